@@ -1,0 +1,91 @@
+"""The exceptions that a user's data or environment can cause.
+
+Every one of them is a sentence for the user: what is wrong, where, and what to do. A programmer's mistake stays a
+``ValueError`` or ``TypeError``.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import ClassVar
+
+
+class InertialError(Exception):
+    """Base class of all errors that the command line shows as one line."""
+
+    exit_code: ClassVar[int] = 2
+
+
+class FormatError(InertialError):
+    """A file or folder cannot be read as what it should be.
+
+    Parameters
+    ----------
+    path
+        The file or folder.
+    reason
+        What is wrong and what to do.
+    line
+        One-based line number, where the file has lines.
+    """
+
+    def __init__(self, path: Path | str, reason: str, *, line: int | None = None) -> None:
+        self.path = Path(path)
+        self.reason = reason
+        self.line = line
+        super().__init__(f"{path}{'' if line is None else f', line {line}'}: {reason}")
+
+
+class TimingError(InertialError):
+    """Time stamps are missing, out of order, or do not fit together."""
+
+
+class OutputExistsError(InertialError):
+    """The output folder already holds something that would be overwritten."""
+
+
+class AlreadyMetricError(InertialError):
+    """A model that already holds a metric scale would be scaled again."""
+
+
+class MissingExtraError(InertialError):
+    """A feature needs an optional dependency that is not installed."""
+
+    def __init__(self, extra: str, purpose: str) -> None:
+        self.extra = extra
+        super().__init__(f'{purpose} needs the extra "{extra}": pip install "colmap-inertial[{extra}]"')
+
+
+class NotObservableError(InertialError):
+    """The data cannot give the quantity that was asked for.
+
+    Parameters
+    ----------
+    quantity
+        What cannot be given, for example ``"scale"``.
+    hint
+        Why, and what to record instead.
+    sigma
+        Relative standard deviation, where one was computed.
+    """
+
+    exit_code = 3
+
+    def __init__(self, quantity: str, hint: str, *, sigma: float | None = None) -> None:
+        self.quantity = quantity
+        self.hint = hint
+        self.sigma = sigma
+        spread = "" if sigma is None else f" (standard deviation {100 * sigma:.1f} %)"
+        super().__init__(f"{quantity} is not observable{spread}: {hint}")
+
+
+class MappingError(InertialError):
+    """COLMAP could not build a model from the images."""
+
+    exit_code = 4
+
+
+class TargetNotFoundError(InertialError):
+    """The calibration target was not found in the images."""
+
+    exit_code = 5

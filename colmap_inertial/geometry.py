@@ -1,0 +1,172 @@
+"""Rotations and pixel conventions, batched over the first axis. Quaternions are xyzw (scalar last), as in COLMAP's Python.
+
+A rotation ``a_from_b`` takes coordinates in frame b to coordinates in frame a; products cancel adjacent frames.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+def skew(v: ArrayLike) -> Array:
+    """Cross-product matrices: ``skew(v) @ x == cross(v, x)``. Shape (..., 3) -> (..., 3, 3)."""
+    v = np.asarray(v, dtype=np.float64)
+    out = np.zeros((*v.shape[:-1], 3, 3))
+    out[..., 0, 1], out[..., 0, 2] = -v[..., 2], v[..., 1]
+    out[..., 1, 0], out[..., 1, 2] = v[..., 2], -v[..., 0]
+    out[..., 2, 0], out[..., 2, 1] = -v[..., 1], v[..., 0]
+    return out
+
+
+def quat_normalize(q: ArrayLike) -> Array:
+    """Unit quaternions with non-negative scalar part, xyzw. Shape (..., 4)."""
+    q = np.asarray(q, dtype=np.float64)
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.where(q[..., 3:] < 0, -q, q)
+
+
+def quat_multiply(a: ArrayLike, b: ArrayLike) -> Array:
+    """Hamilton product of xyzw quaternions: the rotation ``b`` first, then ``a``. Shapes broadcast."""
+    a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
+    av, aw, bv, bw = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
+    vector = aw * bv + bw * av + np.cross(av, bv)
+    return np.concatenate([vector, aw * bw - np.sum(av * bv, axis=-1, keepdims=True)], axis=-1)
+
+
+def quat_conjugate(q: ArrayLike) -> Array:
+    """The inverse of unit quaternions, xyzw."""
+    return np.asarray(q, dtype=np.float64) * np.array([-1.0, -1.0, -1.0, 1.0])
+
+
+def quat_rotate(q: ArrayLike, v: ArrayLike) -> Array:
+    """Rotate vectors by unit quaternions xyzw. Shapes (..., 4), (..., 3) broadcast to (..., 3)."""
+    q, v = np.asarray(q, dtype=np.float64), np.asarray(v, dtype=np.float64)
+    t = 2 * np.cross(q[..., :3], v)
+    return v + q[..., 3:] * t + np.cross(q[..., :3], t)
+
+
+def matrix_from_quat(q: ArrayLike) -> Array:
+    """Rotation matrices of xyzw quaternions (normalised first). Shape (..., 4) -> (..., 3, 3)."""
+    x, y, z, w = np.moveaxis(quat_normalize(q), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def quat_from_matrix(rotation: ArrayLike) -> Array:
+    """Unit quaternions xyzw of rotation matrices (det = +1). Shape (..., 3, 3) -> (..., 4).
+
+    The largest of the four squared components is computed first (Shepperd 1978), so there is no cancellation.
+    """
+    m = np.asarray(rotation, dtype=np.float64)
+    d = np.diagonal(m, axis1=-2, axis2=-1)
+    x, y, z = d[..., 0], d[..., 1], d[..., 2]
+    four_squares = np.stack([1 + x - y - z, 1 - x + y - z, 1 - x - y + z, 1 + x + y + z], axis=-1)
+    a, b, c = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
+    p, q, r = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
+    sx, sy, sz, sw = np.moveaxis(four_squares, -1, 0)
+    candidates = np.stack(
+        [np.stack(row, axis=-1) for row in ([sx, p, q, a], [p, sy, r, b], [q, r, sz, c], [a, b, c, sw])], axis=-2
+    )
+    best = np.argmax(four_squares, axis=-1)
+    return quat_normalize(np.take_along_axis(candidates, best[..., None, None], axis=-2)[..., 0, :])
+
+
+def quat_exp(rotation_vector: ArrayLike) -> Array:
+    """Unit quaternions xyzw of rotation vectors (rad). Shape (..., 3) -> (..., 4)."""
+    v = np.asarray(rotation_vector, dtype=np.float64)
+    angle = np.linalg.norm(v, axis=-1, keepdims=True)
+    # np.sinc(x) = sin(pi x) / (pi x), finite at zero
+    return np.concatenate([0.5 * np.sinc(angle / (2 * np.pi)) * v, np.cos(angle / 2)], axis=-1)
+
+
+def quat_log(q: ArrayLike) -> Array:
+    """Rotation vectors (rad, norm <= pi) of unit quaternions xyzw. Shape (..., 4) -> (..., 3)."""
+    q = quat_normalize(q)
+    norm = np.linalg.norm(q[..., :3], axis=-1, keepdims=True)
+    angle = 2 * np.arctan2(norm, q[..., 3:])
+    small = norm < 1e-9
+    return np.where(small, 2.0, angle / np.where(small, 1.0, norm)) * q[..., :3]
+
+
+def so3_exp(rotation_vector: ArrayLike) -> Array:
+    """Rotation matrices of rotation vectors (rad), Rodrigues' formula. Shape (..., 3) -> (..., 3, 3)."""
+    v = np.asarray(rotation_vector, dtype=np.float64)
+    angle = np.linalg.norm(v, axis=-1)[..., None, None]
+    k = skew(v)
+    a = np.sinc(angle / np.pi)
+    b = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+    return np.eye(3) + a * k + b * (k @ k)
+
+
+def so3_log(rotation: ArrayLike) -> Array:
+    """Rotation vectors (rad, norm <= pi) of rotation matrices. Shape (..., 3, 3) -> (..., 3)."""
+    return quat_log(quat_from_matrix(rotation))
+
+
+def so3_right_jacobian(rotation_vector: ArrayLike) -> Array:
+    """J with ``exp(v + d) ~ exp(v) exp(J d)`` (Sola, Deray and Atchuthan 2018, eq. 143). Shape (..., 3) -> (..., 3, 3)."""
+    v = np.asarray(rotation_vector, dtype=np.float64)
+    angle = np.linalg.norm(v, axis=-1)[..., None, None]
+    k = skew(v)
+    small = angle < 1e-4
+    safe = np.where(small, 1.0, angle)
+    b = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+    c = np.where(small, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
+    return np.eye(3) - b * k + c * (k @ k)
+
+
+def slerp(t_s: ArrayLike, xyzw: ArrayLike, query_s: ArrayLike) -> Array:
+    """Spherical linear interpolation of a quaternion track.
+
+    Parameters
+    ----------
+    t_s
+        (N,) increasing times, N >= 2.
+    xyzw
+        (N, 4) unit quaternions at these times.
+    query_s
+        (M,) times; outside the track the nearest segment is continued.
+
+    Returns
+    -------
+    (M, 4) unit quaternions xyzw.
+    """
+    t_s, q, query_s = np.asarray(t_s, float), np.asarray(xyzw, float), np.asarray(query_s, float)
+    i = np.clip(np.searchsorted(t_s, query_s, side="right") - 1, 0, len(t_s) - 2)
+    fraction = (query_s - t_s[i]) / (t_s[i + 1] - t_s[i])
+    step = quat_log(quat_multiply(quat_conjugate(q[i]), q[i + 1]))
+    return quat_normalize(quat_multiply(q[i], quat_exp(fraction[..., None] * step)))
+
+
+def rotation_between(a: ArrayLike, b: ArrayLike) -> Array:
+    """The smallest rotation that takes direction ``a`` to direction ``b``, as a unit quaternion xyzw.
+
+    Parameters
+    ----------
+    a, b
+        (3,) non-zero vectors. Opposite directions turn about an axis perpendicular to ``a``.
+    """
+    a, b = np.asarray(a, float), np.asarray(b, float)
+    a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
+    w = 1 + float(a @ b)
+    if w < 1e-12:
+        axis = np.cross(a, np.eye(3)[np.argmin(np.abs(a))])
+        return np.append(axis / np.linalg.norm(axis), 0.0)
+    return quat_normalize(np.append(np.cross(a, b), w))
+
+
+def colmap_px_from_opencv(xy_px: ArrayLike) -> Array:
+    """Pixel coordinates with COLMAP's origin from OpenCV's: the centre of the top-left pixel is (0.5, 0.5), not (0, 0)."""
+    return np.asarray(xy_px, dtype=np.float64) + 0.5
+
+
+def opencv_px_from_colmap(xy_px: ArrayLike) -> Array:
+    """Inverse of :func:`colmap_px_from_opencv`."""
+    return np.asarray(xy_px, dtype=np.float64) - 0.5
