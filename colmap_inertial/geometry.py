@@ -1,4 +1,4 @@
-"""Rotations and pixel conventions, batched over the first axis. Quaternions are xyzw (scalar last), as in COLMAP's Python.
+"""Rotations and pixel conventions, batched over the leading axes. Quaternions are xyzw, as in COLMAP's Python.
 
 A rotation ``a_from_b`` takes coordinates in frame b to coordinates in frame a; products cancel adjacent frames.
 """
@@ -6,12 +6,12 @@ A rotation ``a_from_b`` takes coordinates in frame b to coordinates in frame a; 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
 
-def skew(v: ArrayLike) -> Array:
+def skew(v: Array) -> Array:
     """Cross-product matrices: ``skew(v) @ x == cross(v, x)``. Shape (..., 3) -> (..., 3, 3)."""
     v = np.asarray(v, dtype=np.float64)
     out = np.zeros((*v.shape[:-1], 3, 3))
@@ -21,14 +21,14 @@ def skew(v: ArrayLike) -> Array:
     return out
 
 
-def quat_normalize(q: ArrayLike) -> Array:
+def quat_normalize(q: Array) -> Array:
     """Unit quaternions with non-negative scalar part, xyzw. Shape (..., 4)."""
     q = np.asarray(q, dtype=np.float64)
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     return np.where(q[..., 3:] < 0, -q, q)
 
 
-def quat_multiply(a: ArrayLike, b: ArrayLike) -> Array:
+def quat_multiply(a: Array, b: Array) -> Array:
     """Hamilton product of xyzw quaternions: the rotation ``b`` first, then ``a``. Shapes broadcast."""
     a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
     av, aw, bv, bw = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
@@ -36,19 +36,19 @@ def quat_multiply(a: ArrayLike, b: ArrayLike) -> Array:
     return np.concatenate([vector, aw * bw - np.sum(av * bv, axis=-1, keepdims=True)], axis=-1)
 
 
-def quat_conjugate(q: ArrayLike) -> Array:
+def quat_conjugate(q: Array) -> Array:
     """The inverse of unit quaternions, xyzw."""
     return np.asarray(q, dtype=np.float64) * np.array([-1.0, -1.0, -1.0, 1.0])
 
 
-def quat_rotate(q: ArrayLike, v: ArrayLike) -> Array:
+def quat_rotate(q: Array, v: Array) -> Array:
     """Rotate vectors by unit quaternions xyzw. Shapes (..., 4), (..., 3) broadcast to (..., 3)."""
     q, v = np.asarray(q, dtype=np.float64), np.asarray(v, dtype=np.float64)
     t = 2 * np.cross(q[..., :3], v)
     return v + q[..., 3:] * t + np.cross(q[..., :3], t)
 
 
-def matrix_from_quat(q: ArrayLike) -> Array:
+def matrix_from_quat(q: Array) -> Array:
     """Rotation matrices of xyzw quaternions (normalised first). Shape (..., 4) -> (..., 3, 3)."""
     x, y, z, w = np.moveaxis(quat_normalize(q), -1, 0)
     rows = [
@@ -59,7 +59,7 @@ def matrix_from_quat(q: ArrayLike) -> Array:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def quat_from_matrix(rotation: ArrayLike) -> Array:
+def quat_from_matrix(rotation: Array) -> Array:
     """Unit quaternions xyzw of rotation matrices (det = +1). Shape (..., 3, 3) -> (..., 4).
 
     The largest of the four squared components is computed first (Shepperd 1978), so there is no cancellation.
@@ -78,7 +78,7 @@ def quat_from_matrix(rotation: ArrayLike) -> Array:
     return quat_normalize(np.take_along_axis(candidates, best[..., None, None], axis=-2)[..., 0, :])
 
 
-def quat_exp(rotation_vector: ArrayLike) -> Array:
+def quat_exp(rotation_vector: Array) -> Array:
     """Unit quaternions xyzw of rotation vectors (rad). Shape (..., 3) -> (..., 4)."""
     v = np.asarray(rotation_vector, dtype=np.float64)
     angle = np.linalg.norm(v, axis=-1, keepdims=True)
@@ -86,7 +86,7 @@ def quat_exp(rotation_vector: ArrayLike) -> Array:
     return np.concatenate([0.5 * np.sinc(angle / (2 * np.pi)) * v, np.cos(angle / 2)], axis=-1)
 
 
-def quat_log(q: ArrayLike) -> Array:
+def quat_log(q: Array) -> Array:
     """Rotation vectors (rad, norm <= pi) of unit quaternions xyzw. Shape (..., 4) -> (..., 3)."""
     q = quat_normalize(q)
     norm = np.linalg.norm(q[..., :3], axis=-1, keepdims=True)
@@ -95,7 +95,7 @@ def quat_log(q: ArrayLike) -> Array:
     return np.where(small, 2.0, angle / np.where(small, 1.0, norm)) * q[..., :3]
 
 
-def so3_exp(rotation_vector: ArrayLike) -> Array:
+def so3_exp(rotation_vector: Array) -> Array:
     """Rotation matrices of rotation vectors (rad), Rodrigues' formula. Shape (..., 3) -> (..., 3, 3)."""
     v = np.asarray(rotation_vector, dtype=np.float64)
     angle = np.linalg.norm(v, axis=-1)[..., None, None]
@@ -105,13 +105,13 @@ def so3_exp(rotation_vector: ArrayLike) -> Array:
     return np.eye(3) + a * k + b * (k @ k)
 
 
-def so3_log(rotation: ArrayLike) -> Array:
+def so3_log(rotation: Array) -> Array:
     """Rotation vectors (rad, norm <= pi) of rotation matrices. Shape (..., 3, 3) -> (..., 3)."""
     return quat_log(quat_from_matrix(rotation))
 
 
-def so3_right_jacobian(rotation_vector: ArrayLike) -> Array:
-    """J with ``exp(v + d) ~ exp(v) exp(J d)`` (Sola, Deray and Atchuthan 2018, eq. 143). Shape (..., 3) -> (..., 3, 3)."""
+def so3_right_jacobian(rotation_vector: Array) -> Array:
+    """J with ``exp(v + d) ~ exp(v) exp(J d)`` (Sola et al. 2018, eq. 143). Shape (..., 3) -> (..., 3, 3)."""
     v = np.asarray(rotation_vector, dtype=np.float64)
     angle = np.linalg.norm(v, axis=-1)[..., None, None]
     k = skew(v)
@@ -122,7 +122,7 @@ def so3_right_jacobian(rotation_vector: ArrayLike) -> Array:
     return np.eye(3) - b * k + c * (k @ k)
 
 
-def slerp(t_s: ArrayLike, xyzw: ArrayLike, query_s: ArrayLike) -> Array:
+def slerp(t_s: Array, xyzw: Array, query_s: Array) -> Array:
     """Spherical linear interpolation of a quaternion track.
 
     Parameters
@@ -145,7 +145,7 @@ def slerp(t_s: ArrayLike, xyzw: ArrayLike, query_s: ArrayLike) -> Array:
     return quat_normalize(quat_multiply(q[i], quat_exp(fraction[..., None] * step)))
 
 
-def rotation_between(a: ArrayLike, b: ArrayLike) -> Array:
+def rotation_between(a: Array, b: Array) -> Array:
     """The smallest rotation that takes direction ``a`` to direction ``b``, as a unit quaternion xyzw.
 
     Parameters
@@ -153,20 +153,20 @@ def rotation_between(a: ArrayLike, b: ArrayLike) -> Array:
     a, b
         (3,) non-zero vectors. Opposite directions turn about an axis perpendicular to ``a``.
     """
-    a, b = np.asarray(a, float), np.asarray(b, float)
-    a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
-    w = 1 + float(a @ b)
+    u, v = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
+    u, v = u / np.linalg.norm(u), v / np.linalg.norm(v)
+    w = 1 + float(u @ v)
     if w < 1e-12:
-        axis = np.cross(a, np.eye(3)[np.argmin(np.abs(a))])
+        axis = np.cross(u, np.eye(3)[np.argmin(np.abs(u))])
         return np.append(axis / np.linalg.norm(axis), 0.0)
-    return quat_normalize(np.append(np.cross(a, b), w))
+    return quat_normalize(np.append(np.cross(u, v), w))
 
 
-def colmap_px_from_opencv(xy_px: ArrayLike) -> Array:
-    """Pixel coordinates with COLMAP's origin from OpenCV's: the centre of the top-left pixel is (0.5, 0.5), not (0, 0)."""
+def colmap_px_from_opencv(xy_px: Array) -> Array:
+    """COLMAP's pixel coordinates from OpenCV's: the top-left pixel's centre is (0.5, 0.5) instead of (0, 0)."""
     return np.asarray(xy_px, dtype=np.float64) + 0.5
 
 
-def opencv_px_from_colmap(xy_px: ArrayLike) -> Array:
+def opencv_px_from_colmap(xy_px: Array) -> Array:
     """Inverse of :func:`colmap_px_from_opencv`."""
     return np.asarray(xy_px, dtype=np.float64) - 0.5

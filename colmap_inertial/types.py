@@ -21,8 +21,8 @@ LengthUnit = Literal["model", "m"]
 ReadoutDirection = Literal["down", "up", "right", "left"]
 Verdict = Literal["trusted", "weak", "refused"]
 
-#: Order of the parameters in ``CameraImuCalibration.cov``: rotation error (rad, in the camera frame, left: true =
-#: exp(error) * estimate), gyro time offset (s), accelerometer time offset (s), gyro bias (rad/s), lever arm (m), readout (s).
+#: Order of the parameters in ``CameraImuCalibration.cov``. The rotation error is in the camera frame, on the left:
+#: true = exp(error) * estimate.
 CALIBRATION_PARAMETERS = (
     *("rotation_x_rad", "rotation_y_rad", "rotation_z_rad"),
     *("gyro_time_offset_s", "accel_time_offset_s"),
@@ -260,7 +260,7 @@ class CameraTrajectory:
     cam_in_world
         (F, 3) camera centres, in ``length_unit``.
     pose_cov
-        (F, 6, 6) optional covariance: rotation error (rad, camera frame, left), camera centre (``length_unit``, world frame).
+        (F, 6, 6) optional covariance: rotation error (rad, camera frame, left), camera centre (``length_unit``, world).
     """
 
     names: tuple[str, ...]
