@@ -64,5 +64,6 @@ def test_pixel_origin_matches_colmap():
     # COLMAP puts the principal point of an even-sized image on the corner between its four middle pixels
     camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 100.0, 4, 2)
     opencv_centre = np.array([1.5, 0.5])
-    np.testing.assert_array_equal(g.colmap_px_from_opencv(opencv_centre), camera.principal_point())
-    np.testing.assert_array_equal(g.opencv_px_from_colmap(camera.principal_point()), opencv_centre)
+    principal_point = np.array([camera.principal_point_x, camera.principal_point_y])
+    np.testing.assert_array_equal(g.colmap_px_from_opencv(opencv_centre), principal_point)
+    np.testing.assert_array_equal(g.opencv_px_from_colmap(principal_point), opencv_centre)
