@@ -1,0 +1,1 @@
+"""Metres per model unit from inertial data."""

@@ -1,0 +1,73 @@
+"""From a scale and its standard deviation to an interval and a verdict; one rule for every estimator."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from colmap_inertial.types import Verdict
+
+#: Half-widths of the 95 % interval, relative to the scale, up to which a scale is trusted, and given at all.
+TRUSTED_HALF_WIDTH = 0.03
+WEAK_HALF_WIDTH = 0.30
+#: Two-sided 95 % quantile of the normal distribution.
+Z95 = 1.959963984540054
+
+
+def half_width(sigma_log: float) -> float:
+    """Half-width of the log-symmetric 95 % interval relative to the scale: ``(hi - lo) / (2 scale)``."""
+    exponent = Z95 * sigma_log
+    return math.sinh(exponent) if exponent < 700 else math.inf
+
+
+def verdict_of(
+    metres_per_unit: float,
+    sigma_log: float,
+    checks: Sequence[str] = (),
+    *,
+    refusals: Sequence[str] = (),
+) -> tuple[Verdict, tuple[float, float], tuple[str, ...]]:
+    """Judge a scale estimate.
+
+    Parameters
+    ----------
+    metres_per_unit
+        The estimate.
+    sigma_log
+        Standard deviation of its logarithm.
+    checks
+        A sentence for each check that failed. Any of them keeps the verdict from being ``"trusted"``.
+    refusals
+        A sentence for each finding that makes the number worthless whatever its width.
+
+    Returns
+    -------
+    verdict
+        ``"trusted"`` up to a half-width of 3 %, ``"weak"`` up to 30 %, else ``"refused"``.
+    ci95
+        (low, high), symmetric in the logarithm of the scale.
+    reasons
+        ``refusals``, ``checks``, and a sentence on the width where it decided.
+    """
+    if not (math.isfinite(metres_per_unit) and metres_per_unit > 0):
+        raise ValueError(f"metres_per_unit must be positive and finite, not {metres_per_unit}")
+    if not sigma_log >= 0:
+        raise ValueError(f"sigma_log must not be negative, not {sigma_log}")
+    width = half_width(sigma_log)
+    factor = math.exp(min(Z95 * sigma_log, 700.0))
+    ci95 = (metres_per_unit / factor, metres_per_unit * factor)
+    reasons = [*refusals, *checks]
+    verdict: Verdict = "weak" if checks else "trusted"
+    if width > TRUSTED_HALF_WIDTH:
+        verdict = "weak"
+    if width > WEAK_HALF_WIDTH:
+        known = f"known to no better than +-{100 * width:.0f} %" if width < 10 else "not known at all"
+        reasons.append(
+            f"the scale is {known}: record a clip in which the camera itself speeds up and slows down "
+            "(swing it back and forth by 20 cm or more, for 10 s or longer) while it sees texture"
+        )
+    elif width > TRUSTED_HALF_WIDTH:
+        reasons.append(f"the 95 % interval is +-{100 * width:.1f} %: more or livelier motion would narrow it")
+    if width > WEAK_HALF_WIDTH or refusals:
+        verdict = "refused"
+    return verdict, ci95, tuple(reasons)
