@@ -145,6 +145,19 @@ def slerp(t_s: Array, xyzw: Array, query_s: Array) -> Array:
     return quat_normalize(quat_multiply(q[i], quat_exp(fraction[..., None] * step)))
 
 
+def quat_cumulative(steps: Array) -> Array:
+    """Running products ``[1, s0, s0 s1, s0 s1 s2, ...]`` of unit quaternions xyzw. Shape (N, 4) -> (N + 1, 4).
+
+    A parallel prefix scan (Hillis and Steele 1986): log2(N) vectorised passes instead of a Python loop.
+    """
+    out = np.concatenate([[[0.0, 0.0, 0.0, 1.0]], np.asarray(steps, dtype=np.float64)])
+    reach = 1
+    while reach < len(out):
+        out[reach:] = quat_normalize(quat_multiply(out[:-reach], out[reach:]))
+        reach *= 2
+    return out
+
+
 def rotation_between(a: Array, b: Array) -> Array:
     """The smallest rotation that takes direction ``a`` to direction ``b``, as a unit quaternion xyzw.
 

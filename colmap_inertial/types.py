@@ -20,6 +20,10 @@ Array = NDArray[np.float64]
 LengthUnit = Literal["model", "m"]
 ReadoutDirection = Literal["down", "up", "right", "left"]
 Verdict = Literal["trusted", "weak", "refused"]
+WorldAxes = Literal["z-up", "y-down"]
+
+#: The direction of gravity in a metric world with these axes: ``y-down`` is COLMAP's and computer vision's habit.
+DOWN_IN_WORLD = {"z-up": np.array([0.0, 0.0, -1.0]), "y-down": np.array([0.0, 1.0, 0.0])}
 
 #: Order of the parameters in ``CameraImuCalibration.cov``. The rotation error is in the camera frame, on the left:
 #: true = exp(error) * estimate.
@@ -490,7 +494,7 @@ class Similarity:
 
     @classmethod
     def from_scale(
-        cls, estimate: ScaleEstimate, *, world_up: Literal["z", "-y"] = "z", provenance: str = ""
+        cls, estimate: ScaleEstimate, *, world: WorldAxes = "z-up", provenance: str = ""
     ) -> Similarity:
         """The similarity that makes a model metric with gravity along the chosen axis; origin kept.
 
@@ -503,7 +507,7 @@ class Similarity:
 
         if estimate.metres_per_unit is None or estimate.gravity_in_world_m_s2 is None:
             raise NotObservableError("scale", "; ".join(estimate.reasons))
-        down = {"z": np.array([0.0, 0.0, -1.0]), "-y": np.array([0.0, 1.0, 0.0])}[world_up]
+        down = DOWN_IN_WORLD[world]
         gravity = estimate.gravity_in_world_m_s2
         rotation = rotation_between(gravity, down)
         cov = np.zeros((7, 7))
@@ -524,6 +528,7 @@ class Similarity:
 
 __all__ = [
     "CALIBRATION_PARAMETERS",
+    "DOWN_IN_WORLD",
     "Array",
     "CameraImuCalibration",
     "CameraModel",
@@ -539,5 +544,6 @@ __all__ = [
     "Similarity",
     "SmoothedTrajectory",
     "Verdict",
+    "WorldAxes",
     "clock_shift_s",
 ]
