@@ -457,6 +457,35 @@ class ScaleEstimate:
         if self.cov is not None:
             _set(self, cov=_covariance("cov", self.cov, (7, 7)))
 
+    def as_json(self) -> dict[str, object]:
+        """The estimate in JSON types; ``None`` where a refusal has no number."""
+
+        def plain(value: Array | None) -> object:
+            return None if value is None else value.tolist()
+
+        calibration = self.calibration
+        return {
+            "metres_per_unit": self.metres_per_unit,
+            "ci95": None if self.ci95 is None else list(self.ci95),
+            "sigma_log": self.sigma_log,
+            "verdict": self.verdict,
+            "reasons": list(self.reasons),
+            "gravity_in_world_m_s2": plain(self.gravity_in_world_m_s2),
+            "accel_bias_m_s2": plain(self.accel_bias_m_s2),
+            "gyro_bias_rad_s": plain(None if calibration is None else calibration.gyro_bias_rad_s),
+            "cam_from_imu_xyzw": plain(None if calibration is None else calibration.cam_from_imu_xyzw),
+            "imu_in_cam_m": plain(None if calibration is None else calibration.imu_in_cam_m),
+            "gyro_time_offset_s": None if calibration is None else calibration.gyro_time_offset_s,
+            "accel_time_offset_s": None if calibration is None else calibration.accel_time_offset_s,
+            "readout_s": None if calibration is None else calibration.readout_s,
+            "cov": plain(self.cov),
+            "chi2": self.chi2,
+            "dof": self.dof,
+            "excitation_m_s2": self.excitation_m_s2,
+            "method": self.method,
+            "runtime_s": self.runtime_s,
+        }
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Similarity:
