@@ -1,0 +1,55 @@
+"""The values that move through the package: frozen, checked when built, numpy only.
+
+Conventions. Times are seconds on the clock that the name says, counted from the value's ``epoch_ns`` (so that
+nanosecond stamps of the size 1e18 keep their precision). Transforms are ``target_from_source``, quaternions xyzw.
+IMU frame: whatever the reader delivers, right-handed, the same for gyroscope and accelerometer. Accelerations are
+specific force: at rest the accelerometer reads +9.8 m/s2 away from the ground.
+"""
+
+from __future__ import annotations
+
+from colmap_inertial.types._checks import Array
+from colmap_inertial.types.estimated import (
+    CALIBRATION_PARAMETERS,
+    DOWN_IN_WORLD,
+    CameraImuCalibration,
+    ScaleEstimate,
+    Similarity,
+    SmoothedTrajectory,
+    Verdict,
+    WorldAxes,
+)
+from colmap_inertial.types.recorded import (
+    CameraModel,
+    CameraTrajectory,
+    Frame,
+    FrameTiming,
+    ImuNoise,
+    ImuRecording,
+    LengthUnit,
+    Projector,
+    ReadoutDirection,
+    clock_shift_s,
+)
+
+__all__ = [
+    "CALIBRATION_PARAMETERS",
+    "DOWN_IN_WORLD",
+    "Array",
+    "CameraImuCalibration",
+    "CameraModel",
+    "CameraTrajectory",
+    "Frame",
+    "FrameTiming",
+    "ImuNoise",
+    "ImuRecording",
+    "LengthUnit",
+    "Projector",
+    "ReadoutDirection",
+    "ScaleEstimate",
+    "Similarity",
+    "SmoothedTrajectory",
+    "Verdict",
+    "WorldAxes",
+    "clock_shift_s",
+]

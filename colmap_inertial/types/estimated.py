@@ -1,0 +1,272 @@
+"""What is estimated, each with its covariance: calibration, smoothed trajectory, scale, similarity."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from colmap_inertial.errors import NotObservableError
+from colmap_inertial.geometry import matrix_from_quat, rotation_between, skew
+from colmap_inertial.types._checks import (
+    Array,
+    checked_array,
+    checked_covariance,
+    checked_quaternions,
+    checked_times,
+    set_fields,
+)
+from colmap_inertial.types.recorded import LengthUnit
+
+Verdict = Literal["trusted", "weak", "refused"]
+WorldAxes = Literal["z-up", "y-down"]
+
+#: The direction of gravity in a metric world with these axes: ``y-down`` is COLMAP's and computer vision's habit.
+DOWN_IN_WORLD = {"z-up": np.array([0.0, 0.0, -1.0]), "y-down": np.array([0.0, 1.0, 0.0])}
+
+#: Order of the parameters in ``CameraImuCalibration.cov``. The rotation error is in the camera frame, on the left:
+#: true = exp(error) * estimate.
+CALIBRATION_PARAMETERS = (
+    *("rotation_x_rad", "rotation_y_rad", "rotation_z_rad"),
+    *("gyro_time_offset_s", "accel_time_offset_s"),
+    *("gyro_bias_x_rad_s", "gyro_bias_y_rad_s", "gyro_bias_z_rad_s"),
+    *("imu_in_cam_x_m", "imu_in_cam_y_m", "imu_in_cam_z_m"),
+    "readout_s",
+)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CameraImuCalibration:
+    """How the camera and the IMU of one device relate.
+
+    Attributes
+    ----------
+    cam_from_imu_xyzw
+        (4,) rotation.
+    gyro_time_offset_s, accel_time_offset_s
+        ``t_cam = t_stamp + offset`` between raw stamps (each clock's reading in seconds, epoch included).
+    gyro_bias_rad_s
+        (3,) IMU frame; the true rate is the reading minus this.
+    imu_in_cam_m
+        (3,) lever arm: the IMU's position in the camera frame.
+    readout_s
+        Rolling-shutter readout; 0 for a global shutter.
+    cov
+        (12, 12) in the order of ``CALIBRATION_PARAMETERS``. Wide where nothing is known.
+    """
+
+    cam_from_imu_xyzw: Array
+    gyro_time_offset_s: float
+    accel_time_offset_s: float
+    gyro_bias_rad_s: Array
+    imu_in_cam_m: Array
+    readout_s: float
+    cov: Array
+
+    def __post_init__(self) -> None:
+        n = len(CALIBRATION_PARAMETERS)
+        set_fields(
+            self,
+            cam_from_imu_xyzw=checked_quaternions("cam_from_imu_xyzw", self.cam_from_imu_xyzw, (4,)),
+            gyro_bias_rad_s=checked_array("gyro_bias_rad_s", self.gyro_bias_rad_s, (3,)),
+            imu_in_cam_m=checked_array("imu_in_cam_m", self.imu_in_cam_m, (3,)),
+            cov=checked_covariance("cov", self.cov, (n, n)),
+        )
+
+    def sigma(self, parameter: str) -> float:
+        """Standard deviation of one of ``CALIBRATION_PARAMETERS``."""
+        i = CALIBRATION_PARAMETERS.index(parameter)
+        return float(np.sqrt(self.cov[i, i]))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SmoothedTrajectory:
+    """Positions, velocities and accelerations with their covariance.
+
+    Attributes
+    ----------
+    t_s
+        (T,) camera clock, seconds since ``epoch_ns``.
+    cam_in_world, velocity_in_world, accel_in_world
+        (T, 3) in ``length_unit``, per second, per second squared; without gravity.
+    cam_from_world_xyzw
+        (T, 4) rotations.
+    cov
+        (T, 9, 9) of position, velocity, acceleration.
+    """
+
+    t_s: Array
+    cam_in_world: Array
+    velocity_in_world: Array
+    accel_in_world: Array
+    cam_from_world_xyzw: Array
+    cov: Array
+    length_unit: LengthUnit = "model"
+    epoch_ns: int = 0
+
+    def __post_init__(self) -> None:
+        t_s = checked_times("t_s", self.t_s)
+        n = len(t_s)
+        set_fields(
+            self,
+            t_s=t_s,
+            cam_in_world=checked_array("cam_in_world", self.cam_in_world, (n, 3)),
+            velocity_in_world=checked_array("velocity_in_world", self.velocity_in_world, (n, 3)),
+            accel_in_world=checked_array("accel_in_world", self.accel_in_world, (n, 3)),
+            cam_from_world_xyzw=checked_quaternions("cam_from_world_xyzw", self.cam_from_world_xyzw, (n, 4)),
+            cov=checked_covariance("cov", self.cov, (n, 9, 9)),
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScaleEstimate:
+    """Metres per model unit, with its uncertainty and a verdict.
+
+    Attributes
+    ----------
+    metres_per_unit
+        ``None`` when refused.
+    sigma_log
+        Standard deviation of the logarithm of the scale; ``None`` when refused.
+    ci95
+        95 % interval of ``metres_per_unit``; ``None`` when refused.
+    verdict, reasons
+        What to make of it, and why, in words for the user.
+    gravity_in_world_m_s2
+        (3,) points down, in the source model's frame; ``None`` where it could not be estimated.
+    accel_bias_m_s2
+        (3,) IMU frame; the true specific force is the reading minus this.
+    calibration
+        The camera-IMU calibration that the estimate refined.
+    cov
+        (7, 7) of log scale, gravity (m/s2, world frame), accelerometer bias (m/s2).
+    chi2, dof
+        Of the fit, against the noise it assumed.
+    excitation_m_s2
+        Standard deviation of the camera's acceleration: what the scale rests on.
+    method
+        ``"spectral"`` or ``"joint"``.
+    """
+
+    metres_per_unit: float | None
+    sigma_log: float | None
+    ci95: tuple[float, float] | None
+    verdict: Verdict
+    method: str
+    reasons: tuple[str, ...] = ()
+    gravity_in_world_m_s2: Array | None = None
+    accel_bias_m_s2: Array | None = None
+    calibration: CameraImuCalibration | None = None
+    cov: Array | None = None
+    chi2: float | None = None
+    dof: int | None = None
+    excitation_m_s2: float | None = None
+    runtime_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        numbers = (self.metres_per_unit, self.sigma_log, self.ci95)
+        if (self.verdict == "refused") != (self.metres_per_unit is None) or len({n is None for n in numbers}) > 1:
+            raise ValueError("a refused scale has no number, and no other scale lacks one")
+        if self.verdict == "refused" and not self.reasons:
+            raise ValueError("a refusal needs a reason")
+        if self.metres_per_unit is not None and not self.metres_per_unit > 0:
+            raise ValueError("metres_per_unit must be positive")
+        for name, shape in (("gravity_in_world_m_s2", (3,)), ("accel_bias_m_s2", (3,))):
+            if getattr(self, name) is not None:
+                set_fields(self, **{name: checked_array(name, getattr(self, name), shape)})
+        if self.cov is not None:
+            set_fields(self, cov=checked_covariance("cov", self.cov, (7, 7)))
+
+    def as_json(self) -> dict[str, object]:
+        """The estimate in JSON types; ``None`` where a refusal has no number."""
+
+        def plain(value: Array | None) -> object:
+            return None if value is None else value.tolist()
+
+        calibration = self.calibration
+        return {
+            "metres_per_unit": self.metres_per_unit,
+            "ci95": None if self.ci95 is None else list(self.ci95),
+            "sigma_log": self.sigma_log,
+            "verdict": self.verdict,
+            "reasons": list(self.reasons),
+            "gravity_in_world_m_s2": plain(self.gravity_in_world_m_s2),
+            "accel_bias_m_s2": plain(self.accel_bias_m_s2),
+            "gyro_bias_rad_s": plain(None if calibration is None else calibration.gyro_bias_rad_s),
+            "cam_from_imu_xyzw": plain(None if calibration is None else calibration.cam_from_imu_xyzw),
+            "imu_in_cam_m": plain(None if calibration is None else calibration.imu_in_cam_m),
+            "gyro_time_offset_s": None if calibration is None else calibration.gyro_time_offset_s,
+            "accel_time_offset_s": None if calibration is None else calibration.accel_time_offset_s,
+            "readout_s": None if calibration is None else calibration.readout_s,
+            "cov": plain(self.cov),
+            "chi2": self.chi2,
+            "dof": self.dof,
+            "excitation_m_s2": self.excitation_m_s2,
+            "method": self.method,
+            "runtime_s": self.runtime_s,
+        }
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Similarity:
+    """``x_target = scale * R x_source + translation``.
+
+    Attributes
+    ----------
+    scale
+        Target units (metres) per source unit.
+    rotation_xyzw
+        (4,) ``target_from_source``.
+    translation_m
+        (3,).
+    cov
+        (7, 7) of log scale, rotation (rad, target frame, left), translation (m).
+    provenance
+        Where it comes from, in words.
+    """
+
+    scale: float
+    rotation_xyzw: Array
+    translation_m: Array
+    cov: Array
+    provenance: str = ""
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.scale) and self.scale > 0):
+            raise ValueError("scale must be positive")
+        set_fields(
+            self,
+            rotation_xyzw=checked_quaternions("rotation_xyzw", self.rotation_xyzw, (4,)),
+            translation_m=checked_array("translation_m", self.translation_m, (3,)),
+            cov=checked_covariance("cov", self.cov, (7, 7)),
+        )
+
+    @classmethod
+    def from_scale(cls, estimate: ScaleEstimate, *, world: WorldAxes = "z-up", provenance: str = "") -> Similarity:
+        """The similarity that makes a model metric with gravity along the chosen axis; origin kept.
+
+        Raises
+        ------
+        NotObservableError
+            When the scale was refused.
+        """
+        if estimate.metres_per_unit is None or estimate.gravity_in_world_m_s2 is None:
+            raise NotObservableError("scale", "; ".join(estimate.reasons))
+        down = DOWN_IN_WORLD[world]
+        gravity = estimate.gravity_in_world_m_s2
+        rotation = rotation_between(gravity, down)
+        cov = np.zeros((7, 7))
+        if estimate.cov is not None:
+            # A change of gravity dg turns the target frame by R (g x dg) / |g|^2; heading is free and carries none.
+            jacobian = np.zeros((4, 4))
+            jacobian[0, 0] = 1.0
+            jacobian[1:, 1:] = matrix_from_quat(rotation) @ skew(gravity) / (gravity @ gravity)
+            cov[:4, :4] = jacobian @ estimate.cov[:4, :4] @ jacobian.T
+        return cls(
+            scale=estimate.metres_per_unit,
+            rotation_xyzw=rotation,
+            translation_m=np.zeros(3),
+            cov=0.5 * (cov + cov.T),
+            provenance=provenance,
+        )

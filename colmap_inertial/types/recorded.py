@@ -1,0 +1,258 @@
+"""What was recorded or reconstructed: IMU samples, frames and their times, cameras, trajectories."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.types._checks import (
+    Array,
+    checked_array,
+    checked_covariance,
+    checked_quaternions,
+    checked_times,
+    set_fields,
+)
+
+LengthUnit = Literal["model", "m"]
+ReadoutDirection = Literal["down", "up", "right", "left"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ImuNoise:
+    """White-noise densities and bias walks of an IMU, as data sheets give them.
+
+    Attributes
+    ----------
+    gyro_density_rad_s_rthz, accel_density_m_s2_rthz
+        White noise, per square root of hertz.
+    gyro_walk_rad_s2_rthz, accel_walk_m_s3_rthz
+        Random walk of the biases.
+    """
+
+    gyro_density_rad_s_rthz: float
+    accel_density_m_s2_rthz: float
+    gyro_walk_rad_s2_rthz: float
+    accel_walk_m_s3_rthz: float
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not (np.isfinite(value) and value >= 0):
+                raise ValueError(f"{name}: must be finite and not negative")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ImuRecording:
+    """Gyroscope and accelerometer samples of one recording.
+
+    Attributes
+    ----------
+    gyro_t_s, accel_t_s
+        (N,), (M,) stamps in seconds since ``epoch_ns`` on the IMU's clock, strictly increasing. Two time bases: a
+        gyroscope sample never belongs to an accelerometer sample by index.
+    gyro_rad_s
+        (N, 3) angular velocity in the IMU frame.
+    accel_m_s2
+        (M, 3) specific force in the IMU frame, gravity included.
+    epoch_ns
+        The clock's reading, in nanoseconds, where both time bases are zero.
+    repairs
+        What the reader had to sort, merge or drop, in words.
+    device
+        What recorded it, where known.
+    noise
+        The data sheet's noise, where the recording comes with one.
+    """
+
+    gyro_t_s: Array
+    gyro_rad_s: Array
+    accel_t_s: Array
+    accel_m_s2: Array
+    epoch_ns: int = 0
+    repairs: tuple[str, ...] = ()
+    device: str = ""
+    noise: ImuNoise | None = None
+
+    def __post_init__(self) -> None:
+        gyro_t_s, accel_t_s = checked_times("gyro_t_s", self.gyro_t_s), checked_times("accel_t_s", self.accel_t_s)
+        set_fields(
+            self,
+            gyro_t_s=gyro_t_s,
+            accel_t_s=accel_t_s,
+            gyro_rad_s=checked_array("gyro_rad_s", self.gyro_rad_s, (len(gyro_t_s), 3)),
+            accel_m_s2=checked_array("accel_m_s2", self.accel_m_s2, (len(accel_t_s), 3)),
+        )
+        if len(gyro_t_s) < 2 or len(accel_t_s) < 2:
+            raise ValueError("an ImuRecording needs at least two samples of each sensor")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CameraModel:
+    """Intrinsics in COLMAP's terms: model name, image size, parameters; the top-left pixel's centre is (0.5, 0.5)."""
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if self.width <= 0 or self.height <= 0:
+            raise ValueError(f"image size {self.width}x{self.height} must be positive")
+        params = tuple(float(p) for p in self.params)
+        if not np.isfinite(params).all():
+            raise ValueError("camera parameters must be finite")
+        set_fields(self, params=params)
+
+
+class Projector(Protocol):
+    """Maps between pixels and normalised image coordinates; ``pycolmap.Camera`` is one."""
+
+    def cam_from_img(self, image_points: Array, /) -> Array: ...
+
+    def img_from_cam(self, cam_points: Array, /) -> Array: ...
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Frame:
+    """One decoded frame on its way to feature extraction.
+
+    Attributes
+    ----------
+    name
+        File name that COLMAP will see; the frame's identity from here on.
+    image
+        (H, W) or (H, W, 3) pixels, RGB order, uint8 or uint16, read-only. A stage returns a new frame
+        (``dataclasses.replace``) with a new array; one that leaves the array alone has the original file passed on.
+    t_s
+        Start of exposure of row 0, camera clock, seconds since the timing's ``epoch_ns``.
+    exposure_s
+        ``None`` where unknown.
+    readout_s
+        From the first row to one past the last; 0 is a global shutter; ``None`` where unknown.
+    camera
+        ``None`` lets COLMAP calibrate.
+    """
+
+    name: str
+    image: NDArray[np.uint8] | NDArray[np.uint16]
+    t_s: float
+    exposure_s: float | None = None
+    readout_s: float | None = None
+    camera: CameraModel | None = None
+
+    def __post_init__(self) -> None:
+        if self.image.ndim not in (2, 3) or self.image.dtype not in (np.uint8, np.uint16):
+            raise ValueError(f"{self.name}: an image is (H, W) or (H, W, 3), uint8 or uint16")
+        view = self.image.view()
+        view.setflags(write=False)
+        set_fields(self, image=view)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FrameTiming:
+    """When each frame was exposed, on the camera's clock.
+
+    Attributes
+    ----------
+    names
+        (F,) file names, in order of time.
+    t_s
+        (F,) start of exposure of row 0, seconds since ``epoch_ns``, strictly increasing.
+    exposure_s
+        (F,) exposure times, or ``None`` where unknown.
+    readout_s
+        From the first row to one past the last; 0 is a global shutter; ``None`` where unknown.
+    readout_direction
+        Where the rows' exposure moves in the stored image.
+    """
+
+    names: tuple[str, ...]
+    t_s: Array
+    exposure_s: Array | None = None
+    readout_s: float | None = None
+    readout_direction: ReadoutDirection = "down"
+    epoch_ns: int = 0
+
+    def __post_init__(self) -> None:
+        t_s = checked_times("t_s", self.t_s)
+        if len(self.names) != len(t_s) or len(set(self.names)) != len(t_s):
+            raise ValueError("frame names must be unique, one for each time")
+        set_fields(self, names=tuple(self.names), t_s=t_s)
+        if self.exposure_s is not None:
+            set_fields(self, exposure_s=checked_array("exposure_s", self.exposure_s, (len(t_s),)))
+        if self.readout_s is not None and not 0 <= self.readout_s < 1:
+            raise ValueError("readout_s must be from 0 to 1 second")
+
+    def pose_t_s(self) -> Array:
+        """(F,) the instants that whole-image poses hold: mid-exposure of the middle row."""
+        exposure = 0.0 if self.exposure_s is None else self.exposure_s
+        return np.asarray(self.t_s + 0.5 * exposure + 0.5 * (self.readout_s or 0.0))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CameraTrajectory:
+    """Camera poses of a reconstruction with their times.
+
+    Attributes
+    ----------
+    names
+        (F,) image names (or the index as text, where there are no images).
+    t_s
+        (F,) the instant each pose holds, camera clock, seconds since ``epoch_ns``, strictly increasing.
+    cam_from_world_xyzw
+        (F, 4) rotations.
+    cam_in_world
+        (F, 3) camera centres, in ``length_unit``.
+    pose_cov
+        (F, 6, 6) optional covariance: rotation error (rad, camera frame, left), camera centre (``length_unit``, world).
+    """
+
+    names: tuple[str, ...]
+    t_s: Array
+    cam_from_world_xyzw: Array
+    cam_in_world: Array
+    length_unit: LengthUnit = "model"
+    epoch_ns: int = 0
+    pose_cov: Array | None = None
+
+    def __post_init__(self) -> None:
+        t_s = checked_times("t_s", self.t_s)
+        n = len(t_s)
+        if len(self.names) != n:
+            raise ValueError("one name for each pose")
+        set_fields(
+            self,
+            names=tuple(self.names),
+            t_s=t_s,
+            cam_from_world_xyzw=checked_quaternions("cam_from_world_xyzw", self.cam_from_world_xyzw, (n, 4)),
+            cam_in_world=checked_array("cam_in_world", self.cam_in_world, (n, 3)),
+        )
+        if self.pose_cov is not None:
+            set_fields(self, pose_cov=checked_covariance("pose_cov", self.pose_cov, (n, 6, 6)))
+
+    def __len__(self) -> int:
+        return len(self.t_s)
+
+    def select(self, keep: NDArray[np.bool_] | NDArray[np.intp] | slice) -> CameraTrajectory:
+        """The poses that ``keep`` (mask, increasing indices or slice) picks."""
+        index = np.arange(len(self))[keep]
+        return CameraTrajectory(
+            names=tuple(self.names[i] for i in index),
+            t_s=self.t_s[index],
+            cam_from_world_xyzw=self.cam_from_world_xyzw[index],
+            cam_in_world=self.cam_in_world[index],
+            length_unit=self.length_unit,
+            epoch_ns=self.epoch_ns,
+            pose_cov=None if self.pose_cov is None else self.pose_cov[index],
+        )
+
+
+def clock_shift_s(trajectory: CameraTrajectory, imu: ImuRecording) -> float:
+    """What to add to an offset between raw stamps to get the offset between ``t_s`` values.
+
+    With ``t_cam = t_stamp + offset`` on raw stamps, ``trajectory`` time = ``imu`` time + offset + this.
+    """
+    return (imu.epoch_ns - trajectory.epoch_ns) * 1e-9
