@@ -86,9 +86,7 @@ class ImuOptions:
             raise ValueError("sample rates must be positive")
         if not -MARGIN_S < self.lead_s[0] <= self.lead_s[1] < MARGIN_S:
             raise ValueError(f"lead_s must lie within +-{MARGIN_S} s")
-        if any(
-            value < 0 for name, value in vars(self).items() if name.endswith(("_sd", "rthz")) and np.isscalar(value)
-        ):
+        if any(np.min(value) < 0 for name, value in vars(self).items() if name.endswith(("_sd", "_rthz"))):
             raise ValueError("densities and standard deviations must not be negative")
 
     def noise(self) -> ImuNoise:
