@@ -1,0 +1,8 @@
+#!/usr/bin/env bash
+# Sets everything up and reconstructs the example scene, from images and IMU to metres.
+#   demo.sh [OUT]      OUT: a new folder for the result (default: out/desk)
+set -euo pipefail
+out=$(realpath -m "${1:-$(dirname "$0")/../out/desk}")
+cd "$(dirname "$0")/.."
+bash scripts/setup.sh
+.venv/bin/colmap-inertial reconstruct example_scenes/desk "$out"

@@ -1,0 +1,45 @@
+#!/usr/bin/env bash
+# Makes .venv in the checkout with colmap-inertial and what its tests need. Installs missing system packages with apt
+# where it may; otherwise it says what is missing. Running it again is quick.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+
+python=""
+for candidate in python3.11 python3.12 python3.13 python3; do
+  if command -v "$candidate" >/dev/null && "$candidate" -c 'import sys; sys.exit(sys.version_info < (3, 11))'; then
+    python=$candidate
+    break
+  fi
+done
+if [ -z "$python" ]; then
+  echo "setup: Python 3.11 or newer is needed (apt-get install python3.11)" >&2
+  exit 2
+fi
+
+missing=()
+"$python" -c 'import ensurepip' 2>/dev/null || missing+=("python3-venv")
+# open3d, which the simulator renders with, links to these.
+for library in libGL.so.1:libgl1 libEGL.so.1:libegl1 libusb-1.0.so.0:libusb-1.0-0 libgomp.so.1:libgomp1 libX11.so.6:libx11-6; do
+  "$python" -c "import ctypes; ctypes.CDLL('${library%%:*}')" 2>/dev/null || missing+=("${library##*:}")
+done
+if [ ${#missing[@]} -gt 0 ]; then
+  sudo=""
+  if [ "$(id -u)" -ne 0 ]; then sudo="sudo -n"; fi
+  if ! command -v apt-get >/dev/null || ! $sudo true 2>/dev/null; then
+    echo "setup: please install these packages and run this again: ${missing[*]}" >&2
+    exit 2
+  fi
+  echo "setup: installing ${missing[*]}"
+  $sudo apt-get update -qq
+  DEBIAN_FRONTEND=noninteractive $sudo apt-get install -y -qq --no-install-recommends "${missing[@]}" >/dev/null
+fi
+
+if [ ! -x .venv/bin/python ]; then
+  "$python" -m venv .venv
+fi
+stamp=.venv/.colmap-inertial
+if [ ! -f "$stamp" ] || [ pyproject.toml -nt "$stamp" ]; then
+  echo "setup: installing Python packages into .venv"
+  .venv/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+  touch "$stamp"
+fi
