@@ -1,0 +1,305 @@
+"""``capture.toml``: one recording, described by the person who made it.
+
+Paths count from the file's folder. A reconstruction needs ``[images]`` or ``[video]``, and ``[imu]``; the other tables
+may be left out. Nothing is guessed: a unit, axis or time that a file does not state is asked for.
+
+.. code-block:: toml
+
+    [images]                        # a folder of pictures ...
+    folder = "frames"
+    pattern = "*_0.jpg"             # default: every picture in the folder
+    times = "name"                  # the number in each file name is its time; or a CSV file: "frames.csv"
+    time_unit = "ns"                # s, ms, us, ns; for a CSV only where its header does not say
+
+    [video]                         # ... or a video; its own presentation stamps time the frames
+    file = "clip.mp4"
+    frame_times = "clip_times.csv"  # optional: the recorder's own time of each frame, in place of the stamps
+    time_unit = "ns"                # of frame_times, where its header does not say
+    frames_per_s = 5                # optional: use about this many
+
+    [timing]
+    exposure_s = 0.004              # one exposure for all frames, where known
+    readout_s = 0.021               # first to last row (rolling shutter); 0 = global shutter; leave out if unknown
+    readout_direction = "down"      # down, up, right, left in the stored picture
+    shared_clock = false            # true: frame times and IMU stamps come from one clock
+
+    [camera]                        # leave out to let COLMAP calibrate
+    model = "OPENCV"                # a COLMAP model
+    width = 1920
+    height = 1080
+    params = [1500.0, 1500.0, 960.0, 540.0, 0.0, 0.0, 0.0, 0.0]
+    pixel_origin = "corner"         # corner: COLMAP (top-left pixel's centre is 0.5, 0.5); center: OpenCV, Kalibr
+    # or: sensor_yaml = "mav0/cam0/sensor.yaml"   (EuRoC; its T_BS also gives the calibration)
+
+    [imu]
+    path = "mav0/imu0"              # whatever read_imu knows, found by content
+    format = "auto"
+
+    [imu.gyro]                      # or, without path: any table, described
+    file = "imu.csv"
+    time = "t"                      # a name in the header, or a column number counted from 1
+    time_unit = "s"
+    columns = ["gx", "gy", "gz"]
+    unit = "rad/s"                  # rad/s, deg/s
+    axes = "y,-x,z"                 # x = the file's y, y = minus its x, z = its z
+    mirrored = false                # true allows axes that change handedness (a left-handed file)
+
+    [imu.accel]
+    file = "imu.csv"
+    time = "t"
+    time_unit = "s"
+    columns = ["ax", "ay", "az"]
+    unit = "m/s2"                   # m/s2, g
+
+    [imu.noise]                     # data sheet, where known
+    gyro_density_rad_s_rthz = 3e-4
+    accel_density_m_s2_rthz = 2e-3
+    gyro_walk_rad_s2_rthz = 2e-5
+    accel_walk_m_s3_rthz = 3e-3
+
+    [calibration]                   # all optional; what is missing is estimated
+    file = "phone_calibration.json" # from "colmap-inertial align" of the same device; or:
+    cam_from_imu = [[0, -1, 0], [-1, 0, 0], [0, 0, -1]]   # 3x3, or 4x4 with the lever arm; or cam_from_imu_xyzw
+    rotation_sigma_rad = 0.01
+    imu_in_cam_m = [0.03, 0.01, 0.0]
+    imu_in_cam_sigma_m = 0.005
+    gyro_time_offset_s = 0.0        # t_cam = t_stamp + offset
+    accel_time_offset_s = 0.0
+    time_offset_sigma_s = 0.002
+    gyro_bias_rad_s = [0.0, 0.0, 0.0]
+    gyro_bias_sigma_rad_s = 0.002
+
+    [target]
+    spec = "checkerboard:8x6:0.03"  # validated at the end of a reconstruction
+
+With ``[imu] path``, the tables ``[imu.gyro]`` and ``[imu.accel]`` may hold ``unit`` and ``axes`` alone: they correct a
+file whose format or header is wrong.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+
+from colmap_inertial.errors import FormatError
+from colmap_inertial.geometry import quat_from_matrix
+from colmap_inertial.io import sensor_yaml
+from colmap_inertial.io.calibration import calibration_prior
+from colmap_inertial.io.capture_tables import (
+    ImuPath,
+    ImuTables,
+    body_from_imu,
+    read_calibration_table,
+    read_camera,
+    read_imu_table,
+)
+from colmap_inertial.io.imu_text import is_inertial_scale
+from colmap_inertial.io.toml_section import Section, read_toml
+from colmap_inertial.io.units import TIME_UNITS_NS
+from colmap_inertial.types import CameraImuCalibration, CameraModel, ReadoutDirection
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageFolder:
+    """Frames as pictures in a folder.
+
+    Attributes
+    ----------
+    folder, pattern
+        Files that match; ``None`` takes every picture in the folder itself.
+    times
+        ``"name"`` or a CSV file; ``None`` where nothing was said.
+    time_unit
+        Of the names, or of the CSV where its header does not say.
+    """
+
+    folder: Path
+    pattern: str | None = None
+    times: Literal["name"] | Path | None = None
+    time_unit: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Video:
+    """Frames as a video.
+
+    Attributes
+    ----------
+    file
+        The video.
+    frame_times, time_unit
+        The recorder's own frame times, one for each frame, in place of the presentation stamps.
+    frames_per_s
+        Use about this many; ``None`` uses all.
+    """
+
+    file: Path
+    frame_times: Path | None = None
+    time_unit: str | None = None
+    frames_per_s: float | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Capture:
+    """One recording: where its parts lie and what is known about them. Nothing is opened but sheets of numbers.
+
+    Attributes
+    ----------
+    path
+        The capture.toml, or the folder that was recognised without one.
+    frames
+        Pictures or video; ``None`` where there are none.
+    exposure_s, readout_s
+        ``None`` where unknown; a readout of 0 is a global shutter.
+    readout_direction
+        In the stored picture.
+    shared_clock
+        Whether frame times and IMU stamps come from one clock.
+    camera
+        ``None`` lets COLMAP calibrate.
+    imu
+        ``None`` where nothing inertial was recorded.
+    calibration
+        What is known about camera and IMU; wide where nothing is.
+    target
+        Specification of a calibration target in the scene.
+    """
+
+    path: Path
+    frames: ImageFolder | Video | None = None
+    exposure_s: float | None = None
+    readout_s: float | None = None
+    readout_direction: ReadoutDirection = "down"
+    shared_clock: bool = False
+    camera: CameraModel | None = None
+    imu: ImuPath | ImuTables | None = None
+    calibration: CameraImuCalibration
+    target: str | None = None
+
+
+def load_capture(path: Path) -> Capture:
+    """Read a capture description.
+
+    Parameters
+    ----------
+    path
+        A ``.toml`` file, a folder with a ``capture.toml``, the root of an ASL/EuRoC dataset with one camera and one
+        IMU that carry on (``cam0``, ``imu0``), or an InertialScale folder.
+
+    Raises
+    ------
+    FormatError
+        For an unknown key (the nearest known one is named), a value that cannot be, or a folder of no known layout.
+    """
+    path = Path(path)
+    if path.is_dir():
+        if (path / "capture.toml").is_file():
+            return _from_toml(path / "capture.toml")
+        return _from_folder(path)
+    if not path.exists():
+        raise FormatError(path, "no such file or folder")
+    if path.suffix.lower() != ".toml":
+        raise FormatError(path, "a capture is described by a .toml file or a folder; write a capture.toml beside it")
+    return _from_toml(path)
+
+
+def _from_toml(path: Path) -> Capture:
+    root = read_toml(path)
+    images, video = root.section("images"), root.section("video")
+    if images is not None and video is not None:
+        root.fail("video", "a capture has [images] or [video], not both")
+    frames = _images(images) if images is not None else _video(video) if video is not None else None
+    timing = root.table("timing")
+    directions: tuple[ReadoutDirection, ...] = get_args(ReadoutDirection)
+    exposure_s = timing.number("exposure_s", low=0, high=10)
+    readout_s = timing.number("readout_s", low=0, high=0.5)
+    readout_direction = timing.choice("readout_direction", directions) or "down"
+    shared_clock = bool(timing.boolean("shared_clock"))
+    timing.finish()
+    camera, body_from_cam = read_camera(root.section("camera"))
+    imu = read_imu_table(root.section("imu"))
+    calibration = read_calibration_table(
+        root.table("calibration"), body_from_cam=body_from_cam, imu=imu, readout_s=readout_s, shared_clock=shared_clock
+    )
+    target = root.section("target")
+    spec = None
+    if target is not None:
+        spec = target.require("spec", target.text("spec"))
+        target.finish()
+    root.finish()
+    if frames is None and imu is None:
+        raise FormatError(path, "describes neither frames ([images] or [video]) nor an IMU ([imu])")
+    return Capture(
+        path=path,
+        frames=frames,
+        exposure_s=exposure_s,
+        readout_s=readout_s,
+        readout_direction=readout_direction,
+        shared_clock=shared_clock,
+        camera=camera,
+        imu=imu,
+        calibration=calibration,
+        target=spec,
+    )
+
+
+def _images(table: Section) -> ImageFolder:
+    folder = table.require("folder", table.file("folder"))
+    pattern = table.text("pattern")
+    times: Literal["name"] | Path | None = "name" if table.text("times") == "name" else table.file("times")
+    unit = table.choice("time_unit", TIME_UNITS_NS)
+    if times == "name" and unit is None:
+        table.fail("times", f'"name" needs time_unit, one of {", ".join(TIME_UNITS_NS)}')
+    if pattern is not None and (Path(pattern).is_absolute() or ".." in Path(pattern).parts):
+        table.fail("pattern", f"must stay inside folder, found {pattern!r}")
+    table.finish()
+    return ImageFolder(folder=folder, pattern=pattern, times=times, time_unit=unit)
+
+
+def _video(table: Section) -> Video:
+    video = Video(
+        file=table.require("file", table.file("file")),
+        frame_times=table.file("frame_times"),
+        time_unit=table.choice("time_unit", TIME_UNITS_NS),
+        frames_per_s=table.positive("frames_per_s"),
+    )
+    table.finish()
+    return video
+
+
+def _from_folder(path: Path) -> Capture:
+    if is_inertial_scale(path):
+        return Capture(path=path, imu=ImuPath(path=path, format="inertial-scale"), calibration=calibration_prior())
+    base = path / "mav0" if (path / "mav0").is_dir() else path
+    camera, imu = base / "cam0", base / "imu0"
+    if all(part.exists() for part in (camera / "data.csv", camera / "data", imu / "data.csv")):
+        return _from_asl(path, camera, imu)
+    raise FormatError(
+        path,
+        "is no capture by itself: it holds no capture.toml, and is neither an ASL/EuRoC dataset (cam0/data.csv, "
+        "cam0/data/, imu0/data.csv) nor an InertialScale folder; describe it in a capture.toml",
+    )
+
+
+def _from_asl(path: Path, camera: Path, imu: Path) -> Capture:
+    """The first camera and IMU of an ASL/EuRoC dataset, which share a clock."""
+    source = ImuPath(path=imu, format="euroc")
+    model, cam_from_imu = None, None
+    if (camera / "sensor.yaml").is_file():
+        model = sensor_yaml.read_camera(camera / "sensor.yaml")
+        cam_from_imu = np.linalg.inv(sensor_yaml.read_body_from_sensor(camera / "sensor.yaml")) @ body_from_imu(source)
+    return Capture(
+        path=path,
+        frames=ImageFolder(folder=camera / "data", times=camera / "data.csv"),
+        shared_clock=True,
+        camera=model,
+        imu=source,
+        calibration=calibration_prior(
+            cam_from_imu_xyzw=None if cam_from_imu is None else quat_from_matrix(cam_from_imu[:3, :3]),
+            imu_in_cam_m=None if cam_from_imu is None else cam_from_imu[:3, 3],
+            shared_clock=True,
+        ),
+    )

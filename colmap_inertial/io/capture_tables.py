@@ -1,0 +1,299 @@
+"""The tables of a capture.toml that describe sensors: camera, IMU, calibration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.geometry import colmap_px_from_opencv, quat_from_matrix
+from colmap_inertial.io import sensor_yaml
+from colmap_inertial.io.calibration import (
+    KNOWN_GYRO_BIAS_RAD_S,
+    KNOWN_LEVER_ARM_M,
+    KNOWN_OFFSET_S,
+    KNOWN_ROTATION_RAD,
+    calibration_prior,
+    for_another_recording,
+    read_calibration,
+)
+from colmap_inertial.io.imu_text import SensorTable
+from colmap_inertial.io.toml_section import Section
+from colmap_inertial.io.units import SENSOR_UNITS, TIME_UNITS_NS, Axes, DeclaredUnits, Quantity
+from colmap_inertial.types import CameraImuCalibration, CameraModel, ImuNoise
+
+#: COLMAP's camera models: parameters, and where the principal point stands among them.
+CAMERA_MODELS = {
+    "SIMPLE_PINHOLE": (3, 1),
+    "PINHOLE": (4, 2),
+    "SIMPLE_RADIAL": (4, 1),
+    "RADIAL": (5, 1),
+    "OPENCV": (8, 2),
+    "OPENCV_FISHEYE": (8, 2),
+    "FULL_OPENCV": (12, 2),
+    "FOV": (5, 2),
+    "SIMPLE_RADIAL_FISHEYE": (4, 1),
+    "RADIAL_FISHEYE": (5, 1),
+    "THIN_PRISM_FISHEYE": (12, 2),
+    "RAD_TAN_THIN_PRISM_FISHEYE": (16, 2),
+}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ImuPath:
+    """An inertial recording that :func:`read_imu` finds its way in.
+
+    Attributes
+    ----------
+    path, format
+        As for ``read_imu``.
+    units
+        Stated in place of the file's.
+    gyro_axes, accel_axes
+        Applied to what the reader delivers; ``None`` leaves it.
+    noise
+        Stated in place of the file's; ``None`` leaves it.
+    """
+
+    path: Path
+    format: str = "auto"
+    units: DeclaredUnits = field(default_factory=DeclaredUnits)
+    gyro_axes: Axes | None = None
+    accel_axes: Axes | None = None
+    noise: ImuNoise | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ImuTables:
+    """An inertial recording in described tables; attributes as in :class:`ImuPath`."""
+
+    gyro: SensorTable
+    accel: SensorTable
+    gyro_axes: Axes | None = None
+    accel_axes: Axes | None = None
+    noise: ImuNoise | None = None
+
+
+def read_camera(table: Section | None) -> tuple[CameraModel | None, NDArray[np.float64] | None]:
+    """The ``[camera]`` table: the model, and (4, 4) body_from_cam where a sensor.yaml gives it."""
+    if table is None:
+        return None, None
+    sheet = table.file("sensor_yaml")
+    model = table.choice("model", CAMERA_MODELS)
+    width, height = table.integer("width"), table.integer("height")
+    params = table.numbers("params")
+    origin = table.choice("pixel_origin", ("corner", "center"))
+    table.finish()
+    if sheet is not None:
+        if any(value is not None for value in (model, width, height, params, origin)):
+            table.fail("sensor_yaml", "gives the intrinsics; leave out model, width, height, params and pixel_origin")
+        return sensor_yaml.read_camera(sheet), sensor_yaml.read_body_from_sensor(sheet)
+    for key, value in (("model", model), ("width", width), ("height", height), ("params", params)):
+        table.require(key, value)
+    assert model is not None and params is not None and width is not None and height is not None
+    count, centre = CAMERA_MODELS[model]
+    if len(params) != count:
+        table.fail("params", f"{model} has {count} parameters, found {len(params)}")
+    if origin is None:
+        table.fail(
+            None,
+            'pixel_origin is missing: "corner" if params are COLMAP\'s, "center" if they are OpenCV\'s or Kalibr\'s',
+        )
+    values = np.array(params)
+    if origin == "center":
+        values[centre : centre + 2] = colmap_px_from_opencv(values[centre : centre + 2])
+    if (values[:centre] <= 0).any():
+        table.fail("params", "focal lengths must be above 0")
+    return CameraModel(model=model, width=width, height=height, params=tuple(values.tolist())), None
+
+
+def read_imu_table(table: Section | None) -> ImuPath | ImuTables | None:
+    """The ``[imu]`` table with its sub-tables."""
+    if table is None:
+        return None
+    path, fmt = table.file("path"), table.text("format")
+    gyro, accel = table.section("gyro"), table.section("accel")
+    noise = _noise(table.section("noise"))
+    table.finish()
+    if path is not None:
+        if path.suffix.lower() == ".toml" or fmt == "capture":
+            table.fail("path", "must be a recording, not another capture.toml")
+        gyro_unit, gyro_axes = _correction(gyro, "gyro")
+        accel_unit, accel_axes = _correction(accel, "accel")
+        return ImuPath(
+            path=path,
+            format=fmt or "auto",
+            units=DeclaredUnits(gyro=gyro_unit, accel=accel_unit),
+            gyro_axes=gyro_axes,
+            accel_axes=accel_axes,
+            noise=noise,
+        )
+    if fmt is not None:
+        table.fail("format", "belongs to path, which is missing")
+    if gyro is None or accel is None:
+        table.fail(None, "needs path, or both [imu.gyro] and [imu.accel] that describe tables")
+    gyro_table, gyro_axes = _sensor_table(gyro, "gyro")
+    accel_table, accel_axes = _sensor_table(accel, "accel")
+    return ImuTables(gyro=gyro_table, accel=accel_table, gyro_axes=gyro_axes, accel_axes=accel_axes, noise=noise)
+
+
+def read_calibration_table(
+    table: Section,
+    *,
+    body_from_cam: NDArray[np.float64] | None,
+    imu: ImuPath | ImuTables | None,
+    readout_s: float | None,
+    shared_clock: bool,
+) -> CameraImuCalibration:
+    """The ``[calibration]`` table, completed by the sheets of camera and IMU and by ``[timing]``."""
+    file = table.file("file")
+    matrix, xyzw = table.matrix("cam_from_imu"), table.numbers("cam_from_imu_xyzw", 4)
+    lever = table.numbers("imu_in_cam_m", 3)
+    gyro_offset, accel_offset = table.number("gyro_time_offset_s"), table.number("accel_time_offset_s")
+    bias = table.numbers("gyro_bias_rad_s", 3)
+    sigmas = {
+        key: table.positive(key)
+        for key in ("rotation_sigma_rad", "imu_in_cam_sigma_m", "time_offset_sigma_s", "gyro_bias_sigma_rad_s")
+    }
+    table.finish()
+    stated = (matrix, xyzw, lever, gyro_offset, accel_offset, bias, *sigmas.values())
+    if file is not None:
+        if any(value is not None for value in stated):
+            table.fail("file", "gives the calibration; leave out the other keys of this table")
+        return for_another_recording(read_calibration(file), shared_clock=shared_clock)
+    if matrix is not None and xyzw is not None:
+        table.fail("cam_from_imu_xyzw", "and cam_from_imu say the same; leave one out")
+    if xyzw is not None and abs(np.linalg.norm(xyzw) - 1) > 1e-3:
+        table.fail("cam_from_imu_xyzw", "must be a quaternion x, y, z, w of length 1")
+    cam_from_imu = None
+    if matrix is not None:
+        cam_from_imu = _transform(table, matrix)
+    elif xyzw is None and body_from_cam is not None:
+        cam_from_imu = np.linalg.inv(body_from_cam) @ (body_from_imu(imu) if isinstance(imu, ImuPath) else np.eye(4))
+    rotation = xyzw if cam_from_imu is None else quat_from_matrix(cam_from_imu[:3, :3])
+    has_lever = cam_from_imu is not None and (matrix is None or len(matrix) > 3)
+    if lever is not None and has_lever and matrix is not None:
+        table.fail("imu_in_cam_m", "and the last column of cam_from_imu say the same; leave one out")
+    if lever is None and has_lever and cam_from_imu is not None:
+        lever = tuple(cam_from_imu[:3, 3].tolist())
+    return calibration_prior(
+        cam_from_imu_xyzw=rotation,
+        imu_in_cam_m=lever,
+        gyro_time_offset_s=gyro_offset,
+        accel_time_offset_s=accel_offset,
+        gyro_bias_rad_s=bias,
+        readout_s=readout_s,
+        shared_clock=shared_clock,
+        rotation_sigma_rad=sigmas["rotation_sigma_rad"] or KNOWN_ROTATION_RAD,
+        imu_in_cam_sigma_m=sigmas["imu_in_cam_sigma_m"] or KNOWN_LEVER_ARM_M,
+        time_offset_sigma_s=sigmas["time_offset_sigma_s"] or KNOWN_OFFSET_S,
+        gyro_bias_sigma_rad_s=sigmas["gyro_bias_sigma_rad_s"] or KNOWN_GYRO_BIAS_RAD_S,
+    )
+
+
+def body_from_imu(imu: ImuPath) -> NDArray[np.float64]:
+    """(4, 4) body_from_imu: the T_BS of the sensor.yaml beside the IMU's data, or the identity where there is none."""
+    folder = imu.path.parent if imu.path.is_file() else imu.path
+    sheets = [folder / part / "sensor.yaml" for part in ("mav0/imu0", "imu0")]
+    if (folder / "data.csv").is_file():
+        sheets.insert(0, folder / "sensor.yaml")
+    sheet = next((sheet for sheet in sheets if sheet.is_file()), None)
+    if sheet is None:
+        return np.eye(4)
+    return sensor_yaml.read_body_from_sensor(sheet)
+
+
+def _transform(table: Section, rows: list[list[float]]) -> NDArray[np.float64]:
+    shape = (len(rows), len(rows[0]) if rows else 0)
+    if shape not in ((3, 3), (4, 4)):
+        table.fail("cam_from_imu", f"must be a 3x3 or 4x4 matrix, found {shape[0]}x{shape[1]}")
+    matrix = np.eye(4)
+    matrix[: shape[0], : shape[1]] = rows
+    rotation = matrix[:3, :3]
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
+        table.fail("cam_from_imu", "is not a rotation: rows must be perpendicular, of length 1, and right-handed")
+    if not np.allclose(matrix[3], [0, 0, 0, 1]):
+        table.fail("cam_from_imu", "must have 0, 0, 0, 1 as its last row")
+    return matrix
+
+
+def _noise(table: Section | None) -> ImuNoise | None:
+    if table is None:
+        return None
+    keys = (
+        "gyro_density_rad_s_rthz",
+        "accel_density_m_s2_rthz",
+        "gyro_walk_rad_s2_rthz",
+        "accel_walk_m_s3_rthz",
+    )
+    values = {key: table.number(key, low=0) for key in keys}
+    table.finish()
+    return ImuNoise(**{key: table.require(key, value) for key, value in values.items()})
+
+
+def _correction(table: Section | None, quantity: Quantity) -> tuple[str | None, Axes | None]:
+    """What a sensor's table may say beside ``[imu] path``."""
+    if table is None:
+        return None, None
+    if "file" in table:
+        table.fail("file", "and [imu] path say the same; leave one out")
+    unit = table.choice("unit", SENSOR_UNITS[quantity])
+    axes = _axes(table)
+    table.finish()
+    return unit, axes
+
+
+def _sensor_table(table: Section, quantity: Quantity) -> tuple[SensorTable, Axes | None]:
+    file = table.file("file")
+    time = table.raw("time")
+    time_unit = table.choice("time_unit", TIME_UNITS_NS)
+    columns = table.raw("columns")
+    unit = table.choice("unit", SENSOR_UNITS[quantity])
+    axes = _axes(table)
+    table.finish()
+    for key, value in (
+        ("file", file),
+        ("time", time),
+        ("time_unit", time_unit),
+        ("columns", columns),
+        ("unit", unit),
+    ):
+        table.require(key, value)
+    if not _is_column(time):
+        table.fail("time", f"must be a column's name, or its number counted from 1; found {time!r}")
+    if not isinstance(columns, list) or len(columns) != 3 or not all(map(_is_column, columns)):
+        table.fail("columns", f"must be three names, or numbers counted from 1, of x, y and z; found {columns!r}")
+    if len({time, *columns}) != 4:
+        table.fail("columns", "must be three columns, and another than time")
+    assert file is not None and time_unit is not None and unit is not None
+    x, y, z = columns
+    return SensorTable(file=file, time=time, time_unit=time_unit, columns=(x, y, z), unit=unit), axes
+
+
+def _is_column(value: object) -> bool:
+    return (isinstance(value, int) and not isinstance(value, bool) and value > 0) or (
+        isinstance(value, str) and bool(value)
+    )
+
+
+def _axes(table: Section) -> Axes | None:
+    text, mirrored = table.text("axes"), table.boolean("mirrored")
+    if text is None:
+        if mirrored is not None:
+            table.fail("mirrored", "belongs to axes, which is missing")
+        return None
+    try:
+        axes = Axes.parse(text)
+    except ValueError as error:
+        table.fail("axes", str(error))
+    if axes.is_mirrored and not mirrored:
+        table.fail(
+            "axes",
+            f'"{text}" turns a right-handed frame into a left-handed one; correct a sign or the order, or add '
+            "mirrored = true if the file's own axes are left-handed",
+        )
+    if mirrored and not axes.is_mirrored:
+        table.fail("mirrored", f'is true, but axes = "{text}" keep the handedness')
+    return axes

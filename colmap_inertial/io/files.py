@@ -1,0 +1,104 @@
+"""Files that are either whole or absent: a reader never meets one that was being written when the power went."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import os
+import secrets
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from colmap_inertial.errors import FormatError
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write ``text`` (UTF-8) to ``path`` through a temporary file beside it and a rename."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
+    try:
+        with open(temporary, "x", encoding="utf-8", newline="\n") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_json(path: Path, value: object) -> None:
+    """Write ``value`` as JSON, whole or not at all.
+
+    Parameters
+    ----------
+    path
+        Replaced when it exists; its folder must exist.
+    value
+        Mappings with text keys, sequences, dataclass instances (as objects of their fields), numpy arrays and scalars
+        (as lists and numbers), paths (as text), text, numbers, booleans, ``None``.
+
+    Raises
+    ------
+    ValueError
+        For a number that is not finite (JSON has none) or a value of another type; the message names where it is.
+    """
+    write_text(path, json.dumps(_plain(value, "$"), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """The JSON object in ``path``; a :class:`FormatError` where there is none."""
+    text = read_text(path)
+    try:
+        value = json.loads(text, parse_constant=_no_constant)
+    except json.JSONDecodeError as error:
+        raise FormatError(path, f"not valid JSON: {error.msg}", line=error.lineno) from None
+    except (ValueError, RecursionError) as error:
+        raise FormatError(path, f"not valid JSON: {error}") from None
+    if not isinstance(value, dict):
+        raise FormatError(path, f"expected a JSON object, found {type(value).__name__}")
+    return value
+
+
+def read_text(path: Path) -> str:
+    """The text of a file; bytes that are not UTF-8 become U+FFFD, so that the reader can name their line.
+
+    Raises
+    ------
+    FormatError
+        Where the file is missing or cannot be read.
+    """
+    try:
+        return path.read_bytes().decode("utf-8-sig", errors="replace")
+    except FileNotFoundError:
+        raise FormatError(path, "no such file") from None
+    except OSError as error:
+        raise FormatError(path, f"cannot be read: {error.strerror or error}") from None
+
+
+def _no_constant(name: str) -> float:
+    raise ValueError(f"{name} is not a JSON number")
+
+
+def _plain(value: object, where: str) -> object:
+    if value is None or (isinstance(value, bool | str | int) and not isinstance(value, np.generic)):
+        return value
+    if isinstance(value, np.ndarray | np.generic):
+        return _plain(value.tolist(), where)
+    if isinstance(value, float):
+        if not math.isfinite(value):
+            raise ValueError(f"{where}: {value} cannot be written as JSON")
+        return value
+    if isinstance(value, Path):
+        return str(value)
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: _plain(getattr(value, f.name), f"{where}.{f.name}") for f in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        if not all(isinstance(key, str) for key in value):
+            raise ValueError(f"{where}: JSON keys must be text")
+        return {key: _plain(item, f"{where}.{key}") for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item, f"{where}[{i}]") for i, item in enumerate(value)]
+    raise ValueError(f"{where}: {type(value).__name__} cannot be written as JSON")

@@ -1,0 +1,182 @@
+"""When frames were exposed: from file names, CSV files, a recorder's log. Never from an index and a frame rate."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.errors import FormatError, TimingError
+from colmap_inertial.io.columns import recognise, split_unit
+from colmap_inertial.io.tables import Table, read_table
+from colmap_inertial.io.units import TIME_UNITS_NS, seconds, stamps_ns, unit_of
+from colmap_inertial.types import Array, FrameTiming
+
+_NAME_COLUMNS = {"name", "filename", "file", "image", "imagename", "frame"}
+_EXPOSURE_COLUMNS = {"exposure", "exposuretime"}
+_HOW = (
+    'give a CSV with the header "name,t_s" (or t_ms, t_us, t_ns) and one row for each frame, or put the times into the '
+    'file names and set times = "name" with time_unit under [images] in capture.toml'
+)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FrameStamps:
+    """Names and exact times of frames, in order of time.
+
+    Attributes
+    ----------
+    t_ns
+        (F,) start of exposure of row 0.
+    exposure_s
+        (F,) where known.
+    """
+
+    names: tuple[str, ...]
+    t_ns: NDArray[np.int64]
+    exposure_s: Array | None = None
+
+    def timing(self, *, exposure_s: float | None = None, readout_s: float | None = None) -> FrameTiming:
+        """As a :class:`FrameTiming`; ``exposure_s`` fills in where the stamps bring none."""
+        exposures = self.exposure_s
+        if exposures is None and exposure_s is not None:
+            exposures = np.full(len(self.names), exposure_s)
+        epoch_ns = int(self.t_ns[0])
+        return FrameTiming(
+            names=self.names,
+            t_s=seconds(self.t_ns, epoch_ns),
+            exposure_s=exposures,
+            readout_s=readout_s,
+            epoch_ns=epoch_ns,
+        )
+
+
+def stamps_of_csv(path: Path, time_unit: str | None = None) -> FrameStamps:
+    """Read ``name,t_s`` (or ``t_ns``, or EuRoC's ``#timestamp [ns],filename``), optionally with ``exposure_s``.
+
+    Parameters
+    ----------
+    time_unit
+        Used where the header does not say; a header that says otherwise is an error.
+
+    Raises
+    ------
+    FormatError, TimingError
+        Where columns or the unit are missing, a name comes twice, or two frames have one time.
+    """
+    table = read_table(path)
+    if table.header is None:
+        raise TimingError(f"{path} has no header: {_HOW}")
+    flat = [re.sub(r"[\s_]", "", split_unit(cell)[0]).lower() for cell in table.header]
+    name_column = next((i for i, name in enumerate(flat) if name in _NAME_COLUMNS), None)
+    if name_column is None:
+        raise TimingError(f"{path} has no column of names (the header is: {table.header_text[:200]}); {_HOW}")
+    t_ns = _time_column(table, time_unit)
+    exposure_column = next((i for i, name in enumerate(flat) if name in _EXPOSURE_COLUMNS), None)
+    exposure_s = None if exposure_column is None else _exposures(table, exposure_column)
+    return _in_order(path, table.text(name_column), t_ns, table.line_numbers, exposure_s)
+
+
+def stamps_of_names(folder: Path, names: Sequence[str], unit: str) -> FrameStamps:
+    """Take each frame's time from the number in its file name.
+
+    Parameters
+    ----------
+    names
+        File names; the longest number in each (without folder and ending) is its time. A decimal point is allowed.
+    unit
+        Of the numbers.
+
+    Raises
+    ------
+    TimingError
+        For a name without a number, or with two that could be it.
+    """
+    tokens = []
+    for name in names:
+        found = re.findall(r"\d+(?:\.\d+)?", Path(name).stem)
+        longest = [token for token in found if len(token) == max(map(len, found))]
+        if len(longest) != 1:
+            what = "no number" if not found else f"several numbers of one length ({', '.join(longest)})"
+            raise TimingError(f'{folder / name}: the name holds {what}; times = "name" cannot time it: {_HOW}')
+        tokens.append(longest[0])
+    return _in_order(folder, list(names), stamps_ns(folder, tokens, unit), None)
+
+
+def stamps_of_log(path: Path, time_unit: str | None = None) -> NDArray[np.int64]:
+    """Read a recorder's frame times, one row for each frame of its video, in order.
+
+    A header names the time column and its unit; without one the file must have one column, in ``time_unit``.
+    """
+    table = read_table(path)
+    if table.header is not None:
+        return _time_column(table, time_unit)
+    if table.width != 1:
+        raise TimingError(f'{path} has {table.width} columns and no header; name the time column, for example "t_ns"')
+    return table.stamps_ns(0, _required_unit(path, None, time_unit))
+
+
+def _time_column(table: Table, declared: str | None) -> NDArray[np.int64]:
+    assert table.header is not None
+    try:
+        columns = [recognise(cell) for cell in table.header]
+    except ValueError as error:
+        raise FormatError(table.path, str(error)) from None
+    times = [i for i, column in enumerate(columns) if column is not None and column.kind == "time"]
+    if len(times) != 1:
+        what = "no column" if not times else "several columns"
+        raise TimingError(f"{table.path} has {what} of times (the header is: {table.header_text[:200]}); {_HOW}")
+    column = columns[times[0]]
+    assert column is not None
+    return table.stamps_ns(times[0], _required_unit(table.path, column.unit, declared))
+
+
+def _required_unit(path: Path, written: str | None, declared: str | None) -> str:
+    if written is not None and declared is not None and written != declared:
+        raise TimingError(f"{path}: the header says {written}, time_unit says {declared}; correct one of them")
+    unit = written or declared
+    if unit is None:
+        raise TimingError(f"{path} does not say the unit of its times; name the column t_s, t_ms, t_us or t_ns")
+    return unit
+
+
+def _exposures(table: Table, column: int) -> Array:
+    assert table.header is not None
+    unit = unit_of(split_unit(table.header[column])[1] or "")
+    if unit not in TIME_UNITS_NS:
+        raise FormatError(
+            table.path, f'column "{table.header[column]}" needs a unit: name it exposure_s or exposure_ns'
+        )
+    values = table.numbers([column])[:, 0] * (TIME_UNITS_NS[unit] / 1e9)
+    bad = np.flatnonzero(~((values >= 0) & (values < 10)))
+    if len(bad):
+        raise FormatError(table.path, "an exposure must be from 0 to 10 s", line=int(table.line_numbers[bad[0]]))
+    return values
+
+
+def _in_order(
+    path: Path,
+    names: list[str],
+    t_ns: NDArray[np.int64],
+    line_numbers: NDArray[np.int64] | None,
+    exposure_s: Array | None = None,
+) -> FrameStamps:
+    seen: dict[str, int] = {}
+    for i, name in enumerate(names):
+        line = None if line_numbers is None else int(line_numbers[i])
+        if not name:
+            raise FormatError(path, "a row has no name", line=line)
+        if name in seen:
+            raise FormatError(path, f"the frame {name[:80]} comes twice", line=line)
+        seen[name] = i
+    order = np.argsort(t_ns, kind="stable")
+    t_ns = t_ns[order]
+    names = [names[i] for i in order]
+    same = np.flatnonzero(np.diff(t_ns) == 0)
+    if len(same):
+        raise TimingError(f"{path}: the frames {names[same[0]]} and {names[same[0] + 1]} have the same time")
+    return FrameStamps(names=tuple(names), t_ns=t_ns, exposure_s=None if exposure_s is None else exposure_s[order])

@@ -1,0 +1,183 @@
+"""Frames of a capture, one at a time: memory stays flat however long the recording."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.errors import FormatError, TimingError
+from colmap_inertial.io.capture import Capture, ImageFolder, Video, load_capture
+from colmap_inertial.io.frame_times import FrameStamps, stamps_of_csv, stamps_of_log, stamps_of_names
+from colmap_inertial.io.images import SUFFIXES, read_image
+from colmap_inertial.io.video import decode_video, frame_name, video_stamps_ns
+from colmap_inertial.types import Frame, FrameTiming
+
+
+def read_frames(capture: Capture | Path) -> tuple[FrameTiming, Iterator[Frame]]:
+    """The frames of a capture and when they were exposed.
+
+    Parameters
+    ----------
+    capture
+        A capture, or what :func:`load_capture` reads.
+
+    Returns
+    -------
+    timing
+        Names and times of all frames, known before any is decoded.
+    frames
+        The frames in order of time, decoded as they are asked for. Pictures keep the file's depth and stored
+        orientation; see :func:`read_image` and :func:`decode_video`.
+
+    Raises
+    ------
+    FormatError
+        For a frame that cannot be decoded or has another size than the camera (while iterating), or no frames.
+    TimingError
+        Where frames have no times; the message says how to give them.
+    """
+    if isinstance(capture, Path):
+        capture = load_capture(capture)
+    if isinstance(capture.frames, Video):
+        stamps, source_ns = _video_frames(capture.frames)
+        timing = _timing(capture, stamps)
+        return timing, _decode_video(capture, capture.frames, timing, source_ns)
+    timing = read_frame_timing(capture)
+    return timing, _decode_images(capture, timing)
+
+
+def read_frame_timing(capture: Capture | Path) -> FrameTiming:
+    """When the frames of a capture were exposed, without decoding any; see :func:`read_frames`."""
+    if isinstance(capture, Path):
+        capture = load_capture(capture)
+    match capture.frames:
+        case ImageFolder():
+            return _timing(capture, _image_stamps(capture.frames))
+        case Video():
+            return _timing(capture, _video_frames(capture.frames)[0])
+        case None:
+            raise FormatError(capture.path, "describes no frames; add [images] or [video]")
+
+
+def read_frame_times(path: Path) -> FrameTiming:
+    """Frame times from a CSV (``name,t_s`` or ``name,t_ns``; optionally ``exposure_s``), or those of a capture.
+
+    Raises
+    ------
+    FormatError, TimingError
+        See :func:`stamps_of_csv` and :func:`read_frame_timing`.
+    """
+    path = Path(path)
+    if path.is_dir() or path.suffix.lower() == ".toml":
+        return read_frame_timing(load_capture(path))
+    return stamps_of_csv(path).timing()
+
+
+def frame_source(capture: Capture) -> Path | None:
+    """The folder that holds the original file of each frame name, or ``None`` where frames come from a video."""
+    return capture.frames.folder if isinstance(capture.frames, ImageFolder) else None
+
+
+def _timing(capture: Capture, stamps: FrameStamps) -> FrameTiming:
+    timing = stamps.timing(exposure_s=capture.exposure_s, readout_s=capture.readout_s)
+    return replace(timing, readout_direction=capture.readout_direction)
+
+
+def _image_stamps(source: ImageFolder) -> FrameStamps:
+    names = _image_names(source)
+    if source.times is None:
+        raise TimingError(
+            f"{source.folder}: nothing says when its {len(names)} pictures were taken (EXIF is too coarse): set "
+            'times under [images] in capture.toml to "name" (with time_unit) or to a CSV with the header "name,t_s"'
+        )
+    if source.times == "name":
+        return stamps_of_names(source.folder, names, str(source.time_unit))
+    stamps = stamps_of_csv(source.times, source.time_unit)
+    untimed = sorted(set(names) - set(stamps.names))
+    if untimed:
+        raise TimingError(f"{source.times}: no row for {len(untimed)} of {len(names)} pictures (first: {untimed[0]})")
+    present = set(names)
+    keep = np.array([name in present for name in stamps.names])
+    return FrameStamps(
+        names=tuple(name for name in stamps.names if name in present),
+        t_ns=stamps.t_ns[keep],
+        exposure_s=None if stamps.exposure_s is None else stamps.exposure_s[keep],
+    )
+
+
+def _image_names(source: ImageFolder) -> list[str]:
+    """Names relative to the folder, with forward slashes, as COLMAP has them."""
+    if not source.folder.is_dir():
+        raise FormatError(source.folder, "no such folder of pictures")
+    found = source.folder.iterdir() if source.pattern is None else source.folder.glob(source.pattern)
+    paths = [path for path in found if path.suffix.lower() in SUFFIXES and path.is_file()]
+    if not paths:
+        what = "holds no pictures" if source.pattern is None else f"holds no pictures that match {source.pattern!r}"
+        raise FormatError(source.folder, f"{what} (endings: {', '.join(SUFFIXES)})")
+    return sorted(path.relative_to(source.folder).as_posix() for path in paths)
+
+
+def _decode_images(capture: Capture, timing: FrameTiming) -> Iterator[Frame]:
+    assert isinstance(capture.frames, ImageFolder)
+    for i, name in enumerate(timing.names):
+        path = capture.frames.folder / name
+        yield _frame(capture, timing, i, path, read_image(path))
+
+
+def _video_frames(source: Video) -> tuple[FrameStamps, NDArray[np.int64]]:
+    """Stamps of the frames to use, and the presentation stamps by which to find them in the video."""
+    source_ns = video_stamps_ns(source.file)
+    names = tuple(frame_name(int(t_ns), int(source_ns[0])) for t_ns in source_ns)
+    t_ns = source_ns
+    if source.frame_times is not None:
+        t_ns = stamps_of_log(source.frame_times, source.time_unit)
+        if len(t_ns) != len(source_ns):
+            raise TimingError(
+                f"{source.frame_times} has {len(t_ns)} times, the video {source.file} has {len(source_ns)} frames"
+            )
+        if (np.diff(t_ns) <= 0).any():
+            raise TimingError(f"{source.frame_times}: the times do not increase at row {1 + np.argmin(np.diff(t_ns))}")
+    keep = np.arange(len(t_ns)) if source.frames_per_s is None else thin(t_ns, source.frames_per_s)
+    return FrameStamps(names=tuple(names[i] for i in keep), t_ns=t_ns[keep]), source_ns[keep]
+
+
+def thin(t_ns: NDArray[np.int64], frames_per_s: float) -> NDArray[np.intp]:
+    """Indices of about ``frames_per_s`` frames a second: for each tick of that clock the frame nearest to it."""
+    since_s = (t_ns - t_ns[0]) / 1e9
+    ticks = np.arange(int(since_s[-1] * frames_per_s) + 1) / frames_per_s
+    after = np.clip(np.searchsorted(since_s, ticks), 1, max(1, len(since_s) - 1))
+    if len(since_s) == 1:
+        return np.zeros(1, dtype=np.intp)
+    nearest = np.where(since_s[after] - ticks < ticks - since_s[after - 1], after, after - 1)
+    return np.unique(nearest)
+
+
+def _decode_video(
+    capture: Capture, source: Video, timing: FrameTiming, source_ns: NDArray[np.int64]
+) -> Iterator[Frame]:
+    place = {int(t_ns): i for i, t_ns in enumerate(source_ns)}
+    for t_ns, image in decode_video(source.file, source_ns):
+        yield _frame(capture, timing, place[t_ns], source.file, image)
+
+
+def _frame(
+    capture: Capture, timing: FrameTiming, i: int, path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]
+) -> Frame:
+    camera = capture.camera
+    if camera is not None and image.shape[:2] != (camera.height, camera.width):
+        height, width = image.shape[:2]
+        raise FormatError(
+            path, f"is {width}x{height}, but the camera is declared as {camera.width}x{camera.height} ({capture.path})"
+        )
+    return Frame(
+        name=timing.names[i],
+        image=image,
+        t_s=float(timing.t_s[i]),
+        exposure_s=None if timing.exposure_s is None else float(timing.exposure_s[i]),
+        readout_s=timing.readout_s,
+        camera=camera,
+    )

@@ -1,0 +1,99 @@
+"""Decoding single pictures exactly as COLMAP sees them."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.errors import FormatError
+
+#: File endings of pictures that OpenCV and COLMAP both read.
+SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm")
+
+
+def read_image(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
+    """Decode a picture: (H, W) or (H, W, 3) RGB, in the file's own depth, rows as stored.
+
+    The orientation that EXIF may state is not applied, as COLMAP does not apply it either (pycolmap 4.2's
+    ``Bitmap.read``). An alpha channel is dropped.
+
+    Raises
+    ------
+    FormatError
+        Where the file is missing, damaged, cut off, or not 8 or 16 bit.
+    """
+    import cv2
+
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise FormatError(path, "no such picture") from None
+    except OSError as error:
+        raise FormatError(path, f"cannot be read: {error.strerror or error}") from None
+    fault = _fault(data)
+    if fault is not None:
+        raise FormatError(path, f"{fault}; copy it again from its source, or take it out of the folder")
+    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        image = None
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+    if image is None:
+        raise FormatError(path, "cannot be decoded: damaged, cut off, or no picture; take it out of the folder")
+    if image.dtype not in (np.uint8, np.uint16):
+        raise FormatError(path, f"holds {image.dtype} pixels; 8 or 16 bit are needed")
+    if image.ndim == 3 and image.shape[2] in (3, 4):
+        image = np.ascontiguousarray(image[:, :, 2::-1])
+    elif image.ndim == 3:
+        image = np.ascontiguousarray(image[:, :, 0])
+    return image
+
+
+def _fault(data: bytes) -> str | None:
+    """What is wrong with the bytes of a picture, as far as its format tells; decoders pass over some of it."""
+    if not data:
+        return "is empty"
+    if data.startswith(b"\xff\xd8"):
+        return _jpeg_fault(data)
+    if data.startswith(b"\x89PNG\r\n\x1a\n"):
+        return _png_fault(data)
+    return None
+
+
+def _jpeg_fault(data: bytes) -> str | None:
+    """JPEG (ITU-T T.81, annex B): segments up to the first scan, then coded data that an EOI marker ends."""
+    at = 2
+    while at + 4 <= len(data):
+        if data[at] != 0xFF:
+            return "is damaged (a JPEG segment does not start with a marker)"
+        marker = data[at + 1]
+        if marker == 0xFF:
+            at += 1
+            continue
+        at += 2 + struct.unpack_from(">H", data, at + 2)[0]
+        if marker == 0xDA:
+            return None if data.find(b"\xff\xd9", at) >= 0 else "is cut off (no end of image)"
+    return "is cut off (no picture data)"
+
+
+def _png_fault(data: bytes) -> str | None:
+    """PNG (ISO/IEC 15948): chunks with a CRC each, the last one IEND."""
+    at = 8
+    while at + 12 <= len(data):
+        length = struct.unpack_from(">I", data, at)[0]
+        body = memoryview(data)[at + 4 : at + 8 + length]
+        end = at + 12 + length
+        if end > len(data):
+            break
+        if zlib.crc32(body) != struct.unpack_from(">I", data, end - 4)[0]:
+            return "is damaged (a PNG checksum is wrong)"
+        if data[at + 4 : at + 8] == b"IEND":
+            return None
+        at = end
+    return "is cut off (no end of image)"

@@ -1,0 +1,234 @@
+"""Inertial recordings in text files: ASL/EuRoC folders, InertialScale folders, CSV with a header, described tables."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.errors import FormatError
+from colmap_inertial.io.columns import recognise
+from colmap_inertial.io.samples import Samples, order_samples
+from colmap_inertial.io.sensor_yaml import read_imu_noise
+from colmap_inertial.io.tables import Table, read_table
+from colmap_inertial.io.units import SENSOR_NAMES, SENSOR_UNITS, DeclaredUnits, Quantity, seconds, to_si
+from colmap_inertial.types import Array, ImuNoise, ImuRecording
+
+_HOW_TO_DESCRIBE = """write a capture.toml beside it with
+[imu.gyro]
+file = "{name}"
+time = 1                 # column, counted from 1, or its name
+time_unit = "s"          # s, ms, us or ns
+columns = [2, 3, 4]      # x, y, z
+unit = "rad/s"           # rad/s or deg/s
+[imu.accel]
+file = "{name}"
+time = 1
+time_unit = "s"
+columns = [5, 6, 7]
+unit = "m/s2"            # m/s2 or g"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorTable:
+    """Where one sensor's samples lie in a text table, in the user's words.
+
+    Attributes
+    ----------
+    file
+        The table.
+    time, columns
+        Columns of the stamps and of x, y, z: names in the header, or numbers counted from 1.
+    time_unit, unit
+        Of the stamps, and of the samples.
+    """
+
+    file: Path
+    time: str | int
+    time_unit: str
+    columns: tuple[str | int, str | int, str | int]
+    unit: str
+
+
+def read_tables(gyro: SensorTable, accel: SensorTable) -> ImuRecording:
+    """Read an IMU from tables that the user described (units converted, axes as in the file)."""
+    return _recording(_read_described(gyro, "gyro"), _read_described(accel, "accel"))
+
+
+def is_inertial_scale(path: Path) -> bool:
+    """Whether ``path`` is a folder with gyroscope.txt and accelerometer.txt."""
+    return (path / "gyroscope.txt").is_file() and (path / "accelerometer.txt").is_file()
+
+
+def read_inertial_scale_imu(path: Path, units: DeclaredUnits) -> ImuRecording:
+    """Read ``gyroscope.txt`` and ``accelerometer.txt``: rows ``t_ns x y z``, rad/s and m/s2."""
+    if not is_inertial_scale(path):
+        raise FormatError(path, "holds no gyroscope.txt and accelerometer.txt")
+    samples = []
+    for name, quantity, unit in (
+        ("gyroscope.txt", "gyro", units.gyro or "rad/s"),
+        ("accelerometer.txt", "accel", units.accel or "m/s2"),
+    ):
+        table = read_table(path / name)
+        if table.width != 4:
+            raise FormatError(
+                table.path, f"{table.width} columns; expected t_ns x y z", line=int(table.line_numbers[0])
+            )
+        values = to_si(table.numbers([1, 2, 3]), quantity, unit)  # type: ignore[arg-type]
+        samples.append(_ordered(table, quantity, table.stamps_ns(0, "ns"), values))  # type: ignore[arg-type]
+    return _recording(*samples)
+
+
+def is_euroc(path: Path) -> bool:
+    """Whether ``path`` is an ASL dataset root, its mav0, an imu folder, or an imu folder's data.csv."""
+    if path.is_file():
+        return path.name == "data.csv" and _is_imu_table(path)
+    return bool(_imu_tables(path))
+
+
+def read_euroc(path: Path, units: DeclaredUnits) -> ImuRecording:
+    """Read an ASL/EuRoC IMU: ``data.csv``, and the noise in ``sensor.yaml`` where there is one.
+
+    Raises
+    ------
+    FormatError
+        Also where a dataset has several IMUs: give the folder of the one that is meant.
+    """
+    tables = [path] if path.is_file() else _imu_tables(path)
+    if not tables:
+        raise FormatError(path, "holds no mav0/imu0/data.csv, imu0/data.csv or data.csv")
+    if len(tables) > 1:
+        folders = ", ".join(str(table.parent.relative_to(path)) for table in tables)
+        raise FormatError(path, f"holds several IMUs ({folders}); give the folder of one")
+    sheet = tables[0].with_name("sensor.yaml")
+    return _read_csv(tables[0], units, read_imu_noise(sheet) if sheet.is_file() else None)
+
+
+def is_csv(path: Path) -> bool:
+    """Whether ``path`` is a text table with a header; :func:`read_csv` says what is wrong with the header."""
+    return path.is_file() and path.suffix.lower() in (".csv", ".txt", ".tsv")
+
+
+def read_csv(path: Path, units: DeclaredUnits) -> ImuRecording:
+    """Read one CSV whose header names time, gyroscope and accelerometer columns with their units.
+
+    Raises
+    ------
+    FormatError
+        Where a column or unit is missing or unknown; the message shows the header and what to write in capture.toml.
+    """
+    return _read_csv(path, units, None)
+
+
+def _imu_tables(folder: Path) -> list[Path]:
+    own = folder / "data.csv"
+    if own.is_file() and _is_imu_table(own):
+        return [own]
+    return sorted(path for base in ("mav0", ".") for path in (folder / base).glob("imu*/data.csv") if path.is_file())
+
+
+def _is_imu_table(path: Path) -> bool:
+    """Whether a data.csv is an IMU's (a camera's has file names instead of axes)."""
+    try:
+        with open(path, encoding="utf-8-sig", errors="replace") as file:
+            return "w_RS_S_x" in file.readline(1000)
+    except OSError:
+        return False
+
+
+def _read_csv(path: Path, units: DeclaredUnits, noise: ImuNoise | None) -> ImuRecording:
+    table = read_table(path)
+    how = _HOW_TO_DESCRIBE.format(name=path.name)
+    if table.header is None:
+        raise FormatError(path, f"has no header that names its columns; {how}", line=int(table.line_numbers[0]))
+    try:
+        columns = [recognise(cell) for cell in table.header]
+    except ValueError as error:
+        raise FormatError(path, f"{error}; {how}") from None
+    shown = f"the header is: {table.header_text[:300]}\n{how}"
+    place: dict[tuple[str, int], int] = {}
+    for index, column in enumerate(columns):
+        if column is None:
+            continue
+        key = (column.kind, column.axis)
+        if key in place:
+            twice = f'"{table.header[place[key]]}" and "{table.header[index]}"'
+            raise FormatError(path, f"two columns mean the same: {twice}; {shown}")
+        place[key] = index
+    wanted = [("time", 0), *((sensor, axis) for sensor in ("gyro", "accel") for axis in range(3))]
+    missing = [
+        kind if kind == "time" else f"{kind}_{'xyz'[axis]}" for kind, axis in wanted if (kind, axis) not in place
+    ]
+    if missing:
+        raise FormatError(path, f"no column for {', '.join(missing)} was recognised; {shown}")
+
+    def unit(kind: str, axes: int, declared: str | None) -> str:
+        found = {columns[place[kind, axis]].unit for axis in range(axes)}  # type: ignore[union-attr]
+        if declared is not None:
+            return declared
+        if len(found) != 1 or None in found:
+            names = ", ".join(f'"{table.header[place[kind, axis]]}"' for axis in range(axes))  # type: ignore[index]
+            raise FormatError(path, f"no single unit is given for {names}; {shown}")
+        return str(found.pop())
+
+    gyro_unit, accel_unit = unit("gyro", 3, units.gyro), unit("accel", 3, units.accel)
+    t_ns = table.stamps_ns(place["time", 0], unit("time", 1, None))
+    gyro = to_si(table.numbers([place["gyro", axis] for axis in range(3)]), "gyro", gyro_unit)
+    accel = to_si(table.numbers([place["accel", axis] for axis in range(3)]), "accel", accel_unit)
+    # Loggers that write both sensors to one table leave the cells of the other one empty.
+    no_gyro, no_accel = np.asarray(np.isnan(gyro).all(axis=1)), np.asarray(np.isnan(accel).all(axis=1))
+    only_gyro, only_accel = no_accel & ~no_gyro, no_gyro & ~no_accel
+    if only_gyro.any() and only_accel.any() and (only_gyro | only_accel).mean() > 0.5:
+        kept_gyro, kept_accel = ~only_accel, ~only_gyro
+    else:
+        kept_gyro = kept_accel = np.ones(len(t_ns), dtype=bool)
+    return _recording(
+        _ordered(table, "gyro", t_ns, gyro, kept_gyro), _ordered(table, "accel", t_ns, accel, kept_accel), noise=noise
+    )
+
+
+def _read_described(source: SensorTable, quantity: Quantity) -> Samples:
+    if source.unit not in SENSOR_UNITS[quantity]:
+        raise ValueError(f"{source.unit} is not a unit of the {SENSOR_NAMES[quantity]}")
+    table = read_table(source.file)
+    values = table.numbers([column_index(table, column) for column in source.columns])
+    t_ns = table.stamps_ns(column_index(table, source.time), source.time_unit)
+    return _ordered(table, quantity, t_ns, to_si(values, quantity, source.unit))
+
+
+def column_index(table: Table, column: str | int) -> int:
+    """The zero-based index of a column that a user gave by name, or by its number counted from 1."""
+    if isinstance(column, int):
+        if not 1 <= column <= table.width:
+            raise FormatError(table.path, f"there is no column {column}: columns count from 1 to {table.width}")
+        return column - 1
+    if table.header is None:
+        raise FormatError(table.path, f'has no header, so no column "{column}"; give its number, counted from 1')
+    if column not in table.header:
+        raise FormatError(table.path, f'has no column "{column}"; the header is: {table.header_text[:300]}')
+    return table.header.index(column)
+
+
+def _ordered(
+    table: Table, quantity: Quantity, t_ns: NDArray[np.int64], values: Array, kept: NDArray[np.bool_] | None = None
+) -> Samples:
+    numbers = table.line_numbers
+    if kept is not None:
+        t_ns, values, numbers = t_ns[kept], values[kept], numbers[kept]
+    samples = order_samples(table.path, SENSOR_NAMES[quantity], t_ns, values, numbers)
+    return Samples(t_ns=samples.t_ns, values=samples.values, repairs=table.repairs + samples.repairs)
+
+
+def _recording(gyro: Samples, accel: Samples, *, noise: ImuNoise | None = None) -> ImuRecording:
+    epoch_ns = int(min(gyro.t_ns[0], accel.t_ns[0]))
+    return ImuRecording(
+        gyro_t_s=seconds(gyro.t_ns, epoch_ns),
+        gyro_rad_s=gyro.values,
+        accel_t_s=seconds(accel.t_ns, epoch_ns),
+        accel_m_s2=accel.values,
+        epoch_ns=epoch_ns,
+        repairs=tuple(dict.fromkeys(gyro.repairs + accel.repairs)),
+        noise=noise,
+    )

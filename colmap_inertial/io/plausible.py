@@ -1,0 +1,112 @@
+"""Are these numbers an IMU's, in the units that were declared? Physics that no honest recording can break."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from colmap_inertial.errors import FormatError
+from colmap_inertial.io.units import SENSOR_NAMES, STANDARD_GRAVITY_M_S2, Quantity
+from colmap_inertial.types import Array, ImuRecording
+
+#: The median of |accelerometer| of a device that is carried or flown stays near gravity: sensors are off by up to 5 %,
+#: and shaking raises it. Measured on the recordings this was tried on: 9.36 to 9.81, and 10.4 in strong shaking.
+GRAVITY_BOUNDS_M_S2 = (7.0, 14.0)
+#: No gyroscope in phones, cameras or drones measures more than 4000 deg/s = 70 rad/s on an axis.
+LARGEST_RATE_RAD_S = 70.0
+#: Half of a recording faster than a turn in 0.9 s: nobody films like that, but deg/s read as rad/s look like it.
+LARGEST_MEDIAN_RATE_RAD_S = 7.0
+
+
+def check_plausible(imu: ImuRecording, path: Path) -> None:
+    """Refuse a recording whose numbers cannot be rad/s and m/s2 of a working IMU.
+
+    Parameters
+    ----------
+    imu
+        The recording as read.
+    path
+        Where it came from, for the message.
+
+    Raises
+    ------
+    FormatError
+        For deg/s, g, exchanged sensors, missing gravity, a dead sensor or axis. The message says what was found, what
+        is expected, and what to write in capture.toml.
+    """
+    check_alive(imu.gyro_rad_s, "gyro", path)
+    check_alive(imu.accel_m_s2, "accel", path)
+    gyro = float(np.median(np.linalg.norm(imu.gyro_rad_s, axis=1)))
+    accel = float(np.median(np.linalg.norm(imu.accel_m_s2, axis=1)))
+    low, high = GRAVITY_BOUNDS_M_S2
+    if low < gyro < high and not low < accel < high and accel < LARGEST_MEDIAN_RATE_RAD_S:
+        raise FormatError(
+            path,
+            f"the gyroscope's median length is {gyro:.2f} and the accelerometer's {accel:.2f}: the two sensors are "
+            "exchanged; exchange the columns or files of [imu.gyro] and [imu.accel] in capture.toml",
+        )
+    check_gravity(accel, path)
+    check_rates(imu.gyro_rad_s, path)
+
+
+def check_alive(values: Array, quantity: Quantity, path: Path) -> None:
+    """Refuse a sensor with an axis that never changes.
+
+    Parameters
+    ----------
+    values
+        (N, 3) samples.
+    """
+    dead = np.flatnonzero(np.ptp(values, axis=0) == 0)
+    if len(dead) == 0:
+        return
+    name = SENSOR_NAMES[quantity]
+    if len(dead) == 3:
+        raise FormatError(
+            path,
+            f"the {name} never changes (it reads {np.array2string(values[0], precision=4)} throughout): the sensor is "
+            f"dead or was not recorded; record again, or give another file in [imu.{quantity}]",
+        )
+    axes = " and ".join("xyz"[i] for i in dead)
+    raise FormatError(
+        path,
+        f"the {name}'s {axes} axis never changes (it reads {values[0, dead[0]]:.6g} throughout): the axis is dead or "
+        f"the wrong column; check columns of [imu.{quantity}] in capture.toml",
+    )
+
+
+def check_gravity(median_m_s2: float, path: Path) -> None:
+    """Refuse an accelerometer whose median length is not near gravity."""
+    low, high = GRAVITY_BOUNDS_M_S2
+    if low <= median_m_s2 <= high:
+        return
+    found = f"the accelerometer's median length is {median_m_s2:.4g} where gravity gives about 9.8 m/s2"
+    in_g = median_m_s2 * STANDARD_GRAVITY_M_S2
+    if low <= in_g <= high:
+        raise FormatError(path, f'{found}: the numbers are in g; set unit = "g" under [imu.accel] in capture.toml')
+    if low <= median_m_s2 / STANDARD_GRAVITY_M_S2 <= high:
+        raise FormatError(
+            path, f'{found}: m/s2 were converted as if they were g; set unit = "m/s2" under [imu.accel] in capture.toml'
+        )
+    if median_m_s2 < low:
+        raise FormatError(
+            path,
+            f"{found}: gravity was taken out (a phone's linear acceleration) or the unit is wrong; record the "
+            "accelerometer with gravity, or set unit under [imu.accel] in capture.toml",
+        )
+    raise FormatError(path, f"{found}: the unit is wrong or these are raw counts; set unit under [imu.accel]")
+
+
+def check_rates(gyro_rad_s: Array, path: Path) -> None:
+    """Refuse angular velocities that no hand, drone or sensor reaches."""
+    median = float(np.median(np.linalg.norm(gyro_rad_s, axis=1)))
+    largest = float(np.abs(gyro_rad_s).max())
+    if largest <= LARGEST_RATE_RAD_S and median <= LARGEST_MEDIAN_RATE_RAD_S:
+        return
+    raise FormatError(
+        path,
+        f"the gyroscope reads up to {largest:.4g} rad/s, half of the time above {median:.3g} (a hand reaches about 5, "
+        f'a sensor ends at {LARGEST_RATE_RAD_S:g}): the numbers are in deg/s; set unit = "deg/s" under [imu.gyro] in '
+        "capture.toml",
+    )

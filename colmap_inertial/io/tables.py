@@ -1,0 +1,183 @@
+"""Text tables of numbers: parsed fast, checked line by line only where something is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.errors import FormatError
+from colmap_inertial.io.files import read_text
+from colmap_inertial.io.units import stamps_ns
+from colmap_inertial.types import Array
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Table:
+    """The rows of a text table, still as text.
+
+    Attributes
+    ----------
+    header
+        Cells of the header line, stripped of ``#`` and quotes; ``None`` where the first line holds numbers.
+    header_text
+        The header line as it stands in the file.
+    lines, line_numbers
+        The data lines and their one-based numbers in the file.
+    delimiter
+        ``None`` means any white space.
+    width
+        Cells in each line.
+    repairs
+        What was dropped to make the table whole.
+    """
+
+    path: Path
+    header: tuple[str, ...] | None
+    header_text: str
+    lines: tuple[str, ...]
+    line_numbers: NDArray[np.int64]
+    delimiter: str | None
+    width: int
+    repairs: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+    def text(self, column: int) -> list[str]:
+        """The cells of one zero-based column."""
+        cells = (line.split(self.delimiter, column + 1)[column] for line in self.lines)
+        return [cell.strip().strip('"') for cell in cells]
+
+    def numbers(self, columns: Sequence[int]) -> Array:
+        """(N, len(columns)) values of zero-based columns; an empty cell is NaN.
+
+        Raises
+        ------
+        FormatError
+            With the line of the first cell that is not a number.
+        """
+        if not self.lines:
+            return np.empty((0, len(columns)))
+        try:
+            return np.loadtxt(
+                self.lines, delimiter=self.delimiter, usecols=columns, comments=None, ndmin=2, dtype=np.float64
+            )
+        except ValueError:
+            return self._numbers_cell_by_cell(columns)
+
+    def stamps_ns(self, column: int, unit: str) -> NDArray[np.int64]:
+        """(N,) exact nanoseconds of a zero-based column of time stamps in ``unit``."""
+        return stamps_ns(self.path, self.text(column), unit, self.line_numbers)
+
+    def _numbers_cell_by_cell(self, columns: Sequence[int]) -> Array:
+        out = np.empty((len(self.lines), len(columns)))
+        for row, line in enumerate(self.lines):
+            cells = line.split(self.delimiter)
+            for i, column in enumerate(columns):
+                cell = cells[column].strip().strip('"')
+                out[row, i] = number = _number(cell)
+                if number is None:
+                    raise FormatError(
+                        self.path,
+                        f"{cell[:40]!r} in column {column + 1} is not a number",
+                        line=int(self.line_numbers[row]),
+                    )
+        return out
+
+
+def _number(cell: str) -> float | None:
+    if not cell:
+        return float("nan")
+    try:
+        return None if "_" in cell else float(cell)
+    except ValueError:
+        return None
+
+
+def read_table(path: Path) -> Table:
+    """Read a table of numbers: comma, semicolon, tab or white space between cells, at most one header line.
+
+    Blank lines are passed over, as are lines that start with ``#`` (the last one before the data is the header where
+    it has as many cells as the data). A last line that is cut off (no line end, and cells missing or broken) is
+    dropped and listed in ``repairs``.
+
+    Raises
+    ------
+    FormatError
+        Where the file is missing or holds no rows, or a line has another number of cells than the first.
+    """
+    text = read_text(path)
+    ends_with_newline = text.endswith(("\n", "\r"))
+    raw = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    numbered = [(number, line) for number, line in enumerate(raw, start=1) if line and not line.isspace()]
+    comments = [(n, line) for n, line in numbered if line.lstrip().startswith("#")]
+    rows = [(n, line) for n, line in numbered if not line.lstrip().startswith("#")] if comments else numbered
+    if not rows:
+        raise FormatError(path, "holds no rows of numbers")
+    delimiter = _delimiter(rows[-1][1] if len(rows) == 1 else rows[1][1])
+    header: tuple[str, ...] | None = None
+    header_text = ""
+    if _is_header(rows[0][1], delimiter):
+        header_text = rows.pop(0)[1].strip()
+        header = _header_cells(header_text, delimiter)
+        if not rows:
+            raise FormatError(path, "holds a header and no rows")
+    width = len(rows[0][1].split(delimiter))
+    if header is None:
+        for number, line in reversed(comments):
+            if number < rows[0][0] and len(_header_cells(line, delimiter)) == width:
+                header_text, header = line.strip(), _header_cells(line, delimiter)
+                break
+    elif len(header) != width:
+        raise FormatError(path, f"{width} cells under a header of {len(header)}: {header_text[:200]}", line=rows[0][0])
+    repairs: tuple[str, ...] = ()
+    if not ends_with_newline and len(rows) > 1 and _is_cut_off(rows[-1][1], rows[-2][1], delimiter, width):
+        repairs = (f"{path.name}: dropped the last line ({rows[-1][0]}), which is cut off",)
+        rows.pop()
+    lines = tuple(line for _, line in rows)
+    numbers = np.array([number for number, _ in rows], dtype=np.int64)
+    if delimiter is None:
+        widths = np.array([len(line.split()) for line in lines])
+    else:
+        widths = np.array([line.count(delimiter) + 1 for line in lines])
+    wrong = np.flatnonzero(widths != width)
+    if len(wrong):
+        raise FormatError(
+            path, f"{widths[wrong[0]]} cells where the other lines have {width}", line=int(numbers[wrong[0]])
+        )
+    return Table(
+        path=path,
+        header=header,
+        header_text=header_text,
+        lines=lines,
+        line_numbers=numbers,
+        delimiter=delimiter,
+        width=width,
+        repairs=repairs,
+    )
+
+
+def _delimiter(line: str) -> str | None:
+    return next((candidate for candidate in ";,\t" if candidate in line), None)
+
+
+def _is_header(line: str, delimiter: str | None) -> bool:
+    """No cell but empty ones is a number, and there is at least one word."""
+    cells = [cell.strip().strip('"') for cell in line.split(delimiter)]
+    filled = [cell for cell in cells if cell]
+    return bool(filled) and all(_number(cell) is None for cell in filled)
+
+
+def _header_cells(line: str, delimiter: str | None) -> tuple[str, ...]:
+    return tuple(cell.strip().strip('"').strip() for cell in line.strip().lstrip("#").strip().split(delimiter))
+
+
+def _is_cut_off(line: str, previous: str, delimiter: str | None, width: int) -> bool:
+    cells, before = line.split(delimiter), previous.split(delimiter)[-1].strip()
+    if len(cells) != width:
+        return len(cells) < width
+    return bool(before) and _number(before) is not None and (not cells[-1].strip() or _number(cells[-1]) is None)

@@ -1,0 +1,191 @@
+"""One table of a TOML file, read key by key; every complaint names file, line, table and key."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+import tomllib
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, NoReturn, TypeVar
+
+from colmap_inertial.errors import FormatError
+from colmap_inertial.io.files import read_text
+
+T = TypeVar("T", bound=str)
+
+
+def read_toml(path: Path) -> Section:
+    """The root table of a TOML file.
+
+    Raises
+    ------
+    FormatError
+        Where the file is missing or not TOML.
+    """
+    text = read_text(path)
+    try:
+        values = tomllib.loads(text.replace("\r\n", "\n"))
+    except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
+        line = re.search(r"at line (\d+)", str(error))
+        raise FormatError(path, f"not valid TOML: {error}", line=int(line[1]) if line else None) from None
+    return Section(path, "", values, text)
+
+
+class Section:
+    """A table of a TOML file whose keys are taken one by one; :meth:`finish` complains about those left."""
+
+    def __init__(self, path: Path, name: str, values: dict[str, Any], text: str) -> None:
+        self.path = path
+        self.name = name
+        self._values = values
+        self._text = text
+        self._known: list[str] = []
+
+    def __contains__(self, key: str) -> bool:
+        return key in self._values
+
+    def fail(self, key: str | None, reason: str) -> NoReturn:
+        """Raise the :class:`FormatError` of this table (and of one of its keys)."""
+        where = f"[{self.name}]" if self.name else "top level"
+        raise FormatError(self.path, f"{where}{'' if key is None else ' ' + key}: {reason}", line=self._line(key))
+
+    def section(self, key: str) -> Section | None:
+        """The table under ``key``, or ``None`` where it is absent."""
+        value = self._take(key)
+        if value is None:
+            return None
+        name = f"{self.name}.{key}" if self.name else key
+        if not isinstance(value, dict):
+            self.fail(key, f"must be a table: write [{name}] on a line of its own")
+        return Section(self.path, name, value, self._text)
+
+    def table(self, key: str) -> Section:
+        """The table under ``key``; an empty one where it is absent."""
+        found = self.section(key)
+        return Section(self.path, key, {}, self._text) if found is None else found
+
+    def text(self, key: str) -> str | None:
+        """A text, not empty."""
+        value = self._take(key)
+        if value is not None and (not isinstance(value, str) or not value.strip()):
+            self.fail(key, f"must be a text in quotes, found {value!r}")
+        return value
+
+    def choice(self, key: str, allowed: Iterable[T]) -> T | None:
+        """One of the allowed texts."""
+        value = self._take(key)
+        names = list(allowed)
+        if value is not None and value not in names:
+            self.fail(key, f"must be one of {', '.join(map(repr, names))}; found {value!r}")
+        return value
+
+    def file(self, key: str) -> Path | None:
+        """A path; a relative one counts from the TOML file's folder."""
+        value = self.text(key)
+        if value is not None and "\0" in value:
+            self.fail(key, "holds a NUL character")
+        return None if value is None else self.path.parent / value
+
+    def boolean(self, key: str) -> bool | None:
+        """``true`` or ``false``."""
+        value = self._take(key)
+        if value is not None and not isinstance(value, bool):
+            self.fail(key, f"must be true or false, found {value!r}")
+        return value
+
+    def number(self, key: str, *, low: float = -math.inf, high: float = math.inf) -> float | None:
+        """A finite number from ``low`` to ``high``."""
+        value = self._take(key)
+        if value is None:
+            return None
+        number = self._number(key, value)
+        if not low <= number <= high:
+            self.fail(key, f"must be from {low:g} to {high:g}, found {value!r}")
+        return number
+
+    def positive(self, key: str) -> float | None:
+        """A finite number above zero."""
+        value = self.number(key)
+        if value is not None and value <= 0:
+            self.fail(key, f"must be above 0, found {value!r}")
+        return value
+
+    def integer(self, key: str) -> int | None:
+        """A positive whole number."""
+        value = self._take(key)
+        if value is not None and (not isinstance(value, int) or isinstance(value, bool) or not 0 < value < 10**9):
+            self.fail(key, f"must be a whole number above 0, found {value!r}")
+        return value
+
+    def numbers(self, key: str, count: int | None = None) -> tuple[float, ...] | None:
+        """A list of finite numbers."""
+        value = self._take(key)
+        if value is None:
+            return None
+        if not isinstance(value, list) or (count is not None and len(value) != count):
+            self.fail(key, f"must be a list of {'' if count is None else f'{count} '}numbers, found {value!r}")
+        return tuple(self._number(key, item) for item in value)
+
+    def matrix(self, key: str) -> list[list[float]] | None:
+        """A list of lists of finite numbers, all of one length."""
+        value = self._take(key)
+        if value is None:
+            return None
+        if not isinstance(value, list) or not all(isinstance(r, list) and len(r) == len(value[0]) for r in value):
+            self.fail(key, "must be a matrix: a list of rows, each a list of numbers")
+        return [[self._number(key, item) for item in row] for row in value]
+
+    def raw(self, key: str) -> Any:
+        """The value as it stands, or ``None`` where it is absent."""
+        return self._take(key)
+
+    def require(self, key: str, value: Any) -> Any:
+        """``value``, or a complaint that the key is missing."""
+        if value is None:
+            self.fail(None, f"{key} is missing")
+        return value
+
+    def finish(self) -> None:
+        """Complain about keys that nobody asked for."""
+        for key in self._values:
+            if key not in self._known:
+                near = difflib.get_close_matches(key, self._known, n=1, cutoff=0.0)
+                hint = f'; did you mean "{near[0]}"?' if near else ""
+                self.fail(key, f"unknown key{hint} (known here: {', '.join(self._known)})")
+
+    def _take(self, key: str) -> Any:
+        if key not in self._known:
+            self._known.append(key)
+        return self._values.get(key)
+
+    def _number(self, key: str, value: object) -> float:
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            self.fail(key, f"must be a number, found {value!r}")
+        try:
+            number = float(value)
+        except OverflowError:
+            number = math.inf
+        if not math.isfinite(number):
+            self.fail(key, f"must be finite, found {value!r}"[:200])
+        return number
+
+    def _line(self, key: str | None) -> int | None:
+        """The line of a key (or of the table's head), found in the text; ``None`` for unusual spellings."""
+        lines = self._text.splitlines()
+        return _find_line(lines, self.name, key) or (_find_line(lines, self.name, None) if key else None)
+
+
+def _find_line(lines: Sequence[str], table: str, key: str | None) -> int | None:
+    inside = not table
+    for number, line in enumerate(lines, start=1):
+        head = re.match(r"\s*\[\s*([^\]]+?)\s*\]\s*(#.*)?$", line)
+        if head:
+            name = head[1].replace(" ", "").replace('"', "")
+            inside = name == table
+            if (inside and key is None) or (key is not None and name == f"{table}.{key}".lstrip(".")):
+                return number
+        elif inside and key is not None and re.match(rf"\s*[\"']?{re.escape(key)}[\"']?\s*[=.]", line):
+            return number
+    return None

@@ -1,0 +1,127 @@
+"""Camera trajectories in text files: TUM format, and the poses of InertialScale folders."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.errors import FormatError, TimingError
+from colmap_inertial.geometry import quat_conjugate, quat_normalize
+from colmap_inertial.io.files import write_text
+from colmap_inertial.io.imu_text import read_inertial_scale_imu
+from colmap_inertial.io.plausible import check_plausible
+from colmap_inertial.io.tables import Table, read_table
+from colmap_inertial.io.units import DeclaredUnits, seconds
+from colmap_inertial.types import Array, CameraTrajectory, ImuRecording
+
+
+def read_tum(path: Path) -> CameraTrajectory:
+    """Read a trajectory in TUM format.
+
+    Parameters
+    ----------
+    path
+        Rows ``t x y z qx qy qz qw``: seconds, the camera's centre (model units), rotation world_from_camera. Lines
+        that start with ``#`` are comments.
+
+    Raises
+    ------
+    FormatError
+        For other columns, values that are not finite, or quaternions that are not of unit length.
+    TimingError
+        For times that do not increase.
+    """
+    path = Path(path)
+    table = read_table(path)
+    _require_width(table, "t x y z qx qy qz qw")
+    numbers = _finite(table, [1, 2, 3, 4, 5, 6, 7])
+    t_ns = _increasing(table, table.stamps_ns(0, "s"))
+    world_from_cam = _unit(table, numbers[:, 3:])
+    return CameraTrajectory(
+        names=tuple(map(str, range(len(t_ns)))),
+        t_s=seconds(t_ns, int(t_ns[0])),
+        cam_from_world_xyzw=quat_conjugate(world_from_cam),
+        cam_in_world=numbers[:, :3],
+        epoch_ns=int(t_ns[0]),
+    )
+
+
+def write_tum(path: Path, trajectory: CameraTrajectory) -> None:
+    """Write a trajectory in TUM format; see :func:`read_tum`. Times are exact to the nanosecond."""
+    t_ns = np.rint(trajectory.t_s * 1e9).astype(np.int64)
+    world_from_cam = quat_normalize(quat_conjugate(trajectory.cam_from_world_xyzw))
+    lines = ["# t_s x y z qx qy qz qw: camera centre, world_from_camera"]
+    for stamp, centre, xyzw in zip(t_ns.tolist(), trajectory.cam_in_world, world_from_cam, strict=True):
+        total = trajectory.epoch_ns + stamp
+        whole, rest = divmod(abs(total), 1_000_000_000)
+        time = f"{'-' if total < 0 else ''}{whole}.{rest:09d}"
+        lines.append(" ".join([time, *(f"{value:.12g}" for value in (*centre, *xyzw))]))
+    write_text(Path(path), "\n".join(lines) + "\n")
+
+
+def read_inertial_scale(folder: Path) -> tuple[CameraTrajectory, ImuRecording]:
+    """Read an InertialScale folder: ``poses.txt``, ``gyroscope.txt``, ``accelerometer.txt``.
+
+    Parameters
+    ----------
+    folder
+        ``poses.txt`` has rows ``t_ns x y z qw qx qy qz``: the camera's centre (model units), rotation
+        camera_from_world. The sensors have rows ``t_ns x y z`` in rad/s and m/s2, on a clock of their own.
+
+    Raises
+    ------
+    FormatError, TimingError
+        As :func:`read_imu` and :func:`read_tum`.
+    """
+    folder = Path(folder)
+    imu = read_inertial_scale_imu(folder, DeclaredUnits())
+    check_plausible(imu, folder)
+    table = read_table(folder / "poses.txt")
+    _require_width(table, "t_ns x y z qw qx qy qz")
+    numbers = _finite(table, [1, 2, 3, 5, 6, 7, 4])
+    t_ns = _increasing(table, table.stamps_ns(0, "ns"))
+    trajectory = CameraTrajectory(
+        names=tuple(map(str, range(len(t_ns)))),
+        t_s=seconds(t_ns, int(t_ns[0])),
+        cam_from_world_xyzw=_unit(table, numbers[:, 3:]),
+        cam_in_world=numbers[:, :3],
+        epoch_ns=int(t_ns[0]),
+    )
+    return trajectory, imu
+
+
+def _require_width(table: Table, layout: str) -> None:
+    if table.width != len(layout.split()):
+        raise FormatError(table.path, f"{table.width} columns; expected {layout}", line=int(table.line_numbers[0]))
+    if len(table) < 2:
+        raise FormatError(table.path, "holds one pose; a trajectory needs at least two")
+
+
+def _finite(table: Table, columns: list[int]) -> Array:
+    numbers = table.numbers(columns)
+    bad = np.flatnonzero(~np.isfinite(numbers).all(axis=1))
+    if len(bad):
+        raise FormatError(table.path, "a pose has a value that is not finite", line=int(table.line_numbers[bad[0]]))
+    return numbers
+
+
+def _increasing(table: Table, t_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    bad = np.flatnonzero(np.diff(t_ns) <= 0)
+    if len(bad):
+        line = int(table.line_numbers[bad[0] + 1])
+        raise TimingError(f"{table.path}, line {line}: the time does not increase; poses must be in order of time")
+    return t_ns
+
+
+def _unit(table: Table, xyzw: Array) -> Array:
+    norm = np.linalg.norm(xyzw, axis=1)
+    bad = np.flatnonzero(np.abs(norm - 1) > 1e-2)
+    if len(bad):
+        raise FormatError(
+            table.path,
+            f"the quaternion has length {norm[bad[0]]:.4g}, not 1; are these the columns of a rotation?",
+            line=int(table.line_numbers[bad[0]]),
+        )
+    return xyzw / norm[:, None]

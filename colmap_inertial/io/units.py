@@ -1,0 +1,163 @@
+"""Units and axes of inertial samples: converted once, at the reader, from what a file or a user declares."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from decimal import Decimal, DecimalException
+from math import pi
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.errors import FormatError, TimingError
+from colmap_inertial.types import Array
+
+Quantity = Literal["gyro", "accel"]
+
+#: Standard gravity, the definition of the unit g (m/s2; CGPM 1901).
+STANDARD_GRAVITY_M_S2 = 9.80665
+#: Nanoseconds in each unit of time.
+TIME_UNITS_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
+#: SI value of each unit, by quantity. The first of each is the SI unit itself.
+SENSOR_UNITS: dict[Quantity, dict[str, float]] = {
+    "gyro": {"rad/s": 1.0, "deg/s": pi / 180},
+    "accel": {"m/s2": 1.0, "g": STANDARD_GRAVITY_M_S2},
+}
+SENSOR_NAMES: dict[Quantity, str] = {"gyro": "gyroscope", "accel": "accelerometer"}
+
+# Other spellings, after blanks, underscores and "^" are taken out and letters made small.
+_ALIASES = {
+    **dict.fromkeys(("rad/s", "rads-1", "rads", "rad/sec", "radians/s"), "rad/s"),
+    **dict.fromkeys(("deg/s", "degs-1", "degs", "dps", "°/s", "deg/sec", "degrees/s"), "deg/s"),
+    **dict.fromkeys(("m/s2", "ms-2", "ms2", "m/s²", "m/s/s", "mps2", "m/sec2"), "m/s2"),
+    **dict.fromkeys(("g", "g0"), "g"),
+    **dict.fromkeys(("s", "sec", "second", "seconds"), "s"),
+    **dict.fromkeys(("ms", "msec", "milliseconds"), "ms"),
+    **dict.fromkeys(("us", "µs", "μs", "usec", "microseconds"), "us"),
+    **dict.fromkeys(("ns", "nsec", "nanoseconds"), "ns"),
+}
+_LARGEST_STAMP_NS = 9_000_000_000_000_000_000
+
+
+def unit_of(text: str) -> str | None:
+    """The unit that ``text`` spells, in the spelling of this module; ``None`` where it is none of them."""
+    return _ALIASES.get(re.sub(r"[\s_^*·]", "", text).lower())
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeclaredUnits:
+    """Units that the user states in place of what a file or format says; ``None`` leaves the file's."""
+
+    gyro: str | None = None
+    accel: str | None = None
+
+
+def to_si(values: Array, quantity: Quantity, unit: str) -> Array:
+    """Samples in rad/s or m/s2 from samples in ``unit`` (a key of ``SENSOR_UNITS[quantity]``)."""
+    factor = SENSOR_UNITS[quantity][unit]
+    return values if factor == 1.0 else values * factor
+
+
+def seconds(t_ns: NDArray[np.int64], epoch_ns: int) -> Array:
+    """Seconds since ``epoch_ns``: the difference is taken in whole nanoseconds, so nothing is lost."""
+    return np.asarray((t_ns - epoch_ns) / 1e9, dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Axes:
+    """Which file axes make x, y and z: ``"y,-x,z"`` means x = the file's y, y = minus the file's x, z = its z.
+
+    Attributes
+    ----------
+    matrix
+        (3, 3) signed permutation: ``v_imu = matrix @ v_file``.
+    """
+
+    matrix: NDArray[np.float64]
+
+    @classmethod
+    def parse(cls, text: str) -> Axes:
+        """The mapping that ``text`` spells.
+
+        Raises
+        ------
+        ValueError
+            When it does not name x, y and z once each.
+        """
+        parts = [part.strip().lower() for part in text.split(",")]
+        matrix = np.zeros((3, 3))
+        for row, part in enumerate(parts[:3]):
+            match = re.fullmatch(r"([+-]?)([xyz])", part)
+            if match:
+                matrix[row, "xyz".index(match[2])] = -1.0 if match[1] == "-" else 1.0
+        if len(parts) != 3 or not np.array_equal(np.abs(matrix).sum(axis=0), np.ones(3)):
+            raise ValueError(f'"{text}" must name x, y and z once each, with optional signs, like "y,-x,z"')
+        return cls(matrix=matrix)
+
+    @property
+    def is_mirrored(self) -> bool:
+        """Whether the mapping turns a right-handed frame into a left-handed one."""
+        return bool(np.linalg.det(self.matrix) < 0)
+
+    def apply(self, values: Array) -> Array:
+        """(N, 3) samples in the IMU frame from (N, 3) samples in the file's order."""
+        return values @ self.matrix.T
+
+    def __str__(self) -> str:
+        return axes_text(self.matrix)
+
+
+def axes_text(matrix: NDArray[np.float64]) -> str:
+    """The text that :meth:`Axes.parse` reads, of a signed permutation matrix."""
+    index = np.argmax(np.abs(matrix), axis=1)
+    return ",".join(("-" if matrix[row, i] < 0 else "") + "xyz"[i] for row, i in enumerate(index))
+
+
+def stamps_ns(
+    path: Path, tokens: Sequence[str], unit: str, line_numbers: Sequence[int] | NDArray[np.int64] | None = None
+) -> NDArray[np.int64]:
+    """Exact integer nanoseconds of time stamps written as text.
+
+    Parameters
+    ----------
+    path, line_numbers
+        Where the stamps come from, for messages.
+    tokens
+        (N,) decimal numbers, with or without fraction or exponent. Digits below a nanosecond are rounded.
+    unit
+        Key of ``TIME_UNITS_NS``.
+
+    Raises
+    ------
+    FormatError
+        For a token that is not a decimal number.
+    TimingError
+        For a stamp beyond what nanoseconds in 64 bits can hold (292 years).
+    """
+    factor = TIME_UNITS_NS[unit]
+    if all(token.isdecimal() and token.isascii() and len(token) < 19 for token in tokens):
+        values = [int(token) * factor for token in tokens]
+    else:
+        values = []
+        for i, token in enumerate(tokens):
+            try:
+                if len(token) > 64 or "_" in token:
+                    raise ValueError(token)
+                exact = Decimal(token) * factor
+                if not exact.is_finite():
+                    raise ValueError(token)
+                values.append(int(exact.to_integral_value()) if abs(exact) < _LARGEST_STAMP_NS else _LARGEST_STAMP_NS)
+            except (DecimalException, ValueError):
+                line = None if line_numbers is None else int(line_numbers[i])
+                raise FormatError(path, f"time stamp {token[:40]!r} is not a number", line=line) from None
+    if values and not -_LARGEST_STAMP_NS < min(values) <= max(values) < _LARGEST_STAMP_NS:
+        bad = next(i for i, value in enumerate(values) if not -_LARGEST_STAMP_NS < value < _LARGEST_STAMP_NS)
+        where = "" if line_numbers is None else f", line {line_numbers[bad]}"
+        raise TimingError(
+            f"{path}{where}: time stamp {tokens[bad][:40]} {unit} is beyond 285 years; check the time unit"
+        )
+    return np.array(values, dtype=np.int64)
