@@ -175,8 +175,8 @@ def _read_csv(path: Path, units: DeclaredUnits, noise: ImuNoise | None) -> ImuRe
 
     gyro_unit, accel_unit = unit("gyro", 3, units.gyro), unit("accel", 3, units.accel)
     t_ns = table.stamps_ns(place["time", 0], unit("time", 1, None))
-    gyro = to_si(table.numbers([place["gyro", axis] for axis in range(3)]), "gyro", gyro_unit)
-    accel = to_si(table.numbers([place["accel", axis] for axis in range(3)]), "accel", accel_unit)
+    numbers = table.numbers([place[sensor, axis] for sensor in ("gyro", "accel") for axis in range(3)])
+    gyro, accel = to_si(numbers[:, :3], "gyro", gyro_unit), to_si(numbers[:, 3:], "accel", accel_unit)
     # Loggers that write both sensors to one table leave the cells of the other one empty.
     no_gyro, no_accel = np.asarray(np.isnan(gyro).all(axis=1)), np.asarray(np.isnan(accel).all(axis=1))
     only_gyro, only_accel = no_accel & ~no_gyro, no_gyro & ~no_accel

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,8 @@ from colmap_inertial.errors import FormatError
 from colmap_inertial.io.files import read_text
 from colmap_inertial.io.units import stamps_ns
 from colmap_inertial.types import Array
+
+_BLANK_OR_COMMENT = re.compile(r"\n\s*(\n|#|\Z)")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -110,55 +113,65 @@ def read_table(path: Path) -> Table:
     FormatError
         Where the file is missing or holds no rows, or a line has another number of cells than the first.
     """
-    text = read_text(path)
-    ends_with_newline = text.endswith(("\n", "\r"))
-    raw = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
-    numbered = [(number, line) for number, line in enumerate(raw, start=1) if line and not line.isspace()]
-    comments = [(n, line) for n, line in numbered if line.lstrip().startswith("#")]
-    rows = [(n, line) for n, line in numbered if not line.lstrip().startswith("#")] if comments else numbered
-    if not rows:
+    text = read_text(path).replace("\r\n", "\n").replace("\r", "\n")
+    body = text.rstrip("\n")
+    raw = body.split("\n")
+    first = next((i for i, line in enumerate(raw) if line.strip() and not _is_comment(line)), None)
+    if first is None:
         raise FormatError(path, "holds no rows of numbers")
-    delimiter = _delimiter(rows[-1][1] if len(rows) == 1 else rows[1][1])
+    comments = [line for line in raw[:first] if _is_comment(line)]
+    lines, numbers = raw[first:], np.arange(first + 1, len(raw) + 1)
+    repairs = []
+    if _BLANK_OR_COMMENT.search(body):
+        keep = [bool(line.strip()) and not _is_comment(line) for line in lines]
+        inside = sum(map(_is_comment, lines))
+        if inside:
+            repairs.append(f"{path.name}: passed over {inside} lines inside the data that start with #")
+        lines, numbers = [line for line, kept in zip(lines, keep, strict=True) if kept], numbers[keep]
+
+    delimiter = _delimiter(lines[min(1, len(lines) - 1)])
     header: tuple[str, ...] | None = None
     header_text = ""
-    if _is_header(rows[0][1], delimiter):
-        header_text = rows.pop(0)[1].strip()
+    if _is_header(lines[0], delimiter):
+        header_text = lines[0].strip()
         header = _header_cells(header_text, delimiter)
-        if not rows:
+        lines, numbers = lines[1:], numbers[1:]
+        if not lines:
             raise FormatError(path, "holds a header and no rows")
-    width = len(rows[0][1].split(delimiter))
+    width = len(lines[0].split(delimiter))
     if header is None:
-        for number, line in reversed(comments):
-            if number < rows[0][0] and len(_header_cells(line, delimiter)) == width:
+        for line in reversed(comments):
+            if len(_header_cells(line, delimiter)) == width:
                 header_text, header = line.strip(), _header_cells(line, delimiter)
                 break
     elif len(header) != width:
-        raise FormatError(path, f"{width} cells under a header of {len(header)}: {header_text[:200]}", line=rows[0][0])
-    repairs: tuple[str, ...] = ()
-    if not ends_with_newline and len(rows) > 1 and _is_cut_off(rows[-1][1], rows[-2][1], delimiter, width):
-        repairs = (f"{path.name}: dropped the last line ({rows[-1][0]}), which is cut off",)
-        rows.pop()
-    lines = tuple(line for _, line in rows)
-    numbers = np.array([number for number, _ in rows], dtype=np.int64)
+        reason = f"{width} cells under a header of {len(header)}: {header_text[:200]}"
+        raise FormatError(path, reason, line=int(numbers[0]))
+    if not text.endswith("\n") and len(lines) > 1 and _is_cut_off(lines[-1], lines[-2], delimiter, width):
+        repairs.append(f"{path.name}: dropped the last line ({numbers[-1]}), which is cut off")
+        lines, numbers = lines[:-1], numbers[:-1]
     if delimiter is None:
-        widths = np.array([len(line.split()) for line in lines])
+        widths = [len(line.split()) for line in lines]
     else:
-        widths = np.array([line.count(delimiter) + 1 for line in lines])
-    wrong = np.flatnonzero(widths != width)
-    if len(wrong):
-        raise FormatError(
-            path, f"{widths[wrong[0]]} cells where the other lines have {width}", line=int(numbers[wrong[0]])
-        )
+        widths = [line.count(delimiter) + 1 for line in lines]
+    if widths.count(width) != len(widths):
+        wrong = next(i for i, found in enumerate(widths) if found != width)
+        reason = f"{widths[wrong]} cells where the other lines have {width}"
+        raise FormatError(path, reason, line=int(numbers[wrong]))
     return Table(
         path=path,
         header=header,
         header_text=header_text,
-        lines=lines,
+        lines=tuple(lines),
         line_numbers=numbers,
         delimiter=delimiter,
         width=width,
-        repairs=repairs,
+        repairs=tuple(repairs),
     )
+
+
+def _is_comment(line: str) -> bool:
+    return line.lstrip().startswith("#")
 
 
 def _delimiter(line: str) -> str | None:

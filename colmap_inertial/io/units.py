@@ -139,7 +139,8 @@ def stamps_ns(
         For a stamp beyond what nanoseconds in 64 bits can hold (292 years).
     """
     factor = TIME_UNITS_NS[unit]
-    if all(token.isdecimal() and token.isascii() and len(token) < 19 for token in tokens):
+    joined = "".join(tokens)
+    if joined.isdecimal() and joined.isascii() and all(tokens) and max(map(len, tokens)) <= 20:
         values = [int(token) * factor for token in tokens]
     else:
         values = []

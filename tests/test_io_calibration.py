@@ -1,0 +1,103 @@
+"""Calibrations: what is known before an estimate, and their file."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from colmap_inertial.errors import FormatError
+from colmap_inertial.io.calibration import (
+    calibration_prior,
+    for_another_recording,
+    read_calibration,
+    write_calibration,
+)
+from colmap_inertial.types import CALIBRATION_PARAMETERS, CameraImuCalibration
+
+
+def known() -> CameraImuCalibration:
+    rng = np.random.default_rng(3)
+    root = rng.normal(size=(12, 12)) * 1e-3
+    return CameraImuCalibration(
+        cam_from_imu_xyzw=np.array([0.5, -0.5, 0.5, 0.5]),
+        gyro_time_offset_s=12.25,
+        accel_time_offset_s=12.24,
+        gyro_bias_rad_s=np.array([0.01, 0.02, -0.01]),
+        imu_in_cam_m=np.array([0.03, 0.01, 0.0]),
+        readout_s=0.021,
+        cov=root @ root.T,
+    )
+
+
+def sd_of_delay(calibration: CameraImuCalibration) -> float:
+    row = np.zeros(12)
+    row[3:5] = -1, 1
+    return float(np.sqrt(row @ calibration.cov @ row))
+
+
+def test_the_file_keeps_every_bit(tmp_path: Path) -> None:
+    write_calibration(tmp_path / "c.json", known())
+    back = read_calibration(tmp_path / "c.json")
+    for name, value in vars(known()).items():
+        np.testing.assert_array_equal(getattr(back, name), value)
+    assert json.loads((tmp_path / "c.json").read_text())["cov_parameters"] == list(CALIBRATION_PARAMETERS)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"readout_s": None}, "missing: readout_s"),
+        ({"extra": 1}, "unknown: extra"),
+        ({"readout_s": "fast"}, "readout_s"),
+        ({"readout_s": [1]}, "single numbers"),
+        ({"cam_from_imu_xyzw": [1, 1, 1, 1]}, "unit norm"),
+        ({"gyro_bias_rad_s": [1, 2]}, "gyro_bias_rad_s"),
+        ({"cov": [[1.0, 2.0], [3.0]]}, "shape"),
+        ({"cov_parameters": ["a"]}, "cov_parameters"),
+    ],
+)
+def test_a_wrong_file_names_the_field(tmp_path: Path, change: dict[str, object], said: str) -> None:
+    write_calibration(tmp_path / "c.json", known())
+    values = json.loads((tmp_path / "c.json").read_text()) | change
+    (tmp_path / "c.json").write_text(json.dumps({key: value for key, value in values.items() if value is not None}))
+    with pytest.raises(FormatError, match=said):
+        read_calibration(tmp_path / "c.json")
+
+
+def test_where_nothing_is_known_the_prior_is_wide_but_ties_the_sensors_together() -> None:
+    prior = calibration_prior()
+    assert prior.sigma("rotation_x_rad") == pytest.approx(np.pi)
+    assert prior.sigma("gyro_time_offset_s") == pytest.approx(1e6)
+    assert sd_of_delay(prior) == pytest.approx(0.02, rel=0.1)
+    assert prior.sigma("imu_in_cam_x_m") == pytest.approx(0.08)
+    assert prior.sigma("readout_s") == pytest.approx(0.02)
+    np.linalg.cholesky(prior.cov)
+    shared = calibration_prior(shared_clock=True)
+    assert shared.sigma("gyro_time_offset_s") == pytest.approx(1.0)
+    assert sd_of_delay(shared) == pytest.approx(0.02)
+
+
+def test_what_is_known_is_narrow() -> None:
+    prior = calibration_prior(
+        cam_from_imu_xyzw=[0, 0, 0, 1], imu_in_cam_m=[0.1, 0, 0], gyro_time_offset_s=3.0, readout_s=0.0
+    )
+    assert prior.sigma("rotation_z_rad") == pytest.approx(0.01)
+    assert prior.sigma("imu_in_cam_x_m") == pytest.approx(0.005)
+    assert prior.accel_time_offset_s == 3.0
+    assert sd_of_delay(prior) == pytest.approx(0.02)
+    assert prior.sigma("gyro_time_offset_s") == pytest.approx(0.002)
+    np.linalg.cholesky(prior.cov)
+
+
+def test_the_next_recording_of_a_device_keeps_the_delay_and_opens_the_offset() -> None:
+    before = known()
+    prior = for_another_recording(before)
+    assert prior.sigma("gyro_time_offset_s") == pytest.approx(1e6)
+    assert prior.accel_time_offset_s - prior.gyro_time_offset_s == pytest.approx(-0.01)
+    shared = for_another_recording(before, shared_clock=True)
+    assert shared.gyro_time_offset_s == 12.25
+    assert sd_of_delay(shared) == pytest.approx(sd_of_delay(before))
+    np.testing.assert_allclose(shared.cov[:3, :3], before.cov[:3, :3])
+    np.testing.assert_allclose(shared.cov[8:, 8:], before.cov[8:, 8:])
+    np.testing.assert_array_equal(prior.imu_in_cam_m, before.imu_in_cam_m)

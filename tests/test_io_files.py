@@ -1,0 +1,90 @@
+"""Atomic files and JSON."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from colmap_inertial.errors import FormatError
+from colmap_inertial.io.files import read_json, write_json, write_text
+
+
+@dataclass(frozen=True)
+class Point:
+    xy: tuple[float, float]
+    path: Path
+
+
+def test_values_arrive_as_plain_json(tmp_path: Path) -> None:
+    value = {
+        "matrix": np.array([[1.5, 2.0], [3.0, 4.0]]),
+        "count": np.int64(7),
+        "flag": np.bool_(True),
+        "float": np.float32(0.5),
+        "point": Point((1.0, 2.0), Path("a/b")),
+        "none": None,
+        "text": "µm",
+    }
+    write_json(tmp_path / "a.json", value)
+    assert json.loads((tmp_path / "a.json").read_text(encoding="utf-8")) == {
+        "matrix": [[1.5, 2.0], [3.0, 4.0]],
+        "count": 7,
+        "flag": True,
+        "float": 0.5,
+        "point": {"xy": [1.0, 2.0], "path": "a/b"},
+        "none": None,
+        "text": "µm",
+    }
+    assert [path.name for path in tmp_path.iterdir()] == ["a.json"]
+
+
+def test_numbers_survive_to_the_last_bit(tmp_path: Path) -> None:
+    values = np.random.default_rng(0).normal(size=100) * 10.0 ** np.arange(-50, 50)
+    write_json(tmp_path / "a.json", {"v": values})
+    np.testing.assert_array_equal(read_json(tmp_path / "a.json")["v"], values)
+
+
+@pytest.mark.parametrize("bad", [float("nan"), np.array([1.0, np.inf]), np.float64("nan")])
+def test_a_number_that_json_has_not_is_named_and_the_old_file_stays(tmp_path: Path, bad: object) -> None:
+    write_json(tmp_path / "a.json", {"v": 1})
+    with pytest.raises(ValueError, match=r"\$\.deep\[1\]"):
+        write_json(tmp_path / "a.json", {"deep": [0, bad]})
+    assert read_json(tmp_path / "a.json") == {"v": 1}
+
+
+def test_a_value_of_another_type_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"\$\.a: set"):
+        write_json(tmp_path / "a.json", {"a": {1}})
+    with pytest.raises(ValueError, match="keys"):
+        write_json(tmp_path / "a.json", {1: 2})
+
+
+def test_a_failed_write_leaves_no_trace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_text(tmp_path / "a.txt", "old")
+
+    def fail(source: object, target: object) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr("os.replace", fail)
+    with pytest.raises(OSError, match="disk full"):
+        write_text(tmp_path / "a.txt", "new")
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["old"]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [('{"a": 1,\n"b" 2}', "line 2"), ("[1]", "object"), ('{"a": NaN}', "NaN"), ("", "line 1"), ("[" * 100000, "JSON")],
+)
+def test_what_is_no_json_object_is_a_format_error(tmp_path: Path, text: str, said: str) -> None:
+    (tmp_path / "a.json").write_text(text)
+    with pytest.raises(FormatError, match=said):
+        read_json(tmp_path / "a.json")
+
+
+def test_a_missing_file_is_a_format_error(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match="no such file"):
+        read_json(tmp_path / "a.json")
+    with pytest.raises(FormatError, match="cannot be read"):
+        read_json(tmp_path)

@@ -1,0 +1,272 @@
+"""Inertial readers: exact stamps, units, repairs, refusals, and agreement with an independent parser."""
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from colmap_inertial.errors import FormatError, TimingError
+from colmap_inertial.io import imu as imu_room
+from colmap_inertial.io.imu import ImuFormat, imu_formats, read_imu, register_imu_format
+from colmap_inertial.io.units import DeclaredUnits
+from colmap_inertial.types import ImuRecording
+
+HEADER = "#timestamp [ns],w_x [rad s^-1],w_y [rad s^-1],w_z [rad s^-1],a_x [m s^-2],a_y [m s^-2],a_z [m s^-2]"
+EPOCH_NS = 1403715273262142976
+
+
+def handheld(n: int = 400, rate_hz: float = 200.0, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Stamps (ns), rad/s and m/s2 that a quiet hand could have made."""
+    rng = np.random.default_rng(seed)
+    t_ns = EPOCH_NS + (np.arange(n) * 1e9 / rate_hz).astype(np.int64)
+    gyro = 0.3 * np.sin(np.arange(n)[:, None] / [31.0, 47.0, 23.0]) + rng.normal(0, 0.01, (n, 3))
+    accel = np.array([0.5, 9.7, 1.0]) + rng.normal(0, 0.1, (n, 3))
+    return t_ns, gyro, accel
+
+
+def rows(t_ns, gyro, accel) -> list[str]:
+    return [
+        ",".join(map(repr, (int(t), *map(float, g), *map(float, a)))) for t, g, a in zip(t_ns, gyro, accel, strict=True)
+    ]
+
+
+def write_csv(path: Path, lines: list[str], header: str | None = HEADER) -> Path:
+    path.write_text("\n".join(([header] if header else []) + lines) + "\n")
+    return path
+
+
+@pytest.fixture
+def clean(tmp_path: Path) -> tuple[Path, list[str]]:
+    lines = rows(*handheld())
+    return write_csv(tmp_path / "imu.csv", lines), lines
+
+
+def test_euroc_dataset_is_read_exactly_from_each_of_its_doors(shared_data: Path) -> None:
+    root = shared_data / "euroc_v101"
+    table = np.loadtxt(root / "mav0/imu0/data.csv", delimiter=",", skiprows=1)
+    with open(root / "mav0/imu0/data.csv") as file:
+        stamps = [int(line.split(",")[0]) for line in file if line[0] != "#"]
+    for door in (root, root / "mav0", root / "mav0/imu0", root / "mav0/imu0/data.csv"):
+        imu = read_imu(door)
+        np.testing.assert_array_equal(imu.gyro_rad_s, table[:, 1:4])
+        np.testing.assert_array_equal(imu.accel_m_s2, table[:, 4:7])
+        assert [imu.epoch_ns + round(t * 1e9) for t in imu.gyro_t_s.tolist()] == stamps
+        assert imu.repairs == ()
+        assert imu.noise is not None and imu.noise.accel_density_m_s2_rthz == 2e-3
+
+
+def test_no_real_recording_is_refused_or_repaired(shared_data: Path) -> None:
+    folders = sorted((shared_data / "inertial_scale").iterdir())
+    assert len(folders) == 8
+    for folder in folders:
+        imu = read_imu(folder)
+        assert imu.repairs == ()
+        with open(folder / "gyroscope.txt") as file:
+            stamps = [int(line.split()[0]) for line in file]
+        assert [imu.epoch_ns + round(t * 1e9) for t in imu.gyro_t_s.tolist()] == stamps
+
+
+def test_csv_units_are_converted_once(tmp_path: Path) -> None:
+    t_ns, gyro, accel = handheld()
+    table = [
+        f"{(int(t) - EPOCH_NS) / 1e6:.6f},{','.join(map(repr, np.degrees(g).tolist()))},"
+        f"{','.join(map(repr, (a / 9.80665).tolist()))}"
+        for t, g, a in zip(t_ns, gyro, accel, strict=True)
+    ]
+    for header in (
+        "t [ms],gx [deg/s],gy [deg/s],gz [deg/s],ax [g],ay [g],az [g]",
+        "time_ms,gyro_x_dps,gyro_y_dps,gyro_z_dps,acc_x_g,acc_y_g,acc_z_g",
+        "timestamp (ms),wx (°/s),wy (°/s),wz (°/s),accel_x (g),accel_y (g),accel_z (g)",
+    ):
+        imu = read_imu(write_csv(tmp_path / "units.csv", table, header))
+        np.testing.assert_allclose(imu.gyro_rad_s, gyro, rtol=1e-12)
+        np.testing.assert_allclose(imu.accel_m_s2, accel, rtol=1e-12)
+        np.testing.assert_allclose(np.diff(imu.gyro_t_s), 0.005, atol=2e-9)
+
+
+@pytest.mark.parametrize(
+    ("unit", "token", "nanoseconds"),
+    [
+        ("s", "1403715273.262142976", 1403715273262142976),
+        ("s", "-1.5", -1500000000),
+        ("ms", "4.328040426741000265e+06", 4328040426741),
+        ("us", "1403715273262142.9764", 1403715273262142976),
+        ("ns", "9007199254740993", 9007199254740993),
+    ],
+)
+def test_stamps_keep_every_nanosecond(unit: str, token: str, nanoseconds: int) -> None:
+    from colmap_inertial.io.units import stamps_ns
+
+    assert stamps_ns(Path("x"), [token], unit).tolist() == [nanoseconds]
+
+
+def test_columns_of_any_order_and_delimiter_are_found(tmp_path: Path) -> None:
+    t_ns, gyro, accel = handheld(50)
+    header = "az_m_s2;ay_m_s2;ax_m_s2;note;wz_rad_s;wy_rad_s;wx_rad_s;t_ns"
+    lines = [
+        ";".join(map(str, [*a[::-1].tolist(), "7", *g[::-1].tolist(), int(t)]))
+        for t, g, a in zip(t_ns, gyro, accel, strict=True)
+    ]
+    imu = read_imu(write_csv(tmp_path / "odd.csv", lines, header))
+    np.testing.assert_array_equal(imu.gyro_rad_s, gyro)
+    np.testing.assert_array_equal(imu.accel_m_s2, accel)
+    tabs = read_imu(write_csv(tmp_path / "tabs.csv", [x.replace(";", "\t") for x in lines], header.replace(";", "\t")))
+    np.testing.assert_array_equal(tabs.accel_m_s2, accel)
+
+
+def test_sensors_of_two_rates_in_one_table_keep_their_own_times(tmp_path: Path) -> None:
+    t_ns, gyro, accel = handheld(60)
+    lines = []
+    for i, row in enumerate(rows(t_ns, gyro, accel)):
+        cells = row.split(",")
+        lines.append(",".join([*cells[:4], "", "", ""]) if i % 3 else ",".join([cells[0], "", "", "", *cells[4:]]))
+    imu = read_imu(write_csv(tmp_path / "mixed.csv", lines))
+    assert (len(imu.gyro_t_s), len(imu.accel_t_s)) == (40, 20)
+    np.testing.assert_array_equal(imu.accel_m_s2, accel[::3])
+
+
+@pytest.mark.parametrize(
+    ("header", "said"),
+    [
+        (HEADER.replace("[rad s^-1]", "[turns]"), "turns"),
+        ("t,gx,gy,gz,ax,ay,az", "no single unit"),
+        ("t [ns],gx [rad/s],gy [rad/s],gz [deg/s],ax [g],ay [g],az [g]", "no single unit"),
+        ("t [ns],foo,bar,baz,ax [g],ay [g],az [g]", "gyro_x, gyro_y, gyro_z"),
+        ("t [ns],gx [m/s2],gy [m/s2],gz [m/s2],ax [g],ay [g],az [g]", "m/s2"),
+        ("t [ns],gx [rad/s],gx [rad/s],gz [rad/s],ax [g],ay [g],az [g]", "mean the same"),
+        (None, "no header"),
+    ],
+)
+def test_an_unclear_header_is_shown_with_what_to_write(tmp_path: Path, header: str | None, said: str) -> None:
+    path = write_csv(tmp_path / "unclear.csv", rows(*handheld(10)), header)
+    with pytest.raises(FormatError) as caught:
+        read_imu(path)
+    message = str(caught.value)
+    assert said in message and "[imu.gyro]" in message and 'file = "unclear.csv"' in message
+    assert header is None or header.strip("#") in message or said in message
+
+
+def test_a_cut_off_last_line_is_dropped_and_listed(clean: tuple[Path, list[str]]) -> None:
+    path, _ = clean
+    text = path.read_text()
+    for cut in (20, 60, len(text.rstrip().rsplit("\n", 1)[1]) - 1):
+        path.write_text(text.rstrip()[:-cut])
+        imu = read_imu(path)
+        assert len(imu.gyro_t_s) == 399
+        assert any("cut off" in repair for repair in imu.repairs)
+
+
+def test_small_disorder_is_sorted_and_listed(clean: tuple[Path, list[str]]) -> None:
+    path, lines = clean
+    lines[100:104] = lines[100:104][::-1]
+    imu = read_imu(write_csv(path, lines))
+    np.testing.assert_array_equal(imu.gyro_rad_s, handheld()[1])
+    assert any("sorted" in repair for repair in imu.repairs)
+
+
+def test_repeated_rows_are_merged_and_listed(clean: tuple[Path, list[str]]) -> None:
+    path, lines = clean
+    imu = read_imu(write_csv(path, lines[:50] + lines[49:52] + lines[50:]))
+    np.testing.assert_array_equal(imu.gyro_rad_s, handheld()[1])
+    assert any("repeated" in repair for repair in imu.repairs)
+
+
+def test_rows_without_a_value_are_dropped_and_listed(clean: tuple[Path, list[str]]) -> None:
+    path, lines = clean
+    cells = lines[7].split(",")
+    lines[7] = ",".join([*cells[:2], "nan", *cells[3:]])
+    imu = read_imu(write_csv(path, lines))
+    assert (len(imu.gyro_t_s), len(imu.accel_t_s)) == (399, 400)
+    assert any("line 9" in repair for repair in imu.repairs)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "said"),
+    [
+        (lambda lines: [*lines[:10], lines[10] + ",1", *lines[11:]], FormatError, "line 12"),
+        (lambda lines: [*lines[:10], lines[10].rsplit(",", 1)[0], *lines[11:]], FormatError, "line 12"),
+        (lambda lines: [*lines[:10], lines[10].replace(".", "x", 1), *lines[11:]], FormatError, "line 12"),
+        (lambda lines: [*lines[:10], "oops," + lines[10].split(",", 1)[1], *lines[11:]], FormatError, "line 12"),
+        (lambda lines: [line.rsplit(",", 1)[0] + ",nan" for line in lines], FormatError, "NaN"),
+        (lambda lines: lines[:1], FormatError, "at least two"),
+        (lambda lines: [], FormatError, "no rows"),
+        (lambda lines: lines[::-1], TimingError, "backwards"),
+        (lambda lines: lines[200:] + lines[:200], TimingError, "line 202"),
+        (lambda lines: [lines[i - i % 2][:19] + line[19:] for i, line in enumerate(lines)], TimingError, "repeat"),
+        (lambda lines: ["9" * 30 + lines[0][19:], *lines[1:]], TimingError, "time unit"),
+        (lambda lines: ["1e400" + lines[0][19:], *lines[1:]], TimingError, "time unit"),
+    ],
+)
+def test_damage_is_named_with_its_line(clean: tuple[Path, list[str]], change, error, said: str) -> None:
+    path, lines = clean
+    write_csv(path, change(lines))
+    with pytest.raises(error) as caught:
+        read_imu(path)
+    assert said in str(caught.value) and "imu.csv" in str(caught.value)
+
+
+@pytest.mark.parametrize("unit", ["s", "ms", "us"])
+def test_stamps_in_a_smaller_unit_than_declared_are_refused(tmp_path: Path, unit: str) -> None:
+    path = write_csv(tmp_path / "unit.csv", rows(*handheld()), HEADER.replace("[ns]", f"[{unit}]"))
+    with pytest.raises(TimingError, match="unit"):
+        read_imu(path)
+
+
+def test_milliseconds_read_as_nanoseconds_are_refused(tmp_path: Path) -> None:
+    t_ns, gyro, accel = handheld()
+    path = write_csv(tmp_path / "unit.csv", rows(t_ns // 1_000_000, gyro, accel))
+    with pytest.raises(TimingError, match="time_unit"):
+        read_imu(path)
+
+
+def test_a_damaged_stamp_far_away_is_refused(clean: tuple[Path, list[str]]) -> None:
+    path, lines = clean
+    lines[-1] = "2" + lines[-1][1:]
+    with pytest.raises(TimingError, match="pauses"):
+        read_imu(write_csv(path, lines))
+
+
+def test_no_path_and_no_known_layout_are_format_errors(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match="no such"):
+        read_imu(tmp_path / "absent")
+    with pytest.raises(FormatError, match="not an inertial recording"):
+        read_imu(tmp_path)
+    (tmp_path / "a.csv").write_text("x")
+    with pytest.raises(FormatError, match="known are auto, euroc"):
+        read_imu(tmp_path / "a.csv", format="eurok")
+
+
+def test_a_dataset_with_several_imus_asks_which(tmp_path: Path) -> None:
+    for name in ("imu0", "imu1"):
+        folder = tmp_path / "mav0" / name
+        folder.mkdir(parents=True)
+        write_csv(folder / "data.csv", rows(*handheld()), HEADER.replace("w_", "w_RS_S_").replace("a_", "a_RS_S_"))
+    with pytest.raises(FormatError, match="imu0, mav0/imu1"):
+        read_imu(tmp_path)
+    assert len(read_imu(tmp_path / "mav0/imu1").gyro_t_s) == 400
+
+
+def test_a_new_family_joins_with_one_function(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(imu_room, "_formats", list(imu_formats()))
+
+    def read(path: Path, units: DeclaredUnits) -> ImuRecording:
+        _, gyro, accel = handheld(100)
+        t_s = np.arange(100) / 100
+        return ImuRecording(gyro_t_s=t_s, gyro_rad_s=gyro, accel_t_s=t_s, accel_m_s2=accel, device=path.name)
+
+    mine = ImuFormat(name="mine", layout="a .mine file", accepts=lambda path: path.suffix == ".mine", read=read)
+    register_imu_format(mine)
+    (tmp_path / "a.mine").write_bytes(b"\0")
+    assert read_imu(tmp_path / "a.mine").device == "a.mine"
+    with pytest.raises(ValueError, match="exists"):
+        register_imu_format(mine)
+
+
+def test_ten_minutes_at_200_hz_are_read_in_well_under_a_second(tmp_path: Path) -> None:
+    path = write_csv(tmp_path / "long.csv", rows(*handheld(120_000)))
+    read_imu(path)
+    start = time.process_time()
+    imu = read_imu(path)
+    assert len(imu.gyro_t_s) == 120_000
+    assert time.process_time() - start < 1.5  # measured 0.6 s; the bound leaves room for a busy machine
