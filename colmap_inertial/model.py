@@ -1,0 +1,247 @@
+"""COLMAP models on disk: finding, reading, timing and rescaling them. The only place where lengths are multiplied."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from colmap_inertial.errors import AlreadyMetricError, FormatError, OutputExistsError, TimingError
+from colmap_inertial.io.files import read_json, write_json
+from colmap_inertial.types import CameraModel, CameraTrajectory, FrameTiming, ScaleEstimate, Similarity
+
+if TYPE_CHECKING:
+    import pycolmap
+
+#: Written into every folder whose lengths we have changed; its presence means "already metric".
+TRANSFORM_FILE = "transform.json"
+
+_MODEL_FILES = ("cameras", "images", "points3D")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Model:
+    """A COLMAP model on its way through the model stages.
+
+    Attributes
+    ----------
+    folder
+        A COLMAP model that the stages may rewrite; never COLMAP's own output.
+    index
+        Its number in ``sparse/``.
+    timing
+        When the frames were exposed.
+    scale
+        What the inertial estimate said; ``None`` before it.
+    similarity
+        What was applied to get here from COLMAP's model; ``None`` while it has COLMAP's own units.
+    """
+
+    folder: Path
+    index: int
+    timing: FrameTiming
+    scale: ScaleEstimate | None = None
+    similarity: Similarity | None = None
+
+
+def model_format(folder: Path) -> str | None:
+    """``".bin"`` or ``".txt"`` where the folder holds a COLMAP model (binary first), else ``None``."""
+    for suffix in (".bin", ".txt"):
+        if all((folder / f"{name}{suffix}").is_file() for name in _MODEL_FILES):
+            return suffix
+    return None
+
+
+def find_models(folder: Path) -> dict[int, Path]:
+    """The COLMAP models in a folder: itself (as number 0), or its numbered subfolders.
+
+    Raises
+    ------
+    FormatError
+        When there is none.
+    """
+    if model_format(folder) is not None:
+        return {0: folder}
+    found = {}
+    if folder.is_dir():
+        for child in folder.iterdir():
+            if child.name.isdigit() and model_format(child) is not None:
+                found[int(child.name)] = child
+    if not found:
+        raise FormatError(folder, "no COLMAP model here (cameras, images and points3D, .bin or .txt)")
+    return dict(sorted(found.items()))
+
+
+def read_model(folder: Path) -> pycolmap.Reconstruction:
+    """Read a COLMAP model, binary or text.
+
+    Raises
+    ------
+    FormatError
+        When the folder holds no model or a damaged one.
+    """
+    import pycolmap
+
+    suffix = model_format(folder)
+    if suffix is None:
+        raise FormatError(folder, "no COLMAP model here (cameras, images and points3D, .bin or .txt)")
+    reconstruction = pycolmap.Reconstruction()
+    try:
+        if suffix == ".bin":
+            reconstruction.read_binary(str(folder))
+        else:
+            reconstruction.read_text(str(folder))
+    except (ValueError, RuntimeError, IndexError, MemoryError) as error:
+        raise FormatError(folder, f"COLMAP cannot read this model: {error}") from error
+    if reconstruction.num_reg_images() == 0:
+        raise FormatError(folder, "the model has no registered image")
+    return reconstruction
+
+
+def colmap_camera(camera: CameraModel, camera_id: int = 1) -> pycolmap.Camera:
+    """The pycolmap camera of our intrinsics.
+
+    Raises
+    ------
+    ValueError
+        When the model's name or the number of parameters is not COLMAP's.
+    """
+    import pycolmap
+
+    try:
+        built = pycolmap.Camera(
+            camera_id=camera_id, model=camera.model, width=camera.width, height=camera.height, params=camera.params
+        )
+    except (AttributeError, RuntimeError, KeyError) as error:
+        raise ValueError(f"{camera.model} is no COLMAP camera model: {error}") from error
+    if not built.verify_params():
+        raise ValueError(f"COLMAP's {camera.model} takes {built.params_info}, got {len(camera.params)} values")
+    return built
+
+
+def trajectory_from_model(
+    reconstruction: pycolmap.Reconstruction, timing: FrameTiming
+) -> tuple[CameraTrajectory, tuple[str, ...]]:
+    """Camera poses of a model in the order of time.
+
+    Parameters
+    ----------
+    reconstruction
+        A COLMAP model.
+    timing
+        Frame times; joined with the images by name.
+
+    Returns
+    -------
+    CameraTrajectory, tuple of str
+        The poses at mid-exposure of the middle row, in model units, and what was left out, in words.
+
+    Raises
+    ------
+    TimingError
+        When fewer than two images have a time.
+    """
+    t_of = dict(zip(timing.names, timing.pose_t_s(), strict=True))
+    images = [reconstruction.image(i) for i in reconstruction.reg_image_ids()]
+    timed = sorted((image for image in images if image.name in t_of), key=lambda image: float(t_of[image.name]))
+    if len(timed) < 2:
+        example = images[0].name if images else "none"
+        raise TimingError(
+            f"{len(timed)} of the model's {len(images)} images have a frame time; "
+            f"names must agree (the model has {example!r}, the frame times {timing.names[0]!r})"
+        )
+    poses = [image.cam_from_world() for image in timed]
+    notes = ()
+    if len(timed) < len(images):
+        notes = (
+            f"{len(images) - len(timed)} of the model's {len(images)} images have no frame time and were left out",
+        )
+    trajectory = CameraTrajectory(
+        names=tuple(image.name for image in timed),
+        t_s=np.array([t_of[image.name] for image in timed]),
+        cam_from_world_xyzw=np.array([pose.rotation.quat for pose in poses]),
+        cam_in_world=np.array([image.projection_center() for image in timed]),
+        epoch_ns=timing.epoch_ns,
+    )
+    return trajectory, notes
+
+
+def similarity_as_json(similarity: Similarity) -> dict[str, object]:
+    """The similarity's fields in JSON types."""
+    return {
+        "scale": similarity.scale,
+        "rotation_xyzw": similarity.rotation_xyzw.tolist(),
+        "translation_m": similarity.translation_m.tolist(),
+        "cov": similarity.cov.tolist(),
+        "provenance": similarity.provenance,
+    }
+
+
+def is_metric(folder: Path) -> bool:
+    """Whether a folder's lengths were already changed by us."""
+    return (folder / TRANSFORM_FILE).is_file()
+
+
+def apply_similarity(source: Path, target: Path, similarity: Similarity) -> None:
+    """Write a transformed copy of a COLMAP model, in the source's format; the source stays as it is.
+
+    Parameters
+    ----------
+    source
+        A COLMAP model folder.
+    target
+        A folder that does not exist yet. It appears whole or not at all.
+    similarity
+        Target from source.
+
+    Raises
+    ------
+    AlreadyMetricError
+        When the source already carries a similarity of ours.
+    OutputExistsError
+        When the target exists.
+    FormatError
+        When the source is no COLMAP model.
+    """
+    import pycolmap
+
+    if is_metric(source):
+        provenance = read_json(source / TRANSFORM_FILE).get("provenance", "unknown")
+        raise AlreadyMetricError(
+            f"{source} already holds a metric scale ({provenance}); apply it to COLMAP's own model"
+        )
+    if target.exists():
+        raise OutputExistsError(f"{target} exists already; choose another folder or remove it")
+    reconstruction = read_model(source)
+    rotation = pycolmap.Rotation3d(similarity.rotation_xyzw)
+    reconstruction.transform(pycolmap.Sim3d(similarity.scale, rotation, similarity.translation_m))
+    partial = target.with_name(target.name + ".partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    if model_format(source) == ".bin":
+        reconstruction.write_binary(str(partial))
+    else:
+        reconstruction.write_text(str(partial))
+    write_json(partial / TRANSFORM_FILE, similarity_as_json(similarity))
+    os.replace(partial, target)
+
+
+def mean_reprojection_error_px(reconstruction: pycolmap.Reconstruction) -> float:
+    """Mean over all observations, computed afresh rather than read from the file."""
+    reconstruction.update_point_3d_errors()
+    return float(reconstruction.compute_mean_reprojection_error())
+
+
+def summarize(reconstruction: pycolmap.Reconstruction) -> Mapping[str, int | float]:
+    """Counts and mean reprojection error, as COLMAP's model analyzer gives them."""
+    return {
+        "registered_images": reconstruction.num_reg_images(),
+        "points": reconstruction.num_points3D(),
+        "observations": reconstruction.compute_num_observations(),
+        "mean_reprojection_error_px": mean_reprojection_error_px(reconstruction),
+    }
