@@ -1,0 +1,75 @@
+"""The gyroscope integrated to orientations that can be read at any instant; shared by alignment and smoothing."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.geometry import matrix_from_quat, quat_cumulative, quat_exp, quat_multiply
+from colmap_inertial.types import Array
+
+
+class GyroPath:
+    """Orientation of the IMU along a recording, against its orientation at the first sample.
+
+    Between samples the rate is linear and the rotation follows its mean, which is of second order.
+
+    Parameters
+    ----------
+    t_s
+        (N,) stamps.
+    rate_rad_s
+        (N, 3) readings, IMU frame.
+    bias_rad_s
+        (3,) subtracted from the readings.
+    max_gap_s
+        A longer pause between samples is a gap: nothing is known about the rotation in it.
+    """
+
+    def __init__(self, t_s: Array, rate_rad_s: Array, bias_rad_s: Array, *, max_gap_s: float = 0.1) -> None:
+        self.t_s = t_s
+        self.rate_rad_s = rate_rad_s - bias_rad_s
+        self._step_s = np.diff(t_s)
+        mean = 0.5 * (self.rate_rad_s[1:] + self.rate_rad_s[:-1])
+        self.start_from_imu_xyzw = quat_cumulative(quat_exp(mean * self._step_s[:, None]))
+        self._gaps = np.concatenate([[0], np.cumsum(self._step_s > max_gap_s)])
+
+    def covers(self, begin_s: Array, end_s: Array) -> NDArray[np.bool_]:
+        """Which of the intervals lie inside the recording and contain no gap."""
+        top = len(self.t_s) - 1
+        first = np.searchsorted(self.t_s, begin_s, side="right") - 1
+        last = np.searchsorted(self.t_s, end_s, side="left")
+        gapless = self._gaps[np.clip(first, 0, top)] == self._gaps[np.clip(last, 0, top)]
+        return np.asarray((first >= 0) & (last <= top) & gapless)
+
+    def at(self, query_s: Array) -> tuple[Array, Array]:
+        """``start_from_imu`` quaternions (M, 4) and rates (M, 3) in rad/s at ``query_s``; the ends are continued."""
+        i, since_s, rate = self._locate(query_s)
+        turn = quat_exp(0.5 * (self.rate_rad_s[i] + rate) * since_s[:, None])
+        return quat_multiply(self.start_from_imu_xyzw[i], turn), rate
+
+    def bias_lever(self, query_s: Array) -> Array:
+        """(M, 3, 3) integrals of ``start_from_imu`` from the first sample to ``query_s``, in seconds.
+
+        A change ``db`` of the bias turns the interval from i to j, seen in the IMU frame at j, by
+        ``-R_j' (A_j - A_i) db`` with A these integrals.
+        """
+        rotation, lever = self._levers
+        i, since_s, _ = self._locate(query_s)
+        here = matrix_from_quat(self.at(query_s)[0])
+        return np.asarray(lever[i] + 0.5 * (rotation[i] + here) * since_s[:, None, None])
+
+    @cached_property
+    def _levers(self) -> tuple[Array, Array]:
+        rotation = matrix_from_quat(self.start_from_imu_xyzw)
+        steps = 0.5 * (rotation[1:] + rotation[:-1]) * self._step_s[:, None, None]
+        return rotation, np.concatenate([np.zeros((1, 3, 3)), np.cumsum(steps, axis=0)])
+
+    def _locate(self, query_s: Array) -> tuple[NDArray[np.intp], Array, Array]:
+        i = np.clip(np.searchsorted(self.t_s, query_s, side="right") - 1, 0, len(self.t_s) - 2)
+        since_s = query_s - self.t_s[i]
+        # outside the recording the rate stays at the end's instead of running away
+        fraction = np.clip(since_s / self._step_s[i], 0.0, 1.0)[:, None]
+        return i, since_s, self.rate_rad_s[i] + fraction * (self.rate_rad_s[i + 1] - self.rate_rad_s[i])
