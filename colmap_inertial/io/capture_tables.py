@@ -38,6 +38,11 @@ CAMERA_MODELS = {
     "RADIAL_FISHEYE": (5, 1),
     "THIN_PRISM_FISHEYE": (12, 2),
     "RAD_TAN_THIN_PRISM_FISHEYE": (16, 2),
+    "SIMPLE_DIVISION": (4, 1),
+    "DIVISION": (5, 2),
+    "SIMPLE_FISHEYE": (3, 1),
+    "FISHEYE": (4, 2),
+    "EUCM": (6, 2),
 }
 
 

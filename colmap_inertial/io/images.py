@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from colmap_inertial.errors import FormatError
 
-#: File endings of pictures that OpenCV and COLMAP both read.
-SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm")
+#: File endings of pictures that both OpenCV and the published builds of pycolmap read (the latter read no WebP).
+SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".pgm", ".ppm")
 
 
 def read_image(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
