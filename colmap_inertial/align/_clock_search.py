@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial._gyro import GyroPath
 from colmap_inertial.geometry import matrix_from_quat, quat_conjugate, quat_from_matrix, quat_log, quat_multiply
+from colmap_inertial.gyro import GyroPath
 from colmap_inertial.types import Array, CameraTrajectory
 
 #: Frames this close together sample the rotation densely enough to be correlated on a grid.

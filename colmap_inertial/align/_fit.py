@@ -1,19 +1,11 @@
-"""Camera-IMU alignment: rotation, time offset and gyroscope bias from the gyroscope against visual rotation.
-
-Step 1 of Mustaniemi et al., "Inertial-based scale estimation for structure from motion on mobile devices" (IROS 2017),
-with three changes. Every offset at which the two recordings could coincide is searched, because clock origins are
-arbitrary. Rotations over intervals between frames are compared instead of differentiated orientations, so that video
-and sparse keyframes are treated alike. And a result is refused where no offset is clearly better than the rest.
-"""
+"""Refinement of rotation, time offset and gyroscope bias together, with an honest covariance."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from colmap_inertial._clock_search import ClockFit, explained_at, intervals_of, search_offsets, spaced_frames
-from colmap_inertial._gyro import GyroPath
+from colmap_inertial.align._clock_search import ClockFit
+from colmap_inertial.align._prior import UNKNOWN_OFFSET_S
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.geometry import (
     matrix_from_quat,
@@ -23,6 +15,7 @@ from colmap_inertial.geometry import (
     quat_multiply,
     quat_normalize,
 )
+from colmap_inertial.gyro import GyroPath
 from colmap_inertial.types import (
     CALIBRATION_PARAMETERS,
     Array,
@@ -32,203 +25,36 @@ from colmap_inertial.types import (
     clock_shift_s,
 )
 
-#: A time offset with at least this standard deviation is unknown: its value carries nothing.
-UNKNOWN_OFFSET_S = 1e3
-#: Frames closer than this add pose noise rather than rotation.
-_SPACING_S, _CHECK_SPACING_S = 0.1, 0.3
 #: Columns of the refinement among ``CALIBRATION_PARAMETERS``: rotation, gyroscope offset, gyroscope bias.
 _FITTED = np.array([0, 1, 2, 3, 5, 6, 7])
 _OTHERS = np.setdiff1d(np.arange(len(CALIBRATION_PARAMETERS)), _FITTED)
+#: Intervals whose residual is this many times its standard deviation lose weight fast: jumps of the poses.
 _OUTLIER_SIGMAS = 4.0
+#: Standard deviations beyond which rotation and offset count as not observed.
+_OPEN_ROTATION_RAD, _OPEN_OFFSET_S = 0.2, 0.1
 
 
-@dataclass(frozen=True, kw_only=True)
-class AlignOptions:
-    """How the clocks of camera and IMU are brought together."""
-
-    max_offset_s: float | None = None
-    """Largest offset between raw stamps to consider; 1 for a shared clock. Without it, every offset is searched."""
-
-    min_overlap: float = 0.25
-    """Smallest part of the shorter recording that the other one must cover for an offset to be considered."""
-
-    min_log_likelihood: float = 12.0
-    """How much likelier, in nats, the offset must be than the next best one and than no relation at all.
-
-    Where two recordings have nothing in common, the gap between the best offset and the next is distributed roughly
-    as an exponential of mean one, so that 12 would be exceeded 6 times in a million.
-    """
-
-    min_explained: float = 0.75
-    """Smallest part of the camera's rotation over 0.3 s that the gyroscope must explain."""
-
-
-def calibration_prior(
-    *,
-    cam_from_imu_xyzw: Array | None = None,
-    rotation_sigma_rad: float = 0.02,
-    gyro_time_offset_s: float | None = None,
-    gyro_time_offset_sigma_s: float = 0.05,
-    accel_minus_gyro_offset_s: float = 0.0,
-    accel_minus_gyro_offset_sigma_s: float = 0.02,
-    gyro_bias_rad_s: Array | None = None,
-    gyro_bias_sigma_rad_s: float = 0.2,
-    imu_in_cam_m: Array | None = None,
-    imu_in_cam_sigma_m: float | None = None,
-    readout_s: float | None = None,
-    readout_sigma_s: float | None = None,
+def refine_alignment(
+    trajectory: CameraTrajectory, imu: ImuRecording, start: ClockFit, prior: CameraImuCalibration
 ) -> CameraImuCalibration:
-    """A calibration of which only some entries are known; the rest stays wide.
-
-    Parameters
-    ----------
-    cam_from_imu_xyzw, rotation_sigma_rad
-        Rotation and its standard deviation about each axis. Unknown: 10 rad, which says nothing.
-    gyro_time_offset_s, gyro_time_offset_sigma_s
-        Between raw stamps. Unknown: ``10 * UNKNOWN_OFFSET_S``.
-    accel_minus_gyro_offset_s, accel_minus_gyro_offset_sigma_s
-        Accelerometer against gyroscope; both sensors usually sit in one chip but pass different filters.
-    gyro_bias_rad_s, gyro_bias_sigma_rad_s
-        IMU frame.
-    imu_in_cam_m, imu_in_cam_sigma_m
-        Lever arm, camera frame. Unknown: 0 +- 0.08 m, as in phones and tablets; known: +- 0.005 m.
-    readout_s, readout_sigma_s
-        Rolling-shutter readout. Unknown: 0 +- 0.02 s; known: +- 0.0005 s.
-    """
-    offset_sigma = 10 * UNKNOWN_OFFSET_S if gyro_time_offset_s is None else gyro_time_offset_sigma_s
-    lever_sigma = imu_in_cam_sigma_m or (0.08 if imu_in_cam_m is None else 0.005)
-    readout_sigma = readout_sigma_s or (0.02 if readout_s is None else 0.0005)
-    sigmas = np.array(
-        [
-            *[10.0 if cam_from_imu_xyzw is None else rotation_sigma_rad] * 3,
-            *(offset_sigma, np.hypot(offset_sigma, accel_minus_gyro_offset_sigma_s)),
-            *[gyro_bias_sigma_rad_s] * 3,
-            *[lever_sigma] * 3,
-            readout_sigma,
-        ]
-    )
-    cov = np.diag(sigmas**2)
-    cov[3, 4] = cov[4, 3] = offset_sigma**2
-    offset = gyro_time_offset_s or 0.0
-    return CameraImuCalibration(
-        cam_from_imu_xyzw=np.array([0.0, 0.0, 0.0, 1.0]) if cam_from_imu_xyzw is None else cam_from_imu_xyzw,
-        gyro_time_offset_s=offset,
-        accel_time_offset_s=offset + accel_minus_gyro_offset_s,
-        gyro_bias_rad_s=np.zeros(3) if gyro_bias_rad_s is None else gyro_bias_rad_s,
-        imu_in_cam_m=np.zeros(3) if imu_in_cam_m is None else imu_in_cam_m,
-        readout_s=readout_s or 0.0,
-        cov=cov,
-    )
-
-
-def align_camera_imu(
-    trajectory: CameraTrajectory,
-    imu: ImuRecording,
-    *,
-    prior: CameraImuCalibration | None = None,
-    options: AlignOptions | None = None,
-) -> CameraImuCalibration:
-    """Rotation, time offset and gyroscope bias between a camera and an IMU.
+    """Gauss-Newton on the rotations between consecutive frames, with their noise estimated along the way.
 
     Parameters
     ----------
     trajectory
-        At least five poses; only their rotations are used. Video and keyframes seconds apart both serve.
+        Frames far enough apart to have turned by more than the noise of a pose.
     imu
-        Only the gyroscope is used.
+        Its gyroscope.
+    start
+        Where to start: the offset to within a tenth of a second.
     prior
-        What is known beforehand (``calibration_prior`` builds one). Its lever arm, readout and accelerometer delay
-        pass through; a time offset with a standard deviation below ``UNKNOWN_OFFSET_S`` narrows the search to five
-        standard deviations. Where the search cannot find the rotation by itself, a known rotation is held.
-    options
-        Search range and thresholds.
-
-    Returns
-    -------
-    A calibration with covariance in the order of ``CALIBRATION_PARAMETERS``. The covariance is that of generalised
-    least squares with pose noise (white, per frame) and gyroscope noise (random walk) estimated from the residuals,
-    widened per parameter to what the scatter between twelve parts of the recording shows: errors of a real camera
-    (rolling shutter above all) are not white. It describes the very rotations that were used here: as a prior of a
-    second estimate from the same recording it would count them twice.
+        Takes part as a measurement; its entries that the rotations say nothing about pass through.
 
     Raises
     ------
     NotObservableError
-        Where no offset is clearly better than the rest (another recording's IMU, no rotation, rotation that repeats
-        itself), where the recordings cannot overlap, or where turning about one axis only leaves the rotation open.
+        Where the rotation about some axis, or the offset, stays open.
     """
-    options = options or AlignOptions()
-    prior = prior or calibration_prior()
-    if len(trajectory) < 5:
-        raise NotObservableError("time offset", f"{len(trajectory)} poses are too few to compare with the gyroscope")
-    start = _search(trajectory, imu, prior, options)
-    keep = spaced_frames(trajectory.t_s, _SPACING_S)
-    return _refine(trajectory.select(keep), imu, start, prior)
-
-
-def _search(
-    trajectory: CameraTrajectory, imu: ImuRecording, prior: CameraImuCalibration, options: AlignOptions
-) -> ClockFit:
-    """The coarse fit, or the reason why there is none."""
-    shift_s = clock_shift_s(trajectory, imu)
-    lowest_s, highest_s = -np.inf, np.inf
-    if options.max_offset_s is not None:
-        lowest_s, highest_s = shift_s - options.max_offset_s, shift_s + options.max_offset_s
-    sigma_s = prior.sigma("gyro_time_offset_s")
-    if sigma_s < UNKNOWN_OFFSET_S:
-        centre_s = prior.gyro_time_offset_s + shift_s
-        lowest_s, highest_s = max(lowest_s, centre_s - 5 * sigma_s), min(highest_s, centre_s + 5 * sigma_s)
-    intervals = intervals_of(trajectory, _SPACING_S)
-    turned = np.linalg.norm(intervals.turn_rad, axis=1).sum()
-    path = GyroPath(imu.gyro_t_s, imu.gyro_rad_s, np.zeros(3))
-    rotation_known = max(prior.sigma(f"rotation_{axis}_rad") for axis in "xyz") < 0.2
-    for held in (None, prior.cam_from_imu_xyzw) if rotation_known else (None,):
-        fits = search_offsets(
-            intervals,
-            path,
-            lowest_s=lowest_s,
-            highest_s=highest_s,
-            min_overlap=options.min_overlap,
-            cam_from_imu_xyzw=held,
-        )
-        if not fits:
-            raise NotObservableError(
-                "time offset",
-                "camera and IMU do not overlap at any offset that is allowed: check the clocks"
-                + (
-                    f", or allow more than {options.max_offset_s:g} s between them"
-                    if options.max_offset_s is not None
-                    else " and the lengths of the recordings"
-                ),
-            )
-        best = fits[0]
-        rival = max(0.0, *(fit.log_likelihood for fit in fits[1:])) if len(fits) > 1 else 0.0
-        explained = explained_at(intervals_of(trajectory, _CHECK_SPACING_S), path, best.offset_s, held)
-        if best.log_likelihood - rival >= options.min_log_likelihood and explained >= options.min_explained:
-            return best
-    duration_s = float(trajectory.t_s[-1] - trajectory.t_s[0])
-    if turned < 0.02 * duration_s + 0.05:
-        hint = "the camera hardly rotates: turn it about all three axes while recording"
-        raise NotObservableError("camera-IMU rotation", hint)
-    within = "" if options.max_offset_s is None else f" within {options.max_offset_s:g} s"
-    if best.explained > options.min_explained and rival > 0:
-        hint = (
-            f"the rotations fit almost as well at another offset{within}: record longer, with rotation that does not "
-            "repeat itself"
-        )
-    else:
-        hint = (
-            f"at no offset{within} does the gyroscope fit the camera's rotations clearly better than at the rest "
-            f"(it explains {100 * max(best.explained, 0):.0f} %): check that this IMU recording belongs to these "
-            "images, or record longer with rotation about all three axes"
-        )
-    raise NotObservableError("time offset", hint)
-
-
-def _refine(
-    trajectory: CameraTrajectory, imu: ImuRecording, start: ClockFit, prior: CameraImuCalibration
-) -> CameraImuCalibration:
-    """Gauss-Newton on the rotations between consecutive frames, with their noise estimated along the way."""
     shift_s = clock_shift_s(trajectory, imu)
     prior_mean, prior_info = _prior_of_fitted(prior, start, shift_s)
     rotation, offset_s, bias = start.cam_from_imu_xyzw, start.offset_s, start.gyro_bias_rad_s
@@ -269,13 +95,13 @@ def _refine(
             break
     cov = _widened(cov, white_residual, white_jacobian, dt_s)
     axis_sigma = float(np.sqrt(np.linalg.eigvalsh(cov[:3, :3])[-1]))
-    if axis_sigma > 0.2:
+    if axis_sigma > _OPEN_ROTATION_RAD:
         hint = (
             f"known to no better than {np.degrees(axis_sigma):.0f} deg about one axis: turn the camera about at least "
             "two axes while recording"
         )
         raise NotObservableError("camera-IMU rotation", hint)
-    if cov[3, 3] > 0.1**2 or abs(offset_s - start.offset_s) > 0.5:
+    if cov[3, 3] > _OPEN_OFFSET_S**2 or abs(offset_s - start.offset_s) > 0.5:
         hint = "the rotation is too slow to place the clocks to a tenth of a second: turn the camera more briskly"
         raise NotObservableError("time offset", hint)
     return _completed(prior, rotation, offset_s - shift_s, bias, cov)

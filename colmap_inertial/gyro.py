@@ -1,4 +1,4 @@
-"""The gyroscope integrated to orientations that can be read at any instant; shared by alignment and smoothing."""
+"""The gyroscope integrated to orientations that can be read at any instant; for alignment and smoothing."""
 
 from __future__ import annotations
 
