@@ -30,7 +30,8 @@ def up_in_imu(imu: ImuRecording, gyro_bias_rad_s: Array, query_s: Array, accel_d
 
     Returns
     -------
-    (Q, 3) unit vectors. A device that accelerates by 0.2 m/s2 on average over six seconds tilts them by 1 degree.
+    (Q, 3) unit vectors. An acceleration of 0.2 m/s2 on average over six seconds tilts them by 1 degree, and so does an
+    accelerometer bias of that size, which no averaging removes.
     """
     t = imu.gyro_t_s
     rate = imu.gyro_rad_s - gyro_bias_rad_s

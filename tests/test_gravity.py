@@ -1,0 +1,55 @@
+"""Gravity directions against a simulated recording whose attitude is known."""
+
+import numpy as np
+import pytest
+
+from colmap_inertial.geometry import quat_rotate
+from colmap_inertial.gravity import gravity_in_cam, up_in_imu
+from colmap_inertial.simulate import RecordingOptions, simulate_recording
+from colmap_inertial.types import FrameTiming, ImuRecording
+
+
+def true_down_in_cam(recording):
+    """From the simulated poses (milliradians of noise) and the model's true gravity."""
+    truth = recording.truth
+    down_in_world = np.array([0, 0, -1.0])
+    down_in_model = quat_rotate(truth.model_from_world_xyzw, down_in_world)
+    return quat_rotate(recording.trajectory.cam_from_world_xyzw, down_in_model)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_gravity_in_the_camera_is_right_but_for_the_accelerometer_s_bias(seed):
+    recording = simulate_recording(RecordingOptions(), seed=seed)
+    trajectory = recording.trajectory
+    timing = FrameTiming(names=trajectory.names, t_s=trajectory.t_s, epoch_ns=trajectory.epoch_ns)
+    found = gravity_in_cam(recording.imu, recording.truth.calibration, timing)
+    assert len(found) == len(trajectory)
+    down = np.array([found[name] for name in trajectory.names])
+    cosine = np.sum(down * true_down_in_cam(recording), axis=1)
+    error_deg = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    bias_deg = np.degrees(np.arcsin(np.linalg.norm(recording.truth.imu_errors.accel_bias_m_s2) / 9.8))
+    assert np.sqrt(np.mean(error_deg**2)) < bias_deg + 0.5
+    assert error_deg.max() < bias_deg + 2.0
+    assert bias_deg < 4
+
+
+def test_frames_that_the_imu_does_not_cover_get_none():
+    recording = simulate_recording(RecordingOptions(), seed=4)
+    trajectory = recording.trajectory
+    late = FrameTiming(names=trajectory.names, t_s=trajectory.t_s + 1e4, epoch_ns=trajectory.epoch_ns)
+    assert gravity_in_cam(recording.imu, recording.truth.calibration, late) == {}
+
+
+def test_a_still_device_shows_the_mean_of_its_accelerometer():
+
+    t = np.arange(400) * 0.01
+    rng = np.random.default_rng(0)
+    still = ImuRecording(
+        gyro_t_s=t,
+        gyro_rad_s=np.full((400, 3), 0.02),
+        accel_t_s=t + 0.004,
+        accel_m_s2=[1.0, -2.0, 9.5] + 0.05 * rng.normal(size=(400, 3)),
+    )
+    up = up_in_imu(still, np.full(3, 0.02), np.array([0.5, 3.0]))
+    expected = np.array([1.0, -2.0, 9.5]) / np.linalg.norm([1.0, -2.0, 9.5])
+    np.testing.assert_allclose(up, [expected, expected], atol=2e-3)
