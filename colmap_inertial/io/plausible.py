@@ -13,6 +13,8 @@ from colmap_inertial.types import Array, ImuRecording
 #: The median of |accelerometer| of a device that is carried or flown stays near gravity: sensors are off by up to 5 %,
 #: and shaking raises it. Measured on the recordings this was tried on: 9.36 to 9.81, and 10.4 in strong shaking.
 GRAVITY_BOUNDS_M_S2 = (7.0, 14.0)
+#: The 5th percentile of |accelerometer| over its median: above 0.75 with gravity, below 0.45 without.
+STEADY_SHARE = 0.6
 #: No gyroscope in phones, cameras or drones measures more than 4000 deg/s = 70 rad/s on an axis.
 LARGEST_RATE_RAD_S = 70.0
 #: Half of a recording faster than a turn in 0.9 s: nobody films like that, but deg/s read as rad/s look like it.
@@ -38,7 +40,8 @@ def check_plausible(imu: ImuRecording, path: Path) -> None:
     check_alive(imu.gyro_rad_s, "gyro", path)
     check_alive(imu.accel_m_s2, "accel", path)
     gyro = float(np.median(np.linalg.norm(imu.gyro_rad_s, axis=1)))
-    accel = float(np.median(np.linalg.norm(imu.accel_m_s2, axis=1)))
+    accel_lengths = np.linalg.norm(imu.accel_m_s2, axis=1)
+    accel = float(np.median(accel_lengths))
     low, high = GRAVITY_BOUNDS_M_S2
     if low < gyro < high and not low < accel < high and accel < LARGEST_MEDIAN_RATE_RAD_S:
         raise FormatError(
@@ -46,7 +49,7 @@ def check_plausible(imu: ImuRecording, path: Path) -> None:
             f"the gyroscope's median length is {gyro:.2f} and the accelerometer's {accel:.2f}: the two sensors are "
             "exchanged; exchange the columns or files of [imu.gyro] and [imu.accel] in capture.toml",
         )
-    check_gravity(accel, path)
+    check_gravity(accel_lengths, path)
     check_rates(imu.gyro_rad_s, path)
 
 
@@ -76,26 +79,34 @@ def check_alive(values: Array, quantity: Quantity, path: Path) -> None:
     )
 
 
-def check_gravity(median_m_s2: float, path: Path) -> None:
-    """Refuse an accelerometer whose median length is not near gravity."""
+def check_gravity(lengths_m_s2: Array, path: Path) -> None:
+    """Refuse an accelerometer whose median length is not near gravity.
+
+    Parameters
+    ----------
+    lengths_m_s2
+        (M,) lengths of the samples.
+    """
     low, high = GRAVITY_BOUNDS_M_S2
-    if low <= median_m_s2 <= high:
+    median, few = (float(value) for value in np.percentile(lengths_m_s2, [50, 5]))
+    if low <= median <= high:
         return
-    found = f"the accelerometer's median length is {median_m_s2:.4g} where gravity gives about 9.8 m/s2"
-    in_g = median_m_s2 * STANDARD_GRAVITY_M_S2
-    if low <= in_g <= high:
+    found = f"the accelerometer's median length is {median:.4g} where gravity gives about 9.8 m/s2"
+    # Gravity keeps the length near its median; what is left without it comes near zero again and again.
+    steady = few > STEADY_SHARE * median
+    if steady and low <= median * STANDARD_GRAVITY_M_S2 <= high:
         raise FormatError(path, f'{found}: the numbers are in g; set unit = "g" under [imu.accel] in capture.toml')
-    if low <= median_m_s2 / STANDARD_GRAVITY_M_S2 <= high:
+    if steady and low <= median / STANDARD_GRAVITY_M_S2 <= high:
         raise FormatError(
             path, f'{found}: m/s2 were converted as if they were g; set unit = "m/s2" under [imu.accel] in capture.toml'
         )
-    if median_m_s2 < low:
+    if not steady:
         raise FormatError(
             path,
-            f"{found}: gravity was taken out (a phone's linear acceleration) or the unit is wrong; record the "
-            "accelerometer with gravity, or set unit under [imu.accel] in capture.toml",
+            f"{found}: gravity was taken out (a phone's linear acceleration); give the accelerometer with gravity in "
+            "[imu.accel]",
         )
-    raise FormatError(path, f"{found}: the unit is wrong or these are raw counts; set unit under [imu.accel]")
+    raise FormatError(path, f"{found}: the unit is wrong, or these are raw counts; set unit under [imu.accel]")
 
 
 def check_rates(gyro_rad_s: Array, path: Path) -> None:
