@@ -87,7 +87,7 @@ def align_camera_imu(
         raise NotObservableError("time offset", f"{len(trajectory)} poses are too few to compare with the gyroscope")
     start = _search(trajectory, imu, prior, options)
     keep = spaced_frames(trajectory.t_s, _SPACING_S)
-    return refine_alignment(trajectory.select(keep), imu, start, prior)
+    return refine_alignment(trajectory.select(keep), imu, start, prior).calibration
 
 
 def _search(

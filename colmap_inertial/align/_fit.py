@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from colmap_inertial.align._clock_search import ClockFit
@@ -30,14 +32,66 @@ _FITTED = np.array([0, 1, 2, 3, 5, 6, 7])
 _OTHERS = np.setdiff1d(np.arange(len(CALIBRATION_PARAMETERS)), _FITTED)
 #: Intervals whose residual is this many times its standard deviation lose weight fast: jumps of the poses.
 _OUTLIER_SIGMAS = 4.0
+_N, _N_NUISANCE = len(_FITTED), 19
+#: Among the nuisance parameters: rotation of the gyroscope in the IMU (camera axes), its gain (xx, yy, zz, yz, xz,
+#: xy of a symmetric matrix), rolling shutter (3, 3), clock rate.
+_MOUNT, _GAIN, _SHUTTER, _RATE = slice(0, 3), slice(3, 9), slice(9, 18), 18
+#: Data sheets: gain within 1 %, axes within half a percent (of a radian). Clocks of action cameras: within 1 %.
+_GAIN_SIGMA, _AXIS_SIGMA, _RATE_SIGMA = 0.01, 0.005 / np.sqrt(2), 0.01
+#: Orientation error of a rolling-shutter frame by angular velocity, in parts of the readout time, computed for
+#: points all over the picture at random depths: a turn about the vertical looks like a roll; along the diagonal it
+#: averages out, because poses hold at the middle row.
+_SHUTTER_SIGMA_DIAGONAL, _SHUTTER_SIGMA_ELSEWHERE = 0.1, 0.4
 #: Standard deviations beyond which rotation and offset count as not observed.
 _OPEN_ROTATION_RAD, _OPEN_OFFSET_S = 0.2, 0.1
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RotationFit:
+    """What the rotations tell.
+
+    Attributes
+    ----------
+    calibration
+        Its time offset holds at ``middle_s``.
+    clock_rate, clock_rate_sigma
+        Change of the time offset in a second: how much the camera's clock runs faster than the IMU's.
+    middle_s
+        The middle of the overlap, camera clock.
+    """
+
+    calibration: CameraImuCalibration
+    clock_rate: float
+    clock_rate_sigma: float
+    middle_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """What Gauss-Newton moves: rotation (xyzw), offset, bias, nuisance parameters."""
+
+    rotation: Array
+    offset_s: float
+    bias: Array
+    nuisance: Array
+
+    def moved(self, step: Array) -> _State:
+        return _State(
+            quat_normalize(quat_multiply(quat_exp(step[:3]), self.rotation)),
+            self.offset_s + float(step[3]),
+            self.bias + step[4:_N],
+            self.nuisance + step[_N:],
+        )
+
+
 def refine_alignment(
     trajectory: CameraTrajectory, imu: ImuRecording, start: ClockFit, prior: CameraImuCalibration
-) -> CameraImuCalibration:
+) -> RotationFit:
     """Gauss-Newton on the rotations between consecutive frames, with their noise estimated along the way.
+
+    Beside rotation, offset and bias, three errors that real devices have are fitted within their usual size, so that
+    the covariance contains them: gain and misalignment of the gyroscope, the rolling shutter's effect on orientations
+    (to first order a matrix times the angular velocity), and the rate of the IMU's clock.
 
     Parameters
     ----------
@@ -56,15 +110,14 @@ def refine_alignment(
         Where the rotation about some axis, or the offset, stays open.
     """
     shift_s = clock_shift_s(trajectory, imu)
-    prior_mean, prior_info = _prior_of_fitted(prior, start, shift_s)
-    rotation, offset_s, bias = start.cam_from_imu_xyzw, start.offset_s, start.gyro_bias_rad_s
-    path = GyroPath(imu.gyro_t_s, imu.gyro_rad_s, bias)
-    path_bias = bias
+    (prior_rotation, prior_offset_s, prior_bias), prior_info = _prior_of_fitted(prior, start, shift_s)
+    state = _State(start.cam_from_imu_xyzw, start.offset_s, start.gyro_bias_rad_s, np.zeros(_N_NUISANCE))
+    middle_s = _middle_of_overlap(trajectory, imu, start.offset_s)
     noise: tuple[float, float] | None = None
     for iteration in range(25):
-        if iteration in (2, 6):  # the path is linear enough in the bias between these
-            path, path_bias = GyroPath(imu.gyro_t_s, imu.gyro_rad_s, bias), bias
-        residual, jacobian, dt_s = _residuals(trajectory, path, rotation, offset_s, bias - path_bias)
+        if iteration in (0, 2, 6):  # the path is linear enough in the bias between these
+            path, path_bias = GyroPath(imu.gyro_t_s, imu.gyro_rad_s, state.bias), state.bias
+        residual, jacobian, dt_s = _residuals(trajectory, path, state, state.bias - path_bias, middle_s)
         if len(residual) < 4:
             raise NotObservableError("time offset", "fewer than four frame intervals lie inside the IMU recording")
         if noise is None:
@@ -79,17 +132,17 @@ def refine_alignment(
         white_residual, white_jacobian = _whiten(residual, jacobian, dt_s, excess, noise)
         from_prior = np.concatenate(
             [
-                quat_log(quat_multiply(rotation, quat_conjugate(prior_mean[0]))),
-                [offset_s - prior_mean[1]],
-                bias - prior_mean[2],
+                quat_log(quat_multiply(state.rotation, quat_conjugate(prior_rotation))),
+                [state.offset_s - prior_offset_s],
+                state.bias - prior_bias,
+                state.nuisance,
             ]
         )
         information = np.einsum("kai,kaj->ij", white_jacobian, white_jacobian)
         gradient = np.einsum("kai,ka->i", white_jacobian, white_residual)
         step = -np.linalg.solve(information + prior_info, gradient + prior_info @ from_prior)
         step[3] = np.clip(step[3], -0.1, 0.1)
-        rotation = quat_normalize(quat_multiply(quat_exp(step[:3]), rotation))
-        offset_s, bias = offset_s + float(step[3]), bias + step[4:]
+        state = state.moved(step)
         cov = np.linalg.inv(information + prior_info)
         if iteration > 8 and np.all(np.abs(step) < 1e-3 * np.sqrt(np.diag(cov))):
             break
@@ -101,10 +154,22 @@ def refine_alignment(
             "two axes while recording"
         )
         raise NotObservableError("camera-IMU rotation", hint)
-    if cov[3, 3] > _OPEN_OFFSET_S**2 or abs(offset_s - start.offset_s) > 0.5:
+    if cov[3, 3] > _OPEN_OFFSET_S**2 or abs(state.offset_s - start.offset_s) > 0.5:
         hint = "the rotation is too slow to place the clocks to a tenth of a second: turn the camera more briskly"
         raise NotObservableError("time offset", hint)
-    return _completed(prior, rotation, offset_s - shift_s, bias, cov)
+    fitted = _completed(prior, state.rotation, state.offset_s - shift_s, state.bias, cov[:_N, :_N])
+    return RotationFit(
+        calibration=fitted,
+        clock_rate=float(state.nuisance[_RATE]),
+        clock_rate_sigma=float(np.sqrt(cov[-1, -1])),
+        middle_s=middle_s,
+    )
+
+
+def _middle_of_overlap(trajectory: CameraTrajectory, imu: ImuRecording, offset_s: float) -> float:
+    begin_s = max(trajectory.t_s[0], imu.gyro_t_s[0] + offset_s)
+    end_s = min(trajectory.t_s[-1], imu.gyro_t_s[-1] + offset_s)
+    return float(0.5 * (begin_s + end_s))
 
 
 def _prior_of_fitted(
@@ -118,34 +183,70 @@ def _prior_of_fitted(
         prior.gyro_time_offset_s + shift_s if offset_known else start.offset_s,
         prior.gyro_bias_rad_s,
     )
-    return mean, np.linalg.inv(prior.cov[np.ix_(_FITTED, _FITTED)])
+    readout_s = float(np.hypot(prior.readout_s, prior.sigma("readout_s")))
+    shutter = np.full((3, 3), _SHUTTER_SIGMA_ELSEWHERE)
+    np.fill_diagonal(shutter, _SHUTTER_SIGMA_DIAGONAL)
+    sigmas = np.concatenate(
+        [
+            *([_AXIS_SIGMA] * 3, [_GAIN_SIGMA] * 3, [_AXIS_SIGMA] * 3),
+            *(readout_s * shutter.ravel() + 1e-6, [_RATE_SIGMA]),
+        ]
+    )
+    info = np.diag(np.concatenate([np.zeros(_N), 1 / sigmas**2]))
+    info[:_N, :_N] = np.linalg.inv(prior.cov[np.ix_(_FITTED, _FITTED)])
+    return mean, info
 
 
 def _residuals(
-    trajectory: CameraTrajectory, path: GyroPath, cam_from_imu: Array, offset_s: float, bias_change: Array
+    trajectory: CameraTrajectory, path: GyroPath, state: _State, bias_change: Array, middle_s: float
 ) -> tuple[Array, Array, Array]:
-    """Gyroscope against camera over the covered intervals: residuals (K, 3) rad, derivatives (K, 3, 7), lengths (K,).
+    """Gyroscope against camera over the covered intervals: residuals (K, 3) rad, derivatives (K, 3, 26), lengths (K,).
 
-    Camera frame at the end of each interval. Columns: rotation, offset, bias.
+    Camera frame at the end of each interval. Columns: rotation, offset, bias, nuisance parameters.
     """
-    t_s = trajectory.t_s - offset_s
+    since_s = trajectory.t_s - middle_s
+    t_s = trajectory.t_s - state.offset_s - state.nuisance[_RATE] * since_s
     covered = path.covers(t_s[:-1], t_s[1:])
     attitude, rate = path.at(t_s)
     lever = path.bias_lever(t_s)
     turn = quat_multiply(quat_conjugate(attitude[:-1]), attitude[1:])
     by_bias = -matrix_from_quat(quat_conjugate(attitude[1:])) @ (lever[1:] - lever[:-1])
-    turn = quat_multiply(turn, quat_exp(by_bias @ bias_change))
-    felt = quat_multiply(quat_multiply(cam_from_imu, turn), quat_conjugate(cam_from_imu))
+    # the gain acts on the rate all along the interval; its mean there will do for so small an effect
+    by_gain = -by_bias @ _by_symmetric(quat_log(turn) / np.diff(t_s)[:, None])
+    change = by_bias @ bias_change + by_gain @ state.nuisance[_GAIN]
+    turn = quat_multiply(turn, quat_exp(change))
+    cam_from_gyro = quat_multiply(quat_exp(state.nuisance[_MOUNT]), state.rotation)
+    felt = quat_multiply(quat_multiply(cam_from_gyro, turn), quat_conjugate(cam_from_gyro))
+    felt_back = matrix_from_quat(quat_conjugate(felt))
     cam_from_world = trajectory.cam_from_world_xyzw
     seen = quat_multiply(cam_from_world[:-1], quat_conjugate(cam_from_world[1:]))
     residual = quat_log(quat_multiply(quat_conjugate(seen), felt))
-    cam_from_imu_matrix = matrix_from_quat(cam_from_imu)
-    jacobian = np.empty((len(residual), 3, 7))
-    jacobian[:, :, :3] = matrix_from_quat(quat_conjugate(felt)) - np.eye(3)
-    turn_back = matrix_from_quat(quat_conjugate(turn))
-    jacobian[:, :, 3] = (np.einsum("kij,kj->ki", turn_back, rate[:-1]) - rate[1:]) @ cam_from_imu_matrix.T
-    jacobian[:, :, 4:] = cam_from_imu_matrix @ by_bias
+    to_cam = matrix_from_quat(cam_from_gyro)
+    rate_in_cam = rate @ to_cam.T
+    # the shutter turns each frame by K rate: K[i, j] acts on axis i by the rate about j
+    by_shutter = np.einsum("ai,kj->kaij", np.eye(3), rate_in_cam).reshape(-1, 3, 9)
+    by_shutter = felt_back @ by_shutter[:-1] - by_shutter[1:]
+    residual += by_shutter @ state.nuisance[_SHUTTER]
+    by_offset = np.einsum("kij,kj->ki", felt_back, rate_in_cam[:-1]) - rate_in_cam[1:]
+    jacobian = np.empty((len(residual), 3, _N + _N_NUISANCE))
+    jacobian[:, :, :3] = jacobian[:, :, _N:][:, :, _MOUNT] = felt_back - np.eye(3)
+    jacobian[:, :, 3] = by_offset
+    jacobian[:, :, 4:_N] = to_cam @ by_bias
+    jacobian[:, :, _N:][:, :, _GAIN] = to_cam @ by_gain
+    jacobian[:, :, _N:][:, :, _SHUTTER] = by_shutter
+    moving = np.einsum("kij,kj->ki", felt_back, rate_in_cam[:-1] * since_s[:-1, None])
+    jacobian[:, :, _N + _RATE] = moving - rate_in_cam[1:] * since_s[1:, None]
     return residual[covered], jacobian[covered], np.diff(trajectory.t_s)[covered]
+
+
+def _by_symmetric(rate: Array) -> Array:
+    """(K, 3, 6) derivatives of ``S rate`` by the entries xx, yy, zz, yz, xz, xy of a symmetric matrix S."""
+    out = np.zeros((len(rate), 3, 6))
+    for axis in range(3):
+        out[:, axis, axis] = rate[:, axis]
+    for entry, (i, j) in enumerate(((1, 2), (0, 2), (0, 1)), start=3):
+        out[:, i, entry], out[:, j, entry] = rate[:, j], rate[:, i]
+    return out
 
 
 def _bands(dt_s: Array, excess: Array, noise: tuple[float, float]) -> Array:
