@@ -1,15 +1,21 @@
 """Numbers that no IMU can give are refused with the setting that corrects them; honest ones never are."""
 
+import re
 from dataclasses import replace
-from itertools import pairwise
+from itertools import pairwise, permutations, product
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
 
 from colmap_inertial.errors import FormatError
 from colmap_inertial.io.imu import read_imu
-from colmap_inertial.io.plausible import check_plausible, check_rates
+from colmap_inertial.io.plausible import check_consistent, check_plausible, check_rates
+from colmap_inertial.io.units import Axes
+from colmap_inertial.simulate.imu import IMU_PRESETS
+from colmap_inertial.simulate.motion import MotionKind, MotionOptions
+from colmap_inertial.simulate.recording import RecordingOptions, simulate_recording
 from colmap_inertial.types import ImuRecording
 
 RECORDINGS = [*(f"inertial_scale/D{i}" for i in (1, 3, 5, 7, 9, 11, 13, 15)), "euroc_v101"]
@@ -77,11 +83,81 @@ def test_every_altered_recording_is_refused_with_what_to_set(
         check_plausible(ALTERATIONS[said](recordings[name]), Path("x"))
 
 
-@pytest.mark.parametrize("seconds", [60.0, 5.0, 1.0])
+@pytest.mark.parametrize("seconds", [60.0, 25.0, 5.0, 1.0])
 def test_no_part_of_a_clean_recording_is_refused(recordings: dict[str, ImuRecording], seconds: float) -> None:
     for imu in recordings.values():
         for part in pieces(imu, seconds):
             check_plausible(part, Path("x"))
+
+
+HANDHELD = RECORDINGS[:-1]
+SIGNED_PERMUTATIONS = [
+    np.eye(3)[list(order)] * np.array(signs)[:, None]
+    for order in permutations(range(3))
+    for signs in product((1.0, -1.0), repeat=3)
+]
+
+
+def settings(message: str) -> dict[str, Axes]:
+    """The axes that a message says to set, by sensor."""
+    named: dict[str, Axes] = {}
+    for text, mirrored, sensor in re.findall(
+        r'axes = "([-xyz,]+)"( and mirrored = true)? under \[imu\.(\w+)\]', message
+    ):
+        axes = Axes.parse(text)
+        assert axes.is_mirrored == bool(mirrored)
+        named.setdefault(sensor, axes)
+    return named
+
+
+@pytest.mark.parametrize("name", HANDHELD)
+def test_nearly_every_wrong_axis_of_a_gyroscope_is_noticed_and_named_rightly(
+    recordings: dict[str, ImuRecording], name: str
+) -> None:
+    imu = recordings[name]
+    noticed = 0
+    for wrong in SIGNED_PERMUTATIONS[1:]:
+        altered = replace(imu, gyro_rad_s=imu.gyro_rad_s @ wrong.T)
+        try:
+            check_plausible(altered, Path("x"))
+        except FormatError as error:
+            noticed += 1
+            np.testing.assert_array_equal(settings(str(error))["gyro"].matrix @ wrong, np.eye(3))
+    assert noticed >= 45  # of 47; turns about the horizontal axis that the hand nods about look alike
+
+
+def test_a_mirrored_accelerometer_is_noticed_and_named(recordings: dict[str, ImuRecording]) -> None:
+    noticed = {}
+    for axis in range(3):
+        mirror = np.ones(3)
+        mirror[axis] = -1
+        noticed[axis] = 0
+        for name in HANDHELD:
+            imu = recordings[name]
+            try:
+                check_plausible(replace(imu, accel_m_s2=imu.accel_m_s2 * mirror), Path("x"))
+            except FormatError as error:
+                noticed[axis] += 1
+                np.testing.assert_array_equal(settings(str(error))["accel"].matrix, np.diag(mirror))
+    # These hands nod about y, which hides half a turn about it in six recordings.
+    assert noticed == {0: 8, 1: 2, 2: 8}
+
+
+def test_axes_to_set_replace_those_that_were_set(recordings: dict[str, ImuRecording]) -> None:
+    imu = recordings["inertial_scale/D1"]
+    wrong = Axes.parse("-z,y,x")
+    altered = replace(imu, gyro_rad_s=wrong.apply(imu.gyro_rad_s))
+    with pytest.raises(FormatError) as caught:
+        check_plausible(altered, Path("x"), gyro_axes=wrong)
+    assert str(settings(str(caught.value))["gyro"]) == "x,y,z"
+
+
+@pytest.mark.parametrize("name", HANDHELD)
+def test_a_wrong_unit_of_a_slow_gyroscope_is_noticed_by_gravity(recordings: dict[str, ImuRecording], name: str) -> None:
+    imu = recordings[name]
+    for factor, unit in ((180 / np.pi, "deg/s"), (np.pi / 180, "rad/s")):
+        with pytest.raises(FormatError, match=f'unit = "{unit}" under'):
+            check_consistent(replace(imu, gyro_rad_s=imu.gyro_rad_s * factor), Path("x"))
 
 
 def test_a_gyroscope_in_a_moving_car_and_one_in_strong_shake_are_accepted(shared_data: Path) -> None:
@@ -95,6 +171,14 @@ def test_a_gyroscope_in_a_moving_car_and_one_in_strong_shake_are_accepted(shared
         ),
         Path("x"),
     )
+
+
+def test_no_simulated_recording_is_refused() -> None:
+    kinds = get_args(MotionKind)
+    for seed in range(6 * len(kinds)):
+        motion = MotionOptions(kind=kinds[seed % len(kinds)], duration_s=(60, 30, 20)[seed % 3])
+        imu = list(IMU_PRESETS.values())[seed // len(kinds) % len(IMU_PRESETS)]
+        check_plausible(simulate_recording(RecordingOptions(motion=motion, imu=imu), seed=seed).imu, Path("x"))
 
 
 def test_a_still_camera_is_accepted() -> None:

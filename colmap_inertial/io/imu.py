@@ -88,7 +88,7 @@ def read_capture_imu(capture: Capture) -> ImuRecording:
         accel_m_s2=imu.accel_m_s2 if source.accel_axes is None else source.accel_axes.apply(imu.accel_m_s2),
         noise=imu.noise if source.noise is None else source.noise,
     )
-    check_plausible(imu, path)
+    check_plausible(imu, path, gyro_axes=source.gyro_axes, accel_axes=source.accel_axes)
     return imu
 
 

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from colmap_inertial.errors import FormatError
-from colmap_inertial.io.units import SENSOR_NAMES, STANDARD_GRAVITY_M_S2, Quantity
+from colmap_inertial.io.consistency import better_readings
+from colmap_inertial.io.units import SENSOR_NAMES, STANDARD_GRAVITY_M_S2, Axes, Quantity
 from colmap_inertial.types import Array, ImuRecording
 
 #: The median of |accelerometer| of a device that is carried or flown stays near gravity: sensors are off by up to 5 %,
@@ -21,7 +22,9 @@ LARGEST_RATE_RAD_S = 70.0
 LARGEST_MEDIAN_RATE_RAD_S = 7.0
 
 
-def check_plausible(imu: ImuRecording, path: Path) -> None:
+def check_plausible(
+    imu: ImuRecording, path: Path, *, gyro_axes: Axes | None = None, accel_axes: Axes | None = None
+) -> None:
     """Refuse a recording whose numbers cannot be rad/s and m/s2 of a working IMU.
 
     Parameters
@@ -30,12 +33,14 @@ def check_plausible(imu: ImuRecording, path: Path) -> None:
         The recording as read.
     path
         Where it came from, for the message.
+    gyro_axes, accel_axes
+        Mappings of axes that were applied already, so that the message can name the ones to write in their place.
 
     Raises
     ------
     FormatError
-        For deg/s, g, exchanged sensors, missing gravity, a dead sensor or axis. The message says what was found, what
-        is expected, and what to write in capture.toml.
+        For deg/s, g, exchanged sensors, missing gravity, a dead sensor or axis, axes of one sensor that do not match
+        the other's. The message says what was found, what is expected, and what to write in capture.toml.
     """
     check_alive(imu.gyro_rad_s, "gyro", path)
     check_alive(imu.accel_m_s2, "accel", path)
@@ -51,6 +56,7 @@ def check_plausible(imu: ImuRecording, path: Path) -> None:
         )
     check_gravity(accel_lengths, path)
     check_rates(imu.gyro_rad_s, path)
+    check_consistent(imu, path, gyro_axes=gyro_axes, accel_axes=accel_axes)
 
 
 def check_alive(values: Array, quantity: Quantity, path: Path) -> None:
@@ -121,3 +127,42 @@ def check_rates(gyro_rad_s: Array, path: Path) -> None:
         f'a sensor ends at {LARGEST_RATE_RAD_S:g}): the numbers are in deg/s; set unit = "deg/s" under [imu.gyro] in '
         "capture.toml",
     )
+
+
+def check_consistent(
+    imu: ImuRecording, path: Path, *, gyro_axes: Axes | None = None, accel_axes: Axes | None = None
+) -> None:
+    """Refuse a gyroscope that clearly fits the accelerometer better with other axes or in another unit."""
+    readings = better_readings(imu)
+    if not readings:
+        return
+    best = readings[0]
+    found = "seen from the turning gyroscope gravity does not stand still, but would"
+    if best.factor < 1:
+        raise FormatError(
+            path,
+            f'{found} if the gyroscope\'s numbers were in deg/s: set unit = "deg/s" under [imu.gyro] in capture.toml',
+        )
+    if best.factor > 1:
+        raise FormatError(
+            path,
+            f'{found} at 57.3 times the rate: rad/s were converted as if they were deg/s; set unit = "rad/s" under '
+            "[imu.gyro] in capture.toml",
+        )
+    stated = {"gyro": gyro_axes, "accel": accel_axes}
+
+    def setting(quantity: Quantity, matrix: Array) -> str:
+        before = stated[quantity]
+        axes = Axes(matrix=matrix if before is None else matrix @ before.matrix)
+        return f'axes = "{axes}"{" and mirrored = true" if axes.is_mirrored else ""} under [imu.{quantity}]'
+
+    what = "mirrored" if np.linalg.det(best.matrix) < 0 else "turned against the accelerometer's"
+    hint = f"set {setting('gyro', best.matrix)} in capture.toml"
+    kept = np.diag(best.matrix)
+    if np.abs(kept).all() and what != "mirrored":
+        # Half a turn of the gyroscope and a mirrored accelerometer look the same from here.
+        axis = "xyz"[int(np.argmax(kept))]
+        hint += f", or, if it is the accelerometer's {axis} axis that is mirrored, {setting('accel', -best.matrix)}"
+    for other in readings[1:3]:
+        hint += f"; hardly less likely: {setting('gyro', other.matrix)}"
+    raise FormatError(path, f"{found} if the gyroscope's axes are {what}: {hint}")

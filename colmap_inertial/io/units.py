@@ -108,13 +108,8 @@ class Axes:
         return values @ self.matrix.T
 
     def __str__(self) -> str:
-        return axes_text(self.matrix)
-
-
-def axes_text(matrix: NDArray[np.float64]) -> str:
-    """The text that :meth:`Axes.parse` reads, of a signed permutation matrix."""
-    index = np.argmax(np.abs(matrix), axis=1)
-    return ",".join(("-" if matrix[row, i] < 0 else "") + "xyz"[i] for row, i in enumerate(index))
+        index = np.argmax(np.abs(self.matrix), axis=1)
+        return ",".join(("-" if self.matrix[row, i] < 0 else "") + "xyz"[i] for row, i in enumerate(index))
 
 
 def stamps_ns(
