@@ -2,26 +2,30 @@
 
 Step 1 of Mustaniemi et al., "Inertial-based scale estimation for structure from motion on mobile devices" (IROS 2017),
 with three changes. Every offset at which the two recordings could coincide is searched, because clock origins are
-arbitrary. Rotations over intervals between frames are compared instead of differentiated orientations, so that video
-and sparse keyframes are treated alike. And a result is refused where no offset is clearly better than the rest.
+arbitrary, and clocks may run at different rates. Rotations over intervals between frames are compared instead of
+differentiated orientations, so that video and sparse keyframes are treated alike. And a result is refused where no
+offset is clearly better than the rest.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from colmap_inertial.align._clock_search import ClockFit, explained_at, intervals_of, search_offsets, spaced_frames
-from colmap_inertial.align._fit import refine_alignment
-from colmap_inertial.align._prior import UNKNOWN_OFFSET_S, calibration_prior
+from colmap_inertial.align._fit import UNKNOWN_OFFSET_S, Alignment, middle_of_overlap, refine_alignment
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.gyro import GyroPath
+from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.types import CameraImuCalibration, CameraTrajectory, ImuRecording, clock_shift_s
 
 #: Frames closer together than the first have turned by less than the noise of their poses; over the second, the noise
 #: of poses is small against the rotation that is to be explained.
 _SPACING_S, _CHECK_SPACING_S = 0.1, 0.3
+#: Where the clocks drift apart too far for one offset, parts of this length still have one; how many of them are
+#: tried; the largest drift (action cameras: 1 %), and how far the parts may lie off a steady drift.
+_PART_S, _PARTS, _FASTEST_DRIFT, _UNSTEADY_S = 15.0, 8, 0.02, 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,6 +58,20 @@ def align_camera_imu(
 ) -> CameraImuCalibration:
     """Rotation, time offset and gyroscope bias between a camera and an IMU.
 
+    As :func:`align_clocks`, without the clock rate: for clocks that keep step, which all but action cameras' do.
+    """
+    return align_clocks(trajectory, imu, prior=prior, options=options).calibration
+
+
+def align_clocks(
+    trajectory: CameraTrajectory,
+    imu: ImuRecording,
+    *,
+    prior: CameraImuCalibration | None = None,
+    options: AlignOptions | None = None,
+) -> Alignment:
+    """Rotation, time offset, clock rate and gyroscope bias between a camera and an IMU.
+
     Parameters
     ----------
     trajectory
@@ -61,19 +79,20 @@ def align_camera_imu(
     imu
         Only the gyroscope is used.
     prior
-        What is known beforehand (``calibration_prior`` builds one). Its lever arm, readout and accelerometer delay
-        pass through; a time offset with a standard deviation below ``UNKNOWN_OFFSET_S`` narrows the search to five
-        standard deviations. Where the search cannot find the rotation by itself, a known rotation is held.
+        What is known beforehand (``io.calibration.calibration_prior`` builds one). Its lever arm, readout and
+        accelerometer delay pass through; a time offset with a standard deviation below ``UNKNOWN_OFFSET_S`` narrows
+        the search to two standard deviations (and 0.05 s). Where the search cannot find the rotation by itself, a
+        known rotation is held.
     options
         Search range and thresholds.
 
     Returns
     -------
-    A calibration with covariance in the order of ``CALIBRATION_PARAMETERS``. The covariance is that of generalised
-    least squares with pose noise (white, per frame) and gyroscope noise (random walk) estimated from the residuals,
-    widened per parameter to what the scatter between twelve parts of the recording shows: errors of a real camera
-    (rolling shutter above all) are not white. It describes the very rotations that were used here: as a prior of a
-    second estimate from the same recording it would count them twice.
+    The calibration has a covariance in the order of ``CALIBRATION_PARAMETERS``. It is that of generalised least
+    squares with pose noise (white, per frame) and gyroscope noise (random walk) estimated from the residuals, and
+    with gyroscope gain, misalignment, rolling shutter and clock rate as nuisance parameters; then widened per
+    parameter to what the scatter between twelve parts of the recording shows. It describes the very rotations that
+    were used here: as a prior of a second estimate from the same recording it would count them twice.
 
     Raises
     ------
@@ -85,26 +104,44 @@ def align_camera_imu(
     prior = prior or calibration_prior()
     if len(trajectory) < 5:
         raise NotObservableError("time offset", f"{len(trajectory)} poses are too few to compare with the gyroscope")
-    start = _search(trajectory, imu, prior, options)
+    lowest_s, highest_s = _range(trajectory, imu, prior, options)
+    path = GyroPath(imu.gyro_t_s, imu.gyro_rad_s, np.zeros(3))
+    rate = 0.0
+    start = _search(trajectory, path, lowest_s, highest_s, prior, options)
+    if isinstance(start, NotObservableError):
+        drifting = _search_parts(trajectory, path, lowest_s, highest_s, prior, options)
+        if drifting is None:
+            raise start
+        start, rate = drifting
     keep = spaced_frames(trajectory.t_s, _SPACING_S)
-    return refine_alignment(trajectory.select(keep), imu, start, prior).calibration
+    return refine_alignment(trajectory.select(keep), imu, start, prior, clock_rate=rate)
 
 
-def _search(
+def _range(
     trajectory: CameraTrajectory, imu: ImuRecording, prior: CameraImuCalibration, options: AlignOptions
-) -> ClockFit:
-    """The coarse fit, or the reason why there is none."""
+) -> tuple[float, float]:
+    """Lowest and highest offset between times since the two epochs."""
     shift_s = clock_shift_s(trajectory, imu)
     lowest_s, highest_s = -np.inf, np.inf
     if options.max_offset_s is not None:
         lowest_s, highest_s = shift_s - options.max_offset_s, shift_s + options.max_offset_s
     sigma_s = prior.sigma("gyro_time_offset_s")
     if sigma_s < UNKNOWN_OFFSET_S:
-        centre_s = prior.gyro_time_offset_s + shift_s
-        lowest_s, highest_s = max(lowest_s, centre_s - 5 * sigma_s), min(highest_s, centre_s + 5 * sigma_s)
+        centre_s, reach_s = prior.gyro_time_offset_s + shift_s, 2 * sigma_s + 0.05
+        lowest_s, highest_s = max(lowest_s, centre_s - reach_s), min(highest_s, centre_s + reach_s)
+    return lowest_s, highest_s
+
+
+def _search(
+    trajectory: CameraTrajectory,
+    path: GyroPath,
+    lowest_s: float,
+    highest_s: float,
+    prior: CameraImuCalibration,
+    options: AlignOptions,
+) -> ClockFit | NotObservableError:
+    """The coarse fit, or the reason why there is none."""
     intervals = intervals_of(trajectory, _SPACING_S)
-    turned = np.linalg.norm(intervals.turn_rad, axis=1).sum()
-    path = GyroPath(imu.gyro_t_s, imu.gyro_rad_s, np.zeros(3))
     rotation_known = max(prior.sigma(f"rotation_{axis}_rad") for axis in "xyz") < 0.2
     for held in (None, prior.cam_from_imu_xyzw) if rotation_known else (None,):
         fits = search_offsets(
@@ -116,37 +153,67 @@ def _search(
             cam_from_imu_xyzw=held,
         )
         if not fits:
-            raise NotObservableError(
+            return NotObservableError(
                 "time offset",
-                "camera and IMU do not overlap at any offset that is allowed: check the clocks"
-                + (
-                    f", or allow more than {options.max_offset_s:g} s between them"
-                    if options.max_offset_s is not None
-                    else " and the lengths of the recordings"
-                ),
+                "camera and IMU do not overlap at any offset that is allowed: check that the recordings belong "
+                "together and that their clocks are what was declared",
             )
         best = fits[0]
-        rival = max(0.0, *(fit.log_likelihood for fit in fits[1:])) if len(fits) > 1 else 0.0
+        rival = max([0.0, *(fit.log_likelihood for fit in fits[1:])])
         explained = explained_at(intervals_of(trajectory, _CHECK_SPACING_S), path, best.offset_s, held)
         if best.log_likelihood - rival >= options.min_log_likelihood and explained >= options.min_explained:
             return best
+    turned_rad = float(np.linalg.norm(intervals.turn_rad, axis=1).sum())
     duration_s = float(trajectory.t_s[-1] - trajectory.t_s[0])
-    if turned < 0.02 * duration_s + 0.05:
+    if turned_rad < 0.02 * duration_s + 0.05:
         hint = "the camera hardly rotates: turn it about all three axes while recording"
-        raise NotObservableError("camera-IMU rotation", hint)
-    within = "" if options.max_offset_s is None else f" within {options.max_offset_s:g} s"
-    if best.explained > options.min_explained and rival > 0:
+        return NotObservableError("camera-IMU rotation", hint)
+    if explained >= options.min_explained:
         hint = (
-            f"the rotations fit almost as well at another offset{within}: record longer, with rotation that does not "
-            "repeat itself"
+            "the rotations fit almost as well at another offset: record longer, with rotation that does not repeat "
+            "itself"
         )
     else:
         hint = (
-            f"at no offset{within} does the gyroscope fit the camera's rotations clearly better than at the rest "
-            f"(it explains {100 * max(best.explained, 0):.0f} %): check that this IMU recording belongs to these "
+            "at no offset does the gyroscope fit the camera's rotations clearly better than at the rest "
+            f"(it explains {100 * max(explained, 0):.0f} % of them): check that this IMU recording belongs to these "
             "images, or record longer with rotation about all three axes"
         )
-    raise NotObservableError("time offset", hint)
+    return NotObservableError("time offset", hint)
 
 
-__all__ = ["UNKNOWN_OFFSET_S", "AlignOptions", "align_camera_imu", "calibration_prior"]
+def _search_parts(
+    trajectory: CameraTrajectory,
+    path: GyroPath,
+    lowest_s: float,
+    highest_s: float,
+    prior: CameraImuCalibration,
+    options: AlignOptions,
+) -> tuple[ClockFit, float] | None:
+    """Offset in the middle and clock rate from short parts, if at least two of them agree on a steady drift."""
+    t_s = trajectory.t_s
+    if t_s[-1] - t_s[0] < 2 * _PART_S:
+        return None
+    found: list[tuple[float, ClockFit]] = []
+    for begin_s in np.linspace(t_s[0], t_s[-1] - _PART_S, _PARTS):
+        part = trajectory.select((t_s >= begin_s) & (t_s <= begin_s + _PART_S))
+        if len(part) >= 5:
+            fit = _search(part, path, lowest_s, highest_s, prior, options)
+            if isinstance(fit, ClockFit):
+                found.append((begin_s + 0.5 * _PART_S, fit))
+    best: tuple[int, float, float] | None = None
+    for i, (time_i, fit_i) in enumerate(found):
+        for time_j, fit_j in found[i + 1 :]:
+            rate = (fit_j.offset_s - fit_i.offset_s) / (time_j - time_i)
+            at_zero_s = fit_i.offset_s - rate * time_i
+            agreeing = sum(abs(fit.offset_s - at_zero_s - rate * time) < _UNSTEADY_S for time, fit in found)
+            if abs(rate) <= _FASTEST_DRIFT and (best is None or agreeing > best[0]):
+                best = (agreeing, rate, at_zero_s)
+    if best is None or best[0] < max(2, (len(found) + 1) // 2):
+        return None
+    _, rate, at_zero_s = best
+    middle_s = middle_of_overlap(trajectory, path.t_s, at_zero_s + rate * 0.5 * float(t_s[0] + t_s[-1]))
+    return replace(found[0][1], offset_s=at_zero_s + rate * middle_s), rate
+
+
+__all__ = ["UNKNOWN_OFFSET_S", "AlignOptions", "Alignment", "align_camera_imu", "align_clocks"]

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from colmap_inertial.align._clock_search import ClockFit
-from colmap_inertial.align._prior import UNKNOWN_OFFSET_S
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.geometry import (
     matrix_from_quat,
@@ -27,6 +26,8 @@ from colmap_inertial.types import (
     clock_shift_s,
 )
 
+#: A time offset with at least this standard deviation is unknown: its value carries nothing.
+UNKNOWN_OFFSET_S = 1e3
 #: Columns of the refinement among ``CALIBRATION_PARAMETERS``: rotation, gyroscope offset, gyroscope bias.
 _FITTED = np.array([0, 1, 2, 3, 5, 6, 7])
 _OTHERS = np.setdiff1d(np.arange(len(CALIBRATION_PARAMETERS)), _FITTED)
@@ -47,23 +48,47 @@ _OPEN_ROTATION_RAD, _OPEN_OFFSET_S = 0.2, 0.1
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class RotationFit:
-    """What the rotations tell.
+class Alignment:
+    """What the rotations tell about camera and IMU.
 
     Attributes
     ----------
     calibration
-        Its time offset holds at ``middle_s``.
+        Its time offsets hold at ``middle_s``.
     clock_rate, clock_rate_sigma
-        Change of the time offset in a second: how much the camera's clock runs faster than the IMU's.
+        Change of the time offset per second: how much the camera's clock runs faster than the IMU's.
     middle_s
-        The middle of the overlap, camera clock.
+        The middle of the overlap, camera clock, since the trajectory's epoch.
     """
 
     calibration: CameraImuCalibration
     clock_rate: float
     clock_rate_sigma: float
     middle_s: float
+
+    def on_camera_rate(self, imu: ImuRecording, *, trajectory_epoch_ns: int) -> ImuRecording:
+        """The recording with stamps that keep step with the camera; ``calibration`` then holds throughout.
+
+        Parameters
+        ----------
+        imu
+            The recording that was aligned.
+        trajectory_epoch_ns
+            Epoch of the trajectory that it was aligned with.
+        """
+        offset_s = self.calibration.gyro_time_offset_s + (imu.epoch_ns - trajectory_epoch_ns) * 1e-9
+        middle_s = self.middle_s - offset_s
+
+        def stretched(t_s: Array) -> Array:
+            return np.asarray(middle_s + (t_s - middle_s) / (1 - self.clock_rate))
+
+        note = f"stamps stretched by {1e6 * self.clock_rate:+.0f} ppm to keep step with the camera"
+        return replace(
+            imu,
+            gyro_t_s=stretched(imu.gyro_t_s),
+            accel_t_s=stretched(imu.accel_t_s),
+            repairs=(*imu.repairs, note),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +110,13 @@ class _State:
 
 
 def refine_alignment(
-    trajectory: CameraTrajectory, imu: ImuRecording, start: ClockFit, prior: CameraImuCalibration
-) -> RotationFit:
+    trajectory: CameraTrajectory,
+    imu: ImuRecording,
+    start: ClockFit,
+    prior: CameraImuCalibration,
+    *,
+    clock_rate: float = 0.0,
+) -> Alignment:
     """Gauss-Newton on the rotations between consecutive frames, with their noise estimated along the way.
 
     Beside rotation, offset and bias, three errors that real devices have are fitted within their usual size, so that
@@ -100,9 +130,11 @@ def refine_alignment(
     imu
         Its gyroscope.
     start
-        Where to start: the offset to within a tenth of a second.
+        Where to start: the offset in the middle, to within a tenth of a second.
     prior
         Takes part as a measurement; its entries that the rotations say nothing about pass through.
+    clock_rate
+        Where to start: change of the offset per second.
 
     Raises
     ------
@@ -112,7 +144,8 @@ def refine_alignment(
     shift_s = clock_shift_s(trajectory, imu)
     (prior_rotation, prior_offset_s, prior_bias), prior_info = _prior_of_fitted(prior, start, shift_s)
     state = _State(start.cam_from_imu_xyzw, start.offset_s, start.gyro_bias_rad_s, np.zeros(_N_NUISANCE))
-    middle_s = _middle_of_overlap(trajectory, imu, start.offset_s)
+    state.nuisance[_RATE] = clock_rate
+    middle_s = middle_of_overlap(trajectory, imu.gyro_t_s, start.offset_s)
     noise: tuple[float, float] | None = None
     for iteration in range(25):
         if iteration in (0, 2, 6):  # the path is linear enough in the bias between these
@@ -158,7 +191,7 @@ def refine_alignment(
         hint = "the rotation is too slow to place the clocks to a tenth of a second: turn the camera more briskly"
         raise NotObservableError("time offset", hint)
     fitted = _completed(prior, state.rotation, state.offset_s - shift_s, state.bias, cov[:_N, :_N])
-    return RotationFit(
+    return Alignment(
         calibration=fitted,
         clock_rate=float(state.nuisance[_RATE]),
         clock_rate_sigma=float(np.sqrt(cov[-1, -1])),
@@ -166,9 +199,10 @@ def refine_alignment(
     )
 
 
-def _middle_of_overlap(trajectory: CameraTrajectory, imu: ImuRecording, offset_s: float) -> float:
-    begin_s = max(trajectory.t_s[0], imu.gyro_t_s[0] + offset_s)
-    end_s = min(trajectory.t_s[-1], imu.gyro_t_s[-1] + offset_s)
+def middle_of_overlap(trajectory: CameraTrajectory, imu_t_s: Array, offset_s: float) -> float:
+    """The middle of what both recorded, camera clock."""
+    begin_s = max(trajectory.t_s[0], imu_t_s[0] + offset_s)
+    end_s = min(trajectory.t_s[-1], imu_t_s[-1] + offset_s)
     return float(0.5 * (begin_s + end_s))
 
 
