@@ -93,3 +93,17 @@ def test_inertial_scale_poses_turn_with_its_gyroscope(shared_data: Path) -> None
             at = np.interp(trajectory.t_s[:-1], imu.gyro_t_s - offset_s, gyro)
             best = max(best, np.corrcoef(np.convolve(at, kernel, "same"), speed)[0, 1])
         assert best > 0.9, folder.name
+
+
+def test_a_capture_file_corrects_the_units_of_an_inertial_scale_folder(shared_data: Path, tmp_path: Path) -> None:
+    source = shared_data / "inertial_scale/D1"
+    rows = np.loadtxt(source / "accelerometer.txt")
+    for name in ("gyroscope.txt", "poses.txt"):
+        (tmp_path / name).write_bytes((source / name).read_bytes())
+    with open(tmp_path / "accelerometer.txt", "w") as file:
+        for stamp, *xyz in rows.tolist():
+            print(int(stamp), *(repr(value / 9.80665) for value in xyz), file=file)
+    with pytest.raises(FormatError, match=r'set unit = "g" under \[imu.accel\] in capture.toml'):
+        read_inertial_scale(tmp_path)
+    (tmp_path / "capture.toml").write_text('[imu]\npath = "."\n[imu.accel]\nunit = "g"\n')
+    np.testing.assert_allclose(read_inertial_scale(tmp_path)[1].accel_m_s2, rows[:, 1:], rtol=1e-12)

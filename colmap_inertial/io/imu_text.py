@@ -16,19 +16,11 @@ from colmap_inertial.io.tables import Table, read_table
 from colmap_inertial.io.units import SENSOR_NAMES, SENSOR_UNITS, DeclaredUnits, Quantity, seconds, to_si
 from colmap_inertial.types import Array, ImuNoise, ImuRecording
 
-_HOW_TO_DESCRIBE = """write a capture.toml beside it with
-[imu.gyro]
-file = "{name}"
-time = 1                 # column, counted from 1, or its name
-time_unit = "s"          # s, ms, us or ns
-columns = [2, 3, 4]      # x, y, z
-unit = "rad/s"           # rad/s or deg/s
-[imu.accel]
-file = "{name}"
-time = 1
-time_unit = "s"
-columns = [5, 6, 7]
-unit = "m/s2"            # m/s2 or g"""
+_HOW_TO_DESCRIBE = (
+    'describe the file in a capture.toml: [imu.gyro] file = "{name}", time = 1, time_unit = "s", columns = [2, 3, 4], '
+    'unit = "rad/s"; [imu.accel] the same with columns = [5, 6, 7], unit = "m/s2" (columns count from 1; time_unit s, '
+    "ms, us or ns; unit rad/s or deg/s, m/s2 or g; each key on a line of its own)"
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,7 +139,7 @@ def _read_csv(path: Path, units: DeclaredUnits, noise: ImuNoise | None) -> ImuRe
         columns = [recognise(cell) for cell in table.header]
     except ValueError as error:
         raise FormatError(path, f"{error}; {how}") from None
-    shown = f"the header is: {table.header_text[:300]}\n{how}"
+    shown = f"the header is: {table.header_text[:300]}; {how}"
     place: dict[tuple[str, int], int] = {}
     for index, column in enumerate(columns):
         if column is None:

@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 from colmap_inertial.errors import FormatError, TimingError
 from colmap_inertial.geometry import quat_conjugate, quat_normalize
 from colmap_inertial.io.files import write_text
-from colmap_inertial.io.imu_text import read_inertial_scale_imu
-from colmap_inertial.io.plausible import check_plausible
+from colmap_inertial.io.imu import read_imu
 from colmap_inertial.io.tables import Table, read_table
-from colmap_inertial.io.units import DeclaredUnits, seconds
+from colmap_inertial.io.units import seconds
 from colmap_inertial.types import Array, CameraTrajectory, ImuRecording
 
 
@@ -68,7 +67,8 @@ def read_inertial_scale(folder: Path) -> tuple[CameraTrajectory, ImuRecording]:
     ----------
     folder
         ``poses.txt`` has rows ``t_ns x y z qw qx qy qz``: the camera's centre (model units), rotation
-        camera_from_world. The sensors have rows ``t_ns x y z`` in rad/s and m/s2, on a clock of their own.
+        camera_from_world. The sensors have rows ``t_ns x y z`` in rad/s and m/s2, on a clock of their own. A
+        capture.toml in the folder is heeded: ``[imu] path = "."`` with other units or axes corrects the sensors.
 
     Raises
     ------
@@ -76,8 +76,7 @@ def read_inertial_scale(folder: Path) -> tuple[CameraTrajectory, ImuRecording]:
         As :func:`read_imu` and :func:`read_tum`.
     """
     folder = Path(folder)
-    imu = read_inertial_scale_imu(folder, DeclaredUnits())
-    check_plausible(imu, folder)
+    imu = read_imu(folder)
     table = read_table(folder / "poses.txt")
     _require_width(table, "t_ns x y z qw qx qy qz")
     numbers = _finite(table, [1, 2, 3, 5, 6, 7, 4])

@@ -33,11 +33,12 @@ def video_stamps_ns(path: Path) -> NDArray[np.int64]:
     """
     container, stream = _open(path)
     with container:
-        packets = [packet for packet in _guarded(path, container.demux(stream)) if packet.size > 0]
+        packets = _guarded(path, container.demux(stream))
+        found = [(packet.pts, packet.is_discard) for packet in packets if packet.size > 0]
         listed, time_base = stream.frames, stream.time_base
-        stamps = [packet.pts for packet in packets if not packet.is_discard]
-    if len(packets) < listed:
-        raise FormatError(path, f"is cut off: it holds {len(packets)} of the {listed} frames that its index lists")
+    if len(found) < listed:
+        raise FormatError(path, f"is cut off: it holds {len(found)} of the {listed} frames that its index lists")
+    stamps = [stamp for stamp, is_discarded in found if not is_discarded]
     if not stamps:
         raise FormatError(path, "holds no video frames")
     known = [stamp for stamp in stamps if stamp is not None]
