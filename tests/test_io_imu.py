@@ -124,6 +124,10 @@ def test_sensors_of_two_rates_in_one_table_keep_their_own_times(tmp_path: Path) 
     imu = read_imu(write_csv(tmp_path / "mixed.csv", lines))
     assert (len(imu.gyro_t_s), len(imu.accel_t_s)) == (40, 20)
     np.testing.assert_array_equal(imu.accel_m_s2, accel[::3])
+    assert imu.repairs == (
+        "mixed.csv: 20 of 60 rows hold no gyroscope sample",
+        "mixed.csv: 40 of 60 rows hold no accelerometer sample",
+    )
 
 
 @pytest.mark.parametrize(

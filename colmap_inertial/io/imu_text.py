@@ -169,16 +169,7 @@ def _read_csv(path: Path, units: DeclaredUnits, noise: ImuNoise | None) -> ImuRe
     t_ns = table.stamps_ns(place["time", 0], unit("time", 1, None))
     numbers = table.numbers([place[sensor, axis] for sensor in ("gyro", "accel") for axis in range(3)])
     gyro, accel = to_si(numbers[:, :3], "gyro", gyro_unit), to_si(numbers[:, 3:], "accel", accel_unit)
-    # Loggers that write both sensors to one table leave the cells of the other one empty.
-    no_gyro, no_accel = np.asarray(np.isnan(gyro).all(axis=1)), np.asarray(np.isnan(accel).all(axis=1))
-    only_gyro, only_accel = no_accel & ~no_gyro, no_gyro & ~no_accel
-    if only_gyro.any() and only_accel.any() and (only_gyro | only_accel).mean() > 0.5:
-        kept_gyro, kept_accel = ~only_accel, ~only_gyro
-    else:
-        kept_gyro = kept_accel = np.ones(len(t_ns), dtype=bool)
-    return _recording(
-        _ordered(table, "gyro", t_ns, gyro, kept_gyro), _ordered(table, "accel", t_ns, accel, kept_accel), noise=noise
-    )
+    return _recording(_ordered(table, "gyro", t_ns, gyro), _ordered(table, "accel", t_ns, accel), noise=noise)
 
 
 def _read_described(source: SensorTable, quantity: Quantity) -> Samples:
@@ -203,13 +194,8 @@ def column_index(table: Table, column: str | int) -> int:
     return table.header.index(column)
 
 
-def _ordered(
-    table: Table, quantity: Quantity, t_ns: NDArray[np.int64], values: Array, kept: NDArray[np.bool_] | None = None
-) -> Samples:
-    numbers = table.line_numbers
-    if kept is not None:
-        t_ns, values, numbers = t_ns[kept], values[kept], numbers[kept]
-    samples = order_samples(table.path, SENSOR_NAMES[quantity], t_ns, values, numbers)
+def _ordered(table: Table, quantity: Quantity, t_ns: NDArray[np.int64], values: Array) -> Samples:
+    samples = order_samples(table.path, SENSOR_NAMES[quantity], t_ns, values, table.line_numbers)
     return Samples(t_ns=samples.t_ns, values=samples.values, repairs=table.repairs + samples.repairs)
 
 

@@ -45,8 +45,8 @@ def order_samples(
 ) -> Samples:
     """Sort, merge and drop what is harmless.
 
-    Rows with missing values are dropped, rows up to half a second late are sorted in, rows that repeat a stamp are
-    merged (equal values) or averaged (different ones); each is listed.
+    Rows without a sample, and a few with missing values, are dropped; rows up to half a second late are sorted in; rows
+    that repeat a stamp are merged (equal values) or averaged (different ones). Each is listed.
 
     Parameters
     ----------
@@ -63,6 +63,11 @@ def order_samples(
         For stamps that run backwards, jump back, repeat often, or cannot be in the stated unit.
     """
     repairs: list[str] = []
+    # Loggers that write sensors of different rates to one table leave the cells of the others empty.
+    absent = np.asarray(np.isnan(values).all(axis=1))
+    if absent.any():
+        repairs.append(f"{path.name}: {int(absent.sum())} of {len(absent)} rows hold no {what} sample")
+        t_ns, values, line_numbers = t_ns[~absent], values[~absent], line_numbers[~absent]
     finite = np.asarray(np.isfinite(values).all(axis=1))
     if not finite.all():
         missing, first = int((~finite).sum()), int(line_numbers[np.argmin(finite)])

@@ -40,7 +40,8 @@ _ALIASES = {
     **dict.fromkeys(("us", "µs", "μs", "usec", "microseconds"), "us"),
     **dict.fromkeys(("ns", "nsec", "nanoseconds"), "ns"),
 }
-_LARGEST_STAMP_NS = 9_000_000_000_000_000_000
+# Differences of two stamps must fit 64 bits as well.
+_LARGEST_STAMP_NS = 4_500_000_000_000_000_000
 
 
 def unit_of(text: str) -> str | None:
@@ -131,7 +132,7 @@ def stamps_ns(
     FormatError
         For a token that is not a decimal number.
     TimingError
-        For a stamp beyond what nanoseconds in 64 bits can hold (292 years).
+        For a stamp beyond what differences in 64-bit nanoseconds can hold (142 years from the clock's zero).
     """
     factor = TIME_UNITS_NS[unit]
     joined = "".join(tokens)
@@ -154,6 +155,6 @@ def stamps_ns(
         bad = next(i for i, value in enumerate(values) if not -_LARGEST_STAMP_NS < value < _LARGEST_STAMP_NS)
         where = "" if line_numbers is None else f", line {line_numbers[bad]}"
         raise TimingError(
-            f"{path}{where}: time stamp {tokens[bad][:40]} {unit} is beyond 285 years; check the time unit"
+            f"{path}{where}: time stamp {tokens[bad][:40]} {unit} is beyond 142 years; check the time unit"
         )
     return np.array(values, dtype=np.int64)
