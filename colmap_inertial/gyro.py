@@ -56,16 +56,35 @@ class GyroPath:
         A change ``db`` of the bias turns the interval from i to j, seen in the IMU frame at j, by
         ``-R_j' (A_j - A_i) db`` with A these integrals.
         """
-        rotation, lever = self._levers
         i, since_s, _ = self._locate(query_s)
         here = matrix_from_quat(self.at(query_s)[0])
-        return np.asarray(lever[i] + 0.5 * (rotation[i] + here) * since_s[:, None, None])
+        return np.asarray(self._levers[i] + 0.5 * (self._rotation[i] + here) * since_s[:, None, None])
+
+    def gain_lever(self, query_s: Array) -> Array:
+        """(M, 3, 6) integrals of ``start_from_imu S rate`` for symmetric ``S`` with a one in xx, yy, zz, yz, xz, xy.
+
+        A gain error S (the true rate is ``(I + S) rate``) turns the interval from i to j by ``R_j' (G_j - G_i) S``.
+        """
+        i, since_s, rate = self._locate(query_s)
+        here = matrix_from_quat(self.at(query_s)[0]) @ _by_symmetric(rate)
+        before = self._rotation[i] @ _by_symmetric(self.rate_rad_s[i])
+        return np.asarray(self._gain_levers[i] + 0.5 * (before + here) * since_s[:, None, None])
 
     @cached_property
-    def _levers(self) -> tuple[Array, Array]:
-        rotation = matrix_from_quat(self.start_from_imu_xyzw)
-        steps = 0.5 * (rotation[1:] + rotation[:-1]) * self._step_s[:, None, None]
-        return rotation, np.concatenate([np.zeros((1, 3, 3)), np.cumsum(steps, axis=0)])
+    def _rotation(self) -> Array:
+        return matrix_from_quat(self.start_from_imu_xyzw)
+
+    @cached_property
+    def _levers(self) -> Array:
+        return self._integral(self._rotation)
+
+    @cached_property
+    def _gain_levers(self) -> Array:
+        return self._integral(self._rotation @ _by_symmetric(self.rate_rad_s))
+
+    def _integral(self, values: Array) -> Array:
+        steps = 0.5 * (values[1:] + values[:-1]) * self._step_s[:, None, None]
+        return np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(steps, axis=0)])
 
     def _locate(self, query_s: Array) -> tuple[NDArray[np.intp], Array, Array]:
         i = np.clip(np.searchsorted(self.t_s, query_s, side="right") - 1, 0, len(self.t_s) - 2)
@@ -73,3 +92,13 @@ class GyroPath:
         # outside the recording the rate stays at the end's instead of running away
         fraction = np.clip(since_s / self._step_s[i], 0.0, 1.0)[:, None]
         return i, since_s, self.rate_rad_s[i] + fraction * (self.rate_rad_s[i + 1] - self.rate_rad_s[i])
+
+
+def _by_symmetric(rate: Array) -> Array:
+    """(K, 3, 6) derivatives of ``S rate`` by the entries xx, yy, zz, yz, xz, xy of a symmetric matrix S."""
+    out = np.zeros((len(rate), 3, 6))
+    for axis in range(3):
+        out[:, axis, axis] = rate[:, axis]
+    for entry, (i, j) in enumerate(((1, 2), (0, 2), (0, 1)), start=3):
+        out[:, i, entry], out[:, j, entry] = rate[:, j], rate[:, i]
+    return out

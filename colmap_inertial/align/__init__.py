@@ -27,6 +27,9 @@ _SPACING_S, _CHECK_SPACING_S = 0.1, 0.3
 #: tried; the largest drift (action cameras: 1 %), and how far the parts may lie off a steady drift.
 _PART_S, _PARTS, _FASTEST_DRIFT, _UNSTEADY_S = 15.0, 8, 0.02, 0.2
 
+#: Rotation within a second, rms, below which the camera counts as still: what noise of poses looks like.
+_STILL_RAD_RTS = 0.015
+
 
 @dataclass(frozen=True, kw_only=True)
 class AlignOptions:
@@ -163,9 +166,8 @@ def _search(
         explained = explained_at(intervals_of(trajectory, _CHECK_SPACING_S), path, best.offset_s, held)
         if best.log_likelihood - rival >= options.min_log_likelihood and explained >= options.min_explained:
             return best
-    turned_rad = float(np.linalg.norm(intervals.turn_rad, axis=1).sum())
-    duration_s = float(trajectory.t_s[-1] - trajectory.t_s[0])
-    if turned_rad < 0.02 * duration_s + 0.05:
+    seconds = intervals_of(trajectory, 1.0)
+    if np.sqrt(np.mean(np.sum(seconds.turn_rad**2, axis=1) / seconds.dt_s)) < _STILL_RAD_RTS:
         hint = "the camera hardly rotates: turn it about all three axes while recording"
         return NotObservableError("camera-IMU rotation", hint)
     if explained >= options.min_explained:

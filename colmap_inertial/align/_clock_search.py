@@ -22,8 +22,9 @@ from colmap_inertial.types import Array, CameraTrajectory
 DENSE_S = 0.25
 #: Steps between offsets of the two coarse searches. Hand motion decorrelates within some 0.3 s.
 _GRID_S, _SCAN_S = 0.05, 0.04
-#: Intervals that the coarse search of sparse frames uses, and those that compare the candidates.
-_SCAN_INTERVALS, _COMPARED_INTERVALS = 128, 2000
+#: Most and fewest intervals that the coarse search of sparse frames uses, its budget of intervals times offsets, and
+#: the intervals that compare the candidates.
+_SCAN_INTERVALS, _SCAN_FEWEST, _SCAN_BUDGET, _COMPARED_INTERVALS = 128, 40, 2_000_000, 2000
 #: Peaks of the coarse search that are compared closely, and how far apart two of them are at least.
 _PEAKS, _PEAK_DISTANCE_S = 4, 0.5
 #: Longest rotation of one interval that still has a reliable rotation vector (the sign flips at pi).
@@ -264,9 +265,11 @@ def _scan(
     intervals: Intervals, path: GyroPath, lowest_s: float, highest_s: float, min_overlap: float, rotation: Array | None
 ) -> tuple[Array, Array, float]:
     """Gain at a range of offsets, for sparse frames, from the rotations over the very intervals."""
-    some = intervals.select(_evenly(len(intervals), _SCAN_INTERVALS))
-    begin_s, end_s = some.begin_s[0], some.end_s[-1]
     grid = np.arange(path.t_s[0], path.t_s[-1], _SCAN_S)
+    offsets = len(grid) + (intervals.end_s[-1] - intervals.begin_s[0]) / _SCAN_S
+    wanted = int(np.clip(_SCAN_BUDGET / offsets, _SCAN_FEWEST, _SCAN_INTERVALS))
+    some = intervals.select(_evenly(len(intervals), wanted))
+    begin_s, end_s = some.begin_s[0], some.end_s[-1]
     attitude = path.at(grid)[0]
     start = np.round((some.begin_s - begin_s) / _SCAN_S).astype(np.intp)
     end = np.round((some.end_s - begin_s) / _SCAN_S).astype(np.intp)
@@ -274,8 +277,8 @@ def _scan(
     offset_s = begin_s - grid[0] - lag * _SCAN_S
     needed_s = min_overlap * min(float(end_s - begin_s), float(path.t_s[-1] - path.t_s[0])) * some.dt_s.sum()
     needed_s /= float(end_s - begin_s)
-    wanted = (offset_s >= lowest_s - _SCAN_S) & (offset_s <= highest_s + _SCAN_S)
-    offset_s, lag = offset_s[wanted], lag[wanted]
+    allowed = (offset_s >= lowest_s - _SCAN_S) & (offset_s <= highest_s + _SCAN_S)
+    offset_s, lag = offset_s[allowed], lag[allowed]
     effective = _effective_intervals(some)
     gain = np.full(len(lag), np.nan)
     for chunk in range(0, len(lag), 256):

@@ -242,11 +242,10 @@ def _residuals(
     t_s = trajectory.t_s - state.offset_s - state.nuisance[_RATE] * since_s
     covered = path.covers(t_s[:-1], t_s[1:])
     attitude, rate = path.at(t_s)
-    lever = path.bias_lever(t_s)
+    to_end = matrix_from_quat(quat_conjugate(attitude[1:]))
+    by_bias = -to_end @ np.diff(path.bias_lever(t_s), axis=0)
+    by_gain = to_end @ np.diff(path.gain_lever(t_s), axis=0)
     turn = quat_multiply(quat_conjugate(attitude[:-1]), attitude[1:])
-    by_bias = -matrix_from_quat(quat_conjugate(attitude[1:])) @ (lever[1:] - lever[:-1])
-    # the gain acts on the rate all along the interval; its mean there will do for so small an effect
-    by_gain = -by_bias @ _by_symmetric(quat_log(turn) / np.diff(t_s)[:, None])
     change = by_bias @ bias_change + by_gain @ state.nuisance[_GAIN]
     turn = quat_multiply(turn, quat_exp(change))
     cam_from_gyro = quat_multiply(quat_exp(state.nuisance[_MOUNT]), state.rotation)
@@ -271,16 +270,6 @@ def _residuals(
     moving = np.einsum("kij,kj->ki", felt_back, rate_in_cam[:-1] * since_s[:-1, None])
     jacobian[:, :, _N + _RATE] = moving - rate_in_cam[1:] * since_s[1:, None]
     return residual[covered], jacobian[covered], np.diff(trajectory.t_s)[covered]
-
-
-def _by_symmetric(rate: Array) -> Array:
-    """(K, 3, 6) derivatives of ``S rate`` by the entries xx, yy, zz, yz, xz, xy of a symmetric matrix S."""
-    out = np.zeros((len(rate), 3, 6))
-    for axis in range(3):
-        out[:, axis, axis] = rate[:, axis]
-    for entry, (i, j) in enumerate(((1, 2), (0, 2), (0, 1)), start=3):
-        out[:, i, entry], out[:, j, entry] = rate[:, j], rate[:, i]
-    return out
 
 
 def _bands(dt_s: Array, excess: Array, noise: tuple[float, float]) -> Array:
