@@ -1,1 +1,131 @@
 """Metres per model unit from inertial data."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from colmap_inertial.align import AlignOptions, align_camera_imu
+from colmap_inertial.errors import NotObservableError
+from colmap_inertial.scale.verdict import verdict_of
+from colmap_inertial.types import CameraImuCalibration, CameraTrajectory, ImuRecording, ScaleEstimate
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScaleOptions:
+    """How the scale is estimated."""
+
+    method: Literal["joint", "spectral"] = "joint"
+    """joint fits all measurements at once, video or keyframes; spectral is the thesis method, for video."""
+
+    gravity_m_s2: float = 9.80665
+    """Strength of gravity where the recording was made."""
+
+    max_offset_s: float | None = None
+    """Largest offset between the clocks of camera and IMU; 1 for a shared clock. Without it, all are searched."""
+
+
+def gravity_at_latitude_m_s2(latitude_deg: float) -> float:
+    """Normal gravity on the WGS 84 ellipsoid at sea level: Somigliana's formula (NIMA TR8350.2, section 4)."""
+    if not -90 <= latitude_deg <= 90:
+        raise ValueError(f"latitude_deg must be from -90 to 90, not {latitude_deg}")
+    sine_squared = np.sin(np.radians(latitude_deg)) ** 2
+    numerator = 9.7803253359 * (1 + 0.00193185265241 * sine_squared)
+    return float(numerator / np.sqrt(1 - 0.00669437999014 * sine_squared))
+
+
+def first_seconds(trajectory: CameraTrajectory, seconds: float) -> CameraTrajectory:
+    """The frames of the first ``seconds`` of a trajectory; nothing of later ones remains."""
+    return trajectory.select(trajectory.t_s <= trajectory.t_s[0] + seconds)
+
+
+def check_units(imu: ImuRecording) -> list[str]:
+    """What makes an IMU recording's numbers implausible as rad/s and m/s2; empty where nothing does.
+
+    Readers of files raise their own errors before; this guards arrays that come from elsewhere.
+    """
+    out = []
+    accel = float(np.median(np.linalg.norm(imu.accel_m_s2, axis=1)))
+    if not 7.0 < accel < 14.0:
+        hint = "gravity was removed: record the raw accelerometer"
+        if 0.7 < accel < 1.4:
+            hint = "it is in g: multiply it by 9.80665"
+        elif accel > 500:
+            hint = "it is in mg or raw counts: convert it to m/s2"
+        out.append(f"the accelerometer's median length is {accel:.3g} m/s2 instead of about 9.8; {hint}")
+    gyro = float(np.median(np.linalg.norm(imu.gyro_rad_s, axis=1)))
+    if gyro > 7.0:
+        out.append(f"the gyroscope's median rate is {gyro:.3g} rad/s; it is in deg/s: multiply it by pi / 180")
+    return out
+
+
+def estimate_scale(
+    trajectory: CameraTrajectory,
+    imu: ImuRecording,
+    *,
+    calibration: CameraImuCalibration | None = None,
+    options: ScaleOptions | None = None,
+) -> ScaleEstimate:
+    """Metres per unit of a camera trajectory, from the IMU that was recorded along.
+
+    Parameters
+    ----------
+    trajectory
+        Poses of a reconstruction with their times.
+    imu
+        Recording of the same device; its clock may differ by any offset.
+    calibration
+        What is known of the device (``align.calibration_prior``); unknown entries wide.
+    options
+        Method, gravity, range of clock offsets.
+
+    Returns
+    -------
+    The estimate with a verdict. Data that cannot give a scale give the verdict ``"refused"`` with reasons, not an
+    exception.
+    """
+    options = options or ScaleOptions()
+    begin_s = time.perf_counter()
+    problems = check_units(imu)
+    if problems:
+        estimate = _refused(options.method, *problems)
+    else:
+        try:
+            aligned = align_camera_imu(
+                trajectory, imu, prior=calibration, options=AlignOptions(max_offset_s=options.max_offset_s)
+            )
+            estimate = _estimate(trajectory, imu, aligned, options)
+        except NotObservableError as error:
+            estimate = _refused(options.method, f"{error.quantity}: {error.hint}")
+    return replace(estimate, runtime_s=time.perf_counter() - begin_s)
+
+
+def _estimate(
+    trajectory: CameraTrajectory, imu: ImuRecording, calibration: CameraImuCalibration, options: ScaleOptions
+) -> ScaleEstimate:
+    if options.method == "spectral":
+        from colmap_inertial.scale.spectral import SpectralOptions, estimate_spectral
+
+        return estimate_spectral(trajectory, imu, calibration, SpectralOptions(gravity_m_s2=options.gravity_m_s2))
+    from colmap_inertial.scale.joint import JointOptions, estimate_joint
+
+    return estimate_joint(trajectory, imu, calibration, JointOptions(gravity_m_s2=options.gravity_m_s2))
+
+
+def _refused(method: str, *reasons: str) -> ScaleEstimate:
+    return ScaleEstimate(
+        metres_per_unit=None, sigma_log=None, ci95=None, verdict="refused", method=method, reasons=reasons
+    )
+
+
+__all__ = [
+    "ScaleOptions",
+    "check_units",
+    "estimate_scale",
+    "first_seconds",
+    "gravity_at_latitude_m_s2",
+    "verdict_of",
+]

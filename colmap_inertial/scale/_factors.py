@@ -1,0 +1,307 @@
+"""Residuals of the joint model with their derivatives, all divided by their standard deviations.
+
+Rotations change on the right (``R exp(d)``, body frame), cam_from_imu on the left (camera frame), the scale through
+``u`` = assumed over true metres per unit, all else by addition.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from colmap_inertial.geometry import skew, so3_log
+from colmap_inertial.scale import _parameters as par
+from colmap_inertial.scale._parameters import Data, Estimate, Noise, Prior
+from colmap_inertial.scale._preintegration import Preintegrated, preintegrate
+from colmap_inertial.scale._solver import ArrowSystem
+from colmap_inertial.types import Array
+
+#: Cauchy scale of the visual residuals, in standard deviations: a normal error loses 4 % of its weight on average.
+ROBUST_SIGMAS = 4.0
+
+
+@dataclass(eq=False, kw_only=True)
+class Group:
+    """Residuals of one kind.
+
+    Attributes
+    ----------
+    residual
+        (N, r).
+    here, after
+        (N, r, m) derivatives by the states ``first .. first + N`` and by the ones after them.
+    by_globals
+        (N, r, g) derivatives by the globals ``columns``.
+    weight
+        (N,) robust weights, already contained in the rest.
+    """
+
+    residual: Array
+    here: Array
+    after: Array | None = None
+    by_globals: Array | None = None
+    columns: slice = field(default_factory=lambda: slice(0, 0))
+    weight: Array | None = None
+    first: int = 0
+
+    def apply(self, states: Array, z: Array) -> Array:
+        """(N, r, q) changes of the residuals under q steps: states (K, m, q), globals (n, q)."""
+        n = len(self.residual)
+        out = self.here @ states[self.first : self.first + n]
+        if self.after is not None:
+            out += self.after @ states[self.first + 1 : self.first + 1 + n]
+        if self.by_globals is not None:
+            out += self.by_globals @ z[self.columns]
+        return np.asarray(out)
+
+    def pull_back(self, values: Array, states: Array, z: Array) -> None:
+        """Add the transposed derivative times ``values`` (N, r, q) to ``states`` (K, m, q) and ``z`` (n, q)."""
+        n = len(self.residual)
+        states[self.first : self.first + n] += self.here.transpose(0, 2, 1) @ values
+        if self.after is not None:
+            states[self.first + 1 : self.first + 1 + n] += self.after.transpose(0, 2, 1) @ values
+        if self.by_globals is not None:
+            flat = self.by_globals.reshape(-1, self.by_globals.shape[2])
+            z[self.columns] += flat.T @ values.reshape(len(flat), -1)
+
+    def add_to(self, system: ArrowSystem) -> None:
+        """Add the group's information."""
+        n = len(self.residual)
+        now, then = slice(self.first, self.first + n), slice(self.first + 1, self.first + 1 + n)
+        here_t = self.here.transpose(0, 2, 1)
+        system.diagonal[now] += here_t @ self.here
+        if self.by_globals is not None:
+            system.border[now, :, self.columns] += here_t @ self.by_globals
+            flat = self.by_globals.reshape(-1, self.by_globals.shape[2])
+            system.corner[self.columns, self.columns] += flat.T @ flat
+        if self.after is not None:
+            after_t = self.after.transpose(0, 2, 1)
+            system.diagonal[then] += after_t @ self.after
+            system.below[self.first : self.first + n] += after_t @ self.here
+            if self.by_globals is not None:
+                system.border[then, :, self.columns] += after_t @ self.by_globals
+
+
+def _mv(matrices: Array, vectors: Array) -> Array:
+    return np.asarray((matrices @ vectors[:, :, None])[:, :, 0])
+
+
+def integrate(data: Data, x: Estimate) -> Preintegrated:
+    """Preintegration between the nodes at the biases, gains and delays of ``x``."""
+    return preintegrate(
+        data.t_s - x.delay_s - x.clock_rate * (data.t_s - par.middle_s(data.t_s)),
+        data.gyro,
+        data.accel,
+        gyro_bias_rad_s=x.gyro_bias_rad_s[:-1],
+        accel_bias_m_s2=x.accel_bias_m_s2 + x.accel_walk_m_s2[:-1],
+        gyro_gain=x.gyro_gain,
+        accel_gain=x.accel_gain,
+        accel_delay_s=x.accel_delay_s,
+    )
+
+
+def imu_group(noise: Noise, x: Estimate, pre: Preintegrated, *, rotation_only: bool = False) -> Group:
+    """Rows: rotation, velocity, position between consecutive nodes."""
+    k, dt = len(pre.dt_s), pre.dt_s[:, None]
+    body_from_world = x.world_from_imu[:-1].transpose(0, 2, 1)
+    step_velocity = x.velocity_m_s[1:] - x.velocity_m_s[:-1] - x.gravity_m_s2 * dt
+    step_position = x.imu_in_world_m[1:] - x.imu_in_world_m[:-1] - x.velocity_m_s[:-1] * dt
+    velocity = _mv(body_from_world, step_velocity)
+    position = _mv(body_from_world, step_position - 0.5 * x.gravity_m_s2 * dt**2)
+    twist = so3_log(body_from_world @ x.world_from_imu[1:] @ pre.rotation.transpose(0, 2, 1))
+    residual = np.concatenate([twist, velocity - pre.velocity, position - pre.position], axis=1)
+
+    here, after = np.zeros((k, 9, par.N_STATE)), np.zeros((k, 9, par.N_STATE))
+    half_twist = 0.5 * skew(twist)
+    here[:, 0:3, par.THETA] = half_twist - np.eye(3)
+    here[:, 3:6, par.THETA] = skew(velocity)
+    here[:, 6:9, par.THETA] = skew(position)
+    here[:, 3:6, par.VELOCITY] = -body_from_world
+    here[:, 6:9, par.VELOCITY] = -body_from_world * dt[:, :, None]
+    here[:, 6:9, par.POSITION] = -body_from_world
+    here[:, :, par.GYRO_BIAS] = -pre.by_gyro_bias
+    here[:, :, par.ACCEL_WALK] = -pre.by_accel_bias
+    after[:, 0:3, par.THETA] = (np.eye(3) + half_twist) @ pre.rotation
+    after[:, 3:6, par.VELOCITY] = body_from_world
+    after[:, 6:9, par.POSITION] = body_from_world
+
+    z = np.zeros((k, 9, par.N_GLOBALS))
+    z[:, 3:6, par.GRAVITY] = -body_from_world * dt[:, :, None]
+    z[:, 6:9, par.GRAVITY] = -0.5 * body_from_world * dt[:, :, None] ** 2
+    z[:, :, par.ACCEL_BIAS] = -pre.by_accel_bias
+    z[:, :, par.ACCEL_DELAY] = -pre.by_accel_delay
+    z[:, :, par.GYRO_GAIN] = -pre.by_gyro_gain
+    z[:, :, par.ACCEL_GAIN] = -pre.by_accel_gain
+    z = z[:, :, par.IMU_GLOBALS]
+
+    cov = noise.gyro_rad_s_rthz**2 * pre.cov_gyro + noise.accel_m_s2_rthz**2 * pre.cov_accel
+    rows = slice(0, 3) if rotation_only else slice(0, 9)
+    root = np.linalg.inv(np.linalg.cholesky(cov[:, rows, rows]))
+    return Group(
+        residual=_mv(root, residual[:, rows]),
+        here=root @ here[:, rows],
+        after=root @ after[:, rows],
+        by_globals=root @ z[:, rows],
+        columns=par.IMU_GLOBALS,
+    )
+
+
+def visual_groups(data: Data, noise: Noise, x: Estimate, rate_rad_s: Array, *, robust: bool) -> tuple[Group, Group]:
+    """Rotations, and centres given the rotations.
+
+    A picture determines a camera's rotation and its centre together: what turns the camera and moves it so that the
+    scene stays in place hardly changes the picture. The errors of the two are therefore strongly correlated (by 0.6
+    to 0.9 in real recordings), and the centre is much better known once the gyroscope has told the rotation. So the
+    error of the centre is modelled as coupling times error of the rotation plus a rest; the coupling is estimated.
+    """
+    k = len(data.t_s)
+    camera = x.world_from_imu @ x.cam_from_imu.T  # world_from_cam
+    cam_from_world = camera.transpose(0, 2, 1)
+    rate = rate_rad_s @ x.cam_from_imu.T
+    velocity = _mv(cam_from_world, x.velocity_m_s)
+    rotation_by_rate, rotation_by_velocity, centre_by_rate, centre_by_velocity = x.shutter
+
+    rotation = so3_log(data.world_from_cam.transpose(0, 2, 1) @ camera)
+    rotation = rotation - rate @ rotation_by_rate.T - velocity @ rotation_by_velocity.T
+    rotation_here = np.zeros((k, 3, par.N_STATE))
+    rotation_here[:, :, par.THETA] = x.cam_from_imu
+    rotation_here[:, :, par.VELOCITY] = -rotation_by_velocity @ cam_from_world
+    since_middle = (data.t_s - par.middle_s(data.t_s))[:, None]
+    rotation_z = np.zeros((k, 3, par.N_GLOBALS))
+    rotation_z[:, :, par.ROTATION] = -np.eye(3)
+    rotation_z[:, :, par.DELAY] = -rate
+    rotation_z[:, :, par.CLOCK_RATE] = -rate * since_middle
+
+    lever_body = x.cam_from_imu.T @ x.imu_in_cam_m
+    smear = rate @ centre_by_rate.T + velocity @ centre_by_velocity.T
+    predicted = x.imu_in_world_m + _mv(camera, smear - x.imu_in_cam_m)
+    camera_velocity = x.velocity_m_s - _mv(x.world_from_imu, np.cross(rate_rad_s, lever_body))
+    centre = data.centre * x.metres_per_unit - predicted - x.drift_m
+    centre_here = np.zeros((k, 3, par.N_STATE))
+    centre_here[:, :, par.POSITION] = -np.eye(3)
+    centre_here[:, :, par.DRIFT] = -np.eye(3)
+    centre_here[:, :, par.THETA] = -x.world_from_imu @ skew(lever_body)
+    centre_here[:, :, par.VELOCITY] = -camera @ centre_by_velocity @ cam_from_world
+    centre_z = np.zeros((k, 3, par.N_GLOBALS))
+    # The noise sits on the visual centre, so a change of log u scales the prediction: total least squares
+    centre_z[:, :, par.SCALE] = -predicted
+    centre_z[:, :, par.ROTATION] = camera @ skew(x.imu_in_cam_m)
+    centre_z[:, :, par.LEVER] = camera
+    centre_z[:, :, par.DELAY] = camera_velocity
+    centre_z[:, :, par.CLOCK_RATE] = camera_velocity * since_middle
+
+    carried = camera @ (x.coupling_m + x.metres_per_unit * data.coupling)
+    centre = centre - _mv(carried, rotation)
+    for i in range(3):
+        # Entries of the four shutter matrices and of the coupling, row by row
+        at = [par.SHUTTER.start + 9 * j + 3 * i for j in range(4)] + [par.COUPLING.start + 3 * i]
+        rotation_z[:, i, at[0] : at[0] + 3] = -rate
+        rotation_z[:, i, at[1] : at[1] + 3] = -velocity
+        column = -camera[:, :, i, None]
+        centre_z[:, :, at[2] : at[2] + 3] = column * rate[:, None, :]
+        centre_z[:, :, at[3] : at[3] + 3] = column * velocity[:, None, :]
+        centre_z[:, :, at[4] : at[4] + 3] = column * rotation[:, None, :]
+    centre_here -= carried @ rotation_here
+    centre_z -= carried @ rotation_z
+
+    groups = []
+    for residual, here, z, root, columns in (
+        (rotation, rotation_here, rotation_z, data.rotation_shape / noise.rotation_rad, par.VISUAL_GLOBALS),
+        (centre, centre_here, centre_z, data.centre_shape / noise.centre_m, slice(0, par.N_GLOBALS)),
+    ):
+        whitened = _mv(root, residual)
+        weight = np.ones(k)
+        if robust:
+            weight = 1 / (1 + np.sum(whitened**2, axis=1) / (3 * ROBUST_SIGMAS**2))
+        root_weight = np.sqrt(weight)[:, None, None]
+        root = root * root_weight
+        groups.append(
+            Group(
+                residual=whitened * root_weight[:, :, 0],
+                here=root @ here,
+                by_globals=root @ z[:, :, columns],
+                columns=columns,
+                weight=weight,
+            )
+        )
+    return groups[0], groups[1]
+
+
+def _identity(rows: int, columns: slice, scale: Array) -> Array:
+    out = np.zeros((rows, 3, par.N_STATE))
+    out[:, :, columns] = np.eye(3)
+    return out * scale[:, None, None]
+
+
+def walk_group(values: Array, columns: slice, sigma: float, dt_s: Array) -> Group:
+    """A random walk that grows by ``sigma`` in a second."""
+    info = 1 / (sigma * np.sqrt(dt_s))
+    step = _identity(len(dt_s), columns, info)
+    return Group(residual=np.diff(values, axis=0) * info[:, None], here=-step, after=step)
+
+
+def state_group(values: Array, columns: slice, sigma: float, first: int = 0) -> Group:
+    """Values of states ``first ..`` expected to be zero."""
+    info = np.full(len(values), 1 / sigma)
+    return Group(residual=values / sigma, here=_identity(len(values), columns, info), first=first)
+
+
+def all_groups(
+    data: Data, noise: Noise, prior: Prior, x: Estimate, pre: Preintegrated, *, robust: bool
+) -> dict[str, Group]:
+    """Everything but the priors of the globals."""
+    rotation, centre = visual_groups(data, noise, x, pre.rate_rad_s, robust=robust)
+    middle = int(np.argmin(np.abs(data.t_s - par.middle_s(data.t_s))))
+    return {
+        "imu": imu_group(noise, x, pre),
+        "rotation": rotation,
+        "centre": centre,
+        "gyro_walk": walk_group(x.gyro_bias_rad_s, par.GYRO_BIAS, noise.gyro_walk_rad_s_rts, pre.dt_s),
+        "accel_walk": walk_group(x.accel_walk_m_s2, par.ACCEL_WALK, noise.accel_walk_m_s2_rts, pre.dt_s),
+        "drift": walk_group(x.drift_m, par.DRIFT, noise.drift_m_rts, pre.dt_s),
+        # Anchors of what only differences determine
+        "gyro_bias": state_group(
+            x.gyro_bias_rad_s[:1] - prior.mean.gyro_bias_rad_s[:1], par.GYRO_BIAS, prior.gyro_bias_sigma_rad_s
+        ),
+        "accel_zero": state_group(x.accel_walk_m_s2[middle : middle + 1], par.ACCEL_WALK, 1e-4, middle),
+        "drift_zero": state_group(x.drift_m[:1], par.DRIFT, 1e-4),
+        "speed": state_group(x.velocity_m_s, par.VELOCITY, prior.speed_sigma_m_s),
+    }
+
+
+def rotation_groups(data: Data, noise: Noise, prior: Prior, x: Estimate, pre: Preintegrated) -> dict[str, Group]:
+    """What rotations alone say; all else is held."""
+    k = len(data.t_s)
+    rotation, _ = visual_groups(data, noise, x, pre.rate_rad_s, robust=True)
+    held = {
+        str(columns): state_group(np.zeros((k, 3)), columns, 1.0)
+        for columns in (par.POSITION, par.VELOCITY, par.ACCEL_WALK, par.DRIFT)
+    }
+    return {
+        "imu": imu_group(noise, x, pre, rotation_only=True),
+        "rotation": rotation,
+        "gyro_walk": walk_group(x.gyro_bias_rad_s, par.GYRO_BIAS, noise.gyro_walk_rad_s_rts, pre.dt_s),
+        "gyro_bias": state_group(
+            x.gyro_bias_rad_s[:1] - prior.mean.gyro_bias_rad_s[:1], par.GYRO_BIAS, prior.gyro_bias_sigma_rad_s
+        ),
+        **held,
+    }
+
+
+def normal_equations(groups: Sequence[Group], prior: Prior, x: Estimate) -> tuple[ArrowSystem, Array, Array]:
+    """The system, and the right-hand side (K, m, 1), (n, 1) of a step towards the optimum."""
+    k = len(x.velocity_m_s)
+    system = ArrowSystem.zeros(k, par.N_STATE, par.N_GLOBALS)
+    states, z = np.zeros((k, par.N_STATE, 1)), np.zeros((par.N_GLOBALS, 1))
+    for group in groups:
+        group.add_to(system)
+        group.pull_back(-group.residual[:, :, None], states, z)
+    system.corner += prior.info
+    z[:, 0] -= prior.info @ prior.offset(x)
+    magnitude = float(np.linalg.norm(x.gravity_m_s2))
+    row = x.gravity_m_s2 / magnitude / prior.gravity_sigma_m_s2
+    system.corner[par.GRAVITY, par.GRAVITY] += np.outer(row, row)
+    z[par.GRAVITY, 0] -= row * (magnitude - prior.gravity_m_s2) / prior.gravity_sigma_m_s2
+    return system, states, z

@@ -1,0 +1,169 @@
+"""The joint fit: from a recording to the most probable parameters, their covariance and the noise levels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from colmap_inertial.scale import _factors as fac
+from colmap_inertial.scale import _noise as levels
+from colmap_inertial.scale import _parameters as par
+from colmap_inertial.scale._parameters import Data, Estimate, Noise, Prior
+from colmap_inertial.types import Array, ImuNoise
+
+_MAX_ITERATIONS = 40
+_PROBES = 4
+#: The scale changes by at most this factor (in the logarithm) in one iteration.
+_LARGEST_STEP = 0.3
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Fit:
+    """Result of the joint fit.
+
+    Attributes
+    ----------
+    estimate, noise
+        Parameters and levels.
+    cov
+        (79, 79) of the globals; the scale's entry is that of its logarithm (of ``u``: its sign is turned).
+    gyro_bias_cov, gyro_bias_with_globals
+        (3, 3) covariance of the mean gyroscope bias and (79, 3) covariance with the globals.
+    sums
+        Sum of squares and expectation for each noise level.
+    converged
+        Whether the scale came to rest.
+    step_log, step_sigma
+        Logarithm of the ratio between the scales of the second and the first half, and its standard deviation.
+    excitation_m_s2
+        Standard deviation of the acceleration between nodes.
+    """
+
+    estimate: Estimate
+    noise: Noise
+    cov: Array
+    gyro_bias_cov: Array
+    gyro_bias_with_globals: Array
+    sums: dict[str, tuple[float, float]]
+    converged: bool
+    step_log: float
+    step_sigma: float
+    excitation_m_s2: float
+
+
+def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
+    """Gauss-Newton on all states and globals, with noise levels from the residuals.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        When the data leave the system singular.
+    """
+    start, floor = levels.typical_noise(sheet)
+    noise = start
+    x = _rotations_first(data, noise, prior)
+    scale = _moment_scale(data, x)
+    x = replace(x, metres_per_unit=scale, imu_in_world_m=data.centre * scale)
+    signs: dict[str, Array] = {}
+    converged = False
+    for iteration in range(_MAX_ITERATIONS):
+        pre = fac.integrate(data, x)
+        groups = fac.all_groups(data, noise, prior, x, pre, robust=iteration > 2)
+        signs = signs or levels.random_signs(groups, _PROBES)
+        system, rhs, rhs_z = fac.normal_equations(list(groups.values()), prior, x)
+        rhs = np.concatenate([rhs, np.zeros((*rhs.shape[:2], _PROBES))], axis=2)
+        rhs_z = np.concatenate([rhs_z, np.zeros((len(rhs_z), _PROBES))], axis=1)
+        for name, group in groups.items():
+            group.pull_back(signs[name], rhs[:, :, 1:], rhs_z[:, 1:])
+        states, z, cov = system.solve(rhs, rhs_z)
+        sums = levels.sums_of_squares(groups, signs, states, z)
+        step = abs(float(z[par.SCALE, 0]))
+        shrink = min(1.0, _LARGEST_STEP / max(step, 1e-12))
+        x = x.moved(states[:, :, 0] * shrink, z[:, 0] * shrink, pre.rate_rad_s, data.t_s)
+        sigma = float(np.sqrt(cov[par.SCALE, par.SCALE]))
+        converged = step < 0.2 * sigma
+        change = 1.0
+        if iteration > 2:
+            noise, change = levels.updated_noise(noise, start, floor, sums)
+        if step < 0.03 * sigma and change < 0.03:
+            break
+
+    # Once more at the optimum: the mean gyroscope bias, and a second scale for the second half
+    k = len(data.t_s)
+    mean_bias, mean_bias_z = np.zeros((k, par.N_STATE, 3)), np.zeros((par.N_GLOBALS, 3))
+    mean_bias[:, par.GYRO_BIAS] = np.eye(3) / k
+    second, second_z = np.zeros((k, par.N_STATE, 1)), np.zeros((par.N_GLOBALS, 1))
+    column = _second_half(data, x, groups["centre"], noise)
+    pull = replace(groups["centre"], residual=column)
+    pull.pull_back(column[:, :, None], second, second_z)
+    sides = np.concatenate([rhs[:, :, :1], second, mean_bias], axis=2)
+    sides_z = np.concatenate([rhs_z[:, :1], second_z, mean_bias_z], axis=1)
+    states, z, cov = system.solve(sides, sides_z)
+    after = pull.apply(states, z)
+    information = float(np.sum(column * (column - after[:, :, 1])))
+    residual = groups["centre"].residual + after[:, :, 0]
+    step_log = -float(np.sum(column * residual)) / information
+    accel = (x.world_from_imu[:-1] @ (pre.velocity / pre.dt_s[:, None])[:, :, None])[:, :, 0]
+    return Fit(
+        estimate=x,
+        noise=noise,
+        cov=cov,
+        gyro_bias_cov=np.mean(states[:, par.GYRO_BIAS, 2:], axis=0),
+        gyro_bias_with_globals=z[:, 2:],
+        sums=sums,
+        converged=converged,
+        step_log=-step_log,
+        step_sigma=information**-0.5,
+        excitation_m_s2=float(np.sqrt(np.sum(np.var(accel, axis=0)))),
+    )
+
+
+def _rotations_first(data: Data, noise: Noise, prior: Prior) -> Estimate:
+    """Rotations, gyroscope bias and time offset from gyroscope and visual rotations alone."""
+    x = prior.mean
+    for _ in range(4):
+        pre = fac.integrate(data, x)
+        groups = fac.rotation_groups(data, noise, prior, x, pre)
+        system, rhs, rhs_z = fac.normal_equations(list(groups.values()), prior, x)
+        held = np.arange(par.GRAVITY.stop)
+        system.corner[held, held] += 1.0
+        rhs_z[held] = 0.0
+        states, z, _ = system.solve(rhs, rhs_z)
+        z[held] = 0.0
+        x = x.moved(states[:, :, 0], z[:, 0], pre.rate_rad_s, data.t_s)
+    return x
+
+
+def _moment_scale(data: Data, x: Estimate) -> float:
+    """Metres per unit at which visual and inertial second differences, less gravity and bias, are equally large."""
+    pre = fac.integrate(data, x)
+    dt = pre.dt_s[:, None]
+    per_s = 2 / (dt[1:] + dt[:-1])
+    visual = np.diff(np.diff(data.centre, axis=0) / dt, axis=0) * per_s
+
+    def second_difference(velocity: Array, position: Array) -> Array:
+        along = x.world_from_imu[:-1] @ position / dt[:, :, None]
+        return (along[1:] - along[:-1] + x.world_from_imu[:-2] @ velocity[:-1]) * per_s[:, :, None]
+
+    inertial = second_difference(pre.velocity[:, :, None], pre.position[:, :, None])
+    bias = second_difference(pre.by_accel_bias[:, 3:6], pre.by_accel_bias[:, 6:])
+    gravity = np.tile(np.eye(3), (len(per_s), 1, 1))
+    nuisance = np.concatenate([gravity, bias], axis=2).reshape(-1, 6)
+    both = np.stack([visual, inertial[:, :, 0]], axis=-1).reshape(-1, 2)
+    rest = both - nuisance @ np.linalg.lstsq(nuisance, both, rcond=None)[0]
+    visual_size, inertial_size = np.linalg.norm(rest, axis=0)
+    if not (visual_size > 0 and inertial_size > 0):
+        raise np.linalg.LinAlgError("no motion")
+    return float(inertial_size / visual_size)
+
+
+def _second_half(data: Data, x: Estimate, centre: fac.Group, noise: Noise) -> Array:
+    """(K, 3) derivative of the centres' residuals by a logarithm of the scale that only the second half has."""
+    path = -data.centre * x.metres_per_unit
+    middle = int(np.searchsorted(data.t_s, par.middle_s(data.t_s)))
+    late = np.arange(len(path)) > middle
+    column = np.where(late[:, None], path - path[middle], 0.0)
+    root = data.centre_shape / noise.centre_m
+    weight = np.ones(len(path)) if centre.weight is None else centre.weight
+    return np.asarray((root @ column[:, :, None])[:, :, 0] * np.sqrt(weight)[:, None])

@@ -1,0 +1,176 @@
+"""What the joint estimator measures, assumes and estimates, and in which columns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from colmap_inertial.geometry import so3_exp, so3_log
+from colmap_inertial.scale._preintegration import Track
+from colmap_inertial.types import Array
+
+# Columns of the globals: the scale, those that the IMU factors see, those that the visual factors see.
+SCALE = 0
+GRAVITY = slice(1, 4)
+ACCEL_BIAS = slice(4, 7)
+ACCEL_DELAY = 7
+GYRO_GAIN = slice(8, 17)
+ACCEL_GAIN = slice(17, 26)
+IMU_GLOBALS = slice(1, 26)
+ROTATION = slice(26, 29)
+LEVER = slice(29, 32)
+DELAY = 32
+CLOCK_RATE = 33
+SHUTTER = slice(34, 70)
+COUPLING = slice(70, 79)
+VISUAL_GLOBALS = slice(26, 79)
+N_GLOBALS = 79
+
+# Columns of a state. The last two are random walks: of the accelerometer's bias around its value in the middle of the
+# recording, and of the error that the visual centres drift by.
+THETA, POSITION, VELOCITY, GYRO_BIAS, ACCEL_WALK, DRIFT = (slice(3 * i, 3 * i + 3) for i in range(6))
+N_STATE = 18
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Data:
+    """Measurements at K nodes, each a frame of the camera.
+
+    Attributes
+    ----------
+    t_s
+        (K,) camera time.
+    world_from_cam
+        (K, 3, 3) visual rotations.
+    centre
+        (K, 3) visual camera centres in model units, about their mean.
+    rotation_shape, centre_shape
+        (K, 3, 3) square roots of the information of the visual rotation (camera frame) and of the centre (world frame)
+        given the rotation, for a noise level of one.
+    coupling
+        (K, 3, 3) model units per radian: the error of the centre (camera frame) that comes with an error of the
+        rotation, as far as the covariances of the poses tell.
+    gyro, accel
+        Readings over camera time, by the first guess of the offsets.
+    """
+
+    t_s: Array
+    world_from_cam: Array
+    centre: Array
+    rotation_shape: Array
+    centre_shape: Array
+    coupling: Array
+    gyro: Track
+    accel: Track
+
+
+@dataclass(frozen=True, kw_only=True)
+class Noise:
+    """Standard deviations: densities of the sensors, walks per root of a second, visual errors per frame."""
+
+    gyro_rad_s_rthz: float
+    gyro_walk_rad_s_rts: float
+    accel_m_s2_rthz: float
+    accel_walk_m_s2_rts: float
+    rotation_rad: float
+    centre_m: float
+    drift_m_rts: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Estimate:
+    """A point of the parameter space; K states and the globals."""
+
+    metres_per_unit: float
+    world_from_imu: Array  # (K, 3, 3)
+    imu_in_world_m: Array  # (K, 3)
+    velocity_m_s: Array  # (K, 3)
+    gyro_bias_rad_s: Array  # (K, 3)
+    accel_walk_m_s2: Array  # (K, 3)
+    drift_m: Array  # (K, 3)
+    gravity_m_s2: Array  # (3,) world frame
+    accel_bias_m_s2: Array  # (3,)
+    accel_delay_s: float  # beyond the gyroscope's, and beyond the first guess
+    gyro_gain: Array  # (3, 3): rate = (I + gain) reading - bias
+    accel_gain: Array  # (3, 3): force = (I + gain) reading - bias
+    cam_from_imu: Array  # (3, 3)
+    imu_in_cam_m: Array  # (3,)
+    delay_s: float  # of the IMU's stamps, beyond the first guess
+    clock_rate: float  # growth of that delay per second, about the middle of the recording
+    shutter: Array  # (4, 3, 3): rotation by rate, rotation by velocity, centre by rate, centre by velocity
+    coupling_m: Array  # (3, 3): beyond Data.coupling
+
+    def moved(self, states: Array, z: Array, rate_rad_s: Array, t_s: Array) -> Estimate:
+        """The estimate after a step of the states (K, 18) and the globals (79,).
+
+        A later IMU clock makes each node an earlier instant of the IMU: rotations and positions move along.
+        """
+        later = (z[DELAY] + z[CLOCK_RATE] * (t_s - middle_s(t_s)))[:, None]
+        return replace(
+            self,
+            metres_per_unit=self.metres_per_unit * float(np.exp(-z[SCALE])),
+            world_from_imu=self.world_from_imu @ so3_exp(states[:, THETA] - rate_rad_s * later),
+            imu_in_world_m=self.imu_in_world_m + states[:, POSITION] - self.velocity_m_s * later,
+            velocity_m_s=self.velocity_m_s + states[:, VELOCITY],
+            gyro_bias_rad_s=self.gyro_bias_rad_s + states[:, GYRO_BIAS],
+            accel_walk_m_s2=self.accel_walk_m_s2 + states[:, ACCEL_WALK],
+            drift_m=self.drift_m + states[:, DRIFT],
+            gravity_m_s2=self.gravity_m_s2 + z[GRAVITY],
+            accel_bias_m_s2=self.accel_bias_m_s2 + z[ACCEL_BIAS],
+            accel_delay_s=self.accel_delay_s + float(z[ACCEL_DELAY]),
+            gyro_gain=self.gyro_gain + z[GYRO_GAIN].reshape(3, 3),
+            accel_gain=self.accel_gain + z[ACCEL_GAIN].reshape(3, 3),
+            cam_from_imu=so3_exp(z[ROTATION]) @ self.cam_from_imu,
+            imu_in_cam_m=self.imu_in_cam_m + z[LEVER],
+            delay_s=self.delay_s + float(z[DELAY]),
+            clock_rate=self.clock_rate + float(z[CLOCK_RATE]),
+            shutter=self.shutter + z[SHUTTER].reshape(4, 3, 3),
+            coupling_m=self.coupling_m + z[COUPLING].reshape(3, 3),
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Prior:
+    """Gaussian priors.
+
+    Attributes
+    ----------
+    mean
+        Where the globals are expected.
+    info
+        (79, 79) information of the globals; the scale and gravity have none here.
+    gravity_m_s2, gravity_sigma_m_s2
+        Magnitude of gravity.
+    gyro_bias_sigma_rad_s
+        Of the first state's bias.
+    speed_sigma_m_s
+        Of every velocity: holds a keyframe between two long gaps.
+    """
+
+    mean: Estimate
+    info: Array
+    gravity_m_s2: float
+    gravity_sigma_m_s2: float
+    gyro_bias_sigma_rad_s: float = 0.2
+    speed_sigma_m_s: float = 10.0
+
+    def offset(self, x: Estimate) -> Array:
+        """(79,) globals minus their expected values."""
+        z, mean = np.zeros(N_GLOBALS), self.mean
+        z[ACCEL_BIAS] = x.accel_bias_m_s2 - mean.accel_bias_m_s2
+        z[ACCEL_DELAY] = x.accel_delay_s - mean.accel_delay_s
+        z[GYRO_GAIN] = (x.gyro_gain - mean.gyro_gain).ravel()
+        z[ACCEL_GAIN] = (x.accel_gain - mean.accel_gain).ravel()
+        z[ROTATION] = so3_log(x.cam_from_imu @ mean.cam_from_imu.T)
+        z[LEVER] = x.imu_in_cam_m - mean.imu_in_cam_m
+        z[DELAY] = x.delay_s - mean.delay_s
+        z[CLOCK_RATE] = x.clock_rate - mean.clock_rate
+        z[SHUTTER] = (x.shutter - mean.shutter).ravel()
+        z[COUPLING] = (x.coupling_m - mean.coupling_m).ravel()
+        return z
+
+
+def middle_s(t_s: Array) -> float:
+    """Where the clock rate and the accelerometer's walk are anchored."""
+    return 0.5 * float(t_s[0] + t_s[-1])

@@ -1,0 +1,236 @@
+"""What the IMU says between two instants: relative rotation, velocity and position with covariance and derivatives.
+
+Between nodes ``k`` and ``k + 1``, ``T`` apart, with the body frame at node ``k`` as reference (Lupton and Sukkarieh
+2012; Forster et al. 2017)::
+
+    rotation = R_k^T R_k+1
+    velocity = R_k^T (v_k+1 - v_k - g T)
+    position = R_k^T (p_k+1 - p_k - v_k T - g T^2/2)
+
+Errors of the rotation are rotation vectors on its left, in the body frame at node ``k``. White gyroscope noise ``n``
+at time ``s`` then acts on the three through ``G(s) = [I, -[V(s)]x, -[P(s)]x]``, where ``V(s)`` and ``P(s)`` are the
+velocity still to come after ``s`` and the position that the force after ``s`` still adds. Covariance and derivatives
+are integrals over ``G``, so that nothing has to be propagated step by step and all intervals are computed at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from colmap_inertial.geometry import matrix_from_quat, quat_exp, skew
+from colmap_inertial.types import Array
+
+#: Integration step. With cubic interpolation of the samples, halving it changes the scale by less than 0.01 %.
+STEP_S = 0.005
+#: Half the span of the finite difference by the accelerometer's delay: vibration makes shorter ones meaningless.
+DELAY_STEP_S = 0.01
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Track:
+    """Samples of a vector over time, interpolated by cubic Hermite polynomials.
+
+    Linear interpolation would lose 0.1 % of the amplitude at 2 Hz from samples at 100 Hz, and the scale with it.
+    """
+
+    t_s: Array
+    value: Array
+    slope: Array
+
+    @classmethod
+    def of(cls, t_s: Array, value: Array) -> Track:
+        """A track through samples ``value`` (N, 3) at times ``t_s`` (N,)."""
+        slope = np.gradient(value, t_s, axis=0) if len(t_s) > 2 else np.repeat(np.diff(value, axis=0), 2, axis=0)
+        return cls(t_s=t_s, value=value, slope=slope)
+
+    def at(self, query_s: Array) -> tuple[Array, Array]:
+        """Value and time derivative at ``query_s`` (M,); held constant outside the samples."""
+        query_s = np.clip(query_s, self.t_s[0], self.t_s[-1])
+        i = np.clip(np.searchsorted(self.t_s, query_s, side="right") - 1, 0, len(self.t_s) - 2)
+        step = (self.t_s[i + 1] - self.t_s[i])[:, None]
+        x = (query_s - self.t_s[i])[:, None] / step
+        y0, y1, m0, m1 = self.value[i], self.value[i + 1], step * self.slope[i], step * self.slope[i + 1]
+        rise = y1 - y0
+        c2, c3 = 3 * rise - 2 * m0 - m1, m0 + m1 - 2 * rise
+        return y0 + x * (m0 + x * (c2 + x * c3)), (m0 + x * (2 * c2 + 3 * x * c3)) / step
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Preintegrated:
+    """Inertial increments over K intervals; rows of the 9-vectors are rotation, velocity, position.
+
+    Attributes
+    ----------
+    dt_s
+        (K,) lengths of the intervals.
+    rotation, velocity, position
+        (K, 3, 3), (K, 3), (K, 3) increments in the body frame at the start of the interval.
+    cov_gyro, cov_accel
+        (K, 9, 9) covariances for white noise of density one.
+    by_gyro_bias, by_accel_bias
+        (K, 9, 3) derivatives.
+    by_gyro_gain
+        (K, 9, 9) derivative by the entries, row by row, of the gain error E in ``rate = (I + E) reading - bias``.
+    by_accel_gain
+        (K, 9, 9) the same of the accelerometer.
+    by_accel_delay
+        (K, 9) derivative by a later stamp of the accelerometer.
+    rate_rad_s
+        (K + 1, 3) angular velocity at the nodes, body frame.
+    """
+
+    dt_s: Array
+    rotation: Array
+    velocity: Array
+    position: Array
+    cov_gyro: Array
+    cov_accel: Array
+    by_gyro_bias: Array
+    by_accel_bias: Array
+    by_gyro_gain: Array
+    by_accel_gain: Array
+    by_accel_delay: Array
+    rate_rad_s: Array
+
+
+def _multiply(a: Array, b: Array) -> Array:
+    """Product of xyzw quaternions stored (4, ...): component first, which is several times faster here."""
+    ax, ay, az, aw = a
+    bx, by, bz, bw = b
+    return np.stack(
+        [
+            aw * bx + bw * ax + ay * bz - az * by,
+            aw * by + bw * ay + az * bx - ax * bz,
+            aw * bz + bw * az + ax * by - ay * bx,
+            aw * bw - ax * bx - ay * by - az * bz,
+        ]
+    )
+
+
+def running_product(steps: Array) -> Array:
+    """Products ``q_0, q_0 q_1, q_0 q_1 q_2, ...`` of quaternions xyzw stored (4, N), in linear time."""
+    n, block = steps.shape[1], 32
+    if n <= block:
+        out = steps.copy()
+        for i in range(1, n):
+            out[:, i] = _multiply(out[:, i - 1], steps[:, i])
+        return out
+    rows = -(-n // block)
+    padded = np.zeros((4, rows * block))
+    padded[3] = 1.0
+    padded[:, :n] = steps
+    grid = padded.reshape(4, rows, block)
+    for i in range(1, block):
+        grid[:, :, i] = _multiply(grid[:, :, i - 1], grid[:, :, i])
+    before = running_product(grid[:, :, -1])
+    before /= np.linalg.norm(before, axis=0)
+    grid[:, 1:] = _multiply(before[:, :-1, None], grid[:, 1:])
+    return grid.reshape(4, -1)[:, :n]
+
+
+def preintegrate(
+    nodes_s: Array,
+    gyro: Track,
+    accel: Track,
+    *,
+    gyro_bias_rad_s: Array,
+    accel_bias_m_s2: Array,
+    gyro_gain: Array,
+    accel_gain: Array,
+    accel_delay_s: float = 0.0,
+) -> Preintegrated:
+    """Integrate both sensors between consecutive nodes.
+
+    Parameters
+    ----------
+    nodes_s
+        (K + 1,) increasing times on the clock of the tracks.
+    gyro, accel
+        Readings, rad/s and m/s2.
+    gyro_bias_rad_s
+        (K, 3), one for each interval.
+    accel_bias_m_s2
+        (K, 3).
+    gyro_gain, accel_gain
+        (3, 3) gain errors E: ``rate = (I + E) reading - bias``.
+    accel_delay_s
+        Added to the accelerometer's times.
+    """
+    dt = np.diff(nodes_s)
+    steps = np.maximum(np.ceil(dt / STEP_S).astype(np.intp), 2)
+    points = steps + 1
+    first = np.concatenate([[0], np.cumsum(points)[:-1]])
+    interval = np.repeat(np.arange(len(dt)), points)
+    h = (dt / steps)[interval]
+    since = (np.arange(len(interval)) - first[interval]) * h
+    t = nodes_s[interval] + since
+    is_last = np.zeros(len(t), dtype=bool)
+    is_last[first + steps] = True
+    weight = np.where(is_last, 0.5, 1.0) * h
+    weight[first] *= 0.5
+    h_step = np.where(is_last, 0.0, h)[:-1, None]
+
+    reading, _ = gyro.at(t)
+    rate = reading @ (np.eye(3) + gyro_gain).T - gyro_bias_rad_s[interval]
+    # Second-order Magnus expansion for a rate that changes linearly within the step
+    turn = h_step * (0.5 * (rate[:-1] + rate[1:])) + h_step**2 / 12 * np.cross(rate[:-1], rate[1:])
+    product = running_product(np.concatenate([[[0.0, 0.0, 0.0, 1.0]], quat_exp(turn)]).T)
+    start = product[:, first][:, interval] * np.array([[-1.0], [-1.0], [-1.0], [1.0]])
+    rotation = matrix_from_quat(_multiply(start, product).T)
+
+    reading_a, _ = accel.at(t - accel_delay_s)
+    later, _ = accel.at(t - accel_delay_s + DELAY_STEP_S)
+    earlier, _ = accel.at(t - accel_delay_s - DELAY_STEP_S)
+    slope_a = (later - earlier) / (2 * DELAY_STEP_S)
+    force = np.einsum("nij,nj->ni", rotation, reading_a @ (np.eye(3) + accel_gain).T - accel_bias_m_s2[interval])
+
+    def accumulated(increment: Array) -> Array:
+        total = np.concatenate([np.zeros((1, 3)), np.cumsum(increment, axis=0)])
+        return total - total[first][interval]
+
+    velocity = accumulated(0.5 * h_step * (force[:-1] + force[1:]))
+    position = accumulated(h_step * velocity[:-1] + h_step**2 / 6 * (2 * force[:-1] + force[1:]))
+    left = dt[interval] - since
+    end = first + steps
+    velocity_to_come = velocity[end][interval] - velocity
+    position_to_come = position[end][interval] - position - velocity * left[:, None]
+
+    def total(values: Array) -> Array:
+        return np.add.reduceat(values * weight.reshape(-1, *[1] * (values.ndim - 1)), first, axis=0)
+
+    g = np.empty((len(t), 9, 3))
+    g[:, :3] = np.eye(3)
+    g[:, 3:6] = -skew(velocity_to_come)
+    g[:, 6:] = -skew(position_to_come)
+    g_body = g @ rotation
+    k = len(dt)
+    cov_accel = np.zeros((k, 9, 9))
+    for row, col, moment in ((3, 3, dt), (3, 6, dt**2 / 2), (6, 3, dt**2 / 2), (6, 6, dt**3 / 3)):
+        cov_accel[:, row : row + 3, col : col + 3] = moment[:, None, None] * np.eye(3)
+    by_accel_bias = np.zeros((k, 9, 3))
+    by_accel_bias[:, 3:6] = -total(rotation)
+    by_accel_bias[:, 6:] = -total(left[:, None, None] * rotation)
+    by_accel_gain = np.zeros((k, 9, 9))
+    lever = (rotation[:, :, :, None] * reading_a[:, None, None, :]).reshape(-1, 3, 9)
+    by_accel_gain[:, 3:6] = total(lever)
+    by_accel_gain[:, 6:] = total(left[:, None, None] * lever)
+    by_accel_delay = np.zeros((k, 9))
+    change = np.einsum("nij,nj->ni", rotation, slope_a)
+    by_accel_delay[:, 3:6] = -total(change)
+    by_accel_delay[:, 6:] = -total(left[:, None] * change)
+    return Preintegrated(
+        dt_s=dt,
+        rotation=rotation[end],
+        velocity=velocity[end],
+        position=position[end],
+        cov_gyro=total(g @ g.transpose(0, 2, 1)),
+        cov_accel=cov_accel,
+        by_gyro_bias=-total(g_body),
+        by_accel_bias=by_accel_bias,
+        by_gyro_gain=total((g_body[:, :, :, None] * reading[:, None, None, :]).reshape(-1, 9, 9)),
+        by_accel_gain=by_accel_gain,
+        by_accel_delay=by_accel_delay,
+        rate_rad_s=np.concatenate([rate[first], rate[end[-1:]]]),
+    )

@@ -1,0 +1,168 @@
+"""From a recording and a calibration to the measurements and priors of the joint fit."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.errors import NotObservableError
+from colmap_inertial.geometry import matrix_from_quat
+from colmap_inertial.scale import _parameters as par
+from colmap_inertial.scale._parameters import Data, Estimate, Prior
+from colmap_inertial.scale._preintegration import Track
+from colmap_inertial.types import Array, CameraImuCalibration, CameraTrajectory, ImuRecording, clock_shift_s
+
+#: Gain and axis errors of gyroscopes (1 %) and accelerometers (0.5 %) after the factory's calibration.
+_GYRO_GAIN, _ACCEL_GAIN = 0.01, 0.005
+#: Offset of an accelerometer: data sheets of phone sensors give 20-90 mg over temperature and soldering.
+_ACCEL_BIAS_M_S2 = 1.0
+#: Tolerance of the quartzes of camera and IMU against each other.
+_CLOCK_RATE = 1e-4
+#: Standard deviation of rows' times about the middle row, in readouts (uniform over the picture).
+_ROW_SPREAD = 12**-0.5
+#: Scene depths that turn row times into errors of rotation by velocity (1/m) and of position by rate (m).
+_NEAR_M, _FAR_M = 1.0, 2.0
+#: The coupling of centre and rotation errors is of the size of the scene's depth.
+_COUPLING_M = 5.0
+#: An alignment's covariance stems from the very data that are used again here.
+_COUNTED_ONCE = 5.0
+_MIN_STATES = 8
+
+
+def state_frames(t_s: Array, rate_hz: float) -> NDArray[np.intp]:
+    """Indices of frames about ``1 / rate_hz`` apart; sparse frames all stay."""
+    step = 1 / rate_hz
+    slack = 0.5 * min(float(np.median(np.diff(t_s))), step) if len(t_s) > 1 else 0.0
+    keep: list[int] = []
+    last = -np.inf
+    for i, t in enumerate(t_s.tolist()):
+        if t - last >= step - slack:
+            keep.append(i)
+            last = t
+    return np.array(keep, dtype=np.intp)
+
+
+def prepare(
+    trajectory: CameraTrajectory,
+    imu: ImuRecording,
+    calibration: CameraImuCalibration,
+    *,
+    gravity_m_s2: float,
+    gravity_sigma_m_s2: float,
+    states_hz: float,
+) -> tuple[Data, Prior]:
+    """Measurements at the nodes, and the prior, whose mean is the starting point.
+
+    Raises
+    ------
+    NotObservableError
+        When too few frames lie inside the IMU recording.
+    """
+    shift_s = clock_shift_s(trajectory, imu)
+    gyro = Track.of(imu.gyro_t_s + (shift_s + calibration.gyro_time_offset_s), imu.gyro_rad_s)
+    accel = Track.of(imu.accel_t_s + (shift_s + calibration.accel_time_offset_s), imu.accel_m_s2)
+    margin_s = 0.02
+    begin_s = max(gyro.t_s[0], accel.t_s[0]) + margin_s
+    end_s = min(gyro.t_s[-1], accel.t_s[-1]) - margin_s
+    inside = np.flatnonzero((trajectory.t_s >= begin_s) & (trajectory.t_s <= end_s))
+    keep = inside[state_frames(trajectory.t_s[inside], states_hz)]
+    if len(keep) < _MIN_STATES:
+        raise NotObservableError(
+            "scale",
+            f"only {len(keep)} camera poses, spaced by 0.2 s or more, lie inside the IMU recording and at least "
+            f"{_MIN_STATES} are needed: record a longer clip, or check that both recordings belong together",
+        )
+    k = len(keep)
+    world_from_cam = matrix_from_quat(trajectory.cam_from_world_xyzw[keep]).transpose(0, 2, 1)
+    centre = trajectory.cam_in_world[keep]
+    if float(np.max(np.ptp(centre, axis=0))) == 0.0:
+        raise NotObservableError("scale", "the camera does not move in the model: move it, do not only turn it")
+    rotation_shape, centre_shape, coupling = _pose_shapes(
+        None if trajectory.pose_cov is None else trajectory.pose_cov[keep], world_from_cam
+    )
+    data = Data(
+        t_s=trajectory.t_s[keep],
+        world_from_cam=world_from_cam,
+        centre=centre - centre.mean(axis=0),
+        rotation_shape=rotation_shape,
+        centre_shape=centre_shape,
+        coupling=coupling,
+        gyro=gyro,
+        accel=accel,
+    )
+
+    cam_from_imu = matrix_from_quat(calibration.cam_from_imu_xyzw)
+    world_from_imu = world_from_cam @ cam_from_imu
+    mean_force = np.mean((world_from_imu @ accel.at(data.t_s)[0][:, :, None])[:, :, 0], axis=0)
+    zeros = np.zeros((k, 3))
+    mean = Estimate(
+        metres_per_unit=1.0,
+        world_from_imu=world_from_imu,
+        imu_in_world_m=zeros,
+        velocity_m_s=zeros,
+        gyro_bias_rad_s=zeros + calibration.gyro_bias_rad_s,
+        accel_walk_m_s2=zeros,
+        drift_m=zeros,
+        gravity_m_s2=-mean_force * gravity_m_s2 / max(float(np.linalg.norm(mean_force)), 1e-9),
+        accel_bias_m_s2=np.zeros(3),
+        accel_delay_s=0.0,
+        gyro_gain=np.zeros((3, 3)),
+        accel_gain=np.zeros((3, 3)),
+        cam_from_imu=cam_from_imu,
+        imu_in_cam_m=calibration.imu_in_cam_m,
+        delay_s=0.0,
+        clock_rate=0.0,
+        shutter=np.zeros((4, 3, 3)),
+        coupling_m=np.zeros((3, 3)),
+    )
+    prior = Prior(
+        mean=mean,
+        info=np.diag(_sigmas(calibration) ** -2),
+        gravity_m_s2=gravity_m_s2,
+        gravity_sigma_m_s2=gravity_sigma_m_s2,
+    )
+    return data, prior
+
+
+def _sigmas(calibration: CameraImuCalibration) -> Array:
+    """(79,) prior standard deviations of the globals; infinite for scale and gravity."""
+    cov = calibration.cov
+    variance = np.diagonal(cov)
+    accel_delay_s = float(np.sqrt(max(variance[3] + variance[4] - 2 * cov[3, 4], 1e-8)))
+    row_spread_s = _ROW_SPREAD * float(np.hypot(calibration.readout_s, np.sqrt(variance[11])))
+    sigma = np.full(par.N_GLOBALS, np.inf)
+    sigma[par.ACCEL_BIAS] = _ACCEL_BIAS_M_S2
+    sigma[par.ACCEL_DELAY] = accel_delay_s
+    sigma[par.GYRO_GAIN] = _GYRO_GAIN
+    sigma[par.ACCEL_GAIN] = _ACCEL_GAIN
+    sigma[par.ROTATION] = np.maximum(_COUNTED_ONCE * np.sqrt(variance[0:3]), 1e-6)
+    sigma[par.LEVER] = np.maximum(np.sqrt(variance[8:11]), 1e-6)
+    sigma[par.DELAY] = np.clip(_COUNTED_ONCE * np.sqrt(variance[3]), 1e-6, 0.1)
+    sigma[par.CLOCK_RATE] = _CLOCK_RATE
+    shutter = row_spread_s * np.array([1.0, 1 / _NEAR_M, _FAR_M, 1.0])
+    sigma[par.SHUTTER] = np.maximum(np.repeat(shutter, 9), 1e-9)
+    sigma[par.COUPLING] = _COUPLING_M
+    return sigma
+
+
+def _pose_shapes(pose_cov: Array | None, world_from_cam: Array) -> tuple[Array, Array, Array]:
+    """What covariances of the poses say about frames relative to each other; their overall levels are estimated."""
+    k = len(world_from_cam)
+    if pose_cov is None:
+        eye = np.tile(np.eye(3), (k, 1, 1))
+        return eye, eye, np.zeros((k, 3, 3))
+    rotation, cross, centre = pose_cov[:, :3, :3], pose_cov[:, 3:, :3], pose_cov[:, 3:, 3:]
+    slack = 1e-6 * np.trace(rotation, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    carried = cross @ np.linalg.inv(rotation + slack)
+    rest = centre - carried @ cross.transpose(0, 2, 1)
+    coupling = world_from_cam.transpose(0, 2, 1) @ carried
+    return _shape(rotation), _shape(rest), coupling
+
+
+def _shape(cov: Array) -> Array:
+    """Square roots of the information relative to the median level; no direction counts more than tenfold."""
+    level = float(np.median(np.trace(cov, axis1=1, axis2=2))) / 3
+    if not level > 0:
+        return np.tile(np.eye(3), (len(cov), 1, 1))
+    relative = 0.5 * (cov + cov.transpose(0, 2, 1)) / level + 0.1 * np.eye(3)
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(relative)))

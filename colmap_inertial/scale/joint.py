@@ -1,0 +1,192 @@
+"""Scale from one fit of everything that the camera and the IMU measured; positions are never differentiated.
+
+The most probable motion, calibration and scale given gyroscope, accelerometer and visual poses. States at frames about
+0.2 s apart (all of them where frames are sparser): rotation, position, velocity, gyroscope bias, and random walks of
+the accelerometer's bias and of the visual centres' error. Globals: scale, gravity, accelerometer bias, gains and axis
+errors of both sensors, camera-IMU rotation, lever arm, time offsets of both sensors and the rate between the clocks,
+what a rolling shutter does to rotations and centres, and how errors of the centres go with errors of the rotations.
+The IMU enters through preintegration (Forster et al., "On-manifold preintegration", 2017). The noise sits on the visual
+centres, not on the inertial path that explains them: regression the other way round attenuates the scale. Noise levels
+of the accelerometer and of the poses are estimated along (Forstner's variance components).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from colmap_inertial.errors import NotObservableError
+from colmap_inertial.geometry import quat_from_matrix
+from colmap_inertial.scale import _parameters as par
+from colmap_inertial.scale._fit import Fit, fit_jointly
+from colmap_inertial.scale._setup import prepare
+from colmap_inertial.scale.verdict import verdict_of
+from colmap_inertial.types import Array, CameraImuCalibration, CameraTrajectory, ImuRecording, ScaleEstimate
+
+#: What no recording can show: errors of the gain that mimic a scale beyond the priors, and of the model's own metric.
+_UNSEEN = 0.005
+_LARGEST_BIAS_M_S2 = 1.5
+_DISAGREEMENT_SIGMAS = 3.0
+_RECORD_INSTEAD = (
+    "move the camera itself back and forth by 20 cm or more, in several directions and briskly, for 10 s or longer, "
+    "while it sees texture; panning, walking straight at one speed and a tripod cannot give a scale"
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointOptions:
+    """How the joint estimator works."""
+
+    gravity_m_s2: float = 9.80665
+    """Magnitude of gravity where the recording was made (``gravity_at_latitude_m_s2``)."""
+
+    gravity_sigma_m_s2: float = 0.02
+    """Its standard deviation; the default spans 9.78 at the equator to 9.83 at the poles."""
+
+    states_hz: float = 5.0
+    """Video is thinned to this many frames a second: errors of closer frames are too alike to tell more."""
+
+    def __post_init__(self) -> None:
+        if not (self.gravity_m_s2 > 0 and self.gravity_sigma_m_s2 > 0 and self.states_hz > 0):
+            raise ValueError("gravity, its standard deviation and the rate of states must be positive")
+
+
+def estimate_joint(
+    trajectory: CameraTrajectory,
+    imu: ImuRecording,
+    calibration: CameraImuCalibration,
+    options: JointOptions | None = None,
+) -> ScaleEstimate:
+    """Metres per model unit, gravity and accelerometer bias, with a refined calibration.
+
+    Parameters
+    ----------
+    trajectory
+        Camera poses, dense or sparse. ``pose_cov``, where given, weighs frames against each other.
+    imu
+        Recording of the same device.
+    calibration
+        From ``align_camera_imu``. Its rotation, gyroscope bias and time offset are starting points with five times
+        their standard deviations; lever arm, readout and the offset between the sensors are priors as they stand.
+    options
+        See ``JointOptions``.
+
+    Returns
+    -------
+    ``method="joint"``. ``sigma_log`` combines the posterior standard deviation, inflated by chi-square where the fit is
+    worse than its noise, with 0.5 % for what no such recording can show. ``verdict`` is ``"refused"`` where the data
+    cannot give a scale, with the reason.
+    """
+    options = options or JointOptions()
+    try:
+        data, prior = prepare(
+            trajectory,
+            imu,
+            calibration,
+            gravity_m_s2=options.gravity_m_s2,
+            gravity_sigma_m_s2=options.gravity_sigma_m_s2,
+            states_hz=options.states_hz,
+        )
+        fit = fit_jointly(data, prior, imu.noise)
+    except NotObservableError as error:
+        return ScaleEstimate(
+            metres_per_unit=None, sigma_log=None, ci95=None, verdict="refused", method="joint", reasons=(error.hint,)
+        )
+    except np.linalg.LinAlgError:
+        reason = f"camera and IMU do not determine a scale together: {_RECORD_INSTEAD}"
+        return ScaleEstimate(
+            metres_per_unit=None, sigma_log=None, ci95=None, verdict="refused", method="joint", reasons=(reason,)
+        )
+    return _judged(fit, data.t_s, calibration)
+
+
+def _judged(fit: Fit, t_s: Array, calibration: CameraImuCalibration) -> ScaleEstimate:
+    x = fit.estimate
+    squares = sum(s for s, _ in fit.sums.values())
+    expected = sum(e for _, e in fit.sums.values())
+    worst = max(s / e for s, e in fit.sums.values())
+    sigma = float(np.sqrt(fit.cov[par.SCALE, par.SCALE] * max(1.0, worst)))
+    sigma_log = float(np.hypot(sigma, _UNSEEN))
+    checks, refusals = _checks(fit, t_s), _refusals(fit, t_s)
+    verdict, ci95, reasons = verdict_of(x.metres_per_unit, sigma_log, checks, refusals=refusals)
+    refused = verdict == "refused"
+    keep = [par.SCALE, *range(par.GRAVITY.start, par.ACCEL_BIAS.stop)]
+    signs = np.array([-1.0, *[1.0] * 6])
+    cov = fit.cov[np.ix_(keep, keep)] * signs[:, None] * signs
+    cov[0, 0] = sigma_log**2
+    return ScaleEstimate(
+        metres_per_unit=None if refused else x.metres_per_unit,
+        sigma_log=None if refused else sigma_log,
+        ci95=None if refused else ci95,
+        verdict=verdict,
+        method="joint",
+        reasons=reasons,
+        gravity_in_world_m_s2=x.gravity_m_s2,
+        accel_bias_m_s2=x.accel_bias_m_s2,
+        calibration=_refined(fit, calibration),
+        cov=cov,
+        chi2=squares,
+        dof=max(1, round(expected)),
+        excitation_m_s2=fit.excitation_m_s2,
+    )
+
+
+def _refusals(fit: Fit, t_s: Array) -> list[str]:
+    """Findings that make the number worthless, in the user's words."""
+    out = []
+    x = fit.estimate
+    if not fit.converged:
+        out.append(f"the fit of camera and IMU does not come to rest: {_RECORD_INSTEAD}")
+    bias = float(np.linalg.norm(x.accel_bias_m_s2))
+    if bias > _LARGEST_BIAS_M_S2:
+        out.append(
+            f"the accelerometer would have to be off by {bias:.1f} m/s2, more than any working sensor is: check its "
+            "unit (m/s2), its sign (at rest it reads +9.8 away from the ground) and its axes"
+        )
+    # Noise of the accelerometer averaged between states, against the acceleration that it should measure
+    unexplained = fit.noise.accel_m_s2_rthz / float(np.sqrt(np.median(np.diff(t_s))))
+    if unexplained > 0.5 * fit.excitation_m_s2:
+        out.append(
+            f"the accelerometer and the camera's motion disagree by {unexplained:.2f} m/s2, where the motion itself is "
+            f"{fit.excitation_m_s2:.2f} m/s2: check the accelerometer's sign and axes and that both recordings belong "
+            f"together, or {_RECORD_INSTEAD}"
+        )
+    return out
+
+
+def _checks(fit: Fit, t_s: Array) -> list[str]:
+    """Findings that make the number doubtful, in the user's words."""
+    sigma = float(np.hypot(fit.step_sigma, _UNSEEN))
+    if abs(fit.step_log) <= _DISAGREEMENT_SIGMAS * sigma:
+        return []
+    return [
+        f"the second half of the recording is {100 * np.expm1(fit.step_log):+.1f} % in scale against the first, "
+        f"{abs(fit.step_log) / sigma:.1f} standard deviations: the reconstruction's scale drifts, or a part of it is "
+        "wrong; close loops while recording, or scale its parts apart"
+    ]
+
+
+def _refined(fit: Fit, calibration: CameraImuCalibration) -> CameraImuCalibration:
+    x = fit.estimate
+    # Rows of CALIBRATION_PARAMETERS from the globals and the mean gyroscope bias
+    jacobian = np.zeros((12, par.N_GLOBALS))
+    jacobian[0:3, par.ROTATION] = np.eye(3)
+    jacobian[3:5, par.DELAY] = 1.0
+    jacobian[4, par.ACCEL_DELAY] = 1.0
+    jacobian[8:11, par.LEVER] = np.eye(3)
+    cov = jacobian @ fit.cov @ jacobian.T
+    with_bias = jacobian @ fit.gyro_bias_with_globals
+    cov[:, 5:8] += with_bias
+    cov[5:8, :] += with_bias.T
+    cov[5:8, 5:8] = fit.gyro_bias_cov
+    cov[11, 11] = calibration.cov[11, 11]
+    return CameraImuCalibration(
+        cam_from_imu_xyzw=quat_from_matrix(x.cam_from_imu),
+        gyro_time_offset_s=calibration.gyro_time_offset_s + x.delay_s,
+        accel_time_offset_s=calibration.accel_time_offset_s + x.delay_s + x.accel_delay_s,
+        gyro_bias_rad_s=x.gyro_bias_rad_s.mean(axis=0),
+        imu_in_cam_m=x.imu_in_cam_m,
+        readout_s=calibration.readout_s,
+        cov=0.5 * (cov + cov.T),
+    )

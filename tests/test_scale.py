@@ -1,0 +1,95 @@
+"""Choosing an estimator, units, windows, gravity, and the verdict."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from colmap_inertial.scale import ScaleOptions, check_units, estimate_scale, first_seconds, gravity_at_latitude_m_s2
+from colmap_inertial.scale.verdict import half_width, verdict_of
+from colmap_inertial.simulate.recording import RecordingOptions, simulate_recording
+
+
+def test_the_interval_is_symmetric_in_the_logarithm_and_covers_95_percent():
+    verdict, (low, high), reasons = verdict_of(2.0, 0.01)
+    assert verdict == "trusted" and reasons == ()
+    assert low * high == pytest.approx(4.0)
+    draws = 2.0 * np.exp(0.01 * np.random.default_rng(0).standard_normal(100_000))
+    assert np.mean((draws > low) & (draws < high)) == pytest.approx(0.95, abs=0.003)
+
+
+@pytest.mark.parametrize(
+    ("sigma", "verdict"),
+    [(0.0152, "trusted"), (0.0154, "weak"), (0.150, "weak"), (0.152, "refused"), (np.inf, "refused")],
+)
+def test_the_width_of_the_interval_decides_the_verdict(sigma, verdict):
+    assert verdict_of(1.0, sigma)[0] == verdict
+    low, high = verdict_of(1.0, sigma)[1]
+    if np.isfinite(sigma):
+        assert half_width(sigma) == pytest.approx((high - low) / 2)
+
+
+def test_failed_checks_lower_and_refusals_refuse():
+    assert verdict_of(1.0, 0.001, ["the halves disagree"])[::2] == ("weak", ("the halves disagree",))
+    verdict, _, reasons = verdict_of(1.0, 0.001, ["a"], refusals=["b"])
+    assert verdict == "refused" and reasons == ("b", "a")
+
+
+def test_a_verdict_needs_a_positive_scale():
+    with pytest.raises(ValueError, match="metres_per_unit"):
+        verdict_of(-1.0, 0.1)
+    with pytest.raises(ValueError, match="sigma_log"):
+        verdict_of(1.0, float("nan"))
+
+
+def test_gravity_agrees_with_the_wgs84_table():
+    # NIMA TR8350.2, table 3.4: equator, 45 degrees (the older 9.80620 of GRS 80 differs by 2e-5), pole
+    assert gravity_at_latitude_m_s2(0) == pytest.approx(9.7803253359, abs=1e-9)
+    assert gravity_at_latitude_m_s2(90) == pytest.approx(9.8321849378, abs=1e-7)
+    assert gravity_at_latitude_m_s2(-45) == pytest.approx(9.80620, abs=2e-5)
+    with pytest.raises(ValueError, match="latitude"):
+        gravity_at_latitude_m_s2(91)
+
+
+@pytest.fixture(scope="module")
+def recording():
+    return simulate_recording(RecordingOptions(), seed=3)
+
+
+def test_units_are_checked(recording):
+    imu = recording.imu
+    assert check_units(imu) == []
+    assert "in g" in check_units(replace(imu, accel_m_s2=imu.accel_m_s2 / 9.80665))[0]
+    assert "deg/s" in check_units(replace(imu, gyro_rad_s=imu.gyro_rad_s * 180 / np.pi))[0]
+    without_gravity = imu.accel_m_s2 * 0.02
+    assert "gravity was removed" in check_units(replace(imu, accel_m_s2=without_gravity))[0]
+
+
+def test_wrong_units_are_refused_with_what_to_do(recording):
+    imu = replace(recording.imu, accel_m_s2=recording.imu.accel_m_s2 / 9.80665)
+    estimate = estimate_scale(recording.trajectory, imu)
+    assert estimate.verdict == "refused" and "multiply it by 9.80665" in estimate.reasons[0]
+
+
+def test_the_first_seconds_hold_nothing_of_later_frames(recording):
+    cut = first_seconds(recording.trajectory, 5.0)
+    assert cut.t_s[-1] <= cut.t_s[0] + 5.0 < recording.trajectory.t_s[len(cut)]
+
+
+def test_the_default_estimate_is_right_and_says_how_long_it_took(recording):
+    estimate = estimate_scale(recording.trajectory, recording.imu)
+    low, high = estimate.ci95
+    assert estimate.method == "joint" and low < recording.truth.metres_per_unit < high
+    assert 0 < estimate.runtime_s < 60
+
+
+def test_another_recordings_imu_is_refused(recording):
+    other = simulate_recording(RecordingOptions(), seed=4)
+    estimate = estimate_scale(recording.trajectory, other.imu)
+    assert estimate.verdict == "refused" and estimate.metres_per_unit is None
+    assert "time offset" in estimate.reasons[0]
+
+
+def test_a_shared_clock_narrows_the_search(recording):
+    estimate = estimate_scale(recording.trajectory, recording.imu, options=ScaleOptions(max_offset_s=1.0))
+    assert estimate.verdict == "refused" and "do not overlap" in estimate.reasons[0]
