@@ -14,7 +14,8 @@ from colmap_inertial.types import Array
 class GyroPath:
     """Orientation of the IMU along a recording, against its orientation at the first sample.
 
-    Between samples the rate is linear and the rotation follows its mean, which is of second order.
+    Between samples the rate is linear; the rotation follows from Magnus' series up to its second term, without which
+    coning motion looks like a bias.
 
     Parameters
     ----------
@@ -32,8 +33,8 @@ class GyroPath:
         self.t_s = t_s
         self.rate_rad_s = rate_rad_s - bias_rad_s
         self._step_s = np.diff(t_s)
-        mean = 0.5 * (self.rate_rad_s[1:] + self.rate_rad_s[:-1])
-        self.start_from_imu_xyzw = quat_cumulative(quat_exp(mean * self._step_s[:, None]))
+        turns = _turn(self.rate_rad_s[:-1], self.rate_rad_s[1:], self._step_s)
+        self.start_from_imu_xyzw = quat_cumulative(turns)
         self._gaps = np.concatenate([[0], np.cumsum(self._step_s > max_gap_s)])
 
     def covers(self, begin_s: Array, end_s: Array) -> NDArray[np.bool_]:
@@ -47,8 +48,7 @@ class GyroPath:
     def at(self, query_s: Array) -> tuple[Array, Array]:
         """``start_from_imu`` quaternions (M, 4) and rates (M, 3) in rad/s at ``query_s``; the ends are continued."""
         i, since_s, rate = self._locate(query_s)
-        turn = quat_exp(0.5 * (self.rate_rad_s[i] + rate) * since_s[:, None])
-        return quat_multiply(self.start_from_imu_xyzw[i], turn), rate
+        return quat_multiply(self.start_from_imu_xyzw[i], _turn(self.rate_rad_s[i], rate, since_s)), rate
 
     def bias_lever(self, query_s: Array) -> Array:
         """(M, 3, 3) integrals of ``start_from_imu`` from the first sample to ``query_s``, in seconds.
@@ -92,6 +92,12 @@ class GyroPath:
         # outside the recording the rate stays at the end's instead of running away
         fraction = np.clip(since_s / self._step_s[i], 0.0, 1.0)[:, None]
         return i, since_s, self.rate_rad_s[i] + fraction * (self.rate_rad_s[i + 1] - self.rate_rad_s[i])
+
+
+def _turn(rate_before: Array, rate_after: Array, step_s: Array) -> Array:
+    """Rotations (K, 4) over steps in which the rate goes linearly from one value to the other (Magnus, two terms)."""
+    step = step_s[:, None]
+    return quat_exp(0.5 * step * (rate_before + rate_after) + step**2 / 12 * np.cross(rate_before, rate_after))
 
 
 def _by_symmetric(rate: Array) -> Array:

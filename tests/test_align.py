@@ -139,7 +139,7 @@ def test_gyro_path_knows_its_gaps_and_ends():
 
 def test_errors_are_as_large_as_stated_over_simulated_recordings():
     z = []
-    for seed in range(120):
+    for seed in range(100):
         readout_s = abs(np.random.default_rng(seed).normal(0, 0.02))
         options = RecordingOptions(
             motion=MotionOptions(duration_s=15.0), imu=STATED, sfm=SfmOptions(readout_s=readout_s)
@@ -296,24 +296,23 @@ def test_mirrored_axes_are_no_rotation():
         align_camera_imu(simulated.trajectory, mirrored)
 
 
+@pytest.mark.slow
 def test_on_real_recordings_the_own_imu_is_found_and_every_other_is_refused(recordings):
-    for name, (trajectory, _) in recordings.items():
-        for other, (_, imu) in recordings.items():
-            for length_s in (60.1, 10.0):
-                part = window(trajectory, 0.0, length_s)
-                if other != name:
-                    with pytest.raises(NotObservableError):
-                        align_camera_imu(part, imu)
-                    continue
-                calibration = align_camera_imu(part, imu)
-                # camera and IMU were started together, whatever their stamps say
-                assert abs(calibration.gyro_time_offset_s + clock_shift_s(trajectory, imu)) < 0.1
+    for name, (trajectory, own) in recordings.items():
+        for part in (trajectory, window(trajectory, 0.0, 10.0)):
+            calibration = align_camera_imu(part, own)
+            # camera and IMU were started together, whatever their stamps say
+            assert abs(calibration.gyro_time_offset_s + clock_shift_s(trajectory, own)) < 0.1
+        for i, (other, (_, imu)) in enumerate(recordings.items()):
+            if other != name:
+                with pytest.raises(NotObservableError):
+                    align_camera_imu(window(trajectory, 0.0, 10.0 if i % 2 else 60.1), imu)
 
 
 def test_on_real_recordings_five_seconds_suffice_and_agree_with_a_minute(recordings):
     for trajectory, imu in recordings.values():
         whole = align_camera_imu(trajectory, imu)
-        for begin_s in range(0, 60, 10):
+        for begin_s in (10.0, 40.0):
             short = align_camera_imu(window(trajectory, begin_s, 5.0), imu)
             difference = short.gyro_time_offset_s - whole.gyro_time_offset_s
             assert abs(difference) < 4 * np.hypot(short.sigma("gyro_time_offset_s"), 0.005)

@@ -31,6 +31,8 @@ UNKNOWN_OFFSET_S = 1e3
 #: Columns of the refinement among ``CALIBRATION_PARAMETERS``: rotation, gyroscope offset, gyroscope bias.
 _FITTED = np.array([0, 1, 2, 3, 5, 6, 7])
 _OTHERS = np.setdiff1d(np.arange(len(CALIBRATION_PARAMETERS)), _FITTED)
+#: White noise of a gyroscope whose data sheet is not at hand, rad/s/sqrt(Hz): phones have 1e-4 to 1e-3.
+_GYRO_DENSITY = 3e-4
 #: Intervals whose residual is this many times its standard deviation lose weight fast: jumps of the poses.
 _OUTLIER_SIGMAS = 4.0
 _N, _N_NUISANCE = len(_FITTED), 19
@@ -147,6 +149,7 @@ def refine_alignment(
     state.nuisance[_RATE] = clock_rate
     middle_s = middle_of_overlap(trajectory, imu.gyro_t_s, start.offset_s)
     noise: tuple[float, float] | None = None
+    least_density = _GYRO_DENSITY if imu.noise is None else max(imu.noise.gyro_density_rad_s_rthz, 1e-6)
     for iteration in range(25):
         if iteration in (0, 2, 6):  # the path is linear enough in the bias between these
             path, path_bias = GyroPath(imu.gyro_t_s, imu.gyro_rad_s, state.bias), state.bias
@@ -161,7 +164,7 @@ def refine_alignment(
             sigmas = np.sqrt(np.sum(residual**2, axis=1) / (2 * noise[0] + noise[1] * dt_s))
             excess = np.minimum(np.maximum(sigmas / _OUTLIER_SIGMAS, 1.0) ** 4, 1e8)
         if iteration in (2, 3, 5, 8):
-            noise = _noise_of(residual, dt_s, excess, noise)
+            noise = _noise_of(residual, dt_s, excess, noise, least_density**2)
         white_residual, white_jacobian = _whiten(residual, jacobian, dt_s, excess, noise)
         from_prior = np.concatenate(
             [
@@ -236,7 +239,7 @@ def _residuals(
 ) -> tuple[Array, Array, Array]:
     """Gyroscope against camera over the covered intervals: residuals (K, 3) rad, derivatives (K, 3, 26), lengths (K,).
 
-    Camera frame at the end of each interval. Columns: rotation, offset, bias, nuisance parameters.
+    World frame. Columns: rotation, offset, bias, nuisance parameters.
     """
     since_s = trajectory.t_s - middle_s
     t_s = trajectory.t_s - state.offset_s - state.nuisance[_RATE] * since_s
@@ -269,7 +272,10 @@ def _residuals(
     jacobian[:, :, _N:][:, :, _SHUTTER] = by_shutter
     moving = np.einsum("kij,kj->ki", felt_back, rate_in_cam[:-1] * since_s[:-1, None])
     jacobian[:, :, _N + _RATE] = moving - rate_in_cam[1:] * since_s[1:, None]
-    return residual[covered], jacobian[covered], np.diff(trajectory.t_s)[covered]
+    # in the world frame, errors of a pose enter the intervals before and after it alike, whatever the rotation
+    to_world = matrix_from_quat(quat_conjugate(cam_from_world[1:]))[covered]
+    residual = np.einsum("kij,kj->ki", to_world, residual[covered])
+    return residual, to_world @ jacobian[covered], np.diff(trajectory.t_s)[covered]
 
 
 def _bands(dt_s: Array, excess: Array, noise: tuple[float, float]) -> Array:
@@ -292,8 +298,13 @@ def _whiten(
     return white[:, :, 0], white[:, :, 1:]
 
 
-def _noise_of(residual: Array, dt_s: Array, excess: Array, start: tuple[float, float]) -> tuple[float, float]:
-    """Variance of a pose (rad2) and density of the rate (rad2/s), by maximum likelihood."""
+def _noise_of(
+    residual: Array, dt_s: Array, excess: Array, start: tuple[float, float], least_rate: float
+) -> tuple[float, float]:
+    """Variance of a pose (rad2) and density of the rate (rad2/s), by maximum likelihood.
+
+    The density is at least the sensor's: a few poses could not tell it from nothing, and the bias would look too good.
+    """
     from scipy.linalg import cholesky_banded, solve_banded
     from scipy.optimize import minimize
 
@@ -302,13 +313,13 @@ def _noise_of(residual: Array, dt_s: Array, excess: Array, start: tuple[float, f
         white = solve_banded((1, 0), factor, residual)
         return float(0.5 * np.sum(white**2) + 3 * np.sum(np.log(factor[0])))
 
-    # 1 microradian, 1e-6 rad/s/sqrt(Hz): below any camera and gyroscope, above rounding
-    start_logs = np.log(np.maximum(start, 1e-12))
+    least = (1e-12, least_rate)  # a microradian: below any camera, above rounding
+    start_logs = np.log(np.maximum(start, least))
     found = minimize(
         cost,
         start_logs,
         method="Nelder-Mead",
-        bounds=[(np.log(1e-12), 0.0)] * 2,
+        bounds=[(np.log(low), 0.0) for low in least],
         options={"xatol": 0.02, "fatol": 0.02, "maxiter": 80},
     )
     return float(np.exp(found.x[0])), float(np.exp(found.x[1]))
