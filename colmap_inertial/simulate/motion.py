@@ -73,6 +73,12 @@ class MotionOptions:
     """Azimuth swept by orbit."""
     sweep_s: float = 20.0
     """Time for one sweep of the arc; then back again."""
+    heading_deg: float | None = None
+    """Azimuth of the way forwards; for orbit, of the middle of the arc. None draws it."""
+    look_deg: float = 0.0
+    """Where the camera looks, to the left of the way forwards; orbit looks at its subject."""
+    start_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Where the camera is at time 0, but for the hand; for orbit, the subject."""
 
     def __post_init__(self) -> None:
         for name in ("duration_s", "radius_m", "sweep_s"):
@@ -247,7 +253,7 @@ def _looking(direction: Array) -> Array:
 def make_motion(options: MotionOptions, rng: np.random.Generator) -> Motion:
     """Draw a motion. It is defined from ``-MARGIN_S`` to ``duration_s + MARGIN_S``.
 
-    The world's z axis points up; ``orbit`` circles the origin, the others start near it.
+    The world's z axis points up; ``orbit`` circles its start, the others begin near it.
     """
     step_s = 1 / _KNOT_RATE_HZ
     guard = 16  # samples beyond the margin, where the spline's boundary condition is felt
@@ -255,6 +261,8 @@ def make_motion(options: MotionOptions, rng: np.random.Generator) -> Motion:
     start_s = -MARGIN_S - guard * step_s
     t = start_s + step_s * np.arange(n)
     heading = rng.uniform(0, 2 * np.pi)
+    if options.heading_deg is not None:
+        heading = np.deg2rad(options.heading_deg)
     along = np.array([np.cos(heading), np.sin(heading), 0.0])
     side = np.array([-along[1], along[0], 0.0])
     position = np.zeros((n, 3))
@@ -271,7 +279,8 @@ def make_motion(options: MotionOptions, rng: np.random.Generator) -> Motion:
         position = position + reach * np.tanh(shake / reach)
         looking = _looking(-position)
     else:
-        looking = np.broadcast_to(_looking(along[None]), (n, 4))
+        look = heading + np.deg2rad(options.look_deg)
+        looking = np.broadcast_to(_looking(np.array([[np.cos(look), np.sin(look), 0.0]])), (n, 4))
         if options.kind in ("walk", "constant_velocity"):
             position = position + options.speed_m_s * t[:, None] * along
         if options.kind == "walk":
@@ -289,7 +298,7 @@ def make_motion(options: MotionOptions, rng: np.random.Generator) -> Motion:
     return Motion(
         start_s=start_s,
         step_s=step_s,
-        cam_in_world_m=position,
+        cam_in_world_m=position + np.array(options.start_m),
         world_from_cam_xyzw=quat_multiply(looking, quat_exp(turn)),
     )
 

@@ -1,0 +1,172 @@
+"""Rendered pictures are exact in geometry and time."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from colmap_inertial.geometry import matrix_from_quat, quat_exp, quat_from_matrix
+from colmap_inertial.simulate import Motion, MotionOptions, make_motion
+from colmap_inertial.simulate.render import Renderer, ShutterCamera, colmap_camera, develop
+from colmap_inertial.simulate.world import Board, Quad, World, make_world
+from colmap_inertial.types import CameraModel
+
+WIDE = CameraModel(model="OPENCV", width=96, height=64, params=(80, 82, 47, 33, 0.08, -0.1, 0.001, -0.0005))
+#: A small part of a picture of 640 x 480.
+SMALL = CameraModel(model="OPENCV", width=64, height=48, params=(400, 404, 31, 25, 0.08, -0.1, 0.001, -0.0005))
+
+
+@pytest.fixture(scope="module")
+def desk():
+    world = make_world("desk", 3)
+    # what lies in the middle of the table, and the table: all that these tests look at
+    near = [q for q in world.quads if np.abs(q.corner_m[:2]).max() < 0.4 or q.texture.shape == (1100, 1600, 3)]
+    return Renderer(replace(world, quads=tuple(near)))
+
+
+def handheld(vigour=1.0, seed=2):
+    return make_motion(
+        MotionOptions(kind="orbit", heading_deg=-90, duration_s=10.0, vigour=vigour), np.random.default_rng(seed)
+    )
+
+
+def brute_force(renderer, camera, motion, t_s, sub_frames=64):
+    """The mean of instantaneous global-shutter pictures, each line over its own exposure.
+
+    The readout must be a whole number of sub-frames per line.
+    """
+    still = replace(camera, exposure_s=0.0, readout_s=0.0)
+    starts = camera.line_start_s(t_s)
+    step = camera.exposure_s / sub_frames
+    first = np.round((starts - starts.min()) / step).astype(int)
+    np.testing.assert_allclose(starts.min() + first * step, starts, atol=1e-9)
+    by_row = camera.readout_direction in ("down", "up")
+    total = np.zeros((camera.model.height, camera.model.width, 3))
+    for k in range(first.max() + sub_frames):
+        picture = renderer.linear(still, motion, starts.min() + (k + 0.5) * step)
+        line = (first <= k) & (k < first + sub_frames)
+        if by_row:
+            total[line] += picture[line]
+        else:
+            total[:, line] += picture[:, line]
+    return total / sub_frames
+
+
+@pytest.mark.parametrize("direction", ["down", "left"])
+def test_blur_and_rolling_shutter_agree_with_64_sub_frames(desk, direction):
+    lines = SMALL.height if direction == "down" else SMALL.width
+    exposure_s = 0.02
+    camera = ShutterCamera(
+        model=SMALL, exposure_s=exposure_s, readout_s=lines * exposure_s / 64, readout_direction=direction
+    )
+    motion = handheld(vigour=2.0)
+    picture = desk.linear(camera, motion, 4.0)
+    expected = brute_force(desk, camera, motion, 4.0)
+    difference = develop(picture, camera, None).astype(float) - develop(expected, camera, None)
+    assert np.sqrt(np.mean(difference**2)) < 1.5
+    # and both effects are there to be seen
+    sharp = desk.linear(replace(camera, exposure_s=0.0, readout_s=0.0), motion, camera.middle_s(4.0))
+    wrong = desk.linear(replace(camera, readout_s=0.0, exposure_s=exposure_s), motion, 4.0)
+    for other in (sharp, wrong):
+        visible = develop(picture, camera, None).astype(float) - develop(other, camera, None)
+        assert np.sqrt(np.mean(visible**2)) > 3
+
+
+def test_blur_alone_agrees_with_sub_frames_however_long(desk):
+    for exposure_s in (0.004, 0.05):
+        camera, motion = ShutterCamera(model=SMALL, exposure_s=exposure_s), handheld(vigour=1.5)
+        difference = develop(desk.linear(camera, motion, 6.0), camera, None).astype(float) - develop(
+            brute_force(desk, camera, motion, 6.0), camera, None
+        )
+        assert np.sqrt(np.mean(difference**2)) < 1.5
+
+
+def still_at(position, turn=(0.0, 0.0, 0.0)):
+    # a camera that looks along world y with z up, then turned
+    base = matrix_from_quat(quat_exp(np.array(turn))) @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    return Motion(
+        start_s=0.0,
+        step_s=0.1,
+        cam_in_world_m=np.tile(np.array(position, dtype=float), (20, 1)),
+        world_from_cam_xyzw=np.tile(quat_from_matrix(base), (20, 1)),
+    )
+
+
+def wall(texture, *, size=(2.0, 1.5), distance=2.0):
+    quad = Quad(
+        corner_m=np.array([-size[0] / 2, distance, size[1] / 2]),
+        edge_u_m=np.array([size[0], 0, 0]),
+        edge_v_m=np.array([0, 0, -size[1]]),
+        texture=texture,
+    )
+    return World(quads=(quad,), board=Board(), board_corners_m=np.zeros((48, 3)))
+
+
+def test_depth_is_that_of_the_closed_form():
+    renderer = Renderer(wall(np.ones((8, 8, 3), dtype=np.float32), size=(9.0, 9.0)))
+    turn = np.array([0.2, -0.1, 0.3])
+    motion = still_at((0.1, 0.2, -0.1), turn)
+    depth = renderer.depth_m(ShutterCamera(model=WIDE), motion, 1.0)
+    pixels = np.stack(np.meshgrid(np.arange(96) + 0.5, np.arange(64) + 0.5), axis=-1).reshape(-1, 2)
+    rays = np.column_stack([colmap_camera(WIDE).cam_from_img(pixels), np.ones(len(pixels))])
+    rotation = matrix_from_quat(motion.world_from_cam_xyzw([1.0]))[0]
+    np.testing.assert_allclose(depth.ravel(), (2.0 - 0.2) / (rays @ rotation.T)[:, 1], rtol=1e-12)
+
+
+def test_a_point_of_the_world_is_drawn_where_the_camera_projects_it(desk):
+    motion, t = handheld(), 5.0
+    model = CameraModel(model="OPENCV", width=480, height=360, params=(400, 405, 238, 182, 0.08, -0.1, 0.001, -0.0005))
+    camera = ShutterCamera(model=model, exposure_s=1e-4)
+    grey = develop(desk.linear(camera, motion, t), camera, None).mean(axis=2).astype(np.float32)
+    import cv2
+
+    world = desk.world
+    at = camera.middle_s(t)
+    rotation = matrix_from_quat(motion.world_from_cam_xyzw([at]))[0]
+    in_cam = (world.board_corners_m - motion.cam_in_world_m([at])) @ rotation
+    expected = np.asarray(colmap_camera(model).img_from_cam(in_cam))
+    found = cv2.cornerSubPix(grey, (expected - 0.5).astype(np.float32), (3, 3), (-1, -1), (3, 60, 1e-4)).reshape(-1, 2)
+    error = found + 0.5 - expected
+    assert np.abs(error.mean(axis=0)).max() < 0.02
+    assert np.sqrt(np.mean(error**2)) < 0.06
+    depth = desk.depth_m(camera, motion, at)
+    x, y = np.floor(expected).astype(int).T
+    np.testing.assert_allclose(depth[y, x], in_cam[:, 2], rtol=0.01)
+
+
+def test_brightness_of_a_uniform_wall_survives_development():
+    renderer = Renderer(wall(np.full((64, 64, 3), 0.2, dtype=np.float32), size=(9.0, 9.0)))
+    camera = ShutterCamera(model=WIDE, exposure_s=0.01, readout_s=0.02, gain=1.5, white_electrons=5000.0)
+    linear = renderer.linear(camera, still_at((0, 0, 0)), 0.5)
+    np.testing.assert_allclose(linear, 0.3, rtol=1e-5)
+    assert np.all(develop(linear, camera, None) == round(255 * (1.055 * 0.3 ** (1 / 2.4) - 0.055)))
+    noisy = develop(linear, camera, np.random.default_rng(0)).astype(float)
+    light = ((noisy / 255 + 0.055) / 1.055) ** 2.4
+    assert abs(light.std() / np.sqrt(0.3 / 5000 + (8 / 5000) ** 2) - 1) < 0.03
+
+
+def test_cameras_of_a_rig_see_the_parallax_of_their_baseline():
+    rng = np.random.default_rng(0)
+    import cv2
+
+    texture = cv2.GaussianBlur(rng.uniform(0, 1, (600, 800, 1)).astype(np.float32), (0, 0), 4)[..., None] * np.ones(3)
+    renderer = Renderer(wall(texture.astype(np.float32), size=(4.0, 3.0)))
+    left = ShutterCamera(model=CameraModel(model="PINHOLE", width=96, height=64, params=(80, 80, 48, 32)))
+    right = replace(left, cam_in_body_m=(0.1, 0.0, 0.0))
+    motion = still_at((0, 0, 0))
+    a, b = (renderer.linear(camera, motion, 0.5)[..., 0] for camera in (left, right))
+    # 80 px * 0.1 m / 2 m = 4 px
+    np.testing.assert_allclose(a[8:-8, 12:-12], b[8:-8, 8:-16], atol=2e-3)
+
+
+def test_same_seed_same_world_and_picture():
+    a, b = make_world("room", 5), make_world("room", 5)
+    assert len(a.quads) > 100
+    assert all(np.array_equal(p.texture, q.texture) for p, q in zip(a.quads, b.quads, strict=True))
+    motion = make_motion(MotionOptions(kind="roam", vigour=0.4), np.random.default_rng(0))
+    camera = ShutterCamera(model=WIDE)
+    pictures = [Renderer(world).linear(camera, motion, 1.0) for world in (a, b)]
+    np.testing.assert_array_equal(*pictures)
+    noisy = [develop(pictures[0], camera, np.random.default_rng(1)) for _ in range(2)]
+    np.testing.assert_array_equal(*noisy)
+    assert np.isfinite(Renderer(a).depth_m(camera, motion, 1.0)).all()
