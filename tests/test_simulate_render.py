@@ -115,7 +115,7 @@ def test_depth_is_that_of_the_closed_form():
 
 def test_a_point_of_the_world_is_drawn_where_the_camera_projects_it(desk):
     motion, t = handheld(), 5.0
-    model = CameraModel(model="OPENCV", width=480, height=360, params=(400, 405, 238, 182, 0.08, -0.1, 0.001, -0.0005))
+    model = CameraModel(model="OPENCV", width=640, height=480, params=(520, 522, 318, 242, 0.08, -0.1, 0.001, -0.0005))
     camera = ShutterCamera(model=model, exposure_s=1e-4)
     grey = develop(desk.linear(camera, motion, t), camera, None).mean(axis=2).astype(np.float32)
     import cv2
@@ -125,7 +125,7 @@ def test_a_point_of_the_world_is_drawn_where_the_camera_projects_it(desk):
     rotation = matrix_from_quat(motion.world_from_cam_xyzw([at]))[0]
     in_cam = (world.board_corners_m - motion.cam_in_world_m([at])) @ rotation
     expected = np.asarray(colmap_camera(model).img_from_cam(in_cam))
-    found = cv2.cornerSubPix(grey, (expected - 0.5).astype(np.float32), (3, 3), (-1, -1), (3, 60, 1e-4)).reshape(-1, 2)
+    found = cv2.cornerSubPix(grey, (expected - 0.5).astype(np.float32), (4, 4), (-1, -1), (3, 60, 1e-4)).reshape(-1, 2)
     error = found + 0.5 - expected
     assert np.abs(error.mean(axis=0)).max() < 0.02
     assert np.sqrt(np.mean(error**2)) < 0.06
