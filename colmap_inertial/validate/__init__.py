@@ -1,0 +1,29 @@
+"""Is a reconstruction the right size? Checked with a target of known size in its images."""
+
+from colmap_inertial.validate.measure import validate_model
+from colmap_inertial.validate.pictures import write_pictures
+from colmap_inertial.validate.result import (
+    Distance,
+    RejectedView,
+    SetScale,
+    Validation,
+    ViewResiduals,
+    validation_table,
+)
+from colmap_inertial.validate.search import ValidateOptions
+from colmap_inertial.validate.targets import Target, TargetSpecError, parse_target
+
+__all__ = [
+    "Distance",
+    "RejectedView",
+    "SetScale",
+    "Target",
+    "TargetSpecError",
+    "ValidateOptions",
+    "Validation",
+    "ViewResiduals",
+    "parse_target",
+    "validate_model",
+    "validation_table",
+    "write_pictures",
+]
