@@ -164,10 +164,8 @@ def visual_groups(data: Data, noise: Noise, x: Estimate, rate_rad_s: Array, *, r
     rotation_by_rate, rotation_by_velocity, centre_by_rate, centre_by_velocity = x.shutter
 
     rotation = so3_log(data.world_from_cam.transpose(0, 2, 1) @ camera)
-    rotation = rotation - rate @ rotation_by_rate.T - velocity @ rotation_by_velocity.T
     rotation_here = np.zeros((k, 3, par.N_STATE))
     rotation_here[:, :, par.THETA] = x.cam_from_imu
-    rotation_here[:, :, par.VELOCITY] = -rotation_by_velocity @ cam_from_world
     since_middle = (data.t_s - par.middle_s(data.t_s))[:, None]
     rotation_z = np.zeros((k, 3, par.N_GLOBALS))
     rotation_z[:, :, par.ROTATION] = -np.eye(3)
@@ -192,8 +190,14 @@ def visual_groups(data: Data, noise: Noise, x: Estimate, rate_rad_s: Array, *, r
     centre_z[:, :, par.DELAY] = camera_velocity
     centre_z[:, :, par.CLOCK_RATE] = camera_velocity * since_middle
 
+    # Before the shutter's part: that one, too, is mostly along the direction in which a picture changes little
     carried = camera @ (x.coupling_m + x.metres_per_unit * data.coupling)
     centre = centre - _mv(carried, rotation)
+    centre_here -= carried @ rotation_here
+    centre_z -= carried @ rotation_z
+    unsmeared = rotation
+    rotation = rotation - rate @ rotation_by_rate.T - velocity @ rotation_by_velocity.T
+    rotation_here[:, :, par.VELOCITY] = -rotation_by_velocity @ cam_from_world
     for i in range(3):
         # Entries of the four shutter matrices and of the coupling, row by row
         at = [par.SHUTTER.start + 9 * j + 3 * i for j in range(4)] + [par.COUPLING.start + 3 * i]
@@ -202,9 +206,7 @@ def visual_groups(data: Data, noise: Noise, x: Estimate, rate_rad_s: Array, *, r
         column = -camera[:, :, i, None]
         centre_z[:, :, at[2] : at[2] + 3] = column * rate[:, None, :]
         centre_z[:, :, at[3] : at[3] + 3] = column * velocity[:, None, :]
-        centre_z[:, :, at[4] : at[4] + 3] = column * rotation[:, None, :]
-    centre_here -= carried @ rotation_here
-    centre_z -= carried @ rotation_z
+        centre_z[:, :, at[4] : at[4] + 3] = column * unsmeared[:, None, :]
 
     groups = []
     for residual, here, z, root, columns in (
