@@ -1,0 +1,9 @@
+"""Smoothed camera paths: from positions alone, and from positions, orientations and the IMU together."""
+
+from __future__ import annotations
+
+from colmap_inertial.smooth._attitude import Attitude, smooth_attitude
+from colmap_inertial.smooth._positions import SmoothOptions, smooth_positions
+from colmap_inertial.smooth._trajectory import smooth_trajectory
+
+__all__ = ["Attitude", "SmoothOptions", "smooth_attitude", "smooth_positions", "smooth_trajectory"]
