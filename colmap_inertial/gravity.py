@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from colmap_inertial.geometry import quat_conjugate, quat_cumulative, quat_exp, quat_rotate, slerp
 from colmap_inertial.types import Array, CameraImuCalibration, FrameTiming, ImuRecording
@@ -46,7 +49,7 @@ def up_in_imu(imu: ImuRecording, gyro_bias_rad_s: Array, query_s: Array, accel_d
     reach = np.arange(-4 * _AVERAGING_S, 4 * _AVERAGING_S + spacing, spacing)
     window = np.exp(-0.5 * (reach / _AVERAGING_S) ** 2)
     # Normalised convolution: gaps and unequal rates carry their own weight.
-    weight = _convolve_same(np.bincount(cell, minlength=len(grid)).astype(np.float64), window)
+    weight = _convolve_same(np.bincount(cell, minlength=len(grid)), window)
     summed = np.stack(
         [_convolve_same(np.bincount(cell, force_in_start[:, k], len(grid)), window) for k in range(3)], axis=1
     )
@@ -56,7 +59,7 @@ def up_in_imu(imu: ImuRecording, gyro_bias_rad_s: Array, query_s: Array, accel_d
     return up / np.linalg.norm(up, axis=1, keepdims=True)
 
 
-def _convolve_same(signal: Array, window: Array) -> Array:
+def _convolve_same(signal: NDArray[Any], window: Array) -> Array:
     """Convolution of the signal's length, whichever of the two is longer."""
     half = len(window) // 2
     return np.convolve(signal, window)[half : half + len(signal)]

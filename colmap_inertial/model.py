@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -156,7 +155,7 @@ def trajectory_from_model(
             f"names must agree (the model has {example!r}, the frame times {timing.names[0]!r})"
         )
     poses = [image.cam_from_world() for image in timed]
-    notes = ()
+    notes: tuple[str, ...] = ()
     if len(timed) < len(images):
         notes = (
             f"{len(images) - len(timed)} of the model's {len(images)} images have no frame time and were left out",
@@ -237,7 +236,7 @@ def mean_reprojection_error_px(reconstruction: pycolmap.Reconstruction) -> float
     return float(reconstruction.compute_mean_reprojection_error())
 
 
-def summarize(reconstruction: pycolmap.Reconstruction) -> Mapping[str, int | float]:
+def summarize(reconstruction: pycolmap.Reconstruction) -> dict[str, int | float]:
     """Counts and mean reprojection error, as COLMAP's model analyzer gives them."""
     return {
         "registered_images": reconstruction.num_reg_images(),

@@ -13,7 +13,7 @@ from colmap_inertial.io.files import write_text
 from colmap_inertial.io.imu import read_imu
 from colmap_inertial.io.tables import Table, read_table
 from colmap_inertial.io.units import seconds
-from colmap_inertial.types import Array, CameraTrajectory, ImuRecording
+from colmap_inertial.types import Array, CameraTrajectory, ImuRecording, SmoothedTrajectory
 
 
 def read_tum(path: Path) -> CameraTrajectory:
@@ -47,7 +47,7 @@ def read_tum(path: Path) -> CameraTrajectory:
     )
 
 
-def write_tum(path: Path, trajectory: CameraTrajectory) -> None:
+def write_tum(path: Path, trajectory: CameraTrajectory | SmoothedTrajectory) -> None:
     """Write a trajectory in TUM format; see :func:`read_tum`. Times are exact to the nanosecond."""
     t_ns = np.rint(trajectory.t_s * 1e9).astype(np.int64)
     world_from_cam = quat_normalize(quat_conjugate(trajectory.cam_from_world_xyzw))

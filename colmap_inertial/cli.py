@@ -1,0 +1,240 @@
+"""The command line: arguments, one call each, errors as one line. Nothing heavy is imported before a command runs."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Union
+
+import tyro
+from tyro.conf import Positional, arg, subcommand
+
+from colmap_inertial import __version__
+from colmap_inertial.errors import InertialError
+from colmap_inertial.pipeline import ReconstructOptions
+from colmap_inertial.scale import ScaleOptions
+from colmap_inertial.validate import ValidateOptions
+
+DESCRIPTION = """Metric, gravity-aligned COLMAP models from the gyroscope and accelerometer that filmed along.
+
+Exit codes: 0 done, 1 a check failed, 2 bad input, 3 not observable (scale refused), 4 mapping failed,
+5 target not found."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reconstruct:
+    """Turn images or video with an IMU recording into a COLMAP model in metres, gravity along an axis.
+
+    Writes OUT/sparse (COLMAP's own model), OUT/sparse_metric (the same in metres), OUT/trajectory.tum, OUT/result.json.
+    Started again after an interruption, it continues with the last finished stage.
+
+    Example: colmap-inertial reconstruct my_capture/capture.toml out
+    """
+
+    capture: Positional[Path]
+    """A capture.toml, a folder that holds one, or an EuRoC/ASL dataset."""
+    out: Positional[Path]
+    """A new folder for everything that is made."""
+    options: Annotated[ReconstructOptions, arg(name="")] = dataclasses.field(default_factory=ReconstructOptions)
+    config: Path | None = None
+    """TOML file with options, as OUT/config.toml of an earlier run; flags given here go before it."""
+
+    def run(self) -> int:
+        """Run the command; returns the exit code."""
+        from colmap_inertial.pipeline import reconstruct
+        from colmap_inertial.pipeline.terminal import live_progress, show_result
+
+        with live_progress() as progress:
+            result = reconstruct(self.capture, self.out, self.options, progress=progress)
+        show_result(result)
+        return result.exit_code()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scale:
+    """Metres per unit of an existing model or trajectory, without mapping.
+
+    SOURCE is a COLMAP model folder (needs --imu and --frame-times), a trajectory in TUM format (needs --imu), or an
+    InertialScale folder. Exit code 3 when the recording cannot give a scale; the JSON then says why.
+
+    Example: colmap-inertial scale project/sparse/0 --imu imu.csv --frame-times frames.csv --json scale.json
+    """
+
+    source: Positional[Path]
+    """COLMAP model folder, TUM trajectory, or InertialScale folder."""
+    json: Path
+    """Where to write the estimate."""
+    imu: Path | None = None
+    """IMU recording: a file or folder of a known format, or a capture.toml."""
+    frame_times: Path | None = None
+    """When the images were taken: a CSV with columns name,t_s, or a capture.toml."""
+    calibration: Path | None = None
+    """A calibration file of this device, used as a prior."""
+    first_s: float | None = None
+    """Use only this many seconds from the start of the camera's recording."""
+    latitude_deg: float | None = None
+    """Latitude of the recording, from which the strength of gravity follows."""
+    options: Annotated[ScaleOptions, arg(name="")] = dataclasses.field(default_factory=ScaleOptions)
+    config: Path | None = None
+    """TOML file with options; flags given here go before it."""
+
+    def run(self) -> int:
+        """Run the command; returns the exit code."""
+        from colmap_inertial.pipeline.sources import ScaleSource, scale_source
+        from colmap_inertial.pipeline.terminal import show_scale
+
+        estimate = scale_source(
+            ScaleSource(source=self.source, imu=self.imu, frame_times=self.frame_times, calibration=self.calibration),
+            self.options,
+            json=self.json,
+            first_s=self.first_s,
+            latitude_deg=self.latitude_deg,
+        )
+        show_scale(estimate, self.source)
+        return 3 if estimate.verdict == "refused" else 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Align:
+    """Rotation, time offset and gyro bias between the camera and the IMU of one device, from one recording.
+
+    Needs no scale, only a camera that turned. The calibration file serves --calibration for later recordings of the
+    same device. Exit code 3 when no time offset is better than the rest.
+
+    Example: colmap-inertial align project/sparse/0 --imu imu.csv --frame-times frames.csv --out phone.json
+    """
+
+    source: Positional[Path]
+    """COLMAP model folder, TUM trajectory, or InertialScale folder."""
+    out: Path
+    """Where to write the calibration (JSON)."""
+    imu: Path | None = None
+    """IMU recording: a file or folder of a known format, or a capture.toml."""
+    frame_times: Path | None = None
+    """When the images were taken: a CSV with columns name,t_s, or a capture.toml."""
+    calibration: Path | None = None
+    """An earlier calibration file of this device, used as a prior."""
+
+    def run(self) -> int:
+        """Run the command; returns the exit code."""
+        from colmap_inertial.pipeline.sources import ScaleSource, align_source
+        from colmap_inertial.pipeline.terminal import show_calibration
+
+        source = ScaleSource(
+            source=self.source, imu=self.imu, frame_times=self.frame_times, calibration=self.calibration
+        )
+        show_calibration(align_source(source, self.out), self.source)
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Validate:
+    """Compare the size of a model with a target of known size in its images.
+
+    TARGET is checkerboard:COLSxROWS:SQUARE_M (inner corners), charuco:COLSxROWS:SQUARE_M:MARKER_M:DICT (squares),
+    aprilgrid:COLSxROWS:TAG_M:GAP (GAP = gap / tag), or aruco:DICT:SIDE_M. Exit code 0 within the tolerance, 1 outside
+    it, 5 when the target is not found.
+
+    Example: colmap-inertial validate out/sparse_metric/0 --images out/images --target checkerboard:8x6:0.03
+    """
+
+    model: Positional[Path]
+    """COLMAP model folder."""
+    images: Path
+    """Folder with the model's images (the rectified ones where the rolling shutter was undone)."""
+    target: str
+    """What to look for, as above."""
+    json: Path | None = None
+    """Where to write the result."""
+    pictures: Path | None = None
+    """Folder for frames with the corners drawn in and a plot of the distances."""
+    tolerance: float = 2.0
+    """Largest scale error that passes, in per cent."""
+    unscaled: bool = False
+    """The model claims no unit: report the factor that makes it metric; always passes."""
+    apply: Path | None = None
+    """With --unscaled: a new folder for the model in metres, scaled by the control distances alone."""
+
+    def run(self) -> int:
+        """Run the command; returns the exit code."""
+        from colmap_inertial.pipeline.sources import validate_source
+        from colmap_inertial.pipeline.terminal import show_validation
+
+        result = validate_source(
+            self.model,
+            self.images,
+            self.target,
+            ValidateOptions(tolerance_pct=self.tolerance, unscaled=self.unscaled),
+            json=self.json,
+            pictures=self.pictures,
+            apply=self.apply,
+        )
+        show_validation(result)
+        return 0 if result.within_tolerance else 1
+
+
+Command = Reconstruct | Scale | Align | Validate
+_COMMANDS: dict[str, type[Command]] = {
+    "reconstruct": Reconstruct,
+    "scale": Scale,
+    "align": Align,
+    "validate": Validate,
+}
+
+
+def parse(args: Sequence[str]) -> Command:
+    """The command that the arguments describe; exits with code 2 and a message when they describe none.
+
+    Raises
+    ------
+    FormatError
+        For a ``--config`` file that cannot be read.
+    """
+    choices: list[Any] = []
+    for name, cls in _COMMANDS.items():
+        default = _default_from_config(cls, args) if list(args[:1]) == [name] else None
+        settings = subcommand(name) if default is None else subcommand(name, default=default)
+        choices.append(Annotated[cls, settings])
+    command: Any = Union[tuple(choices)]  # noqa: UP007 (built at run time)
+    config = (tyro.conf.PositionalMetavarFromFieldName,)
+    return tyro.cli(command, prog="colmap-inertial", description=DESCRIPTION, args=list(args), config=config)
+
+
+def _default_from_config(cls: type[Command], args: Sequence[str]) -> Command | None:
+    """The command with its options from ``--config``, so that flags go before the file and the file before defaults."""
+    from colmap_inertial.pipeline.config import read_config
+
+    path = None
+    for i, text in enumerate(args):
+        if text == "--config" and i + 1 < len(args):
+            path = args[i + 1]
+        elif text.startswith("--config="):
+            path = text.removeprefix("--config=")
+    if path is None or cls in (Align, Validate):
+        return None
+    fields = {f.name: f for f in dataclasses.fields(cls)}
+    options: Any = read_config(Path(path), ReconstructOptions if cls is Reconstruct else ScaleOptions)
+    required = {
+        name: tyro.MISSING for name, f in fields.items() if f.default is f.default_factory is dataclasses.MISSING
+    }
+    return cls(options=options, **required)  # type: ignore[call-arg]
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Entry point of ``colmap-inertial``."""
+    args = sys.argv[1:] if args is None else args
+    if list(args) == ["--version"]:
+        print(__version__)
+        return
+    try:
+        code = parse(args).run()
+    except InertialError as error:
+        print(f"error: {error}", file=sys.stderr)
+        code = error.exit_code
+    except KeyboardInterrupt:
+        print("interrupted; started again with the same arguments, it continues", file=sys.stderr)
+        code = 130
+    sys.exit(code)

@@ -1,0 +1,98 @@
+"""Options as TOML: read from ``--config``, and written back in full beside every result."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import tomllib
+import types
+import typing
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+from colmap_inertial.errors import FormatError
+
+Options = TypeVar("Options")
+
+
+def config_as_toml(options: object) -> str:
+    """Every option with its value; those that are ``None`` (TOML has none) are left out."""
+    import tomli_w
+
+    return tomli_w.dumps(_plain(options))
+
+
+def _plain(options: Any) -> dict[str, Any]:
+    plain: dict[str, Any] = {}
+    for f in dataclasses.fields(options):
+        value = getattr(options, f.name)
+        if dataclasses.is_dataclass(value):
+            plain[f.name] = _plain(value)
+        elif value is not None:
+            plain[f.name] = str(value) if isinstance(value, Path) else value
+    return plain
+
+
+def read_config(path: Path, cls: type[Options]) -> Options:
+    """Options of type ``cls`` from a TOML file; what it does not name keeps its default.
+
+    Raises
+    ------
+    FormatError
+        For a file that is no TOML, an unknown key (the nearest known one is named), or a value of the wrong type.
+    """
+    try:
+        values = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise FormatError(path, f"cannot be read: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise FormatError(path, f"is not valid TOML: {error}") from error
+    return _build(path, cls, values, "")
+
+
+def _build(path: Path, cls: type[Options], values: Mapping[str, Any], prefix: str) -> Options:
+    hints = typing.get_type_hints(cls)
+    known = [f.name for f in dataclasses.fields(cls)]  # type: ignore[arg-type]
+    built: dict[str, Any] = {}
+    for key, value in values.items():
+        if key not in known:
+            near = difflib.get_close_matches(key, known, n=1)
+            hint = f"; did you mean {prefix}{near[0]}?" if near else f"; known here: {', '.join(known)}"
+            raise FormatError(path, f"unknown option {prefix}{key}{hint}")
+        hint_type = hints[key]
+        if dataclasses.is_dataclass(hint_type):
+            if not isinstance(value, Mapping):
+                raise FormatError(path, f"{prefix}{key} is a table of options")
+            built[key] = _build(path, typing.cast(type, hint_type), value, f"{prefix}{key}.")
+        else:
+            built[key] = _checked(path, f"{prefix}{key}", value, hint_type)
+    try:
+        return cls(**built)
+    except ValueError as error:
+        raise FormatError(path, str(error)) from error
+
+
+def _checked(path: Path, name: str, value: Any, hint: Any) -> Any:
+    alternatives = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+    for kind in alternatives:
+        if typing.get_origin(kind) is typing.Literal:
+            if value in typing.get_args(kind):
+                return value
+        elif kind is Path and isinstance(value, str):
+            return Path(value)
+        elif kind is float and isinstance(value, (int, float)) and not isinstance(value, bool):
+            return float(value)
+        elif isinstance(kind, type) and type(value) is kind:
+            return value
+    raise FormatError(path, f"{name}: {value!r} is not {_describe(alternatives)}")
+
+
+def _describe(kinds: tuple[Any, ...]) -> str:
+    words = []
+    for kind in kinds:
+        if typing.get_origin(kind) is typing.Literal:
+            words.append("one of " + ", ".join(map(repr, typing.get_args(kind))))
+        elif kind is not type(None):
+            words.append(f"a {getattr(kind, '__name__', kind)}")
+    return " or ".join(words)

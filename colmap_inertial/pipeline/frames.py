@@ -1,0 +1,152 @@
+"""Frames through the frame stages into the folder that COLMAP reads, with a record of what was done to each."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.errors import FormatError, InertialError
+from colmap_inertial.io.files import read_json, write_json
+from colmap_inertial.pipeline.colmap import Progress
+from colmap_inertial.types import CameraModel, Frame, FrameTiming
+
+
+class FrameStage(Protocol):
+    """Between decoding and feature extraction: changes pixels or the camera, or drops frames; keeps names."""
+
+    def __call__(self, frames: Iterator[Frame], /) -> Iterator[Frame]:
+        """Take frames in order of time and yield those that COLMAP shall see, in the same order."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameRecord:
+    """What happened to one frame.
+
+    Attributes
+    ----------
+    name
+        Image name.
+    action
+        ``"passed"``: the original file or pixels; ``"changed"``: by a frame stage; ``"dropped"``: by a frame stage.
+    camera
+        Intrinsics that COLMAP starts from; ``None`` where COLMAP guesses.
+    """
+
+    name: str
+    action: str
+    camera: CameraModel | None
+
+
+class _Originals:
+    """Remembers the decoded array of each frame in flight, to tell whether a stage has changed it."""
+
+    def __init__(self) -> None:
+        self._arrays: dict[str, NDArray[Any]] = {}
+
+    def tap(self, frames: Iterator[Frame]) -> Iterator[Frame]:
+        for frame in frames:
+            self._arrays[frame.name] = frame.image
+            yield frame
+
+    def pop_through(self, name: str) -> NDArray[Any] | None:
+        """The original of ``name``; forgets it and, as order is kept, every frame before it."""
+        found = None
+        for known in list(self._arrays):
+            array = self._arrays.pop(known)
+            if known == name:
+                found = array
+                break
+        return found
+
+
+def write_frames(
+    frames: Iterator[Frame],
+    timing: FrameTiming,
+    stages: Sequence[FrameStage],
+    *,
+    source_folder: Path | None,
+    images: Path,
+    records: Path,
+    progress: Progress,
+) -> None:
+    """Run the frames through the stages and write them.
+
+    Parameters
+    ----------
+    frames
+        Decoded frames in order of time.
+    timing
+        Of all frames that the capture has.
+    source_folder
+        Where the original files lie, for image folders: a frame that no stage changed is copied, byte for byte.
+    images
+        Written: the folder for COLMAP.
+    records
+        Written: a JSON with one :class:`FrameRecord` for each frame of the capture.
+
+    Raises
+    ------
+    InertialError
+        When fewer than three frames are left, which cannot become a model.
+    """
+    originals = _Originals()
+    stream = originals.tap(frames)
+    for stage in stages:
+        stream = iter(stage(stream))
+    written: dict[str, FrameRecord] = {}
+    images.mkdir(parents=True)
+    known = set(timing.names)
+    for frame in stream:
+        if frame.name not in known or frame.name in written:
+            raise ValueError(f"a frame stage yielded {frame.name!r}, which is no frame of the capture or came twice")
+        original = originals.pop_through(frame.name)
+        passed = original is not None and _same_memory(original, frame.image)
+        target = images / frame.name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if passed and source_folder is not None:
+            shutil.copyfile(source_folder / frame.name, target)
+        else:
+            _encode(target, frame.image)
+        written[frame.name] = FrameRecord(
+            name=frame.name, action="passed" if passed else "changed", camera=frame.camera
+        )
+        progress("frames", len(written), len(timing.names))
+    if len(written) < 3:
+        raise InertialError(f"{len(written)} frames are left of {len(timing.names)}; a model needs at least three")
+    every = [written.get(name) or FrameRecord(name=name, action="dropped", camera=None) for name in timing.names]
+    write_json(records, {"frames": [asdict(record) for record in every]})
+
+
+def _same_memory(a: NDArray[Any], b: NDArray[Any]) -> bool:
+    """Whether two arrays show the same bytes of the same buffer (``is`` fails: a Frame holds a read-only view)."""
+    return a.__array_interface__ == b.__array_interface__
+
+
+def _encode(target: Path, image: NDArray[Any]) -> None:
+    import cv2
+
+    bgr = image if image.ndim == 2 else cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2BGR)
+    options = [cv2.IMWRITE_JPEG_QUALITY, 98] if target.suffix.lower() in (".jpg", ".jpeg") else []
+    # Through memory: cv2.imwrite reports a full disk as success.
+    ok, data = cv2.imencode(target.suffix, bgr, options)
+    if not ok:
+        raise FormatError(target, f"OpenCV cannot write {image.dtype} images as {target.suffix}")
+    target.write_bytes(data.tobytes())
+
+
+def read_frame_records(path: Path) -> tuple[FrameRecord, ...]:
+    """The records that :func:`write_frames` wrote."""
+    records = []
+    for item in read_json(path)["frames"]:
+        camera = item["camera"]
+        if camera is not None:
+            camera = CameraModel(**{**camera, "params": tuple(camera["params"])})
+        records.append(FrameRecord(name=item["name"], action=item["action"], camera=camera))
+    return tuple(records)

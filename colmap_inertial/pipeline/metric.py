@@ -1,0 +1,92 @@
+"""The default model stage: scale and gravity from the IMU; and the smoothed trajectory of what it made."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from colmap_inertial.geometry import quat_rotate
+from colmap_inertial.io.trajectories import write_tum
+from colmap_inertial.model import Model, apply_similarity, read_model, trajectory_from_model
+from colmap_inertial.scale import ScaleOptions, estimate_scale
+from colmap_inertial.smooth import smooth_trajectory
+from colmap_inertial.types import CameraImuCalibration, ImuRecording, Similarity, WorldAxes
+
+
+class ModelStage(Protocol):
+    """Between mapping and the final write: takes a model of ours and returns the one to go on with."""
+
+    def __call__(self, model: Model, /) -> Model:
+        """Return a model whose ``folder`` is the given one, rewritten, or a new one beside it."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class MetricStage:
+    """Scale, gravity and accelerometer bias from the IMU; a refused scale leaves the model as it is.
+
+    Attributes
+    ----------
+    imu
+        The recording that ran along.
+    calibration
+        What is known of the camera and the IMU beforehand.
+    options
+        Of the scale estimate.
+    world
+        Where gravity points in the metric model.
+    """
+
+    imu: ImuRecording
+    calibration: CameraImuCalibration | None
+    options: ScaleOptions
+    world: WorldAxes
+
+    def __call__(self, model: Model, /) -> Model:
+        """Estimate and apply the scale."""
+        trajectory, notes = trajectory_from_model(read_model(model.folder), model.timing)
+        estimate = estimate_scale(trajectory, self.imu, calibration=self.calibration, options=self.options)
+        estimate = dataclasses.replace(estimate, reasons=(*estimate.reasons, *notes))
+        if estimate.verdict == "refused":
+            return dataclasses.replace(model, scale=estimate)
+        similarity = Similarity.from_scale(
+            estimate, world=self.world, provenance=f"inertial scale, method {estimate.method}, {estimate.verdict}"
+        )
+        metric = model.folder.with_name(model.folder.name + "_metric")
+        apply_similarity(model.folder, metric, similarity)
+        return dataclasses.replace(model, folder=metric, scale=estimate, similarity=similarity)
+
+
+def write_trajectory(path: Path, model: Model, imu: ImuRecording) -> None:
+    """Write the smoothed metric camera path of a model as TUM text, and its covariance beside it.
+
+    Parameters
+    ----------
+    path
+        ``trajectory*.tum``; the covariance goes to ``trajectory*_cov.npz`` with ``t_s`` (T,) and ``cov`` (T, 9, 9) of
+        position, velocity and acceleration.
+    model
+        A model that a stage made metric.
+    imu
+        The recording that ran along.
+    """
+    estimate, similarity = model.scale, model.similarity
+    if estimate is None or similarity is None or estimate.calibration is None or estimate.gravity_in_world_m_s2 is None:
+        raise ValueError("only a metric model has a metric trajectory")
+    trajectory, _ = trajectory_from_model(read_model(model.folder), model.timing)
+    trajectory = dataclasses.replace(trajectory, length_unit="m")
+    smoothed = smooth_trajectory(
+        trajectory,
+        imu,
+        estimate.calibration,
+        gravity_in_world_m_s2=quat_rotate(similarity.rotation_xyzw, estimate.gravity_in_world_m_s2),
+        accel_bias_m_s2=estimate.accel_bias_m_s2,
+    )
+    write_tum(path, smoothed)
+    epoch_s = smoothed.epoch_ns * 1e-9
+    with open(path.with_name(f"{path.stem}_cov.npz"), "wb") as file:
+        np.savez_compressed(file, t_s=smoothed.t_s + epoch_s, cov=smoothed.cov)

@@ -1,0 +1,236 @@
+"""``scale`` and ``align`` without mapping: what the user has, turned into a trajectory and an IMU recording."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from colmap_inertial.align import AlignOptions, align_camera_imu
+from colmap_inertial.errors import FormatError, InertialError, OutputExistsError
+from colmap_inertial.io.calibration import (
+    SHARED_CLOCK_OFFSET_S,
+    for_another_recording,
+    read_calibration,
+    write_calibration,
+)
+from colmap_inertial.io.capture import load_capture
+from colmap_inertial.io.files import write_json
+from colmap_inertial.io.frames import read_frame_times
+from colmap_inertial.io.imu import is_capture, read_imu
+from colmap_inertial.io.imu_text import is_inertial_scale
+from colmap_inertial.io.trajectories import read_inertial_scale, read_tum
+from colmap_inertial.model import apply_similarity, find_models, read_model, trajectory_from_model
+from colmap_inertial.scale import (
+    ScaleOptions,
+    estimate_scale,
+    first_seconds,
+    gravity_at_latitude_m_s2,
+)
+from colmap_inertial.types import CameraImuCalibration, CameraTrajectory, ImuRecording, ScaleEstimate, Similarity
+from colmap_inertial.validate import ValidateOptions, Validation, parse_target, validate_model, write_pictures
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScaleSource:
+    """Where a trajectory and its IMU recording come from.
+
+    Attributes
+    ----------
+    source
+        COLMAP model folder, TUM trajectory, or InertialScale folder.
+    imu
+        What ``read_imu`` accepts; an InertialScale folder has its own.
+    frame_times
+        For a COLMAP model: CSV or capture.toml; where ``imu`` is a capture.toml, its frame times serve.
+    calibration
+        A calibration file; where ``imu`` is a capture.toml, its calibration serves.
+    """
+
+    source: Path
+    imu: Path | None = None
+    frame_times: Path | None = None
+    calibration: Path | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Recording:
+    """A trajectory with the IMU recording that belongs to it."""
+
+    trajectory: CameraTrajectory
+    imu: ImuRecording
+    calibration: CameraImuCalibration | None
+    shared_clock: bool
+    notes: Sequence[str] = ()
+
+
+def load_source(source: ScaleSource) -> Recording:
+    """Read a trajectory and the IMU recording that ran along.
+
+    Raises
+    ------
+    FormatError, TimingError
+        For what is missing or cannot be read, naming the flag to give.
+    """
+    path = source.source
+    if not path.exists():
+        raise FormatError(path, "no such file or folder")
+    if path.is_dir() and is_inertial_scale(path):
+        trajectory, imu = read_inertial_scale(path)
+        if source.imu is not None:
+            imu = read_imu(source.imu)
+        return Recording(
+            trajectory=trajectory, imu=imu, calibration=_calibration(source, shared_clock=False), shared_clock=False
+        )
+    if source.imu is None:
+        raise FormatError(path, "needs the recording that ran along: give --imu PATH")
+    imu = read_imu(source.imu)
+    notes: Sequence[str] = ()
+    if path.is_dir():
+        times = source.frame_times or (source.imu if is_capture(source.imu) else None)
+        if times is None:
+            raise FormatError(path, "a COLMAP model has no frame times: give --frame-times, a CSV with name,t_s")
+        trajectory, notes = trajectory_from_model(read_model(_only_model(path)), read_frame_times(times))
+    else:
+        trajectory = read_tum(path)
+    captures = [load_capture(p) for p in (source.imu, source.frame_times) if p is not None and is_capture(p)]
+    shared = any(capture.shared_clock for capture in captures)
+    return Recording(
+        trajectory=trajectory,
+        imu=imu,
+        calibration=_calibration(source, shared_clock=shared),
+        shared_clock=shared,
+        notes=notes,
+    )
+
+
+def _only_model(path: Path) -> Path:
+    models = find_models(path)
+    if len(models) > 1:
+        raise FormatError(
+            path, f"holds {len(models)} models; give one of them, for example {next(iter(models.values()))}"
+        )
+    return next(iter(models.values()))
+
+
+def _calibration(source: ScaleSource, *, shared_clock: bool) -> CameraImuCalibration | None:
+    if source.calibration is not None:
+        return for_another_recording(read_calibration(source.calibration), shared_clock=shared_clock)
+    if source.imu is not None and is_capture(source.imu):
+        return load_capture(source.imu).calibration
+    return None
+
+
+def align_source(source: ScaleSource, out: Path) -> CameraImuCalibration:
+    """Align camera and IMU of an existing model or trajectory, and write the calibration.
+
+    Raises
+    ------
+    NotObservableError
+        Where no offset between the clocks is better than the rest, or the camera hardly turned.
+    """
+    if not out.parent.is_dir():
+        raise OutputExistsError(f"{out.parent} is no folder; create it first")
+    recording = load_source(source)
+    options = AlignOptions(max_offset_s=SHARED_CLOCK_OFFSET_S if recording.shared_clock else None)
+    found = align_camera_imu(recording.trajectory, recording.imu, prior=recording.calibration, options=options)
+    write_calibration(out, found)
+    return found
+
+
+def scale_source(
+    source: ScaleSource,
+    options: ScaleOptions,
+    *,
+    json: Path,
+    first_s: float | None = None,
+    latitude_deg: float | None = None,
+) -> ScaleEstimate:
+    """Estimate the scale of an existing model or trajectory and write it.
+
+    Parameters
+    ----------
+    source
+        Where the data lie.
+    options
+        Of the estimate.
+    json
+        Written whole, also when the scale is refused.
+    first_s
+        Use only the first seconds of the camera's recording, for the alignment too.
+    latitude_deg
+        Sets ``options.gravity_m_s2``.
+    """
+    if not json.parent.is_dir():
+        raise OutputExistsError(f"{json.parent} is no folder; create it first")
+    recording = load_source(source)
+    trajectory = recording.trajectory if first_s is None else first_seconds(recording.trajectory, first_s)
+    if latitude_deg is not None:
+        options = dataclasses.replace(options, gravity_m_s2=gravity_at_latitude_m_s2(latitude_deg))
+    if recording.shared_clock and options.max_offset_s is None:
+        options = dataclasses.replace(options, max_offset_s=SHARED_CLOCK_OFFSET_S)
+    estimate = estimate_scale(trajectory, recording.imu, calibration=recording.calibration, options=options)
+    notes = (*estimate.reasons, *recording.imu.repairs, *recording.notes)
+    estimate = dataclasses.replace(estimate, reasons=notes)
+    write_json(json, estimate.as_json())
+    return estimate
+
+
+def validate_source(
+    model: Path,
+    images: Path,
+    target: str,
+    options: ValidateOptions,
+    *,
+    json: Path | None = None,
+    pictures: Path | None = None,
+    apply: Path | None = None,
+) -> Validation:
+    """Measure a target in a model and write what was found.
+
+    Parameters
+    ----------
+    model, images, target
+        COLMAP model folder, folder of its images, specification of the target.
+    options
+        Of the validation.
+    json, pictures
+        Where to write the result, and frames with the corners drawn in.
+    apply
+        Where to write the model in metres, scaled by the control distances; for a model without a unit only.
+
+    Raises
+    ------
+    InertialError
+        When ``apply`` is asked for and cannot be done; see also :func:`validate_model`.
+    """
+    parsed = parse_target(target)
+    for path in (json, apply):
+        if path is not None and not path.parent.is_dir():
+            raise OutputExistsError(f"{path.parent} is no folder; create it first")
+    if apply is not None and not options.unscaled:
+        raise InertialError("--apply scales a model that claims no unit: add --unscaled")
+    folder = _only_model(model)
+    result = validate_model(folder, images, parsed, options)
+    if apply is not None:
+        if result.control is None:
+            raise InertialError("too few corners to keep control and check distances apart; --apply needs more views")
+        low, high = result.control.ci95
+        cov = np.zeros((7, 7))
+        cov[0, 0] = (np.log(high / low) / (2 * 1.96)) ** 2
+        similarity = Similarity(
+            scale=result.control.metres_per_unit,
+            rotation_xyzw=np.array([0.0, 0.0, 0.0, 1.0]),
+            translation_m=np.zeros(3),
+            cov=cov,
+            provenance=f"control distances of {parsed.spec}",
+        )
+        apply_similarity(folder, apply, similarity)
+    if json is not None:
+        write_json(json, result.as_json())
+    if pictures is not None:
+        write_pictures(result, images, pictures)
+    return result

@@ -1,0 +1,138 @@
+"""What the command line shows: progress, and one screen at the end."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+from colmap_inertial.errors import InertialError
+from colmap_inertial.pipeline import ReconstructResult
+from colmap_inertial.pipeline.colmap import Progress
+from colmap_inertial.types import CameraImuCalibration, ScaleEstimate
+from colmap_inertial.validate import Validation, validation_table
+
+_STAGES = {
+    "frames": "Frames",
+    "features": "Features",
+    "matches": "Matches",
+    "mapping": "Mapping",
+    "metric": "Metric scale",
+    "validation": "Validation",
+}
+_COLOUR = {"trusted": "green", "weak": "yellow", "refused": "red"}
+
+
+@contextlib.contextmanager
+def live_progress() -> Iterator[Progress]:
+    """A bar for each stage on standard error; plain lines where that is no terminal."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bars
+
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description:<13}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    tasks = {}
+    with Bars(*columns, console=console, disable=not console.is_terminal) as bars:
+
+        def progress(stage: str, done: int, total: int, /) -> None:
+            name = _STAGES.get(stage, stage)
+            if stage not in tasks:
+                tasks[stage] = bars.add_task(name, total=total)
+                if not console.is_terminal:
+                    console.print(f"{name} ...")
+            bars.update(tasks[stage], completed=done, total=total)
+
+        yield progress
+
+
+def scale_lines(estimate: ScaleEstimate) -> list[tuple[str, str]]:
+    """The estimate as labelled lines."""
+    colour = _COLOUR[estimate.verdict]
+    lines = [("Verdict", f"[bold {colour}]{estimate.verdict}[/]")]
+    if estimate.metres_per_unit is not None and estimate.ci95 is not None:
+        low, high = estimate.ci95
+        half_width = 50 * (high - low) / estimate.metres_per_unit
+        lines.append(("Scale", f"{estimate.metres_per_unit:.6g} m per unit, +-{half_width:.2g} % (95 %)"))
+        lines.append(("Interval", f"{low:.6g} to {high:.6g} m per unit"))
+    lines += [("Reason" if i == 0 else "", text) for i, text in enumerate(estimate.reasons)]
+    calibration = estimate.calibration
+    if calibration is not None:
+        gyro, accel = calibration.gyro_time_offset_s, calibration.accel_time_offset_s
+        lines.append(
+            ("Time offset", f"gyro {gyro:+.4f} s, accelerometer {accel:+.4f} s (camera time = stamp + offset)")
+        )
+        bias = ", ".join(f"{value:+.4f}" for value in calibration.gyro_bias_rad_s)
+        lines.append(("Gyro bias", f"{bias} rad/s"))
+    if estimate.accel_bias_m_s2 is not None:
+        bias = ", ".join(f"{value:+.3f}" for value in estimate.accel_bias_m_s2)
+        lines.append(("Accel. bias", f"{bias} m/s2"))
+    return lines
+
+
+def _show(title: str, lines: list[tuple[str, str]]) -> None:
+    from rich.console import Console
+    from rich.panel import Panel
+    from rich.table import Table
+
+    table = Table.grid(padding=(0, 2))
+    table.add_column(style="dim", no_wrap=True)
+    table.add_column(overflow="fold")
+    for label, text in lines:
+        table.add_row(label, text)
+    Console().print(Panel(table, title=title, title_align="left", expand=False))
+
+
+def show_scale(estimate: ScaleEstimate, source: Path) -> None:
+    """Print one scale estimate."""
+    _show(str(source), [*scale_lines(estimate), ("Method", f"{estimate.method}, {estimate.runtime_s:.2f} s")])
+
+
+def show_calibration(calibration: CameraImuCalibration, source: Path) -> None:
+    """Print what an alignment found, with standard deviations."""
+    rotation = ", ".join(f"{value:+.5f}" for value in calibration.cam_from_imu_xyzw)
+    spread_deg = max(math.degrees(calibration.sigma(f"rotation_{axis}_rad")) for axis in "xyz")
+    bias = ", ".join(f"{value:+.4f}" for value in calibration.gyro_bias_rad_s)
+    bias_spread = max(calibration.sigma(f"gyro_bias_{axis}_rad_s") for axis in "xyz")
+    offset, offset_ms = calibration.gyro_time_offset_s, 1e3 * calibration.sigma("gyro_time_offset_s")
+    _show(
+        str(source),
+        [
+            ("Rotation", f"camera from IMU, xyzw: {rotation}, +-{spread_deg:.2g} deg"),
+            ("Time offset", f"{offset:+.4f} s, +-{offset_ms:.2g} ms (camera time = stamp + offset)"),
+            ("Gyro bias", f"{bias} rad/s, +-{bias_spread:.2g}"),
+        ],
+    )
+
+
+def show_validation(result: Validation) -> None:
+    """Print a validation."""
+    from rich.console import Console
+
+    Console().print(validation_table(result))
+
+
+def show_result(result: ReconstructResult) -> None:
+    """Print the end of a reconstruction on one screen."""
+    frames = result.frames
+    used = sum(record.action != "dropped" for record in frames)
+    for model in result.models:
+        summary = model.summary
+        lines = [
+            ("Images", f"{summary['registered_images']} of {used} registered ({len(frames)} frames)"),
+            ("Points", f"{summary['points']}, mean reprojection error {summary['mean_reprojection_error_px']:.2f} px"),
+            *scale_lines(model.scale),
+        ]
+        if isinstance(model.validation, Validation) and model.validation.ci95_pct is not None:
+            low, high = model.validation.ci95_pct
+            error = f"{model.validation.scale_error_pct:+.2f} % (95 %: {low:+.2f} to {high:+.2f})"
+            lines.append(("Target", f"{model.validation.target.spec}: scale error {error}"))
+        elif isinstance(model.validation, InertialError):
+            lines.append(("Target", str(model.validation)))
+        written = [path for path in (model.sparse_metric, model.trajectory) if path is not None]
+        lines += [
+            ("Written" if i == 0 else "", str(path)) for i, path in enumerate([*written, result.workspace.result])
+        ]
+        lines.append(("Time", ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in result.seconds.items())))
+        _show(f"Model {model.index}", lines)

@@ -1,0 +1,217 @@
+"""The output folder: where everything lies, what is finished, and how a stage's output appears whole or not at all."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import hashlib
+import json
+import logging
+import os
+import shutil
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from colmap_inertial import __version__
+from colmap_inertial.errors import FormatError, OutputExistsError
+from colmap_inertial.io.files import read_json, write_json
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """Every path of an output folder, derived from its root."""
+
+    root: Path
+
+    @property
+    def images(self) -> Path:
+        """The frames that COLMAP sees."""
+        return self.root / "images"
+
+    @property
+    def frames(self) -> Path:
+        """Names, times and treatment of the frames."""
+        return self.root / "frames.json"
+
+    @property
+    def features(self) -> Path:
+        """COLMAP's database before matching; removed at the end of a run."""
+        return self.root / "features.db"
+
+    @property
+    def database(self) -> Path:
+        """COLMAP's database."""
+        return self.root / "database.db"
+
+    @property
+    def sparse(self) -> Path:
+        """COLMAP's models, untouched."""
+        return self.root / "sparse"
+
+    @property
+    def sparse_metric(self) -> Path:
+        """The same models in metres."""
+        return self.root / "sparse_metric"
+
+    @property
+    def validation(self) -> Path:
+        """Pictures of the target in the frames."""
+        return self.root / "validation"
+
+    @property
+    def result(self) -> Path:
+        """Written last: its presence means that the run is finished."""
+        return self.root / "result.json"
+
+    @property
+    def config(self) -> Path:
+        """The resolved configuration, in the form that ``--config`` reads."""
+        return self.root / "config.toml"
+
+    @property
+    def log(self) -> Path:
+        """The run's log."""
+        return self.root / "log.txt"
+
+    @property
+    def stamps(self) -> Path:
+        """One JSON for each finished stage."""
+        return self.root / ".stages"
+
+    def trajectory(self, index: int, *, first: bool) -> Path:
+        """The smoothed metric trajectory of a model; the first one has the plain name."""
+        return self.root / ("trajectory.tum" if first else f"trajectory_{index}.tum")
+
+    def open(self, capture: Path) -> None:
+        """Create the folder, or take up an unfinished run of the same capture.
+
+        Raises
+        ------
+        OutputExistsError
+            When the folder holds a finished result, another capture's run, or something that is not ours.
+        """
+        owner = self.stamps / "capture.json"
+        if self.result.exists():
+            raise OutputExistsError(f"{self.root} holds a finished result; choose another folder or remove it")
+        if self.root.exists() and not self.root.is_dir():
+            raise OutputExistsError(f"{self.root} is a file; choose another output folder")
+        identity = {"capture": str(capture.resolve())}
+        if owner.is_file():
+            if read_json(owner) != identity:
+                raise OutputExistsError(
+                    f"{self.root} holds an unfinished run of another capture ({read_json(owner).get('capture')}); "
+                    "choose another folder or remove it"
+                )
+        elif self.root.is_dir() and any(p.name != self.stamps.name for p in self.root.iterdir()):
+            raise OutputExistsError(f"{self.root} is not empty; choose another output folder")
+        self.stamps.mkdir(parents=True, exist_ok=True)
+        write_json(owner, identity)
+
+
+def canonical(value: object) -> object:
+    """A value in JSON types, for hashing: dataclasses by field, paths as text, callables by name."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = {f.name: canonical(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        return {"type": f"{type(value).__module__}.{type(value).__qualname__}", **fields}
+    if isinstance(value, Mapping):
+        return {str(k): canonical(v) for k, v in value.items()}
+    if isinstance(value, enum.Enum):
+        return value.value
+    if isinstance(value, np.ndarray):
+        return hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, (list, tuple)):
+        return [canonical(v) for v in value]
+    if isinstance(value, (set, frozenset)):
+        return sorted((canonical(v) for v in value), key=repr)
+    if isinstance(value, Path):
+        return str(value)
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    if callable(value):
+        named = value if hasattr(value, "__qualname__") else type(value)
+        return f"{named.__module__}.{named.__qualname__}"
+    raise TypeError(f"cannot hash a {type(value).__name__}")
+
+
+def fingerprint(path: Path) -> list[object]:
+    """What identifies an input without reading it whole: names, sizes and modification times."""
+    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    stats = [(file, file.stat()) for file in files]
+    return [[str(file.resolve()), stat.st_size, stat.st_mtime_ns] for file, stat in stats]
+
+
+class StageRunner:
+    """Runs stages in order and skips those whose inputs and options are those of an earlier, finished run.
+
+    A stage's key hashes its options, its inputs and the key of the stage before it, so that a change anywhere reruns
+    everything downstream. A folder's existence proves nothing: only a stamp with the right key does.
+    """
+
+    def __init__(self, workspace: Workspace) -> None:
+        self._workspace = workspace
+        self._upstream = ""
+        self.seconds: dict[str, float] = {}
+
+    def run(
+        self, name: str, depends: Mapping[str, object], outputs: Sequence[Path], work: Callable[[list[Path]], None]
+    ) -> None:
+        """Run ``work`` unless its stamp holds.
+
+        Parameters
+        ----------
+        name
+            The stage.
+        depends
+            Everything that decides its output beside the stages before it.
+        outputs
+            What it writes. ``work`` gets temporary paths in their places, which are renamed when it returns.
+        work
+            Writes every temporary path; parent folders exist, the paths themselves do not.
+        """
+        text = json.dumps([name, __version__, self._upstream, canonical(depends)], sort_keys=True)
+        self._upstream = hashlib.sha256(text.encode()).hexdigest()
+        stamp = self._workspace.stamps / f"{name}.json"
+        done = _read_stamp(stamp)
+        if done is not None and done["key"] == self._upstream and all(path.exists() for path in outputs):
+            self.seconds[name] = done["seconds"]
+            log.info("%s: finished in an earlier run, kept", name)
+            return
+        stamp.unlink(missing_ok=True)
+        partial = [path.with_name(f"{path.stem}.partial{path.suffix}") for path in outputs]
+        for path in (*outputs, *partial):
+            remove(path)
+        log.info("%s: started", name)
+        start = time.perf_counter()
+        work(partial)
+        for source, target in zip(partial, outputs, strict=True):
+            os.replace(source, target)
+        self.seconds[name] = time.perf_counter() - start
+        write_json(stamp, {"key": self._upstream, "seconds": self.seconds[name]})
+        log.info("%s: finished in %.1f s", name, self.seconds[name])
+
+
+def _read_stamp(stamp: Path) -> dict[str, Any] | None:
+    if not stamp.is_file():
+        return None
+    try:
+        return read_json(stamp)
+    except FormatError:
+        return None
+
+
+def remove(path: Path) -> None:
+    """Remove a file or folder of our own, if it is there, with the side files of an SQLite database."""
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        for suffix in ("", "-journal", "-wal", "-shm"):
+            path.with_name(path.name + suffix).unlink(missing_ok=True)

@@ -1,0 +1,193 @@
+"""The command as a user calls it: exit codes, messages, files."""
+
+import json
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from colmap_inertial.cli import main
+
+
+def run(capsys, *args):
+    """Exit code, standard output, standard error of one call."""
+    with pytest.raises(SystemExit) as stopped:
+        main([str(arg) for arg in args])
+    captured = capsys.readouterr()
+    return stopped.value.code, captured.out, captured.err
+
+
+@pytest.mark.parametrize("command", [[], ["reconstruct"], ["scale"], ["align"]])
+def test_help_teaches(capsys, command):
+    code, out, _ = run(capsys, *command, "--help")
+    assert code == 0
+    assert "usage: colmap-inertial" in out
+    if command:
+        assert "Example: colmap-inertial" in out
+
+
+def test_a_wrong_flag_exits_2_and_names_it(capsys):
+    code, _, err = run(capsys, "scale", "x", "--json", "y", "--metod", "joint")
+    assert code == 2
+    assert "--metod" in err
+
+
+def test_the_installed_command_runs():
+    done = subprocess.run(
+        [sys.executable, "-m", "colmap_inertial", "--version"], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "0.1.0"
+
+
+@pytest.mark.parametrize("method", ["joint"])
+def test_scale_of_a_colmap_model(capsys, project, tmp_path, method):
+    target = tmp_path / "scale.json"
+    before = {p: p.read_bytes() for p in project.model.iterdir()}
+    code, out, err = run(
+        capsys, "scale", project.model, "--imu", project.imu, "--frame-times", project.frame_times, "--json", target,
+        "--method", method,
+    )  # fmt: skip
+    assert code == 0, err
+    assert "m per unit" in out
+    found = json.loads(target.read_text())
+    truth = project.recording.truth
+    assert found["method"] == method
+    assert found["verdict"] in ("trusted", "weak")
+    assert found["metres_per_unit"] == pytest.approx(truth.metres_per_unit, rel=0.05)
+    low, high = found["ci95"]
+    assert low < found["metres_per_unit"] < high
+    assert found["gyro_time_offset_s"] == pytest.approx(truth.calibration.gyro_time_offset_s, abs=0.02)
+    np.testing.assert_allclose(found["gyro_bias_rad_s"], truth.calibration.gyro_bias_rad_s, atol=0.01)
+    assert abs(np.dot(found["cam_from_imu_xyzw"], truth.calibration.cam_from_imu_xyzw)) > 0.999
+    assert np.linalg.norm(found["gravity_in_world_m_s2"]) == pytest.approx(9.8, abs=0.1)
+    assert found["runtime_s"] > 0
+    assert {p: p.read_bytes() for p in project.model.iterdir()} == before
+
+
+def test_scale_uses_no_later_frame_than_it_was_given(capsys, project, tmp_path):
+    whole, cut = tmp_path / "whole.json", tmp_path / "cut.json"
+    flags = ["--imu", project.imu, "--frame-times", project.frame_times, "--first-s", 15]
+    assert run(capsys, "scale", project.model, *flags, "--json", whole)[0] in (0, 3)
+    rows = project.frame_times.read_text().splitlines()
+    stamps = [int(row.split(",")[1]) for row in rows[1:]]
+    short = tmp_path / "frames.csv"
+    short.write_text("\n".join([rows[0], *(r for r, t in zip(rows[1:], stamps, strict=True) if t <= stamps[0] + 15e9)]))
+    flags[3] = short
+    assert run(capsys, "scale", project.model, *flags, "--json", cut)[0] in (0, 3)
+    a, b = json.loads(whole.read_text()), json.loads(cut.read_text())
+    assert a["metres_per_unit"] == pytest.approx(b["metres_per_unit"], rel=1e-9)
+
+
+def test_align_writes_a_calibration_that_scale_takes_as_a_prior(capsys, project, tmp_path):
+    files = ["--imu", project.imu, "--frame-times", project.frame_times]
+    calibration = tmp_path / "phone.json"
+    code, out, err = run(capsys, "align", project.model, *files, "--out", calibration)
+    assert code == 0, err
+    assert "Time offset" in out
+    found, truth = json.loads(calibration.read_text()), project.recording.truth.calibration
+    assert found["gyro_time_offset_s"] == pytest.approx(truth.gyro_time_offset_s, abs=0.01)
+    assert abs(np.dot(found["cam_from_imu_xyzw"], truth.cam_from_imu_xyzw)) > 0.9995
+
+    target = tmp_path / "scale.json"
+    code, _, err = run(capsys, "scale", project.model, *files, "--calibration", calibration, "--json", target)
+    assert code == 0, err
+    scale = json.loads(target.read_text())["metres_per_unit"]
+    assert scale == pytest.approx(project.recording.truth.metres_per_unit, rel=0.05)
+
+
+def test_a_refusal_writes_its_reasons_and_exits_3(capsys, project, tmp_path):
+    from conftest import write_project
+
+    from colmap_inertial.simulate import MotionOptions, RecordingOptions, simulate_recording
+
+    still = simulate_recording(RecordingOptions(motion=MotionOptions(kind="static", duration_s=20)), seed=2)
+    files = write_project(tmp_path / "still", still)
+    target = tmp_path / "scale.json"
+    code, out, _ = run(
+        capsys, "scale", files.model, "--imu", files.imu, "--frame-times", files.frame_times, "--json", target
+    )
+    assert code == 3
+    assert "refused" in out
+    found = json.loads(target.read_text())
+    assert found["metres_per_unit"] is None
+    assert found["ci95"] is None
+    assert found["reasons"]
+
+
+def test_the_imu_of_another_recording_is_refused(capsys, project, tmp_path):
+    from conftest import write_project
+
+    from colmap_inertial.simulate import RecordingOptions, simulate_recording
+
+    other = write_project(tmp_path / "other", simulate_recording(RecordingOptions(), seed=77))
+    target = tmp_path / "scale.json"
+    code, _, _ = run(
+        capsys, "scale", project.model, "--imu", other.imu, "--frame-times", project.frame_times, "--json", target
+    )
+    assert code == 3
+    assert "offset" in " ".join(json.loads(target.read_text())["reasons"])
+
+
+def test_missing_pieces_are_asked_for_by_flag(capsys, project, tmp_path):
+    target = tmp_path / "scale.json"
+    code, _, err = run(capsys, "scale", project.model, "--json", target)
+    assert (code, "--imu" in err) == (2, True)
+    code, _, err = run(capsys, "scale", project.model, "--imu", project.imu, "--json", target)
+    assert (code, "--frame-times" in err) == (2, True)
+    code, _, err = run(capsys, "scale", tmp_path / "nowhere", "--imu", project.imu, "--json", target)
+    assert (code, "no such file" in err) == (2, True)
+    code, _, err = run(
+        capsys, "scale", project.model, "--imu", project.imu, "--frame-times", project.frame_times,
+        "--json", tmp_path / "no" / "scale.json",
+    )  # fmt: skip
+    assert (code, "create it first" in err) == (2, True)
+    assert not target.exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda gyro, accel: (gyro * 57.29578, accel), "deg/s"),
+        (lambda gyro, accel: (gyro, accel / 9.80665), "g"),
+        (lambda gyro, accel: (accel, gyro), "exchanged"),
+    ],
+    ids=["deg/s for rad/s", "g for m/s2", "columns exchanged"],
+)
+def test_wrong_units_are_an_error_that_names_the_setting(capsys, project, tmp_path, change, words):
+    imu = tmp_path / "imu"
+    shutil.copytree(project.imu, imu)
+    tables = {name: np.loadtxt(imu / f"{name}.txt") for name in ("gyroscope", "accelerometer")}
+    rows = min(map(len, tables.values()))
+    values = change(tables["gyroscope"][:rows, 1:], tables["accelerometer"][:rows, 1:])
+    for name, columns in zip(tables, values, strict=True):
+        lines = [f"{int(t)} {x} {y} {z}" for t, (x, y, z) in zip(tables[name][:rows, 0], columns, strict=True)]
+        (imu / f"{name}.txt").write_text("\n".join(lines) + "\n")
+    target = tmp_path / "scale.json"
+    code, _, err = run(
+        capsys, "scale", project.model, "--imu", imu, "--frame-times", project.frame_times, "--json", target
+    )
+    assert code == 2
+    assert words in err
+    assert "imu" in err
+    assert not target.exists()
+
+
+def test_a_configuration_file_goes_between_flags_and_defaults(tmp_path):
+    from colmap_inertial.cli import parse
+
+    config = tmp_path / "c.toml"
+    config.write_text("seed = 4\n[mapping]\noverlap = 3\nmax_num_features = 500\n")
+    args = ["reconstruct", "a", "b", "--config", str(config), "--mapping.overlap", "6"]
+    options = parse(args).options
+    assert (options.seed, options.mapping.overlap, options.mapping.max_num_features) == (4, 6, 500)
+    assert options.mapping.pairing == "auto"
+
+
+def test_a_broken_configuration_exits_2(capsys, tmp_path):
+    config = tmp_path / "c.toml"
+    config.write_text("sead = 4\n")
+    code, _, err = run(capsys, "reconstruct", "a", "b", "--config", config)
+    assert code == 2
+    assert "did you mean seed" in err

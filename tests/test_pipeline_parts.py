@@ -1,0 +1,195 @@
+"""The pipeline's bookkeeping: stages that appear whole or not at all, configuration, pairs, frames through stages."""
+
+import dataclasses
+import itertools
+
+import cv2
+import numpy as np
+import pytest
+
+from colmap_inertial.errors import FormatError, InertialError, OutputExistsError
+from colmap_inertial.pipeline import ReconstructOptions, silent
+from colmap_inertial.pipeline.colmap import MappingOptions, image_pairs
+from colmap_inertial.pipeline.config import config_as_toml, read_config
+from colmap_inertial.pipeline.frames import read_frame_records, write_frames
+from colmap_inertial.pipeline.workspace import StageRunner, Workspace
+from colmap_inertial.types import CameraModel, Frame, FrameTiming
+
+
+def test_a_stage_runs_once_and_again_when_anything_before_it_changes(tmp_path):
+    workspace = Workspace(tmp_path / "out")
+    workspace.open(tmp_path / "capture.toml")
+    calls = []
+
+    def run(first_option):
+        runner = StageRunner(workspace)
+        for name, option in (("first", first_option), ("second", 7)):
+            target = workspace.root / f"{name}.txt"
+            runner.run(name, {"option": option}, [target], lambda p, n=name: (calls.append(n), p[0].write_text(n)))
+
+    run(1)
+    run(1)
+    assert calls == ["first", "second"]
+    run(2)
+    assert calls == ["first", "second"] * 2
+    (workspace.root / "second.txt").unlink()
+    run(2)
+    assert calls == ["first", "second", "first", "second", "second"]
+
+
+def test_an_interrupted_stage_leaves_nothing_that_counts_as_finished(tmp_path):
+    workspace = Workspace(tmp_path)
+    workspace.open(tmp_path / "capture.toml")
+    target = tmp_path / "model"
+
+    def half(partial):
+        partial[0].mkdir()
+        (partial[0] / "a").write_text("half")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        StageRunner(workspace).run("mapping", {}, [target], half)
+    assert not target.exists()
+
+    def whole(partial):
+        partial[0].mkdir()
+        (partial[0] / "b").write_text("whole")
+
+    StageRunner(workspace).run("mapping", {}, [target], whole)
+    assert [p.name for p in target.iterdir()] == ["b"]
+    assert not list(tmp_path.glob("*.partial*"))
+
+
+def test_a_damaged_stamp_is_no_stamp(tmp_path):
+    workspace = Workspace(tmp_path)
+    workspace.open(tmp_path / "capture.toml")
+    calls = []
+    for _ in range(2):
+        StageRunner(workspace).run("a", {}, [tmp_path / "a"], lambda p: (calls.append(1), p[0].write_text("x")))
+        (workspace.stamps / "a.json").write_text('{"key": "')
+    assert len(calls) == 2
+
+
+def test_a_folder_that_holds_something_else_is_left_alone(tmp_path):
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(OutputExistsError, match="not empty"):
+        Workspace(tmp_path).open(tmp_path / "capture.toml")
+    assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]
+    with pytest.raises(OutputExistsError, match="is a file"):
+        Workspace(tmp_path / "thesis.tex").open(tmp_path / "capture.toml")
+
+    other = Workspace(tmp_path / "out")
+    other.open(tmp_path / "a" / "capture.toml")
+    other.open(tmp_path / "a" / "capture.toml")
+    with pytest.raises(OutputExistsError, match="another capture"):
+        other.open(tmp_path / "b" / "capture.toml")
+    other.result.write_text("{}")
+    with pytest.raises(OutputExistsError, match="finished result"):
+        other.open(tmp_path / "a" / "capture.toml")
+
+
+def test_the_resolved_configuration_reads_back_as_it_was(tmp_path):
+    options = dataclasses.replace(
+        ReconstructOptions(), seed=5, world="y-down", mapping=MappingOptions(overlap=3, refine_intrinsics=False)
+    )
+    path = tmp_path / "config.toml"
+    path.write_text(config_as_toml(options))
+    assert read_config(path, ReconstructOptions) == options
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("sede = 3", "unknown option sede; did you mean seed"),
+        ("[mapping]\noverlapp = 3", "unknown option mapping.overlapp; did you mean mapping.overlap"),
+        ("[mapping]\noverlap = 'three'", "mapping.overlap: 'three' is not a int"),
+        ("world = 'x-up'", "world: 'x-up' is not one of 'z-up', 'y-down'"),
+        ("mapping = 3", "mapping is a table"),
+        ("seed = ", "not valid TOML"),
+    ],
+)
+def test_a_wrong_configuration_names_the_key(tmp_path, text, words):
+    path = tmp_path / "config.toml"
+    path.write_text(text)
+    with pytest.raises(FormatError, match=words):
+        read_config(path, ReconstructOptions)
+
+
+def test_few_images_are_matched_with_each_other_and_many_with_their_neighbours():
+    few = [f"{i:03}" for i in range(20)]
+    assert image_pairs(few, MappingOptions()) == list(itertools.combinations(few, 2))
+    many = [f"{i:03}" for i in range(400)]
+    pairs = image_pairs(many, MappingOptions(overlap=4))
+    assert len(pairs) == len(set(pairs))
+    assert {int(b) - int(a) for a, b in pairs} == {1, 2, 3, 4, 8, 16, 32, 64, 128, 256}
+
+
+CAMERA = CameraModel(model="PINHOLE", width=32, height=24, params=(30, 30, 16, 12))
+
+
+def frames_of(folder, count=6):
+    """Six grey pictures as JPEG files, and the frames that a reader would deliver."""
+    rng = np.random.default_rng(0)
+    names = tuple(f"{i}.jpg" for i in range(count))
+    folder.mkdir()
+    for name in names:
+        cv2.imwrite(str(folder / name), rng.integers(0, 255, (24, 32), dtype=np.uint8))
+    timing = FrameTiming(names=names, t_s=np.arange(count))
+    frames = (
+        Frame(name=name, image=cv2.imread(str(folder / name), cv2.IMREAD_UNCHANGED), t_s=float(i), camera=CAMERA)
+        for i, name in enumerate(names)
+    )
+    return timing, frames
+
+
+def test_frames_that_no_stage_changed_are_copied_byte_for_byte(tmp_path):
+    timing, frames = frames_of(tmp_path / "in")
+
+    def invert_the_third_and_drop_the_fourth(stream):
+        for frame in stream:
+            if frame.name == "2.jpg":
+                yield dataclasses.replace(frame, image=255 - frame.image)
+            elif frame.name == "4.jpg":
+                yield dataclasses.replace(frame, image=frame.image[:12])
+            elif frame.name != "3.jpg":
+                yield dataclasses.replace(frame, exposure_s=0.01)
+
+    write_frames(
+        frames,
+        timing,
+        [invert_the_third_and_drop_the_fourth],
+        source_folder=tmp_path / "in",
+        images=tmp_path / "out",
+        records=tmp_path / "frames.json",
+        progress=silent,
+    )
+    records = read_frame_records(tmp_path / "frames.json")
+    assert [r.action for r in records] == ["passed", "passed", "changed", "dropped", "changed", "passed"]
+    assert records[0].camera.params == CAMERA.params
+    for name in ("0.jpg", "1.jpg", "5.jpg"):
+        assert (tmp_path / "in" / name).read_bytes() == (tmp_path / "out" / name).read_bytes()
+    inverted = cv2.imread(str(tmp_path / "out" / "2.jpg"), cv2.IMREAD_UNCHANGED)
+    original = cv2.imread(str(tmp_path / "in" / "2.jpg"), cv2.IMREAD_UNCHANGED)
+    assert np.abs(255 - original.astype(int) - inverted).mean() < 2
+    assert cv2.imread(str(tmp_path / "out" / "4.jpg")).shape[0] == 12
+    assert not (tmp_path / "out" / "3.jpg").exists()
+
+
+def test_stages_cannot_rename_or_repeat_frames(tmp_path):
+    def run(stage, count):
+        timing, frames = frames_of(tmp_path / f"in{count}", count)
+        kwargs = dict(source_folder=None, images=tmp_path / f"out{count}", records=tmp_path / "r", progress=silent)
+        write_frames(frames, timing, [stage], **kwargs)
+
+    with pytest.raises(ValueError, match=r"'x\.jpg', which is no frame"):
+        run(lambda stream: (dataclasses.replace(f, name="x.jpg") for f in stream), 4)
+    with pytest.raises(ValueError, match="came twice"):
+        run(lambda stream: (f for f in stream for _ in range(2)), 5)
+    with pytest.raises(InertialError, match="2 frames are left of 6"):
+        run(lambda stream: itertools.islice(stream, 2), 6)
+
+
+def test_pixels_in_a_frame_cannot_be_changed_in_place(tmp_path):
+    _, frames = frames_of(tmp_path / "in")
+    with pytest.raises(ValueError, match="read-only"):
+        next(frames).image[0] = 1
