@@ -6,3 +6,4 @@ out=$(realpath -m "${1:-$(dirname "$0")/../out/desk}")
 cd "$(dirname "$0")/.."
 bash scripts/setup.sh
 .venv/bin/colmap-inertial reconstruct example_scenes/desk "$out"
+.venv/bin/python scripts/compare_with_truth.py "$out" example_scenes/desk
