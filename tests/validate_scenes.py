@@ -89,6 +89,50 @@ def cells(bits: np.ndarray, side_m: float, lower_left=(0.0, 0.0), *, rim: float 
     return grey
 
 
+def charuco(target: Target) -> Texture:
+    """A ChArUco board as OpenCV prints it, with a white rim."""
+    markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{target.dictionary}"))
+    size = (target.columns, target.rows)
+    board = cv2.aruco.CharucoBoard(size, target.length_m, target.marker_m, markers)
+    scale = 80
+    bits = board.generateImage((size[0] * scale, size[1] * scale), marginSize=0, borderBits=1) > 127
+    extent = np.array(size) * target.length_m
+
+    def grey(xy: np.ndarray) -> np.ndarray:
+        u = xy + extent / 2
+        inside = ((u >= 0) & (u < extent)).all(axis=1)
+        paper = ((u >= -target.length_m) & (u < extent + target.length_m)).all(axis=1)
+        index = np.clip((u / target.length_m * scale).astype(int), 0, np.array(size) * scale - 1)
+        return np.where(inside, np.where(bits[index[:, 1], index[:, 0]], LIGHT, DARK), np.where(paper, LIGHT, np.nan))
+
+    return grey
+
+
+def aprilgrid(target: Target, *, centre=(0.0, 0.0)) -> Texture:
+    """An AprilGrid as Kalibr prints it (y up): black squares between the corners of the tags, white around."""
+    tag, gap = target.length_m, target.gap * target.length_m
+    lower_left = target.corners_m[0, :2] + centre
+    extent = np.array([target.columns, target.rows]) * (tag + gap) - gap
+    tags = [
+        cells(
+            np.flipud(np.rot90(marker_bits("DICT_APRILTAG_36h11", i, border=2), 2)),
+            tag,
+            lower_left + np.array([i % target.columns, i // target.columns]) * (tag + gap),
+            rim=0,
+        )
+        for i in range(target.columns * target.rows)
+    ]
+
+    def squares(xy: np.ndarray) -> np.ndarray:
+        u = xy - lower_left
+        on_board = ((u > -gap) & (u < extent + gap)).all(axis=1)
+        paper = ((u > -2 * gap) & (u < extent + 2 * gap)).all(axis=1)
+        between = ((u + gap) % (tag + gap) < gap).all(axis=1)
+        return np.where(on_board & between, DARK, np.where(paper, LIGHT, np.nan))
+
+    return over(*tags, squares)
+
+
 def marker_bits(dictionary: str, number: int, border: int = 1) -> np.ndarray:
     markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
     return markers.generateImageMarker(number, markers.markerSize + 2 * border, borderBits=border) > 127

@@ -27,8 +27,6 @@ Index = NDArray[np.intp]
 _SEARCH_SIZE_PX = 1600
 _MOST_BOARDS = 3
 _SMALLEST_MARKER_PX = 12.0
-#: A refined corner may move this far: what separates the first guess from the corner, not one corner from another.
-_MOVED_PX = 3.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -150,22 +148,25 @@ def _spacing_px(grid: Array) -> Array:
 
 
 def _refine(image: Grey, xy: Array, half_px: Array, *, allowed_px: float) -> tuple[Array, NDArray[np.bool_]]:
-    """Corners (n, 2) in OpenCV's pixels refined within windows of these half sizes, and which of them are good."""
+    """Corners (n, 2) in OpenCV's pixels refined within windows of these half sizes, and which of them are good.
+
+    Good are those that stay within ``allowed_px`` of the first guess, and within their window.
+    """
     import cv2
 
     half = np.clip(np.nan_to_num(half_px, posinf=4.0), 2, 12).astype(int)
-    out = xy.copy()
+    # a corner on which the search gives up is put back to exactly where it began: begin beside every fixed point
+    start = xy.astype(np.float32) + np.float32(1 / 32)
+    out = start.copy()
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 1e-4)
     height, width = image.shape
     inside = ((xy > half[:, None] + 1) & (xy < np.array([width, height]) - half[:, None] - 2)).all(axis=1)
     for size in np.unique(half[inside]):
         pick = inside & (half == size)
-        start = xy[pick].astype(np.float32).reshape(-1, 1, 2)
-        done = cv2.cornerSubPix(image, start, (int(size), int(size)), (-1, -1), criteria)
+        done = cv2.cornerSubPix(image, start[pick].reshape(-1, 1, 2), (int(size), int(size)), (-1, -1), criteria)
         out[pick] = np.asarray(done).reshape(-1, 2)
-    moved = np.abs(out - xy).max(axis=1)
-    # a corner on which the search gave up is put back where it began: exactly there
-    return out, inside & (moved <= allowed_px) & (moved > 0)
+    moved = np.abs(out - start).max(axis=1)
+    return out.astype(np.float64), inside & (moved > 0) & (moved <= np.minimum(allowed_px, half))
 
 
 def _detector(target: Target, border_bits: int, image: Grey) -> Any:
@@ -256,7 +257,7 @@ def _aprilgrid(image: Grey, target: Target) -> list[Detection]:
     for pick in _copies(corners, number, layout_m):
         # the nearest other corners: the tag's code (two of its ten cells away) and the far side of the black square
         half = np.repeat(0.9 * min(0.2, target.gap) * _side_px(corners[pick]), 4)
-        xy, good = _refine(image, corners[pick].reshape(-1, 2), half, allowed_px=_MOVED_PX)
+        xy, good = _refine(image, corners[pick].reshape(-1, 2), half, allowed_px=np.inf)
         which = (4 * number[pick][:, None] + np.arange(4)).ravel()
         if good.sum() >= 4:
             out.append(Detection(part=0, corner=which[good], xy_px=colmap_px_from_opencv(xy[good])))
@@ -291,7 +292,7 @@ def _charuco(image: Grey, target: Target) -> list[Detection]:
             spacing = _spacing_px(grid).ravel()[which]
             # the window must stay clear of the markers inside the white squares
             half = spacing * min(0.4, 0.45 * (1 - target.marker_m / target.length_m))
-            refined, good = _refine(image, start, half, allowed_px=_MOVED_PX)
+            refined, good = _refine(image, start, half, allowed_px=2.0)
             if good.sum() >= 4:
                 out.append(Detection(part=0, corner=which[good], xy_px=colmap_px_from_opencv(refined[good])))
         if out or target.rows % 2:

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 _NOT_FOUND = "target not found"
 _DISAGREES = "does not agree with the other views: a false detection, another target, or a wrong pose"
 _ENOUGH_VIEWS = 10
+_MOST_THOROUGH = 60
 _LEAST_CORNERS = 4
 _OUTLIER_SIGMA = 5.0
 _OUTLIER_VIEW = 4.0
@@ -84,7 +85,8 @@ def validate_model(
     search.run(images)
     placed = search.place()
     if sum(len(p.chosen) for p in placed.values()) < _ENOUGH_VIEWS and target.kind == "checkerboard":
-        search.look_closer([v for v in search.searched if not any(s.view == v for s in search.sightings)])
+        seen = {s.view for s in search.sightings}
+        search.look_closer([v for v in search.searched if v not in seen][:_MOST_THOROUGH])
         placed = search.place()
     if not placed:
         raise why_not_placed(search, images)
@@ -131,7 +133,7 @@ def _measure(search: Search, placed: dict[int, PartPlacement], missing: dict[str
         centre=np.concatenate([placed[p].placement.centre for p in index]),
     )
     everything = obs
-    obs, fit, dropped = _fit_without_outliers(obs, start)
+    obs, fit, dropped = fit_without_outliers(obs, start)
     half = fit.half_width_log()
     if not half < _WIDEST_LOG:
         raise NotObservableError(
@@ -200,7 +202,7 @@ def _rms(vectors: Array) -> float:
     return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
 
 
-def _fit_without_outliers(obs: Observations, start: Placement) -> tuple[Observations, ScaleFit, dict[int, str]]:
+def fit_without_outliers(obs: Observations, start: Placement) -> tuple[Observations, ScaleFit, dict[int, str]]:
     """Fit, leave out views and corners that do not belong, and fit again until none is left."""
     dropped: dict[int, str] = {}
     while True:

@@ -146,13 +146,13 @@ def triangulate(obs: Observations, at: Placement) -> tuple[Index, Array, NDArray
     for _ in range(5):
         in_cam = np.einsum("mij,mj->mi", rotation, in_world[which]) + obs.cam_from_world_t[obs.view]
         residual, _, jac = tangent_residual(obs, in_cam)
-        seen = np.isfinite(residual).all(axis=1)
+        seen: NDArray[np.bool_] = np.asarray(np.isfinite(residual).all(axis=1))
         jac = np.where(seen[:, None, None], jac @ rotation, 0.0)
         residual = np.where(seen[:, None], residual, 0.0)
         matrix, rhs = np.zeros((len(corner), 3, 3)), np.zeros((len(corner), 3))
         np.add.at(matrix, which, np.swapaxes(jac, 1, 2) @ jac)
         np.add.at(rhs, which, np.einsum("mij,mi->mj", jac, residual))
         in_world += np.einsum("cij,cj->ci", np.linalg.pinv(matrix, rcond=1e-9, hermitian=True), rhs)
-    w = np.linalg.eigvalsh(matrix)
+    w = np.asarray(np.linalg.eigvalsh(matrix), dtype=np.float64)
     # two views whose lines of sight meet at an angle a give a ratio of about a^2 / 4; half a degree is the least
     return corner, in_world, w[:, 0] > 2e-5 * w[:, 2]

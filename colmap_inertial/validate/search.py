@@ -89,7 +89,7 @@ class Search:
 
     def place(self) -> dict[int, PartPlacement]:
         """Where each part of the target is; parts on which no two views agree are left out."""
-        self.parts = {}
+        self.parts, self.one_line = {}, None
         for s in self.sightings:
             self.parts.setdefault(s.part, []).append(s)
         out = {}
