@@ -332,3 +332,10 @@ def test_sparse_keyframes_of_a_drone_give_the_factory_s_rotation(shared_data):
     assert np.all(np.abs(error) < 3 * np.sqrt(np.diag(calibration.cov)[:3]))
     assert np.abs(error).max() < 0.005
     assert abs(calibration.gyro_time_offset_s) < 0.002  # one clock, synchronised in hardware
+
+
+@pytest.mark.parametrize("frames", [5, 7, 12, 30])
+def test_a_blink_of_a_recording_is_refused_not_tripped_over(frames):
+    recording = simulate_recording(RecordingOptions(), seed=3)
+    with pytest.raises(NotObservableError):
+        align_camera_imu(recording.trajectory.select(slice(0, frames)), recording.imu)

@@ -5,14 +5,19 @@ import itertools
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 
-from colmap_inertial.errors import FormatError, InertialError, OutputExistsError
-from colmap_inertial.pipeline import ReconstructOptions, silent
+from colmap_inertial.errors import FormatError, InertialError, NotObservableError, OutputExistsError
+from colmap_inertial.io.frames import read_frame_times
+from colmap_inertial.io.imu import read_imu
+from colmap_inertial.model import read_model
+from colmap_inertial.pipeline import MetricStage, ReconstructOptions, ReconstructResult, run_models, silent
 from colmap_inertial.pipeline.colmap import MappingOptions, image_pairs
 from colmap_inertial.pipeline.config import config_as_toml, read_config
 from colmap_inertial.pipeline.frames import read_frame_records, write_frames
 from colmap_inertial.pipeline.workspace import StageRunner, Workspace
+from colmap_inertial.scale import ScaleOptions
 from colmap_inertial.types import CameraModel, Frame, FrameTiming
 
 
@@ -193,3 +198,47 @@ def test_pixels_in_a_frame_cannot_be_changed_in_place(tmp_path):
     _, frames = frames_of(tmp_path / "in")
     with pytest.raises(ValueError, match="read-only"):
         next(frames).image[0] = 1
+
+
+def test_each_sub_model_gets_its_own_scale_and_verdict(project, tmp_path):
+    """Three sub-models in units of their own: two halves of a recording, and one too short to give a scale."""
+    workspace = Workspace(tmp_path / "out")
+    workspace.open(tmp_path / "capture.toml")
+    whole = read_model(project.model)
+    names = sorted(image.name for image in whole.images.values())
+    factors = {0: 2.0, 1: 0.5, 3: 1.0}
+    parts = {0: names[: len(names) // 2], 1: names[len(names) // 2 :], 3: names[:12]}
+    for index, part in parts.items():
+        model = pycolmap.Reconstruction(whole)
+        for name in set(names) - set(part):
+            model.deregister_frame(model.find_image_with_name(name).frame_id)
+        model.transform(pycolmap.Sim3d(factors[index], pycolmap.Rotation3d(), np.zeros(3)))
+        (workspace.sparse / str(index)).mkdir(parents=True)
+        model.write_binary(str(workspace.sparse / str(index)))
+    before = {p: p.read_bytes() for p in workspace.sparse.rglob("*.bin")}
+    imu = read_imu(project.imu)
+    timing = read_frame_times(project.frame_times)
+    stage = MetricStage(imu=imu, calibration=None, options=ScaleOptions(), world="z-up")
+    results = run_models(workspace, timing, imu, [stage], StageRunner(workspace), silent)
+
+    assert [result.index for result in results] == [0, 1, 3]
+    truth = project.recording.truth.metres_per_unit
+    for result in results[:2]:
+        expected = truth / factors[result.index]
+        assert result.scale.metres_per_unit == pytest.approx(expected, rel=0.05)
+        assert result.sparse_metric == workspace.sparse_metric / str(result.index)
+    assert results[2].scale.verdict == "refused"
+    assert results[2].sparse_metric is None
+    assert sorted(p.name for p in workspace.sparse_metric.iterdir()) == ["0", "1"]
+    assert sorted(p.name for p in workspace.root.glob("trajectory*")) == [
+        "trajectory.tum",
+        "trajectory_1.tum",
+        "trajectory_1_cov.npz",
+        "trajectory_cov.npz",
+    ]
+    assert {p: p.read_bytes() for p in workspace.sparse.rglob("*.bin")} == before
+    outcome = ReconstructResult(workspace=workspace, models=results, frames=(), seconds={})
+    assert outcome.exit_code() == 0
+    refused = dataclasses.replace(outcome, models=results[2:])
+    with pytest.raises(NotObservableError):
+        refused.exit_code()

@@ -23,6 +23,8 @@ from colmap_inertial.types import CameraImuCalibration, CameraTrajectory, ImuRec
 #: Frames closer together than the first have turned by less than the noise of their poses; over the second, the noise
 #: of poses is small against the rotation that is to be explained.
 _SPACING_S, _CHECK_SPACING_S = 0.1, 0.3
+#: Below this there is no interval long enough to tell one offset from another.
+_SHORTEST_S = 1.0
 #: Where the clocks drift apart too far for one offset, parts of this length still have one; how many of them are
 #: tried; the largest drift (action cameras: 1 %), and how far the parts may lie off a steady drift.
 _PART_S, _PARTS, _FASTEST_DRIFT, _UNSTEADY_S = 15.0, 8, 0.02, 0.2
@@ -107,6 +109,10 @@ def align_clocks(
     prior = prior or calibration_prior()
     if len(trajectory) < 5:
         raise NotObservableError("time offset", f"{len(trajectory)} poses are too few to compare with the gyroscope")
+    span_s = float(trajectory.t_s[-1] - trajectory.t_s[0])
+    if span_s < _SHORTEST_S:
+        hint = f"{span_s:.2f} s of poses are too short to compare with the gyroscope: record ten seconds or more"
+        raise NotObservableError("time offset", hint)
     lowest_s, highest_s = _range(trajectory, imu, prior, options)
     path = GyroPath(imu.gyro_t_s, imu.gyro_rad_s, np.zeros(3))
     rate = 0.0
@@ -166,7 +172,7 @@ def _search(
         explained = explained_at(intervals_of(trajectory, _CHECK_SPACING_S), path, best.offset_s, held)
         if best.log_likelihood - rival >= options.min_log_likelihood and explained >= options.min_explained:
             return best
-    seconds = intervals_of(trajectory, 1.0)
+    seconds = intervals_of(trajectory, _SHORTEST_S)
     if np.sqrt(np.mean(np.sum(seconds.turn_rad**2, axis=1) / seconds.dt_s)) < _STILL_RAD_RTS:
         hint = "the camera hardly rotates: turn it about all three axes while recording"
         return NotObservableError("camera-IMU rotation", hint)

@@ -190,7 +190,7 @@ def reconstruct(
         _run_frames(runner, workspace, loaded, timing, frames, list(frame_stages or ()), progress)
         records = read_frame_records(workspace.frames)
         _run_colmap(runner, workspace, records, gravity, options, list(keypoint_stages or ()), progress)
-        models = _run_models(workspace, timing, imu, stages, runner, progress)
+        models = run_models(workspace, timing, imu, stages, runner, progress)
         if loaded.target is not None:
             models = tuple(_validated(workspace, model, parse_target(loaded.target), progress) for model in models)
         remove(workspace.features)
@@ -316,7 +316,7 @@ def _run_colmap(
     runner.run("mapping", common, [workspace.sparse], models)
 
 
-def _run_models(
+def run_models(
     workspace: Workspace,
     timing: FrameTiming,
     imu: ImuRecording,
