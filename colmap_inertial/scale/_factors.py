@@ -136,7 +136,7 @@ def imu_group(noise: Noise, x: Estimate, pre: Preintegrated, *, rotation_only: b
     z[:, :, par.ACCEL_GAIN] = -pre.by_accel_gain
     z = z[:, :, par.IMU_GLOBALS]
 
-    cov = noise.gyro_rad_s_rthz**2 * pre.cov_gyro + noise.accel_m_s2_rthz**2 * pre.cov_accel
+    cov = noise.gyro_rad_s_rthz**2 * pre.cov_gyro + noise.accel_m_s2_rthz**2 * pre.cov_accel + pre.cov_gaps
     rows = slice(0, 3) if rotation_only else slice(0, 9)
     root = np.linalg.inv(np.linalg.cholesky(cov[:, rows, rows]))
     return Group(

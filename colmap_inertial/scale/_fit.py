@@ -38,6 +38,10 @@ class Fit:
         Logarithm of the ratio between the scales of the second and the first half, and its standard deviation.
     excitation_m_s2
         Standard deviation of the acceleration between nodes.
+    gap_s
+        How long the IMU is silent within the recording.
+    gain_chi2
+        Squared deviation of the accelerometer's nine gains and axis errors from their prior.
     """
 
     estimate: Estimate
@@ -50,6 +54,8 @@ class Fit:
     step_log: float
     step_sigma: float
     excitation_m_s2: float
+    gap_s: float
+    gain_chi2: float
 
 
 def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
@@ -104,6 +110,7 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
     information = float(np.sum(column * (column - after[:, :, 1])))
     residual = groups["centre"].residual + after[:, :, 0]
     step_log = -float(np.sum(column * residual)) / information
+    gain = x.accel_gain.ravel()
     accel = (x.world_from_imu[:-1] @ (pre.velocity / pre.dt_s[:, None])[:, :, None])[:, :, 0]
     return Fit(
         estimate=x,
@@ -116,6 +123,8 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
         step_log=-step_log,
         step_sigma=information**-0.5,
         excitation_m_s2=float(np.sqrt(np.sum(np.var(accel, axis=0)))),
+        gap_s=float(pre.gap_s.sum()),
+        gain_chi2=float(gain @ prior.info[par.ACCEL_GAIN, par.ACCEL_GAIN] @ gain),
     )
 
 

@@ -18,7 +18,7 @@ from colmap_inertial.types import Array, ImuNoise
 TYPICAL = Noise(
     gyro_rad_s_rthz=3e-4,
     gyro_walk_rad_s_rts=1e-4,
-    accel_m_s2_rthz=1e-2,
+    accel_m_s2_rthz=5e-3,
     accel_walk_m_s2_rts=3e-4,
     rotation_rad=2e-3,
     centre_m=2e-3,

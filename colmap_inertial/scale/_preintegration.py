@@ -24,6 +24,10 @@ from colmap_inertial.types import Array
 
 #: Integration step. With cubic interpolation of the samples, halving it changes the scale by less than 0.01 %.
 STEP_S = 0.005
+#: A longer pause between samples is a gap: what happened in it is unknown.
+LONGEST_STEP_S = 0.06
+#: How far rate and acceleration may then be from the interpolation: a lively hand.
+_GAP_RATE_RAD_S, _GAP_ACCEL_M_S2 = 2.0, 10.0
 #: Half the span of the finite difference by the accelerometer's delay: vibration makes shorter ones meaningless.
 DELAY_STEP_S = 0.01
 
@@ -38,6 +42,12 @@ class Track:
     t_s: Array
     value: Array
     slope: Array
+
+    def gap_s(self, begin_s: Array, end_s: Array) -> Array:
+        """How much of each interval from ``begin_s`` to ``end_s`` lies in pauses longer than ``LONGEST_STEP_S``."""
+        step = np.diff(self.t_s)
+        inside = np.concatenate([[0.0], np.cumsum(np.where(step > LONGEST_STEP_S, step, 0.0))])
+        return np.asarray(np.interp(end_s, self.t_s, inside) - np.interp(begin_s, self.t_s, inside))
 
     @classmethod
     def of(cls, t_s: Array, value: Array) -> Track:
@@ -69,6 +79,10 @@ class Preintegrated:
         (K, 3, 3), (K, 3), (K, 3) increments in the body frame at the start of the interval.
     cov_gyro, cov_accel
         (K, 9, 9) covariances for white noise of density one.
+    cov_gaps
+        (K, 9, 9) covariance for what gaps between samples hide.
+    gap_s
+        (K,) lengths of these gaps.
     by_gyro_bias, by_accel_bias
         (K, 9, 3) derivatives.
     by_gyro_gain
@@ -87,6 +101,8 @@ class Preintegrated:
     position: Array
     cov_gyro: Array
     cov_accel: Array
+    cov_gaps: Array
+    gap_s: Array
     by_gyro_bias: Array
     by_accel_bias: Array
     by_gyro_gain: Array
@@ -209,6 +225,9 @@ def preintegrate(
     cov_accel = np.zeros((k, 9, 9))
     for row, col, moment in ((3, 3, dt), (3, 6, dt**2 / 2), (6, 3, dt**2 / 2), (6, 6, dt**3 / 3)):
         cov_accel[:, row : row + 3, col : col + 3] = moment[:, None, None] * np.eye(3)
+    gap = gyro.gap_s(nodes_s[:-1], nodes_s[1:]) + accel.gap_s(nodes_s[:-1] - accel_delay_s, nodes_s[1:] - accel_delay_s)
+    hidden = np.stack([_GAP_RATE_RAD_S * gap, _GAP_ACCEL_M_S2 * gap, _GAP_ACCEL_M_S2 * gap * dt], axis=1)
+    cov_gaps = np.repeat(hidden**2, 3, axis=1)[:, :, None] * np.eye(9)
     by_accel_bias = np.zeros((k, 9, 3))
     by_accel_bias[:, 3:6] = -total(rotation)
     by_accel_bias[:, 6:] = -total(left[:, None, None] * rotation)
@@ -227,6 +246,8 @@ def preintegrate(
         position=position[end],
         cov_gyro=total(g @ g.transpose(0, 2, 1)),
         cov_accel=cov_accel,
+        cov_gaps=cov_gaps,
+        gap_s=gap,
         by_gyro_bias=-total(g_body),
         by_accel_bias=by_accel_bias,
         by_gyro_gain=total((g_body[:, :, :, None] * reading[:, None, None, :]).reshape(-1, 9, 9)),

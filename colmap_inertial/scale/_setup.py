@@ -117,15 +117,15 @@ def prepare(
     )
     prior = Prior(
         mean=mean,
-        info=np.diag(_sigmas(calibration) ** -2),
+        info=_information(calibration),
         gravity_m_s2=gravity_m_s2,
         gravity_sigma_m_s2=gravity_sigma_m_s2,
     )
     return data, prior
 
 
-def _sigmas(calibration: CameraImuCalibration) -> Array:
-    """(79,) prior standard deviations of the globals; infinite for scale and gravity."""
+def _information(calibration: CameraImuCalibration) -> Array:
+    """(79, 79) prior information of the globals; none for scale and gravity."""
     cov = calibration.cov
     variance = np.diagonal(cov)
     accel_delay_s = float(np.sqrt(max(variance[3] + variance[4] - 2 * cov[3, 4], 1e-8)))
@@ -142,7 +142,7 @@ def _sigmas(calibration: CameraImuCalibration) -> Array:
     shutter = row_spread_s * np.array([1.0, 1 / _NEAR_M, _FAR_M, 1.0])
     sigma[par.SHUTTER] = np.maximum(np.repeat(shutter, 9), 1e-9)
     sigma[par.COUPLING] = _COUPLING_M
-    return sigma
+    return np.diag(sigma**-2)
 
 
 def _pose_shapes(pose_cov: Array | None, world_from_cam: Array) -> tuple[Array, Array, Array]:
