@@ -19,7 +19,7 @@ def run(capsys, *args):
     return stopped.value.code, captured.out, captured.err
 
 
-@pytest.mark.parametrize("command", [[], ["reconstruct"], ["scale"], ["align"]])
+@pytest.mark.parametrize("command", [[], ["reconstruct"], ["scale"], ["align"], ["validate"], ["simulate"]])
 def test_help_teaches(capsys, command):
     code, out, _ = run(capsys, *command, "--help")
     assert code == 0
@@ -41,7 +41,7 @@ def test_the_installed_command_runs():
     assert done.stdout.strip() == "0.1.0"
 
 
-@pytest.mark.parametrize("method", ["joint"])
+@pytest.mark.parametrize("method", ["joint", "spectral"])
 def test_scale_of_a_colmap_model(capsys, project, tmp_path, method):
     target = tmp_path / "scale.json"
     before = {p: p.read_bytes() for p in project.model.iterdir()}

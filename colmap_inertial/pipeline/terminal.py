@@ -14,6 +14,7 @@ from colmap_inertial.types import CameraImuCalibration, ScaleEstimate
 from colmap_inertial.validate import Validation, validation_table
 
 _STAGES = {
+    "rendering": "Rendering",
     "frames": "Frames",
     "features": "Features",
     "matches": "Matches",
