@@ -46,13 +46,17 @@ class Felt:
         """Turn the readings into the world, without their bias and gravity."""
         t_s = imu.accel_t_s + calibration.accel_time_offset_s + clock_shift_s(trajectory, imu)
         world_from_imu, _ = attitude.at(t_s)
-        accel = quat_rotate(world_from_imu, imu.accel_m_s2 - bias_m_s2) + gravity_in_world_m_s2
+        return cls.integrated(t_s, quat_rotate(world_from_imu, imu.accel_m_s2 - bias_m_s2) + gravity_in_world_m_s2)
+
+    @classmethod
+    def integrated(cls, t_s: Array, accel_m_s2: Array) -> Felt:
+        """Integrate an acceleration (M, 3) that is linear between its samples."""
         step = np.diff(t_s)[:, None]
-        gained = step * 0.5 * (accel[1:] + accel[:-1])
+        gained = step * 0.5 * (accel_m_s2[1:] + accel_m_s2[:-1])
         velocity = np.concatenate([np.zeros((1, 3)), np.cumsum(gained, axis=0)])
-        moved = step * velocity[:-1] + step**2 / 6 * (2 * accel[:-1] + accel[1:])
+        moved = step * velocity[:-1] + step**2 / 6 * (2 * accel_m_s2[:-1] + accel_m_s2[1:])
         position = np.concatenate([np.zeros((1, 3)), np.cumsum(moved, axis=0)])
-        return cls(t_s=t_s, accel_m_s2=accel, velocity_m_s=velocity, position_m=position)
+        return cls(t_s=t_s, accel_m_s2=accel_m_s2, velocity_m_s=velocity, position_m=position)
 
     @property
     def step_s(self) -> float:

@@ -56,39 +56,85 @@ def smooth_positions(trajectory: CameraTrajectory, options: SmoothOptions | None
     NotObservableError
         For fewer than six poses.
     """
-    options = options or SmoothOptions()
-    count = len(trajectory)
-    if count < 6:
-        raise NotObservableError("smooth motion", f"{count} poses are too few to tell motion from noise")
-    centre = trajectory.cam_in_world - trajectory.cam_in_world.mean(axis=0)
-    size = float(np.sqrt(np.mean(centre**2))) or 1.0
-    step_s = float(np.median(np.diff(trajectory.t_s)))
-    relative_var = np.ones(count)
-    if trajectory.pose_cov is not None:
-        own = np.trace(trajectory.pose_cov[:, 3:, 3:], axis1=1, axis2=2)
-        relative_var = np.clip(own / np.median(own), 1e-4, 1e4)
-    model = _Model(
-        t=(trajectory.t_s - trajectory.t_s[0]) / step_s,
-        measured=centre / size,
-        relative_var=relative_var,
-        left_out=np.zeros(count, dtype=bool),
-        jumps=np.zeros(count - 1, dtype=bool),
-    )
-    chain = _without_oddities(model, options.outlier_chi2)
-    # back to the trajectory's units: length size, time step_s
-    units = size / step_s ** np.arange(3)
-    states = chain.states * units[None, :, None]
-    cov = chain.cov * np.outer(units, units)
-    return SmoothedTrajectory(
-        t_s=trajectory.t_s,
-        cam_in_world=states[:, 0] + trajectory.cam_in_world.mean(axis=0),
-        velocity_in_world=states[:, 1],
-        accel_in_world=states[:, 2],
-        cam_from_world_xyzw=trajectory.cam_from_world_xyzw,
-        cov=np.asarray(np.kron(cov, np.eye(3)), dtype=np.float64),
-        length_unit=trajectory.length_unit,
-        epoch_ns=trajectory.epoch_ns,
-    )
+    return PositionSmoother.of(trajectory, options).smoothed()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PositionSmoother:
+    """The smoother that the noise of a trajectory asks for, ready to be applied to other signals too.
+
+    Attributes
+    ----------
+    trajectory
+        What it was made from.
+    noise_sigma
+        Standard deviation of a position's white noise, trajectory's unit.
+    time_constant_s
+        Motion slower than this passes: white noise through the smoother has a spectrum like
+        ``1 / (1 + (2 pi f time_constant_s)^6)``, squared.
+    """
+
+    trajectory: CameraTrajectory
+    noise_sigma: float
+    time_constant_s: float
+    _chain: Chain
+    _size: float
+    _step_s: float
+
+    @classmethod
+    def of(cls, trajectory: CameraTrajectory, options: SmoothOptions | None = None) -> PositionSmoother:
+        """Estimate the noise; parameters and errors as for :func:`smooth_positions`."""
+        options = options or SmoothOptions()
+        count = len(trajectory)
+        if count < 6:
+            raise NotObservableError("smooth motion", f"{count} poses are too few to tell motion from noise")
+        centre = trajectory.cam_in_world - trajectory.cam_in_world.mean(axis=0)
+        size = float(np.sqrt(np.mean(centre**2))) or 1.0
+        step_s = float(np.median(np.diff(trajectory.t_s)))
+        relative_var = np.ones(count)
+        if trajectory.pose_cov is not None:
+            own = np.trace(trajectory.pose_cov[:, 3:, 3:], axis1=1, axis2=2)
+            relative_var = np.clip(own / np.median(own), 1e-4, 1e4)
+        model = _Model(
+            t=(trajectory.t_s - trajectory.t_s[0]) / step_s,
+            measured=centre / size,
+            relative_var=relative_var,
+            left_out=np.zeros(count, dtype=bool),
+            jumps=np.zeros(count - 1, dtype=bool),
+        )
+        constant, chain = _without_oddities(model, options.outlier_chi2)
+        return cls(
+            trajectory=trajectory,
+            noise_sigma=size * float(np.sqrt(np.median(chain.measured_var))),
+            time_constant_s=constant * step_s,
+            _chain=chain,
+            _size=size,
+            _step_s=step_s,
+        )
+
+    def smoothed(self) -> SmoothedTrajectory:
+        """The trajectory itself."""
+        units = self._size / self._step_s ** np.arange(3)
+        states = self._chain.states * units[None, :, None]
+        return SmoothedTrajectory(
+            t_s=self.trajectory.t_s,
+            cam_in_world=states[:, 0] + self.trajectory.cam_in_world.mean(axis=0),
+            velocity_in_world=states[:, 1],
+            accel_in_world=states[:, 2],
+            cam_from_world_xyzw=self.trajectory.cam_from_world_xyzw,
+            cov=np.asarray(np.kron(self._chain.cov * np.outer(units, units), np.eye(3)), dtype=np.float64),
+            length_unit=self.trajectory.length_unit,
+            epoch_ns=self.trajectory.epoch_ns,
+        )
+
+    def accelerations_of(self, signals: Array) -> Array:
+        """Second derivatives (T, m) of other signals (T, m) at the frame times, after the very same smoothing.
+
+        What is compared with smoothed positions must have lost what they lost; exact for signals up to parabolas.
+        """
+        centred = signals - signals.mean(axis=0)
+        chain = replace(self._chain, measured=centred, drive=np.zeros((len(self._chain.drive), 3, signals.shape[1])))
+        return chain.states[:, 2] / self._step_s**2
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -136,7 +182,7 @@ class _Model:
         return constant, self.chain(constant, variance(self.chain(constant, 1.0)))
 
 
-def _without_oddities(model: _Model, limit: float) -> Chain:
+def _without_oddities(model: _Model, limit: float) -> tuple[float, Chain]:
     """Leave out poses, and allow jumps, one neighbourhood at a time, until nothing contradicts the rest."""
     constant, chain = model.most_likely()
     for _ in range(_ROUNDS):
@@ -149,4 +195,4 @@ def _without_oddities(model: _Model, limit: float) -> Chain:
             break  # not outliers, but noise of another kind
         model = replace(model, left_out=left_out, jumps=jumps)
         constant, chain = model.most_likely()
-    return chain
+    return constant, chain
