@@ -87,20 +87,29 @@ def estimate_scale(
     The estimate with a verdict. Data that cannot give a scale give the verdict ``"refused"`` with reasons, not an
     exception.
     """
+    from threadpoolctl import threadpool_limits
+
     options = options or ScaleOptions()
     begin_s = time.perf_counter()
+    # Many small matrices: threads within one product cost more than they save (three times the time on two cores).
+    with threadpool_limits(limits=1, user_api="blas"):
+        estimate = _estimate_or_refuse(trajectory, imu, calibration, options)
+    return replace(estimate, runtime_s=time.perf_counter() - begin_s)
+
+
+def _estimate_or_refuse(
+    trajectory: CameraTrajectory, imu: ImuRecording, calibration: CameraImuCalibration | None, options: ScaleOptions
+) -> ScaleEstimate:
     problems = check_units(imu)
     if problems:
-        estimate = _refused(options.method, *problems)
-    else:
-        try:
-            aligned = align_camera_imu(
-                trajectory, imu, prior=calibration, options=AlignOptions(max_offset_s=options.max_offset_s)
-            )
-            estimate = _estimate(trajectory, imu, aligned, options)
-        except NotObservableError as error:
-            estimate = _refused(options.method, f"{error.quantity}: {error.hint}")
-    return replace(estimate, runtime_s=time.perf_counter() - begin_s)
+        return _refused(options.method, *problems)
+    try:
+        aligned = align_camera_imu(
+            trajectory, imu, prior=calibration, options=AlignOptions(max_offset_s=options.max_offset_s)
+        )
+        return _estimate(trajectory, imu, aligned, options)
+    except NotObservableError as error:
+        return _refused(options.method, f"{error.quantity}: {error.hint}")
 
 
 def _estimate(
