@@ -18,10 +18,6 @@ fi
 
 missing=()
 "$python" -c 'import ensurepip' 2>/dev/null || missing+=("python3-venv")
-# open3d, which the simulator renders with, links to these.
-for library in libGL.so.1:libgl1 libEGL.so.1:libegl1 libusb-1.0.so.0:libusb-1.0-0 libgomp.so.1:libgomp1 libX11.so.6:libx11-6; do
-  "$python" -c "import ctypes; ctypes.CDLL('${library%%:*}')" 2>/dev/null || missing+=("${library##*:}")
-done
 if [ ${#missing[@]} -gt 0 ]; then
   sudo=""
   if [ "$(id -u)" -ne 0 ]; then sudo="sudo -n"; fi
