@@ -163,8 +163,8 @@ def test_derivatives_of_all_residuals_are_those_of_finite_differences(recording,
         imu_in_world_m=data.centre * recording.truth.metres_per_unit + 0.002 * rng.standard_normal((k, 3)),
         velocity_m_s=0.3 * rng.standard_normal((k, 3)),
         imu_in_cam_m=np.array([0.03, -0.02, 0.01]),
-        shutter=0.001 * rng.standard_normal((4, 3, 3)),
-        coupling_m=0.01 * rng.standard_normal((3, 3)),
+        shutter=1e-5 * rng.standard_normal((4, 3, 3)),
+        coupling_m=0.5 * rng.standard_normal((3, 3)),
     )
 
     def residuals(moved):
