@@ -30,10 +30,18 @@ def quat_normalize(q: Array) -> Array:
 
 def quat_multiply(a: Array, b: Array) -> Array:
     """Hamilton product of xyzw quaternions: the rotation ``b`` first, then ``a``. Shapes broadcast."""
-    a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
-    av, aw, bv, bw = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
-    vector = aw * bv + bw * av + np.cross(av, bv)
-    return np.concatenate([vector, aw * bw - np.sum(av * bv, axis=-1, keepdims=True)], axis=-1)
+    ax, ay, az, aw = np.moveaxis(np.asarray(a, dtype=np.float64), -1, 0)
+    bx, by, bz, bw = np.moveaxis(np.asarray(b, dtype=np.float64), -1, 0)
+    # components spelled out: several times faster than np.cross
+    return np.stack(
+        [
+            aw * bx + bw * ax + ay * bz - az * by,
+            aw * by + bw * ay + az * bx - ax * bz,
+            aw * bz + bw * az + ax * by - ay * bx,
+            aw * bw - ax * bx - ay * by - az * bz,
+        ],
+        axis=-1,
+    )
 
 
 def quat_conjugate(q: Array) -> Array:
@@ -148,14 +156,20 @@ def slerp(t_s: Array, xyzw: Array, query_s: Array) -> Array:
 def quat_cumulative(steps: Array) -> Array:
     """Running products ``[1, s0, s0 s1, s0 s1 s2, ...]`` of unit quaternions xyzw. Shape (N, 4) -> (N + 1, 4).
 
-    A parallel prefix scan (Hillis and Steele 1986): log2(N) vectorised passes instead of a Python loop.
+    In linear time: products within blocks, all blocks at once, then the blocks' own running products in front.
     """
     out = np.concatenate([[[0.0, 0.0, 0.0, 1.0]], np.asarray(steps, dtype=np.float64)])
-    reach = 1
-    while reach < len(out):
-        out[reach:] = quat_normalize(quat_multiply(out[:-reach], out[reach:]))
-        reach *= 2
-    return out
+    count, block = len(out), 32
+    padded = np.zeros((-(-count // block) * block, 4))
+    padded[:, 3] = 1.0
+    padded[:count] = out
+    grid = padded.reshape(-1, block, 4)
+    for i in range(1, block):
+        grid[:, i] = quat_multiply(grid[:, i - 1], grid[:, i])
+    if len(grid) > 1:
+        before = quat_cumulative(grid[:-1, -1])[1:]
+        grid[1:] = quat_multiply(before[:, None], grid[1:])
+    return quat_normalize(grid.reshape(-1, 4)[:count])
 
 
 def rotation_between(a: Array, b: Array) -> Array:

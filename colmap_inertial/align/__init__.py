@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from colmap_inertial.align._clock_search import ClockFit, explained_at, intervals_of, search_offsets, spaced_frames
-from colmap_inertial.align._fit import UNKNOWN_OFFSET_S, Alignment, middle_of_overlap, refine_alignment
+from colmap_inertial.align._fit import OFFSET_UNKNOWN_FROM_S, Alignment, middle_of_overlap, refine_alignment
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.gyro import GyroPath
 from colmap_inertial.io.calibration import calibration_prior
@@ -85,9 +85,9 @@ def align_clocks(
         Only the gyroscope is used.
     prior
         What is known beforehand (``io.calibration.calibration_prior`` builds one). Its lever arm, readout and
-        accelerometer delay pass through; a time offset with a standard deviation below ``UNKNOWN_OFFSET_S`` narrows
-        the search to two standard deviations (and 0.05 s). Where the search cannot find the rotation by itself, a
-        known rotation is held.
+        accelerometer delay pass through; a time offset with a standard deviation below ``OFFSET_UNKNOWN_FROM_S``
+        narrows the search to two standard deviations (and 0.05 s). Where the search cannot find the rotation by
+        itself, a known rotation is held.
     options
         Search range and thresholds.
 
@@ -135,7 +135,7 @@ def _range(
     if options.max_offset_s is not None:
         lowest_s, highest_s = shift_s - options.max_offset_s, shift_s + options.max_offset_s
     sigma_s = prior.sigma("gyro_time_offset_s")
-    if sigma_s < UNKNOWN_OFFSET_S:
+    if sigma_s < OFFSET_UNKNOWN_FROM_S:
         centre_s, reach_s = prior.gyro_time_offset_s + shift_s, 2 * sigma_s + 0.05
         lowest_s, highest_s = max(lowest_s, centre_s - reach_s), min(highest_s, centre_s + reach_s)
     return lowest_s, highest_s
@@ -224,4 +224,4 @@ def _search_parts(
     return replace(found[0][1], offset_s=at_zero_s + rate * middle_s), rate
 
 
-__all__ = ["UNKNOWN_OFFSET_S", "AlignOptions", "Alignment", "align_camera_imu", "align_clocks"]
+__all__ = ["OFFSET_UNKNOWN_FROM_S", "AlignOptions", "Alignment", "align_camera_imu", "align_clocks"]

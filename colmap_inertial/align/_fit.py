@@ -27,7 +27,7 @@ from colmap_inertial.types import (
 )
 
 #: A time offset with at least this standard deviation is unknown: its value carries nothing.
-UNKNOWN_OFFSET_S = 1e3
+OFFSET_UNKNOWN_FROM_S = 1e3
 #: Columns of the refinement among ``CALIBRATION_PARAMETERS``: rotation, gyroscope offset, gyroscope bias.
 _FITTED = np.array([0, 1, 2, 3, 5, 6, 7])
 _OTHERS = np.setdiff1d(np.arange(len(CALIBRATION_PARAMETERS)), _FITTED)
@@ -214,7 +214,7 @@ def _prior_of_fitted(
 ) -> tuple[tuple[Array, float, Array], Array]:
     """Mean (rotation, offset, bias) and information of what is fitted; what is unknown starts at the search's."""
     rotation_known = prior.sigma("rotation_x_rad") < 1
-    offset_known = prior.sigma("gyro_time_offset_s") < UNKNOWN_OFFSET_S
+    offset_known = prior.sigma("gyro_time_offset_s") < OFFSET_UNKNOWN_FROM_S
     mean = (
         prior.cam_from_imu_xyzw if rotation_known else start.cam_from_imu_xyzw,
         prior.gyro_time_offset_s + shift_s if offset_known else start.offset_s,
