@@ -1,0 +1,332 @@
+"""``reconstruct`` on the committed example scene: real pictures, real COLMAP, known truth."""
+
+import dataclasses
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from colmap_inertial.cli import main
+from colmap_inertial.errors import FormatError, InertialError, NotObservableError, OutputExistsError
+from colmap_inertial.geometry import matrix_from_quat, quat_conjugate
+from colmap_inertial.io.trajectories import read_tum
+from colmap_inertial.model import read_model
+from colmap_inertial.pipeline import MappingOptions, ReconstructOptions, reconstruct
+from colmap_inertial.simulate.truth import read_truth, true_metres_per_unit
+
+SCENE = Path(__file__).parents[1] / "example_scenes" / "desk"
+#: Enough for this scene, and three times faster than COLMAP's defaults.
+QUICK = ReconstructOptions(mapping=MappingOptions(max_num_features=1500, first_octave=0, max_image_size=480))
+DETERMINISTIC = dataclasses.replace(QUICK, deterministic=True)
+
+
+def copy_scene(folder: Path, *, first: int | None = None) -> Path:
+    """A copy of the example scene, or of its first frames."""
+    shutil.copytree(SCENE, folder)
+    if first is not None:
+        table = folder / "frames.csv"
+        rows = table.read_text().splitlines()
+        table.write_text("\n".join(rows[: first + 1]) + "\n")
+        for row in rows[first + 1 :]:
+            (folder / "frames" / row.split(",")[0]).unlink()
+    return folder
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """The whole scene, reconstructed once: (capture, out, result). Tests must not change it."""
+    root = tmp_path_factory.mktemp("desk")
+    capture = copy_scene(root / "capture")
+    before = contents(capture)
+    stages = []
+    result = reconstruct(capture, root / "out", QUICK, progress=lambda stage, done, total: stages.append((stage, done)))
+    assert contents(capture) == before
+    assert list(dict(stages)) == ["frames", "features", "matches", "mapping", "metric", "validation"]
+    return capture, root / "out", result
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return read_truth(SCENE / "truth.json")
+
+
+def centres(folder):
+    model = read_model(folder)
+    images = [model.image(i) for i in model.reg_image_ids()]
+    return tuple(image.name for image in images), np.array([image.projection_center() for image in images])
+
+
+def test_the_model_is_metric_within_its_own_interval(finished, truth):
+    capture, _, result = finished
+    (model,) = result.models
+    names, found = centres(model.sparse_metric)
+    assert len(names) == len(list((capture / "frames").iterdir()))
+    error = 1 / true_metres_per_unit(names, found, truth.trajectory) - 1
+    low, high = np.array(model.scale.ci95) / model.scale.metres_per_unit - 1
+    assert abs(error) < 0.02
+    assert low < -error < high
+    assert result.exit_code() == 0
+    assert abs(model.validation.scale_error_pct / 100 - error) < 0.003
+
+
+def test_z_points_up(finished, truth):
+    _, _, result = finished
+    names, found = centres(result.models[0].sparse_metric)
+    order = [truth.trajectory.names.index(name) for name in names]
+    true = truth.trajectory.cam_in_world[order]
+    u, _, vt = np.linalg.svd((true - true.mean(0)).T @ (found - found.mean(0)))
+    rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    assert np.degrees(np.arccos(rotation[2, 2])) < 1.0
+
+
+def test_the_metric_model_is_colmap_s_model_scaled(finished):
+    _, out, result = finished
+    assert not (out / "sparse" / "0" / "transform.json").exists()
+    transform = json.loads((out / "sparse_metric" / "0" / "transform.json").read_text())
+    names, before = centres(out / "sparse" / "0")
+    after_names, after = centres(out / "sparse_metric" / "0")
+    assert names == after_names
+    expected = transform["scale"] * before @ matrix_from_quat(np.array(transform["rotation_xyzw"])).T
+    np.testing.assert_allclose(after, expected, atol=1e-9)
+    assert transform["scale"] == result.models[0].scale.metres_per_unit
+
+
+def test_the_trajectory_is_smooth_metric_and_says_how_well_it_is_known(finished, truth):
+    _, out, _ = finished
+    track = read_tum(out / "trajectory.tum")
+    model_names, found = centres(out / "sparse_metric" / "0")
+    assert len(track) == len(model_names)
+    by_name = dict(zip(model_names, found, strict=True))
+    ordered = np.array([by_name[name] for name in sorted(by_name)])
+    # the smoothed path lies within a centimetre of the metric model's own cameras
+    assert np.sqrt(np.mean(np.sum((track.cam_in_world - ordered) ** 2, axis=1))) < 0.01
+    stored = np.load(out / "trajectory_cov.npz")
+    assert stored["cov"].shape == (len(track), 9, 9)
+    np.testing.assert_allclose(stored["t_s"], track.t_s + track.epoch_ns * 1e-9, atol=1e-6)
+    sigma_m = np.sqrt(np.diagonal(stored["cov"], axis1=1, axis2=2)[:, :3])
+    assert 1e-5 < np.median(sigma_m) < 0.02
+    # rotations are those of the cameras
+    q = quat_conjugate(track.cam_from_world_xyzw)
+    first = read_model(out / "sparse_metric" / "0").find_image_with_name(sorted(by_name)[0])
+    assert abs(np.dot(q[0], first.cam_from_world().rotation.inverse().quat)) > 0.9999
+
+
+def test_the_result_file_says_everything(finished):
+    capture, out, result = finished
+    stored = json.loads((out / "result.json").read_text())
+    (model,) = stored["models"]
+    for key in ("metres_per_unit", "ci95", "verdict", "reasons", "gravity_in_world_m_s2", "accel_bias_m_s2"):
+        assert key in model
+    assert model["index"] == 0
+    assert model["verdict"] == result.models[0].scale.verdict
+    assert model["validation"]["within_tolerance"]
+    assert {frame["action"] for frame in stored["frames"]} == {"passed"}
+    assert "features: finished" in (out / "log.txt").read_text()
+    assert "max_num_features = 1500" in (out / "config.toml").read_text()
+    assert not (out / "features.db").exists()
+    for name in json.loads((out / "frames.json").read_text())["frames"]:
+        original = capture / "frames" / name["name"]
+        assert (out / "images" / name["name"]).read_bytes() == original.read_bytes()
+
+
+def test_a_finished_result_is_not_overwritten(finished, capsys):
+    capture, out, _ = finished
+    before = contents(out)
+    with pytest.raises(OutputExistsError, match="finished result"):
+        reconstruct(capture, out, QUICK)
+    with pytest.raises(SystemExit) as stopped:
+        main(["reconstruct", str(capture), str(out)])
+    assert stopped.value.code == 2
+    assert "finished result" in capsys.readouterr().err
+    assert contents(out) == before
+
+
+def test_a_refused_scale_keeps_colmap_s_model_and_exits_3(finished, tmp_path, capsys):
+    capture, out, _ = finished
+    unfinished = tmp_path / "out"
+    shutil.copytree(out, unfinished)
+    (unfinished / "result.json").unlink()
+    gyro, accel = (capture / "gyro.csv").read_text(), (capture / "accel.csv").read_text()
+    try:  # in place, because an unfinished run knows its capture by its path
+        # the recording of another take: time runs backwards
+        for name, text in (("gyro", gyro), ("accel", accel)):
+            header, *rows = text.splitlines()
+            stamps = [row.split(",", 1)[0] for row in rows]
+            values = [row.split(",", 1)[1] for row in reversed(rows)]
+            lines = [f"{t},{v}" for t, v in zip(stamps, values, strict=True)]
+            (capture / f"{name}.csv").write_text("\n".join([header, *lines]) + "\n")
+        result = reconstruct(capture, unfinished, QUICK)
+    finally:
+        (capture / "gyro.csv").write_text(gyro)
+        (capture / "accel.csv").write_text(accel)
+    assert result.models[0].scale.verdict == "refused"
+    with pytest.raises(NotObservableError, match="offset"):
+        result.exit_code()
+    stored = json.loads((unfinished / "result.json").read_text())
+    assert stored["models"][0]["metres_per_unit"] is None
+    assert (unfinished / "sparse" / "0").is_dir()
+    assert not (unfinished / "sparse_metric").exists()
+    assert not list(unfinished.glob("trajectory*"))
+
+
+KILLED = """
+import os, signal, sys
+sys.path.insert(0, sys.argv[4])
+from pathlib import Path
+from test_pipeline import DETERMINISTIC
+from colmap_inertial import reconstruct
+
+def progress(stage, done, total):
+    if stage == sys.argv[3] and (done > 0 or total == 1):
+        os.kill(os.getpid(), signal.SIGKILL)
+
+reconstruct(Path(sys.argv[1]), Path(sys.argv[2]), DETERMINISTIC, progress=progress)
+"""
+
+
+def test_killed_at_every_stage_it_ends_as_if_undisturbed(tmp_path):
+    capture = copy_scene(tmp_path / "capture", first=16)
+    undisturbed = reconstruct(capture, tmp_path / "whole", DETERMINISTIC)
+    killed = tmp_path / "killed"
+    for stage in ("frames", "features", "matches", "mapping", "metric"):
+        command = [sys.executable, "-c", KILLED, str(capture), str(killed), stage, str(Path(__file__).parent)]
+        assert subprocess.run(command, capture_output=True).returncode == -9
+        assert not (killed / "result.json").exists()
+    resumed = reconstruct(capture, killed, DETERMINISTIC)
+    kept = (killed / "log.txt").read_text().count("finished in an earlier run, kept")
+    assert kept >= 4
+    for folder in ("images", "sparse", "sparse_metric"):
+        assert contents(tmp_path / "whole" / folder) == contents(killed / folder), folder
+    assert [m.scale.metres_per_unit for m in undisturbed.models] == [m.scale.metres_per_unit for m in resumed.models]
+    assert not list(killed.rglob("*.partial*"))
+
+
+def test_hooks_see_every_frame_keypoint_and_model(tmp_path):
+    capture = copy_scene(tmp_path / "capture", first=14)
+    seen, models = {}, []
+
+    def every_frame_but_the_last(frames):
+        kept = None
+        for frame in frames:
+            if kept is not None:
+                yield dataclasses.replace(kept, image=kept.image // 2 + 60)
+            kept = frame
+
+    def shift(name, keypoints_px):
+        seen[name] = keypoints_px + np.array([0.25, 0.0])
+        return seen[name]
+
+    def refuse(model):
+        from colmap_inertial.types import ScaleEstimate
+
+        models.append((model.index, read_model(model.folder).num_reg_images()))
+        estimate = ScaleEstimate(
+            metres_per_unit=None, sigma_log=None, ci95=None, verdict="refused", method="joint", reasons=("mine",)
+        )
+        return dataclasses.replace(model, scale=estimate)
+
+    result = reconstruct(
+        capture,
+        tmp_path / "out",
+        QUICK,
+        frame_stages=[every_frame_but_the_last],
+        keypoint_stages=[shift],
+        model_stages=[refuse],
+    )
+    assert [record.action for record in result.frames] == ["changed"] * 13 + ["dropped"]
+    assert sorted(seen) == [record.name for record in result.frames[:-1]]
+    assert len(list((tmp_path / "out" / "images").iterdir())) == 13
+    assert models
+    assert models[0][0] == 0
+    assert result.models[0].scale.reasons == ("mine",)
+    with pycolmap.Database.open(str(tmp_path / "out" / "database.db")) as database:
+        for image in database.read_all_images():
+            stored = np.array(database.read_keypoints(image.image_id))
+            np.testing.assert_allclose(stored[:, :2], seen[image.name], atol=1e-4)
+
+
+def test_an_unreadable_picture_is_named_and_nothing_is_left_half_done(tmp_path, capsys):
+    capture = copy_scene(tmp_path / "capture", first=6)
+    broken = sorted((capture / "frames").iterdir())[3]
+    broken.write_bytes(broken.read_bytes()[:200])
+    with pytest.raises(SystemExit) as stopped:
+        main(["reconstruct", str(capture), str(tmp_path / "out")])
+    assert stopped.value.code == 2
+    assert broken.name in capsys.readouterr().err
+    assert not (tmp_path / "out" / "images").exists()
+    assert not (tmp_path / "out" / "result.json").exists()
+
+
+def test_too_few_frames_and_pictures_that_do_not_match_are_said(tmp_path, capsys):
+    two = copy_scene(tmp_path / "two", first=2)
+    with pytest.raises(InertialError, match="needs at least three"):
+        reconstruct(two, tmp_path / "out", QUICK)
+
+    import cv2
+
+    noise = copy_scene(tmp_path / "noise", first=5)
+    rng = np.random.default_rng(0)
+    for path in (noise / "frames").iterdir():
+        flat = np.full(cv2.imread(str(path)).shape, 128, np.uint8)
+        cv2.imwrite(str(path), flat + rng.integers(0, 3, flat.shape, dtype=np.uint8))
+    with pytest.raises(SystemExit) as stopped:
+        main(["reconstruct", str(noise), str(tmp_path / "out2")])
+    assert stopped.value.code == 4
+    assert "COLMAP found no model" in capsys.readouterr().err
+
+
+def test_a_missing_capture_is_said(tmp_path, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(["reconstruct", str(tmp_path / "nothing.toml"), str(tmp_path / "out")])
+    assert stopped.value.code == 2
+    assert "nothing.toml" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_gravity_priors_need_a_calibration_and_the_global_mapper(tmp_path):
+    priors = MappingOptions(gravity_priors=True)
+    with pytest.raises(InertialError, match=r"--mapping\.mapper global"):
+        reconstruct(SCENE, tmp_path / "out", ReconstructOptions(mapping=priors))
+    with pytest.raises(InertialError, match=r"\[calibration\]"):
+        options = ReconstructOptions(mapping=dataclasses.replace(priors, mapper="global"))
+        reconstruct(SCENE, tmp_path / "out", options)
+    assert not (tmp_path / "out").exists()
+
+
+def test_gravity_priors_turn_the_global_mapper_s_world(tmp_path, truth):
+    capture = copy_scene(tmp_path / "capture", first=20)
+    calibration = truth.calibration
+    with open(capture / "capture.toml", "a") as file:
+        file.write(
+            f"\n[calibration]\ncam_from_imu_xyzw = {calibration.cam_from_imu_xyzw.tolist()}\n"
+            f"gyro_time_offset_s = {calibration.gyro_time_offset_s}\n"
+            f"accel_time_offset_s = {calibration.accel_time_offset_s}\n"
+        )
+    mapping = dataclasses.replace(QUICK.mapping, mapper="global", gravity_priors=True)
+    result = reconstruct(capture, tmp_path / "out", dataclasses.replace(QUICK, mapping=mapping))
+    model = read_model(result.models[0].sparse)
+    names = [model.image(i).name for i in model.reg_image_ids()]
+    index = {name: i for i, name in enumerate(truth.trajectory.names)}
+    down = []
+    for image_id, name in zip(model.reg_image_ids(), names, strict=True):
+        cam_from_world = matrix_from_quat(truth.trajectory.cam_from_world_xyzw[index[name]])
+        down.append(model.image(image_id).cam_from_world().rotation.inverse().matrix() @ cam_from_world @ [0, 0, -1])
+    assert np.degrees(np.arccos(np.mean(down, axis=0)[1])) < 5
+
+
+def test_reading_a_capture_without_frames_is_an_error(tmp_path):
+    capture = copy_scene(tmp_path / "capture")
+    text = (capture / "capture.toml").read_text()
+    start, end = text.index("[images]"), text.index("[timing]")
+    (capture / "capture.toml").write_text(text[:start] + text[end:])
+    with pytest.raises(FormatError, match=r"\[images\] or \[video\]"):
+        reconstruct(capture, tmp_path / "out")
