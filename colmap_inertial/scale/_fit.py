@@ -92,7 +92,7 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
         change = 1.0
         if iteration > 2:
             noise, change = levels.updated_noise(noise, start, floor, sums)
-        if step < 0.03 * sigma and change < 0.03:
+        if step < 0.03 * sigma and change < 0.1:
             break
 
     # Once more at the optimum: the mean gyroscope bias, and a second scale for the second half

@@ -36,6 +36,8 @@ _COMPONENTS = {
 }
 #: How many residuals the starting value counts as.
 _WEIGHT = 10.0
+#: Exponent of a ratio of variances; 0.5 converges slowly from afar.
+_OVERSHOOT = 0.6
 
 
 def typical_noise(sheet: ImuNoise | None) -> tuple[Noise, dict[str, float]]:
@@ -86,7 +88,8 @@ def updated_noise(
     for level, (squares, expected) in sums.items():
         now = getattr(noise, level)
         ratio = (squares + _WEIGHT * (getattr(start, level) / now) ** 2) / (expected + _WEIGHT)
-        # A level far off is approached in steps: the robust weights have to follow
-        new[level] = max(now * float(np.clip(np.sqrt(ratio), 0.4, 2.5)), floor[level])
+        # More than the square root, as most residuals of a slow level are used up by states; but in steps, as the
+        # robust weights have to follow
+        new[level] = max(now * float(np.clip(ratio**_OVERSHOOT, 0.4, 2.5)), floor[level])
         largest = max(largest, abs(float(np.log(new[level] / now))))
     return replace(noise, **new), largest
