@@ -14,7 +14,7 @@ from colmap_inertial.types import CALIBRATION_PARAMETERS, CameraImuCalibration
 
 #: Standard deviations of what nobody knows. A rotation: any. Offsets: clock origins are arbitrary.
 UNKNOWN_ROTATION_RAD = np.pi
-UNKNOWN_OFFSET_S = 1e6
+UNKNOWN_OFFSET_S = 1e4
 UNKNOWN_GYRO_BIAS_RAD_S = 0.1
 UNKNOWN_LEVER_ARM_M = 0.08
 UNKNOWN_READOUT_S = 0.02
