@@ -1,10 +1,14 @@
-"""A world in which the truth is known: handheld motion, an IMU, and the reconstruction that would come of it.
+"""A world in which the truth is known.
 
-:func:`simulate_recording` makes poses and IMU samples without rendering, for Monte-Carlo studies.
+:func:`simulate_recording` makes poses and IMU samples without rendering, thousands of seconds in a second, for
+Monte-Carlo studies. :func:`write_capture` films a textured world as a :class:`SceneRecipe` says and writes what a user
+would have recorded, with the truth beside it.
 """
 
+from colmap_inertial.simulate.capture import Scene, make_scene, write_capture
 from colmap_inertial.simulate.imu import IMU_PRESETS, ImuErrors, ImuOptions, draw_imu_errors, sample_imu
 from colmap_inertial.simulate.motion import Kinematics, Motion, MotionOptions, make_motion
+from colmap_inertial.simulate.recipe import SceneRecipe, load_recipe, recipe_text
 from colmap_inertial.simulate.recording import (
     RecordingOptions,
     RecordingTruth,
@@ -12,20 +16,39 @@ from colmap_inertial.simulate.recording import (
     SimulatedRecording,
     simulate_recording,
 )
+from colmap_inertial.simulate.render import Renderer, ShutterCamera, develop
+from colmap_inertial.simulate.truth import SceneTruth, read_truth, true_metres_per_unit
+from colmap_inertial.simulate.world import Board, Quad, World, make_world
 
 __all__ = [
     "IMU_PRESETS",
+    "Board",
     "ImuErrors",
     "ImuOptions",
     "Kinematics",
     "Motion",
     "MotionOptions",
+    "Quad",
     "RecordingOptions",
     "RecordingTruth",
+    "Renderer",
+    "Scene",
+    "SceneRecipe",
+    "SceneTruth",
     "SfmOptions",
+    "ShutterCamera",
     "SimulatedRecording",
+    "World",
+    "develop",
     "draw_imu_errors",
+    "load_recipe",
     "make_motion",
+    "make_scene",
+    "make_world",
+    "read_truth",
+    "recipe_text",
     "sample_imu",
     "simulate_recording",
+    "true_metres_per_unit",
+    "write_capture",
 ]

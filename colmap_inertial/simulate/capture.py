@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import lru_cache
+from functools import lru_cache, partial
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -31,6 +32,8 @@ from colmap_inertial.simulate.world import Board, World, WorldKind, make_world
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
+#: Camera (end of its files' names), frame, folder for the depth map.
+_Job = tuple[str, int, Path | None]
 
 #: Ticks of a video's clock in a second: 30, 25, 24 frames per second are whole numbers of them.
 _TICKS_HZ = 90000
@@ -118,15 +121,20 @@ def write_capture(
         raise OutputExistsError(f"{folder} exists already; name a new folder")
     folder.mkdir(parents=True, exist_ok=True)
     scene = make_scene(recipe)
-    cameras = {"": recipe.camera, **{f"_{name}": camera for name, camera in recipe.rig.items()}}
+    cameras = _cameras(recipe)
     total, done = len(cameras) * len(scene.names), 0
-    for suffix, camera in cameras.items():
-        pictures = _pictures(scene, camera, workers, folder / f"depth{suffix}" if recipe.depth_maps else None)
-        write = _write_video if recipe.format == "h264" else _write_pictures
-        for _ in write(scene, pictures, folder, suffix):
-            done += 1
-            if progress is not None:
-                progress(done, total)
+    write = _write_video if recipe.format == "h264" else _write_pictures
+    with _processes(recipe, workers) as pool:
+        for suffix in cameras:
+            depth = folder / f"depth{suffix}" if recipe.depth_maps else None
+            if depth is not None:
+                depth.mkdir()
+            jobs = [(suffix, i, depth) for i in range(len(scene.names))]
+            pictures = map(partial(_render, scene), jobs) if pool is None else pool.map(_render_job, jobs)
+            for _ in write(scene, pictures, folder, suffix):
+                done += 1
+                if progress is not None:
+                    progress(done, total)
     for name, t_s, values in (
         ("gyro", scene.imu.recording.gyro_t_s, scene.imu.recording.gyro_rad_s),
         ("accel", scene.imu.recording.accel_t_s, scene.imu.recording.accel_m_s2),
@@ -150,41 +158,42 @@ def _renderer(world: WorldKind, seed: int, board: Board) -> Renderer:
     return Renderer(make_world(world, seed, board))
 
 
-def _render(scene: Scene, camera: ShutterCamera, index: int, depth: Path | None) -> Image:
+def _cameras(recipe: SceneRecipe) -> dict[str, ShutterCamera]:
+    """The main camera and those of the rig, by what their files' names end with."""
+    return {"": recipe.camera, **{f"_{name}": camera for name, camera in recipe.rig.items()}}
+
+
+def _render(scene: Scene, job: _Job) -> Image:
+    suffix, index, depth = job
     recipe = scene.recipe
+    camera = _cameras(recipe)[suffix]
     renderer = _renderer(recipe.world, recipe.seed, recipe.board)
     t_s = float(scene.trigger_s[index])
     if depth is not None:
         depth_m = renderer.depth_m(camera, scene.motion, camera.middle_s(t_s))
         np.save(depth / f"{Path(scene.names[index]).stem}.npy", depth_m.astype(np.float32))
     linear = renderer.linear(camera, scene.motion, t_s)
-    # a stream for each frame, so that the noise does not depend on who rendered the one before
-    return develop(linear, camera, np.random.default_rng([recipe.seed, index]))
+    # a stream for each frame and camera, so that the noise does not depend on who rendered the one before
+    stream = [recipe.seed, index, *suffix.encode()]
+    return develop(linear, camera, np.random.default_rng(stream))
 
 
-#: What a rendering process works on.
-_JOB: list[tuple[Scene, ShutterCamera, Path | None]] = []
+#: The scene of a rendering process.
+_SCENE: list[Scene] = []
 
 
-def _begin(recipe: SceneRecipe, camera: ShutterCamera, depth: Path | None) -> None:
-    _JOB.append((make_scene(recipe), camera, depth))
+def _begin(recipe: SceneRecipe) -> None:
+    _SCENE.append(make_scene(recipe))
 
 
-def _render_next(index: int) -> Image:
-    scene, camera, depth = _JOB[-1]
-    return _render(scene, camera, index, depth)
+def _render_job(job: _Job) -> Image:
+    return _render(_SCENE[-1], job)
 
 
-def _pictures(scene: Scene, camera: ShutterCamera, workers: int, depth: Path | None) -> Iterator[Image]:
-    if depth is not None:
-        depth.mkdir()
+def _processes(recipe: SceneRecipe, workers: int) -> AbstractContextManager[ProcessPoolExecutor | None]:
     if workers <= 1:
-        yield from (_render(scene, camera, i, depth) for i in range(len(scene.names)))
-        return
-    with ProcessPoolExecutor(
-        workers, get_context("spawn"), initializer=_begin, initargs=(scene.recipe, camera, depth)
-    ) as pool:
-        yield from pool.map(_render_next, range(len(scene.names)))
+        return nullcontext()
+    return ProcessPoolExecutor(workers, get_context("spawn"), initializer=_begin, initargs=(recipe,))
 
 
 def _write_pictures(scene: Scene, pictures: Iterator[Image], folder: Path, suffix: str) -> Iterator[None]:

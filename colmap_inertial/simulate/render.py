@@ -94,7 +94,7 @@ class _Atlas:
                 start.append(used)
                 shape.append(pyramid[-1].shape[:2])
                 used += pieces[-1].shape[0]
-        self.texels = np.concatenate(pieces).astype(np.float32)
+        self.texels = np.concatenate(pieces)
         self.start = np.array(start, dtype=np.int64)
         self.height, self.width = np.array(shape, dtype=np.int64).T.copy()
         lengths = [np.linalg.norm(q.edge_u_m) / q.texture.shape[1] for q in world.quads]
