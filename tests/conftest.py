@@ -7,6 +7,14 @@ import numpy as np
 import pytest
 
 from colmap_inertial.simulate import RecordingOptions, SimulatedRecording, simulate_recording
+from colmap_inertial.threads import one_blas_thread
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _one_blas_thread():
+    """As the package's own entry points have it; tests also call what lies below them."""
+    with one_blas_thread():
+        yield
 
 
 @pytest.fixture(scope="session")

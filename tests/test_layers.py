@@ -14,7 +14,7 @@ PACKAGE = Path(__file__).parents[1] / "colmap_inertial"
 
 #: Each room may import itself and the rooms before it.
 ORDER = [
-    ("errors", "geometry"),
+    ("errors", "geometry", "threads"),
     ("types",),
     ("io", "gravity", "gyro"),
     ("align", "smooth"),

@@ -18,6 +18,7 @@ from colmap_inertial.align._fit import OFFSET_UNKNOWN_FROM_S, Alignment, middle_
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.gyro import GyroPath
 from colmap_inertial.io.calibration import calibration_prior
+from colmap_inertial.threads import one_blas_thread
 from colmap_inertial.types import CameraImuCalibration, CameraTrajectory, ImuRecording, clock_shift_s
 
 #: Frames closer together than the first have turned by less than the noise of their poses; over the second, the noise
@@ -68,6 +69,7 @@ def align_camera_imu(
     return align_clocks(trajectory, imu, prior=prior, options=options).calibration
 
 
+@one_blas_thread()
 def align_clocks(
     trajectory: CameraTrajectory,
     imu: ImuRecording,

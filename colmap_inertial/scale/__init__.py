@@ -11,6 +11,7 @@ import numpy as np
 from colmap_inertial.align import AlignOptions, align_camera_imu
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.scale.verdict import verdict_of
+from colmap_inertial.threads import one_blas_thread
 from colmap_inertial.types import CameraImuCalibration, CameraTrajectory, ImuRecording, ScaleEstimate
 
 
@@ -87,12 +88,9 @@ def estimate_scale(
     The estimate with a verdict. Data that cannot give a scale give the verdict ``"refused"`` with reasons, not an
     exception.
     """
-    from threadpoolctl import threadpool_limits
-
     options = options or ScaleOptions()
     begin_s = time.perf_counter()
-    # Many small matrices: threads within one product cost more than they save (three times the time on two cores).
-    with threadpool_limits(limits=1, user_api="blas"):
+    with one_blas_thread():
         estimate = _estimate_or_refuse(trajectory, imu, calibration, options)
     return replace(estimate, runtime_s=time.perf_counter() - begin_s)
 

@@ -14,6 +14,7 @@ from colmap_inertial.smooth._chain import Chain
 from colmap_inertial.smooth._felt import Felt
 from colmap_inertial.smooth._models import most_likely, runs_of, white_acceleration, white_jerk, worst_oddities
 from colmap_inertial.smooth._positions import SmoothOptions
+from colmap_inertial.threads import one_blas_thread
 from colmap_inertial.types import (
     Array,
     CameraImuCalibration,
@@ -36,6 +37,7 @@ _GAIN_SIGMA = 0.01
 _FREE, _REACH_S, _ROUNDS, _MOST_ODD = 1e4, 0.5, 5, 0.1
 
 
+@one_blas_thread()
 def smooth_trajectory(
     trajectory: CameraTrajectory,
     imu: ImuRecording,

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.errors import NotObservableError, TargetNotFoundError
+from colmap_inertial.threads import one_blas_thread
 from colmap_inertial.types import Array
 from colmap_inertial.validate.fit import ScaleFit, fit_scale
 from colmap_inertial.validate.observations import Observations, Placement, triangulate
@@ -40,6 +41,7 @@ _WIDEST_LOG = float(np.log(1.3))
 _ODD_PART = 0.05
 
 
+@one_blas_thread()
 def validate_model(
     model: Path | pycolmap.Reconstruction,
     images: Path,
