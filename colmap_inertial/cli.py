@@ -80,7 +80,13 @@ class Scale:
     """Latitude of the recording, from which the strength of gravity follows."""
     options: Annotated[ScaleOptions, arg(name="")] = dataclasses.field(default_factory=ScaleOptions)
     config: Path | None = None
-    """TOML file with options; flags given here go before it."""
+    """TOML file as OUT/config.toml of a reconstruction: its [scale] table counts; flags given here go before it."""
+
+    def __post_init__(self) -> None:
+        if self.first_s is not None and not self.first_s > 0:
+            raise ValueError(f"first_s must be positive, not {self.first_s:g}")
+        if self.latitude_deg is not None and not -90 <= self.latitude_deg <= 90:
+            raise ValueError(f"latitude_deg must be from -90 to 90, not {self.latitude_deg:g}")
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
@@ -158,6 +164,10 @@ class Validate:
     """The model claims no unit: report the factor that makes it metric; always passes."""
     apply: Path | None = None
     """With --unscaled: a new folder for the model in metres, scaled by the control distances alone."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.tolerance < 100:
+            raise ValueError(f"tolerance must be from 0 to 100 per cent, not {self.tolerance:g}")
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
@@ -247,7 +257,9 @@ def _default_from_config(cls: type[Command], args: Sequence[str]) -> Command | N
     if path is None or cls in (Align, Validate, Simulate):
         return None
     fields = {f.name: f for f in dataclasses.fields(cls)}
-    options: Any = read_config(Path(path), ReconstructOptions if cls is Reconstruct else ScaleOptions)
+    options: Any = read_config(Path(path), ReconstructOptions)
+    if cls is Scale:
+        options = options.scale
     required = {
         name: tyro.MISSING for name, f in fields.items() if f.default is f.default_factory is dataclasses.MISSING
     }
@@ -261,11 +273,17 @@ def main(args: Sequence[str] | None = None) -> None:
         print(__version__)
         return
     try:
-        code = parse(args).run()
+        command = parse(args)
+    except (InertialError, ValueError) as error:  # options check their own values when they are built
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    try:
+        code = command.run()
     except InertialError as error:
         print(f"error: {error}", file=sys.stderr)
         code = error.exit_code
     except KeyboardInterrupt:
-        print("interrupted; started again with the same arguments, it continues", file=sys.stderr)
+        again = "; started again with the same arguments, it continues" if isinstance(command, Reconstruct) else ""
+        print(f"interrupted{again}", file=sys.stderr)
         code = 130
     sys.exit(code)

@@ -40,8 +40,12 @@ class TimingError(InertialError):
     """Time stamps are missing, out of order, or do not fit together."""
 
 
-class OutputExistsError(InertialError):
-    """The output folder already holds something that would be overwritten."""
+class OutputError(InertialError):
+    """An output cannot be written where it was asked for."""
+
+
+class OutputExistsError(OutputError):
+    """Something that would be overwritten is already there."""
 
 
 class AlreadyMetricError(InertialError):

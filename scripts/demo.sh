@@ -5,5 +5,9 @@ set -euo pipefail
 out=$(realpath -m "${1:-$(dirname "$0")/../out/desk}")
 cd "$(dirname "$0")/.."
 bash scripts/setup.sh
-.venv/bin/colmap-inertial reconstruct example_scenes/desk "$out"
+if [ -f "$out/result.json" ]; then
+  echo "demo: $out holds the result of an earlier run; remove it to run again"
+else
+  .venv/bin/colmap-inertial reconstruct example_scenes/desk "$out"
+fi
 .venv/bin/python scripts/compare_with_truth.py "$out" example_scenes/desk

@@ -191,3 +191,93 @@ def test_a_broken_configuration_exits_2(capsys, tmp_path):
     code, _, err = run(capsys, "reconstruct", "a", "b", "--config", config)
     assert code == 2
     assert "did you mean seed" in err
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (["--latitude-deg", "100"], "latitude_deg must be from -90 to 90"),
+        (["--gravity-m-s2", "-9.8"], "gravity_m_s2 must be from 9.7 to 9.9"),
+        (["--gravity-m-s2", "nan"], "gravity_m_s2 must be"),
+        (["--first-s", "-3"], "first_s must be positive"),
+        (["--max-offset-s", "-1"], "max_offset_s must be positive"),
+        (["--gravity-m-s2", "9.81", "--latitude-deg", "60"], "give one of them"),
+    ],
+)
+def test_impossible_values_are_refused_before_any_work(capsys, project, tmp_path, flags, words):
+    target = tmp_path / "scale.json"
+    files = ["--imu", project.imu, "--frame-times", project.frame_times, "--json", target]
+    code, _, err = run(capsys, "scale", project.model, *files, *flags)
+    assert code == 2
+    assert words in err
+    assert not target.exists()
+
+
+@pytest.mark.parametrize("flags", [["--seed", "-1"], ["--mapping.overlap", "0"], ["--mapping.max-num-features", "-5"]])
+def test_impossible_options_of_a_reconstruction_leave_no_folder(capsys, tmp_path, flags):
+    code, _, err = run(capsys, "reconstruct", tmp_path / "capture.toml", tmp_path / "out", *flags)
+    assert code == 2
+    assert "must be" in err
+    assert not (tmp_path / "out").exists()
+
+
+def test_outputs_never_replace_what_is_not_an_earlier_result(capsys, project, tmp_path):
+    imu, times = tmp_path / "imu", tmp_path / "frames.csv"
+    shutil.copytree(project.imu, imu)
+    shutil.copyfile(project.frame_times, times)
+    files = ["--imu", imu, "--frame-times", times]
+    thesis = tmp_path / "thesis.json"
+    thesis.write_text('{"years": 4}')
+    for target, words in (
+        (times, "is an input"),
+        (thesis, "is no earlier result"),
+        (imu / "gyroscope.txt", "is no earlier result"),
+        (imu, "is a folder"),
+    ):
+        before = None if target.is_dir() else target.read_bytes()
+        for command, flag in (("scale", "--json"), ("align", "--out")):
+            code, _, err = run(capsys, command, project.model, *files, flag, target)
+            assert (code, words in err) == (2, True), err
+        assert target.is_dir() or target.read_bytes() == before
+    earlier = tmp_path / "scale.json"
+    for _ in range(2):
+        assert run(capsys, "scale", project.model, *files, "--first-s", 20, "--json", earlier)[0] in (0, 3)
+
+
+def test_an_output_folder_that_cannot_be_made_is_an_error(capsys, tmp_path):
+    from test_pipeline import SCENE
+
+    (tmp_path / "file").write_text("")
+    code, _, err = run(capsys, "reconstruct", SCENE, tmp_path / "file" / "out")
+    assert code == 2
+    assert "cannot be made" in err
+
+
+def test_an_imu_shorter_than_the_recording_is_mentioned(capsys, project, tmp_path):
+    imu = tmp_path / "imu"
+    shutil.copytree(project.imu, imu)
+    for path in imu.iterdir():
+        rows = path.read_text().splitlines()
+        path.write_text("\n".join(rows[: len(rows) // 2]) + "\n")
+    target = tmp_path / "scale.json"
+    code, _, _ = run(
+        capsys, "scale", project.model, "--imu", imu, "--frame-times", project.frame_times, "--json", target
+    )
+    assert code in (0, 3)
+    assert "the IMU runs along with" in " ".join(json.loads(target.read_text())["reasons"])
+
+
+def test_validate_does_not_write_into_a_folder_of_pictures(capsys, project, tmp_path):
+    (tmp_path / "frames").mkdir()
+    (tmp_path / "frames" / "00000.jpg").write_bytes(b"precious")
+    code, _, err = run(
+        capsys, "validate", project.model, "--images", tmp_path / "frames", "--target", "checkerboard:8x6:0.04",
+        "--pictures", tmp_path / "frames",
+    )  # fmt: skip
+    assert (code, "name a new folder" in err) == (2, True)
+    assert (tmp_path / "frames" / "00000.jpg").read_bytes() == b"precious"
+    code, _, err = run(
+        capsys, "validate", project.model, "--images", tmp_path / "frames", "--target", "checkerboard:8x6:0.04",
+        "--tolerance", -3,
+    )  # fmt: skip
+    assert (code, "tolerance must be" in err) == (2, True)

@@ -1,6 +1,7 @@
 """The pipeline's bookkeeping: stages that appear whole or not at all, configuration, pairs, frames through stages."""
 
 import dataclasses
+import functools
 import itertools
 
 import cv2
@@ -13,10 +14,10 @@ from colmap_inertial.io.frames import read_frame_times
 from colmap_inertial.io.imu import read_imu
 from colmap_inertial.model import read_model
 from colmap_inertial.pipeline import MetricStage, ReconstructOptions, ReconstructResult, run_models, silent
-from colmap_inertial.pipeline.colmap import MappingOptions, image_pairs
+from colmap_inertial.pipeline.colmap import MappingOptions, check_names, image_pairs
 from colmap_inertial.pipeline.config import config_as_toml, read_config
 from colmap_inertial.pipeline.frames import read_frame_records, write_frames
-from colmap_inertial.pipeline.workspace import StageRunner, Workspace
+from colmap_inertial.pipeline.workspace import StageRunner, Workspace, canonical
 from colmap_inertial.scale import ScaleOptions
 from colmap_inertial.types import CameraModel, Frame, FrameTiming
 
@@ -242,3 +243,52 @@ def test_each_sub_model_gets_its_own_scale_and_verdict(project, tmp_path):
     refused = dataclasses.replace(outcome, models=results[2:])
     with pytest.raises(NotObservableError):
         refused.exit_code()
+
+
+def test_the_key_of_a_hook_knows_its_parameters_and_its_body():
+    def make(strength):
+        def stage(frames):
+            return (f for f in frames if strength > 0)
+
+        return stage
+
+    key = canonical
+    assert key(make(1)) == key(make(1))
+    assert key(make(1)) != key(make(2))
+    assert key(functools.partial(max, 1)) != key(functools.partial(max, 2))
+    assert key(lambda frames: frames) != key(lambda frames: reversed(frames))
+
+    class Opaque:
+        def __call__(self, frames):
+            return frames
+
+    opaque = Opaque()
+    assert key(opaque) != key(opaque), "what cannot be looked into must never count as unchanged"
+
+
+def test_two_runs_do_not_work_in_one_folder(tmp_path):
+    workspace = Workspace(tmp_path / "out")
+    workspace.open(tmp_path / "capture.toml")
+    with workspace.locked(), pytest.raises(OutputExistsError, match="another run is at work"), workspace.locked():
+        pass
+    with workspace.locked():
+        pass
+
+
+def test_a_stage_that_fails_for_a_reason_leaves_nothing_behind(tmp_path):
+    workspace = Workspace(tmp_path)
+    workspace.open(tmp_path / "capture.toml")
+
+    def fail(partial):
+        partial[0].mkdir()
+        raise InertialError("too few")
+
+    with pytest.raises(InertialError, match="too few"):
+        StageRunner(workspace).run("frames", {}, [tmp_path / "images"], fail)
+    assert [p.name for p in tmp_path.iterdir()] == [".stages"]
+
+
+def test_names_that_colmap_s_pair_lists_cannot_hold_are_refused():
+    check_names(["IMG_1.jpg", "ü#1.png"])
+    with pytest.raises(FormatError, match="without spaces"):
+        check_names(["IMG_1.jpg", "IMG 2.jpg"])

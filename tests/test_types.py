@@ -108,6 +108,14 @@ def test_the_covariance_of_gravity_becomes_a_tilt_covariance():
         np.var(np.cross(turned, [0, 0, -1]), axis=0), np.diag(nominal.cov)[1:4], rtol=0.05, atol=1e-12
     )
     assert nominal.cov[0, 0] == 1e-4
+    # and with the right sign: a scale that grows with gravity's x turns the frame this way
+    coupled = cov.copy()
+    coupled[0, 1] = coupled[1, 0] = 0.5 * 1e-2 * sigma
+    step = np.array([1e-5, 0, 0])
+    tilt = np.cross(quat_rotate(nominal.rotation_xyzw, (gravity + step) / np.linalg.norm(gravity + step)), [0, 0, -1.0])
+    expected = coupled[0, 1] * tilt / 1e-5
+    found = Similarity.from_scale(estimate(gravity, coupled)).cov[0, 1:4]
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-9)
     assert np.linalg.det(matrix_from_quat(nominal.rotation_xyzw)) == pytest.approx(1)
 
 

@@ -25,6 +25,7 @@ from colmap_inertial.pipeline.colmap import (
     KeypointStage,
     MappingOptions,
     Progress,
+    check_names,
     extract_features,
     image_pairs,
     map_images,
@@ -32,7 +33,7 @@ from colmap_inertial.pipeline.colmap import (
     write_gravity_priors,
 )
 from colmap_inertial.pipeline.config import config_as_toml
-from colmap_inertial.pipeline.frames import FrameRecord, FrameStage, read_frame_records, write_frames
+from colmap_inertial.pipeline.frames import FrameRecord, FrameStage, read_frame_records, require_frames, write_frames
 from colmap_inertial.pipeline.metric import MetricStage, ModelStage, write_trajectory
 from colmap_inertial.pipeline.workspace import StageRunner, Workspace, fingerprint, remove
 from colmap_inertial.scale import ScaleOptions
@@ -70,6 +71,10 @@ class ReconstructOptions:
     calibration: Path | None = None
     """A calibration file of this device (from `colmap-inertial align --out`), used as a prior."""
 
+    def __post_init__(self) -> None:
+        if not 0 <= self.seed < 2**31:
+            raise ValueError(f"seed must be from 0 to 2147483647, not {self.seed}")
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ModelResult:
@@ -103,7 +108,13 @@ class ReconstructResult:
             When every model's scale was refused.
         """
         if all(model.sparse_metric is None for model in self.models):
-            raise NotObservableError("scale", "; ".join(self.models[0].scale.reasons))
+            reasons = {model.index: "; ".join(model.scale.reasons) for model in self.models}
+            raise NotObservableError(
+                "scale",
+                next(iter(reasons.values()))
+                if len(reasons) == 1
+                else "; ".join(f"model {i}: {text}" for i, text in reasons.items()),
+            )
         checked = [model.validation for model in self.models if model.validation is not None]
         failures = [check.exit_code for check in checked if isinstance(check, InertialError)]
         outside = any(not check.within_tolerance for check in checked if isinstance(check, Validation))
@@ -179,11 +190,13 @@ def reconstruct(
     if loaded.target is not None:
         parse_target(loaded.target)  # a wrong specification is said before the work, not after it
     timing, frames = read_frames(loaded)
+    require_frames(len(timing.names), of=len(timing.names))
     gravity = _gravity_priors(loaded, imu, timing, options)
+    check_names(timing.names)
     stages = default_model_stages(loaded, imu, options) if model_stages is None else list(model_stages)
     workspace = Workspace(out)
     workspace.open(loaded.path)
-    with _logging_to(workspace.log):
+    with workspace.locked(), _logging_to(workspace.log):
         log.info("colmap-inertial %s: %s -> %s", __version__, capture, out)
         write_text(workspace.config, config_as_toml(options))
         runner = StageRunner(workspace)
@@ -193,9 +206,9 @@ def reconstruct(
         models = run_models(workspace, timing, imu, stages, runner, progress)
         if loaded.target is not None:
             models = tuple(_validated(workspace, model, parse_target(loaded.target), progress) for model in models)
-        remove(workspace.features)
         result = ReconstructResult(workspace=workspace, models=models, frames=records, seconds=runner.seconds)
         write_json(workspace.result, _result_as_json(result, loaded))
+        remove(workspace.features)
         log.info("finished")
     return result
 
@@ -224,7 +237,7 @@ def _logging_to(path: Path) -> Iterator[None]:
     """Send this package's log to a file, and keep COLMAP's chatter off the terminal."""
     import pycolmap
 
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     logger = logging.getLogger("colmap_inertial")
     handler = logging.FileHandler(path, encoding="utf-8")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
@@ -260,7 +273,7 @@ def _run_frames(
     inputs = [] if source is None else [source / name for name in timing.names]
     if isinstance(capture.frames, Video):
         inputs = [capture.frames.file]
-    depends = {"capture": capture, "inputs": [fingerprint(path) for path in inputs], "stages": stages}
+    depends = {"capture": capture, "timing": timing, "inputs": [fingerprint(path) for path in inputs], "stages": stages}
     runner.run("frames", depends, [workspace.images, workspace.frames], work)
 
 
@@ -371,7 +384,8 @@ def _validated(workspace: Workspace, model: ModelResult, target: Target, progres
         write_pictures(check, workspace.images, workspace.validation / str(model.index))
     except (TargetNotFoundError, NotObservableError) as error:
         check = error
-    log.info("model %d: %s", model.index, check if isinstance(check, InertialError) else check.scale_error_pct)
+    found = check if isinstance(check, InertialError) else f"scale error {check.scale_error_pct:+.3f} %"
+    log.info("model %d: %s against %s", model.index, found, target.spec)
     return dataclasses.replace(model, validation=check)
 
 

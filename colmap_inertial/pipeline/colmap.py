@@ -46,6 +46,16 @@ class MappingOptions:
     refine_intrinsics: bool | None = None
     """Let bundle adjustment change the camera. Default: only where the capture declares none."""
 
+    def __post_init__(self) -> None:
+        if self.overlap < 1:
+            raise ValueError(f"mapping.overlap must be at least 1, not {self.overlap}")
+        if self.max_image_size is not None and self.max_image_size < 64:
+            raise ValueError(f"mapping.max_image_size must be at least 64, not {self.max_image_size}")
+        if self.max_num_features < 50:
+            raise ValueError(f"mapping.max_num_features must be at least 50, not {self.max_num_features}")
+        if not -1 <= self.first_octave <= 2:
+            raise ValueError(f"mapping.first_octave must be from -1 to 2, not {self.first_octave}")
+
 
 class Progress(Protocol):
     """Receives progress: how many of ``total`` steps of ``stage`` are done. ``total`` is 0 where unknown."""
@@ -59,6 +69,15 @@ class KeypointStage(Protocol):
     def __call__(self, name: str, keypoints_px: Array, /) -> Array:
         """Return the (N, 2) coordinates that COLMAP shall use, COLMAP's pixel origin."""
         ...
+
+
+def check_names(names: Sequence[str]) -> None:
+    """Raise ``FormatError`` for an image name that COLMAP's lists of pairs cannot hold."""
+    for name in names:
+        if len(name.split()) != 1 or name.startswith("#"):
+            raise FormatError(
+                Path(name), "COLMAP's lists of pairs cannot hold such a file name; rename it without spaces"
+            )
 
 
 def image_pairs(names: Sequence[str], options: MappingOptions) -> list[tuple[str, str]]:
@@ -174,9 +193,6 @@ def match_features(
     """Match and verify the pairs in a copy of the features' database."""
     import pycolmap
 
-    for name in itertools.chain.from_iterable(pairs):
-        if len(name.split()) != 1 or name.startswith("#"):
-            raise FormatError(Path(name), "COLMAP's lists of pairs cannot hold such a name; rename it without spaces")
     shutil.copyfile(features, database)
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False

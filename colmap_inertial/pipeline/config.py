@@ -30,7 +30,7 @@ def _plain(options: Any) -> dict[str, Any]:
         if dataclasses.is_dataclass(value):
             plain[f.name] = _plain(value)
         elif value is not None:
-            plain[f.name] = str(value) if isinstance(value, Path) else value
+            plain[f.name] = str(value.resolve()) if isinstance(value, Path) else value
     return plain
 
 

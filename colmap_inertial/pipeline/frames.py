@@ -118,10 +118,15 @@ def write_frames(
             name=frame.name, action="passed" if passed else "changed", camera=frame.camera
         )
         progress("frames", len(written), len(timing.names))
-    if len(written) < 3:
-        raise InertialError(f"{len(written)} frames are left of {len(timing.names)}; a model needs at least three")
+    require_frames(len(written), of=len(timing.names))
     every = [written.get(name) or FrameRecord(name=name, action="dropped", camera=None) for name in timing.names]
     write_json(records, {"frames": [asdict(record) for record in every]})
+
+
+def require_frames(count: int, *, of: int) -> None:
+    """Raise ``InertialError`` where there are too few frames for a model."""
+    if count < 3:
+        raise InertialError(f"{count} frames are left of {of}; a model needs at least three")
 
 
 def _same_memory(a: NDArray[Any], b: NDArray[Any]) -> bool:

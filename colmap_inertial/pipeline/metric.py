@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -50,7 +51,7 @@ class MetricStage:
         """Estimate and apply the scale."""
         trajectory, notes = trajectory_from_model(read_model(model.folder), model.timing)
         estimate = estimate_scale(trajectory, self.imu, calibration=self.calibration, options=self.options)
-        estimate = dataclasses.replace(estimate, reasons=(*estimate.reasons, *notes))
+        estimate = dataclasses.replace(estimate, reasons=(*estimate.reasons, *self.imu.repairs, *notes))
         if estimate.verdict == "refused":
             return dataclasses.replace(model, scale=estimate)
         similarity = Similarity.from_scale(
@@ -87,6 +88,7 @@ def write_trajectory(path: Path, model: Model, imu: ImuRecording) -> None:
         accel_bias_m_s2=estimate.accel_bias_m_s2,
     )
     write_tum(path, smoothed)
-    epoch_s = smoothed.epoch_ns * 1e-9
-    with open(path.with_name(f"{path.stem}_cov.npz"), "wb") as file:
-        np.savez_compressed(file, t_s=smoothed.t_s + epoch_s, cov=smoothed.cov)
+    target = path.with_name(f"{path.stem}_cov.npz")
+    partial = target.with_name(f"{path.stem}_cov.partial.npz")
+    np.savez_compressed(partial, t_s=smoothed.t_s + smoothed.epoch_ns * 1e-9, cov=smoothed.cov)
+    os.replace(partial, target)

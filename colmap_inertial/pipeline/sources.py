@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from colmap_inertial.align import AlignOptions, align_camera_imu
-from colmap_inertial.errors import FormatError, InertialError, OutputExistsError
+from colmap_inertial.errors import FormatError, InertialError, OutputError, OutputExistsError
 from colmap_inertial.io.calibration import (
     SHARED_CLOCK_OFFSET_S,
     for_another_recording,
@@ -18,12 +18,12 @@ from colmap_inertial.io.calibration import (
     write_calibration,
 )
 from colmap_inertial.io.capture import load_capture
-from colmap_inertial.io.files import write_json
+from colmap_inertial.io.files import read_json, write_json
 from colmap_inertial.io.frames import read_frame_times
 from colmap_inertial.io.imu import is_capture, read_imu
 from colmap_inertial.io.imu_text import is_inertial_scale
 from colmap_inertial.io.trajectories import read_inertial_scale, read_tum
-from colmap_inertial.model import apply_similarity, find_models, read_model, trajectory_from_model
+from colmap_inertial.model import apply_similarity, find_models, is_metric, read_model, trajectory_from_model
 from colmap_inertial.scale import (
     ScaleOptions,
     estimate_scale,
@@ -58,12 +58,13 @@ class ScaleSource:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Recording:
-    """A trajectory with the IMU recording that belongs to it."""
+    """A trajectory with its IMU recording; ``start_s`` is when the camera began, where frame times tell."""
 
     trajectory: CameraTrajectory
     imu: ImuRecording
     calibration: CameraImuCalibration | None
     shared_clock: bool
+    start_s: float | None = None
     notes: Sequence[str] = ()
 
 
@@ -78,32 +79,34 @@ def load_source(source: ScaleSource) -> Recording:
     path = source.source
     if not path.exists():
         raise FormatError(path, "no such file or folder")
-    if path.is_dir() and is_inertial_scale(path):
-        trajectory, imu = read_inertial_scale(path)
-        if source.imu is not None:
-            imu = read_imu(source.imu)
-        return Recording(
-            trajectory=trajectory, imu=imu, calibration=_calibration(source, shared_clock=False), shared_clock=False
-        )
-    if source.imu is None:
+    inertial_scale = path.is_dir() and is_inertial_scale(path)
+    if source.imu is None and not inertial_scale:
         raise FormatError(path, "needs the recording that ran along: give --imu PATH")
-    imu = read_imu(source.imu)
     notes: Sequence[str] = ()
-    if path.is_dir():
-        times = source.frame_times or (source.imu if is_capture(source.imu) else None)
-        if times is None:
+    start_s = None
+    if inertial_scale:
+        trajectory, imu = read_inertial_scale(path)
+    elif path.is_dir():
+        times = source.frame_times or source.imu
+        if times is None or (source.frame_times is None and not is_capture(times)):
             raise FormatError(path, "a COLMAP model has no frame times: give --frame-times, a CSV with name,t_s")
-        trajectory, notes = trajectory_from_model(read_model(_only_model(path)), read_frame_times(times))
+        timing = read_frame_times(times)
+        folder = _only_model(path)
+        trajectory, notes = trajectory_from_model(read_model(folder), timing)
+        start_s = float(timing.pose_t_s()[0])
+        if is_metric(folder):
+            notes = (*notes, "this model is metric already: a scale of 1 says that it is right")
     else:
         trajectory = read_tum(path)
-    captures = [load_capture(p) for p in (source.imu, source.frame_times) if p is not None and is_capture(p)]
+    if source.imu is not None:
+        imu = read_imu(source.imu)
+    captures = [load_capture(p) for p in (source.imu, source.frame_times, path) if p is not None and is_capture(p)]
     shared = any(capture.shared_clock for capture in captures)
+    calibration = captures[0].calibration if captures else None
+    if source.calibration is not None:
+        calibration = for_another_recording(read_calibration(source.calibration), shared_clock=shared)
     return Recording(
-        trajectory=trajectory,
-        imu=imu,
-        calibration=_calibration(source, shared_clock=shared),
-        shared_clock=shared,
-        notes=notes,
+        trajectory=trajectory, imu=imu, calibration=calibration, shared_clock=shared, start_s=start_s, notes=notes
     )
 
 
@@ -116,12 +119,28 @@ def _only_model(path: Path) -> Path:
     return next(iter(models.values()))
 
 
-def _calibration(source: ScaleSource, *, shared_clock: bool) -> CameraImuCalibration | None:
-    if source.calibration is not None:
-        return for_another_recording(read_calibration(source.calibration), shared_clock=shared_clock)
-    if source.imu is not None and is_capture(source.imu):
-        return load_capture(source.imu).calibration
-    return None
+def _check_output(path: Path, inputs: Sequence[Path | None]) -> None:
+    """Refuse, before any work, an output that would replace anything but an earlier result of ours.
+
+    Raises
+    ------
+    OutputError
+    """
+    if not path.parent.is_dir():
+        raise OutputError(f"{path.parent} is no folder; create it first")
+    if path.is_dir():
+        raise OutputError(f"{path} is a folder; name a file in it")
+    target = path.resolve()
+    for known in inputs:
+        if known is not None and target == known.resolve():
+            raise OutputExistsError(f"{path} is an input; choose another name for the result")
+    if path.exists():
+        try:
+            ours = {"metres_per_unit", "cam_from_imu_xyzw"} & set(read_json(path))
+        except FormatError:
+            ours = set()
+        if not ours:
+            raise OutputExistsError(f"{path} exists and is no earlier result; choose another name or remove it")
 
 
 def align_source(source: ScaleSource, out: Path) -> CameraImuCalibration:
@@ -132,8 +151,7 @@ def align_source(source: ScaleSource, out: Path) -> CameraImuCalibration:
     NotObservableError
         Where no offset between the clocks is better than the rest, or the camera hardly turned.
     """
-    if not out.parent.is_dir():
-        raise OutputExistsError(f"{out.parent} is no folder; create it first")
+    _check_output(out, [source.source, source.imu, source.frame_times])
     recording = load_source(source)
     options = AlignOptions(max_offset_s=SHARED_CLOCK_OFFSET_S if recording.shared_clock else None)
     found = align_camera_imu(recording.trajectory, recording.imu, prior=recording.calibration, options=options)
@@ -164,12 +182,15 @@ def scale_source(
     latitude_deg
         Sets ``options.gravity_m_s2``.
     """
-    if not json.parent.is_dir():
-        raise OutputExistsError(f"{json.parent} is no folder; create it first")
-    recording = load_source(source)
-    trajectory = recording.trajectory if first_s is None else first_seconds(recording.trajectory, first_s)
+    _check_output(json, [source.source, source.imu, source.frame_times, source.calibration])
     if latitude_deg is not None:
+        if options.gravity_m_s2 != ScaleOptions().gravity_m_s2:
+            raise InertialError("--gravity-m-s2 and --latitude-deg both set the strength of gravity; give one of them")
         options = dataclasses.replace(options, gravity_m_s2=gravity_at_latitude_m_s2(latitude_deg))
+    recording = load_source(source)
+    trajectory = recording.trajectory
+    if first_s is not None:
+        trajectory = first_seconds(trajectory, first_s, start_s=recording.start_s)
     if recording.shared_clock and options.max_offset_s is None:
         options = dataclasses.replace(options, max_offset_s=SHARED_CLOCK_OFFSET_S)
     estimate = estimate_scale(trajectory, recording.imu, calibration=recording.calibration, options=options)
@@ -208,9 +229,12 @@ def validate_source(
         When ``apply`` is asked for and cannot be done; see also :func:`validate_model`.
     """
     parsed = parse_target(target)
-    for path in (json, apply):
-        if path is not None and not path.parent.is_dir():
-            raise OutputExistsError(f"{path.parent} is no folder; create it first")
+    if json is not None:
+        _check_output(json, [model])
+    if pictures is not None and pictures.exists() and not (pictures.is_dir() and not any(pictures.iterdir())):
+        raise OutputExistsError(f"{pictures} exists; name a new folder for the pictures")
+    if apply is not None and apply.exists():
+        raise OutputExistsError(f"{apply} exists; name a new folder for the metric model")
     if apply is not None and not options.unscaled:
         raise InertialError("--apply scales a model that claims no unit: add --unscaled")
     folder = _only_model(model)

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import enum
+import fcntl
+import functools
 import hashlib
 import json
 import logging
 import os
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+import types
+import uuid
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from colmap_inertial import __version__
-from colmap_inertial.errors import FormatError, OutputExistsError
+from colmap_inertial.errors import FormatError, InertialError, OutputError, OutputExistsError
 from colmap_inertial.io.files import read_json, write_json
 
 log = logging.getLogger(__name__)
@@ -111,12 +116,33 @@ class Workspace:
                 )
         elif self.root.is_dir() and any(p.name != self.stamps.name for p in self.root.iterdir()):
             raise OutputExistsError(f"{self.root} is not empty; choose another output folder")
-        self.stamps.mkdir(parents=True, exist_ok=True)
+        try:
+            self.stamps.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"{self.root} cannot be made: {error.strerror or error}") from error
         write_json(owner, identity)
+
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep other runs out of the folder.
+
+        Raises
+        ------
+        OutputExistsError
+            While another run is at work in it.
+        """
+        with open(self.stamps / "lock", "w") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise OutputExistsError(
+                    f"another run is at work in {self.root}; wait for it or choose another folder"
+                ) from None
+            yield
 
 
 def canonical(value: object) -> object:
-    """A value in JSON types, for hashing: dataclasses by field, paths as text, callables by name."""
+    """A value in JSON types, for hashing: dataclasses by field, paths as text, functions by name, body and closure."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = {f.name: canonical(getattr(value, f.name)) for f in dataclasses.fields(value)}
         return {"type": f"{type(value).__module__}.{type(value).__qualname__}", **fields}
@@ -136,10 +162,22 @@ def canonical(value: object) -> object:
         return str(value)
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
-    if callable(value):
-        named = value if hasattr(value, "__qualname__") else type(value)
-        return f"{named.__module__}.{named.__qualname__}"
-    raise TypeError(f"cannot hash a {type(value).__name__}")
+    if isinstance(value, functools.partial):
+        return ["partial", canonical(value.func), canonical(value.args), canonical(value.keywords)]
+    if isinstance(value, types.FunctionType):
+        cells = [canonical(cell.cell_contents) for cell in value.__closure__ or ()]
+        defaults = canonical([value.__defaults__, value.__kwdefaults__])
+        return [f"{value.__module__}.{value.__qualname__}", _code(value.__code__), cells, defaults]
+    if isinstance(value, types.MethodType):
+        return [canonical(value.__func__), canonical(value.__self__)]
+    # Anything else may hide what decides its result: a key of its own, so that nothing made with it is ever kept.
+    return f"{type(value).__module__}.{type(value).__qualname__} {uuid.uuid4()}"
+
+
+def _code(code: types.CodeType) -> list[object]:
+    """A function's body, without names of files and numbers of lines."""
+    constants = [_code(c) if isinstance(c, types.CodeType) else repr(c) for c in code.co_consts]
+    return [code.co_code.hex(), list(code.co_names), constants]
 
 
 def fingerprint(path: Path) -> list[object]:
@@ -191,7 +229,12 @@ class StageRunner:
             remove(path)
         log.info("%s: started", name)
         start = time.perf_counter()
-        work(partial)
+        try:
+            work(partial)
+        except InertialError:
+            for path in partial:
+                remove(path)
+            raise
         for source, target in zip(partial, outputs, strict=True):
             os.replace(source, target)
         self.seconds[name] = time.perf_counter() - start

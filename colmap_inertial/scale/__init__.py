@@ -12,7 +12,7 @@ from colmap_inertial.align import AlignOptions, align_camera_imu
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.scale.verdict import verdict_of
 from colmap_inertial.threads import one_blas_thread
-from colmap_inertial.types import CameraImuCalibration, CameraTrajectory, ImuRecording, ScaleEstimate
+from colmap_inertial.types import CameraImuCalibration, CameraTrajectory, ImuRecording, ScaleEstimate, clock_shift_s
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,6 +28,14 @@ class ScaleOptions:
     max_offset_s: float | None = None
     """Largest offset between the clocks of camera and IMU; 1 for a shared clock. Without it, all are searched."""
 
+    def __post_init__(self) -> None:
+        if not 9.7 <= self.gravity_m_s2 <= 9.9:
+            raise ValueError(
+                f"gravity_m_s2 must be from 9.7 to 9.9 (it is 9.76 to 9.84 on Earth), not {self.gravity_m_s2:g}"
+            )
+        if self.max_offset_s is not None and not self.max_offset_s > 0:
+            raise ValueError(f"max_offset_s must be positive, not {self.max_offset_s:g}")
+
 
 def gravity_at_latitude_m_s2(latitude_deg: float) -> float:
     """Normal gravity on the WGS 84 ellipsoid at sea level: Somigliana's formula (NIMA TR8350.2, section 4)."""
@@ -38,9 +46,16 @@ def gravity_at_latitude_m_s2(latitude_deg: float) -> float:
     return float(numerator / np.sqrt(1 - 0.00669437999014 * sine_squared))
 
 
-def first_seconds(trajectory: CameraTrajectory, seconds: float) -> CameraTrajectory:
-    """The frames of the first ``seconds`` of a trajectory; nothing of later ones remains."""
-    return trajectory.select(trajectory.t_s <= trajectory.t_s[0] + seconds)
+def first_seconds(trajectory: CameraTrajectory, seconds: float, *, start_s: float | None = None) -> CameraTrajectory:
+    """The frames of the first ``seconds`` of a recording; nothing of later ones remains.
+
+    Parameters
+    ----------
+    start_s
+        When the recording began, on the trajectory's clock; without it, at the first pose.
+    """
+    begin_s = trajectory.t_s[0] if start_s is None else start_s
+    return trajectory.select(trajectory.t_s <= begin_s + seconds)
 
 
 def check_units(imu: ImuRecording) -> list[str]:
@@ -105,9 +120,24 @@ def _estimate_or_refuse(
         aligned = align_camera_imu(
             trajectory, imu, prior=calibration, options=AlignOptions(max_offset_s=options.max_offset_s)
         )
-        return _estimate(trajectory, imu, aligned, options)
+        estimate = _estimate(trajectory, imu, aligned, options)
+        return replace(estimate, reasons=(*estimate.reasons, *_uncovered(trajectory, imu, aligned)))
     except NotObservableError as error:
         return _refused(options.method, f"{error.quantity}: {error.hint}")
+
+
+def _uncovered(trajectory: CameraTrajectory, imu: ImuRecording, calibration: CameraImuCalibration) -> tuple[str, ...]:
+    """A remark where the IMU does not run along with all frames."""
+    shift_s = clock_shift_s(trajectory, imu)
+    gyro_s = imu.gyro_t_s[[0, -1]] + calibration.gyro_time_offset_s + shift_s
+    accel_s = imu.accel_t_s[[0, -1]] + calibration.accel_time_offset_s + shift_s
+    begin_s, end_s = max(gyro_s[0], accel_s[0]), min(gyro_s[1], accel_s[1])
+    # A frame or so at either end is nothing to speak of.
+    slack_s = 2 * float(np.median(np.diff(trajectory.t_s)))
+    if begin_s <= trajectory.t_s[0] + slack_s and end_s >= trajectory.t_s[-1] - slack_s:
+        return ()
+    covered = int(np.sum((trajectory.t_s >= begin_s) & (trajectory.t_s <= end_s)))
+    return (f"the IMU runs along with {covered} of {len(trajectory)} frames only; the scale rests on those",)
 
 
 def _estimate(

@@ -258,10 +258,10 @@ class Similarity:
         rotation = rotation_between(gravity, down)
         cov = np.zeros((7, 7))
         if estimate.cov is not None:
-            # A change of gravity dg turns the target frame by R (g x dg) / |g|^2; heading is free and carries none.
+            # A change of gravity dg turns the target frame by -R (g x dg) / |g|^2; heading is free and carries none.
             jacobian = np.zeros((4, 4))
             jacobian[0, 0] = 1.0
-            jacobian[1:, 1:] = matrix_from_quat(rotation) @ skew(gravity) / (gravity @ gravity)
+            jacobian[1:, 1:] = -matrix_from_quat(rotation) @ skew(gravity) / (gravity @ gravity)
             cov[:4, :4] = jacobian @ estimate.cov[:4, :4] @ jacobian.T
         return cls(
             scale=estimate.metres_per_unit,
