@@ -138,6 +138,36 @@ def test_the_result_file_says_everything(finished):
         assert (out / "images" / name["name"]).read_bytes() == original.read_bytes()
 
 
+def test_a_model_without_a_unit_is_scaled_by_the_target(finished, truth, tmp_path, capsys):
+    _, out, _ = finished
+    command = ["validate", str(out / "sparse" / "0"), "--images", str(out / "images")]
+    target, metric = tmp_path / "v.json", tmp_path / "metric"
+    pictures = tmp_path / "pictures"
+    flags = ["--unscaled", "--apply", str(metric), "--json", str(target), "--pictures", str(pictures)]
+    with pytest.raises(SystemExit) as stopped:
+        main([*command, "--target", "checkerboard:8x6:0.04", *flags])
+    assert stopped.value.code == 0
+    found = json.loads(target.read_text())
+    assert found["scale_error_pct"] is None
+    scale = true_metres_per_unit(*centres(out / "sparse" / "0"), truth.trajectory)
+    assert found["metres_per_unit"] == pytest.approx(scale, rel=0.003)
+    assert true_metres_per_unit(*centres(metric), truth.trajectory) == pytest.approx(1, rel=0.003)
+    assert found["control"]["corners"] + found["check"]["corners"] == found["corners_used"]
+    assert abs(found["check_error_pct"]) < 0.3
+    assert (pictures / "distances.svg").is_file()
+
+    # the metric copy passes, another square size does not, another target is not there
+    for source, spec, code in ((metric, "8x6:0.04", 0), (metric, "8x6:0.05", 1), (metric, "5x4:0.04", 5)):
+        command[1] = str(source)
+        with pytest.raises(SystemExit) as stopped:
+            main([*command, "--target", f"checkerboard:{spec}"])
+        assert stopped.value.code == code
+    with pytest.raises(SystemExit) as stopped:
+        main([*command, "--target", "checkerboard:8x6:0.04", "--apply", str(tmp_path / "again")])
+    assert stopped.value.code == 2
+    assert "--unscaled" in capsys.readouterr().err
+
+
 def test_a_finished_result_is_not_overwritten(finished, capsys):
     capture, out, _ = finished
     before = contents(out)

@@ -187,7 +187,8 @@ def _search(
         hint = (
             "at no offset does the gyroscope fit the camera's rotations clearly better than at the rest "
             f"(it explains {100 * max(explained, 0):.0f} % of them): check that this IMU recording belongs to these "
-            "images, or record longer with rotation about all three axes"
+            "images and that the gyroscope's columns, axes and unit are right, or record longer with rotation about "
+            "all three axes"
         )
     return NotObservableError("time offset", hint)
 

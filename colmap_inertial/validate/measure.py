@@ -41,6 +41,10 @@ _WIDEST_LOG = float(np.log(1.3))
 _ODD_PART = 0.05
 
 
+#: Smallest part of the images with sightings that must agree. Two boards in view leave half of them.
+_SMALLEST_AGREEMENT = 0.2
+
+
 @one_blas_thread()
 def validate_model(
     model: Path | pycolmap.Reconstruction,
@@ -97,7 +101,25 @@ def validate_model(
     if outside and target.kind == "checkerboard":  # perhaps the detector took another board there
         search.look_closer(outside)
         placed = search.place()
+    _require_agreement(search, placed)
     return _measure(search, placed, missing)
+
+
+def _require_agreement(search: Search, placed: dict[int, PartPlacement]) -> None:
+    """Refuse a place on which a few of many sightings agree: chance does that, a wrong board size above all.
+
+    Raises
+    ------
+    TargetNotFoundError
+    """
+    used = {search.parts[p][i].view for p, part in placed.items() for i in part.chosen}
+    seen = {s.view for s in search.sightings}
+    if len(used) < _SMALLEST_AGREEMENT * len(seen):
+        raise TargetNotFoundError(
+            f"something like {search.target.spec} was found in {len(seen)} images, but only {len(used)} of them agree "
+            "on where it is in the model: check the number of columns and rows (inner corners of a checkerboard), and "
+            "that the target did not move"
+        )
 
 
 def _reject_odd_parts(search: Search, placed: dict[int, PartPlacement]) -> tuple[dict[int, PartPlacement], list[str]]:
