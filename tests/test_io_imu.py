@@ -267,6 +267,35 @@ def test_a_new_family_joins_with_one_function(tmp_path: Path, monkeypatch: pytes
         register_imu_format(mine)
 
 
+@pytest.mark.parametrize(
+    ("accel_unit", "gyro_factor", "accel_factor", "guilty", "said"),
+    [
+        ("g", 1.0, 1.0, "a.txt", 'unit = "m/s2" under [imu.accel]'),
+        ("m/s2", 1.0, 1.0 / 9.80665, "a.txt", 'unit = "g" under [imu.accel]'),
+        ("m/s2", 1.0, np.array([1.0, 0.0, 1.0]), "a.txt", "y axis never changes"),
+        ("m/s2", np.array([1.0, 0.0, 1.0]), 1.0, "g.txt", "y axis never changes"),
+        ("m/s2", 2000.0, 1.0, "g.txt", 'unit = "deg/s" under [imu.gyro]'),
+    ],
+)
+def test_a_fault_of_one_sensor_names_its_own_file(
+    tmp_path: Path, accel_unit: str, gyro_factor, accel_factor, guilty: str, said: str
+) -> None:
+    t_ns, gyro, accel = handheld()
+    text = ""
+    for sensor, name, values, unit in (
+        ("gyro", "g.txt", gyro * gyro_factor, "rad/s"),
+        ("accel", "a.txt", accel * accel_factor, accel_unit),
+    ):
+        lines = [f"{t} {x!r} {y!r} {z!r}\n" for t, (x, y, z) in zip(t_ns.tolist(), values.tolist(), strict=True)]
+        (tmp_path / name).write_text("".join(lines))
+        text += f'[imu.{sensor}]\nfile = "{name}"\ntime = 1\ntime_unit = "ns"\ncolumns = [2, 3, 4]\nunit = "{unit}"\n'
+    (tmp_path / "capture.toml").write_text(text)
+    with pytest.raises(FormatError) as caught:
+        read_imu(tmp_path)
+    assert caught.value.path == tmp_path / guilty
+    assert said in str(caught.value)
+
+
 def test_ten_minutes_at_200_hz_are_read_in_well_under_a_second(tmp_path: Path) -> None:
     path = write_csv(tmp_path / "long.csv", rows(*handheld(120_000)))
     read_imu(path)

@@ -143,6 +143,53 @@ def test_a_mirrored_accelerometer_is_noticed_and_named(recordings: dict[str, Imu
     assert noticed == {0: 8, 1: 2, 2: 8}
 
 
+MIRRORED = [matrix for matrix in SIGNED_PERMUTATIONS if np.linalg.det(matrix) < 0]
+
+
+@pytest.mark.parametrize("name", HANDHELD)
+def test_the_advice_for_an_accelerometer_of_any_mirrored_axes_restores_it(
+    recordings: dict[str, ImuRecording], name: str
+) -> None:
+    imu = recordings[name]
+    restored = 0
+    for wrong in MIRRORED:
+        altered = replace(imu, accel_m_s2=imu.accel_m_s2 @ wrong.T)
+        try:
+            check_plausible(altered, Path("x"))
+        except FormatError as error:
+            axes = settings(str(error))["accel"]
+            corrected = replace(altered, accel_m_s2=axes.apply(altered.accel_m_s2))
+            np.testing.assert_allclose(corrected.accel_m_s2, imu.accel_m_s2)
+            check_plausible(corrected, Path("x"), accel_axes=axes)
+            restored += 1
+    assert restored >= 22  # of 24; see the test of the gyroscope's axes
+
+
+@pytest.mark.parametrize(("first", "second"), [(0, 1), (0, 2), (1, 2)])
+def test_exchanged_accelerometer_columns_are_named_and_corrected_through_a_capture(
+    recordings: dict[str, ImuRecording], shared_data: Path, tmp_path: Path, first: int, second: int
+) -> None:
+    folder = shared_data / "inertial_scale/D3"
+    columns = [2, 3, 4]
+    columns[first], columns[second] = columns[second], columns[first]
+    text = "".join(
+        f'[imu.{sensor}]\nfile = "{folder / name}"\ntime = 1\ntime_unit = "ns"\ncolumns = {chosen}\nunit = "{unit}"\n'
+        for sensor, name, chosen, unit in (
+            ("gyro", "gyroscope.txt", [2, 3, 4], "rad/s"),
+            ("accel", "accelerometer.txt", columns, "m/s2"),
+        )
+    )
+    capture = tmp_path / "capture.toml"
+    capture.write_text(text)
+    said = f"accelerometer's {'xyz'[first]} and {'xyz'[second]} columns that are exchanged"
+    with pytest.raises(FormatError, match=said) as caught:
+        read_imu(capture)
+    assert {"gyro", "accel"} == set(settings(str(caught.value)))
+    axes = settings(str(caught.value))["accel"]
+    capture.write_text(text + f'axes = "{axes}"\nmirrored = true\n')
+    np.testing.assert_array_equal(read_imu(capture).accel_m_s2, recordings["inertial_scale/D3"].accel_m_s2)
+
+
 def test_axes_to_set_replace_those_that_were_set(recordings: dict[str, ImuRecording]) -> None:
     imu = recordings["inertial_scale/D1"]
     wrong = Axes.parse("-z,y,x")
@@ -150,6 +197,12 @@ def test_axes_to_set_replace_those_that_were_set(recordings: dict[str, ImuRecord
     with pytest.raises(FormatError) as caught:
         check_plausible(altered, Path("x"), gyro_axes=wrong)
     assert str(settings(str(caught.value))["gyro"]) == "x,y,z"
+    wrong = Axes.parse("y,z,-x")
+    assert wrong.is_mirrored
+    altered = replace(imu, accel_m_s2=wrong.apply(imu.accel_m_s2))
+    with pytest.raises(FormatError) as caught:
+        check_plausible(altered, Path("x"), accel_axes=wrong)
+    assert str(settings(str(caught.value))["accel"]) == "x,y,z"
 
 
 @pytest.mark.parametrize("name", HANDHELD)

@@ -77,10 +77,10 @@ def read_capture_imu(capture: Capture) -> ImuRecording:
     if source is None:
         raise FormatError(capture.path, "describes no inertial recording; add [imu] with path = ...")
     if isinstance(source, ImuPath):
-        path = source.path
+        path = accel_path = source.path
         imu = _read_plain(path, source.format, source.units)
     else:
-        path = source.gyro.file
+        path, accel_path = source.gyro.file, source.accel.file
         imu = imu_text.read_tables(source.gyro, source.accel)
     imu = replace(
         imu,
@@ -88,7 +88,7 @@ def read_capture_imu(capture: Capture) -> ImuRecording:
         accel_m_s2=imu.accel_m_s2 if source.accel_axes is None else source.accel_axes.apply(imu.accel_m_s2),
         noise=imu.noise if source.noise is None else source.noise,
     )
-    check_plausible(imu, path, gyro_axes=source.gyro_axes, accel_axes=source.accel_axes)
+    check_plausible(imu, path, accel_path=accel_path, gyro_axes=source.gyro_axes, accel_axes=source.accel_axes)
     return imu
 
 

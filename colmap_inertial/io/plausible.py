@@ -23,7 +23,12 @@ LARGEST_MEDIAN_RATE_RAD_S = 7.0
 
 
 def check_plausible(
-    imu: ImuRecording, path: Path, *, gyro_axes: Axes | None = None, accel_axes: Axes | None = None
+    imu: ImuRecording,
+    path: Path,
+    *,
+    accel_path: Path | None = None,
+    gyro_axes: Axes | None = None,
+    accel_axes: Axes | None = None,
 ) -> None:
     """Refuse a recording whose numbers cannot be rad/s and m/s2 of a working IMU.
 
@@ -33,6 +38,8 @@ def check_plausible(
         The recording as read.
     path
         Where it came from, for the message.
+    accel_path
+        Where the accelerometer came from; faults of it alone name this file. By default it is ``path`` too.
     gyro_axes, accel_axes
         Mappings of axes that were applied already, so that the message can name the ones to write in their place.
 
@@ -42,8 +49,9 @@ def check_plausible(
         For deg/s, g, exchanged sensors, missing gravity, a dead sensor or axis, axes of one sensor that do not match
         the other's. The message says what was found, what is expected, and what to write in capture.toml.
     """
+    accel_path = path if accel_path is None else accel_path
     check_alive(imu.gyro_rad_s, "gyro", path)
-    check_alive(imu.accel_m_s2, "accel", path)
+    check_alive(imu.accel_m_s2, "accel", accel_path)
     gyro = float(np.median(np.linalg.norm(imu.gyro_rad_s, axis=1)))
     accel_lengths = np.linalg.norm(imu.accel_m_s2, axis=1)
     accel = float(np.median(accel_lengths))
@@ -54,7 +62,7 @@ def check_plausible(
             f"the gyroscope's median length is {gyro:.2f} and the accelerometer's {accel:.2f}: the two sensors are "
             "exchanged; exchange the columns or files of [imu.gyro] and [imu.accel] in capture.toml",
         )
-    check_gravity(accel_lengths, path)
+    check_gravity(accel_lengths, accel_path)
     check_rates(imu.gyro_rad_s, path)
     check_consistent(imu, path, gyro_axes=gyro_axes, accel_axes=accel_axes)
 
@@ -158,11 +166,24 @@ def check_consistent(
 
     what = "mirrored" if np.linalg.det(best.matrix) < 0 else "turned against the accelerometer's"
     hint = f"set {setting('gyro', best.matrix)} in capture.toml"
-    kept = np.diag(best.matrix)
-    if np.abs(kept).all() and what != "mirrored":
-        # Half a turn of the gyroscope and a mirrored accelerometer look the same from here.
-        axis = "xyz"[int(np.argmax(kept))]
-        hint += f", or, if it is the accelerometer's {axis} axis that is mirrored, {setting('accel', -best.matrix)}"
+    if what != "mirrored":
+        # A mirrored accelerometer looks like a turned gyroscope from here: a' = P a needs the rate det(P) P w. Only
+        # the user can tell which; the wrong choice leaves both sensors mirrored against the camera.
+        accel = -best.matrix.T
+        hint += f", or, if {_mirroring(accel)}, set instead {setting('accel', accel)}"
     for other in readings[1:3]:
         hint += f"; hardly less likely: {setting('gyro', other.matrix)}"
+        if np.linalg.det(other.matrix) > 0:
+            hint += f", or {setting('accel', -other.matrix.T)}"
     raise FormatError(path, f"{found} if the gyroscope's axes are {what}: {hint}")
+
+
+def _mirroring(matrix: Array) -> str:
+    """What is wrong with an accelerometer that a mirrored signed permutation puts right."""
+    kept = np.diag(matrix)
+    if np.abs(kept).all() and (kept < 0).sum() == 1:
+        return f"it is the accelerometer's {'xyz'[int(np.argmin(kept))]} axis that is mirrored"
+    if (matrix >= 0).all():
+        first, second = ("xyz"[i] for i in np.flatnonzero(kept == 0))
+        return f"it is the accelerometer's {first} and {second} columns that are exchanged"
+    return "it is the accelerometer's axes that are mirrored"
