@@ -52,14 +52,6 @@ class AlreadyMetricError(InertialError):
     """A model that already holds a metric scale would be scaled again."""
 
 
-class MissingExtraError(InertialError):
-    """A feature needs an optional dependency that is not installed."""
-
-    def __init__(self, extra: str, purpose: str) -> None:
-        self.extra = extra
-        super().__init__(f'{purpose} needs the extra "{extra}": pip install "colmap-inertial[{extra}]"')
-
-
 class NotObservableError(InertialError):
     """The data cannot give the quantity that was asked for.
 

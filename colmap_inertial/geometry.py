@@ -118,18 +118,6 @@ def so3_log(rotation: Array) -> Array:
     return quat_log(quat_from_matrix(rotation))
 
 
-def so3_right_jacobian(rotation_vector: Array) -> Array:
-    """J with ``exp(v + d) ~ exp(v) exp(J d)`` (Sola et al. 2018, eq. 143). Shape (..., 3) -> (..., 3, 3)."""
-    v = np.asarray(rotation_vector, dtype=np.float64)
-    angle = np.linalg.norm(v, axis=-1)[..., None, None]
-    k = skew(v)
-    small = angle < 1e-4
-    safe = np.where(small, 1.0, angle)
-    b = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
-    c = np.where(small, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
-    return np.eye(3) - b * k + c * (k @ k)
-
-
 def slerp(t_s: Array, xyzw: Array, query_s: Array) -> Array:
     """Spherical linear interpolation of a quaternion track.
 

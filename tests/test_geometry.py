@@ -35,13 +35,6 @@ def test_quat_from_matrix_survives_half_turns():
     np.testing.assert_allclose(g.matrix_from_quat(g.quat_from_matrix(matrices)), matrices, atol=1e-14)
 
 
-def test_right_jacobian_is_the_derivative_of_exp():
-    step = 1e-6 * RNG.normal(size=VECTORS.shape)
-    left = g.so3_exp(VECTORS + step)
-    right = g.so3_exp(VECTORS) @ g.so3_exp((g.so3_right_jacobian(VECTORS) @ step[..., None])[..., 0])
-    np.testing.assert_allclose(left, right, atol=1e-11)
-
-
 def test_slerp_agrees_with_scipy_inside_and_continues_outside():
     t = np.cumsum(RNG.uniform(0.1, 1, 300))
     inside = np.linspace(t[0], t[-1], 977)

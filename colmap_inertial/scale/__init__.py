@@ -10,6 +10,8 @@ import numpy as np
 
 from colmap_inertial.align import AlignOptions, align_camera_imu
 from colmap_inertial.errors import NotObservableError
+from colmap_inertial.io.plausible import GRAVITY_BOUNDS_M_S2, LARGEST_MEDIAN_RATE_RAD_S
+from colmap_inertial.io.units import STANDARD_GRAVITY_M_S2
 from colmap_inertial.scale.verdict import verdict_of
 from colmap_inertial.threads import one_blas_thread
 from colmap_inertial.types import CameraImuCalibration, CameraTrajectory, ImuRecording, ScaleEstimate, clock_shift_s
@@ -65,15 +67,16 @@ def check_units(imu: ImuRecording) -> list[str]:
     """
     out = []
     accel = float(np.median(np.linalg.norm(imu.accel_m_s2, axis=1)))
-    if not 7.0 < accel < 14.0:
+    low, high = GRAVITY_BOUNDS_M_S2
+    if not low <= accel <= high:
         hint = "gravity was removed: record the raw accelerometer"
-        if 0.7 < accel < 1.4:
+        if low <= STANDARD_GRAVITY_M_S2 * accel <= high:
             hint = "it is in g: multiply it by 9.80665"
         elif accel > 500:
             hint = "it is in mg or raw counts: convert it to m/s2"
         out.append(f"the accelerometer's median length is {accel:.3g} m/s2 instead of about 9.8; {hint}")
     gyro = float(np.median(np.linalg.norm(imu.gyro_rad_s, axis=1)))
-    if gyro > 7.0:
+    if gyro > LARGEST_MEDIAN_RATE_RAD_S:
         out.append(f"the gyroscope's median rate is {gyro:.3g} rad/s; it is in deg/s: multiply it by pi / 180")
     return out
 
@@ -94,7 +97,7 @@ def estimate_scale(
     imu
         Recording of the same device; its clock may differ by any offset.
     calibration
-        What is known of the device (``align.calibration_prior``); unknown entries wide.
+        What is known of the device (``io.calibration.calibration_prior``); unknown entries wide.
     options
         Method, gravity, range of clock offsets.
 

@@ -50,11 +50,6 @@ class NoiseModel:
     pose_ratio: Array
     dof: float
 
-    @property
-    def pose_sigma_rad(self) -> Array:
-        """(5,) standard deviations of the pose errors, in the order of :data:`POSE_ERRORS`."""
-        return self.corner_px * np.sqrt(self.pose_ratio)
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ScaleFit:
