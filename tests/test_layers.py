@@ -17,6 +17,8 @@ ORDER = [
     ("errors", "geometry", "threads"),
     ("types",),
     ("io", "gravity", "gyro"),
+    ("imaging",),
+    ("flow",),
     ("align", "smooth"),
     ("scale",),
     ("model",),
@@ -26,7 +28,7 @@ ORDER = [
     ("cli",),
 ]
 RANK = {room: rank for rank, rooms in enumerate(ORDER) for room in rooms}
-ESTIMATORS = ("geometry", "types", "gravity", "align", "smooth", "scale")
+ESTIMATORS = ("geometry", "types", "gravity", "gyro", "imaging", "flow", "align", "smooth", "scale")
 
 
 def room_of(path: Path) -> str:

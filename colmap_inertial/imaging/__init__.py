@@ -1,0 +1,1 @@
+"""What happens to pixels before feature extraction: blur fields, deconvolution, rolling shutter."""

@@ -1,0 +1,69 @@
+"""Motion blur of an image: one vector for each pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from colmap_inertial.types import Array
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BlurField:
+    """The line segment that each pixel smears along while it is exposed, centred on the pixel.
+
+    Attributes
+    ----------
+    width, height
+        Size of the image, px.
+    step_px
+        Distance of the nodes: node ``(i, j)`` sits on the centre of the pixel in row ``i step_px`` and column
+        ``j step_px``. The last nodes lie on or beyond the last row and column.
+    vector_px
+        (Gy, Gx, 2) float32 blur vectors (x, y) at the nodes, px: the end of the segment minus its beginning.
+        Between nodes the field is bilinear. A vector and its negative blur alike.
+    """
+
+    width: int
+    height: int
+    vector_px: np.ndarray[tuple[int, int, int], np.dtype[np.float32]]
+    step_px: int = 16
+
+    def __post_init__(self) -> None:
+        if self.width <= 0 or self.height <= 0 or self.step_px <= 0:
+            raise ValueError("width, height and step_px must be positive")
+        vector = np.array(self.vector_px, dtype=np.float32)
+        expected = (*self.nodes(self.width, self.height, self.step_px), 2)
+        if vector.shape != expected:
+            raise ValueError(f"vector_px: shape {vector.shape}, expected {expected}")
+        if not np.isfinite(vector).all():
+            raise ValueError("vector_px: must be finite")
+        vector.setflags(write=False)
+        object.__setattr__(self, "vector_px", vector)
+
+    @staticmethod
+    def nodes(width: int, height: int, step_px: int = 16) -> tuple[int, int]:
+        """Numbers of node rows and node columns of an image; at least two of each."""
+        return max(2, -(-(height - 1) // step_px) + 1), max(2, -(-(width - 1) // step_px) + 1)
+
+    @classmethod
+    def uniform(cls, width: int, height: int, vector_px: tuple[float, float], step_px: int = 16) -> BlurField:
+        """The same blur everywhere."""
+        grid = np.broadcast_to(np.asarray(vector_px, dtype=np.float32), (*cls.nodes(width, height, step_px), 2))
+        return cls(width=width, height=height, vector_px=grid, step_px=step_px)
+
+    def per_pixel(self) -> Array:
+        """(height, width, 2) the field at every pixel."""
+        rows, row_part = np.divmod(np.arange(self.height) / self.step_px, 1)
+        columns, column_part = np.divmod(np.arange(self.width) / self.step_px, 1)
+        i, j = rows.astype(np.intp), columns.astype(np.intp)
+        i_next, j_next = np.minimum(i + 1, len(self.vector_px) - 1), np.minimum(j + 1, self.vector_px.shape[1] - 1)
+        v, s, t = self.vector_px.astype(np.float64), row_part[:, None, None], column_part[:, None]
+        upper = v[i][:, j] * (1 - t) + v[i][:, j_next] * t
+        lower = v[i_next][:, j] * (1 - t) + v[i_next][:, j_next] * t
+        return np.asarray(upper * (1 - s) + lower * s)
+
+    def extent_px(self) -> Array:
+        """(Gy, Gx) lengths of the vectors at the nodes."""
+        return np.asarray(np.hypot(self.vector_px[..., 0], self.vector_px[..., 1]), dtype=np.float64)
