@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_inertial.errors import NotObservableError
 from colmap_inertial.geometry import quat_conjugate, quat_cumulative, quat_exp, quat_rotate, slerp
 from colmap_inertial.types import Array, CameraImuCalibration, FrameTiming, ImuRecording
 
@@ -35,7 +36,14 @@ def up_in_imu(imu: ImuRecording, gyro_bias_rad_s: Array, query_s: Array, accel_d
     -------
     (Q, 3) unit vectors. An acceleration of 0.2 m/s2 on average over six seconds tilts them by 1 degree, and so does an
     accelerometer bias of that size, which no averaging removes.
+
+    Raises
+    ------
+    NotObservableError
+        Where the recording has no accelerometer.
     """
+    if not imu.has_accel:
+        raise NotObservableError("gravity", "the recording has no accelerometer; record it along with the gyroscope")
     t = imu.gyro_t_s
     rate = imu.gyro_rad_s - gyro_bias_rad_s
     steps = quat_exp(0.5 * (rate[1:] + rate[:-1]) * np.diff(t)[:, None])
@@ -66,7 +74,10 @@ def _convolve_same(signal: NDArray[Any], window: Array) -> Array:
 
 
 def gravity_in_cam(imu: ImuRecording, calibration: CameraImuCalibration, timing: FrameTiming) -> dict[str, Array]:
-    """Each frame's gravity direction (down, unit vector, camera frame) by name, for frames that the IMU covers."""
+    """Each frame's gravity direction (down, unit vector, camera frame) by name, for frames that the IMU covers;
+    none without an accelerometer."""
+    if not imu.has_accel:
+        return {}
     shift_s = (imu.epoch_ns - timing.epoch_ns) * 1e-9
     query_s = timing.pose_t_s() - calibration.gyro_time_offset_s - shift_s
     covered = (query_s >= imu.gyro_t_s[0]) & (query_s <= imu.gyro_t_s[-1])

@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from colmap_inertial.errors import NotObservableError
 from colmap_inertial.geometry import quat_rotate
 from colmap_inertial.gravity import gravity_in_cam, up_in_imu
+from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.simulate import RecordingOptions, simulate_recording
 from colmap_inertial.types import FrameTiming, ImuRecording
 
@@ -53,3 +55,12 @@ def test_a_still_device_shows_the_mean_of_its_accelerometer():
     up = up_in_imu(still, np.full(3, 0.02), np.array([0.5, 3.0]))
     expected = np.array([1.0, -2.0, 9.5]) / np.linalg.norm([1.0, -2.0, 9.5])
     np.testing.assert_allclose(up, [expected, expected], atol=2e-3)
+
+
+def test_a_gyroscope_alone_knows_no_gravity():
+    t = np.arange(100) * 0.01
+    imu = ImuRecording(gyro_t_s=t, gyro_rad_s=np.ones((100, 3)), accel_t_s=[], accel_m_s2=np.zeros((0, 3)))
+    with pytest.raises(NotObservableError, match="no accelerometer"):
+        up_in_imu(imu, np.zeros(3), t)
+    timing = FrameTiming(names=("a",), t_s=[0.5])
+    assert gravity_in_cam(imu, calibration_prior(), timing) == {}

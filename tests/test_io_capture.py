@@ -86,7 +86,7 @@ def test_a_video_capture(tmp_path: Path) -> None:
         ),
         (IMU + '[camera]\nsensor_yaml = "s.yaml"\nwidth = 4\n', "line 4: .*leave out"),
         (IMU + '[camera]\nsensor_yaml = "s.yaml"\n', "s.yaml: no such file"),
-        ("[imu]\n", r"line 1: \[imu\]: needs path, or both"),
+        ("[imu]\n", r"line 1: \[imu\]: needs path, or"),
         ('[imu]\nformat = "csv"\n', r"line 2: .*belongs to path"),
         ('[imu]\npath = "other/capture.toml"\n', "line 2: .*not another capture"),
         (IMU + '[imu.gyro]\nfile = "a"\n', r"line 4: \[imu.gyro\] file: .*leave one out"),
@@ -163,6 +163,14 @@ def test_described_tables_give_units_axes_and_separate_times(tmp_path: Path) -> 
     np.testing.assert_allclose(imu.accel_m_s2, expected, rtol=1e-12)
     assert [imu.epoch_ns + round(t * 1e9) for t in imu.gyro_t_s] == t_ns.tolist()
     assert [imu.epoch_ns + round(t * 1e9) for t in imu.accel_t_s] == (t_ns[::2] + 7).tolist()
+
+
+def test_a_gyroscope_alone_is_read(tmp_path: Path) -> None:
+    (tmp_path / "gyro.csv").write_text("".join(f"{0.01 * i:.2f},{i % 7},{i % 5},{i % 3}\n" for i in range(200)))
+    table = 'file = "gyro.csv"\ntime = 1\ntime_unit = "s"\ncolumns = [2, 3, 4]\nunit = "deg/s"\naxes = "y,-x,z"\n'
+    imu = read_imu(write(tmp_path, f"[imu.gyro]\n{table}"))
+    assert not imu.has_accel
+    np.testing.assert_allclose(imu.gyro_rad_s[:3], np.radians([[0, 0, 0], [1, -1, 1], [2, -2, 2]]))
 
 
 def test_a_stated_unit_and_axes_correct_a_file_that_is_wrong(tmp_path: Path) -> None:

@@ -83,6 +83,12 @@ def test_the_default_estimate_is_right_and_says_how_long_it_took(recording):
     assert 0 < estimate.runtime_s < 60
 
 
+def test_a_gyroscope_alone_gives_no_scale(recording):
+    alone = replace(recording.imu, accel_t_s=np.zeros(0), accel_m_s2=np.zeros((0, 3)))
+    estimate = estimate_scale(recording.trajectory, alone)
+    assert estimate.verdict == "refused" and "no accelerometer" in estimate.reasons[0]
+
+
 def test_another_recordings_imu_is_refused(recording):
     other = simulate_recording(RecordingOptions(), seed=4)
     estimate = estimate_scale(recording.trajectory, other.imu)

@@ -32,11 +32,17 @@ def recording(**changes):
         ({"accel_m_s2": np.full((10, 3), np.nan)}, "accel_m_s2: contains values that are not finite"),
         ({"gyro_rad_s": np.zeros((9, 3))}, r"gyro_rad_s: shape \(9, 3\), expected \(10, 3\)"),
         ({"gyro_t_s": [0.0], "gyro_rad_s": [[0.0, 0, 0]]}, "at least two samples"),
+        ({"accel_t_s": [0.0], "accel_m_s2": [[0.0, 0, 9.8]]}, "at least two samples"),
     ],
 )
 def test_a_recording_that_makes_no_sense_cannot_be_built(changes, words):
     with pytest.raises(ValueError, match=words):
         recording(**changes)
+
+
+def test_a_gyroscope_alone_is_a_recording():
+    assert recording().has_accel
+    assert not recording(accel_t_s=[], accel_m_s2=np.zeros((0, 3))).has_accel
 
 
 def test_arrays_are_copies_and_read_only():

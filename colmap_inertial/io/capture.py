@@ -44,7 +44,7 @@ may be left out. Nothing is guessed: a unit, axis or time that a file does not s
     axes = "y,-x,z"                 # x = the file's y, y = minus its x, z = its z
     mirrored = false                # true allows axes that change handedness (a left-handed file)
 
-    [imu.accel]
+    [imu.accel]                     # may be missing: then no scale and no gravity, but deblurring
     file = "imu.csv"
     time = "t"
     time_unit = "s"

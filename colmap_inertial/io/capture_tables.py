@@ -75,7 +75,7 @@ class ImuTables:
     """An inertial recording in described tables; attributes as in :class:`ImuPath`."""
 
     gyro: SensorTable
-    accel: SensorTable
+    accel: SensorTable | None = None
     gyro_axes: Axes | None = None
     accel_axes: Axes | None = None
     noise: ImuNoise | None = None
@@ -137,10 +137,10 @@ def read_imu_table(table: Section | None) -> ImuPath | ImuTables | None:
         )
     if fmt is not None:
         table.fail("format", "belongs to path, which is missing")
-    if gyro is None or accel is None:
-        table.fail(None, "needs path, or both [imu.gyro] and [imu.accel] that describe tables")
+    if gyro is None:
+        table.fail(None, "needs path, or [imu.gyro] (and [imu.accel], for scale and gravity) that describe tables")
     gyro_table, gyro_axes = _sensor_table(gyro, "gyro")
-    accel_table, accel_axes = _sensor_table(accel, "accel")
+    accel_table, accel_axes = (None, None) if accel is None else _sensor_table(accel, "accel")
     return ImuTables(gyro=gyro_table, accel=accel_table, gyro_axes=gyro_axes, accel_axes=accel_axes, noise=noise)
 
 

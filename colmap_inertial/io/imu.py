@@ -80,7 +80,9 @@ def read_capture_imu(capture: Capture) -> ImuRecording:
         path = accel_path = source.path
         imu = _read_plain(path, source.format, source.units)
     else:
-        path, accel_path = source.gyro.file, source.accel.file
+        path = accel_path = source.gyro.file
+        if source.accel is not None:
+            accel_path = source.accel.file
         imu = imu_text.read_tables(source.gyro, source.accel)
     imu = replace(
         imu,

@@ -44,9 +44,9 @@ class SensorTable:
     unit: str
 
 
-def read_tables(gyro: SensorTable, accel: SensorTable) -> ImuRecording:
-    """Read an IMU from tables that the user described (units converted, axes as in the file)."""
-    return _recording(_read_described(gyro, "gyro"), _read_described(accel, "accel"))
+def read_tables(gyro: SensorTable, accel: SensorTable | None) -> ImuRecording:
+    """Read an IMU, or a gyroscope alone, from tables that the user described (units converted, axes as in the file)."""
+    return _recording(_read_described(gyro, "gyro"), None if accel is None else _read_described(accel, "accel"))
 
 
 def is_inertial_scale(path: Path) -> bool:
@@ -199,8 +199,10 @@ def _ordered(table: Table, quantity: Quantity, t_ns: NDArray[np.int64], values: 
     return Samples(t_ns=samples.t_ns, values=samples.values, repairs=table.repairs + samples.repairs)
 
 
-def _recording(gyro: Samples, accel: Samples, *, noise: ImuNoise | None = None) -> ImuRecording:
-    epoch_ns = int(min(gyro.t_ns[0], accel.t_ns[0]))
+def _recording(gyro: Samples, accel: Samples | None, *, noise: ImuNoise | None = None) -> ImuRecording:
+    if accel is None:
+        accel = Samples(t_ns=np.zeros(0, dtype=np.int64), values=np.zeros((0, 3)), repairs=())
+    epoch_ns = int(np.concatenate([gyro.t_ns, accel.t_ns]).min())
     return ImuRecording(
         gyro_t_s=seconds(gyro.t_ns, epoch_ns),
         gyro_rad_s=gyro.values,

@@ -51,6 +51,9 @@ def check_plausible(
     """
     accel_path = path if accel_path is None else accel_path
     check_alive(imu.gyro_rad_s, "gyro", path)
+    if not imu.has_accel:
+        check_rates(imu.gyro_rad_s, path)
+        return
     check_alive(imu.accel_m_s2, "accel", accel_path)
     gyro = float(np.median(np.linalg.norm(imu.gyro_rad_s, axis=1)))
     accel_lengths = np.linalg.norm(imu.accel_m_s2, axis=1)

@@ -66,9 +66,9 @@ def check_units(imu: ImuRecording) -> list[str]:
     Readers of files raise their own errors before; this guards arrays that come from elsewhere.
     """
     out = []
-    accel = float(np.median(np.linalg.norm(imu.accel_m_s2, axis=1)))
+    accel = float(np.median(np.linalg.norm(imu.accel_m_s2, axis=1))) if imu.has_accel else np.nan
     low, high = GRAVITY_BOUNDS_M_S2
-    if not low <= accel <= high:
+    if imu.has_accel and not low <= accel <= high:
         hint = "gravity was removed: record the raw accelerometer"
         if low <= STANDARD_GRAVITY_M_S2 * accel <= high:
             hint = "it is in g: multiply it by 9.80665"
@@ -116,6 +116,11 @@ def estimate_scale(
 def _estimate_or_refuse(
     trajectory: CameraTrajectory, imu: ImuRecording, calibration: CameraImuCalibration | None, options: ScaleOptions
 ) -> ScaleEstimate:
+    if not imu.has_accel:
+        return _refused(
+            options.method,
+            "the recording has no accelerometer, without which metres are unknown; record it too",
+        )
     problems = check_units(imu)
     if problems:
         return _refused(options.method, *problems)

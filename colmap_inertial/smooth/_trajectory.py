@@ -76,13 +76,17 @@ def smooth_trajectory(
     Raises
     ------
     NotObservableError
-        For fewer than six poses, or where the IMU recorded during none of the frame intervals.
+        For fewer than six poses, without an accelerometer, or where the IMU recorded during none of the frame
+        intervals.
     """
     options = options or SmoothOptions()
     if trajectory.length_unit != "m":
         raise ValueError("smooth_trajectory needs a metric trajectory")
     if len(trajectory) < 6:
         raise NotObservableError("smooth motion", f"{len(trajectory)} poses are too few to tell motion from noise")
+    if not imu.has_accel:
+        hint = "the recording has no accelerometer; record it along with the gyroscope"
+        raise NotObservableError("smooth motion", hint)
     attitude = smooth_attitude(trajectory, imu, calibration)
     bias = np.zeros(3) if accel_bias_m_s2 is None else np.asarray(accel_bias_m_s2, dtype=np.float64)
     gravity = np.asarray(gravity_in_world_m_s2, dtype=np.float64)

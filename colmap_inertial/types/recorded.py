@@ -56,7 +56,7 @@ class ImuRecording:
     gyro_rad_s
         (N, 3) angular velocity in the IMU frame.
     accel_m_s2
-        (M, 3) specific force in the IMU frame, gravity included.
+        (M, 3) specific force in the IMU frame, gravity included. A gyroscope alone has no samples here (M = 0).
     epoch_ns
         The clock's reading, in nanoseconds, where both time bases are zero.
     repairs
@@ -85,8 +85,13 @@ class ImuRecording:
             gyro_rad_s=checked_array("gyro_rad_s", self.gyro_rad_s, (len(gyro_t_s), 3)),
             accel_m_s2=checked_array("accel_m_s2", self.accel_m_s2, (len(accel_t_s), 3)),
         )
-        if len(gyro_t_s) < 2 or len(accel_t_s) < 2:
-            raise ValueError("an ImuRecording needs at least two samples of each sensor")
+        if len(gyro_t_s) < 2 or len(accel_t_s) == 1:
+            raise ValueError("an ImuRecording needs at least two samples of each sensor (or none of the accelerometer)")
+
+    @property
+    def has_accel(self) -> bool:
+        """Whether the accelerometer was recorded; without it there is no scale and no gravity."""
+        return len(self.accel_t_s) > 0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
