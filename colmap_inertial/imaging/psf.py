@@ -1,0 +1,158 @@
+"""Motion blur of every pixel from the gyroscope alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from colmap_inertial.errors import NotObservableError
+from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
+from colmap_inertial.types import Array, FrameTiming, Projector
+
+#: Nodes at which the blur of a frame is predicted, and frames predicted together.
+_PREDICTED_COLUMNS, _PREDICTED_ROWS, _CHUNK = 7, 5, 512
+#: A picture that moves with the shutter would be blurred without end; what is felt of it stays finite.
+_LEAST_STRETCH = 0.2
+
+
+def blur_field(motion: GyroCamera, camera: Projector, shutter: FrameShutter, *, step_px: int = 16) -> BlurField:
+    """The segment that each pixel of a frame smears along, by the camera's rotation during the exposure of its line.
+
+    A pixel x of a line exposed around t_m sees, at time t, what it sees at t_m at ``project(R(t_m)' R(t) ray(x))``.
+    The vector is the difference of that between the end and the beginning of the exposure. The lines of a rolling
+    shutter see that content at times of their own; with the shutter's speed d (seconds per pixel, along y) the vector
+    b becomes ``b / (1 + b_y d / exposure)``.
+
+    Parameters
+    ----------
+    motion
+        The gyroscope on the camera's clock.
+    camera
+        Intrinsics with distortion (``pycolmap.Camera`` is one), COLMAP's pixel coordinates.
+    shutter
+        When the lines of this frame are exposed.
+    step_px
+        Distance of the field's nodes. At 16 px the field errs by some thousandths of a pixel between them.
+
+    Raises
+    ------
+    NotObservableError
+        Where the exposure is unknown, or the gyroscope did not record all of it.
+    """
+    if shutter.exposure_s is None:
+        raise NotObservableError("motion blur", _NO_EXPOSURE)
+    if not shutter.covered_by(motion):
+        raise NotObservableError("motion blur", _NOT_COVERED)
+    rows, columns = BlurField.nodes(shutter.width, shutter.height, step_px)
+    x, y = step_px * np.arange(float(columns)) + 0.5, step_px * np.arange(float(rows)) + 0.5
+    vectors = _vectors(motion, camera, shutter, np.array([shutter.t_s]), np.array([shutter.exposure_s]), x, y)[0]
+    return BlurField(
+        width=shutter.width, height=shutter.height, vector_px=_filled(vectors).astype(np.float32), step_px=step_px
+    )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PredictedBlur:
+    """How blurred the frames of a recording are, before any of them is decoded.
+
+    Attributes
+    ----------
+    names
+        (F,) of the frames.
+    px
+        (F,) 90th percentile of the blur's length over the image, px of the image as it is; NaN where unknown.
+    reasons
+        (F,) why it is unknown; empty where it is known.
+    """
+
+    names: tuple[str, ...]
+    px: Array
+    reasons: tuple[str, ...]
+
+
+def predicted_blur_px(
+    motion: GyroCamera, camera: Projector, timing: FrameTiming, *, width: int, height: int
+) -> PredictedBlur:
+    """The blur of every frame from the gyroscope alone: to rank frames, and to choose what is deblurred.
+
+    Parameters
+    ----------
+    motion
+        The gyroscope on the camera's clock.
+    camera
+        As in :func:`blur_field`.
+    timing
+        Of all frames.
+    width, height
+        Size of the images.
+    """
+    count = len(timing.t_s)
+    px, reasons = np.full(count, np.nan), [_NO_EXPOSURE] * count
+    if timing.exposure_s is not None:
+        readout_s = timing.readout_s or 0.0
+        covered = motion.covers(timing.t_s, timing.t_s + timing.exposure_s + readout_s)
+        reasons = ["" if inside else _NOT_COVERED for inside in covered]
+        x = (np.arange(_PREDICTED_COLUMNS) + 0.5) * width / _PREDICTED_COLUMNS
+        y = (np.arange(_PREDICTED_ROWS) + 0.5) * height / _PREDICTED_ROWS
+        known = np.flatnonzero(covered)
+        for part in np.split(known, range(_CHUNK, len(known), _CHUNK)):
+            if len(part):
+                shutter = FrameShutter.of(timing, int(part[0]), width=width, height=height)
+                vectors = _vectors(motion, camera, shutter, timing.t_s[part], timing.exposure_s[part], x, y)
+                lengths = np.hypot(vectors[..., 0], vectors[..., 1]).reshape(len(part), -1)
+                px[part] = np.nanpercentile(lengths, 90, axis=1)
+    return PredictedBlur(names=timing.names, px=px, reasons=tuple(reasons))
+
+
+_NO_EXPOSURE = (
+    "the exposure time is unknown (the images carry none); give exposure_s under [timing] in capture.toml, or a column "
+    "of it in the frame times"
+)
+_NOT_COVERED = "the gyroscope does not cover the exposure of this frame, or pauses in it"
+
+
+def _vectors(
+    motion: GyroCamera, camera: Projector, shutter: FrameShutter, t_s: Array, exposure_s: Array, x: Array, y: Array
+) -> Array:
+    """(F, len(y), len(x), 2) blur vectors of F frames that have ``shutter``'s readout, at the nodes of a grid."""
+    nodes = np.stack(np.meshgrid(x, y), axis=-1)
+    rays = np.asarray(camera.cam_from_img(nodes.reshape(-1, 2)))[:, :2].reshape(nodes.shape)
+    rays = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=-1)
+    step_x, step_y = shutter.line_step_s
+    by_column = shutter.readout_direction in ("right", "left")
+    lines = nodes[0] if by_column else nodes[:, 0]
+    # mid-exposure of each node's line against the start of its frame
+    delay_s = shutter.middle_s(lines) - shutter.t_s - 0.5 * (shutter.exposure_s or 0.0)
+    middle_s = t_s[:, None] + 0.5 * exposure_s[:, None] + delay_s
+    half_s = 0.5 * exposure_s[:, None]
+    middle = np.swapaxes(motion.start_from_cam(middle_s), -1, -2)
+    ends = []
+    for sign in (-1, 1):
+        turn = middle @ motion.start_from_cam(middle_s + sign * half_s)
+        seen = np.einsum("fxij,yxj->fyxi" if by_column else "fyij,yxj->fyxi", turn, rays)
+        ends.append(np.asarray(camera.img_from_cam(seen.reshape(-1, 3))).reshape(*seen.shape[:3], 2))
+    vector = ends[1] - ends[0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        per_s = vector / exposure_s[:, None, None, None]
+    stretch = 1 + np.nan_to_num(per_s[..., 0]) * step_x + np.nan_to_num(per_s[..., 1]) * step_y
+    return np.asarray(vector / np.maximum(stretch, _LEAST_STRETCH)[..., None])
+
+
+def _filled(vectors: Array) -> Array:
+    """Nodes beyond the image's edge that no ray meets take the vector of the nearest one that some ray does."""
+    bad = ~np.isfinite(vectors).all(axis=-1)
+    if not bad.any():
+        return vectors
+    if bad.all():
+        raise ValueError("the camera's intrinsics map no pixel to a ray")
+    known, unknown = np.argwhere(~bad), np.argwhere(bad)
+    out = vectors.copy()
+    for node in unknown:
+        nearest = known[np.argmin(np.sum((known - node) ** 2, axis=1))]
+        out[tuple(node)] = vectors[tuple(nearest)]
+    return out
+
+
+__all__ = ["PredictedBlur", "blur_field", "predicted_blur_px"]
