@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import replace
+from functools import cache
 
 import cv2
 import numpy as np
@@ -42,6 +43,11 @@ def handheld(vigour=1.0, seed=3, gyro_hz=400.0):
     rate = motion.rate_in_cam_rad_s(t) @ matrix_from_quat(CAM_FROM_IMU)
     path = GyroPath(t + 11.0, rate, np.zeros(3))
     return motion, GyroCamera(path=path, cam_from_imu_xyzw=CAM_FROM_IMU, offset_s=-11.0)
+
+
+@cache
+def room():
+    return Renderer(make_world("room", 5))
 
 
 def shutter_of(camera, t_s):
@@ -111,7 +117,7 @@ def test_the_field_is_the_path_of_content_in_the_sharp_rolling_picture(model, di
 def test_smearing_the_sharp_picture_along_the_field_gives_the_rendered_blur(direction):
     model = replace(LENS, width=320, height=240, params=(300, 302, 161, 119, 0.12, -0.2, 0.001, -0.0005))
     motion, gyro = handheld(vigour=2.0)
-    renderer = Renderer(make_world("room", 5))
+    renderer = room()
     camera = ShutterCamera(model=model, exposure_s=0.02, readout_s=0.02, readout_direction=direction)
     blurred = renderer.linear(camera, motion, 2.0)
     sharp = renderer.linear(replace(camera, exposure_s=0.0), motion, 2.01)

@@ -5,14 +5,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from test_imaging_psf import FISHEYE, LENS, PINHOLE, handheld, shutter_of, turning
+from test_imaging_psf import FISHEYE, LENS, PINHOLE, handheld, room, shutter_of, turning
 
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.geometry import matrix_from_quat
 from colmap_inertial.imaging.gyro_camera import FrameShutter
 from colmap_inertial.imaging.rolling_shutter import rectify_image, rectify_keypoints
-from colmap_inertial.simulate import make_world
-from colmap_inertial.simulate.render import Renderer, ShutterCamera, colmap_camera, develop
+from colmap_inertial.simulate.render import ShutterCamera, colmap_camera, develop
 from colmap_inertial.types import FrameTiming
 
 POINTS = np.random.default_rng(1).uniform([5, 5], [635, 475], (300, 2))
@@ -80,7 +79,7 @@ def test_affine_shape_and_scale_with_orientation_follow_the_mapping():
 def test_a_rectified_picture_is_the_global_shutter_s(direction):
     model = replace(LENS, width=320, height=240, params=(300, 302, 161, 119, 0.12, -0.2, 0.001, -0.0005))
     motion, gyro = handheld(vigour=2.0)
-    renderer = Renderer(make_world("room", 5))
+    renderer = room()
     rolling = ShutterCamera(model=model, exposure_s=0.0, readout_s=0.03, readout_direction=direction)
     still = replace(rolling, readout_s=0.0)
     picture = develop(renderer.linear(rolling, motion, 2.0), rolling, None)
@@ -100,7 +99,7 @@ def test_image_and_keypoints_are_moved_alike():
     ramp = np.stack(np.meshgrid(np.arange(640), np.arange(480)), axis=-1) * 64
     for axis in (0, 1):
         out, covered = rectify_image(ramp[..., axis].astype(np.uint16), gyro, lens, shutter)
-        v, u = np.nonzero(cv2.erode(covered.astype(np.uint8), np.ones((9, 9), np.uint8)))
+        v, u = np.nonzero(cv2.erode(covered.astype(np.uint8), np.ones((9, 9), np.uint8), borderValue=0))
         source = out[v, u] / 64
         if axis == 0:
             x = source
