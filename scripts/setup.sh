@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
-# Makes .venv in the checkout with colmap-inertial and what its tests need. Installs missing system packages with apt
-# where it may; otherwise it says what is missing. Running it again is quick.
+# Makes .venv in the checkout with colmap-inertial and what its tests need, and compiles its kernels. Installs missing
+# system packages with apt where it may; otherwise it says what is missing. Running it again is quick; after a change of
+# pyproject.toml or of the C++ sources it installs again.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -18,6 +19,9 @@ fi
 
 missing=()
 "$python" -c 'import ensurepip' 2>/dev/null || missing+=("python3-venv")
+command -v g++ >/dev/null || missing+=("g++")
+"$python" -c 'import os, sys, sysconfig; sys.exit(not os.path.exists(sysconfig.get_path("include") + "/Python.h"))' ||
+  missing+=("libpython3-dev")
 if [ ${#missing[@]} -gt 0 ]; then
   sudo=""
   if [ "$(id -u)" -ne 0 ]; then sudo="sudo -n"; fi
@@ -34,7 +38,8 @@ if ! .venv/bin/python -m pip --version >/dev/null 2>&1; then
   "$python" -m venv .venv
 fi
 stamp=.venv/.colmap-inertial
-if [ ! -f "$stamp" ] || [ pyproject.toml -nt "$stamp" ]; then
+sources=(pyproject.toml colmap_inertial/_kernels/{CMakeLists.txt,*.cpp,*.h})
+if [ ! -f "$stamp" ] || [ -n "$(find "${sources[@]}" -newer "$stamp" -print -quit)" ]; then
   echo "setup: installing Python packages into .venv"
   .venv/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
   touch "$stamp"

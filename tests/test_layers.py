@@ -14,7 +14,7 @@ PACKAGE = Path(__file__).parents[1] / "colmap_inertial"
 
 #: Each room may import itself and the rooms before it.
 ORDER = [
-    ("errors", "geometry", "threads"),
+    ("errors", "geometry", "threads", "_kernels"),
     ("types",),
     ("io", "gravity", "gyro"),
     ("imaging",),

@@ -1,0 +1,1 @@
+"""Compiled kernels. Each has a plain numpy counterpart beside the public function that calls it, which is its truth."""

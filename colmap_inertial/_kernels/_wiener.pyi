@@ -1,0 +1,34 @@
+"""Directional Wiener filter. The arguments of `deblur` are those of `colmap_inertial.imaging.wiener`, spelled out."""
+
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+Code = TypeVar("Code", np.uint8, np.uint16, np.float32)
+
+def deblur(
+    image: NDArray[Code],
+    result: NDArray[Code],
+    *,
+    extent_px: NDArray[np.float32],
+    slope: NDArray[np.float32],
+    along_y: NDArray[np.bool_],
+    fade: NDArray[np.float32],
+    weights: NDArray[np.float32],
+    reach: NDArray[np.int32],
+    first: float,
+    steps: float,
+    decode: NDArray[np.float32],
+    encode: NDArray[np.float32],
+    saturated: int,
+    threads: int = 0,
+    instruction_set: str = "",
+) -> tuple[float, float]:
+    """Write the deblurred (H, W, C) image into `result`; returns the seconds of decoding and of filtering."""
+
+def peak_multiply_adds(instruction_set: str = "", seconds: float = 0.2) -> float:
+    """Fused multiply-adds a second that one core reaches in registers, each lane counted."""
+
+def instruction_sets() -> list[str]:
+    """Those that this processor has, the best one last."""

@@ -1,0 +1,400 @@
+#include "wiener.h"
+
+#include <algorithm>
+#include <atomic>
+#include <chrono>
+#include <cmath>
+#include <cstring>
+#include <memory>
+#include <thread>
+#include <type_traits>
+#include <vector>
+
+#if defined(__linux__)
+#include <sched.h>
+#endif
+
+const Simd *simd_named(const char *name) {
+    const bool best = !*name;
+#if defined(COLMAP_INERTIAL_X86_64)
+    __builtin_cpu_init();
+    const bool avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
+    if (avx2 && __builtin_cpu_supports("avx512f") && (best || !strcmp(name, simd_avx512.name))) return &simd_avx512;
+    if (avx2 && (best || !strcmp(name, simd_avx2.name))) return &simd_avx2;
+#endif
+    return best || !strcmp(name, simd_base.name) ? &simd_base : nullptr;
+}
+
+int usable_threads() {
+#if defined(__linux__)
+    cpu_set_t set;
+    if (sched_getaffinity(0, sizeof set, &set) == 0) return std::max(1, CPU_COUNT(&set));
+#endif
+    return std::max(1u, std::thread::hardware_concurrency());
+}
+
+namespace {
+
+constexpr int NODE = 4;                  // px between the points at which the influence of saturation is worked out
+constexpr int PER_CELL = CELL / NODE;
+constexpr float ZERO_TO = 2.0f, ONE_FROM = 2.5f;  // distances from a saturated pixel, in blur lengths: share of the result
+
+// Calls work(i) for 0 <= i < count, every i once.
+template <class Work>
+void in_parallel(int count, int threads, const Work &work) {
+    std::atomic<int> next{0};
+    auto loop = [&] {
+        for (int i; (i = next.fetch_add(1, std::memory_order_relaxed)) < count;) work(i);
+    };
+    std::vector<std::thread> others;
+    for (int t = 1; t < std::min(threads, count); ++t) others.emplace_back(loop);
+    loop();
+    for (auto &thread : others) thread.join();
+}
+
+int mirrored(int index, int size) {
+    if (size == 1) return 0;
+    const int period = 2 * size - 2;
+    index = std::abs(index) % period;
+    return std::min(index, period - index);
+}
+
+// Linear light with its mirrored surroundings. Transposed for cells whose major axis is y, so that the taps always
+// run along the rows.
+struct Plane {
+    int before_major = 0, before_minor = 0;  // px of surroundings
+    int width = 0, height = 0;
+    ptrdiff_t stride = 0;
+    std::unique_ptr<float[]> data;           // not set to zero: every element that is read is written
+
+    void allocate(int major, int minor, int reach, float steepest) {
+        before_major = reach + 1;
+        before_minor = int(std::ceil(float(reach) * steepest)) + 1;
+        width = major + 2 * before_major;
+        height = minor + 2 * before_minor + 1;
+        // 11 cache lines beyond a multiple of 64: the rows around a cell spread over all sets of the first-level cache.
+        stride = ((width + 15) / 16 + 52) / 64 * 64 + 11;
+        stride *= 16;
+        data.reset(new float[size_t(stride) * size_t(height)]);
+    }
+    const float *at(int major, int minor) const { return data.get() + (minor + before_minor) * stride + major + before_major; }
+};
+
+template <class Code>
+float light_of(Code code, const Codec &codec) {
+    if constexpr (std::is_same_v<Code, float>) return code;
+    else return codec.decode[code];
+}
+
+// Codes of linear light, a whole cell at a time.
+template <class Code>
+class Encoder {
+public:
+    explicit Encoder(const Codec &codec) : table_(codec.encode), steps_(float(codec.encode_steps)) {
+        if constexpr (std::is_same_v<Code, uint8_t>) {
+            nearest_.resize(size_t(codec.encode_steps) + 2);
+            for (size_t i = 0; i < nearest_.size(); ++i) nearest_[i] = uint8_t(table_[i] + 0.5f);
+        }
+    }
+
+    void encode(const float *light, Code *codes) const {
+        if constexpr (std::is_same_v<Code, float>) {
+            std::memcpy(codes, light, sizeof(float) * CELL * CELL);
+        } else {
+            float position[CELL * CELL];
+            int index[CELL * CELL];
+            const float half = std::is_same_v<Code, uint8_t> ? 0.5f : 0.0f;  // the nearest entry, or the one below
+            for (int i = 0; i < CELL * CELL; ++i) {
+                const float clipped = light[i] < 0.0f ? 0.0f : light[i];
+                position[i] = (clipped > 1.0f ? 1.0f : clipped) * steps_ + half;
+                index[i] = int(position[i]);
+            }
+            for (int i = 0; i < CELL * CELL; ++i) {
+                if constexpr (std::is_same_v<Code, uint8_t>) {
+                    codes[i] = nearest_[size_t(index[i])];
+                } else {
+                    const float low = table_[index[i]], high = table_[index[i] + 1];
+                    codes[i] = Code(low + (high - low) * (position[i] - float(index[i])) + 0.5f);
+                }
+            }
+        }
+    }
+
+private:
+    const float *table_;
+    float steps_;
+    std::vector<uint8_t> nearest_;
+};
+
+template <class Code>
+void fill(Plane &plane, const Code *image, Image size, int channel, bool transposed, const Codec &codec, int threads) {
+    const int major = transposed ? size.height : size.width, minor = transposed ? size.width : size.height;
+    const ptrdiff_t pixel = size.channels, line = ptrdiff_t(size.width) * pixel;
+    const ptrdiff_t major_step = transposed ? line : pixel, minor_step = transposed ? pixel : line;
+    // Transposed, 16 rows together: they lie on the same cache lines of the image.
+    const int together = transposed ? 16 : 1;
+    in_parallel((plane.height + together - 1) / together, threads, [&](int group) {
+        const int first = group * together, count = std::min(together, plane.height - first);
+        const Code *source[16];
+        float *target[16];
+        for (int r = 0; r < count; ++r) {
+            source[r] = image + channel + mirrored(first + r - plane.before_minor, minor) * minor_step;
+            target[r] = plane.data.get() + (first + r) * plane.stride + plane.before_major;
+        }
+        if (transposed)
+            for (int x = 0; x < major; ++x)
+                for (int r = 0; r < count; ++r) target[r][x] = light_of(source[r][x * major_step], codec);
+        else
+            for (int x = 0; x < major; ++x) target[0][x] = light_of(source[0][x * major_step], codec);
+        for (int r = 0; r < count; ++r) {
+            for (int x = -plane.before_major; x < 0; ++x) target[r][x] = target[r][mirrored(x, major)];
+            for (int x = major; x < plane.width - plane.before_major; ++x) target[r][x] = target[r][mirrored(x, major)];
+        }
+    });
+}
+
+// Where saturated pixels, whose light is unknown, spoil the result.
+class Saturation {
+public:
+    Saturation(Image size, const Field &field) : size_(size), field_(field), ny_(PER_CELL * field.ny + 1), nx_(PER_CELL * field.nx + 1) {}
+
+    template <class Code>
+    void find(const Code *image, int threshold, int threads) {
+        near_.assign(size_t(ny_) * size_t(nx_), 0);
+        const int blocks_y = (size_.height + NODE - 1) / NODE, blocks_x = (size_.width + NODE - 1) / NODE;
+        const int line = size_.width * size_.channels, block = NODE * size_.channels;
+        std::vector<unsigned char> blocks(size_t(blocks_y) * size_t(blocks_x), 0);
+        std::atomic<bool> any{false};
+        in_parallel(blocks_y, threads, [&](int i) {
+            std::vector<Code> brightest(image + ptrdiff_t(i) * NODE * line, image + (ptrdiff_t(i) * NODE + 1) * line);
+            Code top = 0;
+            for (int r = 1; r < std::min(NODE, size_.height - i * NODE); ++r) {
+                const Code *row = image + (ptrdiff_t(i) * NODE + r) * line;
+                for (int x = 0; x < line; ++x) brightest[x] = std::max(brightest[x], row[x]);
+            }
+            for (int x = 0; x < line; ++x) top = std::max(top, brightest[x]);
+            if (top < threshold) return;
+            any = true;
+            for (int x = 0; x < line; ++x)
+                if (brightest[x] >= threshold) blocks[size_t(i) * blocks_x + x / block] = 1;
+        });
+        any_ = any;
+        if (!any_) return;
+        for (int i = 0; i < blocks_y; ++i)
+            for (int j = 0; j < blocks_x; ++j)
+                if (blocks[size_t(i) * blocks_x + j])
+                    for (int dy = 0; dy < 2; ++dy)
+                        for (int dx = 0; dx < 2; ++dx) near_[size_t(i + dy) * nx_ + j + dx] = 1;
+        sums_.assign(size_t(ny_ + 1) * size_t(nx_ + 1), 0);
+        for (int i = 0; i < ny_; ++i)
+            for (int j = 0, row = 0; j < nx_; ++j) {
+                row += near_[size_t(i) * nx_ + j];
+                sums_[size_t(i + 1) * (nx_ + 1) + j + 1] = sums_[size_t(i) * (nx_ + 1) + j + 1] + row;
+            }
+    }
+
+    // Shares of the result at the nodes of a cell; false where all of them are one.
+    bool shares(int cy, int cx, float (&share)[PER_CELL + 1][PER_CELL + 1]) const {
+        if (!any_) return false;
+        // The nodes on the far borders have the blur of the next cells.
+        float reach_y = 0, reach_x = 0;
+        for (int y = cy; y < std::min(cy + 2, field_.ny); ++y)
+            for (int x = cx; x < std::min(cx + 2, field_.nx); ++x) {
+                const size_t cell = size_t(y) * field_.nx + x;
+                const float major = ONE_FROM * field_.extent[cell], minor = major * std::abs(field_.slope[cell]);
+                reach_y = std::max(reach_y, field_.along_y[cell] ? major : minor);
+                reach_x = std::max(reach_x, field_.along_y[cell] ? minor : major);
+            }
+        const int top = std::max(0, cy * PER_CELL - int(reach_y / NODE) - 1), left = std::max(0, cx * PER_CELL - int(reach_x / NODE) - 1);
+        const int bottom = std::min(ny_, (cy + 1) * PER_CELL + int(reach_y / NODE) + 2);
+        const int right = std::min(nx_, (cx + 1) * PER_CELL + int(reach_x / NODE) + 2);
+        if (sum(bottom, right) - sum(top, right) - sum(bottom, left) + sum(top, left) == 0) return false;
+        for (int i = 0; i <= PER_CELL; ++i)
+            for (int j = 0; j <= PER_CELL; ++j) share[i][j] = share_at(cy * PER_CELL + i, cx * PER_CELL + j);
+        return true;
+    }
+
+private:
+    int sum(int y, int x) const { return sums_[size_t(y) * (nx_ + 1) + x]; }
+
+    bool near(int y, int x) const { return y >= 0 && y < ny_ && x >= 0 && x < nx_ && near_[size_t(y) * nx_ + x]; }
+
+    // Zero where the filter reaches a saturated pixel, one half a blur length further on.
+    float share_at(int i, int j) const {
+        const size_t cell = size_t(std::min(i / PER_CELL, field_.ny - 1)) * field_.nx + std::min(j / PER_CELL, field_.nx - 1);
+        const float extent = field_.extent[cell], slope = field_.slope[cell];
+        const bool along_y = field_.along_y[cell];
+        for (int step = 0; float(NODE * step) <= ONE_FROM * extent; ++step) {
+            const int minor = int(std::floor(float(step) * slope + 0.5f));
+            const int dy = along_y ? step : minor, dx = along_y ? minor : step;
+            if (near(i + dy, j + dx) || near(i - dy, j - dx))
+                return std::min(std::max((float(NODE * step) / std::max(extent, 1e-6f) - ZERO_TO) / (ONE_FROM - ZERO_TO), 0.0f), 1.0f);
+        }
+        return 1;
+    }
+
+    Image size_;
+    const Field &field_;
+    int ny_, nx_;
+    bool any_ = false;
+    std::vector<unsigned char> near_;
+    std::vector<int> sums_;
+};
+
+template <class Code>
+class Deblur {
+public:
+    Deblur(const Code *image, Code *result, Image size, const Field &field, const Table &table, const Codec &codec, const Simd &simd, int threads)
+        : image_(image), result_(result), size_(size), field_(field), table_(table), codec_(codec), simd_(simd), threads_(threads), encoder_(codec), saturation_(size, field) {}
+
+    Seconds run() {
+        const auto start = std::chrono::steady_clock::now();
+        if constexpr (!std::is_same_v<Code, float>) saturation_.find(image_, codec_.saturated, threads_);
+        decode();
+        const auto middle = std::chrono::steady_clock::now();
+        in_parallel(field_.ny, threads_, [&](int cy) { filter_row(cy); });
+        const auto end = std::chrono::steady_clock::now();
+        return {std::chrono::duration<double>(middle - start).count(), std::chrono::duration<double>(end - middle).count()};
+    }
+
+private:
+    void decode() {
+        for (const bool transposed : {false, true}) {
+            int reach = 0;
+            float steepest = 0;
+            bool needed = false;
+            for (int cell = 0; cell < field_.ny * field_.nx; ++cell)
+                if (field_.along_y[cell] == transposed && !faded(cell / field_.nx, cell % field_.nx)) {
+                    needed = true;
+                    reach = std::max(reach, table_.reach[row_of(cell) + 1]);
+                    steepest = std::max(steepest, std::abs(field_.slope[cell]));
+                }
+            if (!needed) continue;
+            for (int channel = 0; channel < size_.channels; ++channel) {
+                Plane plane;
+                const int major = (transposed ? field_.ny : field_.nx) * CELL, minor = (transposed ? field_.nx : field_.ny) * CELL;
+                plane.allocate(major, minor, reach, steepest);
+                fill(plane, image_, size_, channel, transposed, codec_, threads_);
+                planes_[transposed].push_back(std::move(plane));
+            }
+        }
+    }
+
+    const float *corner(int cy, int cx) const { return field_.fade + size_t(cy) * (field_.nx + 1) + cx; }
+
+    bool faded(int cy, int cx) const {
+        const float *above = corner(cy, cx), *below = corner(cy + 1, cx);
+        return above[0] == 0 && above[1] == 0 && below[0] == 0 && below[1] == 0;
+    }
+
+    int row_of(int cell) const {
+        const float position = field_.extent[cell] * table_.steps - table_.first;
+        return std::min(std::max(int(position), 0), table_.rows - 2);
+    }
+
+    void filter_row(int cy) {
+        const size_t room = size_t(table_.width);
+        std::vector<float> weights(2 * room);
+        std::vector<int32_t> offsets(2 * room);
+        Taps taps{0, weights.data(), weights.data() + room, offsets.data(), offsets.data() + room};
+        for (int cx = 0; cx < field_.nx; ++cx) {
+            if (faded(cy, cx)) {
+                copy(cy, cx);
+                continue;
+            }
+            const int cell = cy * field_.nx + cx, row = row_of(cell);
+            const bool transposed = field_.along_y[cell];
+            const float *lower = table_.weights + size_t(row) * room;
+            taps.reach = table_.reach[row + 1];
+            const float fraction = field_.extent[cell] * table_.steps - table_.first - float(row);
+            simd_.place(lower, lower + room, fraction, field_.slope[cell], planes_[transposed][0].stride, taps);
+            float share[CELL][CELL];
+            const bool blended = shares(cy, cx, share);
+            for (int channel = 0; channel < size_.channels; ++channel) {
+                const Plane &plane = planes_[transposed][channel];
+                alignas(64) float tile[CELL * CELL];
+                const float *source = transposed ? plane.at(cy * CELL, cx * CELL) : plane.at(cx * CELL, cy * CELL);
+                simd_.filter(source, plane.stride, taps, tile);
+                if (transposed)
+                    for (int y = 1; y < CELL; ++y)
+                        for (int x = 0; x < y; ++x) std::swap(tile[y * CELL + x], tile[x * CELL + y]);
+                write(cy, cx, channel, tile, blended ? share : nullptr);
+            }
+        }
+    }
+
+    // Shares of the result at the pixels of a cell; false where all of them are one.
+    bool shares(int cy, int cx, float (&share)[CELL][CELL]) const {
+        const float *above = corner(cy, cx), *below = corner(cy + 1, cx);
+        float nodes[PER_CELL + 1][PER_CELL + 1];
+        const bool saturated = saturation_.shares(cy, cx, nodes);
+        if (!saturated && above[0] == 1 && above[1] == 1 && below[0] == 1 && below[1] == 1) return false;
+        for (int y = 0; y < CELL; ++y) {
+            const float s = float(y) / CELL, s_node = float(y % NODE) / NODE;
+            for (int x = 0; x < CELL; ++x) {
+                const float t = float(x) / CELL, t_node = float(x % NODE) / NODE;
+                share[y][x] = (above[0] * (1 - t) + above[1] * t) * (1 - s) + (below[0] * (1 - t) + below[1] * t) * s;
+                if (!saturated) continue;
+                const float *upper = &nodes[y / NODE][x / NODE], *lower = &nodes[y / NODE + 1][x / NODE];
+                share[y][x] *= (upper[0] * (1 - t_node) + upper[1] * t_node) * (1 - s_node) + (lower[0] * (1 - t_node) + lower[1] * t_node) * s_node;
+            }
+        }
+        return true;
+    }
+
+    void write(int cy, int cx, int channel, float *tile, const float (*share)[CELL]) {
+        const int rows = std::min(CELL, size_.height - cy * CELL), columns = std::min(CELL, size_.width - cx * CELL);
+        const size_t pixel = size_t(size_.channels), line = size_t(size_.width) * pixel;
+        const size_t at = size_t(cy * CELL) * line + size_t(cx * CELL) * pixel + size_t(channel);
+        const Code *in = image_ + at;
+        Code *out = result_ + at;
+        if (share)
+            for (int y = 0; y < rows; ++y)
+                for (int x = 0; x < columns; ++x) {
+                    const float before = light_of(in[y * line + x * pixel], codec_);
+                    tile[y * CELL + x] = before + share[y][x] * (tile[y * CELL + x] - before);
+                }
+        Code codes[CELL * CELL];
+        encoder_.encode(tile, codes);
+        if (share)
+            for (int y = 0; y < rows; ++y)
+                for (int x = 0; x < columns; ++x)
+                    if (share[y][x] == 0) codes[y * CELL + x] = in[y * line + x * pixel];
+        for (int y = 0; y < rows; ++y) {
+            if (pixel == 1) std::memcpy(out + y * line, codes + y * CELL, size_t(columns) * sizeof(Code));
+            else
+                for (int x = 0; x < columns; ++x) out[y * line + x * pixel] = codes[y * CELL + x];
+        }
+    }
+
+    void copy(int cy, int cx) {
+        const int rows = std::min(CELL, size_.height - cy * CELL), columns = std::min(CELL, size_.width - cx * CELL);
+        for (int y = 0; y < rows; ++y) {
+            const size_t at = (size_t(cy * CELL + y) * size_t(size_.width) + size_t(cx * CELL)) * size_t(size_.channels);
+            std::memcpy(result_ + at, image_ + at, size_t(columns) * size_t(size_.channels) * sizeof(Code));
+        }
+    }
+
+    const Code *image_;
+    Code *result_;
+    Image size_;
+    const Field &field_;
+    const Table &table_;
+    const Codec &codec_;
+    const Simd &simd_;
+    int threads_;
+    Encoder<Code> encoder_;
+    Saturation saturation_;
+    std::vector<Plane> planes_[2];  // by channel; [1] transposed
+};
+
+}  // namespace
+
+template <class Code>
+Seconds deblur(const Code *image, Code *result, Image size, const Field &field, const Table &table, const Codec &codec, const Simd &simd, int threads) {
+    return Deblur<Code>(image, result, size, field, table, codec, simd, threads > 0 ? threads : usable_threads()).run();
+}
+
+template Seconds deblur(const uint8_t *, uint8_t *, Image, const Field &, const Table &, const Codec &, const Simd &, int);
+template Seconds deblur(const uint16_t *, uint16_t *, Image, const Field &, const Table &, const Codec &, const Simd &, int);
+template Seconds deblur(const float *, float *, Image, const Field &, const Table &, const Codec &, const Simd &, int);

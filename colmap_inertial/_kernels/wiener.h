@@ -1,0 +1,47 @@
+// Directional Wiener filter: one image in, one image out, in its own codes.
+#pragma once
+
+#include "wiener_simd.h"
+
+#include <cstdint>
+
+struct Field {
+    int ny, nx;              // cells
+    const float *extent;     // (ny, nx) blur along the major axis, px
+    const float *slope;      // (ny, nx) minor over major component
+    const bool *along_y;     // (ny, nx) whether the major axis is y
+    const float *fade;       // (ny + 1, nx + 1) share of the result at the corners
+};
+
+struct Table {
+    int rows, width;         // width: T + 1
+    float first, steps;      // row i is for (first + i) / steps px
+    const float *weights;    // (rows, width)
+    const int32_t *reach;    // (rows,)
+};
+
+struct Codec {
+    const float *decode;     // linear light of every code
+    const float *encode;     // codes of evenly spaced light, encode_steps + 2 entries
+    int encode_steps;
+    int saturated;           // codes from here on are
+};
+
+struct Image {
+    int height, width, channels;
+};
+
+// The instruction set of that name, or the best one where the name is empty; null where the processor lacks it.
+const Simd *simd_named(const char *name);
+
+// As many as the process may run on.
+int usable_threads();
+
+// Code: uint8_t or uint16_t with a codec; float is linear light already, for which the codec is not read.
+// Returns the seconds that decoding took and that filtering took, on the clock on the wall.
+struct Seconds {
+    double decode, filter;
+};
+template <class Code>
+Seconds deblur(const Code *image, Code *result, Image size, const Field &field, const Table &table, const Codec &codec,
+               const Simd &simd, int threads);

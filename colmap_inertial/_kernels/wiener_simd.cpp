@@ -1,0 +1,109 @@
+// Compiled once for each instruction set. No standard headers beyond the C ones: an inline function of theirs, compiled
+// here for AVX-512, could otherwise be the copy that the linker keeps for everybody.
+#include "wiener_simd.h"
+
+#include <string.h>
+
+#define JOIN_(a, b) a##b
+#define JOIN(a, b) JOIN_(a, b)
+#define TEXT_(a) #a
+#define TEXT(a) TEXT_(a)
+
+namespace {
+
+#if defined(__AVX512F__)
+constexpr int LANES = 16, ROWS = 16, CHAINS = 24;  // 16 of 32 registers add up; 17 loads for 32 multiply-adds
+#elif defined(__AVX2__)
+constexpr int LANES = 8, ROWS = 8, CHAINS = 12;
+#else
+constexpr int LANES = 4, ROWS = 8, CHAINS = 12;
+#endif
+
+typedef float Vector __attribute__((vector_size(4 * LANES)));
+
+inline Vector load(const float *at) {
+    Vector v;
+    memcpy(&v, at, sizeof v);
+    // Into a register, once: GCC would rather read memory again for every multiply-add.
+#if defined(__AVX512F__)
+    __asm__("" : "+v"(v));
+#elif defined(__x86_64__)
+    __asm__("" : "+x"(v));
+#endif
+    return v;
+}
+
+void place(const float *__restrict lower, const float *__restrict upper, float fraction, float slope, ptrdiff_t stride, Taps &taps) {
+    const int pitch = int(stride), reach = taps.reach;
+    float *__restrict near_weight = taps.near_weight, *__restrict far_weight = taps.far_weight;
+    int32_t *__restrict forward = taps.forward, *__restrict backward = taps.backward;
+    for (int j = 0; j <= reach; ++j) {
+        const float weight = lower[j] + (upper[j] - lower[j]) * fraction;
+        const float y = float(j) * slope;
+        int row = int(y);
+        row -= float(row) > y;
+        const float part = y - float(row);
+        near_weight[j] = weight - weight * part;
+        far_weight[j] = weight * part;
+        forward[j] = row * pitch + j;
+        backward[j] = -(row + 1) * pitch - j;
+    }
+}
+
+// LANES x ROWS pixels at once; every row that is loaded serves two rows of the result.
+inline void filter_block(const float *source, ptrdiff_t stride, const Taps &taps, float *tile) {
+    Vector sum[ROWS];
+    {
+        const float weight = taps.near_weight[0];
+#pragma GCC unroll 16
+        for (int r = 0; r < ROWS; ++r) sum[r] = weight * load(source + r * stride);
+    }
+    for (int j = 1; j <= taps.reach; ++j) {
+        const float near_weight = taps.near_weight[j], far_weight = taps.far_weight[j];
+        const float *at = source + taps.forward[j];
+        sum[0] += near_weight * load(at);
+#pragma GCC unroll 16
+        for (int r = 1; r < ROWS; ++r) {
+            const Vector row = load(at + r * stride);
+            sum[r] += near_weight * row;
+            sum[r - 1] += far_weight * row;
+        }
+        sum[ROWS - 1] += far_weight * load(at + ROWS * stride);
+
+        at = source + taps.backward[j];
+        sum[0] += far_weight * load(at);
+#pragma GCC unroll 16
+        for (int r = 1; r < ROWS; ++r) {
+            const Vector row = load(at + r * stride);
+            sum[r] += far_weight * row;
+            sum[r - 1] += near_weight * row;
+        }
+        sum[ROWS - 1] += near_weight * load(at + ROWS * stride);
+    }
+#pragma GCC unroll 16
+    for (int r = 0; r < ROWS; ++r) memcpy(tile + r * CELL, &sum[r], sizeof(Vector));
+}
+
+void filter(const float *source, ptrdiff_t stride, const Taps &taps, float *tile) {
+    for (int y = 0; y < CELL; y += ROWS)
+        for (int x = 0; x < CELL; x += LANES) filter_block(source + y * stride + x, stride, taps, tile + y * CELL + x);
+}
+
+double multiply_adds(int64_t rounds, float *sink) {
+    Vector sum[CHAINS], factor = Vector{} + 0.999f, term = Vector{} + 0.001f;
+#pragma GCC unroll 24
+    for (int i = 0; i < CHAINS; ++i) sum[i] = Vector{} + float(i);
+    for (int64_t round = 0; round < rounds; ++round) {
+#pragma GCC unroll 24
+        for (int i = 0; i < CHAINS; ++i) sum[i] = sum[i] * factor + term;
+    }
+    Vector total = {};
+#pragma GCC unroll 24
+    for (int i = 0; i < CHAINS; ++i) total += sum[i];
+    memcpy(sink, &total, sizeof(float));
+    return double(rounds) * CHAINS * LANES;
+}
+
+}  // namespace
+
+extern const Simd JOIN(simd_, SIMD) = {TEXT(SIMD), LANES, place, filter, multiply_adds};

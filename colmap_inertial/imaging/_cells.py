@@ -1,0 +1,78 @@
+"""How an image is divided for deblurring: cells with one set of taps each, and where its pixels stay untouched."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.types import Array
+
+#: Side of a cell. The vector of its centre holds for all its pixels.
+CELL_PX = 16
+#: Blurs shorter than the first are left alone, longer than the second treated in full; between them, blended.
+FADE_PX = (0.5, 1.0)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Cells:
+    """The blur of every cell.
+
+    Attributes
+    ----------
+    extent_px
+        (Ny, Nx) float32 length of the blur along its major axis, the axis of its larger component.
+    slope
+        (Ny, Nx) float32 minor over major component, within +-1.
+    along_y
+        (Ny, Nx) whether the major axis is y.
+    fade
+        (Ny + 1, Nx + 1) float32 share of the filter's result at the corners of the cells, 0 to 1.
+    """
+
+    extent_px: NDArray[np.float32]
+    slope: NDArray[np.float32]
+    along_y: NDArray[np.bool_]
+    fade: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, blur: BlurField, cell_px: int = CELL_PX) -> Cells:
+        """Cells of ``cell_px`` for a field."""
+        corner_y, corner_x = (np.arange(0, n + cell_px, cell_px) for n in (blur.height, blur.width))
+        centre_y, centre_x = (
+            (corner[:-1] + np.minimum(corner[1:], n) - 1) / 2
+            for corner, n in ((corner_y, blur.height), (corner_x, blur.width))
+        )
+        centre = _sample(blur, centre_y, centre_x)
+        size = np.abs(centre)
+        along_y = size[..., 1] > size[..., 0]
+        major, minor = np.where(along_y, centre[..., ::-1].transpose(2, 0, 1), centre.transpose(2, 0, 1))
+        slope = np.divide(minor, major, out=np.zeros_like(major), where=major != 0)
+        corner = _sample(blur, np.minimum(corner_y, blur.height - 1), np.minimum(corner_x, blur.width - 1))
+        low, high = FADE_PX
+        fade = np.clip((np.hypot(corner[..., 0], corner[..., 1]) - low) / (high - low), 0, 1)
+        return cls(
+            extent_px=np.abs(major).astype(np.float32),
+            slope=slope.astype(np.float32),
+            along_y=along_y,
+            fade=fade.astype(np.float32),
+        )
+
+
+def _sample(blur: BlurField, rows: Array, columns: Array) -> Array:
+    """(R, C, 2) the field at the crossings of rows and columns."""
+
+    def weights(at: Array, nodes: int) -> Array:
+        position = at / blur.step_px
+        index = np.minimum(position.astype(np.intp), nodes - 2)
+        matrix = np.zeros((len(at), nodes))
+        matrix[np.arange(len(at)), index] = 1 - (position - index)
+        matrix[np.arange(len(at)), index + 1] = position - index
+        return matrix
+
+    gy, gx, _ = blur.vector_px.shape
+    v = blur.vector_px.astype(np.float64)
+    down, across = weights(np.asarray(rows), gy), weights(np.asarray(columns), gx)
+    return np.stack([down @ v[..., i] @ across.T for i in range(2)], axis=-1)

@@ -1,0 +1,108 @@
+"""The directional Wiener filter in numpy: slow, plain, and the truth that the compiled one is tested against."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.imaging._cells import CELL_PX, Cells
+from colmap_inertial.imaging._taps import TapTable
+from colmap_inertial.types import Array
+
+#: Spacing of the points at which the influence of saturated pixels is worked out; between them it is bilinear.
+NODE_PX = 4
+#: The result counts nothing up to the first distance from a saturated pixel, and in full from the second one on; in
+#: blur lengths, along the blur. The filter reaches two lengths, and a clipped light echoes most where it ends.
+SATURATION_REACH = (2.0, 2.5)
+
+
+def filter_reference(light: Array, cells: Cells, table: TapTable, cell_px: int = CELL_PX) -> Array:
+    """Deblur one channel of linear light.
+
+    Parameters
+    ----------
+    light
+        (H, W).
+    cells
+        The blur.
+    table
+        Taps for its lengths.
+    cell_px
+        Side of the cells; 1 gives every pixel its own taps.
+
+    Returns
+    -------
+    (H, W) ``sum_j w_j g(x + j, y + j slope)`` along the major axis, linearly interpolated between rows (columns where
+    the major axis is y), the image mirrored about the centres of its border pixels.
+    """
+    height, width = light.shape
+    y, x = np.mgrid[:height, :width]
+    extent, slope, along_y = (
+        a[y // cell_px, x // cell_px] for a in (cells.extent_px.astype(np.float64), cells.slope, cells.along_y)
+    )
+    slope = slope.astype(np.float64)
+    row, fraction = table.at(extent)
+    reach = table.weights.shape[1] - 1
+    result = np.zeros((height, width))
+    for j in range(-reach, reach + 1):
+        taps = table.weights[:, abs(j)].astype(np.float64)
+        weight = taps[row] * (1 - fraction) + taps[row + 1] * fraction
+        minor = j * slope
+        before = np.floor(minor).astype(np.intp)
+        part = minor - before
+        for step, share in ((before, 1 - part), (before + 1, part)):
+            source_y = mirrored(y + np.where(along_y, j, step), height)
+            source_x = mirrored(x + np.where(along_y, step, j), width)
+            result += weight * share * light[source_y, source_x]
+    return result
+
+
+def mirrored(index: NDArray[np.intp], size: int) -> NDArray[np.intp]:
+    """Indices reflected into ``0 .. size - 1`` about the first and last element, as often as needed."""
+    if size == 1:
+        return np.zeros_like(index)
+    index = np.abs(index) % (2 * size - 2)
+    return np.minimum(index, 2 * size - 2 - index)
+
+
+def share_reference(saturated: NDArray[np.bool_], cells: Cells) -> Array:
+    """(H, W) share of the filter's result at every pixel, 0 to 1; the rest is the input.
+
+    Short blurs fade out. So does the result near saturated pixels, whose true light is unknown.
+    """
+    height, width = saturated.shape
+    per_cell = CELL_PX // NODE_PX
+    ny, nx = cells.extent_px.shape
+    near = np.zeros((per_cell * ny + 1, per_cell * nx + 1), dtype=bool)  # a saturated pixel less than NODE_PX away
+    rows, columns = np.nonzero(saturated)
+    for dy in (0, 1):
+        for dx in (0, 1):
+            near[rows // NODE_PX + dy, columns // NODE_PX + dx] = True
+    i, j = np.mgrid[: near.shape[0], : near.shape[1]]
+    cell = np.minimum(i // per_cell, ny - 1), np.minimum(j // per_cell, nx - 1)
+    extent, slope, along_y = cells.extent_px[cell], cells.slope[cell], cells.along_y[cell]
+    share = np.ones(near.shape, dtype=np.float32)
+    zero_to, one_from = (np.float32(r) for r in SATURATION_REACH)
+    for step in range(int(one_from * extent.max() / NODE_PX), -1, -1):
+        minor = np.floor(np.float32(step) * slope + np.float32(0.5)).astype(np.intp)
+        for sign in (-1, 1):
+            at_y = i + sign * np.where(along_y, step, minor)
+            at_x = j + sign * np.where(along_y, minor, step)
+            inside = (at_y >= 0) & (at_y < near.shape[0]) & (at_x >= 0) & (at_x < near.shape[1])
+            hit = (
+                inside
+                & near[np.where(inside, at_y, 0), np.where(inside, at_x, 0)]
+                & (NODE_PX * step <= one_from * extent)
+            )
+            lengths = np.float32(NODE_PX * step) / np.maximum(extent, np.float32(1e-6))
+            share = np.where(hit, np.clip((lengths - zero_to) / (one_from - zero_to), 0, 1), share)
+    return _bilinear(cells.fade, CELL_PX, height, width) * _bilinear(share, NODE_PX, height, width)
+
+
+def _bilinear(nodes: NDArray[np.floating], step_px: int, height: int, width: int) -> Array:
+    """(height, width) interpolation of values at every ``step_px``-th pixel."""
+    (i, s), (j, t) = (np.divmod(np.arange(n), step_px) for n in (height, width))
+    s, t = s[:, None] / step_px, t / step_px
+    upper = nodes[i][:, j] * (1 - t) + nodes[i][:, j + 1] * t
+    lower = nodes[i + 1][:, j] * (1 - t) + nodes[i + 1][:, j + 1] * t
+    return np.asarray(upper * (1 - s) + lower * s)
