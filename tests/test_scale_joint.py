@@ -10,9 +10,10 @@ from colmap_inertial.geometry import quat_cumulative, quat_exp, quat_from_matrix
 from colmap_inertial.scale import ScaleOptions, estimate_scale, first_seconds
 from colmap_inertial.scale import _factors as fac
 from colmap_inertial.scale import _parameters as par
+from colmap_inertial.scale._grouping import first_of_groups, group_frames
 from colmap_inertial.scale._noise import TYPICAL
 from colmap_inertial.scale._preintegration import Track, preintegrate, running_product
-from colmap_inertial.scale._setup import prepare, state_frames
+from colmap_inertial.scale._setup import prepare
 from colmap_inertial.scale._solver import ArrowSystem
 from colmap_inertial.scale.joint import JointOptions, estimate_joint
 from colmap_inertial.simulate.motion import MotionOptions
@@ -126,9 +127,9 @@ def test_the_preintegrated_covariance_is_that_of_noisy_samples():
 
 def test_the_arrow_solver_agrees_with_a_dense_inverse():
     rng = np.random.default_rng(5)
-    k, m, n = 6, 3, 2
+    k, m, n = 150, 3, 2  # more states than are whitened at once
     size = k * m + n
-    root = np.zeros((200, size))
+    root = np.zeros((3000, size))
     for row in root:
         i = rng.integers(0, k - 1) * m
         row[i : i + 2 * m] = rng.standard_normal(2 * m)
@@ -160,7 +161,7 @@ def test_derivatives_of_all_residuals_are_those_of_finite_differences(recording,
     x = replace(
         prior.mean,
         metres_per_unit=recording.truth.metres_per_unit,
-        imu_in_world_m=data.centre * recording.truth.metres_per_unit + 0.002 * rng.standard_normal((k, 3)),
+        imu_in_world_m=data.groups.centre * recording.truth.metres_per_unit + 0.002 * rng.standard_normal((k, 3)),
         velocity_m_s=0.3 * rng.standard_normal((k, 3)),
         imu_in_cam_m=np.array([0.03, -0.02, 0.01]),
         shutter=1e-5 * rng.standard_normal((4, 3, 3)),
@@ -200,10 +201,43 @@ def test_derivatives_of_all_residuals_are_those_of_finite_differences(recording,
             assert np.allclose(change, expected, atol=1e-2 * np.abs(expected).max() + 1e-7), name
 
 
-def test_video_is_thinned_and_keyframes_are_not():
-    assert np.array_equal(state_frames(np.arange(60) / 30, 5.0), np.arange(0, 60, 6))
+def test_frames_of_a_video_are_grouped_and_keyframes_are_not():
+    none = np.zeros(59)
+    assert np.array_equal(first_of_groups(np.arange(60) / 30, 5.0, none), np.arange(0, 60, 6))
     sparse_s = np.array([0.0, 0.3, 0.5, 7.0])
-    assert np.array_equal(state_frames(sparse_s, 5.0), np.arange(4))
+    assert np.array_equal(first_of_groups(sparse_s, 5.0, np.zeros(3)), np.arange(4))
+    pause = np.where(np.arange(59) == 8, 0.1, 0.0)
+    assert first_of_groups(np.arange(60) / 30, 5.0, pause)[:4].tolist() == [0, 6, 9, 15]
+
+
+def test_a_group_tells_the_motion_at_its_mean_instant():
+    # A body that turns at a steady rate and is pushed by a steady force: everything has a closed form
+    rate, force, cam_from_imu = (
+        np.array([0.4, -0.8, 0.6]),
+        np.array([1.0, 2.0, -0.5]),
+        so3_exp(np.array([1.0, 0.3, 2.0])),
+    )
+    t_s = np.arange(0, 0.19, 1 / 30)
+    samples_s = np.arange(-1, 2, 0.005)
+    world_from_imu = so3_exp(t_s[:, None] * rate)
+    force_in_body = (so3_exp(-samples_s[:, None] * rate) @ force[:, None])[:, :, 0]
+    groups = group_frames(
+        t_s,
+        world_from_imu @ cam_from_imu.T,
+        np.outer(t_s, [1.0, 0, 0]),
+        rate_hz=5.0,
+        gyro=Track.of(samples_s, np.tile(rate + 0.01, (len(samples_s), 1))),
+        accel=Track.of(samples_s, force_in_body),
+        gyro_bias_rad_s=np.full(3, 0.01),
+        cam_from_imu=cam_from_imu,
+    )
+    middle_s = t_s.mean()
+    assert groups.t_s == pytest.approx([middle_s]) and groups.count.tolist() == [6]
+    body = so3_exp(middle_s * rate)
+    assert np.allclose(groups.world_from_cam[0], body @ cam_from_imu.T, atol=1e-9)
+    assert np.allclose(body @ groups.thrown_m[0], 0.5 * np.mean((t_s - middle_s) ** 2) * force, atol=1e-8)
+    assert np.allclose(groups.turned[0], so3_exp((t_s - middle_s)[:, None] * rate).mean(axis=0), atol=1e-9)
+    assert np.allclose(groups.centre[0], [middle_s, 0, 0])
 
 
 def test_scale_gravity_bias_and_calibration_are_recovered(recording, calibration):

@@ -7,11 +7,11 @@ Rotations change on the right (``R exp(d)``, body frame), cam_from_imu on the le
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from colmap_inertial.geometry import skew, so3_log
+from colmap_inertial.geometry import skew, so3_exp, so3_log
 from colmap_inertial.scale import _parameters as par
 from colmap_inertial.scale._parameters import Data, Estimate, Noise, Prior
 from colmap_inertial.scale._preintegration import Preintegrated, preintegrate
@@ -102,6 +102,38 @@ def integrate(data: Data, x: Estimate) -> Preintegrated:
     )
 
 
+def still_near(then: Estimate, x: Estimate, t_s: Array) -> bool:
+    """Whether the increments of an earlier estimate need only :func:`corrected` to be those of this one."""
+    delay_s = abs(x.delay_s - then.delay_s) + abs(x.clock_rate - then.clock_rate) * 0.5 * float(np.ptp(t_s))
+    return bool(
+        delay_s < 3e-4
+        and abs(x.accel_delay_s - then.accel_delay_s) < 1e-3
+        and np.max(np.abs(x.gyro_bias_rad_s - then.gyro_bias_rad_s)) < 1e-3
+        and np.max(np.abs(x.gyro_gain - then.gyro_gain)) < 2e-3
+    )
+
+
+def corrected(pre: Preintegrated, then: Estimate, x: Estimate) -> Preintegrated:
+    """Increments that were integrated for the estimate ``then``, for ``x``, to first order."""
+    gyro_gain, accel_gain = x.gyro_gain - then.gyro_gain, x.accel_gain - then.accel_gain
+    gyro_bias = x.gyro_bias_rad_s - then.gyro_bias_rad_s
+    accel_bias = x.accel_bias_m_s2 + x.accel_walk_m_s2 - then.accel_bias_m_s2 - then.accel_walk_m_s2
+    change = (
+        _mv(pre.by_gyro_bias, gyro_bias[:-1])
+        + _mv(pre.by_accel_bias, accel_bias[:-1])
+        + pre.by_gyro_gain @ gyro_gain.ravel()
+        + pre.by_accel_gain @ accel_gain.ravel()
+        + pre.by_accel_delay * (x.accel_delay_s - then.accel_delay_s)
+    )
+    return replace(
+        pre,
+        rotation=so3_exp(change[:, :3]) @ pre.rotation,
+        velocity=pre.velocity + change[:, 3:6],
+        position=pre.position + change[:, 6:],
+        rate_rad_s=pre.rate_rad_s + (pre.rate_rad_s + then.gyro_bias_rad_s) @ gyro_gain.T - gyro_bias,
+    )
+
+
 def imu_group(noise: Noise, x: Estimate, pre: Preintegrated, *, rotation_only: bool = False) -> Group:
     """Rows: rotation, velocity, position between consecutive nodes."""
     k, dt = len(pre.dt_s), pre.dt_s[:, None]
@@ -159,11 +191,15 @@ def visual_groups(data: Data, noise: Noise, x: Estimate, rate_rad_s: Array, *, r
     k = len(data.t_s)
     camera = x.world_from_imu @ x.cam_from_imu.T  # world_from_cam
     cam_from_world = camera.transpose(0, 2, 1)
-    rate = rate_rad_s @ x.cam_from_imu.T
+    # Mean rate of the group's frames: what row times and a delay act on
+    mean_rate_rad_s = data.groups.rate_rad_s @ (np.eye(3) + x.gyro_gain).T - x.gyro_bias_rad_s
+    rate = mean_rate_rad_s @ x.cam_from_imu.T
     velocity = _mv(cam_from_world, x.velocity_m_s)
     rotation_by_rate, rotation_by_velocity, centre_by_rate, centre_by_velocity = x.shutter
 
-    rotation = so3_log(data.world_from_cam.transpose(0, 2, 1) @ camera)
+    rotation = so3_log(data.groups.world_from_cam.transpose(0, 2, 1) @ camera)
+    # The frames were moved to their mean instant with the first guess of the delay
+    rotation = rotation + (rate_rad_s @ x.cam_from_imu.T - rate) * x.delay_s
     rotation_here = np.zeros((k, 3, par.N_STATE))
     rotation_here[:, :, par.THETA] = x.cam_from_imu
     since_middle = (data.t_s - par.middle_s(data.t_s))[:, None]
@@ -174,19 +210,26 @@ def visual_groups(data: Data, noise: Noise, x: Estimate, rate_rad_s: Array, *, r
 
     lever_body = x.cam_from_imu.T @ x.imu_in_cam_m
     smear = rate @ centre_by_rate.T + velocity @ centre_by_velocity.T
+    half_spread_s2 = 0.5 * data.groups.spread_s2[:, None]
+    thrown = data.groups.thrown_m - half_spread_s2 * (x.accel_bias_m_s2 + x.accel_walk_m_s2)
+    thrown = thrown - _mv(data.groups.turned - np.eye(3), np.broadcast_to(lever_body, (k, 3)))
     predicted = x.imu_in_world_m + _mv(camera, smear - x.imu_in_cam_m)
+    predicted = predicted + half_spread_s2 * x.gravity_m_s2 + _mv(x.world_from_imu, thrown)
     camera_velocity = x.velocity_m_s - _mv(x.world_from_imu, np.cross(rate_rad_s, lever_body))
-    centre = data.centre * x.metres_per_unit - predicted - x.drift_m
+    centre = data.groups.centre * x.metres_per_unit - predicted - x.drift_m
     centre_here = np.zeros((k, 3, par.N_STATE))
     centre_here[:, :, par.POSITION] = -np.eye(3)
     centre_here[:, :, par.DRIFT] = -np.eye(3)
-    centre_here[:, :, par.THETA] = -x.world_from_imu @ skew(lever_body)
+    centre_here[:, :, par.THETA] = x.world_from_imu @ skew(thrown - lever_body)
+    centre_here[:, :, par.ACCEL_WALK] = half_spread_s2[:, :, None] * x.world_from_imu
     centre_here[:, :, par.VELOCITY] = -camera @ centre_by_velocity @ cam_from_world
     centre_z = np.zeros((k, 3, par.N_GLOBALS))
     # The noise sits on the visual centre, so a change of log u scales the prediction: total least squares
     centre_z[:, :, par.SCALE] = -predicted
     centre_z[:, :, par.ROTATION] = camera @ skew(x.imu_in_cam_m)
-    centre_z[:, :, par.LEVER] = camera
+    centre_z[:, :, par.GRAVITY] = -half_spread_s2[:, :, None] * np.eye(3)
+    centre_z[:, :, par.ACCEL_BIAS] = half_spread_s2[:, :, None] * x.world_from_imu
+    centre_z[:, :, par.LEVER] = x.world_from_imu @ data.groups.turned @ x.cam_from_imu.T
     centre_z[:, :, par.DELAY] = camera_velocity
     centre_z[:, :, par.CLOCK_RATE] = camera_velocity * since_middle
 
@@ -210,7 +253,13 @@ def visual_groups(data: Data, noise: Noise, x: Estimate, rate_rad_s: Array, *, r
 
     groups = []
     for residual, here, z, root, columns in (
-        (rotation, rotation_here, rotation_z, data.rotation_shape / noise.rotation_rad, par.VISUAL_GLOBALS),
+        (
+            rotation,
+            rotation_here,
+            rotation_z,
+            data.rotation_shape / (noise.rotation_rad * noise.rotation_alike),
+            par.VISUAL_GLOBALS,
+        ),
         (centre, centre_here, centre_z, data.centre_shape / noise.centre_m, slice(0, par.N_GLOBALS)),
     ):
         whitened = _mv(root, residual)

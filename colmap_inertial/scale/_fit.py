@@ -70,11 +70,14 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
     noise = start
     x = _rotations_first(data, noise, prior)
     scale = _moment_scale(data, x)
-    x = replace(x, metres_per_unit=scale, imu_in_world_m=data.centre * scale)
+    x = replace(x, metres_per_unit=scale, imu_in_world_m=data.groups.centre * scale)
     signs: dict[str, Array] = {}
     converged = False
+    integrated, there = fac.integrate(data, x), x
     for iteration in range(_MAX_ITERATIONS):
-        pre = fac.integrate(data, x)
+        if not fac.still_near(there, x, data.t_s):
+            integrated, there = fac.integrate(data, x), x
+        pre = fac.corrected(integrated, there, x)
         groups = fac.all_groups(data, noise, prior, x, pre, robust=iteration > 2)
         signs = signs or levels.random_signs(groups, _PROBES)
         system, rhs, rhs_z = fac.normal_equations(list(groups.values()), prior, x)
@@ -83,7 +86,7 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
         for name, group in groups.items():
             group.pull_back(signs[name], rhs[:, :, 1:], rhs_z[:, 1:])
         states, z, cov = system.solve(rhs, rhs_z)
-        sums = levels.sums_of_squares(groups, signs, states, z)
+        sums = levels.sums_of_squares(noise, groups, signs, states, z)
         step = abs(float(z[par.SCALE, 0]))
         shrink = min(1.0, _LARGEST_STEP / max(step, 1e-12))
         x = x.moved(states[:, :, 0] * shrink, z[:, 0] * shrink, pre.rate_rad_s, data.t_s)
@@ -91,7 +94,7 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
         converged = step < 0.2 * sigma
         change = 1.0
         if iteration > 2:
-            noise, change = levels.updated_noise(noise, start, floor, sums)
+            noise, change = levels.updated_noise(noise, start, floor, sums, levels.alike(groups["rotation"], states, z))
         if step < 0.03 * sigma and change < 0.1:
             break
 
@@ -149,7 +152,7 @@ def _moment_scale(data: Data, x: Estimate) -> float:
     pre = fac.integrate(data, x)
     dt = pre.dt_s[:, None]
     per_s = 2 / (dt[1:] + dt[:-1])
-    visual = np.diff(np.diff(data.centre, axis=0) / dt, axis=0) * per_s
+    visual = np.diff(np.diff(data.groups.centre, axis=0) / dt, axis=0) * per_s
 
     def second_difference(velocity: Array, position: Array) -> Array:
         along = x.world_from_imu[:-1] @ position / dt[:, :, None]
@@ -169,7 +172,7 @@ def _moment_scale(data: Data, x: Estimate) -> float:
 
 def _second_half(data: Data, x: Estimate, centre: fac.Group, noise: Noise) -> Array:
     """(K, 3) derivative of the centres' residuals by a logarithm of the scale that only the second half has."""
-    path = -data.centre * x.metres_per_unit
+    path = -data.groups.centre * x.metres_per_unit
     middle = int(np.searchsorted(data.t_s, par.middle_s(data.t_s)))
     late = np.arange(len(path)) > middle
     column = np.where(late[:, None], path - path[middle], 0.0)

@@ -34,6 +34,8 @@ _COMPONENTS = {
     "centre_m": ("centre", slice(0, 3)),
     "drift_m_rts": ("drift", slice(0, 3)),
 }
+#: Largest correlation between errors of neighbouring rotations that is believed.
+_MOST_ALIKE = 0.8
 #: How many residuals the starting value counts as.
 _WEIGHT = 10.0
 #: Exponent of a ratio of variances; 0.5 converges slowly from afar.
@@ -61,7 +63,7 @@ def random_signs(groups: Mapping[str, Group], count: int) -> dict[str, Array]:
 
 
 def sums_of_squares(
-    groups: Mapping[str, Group], signs: Mapping[str, Array], states: Array, z: Array
+    noise: Noise, groups: Mapping[str, Group], signs: Mapping[str, Array], states: Array, z: Array
 ) -> dict[str, tuple[float, float]]:
     """For each level: the sum of squares of its residuals after a step, and what it would be at the right level.
 
@@ -75,13 +77,28 @@ def sums_of_squares(
         squares = float(np.sum((group.residual[:, rows] + change[:, :, 0]) ** 2))
         count = len(group.residual) if group.weight is None else float(group.weight.sum())
         rows_each = rows.stop - rows.start
+        if level == "rotation_rad":
+            squares *= noise.rotation_alike**2
         used = float(np.sum(signs[name][:, rows] * change[:, :, 1:])) / signs[name].shape[2]
         out[level] = squares, max(rows_each * count - used, 0.02 * rows_each * count)
     return out
 
 
+def alike(group: Group, states: Array, z: Array) -> float:
+    """``Noise.rotation_alike`` from the correlation of consecutive residuals after a step."""
+    residual = group.residual + group.apply(states, z)[:, :, 0]
+    squares = float(np.sum(residual**2))
+    correlation = float(np.sum(residual[1:] * residual[:-1])) / squares if squares > 0 else 0.0
+    correlation = float(np.clip(correlation, 0.0, _MOST_ALIKE))
+    return float(np.sqrt((1 + correlation) / (1 - correlation)))
+
+
 def updated_noise(
-    noise: Noise, start: Noise, floor: Mapping[str, float], sums: Mapping[str, tuple[float, float]]
+    noise: Noise,
+    start: Noise,
+    floor: Mapping[str, float],
+    sums: Mapping[str, tuple[float, float]],
+    rotation_alike: float,
 ) -> tuple[Noise, float]:
     """New levels, and the largest logarithmic change among them."""
     new, largest = {}, 0.0
@@ -92,4 +109,4 @@ def updated_noise(
         # robust weights have to follow
         new[level] = max(now * float(np.clip(ratio**_OVERSHOOT, 0.4, 2.5)), floor[level])
         largest = max(largest, abs(float(np.log(new[level] / now))))
-    return replace(noise, **new), largest
+    return replace(noise, **new, rotation_alike=rotation_alike), largest

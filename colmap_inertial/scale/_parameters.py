@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from colmap_inertial.geometry import so3_exp, so3_log
+from colmap_inertial.scale._grouping import Groups
 from colmap_inertial.scale._preintegration import Track
 from colmap_inertial.types import Array
 
@@ -35,16 +36,12 @@ N_STATE = 18
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Data:
-    """Measurements at K nodes, each a frame of the camera.
+    """Measurements at K nodes, each the mean of a few frames of the camera.
 
     Attributes
     ----------
-    t_s
-        (K,) camera time.
-    world_from_cam
-        (K, 3, 3) visual rotations.
-    centre
-        (K, 3) visual camera centres in model units, about their mean.
+    groups
+        Visual rotations and centres in model units, about their mean.
     rotation_shape, centre_shape
         (K, 3, 3) square roots of the information of the visual rotation (camera frame) and of the centre (world frame)
         given the rotation, for a noise level of one.
@@ -55,19 +52,26 @@ class Data:
         Readings over camera time, by the first guess of the offsets.
     """
 
-    t_s: Array
-    world_from_cam: Array
-    centre: Array
+    groups: Groups
     rotation_shape: Array
     centre_shape: Array
     coupling: Array
     gyro: Track
     accel: Track
 
+    @property
+    def t_s(self) -> Array:
+        """(K,) camera time."""
+        return self.groups.t_s
+
 
 @dataclass(frozen=True, kw_only=True)
 class Noise:
-    """Standard deviations: densities of the sensors, walks per root of a second, visual errors per frame."""
+    """Standard deviations: densities of the sensors, walks per root of a second, visual errors per state.
+
+    ``rotation_alike`` is the factor by which errors of visual rotations weigh more than white ones of their size, since
+    those of neighbouring states are alike: ``sqrt((1 + c) / (1 - c))`` for a correlation ``c``.
+    """
 
     gyro_rad_s_rthz: float
     gyro_walk_rad_s_rts: float
@@ -76,6 +80,7 @@ class Noise:
     rotation_rad: float
     centre_m: float
     drift_m_rts: float
+    rotation_alike: float = 1.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

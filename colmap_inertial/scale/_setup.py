@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.geometry import matrix_from_quat
 from colmap_inertial.scale import _parameters as par
+from colmap_inertial.scale._grouping import group_frames
 from colmap_inertial.scale._parameters import Data, Estimate, Prior
 from colmap_inertial.scale._preintegration import Track
 from colmap_inertial.types import Array, CameraImuCalibration, CameraTrajectory, ImuRecording, clock_shift_s
@@ -27,19 +27,6 @@ _COUPLING_M = 5.0
 #: An alignment's covariance stems from the very data that are used again here.
 _COUNTED_ONCE = 5.0
 _MIN_STATES = 8
-
-
-def state_frames(t_s: Array, rate_hz: float) -> NDArray[np.intp]:
-    """Indices of frames about ``1 / rate_hz`` apart; sparse frames all stay."""
-    step = 1 / rate_hz
-    slack = 0.5 * min(float(np.median(np.diff(t_s))), step) if len(t_s) > 1 else 0.0
-    keep: list[int] = []
-    last = -np.inf
-    for i, t in enumerate(t_s.tolist()):
-        if t - last >= step - slack:
-            keep.append(i)
-            last = t
-    return np.array(keep, dtype=np.intp)
 
 
 def prepare(
@@ -65,25 +52,36 @@ def prepare(
     begin_s = max(gyro.t_s[0], accel.t_s[0]) + margin_s
     end_s = min(gyro.t_s[-1], accel.t_s[-1]) - margin_s
     inside = np.flatnonzero((trajectory.t_s >= begin_s) & (trajectory.t_s <= end_s))
-    keep = inside[state_frames(trajectory.t_s[inside], states_hz)]
-    if len(keep) < _MIN_STATES:
+    centre = trajectory.cam_in_world[inside]
+    if len(inside) and float(np.max(np.ptp(centre, axis=0))) == 0.0:
+        raise NotObservableError("scale", "the camera does not move in the model: move it, do not only turn it")
+    cam_from_imu = matrix_from_quat(calibration.cam_from_imu_xyzw)
+    groups = None
+    if len(inside):
+        groups = group_frames(
+            trajectory.t_s[inside],
+            matrix_from_quat(trajectory.cam_from_world_xyzw[inside]).transpose(0, 2, 1),
+            centre - centre.mean(axis=0),
+            rate_hz=states_hz,
+            gyro=gyro,
+            accel=accel,
+            gyro_bias_rad_s=calibration.gyro_bias_rad_s,
+            cam_from_imu=cam_from_imu,
+        )
+    k = 0 if groups is None else len(groups.t_s)
+    if groups is None or k < _MIN_STATES:
         raise NotObservableError(
             "scale",
-            f"only {len(keep)} camera poses, spaced by 0.2 s or more, lie inside the IMU recording and at least "
+            f"only {k} camera poses, spaced by 0.2 s or more, lie inside the IMU recording and at least "
             f"{_MIN_STATES} are needed: record a longer clip, or check that both recordings belong together",
         )
-    k = len(keep)
-    world_from_cam = matrix_from_quat(trajectory.cam_from_world_xyzw[keep]).transpose(0, 2, 1)
-    centre = trajectory.cam_in_world[keep]
-    if float(np.max(np.ptp(centre, axis=0))) == 0.0:
-        raise NotObservableError("scale", "the camera does not move in the model: move it, do not only turn it")
-    rotation_shape, centre_shape, coupling = _pose_shapes(
-        None if trajectory.pose_cov is None else trajectory.pose_cov[keep], world_from_cam
-    )
+    world_from_cam = groups.world_from_cam
+    pose_cov = None
+    if trajectory.pose_cov is not None:
+        pose_cov = np.add.reduceat(trajectory.pose_cov[inside], groups.first, axis=0) / groups.count[:, None, None]
+    rotation_shape, centre_shape, coupling = _pose_shapes(pose_cov, world_from_cam)
     data = Data(
-        t_s=trajectory.t_s[keep],
-        world_from_cam=world_from_cam,
-        centre=centre - centre.mean(axis=0),
+        groups=groups,
         rotation_shape=rotation_shape,
         centre_shape=centre_shape,
         coupling=coupling,
@@ -91,7 +89,6 @@ def prepare(
         accel=accel,
     )
 
-    cam_from_imu = matrix_from_quat(calibration.cam_from_imu_xyzw)
     world_from_imu = world_from_cam @ cam_from_imu
     mean_force = np.mean((world_from_imu @ accel.at(data.t_s)[0][:, :, None])[:, :, 0], axis=0)
     zeros = np.zeros((k, 3))

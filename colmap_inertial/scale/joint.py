@@ -31,6 +31,9 @@ _LARGEST_BIAS_M_S2 = 1.5
 #: tried on have 3 to 9; by chance, 28 is exceeded once in a thousand.
 _LARGEST_GAIN_CHI2 = 28.0
 _DISAGREEMENT_SIGMAS = 3.0
+#: The accelerometer's noise between states over the motion's acceleration: 0.02 to 0.1 in good recordings, 0.4 and more
+#: where an axis is mirrored.
+_LARGEST_UNEXPLAINED = 0.25
 _RECORD_INSTEAD = (
     "move the camera itself back and forth by 20 cm or more, in several directions and briskly, for 10 s or longer, "
     "while it sees texture; panning, walking straight at one speed and a tripod cannot give a scale"
@@ -47,8 +50,8 @@ class JointOptions:
     gravity_sigma_m_s2: float = 0.02
     """Its standard deviation; the default spans 9.78 at the equator to 9.83 at the poles."""
 
-    states_hz: float = 5.0
-    """Video is thinned to this many frames a second: errors of closer frames are too alike to tell more."""
+    states_hz: float = 8.0
+    """Poses of a video are averaged to this many a second."""
 
     def __post_init__(self) -> None:
         if not (self.gravity_m_s2 > 0 and self.gravity_sigma_m_s2 > 0 and self.states_hz > 0):
@@ -152,7 +155,7 @@ def _refusals(fit: Fit, t_s: Array) -> list[str]:
         )
     # Noise of the accelerometer averaged between states, against the acceleration that it should measure
     unexplained = fit.noise.accel_m_s2_rthz / float(np.sqrt(np.median(np.diff(t_s))))
-    if unexplained > 0.5 * fit.excitation_m_s2:
+    if unexplained > _LARGEST_UNEXPLAINED * fit.excitation_m_s2:
         out.append(
             f"the accelerometer and the camera's motion disagree by {unexplained:.2f} m/s2, where the motion itself is "
             f"{fit.excitation_m_s2:.2f} m/s2: check the accelerometer's sign and axes and that both recordings belong "

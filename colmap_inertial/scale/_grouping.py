@@ -1,0 +1,142 @@
+"""Frames of a video, a fifth of a second at a time: one averaged pose for each state of the joint fit.
+
+Averaging keeps what every frame says without a state for every frame. Within a group the IMU tells the motion far
+better than pictures do, so frames are compared after moving them to the group's mean instant: rotations by the
+gyroscope, centres by what the accelerometer and gravity add to a uniform motion.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.geometry import matrix_from_quat, quat_exp, quat_multiply, so3_exp, so3_log
+from colmap_inertial.scale._preintegration import Track
+from colmap_inertial.types import Array
+
+#: Steps of the integration from a group's mean instant to a frame, 0.1 s at most.
+_STEPS = 8
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Groups:
+    """K groups of frames, each with the motion around its mean instant.
+
+    Attributes
+    ----------
+    first
+        (K,) index of a group's first frame; groups are consecutive.
+    count
+        (K,) numbers of frames.
+    t_s
+        (K,) mean times of the frames.
+    world_from_cam
+        (K, 3, 3) means of the rotations, moved to ``t_s``.
+    centre
+        (K, 3) means of the centres.
+    spread_s2
+        (K,) mean squares of the frames' times about ``t_s``.
+    turned
+        (K, 3, 3) means of the body's rotation since ``t_s``.
+    thrown_m
+        (K, 3) means of what the readings of the accelerometer add to the position since ``t_s``, body frame at ``t_s``.
+    rate_rad_s
+        (K, 3) mean readings of the gyroscope, body frame.
+    """
+
+    first: NDArray[np.intp]
+    count: NDArray[np.intp]
+    t_s: Array
+    world_from_cam: Array
+    centre: Array
+    spread_s2: Array
+    turned: Array
+    thrown_m: Array
+    rate_rad_s: Array
+
+
+def first_of_groups(t_s: Array, rate_hz: float, pauses: Array) -> NDArray[np.intp]:
+    """Indices where a new group begins: ``1 / rate_hz`` after the last beginning, and after a pause of the IMU.
+
+    Parameters
+    ----------
+    t_s
+        (F,) times of the frames.
+    rate_hz
+        Groups per second; sparser frames are groups of their own.
+    pauses
+        (F - 1,) seconds of pauses of the IMU between consecutive frames.
+    """
+    step = 1 / rate_hz
+    slack = 0.5 * min(float(np.median(np.diff(t_s))), step) if len(t_s) > 1 else 0.0
+    begins: list[int] = []
+    last = -np.inf
+    paused = np.concatenate([[False], pauses > 0]).tolist()
+    for i, t in enumerate(t_s.tolist()):
+        if t - last >= step - slack or paused[i]:
+            begins.append(i)
+            last = t
+    return np.array(begins, dtype=np.intp)
+
+
+def group_frames(
+    t_s: Array,
+    world_from_cam: Array,
+    centre: Array,
+    *,
+    rate_hz: float,
+    gyro: Track,
+    accel: Track,
+    gyro_bias_rad_s: Array,
+    cam_from_imu: Array,
+) -> Groups:
+    """Average the poses of frames (F,), (F, 3, 3), (F, 3) in groups.
+
+    Parameters
+    ----------
+    gyro, accel
+        Readings over camera time; the frames lie inside.
+    gyro_bias_rad_s
+        (3,) subtracted from the readings.
+    cam_from_imu
+        (3, 3) from the alignment: its error matters little over the small rotations within a group.
+    """
+    first = first_of_groups(t_s, rate_hz, gyro.gap_s(t_s[:-1], t_s[1:]) + accel.gap_s(t_s[:-1], t_s[1:]))
+    count = np.diff(first, append=len(t_s))
+    group = np.repeat(np.arange(len(first)), count)
+
+    def mean(values: Array) -> Array:
+        total = np.add.reduceat(values, first, axis=0)
+        return np.asarray(total / count.reshape(-1, *[1] * (values.ndim - 1)))
+
+    mean_s = mean(t_s)
+    since_s = t_s - mean_s[group]
+    step_s = since_s / _STEPS
+    turned = np.zeros((len(t_s), 4))
+    turned[:, 3] = 1.0
+    # Two integrations at once: each step's force, at its middle, acts on the position for the rest of the time
+    thrown = np.zeros((len(t_s), 3))
+    for i in range(_STEPS):
+        middle_s = mean_s[group] + (i + 0.5) * step_s
+        half = quat_exp((gyro.at(middle_s)[0] - gyro_bias_rad_s) * (0.5 * step_s)[:, None])
+        turned = quat_multiply(turned, half)
+        force = (matrix_from_quat(turned) @ accel.at(middle_s)[0][:, :, None])[:, :, 0]
+        thrown += force * (step_s * (_STEPS - i - 0.5) * step_s)[:, None]
+        turned = quat_multiply(turned, half)
+    turns = matrix_from_quat(turned)
+    moved = world_from_cam @ (cam_from_imu @ turns.transpose(0, 2, 1) @ cam_from_imu.T)
+    reference = moved[first][group]
+    away = mean(so3_log(reference.transpose(0, 2, 1) @ moved))
+    return Groups(
+        first=first,
+        count=count,
+        t_s=mean_s,
+        world_from_cam=moved[first] @ so3_exp(away),
+        centre=mean(centre),
+        spread_s2=mean(since_s**2),
+        turned=mean(turns),
+        thrown_m=mean(thrown),
+        rate_rad_s=mean(gyro.at(t_s)[0]),
+    )
