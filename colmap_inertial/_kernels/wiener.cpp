@@ -97,27 +97,26 @@ public:
         }
     }
 
-    void encode(const float *light, Code *codes) const {
-        if constexpr (std::is_same_v<Code, float>) {
-            std::memcpy(codes, light, sizeof(float) * CELL * CELL);
-        } else {
-            float position[CELL * CELL];
-            int index[CELL * CELL];
-            const float half = std::is_same_v<Code, uint8_t> ? 0.5f : 0.0f;  // the nearest entry, or the one below
-            for (int i = 0; i < CELL * CELL; ++i) {
-                const float clipped = light[i] < 0.0f ? 0.0f : light[i];
-                position[i] = (clipped > 1.0f ? 1.0f : clipped) * steps_ + half;
-                index[i] = int(position[i]);
-            }
-            for (int i = 0; i < CELL * CELL; ++i) {
-                if constexpr (std::is_same_v<Code, uint8_t>) {
-                    codes[i] = nearest_[size_t(index[i])];
+    // The tile may be transposed; the codes are not.
+    void encode(const float *tile, bool transposed, Code *codes, const Simd &simd) const {
+        float position[CELL * CELL];
+        int32_t index[CELL * CELL];
+        const int down = transposed ? 1 : CELL, across = transposed ? CELL : 1;
+        if constexpr (!std::is_same_v<Code, float>)  // the nearest entry, or the one below
+            simd.index(tile, steps_, std::is_same_v<Code, uint8_t> ? 0.5f : 0.0f, position, index);
+        for (int y = 0; y < CELL; ++y)
+            for (int x = 0; x < CELL; ++x) {
+                const int i = y * down + x * across;
+                Code &code = codes[y * CELL + x];
+                if constexpr (std::is_same_v<Code, float>) {
+                    code = tile[i];
+                } else if constexpr (std::is_same_v<Code, uint8_t>) {
+                    code = nearest_[size_t(index[i])];
                 } else {
                     const float low = table_[index[i]], high = table_[index[i] + 1];
-                    codes[i] = Code(low + (high - low) * (position[i] - float(index[i])) + 0.5f);
+                    code = Code(low + (high - low) * (position[i] - float(index[i])) + 0.5f);
                 }
             }
-        }
     }
 
 private:
@@ -315,10 +314,7 @@ private:
                 alignas(64) float tile[CELL * CELL];
                 const float *source = transposed ? plane.at(cy * CELL, cx * CELL) : plane.at(cx * CELL, cy * CELL);
                 simd_.filter(source, plane.stride, taps, tile);
-                if (transposed)
-                    for (int y = 1; y < CELL; ++y)
-                        for (int x = 0; x < y; ++x) std::swap(tile[y * CELL + x], tile[x * CELL + y]);
-                write(cy, cx, channel, tile, blended ? share : nullptr);
+                write(cy, cx, channel, tile, transposed, blended ? share : nullptr);
             }
         }
     }
@@ -342,7 +338,7 @@ private:
         return true;
     }
 
-    void write(int cy, int cx, int channel, float *tile, const float (*share)[CELL]) {
+    void write(int cy, int cx, int channel, float *tile, bool transposed, const float (*share)[CELL]) {
         const int rows = std::min(CELL, size_.height - cy * CELL), columns = std::min(CELL, size_.width - cx * CELL);
         const size_t pixel = size_t(size_.channels), line = size_t(size_.width) * pixel;
         const size_t at = size_t(cy * CELL) * line + size_t(cx * CELL) * pixel + size_t(channel);
@@ -352,10 +348,11 @@ private:
             for (int y = 0; y < rows; ++y)
                 for (int x = 0; x < columns; ++x) {
                     const float before = light_of(in[y * line + x * pixel], codec_);
-                    tile[y * CELL + x] = before + share[y][x] * (tile[y * CELL + x] - before);
+                    float &light = tile[transposed ? x * CELL + y : y * CELL + x];
+                    light = before + share[y][x] * (light - before);
                 }
         Code codes[CELL * CELL];
-        encoder_.encode(tile, codes);
+        encoder_.encode(tile, transposed, codes, simd_);
         if (share)
             for (int y = 0; y < rows; ++y)
                 for (int x = 0; x < columns; ++x)

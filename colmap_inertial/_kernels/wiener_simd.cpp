@@ -89,6 +89,14 @@ void filter(const float *source, ptrdiff_t stride, const Taps &taps, float *tile
         for (int x = 0; x < CELL; x += LANES) filter_block(source + y * stride + x, stride, taps, tile + y * CELL + x);
 }
 
+void index(const float *__restrict tile, float scale, float offset, float *__restrict position, int32_t *__restrict index) {
+    for (int i = 0; i < CELL * CELL; ++i) {
+        const float clipped = tile[i] < 0.0f ? 0.0f : tile[i];
+        position[i] = (clipped > 1.0f ? 1.0f : clipped) * scale + offset;
+        index[i] = int32_t(position[i]);
+    }
+}
+
 double multiply_adds(int64_t rounds, float *sink) {
     Vector sum[CHAINS], factor = Vector{} + 0.999f, term = Vector{} + 0.001f;
 #pragma GCC unroll 24
@@ -106,4 +114,4 @@ double multiply_adds(int64_t rounds, float *sink) {
 
 }  // namespace
 
-extern const Simd JOIN(simd_, SIMD) = {TEXT(SIMD), LANES, place, filter, multiply_adds};
+extern const Simd JOIN(simd_, SIMD) = {TEXT(SIMD), LANES, place, filter, index, multiply_adds};

@@ -18,7 +18,7 @@ FADE_PX = (0.5, 1.0)
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Cells:
-    """The blur of every cell.
+    """The blur of every cell, in C order.
 
     Attributes
     ----------
@@ -54,25 +54,20 @@ class Cells:
         low, high = FADE_PX
         fade = np.clip((np.hypot(corner[..., 0], corner[..., 1]) - low) / (high - low), 0, 1)
         return cls(
-            extent_px=np.abs(major).astype(np.float32),
-            slope=slope.astype(np.float32),
-            along_y=along_y,
-            fade=fade.astype(np.float32),
+            extent_px=np.ascontiguousarray(np.abs(major), dtype=np.float32),
+            slope=np.ascontiguousarray(slope, dtype=np.float32),
+            along_y=np.ascontiguousarray(along_y),
+            fade=np.ascontiguousarray(fade, dtype=np.float32),
         )
 
 
 def _sample(blur: BlurField, rows: Array, columns: Array) -> Array:
     """(R, C, 2) the field at the crossings of rows and columns."""
 
-    def weights(at: Array, nodes: int) -> Array:
-        position = at / blur.step_px
-        index = np.minimum(position.astype(np.intp), nodes - 2)
-        matrix = np.zeros((len(at), nodes))
-        matrix[np.arange(len(at)), index] = 1 - (position - index)
-        matrix[np.arange(len(at)), index + 1] = position - index
-        return matrix
-
-    gy, gx, _ = blur.vector_px.shape
-    v = blur.vector_px.astype(np.float64)
-    down, across = weights(np.asarray(rows), gy), weights(np.asarray(columns), gx)
-    return np.stack([down @ v[..., i] @ across.T for i in range(2)], axis=-1)
+    (i, s), (j, t) = (np.divmod(np.asarray(at) / blur.step_px, 1) for at in (rows, columns))
+    i, j = i.astype(np.intp), j.astype(np.intp)
+    i_next, j_next = np.minimum(i + 1, len(blur.vector_px) - 1), np.minimum(j + 1, blur.vector_px.shape[1] - 1)
+    v, s, t = blur.vector_px.astype(np.float64), s[:, None, None], t[:, None]
+    upper = v[i][:, j] * (1 - t) + v[i][:, j_next] * t
+    lower = v[i_next][:, j] * (1 - t) + v[i_next][:, j_next] * t
+    return np.asarray(upper * (1 - s) + lower * s)
