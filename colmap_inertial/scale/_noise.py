@@ -11,12 +11,12 @@ from colmap_inertial.scale._factors import Group
 from colmap_inertial.scale._parameters import Noise
 from colmap_inertial.types import Array, ImuNoise
 
-#: Gyroscope and walks: upper end of consumer MEMS data sheets (MPU-6500 1.7e-4, BMI160 1.2e-4, LSM6DS3 1.2e-4
-#: rad/s/sqrt(Hz)), since bandwidth, gain and temperature come on top. Accelerometer: ten times the data sheets, as
-#: sensors in use show (vibration, interpolation, g-sensitivity). Visual errors: video of about a megapixel of a scene
-#: a few metres away. Only the gyroscope's and the accelerometer's walk are kept; the rest are starting values.
+#: Gyroscope: three times the data sheets of consumer MEMS (MPU-6500 1.7e-4, BMI160 1.2e-4, LSM6DS3 1.2e-4
+#: rad/s/sqrt(Hz)), accelerometer ten times, as sensors in use show (vibration, g-sensitivity, bandwidth, jitter).
+#: Visual errors: video of about a megapixel of a scene a few metres away. The gyroscope's levels and the accelerometer's
+#: walk are kept; the rest are starting values.
 TYPICAL = Noise(
-    gyro_rad_s_rthz=3e-4,
+    gyro_rad_s_rthz=4.5e-4,
     gyro_walk_rad_s_rts=1e-4,
     accel_m_s2_rthz=5e-3,
     accel_walk_m_s2_rts=3e-4,

@@ -10,20 +10,13 @@ from colmap_inertial.scale import _parameters as par
 from colmap_inertial.scale._grouping import group_frames
 from colmap_inertial.scale._parameters import Data, Estimate, Prior
 from colmap_inertial.scale._preintegration import Track
+from colmap_inertial.scale.priors import PRIORS
 from colmap_inertial.types import Array, CameraImuCalibration, CameraTrajectory, ImuRecording, clock_shift_s
 
-#: Gain and axis errors of gyroscopes (1 %) and accelerometers (0.5 %) after the factory's calibration.
-_GYRO_GAIN, _ACCEL_GAIN = 0.01, 0.005
-#: Offset of an accelerometer: data sheets of phone sensors give 20-90 mg over temperature and soldering.
-_ACCEL_BIAS_M_S2 = 1.0
-#: Tolerance of the quartzes of camera and IMU against each other.
-_CLOCK_RATE = 1e-4
 #: Standard deviation of rows' times about the middle row, in readouts (uniform over the picture).
 _ROW_SPREAD = 12**-0.5
 #: Scene depths that turn row times into errors of rotation by velocity (1/m) and of position by rate (m).
 _NEAR_M, _FAR_M = 1.0, 2.0
-#: The coupling of centre and rotation errors is of the size of the scene's depth.
-_COUPLING_M = 5.0
 #: An alignment's covariance stems from the very data that are used again here.
 _COUNTED_ONCE = 5.0
 _MIN_STATES = 8
@@ -128,17 +121,17 @@ def _information(calibration: CameraImuCalibration) -> Array:
     accel_delay_s = float(np.sqrt(max(variance[3] + variance[4] - 2 * cov[3, 4], 1e-8)))
     row_spread_s = _ROW_SPREAD * float(np.hypot(calibration.readout_s, np.sqrt(variance[11])))
     sigma = np.full(par.N_GLOBALS, np.inf)
-    sigma[par.ACCEL_BIAS] = _ACCEL_BIAS_M_S2
+    sigma[par.ACCEL_BIAS] = PRIORS.accel_bias_m_s2
     sigma[par.ACCEL_DELAY] = accel_delay_s
-    sigma[par.GYRO_GAIN] = _GYRO_GAIN
-    sigma[par.ACCEL_GAIN] = _ACCEL_GAIN
+    sigma[par.GYRO_GAIN] = PRIORS.gyro_gain
+    sigma[par.ACCEL_GAIN] = PRIORS.accel_gain
     sigma[par.ROTATION] = np.maximum(_COUNTED_ONCE * np.sqrt(variance[0:3]), 1e-6)
     sigma[par.LEVER] = np.maximum(np.sqrt(variance[8:11]), 1e-6)
     sigma[par.DELAY] = np.clip(_COUNTED_ONCE * np.sqrt(variance[3]), 1e-6, 0.1)
-    sigma[par.CLOCK_RATE] = _CLOCK_RATE
+    sigma[par.CLOCK_RATE] = PRIORS.clock_rate
     shutter = row_spread_s * np.array([1.0, 1 / _NEAR_M, _FAR_M, 1.0])
     sigma[par.SHUTTER] = np.maximum(np.repeat(shutter, 9), 1e-9)
-    sigma[par.COUPLING] = _COUPLING_M
+    sigma[par.COUPLING] = PRIORS.coupling_m
     return np.diag(sigma**-2)
 
 

@@ -21,11 +21,10 @@ from colmap_inertial.geometry import quat_from_matrix
 from colmap_inertial.scale import _parameters as par
 from colmap_inertial.scale._fit import Fit, fit_jointly
 from colmap_inertial.scale._setup import prepare
+from colmap_inertial.scale.priors import PRIORS
 from colmap_inertial.scale.verdict import verdict_of
 from colmap_inertial.types import Array, CameraImuCalibration, CameraTrajectory, ImuRecording, ScaleEstimate
 
-#: What no recording can show: errors of the gain that mimic a scale beyond the priors, and of the model's own metric.
-_UNSEEN = 0.005
 _LARGEST_BIAS_M_S2 = 1.5
 #: Chi-square of the accelerometer's nine gains and axis errors against their prior: the 8 recordings that this was
 #: tried on have 3 to 9; by chance, 28 is exceeded once in a thousand.
@@ -47,7 +46,7 @@ class JointOptions:
     gravity_m_s2: float = 9.80665
     """Magnitude of gravity where the recording was made (``gravity_at_latitude_m_s2``)."""
 
-    gravity_sigma_m_s2: float = 0.02
+    gravity_sigma_m_s2: float = PRIORS.gravity_m_s2
     """Its standard deviation; the default spans 9.78 at the equator to 9.83 at the poles."""
 
     states_hz: float = 8.0
@@ -81,7 +80,7 @@ def estimate_joint(
     Returns
     -------
     ``method="joint"``. ``sigma_log`` combines the posterior standard deviation, inflated by chi-square where the fit is
-    worse than its noise, with 0.5 % for what no such recording can show. ``verdict`` is ``"refused"`` where the data
+    worse than its noise, with ``PRIORS.model_scale``. ``verdict`` is ``"refused"`` where the data
     cannot give a scale, with the reason.
     """
     options = options or JointOptions()
@@ -113,7 +112,7 @@ def _judged(fit: Fit, t_s: Array, calibration: CameraImuCalibration) -> ScaleEst
     expected = sum(e for _, e in fit.sums.values())
     worst = max(s / e for s, e in fit.sums.values())
     sigma = float(np.sqrt(fit.cov[par.SCALE, par.SCALE] * max(1.0, worst)))
-    sigma_log = float(np.hypot(sigma, _UNSEEN))
+    sigma_log = float(np.hypot(sigma, PRIORS.model_scale))
     verdict, ci95, reasons = verdict_of(x.metres_per_unit, sigma_log, refusals=_refusals(fit, t_s))
     if verdict != "refused":
         verdict, ci95, reasons = verdict_of(x.metres_per_unit, sigma_log, _checks(fit))
@@ -173,7 +172,7 @@ def _checks(fit: Fit) -> list[str]:
             f"the accelerometer seems to be off in gain by {gains} % on its axes, more than such sensors are: check "
             "its unit and the strength of gravity, or calibrate it by holding it still in six directions"
         )
-    sigma = float(np.hypot(fit.step_sigma, _UNSEEN))
+    sigma = float(np.hypot(fit.step_sigma, PRIORS.model_scale))
     if abs(fit.step_log) > _DISAGREEMENT_SIGMAS * sigma:
         out.append(
             f"the second half of the recording is {100 * np.expm1(fit.step_log):+.1f} % in scale against the first, "

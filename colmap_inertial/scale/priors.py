@@ -1,0 +1,34 @@
+"""What the joint estimator takes for granted before it sees a recording. All are zero-mean normal."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointPriors:
+    """Standard deviations of the joint estimator's priors.
+
+    The lever arm, the delay between the sensors and the readout have theirs in the calibration
+    (``io.calibration.calibration_prior``: 8 cm in the sensor plane and 5 mm along the optical axis, 20 ms, 20 ms);
+    rotation, offset and gyroscope bias come from the alignment; scale and the direction of gravity have none.
+    """
+
+    gyro_gain: float = 0.01
+    """Each of the nine gains and axis errors of the gyroscope: data sheets give 1 %."""
+    accel_gain: float = 0.005
+    """The same of the accelerometer: after the factory's calibration, half of what data sheets allow."""
+    accel_bias_m_s2: float = 0.4
+    """Each axis: data sheets give 20-90 mg over temperature and soldering."""
+    clock_rate: float = 1e-4
+    """Quartzes of camera and IMU against each other."""
+    coupling_m: float = 5.0
+    """Errors of visual centres by errors of visual rotations: of the size of the scene's depth."""
+    gravity_m_s2: float = 0.02
+    """Magnitude of gravity: 9.78 at the equator to 9.83 at the poles."""
+    model_scale: float = 0.005
+    """Scale of the part of the model that somebody measures against that of the camera's path: errors of the focal
+    length and of the lens bend a model by tenths of a percent, and no inertial data show it."""
+
+
+PRIORS = JointPriors()
