@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from colmap_inertial.errors import AlreadyMetricError, FormatError, OutputExistsError, TimingError
+from colmap_inertial.geometry import skew
 from colmap_inertial.io.files import read_json, write_json
 from colmap_inertial.types import CameraModel, CameraTrajectory, FrameTiming, ScaleEstimate, Similarity
 
@@ -19,6 +22,11 @@ if TYPE_CHECKING:
 
 #: Written into every folder whose lengths we have changed; its presence means "already metric".
 TRANSFORM_FILE = "transform.json"
+
+#: Observations of an image that its covariance is computed from: fewer do not tell, more are not needed.
+_FEWEST_OBSERVATIONS, _MOST_OBSERVATIONS = 10, 1000
+#: Keypoints are not better than this.
+_SMALLEST_ERROR_PX = 0.05
 
 _MODEL_FILES = ("cameras", "images", "points3D")
 
@@ -138,7 +146,8 @@ def trajectory_from_model(
     Returns
     -------
     CameraTrajectory, tuple of str
-        The poses at mid-exposure of the middle row, in model units, and what was left out, in words.
+        The poses at mid-exposure of the middle row, in model units, with covariances given the points where the
+        observations determine them, and what was left out, in words.
 
     Raises
     ------
@@ -166,8 +175,50 @@ def trajectory_from_model(
         cam_from_world_xyzw=np.array([pose.rotation.quat for pose in poses]),
         cam_in_world=np.array([image.projection_center() for image in timed]),
         epoch_ns=timing.epoch_ns,
+        pose_cov=_pose_covariances(reconstruction, timed),
     )
     return trajectory, notes
+
+
+def _pose_covariances(
+    reconstruction: pycolmap.Reconstruction, images: Sequence[pycolmap.Image]
+) -> NDArray[np.float64] | None:
+    """(F, 6, 6) covariances of the poses given the points, in the terms of ``CameraTrajectory.pose_cov``.
+
+    What an image's own observations say about its pose: the error that a pose does not share with its neighbours,
+    which see the same points. (The covariance from bundle adjustment also holds what they share, and the gauge.)
+
+    Returns
+    -------
+    ``None`` where an image's observations do not determine its pose.
+    """
+    covariances = []
+    for image in images:
+        seen = [point for point in image.points2D if point.has_point3D()]
+        seen = seen[:: -(-len(seen) // _MOST_OBSERVATIONS) or 1]
+        if len(seen) < _FEWEST_OBSERVATIONS:
+            return None
+        pose = image.cam_from_world()
+        rotation = pose.rotation.matrix()
+        world = np.array([reconstruction.points3D[point.point3D_id].xyz for point in seen])
+        cam = world @ rotation.T + pose.translation
+        error_px = image.camera.img_from_cam(cam) - np.array([point.xy for point in seen])
+        squares = np.sum(error_px**2, axis=1)
+        level = float(np.nanmedian(squares))
+        # Of normal errors, the median of the squares' sum is 2 ln 2 variances; COLMAP's own weights are robust, too
+        weight = np.where(np.isfinite(squares), 1 / (1 + squares / max(2 * level, 1e-12)), 0.0)
+        by_cam = np.zeros((len(seen), 2, 3))
+        by_cam[:, 0, 0] = by_cam[:, 1, 1] = 1 / cam[:, 2]
+        by_cam[:, :, 2] = -cam[:, :2] / cam[:, 2:] ** 2
+        by_pose = image.camera.mean_focal_length() * np.concatenate([-by_cam @ skew(cam), -by_cam @ rotation], axis=2)
+        information = np.einsum("n,nki,nkj->ij", weight, by_pose, by_pose)
+        variance_px2 = max(level / (2 * np.log(2)), _SMALLEST_ERROR_PX**2)
+        try:
+            root = np.linalg.inv(np.linalg.cholesky(information))
+        except np.linalg.LinAlgError:
+            return None
+        covariances.append(variance_px2 * (root.T @ root))
+    return np.array(covariances)
 
 
 def similarity_as_json(similarity: Similarity) -> dict[str, object]:

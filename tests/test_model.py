@@ -7,7 +7,7 @@ import pycolmap
 import pytest
 
 from colmap_inertial.errors import AlreadyMetricError, FormatError, OutputExistsError, TimingError
-from colmap_inertial.geometry import matrix_from_quat, quat_exp
+from colmap_inertial.geometry import matrix_from_quat, quat_exp, so3_log
 from colmap_inertial.model import (
     apply_similarity,
     colmap_camera,
@@ -147,3 +147,49 @@ def test_camera_parameters_are_checked_before_colmap_sees_them():
         colmap_camera(CameraModel(model="PINHOLE", width=640, height=480, params=(500, 320, 240)))
     with pytest.raises(ValueError, match="no COLMAP camera model"):
         colmap_camera(CameraModel(model="PINHOLEE", width=640, height=480, params=(500, 500, 320, 240)))
+
+
+def test_pose_covariances_are_the_scatter_of_resected_poses():
+    # Truth by another library: resect each image again and again from the true points and noisy pixels.
+    pycolmap.set_random_seed(5)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, 4, 300
+    truth = pycolmap.synthesize_dataset(options)
+    sigma_px = 0.8
+    rng = np.random.default_rng(8)
+    images = sorted((truth.image(i) for i in truth.reg_image_ids()), key=lambda image: image.name)
+    clean = {image.name: np.array([p.xy for p in image.points2D if p.has_point3D()]) for image in images}
+    scatter = {}
+    for image in images:
+        world = np.array([truth.points3D[p.point3D_id].xyz for p in image.points2D if p.has_point3D()])
+        pose = image.cam_from_world()
+        errors = []
+        for _ in range(250):
+            noisy = clean[image.name] + sigma_px * rng.standard_normal(clean[image.name].shape)
+            found = pycolmap.refine_absolute_pose(pose, noisy, world, np.ones(len(world), bool), image.camera)
+            turn = so3_log(pose.rotation.matrix() @ found["cam_from_world"].rotation.matrix().T)
+            centre = found["cam_from_world"].inverse().translation
+            errors.append(np.concatenate([turn, image.projection_center() - centre]))
+        scatter[image.name] = np.cov(np.array(errors).T)
+    for image in images:
+        for point in image.points2D:
+            if point.has_point3D():
+                point.xy = point.xy + sigma_px * rng.standard_normal(2)
+    timing = FrameTiming(names=tuple(image.name for image in images), t_s=np.arange(4.0))
+    trajectory, _ = trajectory_from_model(truth, timing)
+    assert trajectory.pose_cov is not None
+    for name, cov in zip(trajectory.names, trajectory.pose_cov, strict=True):
+        root = np.linalg.inv(np.linalg.cholesky(cov))
+        # Whitened scatter: the unit matrix, but for the factor of 250 draws and of the estimated noise of the pixels
+        whitened = root @ scatter[name] @ root.T
+        assert np.all(np.linalg.eigvalsh(whitened) > 0.6) and np.all(np.linalg.eigvalsh(whitened) < 1.7)
+
+
+def test_poses_without_enough_observations_have_no_covariance():
+    pycolmap.set_random_seed(5)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, 3, 6
+    model = pycolmap.synthesize_dataset(options)
+    names = tuple(sorted(model.image(i).name for i in model.reg_image_ids()))
+    trajectory, _ = trajectory_from_model(model, FrameTiming(names=names, t_s=np.arange(3.0)))
+    assert trajectory.pose_cov is None

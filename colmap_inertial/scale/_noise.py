@@ -13,8 +13,8 @@ from colmap_inertial.types import Array, ImuNoise
 
 #: Gyroscope: three times the data sheets of consumer MEMS (MPU-6500 1.7e-4, BMI160 1.2e-4, LSM6DS3 1.2e-4
 #: rad/s/sqrt(Hz)), accelerometer ten times, as sensors in use show (vibration, g-sensitivity, bandwidth, jitter).
-#: Visual errors: video of about a megapixel of a scene a few metres away. The gyroscope's levels and the accelerometer's
-#: walk are kept; the rest are starting values.
+#: Visual errors: video of about a megapixel of a scene a few metres away. The gyroscope's levels and the
+#: accelerometer's walk are kept; the rest are starting values.
 TYPICAL = Noise(
     gyro_rad_s_rthz=4.5e-4,
     gyro_walk_rad_s_rts=1e-4,
