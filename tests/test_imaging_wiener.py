@@ -13,7 +13,7 @@ from colmap_inertial.imaging import wiener
 from colmap_inertial.imaging._cells import Cells
 from colmap_inertial.imaging._taps import Prior, TapTable, optimal_taps, wiener_spectrum
 from colmap_inertial.imaging._transfer import linear_from_srgb, srgb_from_linear
-from colmap_inertial.imaging._wiener_reference import filter_reference, share_reference
+from colmap_inertial.imaging._wiener_reference import filter_reference, lost_light_reference, share_reference
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.wiener import DeblurOptions, deblur, deblur_reference, estimate_noise
 from colmap_inertial.simulate.textures import poster
@@ -165,7 +165,9 @@ def test_every_instruction_set_gives_the_reference_s_light(name, vector_px, rate
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 @pytest.mark.parametrize("colour", [False, True])
 def test_every_instruction_set_gives_the_reference_s_codes(name, dtype, colour):
-    image = coded(1.05 * texture(height=130, width=170, brightest=1), dtype)  # some of it saturated
+    light = 1.05 * texture(height=130, width=170, brightest=1)  # some of it saturated
+    light[40:43, 60:66, 1] = light[90:92, 100:102] = 1  # and some by lamps
+    image = coded(light, dtype)
     image = image if colour else image[..., 1].copy()
     field = turning(130, 170, (9, 6), 0.08)  # both axes, and down to no blur
     planes, cells, prior = wiener._prepare(image, field, DeblurOptions())
@@ -313,7 +315,19 @@ def test_clipped_lights_do_not_ring():
     # Far away the lamp changes nothing; on the trace itself the input stays.
     np.testing.assert_array_equal(result[: HEIGHT // 2 - 20], undisturbed[: HEIGHT // 2 - 20])
     saturated = image >= 250
+    assert saturated.sum() == 24
     np.testing.assert_array_equal(result[saturated], image[saturated])
+
+
+def test_white_that_the_sensor_just_holds_is_deblurred():
+    light = 0.02 + 0.98 * np.round(texture()[..., 1])  # black and white, no lamps
+    image = coded(smeared(light, (20.0, 5.0)))
+    assert (image >= 250).mean() > 0.02
+    field = BlurField.uniform(WIDTH, HEIGHT, (20.0, 5.0))
+    cells = Cells.of(field)
+    lost = lost_light_reference(linear_from_srgb(image / 255), image >= 250, cells)
+    assert not lost.any()
+    assert psnr(deblur(image, field), coded(light)) > psnr(image, coded(light)) + 1
 
 
 def smeared_lamp(light: np.ndarray, length_px: int) -> np.ndarray:

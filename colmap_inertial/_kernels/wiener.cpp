@@ -35,9 +35,10 @@ int usable_threads() {
 
 namespace {
 
-constexpr int NODE = 4;                  // px between the points at which the influence of saturation is worked out
+constexpr int NODE = 4;                  // px between the points at which the influence of lost light is worked out
 constexpr int PER_CELL = CELL / NODE;
-constexpr float ZERO_TO = 2.0f, ONE_FROM = 2.5f;  // distances from a saturated pixel, in blur lengths: share of the result
+constexpr float ZERO_TO = 2.0f, ONE_FROM = 2.5f;  // share of the result, by distance from lost light in blur lengths
+constexpr float STEEPEST = 2.0f;  // of a scene that fits the sensor's range, times full scale over the length of the blur
 
 // Calls work(i) for 0 <= i < count, every i once.
 template <class Work>
@@ -152,13 +153,15 @@ void fill(Plane &plane, const Code *image, Image size, int channel, bool transpo
     });
 }
 
-// Where saturated pixels, whose light is unknown, spoil the result.
-class Saturation {
+// Where light that the sensor could not hold spoils the result: saturated pixels beside which the image is steeper along
+// the blur than the blur of any scene within the sensor's range could be.
+class LostLight {
 public:
-    Saturation(Image size, const Field &field) : size_(size), field_(field), ny_(PER_CELL * field.ny + 1), nx_(PER_CELL * field.nx + 1) {}
+    LostLight(Image size, const Field &field) : size_(size), field_(field), ny_(PER_CELL * field.ny + 1), nx_(PER_CELL * field.nx + 1) {}
 
     template <class Code>
-    void find(const Code *image, int threshold, int threads) {
+    void find(const Code *image, const Codec &codec, int threads) {
+        const int threshold = codec.saturated;
         near_.assign(size_t(ny_) * size_t(nx_), 0);
         const int blocks_y = (size_.height + NODE - 1) / NODE, blocks_x = (size_.width + NODE - 1) / NODE;
         const int line = size_.width * size_.channels, block = NODE * size_.channels;
@@ -173,9 +176,13 @@ public:
             }
             for (int x = 0; x < line; ++x) top = std::max(top, brightest[x]);
             if (top < threshold) return;
-            any = true;
-            for (int x = 0; x < line; ++x)
-                if (brightest[x] >= threshold) blocks[size_t(i) * blocks_x + x / block] = 1;
+            for (int x = 0; x < line; ++x) {
+                unsigned char &lost = blocks[size_t(i) * blocks_x + x / block];
+                if (brightest[x] < threshold || lost) continue;
+                for (int y = i * NODE; y < std::min((i + 1) * NODE, size_.height); ++y)
+                    lost |= image[ptrdiff_t(y) * line + x] >= threshold && steep(image, codec, y, x / size_.channels, x % size_.channels);
+                if (lost) any = true;
+            }
         });
         any_ = any;
         if (!any_) return;
@@ -216,9 +223,24 @@ public:
 private:
     int sum(int y, int x) const { return sums_[size_t(y) * (nx_ + 1) + x]; }
 
+    template <class Code>
+    bool steep(const Code *image, const Codec &codec, int y, int x, int channel) const {
+        const size_t cell = size_t(y / CELL) * field_.nx + x / CELL;
+        const float extent = field_.extent[cell];
+        const int major = std::max(1, int(extent / 4 + 0.5f)), minor = int(std::floor(float(major) * field_.slope[cell] + 0.5f));
+        const int dy = field_.along_y[cell] ? major : minor, dx = field_.along_y[cell] ? minor : major;
+        auto light = [&](int at_y, int at_x) {
+            at_y = std::min(std::max(at_y, 0), size_.height - 1);
+            at_x = std::min(std::max(at_x, 0), size_.width - 1);
+            return codec.decode[image[(ptrdiff_t(at_y) * size_.width + at_x) * size_.channels + channel]];
+        };
+        const float fall = light(y, x) - std::min(light(y + dy, x + dx), light(y - dy, x - dx));
+        return fall * extent > STEEPEST * float(major);
+    }
+
     bool near(int y, int x) const { return y >= 0 && y < ny_ && x >= 0 && x < nx_ && near_[size_t(y) * nx_ + x]; }
 
-    // Zero where the filter reaches a saturated pixel, one half a blur length further on.
+    // Zero where the filter reaches lost light, one half a blur length further on.
     float share_at(int i, int j) const {
         const size_t cell = size_t(std::min(i / PER_CELL, field_.ny - 1)) * field_.nx + std::min(j / PER_CELL, field_.nx - 1);
         const float extent = field_.extent[cell], slope = field_.slope[cell];
@@ -244,11 +266,11 @@ template <class Code>
 class Deblur {
 public:
     Deblur(const Code *image, Code *result, Image size, const Field &field, const Table &table, const Codec &codec, const Simd &simd, int threads)
-        : image_(image), result_(result), size_(size), field_(field), table_(table), codec_(codec), simd_(simd), threads_(threads), encoder_(codec), saturation_(size, field) {}
+        : image_(image), result_(result), size_(size), field_(field), table_(table), codec_(codec), simd_(simd), threads_(threads), encoder_(codec), lost_light_(size, field) {}
 
     Seconds run() {
         const auto start = std::chrono::steady_clock::now();
-        if constexpr (!std::is_same_v<Code, float>) saturation_.find(image_, codec_.saturated, threads_);
+        if constexpr (!std::is_same_v<Code, float>) lost_light_.find(image_, codec_, threads_);
         decode();
         const auto middle = std::chrono::steady_clock::now();
         in_parallel(field_.ny, threads_, [&](int cy) { filter_row(cy); });
@@ -323,14 +345,14 @@ private:
     bool shares(int cy, int cx, float (&share)[CELL][CELL]) const {
         const float *above = corner(cy, cx), *below = corner(cy + 1, cx);
         float nodes[PER_CELL + 1][PER_CELL + 1];
-        const bool saturated = saturation_.shares(cy, cx, nodes);
-        if (!saturated && above[0] == 1 && above[1] == 1 && below[0] == 1 && below[1] == 1) return false;
+        const bool spoilt = lost_light_.shares(cy, cx, nodes);
+        if (!spoilt && above[0] == 1 && above[1] == 1 && below[0] == 1 && below[1] == 1) return false;
         for (int y = 0; y < CELL; ++y) {
             const float s = float(y) / CELL, s_node = float(y % NODE) / NODE;
             for (int x = 0; x < CELL; ++x) {
                 const float t = float(x) / CELL, t_node = float(x % NODE) / NODE;
                 share[y][x] = (above[0] * (1 - t) + above[1] * t) * (1 - s) + (below[0] * (1 - t) + below[1] * t) * s;
-                if (!saturated) continue;
+                if (!spoilt) continue;
                 const float *upper = &nodes[y / NODE][x / NODE], *lower = &nodes[y / NODE + 1][x / NODE];
                 share[y][x] *= (upper[0] * (1 - t_node) + upper[1] * t_node) * (1 - s_node) + (lower[0] * (1 - t_node) + lower[1] * t_node) * s_node;
             }
@@ -381,7 +403,7 @@ private:
     const Simd &simd_;
     int threads_;
     Encoder<Code> encoder_;
-    Saturation saturation_;
+    LostLight lost_light_;
     std::vector<Plane> planes_[2];  // by channel; [1] transposed
 };
 

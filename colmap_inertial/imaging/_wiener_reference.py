@@ -9,11 +9,14 @@ from colmap_inertial.imaging._cells import CELL_PX, Cells
 from colmap_inertial.imaging._taps import TapTable
 from colmap_inertial.types import Array
 
-#: Spacing of the points at which the influence of saturated pixels is worked out; between them it is bilinear.
+#: Spacing of the points at which the influence of lost light is worked out; between them it is bilinear.
 NODE_PX = 4
-#: The result counts nothing up to the first distance from a saturated pixel, and in full from the second one on; in
-#: blur lengths, along the blur. The filter reaches two lengths, and a clipped light echoes most where it ends.
-SATURATION_REACH = (2.0, 2.5)
+#: The result counts nothing up to the first distance from lost light, and in full from the second one on; in blur
+#: lengths, along the blur. The filter reaches two lengths, and a clipped lamp echoes most where it ends.
+LOST_LIGHT_REACH = (2.0, 2.5)
+#: The steepest that an image can be along its blur: from one pixel to the next by this times full scale over the length
+#: of the blur. In theory 1, if the scene fits the sensor's range.
+STEEPEST = 2.0
 
 
 def filter_reference(light: Array, cells: Cells, table: TapTable, cell_px: int = CELL_PX) -> Array:
@@ -65,16 +68,35 @@ def mirrored(index: NDArray[np.intp], size: int) -> NDArray[np.intp]:
     return np.minimum(index, 2 * size - 2 - index)
 
 
-def share_reference(saturated: NDArray[np.bool_], cells: Cells) -> Array:
+def lost_light_reference(light: Array, saturated: NDArray[np.bool_], cells: Cells) -> NDArray[np.bool_]:
+    """(H, W) where one channel is saturated by far more light than the sensor can hold.
+
+    A blur of length L is the mean over L, so that a scene within the sensor's range changes by at most 1/L from pixel
+    to pixel along it. Where a saturated pixel stands out more, it was a lamp or a glint. Most saturated pixels are not
+    of that kind (sky, paper), and are deblurred like others: leaving them all out loses up to a third of the matches.
+    """
+    height, width = light.shape
+    y, x = np.mgrid[:height, :width]
+    extent, slope, along_y = (a[y // CELL_PX, x // CELL_PX] for a in (cells.extent_px, cells.slope, cells.along_y))
+    major = np.maximum(1, np.floor(extent / 4 + np.float32(0.5)))
+    minor = np.floor(major * slope + np.float32(0.5))
+    dy, dx = (np.where(along_y, a, b).astype(np.intp) for a, b in ((major, minor), (minor, major)))
+    darkest = np.minimum(
+        *(light[np.clip(y + s * dy, 0, height - 1), np.clip(x + s * dx, 0, width - 1)] for s in (-1, 1))
+    )
+    return saturated & ((light - darkest) * extent > STEEPEST * major)
+
+
+def share_reference(lost: NDArray[np.bool_], cells: Cells) -> Array:
     """(H, W) share of the filter's result at every pixel, 0 to 1; the rest is the input.
 
-    Short blurs fade out. So does the result near saturated pixels, whose true light is unknown.
+    Short blurs fade out. So does the result near lost light.
     """
-    height, width = saturated.shape
+    height, width = lost.shape
     per_cell = CELL_PX // NODE_PX
     ny, nx = cells.extent_px.shape
-    near = np.zeros((per_cell * ny + 1, per_cell * nx + 1), dtype=bool)  # a saturated pixel less than NODE_PX away
-    rows, columns = np.nonzero(saturated)
+    near = np.zeros((per_cell * ny + 1, per_cell * nx + 1), dtype=bool)  # lost light less than NODE_PX away
+    rows, columns = np.nonzero(lost)
     for dy in (0, 1):
         for dx in (0, 1):
             near[rows // NODE_PX + dy, columns // NODE_PX + dx] = True
@@ -82,7 +104,7 @@ def share_reference(saturated: NDArray[np.bool_], cells: Cells) -> Array:
     cell = np.minimum(i // per_cell, ny - 1), np.minimum(j // per_cell, nx - 1)
     extent, slope, along_y = cells.extent_px[cell], cells.slope[cell], cells.along_y[cell]
     share = np.ones(near.shape, dtype=np.float32)
-    zero_to, one_from = (np.float32(r) for r in SATURATION_REACH)
+    zero_to, one_from = (np.float32(r) for r in LOST_LIGHT_REACH)
     for step in range(int(one_from * extent.max() / NODE_PX), -1, -1):
         minor = np.floor(np.float32(step) * slope + np.float32(0.5)).astype(np.intp)
         for sign in (-1, 1):

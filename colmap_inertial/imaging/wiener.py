@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from colmap_inertial.imaging._cells import Cells
 from colmap_inertial.imaging._taps import STEPS_PER_PX, Prior, TapTable
 from colmap_inertial.imaging._transfer import decode_table, encode_table, srgb_from_linear
-from colmap_inertial.imaging._wiener_reference import filter_reference, share_reference
+from colmap_inertial.imaging._wiener_reference import filter_reference, lost_light_reference, share_reference
 from colmap_inertial.imaging.blur_field import BlurField
 
 Code = TypeVar("Code", np.uint8, np.uint16)
@@ -57,7 +57,7 @@ def deblur(image: NDArray[Code], blur: BlurField, options: DeblurOptions | None 
     Returns
     -------
     A new image of the same shape and type. Pixels whose blur is below half a pixel, and those from which the filter
-    would reach a saturated pixel (two blur lengths), are the input's, bit for bit.
+    would reach a clipped lamp or glint (two blur lengths), are the input's, bit for bit.
 
     Notes
     -----
@@ -80,14 +80,17 @@ def deblur_reference(image: NDArray[Code], blur: BlurField, options: DeblurOptio
     """`deblur` in plain numpy; hundreds of times slower."""
     planes, cells, prior = _prepare(image, blur, options or DeblurOptions())
     table = _table(cells, prior)
-    share = share_reference(np.any(planes >= _saturated_code(image.dtype), axis=2), cells)
     top = np.iinfo(image.dtype).max
+    light = decode_table(image.dtype)[planes].astype(np.float64)
+    saturated = planes >= _saturated_code(image.dtype)
+    channels = range(planes.shape[2])
+    lost = np.any([lost_light_reference(light[..., c], saturated[..., c], cells) for c in channels], axis=0)
+    share = share_reference(lost, cells)
     result = planes.copy()
-    for channel in range(planes.shape[2]):
-        light = decode_table(image.dtype)[planes[..., channel]].astype(np.float64)
-        blended = light + share * (filter_reference(light, cells, table) - light)
+    for c in channels:
+        blended = light[..., c] + share * (filter_reference(light[..., c], cells, table) - light[..., c])
         codes = np.floor(top * srgb_from_linear(blended) + 0.5).astype(image.dtype)
-        result[..., channel] = np.where(share == 0, planes[..., channel], codes)
+        result[..., c] = np.where(share == 0, planes[..., c], codes)
     return result.reshape(image.shape)
 
 
