@@ -14,7 +14,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from colmap_inertial.align._clock_search import ClockFit, explained_at, intervals_of, search_offsets, spaced_frames
-from colmap_inertial.align._fit import OFFSET_UNKNOWN_FROM_S, Alignment, middle_of_overlap, refine_alignment
+from colmap_inertial.align._fit import (
+    OFFSET_UNKNOWN_FROM_S,
+    Alignment,
+    middle_of_overlap,
+    on_camera_rate,
+    refine_alignment,
+)
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.gyro import GyroPath
 from colmap_inertial.io.calibration import calibration_prior
@@ -227,4 +233,4 @@ def _search_parts(
     return replace(found[0][1], offset_s=at_zero_s + rate * middle_s), rate
 
 
-__all__ = ["OFFSET_UNKNOWN_FROM_S", "AlignOptions", "Alignment", "align_camera_imu", "align_clocks"]
+__all__ = ["OFFSET_UNKNOWN_FROM_S", "AlignOptions", "Alignment", "align_camera_imu", "align_clocks", "on_camera_rate"]

@@ -78,19 +78,47 @@ class Alignment:
         trajectory_epoch_ns
             Epoch of the trajectory that it was aligned with.
         """
-        offset_s = self.calibration.gyro_time_offset_s + (imu.epoch_ns - trajectory_epoch_ns) * 1e-9
-        middle_s = self.middle_s - offset_s
-
-        def stretched(t_s: Array) -> Array:
-            return np.asarray(middle_s + (t_s - middle_s) / (1 - self.clock_rate))
-
-        note = f"stamps stretched by {1e6 * self.clock_rate:+.0f} ppm to keep step with the camera"
-        return replace(
+        return on_camera_rate(
             imu,
-            gyro_t_s=stretched(imu.gyro_t_s),
-            accel_t_s=stretched(imu.accel_t_s),
-            repairs=(*imu.repairs, note),
+            self.calibration,
+            clock_rate=self.clock_rate,
+            middle_s=self.middle_s,
+            trajectory_epoch_ns=trajectory_epoch_ns,
         )
+
+
+def on_camera_rate(
+    imu: ImuRecording,
+    calibration: CameraImuCalibration,
+    *,
+    clock_rate: float,
+    middle_s: float,
+    trajectory_epoch_ns: int,
+) -> ImuRecording:
+    """A recording with stamps that keep step with the camera; see :meth:`Alignment.on_camera_rate`.
+
+    Parameters
+    ----------
+    imu
+        The recording as it was read.
+    calibration
+        Its time offsets hold at ``middle_s``, camera clock, in seconds since ``trajectory_epoch_ns``.
+    clock_rate
+        Change of the time offset per second.
+    """
+    offset_s = calibration.gyro_time_offset_s + (imu.epoch_ns - trajectory_epoch_ns) * 1e-9
+    fixed_s = middle_s - offset_s
+
+    def stretched(t_s: Array) -> Array:
+        return np.asarray(fixed_s + (t_s - fixed_s) / (1 - clock_rate))
+
+    note = f"the IMU's clock is {1e6 * clock_rate:+.0f} ppm off the camera's: its stamps were stretched to keep step"
+    return replace(
+        imu,
+        gyro_t_s=stretched(imu.gyro_t_s),
+        accel_t_s=stretched(imu.accel_t_s),
+        repairs=(*imu.repairs, note),
+    )
 
 
 @dataclass(frozen=True, eq=False)

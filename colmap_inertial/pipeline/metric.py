@@ -10,6 +10,7 @@ from typing import Protocol
 
 import numpy as np
 
+from colmap_inertial.align import on_camera_rate
 from colmap_inertial.geometry import quat_rotate
 from colmap_inertial.io.trajectories import write_tum
 from colmap_inertial.model import Model, apply_similarity, read_model, trajectory_from_model
@@ -80,6 +81,14 @@ def write_trajectory(path: Path, model: Model, imu: ImuRecording) -> None:
         raise ValueError("only a metric model has a metric trajectory")
     trajectory, _ = trajectory_from_model(read_model(model.folder), model.timing)
     trajectory = dataclasses.replace(trajectory, length_unit="m")
+    if estimate.clock_rate != 0:
+        imu = on_camera_rate(
+            imu,
+            estimate.calibration,
+            clock_rate=estimate.clock_rate,
+            middle_s=estimate.clock_middle_s,
+            trajectory_epoch_ns=trajectory.epoch_ns,
+        )
     smoothed = smooth_trajectory(
         trajectory,
         imu,

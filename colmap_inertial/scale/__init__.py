@@ -8,13 +8,18 @@ from typing import Literal
 
 import numpy as np
 
-from colmap_inertial.align import AlignOptions, align_camera_imu
+from colmap_inertial.align import AlignOptions, align_clocks
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.io.plausible import GRAVITY_BOUNDS_M_S2, LARGEST_MEDIAN_RATE_RAD_S
 from colmap_inertial.io.units import STANDARD_GRAVITY_M_S2
 from colmap_inertial.scale.verdict import verdict_of
 from colmap_inertial.threads import one_blas_thread
 from colmap_inertial.types import CameraImuCalibration, CameraTrajectory, ImuRecording, ScaleEstimate, clock_shift_s
+
+
+#: A clock rate is corrected beforehand where it is this many standard deviations from zero and faster than what the
+#: estimators allow for.
+_SIGNIFICANT, _FAST_CLOCK = 5.0, 3e-4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,11 +130,24 @@ def _estimate_or_refuse(
     if problems:
         return _refused(options.method, *problems)
     try:
-        aligned = align_camera_imu(
+        alignment = align_clocks(
             trajectory, imu, prior=calibration, options=AlignOptions(max_offset_s=options.max_offset_s)
         )
+        aligned = alignment.calibration
+        rate = alignment.clock_rate
+        remarks: tuple[str, ...] = ()
+        if abs(rate) > max(_SIGNIFICANT * alignment.clock_rate_sigma, _FAST_CLOCK):
+            stretched = alignment.on_camera_rate(imu, trajectory_epoch_ns=trajectory.epoch_ns)
+            remarks, imu = stretched.repairs[len(imu.repairs) :], stretched
+        else:
+            rate = 0.0
         estimate = _estimate(trajectory, imu, aligned, options)
-        return replace(estimate, reasons=(*estimate.reasons, *_uncovered(trajectory, imu, aligned)))
+        return replace(
+            estimate,
+            reasons=(*estimate.reasons, *remarks, *_uncovered(trajectory, imu, aligned)),
+            clock_rate=rate,
+            clock_middle_s=alignment.middle_s,
+        )
     except NotObservableError as error:
         return _refused(options.method, f"{error.quantity}: {error.hint}")
 

@@ -139,6 +139,9 @@ class ScaleEstimate:
         (3,) IMU frame; the true specific force is the reading minus this.
     calibration
         The camera-IMU calibration that the estimate refined.
+    clock_rate, clock_middle_s
+        Change of the calibration's time offsets per second, 0 where the clocks keep step, and the camera time, since
+        the trajectory's epoch, at which the offsets hold.
     cov
         (7, 7) of log scale, gravity (m/s2, world frame), accelerometer bias (m/s2).
     chi2, dof
@@ -158,6 +161,8 @@ class ScaleEstimate:
     gravity_in_world_m_s2: Array | None = None
     accel_bias_m_s2: Array | None = None
     calibration: CameraImuCalibration | None = None
+    clock_rate: float = 0.0
+    clock_middle_s: float = 0.0
     cov: Array | None = None
     chi2: float | None = None
     dof: int | None = None
@@ -198,6 +203,8 @@ class ScaleEstimate:
             "imu_in_cam_m": plain(None if calibration is None else calibration.imu_in_cam_m),
             "gyro_time_offset_s": None if calibration is None else calibration.gyro_time_offset_s,
             "accel_time_offset_s": None if calibration is None else calibration.accel_time_offset_s,
+            "clock_rate": self.clock_rate,
+            "clock_middle_s": self.clock_middle_s,
             "readout_s": None if calibration is None else calibration.readout_s,
             "cov": plain(self.cov),
             "chi2": self.chi2,
