@@ -25,7 +25,7 @@ def deblur(
     threads: int = 0,
     instruction_set: str = "",
 ) -> tuple[float, float]:
-    """Write the deblurred (H, W, C) image into `result`; returns the seconds of decoding and of filtering."""
+    """Write the deblurred (H, W, C) image into `result`; returns the processor time of decoding and of filtering, s."""
 
 def peak_multiply_adds(instruction_set: str = "", seconds: float = 0.2) -> float:
     """Fused multiply-adds a second that one core reaches in registers, each lane counted."""

@@ -2,7 +2,7 @@
 
 #include <algorithm>
 #include <atomic>
-#include <chrono>
+#include <ctime>
 #include <cmath>
 #include <cstring>
 #include <memory>
@@ -98,26 +98,21 @@ public:
         }
     }
 
-    // The tile may be transposed; the codes are not.
-    void encode(const float *tile, bool transposed, Code *codes, const Simd &simd) const {
-        float position[CELL * CELL];
-        int32_t index[CELL * CELL];
-        const int down = transposed ? 1 : CELL, across = transposed ? CELL : 1;
-        if constexpr (!std::is_same_v<Code, float>)  // the nearest entry, or the one below
-            simd.index(tile, steps_, std::is_same_v<Code, uint8_t> ? 0.5f : 0.0f, position, index);
-        for (int y = 0; y < CELL; ++y)
-            for (int x = 0; x < CELL; ++x) {
-                const int i = y * down + x * across;
-                Code &code = codes[y * CELL + x];
-                if constexpr (std::is_same_v<Code, float>) {
-                    code = tile[i];
-                } else if constexpr (std::is_same_v<Code, uint8_t>) {
-                    code = nearest_[size_t(index[i])];
-                } else {
-                    const float low = table_[index[i]], high = table_[index[i] + 1];
-                    code = Code(low + (high - low) * (position[i] - float(index[i])) + 0.5f);
-                }
-            }
+    // Indices into the table for a tile, and where between its entries.
+    void find(const float *tile, const Simd &simd, float *position, int32_t *index) const {
+        // the nearest entry, or the one below
+        if constexpr (!std::is_same_v<Code, float>) simd.index(tile, steps_, std::is_same_v<Code, uint8_t> ? 0.5f : 0.0f, position, index);
+    }
+
+    Code code(float light, float position, int32_t index) const {
+        if constexpr (std::is_same_v<Code, float>) {
+            return light;
+        } else if constexpr (std::is_same_v<Code, uint8_t>) {
+            return nearest_[size_t(index)];
+        } else {
+            const float low = table_[index], high = table_[index + 1];
+            return Code(low + (high - low) * (position - float(index)) + 0.5f);
+        }
     }
 
 private:
@@ -168,20 +163,17 @@ public:
         std::vector<unsigned char> blocks(size_t(blocks_y) * size_t(blocks_x), 0);
         std::atomic<bool> any{false};
         in_parallel(blocks_y, threads, [&](int i) {
-            std::vector<Code> brightest(image + ptrdiff_t(i) * NODE * line, image + (ptrdiff_t(i) * NODE + 1) * line);
-            Code top = 0;
-            for (int r = 1; r < std::min(NODE, size_.height - i * NODE); ++r) {
-                const Code *row = image + (ptrdiff_t(i) * NODE + r) * line;
-                for (int x = 0; x < line; ++x) brightest[x] = std::max(brightest[x], row[x]);
-            }
-            for (int x = 0; x < line; ++x) top = std::max(top, brightest[x]);
-            if (top < threshold) return;
-            for (int x = 0; x < line; ++x) {
-                unsigned char &lost = blocks[size_t(i) * blocks_x + x / block];
-                if (brightest[x] < threshold || lost) continue;
-                for (int y = i * NODE; y < std::min((i + 1) * NODE, size_.height); ++y)
-                    lost |= image[ptrdiff_t(y) * line + x] >= threshold && steep(image, codec, y, x / size_.channels, x % size_.channels);
-                if (lost) any = true;
+            for (int y = i * NODE; y < std::min((i + 1) * NODE, size_.height); ++y) {
+                const Code *row = image + ptrdiff_t(y) * line;
+                Code top = 0;
+                for (int x = 0; x < line; ++x) top = std::max(top, row[x]);
+                if (top < threshold) continue;
+                for (int x = 0; x < line; ++x) {
+                    unsigned char &lost = blocks[size_t(i) * blocks_x + x / block];
+                    if (row[x] < threshold || lost || !steep(image, codec, y, x / size_.channels, x % size_.channels)) continue;
+                    lost = 1;
+                    any = true;
+                }
             }
         });
         any_ = any;
@@ -269,13 +261,13 @@ public:
         : image_(image), result_(result), size_(size), field_(field), table_(table), codec_(codec), simd_(simd), threads_(threads), encoder_(codec), lost_light_(size, field) {}
 
     Seconds run() {
-        const auto start = std::chrono::steady_clock::now();
+        const std::clock_t start = std::clock();
         if constexpr (!std::is_same_v<Code, float>) lost_light_.find(image_, codec_, threads_);
         decode();
-        const auto middle = std::chrono::steady_clock::now();
+        const std::clock_t middle = std::clock();
         in_parallel(field_.ny, threads_, [&](int cy) { filter_row(cy); });
-        const auto end = std::chrono::steady_clock::now();
-        return {std::chrono::duration<double>(middle - start).count(), std::chrono::duration<double>(end - middle).count()};
+        const std::clock_t end = std::clock();
+        return {double(middle - start) / CLOCKS_PER_SEC, double(end - middle) / CLOCKS_PER_SEC};
     }
 
 private:
@@ -373,17 +365,14 @@ private:
                     float &light = tile[transposed ? x * CELL + y : y * CELL + x];
                     light = before + share[y][x] * (light - before);
                 }
-        Code codes[CELL * CELL];
-        encoder_.encode(tile, transposed, codes, simd_);
-        if (share)
-            for (int y = 0; y < rows; ++y)
-                for (int x = 0; x < columns; ++x)
-                    if (share[y][x] == 0) codes[y * CELL + x] = in[y * line + x * pixel];
-        for (int y = 0; y < rows; ++y) {
-            if (pixel == 1) std::memcpy(out + y * line, codes + y * CELL, size_t(columns) * sizeof(Code));
-            else
-                for (int x = 0; x < columns; ++x) out[y * line + x * pixel] = codes[y * CELL + x];
-        }
+        float position[CELL * CELL];
+        int32_t index[CELL * CELL];
+        encoder_.find(tile, simd_, position, index);
+        for (int y = 0; y < rows; ++y)
+            for (int x = 0; x < columns; ++x) {
+                const int i = transposed ? x * CELL + y : y * CELL + x;
+                out[y * line + x * pixel] = share && share[y][x] == 0 ? in[y * line + x * pixel] : encoder_.code(tile[i], position[i], index[i]);
+            }
     }
 
     void copy(int cy, int cx) {

@@ -38,7 +38,7 @@ const Simd *simd_named(const char *name);
 int usable_threads();
 
 // Code: uint8_t or uint16_t with a codec; float is linear light already, for which the codec is not read.
-// Returns the seconds that decoding took and that filtering took, on the clock on the wall.
+// Returns the processor time of decoding and of filtering, of all threads of the process.
 struct Seconds {
     double decode, filter;
 };
