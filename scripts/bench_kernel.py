@@ -38,7 +38,7 @@ def main() -> None:
     parser.add_argument("--image", type=Path, help="a sharp picture, scaled to cover the frame (default: a drawn one)")
     parser.add_argument("--length", type=float, default=20.0, help="blur, px")
     parser.add_argument("--angle", type=float, default=20.0, help="of the blur to the rows, degrees")
-    parser.add_argument("--noise", type=float, default=0.01, help="standard deviation, full scale = 1")
+    parser.add_argument("--noise", type=float, default=0.01, help="standard deviation of the codes, full scale = 1")
     parser.add_argument("--repeat", type=int, default=15, help="the best of so many runs counts")
     args = parser.parse_args()
     cv2.setNumThreads(1)
@@ -124,7 +124,7 @@ def sharp_frame(path: Path | None) -> Image:
 
 
 def blur(sharp: Image, vector_px: tuple[float, float], noise: float) -> Image:
-    """What the moving camera records: light averaged along the line, then noise."""
+    """What the moving camera records: light averaged along the line, encoded, with noise."""
     light = linear_from_srgb(sharp / 255).astype(np.float32)
     y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
     steps = int(3 * np.hypot(*vector_px)) + 3
@@ -132,8 +132,8 @@ def blur(sharp: Image, vector_px: tuple[float, float], noise: float) -> Image:
     for s in ((np.arange(steps) + 0.5) / steps - 0.5).tolist():
         shifted = x + np.float32(s * vector_px[0]), y + np.float32(s * vector_px[1])
         total += cv2.remap(light, *shifted, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT_101)
-    total = total / steps + noise * np.random.default_rng(0).standard_normal(light.shape)
-    return np.round(255 * srgb_from_linear(total)).astype(np.uint8)
+    codes = srgb_from_linear(total / steps) + noise * np.random.default_rng(0).standard_normal(light.shape)
+    return np.round(255 * np.clip(codes, 0, 1)).astype(np.uint8)
 
 
 def line(vector_px: tuple[float, float]) -> Light:

@@ -367,6 +367,8 @@ def test_wrong_images_and_options_are_refused():
         deblur(np.zeros((0, 30), dtype=np.uint8), field)
     with pytest.raises(ValueError, match="for 30 x 20 px, the image has 20 x 30"):
         deblur(np.zeros((30, 20), dtype=np.uint8), field)
+    with pytest.raises(ValueError, match="900 px long"):
+        deblur(np.zeros((20, 30), dtype=np.uint8), BlurField.uniform(30, 20, (5.0, -900.0)))
     with pytest.raises(ValueError, match="noise"):
         DeblurOptions(noise=1.0)
     with pytest.raises(ValueError, match="threads"):

@@ -2,9 +2,9 @@
 
 #include <algorithm>
 #include <atomic>
-#include <ctime>
 #include <cmath>
 #include <cstring>
+#include <ctime>
 #include <memory>
 #include <thread>
 #include <type_traits>
@@ -35,10 +35,11 @@ int usable_threads() {
 
 namespace {
 
-constexpr int NODE = 4;                  // px between the points at which the influence of lost light is worked out
+constexpr int NODE = 4;  // px between the points at which the influence of lost light is worked out
 constexpr int PER_CELL = CELL / NODE;
 constexpr float ZERO_TO = 2.0f, ONE_FROM = 2.5f;  // share of the result, by distance from lost light in blur lengths
-constexpr float STEEPEST = 2.0f;  // of a scene that fits the sensor's range, times full scale over the length of the blur
+constexpr float STEEPEST =
+    2.0f;  // of a scene that fits the sensor's range, times full scale over the length of the blur
 
 // Calls work(i) for 0 <= i < count, every i once.
 template <class Work>
@@ -66,7 +67,7 @@ struct Plane {
     int before_major = 0, before_minor = 0;  // px of surroundings
     int width = 0, height = 0;
     ptrdiff_t stride = 0;
-    std::unique_ptr<float[]> data;           // not set to zero: every element that is read is written
+    std::unique_ptr<float[]> data;  // not set to zero: every element that is read is written
 
     void allocate(int major, int minor, int reach, float steepest) {
         before_major = reach + 1;
@@ -78,19 +79,23 @@ struct Plane {
         stride *= 16;
         data.reset(new float[size_t(stride) * size_t(height)]);
     }
-    const float *at(int major, int minor) const { return data.get() + (minor + before_minor) * stride + major + before_major; }
+    const float *at(int major, int minor) const {
+        return data.get() + (minor + before_minor) * stride + major + before_major;
+    }
 };
 
 template <class Code>
 float light_of(Code code, const Codec &codec) {
-    if constexpr (std::is_same_v<Code, float>) return code;
-    else return codec.decode[code];
+    if constexpr (std::is_same_v<Code, float>)
+        return code;
+    else
+        return codec.decode[code];
 }
 
 // Codes of linear light, a whole cell at a time.
 template <class Code>
 class Encoder {
-public:
+  public:
     explicit Encoder(const Codec &codec) : table_(codec.encode), steps_(float(codec.encode_steps)) {
         if constexpr (std::is_same_v<Code, uint8_t>) {
             nearest_.resize(size_t(codec.encode_steps) + 2);
@@ -101,7 +106,8 @@ public:
     // Indices into the table for a tile, and where between its entries.
     void find(const float *tile, const Simd &simd, float *position, int32_t *index) const {
         // the nearest entry, or the one below
-        if constexpr (!std::is_same_v<Code, float>) simd.index(tile, steps_, std::is_same_v<Code, uint8_t> ? 0.5f : 0.0f, position, index);
+        if constexpr (!std::is_same_v<Code, float>)
+            simd.index(tile, steps_, std::is_same_v<Code, uint8_t> ? 0.5f : 0.0f, position, index);
     }
 
     Code code(float light, float position, int32_t index) const {
@@ -115,7 +121,7 @@ public:
         }
     }
 
-private:
+  private:
     const float *table_;
     float steps_;
     std::vector<uint8_t> nearest_;
@@ -148,11 +154,12 @@ void fill(Plane &plane, const Code *image, Image size, int channel, bool transpo
     });
 }
 
-// Where light that the sensor could not hold spoils the result: saturated pixels beside which the image is steeper along
-// the blur than the blur of any scene within the sensor's range could be.
+// Where light that the sensor could not hold spoils the result: saturated pixels beside which the image is steeper
+// along the blur than the blur of any scene within the sensor's range could be.
 class LostLight {
-public:
-    LostLight(Image size, const Field &field) : size_(size), field_(field), ny_(PER_CELL * field.ny + 1), nx_(PER_CELL * field.nx + 1) {}
+  public:
+    LostLight(Image size, const Field &field)
+        : size_(size), field_(field), ny_(PER_CELL * field.ny + 1), nx_(PER_CELL * field.nx + 1) {}
 
     template <class Code>
     void find(const Code *image, const Codec &codec, int threads) {
@@ -170,7 +177,8 @@ public:
                 if (top < threshold) continue;
                 for (int x = 0; x < line; ++x) {
                     unsigned char &lost = blocks[size_t(i) * blocks_x + x / block];
-                    if (row[x] < threshold || lost || !steep(image, codec, y, x / size_.channels, x % size_.channels)) continue;
+                    if (row[x] < threshold || lost || !steep(image, codec, y, x / size_.channels, x % size_.channels))
+                        continue;
                     lost = 1;
                     any = true;
                 }
@@ -203,7 +211,8 @@ public:
                 reach_y = std::max(reach_y, field_.along_y[cell] ? major : minor);
                 reach_x = std::max(reach_x, field_.along_y[cell] ? minor : major);
             }
-        const int top = std::max(0, cy * PER_CELL - int(reach_y / NODE) - 1), left = std::max(0, cx * PER_CELL - int(reach_x / NODE) - 1);
+        const int top = std::max(0, cy * PER_CELL - int(reach_y / NODE) - 1),
+                  left = std::max(0, cx * PER_CELL - int(reach_x / NODE) - 1);
         const int bottom = std::min(ny_, (cy + 1) * PER_CELL + int(reach_y / NODE) + 2);
         const int right = std::min(nx_, (cx + 1) * PER_CELL + int(reach_x / NODE) + 2);
         if (sum(bottom, right) - sum(top, right) - sum(bottom, left) + sum(top, left) == 0) return false;
@@ -212,14 +221,15 @@ public:
         return true;
     }
 
-private:
+  private:
     int sum(int y, int x) const { return sums_[size_t(y) * (nx_ + 1) + x]; }
 
     template <class Code>
     bool steep(const Code *image, const Codec &codec, int y, int x, int channel) const {
         const size_t cell = size_t(y / CELL) * field_.nx + x / CELL;
         const float extent = field_.extent[cell];
-        const int major = std::max(1, int(extent / 4 + 0.5f)), minor = int(std::floor(float(major) * field_.slope[cell] + 0.5f));
+        const int major = std::max(1, int(extent / 4 + 0.5f)),
+                  minor = int(std::floor(float(major) * field_.slope[cell] + 0.5f));
         const int dy = field_.along_y[cell] ? major : minor, dx = field_.along_y[cell] ? minor : major;
         auto light = [&](int at_y, int at_x) {
             at_y = std::min(std::max(at_y, 0), size_.height - 1);
@@ -234,14 +244,17 @@ private:
 
     // Zero where the filter reaches lost light, one half a blur length further on.
     float share_at(int i, int j) const {
-        const size_t cell = size_t(std::min(i / PER_CELL, field_.ny - 1)) * field_.nx + std::min(j / PER_CELL, field_.nx - 1);
+        const size_t cell =
+            size_t(std::min(i / PER_CELL, field_.ny - 1)) * field_.nx + std::min(j / PER_CELL, field_.nx - 1);
         const float extent = field_.extent[cell], slope = field_.slope[cell];
         const bool along_y = field_.along_y[cell];
         for (int step = 0; float(NODE * step) <= ONE_FROM * extent; ++step) {
             const int minor = int(std::floor(float(step) * slope + 0.5f));
             const int dy = along_y ? step : minor, dx = along_y ? minor : step;
             if (near(i + dy, j + dx) || near(i - dy, j - dx))
-                return std::min(std::max((float(NODE * step) / std::max(extent, 1e-6f) - ZERO_TO) / (ONE_FROM - ZERO_TO), 0.0f), 1.0f);
+                return std::min(
+                    std::max((float(NODE * step) / std::max(extent, 1e-6f) - ZERO_TO) / (ONE_FROM - ZERO_TO), 0.0f),
+                    1.0f);
         }
         return 1;
     }
@@ -256,9 +269,19 @@ private:
 
 template <class Code>
 class Deblur {
-public:
-    Deblur(const Code *image, Code *result, Image size, const Field &field, const Table &table, const Codec &codec, const Simd &simd, int threads)
-        : image_(image), result_(result), size_(size), field_(field), table_(table), codec_(codec), simd_(simd), threads_(threads), encoder_(codec), lost_light_(size, field) {}
+  public:
+    Deblur(const Code *image, Code *result, Image size, const Field &field, const Table &table, const Codec &codec,
+           const Simd &simd, int threads)
+        : image_(image),
+          result_(result),
+          size_(size),
+          field_(field),
+          table_(table),
+          codec_(codec),
+          simd_(simd),
+          threads_(threads),
+          encoder_(codec),
+          lost_light_(size, field) {}
 
     Seconds run() {
         const std::clock_t start = std::clock();
@@ -270,7 +293,7 @@ public:
         return {double(middle - start) / CLOCKS_PER_SEC, double(end - middle) / CLOCKS_PER_SEC};
     }
 
-private:
+  private:
     void decode() {
         for (const bool transposed : {false, true}) {
             int reach = 0;
@@ -285,7 +308,8 @@ private:
             if (!needed) continue;
             for (int channel = 0; channel < size_.channels; ++channel) {
                 Plane plane;
-                const int major = (transposed ? field_.ny : field_.nx) * CELL, minor = (transposed ? field_.nx : field_.ny) * CELL;
+                const int major = (transposed ? field_.ny : field_.nx) * CELL,
+                          minor = (transposed ? field_.nx : field_.ny) * CELL;
                 plane.allocate(major, minor, reach, steepest);
                 fill(plane, image_, size_, channel, transposed, codec_, threads_);
                 planes_[transposed].push_back(std::move(plane));
@@ -346,7 +370,8 @@ private:
                 share[y][x] = (above[0] * (1 - t) + above[1] * t) * (1 - s) + (below[0] * (1 - t) + below[1] * t) * s;
                 if (!spoilt) continue;
                 const float *upper = &nodes[y / NODE][x / NODE], *lower = &nodes[y / NODE + 1][x / NODE];
-                share[y][x] *= (upper[0] * (1 - t_node) + upper[1] * t_node) * (1 - s_node) + (lower[0] * (1 - t_node) + lower[1] * t_node) * s_node;
+                share[y][x] *= (upper[0] * (1 - t_node) + upper[1] * t_node) * (1 - s_node) +
+                               (lower[0] * (1 - t_node) + lower[1] * t_node) * s_node;
             }
         }
         return true;
@@ -371,14 +396,16 @@ private:
         for (int y = 0; y < rows; ++y)
             for (int x = 0; x < columns; ++x) {
                 const int i = transposed ? x * CELL + y : y * CELL + x;
-                out[y * line + x * pixel] = share && share[y][x] == 0 ? in[y * line + x * pixel] : encoder_.code(tile[i], position[i], index[i]);
+                out[y * line + x * pixel] = share && share[y][x] == 0 ? in[y * line + x * pixel]
+                                                                      : encoder_.code(tile[i], position[i], index[i]);
             }
     }
 
     void copy(int cy, int cx) {
         const int rows = std::min(CELL, size_.height - cy * CELL), columns = std::min(CELL, size_.width - cx * CELL);
         for (int y = 0; y < rows; ++y) {
-            const size_t at = (size_t(cy * CELL + y) * size_t(size_.width) + size_t(cx * CELL)) * size_t(size_.channels);
+            const size_t at =
+                (size_t(cy * CELL + y) * size_t(size_.width) + size_t(cx * CELL)) * size_t(size_.channels);
             std::memcpy(result_ + at, image_ + at, size_t(columns) * size_t(size_.channels) * sizeof(Code));
         }
     }
@@ -399,10 +426,13 @@ private:
 }  // namespace
 
 template <class Code>
-Seconds deblur(const Code *image, Code *result, Image size, const Field &field, const Table &table, const Codec &codec, const Simd &simd, int threads) {
+Seconds deblur(const Code *image, Code *result, Image size, const Field &field, const Table &table, const Codec &codec,
+               const Simd &simd, int threads) {
     return Deblur<Code>(image, result, size, field, table, codec, simd, threads > 0 ? threads : usable_threads()).run();
 }
 
-template Seconds deblur(const uint8_t *, uint8_t *, Image, const Field &, const Table &, const Codec &, const Simd &, int);
-template Seconds deblur(const uint16_t *, uint16_t *, Image, const Field &, const Table &, const Codec &, const Simd &, int);
+template Seconds deblur(const uint8_t *, uint8_t *, Image, const Field &, const Table &, const Codec &, const Simd &,
+                        int);
+template Seconds deblur(const uint16_t *, uint16_t *, Image, const Field &, const Table &, const Codec &, const Simd &,
+                        int);
 template Seconds deblur(const float *, float *, Image, const Field &, const Table &, const Codec &, const Simd &, int);

@@ -6,25 +6,25 @@
 #include <cstdint>
 
 struct Field {
-    int ny, nx;              // cells
-    const float *extent;     // (ny, nx) blur along the major axis, px
-    const float *slope;      // (ny, nx) minor over major component
-    const bool *along_y;     // (ny, nx) whether the major axis is y
-    const float *fade;       // (ny + 1, nx + 1) share of the result at the corners
+    int ny, nx;           // cells
+    const float *extent;  // (ny, nx) blur along the major axis, px
+    const float *slope;   // (ny, nx) minor over major component
+    const bool *along_y;  // (ny, nx) whether the major axis is y
+    const float *fade;    // (ny + 1, nx + 1) share of the result at the corners
 };
 
 struct Table {
-    int rows, width;         // width: T + 1
-    float first, steps;      // row i is for (first + i) / steps px
-    const float *weights;    // (rows, width)
-    const int32_t *reach;    // (rows,)
+    int rows, width;       // width: T + 1
+    float first, steps;    // row i is for (first + i) / steps px
+    const float *weights;  // (rows, width)
+    const int32_t *reach;  // (rows,)
 };
 
 struct Codec {
-    const float *decode;     // linear light of every code
-    const float *encode;     // codes of evenly spaced light, encode_steps + 2 entries
+    const float *decode;  // linear light of every code
+    const float *encode;  // codes of evenly spaced light, encode_steps + 2 entries
     int encode_steps;
-    int saturated;           // codes from here on are
+    int saturated;  // codes from here on are
 };
 
 struct Image {

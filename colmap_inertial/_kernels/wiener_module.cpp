@@ -29,20 +29,28 @@ const Simd &simd_for(const std::string &name) {
 }
 
 template <class Code>
-std::pair<double, double> deblur_image(In<Code, 3> image, Out<Code> result, In<float, 2> extent_px, In<float, 2> slope, In<bool, 2> along_y,
-                                       In<float, 2> fade, In<float, 2> weights, In<int32_t, 1> reach, float first, float steps,
-                                       In<float, 1> decode, In<float, 1> encode, int saturated, int threads, const std::string &instruction_set) {
+std::pair<double, double> deblur_image(In<Code, 3> image, Out<Code> result, In<float, 2> extent_px, In<float, 2> slope,
+                                       In<bool, 2> along_y, In<float, 2> fade, In<float, 2> weights,
+                                       In<int32_t, 1> reach, float first, float steps, In<float, 1> decode,
+                                       In<float, 1> encode, int saturated, int threads,
+                                       const std::string &instruction_set) {
     const int height = int(image.shape(0)), width = int(image.shape(1));
     const int ny = (height + CELL - 1) / CELL, nx = (width + CELL - 1) / CELL;
-    auto is = [](const auto &array, size_t rows, size_t columns) { return array.shape(0) == rows && array.shape(1) == columns; };
+    auto is = [](const auto &array, size_t rows, size_t columns) {
+        return array.shape(0) == rows && array.shape(1) == columns;
+    };
     check(height > 0 && width > 0 && image.shape(2) > 0, "image: empty");
-    check(is(result, image.shape(0), image.shape(1)) && result.shape(2) == image.shape(2), "result: not the shape of image");
-    check(is(extent_px, ny, nx) && is(slope, ny, nx) && is(along_y, ny, nx), "extent_px, slope, along_y: not one value for each cell");
+    check(is(result, image.shape(0), image.shape(1)) && result.shape(2) == image.shape(2),
+          "result: not the shape of image");
+    check(is(extent_px, ny, nx) && is(slope, ny, nx) && is(along_y, ny, nx),
+          "extent_px, slope, along_y: not one value for each cell");
     check(is(fade, ny + 1, nx + 1), "fade: not one value for each corner");
-    check(weights.shape(0) >= 2 && reach.shape(0) == weights.shape(0) && weights.shape(1) >= 1, "weights, reach: not a table");
+    check(weights.shape(0) >= 2 && reach.shape(0) == weights.shape(0) && weights.shape(1) >= 1,
+          "weights, reach: not a table");
     for (size_t i = 0; i < reach.shape(0); ++i)
         check(reach.data()[i] >= 0 && size_t(reach.data()[i]) < weights.shape(1), "reach: beyond the weights");
-    for (size_t i = 0; i < slope.size(); ++i) check(slope.data()[i] >= -1 && slope.data()[i] <= 1, "slope: must be within +-1");
+    for (size_t i = 0; i < slope.size(); ++i)
+        check(slope.data()[i] >= -1 && slope.data()[i] <= 1, "slope: must be within +-1");
     if constexpr (!std::is_same_v<Code, float>) {
         check(decode.shape(0) == size_t(1) << (8 * sizeof(Code)), "decode: not one value for each code");
         check(encode.shape(0) >= 3, "encode: too short");
@@ -52,7 +60,8 @@ std::pair<double, double> deblur_image(In<Code, 3> image, Out<Code> result, In<f
     const Codec codec{decode.data(), encode.data(), int(encode.shape(0)) - 2, saturated};
     const Simd &simd = simd_for(instruction_set);
     nb::gil_scoped_release release;
-    const Seconds seconds = deblur(image.data(), result.data(), Image{height, width, int(image.shape(2))}, field, table, codec, simd, threads);
+    const Seconds seconds = deblur(image.data(), result.data(), Image{height, width, int(image.shape(2))}, field, table,
+                                   codec, simd, threads);
     return {seconds.decode, seconds.filter};
 }
 
@@ -84,9 +93,12 @@ std::vector<std::string> instruction_sets() {
 
 template <class Code>
 void define(nb::module_ &module) {
-    module.def("deblur", &deblur_image<Code>, nb::arg("image").noconvert(), nb::arg("result").noconvert(), nb::kw_only(), nb::arg("extent_px").noconvert(), nb::arg("slope").noconvert(),
-               nb::arg("along_y").noconvert(), nb::arg("fade").noconvert(), nb::arg("weights").noconvert(), nb::arg("reach").noconvert(), nb::arg("first"), nb::arg("steps"), nb::arg("decode").noconvert(),
-               nb::arg("encode").noconvert(), nb::arg("saturated"), nb::arg("threads") = 0, nb::arg("instruction_set") = "");
+    module.def("deblur", &deblur_image<Code>, nb::arg("image").noconvert(), nb::arg("result").noconvert(),
+               nb::kw_only(), nb::arg("extent_px").noconvert(), nb::arg("slope").noconvert(),
+               nb::arg("along_y").noconvert(), nb::arg("fade").noconvert(), nb::arg("weights").noconvert(),
+               nb::arg("reach").noconvert(), nb::arg("first"), nb::arg("steps"), nb::arg("decode").noconvert(),
+               nb::arg("encode").noconvert(), nb::arg("saturated"), nb::arg("threads") = 0,
+               nb::arg("instruction_set") = "");
 }
 
 }  // namespace

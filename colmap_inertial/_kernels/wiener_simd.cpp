@@ -33,7 +33,8 @@ inline Vector load(const float *at) {
     return v;
 }
 
-void place(const float *__restrict lower, const float *__restrict upper, float fraction, float slope, ptrdiff_t stride, Taps &taps) {
+void place(const float *__restrict lower, const float *__restrict upper, float fraction, float slope, ptrdiff_t stride,
+           Taps &taps) {
     const int pitch = int(stride), reach = taps.reach;
     float *__restrict near_weight = taps.near_weight, *__restrict far_weight = taps.far_weight;
     int32_t *__restrict forward = taps.forward, *__restrict backward = taps.backward;
@@ -89,7 +90,8 @@ void filter(const float *source, ptrdiff_t stride, const Taps &taps, float *tile
         for (int x = 0; x < CELL; x += LANES) filter_block(source + y * stride + x, stride, taps, tile + y * CELL + x);
 }
 
-void index(const float *__restrict tile, float scale, float offset, float *__restrict position, int32_t *__restrict index) {
+void index(const float *__restrict tile, float scale, float offset, float *__restrict position,
+           int32_t *__restrict index) {
     for (int i = 0; i < CELL * CELL; ++i) {
         const float clipped = tile[i] < 0.0f ? 0.0f : tile[i];
         position[i] = (clipped > 1.0f ? 1.0f : clipped) * scale + offset;

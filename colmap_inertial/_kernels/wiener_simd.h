@@ -10,10 +10,10 @@ constexpr int CELL = 16;  // px, width and height of a cell: the largest patch t
 // row `j * slope` between two rows, and at -j it crosses the mirrored pair.
 struct Taps {
     int reach;
-    float *near_weight;    // of the row nearer to the pixel
-    float *far_weight;     // of the row beyond it
-    int32_t *forward;      // offset of the near row at +j (the far row is one stride on)
-    int32_t *backward;     // offset of the far row at -j (the near row is one stride on)
+    float *near_weight;  // of the row nearer to the pixel
+    float *far_weight;   // of the row beyond it
+    int32_t *forward;    // offset of the near row at +j (the far row is one stride on)
+    int32_t *backward;   // offset of the far row at -j (the near row is one stride on)
 };
 
 struct Simd {

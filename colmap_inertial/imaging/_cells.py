@@ -63,7 +63,6 @@ class Cells:
 
 def _sample(blur: BlurField, rows: Array, columns: Array) -> Array:
     """(R, C, 2) the field at the crossings of rows and columns."""
-
     (i, s), (j, t) = (np.divmod(np.asarray(at) / blur.step_px, 1) for at in (rows, columns))
     i, j = i.astype(np.intp), j.astype(np.intp)
     i_next, j_next = np.minimum(i + 1, len(blur.vector_px) - 1), np.minimum(j + 1, blur.vector_px.shape[1] - 1)

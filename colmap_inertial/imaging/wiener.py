@@ -23,6 +23,8 @@ Sample = TypeVar("Sample", np.uint8, np.uint16, np.float32)
 
 #: Pixels as bright as this share of the largest code may have been clipped.
 SATURATED = 250 / 255
+#: Longer blurs leave nothing to restore; filters for them would take seconds to work out.
+LONGEST_PX = 500.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +70,7 @@ def deblur(image: NDArray[Code], blur: BlurField, options: DeblurOptions | None 
     Raises
     ------
     ValueError
-        Where the image is of another type, or the blur of another size.
+        Where the image is of another type, the blur of another size, or longer than `LONGEST_PX` along x or y.
     """
     options = options or DeblurOptions()
     planes, cells, prior = _prepare(image, blur, options)
@@ -120,6 +122,8 @@ def _prepare(image: NDArray[Code], blur: BlurField, options: DeblurOptions) -> t
     if (height, width) != (blur.height, blur.width):
         raise ValueError(f"blur: for {blur.width} x {blur.height} px, the image has {width} x {height}")
     cells = Cells.of(blur)
+    if cells.extent_px.max() > LONGEST_PX:
+        raise ValueError(f"blur: {cells.extent_px.max():.0f} px long; at most {LONGEST_PX:.0f} can be undone")
     noise = options.noise
     if noise is None:
         noise = estimate_noise(image, "y" if cells.along_y.mean() > 0.5 else "x")
