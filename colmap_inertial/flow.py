@@ -25,7 +25,7 @@ from colmap_inertial.geometry import (
     so3_log,
 )
 from colmap_inertial.gyro import GyroPath
-from colmap_inertial.imaging.gyro_camera import FrameShutter
+from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.types import Array, CameraTrajectory, Frame, FrameTiming, ImuRecording, Projector
 
 Grey = NDArray[np.uint8]
@@ -167,6 +167,74 @@ class Stabilisation:
     share: float | None
     stabilised: bool | None
     reason: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionCheck:
+    """Whether the camera turned as its gyroscope and calibration say.
+
+    Attributes
+    ----------
+    explained
+        Share of the rotation in the pictures that the gyroscope explains: one is all of it, below zero is worse than
+        no gyroscope. ``None`` where too few frames, or too little rotation, could be compared.
+    gain
+        (3,) rotation in the pictures per rotation felt, about each camera axis; negative means a flipped axis, NaN one
+        about which the camera hardly turned. A common factor above or below one points at the focal length.
+    agrees
+        ``None`` where that cannot be told.
+    reason
+        In words.
+    """
+
+    explained: float | None
+    gain: tuple[float, float, float]
+    agrees: bool | None
+    reason: str
+
+
+#: The gyroscope must explain so much; an axis counts where it turned by more than this many times the noise.
+_LEAST_EXPLAINED, _TURNED = 0.5, 3.0
+
+
+def check_motion(rotation: VisualRotation, motion: GyroCamera) -> MotionCheck:
+    """Compare the rotation between frames with the gyroscope's, axis by axis.
+
+    Blur looks alike whichever way the camera turned; the way from frame to frame does not. So this tells a wrong sign,
+    exchanged axes and a wrong clock offset from the right ones.
+
+    Parameters
+    ----------
+    rotation
+        From :func:`measure_rotation`.
+    motion
+        The gyroscope with the calibration to check, on the same clock.
+    """
+    unknown = (float("nan"),) * 3
+    known = np.isfinite(rotation.turn_rad).all(axis=1) & motion.covers(rotation.t_s[:-1], rotation.t_s[1:])
+    if known.sum() < 3:
+        return MotionCheck(
+            explained=None, gain=unknown, agrees=None, reason="too few pairs of frames to compare with the gyroscope"
+        )
+    looking = motion.start_from_cam(rotation.t_s)
+    felt = so3_log(np.swapaxes(looking[:-1], 1, 2) @ looking[1:])[known]
+    seen, sigma = rotation.turn_rad[known], float(np.median(rotation.sigma_rad[known]))
+    size = np.sqrt(np.mean(seen**2))
+    if size < _TURNED * sigma:
+        return MotionCheck(explained=None, gain=unknown, agrees=None, reason="the camera hardly turned between frames")
+    # the median copes with pairs that were measured wrongly
+    left, all_of_it = (float(np.median(np.sum(v**2, axis=1))) for v in (seen - felt, seen))
+    explained = 1 - left / max(all_of_it, 1e-12)
+    gain = []
+    for axis in range(3):
+        turned = np.sqrt(np.mean(felt[:, axis] ** 2)) > _TURNED * sigma
+        gain.append(float(seen[:, axis] @ felt[:, axis] / (felt[:, axis] @ felt[:, axis])) if turned else float("nan"))
+    flipped = ["xyz"[axis] for axis in range(3) if gain[axis] < -0.3]
+    reason = f"the gyroscope explains {100 * max(explained, 0):.0f} % of the rotation between frames"
+    if flipped:
+        reason += f"; the camera's {' and '.join(flipped)} axis turns the other way: check the axes"
+    agrees = explained >= _LEAST_EXPLAINED and not flipped
+    return MotionCheck(explained=explained, gain=(gain[0], gain[1], gain[2]), agrees=agrees, reason=reason)
 
 
 #: Rotation slower than this is what a stabiliser lets pass.
@@ -381,4 +449,12 @@ def _from_two(a: Array, b: Array) -> Array | None:
     return np.asarray(frames[1] @ frames[0].T)
 
 
-__all__ = ["FlowOptions", "Stabilisation", "VisualRotation", "find_stabilisation", "measure_rotation"]
+__all__ = [
+    "FlowOptions",
+    "MotionCheck",
+    "Stabilisation",
+    "VisualRotation",
+    "check_motion",
+    "find_stabilisation",
+    "measure_rotation",
+]

@@ -11,8 +11,9 @@ from far_scene import FarScene
 
 from colmap_inertial.align import AlignOptions, align_camera_imu
 from colmap_inertial.errors import NotObservableError
-from colmap_inertial.flow import FlowOptions, find_stabilisation, measure_rotation
+from colmap_inertial.flow import FlowOptions, check_motion, find_stabilisation, measure_rotation
 from colmap_inertial.geometry import matrix_from_quat, quat_conjugate, quat_log, quat_multiply
+from colmap_inertial.gyro import GyroPath
 from colmap_inertial.imaging.gyro_camera import FrameShutter
 from colmap_inertial.simulate.render import colmap_camera
 from colmap_inertial.types import CameraModel, Frame, FrameTiming, ImuRecording
@@ -113,6 +114,25 @@ def test_pictures_without_the_gyroscope_s_rotation_were_stabilised(scene, film):
     still = replace(imu, gyro_rad_s=0.01 * imu.gyro_rad_s)
     assert find_stabilisation(rotation, still).stabilised is None
     assert find_stabilisation(replace(rotation, t_s=rotation.t_s * 10), imu).stabilised is None
+
+
+def test_a_flipped_axis_is_told_from_the_way_between_frames(scene, film):
+    frames, timing = film
+    rotation = measure_rotation(frames, colmap_camera(LENS), timing)
+    gyro = scene.gyro()
+    right = check_motion(rotation, gyro)
+    assert right.agrees and right.explained > 0.98
+    np.testing.assert_allclose(right.gain, 1, atol=0.08)
+    to_cam = matrix_from_quat(gyro.cam_from_imu_xyzw)
+    for axis in range(3):
+        sign = np.ones(3)
+        sign[axis] = -1
+        rate = gyro.path.rate_rad_s @ to_cam.T * sign @ to_cam
+        flipped = check_motion(rotation, replace(gyro, path=GyroPath(gyro.path.t_s, rate, np.zeros(3))))
+        assert not flipped.agrees and f"{'xyz'[axis]} axis turns the other way" in flipped.reason
+    elsewhere = check_motion(rotation, replace(gyro, offset_s=gyro.offset_s + 0.7))
+    assert not elsewhere.agrees
+    assert check_motion(rotation, replace(gyro, offset_s=100.0)).agrees is None
 
 
 def test_memory_does_not_grow_with_the_number_of_frames(film):

@@ -1,0 +1,204 @@
+"""What an image itself says about its motion blur: does it bear out the blur that the gyroscope predicts?
+
+A picture smeared by L pixels along a direction has a spectrum with zeros every 1/L, and therefore a dip in its
+cepstrum (the inverse transform of the logarithm of its power spectrum) at that lag, in that direction and in no
+other. Tiles of the picture are compared at lags relative to the blur predicted for each of them, so that the whole
+picture, and many pictures of one recording, add up. The cepstrum of blurred pictures: Rom, "On the cepstrum of
+two-dimensional functions" (IEEE Trans. Information Theory, 1975).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.types import Array
+
+#: Lags as factors of the predicted extent, and directions against the predicted one.
+FACTORS = np.arange(0.6, 1.5001, 0.05)
+TURNS_RAD = np.radians(np.arange(0.0, 180.0, 7.5))
+#: Tiles are at least so large, and so many times the blur's length.
+_SMALLEST_TILE_PX, _TILE_BLURS = 64, 2.9
+#: Images with longer blur are looked at in half the size, a quarter and so on.
+_LONGEST_PX = 44.0
+#: Shorter blur leaves no zero in the spectrum; flat or overexposed tiles say nothing; more tiles than this add little.
+_SHORTEST_PX, _LEAST_CONTRAST, _MOST_CLIPPED, _MOST_TILES = 2.5, 0.01, 0.1, 900
+#: Standard deviation of the smoothing of the cepstrum, px; power (of a tile's mean square 1) below which noise rules.
+_SMOOTHING_PX, _FLOOR = 0.8, 1e-7
+_FEWEST_TILES = 12
+#: The extents among which the prediction may be: dips at shorter lags are the texture's own.
+_PLAUSIBLE = slice(2, 17)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BlurEvidence:
+    """Depths of the dips in the cepstra of tiles, summed; evidence of several images adds up.
+
+    Attributes
+    ----------
+    total, total_square
+        (FACTORS, TURNS_RAD) sums over tiles of the cepstrum at that factor of the predicted blur and that direction
+        from it, less its median over all directions; and of the squares.
+    tiles
+        How many were summed.
+    """
+
+    total: Array
+    total_square: Array
+    tiles: int
+
+    @classmethod
+    def nothing(cls) -> BlurEvidence:
+        """Of no image."""
+        zero = np.zeros((len(FACTORS), len(TURNS_RAD)))
+        return cls(total=zero, total_square=zero, tiles=0)
+
+    def __add__(self, other: BlurEvidence) -> BlurEvidence:
+        return BlurEvidence(
+            total=self.total + other.total,
+            total_square=self.total_square + other.total_square,
+            tiles=self.tiles + other.tiles,
+        )
+
+    @property
+    def enough(self) -> bool:
+        """Whether there are tiles enough to say anything."""
+        return self.tiles >= _FEWEST_TILES
+
+    @cached_property
+    def sigmas(self) -> Array:
+        """(FACTORS, TURNS_RAD) depth of the mean dip in its standard deviations: positive is a dip."""
+        if not self.enough:
+            return np.zeros((len(FACTORS), len(TURNS_RAD)))
+        mean = self.total / self.tiles
+        variance = np.maximum(self.total_square / self.tiles - mean**2, 1e-12)
+        return np.asarray(-mean / np.sqrt(variance / self.tiles))
+
+    @property
+    def support(self) -> float:
+        """Standard deviations by which the dip shows in the predicted direction, at the extent where it is deepest."""
+        return float(self.sigmas[_PLAUSIBLE, 0].max())
+
+    @property
+    def extent_factor(self) -> float:
+        """The extent in the image as a factor of the predicted one: where the dip is deepest, by a parabola."""
+        mean = self.total[_PLAUSIBLE, 0]
+        i = int(np.clip(np.argmin(mean), 1, len(mean) - 2))
+        before, here, after = mean[i - 1 : i + 2]
+        bend = before - 2 * here + after
+        shift = 0.0 if bend <= 0 else float(np.clip(0.5 * (before - after) / bend, -1, 1))
+        return float(FACTORS[_PLAUSIBLE][i] + shift * (FACTORS[1] - FACTORS[0]))
+
+    @property
+    def extent_is_plausible(self) -> bool:
+        """Whether the deepest dip lies inside the range of extents rather than at its end."""
+        i = int(np.argmin(self.total[:, 0]))
+        return _PLAUSIBLE.start <= i < _PLAUSIBLE.stop
+
+    @property
+    def contradiction(self) -> float:
+        """Standard deviations by which the deepest dip in some clearly different direction shows."""
+        return float(self.sigmas[:, 4:-3].max())
+
+
+def blur_evidence(image: NDArray[np.uint8] | NDArray[np.uint16], blur: BlurField) -> BlurEvidence:
+    """Look for the blur that was predicted.
+
+    Parameters
+    ----------
+    image
+        (H, W) or (H, W, 3), sRGB.
+    blur
+        Predicted, of the image's size.
+
+    Returns
+    -------
+    Evidence in units of the prediction; of no tile where blur is short, or texture missing, all over.
+    """
+    import cv2
+    from scipy.fft import irfft2, rfft2
+
+    light = _light(image)
+    lengths = blur.extent_px()
+    long_px = float(np.percentile(lengths, 90))
+    reduced = 1
+    while long_px / reduced > _LONGEST_PX:
+        reduced *= 2
+    if reduced > 1:
+        size = (light.shape[1] // reduced, light.shape[0] // reduced)
+        if min(size) == 0:
+            return BlurEvidence.nothing()
+        light = np.asarray(
+            cv2.resize(light[: size[1] * reduced, : size[0] * reduced], size, interpolation=cv2.INTER_AREA)
+        )
+    tile = _SMALLEST_TILE_PX
+    while tile < _TILE_BLURS * long_px / reduced:
+        tile *= 2
+    height, width = light.shape
+    if min(height, width) < tile:
+        return BlurEvidence.nothing()
+    step = max(3 * tile // 4, int(np.ceil(np.sqrt(height * width / _MOST_TILES))))
+    top, left = (_starts(size, tile, step) for size in (height, width))
+    windows = np.lib.stride_tricks.sliding_window_view(light, (tile, tile))[top][:, left].reshape(-1, tile, tile)
+    rows, columns = (
+        np.minimum(np.rint((start + tile / 2) * reduced / blur.step_px), size - 1).astype(np.intp)
+        for start, size in ((top, lengths.shape[0]), (left, lengths.shape[1]))
+    )
+    vectors = blur.vector_px[rows][:, columns].reshape(-1, 2).astype(np.float64) / reduced
+    extent = np.hypot(vectors[:, 0], vectors[:, 1])
+    usable = (extent >= _SHORTEST_PX) & (extent * FACTORS[-1] < 0.5 * tile)
+    usable &= (windows > 0.97).mean(axis=(1, 2)) < _MOST_CLIPPED
+    spread = windows.std(axis=(1, 2))
+    usable &= spread > _LEAST_CONTRAST
+    if usable.sum() < _FEWEST_TILES:
+        return BlurEvidence.nothing()
+    tiles = windows[usable]
+    window = np.hanning(tile).astype(np.float32)
+    tiles = (tiles - tiles.mean(axis=(1, 2), keepdims=True)) * (window[:, None] * window)
+    power = np.abs(rfft2(tiles)) ** 2
+    smooth = np.exp(-2 * (np.pi * _SMOOTHING_PX * np.fft.fftfreq(tile)) ** 2).astype(np.float32)
+    damped = np.log(power + _FLOOR * tile**2) * smooth[:, None] * smooth[: tile // 2 + 1]
+    cepstra = irfft2(damped, s=(tile, tile))
+    values = _at_lags(np.asarray(cepstra), vectors[usable])
+    values -= np.median(values[:, :, 3:-2], axis=2, keepdims=True)
+    return BlurEvidence(total=values.sum(axis=0), total_square=(values**2).sum(axis=0), tiles=len(values))
+
+
+def _light(image: NDArray[np.uint8] | NDArray[np.uint16]) -> NDArray[np.float32]:
+    """(H, W) roughly linear light, 0 to 1."""
+    import cv2
+
+    grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    codes = np.iinfo(grey.dtype).max
+    if grey.dtype == np.uint8:
+        return np.asarray(((np.arange(256) / 255) ** 2.2).astype(np.float32)[grey])
+    return np.asarray((grey.astype(np.float32) / np.float32(codes)) ** np.float32(2.2))
+
+
+def _starts(size: int, tile: int, step: int) -> NDArray[np.intp]:
+    """Tiles that cover a side evenly."""
+    count = max(1, -(-(size - tile) // step) + 1)
+    return np.unique(np.rint(np.linspace(0, size - tile, count)).astype(np.intp))
+
+
+def _at_lags(cepstra: NDArray[np.float32], vectors: Array) -> Array:
+    """(N, FACTORS, TURNS_RAD) values of (N, T, T) cepstra at the lags around (N, 2) blur vectors; bilinear."""
+    tile = cepstra.shape[1]
+    cosine, sine = np.cos(TURNS_RAD), np.sin(TURNS_RAD)
+    along_x = vectors[:, 0, None] * cosine - vectors[:, 1, None] * sine
+    along_y = vectors[:, 0, None] * sine + vectors[:, 1, None] * cosine
+    x, y = (FACTORS[None, :, None] * v[:, None, :] for v in (along_x, along_y))
+    x0, y0 = np.floor(x).astype(np.intp), np.floor(y).astype(np.intp)
+    fx, fy = x - x0, y - y0
+    index = np.arange(len(cepstra))[:, None, None]
+    upper = cepstra[index, y0 % tile, x0 % tile] * (1 - fx) + cepstra[index, y0 % tile, (x0 + 1) % tile] * fx
+    y1 = (y0 + 1) % tile
+    lower = cepstra[index, y1, x0 % tile] * (1 - fx) + cepstra[index, y1, (x0 + 1) % tile] * fx
+    return np.asarray(upper * (1 - fy) + lower * fy)
+
+
+__all__ = ["FACTORS", "TURNS_RAD", "BlurEvidence", "blur_evidence"]

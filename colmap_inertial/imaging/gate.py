@@ -1,0 +1,384 @@
+"""The safety gate of deblurring: which frames to touch, and nothing that the image does not bear out.
+
+Deconvolving what is sharp, or along a wrong direction, destroys more than blur does. So a frame is deblurred only
+where its own cepstrum shows the blur that the gyroscope predicts, or other frames of the recording have shown that
+the gyroscope is right and this one does not contradict; the extent is corrected to what the images show; and places
+in a deblurred frame that were sharp before keep their pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from typing import Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence
+from colmap_inertial.imaging.gyro_camera import GyroCamera
+from colmap_inertial.imaging.psf import PredictedBlur
+from colmap_inertial.types import Array
+
+Code = TypeVar("Code", np.uint8, np.uint16)
+Picture = NDArray[np.float32]
+Action = Literal["keep", "deblur", "drop"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class GateOptions:
+    """What is deblurred. Blur is the 90th percentile over the image, scaled to an image 1920 px wide."""
+
+    skip_below_px: float = 3.0
+    """Less blur than this is left alone."""
+
+    drop_above_px: float = 45.0
+    """Frames with more blur are left out, unless they bridge a gap."""
+
+    bridge_s: float = 0.5
+    """Longest pause that leaving out frames may open."""
+
+    bridge_deg: float = 10.0
+    """Largest turn of the camera that leaving out frames may open."""
+
+    min_support: float = 4.0
+    """Standard deviations by which one frame alone must show the predicted blur."""
+
+    min_recording_support: float = 2.5
+    """Standard deviations by which the median frame must show it, for the gyroscope to be trusted in all."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.skip_below_px < self.drop_above_px:
+            raise ValueError("skip_below_px must be from 0 to below drop_above_px")
+        if not (self.bridge_s > 0 and self.bridge_deg > 0):
+            raise ValueError("bridge_s and bridge_deg must be positive")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameDecision:
+    """What happens to one frame, and why.
+
+    Attributes
+    ----------
+    name
+        Of the frame.
+    blur_px
+        Predicted, px of the image as it is; ``None`` where unknown.
+    action
+        keep: as filmed.
+    reason
+        In words.
+    """
+
+    name: str
+    blur_px: float | None
+    action: Action
+    reason: str
+
+
+def decide(
+    predicted: PredictedBlur,
+    t_s: Array,
+    *,
+    width: int,
+    height: int,
+    motion: GyroCamera | None = None,
+    options: GateOptions | None = None,
+) -> tuple[FrameDecision, ...]:
+    """Keep, deblur or drop each frame, from the gyroscope alone.
+
+    Parameters
+    ----------
+    predicted
+        Of all frames, in order of time.
+    t_s
+        (F,) their times.
+    width, height
+        Size of the images.
+    motion
+        Tells how far the camera turned across a gap; without it, only the pause counts.
+    options
+        Thresholds.
+    """
+    options = options or GateOptions()
+    scale = max(width, height) / 1920
+    px = predicted.px
+    dropped = _droppable(px > options.drop_above_px * scale, px, t_s, motion, options)
+    out = []
+    for name, blur, reason, drop in zip(predicted.names, px, predicted.reasons, dropped, strict=True):
+        if not np.isfinite(blur):
+            out.append(FrameDecision(name=name, blur_px=None, action="keep", reason=reason))
+            continue
+        action: Action = "deblur"
+        why = f"{blur:.1f} px of blur"
+        if blur < options.skip_below_px * scale:
+            action, why = "keep", f"{blur:.1f} px of blur are too few to matter"
+        elif drop:
+            action, why = "drop", f"{blur:.0f} px of blur are too many, and the frames around it are better"
+        elif blur > options.drop_above_px * scale:
+            why = f"{blur:.0f} px of blur are too many, but the frame bridges a gap"
+        out.append(FrameDecision(name=name, blur_px=float(blur), action=action, reason=why))
+    return tuple(out)
+
+
+def _droppable(
+    candidate: NDArray[np.bool_], px: Array, t_s: Array, motion: GyroCamera | None, options: GateOptions
+) -> NDArray[np.bool_]:
+    """Which candidates can go, the most blurred first, without opening too wide a gap between those that stay."""
+    looking = None if motion is None else motion.start_from_cam(t_s)
+    stays = np.ones(len(px), dtype=np.bool_)
+    before, after = np.arange(len(px)) - 1, np.arange(len(px)) + 1
+    for i in sorted(np.flatnonzero(candidate), key=lambda k: -px[k]):
+        left, right = before[i], after[i]
+        if left >= 0 and right < len(px):
+            turn_deg = 0.0
+            if looking is not None:
+                cosine = 0.5 * (np.trace(looking[left].T @ looking[right]) - 1)
+                turn_deg = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+            if t_s[right] - t_s[left] > options.bridge_s or turn_deg > options.bridge_deg:
+                continue
+        stays[i] = False
+        if left >= 0:
+            after[left] = right
+        if right < len(px):
+            before[right] = left
+    return ~stays
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class GatedFrame:
+    """A frame that went through the gate.
+
+    Attributes
+    ----------
+    image
+        Deblurred, or the very array that came in.
+    deblurred
+        Whether any pixel was changed on purpose.
+    kept_share
+        Share of the image that keeps its pixels because it was sharp already.
+    extent_factor
+        What the predicted extents were multiplied by, to agree with the images.
+    evidence
+        Of this frame, in units of the gyroscope's prediction; adds up over a recording.
+    reason
+        In words.
+    """
+
+    image: NDArray[np.uint8] | NDArray[np.uint16]
+    deblurred: bool
+    kept_share: float
+    extent_factor: float
+    evidence: BlurEvidence
+    reason: str
+
+
+def deblur_gated(
+    image: NDArray[Code],
+    blur: BlurField,
+    *,
+    recording: RecordingVerdict | None = None,
+    deblur: Callable[[NDArray[Code], BlurField], NDArray[Code]] | None = None,
+    options: GateOptions | None = None,
+) -> GatedFrame:
+    """Deblur a frame where the image bears it out, and only there.
+
+    Parameters
+    ----------
+    image
+        (H, W) or (H, W, 3), sRGB.
+    blur
+        Predicted by the gyroscope.
+    recording
+        What its frames say together (:func:`judge_recording`). Without it, only frames that show the blur clearly by
+        themselves are deblurred.
+    deblur
+        ``wiener.deblur`` by default.
+    options
+        Thresholds.
+    """
+    options = options or GateOptions()
+    evidence = blur_evidence(image, blur)
+    factor, reason = _judge(evidence, blur, recording, options)
+    if factor is None:
+        return GatedFrame(
+            image=image, deblurred=False, kept_share=1.0, extent_factor=1.0, evidence=evidence, reason=reason
+        )
+    if factor != 1.0:
+        blur = replace(blur, vector_px=(blur.vector_px * np.float32(factor)))
+    if deblur is None:
+        from colmap_inertial.imaging.wiener import deblur as wiener_deblur
+
+        deblur = wiener_deblur
+    out, kept = keep_sharp(image, deblur(image, blur), blur)
+    return GatedFrame(
+        image=out, deblurred=True, kept_share=kept, extent_factor=factor, evidence=evidence, reason=reason
+    )
+
+
+#: An extent is corrected where it is further off than small blur lets the dip drift, and where the dip is this clear.
+_CORRECTED_FROM, _CLEAR_SUPPORT = 0.1, 8.0
+#: Blur this long must show in a frame with texture; below, a frame that shows nothing does not contradict.
+_MUST_SHOW_PX = 8.0
+_FEWEST_FRAMES = 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordingVerdict:
+    """Whether the images of a recording bear out its gyroscope.
+
+    Attributes
+    ----------
+    trusted
+        ``None`` where too few frames are blurred and textured enough to tell: then each frame speaks for itself.
+    support
+        Median over the frames that can tell, in standard deviations.
+    extent_factor
+        What the predicted extents must be multiplied by to agree with the images.
+    frames
+        How many can tell.
+    reason
+        In words.
+    """
+
+    trusted: bool | None
+    support: float
+    extent_factor: float
+    frames: int
+    reason: str
+
+
+def judge_recording(evidence: Iterable[BlurEvidence], options: GateOptions | None = None) -> RecordingVerdict:
+    """Judge gyroscope, axes, clock offset and exposure by several frames at once.
+
+    The median decides: a wrong axis still fits the frames in which it hardly turns.
+
+    Parameters
+    ----------
+    evidence
+        ``blur_evidence`` of some ten frames or more, among the more blurred of the recording.
+    options
+        Thresholds.
+    """
+    options = options or GateOptions()
+    telling = [one for one in evidence if one.enough]
+    supports = [_support(one) for one in telling]
+    median = float(np.median(supports)) if supports else 0.0
+    clear = [one.extent_factor for one, support in zip(telling, supports, strict=True) if support >= _CLEAR_SUPPORT]
+    factor = float(np.median(clear)) if len(clear) >= _FEWEST_FRAMES else 1.0
+    factor = factor if abs(factor - 1) > _CORRECTED_FROM else 1.0
+    if len(telling) < _FEWEST_FRAMES:
+        trusted, reason = None, f"{len(telling)} frames are too few to check the gyroscope against the images"
+    elif median < options.min_recording_support:
+        trusted = False
+        reason = (
+            f"the images do not show the blur that the gyroscope predicts ({median:.1f} standard deviations in the "
+            f"median of {len(telling)} frames): check its axes, the clock offset, the exposure times, and that the "
+            "video was not stabilised"
+        )
+    else:
+        trusted, reason = True, f"the images bear out the gyroscope's blur ({median:.0f} standard deviations)"
+        if factor != 1.0:
+            reason += f", but for its extent, which is multiplied by {factor:.2f}"
+    return RecordingVerdict(trusted=trusted, support=median, extent_factor=factor, frames=len(telling), reason=reason)
+
+
+def _support(evidence: BlurEvidence) -> float:
+    return evidence.support if evidence.extent_is_plausible else min(evidence.support, 0.0)
+
+
+def _judge(
+    evidence: BlurEvidence, blur: BlurField, recording: RecordingVerdict | None, options: GateOptions
+) -> tuple[float | None, str]:
+    """The factor for the extents, or ``None`` for a frame to leave alone; and why."""
+    if recording is not None and recording.trusted is False:
+        return None, recording.reason
+    own = _support(evidence) if evidence.enough else 0.0
+    if recording is not None and recording.trusted:
+        long_px = float(np.percentile(blur.extent_px(), 90))
+        if evidence.enough and own < 0 and long_px >= _MUST_SHOW_PX:
+            return None, "the image does not show the blur that the gyroscope predicts, though other frames do"
+        return recording.extent_factor, recording.reason
+    if not evidence.enough:
+        return None, "too little texture or blur to check the gyroscope's prediction against"
+    if own < options.min_support:
+        return None, (
+            f"the image does not show the blur that the gyroscope predicts ({own:.1f} standard deviations where "
+            f"{options.min_support:g} are wanted)"
+        )
+    factor = evidence.extent_factor
+    if abs(factor - 1) <= _CORRECTED_FROM or own < _CLEAR_SUPPORT:
+        factor = 1.0
+    return factor, f"the image bears out the gyroscope's blur ({own:.0f} standard deviations)"
+
+
+#: Side of the blocks that keep or give up their pixels together; a step smeared over L rises by no more than a quarter
+#: of its height within L / 4: at about twice that, the original fades in.
+_BLOCK_PX, _SPAN, _FADE_FROM, _FADE_TO = 32, 0.25, 1.8, 2.6
+#: Least brightness range of a block, of full scale: below, there is nothing to lose. Shorter blur cannot be told.
+_LEAST_RANGE, _SHORTEST_PX = 0.06, 5.0
+
+
+def keep_sharp(image: NDArray[Code], deblurred: NDArray[Code], blur: BlurField) -> tuple[NDArray[Code], float]:
+    """Blend back to the original where it was too sharp to be blurred as predicted.
+
+    Blur of length L lets brightness change by its whole local range only over L. A block where it changes by more than
+    half of its range within a quarter of L along the blur was not blurred so: something that moved with the camera,
+    a reflection, writing on the lens.
+
+    Returns
+    -------
+    The blend, and the share of the image that stayed as it was.
+    """
+    import cv2
+
+    height, width = image.shape[:2]
+    codes = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    full = np.float32(np.iinfo(image.dtype).max)
+    grey: Picture = np.asarray(cv2.GaussianBlur(codes.astype(np.float32), (0, 0), 1.0) / full, dtype=np.float32)
+    vectors = blur.per_pixel().astype(np.float32)
+    x, y = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)[:, None]
+    half = 0.5 * _SPAN
+    ends = [
+        cv2.remap(
+            grey, x + s * vectors[..., 0], y + s * vectors[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101
+        )
+        for s in (half, -half)
+    ]
+    change = np.asarray(np.abs(ends[0] - ends[1]), dtype=np.float32)
+    rows, columns = -(-height // _BLOCK_PX), -(-width // _BLOCK_PX)
+
+    def blocks(values: Picture, pick: Callable[..., Picture], pad: float) -> Picture:
+        padded = np.full((rows * _BLOCK_PX, columns * _BLOCK_PX), pad, dtype=np.float32)
+        padded[:height, :width] = values
+        return pick(padded.reshape(rows, _BLOCK_PX, columns, _BLOCK_PX), axis=(1, 3))
+
+    around = np.ones((3, 3), np.uint8)
+    steepest = blocks(change, np.max, 0.0)
+    span = cv2.dilate(blocks(grey, np.max, -np.inf), around) - cv2.erode(blocks(grey, np.min, np.inf), around)
+    length = blocks(np.asarray(np.hypot(vectors[..., 0], vectors[..., 1]), dtype=np.float32), np.max, 0.0)
+    q = steepest / (_SPAN * np.maximum(span, _LEAST_RANGE))
+    keep = np.clip((q - _FADE_FROM) / (_FADE_TO - _FADE_FROM), 0, 1)
+    keep[(span < _LEAST_RANGE) | (length < _SHORTEST_PX)] = 0
+    share = float(keep.mean())
+    if share == 0:
+        return deblurred, 0.0
+    size = (columns * _BLOCK_PX, rows * _BLOCK_PX)
+    weight = cv2.resize(keep.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)[:height, :width]
+    if image.ndim == 3:
+        weight = weight[..., None]
+    out = deblurred + weight * (image.astype(np.float32) - deblurred)
+    return np.rint(out).astype(image.dtype), share
+
+
+__all__ = [
+    "FrameDecision",
+    "GateOptions",
+    "GatedFrame",
+    "RecordingVerdict",
+    "deblur_gated",
+    "decide",
+    "judge_recording",
+    "keep_sharp",
+]
