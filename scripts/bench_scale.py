@@ -1,64 +1,370 @@
-"""Scale errors on InertialScale recordings, by method and window length.
+"""Scale errors on InertialScale recordings, by method and window, beside the published ones.
 
-    python scripts/bench_scale.py FOLDER [--methods joint spectral] [--windows 60 30 10]
+    python scripts/bench_scale.py FOLDER [--figure FILE.png] [--json FILE] [--sensitivity]
 
 FOLDER holds recordings (``poses.txt``, ``gyroscope.txt``, ``accelerometer.txt``) with ``groundtruth.txt``: metres per
-model unit. Each window takes the first so many seconds of the camera's recording. Printed are the error in % of each
-recording and, by method and window, mean, median and largest absolute error, how many 95 % intervals hold the truth,
-the median half-width of the intervals, how many were refused, and the time per estimate.
+model unit. Windows: the first so many seconds of a recording; the first so many metres of the camera's path, its length
+taken with the true scale from positions averaged over 0.2 s; and the first minute cut into equal parts. Each starts
+from nothing but its own frames and the IMU recording: the alignment is estimated anew.
+
+Methods: ``joint`` and ``spectral`` of the package, ``linear`` of ``linear_scale.py`` (a baseline without an interval),
+and for comparison the ``published`` figures of Mustaniemi et al. (IROS 2017): their own code on their 15 recordings,
+of which FOLDER may hold some only.
+
+Printed per method and window: the errors in % of the recordings, mean, median and largest absolute error of those that
+were not refused, how many 95 % intervals hold the truth (a refusal counts as a miss), their median half-width, the
+refusals, and the median processor time of alignment and estimate together, on one thread.
 """
 
+from __future__ import annotations
+
 import argparse
+import functools
+import itertools
+import json
+import multiprocessing
+import os
+import platform
+import subprocess
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from linear_scale import estimate_linear
+from rich.console import Console
+from rich.progress import track
 
+from colmap_inertial.align import align_camera_imu
+from colmap_inertial.errors import NotObservableError
 from colmap_inertial.io.trajectories import read_inertial_scale
-from colmap_inertial.scale import ScaleOptions, estimate_scale, first_seconds
+from colmap_inertial.scale import ScaleOptions, estimate_scale
+from colmap_inertial.types import Array, CameraTrajectory, ImuRecording
+
+METHODS = ("joint", "spectral", "linear")
+SECONDS = (60.0, 30.0, 20.0, 10.0, 5.0)
+METRES = (1.0, 2.0, 4.0, 8.0)
+PARTS = (2, 3, 6, 12)
+PARTED_S = 60.0
+#: Mean, median and largest absolute error in % over all 15 recordings, and errors of some at 60 s.
+PUBLISHED = {
+    "first 60 s": (1.23, 0.85, 3.52),
+    "first 30 s": (1.95, 2.00, 4.39),
+    "first 20 s": (2.54, 2.14, 7.34),
+    "first 10 s": (1.84, 2.03, 4.75),
+    "first 5 s": (5.48, 3.19, 20.1),
+    "first 2 m": (4.61, 2.30, 17.3),
+}
+PUBLISHED_60_S = {
+    **{"D1": -1.99, "D3": 0.71, "D5": 0.63, "D7": 0.63},
+    **{"D9": -3.52, "D11": -0.85, "D13": -3.10, "D15": 0.73},
+}
 
 
-def bench(folder: Path, methods: Sequence[str], windows: Sequence[float]) -> None:
-    """Print the table that the module describes."""
-    recordings = sorted(folder.glob("*/groundtruth.txt"), key=lambda path: (len(path.parent.name), path.parent.name))
-    data = [(path.parent.name, *read_inertial_scale(path.parent), float(path.read_text())) for path in recordings]
-    if not data:
+@dataclass(frozen=True, kw_only=True)
+class Window:
+    """Frames ``begin_s <= t <= end_s`` of a recording; ``group`` names windows of the same kind and length."""
+
+    folder: Path
+    group: str
+    begin_s: float
+    end_s: float
+
+    @property
+    def recording(self) -> str:
+        return self.folder.name
+
+    def read(self) -> tuple[CameraTrajectory, ImuRecording, float]:
+        """Its frames, the whole IMU recording, the true metres per unit."""
+        trajectory, imu, truth = read(self.folder)
+        return trajectory.select((trajectory.t_s >= self.begin_s) & (trajectory.t_s <= self.end_s)), imu, truth
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What a method made of a window; errors and half-width in %, None where refused or not given."""
+
+    recording: str
+    group: str
+    begin_s: float
+    duration_s: float
+    method: str
+    error: float | None
+    half_width: float | None
+    inside: bool
+    verdict: str
+    cpu_s: float
+
+
+@functools.lru_cache
+def read(folder: Path) -> tuple[CameraTrajectory, ImuRecording, float]:
+    """A recording and its true metres per unit."""
+    return *read_inertial_scale(folder), float((folder / "groundtruth.txt").read_text())
+
+
+def recordings_in(folder: Path) -> list[Path]:
+    """Recordings with a ground truth, in natural order."""
+    found = [path.parent for path in folder.glob("*/groundtruth.txt")]
+    if not found:
         raise SystemExit(f"{folder}: no recording with a groundtruth.txt")
-    print(
-        "method    window s  "
-        + "".join(f"{name:>8}" for name, *_ in data)
-        + "    mean  median     max  inside  +-%  refused  s"
+    return sorted(found, key=lambda path: (len(path.name), path.name))
+
+
+def path_length_m(trajectory: CameraTrajectory, metres_per_unit: float) -> tuple[Array, Array]:
+    """Times and lengths of the path up to then; of positions averaged over 0.2 s, as noise would lengthen it."""
+    cell = ((trajectory.t_s - trajectory.t_s[0]) / 0.2).astype(int)
+    cell = np.unique(cell, return_inverse=True)[1]
+    columns = np.column_stack([trajectory.t_s, trajectory.cam_in_world * metres_per_unit])
+    means = np.stack([np.bincount(cell, column) / np.bincount(cell) for column in columns.T], axis=1)
+    steps = np.linalg.norm(np.diff(means[:, 1:], axis=0), axis=1)
+    return means[:, 0], np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def first_windows(folder: Path, seconds: Sequence[float], metres: Sequence[float]) -> list[Window]:
+    """From a recording's begin; a path that is shorter than asked for gives no window."""
+    trajectory, _, truth = read(folder)
+    begin_s = float(trajectory.t_s[0])
+    out = [Window(folder=folder, group=f"first {s:g} s", begin_s=begin_s, end_s=begin_s + s) for s in seconds]
+    t_s, length_m = path_length_m(trajectory, truth)
+    for wanted in metres:
+        if length_m[-1] >= wanted:
+            end_s = float(np.interp(wanted, length_m, t_s))
+            out.append(Window(folder=folder, group=f"first {wanted:g} m", begin_s=begin_s, end_s=end_s))
+    return out
+
+
+def part_windows(folder: Path, parts: Sequence[int]) -> list[Window]:
+    """The first minute cut into equal parts."""
+    trajectory, _, _ = read(folder)
+    begin_s = float(trajectory.t_s[0])
+    out = []
+    for count in parts:
+        edges = np.linspace(begin_s, min(float(trajectory.t_s[-1]), begin_s + PARTED_S), count + 1)
+        for first, last in itertools.pairwise(edges):
+            group = f"{count} parts of {PARTED_S / count:g} s"
+            out.append(Window(folder=folder, group=group, begin_s=float(first), end_s=float(last)))
+    return out
+
+
+def run(task: tuple[Window, str]) -> Outcome:
+    """One method on one window."""
+    window, method = task
+    trajectory, imu, truth = window.read()
+    start = time.process_time()
+    scale: float | None = None
+    interval, verdict = None, "-"
+    if method == "linear":
+        try:
+            scale = estimate_linear(trajectory, imu, align_camera_imu(trajectory, imu)).metres_per_unit
+        except NotObservableError:
+            verdict = "refused"
+    else:
+        estimate = estimate_scale(trajectory, imu, options=ScaleOptions(method=method))
+        scale, interval, verdict = estimate.metres_per_unit, estimate.ci95, estimate.verdict
+    cpu_s = time.process_time() - start
+    low, high = interval or (np.nan, np.nan)
+    return Outcome(
+        recording=window.recording,
+        group=window.group,
+        begin_s=window.begin_s - float(read(window.folder)[0].t_s[0]),
+        duration_s=window.end_s - window.begin_s,
+        method=method,
+        error=None if scale is None else 100 * (scale / truth - 1),
+        half_width=None if scale is None or interval is None else 50 * (high - low) / scale,
+        inside=bool(low <= truth <= high),
+        verdict=verdict,
+        cpu_s=cpu_s,
     )
-    for method in methods:
-        for window in windows:
-            errors, inside, half_widths, seconds = [], 0, [], []
-            for _, trajectory, imu, truth in data:
-                start = time.perf_counter()
-                estimate = estimate_scale(first_seconds(trajectory, window), imu, options=ScaleOptions(method=method))
-                seconds.append(time.perf_counter() - start)
-                if estimate.metres_per_unit is None or estimate.ci95 is None:
-                    errors.append(np.nan)
-                    continue
-                low, high = estimate.ci95
-                errors.append(100 * (estimate.metres_per_unit / truth - 1))
-                inside += low <= truth <= high
-                half_widths.append(50 * (high - low) / estimate.metres_per_unit)
-            known = np.abs([error for error in errors if np.isfinite(error)])
-            row = "".join(f"{error:>8.2f}" if np.isfinite(error) else " refused" for error in errors)
-            figures = (
-                (known.mean(), np.median(known), known.max(), np.median(half_widths)) if len(known) else (np.nan,) * 4
-            )
-            print(
-                f"{method:<10}{window:>8g}  {row}{figures[0]:>8.2f}{figures[1]:>8.2f}{figures[2]:>8.2f}"
-                f"{inside:>5}/{len(known)}{figures[3]:>6.1f}{len(errors) - len(known):>6}{np.median(seconds):>7.2f}",
-                flush=True,
-            )
+
+
+def each(function: Callable[[Any], Any], tasks: Sequence[Any], processes: int, title: str) -> list[Any]:
+    """Map, with a progress bar on a terminal; results in the order of the tasks."""
+    show = {"description": title, "total": len(tasks), "transient": True, "console": Console(stderr=True)}
+    if processes == 1:
+        return list(track(map(function, tasks), **show))
+    with multiprocessing.get_context("spawn").Pool(processes) as pool:
+        return list(track(pool.imap(function, tasks), **show))
+
+
+def summary(outcomes: Sequence[Outcome]) -> dict[str, float | int]:
+    """Figures of one method's outcomes; NaN where there are none."""
+    errors = np.abs([o.error for o in outcomes if o.error is not None])
+    widths = [o.half_width for o in outcomes if o.half_width is not None]
+    return {
+        "windows": len(outcomes),
+        "mean": float(errors.mean()) if len(errors) else np.nan,
+        "median": float(np.median(errors)) if len(errors) else np.nan,
+        "max": float(errors.max()) if len(errors) else np.nan,
+        "inside": sum(o.inside for o in outcomes),
+        "half_width": float(np.median(widths)) if widths else np.nan,
+        "refused": sum(o.error is None for o in outcomes),
+        "cpu_s": float(np.median([o.cpu_s for o in outcomes])),
+    }
+
+
+def grouped(outcomes: Iterable[Outcome]) -> dict[tuple[str, str], list[Outcome]]:
+    """By group and method, in the order of appearance."""
+    out: dict[tuple[str, str], list[Outcome]] = {}
+    for outcome in outcomes:
+        out.setdefault((outcome.group, outcome.method), []).append(outcome)
+    return out
+
+
+def _cell(value: float | None, width: int, digits: int = 2) -> str:
+    return ("refused" if value is None else "-" if np.isnan(value) else f"{value:.{digits}f}").rjust(width)
+
+
+def _figures(label: str, rows: Sequence[Outcome], middle: str) -> str:
+    s = summary(rows)
+    errors = "".join(_cell(s[name], 8) for name in ("mean", "median", "max"))
+    interval = f"{s['inside']}/{s['windows']}" if s["half_width"] == s["half_width"] else "-"
+    return f"{label}{middle}{errors}{interval:>9}{_cell(s['half_width'], 7, 1)}{s['refused']:>9}{_cell(s['cpu_s'], 7)}"
+
+
+_HEADINGS = f"{'mean':>8}{'median':>8}{'max':>8}{'inside':>9}{'+-%':>7}{'refused':>9}{'cpu s':>7}"
+
+
+def print_first(outcomes: Sequence[Outcome], names: Sequence[str]) -> None:
+    """The table with a column for each recording."""
+    print(f"{'window':<12}{'method':<11}" + "".join(f"{name:>8}" for name in names) + _HEADINGS)
+    by_group = grouped(outcomes)
+    for group in dict.fromkeys(group for group, _ in by_group):
+        published = PUBLISHED.get(group)
+        if published:
+            blank = " " * 8 * len(names)
+            print(f"{group:<12}{'published':<11}{blank}" + "".join(_cell(value, 8) for value in published))
+        here = [PUBLISHED_60_S[name] for name in names if name in PUBLISHED_60_S]
+        if group == "first 60 s" and here:
+            row = "".join(_cell(PUBLISHED_60_S.get(name, np.nan), 8) for name in names)
+            figures = (np.mean(np.abs(here)), np.median(np.abs(here)), np.max(np.abs(here)))
+            print(f"{group:<12}{' of these':<11}{row}" + "".join(_cell(float(value), 8) for value in figures))
+        for (of, method), rows in by_group.items():
+            if of == group:
+                errors = {row.recording: row.error for row in rows}
+                cells = "".join(_cell(errors.get(name, np.nan), 8) for name in names)
+                print(_figures(f"{group:<12}{method:<11}", rows, cells))
+
+
+def print_parts(outcomes: Sequence[Outcome]) -> None:
+    """The table of equal parts, by length and pooled."""
+    print(f"{'windows':<20}{'method':<11}" + _HEADINGS)
+    for (group, method), rows in grouped(outcomes).items():
+        print(_figures(f"{group:<20}{method:<11}", rows, ""))
+    for method in dict.fromkeys(o.method for o in outcomes):
+        rows = [o for o in outcomes if o.method == method]
+        share = 100 * sum(o.inside for o in rows) / len(rows)
+        note = "" if method == "linear" else f"  inside {share:.1f} %"
+        print(_figures(f"{'pooled':<20}{method:<11}", rows, "") + note)
+
+
+def draw(outcomes: Sequence[Outcome], path: Path) -> None:
+    """Mean absolute error against the length of the window, first so many seconds, and the joint half-width."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    colours = {"joint": "#0b6e4f", "spectral": "#d17a00", "linear": "#8a8a8a", "published": "#b3123c"}
+    rows = [o for o in outcomes if o.group.startswith("first") and o.group.endswith(" s")]
+    figure, axes = plt.subplots(figsize=(7.2, 4.6), layout="constrained")
+
+    def line(method: str, points: dict[float, float], style: str, label: str) -> None:
+        lengths = sorted(points)
+        axes.plot(lengths, [points[s] for s in lengths], style, color=colours[method], label=label)
+
+    def by_length(method: str, figure_of: str) -> dict[float, float]:
+        groups = [(group, found) for (group, of), found in grouped(rows).items() if of == method]
+        return {float(group.split()[1]): float(summary(found)[figure_of]) for group, found in groups}
+
+    line("published", {float(g.split()[1]): v[0] for g, v in PUBLISHED.items() if g.endswith(" s")}, "s-", "published")
+    for method in (m for m in reversed(METHODS) if any(o.method == m for o in rows)):
+        line(method, by_length(method, "mean"), "o-", method)
+    joint = [o for o in rows if o.method == "joint" and o.error is not None]
+    if joint:
+        line("joint", by_length("joint", "half_width"), "--", "joint, median half-width of the 95 % interval")
+        lengths = [float(o.group.split()[1]) for o in joint]
+        axes.plot(lengths, [abs(o.error or 0) for o in joint], ".", color=colours["joint"], alpha=0.35, ms=5)
+    ticks = sorted({float(o.group.split()[1]) for o in rows})
+    axes.set(xscale="log", yscale="log", xlabel="first seconds of the recording", ylabel="absolute scale error, %")
+    axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    axes.set_xticks([], minor=True)
+    axes.yaxis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
+    axes.set_ylim(bottom=0.1)
+    axes.grid(True, which="major", alpha=0.3)
+    names = len({o.recording for o in rows})
+    axes.set_title(f"Mean over {names} recordings (published: 15); dots: single recordings, joint", fontsize=10)
+    axes.legend(frameon=False, fontsize=9)
+    figure.savefig(path, dpi=150)
+    plt.close(figure)
+
+
+def circumstances() -> dict[str, Any]:
+    """Machine, versions, commit."""
+    here = Path(__file__).parent
+
+    def git(*arguments: str) -> str:
+        done = subprocess.run(["git", *arguments], cwd=here, capture_output=True, text=True, check=False)
+        return done.stdout.strip() if done.returncode == 0 else ""
+
+    cpu = [line.partition(":")[2].strip() for line in _lines(Path("/proc/cpuinfo")) if line.startswith("model name")]
+    return {
+        "machine": {"system": platform.platform(), "processor": (cpu or [platform.processor()])[0]},
+        "cores": os.cpu_count(),
+        "versions": {
+            "python": platform.python_version(),
+            **{name: version(name) for name in ("colmap-inertial", "numpy", "scipy")},
+        },
+        "commit": git("rev-parse", "HEAD"),
+        "modified": bool(git("status", "--porcelain", "--", "../colmap_inertial", ".")),
+    }
+
+
+def _lines(path: Path) -> list[str]:
+    return path.read_text().splitlines() if path.is_file() else []
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--methods", nargs="+", default=METHODS, choices=METHODS)
+    parser.add_argument("--seconds", nargs="*", type=float, default=SECONDS, help="windows from the begin, s")
+    parser.add_argument("--metres", nargs="*", type=float, default=METRES, help="windows from the begin, m of path")
+    parser.add_argument("--parts", nargs="*", type=int, default=PARTS, help="equal parts of the first minute")
+    parser.add_argument("--figure", type=Path, help="draw error against window length")
+    parser.add_argument("--json", type=Path, help="write every outcome, machine, versions and commit")
+    parser.add_argument("--sensitivity", action="store_true", help="instead: the joint method's constants, each varied")
+    parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
+    args = parser.parse_args(arguments)
+
+    folders = recordings_in(args.folder)
+    result = circumstances()
+    if args.sensitivity:
+        from scale_sensitivity import study
+
+        result["sensitivity"] = study(folders, args.processes)
+    else:
+        first = [window for folder in folders for window in first_windows(folder, args.seconds, args.metres)]
+        parts = [window for folder in folders for window in part_windows(folder, args.parts)]
+        order = [f"first {s:g} s" for s in args.seconds] + [f"first {m:g} m" for m in args.metres]
+        first.sort(key=lambda window: order.index(window.group))
+        parts.sort(key=lambda window: int(window.group.split()[0]))
+        tasks = [(window, method) for window in (*first, *parts) for method in args.methods]
+        outcomes: list[Outcome] = each(run, tasks, args.processes, "estimating")
+        of_first, of_parts = outcomes[: len(first) * len(args.methods)], outcomes[len(first) * len(args.methods) :]
+        if of_first:
+            print_first(of_first, [folder.name for folder in folders])
+        if of_parts:
+            print()
+            print_parts(of_parts)
+        if args.figure:
+            draw(of_first, args.figure)
+        result["outcomes"] = [asdict(outcome) for outcome in outcomes]
+    if args.json:
+        args.json.write_text(json.dumps(result, indent=1) + "\n")
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--methods", nargs="+", default=["joint", "spectral"], choices=["joint", "spectral"])
-    parser.add_argument("--windows", nargs="+", type=float, default=[60, 30, 20, 10, 5])
-    bench(**vars(parser.parse_args()))
+    main()
