@@ -194,6 +194,7 @@ def _pose_covariances(
     """
     covariances = []
     for image in images:
+        camera = reconstruction.camera(image.camera_id)
         seen = [point for point in image.points2D if point.has_point3D()]
         seen = seen[:: -(-len(seen) // _MOST_OBSERVATIONS) or 1]
         if len(seen) < _FEWEST_OBSERVATIONS:
@@ -202,7 +203,7 @@ def _pose_covariances(
         rotation = pose.rotation.matrix()
         world = np.array([reconstruction.points3D[point.point3D_id].xyz for point in seen])
         cam = world @ rotation.T + pose.translation
-        error_px = image.camera.img_from_cam(cam) - np.array([point.xy for point in seen])
+        error_px = camera.img_from_cam(cam) - np.array([point.xy for point in seen])
         squares = np.sum(error_px**2, axis=1)
         level = float(np.nanmedian(squares))
         # Of normal errors, the median of the squares' sum is 2 ln 2 variances; COLMAP's own weights are robust, too
@@ -210,7 +211,7 @@ def _pose_covariances(
         by_cam = np.zeros((len(seen), 2, 3))
         by_cam[:, 0, 0] = by_cam[:, 1, 1] = 1 / cam[:, 2]
         by_cam[:, :, 2] = -cam[:, :2] / cam[:, 2:] ** 2
-        by_pose = image.camera.mean_focal_length() * np.concatenate([-by_cam @ skew(cam), -by_cam @ rotation], axis=2)
+        by_pose = camera.mean_focal_length() * np.concatenate([-by_cam @ skew(cam), -by_cam @ rotation], axis=2)
         information = np.einsum("n,nki,nkj->ij", weight, by_pose, by_pose)
         variance_px2 = max(level / (2 * np.log(2)), _SMALLEST_ERROR_PX**2)
         try:

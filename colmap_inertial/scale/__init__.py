@@ -16,7 +16,6 @@ from colmap_inertial.scale.verdict import verdict_of
 from colmap_inertial.threads import one_blas_thread
 from colmap_inertial.types import CameraImuCalibration, CameraTrajectory, ImuRecording, ScaleEstimate, clock_shift_s
 
-
 #: A clock rate is corrected beforehand where it is this many standard deviations from zero and faster than what the
 #: estimators allow for.
 _SIGNIFICANT, _FAST_CLOCK = 5.0, 3e-4

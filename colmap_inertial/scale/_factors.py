@@ -84,6 +84,53 @@ class Group:
                 system.border[then, :, self.columns] += after_t @ self.by_globals
 
 
+@dataclass(eq=False, kw_only=True)
+class Direct:
+    """Residuals that are three numbers of a state, or their change to the next state, times ``info``.
+
+    Attributes
+    ----------
+    residual
+        (N, 3).
+    columns
+        The three numbers.
+    info
+        (N,) one over their standard deviation.
+    step
+        Whether it is the change to the next state.
+    """
+
+    residual: Array
+    columns: slice
+    info: Array
+    step: bool = False
+    first: int = 0
+    weight: Array | None = None
+
+    def apply(self, states: Array, z: Array) -> Array:
+        """As :meth:`Group.apply`."""
+        values = states[self.first : self.first + len(self.info) + self.step, self.columns]
+        return np.asarray(self.info[:, None, None] * (np.diff(values, axis=0) if self.step else values))
+
+    def pull_back(self, values: Array, states: Array, z: Array) -> None:
+        """As :meth:`Group.pull_back`."""
+        n = len(self.info)
+        pulled = self.info[:, None, None] * values
+        if self.step:
+            states[self.first + 1 : self.first + 1 + n, self.columns] += pulled
+            pulled = -pulled
+        states[self.first : self.first + n, self.columns] += pulled
+
+    def add_to(self, system: ArrowSystem) -> None:
+        """As :meth:`Group.add_to`."""
+        n, squared = len(self.info), self.info**2
+        for i in range(self.columns.start, self.columns.stop):
+            system.diagonal[self.first : self.first + n, i, i] += squared
+            if self.step:
+                system.diagonal[self.first + 1 : self.first + 1 + n, i, i] += squared
+                system.below[self.first : self.first + n, i, i] -= squared
+
+
 def _mv(matrices: Array, vectors: Array) -> Array:
     return np.asarray((matrices @ vectors[:, :, None])[:, :, 0])
 
@@ -102,14 +149,17 @@ def integrate(data: Data, x: Estimate) -> Preintegrated:
     )
 
 
-def still_near(then: Estimate, x: Estimate, t_s: Array) -> bool:
-    """Whether the increments of an earlier estimate need only :func:`corrected` to be those of this one."""
+def still_near(then: Estimate, x: Estimate, t_s: Array, tolerance: float = 1.0) -> bool:
+    """Whether the increments of an earlier estimate need only :func:`corrected` to be those of this one.
+
+    At a tolerance of one the difference is far below the noise.
+    """
     delay_s = abs(x.delay_s - then.delay_s) + abs(x.clock_rate - then.clock_rate) * 0.5 * float(np.ptp(t_s))
     return bool(
-        delay_s < 3e-4
-        and abs(x.accel_delay_s - then.accel_delay_s) < 1e-3
-        and np.max(np.abs(x.gyro_bias_rad_s - then.gyro_bias_rad_s)) < 1e-3
-        and np.max(np.abs(x.gyro_gain - then.gyro_gain)) < 2e-3
+        delay_s < tolerance * 3e-4
+        and abs(x.accel_delay_s - then.accel_delay_s) < tolerance * 1e-3
+        and np.max(np.abs(x.gyro_bias_rad_s - then.gyro_bias_rad_s)) < tolerance * 1e-3
+        and np.max(np.abs(x.gyro_gain - then.gyro_gain)) < tolerance * 2e-3
     )
 
 
@@ -280,28 +330,21 @@ def visual_groups(data: Data, noise: Noise, x: Estimate, rate_rad_s: Array, *, r
     return groups[0], groups[1]
 
 
-def _identity(rows: int, columns: slice, scale: Array) -> Array:
-    out = np.zeros((rows, 3, par.N_STATE))
-    out[:, :, columns] = np.eye(3)
-    return out * scale[:, None, None]
-
-
-def walk_group(values: Array, columns: slice, sigma: float, dt_s: Array) -> Group:
+def walk_group(values: Array, columns: slice, sigma: float, dt_s: Array) -> Direct:
     """A random walk that grows by ``sigma`` in a second."""
     info = 1 / (sigma * np.sqrt(dt_s))
-    step = _identity(len(dt_s), columns, info)
-    return Group(residual=np.diff(values, axis=0) * info[:, None], here=-step, after=step)
+    return Direct(residual=np.diff(values, axis=0) * info[:, None], columns=columns, info=info, step=True)
 
 
-def state_group(values: Array, columns: slice, sigma: float, first: int = 0) -> Group:
+def state_group(values: Array, columns: slice, sigma: float, first: int = 0) -> Direct:
     """Values of states ``first ..`` expected to be zero."""
     info = np.full(len(values), 1 / sigma)
-    return Group(residual=values / sigma, here=_identity(len(values), columns, info), first=first)
+    return Direct(residual=values / sigma, columns=columns, info=info, first=first)
 
 
 def all_groups(
     data: Data, noise: Noise, prior: Prior, x: Estimate, pre: Preintegrated, *, robust: bool
-) -> dict[str, Group]:
+) -> dict[str, Group | Direct]:
     """Everything but the priors of the globals."""
     rotation, centre = visual_groups(data, noise, x, pre.rate_rad_s, robust=robust)
     middle = int(np.argmin(np.abs(data.t_s - par.middle_s(data.t_s))))
@@ -322,7 +365,9 @@ def all_groups(
     }
 
 
-def rotation_groups(data: Data, noise: Noise, prior: Prior, x: Estimate, pre: Preintegrated) -> dict[str, Group]:
+def rotation_groups(
+    data: Data, noise: Noise, prior: Prior, x: Estimate, pre: Preintegrated
+) -> dict[str, Group | Direct]:
     """What rotations alone say; all else is held."""
     k = len(data.t_s)
     rotation, _ = visual_groups(data, noise, x, pre.rate_rad_s, robust=True)
@@ -341,7 +386,7 @@ def rotation_groups(data: Data, noise: Noise, prior: Prior, x: Estimate, pre: Pr
     }
 
 
-def normal_equations(groups: Sequence[Group], prior: Prior, x: Estimate) -> tuple[ArrowSystem, Array, Array]:
+def normal_equations(groups: Sequence[Group | Direct], prior: Prior, x: Estimate) -> tuple[ArrowSystem, Array, Array]:
     """The system, and the right-hand side (K, m, 1), (n, 1) of a step towards the optimum."""
     k = len(x.velocity_m_s)
     system = ArrowSystem.zeros(k, par.N_STATE, par.N_GLOBALS)

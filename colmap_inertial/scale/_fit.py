@@ -12,7 +12,7 @@ from colmap_inertial.scale import _parameters as par
 from colmap_inertial.scale._parameters import Data, Estimate, Noise, Prior
 from colmap_inertial.types import Array, ImuNoise
 
-_MAX_ITERATIONS = 40
+_MAX_ITERATIONS, _MAX_ROTATION_ITERATIONS = 40, 4
 _PROBES = 4
 #: The scale changes by at most this factor (in the logarithm) in one iteration.
 _LARGEST_STEP = 0.3
@@ -72,10 +72,10 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
     scale = _moment_scale(data, x)
     x = replace(x, metres_per_unit=scale, imu_in_world_m=data.groups.centre * scale)
     signs: dict[str, Array] = {}
-    converged = False
+    converged = settled = False
     integrated, there = fac.integrate(data, x), x
     for iteration in range(_MAX_ITERATIONS):
-        if not fac.still_near(there, x, data.t_s):
+        if settled or not fac.still_near(there, x, data.t_s, tolerance=4.0):
             integrated, there = fac.integrate(data, x), x
         pre = fac.corrected(integrated, there, x)
         groups = fac.all_groups(data, noise, prior, x, pre, robust=iteration > 2)
@@ -95,7 +95,8 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
         change = 1.0
         if iteration > 2:
             noise, change = levels.updated_noise(noise, start, floor, sums, levels.alike(groups["rotation"], states, z))
-        if step < 0.03 * sigma and change < 0.1:
+        settled = step < 0.03 * sigma and change < 0.1
+        if settled and fac.still_near(there, x, data.t_s):
             break
 
     # Once more at the optimum: the mean gyroscope bias, and a second scale for the second half
@@ -134,7 +135,7 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
 def _rotations_first(data: Data, noise: Noise, prior: Prior) -> Estimate:
     """Rotations, gyroscope bias and time offset from gyroscope and visual rotations alone."""
     x = prior.mean
-    for _ in range(4):
+    for _ in range(_MAX_ROTATION_ITERATIONS):
         pre = fac.integrate(data, x)
         groups = fac.rotation_groups(data, noise, prior, x, pre)
         system, rhs, rhs_z = fac.normal_equations(list(groups.values()), prior, x)
@@ -143,7 +144,10 @@ def _rotations_first(data: Data, noise: Noise, prior: Prior) -> Estimate:
         rhs_z[held] = 0.0
         states, z, _ = system.solve(rhs, rhs_z)
         z[held] = 0.0
-        x = x.moved(states[:, :, 0], z[:, 0], pre.rate_rad_s, data.t_s)
+        moved = x.moved(states[:, :, 0], z[:, 0], pre.rate_rad_s, data.t_s)
+        settled, x = fac.still_near(x, moved, data.t_s), moved
+        if settled:
+            break
     return x
 
 
@@ -170,7 +174,7 @@ def _moment_scale(data: Data, x: Estimate) -> float:
     return float(inertial_size / visual_size)
 
 
-def _second_half(data: Data, x: Estimate, centre: fac.Group, noise: Noise) -> Array:
+def _second_half(data: Data, x: Estimate, centre: fac.Group | fac.Direct, noise: Noise) -> Array:
     """(K, 3) derivative of the centres' residuals by a logarithm of the scale that only the second half has."""
     path = -data.groups.centre * x.metres_per_unit
     middle = int(np.searchsorted(data.t_s, par.middle_s(data.t_s)))

@@ -1,4 +1,4 @@
-"""Frames of a video, a fifth of a second at a time: one averaged pose for each state of the joint fit.
+"""Frames of a video, an eighth of a second at a time: one averaged pose for each state of the joint fit.
 
 Averaging keeps what every frame says without a state for every frame. Within a group the IMU tells the motion far
 better than pictures do, so frames are compared after moving them to the group's mean instant: rotations by the
@@ -16,8 +16,8 @@ from colmap_inertial.geometry import matrix_from_quat, quat_exp, quat_multiply, 
 from colmap_inertial.scale._preintegration import Track
 from colmap_inertial.types import Array
 
-#: Steps of the integration from a group's mean instant to a frame, 0.1 s at most.
-_STEPS = 8
+#: Longest step of the integration from a group's mean instant to a frame.
+_STEP_S = 0.01
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -113,17 +113,18 @@ def group_frames(
 
     mean_s = mean(t_s)
     since_s = t_s - mean_s[group]
-    step_s = since_s / _STEPS
+    steps = max(1, int(np.ceil(np.abs(since_s).max() / _STEP_S)))
+    step_s = since_s / steps
     turned = np.zeros((len(t_s), 4))
     turned[:, 3] = 1.0
     # Two integrations at once: each step's force, at its middle, acts on the position for the rest of the time
     thrown = np.zeros((len(t_s), 3))
-    for i in range(_STEPS):
+    for i in range(steps):
         middle_s = mean_s[group] + (i + 0.5) * step_s
         half = quat_exp((gyro.at(middle_s)[0] - gyro_bias_rad_s) * (0.5 * step_s)[:, None])
         turned = quat_multiply(turned, half)
         force = (matrix_from_quat(turned) @ accel.at(middle_s)[0][:, :, None])[:, :, 0]
-        thrown += force * (step_s * (_STEPS - i - 0.5) * step_s)[:, None]
+        thrown += force * (step_s * (steps - i - 0.5) * step_s)[:, None]
         turned = quat_multiply(turned, half)
     turns = matrix_from_quat(turned)
     moved = world_from_cam @ (cam_from_imu @ turns.transpose(0, 2, 1) @ cam_from_imu.T)

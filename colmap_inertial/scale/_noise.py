@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from colmap_inertial.scale._factors import Group
+from colmap_inertial.scale._factors import Direct, Group
 from colmap_inertial.scale._parameters import Noise
 from colmap_inertial.types import Array, ImuNoise
 
@@ -56,14 +56,14 @@ def typical_noise(sheet: ImuNoise | None) -> tuple[Noise, dict[str, float]]:
     return start, {**_FLOOR, "accel_m_s2_rthz": max(_FLOOR["accel_m_s2_rthz"], sheet.accel_density_m_s2_rthz)}
 
 
-def random_signs(groups: Mapping[str, Group], count: int) -> dict[str, Array]:
+def random_signs(groups: Mapping[str, Group | Direct], count: int) -> dict[str, Array]:
     """(N, r, count) signs for each group, the same in every call."""
     rng = np.random.default_rng(0)
     return {name: rng.choice([-1.0, 1.0], (*group.residual.shape, count)) for name, group in groups.items()}
 
 
 def sums_of_squares(
-    noise: Noise, groups: Mapping[str, Group], signs: Mapping[str, Array], states: Array, z: Array
+    noise: Noise, groups: Mapping[str, Group | Direct], signs: Mapping[str, Array], states: Array, z: Array
 ) -> dict[str, tuple[float, float]]:
     """For each level: the sum of squares of its residuals after a step, and what it would be at the right level.
 
@@ -84,7 +84,7 @@ def sums_of_squares(
     return out
 
 
-def alike(group: Group, states: Array, z: Array) -> float:
+def alike(group: Group | Direct, states: Array, z: Array) -> float:
     """``Noise.rotation_alike`` from the correlation of consecutive residuals after a step."""
     residual = group.residual + group.apply(states, z)[:, :, 0]
     squares = float(np.sum(residual**2))

@@ -46,18 +46,20 @@ class Track:
     t_s: Array
     value: Array
     slope: Array
+    paused_s: Array  # by each sample, the sum of the pauses before it
 
     def gap_s(self, begin_s: Array, end_s: Array) -> Array:
         """How much of each interval from ``begin_s`` to ``end_s`` lies in pauses longer than ``LONGEST_PAUSE_S``."""
-        step = np.diff(self.t_s)
-        inside = np.concatenate([[0.0], np.cumsum(np.where(step > LONGEST_PAUSE_S, step, 0.0))])
-        return np.asarray(np.interp(end_s, self.t_s, inside) - np.interp(begin_s, self.t_s, inside))
+        ends = np.interp(end_s, self.t_s, self.paused_s) - np.interp(begin_s, self.t_s, self.paused_s)
+        return np.asarray(ends)
 
     @classmethod
     def of(cls, t_s: Array, value: Array) -> Track:
         """A track through samples ``value`` (N, 3) at times ``t_s`` (N,)."""
         slope = np.gradient(value, t_s, axis=0) if len(t_s) > 2 else np.repeat(np.diff(value, axis=0), 2, axis=0)
-        return cls(t_s=t_s, value=value, slope=slope)
+        step = np.diff(t_s)
+        paused_s = np.concatenate([[0.0], np.cumsum(np.where(step > LONGEST_PAUSE_S, step, 0.0))])
+        return cls(t_s=t_s, value=value, slope=slope, paused_s=paused_s)
 
     def at(self, query_s: Array) -> tuple[Array, Array]:
         """Value and time derivative at ``query_s`` (M,); held constant outside the samples."""

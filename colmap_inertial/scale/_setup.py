@@ -20,6 +20,8 @@ _NEAR_M, _FAR_M = 1.0, 2.0
 #: An alignment's covariance stems from the very data that are used again here.
 _COUNTED_ONCE = 5.0
 _MIN_STATES = 8
+#: Recordings with more states than the first have fewer of them in a second, down to the second.
+_MANY_STATES, _FEWEST_HZ = 2400.0, 2.0
 
 
 def prepare(
@@ -50,12 +52,13 @@ def prepare(
         raise NotObservableError("scale", "the camera does not move in the model: move it, do not only turn it")
     cam_from_imu = matrix_from_quat(calibration.cam_from_imu_xyzw)
     groups = None
-    if len(inside):
+    if len(inside) > 1:
+        span_s = float(trajectory.t_s[inside[-1]] - trajectory.t_s[inside[0]])
         groups = group_frames(
             trajectory.t_s[inside],
             matrix_from_quat(trajectory.cam_from_world_xyzw[inside]).transpose(0, 2, 1),
             centre - centre.mean(axis=0),
-            rate_hz=states_hz,
+            rate_hz=max(min(_MANY_STATES / span_s, states_hz), min(_FEWEST_HZ, states_hz)),
             gyro=gyro,
             accel=accel,
             gyro_bias_rad_s=calibration.gyro_bias_rad_s,
@@ -65,7 +68,7 @@ def prepare(
     if groups is None or k < _MIN_STATES:
         raise NotObservableError(
             "scale",
-            f"only {k} camera poses, spaced by 0.2 s or more, lie inside the IMU recording and at least "
+            f"only {k} camera poses, an eighth of a second or more apart, lie inside the IMU recording and at least "
             f"{_MIN_STATES} are needed: record a longer clip, or check that both recordings belong together",
         )
     world_from_cam = groups.world_from_cam

@@ -1,10 +1,11 @@
 """Scale from one fit of everything that the camera and the IMU measured; positions are never differentiated.
 
-The most probable motion, calibration and scale given gyroscope, accelerometer and visual poses. States at frames about
-0.2 s apart (all of them where frames are sparser): rotation, position, velocity, gyroscope bias, and random walks of
-the accelerometer's bias and of the visual centres' error. Globals: scale, gravity, accelerometer bias, gains and axis
-errors of both sensors, camera-IMU rotation, lever arm, time offsets of both sensors and the rate between the clocks,
-what a rolling shutter does to rotations and centres, and how errors of the centres go with errors of the rotations.
+The most probable motion, calibration and scale given gyroscope, accelerometer and visual poses. States an eighth of a
+second apart (at every frame where frames are sparser; fewer in recordings of many minutes): rotation, position,
+velocity, gyroscope bias, and random walks of the accelerometer's bias and of the visual centres' error. Globals: scale,
+gravity, accelerometer bias, gains and axis errors of both sensors, camera-IMU rotation, lever arm, time offsets of both
+sensors and the rate between the clocks, what a rolling shutter does to rotations and centres, and how errors of the
+centres go with errors of the rotations.
 The IMU enters through preintegration (Forster et al., "On-manifold preintegration", 2017). The noise sits on the visual
 centres, not on the inertial path that explains them: regression the other way round attenuates the scale. Noise levels
 of the accelerometer and of the poses are estimated along (Forstner's variance components).
