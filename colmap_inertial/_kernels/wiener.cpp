@@ -216,9 +216,13 @@ class LostLight {
         const int bottom = std::min(ny_, (cy + 1) * PER_CELL + int(reach_y / NODE) + 2);
         const int right = std::min(nx_, (cx + 1) * PER_CELL + int(reach_x / NODE) + 2);
         if (sum(bottom, right) - sum(top, right) - sum(bottom, left) + sum(top, left) == 0) return false;
+        float least = 1;
         for (int i = 0; i <= PER_CELL; ++i)
-            for (int j = 0; j <= PER_CELL; ++j) share[i][j] = share_at(cy * PER_CELL + i, cx * PER_CELL + j);
-        return true;
+            for (int j = 0; j <= PER_CELL; ++j) {
+                share[i][j] = share_at(cy * PER_CELL + i, cx * PER_CELL + j);
+                least = std::min(least, share[i][j]);
+            }
+        return least < 1;
     }
 
   private:
