@@ -1,0 +1,254 @@
+"""Nothing that is sharp gets worse, and what is blurred is still deblurred."""
+
+from dataclasses import replace
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+from far_scene import FarScene
+
+from colmap_inertial.geometry import matrix_from_quat
+from colmap_inertial.gyro import GyroPath
+from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence
+from colmap_inertial.imaging.gate import GateOptions, deblur_gated, decide, judge_recording, keep_sharp
+from colmap_inertial.imaging.gyro_camera import FrameShutter
+from colmap_inertial.imaging.psf import PredictedBlur, blur_field
+from colmap_inertial.imaging.rolling_shutter import rectify_keypoints
+from colmap_inertial.simulate.render import colmap_camera
+from colmap_inertial.types import CameraModel
+
+WIDTH, HEIGHT = 800, 450
+LENS = CameraModel(
+    model="OPENCV", width=WIDTH, height=HEIGHT, params=(640, 640, 400, 225, 0.08, -0.12, 0.0005, -0.0003)
+)
+#: Pairs of instants at which the scene's camera turns quickly and looks at much the same.
+PAIRS = {"a": (0.98, 1.14), "b": (2.74, 2.9), "c": (3.58, 3.74)}
+
+
+@cache
+def scene():
+    return FarScene.make(6, vigour=1.0, size=1600)
+
+
+def scaled(field, factor):
+    return replace(field, vector_px=field.vector_px * np.float32(factor))
+
+
+@cache
+def shot(t_s, blur_px):
+    """Shutter and picture (1 % noise) of a frame whose 90th percentile of blur is ``blur_px``."""
+    gyro, camera = scene().gyro(), colmap_camera(LENS)
+    shutter = FrameShutter(width=WIDTH, height=HEIGHT, t_s=t_s, exposure_s=0.01, readout_s=0.015)
+    length = float(np.percentile(blur_field(gyro, camera, shutter).extent_px(), 90))
+    shutter = replace(shutter, exposure_s=0.01 * blur_px / length)
+    assert shutter.exposure_s < 0.06
+    picture = scene().picture(LENS, shutter, samples=max(2, int(1.4 * blur_px)), noise=0.01, seed=int(1e3 * t_s))
+    picture.setflags(write=False)
+    return shutter, picture
+
+
+def flipped_gyro():
+    gyro = scene().gyro()
+    to_cam = matrix_from_quat(gyro.cam_from_imu_xyzw)
+    rate = gyro.path.rate_rad_s @ to_cam.T * [-1, 1, 1] @ to_cam
+    return replace(gyro, path=GyroPath(gyro.path.t_s, rate, np.zeros(3)))
+
+
+def predicted(shutter, error):
+    """The blur field as a gyroscope with an error says."""
+    camera = colmap_camera(LENS)
+    gyro = {
+        "flipped axis": flipped_gyro,
+        "noise": lambda: scene().gyro(noise_rad_s=0.2, seed=int(1e3 * shutter.t_s)),
+        "10 ms late": lambda: scene().gyro(late_s=0.01),
+    }.get(error, scene().gyro)()
+    field = blur_field(gyro, camera, shutter)
+    return scaled(field, {"20 % long": 1.2, "20 % short": 0.8}.get(error, 1.0))
+
+
+def detect(image):
+    points, descriptors = cv2.SIFT.create(4000).detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
+    root = np.sqrt(descriptors / descriptors.sum(axis=1, keepdims=True))
+    return np.array([p.pt for p in points]) + 0.5, root
+
+
+def correct_matches(images, shutters):
+    """Mutual nearest neighbours that pass the ratio test and agree with the true motion to 3 px."""
+    gyro, camera = scene().gyro(), colmap_camera(LENS)
+    (xa, a), (xb, b) = (detect(image) for image in images)
+    likeness = a @ b.T
+    there, back = likeness.argmax(axis=1), likeness.argmax(axis=0)
+    second, first = np.arccos(np.clip(np.partition(likeness, -2, axis=1)[:, -2:], -1, 1)).T
+    good = np.flatnonzero((back[there] == np.arange(len(a))) & (first < 0.8 * second))
+    at_a, at_b = (
+        rectify_keypoints(x, gyro, camera, shutter)
+        for x, shutter in ((xa[good], shutters[0]), (xb[there[good]], shutters[1]))
+    )
+    turns = [scene().wall_from_cam(np.array([s.reference_s()]))[0] for s in shutters]
+    rays = np.concatenate([camera.cam_from_img(at_a)[:, :2], np.ones((len(good), 1))], axis=1)
+    expected = camera.img_from_cam(rays @ turns[0].T @ turns[1])
+    return int(np.sum(np.linalg.norm(expected - at_b, axis=1) < 3))
+
+
+@cache
+def untouched(pair, blur_px):
+    shots = [shot(t, blur_px) for t in PAIRS[pair]]
+    return correct_matches([s[1] for s in shots], [s[0] for s in shots])
+
+
+def ratio(blur_px, error):
+    """Correct matches through the gate against those without any deblurring, summed over the pairs."""
+    shots = {pair: [shot(t, blur_px) for t in PAIRS[pair]] for pair in PAIRS}
+    fields = {pair: [predicted(s, error) for s, _ in shots[pair]] for pair in PAIRS}
+    verdict = judge_recording(
+        blur_evidence(image, field)
+        for pair in PAIRS
+        for (_, image), field in zip(shots[pair], fields[pair], strict=True)
+    )
+    gated = before = 0
+    for pair in PAIRS:
+        images = [
+            deblur_gated(image, field, recording=verdict).image
+            for (_, image), field in zip(shots[pair], fields[pair], strict=True)
+        ]
+        before += untouched(pair, blur_px)
+        same = all(a is b for a, (_, b) in zip(images, shots[pair], strict=True))
+        gated += untouched(pair, blur_px) if same else correct_matches(images, [s for s, _ in shots[pair]])
+    return gated / before
+
+
+@pytest.mark.parametrize("blur_px", [6, 12])
+def test_what_is_blurred_is_deblurred(blur_px):
+    assert ratio(blur_px, "none") > {6: 1.15, 12: 1.4}[blur_px]
+
+
+@pytest.mark.parametrize("error", ["flipped axis", "noise", "20 % long", "20 % short", "10 ms late"])
+def test_a_wrong_gyroscope_loses_no_matches(error):
+    assert ratio(12, error) >= 0.95
+
+
+@pytest.mark.parametrize("blur_px", [5, 10, 20])
+def test_a_sharp_frame_stays_as_it_is(blur_px):
+    for pair in PAIRS.values():
+        shutter, image = shot(pair[0], 0.2)
+        field = scaled(predicted(shutter, "none"), blur_px / 0.2)
+        gated = deblur_gated(image, field)
+        assert gated.image is image and not gated.deblurred and "does not show the blur" in gated.reason
+
+
+@pytest.mark.parametrize("blur_px", [10, 25])
+def test_the_image_tells_extent_and_direction(blur_px):
+    shutter, image = shot(0.98, blur_px)
+    field = predicted(shutter, "none")
+    for factor in (0.8, 1.0, 1.2):
+        evidence = blur_evidence(image, scaled(field, factor))
+        assert evidence.support > 8 and evidence.extent_is_plausible
+        assert evidence.extent_factor == pytest.approx(1 / factor, rel=0.06)
+    turned = replace(field, vector_px=field.vector_px[..., ::-1] * np.float32([1, -1]))
+    evidence = blur_evidence(image, turned)
+    assert evidence.support < 4 and evidence.contradiction > evidence.support
+
+
+def test_a_wrong_extent_is_corrected_and_a_right_one_left_alone():
+    shutter, image = shot(0.98, 12)
+    field = predicted(shutter, "none")
+    assert deblur_gated(image, field).extent_factor == 1.0
+    assert deblur_gated(image, scaled(field, 0.8)).extent_factor == pytest.approx(1.25, rel=0.06)
+    right, mended = (deblur_gated(image, scaled(field, k)).image.astype(int) for k in (1.0, 1.25))
+    assert np.abs(right - mended).mean() < 1.5
+
+
+def test_grey_and_16_bit_pictures_and_very_long_blur_are_judged_alike():
+    shutter, image = shot(0.98, 12)
+    field = predicted(shutter, "none")
+    colour = blur_evidence(image, field)
+    grey = blur_evidence(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), field)
+    deep = blur_evidence(image.astype(np.uint16) * 257, field)
+    assert grey.support == pytest.approx(colour.support, rel=0.05)
+    assert deep.support == pytest.approx(colour.support, rel=0.06)
+    shutter, image = shot(0.98, 25)
+    large = cv2.resize(image, None, fx=3, fy=3, interpolation=cv2.INTER_CUBIC)
+    field = predicted(shutter, "none")
+    vectors = cv2.resize(field.vector_px, BlurField.nodes(3 * WIDTH, 3 * HEIGHT)[::-1]) * 3
+    evidence = blur_evidence(large, BlurField(width=3 * WIDTH, height=3 * HEIGHT, vector_px=vectors))
+    assert evidence.support > 8 and evidence.extent_factor == pytest.approx(1.0, abs=0.08)
+
+
+def test_flat_small_and_clipped_pictures_tell_nothing():
+    field = BlurField.uniform(640, 480, (12.0, 3.0))
+    for image in (np.full((480, 640), 90, np.uint8), np.full((480, 640, 3), 255, np.uint8)):
+        evidence = blur_evidence(image, field)
+        assert not evidence.enough and evidence.support == 0
+        assert not deblur_gated(image, field).deblurred
+    assert not blur_evidence(np.zeros((40, 50), np.uint8), BlurField.uniform(50, 40, (12.0, 3.0))).enough
+    noise = np.random.default_rng(0).integers(0, 255, (480, 640), dtype=np.uint8)
+    assert not deblur_gated(noise, field).deblurred
+    assert not deblur_gated(noise, BlurField.uniform(640, 480, (0.0, 0.0))).deblurred
+
+
+def test_a_recording_is_judged_by_its_median_frame():
+    shutter, image = shot(0.98, 12)
+    right = blur_evidence(image, predicted(shutter, "none"))
+    wrong = blur_evidence(image, predicted(shutter, "flipped axis"))
+    assert judge_recording([right, right]).trusted is None
+    assert judge_recording([right, wrong, right, BlurEvidence.nothing()]).trusted is True
+    verdict = judge_recording([wrong, right, wrong])
+    assert verdict.trusted is False and verdict.frames == 3 and "check its axes" in verdict.reason
+    assert not deblur_gated(image, predicted(shutter, "none"), recording=verdict).deblurred
+    long = blur_evidence(image, scaled(predicted(shutter, "none"), 1.25))
+    verdict = judge_recording([long, long, long])
+    assert verdict.trusted and verdict.extent_factor == pytest.approx(0.8, rel=0.05) and "0.8" in verdict.reason
+
+
+def test_what_moved_with_the_camera_keeps_its_pixels():
+    shutter, image = shot(0.98, 20)
+    sharp = scene().picture(LENS, replace(shutter, exposure_s=0.0), noise=0.01)
+    mixed = image.copy()
+    mixed[160:320, 240:560] = sharp[160:320, 240:560]
+    field = predicted(shutter, "none")
+    out, share = keep_sharp(mixed, np.zeros_like(mixed), field)
+    kept = (out > 0).any(axis=2)
+    assert kept[192:288, 272:528].mean() > 0.3 and kept[:128].mean() < 0.05 and 0 < share < 0.2
+    out, share = keep_sharp(image, np.zeros_like(image), field)
+    assert share < 0.02
+
+
+def blur_of(px, reasons=None):
+    names = tuple(f"{i}.jpg" for i in range(len(px)))
+    return PredictedBlur(names=names, px=np.array(px, dtype=float), reasons=tuple(reasons or [""] * len(px)))
+
+
+def test_every_frame_has_a_decision_with_a_reason():
+    px = [1.0, 10.0, 60.0, 10.0, np.nan]
+    decisions = decide(
+        blur_of(px, ["", "", "", "", "the exposure time is unknown"]), np.arange(5) / 30, width=1920, height=1080
+    )
+    assert [d.action for d in decisions] == ["keep", "deblur", "drop", "deblur", "keep"]
+    assert "too few to matter" in decisions[0].reason and "10.0 px" in decisions[1].reason
+    assert "too many" in decisions[2].reason and decisions[4].reason == "the exposure time is unknown"
+    assert decisions[4].blur_px is None and decisions[2].blur_px == 60
+    small = decide(blur_of(px[:4]), np.arange(4) / 30, width=640, height=360)
+    assert [d.action for d in small] == ["deblur", "deblur", "drop", "deblur"]
+    assert decide(blur_of([0.9]), np.zeros(1), width=640, height=360)[0].action == "keep"
+
+
+def test_frames_that_bridge_a_gap_stay_the_least_blurred_first():
+    t_s = np.arange(8) * 0.2
+    px = [5, 60, 80, 50, 70, 90, 60, 5]
+    decisions = decide(blur_of(px), t_s, width=1920, height=1080)
+    kept = [i for i, d in enumerate(decisions) if d.action != "drop"]
+    assert kept[0] == 0 and kept[-1] == 7 and max(np.diff(t_s[kept])) < 0.5 + 1e-9
+    assert 3 in kept and 5 not in kept and "bridges a gap" in decisions[3].reason
+    none = decide(blur_of(px), t_s, width=1920, height=1080, options=GateOptions(bridge_s=10.0))
+    assert [d.action for d in none].count("drop") == 6
+    turning = decide(
+        blur_of(px),
+        t_s + 0.5,
+        width=1920,
+        height=1080,
+        motion=scene().gyro(),
+        options=GateOptions(bridge_s=10.0, bridge_deg=3.0),
+    )
+    assert [d.action for d in turning].count("drop") < 6
