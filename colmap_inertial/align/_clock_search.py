@@ -190,18 +190,16 @@ def _correlate(
     intervals: Intervals, path: GyroPath, min_overlap: float, rotation: Array | None
 ) -> tuple[Array, Array, float]:
     """Gain at all offsets on a grid, for dense frames, by FFT of the angular velocities with their gaps masked."""
-    from scipy.fft import irfft, next_fast_len, rfft
-
     swept = 0.5 * (path.rate_rad_s[1:] + path.rate_rad_s[:-1]) * np.diff(path.t_s)[:, None]
     seen, seen_ok, begin_s = _on_grid(intervals.begin_s, intervals.end_s, intervals.turn_rad)
     felt, felt_ok, imu_begin_s = _on_grid(path.t_s[:-1], path.t_s[1:], swept)
-    size = next_fast_len(len(seen) + len(felt), real=True)
+    size = _fft_length(len(seen) + len(felt))
 
     def spectrum(x: Array) -> NDArray[np.complex128]:
-        return np.asarray(rfft(x, size, axis=0), dtype=np.complex128)
+        return np.asarray(np.fft.rfft(x, size, axis=0), dtype=np.complex128)
 
     def correlate(a: NDArray[np.complex128], b: NDArray[np.complex128]) -> Array:
-        return np.asarray(irfft(np.conj(a) * b, size, axis=0), dtype=np.float64)
+        return np.asarray(np.fft.irfft(np.conj(a) * b, size, axis=0), dtype=np.float64)
 
     v, g = spectrum(seen), spectrum(felt)
     v_ok, g_ok = spectrum(seen_ok.astype(float))[:, None], spectrum(felt_ok.astype(float))[:, None]
@@ -226,6 +224,11 @@ def _correlate(
     return offset_s[order], gain[order], per_second
 
 
+def _fft_length(at_least: int) -> int:
+    """A power of two: numpy's FFT, as scipy's takes longer to import than the whole search."""
+    return 1 << max(at_least - 1, 1).bit_length()
+
+
 def _on_grid(begin_s: Array, end_s: Array, turn_rad: Array) -> tuple[Array, NDArray[np.bool_], float]:
     """Mean rates in the cells of a grid, which cells are covered by intervals without gaps, and the grid's start."""
     start_s = float(begin_s[0])
@@ -247,13 +250,11 @@ def _on_grid(begin_s: Array, end_s: Array, turn_rad: Array) -> tuple[Array, NDAr
 
 def _redundancy(seen: Array, felt: Array) -> float:
     """Cells per independent cell: Bartlett's sum over the products of the two autocorrelations."""
-    from scipy.fft import irfft, next_fast_len, rfft
-
     def autocorrelation(x: Array) -> Array:
         x = x - x.mean(axis=0)
-        size = next_fast_len(2 * len(x), real=True)
-        power = np.sum(np.abs(rfft(x, size, axis=0)) ** 2, axis=1)
-        out = np.asarray(irfft(power, size)[: len(x)])
+        size = _fft_length(2 * len(x))
+        power = np.sum(np.abs(np.fft.rfft(x, size, axis=0)) ** 2, axis=1)
+        out = np.asarray(np.fft.irfft(power, size)[: len(x)])
         return out / max(out[0], 1e-15)
 
     a, b = autocorrelation(seen), autocorrelation(felt)
