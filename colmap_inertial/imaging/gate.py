@@ -218,7 +218,7 @@ def deblur_gated(
 
 
 #: An extent is corrected where it is further off than small blur lets the dip drift, and where the dip is this clear.
-_CORRECTED_FROM, _CLEAR_SUPPORT = 0.1, 8.0
+_CORRECTED_FROM, _CLEAR_SUPPORT = 0.1, 7.0
 #: Blur this long must show in a frame with texture; below, a frame that shows nothing does not contradict.
 _MUST_SHOW_PX = 8.0
 _FEWEST_FRAMES = 3
@@ -265,9 +265,8 @@ def judge_recording(evidence: Iterable[BlurEvidence], options: GateOptions | Non
     telling = [one for one in evidence if one.enough]
     supports = [_support(one) for one in telling]
     median = float(np.median(supports)) if supports else 0.0
-    clear = [one.extent_factor for one, support in zip(telling, supports, strict=True) if support >= _CLEAR_SUPPORT]
-    factor = float(np.median(clear)) if len(clear) >= _FEWEST_FRAMES else 1.0
-    factor = factor if abs(factor - 1) > _CORRECTED_FROM else 1.0
+    together = sum(telling, BlurEvidence.nothing())
+    factor = _mended(together)
     if len(telling) < _FEWEST_FRAMES:
         trusted, reason = None, f"{len(telling)} frames are too few to check the gyroscope against the images"
     elif median < options.min_recording_support:
@@ -282,6 +281,13 @@ def judge_recording(evidence: Iterable[BlurEvidence], options: GateOptions | Non
         if factor != 1.0:
             reason += f", but for its extent, which is multiplied by {factor:.2f}"
     return RecordingVerdict(trusted=trusted, support=median, extent_factor=factor, frames=len(telling), reason=reason)
+
+
+def _mended(evidence: BlurEvidence) -> float:
+    """The factor that the extents need."""
+    factor = evidence.extent_factor
+    clear = evidence.support >= _CLEAR_SUPPORT and evidence.extent_is_plausible
+    return factor if clear and abs(factor - 1) > _CORRECTED_FROM else 1.0
 
 
 def _support(evidence: BlurEvidence) -> float:
@@ -307,10 +313,7 @@ def _judge(
             f"the image does not show the blur that the gyroscope predicts ({own:.1f} standard deviations where "
             f"{options.min_support:g} are wanted)"
         )
-    factor = evidence.extent_factor
-    if abs(factor - 1) <= _CORRECTED_FROM or own < _CLEAR_SUPPORT:
-        factor = 1.0
-    return factor, f"the image bears out the gyroscope's blur ({own:.0f} standard deviations)"
+    return _mended(evidence), f"the image bears out the gyroscope's blur ({own:.0f} standard deviations)"
 
 
 #: Side of the blocks that keep or give up their pixels together; a step smeared over L rises by no more than a quarter
