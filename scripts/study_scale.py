@@ -280,7 +280,6 @@ def show(runs: Sequence[Run]) -> None:
         table.add_row(label, *(text(figures) for text in columns.values()), style="bold" if label == name else None)
     console.print(table)
     for part in PARTS[:3]:
-        # A width alone is no finding
         odd = [r for r in runs if r.part == part and (r.verdict != "trusted" or not r.inside)]
         counts = Counter(wording(reason) for r in odd for reason in r.reasons)
         for reason, count in counts.most_common(8):
@@ -288,6 +287,10 @@ def show(runs: Sequence[Run]) -> None:
         for r in sorted((r for r in odd if r.error is not None and not r.inside), key=lambda r: r.seed):
             z = abs(r.error or 0) / (r.sigma or 1)
             console.print(f"{part}: seed {r.seed} is {z:.1f} sigma off, {r.verdict}", markup=False)
+    stressed = [r for r in runs if r.part == "stressed"]
+    if stressed:
+        share = 100 * summary(stressed)["inside_or_not_trusted"]
+        console.print(f"stressed: {share:.1f} % inside the interval or not trusted (target: at least 90 %)")
     futile = [r for r in runs if r.part == "unobservable"]
     for kind in FUTILE:
         of_kind = [r for r in futile if r.kind == kind]
