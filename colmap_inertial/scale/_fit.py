@@ -9,8 +9,10 @@ import numpy as np
 from colmap_inertial.scale import _factors as fac
 from colmap_inertial.scale import _noise as levels
 from colmap_inertial.scale import _parameters as par
+from colmap_inertial.scale._drift import scale_drift
 from colmap_inertial.scale._parameters import Data, Estimate, Noise, Prior
-from colmap_inertial.types import Array, ImuNoise
+from colmap_inertial.scale.priors import PRIORS
+from colmap_inertial.types import Array, ImuNoise, ScaleDrift
 
 _MAX_ITERATIONS, _MAX_ROTATION_ITERATIONS = 40, 4
 _PROBES = 4
@@ -34,8 +36,8 @@ class Fit:
         Sum of squares and expectation for each noise level.
     converged
         Whether the scale came to rest.
-    step_log, step_sigma
-        Logarithm of the ratio between the scales of the second and the first half, and its standard deviation.
+    drift
+        Scales of parts of the recording.
     excitation_m_s2
         Standard deviation of the acceleration between nodes.
     gap_s
@@ -51,8 +53,7 @@ class Fit:
     gyro_bias_with_globals: Array
     sums: dict[str, tuple[float, float]]
     converged: bool
-    step_log: float
-    step_sigma: float
+    drift: ScaleDrift
     excitation_m_s2: float
     gap_s: float
     gain_chi2: float
@@ -99,33 +100,32 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
         if settled and fac.still_near(there, x, data.t_s):
             break
 
-    # Once more at the optimum: the mean gyroscope bias, and a second scale for the second half
+    # Once more at the optimum: the mean gyroscope bias, and scales of the parts
     k = len(data.t_s)
     mean_bias, mean_bias_z = np.zeros((k, par.N_STATE, 3)), np.zeros((par.N_GLOBALS, 3))
     mean_bias[:, par.GYRO_BIAS] = np.eye(3) / k
-    second, second_z = np.zeros((k, par.N_STATE, 1)), np.zeros((par.N_GLOBALS, 1))
-    column = _second_half(data, x, groups["centre"], noise)
-    pull = replace(groups["centre"], residual=column)
-    pull.pull_back(column[:, :, None], second, second_z)
-    sides = np.concatenate([rhs[:, :, :1], second, mean_bias], axis=2)
-    sides_z = np.concatenate([rhs_z[:, :1], second_z, mean_bias_z], axis=1)
-    states, z, cov = system.solve(sides, sides_z)
-    after = pull.apply(states, z)
-    information = float(np.sum(column * (column - after[:, :, 1])))
-    residual = groups["centre"].residual + after[:, :, 0]
-    step_log = -float(np.sum(column * residual)) / information
+    states, z, cov = system.solve(mean_bias, mean_bias_z)
+    inflation = max(1.0, *(squares / expected for squares, expected in sums.values()))
+    drift = scale_drift(
+        data,
+        x,
+        noise,
+        groups["centre"],
+        (system, rhs[:, :, :1], rhs_z[:, :1]),
+        inflation=inflation,
+        tolerated_log=PRIORS.model_scale,
+    )
     gain = x.accel_gain.ravel()
     accel = (x.world_from_imu[:-1] @ (pre.velocity / pre.dt_s[:, None])[:, :, None])[:, :, 0]
     return Fit(
         estimate=x,
         noise=noise,
         cov=cov,
-        gyro_bias_cov=np.mean(states[:, par.GYRO_BIAS, 2:], axis=0),
-        gyro_bias_with_globals=z[:, 2:],
+        gyro_bias_cov=np.mean(states[:, par.GYRO_BIAS], axis=0),
+        gyro_bias_with_globals=z,
         sums=sums,
         converged=converged,
-        step_log=-step_log,
-        step_sigma=information**-0.5,
+        drift=drift,
         excitation_m_s2=float(np.sqrt(np.sum(np.var(accel, axis=0)))),
         gap_s=float(pre.gap_s.sum()),
         gain_chi2=float(gain @ prior.info[par.ACCEL_GAIN, par.ACCEL_GAIN] @ gain),
@@ -172,14 +172,3 @@ def _moment_scale(data: Data, x: Estimate) -> float:
     if not (visual_size > 0 and inertial_size > 0):
         raise np.linalg.LinAlgError("no motion")
     return float(inertial_size / visual_size)
-
-
-def _second_half(data: Data, x: Estimate, centre: fac.Group | fac.Direct, noise: Noise) -> Array:
-    """(K, 3) derivative of the centres' residuals by a logarithm of the scale that only the second half has."""
-    path = -data.groups.centre * x.metres_per_unit
-    middle = int(np.searchsorted(data.t_s, par.middle_s(data.t_s)))
-    late = np.arange(len(path)) > middle
-    column = np.where(late[:, None], path - path[middle], 0.0)
-    root = data.centre_shape / noise.centre_m
-    weight = np.ones(len(path)) if centre.weight is None else centre.weight
-    return np.asarray((root @ column[:, :, None])[:, :, 0] * np.sqrt(weight)[:, None])

@@ -30,7 +30,8 @@ _LARGEST_BIAS_M_S2 = 1.5
 #: Chi-square of the accelerometer's nine gains and axis errors against their prior: the 8 recordings that this was
 #: tried on have 3 to 9; by chance, 28 is exceeded once in a thousand.
 _LARGEST_GAIN_CHI2 = 28.0
-_DISAGREEMENT_SIGMAS = 3.0
+#: A drift of the scale is reported where chance would show as much once in a thousand recordings.
+_DRIFT_PROBABILITY, _DRIFT_SIGMAS = 1e-3, 3.29
 #: The accelerometer's noise between states over the motion's acceleration: 0.02 to 0.1 in good recordings, 0.4 and more
 #: where an axis is mirrored.
 _LARGEST_UNEXPLAINED = 0.25
@@ -138,6 +139,7 @@ def _judged(fit: Fit, t_s: Array, calibration: CameraImuCalibration) -> ScaleEst
         chi2=squares,
         dof=max(1, round(expected)),
         excitation_m_s2=fit.excitation_m_s2,
+        drift=fit.drift,
     )
 
 
@@ -173,12 +175,14 @@ def _checks(fit: Fit) -> list[str]:
             f"the accelerometer seems to be off in gain by {gains} % on its axes, more than such sensors are: check "
             "its unit and the strength of gravity, or calibrate it by holding it still in six directions"
         )
-    sigma = float(np.hypot(fit.step_sigma, PRIORS.model_scale))
-    if abs(fit.step_log) > _DISAGREEMENT_SIGMAS * sigma:
+    drift = fit.drift
+    trend = drift.trend_log_per_s / drift.trend_sigma_log_per_s
+    if drift.p_value < _DRIFT_PROBABILITY or abs(trend) > _DRIFT_SIGMAS:
+        low, high = np.expm1(drift.log_ratio.min()), np.expm1(drift.log_ratio.max())
         out.append(
-            f"the second half of the recording is {100 * np.expm1(fit.step_log):+.1f} % in scale against the first, "
-            f"{abs(fit.step_log) / sigma:.1f} standard deviations: the reconstruction's scale drifts, or a part of it "
-            "is wrong; close loops while recording, or scale its parts apart"
+            f"the reconstruction's scale is not the same throughout: from {100 * low:+.1f} to {100 * high:+.1f} % in "
+            f"parts of {drift.end_s[0] - drift.begin_s[0]:.0f} s (see drift in the JSON); it drifts, or a part of it "
+            "is wrong: close loops while recording, or scale its parts apart"
         )
     return out
 

@@ -120,6 +120,57 @@ class SmoothedTrajectory:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class ScaleDrift:
+    """Scales of parts of a recording against the scale of the whole, and whether they are the same.
+
+    Attributes
+    ----------
+    begin_s, end_s
+        (W,) the parts, camera clock, seconds since the trajectory's epoch.
+    log_ratio
+        (W,) logarithm of the part's scale over the whole one's.
+    sigma_log
+        (W,) its standard deviation.
+    chi2, dof, p_value
+        Test of equal scales, small differences tolerated: how probable it would be to see as much by chance.
+    trend_log_per_s, trend_sigma_log_per_s
+        Steady growth of the logarithm of the scale, and its standard deviation.
+    """
+
+    begin_s: Array
+    end_s: Array
+    log_ratio: Array
+    sigma_log: Array
+    chi2: float
+    dof: int
+    p_value: float
+    trend_log_per_s: float
+    trend_sigma_log_per_s: float
+
+    def __post_init__(self) -> None:
+        n = len(checked_times("begin_s", self.begin_s))
+        for name in ("begin_s", "end_s", "log_ratio", "sigma_log"):
+            set_fields(self, **{name: checked_array(name, getattr(self, name), (n,))})
+
+    def as_json(self, metres_per_unit: float | None) -> dict[str, object]:
+        """The fields in JSON types; scales of the parts where the whole one is given."""
+        parts = []
+        for begin_s, end_s, log_ratio, sigma in zip(
+            self.begin_s.tolist(), self.end_s.tolist(), self.log_ratio.tolist(), self.sigma_log.tolist(), strict=True
+        ):
+            scale = None if metres_per_unit is None else metres_per_unit * float(np.exp(log_ratio))
+            parts.append({"begin_s": begin_s, "end_s": end_s, "metres_per_unit": scale, "sigma_log": sigma})
+        return {
+            "parts": parts,
+            "chi2": self.chi2,
+            "dof": self.dof,
+            "p_value": self.p_value,
+            "trend_log_per_s": self.trend_log_per_s,
+            "trend_sigma_log_per_s": self.trend_sigma_log_per_s,
+        }
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ScaleEstimate:
     """Metres per model unit, with its uncertainty and a verdict.
 
@@ -148,6 +199,8 @@ class ScaleEstimate:
         Of the fit, against the noise it assumed.
     excitation_m_s2
         Standard deviation of the camera's acceleration: what the scale rests on.
+    drift
+        Whether the scale stays the same along the recording; ``None`` where the method does not tell.
     method
         ``"spectral"`` or ``"joint"``.
     """
@@ -167,6 +220,7 @@ class ScaleEstimate:
     chi2: float | None = None
     dof: int | None = None
     excitation_m_s2: float | None = None
+    drift: ScaleDrift | None = None
     runtime_s: float = 0.0
 
     def __post_init__(self) -> None:
@@ -210,6 +264,7 @@ class ScaleEstimate:
             "chi2": self.chi2,
             "dof": self.dof,
             "excitation_m_s2": self.excitation_m_s2,
+            "drift": None if self.drift is None else self.drift.as_json(self.metres_per_unit),
             "method": self.method,
             "runtime_s": self.runtime_s,
         }
