@@ -13,7 +13,7 @@ from colmap_inertial.gyro import GyroPath
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence
 from colmap_inertial.imaging.gate import GateOptions, deblur_gated, decide, judge_recording, keep_sharp
-from colmap_inertial.imaging.gyro_camera import FrameShutter
+from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.psf import PredictedBlur, blur_field
 from colmap_inertial.imaging.rolling_shutter import rectify_keypoints
 from colmap_inertial.simulate.render import colmap_camera
@@ -24,7 +24,7 @@ LENS = CameraModel(
     model="OPENCV", width=WIDTH, height=HEIGHT, params=(640, 640, 400, 225, 0.08, -0.12, 0.0005, -0.0003)
 )
 #: Pairs of instants at which the scene's camera turns quickly and looks at much the same.
-PAIRS = {"a": (0.98, 1.14), "b": (2.74, 2.9), "c": (3.58, 3.74)}
+PAIRS = {"a": (0.98, 1.14), "c": (3.58, 3.74)}
 
 
 @cache
@@ -69,7 +69,7 @@ def predicted(shutter, error):
 
 
 def detect(image):
-    points, descriptors = cv2.SIFT.create(4000).detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
+    points, descriptors = cv2.SIFT.create(2500).detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
     root = np.sqrt(descriptors / descriptors.sum(axis=1, keepdims=True))
     return np.array([p.pt for p in points]) + 0.5, root
 
@@ -200,6 +200,32 @@ def test_a_recording_is_judged_by_its_median_frame():
     long = blur_evidence(image, scaled(predicted(shutter, "none"), 1.25))
     verdict = judge_recording([long, long, long])
     assert verdict.trusted and verdict.extent_factor == pytest.approx(0.8, rel=0.05) and "0.8" in verdict.reason
+
+
+def test_deepgyro_s_frames_show_a_fifth_more_blur_than_turning_explains(shared_data):
+    """Its camera was swung at arm's length: near things move half as much again as turning explains, far ones 1.19."""
+    folder = shared_data / "deepgyro" / "raw"
+    stamps_ns, exposure_ns = np.loadtxt(folder / "images" / "images.txt").T
+    rows = np.loadtxt(folder / "imu" / "imu.txt")
+    gyro = rows[rows[:, 0] == 4, 1:]
+    # published: camera x, y, z are the gyroscope's y, x, z; that mirrors, and the way between frames says the opposite
+    path = GyroPath((gyro[:, 0] - gyro[0, 0]) * 1e-9, -gyro[:, [2, 1, 3]], np.zeros(3))
+    motion = GyroCamera(path=path, cam_from_imu_xyzw=np.array([0, 0, 0, 1.0]), offset_s=0.022)
+    intrinsics = (1558.6899, 1558.6899, 939.6533, 518.4131)
+    camera = colmap_camera(CameraModel(model="PINHOLE", width=1920, height=1080, params=intrinsics))
+    images, fields = [], []
+    for i in range(1, 6):
+        shutter = FrameShutter(
+            width=1920,
+            height=1080,
+            t_s=(stamps_ns[i] - stamps_ns[0]) * 1e-9,
+            exposure_s=exposure_ns[i] * 1e-9,
+            readout_s=0.0244944,
+        )
+        fields.append(blur_field(motion, camera, shutter))
+        images.append(cv2.imread(str(folder / "images" / f"{i + 1:04}.jpg")))
+    verdict = judge_recording(blur_evidence(image, field) for image, field in zip(images, fields, strict=True))
+    assert verdict.trusted and 1.12 < verdict.extent_factor < 1.28
 
 
 def test_what_moved_with_the_camera_keeps_its_pixels():

@@ -20,13 +20,13 @@ from colmap_inertial.types import Array
 
 #: Lags as factors of the predicted extent, and directions against the predicted one.
 FACTORS = np.arange(0.6, 1.5001, 0.05)
-TURNS_RAD = np.radians(np.arange(0.0, 180.0, 7.5))
+TURNS_RAD = np.radians(np.arange(0.0, 180.0, 15.0))
 #: Tiles are at least so large, and so many times the blur's length.
 _SMALLEST_TILE_PX, _TILE_BLURS = 64, 2.9
 #: Images with longer blur are looked at in half the size, a quarter and so on.
 _LONGEST_PX = 44.0
-#: Shorter blur leaves no zero in the spectrum; flat or overexposed tiles say nothing; more tiles than this add little.
-_SHORTEST_PX, _LEAST_CONTRAST, _MOST_CLIPPED, _MOST_TILES = 2.5, 0.01, 0.1, 900
+#: Shorter blur leaves no zero in the spectrum; flat or overexposed tiles say nothing.
+_SHORTEST_PX, _LEAST_CONTRAST, _MOST_CLIPPED = 2.5, 0.01, 0.1
 #: Standard deviation of the smoothing of the cepstrum, px; power (of a tile's mean square 1) below which noise rules.
 _SMOOTHING_PX, _FLOOR = 0.8, 1e-7
 _FEWEST_TILES = 12
@@ -102,10 +102,12 @@ class BlurEvidence:
     @property
     def contradiction(self) -> float:
         """Standard deviations by which the deepest dip in some clearly different direction shows."""
-        return float(self.sigmas[:, 4:-3].max())
+        return float(self.sigmas[:, 2:-1].max())
 
 
-def blur_evidence(image: NDArray[np.uint8] | NDArray[np.uint16], blur: BlurField) -> BlurEvidence:
+def blur_evidence(
+    image: NDArray[np.uint8] | NDArray[np.uint16], blur: BlurField, *, most_tiles: int = 900
+) -> BlurEvidence:
     """Look for the blur that was predicted.
 
     Parameters
@@ -114,6 +116,8 @@ def blur_evidence(image: NDArray[np.uint8] | NDArray[np.uint16], blur: BlurField
         (H, W) or (H, W, 3), sRGB.
     blur
         Predicted, of the image's size.
+    most_tiles
+        More of them than this are thinned out: support grows with the square root of their number, cost with it.
 
     Returns
     -------
@@ -141,9 +145,9 @@ def blur_evidence(image: NDArray[np.uint8] | NDArray[np.uint16], blur: BlurField
     height, width = light.shape
     if min(height, width) < tile:
         return BlurEvidence.nothing()
-    step = max(3 * tile // 4, int(np.ceil(np.sqrt(height * width / _MOST_TILES))))
+    step = max(3 * tile // 4, int(np.ceil(np.sqrt(height * width / most_tiles))))
     top, left = (_starts(size, tile, step) for size in (height, width))
-    windows = np.lib.stride_tricks.sliding_window_view(light, (tile, tile))[top][:, left].reshape(-1, tile, tile)
+    windows = np.lib.stride_tricks.sliding_window_view(light, (tile, tile))[top[:, None], left].reshape(-1, tile, tile)
     rows, columns = (
         np.minimum(np.rint((start + tile / 2) * reduced / blur.step_px), size - 1).astype(np.intp)
         for start, size in ((top, lengths.shape[0]), (left, lengths.shape[1]))
@@ -164,7 +168,7 @@ def blur_evidence(image: NDArray[np.uint8] | NDArray[np.uint16], blur: BlurField
     damped = np.log(power + _FLOOR * tile**2) * smooth[:, None] * smooth[: tile // 2 + 1]
     cepstra = irfft2(damped, s=(tile, tile))
     values = _at_lags(np.asarray(cepstra), vectors[usable])
-    values -= np.median(values[:, :, 3:-2], axis=2, keepdims=True)
+    values -= np.median(values[:, :, 2:-1], axis=2, keepdims=True)
     return BlurEvidence(total=values.sum(axis=0), total_square=(values**2).sum(axis=0), tiles=len(values))
 
 
@@ -192,13 +196,15 @@ def _at_lags(cepstra: NDArray[np.float32], vectors: Array) -> Array:
     along_x = vectors[:, 0, None] * cosine - vectors[:, 1, None] * sine
     along_y = vectors[:, 0, None] * sine + vectors[:, 1, None] * cosine
     x, y = (FACTORS[None, :, None] * v[:, None, :] for v in (along_x, along_y))
-    x0, y0 = np.floor(x).astype(np.intp), np.floor(y).astype(np.intp)
-    fx, fy = x - x0, y - y0
-    index = np.arange(len(cepstra))[:, None, None]
-    upper = cepstra[index, y0 % tile, x0 % tile] * (1 - fx) + cepstra[index, y0 % tile, (x0 + 1) % tile] * fx
-    y1 = (y0 + 1) % tile
-    lower = cepstra[index, y1, x0 % tile] * (1 - fx) + cepstra[index, y1, (x0 + 1) % tile] * fx
-    return np.asarray(upper * (1 - fy) + lower * fy)
+    x0, y0 = np.floor(x), np.floor(y)
+    part_x, part_y = (x - x0).astype(np.float32), (y - y0).astype(np.float32)
+    left, top = x0.astype(np.intp) % tile, y0.astype(np.intp) % tile
+    right = (left + 1) % tile
+    flat = cepstra.ravel()
+    first = np.arange(len(cepstra))[:, None, None] * tile**2
+    rows = first + top * tile, first + (top + 1) % tile * tile
+    upper, lower = (flat[row + left] * (1 - part_x) + flat[row + right] * part_x for row in rows)
+    return np.asarray(upper * (1 - part_y) + lower * part_y, dtype=np.float64)
 
 
 __all__ = ["FACTORS", "TURNS_RAD", "BlurEvidence", "blur_evidence"]

@@ -19,6 +19,7 @@ from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.imaging.psf import PredictedBlur
+from colmap_inertial.imaging.rolling_shutter import spread_nodes
 from colmap_inertial.types import Array
 
 Code = TypeVar("Code", np.uint8, np.uint16)
@@ -199,7 +200,8 @@ def deblur_gated(
         Thresholds.
     """
     options = options or GateOptions()
-    evidence = blur_evidence(image, blur)
+    trusted = recording is not None and recording.trusted is True
+    evidence = blur_evidence(image, blur, most_tiles=_FEW_TILES if trusted else 900)
     factor, reason = _judge(evidence, blur, recording, options)
     if factor is None:
         return GatedFrame(
@@ -222,6 +224,8 @@ _CORRECTED_FROM, _CLEAR_SUPPORT = 0.1, 7.0
 #: Blur this long must show in a frame with texture; below, a frame that shows nothing does not contradict.
 _MUST_SHOW_PX = 8.0
 _FEWEST_FRAMES = 3
+#: Tiles that show whether a frame contradicts a gyroscope that is trusted.
+_FEW_TILES = 200
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -337,38 +341,39 @@ def keep_sharp(image: NDArray[Code], deblurred: NDArray[Code], blur: BlurField) 
     import cv2
 
     height, width = image.shape[:2]
+    rows, columns = -(-height // _BLOCK_PX), -(-width // _BLOCK_PX)
+    # judged at half the size: a quarter of the cost, and of the noise
+    size = (max(1, width // 2), max(1, height // 2))
     codes = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    full = np.float32(np.iinfo(image.dtype).max)
-    grey: Picture = np.asarray(cv2.GaussianBlur(codes.astype(np.float32), (0, 0), 1.0) / full, dtype=np.float32)
-    vectors = blur.per_pixel().astype(np.float32)
-    x, y = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)[:, None]
+    small = cv2.resize(codes, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    grey: Picture = np.asarray(cv2.GaussianBlur(small, (0, 0), 0.5) / np.float32(np.iinfo(image.dtype).max))
+    along_x, along_y = (
+        spread_nodes(0.5 * blur.vector_px[..., i].astype(np.float64), *size, 0.5 * blur.step_px) for i in (0, 1)
+    )
+    x, y = np.arange(size[0], dtype=np.float32), np.arange(size[1], dtype=np.float32)[:, None]
     half = 0.5 * _SPAN
     ends = [
-        cv2.remap(
-            grey, x + s * vectors[..., 0], y + s * vectors[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101
-        )
+        cv2.remap(grey, x + s * along_x, y + s * along_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
         for s in (half, -half)
     ]
     change = np.asarray(np.abs(ends[0] - ends[1]), dtype=np.float32)
-    rows, columns = -(-height // _BLOCK_PX), -(-width // _BLOCK_PX)
+    side = _BLOCK_PX // 2
 
-    def blocks(values: Picture, pick: Callable[..., Picture], pad: float) -> Picture:
-        padded = np.full((rows * _BLOCK_PX, columns * _BLOCK_PX), pad, dtype=np.float32)
-        padded[:height, :width] = values
-        return pick(padded.reshape(rows, _BLOCK_PX, columns, _BLOCK_PX), axis=(1, 3))
+    def blocks(values: Picture, pick: Callable[..., Picture]) -> Picture:
+        padded = np.pad(values, ((0, rows * side - size[1]), (0, columns * side - size[0])), mode="edge")
+        return pick(padded.reshape(rows, side, columns, side), axis=(1, 3))
 
     around = np.ones((3, 3), np.uint8)
-    steepest = blocks(change, np.max, 0.0)
-    span = cv2.dilate(blocks(grey, np.max, -np.inf), around) - cv2.erode(blocks(grey, np.min, np.inf), around)
-    length = blocks(np.asarray(np.hypot(vectors[..., 0], vectors[..., 1]), dtype=np.float32), np.max, 0.0)
-    q = steepest / (_SPAN * np.maximum(span, _LEAST_RANGE))
+    span = cv2.dilate(blocks(grey, np.max), around) - cv2.erode(blocks(grey, np.min), around)
+    length = 2 * np.hypot(blocks(np.abs(along_x), np.max), blocks(np.abs(along_y), np.max))
+    q = blocks(change, np.max) / (_SPAN * np.maximum(span, _LEAST_RANGE))
     keep = np.clip((q - _FADE_FROM) / (_FADE_TO - _FADE_FROM), 0, 1)
     keep[(span < _LEAST_RANGE) | (length < _SHORTEST_PX)] = 0
     share = float(keep.mean())
     if share == 0:
         return deblurred, 0.0
-    size = (columns * _BLOCK_PX, rows * _BLOCK_PX)
-    weight = cv2.resize(keep.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)[:height, :width]
+    whole = (columns * _BLOCK_PX, rows * _BLOCK_PX)
+    weight = cv2.resize(keep.astype(np.float32), whole, interpolation=cv2.INTER_LINEAR)[:height, :width]
     if image.ndim == 3:
         weight = weight[..., None]
     out = deblurred + weight * (image.astype(np.float32) - deblurred)

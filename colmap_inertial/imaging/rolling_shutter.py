@@ -99,8 +99,8 @@ def rectify_image(
     if shutter.readout_s == 0:
         return image.copy(), np.ones((height, width), dtype=np.bool_)
     shift = _from_reference(motion, camera, shutter, step_px)
-    map_x = _spread(shift[..., 0], width, height, step_px) + np.arange(width, dtype=np.float32)
-    map_y = _spread(shift[..., 1], width, height, step_px) + np.arange(height, dtype=np.float32)[:, None]
+    map_x = spread_nodes(shift[..., 0], width, height, step_px) + np.arange(width, dtype=np.float32)
+    map_y = spread_nodes(shift[..., 1], width, height, step_px) + np.arange(height, dtype=np.float32)[:, None]
     covered = (map_x >= -0.5) & (map_x <= width - 0.5) & (map_y >= -0.5) & (map_y <= height - 0.5)
     out = cv2.remap(image, map_x, map_y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     out[~covered] = 0
@@ -142,7 +142,7 @@ def _from_reference(motion: GyroCamera, camera: Projector, shutter: FrameShutter
     return np.asarray(source - target).reshape(rows, columns, 2)
 
 
-def _spread(nodes: Array, width: int, height: int, step_px: int) -> NDArray[np.float32]:
+def spread_nodes(nodes: Array, width: int, height: int, step_px: float) -> NDArray[np.float32]:
     """(H, W) bilinear values between (Gy, Gx) nodes, as two products with weights."""
 
     def weights(size: int, count: int) -> NDArray[np.float32]:
@@ -165,4 +165,4 @@ def _reshaped(columns: Array, derivative: Array) -> Array:
     return np.stack([scale * size, np.arctan2(along[:, 1], along[:, 0])], axis=1)
 
 
-__all__ = ["rectify_image", "rectify_keypoints"]
+__all__ = ["rectify_image", "rectify_keypoints", "spread_nodes"]
