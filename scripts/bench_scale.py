@@ -269,7 +269,7 @@ def draw(outcomes: Sequence[Outcome], path: Path) -> None:
 
     colours = {"joint": "#0b6e4f", "spectral": "#d17a00", "linear": "#8a8a8a", "published": "#b3123c"}
     rows = [o for o in outcomes if o.group.startswith("first") and o.group.endswith(" s")]
-    figure, axes = plt.subplots(figsize=(7.2, 4.6), layout="constrained")
+    figure, axes = plt.subplots(figsize=(7.2, 5.0), layout="constrained")
 
     def line(method: str, points: dict[float, float], style: str, label: str) -> None:
         lengths = sorted(points)
@@ -296,7 +296,7 @@ def draw(outcomes: Sequence[Outcome], path: Path) -> None:
     axes.grid(True, which="major", alpha=0.3)
     names = len({o.recording for o in rows})
     axes.set_title(f"Mean over {names} recordings (published: 15); dots: single recordings, joint", fontsize=10)
-    axes.legend(frameon=False, fontsize=9)
+    figure.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=9)
     figure.savefig(path, dpi=150)
     plt.close(figure)
 
