@@ -12,9 +12,10 @@ from colmap_inertial.align import AlignOptions, align_clocks
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.io.plausible import GRAVITY_BOUNDS_M_S2, LARGEST_MEDIAN_RATE_RAD_S
 from colmap_inertial.io.units import STANDARD_GRAVITY_M_S2
+from colmap_inertial.scale._remarks import remarks
 from colmap_inertial.scale.verdict import verdict_of
 from colmap_inertial.threads import one_blas_thread
-from colmap_inertial.types import CameraImuCalibration, CameraTrajectory, ImuRecording, ScaleEstimate, clock_shift_s
+from colmap_inertial.types import CameraImuCalibration, CameraTrajectory, ImuRecording, ScaleEstimate
 
 #: A clock rate is corrected beforehand where it is this many standard deviations from zero and faster than what the
 #: estimators allow for.
@@ -134,35 +135,21 @@ def _estimate_or_refuse(
         )
         aligned = alignment.calibration
         rate = alignment.clock_rate
-        remarks: tuple[str, ...] = ()
+        said: tuple[str, ...] = ()
         if abs(rate) > max(_SIGNIFICANT * alignment.clock_rate_sigma, _FAST_CLOCK):
             stretched = alignment.on_camera_rate(imu, trajectory_epoch_ns=trajectory.epoch_ns)
-            remarks, imu = stretched.repairs[len(imu.repairs) :], stretched
+            said, imu = stretched.repairs[len(imu.repairs) :], stretched
         else:
             rate = 0.0
         estimate = _estimate(trajectory, imu, aligned, options)
         return replace(
             estimate,
-            reasons=(*estimate.reasons, *remarks, *_uncovered(trajectory, imu, aligned)),
+            reasons=(*estimate.reasons, *said, *remarks(trajectory, imu, aligned)),
             clock_rate=rate,
             clock_middle_s=alignment.middle_s,
         )
     except NotObservableError as error:
         return _refused(options.method, f"{error.quantity}: {error.hint}")
-
-
-def _uncovered(trajectory: CameraTrajectory, imu: ImuRecording, calibration: CameraImuCalibration) -> tuple[str, ...]:
-    """A remark where the IMU does not run along with all frames."""
-    shift_s = clock_shift_s(trajectory, imu)
-    gyro_s = imu.gyro_t_s[[0, -1]] + calibration.gyro_time_offset_s + shift_s
-    accel_s = imu.accel_t_s[[0, -1]] + calibration.accel_time_offset_s + shift_s
-    begin_s, end_s = max(gyro_s[0], accel_s[0]), min(gyro_s[1], accel_s[1])
-    # A frame or so at either end is nothing to speak of.
-    slack_s = 2 * float(np.median(np.diff(trajectory.t_s)))
-    if begin_s <= trajectory.t_s[0] + slack_s and end_s >= trajectory.t_s[-1] - slack_s:
-        return ()
-    covered = int(np.sum((trajectory.t_s >= begin_s) & (trajectory.t_s <= end_s)))
-    return (f"the IMU runs along with {covered} of {len(trajectory)} frames only; the scale rests on those",)
 
 
 def _estimate(

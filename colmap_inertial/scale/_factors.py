@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from colmap_inertial.geometry import skew, so3_exp, so3_log
 from colmap_inertial.scale import _parameters as par
@@ -20,6 +21,8 @@ from colmap_inertial.types import Array
 
 #: Cauchy scale of the visual residuals, in standard deviations: a normal error loses 4 % of its weight on average.
 ROBUST_SIGMAS = 4.0
+#: How far a model's parts may be shifted against each other where it breaks.
+_BREAK_M = 10.0
 
 
 @dataclass(eq=False, kw_only=True)
@@ -330,9 +333,13 @@ def visual_groups(data: Data, noise: Noise, x: Estimate, rate_rad_s: Array, *, r
     return groups[0], groups[1]
 
 
-def walk_group(values: Array, columns: slice, sigma: float, dt_s: Array) -> Direct:
-    """A random walk that grows by ``sigma`` in a second."""
+def walk_group(
+    values: Array, columns: slice, sigma: float, dt_s: Array, broken: NDArray[np.bool_] | None = None
+) -> Direct:
+    """A random walk that grows by ``sigma`` in a second, and anyhow where it is ``broken``."""
     info = 1 / (sigma * np.sqrt(dt_s))
+    if broken is not None:
+        info = np.where(broken, 1 / _BREAK_M, info)
     return Direct(residual=np.diff(values, axis=0) * info[:, None], columns=columns, info=info, step=True)
 
 
@@ -354,7 +361,7 @@ def all_groups(
         "centre": centre,
         "gyro_walk": walk_group(x.gyro_bias_rad_s, par.GYRO_BIAS, noise.gyro_walk_rad_s_rts, pre.dt_s),
         "accel_walk": walk_group(x.accel_walk_m_s2, par.ACCEL_WALK, noise.accel_walk_m_s2_rts, pre.dt_s),
-        "drift": walk_group(x.drift_m, par.DRIFT, noise.drift_m_rts, pre.dt_s),
+        "drift": walk_group(x.drift_m, par.DRIFT, noise.drift_m_rts, pre.dt_s, data.broken),
         # Anchors of what only differences determine
         "gyro_bias": state_group(
             x.gyro_bias_rad_s[:1] - prior.mean.gyro_bias_rad_s[:1], par.GYRO_BIAS, prior.gyro_bias_sigma_rad_s

@@ -16,6 +16,8 @@ from colmap_inertial.types import Array, ImuNoise, ScaleDrift
 
 _MAX_ITERATIONS, _MAX_ROTATION_ITERATIONS = 40, 4
 _PROBES = 4
+#: A robust weight below this: five times as far off as errors usually are.
+_HARDLY = 0.35
 #: The scale changes by at most this factor (in the logarithm) in one iteration.
 _LARGEST_STEP = 0.3
 
@@ -40,8 +42,8 @@ class Fit:
         Scales of parts of the recording.
     excitation_m_s2
         Standard deviation of the acceleration between nodes.
-    gap_s
-        How long the IMU is silent within the recording.
+    jumped
+        How many of the states' poses hardly count or lie behind a break of the path.
     gain_chi2
         Squared deviation of the accelerometer's nine gains and axis errors from their prior.
     """
@@ -55,7 +57,7 @@ class Fit:
     converged: bool
     drift: ScaleDrift
     excitation_m_s2: float
-    gap_s: float
+    jumped: int
     gain_chi2: float
 
 
@@ -127,7 +129,7 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
         converged=converged,
         drift=drift,
         excitation_m_s2=float(np.sqrt(np.sum(np.var(accel, axis=0)))),
-        gap_s=float(pre.gap_s.sum()),
+        jumped=int(np.sum(data.broken)) + _jumped(groups["rotation"], groups["centre"]),
         gain_chi2=float(gain @ prior.info[par.ACCEL_GAIN, par.ACCEL_GAIN] @ gain),
     )
 
@@ -172,3 +174,9 @@ def _moment_scale(data: Data, x: Estimate) -> float:
     if not (visual_size > 0 and inertial_size > 0):
         raise np.linalg.LinAlgError("no motion")
     return float(inertial_size / visual_size)
+
+
+def _jumped(*groups: fac.Group | fac.Direct) -> int:
+    """How many states have a pose that a robust weight all but switches off."""
+    weights = [group.weight for group in groups if group.weight is not None]
+    return int(np.sum(np.min(weights, axis=0) < _HARDLY)) if weights else 0

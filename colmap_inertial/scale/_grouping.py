@@ -18,6 +18,9 @@ from colmap_inertial.types import Array
 
 #: Longest step of the integration from a group's mean instant to a frame.
 _STEP_S = 0.01
+#: A step is a break where it is this many times as surprising as steps usually are, altogether and among the nearest;
+#: known only where states are at most so far apart.
+_BREAK, _NEAR, _DENSE_S = 9.0, 10, 0.3
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -79,6 +82,27 @@ def first_of_groups(t_s: Array, rate_hz: float, pauses: Array) -> NDArray[np.int
             begins.append(i)
             last = t
     return np.array(begins, dtype=np.intp)
+
+
+def find_breaks(t_s: Array, centre: Array) -> NDArray[np.bool_]:
+    """Between which of K states (K,), (K, 3) the path jumps, as where a reconstruction lost and found its way again.
+
+    A displacement is compared with the median velocity of its neighbours. Of eight recordings no step is more than six
+    times as far from it as steps usually are. Sparse frames tell nothing: anything may happen between them.
+
+    Returns
+    -------
+    (K - 1,) mask.
+    """
+    dt_s = np.diff(t_s)
+    if len(dt_s) < 2 * _NEAR or np.median(dt_s) > _DENSE_S:
+        return np.zeros(len(dt_s), dtype=np.bool_)
+    velocity = np.diff(centre, axis=0) / dt_s[:, None]
+    around = [np.roll(velocity, shift, axis=0) for shift in (-3, -2, -1, 1, 2, 3)]
+    surprise = np.linalg.norm(velocity - np.median(around, axis=0), axis=1) * dt_s
+    usual = float(np.median(surprise))
+    nearby = np.median([np.roll(surprise, shift) for shift in range(-_NEAR, _NEAR + 1)], axis=0)
+    return np.asarray(surprise > _BREAK * np.maximum(nearby, usual))
 
 
 def group_frames(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from colmap_inertial.geometry import so3_exp, so3_log
 from colmap_inertial.scale._grouping import Groups
@@ -48,6 +49,8 @@ class Data:
     coupling
         (K, 3, 3) model units per radian: the error of the centre (camera frame) that comes with an error of the
         rotation, as far as the covariances of the poses tell.
+    broken
+        (K - 1,) where the model's parts may be shifted against each other.
     gyro, accel
         Readings over camera time, by the first guess of the offsets.
     """
@@ -56,6 +59,7 @@ class Data:
     rotation_shape: Array
     centre_shape: Array
     coupling: Array
+    broken: NDArray[np.bool_]
     gyro: Track
     accel: Track
 

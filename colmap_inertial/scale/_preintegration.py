@@ -87,8 +87,6 @@ class Preintegrated:
         (K, 9, 9) covariances for white noise of density one.
     cov_gaps
         (K, 9, 9) covariance for what gaps between samples hide.
-    gap_s
-        (K,) lengths of these gaps.
     by_gyro_bias, by_accel_bias
         (K, 9, 3) derivatives.
     by_gyro_gain
@@ -108,7 +106,6 @@ class Preintegrated:
     cov_gyro: Array
     cov_accel: Array
     cov_gaps: Array
-    gap_s: Array
     by_gyro_bias: Array
     by_accel_bias: Array
     by_gyro_gain: Array
@@ -290,7 +287,6 @@ def _integrate(
         cov_gyro=total(g @ g.transpose(0, 2, 1)),
         cov_accel=cov_accel,
         cov_gaps=cov_gaps,
-        gap_s=gap,
         by_gyro_bias=-total(g_body),
         by_accel_bias=by_accel_bias,
         by_gyro_gain=total((g_body[:, :, :, None] * reading[:, None, None, :]).reshape(-1, 9, 9)),

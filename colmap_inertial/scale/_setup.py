@@ -7,7 +7,7 @@ import numpy as np
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.geometry import matrix_from_quat
 from colmap_inertial.scale import _parameters as par
-from colmap_inertial.scale._grouping import group_frames
+from colmap_inertial.scale._grouping import find_breaks, group_frames
 from colmap_inertial.scale._parameters import Data, Estimate, Prior
 from colmap_inertial.scale._preintegration import Track
 from colmap_inertial.scale.priors import PRIORS
@@ -81,6 +81,7 @@ def prepare(
         rotation_shape=rotation_shape,
         centre_shape=centre_shape,
         coupling=coupling,
+        broken=find_breaks(groups.t_s, groups.centre),
         gyro=gyro,
         accel=accel,
     )

@@ -118,8 +118,9 @@ def _judged(fit: Fit, t_s: Array, calibration: CameraImuCalibration) -> ScaleEst
     verdict, ci95, reasons = verdict_of(x.metres_per_unit, sigma_log, refusals=_refusals(fit, t_s))
     if verdict != "refused":
         verdict, ci95, reasons = verdict_of(x.metres_per_unit, sigma_log, _checks(fit))
-    if fit.gap_s > 0:
-        reasons = (*reasons, f"the IMU pauses for {fit.gap_s:.2f} s in all; the motion in between is left open")
+    if fit.jumped:
+        places = "one place" if fit.jumped == 1 else f"{fit.jumped} places"
+        reasons = (*reasons, f"poses jump at {places}, which hardly counts")
     refused = verdict == "refused"
     keep = [par.SCALE, *range(par.GRAVITY.start, par.ACCEL_BIAS.stop)]
     signs = np.array([-1.0, *[1.0] * 6])

@@ -1,0 +1,64 @@
+"""What a recording has that the estimate copes with, in words: the user should know, whatever the method."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from colmap_inertial.types import Array, CameraImuCalibration, CameraTrajectory, ImuRecording, clock_shift_s
+
+#: A pause is longer than this many sampling intervals, and than this.
+_PAUSE_INTERVALS, _PAUSE_S = 3.5, 0.02
+
+
+def remarks(trajectory: CameraTrajectory, imu: ImuRecording, calibration: CameraImuCalibration) -> tuple[str, ...]:
+    """Sentences on clocks far apart, pauses of the sensors, and frames without IMU.
+
+    Parameters
+    ----------
+    trajectory, imu
+        As they were read.
+    calibration
+        Time offsets between them.
+    """
+    shift_s = clock_shift_s(trajectory, imu)
+    gyro_s = imu.gyro_t_s + (calibration.gyro_time_offset_s + shift_s)
+    accel_s = imu.accel_t_s + (calibration.accel_time_offset_s + shift_s)
+    covered = (max(gyro_s[0], accel_s[0]), min(gyro_s[-1], accel_s[-1]))
+    said = (
+        _far_apart(trajectory, imu, calibration),
+        _pauses("gyroscope", gyro_s, trajectory),
+        _pauses("accelerometer", accel_s, trajectory),
+        _uncovered(trajectory, covered),
+    )
+    return tuple(sentence for sentence in said if sentence)
+
+
+def _far_apart(trajectory: CameraTrajectory, imu: ImuRecording, calibration: CameraImuCalibration) -> str:
+    shift_s = clock_shift_s(trajectory, imu)
+    begin_s, end_s = imu.gyro_t_s[0] + shift_s, imu.gyro_t_s[-1] + shift_s
+    if begin_s < trajectory.t_s[-1] and end_s > trajectory.t_s[0]:
+        return ""
+    return (
+        "the stamps of camera and IMU have no time in common; the rotations give an offset of "
+        f"{calibration.gyro_time_offset_s:.2f} s"
+    )
+
+
+def _pauses(sensor: str, t_s: Array, trajectory: CameraTrajectory) -> str:
+    step_s = np.diff(t_s)
+    inside = (t_s[1:] > trajectory.t_s[0]) & (t_s[:-1] < trajectory.t_s[-1])
+    long_s = step_s[inside & (step_s > max(_PAUSE_INTERVALS * float(np.median(step_s)), _PAUSE_S))]
+    if len(long_s) == 0:
+        return ""
+    times = "once" if len(long_s) == 1 else f"{len(long_s)} times"
+    longest = "" if len(long_s) == 1 else f", {long_s.max():.2f} s at the longest"
+    return f"the {sensor} pauses {times}, for {long_s.sum():.2f} s in all{longest}"
+
+
+def _uncovered(trajectory: CameraTrajectory, covered_s: tuple[float, float]) -> str:
+    # A frame or so at either end is nothing to speak of.
+    slack_s = 2 * float(np.median(np.diff(trajectory.t_s)))
+    if covered_s[0] <= trajectory.t_s[0] + slack_s and covered_s[1] >= trajectory.t_s[-1] - slack_s:
+        return ""
+    count = int(np.sum((trajectory.t_s >= covered_s[0]) & (trajectory.t_s <= covered_s[1])))
+    return f"the IMU runs along with {count} of {len(trajectory)} frames only; the scale rests on those"
