@@ -1,0 +1,179 @@
+"""Recordings with something wrong, through the command: an error that names the setting, a refusal, or a right scale.
+
+Nothing is ever trusted and wrong. The recordings are real (30 s of one of Mustaniemi et al., IROS 2017).
+"""
+
+import json
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from colmap_inertial.cli import main
+from colmap_inertial.geometry import so3_exp
+
+NAME, SECONDS, OTHER = "D11", 30.0, "D5"
+GYRO, ACCEL, POSES = "gyroscope", "accelerometer", "poses"
+Tables = dict[str, np.ndarray]
+
+
+def values(sensor: str, change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Tables], None]:
+    def alter(tables: Tables) -> None:
+        tables[sensor][:, 1:] = change(tables[sensor][:, 1:])
+
+    return alter
+
+
+def stamps(sensors: tuple[str, ...], change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Tables], None]:
+    def alter(tables: Tables) -> None:
+        for sensor in sensors:
+            tables[sensor][:, 0] = change(tables[sensor][:, 0])
+
+    return alter
+
+
+def turned(rotation_vector: list[float]) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda x: x @ so3_exp(np.array(rotation_vector)).T
+
+
+def without(*, begin_s: float, length_s: float, sensors: tuple[str, ...] = (GYRO, ACCEL)) -> Callable[[Tables], None]:
+    def alter(tables: Tables) -> None:
+        for sensor in sensors:
+            t_s = (tables[sensor][:, 0] - tables[POSES][0, 0]) * 1e-9
+            tables[sensor] = tables[sensor][(t_s < begin_s) | (t_s > begin_s + length_s)]
+
+    return alter
+
+
+def repeated(tables: Tables) -> None:
+    for sensor in (GYRO, ACCEL):
+        tables[sensor] = np.repeat(tables[sensor], np.where(np.arange(len(tables[sensor])) % 50 == 7, 2, 1), axis=0)
+
+
+def jumping(tables: Tables) -> None:
+    rng = np.random.default_rng(1)
+    size = np.ptp(tables[POSES][:, 1:4], axis=0).max()
+    for i in rng.integers(0, len(tables[POSES]) - 3, 5):
+        tables[POSES][i : i + 3, 1:4] += 0.2 * size * rng.standard_normal(3)
+
+
+def broken(tables: Tables) -> None:
+    size = np.ptp(tables[POSES][:, 1:4], axis=0).max()
+    tables[POSES][len(tables[POSES]) // 2 :, 1:4] += 0.1 * size * np.array([1, 0.5, -0.3])
+
+
+def weightless(tables: Tables) -> None:
+    from scipy.signal import butter, filtfilt
+
+    force = tables[ACCEL][:, 1:]
+    tables[ACCEL][:, 1:] = force - filtfilt(*butter(2, 0.3 / 50), force, axis=0)
+
+
+@pytest.fixture
+def attempt(shared_data, tmp_path, capsys):
+    """Runs the command on an altered copy; gives exit code, message and the JSON (None where there is none)."""
+
+    def run(alter: Callable[[Tables], None], name: str = NAME, seconds: float = SECONDS):
+        source = shared_data / "inertial_scale" / name
+        tables = {kind: np.loadtxt(source / f"{kind}.txt") for kind in (POSES, GYRO, ACCEL)}
+        begin_ns = tables[POSES][0, 0]
+        tables[POSES] = tables[POSES][tables[POSES][:, 0] <= begin_ns + seconds * 1e9]
+        alter(tables)
+        folder = tmp_path / name
+        folder.mkdir()
+        for kind, table in tables.items():
+            np.savetxt(folder / f"{kind}.txt", table, fmt=["%d"] + ["%.9g"] * (table.shape[1] - 1))
+        target = tmp_path / "scale.json"
+        with pytest.raises(SystemExit) as stopped:
+            main(["scale", str(folder), "--json", str(target)])
+        truth = float((source / "groundtruth.txt").read_text())
+        estimate = json.loads(target.read_text()) if target.exists() else None
+        if estimate is not None and estimate["verdict"] == "trusted":
+            low, high = estimate["ci95"]
+            assert low <= truth <= high, "trusted and wrong"
+        return stopped.value.code, capsys.readouterr().err, estimate
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("alter", "setting"),
+    [
+        pytest.param(values(GYRO, np.degrees), 'unit = "deg/s" under [imu.gyro]', id="gyro-in-deg/s"),
+        pytest.param(values(ACCEL, lambda x: x / 9.80665), 'unit = "g" under [imu.accel]', id="accel-in-g"),
+        pytest.param(values(GYRO, np.negative), 'axes = "-x,-y,-z" and mirrored = true', id="gyro-sign"),
+        pytest.param(weightless, "[imu.accel]", id="no-gravity"),
+        pytest.param(values(GYRO, turned([0, 0, np.pi / 2])), 'axes = "y,-x,z" under [imu.gyro]', id="gyro-turned"),
+        pytest.param(values(ACCEL, turned([0, 0, np.pi / 2])), "axes = ", id="accel-turned"),
+        pytest.param(values(GYRO, lambda x: x * [-1, 1, 1]), 'axes = "-x,y,z" and mirrored = true', id="gyro-mirrored"),
+        pytest.param(
+            values(ACCEL, lambda x: x * [-1, 1, 1]), 'axes = "-x,y,z" and mirrored = true', id="accel-mirrored"
+        ),
+        pytest.param(values(GYRO, lambda x: x[:, [1, 0, 2]]), 'axes = "y,x,z" and mirrored = true', id="gyro-columns"),
+        pytest.param(values(ACCEL, lambda x: x * [0, 1, 1]), "columns of [imu.accel]", id="dead-accel-x"),
+        pytest.param(values(ACCEL, lambda x: x * [1, 1, 0]), "columns of [imu.accel]", id="dead-accel-z"),
+        pytest.param(values(GYRO, lambda x: x * [1, 0, 1]), "columns of [imu.gyro]", id="dead-gyro-y"),
+        pytest.param(values(GYRO, lambda x: x * 0), "[imu.gyro]", id="dead-gyro"),
+    ],
+)
+def test_a_wrong_file_is_an_error_that_names_the_setting(attempt, alter, setting):
+    code, message, estimate = attempt(alter)
+    assert code == 2 and estimate is None
+    assert setting in " ".join(message.split())
+
+
+@pytest.mark.parametrize(
+    "alter",
+    [
+        pytest.param(values(ACCEL, np.negative), id="accel-sign"),
+        pytest.param(stamps((ACCEL,), lambda t: t + 1000e9), id="sensors-1000-s-apart"),
+    ],
+)
+def test_a_recording_that_cannot_give_a_scale_is_refused(attempt, alter):
+    code, _, estimate = attempt(alter)
+    assert code == 3 and estimate["verdict"] == "refused" and estimate["metres_per_unit"] is None
+    assert estimate["reasons"]
+
+
+def test_the_imu_of_another_recording_is_refused(attempt, shared_data):
+    def exchange(tables: Tables) -> None:
+        for sensor in (GYRO, ACCEL):
+            tables[sensor] = np.loadtxt(shared_data / "inertial_scale" / OTHER / f"{sensor}.txt")
+
+    code, _, estimate = attempt(exchange)
+    assert code == 3 and "belongs to these images" in estimate["reasons"][0]
+
+
+@pytest.mark.parametrize(
+    ("alter", "said"),
+    [
+        pytest.param(lambda tables: None, "", id="clean"),
+        pytest.param(stamps((GYRO, ACCEL), lambda t: t + 1000e9), "no time in common", id="stamps-1000-s-apart"),
+        pytest.param(stamps((GYRO, ACCEL), lambda t: t[0] + 1.01 * (t - t[0])), "ppm off the camera's", id="rate+1%"),
+        pytest.param(stamps((GYRO, ACCEL), lambda t: t[0] + 0.99 * (t - t[0])), "ppm off the camera's", id="rate-1%"),
+        pytest.param(without(begin_s=12.0, length_s=0.05), "pauses once, for 0.06 s", id="gap-0.05-s"),
+        pytest.param(without(begin_s=12.0, length_s=1.0), "gyroscope pauses once, for 1.0", id="gap-1-s"),
+        pytest.param(without(begin_s=9.0, length_s=4.0, sensors=(ACCEL,)), "accelerometer pauses once", id="gap-4-s"),
+        pytest.param(repeated, "repeated gyroscope rows", id="duplicates"),
+        pytest.param(jumping, "poses jump at", id="pose-jumps"),
+        pytest.param(broken, "poses jump at", id="path-breaks"),
+    ],
+)
+def test_what_recordings_suffer_is_handled_and_listed(attempt, alter, said):
+    code, message, estimate = attempt(alter)
+    assert code == 0, message
+    assert estimate["verdict"] == "trusted"
+    assert said in " ".join(estimate["reasons"])
+
+
+@pytest.mark.parametrize(
+    "alter",
+    [
+        pytest.param(values(ACCEL, lambda x: 1.1 * x), id="gain"),
+        pytest.param(values(ACCEL, lambda x: x * [1.1, 1, 1]), id="gain-of-one-axis"),
+        pytest.param(values(GYRO, turned([0, 0.5, 0])), id="gyro-turned-by-30-degrees"),
+    ],
+)
+def test_a_badly_calibrated_imu_is_not_trusted(attempt, alter):
+    _, _, estimate = attempt(alter, seconds=60.0)
+    assert estimate["verdict"] != "trusted" and estimate["reasons"]
