@@ -34,7 +34,20 @@ from colmap_inertial.pipeline.colmap import (
 )
 from colmap_inertial.pipeline.config import config_as_toml
 from colmap_inertial.pipeline.frames import FrameRecord, FrameStage, read_frame_records, require_frames, write_frames
+from colmap_inertial.pipeline.imaging import (
+    DeblurMethod,
+    ImagingPlan,
+    RollingShutterMethod,
+    for_rectified,
+    plan_imaging,
+    read_plan,
+    with_stated_exposures,
+    write_plan,
+    write_rectified,
+)
 from colmap_inertial.pipeline.metric import MetricStage, ModelStage, write_trajectory
+from colmap_inertial.pipeline.result import ModelResult, ReconstructResult, result_as_json
+from colmap_inertial.pipeline.stages import DeblurStage, GyroView, RollingShutterStage
 from colmap_inertial.pipeline.workspace import StageRunner, Workspace, fingerprint, remove
 from colmap_inertial.scale import ScaleOptions
 from colmap_inertial.types import (
@@ -43,7 +56,6 @@ from colmap_inertial.types import (
     Frame,
     FrameTiming,
     ImuRecording,
-    ScaleEstimate,
     WorldAxes,
 )
 from colmap_inertial.validate import Target, Validation, parse_target, validate_model, write_pictures
@@ -58,6 +70,11 @@ _GRAVITY_ROTATION_RAD = 0.2
 class ReconstructOptions:
     """Everything that decides the result of a reconstruction, beside the capture itself."""
 
+    deblur: DeblurMethod | None = None
+    """Undo motion blur by the gyroscope before COLMAP sees a frame. Default: wiener, where exposure times are known
+    and the pictures bear the gyroscope out."""
+    rolling_shutter: RollingShutterMethod | None = None
+    """Undo the rolling shutter by the gyroscope. Default: rectify, where the readout time is known."""
     mapping: MappingOptions = field(default_factory=MappingOptions)
     """How COLMAP builds the model."""
     scale: ScaleOptions = field(default_factory=ScaleOptions)
@@ -76,53 +93,6 @@ class ReconstructOptions:
             raise ValueError(f"seed must be from 0 to 2147483647, not {self.seed}")
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class ModelResult:
-    """What became of one of COLMAP's models; paths are ``None`` where the scale was refused."""
-
-    index: int
-    scale: ScaleEstimate
-    summary: dict[str, int | float]
-    sparse: Path
-    sparse_metric: Path | None = None
-    trajectory: Path | None = None
-    validation: Validation | InertialError | None = None
-    """Against the capture's target, where it names one; an error says why the target could not be measured."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class ReconstructResult:
-    """What ``reconstruct`` made; the same as ``result.json``."""
-
-    workspace: Workspace
-    models: tuple[ModelResult, ...]
-    frames: tuple[FrameRecord, ...]
-    seconds: dict[str, float]
-
-    def exit_code(self) -> int:
-        """0; 1 where a validation is outside its tolerance; its error's code where the target could not be measured.
-
-        Raises
-        ------
-        NotObservableError
-            When every model's scale was refused.
-        """
-        if all(model.sparse_metric is None for model in self.models):
-            reasons = {model.index: "; ".join(model.scale.reasons) for model in self.models}
-            raise NotObservableError(
-                "scale",
-                next(iter(reasons.values()))
-                if len(reasons) == 1
-                else "; ".join(f"model {i}: {text}" for i, text in reasons.items()),
-            )
-        checked = [model.validation for model in self.models if model.validation is not None]
-        failures = [check.exit_code for check in checked if isinstance(check, InertialError)]
-        outside = any(not check.within_tolerance for check in checked if isinstance(check, Validation))
-        if outside:
-            return 1
-        return failures[0] if len(failures) == len(checked) > 0 else 0
-
-
 def silent(stage: str, done: int, total: int, /) -> None:
     """A progress receiver that shows nothing."""
 
@@ -134,12 +104,19 @@ def prior_calibration(capture: Capture, options: ReconstructOptions) -> CameraIm
     return for_another_recording(read_calibration(options.calibration), shared_clock=capture.shared_clock)
 
 
-def default_model_stages(capture: Capture, imu: ImuRecording, options: ReconstructOptions) -> list[ModelStage]:
-    """What ``reconstruct`` runs when ``model_stages`` is ``None``: a starting point for one's own list."""
+def default_model_stages(
+    capture: Capture, imu: ImuRecording, options: ReconstructOptions, *, rectified: bool = False
+) -> list[ModelStage]:
+    """What ``reconstruct`` runs when ``model_stages`` is ``None``: a starting point for one's own list.
+
+    With ``rectified`` keypoints, the model is that of a global shutter.
+    """
     scale = options.scale
     if capture.shared_clock and scale.max_offset_s is None:
         scale = dataclasses.replace(scale, max_offset_s=SHARED_CLOCK_OFFSET_S)
     calibration = prior_calibration(capture, options)
+    if rectified:
+        calibration = for_rectified(calibration)
     return [MetricStage(imu=imu, calibration=calibration, options=scale, world=options.world)]
 
 
@@ -164,8 +141,9 @@ def reconstruct(
     options
         See :class:`ReconstructOptions`.
     frame_stages, keypoint_stages, model_stages
-        The hooks. ``None`` means the default stages, an empty list none. The model stages must include one that makes
-        the model metric, see :func:`default_model_stages`.
+        The hooks. ``None`` means the default stages, an empty list none: :class:`DeblurStage` for frames and
+        :class:`RollingShutterStage` for keypoints, where the options and the recording allow them. The model stages
+        must include one that makes the model metric, see :func:`default_model_stages`.
     progress
         Called with stage, steps done and steps in all.
 
@@ -182,6 +160,8 @@ def reconstruct(
         When ``out`` holds something else.
     MappingError
         When COLMAP finds no model.
+    NotObservableError
+        When deblurring or rectifying was asked for by name, and the gyroscope does not belong to the pixels.
     """
     loaded = load_capture(capture)
     if loaded.frames is None:
@@ -190,27 +170,87 @@ def reconstruct(
     if loaded.target is not None:
         parse_target(loaded.target)  # a wrong specification is said before the work, not after it
     timing, frames = read_frames(loaded)
+    timing = with_stated_exposures(loaded, timing)
     require_frames(len(timing.names), of=len(timing.names))
     gravity = _gravity_priors(loaded, imu, timing, options)
     check_names(timing.names)
-    stages = default_model_stages(loaded, imu, options) if model_stages is None else list(model_stages)
+    prior_calibration(loaded, options)  # likewise
     workspace = Workspace(out)
     workspace.open(loaded.path)
     with workspace.locked(), _logging_to(workspace.log):
         log.info("colmap-inertial %s: %s -> %s", __version__, capture, out)
         write_text(workspace.config, config_as_toml(options))
         runner = StageRunner(workspace)
-        _run_frames(runner, workspace, loaded, timing, frames, list(frame_stages or ()), progress)
+        plan = _plan(runner, workspace, loaded, imu, timing, options, progress)
+        of_frames = list(plan.frame_stages() if frame_stages is None else frame_stages)
+        of_keypoints = list(plan.keypoint_stages() if keypoint_stages is None else keypoint_stages)
+        _run_frames(runner, workspace, loaded, timing, frames, of_frames, progress)
         records = read_frame_records(workspace.frames)
-        _run_colmap(runner, workspace, records, gravity, options, list(keypoint_stages or ()), progress)
+        _run_colmap(runner, workspace, records, gravity, options, of_keypoints, progress)
+        rectifying = [stage for stage in of_keypoints if isinstance(stage, RollingShutterStage)]
+        _run_rectified(runner, workspace, records, rectifying, progress)
+        stages = (
+            default_model_stages(loaded, imu, options, rectified=bool(rectifying))
+            if model_stages is None
+            else list(model_stages)
+        )
         models = run_models(workspace, timing, imu, stages, runner, progress)
         if loaded.target is not None:
             models = tuple(_validated(workspace, model, parse_target(loaded.target), progress) for model in models)
-        result = ReconstructResult(workspace=workspace, models=models, frames=records, seconds=runner.seconds)
-        write_json(workspace.result, _result_as_json(result, loaded))
+        result = ReconstructResult(
+            workspace=workspace, models=models, frames=records, imaging=plan, seconds=runner.seconds
+        )
+        write_json(workspace.result, result_as_json(result, loaded))
         remove(workspace.features)
         log.info("finished")
     return result
+
+
+def _plan(
+    runner: StageRunner,
+    workspace: Workspace,
+    capture: Capture,
+    imu: ImuRecording,
+    timing: FrameTiming,
+    options: ReconstructOptions,
+    progress: Progress,
+) -> ImagingPlan:
+    """What to do to frames and keypoints; with both switched off, nothing is looked at."""
+    prior = prior_calibration(capture, options)
+
+    def work(partial: Sequence[Path]) -> None:
+        plan = plan_imaging(
+            capture,
+            imu,
+            timing,
+            prior,
+            deblur=options.deblur,
+            rolling_shutter=options.rolling_shutter,
+            scratch=workspace.stamps,
+            max_offset_s=options.scale.max_offset_s,
+            num_threads=1 if options.deterministic else -1,
+            seed=options.seed,
+            progress=progress,
+        )
+        write_plan(partial[0], plan)
+
+    depends = {
+        "capture": capture,
+        "imu": imu,
+        "timing": timing,
+        "prior": prior,
+        "deblur": options.deblur,
+        "rolling_shutter": options.rolling_shutter,
+        "max_offset_s": options.scale.max_offset_s,
+        "deterministic": options.deterministic,
+        "seed": options.seed,
+        "inputs": _inputs(capture, timing),
+    }
+    runner.run("imaging", depends, [workspace.imaging], work)
+    plan = read_plan(workspace.imaging, imu, timing)
+    log.info("deblurring: %s", plan.deblur_note)
+    log.info("rolling shutter: %s", plan.rolling_shutter_note)
+    return plan
 
 
 def _gravity_priors(
@@ -270,11 +310,35 @@ def _run_frames(
         images, records = partial
         write_frames(frames, timing, stages, source_folder=source, images=images, records=records, progress=progress)
 
-    inputs = [] if source is None else [source / name for name in timing.names]
-    if isinstance(capture.frames, Video):
-        inputs = [capture.frames.file]
-    depends = {"capture": capture, "timing": timing, "inputs": [fingerprint(path) for path in inputs], "stages": stages}
+    depends = {"capture": capture, "timing": timing, "inputs": _inputs(capture, timing), "stages": stages}
     runner.run("frames", depends, [workspace.images, workspace.frames], work)
+
+
+def _inputs(capture: Capture, timing: FrameTiming) -> list[object]:
+    """What identifies the files that frames are read from."""
+    source = frame_source(capture)
+    paths = [] if source is None else [source / name for name in timing.names]
+    if isinstance(capture.frames, Video):
+        paths = [capture.frames.file]
+    return [fingerprint(path) for path in paths]
+
+
+def _run_rectified(
+    runner: StageRunner,
+    workspace: Workspace,
+    records: Sequence[FrameRecord],
+    stages: Sequence[RollingShutterStage],
+    progress: Progress,
+) -> None:
+    """Images that agree with the rectified keypoints, for whoever goes on from the model."""
+    if not stages:
+        remove(workspace.images_rectified)
+        return
+
+    def work(partial: Sequence[Path]) -> None:
+        write_rectified(stages[0], records, workspace.images, partial[0], progress)
+
+    runner.run("rectified", {"stages": stages}, [workspace.images_rectified], work)
 
 
 def _run_colmap(
@@ -374,14 +438,15 @@ def _validated(workspace: Workspace, model: ModelResult, target: Target, progres
     if model.sparse_metric is None:
         return model
     check: Validation | InertialError
+    images = workspace.images_rectified if workspace.images_rectified.is_dir() else workspace.images
     try:
         check = validate_model(
             model.sparse_metric,
-            workspace.images,
+            images,
             target,
             progress=lambda done, total: progress("validation", done, total),
         )
-        write_pictures(check, workspace.images, workspace.validation / str(model.index))
+        write_pictures(check, images, workspace.validation / str(model.index))
     except (TargetNotFoundError, NotObservableError) as error:
         check = error
     found = check if isinstance(check, InertialError) else f"scale error {check.scale_error_pct:+.3f} %"
@@ -389,33 +454,22 @@ def _validated(workspace: Workspace, model: ModelResult, target: Target, progres
     return dataclasses.replace(model, validation=check)
 
 
-def _validation_as_json(check: Validation | InertialError | None) -> object:
-    return {"error": str(check)} if isinstance(check, InertialError) else check and check.as_json()
-
-
-def _result_as_json(result: ReconstructResult, capture: Capture) -> dict[str, object]:
-    import pycolmap
-
-    root = result.workspace.root
-
-    def relative(path: Path | None) -> str | None:
-        return None if path is None else str(path.relative_to(root))
-
-    return {
-        "versions": {"colmap_inertial": __version__, "pycolmap": pycolmap.__version__},
-        "capture": str(capture.path),
-        "models": [
-            {
-                "index": model.index,
-                **model.summary,
-                "sparse": relative(model.sparse),
-                "sparse_metric": relative(model.sparse_metric),
-                "trajectory": relative(model.trajectory),
-                **model.scale.as_json(),
-                "validation": _validation_as_json(model.validation),
-            }
-            for model in result.models
-        ],
-        "frames": [{"name": record.name, "action": record.action} for record in result.frames],
-        "seconds": result.seconds,
-    }
+__all__ = [
+    "DeblurStage",
+    "FrameStage",
+    "GyroView",
+    "KeypointStage",
+    "MappingOptions",
+    "MetricStage",
+    "ModelResult",
+    "ModelStage",
+    "ReconstructOptions",
+    "ReconstructResult",
+    "RollingShutterStage",
+    "default_model_stages",
+    "plan_imaging",
+    "prior_calibration",
+    "reconstruct",
+    "run_models",
+    "silent",
+]

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from colmap_inertial.errors import FormatError, InertialError
 from colmap_inertial.io.files import read_json, write_json
 from colmap_inertial.pipeline.colmap import Progress
+from colmap_inertial.pipeline.metadata import carry_metadata
 from colmap_inertial.types import CameraModel, Frame, FrameTiming
 
 
@@ -26,6 +27,40 @@ class FrameStage(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
+class FrameTreatment:
+    """What a frame stage decided about one frame, and why.
+
+    Attributes
+    ----------
+    reason
+        In words.
+    blur_px
+        90th percentile over the image of the blur that the gyroscope predicts; ``None`` where unknown.
+    deblurred
+        Whether pixels were deblurred.
+    kept_share
+        Share of the image that kept its pixels.
+    extent_factor
+        What the predicted blur was multiplied by to agree with the images.
+    """
+
+    reason: str
+    blur_px: float | None = None
+    deblurred: bool = False
+    kept_share: float = 1.0
+    extent_factor: float = 1.0
+
+
+@runtime_checkable
+class ExplainedStage(Protocol):
+    """A frame stage that says what it did to each frame."""
+
+    def treatment(self, name: str, /) -> FrameTreatment | None:
+        """What was decided about a frame that went through; ``None`` where there is nothing to say."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
 class FrameRecord:
     """What happened to one frame.
 
@@ -34,14 +69,18 @@ class FrameRecord:
     name
         Image name.
     action
-        ``"passed"``: the original file or pixels; ``"changed"``: by a frame stage; ``"dropped"``: by a frame stage.
+        ``"passed"``: the original file or pixels; ``"deblurred"``; ``"changed"``: by another frame stage;
+        ``"dropped"``: by a frame stage.
     camera
         Intrinsics that COLMAP starts from; ``None`` where COLMAP guesses.
+    treatment
+        What a stage that explains itself decided; ``None`` where there was none.
     """
 
     name: str
     action: str
     camera: CameraModel | None
+    treatment: FrameTreatment | None = None
 
 
 class _Originals:
@@ -113,14 +152,24 @@ def write_frames(
         if passed and source_folder is not None:
             shutil.copyfile(source_folder / frame.name, target)
         else:
-            _encode(target, frame.image)
+            encode_image(target, frame.image, None if source_folder is None else source_folder / frame.name)
         written[frame.name] = FrameRecord(
             name=frame.name, action="passed" if passed else "changed", camera=frame.camera
         )
         progress("frames", len(written), len(timing.names))
     require_frames(len(written), of=len(timing.names))
     every = [written.get(name) or FrameRecord(name=name, action="dropped", camera=None) for name in timing.names]
+    for stage in stages:
+        if isinstance(stage, ExplainedStage):
+            every = [_explained(record, stage.treatment(record.name)) for record in every]
     write_json(records, {"frames": [asdict(record) for record in every]})
+
+
+def _explained(record: FrameRecord, treatment: FrameTreatment | None) -> FrameRecord:
+    if treatment is None:
+        return record
+    action = "deblurred" if record.action == "changed" and treatment.deblurred else record.action
+    return replace(record, action=action, treatment=treatment)
 
 
 def require_frames(count: int, *, of: int) -> None:
@@ -134,7 +183,14 @@ def _same_memory(a: NDArray[Any], b: NDArray[Any]) -> bool:
     return a.__array_interface__ == b.__array_interface__
 
 
-def _encode(target: Path, image: NDArray[Any]) -> None:
+def encode_image(target: Path, image: NDArray[Any], original: Path | None = None) -> None:
+    """Write an image in the format of its file name, with the metadata of the file that it was made from.
+
+    Raises
+    ------
+    FormatError
+        Where the format cannot hold such pixels.
+    """
     import cv2
 
     bgr = image if image.ndim == 2 else cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2BGR)
@@ -143,7 +199,8 @@ def _encode(target: Path, image: NDArray[Any]) -> None:
     ok, data = cv2.imencode(target.suffix, bgr, options)
     if not ok:
         raise FormatError(target, f"OpenCV cannot write {image.dtype} images as {target.suffix}")
-    target.write_bytes(data.tobytes())
+    encoded = data.tobytes()
+    target.write_bytes(encoded if original is None else carry_metadata(original.read_bytes(), encoded))
 
 
 def read_frame_records(path: Path) -> tuple[FrameRecord, ...]:
@@ -153,5 +210,6 @@ def read_frame_records(path: Path) -> tuple[FrameRecord, ...]:
         camera = item["camera"]
         if camera is not None:
             camera = CameraModel(**{**camera, "params": tuple(camera["params"])})
-        records.append(FrameRecord(name=item["name"], action=item["action"], camera=camera))
+        treatment = None if item["treatment"] is None else FrameTreatment(**item["treatment"])
+        records.append(FrameRecord(name=item["name"], action=item["action"], camera=camera, treatment=treatment))
     return tuple(records)

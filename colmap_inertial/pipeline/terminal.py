@@ -4,21 +4,27 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from colmap_inertial.errors import InertialError
 from colmap_inertial.pipeline import ReconstructResult
 from colmap_inertial.pipeline.colmap import Progress
+from colmap_inertial.pipeline.frames import FrameRecord
+from colmap_inertial.pipeline.imaging import ImagingPlan
 from colmap_inertial.types import CameraImuCalibration, ScaleEstimate
 from colmap_inertial.validate import Validation, validation_table
 
 _STAGES = {
     "rendering": "Rendering",
+    "motion": "Camera motion",
+    "calibration": "Calibration",
+    "blur": "Blur",
     "frames": "Frames",
     "features": "Features",
     "matches": "Matches",
     "mapping": "Mapping",
+    "rectified": "Rectified",
     "metric": "Metric scale",
     "validation": "Validation",
 }
@@ -114,6 +120,18 @@ def show_validation(result: Validation) -> None:
     Console().print(validation_table(result))
 
 
+def imaging_lines(frames: Sequence[FrameRecord], plan: ImagingPlan) -> list[tuple[str, str]]:
+    """What was done to the frames, as labelled lines."""
+    counts = {action: sum(frame.action == action for frame in frames) for action in ("deblurred", "dropped")}
+    done = ", ".join(f"{count} {action}" for action, count in counts.items() if count)
+    view = plan.view
+    lines = [
+        ("Deblurring", f"{done} of {len(frames)} frames: {plan.deblur_note}" if done else plan.deblur_note),
+        ("Shutter", plan.rolling_shutter_note),
+    ]
+    return [*lines, *(("", note) for note in (() if view is None else view.notes))]
+
+
 def show_result(result: ReconstructResult) -> None:
     """Print the end of a reconstruction on one screen."""
     frames = result.frames
@@ -123,6 +141,7 @@ def show_result(result: ReconstructResult) -> None:
         lines = [
             ("Images", f"{summary['registered_images']} of {used} registered ({len(frames)} frames)"),
             ("Points", f"{summary['points']}, mean reprojection error {summary['mean_reprojection_error_px']:.2f} px"),
+            *imaging_lines(frames, result.imaging),
             *scale_lines(model.scale),
         ]
         if isinstance(model.validation, Validation) and model.validation.ci95_pct is not None:

@@ -41,6 +41,16 @@ class Workspace:
         return self.root / "images"
 
     @property
+    def images_rectified(self) -> Path:
+        """The same frames as a global shutter would have taken them, where the rolling shutter was undone."""
+        return self.root / "images_rectified"
+
+    @property
+    def imaging(self) -> Path:
+        """Calibration from before the reconstruction, and what it means for each frame."""
+        return self.root / "imaging.json"
+
+    @property
     def frames(self) -> Path:
         """Names, times and treatment of the frames."""
         return self.root / "frames.json"
@@ -142,9 +152,12 @@ class Workspace:
 
 
 def canonical(value: object) -> object:
-    """A value in JSON types, for hashing: dataclasses by field, paths as text, functions by name, body and closure."""
+    """A value in JSON types, for hashing: dataclasses by field, paths as text, functions by name, body and closure.
+
+    A field that is declared with ``compare=False`` decides nothing and is left out.
+    """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = {f.name: canonical(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        fields = {f.name: canonical(getattr(value, f.name)) for f in dataclasses.fields(value) if f.compare}
         return {"type": f"{type(value).__module__}.{type(value).__qualname__}", **fields}
     if isinstance(value, Mapping):
         return {str(k): canonical(v) for k, v in value.items()}

@@ -1,0 +1,306 @@
+"""Camera and IMU brought together before the reconstruction: what deblurring and the rolling shutter need.
+
+The rotation between frames comes from a small model that COLMAP makes of some of the frames at reduced size; it tells
+rotation from translation, which pixels followed from frame to frame cannot. Where there is no such model (a camera
+that only turns), the followed pixels serve; in a video they also tell whether it was stabilised.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from colmap_inertial.align import AlignOptions, align_clocks
+from colmap_inertial.errors import FormatError, MappingError, NotObservableError
+from colmap_inertial.flow import FlowOptions, VisualRotation, check_motion, find_stabilisation, measure_rotation
+from colmap_inertial.io.capture import Capture, ImageFolder
+from colmap_inertial.io.frames import frame_source, read_frames
+from colmap_inertial.io.images import read_image
+from colmap_inertial.model import colmap_camera, find_models, read_model, trajectory_from_model
+from colmap_inertial.pipeline.colmap import (
+    MappingOptions,
+    Progress,
+    extract_features,
+    image_pairs,
+    map_images,
+    match_features,
+)
+from colmap_inertial.pipeline.frames import encode_image
+from colmap_inertial.pipeline.stages import GyroView, RollingShutterStage
+from colmap_inertial.threads import one_blas_thread
+from colmap_inertial.types import (
+    CameraImuCalibration,
+    CameraModel,
+    CameraTrajectory,
+    Frame,
+    FrameTiming,
+    ImuRecording,
+)
+
+#: Frames of the small model: at most so many, at least so far apart; and how COLMAP makes it.
+_MODEL_FRAMES, _MODEL_SPACING_S = 60, 0.24
+_SMALL = MappingOptions(
+    pairing="sequential", overlap=6, max_num_features=1500, first_octave=0, max_image_size=800, refine_intrinsics=None
+)
+#: Frames that are followed by their pixels: at most so many, not closer than this; a video has them closer than that.
+_FLOW_FRAMES, _FLOW_SPACING_S, _VIDEO_STEP_S = 300, 0.06, 0.13
+#: A declared calibration that is as good as this needs no search.
+_GOOD_ROTATION_RAD, _GOOD_OFFSET_S = 0.03, 0.005
+#: What is found must be as good as this.
+_USABLE_ROTATION_RAD, _USABLE_OFFSET_S = 0.1, 0.01
+#: A clock rate is corrected where it is this many standard deviations from zero, and faster than this.
+_SIGNIFICANT, _FAST_CLOCK = 5.0, 3e-4
+#: COLMAP's guess of a focal length, in longer sides of the image.
+_GUESSED_FOCAL = 1.2
+
+
+def some_frames(capture: Capture, timing: FrameTiming, indices: Sequence[int]) -> Iterator[Frame]:
+    """Some frames of a capture, in order of time; of a folder, no other is opened."""
+    if not isinstance(capture.frames, ImageFolder):
+        wanted = {timing.names[i] for i in indices}
+        for frame in read_frames(capture)[1]:
+            if frame.name in wanted:
+                yield frame
+                wanted.remove(frame.name)
+                if not wanted:
+                    return
+        return
+    for i in sorted(indices):
+        image = read_image(capture.frames.folder / timing.names[i])
+        yield Frame(name=timing.names[i], image=image, t_s=float(timing.t_s[i]), camera=capture.camera)
+
+
+def guessed_camera(capture: Capture, timing: FrameTiming) -> CameraModel:
+    """The declared intrinsics, or what COLMAP starts from without any."""
+    if capture.camera is not None:
+        return capture.camera
+    height, width = next(some_frames(capture, timing, [0])).image.shape[:2]
+    params = (_GUESSED_FOCAL * max(width, height), width / 2, height / 2)
+    return CameraModel(model="SIMPLE_PINHOLE", width=width, height=height, params=params)
+
+
+def look_first(
+    capture: Capture,
+    imu: ImuRecording,
+    timing: FrameTiming,
+    prior: CameraImuCalibration,
+    *,
+    max_offset_s: float | None,
+    scratch: Path,
+    num_threads: int,
+    seed: int,
+    progress: Progress,
+) -> GyroView:
+    """Find the calibration that the treatment of frames needs.
+
+    Parameters
+    ----------
+    capture, imu, timing
+        The recording.
+    prior
+        What is known; used as it stands where that is enough.
+    max_offset_s
+        Largest offset between the clocks.
+    scratch
+        A folder for temporary files.
+    num_threads, seed
+        Of COLMAP.
+    progress
+        Called with ``"calibration"``.
+
+    Raises
+    ------
+    NotObservableError
+        Where the frames do not turn as the gyroscope does, or were stabilised.
+    """
+    camera = guessed_camera(capture, timing)
+    options = AlignOptions(max_offset_s=max_offset_s)
+    is_video = len(timing.t_s) > 1 and float(np.median(np.diff(timing.t_s))) <= _VIDEO_STEP_S
+    rotation_rad, offset_s = _sigmas(prior)
+    declared = rotation_rad <= _GOOD_ROTATION_RAD and offset_s <= _GOOD_OFFSET_S
+    rotation = _followed(capture, timing, camera, progress) if is_video else None
+    found: GyroView | NotObservableError
+    if declared:
+        notes = () if capture.camera is not None else (f"the focal length was guessed: {camera.params[0]:.0f} px",)
+        found = GyroView(imu=imu, timing=timing, calibration=prior, camera=camera, source="capture", notes=notes)
+    else:
+        found = _by_model(capture, imu, timing, prior, options, scratch, num_threads, seed, progress)
+        if isinstance(found, NotObservableError):
+            rotation = rotation or _followed(capture, timing, camera, progress)
+            found = _by_pixels(rotation, imu, timing, prior, options, camera, found)
+    if rotation is not None:
+        known_s = None if isinstance(found, NotObservableError) else found.motion().offset_s
+        stabilised = find_stabilisation(rotation, imu, offset_s=known_s)
+        if stabilised.stabilised:
+            raise NotObservableError("the pixels' motion", stabilised.reason)
+        if not isinstance(found, NotObservableError):
+            agreement = check_motion(rotation, found.motion())
+            if agreement.agrees is False:
+                raise NotObservableError("the pixels' motion", agreement.reason)
+    if isinstance(found, NotObservableError):
+        raise found
+    return found
+
+
+def _sigmas(calibration: CameraImuCalibration) -> tuple[float, float]:
+    """Standard deviations of rotation (rad) and of the gyroscope's time offset (s)."""
+    rotation = max(calibration.sigma(f"rotation_{axis}_rad") for axis in "xyz")
+    return rotation, calibration.sigma("gyro_time_offset_s")
+
+
+def _middle(timing: FrameTiming, spacing_s: float, most: int) -> list[int]:
+    """Frames from the middle of a recording, not closer together than asked for."""
+    kept = [0]
+    for i, t_s in enumerate(timing.t_s.tolist()):
+        if t_s - timing.t_s[kept[-1]] >= spacing_s:
+            kept.append(i)
+    first = max(0, (len(kept) - most) // 2)
+    return kept[first : first + most]
+
+
+def _followed(capture: Capture, timing: FrameTiming, camera: CameraModel, progress: Progress) -> VisualRotation:
+    indices = _middle(timing, _FLOW_SPACING_S, _FLOW_FRAMES)
+
+    def counted() -> Iterator[Frame]:
+        for done, frame in enumerate(some_frames(capture, timing, indices)):
+            progress("motion", done, len(indices))
+            yield frame
+        progress("motion", len(indices), len(indices))
+
+    with one_blas_thread():
+        return measure_rotation(counted(), colmap_camera(camera), timing, FlowOptions())
+
+
+def _by_pixels(
+    rotation: VisualRotation,
+    imu: ImuRecording,
+    timing: FrameTiming,
+    prior: CameraImuCalibration,
+    options: AlignOptions,
+    camera: CameraModel,
+    instead_of: NotObservableError,
+) -> GyroView | NotObservableError:
+    try:
+        view = _aligned(rotation.trajectory(), imu, timing, prior, options, camera, "pixels")
+    except NotObservableError as error:
+        return NotObservableError(error.quantity, f"{error.hint} (nor by a small model: {instead_of})")
+    # what translation does to pixels looks like a bias of the gyroscope
+    return replace(view, calibration=replace(view.calibration, gyro_bias_rad_s=prior.gyro_bias_rad_s))
+
+
+def _aligned(
+    trajectory: CameraTrajectory,
+    imu: ImuRecording,
+    timing: FrameTiming,
+    prior: CameraImuCalibration,
+    options: AlignOptions,
+    camera: CameraModel,
+    source: str,
+) -> GyroView:
+    found = align_clocks(trajectory, imu, prior=prior, options=options)
+    rotation_rad, offset_s = _sigmas(found.calibration)
+    if rotation_rad > _USABLE_ROTATION_RAD or offset_s > _USABLE_OFFSET_S:
+        raise NotObservableError(
+            "camera-IMU calibration",
+            f"before the reconstruction it is known to {math.degrees(rotation_rad):.1f} deg and "
+            f"{1e3 * offset_s:.0f} ms, which is too little: give [calibration] in capture.toml",
+        )
+    fast = abs(found.clock_rate) > max(_SIGNIFICANT * found.clock_rate_sigma, _FAST_CLOCK)
+    return GyroView(
+        imu=imu,
+        timing=timing,
+        calibration=found.calibration,
+        clock_rate=found.clock_rate if fast else 0.0,
+        clock_middle_s=found.middle_s,
+        camera=camera,
+        source=source,
+    )
+
+
+def _by_model(
+    capture: Capture,
+    imu: ImuRecording,
+    timing: FrameTiming,
+    prior: CameraImuCalibration,
+    options: AlignOptions,
+    scratch: Path,
+    num_threads: int,
+    seed: int,
+    progress: Progress,
+) -> GyroView | NotObservableError:
+    """The calibration by a small model; with a rolling shutter, by a second one of rectified keypoints."""
+    indices = _middle(timing, _MODEL_SPACING_S, _MODEL_FRAMES)
+    names = [timing.names[i] for i in indices]
+    rounds = 2 if timing.readout_s else 1
+    steps = itertools.count()
+
+    def step(stage: str, done: int, total: int, /) -> None:
+        progress("calibration", min(next(steps), 10 * len(names) * rounds), 10 * len(names) * rounds)
+
+    with tempfile.TemporaryDirectory(dir=scratch) as folder:
+        work = Path(folder)
+        images = frame_source(capture)
+        if images is None:
+            images = work / "images"
+            images.mkdir()
+            for frame in some_frames(capture, timing, indices):
+                encode_image(images / frame.name, frame.image)
+        view: GyroView | None = None
+        try:
+            for i in range(rounds):
+                model, camera = _small_model(
+                    capture, images, names, work / str(i), view, num_threads=num_threads, seed=seed, progress=step
+                )
+                trajectory, _ = trajectory_from_model(read_model(model), timing)
+                view = _aligned(trajectory, imu, timing, prior, options, camera, "model")
+        except (MappingError, FormatError) as error:
+            return view or NotObservableError("camera-IMU calibration", str(error))
+        except NotObservableError as error:
+            return view or error
+    assert view is not None
+    progress("calibration", 1, 1)
+    return view
+
+
+def _small_model(
+    capture: Capture,
+    images: Path,
+    names: Sequence[str],
+    work: Path,
+    view: GyroView | None,
+    *,
+    num_threads: int,
+    seed: int,
+    progress: Progress,
+) -> tuple[Path, CameraModel]:
+    """COLMAP's largest model of some frames and its camera; with a view, of rectified keypoints."""
+    work.mkdir()
+    features, database, sparse = work / "features.db", work / "database.db", work / "sparse"
+    cameras = {name: capture.camera for name in names}
+    stages = [] if view is None else [RollingShutterStage(view=view)]
+    extract_features(
+        images, cameras, features, _SMALL, keypoint_stages=stages, num_threads=num_threads, seed=seed, progress=progress
+    )
+    pairs = image_pairs(names, _SMALL)
+    match_features(features, database, pairs, num_threads=num_threads, seed=seed, progress=progress)
+    map_images(
+        database,
+        images,
+        sparse,
+        _SMALL,
+        refine_intrinsics=capture.camera is None,
+        num_images=len(names),
+        num_threads=num_threads,
+        seed=seed,
+        progress=progress,
+    )
+    largest = max(find_models(sparse).values(), key=lambda folder: read_model(folder).num_reg_images())
+    used = next(iter(read_model(largest).cameras.values()))
+    params = tuple(float(value) for value in used.params)
+    return largest, CameraModel(model=used.model.name, width=used.width, height=used.height, params=params)

@@ -1,0 +1,333 @@
+"""What is done to the frames of a capture before COLMAP sees them, decided once and written down."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from colmap_inertial.errors import InertialError, NotObservableError
+from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence
+from colmap_inertial.imaging.gate import FrameDecision, GateOptions, RecordingVerdict, decide, judge_recording
+from colmap_inertial.imaging.psf import blur_field, predicted_blur_px
+from colmap_inertial.imaging.rolling_shutter import rectify_image
+from colmap_inertial.io.calibration import SHARED_CLOCK_OFFSET_S, SMALLEST_READOUT_S
+from colmap_inertial.io.capture import Capture
+from colmap_inertial.io.files import read_json, write_json
+from colmap_inertial.io.frames import frame_source
+from colmap_inertial.io.images import read_image
+from colmap_inertial.model import colmap_camera
+from colmap_inertial.pipeline.colmap import Progress
+from colmap_inertial.pipeline.first_look import guessed_camera, look_first, some_frames
+from colmap_inertial.pipeline.frames import FrameRecord, encode_image
+from colmap_inertial.pipeline.metadata import stated_exposures_s
+from colmap_inertial.pipeline.stages import DeblurStage, GyroView, RollingShutterStage
+from colmap_inertial.types import CALIBRATION_PARAMETERS, CameraImuCalibration, CameraModel, FrameTiming, ImuRecording
+
+DeblurMethod = Literal["off", "wiener"]
+RollingShutterMethod = Literal["off", "rectify"]
+
+#: Blur below this cannot be told from the texture: where no frame has more, nothing is deblurred.
+_TELLING_PX = 4.0
+#: Share of the readout that acts on poses after rectification.
+_LEFT_SHARE = 0.1
+_READOUT = CALIBRATION_PARAMETERS.index("readout_s")
+#: Frames by which the gyroscope is judged.
+_JUDGED_FRAMES = 14
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ImagingPlan:
+    """What is to be done to frames and keypoints, and why.
+
+    Attributes
+    ----------
+    view
+        Gyroscope, camera and times; ``None`` where nothing is to be done.
+    deblur
+        Decisions and verdict for :class:`DeblurStage`; ``None`` where no frame is to be deblurred.
+    rectify
+        Whether the rolling shutter is undone.
+    deblur_note, rolling_shutter_note
+        What is done, or why not, in words.
+    """
+
+    view: GyroView | None = None
+    deblur: tuple[tuple[FrameDecision, ...], RecordingVerdict] | None = None
+    rectify: bool = False
+    deblur_note: str = ""
+    rolling_shutter_note: str = ""
+
+    def frame_stages(self) -> list[DeblurStage]:
+        """The default frame stages."""
+        if self.view is None or self.deblur is None:
+            return []
+        decisions, verdict = self.deblur
+        return [DeblurStage(view=self.view, decisions=decisions, verdict=verdict)]
+
+    def keypoint_stages(self) -> list[RollingShutterStage]:
+        """The default keypoint stages."""
+        return [RollingShutterStage(view=self.view)] if self.view is not None and self.rectify else []
+
+    def as_json(self) -> dict[str, object]:
+        """In JSON types, without the recording."""
+        view = self.view
+        return {
+            "deblur": self.deblur_note,
+            "rolling_shutter": self.rolling_shutter_note,
+            "rectify": self.rectify,
+            "calibration": None
+            if view is None
+            else {
+                **asdict(view.calibration),
+                "clock_rate": view.clock_rate,
+                "clock_middle_s": view.clock_middle_s,
+                "source": view.source,
+                "notes": list(view.notes),
+            },
+            "camera": None if view is None else asdict(view.camera),
+            "verdict": None if self.deblur is None else asdict(self.deblur[1]),
+            "decisions": None if self.deblur is None else [asdict(decision) for decision in self.deblur[0]],
+        }
+
+
+def write_plan(path: Path, plan: ImagingPlan) -> None:
+    """Write a plan for :func:`read_plan`."""
+    write_json(path, plan.as_json())
+
+
+def read_plan(path: Path, imu: ImuRecording, timing: FrameTiming) -> ImagingPlan:
+    """The plan that :func:`write_plan` wrote for the same recording."""
+    values: dict[str, Any] = read_json(path)
+    view = None
+    if values["calibration"] is not None:
+        found = dict(values["calibration"])
+        camera = values["camera"]
+        view = GyroView(
+            imu=imu,
+            timing=timing,
+            clock_rate=found.pop("clock_rate"),
+            clock_middle_s=found.pop("clock_middle_s"),
+            source=found.pop("source"),
+            notes=tuple(found.pop("notes")),
+            calibration=CameraImuCalibration(**found),
+            camera=CameraModel(**{**camera, "params": tuple(camera["params"])}),
+        )
+    deblur = None
+    if values["decisions"] is not None:
+        decisions = tuple(FrameDecision(**decision) for decision in values["decisions"])
+        deblur = decisions, RecordingVerdict(**values["verdict"])
+    return ImagingPlan(
+        view=view,
+        deblur=deblur,
+        rectify=values["rectify"],
+        deblur_note=values["deblur"],
+        rolling_shutter_note=values["rolling_shutter"],
+    )
+
+
+def with_stated_exposures(capture: Capture, timing: FrameTiming) -> FrameTiming:
+    """The timing with exposure times from the pictures' EXIF, where nothing else gives them."""
+    source = frame_source(capture)
+    if timing.exposure_s is not None or source is None:
+        return timing
+    stated = stated_exposures_s([source / name for name in timing.names])
+    return timing if stated is None else replace(timing, exposure_s=stated)
+
+
+def plan_imaging(
+    capture: Capture,
+    imu: ImuRecording,
+    timing: FrameTiming,
+    prior: CameraImuCalibration,
+    *,
+    deblur: DeblurMethod | None,
+    rolling_shutter: RollingShutterMethod | None,
+    scratch: Path,
+    max_offset_s: float | None = None,
+    num_threads: int = -1,
+    seed: int = 0,
+    progress: Progress,
+) -> ImagingPlan:
+    """Decide what is done to frames and keypoints.
+
+    Parameters
+    ----------
+    capture, imu, timing
+        The recording; see :func:`with_stated_exposures`.
+    prior
+        What is known of camera and IMU.
+    deblur, rolling_shutter
+        ``None`` does what the recording allows; what is asked for by name and not possible is an error.
+    scratch
+        A folder for temporary files.
+    max_offset_s
+        Largest offset between the clocks.
+    num_threads, seed
+        Of COLMAP.
+    progress
+        Called with ``"motion"``, ``"calibration"`` and ``"blur"``.
+
+    Raises
+    ------
+    NotObservableError
+        Where deblurring or rectifying was asked for by name, and the gyroscope does not belong to the pixels.
+    InertialError
+        Where rectifying was asked for and the readout is unknown.
+    """
+    if rolling_shutter == "rectify" and timing.readout_s is None:
+        raise InertialError(
+            f"{capture.path}: undoing the rolling shutter needs readout_s under [timing], the time from the first row "
+            "to the last"
+        )
+    plan = ImagingPlan(
+        rectify=rolling_shutter != "off" and bool(timing.readout_s), rolling_shutter_note=_shutter_note(timing)
+    )
+    if rolling_shutter == "off":
+        plan = replace(plan, rolling_shutter_note="not asked for")
+    why_not = "not asked for" if deblur == "off" else _no_deblurring(capture, imu, timing)
+    plan = replace(plan, deblur_note=why_not)
+    if why_not and not plan.rectify:
+        return plan
+    if max_offset_s is None and capture.shared_clock:
+        max_offset_s = SHARED_CLOCK_OFFSET_S
+    try:
+        view = look_first(
+            capture,
+            imu,
+            timing,
+            prior,
+            max_offset_s=max_offset_s,
+            scratch=scratch,
+            num_threads=num_threads,
+            seed=seed,
+            progress=progress,
+        )
+    except NotObservableError as error:
+        asked = [deblur == "wiener" and not why_not, rolling_shutter == "rectify" and plan.rectify]
+        if any(asked):
+            raise
+        untreated = f"frames stay as they were filmed: {error}"
+        return ImagingPlan(
+            deblur_note=why_not or untreated,
+            rolling_shutter_note=untreated if plan.rectify else plan.rolling_shutter_note,
+        )
+    plan = replace(plan, view=view)
+    return plan if why_not else _with_decisions(plan, view, capture, progress)
+
+
+def _shutter_note(timing: FrameTiming) -> str:
+    if timing.readout_s is None:
+        return "the readout is unknown: give readout_s under [timing] in capture.toml"
+    if timing.readout_s == 0:
+        return "global shutter"
+    return f"keypoints are rectified, readout {1e3 * timing.readout_s:.1f} ms"
+
+
+def _no_deblurring(capture: Capture, imu: ImuRecording, timing: FrameTiming) -> str:
+    """Why no frame of a recording can be deblurred; empty where some may be."""
+    if timing.exposure_s is None:
+        return (
+            "frames stay as they were filmed: the exposure time is unknown; give exposure_s under [timing] in "
+            "capture.toml, or a column of it in the frame times"
+        )
+    camera = guessed_camera(capture, timing)
+    rate = float(np.linalg.norm(imu.gyro_rad_s, axis=1).max())
+    most_px = rate * float(timing.exposure_s.max()) * 1.2 * colmap_camera(camera).mean_focal_length()
+    limit_px = max(_TELLING_PX, GateOptions().skip_below_px * max(camera.width, camera.height) / 1920)
+    if most_px < limit_px:
+        return f"no frame has more than {most_px:.1f} px of blur, by the quickest turn that the gyroscope felt"
+    return ""
+
+
+def _with_decisions(plan: ImagingPlan, view: GyroView, capture: Capture, progress: Progress) -> ImagingPlan:
+    width, height = view.camera.width, view.camera.height
+    motion, camera = view.motion(), colmap_camera(view.camera)
+    predicted = predicted_blur_px(motion, camera, view.timing, width=width, height=height)
+    decisions = decide(predicted, view.timing.t_s, width=width, height=height, motion=motion)
+    index = view.index()
+    blurred = sorted((d for d in decisions if d.action == "deblur"), key=lambda d: -(d.blur_px or 0))
+    chosen = [d for d in blurred if (d.blur_px or 0) >= _TELLING_PX][:_JUDGED_FRAMES]
+    if not chosen:
+        known = predicted.px[np.isfinite(predicted.px)]
+        most = f"{known.max():.1f} px" if len(known) else "nothing"
+        return replace(plan, deblur_note=f"frames stay as they were filmed: the gyroscope predicts {most} of blur")
+    evidence: list[BlurEvidence] = []
+    for frame in some_frames(capture, view.timing, [index[d.name] for d in chosen]):
+        progress("blur", len(evidence), len(chosen))
+        evidence.append(blur_evidence(frame.image, blur_field(motion, camera, view.shutter(index[frame.name]))))
+    progress("blur", len(chosen), len(chosen))
+    verdict = judge_recording(evidence)
+    note = f"{sum(d.action == 'deblur' for d in decisions)} of {len(decisions)} frames are blurred; {verdict.reason}"
+    return replace(plan, deblur=(decisions, verdict), deblur_note=note)
+
+
+def for_rectified(calibration: CameraImuCalibration) -> CameraImuCalibration:
+    """The calibration of a camera whose keypoints were rectified: hardly any readout is left.
+
+    Its standard deviation stands for what the camera's translation does within the readout, which stays.
+    """
+    cov = calibration.cov.copy()
+    cov[_READOUT, :] = cov[:, _READOUT] = 0.0
+    cov[_READOUT, _READOUT] = max(SMALLEST_READOUT_S, _LEFT_SHARE * calibration.readout_s) ** 2
+    return replace(calibration, readout_s=0.0, cov=cov)
+
+
+def write_rectified(
+    stage: RollingShutterStage, records: Sequence[FrameRecord], images: Path, target: Path, progress: Progress
+) -> None:
+    """Write the images that COLMAP saw as a global shutter would have taken them; what cannot be rectified is copied.
+
+    Parameters
+    ----------
+    stage
+        That rectified the keypoints.
+    records
+        Of all frames; those that were dropped have no image.
+    images, target
+        Folders of the images and of the rectified ones.
+    progress
+        Called with ``"rectified"``.
+    """
+    view = stage.view
+    motion, camera, index = view.motion(), colmap_camera(view.camera), view.index()
+
+    def work(name: str) -> None:
+        source, out = images / name, target / name
+        out.parent.mkdir(parents=True, exist_ok=True)
+        if stage.covers(name):
+            original: Any = read_image(source)
+            image, _ = rectify_image(original, motion, camera, view.shutter(index[name]))
+            encode_image(out, image, source)
+        else:
+            out.write_bytes(source.read_bytes())
+
+    names = [record.name for record in records if record.action != "dropped"]
+    target.mkdir(parents=True)
+    waiting: deque[Future[None]] = deque()
+    with ThreadPoolExecutor(2) as pool:
+        for done, name in enumerate(names):
+            waiting.append(pool.submit(work, name))
+            if len(waiting) > 2:
+                waiting.popleft().result()
+            progress("rectified", done, len(names))
+        for future in waiting:
+            future.result()
+    progress("rectified", len(names), len(names))
+
+
+__all__ = [
+    "DeblurMethod",
+    "ImagingPlan",
+    "RollingShutterMethod",
+    "plan_imaging",
+    "read_plan",
+    "with_stated_exposures",
+    "write_plan",
+    "write_rectified",
+]

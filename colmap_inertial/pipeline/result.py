@@ -1,0 +1,139 @@
+"""What a reconstruction made, and ``result.json``, which says the same."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from colmap_inertial import __version__
+from colmap_inertial.errors import InertialError, NotObservableError
+from colmap_inertial.geometry import quat_conjugate, quat_log, quat_multiply
+from colmap_inertial.io.capture import Capture
+from colmap_inertial.pipeline.frames import FrameRecord
+from colmap_inertial.pipeline.imaging import ImagingPlan
+from colmap_inertial.pipeline.workspace import Workspace
+from colmap_inertial.types import CameraImuCalibration, ScaleEstimate
+from colmap_inertial.validate import Validation
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ModelResult:
+    """What became of one of COLMAP's models; paths are ``None`` where the scale was refused."""
+
+    index: int
+    scale: ScaleEstimate
+    summary: dict[str, int | float]
+    sparse: Path
+    sparse_metric: Path | None = None
+    trajectory: Path | None = None
+    validation: Validation | InertialError | None = None
+    """Against the capture's target, where it names one; an error says why the target could not be measured."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ReconstructResult:
+    """What ``reconstruct`` made; the same as ``result.json``."""
+
+    workspace: Workspace
+    models: tuple[ModelResult, ...]
+    frames: tuple[FrameRecord, ...]
+    seconds: dict[str, float]
+    imaging: ImagingPlan = field(default_factory=ImagingPlan)
+    """What was done to frames and keypoints beforehand, and why."""
+
+    def exit_code(self) -> int:
+        """0; 1 where a validation is outside its tolerance; its error's code where the target could not be measured.
+
+        Raises
+        ------
+        NotObservableError
+            When every model's scale was refused.
+        """
+        if all(model.sparse_metric is None for model in self.models):
+            reasons = {model.index: "; ".join(model.scale.reasons) for model in self.models}
+            raise NotObservableError(
+                "scale",
+                next(iter(reasons.values()))
+                if len(reasons) == 1
+                else "; ".join(f"model {i}: {text}" for i, text in reasons.items()),
+            )
+        checked = [model.validation for model in self.models if model.validation is not None]
+        failures = [check.exit_code for check in checked if isinstance(check, InertialError)]
+        outside = any(not check.within_tolerance for check in checked if isinstance(check, Validation))
+        if outside:
+            return 1
+        return failures[0] if len(failures) == len(checked) > 0 else 0
+
+
+def imaging_as_json(plan: ImagingPlan) -> dict[str, object]:
+    """What was done beforehand and why, without the decision about each frame."""
+    return {key: value for key, value in plan.as_json().items() if key != "decisions"}
+
+
+def frame_as_json(record: FrameRecord, plan: ImagingPlan) -> dict[str, object]:
+    """What happened to one frame."""
+    treatment = record.treatment
+    rectified = record.action != "dropped" and any(stage.covers(record.name) for stage in plan.keypoint_stages())
+    return {
+        "name": record.name,
+        "action": record.action,
+        "reason": plan.deblur_note if treatment is None else treatment.reason,
+        "blur_px": None if treatment is None else treatment.blur_px,
+        "kept_share": None if treatment is None else treatment.kept_share,
+        "extent_factor": None if treatment is None else treatment.extent_factor,
+        "rectified": rectified,
+    }
+
+
+def _change(first: CameraImuCalibration, refined: CameraImuCalibration | None) -> dict[str, object] | None:
+    """How far the scale estimate moved the calibration that the frames were treated with."""
+    if refined is None:
+        return None
+    turn = quat_log(quat_multiply(refined.cam_from_imu_xyzw, quat_conjugate(first.cam_from_imu_xyzw)))
+    return {
+        "rotation_deg": float(np.degrees(np.linalg.norm(turn))),
+        "gyro_time_offset_s": refined.gyro_time_offset_s - first.gyro_time_offset_s,
+        "gyro_bias_rad_s": (refined.gyro_bias_rad_s - first.gyro_bias_rad_s).tolist(),
+    }
+
+
+def _validation_as_json(check: Validation | InertialError | None) -> object:
+    return {"error": str(check)} if isinstance(check, InertialError) else check and check.as_json()
+
+
+def result_as_json(result: ReconstructResult, capture: Capture) -> dict[str, object]:
+    """The content of ``result.json``."""
+    import pycolmap
+
+    root, plan = result.workspace.root, result.imaging
+
+    def relative(path: Path | None) -> str | None:
+        return None if path is None else str(path.relative_to(root))
+
+    return {
+        "versions": {"colmap_inertial": __version__, "pycolmap": pycolmap.__version__},
+        "capture": str(capture.path),
+        "models": [
+            {
+                "index": model.index,
+                **model.summary,
+                "sparse": relative(model.sparse),
+                "sparse_metric": relative(model.sparse_metric),
+                "trajectory": relative(model.trajectory),
+                **model.scale.as_json(),
+                "calibration_change": None
+                if plan.view is None
+                else _change(plan.view.calibration, model.scale.calibration),
+                "validation": _validation_as_json(model.validation),
+            }
+            for model in result.models
+        ],
+        "imaging": imaging_as_json(plan),
+        "frames": [frame_as_json(record, plan) for record in result.frames],
+        "seconds": result.seconds,
+    }
+
+
+__all__ = ["ModelResult", "ReconstructResult", "frame_as_json", "imaging_as_json", "result_as_json"]

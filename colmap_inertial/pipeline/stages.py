@@ -1,0 +1,214 @@
+"""The default stages that treat frames by the gyroscope: deblurring, and keypoints without the rolling shutter."""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from colmap_inertial.align import on_camera_rate
+from colmap_inertial.errors import NotObservableError
+from colmap_inertial.imaging.gate import FrameDecision, GateOptions, RecordingVerdict, deblur_gated
+from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
+from colmap_inertial.imaging.psf import blur_field
+from colmap_inertial.imaging.rolling_shutter import rectify_keypoints
+from colmap_inertial.imaging.wiener import LONGEST_PX, DeblurOptions, deblur
+from colmap_inertial.model import colmap_camera
+from colmap_inertial.pipeline.frames import FrameTreatment
+from colmap_inertial.types import Array, CameraImuCalibration, CameraModel, Frame, FrameTiming, ImuRecording, Projector
+
+#: Frames in work at once: enough for a desk computer's cores, few enough for its memory.
+_MOST_WORKERS = 4
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class GyroView:
+    """A recording's gyroscope, camera and frame times, brought together.
+
+    Attributes
+    ----------
+    imu
+        The recording, as it was read.
+    timing
+        Of all frames.
+    calibration
+        Rotation, time offset and gyroscope bias.
+    clock_rate, clock_middle_s
+        Change of the time offset per second, and the camera time at which it holds.
+    camera
+        Intrinsics.
+    source
+        Where the calibration comes from: ``"capture"``, ``"model"`` (a small one, made beforehand) or ``"pixels"``.
+    notes
+        What there is to say about it, in words.
+    """
+
+    imu: ImuRecording
+    timing: FrameTiming
+    calibration: CameraImuCalibration
+    clock_rate: float = 0.0
+    clock_middle_s: float = 0.0
+    camera: CameraModel
+    source: str
+    notes: tuple[str, ...] = ()
+
+    def motion(self) -> GyroCamera:
+        """The gyroscope on the camera's clock."""
+        imu = self.imu
+        if self.clock_rate != 0:
+            imu = on_camera_rate(
+                imu,
+                self.calibration,
+                clock_rate=self.clock_rate,
+                middle_s=self.clock_middle_s,
+                trajectory_epoch_ns=self.timing.epoch_ns,
+            )
+        return GyroCamera.of(imu, self.calibration, camera_epoch_ns=self.timing.epoch_ns)
+
+    def shutter(self, index: int) -> FrameShutter:
+        """When the lines of one frame are exposed."""
+        return FrameShutter.of(self.timing, index, width=self.camera.width, height=self.camera.height)
+
+    def index(self) -> dict[str, int]:
+        """The place of each frame name."""
+        return {name: i for i, name in enumerate(self.timing.names)}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DeblurStage:
+    """The frame stage that undoes motion blur where gyroscope and image agree on it, and drops what is beyond help.
+
+    Frames that it does not change pass as they are. Two or more are worked on at once; the order stays, and memory
+    does not grow with their number.
+
+    Attributes
+    ----------
+    view
+        Gyroscope, camera and times.
+    decisions
+        What to do with each frame, by the gyroscope alone (``imaging.gate.decide``).
+    verdict
+        What some of the frames say about the gyroscope together (``imaging.gate.judge_recording``).
+    gate
+        Thresholds.
+    workers
+        Frames in work at once; as many as the process has processors, up to four, where absent.
+    """
+
+    view: GyroView
+    decisions: tuple[FrameDecision, ...]
+    verdict: RecordingVerdict
+    gate: GateOptions = field(default_factory=GateOptions)
+    workers: int | None = field(default=None, compare=False)
+    _done: dict[str, FrameTreatment] = field(default_factory=dict, init=False, compare=False, repr=False)
+
+    def __call__(self, frames: Iterator[Frame], /) -> Iterator[Frame]:
+        """Deblur the frames, in order."""
+        motion, camera, index = self.view.motion(), colmap_camera(self.view.camera), self.view.index()
+        decision_of = {decision.name: decision for decision in self.decisions}
+        workers = self.workers or min(_MOST_WORKERS, len(os.sched_getaffinity(0)))
+
+        def treat(frame: Frame) -> tuple[Frame | None, FrameTreatment | None]:
+            decision = decision_of.get(frame.name)
+            if decision is None:
+                return frame, None
+            return self._treated(frame, decision, motion, camera, self.view.shutter(index[frame.name]))
+
+        with ThreadPoolExecutor(workers) as pool:
+            waiting: deque[tuple[str, Future[tuple[Frame | None, FrameTreatment | None]]]] = deque()
+            try:
+                for frame in frames:
+                    waiting.append((frame.name, pool.submit(treat, frame)))
+                    if len(waiting) > workers:
+                        yield from self._finished(*waiting.popleft())
+                while waiting:
+                    yield from self._finished(*waiting.popleft())
+            finally:
+                for _, future in waiting:
+                    future.cancel()
+
+    def treatment(self, name: str, /) -> FrameTreatment | None:
+        """What was decided about a frame that went through."""
+        return self._done.get(name)
+
+    def _finished(self, name: str, future: Future[tuple[Frame | None, FrameTreatment | None]]) -> Iterator[Frame]:
+        frame, treatment = future.result()
+        if treatment is not None:
+            self._done[name] = treatment
+        if frame is not None:
+            yield frame
+
+    def _treated(
+        self, frame: Frame, decision: FrameDecision, motion: GyroCamera, camera: Projector, shutter: FrameShutter
+    ) -> tuple[Frame | None, FrameTreatment]:
+        """The frame to go on with (``None`` drops it), and what to say about it."""
+        said = FrameTreatment(reason=decision.reason, blur_px=decision.blur_px)
+        if decision.action == "keep":
+            return frame, said
+        if self.verdict.trusted is False:
+            return frame, replace(said, reason=self.verdict.reason)
+        if decision.action == "drop":
+            return None, said
+        try:
+            blur = blur_field(motion, camera, shutter)
+        except NotObservableError as error:
+            return frame, replace(said, reason=error.hint)
+        if float(np.abs(blur.vector_px).max()) * 1.5 > LONGEST_PX:
+            return frame, replace(said, reason=f"{decision.blur_px:.0f} px of blur are too long to be undone")
+        one_thread: Any = partial(deblur, options=DeblurOptions(threads=1))
+        image: Any = frame.image  # either of two types of pixel, which the checker would keep apart
+        gated = deblur_gated(image, blur, recording=self.verdict, deblur=one_thread, options=self.gate)
+        said = replace(
+            said,
+            reason=gated.reason,
+            deblurred=gated.deblurred,
+            kept_share=gated.kept_share,
+            extent_factor=gated.extent_factor,
+        )
+        return (replace(frame, image=gated.image) if gated.deblurred else frame), said
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RollingShutterStage:
+    """The keypoint stage that moves keypoints to where a global shutter would have seen them.
+
+    The instant is the one that poses hold, mid-exposure of the middle row. Keypoints of frames that the gyroscope does
+    not cover stay in place.
+
+    Attributes
+    ----------
+    view
+        Gyroscope, camera and times.
+    """
+
+    view: GyroView
+    _ready: dict[str, tuple[GyroCamera, Projector, dict[str, int]]] = field(
+        default_factory=dict, init=False, compare=False, repr=False
+    )
+
+    def __call__(self, name: str, keypoints_px: Array, /) -> Array:
+        """Move the keypoints of one image."""
+        if not self.covers(name):
+            return keypoints_px
+        motion, camera, index = self._parts()
+        shutter = self.view.shutter(index[name])
+        return np.asarray(rectify_keypoints(keypoints_px, motion, camera, shutter), dtype=np.float64)
+
+    def covers(self, name: str) -> bool:
+        """Whether the gyroscope recorded the whole readout of a frame."""
+        motion, _, index = self._parts()
+        return self.view.shutter(index[name]).covered_by(motion, reference=True)
+
+    def _parts(self) -> tuple[GyroCamera, Projector, dict[str, int]]:
+        if "parts" not in self._ready:
+            self._ready["parts"] = self.view.motion(), colmap_camera(self.view.camera), self.view.index()
+        return self._ready["parts"]
+
+
+__all__ = ["DeblurStage", "GyroView", "RollingShutterStage"]
