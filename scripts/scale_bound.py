@@ -45,7 +45,7 @@ class BoundPriors:
     gravity_m_s2: float = PRIORS.gravity_m_s2
     gravity_direction_m_s2: float = 10.0
     cam_from_imu_rad: float = 1.0
-    imu_in_cam_m: tuple[float, float, float] = (0.08, 0.08, 0.005)
+    imu_in_cam_m: tuple[float, float, float] = (0.08, 0.08, 0.01)
     time_offset_s: float = 1.0
     accel_delay_s: float = 0.02
     clock_rate: float = PRIORS.clock_rate

@@ -16,7 +16,7 @@ from colmap_inertial.types import CALIBRATION_PARAMETERS, CameraImuCalibration
 UNKNOWN_ROTATION_RAD = np.pi
 UNKNOWN_OFFSET_S = 1e4
 UNKNOWN_GYRO_BIAS_RAD_S = 0.1
-UNKNOWN_LEVER_ARM_M = 0.08
+UNKNOWN_LEVER_ARM_M = (0.08, 0.08, 0.01)  # a device is flat: along the optical axis it is centimetres thick at most
 UNKNOWN_READOUT_S = 0.02
 #: Camera and IMU on one clock differ by pipeline delays at most.
 SHARED_CLOCK_OFFSET_S = 1.0
@@ -81,7 +81,7 @@ def calibration_prior(
     cov[_ROTATION, _ROTATION] = np.eye(3) * rotation_sd**2
     cov[_OFFSETS, _OFFSETS] = common + np.diag([gyro_extra, accel_extra])
     cov[_BIAS, _BIAS] = np.eye(3) * bias_sd**2
-    cov[_LEVER, _LEVER] = np.eye(3) * lever_sd**2
+    cov[_LEVER, _LEVER] = np.eye(3) * np.square(lever_sd)
     cov[_READOUT, _READOUT] = readout_sigma_s(readout_s) ** 2
     return CameraImuCalibration(
         cam_from_imu_xyzw=np.array([0.0, 0.0, 0.0, 1.0] if cam_from_imu_xyzw is None else cam_from_imu_xyzw),

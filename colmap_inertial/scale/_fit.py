@@ -16,6 +16,8 @@ from colmap_inertial.types import Array, ImuNoise, ScaleDrift
 
 _MAX_ITERATIONS, _MAX_ROTATION_ITERATIONS = 40, 4
 _PROBES = 4
+#: Noise levels (logarithms) at rest.
+_SETTLED = 0.03
 #: A robust weight below this: five times as far off as errors usually are.
 _HARDLY = 0.35
 #: The scale changes by at most this factor (in the logarithm) in one iteration.
@@ -41,7 +43,7 @@ class Fit:
     drift
         Scales of parts of the recording.
     excitation_m_s2
-        Standard deviation of the acceleration between nodes.
+        Standard deviation of the camera's acceleration between nodes.
     jumped
         How many of the states' poses hardly count or lie behind a break of the path.
     gain_chi2
@@ -76,6 +78,7 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
     x = replace(x, metres_per_unit=scale, imu_in_world_m=data.groups.centre * scale)
     signs: dict[str, Array] = {}
     converged = settled = False
+    asked: dict[str, float] = {}
     integrated, there = fac.integrate(data, x), x
     for iteration in range(_MAX_ITERATIONS):
         if settled or not fac.still_near(there, x, data.t_s, tolerance=4.0):
@@ -95,10 +98,11 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
         x = x.moved(states[:, :, 0] * shrink, z[:, 0] * shrink, pre.rate_rad_s, data.t_s)
         sigma = float(np.sqrt(cov[par.SCALE, par.SCALE]))
         converged = step < 0.2 * sigma
-        change = 1.0
         if iteration > 2:
-            noise, change = levels.updated_noise(noise, start, floor, sums, levels.alike(groups["rotation"], states, z))
-        settled = step < 0.03 * sigma and change < 0.1
+            alike = levels.alike(groups["rotation"], states, z)
+            noise, asked = levels.updated_noise(noise, start, floor, sums, alike, asked)
+        change = max(map(abs, asked.values()), default=1.0)
+        settled = step < 0.03 * sigma and change < _SETTLED
         if settled and fac.still_near(there, x, data.t_s):
             break
 
@@ -118,7 +122,6 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
         tolerated_log=PRIORS.model_scale,
     )
     gain = x.accel_gain.ravel()
-    accel = (x.world_from_imu[:-1] @ (pre.velocity / pre.dt_s[:, None])[:, :, None])[:, :, 0]
     return Fit(
         estimate=x,
         noise=noise,
@@ -128,7 +131,7 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
         sums=sums,
         converged=converged,
         drift=drift,
-        excitation_m_s2=float(np.sqrt(np.sum(np.var(accel, axis=0)))),
+        excitation_m_s2=_excitation_m_s2(data, x),
         jumped=int(np.sum(data.broken)) + _jumped(groups["rotation"], groups["centre"]),
         gain_chi2=float(gain @ prior.info[par.ACCEL_GAIN, par.ACCEL_GAIN] @ gain),
     )
@@ -180,3 +183,11 @@ def _jumped(*groups: fac.Group | fac.Direct) -> int:
     """How many states have a pose that a robust weight all but switches off."""
     weights = [group.weight for group in groups if group.weight is not None]
     return int(np.sum(np.min(weights, axis=0) < _HARDLY)) if weights else 0
+
+
+def _excitation_m_s2(data: Data, x: Estimate) -> float:
+    """Standard deviation of the camera's acceleration; the IMU, on its lever arm, swings even where the camera stays."""
+    path = x.imu_in_world_m - x.world_from_imu @ (x.cam_from_imu.T @ x.imu_in_cam_m)
+    dt_s = np.diff(data.t_s)[:, None]
+    accel = np.diff(np.diff(path, axis=0) / dt_s, axis=0) / (0.5 * (dt_s[1:] + dt_s[:-1]))
+    return float(np.sqrt(np.sum(np.var(accel, axis=0))))

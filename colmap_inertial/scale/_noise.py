@@ -38,8 +38,8 @@ _COMPONENTS = {
 _MOST_ALIKE = 0.8
 #: How many residuals the starting value counts as.
 _WEIGHT = 10.0
-#: Exponent of a ratio of variances; 0.5 converges slowly from afar.
-_OVERSHOOT = 0.6
+#: Largest change of a level in an iteration (logarithm), and largest factor by which changes are taken to shrink.
+_LARGEST_CHANGE, _STEADIEST = 0.9, 0.8
 
 
 def typical_noise(sheet: ImuNoise | None) -> tuple[Noise, dict[str, float]]:
@@ -99,14 +99,26 @@ def updated_noise(
     floor: Mapping[str, float],
     sums: Mapping[str, tuple[float, float]],
     rotation_alike: float,
-) -> tuple[Noise, float]:
-    """New levels, and the largest logarithmic change among them."""
-    new, largest = {}, 0.0
+    before: Mapping[str, float],
+) -> tuple[Noise, dict[str, float]]:
+    """New levels, and the logarithmic change of each that the residuals ask for.
+
+    Parameters
+    ----------
+    before
+        The changes asked for the last time. Where they shrink by a steady factor, the rest of the series is added at
+        once (Aitken's extrapolation): a level of which most residuals are used up by states converges slowly.
+    """
+    new, asked = {}, {}
     for level, (squares, expected) in sums.items():
         now = getattr(noise, level)
         ratio = (squares + _WEIGHT * (getattr(start, level) / now) ** 2) / (expected + _WEIGHT)
-        # More than the square root, as most residuals of a slow level are used up by states; but in steps, as the
-        # robust weights have to follow
-        new[level] = max(now * float(np.clip(ratio**_OVERSHOOT, 0.4, 2.5)), floor[level])
-        largest = max(largest, abs(float(np.log(new[level] / now))))
-    return replace(noise, **new, rotation_alike=rotation_alike), largest
+        change = 0.5 * float(np.log(ratio))
+        shrinks = change / before[level] if before.get(level) else 0.0
+        # In steps, as the robust weights have to follow
+        step = float(
+            np.clip(change / (1 - float(np.clip(shrinks, 0.0, _STEADIEST))), -_LARGEST_CHANGE, _LARGEST_CHANGE)
+        )
+        new[level] = max(now * float(np.exp(step)), floor[level])
+        asked[level] = float(np.log(new[level] / now)) if new[level] == floor[level] else change
+    return replace(noise, **new, rotation_alike=rotation_alike), asked

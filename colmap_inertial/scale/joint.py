@@ -26,7 +26,7 @@ from colmap_inertial.scale.priors import PRIORS
 from colmap_inertial.scale.verdict import verdict_of
 from colmap_inertial.types import Array, CameraImuCalibration, CameraTrajectory, ImuRecording, ScaleEstimate
 
-_LARGEST_BIAS_M_S2 = 1.5
+_LARGEST_BIAS_M_S2 = 2.0
 #: Chi-square of the accelerometer's nine gains and axis errors against their prior: the 8 recordings that this was
 #: tried on have 3 to 9; by chance, 28 is exceeded once in a thousand.
 _LARGEST_GAIN_CHI2 = 28.0

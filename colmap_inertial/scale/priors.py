@@ -10,7 +10,7 @@ class JointPriors:
     """Standard deviations of the joint estimator's priors.
 
     The lever arm, the delay between the sensors and the readout have theirs in the calibration
-    (``io.calibration.calibration_prior``: 8 cm in the sensor plane and 5 mm along the optical axis, 20 ms, 20 ms);
+    (``io.calibration.calibration_prior``: 8 cm in the sensor plane and 1 cm along the optical axis, 20 ms, 20 ms);
     rotation, offset and gyroscope bias come from the alignment; scale and the direction of gravity have none.
     """
 
