@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from colmap_inertial.align import AlignOptions, align_camera_imu
     from colmap_inertial.errors import InertialError
+    from colmap_inertial.imaging.wiener import deblur
     from colmap_inertial.io.capture import load_capture
     from colmap_inertial.io.frames import read_frames
     from colmap_inertial.io.imu import read_imu
     from colmap_inertial.model import apply_similarity
-    from colmap_inertial.pipeline import ReconstructOptions, reconstruct
+    from colmap_inertial.pipeline import DeblurStage, ReconstructOptions, RollingShutterStage, reconstruct
     from colmap_inertial.scale import ScaleOptions, estimate_scale
     from colmap_inertial.smooth import smooth_trajectory
     from colmap_inertial.validate import validate_model
@@ -27,11 +28,14 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "AlignOptions": "align",
+    "DeblurStage": "pipeline",
     "InertialError": "errors",
     "ReconstructOptions": "pipeline",
+    "RollingShutterStage": "pipeline",
     "ScaleOptions": "scale",
     "align_camera_imu": "align",
     "apply_similarity": "model",
+    "deblur": "imaging.wiener",
     "estimate_scale": "scale",
     "load_capture": "io.capture",
     "read_frames": "io.frames",
@@ -43,11 +47,14 @@ _HOMES = {
 
 __all__ = [
     "AlignOptions",
+    "DeblurStage",
     "InertialError",
     "ReconstructOptions",
+    "RollingShutterStage",
     "ScaleOptions",
     "align_camera_imu",
     "apply_similarity",
+    "deblur",
     "estimate_scale",
     "load_capture",
     "read_frames",

@@ -188,6 +188,46 @@ class Validate:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Deblur:
+    """Undo the motion blur of images by the gyroscope, without reconstructing anything.
+
+    Writes OUT/images with the frames' names, sizes, formats and metadata, and OUT/result.json with what happened to
+    each of them and why. Frames that are sharp, or in which the gyroscope's blur does not show, are copied as they
+    are. Exit code 3 where the gyroscope does not belong to the pixels, as in stabilised video.
+
+    Example: colmap-inertial deblur my_capture/capture.toml out --sheet before_after.png
+    """
+
+    capture: Positional[Path]
+    """A capture.toml, a folder that holds one, or an EuRoC/ASL dataset; it must know the exposure times."""
+    out: Positional[Path]
+    """A new folder for everything that is made."""
+    calibration: Path | None = None
+    """A calibration file of this device (from `colmap-inertial align --out`), used as a prior."""
+    rectify: bool = False
+    """Also write OUT/images_rectified, without the rolling shutter (needs its readout time)."""
+    sheet: Path | None = None
+    """Write a PNG with parts of the most blurred frames before and after."""
+
+    def run(self) -> int:
+        """Run the command; returns the exit code."""
+        from colmap_inertial.pipeline.deblur import deblur_capture
+        from colmap_inertial.pipeline.terminal import live_progress, show_deblurred
+
+        with live_progress() as progress:
+            result = deblur_capture(
+                self.capture,
+                self.out,
+                calibration=self.calibration,
+                rectify=self.rectify,
+                sheet=self.sheet,
+                progress=progress,
+            )
+        show_deblurred(result)
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
 class Simulate:
     """Make a simulated capture with known truth: a desk or room, filmed by a hand, with the IMU that ran along.
 
@@ -216,12 +256,13 @@ class Simulate:
         return 0
 
 
-Command = Reconstruct | Scale | Align | Validate | Simulate
+Command = Reconstruct | Scale | Align | Validate | Deblur | Simulate
 _COMMANDS: dict[str, type[Command]] = {
     "reconstruct": Reconstruct,
     "scale": Scale,
     "align": Align,
     "validate": Validate,
+    "deblur": Deblur,
     "simulate": Simulate,
 }
 
@@ -254,7 +295,7 @@ def _default_from_config(cls: type[Command], args: Sequence[str]) -> Command | N
             path = args[i + 1]
         elif text.startswith("--config="):
             path = text.removeprefix("--config=")
-    if path is None or cls in (Align, Validate, Simulate):
+    if path is None or cls not in (Reconstruct, Scale):
         return None
     fields = {f.name: f for f in dataclasses.fields(cls)}
     options: Any = read_config(Path(path), ReconstructOptions)
@@ -263,7 +304,7 @@ def _default_from_config(cls: type[Command], args: Sequence[str]) -> Command | N
     required = {
         name: tyro.MISSING for name, f in fields.items() if f.default is f.default_factory is dataclasses.MISSING
     }
-    return cls(options=options, **required)  # type: ignore[call-arg]
+    return cls(options=options, **required)
 
 
 def main(args: Sequence[str] | None = None) -> None:
@@ -283,7 +324,9 @@ def main(args: Sequence[str] | None = None) -> None:
         print(f"error: {error}", file=sys.stderr)
         code = error.exit_code
     except KeyboardInterrupt:
-        again = "; started again with the same arguments, it continues" if isinstance(command, Reconstruct) else ""
+        again = (
+            "; started again with the same arguments, it continues" if isinstance(command, Reconstruct | Deblur) else ""
+        )
         print(f"interrupted{again}", file=sys.stderr)
         code = 130
     sys.exit(code)

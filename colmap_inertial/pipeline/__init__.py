@@ -177,18 +177,18 @@ def reconstruct(
     prior_calibration(loaded, options)  # likewise
     workspace = Workspace(out)
     workspace.open(loaded.path)
-    with workspace.locked(), _logging_to(workspace.log):
+    with workspace.locked(), logging_to(workspace.log):
         log.info("colmap-inertial %s: %s -> %s", __version__, capture, out)
         write_text(workspace.config, config_as_toml(options))
         runner = StageRunner(workspace)
-        plan = _plan(runner, workspace, loaded, imu, timing, options, progress)
+        plan = run_plan(runner, workspace, loaded, imu, timing, options, progress)
         of_frames = list(plan.frame_stages() if frame_stages is None else frame_stages)
         of_keypoints = list(plan.keypoint_stages() if keypoint_stages is None else keypoint_stages)
-        _run_frames(runner, workspace, loaded, timing, frames, of_frames, progress)
+        run_frames(runner, workspace, loaded, timing, frames, of_frames, progress)
         records = read_frame_records(workspace.frames)
         _run_colmap(runner, workspace, records, gravity, options, of_keypoints, progress)
         rectifying = [stage for stage in of_keypoints if isinstance(stage, RollingShutterStage)]
-        _run_rectified(runner, workspace, records, rectifying, progress)
+        run_rectified(runner, workspace, records, rectifying, progress)
         stages = (
             default_model_stages(loaded, imu, options, rectified=bool(rectifying))
             if model_stages is None
@@ -206,7 +206,7 @@ def reconstruct(
     return result
 
 
-def _plan(
+def run_plan(
     runner: StageRunner,
     workspace: Workspace,
     capture: Capture,
@@ -273,7 +273,7 @@ def _gravity_priors(
 
 
 @contextlib.contextmanager
-def _logging_to(path: Path) -> Iterator[None]:
+def logging_to(path: Path) -> Iterator[None]:
     """Send this package's log to a file, and keep COLMAP's chatter off the terminal."""
     import pycolmap
 
@@ -295,7 +295,7 @@ def _logging_to(path: Path) -> Iterator[None]:
         handler.close()
 
 
-def _run_frames(
+def run_frames(
     runner: StageRunner,
     workspace: Workspace,
     capture: Capture,
@@ -323,7 +323,7 @@ def _inputs(capture: Capture, timing: FrameTiming) -> list[object]:
     return [fingerprint(path) for path in paths]
 
 
-def _run_rectified(
+def run_rectified(
     runner: StageRunner,
     workspace: Workspace,
     records: Sequence[FrameRecord],

@@ -34,6 +34,10 @@ RollingShutterMethod = Literal["off", "rectify"]
 
 #: Blur below this cannot be told from the texture: where no frame has more, nothing is deblurred.
 _TELLING_PX = 4.0
+#: A gyroscope that is borne out by this share of them is trusted for all frames.
+_MOST_OF_THEM = 0.85
+#: Standard deviations by which a frame must bear it out by itself, where others do not: with 4, some were made worse.
+_CLEAR_SUPPORT = 7.0
 #: Share of the readout that acts on poses after rectification.
 _LEFT_SHARE = 0.1
 _READOUT = CALIBRATION_PARAMETERS.index("readout_s")
@@ -44,6 +48,8 @@ _JUDGED_FRAMES = 14
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ImagingPlan:
     """What is to be done to frames and keypoints, and why.
+
+    Where frames must bear out the gyroscope by themselves, they must do so clearly.
 
     Attributes
     ----------
@@ -63,12 +69,13 @@ class ImagingPlan:
     deblur_note: str = ""
     rolling_shutter_note: str = ""
 
-    def frame_stages(self) -> list[DeblurStage]:
-        """The default frame stages."""
+    def frame_stages(self, *, drop: bool = True) -> list[DeblurStage]:
+        """The default frame stages; they need not drop what is too blurred."""
         if self.view is None or self.deblur is None:
             return []
         decisions, verdict = self.deblur
-        return [DeblurStage(view=self.view, decisions=decisions, verdict=verdict)]
+        gate = GateOptions() if verdict.trusted else GateOptions(min_support=_CLEAR_SUPPORT)
+        return [DeblurStage(view=self.view, decisions=decisions, verdict=verdict, gate=gate, drop=drop)]
 
     def keypoint_stages(self) -> list[RollingShutterStage]:
         """The default keypoint stages."""
@@ -262,9 +269,26 @@ def _with_decisions(plan: ImagingPlan, view: GyroView, capture: Capture, progres
         progress("blur", len(evidence), len(chosen))
         evidence.append(blur_evidence(frame.image, blur_field(motion, camera, view.shutter(index[frame.name]))))
     progress("blur", len(chosen), len(chosen))
-    verdict = judge_recording(evidence)
+    verdict = _by_frame(judge_recording(evidence), evidence)
     note = f"{sum(d.action == 'deblur' for d in decisions)} of {len(decisions)} frames are blurred; {verdict.reason}"
     return replace(plan, deblur=(decisions, verdict), deblur_note=note)
+
+
+def _by_frame(verdict: RecordingVerdict, evidence: Sequence[BlurEvidence]) -> RecordingVerdict:
+    """The verdict, unless only some of the frames bear it out: then every frame must do so by itself.
+
+    So it is where the camera moves close to things: they blur by translation, too, which no gyroscope feels.
+    """
+    telling = [one for one in evidence if one.enough]
+    least = GateOptions().min_support
+    shown = sum(one.support >= least and one.extent_is_plausible for one in telling)
+    if verdict.trusted is not True or shown >= _MOST_OF_THEM * len(telling):
+        return verdict
+    reason = (
+        f"{shown} of {len(telling)} frames that were looked at bear out the gyroscope's blur, so each frame must do so "
+        "by itself (close to things, the camera's translation blurs, too)"
+    )
+    return replace(verdict, trusted=None, reason=reason)
 
 
 def for_rectified(calibration: CameraImuCalibration) -> CameraImuCalibration:

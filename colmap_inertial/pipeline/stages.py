@@ -97,6 +97,8 @@ class DeblurStage:
         What some of the frames say about the gyroscope together (``imaging.gate.judge_recording``).
     gate
         Thresholds.
+    drop
+        Whether frames that are too blurred are left out.
     workers
         Frames in work at once; as many as the process has processors, up to four, where absent.
     """
@@ -105,6 +107,7 @@ class DeblurStage:
     decisions: tuple[FrameDecision, ...]
     verdict: RecordingVerdict
     gate: GateOptions = field(default_factory=GateOptions)
+    drop: bool = True
     workers: int | None = field(default=None, compare=False)
     _done: dict[str, FrameTreatment] = field(default_factory=dict, init=False, compare=False, repr=False)
 
@@ -154,7 +157,7 @@ class DeblurStage:
         if self.verdict.trusted is False:
             return frame, replace(said, reason=self.verdict.reason)
         if decision.action == "drop":
-            return None, said
+            return (None if self.drop and self.verdict.trusted else frame), said
         try:
             blur = blur_field(motion, camera, shutter)
         except NotObservableError as error:

@@ -10,6 +10,7 @@ from pathlib import Path
 from colmap_inertial.errors import InertialError
 from colmap_inertial.pipeline import ReconstructResult
 from colmap_inertial.pipeline.colmap import Progress
+from colmap_inertial.pipeline.deblur import DeblurResult
 from colmap_inertial.pipeline.frames import FrameRecord
 from colmap_inertial.pipeline.imaging import ImagingPlan
 from colmap_inertial.types import CameraImuCalibration, ScaleEstimate
@@ -130,6 +131,17 @@ def imaging_lines(frames: Sequence[FrameRecord], plan: ImagingPlan) -> list[tupl
         ("Shutter", plan.rolling_shutter_note),
     ]
     return [*lines, *(("", note) for note in (() if view is None else view.notes))]
+
+
+def show_deblurred(result: DeblurResult) -> None:
+    """Print what became of the images."""
+    written = [result.workspace.images, result.workspace.result]
+    if result.workspace.images_rectified.is_dir():
+        written.insert(1, result.workspace.images_rectified)
+    if result.sheet is not None:
+        written.append(result.sheet)
+    lines = imaging_lines(result.frames, result.imaging)
+    _show("Images", [*lines, *(("Written" if i == 0 else "", str(path)) for i, path in enumerate(written))])
 
 
 def show_result(result: ReconstructResult) -> None:

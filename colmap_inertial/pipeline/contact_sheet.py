@@ -1,0 +1,98 @@
+"""Parts of the most blurred frames before and after deblurring, side by side, with the blur that was undone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.errors import OutputError
+from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.imaging.psf import blur_field
+from colmap_inertial.io.capture import Capture
+from colmap_inertial.io.images import read_image
+from colmap_inertial.model import colmap_camera
+from colmap_inertial.pipeline.first_look import some_frames
+from colmap_inertial.pipeline.stages import GyroView
+
+_FRAMES, _WIDTH, _HEIGHT, _GAP, _LABEL = 8, 420, 280, 6, 22
+#: Distance of the arrows, px of the crop.
+_ARROWS_PX = 70
+
+
+def write_contact_sheet(path: Path, capture: Capture, view: GyroView, images: Path, names: Sequence[str]) -> None:
+    """Write a PNG: one row for each of the first frames named; before on the left, after on the right.
+
+    Parameters
+    ----------
+    path
+        Of the PNG.
+    capture, view
+        The recording.
+    images
+        Folder of the deblurred images.
+    names
+        Of deblurred frames, the most blurred first.
+    """
+    import cv2
+
+    index = view.index()
+    motion, camera = view.motion(), colmap_camera(view.camera)
+    rows: dict[str, NDArray[np.uint8]] = {}
+    for frame in some_frames(capture, view.timing, [index[name] for name in names[:_FRAMES]]):
+        field = blur_field(motion, camera, view.shutter(index[frame.name]))
+        before, after = _eight_bit(frame.image), _eight_bit(read_image(images / frame.name))
+        top, left, height, width = _busiest(before)
+        cut = [np.ascontiguousarray(i[top : top + height, left : left + width]) for i in (before, after)]
+        _draw(cut[0], field, top, left)
+        length = float(np.percentile(field.extent_px(), 90))
+        gap = np.full((height, _GAP, 3), 255, np.uint8)
+        label = np.full((_LABEL, 2 * width + _GAP, 3), 255, np.uint8)
+        text = f"{frame.name}   {length:.1f} px   before | after"
+        cv2.putText(label, text, (4, _LABEL - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
+        rows[frame.name] = np.concatenate([label, np.concatenate([cut[0], gap, cut[1]], axis=1)])
+    sheet = np.concatenate([rows[name] for name in names[:_FRAMES]])
+    data = cv2.imencode(".png", cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))[1]
+    try:
+        path.write_bytes(data.tobytes())
+    except OSError as error:
+        raise OutputError(f"{path} cannot be written: {error.strerror or error}") from error
+
+
+def _eight_bit(image: NDArray[Any]) -> NDArray[np.uint8]:
+    """(H, W, 3) with 8 bit."""
+    codes = np.asarray(image if image.dtype == np.uint8 else image >> 8, dtype=np.uint8)
+    return np.repeat(codes[..., None], 3, axis=2) if codes.ndim == 2 else codes
+
+
+def _busiest(image: NDArray[np.uint8]) -> tuple[int, int, int, int]:
+    """Top, left, height and width of the part with the most texture."""
+    import cv2
+
+    height, width = min(_HEIGHT, image.shape[0]), min(_WIDTH, image.shape[1])
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    texture = np.abs(cv2.Laplacian(cv2.GaussianBlur(grey, (0, 0), 2), cv2.CV_32F))
+    sums = cv2.integral(np.minimum(texture, np.percentile(texture, 99)))
+    inside = sums[height:, width:] - sums[:-height, width:] - sums[height:, :-width] + sums[:-height, :-width]
+    top, left = np.unravel_index(int(np.argmax(inside)), inside.shape)
+    return int(top), int(left), height, width
+
+
+def _draw(crop: NDArray[np.uint8], field: BlurField, top: int, left: int) -> None:
+    """The segments along which pixels were smeared."""
+    import cv2
+
+    height, width = crop.shape[:2]
+    for y in range(_ARROWS_PX // 2, height, _ARROWS_PX):
+        for x in range(_ARROWS_PX // 2, width, _ARROWS_PX):
+            row, column = (round((at + offset) / field.step_px) for at, offset in ((y, top), (x, left)))
+            row, column = min(row, field.vector_px.shape[0] - 1), min(column, field.vector_px.shape[1] - 1)
+            dx, dy = 0.5 * field.vector_px[row, column]
+            ends = [(round(float(x + sign * dx)), round(float(y + sign * dy))) for sign in (-1, 1)]
+            cv2.line(crop, ends[0], ends[1], (255, 60, 0), 2, cv2.LINE_AA)
+
+
+__all__ = ["write_contact_sheet"]
