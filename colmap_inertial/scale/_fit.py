@@ -186,7 +186,7 @@ def _jumped(*groups: fac.Group | fac.Direct) -> int:
 
 
 def _excitation_m_s2(data: Data, x: Estimate) -> float:
-    """Standard deviation of the camera's acceleration; the IMU, on its lever arm, swings even where the camera stays."""
+    """Standard deviation of the camera's acceleration; on its lever arm the IMU swings even where the camera stays."""
     path = x.imu_in_world_m - x.world_from_imu @ (x.cam_from_imu.T @ x.imu_in_cam_m)
     dt_s = np.diff(data.t_s)[:, None]
     accel = np.diff(np.diff(path, axis=0) / dt_s, axis=0) / (0.5 * (dt_s[1:] + dt_s[:-1]))

@@ -82,7 +82,7 @@ def estimate_joint(
     Returns
     -------
     ``method="joint"``. ``sigma_log`` combines the posterior standard deviation, inflated by chi-square where the fit is
-    worse than its noise, with ``PRIORS.model_scale``. ``verdict`` is ``"refused"`` where the data
+    worse than its noise, with ``PRIORS.model_scale`` and half of what noise in the fitted path may take from the scale. ``verdict`` is ``"refused"`` where the data
     cannot give a scale, with the reason.
     """
     options = options or JointOptions()
@@ -113,8 +113,13 @@ def _judged(fit: Fit, t_s: Array, calibration: CameraImuCalibration) -> ScaleEst
     squares = sum(s for s, _ in fit.sums.values())
     expected = sum(e for _, e in fit.sums.values())
     worst = max(s / e for s, e in fit.sums.values())
-    sigma = float(np.sqrt(fit.cov[par.SCALE, par.SCALE] * max(1.0, worst)))
-    sigma_log = float(np.hypot(sigma, PRIORS.model_scale))
+    variance = float(fit.cov[par.SCALE, par.SCALE]) * max(1.0, worst)
+    # The scale makes residuals orthogonal to the fitted path. That path follows the visual noise with as many degrees
+    # of freedom as the states take from the centres, which lowers the scale by this share where all noise is as
+    # modelled, and by none of it where it is not (as in real recordings): half of it counts as unknown
+    taken = 3 * len(t_s) - fit.sums["centre_m"][1] - fit.sums["drift_m_rts"][1]
+    share = 0.5 * variance * max(0.0, taken)
+    sigma_log = float(np.sqrt(variance + share**2 + PRIORS.model_scale**2))
     verdict, ci95, reasons = verdict_of(x.metres_per_unit, sigma_log, refusals=_refusals(fit, t_s))
     if verdict != "refused":
         verdict, ci95, reasons = verdict_of(x.metres_per_unit, sigma_log, _checks(fit))
