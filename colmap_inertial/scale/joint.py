@@ -82,8 +82,8 @@ def estimate_joint(
     Returns
     -------
     ``method="joint"``. ``sigma_log`` combines the posterior standard deviation, inflated by chi-square where the fit is
-    worse than its noise, with ``PRIORS.model_scale`` and half of what noise in the fitted path may take from the scale. ``verdict`` is ``"refused"`` where the data
-    cannot give a scale, with the reason.
+    worse than its noise, with ``PRIORS.model_scale`` and half of what noise in the fitted path may take from the
+    scale. ``verdict`` is ``"refused"`` where the data cannot give a scale, with the reason.
     """
     options = options or JointOptions()
     try:
