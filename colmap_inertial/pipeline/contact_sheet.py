@@ -46,7 +46,7 @@ def write_contact_sheet(path: Path, capture: Capture, view: GyroView, images: Pa
         field = blur_field(motion, camera, view.shutter(index[frame.name]))
         before, after = _eight_bit(frame.image), _eight_bit(read_image(images / frame.name))
         top, left, height, width = _busiest(before)
-        cut = [np.ascontiguousarray(i[top : top + height, left : left + width]) for i in (before, after)]
+        cut = [picture[top : top + height, left : left + width].copy() for picture in (before, after)]
         _draw(cut[0], field, top, left)
         length = float(np.percentile(field.extent_px(), 90))
         gap = np.full((height, _GAP, 3), 255, np.uint8)

@@ -35,7 +35,7 @@ RollingShutterMethod = Literal["off", "rectify"]
 #: Blur below this cannot be told from the texture: where no frame has more, nothing is deblurred.
 _TELLING_PX = 4.0
 #: A gyroscope that is borne out by this share of them is trusted for all frames.
-_MOST_OF_THEM = 0.85
+_MOST_OF_THEM = 0.95
 #: Standard deviations by which a frame must bear it out by itself, where others do not: with 4, some were made worse.
 _CLEAR_SUPPORT = 7.0
 #: Share of the readout that acts on poses after rectification.
@@ -256,7 +256,7 @@ def _with_decisions(plan: ImagingPlan, view: GyroView, capture: Capture, progres
     width, height = view.camera.width, view.camera.height
     motion, camera = view.motion(), colmap_camera(view.camera)
     predicted = predicted_blur_px(motion, camera, view.timing, width=width, height=height)
-    decisions = decide(predicted, view.timing.t_s, width=width, height=height, motion=motion)
+    decisions = _keeping_ends(decide(predicted, view.timing.t_s, width=width, height=height, motion=motion))
     index = view.index()
     blurred = sorted((d for d in decisions if d.action == "deblur"), key=lambda d: -(d.blur_px or 0))
     chosen = [d for d in blurred if (d.blur_px or 0) >= _TELLING_PX][:_JUDGED_FRAMES]
@@ -272,6 +272,18 @@ def _with_decisions(plan: ImagingPlan, view: GyroView, capture: Capture, progres
     verdict = _by_frame(judge_recording(evidence), evidence)
     note = f"{sum(d.action == 'deblur' for d in decisions)} of {len(decisions)} frames are blurred; {verdict.reason}"
     return replace(plan, deblur=(decisions, verdict), deblur_note=note)
+
+
+def _keeping_ends(decisions: tuple[FrameDecision, ...]) -> tuple[FrameDecision, ...]:
+    """No frame is dropped before the first or after the last one that stays: nothing would bridge the gap."""
+    stay = [i for i, decision in enumerate(decisions) if decision.action != "drop"]
+    first, last = (stay[0], stay[-1]) if stay else (len(decisions), -1)
+    return tuple(
+        replace(d, action="deblur", reason=f"{d.blur_px:.0f} px of blur are too many, but no frame is beyond it")
+        if d.action == "drop" and not first < i < last
+        else d
+        for i, d in enumerate(decisions)
+    )
 
 
 def _by_frame(verdict: RecordingVerdict, evidence: Sequence[BlurEvidence]) -> RecordingVerdict:
