@@ -1,0 +1,149 @@
+"""The imaging benchmark's report as tables, each figure beside what is wanted of it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+#: Least ratio of correct matches, by blur.
+MATCHES_WANTED = {"6": 1.4, "10": 1.9, "20": 3.3, "30": 6.0}
+KEPT_WANTED = 0.95
+
+
+def print_report(report: dict[str, Any], console: Console) -> None:
+    """Print every section."""
+    about = report["about"]
+    console.print(", ".join(f"{key} {value}" for key, value in about.items()), style="dim", highlight=False)
+    for kind, by_blur in report["quality"].items():
+        _quality(kind, by_blur, console)
+    _other_ways(report["other_ways_20_px"], console)
+    _cost(report["cost"], console)
+    _false_blur(report["false_blur_10_px"], console)
+    _shutter(report["rolling_shutter"], console)
+    if "colmap" in report:
+        _colmap(report["colmap"], console)
+
+
+def verdict(value: float, wanted: float, *, least: bool = True) -> str:
+    """What is wanted, and whether it is met."""
+    good = value >= wanted if least else value <= wanted
+    return f"[{'green' if good else 'red'}]{'>=' if least else '<='} {wanted:g}[/]"
+
+
+def _table(title: str, *columns: str) -> Table:
+    table = Table(title=title, title_justify="left")
+    for i, column in enumerate(columns):
+        table.add_column(column, justify="left" if i == 0 else "right")
+    return table
+
+
+def _quality(kind: str, by_blur: dict[str, Any], console: Console) -> None:
+    table = _table(
+        f"Quality, {kind}: nothing -> gated default",
+        *("blur px", "median", "deblurred", "correct matches", "ratio", "wanted"),
+        *("repeatability", "localisation px", "PSNR dB", "SSIM"),
+    )
+    for blur, row in by_blur.items():
+        a, b = row["nothing"], row["gated"]
+        table.add_row(
+            blur,
+            f"{row['median_blur_px']:.1f}",
+            f"{row['deblurred_frames']}/{2 * row['pairs']}",
+            f"{a['correct']:.0f} -> {b['correct']:.0f}",
+            f"{row['ratio']:.2f}",
+            verdict(row["ratio"], MATCHES_WANTED[blur]) if blur in MATCHES_WANTED else "",
+            f"{a['repeatability']:.3f} -> {b['repeatability']:.3f}",
+            f"{a['localisation_px']:.3f} -> {b['localisation_px']:.3f}",
+            f"{a['psnr_db']:.2f} -> {b['psnr_db']:.2f}",
+            f"{a['ssim']:.3f} -> {b['ssim']:.3f}",
+        )
+    console.print(table)
+
+
+def _other_ways(ways: dict[str, Any], console: Console) -> None:
+    table = _table("At 20 px", "way", "correct matches", "repeatability", "localisation px", "PSNR dB", "SSIM")
+    for name, row in ways.items():
+        measures = [
+            f"{row[key]:.{digits}f}" if key in row else "-"
+            for key, digits in (("repeatability", 3), ("localisation_px", 3), ("psnr_db", 2), ("ssim", 3))
+        ]
+        table.add_row(name, f"{row['correct']:.0f}", *measures)
+    console.print(table)
+
+
+def _cost(cost: dict[str, Any], console: Console) -> None:
+    table = _table(
+        f"Processor time, grey 1080p, {cost['blur_px']} px, 8 bit to 8 bit", "way", "ms", "times ours", "wanted"
+    )
+    wanted = {"spatial_wiener_2d": 10.0, "richardson_lucy_one_psf": 50.0, "richardson_lucy_blocks": 50.0}
+    for name, ms in cost["ms_cpu"].items():
+        times = cost["times_faster"].get(name)
+        text = "" if times is None else f"{times:.1f}"
+        table.add_row(name, f"{ms:.1f}", text, verdict(times, wanted[name]) if name in wanted else "")
+    console.print(table)
+    share = cost["share_of_colmap_sift"]
+    console.print(f"share of COLMAP's SIFT: {100 * share:.2f} % {verdict(100 * share, 1.0, least=False)}")
+    for name, row in cost["instruction_sets"].items():
+        of_peak = row["share_of_peak"]
+        console.print(
+            f"{name}: {of_peak:.0%} of a core's {row['peak_gflops']:.0f} Gflop/s in the filter "
+            f"({row['share_of_peak_with_encoding']:.0%} with encoding) {verdict(of_peak, 0.35)}"
+        )
+
+
+def _false_blur(errors: dict[str, Any], console: Console) -> None:
+    table = _table(
+        "False blur, 10 px: correct matches against doing nothing",
+        *("error", "kept", "wanted", "frames deblurred", "gyroscope trusted", "sigmas", "extents times"),
+    )
+    for name, row in errors.items():
+        table.add_row(
+            name,
+            f"{row['kept']:.3f}",
+            verdict(row["kept"], KEPT_WANTED),
+            f"{row['deblurred_frames']}/{row['frames']}",
+            str(row["trusted"]),
+            f"{row['support']:.1f}",
+            f"{row['extent_factor']:.2f}",
+        )
+    console.print(table)
+
+
+def _shutter(row: dict[str, Any], console: Console) -> None:
+    table = _table(
+        f"Rolling shutter, two views, readout {1e3 * row['readout_s']:.0f} ms, {row['rate_rad_s']:g} rad/s",
+        *("keypoints", "rotation deg", "90th", "direction deg", "inliers"),
+    )
+    for name in ("as filmed", "rectified"):
+        one = row[name]
+        table.add_row(
+            name,
+            f"{one['rotation_deg']:.3f}",
+            f"{one['rotation_deg_90th']:.3f}",
+            f"{one['direction_deg']:.2f}",
+            f"{one['inliers']:.3f}",
+        )
+    best = row["rectified"]
+    table.add_row("wanted", verdict(best["rotation_deg"], 0.2, least=False), "", "", verdict(best["inliers"], 0.98))
+    console.print(table)
+
+
+def _colmap(scenes: dict[str, Any], console: Console) -> None:
+    for name, row in scenes.items():
+        table = _table(
+            f"COLMAP, {name}: {row['images']} images, {row['blur_px']:.0f} px, readout {1e3 * row['readout_s']:.0f} ms",
+            *("treatment", "registered", "points", "camera error %", "rotation deg"),
+        )
+        for way, one in row["ways"].items():
+            table.add_row(
+                way,
+                f"{one['registered']}/{row['images']}",
+                f"{one['points']}",
+                f"{one['centre_error_pct']:.3f}",
+                f"{one['rotation_deg']:.3f}",
+            )
+        console.print(table)
+        for label, value, wanted, least in row["wanted"]:
+            console.print(f"{label}: {value:.3g} {verdict(value, wanted, least=least)}")
