@@ -1,0 +1,130 @@
+"""A textured corner of a room, filmed by a hand: exact blur and rolling shutter with parallax, in seconds."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from far_scene import CAM_FROM_IMU, srgb
+
+from colmap_inertial.geometry import matrix_from_quat
+from colmap_inertial.imaging.gyro_camera import FrameShutter
+from colmap_inertial.simulate import Motion, MotionOptions, make_motion
+from colmap_inertial.simulate.render import colmap_camera
+from colmap_inertial.simulate.textures import poster
+from colmap_inertial.types import CameraModel
+
+LENS = CameraModel(model="PINHOLE", width=400, height=300, params=(340, 340, 200, 150))
+#: Planes as the axis that they stand on and where; the IMU's clock against the camera's.
+PLANES = ((2, -0.4), (1, 1.4), (0, -1.6), (0, 1.6))
+IMU_CLOCK_S = 11.0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CornerScene:
+    """The corner, the hand's motion and the shutter."""
+
+    motion: Motion
+    textures: np.ndarray
+    frames: int
+    exposure_s: float
+    readout_s: float
+
+    @classmethod
+    def make(cls, *, exposure_s, readout_s, frames=24, seed=5, vigour=1.0):
+        rng = np.random.default_rng(seed)
+        options = MotionOptions(
+            kind="orbit", duration_s=frames / 3, heading_deg=-90.0, vigour=vigour, radius_m=1.6, arc_deg=40,
+            sweep_s=frames / 3,
+        )  # fmt: skip
+        textures = np.stack([poster(rng, 1024, 1024) for _ in PLANES])
+        return cls(
+            motion=make_motion(options, rng), textures=textures, frames=frames, exposure_s=exposure_s,
+            readout_s=readout_s,
+        )  # fmt: skip
+
+    def shutter(self, i):
+        return FrameShutter(
+            width=LENS.width, height=LENS.height, t_s=0.1 + i / 3.2, exposure_s=self.exposure_s,
+            readout_s=self.readout_s,
+        )  # fmt: skip
+
+    def picture(self, i, *, noise=0.006):
+        """(H, W, 3) 8 bit sRGB."""
+        shutter = self.shutter(i)
+        x, y = np.meshgrid(np.arange(LENS.width) + 0.5, np.arange(LENS.height) + 0.5)
+        flat = np.stack([x, y], axis=-1).reshape(-1, 2)
+        rays = np.asarray(colmap_camera(LENS).cam_from_img(flat))[:, :2].reshape(*x.shape, 2)
+        rays = np.concatenate([rays, np.ones((*x.shape, 1))], axis=-1)
+        samples = max(2, round(self.exposure_s * 400))
+        light = np.zeros((*x.shape, 3), np.float32)
+        for k in range(samples):
+            t_s = shutter.middle_s(np.stack([x[:, 0], y[:, 0]], axis=-1)) + self.exposure_s * (
+                (k + 0.5) / samples - 0.5
+            )
+            rotation = matrix_from_quat(self.motion.world_from_cam_xyzw(t_s))
+            light += self._seen(self.motion.cam_in_world_m(t_s), np.einsum("yij,yxj->yxi", rotation, rays)) / samples
+        light += noise * np.random.default_rng(i).standard_normal(light.shape)
+        return np.round(255 * srgb(light)).astype(np.uint8)
+
+    def _seen(self, centre, direction):
+        nearest, out = np.full(direction.shape[:2], np.inf), np.zeros(direction.shape, np.float32)
+        for (axis, place), texture in zip(PLANES, self.textures, strict=True):
+            with np.errstate(divide="ignore"):
+                along = (place - centre[:, None, axis]) / direction[..., axis]
+            closer = (along > 0) & (along < nearest)
+            nearest = np.where(closer, along, nearest)
+            point = centre[:, None] + np.where(closer, along, 0)[..., None] * direction
+            u, v = (np.mod(400 * point[..., k], 1024).astype(np.float32) for k in range(3) if k != axis)
+            seen = cv2.remap(texture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            out[closer] = seen[closer]
+        return out
+
+    def centres(self):
+        """(F, 3) true camera centres at the instants of the poses."""
+        return self.motion.cam_in_world_m(np.array([self.shutter(i).reference_s() for i in range(self.frames)]))
+
+    def write(self, folder: Path, *, metadata=None, extra="", suffix=".jpg"):
+        """A capture folder; ``metadata`` changes the bytes of each encoded picture."""
+        (folder / "frames").mkdir(parents=True)
+        rows = ["name,t_ns"]
+        for i in range(self.frames):
+            name = f"{i:04}{suffix}"
+            bgr = cv2.cvtColor(self.picture(i), cv2.COLOR_RGB2BGR)
+            data = cv2.imencode(suffix, bgr, [cv2.IMWRITE_JPEG_QUALITY, 95] if suffix == ".jpg" else [])[1].tobytes()
+            (folder / "frames" / name).write_bytes(data if metadata is None else metadata(data))
+            rows.append(f"{name},{round(1e9 * self.shutter(i).t_s)}")
+        (folder / "frames.csv").write_text("\n".join(rows) + "\n")
+        t_s = np.arange(0.0, self.frames / 3 + 0.5, 1 / 200)
+        to_imu = matrix_from_quat(CAM_FROM_IMU)
+        to_cam = matrix_from_quat(self.motion.world_from_cam_xyzw(t_s))
+        force = (
+            np.einsum("nji,nj->ni", to_cam, self.motion.at(t_s).accel_in_world_m_s2 + np.array([0, 0, 9.81])) @ to_imu
+        )
+        rng = np.random.default_rng(1)
+        for file, values, sigma in (
+            ("gyro", self.motion.rate_in_cam_rad_s(t_s) @ to_imu, 2e-3),
+            ("accel", force, 2e-2),
+        ):
+            values = values + sigma * rng.standard_normal(values.shape)
+            table = np.column_stack([t_s + IMU_CLOCK_S, values])
+            np.savetxt(folder / f"{file}.csv", table, delimiter=",", header="t,x,y,z", comments="", fmt="%.9g")
+        tables = "".join(
+            f'[imu.{s}]\nfile = "{s}.csv"\ntime = "t"\ntime_unit = "s"\ncolumns = ["x", "y", "z"]\nunit = "{unit}"\n'
+            for s, unit in (("gyro", "rad/s"), ("accel", "m/s2"))
+        )
+        params = [float(p) for p in LENS.params]
+        (folder / "capture.toml").write_text(
+            '[images]\nfolder = "frames"\ntimes = "frames.csv"\n'
+            f"[timing]\nexposure_s = {self.exposure_s}\nreadout_s = {self.readout_s}\n"
+            f'[camera]\nmodel = "PINHOLE"\nwidth = {LENS.width}\nheight = {LENS.height}\nparams = {params}\n'
+            f'pixel_origin = "corner"\n{tables}{extra}'
+        )
+        return folder
+
+
+#: What a capture.toml says of this camera and IMU where it knows everything.
+CALIBRATED = (
+    f"[calibration]\ncam_from_imu_xyzw = {CAM_FROM_IMU.tolist()}\ngyro_time_offset_s = {-IMU_CLOCK_S}\n"
+    f"accel_time_offset_s = {-IMU_CLOCK_S}\ngyro_bias_rad_s = [0.0, 0.0, 0.0]\n"
+)

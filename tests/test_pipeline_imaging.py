@@ -1,0 +1,295 @@
+"""Deblurring and rolling shutter in the pipeline: better models, nothing lost, everything said."""
+
+import json
+import shutil
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from corner_scene import CALIBRATED, LENS, CornerScene
+from test_pipeline import contents
+
+from colmap_inertial.cli import main
+from colmap_inertial.errors import InertialError, NotObservableError, OutputExistsError
+from colmap_inertial.io.capture import load_capture
+from colmap_inertial.io.frames import read_frames
+from colmap_inertial.io.imu import read_capture_imu
+from colmap_inertial.model import read_model
+from colmap_inertial.pipeline import MappingOptions, ReconstructOptions, prior_calibration, reconstruct, silent
+from colmap_inertial.pipeline.deblur import deblur_capture
+from colmap_inertial.pipeline.imaging import plan_imaging, read_plan, with_stated_exposures, write_plan
+from colmap_inertial.pipeline.metadata import carry_metadata, stated_exposures_s
+from colmap_inertial.simulate import MotionOptions, make_motion
+
+QUICK = ReconstructOptions(mapping=MappingOptions(max_num_features=2000, first_octave=0))
+OFF = replace(QUICK, deblur="off", rolling_shutter="off")
+
+
+def exif(exposure=(1, 25)):
+    """A TIFF structure that states an exposure time, as EXIF holds it."""
+    directory = struct.pack("<HHHIII", 1, 0x8769, 4, 1, 26, 0)
+    inner = struct.pack("<HHHIII", 1, 0x829A, 5, 1, 44, 0)
+    return b"II*\0" + struct.pack("<I", 8) + directory + inner + struct.pack("<II", *exposure)
+
+
+def with_exif(jpeg):
+    body = b"Exif\0\0" + exif()
+    return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body + jpeg[2:]
+
+
+def edges(image):
+    """Power of what is finer than a few pixels and coarser than noise."""
+    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.float32)
+    return float((cv2.GaussianBlur(grey, (0, 0), 1.5) - cv2.GaussianBlur(grey, (0, 0), 3)).var())
+
+
+def centre_error_m(result, scene):
+    """Root mean square distance of the cameras from the truth after the best similarity."""
+    model = read_model(result.models[0].sparse)
+    images = sorted((model.image(i) for i in model.reg_image_ids()), key=lambda image: image.name)
+    found = np.array([image.projection_center() for image in images])
+    true = scene.centres()[[int(image.name[:4]) for image in images]]
+    a, b = found - found.mean(axis=0), true - true.mean(axis=0)
+    u, size, vt = np.linalg.svd(b.T @ a)
+    size[2] *= np.sign(np.linalg.det(u @ vt))
+    rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+    return float(np.sqrt(np.mean(np.sum((b - size.sum() / np.sum(a**2) * a @ rotation.T) ** 2, axis=1))))
+
+
+@pytest.fixture(scope="module")
+def rolling(tmp_path_factory):
+    """A capture with 30 ms of readout, reconstructed without and with treatment."""
+    root = tmp_path_factory.mktemp("rolling")
+    scene = CornerScene.make(exposure_s=0.004, readout_s=0.03)
+    capture = scene.write(root / "capture")
+    before = contents(capture)
+    results = [reconstruct(capture, root / name, options) for name, options in (("off", OFF), ("on", QUICK))]
+    assert contents(capture) == before
+    return scene, root, results
+
+
+def test_without_the_rolling_shutter_cameras_are_several_times_more_accurate(rolling):
+    scene, _, (off, on) = rolling
+    assert off.models[0].summary["registered_images"] == on.models[0].summary["registered_images"] == scene.frames
+    assert centre_error_m(on, scene) < 0.3 * centre_error_m(off, scene)
+    assert on.models[0].summary["mean_reprojection_error_px"] < off.models[0].summary["mean_reprojection_error_px"]
+
+
+def test_images_and_model_agree_where_keypoints_were_rectified(rolling):
+    _, root, _ = rolling
+    names = {path.name for path in (root / "on" / "images").iterdir()}
+    assert {path.name for path in (root / "on" / "images_rectified").iterdir()} == names
+    before, after = (cv2.imread(str(root / "on" / folder / "0007.jpg")) for folder in ("images", "images_rectified"))
+    assert before.shape == after.shape and np.abs(before.astype(int) - after).mean() > 2
+    # what COLMAP saw are the very files of the capture
+    for name in names:
+        assert (root / "on" / "images" / name).read_bytes() == (root / "capture" / "frames" / name).read_bytes()
+
+
+def test_the_result_shows_the_calibration_from_before_and_after(rolling):
+    _, root, (off, _) = rolling
+    stored = json.loads((root / "on" / "result.json").read_text())
+    assert stored["imaging"]["calibration"]["source"] == "model"
+    assert stored["imaging"]["calibration"]["gyro_time_offset_s"] == pytest.approx(-11.0, abs=2e-3)
+    assert stored["models"][0]["calibration_change"]["rotation_deg"] < 1
+    assert abs(stored["models"][0]["calibration_change"]["gyro_time_offset_s"]) < 2e-3
+    assert all(frame["rectified"] and frame["action"] == "passed" for frame in stored["frames"])
+    assert "readout 30.0 ms" in stored["imaging"]["rolling_shutter"]
+    assert off.imaging.view is None and off.imaging.deblur_note == "not asked for"
+    assert not (root / "off" / "images_rectified").exists()
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return CornerScene.make(exposure_s=0.03, readout_s=0.0)
+
+
+@pytest.fixture(scope="module")
+def blurred(tmp_path_factory, scene):
+    """Dim light, and a camera that knows its IMU; every picture has EXIF."""
+    return scene.write(tmp_path_factory.mktemp("blurred") / "capture", metadata=with_exif, extra=CALIBRATED)
+
+
+@pytest.fixture(scope="module")
+def deblurred(tmp_path_factory, blurred):
+    out = tmp_path_factory.mktemp("deblurred")
+    return deblur_capture(blurred, out / "out", sheet=out / "sheet.png", progress=silent)
+
+
+def test_deblurred_images_see_more_of_the_scene(tmp_path, scene, blurred):
+    off, on = (reconstruct(blurred, tmp_path / name, o) for name, o in (("off", OFF), ("on", QUICK)))
+    before, after = off.models[0].summary, on.models[0].summary
+    assert after["registered_images"] >= before["registered_images"]
+    assert after["observations"] > 1.1 * before["observations"]
+    assert centre_error_m(on, scene) < centre_error_m(off, scene)
+    assert on.imaging.view.source == "capture"
+    low, high = on.models[0].scale.ci95
+    assert low < high and on.models[0].scale.verdict != "refused"
+
+
+def test_deblur_keeps_names_sizes_metadata_and_says_what_it_did(blurred, deblurred):
+    out = deblurred.workspace
+    stored = json.loads(out.result.read_text())
+    names = sorted(path.name for path in (blurred / "frames").iterdir())
+    assert sorted(path.name for path in out.images.iterdir()) == names == [f["name"] for f in stored["frames"]]
+    actions, crisper = [frame["action"] for frame in stored["frames"]], []
+    assert actions.count("deblurred") >= 8 and set(actions) <= {"deblurred", "passed"}
+    for frame in stored["frames"]:
+        original, new = (folder / frame["name"] for folder in (blurred / "frames", out.images))
+        assert frame["blur_px"] > 0 and frame["reason"]
+        if frame["action"] == "passed":
+            assert new.read_bytes() == original.read_bytes() and frame["kept_share"] == 1
+        else:
+            assert exif() in new.read_bytes() and new.read_bytes() != original.read_bytes()
+            before, after = (cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in (original, new))
+            assert before.shape == after.shape and before.dtype == after.dtype
+            crisper.append(edges(after) / edges(before))
+    assert np.median(crisper) > 1.2
+    sheet = cv2.imread(str(deblurred.sheet))
+    assert sheet is not None and sheet.shape[1] > 2 * LENS.width
+
+
+def test_a_finished_folder_is_not_touched_again(blurred, deblurred):
+    before = contents(deblurred.workspace.root)
+    with pytest.raises(OutputExistsError, match="finished result"):
+        deblur_capture(blurred, deblurred.workspace.root, progress=silent)
+    assert contents(deblurred.workspace.root) == before
+
+
+def test_a_stopped_run_does_not_deblur_again(tmp_path, blurred):
+    def stop(stage, done, total, /):
+        if stage == "features":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(blurred, tmp_path / "out", QUICK, progress=stop)
+    before = contents(tmp_path / "out" / "images")
+    stages = []
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(
+            blurred, tmp_path / "out", QUICK, progress=lambda s, d, t, /: (stages.append(s), stop(s, d, t))
+        )  # fmt: skip
+    assert set(stages) == {"features"} and contents(tmp_path / "out" / "images") == before
+    log = (tmp_path / "out" / "log.txt").read_text()
+    assert "imaging: finished in an earlier run" in log and "frames: finished in an earlier run" in log
+    # another decision makes the frames again
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(blurred, tmp_path / "out", replace(QUICK, deblur="off"), progress=stop)
+    assert contents(tmp_path / "out" / "images") == contents(blurred / "frames")
+
+
+def parts(capture):
+    loaded = load_capture(capture)
+    timing, _ = read_frames(loaded)
+    timing = with_stated_exposures(loaded, timing)
+    return loaded, read_capture_imu(loaded), timing, prior_calibration(loaded, QUICK)
+
+
+def test_the_plan_reads_back_and_the_stage_keeps_order_and_memory(tmp_path, blurred):
+    loaded, imu, timing, prior = parts(blurred)
+    plan = plan_imaging(
+        loaded, imu, timing, prior, deblur=None, rolling_shutter=None, scratch=tmp_path, progress=silent
+    )
+    write_plan(tmp_path / "plan.json", plan)
+    again = read_plan(tmp_path / "plan.json", imu, timing)
+    write_plan(tmp_path / "again.json", again)
+    assert (tmp_path / "again.json").read_text() == (tmp_path / "plan.json").read_text()
+    assert again.deblur == plan.deblur
+    (stage,) = plan.frame_stages()
+    stage = replace(stage, workers=3)
+    taken = []
+
+    def frames():
+        for frame in read_frames(loaded)[1]:
+            taken.append(frame.name)
+            yield frame
+
+    for i, frame in enumerate(stage(frames())):
+        assert frame.name == timing.names[i] and len(taken) <= i + 5
+    assert all(stage.treatment(name) is not None for name in timing.names)
+
+
+def test_unknown_exposure_leaves_every_frame_and_says_why(tmp_path, blurred):
+    capture = tmp_path / "capture"
+    shutil.copytree(blurred, capture)
+    text = (capture / "capture.toml").read_text()
+    (capture / "capture.toml").write_text(text.replace("exposure_s = 0.03\n", ""))
+    loaded, *_ = parts(capture)
+    timing = with_stated_exposures(loaded, read_frames(loaded)[0])
+    np.testing.assert_allclose(timing.exposure_s, 0.04)  # by EXIF
+    for path in (capture / "frames").iterdir():
+        path.write_bytes(path.read_bytes().replace(exif(), exif((0, 1))))
+    result = deblur_capture(capture, tmp_path / "out", progress=silent)
+    assert contents(tmp_path / "out" / "images") == contents(capture / "frames")
+    stored = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert all("exposure time is unknown" in frame["reason"] for frame in stored["frames"])
+    assert result.imaging.view is None
+
+
+def test_a_stabilised_video_is_refused_where_asked_and_left_alone_otherwise(tmp_path, capsys):
+    scene = CornerScene.make(exposure_s=0.03, readout_s=0.02, frames=3)
+    capture = scene.write(tmp_path / "capture", extra=CALIBRATED)
+    lively = make_motion(MotionOptions(kind="pure_rotation", duration_s=4.0, vigour=1.0), np.random.default_rng(2))
+    t_s = np.arange(0.0, 4.0, 0.005)
+    rows = np.column_stack([t_s + 11.0, lively.rate_in_cam_rad_s(t_s)])
+    np.savetxt(capture / "gyro.csv", rows, delimiter=",", header="t,x,y,z", comments="")
+    rows[:, 1:] = [0.0, 0.0, 9.81]
+    np.savetxt(capture / "accel.csv", rows + 0.01 * np.random.default_rng(1).standard_normal(rows.shape) * [0, 1, 1, 1],
+               delimiter=",", header="t,x,y,z", comments="")  # fmt: skip
+    shutil.rmtree(capture / "frames")
+    (capture / "frames").mkdir()
+    table = ["name,t_ns"]
+    wide = np.round(255 * scene.textures[0] ** 0.45).astype(np.uint8)
+    for i in range(50):
+        cv2.imwrite(str(capture / "frames" / f"{i:04}.jpg"), wide[100:400, 100 + i : 500 + i])
+        table.append(f"{i:04}.jpg,{200_000_000 + round(i * 1e9 / 15)}")
+    (capture / "frames.csv").write_text("\n".join(table) + "\n")
+    with pytest.raises(SystemExit) as stopped:
+        main(["deblur", str(capture), str(tmp_path / "out")])
+    assert stopped.value.code == 3
+    assert "stabilised in the camera" in capsys.readouterr().err
+    assert not (tmp_path / "out" / "result.json").exists() and not (tmp_path / "out" / "images").exists()
+    loaded, imu, timing, prior = parts(capture)
+    known = {"scratch": tmp_path, "progress": silent}
+    with pytest.raises(NotObservableError, match="stabilised"):
+        plan_imaging(loaded, imu, timing, prior, deblur="off", rolling_shutter="rectify", **known)
+    plan = plan_imaging(loaded, imu, timing, prior, deblur=None, rolling_shutter=None, **known)
+    assert plan.frame_stages() == [] == plan.keypoint_stages()
+    assert "stabilised" in plan.deblur_note and "stabilised" in plan.rolling_shutter_note
+
+
+def test_rectifying_needs_a_readout(tmp_path, blurred):
+    loaded, imu, timing, prior = parts(blurred)
+    with pytest.raises(InertialError, match="readout_s"):
+        plan_imaging(
+            loaded, imu, replace(timing, readout_s=None), prior, deblur=None, rolling_shutter="rectify",
+            scratch=tmp_path, progress=silent,
+        )  # fmt: skip
+
+
+def test_metadata_of_png_and_jpeg_is_carried_over(tmp_path):
+    image = np.random.default_rng(0).integers(0, 255, (20, 30, 3), dtype=np.uint8)
+    jpeg, png = (cv2.imencode(suffix, image)[1].tobytes() for suffix in (".jpg", ".png"))
+    chunk = b"eXIf" + exif()
+    import zlib
+
+    whole = struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    with_chunk = png[:33] + whole + png[33:]
+    for original, encoded, suffix in ((with_exif(jpeg), jpeg, ".jpg"), (with_chunk, png, ".png")):
+        carried = carry_metadata(original, encoded)
+        assert exif() in carried
+        np.testing.assert_array_equal(
+            cv2.imdecode(np.frombuffer(carried, np.uint8), cv2.IMREAD_UNCHANGED),
+            cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_UNCHANGED),
+        )
+        path = tmp_path / f"a{suffix}"
+        path.write_bytes(carried)
+        np.testing.assert_allclose(stated_exposures_s([path, path]), 0.04)
+        path.write_bytes(encoded)
+        assert stated_exposures_s([path]) is None
+    assert carry_metadata(b"BM...", b"BM....") == b"BM...."
+    (tmp_path / "a.tif").write_bytes(exif())
+    assert stated_exposures_s([Path(tmp_path / "a.tif")]) is not None
