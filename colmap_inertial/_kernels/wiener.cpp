@@ -1,5 +1,7 @@
 #include "wiener.h"
 
+#include "dispatch.h"
+
 #include <algorithm>
 #include <atomic>
 #include <cmath>
@@ -15,14 +17,11 @@
 #endif
 
 const Simd *simd_named(const char *name) {
-    const bool best = !*name;
 #if defined(COLMAP_INERTIAL_X86_64)
-    __builtin_cpu_init();
-    const bool avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
-    if (avx2 && __builtin_cpu_supports("avx512f") && (best || !strcmp(name, simd_avx512.name))) return &simd_avx512;
-    if (avx2 && (best || !strcmp(name, simd_avx2.name))) return &simd_avx2;
+    return named(name, simd_base, &simd_avx2, &simd_avx512);
+#else
+    return named<Simd>(name, simd_base, nullptr, nullptr);
 #endif
-    return best || !strcmp(name, simd_base.name) ? &simd_base : nullptr;
 }
 
 int usable_threads() {

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from colmap_inertial._kernels import _inertial
 from colmap_inertial.align._clock_search import ClockFit
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.geometry import (
@@ -192,7 +193,7 @@ def refine_alignment(
             sigmas = np.sqrt(np.sum(residual**2, axis=1) / (2 * noise[0] + noise[1] * dt_s))
             excess = np.minimum(np.maximum(sigmas / _OUTLIER_SIGMAS, 1.0) ** 4, 1e8)
         if iteration in (2, 3, 5, 8):
-            noise = _noise_of(residual, dt_s, excess, noise, least_density**2)
+            noise = _noise_of(residual, dt_s, excess, least_density**2)
         white_residual, white_jacobian = _whiten(residual, jacobian, dt_s, excess, noise)
         from_prior = np.concatenate(
             [
@@ -306,51 +307,62 @@ def _residuals(
     return residual, to_world @ jacobian[covered], np.diff(trajectory.t_s)[covered]
 
 
-def _bands(dt_s: Array, excess: Array, noise: tuple[float, float]) -> Array:
-    """Lower bands of the covariance of the residuals: pose noise shared by neighbours, gyroscope noise, outliers."""
-    pose, rate = noise
-    bands = np.zeros((2, len(dt_s)))
-    bands[0] = (2 * pose + rate * dt_s) * excess
-    bands[1, :-1] = -pose
-    return bands
-
-
 def _whiten(
     residual: Array, jacobian: Array, dt_s: Array, excess: Array, noise: tuple[float, float]
 ) -> tuple[Array, Array]:
-    from scipy.linalg import cholesky_banded, solve_banded
-
-    factor = cholesky_banded(_bands(dt_s, excess, noise), lower=True)
+    """Residuals and derivatives divided by the Cholesky factor of the covariance of the residuals."""
     both = np.concatenate([residual[:, :, None], jacobian], axis=2)
-    white = solve_banded((1, 0), factor, both.reshape(len(both), -1)).reshape(both.shape)
-    return white[:, :, 0], white[:, :, 1:]
+    _divide(both.reshape(len(both), -1), dt_s, excess, noise)
+    return both[:, :, 0], both[:, :, 1:]
 
 
-def _noise_of(
-    residual: Array, dt_s: Array, excess: Array, start: tuple[float, float], least_rate: float
-) -> tuple[float, float]:
+def _divide(sides: Array, dt_s: Array, excess: Array, noise: tuple[float, float]) -> float:
+    """Whiten ``sides`` (K, c) in place; returns half the logarithm of the determinant of the covariance (K, K).
+
+    The covariance: pose noise shared by neighbours, gyroscope noise, outliers.
+    """
+    pose, rate = noise
+    half_log_det = _inertial.whiten_tridiagonal((2 * pose + rate * dt_s) * excess, np.full(len(dt_s) - 1, -pose), sides)
+    if not np.isfinite(half_log_det):
+        raise np.linalg.LinAlgError("the covariance of the residuals is not positive definite")
+    return half_log_det
+
+
+def _noise_of(residual: Array, dt_s: Array, excess: Array, least_rate: float) -> tuple[float, float]:
     """Variance of a pose (rad2) and density of the rate (rad2/s), by maximum likelihood.
 
     The density is at least the sensor's: a few poses could not tell it from nothing, and the bias would look too good.
     """
-    from scipy.linalg import cholesky_banded, solve_banded
-    from scipy.optimize import minimize
+    least_pose, count = 1e-12, residual.size  # a microradian: below any camera, above rounding
 
-    def cost(logs: Array) -> float:
-        factor = cholesky_banded(_bands(dt_s, excess, (float(np.exp(logs[0])), float(np.exp(logs[1])))), lower=True)
-        white = solve_banded((1, 0), factor, residual)
-        return float(0.5 * np.sum(white**2) + 3 * np.sum(np.log(factor[0])))
+    def best(log_ratio: float) -> tuple[float, float]:
+        """Cost and pose variance where the density is ``exp(log_ratio)`` times the latter: a closed form."""
+        white, ratio = residual.copy(), float(np.exp(log_ratio))
+        half_log_det = _divide(white, dt_s, excess, (1.0, ratio))
+        squares = float(np.sum(white**2))
+        pose = min(max(squares / count, least_pose, least_rate / ratio), 1.0, 1 / ratio)
+        return 0.5 * squares / pose + 0.5 * count * float(np.log(pose)) + residual.shape[1] * half_log_det, pose
 
-    least = (1e-12, least_rate)  # a microradian: below any camera, above rounding
-    start_logs = np.log(np.maximum(start, least))
-    found = minimize(
-        cost,
-        start_logs,
-        method="Nelder-Mead",
-        bounds=[(np.log(low), 0.0) for low in least],
-        options={"xatol": 0.02, "fatol": 0.02, "maxiter": 80},
-    )
-    return float(np.exp(found.x[0])), float(np.exp(found.x[1]))
+    # All ratios within the bounds, then golden sections about the best one
+    ratios = np.linspace(np.log(least_rate), -np.log(least_pose), 25)
+    costs = [best(ratio)[0] for ratio in ratios]
+    at = int(np.argmin(costs))
+    low, high = float(ratios[max(at - 1, 0)]), float(ratios[min(at + 1, len(ratios) - 1)])
+    golden = 0.5 * (np.sqrt(5) - 1)
+    inner = [high - golden * (high - low), low + golden * (high - low)]
+    values = [best(ratio)[0] for ratio in inner]
+    while high - low > 0.01:
+        if values[0] < values[1]:
+            high, inner[1], values[1] = inner[1], inner[0], values[0]
+            inner[0] = high - golden * (high - low)
+            values[0] = best(inner[0])[0]
+        else:
+            low, inner[0], values[0] = inner[0], inner[1], values[1]
+            inner[1] = low + golden * (high - low)
+            values[1] = best(inner[1])[0]
+    log_ratio = 0.5 * (low + high)
+    pose = best(log_ratio)[1]
+    return pose, max(least_rate, pose * float(np.exp(log_ratio)))
 
 
 def _widened(cov: Array, white_residual: Array, white_jacobian: Array, dt_s: Array) -> Array:

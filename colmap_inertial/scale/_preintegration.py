@@ -10,7 +10,7 @@ Between nodes ``k`` and ``k + 1``, ``T`` apart, with the body frame at node ``k`
 Errors of the rotation are rotation vectors on its left, in the body frame at node ``k``. White gyroscope noise ``n``
 at time ``s`` then acts on the three through ``G(s) = [I, -[V(s)]x, -[P(s)]x]``, where ``V(s)`` and ``P(s)`` are the
 velocity still to come after ``s`` and the position that the force after ``s`` still adds. Covariance and derivatives
-are integrals over ``G``, so that nothing has to be propagated step by step and all intervals are computed at once.
+are integrals over ``G``, so that nothing has to be propagated step by step.
 """
 
 from __future__ import annotations
@@ -21,12 +21,13 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_inertial._kernels import _inertial
 from colmap_inertial.geometry import matrix_from_quat, quat_exp, skew
 from colmap_inertial.types import Array
 
 #: Integration steps: as the samples come, within these. Steps of 5 instead of 2.5 ms change the scale by 0.003 %.
 _SHORTEST_STEP_S, _LONGEST_STEP_S = 0.0025, 0.005
-#: Intervals are integrated in groups of about this many steps: bounds the memory, and fits the cache.
+#: The reference integrates intervals in groups of about this many steps: bounds the memory, and fits the cache.
 _STEPS_AT_ONCE = 4096
 #: A longer pause between samples is a gap: what happened in it is unknown.
 LONGEST_PAUSE_S = 0.06
@@ -177,9 +178,77 @@ def preintegrate(
     accel_delay_s
         Added to the accelerometer's times.
     """
+    nodes_s = np.ascontiguousarray(nodes_s)
+    k, steps = len(nodes_s) - 1, _steps(nodes_s, gyro, accel)
+    shapes = {"rotation": (3, 3), "velocity": (3,), "position": (3,)}
+    shapes |= {"cov_gyro": (9, 9), "by_gyro_bias": (9, 3), "by_accel_bias": (9, 3)}
+    shapes |= {"by_gyro_gain": (9, 9), "by_accel_gain": (9, 9), "by_accel_delay": (9,)}
+    results = {name: np.empty((k, *shape)) for name, shape in shapes.items()}
+    rate_rad_s = np.empty((k + 1, 3))
+    _inertial.preintegrate(
+        nodes_s=nodes_s,
+        steps=steps,
+        gyro_t_s=gyro.t_s,
+        gyro=gyro.value,
+        gyro_slope=gyro.slope,
+        accel_t_s=accel.t_s,
+        accel=accel.value,
+        accel_slope=accel.slope,
+        gyro_bias=gyro_bias_rad_s,
+        accel_bias=accel_bias_m_s2,
+        gyro_matrix=np.eye(3) + gyro_gain,
+        accel_matrix=np.eye(3) + accel_gain,
+        accel_delay_s=accel_delay_s,
+        delay_step_s=DELAY_STEP_S,
+        rate=rate_rad_s,
+        **results,
+    )
+    dt_s = np.diff(nodes_s)
+    return Preintegrated(
+        dt_s=dt_s,
+        cov_accel=_cov_accel(dt_s),
+        cov_gaps=_cov_gaps(nodes_s, gyro, accel, accel_delay_s),
+        rate_rad_s=rate_rad_s,
+        **results,
+    )
+
+
+def _steps(nodes_s: Array, gyro: Track, accel: Track) -> NDArray[np.int64]:
+    """In how many steps each interval is integrated."""
     spacing = min(float(np.median(np.diff(track.t_s))) for track in (gyro, accel))
     step_s = float(np.clip(spacing, _SHORTEST_STEP_S, _LONGEST_STEP_S))
-    steps = np.maximum(np.ceil(np.diff(nodes_s) / step_s).astype(np.intp), 2)
+    return np.maximum(np.ceil(np.diff(nodes_s) / step_s).astype(np.int64), 2)
+
+
+def _cov_accel(dt: Array) -> Array:
+    """(K, 9, 9) covariance for white noise of the accelerometer of density one."""
+    cov = np.zeros((len(dt), 9, 9))
+    for row, col, moment in ((3, 3, dt), (3, 6, dt**2 / 2), (6, 3, dt**2 / 2), (6, 6, dt**3 / 3)):
+        cov[:, row : row + 3, col : col + 3] = moment[:, None, None] * np.eye(3)
+    return cov
+
+
+def _cov_gaps(nodes_s: Array, gyro: Track, accel: Track, accel_delay_s: float) -> Array:
+    """(K, 9, 9) covariance for what gaps between samples hide."""
+    accel_s = nodes_s - accel_delay_s
+    gap = gyro.gap_s(nodes_s[:-1], nodes_s[1:]) + accel.gap_s(accel_s[:-1], accel_s[1:])
+    hidden = np.stack([_GAP_RATE_RAD_S * gap, _GAP_ACCEL_M_S2 * gap, _GAP_ACCEL_M_S2 * gap * np.diff(nodes_s)], axis=1)
+    return np.asarray(np.repeat(hidden**2, 3, axis=1)[:, :, None] * np.eye(9))
+
+
+def preintegrate_reference(
+    nodes_s: Array,
+    gyro: Track,
+    accel: Track,
+    *,
+    gyro_bias_rad_s: Array,
+    accel_bias_m_s2: Array,
+    gyro_gain: Array,
+    accel_gain: Array,
+    accel_delay_s: float = 0.0,
+) -> Preintegrated:
+    """As :func:`preintegrate`, in numpy."""
+    steps = _steps(nodes_s, gyro, accel)
     group = np.cumsum(steps) // _STEPS_AT_ONCE
     cuts = [0, *(np.flatnonzero(np.diff(group)) + 1).tolist(), len(steps)]
     parts = [
@@ -204,7 +273,7 @@ def preintegrate(
 
 def _integrate(
     nodes_s: Array,
-    steps: NDArray[np.intp],
+    steps: NDArray[np.int64],
     gyro: Track,
     accel: Track,
     *,
@@ -262,12 +331,6 @@ def _integrate(
     g[:, 6:] = -skew(position_to_come)
     g_body = g @ rotation
     k = len(dt)
-    cov_accel = np.zeros((k, 9, 9))
-    for row, col, moment in ((3, 3, dt), (3, 6, dt**2 / 2), (6, 3, dt**2 / 2), (6, 6, dt**3 / 3)):
-        cov_accel[:, row : row + 3, col : col + 3] = moment[:, None, None] * np.eye(3)
-    gap = gyro.gap_s(nodes_s[:-1], nodes_s[1:]) + accel.gap_s(nodes_s[:-1] - accel_delay_s, nodes_s[1:] - accel_delay_s)
-    hidden = np.stack([_GAP_RATE_RAD_S * gap, _GAP_ACCEL_M_S2 * gap, _GAP_ACCEL_M_S2 * gap * dt], axis=1)
-    cov_gaps = np.repeat(hidden**2, 3, axis=1)[:, :, None] * np.eye(9)
     by_accel_bias = np.zeros((k, 9, 3))
     by_accel_bias[:, 3:6] = -total(rotation)
     by_accel_bias[:, 6:] = -total(left[:, None, None] * rotation)
@@ -285,8 +348,8 @@ def _integrate(
         velocity=velocity[end],
         position=position[end],
         cov_gyro=total(g @ g.transpose(0, 2, 1)),
-        cov_accel=cov_accel,
-        cov_gaps=cov_gaps,
+        cov_accel=_cov_accel(dt),
+        cov_gaps=_cov_gaps(nodes_s, gyro, accel, accel_delay_s),
         by_gyro_bias=-total(g_body),
         by_accel_bias=by_accel_bias,
         by_gyro_gain=total((g_body[:, :, :, None] * reading[:, None, None, :]).reshape(-1, 9, 9)),

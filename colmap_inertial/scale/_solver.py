@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from colmap_inertial._kernels import _inertial
 from colmap_inertial.types import Array
 
 _STATES_AT_ONCE = 64
@@ -60,11 +61,23 @@ class ArrowSystem:
         numpy.linalg.LinAlgError
             When the matrix is not positive definite.
         """
+        unit, rhs = self._scaling(rhs_states)
+        n, q = len(self.corner), rhs.shape[2]
+        products = np.empty((n, n + q))
+        factor = _inertial.eliminate(self.diagonal, self.below, self.border, rhs_states, unit, products)
+        if factor is None:
+            raise np.linalg.LinAlgError("the normal equations are singular")
+        x_globals, cov = self._solve_globals(products, rhs_globals)
+        rest = np.ascontiguousarray(rhs - (self.border @ x_globals) * unit[:, :, None])
+        factor.substitute(rest)
+        return rest * unit[:, :, None], x_globals, cov
+
+    def solve_reference(self, rhs_states: Array, rhs_globals: Array) -> tuple[Array, Array, Array]:
+        """As :meth:`solve`, by LAPACK's routines for banded matrices."""
         from scipy.linalg import cho_solve_banded, cholesky_banded
 
+        unit, rhs = self._scaling(rhs_states)
         k, m, n = self.border.shape
-        # Unit diagonal: radians, metres and bias walks differ by many orders of magnitude
-        unit = 1 / np.sqrt(np.diagonal(self.diagonal, axis1=1, axis2=2))
         band = np.zeros((2 * m, k, m))
         diagonal = self.diagonal * unit[:, :, None] * unit[:, None, :]
         below = self.below * unit[1:, :, None] * unit[:-1, None, :]
@@ -72,15 +85,30 @@ class ArrowSystem:
             band[: m - j, :, j] = diagonal[:, j:, j].T
             band[m - j : 2 * m - j, :-1, j] = below[:, :, j].T
         band = band.reshape(2 * m, k * m)
-        if not np.isfinite(band[0]).all():
-            raise np.linalg.LinAlgError("the normal equations are not finite")
         factor = cholesky_banded(band, lower=True, overwrite_ab=True, check_finite=False)
-        rhs = rhs_states * unit[:, :, None]
         # Only products of the border with itself and the right-hand sides are needed, so that the border is never
         # solved for as a whole: with H = L L', they are those of L^-1 border
         products = np.zeros((n, n + rhs.shape[2]))
         for whitened in _forward(factor, self.border, rhs, unit):
             products += whitened[:, :n].T @ whitened
+        x_globals, cov = self._solve_globals(products, rhs_globals)
+        rest = rhs - (self.border @ x_globals) * unit[:, :, None]
+        x_states = cho_solve_banded((factor, True), rest.reshape(k * m, -1), check_finite=False)
+        return x_states.reshape(k, m, -1) * unit[:, :, None], x_globals, cov
+
+    def _scaling(self, rhs_states: Array) -> tuple[Array, Array]:
+        """What makes the diagonal one, and the right-hand sides multiplied by it.
+
+        Radians, metres and bias walks differ by many orders of magnitude.
+        """
+        unit = 1 / np.sqrt(np.diagonal(self.diagonal, axis1=1, axis2=2))
+        if not (np.isfinite(unit).all() and (unit > 0).all()):
+            raise np.linalg.LinAlgError("the normal equations are not finite")
+        return unit, rhs_states * unit[:, :, None]
+
+    def _solve_globals(self, products: Array, rhs_globals: Array) -> tuple[Array, Array]:
+        """The globals and their covariance, from the products of ``L^-1 border`` with ``L^-1 [border, rhs]``."""
+        n = len(self.corner)
         schur = self.corner - products[:, :n]
         schur = 0.5 * (schur + schur.T)
         spread = np.diagonal(schur)
@@ -89,10 +117,7 @@ class ArrowSystem:
         spread = 1 / np.sqrt(spread)
         inverse = np.linalg.inv(np.linalg.cholesky(schur * spread[:, None] * spread))
         cov = (inverse.T @ inverse) * spread[:, None] * spread
-        x_globals = cov @ (rhs_globals - products[:, n:])
-        rest = rhs - (self.border @ x_globals) * unit[:, :, None]
-        x_states = cho_solve_banded((factor, True), rest.reshape(k * m, -1), check_finite=False)
-        return x_states.reshape(k, m, -1) * unit[:, :, None], x_globals, cov
+        return cov @ (rhs_globals - products[:, n:]), cov
 
 
 def _forward(factor: Array, border: Array, rhs: Array, unit: Array) -> Iterator[Array]:

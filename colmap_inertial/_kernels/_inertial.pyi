@@ -1,0 +1,65 @@
+"""Linear algebra and integration of `colmap_inertial.scale` and `.align`. Results are written in place."""
+
+from numpy import int64
+from numpy.typing import NDArray
+
+from colmap_inertial.types import Array
+
+class ArrowFactor:
+    """Cholesky factor of a chain of states."""
+
+    def substitute(self, sides: Array) -> None:
+        """Solve for `sides` (K, m, q) in place; the matrix is the one with its rows and columns scaled by `unit`."""
+
+def eliminate(
+    diagonal: Array,
+    below: Array,
+    border: Array,
+    rhs: Array,
+    unit: Array,
+    products: Array,
+    *,
+    instruction_set: str = "",
+) -> ArrowFactor | None:
+    """Factor H = L L' of a chain with `unit`'s scaling; None where it is not positive definite.
+
+    `products` (n, n + q) becomes the product of L^-1 border (transposed) with L^-1 [border, rhs].
+    """
+
+def preintegrate(
+    *,
+    nodes_s: Array,
+    steps: NDArray[int64],
+    gyro_t_s: Array,
+    gyro: Array,
+    gyro_slope: Array,
+    accel_t_s: Array,
+    accel: Array,
+    accel_slope: Array,
+    gyro_bias: Array,
+    accel_bias: Array,
+    gyro_matrix: Array,
+    accel_matrix: Array,
+    accel_delay_s: float,
+    delay_step_s: float,
+    rotation: Array,
+    velocity: Array,
+    position: Array,
+    cov_gyro: Array,
+    by_gyro_bias: Array,
+    by_accel_bias: Array,
+    by_gyro_gain: Array,
+    by_accel_gain: Array,
+    by_accel_delay: Array,
+    rate: Array,
+) -> None:
+    """Increments over K intervals, each in its number of steps, as `Preintegrated` describes them."""
+
+def whiten_tridiagonal(diagonal: Array, below: Array, sides: Array) -> float:
+    """Divide `sides` (N, c) by the Cholesky factor of a tridiagonal matrix; half the logarithm of its determinant.
+
+    The latter is nan where the matrix is not positive definite.
+    """
+
+def instruction_sets() -> list[str]:
+    """Those that this processor has, the best one last."""

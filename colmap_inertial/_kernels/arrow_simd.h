@@ -1,0 +1,40 @@
+// A chain of states with a few globals, as `ArrowSystem` in scale/_solver.py has it: what depends on the instruction
+// set. Rows of all matrices here are padded to multiples of PAD columns.
+#pragma once
+
+#include <stddef.h>
+
+constexpr ptrdiff_t PAD = 8;
+
+constexpr ptrdiff_t padded(ptrdiff_t columns) { return (columns + PAD - 1) / PAD * PAD; }
+
+struct Chain {
+    ptrdiff_t states, size, globals, sides;  // K, m, n, q
+    const double *diagonal;                  // (K, m, m), of which the lower triangles are read
+    const double *below;                     // (K - 1, m, m)
+    const double *border;                    // (K, m, n)
+    const double *rhs;                       // (K, m, q)
+    const double *unit;                      // (K, m), by which rows and columns are multiplied
+};
+
+// H = U' U: upper triangles on the diagonal, and full blocks to the right of them.
+struct Factor {
+    double *diagonal;  // (K, m, padded(m))
+    double *right;     // (K, m, padded(m)), of which the last is not used
+};
+
+struct ArrowSimd {
+    const char *name;
+    // Doubles of memory, aligned to 64 bytes, that eliminate needs.
+    size_t (*work)(const Chain &chain);
+    // Factors the chain and subtracts the products of U'^-1 border with U'^-1 [border, rhs] from `products`
+    // (n, padded(n + q)), of whose first n columns only the upper triangle is right. False where a pivot is not
+    // positive.
+    bool (*eliminate)(const Chain &chain, const Factor &factor, double *products, double *work);
+    // Solves U' U x = b in place: (K, m, padded(q)).
+    void (*substitute)(const Chain &chain, const Factor &factor, double *x);
+};
+
+extern const ArrowSimd arrow_base;
+extern const ArrowSimd arrow_avx2;
+extern const ArrowSimd arrow_avx512;

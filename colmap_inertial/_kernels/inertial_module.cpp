@@ -1,0 +1,201 @@
+#include "arrow_simd.h"
+#include "dispatch.h"
+#include "preintegration.h"
+
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
+
+#include <cmath>
+#include <cstdlib>
+#include <limits>
+#include <memory>
+#include <new>
+#include <stdexcept>
+#include <vector>
+
+namespace nb = nanobind;
+
+namespace {
+
+template <class T, int N>
+using Of = nb::ndarray<T, nb::ndim<N>, nb::c_contig, nb::device::cpu>;
+template <int N>
+using In = Of<const double, N>;
+template <int N>
+using Out = Of<double, N>;
+
+void check(bool holds, const char *message) {
+    if (!holds) throw std::invalid_argument(message);
+}
+
+template <class Array, class... Sizes>
+bool is(const Array &array, Sizes... sizes) {
+    size_t axis = 0;
+    return (... && (array.shape(axis++) == size_t(sizes)));
+}
+
+const ArrowSimd *arrow_named(const std::string &name) {
+#if defined(COLMAP_INERTIAL_X86_64)
+    return named(name.c_str(), arrow_base, &arrow_avx2, &arrow_avx512);
+#else
+    return named<ArrowSimd>(name.c_str(), arrow_base, nullptr, nullptr);
+#endif
+}
+
+struct Free {
+    void operator()(void *memory) const { std::free(memory); }
+};
+using Memory = std::unique_ptr<double, Free>;
+
+// On a boundary of cache lines, not initialised.
+Memory memory_for(size_t doubles) {
+    void *memory = std::aligned_alloc(64, (doubles * sizeof(double) + 63) / 64 * 64 + 64);
+    if (!memory) throw std::bad_alloc();
+    return Memory(static_cast<double *>(memory));
+}
+
+class ArrowFactor {
+   public:
+    ArrowFactor(const Chain &chain, const ArrowSimd &simd)
+        : chain_(chain),
+          simd_(simd),
+          diagonal_(memory_for(size_t(chain.states * chain.size * padded(chain.size)))),
+          right_(memory_for(size_t(chain.states * chain.size * padded(chain.size)))) {}
+
+    Factor factor() const { return {diagonal_.get(), right_.get()}; }
+
+    void substitute(Out<3> sides) const {
+        check(is(sides, chain_.states, chain_.size, sides.shape(2)), "sides: not one row for each number of a state");
+        Chain chain = chain_;
+        chain.sides = ptrdiff_t(sides.shape(2));
+        const ptrdiff_t rows = chain.states * chain.size, q = chain.sides, pitch = padded(q);
+        double *values = sides.data();
+        nb::gil_scoped_release release;
+        const Memory x = memory_for(size_t(rows * pitch));
+        for (ptrdiff_t i = 0; i < rows; ++i)
+            for (ptrdiff_t j = 0; j < pitch; ++j) x.get()[i * pitch + j] = j < q ? values[i * q + j] : 0;
+        simd_.substitute(chain, factor(), x.get());
+        for (ptrdiff_t i = 0; i < rows; ++i)
+            for (ptrdiff_t j = 0; j < q; ++j) values[i * q + j] = x.get()[i * pitch + j];
+    }
+
+   private:
+    Chain chain_;  // its sizes
+    const ArrowSimd &simd_;
+    Memory diagonal_, right_;
+};
+
+// Null where the chain is not positive definite.
+std::unique_ptr<ArrowFactor> eliminate(const Chain &chain, const ArrowSimd &simd, double *products) {
+    auto result = std::make_unique<ArrowFactor>(chain, simd);
+    const ptrdiff_t n = chain.globals, columns = n + chain.sides, pitch = padded(columns);
+    const Memory work = memory_for(simd.work(chain));
+    std::vector<double> negative(size_t(n * pitch), 0.0);
+    if (!simd.eliminate(chain, result->factor(), negative.data(), work.get())) return nullptr;
+    for (ptrdiff_t i = 0; i < n; ++i)
+        for (ptrdiff_t j = 0; j < columns; ++j)
+            products[i * columns + j] = -negative[size_t(j < i ? j * pitch + i : i * pitch + j)];
+    return result;
+}
+
+ArrowFactor *eliminate_chain(In<3> diagonal, In<3> below, In<3> border, In<3> rhs, In<2> unit, Out<2> products,
+                             const std::string &instruction_set) {
+    const size_t k = border.shape(0), m = border.shape(1), n = border.shape(2), q = rhs.shape(2);
+    check(k > 0 && m > 0, "border: empty");
+    check(is(diagonal, k, m, m) && is(below, k - 1, m, m) && is(rhs, k, m, q) && is(unit, k, m),
+          "diagonal, below, rhs, unit: not of the size of border");
+    check(is(products, n, n + q), "products: not (n, n + q)");
+    const ArrowSimd *simd = arrow_named(instruction_set);
+    check(simd != nullptr, "instruction_set: unknown, or this processor lacks it");
+    const Chain chain{ptrdiff_t(k), ptrdiff_t(m), ptrdiff_t(n), ptrdiff_t(q), diagonal.data(), below.data(),
+                      border.data(), rhs.data(), unit.data()};
+    double *values = products.data();
+    nb::gil_scoped_release release;
+    return eliminate(chain, *simd, values).release();
+}
+
+void preintegrate_intervals(In<1> nodes_s, Of<const int64_t, 1> steps, In<1> gyro_t_s, In<2> gyro, In<2> gyro_slope,
+                            In<1> accel_t_s, In<2> accel, In<2> accel_slope, In<2> gyro_bias, In<2> accel_bias,
+                            In<2> gyro_matrix, In<2> accel_matrix, double accel_delay_s, double delay_step_s,
+                            Out<3> rotation, Out<2> velocity, Out<2> position, Out<3> cov_gyro, Out<3> by_gyro_bias,
+                            Out<3> by_accel_bias, Out<3> by_gyro_gain, Out<3> by_accel_gain, Out<2> by_accel_delay,
+                            Out<2> rate) {
+    const size_t k = steps.shape(0), n = gyro_t_s.shape(0), a = accel_t_s.shape(0);
+    check(k > 0 && is(nodes_s, k + 1), "nodes_s, steps: not the ends of intervals");
+    for (size_t i = 0; i < k; ++i) check(steps.data()[i] > 0, "steps: must be positive");
+    check(n > 1 && is(gyro, n, 3) && is(gyro_slope, n, 3), "gyro: not (N, 3), or too short");
+    check(a > 1 && is(accel, a, 3) && is(accel_slope, a, 3), "accel: not (N, 3), or too short");
+    check(is(gyro_bias, k, 3) && is(accel_bias, k, 3), "gyro_bias, accel_bias: not one for each interval");
+    check(is(gyro_matrix, 3, 3) && is(accel_matrix, 3, 3), "gyro_matrix, accel_matrix: not (3, 3)");
+    check(is(rotation, k, 3, 3) && is(velocity, k, 3) && is(position, k, 3) && is(cov_gyro, k, 9, 9) &&
+              is(by_gyro_bias, k, 9, 3) && is(by_accel_bias, k, 9, 3) && is(by_gyro_gain, k, 9, 9) &&
+              is(by_accel_gain, k, 9, 9) && is(by_accel_delay, k, 9) && is(rate, k + 1, 3),
+          "results: not of the size of the intervals");
+    const Track gyro_track{n, gyro_t_s.data(), gyro.data(), gyro_slope.data()};
+    const Track accel_track{a, accel_t_s.data(), accel.data(), accel_slope.data()};
+    const Intervals intervals{k,
+                              nodes_s.data(),
+                              steps.data(),
+                              gyro_bias.data(),
+                              accel_bias.data(),
+                              gyro_matrix.data(),
+                              accel_matrix.data(),
+                              accel_delay_s,
+                              delay_step_s};
+    const Increments out{rotation.data(),      velocity.data(),       position.data(),     cov_gyro.data(),
+                         by_gyro_bias.data(),  by_accel_bias.data(),  by_gyro_gain.data(), by_accel_gain.data(),
+                         by_accel_delay.data(), rate.data()};
+    nb::gil_scoped_release release;
+    preintegrate(gyro_track, accel_track, intervals, out);
+}
+
+// Divides `sides` by the Cholesky factor of a tridiagonal matrix; returns half the logarithm of its determinant.
+double whiten_tridiagonal(In<1> diagonal, In<1> below, Out<2> sides) {
+    const size_t n = diagonal.shape(0), columns = sides.shape(1);
+    check(n > 0 && is(below, n - 1) && is(sides, n, columns), "diagonal, below, sides: not of one size");
+    const double *d = diagonal.data(), *b = below.data();
+    double *x = sides.data();
+    nb::gil_scoped_release release;
+    double logarithm = 0, root = 0;
+    for (size_t i = 0; i < n; ++i, x += columns) {
+        const double left = i > 0 ? b[i - 1] / root : 0, pivot = d[i] - left * left;
+        if (!(pivot > 0)) return std::numeric_limits<double>::quiet_NaN();
+        root = std::sqrt(pivot);
+        logarithm += std::log(root);
+        for (size_t c = 0; c < columns; ++c) {
+            const double before = i > 0 ? left * *(x + c - columns) : 0;
+            x[c] = (x[c] - before) / root;
+        }
+    }
+    return logarithm;
+}
+
+std::vector<std::string> instruction_sets() {
+    std::vector<std::string> names;
+    for (const char *name : {"base", "avx2", "avx512"})
+        if (arrow_named(name)) names.emplace_back(name);
+    return names;
+}
+
+}  // namespace
+
+NB_MODULE(_inertial, module) {
+    nb::class_<ArrowFactor>(module, "ArrowFactor")
+        .def("substitute", &ArrowFactor::substitute, nb::arg("sides").noconvert());
+    module.def("eliminate", &eliminate_chain, nb::rv_policy::take_ownership, nb::arg("diagonal"), nb::arg("below"),
+               nb::arg("border"), nb::arg("rhs"), nb::arg("unit"), nb::arg("products").noconvert(), nb::kw_only(),
+               nb::arg("instruction_set") = "");
+    module.def("preintegrate", &preintegrate_intervals, nb::kw_only(), nb::arg("nodes_s"), nb::arg("steps"),
+               nb::arg("gyro_t_s"), nb::arg("gyro"), nb::arg("gyro_slope"), nb::arg("accel_t_s"), nb::arg("accel"),
+               nb::arg("accel_slope"), nb::arg("gyro_bias"), nb::arg("accel_bias"), nb::arg("gyro_matrix"),
+               nb::arg("accel_matrix"), nb::arg("accel_delay_s"), nb::arg("delay_step_s"),
+               nb::arg("rotation").noconvert(), nb::arg("velocity").noconvert(), nb::arg("position").noconvert(),
+               nb::arg("cov_gyro").noconvert(), nb::arg("by_gyro_bias").noconvert(),
+               nb::arg("by_accel_bias").noconvert(), nb::arg("by_gyro_gain").noconvert(),
+               nb::arg("by_accel_gain").noconvert(), nb::arg("by_accel_delay").noconvert(), nb::arg("rate").noconvert());
+    module.def("whiten_tridiagonal", &whiten_tridiagonal, nb::arg("diagonal"), nb::arg("below"),
+               nb::arg("sides").noconvert());
+    module.def("instruction_sets", &instruction_sets);
+}
