@@ -28,10 +28,11 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import imaging_baselines as baselines
+import imaging_colmap
 import imaging_cost
 import imaging_shutter
 import numpy as np
@@ -54,6 +55,7 @@ SHARP_S = 0.0002
 #: As many frames judge a recording, the most blurred ones.
 JUDGED = 14
 console = Console(stderr=True)
+T = TypeVar("T")
 
 
 def main() -> None:
@@ -78,22 +80,24 @@ def main() -> None:
         walls = photographed_walls(args.photos, scenes, args.seed)
         native = native_walls(args.photos, scenes, args.seed)
         kinds = {"photographs": (walls, SIZE), "whole photographs": (native, None)}
-    report: dict[str, Any] = {"about": about(args)}
-    report["quality"] = {
-        kind: {f"{blur:g}": quality(wall, size, blur, args.seed, kind) for blur in blurs}
-        for kind, (wall, size) in kinds.items()
+    sections: dict[str, Callable[[], Any]] = {
+        "quality": lambda: {
+            kind: {f"{blur:g}": quality(wall, size, blur, args.seed, kind) for blur in blurs}
+            for kind, (wall, size) in kinds.items()
+        },
+        "other_ways_20_px": lambda: other_ways(make_pairs(walls[:compared], 20.0, size=SIZE, seed=args.seed)),
+        "cost": lambda: imaging_cost.measure(make_pairs(walls[:1], 20.0, size=SIZE, seed=args.seed)[0]),
+        "false_blur_10_px": lambda: false_blur(make_pairs(walls[:compared], 10.0, size=SIZE, seed=args.seed)),
+        "rolling_shutter": lambda: imaging_shutter.two_views(20, args.seed),
     }
-    report["other_ways_20_px"] = other_ways(make_pairs(walls[:compared], 20.0, size=SIZE, seed=args.seed))
-    report["cost"] = imaging_cost.measure(make_pairs(walls[:1], 20.0, size=SIZE, seed=args.seed)[0])
-    report["false_blur_10_px"] = false_blur(make_pairs(walls[:compared], 10.0, size=SIZE, seed=args.seed))
-    report["rolling_shutter"] = imaging_shutter.two_views(20, args.seed)
     if args.colmap:
-        import imaging_colmap
-
-        report["colmap"] = imaging_colmap.measure(quick=args.quick, console=console)
-    report["about"]["cpu_s"] = round(time.process_time() - start)
-    if args.json:
-        args.json.write_text(json.dumps(report, indent=2) + "\n")
+        sections["colmap"] = lambda: imaging_colmap.measure(quick=args.quick, console=console)
+    report: dict[str, Any] = {"about": about(args)}
+    for name, section in sections.items():
+        report[name] = section()
+        report["about"]["cpu_s"] = round(time.process_time() - start)
+        if args.json:
+            args.json.write_text(json.dumps(report, indent=2) + "\n")
     print_report(report, Console())
 
 
@@ -117,6 +121,11 @@ def about(args: argparse.Namespace) -> dict[str, Any]:
 def _cpu_lines() -> list[str]:
     path = Path("/proc/cpuinfo")
     return path.read_text().splitlines() if path.exists() else []
+
+
+def flat(pairs: Sequence[Sequence[T]]) -> list[T]:
+    """Both of each pair in one list."""
+    return [one for pair in pairs for one in pair]
 
 
 def features_of(images: Sequence[Grey]) -> list[Features]:
@@ -159,7 +168,7 @@ def quality(
     pairs = make_pairs(walls, blur_px, size=size, seed=seed)
     frames = [[pair.frame(i) for i in (0, 1)] for pair in pairs]
     blurs = [[pair.blur(i) for i in (0, 1)] for pair in pairs]
-    verdict = verdict_on(sum(frames, []), sum(blurs, []))
+    verdict = verdict_on(flat(frames), flat(blurs))
     rows: dict[str, list[dict[str, float]]] = {"nothing": [], "gated": []}
     kept, deblurred = [], 0
     for pair, images, fields in track(
@@ -189,7 +198,7 @@ def other_ways(pairs: Sequence[Pair]) -> dict[str, Any]:
     """The gated default, the filter without the gate, and what others do, on the same frames."""
     frames = [[pair.frame(i) for i in (0, 1)] for pair in pairs]
     blurs = [[pair.blur(i) for i in (0, 1)] for pair in pairs]
-    verdict = verdict_on(sum(frames, []), sum(blurs, []))
+    verdict = verdict_on(flat(frames), flat(blurs))
     ways: dict[str, Callable[[Grey, BlurField], Grey]] = {
         "nothing": lambda image, _: image,
         "gated": lambda image, blur: deblur_gated(image, blur, recording=verdict).image,
@@ -212,17 +221,17 @@ def false_blur(pairs: Sequence[Pair]) -> dict[str, Any]:
     """Correct matches of the gated default with a wrong gyroscope, as a share of those of doing nothing."""
     frames = [[pair.frame(i) for i in (0, 1)] for pair in pairs]
     before = [correct_matches(pair, *features_of(two))[0] for pair, two in zip(pairs, frames, strict=True)]
-    trusted = verdict_on(sum(frames, []), [pair.blur(i) for pair in pairs for i in (0, 1)])
+    trusted = verdict_on(flat(frames), [pair.blur(i) for pair in pairs for i in (0, 1)])
     out: dict[str, Any] = {}
     for error in track(("", *ERRORS), "false blur", console=console):
         fields = [[pair.blur(i, error) for i in (0, 1)] for pair in pairs]
-        verdict = verdict_on(sum(frames, []), sum(fields, []))
+        verdict = verdict_on(flat(frames), flat(fields))
         out[error or "none"] = kept_share(pairs, frames, fields, verdict, before)
     short = [_sharp_pair(pair) for pair in pairs]
     frames = [[pair.frame(i) for i in (0, 1)] for pair in short]
     before = [correct_matches(pair, *features_of(two))[0] for pair, two in zip(short, frames, strict=True)]
     fields = [[pair.blur(i) for i in (0, 1)] for pair in pairs]
-    alone = verdict_on(sum(frames, []), sum(fields, []))
+    alone = verdict_on(flat(frames), flat(fields))
     out["sharp recording"] = kept_share(short, frames, fields, alone, before)
     out["sharp frames among blurred ones"] = kept_share(short, frames, fields, trusted, before)
     return out

@@ -23,7 +23,8 @@ from colmap_inertial.types import Array
 BLOCK_PX = 64
 #: Blocks of the iterative method, and what surrounds a block when it is transformed.
 LARGE_BLOCK_PX, AROUND_PX = 192, 32
-NOISE_TO_SIGNAL = 0.01
+#: Best of 0.01, 0.03, 0.1 for both Wiener filters, by PSNR at 10 and 20 px and 1 % noise; so is the window.
+NOISE_TO_SIGNAL = 0.03
 ITERATIONS = 10
 #: Vectors are rounded to this, so that kernels can be kept.
 STEP_PX = 0.25
@@ -55,12 +56,14 @@ def line(vector_px: tuple[float, float]) -> Light:
 
 @lru_cache(maxsize=4096)
 def wiener_kernel(vector_px: tuple[float, float]) -> Light:
-    """The 2-D Wiener filter of the published schemes, cut to twice the size of the point spread function."""
+    """The 2-D Wiener filter of the published schemes, cut by a window to three times the point spread function."""
     spread = line(vector_px)
-    n, reach = 4 * spread.shape[0] + 1, spread.shape[0]
+    n, reach = scipy.fft.next_fast_len(8 * spread.shape[0]) | 1, 3 * spread.shape[0] // 2
     spectrum = np.fft.fft2(np.fft.ifftshift(np.pad(spread, (n - spread.shape[0]) // 2)))
     inverse = np.fft.fftshift(np.fft.ifft2(np.conj(spectrum) / (np.abs(spectrum) ** 2 + NOISE_TO_SIGNAL)).real)
     kernel = inverse[n // 2 - reach : n // 2 + reach + 1, n // 2 - reach : n // 2 + reach + 1]
+    window = np.hanning(2 * reach + 3)[1:-1]
+    kernel = kernel * window * window[:, None]
     return np.asarray(kernel / kernel.sum(), dtype=np.float32)
 
 
