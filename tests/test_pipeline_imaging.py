@@ -24,7 +24,7 @@ from colmap_inertial.pipeline.imaging import plan_imaging, read_plan, with_state
 from colmap_inertial.pipeline.metadata import carry_metadata, stated_exposures_s
 from colmap_inertial.simulate import MotionOptions, make_motion
 
-QUICK = ReconstructOptions(mapping=MappingOptions(max_num_features=2000, first_octave=0))
+QUICK = ReconstructOptions(mapping=MappingOptions(max_num_features=2000, first_octave=0), deterministic=True)
 OFF = replace(QUICK, deblur="off", rolling_shutter="off")
 
 
