@@ -29,8 +29,8 @@ WAYS = {
 
 def measure(*, quick: bool, console: Console) -> dict[str, Any]:
     """A lively desk with 10 px of blur and 20 ms readout, and one with so much blur that frames are lost."""
-    duration_s = 6.0 if quick else 16.0
-    motion = MotionOptions(kind="orbit", duration_s=duration_s, vigour=0.8, sweep_s=16.0, arc_deg=120.0)
+    duration_s = 6.0 if quick else 12.0
+    motion = MotionOptions(kind="orbit", duration_s=duration_s, vigour=0.8, sweep_s=16.0, arc_deg=130.0)
     base = SceneRecipe(seed=4, frame_rate_hz=2.5, quality=95, motion=motion)
     base = replace(base, camera=replace(base.camera, readout_s=0.02, white_electrons=10000.0))
     scenes = {"10 px": (base, 10.0), "heavy blur": (replace(base, seed=5), 28.0)}

@@ -38,6 +38,15 @@ class Features:
     descriptors: NDArray[np.float32]
 
 
+_first_octave = -1
+
+
+def set_first_octave(octave: int) -> None:
+    """For all that follows: -1 is COLMAP's default, 0 leaves out the octave at twice the image's size."""
+    global _first_octave
+    _first_octave = octave
+
+
 @lru_cache
 def _extractor(first_octave: int) -> Any:
     import zlib  # noqa: F401  (before pycolmap: both bring a copy)
@@ -54,9 +63,9 @@ def _extractor(first_octave: int) -> Any:
         return pycolmap.Sift(options, pycolmap.Device.cpu)
 
 
-def extract(image: Grey, first_octave: int = -1) -> Features:
-    """COLMAP's SIFT; at its defaults unless told to leave out the octave at twice the size."""
-    keypoints, descriptors = _extractor(first_octave).extract(image)
+def extract(image: Grey, first_octave: int | None = None) -> Features:
+    """COLMAP's SIFT at its defaults, but for the first octave (`set_first_octave`)."""
+    keypoints, descriptors = _extractor(_first_octave if first_octave is None else first_octave).extract(image)
     points = np.asarray(keypoints[:, :2], dtype=np.float64)
     size = np.array(image.shape[::-1])
     inside = ((points > BORDER_PX) & (points < size - BORDER_PX)).all(axis=1)

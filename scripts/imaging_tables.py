@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
@@ -43,7 +44,7 @@ def _quality(kind: str, by_blur: dict[str, Any], console: Console) -> None:
     table = _table(
         f"Quality, {kind}: nothing -> gated default",
         *("blur px", "median", "deblurred", "correct matches", "ratio", "wanted"),
-        *("repeatability", "localisation px", "PSNR dB", "SSIM"),
+        *("least, median, most", "repeatability", "localisation px", "PSNR dB", "SSIM"),
     )
     for blur, row in by_blur.items():
         a, b = row["nothing"], row["gated"]
@@ -54,6 +55,7 @@ def _quality(kind: str, by_blur: dict[str, Any], console: Console) -> None:
             f"{a['correct']:.0f} -> {b['correct']:.0f}",
             f"{row['ratio']:.2f}",
             verdict(row["ratio"], MATCHES_WANTED[blur]) if blur in MATCHES_WANTED else "",
+            ", ".join(f"{r:.2f}" for r in np.percentile(row["ratio_of_each_scene"], [0, 50, 100])),
             f"{a['repeatability']:.3f} -> {b['repeatability']:.3f}",
             f"{a['localisation_px']:.3f} -> {b['localisation_px']:.3f}",
             f"{a['psnr_db']:.2f} -> {b['psnr_db']:.2f}",
