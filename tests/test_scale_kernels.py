@@ -83,6 +83,35 @@ def test_every_instruction_set_eliminates_and_substitutes_alike(instruction_set,
     assert close(sides.reshape(k * m, q), np.linalg.solve(dense, scaled))
 
 
+@pytest.mark.parametrize("instruction_set", ["", *_inertial.instruction_sets()])
+@pytest.mark.parametrize(
+    ("rows", "with_after", "n_globals"), [(9, True, 28), (3, False, 79), (3, True, 0), (1, False, 5)], ids=str
+)
+def test_information_of_residuals_is_added_as_by_numpy(instruction_set, rows, with_after, n_globals):
+    rng = np.random.default_rng(8)
+    states, size, first, column = 37, 18, 2, 3
+    here, after = rng.standard_normal((2, states, rows, size))
+    z = rng.standard_normal((states, rows, n_globals)) if n_globals else None
+    system, truth = (random_system(np.random.default_rng(9), 40, size, n_globals + 4) for _ in range(2))
+    arguments = (here, after if with_after else None, z)
+    if instruction_set:
+        blocks = {name: getattr(system, name) for name in ("diagonal", "below", "border", "corner")}
+        _inertial.add_information(*arguments, first=first, column=column, **blocks, instruction_set=instruction_set)
+    else:
+        system.add(*arguments, first=first, column=column)
+    truth.add_reference(*arguments, first=first, column=column)
+    for name in ("diagonal", "below", "border", "corner"):
+        assert close(getattr(system, name), getattr(truth, name), 1e-14), name
+
+
+def test_residuals_beyond_the_chain_are_rejected():
+    system = ArrowSystem.zeros(3, 4, 2)
+    here = np.ones((3, 1, 4))
+    for after, first, column, z in ((here, 0, 0, None), (None, 1, 0, None), (None, 0, 1, np.ones((3, 1, 2)))):
+        with pytest.raises(ValueError, match="beyond"):
+            system.add(here, after, z, first=first, column=column)
+
+
 @pytest.mark.parametrize("solve", [ArrowSystem.solve, ArrowSystem.solve_reference])
 def test_systems_that_determine_too_little_raise(solve):
     rng = np.random.default_rng(2)

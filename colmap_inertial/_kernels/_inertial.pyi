@@ -26,6 +26,25 @@ def eliminate(
     `products` (n, n + q) becomes the product of L^-1 border (transposed) with L^-1 [border, rhs].
     """
 
+def add_information(
+    here: Array,
+    after: Array | None,
+    by_globals: Array | None,
+    *,
+    first: int,
+    column: int,
+    diagonal: Array,
+    below: Array,
+    border: Array,
+    corner: Array,
+    instruction_set: str = "",
+) -> None:
+    """Add the products of the derivatives of residuals (N, r) to a chain's blocks.
+
+    `here`, `after` (N, r, m): by the states `first ..` and the ones after them; `by_globals` (N, r, g): by the globals
+    `column ..`.
+    """
+
 def preintegrate(
     *,
     nodes_s: Array,

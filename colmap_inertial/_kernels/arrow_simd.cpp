@@ -68,7 +68,13 @@ inline void subtract_rows(double *c, ptrdiff_t c_row, const Matrix &a, const dou
     ptrdiff_t j = 0;
     for (; j + VECTORS * LANES <= columns; j += VECTORS * LANES)
         subtract_tile<R, VECTORS>(c + j, c_row, a, b + j, b_row, inner);
-    for (; j < columns; j += LANES) subtract_tile<R, 1>(c + j, c_row, a, b + j, b_row, inner);
+    // What is left, in one piece: fewer vectors at a time would wait for the loads of `a`
+    const ptrdiff_t left = (columns - j) / LANES;
+    if (left == 1) subtract_tile<R, 1>(c + j, c_row, a, b + j, b_row, inner);
+    if constexpr (VECTORS > 2) {
+        if (left == 2) subtract_tile<R, 2>(c + j, c_row, a, b + j, b_row, inner);
+        if (left == 3) subtract_tile<R, 3>(c + j, c_row, a, b + j, b_row, inner);
+    }
 }
 
 // c -= a b: (rows, inner) times (inner, columns), the latter a multiple of PAD.
@@ -205,6 +211,59 @@ void substitute(const Chain &chain, const Factor &factor, double *x) {
     }
 }
 
+// to[i * to_row + j] -= from[i * from_row + j]
+void subtract(double *__restrict to, ptrdiff_t to_row, const double *__restrict from, ptrdiff_t from_row,
+              ptrdiff_t rows, ptrdiff_t columns) {
+    for (ptrdiff_t i = 0; i < rows; ++i)
+        for (ptrdiff_t j = 0; j < columns; ++j) to[i * to_row + j] -= from[i * from_row + j];
+}
+
+// In add_rows, a residual's line: derivatives by the globals, the state and the next one, each padded.
+ptrdiff_t line_of(const Rows &rows) { return padded(rows.globals) + 2 * padded(rows.size); }
+
+size_t rows_work(const Rows &rows) {
+    const ptrdiff_t g = padded(rows.globals);
+    return size_t(STATES_AT_ONCE * rows.rows * line_of(rows) + 2 * rows.size * line_of(rows) + g * g);
+}
+
+void add_rows(const Rows &rows, const Sums &sums, double *work) {
+    const ptrdiff_t r = rows.rows, m = rows.size, g = rows.globals, n = sums.globals, line = line_of(rows);
+    const ptrdiff_t at_here = padded(g), at_after = at_here + padded(m);
+    double *const jacobians = work, *const here = jacobians + STATES_AT_ONCE * r * line, *const after = here + m * line;
+    double *const corner = after + m * line;
+    memset(corner, 0, size_t(at_here * at_here) * sizeof(double));
+    for (ptrdiff_t k = 0, waiting = 0; k < rows.states; ++k) {
+        double *jacobian = jacobians + waiting * r * line;
+        memset(jacobian, 0, size_t(r * line) * sizeof(double));
+        for (ptrdiff_t i = 0; i < r; ++i) {
+            double *to = jacobian + i * line;
+            if (g) memcpy(to, rows.by_globals + (k * r + i) * g, size_t(g) * sizeof(double));
+            memcpy(to + at_here, rows.here + (k * r + i) * m, size_t(m) * sizeof(double));
+            if (rows.after) memcpy(to + at_after, rows.after + (k * r + i) * m, size_t(m) * sizeof(double));
+        }
+        memset(here, 0, size_t(2 * m * line) * sizeof(double));
+        subtract_product(here, line, Matrix{jacobian + at_here, 1, line}, jacobian, line, m, r, at_after);
+        subtract(sums.border + k * m * n, n, here, line, m, g);
+        subtract(sums.diagonal + k * m * m, m, here + at_here, line, m, m);
+        if (rows.after) {
+            subtract_product(after, line, Matrix{jacobian + at_after, 1, line}, jacobian, line, m, r, line);
+            subtract(sums.border + (k + 1) * m * n, n, after, line, m, g);
+            subtract(sums.below + k * m * m, m, after + at_here, line, m, m);
+            subtract(sums.diagonal + (k + 1) * m * m, m, after + at_after, line, m, m);
+        }
+        if (++waiting == STATES_AT_ONCE || k + 1 == rows.states) {
+            for (ptrdiff_t i = 0; i < g; i += ROWS) {
+                const ptrdiff_t from = i / PAD * PAD;
+                subtract_product(corner + i * at_here + from, at_here, Matrix{jacobians + i, 1, line}, jacobians + from,
+                                 line, i + ROWS < g ? ROWS : g - i, waiting * r, at_here - from);
+            }
+            waiting = 0;
+        }
+    }
+    for (ptrdiff_t i = 0; i < g; ++i)
+        for (ptrdiff_t j = 0; j < g; ++j) sums.corner[i * n + j] -= corner[j < i ? j * at_here + i : i * at_here + j];
+}
+
 }  // namespace
 
-extern const ArrowSimd JOIN(arrow_, SIMD) = {TEXT(SIMD), work, eliminate, substitute};
+extern const ArrowSimd JOIN(arrow_, SIMD) = {TEXT(SIMD), work, eliminate, substitute, rows_work, add_rows};

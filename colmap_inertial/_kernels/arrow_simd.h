@@ -23,6 +23,20 @@ struct Factor {
     double *right;     // (K, m, padded(m)), of which the last is not used
 };
 
+// Derivatives of residuals, `rows` of them for each state or pair of neighbours.
+struct Rows {
+    ptrdiff_t states, rows, size, globals;
+    const double *here;        // (states, rows, size)
+    const double *after;       // the same by the next states, or null
+    const double *by_globals;  // (states, rows, globals)
+};
+
+// Where the products of the derivatives are added, from the first state that takes part; the globals likewise.
+struct Sums {
+    ptrdiff_t globals;  // in a line of border and corner
+    double *diagonal, *below, *border, *corner;
+};
+
 struct ArrowSimd {
     const char *name;
     // Doubles of memory, aligned to 64 bytes, that eliminate needs.
@@ -33,6 +47,10 @@ struct ArrowSimd {
     bool (*eliminate)(const Chain &chain, const Factor &factor, double *products, double *work);
     // Solves U' U x = b in place: (K, m, padded(q)).
     void (*substitute)(const Chain &chain, const Factor &factor, double *x);
+    // Doubles of memory, aligned to 64 bytes, that add_rows needs.
+    size_t (*rows_work)(const Rows &rows);
+    // Adds the information of residuals: the products of their derivatives.
+    void (*add_rows)(const Rows &rows, const Sums &sums, double *work);
 };
 
 extern const ArrowSimd arrow_base;

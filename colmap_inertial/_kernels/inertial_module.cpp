@@ -4,6 +4,7 @@
 
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
@@ -12,6 +13,7 @@
 #include <limits>
 #include <memory>
 #include <new>
+#include <optional>
 #include <stdexcept>
 #include <vector>
 
@@ -116,6 +118,29 @@ ArrowFactor *eliminate_chain(In<3> diagonal, In<3> below, In<3> border, In<3> rh
     return eliminate(chain, *simd, values).release();
 }
 
+void add_information(In<3> here, std::optional<In<3>> after, std::optional<In<3>> by_globals, size_t first,
+                     size_t column, Out<3> diagonal, Out<3> below, Out<3> border, Out<2> corner,
+                     const std::string &instruction_set) {
+    const size_t states = here.shape(0), r = here.shape(1), m = here.shape(2);
+    const size_t k = border.shape(0), n = border.shape(2), g = by_globals ? by_globals->shape(2) : 0;
+    check(k > 0 && is(diagonal, k, m, m) && is(below, k - 1, m, m) && is(border, k, m, n) && is(corner, n, n),
+          "diagonal, below, border, corner: not a system with states of the size that here has");
+    check(!after || is(*after, states, r, m), "after: not of the size of here");
+    check(!by_globals || is(*by_globals, states, r, g), "by_globals: not of the size of here");
+    check(first <= k && states + (after ? 1 : 0) <= k - first, "first: beyond the states");
+    check(column <= n && g <= n - column, "column: beyond the globals");
+    const ArrowSimd *simd = arrow_named(instruction_set);
+    check(simd != nullptr, "instruction_set: unknown, or this processor lacks it");
+    if (states == 0) return;
+    const double *next = after ? after->data() : nullptr, *globals = by_globals ? by_globals->data() : nullptr;
+    const Rows rows{ptrdiff_t(states), ptrdiff_t(r), ptrdiff_t(m), ptrdiff_t(g), here.data(), next, globals};
+    const Sums sums{ptrdiff_t(n), diagonal.data() + first * m * m, below.data() + first * m * m,
+                    border.data() + first * m * n + column, corner.data() + column * n + column};
+    nb::gil_scoped_release release;
+    const Memory work = memory_for(simd->rows_work(rows));
+    simd->add_rows(rows, sums, work.get());
+}
+
 void preintegrate_intervals(In<1> nodes_s, Of<const int64_t, 1> steps, In<1> gyro_t_s, In<2> gyro, In<2> gyro_slope,
                             In<1> accel_t_s, In<2> accel, In<2> accel_slope, In<2> gyro_bias, In<2> accel_bias,
                             In<2> gyro_matrix, In<2> accel_matrix, double accel_delay_s, double delay_step_s,
@@ -187,6 +212,10 @@ NB_MODULE(_inertial, module) {
     module.def("eliminate", &eliminate_chain, nb::rv_policy::take_ownership, nb::arg("diagonal"), nb::arg("below"),
                nb::arg("border"), nb::arg("rhs"), nb::arg("unit"), nb::arg("products").noconvert(), nb::kw_only(),
                nb::arg("instruction_set") = "");
+    module.def("add_information", &add_information, nb::arg("here"), nb::arg("after").none(),
+               nb::arg("by_globals").none(), nb::kw_only(), nb::arg("first"), nb::arg("column"),
+               nb::arg("diagonal").noconvert(), nb::arg("below").noconvert(), nb::arg("border").noconvert(),
+               nb::arg("corner").noconvert(), nb::arg("instruction_set") = "");
     module.def("preintegrate", &preintegrate_intervals, nb::kw_only(), nb::arg("nodes_s"), nb::arg("steps"),
                nb::arg("gyro_t_s"), nb::arg("gyro"), nb::arg("gyro_slope"), nb::arg("accel_t_s"), nb::arg("accel"),
                nb::arg("accel_slope"), nb::arg("gyro_bias"), nb::arg("accel_bias"), nb::arg("gyro_matrix"),

@@ -44,6 +44,45 @@ class ArrowSystem:
             corner=np.zeros((n_globals, n_globals)),
         )
 
+    def add(self, here: Array, after: Array | None, by_globals: Array | None, *, first: int, column: int) -> None:
+        """Add the information of residuals.
+
+        Parameters
+        ----------
+        here, after
+            (N, r, m) derivatives by the states ``first ..`` and, where there are any, by the ones after them.
+        by_globals
+            (N, r, g) derivatives by the globals ``column ..``.
+        """
+        _inertial.add_information(
+            here,
+            after,
+            by_globals,
+            first=first,
+            column=column,
+            diagonal=self.diagonal,
+            below=self.below,
+            border=self.border,
+            corner=self.corner,
+        )
+
+    def add_reference(
+        self, here: Array, after: Array | None, by_globals: Array | None, *, first: int, column: int
+    ) -> None:
+        """As :meth:`add`, in numpy."""
+        n, g = len(here), 0 if by_globals is None else by_globals.shape[2]
+        z = np.zeros((*here.shape[:2], 0)) if by_globals is None else by_globals
+        now, then, columns = slice(first, first + n), slice(first + 1, first + 1 + n), slice(column, column + g)
+        here_t, flat = here.transpose(0, 2, 1), z.reshape(n * here.shape[1], g)
+        self.diagonal[now] += here_t @ here
+        self.border[now, :, columns] += here_t @ z
+        self.corner[columns, columns] += flat.T @ flat
+        if after is not None:
+            after_t = after.transpose(0, 2, 1)
+            self.diagonal[then] += after_t @ after
+            self.below[now] += after_t @ here
+            self.border[then, :, columns] += after_t @ z
+
     def solve(self, rhs_states: Array, rhs_globals: Array) -> tuple[Array, Array, Array]:
         """Solve for q right-hand sides at once.
 
