@@ -223,7 +223,8 @@ NB_MODULE(_inertial, module) {
                nb::arg("rotation").noconvert(), nb::arg("velocity").noconvert(), nb::arg("position").noconvert(),
                nb::arg("cov_gyro").noconvert(), nb::arg("by_gyro_bias").noconvert(),
                nb::arg("by_accel_bias").noconvert(), nb::arg("by_gyro_gain").noconvert(),
-               nb::arg("by_accel_gain").noconvert(), nb::arg("by_accel_delay").noconvert(), nb::arg("rate").noconvert());
+               nb::arg("by_accel_gain").noconvert(), nb::arg("by_accel_delay").noconvert(),
+               nb::arg("rate").noconvert());
     module.def("whiten_tridiagonal", &whiten_tridiagonal, nb::arg("diagonal"), nb::arg("below"),
                nb::arg("sides").noconvert());
     module.def("instruction_sets", &instruction_sets);

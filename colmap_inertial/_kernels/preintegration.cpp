@@ -125,7 +125,8 @@ struct Moments {
             const double *a = first[block];
             const double skew[9] = {0, -a[2], a[1], a[2], 0, -a[0], -a[1], a[0], 0};
             for (int i = 0; i < 3; ++i)
-                for (int j = 0; j < 3; ++j) entry(3 + 3 * block + i, j) = entry(j, 3 + 3 * block + i) = -skew[3 * i + j];
+                for (int j = 0; j < 3; ++j)
+                    entry(3 + 3 * block + i, j) = entry(j, 3 + 3 * block + i) = -skew[3 * i + j];
         }
         for (int block = 0; block < 3; ++block) {
             const int row = block == 0 ? 3 : 6, column = block == 2 ? 6 : 3;
