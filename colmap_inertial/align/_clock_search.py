@@ -250,6 +250,7 @@ def _on_grid(begin_s: Array, end_s: Array, turn_rad: Array) -> tuple[Array, NDAr
 
 def _redundancy(seen: Array, felt: Array) -> float:
     """Cells per independent cell: Bartlett's sum over the products of the two autocorrelations."""
+
     def autocorrelation(x: Array) -> Array:
         x = x - x.mean(axis=0)
         size = _fft_length(2 * len(x))

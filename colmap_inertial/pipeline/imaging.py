@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -28,6 +27,9 @@ from colmap_inertial.pipeline.frames import FrameRecord, encode_image
 from colmap_inertial.pipeline.metadata import stated_exposures_s
 from colmap_inertial.pipeline.stages import DeblurStage, GyroView, RollingShutterStage
 from colmap_inertial.types import CALIBRATION_PARAMETERS, CameraImuCalibration, CameraModel, FrameTiming, ImuRecording
+
+if TYPE_CHECKING:
+    from concurrent.futures import Future
 
 DeblurMethod = Literal["off", "wiener"]
 RollingShutterMethod = Literal["off", "rectify"]
@@ -330,6 +332,8 @@ def write_rectified(
     progress
         Called with ``"rectified"``.
     """
+    from concurrent.futures import ThreadPoolExecutor
+
     view = stage.view
     motion, camera, index = view.motion(), colmap_camera(view.camera), view.index()
 

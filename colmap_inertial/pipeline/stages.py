@@ -5,10 +5,9 @@ from __future__ import annotations
 import os
 from collections import deque
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,6 +21,9 @@ from colmap_inertial.imaging.wiener import LONGEST_PX, DeblurOptions, deblur
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.pipeline.frames import FrameTreatment
 from colmap_inertial.types import Array, CameraImuCalibration, CameraModel, Frame, FrameTiming, ImuRecording, Projector
+
+if TYPE_CHECKING:
+    from concurrent.futures import Future
 
 #: Frames in work at once: enough for a desk computer's cores, few enough for its memory.
 _MOST_WORKERS = 4
@@ -113,6 +115,8 @@ class DeblurStage:
 
     def __call__(self, frames: Iterator[Frame], /) -> Iterator[Frame]:
         """Deblur the frames, in order."""
+        from concurrent.futures import ThreadPoolExecutor
+
         motion, camera, index = self.view.motion(), colmap_camera(self.view.camera), self.view.index()
         decision_of = {decision.name: decision for decision in self.decisions}
         workers = self.workers or min(_MOST_WORKERS, len(os.sched_getaffinity(0)))

@@ -71,20 +71,7 @@ class Group:
 
     def add_to(self, system: ArrowSystem) -> None:
         """Add the group's information."""
-        n = len(self.residual)
-        now, then = slice(self.first, self.first + n), slice(self.first + 1, self.first + 1 + n)
-        here_t = self.here.transpose(0, 2, 1)
-        system.diagonal[now] += here_t @ self.here
-        if self.by_globals is not None:
-            system.border[now, :, self.columns] += here_t @ self.by_globals
-            flat = self.by_globals.reshape(-1, self.by_globals.shape[2])
-            system.corner[self.columns, self.columns] += flat.T @ flat
-        if self.after is not None:
-            after_t = self.after.transpose(0, 2, 1)
-            system.diagonal[then] += after_t @ self.after
-            system.below[self.first : self.first + n] += after_t @ self.here
-            if self.by_globals is not None:
-                system.border[then, :, self.columns] += after_t @ self.by_globals
+        system.add(self.here, self.after, self.by_globals, first=self.first, column=self.columns.start)
 
 
 @dataclass(eq=False, kw_only=True)

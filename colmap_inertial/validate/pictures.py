@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
-from xml.sax.saxutils import escape
 
 import numpy as np
 
@@ -98,6 +97,8 @@ def _fixed(xy: Array, radius: int = 0) -> tuple[tuple[int, int], int]:
 
 def distance_chart(validation: Validation) -> str:
     """An SVG: measured against known distances, and their differences, in millimetres."""
+    from xml.sax.saxutils import escape
+
     known = np.array([d.known_m for d in validation.distances]) * 1000
     residual = np.array([d.residual_m for d in validation.distances]) * 1000
     sets = [d.set for d in validation.distances]
