@@ -98,7 +98,7 @@ def main() -> None:
             for kind, (wall, size) in kinds.items()
         },
         "other_ways_20_px": lambda: other_ways(make_pairs(walls[:compared], 20.0, size=SIZE, seed=args.seed)),
-        "cost": lambda: imaging_cost.measure(make_pairs(walls[:1], 20.0, size=SIZE, seed=args.seed)[0]),
+        "cost": lambda: imaging_cost.measure(make_pairs(walls, 20.0, size=SIZE, seed=args.seed)),
         "false_blur_10_px": lambda: false_blur(make_pairs(walls[:compared], 10.0, size=SIZE, seed=args.seed)),
         "rolling_shutter": lambda: imaging_shutter.two_views(20, args.seed),
     }
@@ -195,6 +195,8 @@ def quality(
         rows["gated"].append(measured(pair, [g.image for g in gated], sharp))
     each = [b["correct"] / max(a["correct"], 1) for a, b in zip(*rows.values(), strict=True)]
     out = {name: summed(found) for name, found in rows.items()}
+    ratio = out["gated"]["correct"] / max(out["nothing"]["correct"], 1)
+    console.print(f"{kind}, {blur_px:g} px: {ratio:.2f} times the correct matches of doing nothing")
     return {
         "pairs": len(pairs),
         "median_blur_px": float(np.median([np.median(b.extent_px()) for two in blurs for b in two])),
@@ -202,7 +204,7 @@ def quality(
         "verdict": verdict.reason,
         "kept_share": float(np.mean(kept)) if kept else 1.0,
         **out,
-        "ratio": out["gated"]["correct"] / max(out["nothing"]["correct"], 1),
+        "ratio": ratio,
         "ratio_of_each_scene": [round(r, 3) for r in each],
     }
 
