@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from colmap_inertial.align import align_camera_imu, calibration_prior
-from colmap_inertial.geometry import quat_cumulative, quat_exp, quat_from_matrix, so3_exp, so3_log
+from colmap_inertial.geometry import quat_from_matrix, so3_exp, so3_log
 from colmap_inertial.scale import ScaleOptions, estimate_scale, first_seconds
 from colmap_inertial.scale import _factors as fac
 from colmap_inertial.scale import _parameters as par
 from colmap_inertial.scale._grouping import first_of_groups, group_frames
 from colmap_inertial.scale._noise import TYPICAL
-from colmap_inertial.scale._preintegration import Track, preintegrate, running_product
+from colmap_inertial.scale._preintegration import Track, preintegrate
 from colmap_inertial.scale._setup import prepare
 from colmap_inertial.scale._solver import ArrowSystem
 from colmap_inertial.scale.joint import JointOptions, estimate_joint
@@ -44,12 +44,6 @@ def run_through(nodes_s, gyro, accel, **changed):
         "gyro_bias_rad_s": zero, "accel_bias_m_s2": zero, "gyro_gain": np.zeros((3, 3)), "accel_gain": np.zeros((3, 3))
     }  # fmt: skip
     return preintegrate(nodes_s, gyro, accel, **{**arguments, **changed})
-
-
-def test_running_products_are_those_of_a_loop():
-    steps = quat_exp(np.random.default_rng(0).standard_normal((1000, 3)))
-    same = np.abs(np.sum(running_product(steps.T).T * quat_cumulative(steps)[1:], axis=1))
-    assert np.allclose(same, 1, atol=1e-12)
 
 
 def test_preintegration_agrees_with_fine_steps_of_the_motion():

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from colmap_inertial._kernels import _inertial
 from colmap_inertial.types import Array
-
-_STATES_AT_ONCE = 64
 
 
 @dataclass(eq=False, kw_only=True)
@@ -125,11 +122,8 @@ class ArrowSystem:
             band[m - j : 2 * m - j, :-1, j] = below[:, :, j].T
         band = band.reshape(2 * m, k * m)
         factor = cholesky_banded(band, lower=True, overwrite_ab=True, check_finite=False)
-        # Only products of the border with itself and the right-hand sides are needed, so that the border is never
-        # solved for as a whole: with H = L L', they are those of L^-1 border
-        products = np.zeros((n, n + rhs.shape[2]))
-        for whitened in _forward(factor, self.border, rhs, unit):
-            products += whitened[:, :n].T @ whitened
+        sides = np.concatenate([self.border * unit[:, :, None], rhs], axis=2).reshape(k * m, -1)
+        products = sides[:, :n].T @ cho_solve_banded((factor, True), sides, check_finite=False)
         x_globals, cov = self._solve_globals(products, rhs_globals)
         rest = rhs - (self.border @ x_globals) * unit[:, :, None]
         x_states = cho_solve_banded((factor, True), rest.reshape(k * m, -1), check_finite=False)
@@ -157,29 +151,3 @@ class ArrowSystem:
         inverse = np.linalg.inv(np.linalg.cholesky(schur * spread[:, None] * spread))
         cov = (inverse.T @ inverse) * spread[:, None] * spread
         return cov @ (rhs_globals - products[:, n:]), cov
-
-
-def _forward(factor: Array, border: Array, rhs: Array, unit: Array) -> Iterator[Array]:
-    """Rows of ``L^-1 [border, rhs]``, some states at a time, so that they stay in the cache."""
-    from scipy.linalg.lapack import dtbtrs
-
-    k, m, _ = border.shape
-    reach = len(factor)
-    before = np.zeros((reach, border.shape[2] + rhs.shape[2]))
-    for begin in range(0, k, _STATES_AT_ONCE):
-        end = min(begin + _STATES_AT_ONCE, k)
-        sides = np.concatenate([border[begin:end] * unit[begin:end, :, None], rhs[begin:end]], axis=2)
-        sides = sides.reshape((end - begin) * m, -1)
-        if begin:
-            # What the band of the ``reach`` rows before reaches into these ones
-            above = factor[:, begin * m - reach : begin * m]
-            carry = np.zeros((reach, reach))
-            for j in range(1, reach):
-                carry[:j, j] = above[reach - j :, j]
-            rows = min(reach, len(sides))
-            sides[:rows] -= (carry @ before)[:rows]
-        solved, info = dtbtrs(factor[:, begin * m : end * m], sides, uplo="L", overwrite_b=True)
-        if info != 0:
-            raise np.linalg.LinAlgError("the normal equations are singular")
-        before = np.concatenate([before, solved])[-reach:]
-        yield solved
