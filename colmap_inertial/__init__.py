@@ -19,8 +19,9 @@ if TYPE_CHECKING:
     from colmap_inertial.io.frames import read_frames
     from colmap_inertial.io.imu import read_imu
     from colmap_inertial.model import apply_similarity
-    from colmap_inertial.pipeline import DeblurStage, ReconstructOptions, RollingShutterStage, reconstruct
-    from colmap_inertial.scale import ScaleOptions, estimate_scale
+    from colmap_inertial.options import MappingOptions, ReconstructOptions, ScaleOptions, ValidateOptions
+    from colmap_inertial.pipeline import DeblurStage, RollingShutterStage, reconstruct
+    from colmap_inertial.scale import estimate_scale
     from colmap_inertial.smooth import smooth_trajectory
     from colmap_inertial.validate import validate_model
 
@@ -30,9 +31,11 @@ _HOMES = {
     "AlignOptions": "align",
     "DeblurStage": "pipeline",
     "InertialError": "errors",
-    "ReconstructOptions": "pipeline",
+    "MappingOptions": "options",
+    "ReconstructOptions": "options",
     "RollingShutterStage": "pipeline",
-    "ScaleOptions": "scale",
+    "ScaleOptions": "options",
+    "ValidateOptions": "options",
     "align_camera_imu": "align",
     "apply_similarity": "model",
     "deblur": "imaging.wiener",
@@ -49,9 +52,11 @@ __all__ = [
     "AlignOptions",
     "DeblurStage",
     "InertialError",
+    "MappingOptions",
     "ReconstructOptions",
     "RollingShutterStage",
     "ScaleOptions",
+    "ValidateOptions",
     "align_camera_imu",
     "apply_similarity",
     "deblur",

@@ -15,9 +15,7 @@ from tyro.conf import Positional, arg, subcommand
 
 from colmap_inertial import __version__
 from colmap_inertial.errors import InertialError
-from colmap_inertial.pipeline import ReconstructOptions
-from colmap_inertial.scale import ScaleOptions
-from colmap_inertial.validate import ValidateOptions
+from colmap_inertial.options import ReconstructOptions, ScaleOptions, ValidateOptions
 
 DESCRIPTION = """Metric, gravity-aligned COLMAP models from the gyroscope and accelerometer that filmed along.
 

@@ -41,7 +41,8 @@ from rich.progress import track
 from colmap_inertial.align import align_camera_imu
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.io.trajectories import read_inertial_scale
-from colmap_inertial.scale import ScaleOptions, estimate_scale
+from colmap_inertial.options import ScaleOptions
+from colmap_inertial.scale import estimate_scale
 from colmap_inertial.types import Array, CameraTrajectory, ImuRecording
 
 METHODS = ("joint", "spectral", "linear")

@@ -16,7 +16,8 @@ from colmap_inertial.gyro import GyroPath
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.imaging.psf import predicted_blur_px
 from colmap_inertial.model import colmap_camera, find_models, read_model
-from colmap_inertial.pipeline import ReconstructOptions, reconstruct
+from colmap_inertial.options import ReconstructOptions
+from colmap_inertial.pipeline import reconstruct
 from colmap_inertial.simulate import MotionOptions, SceneRecipe, make_scene, read_truth, write_capture
 from colmap_inertial.types import Array, CameraTrajectory, FrameTiming
 

@@ -24,7 +24,8 @@ import yaml
 from rich.console import Console
 
 from colmap_inertial.geometry import skew
-from colmap_inertial.validate import ValidateOptions, Validation, parse_target, validate_model, validation_table
+from colmap_inertial.options import ValidateOptions
+from colmap_inertial.validate import Validation, parse_target, validate_model, validation_table
 from colmap_inertial.validate.detect import Detection, detect
 
 SPEC = "aprilgrid:6x6:0.088:0.3"

@@ -18,7 +18,8 @@ from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.frames import read_frames
 from colmap_inertial.io.imu import read_capture_imu
 from colmap_inertial.model import read_model
-from colmap_inertial.pipeline import MappingOptions, ReconstructOptions, prior_calibration, reconstruct, silent
+from colmap_inertial.options import MappingOptions, ReconstructOptions
+from colmap_inertial.pipeline import prior_calibration, reconstruct, silent
 from colmap_inertial.pipeline.deblur import deblur_capture
 from colmap_inertial.pipeline.imaging import plan_imaging, read_plan, with_stated_exposures, write_plan
 from colmap_inertial.pipeline.metadata import carry_metadata, stated_exposures_s

@@ -13,12 +13,12 @@ from colmap_inertial.errors import FormatError, InertialError, NotObservableErro
 from colmap_inertial.io.frames import read_frame_times
 from colmap_inertial.io.imu import read_imu
 from colmap_inertial.model import read_model
-from colmap_inertial.pipeline import MetricStage, ReconstructOptions, ReconstructResult, run_models, silent
-from colmap_inertial.pipeline.colmap import MappingOptions, check_names, image_pairs
+from colmap_inertial.options import MappingOptions, ReconstructOptions, ScaleOptions
+from colmap_inertial.pipeline import MetricStage, ReconstructResult, run_models, silent
+from colmap_inertial.pipeline.colmap import check_names, image_pairs
 from colmap_inertial.pipeline.config import config_as_toml, read_config
 from colmap_inertial.pipeline.frames import read_frame_records, write_frames
 from colmap_inertial.pipeline.workspace import StageRunner, Workspace, canonical
-from colmap_inertial.scale import ScaleOptions
 from colmap_inertial.types import CameraModel, Frame, FrameTiming
 
 

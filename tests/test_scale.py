@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from colmap_inertial.scale import ScaleOptions, check_units, estimate_scale, first_seconds, gravity_at_latitude_m_s2
+from colmap_inertial.options import ScaleOptions
+from colmap_inertial.scale import check_units, estimate_scale, first_seconds, gravity_at_latitude_m_s2
 from colmap_inertial.scale.verdict import half_width, verdict_of
 from colmap_inertial.simulate.recording import RecordingOptions, simulate_recording
 

@@ -7,9 +7,10 @@ import pytest
 
 from colmap_inertial.align import align_camera_imu, calibration_prior
 from colmap_inertial.geometry import quat_from_matrix, so3_exp, so3_log
-from colmap_inertial.scale import ScaleOptions, estimate_scale, first_seconds
+from colmap_inertial.options import ScaleOptions
 from colmap_inertial.scale import _factors as fac
 from colmap_inertial.scale import _parameters as par
+from colmap_inertial.scale import estimate_scale, first_seconds
 from colmap_inertial.scale._grouping import first_of_groups, group_frames
 from colmap_inertial.scale._noise import TYPICAL
 from colmap_inertial.scale._preintegration import Track, preintegrate

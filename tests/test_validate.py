@@ -26,13 +26,8 @@ from validate_scenes import (
 
 from colmap_inertial.errors import FormatError, NotObservableError, TargetNotFoundError
 from colmap_inertial.geometry import colmap_px_from_opencv
-from colmap_inertial.validate import (
-    ValidateOptions,
-    parse_target,
-    validate_model,
-    validation_table,
-    write_pictures,
-)
+from colmap_inertial.options import ValidateOptions
+from colmap_inertial.validate import parse_target, validate_model, validation_table, write_pictures
 from colmap_inertial.validate import search as search_module
 from colmap_inertial.validate.detect import Detection, detect
 from colmap_inertial.validate.views import sight

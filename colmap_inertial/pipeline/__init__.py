@@ -9,7 +9,6 @@ import os
 import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 
 from colmap_inertial import __version__
@@ -21,9 +20,9 @@ from colmap_inertial.io.files import write_json, write_text
 from colmap_inertial.io.frames import frame_source, read_frames
 from colmap_inertial.io.imu import read_capture_imu
 from colmap_inertial.model import Model, find_models, read_model, summarize
+from colmap_inertial.options import ReconstructOptions
 from colmap_inertial.pipeline.colmap import (
     KeypointStage,
-    MappingOptions,
     Progress,
     check_names,
     extract_features,
@@ -35,9 +34,7 @@ from colmap_inertial.pipeline.colmap import (
 from colmap_inertial.pipeline.config import config_as_toml
 from colmap_inertial.pipeline.frames import FrameRecord, FrameStage, read_frame_records, require_frames, write_frames
 from colmap_inertial.pipeline.imaging import (
-    DeblurMethod,
     ImagingPlan,
-    RollingShutterMethod,
     for_rectified,
     plan_imaging,
     read_plan,
@@ -49,14 +46,12 @@ from colmap_inertial.pipeline.metric import MetricStage, ModelStage, write_traje
 from colmap_inertial.pipeline.result import ModelResult, ReconstructResult, result_as_json
 from colmap_inertial.pipeline.stages import DeblurStage, GyroView, RollingShutterStage
 from colmap_inertial.pipeline.workspace import StageRunner, Workspace, fingerprint, remove
-from colmap_inertial.scale import ScaleOptions
 from colmap_inertial.types import (
     Array,
     CameraImuCalibration,
     Frame,
     FrameTiming,
     ImuRecording,
-    WorldAxes,
 )
 from colmap_inertial.validate import Target, Validation, parse_target, validate_model, write_pictures
 
@@ -64,33 +59,6 @@ log = logging.getLogger(__name__)
 
 #: A camera-IMU rotation less certain than this is no basis for gravity directions.
 _GRAVITY_ROTATION_RAD = 0.2
-
-
-@dataclass(frozen=True, kw_only=True)
-class ReconstructOptions:
-    """Everything that decides the result of a reconstruction, beside the capture itself."""
-
-    deblur: DeblurMethod | None = None
-    """Undo motion blur by the gyroscope before COLMAP sees a frame. Default: wiener, where exposure times are known
-    and the pictures bear the gyroscope out."""
-    rolling_shutter: RollingShutterMethod | None = None
-    """Undo the rolling shutter by the gyroscope. Default: rectify, where the readout time is known."""
-    mapping: MappingOptions = field(default_factory=MappingOptions)
-    """How COLMAP builds the model."""
-    scale: ScaleOptions = field(default_factory=ScaleOptions)
-    """How metres come from the IMU."""
-    world: WorldAxes = "z-up"
-    """Axes of the metric model: z away from the ground, or y towards it, as COLMAP's own cameras have it."""
-    deterministic: bool = False
-    """Fixed seed and one thread: the same input gives the same model, bit for bit. Slower."""
-    seed: int = 0
-    """Seed of COLMAP's random sampling."""
-    calibration: Path | None = None
-    """A calibration file of this device (from `colmap-inertial align --out`), used as a prior."""
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.seed < 2**31:
-            raise ValueError(f"seed must be from 0 to 2147483647, not {self.seed}")
 
 
 def silent(stage: str, done: int, total: int, /) -> None:
@@ -459,11 +427,9 @@ __all__ = [
     "FrameStage",
     "GyroView",
     "KeypointStage",
-    "MappingOptions",
     "MetricStage",
     "ModelResult",
     "ModelStage",
-    "ReconstructOptions",
     "ReconstructResult",
     "RollingShutterStage",
     "default_model_stages",

@@ -6,14 +6,14 @@ import itertools
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from colmap_inertial.errors import FormatError, MappingError
 from colmap_inertial.model import colmap_camera
+from colmap_inertial.options import MappingOptions
 from colmap_inertial.types import Array, CameraModel
 
 if TYPE_CHECKING:
@@ -23,38 +23,6 @@ if TYPE_CHECKING:
 _EXHAUSTIVE_UP_TO = 150
 _EXTRACTION_BATCH = 16
 _MATCHING_BATCH = 400
-
-
-@dataclass(frozen=True, kw_only=True)
-class MappingOptions:
-    """How COLMAP builds the model."""
-
-    pairing: Literal["auto", "exhaustive", "sequential"] = "auto"
-    """Which images are matched: every pair, neighbours in time, or `auto`: every pair up to 150 images."""
-    overlap: int = 10
-    """Sequential pairing: match each frame with this many next ones, and with the 1, 2, 4, 8, ... th after it."""
-    max_image_size: int | None = None
-    """Longer side in pixels above which images are shrunk for feature extraction (COLMAP's default: 3200)."""
-    max_num_features: int = 8192
-    """SIFT features per image."""
-    first_octave: int = -1
-    """SIFT: -1 starts at twice the image size (COLMAP's default), 0 at the image size (three times faster)."""
-    mapper: Literal["incremental", "global"] = "incremental"
-    """COLMAP's mapper."""
-    gravity_priors: bool = False
-    """Global mapper only: start it from each frame's gravity direction, by the IMU (needs a calibration)."""
-    refine_intrinsics: bool | None = None
-    """Let bundle adjustment change the camera. Default: only where the capture declares none."""
-
-    def __post_init__(self) -> None:
-        if self.overlap < 1:
-            raise ValueError(f"mapping.overlap must be at least 1, not {self.overlap}")
-        if self.max_image_size is not None and self.max_image_size < 64:
-            raise ValueError(f"mapping.max_image_size must be at least 64, not {self.max_image_size}")
-        if self.max_num_features < 50:
-            raise ValueError(f"mapping.max_num_features must be at least 50, not {self.max_num_features}")
-        if not -1 <= self.first_octave <= 2:
-            raise ValueError(f"mapping.first_octave must be from -1 to 2, not {self.first_octave}")
 
 
 class Progress(Protocol):

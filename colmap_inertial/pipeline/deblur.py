@@ -12,7 +12,8 @@ from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.files import write_json
 from colmap_inertial.io.frames import frame_source, read_frames
 from colmap_inertial.io.imu import read_capture_imu
-from colmap_inertial.pipeline import ReconstructOptions, logging_to, run_frames, run_plan, run_rectified
+from colmap_inertial.options import ReconstructOptions
+from colmap_inertial.pipeline import logging_to, run_frames, run_plan, run_rectified
 from colmap_inertial.pipeline.colmap import Progress, check_names
 from colmap_inertial.pipeline.contact_sheet import write_contact_sheet
 from colmap_inertial.pipeline.frames import FrameRecord, read_frame_records

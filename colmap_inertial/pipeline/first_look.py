@@ -23,14 +23,8 @@ from colmap_inertial.io.capture import Capture, ImageFolder
 from colmap_inertial.io.frames import frame_source, read_frames
 from colmap_inertial.io.images import read_image
 from colmap_inertial.model import colmap_camera, find_models, read_model, trajectory_from_model
-from colmap_inertial.pipeline.colmap import (
-    MappingOptions,
-    Progress,
-    extract_features,
-    image_pairs,
-    map_images,
-    match_features,
-)
+from colmap_inertial.options import MappingOptions
+from colmap_inertial.pipeline.colmap import Progress, extract_features, image_pairs, map_images, match_features
 from colmap_inertial.pipeline.frames import encode_image
 from colmap_inertial.pipeline.stages import GyroView, RollingShutterStage
 from colmap_inertial.threads import one_blas_thread

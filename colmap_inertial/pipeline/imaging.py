@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from colmap_inertial.io.files import read_json, write_json
 from colmap_inertial.io.frames import frame_source
 from colmap_inertial.io.images import read_image
 from colmap_inertial.model import colmap_camera
+from colmap_inertial.options import DeblurMethod, RollingShutterMethod
 from colmap_inertial.pipeline.colmap import Progress
 from colmap_inertial.pipeline.first_look import guessed_camera, look_first, some_frames
 from colmap_inertial.pipeline.frames import FrameRecord, encode_image
@@ -31,8 +32,6 @@ from colmap_inertial.types import CALIBRATION_PARAMETERS, CameraImuCalibration, 
 if TYPE_CHECKING:
     from concurrent.futures import Future
 
-DeblurMethod = Literal["off", "wiener"]
-RollingShutterMethod = Literal["off", "rectify"]
 
 #: Blur below this cannot be told from the texture: where no frame has more, nothing is deblurred.
 _TELLING_PX = 4.0
@@ -362,9 +361,7 @@ def write_rectified(
 
 
 __all__ = [
-    "DeblurMethod",
     "ImagingPlan",
-    "RollingShutterMethod",
     "plan_imaging",
     "read_plan",
     "with_stated_exposures",

@@ -14,9 +14,10 @@ from colmap_inertial.align import on_camera_rate
 from colmap_inertial.geometry import quat_rotate
 from colmap_inertial.io.trajectories import write_tum
 from colmap_inertial.model import Model, apply_similarity, read_model, trajectory_from_model
-from colmap_inertial.scale import ScaleOptions, estimate_scale
+from colmap_inertial.options import ScaleOptions, WorldAxes
+from colmap_inertial.scale import estimate_scale
 from colmap_inertial.smooth import smooth_trajectory
-from colmap_inertial.types import CameraImuCalibration, ImuRecording, Similarity, WorldAxes
+from colmap_inertial.types import CameraImuCalibration, ImuRecording, Similarity
 
 
 class ModelStage(Protocol):

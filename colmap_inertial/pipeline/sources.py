@@ -24,14 +24,10 @@ from colmap_inertial.io.imu import is_capture, read_imu
 from colmap_inertial.io.imu_text import is_inertial_scale
 from colmap_inertial.io.trajectories import read_inertial_scale, read_tum
 from colmap_inertial.model import apply_similarity, find_models, is_metric, read_model, trajectory_from_model
-from colmap_inertial.scale import (
-    ScaleOptions,
-    estimate_scale,
-    first_seconds,
-    gravity_at_latitude_m_s2,
-)
+from colmap_inertial.options import ScaleOptions, ValidateOptions
+from colmap_inertial.scale import estimate_scale, first_seconds, gravity_at_latitude_m_s2
 from colmap_inertial.types import CameraImuCalibration, CameraTrajectory, ImuRecording, ScaleEstimate, Similarity
-from colmap_inertial.validate import ValidateOptions, Validation, parse_target, validate_model, write_pictures
+from colmap_inertial.validate import Validation, parse_target, validate_model, write_pictures
 
 
 @dataclass(frozen=True, kw_only=True)

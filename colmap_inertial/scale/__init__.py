@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from colmap_inertial.align import AlignOptions, align_clocks
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.io.plausible import GRAVITY_BOUNDS_M_S2, LARGEST_MEDIAN_RATE_RAD_S
 from colmap_inertial.io.units import STANDARD_GRAVITY_M_S2
+from colmap_inertial.options import ScaleOptions
 from colmap_inertial.scale._remarks import remarks
 from colmap_inertial.scale.verdict import verdict_of
 from colmap_inertial.threads import one_blas_thread
@@ -20,28 +20,6 @@ from colmap_inertial.types import CameraImuCalibration, CameraTrajectory, ImuRec
 #: A clock rate is corrected beforehand where it is this many standard deviations from zero and faster than what the
 #: estimators allow for.
 _SIGNIFICANT, _FAST_CLOCK = 5.0, 3e-4
-
-
-@dataclass(frozen=True, kw_only=True)
-class ScaleOptions:
-    """How the scale is estimated."""
-
-    method: Literal["joint", "spectral"] = "joint"
-    """joint fits all measurements at once, video or keyframes; spectral is the thesis method, for video."""
-
-    gravity_m_s2: float = 9.80665
-    """Strength of gravity where the recording was made."""
-
-    max_offset_s: float | None = None
-    """Largest offset between the clocks of camera and IMU; 1 for a shared clock. Without it, all are searched."""
-
-    def __post_init__(self) -> None:
-        if not 9.7 <= self.gravity_m_s2 <= 9.9:
-            raise ValueError(
-                f"gravity_m_s2 must be from 9.7 to 9.9 (it is 9.76 to 9.84 on Earth), not {self.gravity_m_s2:g}"
-            )
-        if self.max_offset_s is not None and not self.max_offset_s > 0:
-            raise ValueError(f"max_offset_s must be positive, not {self.max_offset_s:g}")
 
 
 def gravity_at_latitude_m_s2(latitude_deg: float) -> float:
@@ -171,7 +149,6 @@ def _refused(method: str, *reasons: str) -> ScaleEstimate:
 
 
 __all__ = [
-    "ScaleOptions",
     "check_units",
     "estimate_scale",
     "first_seconds",

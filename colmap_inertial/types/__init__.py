@@ -18,7 +18,6 @@ from colmap_inertial.types.estimated import (
     Similarity,
     SmoothedTrajectory,
     Verdict,
-    WorldAxes,
 )
 from colmap_inertial.types.recorded import (
     CameraModel,
@@ -52,6 +51,5 @@ __all__ = [
     "Similarity",
     "SmoothedTrajectory",
     "Verdict",
-    "WorldAxes",
     "clock_shift_s",
 ]

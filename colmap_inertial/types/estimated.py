@@ -9,6 +9,7 @@ import numpy as np
 
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.geometry import matrix_from_quat, rotation_between, skew
+from colmap_inertial.options import WorldAxes
 from colmap_inertial.types._checks import (
     Array,
     checked_array,
@@ -20,7 +21,6 @@ from colmap_inertial.types._checks import (
 from colmap_inertial.types.recorded import LengthUnit
 
 Verdict = Literal["trusted", "weak", "refused"]
-WorldAxes = Literal["z-up", "y-down"]
 
 #: The direction of gravity in a metric world with these axes: ``y-down`` is COLMAP's and computer vision's habit.
 DOWN_IN_WORLD = {"z-up": np.array([0.0, 0.0, -1.0]), "y-down": np.array([0.0, 1.0, 0.0])}

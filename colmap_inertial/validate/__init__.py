@@ -10,7 +10,6 @@ from colmap_inertial.validate.result import (
     ViewResiduals,
     validation_table,
 )
-from colmap_inertial.validate.search import ValidateOptions
 from colmap_inertial.validate.targets import Target, TargetSpecError, parse_target
 
 __all__ = [
@@ -19,7 +18,6 @@ __all__ = [
     "SetScale",
     "Target",
     "TargetSpecError",
-    "ValidateOptions",
     "Validation",
     "ViewResiduals",
     "parse_target",

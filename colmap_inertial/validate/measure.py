@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.errors import NotObservableError, TargetNotFoundError
+from colmap_inertial.options import ValidateOptions
 from colmap_inertial.threads import one_blas_thread
 from colmap_inertial.types import Array
 from colmap_inertial.validate.fit import ScaleFit, fit_scale
@@ -23,7 +24,7 @@ from colmap_inertial.validate.result import (
     Validation,
     ViewResiduals,
 )
-from colmap_inertial.validate.search import Progress, Search, ValidateOptions, why_not_placed
+from colmap_inertial.validate.search import Progress, Search, why_not_placed
 from colmap_inertial.validate.targets import Target
 from colmap_inertial.validate.views import Sighting, load_views
 

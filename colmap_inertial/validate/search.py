@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 from colmap_inertial.errors import FormatError, NotObservableError, TargetNotFoundError
+from colmap_inertial.options import ValidateOptions
 from colmap_inertial.validate.detect import detect, other_checkerboard
 from colmap_inertial.validate.place import PartPlacement, place_part
 from colmap_inertial.validate.targets import Target
@@ -17,31 +17,6 @@ Progress = Callable[[int, int], None]
 _MIRROR_VIEWS = 20
 _HINT_VIEWS = 10
 _LEAST_CORNERS = 4
-
-
-@dataclass(frozen=True, kw_only=True)
-class ValidateOptions:
-    """How to validate a model."""
-
-    unscaled: bool = False
-    """The model claims no unit: report the factor that makes it metric instead of a scale error."""
-    tolerance_pct: float = 2.0
-    """Largest scale error that passes, in per cent."""
-    max_views: int = 100
-    """Stop searching when the target was found in this many images; they are taken evenly over the names."""
-    max_residual_px: float = 4.0
-    """A view belongs to the result when at least half of its corners agree with the other views to this many pixels
-    (the limit that COLMAP sets to its own points)."""
-    seed: int = 0
-    """Seed of the search for views that agree."""
-
-    def __post_init__(self) -> None:
-        if not self.tolerance_pct > 0:
-            raise ValueError("tolerance_pct must be positive")
-        if self.max_views < 2:
-            raise ValueError("max_views must be at least 2")
-        if not self.max_residual_px > 0:
-            raise ValueError("max_residual_px must be positive")
 
 
 class Search:

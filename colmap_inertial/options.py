@@ -1,0 +1,117 @@
+"""What a user may choose, as the command line and ``config.toml`` have it. Plain values: loading this costs nothing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+DeblurMethod = Literal["off", "wiener"]
+RollingShutterMethod = Literal["off", "rectify"]
+WorldAxes = Literal["z-up", "y-down"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MappingOptions:
+    """How COLMAP builds the model."""
+
+    pairing: Literal["auto", "exhaustive", "sequential"] = "auto"
+    """Which images are matched: every pair, neighbours in time, or `auto`: every pair up to 150 images."""
+    overlap: int = 10
+    """Sequential pairing: match each frame with this many next ones, and with the 1, 2, 4, 8, ... th after it."""
+    max_image_size: int | None = None
+    """Longer side in pixels above which images are shrunk for feature extraction (COLMAP's default: 3200)."""
+    max_num_features: int = 8192
+    """SIFT features per image."""
+    first_octave: int = -1
+    """SIFT: -1 starts at twice the image size (COLMAP's default), 0 at the image size (three times faster)."""
+    mapper: Literal["incremental", "global"] = "incremental"
+    """COLMAP's mapper."""
+    gravity_priors: bool = False
+    """Global mapper only: start it from each frame's gravity direction, by the IMU (needs a calibration)."""
+    refine_intrinsics: bool | None = None
+    """Let bundle adjustment change the camera. Default: only where the capture declares none."""
+
+    def __post_init__(self) -> None:
+        if self.overlap < 1:
+            raise ValueError(f"mapping.overlap must be at least 1, not {self.overlap}")
+        if self.max_image_size is not None and self.max_image_size < 64:
+            raise ValueError(f"mapping.max_image_size must be at least 64, not {self.max_image_size}")
+        if self.max_num_features < 50:
+            raise ValueError(f"mapping.max_num_features must be at least 50, not {self.max_num_features}")
+        if not -1 <= self.first_octave <= 2:
+            raise ValueError(f"mapping.first_octave must be from -1 to 2, not {self.first_octave}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScaleOptions:
+    """How the scale is estimated."""
+
+    method: Literal["joint", "spectral"] = "joint"
+    """joint fits all measurements at once, video or keyframes; spectral is the thesis method, for video."""
+
+    gravity_m_s2: float = 9.80665
+    """Strength of gravity where the recording was made."""
+
+    max_offset_s: float | None = None
+    """Largest offset between the clocks of camera and IMU; 1 for a shared clock. Without it, all are searched."""
+
+    def __post_init__(self) -> None:
+        if not 9.7 <= self.gravity_m_s2 <= 9.9:
+            raise ValueError(
+                f"gravity_m_s2 must be from 9.7 to 9.9 (it is 9.76 to 9.84 on Earth), not {self.gravity_m_s2:g}"
+            )
+        if self.max_offset_s is not None and not self.max_offset_s > 0:
+            raise ValueError(f"max_offset_s must be positive, not {self.max_offset_s:g}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ValidateOptions:
+    """How to validate a model."""
+
+    unscaled: bool = False
+    """The model claims no unit: report the factor that makes it metric instead of a scale error."""
+    tolerance_pct: float = 2.0
+    """Largest scale error that passes, in per cent."""
+    max_views: int = 100
+    """Stop searching when the target was found in this many images; they are taken evenly over the names."""
+    max_residual_px: float = 4.0
+    """A view belongs to the result when at least half of its corners agree with the other views to this many pixels
+    (the limit that COLMAP sets to its own points)."""
+    seed: int = 0
+    """Seed of the search for views that agree."""
+
+    def __post_init__(self) -> None:
+        if not self.tolerance_pct > 0:
+            raise ValueError("tolerance_pct must be positive")
+        if self.max_views < 2:
+            raise ValueError("max_views must be at least 2")
+        if not self.max_residual_px > 0:
+            raise ValueError("max_residual_px must be positive")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReconstructOptions:
+    """Everything that decides the result of a reconstruction, beside the capture itself."""
+
+    deblur: DeblurMethod | None = None
+    """Undo motion blur by the gyroscope before COLMAP sees a frame. Default: wiener, where exposure times are known
+    and the pictures bear the gyroscope out."""
+    rolling_shutter: RollingShutterMethod | None = None
+    """Undo the rolling shutter by the gyroscope. Default: rectify, where the readout time is known."""
+    mapping: MappingOptions = field(default_factory=MappingOptions)
+    """How COLMAP builds the model."""
+    scale: ScaleOptions = field(default_factory=ScaleOptions)
+    """How metres come from the IMU."""
+    world: WorldAxes = "z-up"
+    """Axes of the metric model: z away from the ground, or y towards it, as COLMAP's own cameras have it."""
+    deterministic: bool = False
+    """Fixed seed and one thread: the same input gives the same model, bit for bit. Slower."""
+    seed: int = 0
+    """Seed of COLMAP's random sampling."""
+    calibration: Path | None = None
+    """A calibration file of this device (from `colmap-inertial align --out`), used as a prior."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.seed < 2**31:
+            raise ValueError(f"seed must be from 0 to 2147483647, not {self.seed}")
