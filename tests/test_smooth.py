@@ -1,6 +1,5 @@
 """Smoothing agrees with independent solvers, states its errors honestly, and survives what recordings contain."""
 
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -263,21 +262,6 @@ def test_perfect_and_still_poses_are_no_trouble():
     assert np.allclose(still.accel_in_world, 0.0, atol=1e-9)
     with pytest.raises(NotObservableError, match="5 poses"):
         smooth_positions(track(t[:5], parabola[:5]))
-
-
-def test_smoothing_takes_linear_time():
-    rng = np.random.default_rng(7)
-
-    def seconds(count):
-        t = np.arange(count) / 30
-        centre = np.sin(t)[:, None] + 0.003 * rng.standard_normal((count, 3))
-        before = time.process_time()
-        smooth_positions(track(t, centre))
-        return time.process_time() - before
-
-    seconds(200)
-    assert seconds(1800) < 0.6  # a tenth of a second on a machine of one's own
-    assert seconds(54_000) < 12
 
 
 # --- with the IMU
