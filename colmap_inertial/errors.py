@@ -48,6 +48,22 @@ class OutputExistsError(OutputError):
     """Something that would be overwritten is already there."""
 
 
+class MissingExtraError(InertialError):
+    """Something needs an optional package that is not installed.
+
+    Parameters
+    ----------
+    extra
+        The name in brackets of ``pip install 'colmap-inertial[...]'``.
+    what
+        What needs it.
+    """
+
+    def __init__(self, extra: str, what: str) -> None:
+        self.extra = extra
+        super().__init__(f"{what}, which needs an extra package: pip install 'colmap-inertial[{extra}]'")
+
+
 class AlreadyMetricError(InertialError):
     """A model that already holds a metric scale would be scaled again."""
 

@@ -11,8 +11,8 @@ may be left out. Nothing is guessed: a unit, axis or time that a file does not s
     times = "name"                  # the number in each file name is its time; or a CSV file: "frames.csv"
     time_unit = "ns"                # s, ms, us, ns; for a CSV only where its header does not say
 
-    [video]                         # ... or a video; its own presentation stamps time the frames
-    file = "clip.mp4"
+    [video]                         # ... or a video; its own presentation stamps time the frames. A video with an IMU
+    file = "clip.mp4"               # inside (GoPro, CAMM) needs no more than: video = "GX010001.MP4"
     frame_times = "clip_times.csv"  # optional: the recorder's own time of each frame, in place of the stamps
     time_unit = "ns"                # of frame_times, where its header does not say
     frames_per_s = 5                # optional: use about this many
@@ -97,9 +97,10 @@ from colmap_inertial.io.capture_tables import (
     read_imu_table,
 )
 from colmap_inertial.io.imu_text import is_inertial_scale
+from colmap_inertial.io.recorders import Recording, find_recording
 from colmap_inertial.io.toml_section import Section, read_toml
 from colmap_inertial.io.units import TIME_UNITS_NS
-from colmap_inertial.types import CameraImuCalibration, CameraModel, ReadoutDirection
+from colmap_inertial.types import CameraImuCalibration, CameraModel, FrameLog, ReadoutDirection
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,6 +167,8 @@ class Capture:
         What is known about camera and IMU; wide where nothing is.
     target
         Specification of a calibration target in the scene.
+    frame_log
+        What the recorder noted about the frames of the video; what the capture.toml says goes before it.
     """
 
     path: Path
@@ -178,6 +181,7 @@ class Capture:
     imu: ImuPath | ImuTables | None = None
     calibration: CameraImuCalibration
     target: str | None = None
+    frame_log: FrameLog | None = None
 
 
 def load_capture(path: Path) -> Capture:
@@ -187,7 +191,9 @@ def load_capture(path: Path) -> Capture:
     ----------
     path
         A ``.toml`` file, a folder with a ``capture.toml``, the root of an ASL/EuRoC dataset with one camera and one
-        IMU that carry on (``cam0``, ``imu0``), or an InertialScale folder.
+        IMU that carry on (``cam0``, ``imu0``), an InertialScale folder, a video with an IMU inside (GoPro, CAMM), or
+        the folder of a recorder that wrote down everything (VideoIMUCapture, MARS logger, OpenCamera-Sensors, Stray
+        Scanner).
 
     Raises
     ------
@@ -202,25 +208,45 @@ def load_capture(path: Path) -> Capture:
     if not path.exists():
         raise FormatError(path, "no such file or folder")
     if path.suffix.lower() != ".toml":
-        raise FormatError(path, "a capture is described by a .toml file or a folder; write a capture.toml beside it")
+        recording = find_recording(path)
+        if recording is not None:
+            return _from_recording(path, recording)
+        raise FormatError(
+            path,
+            "a capture is described by a .toml file or a folder, unless it is a video with an IMU inside; write a "
+            "capture.toml beside it",
+        )
     return _from_toml(path)
 
 
 def _from_toml(path: Path) -> Capture:
     root = read_toml(path)
-    images, video = root.section("images"), root.section("video")
-    if images is not None and video is not None:
-        root.fail("video", "a capture has [images] or [video], not both")
-    frames = _images(images) if images is not None else _video(video) if video is not None else None
+    images = root.section("images")
+    frames: ImageFolder | Video | None = _video_of(root)
+    if images is not None:
+        if frames is not None:
+            root.fail("video", "a capture has [images] or [video], not both")
+        frames = _images(images)
     timing = root.table("timing")
     directions: tuple[ReadoutDirection, ...] = get_args(ReadoutDirection)
     exposure_s = timing.number("exposure_s", low=0, high=10)
     readout_s = timing.number("readout_s", low=0, high=0.5)
     readout_direction = timing.choice("readout_direction", directions) or "down"
-    shared_clock = bool(timing.boolean("shared_clock"))
+    shared_clock = timing.boolean("shared_clock")
     timing.finish()
     camera, body_from_cam = read_camera(root.section("camera"))
     imu = read_imu_table(root.section("imu"))
+    log = None
+    if isinstance(frames, Video):
+        recording = find_recording(frames.file)
+        log = None if recording is None else recording.log
+        if recording is not None and imu is None:
+            imu = ImuPath(path=recording.imu, format=recording.format)
+        if log is not None:
+            readout_s = log.readout_s if readout_s is None else readout_s
+            if shared_clock is None and isinstance(imu, ImuPath) and imu.path == frames.file:
+                shared_clock = log.shared_clock
+    shared_clock = bool(shared_clock)
     calibration = read_calibration_table(
         root.table("calibration"), body_from_cam=body_from_cam, imu=imu, readout_s=readout_s, shared_clock=shared_clock
     )
@@ -243,6 +269,7 @@ def _from_toml(path: Path) -> Capture:
         imu=imu,
         calibration=calibration,
         target=spec,
+        frame_log=log,
     )
 
 
@@ -259,7 +286,13 @@ def _images(table: Section) -> ImageFolder:
     return ImageFolder(folder=folder, pattern=pattern, times=times, time_unit=unit)
 
 
-def _video(table: Section) -> Video:
+def _video_of(root: Section) -> Video | None:
+    """The table ``[video]``, or the video's path alone."""
+    if isinstance(root.raw("video"), str):
+        return Video(file=root.require("video", root.file("video")))
+    table = root.section("video")
+    if table is None:
+        return None
     video = Video(
         file=table.require("file", table.file("file")),
         frame_times=table.file("frame_times"),
@@ -277,10 +310,31 @@ def _from_folder(path: Path) -> Capture:
     camera, imu = base / "cam0", base / "imu0"
     if all(part.exists() for part in (camera / "data.csv", camera / "data", imu / "data.csv")):
         return _from_asl(path, camera, imu)
+    recording = find_recording(path)
+    if recording is not None:
+        return _from_recording(path, recording)
     raise FormatError(
         path,
         "is no capture by itself: it holds no capture.toml, and is neither an ASL/EuRoC dataset (cam0/data.csv, "
         "cam0/data/, imu0/data.csv) nor an InertialScale folder; describe it in a capture.toml",
+    )
+
+
+def _from_recording(path: Path, recording: Recording) -> Capture:
+    """A recording that describes itself."""
+    log = recording.log
+    readout_s = None if log is None else log.readout_s
+    shared_clock = log is not None and log.shared_clock
+    return Capture(
+        path=path,
+        frames=None if recording.video is None else Video(file=recording.video),
+        readout_s=readout_s,
+        readout_direction="down" if log is None else log.readout_direction,
+        shared_clock=shared_clock,
+        camera=None if log is None else log.camera,
+        imu=ImuPath(path=recording.imu, format=recording.format),
+        calibration=calibration_prior(readout_s=readout_s, shared_clock=shared_clock),
+        frame_log=log,
     )
 
 

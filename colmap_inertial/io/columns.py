@@ -8,7 +8,7 @@ from typing import Literal
 
 from colmap_inertial.io.units import SENSOR_UNITS, TIME_UNITS_NS, Quantity, unit_of
 
-_TIME_NAMES = {"t", "time", "timestamp", "stamp", "ts", "timestamps"}
+_TIME_NAMES = {"t", "time", "timestamp", "stamp", "ts", "timestamps", "frametimestamp"}
 _GYRO_NAMES = {"g", "w", "gyr", "gyro", "gyroscope", "omega", "angularvelocity", "angvel", "wrss"}
 _ACCEL_NAMES = {"a", "acc", "acce", "accel", "accelerometer", "acceleration", "arss"}
 # A unit at the end of a name without brackets: "t_ns", "gyro_x_rad_s", "acc_x_m_s2".

@@ -14,7 +14,7 @@ from colmap_inertial.io.capture import Capture, ImageFolder, Video, load_capture
 from colmap_inertial.io.frame_times import FrameStamps, stamps_of_csv, stamps_of_log, stamps_of_names
 from colmap_inertial.io.images import SUFFIXES, read_image
 from colmap_inertial.io.video import decode_video, frame_name, video_stamps_ns
-from colmap_inertial.types import Frame, FrameTiming
+from colmap_inertial.types import Frame, FrameLog, FrameTiming
 
 
 def read_frames(capture: Capture | Path) -> tuple[FrameTiming, Iterator[Frame]]:
@@ -43,7 +43,7 @@ def read_frames(capture: Capture | Path) -> tuple[FrameTiming, Iterator[Frame]]:
     if isinstance(capture, Path):
         capture = load_capture(capture)
     if isinstance(capture.frames, Video):
-        stamps, source_ns = _video_frames(capture.frames)
+        stamps, source_ns = _video_frames(capture.frames, capture.frame_log)
         timing = _timing(capture, stamps)
         return timing, _decode_video(capture, capture.frames, timing, source_ns)
     timing = read_frame_timing(capture)
@@ -58,7 +58,7 @@ def read_frame_timing(capture: Capture | Path) -> FrameTiming:
         case ImageFolder():
             return _timing(capture, _image_stamps(capture.frames))
         case Video():
-            return _timing(capture, _video_frames(capture.frames)[0])
+            return _timing(capture, _video_frames(capture.frames, capture.frame_log)[0])
         case None:
             raise FormatError(capture.path, "describes no frames; add [images] or [video]")
 
@@ -83,6 +83,9 @@ def frame_source(capture: Capture) -> Path | None:
 
 
 def _timing(capture: Capture, stamps: FrameStamps) -> FrameTiming:
+    if capture.exposure_s is not None and isinstance(capture.frames, Video):
+        # what the user states goes before what the recorder noted
+        stamps = replace(stamps, exposure_s=None)
     timing = stamps.timing(exposure_s=capture.exposure_s, readout_s=capture.readout_s)
     return replace(timing, readout_direction=capture.readout_direction)
 
@@ -128,11 +131,19 @@ def _decode_images(capture: Capture, timing: FrameTiming) -> Iterator[Frame]:
         yield _frame(capture, timing, i, path, read_image(path))
 
 
-def _video_frames(source: Video) -> tuple[FrameStamps, NDArray[np.int64]]:
+def _video_frames(source: Video, log: FrameLog | None) -> tuple[FrameStamps, NDArray[np.int64]]:
     """Stamps of the frames to use, and the presentation stamps by which to find them in the video."""
     source_ns = video_stamps_ns(source.file)
     names = tuple(frame_name(int(t_ns), int(source_ns[0])) for t_ns in source_ns)
     t_ns = source_ns
+    recorded_ns = None if log is None else log.epoch_ns + np.rint(log.t_s * 1e9).astype(np.int64)
+    if source.frame_times is None and log is not None and recorded_ns is not None and not log.in_video_time:
+        if len(recorded_ns) not in (0, len(source_ns)):
+            raise TimingError(
+                f"{source.file} has {len(source_ns)} frames, its recorder noted the times of {len(recorded_ns)}; give "
+                "frame_times under [video] in a capture.toml"
+            )
+        t_ns = recorded_ns if len(recorded_ns) else source_ns
     if source.frame_times is not None:
         t_ns = stamps_of_log(source.frame_times, source.time_unit)
         if len(t_ns) != len(source_ns):
@@ -142,7 +153,10 @@ def _video_frames(source: Video) -> tuple[FrameStamps, NDArray[np.int64]]:
         if (np.diff(t_ns) <= 0).any():
             raise TimingError(f"{source.frame_times}: the times do not increase at row {1 + np.argmin(np.diff(t_ns))}")
     keep = np.arange(len(t_ns)) if source.frames_per_s is None else thin(t_ns, source.frames_per_s)
-    return FrameStamps(names=tuple(names[i] for i in keep), t_ns=t_ns[keep]), source_ns[keep]
+    exposure_s = None
+    if log is not None and log.exposure_s is not None and len(log.exposure_s) == len(source_ns):
+        exposure_s = log.exposure_s[keep]
+    return FrameStamps(names=tuple(names[i] for i in keep), t_ns=t_ns[keep], exposure_s=exposure_s), source_ns[keep]
 
 
 def thin(t_ns: NDArray[np.int64], frames_per_s: float) -> NDArray[np.intp]:

@@ -10,12 +10,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from colmap_inertial.errors import FormatError
-from colmap_inertial.io import imu_text
+from colmap_inertial.io import android, camm, dji, gcsv, gopro, imu_text, ios, rosbag, video_imu_capture
 from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.capture_tables import ImuPath
+from colmap_inertial.io.mp4 import is_mp4, read_movie
 from colmap_inertial.io.plausible import check_plausible
 from colmap_inertial.io.units import DeclaredUnits
-from colmap_inertial.types import ImuRecording
+from colmap_inertial.types import FrameLog, ImuRecording
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,12 +33,16 @@ class ImuFormat:
         Whether a path holds one. Looks at names and first bytes; cheap, never raises for a readable path.
     read
         Reads it, given the units that the user declared in place of the file's.
+    frames
+        Reads what it says about the frames of the video, where such recordings can say anything; gives ``None`` where
+        this one does not.
     """
 
     name: str
     layout: str
     accepts: Callable[[Path], bool]
     read: Callable[[Path, DeclaredUnits], ImuRecording]
+    frames: Callable[[Path], FrameLog | None] | None = None
 
 
 def read_imu(path: Path, *, format: str = "auto") -> ImuRecording:
@@ -46,8 +51,7 @@ def read_imu(path: Path, *, format: str = "auto") -> ImuRecording:
     Parameters
     ----------
     path
-        A file or folder: an ASL/EuRoC dataset (its root, ``mav0``, ``imu0`` or ``data.csv``), a folder with
-        ``gyroscope.txt`` and ``accelerometer.txt``, a CSV whose header names columns and units, or a ``capture.toml``
+        A file or folder of one of :func:`imu_formats`, which includes a video with an IMU inside, or a ``capture.toml``
         (or a folder that holds one).
     format
         ``"auto"`` finds it by content; otherwise a name from :func:`imu_formats` or ``"capture"``.
@@ -69,6 +73,28 @@ def read_imu(path: Path, *, format: str = "auto") -> ImuRecording:
     imu = _read_plain(path, format, DeclaredUnits())
     check_plausible(imu, path)
     return imu
+
+
+def read_frame_log(path: Path, *, format: str = "auto") -> FrameLog | None:
+    """What a recording says about the frames of its video: times, exposure, readout, stabilisation, intrinsics.
+
+    Parameters
+    ----------
+    path, format
+        As for :func:`read_imu`, without captures.
+
+    Returns
+    -------
+    ``None`` where the recording, or its kind, says nothing.
+
+    Raises
+    ------
+    FormatError
+        Where the recording is damaged or of no known kind.
+    """
+    path = Path(path)
+    found = _format_of(path, format)
+    return None if found.frames is None else found.frames(path)
 
 
 def read_capture_imu(capture: Capture) -> ImuRecording:
@@ -112,12 +138,19 @@ def register_imu_format(added: ImuFormat) -> None:
 
 
 def _read_plain(path: Path, name: str, units: DeclaredUnits) -> ImuRecording:
+    return _format_of(path, name).read(path, units)
+
+
+def _format_of(path: Path, name: str) -> ImuFormat:
     if not path.exists():
         raise FormatError(path, "no such file or folder")
     if name == "auto":
         for candidate in _formats:
             if candidate.accepts(path):
-                return candidate.read(path, units)
+                return candidate
+        if path.is_file() and is_mp4(path):
+            tracks = ", ".join(f"{track.handler} {track.entry}" for track in read_movie(path).tracks)
+            raise FormatError(path, f"is a video without an IMU that is known here; its tracks: {tracks or 'none'}")
         known = "; ".join(candidate.layout for candidate in _formats)
         raise FormatError(
             path,
@@ -126,7 +159,7 @@ def _read_plain(path: Path, name: str, units: DeclaredUnits) -> ImuRecording:
         )
     for candidate in _formats:
         if candidate.name == name:
-            return candidate.read(path, units)
+            return candidate
     names = ", ".join(["auto", *(candidate.name for candidate in _formats), "capture"])
     raise FormatError(path, f'unknown IMU format "{name}"; known are {names}')
 
@@ -143,6 +176,73 @@ _formats: list[ImuFormat] = [
         layout="a folder with gyroscope.txt and accelerometer.txt",
         accepts=imu_text.is_inertial_scale,
         read=imu_text.read_inertial_scale_imu,
+    ),
+    ImuFormat(
+        name="gopro",
+        layout="a GoPro video (HERO5 and later, MAX, Fusion)",
+        accepts=gopro.is_gopro,
+        read=gopro.read_gopro,
+        frames=gopro.read_gopro_frames,
+    ),
+    ImuFormat(
+        name="camm",
+        layout="a video with a CAMM track",
+        accepts=camm.is_camm,
+        read=camm.read_camm,
+        frames=camm.read_camm_frames,
+    ),
+    ImuFormat(
+        name="dji",
+        layout="a DJI video, of which the message says what it can give",
+        accepts=dji.is_dji,
+        read=dji.read_dji,
+    ),
+    ImuFormat(
+        name="gcsv",
+        layout="a Gyroflow log (.gcsv)",
+        accepts=gcsv.is_gcsv,
+        read=gcsv.read_gcsv,
+        frames=gcsv.read_gcsv_frames,
+    ),
+    ImuFormat(
+        name="video-imu-capture",
+        layout="a VideoIMUCapture folder with video_meta.pb3",
+        accepts=video_imu_capture.is_video_imu_capture,
+        read=video_imu_capture.read_video_imu_capture,
+        frames=video_imu_capture.read_video_imu_capture_frames,
+    ),
+    ImuFormat(
+        name="mars",
+        layout="a MARS logger folder with gyro_accel.csv",
+        accepts=android.is_mars,
+        read=android.read_mars,
+        frames=android.read_mars_frames,
+    ),
+    ImuFormat(
+        name="opencamera",
+        layout="an OpenCamera-Sensors folder with *gyro.csv and *accel.csv",
+        accepts=android.is_opencamera,
+        read=android.read_opencamera,
+        frames=android.read_opencamera_frames,
+    ),
+    ImuFormat(
+        name="stray-scanner",
+        layout="a Stray Scanner folder with imu.csv",
+        accepts=ios.is_stray_scanner,
+        read=ios.read_stray_scanner,
+        frames=ios.read_stray_scanner_frames,
+    ),
+    ImuFormat(
+        name="sensor-logger",
+        layout="a Sensor Logger zip or folder with Gyroscope.csv",
+        accepts=ios.is_sensor_logger,
+        read=ios.read_sensor_logger,
+    ),
+    ImuFormat(
+        name="rosbag",
+        layout="a ROS 1 bag or ROS 2 recording",
+        accepts=rosbag.is_rosbag,
+        read=rosbag.read_rosbag,
     ),
     ImuFormat(
         name="csv",

@@ -46,7 +46,7 @@ class SensorTable:
 
 def read_tables(gyro: SensorTable, accel: SensorTable | None) -> ImuRecording:
     """Read an IMU, or a gyroscope alone, from tables that the user described (units converted, axes as in the file)."""
-    return _recording(_read_described(gyro, "gyro"), None if accel is None else _read_described(accel, "accel"))
+    return recording(_read_described(gyro, "gyro"), None if accel is None else _read_described(accel, "accel"))
 
 
 def is_inertial_scale(path: Path) -> bool:
@@ -69,8 +69,8 @@ def read_inertial_scale_imu(path: Path, units: DeclaredUnits) -> ImuRecording:
                 table.path, f"{table.width} columns; expected t_ns x y z", line=int(table.line_numbers[0])
             )
         values = to_si(table.numbers([1, 2, 3]), quantity, unit)  # type: ignore[arg-type]
-        samples.append(_ordered(table, quantity, table.stamps_ns(0, "ns"), values))  # type: ignore[arg-type]
-    return _recording(*samples)
+        samples.append(ordered(table, quantity, table.stamps_ns(0, "ns"), values))  # type: ignore[arg-type]
+    return recording(*samples)
 
 
 def is_euroc(path: Path) -> bool:
@@ -169,7 +169,7 @@ def _read_csv(path: Path, units: DeclaredUnits, noise: ImuNoise | None) -> ImuRe
     t_ns = table.stamps_ns(place["time", 0], unit("time", 1, None))
     numbers = table.numbers([place[sensor, axis] for sensor in ("gyro", "accel") for axis in range(3)])
     gyro, accel = to_si(numbers[:, :3], "gyro", gyro_unit), to_si(numbers[:, 3:], "accel", accel_unit)
-    return _recording(_ordered(table, "gyro", t_ns, gyro), _ordered(table, "accel", t_ns, accel), noise=noise)
+    return recording(ordered(table, "gyro", t_ns, gyro), ordered(table, "accel", t_ns, accel), noise=noise)
 
 
 def _read_described(source: SensorTable, quantity: Quantity) -> Samples:
@@ -178,7 +178,7 @@ def _read_described(source: SensorTable, quantity: Quantity) -> Samples:
     table = read_table(source.file)
     values = table.numbers([column_index(table, column) for column in source.columns])
     t_ns = table.stamps_ns(column_index(table, source.time), source.time_unit)
-    return _ordered(table, quantity, t_ns, to_si(values, quantity, source.unit))
+    return ordered(table, quantity, t_ns, to_si(values, quantity, source.unit))
 
 
 def column_index(table: Table, column: str | int) -> int:
@@ -194,12 +194,14 @@ def column_index(table: Table, column: str | int) -> int:
     return table.header.index(column)
 
 
-def _ordered(table: Table, quantity: Quantity, t_ns: NDArray[np.int64], values: Array) -> Samples:
+def ordered(table: Table, quantity: Quantity, t_ns: NDArray[np.int64], values: Array) -> Samples:
+    """:func:`order_samples` of a table's rows."""
     samples = order_samples(table.path, SENSOR_NAMES[quantity], t_ns, values, table.line_numbers)
     return Samples(t_ns=samples.t_ns, values=samples.values, repairs=table.repairs + samples.repairs)
 
 
-def _recording(gyro: Samples, accel: Samples | None, *, noise: ImuNoise | None = None) -> ImuRecording:
+def recording(gyro: Samples, accel: Samples | None, *, noise: ImuNoise | None = None, device: str = "") -> ImuRecording:
+    """An :class:`ImuRecording` of ordered samples, its epoch at the first of them."""
     if accel is None:
         accel = Samples(t_ns=np.zeros(0, dtype=np.int64), values=np.zeros((0, 3)), repairs=())
     epoch_ns = int(np.concatenate([gyro.t_ns, accel.t_ns]).min())
@@ -210,5 +212,6 @@ def _recording(gyro: Samples, accel: Samples | None, *, noise: ImuNoise | None =
         accel_m_s2=accel.values,
         epoch_ns=epoch_ns,
         repairs=tuple(dict.fromkeys(gyro.repairs + accel.repairs)),
+        device=device,
         noise=noise,
     )

@@ -113,7 +113,12 @@ def read_table(path: Path) -> Table:
     FormatError
         Where the file is missing or holds no rows, or a line has another number of cells than the first.
     """
-    text = read_text(path).replace("\r\n", "\n").replace("\r", "\n")
+    return parse_table(path, read_text(path))
+
+
+def parse_table(path: Path, text: str) -> Table:
+    """:func:`read_table` of a text that lies elsewhere than in a file of its own; ``path`` is for messages."""
+    text = text.replace("\r\n", "\n").replace("\r", "\n")
     body = text.rstrip("\n")
     raw = body.split("\n")
     first = next((i for i, line in enumerate(raw) if line.strip() and not _is_comment(line)), None)

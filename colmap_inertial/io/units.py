@@ -36,9 +36,9 @@ _ALIASES = {
     **dict.fromkeys(("m/s2", "ms-2", "ms2", "m/s²", "m/s/s", "mps2", "m/sec2"), "m/s2"),
     **dict.fromkeys(("g", "g0"), "g"),
     **dict.fromkeys(("s", "sec", "second", "seconds"), "s"),
-    **dict.fromkeys(("ms", "msec", "milliseconds"), "ms"),
-    **dict.fromkeys(("us", "µs", "μs", "usec", "microseconds"), "us"),
-    **dict.fromkeys(("ns", "nsec", "nanoseconds"), "ns"),
+    **dict.fromkeys(("ms", "msec", "millisec", "milliseconds"), "ms"),
+    **dict.fromkeys(("us", "µs", "μs", "usec", "microsec", "microseconds"), "us"),
+    **dict.fromkeys(("ns", "nsec", "nanosec", "nanoseconds"), "ns"),
 }
 # Differences of two stamps must fit 64 bits as well.
 _LARGEST_STAMP_NS = 4_500_000_000_000_000_000

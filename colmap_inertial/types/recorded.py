@@ -198,6 +198,72 @@ class FrameTiming:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class FrameLog:
+    """What a recorder noted about the frames of its video, beside the inertial samples.
+
+    Attributes
+    ----------
+    t_s
+        (F,) start of exposure of row 0 (or the recorder's own stamp) of each frame of the video, in seconds since
+        ``epoch_ns``; empty where the recorder noted no times.
+    epoch_ns
+        The clock's reading, in nanoseconds, where ``t_s`` is zero.
+    in_video_time
+        Whether ``t_s`` are the video's presentation stamps, which the IMU's stamps were brought to; otherwise they are
+        the recorder's own times of the frames.
+    shared_clock
+        Whether ``t_s`` and the IMU's stamps come from one clock.
+    exposure_s, iso, focal_px
+        (F,) of each frame, or ``None`` where unknown.
+    readout_s, readout_direction
+        As in :class:`FrameTiming`.
+    stabilised
+        Whether the picture was stabilised (electronically, or by moving the lens), so that it does not turn with the
+        IMU; ``None`` where the recorder did not say.
+    stabilisation
+        In the recorder's words.
+    camera
+        Intrinsics of the video's pictures.
+    up_in_imu
+        (F, 3) unit vectors away from the ground, IMU frame, as the recorder's own filter saw them.
+    start_from_imu_xyzw
+        (F, 4) orientations of the device against the first frame's, by the recorder's own filter.
+    image_from_cam_xyzw
+        (F, 4) how the recorder turned each picture against its lens.
+    """
+
+    t_s: Array
+    epoch_ns: int = 0
+    in_video_time: bool = False
+    shared_clock: bool = False
+    exposure_s: Array | None = None
+    iso: Array | None = None
+    focal_px: Array | None = None
+    readout_s: float | None = None
+    readout_direction: ReadoutDirection = "down"
+    stabilised: bool | None = None
+    stabilisation: str = ""
+    camera: CameraModel | None = None
+    up_in_imu: Array | None = None
+    start_from_imu_xyzw: Array | None = None
+    image_from_cam_xyzw: Array | None = None
+
+    def __post_init__(self) -> None:
+        t_s = checked_times("t_s", self.t_s)
+        set_fields(self, t_s=t_s)
+        for name in ("exposure_s", "iso", "focal_px"):
+            if getattr(self, name) is not None:
+                set_fields(self, **{name: checked_array(name, getattr(self, name), (len(t_s),))})
+        for name in ("start_from_imu_xyzw", "image_from_cam_xyzw"):
+            if getattr(self, name) is not None:
+                set_fields(self, **{name: checked_quaternions(name, getattr(self, name), (len(t_s), 4))})
+        if self.up_in_imu is not None:
+            set_fields(self, up_in_imu=checked_array("up_in_imu", self.up_in_imu, (len(t_s), 3)))
+        if self.readout_s is not None and not 0 <= self.readout_s < 1:
+            raise ValueError("readout_s must be from 0 to 1 second")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class CameraTrajectory:
     """Camera poses of a reconstruction with their times.
 

@@ -1,0 +1,190 @@
+"""Android recorders that write text: OpenCamera-Sensors and MARS logger. Sensors and frames share the phone's clock.
+
+OpenCamera-Sensors writes ``{name}gyro.csv`` and ``{name}accel.csv`` without a header, rows ``x,y,z,t_ns`` in rad/s and
+m/s2, and ``{name}timestamps.csv`` with one ``t_ns`` for each frame of the video
+(github.com/prime-slam/OpenCamera-Sensors).
+
+MARS logger writes ``gyro_accel.csv``, whose header names units, the accelerometer interpolated at the gyroscope's
+times; ``frame_timestamps.txt`` with the time of each frame of the video, rounded to microseconds;
+``movie_metadata.csv`` with exposure, readout, focal length in pixels and ISO of what the sensor took, which may be more
+than the frames. The iOS version writes ``Timestamp[sec]`` and a first line ``#Recording starts at``
+(github.com/OSUPCVLab/mobile-ar-sensor-logger).
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.errors import FormatError
+from colmap_inertial.io.columns import split_unit
+from colmap_inertial.io.frame_times import stamps_of_log
+from colmap_inertial.io.imu_text import ordered, read_csv, recording
+from colmap_inertial.io.samples import Samples
+from colmap_inertial.io.tables import Table, read_table
+from colmap_inertial.io.units import SENSOR_NAMES, TIME_UNITS_NS, DeclaredUnits, Quantity, seconds, to_si, unit_of
+from colmap_inertial.types import Array, FrameLog, ImuRecording
+
+_MARS_TABLES = ("gyro_accel.csv", "raw_accel_gyro.csv")
+#: Frames that the sensor took within this of a frame's rounded time are that frame.
+_SAME_FRAME_NS = 2_000_000
+
+
+def is_opencamera(path: Path) -> bool:
+    """Whether ``path`` is an OpenCamera-Sensors folder, or the gyroscope's file in one."""
+    found = _gyro_files(path)
+    return bool(found) and all(_has_bare_rows(file) for file in found)
+
+
+def read_opencamera(path: Path, units: DeclaredUnits) -> ImuRecording:
+    """Read ``{name}gyro.csv`` and ``{name}accel.csv``; the accelerometer may be missing.
+
+    Raises
+    ------
+    FormatError
+        Also where a folder holds several recordings: give the gyroscope's file of one.
+    """
+    gyro_file = _one_gyro_file(path)
+    accel_file = _sibling(gyro_file, "accel.csv")
+    gyro = _bare_samples(gyro_file, "gyro", units.gyro or "rad/s")
+    accel = _bare_samples(accel_file, "accel", units.accel or "m/s2") if accel_file.is_file() else None
+    return recording(gyro, accel)
+
+
+def read_opencamera_frames(path: Path) -> FrameLog | None:
+    """The time of each frame of the video, on the IMU's clock; ``None`` where they were not recorded."""
+    file = _sibling(_one_gyro_file(path), "timestamps.csv")
+    return _log_of_times(stamps_of_log(file, "ns"), file) if file.is_file() else None
+
+
+def is_mars(path: Path) -> bool:
+    """Whether ``path`` is a MARS logger folder, or the table of its IMU."""
+    return _mars_table(path) is not None
+
+
+def read_mars(path: Path, units: DeclaredUnits) -> ImuRecording:
+    """Read MARS logger's table of gyroscope and accelerometer."""
+    table = _mars_table(path)
+    if table is None:
+        raise FormatError(path, f"holds no {_MARS_TABLES[0]} of MARS logger")
+    return read_csv(table, units)
+
+
+def read_mars_frames(path: Path) -> FrameLog | None:
+    """Times, exposures, ISO and focal lengths of the video's frames; ``None`` where they were not recorded."""
+    folder = path.parent if path.is_file() else path
+    times, details = folder / "frame_timestamps.txt", folder / "movie_metadata.csv"
+    if not times.is_file() and not details.is_file():
+        return None
+    if not details.is_file():
+        return _log_of_times(stamps_of_log(times), times)
+    table = read_table(details)
+    taken_ns = stamps_of_log(details)
+    frame_ns = stamps_of_log(times) if times.is_file() else taken_ns
+    _require_increasing(frame_ns, times if times.is_file() else details)
+    order = np.argsort(taken_ns, kind="stable")
+    after = np.clip(np.searchsorted(taken_ns[order], frame_ns), 1, max(1, len(order) - 1))
+    if len(order) == 1:
+        after = np.zeros(len(frame_ns), dtype=np.intp)
+    before = np.maximum(after - 1, 0)
+    closer = np.abs(taken_ns[order[before]] - frame_ns) < np.abs(taken_ns[order[after]] - frame_ns)
+    row = order[np.where(closer, before, after)]
+    matched = bool((np.abs(taken_ns[row] - frame_ns) <= _SAME_FRAME_NS).all())
+
+    def column(pattern: str, *, time: bool = False) -> Array | None:
+        """One column at the frames: seconds of a time."""
+        index = _find(table, pattern)
+        if index is None or not matched:
+            return None
+        values = table.numbers([index])[row, 0]
+        if time:
+            assert table.header is not None
+            unit = unit_of(split_unit(table.header[index])[1] or "")
+            if unit not in TIME_UNITS_NS:
+                return None
+            values = values * (TIME_UNITS_NS[unit] / 1e9)
+        return values if np.isfinite(values).all() and (values >= 0).all() else None
+
+    readout = column("framereadouttime|rollingshutterskew", time=True)
+    readout_s = None if readout is None else float(np.median(readout))
+    return FrameLog(
+        t_s=seconds(frame_ns, int(frame_ns[0])),
+        epoch_ns=int(frame_ns[0]),
+        shared_clock=True,
+        exposure_s=column("exposuretime|exposure", time=True),
+        iso=column("iso"),
+        focal_px=column("fx"),
+        readout_s=readout_s if readout_s is not None and 0 < readout_s < 0.5 else None,
+    )
+
+
+# --- OpenCamera-Sensors ----------------------------------------------------------------------------------------------
+
+
+def _gyro_files(path: Path) -> list[Path]:
+    if path.is_file():
+        return [path] if path.name.endswith("gyro.csv") else []
+    return sorted(file for file in path.glob("*gyro.csv") if file.is_file())
+
+
+def _one_gyro_file(path: Path) -> Path:
+    found = _gyro_files(path)
+    if len(found) != 1:
+        what = ", ".join(file.name for file in found[:5]) if found else "none"
+        raise FormatError(
+            path, f"holds {len(found)} files *gyro.csv of OpenCamera-Sensors ({what}); give the one to read"
+        )
+    return found[0]
+
+
+def _sibling(gyro_file: Path, ending: str) -> Path:
+    return gyro_file.with_name(gyro_file.name.removesuffix("gyro.csv") + ending)
+
+
+def _has_bare_rows(path: Path) -> bool:
+    """Whether a file begins with a row of four numbers."""
+    try:
+        with open(path, encoding="utf-8-sig", errors="replace") as file:
+            cells = file.readline(1000).split(",")
+        return len(cells) == 4 and all(re.fullmatch(r"[-+.\deE]+", cell.strip()) for cell in cells)
+    except OSError:
+        return False
+
+
+def _bare_samples(path: Path, quantity: Quantity, unit: str) -> Samples:
+    table = read_table(path)
+    if table.width != 4:
+        raise FormatError(
+            path,
+            f"{table.width} cells where the {SENSOR_NAMES[quantity]}'s file has x,y,z,t_ns",
+            line=int(table.line_numbers[0]),
+        )
+    return ordered(table, quantity, table.stamps_ns(3, "ns"), to_si(table.numbers([0, 1, 2]), quantity, unit))
+
+
+def _log_of_times(frame_ns: NDArray[np.int64], path: Path) -> FrameLog:
+    _require_increasing(frame_ns, path)
+    return FrameLog(t_s=seconds(frame_ns, int(frame_ns[0])), epoch_ns=int(frame_ns[0]), shared_clock=True)
+
+
+def _require_increasing(frame_ns: NDArray[np.int64], path: Path) -> None:
+    bad = np.flatnonzero(np.diff(frame_ns) <= 0)
+    if len(bad):
+        raise FormatError(path, f"the time of frame {bad[0] + 2} is not after the one before")
+
+
+# --- MARS logger -----------------------------------------------------------------------------------------------------
+
+
+def _mars_table(path: Path) -> Path | None:
+    candidates = [path] if path.is_file() else [path / name for name in _MARS_TABLES]
+    return next((file for file in candidates if file.name in _MARS_TABLES and file.is_file()), None)
+
+
+def _find(table: Table, pattern: str) -> int | None:
+    """The column whose name, small and without blanks and unit, is ``pattern``."""
+    flat = [re.sub(r"[\s_.]", "", split_unit(cell)[0]).lower() for cell in table.header or ()]
+    return next((i for i, name in enumerate(flat) if re.fullmatch(pattern, name)), None)

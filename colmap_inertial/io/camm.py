@@ -1,0 +1,132 @@
+"""CAMM, the camera motion metadata that phones and street cameras write into MP4 files (track ``camm``).
+
+Each sample of the track, little-endian: two reserved bytes, a 16-bit type, the data. Type 1 holds the exposure of a
+pixel and the rolling shutter's skew (nanoseconds, 32 bit each), 2 the gyroscope (rad/s), 3 the accelerometer (m/s2),
+both three floats along the camera's axes; 0 and 4 to 7 are orientations, positions and the magnetometer. A sample's
+time is the track's, on the movie's clock (Google's Camera Motion Metadata Spec).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.errors import FormatError
+from colmap_inertial.io.imu_text import recording
+from colmap_inertial.io.mp4 import Movie, Track, has_track, read_movie
+from colmap_inertial.io.samples import Samples, order_samples
+from colmap_inertial.io.units import SENSOR_NAMES, DeclaredUnits, Quantity, seconds, to_si
+from colmap_inertial.types import FrameLog, ImuRecording
+
+_EXPOSURE, _GYRO, _ACCEL = 1, 2, 3
+#: Bytes of each type's data; a sample may hold several packets.
+_LENGTHS = {0: 12, 1: 8, 2: 12, 3: 12, 4: 12, 5: 24, 6: 56, 7: 12}
+
+
+def is_camm(path: Path) -> bool:
+    """Whether ``path`` is an MP4 file with a CAMM track."""
+    return has_track(path, "camm")
+
+
+def read_camm(path: Path, units: DeclaredUnits) -> ImuRecording:
+    """Read the IMU of a video with a CAMM track; stamps are on the video's clock.
+
+    Raises
+    ------
+    FormatError
+        Where there is no gyroscope, or the file is damaged.
+    """
+    packets = _packets(*_open(path))
+    found: dict[int, Samples] = {}
+    sensors: tuple[tuple[int, Quantity, str], ...] = (
+        (_GYRO, "gyro", units.gyro or "rad/s"),
+        (_ACCEL, "accel", units.accel or "m/s2"),
+    )
+    for kind, quantity, unit in sensors:
+        t_ns, data = packets[kind]
+        if len(t_ns):
+            values = to_si(data.view("<f4").astype(np.float64), quantity, unit)
+            found[kind] = order_samples(path, SENSOR_NAMES[quantity], t_ns, values, np.arange(1, len(t_ns) + 1))
+    if _GYRO not in found:
+        raise FormatError(path, "its CAMM track holds no gyroscope samples (type 2)")
+    return recording(found[_GYRO], found.get(_ACCEL))
+
+
+def read_camm_frames(path: Path) -> FrameLog:
+    """Exposure and readout of the frames, where the CAMM track has them.
+
+    Raises
+    ------
+    FormatError
+        Where the file is damaged or holds no video.
+    """
+    movie, track = _open(path)
+    video = movie.track(handler="vide")
+    if video is None or len(video.t_ns) == 0:
+        raise FormatError(path, "holds no video")
+    frame_ns = np.sort(video.t_ns)
+    t_ns, data = _packets(movie, track)[_EXPOSURE]
+    exposure_s = readout_s = None
+    if len(t_ns):
+        times = data.view("<i4").astype(np.float64) * 1e-9
+        nearest = near(t_ns, frame_ns)
+        exposure, skew = times[nearest, 0], float(np.median(times[:, 1]))
+        exposure_s = exposure if ((exposure >= 0) & (exposure < 10)).all() else None
+        readout_s = skew if 0 <= skew < 0.5 else None
+    return FrameLog(
+        t_s=seconds(frame_ns, int(frame_ns[0])),
+        epoch_ns=int(frame_ns[0]),
+        in_video_time=True,
+        shared_clock=True,
+        exposure_s=exposure_s,
+        readout_s=readout_s,
+    )
+
+
+def _open(path: Path) -> tuple[Movie, Track]:
+    movie = read_movie(path)
+    track = movie.track(entry="camm")
+    if track is None or len(track.size) == 0:
+        raise FormatError(path, "holds no camera motion metadata (a track of format camm)")
+    return movie, track
+
+
+def near(t_ns: NDArray[np.int64], frame_ns: NDArray[np.int64]) -> NDArray[np.intp]:
+    after = np.clip(np.searchsorted(t_ns, frame_ns), 1, len(t_ns) - 1)
+    return np.where(frame_ns - t_ns[after - 1] < t_ns[after] - frame_ns, after - 1, after)
+
+
+def _packets(movie: Movie, track: Track) -> dict[int, tuple[NDArray[np.int64], NDArray[np.uint8]]]:
+    """Times (N,) and data (N, bytes) of the packets of the three types that are used."""
+    raw, begin = movie.contents(track)
+    data = np.frombuffer(raw, np.uint8)
+    at, end, t_ns = begin, begin + track.size, track.t_ns
+    lengths = np.full(65536, -1)
+    lengths[list(_LENGTHS)] = list(_LENGTHS.values())
+    parts: dict[int, list[tuple[NDArray[np.int64], NDArray[np.uint8]]]] = {_EXPOSURE: [], _GYRO: [], _ACCEL: []}
+    while len(at):
+        if (at + 4 > end).any():
+            raise FormatError(movie.path, "is damaged: a sample of the camm track is shorter than its head")
+        kind = data[at + 2].astype(np.int64) | data[at + 3].astype(np.int64) << 8
+        length = lengths[kind]
+        wrong = (at + 4 + np.maximum(length, 0) > end) & (length >= 0)
+        if wrong.any():
+            first = int(np.argmax(wrong))
+            raise FormatError(
+                movie.path, f"is damaged: packet {first + 1} of type {kind[first]} of its camm track is cut off"
+            )
+        for wanted, found in parts.items():
+            rows = np.flatnonzero(kind == wanted)
+            found.append((t_ns[rows], data[at[rows, None] + 4 + np.arange(_LENGTHS[wanted])]))
+        # an unknown type ends its sample
+        more = np.flatnonzero((length >= 0) & (at + 4 + length < end))
+        at, end, t_ns = (at + 4 + length)[more], end[more], t_ns[more]
+    return {
+        kind: (
+            np.concatenate([t for t, _ in found] or [np.zeros(0, dtype=np.int64)]),
+            np.ascontiguousarray(np.concatenate([d for _, d in found] or [np.zeros((0, _LENGTHS[kind]), np.uint8)])),
+        )
+        for kind, found in parts.items()
+    }

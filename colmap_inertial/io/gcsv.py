@@ -1,0 +1,138 @@
+"""Gyroflow's text format (``.gcsv``).
+
+The first line is ``GYROFLOW IMU LOG`` (or ``CAMERA IMU LOG``). Then ``key,value`` lines, then a header ``t,gx,gy,gz``
+with optional ``ax,ay,az`` and ``mx,my,mz``, then rows of raw numbers: ``tscale`` seconds, ``gscale`` rad/s and
+``ascale`` g (each 1, a missing ``tscale`` 0.001) make one of them. ``orientation`` such as ``YxZ`` says which column,
+or with a small letter which column's opposite, is x, y, z. ``frame_readout_time`` is in milliseconds;
+``frame_readout_direction`` 0, 1, 2, 3 is from the top, the bottom, the left, the right. Times count from the start of
+the recording (docs.gyroflow.xyz, gcsv format).
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from colmap_inertial.errors import FormatError
+from colmap_inertial.io.files import read_text
+from colmap_inertial.io.imu_text import ordered, recording
+from colmap_inertial.io.tables import Table, parse_table
+from colmap_inertial.io.units import Axes, DeclaredUnits, to_si
+from colmap_inertial.types import FrameLog, ImuRecording, ReadoutDirection
+
+_FIRST_LINES = ("GYROFLOW IMU LOG", "CAMERA IMU LOG")
+_DIRECTIONS: dict[str, ReadoutDirection] = {
+    **dict.fromkeys(("0", "toptobottom"), "down"),
+    **dict.fromkeys(("1", "180", "bottomtotop"), "up"),
+    **dict.fromkeys(("2", "270", "lefttoright"), "right"),
+    **dict.fromkeys(("3", "90", "righttoleft"), "left"),
+}
+#: Lines that a header may have; the rows begin before.
+_LONGEST_HEADER = 1000
+
+
+def is_gcsv(path: Path) -> bool:
+    """Whether ``path`` is a Gyroflow log."""
+    if not path.is_file():
+        return False
+    try:
+        with open(path, encoding="utf-8-sig", errors="replace") as file:
+            return file.readline(100).strip().startswith(_FIRST_LINES)
+    except OSError:
+        return False
+
+
+def read_gcsv(path: Path, units: DeclaredUnits) -> ImuRecording:
+    """Read the IMU of a Gyroflow log; the accelerometer may be missing.
+
+    Raises
+    ------
+    FormatError
+        Where a scale, the orientation or a row is damaged.
+    """
+    header, rows = _read(path)
+    assert rows.header is not None
+    names = [name.lower() for name in rows.header]
+    axes = _orientation(path, header)
+    t_ns = np.rint(rows.numbers([0])[:, 0] * (_number(path, header, "tscale", 1e-3) * 1e9))
+    if not np.isfinite(t_ns).all() or np.abs(t_ns).max() > 4e18:
+        raise FormatError(path, "a time is not a number, or beyond 142 years; check tscale")
+    stamps = t_ns.astype(np.int64)
+
+    columns = [names.index(f"g{axis}") for axis in "xyz"]
+    gyro = rows.numbers(columns) * _number(path, header, "gscale", 1.0)
+    samples = ordered(rows, "gyro", stamps, to_si(axes.apply(gyro), "gyro", units.gyro or "rad/s"))
+    accel_samples = None
+    if all(f"a{axis}" in names for axis in "xyz"):
+        columns = [names.index(f"a{axis}") for axis in "xyz"]
+        accel = rows.numbers(columns) * _number(path, header, "ascale", 1.0)
+        accel_samples = ordered(rows, "accel", stamps, to_si(axes.apply(accel), "accel", units.accel or "g"))
+    device = " ".join(header[key][0] for key in ("vendor", "id") if header.get(key, ("",))[0])
+    return recording(samples, accel_samples, device=device)
+
+
+def read_gcsv_frames(path: Path) -> FrameLog:
+    """The readout of the frames, where the log states it; it holds no frame times.
+
+    Raises
+    ------
+    FormatError
+        Where the header is damaged.
+    """
+    header, _ = _read(path)
+    readout_s = None
+    direction: ReadoutDirection = "down"
+    if "frame_readout_time" in header:
+        readout_s = abs(_number(path, header, "frame_readout_time", 0.0)) * 1e-3
+        if readout_s >= 0.5:
+            raise FormatError(
+                path, f"frame_readout_time is {1e3 * readout_s:g} ms", line=header["frame_readout_time"][1]
+            )
+        text, line = header.get("frame_readout_direction", ("0", 1))
+        if text.lower() not in _DIRECTIONS:
+            raise FormatError(path, f"frame_readout_direction is {text[:40]!r}; expected 0, 1, 2 or 3", line=line)
+        direction = _DIRECTIONS[text.lower()]
+    return FrameLog(t_s=np.zeros(0), readout_s=readout_s, readout_direction=direction)
+
+
+def _read(path: Path) -> tuple[dict[str, tuple[str, int]], Table]:
+    """The header's values with their lines, and the rows."""
+    lines = read_text(path).splitlines()
+    if not lines or not lines[0].strip().startswith(_FIRST_LINES):
+        raise FormatError(path, f"does not begin with {_FIRST_LINES[0]}", line=1)
+    header: dict[str, tuple[str, int]] = {}
+    for number, line in enumerate(lines[1:_LONGEST_HEADER], start=2):
+        cells = [cell.strip() for cell in line.split(",")]
+        if cells[0].lower() in ("t", "time") and len(cells) > 3:
+            names = [cell.lower() for cell in cells]
+            if not all(f"g{axis}" in names for axis in "xyz"):
+                raise FormatError(path, f"names no columns gx, gy, gz: {line[:100]}", line=number)
+            # blank lines in front keep the line numbers of messages right
+            return header, parse_table(path, "\n" * (number - 1) + "\n".join(lines[number - 1 :]) + "\n")
+        if len(cells) >= 2:
+            header[cells[0].lower()] = (",".join(cells[1:]), number)
+    raise FormatError(path, "has no line that names its columns (t,gx,gy,gz,...)")
+
+
+def _number(path: Path, header: dict[str, tuple[str, int]], key: str, default: float) -> float:
+    text, line = header.get(key, (str(default), 1))
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value) or (key != "frame_readout_time" and value == 0):
+        raise FormatError(path, f"{key} is {text[:40]!r}, not a number to multiply by", line=line)
+    return value
+
+
+def _orientation(path: Path, header: dict[str, tuple[str, int]]) -> Axes:
+    """Which column is which axis; as written where the log does not say."""
+    text, line = header.get("orientation", ("XYZ", 1))
+    try:
+        return Axes.parse(",".join(("-" if letter.islower() else "") + letter for letter in text))
+    except ValueError:
+        raise FormatError(
+            path, f"orientation is {text[:40]!r}; expected three letters such as YxZ", line=line
+        ) from None

@@ -1,0 +1,218 @@
+"""Recorders that hand on what iOS measures: Stray Scanner, and Sensor Logger (iOS and Android).
+
+iOS states accelerations in g and with the sign of gravity: a phone that lies on its back reads z = -1, where the
+specific force is +9.8 m/s2. Gyroscopes agree everywhere.
+
+Stray Scanner writes a folder: ``imu.csv`` (``timestamp, a_x, a_y, a_z, alpha_x, alpha_y, alpha_z``: seconds, what
+CoreMotion gave, rad/s), ``odometry.csv`` with the time of each frame of ``rgb.mp4`` on the same clock and ARKit's
+poses, ``camera_matrix.csv``. Its description says m/s2, its source writes CoreMotion's g; which one it is shows in the
+numbers (github.com/strayrobots/scanner).
+
+Sensor Logger writes a zip, or the folder in it, with one table for each sensor: ``time`` (nanoseconds UTC), ``z``,
+``y``, ``x`` in an order of its own. ``Accelerometer`` is without gravity, ``Gravity`` the rest; ``TotalAcceleration``
+(Android) and ``AccelerometerUncalibrated`` hold both, the latter in g on iOS. ``Metadata.csv`` names the platform and
+whether "Standardise Units & Frames" was on, which makes iOS write what Android does
+(github.com/tszheichoi/awesome-sensor-logger).
+"""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.errors import FormatError
+from colmap_inertial.geometry import colmap_px_from_opencv
+from colmap_inertial.io.files import read_text
+from colmap_inertial.io.imu_text import ordered, recording
+from colmap_inertial.io.mp4 import is_mp4, read_movie
+from colmap_inertial.io.samples import Samples
+from colmap_inertial.io.tables import Table, parse_table, read_table
+from colmap_inertial.io.units import DeclaredUnits, seconds, to_si
+from colmap_inertial.types import CameraModel, FrameLog, ImuRecording
+
+#: A median length up to this is g, above it m/s2: gravity gives 1 or 9.8.
+_G_BELOW = 3.0
+#: An unpacked table larger than this is no recording.
+_LARGEST_MEMBER = 1 << 31
+
+
+# --- Stray Scanner ---------------------------------------------------------------------------------------------------
+
+
+def is_stray_scanner(path: Path) -> bool:
+    """Whether ``path`` is a Stray Scanner folder, or its imu.csv."""
+    file = path if path.is_file() else path / "imu.csv"
+    if file.name != "imu.csv" or not file.is_file():
+        return False
+    try:
+        with open(file, encoding="utf-8-sig", errors="replace") as text:
+            return "alpha_x" in text.readline(1000)
+    except OSError:
+        return False
+
+
+def read_stray_scanner(path: Path, units: DeclaredUnits) -> ImuRecording:
+    """Read the IMU of a Stray Scanner recording."""
+    table = read_table(path if path.is_file() else path / "imu.csv")
+    t_ns = table.stamps_ns(_column(table, "timestamp"), "s")
+    gyro = table.numbers([_column(table, f"alpha_{axis}") for axis in "xyz"])
+    accel = -table.numbers([_column(table, f"a_{axis}") for axis in "xyz"])
+    length = float(np.nanmedian(np.linalg.norm(accel, axis=1))) if len(accel) else 0.0
+    unit = units.accel or ("g" if length < _G_BELOW else "m/s2")
+    return recording(
+        ordered(table, "gyro", t_ns, to_si(gyro, "gyro", units.gyro or "rad/s")),
+        ordered(table, "accel", t_ns, to_si(accel, "accel", unit)),
+        device="Stray Scanner",
+    )
+
+
+def read_stray_scanner_frames(path: Path) -> FrameLog | None:
+    """Frame times on the IMU's clock, and the intrinsics; ``None`` where there is no odometry.csv."""
+    folder = path.parent if path.is_file() else path
+    file = folder / "odometry.csv"
+    if not file.is_file():
+        return None
+    table = read_table(file)
+    frame_ns = table.stamps_ns(_column(table, "timestamp"), "s")
+    bad = np.flatnonzero(np.diff(frame_ns) <= 0)
+    if len(bad):
+        raise FormatError(
+            file, "the frame's time is not after the one before", line=int(table.line_numbers[bad[0] + 1])
+        )
+    return FrameLog(
+        t_s=seconds(frame_ns, int(frame_ns[0])),
+        epoch_ns=int(frame_ns[0]),
+        shared_clock=True,
+        camera=_camera_matrix(folder),
+    )
+
+
+def _camera_matrix(folder: Path) -> CameraModel | None:
+    """ARKit's intrinsics; its pixels count from the centre of the top-left one."""
+    file, video = folder / "camera_matrix.csv", folder / "rgb.mp4"
+    if not file.is_file() or not video.is_file() or not is_mp4(video):
+        return None
+    table = read_table(file)
+    matrix = table.numbers(range(table.width))
+    if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or (np.diagonal(matrix) <= 0).any():
+        raise FormatError(file, "is no 3x3 matrix of intrinsics")
+    track = read_movie(video).track(handler="vide")
+    if track is None or min(track.width_px, track.height_px) < 1:
+        return None
+    centre = colmap_px_from_opencv(matrix[:2, 2])
+    params = (matrix[0, 0], matrix[1, 1], float(centre[0]), float(centre[1]))
+    return CameraModel(model="PINHOLE", width=track.width_px, height=track.height_px, params=params)
+
+
+# --- Sensor Logger ---------------------------------------------------------------------------------------------------
+
+
+def is_sensor_logger(path: Path) -> bool:
+    """Whether ``path`` is a Sensor Logger zip or folder."""
+    tables = {"Gyroscope.csv", "GyroscopeUncalibrated.csv"}
+    return bool(tables & _members(path).keys())
+
+
+def read_sensor_logger(path: Path, units: DeclaredUnits) -> ImuRecording:
+    """Read the IMU of a Sensor Logger recording; the accelerometer may be missing.
+
+    Raises
+    ------
+    FormatError
+        Where nothing says on which platform it was recorded, on which the accelerometer's sign depends.
+    """
+    members = _members(path)
+    name = next((n for n in ("Gyroscope.csv", "GyroscopeUncalibrated.csv") if n in members), None)
+    if name is None:
+        raise FormatError(path, "holds no Gyroscope.csv of Sensor Logger")
+    table, t_ns, values = _sensor(path, members, name)
+    gyro = ordered(table, "gyro", t_ns, to_si(values, "gyro", units.gyro or "rad/s"))
+    return recording(gyro, _accelerometer(path, members, units), device="Sensor Logger")
+
+
+def _accelerometer(path: Path, members: dict[str, str], units: DeclaredUnits) -> Samples | None:
+    whole = next((n for n in ("TotalAcceleration.csv", "AccelerometerUncalibrated.csv") if n in members), None)
+    parts = {"Accelerometer.csv", "Gravity.csv"} <= members.keys()
+    if whole is None and not parts:
+        if "Accelerometer.csv" in members:
+            raise FormatError(
+                path,
+                "its Accelerometer.csv is without gravity; record Gravity, Total Acceleration or the uncalibrated "
+                "accelerometer as well",
+            )
+        return None
+    ios, standardised = _platform(path, members)
+    if whole is not None:
+        table, t_ns, values = _sensor(path, members, whole)
+        unit = "g" if whole == "AccelerometerUncalibrated.csv" and ios and not standardised else "m/s2"
+    else:
+        table, t_ns, values = _sensor(path, members, "Accelerometer.csv")
+        _, gravity_ns, gravity = _sensor(path, members, "Gravity.csv")
+        origin = min(int(t_ns[0]), int(gravity_ns[0]))
+        at, known = seconds(t_ns, origin), seconds(gravity_ns, origin)
+        values = values + np.stack([np.interp(at, known, column) for column in gravity.T], axis=1)
+        unit = "m/s2"
+    sign = -1.0 if ios and not standardised else 1.0
+    return ordered(table, "accel", t_ns, to_si(sign * values, "accel", units.accel or unit))
+
+
+def _platform(path: Path, members: dict[str, str]) -> tuple[bool, bool]:
+    """Whether it was iOS, and whether units and frames were standardised."""
+    if "Metadata.csv" in members:
+        lines = [line.split(",") for line in _text(path, members["Metadata.csv"]).splitlines() if line.strip()]
+        if len(lines) >= 2:
+            row = {key.strip().lower(): value.strip().lower() for key, value in zip(lines[0], lines[1], strict=False)}
+            if row.get("platform") in ("ios", "android"):
+                return row["platform"] == "ios", row.get("standardisation") == "true"
+    raise FormatError(
+        path,
+        "no Metadata.csv says whether this is from iOS or Android, and the accelerometer's sign differs; add it, or "
+        "describe the tables under [imu.gyro] and [imu.accel] in a capture.toml",
+    )
+
+
+def _sensor(path: Path, members: dict[str, str], name: str) -> tuple[Table, NDArray[np.int64], NDArray[np.float64]]:
+    table = parse_table(path / name if path.is_dir() else path, _text(path, members[name]))
+    values = table.numbers([_column(table, axis) for axis in "xyz"])
+    return table, table.stamps_ns(_column(table, "time"), "ns"), values
+
+
+def _members(path: Path) -> dict[str, str]:
+    """The tables of a recording: file name to where it lies. A zip may hold them in one folder."""
+    if path.is_dir():
+        return {file.name: file.name for file in path.glob("*.csv")}
+    try:
+        if not path.is_file() or not zipfile.is_zipfile(path):
+            return {}
+        with zipfile.ZipFile(path) as archive:
+            names = [info.filename for info in archive.infolist() if info.filename.endswith(".csv")]
+    except (OSError, zipfile.BadZipFile, ValueError, NotImplementedError):
+        return {}
+    return {PurePosixPath(name).name: name for name in names if len(PurePosixPath(name).parts) <= 2}
+
+
+def _text(path: Path, member: str) -> str:
+    if path.is_dir():
+        return read_text(path / member)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if archive.getinfo(member).file_size > _LARGEST_MEMBER:
+                raise FormatError(path, f"its {member} unpacks to more than {_LARGEST_MEMBER >> 30} GiB")
+            return archive.read(member).decode("utf-8-sig", errors="replace")
+    # what the standard library raises for damaged archives is not documented as one class
+    except (OSError, EOFError, KeyError, ValueError, RuntimeError, NotImplementedError, zipfile.BadZipFile) as error:
+        raise FormatError(path, f"its {member} cannot be unpacked: {error}") from None
+    except Exception as error:
+        if type(error).__module__ == "zlib":
+            raise FormatError(path, f"its {member} cannot be unpacked: {error}") from None
+        raise
+
+
+def _column(table: Table, name: str) -> int:
+    if table.header is None or name not in table.header:
+        shown = "it has no header" if table.header is None else f"the header is: {table.header_text[:200]}"
+        raise FormatError(table.path, f'has no column "{name}"; {shown}')
+    return table.header.index(name)
