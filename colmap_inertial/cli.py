@@ -15,7 +15,7 @@ from tyro.conf import Positional, arg, subcommand
 
 from colmap_inertial import __version__
 from colmap_inertial.errors import InertialError
-from colmap_inertial.options import ReconstructOptions, ScaleOptions, ValidateOptions
+from colmap_inertial.options import ReconstructOptions, ScaleOptions, ValidateOptions, WorldAxes
 
 DESCRIPTION = """Metric, gravity-aligned COLMAP models from the gyroscope and accelerometer that filmed along.
 
@@ -100,6 +100,74 @@ class Scale:
         )
         show_scale(estimate, self.source)
         return 3 if estimate.verdict == "refused" else 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Apply:
+    """Make a whole COLMAP project metric: sparse models, dense workspaces, point clouds, meshes, database.
+
+    OUT mirrors PROJECT, which is only read; it appears whole or not at all, and OUT/transform.json says what was done.
+    Give --scale, --factor or --sim3; or --undo to take back what an earlier run applied. Exit code 3 when every scale
+    was refused; a sub-model with a refused scale keeps its own units.
+
+    Example: colmap-inertial apply project project_metric --scale scale.json
+    """
+
+    project: Positional[Path]
+    """A folder with a COLMAP model, and whatever was made from it."""
+    out: Positional[Path]
+    """A new folder."""
+    scale: tuple[str, ...] = ()
+    """What `colmap-inertial scale --json` wrote; with several sub-models one for each, as NUMBER=FILE, or the
+    result.json of a reconstruction."""
+    factor: float | None = None
+    """Lengths times this; axes and origin stay."""
+    sim3: Path | None = None
+    """JSON with scale, rotation_xyzw, translation_m (and cov, provenance): x' = scale * R x + translation."""
+    undo: bool = False
+    """PROJECT was written by this command: write it in its old units."""
+    world: WorldAxes = "z-up"
+    """With --scale, axes of the metric project: z away from the ground, or y towards it."""
+    link: bool = False
+    """Hard links for files that do not change; an edit of one then changes the original, too."""
+    keep: tuple[str, ...] = ()
+    """Patterns of paths in PROJECT that are copied as they are, such as "old/*"."""
+
+    def __post_init__(self) -> None:
+        given = (bool(self.scale), self.factor is not None, self.sim3 is not None, self.undo)
+        if sum(given) != 1:
+            raise ValueError("give one of --scale, --factor, --sim3 and --undo")
+        if self.undo and self.keep:
+            raise ValueError("--undo keeps what was kept before; leave out --keep")
+        if self.factor is not None and not 0 < self.factor < float("inf"):
+            raise ValueError(f"factor must be positive, not {self.factor:g}")
+
+    def run(self) -> int:
+        """Run the command; returns the exit code."""
+        from colmap_inertial.model.project import apply_to_project, undo_project
+        from colmap_inertial.model.similarities import plain_factor, read_scales, read_similarity
+        from colmap_inertial.pipeline.terminal import live_progress, show_applied
+
+        scales: Any
+        with live_progress() as progress:
+
+            def files(done: int, total: int) -> None:
+                progress("apply", done, total)
+
+            if self.undo:
+                applied = undo_project(self.project, self.out, link=self.link, progress=files)
+            else:
+                if self.sim3 is not None:
+                    scales = read_similarity(self.sim3)
+                elif self.factor is not None:
+                    scales = plain_factor(self.factor)
+                else:
+                    scales = read_scales(self.scale, world=self.world)
+                applied = apply_to_project(
+                    self.project, self.out, scales, link=self.link, keep=self.keep, progress=files
+                )
+        show_applied(applied)
+        return 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -254,10 +322,11 @@ class Simulate:
         return 0
 
 
-Command = Reconstruct | Scale | Align | Validate | Deblur | Simulate
+Command = Reconstruct | Scale | Apply | Align | Validate | Deblur | Simulate
 _COMMANDS: dict[str, type[Command]] = {
     "reconstruct": Reconstruct,
     "scale": Scale,
+    "apply": Apply,
     "align": Align,
     "validate": Validate,
     "deblur": Deblur,

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from colmap_inertial.errors import AlreadyMetricError, FormatError, OutputExistsError, TimingError
 from colmap_inertial.geometry import skew
 from colmap_inertial.io.files import read_json, write_json
+from colmap_inertial.model.binary import check_binary_model
 from colmap_inertial.types import CameraModel, CameraTrajectory, FrameTiming, ScaleEstimate, Similarity
 
 if TYPE_CHECKING:
@@ -84,8 +85,15 @@ def find_models(folder: Path) -> dict[int, Path]:
     return dict(sorted(found.items()))
 
 
-def read_model(folder: Path) -> pycolmap.Reconstruction:
+def read_model(folder: Path, suffix: str | None = None) -> pycolmap.Reconstruction:
     """Read a COLMAP model, binary or text.
+
+    Parameters
+    ----------
+    folder
+        The model.
+    suffix
+        ``".bin"`` or ``".txt"`` where it has to be this one; otherwise what ``model_format`` says.
 
     Raises
     ------
@@ -94,9 +102,11 @@ def read_model(folder: Path) -> pycolmap.Reconstruction:
     """
     import pycolmap
 
-    suffix = model_format(folder)
+    suffix = suffix or model_format(folder)
     if suffix is None:
         raise FormatError(folder, "no COLMAP model here (cameras, images and points3D, .bin or .txt)")
+    if suffix == ".bin":
+        check_binary_model(folder)
     reconstruction = pycolmap.Reconstruction()
     try:
         if suffix == ".bin":

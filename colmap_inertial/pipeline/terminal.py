@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from colmap_inertial.errors import InertialError
+from colmap_inertial.model.project import Applied
 from colmap_inertial.pipeline import ReconstructResult
 from colmap_inertial.pipeline.colmap import Progress
 from colmap_inertial.pipeline.deblur import DeblurResult
@@ -28,6 +29,7 @@ _STAGES = {
     "rectified": "Rectified",
     "metric": "Metric scale",
     "validation": "Validation",
+    "apply": "Files",
 }
 _COLOUR = {"trusted": "green", "weak": "yellow", "refused": "red"}
 
@@ -95,6 +97,26 @@ def _show(title: str, lines: list[tuple[str, str]]) -> None:
 def show_scale(estimate: ScaleEstimate, source: Path) -> None:
     """Print one scale estimate."""
     _show(str(source), [*scale_lines(estimate), ("Method", f"{estimate.method}, {estimate.runtime_s:.2f} s")])
+
+
+def show_applied(applied: Applied) -> None:
+    """Print what was done to a project: each sub-model's scale, and what changed by kind."""
+    lines = []
+    for index, (folder, scale) in applied.models.items():
+        done = "kept its own units" if scale.similarity is None else f"lengths times {scale.similarity.scale:.6g}"
+        verdict = "" if scale.verdict is None else f" ([bold {_COLOUR[scale.verdict]}]{scale.verdict}[/])"
+        lines.append((f"Model {index}", f"{folder}: {done}{verdict}"))
+        lines += [("", reason) for reason in scale.reasons if scale.similarity is None]
+    kinds: dict[str, list[str]] = {}
+    for change in applied.changes:
+        kinds.setdefault(change.kind, []).append(f"{change.path} ({', '.join(change.changed)})")
+    for kind, paths in kinds.items():
+        more = f" and {len(paths) - 1} more" if len(paths) > 1 else ""
+        lines.append((kind.capitalize(), f"{paths[0]}{more}"))
+    lines.append(("Unchanged", ", ".join(f"{n} {how}" for how, n in applied.unchanged.items()) or "nothing"))
+    lines += [("Note", note) for note in applied.notes]
+    lines.append(("Written", str(applied.out)))
+    _show("Project", lines)
 
 
 def show_calibration(calibration: CameraImuCalibration, source: Path) -> None:

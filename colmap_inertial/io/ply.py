@@ -1,0 +1,408 @@
+"""PLY files moved by a similarity: positions and normals change, every other byte stays.
+
+Any PLY: ASCII, binary little- or big-endian, whatever elements, properties, lists and comments it has. The file passes
+through in chunks, and what the format lets one check on the way is checked: sizes, counts, indices of faces.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.errors import FormatError
+from colmap_inertial.geometry import matrix_from_quat
+from colmap_inertial.types import Similarity
+
+_CHUNK_BYTES = 4 << 20
+_LONGEST_HEADER = 1 << 20
+_LONGEST_LINE = 1 << 20
+_TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
+    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
+    **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
+}
+_BYTE_ORDERS = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}
+_POSITION, _NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
+#: Sizes and colours of Gaussian splats turn with the model in ways that this module does not know.
+_SPLAT = {"scale_0", "rot_0"}
+
+
+@dataclass(frozen=True)
+class Property:
+    """One property of an element; ``count`` is the type of a list's length, ``None`` for a single value."""
+
+    name: str
+    kind: str
+    count: str | None = None
+
+
+@dataclass(frozen=True)
+class Element:
+    """One element of a PLY file: name, number of rows, properties in the file's order."""
+
+    name: str
+    rows: int
+    properties: tuple[Property, ...]
+
+    @property
+    def has_list(self) -> bool:
+        """Whether rows may differ in length."""
+        return any(p.count is not None for p in self.properties)
+
+    def dtype(self, order: str) -> np.dtype[np.void]:
+        """One row without lists, packed."""
+        return np.dtype([(p.name, order + p.kind) for p in self.properties])
+
+
+@dataclass(frozen=True)
+class Header:
+    """What stands before ``end_header``; ``raw`` has its bytes, ``order`` is ``None`` for ASCII."""
+
+    raw: bytes
+    order: str | None
+    elements: tuple[Element, ...]
+
+    @property
+    def lines(self) -> int:
+        """Number of lines of the header."""
+        return self.raw.count(b"\n")
+
+
+def read_ply_header(path: Path, file: IO[bytes]) -> Header:
+    """Read the header and leave the file behind it.
+
+    Raises
+    ------
+    FormatError
+        Where it is none, naming the line.
+    """
+    raw = [file.readline(64)]
+    if raw[0].strip() != b"ply":
+        raise FormatError(path, "not a PLY file", line=1)
+    order: str | None = "?"
+    elements: list[Element] = []
+    length = 0
+    while True:
+        line = file.readline(_LONGEST_LINE)
+        raw.append(line)
+        n = len(raw)
+        length += len(line)
+        if not line.endswith(b"\n") or length > _LONGEST_HEADER:
+            raise FormatError(path, "the PLY header does not end", line=n)
+        words = line.decode("latin-1").split()
+        match words:
+            case ["end_header"]:
+                break
+            case ["comment" | "obj_info", *_]:
+                continue
+            case ["format", name, "1.0"] if name in _BYTE_ORDERS and order == "?":
+                order = _BYTE_ORDERS[name]
+            case ["element", name, rows] if rows.isascii() and rows.isdigit() and len(rows) < 16:
+                if name in {e.name for e in elements}:
+                    raise FormatError(path, f"element {name} is declared twice", line=n)
+                elements.append(Element(name, int(rows), ()))
+            case ["property", "list", count, kind, name] if elements and _TYPES.get(count, "f")[0] in "iu":
+                _add(path, n, elements, Property(name, _known(path, n, kind), _TYPES[count]))
+            case ["property", kind, name] if elements:
+                _add(path, n, elements, Property(name, _known(path, n, kind)))
+            case _:
+                raise FormatError(path, f"not a line of a PLY header: {' '.join(words)[:60]!r}", line=n)
+    if order == "?":
+        raise FormatError(path, "the PLY header does not say its format")
+    for element in elements:
+        if element.rows and not element.properties:
+            raise FormatError(path, f"element {element.name} has rows but no property")
+    return Header(b"".join(raw), order, tuple(elements))
+
+
+def _known(path: Path, line: int, kind: str) -> str:
+    if kind not in _TYPES:
+        raise FormatError(path, f"{kind!r} is no PLY type", line=line)
+    return _TYPES[kind]
+
+
+def _add(path: Path, line: int, elements: list[Element], new: Property) -> None:
+    last = elements[-1]
+    if new.name in {p.name for p in last.properties}:
+        raise FormatError(path, f"property {new.name} of {last.name} is declared twice", line=line)
+    elements[-1] = Element(last.name, last.rows, (*last.properties, new))
+
+
+def transform_ply(source: Path, target: Path, similarity: Similarity) -> tuple[str, ...]:
+    """Write a copy with positions ``x y z`` moved and normals ``nx ny nz`` turned, wherever an element has them.
+
+    Parameters
+    ----------
+    source, target
+        Files; the target is written anew.
+    similarity
+        Target from source.
+
+    Returns
+    -------
+    tuple of str
+        What was changed: ``"positions"``, ``"normals"``; empty where the file has neither.
+
+    Raises
+    ------
+    FormatError
+        For a file that is damaged, or holds what cannot be transformed.
+    """
+    with open(source, "rb") as file:
+        header = read_ply_header(source, file)
+        vertices = next((e for e in header.elements if e.name == "vertex"), None)
+        changed = () if vertices is None else _check_vertices(source, vertices)
+        body = source.stat().st_size - len(header.raw)
+        with open(target, "wb", buffering=0) as out:
+            _write(out, header.raw)
+            n_vertices = 0 if vertices is None else vertices.rows
+            chunks: Iterator[bytes | memoryview]
+            if header.order is None:
+                chunks = _ascii(source, file, header, similarity)
+            else:
+                chunks = _binary(source, file, header, header.order, body, n_vertices, similarity)
+            for chunk in chunks:
+                _write(out, chunk)
+    return changed
+
+
+def _write(out: IO[bytes], data: bytes | memoryview) -> None:
+    """A raw file may write less than it was given."""
+    view = memoryview(data)
+    while len(view):
+        view = view[out.write(view) :]
+
+
+def _check_vertices(path: Path, vertices: Element) -> tuple[str, ...]:
+    kinds = {p.name: p for p in vertices.properties}
+    changed = []
+    for label, names in (("positions", _POSITION), ("normals", _NORMAL)):
+        present = [name for name in names if name in kinds]
+        if not present:
+            continue
+        if len(present) < 3:
+            raise FormatError(path, f"of the vertices' {label} there is only {' '.join(present)}")
+        for name in names:
+            if kinds[name].count is not None or kinds[name].kind[0] != "f":
+                raise FormatError(path, f"the vertices' {name} is no floating-point number: it cannot be transformed")
+        changed.append(label)
+    if kinds.keys() >= _SPLAT:
+        raise FormatError(path, "Gaussian splats cannot be transformed yet; leave the file out with --keep")
+    if changed and vertices.has_list:
+        raise FormatError(path, "vertices with a list property cannot be transformed; leave the file out with --keep")
+    return tuple(changed)
+
+
+class Mover:
+    """Moves the named fields of structured rows in place."""
+
+    def __init__(self, similarity: Similarity, names: set[str]) -> None:
+        rotation = matrix_from_quat(similarity.rotation_xyzw)
+        self._parts = []
+        if names.issuperset(_POSITION):
+            self._parts.append((_POSITION, similarity.scale * rotation, similarity.translation_m))
+        if names.issuperset(_NORMAL):
+            self._parts.append((_NORMAL, rotation, np.zeros(3)))
+
+    @property
+    def names(self) -> list[str]:
+        """The fields that change."""
+        return [name for names, _, _ in self._parts for name in names]
+
+    def __call__(self, rows: NDArray[np.void]) -> None:
+        """Move them."""
+        for names, matrix, offset in self._parts:
+            values = np.empty((3, len(rows)))
+            for i, name in enumerate(names):
+                values[i] = rows[name]
+            with np.errstate(over="ignore", invalid="ignore"):
+                moved = matrix @ values
+                moved += offset[:, None]
+                for i, name in enumerate(names):
+                    rows[name] = moved[i]
+
+
+def _binary(
+    path: Path, file: IO[bytes], header: Header, order: str, left: int, n_vertices: int, similarity: Similarity
+) -> Iterator[memoryview]:
+    for element in header.elements:
+        smallest = sum(np.dtype(p.count or p.kind).itemsize for p in element.properties)
+        if element.rows * smallest > left:
+            raise FormatError(path, f"truncated: {element.rows} rows of {element.name} do not fit into the file")
+        if element.has_list:
+            walked = _binary_lists(path, file, element, order, n_vertices)
+        else:
+            names = {p.name for p in element.properties}
+            mover = Mover(similarity, names if element.name == "vertex" else set())
+            walked = _binary_rows(path, file, element, order, mover)
+        for chunk in walked:
+            left -= len(chunk)
+            yield chunk
+    if left != 0:
+        raise FormatError(path, f"damaged: {left} bytes follow the last element")
+
+
+def _read(path: Path, file: IO[bytes], buffer: memoryview, element: Element) -> memoryview:
+    n = 0
+    while n < len(buffer):
+        got = file.readinto(buffer[n:])  # type: ignore[attr-defined]
+        if not got:
+            raise FormatError(path, f"truncated within element {element.name}")
+        n += got
+    return buffer
+
+
+def _binary_rows(path: Path, file: IO[bytes], element: Element, order: str, mover: Mover) -> Iterator[memoryview]:
+    dtype = element.dtype(order)
+    per_chunk = max(1, _CHUNK_BYTES // dtype.itemsize)
+    buffer = bytearray(min(per_chunk, element.rows) * dtype.itemsize)
+    for start in range(0, element.rows, per_chunk):
+        n = min(per_chunk, element.rows - start)
+        data = _read(path, file, memoryview(buffer)[: n * dtype.itemsize], element)
+        mover(np.frombuffer(data, dtype))
+        yield data
+
+
+def _binary_lists(path: Path, file: IO[bytes], element: Element, order: str, n_vertices: int) -> Iterator[memoryview]:
+    """Copy rows with lists; rows whose lists are as long as the first row's are looked at all together."""
+    rows_left, window = element.rows, 64
+    while rows_left:
+        first = bytes(_one_row(path, file, element, order))
+        lengths = _lengths(element, order, first)
+        fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
+        for i, p in enumerate(element.properties):
+            if p.count is not None:
+                fields.append((f"n{i}", order + p.count))
+            fields.append((f"v{i}", order + p.kind, (lengths[i],)))
+        dtype = np.dtype(fields)
+        file.seek(-len(first), 1)
+        n = max(1, min(rows_left, window, _CHUNK_BYTES // dtype.itemsize))
+        data = bytearray(file.read(n * dtype.itemsize))
+        table = np.frombuffer(data[: len(data) // dtype.itemsize * dtype.itemsize], dtype)
+        same = np.ones(len(table), bool)
+        for i, p in enumerate(element.properties):
+            if p.count is not None:
+                same &= table[f"n{i}"] == lengths[i]
+        good = len(table) if same.all() else int(np.argmin(same))
+        for i, p in enumerate(element.properties):
+            if element.name == "face" and p.name in ("vertex_indices", "vertex_index") and p.kind[0] in "iu":
+                indices = table[f"v{i}"][:good]
+                if indices.size and (int(indices.min()) < 0 or int(indices.max()) >= n_vertices):
+                    raise FormatError(path, f"damaged: a face refers to none of the {n_vertices} vertices")
+        file.seek(good * dtype.itemsize - len(data), 1)
+        rows_left -= good
+        # As far as rows have been alike, so far they are expected to be
+        window = 2 * window if good == n else max(16, good)
+        yield memoryview(data)[: good * dtype.itemsize]
+
+
+def _one_row(path: Path, file: IO[bytes], element: Element, order: str) -> bytes:
+    row = bytearray()
+    for p in element.properties:
+        n = 1
+        if p.count is not None:
+            counted = _read(path, file, memoryview(bytearray(np.dtype(p.count).itemsize)), element)
+            row += counted
+            n = int(np.frombuffer(counted, order + p.count)[0])
+            if not 0 <= n <= _CHUNK_BYTES:
+                raise FormatError(path, f"damaged: a list of {n} values in element {element.name}")
+        row += _read(path, file, memoryview(bytearray(n * np.dtype(p.kind).itemsize)), element)
+    return bytes(row)
+
+
+def _lengths(element: Element, order: str, row: bytes) -> list[int]:
+    """Number of values of each property in one row."""
+    lengths, at = [], 0
+    for p in element.properties:
+        n = 1
+        if p.count is not None:
+            n = int(np.frombuffer(row, order + p.count, 1, at)[0])
+            at += np.dtype(p.count).itemsize
+        at += n * np.dtype(p.kind).itemsize
+        lengths.append(n)
+    return lengths
+
+
+def _ascii(path: Path, file: IO[bytes], header: Header, similarity: Similarity) -> Iterator[bytes]:
+    number = header.lines
+    n_vertices = next((e.rows for e in header.elements if e.name == "vertex"), 0)
+    for element in header.elements:
+        names = [p.name for p in element.properties]
+        mover = Mover(similarity, set(names) if element.name == "vertex" else set())
+        columns = [names.index(name) for name in mover.names]
+        dtype = np.dtype([(name, element.properties[i].kind) for name, i in zip(mover.names, columns, strict=True)])
+        left = element.rows
+        while left:
+            lines = []
+            for _ in range(min(left, 4096)):
+                number += 1
+                line = file.readline(_LONGEST_LINE)
+                if not line.strip():
+                    raise FormatError(path, f"truncated within element {element.name}", line=number)
+                lines.append(line)
+            rows = [
+                _checked_tokens(path, number - len(lines) + i + 1, element, line, n_vertices)
+                for i, line in enumerate(lines)
+            ]
+            if columns:
+                table = np.array([tuple(float(row[2 * c + 1]) for c in columns) for row in rows], dtype)
+                mover(table)
+                for column, name in zip(columns, mover.names, strict=True):
+                    # numpy's shortest text that reads back as the same number of this precision
+                    for row, text in zip(rows, table[name].astype("S32").tolist(), strict=True):
+                        row[2 * column + 1] = text
+                lines = [b"".join(row) for row in rows]
+            left -= len(lines)
+            yield b"".join(lines)
+    rest = file.read(_CHUNK_BYTES)
+    if rest.strip():
+        raise FormatError(path, "damaged: text follows the last element", line=number + 1)
+    yield rest
+
+
+def _checked_tokens(path: Path, number: int, element: Element, line: bytes, n_vertices: int) -> list[bytes]:
+    """A line as white space, token, white space, token, ..., white space, its values checked."""
+    row = re.split(rb"(\S+)", line)
+    tokens = row[1::2]
+    at = 0
+    try:
+        for p in element.properties:
+            n = 1
+            if p.count is not None:
+                n = _integer(tokens[at], p.count)
+                at += 1
+            values = tokens[at : at + n]
+            if len(values) < n or n < 0:
+                raise IndexError
+            if p.kind[0] == "f":
+                for token in values:
+                    if b"_" in token:
+                        raise ValueError(token)
+                    float(token)
+            else:
+                indices = [_integer(token, p.kind) for token in values]
+                points = element.name == "face" and p.name in ("vertex_indices", "vertex_index")
+                if points and any(not 0 <= i < n_vertices for i in indices):
+                    raise FormatError(path, f"a face refers to none of the {n_vertices} vertices", line=number)
+            at += n
+    except IndexError:
+        raise FormatError(path, f"too few values for element {element.name}", line=number) from None
+    except ValueError as error:
+        raise FormatError(path, f"not a value of element {element.name}: {error}", line=number) from None
+    if at != len(tokens):
+        raise FormatError(path, f"{len(tokens)} values where element {element.name} has {at}", line=number)
+    return row
+
+
+def _integer(token: bytes, kind: str) -> int:
+    value = float(token)
+    limits = np.iinfo(kind)
+    if b"_" in token or value != int(value) or not limits.min <= value <= limits.max:
+        raise ValueError(f"{token.decode('latin-1')} does not fit into {limits.bits} bits")
+    return int(value)

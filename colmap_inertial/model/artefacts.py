@@ -1,0 +1,145 @@
+"""The smaller files of a COLMAP project that carry length: depth maps, option files, OBJ meshes."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from colmap_inertial.errors import FormatError
+from colmap_inertial.geometry import matrix_from_quat
+from colmap_inertial.types import Similarity
+
+_CHUNK_BYTES = 4 << 20
+_LONGEST_LINE = 1 << 20
+#: Keys of COLMAP's option files that are lengths in model units; not positive means "automatic".
+_DEPTH_KEYS = ("depth_min", "depth_max")
+_BOX_KEYS = ("bounding_box", "bbox_path")
+
+
+def check_map(path: Path, channels: int) -> int:
+    """Compare a depth or normal map's size with its header ``width&height&channels&``.
+
+    Returns
+    -------
+    int
+        Length of the header in bytes; float32 values follow, little-endian.
+
+    Raises
+    ------
+    FormatError
+        When they disagree.
+    """
+    with open(path, "rb") as file:
+        head = file.read(64)
+    match = re.match(rb"(\d{1,9})&(\d{1,9})&(\d{1,3})&", head)
+    if match is None:
+        raise FormatError(path, "not a depth or normal map of COLMAP: it does not begin with width&height&channels&")
+    width, height, found = (int(text) for text in match.groups())
+    if found != channels:
+        raise FormatError(path, f"its header says {found} channels instead of {channels}")
+    if width == 0 or height == 0:
+        raise FormatError(path, f"its header says {width} x {height} pixels")
+    size, expected = path.stat().st_size, match.end() + 4 * width * height * channels
+    if size != expected:
+        state = "truncated" if size < expected else "damaged"
+        raise FormatError(path, f"{state}: {size} bytes instead of {expected} for {width} x {height} x {channels}")
+    return match.end()
+
+
+def transform_depth_map(source: Path, target: Path, similarity: Similarity) -> None:
+    """Write a depth map times the scale; 0, which means unknown, stays 0."""
+    header = check_map(source, 1)
+    buffer = bytearray(_CHUNK_BYTES)
+    view = memoryview(buffer)
+    values = np.frombuffer(buffer, "<f4")
+    scale = np.float64(similarity.scale)
+    with open(source, "rb", buffering=0) as file, open(target, "wb", buffering=0) as out:
+        out.write(file.read(header))
+        while n := file.readinto(view):  # regular files give less only at their end
+            if n % 4:
+                raise FormatError(source, "truncated while it was read")
+            part = values[: n // 4]
+            with np.errstate(over="ignore", invalid="ignore"):
+                np.multiply(part, scale, out=part, casting="same_kind", dtype=np.float64)
+            written = 0
+            while written < n:
+                written += out.write(view[written:n])
+
+
+def transform_options(source: Path, target: Path, similarity: Similarity) -> tuple[str, ...]:
+    """Write a copy of an option file with its depth range times the scale, everything else as it is.
+
+    Returns
+    -------
+    tuple of str
+        The keys that were changed.
+
+    Raises
+    ------
+    FormatError
+        For a depth that is no number, and for a bounding box, which has axes that a rotation does not keep.
+    """
+    section, changed, lines = "", [], []
+    for number, line in enumerate(source.read_bytes().splitlines(keepends=True), 1):
+        if header := re.match(rb"\s*\[([^\]]*)\]", line):
+            section = header[1].decode("latin-1").strip()
+        found = re.match(rb"(\s*([\w.]+)\s*=\s*)(.*?)(\s*)$", line, re.DOTALL)
+        if found is not None:
+            key = found[2].decode("latin-1").rpartition(".")
+            where, name = key[0] or section, key[2]
+            if name in _BOX_KEYS and found[3]:
+                raise FormatError(
+                    source, f"{name}: a bounding box cannot be transformed; leave the file out with --keep", line=number
+                )
+            if name in _DEPTH_KEYS and where.startswith("PatchMatch"):
+                try:
+                    value = float(found[3])
+                except ValueError:
+                    raise FormatError(source, f"{name} is no number", line=number) from None
+                if value > 0:
+                    line = found[1] + repr(value * similarity.scale).encode() + found[4]
+                    changed.append(f"{where}.{name}")
+        lines.append(line)
+    target.write_bytes(b"".join(lines))
+    return tuple(changed)
+
+
+def transform_obj(source: Path, target: Path, similarity: Similarity) -> tuple[str, ...]:
+    """Write a copy of an OBJ mesh with its ``v`` and ``vn`` lines moved; whatever follows x y z stays.
+
+    Raises
+    ------
+    FormatError
+        For a vertex without three numbers.
+    """
+    turn = matrix_from_quat(similarity.rotation_xyzw)
+    parts = {b"v": (similarity.scale * turn, similarity.translation_m), b"vn": (turn, np.zeros(3))}
+    changed: set[bytes] = set()
+    with open(source, "rb") as file, open(target, "wb") as out:
+        for number, line in enumerate(_lines(source, file), 1):
+            found = re.match(rb"(\s*(vn?)[ \t]+)(\S+)([ \t]+)(\S+)([ \t]+)(\S+)(.*)$", line, re.DOTALL)
+            if found is not None:
+                try:
+                    xyz = np.array([float(found[i]) for i in (3, 5, 7)])
+                except ValueError:
+                    raise FormatError(source, f"not three numbers: {line[:60]!r}", line=number) from None
+                matrix, offset = parts[found[2]]
+                x, y, z = (repr(value).encode() for value in (matrix @ xyz + offset).tolist())
+                line = b"".join((found[1], x, found[4], y, found[6], z, found[8]))
+                changed.add(found[2])
+            elif line.split(maxsplit=1)[:1] in ([b"v"], [b"vn"]):
+                raise FormatError(source, "a vertex or normal without three numbers", line=number)
+            out.write(line)
+    return tuple(name for key, name in ((b"v", "positions"), (b"vn", "normals")) if key in changed)
+
+
+def _lines(path: Path, file: object) -> Iterator[bytes]:
+    number = 0
+    while line := file.readline(_LONGEST_LINE):  # type: ignore[attr-defined]
+        number += 1
+        if len(line) == _LONGEST_LINE:
+            raise FormatError(path, "a line without end", line=number)
+        yield line

@@ -1,0 +1,220 @@
+"""A folder that appears whole or not at all, and copies that share their blocks with the original where they can."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import errno
+import fcntl
+import os
+import shutil
+import signal
+import stat
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from types import FrameType
+from typing import NoReturn
+
+from colmap_inertial.errors import FormatError, OutputError, OutputExistsError
+
+#: Linux: share the blocks of another file (Btrfs, XFS, bcachefs, ...).
+_FICLONE = 0x40049409
+_FULL = {errno.ENOSPC: "the disk is full", errno.EDQUOT: "the quota is used up", errno.EFBIG: "the file is too large"}
+#: What a file system answers that cannot copy within the kernel.
+_NO_OFFLOAD = {errno.EXDEV, errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP, errno.ETXTBSY, errno.EPERM, errno.EIO}
+
+
+class _Terminated(BaseException):
+    pass
+
+
+@contextlib.contextmanager
+def new_folder(target: Path) -> Iterator[Path]:
+    """A temporary folder beside ``target`` that takes its name at the end; after a failure nothing is left of it.
+
+    SIGTERM and SIGHUP count as failures, too: the process cleans up before it ends by them. What a killed process left
+    behind is removed by the next one.
+
+    Raises
+    ------
+    OutputExistsError
+        When the target exists, or another process is writing it.
+    OutputError
+        When it cannot be written; says so when the disk is full.
+    """
+    if os.path.lexists(target):
+        raise OutputExistsError(f"{target} exists already; choose another folder or remove it")
+    partial = target.with_name(f".{target.name}.colmap-inertial-partial")
+    with _ending_by_signal(), _as_output_error(target):
+        partial.mkdir(parents=True, exist_ok=True)
+        lock = os.open(partial, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise OutputExistsError(f"another process is writing {target}") from None
+            try:
+                _empty(partial)
+                yield partial
+                _flush(lock)
+                if os.path.lexists(target):
+                    raise OutputExistsError(f"{target} appeared in the meantime; choose another folder")
+                os.rename(partial, target)
+            except BaseException:
+                shutil.rmtree(partial, ignore_errors=True)
+                raise
+        finally:
+            os.close(lock)
+
+
+def _empty(folder: Path) -> None:
+    for child in folder.iterdir():
+        if child.is_dir() and not child.is_symlink():
+            shutil.rmtree(child)
+        else:
+            child.unlink()
+
+
+def _flush(folder: int) -> None:
+    """Have the disk hold what was written before the rename says that it is whole."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.syncfs(folder) != 0:
+        code = ctypes.get_errno()
+        raise OSError(code, os.strerror(code))
+
+
+@contextlib.contextmanager
+def _as_output_error(target: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        where = f" ({error.filename})" if error.filename else ""
+        why = _FULL.get(error.errno or 0, error.strerror or str(error))
+        raise OutputError(f"{target} cannot be written: {why}{where}; nothing was left behind") from error
+
+
+@contextlib.contextmanager
+def _ending_by_signal() -> Iterator[None]:
+    """Turn SIGTERM and SIGHUP into an exception inside the block, and end by the signal after it."""
+    import pycolmap  # noqa: F401 (installs handlers of its own when it is loaded)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    caught: list[int] = []
+
+    def stop(number: int, _frame: FrameType | None) -> NoReturn:
+        caught.append(number)
+        raise _Terminated
+
+    before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield
+    except _Terminated:
+        pass
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, signal.SIG_DFL if caught or handler is None else handler)
+    if caught:
+        signal.raise_signal(caught[0])
+
+
+def copy_file(source: Path, target: Path, *, link: bool = False) -> str:
+    """Copy a file with mode and times.
+
+    Parameters
+    ----------
+    source, target
+        The target does not exist.
+    link
+        Make a hard link where the file system can.
+
+    Returns
+    -------
+    str
+        ``"linked"``, ``"reflinked"`` (blocks shared until one of them changes) or ``"copied"``.
+    """
+    if link:
+        with contextlib.suppress(OSError):
+            os.link(source, target)
+            return "linked"
+    how = "copied"
+    with open(source, "rb", buffering=0) as src, open(target, "xb", buffering=0) as dst:
+        try:
+            fcntl.ioctl(dst.fileno(), _FICLONE, src.fileno())
+            how = "reflinked"
+        except OSError:
+            _copy_bytes(src.fileno(), dst.fileno(), os.fstat(src.fileno()).st_size)
+    shutil.copystat(source, target)
+    return how
+
+
+def _copy_bytes(source: int, target: int, size: int) -> None:
+    done = 0
+    while done < size:
+        try:
+            n = os.copy_file_range(source, target, min(size - done, 1 << 28))
+        except OSError as error:
+            if error.errno not in _NO_OFFLOAD:
+                raise
+            break
+        if n == 0:
+            break
+        done += n
+    while data := os.read(source, 1 << 20):  # the rest, where the kernel could not do it
+        view = memoryview(data)
+        while view:
+            view = view[os.write(target, view) :]
+
+
+def list_tree(root: Path) -> tuple[list[Path], list[Path], list[Path]]:
+    """Folders, files and symbolic links below ``root``, as paths relative to it, in order.
+
+    A relative link that stays below ``root`` is listed as a link; any other is followed, so that what it leads to is
+    listed as a folder or file. A broken link is listed as a link.
+
+    Raises
+    ------
+    FormatError
+        For a link that leads back to where it is found, and for what is neither file, folder nor link.
+    """
+    folders: list[Path] = []
+    files: list[Path] = []
+    links: list[Path] = []
+
+    def visit(folder: Path, above: frozenset[Path]) -> None:
+        real = (root / folder).resolve()
+        if real in above:
+            raise FormatError(root / folder, "this link leads back to a folder above it")
+        try:
+            entries = sorted(os.scandir(root / folder), key=lambda entry: entry.name)
+        except OSError as error:
+            raise FormatError(root / folder, f"cannot be read: {error.strerror}") from None
+        for entry in entries:
+            path = folder / entry.name
+            if entry.is_symlink() and _is_kept(root, path):
+                links.append(path)
+            elif entry.is_dir():
+                folders.append(path)
+                visit(path, above | {real})
+            elif entry.is_file():
+                files.append(path)
+            else:
+                raise FormatError(root / path, "neither a file nor a folder; move it out of the project")
+
+    visit(Path(), frozenset())
+    return folders, files, links
+
+
+def _is_kept(root: Path, path: Path) -> bool:
+    """Whether a link means the same in a copy of the whole tree."""
+    link = root / path
+    try:
+        mode = link.stat().st_mode
+    except OSError:
+        return True
+    text = os.readlink(link)
+    inside = Path(os.path.normpath(path.parent / text))
+    stays = not os.path.isabs(text) and inside.parts[:1] != ("..",)
+    return stays and (stat.S_ISDIR(mode) or stat.S_ISREG(mode))

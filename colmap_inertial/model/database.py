@@ -1,0 +1,258 @@
+"""Lengths in COLMAP's database: pose priors and rigs. Through SQLite, on a copy.
+
+pycolmap migrates every database that it opens, and no older COLMAP opens it afterwards; so it is not asked.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import sqlite3
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.errors import FormatError
+from colmap_inertial.geometry import matrix_from_quat
+from colmap_inertial.types import Similarity
+
+SIDE_FILES = ("-wal", "-journal")
+#: Rebuilt by SQLite; a copy must not have it.
+SHARED_MEMORY = "-shm"
+
+_WGS84 = 0
+_CAMERA = 0
+#: Priors and rigs of a database count as the model's when they differ from it by less than this share of its size.
+_SAME_FRAME = 0.1
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PlacedModel:
+    """Where a model's cameras stand, and what becomes of it.
+
+    Attributes
+    ----------
+    index
+        Its number among the sub-models.
+    centres
+        (3,) camera centre of each image, by name, before the similarity.
+    sensors
+        (3,) translation of ``sensor_from_rig``, by sensor type and id.
+    """
+
+    index: int
+    centres: Mapping[str, NDArray[np.float64]]
+    sensors: Mapping[tuple[int, int], NDArray[np.float64]]
+
+    def extent(self) -> float:
+        """Diagonal of the box around the cameras."""
+        centres = np.array(list(self.centres.values()))
+        return float(np.linalg.norm(np.ptp(centres, axis=0)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatabaseChange:
+    """What was moved: numbers of rows, and the models whose priors and rigs the database has."""
+
+    priors_moved: int = 0
+    priors_kept: int = 0
+    rigs_moved: int = 0
+    rigs_kept: int = 0
+    prior_models: tuple[int, ...] = ()
+    rig_models: tuple[int, ...] = ()
+
+
+def is_database(path: Path) -> bool:
+    """Whether this is an SQLite file, or has the name of COLMAP's."""
+    with open(path, "rb") as file:
+        return path.name == "database.db" or file.read(16) == b"SQLite format 3\0"
+
+
+def copy_database(source: Path, target: Path) -> None:
+    """Copy a database with what SQLite has beside it; no hard link, as SQLite writes in place.
+
+    Raises
+    ------
+    FormatError
+        When it is shorter than it says.
+    """
+    with open(source, "rb") as file:
+        head = file.read(100)
+    size = source.stat().st_size
+    alone = not any(source.with_name(source.name + suffix).exists() for suffix in SIDE_FILES)
+    if size and (len(head) < 100 or not head.startswith(b"SQLite format 3\0")):
+        raise FormatError(source, "not an SQLite database")
+    page = int.from_bytes(head[16:18], "big")
+    pages = int.from_bytes(head[28:32], "big")
+    if size and alone and head[24:28] == head[92:96] and pages * (65536 if page == 1 else page) > size:
+        raise FormatError(source, f"truncated: {size} bytes instead of {pages} pages of {page}")
+    for suffix in ("", *SIDE_FILES):
+        beside = source.with_name(source.name + suffix)
+        if beside.exists():
+            shutil.copy2(beside, target.with_name(target.name + suffix))
+
+
+def transform_database(
+    source: Path,
+    target: Path,
+    models: Sequence[PlacedModel],
+    similarities: Mapping[int, Similarity | None],
+    *,
+    prior_models: Collection[int] | None = None,
+    rig_models: Collection[int] | None = None,
+) -> DatabaseChange:
+    """Copy a database with the pose priors and rigs moved that are in a model's frame.
+
+    Priors in degrees (WGS84) stay, and so do Cartesian ones and rigs that do not lie where the model has them: they
+    are in a frame of their own. Gravity is a direction in the camera's frame and stays.
+
+    Parameters
+    ----------
+    source, target
+        Databases; the source is not opened.
+    models, similarities
+        The sub-models and, by number, what is applied to them (``None``: left alone).
+    prior_models, rig_models
+        The models whose priors and rigs are in the database, where it is known; otherwise their positions tell.
+
+    Raises
+    ------
+    FormatError
+        For a damaged database.
+    """
+    copy_database(source, target)
+    try:
+        with contextlib.closing(sqlite3.connect(target)) as database, database:
+            return _transform(database, source, models, similarities, prior_models, rig_models)
+    except sqlite3.DatabaseError as error:
+        if isinstance(error, sqlite3.OperationalError) and "full" in str(error):
+            raise OSError(28, "No space left on device", str(target)) from None
+        raise FormatError(source, f"SQLite cannot read it: {error}") from None
+    finally:
+        target.with_name(target.name + SHARED_MEMORY).unlink(missing_ok=True)
+
+
+def _transform(
+    database: sqlite3.Connection,
+    path: Path,
+    models: Sequence[PlacedModel],
+    similarities: Mapping[int, Similarity | None],
+    prior_models: Collection[int] | None,
+    rig_models: Collection[int] | None,
+) -> DatabaseChange:
+    # The pages of the tables that matter; a check of the whole takes minutes on a large database
+    tables = {row[0] for row in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+    for table in tables & {"pose_priors", "rig_sensors", "images"}:
+        told = database.execute(f"PRAGMA quick_check({table})").fetchone()[0]
+        if told != "ok":
+            raise FormatError(path, f"damaged: {told}")
+    priors = list(_priors(database, path)) if {"pose_priors", "images"} <= tables else []
+    rigs = list(_rigs(database, path)) if "rig_sensors" in tables else []
+    moved_priors: set[int] = set()
+    moved_rigs: set[int] = set()
+    used_priors, used_rigs = [], []
+    for model in models:
+        similarity = similarities[model.index]
+        mine = [p for p in priors if p.name in model.centres and p.rowid not in moved_priors]
+        in_frame = model.index in prior_models if prior_models is not None else _priors_agree(model, mine)
+        if in_frame and mine and similarity is not None:
+            rotation = matrix_from_quat(similarity.rotation_xyzw)
+            database.executemany("UPDATE pose_priors SET position = ?, position_covariance = ? WHERE rowid = ?", [
+                (
+                    (similarity.scale * rotation @ p.position + similarity.translation_m).tobytes(),
+                    p.covariance if p.covariance is None
+                    else (similarity.scale**2 * rotation @ p.covariance @ rotation.T).tobytes("F"),
+                    p.rowid,
+                )
+                for p in mine
+            ])  # fmt: skip
+            moved_priors |= {p.rowid for p in mine}
+            used_priors.append(model.index)
+        own = [r for r in rigs if (r.kind, r.sensor) in model.sensors and r.rowid not in moved_rigs]
+        in_frame = model.index in rig_models if rig_models is not None else _rigs_agree(model, own)
+        if in_frame and own and similarity is not None:
+            database.executemany(
+                "UPDATE rig_sensors SET sensor_from_rig = ? WHERE rowid = ?",
+                [(np.append(r.pose[:4], similarity.scale * r.pose[4:]).tobytes(), r.rowid) for r in own],
+            )
+            moved_rigs |= {r.rowid for r in own}
+            used_rigs.append(model.index)
+    return DatabaseChange(
+        priors_moved=len(moved_priors),
+        priors_kept=len(priors) - len(moved_priors),
+        rigs_moved=len(moved_rigs),
+        rigs_kept=len(rigs) - len(moved_rigs),
+        prior_models=tuple(used_priors),
+        rig_models=tuple(used_rigs),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Prior:
+    rowid: int
+    name: str
+    position: NDArray[np.float64]
+    covariance: NDArray[np.float64] | None
+
+
+@dataclass(frozen=True, eq=False)
+class _Rig:
+    rowid: int
+    kind: int
+    sensor: int
+    pose: NDArray[np.float64]
+
+
+def _doubles(path: Path, what: str, blob: object, count: int) -> NDArray[np.float64] | None:
+    if blob is None:
+        return None
+    if not isinstance(blob, bytes) or len(blob) != 8 * count:
+        raise FormatError(path, f"damaged: a {what} is not {count} numbers")
+    return np.frombuffer(blob, "<f8")
+
+
+def _priors(database: sqlite3.Connection, path: Path) -> Iterator[_Prior]:
+    """Cartesian priors of images; COLMAP 3 keeps them by image, 4 by sensor and datum."""
+    columns = {row[1] for row in database.execute("PRAGMA table_info(pose_priors)")}
+    join = "p.image_id = i.image_id"
+    if "corr_data_id" in columns:
+        join = f"p.corr_data_id = i.image_id AND p.corr_sensor_type = {_CAMERA}"
+    covariance = "p.position_covariance" if "position_covariance" in columns else "NULL"
+    query = (
+        f"SELECT p.rowid, i.name, p.position, {covariance}, p.coordinate_system "
+        f"FROM pose_priors p JOIN images i ON {join} ORDER BY p.rowid"
+    )
+    for rowid, name, blob, cov, system in database.execute(query):
+        position = _doubles(path, "prior's position", blob, 3)
+        spread = _doubles(path, "prior's covariance", cov, 9)
+        if position is None or system == _WGS84 or not np.isfinite(position).all():
+            continue
+        yield _Prior(rowid, name, position, None if spread is None else spread.reshape(3, 3))
+
+
+def _rigs(database: sqlite3.Connection, path: Path) -> Iterator[_Rig]:
+    for rowid, kind, sensor, blob in database.execute(
+        "SELECT rowid, sensor_type, sensor_id, sensor_from_rig FROM rig_sensors ORDER BY rowid"
+    ):
+        pose = _doubles(path, "pose of a sensor in its rig", blob, 7)
+        if pose is not None:
+            yield _Rig(rowid, kind, sensor, pose)
+
+
+def _priors_agree(model: PlacedModel, priors: Sequence[_Prior]) -> bool:
+    if not priors:
+        return False
+    distances = [np.linalg.norm(p.position - model.centres[p.name]) for p in priors]
+    return float(np.median(distances)) <= _SAME_FRAME * model.extent()
+
+
+def _rigs_agree(model: PlacedModel, rigs: Sequence[_Rig]) -> bool:
+    if not rigs:
+        return False
+    ours = np.array([model.sensors[r.kind, r.sensor] for r in rigs])
+    theirs = np.array([r.pose[4:] for r in rigs])
+    size = float(np.linalg.norm(ours, axis=1).max())
+    return float(np.median(np.linalg.norm(theirs - ours, axis=1))) <= _SAME_FRAME * size

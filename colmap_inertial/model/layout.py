@@ -1,0 +1,150 @@
+"""What lies where in a COLMAP project, and which sub-model's units each part has."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.errors import FormatError
+from colmap_inertial.model import model_format, read_model
+from colmap_inertial.model.database import PlacedModel
+
+#: Two models are in one frame when the cameras they share stand closer together than this share of their extent.
+_SAME_FRAME = 0.01
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layout:
+    """The models of a project; all folders are relative to its root.
+
+    Attributes
+    ----------
+    submodels
+        COLMAP's sub-models, by number.
+    owners
+        The sub-model that each model folder shows, that of dense workspaces and exports included.
+    workspaces
+        Dense workspaces, with the sub-model that they were made from.
+    placed
+        Where the sub-models' cameras stand.
+    """
+
+    submodels: Mapping[int, Path]
+    owners: Mapping[Path, int]
+    workspaces: Mapping[Path, int]
+    placed: Sequence[PlacedModel]
+
+    def owner(self, path: Path) -> int | None:
+        """The sub-model in whose frame a file is; ``None`` where only the project as a whole is above it."""
+        for folder in path.parents:
+            if folder in self.owners:
+                return self.owners[folder]
+            if folder in self.workspaces:
+                return self.workspaces[folder]
+        return next(iter(self.submodels)) if len(self.submodels) == 1 else None
+
+
+def read_layout(root: Path, folders: Sequence[Path], *, one_for_all: bool) -> Layout:
+    """Find the models of a project and which of them belong together.
+
+    Parameters
+    ----------
+    root
+        The project.
+    folders
+        Its folders, relative to it, without those that are kept as they are.
+    one_for_all
+        The same similarity goes to everything, whatever belongs together.
+
+    Raises
+    ------
+    FormatError
+        Where there is no model, or one cannot be told to belong to a sub-model.
+    """
+    models = [folder for folder in (Path(), *folders) if model_format(root / folder) is not None]
+    if not models:
+        raise FormatError(root, "no COLMAP model here (cameras, images and points3D, .bin or .txt)")
+    known = {Path(), *folders}
+    dense = [f for f in known if f / "stereo" in known and any(m.is_relative_to(f / "sparse") for m in models)]
+    submodels = _submodels(root, models, dense, one_for_all=one_for_all)
+    placed = {folder: _placed(root / folder, index) for index, folder in submodels.items()}
+    owners = {folder: index for index, folder in submodels.items()}
+    for folder in models:
+        if folder not in owners:
+            owners[folder] = next(iter(submodels)) if one_for_all else _owner(root, folder, placed)
+    workspaces = {}
+    for folder in dense:
+        inside = {owners[m] for m in models if m.is_relative_to(folder / "sparse")}
+        if len(inside) > 1 and folder != Path():
+            raise FormatError(root / folder, "this dense workspace holds more than one model: it cannot be told whose")
+        if len(inside) == 1:
+            workspaces[folder] = inside.pop()
+        elif (root / folder / "stereo" / "depth_maps").is_dir():
+            raise FormatError(root / folder, "depth maps beside several sub-models: it cannot be told whose they are")
+    return Layout(submodels=submodels, owners=owners, workspaces=workspaces, placed=list(placed.values()))
+
+
+def _submodels(root: Path, models: list[Path], dense: list[Path], *, one_for_all: bool) -> dict[int, Path]:
+    """COLMAP's own models: ``sparse`` or its numbered folders, else what is nearest to the root."""
+    outside = [m for m in models if not any(m.is_relative_to(d) for d in dense)] or models
+    top = Path("sparse")
+    if top in outside:
+        return {0: top}
+    numbered = {int(m.name): m for m in outside if m.parent == top and m.name.isdigit()}
+    if numbered:
+        return dict(sorted(numbered.items()))
+    depth = min(len(m.parts) for m in outside)
+    nearest = [m for m in outside if len(m.parts) == depth]
+    if len(nearest) == 1:
+        return {0: nearest[0]}
+    if len({m.parent for m in nearest}) == 1 and all(m.name.isdigit() for m in nearest):
+        return dict(sorted((int(m.name), m) for m in nearest))
+    if one_for_all:
+        return dict(enumerate(sorted(nearest)))
+    names = ", ".join(str(m) for m in nearest[:4])
+    raise FormatError(
+        root, f"it cannot be told which of these is COLMAP's model: {names}; leave others out with --keep"
+    )
+
+
+def _placed(folder: Path, index: int) -> PlacedModel:
+    model = read_model(folder)
+    images = [model.image(i) for i in model.reg_image_ids()]
+    sensors: dict[tuple[int, int], NDArray[np.float64]] = {}
+    for rig in model.rigs.values():
+        for sensor, pose in rig.non_ref_sensors.items():
+            if pose is not None:
+                sensors[int(sensor.type), int(sensor.id)] = np.array(pose.translation)
+    return PlacedModel(
+        index=index, centres={image.name: image.projection_center() for image in images}, sensors=sensors
+    )
+
+
+def _owner(root: Path, folder: Path, submodels: Mapping[Path, PlacedModel]) -> int:
+    """The sub-model that shares images with a model, their cameras in the same places."""
+    model = _placed(root / folder, -1)
+    fits: list[Path] = []
+    elsewhere: list[Path] = []
+    for other, placed in submodels.items():
+        common = model.centres.keys() & placed.centres.keys()
+        if 2 * len(common) < len(model.centres):
+            continue
+        distances = [np.linalg.norm(model.centres[name] - placed.centres[name]) for name in common]
+        same = float(np.median(distances)) <= max(_SAME_FRAME * placed.extent(), 1e-9)
+        (fits if same else elsewhere).append(other)
+    if len(fits) == 1:
+        return submodels[fits[0]].index
+    if fits:
+        names = " and ".join(str(f) for f in fits)
+        raise FormatError(root / folder, f"it cannot be told whether this belongs to {names}")
+    if elsewhere:
+        raise FormatError(
+            root / folder,
+            f"its images are those of {elsewhere[0]}, but its cameras stand elsewhere: it was made from another model, "
+            "whose scale is another; leave it out with --keep",
+        )
+    raise FormatError(root / folder, "its images are those of none of the sub-models; leave it out with --keep")

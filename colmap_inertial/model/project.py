@@ -1,0 +1,417 @@
+"""A whole COLMAP project under one similarity: sparse, dense, meshes, database. All of it, or nothing."""
+
+from __future__ import annotations
+
+import fnmatch
+import shutil
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from colmap_inertial import __version__
+from colmap_inertial.errors import AlreadyMetricError, FormatError, InertialError, OutputError
+from colmap_inertial.io.files import read_json, write_json
+from colmap_inertial.io.ply import transform_ply
+from colmap_inertial.model import TRANSFORM_FILE, is_metric, model_format, read_model, similarity_as_json
+from colmap_inertial.model.artefacts import check_map, transform_depth_map, transform_obj, transform_options
+from colmap_inertial.model.binary import check_binary_model
+from colmap_inertial.model.copying import copy_file, list_tree, new_folder
+from colmap_inertial.model.database import SHARED_MEMORY, SIDE_FILES, is_database, transform_database
+from colmap_inertial.model.layout import Layout, read_layout
+from colmap_inertial.model.similarities import ModelScale, similarity_from_json, undoing
+from colmap_inertial.threads import one_blas_thread
+from colmap_inertial.types import Similarity
+
+_MODEL_FILES = ("cameras", "images", "points3D", "rigs", "frames")
+#: Formats that carry length and are left as they are; the user is told.
+_FOREIGN = (
+    *(".stl", ".off", ".glb", ".gltf", ".fbx", ".dae", ".las", ".laz", ".pcd", ".xyz", ".pts", ".e57", ".splat"),
+    *(".mvs", ".nvm", ".out"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Change:
+    """What was done to one file or model folder: its path in the project, what it is, what changed, whose frame."""
+
+    path: str
+    kind: str
+    changed: tuple[str, ...]
+    model: int | None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Applied:
+    """What :func:`apply_to_project` or :func:`undo_project` did.
+
+    Attributes
+    ----------
+    out
+        The new project.
+    models
+        Each sub-model's folder and what was applied to it, by number.
+    changes
+        What carries length.
+    unchanged
+        Number of other files, by how they came over: ``copied``, ``reflinked``, ``linked``, ``link``.
+    notes
+        What the user should know.
+    """
+
+    out: Path
+    models: Mapping[int, tuple[str, ModelScale]]
+    changes: tuple[Change, ...]
+    unchanged: Mapping[str, int]
+    notes: tuple[str, ...]
+
+
+def apply_to_project(
+    project: Path,
+    out: Path,
+    scales: Similarity | Mapping[int | None, ModelScale],
+    *,
+    link: bool = False,
+    keep: Sequence[str] = (),
+    progress: Callable[[int, int], object] = lambda done, total: None,
+) -> Applied:
+    """Write a copy of a COLMAP project in which everything that carries length is transformed.
+
+    Sparse models (binary, text; with rigs and frames), dense workspaces with depth maps, point clouds and meshes (PLY,
+    OBJ), depth ranges in option files, and the pose priors and rigs of the database. Other files are copied, blocks
+    shared with the original where the file system can. The project itself is only read.
+
+    Parameters
+    ----------
+    project
+        A folder with a COLMAP model, in any layout that COLMAP's own commands make.
+    out
+        A folder that does not exist; it appears whole or not at all. ``transform.json`` in it says what was done.
+    scales
+        One similarity for everything, or what :func:`read_scales` returns: one for each sub-model and all that was
+        made from it.
+    link
+        Make hard links of files that do not change. A later edit then reaches the original, too.
+    keep
+        Patterns, as in a shell, of paths in the project that are copied as they are.
+    progress
+        Called with the number of files done and of all.
+
+    Raises
+    ------
+    AlreadyMetricError
+        When the project already carries a similarity of ours.
+    FormatError
+        For an artefact that cannot be read, and where it cannot be told which sub-model something belongs to.
+    OutputError
+        When ``out`` exists or cannot be written.
+    """
+    work = _Work(project, out, keep)
+    for folder in (Path(), *work.folders):
+        if not work.is_kept(folder / TRANSFORM_FILE) and is_metric(project / folder):
+            provenance = read_json(project / folder / TRANSFORM_FILE).get("provenance", "unknown")
+            raise AlreadyMetricError(
+                f"{project / folder} already holds a metric scale ({provenance}); apply it to COLMAP's own project, "
+                "or take it back with --undo"
+            )
+    one = scales if isinstance(scales, Similarity) else None
+    layout = read_layout(project, work.open_folders(), one_for_all=one is not None)
+    by_model = _by_model(project, layout, scales)
+    return work.run(layout, by_model, one, link=link, progress=progress)
+
+
+def undo_project(
+    project: Path,
+    out: Path,
+    *,
+    link: bool = False,
+    progress: Callable[[int, int], object] = lambda done, total: None,
+) -> Applied:
+    """Write a copy of what :func:`apply_to_project` made in the units that it had before.
+
+    Raises
+    ------
+    FormatError
+        When the project holds no ``transform.json`` of ours.
+    OutputError
+        When ``out`` exists or cannot be written.
+    """
+    path = project / TRANSFORM_FILE
+    record = read_json(path)
+    try:
+        keep = [str(pattern) for pattern in record["keep"]]
+        models = [(int(m["index"]), m["similarity"]) for m in record["models"]]
+        database = {name: (list(d["prior_models"]), list(d["rig_models"])) for name, d in record["databases"].items()}
+    except (KeyError, TypeError, ValueError, AttributeError):
+        raise FormatError(path, "not the record of a project that colmap-inertial apply wrote") from None
+    by_model = {
+        index: ModelScale(similarity=None if fields is None else undoing(similarity_from_json(path, fields)))
+        for index, fields in models
+    }
+    work = _Work(project, out, keep)
+    one = undoing(similarity_from_json(path, record)) if record.get("one_for_all") is True else None
+    layout = read_layout(project, work.open_folders(), one_for_all=one is not None)
+    if layout.submodels.keys() != by_model.keys():
+        raise FormatError(path, "the models of the project are not those that it records")
+    return work.run(layout, by_model, one, link=link, progress=progress, undo=True, database=database)
+
+
+def _by_model(
+    project: Path, layout: Layout, scales: Similarity | Mapping[int | None, ModelScale]
+) -> dict[int, ModelScale]:
+    if isinstance(scales, Similarity):
+        return {index: ModelScale(similarity=scales) for index in layout.submodels}
+    numbers = ", ".join(str(i) for i in layout.submodels)
+    if None in scales:
+        if len(layout.submodels) > 1:
+            raise InertialError(
+                f"{project} has the sub-models {numbers}, each with a scale of its own: "
+                "give one for each, --scale NUMBER=FILE"
+            )
+        return {next(iter(layout.submodels)): scales[None]}
+    missing = [index for index in layout.submodels if index not in scales]
+    if missing or len(scales) > len(layout.submodels):
+        given = ", ".join(str(i) for i in scales)
+        raise InertialError(f"{project} has the sub-models {numbers}, but there are scales of {given}")
+    return {index: scales[index] for index in layout.submodels}
+
+
+class _Work:
+    """One copy of a project, file by file."""
+
+    def __init__(self, project: Path, out: Path, keep: Sequence[str]) -> None:
+        if not project.is_dir():
+            raise FormatError(project, "no such folder")
+        inner, outer = out.resolve(), project.resolve()
+        if inner.is_relative_to(outer) or outer.is_relative_to(inner):
+            raise OutputError(f"{out} and {project} lie within each other; choose a folder elsewhere")
+        self._project, self._out, self._keep = project, out, tuple(keep)
+        self.folders, self._files, self._links = list_tree(project)
+        self._changes: list[Change] = []
+        self._databases: dict[str, dict[str, Any]] = {}
+        self._notes: list[str] = []
+
+    def is_kept(self, path: Path) -> bool:
+        """Whether a path, or a folder above it, is to be copied as it is."""
+        return any(fnmatch.fnmatch(str(p), pattern) for p in (path, *path.parents[:-1]) for pattern in self._keep)
+
+    def open_folders(self) -> list[Path]:
+        """Folders that are not kept as they are."""
+        return [folder for folder in self.folders if not self.is_kept(folder)]
+
+    @one_blas_thread()
+    def run(
+        self,
+        layout: Layout,
+        by_model: Mapping[int, ModelScale],
+        one: Similarity | None,
+        *,
+        link: bool,
+        progress: Callable[[int, int], object],
+        undo: bool = False,
+        database: Mapping[str, tuple[Collection[int], Collection[int]]] | None = None,
+    ) -> Applied:
+        """Write everything, then give it its name."""
+        similarities = {index: scale.similarity for index, scale in by_model.items()}
+        models = _model_files(self._project, layout.owners)
+        skipped = {folder / TRANSFORM_FILE for folder in (Path(), *layout.owners)} if undo else set()
+        unchanged: Counter[str] = Counter()
+        foreign: Counter[str] = Counter()
+        with new_folder(self._out) as partial:
+            for folder in self.folders:
+                (partial / folder).mkdir()
+            for path in self._links:
+                (partial / path).symlink_to((self._project / path).readlink())
+                unchanged["link"] += 1
+            for folder, index in layout.owners.items():
+                self._write_model(folder, partial, index, one or similarities[index], record=not undo)
+            for n, path in enumerate(self._files):
+                progress(n, len(self._files))
+                if path in models or path in skipped or self._is_side_file(path):
+                    continue
+                kept = self.is_kept(path)
+                kind = None if kept else _kind(self._project / path, path)
+                similarity = one
+                owner = None if one is not None or kind in (None, "database") else self._owner(layout, path)
+                if owner is not None:
+                    similarity = similarities[owner]
+                if kind == "database":
+                    if not self._write_database(path, partial, layout, similarities, database):
+                        unchanged["copied"] += 1
+                elif kind is None or similarity is None:
+                    unchanged[copy_file(self._project / path, partial / path, link=link)] += 1
+                    if not kept and path.suffix.lower() in _FOREIGN:
+                        foreign[path.suffix.lower()] += 1
+                else:
+                    changed = _WRITERS[kind](self._project / path, partial / path, similarity)
+                    shutil.copymode(self._project / path, partial / path)
+                    if changed:
+                        self._changes.append(Change(path=str(path), kind=kind, changed=changed, model=owner))
+                    else:
+                        unchanged["copied"] += 1
+            for folder in reversed(self.folders):
+                shutil.copymode(self._project / folder, partial / folder)
+            if foreign:
+                told = ", ".join(f"{count} {suffix}" for suffix, count in sorted(foreign.items()))
+                self._notes.append(f"copied in their old units, as their formats are not transformed: {told}")
+            progress(len(self._files), len(self._files))
+            applied = Applied(
+                out=self._out,
+                models={index: (str(layout.submodels[index]), scale) for index, scale in by_model.items()},
+                changes=tuple(self._changes),
+                unchanged=dict(unchanged),
+                notes=tuple(self._notes),
+            )
+            if not undo:
+                write_json(partial / TRANSFORM_FILE, self._record(applied, one))
+        return applied
+
+    def _owner(self, layout: Layout, path: Path) -> int:
+        owner = layout.owner(path)
+        if owner is None:
+            raise FormatError(
+                self._project / path,
+                "it cannot be told in which sub-model's units this is; move it into its dense workspace or leave it "
+                "out with --keep",
+            )
+        return owner
+
+    def _is_side_file(self, path: Path) -> bool:
+        """What SQLite has beside a database is copied with it."""
+        for suffix in (*SIDE_FILES, SHARED_MEMORY):
+            base = path.with_name(path.name.removesuffix(suffix))
+            if base != path and (self._project / base).is_file() and is_database(self._project / base):
+                return not self.is_kept(base)
+        return False
+
+    def _write_model(
+        self, folder: Path, partial: Path, index: int, similarity: Similarity | None, *, record: bool
+    ) -> None:
+        import pycolmap
+
+        source, target = self._project / folder, partial / folder
+        for suffix in (".bin", ".txt"):
+            if not all((source / f"{name}{suffix}").is_file() for name in _MODEL_FILES[:3]):
+                continue
+            model = read_model(source, suffix)
+            if similarity is None:
+                for name in _MODEL_FILES:
+                    if (source / f"{name}{suffix}").is_file():
+                        copy_file(source / f"{name}{suffix}", target / f"{name}{suffix}")
+                continue
+            rotation = pycolmap.Rotation3d(similarity.rotation_xyzw)
+            model.transform(pycolmap.Sim3d(similarity.scale, rotation, similarity.translation_m))
+            counts = model.num_reg_images(), model.num_points3D()
+            # COLMAP does not notice a disk that is full
+            try:
+                if suffix == ".bin":
+                    model.write_binary(str(target))
+                    check_binary_model(target)
+                else:
+                    model.write_text(str(target))
+                    again = read_model(target, suffix)
+                    if (again.num_reg_images(), again.num_points3D()) != counts:
+                        raise FormatError(target, "truncated")
+            except (FormatError, ValueError, RuntimeError) as error:
+                raise OutputError(
+                    f"{self._out / folder}: COLMAP did not write the model whole; is the disk full? ({error})"
+                ) from error
+            self._changes.append(
+                Change(path=str(folder), kind=f"model {suffix}", changed=("cameras", "points", "rigs"), model=index)
+            )
+        if similarity is not None and record and folder != Path():
+            write_json(target / TRANSFORM_FILE, similarity_as_json(similarity))
+
+    def _write_database(
+        self,
+        path: Path,
+        partial: Path,
+        layout: Layout,
+        similarities: Mapping[int, Similarity | None],
+        decided: Mapping[str, tuple[Collection[int], Collection[int]]] | None,
+    ) -> bool:
+        """Whether anything in it changed."""
+        priors, rigs = (None, None) if decided is None else decided.get(str(path), (None, None))
+        done = transform_database(
+            self._project / path,
+            partial / path,
+            layout.placed,
+            similarities,
+            prior_models=priors,
+            rig_models=rigs,
+        )
+        self._databases[str(path)] = asdict(done)
+        changed = []
+        for what, moved, kept in (
+            ("pose priors", done.priors_moved, done.priors_kept),
+            ("rig sensors", done.rigs_moved, done.rigs_kept),
+        ):
+            if moved:
+                changed.append(f"{moved} {what}")
+            if kept:
+                self._notes.append(f"{path}: {kept} {what} are not in a model's frame and stay as they are")
+        if changed:
+            self._changes.append(Change(path=str(path), kind="database", changed=tuple(changed), model=None))
+        return bool(changed)
+
+    def _record(self, applied: Applied, one: Similarity | None) -> dict[str, object]:
+        """The content of ``transform.json``."""
+        found = [scale.similarity for _, scale in applied.models.values() if scale.similarity is not None]
+        same = one or (found[0] if len(applied.models) == 1 else None)
+        whole = {"provenance": "; ".join(s.provenance for s in found)} if same is None else similarity_as_json(same)
+        return {
+            **whole,
+            "one_for_all": one is not None,
+            "source": str(self._project.resolve()),
+            "version": __version__,
+            "keep": list(self._keep),
+            "models": [
+                {"index": index, "folder": folder, **scale.as_json()}
+                for index, (folder, scale) in applied.models.items()
+            ],
+            "databases": self._databases,
+            "files": [asdict(change) for change in applied.changes],
+            "unchanged": applied.unchanged,
+            "notes": list(applied.notes),
+        }
+
+
+def _model_files(project: Path, models: Collection[Path]) -> set[Path]:
+    """The files of COLMAP's models, which COLMAP reads and writes itself."""
+    return {
+        folder / f"{name}{suffix}"
+        for folder in models
+        if model_format(project / folder) is not None
+        for suffix in (".bin", ".txt")
+        if all((project / folder / f"{name}{suffix}").is_file() for name in _MODEL_FILES[:3])
+        for name in _MODEL_FILES
+    }
+
+
+def _kind(file: Path, path: Path) -> str | None:
+    """What a file is, where it carries length; damaged maps are refused here even where they would not change."""
+    suffix = path.suffix.lower()
+    stereo = path.parts[:-1]
+    if suffix == ".bin" and "depth_maps" in stereo:
+        return "depth map"
+    if suffix == ".bin" and "normal_maps" in stereo:
+        check_map(file, 3)
+        return None
+    if suffix == ".obj":
+        with open(file, "rb") as head:
+            return None if b"\0" in head.read(1024) else "obj"  # a compiler's object file has the same ending
+    return {".ply": "ply", ".ini": "options"}.get(suffix) or ("database" if is_database(file) else None)
+
+
+def _depth_map(source: Path, target: Path, similarity: Similarity) -> tuple[str, ...]:
+    transform_depth_map(source, target, similarity)
+    return ("depths",)
+
+
+_WRITERS: dict[str, Callable[[Path, Path, Similarity], tuple[str, ...]]] = {
+    "depth map": _depth_map,
+    "ply": transform_ply,
+    "obj": transform_obj,
+    "options": transform_options,
+}

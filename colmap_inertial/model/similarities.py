@@ -1,0 +1,202 @@
+"""Which similarity: from a scale that was estimated, from a file, or a plain factor."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from colmap_inertial.errors import FormatError, InertialError, NotObservableError
+from colmap_inertial.geometry import matrix_from_quat, quat_conjugate
+from colmap_inertial.io.files import read_json
+from colmap_inertial.model import similarity_as_json
+from colmap_inertial.options import WorldAxes
+from colmap_inertial.types import ScaleEstimate, Similarity
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ModelScale:
+    """What is applied to one sub-model.
+
+    Attributes
+    ----------
+    similarity
+        ``None`` where the scale was refused: the sub-model keeps its own units.
+    verdict, reasons
+        Of the scale estimate; ``None`` and empty where the user gave the similarity.
+    """
+
+    similarity: Similarity | None
+    verdict: str | None = None
+    reasons: tuple[str, ...] = ()
+
+    def as_json(self) -> dict[str, object]:
+        """The fields in JSON types."""
+        similarity = None if self.similarity is None else similarity_as_json(self.similarity)
+        return {"verdict": self.verdict, "reasons": list(self.reasons), "similarity": similarity}
+
+
+def similarity_from_json(path: Path, fields: Mapping[str, Any]) -> Similarity:
+    """The similarity that :func:`similarity_as_json` wrote; ``path`` is for messages.
+
+    ``scale`` is required. Without ``rotation_xyzw`` nothing turns, without ``translation_m`` the origin stays, without
+    ``cov`` the similarity counts as exact.
+
+    Raises
+    ------
+    FormatError
+        For a field that is missing, of another type, or not finite.
+    """
+    if "scale" not in fields:
+        raise FormatError(path, "no similarity: the field scale is missing")
+    arrays = {}
+    for name, shape, default in (
+        ("rotation_xyzw", (4,), [0.0, 0.0, 0.0, 1.0]),
+        ("translation_m", (3,), [0.0] * 3),
+        ("cov", (7, 7), np.zeros((7, 7))),
+    ):
+        value = fields.get(name)
+        try:
+            array = np.array(default if value is None else value)
+        except ValueError:
+            array = np.array(None)
+        if array.dtype.kind not in "fiu" or array.shape != shape:
+            raise FormatError(path, f"{name} must be {' x '.join(map(str, shape))} numbers")
+        arrays[name] = array.astype(np.float64)
+    scale, provenance = fields["scale"], fields.get("provenance", "")
+    if isinstance(scale, bool) or not isinstance(scale, int | float):
+        raise FormatError(path, "scale must be a number")
+    if not isinstance(provenance, str):
+        raise FormatError(path, "provenance must be text")
+    try:
+        return Similarity(scale=float(scale), provenance=provenance, **arrays)
+    except (ValueError, OverflowError) as error:
+        raise FormatError(path, str(error)) from None
+
+
+def read_similarity(path: Path) -> Similarity:
+    """Read a similarity: a JSON object with ``scale``, ``rotation_xyzw``, ``translation_m``, ``cov``, ``provenance``.
+
+    Raises
+    ------
+    FormatError
+        For what is none; see :func:`similarity_from_json`.
+    """
+    return similarity_from_json(path, read_json(path))
+
+
+def plain_factor(factor: float) -> Similarity:
+    """Lengths times a factor, origin and axes kept.
+
+    Raises
+    ------
+    ValueError
+        When it is not positive.
+    """
+    if not (math.isfinite(factor) and factor > 0):
+        raise ValueError(f"factor must be positive, not {factor:g}")
+    return Similarity(
+        scale=factor,
+        rotation_xyzw=np.array([0.0, 0.0, 0.0, 1.0]),
+        translation_m=np.zeros(3),
+        cov=np.zeros((7, 7)),
+        provenance=f"factor {factor:g}, given by the user",
+    )
+
+
+def undoing(similarity: Similarity) -> Similarity:
+    """The inverse, to take back what was applied; as it makes no estimate of anything, its covariance is zero."""
+    rotation = matrix_from_quat(similarity.rotation_xyzw)
+    return Similarity(
+        scale=1 / similarity.scale,
+        rotation_xyzw=quat_conjugate(similarity.rotation_xyzw),
+        translation_m=-(rotation.T @ similarity.translation_m) / similarity.scale,
+        cov=np.zeros((7, 7)),
+        provenance=f"undoes: {similarity.provenance}",
+    )
+
+
+def read_scales(sources: Sequence[str], *, world: WorldAxes = "z-up") -> dict[int | None, ModelScale]:
+    """Read scale estimates, by sub-model.
+
+    Parameters
+    ----------
+    sources
+        Files that ``colmap-inertial scale --json`` wrote, as ``FILE`` for a project's only model or ``NUMBER=FILE`` for
+        one of several; or the ``result.json`` of a reconstruction, which has a scale for each.
+    world
+        Where gravity points afterwards.
+
+    Returns
+    -------
+    dict
+        By number; the key is ``None`` for a file that does not say which model it is about.
+
+    Raises
+    ------
+    FormatError
+        For what is no scale estimate.
+    InertialError
+        When a model has two scales.
+    NotObservableError
+        When every scale was refused.
+    """
+    found: dict[int | None, ModelScale] = {}
+    for source in sources:
+        number, equals, name = source.partition("=")
+        if equals and number.isascii() and number.isdigit() and not Path(source).exists():
+            path, index = Path(name), int(number)
+            entries: list[tuple[int | None, Any]] = [(index, read_json(path))]
+        else:
+            path = Path(source)
+            content = read_json(path)
+            models = content.get("models")
+            entries = [(None, content)]
+            if isinstance(models, list):
+                entries = [(m.get("index") if isinstance(m, dict) else None, m) for m in models]
+                if not all(isinstance(i, int) for i, _ in entries):
+                    raise FormatError(path, "models: each needs an index")
+        for key, fields in entries:
+            if key in found or (None in found) != (key is None and bool(found)):
+                raise InertialError(f"{source}: two scales for one model; give each as NUMBER=FILE")
+            found[key] = _model_scale(path, fields, world)
+    if found and all(scale.similarity is None for scale in found.values()):
+        raise NotObservableError("scale", "; ".join(reason for scale in found.values() for reason in scale.reasons))
+    return found
+
+
+def _model_scale(path: Path, fields: Any, world: WorldAxes) -> ModelScale:
+    if not isinstance(fields, dict) or not {"metres_per_unit", "verdict"} <= fields.keys():
+        raise FormatError(path, "not a scale estimate (as colmap-inertial scale --json writes it)")
+    numbers = ("metres_per_unit", "sigma_log")
+    if any(isinstance(fields.get(name), bool | str | list | dict) for name in numbers):
+        raise FormatError(path, f"{' and '.join(numbers)} must be numbers or null")
+    reasons = fields.get("reasons")
+    if not isinstance(reasons, list) or not all(isinstance(reason, str) for reason in reasons):
+        raise FormatError(path, "reasons must be a list of texts")
+    if fields["verdict"] not in ("trusted", "weak", "refused"):
+        raise FormatError(path, f"unknown verdict {fields['verdict']!r}")
+    try:
+        estimate = ScaleEstimate(
+            metres_per_unit=fields["metres_per_unit"],
+            sigma_log=fields.get("sigma_log"),
+            ci95=None if fields.get("ci95") is None else tuple(fields["ci95"]),
+            verdict=fields["verdict"],
+            method=str(fields.get("method", "unknown")),
+            reasons=tuple(reasons),
+            gravity_in_world_m_s2=fields.get("gravity_in_world_m_s2"),
+            cov=fields.get("cov"),
+        )
+    except (ValueError, TypeError) as error:
+        raise FormatError(path, f"not a valid scale estimate: {error}") from None
+    similarity = None
+    if estimate.verdict != "refused":
+        if estimate.gravity_in_world_m_s2 is None:
+            raise FormatError(path, "gravity_in_world_m_s2 is missing: give the number with --factor to scale alone")
+        provenance = f"inertial scale, method {estimate.method}, {estimate.verdict}, from {path.name}"
+        similarity = Similarity.from_scale(estimate, world=world, provenance=provenance)
+    return ModelScale(similarity=similarity, verdict=estimate.verdict, reasons=estimate.reasons)
