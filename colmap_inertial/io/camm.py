@@ -47,7 +47,8 @@ def read_camm(path: Path, units: DeclaredUnits) -> ImuRecording:
     for kind, quantity, unit in sensors:
         t_ns, data = packets[kind]
         if len(t_ns):
-            values = to_si(data.view("<f4").astype(np.float64), quantity, unit)
+            with np.errstate(invalid="ignore"):  # a damaged file may hold signalling NaNs
+                values = to_si(data.view("<f4").astype(np.float64), quantity, unit)
             found[kind] = order_samples(path, SENSOR_NAMES[quantity], t_ns, values, np.arange(1, len(t_ns) + 1))
     if _GYRO not in found:
         raise FormatError(path, "its CAMM track holds no gyroscope samples (type 2)")
@@ -66,7 +67,7 @@ def read_camm_frames(path: Path) -> FrameLog:
     video = movie.track(handler="vide")
     if video is None or len(video.t_ns) == 0:
         raise FormatError(path, "holds no video")
-    frame_ns = np.sort(video.t_ns)
+    frame_ns = video.shown_ns(path)
     t_ns, data = _packets(movie, track)[_EXPOSURE]
     exposure_s = readout_s = None
     if len(t_ns):

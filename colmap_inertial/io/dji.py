@@ -30,7 +30,7 @@ def read_dji(path: Path, units: DeclaredUnits) -> NoReturn:
     raise FormatError(
         path,
         "is a DJI video: it holds orientations but no accelerometer, so it can give no scale and no gravity. What "
-        "still works: COLMAP's own reconstruction, in units of its own; deblurring and the rolling shutter with a gyroscope "
-        "log (.gcsv) that Gyroflow exports from it. For metres, record an IMU beside it, or film a target of known "
-        "size",
+        "still works: COLMAP's own reconstruction, in its arbitrary units; deblurring and the rolling shutter, with a "
+        "gyroscope log (.gcsv) that Gyroflow exports from it. For metres, record an IMU beside it, or film a target of "
+        "known size",
     )

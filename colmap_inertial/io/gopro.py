@@ -93,13 +93,16 @@ def read_gopro_frames(path: Path) -> FrameLog:
     streams = _streams(movie, payloads)
     track = _telemetry(movie)
     shift_ns, _ = _video_minus_stamp_ns(movie, streams, track)
-    frame_ns = np.sort(video.t_ns)
+    frame_ns = video.shown_ns(path)
 
     def of_frames(key: str, channels: int) -> Array | None:
         if key not in streams or streams[key].values.shape[1] != channels:
             return None
         t_ns = _sample_times_ns(path, streams[key], track) + shift_ns
-        return _nearest(t_ns, streams[key].values, frame_ns)
+        found = _nearest(t_ns, streams[key].values, frame_ns)
+        # directions and orientations have a length, exposures a bound; what has not is damaged
+        good = found is not None and np.isfinite(found).all() and (channels == 1 or np.linalg.norm(found, axis=1).all())
+        return found if good else None
 
     exposure, iso, iso_hundreds = (of_frames(key, 1) for key in ("SHUT", "ISOE", "ISOG"))
     if iso is None and iso_hundreds is not None:
@@ -113,7 +116,7 @@ def read_gopro_frames(path: Path) -> FrameLog:
         epoch_ns=int(frame_ns[0]),
         in_video_time=True,
         shared_clock=True,
-        exposure_s=None if exposure is None else exposure[:, 0],
+        exposure_s=None if exposure is None or not ((exposure >= 0) & (exposure < 10)).all() else exposure[:, 0],
         iso=None if iso is None else iso[:, 0],
         readout_s=_readout_s(path, settings, streams),
         stabilised=stabilised,

@@ -63,7 +63,8 @@ class Entry:
         kind = _TYPES.get(self.type)
         if kind is None or self.size % np.dtype(kind).itemsize:
             raise ValueError(f"{self.key} holds samples of {self.size} bytes of type {self.type!r}")
-        values = np.frombuffer(self.data, kind).astype(np.float64).reshape(self.count, -1)
+        with np.errstate(invalid="ignore"):  # a damaged file may hold signalling NaNs
+            values = np.frombuffer(self.data, kind).astype(np.float64).reshape(self.count, -1)
         return values / _FIXED_POINT.get(self.type, 1.0)
 
     def text(self) -> str:

@@ -52,6 +52,19 @@ class Track:
     width_px: int = 0
     height_px: int = 0
 
+    def shown_ns(self, path: Path) -> Int:
+        """(N,) presentation times in their order.
+
+        Raises
+        ------
+        FormatError
+            Where two samples are shown at one time; ``path`` is for the message.
+        """
+        shown = np.sort(self.t_ns)
+        if (np.diff(shown) <= 0).any():
+            raise FormatError(path, f"two samples of its {self.entry} track have the same time")
+        return shown
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Movie:

@@ -17,6 +17,8 @@ LATEST_ARRIVAL_NS = 500_000_000
 HARMLESS_SHARE = 0.05
 #: Sampling rates outside these bounds mean a wrong time unit: no phone, camera or drone IMU is slower or faster.
 RATE_BOUNDS_HZ = (4.0, 20_000.0)
+#: No unit makes a reading of a working sensor larger; what is larger is no number but damage.
+LARGEST_READING = 1e9
 #: A pause this long within one recording means a broken stamp.
 LONGEST_GAP_NS = 3_600_000_000_000
 
@@ -68,7 +70,7 @@ def order_samples(
     if absent.any():
         repairs.append(f"{path.name}: {int(absent.sum())} of {len(absent)} rows hold no {what} sample")
         t_ns, values, line_numbers = t_ns[~absent], values[~absent], line_numbers[~absent]
-    finite = np.asarray(np.isfinite(values).all(axis=1))
+    finite = np.asarray((np.abs(values) < LARGEST_READING).all(axis=1))
     if not finite.all():
         missing, first = int((~finite).sum()), int(line_numbers[np.argmin(finite)])
         if missing > HARMLESS_SHARE * len(finite):
@@ -97,6 +99,8 @@ def order_samples(
     same = np.diff(t_ns) == 0
     if same.any():
         t_ns, values = _merge(path, what, t_ns, values, line_numbers, same, repairs)
+        if len(t_ns) < 2:
+            raise TimingError(f"{path}: all {what} samples have one stamp; this is not the time column")
     check_rate(path, what, t_ns)
     return Samples(t_ns=t_ns, values=values, repairs=tuple(repairs))
 

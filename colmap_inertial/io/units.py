@@ -106,7 +106,9 @@ class Axes:
 
     def apply(self, values: Array) -> Array:
         """(N, 3) samples in the IMU frame from (N, 3) samples in the file's order."""
-        return values @ self.matrix.T
+        # a missing or damaged value stays one: 0 * inf is no news
+        with np.errstate(invalid="ignore"):
+            return values @ self.matrix.T
 
     def __str__(self) -> str:
         index = np.argmax(np.abs(self.matrix), axis=1)

@@ -135,7 +135,8 @@ def _samples(file: Path, t_ns: NDArray[np.int64], rows: list[bytes], quantity: Q
     wrong = next((i for i, row in enumerate(rows) if len(row) not in (0, 12)), None)
     if wrong is not None:
         raise FormatError(file, f"IMU sample {wrong + 1} has {len(rows[wrong])} bytes where three floats have 12")
-    values = np.frombuffer(b"".join(rows), "<f4").astype(np.float64).reshape(-1, 3)
+    with np.errstate(invalid="ignore"):  # a damaged file may hold signalling NaNs
+        values = np.frombuffer(b"".join(rows), "<f4").astype(np.float64).reshape(-1, 3)
     numbers = np.flatnonzero(has) + 1
     return order_samples(file, SENSOR_NAMES[quantity], t_ns[has], to_si(values, quantity, unit), numbers)
 

@@ -1,0 +1,197 @@
+"""Damaged recordings of cameras and apps: an error of ours that names the file, never a crash, never a hang."""
+
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import imu_files
+import numpy as np
+import pytest
+from test_io_fuzz import mutated
+from test_io_recorders import FRAME_NS, recorded
+
+from colmap_inertial.errors import FormatError, InertialError
+from colmap_inertial.io.capture import load_capture
+from colmap_inertial.io.imu import read_frame_log, read_imu
+from colmap_inertial.types import ImuRecording
+
+MUTATIONS = 200
+#: Sizes that a damaged box or entry may state.
+SIZES = (0, 1, 7, 8, 9, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF)
+
+
+@pytest.fixture(scope="module")
+def imu() -> ImuRecording:
+    """Two seconds of both sensors at the same stamps."""
+    whole = recorded(100.0, 100.0)
+    n = 200
+    return ImuRecording(
+        gyro_t_s=whole.accel_t_s[:n],
+        gyro_rad_s=whole.gyro_rad_s[:n],
+        accel_t_s=whole.accel_t_s[:n],
+        accel_m_s2=whole.accel_m_s2[:n],
+        epoch_ns=whole.epoch_ns,
+    )
+
+
+def damaged(data: bytes, rng: np.random.Generator, *, binary: bool) -> bytes:
+    """The text fuzzer's mutations; in binary files mostly wrong sizes and counts, near the end where the index is."""
+    if not binary or rng.random() < 0.3:
+        return mutated(data, rng)
+    out = bytearray(data)
+    for _ in range(rng.integers(1, 4)):
+        tail = rng.random() < 0.7
+        at = int(rng.integers(max(0, len(out) - 1200) if tail else 0, len(out) - 4))
+        match rng.integers(0, 3):
+            case 0:
+                out[at : at + 4] = struct.pack(">I", SIZES[rng.integers(0, len(SIZES))])
+            case 1:
+                out[at] = int(rng.integers(0, 256))
+            case 2:
+                names = [
+                    i for i in (out.find(n) for n in (b"stbl", b"stsz", b"stco", b"STRM", b"GYRO", b"SCAL")) if i > 4
+                ]
+                if names:
+                    place = names[rng.integers(0, len(names))] + int(rng.choice([-4, 4]))
+                    out[place : place + 4] = struct.pack(">I", SIZES[rng.integers(0, len(SIZES))])
+    return bytes(out)
+
+
+def in_folder(write: Callable, name: str) -> Callable[[Path, ImuRecording], tuple[Path, Path]]:
+    """A writer of a folder: what to read, and the file in it to damage."""
+    return lambda folder, imu: (write(folder, imu, FRAME_NS[:40]), folder / name)
+
+
+def alone(write: Callable, name: str, *args: object) -> Callable[[Path, ImuRecording], tuple[Path, Path]]:
+    return lambda folder, imu: (write(folder / name, imu, *args),) * 2
+
+
+def zipped(folder: Path, imu: ImuRecording) -> tuple[Path, Path]:
+    return (imu_files.write_sensor_logger(folder, imu),) * 2
+
+
+def ros2(folder: Path, imu: ImuRecording) -> tuple[Path, Path]:
+    path = imu_files.write_rosbag(folder / "recording", imu, kind="mcap")
+    return path, next(path.glob("*.mcap"))
+
+
+RECORDERS = {
+    "gopro max": (alone(imu_files.write_gopro, "a.mp4"), True),
+    "gopro hero5": (alone(imu_files.write_gopro, "a.mp4", imu_files.HERO5), True),
+    "camm": (alone(imu_files.write_camm, "a.mp4"), True),
+    "gcsv": (alone(imu_files.write_gcsv, "a.gcsv"), False),
+    "video-imu-capture": (in_folder(imu_files.write_video_imu_capture, "video_meta.pb3"), True),
+    "opencamera": (in_folder(imu_files.write_opencamera, "VID_20260101_120000_gyro.csv"), False),
+    "opencamera times": (in_folder(imu_files.write_opencamera, "VID_20260101_120000_timestamps.csv"), False),
+    "mars": (in_folder(imu_files.write_mars, "gyro_accel.csv"), False),
+    "mars frames": (in_folder(imu_files.write_mars, "movie_metadata.csv"), False),
+    "stray": (in_folder(imu_files.write_stray_scanner, "imu.csv"), False),
+    "stray odometry": (in_folder(imu_files.write_stray_scanner, "odometry.csv"), False),
+    "stray matrix": (in_folder(imu_files.write_stray_scanner, "camera_matrix.csv"), False),
+    "sensor-logger": (zipped, True),
+    "ros 1": (alone(imu_files.write_rosbag, "a.bag"), True),
+    "ros 2": (ros2, True),
+}
+
+
+@pytest.mark.parametrize("name", RECORDERS)
+def test_only_errors_of_our_own_escape(tmp_path: Path, imu: ImuRecording, name: str) -> None:
+    write, binary = RECORDERS[name]
+    path, victim = write(tmp_path, imu)
+    whole = victim.read_bytes()
+    read_imu(path)
+    rng = np.random.default_rng(zlib.crc32(name.encode()))
+    refused = 0
+    for i in range(MUTATIONS if "ros" not in name else MUTATIONS // 4):
+        data = damaged(whole, rng, binary=binary)
+        victim.write_bytes(data)
+        failed = False
+        for read in (read_imu, read_frame_log, load_capture):
+            try:
+                read(path)
+            except InertialError as error:
+                failed = True
+                assert str(tmp_path) in str(error) and "\n\n" not in str(error)
+            except Exception as error:
+                error.add_note(f"mutation {i} of {name}, read by {read.__name__}")
+                victim.with_suffix(".damaged").write_bytes(data)
+                raise
+        refused += failed
+    assert refused > 0
+
+
+# --- damage that has a name ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def gopro(tmp_path: Path, imu: ImuRecording) -> Path:
+    return imu_files.write_gopro(tmp_path / "GX010001.MP4", imu)
+
+
+def refused(path: Path) -> str:
+    with pytest.raises(FormatError) as caught:
+        read_imu(path)
+    return str(caught.value)
+
+
+def with_size(path: Path, name: bytes, size: int) -> None:
+    data = path.read_bytes()
+    at = data.index(name) - 4
+    path.write_bytes(data[:at] + struct.pack(">I", size) + data[at + 4 :])
+
+
+def test_a_recording_that_was_not_finished_says_so(gopro: Path) -> None:
+    data = gopro.read_bytes()
+    gopro.write_bytes(data[: data.index(b"moov") - 4])
+    assert "the recording was not finished" in refused(gopro)
+
+
+@pytest.mark.parametrize("size", [1, 7, 0xFFFFFFFF])
+def test_a_box_of_a_wrong_size_is_named_with_its_byte(gopro: Path, size: int) -> None:
+    at = gopro.read_bytes().index(b"stbl") - 4
+    with_size(gopro, b"stbl", size)
+    assert f"is damaged at byte {at}: the box 'stbl' states a size of" in refused(gopro)
+
+
+def test_a_box_that_ends_beyond_the_file_is_named(gopro: Path) -> None:
+    at = gopro.read_bytes().index(b"moov") - 4
+    with_size(gopro, b"moov", 1 << 20)
+    assert f"its index at byte {at} ends beyond the file" in refused(gopro)
+
+
+def test_a_box_of_size_zero_cannot_hold_the_reader(gopro: Path) -> None:
+    with_size(gopro, b"stsz", 0)
+    refused(gopro)
+
+
+def test_samples_beyond_the_file_are_named(gopro: Path) -> None:
+    data = bytearray(gopro.read_bytes())
+    at = data.rindex(b"stco") + 12
+    data[at : at + 4] = struct.pack(">I", 1 << 30)
+    gopro.write_bytes(data)
+    assert "sample 1 of the gpmd track at byte 1073741824 ends beyond the file" in refused(gopro)
+
+
+def test_an_entry_of_a_wrong_size_names_payload_and_byte(gopro: Path) -> None:
+    data = bytearray(gopro.read_bytes())
+    at = data.index(b"GYROs")
+    data[at + 6 : at + 8] = b"\xff\xff"
+    gopro.write_bytes(data)
+    assert "is damaged in telemetry payload 1 at byte" in refused(gopro)
+
+
+def test_a_truncated_protobuf_names_the_byte(tmp_path: Path, imu: ImuRecording) -> None:
+    imu_files.write_video_imu_capture(tmp_path, imu, FRAME_NS[:40])
+    file = tmp_path / "video_meta.pb3"
+    file.write_bytes(file.read_bytes()[:-3])
+    message = refused(tmp_path)
+    assert "video_meta.pb3: is damaged at byte" in message and "are left" in message
+
+
+def test_text_that_is_not_utf_8_names_the_line(tmp_path: Path, imu: ImuRecording) -> None:
+    path = imu_files.write_gcsv(tmp_path / "a.gcsv", imu)
+    lines = path.read_bytes().split(b"\n")
+    lines[20] = b"1,\xff\xfe,3,4,5,6,7"
+    path.write_bytes(b"\n".join(lines))
+    assert "line 21" in refused(path)
