@@ -217,11 +217,12 @@ class Mover:
 
     def __call__(self, rows: NDArray[np.void]) -> None:
         """Move them."""
-        for names, matrix, offset in self._parts:
-            values = np.empty((3, len(rows)))
-            for i, name in enumerate(names):
-                values[i] = rows[name]
-            with np.errstate(over="ignore", invalid="ignore"):
+        # Points that are no number, or too far away for the file's precision, stay so and need no warning
+        with np.errstate(over="ignore", invalid="ignore"):
+            for names, matrix, offset in self._parts:
+                values = np.empty((3, len(rows)))
+                for i, name in enumerate(names):
+                    values[i] = rows[name]
                 moved = matrix @ values
                 moved += offset[:, None]
                 for i, name in enumerate(names):

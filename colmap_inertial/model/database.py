@@ -160,15 +160,15 @@ def _transform(
         in_frame = model.index in prior_models if prior_models is not None else _priors_agree(model, mine)
         if in_frame and mine and similarity is not None:
             rotation = matrix_from_quat(similarity.rotation_xyzw)
-            database.executemany("UPDATE pose_priors SET position = ?, position_covariance = ? WHERE rowid = ?", [
-                (
-                    (similarity.scale * rotation @ p.position + similarity.translation_m).tobytes(),
-                    p.covariance if p.covariance is None
-                    else (similarity.scale**2 * rotation @ p.covariance @ rotation.T).tobytes("F"),
-                    p.rowid,
-                )
-                for p in mine
-            ])  # fmt: skip
+            for p in mine:
+                position = similarity.scale * rotation @ p.position + similarity.translation_m
+                database.execute("UPDATE pose_priors SET position = ? WHERE rowid = ?", (position.tobytes(), p.rowid))
+                if p.covariance is not None:
+                    covariance = similarity.scale**2 * rotation @ p.covariance @ rotation.T
+                    database.execute(
+                        "UPDATE pose_priors SET position_covariance = ? WHERE rowid = ?",
+                        (covariance.tobytes(), p.rowid),
+                    )
             moved_priors |= {p.rowid for p in mine}
             used_priors.append(model.index)
         own = [r for r in rigs if (r.kind, r.sensor) in model.sensors and r.rowid not in moved_rigs]
