@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 import zipfile
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
@@ -143,7 +143,7 @@ class GoPro:
     settings: bytes = b""
     extra: bytes = b""
     late_s: float = 0.0
-    streams: dict[str, tuple[float, np.ndarray]] = field(default_factory=dict)
+    readout_ms: float | None = None
 
 
 HERO5 = GoPro(
@@ -188,6 +188,8 @@ def write_gopro(path: Path, imu: ImuRecording, style: GoPro = MAX, *, frames: in
         (b"GYRO", imu.gyro_t_s, np.rint(channels(imu.gyro_rad_s, style.order) * style.gyro_scale), b"rad/s"),
         (b"SHUT", frame_t, exposure[:, None], b"s"),
     ]
+    if style.readout_ms is not None:
+        series.append((b"SROT", frame_t, np.full((frames, 1), style.readout_ms), b"ms"))
     payloads = []
     for begin, stop in pairwise(edges):
         streams = []
@@ -195,9 +197,10 @@ def write_gopro(path: Path, imu: ImuRecording, style: GoPro = MAX, *, frames: in
             inside = np.flatnonzero((t_s >= begin) & (t_s < stop)) if begin > t0 else np.flatnonzero(t_s < stop)
             if len(inside):
                 streams.append(_gopro_stream(key, t_s[inside[0]], values[inside], unit, inside[-1] + 1, style))
-        payloads.append(
-            nest(b"DEVC", klv(b"DVID", b"L", 4, b"\0\0\0\1"), text(b"DVNM", b"Camera"), *streams) + style.extra
-        )
+        about = [klv(b"DVID", b"L", 4, b"\0\0\0\1"), text(b"DVNM", b"Camera")]
+        if style.clock == "DEVC":
+            about.append(klv(b"TICK", b"L", 4, struct.pack(">I", round((begin + 1000) * 1e3))))
+        payloads.append(nest(b"DEVC", *about, *streams) + style.extra)
     data = [(b"FIRM", style.firmware)]
     if style.settings:
         data.append((b"GPMF", style.settings + bytes(64)))
@@ -212,11 +215,12 @@ def _gopro_stream(key: bytes, t_s: float, values: np.ndarray, unit: bytes, total
     parts.append(klv(b"TSMP", b"L", 4, struct.pack(">I", total)))
     if style.clock == "TICK":
         parts.append(klv(b"TICK", b"L", 4, struct.pack(">I", round((t_s + style.late_s + 1000) * 1e3))))
-    if style.late_s and key != b"SHUT":
+    if style.late_s and key in (b"GYRO", b"ACCL"):
         parts.append(klv(b"TIMO", b"f", 4, struct.pack(">f", style.late_s)))
-    if key == b"SHUT":
-        body = values.astype(">f4").tobytes()
-        return nest(b"STRM", *parts, text(b"STNM", b"Exposure time (shutter speed)"), klv(key, b"f", 4, body))
+    if key in (b"SHUT", b"SROT"):
+        return nest(
+            b"STRM", *parts, klv(b"SIUN", b"c", len(unit), unit), klv(key, b"f", 4, values.astype(">f4").tobytes())
+        )
     gyro = key == b"GYRO"
     parts.append(text(b"STNM", style.names[0 if gyro else 1]))
     if style.says_order:

@@ -44,7 +44,7 @@ def rate_hz(t_s: np.ndarray) -> float:
     return float((len(t_s) - 1) / (t_s[-1] - t_s[0]))
 
 
-# --- real recordings -----------------------------------------------------------------------------------------------------
+# --- real recordings ------------------------------------------------------------------------------------------------
 
 
 def stream_bodies(path: Path, key: bytes) -> list[tuple[int, np.ndarray]]:
@@ -159,7 +159,7 @@ def test_karma_turns_as_its_gyroscope_says(karma: Path) -> None:
     assert abs(offsets_s[int(np.argmax(found))]) < 0.08
 
 
-# --- layouts -------------------------------------------------------------------------------------------------------------
+# --- layouts --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("order", ["XzY", "YxZ", "ZXY", "yXZ", "zYX"])
@@ -206,6 +206,17 @@ def test_settings_decide_readout_and_stabilisation(tmp_path: Path, imu: ImuRecor
     assert nothing.stabilised is None and nothing.readout_s is None
 
 
+def test_the_readout_may_be_noted_frame_by_frame(tmp_path: Path, imu: ImuRecording) -> None:
+    style = replace(imu_files.HERO6, readout_ms=15.25)
+    assert log_of(imu_files.write_gopro(tmp_path / "a.mp4", imu, style)).readout_s == pytest.approx(15.25e-3)
+
+
+def test_a_device_s_tick_stamps_streams_without_one(tmp_path: Path, imu: ImuRecording) -> None:
+    own = read_imu(imu_files.write_gopro(tmp_path / "a.mp4", imu, imu_files.HERO5))
+    read = read_imu(imu_files.write_gopro(tmp_path / "b.mp4", imu, replace(imu_files.HERO5, clock="DEVC")))
+    np.testing.assert_allclose(read.gyro_t_s, own.gyro_t_s, atol=3e-3)
+
+
 def test_exposures_belong_to_frames_by_time(tmp_path: Path, imu: ImuRecording) -> None:
     log = log_of(imu_files.write_gopro(tmp_path / "a.mp4", imu))
     np.testing.assert_allclose(log.exposure_s, 1e-3 * (1 + np.arange(len(log.t_s)) % 7), atol=1e-9)
@@ -234,7 +245,7 @@ def test_an_entry_beyond_its_payload_names_the_byte() -> None:
         list(entries(struct.pack(">4scBH", b"GYRO", b"s", 6, 100) + bytes(12)))
 
 
-# --- the container -------------------------------------------------------------------------------------------------------
+# --- the container --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("suffix", ["mp4", "mov"])

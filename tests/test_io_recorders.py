@@ -134,7 +134,7 @@ def test_the_same_recording_comes_back_from_every_layout(
     np.testing.assert_allclose(read.accel_m_s2, truth.accel_m_s2[accel], atol=layout.accel, rtol=0)
 
 
-# --- what the recorders say about the frames ---------------------------------------------------------------------------
+# --- what the recorders say about the frames ------------------------------------------------------------------------
 
 
 def log_of(path: Path) -> FrameLog:
@@ -206,7 +206,7 @@ def test_camm_gives_exposure_and_readout(tmp_path: Path, imu: ImuRecording) -> N
     assert log.readout_s == pytest.approx(0.021)
 
 
-# --- whole captures ------------------------------------------------------------------------------------------------------
+# --- whole captures -------------------------------------------------------------------------------------------------
 
 
 def test_a_recorder_s_folder_is_a_capture(tmp_path: Path, one_clock: ImuRecording) -> None:
@@ -245,7 +245,7 @@ def test_a_gopro_video_alone_is_a_capture(tmp_path: Path, imu: ImuRecording) -> 
     assert stated.readout_s == 0.01 and not stated.shared_clock
 
 
-# --- refusals ------------------------------------------------------------------------------------------------------------
+# --- refusals -------------------------------------------------------------------------------------------------------
 
 
 def test_dji_says_what_still_works(tmp_path: Path) -> None:

@@ -121,7 +121,7 @@ def test_only_errors_of_our_own_escape(tmp_path: Path, imu: ImuRecording, name: 
     assert refused > 0
 
 
-# --- damage that has a name ----------------------------------------------------------------------------------------------
+# --- damage that has a name ------------------------------------------------------------------------------------------
 
 
 @pytest.fixture

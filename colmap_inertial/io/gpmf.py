@@ -40,7 +40,6 @@ _TYPES = {
 }
 _FIXED_POINT = {b"q": 2.0**16, b"Q": 2.0**32}
 _NESTED = b"\0"
-_DEEPEST = 8
 #: A payload whose samples lie this much farther apart than the others' has lost some.
 _LOST_SHARE = 0.02
 #: Stamps are smoothed over so many payloads to either side: milliseconds jitter by two, microseconds by 0.02.
@@ -178,18 +177,20 @@ def read_streams(path: Path, payloads: list[bytes], offsets: list[int], wanted: 
 
 
 def _read_device(
-    device: Entry, index: int, found: dict[tuple[str, str, str], Stream], wanted: set[str], depth: int = 0
+    device: Entry, index: int, found: dict[tuple[str, str, str], Stream], wanted: set[str]
 ) -> None:
-    if depth > _DEEPEST:
-        raise ValueError("entries nest deeper than any camera's")
     identity = name = ""
+    tick: dict[str, Entry] = {}
     for entry in entries(device.data):
         if entry.key == "DVID":
             identity = entry.data.hex()
         elif entry.key == "DVNM":
             name = entry.text()
+        elif entry.key == "TICK":
+            # the device's own, for streams without one
+            tick = {"TICK": entry}
         elif entry.key == "STRM" and entry.type == _NESTED:
-            inside = {item.key: item for item in entries(entry.data)}
+            inside = {**tick, **{item.key: item for item in entries(entry.data)}}
             for key in wanted & inside.keys():
                 stream = found.setdefault((identity, name, key), Stream(key, name))
                 # a device with two streams of one kind keeps the first
