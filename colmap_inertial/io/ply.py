@@ -19,7 +19,7 @@ from colmap_inertial.errors import FormatError
 from colmap_inertial.geometry import matrix_from_quat
 from colmap_inertial.types import Similarity
 
-_CHUNK_BYTES = 4 << 20
+_CHUNK_BYTES = 512 << 10
 _LONGEST_HEADER = 1 << 20
 _LONGEST_LINE = 1 << 20
 _TYPES = {

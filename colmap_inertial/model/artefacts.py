@@ -12,7 +12,7 @@ from colmap_inertial.errors import FormatError
 from colmap_inertial.geometry import matrix_from_quat
 from colmap_inertial.types import Similarity
 
-_CHUNK_BYTES = 4 << 20
+_CHUNK_BYTES = 1 << 20
 _LONGEST_LINE = 1 << 20
 #: Keys of COLMAP's option files that are lengths in model units; not positive means "automatic".
 _DEPTH_KEYS = ("depth_min", "depth_max")
@@ -55,7 +55,7 @@ def transform_depth_map(source: Path, target: Path, similarity: Similarity) -> N
     buffer = bytearray(_CHUNK_BYTES)
     view = memoryview(buffer)
     values = np.frombuffer(buffer, "<f4")
-    scale = np.float64(similarity.scale)
+    scale = np.float32(similarity.scale)
     with open(source, "rb", buffering=0) as file, open(target, "wb", buffering=0) as out:
         out.write(file.read(header))
         while n := file.readinto(view):  # regular files give less only at their end
@@ -63,7 +63,7 @@ def transform_depth_map(source: Path, target: Path, similarity: Similarity) -> N
                 raise FormatError(source, "truncated while it was read")
             part = values[: n // 4]
             with np.errstate(over="ignore", invalid="ignore"):
-                np.multiply(part, scale, out=part, casting="same_kind", dtype=np.float64)
+                np.multiply(part, scale, out=part)
             written = 0
             while written < n:
                 written += out.write(view[written:n])

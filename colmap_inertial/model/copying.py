@@ -14,7 +14,6 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
-from typing import NoReturn
 
 from colmap_inertial.errors import FormatError, OutputError, OutputExistsError
 
@@ -104,9 +103,10 @@ def _ending_by_signal() -> Iterator[None]:
         return
     caught: list[int] = []
 
-    def stop(number: int, _frame: FrameType | None) -> NoReturn:
+    def stop(number: int, _frame: FrameType | None) -> None:
         caught.append(number)
-        raise _Terminated
+        if len(caught) == 1:  # a second one must not interrupt the cleaning up
+            raise _Terminated
 
     before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGHUP)}
     try:

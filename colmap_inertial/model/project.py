@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import fnmatch
+import functools
+import os
 import shutil
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -226,36 +230,36 @@ class _Work:
                 unchanged["link"] += 1
             for folder, index in layout.owners.items():
                 self._write_model(folder, partial, index, one or similarities[index], record=not undo)
-            for n, path in enumerate(self._files):
-                progress(n, len(self._files))
-                if path in models or path in skipped or self._is_side_file(path):
-                    continue
-                kept = self.is_kept(path)
-                kind = None if kept else _kind(self._project / path, path)
-                similarity = one
-                owner = None if one is not None or kind in (None, "database") else self._owner(layout, path)
-                if owner is not None:
-                    similarity = similarities[owner]
+            todo = [p for p in self._files if p not in models and p not in skipped and not self._is_side_file(p)]
+            databases: list[Path] = []
+            jobs: list[Callable[[], Change | str]] = []
+            for path in todo:
+                kind = None if self.is_kept(path) else _kind(self._project / path, path)
                 if kind == "database":
-                    if not self._write_database(path, partial, layout, similarities, database):
-                        unchanged["copied"] += 1
-                elif kind is None or similarity is None:
-                    unchanged[copy_file(self._project / path, partial / path, link=link)] += 1
-                    if not kept and path.suffix.lower() in _FOREIGN:
-                        foreign[path.suffix.lower()] += 1
-                else:
-                    changed = _WRITERS[kind](self._project / path, partial / path, similarity)
-                    shutil.copymode(self._project / path, partial / path)
-                    if changed:
-                        self._changes.append(Change(path=str(path), kind=kind, changed=changed, model=owner))
+                    databases.append(path)
+                    continue
+                owner = None if one is not None or kind is None else self._owner(layout, path)
+                similarity = one if owner is None else similarities[owner]
+                if kind is None and path.suffix.lower() in _FOREIGN and not self.is_kept(path):
+                    foreign[path.suffix.lower()] += 1
+                jobs.append(functools.partial(self._write_file, path, partial, kind, similarity, owner, link))
+            done = 0
+            for path in databases:
+                if not self._write_database(path, partial, layout, similarities, database):
+                    unchanged["copied"] += 1
+                progress(done := done + 1, len(todo))
+            with contextlib.closing(_side_by_side(jobs)) as outcomes:
+                for outcome in outcomes:
+                    if isinstance(outcome, Change):
+                        self._changes.append(outcome)
                     else:
-                        unchanged["copied"] += 1
+                        unchanged[outcome] += 1
+                    progress(done := done + 1, len(todo))
             for folder in reversed(self.folders):
                 shutil.copymode(self._project / folder, partial / folder)
             if foreign:
                 told = ", ".join(f"{count} {suffix}" for suffix, count in sorted(foreign.items()))
                 self._notes.append(f"copied in their old units, as their formats are not transformed: {told}")
-            progress(len(self._files), len(self._files))
             applied = Applied(
                 out=self._out,
                 models={index: (str(layout.submodels[index]), scale) for index, scale in by_model.items()},
@@ -266,6 +270,23 @@ class _Work:
             if not undo:
                 write_json(partial / TRANSFORM_FILE, self._record(applied, one))
         return applied
+
+    def _write_file(
+        self,
+        path: Path,
+        partial: Path,
+        kind: str | None,
+        similarity: Similarity | None,
+        owner: int | None,
+        link: bool,
+    ) -> Change | str:
+        """Transform or copy one file; what was changed, or how it was copied."""
+        source, target = self._project / path, partial / path
+        if kind is None or similarity is None:
+            return copy_file(source, target, link=link)
+        changed = _WRITERS[kind](source, target, similarity)
+        shutil.copymode(source, target)
+        return Change(path=str(path), kind=kind, changed=changed, model=owner) if changed else "copied"
 
     def _owner(self, layout: Layout, path: Path) -> int:
         owner = layout.owner(path)
@@ -375,6 +396,17 @@ class _Work:
             "unchanged": applied.unchanged,
             "notes": list(applied.notes),
         }
+
+
+def _side_by_side(jobs: Sequence[Callable[[], Change | str]]) -> Generator[Change | str, None, None]:
+    """Results of the jobs in their order; a few at a time, as disk and processor take turns within one."""
+    with ThreadPoolExecutor(max_workers=min(4, os.cpu_count() or 1)) as pool:
+        try:
+            for future in [pool.submit(job) for job in jobs]:
+                yield future.result()
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
 
 
 def _model_files(project: Path, models: Collection[Path]) -> set[Path]:
