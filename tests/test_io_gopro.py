@@ -202,6 +202,10 @@ def test_settings_decide_readout_and_stabilisation(tmp_path: Path, imu: ImuRecor
 
     assert settings(imu_files.text(b"EISE", b"Y"), imu_files.text(b"EISA", b"HS Boost")).stabilised is True
     assert settings(imu_files.text(b"EISE", b"N")).stabilised is False
+    srot = imu_files.klv(b"SROT", b"f", 4, struct.pack(">f", 15.5))
+    assert settings(srot, imu_files.text(b"OREN", b"U")).readout_s == pytest.approx(15.5e-3)
+    # upside down the picture is turned, and nothing says which way its rows are read
+    assert settings(srot, imu_files.text(b"OREN", b"D")).readout_s is None
     nothing = settings(imu_files.text(b"MINF", b"HERO9 Black"))
     assert nothing.stabilised is None and nothing.readout_s is None
 

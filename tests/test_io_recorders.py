@@ -13,7 +13,8 @@ from colmap_inertial.errors import FormatError, MissingExtraError, TimingError
 from colmap_inertial.io.capture import ImuPath, Video, load_capture
 from colmap_inertial.io.frames import read_frame_timing, read_frames
 from colmap_inertial.io.imu import imu_formats, read_capture_imu, read_frame_log, read_imu
-from colmap_inertial.simulate import RecordingOptions, simulate_recording
+from colmap_inertial.scale import estimate_scale
+from colmap_inertial.simulate import RecordingOptions, SimulatedRecording, simulate_recording
 from colmap_inertial.simulate.imu import ImuOptions
 from colmap_inertial.simulate.motion import MotionOptions
 from colmap_inertial.types import FrameLog, ImuRecording
@@ -42,7 +43,10 @@ def imu() -> ImuRecording:
 @pytest.fixture(scope="module")
 def one_clock() -> ImuRecording:
     """Both sensors at the same stamps: what apps with one table write."""
-    imu = recorded(200.0, 200.0)
+    return at_one_clock(recorded(200.0, 200.0))
+
+
+def at_one_clock(imu: ImuRecording) -> ImuRecording:
     inside = imu.gyro_t_s >= imu.accel_t_s[0]
     t_s = imu.gyro_t_s[inside]
     accel = np.stack([np.interp(t_s, imu.accel_t_s, column) for column in imu.accel_m_s2.T], axis=1)
@@ -132,6 +136,30 @@ def test_the_same_recording_comes_back_from_every_layout(
     np.testing.assert_allclose(read.accel_t_s + shift, truth.accel_t_s[accel], atol=layout.t_s, rtol=0)
     np.testing.assert_allclose(read.gyro_rad_s, truth.gyro_rad_s, atol=layout.gyro, rtol=0)
     np.testing.assert_allclose(read.accel_m_s2, truth.accel_m_s2[accel], atol=layout.accel, rtol=0)
+
+
+@pytest.fixture(scope="module")
+def filmed() -> tuple[SimulatedRecording, ImuRecording, float]:
+    """A recording of half a minute, its IMU with both sensors at the same stamps, and the scale with that."""
+    recording = simulate_recording(RecordingOptions(motion=MotionOptions(duration_s=30.0)), seed=3)
+    together = replace(at_one_clock(recording.imu), epoch_ns=10**12)
+    return recording, together, scale(recording, together)
+
+
+def scale(recording: SimulatedRecording, imu: ImuRecording) -> float:
+    found = estimate_scale(recording.trajectory, imu).metres_per_unit
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize(
+    "name",
+    [name for name in LAYOUTS if name not in ("gopro fusion", "sensor-logger android", "sensor-logger parts", "ros 1")],
+)
+def test_every_layout_gives_the_same_scale(tmp_path: Path, filmed, name: str) -> None:
+    recording, together, expected = filmed
+    # the interval's half-width is 1.2 %; what layouts round or smooth away is nothing beside it
+    assert scale(recording, read_imu(LAYOUTS[name].write(tmp_path, together))) == pytest.approx(expected, rel=5e-4)
 
 
 # --- what the recorders say about the frames ------------------------------------------------------------------------
@@ -243,6 +271,16 @@ def test_a_gopro_video_alone_is_a_capture(tmp_path: Path, imu: ImuRecording) -> 
     )
     stated = load_capture(tmp_path)
     assert stated.readout_s == 0.01 and not stated.shared_clock
+
+
+def test_an_opencamera_folder_finds_its_video_beside_it(tmp_path: Path, imu: ImuRecording) -> None:
+    folder = tmp_path / "20260101_120000"
+    folder.mkdir()
+    imu_files.write_opencamera(folder, imu, FRAME_NS)
+    assert load_capture(folder).frames is None
+    video = imu_files.write_mp4(tmp_path / "VID_20260101_120000.mp4", [imu_files.video_track(200)])
+    found = load_capture(folder).frames
+    assert isinstance(found, Video) and found.file.resolve() == video.resolve()
 
 
 # --- refusals -------------------------------------------------------------------------------------------------------

@@ -9,8 +9,9 @@ z up. HERO5 and Session write z, x, y; Fusion -y, x, z; HERO6 and later y, -x, z
 ``MTRX``. All of these are rotations, none mirrors.
 
 Of the frames: exposure (``SHUT``), ISO (``ISOE``; ``ISOG`` times 100), readout (``SROT``, milliseconds; global since
-HERO8, per frame before), stabilisation (``EISE``, ``EISA``, or an image orientation ``IORI`` that moves), gravity
-(``GRAV``), camera orientation (``CORI``). The vectors are written x, z, y and the quaternions w, x, z, y.
+HERO8, per frame before; only where the camera stood upright, ``OREN``), stabilisation (``EISE``, ``EISA``, or an image
+orientation ``IORI`` that moves), gravity (``GRAV``), camera orientation (``CORI``). The vectors are written x, z, y and
+the quaternions w, x, z, y.
 """
 
 from __future__ import annotations
@@ -242,6 +243,9 @@ def _settings(movie: Movie) -> dict[str, Entry]:
 
 
 def _readout_s(path: Path, settings: dict[str, Entry], streams: dict[str, Stream]) -> float | None:
+    if "OREN" in settings and settings["OREN"].text() not in ("", "U"):
+        # the camera hung upside down or on its side and turned the picture: which way its rows are read is not said
+        return None
     try:
         if "SROT" in settings:
             found = settings["SROT"].numbers().ravel()
