@@ -191,8 +191,19 @@ def test_jitter_of_stamps_is_smoothed_and_drift_of_the_clock_is_followed() -> No
     # a clock that is 0.4 % fast and drifts by 30 ppm over half an hour
     true_ns = 1e9 / 200.8 * (index + 30e-6 * index**2 / 360_000)
     stamps = np.rint(true_ns[:-1:200] / 1e6 + rng.uniform(-1.5, 1.5, 1800)) * 1e6
-    off_ns = spread(stamps.astype(np.int64), count, 15) - true_ns[:-1]
+    off_ns = spread(stamps.astype(np.int64), count, 15, 0.02) - true_ns[:-1]
     assert np.abs(off_ns).max() < 2e6 and np.std(off_ns) < 0.25e6
+
+
+def test_payloads_without_stamps_are_timed_by_how_many_samples_they_hold() -> None:
+    rng = np.random.default_rng(4)
+    # a payload is closed every 1.001 s, a few samples early or late; the first holds 17 from before the recording
+    closed = np.arange(1, 61) * 1.001 + rng.uniform(-0.01, 0.01, 60)
+    count = np.diff(np.floor(closed * 201.9).astype(np.int64), prepend=-17)
+    spread_ns = spread(np.rint(np.arange(60) * 1.001e9).astype(np.int64), count, 15, 0.05)
+    off_s = spread_ns * 1e-9 - (np.arange(count.sum()) - 17) / 201.9
+    assert np.abs(off_s).max() < 0.012 and (np.diff(spread_ns) > 0).all()
+    assert spread_ns[0] == pytest.approx(-17e9 / 201.9, abs=12e6)
 
 
 def test_settings_decide_readout_and_stabilisation(tmp_path: Path, imu: ImuRecording) -> None:

@@ -40,10 +40,10 @@ _TYPES = {
 }
 _FIXED_POINT = {b"q": 2.0**16, b"Q": 2.0**32}
 _NESTED = b"\0"
-#: A payload whose samples lie this much farther apart than the others' has lost some.
-_LOST_SHARE = 0.02
-#: Stamps are smoothed over so many payloads to either side: milliseconds jitter by two, microseconds by 0.02.
+#: By the kind of stamp: payloads to either side that smooth it (milliseconds jitter by two, microseconds by 0.02,
+    """One entry: four letters, type, bytes of a sample, number of samples, contents, where it lies in the payload."""
 _REACH = {"STMP": 2, "TICK": 15, "track": 15}
+_LOST_SHARE = {"STMP": 0.02, "TICK": 0.02, "track": 0.05}
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +128,7 @@ class Stream:
         late_ns = 0
         if "TIMO" in self.about:
             late_ns = round(float(self.about["TIMO"].numbers()[0, 0]) * 1e9)
-        return spread(stamps, self.count, _REACH[kind]) - late_ns, kind
+        return spread(stamps, self.count, _REACH[kind], _LOST_SHARE[kind]) - late_ns, kind
 
 
 def entries(payload: bytes, begin: int = 0, end: int | None = None) -> Iterator[Entry]:
@@ -176,9 +176,7 @@ def read_streams(path: Path, payloads: list[bytes], offsets: list[int], wanted: 
     return list(found.values())
 
 
-def _read_device(
-    device: Entry, index: int, found: dict[tuple[str, str, str], Stream], wanted: set[str]
-) -> None:
+def _read_device(device: Entry, index: int, found: dict[tuple[str, str, str], Stream], wanted: set[str]) -> None:
     identity = name = ""
     tick: dict[str, Entry] = {}
     for entry in entries(device.data):
@@ -223,12 +221,13 @@ def _stamp(inside: dict[str, Entry], key: str) -> int | None:
     return int.from_bytes(entry.data[: entry.size], "big")
 
 
-def spread(stamp_ns: NDArray[np.int64], count: NDArray[np.int64], reach: int) -> NDArray[np.int64]:
+def spread(stamp_ns: NDArray[np.int64], count: NDArray[np.int64], reach: int, lost_share: float) -> NDArray[np.int64]:
     """When each sample was taken, from the stamps of the first sample of each payload.
 
     Samples are even within a payload, stamps jitter by what the camera was busy with. So a line is fitted to the stamps
     around each payload against the number of samples, and samples lie evenly between the fitted stamps. Where samples
-    were lost, the payload's own step is far from the others'; then the lines end there and begin anew.
+    were lost, a payload has too few of them for its time; there the lines end and begin anew. A first payload with too
+    many holds some from before the recording; its own stamp is left out.
 
     Parameters
     ----------
@@ -236,21 +235,27 @@ def spread(stamp_ns: NDArray[np.int64], count: NDArray[np.int64], reach: int) ->
         (P,) stamp of each payload's first sample, and its number of samples.
     reach
         Payloads to either side that a line is fitted to.
+    lost_share
+        How much longer than the others' a payload's step may be before samples count as lost.
     """
     n = len(count)
-    total = int(count.sum())
     if n == 1:
         raise ValueError("one payload alone: nothing says how fast its samples follow each other")
     step_ns = np.diff(stamp_ns) / count[:-1]
     usual_ns = float(np.median(step_ns))
     if usual_ns <= 0:
         raise ValueError("the stamps of the payloads do not increase")
-    breaks = np.flatnonzero(np.abs(step_ns / usual_ns - 1) > _LOST_SHARE) + 1
-    out = np.empty(total, dtype=np.int64)
+    breaks = np.flatnonzero(step_ns > (1 + lost_share) * usual_ns) + 1
+    out = np.empty(int(count.sum()), dtype=np.int64)
     first = np.concatenate([[0], np.cumsum(count)])
     for begin, end in zip([0, *breaks.tolist()], [*breaks.tolist(), n], strict=True):
-        stamps, starts = stamp_ns[begin:end] - stamp_ns[begin], first[begin : end + 1] - first[begin]
-        fitted, slope = _local_lines(stamps.astype(np.float64), starts[:-1].astype(np.float64), reach, usual_ns)
+        early = int(begin == 0 and end > 2 and step_ns[0] < (1 - lost_share) * usual_ns)
+        used = slice(begin + early, end)
+        stamps = (stamp_ns[used] - stamp_ns[begin]).astype(np.float64)
+        starts = (first[begin : end + 1] - first[begin]).astype(np.float64)
+        fitted, slope = _local_lines(stamps, starts[early:-1], reach, usual_ns)
+        if early:
+            fitted, slope = np.append(fitted[0] - slope[0] * count[0], fitted), np.append(slope[0], slope)
         # the end of the last payload, so that its samples follow at the rate before it
         knots = np.append(fitted, fitted[-1] + slope[-1] * count[end - 1])
         inner = np.interp(np.arange(starts[-1]), starts, knots)
