@@ -41,7 +41,7 @@ _TYPES = {
 _FIXED_POINT = {b"q": 2.0**16, b"Q": 2.0**32}
 _NESTED = b"\0"
 #: By the kind of stamp: payloads to either side that smooth it (milliseconds jitter by two, microseconds by 0.02,
-    """One entry: four letters, type, bytes of a sample, number of samples, contents, where it lies in the payload."""
+#: payloads without stamps by a few samples), and how much more time than usual for its samples means a loss.
 _REACH = {"STMP": 2, "TICK": 15, "track": 15}
 _LOST_SHARE = {"STMP": 0.02, "TICK": 0.02, "track": 0.05}
 
