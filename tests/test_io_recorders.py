@@ -271,6 +271,9 @@ def test_a_gopro_video_alone_is_a_capture(tmp_path: Path, imu: ImuRecording) -> 
     )
     stated = load_capture(tmp_path)
     assert stated.readout_s == 0.01 and not stated.shared_clock
+    # frame times of another clock: the IMU's stamps are on the video's
+    (tmp_path / "capture.toml").write_text('[video]\nfile = "GX010001.MP4"\nframe_times = "t.csv"\n')
+    assert not load_capture(tmp_path).shared_clock
 
 
 def test_an_opencamera_folder_finds_its_video_beside_it(tmp_path: Path, imu: ImuRecording) -> None:

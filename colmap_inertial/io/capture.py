@@ -244,7 +244,8 @@ def _from_toml(path: Path) -> Capture:
             imu = ImuPath(path=recording.imu, format=recording.format)
         if log is not None:
             readout_s = log.readout_s if readout_s is None else readout_s
-            if shared_clock is None and isinstance(imu, ImuPath) and imu.path == frames.file:
+            inside = isinstance(imu, ImuPath) and imu.path == frames.file
+            if shared_clock is None and inside and frames.frame_times is None:
                 shared_clock = log.shared_clock
     shared_clock = bool(shared_clock)
     calibration = read_calibration_table(
