@@ -285,6 +285,18 @@ def test_chunks_offsets_and_edit_lists_are_followed(tmp_path: Path) -> None:
         np.testing.assert_array_equal(read.t_ns, (np.arange(23) * 10 + 230) * 1_000_000)
 
 
+def test_sound_is_passed_over_and_a_track_of_endless_samples_refused(tmp_path: Path) -> None:
+    sound = imu_files.Mp4Track(b"soun", b"sowt", [b"1234"] * 5, [1] * 5, 48000)
+    path = imu_files.write_mp4(tmp_path / "a.mp4", [sound, imu_files.video_track(3)])
+    assert [track.handler for track in read_movie(path).tracks] == ["vide"]
+    data = bytearray(path.read_bytes())
+    at = data.rindex(b"stsz") + 8
+    data[at : at + 8] = struct.pack(">II", 1, 1 << 31)
+    path.write_bytes(data)
+    with pytest.raises(FormatError, match="2147483648 samples of 1 bytes"):
+        read_movie(path)
+
+
 def test_boxes_with_64_bit_sizes_are_read(tmp_path: Path) -> None:
     path = imu_files.write_mp4(tmp_path / "a.mp4", [imu_files.video_track(3)])
     data = path.read_bytes()

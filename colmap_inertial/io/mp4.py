@@ -25,6 +25,8 @@ Int = NDArray[np.int64]
 _FIRST_BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
 #: An index larger than this belongs to no recording.
 _LARGEST_INDEX = 1 << 30
+#: Nor does a track with more samples: five hours of a kilohertz are a quarter of it. Sound, which may, is not read.
+_MOST_SAMPLES = 1 << 26
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -68,7 +70,7 @@ class Track:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Movie:
-    """The tracks of a file, and its ``udta`` boxes by their four letters."""
+    """The tracks of a file but for sound, and its ``udta`` boxes by their four letters."""
 
     path: Path
     tracks: tuple[Track, ...]
@@ -249,7 +251,7 @@ def _shown(name: bytes) -> str:
 
 
 def _track(reader: _Boxes, begin: int, end: int, movie_scale: int) -> Track | None:
-    """A track; ``None`` where it has no samples table."""
+    """A track; ``None`` where it has no samples table, and for sound."""
     header, handler = reader.find(begin, end, b"mdia", b"mdhd"), reader.find(begin, end, b"mdia", b"hdlr")
     table = reader.find(begin, end, b"mdia", b"minf", b"stbl")
     if header is None or handler is None or table is None:
@@ -257,6 +259,8 @@ def _track(reader: _Boxes, begin: int, end: int, movie_scale: int) -> Track | No
     scale = reader.timescale(*header)
     reader.need(*handler, 12, "a handler")
     kind = reader.data[handler[0] + 8 : handler[0] + 12].decode("latin-1")
+    if kind == "soun":
+        return None
     boxes = {name: (b, e) for name, b, e in reader.inside(*table)}
     entry, width, height = _entry(reader, boxes.get(b"stsd"), kind)
     size = _sizes(reader, boxes.get(b"stsz"))
@@ -300,7 +304,7 @@ def _sizes(reader: _Boxes, place: tuple[int, int] | None) -> Int:
     common, count = struct.unpack_from(">II", reader.data, begin + 4)
     if common == 0:
         return reader.table(place, "stsz", ">u4", 1, head=12)[:, 0]
-    if common * count > reader.path.stat().st_size:
+    if common * count > reader.path.stat().st_size or count > _MOST_SAMPLES:
         raise reader.fail(begin, f"stsz states {count} samples of {common} bytes, more than the file holds")
     return np.full(count, common, dtype=np.int64)
 
