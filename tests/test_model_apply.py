@@ -505,6 +505,8 @@ def test_links_are_kept_inside_and_followed_outside(project, tmp_path):
     (project / "dense" / "latest.ply").symlink_to("fused.ply")
     (project / "dense" / "mesh.ply").symlink_to(project / "dense" / "meshed-poisson.ply")
     (project / "gone").symlink_to("nowhere")
+    (tmp_path / "pictures" / "mask.txt").symlink_to("../mask.txt")
+    (tmp_path / "mask.txt").write_text("outside")
     before = digest(tmp_path / "pictures")
     apply_to_project(project, tmp_path / "out", SIMILARITY)
     out = tmp_path / "out"
@@ -514,6 +516,7 @@ def test_links_are_kept_inside_and_followed_outside(project, tmp_path):
     assert not (out / "dense" / "mesh.ply").is_symlink()
     assert (out / "dense" / "mesh.ply").read_bytes() == (out / "dense" / "meshed-poisson.ply").read_bytes()
     assert os.readlink(out / "gone") == "nowhere"
+    assert (out / "images" / "mask.txt").read_text() == "outside"
     (project / "loop").symlink_to(project)
     with pytest.raises(FormatError, match="leads back"):
         apply_to_project(project, tmp_path / "again", SIMILARITY)
@@ -644,3 +647,22 @@ def test_a_model_file_cut_anywhere_is_refused_before_colmap_reads_it(project, na
     path.write_bytes(bytes(damaged))
     with pytest.raises(FormatError, match="claims"):
         read_model(path.parent)
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".txt"])
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D", "rigs", "frames"])
+def test_a_model_with_flipped_bits_is_read_or_refused_at_once(project, name, suffix):
+    path = project / "sparse" / "0" / f"{name}{suffix}"
+    whole = path.read_bytes()
+    rng = np.random.default_rng(zlib.crc32(path.name.encode()))
+    refused = 0
+    for _ in range(40):
+        damaged = bytearray(whole)
+        for at in rng.integers(0, len(whole), 2):
+            damaged[at] ^= 1 << int(rng.integers(0, 8))
+        path.write_bytes(bytes(damaged))
+        try:
+            read_model(path.parent, suffix).transform(pycolmap.Sim3d())
+        except InertialError:
+            refused += 1
+    assert refused > 0

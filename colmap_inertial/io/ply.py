@@ -6,6 +6,7 @@ through in chunks, and what the format lets one check on the way is checked: siz
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -155,6 +156,7 @@ def transform_ply(source: Path, target: Path, similarity: Similarity) -> tuple[s
         For a file that is damaged, or holds what cannot be transformed.
     """
     with open(source, "rb") as file:
+        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_SEQUENTIAL)
         header = read_ply_header(source, file)
         vertices = next((e for e in header.elements if e.name == "vertex"), None)
         changed = () if vertices is None else _check_vertices(source, vertices)

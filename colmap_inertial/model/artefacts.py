@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -57,6 +58,7 @@ def transform_depth_map(source: Path, target: Path, similarity: Similarity) -> N
     values = np.frombuffer(buffer, "<f4")
     scale = np.float32(similarity.scale)
     with open(source, "rb", buffering=0) as file, open(target, "wb", buffering=0) as out:
+        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_SEQUENTIAL)
         out.write(file.read(header))
         while n := file.readinto(view):  # regular files give less only at their end
             if n % 4:

@@ -44,7 +44,7 @@ def check_binary_model(folder: Path) -> None:
                 if count > size:
                     raise _Damaged(f"it claims {count} records")
                 end = walk(data, count)
-            except (struct.error, IndexError):
+            except (struct.error, IndexError, OverflowError):
                 raise FormatError(path, "truncated") from None
             except _Damaged as error:
                 raise FormatError(path, f"damaged: {error}") from None

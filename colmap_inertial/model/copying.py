@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import errno
 import fcntl
 import os
@@ -56,7 +55,7 @@ def new_folder(target: Path) -> Iterator[Path]:
             try:
                 _empty(partial)
                 yield partial
-                _flush(lock)
+                _flush(partial)
                 if os.path.lexists(target):
                     raise OutputExistsError(f"{target} appeared in the meantime; choose another folder")
                 os.rename(partial, target)
@@ -75,12 +74,19 @@ def _empty(folder: Path) -> None:
             child.unlink()
 
 
-def _flush(folder: int) -> None:
-    """Have the disk hold what was written before the rename says that it is whole."""
-    libc = ctypes.CDLL(None, use_errno=True)
-    if libc.syncfs(folder) != 0:
-        code = ctypes.get_errno()
-        raise OSError(code, os.strerror(code))
+def _flush(folder: Path) -> None:
+    """Have the disk hold what was written before the rename says that it is whole.
+
+    File by file: to flush the file system is to wait for what everybody else wrote, too.
+    """
+    for parent, _, names in os.walk(folder, topdown=False):
+        for path in (*(os.path.join(parent, name) for name in names), parent):
+            if not os.path.islink(path):
+                handle = os.open(path, os.O_RDONLY)
+                try:
+                    os.fsync(handle)
+                finally:
+                    os.close(handle)
 
 
 @contextlib.contextmanager
@@ -150,6 +156,15 @@ def copy_file(source: Path, target: Path, *, link: bool = False) -> str:
     return how
 
 
+def begin_writing(path: Path) -> None:
+    """Have the disk start on a finished file, so that it works while the next ones are made."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.posix_fadvise(handle, 0, 0, os.POSIX_FADV_DONTNEED)
+    finally:
+        os.close(handle)
+
+
 def _copy_bytes(source: int, target: int, size: int) -> None:
     done = 0
     while done < size:
@@ -217,4 +232,6 @@ def _is_kept(root: Path, path: Path) -> bool:
     text = os.readlink(link)
     inside = Path(os.path.normpath(path.parent / text))
     stays = not os.path.isabs(text) and inside.parts[:1] != ("..",)
+    # Below a followed link, ".." leads to where that link's target lies
+    stays = stays and (root / inside).resolve() == link.resolve()
     return stays and (stat.S_ISDIR(mode) or stat.S_ISREG(mode))

@@ -6,6 +6,8 @@ pycolmap migrates every database that it opens, and no older COLMAP opens it aft
 from __future__ import annotations
 
 import contextlib
+import errno
+import os
 import shutil
 import sqlite3
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -92,7 +94,7 @@ def copy_database(source: Path, target: Path) -> None:
     for suffix in ("", *SIDE_FILES):
         beside = source.with_name(source.name + suffix)
         if beside.exists():
-            shutil.copy2(beside, target.with_name(target.name + suffix))
+            shutil.copyfile(beside, target.with_name(target.name + suffix))
 
 
 def transform_database(
@@ -128,8 +130,11 @@ def transform_database(
         with contextlib.closing(sqlite3.connect(target)) as database, database:
             return _transform(database, source, models, similarities, prior_models, rig_models)
     except sqlite3.DatabaseError as error:
-        if isinstance(error, sqlite3.OperationalError) and "full" in str(error):
-            raise OSError(28, "No space left on device", str(target)) from None
+        code = {sqlite3.SQLITE_FULL: errno.ENOSPC, sqlite3.SQLITE_IOERR: errno.EIO}.get(
+            getattr(error, "sqlite_errorcode", 0) & 0xFF
+        )
+        if code is not None:
+            raise OSError(code, os.strerror(code), str(source)) from None
         raise FormatError(source, f"SQLite cannot read it: {error}") from None
     finally:
         target.with_name(target.name + SHARED_MEMORY).unlink(missing_ok=True)

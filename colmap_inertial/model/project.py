@@ -21,7 +21,7 @@ from colmap_inertial.io.ply import transform_ply
 from colmap_inertial.model import TRANSFORM_FILE, is_metric, model_format, read_model, similarity_as_json
 from colmap_inertial.model.artefacts import check_map, transform_depth_map, transform_obj, transform_options
 from colmap_inertial.model.binary import check_binary_model
-from colmap_inertial.model.copying import copy_file, list_tree, new_folder
+from colmap_inertial.model.copying import begin_writing, copy_file, list_tree, new_folder
 from colmap_inertial.model.database import SHARED_MEMORY, SIDE_FILES, is_database, transform_database
 from colmap_inertial.model.layout import Layout, read_layout
 from colmap_inertial.model.similarities import ModelScale, similarity_from_json, undoing
@@ -283,8 +283,12 @@ class _Work:
         """Transform or copy one file; what was changed, or how it was copied."""
         source, target = self._project / path, partial / path
         if kind is None or similarity is None:
-            return copy_file(source, target, link=link)
+            how = copy_file(source, target, link=link)
+            if how == "copied":
+                begin_writing(target)
+            return how
         changed = _WRITERS[kind](source, target, similarity)
+        begin_writing(target)
         shutil.copymode(source, target)
         return Change(path=str(path), kind=kind, changed=changed, model=owner) if changed else "copied"
 
@@ -363,7 +367,7 @@ class _Work:
             rig_models=rigs,
         )
         self._databases[str(path)] = asdict(done)
-        changed = []
+        changed: list[str] = []
         for what, moved, kept in (
             ("pose priors", done.priors_moved, done.priors_kept),
             ("rig sensors", done.rigs_moved, done.rigs_kept),
@@ -372,6 +376,7 @@ class _Work:
                 changed.append(f"{moved} {what}")
             if kept:
                 self._notes.append(f"{path}: {kept} {what} are not in a model's frame and stay as they are")
+        (shutil.copymode if changed else shutil.copystat)(self._project / path, partial / path)
         if changed:
             self._changes.append(Change(path=str(path), kind="database", changed=tuple(changed), model=None))
         return bool(changed)
