@@ -286,6 +286,18 @@ def test_an_opencamera_folder_finds_its_video_beside_it(tmp_path: Path, imu: Imu
     assert isinstance(found, Video) and found.file.resolve() == video.resolve()
 
 
+def test_a_gyroflow_log_beside_a_video_gives_the_readout(tmp_path: Path, one_clock: ImuRecording) -> None:
+    header = "frame_readout_time,18.5\nframe_readout_direction,1"
+    imu_files.write_gcsv(tmp_path / "a.gcsv", one_clock, header=header)
+    stated = '[video]\nfile = "a.mp4"\n[imu]\npath = "a.gcsv"\n'
+    (tmp_path / "capture.toml").write_text(stated)
+    capture = load_capture(tmp_path)
+    assert (capture.readout_s, capture.readout_direction, capture.shared_clock) == (0.0185, "up", False)
+    (tmp_path / "capture.toml").write_text(stated + "[timing]\nreadout_s = 0.02\n")
+    capture = load_capture(tmp_path)
+    assert (capture.readout_s, capture.readout_direction) == (0.02, "up")
+
+
 # --- refusals -------------------------------------------------------------------------------------------------------
 
 

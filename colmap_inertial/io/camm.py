@@ -49,7 +49,7 @@ def read_camm(path: Path, units: DeclaredUnits) -> ImuRecording:
         if len(t_ns):
             with np.errstate(invalid="ignore"):  # a damaged file may hold signalling NaNs
                 values = to_si(data.view("<f4").astype(np.float64), quantity, unit)
-            found[kind] = order_samples(path, SENSOR_NAMES[quantity], t_ns, values, np.arange(1, len(t_ns) + 1))
+            found[kind] = order_samples(path, SENSOR_NAMES[quantity], t_ns, values)
     if _GYRO not in found:
         raise FormatError(path, "its CAMM track holds no gyroscope samples (type 2)")
     return recording(found[_GYRO], found.get(_ACCEL))

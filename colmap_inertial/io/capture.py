@@ -96,6 +96,7 @@ from colmap_inertial.io.capture_tables import (
     read_camera,
     read_imu_table,
 )
+from colmap_inertial.io.gcsv import is_gcsv, read_gcsv_frames
 from colmap_inertial.io.imu_text import is_inertial_scale
 from colmap_inertial.io.recorders import Recording, find_recording
 from colmap_inertial.io.toml_section import Section, read_toml
@@ -231,7 +232,7 @@ def _from_toml(path: Path) -> Capture:
     directions: tuple[ReadoutDirection, ...] = get_args(ReadoutDirection)
     exposure_s = timing.number("exposure_s", low=0, high=10)
     readout_s = timing.number("readout_s", low=0, high=0.5)
-    readout_direction = timing.choice("readout_direction", directions) or "down"
+    readout_direction = timing.choice("readout_direction", directions)
     shared_clock = timing.boolean("shared_clock")
     timing.finish()
     camera, body_from_cam = read_camera(root.section("camera"))
@@ -242,8 +243,11 @@ def _from_toml(path: Path) -> Capture:
         log = None if recording is None else recording.log
         if recording is not None and imu is None:
             imu = ImuPath(path=recording.imu, format=recording.format)
+        if recording is None and isinstance(imu, ImuPath) and is_gcsv(imu.path):
+            log = read_gcsv_frames(imu.path)
         if log is not None:
             readout_s = log.readout_s if readout_s is None else readout_s
+            readout_direction = readout_direction or log.readout_direction
             inside = isinstance(imu, ImuPath) and imu.path == frames.file
             if shared_clock is None and inside and frames.frame_times is None:
                 shared_clock = log.shared_clock
@@ -264,7 +268,7 @@ def _from_toml(path: Path) -> Capture:
         frames=frames,
         exposure_s=exposure_s,
         readout_s=readout_s,
-        readout_direction=readout_direction,
+        readout_direction=readout_direction or "down",
         shared_clock=shared_clock,
         camera=camera,
         imu=imu,

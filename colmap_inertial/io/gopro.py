@@ -70,8 +70,7 @@ def read_gopro(path: Path, units: DeclaredUnits) -> ImuRecording:
         t_ns = _sample_times_ns(path, stream, track) + shift_ns
         declared = units.gyro if quantity == "gyro" else units.accel
         values = to_si(values @ _axes(path, movie, stream).T, quantity, declared or _unit(path, stream, quantity))
-        rows = np.arange(1, len(values) + 1)
-        found[key] = order_samples(path, SENSOR_NAMES[quantity], t_ns, values, rows)
+        found[key] = order_samples(path, SENSOR_NAMES[quantity], t_ns, values)
     if "GYRO" not in found:
         raise FormatError(
             path, "its telemetry holds no gyroscope (GYRO): HERO5 and later write one; older cameras have none"

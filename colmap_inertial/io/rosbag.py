@@ -75,8 +75,7 @@ def read_rosbag(path: Path, units: DeclaredUnits) -> ImuRecording:
                 f"rosbags-convert --src {path.name} --dst one --include-topic {next(iter(with_it))}",
             )
         for t_ns, values in with_it.values():
-            rows = np.arange(1, len(t_ns) + 1)
-            found[quantity] = order_samples(path, SENSOR_NAMES[quantity], t_ns, to_si(values, quantity, unit), rows)
+            found[quantity] = order_samples(path, SENSOR_NAMES[quantity], t_ns, to_si(values, quantity, unit))
     if "gyro" not in found:
         raise FormatError(path, f"none of its IMU topics ({', '.join(topics)}) has a gyroscope that moves")
     return recording(found["gyro"], found.get("accel"))

@@ -43,7 +43,7 @@ class Samples:
 
 
 def order_samples(
-    path: Path, what: str, t_ns: NDArray[np.int64], values: Array, line_numbers: NDArray[np.int64]
+    path: Path, what: str, t_ns: NDArray[np.int64], values: Array, line_numbers: NDArray[np.int64] | None = None
 ) -> Samples:
     """Sort, merge and drop what is harmless.
 
@@ -55,7 +55,7 @@ def order_samples(
     path, what
         For messages: the file, and the sensor's name.
     t_ns, values, line_numbers
-        (N,), (N, 3), (N,) rows as they stand in the file.
+        (N,), (N, 3), (N,) rows as they stand in the file; without line numbers, samples are counted.
 
     Raises
     ------
@@ -64,6 +64,9 @@ def order_samples(
     TimingError
         For stamps that run backwards, jump back, repeat often, or cannot be in the stated unit.
     """
+    unit = "line"
+    if line_numbers is None:
+        unit, line_numbers = "sample", np.arange(1, len(t_ns) + 1)
     repairs: list[str] = []
     # Loggers that write sensors of different rates to one table leave the cells of the others empty.
     absent = np.asarray(np.isnan(values).all(axis=1))
@@ -74,8 +77,9 @@ def order_samples(
     if not finite.all():
         missing, first = int((~finite).sum()), int(line_numbers[np.argmin(finite)])
         if missing > HARMLESS_SHARE * len(finite):
-            raise FormatError(path, f"{missing} of {len(finite)} {what} rows lack a value (NaN or empty)", line=first)
-        repairs.append(f"{path.name}: dropped {missing} {what} rows without a value (first: line {first})")
+            lacking = f"{missing} of {len(finite)} {what} rows lack a value (NaN or empty)"
+            raise FormatError(path, lacking, line=first if unit == "line" else None)
+        repairs.append(f"{path.name}: dropped {missing} {what} rows without a value (first: {unit} {first})")
         t_ns, values, line_numbers = t_ns[finite], values[finite], line_numbers[finite]
     if len(t_ns) < 2:
         raise FormatError(path, f"holds {len(t_ns)} {what} samples; at least two are needed")
@@ -89,7 +93,7 @@ def order_samples(
         if late_ns[worst] > LATEST_ARRIVAL_NS:
             first = int(np.argmax(late_ns > LATEST_ARRIVAL_NS))
             raise TimingError(
-                f"{path}, line {line_numbers[first]}: the {what} stamp is {late_ns[first] * 1e-9:.3f} s behind one "
+                f"{path}, {unit} {line_numbers[first]}: the {what} stamp is {late_ns[first] * 1e-9:.3f} s behind one "
                 "before it; the clock was set back or a stamp is damaged: split or correct the file there"
             )
         repairs.append(f"{path.name}: sorted {int((late_ns > 0).sum())} {what} rows that came late")
@@ -98,7 +102,7 @@ def order_samples(
 
     same = np.diff(t_ns) == 0
     if same.any():
-        t_ns, values = _merge(path, what, t_ns, values, line_numbers, same, repairs)
+        t_ns, values = _merge(path, what, t_ns, values, line_numbers, same, repairs, unit)
         if len(t_ns) < 2:
             raise TimingError(f"{path}: all {what} samples have one stamp; this is not the time column")
     check_rate(path, what, t_ns)
@@ -113,6 +117,7 @@ def _merge(
     line_numbers: NDArray[np.int64],
     same: NDArray[np.bool_],
     repairs: list[str],
+    unit: str,
 ) -> tuple[NDArray[np.int64], Array]:
     group = np.concatenate([[0], np.cumsum(~same)])
     first = np.concatenate([[0], np.flatnonzero(~same) + 1])
@@ -121,8 +126,8 @@ def _merge(
     if n_different > HARMLESS_SHARE * len(t_ns):
         line = int(line_numbers[1 + np.argmax(differs)])
         raise TimingError(
-            f"{path}, line {line}: {n_different} of {len(t_ns)} {what} samples repeat the stamp before them with other "
-            "values; the stamps are too coarse, or this is not the time column"
+            f"{path}, {unit} {line}: {n_different} of {len(t_ns)} {what} samples repeat the stamp before them with "
+            "other values; the stamps are too coarse, or this is not the time column"
         )
     if n_equal:
         repairs.append(f"{path.name}: merged {n_equal} repeated {what} rows")

@@ -137,8 +137,7 @@ def _samples(file: Path, t_ns: NDArray[np.int64], rows: list[bytes], quantity: Q
         raise FormatError(file, f"IMU sample {wrong + 1} has {len(rows[wrong])} bytes where three floats have 12")
     with np.errstate(invalid="ignore"):  # a damaged file may hold signalling NaNs
         values = np.frombuffer(b"".join(rows), "<f4").astype(np.float64).reshape(-1, 3)
-    numbers = np.flatnonzero(has) + 1
-    return order_samples(file, SENSOR_NAMES[quantity], t_ns[has], to_si(values, quantity, unit), numbers)
+    return order_samples(file, SENSOR_NAMES[quantity], t_ns[has], to_si(values, quantity, unit))
 
 
 # --- protobuf --------------------------------------------------------------------------------------------------------
