@@ -1,6 +1,6 @@
 """Quality and cost of deblurring and of undoing the rolling shutter, against the usual ways, in one run.
 
-    python scripts/bench_imaging.py [--photos FOLDER] [--scenes N] [--colmap] [--json FILE] [--quick]
+    python scripts/bench_imaging.py [--photos FOLDER] [--scenes N] [--colmap] [--only SECTION ...] [--json FILE]
 
 Scenes are walls at infinity before a handheld camera that turns (``imaging_scenes.py``: blur and rolling shutter exact,
 motion as measured of people, 20 ms exposure, 20 ms readout, a phone's gyroscope at 400 Hz, 1 % noise in linear light,
@@ -56,6 +56,7 @@ ERRORS = ("noise", "flipped axis", "20 % long", "20 % short", "10 ms late")
 SHARP_S = 0.0002
 #: As many frames judge a recording, the most blurred ones.
 JUDGED = 14
+SECTIONS = ("quality", "other_ways_20_px", "cost", "false_blur_10_px", "rolling_shutter", "colmap")
 console = Console(stderr=True)
 T = TypeVar("T")
 
@@ -77,6 +78,7 @@ def main() -> None:
     parser.add_argument(
         "--quick", action="store_true", help="two scenes, 10 and 20 px, one for the other ways, short reconstructions"
     )
+    parser.add_argument("--only", nargs="+", choices=SECTIONS, help="these sections alone")
     parser.add_argument("--json", type=Path, help="also write all figures there")
     args = parser.parse_args()
     if args.scenes < 1:
@@ -102,11 +104,10 @@ def main() -> None:
         "false_blur_10_px": lambda: false_blur(make_pairs(walls[:compared], 10.0, size=SIZE, seed=args.seed)),
         "rolling_shutter": lambda: imaging_shutter.two_views(20, args.seed),
     }
-    if args.colmap:
-        sections["colmap"] = lambda: imaging_colmap.measure(quick=args.quick, console=console)
+    sections["colmap"] = lambda: imaging_colmap.measure(quick=args.quick, console=console)
     report: dict[str, Any] = {"about": about(args)}
-    for name, section in sections.items():
-        report[name] = section()
+    for name in args.only or [name for name in SECTIONS if name != "colmap" or args.colmap]:
+        report[name] = sections[name]()
         report["about"]["cpu_s"] = round(time.process_time() - start)
         if args.json:
             args.json.write_text(json.dumps(report, indent=2) + "\n")

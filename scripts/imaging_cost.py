@@ -76,9 +76,11 @@ def roofline(image: Grey, blur: BlurField, name: str, repeat: int) -> dict[str, 
     The filter is timed on light that needs no decoding, less the time of the same pass with a single tap: what is left
     is the filter and not the copying in and out. The peak is that of a loop of independent multiply-adds, just before.
     """
-    planes, cells, prior = wiener._prepare(image, blur, DeblurOptions())
-    table = wiener._table(cells, prior)
-    single = wiener.TapTable(first=table.first, weights=table.weights, reach=np.zeros_like(table.reach))
+    planes, cells, noise = wiener._prepare(image, blur, DeblurOptions())
+    table = wiener._table(cells, noise)
+    single = wiener.TapTable(
+        first=table.first, weights=table.weights, reach=np.zeros_like(table.reach), smoothing=table.smoothing
+    )
     light = decode_table(image.dtype)[planes]
     row, _ = table.at(cells.extent_px)
     taps = 2 * table.reach[row + 1] + 1

@@ -17,14 +17,18 @@ def print_report(report: dict[str, Any], console: Console) -> None:
     """Print every section."""
     about = report["about"]
     console.print(", ".join(f"{key} {value}" for key, value in about.items()), style="dim", highlight=False)
-    for kind, by_blur in report["quality"].items():
+    for kind, by_blur in report.get("quality", {}).items():
         _quality(kind, by_blur, console)
-    _other_ways(report["other_ways_20_px"], console)
-    _cost(report["cost"], console)
-    _false_blur(report["false_blur_10_px"], console)
-    _shutter(report["rolling_shutter"], console)
-    if "colmap" in report:
-        _colmap(report["colmap"], console)
+    sections = {
+        "other_ways_20_px": _other_ways,
+        "cost": _cost,
+        "false_blur_10_px": _false_blur,
+        "rolling_shutter": _shutter,
+        "colmap": _colmap,
+    }
+    for name, section in sections.items():
+        if name in report:
+            section(report[name], console)
 
 
 def verdict(value: float, wanted: float, *, least: bool = True) -> str:

@@ -19,6 +19,7 @@ def deblur(
     reach: NDArray[np.int32],
     first: float,
     steps: float,
+    smoothing: NDArray[np.float32],
     decode: NDArray[np.float32],
     encode: NDArray[np.float32],
     saturated: int,

@@ -153,6 +153,42 @@ void fill(Plane &plane, const Code *image, Image size, int channel, bool transpo
     });
 }
 
+// Smooths a plane, rows and columns alike.
+void smooth(Plane &plane, int major, int minor, const Table &table, const Simd &simd, int threads) {
+    const int radius = table.radius;
+    if (radius == 0) return;
+    in_parallel(plane.height, threads, [&](int y) {
+        float *row = plane.data.get() + y * plane.stride;
+        std::vector<float> before(size_t(plane.width + 2 * radius));
+        std::copy(row, row + plane.width, before.data() + radius);
+        for (int k = 1; k <= radius; ++k) {
+            before[size_t(radius - k)] = row[mirrored(-k - plane.before_major, major) + plane.before_major];
+            before[size_t(radius + plane.width - 1 + k)] =
+                row[mirrored(plane.width - 1 + k - plane.before_major, major) + plane.before_major];
+        }
+        std::vector<const float *> sources{before.data() + radius};
+        for (int k = 1; k <= radius; ++k) {
+            sources.push_back(before.data() + radius - k);
+            sources.push_back(before.data() + radius + k);
+        }
+        simd.combine(sources.data(), table.smoothing, radius, row, plane.width);
+    });
+    std::unique_ptr<float[]> result(new float[size_t(plane.stride) * size_t(plane.height)]);
+    in_parallel(plane.height, threads, [&](int y) {
+        auto row = [&](int at) {
+            if (at < 0 || at >= plane.height) at = mirrored(at - plane.before_minor, minor) + plane.before_minor;
+            return plane.data.get() + at * plane.stride;
+        };
+        std::vector<const float *> sources{row(y)};
+        for (int k = 1; k <= radius; ++k) {
+            sources.push_back(row(y - k));
+            sources.push_back(row(y + k));
+        }
+        simd.combine(sources.data(), table.smoothing, radius, result.get() + y * plane.stride, plane.width);
+    });
+    plane.data = std::move(result);
+}
+
 // Where light that the sensor could not hold spoils the result: saturated pixels beside which the image is steeper
 // along the blur than the blur of any scene within the sensor's range could be.
 class LostLight {
@@ -315,6 +351,8 @@ class Deblur {
                           minor = (transposed ? field_.nx : field_.ny) * CELL;
                 plane.allocate(major, minor, reach, steepest);
                 fill(plane, image_, size_, channel, transposed, codec_, threads_);
+                smooth(plane, transposed ? size_.height : size_.width, transposed ? size_.width : size_.height, table_,
+                       simd_, threads_);
                 planes_[transposed].push_back(std::move(plane));
             }
         }

@@ -18,6 +18,8 @@ struct Table {
     float first, steps;    // row i is for (first + i) / steps px
     const float *weights;  // (rows, width)
     const int32_t *reach;  // (rows,)
+    int radius;            // of the smoothing
+    const float *smoothing;  // (radius + 1,) weights at the distances 0, 1, ... along rows and columns
 };
 
 struct Codec {

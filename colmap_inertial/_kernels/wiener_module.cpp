@@ -31,8 +31,8 @@ const Simd &simd_for(const std::string &name) {
 template <class Code>
 std::pair<double, double> deblur_image(In<Code, 3> image, Out<Code> result, In<float, 2> extent_px, In<float, 2> slope,
                                        In<bool, 2> along_y, In<float, 2> fade, In<float, 2> weights,
-                                       In<int32_t, 1> reach, float first, float steps, In<float, 1> decode,
-                                       In<float, 1> encode, int saturated, int threads,
+                                       In<int32_t, 1> reach, float first, float steps, In<float, 1> smoothing,
+                                       In<float, 1> decode, In<float, 1> encode, int saturated, int threads,
                                        const std::string &instruction_set) {
     const int height = int(image.shape(0)), width = int(image.shape(1));
     const int ny = (height + CELL - 1) / CELL, nx = (width + CELL - 1) / CELL;
@@ -49,6 +49,7 @@ std::pair<double, double> deblur_image(In<Code, 3> image, Out<Code> result, In<f
           "weights, reach: not a table");
     for (size_t i = 0; i < reach.shape(0); ++i)
         check(reach.data()[i] >= 0 && size_t(reach.data()[i]) < weights.shape(1), "reach: beyond the weights");
+    check(smoothing.shape(0) >= 1, "smoothing: empty");
     for (size_t i = 0; i < slope.size(); ++i)
         check(slope.data()[i] >= -1 && slope.data()[i] <= 1, "slope: must be within +-1");
     if constexpr (!std::is_same_v<Code, float>) {
@@ -56,7 +57,8 @@ std::pair<double, double> deblur_image(In<Code, 3> image, Out<Code> result, In<f
         check(encode.shape(0) >= 3, "encode: too short");
     }
     const Field field{ny, nx, extent_px.data(), slope.data(), along_y.data(), fade.data()};
-    const Table table{int(weights.shape(0)), int(weights.shape(1)), first, steps, weights.data(), reach.data()};
+    const Table table{int(weights.shape(0)), int(weights.shape(1)), first, steps, weights.data(), reach.data(),
+                      int(smoothing.shape(0)) - 1, smoothing.data()};
     const Codec codec{decode.data(), encode.data(), int(encode.shape(0)) - 2, saturated};
     const Simd &simd = simd_for(instruction_set);
     nb::gil_scoped_release release;
@@ -96,7 +98,7 @@ void define(nb::module_ &module) {
     module.def("deblur", &deblur_image<Code>, nb::arg("image").noconvert(), nb::arg("result").noconvert(),
                nb::kw_only(), nb::arg("extent_px").noconvert(), nb::arg("slope").noconvert(),
                nb::arg("along_y").noconvert(), nb::arg("fade").noconvert(), nb::arg("weights").noconvert(),
-               nb::arg("reach").noconvert(), nb::arg("first"), nb::arg("steps"), nb::arg("decode").noconvert(),
+               nb::arg("reach").noconvert(), nb::arg("first"), nb::arg("steps"), nb::arg("smoothing").noconvert(), nb::arg("decode").noconvert(),
                nb::arg("encode").noconvert(), nb::arg("saturated"), nb::arg("threads") = 0,
                nb::arg("instruction_set") = "");
 }

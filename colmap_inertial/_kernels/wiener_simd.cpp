@@ -90,6 +90,21 @@ void filter(const float *source, ptrdiff_t stride, const Taps &taps, float *tile
         for (int x = 0; x < CELL; x += LANES) filter_block(source + y * stride + x, stride, taps, tile + y * CELL + x);
 }
 
+void combine(const float *const *sources, const float *weights, int radius, float *target, int width) {
+    int x = 0;
+    for (; x + LANES <= width; x += LANES) {
+        Vector sum = weights[0] * load(sources[0] + x);
+        for (int k = 1; k <= radius; ++k)
+            sum += weights[k] * (load(sources[2 * k - 1] + x) + load(sources[2 * k] + x));
+        memcpy(target + x, &sum, sizeof sum);
+    }
+    for (; x < width; ++x) {
+        float sum = weights[0] * sources[0][x];
+        for (int k = 1; k <= radius; ++k) sum += weights[k] * (sources[2 * k - 1][x] + sources[2 * k][x]);
+        target[x] = sum;
+    }
+}
+
 void index(const float *__restrict tile, float scale, float offset, float *__restrict position,
            int32_t *__restrict index) {
     for (int i = 0; i < CELL * CELL; ++i) {
@@ -116,4 +131,4 @@ double multiply_adds(int64_t rounds, float *sink) {
 
 }  // namespace
 
-extern const Simd JOIN(simd_, SIMD) = {TEXT(SIMD), LANES, place, filter, index, multiply_adds};
+extern const Simd JOIN(simd_, SIMD) = {TEXT(SIMD), LANES, place, filter, combine, index, multiply_adds};

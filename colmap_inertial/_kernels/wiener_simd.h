@@ -23,6 +23,8 @@ struct Simd {
     void (*place)(const float *lower, const float *upper, float fraction, float slope, ptrdiff_t stride, Taps &taps);
     // tile (CELL x CELL) = sum of taps around `source`, whose rows are `stride` apart.
     void (*filter)(const float *source, ptrdiff_t stride, const Taps &taps, float *tile);
+    // target[x] = weights[0] sources[0][x] + sum over 1 <= k <= radius of weights[k] (sources[2k-1][x] + sources[2k][x]).
+    void (*combine)(const float *const *sources, const float *weights, int radius, float *target, int width);
     // Clips a tile to 0..1, scales it, and rounds down.
     void (*index)(const float *tile, float scale, float offset, float *position, int32_t *index);
     // Runs `rounds` of independent multiply-adds in registers; returns how many (lanes counted singly) it did.

@@ -37,6 +37,11 @@ class Cells:
     along_y: NDArray[np.bool_]
     fade: NDArray[np.float32]
 
+    @property
+    def typical_px(self) -> float:
+        """Mean length of the blur."""
+        return float(np.mean(self.extent_px * np.hypot(1, self.slope)))
+
     @classmethod
     def of(cls, blur: BlurField, cell_px: int = CELL_PX) -> Cells:
         """Cells of ``cell_px`` for a field."""

@@ -36,9 +36,11 @@ def filter_reference(light: Array, cells: Cells, table: TapTable, cell_px: int =
     Returns
     -------
     (H, W) ``sum_j w_j g(x + j, y + j slope)`` along the major axis, linearly interpolated between rows (columns where
-    the major axis is y), the image mirrored about the centres of its border pixels.
+    the major axis is y), ``g`` the image smoothed as the table says, mirrored about the
+    centres of its border pixels.
     """
     height, width = light.shape
+    light = smoothed_reference(light, table.smoothing)
     y, x = np.mgrid[:height, :width]
     extent, slope, along_y = (
         a[y // cell_px, x // cell_px] for a in (cells.extent_px.astype(np.float64), cells.slope, cells.along_y)
@@ -58,6 +60,16 @@ def filter_reference(light: Array, cells: Cells, table: TapTable, cell_px: int =
             source_x = mirrored(x + np.where(along_y, step, j), width)
             result += weight * share * light[source_y, source_x]
     return result
+
+
+def smoothed_reference(light: Array, weights: NDArray[np.floating]) -> Array:
+    """(H, W) smoothed along rows and columns with symmetric weights at the distances 0, 1, ... px; mirrored borders."""
+    for axis, size in enumerate(light.shape):
+        at, smoothed = np.arange(size), weights[0] * light
+        for k, weight in enumerate(weights[1:], 1):
+            smoothed = smoothed + weight * sum(np.take(light, mirrored(at + s * k, size), axis) for s in (-1, 1))
+        light = smoothed
+    return light
 
 
 def mirrored(index: NDArray[np.intp], size: int) -> NDArray[np.intp]:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.imaging._cells import Cells
-from colmap_inertial.imaging._taps import STEPS_PER_PX, Prior, TapTable
+from colmap_inertial.imaging._taps import STEPS_PER_PX, Prior, TapTable, smoothing_px
 from colmap_inertial.imaging._transfer import decode_table, encode_table, srgb_from_linear
 from colmap_inertial.imaging._wiener_reference import filter_reference, lost_light_reference, share_reference
 from colmap_inertial.imaging.blur_field import BlurField
@@ -64,8 +64,8 @@ def deblur(image: NDArray[Code], blur: BlurField, options: DeblurOptions | None 
     Notes
     -----
     ``out(x, y) = sum_j w_j g(x + j, y + j slope)`` in linear light, ``w`` the optimal finite filter (`optimal_taps`)
-    for the blur at the centre of a 16 px cell. Compiled; other Python threads go on while it runs. The plain version
-    is `deblur_reference`.
+    for the blur at the centre of a 16 px cell, ``g`` the image, smoothed a little (`smoothing_px`). Compiled; other
+    Python threads go on while it runs. The plain version is `deblur_reference`.
 
     Raises
     ------
@@ -73,15 +73,15 @@ def deblur(image: NDArray[Code], blur: BlurField, options: DeblurOptions | None 
         Where the image is of another type, the blur of another size, or longer than `LONGEST_PX` along x or y.
     """
     options = options or DeblurOptions()
-    planes, cells, prior = _prepare(image, blur, options)
-    result, _ = _compiled(planes, cells, _table(cells, prior), threads=options.threads)
+    planes, cells, noise = _prepare(image, blur, options)
+    result, _ = _compiled(planes, cells, _table(cells, noise), threads=options.threads)
     return result.reshape(image.shape)
 
 
 def deblur_reference(image: NDArray[Code], blur: BlurField, options: DeblurOptions | None = None) -> NDArray[Code]:
     """`deblur` in plain numpy; hundreds of times slower."""
-    planes, cells, prior = _prepare(image, blur, options or DeblurOptions())
-    table = _table(cells, prior)
+    planes, cells, noise = _prepare(image, blur, options or DeblurOptions())
+    table = _table(cells, noise)
     top = np.iinfo(image.dtype).max
     light = decode_table(image.dtype)[planes].astype(np.float64)
     saturated = planes >= _saturated_code(image.dtype)
@@ -114,8 +114,8 @@ def estimate_noise(image: NDArray[Code], axis: Literal["x", "y"]) -> float:
     return 0.0 if sigma == 0 else 2 ** (round(4 * np.log2(sigma)) / 4)
 
 
-def _prepare(image: NDArray[Code], blur: BlurField, options: DeblurOptions) -> tuple[NDArray[Code], Cells, Prior]:
-    """The image as (H, W, channels), its cells, and the prior of the filter."""
+def _prepare(image: NDArray[Code], blur: BlurField, options: DeblurOptions) -> tuple[NDArray[Code], Cells, float]:
+    """The image as (H, W, channels), its cells, and its noise."""
     if image.dtype not in (np.uint8, np.uint16) or image.ndim not in (2, 3) or 0 in image.shape:
         raise ValueError(f"image: (H, W) or (H, W, channels) of uint8 or uint16, not {image.shape} of {image.dtype}")
     height, width = image.shape[:2]
@@ -127,11 +127,12 @@ def _prepare(image: NDArray[Code], blur: BlurField, options: DeblurOptions) -> t
     noise = options.noise
     if noise is None:
         noise = estimate_noise(image, "y" if cells.along_y.mean() > 0.5 else "x")
-    return np.ascontiguousarray(image).reshape(height, width, -1), cells, Prior.for_noise(noise)
+    return np.ascontiguousarray(image).reshape(height, width, -1), cells, noise
 
 
-def _table(cells: Cells, prior: Prior) -> TapTable:
-    return TapTable.covering(float(cells.extent_px.min()), float(cells.extent_px.max()), prior)
+def _table(cells: Cells, noise: float) -> TapTable:
+    shortest, longest = float(cells.extent_px.min()), float(cells.extent_px.max())
+    return TapTable.covering(shortest, longest, Prior.for_noise(noise), smoothing_px(noise, cells.typical_px))
 
 
 def _compiled(
@@ -164,6 +165,7 @@ def _compiled(
         reach=table.reach,
         first=table.first,
         steps=STEPS_PER_PX,
+        smoothing=table.smoothing,
         decode=decode_table(dtype) if coded else none,
         encode=encode_table(dtype) if coded else none,
         saturated=_saturated_code(dtype) if coded else 0,
