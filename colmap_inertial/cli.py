@@ -294,6 +294,59 @@ class Deblur:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Batch:
+    """Reconstruct many captures, each in a process of its own; one that fails does not stop the rest.
+
+    MANIFEST is a TOML file with a [[capture]] table for each: path (from the manifest's folder), and optionally name,
+    config (a TOML file with options) and options; or a folder in which every folder is a capture. Writes OUT/NAME for
+    each capture as reconstruct does, OUT/status/NAME.json with how far it is, OUT/summary.csv and OUT/summary.json.
+    Started again, it takes up what has no result yet. Exit code 0 when every capture is done, 1 when one is not.
+
+    Example: colmap-inertial batch captures.toml out
+    """
+
+    manifest: Positional[Path]
+    """A TOML file that lists captures, or a folder of captures."""
+    out: Positional[Path]
+    """A new folder, or that of an earlier run."""
+    workers: int | None = None
+    """Captures in work at once on this machine. Default: what processors and free memory allow."""
+    scheduler: str | None = None
+    """Address of a Dask scheduler (tcp://host:8786), whose workers do the work instead (needs the extra `cluster`)."""
+    attempts: int = 3
+    """How often a capture is started in all, where its process or its worker is killed."""
+    options: Annotated[ReconstructOptions, arg(name="")] = dataclasses.field(default_factory=ReconstructOptions)
+    config: Path | None = None
+    """TOML file with options for all; flags given here go before it, and what the manifest says before both."""
+
+    def __post_init__(self) -> None:
+        if self.workers is not None and self.workers < 1:
+            raise ValueError(f"workers must be at least 1, not {self.workers}")
+        if self.workers is not None and self.scheduler is not None:
+            raise ValueError("--workers are those of this machine; with --scheduler, the cluster has its own")
+        if not 1 <= self.attempts <= 100:
+            raise ValueError(f"attempts must be from 1 to 100, not {self.attempts}")
+
+    def run(self) -> int:
+        """Run the command; returns the exit code."""
+        from colmap_inertial.batch import run_batch
+        from colmap_inertial.batch.terminal import live_batch, show_batch
+
+        with live_batch() as watch:
+            result = run_batch(
+                self.manifest,
+                self.out,
+                self.options,
+                workers=self.workers,
+                scheduler=self.scheduler,
+                attempts=self.attempts,
+                watch=watch,
+            )
+        show_batch(result)
+        return result.exit_code()
+
+
+@dataclass(frozen=True, kw_only=True)
 class Simulate:
     """Make a simulated capture with known truth: a desk or room, filmed by a hand, with the IMU that ran along.
 
@@ -322,7 +375,7 @@ class Simulate:
         return 0
 
 
-Command = Reconstruct | Scale | Apply | Align | Validate | Deblur | Simulate
+Command = Reconstruct | Scale | Apply | Align | Validate | Deblur | Batch | Simulate
 _COMMANDS: dict[str, type[Command]] = {
     "reconstruct": Reconstruct,
     "scale": Scale,
@@ -330,6 +383,7 @@ _COMMANDS: dict[str, type[Command]] = {
     "align": Align,
     "validate": Validate,
     "deblur": Deblur,
+    "batch": Batch,
     "simulate": Simulate,
 }
 
@@ -362,7 +416,7 @@ def _default_from_config(cls: type[Command], args: Sequence[str]) -> Command | N
             path = args[i + 1]
         elif text.startswith("--config="):
             path = text.removeprefix("--config=")
-    if path is None or cls not in (Reconstruct, Scale):
+    if path is None or cls not in (Reconstruct, Scale, Batch):
         return None
     fields = {f.name: f for f in dataclasses.fields(cls)}
     options: Any = read_config(Path(path), ReconstructOptions)
@@ -391,9 +445,8 @@ def main(args: Sequence[str] | None = None) -> None:
         print(f"error: {error}", file=sys.stderr)
         code = error.exit_code
     except KeyboardInterrupt:
-        again = (
-            "; started again with the same arguments, it continues" if isinstance(command, Reconstruct | Deblur) else ""
-        )
+        resumes = isinstance(command, Reconstruct | Deblur | Batch)
+        again = "; started again with the same arguments, it continues" if resumes else ""
         print(f"interrupted{again}", file=sys.stderr)
         code = 130
     sys.exit(code)

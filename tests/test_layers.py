@@ -23,7 +23,7 @@ ORDER = [
     ("model",),
     ("validate",),
     ("pipeline",),
-    ("simulate",),
+    ("simulate", "batch"),
     ("cli",),
 ]
 RANK = {room: rank for rank, rooms in enumerate(ORDER) for room in rooms}

@@ -42,13 +42,54 @@ def read_config(path: Path, cls: type[Options]) -> Options:
     FormatError
         For a file that is no TOML, an unknown key (the nearest known one is named), or a value of the wrong type.
     """
+    return _build(path, cls, read_values(path), "")
+
+
+def read_values(path: Path) -> dict[str, Any]:
+    """What a TOML file says, unchecked; a :class:`FormatError` for a file that is none."""
     try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise FormatError(path, f"cannot be read: {error.strerror}") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise FormatError(path, f"is not valid TOML: {error}") from error
-    return _build(path, cls, values, "")
+
+
+def with_values(options: Options, values: Mapping[str, Any], path: Path) -> Options:
+    """``options``, where ``values`` (nested as in TOML) go before its own.
+
+    Parameters
+    ----------
+    path
+        The file that the values come from: named by errors, and its folder is where relative paths count from.
+
+    Raises
+    ------
+    FormatError
+        As :func:`read_config`.
+    """
+    stated = _build(path, type(options), values, "")  # by themselves first: a wrong one is named as it was written
+    plain = _merged(_plain(options), _with_absolute_paths(stated, values, path.parent))
+    return _build(path, type(options), plain, "")
+
+
+def _with_absolute_paths(stated: Any, values: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    absolute: dict[str, Any] = {}
+    for key, value in values.items():
+        built = getattr(stated, key)
+        if dataclasses.is_dataclass(built):
+            absolute[key] = _with_absolute_paths(built, value, folder)
+        else:
+            absolute[key] = str((folder / built).resolve()) if isinstance(built, Path) else value
+    return absolute
+
+
+def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    merged = dict(below)
+    for key, value in above.items():
+        deeper = isinstance(value, Mapping) and isinstance(merged.get(key), Mapping)
+        merged[key] = _merged(merged[key], value) if deeper else value
+    return merged
 
 
 def _build(path: Path, cls: type[Options], values: Mapping[str, Any], prefix: str) -> Options:
