@@ -179,7 +179,7 @@ def _light(image: NDArray[np.uint8] | NDArray[np.uint16]) -> NDArray[np.float32]
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     codes = np.iinfo(grey.dtype).max
     if grey.dtype == np.uint8:
-        return np.asarray(((np.arange(256) / 255) ** 2.2).astype(np.float32)[grey])
+        return np.asarray(cv2.LUT(grey, ((np.arange(256) / 255) ** 2.2).astype(np.float32)))
     return np.asarray((grey.astype(np.float32) / np.float32(codes)) ** np.float32(2.2))
 
 

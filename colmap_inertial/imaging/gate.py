@@ -360,8 +360,9 @@ def keep_sharp(image: NDArray[Code], deblurred: NDArray[Code], blur: BlurField) 
     side = _BLOCK_PX // 2
 
     def blocks(values: Picture, pick: Callable[..., Picture]) -> Picture:
-        padded = np.pad(values, ((0, rows * side - size[1]), (0, columns * side - size[0])), mode="edge")
-        return pick(padded.reshape(rows, side, columns, side), axis=(1, 3))
+        padded = cv2.copyMakeBorder(values, 0, rows * side - size[1], 0, columns * side - size[0], cv2.BORDER_REPLICATE)
+        # lines first: whole rows at a time
+        return pick(pick(padded.reshape(rows, side, -1), axis=1).reshape(rows, columns, side), axis=2)
 
     around = np.ones((3, 3), np.uint8)
     span = cv2.dilate(blocks(grey, np.max), around) - cv2.erode(blocks(grey, np.min), around)
@@ -374,10 +375,13 @@ def keep_sharp(image: NDArray[Code], deblurred: NDArray[Code], blur: BlurField) 
         return deblurred, 0.0
     whole = (columns * _BLOCK_PX, rows * _BLOCK_PX)
     weight = cv2.resize(keep.astype(np.float32), whole, interpolation=cv2.INTER_LINEAR)[:height, :width]
-    if image.ndim == 3:
-        weight = weight[..., None]
-    out = deblurred + weight * (image.astype(np.float32) - deblurred)
-    return np.rint(out).astype(image.dtype), share
+    out = deblurred.copy()
+    for top in range(0, height, _BLOCK_PX):
+        band = slice(top, top + _BLOCK_PX)
+        if weight[band].any():
+            part = weight[band] if image.ndim == 2 else weight[band, :, None]
+            out[band] = np.rint(deblurred[band] + part * (image[band].astype(np.float32) - deblurred[band]))
+    return out, share
 
 
 __all__ = [
