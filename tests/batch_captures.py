@@ -1,0 +1,27 @@
+"""Small captures for the tests of batches and scripts: the first frames of the example scene."""
+
+from pathlib import Path
+
+from test_pipeline import copy_scene
+
+from colmap_inertial.options import MappingOptions, ReconstructOptions
+
+#: Four seconds a capture, and a scale that is trusted.
+TINY = ReconstructOptions(
+    mapping=MappingOptions(max_num_features=600, first_octave=0, max_image_size=320), deterministic=True
+)
+FRAMES = 14
+
+
+def tiny_capture(folder: Path, *, frames: int = FRAMES) -> Path:
+    """A capture of a few frames, without a target."""
+    copy_scene(folder, first=frames)
+    text = (folder / "capture.toml").read_text()
+    (folder / "capture.toml").write_text(text[: text.index("[target]")])
+    return folder
+
+
+def model_bytes(out: Path) -> dict[str, bytes]:
+    """Every file of the models that a reconstruction made."""
+    found = [path for name in ("sparse", "sparse_metric") for path in (out / name).rglob("*") if path.is_file()]
+    return {str(path.relative_to(out)): path.read_bytes() for path in sorted(found)}

@@ -1,0 +1,365 @@
+"""Batches of real, small reconstructions: on this machine, and on a Dask cluster whose workers die."""
+
+import csv
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from batch_captures import TINY, model_bytes, tiny_capture
+
+from colmap_inertial.batch import BatchCapture, needs_gpu, read_manifest, run_batch
+from colmap_inertial.batch.pools import available_memory, shares_of_this_machine
+from colmap_inertial.batch.task import CaptureStatus, read_status
+from colmap_inertial.cli import main, parse
+from colmap_inertial.errors import FormatError, InertialError, MissingExtraError, OutputExistsError
+from colmap_inertial.options import ReconstructOptions
+from colmap_inertial.pipeline import reconstruct
+
+
+def table(out: Path) -> dict[str, dict[str, str]]:
+    with open(out / "summary.csv", newline="") as file:
+        return {row["name"]: row for row in csv.DictReader(file)}
+
+
+def processes_of(out: Path) -> list[int]:
+    """Running processes that work on a batch."""
+    found = []
+    for folder in Path("/proc").iterdir():
+        try:
+            command = (folder / "cmdline").read_bytes()
+        except (OSError, ValueError):
+            continue
+        if folder.name.isdigit() and b"colmap_inertial.batch.process" in command and str(out).encode() in command:
+            found.append(int(folder.name))
+    return found
+
+
+def eventually(condition, seconds: float = 60.0):
+    """The first true value of ``condition``."""
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        value = condition()
+        if value:
+            return value
+        time.sleep(0.05)
+    raise AssertionError("it never came true")
+
+
+@pytest.fixture(scope="module")
+def captures(tmp_path_factory):
+    """Two captures of one scene, and what ``reconstruct`` makes of each by itself."""
+    root = tmp_path_factory.mktemp("captures")
+    found = {name: tiny_capture(root / name, frames=frames) for name, frames in (("hall", 14), ("yard", 15))}
+    for name, folder in found.items():
+        reconstruct(folder, root / "alone" / name, TINY)
+    return found, {name: model_bytes(root / "alone" / name) for name in found}
+
+
+@pytest.fixture
+def manifest(captures, tmp_path):
+    """A manifest beside links to the captures; one more is broken."""
+    found, _ = captures
+    for name, folder in found.items():
+        (tmp_path / name).symlink_to(folder)
+    broken = tiny_capture(tmp_path / "broken")
+    (broken / "gyro.csv").write_text("t,x,y,z\n0,1\n")
+    names = ("hall", "broken", "yard")
+    (tmp_path / "captures.toml").write_text("".join(f'[[capture]]\npath = "{name}"\n' for name in names))
+    return tmp_path / "captures.toml"
+
+
+def test_a_manifest_gives_each_capture_its_options(tmp_path):
+    (tmp_path / "yard.toml").write_text('world = "y-down"\ncalibration = "phone.json"\n[mapping]\noverlap = 4\n')
+    (tmp_path / "m.toml").write_text(
+        '[[capture]]\npath = "captures/hall"\n\n[[capture]]\nname = "yard-2"\npath = "yard/second.mp4"\n'
+        'config = "yard.toml"\noptions.mapping.overlap = 5\n\n[[capture]]\npath = "roof/capture.toml"\n'
+    )
+    hall, yard, roof = read_manifest(tmp_path / "m.toml", ReconstructOptions(seed=7))
+    assert (hall.name, hall.path, hall.options.seed) == ("hall", tmp_path / "captures" / "hall", 7)
+    assert (yard.name, yard.path) == ("yard-2", tmp_path / "yard" / "second.mp4")
+    assert (yard.options.seed, yard.options.world, yard.options.mapping.overlap) == (7, "y-down", 5)
+    assert yard.options.calibration == tmp_path / "phone.json"
+    assert roof.name == "roof"
+
+
+def test_a_folder_of_captures_is_a_manifest(tmp_path):
+    for name in ("b", "a", ".hidden"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "notes.txt").write_text("")
+    assert [capture.name for capture in read_manifest(tmp_path)] == ["a", "b"]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "names no capture"),
+        ('[capture]\npath = "a"\n', "two brackets"),
+        ('[[capture]]\nname = "a"\n', "path is missing"),
+        ('[[capture]]\npath = "a"\npth = "b"\n', "did you mean"),
+        ('[[capture]]\npath = "a"\n[[capture]]\npath = "b/A"\n', "two captures are called A"),
+        ('[[capture]]\npath = "a"\nname = "../a"\n', "cannot be one"),
+        ('[[capture]]\npath = "status"\n', "choose another name"),
+        ('[[capture]]\npath = "a"\noptions.mapping.overlp = 2\n', "did you mean mapping.overlap"),
+        ('[[capture]]\npath = "a"\noptions.seed = -1\n', "seed must be"),
+        ('[[capture]]\npath = "a"\noptions = 3\n', "table of options"),
+        ('[[capture]]\npath = "a"\nconfig = "none.toml"\n', "none.toml: cannot be read"),
+        ("[[capture]\n", "not valid TOML"),
+    ],
+)
+def test_a_wrong_manifest_is_named_before_any_work(capsys, tmp_path, text, words):
+    (tmp_path / "m.toml").write_text(text)
+    with pytest.raises(SystemExit) as stopped:
+        main(["batch", str(tmp_path / "m.toml"), str(tmp_path / "out")])
+    assert stopped.value.code == 2
+    assert words in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_flags_and_a_configuration_reach_every_capture(tmp_path):
+    (tmp_path / "c.toml").write_text("seed = 4\n[mapping]\noverlap = 3\n")
+    command = parse(["batch", "m", "out", "--config", str(tmp_path / "c.toml"), "--seed", "5", "--workers", "2"])
+    assert (command.options.seed, command.options.mapping.overlap, command.workers) == (5, 3, 2)
+
+
+@pytest.mark.parametrize(
+    "flags", [["--workers", "0"], ["--attempts", "0"], ["--workers", "2", "--scheduler", "tcp://nowhere:1"]]
+)
+def test_impossible_values_are_refused(capsys, tmp_path, flags):
+    with pytest.raises(SystemExit) as stopped:
+        main(["batch", str(tmp_path), str(tmp_path / "out"), *flags])
+    assert stopped.value.code == 2
+
+
+def test_workers_share_the_processors(monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(8)))
+    monkeypatch.setattr("colmap_inertial.batch.pools.available_memory", lambda: 64 * 2**30)
+    assert shares_of_this_machine(3) == [[0, 3, 6], [1, 4, 7], [2, 5]]
+    assert shares_of_this_machine(100) == [[i] for i in range(8)]
+    assert len(shares_of_this_machine(100, 2)) == 2
+    assert shares_of_this_machine(100, 10)[8:] == [[0], [1]]
+    monkeypatch.setattr("colmap_inertial.batch.pools.available_memory", lambda: 7 * 2**30)
+    assert shares_of_this_machine(100) == [[0], [1]]
+    monkeypatch.setattr("colmap_inertial.batch.pools.available_memory", lambda: 0)
+    assert shares_of_this_machine(100) == [[0]]
+
+
+def test_memory_is_that_of_this_machine():
+    assert 2**20 < available_memory() < 2**46
+
+
+def test_one_broken_capture_does_not_stop_the_rest_and_finished_ones_are_not_run_again(
+    captures, manifest, tmp_path, capsys
+):
+    _, alone = captures
+    out, seen = tmp_path / "out", []
+    result = run_batch(manifest, out, TINY, watch=seen.append)
+    assert [(c.name, c.state, c.exit_code) for c in result.captures] == [
+        ("hall", "done", 0),
+        ("broken", "failed", 2),
+        ("yard", "done", 0),
+    ]
+    assert result.exit_code() == 1
+    assert "gyro.csv" in result.captures[1].error
+    assert {status.stage for status in seen} & {"features", "matches", "mapping"}
+    for name, expected in alone.items():
+        assert model_bytes(out / name) == expected
+    rows = table(out)
+    assert rows["hall"]["verdict"] == "trusted"
+    assert float(rows["hall"]["ci95_low"]) < float(rows["hall"]["metres_per_unit"]) < float(rows["hall"]["ci95_high"])
+    assert (rows["broken"]["state"], rows["broken"]["exit_code"]) == ("failed", "2")
+    stored = json.loads((out / "summary.json").read_text())
+    assert (stored["done"], stored["failed"], stored["interrupted"]) == (2, 1, 0)
+    assert read_status(out / "status" / "hall.json") == result.captures[0]
+    assert not (out / "status" / "run").exists()
+
+    # again: the broken one, repaired, and nothing else
+    before = {name: (out / name / "result.json").stat().st_mtime_ns for name in alone}
+    (manifest.parent / "broken" / "gyro.csv").write_bytes((captures[0]["hall"] / "gyro.csv").read_bytes())
+    again = run_batch(manifest, out, TINY)
+    assert again.exit_code() == 0
+    assert model_bytes(out / "broken") == alone["hall"]
+    assert {name: (out / name / "result.json").stat().st_mtime_ns for name in alone} == before
+
+    # a result of other options is not this capture's result
+    other = run_batch(manifest, out, dataclasses.replace(TINY, world="y-down"))
+    assert {c.exit_code for c in other.captures} == {2}
+    assert "another set of options" in other.captures[0].error
+    assert model_bytes(out / "hall") == alone["hall"]
+
+
+def test_a_killed_process_is_started_again_and_at_last_given_up(captures, tmp_path):
+    found, alone = captures
+    hall = BatchCapture(name="hall", path=found["hall"], options=TINY)
+    killed: list[int] = []
+
+    def kill(times: int, out: Path):
+        def watch(status: CaptureStatus) -> None:
+            if status.state == "running" and status.stage in ("features", "matches") and len(killed) < times:
+                for pid in processes_of(out):
+                    if pid not in killed:
+                        os.kill(pid, signal.SIGKILL)
+                        killed.append(pid)
+
+        return watch
+
+    (end,) = run_batch([hall], tmp_path / "once", watch=kill(1, tmp_path / "once")).captures
+    assert (end.state, end.attempts) == ("done", 2)
+    assert model_bytes(tmp_path / "once" / "hall") == alone["hall"]
+    killed.clear()
+    (end,) = run_batch([hall], tmp_path / "ever", attempts=1, watch=kill(1, tmp_path / "ever")).captures
+    assert (end.state, end.exit_code) == ("failed", 1)
+    assert "killed 1 times" in end.error
+
+
+def test_ctrl_c_stops_every_process_and_the_batch_continues_afterwards(captures, manifest, tmp_path):
+    _, alone = captures
+    (manifest.parent / "options.toml").write_text(
+        "deterministic = true\n[mapping]\nmax_num_features = 600\nfirst_octave = 0\nmax_image_size = 320\n"
+    )
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "colmap_inertial", "batch", manifest, out, "--config", tmp_path / "options.toml"]
+    batch = subprocess.Popen(list(map(str, command)), stderr=subprocess.PIPE, text=True)
+    eventually(lambda: processes_of(out) and list((out / "hall").glob("frames.json")))
+    with pytest.raises(OutputExistsError, match="another batch is at work"):
+        run_batch(manifest, out, TINY)
+    batch.send_signal(signal.SIGINT)
+    _, said = batch.communicate(timeout=30)
+    assert batch.returncode == 130
+    assert "it continues" in said
+    assert processes_of(out) == []
+    assert table(out)["hall"]["state"] == "interrupted"
+    assert run_batch(manifest, out, TINY).captures[0].state == "done"
+    assert model_bytes(out / "hall") == alone["hall"]
+
+
+def test_processes_end_with_a_batch_that_is_killed(captures, manifest, tmp_path):
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "colmap_inertial", "batch", str(manifest), str(out)]
+    batch = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+    eventually(lambda: processes_of(out))
+    batch.kill()
+    batch.wait()
+    eventually(lambda: not processes_of(out), 10)
+
+
+def test_a_folder_of_something_else_is_left_alone(manifest, tmp_path):
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "a.jpg").write_bytes(b"precious")
+    with pytest.raises(OutputExistsError, match="no batch's folder"):
+        run_batch(manifest, tmp_path / "photos")
+    assert [path.name for path in (tmp_path / "photos").iterdir()] == ["a.jpg"]
+
+
+def test_dense_captures_want_a_gpu():
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Dense(ReconstructOptions):
+        dense: bool = True
+
+    assert needs_gpu(Dense())
+    assert not needs_gpu(ReconstructOptions())
+
+
+def test_without_dask_the_extra_is_named(monkeypatch, manifest, tmp_path):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(MissingExtraError, match=r"colmap-inertial\[cluster\]"):
+        run_batch(manifest, tmp_path / "out", scheduler="tcp://127.0.0.1:1")
+
+
+def dask(*args: object) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-m", "dask", *map(str, args)]
+    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
+
+
+@pytest.fixture
+def cluster(tmp_path):
+    """A Dask scheduler and two workers of one thread each: (address, worker processes)."""
+    pytest.importorskip("distributed", reason="dask[distributed] is not installed")
+    described = tmp_path / "scheduler.json"
+    running = [dask("scheduler", "--host", "127.0.0.1", "--port", 0, "--no-dashboard", "--scheduler-file", described)]
+    eventually(lambda: described.is_file() and described.read_text().endswith("}"))
+    address = json.loads(described.read_text())["address"]
+    for name in ("one", "two"):
+        flags = ("--nthreads", 1, "--no-nanny", "--no-dashboard", "--name", name, "--local-directory", tmp_path / name)
+        running.append(dask("worker", address, *flags))
+    yield address, running[1:]
+    for process in running:
+        process.kill()
+        process.wait()
+
+
+@pytest.mark.slow
+def test_a_cluster_loses_a_worker_and_no_capture(captures, cluster, tmp_path):
+    found, alone = captures
+    address, workers = cluster
+    entries = [
+        BatchCapture(name=f"{i:02}", path=found["hall" if i % 2 else "yard"], options=TINY) for i in range(1, 13)
+    ]
+    broken = tiny_capture(tmp_path / "broken")
+    sorted((broken / "frames").iterdir())[5].write_bytes(b"no picture")
+    entries[4] = BatchCapture(name="05", path=broken, options=TINY)
+    done, out = [], tmp_path / "out"
+
+    def watch(status: CaptureStatus) -> None:
+        done.extend([status] * status.finished)
+        if len(done) >= 6 and workers[0].poll() is None and status.state == "running":
+            workers[0].kill()
+            workers[0].wait()
+
+    result = run_batch(entries, out, scheduler=address, watch=watch)
+    assert workers[0].poll() == -signal.SIGKILL
+    assert [c.state for c in result.captures] == ["done" if c.name != "05" else "failed" for c in result.captures]
+    assert sorted(table(out)) == [f"{i:02}" for i in range(1, 13)]
+    (failure,) = [c for c in result.captures if c.state == "failed"]
+    assert failure.exit_code == 2
+    assert sorted((broken / "frames").iterdir())[5].name in failure.error
+    assert result.exit_code() == 1
+    assert max(c.attempts for c in result.captures) <= 2
+    for i in (i for i in range(1, 13) if i != 5):
+        assert model_bytes(out / f"{i:02}") == alone["hall" if i % 2 else "yard"], i
+
+
+def test_a_cluster_stops_when_the_batch_does(captures, cluster, tmp_path):
+    found, _ = captures
+    address, _ = cluster
+    out = tmp_path / "out"
+
+    def watch(status: CaptureStatus) -> None:
+        if status.state == "running" and status.stage:
+            raise KeyboardInterrupt
+
+    entries = [BatchCapture(name=name, path=path, options=TINY) for name, path in found.items()]
+    with pytest.raises(KeyboardInterrupt):
+        run_batch(entries, out, scheduler=address, watch=watch)
+    eventually(lambda: not processes_of(out), 10)
+    assert {row["state"] for row in table(out).values()} == {"interrupted"}
+
+
+def test_a_scheduler_that_does_not_answer_is_said(monkeypatch, manifest, tmp_path):
+    pytest.importorskip("distributed", reason="dask[distributed] is not installed")
+    with pytest.raises(InertialError, match="no Dask scheduler answers"):
+        run_batch(manifest, tmp_path / "out", scheduler="nonsense://127.0.0.1:1")
+    assert threading.active_count() < 20
+
+
+def test_a_worker_that_does_not_see_the_files_says_so(tmp_path):
+    from colmap_inertial.batch.task import CaptureTask, run_capture
+
+    gone = tmp_path / "gone"
+    task = CaptureTask(
+        name="a", capture=gone, out=gone, config=gone, status=gone, log=gone, run_file=gone, run="", attempts=1
+    )
+    status = run_capture(task)
+    assert status.state == "failed"
+    assert "the same files" in status.error
+
+
+def test_an_unreadable_manifest_is_named(tmp_path):
+    with pytest.raises(FormatError, match="no such file"):
+        read_manifest(tmp_path / "none.toml")
