@@ -15,7 +15,7 @@ from tyro.conf import Positional, arg, subcommand
 
 from colmap_inertial import __version__
 from colmap_inertial.errors import InertialError
-from colmap_inertial.options import ReconstructOptions, ScaleOptions, ValidateOptions, WorldAxes
+from colmap_inertial.options import ProjectOptions, ReconstructOptions, ScaleOptions, ValidateOptions, WorldAxes
 
 DESCRIPTION = """Metric, gravity-aligned COLMAP models from the gyroscope and accelerometer that filmed along.
 
@@ -27,16 +27,20 @@ Exit codes: 0 done, 1 a check failed, 2 bad input, 3 not observable (scale refus
 class Reconstruct:
     """Turn images or video with an IMU recording into a COLMAP model in metres, gravity along an axis.
 
-    Writes OUT/sparse (COLMAP's own model), OUT/sparse_metric (the same in metres), OUT/trajectory.tum, OUT/result.json.
-    Started again after an interruption, it continues with the last finished stage.
+    Writes OUT/sparse (COLMAP's own model), OUT/sparse_metric (the same in metres), OUT/trajectory.tum, OUT/result.json;
+    with --dense also OUT/dense_metric. Started again after an interruption, it continues with the last finished stage.
+
+    CAPTURE may be an existing COLMAP project: give --imu, and when its images were taken. Nothing is mapped again, and
+    OUT/project_metric is all of the project in metres.
 
     Example: colmap-inertial reconstruct my_capture/capture.toml out
     """
 
     capture: Positional[Path]
-    """A capture.toml, a folder that holds one, or an EuRoC/ASL dataset."""
+    """A capture.toml, a folder that holds one, an EuRoC/ASL dataset, or a COLMAP project."""
     out: Positional[Path]
     """A new folder for everything that is made."""
+    project: Annotated[ProjectOptions, arg(name="")] = dataclasses.field(default_factory=ProjectOptions)
     options: Annotated[ReconstructOptions, arg(name="")] = dataclasses.field(default_factory=ReconstructOptions)
     config: Path | None = None
     """TOML file with options, as OUT/config.toml of an earlier run; flags given here go before it."""
@@ -44,10 +48,14 @@ class Reconstruct:
     def run(self) -> int:
         """Run the command; returns the exit code."""
         from colmap_inertial.pipeline import reconstruct
+        from colmap_inertial.pipeline.existing import is_project, reconstruct_project
         from colmap_inertial.pipeline.terminal import live_progress, show_result
 
         with live_progress() as progress:
-            result = reconstruct(self.capture, self.out, self.options, progress=progress)
+            if self.project != ProjectOptions() or is_project(self.capture):
+                result = reconstruct_project(self.capture, self.out, self.project, self.options, progress=progress)
+            else:
+                result = reconstruct(self.capture, self.out, self.options, progress=progress)
         show_result(result)
         return result.exit_code()
 

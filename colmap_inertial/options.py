@@ -91,6 +91,50 @@ class ValidateOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
+class DenseOptions:
+    """How the dense reconstruction is made."""
+
+    max_image_size: int | None = None
+    """Longer side in pixels of the undistorted images and their depth maps (default: as the images are)."""
+    mesh: Literal["poisson", "none"] = "poisson"
+    """Surface of the fused points."""
+
+    def __post_init__(self) -> None:
+        if self.max_image_size is not None and self.max_image_size < 64:
+            raise ValueError(f"dense_options.max_image_size must be at least 64, not {self.max_image_size}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProjectOptions:
+    """An existing COLMAP project in place of a capture: the recording that ran along, and when images were taken."""
+
+    imu: Path | None = None
+    """Project: IMU recording, a file or folder of a known format, or a capture.toml."""
+    frame_times: Path | None = None
+    """Project: CSV with columns name,t_s, or a capture.toml; with --video, the time of each of its frames."""
+    name_times: str | None = None
+    """Project: times are in the file names: the unit (s, ms, us, ns) of the longest number, its place as in
+    cam0_{ns}_*, or a date as in PXL_%Y%m%d_%H%M%S%f."""
+    exif_times: bool = False
+    """Project: times are in the images' EXIF, with fractions of a second."""
+    video: Path | None = None
+    """Project: images are frames of this video, and are found in it by their content."""
+    images: Path | None = None
+    """Project: folder of the project's images (default: images in the project)."""
+    keep: tuple[str, ...] = ()
+    """Project: patterns of paths in it that are copied as they are, such as "old/*"."""
+    link: bool = False
+    """Project: hard links for files that do not change; an edit of one then changes the original, too."""
+
+    def __post_init__(self) -> None:
+        ways = (self.frame_times is not None and self.video is None, self.name_times is not None, self.exif_times)
+        if sum((*ways, self.video is not None)) > 1:
+            raise ValueError(
+                "give one of --frame-times, --name-times, --exif-times and --video (--frame-times may go with --video)"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
 class ReconstructOptions:
     """Everything that decides the result of a reconstruction, beside the capture itself."""
 
@@ -105,6 +149,10 @@ class ReconstructOptions:
     """How metres come from the IMU."""
     world: WorldAxes = "z-up"
     """Axes of the metric model: z away from the ground, or y towards it, as COLMAP's own cameras have it."""
+    dense: bool = False
+    """Go on to depth maps (needs CUDA), a fused point cloud and a mesh in metres."""
+    dense_options: DenseOptions = field(default_factory=DenseOptions)
+    """How the dense reconstruction is made."""
     deterministic: bool = False
     """Fixed seed and one thread: the same input gives the same model, bit for bit. Slower."""
     seed: int = 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -78,7 +79,7 @@ def stamps_of_csv(path: Path, time_unit: str | None = None) -> FrameStamps:
     t_ns = _time_column(table, time_unit)
     exposure_column = next((i for i, name in enumerate(flat) if name in _EXPOSURE_COLUMNS), None)
     exposure_s = None if exposure_column is None else _exposures(table, exposure_column)
-    return _in_order(path, table.text(name_column), t_ns, table.line_numbers, exposure_s)
+    return stamps_in_order(path, table.text(name_column), t_ns, table.line_numbers, exposure_s)
 
 
 def stamps_of_names(folder: Path, names: Sequence[str], unit: str) -> FrameStamps:
@@ -104,7 +105,53 @@ def stamps_of_names(folder: Path, names: Sequence[str], unit: str) -> FrameStamp
             what = "no number" if not found else f"several numbers of one length ({', '.join(longest)})"
             raise TimingError(f'{folder / name}: the name holds {what}; times = "name" cannot time it: {_HOW}')
         tokens.append(longest[0])
-    return _in_order(folder, list(names), stamps_ns(folder, tokens, unit), None)
+    return stamps_in_order(folder, list(names), stamps_ns(folder, tokens, unit))
+
+
+def stamps_of_pattern(folder: Path, names: Sequence[str], pattern: str) -> FrameStamps:
+    """Take each frame's time from its file name, as a pattern describes it.
+
+    Parameters
+    ----------
+    names
+        File names; the folder and the ending do not count.
+    pattern
+        A unit (s, ms, us, ns): the longest number is the time. Or a name with the unit in braces where the number
+        stands and ``*`` where anything may, as ``cam0_{ns}_*``. Or a date as ``strptime`` has it, with a fraction of
+        the second, as ``PXL_%Y%m%d_%H%M%S%f``.
+
+    Raises
+    ------
+    TimingError
+        For a pattern that is none of these, and a name that does not fit it.
+    """
+    if pattern in TIME_UNITS_NS:
+        return stamps_of_names(folder, names, pattern)
+    units = re.findall(r"\{(\w+)\}", pattern)
+    if len(units) == 1 and units[0] in TIME_UNITS_NS and "%" not in pattern:
+        before, after = (".*".join(map(re.escape, part.split("*"))) for part in pattern.split(f"{{{units[0]}}}"))
+        tokens = []
+        for name in names:
+            found = re.fullmatch(rf"{before}(\d+(?:\.\d+)?){after}", Path(name).stem)
+            if found is None:
+                raise TimingError(f"{folder / name}: the name does not fit {pattern!r} (without folder and ending)")
+            tokens.append(found[1])
+        return stamps_in_order(folder, list(names), stamps_ns(folder, tokens, units[0]))
+    if "%f" in pattern and ("%d" in pattern or "%j" in pattern):
+        return stamps_in_order(folder, list(names), np.array([_date_ns(folder / n, pattern) for n in names]))
+    raise TimingError(
+        f"{pattern!r} does not say how names hold times: give a unit ({', '.join(TIME_UNITS_NS)}), the number's place "
+        "as in 'cam0_{ns}_*', or a date with a fraction of the second as in 'PXL_%Y%m%d_%H%M%S%f'"
+    )
+
+
+def _date_ns(path: Path, pattern: str) -> int:
+    try:
+        date = datetime.datetime.strptime(path.stem, pattern)
+    except ValueError:
+        raise TimingError(f"{path}: the name does not fit {pattern!r} (without folder and ending)") from None
+    since = date.replace(tzinfo=datetime.UTC) - datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
+    return since // datetime.timedelta(microseconds=1) * 1000
 
 
 def stamps_of_log(path: Path, time_unit: str | None = None) -> NDArray[np.int64]:
@@ -158,13 +205,14 @@ def _exposures(table: Table, column: int) -> Array:
     return values
 
 
-def _in_order(
+def stamps_in_order(
     path: Path,
     names: list[str],
     t_ns: NDArray[np.int64],
-    line_numbers: NDArray[np.int64] | None,
+    line_numbers: NDArray[np.int64] | None = None,
     exposure_s: Array | None = None,
 ) -> FrameStamps:
+    """Stamps sorted by time; a name or time that comes twice is an error of ``path``."""
     seen: dict[str, int] = {}
     for i, name in enumerate(names):
         line = None if line_numbers is None else int(line_numbers[i])

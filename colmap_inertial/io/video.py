@@ -96,6 +96,21 @@ def decode_video(
     )
 
 
+def decode_grey(path: Path) -> Iterator[tuple[int, int, NDArray[np.uint8]]]:
+    """Every frame's presentation stamp in nanoseconds, the turn that the container wants (degrees), and (H, W) grey.
+
+    The grey is in the sensor's orientation, as :func:`decode_video` has it.
+    """
+    container, stream = _open(path)
+    stream.thread_type = "AUTO"
+    with container:
+        for frame in _guarded(path, container.decode(stream)):
+            if frame.pts is not None and frame.time_base is not None:
+                t_ns = _ns(frame.pts, frame.time_base.numerator, frame.time_base.denominator)
+                turn = int(getattr(frame, "rotation", 0))  # PyAV 13 does not tell it
+                yield t_ns, turn, np.asarray(frame.to_ndarray(format="gray"), dtype=np.uint8)
+
+
 def _ns(pts: int, numerator: int, denominator: int) -> int:
     """Nanoseconds of a stamp, rounded once, in whole numbers."""
     return (2 * pts * numerator * 1_000_000_000 + denominator) // (2 * denominator)

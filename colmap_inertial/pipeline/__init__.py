@@ -32,6 +32,7 @@ from colmap_inertial.pipeline.colmap import (
     write_gravity_priors,
 )
 from colmap_inertial.pipeline.config import config_as_toml
+from colmap_inertial.pipeline.dense import run_dense
 from colmap_inertial.pipeline.frames import FrameRecord, FrameStage, read_frame_records, require_frames, write_frames
 from colmap_inertial.pipeline.imaging import (
     ImagingPlan,
@@ -163,8 +164,11 @@ def reconstruct(
             else list(model_stages)
         )
         models = run_models(workspace, timing, imu, stages, runner, progress)
+        images = workspace.images_rectified if workspace.images_rectified.is_dir() else workspace.images
         if loaded.target is not None:
-            models = tuple(_validated(workspace, model, parse_target(loaded.target), progress) for model in models)
+            models = validated(workspace, models, parse_target(loaded.target), images, progress)
+        if options.dense:
+            models = with_dense(runner, workspace, models, images, options, progress)
         result = ReconstructResult(
             workspace=workspace, models=models, frames=records, imaging=plan, seconds=runner.seconds
         )
@@ -368,14 +372,18 @@ def run_models(
     stages: Sequence[ModelStage],
     runner: StageRunner,
     progress: Progress,
+    found: Mapping[int, Path] | None = None,
 ) -> tuple[ModelResult, ...]:
-    """Every sub-model through the model stages, then to its final place; run again after an interruption."""
+    """Every sub-model through the model stages, then to its final place; run again after an interruption.
+
+    The sub-models are those of ``sparse/``, or ``found`` by number elsewhere.
+    """
     start = time.perf_counter()
     scratch = workspace.stamps / "models"
     for path in (scratch, workspace.sparse_metric, workspace.validation, *workspace.root.glob("trajectory*")):
         remove(path)
     results: list[ModelResult] = []
-    found = find_models(workspace.sparse)
+    found = find_models(workspace.sparse) if found is None else found
     for done, (index, folder) in enumerate(found.items()):
         progress("metric", done, len(found))
         shutil.copytree(folder, scratch / str(index))
@@ -401,25 +409,45 @@ def run_models(
     return tuple(results)
 
 
-def _validated(workspace: Workspace, model: ModelResult, target: Target, progress: Progress) -> ModelResult:
-    """Measure the capture's target in a metric model; a target that cannot be measured does not undo the model."""
-    if model.sparse_metric is None:
-        return model
-    check: Validation | InertialError
-    images = workspace.images_rectified if workspace.images_rectified.is_dir() else workspace.images
-    try:
-        check = validate_model(
-            model.sparse_metric,
-            images,
-            target,
-            progress=lambda done, total: progress("validation", done, total),
-        )
-        write_pictures(check, images, workspace.validation / str(model.index))
-    except (TargetNotFoundError, NotObservableError) as error:
-        check = error
-    found = check if isinstance(check, InertialError) else f"scale error {check.scale_error_pct:+.3f} %"
-    log.info("model %d: %s against %s", model.index, found, target.spec)
-    return dataclasses.replace(model, validation=check)
+def validated(
+    workspace: Workspace, models: Sequence[ModelResult], target: Target, images: Path, progress: Progress
+) -> tuple[ModelResult, ...]:
+    """Measure the target in the metric models; one that cannot be measured does not undo its model."""
+    checked = []
+    for model in models:
+        if model.sparse_metric is None:
+            checked.append(model)
+            continue
+        check: Validation | InertialError
+        try:
+            check = validate_model(
+                model.sparse_metric,
+                images,
+                target,
+                progress=lambda done, total: progress("validation", done, total),
+            )
+            write_pictures(check, images, workspace.validation / str(model.index))
+        except (TargetNotFoundError, NotObservableError) as error:
+            check = error
+        said = check if isinstance(check, InertialError) else f"scale error {check.scale_error_pct:+.3f} %"
+        log.info("model %d: %s against %s", model.index, said, target.spec)
+        checked.append(dataclasses.replace(model, validation=check))
+    return tuple(checked)
+
+
+def with_dense(
+    runner: StageRunner,
+    workspace: Workspace,
+    models: Sequence[ModelResult],
+    images: Path,
+    options: ReconstructOptions,
+    progress: Progress,
+) -> tuple[ModelResult, ...]:
+    """The models with their dense reconstructions, where they are metric."""
+    metric = [model.index for model in models if model.sparse_metric is not None]
+    threads = 1 if options.deterministic else -1
+    dense = run_dense(runner, workspace, metric, images, options.dense_options, num_threads=threads, progress=progress)
+    return tuple(dataclasses.replace(model, dense=dense.get(model.index)) for model in models)
 
 
 __all__ = [

@@ -11,6 +11,7 @@ from colmap_inertial import __version__
 from colmap_inertial.errors import InertialError, NotObservableError
 from colmap_inertial.geometry import quat_conjugate, quat_log, quat_multiply
 from colmap_inertial.io.capture import Capture
+from colmap_inertial.pipeline.dense import DenseResult
 from colmap_inertial.pipeline.frames import FrameRecord
 from colmap_inertial.pipeline.imaging import ImagingPlan
 from colmap_inertial.pipeline.workspace import Workspace
@@ -30,6 +31,8 @@ class ModelResult:
     trajectory: Path | None = None
     validation: Validation | InertialError | None = None
     """Against the capture's target, where it names one; an error says why the target could not be measured."""
+    dense: DenseResult | None = None
+    """Where it was asked for."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -42,6 +45,8 @@ class ReconstructResult:
     seconds: dict[str, float]
     imaging: ImagingPlan = field(default_factory=ImagingPlan)
     """What was done to frames and keypoints beforehand, and why."""
+    project_metric: Path | None = None
+    """The whole project in metres, where an existing one was given and not every scale was refused."""
 
     def exit_code(self) -> int:
         """0; 1 where a validation is outside its tolerance; its error's code where the target could not be measured.
@@ -50,6 +55,8 @@ class ReconstructResult:
         ------
         NotObservableError
             When every model's scale was refused.
+        InertialError
+            When a dense reconstruction was asked for and waits for depth maps.
         """
         if all(model.sparse_metric is None for model in self.models):
             reasons = {model.index: "; ".join(model.scale.reasons) for model in self.models}
@@ -59,6 +66,9 @@ class ReconstructResult:
                 if len(reasons) == 1
                 else "; ".join(f"model {i}: {text}" for i, text in reasons.items()),
             )
+        waiting = [model.dense.waiting for model in self.models if model.dense is not None and model.dense.waiting]
+        if waiting:
+            raise InertialError("; ".join(waiting))
         checked = [model.validation for model in self.models if model.validation is not None]
         failures = [check.exit_code for check in checked if isinstance(check, InertialError)]
         outside = any(not check.within_tolerance for check in checked if isinstance(check, Validation))
@@ -110,7 +120,9 @@ def result_as_json(result: ReconstructResult, capture: Capture) -> dict[str, obj
     root, plan = result.workspace.root, result.imaging
 
     def relative(path: Path | None) -> str | None:
-        return None if path is None else str(path.relative_to(root))
+        if path is None or not path.is_relative_to(root):
+            return None if path is None else str(path)
+        return str(path.relative_to(root))
 
     return {
         "versions": {"colmap_inertial": __version__, "pycolmap": pycolmap.__version__},
@@ -127,9 +139,12 @@ def result_as_json(result: ReconstructResult, capture: Capture) -> dict[str, obj
                 if plan.view is None
                 else _change(plan.view.calibration, model.scale.calibration),
                 "validation": _validation_as_json(model.validation),
+                "dense": model.dense and model.dense.as_json(root),
             }
             for model in result.models
         ],
+        "project_metric": relative(result.project_metric),
+        "waiting": any(model.dense is not None and bool(model.dense.waiting) for model in result.models),
         "imaging": imaging_as_json(plan),
         "frames": [frame_as_json(record, plan) for record in result.frames],
         "seconds": result.seconds,

@@ -19,6 +19,7 @@ from colmap_inertial.validate import Validation, validation_table
 
 _STAGES = {
     "rendering": "Rendering",
+    "video": "Video frames",
     "motion": "Camera motion",
     "calibration": "Calibration",
     "blur": "Blur",
@@ -30,6 +31,7 @@ _STAGES = {
     "metric": "Metric scale",
     "validation": "Validation",
     "apply": "Files",
+    "dense": "Dense",
 }
 _COLOUR = {"trusted": "green", "weak": "yellow", "refused": "red"}
 
@@ -170,12 +172,13 @@ def show_result(result: ReconstructResult) -> None:
     """Print the end of a reconstruction on one screen."""
     frames = result.frames
     used = sum(record.action != "dropped" for record in frames)
+    registered = f" of {used} registered ({len(frames)} frames)" if frames else ""
     for model in result.models:
         summary = model.summary
         lines = [
-            ("Images", f"{summary['registered_images']} of {used} registered ({len(frames)} frames)"),
+            ("Images", f"{summary['registered_images']}{registered}"),
             ("Points", f"{summary['points']}, mean reprojection error {summary['mean_reprojection_error_px']:.2f} px"),
-            *imaging_lines(frames, result.imaging),
+            *(imaging_lines(frames, result.imaging) if frames else []),
             *scale_lines(model.scale),
         ]
         if isinstance(model.validation, Validation) and model.validation.ci95_pct is not None:
@@ -184,7 +187,13 @@ def show_result(result: ReconstructResult) -> None:
             lines.append(("Target", f"{model.validation.target.spec}: scale error {error}"))
         elif isinstance(model.validation, InertialError):
             lines.append(("Target", str(model.validation)))
-        written = [path for path in (model.sparse_metric, model.trajectory) if path is not None]
+        dense = model.dense
+        made = [] if dense is None else [dense.fused, dense.mesh]
+        if dense is not None and not dense.waiting:
+            maps = f"{dense.depth_maps} depth maps of {dense.images} images"
+            lines.append(("Dense", f"{maps}, {dense.points} points, {dense.faces} faces"))
+        paths = (model.sparse_metric, model.trajectory, *made, result.project_metric)
+        written = [path for path in paths if path is not None]
         lines += [
             ("Written" if i == 0 else "", str(path)) for i, path in enumerate([*written, result.workspace.result])
         ]

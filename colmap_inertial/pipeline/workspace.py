@@ -76,6 +76,16 @@ class Workspace:
         return self.root / "sparse_metric"
 
     @property
+    def project_metric(self) -> Path:
+        """The whole project in metres, where an existing one was given."""
+        return self.root / "project_metric"
+
+    @property
+    def dense_metric(self) -> Path:
+        """Dense reconstructions of the metric models."""
+        return self.root / "dense_metric"
+
+    @property
     def validation(self) -> Path:
         """Pictures of the target in the frames."""
         return self.root / "validation"
@@ -105,7 +115,7 @@ class Workspace:
         return self.root / ("trajectory.tum" if first else f"trajectory_{index}.tum")
 
     def open(self, capture: Path) -> None:
-        """Create the folder, or take up an unfinished run of the same capture.
+        """Create the folder, or take up a run of the same capture that is unfinished or waits for depth maps.
 
         Raises
         ------
@@ -113,7 +123,7 @@ class Workspace:
             When the folder holds a finished result, another capture's run, or something that is not ours.
         """
         owner = self.stamps / "capture.json"
-        if self.result.exists():
+        if self.result.exists() and not (owner.is_file() and read_json(self.result).get("waiting")):
             raise OutputExistsError(f"{self.root} holds a finished result; choose another folder or remove it")
         if self.root.exists() and not self.root.is_dir():
             raise OutputExistsError(f"{self.root} is a file; choose another output folder")

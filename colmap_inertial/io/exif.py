@@ -1,0 +1,143 @@
+"""When pictures were taken, by their own EXIF: only where it tells more than whole seconds."""
+
+from __future__ import annotations
+
+import datetime
+import re
+import struct
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from colmap_inertial.errors import FormatError, TimingError
+from colmap_inertial.io.frame_times import FrameStamps, stamps_in_order
+
+_PNG = b"\x89PNG\r\n\x1a\n"
+_EXIF_HEADER = b"Exif\0\0"
+#: EXIF stands at the beginning of a file.
+_HEAD_BYTES = 256 * 1024
+#: Tags of EXIF (CIPA DC-008): the directory, and DateTimeOriginal, OffsetTimeOriginal, SubSecTimeOriginal in it.
+_DIRECTORY, _DATE, _OFFSET, _FRACTION = 0x8769, 0x9003, 0x9011, 0x9291
+_ASCII = 2
+_EPOCH = datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
+
+
+def stamps_of_exif(folder: Path, names: Sequence[str]) -> tuple[FrameStamps, int]:
+    """Take each picture's time from DateTimeOriginal and SubSecTimeOriginal of its EXIF.
+
+    Parameters
+    ----------
+    folder, names
+        The pictures: JPEG, PNG or TIFF.
+
+    Returns
+    -------
+    stamps
+        Universal time where the EXIF states its offset, else the camera's local time.
+    digits
+        Of the fraction of a second, in the picture with the fewest.
+
+    Raises
+    ------
+    FormatError
+        For a picture that is missing, or whose EXIF is.
+    TimingError
+        For a time to whole or tenths of a second, which is too coarse to join with an IMU, and where only some pictures
+        state their time's offset.
+    """
+    t_ns, digits, offsets = [], [], []
+    for name in names:
+        path = folder / name
+        texts = _texts(path)
+        fraction = texts.get(_FRACTION, "").strip()
+        if not re.fullmatch(r"\d{2,9}", fraction):
+            tells = "tenths of a second" if fraction.isdigit() else "whole seconds"
+            raise TimingError(
+                f"{path}: its EXIF gives the time to {tells} only (SubSecTimeOriginal, two digits or more, is "
+                "needed); a scale needs the times of its images to some milliseconds: give --frame-times, or --video "
+                "where they were taken from one"
+            )
+        try:
+            local = datetime.datetime.strptime(texts.get(_DATE, "").strip(), "%Y:%m:%d %H:%M:%S")
+        except ValueError:
+            raise FormatError(path, "its EXIF has no DateTimeOriginal; give --frame-times") from None
+        seconds = (local.replace(tzinfo=datetime.UTC) - _EPOCH) // datetime.timedelta(seconds=1)
+        offset = re.fullmatch(r"([+-])(\d\d):(\d\d)", texts.get(_OFFSET, "").strip())
+        if offset is not None:
+            sign, hours, minutes = offset.groups()
+            seconds -= (1 if sign == "+" else -1) * (3600 * int(hours) + 60 * int(minutes))
+        offsets.append(offset is not None)
+        t_ns.append(seconds * 1_000_000_000 + int(fraction.ljust(9, "0")))
+        digits.append(len(fraction))
+    if len(set(offsets)) > 1:
+        raise TimingError(
+            f"{folder / names[offsets.index(False)]}: its EXIF does not state the offset from universal time, that of "
+            f"{names[offsets.index(True)]} does: their times cannot be compared; give --frame-times"
+        )
+    return stamps_in_order(folder, list(names), np.array(t_ns, dtype=np.int64)), min(digits)
+
+
+def _texts(path: Path) -> dict[int, str]:
+    """The text entries of a picture's EXIF directory."""
+    try:
+        with open(path, "rb") as file:
+            head = file.read(_HEAD_BYTES)
+    except FileNotFoundError:
+        raise FormatError(path, "no such picture") from None
+    except OSError as error:
+        raise FormatError(path, f"cannot be read: {error.strerror or error}") from None
+    tiff = _tiff(head)
+    order = {b"II": "<", b"MM": ">"}.get(b"" if tiff is None else tiff[:2])
+    if tiff is None or order is None:
+        raise FormatError(path, "has no EXIF, which is to give its time; give --frame-times")
+    try:
+        first = _entries(tiff, order, struct.unpack_from(order + "I", tiff, 4)[0])
+        directory = _entries(tiff, order, struct.unpack_from(order + "I", first[_DIRECTORY][2])[0])
+        return {tag: _text(tiff, order, *entry) for tag, entry in directory.items() if entry[0] == _ASCII}
+    except (struct.error, KeyError):
+        raise FormatError(path, "its EXIF is damaged or empty; give --frame-times") from None
+
+
+def _tiff(head: bytes) -> bytes | None:
+    """The TIFF structure that EXIF is, in the head of a file."""
+    if head.startswith(b"\xff\xd8"):
+        return next((part[6:] for part in _jpeg_exif(head) if part.startswith(_EXIF_HEADER)), None)
+    if head.startswith(_PNG):
+        return next(_png_exif(head), None)
+    return head if head[:4] in (b"II*\0", b"MM\0*") else None
+
+
+def _jpeg_exif(data: bytes) -> Iterator[bytes]:
+    at = 2
+    while at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xDA:
+        size = struct.unpack_from(">H", data, at + 2)[0]
+        if data[at + 1] == 0xE1:
+            yield data[at + 4 : at + 2 + size]
+        at += 2 + size
+
+
+def _png_exif(data: bytes) -> Iterator[bytes]:
+    at = len(_PNG)
+    while at + 12 <= len(data):
+        size = struct.unpack_from(">I", data, at)[0]
+        if data[at + 4 : at + 8] == b"eXIf":
+            yield data[at + 8 : at + 8 + size]
+        at += 12 + size
+
+
+def _entries(tiff: bytes, order: str, at: int) -> dict[int, tuple[int, int, bytes]]:
+    """Type, count and value field of a directory's entries, by tag."""
+    (count,) = struct.unpack_from(order + "H", tiff, at)
+    found = {}
+    for i in range(count):
+        tag, kind, n, value = struct.unpack_from(order + "HHI4s", tiff, at + 2 + 12 * i)
+        found[tag] = (kind, n, value)
+    return found
+
+
+def _text(tiff: bytes, order: str, kind: int, count: int, value: bytes) -> str:
+    if count > 4:
+        at = struct.unpack(order + "I", value)[0]
+        value = tiff[at : at + count]
+    return value[:count].split(b"\0")[0].decode("ascii", errors="replace")
