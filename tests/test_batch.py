@@ -56,7 +56,7 @@ def eventually(condition, seconds: float = 60.0):
 def captures(tmp_path_factory):
     """Two captures of one scene, and what ``reconstruct`` makes of each by itself."""
     root = tmp_path_factory.mktemp("captures")
-    found = {name: tiny_capture(root / name, frames=frames) for name, frames in (("hall", 14), ("yard", 15))}
+    found = {name: tiny_capture(root / name, frames=frames) for name, frames in (("hall", 12), ("yard", 13))}
     for name, folder in found.items():
         reconstruct(folder, root / "alone" / name, TINY)
     return found, {name: model_bytes(root / "alone" / name) for name in found}
@@ -89,6 +89,23 @@ def test_a_manifest_gives_each_capture_its_options(tmp_path):
     assert roof.name == "roof"
 
 
+def test_an_existing_project_names_its_recording_in_the_manifest(project, tmp_path):
+    (tmp_path / "m.toml").write_text(
+        f'[[capture]]\nname = "desk"\npath = "{project.model.parents[1]}"\n'
+        'project.imu = "imu"\nproject.frame_times = "frames.csv"\nproject.keep = ["old/*"]\n'
+    )
+    (tmp_path / "imu").symlink_to(project.imu)
+    (tmp_path / "frames.csv").symlink_to(project.frame_times)
+    (capture,) = read_manifest(tmp_path / "m.toml")
+    assert capture.project.keep == ("old/*",)
+    for _ in range(2):
+        (end,) = run_batch(tmp_path / "m.toml", tmp_path / "out").captures
+        assert (end.state, end.models[0]["verdict"]) == ("done", "trusted"), end.error
+    assert (tmp_path / "out" / "desk" / "project_metric").is_dir()
+    other = dataclasses.replace(capture, project=dataclasses.replace(capture.project, link=True))
+    assert "another set of options" in run_batch([other], tmp_path / "out").captures[0].error
+
+
 def test_a_folder_of_captures_is_a_manifest(tmp_path):
     for name in ("b", "a", ".hidden"):
         (tmp_path / name).mkdir()
@@ -108,7 +125,7 @@ def test_a_folder_of_captures_is_a_manifest(tmp_path):
         ('[[capture]]\npath = "status"\n', "choose another name"),
         ('[[capture]]\npath = "a"\noptions.mapping.overlp = 2\n', "did you mean mapping.overlap"),
         ('[[capture]]\npath = "a"\noptions.seed = -1\n', "seed must be"),
-        ('[[capture]]\npath = "a"\noptions = 3\n', "table of options"),
+        ('[[capture]]\npath = "a"\noptions = 3\n', "is a table"),
         ('[[capture]]\npath = "a"\nconfig = "none.toml"\n', "none.toml: cannot be read"),
         ("[[capture]\n", "not valid TOML"),
     ],
@@ -258,11 +275,7 @@ def test_a_folder_of_something_else_is_left_alone(manifest, tmp_path):
 
 
 def test_dense_captures_want_a_gpu():
-    @dataclasses.dataclass(frozen=True, kw_only=True)
-    class Dense(ReconstructOptions):
-        dense: bool = True
-
-    assert needs_gpu(Dense())
+    assert needs_gpu(ReconstructOptions(dense=True))
     assert not needs_gpu(ReconstructOptions())
 
 

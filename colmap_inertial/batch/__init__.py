@@ -22,7 +22,15 @@ from pathlib import Path
 
 from colmap_inertial.batch.manifest import BatchCapture, check_unique, read_manifest
 from colmap_inertial.batch.pools import Pending, dask_pool, local_pool, shares_of_this_machine
-from colmap_inertial.batch.task import CaptureStatus, CaptureTask, failed, finished_earlier, read_status, write_status
+from colmap_inertial.batch.task import (
+    CaptureStatus,
+    CaptureTask,
+    Job,
+    failed,
+    finished_earlier,
+    read_status,
+    write_status,
+)
 from colmap_inertial.errors import OutputError, OutputExistsError
 from colmap_inertial.io.files import write_json, write_text
 from colmap_inertial.options import ReconstructOptions
@@ -64,7 +72,7 @@ def unwatched(status: CaptureStatus, /) -> None:
 
 def needs_gpu(options: ReconstructOptions) -> bool:
     """Whether a capture is to have a GPU to itself: where its options ask for dense reconstruction."""
-    return bool(getattr(options, "dense", False))
+    return options.dense
 
 
 def run_batch(
@@ -178,7 +186,7 @@ def _owned(out: Path) -> Iterator[str]:
 def _task(entry: BatchCapture, out: Path, run: str, attempts: int) -> CaptureTask:
     status = out / "status"
     config = status / f"{entry.name}.toml"
-    write_text(config, config_as_toml(entry.options))
+    write_text(config, config_as_toml(Job(options=entry.options, project=entry.project)))
     return CaptureTask(
         name=entry.name,
         capture=entry.path.resolve(),

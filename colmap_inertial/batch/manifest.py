@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from colmap_inertial.errors import FormatError
 from colmap_inertial.io.toml_section import Section, read_toml
-from colmap_inertial.options import ReconstructOptions
+from colmap_inertial.options import ProjectOptions, ReconstructOptions
 from colmap_inertial.pipeline.config import read_values, with_values
 
 #: What the batch itself writes into its output folder.
@@ -27,11 +28,14 @@ class BatchCapture:
         What ``reconstruct`` takes.
     options
         How it is reconstructed.
+    project
+        For an existing COLMAP project: the recording that ran along, and when its images were taken.
     """
 
     name: str
     path: Path
-    options: ReconstructOptions = ReconstructOptions()
+    options: ReconstructOptions = field(default_factory=ReconstructOptions)
+    project: ProjectOptions = field(default_factory=ProjectOptions)
 
     def __post_init__(self) -> None:
         if not self.name.isprintable() or "/" in self.name or self.name.startswith(".") or not self.name.strip():
@@ -57,9 +61,14 @@ def read_manifest(path: Path, options: ReconstructOptions = ReconstructOptions()
             config = "yard.toml"        # options of this capture, as OUT/config.toml has them
             options.world = "y-down"    # and one by one
 
+            [[capture]]
+            path = "old/bridge"         # an existing COLMAP project: with the flags that reconstruct takes for one
+            project.imu = "old/bridge_imu.csv"
+            project.frame_times = "old/bridge_frames.csv"
+
         Or a folder: every folder in it is a capture.
     options
-        Those of captures that state none. What a capture states goes before them, ``options`` before ``config``.
+        Those of all captures; what the manifest states of one goes before them, ``options`` before ``config``.
 
     Raises
     ------
@@ -110,18 +119,23 @@ def _capture(manifest: Path, table: Section, options: ReconstructOptions) -> Bat
     source: Path = table.require("path", table.file("path"))
     name = table.text("name")
     config = table.file("config")
-    values = table.raw("options")
+    values = _table(table, "options")
+    project = with_values(ProjectOptions(), _table(table, "project"), manifest)
     table.finish()
     if config is not None:
         options = with_values(options, read_values(config), config)
-    if values is not None:
-        if not isinstance(values, dict):
-            table.fail("options", 'is a table of options, such as options.world = "y-down"')
-        options = with_values(options, values, manifest)
+    options = with_values(options, values, manifest)
     if name is None:
         resolved = source.resolve()
         name = resolved.parent.name if resolved.name == "capture.toml" else resolved.stem
     try:
-        return BatchCapture(name=name, path=source, options=options)
+        return BatchCapture(name=name, path=source, options=options, project=project)
     except ValueError as error:
         table.fail("name", str(error))
+
+
+def _table(table: Section, key: str) -> dict[str, Any]:
+    values = table.raw(key)
+    if values is not None and not isinstance(values, dict):
+        table.fail(key, f"is a table, such as {key}.name = value")
+    return values or {}

@@ -14,11 +14,12 @@ import traceback
 from pathlib import Path
 from typing import Any
 
-from colmap_inertial.batch.task import CaptureTask, failed, read_status, with_result, write_status
+from colmap_inertial.batch.task import CaptureTask, Job, failed, read_status, with_result, write_status
 from colmap_inertial.errors import InertialError
-from colmap_inertial.options import ReconstructOptions
+from colmap_inertial.options import ProjectOptions
 from colmap_inertial.pipeline import reconstruct
 from colmap_inertial.pipeline.config import read_config
+from colmap_inertial.pipeline.existing import is_project, reconstruct_project
 from colmap_inertial.pipeline.workspace import Workspace
 
 #: The task's paths, which JSON carries as text.
@@ -52,7 +53,11 @@ def main() -> None:
     workspace = Workspace(task.out)
     try:
         _wait_for(workspace)
-        reconstruct(task.capture, task.out, read_config(task.config, ReconstructOptions), progress=progress)
+        job = read_config(task.config, Job)
+        if job.project != ProjectOptions() or is_project(task.capture):
+            reconstruct_project(task.capture, task.out, job.project, job.options, progress=progress)
+        else:
+            reconstruct(task.capture, task.out, job.options, progress=progress)
         end = with_result(status, workspace.result)
     except InertialError as error:
         print(f"error: {error}", file=sys.stderr)

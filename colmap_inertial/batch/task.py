@@ -20,9 +20,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from colmap_inertial.errors import FormatError, OutputError, TargetNotFoundError
+from colmap_inertial.errors import FormatError, InertialError, OutputError, TargetNotFoundError
 from colmap_inertial.io.files import read_json, write_json
-from colmap_inertial.options import ReconstructOptions
+from colmap_inertial.options import ProjectOptions, ReconstructOptions
 from colmap_inertial.pipeline.config import read_config
 from colmap_inertial.pipeline.workspace import Workspace
 
@@ -30,6 +30,22 @@ State = Literal["waiting", "running", "done", "failed", "interrupted"]
 
 #: How often a process at work is looked at.
 _POLL_S = 0.25
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """How a capture is to be reconstructed, as its task's configuration file has it.
+
+    Attributes
+    ----------
+    options
+        As for ``reconstruct``.
+    project
+        For an existing COLMAP project: the recording that ran along, and when its images were taken.
+    """
+
+    options: ReconstructOptions = field(default_factory=ReconstructOptions)
+    project: ProjectOptions = field(default_factory=ProjectOptions)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +59,7 @@ class CaptureTask:
     capture, out
         What ``reconstruct`` takes.
     config
-        Its options, as ``--config`` takes them.
+        A :class:`Job`, as TOML.
     status, log
         Where to write what becomes of it, and what its process says.
     run_file, run
@@ -147,9 +163,13 @@ def finished_earlier(task: CaptureTask) -> CaptureStatus | None:
         return None
     status = CaptureStatus(name=task.name) if known is None else known
     try:
-        made_from = Path(str(read_json(workspace.result).get("capture"))).resolve()
+        result, job = read_json(workspace.result), read_config(task.config, Job)
+        if result.get("waiting"):
+            return None
+        made_from = Path(str(read_json(workspace.stamps / "capture.json").get("capture")))
         other = None if made_from == task.capture or task.capture in made_from.parents else "capture"
-        if read_config(workspace.config, ReconstructOptions) != read_config(task.config, ReconstructOptions):
+        project = result.get("project", _plain(ProjectOptions()))
+        if read_config(workspace.config, ReconstructOptions) != job.options or project != _plain(job.project):
             other = other or "set of options"
         if other is not None:
             text = f"{task.out} holds the result of another {other}; remove it or choose another folder"
@@ -159,12 +179,16 @@ def finished_earlier(task: CaptureTask) -> CaptureStatus | None:
         return failed(status, str(error), error.exit_code)
 
 
+def _plain(project: ProjectOptions) -> object:
+    return json.loads(json.dumps(dataclasses.asdict(project), default=str))
+
+
 def with_result(status: CaptureStatus, result: Path) -> CaptureStatus:
     """The status of a capture whose ``result.json`` is there, by the rules of ``ReconstructResult.exit_code``."""
     values = read_json(result)
     try:
         models = tuple(_model(model) for model in values["models"])
-        frames = len(values["frames"])
+        frames = len(values["frames"]) or None  # an existing project counts none
     except (KeyError, TypeError, AttributeError):
         raise FormatError(result, "is not the result of a reconstruction") from None
     code, error = _verdict(models)
@@ -179,6 +203,7 @@ def _model(values: Mapping[str, Any]) -> dict[str, Any]:
     check = values["validation"]
     return {
         **{key: values[key] for key in kept},
+        "waiting": (values.get("dense") or {}).get("waiting"),
         "scale_error_pct": None if check is None else check.get("scale_error_pct"),
         "within_tolerance": None if check is None else check.get("within_tolerance"),
         "validation_error": None if check is None else check.get("error"),
@@ -188,6 +213,9 @@ def _model(values: Mapping[str, Any]) -> dict[str, Any]:
 def _verdict(models: Sequence[Mapping[str, Any]]) -> tuple[int, str | None]:
     if all(model["sparse_metric"] is None for model in models):
         return 3, "scale refused: " + "; ".join(reason for model in models for reason in model["reasons"])
+    waiting = [model["waiting"] for model in models if model["waiting"]]
+    if waiting:
+        return InertialError.exit_code, "; ".join(waiting)
     outside = [model for model in models if model["within_tolerance"] is False]
     if outside:
         return 1, f"the target is outside its tolerance: scale error {outside[0]['scale_error_pct']:+.2f} %"

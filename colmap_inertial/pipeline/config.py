@@ -29,8 +29,10 @@ def _plain(options: Any) -> dict[str, Any]:
         value = getattr(options, f.name)
         if dataclasses.is_dataclass(value):
             plain[f.name] = _plain(value)
+        elif isinstance(value, Path):
+            plain[f.name] = str(value.resolve())
         elif value is not None:
-            plain[f.name] = str(value.resolve()) if isinstance(value, Path) else value
+            plain[f.name] = list(value) if isinstance(value, tuple) else value
     return plain
 
 
@@ -122,6 +124,9 @@ def _checked(path: Path, name: str, value: Any, hint: Any) -> Any:
                 return value
         elif kind is Path and isinstance(value, str):
             return Path(value)
+        elif typing.get_origin(kind) is tuple:
+            if isinstance(value, list) and all(isinstance(item, str) for item in value):
+                return tuple(value)
         elif kind is float and isinstance(value, (int, float)) and not isinstance(value, bool):
             return float(value)
         elif isinstance(kind, type) and type(value) is kind:
@@ -134,6 +139,8 @@ def _describe(kinds: tuple[Any, ...]) -> str:
     for kind in kinds:
         if typing.get_origin(kind) is typing.Literal:
             words.append("one of " + ", ".join(map(repr, typing.get_args(kind))))
+        elif typing.get_origin(kind) is tuple:
+            words.append("a list of texts")
         elif kind is not type(None):
             words.append(f"a {getattr(kind, '__name__', kind)}")
     return " or ".join(words)
