@@ -15,7 +15,7 @@ from colmap_inertial.geometry import matrix_from_quat
 from colmap_inertial.gyro import GyroPath
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.imaging.psf import predicted_blur_px
-from colmap_inertial.model import colmap_camera, find_models, read_model
+from colmap_inertial.model import colmap_camera, read_model
 from colmap_inertial.options import ReconstructOptions
 from colmap_inertial.pipeline import reconstruct
 from colmap_inertial.simulate import MotionOptions, SceneRecipe, make_scene, read_truth, write_capture
@@ -90,13 +90,13 @@ def _scene(recipe: SceneRecipe, folder: Path, blur_px: float) -> dict[str, Any]:
 
 
 def _run(capture: Path, out: Path, options: ReconstructOptions, truth: CameraTrajectory) -> dict[str, Any]:
-    """Of the largest model."""
+    """Of the largest model, as it is handed on."""
     try:
         result = reconstruct(capture, out, options)
     except MappingError:
         return {"registered": 0, "points": 0, "centre_error_pct": float("nan"), "rotation_deg": float("nan")}
-    models = [read_model(folder) for folder in find_models(result.workspace.sparse).values()]
-    best = max(models, key=lambda model: model.num_reg_images())
+    largest = max(result.models, key=lambda model: model.summary["registered_images"])
+    best = read_model(largest.sparse_metric or largest.sparse)
     images = [best.image(i) for i in best.reg_image_ids()]
     index = {name: i for i, name in enumerate(truth.names)}
     at = [index[image.name] for image in images]
@@ -115,7 +115,7 @@ def _run(capture: Path, out: Path, options: ReconstructOptions, truth: CameraTra
         "centre_error_pct": float(100 * np.sqrt(np.mean(np.sum((centres - true) ** 2, axis=1))) / extent),
         "rotation_deg": float(np.median(angle)),
         "deblurring": result.imaging.deblur_note,
-        "scale_verdict": result.models[0].scale.verdict,
+        "scale_verdict": largest.scale.verdict,
     }
 
 

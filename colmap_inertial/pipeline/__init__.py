@@ -44,6 +44,7 @@ from colmap_inertial.pipeline.imaging import (
     write_rectified,
 )
 from colmap_inertial.pipeline.metric import MetricStage, ModelStage, write_trajectory
+from colmap_inertial.pipeline.readout import ReadoutStage
 from colmap_inertial.pipeline.result import ModelResult, ReconstructResult, result_as_json
 from colmap_inertial.pipeline.stages import DeblurStage, GyroView, RollingShutterStage
 from colmap_inertial.pipeline.workspace import StageRunner, Workspace, fingerprint, remove
@@ -78,7 +79,7 @@ def default_model_stages(
 ) -> list[ModelStage]:
     """What ``reconstruct`` runs when ``model_stages`` is ``None``: a starting point for one's own list.
 
-    With ``rectified`` keypoints, the model is that of a global shutter.
+    With ``rectified`` keypoints, the model is that of a global shutter, once the camera's translation is undone, too.
     """
     scale = options.scale
     if capture.shared_clock and scale.max_offset_s is None:
@@ -86,7 +87,20 @@ def default_model_stages(
     calibration = prior_calibration(capture, options)
     if rectified:
         calibration = for_rectified(calibration)
-    return [MetricStage(imu=imu, calibration=calibration, options=scale, world=options.world)]
+    metric = MetricStage(imu=imu, calibration=calibration, options=scale, world=options.world)
+    if not rectified:
+        return [metric]
+    refine = options.mapping.refine_intrinsics
+    return [
+        ReadoutStage(
+            imu=imu,
+            calibration=calibration,
+            options=scale,
+            refine_intrinsics=capture.camera is None if refine is None else refine,
+            num_threads=1 if options.deterministic else -1,
+        ),
+        metric,
+    ]
 
 
 def reconstruct(
@@ -456,6 +470,7 @@ __all__ = [
     "GyroView",
     "KeypointStage",
     "MetricStage",
+    "ReadoutStage",
     "ModelResult",
     "ModelStage",
     "ReconstructResult",

@@ -17,7 +17,15 @@ from colmap_inertial.model import Model, apply_similarity, read_model, trajector
 from colmap_inertial.options import ScaleOptions, WorldAxes
 from colmap_inertial.scale import estimate_scale
 from colmap_inertial.smooth import smooth_trajectory
-from colmap_inertial.types import CameraImuCalibration, ImuRecording, Similarity
+from colmap_inertial.types import (
+    Array,
+    CameraImuCalibration,
+    CameraTrajectory,
+    ImuRecording,
+    ScaleEstimate,
+    Similarity,
+    SmoothedTrajectory,
+)
 
 
 class ModelStage(Protocol):
@@ -64,6 +72,29 @@ class MetricStage:
         return dataclasses.replace(model, folder=metric, scale=estimate, similarity=similarity)
 
 
+def smoothed_path(
+    trajectory: CameraTrajectory, imu: ImuRecording, estimate: ScaleEstimate, gravity_in_world_m_s2: Array
+) -> SmoothedTrajectory:
+    """Smooth a metric path with what the scale estimate says of the IMU; gravity in the path's world."""
+    if estimate.calibration is None:
+        raise ValueError("a refused scale says nothing of the IMU")
+    if estimate.clock_rate != 0:
+        imu = on_camera_rate(
+            imu,
+            estimate.calibration,
+            clock_rate=estimate.clock_rate,
+            middle_s=estimate.clock_middle_s,
+            trajectory_epoch_ns=trajectory.epoch_ns,
+        )
+    return smooth_trajectory(
+        trajectory,
+        imu,
+        estimate.calibration,
+        gravity_in_world_m_s2=gravity_in_world_m_s2,
+        accel_bias_m_s2=estimate.accel_bias_m_s2,
+    )
+
+
 def write_trajectory(path: Path, model: Model, imu: ImuRecording) -> None:
     """Write the smoothed metric camera path of a model as TUM text, and its covariance beside it.
 
@@ -81,22 +112,8 @@ def write_trajectory(path: Path, model: Model, imu: ImuRecording) -> None:
     if estimate is None or similarity is None or estimate.calibration is None or estimate.gravity_in_world_m_s2 is None:
         raise ValueError("only a metric model has a metric trajectory")
     trajectory, _ = trajectory_from_model(read_model(model.folder), model.timing)
-    trajectory = dataclasses.replace(trajectory, length_unit="m")
-    if estimate.clock_rate != 0:
-        imu = on_camera_rate(
-            imu,
-            estimate.calibration,
-            clock_rate=estimate.clock_rate,
-            middle_s=estimate.clock_middle_s,
-            trajectory_epoch_ns=trajectory.epoch_ns,
-        )
-    smoothed = smooth_trajectory(
-        trajectory,
-        imu,
-        estimate.calibration,
-        gravity_in_world_m_s2=quat_rotate(similarity.rotation_xyzw, estimate.gravity_in_world_m_s2),
-        accel_bias_m_s2=estimate.accel_bias_m_s2,
-    )
+    gravity = quat_rotate(similarity.rotation_xyzw, estimate.gravity_in_world_m_s2)
+    smoothed = smoothed_path(dataclasses.replace(trajectory, length_unit="m"), imu, estimate, gravity)
     write_tum(path, smoothed)
     target = path.with_name(f"{path.stem}_cov.npz")
     partial = target.with_name(f"{path.stem}_cov.partial.npz")
