@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from colmap_inertial import __version__
-from colmap_inertial.errors import AlreadyMetricError, FormatError, InertialError, OutputError
+from colmap_inertial.errors import AlreadyMetricError, FormatError, InertialError, NotObservableError, OutputError
 from colmap_inertial.io.files import read_json, write_json
 from colmap_inertial.io.ply import transform_ply
 from colmap_inertial.model import TRANSFORM_FILE, is_metric, model_format, read_model, similarity_as_json
@@ -106,6 +106,8 @@ def apply_to_project(
     ------
     AlreadyMetricError
         When the project already carries a similarity of ours.
+    NotObservableError
+        When every scale was refused.
     FormatError
         For an artefact that cannot be read, and where it cannot be told which sub-model something belongs to.
     OutputError
@@ -173,7 +175,9 @@ def _by_model(
                 f"{project} has the sub-models {numbers}, each with a scale of its own: "
                 "give one for each, --scale NUMBER=FILE"
             )
-        return {next(iter(layout.submodels)): scales[None]}
+        scales = {next(iter(layout.submodels)): scales[None]}
+    if all(scale.similarity is None for scale in scales.values()):
+        raise NotObservableError("scale", "; ".join(reason for scale in scales.values() for reason in scale.reasons))
     missing = [index for index in layout.submodels if index not in scales]
     if missing or len(scales) > len(layout.submodels):
         given = ", ".join(str(i) for i in scales)

@@ -1,0 +1,63 @@
+"""The worked scripts, run as their readers would run them."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from batch_captures import TINY, tiny_capture
+
+from colmap_inertial.model import read_model
+from colmap_inertial.pipeline.config import config_as_toml
+
+SCRIPTS = Path(__file__).parents[1] / "scripts"
+
+
+@pytest.fixture
+def config(tmp_path):
+    (tmp_path / "options.toml").write_text(config_as_toml(TINY))
+    return tmp_path / "options.toml"
+
+
+def run(script: str, *args: object, code: int = 0) -> str:
+    """What a script prints."""
+    command = [sys.executable, "-W", "error", SCRIPTS / script, *args]
+    done = subprocess.run(list(map(str, command)), capture_output=True, text=True)
+    assert done.returncode == code, done.stderr
+    return done.stdout
+
+
+def test_a_frame_hook_of_one_s_own(config, tmp_path):
+    capture = tiny_capture(tmp_path / "capture")
+    said = run("example_frame_hook.py", capture, tmp_path / "out", "--below", 1000, "--config", config)
+    assert "12 of 12 frames changed" in said
+    assert "trusted" in said
+    name = json.loads((tmp_path / "out" / "frames.json").read_text())["frames"][0]["name"]
+    assert (tmp_path / "out" / "images" / name).read_bytes() != (capture / "frames" / name).read_bytes()
+
+
+def test_an_existing_project(project, tmp_path):
+    flags = ["--imu", project.imu, "--frame-times", project.frame_times]
+    root = project.model.parents[1]
+    said = run("example_existing_project.py", root, tmp_path / "metric", *flags)
+    assert "trusted" in said
+    transform = json.loads((tmp_path / "metric" / "sparse" / "0" / "transform.json").read_text())
+    assert transform["scale"] == pytest.approx(project.recording.truth.metres_per_unit, rel=0.05)
+    before, after = read_model(project.model), read_model(tmp_path / "metric" / "sparse" / "0")
+    assert after.num_reg_images() == before.num_reg_images()
+
+    refused = run("example_existing_project.py", root, tmp_path / "own", *flags, "--worst-percent", 0.0, code=1)
+    assert "m per unit" in refused
+    assert not (tmp_path / "own").exists()
+
+
+def test_a_batch_over_a_folder(config, tmp_path):
+    tiny_capture(tmp_path / "captures" / "hall")
+    broken = tiny_capture(tmp_path / "captures" / "yard")
+    (broken / "accel.csv").unlink()
+    said = run("example_batch.py", tmp_path / "captures", tmp_path / "out", "--config", config, code=1)
+    assert "hall: done" in said
+    assert "yard: failed" in said
+    assert "accel.csv" in said
+    assert "hall model 0" in said
