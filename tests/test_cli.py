@@ -19,7 +19,9 @@ def run(capsys, *args):
     return stopped.value.code, captured.out, captured.err
 
 
-@pytest.mark.parametrize("command", [[], ["reconstruct"], ["scale"], ["align"], ["validate"], ["deblur"], ["simulate"]])
+@pytest.mark.parametrize(
+    "command", [[], ["reconstruct"], ["scale"], ["align"], ["validate"], ["deblur"], ["batch"], ["simulate"]]
+)
 def test_help_teaches(capsys, command):
     code, out, _ = run(capsys, *command, "--help")
     assert code == 0
