@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import math
 import os
@@ -14,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from colmap_inertial.errors import FormatError, OutputError, OutputExistsError
+from colmap_inertial.io.files import read_json, write_json
 from colmap_inertial.io.images import read_image
 from colmap_inertial.io.ply import read_ply_header
 from colmap_inertial.model import TRANSFORM_FILE, read_model
@@ -202,14 +204,16 @@ def _undistort(
     reconstruction = read_model(model)
     names = tuple(sorted(reconstruction.image(i).name for i in reconstruction.reg_image_ids()))
     _check_images(images, reconstruction)
+    # depth maps may have taken hours: they are never removed, and never used with another model
+    identity = {"model": _digest(model), "max_image_size": options.max_image_size}
+    record = folder / "made_from.json"
+    has_maps = any(file.is_file() for file in (folder / "stereo").glob("*_maps/**/*"))
+    if has_maps and not (record.is_file() and read_json(record) == identity):
+        raise OutputExistsError(
+            f"{folder / 'stereo'} holds depth maps of another model or other options; rename or remove {folder}"
+        )
 
     def work(partial: Sequence[Path]) -> None:
-        stereo = folder / "stereo"
-        if any(file.is_file() for file in stereo.glob("*_maps/**/*")):
-            raise OutputExistsError(
-                f"{stereo} holds depth maps of another model or other options; rename or remove {folder}"
-            )
-        remove(stereo)
         scratch = workspace.stamps / "dense"
         remove(scratch)
         scratch.mkdir(parents=True)
@@ -223,16 +227,24 @@ def _undistort(
         for source, target in zip((scratch / "images", scratch / "sparse"), partial, strict=True):
             os.replace(source, target)
         for path in scratch.iterdir():
-            os.replace(path, folder / path.name)
+            if not has_maps or path.name != "stereo":
+                remove(folder / path.name)
+                os.replace(path, folder / path.name)
+        write_json(record, identity)
         remove(scratch)
 
-    depends = {
-        "model": (model / TRANSFORM_FILE).read_text(),
-        "images": [fingerprint(images / name) for name in names],
-        "max_image_size": options.max_image_size,
-    }
+    depends = {**identity, "images": [fingerprint(images / name) for name in names]}
     runner.run(f"dense_{index}_undistorted", depends, [folder / "images", folder / "sparse"], work)
     return names
+
+
+def _digest(model: Path) -> str:
+    """Of a model's poses and cameras."""
+    digest = hashlib.sha256()
+    for path in sorted(model.iterdir()):
+        if path.stem in ("cameras", "images", "rigs", "frames"):
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
 def _check_images(images: Path, reconstruction: pycolmap.Reconstruction) -> None:

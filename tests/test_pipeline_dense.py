@@ -1,0 +1,224 @@
+"""The dense stage: undistortion, fusion and meshing by COLMAP; depth maps are cast, as it needs CUDA for them."""
+
+import dataclasses
+import json
+import shutil
+
+import numpy as np
+import pycolmap
+import pytest
+from box_project import HIGH, LOW, cast, off_the_walls, rays, shared_box
+from test_pipeline_existing import contents, run
+
+from colmap_inertial.geometry import matrix_from_quat
+from colmap_inertial.io.ply import read_ply_header
+from colmap_inertial.model import read_model
+from colmap_inertial.options import DenseOptions, ProjectOptions, ReconstructOptions
+from colmap_inertial.pipeline.existing import reconstruct_project
+
+QUICK = ReconstructOptions(dense=True, dense_options=DenseOptions(max_image_size=96), deterministic=True)
+FLAGS = ["--dense", "--dense-options.max-image-size", "96", "--deterministic"]
+
+
+@pytest.fixture(scope="module")
+def box(tmp_path_factory):
+    """Tests must not change it."""
+    return shared_box(tmp_path_factory)
+
+
+@pytest.fixture(scope="module")
+def waiting(box, tmp_path_factory):
+    """Everything but the depth maps. Tests must not change it."""
+    out = tmp_path_factory.mktemp("dense") / "out"
+    result = reconstruct_project(box.root, out, source(box), QUICK)
+    return out, result
+
+
+@pytest.fixture
+def unfinished(waiting, tmp_path):
+    """A copy to change."""
+    return shutil.copytree(waiting[0], tmp_path / "out")
+
+
+def source(box):
+    return ProjectOptions(imu=box.imu, frame_times=box.frame_times)
+
+
+def world_from_metric(box, out):
+    """Scale, rotation and shift from the metric model to the true world."""
+    (model,) = json.loads((out / "result.json").read_text())["models"]
+    transform = json.loads((out / "sparse_metric" / "0" / "transform.json").read_text())
+    truth = box.recording.truth
+    world_from_model = matrix_from_quat(truth.model_from_world_xyzw).T
+    model_from_metric = matrix_from_quat(np.array(transform["rotation_xyzw"])).T
+    ratio = truth.metres_per_unit / model["metres_per_unit"]
+    return (
+        ratio,
+        world_from_model @ model_from_metric,
+        -truth.metres_per_unit * (world_from_model @ truth.world_in_model),
+    )
+
+
+def cast_depth_maps(box, out, *, kind="geometric", only=None):
+    """What patch-match would find for the workspace's images, in the model's own unit."""
+    folder = out / "dense_metric" / "0"
+    ratio, rotation, shift = world_from_metric(box, out)
+    model = read_model(folder / "sparse")
+    for i in list(model.reg_image_ids())[:only]:
+        image = model.image(i)
+        camera = model.camera(image.camera_id)
+        centre = ratio * rotation @ image.projection_center() + shift
+        world_from_cam = rotation @ image.cam_from_world().rotation.inverse().matrix()
+        # COLMAP's fusion takes a pixel's ray at its corner, not at its centre
+        fx, fy, cx, cy = camera.params
+        corners = rays(camera.width, camera.height, (fx, fy, cx + 0.5, cy + 0.5))
+        depth, normals = cast(world_from_cam, centre, corners)
+        maps = folder / "stereo"
+        (maps / "depth_maps").mkdir(exist_ok=True)
+        pycolmap.DepthMap.from_array((depth / ratio).astype("f4"), 0.1, 100).write(
+            str(maps / "depth_maps" / f"{image.name}.{kind}.bin")
+        )
+        planar = np.moveaxis(normals, -1, 0).astype("<f4").tobytes()
+        header = b"%d&%d&3&" % (camera.width, camera.height)
+        (maps / "normal_maps" / f"{image.name}.{kind}.bin").write_bytes(header + planar)
+
+
+def vertices(path):
+    with open(path, "rb") as file:
+        header = read_ply_header(path, file)
+        element = header.elements[0]
+        rows = np.frombuffer(file.read(), element.dtype("<"), element.rows)
+    return np.stack([rows[axis].astype(float) for axis in "xyz"], axis=1)
+
+
+def test_without_cuda_all_but_the_depth_maps_is_made(waiting, box):
+    out, result = waiting
+    dense = result.models[0].dense
+    assert (dense.images, dense.depth_maps, dense.fused) == (len(box.names), 0, None)
+    assert "pycolmap-cuda12" in dense.waiting
+    assert "patch_match_stereo" in dense.waiting
+    folder = out / "dense_metric" / "0"
+    assert len(list((folder / "images").iterdir())) == len(box.names)
+    metric, undistorted = read_model(out / "sparse_metric" / "0"), read_model(folder / "sparse")
+    for i in metric.reg_image_ids():
+        np.testing.assert_allclose(undistorted.image(i).projection_center(), metric.image(i).projection_center())
+    assert (folder / "sparse" / "transform.json").is_file()
+    assert (folder / "stereo" / "patch-match.cfg").is_file()
+    assert json.loads((out / "result.json").read_text())["waiting"] is True
+    assert (out / "project_metric").is_dir()
+
+
+def test_depth_maps_that_come_later_become_points_and_a_mesh_in_metres(unfinished, box, capsys):
+    out = unfinished
+    flags = ["--imu", box.imu, "--frame-times", box.frame_times, *FLAGS]
+    before = contents(box.root)
+    code, _, err = run(capsys, "reconstruct", box.root, out, *flags)
+    assert code == 2
+    assert "waits for depth maps" in err
+    cast_depth_maps(box, out)
+    code, shown, err = run(capsys, "reconstruct", box.root, out, *flags)
+    assert code == 0, err
+    assert "120 depth maps" in shown
+    log = (out / "log.txt").read_text()
+    assert log.count("dense_0_undistorted: finished in an earlier run, kept") == 2
+
+    (model,) = json.loads((out / "result.json").read_text())["models"]
+    dense = model["dense"]
+    assert dense["waiting"] is None
+    assert dense["mesh"] == "dense_metric/0/meshed-poisson.ply"
+    points, mesh = vertices(out / dense["fused"]), vertices(out / dense["mesh"])
+    assert len(points) == dense["points"] > 5000
+    assert dense["faces"] > 5000
+    ratio, rotation, shift = world_from_metric(box, out)
+    # up is up: what remains is a turn about the vertical
+    assert np.degrees(np.arccos(rotation[2, 2])) < 1
+    # metres are metres: as they stand, no scale applied, points lie on the walls within the scale's own interval
+    half_width = 0.5 * (model["ci95"][1] - model["ci95"][0]) / model["metres_per_unit"]
+    middle = points.mean(axis=0)
+    in_metres = (points - middle) @ rotation.T + ratio * rotation @ middle + shift
+    assert np.percentile(off_the_walls(in_metres), 95) < half_width * np.linalg.norm(HIGH - LOW)
+    # and but for the scale's error exactly so
+    true = ratio * points @ rotation.T + shift
+    assert np.percentile(off_the_walls(true), 99) < 1e-4
+    surface = ratio * mesh @ rotation.T + shift
+    assert np.percentile(off_the_walls(surface), 90) < 0.02
+    assert (out / "dense_metric" / "0" / "fused.ply.vis").is_file()
+    assert contents(box.root) == before
+    code, _, err = run(capsys, "reconstruct", box.root, out, *flags)
+    assert code == 2
+    assert "finished result" in err
+
+
+def test_with_cuda_it_goes_through_in_one_run(box, tmp_path, monkeypatch):
+    out, calls = tmp_path / "out", []
+
+    def patch_match(workspace, options):
+        calls.append(options.max_image_size)
+        # the result file is not there yet, but the scale is in the model
+        estimate = json.loads((out / "sparse_metric" / "0" / "transform.json").read_text())["scale"]
+        (out / "result.json").write_text(json.dumps({"models": [{"metres_per_unit": estimate}]}))
+        cast_depth_maps(box, out, only=100)
+        (out / "result.json").unlink()
+
+    monkeypatch.setattr(pycolmap, "has_cuda", True)
+    monkeypatch.setattr(pycolmap, "patch_match_stereo", patch_match)
+    options = dataclasses.replace(QUICK, dense_options=DenseOptions(max_image_size=96, mesh="none"))
+    seen = []
+    result = reconstruct_project(
+        box.root, out, source(box), options, progress=lambda stage, done, total: seen.append((stage, done, total))
+    )
+    dense = result.models[0].dense
+    assert calls == [96]
+    assert result.exit_code() == 0
+    assert (dense.depth_maps, dense.images, dense.mesh, dense.waiting) == (100, 120, None, "")
+    assert dense.points > 2000
+    assert max(camera.width for camera in read_model(dense.folder / "sparse").cameras.values()) == 96
+    assert [done for stage, done, _ in seen if stage == "dense"][-1] == 4
+    assert "no depth map of" in (out / "log.txt").read_text()
+
+
+def test_half_written_depth_maps_are_made_again(unfinished, box, monkeypatch):
+    torn = unfinished / "dense_metric" / "0" / "stereo" / "depth_maps" / f"{box.names[0]}.geometric.bin"
+    torn.write_bytes(b"96&72&1&" + bytes(100))
+
+    def patch_match(workspace, options):
+        assert not torn.exists()
+        cast_depth_maps(box, unfinished)
+
+    monkeypatch.setattr(pycolmap, "has_cuda", True)
+    monkeypatch.setattr(pycolmap, "patch_match_stereo", patch_match)
+    no_mesh = dataclasses.replace(QUICK, dense_options=DenseOptions(max_image_size=96, mesh="none"))
+    assert reconstruct_project(box.root, unfinished, source(box), no_mesh).exit_code() == 0
+
+
+def test_damaged_depth_maps_and_those_of_other_options_are_named(unfinished, box, capsys):
+    cast_depth_maps(box, unfinished, kind="photometric", only=5)
+    flags = ["--imu", box.imu, "--frame-times", box.frame_times, *FLAGS]
+    code, _, err = run(
+        capsys, "reconstruct", box.root, unfinished, *flags, "--dense-options.max-image-size", "80"
+    )  # fmt: skip
+    assert code == 2
+    assert "depth maps of another model or other options" in err
+    broken = next((unfinished / "dense_metric" / "0" / "stereo" / "normal_maps").glob("*.bin"))
+    broken.write_bytes(broken.read_bytes()[:-8])
+    code, _, err = run(capsys, "reconstruct", box.root, unfinished, *flags)
+    assert code == 2
+    assert broken.name in err
+    assert "truncated" in err
+
+
+def test_images_that_are_not_the_model_s_are_named(box, tmp_path, capsys):
+    flags = ["--imu", box.imu, "--frame-times", box.frame_times, "--dense", "--images"]
+    some = shutil.copytree(box.root / "images", tmp_path / "some")
+    (some / box.names[4]).unlink()
+    code, _, err = run(capsys, "reconstruct", box.root, tmp_path / "out", *flags, some)
+    assert code == 2
+    assert box.names[4] in err
+    import cv2
+
+    image = cv2.imread(str(some / box.names[0]))
+    cv2.imwrite(str(some / box.names[0]), image[::2, ::2])
+    shutil.copy(some / box.names[3], some / box.names[4])
+    code, _, err = run(capsys, "reconstruct", box.root, tmp_path / "out2", *flags, some)
+    assert code == 2
+    assert "80x60" in err
