@@ -6,7 +6,6 @@ Depth and colour inside a box are closed forms, and everything in view is visibl
 import struct
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import cache
 from pathlib import Path
 
 import cv2
@@ -94,10 +93,14 @@ def pictures(recording, frames):
         yield picture(matrix_from_quat(motion.world_from_cam_xyzw(t))[0], motion.cam_in_world_m(t)[0])
 
 
-@cache
+_built: list[BoxProject] = []
+
+
 def shared_box(tmp_path_factory) -> BoxProject:
     """One for all tests of a run, which must not change it."""
-    return build(tmp_path_factory.mktemp("box"))
+    if not _built:
+        _built.append(build(tmp_path_factory.mktemp("box")))
+    return _built[0]
 
 
 def build(root: Path) -> BoxProject:

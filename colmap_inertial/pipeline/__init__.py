@@ -187,7 +187,8 @@ def reconstruct(
             workspace=workspace, models=models, frames=records, imaging=plan, seconds=runner.seconds
         )
         write_json(workspace.result, result_as_json(result, loaded))
-        remove(workspace.features)
+        if not result.waiting:  # else the run goes on later, and needs them
+            remove(workspace.features)
         log.info("finished")
     return result
 

@@ -48,6 +48,11 @@ class ReconstructResult:
     project_metric: Path | None = None
     """The whole project in metres, where an existing one was given and not every scale was refused."""
 
+    @property
+    def waiting(self) -> tuple[str, ...]:
+        """What the user has to do for the dense reconstructions to go on; empty where nothing is left to do."""
+        return tuple(model.dense.waiting for model in self.models if model.dense is not None and model.dense.waiting)
+
     def exit_code(self) -> int:
         """0; 1 where a validation is outside its tolerance; its error's code where the target could not be measured.
 
@@ -66,9 +71,8 @@ class ReconstructResult:
                 if len(reasons) == 1
                 else "; ".join(f"model {i}: {text}" for i, text in reasons.items()),
             )
-        waiting = [model.dense.waiting for model in self.models if model.dense is not None and model.dense.waiting]
-        if waiting:
-            raise InertialError("; ".join(waiting))
+        if self.waiting:
+            raise InertialError("; ".join(self.waiting))
         checked = [model.validation for model in self.models if model.validation is not None]
         failures = [check.exit_code for check in checked if isinstance(check, InertialError)]
         outside = any(not check.within_tolerance for check in checked if isinstance(check, Validation))
@@ -144,7 +148,7 @@ def result_as_json(result: ReconstructResult, capture: Capture) -> dict[str, obj
             for model in result.models
         ],
         "project_metric": relative(result.project_metric),
-        "waiting": any(model.dense is not None and bool(model.dense.waiting) for model in result.models),
+        "waiting": bool(result.waiting),
         "imaging": imaging_as_json(plan),
         "frames": [frame_as_json(record, plan) for record in result.frames],
         "seconds": result.seconds,
