@@ -89,7 +89,12 @@ def settle_readout(
     options.refine_principal_point = False
     solver: Any = getattr(options, "ceres", options)  # COLMAP 4.2 keeps the solver apart
     solver.solver_options.num_threads = num_threads
-    pycolmap.bundle_adjustment(settled, options)
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in settled.reg_image_ids():
+        config.add_image(image_id)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    # pycolmap.bundle_adjustment would switch COLMAP's log back on
+    pycolmap.create_default_bundle_adjuster(options, config, settled).solve()
     settled.update_point_3d_errors()
     after_px = float(settled.compute_mean_reprojection_error())
     accepted = after_px < before_px
