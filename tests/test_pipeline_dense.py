@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import shutil
+import subprocess
 
 import numpy as np
 import pycolmap
@@ -10,10 +11,12 @@ import pytest
 from box_project import HIGH, LOW, cast, off_the_walls, rays, shared_box
 from test_pipeline_existing import contents, run
 
+from colmap_inertial.errors import InertialError
 from colmap_inertial.geometry import matrix_from_quat
 from colmap_inertial.io.ply import read_ply_header
 from colmap_inertial.model import read_model
 from colmap_inertial.options import DenseOptions, ProjectOptions, ReconstructOptions
+from colmap_inertial.pipeline import dense as dense_stage
 from colmap_inertial.pipeline.existing import reconstruct_project
 
 QUICK = ReconstructOptions(dense=True, dense_options=DenseOptions(max_image_size=96), deterministic=True)
@@ -152,8 +155,8 @@ def test_depth_maps_that_come_later_become_points_and_a_mesh_in_metres(unfinishe
 def test_with_cuda_it_goes_through_in_one_run(box, tmp_path, monkeypatch):
     out, calls = tmp_path / "out", []
 
-    def patch_match(workspace, options):
-        calls.append(options.max_image_size)
+    def patch_match(workspace, max_image_size):
+        calls.append(max_image_size)
         # the result file is not there yet, but the scale is in the model
         estimate = json.loads((out / "sparse_metric" / "0" / "transform.json").read_text())["scale"]
         (out / "result.json").write_text(json.dumps({"models": [{"metres_per_unit": estimate}]}))
@@ -161,7 +164,7 @@ def test_with_cuda_it_goes_through_in_one_run(box, tmp_path, monkeypatch):
         (out / "result.json").unlink()
 
     monkeypatch.setattr(pycolmap, "has_cuda", True)
-    monkeypatch.setattr(pycolmap, "patch_match_stereo", patch_match)
+    monkeypatch.setattr(dense_stage, "patch_match", patch_match)
     options = dataclasses.replace(QUICK, dense_options=DenseOptions(max_image_size=96, mesh="none"))
     seen = []
     result = reconstruct_project(
@@ -181,14 +184,22 @@ def test_half_written_depth_maps_are_made_again(unfinished, box, monkeypatch):
     torn = unfinished / "dense_metric" / "0" / "stereo" / "depth_maps" / f"{box.names[0]}.geometric.bin"
     torn.write_bytes(b"96&72&1&" + bytes(100))
 
-    def patch_match(workspace, options):
+    def run_colmap(command, **_):
         assert not torn.exists()
         cast_depth_maps(box, unfinished)
+        return subprocess.CompletedProcess(command, 0, "", "")
 
     monkeypatch.setattr(pycolmap, "has_cuda", True)
-    monkeypatch.setattr(pycolmap, "patch_match_stereo", patch_match)
+    monkeypatch.setattr(dense_stage.subprocess, "run", run_colmap)
     no_mesh = dataclasses.replace(QUICK, dense_options=DenseOptions(max_image_size=96, mesh="none"))
     assert reconstruct_project(box.root, unfinished, source(box), no_mesh).exit_code() == 0
+
+
+def test_a_patch_match_that_fails_is_said(unfinished, box, monkeypatch):
+    monkeypatch.setattr(pycolmap, "has_cuda", True)  # which it has not
+    with pytest.raises(InertialError, match=r"patch-match ended with code 1: ValueError.* CUDA"):
+        reconstruct_project(box.root, unfinished, source(box), QUICK)
+    assert (unfinished / "sparse_metric" / "0").is_dir()
 
 
 def test_damaged_depth_maps_and_those_of_other_options_are_named(unfinished, box, capsys):

@@ -312,6 +312,26 @@ def test_a_metric_project_is_not_scaled_again(box, tmp_path, capsys):
     assert "already holds a metric scale" in err
 
 
+def test_each_sub_model_has_its_own_scale(box, tmp_path):
+    import pycolmap
+
+    project = shutil.copytree(box.root, tmp_path / "project")
+    other = read_model(project / "sparse" / "0")
+    other.transform(pycolmap.Sim3d(2.0, pycolmap.Rotation3d(np.array([0.0, 0.6, 0.0, 0.8])), np.array([1.0, 2.0, 3.0])))
+    (project / "sparse" / "1").mkdir()
+    other.write_binary(str(project / "sparse" / "1"))
+    out = tmp_path / "out"
+    result = reconstruct_project(project, out, ProjectOptions(imu=box.imu, frame_times=box.frame_times))
+    scales = [model.scale.metres_per_unit for model in result.models]
+    assert scales[0] / scales[1] == pytest.approx(2, rel=1e-3)
+    models = [read_model(out / "project_metric" / "sparse" / str(i)) for i in (0, 1)]
+    first, last = 1, len(box.names)
+    spans = [m.image(first).projection_center() - m.image(last).projection_center() for m in models]
+    assert np.linalg.norm(spans[0]) == pytest.approx(np.linalg.norm(spans[1]), rel=1e-3)
+    assert (out / "trajectory.tum").is_file()
+    assert (out / "trajectory_1.tum").is_file()
+
+
 def test_an_interrupted_run_continues(box, tmp_path):
     source = ProjectOptions(imu=box.imu, frame_times=box.frame_times)
 
@@ -345,6 +365,12 @@ def test_what_a_project_is(box, tmp_path):
     shutil.copytree(box.root / "sparse", described / "sparse")
     (described / "capture.toml").write_text("")
     assert not is_project(described)
+    dataset = tmp_path / "asl"  # in which somebody ran COLMAP
+    shutil.copytree(box.root / "sparse", dataset / "sparse")
+    for file in ("cam0/data.csv", "cam0/data/1.png", "imu0/data.csv"):
+        (dataset / file).parent.mkdir(parents=True, exist_ok=True)
+        (dataset / file).write_text("")
+    assert not is_project(dataset)
     with pytest.raises(ValueError, match="give one of"):
         ProjectOptions(exif_times=True, video=tmp_path)
 

@@ -7,6 +7,8 @@ import logging
 import math
 import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from colmap_inertial.errors import FormatError, OutputError, OutputExistsError
+from colmap_inertial.errors import FormatError, InertialError, OutputError, OutputExistsError
 from colmap_inertial.io.files import read_json, write_json
 from colmap_inertial.io.images import read_image
 from colmap_inertial.io.ply import read_ply_header
@@ -34,6 +36,15 @@ _LEAST_DEPTH, _MOST_DEPTH = 6, 13
 #: COLMAP cuts away what is sampled three levels (8 times) more coarsely than the finest; so do we.
 _TRIM_LEVELS = 3
 _STEPS = 4
+#: Ends with the process that started it.
+_PATCH_MATCH = """
+import ctypes, signal, sys, zlib
+ctypes.CDLL(None).prctl(1, signal.SIGKILL)
+import pycolmap
+options = pycolmap.PatchMatchOptions()
+options.max_image_size = int(sys.argv[2])
+pycolmap.patch_match_stereo(sys.argv[1], options=options)
+"""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -146,7 +157,7 @@ def _densify(
     import pycolmap
 
     if pycolmap.has_cuda:
-        runner.run(f"dense_{index}_depth", {}, [], lambda _: _patch_match(folder, options))
+        runner.run(f"dense_{index}_depth", {}, [], lambda _: patch_match(folder, options.max_image_size))
     kind, mapped = _depth_maps(folder, names)
     progress(1)
     result = DenseResult(folder=folder, images=len(names), depth_maps=len(mapped))
@@ -269,18 +280,28 @@ def _map_file(folder: Path, what: str, name: str, kind: str) -> Path:
     return folder / "stereo" / f"{what}_maps" / f"{name}.{kind}.bin"
 
 
-def _patch_match(folder: Path, options: DenseOptions) -> None:
-    """COLMAP's patch-match; it keeps the maps that are there, so that half-written ones must go first."""
-    import pycolmap
+def patch_match(folder: Path, max_image_size: int | None) -> None:
+    """COLMAP's patch-match on a dense workspace, in a process of its own: where CUDA fails it ends the process.
 
+    Raises
+    ------
+    InertialError
+        When it fails; the depth maps that are done stay.
+    """
+    # COLMAP keeps the maps that are there, so that half-written ones must go first
     for path in (folder / "stereo").glob("*_maps/**/*.bin"):
         try:
             check_map(path, 1 if "depth_maps" in path.parts else 3)
         except FormatError:
             remove(path)
-    settings = pycolmap.PatchMatchOptions()
-    settings.max_image_size = options.max_image_size or -1
-    pycolmap.patch_match_stereo(str(folder), options=settings)
+    command = [sys.executable, "-c", _PATCH_MATCH, str(folder), str(max_image_size or -1)]
+    done = subprocess.run(command, capture_output=True, text=True, errors="replace")
+    if done.returncode:
+        said = (done.stderr.strip().splitlines() or ["no message"])[-1]
+        raise InertialError(
+            f"{folder}: COLMAP's patch-match ended with code {done.returncode}: {said}. Started again, it continues "
+            "with the next depth map"
+        )
 
 
 def _depth_maps(folder: Path, names: Sequence[str]) -> tuple[str, list[str]]:

@@ -58,9 +58,17 @@ _HOW_TIMES = (
 
 
 def is_project(path: Path) -> bool:
-    """Whether ``path`` holds a COLMAP model where a project has it, and does not describe itself as a capture."""
-    if not path.is_dir() or is_capture(path):
+    """Whether ``path`` holds a COLMAP model where a project has it, and is no capture by itself."""
+    if not _has_model(path):
         return False
+    try:
+        load_capture(path)
+    except FormatError:
+        return not is_capture(path)
+    return False
+
+
+def _has_model(path: Path) -> bool:
     places = (path, path / "sparse")
     return any(
         model_format(folder) is not None
@@ -103,7 +111,7 @@ def reconstruct_project(
     OutputError, OutputExistsError
         When ``out`` holds something else, or lies in the project.
     """
-    if not is_project(project):
+    if not _has_model(project):
         raise FormatError(
             project,
             "holds no COLMAP model (sparse/ or a model folder), and --imu and the like belong to one: leave them out "
