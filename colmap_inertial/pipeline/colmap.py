@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from colmap_inertial.errors import FormatError, MappingError
-from colmap_inertial.model import colmap_camera
+from colmap_inertial.model import colmap_camera, read_model
 from colmap_inertial.options import MappingOptions
+from colmap_inertial.pipeline.workspace import require_room
 from colmap_inertial.types import Array, CameraModel
 
 if TYPE_CHECKING:
@@ -23,6 +24,9 @@ if TYPE_CHECKING:
 _EXHAUSTIVE_UP_TO = 150
 _EXTRACTION_BATCH = 16
 _MATCHING_BATCH = 400
+#: What a feature takes in the database at most, several orientations and SQLite's log included; likewise a pair.
+_FEATURE_BYTES = 500
+_PAIR_BYTES = 100_000
 
 
 class Progress(Protocol):
@@ -102,6 +106,7 @@ def extract_features(
             reader.camera_params = ",".join(repr(p) for p in camera.params)
         for batch in _batches(sorted(names), _EXTRACTION_BATCH):
             progress("features", done, len(cameras))
+            require_room(database.parent, len(batch) * options.max_num_features * _FEATURE_BYTES)
             pycolmap.extract_features(
                 str(database),
                 str(images),
@@ -173,6 +178,7 @@ def match_features(
         listed = Path(folder) / "pairs.txt"
         for i, batch in enumerate(_batches(lines, _MATCHING_BATCH)):
             progress("matches", i * _MATCHING_BATCH, len(pairs))
+            require_room(database.parent, len(batch) * _PAIR_BYTES)
             listed.write_text("\n".join(batch) + "\n")
             pycolmap.match_image_pairs(
                 str(database),
@@ -207,6 +213,7 @@ def map_images(
 
     pycolmap.set_random_seed(seed)
     sparse.mkdir(parents=True)
+    require_room(sparse, database.stat().st_size)
     progress("mapping", 0, num_images)
     if options.mapper == "incremental":
         models = pycolmap.incremental_mapping(
@@ -224,6 +231,8 @@ def map_images(
             options=_global_options(options, refine_intrinsics, num_threads, seed),
         )
     progress("mapping", num_images, num_images)
+    for folder in sparse.iterdir():
+        read_model(folder)  # COLMAP does not say when it could not write one whole
     if not models:
         raise MappingError(
             "COLMAP found no model: too few matches between the frames. Film with more overlap, more texture or less "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import enum
+import errno
 import fcntl
 import functools
 import hashlib
@@ -150,8 +151,10 @@ class Workspace:
         ------
         OutputExistsError
             While another run is at work in it.
+        OutputError
+            Where the disk is full.
         """
-        with open(self.stamps / "lock", "w") as file:
+        with full_disk_is_an_error(self.root), open(self.stamps / "lock", "w") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
@@ -159,6 +162,33 @@ class Workspace:
                     f"another run is at work in {self.root}; wait for it or choose another folder"
                 ) from None
             yield
+
+
+@contextlib.contextmanager
+def full_disk_is_an_error(root: Path) -> Iterator[None]:
+    """Turn the system's complaint about a full disk (or a quota, or a limit of file sizes) into one of ours."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+            raise
+        raise OutputError(f"the disk of {root} is full ({error.strerror}); {_MAKE_ROOM}") from error
+
+
+def require_room(folder: Path, num_bytes: int) -> None:
+    """Raise :class:`OutputError` where the disk of ``folder`` has less room left than ``num_bytes``.
+
+    For what COLMAP writes: its threads end the process when a database cannot grow, and its models end early.
+    """
+    free = shutil.disk_usage(folder).free
+    if free < num_bytes:
+        raise OutputError(
+            f"the disk of {folder} is nearly full: {free / 1e6:.0f} MB are left, COLMAP's next step may need "
+            f"{num_bytes / 1e6:.0f} MB; {_MAKE_ROOM}"
+        )
+
+
+_MAKE_ROOM = "make room and start again, it continues"
 
 
 def canonical(value: object) -> object:
@@ -254,7 +284,7 @@ class StageRunner:
         start = time.perf_counter()
         try:
             work(partial)
-        except InertialError:
+        except (InertialError, OSError):
             for path in partial:
                 remove(path)
             raise
