@@ -10,7 +10,7 @@ from colmap_inertial.options import MappingOptions, ReconstructOptions
 TINY = ReconstructOptions(
     mapping=MappingOptions(max_num_features=600, first_octave=0, max_image_size=320), deterministic=True
 )
-FRAMES = 12
+FRAMES = 16
 
 
 def tiny_capture(folder: Path, *, frames: int = FRAMES) -> Path:

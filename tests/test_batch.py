@@ -56,7 +56,7 @@ def eventually(condition, seconds: float = 60.0):
 def captures(tmp_path_factory):
     """Two captures of one scene, and what ``reconstruct`` makes of each by itself."""
     root = tmp_path_factory.mktemp("captures")
-    found = {name: tiny_capture(root / name, frames=frames) for name, frames in (("hall", 12), ("yard", 13))}
+    found = {name: tiny_capture(root / name, frames=frames) for name, frames in (("hall", 16), ("yard", 17))}
     for name, folder in found.items():
         reconstruct(folder, root / "alone" / name, TINY)
     return found, {name: model_bytes(root / "alone" / name) for name in found}

@@ -31,7 +31,7 @@ def run(script: str, *args: object, code: int = 0) -> str:
 def test_a_frame_hook_of_one_s_own(config, tmp_path):
     capture = tiny_capture(tmp_path / "capture")
     said = run("example_frame_hook.py", capture, tmp_path / "out", "--below", 1000, "--config", config)
-    assert "12 of 12 frames changed" in said
+    assert "16 of 16 frames changed" in said
     assert "trusted" in said
     name = json.loads((tmp_path / "out" / "frames.json").read_text())["frames"][0]["name"]
     assert (tmp_path / "out" / "images" / name).read_bytes() != (capture / "frames" / name).read_bytes()
