@@ -15,6 +15,7 @@ from colmap_inertial.errors import FormatError, InertialError
 from colmap_inertial.io.files import read_json, write_json
 from colmap_inertial.pipeline.colmap import Progress
 from colmap_inertial.pipeline.metadata import carry_metadata
+from colmap_inertial.pipeline.workspace import a_record_of_ours
 from colmap_inertial.types import CameraModel, Frame, FrameTiming
 
 
@@ -205,11 +206,12 @@ def encode_image(target: Path, image: NDArray[Any], original: Path | None = None
 
 def read_frame_records(path: Path) -> tuple[FrameRecord, ...]:
     """The records that :func:`write_frames` wrote."""
-    records = []
-    for item in read_json(path)["frames"]:
-        camera = item["camera"]
-        if camera is not None:
-            camera = CameraModel(**{**camera, "params": tuple(camera["params"])})
-        treatment = None if item["treatment"] is None else FrameTreatment(**item["treatment"])
-        records.append(FrameRecord(name=item["name"], action=item["action"], camera=camera, treatment=treatment))
+    records, values = [], read_json(path)
+    with a_record_of_ours(path):
+        for item in values["frames"]:
+            camera = item["camera"]
+            if camera is not None:
+                camera = CameraModel(**{**camera, "params": tuple(camera["params"])})
+            treatment = None if item["treatment"] is None else FrameTreatment(**item["treatment"])
+            records.append(FrameRecord(name=item["name"], action=item["action"], camera=camera, treatment=treatment))
     return tuple(records)

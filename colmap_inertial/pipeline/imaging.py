@@ -27,6 +27,7 @@ from colmap_inertial.pipeline.first_look import guessed_camera, look_first, some
 from colmap_inertial.pipeline.frames import FrameRecord, encode_image
 from colmap_inertial.pipeline.metadata import stated_exposures_s
 from colmap_inertial.pipeline.stages import DeblurStage, GyroView, RollingShutterStage
+from colmap_inertial.pipeline.workspace import a_record_of_ours
 from colmap_inertial.types import CALIBRATION_PARAMETERS, CameraImuCalibration, CameraModel, FrameTiming, ImuRecording
 
 if TYPE_CHECKING:
@@ -112,31 +113,32 @@ def write_plan(path: Path, plan: ImagingPlan) -> None:
 def read_plan(path: Path, imu: ImuRecording, timing: FrameTiming) -> ImagingPlan:
     """The plan that :func:`write_plan` wrote for the same recording."""
     values: dict[str, Any] = read_json(path)
-    view = None
-    if values["calibration"] is not None:
-        found = dict(values["calibration"])
-        camera = values["camera"]
-        view = GyroView(
-            imu=imu,
-            timing=timing,
-            clock_rate=found.pop("clock_rate"),
-            clock_middle_s=found.pop("clock_middle_s"),
-            source=found.pop("source"),
-            notes=tuple(found.pop("notes")),
-            calibration=CameraImuCalibration(**found),
-            camera=CameraModel(**{**camera, "params": tuple(camera["params"])}),
+    with a_record_of_ours(path):
+        view = None
+        if values["calibration"] is not None:
+            found = dict(values["calibration"])
+            camera = values["camera"]
+            view = GyroView(
+                imu=imu,
+                timing=timing,
+                clock_rate=found.pop("clock_rate"),
+                clock_middle_s=found.pop("clock_middle_s"),
+                source=found.pop("source"),
+                notes=tuple(found.pop("notes")),
+                calibration=CameraImuCalibration(**found),
+                camera=CameraModel(**{**camera, "params": tuple(camera["params"])}),
+            )
+        deblur = None
+        if values["decisions"] is not None:
+            decisions = tuple(FrameDecision(**decision) for decision in values["decisions"])
+            deblur = decisions, RecordingVerdict(**values["verdict"])
+        return ImagingPlan(
+            view=view,
+            deblur=deblur,
+            rectify=values["rectify"],
+            deblur_note=values["deblur"],
+            rolling_shutter_note=values["rolling_shutter"],
         )
-    deblur = None
-    if values["decisions"] is not None:
-        decisions = tuple(FrameDecision(**decision) for decision in values["decisions"])
-        deblur = decisions, RecordingVerdict(**values["verdict"])
-    return ImagingPlan(
-        view=view,
-        deblur=deblur,
-        rectify=values["rectify"],
-        deblur_note=values["deblur"],
-        rolling_shutter_note=values["rolling_shutter"],
-    )
 
 
 def with_stated_exposures(capture: Capture, timing: FrameTiming) -> FrameTiming:

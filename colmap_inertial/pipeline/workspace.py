@@ -175,6 +175,15 @@ def full_disk_is_an_error(root: Path) -> Iterator[None]:
         raise OutputError(f"the disk of {root} is full ({error.strerror}); {_MAKE_ROOM}") from error
 
 
+@contextlib.contextmanager
+def a_record_of_ours(path: Path) -> Iterator[None]:
+    """While a record of an earlier run is taken apart: what does not fit means that it was changed since."""
+    try:
+        yield
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        raise FormatError(path, f"was damaged since it was written ({error}); remove it and start again") from None
+
+
 def require_room(folder: Path, num_bytes: int) -> None:
     """Raise :class:`OutputError` where the disk of ``folder`` has less room left than ``num_bytes``.
 
