@@ -43,24 +43,30 @@ class BlurEvidence:
     total, total_square
         (FACTORS, TURNS_RAD) sums over tiles of the cepstrum at that factor of the predicted blur and that direction
         from it, less its median over all directions; and of the squares.
+    mirrored, mirrored_square
+        (FACTORS, 1) the same in the direction that a gyroscope with one axis flipped would predict.
     tiles
         How many were summed.
     """
 
     total: Array
     total_square: Array
+    mirrored: Array
+    mirrored_square: Array
     tiles: int
 
     @classmethod
     def nothing(cls) -> BlurEvidence:
         """Of no image."""
         zero = np.zeros((len(FACTORS), len(TURNS_RAD)))
-        return cls(total=zero, total_square=zero, tiles=0)
+        return cls(total=zero, total_square=zero, mirrored=zero[:, :1], mirrored_square=zero[:, :1], tiles=0)
 
     def __add__(self, other: BlurEvidence) -> BlurEvidence:
         return BlurEvidence(
             total=self.total + other.total,
             total_square=self.total_square + other.total_square,
+            mirrored=self.mirrored + other.mirrored,
+            mirrored_square=self.mirrored_square + other.mirrored_square,
             tiles=self.tiles + other.tiles,
         )
 
@@ -72,10 +78,13 @@ class BlurEvidence:
     @cached_property
     def sigmas(self) -> Array:
         """(FACTORS, TURNS_RAD) depth of the mean dip in its standard deviations: positive is a dip."""
+        return self._depth(self.total, self.total_square)
+
+    def _depth(self, total: Array, total_square: Array) -> Array:
         if not self.enough:
-            return np.zeros((len(FACTORS), len(TURNS_RAD)))
-        mean = self.total / self.tiles
-        variance = np.maximum(self.total_square / self.tiles - mean**2, 1e-12)
+            return np.zeros_like(total)
+        mean = total / self.tiles
+        variance = np.maximum(total_square / self.tiles - mean**2, 1e-12)
         return np.asarray(-mean / np.sqrt(variance / self.tiles))
 
     @property
@@ -100,9 +109,12 @@ class BlurEvidence:
         return _PLAUSIBLE.start <= i < _PLAUSIBLE.stop
 
     @property
-    def contradiction(self) -> float:
-        """Standard deviations by which the deepest dip in some clearly different direction shows."""
-        return float(self.sigmas[:, 2:-1].max())
+    def mirrored_support(self) -> float:
+        """As ``support``, in the direction that a gyroscope with one axis flipped would predict.
+
+        What textures have of their own, which is upright or level, is the same in both.
+        """
+        return float(self._depth(self.mirrored, self.mirrored_square)[_PLAUSIBLE].max())
 
 
 def blur_evidence(
@@ -167,9 +179,17 @@ def blur_evidence(
     smooth = np.exp(-2 * (np.pi * _SMOOTHING_PX * np.fft.fftfreq(tile)) ** 2).astype(np.float32)
     damped = np.log(power + _FLOOR * tile**2) * smooth[:, None] * smooth[: tile // 2 + 1]
     cepstra = irfft2(damped, s=(tile, tile))
-    values = _at_lags(np.asarray(cepstra), vectors[usable])
-    values -= np.median(values[:, :, 2:-1], axis=2, keepdims=True)
-    return BlurEvidence(total=values.sum(axis=0), total_square=(values**2).sum(axis=0), tiles=len(values))
+    values = _at_lags(np.asarray(cepstra), vectors[usable], TURNS_RAD)
+    level = np.median(values[:, :, 2:-1], axis=2, keepdims=True)
+    values -= level
+    mirrored = _at_lags(np.asarray(cepstra), vectors[usable] * [1, -1], TURNS_RAD[:1]) - level
+    return BlurEvidence(
+        total=values.sum(axis=0),
+        total_square=(values**2).sum(axis=0),
+        mirrored=mirrored.sum(axis=0),
+        mirrored_square=(mirrored**2).sum(axis=0),
+        tiles=len(values),
+    )
 
 
 def _light(image: NDArray[np.uint8] | NDArray[np.uint16]) -> NDArray[np.float32]:
@@ -189,10 +209,10 @@ def _starts(size: int, tile: int, step: int) -> NDArray[np.intp]:
     return np.unique(np.rint(np.linspace(0, size - tile, count)).astype(np.intp))
 
 
-def _at_lags(cepstra: NDArray[np.float32], vectors: Array) -> Array:
-    """(N, FACTORS, TURNS_RAD) values of (N, T, T) cepstra at the lags around (N, 2) blur vectors; bilinear."""
+def _at_lags(cepstra: NDArray[np.float32], vectors: Array, turns_rad: Array) -> Array:
+    """(N, FACTORS, turns) values of (N, T, T) cepstra at the lags around (N, 2) blur vectors; bilinear."""
     tile = cepstra.shape[1]
-    cosine, sine = np.cos(TURNS_RAD), np.sin(TURNS_RAD)
+    cosine, sine = np.cos(turns_rad), np.sin(turns_rad)
     along_x = vectors[:, 0, None] * cosine - vectors[:, 1, None] * sine
     along_y = vectors[:, 0, None] * sine + vectors[:, 1, None] * cosine
     x, y = (FACTORS[None, :, None] * v[:, None, :] for v in (along_x, along_y))

@@ -8,7 +8,7 @@ in a deblurred frame that were sharp before keep their pixels.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, TypeVar
 
@@ -222,7 +222,11 @@ def deblur_gated(
 #: An extent is corrected where it is further off than small blur lets the dip drift, and where the dip is this clear.
 _CORRECTED_FROM, _CLEAR_SUPPORT = 0.1, 7.0
 #: Blur this long must show in a frame with texture; below, a frame that shows nothing does not contradict.
-_MUST_SHOW_PX = 8.0
+MUST_SHOW_PX = 8.0
+#: Standard deviations by which all frames together must show short blur: of wrong gyroscopes, none reached three.
+_TOGETHER_SUPPORT = 4.5
+#: From so many on, a frame has a vote whether it is rather the gyroscope's direction, or the mirrored one.
+_VOTE = 2.5
 _FEWEST_FRAMES = 3
 #: Tiles that show whether a frame contradicts a gyroscope that is trusted.
 _FEW_TILES = 200
@@ -256,7 +260,8 @@ class RecordingVerdict:
 def judge_recording(evidence: Iterable[BlurEvidence], options: GateOptions | None = None) -> RecordingVerdict:
     """Judge gyroscope, axes, clock offset and exposure by several frames at once.
 
-    The median decides: a wrong axis still fits the frames in which it hardly turns.
+    The median decides: a wrong axis still fits the frames in which it hardly turns. Where single frames say too little,
+    as short blurs do, all together decide, against what they say of a flipped axis.
 
     Parameters
     ----------
@@ -273,7 +278,7 @@ def judge_recording(evidence: Iterable[BlurEvidence], options: GateOptions | Non
     factor = _mended(together)
     if len(telling) < _FEWEST_FRAMES:
         trusted, reason = None, f"{len(telling)} frames are too few to check the gyroscope against the images"
-    elif median < options.min_recording_support:
+    elif median < options.min_recording_support and not _clear_together(telling, together):
         trusted = False
         reason = (
             f"the images do not show the blur that the gyroscope predicts ({median:.1f} standard deviations in the "
@@ -281,10 +286,22 @@ def judge_recording(evidence: Iterable[BlurEvidence], options: GateOptions | Non
             "video was not stabilised"
         )
     else:
-        trusted, reason = True, f"the images bear out the gyroscope's blur ({median:.0f} standard deviations)"
+        sigmas = max(median, together.support)
+        trusted, reason = True, f"the images bear out the gyroscope's blur ({sigmas:.0f} standard deviations)"
         if factor != 1.0:
             reason += f", but for its extent, which is multiplied by {factor:.2f}"
     return RecordingVerdict(trusted=trusted, support=median, extent_factor=factor, frames=len(telling), reason=reason)
+
+
+def _clear_together(telling: Sequence[BlurEvidence], together: BlurEvidence) -> bool:
+    """Whether many frames, of which none says much, bear the gyroscope out, and no flipped axis."""
+    if together.support - max(0.0, together.mirrored_support) < _TOGETHER_SUPPORT or not together.extent_is_plausible:
+        return False
+    votes = [
+        one.support - one.mirrored_support for one in telling if one.support >= _VOTE or one.mirrored_support >= _VOTE
+    ]
+    against = sum(vote < -1 for vote in votes)
+    return len(votes) - against >= max(_FEWEST_FRAMES, 3 * against)
 
 
 def _mended(evidence: BlurEvidence) -> float:
@@ -307,7 +324,7 @@ def _judge(
     own = _support(evidence) if evidence.enough else 0.0
     if recording is not None and recording.trusted:
         long_px = float(np.percentile(blur.extent_px(), 90))
-        if evidence.enough and own < 0 and long_px >= _MUST_SHOW_PX:
+        if evidence.enough and own < 0 and long_px >= MUST_SHOW_PX:
             return None, "the image does not show the blur that the gyroscope predicts, though other frames do"
         return recording.extent_factor, recording.reason
     if not evidence.enough:

@@ -12,7 +12,14 @@ import numpy as np
 
 from colmap_inertial.errors import InertialError, NotObservableError
 from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence
-from colmap_inertial.imaging.gate import FrameDecision, GateOptions, RecordingVerdict, decide, judge_recording
+from colmap_inertial.imaging.gate import (
+    MUST_SHOW_PX,
+    FrameDecision,
+    GateOptions,
+    RecordingVerdict,
+    decide,
+    judge_recording,
+)
 from colmap_inertial.imaging.psf import blur_field, predicted_blur_px
 from colmap_inertial.imaging.rolling_shutter import rectify_image
 from colmap_inertial.io.calibration import SHARED_CLOCK_OFFSET_S, SMALLEST_READOUT_S
@@ -272,7 +279,7 @@ def _with_decisions(plan: ImagingPlan, view: GyroView, capture: Capture, progres
         progress("blur", len(evidence), len(chosen))
         evidence.append(blur_evidence(frame.image, blur_field(motion, camera, view.shutter(index[frame.name]))))
     progress("blur", len(chosen), len(chosen))
-    verdict = _by_frame(judge_recording(evidence), evidence)
+    verdict = _by_frame(judge_recording(evidence), evidence, [d.blur_px or 0.0 for d in chosen])
     note = f"{sum(d.action == 'deblur' for d in decisions)} of {len(decisions)} frames are blurred; {verdict.reason}"
     return replace(plan, deblur=(decisions, verdict), deblur_note=note)
 
@@ -289,12 +296,14 @@ def _keeping_ends(decisions: tuple[FrameDecision, ...]) -> tuple[FrameDecision, 
     )
 
 
-def _by_frame(verdict: RecordingVerdict, evidence: Sequence[BlurEvidence]) -> RecordingVerdict:
+def _by_frame(
+    verdict: RecordingVerdict, evidence: Sequence[BlurEvidence], blur_px: Sequence[float]
+) -> RecordingVerdict:
     """The verdict, unless only some of the frames bear it out: then every frame must do so by itself.
 
     So it is where the camera moves close to things: they blur by translation, too, which no gyroscope feels.
     """
-    telling = [one for one in evidence if one.enough]
+    telling = [one for one, px in zip(evidence, blur_px, strict=True) if one.enough and px >= MUST_SHOW_PX]
     least = GateOptions().min_support
     shown = sum(one.support >= least and one.extent_is_plausible for one in telling)
     if verdict.trusted is not True or shown >= _MOST_OF_THEM * len(telling):
