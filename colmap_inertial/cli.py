@@ -212,6 +212,41 @@ class Align:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Diagnose:
+    """What is wrong with a recording, and what to do, before any reconstruction.
+
+    Exit code 1 when something makes a scale wrong or impossible, 0 when nothing is worse than a warning.
+
+    Example: colmap-inertial diagnose my_capture/capture.toml --json findings.json
+    """
+
+    source: Positional[Path]
+    """A capture, COLMAP model folder, TUM trajectory, InertialScale folder, or IMU recording."""
+    json: Path | None = None
+    """Where to write the findings."""
+    imu: Path | None = None
+    """IMU recording of a model or trajectory: a file or folder of a known format, or a capture.toml."""
+    frame_times: Path | None = None
+    """When the images were taken: a CSV with columns name,t_s, or a capture.toml."""
+    calibration: Path | None = None
+    """A calibration file of this device, used as a prior."""
+
+    def run(self) -> int:
+        """Run the command; returns the exit code."""
+        from colmap_inertial.pipeline.preflight import diagnose_source
+        from colmap_inertial.pipeline.sources import ScaleSource
+        from colmap_inertial.pipeline.terminal import live_progress, show_diagnosis
+
+        source = ScaleSource(
+            source=self.source, imu=self.imu, frame_times=self.frame_times, calibration=self.calibration
+        )
+        with live_progress() as progress:
+            found = diagnose_source(source, json=self.json, progress=progress)
+        show_diagnosis(found, self.source)
+        return 1 if found.worst == "error" else 0
+
+
+@dataclass(frozen=True, kw_only=True)
 class Validate:
     """Compare the size of a model with a target of known size in its images.
 
@@ -383,12 +418,13 @@ class Simulate:
         return 0
 
 
-Command = Reconstruct | Scale | Apply | Align | Validate | Deblur | Batch | Simulate
+Command = Reconstruct | Scale | Apply | Align | Diagnose | Validate | Deblur | Batch | Simulate
 _COMMANDS: dict[str, type[Command]] = {
     "reconstruct": Reconstruct,
     "scale": Scale,
     "apply": Apply,
     "align": Align,
+    "diagnose": Diagnose,
     "validate": Validate,
     "deblur": Deblur,
     "batch": Batch,

@@ -27,17 +27,32 @@ class FormatError(InertialError):
         What is wrong and what to do.
     line
         One-based line number, where the file has lines.
+    code
+        Stable name of what is wrong, where it is one of the things that recordings often have.
     """
 
-    def __init__(self, path: Path | str, reason: str, *, line: int | None = None) -> None:
+    def __init__(self, path: Path | str, reason: str, *, line: int | None = None, code: str = "unreadable") -> None:
         self.path = Path(path)
         self.reason = reason
         self.line = line
+        self.code = code
         super().__init__(f"{path}{'' if line is None else f', line {line}'}: {reason}")
 
 
 class TimingError(InertialError):
-    """Time stamps are missing, out of order, or do not fit together."""
+    """Time stamps are missing, out of order, or do not fit together.
+
+    Parameters
+    ----------
+    message
+        Where, what is wrong and what to do.
+    code
+        Stable name of what is wrong, as of :class:`FormatError`.
+    """
+
+    def __init__(self, message: str, *, code: str = "untimed") -> None:
+        self.code = code
+        super().__init__(message)
 
 
 class OutputError(InertialError):

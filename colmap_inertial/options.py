@@ -159,6 +159,8 @@ class ReconstructOptions:
     """Seed of COLMAP's random sampling."""
     calibration: Path | None = None
     """A calibration file of this device (from `colmap-inertial align --out`), used as a prior."""
+    force: bool = False
+    """Go on where the check beforehand finds what makes metres meaningless; the verdict is then at most weak."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.seed < 2**31:

@@ -40,7 +40,9 @@ def test_the_documented_example_is_read(tmp_path: Path) -> None:
     tables = re.sub(r'\nfile = "phone_calibration.json".*?\n', "\n", tables)
     capture = load_capture(write(tmp_path, tables))
     assert isinstance(capture.imu, ImuTables)
-    assert capture.frames == ImageFolder(folder=tmp_path / "frames", pattern="*_0.jpg", times="name", time_unit="ns")
+    assert capture.frames == ImageFolder(
+        folder=tmp_path / "frames", pattern="*_0.jpg", times="name", time_unit="ns", video=tmp_path / "clip.mp4"
+    )
     assert capture.exposure_s == 0.004 and capture.readout_s == 0.021 and not capture.shared_clock
     assert capture.camera is not None and capture.camera.params[:4] == (1500, 1500, 960, 540)
     assert capture.target == "checkerboard:8x6:0.03"

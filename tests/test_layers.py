@@ -21,7 +21,7 @@ ORDER = [
     ("align", "smooth"),
     ("scale",),
     ("model",),
-    ("validate",),
+    ("validate", "diagnose"),
     ("pipeline",),
     ("simulate", "batch"),
     ("cli",),

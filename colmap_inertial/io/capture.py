@@ -10,6 +10,7 @@ may be left out. Nothing is guessed: a unit, axis or time that a file does not s
     pattern = "*_0.jpg"             # default: every picture in the folder
     times = "name"                  # the number in each file name is its time; or a CSV file: "frames.csv"
     time_unit = "ns"                # s, ms, us, ns; for a CSV only where its header does not say
+    video = "clip.mp4"              # optional: the frames were cut from it; "diagnose" finds them there
 
     [video]                         # ... or a video; its own presentation stamps time the frames. A video with an IMU
     file = "clip.mp4"               # inside (GoPro, CAMM) needs no more than: video = "GX010001.MP4"
@@ -116,12 +117,15 @@ class ImageFolder:
         ``"name"`` or a CSV file; ``None`` where nothing was said.
     time_unit
         Of the names, or of the CSV where its header does not say.
+    video
+        What the pictures were cut from, where known; only ``diagnose`` looks at it.
     """
 
     folder: Path
     pattern: str | None = None
     times: Literal["name"] | Path | None = None
     time_unit: str | None = None
+    video: Path | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -283,12 +287,13 @@ def _images(table: Section) -> ImageFolder:
     pattern = table.text("pattern")
     times: Literal["name"] | Path | None = "name" if table.text("times") == "name" else table.file("times")
     unit = table.choice("time_unit", TIME_UNITS_NS)
+    video = table.file("video")
     if times == "name" and unit is None:
         table.fail("times", f'"name" needs time_unit, one of {", ".join(TIME_UNITS_NS)}')
     if pattern is not None and (Path(pattern).is_absolute() or ".." in Path(pattern).parts):
         table.fail("pattern", f"must stay inside folder, found {pattern!r}")
     table.finish()
-    return ImageFolder(folder=folder, pattern=pattern, times=times, time_unit=unit)
+    return ImageFolder(folder=folder, pattern=pattern, times=times, time_unit=unit, video=video)
 
 
 def _video_of(root: Section) -> Video | None:

@@ -15,7 +15,7 @@ from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.capture_tables import ImuPath
 from colmap_inertial.io.mp4 import is_mp4, read_movie
 from colmap_inertial.io.plausible import check_plausible
-from colmap_inertial.io.units import DeclaredUnits
+from colmap_inertial.io.units import Axes, DeclaredUnits
 from colmap_inertial.types import FrameLog, ImuRecording
 
 
@@ -67,12 +67,48 @@ def read_imu(path: Path, *, format: str = "auto") -> ImuRecording:
     TimingError
         Where its stamps run backwards or cannot be in the stated unit.
     """
+    raw = read_raw_imu(path, format=format)
+    raw.check()
+    return raw.imu
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RawImu:
+    """A recording whose numbers nobody has checked.
+
+    Attributes
+    ----------
+    imu
+        In SI units, as far as the units are those that were declared.
+    path, accel_path
+        Where it came from, for messages.
+    gyro_axes, accel_axes
+        Mappings of axes that were applied.
+    """
+
+    imu: ImuRecording
+    path: Path
+    accel_path: Path
+    gyro_axes: Axes | None = None
+    accel_axes: Axes | None = None
+
+    def check(self) -> None:
+        """Refuse numbers that cannot be rad/s and m/s2 of a working IMU; see :func:`check_plausible`."""
+        check_plausible(
+            self.imu,
+            self.path,
+            accel_path=self.accel_path,
+            gyro_axes=self.gyro_axes,
+            accel_axes=self.accel_axes,
+        )
+
+
+def read_raw_imu(path: Path, *, format: str = "auto") -> RawImu:
+    """As :func:`read_imu`, without looking whether the numbers are plausible: for those who look themselves."""
     path = Path(path)
     if format == "capture" or (format == "auto" and is_capture(path)):
-        return read_capture_imu(load_capture(path))
-    imu = _read_plain(path, format, DeclaredUnits())
-    check_plausible(imu, path)
-    return imu
+        return read_raw_capture_imu(load_capture(path))
+    return RawImu(imu=_read_plain(path, format, DeclaredUnits()), path=path, accel_path=path)
 
 
 def read_frame_log(path: Path, *, format: str = "auto") -> FrameLog | None:
@@ -99,6 +135,13 @@ def read_frame_log(path: Path, *, format: str = "auto") -> FrameLog | None:
 
 def read_capture_imu(capture: Capture) -> ImuRecording:
     """The inertial recording of a capture, as :func:`read_imu` gives it."""
+    raw = read_raw_capture_imu(capture)
+    raw.check()
+    return raw.imu
+
+
+def read_raw_capture_imu(capture: Capture) -> RawImu:
+    """The inertial recording of a capture, as :func:`read_raw_imu` gives it."""
     source = capture.imu
     if source is None:
         raise FormatError(capture.path, "describes no inertial recording; add [imu] with path = ...")
@@ -116,8 +159,7 @@ def read_capture_imu(capture: Capture) -> ImuRecording:
         accel_m_s2=imu.accel_m_s2 if source.accel_axes is None else source.accel_axes.apply(imu.accel_m_s2),
         noise=imu.noise if source.noise is None else source.noise,
     )
-    check_plausible(imu, path, accel_path=accel_path, gyro_axes=source.gyro_axes, accel_axes=source.accel_axes)
-    return imu
+    return RawImu(imu=imu, path=path, accel_path=accel_path, gyro_axes=source.gyro_axes, accel_axes=source.accel_axes)
 
 
 def is_capture(path: Path) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -50,24 +51,68 @@ def check_plausible(
         the other's. The message says what was found, what is expected, and what to write in capture.toml.
     """
     accel_path = path if accel_path is None else accel_path
-    check_alive(imu.gyro_rad_s, "gyro", path)
-    if not imu.has_accel:
-        check_rates(imu.gyro_rad_s, path)
+    for problem in find_implausible(imu, path, accel_path=accel_path, gyro_axes=gyro_axes, accel_axes=accel_axes):
+        raise problem
+
+
+def find_implausible(
+    imu: ImuRecording,
+    path: Path,
+    *,
+    accel_path: Path | None = None,
+    gyro_axes: Axes | None = None,
+    accel_axes: Axes | None = None,
+) -> Iterator[FormatError]:
+    """Everything that :func:`check_plausible` would refuse a recording for, each with a code; parameters as there.
+
+    What follows from a fault that was found already is not looked for: axes are compared in right units only.
+    """
+    accel_path = path if accel_path is None else accel_path
+    lengths = np.linalg.norm(imu.accel_m_s2, axis=1)
+    found = False
+    for problem in (
+        _problem(check_alive, imu.gyro_rad_s, "gyro", path),
+        _problem(check_alive, imu.accel_m_s2, "accel", accel_path) if imu.has_accel else None,
+        _problem(check_exchanged, imu, path) if imu.has_accel else None,
+    ):
+        if problem is not None:
+            found = True
+            yield problem
+    if found:
         return
-    check_alive(imu.accel_m_s2, "accel", accel_path)
+    for problem in (
+        _problem(check_gravity, lengths, accel_path) if imu.has_accel else None,
+        _problem(check_rates, imu.gyro_rad_s, path),
+    ):
+        if problem is not None:
+            found = True
+            yield problem
+    if not found and imu.has_accel:
+        problem = _problem(check_consistent, imu, path, gyro_axes=gyro_axes, accel_axes=accel_axes)
+        if problem is not None:
+            yield problem
+
+
+def _problem(check: Callable[..., None], /, *args: object, **settings: object) -> FormatError | None:
+    try:
+        check(*args, **settings)
+    except FormatError as error:
+        return error
+    return None
+
+
+def check_exchanged(imu: ImuRecording, path: Path) -> None:
+    """Refuse a gyroscope that feels gravity beside an accelerometer that does not."""
     gyro = float(np.median(np.linalg.norm(imu.gyro_rad_s, axis=1)))
-    accel_lengths = np.linalg.norm(imu.accel_m_s2, axis=1)
-    accel = float(np.median(accel_lengths))
+    accel = float(np.median(np.linalg.norm(imu.accel_m_s2, axis=1)))
     low, high = GRAVITY_BOUNDS_M_S2
     if low < gyro < high and not low < accel < high and accel < LARGEST_MEDIAN_RATE_RAD_S:
         raise FormatError(
             path,
             f"the gyroscope's median length is {gyro:.2f} and the accelerometer's {accel:.2f}: the two sensors are "
             "exchanged; exchange the columns or files of [imu.gyro] and [imu.accel] in capture.toml",
+            code="sensors-exchanged",
         )
-    check_gravity(accel_lengths, accel_path)
-    check_rates(imu.gyro_rad_s, path)
-    check_consistent(imu, path, gyro_axes=gyro_axes, accel_axes=accel_axes)
 
 
 def check_alive(values: Array, quantity: Quantity, path: Path) -> None:
@@ -87,12 +132,14 @@ def check_alive(values: Array, quantity: Quantity, path: Path) -> None:
             path,
             f"the {name} never changes (it reads {np.array2string(values[0], precision=4)} throughout): the sensor is "
             f"dead or was not recorded; record again, or give another file in [imu.{quantity}]",
+            code="dead-sensor",
         )
     axes = " and ".join("xyz"[i] for i in dead)
     raise FormatError(
         path,
         f"the {name}'s {axes} axis never changes (it reads {values[0, dead[0]]:.6g} throughout): the axis is dead or "
         f"the wrong column; check columns of [imu.{quantity}] in capture.toml",
+        code="dead-axis",
     )
 
 
@@ -112,18 +159,27 @@ def check_gravity(lengths_m_s2: Array, path: Path) -> None:
     # Gravity keeps the length near its median; what is left without it comes near zero again and again.
     steady = few > STEADY_SHARE * median
     if steady and low <= median * STANDARD_GRAVITY_M_S2 <= high:
-        raise FormatError(path, f'{found}: the numbers are in g; set unit = "g" under [imu.accel] in capture.toml')
+        raise FormatError(
+            path, f'{found}: the numbers are in g; set unit = "g" under [imu.accel] in capture.toml', code="accel-in-g"
+        )
     if steady and low <= median / STANDARD_GRAVITY_M_S2 <= high:
         raise FormatError(
-            path, f'{found}: m/s2 were converted as if they were g; set unit = "m/s2" under [imu.accel] in capture.toml'
+            path,
+            f'{found}: m/s2 were converted as if they were g; set unit = "m/s2" under [imu.accel] in capture.toml',
+            code="accel-not-in-g",
         )
     if not steady:
         raise FormatError(
             path,
             f"{found}: gravity was taken out (a phone's linear acceleration); give the accelerometer with gravity in "
             "[imu.accel]",
+            code="gravity-removed",
         )
-    raise FormatError(path, f"{found}: the unit is wrong, or these are raw counts; set unit under [imu.accel]")
+    raise FormatError(
+        path,
+        f"{found}: the unit is wrong, or these are raw counts; set unit under [imu.accel]",
+        code="accel-unit",
+    )
 
 
 def check_rates(gyro_rad_s: Array, path: Path) -> None:
@@ -137,6 +193,7 @@ def check_rates(gyro_rad_s: Array, path: Path) -> None:
         f"the gyroscope reads up to {largest:.4g} rad/s, half of the time above {median:.3g} (a hand reaches about 5, "
         f'a sensor ends at {LARGEST_RATE_RAD_S:g}): the numbers are in deg/s; set unit = "deg/s" under [imu.gyro] in '
         "capture.toml",
+        code="gyro-in-deg",
     )
 
 
@@ -153,12 +210,14 @@ def check_consistent(
         raise FormatError(
             path,
             f'{found} if the gyroscope\'s numbers were in deg/s: set unit = "deg/s" under [imu.gyro] in capture.toml',
+            code="gyro-in-deg",
         )
     if best.factor > 1:
         raise FormatError(
             path,
             f'{found} at 57.3 times the rate: rad/s were converted as if they were deg/s; set unit = "rad/s" under '
             "[imu.gyro] in capture.toml",
+            code="gyro-not-in-deg",
         )
     stated = {"gyro": gyro_axes, "accel": accel_axes}
 
@@ -178,7 +237,11 @@ def check_consistent(
         hint += f"; hardly less likely: {setting('gyro', other.matrix)}"
         if np.linalg.det(other.matrix) > 0:
             hint += f", or {setting('accel', -other.matrix.T)}"
-    raise FormatError(path, f"{found} if the gyroscope's axes are {what}: {hint}")
+    raise FormatError(
+        path,
+        f"{found} if the gyroscope's axes are {what}: {hint}",
+        code="axes-mirrored" if what == "mirrored" else "axes-turned",
+    )
 
 
 def _mirroring(matrix: Array) -> str:

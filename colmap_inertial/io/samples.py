@@ -23,6 +23,17 @@ LARGEST_READING = 1e9
 LONGEST_GAP_NS = 3_600_000_000_000
 
 
+class Repair(str):
+    """A sentence on what was repaired, with a stable name of it."""
+
+    code: str
+
+    def __new__(cls, text: str, code: str = "repaired") -> Repair:
+        self = super().__new__(cls, text)
+        self.code = code
+        return self
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Samples:
     """Samples of one sensor, in order.
@@ -71,7 +82,9 @@ def order_samples(
     # Loggers that write sensors of different rates to one table leave the cells of the others empty.
     absent = np.asarray(np.isnan(values).all(axis=1))
     if absent.any():
-        repairs.append(f"{path.name}: {int(absent.sum())} of {len(absent)} rows hold no {what} sample")
+        repairs.append(
+            Repair(f"{path.name}: {int(absent.sum())} of {len(absent)} rows hold no {what} sample", code="empty-cells")
+        )
         t_ns, values, line_numbers = t_ns[~absent], values[~absent], line_numbers[~absent]
     finite = np.asarray((np.abs(values) < LARGEST_READING).all(axis=1))
     if not finite.all():
@@ -79,7 +92,12 @@ def order_samples(
         if missing > HARMLESS_SHARE * len(finite):
             lacking = f"{missing} of {len(finite)} {what} rows lack a value (NaN or empty)"
             raise FormatError(path, lacking, line=first if unit == "line" else None)
-        repairs.append(f"{path.name}: dropped {missing} {what} rows without a value (first: {unit} {first})")
+        repairs.append(
+            Repair(
+                f"{path.name}: dropped {missing} {what} rows without a value (first: {unit} {first})",
+                code="samples-missing",
+            )
+        )
         t_ns, values, line_numbers = t_ns[finite], values[finite], line_numbers[finite]
     if len(t_ns) < 2:
         raise FormatError(path, f"holds {len(t_ns)} {what} samples; at least two are needed")
@@ -89,14 +107,21 @@ def order_samples(
     if late_ns.any():
         worst = int(np.argmax(late_ns))
         if (np.diff(t_ns) < 0).mean() > 0.5:
-            raise TimingError(f"{path}: {what} stamps run backwards; is the file written in reverse order?")
+            raise TimingError(
+                f"{path}: {what} stamps run backwards; is the file written in reverse order?", code="stamps-reversed"
+            )
         if late_ns[worst] > LATEST_ARRIVAL_NS:
             first = int(np.argmax(late_ns > LATEST_ARRIVAL_NS))
             raise TimingError(
                 f"{path}, {unit} {line_numbers[first]}: the {what} stamp is {late_ns[first] * 1e-9:.3f} s behind one "
-                "before it; the clock was set back or a stamp is damaged: split or correct the file there"
+                "before it; the clock was set back or a stamp is damaged: split or correct the file there",
+                code="stamps-jump-back",
             )
-        repairs.append(f"{path.name}: sorted {int((late_ns > 0).sum())} {what} rows that came late")
+        repairs.append(
+            Repair(
+                f"{path.name}: sorted {int((late_ns > 0).sum())} {what} rows that came late", code="stamps-reordered"
+            )
+        )
         order = np.argsort(t_ns, kind="stable")
         t_ns, values, line_numbers = t_ns[order], values[order], line_numbers[order]
 
@@ -127,12 +152,18 @@ def _merge(
         line = int(line_numbers[1 + np.argmax(differs)])
         raise TimingError(
             f"{path}, {unit} {line}: {n_different} of {len(t_ns)} {what} samples repeat the stamp before them with "
-            "other values; the stamps are too coarse, or this is not the time column"
+            "other values; the stamps are too coarse, or this is not the time column",
+            code="stamps-too-coarse",
         )
     if n_equal:
-        repairs.append(f"{path.name}: merged {n_equal} repeated {what} rows")
+        repairs.append(Repair(f"{path.name}: merged {n_equal} repeated {what} rows", code="stamps-repeated"))
     if n_different:
-        repairs.append(f"{path.name}: averaged {n_different} {what} rows that repeat a stamp with other values")
+        repairs.append(
+            Repair(
+                f"{path.name}: averaged {n_different} {what} rows that repeat a stamp with other values",
+                code="stamps-repeated",
+            )
+        )
     merged = values[first]
     mixed = np.unique(group[1:][differs])
     if len(mixed):
@@ -157,11 +188,13 @@ def check_rate(path: Path, what: str, t_ns: NDArray[np.int64]) -> None:
         direction = "smaller" if median_s > 1 / low else "larger"
         raise TimingError(
             f"{path}: {what} samples lie {median_s:.3g} s apart, which no IMU does; the stamps are probably in a "
-            f"{direction} unit: set time_unit in capture.toml"
+            f"{direction} unit: set time_unit in capture.toml",
+            code="time-unit",
         )
     longest = int(np.argmax(steps))
     if steps[longest] > LONGEST_GAP_NS:
         raise TimingError(
             f"{path}: the {what} pauses for {steps[longest] * 1e-9:.0f} s after {(t_ns[longest] - t_ns[0]) * 1e-9:.3f} "
-            "s; a stamp is damaged, or this is more than one recording"
+            "s; a stamp is damaged, or this is more than one recording",
+            code="stamps-damaged",
         )

@@ -77,18 +77,22 @@ def read_inertial_scale(folder: Path) -> tuple[CameraTrajectory, ImuRecording]:
     """
     folder = Path(folder)
     imu = read_imu(folder)
+    return read_inertial_scale_poses(folder), imu
+
+
+def read_inertial_scale_poses(folder: Path) -> CameraTrajectory:
+    """The ``poses.txt`` of an InertialScale folder alone; see :func:`read_inertial_scale`."""
     table = read_table(folder / "poses.txt")
     _require_width(table, "t_ns x y z qw qx qy qz")
     numbers = _finite(table, [1, 2, 3, 5, 6, 7, 4])
     t_ns = _increasing(table, table.stamps_ns(0, "ns"))
-    trajectory = CameraTrajectory(
+    return CameraTrajectory(
         names=tuple(map(str, range(len(t_ns)))),
         t_s=seconds(t_ns, int(t_ns[0])),
         cam_from_world_xyzw=_unit(table, numbers[:, 3:]),
         cam_in_world=numbers[:, :3],
         epoch_ns=int(t_ns[0]),
     )
-    return trajectory, imu
 
 
 def _require_width(table: Table, layout: str) -> None:

@@ -18,7 +18,6 @@ from colmap_inertial.io.calibration import SHARED_CLOCK_OFFSET_S, for_another_re
 from colmap_inertial.io.capture import Capture, Video, load_capture
 from colmap_inertial.io.files import write_json, write_text
 from colmap_inertial.io.frames import frame_source, read_frames
-from colmap_inertial.io.imu import read_capture_imu
 from colmap_inertial.model import Model, find_models, read_model, summarize
 from colmap_inertial.options import ReconstructOptions
 from colmap_inertial.pipeline.colmap import (
@@ -44,6 +43,7 @@ from colmap_inertial.pipeline.imaging import (
     write_rectified,
 )
 from colmap_inertial.pipeline.metric import MetricStage, ModelStage, write_trajectory
+from colmap_inertial.pipeline.preflight import preflight, read_checked_imu, stop_or_doubt
 from colmap_inertial.pipeline.readout import ReadoutStage
 from colmap_inertial.pipeline.result import ModelResult, ReconstructResult, result_as_json
 from colmap_inertial.pipeline.stages import DeblurStage, GyroView, RollingShutterStage
@@ -75,11 +75,17 @@ def prior_calibration(capture: Capture, options: ReconstructOptions) -> CameraIm
 
 
 def default_model_stages(
-    capture: Capture, imu: ImuRecording, options: ReconstructOptions, *, rectified: bool = False
+    capture: Capture,
+    imu: ImuRecording,
+    options: ReconstructOptions,
+    *,
+    rectified: bool = False,
+    doubts: Sequence[str] = (),
 ) -> list[ModelStage]:
     """What ``reconstruct`` runs when ``model_stages`` is ``None``: a starting point for one's own list.
 
     With ``rectified`` keypoints, the model is that of a global shutter, once the camera's translation is undone, too.
+    With ``doubts`` about the recording, no scale is trusted.
     """
     scale = options.scale
     if capture.shared_clock and scale.max_offset_s is None:
@@ -87,7 +93,7 @@ def default_model_stages(
     calibration = prior_calibration(capture, options)
     if rectified:
         calibration = for_rectified(calibration)
-    metric = MetricStage(imu=imu, calibration=calibration, options=scale, world=options.world)
+    metric = MetricStage(imu=imu, calibration=calibration, options=scale, world=options.world, doubts=tuple(doubts))
     if not rectified:
         return [metric]
     refine = options.mapping.refine_intrinsics
@@ -144,12 +150,14 @@ def reconstruct(
     MappingError
         When COLMAP finds no model.
     NotObservableError
-        When deblurring or rectifying was asked for by name, and the gyroscope does not belong to the pixels.
+        When the recording cannot give metres, as a stabilised video (``options.force`` goes on); when deblurring or
+        rectifying was asked for by name, and the gyroscope does not belong to the pixels.
     """
     loaded = load_capture(capture)
     if loaded.frames is None:
         raise FormatError(loaded.path, "has no frames: add [images] or [video]")
-    imu = read_capture_imu(loaded)
+    raw = read_checked_imu(loaded, force=options.force)
+    imu = raw.imu
     if loaded.target is not None:
         parse_target(loaded.target)  # a wrong specification is said before the work, not after it
     timing, frames = read_frames(loaded)
@@ -157,12 +165,13 @@ def reconstruct(
     require_frames(len(timing.names), of=len(timing.names))
     gravity = _gravity_priors(loaded, imu, timing, options)
     check_names(timing.names)
-    prior_calibration(loaded, options)  # likewise
+    prior = prior_calibration(loaded, options)  # likewise
     workspace = Workspace(out)
     workspace.open(loaded.path)
     with workspace.locked(), logging_to(workspace.log):
         log.info("colmap-inertial %s: %s -> %s", __version__, capture, out)
         write_text(workspace.config, config_as_toml(options))
+        doubts = stop_or_doubt(preflight(loaded, raw, timing, prior, progress), force=options.force)
         runner = StageRunner(workspace)
         plan = run_plan(runner, workspace, loaded, imu, timing, options, progress)
         of_frames = list(plan.frame_stages() if frame_stages is None else frame_stages)
@@ -173,7 +182,7 @@ def reconstruct(
         rectifying = [stage for stage in of_keypoints if isinstance(stage, RollingShutterStage)]
         run_rectified(runner, workspace, records, rectifying, progress)
         stages = (
-            default_model_stages(loaded, imu, options, rectified=bool(rectifying))
+            default_model_stages(loaded, imu, options, rectified=bool(rectifying), doubts=doubts)
             if model_stages is None
             else list(model_stages)
         )

@@ -50,18 +50,23 @@ class MetricStage:
         Of the scale estimate.
     world
         Where gravity points in the metric model.
+    doubts
+        What was found wrong with the recording beforehand; with any of them, no scale is trusted.
     """
 
     imu: ImuRecording
     calibration: CameraImuCalibration | None
     options: ScaleOptions
     world: WorldAxes
+    doubts: tuple[str, ...] = ()
 
     def __call__(self, model: Model, /) -> Model:
         """Estimate and apply the scale."""
         trajectory, notes = trajectory_from_model(read_model(model.folder), model.timing)
         estimate = estimate_scale(trajectory, self.imu, calibration=self.calibration, options=self.options)
-        estimate = dataclasses.replace(estimate, reasons=(*estimate.reasons, *self.imu.repairs, *notes))
+        estimate = dataclasses.replace(estimate, reasons=(*self.doubts, *estimate.reasons, *self.imu.repairs, *notes))
+        if self.doubts and estimate.verdict == "trusted":
+            estimate = dataclasses.replace(estimate, verdict="weak")
         if estimate.verdict == "refused":
             return dataclasses.replace(model, scale=estimate)
         similarity = Similarity.from_scale(

@@ -87,7 +87,7 @@ def load_source(source: ScaleSource) -> Recording:
         if times is None or (source.frame_times is None and not is_capture(times)):
             raise FormatError(path, "a COLMAP model has no frame times: give --frame-times, a CSV with name,t_s")
         timing = read_frame_times(times)
-        folder = _only_model(path)
+        folder = only_model(path)
         trajectory, notes = trajectory_from_model(read_model(folder), timing)
         start_s = float(timing.pose_t_s()[0])
         if is_metric(folder):
@@ -106,7 +106,7 @@ def load_source(source: ScaleSource) -> Recording:
     )
 
 
-def _only_model(path: Path) -> Path:
+def only_model(path: Path) -> Path:
     models = find_models(path)
     if len(models) > 1:
         raise FormatError(
@@ -115,7 +115,7 @@ def _only_model(path: Path) -> Path:
     return next(iter(models.values()))
 
 
-def _check_output(path: Path, inputs: Sequence[Path | None]) -> None:
+def check_output(path: Path, inputs: Sequence[Path | None]) -> None:
     """Refuse, before any work, an output that would replace anything but an earlier result of ours.
 
     Raises
@@ -132,7 +132,7 @@ def _check_output(path: Path, inputs: Sequence[Path | None]) -> None:
             raise OutputExistsError(f"{path} is an input; choose another name for the result")
     if path.exists():
         try:
-            ours = {"metres_per_unit", "cam_from_imu_xyzw"} & set(read_json(path))
+            ours = {"metres_per_unit", "cam_from_imu_xyzw", "findings"} & set(read_json(path))
         except FormatError:
             ours = set()
         if not ours:
@@ -147,7 +147,7 @@ def align_source(source: ScaleSource, out: Path) -> CameraImuCalibration:
     NotObservableError
         Where no offset between the clocks is better than the rest, or the camera hardly turned.
     """
-    _check_output(out, [source.source, source.imu, source.frame_times])
+    check_output(out, [source.source, source.imu, source.frame_times])
     recording = load_source(source)
     options = AlignOptions(max_offset_s=SHARED_CLOCK_OFFSET_S if recording.shared_clock else None)
     found = align_camera_imu(recording.trajectory, recording.imu, prior=recording.calibration, options=options)
@@ -178,7 +178,7 @@ def scale_source(
     latitude_deg
         Sets ``options.gravity_m_s2``.
     """
-    _check_output(json, [source.source, source.imu, source.frame_times, source.calibration])
+    check_output(json, [source.source, source.imu, source.frame_times, source.calibration])
     if latitude_deg is not None:
         if options.gravity_m_s2 != ScaleOptions().gravity_m_s2:
             raise InertialError("--gravity-m-s2 and --latitude-deg both set the strength of gravity; give one of them")
@@ -226,14 +226,14 @@ def validate_source(
     """
     parsed = parse_target(target)
     if json is not None:
-        _check_output(json, [model])
+        check_output(json, [model])
     if pictures is not None and pictures.exists() and not (pictures.is_dir() and not any(pictures.iterdir())):
         raise OutputExistsError(f"{pictures} exists; name a new folder for the pictures")
     if apply is not None and apply.exists():
         raise OutputExistsError(f"{apply} exists; name a new folder for the metric model")
     if apply is not None and not options.unscaled:
         raise InertialError("--apply scales a model that claims no unit: add --unscaled")
-    folder = _only_model(model)
+    folder = only_model(model)
     result = validate_model(folder, images, parsed, options)
     if apply is not None:
         if result.control is None:

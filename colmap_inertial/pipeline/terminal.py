@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from colmap_inertial.diagnose import Diagnosis
 from colmap_inertial.errors import InertialError
 from colmap_inertial.model.project import Applied
 from colmap_inertial.pipeline import ReconstructResult
@@ -33,6 +34,7 @@ _STAGES = {
     "apply": "Files",
     "dense": "Dense",
 }
+_SEVERITY_COLOUR = {"info": "blue", "warning": "yellow", "error": "red"}
 _COLOUR = {"trusted": "green", "weak": "yellow", "refused": "red"}
 
 
@@ -136,6 +138,27 @@ def show_calibration(calibration: CameraImuCalibration, source: Path) -> None:
             ("Gyro bias", f"{bias} rad/s, +-{bias_spread:.2g}"),
         ],
     )
+
+
+def show_diagnosis(diagnosis: Diagnosis, source: Path) -> None:
+    """Print findings, worst first."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    checked = ", ".join(diagnosis.checked) or "nothing"
+    console = Console()
+    if not diagnosis.findings:
+        console.print(f"{escape(str(source))}: nothing found (looked at: {checked})")
+        return
+    table = Table(title=f"{escape(str(source))} (looked at: {checked})", title_justify="left", show_lines=True)
+    for column in ("Severity", "Code", "Found", "What to do"):
+        table.add_column(column, overflow="fold", no_wrap=column in ("Severity", "Code"))
+    for finding in diagnosis.findings:
+        colour = _SEVERITY_COLOUR[finding.severity]
+        severity = f"[bold {colour}]{finding.severity}[/]"
+        table.add_row(severity, finding.code, escape(finding.evidence), escape(finding.advice))
+    console.print(table)
 
 
 def show_validation(result: Validation) -> None:

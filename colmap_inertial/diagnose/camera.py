@@ -1,0 +1,350 @@
+"""The camera against the gyroscope: do they belong together, at one rate, in one set of axes?"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from colmap_inertial.align import Alignment
+from colmap_inertial.diagnose.findings import Finding, Recorded, Severity
+from colmap_inertial.errors import NotObservableError
+from colmap_inertial.flow import find_stabilisation
+from colmap_inertial.geometry import quat_conjugate, quat_log, quat_multiply, quat_rotate, so3_log
+from colmap_inertial.imaging.gyro_camera import GyroCamera
+from colmap_inertial.types import Array, CameraTrajectory, ImuRecording
+
+#: Clock rates: phones keep within 1e-4, action cameras within 1 %; the scale is corrected for what is found.
+_RATE, _WRONG_RATE = 0.003, 0.012
+#: Intervals over which rotations are compared, and how strong the axis must be that turns the wrong way.
+_INTERVAL_S, _MIRROR_SHARE = 0.1, 0.03
+#: Rates beyond what an alignment follows, which are tried where it finds nothing.
+_TRIED_RATES = (0.02, -0.02, 0.03, -0.03, 0.04, -0.04)
+#: A recording that is shorter may simply not have turned enough.
+_ENOUGH_S = 8.0
+#: The IMU may miss so many frames, and this share of them; below the last, too little is left.
+_SLACK_FRAMES, _SLACK_SHARE, _LEAST_COVERED = 2.0, 0.03, 0.25
+#: A camera-IMU rotation known better than the first, and off by more than the second, is declared wrongly.
+_KNOWN_ROTATION_RAD, _OTHER_ROTATION_RAD = 0.2, 0.35
+#: Parts whose offsets are compared, how far they may be off, and how sharp a part's best offset must be.
+_PART_S, _PART_REACH_S, _PART_STEP_S, _UNEVEN_S, _PART_EXPLAINED = 3.0, 0.4, 0.01, 0.05, 0.6
+#: Quick rotation in the picture per rotation felt; translation is slow against it.
+_QUICK_S, _GAIN_OFF, _GAIN_SIGMA, _LEAST_QUICK_RAD_S = 0.5, 0.1, 0.03, 0.03
+#: Visual acceleration: window of the quadratics, and the correlation that tells its sign.
+_ACCELERATION_S, _OPPOSITE = 0.5, -0.3
+
+
+_MIRRORED = Finding(
+    code="gyro-mirrored",
+    severity="error",
+    evidence="the gyroscope fits the camera's rotation better when it is mirrored",
+    advice='give the axes of both sensors in capture.toml, for example axes = "-x,y,z" and mirrored = true under '
+    "[imu.gyro] and [imu.accel]",
+)
+
+
+def check_belonging(recorded: Recorded) -> Iterator[Finding]:
+    """Whether at some offset the gyroscope turns as the camera does; if not, whether it would, read otherwise."""
+    failed, imu, turning = recorded.aligned, recorded.imu, recorded.turning
+    if isinstance(failed, Alignment) and imu is not None and turning is not None:
+        if _is_mirrored(turning, imu, failed):
+            yield _MIRRORED
+        return
+    if not isinstance(failed, NotObservableError) or imu is None or turning is None:
+        return
+    if recorded.log is not None and recorded.log.stabilised:
+        return
+    if failed.quantity != "time offset":
+        yield Finding(
+            code="rotation-too-little",
+            severity="warning",
+            evidence=failed.hint,
+            advice="turn the camera about all three axes while recording; clocks and axes cannot be checked without",
+        )
+        return
+    if isinstance(recorded.align(replace(imu, gyro_rad_s=-imu.gyro_rad_s)), Alignment):
+        yield _MIRRORED
+        return
+    for rate in _TRIED_RATES:
+        begin_s = imu.gyro_t_s[0]
+        stretched = replace(imu, gyro_t_s=begin_s + (imu.gyro_t_s - begin_s) * (1 + rate))
+        found = recorded.align(stretched)
+        if isinstance(found, Alignment):
+            yield _rate_finding((1 + rate) * (1 + found.clock_rate) - 1)
+            return
+    span_s = float(np.ptp(turning.t_s))
+    if span_s < _ENOUGH_S:
+        yield Finding(
+            code="offset-undecided",
+            severity="warning",
+            evidence=f"in {span_s:.1f} s no time offset between camera and gyroscope is clearly better than the rest",
+            advice="record ten seconds or more, with rotation about all three axes",
+            numbers={"seconds": span_s},
+        )
+        return
+    yield Finding(
+        code="imu-does-not-fit",
+        severity="error",
+        evidence=failed.hint.split(":")[0],
+        advice="check that this IMU recording belongs to these images, and the gyroscope's columns, axes and unit",
+        numbers={"seconds": span_s},
+    )
+
+
+def _is_mirrored(turning: CameraTrajectory, imu: ImuRecording, aligned: Alignment) -> bool:
+    """Whether rates of camera and IMU are related by a mirror: where one axis hardly turns, a rotation nearly fits."""
+    motion = GyroCamera.of(imu, aligned.calibration, camera_epoch_ns=turning.epoch_ns)
+    step = max(1, round(_INTERVAL_S / float(np.median(np.diff(turning.t_s)))))
+    poses = turning.select(slice(None, None, step))
+    t_s = poses.t_s - aligned.clock_rate * (poses.t_s - aligned.middle_s)
+    pose = poses.cam_from_world_xyzw
+    seen = quat_log(quat_multiply(pose[:-1], quat_conjugate(pose[1:])))
+    looking = motion.start_from_cam(t_s)
+    felt = so3_log(np.swapaxes(looking[:-1], 1, 2) @ looking[1:])
+    usable = motion.covers(t_s[:-1], t_s[1:]) & (np.diff(t_s) < 5 * _INTERVAL_S)
+    if usable.sum() < 20:
+        return False
+    cross = seen[usable].T @ felt[usable]
+    singular = np.linalg.svd(cross, compute_uv=False)
+    return bool(np.linalg.det(cross) < 0 and singular[2] > _MIRROR_SHARE * singular[0])
+
+
+def check_clock_rate(recorded: Recorded) -> Iterator[Finding]:
+    """A camera's clock that runs faster or slower than the IMU's."""
+    aligned = recorded.aligned
+    if isinstance(aligned, Alignment) and abs(aligned.clock_rate) > max(_RATE, 5 * aligned.clock_rate_sigma):
+        yield _rate_finding(aligned.clock_rate)
+
+
+def _rate_finding(rate: float) -> Finding:
+    severity: Severity = "error" if abs(rate) > _WRONG_RATE else "warning"
+    return Finding(
+        code="clock-rate",
+        severity=severity,
+        evidence=f"the camera's clock runs {100 * rate:+.2f} % faster than the IMU's",
+        advice="give times as the recorder stamped them, not a frame number divided by a nominal rate; up to 1 % is "
+        "corrected",
+        numbers={"rate": rate},
+    )
+
+
+def check_coverage(recorded: Recorded) -> Iterator[Finding]:
+    """An IMU that was started late or stopped early."""
+    imu = recorded.imu
+    frames = recorded.timing or recorded.trajectory
+    if imu is None or frames is None or len(frames.t_s) < 3:
+        return
+    sensors = [imu.gyro_t_s, imu.accel_t_s] if imu.has_accel else [imu.gyro_t_s]
+    begin_s, end_s = max(t_s[0] for t_s in sensors), min(t_s[-1] for t_s in sensors)
+    span_s = float(frames.t_s[-1] - frames.t_s[0])
+    slack_s = max(_SLACK_FRAMES * float(np.median(np.diff(frames.t_s))), _SLACK_SHARE * span_s)
+    aligned = recorded.aligned
+    if isinstance(aligned, Alignment):
+        shift_s = aligned.calibration.gyro_time_offset_s + (imu.epoch_ns - frames.epoch_ns) * 1e-9
+        missed_s = max(begin_s + shift_s - frames.t_s[0], 0) + max(frames.t_s[-1] - end_s - shift_s, 0)
+    else:
+        missed_s = span_s - (end_s - begin_s)
+    if missed_s <= slack_s:
+        return
+    share = float(np.clip(1 - missed_s / span_s, 0, 1))
+    yield Finding(
+        code="imu-too-short",
+        severity="error" if share < _LEAST_COVERED else "warning",
+        evidence=f"the IMU runs along with {100 * share:.0f} % of {span_s:.1f} s of frames",
+        advice="start the IMU before the video and stop it after; the scale rests on what both recorded",
+        numbers={"share": share, "frames_s": span_s, "imu_s": float(end_s - begin_s)},
+    )
+
+
+def check_stabilisation(recorded: Recorded) -> Iterator[Finding]:
+    """A picture that was turned against its lens no longer belongs to the gyroscope."""
+    advice = "switch stabilisation off in the camera and record again; the scale of such a video is wrong"
+    if recorded.log is not None and recorded.log.stabilised:
+        said = recorded.log.stabilisation or "stabilisation was on"
+        yield Finding(
+            code="stabilised",
+            severity="error",
+            evidence=f"the recorder says that the video was stabilised in the camera ({said})",
+            advice=advice,
+        )
+        return
+    if recorded.rotation is None or recorded.imu is None:
+        return
+    aligned = recorded.aligned
+    offset_s = None
+    if isinstance(aligned, Alignment):
+        epochs_s = (recorded.imu.epoch_ns - recorded.rotation.epoch_ns) * 1e-9
+        offset_s = aligned.calibration.gyro_time_offset_s + epochs_s
+    told = find_stabilisation(recorded.rotation, recorded.imu, offset_s=offset_s)
+    if told.stabilised and told.share is not None:
+        yield Finding(
+            code="stabilised",
+            severity="error",
+            evidence=f"the pictures hold {100 * told.share:.0f} % of the quick rotation that the gyroscope felt: the "
+            "video was stabilised in the camera",
+            advice=advice,
+            numbers={"share": told.share},
+        )
+
+
+def check_declared_rotation(recorded: Recorded) -> Iterator[Finding]:
+    """The declared rotation between camera and IMU against the one that the pictures show."""
+    aligned, prior = recorded.aligned, recorded.calibration
+    if not isinstance(aligned, Alignment) or prior is None:
+        return
+    sigmas = [max(c.sigma(f"rotation_{axis}_rad") for axis in "xyz") for c in (prior, aligned.calibration)]
+    if max(sigmas) > _KNOWN_ROTATION_RAD:
+        return
+    turn = quat_multiply(aligned.calibration.cam_from_imu_xyzw, quat_conjugate(prior.cam_from_imu_xyzw))
+    angle = float(np.linalg.norm(quat_log(turn)))
+    if angle > _OTHER_ROTATION_RAD + 3 * max(sigmas):
+        yield Finding(
+            code="declared-rotation",
+            severity="error",
+            evidence=f"camera and IMU are turned by {np.degrees(angle):.0f} deg against what is declared",
+            advice="correct cam_from_imu under [calibration]; frames that were turned upright are not in the sensor's "
+            "orientation: cut them without (ffmpeg -noautorotate)",
+            numbers={"angle_deg": float(np.degrees(angle))},
+        )
+
+
+def check_even_times(recorded: Recorded) -> Iterator[Finding]:
+    """Frame times that drift to and fro against the gyroscope, as those counted from a frame rate do."""
+    aligned, imu, turning = recorded.aligned, recorded.imu, recorded.turning
+    if not isinstance(aligned, Alignment) or imu is None or turning is None:
+        return
+    if float(np.median(np.diff(turning.t_s))) > _PART_REACH_S / 2:
+        return
+    motion = GyroCamera.of(imu, aligned.calibration, camera_epoch_ns=turning.epoch_ns)
+    middles, offsets = [], []
+    count = int(np.ptp(turning.t_s) / _PART_S)
+    for begin_s in turning.t_s[0] + _PART_S * np.arange(count):
+        inside = np.flatnonzero((turning.t_s >= begin_s) & (turning.t_s < begin_s + _PART_S))
+        middle_s = begin_s + 0.5 * _PART_S
+        drift_s = aligned.clock_rate * (middle_s - aligned.middle_s)
+        found = _part_offset_s(turning.select(inside), motion, drift_s)
+        if found is not None:
+            middles.append(middle_s)
+            offsets.append(found)
+    if len(offsets) < 3:
+        return
+    off = np.array(offsets)
+    off -= np.median(off)
+    worst = int(np.argmax(np.abs(off)))
+    if abs(off[worst]) > _UNEVEN_S:
+        yield Finding(
+            code="frame-times-uneven",
+            severity="error",
+            evidence=f"against the gyroscope, frame times wander by {1e3 * np.ptp(off):.0f} ms; worst "
+            f"{middles[worst] - turning.t_s[0]:.0f} s after the first frame",
+            advice="time frames by the video's presentation stamps or the recorder's own times, never by counting; "
+            "frames that were dropped or repeated must not shift the rest",
+            numbers={"wander_s": float(np.ptp(off)), "parts": float(len(off))},
+        )
+
+
+def _part_offset_s(part: CameraTrajectory, motion: GyroCamera, drift_s: float) -> float | None:
+    """What must be added to a part's offset so that the gyroscope explains it best."""
+    if len(part) < 8:
+        return None
+    pose = part.cam_from_world_xyzw
+    seen = quat_log(quat_multiply(pose[:-1], quat_conjugate(pose[1:])))
+    shifts = np.arange(-_PART_REACH_S, _PART_REACH_S + 1e-9, _PART_STEP_S)
+    left = np.full(len(shifts), np.inf)
+    for i, shift_s in enumerate(shifts):
+        t_s = part.t_s - drift_s - shift_s
+        if not motion.covers(t_s[:1], t_s[-1:])[0]:
+            continue
+        looking = motion.start_from_cam(t_s)
+        difference = seen - so3_log(np.swapaxes(looking[:-1], 1, 2) @ looking[1:])
+        left[i] = np.median(np.sum((difference - difference.mean(axis=0)) ** 2, axis=1))
+    best = int(np.argmin(left))
+    energy = float(np.median(np.sum((seen - seen.mean(axis=0)) ** 2, axis=1)))
+    if best in (0, len(left) - 1) or not np.isfinite(left[best - 1 : best + 2]).all():
+        return None
+    if left[best] > (1 - _PART_EXPLAINED) * energy:
+        return None
+    return float(shifts[best])
+
+
+def check_focal_length(recorded: Recorded) -> Iterator[Finding]:
+    """A focal length that is too long makes all rotation in the picture too small, about both of its axes."""
+    aligned, rotation, imu, camera = recorded.aligned, recorded.rotation, recorded.imu, recorded.camera
+    if not isinstance(aligned, Alignment) or rotation is None or imu is None or camera is None:
+        return
+    motion = GyroCamera.of(imu, aligned.calibration, camera_epoch_ns=rotation.epoch_ns)
+    known = np.isfinite(rotation.turn_rad).all(axis=1) & motion.covers(rotation.t_s[:-1], rotation.t_s[1:])
+    dt_s = np.diff(rotation.t_s)
+    width = max(3, round(_QUICK_S / float(np.median(dt_s))))
+    if known.sum() < 10 * width:
+        return
+    looking = motion.start_from_cam(rotation.t_s)
+    felt = (so3_log(np.swapaxes(looking[:-1], 1, 2) @ looking[1:]) / dt_s[:, None])[known]
+    seen = (rotation.turn_rad / dt_s[:, None])[known]
+    quick_felt, quick_seen = _quick(felt, width)[:, :2], _quick(seen, width)[:, :2]
+    energy = float(np.sum(quick_felt**2))
+    if np.sqrt(energy / len(quick_felt)) < _LEAST_QUICK_RAD_S:
+        return
+    gain = float(np.sum(quick_seen * quick_felt)) / energy
+    rest = quick_seen - gain * quick_felt
+    sigma = float(np.sqrt(np.mean(rest**2) * width / energy))
+    if abs(gain - 1) > _GAIN_OFF + 2 * sigma and sigma < _GAIN_SIGMA:
+        yield Finding(
+            code="focal-length",
+            severity="error",
+            evidence=f"the pictures turn {gain:.2f} times as far as the gyroscope felt: with the declared focal length "
+            f"of {camera.params[0]:.0f} px, about {camera.params[0] * gain:.0f} px would fit",
+            advice="leave out [camera] to let COLMAP calibrate, or give the intrinsics of this very video mode",
+            numbers={"gain": gain, "gain_sigma": sigma},
+        )
+
+
+def _quick(rate: Array, width: int) -> Array:
+    """What changes faster than the running mean over ``width`` samples."""
+    kernel = np.ones(width) / width
+    slow = np.stack([np.convolve(column, kernel, mode="valid") for column in rate.T], axis=1)
+    start = (width - 1) // 2
+    return np.asarray(rate[start : start + len(slow)] - slow)
+
+
+def check_accelerometer_sign(recorded: Recorded) -> Iterator[Finding]:
+    """Where a reconstruction shows how the camera sped up, the accelerometer must have felt that, not its opposite."""
+    aligned, imu, poses = recorded.aligned, recorded.imu, recorded.trajectory
+    if not isinstance(aligned, Alignment) or imu is None or not imu.has_accel or poses is None:
+        return
+    correlation = acceleration_correlation(poses, imu, aligned)
+    if correlation is not None and correlation < _OPPOSITE:
+        yield Finding(
+            code="accel-flipped",
+            severity="error",
+            evidence="the accelerometer feels the opposite of the camera's acceleration (correlation "
+            f"{correlation:.2f}): its sign is flipped",
+            advice='set axes = "-x,-y,-z" and mirrored = true under [imu.accel] in capture.toml',
+            numbers={"correlation": correlation},
+        )
+
+
+def acceleration_correlation(poses: CameraTrajectory, imu: ImuRecording, aligned: Alignment) -> float | None:
+    """Correlation of visual and inertial acceleration in the world, without what is slow; ``None`` where sparse."""
+    step_s = float(np.median(np.diff(poses.t_s)))
+    half = round(0.5 * _ACCELERATION_S / step_s)
+    if half < 3 or len(poses) < 40 * half:
+        return None
+    shift_s = aligned.calibration.accel_time_offset_s + (imu.epoch_ns - poses.epoch_ns) * 1e-9
+    t_s = poses.t_s - aligned.clock_rate * (poses.t_s - aligned.middle_s) - shift_s
+    time = step_s * np.arange(-half, half + 1)
+    basis = np.stack([np.ones(len(time)), time, time**2], axis=1)
+    second = 2 * np.linalg.pinv(basis)[2][::-1]
+    mean = np.ones(len(time)) / len(time)
+    force = np.stack([np.interp(t_s, imu.accel_t_s, column) for column in imu.accel_m_s2.T], axis=1)
+    world_from_imu = quat_multiply(quat_conjugate(poses.cam_from_world_xyzw), aligned.calibration.cam_from_imu_xyzw)
+    felt = np.stack([np.convolve(c, mean, "valid") for c in quat_rotate(world_from_imu, force).T], axis=1)
+    seen = np.stack([np.convolve(c, second, "valid") for c in poses.cam_in_world.T], axis=1)
+    even = np.abs(poses.t_s[2 * half :] - poses.t_s[: -2 * half] - 2 * half * step_s) < 0.1 * step_s
+    even &= (t_s[half:-half] > imu.accel_t_s[0]) & (t_s[half:-half] < imu.accel_t_s[-1])
+    width = 4 * half
+    felt, seen = _quick(felt[even], width), _quick(seen[even], width)
+    if len(felt) < width:
+        return None
+    return float(np.sum(felt * seen) / max(np.sqrt(np.sum(felt**2) * np.sum(seen**2)), 1e-12))
