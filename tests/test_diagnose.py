@@ -1,6 +1,7 @@
 """What is seeded into clean recordings is found by its code, which is absent from the clean ones."""
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -10,16 +11,24 @@ import av
 import cv2
 import numpy as np
 import pytest
+from conftest import Project
 from far_scene import CAM_FROM_IMU, FarScene
 
 from colmap_inertial.cli import main
 from colmap_inertial.diagnose import Diagnosis, FramesInVideo, Recorded, diagnose
+from colmap_inertial.errors import NotObservableError
 from colmap_inertial.flow import measure_rotation
 from colmap_inertial.geometry import quat_conjugate, quat_exp, quat_multiply, quat_rotate, so3_exp
 from colmap_inertial.imaging.gyro_camera import FrameShutter
 from colmap_inertial.io.calibration import calibration_prior
-from colmap_inertial.io.imu import read_imu
+from colmap_inertial.io.capture import load_capture
+from colmap_inertial.io.frames import read_frame_times
+from colmap_inertial.io.imu import read_capture_imu, read_imu
 from colmap_inertial.io.trajectories import read_inertial_scale
+from colmap_inertial.model import Model
+from colmap_inertial.options import ScaleOptions
+from colmap_inertial.pipeline.metric import MetricStage
+from colmap_inertial.pipeline.preflight import stop_or_doubt
 from colmap_inertial.simulate.motion import MotionKind, MotionOptions
 from colmap_inertial.simulate.recording import RecordingOptions, SimulatedRecording, simulate_recording
 from colmap_inertial.simulate.render import colmap_camera
@@ -477,3 +486,44 @@ def test_pictures_that_were_turned_upright_belie_what_refers_to_the_sensor_s_row
     stored = replace(upright, quarter_turns=0)
     assert found(diagnose(Recorded(in_video=stored)), "rotation-ignored") == "info"
     assert diagnose(Recorded(in_video=replace(stored, container_turn_deg=0))).findings == ()
+
+
+# --- before a reconstruction -----------------------------------------------------------------------------------------
+
+
+def test_a_stabilised_gopro_stops_a_reconstruction_with_the_reason_and_one_that_is_not_goes_on(
+    shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("reconstruct", shared_data / "gopro/max-heromode.mp4", tmp_path / "out") == 3
+    assert "stabilised in the camera (EISE=Y" in " ".join(capsys.readouterr().err.split())
+    for name, codes in (("max-heromode", {"stabilised"}), ("karma", set())):
+        capture = load_capture(shared_data / f"gopro/{name}.mp4")
+        told = diagnose(Recorded(imu=read_capture_imu(capture), log=capture.frame_log, is_capture=True))
+        assert told.codes == codes
+        if codes:
+            with pytest.raises(NotObservableError, match="stabilised"):
+                stop_or_doubt(told, force=False)
+        (doubt,) = stop_or_doubt(told, force=True) or [""]
+        assert ("stabilised" in doubt) == bool(codes)
+
+
+def test_gravity_that_was_removed_stops_a_reconstruction_unless_forced(clean: dict[str, Recording]) -> None:
+    told = diagnose(Recorded(imu=weightless(clean["D3"][1])))
+    with pytest.raises(NotObservableError, match="gravity was taken out"):
+        stop_or_doubt(told, force=False)
+    assert stop_or_doubt(told, force=True)
+
+
+def test_a_forced_scale_is_at_most_weak(project: Project, tmp_path: Path) -> None:
+    timing = read_frame_times(project.frame_times)
+    verdicts = {}
+    for doubts in ((), ("the video was stabilised",)):
+        folder = tmp_path / f"model{len(doubts)}"
+        shutil.copytree(project.model, folder)
+        stage = MetricStage(
+            imu=project.recording.imu, calibration=None, options=ScaleOptions(), world="z-up", doubts=doubts
+        )
+        scale = stage(Model(folder=folder, index=0, timing=timing)).scale
+        assert scale is not None and scale.reasons[: len(doubts)] == doubts
+        verdicts[doubts] = scale.verdict
+    assert list(verdicts.values()) == ["trusted", "weak"]
