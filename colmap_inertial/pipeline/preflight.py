@@ -37,7 +37,7 @@ T = TypeVar("T")
 #: asked to diagnose, and how far apart at least.
 _VIDEO_STEP_S = 0.13
 _FEW, _FEW_SPACING_S = 90, 0.09
-_MANY, _MANY_SPACING_S = 300, 0.03
+_MANY, _MANY_SPACING_S = 400, 0.03
 #: They are not from further in than this: what lies before them must be decoded, too.
 _BEGIN_S = 5.0
 #: Pictures that are looked for in the video they were cut from.
