@@ -330,8 +330,6 @@ def test_what_is_wrong_with_stamps_is_found_through_the_command(
     shared_data: Path, tmp_path: Path, code: str, severity: str, alter: Callable[[np.ndarray], np.ndarray]
 ) -> None:
     source = shared_data / "inertial_scale/D11"
-    assert run("diagnose", written(tmp_path / "clean", source), "--json", tmp_path / "clean.json") == 0
-    assert json.loads((tmp_path / "clean.json").read_text())["findings"] == []
     assert run("diagnose", written(tmp_path / "altered", source, alter), "--json", tmp_path / "found.json") == (
         severity == "error"
     )
@@ -339,6 +337,12 @@ def test_what_is_wrong_with_stamps_is_found_through_the_command(
     assert {f["code"]: f["severity"] for f in told["findings"]}[code] == severity
     assert "poses" in told["checked"]  # what can still be read is read
     assert all(f["evidence"] and f["advice"] for f in told["findings"])
+
+
+def test_nothing_is_found_in_the_same_files_unaltered(shared_data: Path, tmp_path: Path) -> None:
+    folder = written(tmp_path / "clean", shared_data / "inertial_scale/D11")
+    assert run("diagnose", folder, "--json", tmp_path / "clean.json") == 0
+    assert json.loads((tmp_path / "clean.json").read_text())["findings"] == []
 
 
 def test_an_imu_file_alone_is_diagnosed_and_what_is_none_is_bad_input(
