@@ -12,7 +12,14 @@ from colmap_inertial.geometry import matrix_from_quat
 from colmap_inertial.gyro import GyroPath
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence
-from colmap_inertial.imaging.gate import GateOptions, deblur_gated, decide, judge_recording, keep_sharp
+from colmap_inertial.imaging.gate import (
+    GateOptions,
+    RecordingVerdict,
+    deblur_gated,
+    decide,
+    judge_recording,
+    keep_sharp,
+)
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.psf import PredictedBlur, blur_field
 from colmap_inertial.imaging.rolling_shutter import rectify_keypoints
@@ -136,6 +143,18 @@ def test_a_sharp_frame_stays_as_it_is(blur_px):
         field = scaled(predicted(shutter, "none"), blur_px / 0.2)
         gated = deblur_gated(image, field)
         assert gated.image is image and not gated.deblurred and "does not show the blur" in gated.reason
+
+
+@pytest.mark.parametrize("blur_px", [6, 10, 20])
+def test_a_sharp_frame_stays_as_it_is_among_blurred_ones(blur_px):
+    trusted = RecordingVerdict(trusted=True, support=9.0, extent_factor=1.0, frames=9, reason="others do")
+    for pair in PAIRS.values():
+        shutter, image = shot(pair[0], 0.2)
+        field = scaled(predicted(shutter, "none"), blur_px / 0.2)
+        gated = deblur_gated(image, field, recording=trusted)
+        assert gated.image is image and not gated.deblurred and "as much detail along" in gated.reason
+        shutter, image = shot(pair[0], blur_px)
+        assert deblur_gated(image, predicted(shutter, "none"), recording=trusted).deblurred
 
 
 @pytest.mark.parametrize("blur_px", [10, 25])

@@ -18,8 +18,8 @@ REACH = 2.0
 
 
 #: Standard deviation of the smoothing for 10 px of blur at 1 % of noise; it grows with the root of either, up to the
-#: second. PSNR is best a little below it, correct matches a little above.
-SMOOTHING_PX, LARGEST_SMOOTHING_PX = 1.0, 1.5
+#: second. PSNR is best there, and so is the accuracy of small reconstructions; correct matches would like 1.2.
+SMOOTHING_PX, LARGEST_SMOOTHING_PX = 0.7, 1.5
 
 
 def smoothing_px(sigma: float, extent_px: float) -> float:

@@ -30,6 +30,8 @@ _SHORTEST_PX, _LEAST_CONTRAST, _MOST_CLIPPED = 2.5, 0.01, 0.1
 #: Standard deviation of the smoothing of the cepstrum, px; power (of a tile's mean square 1) below which noise rules.
 _SMOOTHING_PX, _FLOOR = 0.8, 1e-7
 _FEWEST_TILES = 12
+#: Cycles per pixel in which blur takes power from a direction before noise covers it.
+_BAND = (0.05, 0.25)
 #: The extents among which the prediction may be: dips at shorter lags are the texture's own.
 _PLAUSIBLE = slice(2, 17)
 
@@ -45,6 +47,8 @@ class BlurEvidence:
         from it, less its median over all directions; and of the squares.
     mirrored, mirrored_square
         (FACTORS, 1) the same in the direction that a gyroscope with one axis flipped would predict.
+    fall_total
+        Sum over tiles of the logarithm of the power along the predicted blur against that across it.
     tiles
         How many were summed.
     """
@@ -53,13 +57,16 @@ class BlurEvidence:
     total_square: Array
     mirrored: Array
     mirrored_square: Array
+    fall_total: float
     tiles: int
 
     @classmethod
     def nothing(cls) -> BlurEvidence:
         """Of no image."""
         zero = np.zeros((len(FACTORS), len(TURNS_RAD)))
-        return cls(total=zero, total_square=zero, mirrored=zero[:, :1], mirrored_square=zero[:, :1], tiles=0)
+        return cls(
+            total=zero, total_square=zero, mirrored=zero[:, :1], mirrored_square=zero[:, :1], fall_total=0.0, tiles=0
+        )
 
     def __add__(self, other: BlurEvidence) -> BlurEvidence:
         return BlurEvidence(
@@ -67,6 +74,7 @@ class BlurEvidence:
             total_square=self.total_square + other.total_square,
             mirrored=self.mirrored + other.mirrored,
             mirrored_square=self.mirrored_square + other.mirrored_square,
+            fall_total=self.fall_total + other.fall_total,
             tiles=self.tiles + other.tiles,
         )
 
@@ -107,6 +115,15 @@ class BlurEvidence:
         """Whether the deepest dip lies inside the range of extents rather than at its end."""
         i = int(np.argmin(self.total[:, 0]))
         return _PLAUSIBLE.start <= i < _PLAUSIBLE.stop
+
+    @property
+    def fall(self) -> float:
+        """Natural logarithm of the power of fine detail along the predicted blur against that across it.
+
+        About -1 or less where a picture is blurred so; about 0 where it is sharp, or blurred otherwise: then textures
+        decide, and tiles are many.
+        """
+        return self.fall_total / max(self.tiles, 1)
 
     @property
     def mirrored_support(self) -> float:
@@ -177,7 +194,9 @@ def blur_evidence(
     tiles = (tiles - tiles.mean(axis=(1, 2), keepdims=True)) * (window[:, None] * window)
     power = np.abs(rfft2(tiles)) ** 2
     smooth = np.exp(-2 * (np.pi * _SMOOTHING_PX * np.fft.fftfreq(tile)) ** 2).astype(np.float32)
-    damped = np.log(power + _FLOOR * tile**2) * smooth[:, None] * smooth[: tile // 2 + 1]
+    logarithm = np.log(power + _FLOOR * tile**2)
+    fall = _fall(logarithm, vectors[usable])
+    damped = logarithm * smooth[:, None] * smooth[: tile // 2 + 1]
     cepstra = irfft2(damped, s=(tile, tile))
     values = _at_lags(np.asarray(cepstra), vectors[usable], TURNS_RAD)
     level = np.median(values[:, :, 2:-1], axis=2, keepdims=True)
@@ -188,6 +207,7 @@ def blur_evidence(
         total_square=(values**2).sum(axis=0),
         mirrored=mirrored.sum(axis=0),
         mirrored_square=(mirrored**2).sum(axis=0),
+        fall_total=float(fall.sum()),
         tiles=len(values),
     )
 
@@ -207,6 +227,19 @@ def _starts(size: int, tile: int, step: int) -> NDArray[np.intp]:
     """Tiles that cover a side evenly."""
     count = max(1, -(-(size - tile) // step) + 1)
     return np.unique(np.rint(np.linspace(0, size - tile, count)).astype(np.intp))
+
+
+def _fall(logarithm: NDArray[np.float32], vectors: Array) -> Array:
+    """(N,) mean of (N, T, T // 2 + 1) log power within 30 degrees of (N, 2) blur vectors, less that across them."""
+    tile = logarithm.shape[1]
+    x, y = np.fft.rfftfreq(tile)[None, :], np.fft.fftfreq(tile)[:, None]
+    radius = np.hypot(x, y)
+    band = (radius > _BAND[0]) & (radius < _BAND[1])
+    turn = np.stack([(x / np.maximum(radius, 1e-9))[band], (y / np.maximum(radius, 1e-9))[band]])
+    cosine = np.abs(vectors @ turn) / np.hypot(vectors[:, 0], vectors[:, 1])[:, None]
+    power = logarithm[:, band]
+    along, across = cosine > np.cos(np.pi / 6), cosine < np.sin(np.pi / 6)
+    return np.asarray((power * along).sum(1) / along.sum(1) - (power * across).sum(1) / across.sum(1))
 
 
 def _at_lags(cepstra: NDArray[np.float32], vectors: Array, turns_rad: Array) -> Array:

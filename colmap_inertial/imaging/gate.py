@@ -202,7 +202,7 @@ def deblur_gated(
     options = options or GateOptions()
     trusted = recording is not None and recording.trusted is True
     evidence = blur_evidence(image, blur, most_tiles=_FEW_TILES if trusted else 900)
-    factor, reason = _judge(evidence, blur, recording, options)
+    factor, reason = _judge(evidence, recording, options)
     if factor is None:
         return GatedFrame(
             image=image, deblurred=False, kept_share=1.0, extent_factor=1.0, evidence=evidence, reason=reason
@@ -221,8 +221,10 @@ def deblur_gated(
 
 #: An extent is corrected where it is further off than small blur lets the dip drift, and where the dip is this clear.
 _CORRECTED_FROM, _CLEAR_SUPPORT = 0.1, 7.0
-#: Blur this long must show in a frame with texture; below, a frame that shows nothing does not contradict.
+#: Blur this long must show in a frame with texture.
 MUST_SHOW_PX = 8.0
+#: Blur takes at least this from the logarithm of the power along it; sharp pictures are at 0 +- 0.2.
+_LEAST_FALL = -0.35
 #: Standard deviations by which all frames together must show short blur: of wrong gyroscopes, none reached three.
 _TOGETHER_SUPPORT = 4.5
 #: From so many on, a frame has a vote whether it is rather the gyroscope's direction, or the mirrored one.
@@ -316,16 +318,18 @@ def _support(evidence: BlurEvidence) -> float:
 
 
 def _judge(
-    evidence: BlurEvidence, blur: BlurField, recording: RecordingVerdict | None, options: GateOptions
+    evidence: BlurEvidence, recording: RecordingVerdict | None, options: GateOptions
 ) -> tuple[float | None, str]:
     """The factor for the extents, or ``None`` for a frame to leave alone; and why."""
     if recording is not None and recording.trusted is False:
         return None, recording.reason
     own = _support(evidence) if evidence.enough else 0.0
     if recording is not None and recording.trusted:
-        long_px = float(np.percentile(blur.extent_px(), 90))
-        if evidence.enough and own < 0 and long_px >= MUST_SHOW_PX:
-            return None, "the image does not show the blur that the gyroscope predicts, though other frames do"
+        if evidence.enough and evidence.fall > _LEAST_FALL:
+            return (
+                None,
+                "the image has as much detail along the predicted blur as across it, though other frames lack it",
+            )
         return recording.extent_factor, recording.reason
     if not evidence.enough:
         return None, "too little texture or blur to check the gyroscope's prediction against"
