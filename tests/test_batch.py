@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -242,7 +243,9 @@ def test_ctrl_c_stops_every_process_and_the_batch_continues_afterwards(captures,
     )
     out = tmp_path / "out"
     command = [sys.executable, "-m", "colmap_inertial", "batch", manifest, out, "--config", tmp_path / "options.toml"]
-    batch = subprocess.Popen(list(map(str, command)), stderr=subprocess.PIPE, text=True)
+    # whoever runs the tests in the background lets their children ignore Ctrl-C
+    heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    batch = subprocess.Popen(list(map(str, command)), stderr=subprocess.PIPE, text=True, preexec_fn=heed)
     eventually(lambda: processes_of(out) and list((out / "hall").glob("frames.json")))
     with pytest.raises(OutputExistsError, match="another batch is at work"):
         run_batch(manifest, out, TINY)
