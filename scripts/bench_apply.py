@@ -99,6 +99,7 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
+    args.folder.mkdir(parents=True, exist_ok=True)
     free = shutil.disk_usage(args.folder).free
     if free < 3e9 * args.gigabytes:
         raise SystemExit(f"{args.folder} has {free / 1e9:.1f} GB free; {3 * args.gigabytes:.1f} are needed")

@@ -34,7 +34,7 @@ def measure(*, quick: bool, console: Console) -> dict[str, Any]:
     motion = MotionOptions(kind="orbit", duration_s=duration_s, vigour=0.8, sweep_s=16.0, arc_deg=130.0)
     base = SceneRecipe(seed=4, frame_rate_hz=2.5, quality=95, motion=motion)
     base = replace(base, camera=replace(base.camera, readout_s=0.02, white_electrons=10000.0))
-    scenes = {"10 px": (base, 10.0), "heavy blur": (replace(base, seed=5), 28.0)}
+    scenes = {"10 px": (base, 10.0), "heavy blur": (replace(base, seed=5), 19.0)}
     out = {}
     for name, (recipe, blur_px) in scenes.items():
         exposed = with_blur(recipe, blur_px)
