@@ -13,10 +13,10 @@ import numpy as np
 from colmap_inertial.errors import FormatError, TimingError
 from colmap_inertial.io.frame_times import FrameStamps, stamps_in_order
 
-_PNG = b"\x89PNG\r\n\x1a\n"
+PNG = b"\x89PNG\r\n\x1a\n"
 _EXIF_HEADER = b"Exif\0\0"
 #: EXIF stands at the beginning of a file.
-_HEAD_BYTES = 256 * 1024
+HEAD_BYTES = 256 * 1024
 #: Tags of EXIF (CIPA DC-008): the directory, and DateTimeOriginal, OffsetTimeOriginal, SubSecTimeOriginal in it.
 _DIRECTORY, _DATE, _OFFSET, _FRACTION = 0x8769, 0x9003, 0x9011, 0x9291
 _ASCII = 2
@@ -82,48 +82,69 @@ def _texts(path: Path) -> dict[int, str]:
     """The text entries of a picture's EXIF directory."""
     try:
         with open(path, "rb") as file:
-            head = file.read(_HEAD_BYTES)
+            head = file.read(HEAD_BYTES)
     except FileNotFoundError:
         raise FormatError(path, "no such picture") from None
     except OSError as error:
         raise FormatError(path, f"cannot be read: {error.strerror or error}") from None
-    tiff = _tiff(head)
-    order = {b"II": "<", b"MM": ">"}.get(b"" if tiff is None else tiff[:2])
-    if tiff is None or order is None:
-        raise FormatError(path, "has no EXIF, which is to give its time; give --frame-times")
     try:
-        first = _entries(tiff, order, struct.unpack_from(order + "I", tiff, 4)[0])
-        directory = _entries(tiff, order, struct.unpack_from(order + "I", first[_DIRECTORY][2])[0])
+        found = exif_directory(head)
+        if found is None:
+            raise FormatError(path, "has no EXIF, which is to give its time; give --frame-times")
+        tiff, order, directory = found
         return {tag: _text(tiff, order, *entry) for tag, entry in directory.items() if entry[0] == _ASCII}
     except (struct.error, KeyError):
         raise FormatError(path, "its EXIF is damaged or empty; give --frame-times") from None
 
 
+def exif_directory(head: bytes) -> tuple[bytes, str, dict[int, tuple[int, int, bytes]]] | None:
+    """The EXIF directory in the head of a JPEG, PNG or TIFF file.
+
+    Returns
+    -------
+    The TIFF structure that EXIF is, its byte order for ``struct``, and type, count and value field of the directory's
+    entries by tag (CIPA DC-008); ``None`` where the file has no EXIF.
+
+    Raises
+    ------
+    struct.error, KeyError
+        Where the EXIF is damaged or has no directory.
+    """
+    tiff = _tiff(head)
+    order = {b"II": "<", b"MM": ">"}.get(b"" if tiff is None else tiff[:2])
+    if tiff is None or order is None:
+        return None
+    first = _entries(tiff, order, struct.unpack_from(order + "I", tiff, 4)[0])
+    return tiff, order, _entries(tiff, order, struct.unpack_from(order + "I", first[_DIRECTORY][2])[0])
+
+
 def _tiff(head: bytes) -> bytes | None:
     """The TIFF structure that EXIF is, in the head of a file."""
     if head.startswith(b"\xff\xd8"):
-        return next((part[6:] for part in _jpeg_exif(head) if part.startswith(_EXIF_HEADER)), None)
-    if head.startswith(_PNG):
-        return next(_png_exif(head), None)
+        exif = (part[4:] for marker, part in jpeg_segments(head) if marker == 0xE1)
+        return next((part[len(_EXIF_HEADER) :] for part in exif if part.startswith(_EXIF_HEADER)), None)
+    if head.startswith(PNG):
+        chunk = next((part for name, part in png_chunks(head) if name == b"eXIf"), None)
+        return None if chunk is None else chunk[8 : 8 + struct.unpack_from(">I", chunk)[0]]
     return head if head[:4] in (b"II*\0", b"MM\0*") else None
 
 
-def _jpeg_exif(data: bytes) -> Iterator[bytes]:
+def jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Marker and bytes (marker and length included) of the segments before the scan (ITU-T T.81, annex B)."""
     at = 2
     while at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xDA:
         size = struct.unpack_from(">H", data, at + 2)[0]
-        if data[at + 1] == 0xE1:
-            yield data[at + 4 : at + 2 + size]
+        yield data[at + 1], data[at : at + 2 + size]
         at += 2 + size
 
 
-def _png_exif(data: bytes) -> Iterator[bytes]:
-    at = len(_PNG)
+def png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
+    """Name and bytes of the chunks of a PNG (ISO/IEC 15948)."""
+    at = len(PNG)
     while at + 12 <= len(data):
-        size = struct.unpack_from(">I", data, at)[0]
-        if data[at + 4 : at + 8] == b"eXIf":
-            yield data[at + 8 : at + 8 + size]
-        at += 12 + size
+        size = 12 + struct.unpack_from(">I", data, at)[0]
+        yield data[at + 4 : at + 8], data[at : at + size]
+        at += size
 
 
 def _entries(tiff: bytes, order: str, at: int) -> dict[int, tuple[int, int, bytes]]:
