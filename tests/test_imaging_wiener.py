@@ -283,7 +283,7 @@ def test_blurs_far_longer_than_the_image_work():
 
 
 @pytest.mark.parametrize(
-    ("length_px", "gain_db"), [(6, 0.3), (10, 0.8), (20, 1.5), (30, 1.5)], ids=lambda value: f"{value}"
+    ("length_px", "gain_db"), [(6, 0.4), (10, 1.4), (20, 1.5), (30, 1.5)], ids=lambda value: f"{value}"
 )
 @pytest.mark.parametrize("angle_deg", [0, 25, 80])
 def test_a_blurred_and_noisy_picture_comes_closer_to_the_sharp_one(length_px, gain_db, angle_deg):
