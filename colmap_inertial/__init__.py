@@ -30,7 +30,13 @@ if TYPE_CHECKING:
         ScaleOptions,
         ValidateOptions,
     )
-    from colmap_inertial.pipeline import DeblurStage, RollingShutterStage, default_model_stages, reconstruct
+    from colmap_inertial.pipeline import (
+        DeblurStage,
+        ReadoutStage,
+        RollingShutterStage,
+        default_model_stages,
+        reconstruct,
+    )
     from colmap_inertial.pipeline.config import read_config
     from colmap_inertial.pipeline.existing import reconstruct_project
     from colmap_inertial.scale import estimate_scale
@@ -67,6 +73,7 @@ _HOMES = {
     "MappingOptions": "options",
     "ModelScale": "model.similarities",
     "ProjectOptions": "options",
+    "ReadoutStage": "pipeline",
     "ReconstructOptions": "options",
     "RollingShutterStage": "pipeline",
     "ScaleEstimate": "types",
@@ -118,6 +125,7 @@ __all__ = [
     "MappingOptions",
     "ModelScale",
     "ProjectOptions",
+    "ReadoutStage",
     "ReconstructOptions",
     "RollingShutterStage",
     "ScaleEstimate",
