@@ -1,0 +1,101 @@
+"""The command line: arguments, one call each, errors as one line. Nothing heavy is imported before a command runs."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Union
+
+import tyro
+from tyro.conf import subcommand
+
+from colmap_inertial import __version__
+from colmap_inertial.cli.captures import Batch, Deblur, Reconstruct, Simulate
+from colmap_inertial.cli.models import Align, Apply, Diagnose, Scale, Validate
+from colmap_inertial.errors import InertialError
+from colmap_inertial.options import ReconstructOptions
+
+DESCRIPTION = """Metric, gravity-aligned COLMAP models from the gyroscope and accelerometer that filmed along.
+
+Exit codes: 0 done, 1 a check failed, 2 bad input, 3 not observable (scale refused), 4 mapping failed,
+5 target not found."""
+
+
+Command = Reconstruct | Scale | Apply | Align | Diagnose | Validate | Deblur | Batch | Simulate
+_COMMANDS: dict[str, type[Command]] = {
+    "reconstruct": Reconstruct,
+    "scale": Scale,
+    "apply": Apply,
+    "align": Align,
+    "diagnose": Diagnose,
+    "validate": Validate,
+    "deblur": Deblur,
+    "batch": Batch,
+    "simulate": Simulate,
+}
+
+
+def parse(args: Sequence[str]) -> Command:
+    """The command that the arguments describe; exits with code 2 and a message when they describe none.
+
+    Raises
+    ------
+    FormatError
+        For a ``--config`` file that cannot be read.
+    """
+    choices: list[Any] = []
+    for name, cls in _COMMANDS.items():
+        default = _default_from_config(cls, args) if list(args[:1]) == [name] else None
+        settings = subcommand(name) if default is None else subcommand(name, default=default)
+        choices.append(Annotated[cls, settings])
+    command: Any = Union[tuple(choices)]  # noqa: UP007 (built at run time)
+    config = (tyro.conf.PositionalMetavarFromFieldName,)
+    return tyro.cli(command, prog="colmap-inertial", description=DESCRIPTION, args=list(args), config=config)
+
+
+def _default_from_config(cls: type[Command], args: Sequence[str]) -> Command | None:
+    """The command with its options from ``--config``, so that flags go before the file and the file before defaults."""
+    from colmap_inertial.pipeline.config import read_config
+
+    path = None
+    for i, text in enumerate(args):
+        if text == "--config" and i + 1 < len(args):
+            path = args[i + 1]
+        elif text.startswith("--config="):
+            path = text.removeprefix("--config=")
+    if path is None or cls not in (Reconstruct, Scale, Batch):
+        return None
+    fields = {f.name: f for f in dataclasses.fields(cls)}
+    options: Any = read_config(Path(path), ReconstructOptions)
+    if cls is Scale:
+        options = options.scale
+    required = {
+        name: tyro.MISSING for name, f in fields.items() if f.default is f.default_factory is dataclasses.MISSING
+    }
+    return cls(options=options, **required)
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Entry point of ``colmap-inertial``."""
+    args = sys.argv[1:] if args is None else args
+    if list(args) == ["--version"]:
+        print(__version__)
+        return
+    try:
+        command = parse(args)
+    except (InertialError, ValueError) as error:  # options check their own values when they are built
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    try:
+        code = command.run()
+    except InertialError as error:
+        print(f"error: {error}", file=sys.stderr)
+        code = error.exit_code
+    except KeyboardInterrupt:
+        resumes = isinstance(command, Reconstruct | Deblur | Batch)
+        again = "; started again with the same arguments, it continues" if resumes else ""
+        print(f"interrupted{again}", file=sys.stderr)
+        code = 130
+    sys.exit(code)

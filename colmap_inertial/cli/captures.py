@@ -1,0 +1,172 @@
+"""Commands that begin with a capture: images or video, and the IMU that ran along."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from colmap_inertial.options import ProjectOptions, ReconstructOptions
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reconstruct:
+    """Turn images or video with an IMU recording into a COLMAP model in metres, gravity along an axis.
+
+    Writes OUT/sparse (COLMAP's own model), OUT/sparse_metric (the same in metres), OUT/trajectory.tum, OUT/result.json;
+    with --dense also OUT/dense_metric. Started again after an interruption, it continues with the last finished stage.
+
+    CAPTURE may be an existing COLMAP project: give --imu, and when its images were taken. Nothing is mapped again, and
+    OUT/project_metric is all of the project in metres.
+
+    Example: colmap-inertial reconstruct my_capture/capture.toml out
+    """
+
+    capture: Positional[Path]
+    """A capture.toml, a folder that holds one, an EuRoC/ASL dataset, or a COLMAP project."""
+    out: Positional[Path]
+    """A new folder for everything that is made."""
+    project: Annotated[ProjectOptions, arg(name="")] = dataclasses.field(default_factory=ProjectOptions)
+    options: Annotated[ReconstructOptions, arg(name="")] = dataclasses.field(default_factory=ReconstructOptions)
+    config: Path | None = None
+    """TOML file with options, as OUT/config.toml of an earlier run; flags given here go before it."""
+
+    def run(self) -> int:
+        """Run the command; returns the exit code."""
+        from colmap_inertial.pipeline import reconstruct
+        from colmap_inertial.pipeline.existing import is_project, reconstruct_project
+        from colmap_inertial.pipeline.terminal import live_progress, show_result
+
+        with live_progress() as progress:
+            if self.project != ProjectOptions() or is_project(self.capture):
+                result = reconstruct_project(self.capture, self.out, self.project, self.options, progress=progress)
+            else:
+                result = reconstruct(self.capture, self.out, self.options, progress=progress)
+        show_result(result)
+        return result.exit_code()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Deblur:
+    """Undo the motion blur of images by the gyroscope, without reconstructing anything.
+
+    Writes OUT/images with the frames' names, sizes, formats and metadata, and OUT/result.json with what happened to
+    each of them and why. Frames that are sharp, or in which the gyroscope's blur does not show, are copied as they
+    are. Exit code 3 where the gyroscope does not belong to the pixels, as in stabilised video.
+
+    Example: colmap-inertial deblur my_capture/capture.toml out --sheet before_after.png
+    """
+
+    capture: Positional[Path]
+    """A capture.toml, a folder that holds one, or an EuRoC/ASL dataset; it must know the exposure times."""
+    out: Positional[Path]
+    """A new folder for everything that is made."""
+    calibration: Path | None = None
+    """A calibration file of this device (from `colmap-inertial align --out`), used as a prior."""
+    rectify: bool = False
+    """Also write OUT/images_rectified, without the rolling shutter (needs its readout time)."""
+    sheet: Path | None = None
+    """Write a PNG with parts of the most blurred frames before and after."""
+
+    def run(self) -> int:
+        """Run the command; returns the exit code."""
+        from colmap_inertial.pipeline.deblur import deblur_capture
+        from colmap_inertial.pipeline.terminal import live_progress, show_deblurred
+
+        with live_progress() as progress:
+            result = deblur_capture(
+                self.capture,
+                self.out,
+                calibration=self.calibration,
+                rectify=self.rectify,
+                sheet=self.sheet,
+                progress=progress,
+            )
+        show_deblurred(result)
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Batch:
+    """Reconstruct many captures, each in a process of its own; one that fails does not stop the rest.
+
+    MANIFEST is a TOML file with a [[capture]] table for each: path (from the manifest's folder), and optionally name,
+    config (a TOML file with options) and options; or a folder in which every folder is a capture. Writes OUT/NAME for
+    each capture as reconstruct does, OUT/status/NAME.json with how far it is, OUT/summary.csv and OUT/summary.json.
+    Started again, it takes up what has no result yet. Exit code 0 when every capture is done, 1 when one is not.
+
+    Example: colmap-inertial batch captures.toml out
+    """
+
+    manifest: Positional[Path]
+    """A TOML file that lists captures, or a folder of captures."""
+    out: Positional[Path]
+    """A new folder, or that of an earlier run."""
+    workers: int | None = None
+    """Captures in work at once on this machine. Default: what processors and free memory allow."""
+    scheduler: str | None = None
+    """Address of a Dask scheduler (tcp://host:8786), whose workers do the work instead (needs the extra `cluster`)."""
+    attempts: int = 3
+    """How often a capture is started in all, where its process or its worker is killed."""
+    options: Annotated[ReconstructOptions, arg(name="")] = dataclasses.field(default_factory=ReconstructOptions)
+    config: Path | None = None
+    """TOML file with options for all; flags given here go before it, and what the manifest says before both."""
+
+    def __post_init__(self) -> None:
+        if self.workers is not None and self.workers < 1:
+            raise ValueError(f"workers must be at least 1, not {self.workers}")
+        if self.workers is not None and self.scheduler is not None:
+            raise ValueError("--workers are those of this machine; with --scheduler, the cluster has its own")
+        if not 1 <= self.attempts <= 100:
+            raise ValueError(f"attempts must be from 1 to 100, not {self.attempts}")
+
+    def run(self) -> int:
+        """Run the command; returns the exit code."""
+        from colmap_inertial.batch import run_batch
+        from colmap_inertial.batch.terminal import live_batch, show_batch
+
+        with live_batch() as watch:
+            result = run_batch(
+                self.manifest,
+                self.out,
+                self.options,
+                workers=self.workers,
+                scheduler=self.scheduler,
+                attempts=self.attempts,
+                watch=watch,
+            )
+        show_batch(result)
+        return result.exit_code()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Simulate:
+    """Make a simulated capture with known truth: a desk or room, filmed by a hand, with the IMU that ran along.
+
+    Example: colmap-inertial simulate example_scenes/rolling_shutter/recipe.toml my_scene
+    """
+
+    recipe: Positional[Path]
+    """A recipe (TOML): world, motion, IMU, camera, checkerboard; see example_scenes/."""
+    out: Positional[Path]
+    """A new folder for pictures or video, IMU files, capture.toml and truth.json."""
+    workers: int = os.cpu_count() or 1
+    """Processes that render; a frame of 640 x 480 takes one to three seconds of one core, more where it is blurred."""
+
+    def run(self) -> int:
+        """Run the command; returns the exit code."""
+        from colmap_inertial.pipeline.terminal import live_progress
+        from colmap_inertial.simulate.capture import write_capture
+        from colmap_inertial.simulate.recipe import load_recipe
+
+        recipe = load_recipe(self.recipe)
+        with live_progress() as progress:
+            capture = write_capture(
+                recipe, self.out, workers=self.workers, progress=lambda done, total: progress("rendering", done, total)
+            )
+        print(capture)
+        return 0

@@ -1,0 +1,248 @@
+"""Commands that begin with what exists: a model, a trajectory, a recording."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from tyro.conf import Positional, arg
+
+from colmap_inertial.options import ScaleOptions, ValidateOptions, WorldAxes
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scale:
+    """Metres per unit of an existing model or trajectory, without mapping.
+
+    SOURCE is a COLMAP model folder (needs --imu and --frame-times), a trajectory in TUM format (needs --imu), or an
+    InertialScale folder. Exit code 3 when the recording cannot give a scale; the JSON then says why.
+
+    Example: colmap-inertial scale project/sparse/0 --imu imu.csv --frame-times frames.csv --json scale.json
+    """
+
+    source: Positional[Path]
+    """COLMAP model folder, TUM trajectory, or InertialScale folder."""
+    json: Path
+    """Where to write the estimate."""
+    imu: Path | None = None
+    """IMU recording: a file or folder of a known format, or a capture.toml."""
+    frame_times: Path | None = None
+    """When the images were taken: a CSV with columns name,t_s, or a capture.toml."""
+    calibration: Path | None = None
+    """A calibration file of this device, used as a prior."""
+    first_s: float | None = None
+    """Use only this many seconds from the start of the camera's recording."""
+    latitude_deg: float | None = None
+    """Latitude of the recording, from which the strength of gravity follows."""
+    options: Annotated[ScaleOptions, arg(name="")] = dataclasses.field(default_factory=ScaleOptions)
+    config: Path | None = None
+    """TOML file as OUT/config.toml of a reconstruction: its [scale] table counts; flags given here go before it."""
+
+    def __post_init__(self) -> None:
+        if self.first_s is not None and not self.first_s > 0:
+            raise ValueError(f"first_s must be positive, not {self.first_s:g}")
+        if self.latitude_deg is not None and not -90 <= self.latitude_deg <= 90:
+            raise ValueError(f"latitude_deg must be from -90 to 90, not {self.latitude_deg:g}")
+
+    def run(self) -> int:
+        """Run the command; returns the exit code."""
+        from colmap_inertial.pipeline.sources import ScaleSource, scale_source
+        from colmap_inertial.pipeline.terminal import show_scale
+
+        estimate = scale_source(
+            ScaleSource(source=self.source, imu=self.imu, frame_times=self.frame_times, calibration=self.calibration),
+            self.options,
+            json=self.json,
+            first_s=self.first_s,
+            latitude_deg=self.latitude_deg,
+        )
+        show_scale(estimate, self.source)
+        return 3 if estimate.verdict == "refused" else 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Apply:
+    """Make a whole COLMAP project metric: sparse models, dense workspaces, point clouds, meshes, database.
+
+    OUT mirrors PROJECT, which is only read; it appears whole or not at all, and OUT/transform.json says what was done.
+    Give --scale, --factor or --sim3; or --undo to take back what an earlier run applied. Exit code 3 when every scale
+    was refused; a sub-model with a refused scale keeps its own units.
+
+    Example: colmap-inertial apply project project_metric --scale scale.json
+    """
+
+    project: Positional[Path]
+    """A folder with a COLMAP model, and whatever was made from it."""
+    out: Positional[Path]
+    """A new folder."""
+    scale: tuple[str, ...] = ()
+    """What `colmap-inertial scale --json` wrote; with several sub-models one for each, as NUMBER=FILE, or the
+    result.json of a reconstruction."""
+    factor: float | None = None
+    """Lengths times this; axes and origin stay."""
+    sim3: Path | None = None
+    """JSON with scale, rotation_xyzw, translation_m (and cov, provenance): x' = scale * R x + translation."""
+    undo: bool = False
+    """PROJECT was written by this command: write it in its old units."""
+    world: WorldAxes = "z-up"
+    """With --scale, axes of the metric project: z away from the ground, or y towards it."""
+    link: bool = False
+    """Hard links for files that do not change; an edit of one then changes the original, too."""
+    keep: tuple[str, ...] = ()
+    """Patterns of paths in PROJECT that are copied as they are, such as "old/*"."""
+
+    def __post_init__(self) -> None:
+        given = (bool(self.scale), self.factor is not None, self.sim3 is not None, self.undo)
+        if sum(given) != 1:
+            raise ValueError("give one of --scale, --factor, --sim3 and --undo")
+        if self.undo and self.keep:
+            raise ValueError("--undo keeps what was kept before; leave out --keep")
+        if self.factor is not None and not 0 < self.factor < float("inf"):
+            raise ValueError(f"factor must be positive, not {self.factor:g}")
+
+    def run(self) -> int:
+        """Run the command; returns the exit code."""
+        from colmap_inertial.model.project import apply_to_project, undo_project
+        from colmap_inertial.model.similarities import plain_factor, read_scales, read_similarity
+        from colmap_inertial.pipeline.terminal import live_progress, show_applied
+
+        scales: Any
+        with live_progress() as progress:
+
+            def files(done: int, total: int) -> None:
+                progress("apply", done, total)
+
+            if self.undo:
+                applied = undo_project(self.project, self.out, link=self.link, progress=files)
+            else:
+                if self.sim3 is not None:
+                    scales = read_similarity(self.sim3)
+                elif self.factor is not None:
+                    scales = plain_factor(self.factor)
+                else:
+                    scales = read_scales(self.scale, world=self.world)
+                applied = apply_to_project(
+                    self.project, self.out, scales, link=self.link, keep=self.keep, progress=files
+                )
+        show_applied(applied)
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Align:
+    """Rotation, time offset and gyro bias between the camera and the IMU of one device, from one recording.
+
+    Needs no scale, only a camera that turned. The calibration file serves --calibration for later recordings of the
+    same device. Exit code 3 when no time offset is better than the rest.
+
+    Example: colmap-inertial align project/sparse/0 --imu imu.csv --frame-times frames.csv --out phone.json
+    """
+
+    source: Positional[Path]
+    """COLMAP model folder, TUM trajectory, or InertialScale folder."""
+    out: Path
+    """Where to write the calibration (JSON)."""
+    imu: Path | None = None
+    """IMU recording: a file or folder of a known format, or a capture.toml."""
+    frame_times: Path | None = None
+    """When the images were taken: a CSV with columns name,t_s, or a capture.toml."""
+    calibration: Path | None = None
+    """An earlier calibration file of this device, used as a prior."""
+
+    def run(self) -> int:
+        """Run the command; returns the exit code."""
+        from colmap_inertial.pipeline.sources import ScaleSource, align_source
+        from colmap_inertial.pipeline.terminal import show_calibration
+
+        source = ScaleSource(
+            source=self.source, imu=self.imu, frame_times=self.frame_times, calibration=self.calibration
+        )
+        show_calibration(align_source(source, self.out), self.source)
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Diagnose:
+    """What is wrong with a recording, and what to do, before any reconstruction.
+
+    Exit code 1 when something makes a scale wrong or impossible, 0 when nothing is worse than a warning.
+
+    Example: colmap-inertial diagnose my_capture/capture.toml --json findings.json
+    """
+
+    source: Positional[Path]
+    """A capture, COLMAP model folder, TUM trajectory, InertialScale folder, or IMU recording."""
+    json: Path | None = None
+    """Where to write the findings."""
+    imu: Path | None = None
+    """IMU recording of a model or trajectory: a file or folder of a known format, or a capture.toml."""
+    frame_times: Path | None = None
+    """When the images were taken: a CSV with columns name,t_s, or a capture.toml."""
+    calibration: Path | None = None
+    """A calibration file of this device, used as a prior."""
+
+    def run(self) -> int:
+        """Run the command; returns the exit code."""
+        from colmap_inertial.pipeline.preflight import diagnose_source
+        from colmap_inertial.pipeline.sources import ScaleSource
+        from colmap_inertial.pipeline.terminal import live_progress, show_diagnosis
+
+        source = ScaleSource(
+            source=self.source, imu=self.imu, frame_times=self.frame_times, calibration=self.calibration
+        )
+        with live_progress() as progress:
+            found = diagnose_source(source, json=self.json, progress=progress)
+        show_diagnosis(found, self.source)
+        return 1 if found.worst == "error" else 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Validate:
+    """Compare the size of a model with a target of known size in its images.
+
+    TARGET is checkerboard:COLSxROWS:SQUARE_M (inner corners), charuco:COLSxROWS:SQUARE_M:MARKER_M:DICT (squares),
+    aprilgrid:COLSxROWS:TAG_M:GAP (GAP = gap / tag), or aruco:DICT:SIDE_M. Exit code 0 within the tolerance, 1 outside
+    it, 5 when the target is not found.
+
+    Example: colmap-inertial validate out/sparse_metric/0 --images out/images --target checkerboard:8x6:0.03
+    """
+
+    model: Positional[Path]
+    """COLMAP model folder."""
+    images: Path
+    """Folder with the model's images (the rectified ones where the rolling shutter was undone)."""
+    target: str
+    """What to look for, as above."""
+    json: Path | None = None
+    """Where to write the result."""
+    pictures: Path | None = None
+    """Folder for frames with the corners drawn in and a plot of the distances."""
+    tolerance: float = 2.0
+    """Largest scale error that passes, in per cent."""
+    unscaled: bool = False
+    """The model claims no unit: report the factor that makes it metric; always passes."""
+    apply: Path | None = None
+    """With --unscaled: a new folder for the model in metres, scaled by the control distances alone."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.tolerance < 100:
+            raise ValueError(f"tolerance must be from 0 to 100 per cent, not {self.tolerance:g}")
+
+    def run(self) -> int:
+        """Run the command; returns the exit code."""
+        from colmap_inertial.pipeline.sources import validate_source
+        from colmap_inertial.pipeline.terminal import show_validation
+
+        result = validate_source(
+            self.model,
+            self.images,
+            self.target,
+            ValidateOptions(tolerance_pct=self.tolerance, unscaled=self.unscaled),
+            json=self.json,
+            pictures=self.pictures,
+            apply=self.apply,
+        )
+        show_validation(result)
+        return 0 if result.within_tolerance else 1
