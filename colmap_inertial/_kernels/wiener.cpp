@@ -126,68 +126,102 @@ class Encoder {
     std::vector<uint8_t> nearest_;
 };
 
+// Linear light of an image, smoothed, with its mirrored surroundings. Smoothed a band of rows at a time, so that what is
+// in between stays in the cache; a symmetric filter makes mirrored surroundings of mirrored surroundings.
 template <class Code>
-void fill(Plane &plane, const Code *image, Image size, int channel, bool transposed, const Codec &codec, int threads) {
-    const int major = transposed ? size.height : size.width, minor = transposed ? size.width : size.height;
-    const ptrdiff_t pixel = size.channels, line = ptrdiff_t(size.width) * pixel;
-    const ptrdiff_t major_step = transposed ? line : pixel, minor_step = transposed ? pixel : line;
-    // Transposed, 16 rows together: they lie on the same cache lines of the image.
-    const int together = transposed ? 16 : 1;
-    in_parallel((plane.height + together - 1) / together, threads, [&](int group) {
-        const int first = group * together, count = std::min(together, plane.height - first);
-        const Code *source[16];
-        float *target[16];
-        for (int r = 0; r < count; ++r) {
-            source[r] = image + channel + mirrored(first + r - plane.before_minor, minor) * minor_step;
-            target[r] = plane.data.get() + (first + r) * plane.stride + plane.before_major;
-        }
-        if (transposed)
-            for (int x = 0; x < major; ++x)
-                for (int r = 0; r < count; ++r) target[r][x] = light_of(source[r][x * major_step], codec);
-        else
-            for (int x = 0; x < major; ++x) target[0][x] = light_of(source[0][x * major_step], codec);
-        for (int r = 0; r < count; ++r) {
-            for (int x = -plane.before_major; x < 0; ++x) target[r][x] = target[r][mirrored(x, major)];
-            for (int x = major; x < plane.width - plane.before_major; ++x) target[r][x] = target[r][mirrored(x, major)];
-        }
-    });
-}
+class Filling {
+  public:
+    Filling(Plane &plane, const Code *image, Image size, int channel, bool transposed, const Codec &codec,
+            const Table &table, const Simd &simd)
+        : plane_(plane),
+          image_(image + channel),
+          codec_(codec),
+          table_(table),
+          simd_(simd),
+          major_(transposed ? size.height : size.width),
+          minor_(transposed ? size.width : size.height),
+          together_(transposed ? TOGETHER : 1) {
+        const ptrdiff_t pixel = size.channels, line = ptrdiff_t(size.width) * pixel;
+        major_step_ = transposed ? line : pixel;
+        minor_step_ = transposed ? pixel : line;
+    }
 
-// Smooths a plane, rows and columns alike.
-void smooth(Plane &plane, int major, int minor, const Table &table, const Simd &simd, int threads) {
-    const int radius = table.radius;
-    if (radius == 0) return;
-    in_parallel(plane.height, threads, [&](int y) {
-        float *row = plane.data.get() + y * plane.stride;
-        std::vector<float> before(size_t(plane.width + 2 * radius));
-        std::copy(row, row + plane.width, before.data() + radius);
-        for (int k = 1; k <= radius; ++k) {
-            before[size_t(radius - k)] = row[mirrored(-k - plane.before_major, major) + plane.before_major];
-            before[size_t(radius + plane.width - 1 + k)] =
-                row[mirrored(plane.width - 1 + k - plane.before_major, major) + plane.before_major];
+    void run(int threads) {
+        in_parallel((minor_ + BAND - 1) / BAND, threads, [&](int i) { band(i * BAND, std::min(minor_, (i + 1) * BAND)); });
+        const int outside = plane_.height - minor_;
+        in_parallel(outside, threads, [&](int i) {
+            const int y = i < plane_.before_minor ? i - plane_.before_minor : minor_ + i - plane_.before_minor;
+            std::copy_n(line(mirrored(y, minor_)), plane_.width, line(y));
+        });
+    }
+
+  private:
+    static constexpr int BAND = 48, TOGETHER = 16;  // transposed, 16 rows lie on the same cache lines of the image
+
+    float *line(int y) const { return plane_.data.get() + (y + plane_.before_minor) * plane_.stride; }
+
+    void band(int first, int last) {
+        const int radius = table_.radius;
+        const size_t margin = size_t((radius + 15) / 16 * 16), pitch = (size_t(major_) + 2 * margin + 15) / 16 * 16;
+        // light as it was decoded, and smoothed along the rows: room for as many as are alive
+        thread_local std::vector<float> room;
+        room.resize(pitch * size_t(TOGETHER + BAND + 2 * radius));
+        float *const rows = room.data() + TOGETHER * pitch;
+        const int low = first - radius, high = last + radius;
+        for (int y = low; y < high; y += together_) {
+            const int count = std::min(together_, high - y);
+            float *raw[TOGETHER];
+            for (int r = 0; r < count; ++r)
+                raw[r] = radius ? room.data() + size_t(r) * pitch + margin : line(y + r) + plane_.before_major;
+            decode(y, count, raw);
+            for (int r = 0; r < count && radius; ++r) along(raw[r], rows + size_t(y + r - low) * pitch);
         }
-        std::vector<const float *> sources{before.data() + radius};
-        for (int k = 1; k <= radius; ++k) {
-            sources.push_back(before.data() + radius - k);
-            sources.push_back(before.data() + radius + k);
+        for (int y = first; y < last; ++y) {
+            float *target = line(y) + plane_.before_major;
+            if (radius) across(rows + size_t(y - low) * pitch, ptrdiff_t(pitch), target);
+            for (int x = -plane_.before_major; x < 0; ++x) target[x] = target[mirrored(x, major_)];
+            for (int x = major_; x < plane_.width - plane_.before_major; ++x) target[x] = target[mirrored(x, major_)];
         }
-        simd.combine(sources.data(), table.smoothing, radius, row, plane.width);
-    });
-    std::unique_ptr<float[]> result(new float[size_t(plane.stride) * size_t(plane.height)]);
-    in_parallel(plane.height, threads, [&](int y) {
-        auto row = [&](int at) {
-            if (at < 0 || at >= plane.height) at = mirrored(at - plane.before_minor, minor) + plane.before_minor;
-            return plane.data.get() + at * plane.stride;
-        };
-        std::vector<const float *> sources{row(y)};
-        for (int k = 1; k <= radius; ++k) {
-            sources.push_back(row(y - k));
-            sources.push_back(row(y + k));
+    }
+
+    void decode(int first, int count, float *const *target) const {
+        const Code *source[TOGETHER];
+        for (int r = 0; r < count; ++r) source[r] = image_ + mirrored(first + r, minor_) * minor_step_;
+        if (count == 1)
+            for (int x = 0; x < major_; ++x) target[0][x] = light_of(source[0][x * major_step_], codec_);
+        else
+            for (int x = 0; x < major_; ++x)
+                for (int r = 0; r < count; ++r) target[r][x] = light_of(source[r][x * major_step_], codec_);
+    }
+
+    void along(float *row, float *target) const {
+        const float *sources[1 + 2 * MOST_RADIUS] = {row};
+        for (int k = 1; k <= table_.radius; ++k) {
+            row[-k] = row[mirrored(-k, major_)];
+            row[major_ - 1 + k] = row[mirrored(major_ - 1 + k, major_)];
+            sources[2 * k - 1] = row - k;
+            sources[2 * k] = row + k;
         }
-        simd.combine(sources.data(), table.smoothing, radius, result.get() + y * plane.stride, plane.width);
-    });
-    plane.data = std::move(result);
-}
+        simd_.combine(sources, table_.smoothing, table_.radius, target, major_);
+    }
+
+    void across(const float *row, ptrdiff_t pitch, float *target) const {
+        const float *sources[1 + 2 * MOST_RADIUS] = {row};
+        for (int k = 1; k <= table_.radius; ++k) {
+            sources[2 * k - 1] = row - k * pitch;
+            sources[2 * k] = row + k * pitch;
+        }
+        simd_.combine(sources, table_.smoothing, table_.radius, target, major_);
+    }
+
+    Plane &plane_;
+    const Code *image_;
+    const Codec &codec_;
+    const Table &table_;
+    const Simd &simd_;
+    int major_, minor_, together_;
+    ptrdiff_t major_step_, minor_step_;
+};
 
 // Where light that the sensor could not hold spoils the result: saturated pixels beside which the image is steeper
 // along the blur than the blur of any scene within the sensor's range could be.
@@ -350,9 +384,7 @@ class Deblur {
                 const int major = (transposed ? field_.ny : field_.nx) * CELL,
                           minor = (transposed ? field_.nx : field_.ny) * CELL;
                 plane.allocate(major, minor, reach, steepest);
-                fill(plane, image_, size_, channel, transposed, codec_, threads_);
-                smooth(plane, transposed ? size_.height : size_.width, transposed ? size_.width : size_.height, table_,
-                       simd_, threads_);
+                Filling<Code>(plane, image_, size_, channel, transposed, codec_, table_, simd_).run(threads_);
                 planes_[transposed].push_back(std::move(plane));
             }
         }

@@ -13,12 +13,14 @@ struct Field {
     const float *fade;    // (ny + 1, nx + 1) share of the result at the corners
 };
 
+constexpr int MOST_RADIUS = 8;  // of the smoothing
+
 struct Table {
     int rows, width;       // width: T + 1
     float first, steps;    // row i is for (first + i) / steps px
     const float *weights;  // (rows, width)
     const int32_t *reach;  // (rows,)
-    int radius;            // of the smoothing
+    int radius;            // of the smoothing, at most MOST_RADIUS
     const float *smoothing;  // (radius + 1,) weights at the distances 0, 1, ... along rows and columns
 };
 

@@ -49,7 +49,7 @@ std::pair<double, double> deblur_image(In<Code, 3> image, Out<Code> result, In<f
           "weights, reach: not a table");
     for (size_t i = 0; i < reach.shape(0); ++i)
         check(reach.data()[i] >= 0 && size_t(reach.data()[i]) < weights.shape(1), "reach: beyond the weights");
-    check(smoothing.shape(0) >= 1, "smoothing: empty");
+    check(smoothing.shape(0) >= 1 && smoothing.shape(0) <= 1 + MOST_RADIUS, "smoothing: empty, or too wide");
     for (size_t i = 0; i < slope.size(); ++i)
         check(slope.data()[i] >= -1 && slope.data()[i] <= 1, "slope: must be within +-1");
     if constexpr (!std::is_same_v<Code, float>) {
