@@ -1,17 +1,22 @@
 """Frames from video: presentation stamps to the microsecond, whatever the frame rate, and the recorder's own times."""
 
+import itertools
+import random
+import re
+import struct
 import tracemalloc
 from fractions import Fraction
 from pathlib import Path
 
 import av
+import cv2
 import numpy as np
 import pytest
 
 from colmap_inertial.errors import FormatError, TimingError
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.frames import frame_source, read_frame_timing, read_frames, thin
-from colmap_inertial.io.video import video_stamps_ns
+from colmap_inertial.io.video import decode_grey, decode_reduced, decode_video, video_stamps_ns
 
 VARIABLE_MS = (100, 133, 167, 250, 283, 400, 417, 450, 600, 633, 667, 700)
 
@@ -155,3 +160,221 @@ def test_gopro_files_are_timed_by_their_own_stamps(shared_data: Path) -> None:
     for name in ("karma.mp4", "max-heromode.mp4"):
         t_ns = video_stamps_ns(shared_data / "gopro" / name)
         np.testing.assert_allclose(np.diff(t_ns), 1001 / 30000 * 1e9, atol=1)
+
+
+def write_pattern(
+    path: Path,
+    count: int = 60,
+    *,
+    codec: str = "libx264",
+    pix_fmt: str = "yuv420p",
+    size: tuple[int, int] = (320, 240),
+    muxer: dict[str, str] | None = None,
+) -> Path:
+    """A pattern that moves by two pixels a frame, at 30 frames a second, with B-frames where the codec has them."""
+    width, height = size
+    tiles = np.random.default_rng(0).integers(0, 255, (height // 4 + 1, width // 4 + 1, 3), dtype=np.uint8)
+    texture = tiles.repeat(8, 0).repeat(8, 1)
+    with av.open(str(path), "w", options=muxer or {}) as container:
+        stream = container.add_stream(codec, rate=30)
+        stream.width, stream.height, stream.pix_fmt = width, height, pix_fmt
+        if codec == "libx264":
+            stream.options = {"crf": "20", "bf": "2", "g": "15"}
+        if codec == "libx265":
+            stream.options = {"x265-params": "log-level=none:keyint=15:bframes=3:crf=18"}
+        for i in range(count):
+            picture = np.ascontiguousarray(texture[i : i + height, 2 * i % width : 2 * i % width + width])
+            frame = av.VideoFrame.from_ndarray(picture, format="rgb24").reformat(format=pix_fmt)
+            frame.pts, frame.time_base = i, Fraction(1, 30)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return path
+
+
+def patched(path: Path, box: bytes, offset: int, data: bytes) -> Path:
+    """Overwrite what stands ``offset`` bytes after the four letters of a box."""
+    raw = bytearray(path.read_bytes())
+    at = raw.index(box) + 4 + offset
+    raw[at : at + len(data)] = data
+    path.write_bytes(raw)
+    return path
+
+
+def test_frames_before_an_edit_list_s_beginning_are_no_frames_of_the_video(tmp_path: Path) -> None:
+    stamps = tuple(range(0, 1000, 40))
+    video = write_video(tmp_path / "a.mp4", stamps, b_frames=0)
+    with av.open(str(video)) as container:
+        per_s = int(1 / container.streams.video[0].time_base)
+    # one entry: version and flags, count, duration, media time
+    patched(video, b"elst", 12, struct.pack(">i", per_s // 5))
+    timing, frames = read_frames(capture_of(tmp_path, 'file = "a.mp4"'))
+    np.testing.assert_allclose(timing.epoch_ns * 1e-9 + timing.t_s, np.array(stamps[5:]) / 1e3 - 0.2, atol=1e-6, rtol=0)
+    levels = [float(frame.image.mean()) for frame in frames]
+    np.testing.assert_allclose(levels, [20 + 15 * i % 220 for i in range(5, 25)], atol=3)
+
+
+@pytest.mark.parametrize("turn", [90, 180, 270])
+def test_a_rotation_mark_leaves_the_sensor_s_rows_alone(tmp_path: Path, turn: int) -> None:
+    video = write_pattern(tmp_path / "a.mp4", 6)
+    before = [frame.image for frame in read_frames(capture_of(tmp_path, 'file = "a.mp4"'))[1]]
+    c, s = round(np.cos(np.radians(turn))), round(np.sin(np.radians(turn)))
+    matrix = struct.pack(">9i", *(int(v * 2**16) for v in (c, s, 0, -s, c, 0)), 0, 0, 2**30)
+    patched(video, b"tkhd", 40, matrix)
+    assert next(decode_grey(video))[1] % 360 == -turn % 360  # FFmpeg counts the other way round
+    timing, frames = read_frames(capture_of(tmp_path, 'file = "a.mp4"', "[timing]\nreadout_s = 0.02"))
+    assert timing.readout_direction == "down"
+    for frame, expected in zip(frames, before, strict=True):
+        np.testing.assert_array_equal(frame.image, expected)
+    camera = '[camera]\nmodel = "SIMPLE_PINHOLE"\nwidth = 240\nheight = 320\nparams = [300, 120, 160]\n'
+    camera += 'pixel_origin = "corner"'
+    with pytest.raises(FormatError, match=r"is 320x240.* declared as 240x320.*not turned by 90 degrees"):
+        list(read_frames(capture_of(tmp_path, 'file = "a.mp4"', camera))[1])
+
+
+#: Weights of red and blue in the luma of FFmpeg's colour matrices 1 (BT.709), 5, 6 (BT.601), 9 (BT.2020).
+LUMA = {1: (0.2126, 0.0722), 5: (0.299, 0.114), 6: (0.299, 0.114), 9: (0.2627, 0.0593)}
+
+
+def rgb_of(yuv: np.ndarray, matrix: int, full: bool, bits: int) -> np.ndarray:
+    """By the definitions of ITU-R BT.601, BT.709, BT.2020; 0 to 1."""
+    red, blue = LUMA[matrix]
+    one = 2 ** (bits - 8)
+    y, cb, cr = np.moveaxis(yuv.astype(np.float64), -1, 0)
+    if full:
+        top = 256 * one - 1
+        y, cb, cr = y / top, (cb - 128 * one) / top, (cr - 128 * one) / top
+    else:
+        y, cb, cr = (y - 16 * one) / (219 * one), (cb - 128 * one) / (224 * one), (cr - 128 * one) / (224 * one)
+    r, b = y + 2 * (1 - red) * cr, y + 2 * (1 - blue) * cb
+    return np.clip(np.stack([r, (y - red * r - blue * b) / (1 - red - blue), b], axis=-1), 0, 1)
+
+
+@pytest.mark.parametrize("bits", [8, 10])
+@pytest.mark.parametrize("height", [240, 720])
+def test_colours_are_those_that_the_video_states(tmp_path: Path, bits: int, height: int) -> None:
+    width, one = 64, 2 ** (bits - 8)
+    pix_fmt, kind = ("yuv444p", np.uint8) if bits == 8 else ("yuv444p10le", np.uint16)
+    yuv = np.empty((height, width, 3), kind)
+    yuv[..., 0] = np.linspace(16, 235, width) * one
+    yuv[..., 1:] = 100 * one, 160 * one
+    for matrix, stated_range in itertools.product((2, *LUMA), (0, 1, 2)):
+        with av.open(str(tmp_path / "a.mkv"), "w") as container:
+            stream = container.add_stream("ffv1", rate=30)
+            stream.width, stream.height, stream.pix_fmt = width, height, pix_fmt
+            stream.codec_context.colorspace, stream.codec_context.color_range = matrix, stated_range
+            frame = av.VideoFrame(width, height, pix_fmt)
+            for i, plane in enumerate(frame.planes):
+                rows = np.zeros((height, plane.line_size), np.uint8)
+                rows[:, : width * yuv.itemsize] = np.ascontiguousarray(yuv[..., i]).view(np.uint8)
+                plane.update(rows.tobytes())
+            frame.pts, frame.time_base = 0, Fraction(1, 30)
+            frame.colorspace, frame.color_range = matrix, stated_range
+            container.mux(stream.encode(frame))
+            container.mux(stream.encode())
+        [(_, image)] = decode_video(tmp_path / "a.mkv", np.array([0]))
+        # without a statement: limited range; high definition is BT.709, the rest BT.601
+        meant = matrix if matrix != 2 else (1 if height >= 720 else 6)
+        expected = rgb_of(yuv, meant, stated_range == 2, bits)
+        # FFmpeg takes white of 10 bit in limited range to 65280 of 65535
+        tolerance = 0.8 / 255 if bits == 8 else 1.0 / 255
+        assert image.dtype == kind and np.abs(image / np.iinfo(kind).max - expected).max() < tolerance
+        [(_, grey)] = decode_reduced(tmp_path / "a.mkv", np.array([0]), 4000)
+        assert np.array_equal(grey, yuv[..., 0] // one)
+
+
+@pytest.mark.parametrize(
+    ("codec", "pix_fmt", "size"),
+    [
+        ("libx265", "yuv420p", (320, 240)),
+        ("libx265", "yuv420p10le", (320, 240)),
+        ("ffv1", "yuv420p", (321, 241)),
+        ("libx264", "yuv444p", (321, 241)),
+        ("libx264", "yuvj420p", (322, 242)),
+        ("mjpeg", "yuvj422p", (320, 240)),
+    ],
+)
+def test_codecs_depths_and_odd_sizes(tmp_path: Path, codec: str, pix_fmt: str, size: tuple[int, int]) -> None:
+    write_pattern(tmp_path / "a.mkv", 20, codec=codec, pix_fmt=pix_fmt, size=size)
+    write_pattern(tmp_path / "true.mkv", 20, codec="ffv1", pix_fmt="bgr0", size=size)
+    timing, frames = read_frames(capture_of(tmp_path, 'file = "a.mkv"'))
+    np.testing.assert_allclose(timing.t_s, np.arange(20) / 30, atol=5.1e-4)  # Matroska counts milliseconds
+    _, truth = read_frames(capture_of(tmp_path, 'file = "true.mkv"'))
+    for frame, true in zip(frames, truth, strict=True):
+        assert frame.image.shape == true.image.shape == (size[1], size[0], 3)
+        assert frame.image.dtype == (np.uint16 if "10" in pix_fmt else np.uint8)
+        found = frame.image / (257 if "10" in pix_fmt else 1)
+        grey, expected = (cv2.cvtColor(x.astype(np.float32), cv2.COLOR_RGB2GRAY) for x in (found, true.image))
+        assert np.sqrt(np.mean((grey - expected) ** 2)) < 16
+
+
+def test_damage_that_the_decoder_notices_is_an_error_with_its_time(tmp_path: Path) -> None:
+    """A decoder conceals what it cannot read; a picture that it made up must not pass for one that was filmed."""
+    video = write_pattern(tmp_path / "a.mp4", muxer={"movflags": "faststart"})
+    whole, stamps = video.read_bytes(), video_stamps_ns(video)
+    truth = [image.astype(np.int16) for _, image in decode_video(video, stamps)]
+    unnoticed = 0
+    for seed in range(20):
+        draw = random.Random(seed)
+        damaged = bytearray(whole)
+        at = draw.randrange(len(whole) // 4, len(whole) - 400)
+        damaged[at : at + 200] = draw.randbytes(200)
+        video.write_bytes(damaged)
+        try:
+            images = [image for _, image in decode_video(video, stamps)]
+        except FormatError as error:
+            assert re.search(r"a\.mp4.*(\d\.\d+ s|cut off)", str(error))
+        else:
+            unnoticed += any(np.abs(i - t).mean() > 1 for i, t in zip(images, truth, strict=True))
+    # bits that decode to something else without breaking a rule of the format cannot be noticed
+    assert unnoticed <= 4
+
+
+@pytest.mark.parametrize("kind", ["mp4", "mkv", "avi"])
+def test_a_video_that_ends_early_says_where(tmp_path: Path, kind: str) -> None:
+    video = write_pattern(tmp_path / f"a.{kind}", muxer={"movflags": "faststart"} if kind == "mp4" else {})
+    whole = video.read_bytes()
+    for share in (0.5, 0.9):
+        video.write_bytes(whole[: int(share * len(whole))])
+        with pytest.raises(FormatError, match=rf"a\.{kind}: is cut off: .*, the last at \d\.\d\d\d s"):
+            video_stamps_ns(video)
+
+
+def test_a_recording_that_was_not_finished_has_no_index(tmp_path: Path) -> None:
+    video = write_pattern(tmp_path / "a.mp4")
+    video.write_bytes(video.read_bytes()[:-2000])
+    with pytest.raises(FormatError, match=r"a\.mp4.*(cut off|not finished)"):
+        video_stamps_ns(video)
+
+
+def add_stream(path: Path, other: Path, *, cover: bool = False, first: bool = False) -> Path:
+    """``path`` with the pictures of another file as a second stream, or as its cover picture."""
+    out = path.with_stem("both")
+    with av.open(str(path)) as a, av.open(str(other)) as b, av.open(str(out), "w") as container:
+        pairs = [(a, a.streams.video[0]), (b, b.streams.video[0])]
+        if first:
+            pairs.reverse()
+        targets = []
+        for source, stream in pairs:
+            targets.append(container.add_stream_from_template(stream))
+            if cover and source is b:
+                targets[-1].disposition = av.stream.Disposition.attached_pic
+        for (source, stream), target in zip(pairs, targets, strict=True):
+            for packet in source.demux(stream):
+                if packet.dts is not None:
+                    packet.stream = target
+                    container.mux(packet)
+    return out
+
+
+@pytest.mark.parametrize("first", [False, True])
+def test_the_filmed_stream_is_found_among_others(tmp_path: Path, first: bool) -> None:
+    video = write_video(tmp_path / "a.mp4")
+    other = write_pattern(tmp_path / "small.mp4", 20, size=(32, 24))
+    both = add_stream(video, other, first=first)
+    assert np.array_equal(video_stamps_ns(both), video_stamps_ns(video))
+    cover = write_pattern(tmp_path / "cover.mp4", 1, codec="mjpeg", pix_fmt="yuvj420p", size=(640, 480))
+    both = add_stream(video, cover, cover=True, first=first)
+    assert np.array_equal(video_stamps_ns(both), video_stamps_ns(video))
+    same = write_pattern(tmp_path / "same.mp4", 20, size=(64, 48))
+    with pytest.raises(FormatError, match=r"2 video streams of 64x48; .*-map"):
+        video_stamps_ns(add_stream(video, same, first=first))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,17 +13,19 @@ from colmap_inertial.errors import FormatError, TimingError
 from colmap_inertial.io.capture import Capture, ImageFolder, Video, load_capture
 from colmap_inertial.io.frame_times import FrameStamps, stamps_of_csv, stamps_of_log, stamps_of_names
 from colmap_inertial.io.images import SUFFIXES, read_image
-from colmap_inertial.io.video import decode_video, frame_name, video_stamps_ns
+from colmap_inertial.io.video import decode_reduced, decode_video, frame_name, reduced, video_stamps_ns
 from colmap_inertial.types import Frame, FrameLog, FrameTiming
 
 
-def read_frames(capture: Capture | Path) -> tuple[FrameTiming, Iterator[Frame]]:
+def read_frames(capture: Capture | Path, *, only: Collection[str] | None = None) -> tuple[FrameTiming, Iterator[Frame]]:
     """The frames of a capture and when they were exposed.
 
     Parameters
     ----------
     capture
         A capture, or what :func:`load_capture` reads.
+    only
+        Names of the frames to decode; all, where absent.
 
     Returns
     -------
@@ -45,9 +47,45 @@ def read_frames(capture: Capture | Path) -> tuple[FrameTiming, Iterator[Frame]]:
     if isinstance(capture.frames, Video):
         stamps, source_ns = _video_frames(capture.frames, capture.frame_log)
         timing = _timing(capture, stamps)
-        return timing, _decode_video(capture, capture.frames, timing, source_ns)
+        return timing, _decode_video(capture, capture.frames, timing, source_ns, _places(timing, only))
     timing = read_frame_timing(capture)
-    return timing, _decode_images(capture, timing)
+    return timing, _decode_images(capture, timing, _places(timing, only))
+
+
+def read_reduced(
+    capture: Capture, names: Collection[str], long_side_px: int
+) -> Iterator[tuple[str, NDArray[np.uint8]]]:
+    """Some frames of a capture to look at: grey, 8 bit, not larger than ``long_side_px``, in order of time.
+
+    Raises
+    ------
+    FormatError, TimingError
+        As :func:`read_frames`.
+    """
+    if not isinstance(capture.frames, Video):
+        for frame in read_frames(capture, only=names)[1]:
+            yield frame.name, reduced(_grey(frame.image), long_side_px)
+        return
+    stamps, source_ns = _video_frames(capture.frames, capture.frame_log)
+    wanted = set(names)
+    name_of = {int(t): name for t, name in zip(source_ns, stamps.names, strict=True) if name in wanted}
+    for t_ns, grey in decode_reduced(capture.frames.file, np.array(list(name_of), dtype=np.int64), long_side_px):
+        yield name_of[t_ns], grey
+
+
+def _grey(image: NDArray[np.uint8] | NDArray[np.uint16]) -> NDArray[np.uint8]:
+    import cv2
+
+    grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    return np.asarray(grey if grey.dtype == np.uint8 else grey >> 8, dtype=np.uint8)
+
+
+def _places(timing: FrameTiming, only: Collection[str] | None) -> NDArray[np.intp]:
+    """Indices of the frames to decode."""
+    if only is None:
+        return np.arange(len(timing.names))
+    wanted = set(only)
+    return np.array([i for i, name in enumerate(timing.names) if name in wanted], dtype=np.intp)
 
 
 def read_frame_timing(capture: Capture | Path) -> FrameTiming:
@@ -124,10 +162,10 @@ def _image_names(source: ImageFolder) -> list[str]:
     return sorted(path.relative_to(source.folder).as_posix() for path in paths)
 
 
-def _decode_images(capture: Capture, timing: FrameTiming) -> Iterator[Frame]:
+def _decode_images(capture: Capture, timing: FrameTiming, places: NDArray[np.intp]) -> Iterator[Frame]:
     assert isinstance(capture.frames, ImageFolder)
-    for i, name in enumerate(timing.names):
-        path = capture.frames.folder / name
+    for i in places.tolist():
+        path = capture.frames.folder / timing.names[i]
         yield _frame(capture, timing, i, path, read_image(path))
 
 
@@ -171,10 +209,10 @@ def thin(t_ns: NDArray[np.int64], frames_per_s: float) -> NDArray[np.intp]:
 
 
 def _decode_video(
-    capture: Capture, source: Video, timing: FrameTiming, source_ns: NDArray[np.int64]
+    capture: Capture, source: Video, timing: FrameTiming, source_ns: NDArray[np.int64], places: NDArray[np.intp]
 ) -> Iterator[Frame]:
-    place = {int(t_ns): i for i, t_ns in enumerate(source_ns)}
-    for t_ns, image in decode_video(source.file, source_ns):
+    place = {int(source_ns[i]): i for i in places.tolist()}
+    for t_ns, image in decode_video(source.file, source_ns[places]):
         yield _frame(capture, timing, place[t_ns], source.file, image)
 
 
@@ -184,8 +222,11 @@ def _frame(
     camera = capture.camera
     if camera is not None and image.shape[:2] != (camera.height, camera.width):
         height, width = image.shape[:2]
+        turned = (height, width) == (camera.width, camera.height)
         raise FormatError(
-            path, f"is {width}x{height}, but the camera is declared as {camera.width}x{camera.height} ({capture.path})"
+            path,
+            f"is {width}x{height}, but the camera is declared as {camera.width}x{camera.height} ({capture.path})"
+            + ("; pictures stay as the sensor was read, not turned by 90 degrees for display" if turned else ""),
         )
     return Frame(
         name=timing.names[i],

@@ -1,4 +1,8 @@
-"""Video: exact presentation stamps, and frames one by one in the sensor's own orientation."""
+"""Video: exact presentation stamps, and frames one by one in the sensor's own orientation.
+
+Colours follow what the video says of itself: matrix (BT.601, BT.709, BT.2020) and range, limited where it says nothing,
+BT.709 from 720 rows on where it says nothing, as players have it. Transfer curves stay: a log or HDR picture stays one.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.errors import FormatError, TimingError
+from colmap_inertial.io.mp4 import is_mp4, read_movie
 
 if TYPE_CHECKING:
     import av
@@ -19,15 +24,18 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
+#: FFmpeg's number for a colour matrix that is not stated, and the rows from which it is then BT.709.
+_UNSTATED, _HD_ROWS = 2, 720
+
 
 def video_stamps_ns(path: Path) -> NDArray[np.int64]:
     """(F,) presentation time of every frame, without decoding: nanoseconds on the container's clock, its start offset
-    included, in order.
+    included, in order. Frames that an edit list cuts away have none.
 
     Raises
     ------
     FormatError
-        Where the file is missing or holds no video.
+        Where the file is missing, cut off, or holds no video.
     TimingError
         Where frames have no stamp, or two have the same.
     """
@@ -35,24 +43,32 @@ def video_stamps_ns(path: Path) -> NDArray[np.int64]:
     with container:
         packets = _guarded(path, container.demux(stream))
         found = [(packet.pts, packet.is_discard) for packet in packets if packet.size > 0]
-        listed, time_base = stream.frames, stream.time_base
-    if len(found) < listed:
-        raise FormatError(path, f"is cut off: it holds {len(found)} of the {listed} frames that its index lists")
+        listed, time_base, duration_s = stream.frames, stream.time_base, _stated_duration_s(stream)
     stamps = [stamp for stamp, is_discarded in found if not is_discarded]
+    known = [stamp for stamp in stamps if stamp is not None]
+    t_ns = np.zeros(0, dtype=np.int64)
+    if time_base is not None:
+        t_ns = np.array(sorted(_ns(stamp, time_base.numerator, time_base.denominator) for stamp in known), np.int64)
+    last = f", the last at {t_ns[-1] * 1e-9:.3f} s" if len(t_ns) else ""
+    if len(found) < listed:
+        raise FormatError(path, f"is cut off: it holds {len(found)} of the {listed} frames that its index lists{last}")
     if not stamps:
         raise FormatError(path, "holds no video frames")
-    known = [stamp for stamp in stamps if stamp is not None]
     if time_base is None or len(known) < len(stamps):
         raise TimingError(
             f"{path}: frames carry no presentation stamps; give frame_times under [video] in capture.toml"
         )
-    t_ns = np.array(sorted(_ns(stamp, time_base.numerator, time_base.denominator) for stamp in known))
-    same = np.flatnonzero(np.diff(t_ns) == 0)
+    steps = np.diff(t_ns)
+    same = np.flatnonzero(steps == 0)
     if len(same):
         raise TimingError(
             f"{path}: two frames have the presentation stamp {t_ns[same[0]] * 1e-9:.6f} s; give frame_times under "
             "[video] in capture.toml"
         )
+    # the last frame may stand as long as any other did
+    longest_s = 1e-9 * float(steps.max(initial=0))
+    if duration_s is not None and t_ns[-1] * 1e-9 + 2 * longest_s + 0.1 < duration_s:
+        raise FormatError(path, f"is cut off: it states {duration_s:.3f} s, but holds {len(t_ns)} frames{last}")
     return t_ns
 
 
@@ -70,30 +86,42 @@ def decode_video(
     """Decode the frames with the wanted presentation stamps, in order.
 
     Rotation that the container states is not applied: rows stay the sensor's rows, which the rolling shutter, the
-    calibration and the IMU's axes refer to. Videos of more than 8 bit give uint16.
+    calibration and the IMU's axes refer to. Videos of more than 8 bit give uint16, spread over its whole range.
 
     Raises
     ------
     FormatError
-        Where a wanted frame cannot be decoded.
+        Where a wanted frame cannot be decoded whole, or has another size than those before.
     """
-    container, stream = _open(path)
-    stream.thread_type = "AUTO"
-    wanted = set(wanted_ns.tolist())
-    missing = set(wanted)
-    with container:
-        for frame in _guarded(path, container.decode(stream)):
-            if frame.pts is None or frame.time_base is None:
-                continue
-            t_ns = _ns(frame.pts, frame.time_base.numerator, frame.time_base.denominator)
-            if t_ns in missing:
-                missing.discard(t_ns)
-                yield t_ns, _pixels(frame)
-                if not missing:
-                    return
-    raise FormatError(
-        path, f"{len(missing)} of {len(wanted)} frames cannot be decoded (first: at {min(missing) * 1e-9:.6f} s)"
-    )
+    size: tuple[int, int] | None = None
+    for t_ns, frame in _wanted(path, wanted_ns):
+        if size is None:
+            size = frame.width, frame.height
+        if (frame.width, frame.height) != size:
+            raise FormatError(
+                path,
+                f"changes its size from {size[0]}x{size[1]} to {frame.width}x{frame.height} at {t_ns * 1e-9:.3f} s",
+            )
+        yield t_ns, _pixels(frame)
+
+
+def decode_reduced(
+    path: Path, wanted_ns: NDArray[np.int64], long_side_px: int
+) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+    """As :func:`decode_video`, but 8 bit of brightness, as coded, not larger than ``long_side_px``: to look at."""
+    for t_ns, frame in _wanted(path, wanted_ns):
+        yield t_ns, reduced(_brightness(frame), long_side_px)
+
+
+def reduced(grey: NDArray[np.uint8], long_side_px: int) -> NDArray[np.uint8]:
+    """A grey picture, shrunk by area where its longer side is longer than this."""
+    import cv2
+
+    scale = long_side_px / max(grey.shape)
+    if scale >= 1:
+        return np.ascontiguousarray(grey)
+    size = max(1, round(grey.shape[1] * scale)), max(1, round(grey.shape[0] * scale))
+    return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
 def decode_grey(path: Path) -> Iterator[tuple[int, int, NDArray[np.uint8]]]:
@@ -111,6 +139,32 @@ def decode_grey(path: Path) -> Iterator[tuple[int, int, NDArray[np.uint8]]]:
                 yield t_ns, turn, np.asarray(frame.to_ndarray(format="gray"), dtype=np.uint8)
 
 
+def _wanted(path: Path, wanted_ns: NDArray[np.int64]) -> Iterator[tuple[int, av.VideoFrame]]:
+    """The frames with the wanted stamps, each of them whole."""
+    container, stream = _open(path)
+    stream.thread_type = "AUTO"
+    missing = set(wanted_ns.tolist())
+    first_ns = min(missing, default=0)
+    with container:
+        for frame in _guarded(path, container.decode(stream)):
+            if frame.pts is None or frame.time_base is None:
+                continue
+            t_ns = _ns(frame.pts, frame.time_base.numerator, frame.time_base.denominator)
+            if frame.is_corrupt and t_ns >= first_ns:
+                # whether wanted or not: others are made from it
+                raise FormatError(path, f"is damaged: the frame at {t_ns * 1e-9:.3f} s cannot be decoded whole")
+            if t_ns not in missing:
+                continue
+            missing.discard(t_ns)
+            yield t_ns, frame
+            if not missing:
+                return
+    raise FormatError(
+        path,
+        f"{len(missing)} of {len(wanted_ns)} frames cannot be decoded (first: at {min(missing) * 1e-9:.6f} s)",
+    )
+
+
 def _ns(pts: int, numerator: int, denominator: int) -> int:
     """Nanoseconds of a stamp, rounded once, in whole numbers."""
     return (2 * pts * numerator * 1_000_000_000 + denominator) // (2 * denominator)
@@ -120,8 +174,21 @@ def _pixels(frame: av.VideoFrame) -> NDArray[np.uint8] | NDArray[np.uint16]:
     grey = frame.format.name.startswith("gray")
     deep = max(component.bits for component in frame.format.components) > 8
     layout = ("gray16le" if deep else "gray") if grey else ("rgb48le" if deep else "rgb24")
-    pixels = frame.to_ndarray(format=layout)
+    by_rows = frame.colorspace == _UNSTATED and frame.height >= _HD_ROWS and not grey
+    pixels = frame.to_ndarray(format=layout, src_colorspace="ITU709" if by_rows else None)
     return np.asarray(pixels, dtype=np.uint16) if deep else np.asarray(pixels, dtype=np.uint8)
+
+
+def _brightness(frame: av.VideoFrame) -> NDArray[np.uint8]:
+    """The plane of brightness, as it is coded, in 8 bit; FFmpeg's grey is ten times as slow."""
+    name, bits = frame.format.name, frame.format.components[0].bits
+    if not name.startswith(("yuv", "nv12", "gray")) or name.endswith("be"):
+        return np.asarray(frame.to_ndarray(format="gray"), dtype=np.uint8)
+    plane = frame.planes[0]
+    rows = np.frombuffer(memoryview(plane), np.uint8).reshape(-1, plane.line_size)[: frame.height]
+    if bits == 8:
+        return rows[:, : frame.width]
+    return np.asarray(rows[:, : 2 * frame.width].view("<u2") >> (bits - 8), dtype=np.uint8)
 
 
 def _open(path: Path) -> tuple[InputContainer, VideoStream]:
@@ -132,21 +199,63 @@ def _open(path: Path) -> tuple[InputContainer, VideoStream]:
     try:
         container = av.open(str(path))
     except (av.FFmpegError, OSError, ValueError) as error:
+        if is_mp4(path):
+            read_movie(path)  # knows better what is wrong with its index
         raise FormatError(path, f"is no video that FFmpeg reads: {_reason(error)}") from None
-    if not container.streams.video:
+    try:
+        return container, _filmed(path, container)
+    except FormatError:
         container.close()
-        raise FormatError(path, "holds no video stream")
-    return container, container.streams.video[0]
+        raise
+
+
+def _filmed(path: Path, container: InputContainer) -> VideoStream:
+    """The video stream that the camera filmed: no cover picture, no smaller copy."""
+    from av.stream import Disposition
+
+    accompanying = Disposition.attached_pic | Disposition.timed_thumbnails
+    streams = [stream for stream in container.streams.video if not stream.disposition & accompanying]
+    if not streams:
+        what = "only a cover picture, no video stream" if container.streams.video else "no video stream"
+        raise FormatError(path, f"holds {what}")
+    largest = max(_area(stream) for stream in streams)
+    streams = [stream for stream in streams if _area(stream) == largest]
+    if len(streams) > 1:
+        raise FormatError(
+            path,
+            f"holds {len(streams)} video streams of {streams[0].width}x{streams[0].height}; write the one to use into "
+            "a file of its own (ffmpeg -i IN -map 0:v:0 -c copy OUT)",
+        )
+    return streams[0]
+
+
+def _area(stream: VideoStream) -> int:
+    # a stream of no known codec has no size
+    return int(getattr(stream, "width", 0) * getattr(stream, "height", 0))
+
+
+def _stated_duration_s(stream: VideoStream) -> float | None:
+    """When the stream ends by its own account, where that was noted at the end of the recording (Matroska)."""
+    try:
+        hours, minutes, seconds = stream.metadata.get("DURATION", "").split(":")
+        return 3600 * int(hours) + 60 * int(minutes) + float(seconds)
+    except ValueError:
+        return None
 
 
 def _guarded(path: Path, items: Iterator[T]) -> Iterator[T]:
     """The same items; FFmpeg's complaint about a damaged file becomes ours."""
     import av
 
+    shown = ""
     try:
-        yield from items
+        for item in items:
+            time_s = getattr(item, "time", None)  # of a frame; packets have none
+            if time_s is not None:
+                shown = f" after the frame at {time_s:.3f} s"
+            yield item
     except (av.FFmpegError, OSError) as error:
-        raise FormatError(path, f"is damaged or cut off: {_reason(error)}") from None
+        raise FormatError(path, f"is damaged or cut off{shown}: {_reason(error)}") from None
 
 
 def _reason(error: Exception) -> str:
