@@ -21,9 +21,9 @@ ORDER = [
     ("align", "smooth"),
     ("scale",),
     ("model",),
-    ("validate", "diagnose"),
+    ("validate", "diagnose", "report"),
     ("pipeline",),
-    ("simulate", "batch"),
+    ("simulate", "batch", "view"),
     ("cli",),
 ]
 RANK = {room: rank for rank, rooms in enumerate(ORDER) for room in rooms}

@@ -3,6 +3,7 @@
 from colmap_inertial.validate.measure import validate_model
 from colmap_inertial.validate.pictures import write_pictures
 from colmap_inertial.validate.result import (
+    Corner,
     Distance,
     RejectedView,
     SetScale,
@@ -13,6 +14,7 @@ from colmap_inertial.validate.result import (
 from colmap_inertial.validate.targets import Target, TargetSpecError, parse_target
 
 __all__ = [
+    "Corner",
     "Distance",
     "RejectedView",
     "SetScale",

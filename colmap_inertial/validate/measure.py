@@ -17,6 +17,7 @@ from colmap_inertial.validate.fit import ScaleFit, fit_scale
 from colmap_inertial.validate.observations import Observations, Placement, triangulate
 from colmap_inertial.validate.place import PartPlacement, median_residual_px, observe
 from colmap_inertial.validate.result import (
+    Corner,
     Distance,
     DistanceSet,
     RejectedView,
@@ -189,6 +190,7 @@ def _measure(search: Search, placed: dict[int, PartPlacement], missing: dict[str
     rejected = _rejected_views(search, placed, obs, dropped, missing)
     view_results = _view_results(search, sightings, obs, fit, everything)
     pose_px = fit.residual_px - fit.corner_residual_px
+    position = _positions(target, obs, fit)
     return Validation(
         target=target,
         unscaled=options.unscaled,
@@ -204,7 +206,10 @@ def _measure(search: Search, placed: dict[int, PartPlacement], missing: dict[str
         rms_px=_rms(fit.residual_px),
         corner_noise_px=fit.noise.corner_px,
         pose_noise_px=_rms(pose_px),
-        distances=_distances(target, obs, fit, control_corner, to_metres),
+        distances=_distances(target, position, control_corner, to_metres),
+        corners=tuple(
+            Corner(name=target.label(i), in_model=position[i]) for i in np.flatnonzero(np.isfinite(position[:, 0]))
+        ),
         views=view_results,
         views_rejected=rejected,
         control=control,
@@ -294,12 +299,15 @@ def _set_scale(of: tuple[ScaleFit, int] | None) -> SetScale | None:
     )
 
 
-def _distances(
-    target: Target, obs: Observations, fit: ScaleFit, control: NDArray[np.bool_], to_metres: float
-) -> tuple[Distance, ...]:
+def _positions(target: Target, obs: Observations, fit: ScaleFit) -> Array:
+    """(N, 3) each corner triangulated on its own; not a number where its views do not determine it."""
     corner, in_world, determined = triangulate(obs, fit.placement)
     position = np.full((len(target.part), 3), np.nan)
     position[corner[determined]] = in_world[determined]
+    return position
+
+
+def _distances(target: Target, position: Array, control: NDArray[np.bool_], to_metres: float) -> tuple[Distance, ...]:
     out = []
     for a, b in target.pairs(np.isfinite(position[:, 0])).tolist():
         known = float(np.linalg.norm(target.corners_m[a] - target.corners_m[b]))

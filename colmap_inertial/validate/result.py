@@ -44,6 +44,22 @@ class Distance:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class Corner:
+    """A corner of the target, triangulated on its own.
+
+    Attributes
+    ----------
+    name
+        As in :class:`Distance`.
+    in_model
+        (3,) its position; model units.
+    """
+
+    name: str
+    in_model: Array
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ViewResiduals:
     """The target in one image.
 
@@ -131,6 +147,8 @@ class Validation:
         The part that all corners of a view share: root mean square movement of corners by each view's pose error.
     distances
         Known distances, measured.
+    corners
+        The ends of these distances.
     views
         Residuals by view.
     views_rejected
@@ -159,6 +177,7 @@ class Validation:
     corner_noise_px: float
     pose_noise_px: float
     distances: tuple[Distance, ...]
+    corners: tuple[Corner, ...]
     views: tuple[ViewResiduals, ...]
     views_rejected: tuple[RejectedView, ...]
     control: SetScale | None
@@ -214,6 +233,7 @@ class Validation:
                 }
                 for d in self.distances
             ],
+            "corners": [{"name": c.name, "in_model": c.in_model.tolist()} for c in self.corners],
             "views": [{"name": v.name, "corners": len(v.corner), "rms_px": v.rms_px} for v in self.views],
             "views_rejected": [
                 {"name": v.name, "reason": v.reason, "residual_px": v.residual_px} for v in self.views_rejected
