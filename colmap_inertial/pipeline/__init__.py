@@ -5,20 +5,16 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import logging
-import os
-import shutil
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from colmap_inertial import __version__
-from colmap_inertial.errors import FormatError, InertialError, NotObservableError, TargetNotFoundError
+from colmap_inertial.errors import FormatError, InertialError
 from colmap_inertial.gravity import gravity_in_cam
 from colmap_inertial.io.calibration import SHARED_CLOCK_OFFSET_S, for_another_recording, read_calibration
 from colmap_inertial.io.capture import Capture, Video, load_capture
 from colmap_inertial.io.files import write_json, write_text
 from colmap_inertial.io.frames import frame_source, read_frames
-from colmap_inertial.model import Model, find_models, read_model, summarize
 from colmap_inertial.options import ReconstructOptions
 from colmap_inertial.pipeline.colmap import (
     KeypointStage,
@@ -31,7 +27,7 @@ from colmap_inertial.pipeline.colmap import (
     write_gravity_priors,
 )
 from colmap_inertial.pipeline.config import config_as_toml
-from colmap_inertial.pipeline.dense import run_dense
+from colmap_inertial.pipeline.contact_sheet import CropKeeper
 from colmap_inertial.pipeline.frames import FrameRecord, FrameStage, read_frame_records, require_frames, write_frames
 from colmap_inertial.pipeline.imaging import (
     ImagingPlan,
@@ -42,10 +38,12 @@ from colmap_inertial.pipeline.imaging import (
     write_plan,
     write_rectified,
 )
-from colmap_inertial.pipeline.metric import MetricStage, ModelStage, write_trajectory
+from colmap_inertial.pipeline.metric import MetricStage, ModelStage
+from colmap_inertial.pipeline.models import run_models, validated, with_dense
 from colmap_inertial.pipeline.preflight import preflight, read_checked_imu, stop_or_doubt
 from colmap_inertial.pipeline.readout import ReadoutStage
-from colmap_inertial.pipeline.result import ModelResult, ReconstructResult, result_as_json
+from colmap_inertial.pipeline.reporting import report_result, reporting_stops, write_recording
+from colmap_inertial.pipeline.result import ModelResult, ReconstructResult
 from colmap_inertial.pipeline.stages import DeblurStage, GyroView, RollingShutterStage
 from colmap_inertial.pipeline.workspace import StageRunner, Workspace, fingerprint, remove
 from colmap_inertial.types import (
@@ -55,7 +53,7 @@ from colmap_inertial.types import (
     FrameTiming,
     ImuRecording,
 )
-from colmap_inertial.validate import Target, Validation, parse_target, validate_model, write_pictures
+from colmap_inertial.validate import parse_target
 
 log = logging.getLogger(__name__)
 
@@ -168,15 +166,19 @@ def reconstruct(
     prior = prior_calibration(loaded, options)  # likewise
     workspace = Workspace(out)
     workspace.open(loaded.path)
-    with workspace.locked(), logging_to(workspace.log):
+    with workspace.locked(), logging_to(workspace.log), reporting_stops(workspace, loaded):
         log.info("colmap-inertial %s: %s -> %s", __version__, capture, out)
         write_text(workspace.config, config_as_toml(options))
-        doubts = stop_or_doubt(preflight(loaded, raw, timing, prior, progress), force=options.force)
+        diagnosis = preflight(loaded, raw, timing, prior, progress)
+        write_json(workspace.diagnosis, diagnosis.as_json())
+        write_recording(workspace, imu, timing)
+        doubts = stop_or_doubt(diagnosis, force=options.force)
         runner = StageRunner(workspace)
         plan = run_plan(runner, workspace, loaded, imu, timing, options, progress)
         of_frames = list(plan.frame_stages() if frame_stages is None else frame_stages)
         of_keypoints = list(plan.keypoint_stages() if keypoint_stages is None else keypoint_stages)
-        run_frames(runner, workspace, loaded, timing, frames, of_frames, progress)
+        kept = CropKeeper.of(plan)
+        run_frames(runner, workspace, loaded, timing, frames, of_frames, progress, kept=kept)
         records = read_frame_records(workspace.frames)
         _run_colmap(runner, workspace, records, gravity, options, of_keypoints, progress)
         rectifying = [stage for stage in of_keypoints if isinstance(stage, RollingShutterStage)]
@@ -195,7 +197,8 @@ def reconstruct(
         result = ReconstructResult(
             workspace=workspace, models=models, frames=records, imaging=plan, seconds=runner.seconds
         )
-        write_json(workspace.result, result_as_json(result, loaded))
+        write_recording(workspace, imu, timing, plan)
+        report_result(result, loaded)
         if not result.waiting:  # else the run goes on later, and needs them
             remove(workspace.features)
         log.info("finished")
@@ -299,15 +302,22 @@ def run_frames(
     frames: Iterator[Frame],
     stages: Sequence[FrameStage],
     progress: Progress,
+    *,
+    kept: CropKeeper | None = None,
 ) -> None:
+    """The frames through the stages; ``kept`` keeps parts of some before and after."""
     source = frame_source(capture)
 
     def work(partial: Sequence[Path]) -> None:
-        images, records = partial
-        write_frames(frames, timing, stages, source_folder=source, images=images, records=records, progress=progress)
+        images, records = partial[:2]
+        through = stages if kept is None else (kept.before, *stages, kept.after)
+        write_frames(frames, timing, through, source_folder=source, images=images, records=records, progress=progress)
+        if kept is not None:
+            kept.write(partial[2])
 
     depends = {"capture": capture, "timing": timing, "inputs": _inputs(capture, timing), "stages": stages}
-    runner.run("frames", depends, [workspace.images, workspace.frames], work)
+    crops = [] if kept is None else [workspace.crops]
+    runner.run("frames", depends, [workspace.images, workspace.frames, *crops], work)
 
 
 def _inputs(capture: Capture, timing: FrameTiming) -> list[object]:
@@ -387,91 +397,6 @@ def _run_colmap(
     runner.run("features", {**common, "stages": stages, "gravity": gravity}, [workspace.features], features)
     runner.run("matches", common, [workspace.database], matches)
     runner.run("mapping", common, [workspace.sparse], models)
-
-
-def run_models(
-    workspace: Workspace,
-    timing: FrameTiming,
-    imu: ImuRecording,
-    stages: Sequence[ModelStage],
-    runner: StageRunner,
-    progress: Progress,
-    found: Mapping[int, Path] | None = None,
-) -> tuple[ModelResult, ...]:
-    """Every sub-model through the model stages, then to its final place; run again after an interruption.
-
-    The sub-models are those of ``sparse/``, or ``found`` by number elsewhere.
-    """
-    start = time.perf_counter()
-    scratch = workspace.stamps / "models"
-    for path in (scratch, workspace.sparse_metric, workspace.validation, *workspace.root.glob("trajectory*")):
-        remove(path)
-    results: list[ModelResult] = []
-    found = find_models(workspace.sparse) if found is None else found
-    for done, (index, folder) in enumerate(found.items()):
-        progress("metric", done, len(found))
-        shutil.copytree(folder, scratch / str(index))
-        model = Model(folder=scratch / str(index), index=index, timing=timing)
-        for stage in stages:
-            model = stage(model)
-        if model.scale is None:
-            raise ValueError("the model stages must include one that estimates the scale; see default_model_stages")
-        result = ModelResult(index=index, scale=model.scale, summary=summarize(read_model(folder)), sparse=folder)
-        if model.similarity is not None:
-            target = workspace.sparse_metric / str(index)
-            target.parent.mkdir(exist_ok=True)
-            os.replace(model.folder, target)
-            first = not any(other.sparse_metric for other in results)
-            trajectory = workspace.trajectory(index, first=first)
-            write_trajectory(trajectory, dataclasses.replace(model, folder=target), imu)
-            result = dataclasses.replace(result, sparse_metric=target, trajectory=trajectory)
-        log.info("model %d: %s %s", index, result.scale.verdict, "; ".join(result.scale.reasons))
-        results.append(result)
-    remove(scratch)
-    progress("metric", len(found), len(found))
-    runner.seconds["metric"] = time.perf_counter() - start
-    return tuple(results)
-
-
-def validated(
-    workspace: Workspace, models: Sequence[ModelResult], target: Target, images: Path, progress: Progress
-) -> tuple[ModelResult, ...]:
-    """Measure the target in the metric models; one that cannot be measured does not undo its model."""
-    checked = []
-    for model in models:
-        if model.sparse_metric is None:
-            checked.append(model)
-            continue
-        check: Validation | InertialError
-        try:
-            check = validate_model(
-                model.sparse_metric,
-                images,
-                target,
-                progress=lambda done, total: progress("validation", done, total),
-            )
-            write_pictures(check, images, workspace.validation / str(model.index))
-        except (TargetNotFoundError, NotObservableError) as error:
-            check = error
-        said = check if isinstance(check, InertialError) else f"scale error {check.scale_error_pct:+.3f} %"
-        log.info("model %d: %s against %s", model.index, said, target.spec)
-        checked.append(dataclasses.replace(model, validation=check))
-    return tuple(checked)
-
-
-def with_dense(
-    runner: StageRunner,
-    workspace: Workspace,
-    models: Sequence[ModelResult],
-    images: Path,
-    options: ReconstructOptions,
-    progress: Progress,
-) -> tuple[ModelResult, ...]:
-    """The models with their dense reconstructions, where they are metric."""
-    metric = [model.index for model in models if model.sparse_metric is not None]
-    threads = 1 if options.deterministic else -1
-    dense = run_dense(runner, workspace, metric, images, options.dense_options, num_threads=threads, progress=progress)
-    return tuple(dataclasses.replace(model, dense=dense.get(model.index)) for model in models)
 
 
 __all__ = [

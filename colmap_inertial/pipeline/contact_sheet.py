@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,20 @@ from colmap_inertial.errors import OutputError
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.psf import blur_field
 from colmap_inertial.io.capture import Capture
+from colmap_inertial.io.files import write_json
 from colmap_inertial.io.images import read_image
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.pipeline.first_look import some_frames
+from colmap_inertial.pipeline.frames import encode_image
+from colmap_inertial.pipeline.imaging import ImagingPlan
 from colmap_inertial.pipeline.stages import GyroView
+from colmap_inertial.types import Frame
 
 _FRAMES, _WIDTH, _HEIGHT, _GAP, _LABEL = 8, 420, 280, 6, 22
+#: Frames that are looked at for the report, and how many of them it shows.
+_CANDIDATES, _SHOWN = 16, 4
+#: Top, left, height and width.
+Part = tuple[int, int, int, int]
 #: Distance of the arrows, px of the crop.
 _ARROWS_PX = 70
 
@@ -62,13 +71,73 @@ def write_contact_sheet(path: Path, capture: Capture, view: GyroView, images: Pa
         raise OutputError(f"{path} cannot be written: {error.strerror or error}") from error
 
 
+@dataclass(eq=False)
+class CropKeeper:
+    """Keeps parts of some frames as they pass before and after the frame stages, a few however many there are.
+
+    Attributes
+    ----------
+    blur_px
+        By name, the blur of the frames to look at.
+    """
+
+    blur_px: Mapping[str, float]
+    _seen: dict[str, tuple[Part, NDArray[np.uint8]]] = field(default_factory=dict, init=False)
+    _pairs: dict[str, tuple[NDArray[np.uint8], NDArray[np.uint8]]] = field(default_factory=dict, init=False)
+
+    @classmethod
+    def of(cls, plan: ImagingPlan) -> CropKeeper:
+        """For a plan: frames that are to be deblurred, evenly from the most to the least blurred."""
+        blurred = () if plan.deblur is None else plan.deblur[0]
+        by_blur = sorted((d for d in blurred if d.action == "deblur"), key=lambda d: (-(d.blur_px or 0.0), d.name))
+        some = by_blur[:: -(-len(by_blur) // _CANDIDATES) or 1]
+        return cls(blur_px={decision.name: decision.blur_px or 0.0 for decision in some})
+
+    def before(self, frames: Iterator[Frame], /) -> Iterator[Frame]:
+        """The first stage."""
+        for frame in frames:
+            if frame.name in self.blur_px:
+                picture = _eight_bit(frame.image)
+                part = _busiest(picture)
+                self._seen[frame.name] = part, _cut(picture, part)
+            yield frame
+
+    def after(self, frames: Iterator[Frame], /) -> Iterator[Frame]:
+        """The last stage."""
+        for frame in frames:
+            seen = self._seen.pop(frame.name, None)
+            if seen is not None:
+                part, before = seen
+                after = _cut(_eight_bit(frame.image), part)
+                if before.shape == after.shape and not np.array_equal(before, after):
+                    self._pairs[frame.name] = before, after
+            yield frame
+
+    def write(self, folder: Path) -> None:
+        """Write the most blurred of the frames that were changed: JPEGs, and ``crops.json`` with their names."""
+        folder.mkdir(parents=True)
+        listed = []
+        for number, name in enumerate(sorted(self._pairs, key=lambda name: -self.blur_px[name])[:_SHOWN]):
+            entry: dict[str, object] = {"name": name, "blur_px": self.blur_px[name]}
+            for side, picture in zip(("before", "after"), self._pairs[name], strict=True):
+                entry[side] = f"{number}_{side}.jpg"
+                encode_image(folder / f"{number}_{side}.jpg", picture)
+            listed.append(entry)
+        write_json(folder / "crops.json", {"crops": listed})
+
+
+def _cut(picture: NDArray[np.uint8], part: Part) -> NDArray[np.uint8]:
+    top, left, height, width = part
+    return picture[top : top + height, left : left + width].copy()
+
+
 def _eight_bit(image: NDArray[Any]) -> NDArray[np.uint8]:
     """(H, W, 3) with 8 bit."""
     codes = np.asarray(image if image.dtype == np.uint8 else image >> 8, dtype=np.uint8)
     return np.repeat(codes[..., None], 3, axis=2) if codes.ndim == 2 else codes
 
 
-def _busiest(image: NDArray[np.uint8]) -> tuple[int, int, int, int]:
+def _busiest(image: NDArray[np.uint8]) -> Part:
     """Top, left, height and width of the part with the most texture."""
     import cv2
 
@@ -95,4 +164,4 @@ def _draw(crop: NDArray[np.uint8], field: BlurField, top: int, left: int) -> Non
             cv2.line(crop, ends[0], ends[1], (255, 60, 0), 2, cv2.LINE_AA)
 
 
-__all__ = ["write_contact_sheet"]
+__all__ = ["CropKeeper", "write_contact_sheet"]

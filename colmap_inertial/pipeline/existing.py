@@ -28,19 +28,13 @@ from colmap_inertial.model.layout import read_layout
 from colmap_inertial.model.project import apply_to_project
 from colmap_inertial.model.similarities import ModelScale
 from colmap_inertial.options import MappingOptions, ProjectOptions, ReconstructOptions
-from colmap_inertial.pipeline import (
-    default_model_stages,
-    logging_to,
-    prior_calibration,
-    run_models,
-    silent,
-    validated,
-    with_dense,
-)
+from colmap_inertial.pipeline import default_model_stages, logging_to, prior_calibration, silent
 from colmap_inertial.pipeline.colmap import Progress
 from colmap_inertial.pipeline.config import config_as_toml
 from colmap_inertial.pipeline.metadata import stated_exposures_s
-from colmap_inertial.pipeline.result import ModelResult, ReconstructResult, result_as_json
+from colmap_inertial.pipeline.models import run_models, validated, with_dense
+from colmap_inertial.pipeline.reporting import report_result, write_recording
+from colmap_inertial.pipeline.result import ModelResult, ReconstructResult
 from colmap_inertial.pipeline.workspace import StageRunner, Workspace, fingerprint
 from colmap_inertial.types import FrameTiming, ImuRecording, ReadoutDirection, Similarity
 from colmap_inertial.validate import parse_target
@@ -141,7 +135,8 @@ def reconstruct_project(
         result = ReconstructResult(
             workspace=workspace, models=results, frames=(), seconds=runner.seconds, project_metric=metric
         )
-        write_json(workspace.result, {**result_as_json(result, given.capture), "project": source})
+        write_recording(workspace, given.imu, timing)
+        report_result(result, given.capture, project=source)
         log.info("finished")
     return result
 

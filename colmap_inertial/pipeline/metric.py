@@ -100,7 +100,20 @@ def smoothed_path(
     )
 
 
-def write_trajectory(path: Path, model: Model, imu: ImuRecording) -> None:
+def metric_trajectory(trajectory: CameraTrajectory) -> CameraTrajectory:
+    """The trajectory of a model that is in metres, said to be so."""
+    return dataclasses.replace(trajectory, length_unit="m")
+
+
+def gravity_in_model(model: Model) -> Array | None:
+    """(3,) gravity in the world of a model as it came out of the model stages; ``None`` where unknown."""
+    gravity = None if model.scale is None else model.scale.gravity_in_world_m_s2
+    if gravity is None or model.similarity is None:
+        return gravity
+    return quat_rotate(model.similarity.rotation_xyzw, gravity)
+
+
+def write_trajectory(path: Path, model: Model, trajectory: CameraTrajectory, imu: ImuRecording) -> None:
     """Write the smoothed metric camera path of a model as TUM text, and its covariance beside it.
 
     Parameters
@@ -110,15 +123,15 @@ def write_trajectory(path: Path, model: Model, imu: ImuRecording) -> None:
         position, velocity and acceleration.
     model
         A model that a stage made metric.
+    trajectory
+        Its poses, in metres.
     imu
         The recording that ran along.
     """
-    estimate, similarity = model.scale, model.similarity
-    if estimate is None or similarity is None or estimate.calibration is None or estimate.gravity_in_world_m_s2 is None:
+    estimate, gravity = model.scale, gravity_in_model(model)
+    if estimate is None or model.similarity is None or estimate.calibration is None or gravity is None:
         raise ValueError("only a metric model has a metric trajectory")
-    trajectory, _ = trajectory_from_model(read_model(model.folder), model.timing)
-    gravity = quat_rotate(similarity.rotation_xyzw, estimate.gravity_in_world_m_s2)
-    smoothed = smoothed_path(dataclasses.replace(trajectory, length_unit="m"), imu, estimate, gravity)
+    smoothed = smoothed_path(trajectory, imu, estimate, gravity)
     write_tum(path, smoothed)
     target = path.with_name(f"{path.stem}_cov.npz")
     partial = target.with_name(f"{path.stem}_cov.partial.npz")

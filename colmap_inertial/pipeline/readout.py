@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.imaging.gyro_camera import FrameShutter
 from colmap_inertial.model import Model, read_model, trajectory_from_model
-from colmap_inertial.model.readout import settle_readout
+from colmap_inertial.model.readout import Settled, settle_readout
 from colmap_inertial.options import ScaleOptions
 from colmap_inertial.pipeline.metric import smoothed_path
 from colmap_inertial.scale import estimate_scale
@@ -45,6 +45,11 @@ class ReadoutStage:
     options: ScaleOptions
     refine_intrinsics: bool
     num_threads: int = -1
+    _done: dict[int, Settled] = field(default_factory=dict, init=False, compare=False, repr=False)
+
+    def settled(self, index: int, /) -> Settled | None:
+        """What became of a model that went through; ``None`` where there was no scale to go by."""
+        return self._done.get(index)
 
     def __call__(self, model: Model, /) -> Model:
         """Adjust the model."""
@@ -78,6 +83,7 @@ class ReadoutStage:
             refine_intrinsics=self.refine_intrinsics,
             num_threads=self.num_threads,
         )
+        self._done[model.index] = what
         log.info(
             "model %d: translation within the readout moves points by %.2f px; reprojection error %.3f -> %.3f px%s",
             model.index,

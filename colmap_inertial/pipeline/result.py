@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,7 @@ from colmap_inertial import __version__
 from colmap_inertial.errors import InertialError, NotObservableError
 from colmap_inertial.geometry import quat_conjugate, quat_log, quat_multiply
 from colmap_inertial.io.capture import Capture
+from colmap_inertial.model.readout import Settled
 from colmap_inertial.pipeline.dense import DenseResult
 from colmap_inertial.pipeline.frames import FrameRecord
 from colmap_inertial.pipeline.imaging import ImagingPlan
@@ -33,6 +34,8 @@ class ModelResult:
     """Against the capture's target, where it names one; an error says why the target could not be measured."""
     dense: DenseResult | None = None
     """Where it was asked for."""
+    readout: Settled | None = None
+    """What the camera's translation within a rolling shutter's readout did to the model, where it was looked at."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -143,6 +146,7 @@ def result_as_json(result: ReconstructResult, capture: Capture) -> dict[str, obj
                 if plan.view is None
                 else _change(plan.view.calibration, model.scale.calibration),
                 "validation": _validation_as_json(model.validation),
+                "readout_translation": None if model.readout is None else asdict(model.readout),
                 "dense": model.dense and model.dense.as_json(root),
             }
             for model in result.models

@@ -218,7 +218,8 @@ def show_result(result: ReconstructResult) -> None:
         paths = (model.sparse_metric, model.trajectory, *made, result.project_metric)
         written = [path for path in paths if path is not None]
         lines += [
-            ("Written" if i == 0 else "", str(path)) for i, path in enumerate([*written, result.workspace.result])
+            ("Written" if i == 0 else "", str(path))
+            for i, path in enumerate([*written, result.workspace.result, result.workspace.report])
         ]
         lines.append(("Time", ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in result.seconds.items())))
         _show(f"Model {model.index}", lines)

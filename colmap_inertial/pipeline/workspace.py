@@ -26,6 +26,7 @@ import numpy as np
 from colmap_inertial import __version__
 from colmap_inertial.errors import FormatError, InertialError, OutputError, OutputExistsError
 from colmap_inertial.io.files import read_json, write_json
+from colmap_inertial.report.content import CROPS_FOLDER, DATA_FOLDER
 
 log = logging.getLogger(__name__)
 
@@ -90,6 +91,26 @@ class Workspace:
     def validation(self) -> Path:
         """Pictures of the target in the frames."""
         return self.root / "validation"
+
+    @property
+    def diagnosis(self) -> Path:
+        """What was found wrong with the recording before the reconstruction."""
+        return self.root / "diagnosis.json"
+
+    @property
+    def report(self) -> Path:
+        """For reading: everything in one page."""
+        return self.root / "report.html"
+
+    @property
+    def report_data(self) -> Path:
+        """What the report shows beside the results; with it, the report can be made again."""
+        return self.root / DATA_FOLDER
+
+    @property
+    def crops(self) -> Path:
+        """Parts of some frames before and after the frame stages."""
+        return self.report_data / CROPS_FOLDER
 
     @property
     def result(self) -> Path:
@@ -286,6 +307,8 @@ class StageRunner:
             log.info("%s: finished in an earlier run, kept", name)
             return
         stamp.unlink(missing_ok=True)
+        for path in outputs:
+            path.parent.mkdir(parents=True, exist_ok=True)
         partial = [path.with_name(f"{path.stem}.partial{path.suffix}") for path in outputs]
         for path in (*outputs, *partial):
             remove(path)

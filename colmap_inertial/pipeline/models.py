@@ -1,0 +1,128 @@
+"""COLMAP's models through the model stages, to their final places; measured and made dense where that is asked for."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import os
+import shutil
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from colmap_inertial.errors import InertialError, NotObservableError, TargetNotFoundError
+from colmap_inertial.model import Model, find_models, read_model, summarize, trajectory_from_model
+from colmap_inertial.options import ReconstructOptions
+from colmap_inertial.pipeline.colmap import Progress
+from colmap_inertial.pipeline.dense import run_dense
+from colmap_inertial.pipeline.metric import ModelStage, metric_trajectory, write_trajectory
+from colmap_inertial.pipeline.readout import ReadoutStage
+from colmap_inertial.pipeline.reporting import write_model_record
+from colmap_inertial.pipeline.result import ModelResult
+from colmap_inertial.pipeline.workspace import StageRunner, Workspace, remove
+from colmap_inertial.types import FrameTiming, ImuRecording
+from colmap_inertial.validate import Target, Validation, validate_model, write_pictures
+
+log = logging.getLogger(__name__)
+
+
+def run_models(
+    workspace: Workspace,
+    timing: FrameTiming,
+    imu: ImuRecording,
+    stages: Sequence[ModelStage],
+    runner: StageRunner,
+    progress: Progress,
+    found: Mapping[int, Path] | None = None,
+) -> tuple[ModelResult, ...]:
+    """Every sub-model through the model stages, then to its final place; run again after an interruption.
+
+    The sub-models are those of ``sparse/``, or ``found`` by number elsewhere.
+    """
+    start = time.perf_counter()
+    scratch = workspace.stamps / "models"
+    stale = [*workspace.root.glob("trajectory*"), *workspace.report_data.glob("model_*.json")]
+    for path in (scratch, workspace.sparse_metric, workspace.validation, *stale):
+        remove(path)
+    results: list[ModelResult] = []
+    found = find_models(workspace.sparse) if found is None else found
+    for done, (index, folder) in enumerate(found.items()):
+        progress("metric", done, len(found))
+        shutil.copytree(folder, scratch / str(index))
+        model = Model(folder=scratch / str(index), index=index, timing=timing)
+        for stage in stages:
+            model = stage(model)
+        if model.scale is None:
+            raise ValueError("the model stages must include one that estimates the scale; see default_model_stages")
+        settled = [stage.settled(index) for stage in stages if isinstance(stage, ReadoutStage)]
+        result = ModelResult(
+            index=index,
+            scale=model.scale,
+            summary=summarize(read_model(folder)),
+            sparse=folder,
+            readout=next((one for one in settled if one is not None), None),
+        )
+        if model.similarity is not None:
+            target = workspace.sparse_metric / str(index)
+            target.parent.mkdir(exist_ok=True)
+            os.replace(model.folder, target)
+            model = dataclasses.replace(model, folder=target)
+            first = not any(other.sparse_metric for other in results)
+            trajectory = workspace.trajectory(index, first=first)
+            result = dataclasses.replace(result, sparse_metric=target, trajectory=trajectory)
+        reconstruction = read_model(model.folder)
+        poses, _ = trajectory_from_model(reconstruction, timing)
+        if model.similarity is not None and result.trajectory is not None:
+            poses = metric_trajectory(poses)
+            write_trajectory(result.trajectory, model, poses, imu)
+        write_model_record(workspace, model, reconstruction, poses, imu)
+        log.info("model %d: %s %s", index, result.scale.verdict, "; ".join(result.scale.reasons))
+        results.append(result)
+    remove(scratch)
+    progress("metric", len(found), len(found))
+    runner.seconds["metric"] = time.perf_counter() - start
+    return tuple(results)
+
+
+def validated(
+    workspace: Workspace, models: Sequence[ModelResult], target: Target, images: Path, progress: Progress
+) -> tuple[ModelResult, ...]:
+    """Measure the target in the metric models; one that cannot be measured does not undo its model."""
+    checked = []
+    for model in models:
+        if model.sparse_metric is None:
+            checked.append(model)
+            continue
+        check: Validation | InertialError
+        try:
+            check = validate_model(
+                model.sparse_metric,
+                images,
+                target,
+                progress=lambda done, total: progress("validation", done, total),
+            )
+            write_pictures(check, images, workspace.validation / str(model.index))
+        except (TargetNotFoundError, NotObservableError) as error:
+            check = error
+        said = check if isinstance(check, InertialError) else f"scale error {check.scale_error_pct:+.3f} %"
+        log.info("model %d: %s against %s", model.index, said, target.spec)
+        checked.append(dataclasses.replace(model, validation=check))
+    return tuple(checked)
+
+
+def with_dense(
+    runner: StageRunner,
+    workspace: Workspace,
+    models: Sequence[ModelResult],
+    images: Path,
+    options: ReconstructOptions,
+    progress: Progress,
+) -> tuple[ModelResult, ...]:
+    """The models with their dense reconstructions, where they are metric."""
+    metric = [model.index for model in models if model.sparse_metric is not None]
+    threads = 1 if options.deterministic else -1
+    dense = run_dense(runner, workspace, metric, images, options.dense_options, num_threads=threads, progress=progress)
+    return tuple(dataclasses.replace(model, dense=dense.get(model.index)) for model in models)
+
+
+__all__ = ["run_models", "validated", "with_dense"]

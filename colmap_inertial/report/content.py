@@ -1,0 +1,205 @@
+"""What a report says, gathered from the files of an output folder: nothing is computed again."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from colmap_inertial import __version__
+from colmap_inertial.io.files import read_json, read_text
+from colmap_inertial.report.series import strided
+from colmap_inertial.report.words import half_width_pct, outcome_of_model, outcome_of_stop
+
+VERSION = 1
+#: What the pipeline keeps for the report alone, in an output folder.
+DATA_FOLDER, CROPS_FOLDER = "report_data", "crops"
+#: Models that are shown in full, the largest ones; frames in the plot of blur; pictures of the target.
+_MOST_MODELS, _MOST_FRAMES, _MOST_PICTURES = 3, 3000, 4
+
+Content = dict[str, Any]
+
+
+def recording_file(out: Path) -> Path:
+    """What is kept of the recording."""
+    return out / DATA_FOLDER / "recording.json"
+
+
+def model_file(out: Path, index: int) -> Path:
+    """What is kept of one model."""
+    return out / DATA_FOLDER / f"model_{index}.json"
+
+
+def gather(
+    out: Path, *, result: Content | None = None, stopped: str | None = None, capture: str | None = None
+) -> Content:
+    """The content of a report; its layout is that of ``colmap_inertial.report``.
+
+    Parameters
+    ----------
+    out
+        Folder of a run.
+    result
+        Content of ``result.json``, where it is not written yet.
+    stopped
+        Why the run ended without a result.
+    capture
+        What was run, where there is no result to say so.
+
+    Raises
+    ------
+    FormatError
+        For files that were damaged since they were written.
+    """
+    if result is None and stopped is None:
+        result = read_json(out / "result.json")
+    recording = read_json(recording_file(out)) if recording_file(out).is_file() else None
+    done = result or {"models": [], "frames": [], "seconds": {}, "versions": {"colmap_inertial": __version__}}
+    models = sorted(done["models"], key=lambda m: (m["metres_per_unit"] is None, -m["registered_images"], m["index"]))
+    full = {model["index"] for model in models[:_MOST_MODELS]}
+    shown = [_model(out, model, in_full=model["index"] in full) for model in models]
+    outcome = shown[0]["outcome"] if shown else outcome_of_stop(stopped or "COLMAP made no model.")
+    source = done.get("capture", capture) or str(out)
+    return {
+        "format": "colmap-inertial report",
+        "version": VERSION,
+        "title": _title(source),
+        "capture": source,
+        "outcome": outcome,
+        "models": shown,
+        "findings": _findings(out),
+        "recording": None if recording is None else _of_recording(recording),
+        "blur": _blur(done, recording, project=done.get("project") is not None),
+        "crops": _crops(out, done),
+        "rolling_shutter": _rolling_shutter(done, recording),
+        "seconds": done["seconds"],
+        "configuration": _configuration(out),
+        "versions": done["versions"],
+    }
+
+
+def _missing(why: str) -> Content:
+    return {"missing": why}
+
+
+def _title(source: str) -> str:
+    path = Path(source)
+    return (path.parent.name if path.name == "capture.toml" else path.name) or source
+
+
+def _model(out: Path, model: Content, *, in_full: bool) -> Content:
+    scale, ci95 = model["metres_per_unit"], model["ci95"]
+    kept = {key: value for key, value in model.items() if key not in ("drift", "validation", "cov", "dense")}
+    kept["half_width_pct"] = None if scale is None else half_width_pct(scale, ci95)
+    kept["outcome"] = outcome_of_model(model)
+    drift = model.get("drift")
+    if drift is None or scale is None:
+        kept["drift"] = _missing(
+            "There is no scale whose parts could be compared."
+            if scale is None
+            else "This method does not tell the scale of parts of the recording."
+        )
+    else:
+        kept["drift"] = drift
+    kept["validation"] = _validation(out, model)
+    file = model_file(out, model["index"])
+    if not in_full:
+        why = f"Only the {_MOST_MODELS} largest models are shown in full."
+        kept["scene"], kept["signals"] = _missing(why), _missing(why)
+    elif not file.is_file():
+        why = "What it is drawn from was not kept."
+        kept["scene"], kept["signals"] = _missing(why), _missing(why)
+    else:
+        kept |= read_json(file)
+    return kept
+
+
+def _validation(out: Path, model: Content) -> Content:
+    found = model.get("validation")
+    if found is None:
+        if model["metres_per_unit"] is None:
+            return _missing("Without a scale there is nothing to measure a target with.")
+        return _missing("The capture names no target of known size ([target] in capture.toml).")
+    if "error" in found:
+        return _missing(f"The target could not be measured: {found['error']}.")
+    folder = out / "validation" / str(model["index"])
+    pictures = sorted(folder.glob("*.jpg")) if folder.is_dir() else []
+    chosen = [str(pictures[i].relative_to(out)) for i in strided(len(pictures), _MOST_PICTURES)]
+    return {**found, "pictures": chosen}
+
+
+def _findings(out: Path) -> Content:
+    file = out / "diagnosis.json"
+    if not file.is_file():
+        return _missing("The recording was not looked at beforehand: an existing model was given.")
+    found = read_json(file)
+    return {"checked": found["checked"], "findings": found["findings"]}
+
+
+def _of_recording(recording: Content) -> Content:
+    frames = {key: value for key, value in recording["frames"].items() if key not in ("names", "t_s", "exposure_s")}
+    exposures = [value for value in recording["frames"]["exposure_s"] or [] if value is not None]
+    frames["median_exposure_s"] = float(np.median(exposures)) if exposures else None
+    return {"imu": recording["imu"], "frames": frames}
+
+
+def _blur(done: Content, recording: Content | None, *, project: bool) -> Content:
+    if project:
+        return _missing("The images of an existing project are left as they are.")
+    note = done.get("imaging", {}).get("deblur") or "the run did not get that far"
+    known = [frame for frame in done["frames"] if frame["blur_px"] is not None]
+    if not known or recording is None:
+        return _missing(f"No blur to show: {note}.")
+    time_of = dict(zip(recording["frames"]["names"], recording["frames"]["t_s"], strict=True))
+    blur_px = np.array([frame["blur_px"] for frame in known])
+    some = strided(len(known), _MOST_FRAMES)
+    worst = np.argsort(-blur_px, kind="stable")[: _MOST_FRAMES // 10] if len(some) < len(known) else some[:0]
+    counts: dict[str, int] = {}
+    for frame in done["frames"]:
+        counts[frame["action"]] = counts.get(frame["action"], 0) + 1
+    return {
+        "note": note,
+        "counts": counts,
+        "median_px": float(np.median(blur_px)),
+        "largest_px": float(blur_px.max()),
+        "frames": [
+            {"t_s": time_of.get(known[i]["name"]), **{k: known[i][k] for k in ("name", "action", "blur_px", "reason")}}
+            for i in np.union1d(some, worst).tolist()
+        ],
+    }
+
+
+def _crops(out: Path, done: Content) -> Content:
+    file = out / DATA_FOLDER / CROPS_FOLDER / "crops.json"
+    crops = read_json(file)["crops"] if file.is_file() else []
+    if not crops:
+        return _missing("No frame was changed, so there is nothing to show before and after.")
+    reason = {frame["name"]: frame["reason"] for frame in done["frames"]}
+    folder = f"{DATA_FOLDER}/{CROPS_FOLDER}/"
+    return {
+        "pairs": [
+            {**crop, "reason": reason.get(crop["name"], ""), **{s: folder + crop[s] for s in ("before", "after")}}
+            for crop in crops
+        ]
+    }
+
+
+def _rolling_shutter(done: Content, recording: Content | None) -> Content:
+    movement = None if recording is None else recording["rolling_shutter"]
+    if movement is None:
+        note = done.get("imaging", {}).get("rolling_shutter")
+        return _missing(f"Nothing was done about a rolling shutter{f': {note}' if note else ''}.")
+    return {"note": done["imaging"]["rolling_shutter"], "readout_s": recording["frames"]["readout_s"], **movement}  # type: ignore[index]
+
+
+def _configuration(out: Path) -> Content:
+    file = out / "config.toml"
+    if not file.is_file():
+        return _missing("The run ended before its configuration was written.")
+    text = read_text(file)
+    return {"toml": text, "values": tomllib.loads(text)}
+
+
+__all__ = ["CROPS_FOLDER", "DATA_FOLDER", "VERSION", "gather", "model_file", "recording_file"]

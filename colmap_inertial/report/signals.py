@@ -1,0 +1,304 @@
+"""Camera against IMU, as the report draws it: rotation rates, accelerations, their spectra.
+
+Both sides go through the same operation, so that what they differ by is error: rotations over the intervals between
+frames; second differences of positions, of the camera's own and of the accelerometer's double integral.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.align import on_camera_rate
+from colmap_inertial.geometry import quat_conjugate, quat_log, quat_multiply, quat_rotate, rotation_between, so3_log
+from colmap_inertial.gyro import GyroPath
+from colmap_inertial.imaging.gyro_camera import GyroCamera
+from colmap_inertial.report.series import rounded, thinned
+from colmap_inertial.smooth import Felt, smooth_attitude
+from colmap_inertial.threads import one_blas_thread
+from colmap_inertial.types import (
+    Array,
+    CameraImuCalibration,
+    CameraTrajectory,
+    ImuRecording,
+    ScaleEstimate,
+    clock_shift_s,
+)
+
+#: Positions are differentiated over this long: a millimetre of noise becomes 0.06 m/s2.
+_REACH_S = 0.2
+#: A longer pause between frames is a gap in the lines.
+_PAUSE_S = 2.0
+#: Parts that spectra are averaged over; samples less even than this have none (share within a fifth of the usual step).
+_PART_S, _EVEN = 8.0, 0.9
+#: Points of a spectrum.
+_BINS = 120
+
+Record = dict[str, Any]
+
+
+@one_blas_thread()
+def signal_record(
+    trajectory: CameraTrajectory, imu: ImuRecording, estimate: ScaleEstimate, gravity_in_world_m_s2: Array | None
+) -> Record:
+    """What the report shows of camera and IMU, at most some thousand numbers for a recording of any length.
+
+    Parameters
+    ----------
+    trajectory
+        Poses of the model, in metres where its scale is known, else in the model's units.
+    imu
+        The recording that ran along.
+    estimate
+        What was found about the two.
+    gravity_in_world_m_s2
+        (3,) in the trajectory's world; ``None`` where unknown.
+
+    Returns
+    -------
+    ``rotation``, ``acceleration``, ``rotation_spectrum`` and ``acceleration_spectrum``, as ``colmap_inertial.report``
+    describes them.
+    """
+    calibration = estimate.calibration
+    record: Record = {"duration_s": float(np.ptp(trajectory.t_s)), "frames": len(trajectory)}
+    seen = _Rates.of(trajectory)
+    aligned = None
+    if calibration is not None:
+        if estimate.clock_rate != 0:
+            imu = on_camera_rate(
+                imu,
+                calibration,
+                clock_rate=estimate.clock_rate,
+                middle_s=estimate.clock_middle_s,
+                trajectory_epoch_ns=trajectory.epoch_ns,
+            )
+        aligned = GyroCamera.of(imu, calibration, camera_epoch_ns=trajectory.epoch_ns)
+    record["rotation"] = _rotation(trajectory, imu, seen, aligned)
+    if aligned is None or calibration is None:
+        why = "Camera and IMU could not be brought together, so their {} cannot be compared."
+        record["rotation_spectrum"] = {"missing": why.format("rotations")}
+        record["acceleration"] = record["acceleration_spectrum"] = {"missing": why.format("accelerations")}
+        return record
+    record["rotation_spectrum"] = _rotation_spectrum(seen, aligned)
+    if not imu.has_accel:
+        why = "The recording has no accelerometer."
+        record["acceleration"] = record["acceleration_spectrum"] = {"missing": why}
+        return record
+    both = _Accelerations.of(trajectory, imu, calibration, estimate, gravity_in_world_m_s2)
+    record["acceleration"] = both.record()
+    record["acceleration_spectrum"] = both.spectrum()
+    return record
+
+
+class _Rates:
+    """The camera's rotation from each frame to the next (K, 3), rad/s, camera frame, at ``middle_s``."""
+
+    def __init__(self, begin_s: Array, end_s: Array, rate_rad_s: Array) -> None:
+        self.begin_s, self.end_s, self.rate_rad_s = begin_s, end_s, rate_rad_s
+        self.middle_s = 0.5 * (begin_s + end_s)
+        self.step_s = float(np.median(end_s - begin_s))
+
+    @classmethod
+    def of(cls, trajectory: CameraTrajectory) -> _Rates:
+        t_s, pose = trajectory.t_s, trajectory.cam_from_world_xyzw
+        turn = quat_log(quat_multiply(pose[:-1], quat_conjugate(pose[1:])))
+        rate = turn / np.diff(t_s)[:, None]
+        rate[np.diff(t_s) > _PAUSE_S] = np.nan
+        return cls(t_s[:-1], t_s[1:], rate)
+
+    def felt(self, motion: GyroCamera) -> Array:
+        """The gyroscope's rotation over the same intervals."""
+        first, last = motion.start_from_cam(self.begin_s), motion.start_from_cam(self.end_s)
+        rate = so3_log(np.swapaxes(first, 1, 2) @ last) / (self.end_s - self.begin_s)[:, None]
+        return np.where(motion.covers(self.begin_s, self.end_s)[:, None], rate, np.nan)
+
+
+def _rotation(trajectory: CameraTrajectory, imu: ImuRecording, seen: _Rates, aligned: GyroCamera | None) -> Record:
+    start_s = trajectory.t_s[0]
+    shift_s = clock_shift_s(trajectory, imu)
+    gyro_s = imu.gyro_t_s + shift_s
+    overlap = gyro_s[0] < trajectory.t_s[-1] and gyro_s[-1] > trajectory.t_s[0]
+    # clocks that have nothing in common are drawn from the first sample of each
+    gyro_s = gyro_s - start_s if overlap else imu.gyro_t_s - imu.gyro_t_s[0]
+    raw_s, raw = _averaged(gyro_s, imu.gyro_rad_s, max(seen.step_s, 0.02))
+    times = seen.middle_s - start_s
+    near = (raw_s >= -2) & (raw_s <= times[-1] + 2)
+    record: Record = {
+        "same_clock_origin": bool(overlap),
+        "before": {
+            "camera": [thinned(times, column) for column in seen.rate_rad_s.T],
+            "gyroscope": [thinned(raw_s[near], column[near]) for column in raw.T] if near.sum() > 1 else [],
+        },
+        "after": None,
+    }
+    if aligned is None:
+        record["before"]["camera_size"] = thinned(times, np.linalg.norm(seen.rate_rad_s, axis=1))
+        record["before"]["gyroscope_size"] = thinned(raw_s[near], np.linalg.norm(raw[near], axis=1))
+        return record
+    felt = seen.felt(aligned)
+    both = np.isfinite(felt).all(axis=1) & np.isfinite(seen.rate_rad_s).all(axis=1)
+    if not both.any():
+        return record
+    left = (seen.rate_rad_s - felt)[both]
+    record["after"] = {
+        "camera": [thinned(times, column) for column in seen.rate_rad_s.T],
+        "gyroscope": [thinned(times, column) for column in felt.T],
+        "rms_difference_rad_s": float(np.sqrt(np.mean(np.sum(left**2, axis=1)))),
+        "rms_rate_rad_s": float(np.sqrt(np.mean(np.sum(felt[both] ** 2, axis=1)))),
+    }
+    return record
+
+
+def _averaged(t_s: Array, values: Array, width_s: float) -> tuple[Array, Array]:
+    """Means of samples (N, 3) over windows of equal length."""
+    place = np.floor((t_s - t_s[0]) / width_s).astype(np.intp)
+    found, index, count = np.unique(place, return_inverse=True, return_counts=True)
+    sums = np.stack([np.bincount(index, column, len(found)) for column in values.T], axis=1)
+    return t_s[0] + (found + 0.5) * width_s, sums / count[:, None]
+
+
+def _rotation_spectrum(seen: _Rates, aligned: GyroCamera) -> Record:
+    path: GyroPath = aligned.path
+    begin_s, end_s = seen.begin_s[0] - aligned.offset_s, seen.end_s[-1] - aligned.offset_s
+    during = (path.t_s >= begin_s) & (path.t_s <= end_s)
+    return _spectra(
+        camera=(seen.middle_s, seen.rate_rad_s),
+        imu_at_frames=(seen.middle_s, seen.felt(aligned)),
+        imu=(path.t_s[during], path.rate_rad_s[during]),
+    )
+
+
+class _Accelerations:
+    """Accelerations of the IMU's place by camera (K, 3) and accelerometer (K, 3), gravity-aligned, at ``t_s``."""
+
+    def __init__(self, trajectory: CameraTrajectory, path: Array, felt: Felt, metric: bool, step_s: float) -> None:
+        self._t_s, self._path, self._felt = trajectory.t_s, path, felt
+        self._sums = felt.sums(trajectory.t_s)[:, 0]
+        self._covered = np.concatenate([[0], np.cumsum(~felt.covers(trajectory.t_s))])
+        self._metric, self._step_s = metric, step_s
+
+    @classmethod
+    def of(
+        cls,
+        trajectory: CameraTrajectory,
+        imu: ImuRecording,
+        calibration: CameraImuCalibration,
+        estimate: ScaleEstimate,
+        gravity: Array | None,
+    ) -> _Accelerations:
+        attitude = smooth_attitude(trajectory, imu, calibration)
+        bias = np.zeros(3) if estimate.accel_bias_m_s2 is None else estimate.accel_bias_m_s2
+        felt = Felt.of(trajectory, imu, calibration, attitude, bias_m_s2=bias, gravity_in_world_m_s2=np.zeros(3))
+        during = (felt.t_s >= trajectory.t_s[0]) & (felt.t_s <= trajectory.t_s[-1])
+        weight = felt.accel_m_s2[during].mean(axis=0) if during.any() else felt.accel_m_s2.mean(axis=0)
+        down = -weight if gravity is None else gravity
+        up = rotation_between(-down, np.array([0.0, 0.0, 1.0]))
+        felt = Felt.integrated(felt.t_s, quat_rotate(up, felt.accel_m_s2 + down))
+        path = trajectory.cam_in_world
+        metric = trajectory.length_unit == "m"
+        if metric:
+            lever = quat_rotate(quat_conjugate(calibration.cam_from_imu_xyzw), calibration.imu_in_cam_m)
+            path = path + quat_rotate(attitude.world_from_imu_xyzw, lever)
+        step_s = float(np.median(np.diff(trajectory.t_s)))
+        return cls(trajectory, quat_rotate(up, path - path.mean(axis=0)), felt, metric, step_s)
+
+    def over(self, reach: int) -> tuple[Array, Array, Array]:
+        """Times, and accelerations by second differences over so many frames to both sides."""
+        t_s = self._t_s
+        if len(t_s) <= 2 * reach:
+            return np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3))
+        before, after = t_s[reach:-reach] - t_s[: -2 * reach], t_s[2 * reach :] - t_s[reach:-reach]
+
+        def bend(p: Array) -> Array:
+            slopes = (p[2 * reach :] - p[reach:-reach]) / after[:, None] - (p[reach:-reach] - p[: -2 * reach]) / (
+                before[:, None]
+            )
+            return 2 * slopes / (before + after)[:, None]
+
+        gaps = self._covered[2 * reach :] != self._covered[: -2 * reach]
+        torn = gaps | (np.maximum(before, after) > max(_PAUSE_S, 3 * reach * self._step_s))
+        seen, felt = bend(self._path), bend(self._sums)
+        seen[torn] = felt[torn] = np.nan
+        return t_s[reach:-reach], seen, felt
+
+    def record(self) -> Record:
+        reach = max(1, round(_REACH_S / self._step_s))
+        t_s, seen, felt = self.over(reach)
+        both = np.isfinite(seen).all(axis=1)
+        if both.sum() < 3:
+            return {"missing": "The accelerometer ran along with too few frames for a comparison."}
+        times = t_s - self._t_s[0]
+        x, y = (a[both] - a[both].mean(axis=0) for a in (seen, felt))
+        power = float(np.sqrt(np.sum(x**2) * np.sum(y**2)))
+        return {
+            "camera": [thinned(times, column) for column in seen.T],
+            "accelerometer": [thinned(times, column) for column in felt.T],
+            "camera_unit": "m/s2" if self._metric else "units/s2",
+            "averaged_over_s": 2 * reach * self._step_s,
+            "correlation": float(np.sum(x * y)) / power if power > 0 else None,
+            "rms_camera": float(np.sqrt(np.mean(np.sum(x**2, axis=1)))),
+            "rms_accelerometer_m_s2": float(np.sqrt(np.mean(np.sum(y**2, axis=1)))),
+        }
+
+    def spectrum(self) -> Record:
+        t_s, seen, felt = self.over(1)
+        during = (self._felt.t_s >= self._t_s[0]) & (self._felt.t_s <= self._t_s[-1])
+        spectra = _spectra(
+            camera=(t_s, seen),
+            imu_at_frames=(t_s, felt),
+            imu=(self._felt.t_s[during], self._felt.accel_m_s2[during]),
+        )
+        return {**spectra, "camera_unit": "m/s2" if self._metric else "units/s2"}
+
+
+def _spectra(**signals: tuple[Array, Array]) -> Record:
+    found = {name: _spectrum(*signal) for name, signal in signals.items()}
+    curves = {name: curve for name, curve in found.items() if curve is not None}
+    return {"curves": curves} if curves else {"missing": "The recording is too short for a spectrum."}
+
+
+def _spectrum(t_s: Array, values: Array) -> Record | None:
+    """Amplitude density of a vector (N, 3), unit per root hertz, by Welch's method.
+
+    Returns
+    -------
+    ``None`` where samples are few or uneven.
+    """
+    from scipy.signal import welch
+
+    known = np.isfinite(values).all(axis=1)
+    if known.sum() < 16:
+        return None
+    t_s, values = t_s[known], values[known]
+    steps = np.diff(t_s)
+    step_s = float(np.median(steps))
+    if np.mean(np.abs(steps - step_s) < 0.2 * step_s) < _EVEN:
+        return None
+    total: NDArray[np.float64] | float = 0.0
+    count = min(round(_PART_S / step_s), int(np.ptp(t_s) / step_s))
+    hz = np.zeros(0)
+    weights = 0
+    for part in np.split(np.arange(len(t_s)), np.flatnonzero(np.diff(t_s) > 5 * step_s) + 1):
+        if len(part) < 2 or np.ptp(t_s[part]) < (count - 1) * step_s:
+            continue
+        grid = np.arange(t_s[part[0]], t_s[part[-1]], step_s)
+        if len(grid) < count or count < 8:
+            continue
+        even = np.stack([np.interp(grid, t_s[part], column[part]) for column in values.T])
+        hz, power = welch(even, fs=1 / step_s, nperseg=count, detrend="constant")
+        total = total + len(grid) * power.sum(axis=0)
+        weights += len(grid)
+    if weights == 0:
+        return None
+    density = np.sqrt(total / weights)[1:]
+    hz = hz[1:]
+    edges = np.geomspace(hz[0], hz[-1] * 1.0001, _BINS + 1)
+    place = np.searchsorted(edges, hz, side="right")
+    found, index, members = np.unique(place, return_inverse=True, return_counts=True)
+    mean = np.sqrt(np.bincount(index, density**2, len(found)) / members)
+    return {"hz": rounded(np.bincount(index, hz, len(found)) / members, 4), "density": rounded(mean, 4)}
+
+
+__all__ = ["signal_record"]

@@ -1,0 +1,120 @@
+"""The outcome in plain words: what was found, what it means, what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+#: Camera acceleration below which there is too little to weigh gravity against; what filming by hand usually has.
+_LITTLE_M_S2, _USUAL = 0.3, "0.5 to 2 m/s²"
+
+_MOVE = (
+    "Film again, and move the camera itself: swing it by 20 cm or more, to and fro and up and down, about once a "
+    "second, all through the recording, for 10 s or longer. Turning on the spot, a tripod, or gliding at constant "
+    "speed tells nothing."
+)
+_RAW = (
+    "Record the raw gyroscope and accelerometer (with gravity), from before the first frame to after the last, with "
+    "the camera's stabilisation switched off."
+)
+_TARGET = (
+    "To be independent of motion, put a printed board into the scene and name it in capture.toml ([target]), or scale "
+    "the model by a length you measured."
+)
+_SHAPE = "COLMAP's own model in sparse/ is complete: its shape is not affected, only its size is unknown."
+
+
+def digits(value: float, count: int = 4) -> str:
+    """A number with so many significant digits, never in powers of ten where it can be avoided."""
+    text = f"{value:.{count}g}"
+    return f"{value:.0f}" if "e+" in text and abs(value) < 1e9 else text
+
+
+def signed(value: float, decimals: int = 2) -> str:
+    """A number with its sign."""
+    return f"{value:+.{decimals}f}".replace("-", "−")
+
+
+def half_width_pct(metres_per_unit: float, ci95: Sequence[float]) -> float:
+    """Half of the 95 % interval, in per cent of the scale."""
+    return 50 * (ci95[1] - ci95[0]) / metres_per_unit
+
+
+def length_error(pct: float) -> str:
+    """What a relative error does to ten metres, in a unit that fits."""
+    metres = 10 * pct / 100
+    if metres >= 1:
+        return f"{metres:.2g} m"
+    return f"{100 * metres:.2g} cm" if metres >= 0.01 else f"{1000 * metres:.2g} mm"
+
+
+def outcome_of_model(model: dict[str, Any]) -> dict[str, Any]:
+    """Headline, summary and advice for one model of ``result.json``.
+
+    Returns
+    -------
+    ``verdict``, ``headline``, ``summary`` (sentences) and ``todo`` (sentences; empty where nothing needs doing).
+    """
+    verdict, scale, ci95 = model["verdict"], model["metres_per_unit"], model["ci95"]
+    if scale is None or ci95 is None:
+        return _refused(model)
+    pct = half_width_pct(scale, ci95)
+    summary = [
+        f"One unit of COLMAP's model is {digits(scale)} m; with 95 % certainty between {digits(ci95[0])} and "
+        f"{digits(ci95[1])} m (±{digits(pct, 2)} %).",
+    ]
+    todo = []
+    if verdict == "trusted":
+        headline = "The scale can be trusted"
+        summary.append(
+            f"In the metric model, 10 m are 10 m to within ±{length_error(pct)}, and gravity points along an axis."
+        )
+    else:
+        headline = "The scale is rough"
+        summary.append(
+            f"In the metric model, 10 m may be off by {length_error(pct)} or, if what is listed below is at fault, by "
+            "more. It has the right order of size and gravity points along an axis; do not measure by it without a "
+            "check against a known length."
+        )
+        todo = [_MOVE, _TARGET]
+    checked = model.get("validation")
+    if checked and checked.get("scale_error_pct") is not None:
+        word = "within" if checked["within_tolerance"] else "outside"
+        summary.append(
+            f"Measured against the target in the pictures, lengths are {signed(checked['scale_error_pct'])} % off, "
+            f"{word} the tolerance of {checked['tolerance_pct']:g} %."
+        )
+    return {"verdict": verdict, "headline": headline, "summary": summary, "todo": todo}
+
+
+def _refused(model: dict[str, Any]) -> dict[str, Any]:
+    summary = ["The recording does not tell how large things are, so no number is given rather than a wrong one."]
+    todo = [_MOVE, _RAW, _TARGET]
+    excitation = model.get("excitation_m_s2")
+    if excitation is not None and excitation < _LITTLE_M_S2:
+        summary.append(
+            f"The camera itself hardly sped up or slowed down: {digits(excitation, 2)} m/s², where filming by hand "
+            f"usually has {_USUAL}. An accelerometer feels no speed, so there was nothing to compare with the pictures."
+        )
+        todo = [_MOVE, _TARGET]
+    elif model.get("cam_from_imu_xyzw") is None:
+        summary.append(
+            "Camera and IMU could not be brought together: check the reasons and the two curves of rotation below, "
+            "which should look alike."
+        )
+        todo = [_RAW, _MOVE, _TARGET]
+    summary.append(_SHAPE)
+    return {"verdict": "refused", "headline": "No scale could be found", "summary": summary, "todo": todo}
+
+
+def outcome_of_stop(reason: str) -> dict[str, Any]:
+    """The same where a run ended before there was a model."""
+    return {
+        "verdict": "stopped",
+        "headline": "Stopped before there was a scale",
+        "summary": [reason],
+        "todo": ["What was found in the recording is listed below, each with what to do about it."],
+    }
+
+
+__all__ = ["digits", "half_width_pct", "length_error", "outcome_of_model", "outcome_of_stop", "signed"]
