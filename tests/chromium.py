@@ -21,7 +21,9 @@ _FLAGS = [
 
 def chromium_or_skip():
     """Path of the browser; skips the test where there is none."""
-    found = next((path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None)
+    found = next(
+        (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
+    )
     if found is None:
         pytest.skip("no Chromium here (apt install chromium)")
     return found

@@ -81,6 +81,15 @@ def test_a_model_of_the_wrong_size_is_measured_and_fails(sharp):
     assert sharp.validate(units_per_m=1.03, tolerance_pct=4.0).within_tolerance
     for distance in result.distances:
         assert distance.residual_m == pytest.approx(0.03 * distance.known_m, abs=2e-4)
+    # as validate_scenes.reconstruction moves its world; the board may be numbered from its other end
+    world = cv2.Rodrigues(np.array([0.3, -1.1, 0.7]))[0]
+    truth = result.target.corners_m @ world.T + [5.0, -3.0, 2.0]
+    placed = np.array([corner.in_model for corner in result.corners]) / 1.03
+    assert len(placed) == len(truth)
+    assert np.linalg.norm(placed[:, None] - truth, axis=2).min(axis=1).max() < 2e-4
+    at = {corner.name: corner.in_model for corner in result.corners}
+    for distance in result.distances:
+        assert np.linalg.norm(at[distance.pair[0]] - at[distance.pair[1]]) == pytest.approx(distance.measured)
 
 
 def test_a_model_without_a_unit_gets_the_factor_that_makes_it_metric(sharp):

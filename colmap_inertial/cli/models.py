@@ -246,3 +246,46 @@ class Validate:
         )
         show_validation(result)
         return 0 if result.within_tolerance else 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """Show a reconstruction in the browser: points, cameras, gravity, a scale bar, the target; and measure in it.
+
+    OUT is what reconstruct or apply wrote, or a COLMAP model folder. A model without a scale is shown in its own units,
+    without a grid in metres. Prints an address to open; Ctrl-C ends it. Needs the extra package [view].
+
+    Example: colmap-inertial view out
+    """
+
+    out: Positional[Path]
+    """What reconstruct or apply wrote, or a COLMAP model folder."""
+    model: int | None = None
+    """Number of the model, where there are several; the largest otherwise."""
+    max_points: int = 400_000
+    """Show no more points than this, evenly chosen."""
+    port: int = 8080
+    """Port to listen at; one that is taken makes way for the next free one, 0 takes any."""
+    host: str = "127.0.0.1"
+    """Address to listen at: this machine alone, or 0.0.0.0 for everybody on the network."""
+
+    def __post_init__(self) -> None:
+        if self.max_points < 1:
+            raise ValueError(f"max_points must be positive, not {self.max_points}")
+        if not 0 <= self.port <= 65535:
+            raise ValueError(f"port must be from 0 to 65535, not {self.port}")
+
+    def run(self) -> int:
+        """Run the command; returns the exit code."""
+        from colmap_inertial.view.scene import load_scene
+        from colmap_inertial.view.server import require_viser, serve
+
+        require_viser()
+        scene = load_scene(self.out, model=self.model, max_points=self.max_points)
+        serve(
+            scene,
+            host=self.host,
+            port=self.port,
+            ready=lambda url: print(f"{self.out} is shown at {url} (Ctrl-C ends this)", flush=True),
+        )
+        return 0

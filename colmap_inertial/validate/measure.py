@@ -208,7 +208,8 @@ def _measure(search: Search, placed: dict[int, PartPlacement], missing: dict[str
         pose_noise_px=_rms(pose_px),
         distances=_distances(target, position, control_corner, to_metres),
         corners=tuple(
-            Corner(name=target.label(i), in_model=position[i]) for i in np.flatnonzero(np.isfinite(position[:, 0]))
+            Corner(name=target.label(i), in_model=position[i] + views[0].origin_in_model)
+            for i in np.flatnonzero(np.isfinite(position[:, 0])).tolist()
         ),
         views=view_results,
         views_rejected=rejected,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -40,6 +40,8 @@ class View:
         (3, 3) rotation.
     cam_from_world_t
         (3,) translation, model units; the world's origin is the middle of the cameras, not the model's own.
+    origin_in_model
+        (3,) that origin in the model's own world.
     """
 
     name: str
@@ -47,6 +49,7 @@ class View:
     camera: Any
     cam_from_world: Array
     cam_from_world_t: Array
+    origin_in_model: Array = field(default_factory=lambda: np.zeros(3))
 
     def read(self, *, flip: int | None = None) -> NDArray[np.uint8] | str:
         """The image (H, W) in grey as COLMAP sees it (orientation tags ignored), or why it cannot be used.
@@ -148,6 +151,7 @@ def load_views(model: Path | pycolmap.Reconstruction, images: Path) -> tuple[lis
                 camera=reconstruction.cameras[image.camera_id],
                 cam_from_world=rotation,
                 cam_from_world_t=np.asarray(pose.translation) + rotation @ middle,
+                origin_in_model=middle,
             )
         )
     if not views:

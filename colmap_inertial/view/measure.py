@@ -11,6 +11,8 @@ from colmap_inertial.types.recorded import LengthUnit
 
 #: A click means a point within this angle of it, rad; of several closer than the smaller angle, the one in front.
 _WIDEST_RAD, _SAME_RAD = 0.03, 0.004
+#: Nothing that can be clicked is smaller than this angle.
+_LEAST_RAD = 0.008
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,6 +90,15 @@ def nearest_to_ray(points: Array, origin: Array, direction: Array) -> int | None
     return int(ahead[meant[np.argmin(depth[meant])]])
 
 
+def ball_at_ray(middles: Array, radius: float, origin: Array, direction: Array) -> int | None:
+    """The foremost of equally large balls (N, 3) that a ray meets, far ones a little larger; ``None`` where none."""
+    away = np.asarray(middles, dtype=np.float64) - origin
+    depth = away @ (np.asarray(direction) / np.linalg.norm(direction))
+    beside = np.sqrt(np.maximum(np.sum(away**2, axis=1) - depth**2, 0))
+    met = np.flatnonzero((depth > 0) & (beside < np.maximum(radius, _LEAST_RAD * depth)))
+    return int(met[np.argmin(depth[met])]) if len(met) else None
+
+
 def round_length(about: float) -> float:
     """The largest of 1, 2 and 5 times a power of ten that is not above ``about``."""
     if not (np.isfinite(about) and about > 0):
@@ -115,4 +126,4 @@ def _with_uncertainty(length_m: float, half_m: float) -> str:
     return f"{value:.{decimals}f} ± {half:.{decimals}f} {unit}"
 
 
-__all__ = ["Measured", "length_text", "measured", "nearest_to_ray", "round_length"]
+__all__ = ["Measured", "ball_at_ray", "length_text", "measured", "nearest_to_ray", "round_length"]

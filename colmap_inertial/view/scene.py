@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 _MOST_PIECES, _MOST_FACES = 4000, 1_500_000
 #: A step of the path this many times longer than usual is a gap.
 _GAP = 10.0
+#: Angle of view at the beginning; at least this much wider than high; so much of it is filled.
+START_FOV_RAD, _ASPECT, _MARGIN = 0.87, 1.2, 0.92
 #: Distances of the target that get a label, and how far apart these are, as a share of the longest distance.
 _LABELS, _APART = 3, 0.2
 
@@ -180,8 +182,11 @@ def load_scene(out: Path, *, model: int | None = None, max_points: int = 400_000
         mesh_note = "" if mesh is not None else f"the mesh has no faces, or more than {_MOST_FACES}"
     up, known = _up(source, cameras)
     centre, reach = centre_and_reach(cloud.xyz.astype(np.float64), cameras.cam_in_world)
-    start = _start(centre, reach, up, cameras)
-    ground = _ground(cloud, cameras, centre, reach, up, start) if source.scale.unit == "m" else None
+    side = _side(centre, reach, up, cameras)
+    ground = _ground(cloud, cameras, centre, reach, up, side) if source.scale.unit == "m" else None
+    near = cameras.cam_in_world[np.linalg.norm(cameras.cam_in_world - centre, axis=1) <= 1.001 * reach]
+    seen = near if ground is None else np.concatenate([near, ground.bar])
+    start = centre + _distance(side, reach, up, seen - centre) * side
     lines, labelled = _target_parts(source.target)
     return Scene(
         out=Path(out),
@@ -242,20 +247,30 @@ def _path(source: ViewSource, cameras: Cameras) -> Array:
     return pieces[length <= _GAP * np.median(length)] if len(pieces) else pieces
 
 
-def _start(centre: Array, reach: float, up: Array, cameras: Cameras) -> Array:
-    """From the side of the cameras, a little above, far enough to see everything."""
+def _side(centre: Array, reach: float, up: Array, cameras: Cameras) -> Array:
+    """(3,) unit vector from the scene to where it is looked at from: the side of the cameras, a little above."""
     towards = cameras.cam_in_world.mean(axis=0) - centre
     level = towards - (towards @ up) * up
     if np.linalg.norm(level) < 0.05 * reach:  # cameras all around, or above
         level = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
     level = level / np.linalg.norm(level)
-    side = np.cross(up, level)
+    across = np.cross(up, level)
     # a little from the side: depth is seen better than from straight behind
-    direction = np.cos(0.5) * (np.cos(0.45) * level + np.sin(0.45) * side) + np.sin(0.5) * up
-    return centre + 2.8 * reach * direction
+    side: Array = np.cos(0.5) * (np.cos(0.45) * level + np.sin(0.45) * across) + np.sin(0.5) * up
+    return side
 
 
-def _ground(cloud: Cloud, cameras: Cameras, centre: Array, reach: float, up: Array, start: Array) -> Ground:
+def _distance(side: Array, reach: float, up: Array, must_be_seen: Array) -> float:
+    """How far away one has to be to see all of these points (N, 3), given from the scene's middle."""
+    right = np.cross(up, side)
+    right /= np.linalg.norm(right)
+    above = np.cross(side, right)
+    beside = np.maximum(np.abs(must_be_seen @ right) / _ASPECT, np.abs(must_be_seen @ above))
+    needed = beside / np.tan(0.5 * START_FOV_RAD * _MARGIN) + must_be_seen @ side
+    return float(np.clip(needed.max(initial=0.0), 1.5 * reach, 6 * reach))
+
+
+def _ground(cloud: Cloud, cameras: Cameras, centre: Array, reach: float, up: Array, side: Array) -> Ground:
     xyz = cloud.xyz.astype(np.float64)
     near = xyz[np.linalg.norm(xyz - centre, axis=1) < 1.5 * reach]
     height = float(np.percentile((near if len(near) else cameras.cam_in_world) @ up, 2))
@@ -272,7 +287,7 @@ def _ground(cloud: Cloud, cameras: Cameras, centre: Array, reach: float, up: Arr
 
     origin = on_lines(along) * along + on_lines(across) * across + height * up
     # the bar lies along the side of the grid that faces the viewer
-    outward = max((s * v for s in (1, -1) for v in (along, across)), key=lambda v: float(v @ (start - centre)))
+    outward = max((s * v for s in (1, -1) for v in (along, across)), key=lambda v: float(v @ side))
     bar_m = round_length(0.6 * reach)
     beside = np.cross(up, outward)
     middle = origin + (half * step + 0.06 * reach) * outward
@@ -303,4 +318,4 @@ def _target_parts(target: TargetFacts | None) -> tuple[Array, tuple[KnownDistanc
     return np.array(neighbours).reshape(-1, 2, 3), tuple(labelled)
 
 
-__all__ = ["Cameras", "Ground", "Scene", "load_scene"]
+__all__ = ["START_FOV_RAD", "Cameras", "Ground", "Scene", "load_scene"]

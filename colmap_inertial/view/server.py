@@ -18,20 +18,19 @@ from colmap_inertial.errors import FormatError, MissingExtraError, OutputError
 from colmap_inertial.geometry import quat_rotate
 from colmap_inertial.types import Array
 from colmap_inertial.view import panel
-from colmap_inertial.view.measure import length_text, measured, nearest_to_ray
-from colmap_inertial.view.scene import Scene
+from colmap_inertial.view.measure import ball_at_ray, length_text, measured, nearest_to_ray
+from colmap_inertial.view.scene import START_FOV_RAD, Scene
 
 if TYPE_CHECKING:
     import viser
 
-_FOV_RAD = 0.87
 #: Cameras that carry their image at the same time, and widths of images in the panel and on cameras.
 _THUMBNAILS, _PANEL_PX, _THUMBNAIL_PX = 24, 640, 160
 #: Opacity of the image that one looks through, so that points show whether they are where the image has them.
 _THROUGH = 0.55
 #: Ports that are tried from the first one on.
 _PORTS = 50
-_BLUE, _RED, _AMBER, _GREEN = (70, 130, 230), (230, 60, 50), (240, 170, 30), (40, 190, 110)
+_BLUE, _RED, _AMBER, _GREEN = (70, 130, 230), (230, 40, 30), (240, 170, 30), (30, 190, 90)
 
 
 class Viewer:
@@ -62,7 +61,7 @@ class Viewer:
         self._passing: dict[str, list[Any]] = {"chosen": [], "thumbnails": [], "measure": []}
         self._image_of = functools.lru_cache(maxsize=64)(self._read_image)
         #: Size of a drawn camera, in units of the scene.
-        self._size = 0.06 * scene.reach
+        self._size = 0.05 * scene.reach
         self._candidates = scene.pickable()
         self._set_stage()
         self._draw()
@@ -85,7 +84,7 @@ class Viewer:
         server.gui.main_panel.dock_right()
         server.scene.set_up_direction(scene.up_in_world)
         camera = server.initial_camera
-        camera.fov, camera.near, camera.far = _FOV_RAD, 2e-3 * scene.reach, 300 * scene.reach
+        camera.fov, camera.near, camera.far = START_FOV_RAD, 2e-3 * scene.reach, 300 * scene.reach
         camera.up, camera.look_at, camera.position = scene.up_in_world, scene.centre, scene.start
 
     def _draw(self) -> None:
@@ -115,9 +114,9 @@ class Viewer:
             self._drawn["Target"] = self._add_target()
 
     def _point_size(self) -> float:
-        """So that points cover about a third of the area they lie in."""
+        """So that points cover a part of the area they lie in."""
         return float(
-            np.clip(1.2 * self.scene.reach / np.sqrt(max(len(self.scene.cloud.xyz), 1)), 0, self.scene.reach / 150)
+            np.clip(0.9 * self.scene.reach / np.sqrt(max(len(self.scene.cloud.xyz), 1)), 0, self.scene.reach / 150)
         )
 
     def _add_mesh(self) -> Any:
@@ -160,12 +159,6 @@ class Viewer:
         lines = add.add_line_segments(
             "/cameras/edges", world[:, edges].reshape(-1, 2, 3), _BLUE, thickness=1.2, thickness_units="screen"
         )
-
-        @bodies.on_click
-        def _(event: Any) -> None:
-            if event.instance_index is not None and not self._measuring.value:
-                self._choose(int(event.instance_index), event.client)
-
         return [bodies, lines]
 
     def _add_ground(self) -> list[Any]:
@@ -260,6 +253,9 @@ class Viewer:
             drawn.append(label)
         return drawn
 
+    def _add_lines(self, name: str, pieces: Array, colour: tuple[int, int, int], width_px: float) -> Any:
+        return self._server.scene.add_line_segments(name, pieces, colour, thickness=width_px, thickness_units="screen")
+
     def _label(self, name: str, text: str, position: Array, *, anchor: Any = "center-center", size: float = 1.0) -> Any:
         return self._server.scene.add_label(name, text, position=position, anchor=anchor, font_screen_scale=size)
 
@@ -269,12 +265,8 @@ class Viewer:
         gui.add_markdown(panel.scale_text(scene))
         gui.add_markdown(panel.contents_text(scene))
         overview = gui.add_button("Overview", icon="home")
-
-        @overview.on_click
-        def _(event: Any) -> None:
-            if event.client is not None:
-                self._look_at_everything(event.client)
-
+        overview.on_click(lambda event: self._look_at_everything(event.client))
+        self._server.scene.on_click()(self._click)
         with gui.add_folder("Distance"):
             self._measuring = gui.add_checkbox("Measure", False, hint="Click two points in the scene.")
             self._measured = gui.add_markdown("")
@@ -289,21 +281,12 @@ class Viewer:
             size = gui.add_slider("Point size", 0.2, 5.0, 0.1, 1.0)
             if scene.ground is not None:
                 gui.add_markdown(panel.ground_text(scene))
-
-        @size.on_update
-        def _(_: Any) -> None:
-            self._cloud.point_size = self._point_size() * size.value
-
+        size.on_update(lambda _: setattr(self._cloud, "point_size", self._point_size() * size.value))
         with gui.add_folder("Camera"):
             self._slider = gui.add_slider("Number", 0, max(len(scene.cameras) - 1, 1), 1, 0)
             self._about = gui.add_markdown("Click a camera, or move the slider.")
             self._picture = gui.add_image(np.zeros((3, 4, 3), np.uint8), visible=False, format="jpeg")
-
-        @self._slider.on_update
-        def _(event: Any) -> None:
-            if event.client is not None:
-                self._choose(min(int(self._slider.value), len(scene.cameras) - 1), event.client)
-
+        self._slider.on_update(self._slide)
         if scene.target is not None:
             with gui.add_folder("Target"):
                 gui.add_html(panel.tolerance_html(scene.target))
@@ -315,15 +298,22 @@ class Viewer:
     def _add_switch(self, name: str, drawn: list[Any]) -> None:
         switch = self._server.gui.add_checkbox(name, bool(drawn[0].visible))
 
-        @switch.on_update
-        def _(_: Any) -> None:
+        def show(_: Any) -> None:
             for handle in drawn:
                 handle.visible = switch.value
 
-    def _look_at_everything(self, client: viser.ClientHandle) -> None:
+        switch.on_update(show)
+
+    def _slide(self, event: Any) -> None:
+        if event.client is not None:  # moved by a user, not by _choose
+            self._choose(min(int(self._slider.value), len(self.scene.cameras) - 1), event.client)
+
+    def _look_at_everything(self, client: viser.ClientHandle | None) -> None:
         scene = self.scene
+        if client is None:
+            return
         with client.atomic():
-            client.camera.fov = _FOV_RAD
+            client.camera.fov = START_FOV_RAD
             client.camera.up_direction = scene.up_in_world
             client.camera.position = scene.start
             client.camera.look_at = scene.centre
@@ -340,7 +330,7 @@ class Viewer:
         # from the side from which the cameras saw it
         towards = self.scene.cameras.cam_in_world.mean(axis=0) - middle
         with client.atomic():
-            client.camera.fov = _FOV_RAD
+            client.camera.fov = START_FOV_RAD
             client.camera.up_direction = up
             client.camera.position = middle + 3.5 * size * towards / np.linalg.norm(towards)
             client.camera.look_at = middle
@@ -429,20 +419,31 @@ class Viewer:
         height, width = image.shape[:2]
         if width > width_px:
             size = (width_px, max(1, round(height * width_px / width)))
-            image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+            return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8), ""
         return np.asarray(image, dtype=np.uint8), ""
 
     def _switch_measuring(self) -> None:
-        if self._measuring.value:
-            self._server.scene.on_click()(self._pick)
-            self._measured.content = "Click the first point."
-        else:
-            self._server.scene.remove_click_callback(self._pick)
-            if len(self._picked) < 2:
+        with self._lock:
+            if self._measuring.value:
+                self._measured.content = "Click the first point."
+            elif len(self._picked) < 2:
                 self._clear()
 
-    def _pick(self, event: Any) -> None:
-        found = nearest_to_ray(self._candidates, np.array(event.ray_origin), np.array(event.ray_direction))
+    def _click(self, event: viser.SceneClickEvent) -> None:
+        """Measures, or chooses the camera that was clicked."""
+        ray = np.array(event.ray_origin), np.array(event.ray_direction)
+        if self._measuring.value:
+            self._pick(nearest_to_ray(self._candidates, *ray))
+            return
+        if not self._drawn["Cameras"][0].visible:
+            return
+        ahead = quat_rotate(self.scene.cameras.world_from_cam_xyzw, np.array([0.0, 0.0, 1.0]))
+        middles = self.scene.cameras.cam_in_world + 0.6 * self._size * ahead
+        camera = ball_at_ray(middles, 0.6 * self._size, *ray)
+        if camera is not None:
+            self._choose(camera, event.client)
+
+    def _pick(self, found: int | None) -> None:
         with self._lock:
             if len(self._picked) == 2:
                 self._clear()
@@ -450,9 +451,8 @@ class Viewer:
                 self._measured.content = "No point there; click closer to one."
                 return
             self._picked.append(self._candidates[found])
-            scene = self._server.scene
             points = np.array(self._picked)
-            ends = scene.add_point_cloud(
+            ends = self._server.scene.add_point_cloud(
                 "/measure/ends",
                 points,
                 _RED,
@@ -460,14 +460,14 @@ class Viewer:
                 point_shape="circle",
                 precision="float32",
             )
-            self._passing["measure"].append(ends)
             if len(points) == 1:
+                self._passing["measure"].append(ends)
                 self._measured.content = "Click the second point."
                 return
             result = measured(points[0], points[1], self.scene.scale.unit, self.scene.scale.relative_ci95)
-            line = scene.add_line_segments("/measure/line", points[None], _RED, thickness=3.0, thickness_units="screen")
+            line = self._add_lines("/measure/line", points[None], _RED, 3.0)
             label = self._label("/measure/label", result.text, points.mean(axis=0), size=1.2)
-            self._passing["measure"] += [line, label]
+            self._passing["measure"] = [ends, line, label]
             self._measured.content = panel.measured_text(result)
 
     def _clear(self) -> None:
