@@ -304,10 +304,18 @@ def shutter_field(worst: dict[str, Any]) -> Figure:
     ]
     data[0]["line"] = {"color": IMU, "width": 1.6}
     layout = _layout(420)
-    layout["xaxis"] = {"title": {"text": "x (px)"}, "range": [0, worst["width"]], "zeroline": False}
+    width, height, edge = worst["width"], worst["height"], 0.08
+    outline = {"type": "rect", "x0": 0, "x1": width, "y0": 0, "y1": height, "line": {"color": QUIET, "width": 1}}
+    layout["shapes"] = [outline]
+    layout["xaxis"] = {
+        "title": {"text": "x (px)"},
+        "range": [-edge * width, (1 + edge) * width],
+        "constrain": "domain",
+        "zeroline": False,
+    }
     layout["yaxis"] = {
         "title": {"text": "y (px)"},
-        "range": [worst["height"], 0],
+        "range": [(1 + edge) * height, -edge * height],
         "scaleanchor": "x",
         "constrain": "domain",
         "zeroline": False,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from pathlib import Path
@@ -12,15 +13,27 @@ from typing import Any
 from colmap_inertial.report.words import digits
 from colmap_inertial.scale.verdict import TRUSTED_HALF_WIDTH, WEAK_HALF_WIDTH
 
+_UNIT = re.compile(r"(\d) ((?:m|cm|mm|s|ms|px|Hz|m/s²|°/s)\b|%)")
 #: Pictures are embedded no wider than this.
 _WIDTH_PX, _QUALITY = 720, 78
 #: Half-widths of the 95 % interval, per cent, up to which a scale is trusted, and given at all.
 _TRUSTED_PCT, _WEAK_PCT = 100 * TRUSTED_HALF_WIDTH, 100 * WEAK_HALF_WIDTH
 
 
+def prose(text: str) -> str:
+    """Text for a paragraph: escaped, numbers kept on one line with their units."""
+    return _UNIT.sub("\\1\N{NO-BREAK SPACE}\\2", escape(text.replace("m/s2", "m/s²")))
+
+
+def sentence(text: str) -> str:
+    """The same, with a capital letter and a full stop."""
+    text = text.strip()
+    return prose(text[:1].upper() + text[1:] + ("" if text.endswith((".", "!", "?")) else "."))
+
+
 def scale_text(model: Mapping[str, Any]) -> str:
     """The scale, in short."""
-    return f"1 model unit = {digits(model['metres_per_unit'])} m ± {digits(model['half_width_pct'], 2)} %"
+    return prose(f"1 model unit = {digits(model['metres_per_unit'])} m ±{digits(model['half_width_pct'], 2)} %")
 
 
 def gauge(half_width_pct: float) -> str:
@@ -56,12 +69,12 @@ def gauge(half_width_pct: float) -> str:
 
 def listing(sentences: Iterable[str]) -> str:
     """A list."""
-    return "<ul>" + "".join(f"<li>{escape(s[:1].upper() + s[1:])}</li>" for s in sentences) + "</ul>"
+    return "<ul>" + "".join(f"<li>{sentence(s)}</li>" for s in sentences) + "</ul>"
 
 
 def facts(pairs: Iterable[tuple[str, str]]) -> str:
     """Labelled values, side by side."""
-    inner = "".join(f"<div><dt>{escape(label)}</dt><dd>{escape(value)}</dd></div>" for label, value in pairs)
+    inner = "".join(f"<div><dt>{escape(label)}</dt><dd>{prose(value)}</dd></div>" for label, value in pairs)
     return f'<dl class="facts">{inner}</dl>'
 
 
@@ -117,4 +130,4 @@ def _embedded(path: Path) -> str | None:
     return f"data:image/jpeg;base64,{base64.b64encode(data).decode('ascii')}"
 
 
-__all__ = ["bars", "facts", "gauge", "listing", "pictures", "scale_text", "table"]
+__all__ = ["bars", "facts", "gauge", "listing", "pictures", "prose", "scale_text", "sentence", "table"]

@@ -40,7 +40,11 @@
       for (const key of ["xaxis", "yaxis", "zaxis"]) {
         out.scene[key] = { ...out.scene[key], gridcolor: rule, zerolinecolor: rule, color: soft };
       }
-      if (narrow()) out.height = Math.min(out.height, Math.round(0.62 * window.innerHeight));
+      if (narrow()) {
+        const { x, y, z } = out.scene.camera.eye;
+        out.scene.camera = { ...out.scene.camera, eye: { x: 1.4 * x, y: 1.4 * y, z: 1.4 * z } };
+        out.height = Math.min(out.height, Math.round(0.62 * window.innerHeight));
+      }
     } else {
       // a finger scrolls the page; a mouse zooms
       out.dragmode = touch ? false : "zoom";

@@ -12,7 +12,7 @@ from typing import Any
 from colmap_inertial.report import figures
 from colmap_inertial.report.figure_3d import scene_figure
 from colmap_inertial.report.figures import Figure
-from colmap_inertial.report.markup import bars, facts, gauge, listing, pictures, scale_text, table
+from colmap_inertial.report.markup import bars, facts, gauge, listing, pictures, prose, scale_text, sentence, table
 from colmap_inertial.report.words import digits, signed
 
 Content = dict[str, Any]
@@ -74,7 +74,7 @@ def _outcome(content: Content) -> Section:
     if model is not None and model["metres_per_unit"] is not None:
         parts.append(f'<p class="number">{scale_text(model)}</p>')
         parts.append(gauge(model["half_width_pct"]))
-    parts += [f"<p>{escape(sentence)}</p>" for sentence in outcome["summary"]]
+    parts += [f"<p>{prose(text)}</p>" for text in outcome["summary"]]
     if model is not None and model["reasons"]:
         word = "Reasons" if outcome["verdict"] != "trusted" else "Remarks"
         parts += [f"<h3>{word}</h3>", listing(model["reasons"])]
@@ -123,14 +123,9 @@ def _findings(found: Content) -> Section:
         severity = escape(finding["severity"])
         parts.append(
             f'<div class="finding {severity}"><p><b>{severity}</b> <span class="soft">{escape(finding["code"])}</span>'
-            f"</p><p>{_sentence(finding['evidence'])}</p><p>What to do: {_sentence(finding['advice'])}</p></div>"
+            f"</p><p>{sentence(finding['evidence'])}</p><p>What to do: {sentence(finding['advice'])}</p></div>"
         )
     return Section(anchor="findings", short="Findings", parts=parts)
-
-
-def _sentence(text: str) -> str:
-    text = text.strip().replace("m/s2", "m/s²")
-    return escape(text[:1].upper() + text[1:] + ("" if text.endswith((".", "!", "?")) else "."))
 
 
 def _model_head(model: Content, mark: str) -> Section:
@@ -325,7 +320,7 @@ def _blur(content: Content, out: Path) -> Section:
     parts: list[str | Plot] = [
         f"<h2>Blur</h2><p>How far a point smears while a frame is exposed, as the gyroscope predicts it: "
         f"{digits(found['median_px'], 2)} px in the median, {digits(found['largest_px'], 3)} px at most. "
-        f"{_sentence(found['note'])}</p>",
+        f"{sentence(found['note'])}</p>",
         Plot(figure=figures.blur(found["frames"]), label="Predicted blur of each frame"),
     ]
     if "missing" not in content["crops"]:
@@ -341,7 +336,7 @@ def _shutter(content: Content, out: Path) -> Section:
     found = content["rolling_shutter"]
     worst = found["worst"]
     parts: list[str | Plot] = [
-        f"<h2>Rolling shutter</h2><p>{_sentence(found['note'])} As the camera turns within the "
+        f"<h2>Rolling shutter</h2><p>{sentence(found['note'])} As the camera turns within the "
         f"{digits(1000 * found['readout_s'], 3)} ms from the first line to the last, things lean; this is by how much "
         "keypoints were moved to where a global shutter would have seen them.</p>",
         Plot(figure=figures.shutter_over_time(found), label="Movement of keypoints in each frame"),

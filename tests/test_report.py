@@ -1,0 +1,502 @@
+"""The report says what the results say, leaves out what there is no data for, and runs nothing that a user named."""
+
+import base64
+import dataclasses
+import gzip
+import html.parser
+import json
+import re
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from report_runs import HOSTILE, cloud, recorded, write_run
+
+from colmap_inertial.errors import FormatError, MappingError
+from colmap_inertial.geometry import quat_exp, quat_rotate
+from colmap_inertial.model import trajectory_from_model
+from colmap_inertial.options import MappingOptions, ProjectOptions, ReconstructOptions
+from colmap_inertial.pipeline import reconstruct
+from colmap_inertial.pipeline.existing import reconstruct_project
+from colmap_inertial.report import write_report
+from colmap_inertial.report.figure_3d import nice_length, scene_figure
+from colmap_inertial.report.scene import scene_record
+from colmap_inertial.report.series import MOST_POINTS, rounded, strided, thinned
+from colmap_inertial.report.signals import signal_record
+from colmap_inertial.report.words import outcome_of_model
+from colmap_inertial.types import CameraTrajectory, FrameTiming, ImuRecording, ScaleEstimate
+
+SCENE = Path(__file__).parents[1] / "example_scenes" / "desk"
+
+
+class Page(html.parser.HTMLParser):
+    """What a browser would make of a page: tags with attributes, and the text that is shown."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.packed: dict[str, str] = {}
+        self._parts: list[str] = []
+        self._inside: list[tuple[str, dict[str, str | None]]] = []
+        self.feed(path.read_text(encoding="utf-8"))
+        self.text = re.sub(r"\s+", " ", "".join(self._parts).replace("\N{NO-BREAK SPACE}", " "))
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        if tag in ("script", "style"):
+            self._inside.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag):
+        if self._inside and self._inside[-1][0] == tag:
+            self._inside.pop()
+
+    def handle_data(self, data):
+        if not self._inside:
+            self._parts.append(data)
+        elif self._inside[-1][1].get("id"):
+            self.packed[self._inside[-1][1]["id"]] = data
+
+    def figures(self):
+        return json.loads(gzip.decompress(base64.b64decode(self.packed["figures"])))
+
+    def anchors(self):
+        return [attrs["id"] for tag, attrs in self.tags if tag == "section"]
+
+
+def report_of(out):
+    write_report(out)
+    return json.loads((out / "report.json").read_text(encoding="utf-8")), Page(out / "report.html")
+
+
+@pytest.fixture(scope="module")
+def full(tmp_path_factory):
+    """A run with data for everything: (folder, content of result.json). Tests must not change it."""
+    out = tmp_path_factory.mktemp("full") / "out"
+    return out, write_run(out)
+
+
+def copy_of(full, tmp_path):
+    out = tmp_path / "out"
+    shutil.copytree(full[0], out)
+    return out
+
+
+# What is said
+
+
+def test_the_numbers_are_those_of_the_result(full):
+    out, result = full
+    content, page = report_of(out)
+    (model,) = content["models"]
+    for key, value in result["models"][0].items():
+        if key not in ("drift", "validation", "cov", "dense"):
+            assert model[key] == value
+    assert model["drift"] == result["models"][0]["drift"]
+    assert {**model["validation"], "pictures": None} == {**result["models"][0]["validation"], "pictures": None}
+    assert content["seconds"] == result["seconds"]
+    assert content["versions"] == result["versions"]
+    assert content["configuration"]["values"] == {"seed": 0, "note": "frame"}
+    scale, (low, high) = model["metres_per_unit"], model["ci95"]
+    assert content["outcome"]["verdict"] == model["verdict"] == "trusted"
+    assert model["half_width_pct"] == pytest.approx(50 * (high - low) / scale)
+    for number in (scale, low, high):
+        assert f"{number:.4g}" in page.text
+    assert "−0.31 %" in page.text
+    assert "saturated" in page.text
+    assert "mapping" in page.text
+
+
+def test_every_section_that_has_data_is_there_and_every_figure_has_its_place(full):
+    _, page = report_of(full[0])
+    assert page.anchors() == [
+        "outcome",
+        "findings",
+        "scene",
+        "rotation",
+        "acceleration",
+        "spectra",
+        "drift",
+        "target",
+        "blur",
+        "shutter",
+        "run",
+    ]
+    places = [attrs["data-figure"] for tag, attrs in page.tags if attrs.get("class") == "plot" and tag == "div"]
+    assert places == list(page.figures())
+    assert len(places) == 12
+    assert sum(tag == "img" for tag, _ in page.tags) == 3 * 2 + 4
+
+
+def test_figures_are_what_plotly_takes(full):
+    graph_objects = pytest.importorskip("plotly.graph_objects")
+    _, page = report_of(full[0])
+    for figure in page.figures().values():
+        graph_objects.Figure(figure)  # raises on any name or value that plotly does not know
+
+
+def test_a_refused_scale_has_no_number_and_says_what_to_do(tmp_path):
+    out = tmp_path / "out"
+    result = write_run(out, kind="constant_velocity")
+    content, page = report_of(out)
+    (model,) = content["models"]
+    assert content["outcome"]["verdict"] == result["models"][0]["verdict"] == "refused"
+    assert model["metres_per_unit"] is None and model["half_width_pct"] is None
+    assert "What to do" in page.text
+    assert "Film again" in page.text
+    assert model["reasons"][0] in page.text.replace("The scale", "the scale", 1) or model["reasons"][0][1:] in page.text
+    assert model["signals"]["acceleration"]["camera_unit"] == "units/s2"
+    assert "missing" in model["drift"] and "missing" in model["validation"]
+    assert {"drift", "target"}.isdisjoint(page.anchors())
+    assert {"scene", "rotation", "acceleration"} <= set(page.anchors())
+    assert "scale bar" not in json.dumps(page.figures())
+    assert model["drift"]["missing"] in page.text
+
+
+@pytest.mark.parametrize(
+    ("gone", "anchor", "said"),
+    [
+        ("diagnosis.json", "findings", "was not looked at beforehand"),
+        ("report_data/model_0.json", "scene", "was not kept"),
+        ("report_data/recording.json", "shutter", "Nothing was done about a rolling shutter"),
+    ],
+)
+def test_a_section_without_data_is_left_out_with_the_reason(full, tmp_path, gone, anchor, said):
+    out = copy_of(full, tmp_path)
+    (out / gone).unlink()
+    _, page = report_of(out)
+    assert anchor not in page.anchors()
+    assert said in page.text
+
+
+def test_without_exposure_times_there_is_no_blur(full, tmp_path):
+    out = copy_of(full, tmp_path)
+    result = json.loads((out / "result.json").read_text(encoding="utf-8"))
+    result["imaging"]["deblur"] = "frames stay as they were filmed: the exposure time is unknown"
+    for frame in result["frames"]:
+        frame["blur_px"] = None
+    content, page = report_of_changed(out, result)
+    assert "exposure time is unknown" in content["blur"]["missing"]
+    assert "blur" not in page.anchors()
+    assert "the exposure time is unknown" in page.text
+
+
+def report_of_changed(out, result):
+    (out / "result.json").write_text(json.dumps(result), encoding="utf-8")
+    return report_of(out)
+
+
+def test_a_target_that_could_not_be_measured_is_said(full, tmp_path):
+    out = copy_of(full, tmp_path)
+    result = json.loads((out / "result.json").read_text(encoding="utf-8"))
+    result["models"][0]["validation"] = {"error": "the board was found in 1 image"}
+    _, page = report_of_changed(out, result)
+    assert "target" not in page.anchors()
+    assert "the board was found in 1 image" in page.text
+
+
+def test_of_several_models_the_largest_with_a_scale_comes_first(full, tmp_path):
+    out = copy_of(full, tmp_path)
+    result = json.loads((out / "result.json").read_text(encoding="utf-8"))
+    one = result["models"][0]
+    refused = {**one, "index": 1, "registered_images": 10**6, "verdict": "refused", "validation": None}
+    refused |= {"metres_per_unit": None, "ci95": None, "sigma_log": None}
+    smaller = {**one, "index": 2, "registered_images": 5, "validation": None}
+    result["models"] = [refused, smaller, one]
+    content, page = report_of_changed(out, result)
+    assert [model["index"] for model in content["models"]] == [0, 2, 1]
+    assert content["outcome"]["verdict"] == "trusted"
+    assert {"scene-0", "model-1", "model-2"} <= set(page.anchors())
+    assert len(page.anchors()) == len(set(page.anchors()))
+
+
+def test_a_weak_scale_is_told_from_a_trusted_one():
+    model = {"verdict": "weak", "metres_per_unit": 2.0, "ci95": [1.8, 2.2], "reasons": ["x"], "validation": None}
+    weak = outcome_of_model(model)
+    assert weak["headline"] != outcome_of_model({**model, "verdict": "trusted"})["headline"]
+    assert weak["todo"]
+    assert "±10 %" in weak["summary"][0]
+    assert "1 m" in weak["summary"][1]
+
+
+def test_a_folder_without_a_run_is_refused(tmp_path):
+    with pytest.raises(FormatError, match="no such file"):
+        write_report(tmp_path)
+
+
+# What must not happen
+
+
+def test_names_from_users_are_text_and_nothing_else(tmp_path):
+    out = tmp_path / "out"
+    write_run(out, name=HOSTILE)
+    _, page = report_of(out)
+    assert [attrs.get("id") for tag, attrs in page.tags if tag == "script"] == ["library", "figures", None]
+    assert all(attrs["src"].startswith("data:image/jpeg;base64,") for tag, attrs in page.tags if tag == "img")
+    assert not [name for _, attrs in page.tags for name in attrs if name.startswith("on")]
+    assert page.text.count(HOSTILE.replace("  ", " ")) > 8
+    for figure in page.figures().values():
+        assert "<script" not in json.dumps(figure)
+        assert "<img" not in json.dumps(figure)
+
+
+def test_the_page_names_no_place_to_load_from(full):
+    _, page = report_of(full[0])
+    for tag, attrs in page.tags:
+        for name in ("src", "href", "srcset", "action", "data", "poster"):
+            target = attrs.get(name)
+            assert target is None or target.startswith(("data:", "#")), (tag, target)
+    policy = next(attrs["content"] for tag, attrs in page.tags if attrs.get("http-equiv"))
+    assert policy.startswith("default-src 'none'")
+
+
+def test_the_same_run_gives_the_same_bytes(full, tmp_path):
+    out = copy_of(full, tmp_path)
+    first = [write_report(out).read_bytes(), (out / "report.json").read_bytes()]
+    other = tmp_path / "elsewhere"
+    shutil.copytree(out, other)
+    second = [write_report(other).read_bytes(), (other / "report.json").read_bytes()]
+    assert first == second
+
+
+def test_a_long_recording_with_several_models_stays_below_five_megabytes(tmp_path):
+    out = tmp_path / "out"
+    result = write_run(out, duration_s=60.0, points=60000, models=3)
+    assert len(result["frames"]) == 1800
+    content, page = report_of(out)
+    assert (out / "report.html").stat().st_size < 5e6
+    for model in content["models"]:
+        for line in model["signals"]["rotation"]["after"]["camera"]:
+            assert len(line["t_s"]) <= MOST_POINTS
+        assert len(model["scene"]["points"]["rgb"]) <= 12000
+    assert len(page.anchors()) > 20
+
+
+# What is drawn
+
+
+def test_thinning_keeps_the_extremes_the_order_and_the_gaps():
+    t_s = np.linspace(0, 100, 20001)
+    values = np.sin(t_s)
+    values[7777], values[15000] = 9.0, -9.0
+    values[4000:6000] = np.nan
+    line = thinned(t_s, values)
+    assert len(line["t_s"]) == len(line["values"]) <= MOST_POINTS
+    assert line["t_s"] == sorted(line["t_s"])
+    known = [value for value in line["values"] if value is not None]
+    assert max(known) == 9.0 and min(known) == -9.0
+    assert None in line["values"]
+    assert not [t for t, v in zip(line["t_s"], line["values"], strict=True) if v is not None and 20.1 < t < 29.9]
+    short = thinned(t_s[:50], values[:50])
+    assert len(short["t_s"]) == 50
+
+
+def test_numbers_are_short_and_right():
+    values = np.array([123456.789, -0.000123456, 0.0, np.nan, np.inf, 1e-300])
+    assert rounded(values, 4) == [123500.0, -0.0001235, 0.0, None, None, 1e-300]
+    assert strided(5, 10).tolist() == [0, 1, 2, 3, 4]
+    assert strided(1000, 3).tolist() == [0, 500, 999]
+
+
+def steady_turn(rate_rad_s, *, offset_s=0.0):
+    """A camera that turns steadily about an axis of its own and flies along a sine, and what an IMU feels of it."""
+    from colmap_inertial.io.calibration import calibration_prior
+
+    t_s = np.arange(0, 20, 1 / 30)
+    axis = np.asarray(rate_rad_s)
+    cam_from_world = quat_exp(-axis * t_s[:, None])
+    amplitude, hz = 0.1, 1.0
+    path = np.zeros((len(t_s), 3))
+    path[:, 0] = amplitude * np.sin(2 * np.pi * hz * t_s)
+    trajectory = CameraTrajectory(
+        names=tuple(map(str, range(len(t_s)))),
+        t_s=t_s,
+        cam_from_world_xyzw=cam_from_world,
+        cam_in_world=path,
+        length_unit="m",
+    )
+    imu_s = np.arange(-1, 21, 1 / 200)
+    accel = np.zeros((len(imu_s), 3))
+    accel[:, 0] = -amplitude * (2 * np.pi * hz) ** 2 * np.sin(2 * np.pi * hz * imu_s)
+    accel[:, 2] = 9.8
+    imu = ImuRecording(
+        gyro_t_s=imu_s - offset_s,
+        gyro_rad_s=np.tile(axis, (len(imu_s), 1)),
+        accel_t_s=imu_s - offset_s,
+        accel_m_s2=quat_rotate(quat_exp(-axis * imu_s[:, None]), accel),
+    )
+    calibration = dataclasses.replace(
+        calibration_prior(),
+        cam_from_imu_xyzw=np.array([0.0, 0, 0, 1]),
+        gyro_time_offset_s=offset_s,
+        accel_time_offset_s=offset_s,
+        imu_in_cam_m=np.zeros(3),
+    )
+    estimate = ScaleEstimate(
+        metres_per_unit=1.0,
+        sigma_log=0.01,
+        ci95=(0.98, 1.02),
+        verdict="trusted",
+        method="joint",
+        calibration=calibration,
+        gravity_in_world_m_s2=np.array([0, 0, -9.8]),
+        accel_bias_m_s2=np.zeros(3),
+    )
+    return trajectory, imu, estimate
+
+
+def test_rotation_and_acceleration_are_the_true_ones():
+    rate = np.array([0.2, -0.3, 0.5])
+    trajectory, imu, estimate = steady_turn(rate, offset_s=100.0)
+    record = signal_record(trajectory, imu, estimate, estimate.gravity_in_world_m_s2)
+    assert not record["rotation"]["same_clock_origin"]
+    for side in ("camera", "gyroscope"):
+        for line, true in zip(record["rotation"]["after"][side], rate, strict=True):
+            assert line["values"] == pytest.approx([true] * len(line["values"]), abs=1e-4)
+    acceleration = record["acceleration"]
+    assert acceleration["correlation"] > 0.999
+    # a second difference over h to both sides passes sinc(f h) squared of a sine
+    reach_s = 0.5 * acceleration["averaged_over_s"]
+    passed = np.sinc(reach_s) ** 2
+    true = passed * 0.1 * (2 * np.pi) ** 2
+    for side in ("camera", "accelerometer"):
+        peaks = [max(abs(v) for v in line["values"] if v is not None) for line in acceleration[side]]
+        assert peaks[2] < 0.02
+        assert np.hypot(peaks[0], peaks[1]) == pytest.approx(true, rel=0.02)
+    assert record["acceleration"]["rms_camera"] == pytest.approx(true / np.sqrt(2), rel=0.02)
+
+
+def test_the_spectrum_of_a_sine_has_its_power_at_its_frequency():
+    trajectory, imu, estimate = steady_turn(np.array([0.1, 0.0, 0.0]))
+    record = signal_record(trajectory, imu, estimate, estimate.gravity_in_world_m_s2)
+    curve = record["acceleration_spectrum"]["curves"]["imu"]
+    hz, density = np.array(curve["hz"]), np.array(curve["density"])
+    assert hz[np.argmax(density)] == pytest.approx(1.0, abs=0.13)
+    near = np.abs(hz - 1.0) < 0.4
+    power = np.sum(density[near] ** 2) * np.median(np.diff(hz[near]))
+    assert power == pytest.approx((0.1 * (2 * np.pi) ** 2) ** 2 / 2, rel=0.1)
+
+
+def test_a_wrong_scale_would_be_seen():
+    trajectory, imu, estimate, gravity, _ = recorded()
+    right = signal_record(trajectory, imu, estimate, gravity)["acceleration"]
+    twice = dataclasses.replace(trajectory, cam_in_world=2 * trajectory.cam_in_world)
+    wrong = signal_record(twice, imu, estimate, gravity)["acceleration"]
+    assert right["correlation"] > 0.97
+    assert right["rms_camera"] == pytest.approx(right["rms_accelerometer_m_s2"], rel=0.1)
+    assert wrong["rms_camera"] == pytest.approx(2 * right["rms_accelerometer_m_s2"], rel=0.1)
+
+
+def test_without_an_alignment_only_the_speed_of_turning_is_compared():
+    trajectory, imu, _, _, _ = recorded()
+    refused = ScaleEstimate(
+        metres_per_unit=None, sigma_log=None, ci95=None, verdict="refused", method="joint", reasons=("no offset fits",)
+    )
+    trajectory = dataclasses.replace(trajectory, length_unit="model")
+    record = signal_record(trajectory, imu, refused, None)
+    assert record["rotation"]["after"] is None
+    assert record["rotation"]["before"]["camera_size"]["values"]
+    assert "missing" in record["acceleration"]
+
+
+def test_the_scene_is_upright_and_holds_the_model():
+    reconstruction = cloud()
+    timing = FrameTiming(names=tuple(sorted(i.name for i in reconstruction.images.values())), t_s=np.arange(4.0))
+    trajectory, _ = trajectory_from_model(reconstruction, timing)
+    gravity = np.array([3.0, -5.0, 7.0])
+    scene = scene_record(reconstruction, dataclasses.replace(trajectory, length_unit="m"), gravity)
+    turn = np.array(scene["display_from_model_xyzw"])
+    np.testing.assert_allclose(quat_rotate(turn, gravity / np.linalg.norm(gravity)), [0, 0, -1], atol=1e-8)
+    centres = np.array(scene["path"]["xyz"]).T
+    np.testing.assert_allclose(centres, quat_rotate(turn, trajectory.cam_in_world), atol=1e-3)
+    points = np.array([point.xyz for point in reconstruction.points3D.values()])
+    assert len(scene["points"]["rgb"]) > 0.9 * len(points)
+    first = quat_rotate(turn, points)
+    shown = np.array(scene["points"]["xyz"]).T
+    assert max(np.linalg.norm(first - point, axis=1).min() for point in shown[:20]) < 2e-3
+    figure = scene_figure(scene)
+    names = [trace.get("name", "") for trace in figure["data"]]
+    assert any("scale bar" in name for name in names)
+    assert "gravity" in names
+
+
+def test_grid_cells_are_round_lengths():
+    assert [nice_length(v) for v in (0.011, 0.3, 1.0, 1.2, 47.0)] == [0.02, 0.5, 1.0, 2.0, 50.0]
+
+
+# The pipeline
+
+
+def first_frames(folder, count):
+    """A copy of the example scene with its first frames only."""
+    shutil.copytree(SCENE, folder)
+    table = folder / "frames.csv"
+    rows = table.read_text().splitlines()
+    table.write_text("\n".join(rows[: count + 1]) + "\n")
+    for row in rows[count + 1 :]:
+        (folder / "frames" / row.split(",")[0]).unlink()
+    return folder
+
+
+def test_reconstruct_writes_it_and_a_continued_run_does_too(tmp_path):
+    capture = first_frames(tmp_path / "capture", 14)
+    quick = ReconstructOptions(mapping=MappingOptions(max_num_features=1000, first_octave=0, max_image_size=480))
+    out = tmp_path / "out"
+    result = reconstruct(capture, out, quick)
+    content, page = json.loads((out / "report.json").read_text()), Page(out / "report.html")
+    written = json.loads((out / "result.json").read_text())
+    assert content["models"][0]["metres_per_unit"] == written["models"][0]["metres_per_unit"]
+    assert content["outcome"]["verdict"] == result.models[0].scale.verdict
+    assert content["findings"]["checked"]
+    assert content["recording"]["frames"]["count"] == 14
+    assert content["models"][0]["scene"]["unit"] == ("m" if result.models[0].sparse_metric else "model")
+    assert {"scene", "rotation", "acceleration"} <= set(page.anchors())
+    assert result.workspace.report == out / "report.html"
+
+    (out / "result.json").unlink()
+    (out / "report.html").unlink()
+    shutil.rmtree(out / "sparse_metric", ignore_errors=True)
+    reconstruct(capture, out, quick)
+    assert Page(out / "report.html").anchors() == page.anchors()
+
+    again = write_report(out)  # from the folder alone
+    assert Page(again).anchors() == page.anchors()
+
+
+def test_a_run_that_stops_says_why(tmp_path):
+    capture = first_frames(tmp_path / "capture", 4)
+    for path in (capture / "frames").iterdir():
+        cv2.imwrite(str(path), np.full((480, 640, 3), 120, np.uint8))
+    with pytest.raises(MappingError) as stopped:
+        reconstruct(capture, tmp_path / "out", ReconstructOptions(deblur="off", rolling_shutter="off"))
+    content, page = json.loads((tmp_path / "out" / "report.json").read_text()), Page(tmp_path / "out" / "report.html")
+    assert content["outcome"]["verdict"] == "stopped"
+    assert str(stopped.value)[:40] in page.text
+    assert content["title"] == "capture"
+    assert page.anchors()[:2] == ["outcome", "findings"]
+
+
+def test_an_existing_project_gets_one_with_and_without_a_scale(project, tmp_path):
+    source = ProjectOptions(imu=project.imu, frame_times=project.frame_times)
+    result = reconstruct_project(project.model.parents[1], tmp_path / "out", source)
+    content = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert content["models"][0]["metres_per_unit"] == result.models[0].scale.metres_per_unit
+    assert content["models"][0]["signals"]["acceleration"]["correlation"] > 0.97
+    assert "missing" in content["findings"] and "missing" in content["blur"]
+
+    other = tmp_path / "still"
+    shutil.copytree(project.imu, other)
+    stamps = [line.split()[0] for line in (other / "gyroscope.txt").read_text().splitlines()]
+    (other / "gyroscope.txt").write_text(
+        "".join(
+            f"{stamp} {np.sin(i) / 500:.6f} {np.cos(i) / 500:.6f} {i % 7 / 500:.6f}\n" for i, stamp in enumerate(stamps)
+        )
+    )
+    refused = reconstruct_project(
+        project.model.parents[1], tmp_path / "none", ProjectOptions(imu=other, frame_times=project.frame_times)
+    )
+    content, page = json.loads((tmp_path / "none" / "report.json").read_text()), Page(tmp_path / "none" / "report.html")
+    assert refused.models[0].scale.verdict == content["outcome"]["verdict"] == "refused"
+    assert content["models"][0]["signals"]["rotation"]["after"] is None
+    assert "could not be brought together" in page.text
