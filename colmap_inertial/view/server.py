@@ -116,7 +116,7 @@ class Viewer:
     def _point_size(self) -> float:
         """So that points cover a part of the area they lie in."""
         return float(
-            np.clip(0.9 * self.scene.reach / np.sqrt(max(len(self.scene.cloud.xyz), 1)), 0, self.scene.reach / 150)
+            np.clip(0.6 * self.scene.reach / np.sqrt(max(len(self.scene.cloud.xyz), 1)), 0, self.scene.reach / 150)
         )
 
     def _add_mesh(self) -> Any:
@@ -248,7 +248,7 @@ class Viewer:
                 position=ends.mean(axis=0),
                 anchor="center-center",
                 font_size_mode="scene",
-                font_scene_height=0.4 * spacing,
+                font_scene_height=0.25 * spacing,
             )
             drawn.append(label)
         return drawn
@@ -412,15 +412,14 @@ class Viewer:
             image = read_image(path)
         except FormatError as error:
             return None, f"Its image: {error.reason}"
-        if image.dtype == np.uint16:
-            image = (image >> 8).astype(np.uint8)
-        if image.ndim == 2:
-            image = np.repeat(image[:, :, None], 3, axis=2)
-        height, width = image.shape[:2]
+        shown = np.asarray(image // 257 if image.dtype == np.uint16 else image, dtype=np.uint8)
+        if shown.ndim == 2:
+            shown = np.repeat(shown[:, :, None], 3, axis=2)
+        height, width = shown.shape[:2]
         if width > width_px:
             size = (width_px, max(1, round(height * width_px / width)))
-            return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8), ""
-        return np.asarray(image, dtype=np.uint8), ""
+            shown = np.asarray(cv2.resize(shown, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        return shown, ""
 
     def _switch_measuring(self) -> None:
         with self._lock:
