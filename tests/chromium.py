@@ -127,6 +127,21 @@ class Page:
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button=button, buttons=buttons, clickCount=1)
             time.sleep(0.1)
 
+    def middle_of(self, selector: str, text: str = "") -> tuple[float, float]:
+        """Where to click for the first visible element of this kind that has this text."""
+        chosen = f"e.getBoundingClientRect().width && e.innerText.includes({json.dumps(text)})"
+        find = f"[...document.querySelectorAll({json.dumps(selector)})].find(e => {chosen})"
+        box = self.wait(
+            f"(e => e && (r => [r.x + r.width / 2, r.y + r.height / 2])(e.getBoundingClientRect()))({find})"
+        )
+        return box[0], box[1]
+
+    def settle(self, frames: int = 30) -> None:
+        """Wait for so many frames to be drawn."""
+        count = "let n = 0; const next = () => ++n > frames ? done(n) : requestAnimationFrame(next); next()"
+        promise = f"new Promise(done => {{ const frames = {frames}; {count} }})"
+        self.call("Runtime.evaluate", expression=promise, awaitPromise=True)
+
     def screenshot(self) -> bytes:
         """The page as PNG."""
         return base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])

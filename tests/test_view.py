@@ -1,0 +1,422 @@
+"""The viewer: what it shows is where it should be, what one measures is true, and a real browser shows it."""
+
+import dataclasses
+import json
+import re
+import signal
+import subprocess
+import sys
+
+import cv2
+import model_project
+import numpy as np
+import pycolmap
+import pytest
+from chromium import Page, chromium_or_skip
+
+from colmap_inertial.cli import main
+from colmap_inertial.errors import FormatError, MissingExtraError, OutputError
+from colmap_inertial.geometry import quat_exp, quat_rotate
+from colmap_inertial.model import apply_similarity
+from colmap_inertial.model.project import apply_to_project
+from colmap_inertial.model.similarities import plain_factor
+from colmap_inertial.types import ScaleEstimate, Similarity
+from colmap_inertial.view import load_scene, measured, nearest_to_ray, round_length
+from colmap_inertial.view.measure import ball_at_ray, length_text
+from colmap_inertial.view.panel import measured_text, scale_text, target_text
+from colmap_inertial.view.scene import START_FOV_RAD
+
+METRES_PER_UNIT = 0.25
+#: Gravity in the model's own world: neither along an axis nor of length 1.
+GRAVITY = quat_rotate(quat_exp(np.array([0.4, -0.7, 0.2])), np.array([0.0, 0.0, -9.81]))
+ESTIMATE = ScaleEstimate(
+    metres_per_unit=METRES_PER_UNIT,
+    sigma_log=0.01,
+    ci95=(0.98 * METRES_PER_UNIT, 1.03 * METRES_PER_UNIT),
+    verdict="trusted",
+    method="joint",
+    gravity_in_world_m_s2=GRAVITY,
+    cov=np.diag([1e-4, 1e-4, 1e-4, 1e-4, 1e-6, 1e-6, 1e-6]),
+)
+REFUSED = ScaleEstimate(
+    metres_per_unit=None, sigma_log=None, ci95=None, verdict="refused", method="joint", reasons=("a *still* camera",)
+)
+#: Corners of a target that is 1 % too large in the model, metres.
+CORNERS = {"r0c0": [0.0, 0.0, 0.0], "r0c1": [0.101, 0.0, 0.0], "r1c0": [0.0, 0.101, 0.0], "r1c1": [0.101, 0.101, 0.0]}
+
+
+def synthesized(seed, frames=12, points=400):
+    """A model without noise: its points and poses are the truth."""
+    pycolmap.set_random_seed(seed)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig = 1, 1
+    options.num_frames_per_rig, options.num_points3D = frames, points
+    model = pycolmap.synthesize_dataset(options)
+    rng = np.random.default_rng(seed)
+    for point in model.points3D.values():
+        point.color = rng.integers(60, 255, 3, dtype=np.uint8)
+    return model
+
+
+def write_result(root, estimates, world="z-up", validation=None):
+    """An output folder as ``reconstruct`` leaves it, with a model for each estimate; returns these models."""
+    (root / ".stages").mkdir(parents=True)
+    models, records = [], []
+    for index, estimate in enumerate(estimates):
+        model = synthesized(index + 1, frames=8 + 4 * index)
+        models.append(model)
+        sparse = root / "sparse" / str(index)
+        sparse.mkdir(parents=True)
+        model.write_binary(str(sparse))
+        metric = None
+        if estimate.verdict != "refused":
+            metric = f"sparse_metric/{index}"
+            (root / "sparse_metric").mkdir(exist_ok=True)
+            apply_similarity(sparse, root / metric, Similarity.from_scale(estimate, world=world, provenance="a test"))
+        records.append(
+            {"index": index, "registered_images": model.num_reg_images(), "sparse": f"sparse/{index}",
+             "sparse_metric": metric, "trajectory": None, "validation": validation, "dense": None, **estimate.as_json()}
+        )  # fmt: skip
+    (root / "result.json").write_text(json.dumps({"models": records}))
+    return models
+
+
+def validation_record():
+    pairs = [("r0c0", "r0c1", 0.1), ("r0c0", "r1c0", 0.1), ("r1c0", "r1c1", 0.1), ("r0c0", "r1c1", 0.1 * 2**0.5)]
+    return {
+        "target": "checkerboard:2x2:0.1",
+        "scale_error_pct": 1.0,
+        "ci95_pct": [0.8, 1.2],
+        "within_tolerance": True,
+        "distances": [
+            {"pair": [a, b], "known_m": known, "measured": 1.01 * known, "residual_m": 0.01 * known, "set": "check"}
+            for a, b, known in pairs
+        ],
+        "corners": [{"name": name, "in_model": place} for name, place in CORNERS.items()],
+    }
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory):
+    """A finished result with images; and its model in COLMAP's units."""
+    root = tmp_path_factory.mktemp("view") / "garden"
+    (model,) = write_result(root, [ESTIMATE], validation=validation_record())
+    rng = np.random.default_rng(1)
+    for image in model.images.values():
+        (root / "images" / image.name).parent.mkdir(parents=True, exist_ok=True)
+        assert cv2.imwrite(str(root / "images" / image.name), rng.integers(0, 255, (96, 128, 3), dtype=np.uint8))
+    return root, model
+
+
+def places_in_m(model):
+    """(N, 3) points of a model, (F, 3) its cameras in the order of their names: what they should be in metres."""
+    turn = Similarity.from_scale(ESTIMATE).rotation_xyzw
+    images = sorted(model.images.values(), key=lambda image: image.name)
+    points = np.array([model.points3D[i].xyz for i in sorted(model.point3D_ids())])
+    cameras = np.array([image.projection_center() for image in images])
+    return tuple(METRES_PER_UNIT * quat_rotate(turn, xyz) for xyz in (points, cameras))
+
+
+def test_points_and_cameras_are_where_the_metric_model_has_them(out):
+    root, model = out
+    scene = load_scene(root)
+    points, cameras = places_in_m(model)
+    np.testing.assert_allclose(scene.cloud.xyz, points, atol=1e-5)
+    np.testing.assert_array_equal(scene.cloud.rgb[3], model.points3D[sorted(model.point3D_ids())[3]].color)
+    np.testing.assert_allclose(scene.cameras.cam_in_world, cameras, atol=1e-9)
+    image = next(image for image in model.images.values() if image.name == scene.cameras.names[2])
+    ahead = quat_rotate(Similarity.from_scale(ESTIMATE).rotation_xyzw, image.cam_from_world().rotation.matrix()[2])
+    np.testing.assert_allclose(quat_rotate(scene.cameras.world_from_cam_xyzw[2], [0.0, 0, 1]), ahead, atol=1e-9)
+    camera = image.camera
+    assert scene.cameras.vertical_fov_rad[2] == pytest.approx(
+        2 * np.arctan(camera.height / 2 / camera.mean_focal_length())
+    )
+    assert scene.image_of(2) == root / "images" / image.name
+    assert scene.path.shape == (len(cameras) - 1, 2, 3)
+
+
+@pytest.mark.parametrize(("world", "up"), [("z-up", [0, 0, 1]), ("y-down", [0, -1, 0])])
+def test_up_is_against_gravity_in_either_world(tmp_path, world, up):
+    write_result(tmp_path / "out", [ESTIMATE], world=world)
+    scene = load_scene(tmp_path / "out")
+    assert scene.gravity_known
+    np.testing.assert_allclose(scene.up_in_world, up, atol=1e-12)
+    np.testing.assert_allclose(
+        [scene.ground.along @ scene.up_in_world, scene.ground.across @ scene.up_in_world], 0, atol=1e-12
+    )
+
+
+def test_the_scale_bar_is_round_level_as_long_as_it_says_and_in_view(out):
+    scene = load_scene(out[0])
+    ground = scene.ground
+    bar = ground.bar[1] - ground.bar[0]
+    assert np.linalg.norm(bar) == pytest.approx(ground.bar_m)
+    assert bar @ scene.up_in_world == pytest.approx(0, abs=1e-9)
+    assert ground.bar_m == round_length(ground.bar_m)
+    assert 0.2 * scene.reach < ground.bar_m <= 0.6 * scene.reach
+    assert ground.side_m >= 2 * scene.reach
+    view = scene.centre - scene.start
+    for end in [*ground.bar, *scene.cameras.cam_in_world[:2]]:
+        seen = end - scene.start
+        assert np.arccos(seen @ view / np.linalg.norm(seen) / np.linalg.norm(view)) < 0.75 * START_FOV_RAD
+
+
+@pytest.mark.parametrize(
+    ("about", "expected"), [(1, 1), (1.99, 1), (2, 2), (4.9, 2), (0.0501, 0.05), (999, 500), (1000, 1000), (0.2, 0.2)]
+)
+def test_round_lengths_are_1_2_5(about, expected):
+    assert round_length(about) == pytest.approx(expected, rel=1e-12)
+
+
+def test_lengths_have_fitting_units():
+    assert [length_text(x) for x in (2000, 1, 0.5, 0.02, 0.005)] == ["2 km", "1 m", "50 cm", "2 cm", "5 mm"]
+
+
+def test_two_clicks_measure_the_true_distance_with_the_scale_s_interval(out):
+    root, model = out
+    scene = load_scene(root)
+    truth, _ = places_in_m(model)
+    candidates = scene.pickable()
+    rng = np.random.default_rng(0)
+    for a, b in rng.choice(len(truth), (30, 2), replace=False):
+        found = []
+        for target in (truth[a], truth[b]):
+            # from close by, so that no other point is in front
+            away = rng.standard_normal(3)
+            origin = target + 0.02 * scene.reach * away / np.linalg.norm(away)
+            index = nearest_to_ray(candidates, origin, target - origin)
+            found.append(candidates[index])
+        result = measured(*found, scene.scale.unit, scene.scale.relative_ci95)
+        length = np.linalg.norm(truth[a] - truth[b])
+        assert result.length == pytest.approx(length, abs=1e-5)
+        assert result.ci95 == pytest.approx((0.98 * length, 1.03 * length), abs=1e-5)
+
+
+def test_a_measured_length_is_written_to_the_digits_of_its_uncertainty():
+    result = measured(np.zeros(3), np.array([1.23456, 0, 0]), "m", (0.98, 1.02))
+    assert result.text == "1.235 ± 0.025 m"
+    assert "1.21 m to 1.259 m" in measured_text(result)
+    assert measured(np.zeros(3), np.array([0, 0.28, 0]), "m", (0.99, 1.01)).text == "280.0 ± 2.8 mm"
+    assert measured(np.zeros(3), np.array([0, 0, 2.0]), "m", None).text == "2 m"
+    assert measured(np.zeros(3), np.array([0, 0, 2.0]), "model", (0.9, 1.1)).text == "2 units (no scale)"
+
+
+def test_a_click_takes_the_point_in_front_and_none_where_there_is_none():
+    points = np.array([[0.001, 0, 5.0], [0.001, 0, 2.0], [0.5, 0, 2.0], [0, 0, -1.0]])
+    ahead = np.array([0.0, 0, 1])
+    assert nearest_to_ray(points, np.zeros(3), ahead) == 1
+    assert nearest_to_ray(points, np.array([0, 0, 3.0]), ahead) == 0
+    assert nearest_to_ray(points, np.zeros(3), np.array([0.5, 0, 2])) == 2
+    assert nearest_to_ray(points, np.zeros(3), np.array([0, 1.0, 0.1])) is None
+    assert nearest_to_ray(np.zeros((0, 3)), np.zeros(3), ahead) is None
+    assert ball_at_ray(points, 0.1, np.zeros(3), ahead) == 1
+    assert ball_at_ray(points, 0.1, np.zeros(3), np.array([0.0, 1, 0])) is None
+
+
+def test_a_refused_scale_shows_the_model_in_its_own_units_and_says_so(tmp_path):
+    (model,) = write_result(tmp_path / "out", [REFUSED])
+    scene = load_scene(tmp_path / "out")
+    assert scene.scale.unit == "model"
+    assert scene.ground is None
+    points = np.array([model.points3D[i].xyz for i in sorted(model.point3D_ids())])
+    np.testing.assert_allclose(scene.cloud.xyz, points, rtol=1e-5, atol=1e-5)
+    text = scale_text(scene)
+    assert "no scale" in text
+    assert r"a \*still\* camera" in text
+    assert not scene.gravity_known
+    assert "Gravity is not known" in text
+    write_result(tmp_path / "knows", [dataclasses.replace(REFUSED, gravity_in_world_m_s2=GRAVITY)])
+    scene = load_scene(tmp_path / "knows")
+    assert scene.gravity_known
+    np.testing.assert_allclose(scene.up_in_world, -GRAVITY / np.linalg.norm(GRAVITY), atol=1e-12)
+
+
+def test_the_target_has_its_corners_lines_and_known_distances(out):
+    scene = load_scene(out[0])
+    assert set(scene.target.corners) == set(CORNERS)
+    assert len(scene.target_lines) == 3  # the sides; not the diagonal
+    np.testing.assert_allclose(np.linalg.norm(scene.target_lines[:, 1] - scene.target_lines[:, 0], axis=1), 0.101)
+    assert max(d.known_m for d in scene.labelled) == pytest.approx(0.1 * 2**0.5)
+    assert "| 100.0 | 101.00 | 3 |" in target_text(scene.target)
+    old = dataclasses.replace(scene.target, corners={})
+    assert "not in this result" in target_text(old)
+
+
+def test_the_largest_model_is_shown_unless_another_is_asked_for(tmp_path):
+    write_result(tmp_path / "out", [ESTIMATE, REFUSED])
+    assert load_scene(tmp_path / "out").source.index == 1
+    scene = load_scene(tmp_path / "out", model=0)
+    assert (scene.source.index, scene.scale.unit, len(scene.cameras)) == (0, "m", 8)
+    with pytest.raises(FormatError, match="--model takes one of 0, 1"):
+        load_scene(tmp_path / "out", model=7)
+
+
+def test_dense_points_and_mesh_go_before_sparse_points_and_are_thinned(tmp_path):
+    project = tmp_path / "project"
+    project.mkdir()
+    model_project.write_project(project)
+    fused = pycolmap.Reconstruction()
+    fused.import_PLY(str(project / "dense" / "fused.ply"))
+    scene = load_scene(project)
+    assert scene.cloud.dense
+    assert scene.cloud.total == len(scene.cloud.xyz) == fused.num_points3D()
+    # the ball of model_project, in COLMAP's units
+    assert np.median(np.linalg.norm(scene.cloud.xyz, axis=1)) == pytest.approx(1, abs=0.02)
+    assert scene.scale.unit == "model"
+    few = load_scene(project, max_points=50).cloud
+    assert (len(few.xyz), few.total) == (50, scene.cloud.total)
+    assert scene.mesh is not None
+    corners = scene.mesh.vertices[scene.mesh.faces]
+    assert np.median(np.linalg.norm(corners.mean(axis=1), axis=1)) == pytest.approx(1, abs=0.05)
+    assert scene.image_of(0) is not None
+
+
+def test_an_applied_project_is_metric_with_its_interval_or_without_one(tmp_path):
+    project = tmp_path / "project"
+    project.mkdir()
+    model_project.write_project(project)
+    plain = load_scene(project)
+    apply_to_project(project, tmp_path / "metric", Similarity.from_scale(ESTIMATE, provenance="a test"))
+    scene = load_scene(tmp_path / "metric")
+    assert scene.scale.unit == "m"
+    np.testing.assert_allclose(scene.scale.relative_ci95, np.exp([-0.0196, 0.0196]), atol=1e-5)
+    assert scene.gravity_known
+    assert sorted(np.abs(scene.up_in_world)) == [0, 0, 1]
+    assert np.ptp(scene.cameras.cam_in_world, axis=0).max() < np.ptp(plain.cameras.cam_in_world)
+    apply_to_project(project, tmp_path / "factor", plain_factor(3.0))
+    scene = load_scene(tmp_path / "factor")
+    assert (scene.scale.unit, scene.scale.relative_ci95, scene.gravity_known) == ("m", None, False)
+    assert "uncertainty is not known" in scale_text(scene)
+
+
+def test_what_cannot_be_shown_is_said(tmp_path, capsys):
+    with pytest.raises(FormatError, match="no such folder"):
+        load_scene(tmp_path / "nothing")
+    with pytest.raises(FormatError, match="no COLMAP model"):
+        load_scene(tmp_path)
+    unfinished = tmp_path / "unfinished"
+    write_result(unfinished, [ESTIMATE])
+    (unfinished / "result.json").unlink()
+    with pytest.raises(FormatError, match="not finished"):
+        load_scene(unfinished)
+    damaged = tmp_path / "damaged"
+    write_result(damaged, [ESTIMATE])
+    (damaged / "result.json").write_text('{"models": [{"index": 0}]}')
+    with pytest.raises(FormatError, match="damaged"):
+        load_scene(damaged)
+    with pytest.raises(SystemExit) as stopped:
+        main(["view", str(tmp_path / "nothing")])
+    assert stopped.value.code == 2
+    assert "no such folder" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("flags", [["--port", "70000"], ["--max-points", "0"]])
+def test_options_out_of_range_exit_2(capsys, flags):
+    with pytest.raises(SystemExit) as stopped:
+        main(["view", "out", *flags])
+    assert stopped.value.code == 2
+
+
+def test_without_viser_the_extra_is_named(monkeypatch, out, capsys):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(SystemExit) as stopped:
+        main(["view", str(out[0])])
+    assert stopped.value.code == MissingExtraError.exit_code == 2
+    assert "pip install 'colmap-inertial[view]'" in capsys.readouterr().err
+
+
+def test_an_address_of_another_machine_is_an_error_and_a_taken_port_makes_way(out):
+    from colmap_inertial.view.server import Viewer
+
+    scene = load_scene(out[0])
+    with pytest.raises(OutputError, match=r"cannot listen at 192\.0\.2\.1"):
+        Viewer(scene, host="192.0.2.1")
+    first = Viewer(scene, port=0)
+    try:
+        port = int(first.url.rsplit(":", 1)[1])
+        second = Viewer(scene, port=port)
+        try:
+            assert second.url != first.url
+        finally:
+            second.close()
+    finally:
+        first.close()
+
+
+def on_screen(scene, place, width, height):
+    """The pixel at which the first view shows a place."""
+    ahead = scene.centre - scene.start
+    ahead = ahead / np.linalg.norm(ahead)
+    right = np.cross(ahead, scene.up_in_world)
+    right /= np.linalg.norm(right)
+    x, y, z = np.stack([right, np.cross(ahead, right), ahead]) @ (place - scene.start)
+    focal = 0.5 * height / np.tan(0.5 * START_FOV_RAD)
+    return 0.5 * width + focal * x / z, 0.5 * height + focal * y / z
+
+
+def test_a_real_browser_shows_it_measures_and_looks_through_a_camera(out, tmp_path):
+    chromium_or_skip()
+    scene = load_scene(out[0])
+    command = [sys.executable, "-m", "colmap_inertial", "view", str(out[0]), "--port", "0"]
+    server = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        url = re.search(r"http://127\.0\.0\.1:\d+", server.stdout.readline())[0]
+        page = Page(tmp_path / "profile")
+        try:
+            page.open(url)
+            size = page.wait("(c => c && [c.clientWidth, c.clientHeight])(document.querySelector('canvas'))")
+            page.wait("document.body.innerText.includes('Scale trusted')")
+            page.wait("document.body.innerText.includes('checkerboard:2x2:0.1')")
+            # docking the panel makes the canvas narrower
+            page.wait("document.querySelector('canvas').clientWidth < innerWidth - 100")
+            size = page.evaluate("(c => [c.clientWidth, c.clientHeight])(document.querySelector('canvas'))")
+            page.settle()
+            page.click(*on_screen(scene, foremost_camera(scene), *size))
+            page.wait(f"document.body.innerText.includes({json.dumps(scene.cameras.names[foremost(scene)])})")
+            page.click(*page.middle_of("button", "Overview"))
+            page.settle()
+            page.click(*page.middle_of("input[type=checkbox]"))
+            page.wait("document.body.innerText.includes('Click the first point')")
+            # two points that nothing is in front of
+            a, b = lonely_points(scene, *size)
+            for place, answer in ((a, "Click the second point"), (b, "Errors of the two points")):
+                page.click(*on_screen(scene, place, *size))
+                page.wait(f"document.body.innerText.includes({json.dumps(answer)})")
+            text = measured(a, b, "m", scene.scale.relative_ci95).text
+            assert text in page.evaluate("document.body.innerText")
+            picture = cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR)
+            drawn = picture[: size[1], : size[0]].reshape(-1, 3)
+            assert len(np.unique(drawn, axis=0)) > 200  # coloured points, lines, labels
+            assert page.errors == []
+            here = (url, url.replace("http", "ws"), "data:", "blob:", "about:")
+            assert [request for request in page.requests if not request.startswith(here)] == []
+        finally:
+            page.close()
+        server.send_signal(signal.SIGINT)
+        rest, errors = server.communicate(timeout=20)
+        assert (server.returncode, rest, errors) == (0, "", "")
+    finally:
+        server.kill()
+        server.communicate()
+
+
+def foremost(scene):
+    """The camera that is nearest to the first view."""
+    return int(np.argmin(np.linalg.norm(scene.cameras.cam_in_world - scene.start, axis=1)))
+
+
+def foremost_camera(scene):
+    """The middle of the pyramid that is drawn for it."""
+    i = foremost(scene)
+    ahead = quat_rotate(scene.cameras.world_from_cam_xyzw[i], np.array([0.0, 0, 1]))
+    return scene.cameras.cam_in_world[i] + 0.6 * 0.05 * scene.reach * ahead
+
+
+def lonely_points(scene, width, height):
+    """Two points well inside the first view that no other point is near to in it."""
+    places = scene.pickable()
+    px = np.array([on_screen(scene, place, width, height) for place in places])
+    inside = (np.abs(px - [width / 2, height / 2]) < [0.4 * width, 0.4 * height]).all(axis=1)
+    apart = np.linalg.norm(px[:, None] - px, axis=2) + 1e9 * np.eye(len(px))
+    order = np.argsort(np.where(inside, -apart.min(axis=1), 0))
+    return places[order[0]], places[order[1]]
