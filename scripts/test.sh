@@ -3,6 +3,23 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 bash scripts/setup.sh
+
+# The report's page is tested in a browser; without one, those tests are skipped.
+missing=()
+command -v chromium >/dev/null || missing+=("chromium")
+command -v chromedriver >/dev/null || missing+=("chromium-driver")
+install_missing() {
+  local sudo=""
+  if [ "$(id -u)" -ne 0 ]; then sudo="sudo -n"; fi
+  command -v apt-get >/dev/null && $sudo true 2>/dev/null || return 1
+  echo "test: installing ${missing[*]}"
+  $sudo apt-get update -qq &&
+    DEBIAN_FRONTEND=noninteractive $sudo apt-get install -y -qq --no-install-recommends "${missing[@]}" >/dev/null
+}
+if [ ${#missing[@]} -gt 0 ] && ! install_missing; then
+  echo "test: the report's page is not tested in a browser; please install ${missing[*]} for that" >&2
+fi
+
 .venv/bin/ruff check .
 .venv/bin/ruff format --check .
 .venv/bin/mypy

@@ -112,7 +112,7 @@ def outcome_of_stop(reason: str) -> dict[str, Any]:
     return {
         "verdict": "stopped",
         "headline": "Stopped before there was a scale",
-        "summary": [reason],
+        "summary": [reason[:1].upper() + reason[1:]],
         "todo": ["What was found in the recording is listed below, each with what to do about it."],
     }
 

@@ -1,0 +1,216 @@
+"""The report in a real browser, off the disk: all is drawn, nothing is loaded, nothing overflows, no name is run."""
+
+import json
+import shutil
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from report_runs import HOSTILE, write_run
+
+from colmap_inertial.report import write_report
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+DRIVER = shutil.which("chromedriver")
+
+pytestmark = pytest.mark.skipif(
+    CHROMIUM is None or DRIVER is None, reason="no Chromium here (apt-get install chromium chromium-driver)"
+)
+
+WIDTHS = {"desktop": (1280, 900, False), "phone": (390, 844, True)}
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """A headless Chromium, with its console and its requests kept."""
+    from selenium import webdriver
+
+    options = webdriver.ChromeOptions()
+    options.binary_location = CHROMIUM
+    for flag in (
+        "--headless=new",
+        "--no-sandbox",
+        "--disable-dev-shm-usage",
+        "--disable-background-networking",
+        "--enable-unsafe-swiftshader",
+        "--use-angle=swiftshader",
+        "--hide-scrollbars",
+    ):
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
+    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(DRIVER))
+    driver.set_script_timeout(60)
+    yield driver
+    driver.quit()
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory):
+    """Reports by kind: everything there, with names that a page must not run; a refused scale; a run that stopped."""
+    root = tmp_path_factory.mktemp("reports")
+    write_run(root / "full", name=HOSTILE, models=2)
+    write_run(root / "refused", kind="constant_velocity")
+    (root / "stopped").mkdir()
+    stopped = root / "stopped"
+    page = {kind: write_report(root / kind) for kind in ("full", "refused")}
+    return page | {"stopped": write_report(stopped, stopped="the video was stabilised", capture="capture.toml")}
+
+
+@dataclass
+class Visit:
+    """A page that was opened and has drawn what it has to draw."""
+
+    driver: object
+    console: list[str]
+    requests: list[str]
+
+    def script(self, code: str):
+        return self.driver.execute_script(code)
+
+
+def visit(driver, page: Path, width: str, *, dark: bool = False, wait: bool = True) -> Visit:
+    across, down, mobile = WIDTHS[width]
+    screen = {"width": across, "height": down, "deviceScaleFactor": 1, "mobile": mobile}
+    driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
+    driver.execute_cdp_cmd("Emulation.setTouchEmulationEnabled", {"enabled": mobile})
+    scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+    driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [scheme]})
+    driver.get_log("browser")
+    driver.get_log("performance")
+    driver.get(page.as_uri())
+    until = time.monotonic() + 60
+    while wait and not driver.execute_script("return document.documentElement.dataset.plots"):
+        assert time.monotonic() < until, "the plots were not drawn within a minute"
+        time.sleep(0.05)
+    console = [f"{line['level']}: {line['message']}" for line in driver.get_log("browser")]
+    events = [json.loads(line["message"])["message"] for line in driver.get_log("performance")]
+    sent = [event["params"]["request"]["url"] for event in events if event["method"] == "Network.requestWillBeSent"]
+    return Visit(driver=driver, console=console, requests=sent)
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+@pytest.mark.parametrize("kind", ["full", "refused"])
+def test_every_plot_is_drawn_without_errors_or_requests(browser, pages, kind, width):
+    seen = visit(browser, pages[kind], width)
+    assert seen.script("return document.documentElement.dataset.plots") == "drawn"
+    assert not [line for line in seen.console if line.startswith("SEVERE")]
+    assert [url for url in seen.requests if not url.startswith(("data:", "blob:"))] == [pages[kind].as_uri()]
+    empty = seen.script(
+        """return [...document.querySelectorAll('.plot')].filter(div => {
+             const cloud = div.querySelector('.gl-container canvas');
+             const lines = div.querySelectorAll('.scatterlayer path.js-line, .scatterlayer path.point, .bars path');
+             const height = div.getBoundingClientRect().height;
+             return height < 150 || (!cloud && lines.length === 0);
+           }).map(div => div.dataset.figure)"""
+    )
+    assert empty == []
+    assert seen.script("return document.querySelectorAll('.gl-container canvas').length") == len(
+        seen.script("return [...document.querySelectorAll('section[id^=scene] .plot')]")
+    )
+    assert seen.script("return document.querySelectorAll('.plot').length") >= (12 if kind == "full" else 5)
+    assert seen.script("return [...document.images].every(image => image.complete && image.naturalWidth > 0)")
+    assert_nothing_overflows(seen, width)
+
+
+def test_a_run_that_stopped_has_a_page_without_plots(browser, pages):
+    seen = visit(browser, pages["stopped"], "phone", wait=False)
+    assert not [line for line in seen.console if line.startswith("SEVERE")]
+    assert "The video was stabilised" in seen.script("return document.body.innerText")
+    assert_nothing_overflows(seen, "phone")
+
+
+def assert_nothing_overflows(seen: Visit, width: str) -> None:
+    across = WIDTHS[width][0]
+    assert seen.script("return document.documentElement.scrollWidth") <= across
+    outside = seen.script(
+        f"""return [...document.querySelectorAll('main *, header *, footer *')].filter(element =>
+             !element.closest('.plot') && element.getBoundingClientRect().right > {across} + 1
+           ).map(element => element.outerHTML.slice(0, 80))"""
+    )
+    assert outside == []
+
+
+def test_names_are_shown_and_not_run(browser, pages):
+    seen = visit(browser, pages["full"], "desktop")
+    assert seen.script("return document.title").startswith(HOSTILE.rsplit("/", 1)[1])  # a folder's name
+    text = seen.script("return document.body.innerText")
+    assert "<script>alert" in text
+    for leaked in ("DecompressionStream", "use strict", "function(", "undefined", "NaN", "[object"):
+        assert leaked not in text
+    assert seen.script("return [...document.querySelectorAll('[onerror]')].length") == 0
+    assert seen.script("return document.querySelectorAll('img[src=\"x\"]').length") == 0
+
+
+def test_the_cloud_is_really_there_and_can_be_turned(browser, pages):
+    seen = visit(browser, pages["refused"], "desktop")
+    # a WebGL canvas is empty once shown: plotly draws it again for a picture
+    picture = """
+        const done = arguments[arguments.length - 1];
+        const div = document.querySelector('#scene .plot');
+        const eye = arguments[0];
+        const draw = async () => {
+          if (eye) await Plotly.relayout(div, {'scene.camera.eye': eye});
+          const url = await Plotly.toImage(div, {format: 'png', width: 300, height: 300});
+          const image = new Image();
+          image.src = url;
+          await image.decode();
+          const canvas = document.createElement('canvas');
+          canvas.width = canvas.height = 300;
+          const context = canvas.getContext('2d');
+          context.drawImage(image, 0, 0);
+          const pixels = context.getImageData(0, 0, 300, 220).data;
+          let drawn = 0, sum = 0;
+          for (let i = 0; i < pixels.length; i += 4) {
+            if (pixels[i + 3] > 40) { drawn++; sum += i % 997; }
+          }
+          return [drawn, sum];
+        };
+        draw().then(done, error => done(String(error)));
+    """
+    before = seen.driver.execute_async_script(picture, None)
+    after = seen.driver.execute_async_script(picture, {"x": -1.2, "y": 0.4, "z": 1.6})
+    assert before[0] > 300 and after[0] > 300
+    assert before != after
+
+
+def test_it_follows_a_dark_screen(browser, pages):
+    colour = "return getComputedStyle(document.body).backgroundColor"
+    tick = "return getComputedStyle(document.querySelector('#rotation .plot .xtick text')).fill"
+    light = visit(browser, pages["refused"], "desktop")
+    bright = [light.script(colour), light.script(tick)]
+    dark = visit(browser, pages["refused"], "desktop", dark=True)
+    dim = [dark.script(colour), dark.script(tick)]
+    assert all(a != b for a, b in zip(bright, dim, strict=True))
+    browser.execute_cdp_cmd(
+        "Emulation.setEmulatedMedia", {"features": [{"name": "prefers-color-scheme", "value": "light"}]}
+    )
+    until = time.monotonic() + 20
+    while [dark.script(colour), dark.script(tick)] != bright:
+        assert time.monotonic() < until, "the plots did not follow"
+        time.sleep(0.1)
+
+
+def test_text_and_tables_stand_without_scripts(browser, pages):
+    browser.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": True})
+    try:
+        browser.get(pages["refused"].as_uri())
+        text = browser.execute_cdp_cmd("Accessibility.getFullAXTree", {})
+        names = " ".join(str(node.get("name", {}).get("value", "")) for node in text["nodes"])
+    finally:
+        browser.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": False})
+    assert "No scale could be found" in names
+    assert "The plots need JavaScript" in names
+    assert "config.toml" in names
+
+
+def test_a_browser_that_cannot_unpack_says_so(browser, pages):
+    old = browser.execute_cdp_cmd(
+        "Page.addScriptToEvaluateOnNewDocument", {"source": "delete window.DecompressionStream"}
+    )
+    try:
+        seen = visit(browser, pages["refused"], "desktop")
+        assert seen.script("return document.documentElement.dataset.plots") == "none"
+        assert "newer browser" in seen.script("return document.getElementById('notice').innerText")
+    finally:
+        browser.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", {"identifier": old["identifier"]})
