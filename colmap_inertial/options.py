@@ -105,6 +105,27 @@ class DenseOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
+class FrameOptions:
+    """Which frames are used."""
+
+    use: Literal["auto", "all"] | None = None
+    """auto: as many as the motion needs, each the least blurred around. Default: auto for a video, all pictures of a
+    folder."""
+    min_fps: float = 4.0
+    """At least so many frames a second, while the picture moves. The scale's error does not grow down to 4; at 2 it
+    doubles, at 1 it is three times as large."""
+    max_fps: float = 10.0
+    """At most so many frames a second."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.min_fps <= self.max_fps:
+            raise ValueError(
+                f"frames.min_fps must be above 0 and not above frames.max_fps, not {self.min_fps:g} and "
+                f"{self.max_fps:g}"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
 class ProjectOptions:
     """An existing COLMAP project in place of a capture: the recording that ran along, and when images were taken."""
 
@@ -138,6 +159,8 @@ class ProjectOptions:
 class ReconstructOptions:
     """Everything that decides the result of a reconstruction, beside the capture itself."""
 
+    frames: FrameOptions = field(default_factory=FrameOptions)
+    """Which frames are used."""
     deblur: DeblurMethod | None = None
     """Undo motion blur by the gyroscope before COLMAP sees a frame. Default: wiener, where exposure times are known
     and the pictures bear the gyroscope out."""
@@ -165,3 +188,29 @@ class ReconstructOptions:
     def __post_init__(self) -> None:
         if not 0 <= self.seed < 2**31:
             raise ValueError(f"seed must be from 0 to 2147483647, not {self.seed}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ApertureOptions:
+    """How the pictures of a multi-aperture camera are fused."""
+
+    cost: Literal["census", "mutual-information"] = "census"
+    """What pixels of different colour are compared by: the order of brightness around them, or how their brightness
+    goes together over the whole picture."""
+    disparity_px: tuple[float, float] | None = None
+    """Least and largest shift between the reference and its partner to search, in pixels, below zero for what lies
+    behind infinity (default: found for each exposure in a smaller picture)."""
+    step_px: float = 0.5
+    """Spacing of the shifts that are tried; between them a parabola is fitted."""
+    use_luminance: bool = True
+    """Let an aperture without colour filter lend its lower noise to the colours."""
+    threads: int | None = None
+    """Threads for one exposure; as many as the process may use where absent."""
+
+    def __post_init__(self) -> None:
+        if self.disparity_px is not None and not self.disparity_px[0] < self.disparity_px[1]:
+            raise ValueError(f"disparity_px: must be a lower and a higher limit, not {self.disparity_px}")
+        if not 0.1 <= self.step_px <= 2:
+            raise ValueError(f"step_px must be from 0.1 to 2, not {self.step_px:g}")
+        if self.threads is not None and self.threads < 1:
+            raise ValueError(f"threads must be at least 1, not {self.threads}")

@@ -9,6 +9,7 @@ specific force: at rest the accelerometer reads +9.8 m/s2 away from the ground.
 from __future__ import annotations
 
 from colmap_inertial.types._checks import Array
+from colmap_inertial.types.apertures import Aperture, ApertureRig, SpectralRole
 from colmap_inertial.types.estimated import (
     CALIBRATION_PARAMETERS,
     DOWN_IN_WORLD,
@@ -36,6 +37,8 @@ from colmap_inertial.types.recorded import (
 __all__ = [
     "CALIBRATION_PARAMETERS",
     "DOWN_IN_WORLD",
+    "Aperture",
+    "ApertureRig",
     "Array",
     "CameraImuCalibration",
     "CameraModel",
@@ -52,6 +55,7 @@ __all__ = [
     "ScaleEstimate",
     "Similarity",
     "SmoothedTrajectory",
+    "SpectralRole",
     "Verdict",
     "clock_shift_s",
 ]
