@@ -1,7 +1,8 @@
-"""Motion blur of every pixel from the gyroscope alone."""
+"""Motion blur of every pixel from the gyroscope, and where it is known from the camera's translation."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
+from colmap_inertial.imaging.parallax import Parallax
 from colmap_inertial.types import Array, FrameTiming, Projector
 
 #: Nodes at which the blur of a frame is predicted, and frames predicted together.
@@ -17,13 +19,21 @@ _PREDICTED_COLUMNS, _PREDICTED_ROWS, _CHUNK = 7, 5, 512
 _LEAST_STRETCH = 0.2
 
 
-def blur_field(motion: GyroCamera, camera: Projector, shutter: FrameShutter, *, step_px: int = 16) -> BlurField:
-    """The segment that each pixel of a frame smears along, by the camera's rotation during the exposure of its line.
+def blur_field(
+    motion: GyroCamera,
+    camera: Projector,
+    shutter: FrameShutter,
+    *,
+    parallax: Parallax | None = None,
+    step_px: int = 16,
+) -> BlurField:
+    """The segment that each pixel of a frame smears along, by the camera's motion during the exposure of its line.
 
-    A pixel x of a line exposed around t_m sees, at time t, what it sees at t_m at ``project(R(t_m)' R(t) ray(x))``.
-    The vector is the difference of that between the end and the beginning of the exposure. The lines of a rolling
-    shutter see that content at times of their own; with the shutter's speed d (seconds per pixel, along y) the vector
-    b becomes ``b / (1 + b_y d / exposure)``.
+    A pixel x of a line exposed around t_m sees, at time t, what it sees at t_m at
+    ``project(R(t_m)' R(t) ray(x) + (t - t_m) v / z(x))``, with velocity v and depth z. The vector is the difference of
+    that between the end and the beginning of the exposure. The lines of a rolling shutter see that content at times of
+    their own; with the shutter's speed d (seconds per pixel, along y) the vector b becomes
+    ``b / (1 + b_y d / exposure)``.
 
     Parameters
     ----------
@@ -33,6 +43,8 @@ def blur_field(motion: GyroCamera, camera: Projector, shutter: FrameShutter, *, 
         Intrinsics with distortion (``pycolmap.Camera`` is one), COLMAP's pixel coordinates.
     shutter
         When the lines of this frame are exposed.
+    parallax
+        Velocity and depths; without it, the camera only turns.
     step_px
         Distance of the field's nodes. At 16 px the field errs by some thousandths of a pixel between them.
 
@@ -47,7 +59,8 @@ def blur_field(motion: GyroCamera, camera: Projector, shutter: FrameShutter, *, 
         raise NotObservableError("motion blur", _NOT_COVERED)
     rows, columns = BlurField.nodes(shutter.width, shutter.height, step_px)
     x, y = step_px * np.arange(float(columns)) + 0.5, step_px * np.arange(float(rows)) + 0.5
-    vectors = _vectors(motion, camera, shutter, np.array([shutter.t_s]), np.array([shutter.exposure_s]), x, y)[0]
+    rates = None if parallax is None else parallax.rate_at(x, y)[None]
+    vectors = _vectors(motion, camera, shutter, np.array([shutter.t_s]), np.array([shutter.exposure_s]), x, y, rates)[0]
     return BlurField(
         width=shutter.width, height=shutter.height, vector_px=_filled(vectors).astype(np.float32), step_px=step_px
     )
@@ -73,9 +86,15 @@ class PredictedBlur:
 
 
 def predicted_blur_px(
-    motion: GyroCamera, camera: Projector, timing: FrameTiming, *, width: int, height: int
+    motion: GyroCamera,
+    camera: Projector,
+    timing: FrameTiming,
+    *,
+    width: int,
+    height: int,
+    parallaxes: Mapping[str, Parallax] | None = None,
 ) -> PredictedBlur:
-    """The blur of every frame from the gyroscope alone: to rank frames, and to choose what is deblurred.
+    """The blur of every frame before it is decoded: to rank frames, and to choose what is deblurred.
 
     Parameters
     ----------
@@ -87,7 +106,10 @@ def predicted_blur_px(
         Of all frames.
     width, height
         Size of the images.
+    parallaxes
+        By frame name, where they are known.
     """
+    parallaxes = parallaxes or {}
     count = len(timing.t_s)
     px, reasons = np.full(count, np.nan), [_NO_EXPOSURE] * count
     if timing.exposure_s is not None:
@@ -100,7 +122,11 @@ def predicted_blur_px(
         for part in np.split(known, range(_CHUNK, len(known), _CHUNK)):
             if len(part):
                 shutter = FrameShutter.of(timing, int(part[0]), width=width, height=height)
-                vectors = _vectors(motion, camera, shutter, timing.t_s[part], timing.exposure_s[part], x, y)
+                rates = np.zeros((len(part), len(y), len(x), 3))
+                for rate, i in zip(rates, part, strict=True):
+                    if timing.names[i] in parallaxes:
+                        rate[:] = parallaxes[timing.names[i]].rate_at(x, y)
+                vectors = _vectors(motion, camera, shutter, timing.t_s[part], timing.exposure_s[part], x, y, rates)
                 lengths = np.hypot(vectors[..., 0], vectors[..., 1]).reshape(len(part), -1)
                 px[part] = np.nanpercentile(lengths, 90, axis=1)
     return PredictedBlur(names=timing.names, px=px, reasons=tuple(reasons))
@@ -114,9 +140,19 @@ _NOT_COVERED = "the gyroscope does not cover the exposure of this frame, or paus
 
 
 def _vectors(
-    motion: GyroCamera, camera: Projector, shutter: FrameShutter, t_s: Array, exposure_s: Array, x: Array, y: Array
+    motion: GyroCamera,
+    camera: Projector,
+    shutter: FrameShutter,
+    t_s: Array,
+    exposure_s: Array,
+    x: Array,
+    y: Array,
+    rates: Array | None,
 ) -> Array:
-    """(F, len(y), len(x), 2) blur vectors of F frames that have ``shutter``'s readout, at the nodes of a grid."""
+    """(F, len(y), len(x), 2) blur vectors of F frames that have ``shutter``'s readout, at the nodes of a grid.
+
+    ``rates``: (F, len(y), len(x), 3) velocity times inverse depth, 1/s.
+    """
     nodes = np.stack(np.meshgrid(x, y), axis=-1)
     rays = np.asarray(camera.cam_from_img(nodes.reshape(-1, 2)))[:, :2].reshape(nodes.shape)
     rays = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=-1)
@@ -132,6 +168,8 @@ def _vectors(
     for sign in (-1, 1):
         turn = middle @ motion.start_from_cam(middle_s + sign * half_s)
         seen = np.einsum("fxij,yxj->fyxi" if by_column else "fyij,yxj->fyxi", turn, rays)
+        if rates is not None:
+            seen = seen + sign * half_s[:, None, :, None] * rates
         ends.append(np.asarray(camera.img_from_cam(seen.reshape(-1, 3))).reshape(*seen.shape[:3], 2))
     vector = ends[1] - ends[0]
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -8,11 +8,13 @@ that only turns), the followed pixels serve; in a video they also tell whether i
 from __future__ import annotations
 
 import itertools
+import logging
 import math
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,7 +27,7 @@ from colmap_inertial.io.images import read_image
 from colmap_inertial.model import colmap_camera, find_models, read_model, trajectory_from_model
 from colmap_inertial.options import MappingOptions
 from colmap_inertial.pipeline.colmap import Progress, extract_features, image_pairs, map_images, match_features
-from colmap_inertial.pipeline.frames import encode_image
+from colmap_inertial.pipeline.frames import FrameStage, encode_image
 from colmap_inertial.pipeline.stages import GyroView, RollingShutterStage
 from colmap_inertial.threads import one_blas_thread
 from colmap_inertial.types import (
@@ -36,6 +38,11 @@ from colmap_inertial.types import (
     FrameTiming,
     ImuRecording,
 )
+
+if TYPE_CHECKING:
+    import pycolmap
+
+log = logging.getLogger(__name__)
 
 #: Frames of the small model: at most so many, at least so far apart; and how COLMAP makes it.
 _MODEL_FRAMES, _MODEL_SPACING_S = 60, 0.24
@@ -52,6 +59,23 @@ _USABLE_ROTATION_RAD, _USABLE_OFFSET_S = 0.1, 0.01
 _SIGNIFICANT, _FAST_CLOCK = 5.0, 3e-4
 #: COLMAP's guess of a focal length, in longer sides of the image.
 _GUESSED_FOCAL = 1.2
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FirstLook:
+    """What there is before the reconstruction.
+
+    Attributes
+    ----------
+    view
+        Gyroscope, camera and times, brought together.
+    models
+        COLMAP's models of frames all along the recording, of keypoints without the rolling shutter; empty where none
+        were needed.
+    """
+
+    view: GyroView
+    models: tuple[pycolmap.Reconstruction, ...] = ()
 
 
 def some_frames(capture: Capture, timing: FrameTiming, indices: Sequence[int]) -> Iterator[Frame]:
@@ -90,7 +114,7 @@ def look_first(
     num_threads: int,
     seed: int,
     progress: Progress,
-) -> GyroView:
+) -> FirstLook:
     """Find the calibration that the treatment of frames needs.
 
     Parameters
@@ -120,11 +144,12 @@ def look_first(
     declared = rotation_rad <= _GOOD_ROTATION_RAD and offset_s <= _GOOD_OFFSET_S
     rotation = _followed(capture, timing, camera, progress) if is_video else None
     found: GyroView | NotObservableError
+    models: tuple[pycolmap.Reconstruction, ...] = ()
     if declared:
         notes = () if capture.camera is not None else (f"the focal length was guessed: {camera.params[0]:.0f} px",)
         found = GyroView(imu=imu, timing=timing, calibration=prior, camera=camera, source="capture", notes=notes)
     else:
-        found = _by_model(capture, imu, timing, prior, options, scratch, num_threads, seed, progress)
+        found, models = _by_model(capture, imu, timing, prior, options, scratch, num_threads, seed, progress)
         if isinstance(found, NotObservableError):
             rotation = rotation or _followed(capture, timing, camera, progress)
             found = _by_pixels(rotation, imu, timing, prior, options, camera, found)
@@ -139,6 +164,53 @@ def look_first(
                 raise NotObservableError("the pixels' motion", agreement.reason)
     if isinstance(found, NotObservableError):
         raise found
+    return FirstLook(view=found, models=models)
+
+
+def survey(
+    capture: Capture,
+    view: GyroView,
+    stages: Sequence[FrameStage],
+    *,
+    scratch: Path,
+    num_threads: int,
+    seed: int,
+    progress: Progress,
+) -> tuple[pycolmap.Reconstruction, ...]:
+    """COLMAP's small models of frames all along a recording; empty where it makes none.
+
+    Parameters
+    ----------
+    capture
+        The recording.
+    view
+        By which keypoints are rectified.
+    stages
+        That the frames go through.
+    scratch
+        A folder for temporary files.
+    num_threads, seed
+        Of COLMAP.
+    progress
+        Called with ``"survey"``.
+    """
+    names = [view.timing.names[i] for i in _spaced(view.timing, _MODEL_SPACING_S)]
+    steps = itertools.count()
+
+    def step(stage: str, done: int, total: int, /) -> None:
+        progress("survey", min(next(steps), 10 * len(names)), 10 * len(names))
+
+    with tempfile.TemporaryDirectory(dir=scratch) as folder:
+        work = Path(folder)
+        images = _picture_folder(capture, view.timing, names, work, stages)
+        try:
+            found = _small_models(
+                capture, images, names, work / "0", view, num_threads=num_threads, seed=seed, progress=step
+            )
+        except (MappingError, FormatError) as error:
+            log.info("no survey: %s", error)
+            found = ()
+    progress("survey", 1, 1)
     return found
 
 
@@ -150,12 +222,17 @@ def _sigmas(calibration: CameraImuCalibration) -> tuple[float, float]:
 
 def _middle(timing: FrameTiming, spacing_s: float, most: int) -> list[int]:
     """Frames from the middle of a recording, not closer together than asked for."""
+    kept = _spaced(timing, spacing_s)
+    first = max(0, (len(kept) - most) // 2)
+    return kept[first : first + most]
+
+
+def _spaced(timing: FrameTiming, spacing_s: float) -> list[int]:
     kept = [0]
     for i, t_s in enumerate(timing.t_s.tolist()):
         if t_s - timing.t_s[kept[-1]] >= spacing_s:
             kept.append(i)
-    first = max(0, (len(kept) - most) // 2)
-    return kept[first : first + most]
+    return kept
 
 
 def _followed(capture: Capture, timing: FrameTiming, camera: CameraModel, progress: Progress) -> VisualRotation:
@@ -227,9 +304,13 @@ def _by_model(
     num_threads: int,
     seed: int,
     progress: Progress,
-) -> GyroView | NotObservableError:
-    """The calibration by a small model; with a rolling shutter, by a second one of rectified keypoints."""
+) -> tuple[GyroView | NotObservableError, tuple[pycolmap.Reconstruction, ...]]:
+    """The calibration by a small model; with a rolling shutter, by a second one of rectified keypoints.
+
+    Also the models, where they are of all the recording.
+    """
     indices = _middle(timing, _MODEL_SPACING_S, _MODEL_FRAMES)
+    whole = len(indices) == len(_spaced(timing, _MODEL_SPACING_S))
     names = [timing.names[i] for i in indices]
     rounds = 2 if timing.readout_s else 1
     steps = itertools.count()
@@ -237,32 +318,47 @@ def _by_model(
     def step(stage: str, done: int, total: int, /) -> None:
         progress("calibration", min(next(steps), 10 * len(names) * rounds), 10 * len(names) * rounds)
 
+    models: tuple[pycolmap.Reconstruction, ...] = ()
     with tempfile.TemporaryDirectory(dir=scratch) as folder:
         work = Path(folder)
-        images = frame_source(capture)
-        if images is None:
-            images = work / "images"
-            images.mkdir()
-            for frame in some_frames(capture, timing, indices):
-                encode_image(images / frame.name, frame.image)
+        images = _picture_folder(capture, timing, names, work)
         view: GyroView | None = None
         try:
             for i in range(rounds):
-                model, camera = _small_model(
+                models = _small_models(
                     capture, images, names, work / str(i), view, num_threads=num_threads, seed=seed, progress=step
                 )
-                trajectory, _ = trajectory_from_model(read_model(model), timing)
-                view = _aligned(trajectory, imu, timing, prior, options, camera, "model")
+                trajectory, _ = trajectory_from_model(models[0], timing)
+                view = _aligned(trajectory, imu, timing, prior, options, _camera_of(models[0]), "model")
         except (MappingError, FormatError) as error:
-            return view or NotObservableError("camera-IMU calibration", str(error))
+            return view or NotObservableError("camera-IMU calibration", str(error)), ()
         except NotObservableError as error:
-            return view or error
+            return view or error, ()
     assert view is not None
     progress("calibration", 1, 1)
-    return view
+    return view, models if whole else ()
 
 
-def _small_model(
+def _picture_folder(
+    capture: Capture, timing: FrameTiming, names: Sequence[str], work: Path, stages: Sequence[FrameStage] = ()
+) -> Path:
+    """Where some frames are as pictures: with the capture, or written to a folder of work."""
+    images = frame_source(capture)
+    if images is not None and not stages:
+        return images
+    images = work / "images"
+    place = {name: i for i, name in enumerate(timing.names)}
+    frames = some_frames(capture, timing, [place[name] for name in names])
+    for stage in stages:
+        frames = stage(frames)
+    for frame in frames:
+        target = images / frame.name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        encode_image(target, frame.image)
+    return images
+
+
+def _small_models(
     capture: Capture,
     images: Path,
     names: Sequence[str],
@@ -272,8 +368,8 @@ def _small_model(
     num_threads: int,
     seed: int,
     progress: Progress,
-) -> tuple[Path, CameraModel]:
-    """COLMAP's largest model of some frames and its camera; with a view, of rectified keypoints."""
+) -> tuple[pycolmap.Reconstruction, ...]:
+    """COLMAP's models of some frames, the largest first; with a view, of rectified keypoints."""
     work.mkdir()
     features, database, sparse = work / "features.db", work / "database.db", work / "sparse"
     cameras = {name: capture.camera for name in names}
@@ -294,7 +390,11 @@ def _small_model(
         seed=seed,
         progress=progress,
     )
-    largest = max(find_models(sparse).values(), key=lambda folder: read_model(folder).num_reg_images())
-    used = next(iter(read_model(largest).cameras.values()))
+    models = [read_model(folder) for folder in find_models(sparse).values()]
+    return tuple(sorted(models, key=lambda model: -int(model.num_reg_images())))
+
+
+def _camera_of(model: pycolmap.Reconstruction) -> CameraModel:
+    used = next(iter(model.cameras.values()))
     params = tuple(float(value) for value in used.params)
-    return largest, CameraModel(model=used.model.name, width=used.width, height=used.height, params=params)
+    return CameraModel(model=used.model.name, width=used.width, height=used.height, params=params)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +20,7 @@ from colmap_inertial.imaging.gate import (
     decide,
     judge_recording,
 )
+from colmap_inertial.imaging.parallax import Parallax
 from colmap_inertial.imaging.psf import blur_field, predicted_blur_px
 from colmap_inertial.imaging.rolling_shutter import rectify_image
 from colmap_inertial.io.calibration import SHARED_CLOCK_OFFSET_S, SMALLEST_READOUT_S
@@ -30,15 +31,18 @@ from colmap_inertial.io.images import read_image
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.options import DeblurMethod, RollingShutterMethod
 from colmap_inertial.pipeline.colmap import Progress
-from colmap_inertial.pipeline.first_look import guessed_camera, look_first, some_frames
+from colmap_inertial.pipeline.first_look import guessed_camera, look_first, some_frames, survey
 from colmap_inertial.pipeline.frames import FrameRecord, encode_image
 from colmap_inertial.pipeline.metadata import stated_exposures_s
+from colmap_inertial.pipeline.passing import find_parallaxes
 from colmap_inertial.pipeline.stages import DeblurStage, GyroView, RollingShutterStage
 from colmap_inertial.pipeline.workspace import a_record_of_ours
 from colmap_inertial.types import CALIBRATION_PARAMETERS, CameraImuCalibration, CameraModel, FrameTiming, ImuRecording
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
+
+    import pycolmap
 
 
 #: Blur below this cannot be told from the texture: where no frame has more, nothing is deblurred.
@@ -50,6 +54,8 @@ _CLEAR_SUPPORT = 7.0
 #: Share of the readout that acts on poses after rectification.
 _LEFT_SHARE = 0.1
 _READOUT = CALIBRATION_PARAMETERS.index("readout_s")
+#: How often small models are made, at most, for more of the blurred frames.
+_SURVEYS = 4
 #: Frames by which the gyroscope is judged.
 _JUDGED_FRAMES = 14
 
@@ -66,6 +72,8 @@ class ImagingPlan:
         Gyroscope, camera and times; ``None`` where nothing is to be done.
     deblur
         Decisions and verdict for :class:`DeblurStage`; ``None`` where no frame is to be deblurred.
+    parallaxes
+        By frame name, where the camera's translation is known to blur.
     rectify
         Whether the rolling shutter is undone.
     deblur_note, rolling_shutter_note
@@ -74,6 +82,7 @@ class ImagingPlan:
 
     view: GyroView | None = None
     deblur: tuple[tuple[FrameDecision, ...], RecordingVerdict] | None = None
+    parallaxes: Mapping[str, Parallax] = field(default_factory=dict)
     rectify: bool = False
     deblur_note: str = ""
     rolling_shutter_note: str = ""
@@ -84,7 +93,10 @@ class ImagingPlan:
             return []
         decisions, verdict = self.deblur
         gate = GateOptions() if verdict.trusted else GateOptions(min_support=_CLEAR_SUPPORT)
-        return [DeblurStage(view=self.view, decisions=decisions, verdict=verdict, gate=gate, drop=drop)]
+        stage = DeblurStage(
+            view=self.view, decisions=decisions, verdict=verdict, parallaxes=self.parallaxes, gate=gate, drop=drop
+        )
+        return [stage]
 
     def keypoint_stages(self) -> list[RollingShutterStage]:
         """The default keypoint stages."""
@@ -109,6 +121,7 @@ class ImagingPlan:
             "camera": None if view is None else asdict(view.camera),
             "verdict": None if self.deblur is None else asdict(self.deblur[1]),
             "decisions": None if self.deblur is None else [asdict(decision) for decision in self.deblur[0]],
+            "parallaxes": {name: parallax.as_json() for name, parallax in self.parallaxes.items()},
         }
 
 
@@ -142,6 +155,7 @@ def read_plan(path: Path, imu: ImuRecording, timing: FrameTiming) -> ImagingPlan
         return ImagingPlan(
             view=view,
             deblur=deblur,
+            parallaxes={name: Parallax.from_json(parallax) for name, parallax in values["parallaxes"].items()},
             rectify=values["rectify"],
             deblur_note=values["deblur"],
             rolling_shutter_note=values["rolling_shutter"],
@@ -188,7 +202,7 @@ def plan_imaging(
     num_threads, seed
         Of COLMAP.
     progress
-        Called with ``"motion"``, ``"calibration"`` and ``"blur"``.
+        Called with ``"motion"``, ``"calibration"``, ``"survey"`` and ``"blur"``.
 
     Raises
     ------
@@ -214,7 +228,7 @@ def plan_imaging(
     if max_offset_s is None and capture.shared_clock:
         max_offset_s = SHARED_CLOCK_OFFSET_S
     try:
-        view = look_first(
+        look = look_first(
             capture,
             imu,
             timing,
@@ -234,8 +248,19 @@ def plan_imaging(
             deblur_note=why_not or untreated,
             rolling_shutter_note=untreated if plan.rectify else plan.rolling_shutter_note,
         )
-    plan = replace(plan, view=view)
-    return plan if why_not else _with_decisions(plan, view, capture, progress)
+    plan = replace(plan, view=look.view)
+    if why_not:
+        return plan
+
+    def models(plan: ImagingPlan | None) -> tuple[pycolmap.Reconstruction, ...]:
+        if plan is None and look.models:
+            return look.models
+        stages = [] if plan is None else plan.frame_stages(drop=False)
+        return survey(
+            capture, look.view, stages, scratch=scratch, num_threads=num_threads, seed=seed, progress=progress
+        )
+
+    return _deblurring(plan, look.view, capture, models, progress)
 
 
 def _shutter_note(timing: FrameTiming) -> str:
@@ -262,26 +287,74 @@ def _no_deblurring(capture: Capture, imu: ImuRecording, timing: FrameTiming) -> 
     return ""
 
 
-def _with_decisions(plan: ImagingPlan, view: GyroView, capture: Capture, progress: Progress) -> ImagingPlan:
+def _deblurring(
+    plan: ImagingPlan,
+    view: GyroView,
+    capture: Capture,
+    models: Callable[[ImagingPlan | None], tuple[pycolmap.Reconstruction, ...]],
+    progress: Progress,
+) -> ImagingPlan:
+    """The plan with what is to be deblurred, by the gyroscope and by what small models tell of the translation.
+
+    ``models`` makes them of the frames as filmed, or as a plan has them. Where frames were too blurred for a model,
+    those around them, and the IMU beyond, tell how to deblur them for the next one.
+    """
+    calibration = for_rectified(view.calibration) if plan.rectify else view.calibration
+    if not _blurred(_decisions(view, {})):
+        return _decided(plan, view, capture, {}, progress)
+    found = models(None)
+    for _ in range(_SURVEYS):
+        parallaxes = find_parallaxes(found, view, calibration)
+        decided = _decided(plan, view, capture, parallaxes, progress)
+        lost = {d.name for d in _decisions(view, parallaxes) if d.action == "deblur"} - _registered(found)
+        if not parallaxes or not lost or not decided.frame_stages():
+            break
+        again = models(decided)
+        if len(_registered(again)) <= len(_registered(found)):
+            break
+        found = again
+    return decided
+
+
+def _registered(models: Sequence[pycolmap.Reconstruction]) -> set[str]:
+    return {model.image(i).name for model in models for i in model.reg_image_ids()}
+
+
+def _decisions(view: GyroView, parallaxes: Mapping[str, Parallax]) -> tuple[FrameDecision, ...]:
+    """What to do with each frame, before any is looked at."""
     width, height = view.camera.width, view.camera.height
     motion, camera = view.motion(), colmap_camera(view.camera)
-    predicted = predicted_blur_px(motion, camera, view.timing, width=width, height=height)
-    decisions = _keeping_ends(decide(predicted, view.timing.t_s, width=width, height=height, motion=motion))
-    index = view.index()
-    blurred = sorted((d for d in decisions if d.action == "deblur"), key=lambda d: -(d.blur_px or 0))
-    chosen = [d for d in blurred if (d.blur_px or 0) >= _TELLING_PX][:_JUDGED_FRAMES]
+    predicted = predicted_blur_px(motion, camera, view.timing, width=width, height=height, parallaxes=parallaxes)
+    return _keeping_ends(decide(predicted, view.timing.t_s, width=width, height=height, motion=motion))
+
+
+def _blurred(decisions: Sequence[FrameDecision]) -> list[FrameDecision]:
+    """The frames by which to judge, the most blurred first."""
+    telling = [d for d in decisions if d.action == "deblur" and (d.blur_px or 0) >= _TELLING_PX]
+    return sorted(telling, key=lambda d: -(d.blur_px or 0))[:_JUDGED_FRAMES]
+
+
+def _decided(
+    plan: ImagingPlan, view: GyroView, capture: Capture, parallaxes: Mapping[str, Parallax], progress: Progress
+) -> ImagingPlan:
+    decisions = _decisions(view, parallaxes)
+    chosen = _blurred(decisions)
     if not chosen:
-        known = predicted.px[np.isfinite(predicted.px)]
-        most = f"{known.max():.1f} px" if len(known) else "nothing"
+        known = [d.blur_px for d in decisions if d.blur_px is not None]
+        most = f"{max(known):.1f} px" if known else "nothing"
         return replace(plan, deblur_note=f"frames stay as they were filmed: the gyroscope predicts {most} of blur")
+    motion, camera, index = view.motion(), colmap_camera(view.camera), view.index()
     evidence: list[BlurEvidence] = []
     for frame in some_frames(capture, view.timing, [index[d.name] for d in chosen]):
         progress("blur", len(evidence), len(chosen))
-        evidence.append(blur_evidence(frame.image, blur_field(motion, camera, view.shutter(index[frame.name]))))
+        blur = blur_field(motion, camera, view.shutter(index[frame.name]), parallax=parallaxes.get(frame.name))
+        evidence.append(blur_evidence(frame.image, blur))
     progress("blur", len(chosen), len(chosen))
     verdict = _by_frame(judge_recording(evidence), evidence, [d.blur_px or 0.0 for d in chosen])
     note = f"{sum(d.action == 'deblur' for d in decisions)} of {len(decisions)} frames are blurred; {verdict.reason}"
-    return replace(plan, deblur=(decisions, verdict), deblur_note=note)
+    if parallaxes:
+        note += f"; the camera's translation is counted in for {len(parallaxes)} frames"
+    return replace(plan, deblur=(decisions, verdict), parallaxes=parallaxes, deblur_note=note)
 
 
 def _keeping_ends(decisions: tuple[FrameDecision, ...]) -> tuple[FrameDecision, ...]:

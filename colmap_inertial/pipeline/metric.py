@@ -78,9 +78,17 @@ class MetricStage:
 
 
 def smoothed_path(
-    trajectory: CameraTrajectory, imu: ImuRecording, estimate: ScaleEstimate, gravity_in_world_m_s2: Array
+    trajectory: CameraTrajectory,
+    imu: ImuRecording,
+    estimate: ScaleEstimate,
+    gravity_in_world_m_s2: Array,
+    *,
+    also_at_s: Array | None = None,
 ) -> SmoothedTrajectory:
-    """Smooth a metric path with what the scale estimate says of the IMU; gravity in the path's world."""
+    """Smooth a metric path with what the scale estimate says of the IMU; gravity in the path's world.
+
+    ``also_at_s``: instants without a pose, as in :func:`~colmap_inertial.smooth.smooth_trajectory`.
+    """
     if estimate.calibration is None:
         raise ValueError("a refused scale says nothing of the IMU")
     if estimate.clock_rate != 0:
@@ -97,6 +105,7 @@ def smoothed_path(
         estimate.calibration,
         gravity_in_world_m_s2=gravity_in_world_m_s2,
         accel_bias_m_s2=estimate.accel_bias_m_s2,
+        also_at_s=also_at_s,
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -15,6 +15,7 @@ from colmap_inertial.align import on_camera_rate
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.imaging.gate import FrameDecision, GateOptions, RecordingVerdict, deblur_gated
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
+from colmap_inertial.imaging.parallax import Parallax
 from colmap_inertial.imaging.psf import blur_field
 from colmap_inertial.imaging.rolling_shutter import rectify_keypoints
 from colmap_inertial.imaging.wiener import LONGEST_PX, DeblurOptions, deblur
@@ -97,6 +98,8 @@ class DeblurStage:
         What to do with each frame, by the gyroscope alone (``imaging.gate.decide``).
     verdict
         What some of the frames say about the gyroscope together (``imaging.gate.judge_recording``).
+    parallaxes
+        By frame name, where the camera's translation is known to blur.
     gate
         Thresholds.
     drop
@@ -108,6 +111,7 @@ class DeblurStage:
     view: GyroView
     decisions: tuple[FrameDecision, ...]
     verdict: RecordingVerdict
+    parallaxes: Mapping[str, Parallax] = field(default_factory=dict)
     gate: GateOptions = field(default_factory=GateOptions)
     drop: bool = True
     workers: int | None = field(default=None, compare=False)
@@ -163,7 +167,7 @@ class DeblurStage:
         if decision.action == "drop":
             return (None if self.drop and self.verdict.trusted else frame), said
         try:
-            blur = blur_field(motion, camera, shutter)
+            blur = blur_field(motion, camera, shutter, parallax=self.parallaxes.get(frame.name))
         except NotObservableError as error:
             return frame, replace(said, reason=error.hint)
         if float(np.abs(blur.vector_px).max()) * 1.5 > LONGEST_PX:

@@ -33,6 +33,8 @@ _USUAL, _SPREAD = np.array([3e-3, 3e-3, 1e-2, 1e-2]), 4.0
 _MOTION_S = 0.2
 #: Gain and misalignment of IMUs, by their data sheets: motion too quick for the camera is wrong by this much of it.
 _GAIN_SIGMA = 0.01
+#: An instant this close to a pose is that of the pose.
+_SAME_S = 1e-6
 #: Variance (m2) that frees a pose or a transition; how far an odd pose makes its neighbours look odd.
 _FREE, _REACH_S, _ROUNDS, _MOST_ODD = 1e4, 0.5, 5, 0.1
 
@@ -45,6 +47,7 @@ def smooth_trajectory(
     *,
     gravity_in_world_m_s2: Array,
     accel_bias_m_s2: Array | None = None,
+    also_at_s: Array | None = None,
     options: SmoothOptions | None = None,
 ) -> SmoothedTrajectory:
     """Smooth a metric camera path with the IMU that filmed along.
@@ -66,12 +69,16 @@ def smooth_trajectory(
         (3,) points down, in the trajectory's world.
     accel_bias_m_s2
         (3,) IMU frame; zero if not given.
+    also_at_s
+        Instants without a pose, camera clock: between poses and beyond them the IMU goes on alone, and the covariance
+        grows. Instants that the IMU did not record are passed over.
     options
         When to leave a pose out.
 
     Returns
     -------
-    The camera's path at the frame times with its covariance (position, velocity, acceleration); smoothed orientations.
+    The camera's path at the frame times, and the others asked for, with its covariance (position, velocity,
+    acceleration); smoothed orientations.
 
     Raises
     ------
@@ -96,7 +103,7 @@ def smooth_trajectory(
     if silent.all():
         raise NotObservableError("smoothed trajectory", "the IMU recorded during none of the frame intervals")
 
-    world_from_imu, rate = attitude.at(t_s)
+    world_from_imu, _ = attitude.at(t_s)
     imu_from_cam = quat_conjugate(calibration.cam_from_imu_xyzw)
     lever = quat_rotate(imu_from_cam, calibration.imu_in_cam_m)  # from the camera to the IMU, IMU frame
     origin = trajectory.cam_in_world.mean(axis=0)
@@ -109,7 +116,11 @@ def smooth_trajectory(
         jumps=np.zeros(len(t_s) - 1, dtype=bool),
         motion_density=2 * _MOTION_S * felt.variance,
     )
-    chain = _without_oddities(model, options.outlier_chi2)
+    model, logs = _without_oddities(model, options.outlier_chi2)
+    if also_at_s is not None:
+        model = _with_instants(model, felt, also_at_s)
+    chain, t_s = model.chain(logs), model.t_s
+    world_from_imu, rate = attitude.at(t_s)
 
     states, cov = chain.states, chain.cov[:, :3, :3].copy()
     # acceleration of the IMU: the sample itself, and what was found to be missing
@@ -131,6 +142,23 @@ def smooth_trajectory(
         length_unit="m",
         epoch_ns=trajectory.epoch_ns,
     )
+
+
+def _with_instants(model: _Model, felt: Felt, also_at_s: Array) -> _Model:
+    """The model with states at instants that nothing was measured at."""
+    asked = np.unique(np.asarray(also_at_s, dtype=np.float64))
+    nearest = np.minimum(np.searchsorted(model.t_s, asked), len(model.t_s) - 1)
+    new = np.minimum(np.abs(model.t_s[nearest] - asked), np.abs(model.t_s[nearest - 1] - asked)) > _SAME_S
+    asked = asked[new & (asked > felt.t_s[0]) & (asked < felt.t_s[-1])]
+    t_s = np.concatenate([model.t_s, asked])
+    order = np.argsort(t_s)
+    t_s, posed = t_s[order], np.argsort(order)[: len(model.t_s)]
+    measured, left_out = np.zeros((len(t_s), 3)), np.ones(len(t_s), dtype=bool)
+    measured[posed], left_out[posed] = model.measured, model.left_out
+    jumps = np.zeros(len(t_s) - 1, dtype=bool)
+    jumps[posed[:-1]] = model.jumps
+    gained, silent = felt.sums(t_s), ~felt.covers(t_s)
+    return replace(model, t_s=t_s, measured=measured, gained=gained, silent=silent, left_out=left_out, jumps=jumps)
 
 
 def _rate_of_change(attitude: Attitude, t_s: Array, step_s: float) -> Array:
@@ -203,8 +231,8 @@ class _Model:
         )
 
 
-def _without_oddities(model: _Model, limit: float) -> Chain:
-    """The chain without the poses and with the jumps that contradict the rest."""
+def _without_oddities(model: _Model, limit: float) -> tuple[_Model, Array]:
+    """The model without the poses and with the jumps that contradict the rest, and its noise."""
     usual = 2 * np.log(_USUAL)
     logs = usual
     for attempt in range(_ROUNDS):
@@ -219,4 +247,4 @@ def _without_oddities(model: _Model, limit: float) -> Chain:
         if found == model.left_out.sum() + model.jumps.sum() or found > _MOST_ODD * len(model.t_s):
             break
         model = replace(model, left_out=left_out, jumps=jumps)
-    return chain
+    return model, logs

@@ -1,0 +1,150 @@
+"""What a camera's translation does to its picture: the part of the blur that no gyroscope feels.
+
+Close to things, a hand's translation blurs as much as its turning. It takes the camera's velocity and the depth of
+what it sees, from a model of some sort; the lengths' unit is of no matter, as only velocity by depth counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.types import Array, Projector
+
+#: Spacing of the nodes, as a share of the longer side: depths between a few hundred points tell no more.
+_STEP_SHARE = 1 / 24
+#: Points from which the depth at a node is averaged; with fewer in all, depths are not known.
+_NEIGHBOURS, _FEWEST = 6, 12
+#: Points beyond the border count, too, up to this share of the sides.
+_BEYOND = 0.1
+#: Depths below this share of the median one are of points that the camera is about to pass, or wrong.
+_NEAREST_SHARE = 0.1
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Parallax:
+    """How fast a camera moves past what one of its frames shows.
+
+    Attributes
+    ----------
+    width, height
+        Size of the image, px.
+    step_px
+        Distance of the nodes, which lie as those of a `BlurField`.
+    velocity_in_cam
+        (3,) of the camera at the instant that stands for the frame, units of length per second.
+    inverse_depth
+        (Gy, Gx) float32, per unit of length, along the optical axis.
+    """
+
+    width: int
+    height: int
+    step_px: int
+    velocity_in_cam: Array
+    inverse_depth: np.ndarray[tuple[int, int], np.dtype[np.float32]]
+
+    def __post_init__(self) -> None:
+        velocity = np.array(self.velocity_in_cam, dtype=np.float64)
+        inverse = np.array(self.inverse_depth, dtype=np.float32)
+        if velocity.shape != (3,) or not np.isfinite(velocity).all():
+            raise ValueError("velocity_in_cam: three finite numbers")
+        if inverse.shape != BlurField.nodes(self.width, self.height, self.step_px):
+            raise ValueError(f"inverse_depth: shape {inverse.shape} does not fit the image")
+        if not (np.isfinite(inverse).all() and (inverse >= 0).all()):
+            raise ValueError("inverse_depth: must be finite and not negative")
+        for name, value in (("velocity_in_cam", velocity), ("inverse_depth", inverse)):
+            value.setflags(write=False)
+            object.__setattr__(self, name, value)
+
+    def rate_at(self, x_px: Array, y_px: Array) -> Array:
+        """(len(y), len(x), 3) velocity times inverse depth at a grid of image points (COLMAP's coordinates), 1/s."""
+        (i, s), (j, t) = (
+            _place(coordinate, self.step_px, size)
+            for coordinate, size in zip((y_px, x_px), self.inverse_depth.shape, strict=True)
+        )
+        s = s[:, None]
+        upper = self.inverse_depth[i][:, j] * (1 - t) + self.inverse_depth[i][:, j + 1] * t
+        lower = self.inverse_depth[i + 1][:, j] * (1 - t) + self.inverse_depth[i + 1][:, j + 1] * t
+        return np.asarray((upper * (1 - s) + lower * s)[..., None] * self.velocity_in_cam)
+
+    def as_json(self) -> dict[str, object]:
+        """In JSON types; the unit of length becomes the median depth, and four digits are kept."""
+        unit = float(np.median(self.inverse_depth)) or 1.0
+        return {
+            "width": self.width,
+            "height": self.height,
+            "step_px": self.step_px,
+            "velocity_in_cam": [float(f"{unit * v:.4g}") for v in self.velocity_in_cam],
+            "inverse_depth": [[float(f"{v / unit:.4g}") for v in row] for row in self.inverse_depth],
+        }
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> Parallax:
+        """What :meth:`as_json` made."""
+        return cls(**values)
+
+
+def _place(coordinate: Array, step_px: int, nodes: int) -> tuple[np.ndarray[tuple[int], np.dtype[np.intp]], Array]:
+    """The nodes before coordinates, and how far it is to the next ones."""
+    at = np.clip((np.asarray(coordinate) - 0.5) / step_px, 0, nodes - 1)
+    before = np.minimum(at.astype(np.intp), nodes - 2)
+    return before, at - before
+
+
+def parallax_from_points(
+    points_in_cam: Array, velocity_in_cam: Array, camera: Projector, *, width: int, height: int
+) -> Parallax | None:
+    """The parallax of a frame from points that it shows.
+
+    Parameters
+    ----------
+    points_in_cam
+        (N, 3) in the camera's frame at the instant that stands for the frame; points that are hidden do harm.
+    velocity_in_cam
+        (3,) of the camera then, the same unit of length per second.
+    camera
+        Intrinsics with distortion.
+    width, height
+        Size of the image, px.
+
+    Returns
+    -------
+    Inverse depths between the points are averaged from the nearest ones; ``None`` where the points are too few.
+    """
+    from scipy.spatial import cKDTree
+
+    points = np.asarray(points_in_cam, dtype=np.float64)
+    ahead = points[:, 2] > 0
+    if ahead.sum() < _FEWEST:
+        return None
+    points = points[ahead]
+    points = points[points[:, 2] > _NEAREST_SHARE * np.median(points[:, 2])]
+    xy = np.asarray(camera.img_from_cam(points))
+    margin = _BEYOND * np.array([width, height])
+    seen = (
+        np.isfinite(xy).all(axis=1) & (xy > -margin).all(axis=1) & (xy < np.array([width, height]) + margin).all(axis=1)
+    )
+    if seen.sum() < _FEWEST:
+        return None
+    xy, inverse = xy[seen], 1 / points[seen, 2]
+    step_px = max(1, round(_STEP_SHARE * max(width, height)))
+    rows, columns = BlurField.nodes(width, height, step_px)
+    nodes = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2) * step_px + 0.5
+    found: Any = cKDTree(xy).query(nodes, k=_NEIGHBOURS)
+    away, nearest = found
+    weight = 1 / (away**2 + (0.5 * step_px) ** 2)
+    smooth = (weight * inverse[nearest]).sum(axis=1) / weight.sum(axis=1)
+    return Parallax(
+        width=width,
+        height=height,
+        step_px=step_px,
+        velocity_in_cam=np.asarray(velocity_in_cam),
+        inverse_depth=smooth.reshape(rows, columns).astype(np.float32),
+    )
+
+
+__all__ = ["Parallax", "parallax_from_points"]
