@@ -80,6 +80,18 @@ class CornerScene:
             out[closer] = seen[closer]
         return out
 
+    def true_blur(self, i, xy):
+        """(N, 2) px that the content at (N, 2) points of a global-shutter picture moves by while it is exposed."""
+        shutter = self.shutter(i)
+        t_s = shutter.reference_s() + np.array([-0.5, 0.0, 0.5]) * self.exposure_s
+        rotation, centre = matrix_from_quat(self.motion.world_from_cam_xyzw(t_s)), self.motion.cam_in_world_m(t_s)
+        rays = np.column_stack([np.asarray(colmap_camera(LENS).cam_from_img(xy))[:, :2], np.ones(len(xy))])
+        direction = rays @ rotation[1].T
+        along = np.stack([(place - centre[1, axis]) / direction[:, axis] for axis, place in PLANES])
+        world = centre[1] + np.where(along > 0, along, np.inf).min(axis=0)[:, None] * direction
+        ends = [np.asarray(colmap_camera(LENS).img_from_cam((world - centre[k]) @ rotation[k])) for k in (0, 2)]
+        return ends[0] - ends[1]
+
     def centres(self):
         """(F, 3) true camera centres at the instants of the poses."""
         return self.motion.cam_in_world_m(np.array([self.shutter(i).reference_s() for i in range(self.frames)]))

@@ -14,10 +14,11 @@ from test_pipeline import contents
 
 from colmap_inertial.cli import main
 from colmap_inertial.errors import InertialError, NotObservableError, OutputExistsError
+from colmap_inertial.imaging.psf import blur_field
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.frames import read_frames
 from colmap_inertial.io.imu import read_capture_imu
-from colmap_inertial.model import read_model
+from colmap_inertial.model import colmap_camera, read_model
 from colmap_inertial.options import MappingOptions, ReconstructOptions
 from colmap_inertial.pipeline import prior_calibration, reconstruct, silent
 from colmap_inertial.pipeline.deblur import deblur_capture
@@ -196,16 +197,33 @@ def parts(capture):
     return loaded, read_capture_imu(loaded), timing, prior_calibration(loaded, QUICK)
 
 
-def test_the_plan_reads_back_and_the_stage_keeps_order_and_memory(tmp_path, blurred):
-    loaded, imu, timing, prior = parts(blurred)
-    plan = plan_imaging(
-        loaded, imu, timing, prior, deblur=None, rolling_shutter=None, scratch=tmp_path, progress=silent
-    )
+@pytest.fixture(scope="module")
+def plan(tmp_path_factory, blurred):
+    scratch = tmp_path_factory.mktemp("plan")
+    return plan_imaging(*parts(blurred), deblur=None, rolling_shutter=None, scratch=scratch, progress=silent)
+
+
+def test_blur_by_translation_is_known_to_a_fraction_of_a_pixel(scene, plan):
+    timing = plan.view.timing
+    assert set(plan.parallaxes) == set(timing.names) and "translation is counted in" in plan.deblur_note
+    motion, camera = plan.view.motion(), colmap_camera(plan.view.camera)
+    at = np.stack(np.meshgrid(np.arange(2, 24, 3), np.arange(2, 18, 3)), axis=-1).reshape(-1, 2)
+    off = {"turning": [], "both": []}
+    for i, name in enumerate(timing.names):
+        true = scene.true_blur(i, 16 * at + 0.5)
+        for kind, parallax in (("turning", None), ("both", plan.parallaxes[name])):
+            field = blur_field(motion, camera, plan.view.shutter(i), parallax=parallax)
+            off[kind].append(np.linalg.norm(field.vector_px[at[:, 1], at[:, 0]] - true, axis=1))
+    assert np.median(off["both"]) < 0.4 and np.median(off["both"]) < 0.15 * np.median(off["turning"])
+
+
+def test_the_plan_reads_back_and_the_stage_keeps_order_and_memory(tmp_path, blurred, plan):
+    loaded, imu, timing, _ = parts(blurred)
     write_plan(tmp_path / "plan.json", plan)
     again = read_plan(tmp_path / "plan.json", imu, timing)
     write_plan(tmp_path / "again.json", again)
     assert (tmp_path / "again.json").read_text() == (tmp_path / "plan.json").read_text()
-    assert again.deblur == plan.deblur
+    assert again.deblur == plan.deblur and set(again.parallaxes) == set(plan.parallaxes)
     (stage,) = plan.frame_stages()
     stage = replace(stage, workers=3)
     taken = []

@@ -376,6 +376,32 @@ def test_pauses_of_the_imu_and_frames_without_it_are_bridged():
     assert normalised(error[:, 3:6], smooth.cov[:, 3:6, 3:6]) < 2.5
 
 
+def test_between_and_beyond_poses_the_imu_tells_the_velocity_and_how_well():
+    ratios = []
+    for seed in range(4):
+        simulated = simulate_recording(RecordingOptions(motion=MotionOptions(duration_s=30.0)), seed=seed)
+        truth, whole = simulated.truth, metric(simulated, 12)
+        t_s = whole.t_s
+        lost = ((t_s > 10) & (t_s < 12)) | ((t_s > 20) & (t_s < 21)) | (t_s > 28.5)
+        kept = whole.select(np.flatnonzero(~lost))
+        given = {
+            "gravity_in_world_m_s2": truth.gravity_in_world_m_s2,
+            "accel_bias_m_s2": truth.accel_bias_m_s2,
+        }
+        plain = smooth_trajectory(kept, simulated.imu, truth.calibration, **given)
+        # asked for at all times: those of poses are not asked for twice, those beyond the IMU are passed over
+        asked = np.append(t_s, [t_s[-1] + 1e6])
+        dense = smooth_trajectory(kept, simulated.imu, truth.calibration, also_at_s=asked, **given)
+        np.testing.assert_array_equal(dense.t_s, t_s)
+        np.testing.assert_allclose(dense.velocity_in_world[~lost], plain.velocity_in_world, atol=2e-4)
+        np.testing.assert_allclose(dense.cam_in_world[~lost], plain.cam_in_world, atol=2e-4)
+        error, turned = errors(dense, simulated)
+        assert np.std(error[lost, 3:6]) < 0.06 and np.abs(turned[lost]).max() < 0.01
+        assert np.median(dense.cov[lost, 3, 3]) > np.median(dense.cov[~lost, 3, 3])
+        ratios.append(normalised(error[lost, 3:6], dense.cov[lost, 3:6, 3:6]))
+    assert 0.1 < np.mean(ratios) < 2.5
+
+
 def test_a_jump_of_the_poses_does_not_move_the_camera():
     simulated = simulate_recording(RecordingOptions(motion=MotionOptions(duration_s=20.0), imu=IDEAL_GAINS), seed=14)
     scale = simulated.truth.metres_per_unit
