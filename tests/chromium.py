@@ -136,7 +136,7 @@ class Page:
         )
         return box[0], box[1]
 
-    def settle(self, frames: int = 30) -> None:
+    def settle(self, frames: int = 8) -> None:
         """Wait for so many frames to be drawn."""
         count = "let n = 0; const next = () => ++n > frames ? done(n) : requestAnimationFrame(next); next()"
         promise = f"new Promise(done => {{ const frames = {frames}; {count} }})"

@@ -354,6 +354,7 @@ def on_screen(scene, place, width, height):
     return 0.5 * width + focal * x / z, 0.5 * height + focal * y / z
 
 
+@pytest.mark.slow
 def test_a_real_browser_shows_it_measures_and_looks_through_a_camera(out, tmp_path):
     chromium_or_skip()
     scene = load_scene(out[0])
@@ -361,7 +362,7 @@ def test_a_real_browser_shows_it_measures_and_looks_through_a_camera(out, tmp_pa
     server = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         url = re.search(r"http://127\.0\.0\.1:\d+", server.stdout.readline())[0]
-        page = Page(tmp_path / "profile")
+        page = Page(tmp_path / "profile", 900, 640)
         try:
             page.open(url)
             size = page.wait("(c => c && [c.clientWidth, c.clientHeight])(document.querySelector('canvas'))")
