@@ -20,7 +20,7 @@ from colmap_inertial.model import trajectory_from_model
 from colmap_inertial.options import MappingOptions, ProjectOptions, ReconstructOptions
 from colmap_inertial.pipeline import reconstruct
 from colmap_inertial.pipeline.existing import reconstruct_project
-from colmap_inertial.report import write_report
+from colmap_inertial.report import signals, write_report
 from colmap_inertial.report.figure_3d import nice_length, scene_figure
 from colmap_inertial.report.scene import scene_record
 from colmap_inertial.report.series import MOST_POINTS, rounded, strided, thinned
@@ -376,6 +376,18 @@ def test_the_spectrum_of_a_sine_has_its_power_at_its_frequency():
     near = np.abs(hz - 1.0) < 0.4
     power = np.sum(density[near] ** 2) * np.median(np.diff(hz[near]))
     assert power == pytest.approx((0.1 * (2 * np.pi) ** 2) ** 2 / 2, rel=0.1)
+
+
+def test_spectra_are_those_of_scipy():
+    from scipy.signal import welch
+
+    values = np.random.default_rng(1).normal(0, 1, (3, 5000))
+    for count in (100, 801):
+        hz, power = signals._welch(values, 0.01, count)
+        expected_hz, expected = welch(values, fs=100, nperseg=count)
+        np.testing.assert_allclose(hz, expected_hz)
+        inner = slice(1, -1)  # scipy counts both ends once
+        np.testing.assert_allclose(power[:, inner], expected[:, inner], rtol=1e-9)
 
 
 def test_a_wrong_scale_would_be_seen():

@@ -28,6 +28,7 @@ largest values, ``null`` for gaps; three lines are x, y, z.
 ``rolling_shutter``  ``note``, ``readout_s``, ``t_s``, ``median_px``, ``largest_px`` (movement of keypoints in each of
                    some frames), ``worst`` (``name``, ``width``, ``height``, ``at_px``, ``shift_px`` over a grid), or
                    missing
+``project_metric``  the whole project in metres, where an existing one was given, or ``null``
 ``seconds``        by stage
 ``configuration``  ``toml`` text and ``values``, or missing
 ``versions``       of this package and of what it ran with

@@ -74,6 +74,7 @@ def gather(
         "blur": _blur(done, recording, project=done.get("project") is not None),
         "crops": _crops(out, done),
         "rolling_shutter": _rolling_shutter(done, recording),
+        "project_metric": done.get("project_metric"),
         "seconds": done["seconds"],
         "configuration": _configuration(out),
         "versions": done["versions"],

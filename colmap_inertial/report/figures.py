@@ -184,7 +184,8 @@ def spectra(spectrum: dict[str, Any], *, unit: str, factor: float = 1.0) -> Figu
         trace["opacity"] = 0.45 if width > 2 else 1.0
         data.append(trace)
     layout = _layout(360)
-    decades = {"type": "log", "dtick": 1, "tickformat": "~g"}
+    layout["showlegend"] = True
+    decades = {"type": "log", "tickformat": "~g"}
     layout["xaxis"] = {**decades, "title": {"text": "frequency (Hz)"}}
     layout["yaxis"] = {**decades, "title": {"text": f"{unit}/√Hz"}}
     if other:

@@ -48,6 +48,7 @@
     } else {
       // a finger scrolls the page; a mouse zooms
       out.dragmode = touch ? false : "zoom";
+      if (narrow() && out.yaxis?.scaleanchor) out.height = Math.min(out.height, Math.round(0.8 * window.innerWidth) + 50);
       if (narrow()) out.margin = { ...out.margin, l: 48, r: Math.min(out.margin.r, 46) };
     }
     return out;

@@ -17,6 +17,14 @@ from colmap_inertial.report.words import digits, signed
 
 Content = dict[str, Any]
 
+#: What the paths of a result are.
+_WRITTEN = {
+    "sparse": "COLMAP's own model",
+    "sparse_metric": "the model in metres",
+    "trajectory": "the camera's smoothed path in metres",
+    "project_metric": "the whole project in metres",
+}
+
 
 @dataclass(frozen=True, kw_only=True)
 class Plot:
@@ -98,6 +106,7 @@ def _key_facts(content: Content, model: Content | None) -> Iterator[tuple[str, s
             yield "camera path", f"{digits(path, 3)} {'m' if model['scene']['unit'] == 'm' else 'model units'}"
         if model["excitation_m_s2"] is not None:
             yield "camera acceleration", f"{digits(model['excitation_m_s2'], 2)} m/s²"
+        yield "method", model["method"]
         if model["gyro_time_offset_s"] is not None:
             yield "camera clock − IMU clock", f"{signed(model['gyro_time_offset_s'], 4)} s"
     if recording is not None:
@@ -247,10 +256,16 @@ def _acceleration(signals: Content, name: str, mark: str) -> Section:
 
 def _spectra(signals: Content, name: str, mark: str) -> Section:
     figure = figures.spectra(signals["acceleration_spectrum"], unit="(m/s²)")
+    if signals["acceleration_spectrum"]["camera_unit"] == "m/s2":
+        said = "Camera and IMU should agree up to where the camera's curve bends upwards: from there on it shows the "
+        said += "noise of positions, which the estimate weighs down."
+    else:
+        said = "Units differ, so that only the shapes of the curves can be compared."
+    if "camera" not in signals["acceleration_spectrum"]["curves"]:
+        said = "The frames are too few or too unevenly spaced for a spectrum of the camera; this is the IMU's."
     parts: list[str | Plot] = [
-        f"<h2>{escape(name)}Spectra</h2><p>The same by frequency. Camera and IMU should agree up to where the camera "
-        "curve bends upwards: from there on it shows the noise of positions, which the estimate weighs down. Motion "
-        "of the hand lies between 0.5 and 5 Hz; peaks above are vibration.</p>",
+        f"<h2>{escape(name)}Spectra</h2><p>The same by frequency. {prose(said)} Motion of the hand lies between 0.5 "
+        "and 5 Hz; peaks above are vibration.</p>",
         "<h3>Acceleration</h3>",
         Plot(figure=figure, label="Spectra of acceleration"),
     ]
@@ -368,7 +383,12 @@ def _run(content: Content) -> Section:
     versions = content["versions"].items()
     parts += ["<h3>Versions</h3>", table(("Package", "Version"), [(k, str(v)) for k, v in versions])]
     models = content["models"]
-    if models:
+    written = [(name, model[name]) for model in models for name in ("sparse", "sparse_metric", "trajectory")]
+    written += [("project_metric", content["project_metric"])]
+    listed = [(path, _WRITTEN[name]) for name, path in written if path is not None]
+    if listed:
+        parts += ["<h3>Written</h3>", table(("Where", "What"), listed)]
+    if len(models) > 1:
         rows = []
         for model in models:
             scale = "none" if model["metres_per_unit"] is None else f"{digits(model['metres_per_unit'], 5)} m"

@@ -29,8 +29,8 @@ from colmap_inertial.types import (
 
 #: Positions are differentiated over this long: a millimetre of noise becomes 0.06 m/s2.
 _REACH_S = 0.2
-#: A longer pause between frames is a gap in the lines.
-_PAUSE_S = 2.0
+#: A longer pause between frames is a gap in the lines, as is a turn in one that may be one the other way round.
+_PAUSE_S, _HALF_TURN_RAD = 5.0, 2.5
 #: Parts that spectra are averaged over; samples less even than this have none (share within a fifth of the usual step).
 _PART_S, _EVEN = 8.0, 0.9
 #: Points of a spectrum.
@@ -105,14 +105,15 @@ class _Rates:
         t_s, pose = trajectory.t_s, trajectory.cam_from_world_xyzw
         turn = quat_log(quat_multiply(pose[:-1], quat_conjugate(pose[1:])))
         rate = turn / np.diff(t_s)[:, None]
-        rate[np.diff(t_s) > _PAUSE_S] = np.nan
+        rate[(np.diff(t_s) > _PAUSE_S) | (np.linalg.norm(turn, axis=1) > _HALF_TURN_RAD)] = np.nan
         return cls(t_s[:-1], t_s[1:], rate)
 
     def felt(self, motion: GyroCamera) -> Array:
         """The gyroscope's rotation over the same intervals."""
         first, last = motion.start_from_cam(self.begin_s), motion.start_from_cam(self.end_s)
         rate = so3_log(np.swapaxes(first, 1, 2) @ last) / (self.end_s - self.begin_s)[:, None]
-        return np.where(motion.covers(self.begin_s, self.end_s)[:, None], rate, np.nan)
+        known = motion.covers(self.begin_s, self.end_s) & np.isfinite(self.rate_rad_s).all(axis=1)
+        return np.where(known[:, None], rate, np.nan)
 
 
 def _rotation(trajectory: CameraTrajectory, imu: ImuRecording, seen: _Rates, aligned: GyroCamera | None) -> Record:
@@ -138,7 +139,7 @@ def _rotation(trajectory: CameraTrajectory, imu: ImuRecording, seen: _Rates, ali
         record["before"]["gyroscope_size"] = thinned(raw_s[near], np.linalg.norm(raw[near], axis=1))
         return record
     felt = seen.felt(aligned)
-    both = np.isfinite(felt).all(axis=1) & np.isfinite(seen.rate_rad_s).all(axis=1)
+    both = np.isfinite(felt).all(axis=1)
     if not both.any():
         return record
     left = (seen.rate_rad_s - felt)[both]
@@ -266,8 +267,6 @@ def _spectrum(t_s: Array, values: Array) -> Record | None:
     -------
     ``None`` where samples are few or uneven.
     """
-    from scipy.signal import welch
-
     known = np.isfinite(values).all(axis=1)
     if known.sum() < 16:
         return None
@@ -287,7 +286,7 @@ def _spectrum(t_s: Array, values: Array) -> Record | None:
         if len(grid) < count or count < 8:
             continue
         even = np.stack([np.interp(grid, t_s[part], column[part]) for column in values.T])
-        hz, power = welch(even, fs=1 / step_s, nperseg=count, detrend="constant")
+        hz, power = _welch(even, step_s, count)
         total = total + len(grid) * power.sum(axis=0)
         weights += len(grid)
     if weights == 0:
@@ -299,6 +298,16 @@ def _spectrum(t_s: Array, values: Array) -> Record | None:
     found, index, members = np.unique(place, return_inverse=True, return_counts=True)
     mean = np.sqrt(np.bincount(index, density**2, len(found)) / members)
     return {"hz": rounded(np.bincount(index, hz, len(found)) / members, 4), "density": rounded(mean, 4)}
+
+
+def _welch(values: Array, step_s: float, count: int) -> tuple[Array, Array]:
+    """Frequencies and one-sided power densities (3, F) of even samples (3, N), over parts of so many that overlap by
+    half (Welch 1967); written out, because importing scipy's takes longer than all of this."""
+    parts = np.lib.stride_tricks.sliding_window_view(values, count, axis=1)[:, :: count - count // 2]
+    window = np.hanning(count + 1)[:-1]
+    spectra = np.fft.rfft((parts - parts.mean(axis=2, keepdims=True)) * window, axis=2)
+    power = 2 * step_s / np.sum(window**2) * np.mean(np.abs(spectra) ** 2, axis=1)
+    return np.asarray(np.fft.rfftfreq(count, step_s), dtype=np.float64), power
 
 
 __all__ = ["signal_record"]
