@@ -44,6 +44,7 @@ from colmap_inertial.pipeline.preflight import preflight, read_checked_imu, stop
 from colmap_inertial.pipeline.readout import ReadoutStage
 from colmap_inertial.pipeline.reporting import report_result, reporting_stops, write_recording
 from colmap_inertial.pipeline.result import ModelResult, ReconstructResult
+from colmap_inertial.pipeline.selection import part_of, run_selection
 from colmap_inertial.pipeline.stages import DeblurStage, GyroView, RollingShutterStage
 from colmap_inertial.pipeline.workspace import StageRunner, Workspace, fingerprint, remove
 from colmap_inertial.types import (
@@ -174,6 +175,11 @@ def reconstruct(
         write_recording(workspace, imu, timing)
         doubts = stop_or_doubt(diagnosis, force=options.force)
         runner = StageRunner(workspace)
+        inputs = _inputs(loaded, timing)
+        selection = run_selection(runner, workspace, loaded, imu, timing, prior, options, inputs, progress)
+        if len(selection.names) < len(timing.names):
+            timing = part_of(timing, selection.names)
+            _, frames = read_frames(loaded, only=timing.names)
         plan = run_plan(runner, workspace, loaded, imu, timing, options, progress)
         of_frames = list(plan.frame_stages() if frame_stages is None else frame_stages)
         of_keypoints = list(plan.keypoint_stages() if keypoint_stages is None else keypoint_stages)
@@ -195,7 +201,12 @@ def reconstruct(
         if options.dense:
             models = with_dense(runner, workspace, models, images, options, progress)
         result = ReconstructResult(
-            workspace=workspace, models=models, frames=records, imaging=plan, seconds=runner.seconds
+            workspace=workspace,
+            models=models,
+            frames=records,
+            imaging=plan,
+            selection=selection,
+            seconds=runner.seconds,
         )
         write_recording(workspace, imu, timing, plan)
         report_result(result, loaded)

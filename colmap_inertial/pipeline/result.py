@@ -15,6 +15,7 @@ from colmap_inertial.model.readout import Settled
 from colmap_inertial.pipeline.dense import DenseResult
 from colmap_inertial.pipeline.frames import FrameRecord
 from colmap_inertial.pipeline.imaging import ImagingPlan
+from colmap_inertial.pipeline.selection import Selection
 from colmap_inertial.pipeline.workspace import Workspace
 from colmap_inertial.types import CameraImuCalibration, ScaleEstimate
 from colmap_inertial.validate import Validation
@@ -48,6 +49,8 @@ class ReconstructResult:
     seconds: dict[str, float]
     imaging: ImagingPlan = field(default_factory=ImagingPlan)
     """What was done to frames and keypoints beforehand, and why."""
+    selection: Selection | None = None
+    """Which frames were used, and why; ``None`` for an existing project."""
     project_metric: Path | None = None
     """The whole project in metres, where an existing one was given and not every scale was refused."""
 
@@ -153,6 +156,7 @@ def result_as_json(result: ReconstructResult, capture: Capture) -> dict[str, obj
         ],
         "project_metric": relative(result.project_metric),
         "waiting": bool(result.waiting),
+        "selection": result.selection and result.selection.as_json(),
         "imaging": imaging_as_json(plan),
         "frames": [frame_as_json(record, plan) for record in result.frames],
         "seconds": result.seconds,

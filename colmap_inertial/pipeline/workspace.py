@@ -48,6 +48,11 @@ class Workspace:
         return self.root / "images_rectified"
 
     @property
+    def selection(self) -> Path:
+        """Which frames of a video are used, and why."""
+        return self.root / "selection.json"
+
+    @property
     def imaging(self) -> Path:
         """Calibration from before the reconstruction, and what it means for each frame."""
         return self.root / "imaging.json"
