@@ -214,3 +214,23 @@ class ApertureOptions:
             raise ValueError(f"step_px must be from 0.1 to 2, not {self.step_px:g}")
         if self.threads is not None and self.threads < 1:
             raise ValueError(f"threads must be at least 1, not {self.threads}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FuseAperturesOptions:
+    """What is made of the pictures of a multi-aperture camera."""
+
+    fusion: ApertureOptions = field(default_factory=ApertureOptions)
+    """How they are fused."""
+    refocus: float | None = None
+    """Also write pictures that are sharp at this depth only, in metres (or in the calibration's own unit)."""
+    lens_width: float = 1.0
+    """Width of the lens that refocused pictures show, in distances between the reference and its partner."""
+    depth: bool = False
+    """Also write disparities (pixels) and depths (metres) as NumPy files; nan where they were not measured."""
+
+    def __post_init__(self) -> None:
+        if self.refocus is not None and not self.refocus > 0:
+            raise ValueError(f"refocus must be a depth above 0, not {self.refocus:g}")
+        if not self.lens_width > 0:
+            raise ValueError(f"lens_width must be positive, not {self.lens_width:g}")

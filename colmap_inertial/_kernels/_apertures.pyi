@@ -26,10 +26,10 @@ def matching_costs(
 ) -> None:
     """Write what each candidate costs into `cost` (H, W, D), summed over the views (N, Hv, Wv).
 
-    `columns` (N, D, W) and `rows` (N, D, H): where the reference's columns and rows lie in a view, in 1/16 px. Census counts
-    comparisons that differ by `least` codes or more in the reference. `tables`
-    (N, 256, 256): costs by codes of reference and view in place of census. `blend` (N + 2): weights of reference and
-    views in 1/256 and a constant, whose sum costs what `blend_table` (256) says.
+    `columns` (N, D, W) and `rows` (N, D, H): where the reference's columns and rows lie in a view, in 1/16 px. Census
+    counts comparisons that differ by `least` codes or more in the reference. `tables` (N, 256, 256): costs by codes of
+    reference and view in place of census. `blend` (N + 2): weights of reference and views in 1/256 and a constant,
+    whose sum costs what `blend_table` (256) says.
     """
 
 def semi_global(

@@ -73,6 +73,9 @@ may be left out. Nothing is guessed: a unit, axis or time that a file does not s
     [target]
     spec = "checkerboard:8x6:0.03"  # validated at the end of a reconstruction
 
+    [apertures]                     # a camera of several apertures, fused to one frame: see io.apertures
+    calibration = "camchain.yaml"
+
 With ``[imu] path``, the tables ``[imu.gyro]`` and ``[imu.accel]`` may hold ``unit`` and ``axes`` alone: they correct a
 file whose format or header is wrong.
 """
@@ -88,6 +91,7 @@ import numpy as np
 from colmap_inertial.errors import FormatError
 from colmap_inertial.geometry import quat_from_matrix
 from colmap_inertial.io import sensor_yaml
+from colmap_inertial.io.apertures import AperturePictures, read_apertures_table
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.io.capture_tables import (
     ImuPath,
@@ -174,6 +178,8 @@ class Capture:
         Specification of a calibration target in the scene.
     frame_log
         What the recorder noted about the frames of the video; what the capture.toml says goes before it.
+    apertures
+        The sub-images that are fused to one frame; ``frames`` and ``camera`` are the reference aperture's.
     """
 
     path: Path
@@ -187,6 +193,7 @@ class Capture:
     calibration: CameraImuCalibration
     target: str | None = None
     frame_log: FrameLog | None = None
+    apertures: AperturePictures | None = None
 
 
 def load_capture(path: Path) -> Capture:
@@ -240,6 +247,13 @@ def _from_toml(path: Path) -> Capture:
     shared_clock = timing.boolean("shared_clock")
     timing.finish()
     camera, body_from_cam = read_camera(root.section("camera"))
+    apertures = read_apertures_table(
+        root.section("apertures"), frames.folder if isinstance(frames, ImageFolder) else None
+    )
+    if apertures is not None:
+        if camera is not None:
+            root.fail("camera", "is given by the calibration under [apertures]; leave it out")
+        camera = apertures.rig.reference.camera
     imu = read_imu_table(root.section("imu"))
     log = None
     if isinstance(frames, Video):
@@ -279,6 +293,7 @@ def _from_toml(path: Path) -> Capture:
         calibration=calibration,
         target=spec,
         frame_log=log,
+        apertures=apertures,
     )
 
 

@@ -129,7 +129,7 @@ def _timing(capture: Capture, stamps: FrameStamps) -> FrameTiming:
 
 
 def _image_stamps(source: ImageFolder) -> FrameStamps:
-    names = _image_names(source)
+    names = image_names(source)
     if source.times is None:
         raise TimingError(
             f"{source.folder}: nothing says when its {len(names)} pictures were taken (EXIF is too coarse): set "
@@ -150,7 +150,7 @@ def _image_stamps(source: ImageFolder) -> FrameStamps:
     )
 
 
-def _image_names(source: ImageFolder) -> list[str]:
+def image_names(source: ImageFolder) -> list[str]:
     """Names relative to the folder, with forward slashes, as COLMAP has them."""
     if not source.folder.is_dir():
         raise FormatError(source.folder, "no such folder of pictures")

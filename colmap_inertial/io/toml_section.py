@@ -46,6 +46,10 @@ class Section:
     def __contains__(self, key: str) -> bool:
         return key in self._values
 
+    def names(self) -> list[str]:
+        """Keys in the order of the file."""
+        return list(self._values)
+
     def fail(self, key: str | None, reason: str) -> NoReturn:
         """Raise the :class:`FormatError` of this table (and of one of its keys)."""
         where = f"[{self.name}]" if self.name else "top level"

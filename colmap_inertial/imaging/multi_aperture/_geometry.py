@@ -113,12 +113,7 @@ class Rectified:
             image_from_canvas=(),
             canvas_from_reference=None,
             covered=tuple(
-                (
-                    -(-a // by),
-                    max(-(-a // by), min((b + 1) // by, self.width // by) - 1),
-                    -(-c // by),
-                    max(-(-c // by), min((d + 1) // by, self.height // by) - 1),
-                )
+                _shrunk_range(a, b, by, self.width // by) + _shrunk_range(c, d, by, self.height // by)
                 for a, b, c, d in self.covered
             ),
         )
@@ -180,7 +175,7 @@ def rectify(rig: ApertureRig, projectors: Sequence[Projector]) -> Rectified:
     flat = to_others[1] * np.array([1.0, 1.0, 0.0])
     if np.linalg.norm(flat) < 0.2 * np.linalg.norm(to_others[1]):
         raise ValueError(
-            f"{rig.names[1]} stands before or behind {rig.names[0]}, not beside it: disparities would be next to nothing"
+            f"{rig.names[1]} stands before or behind {rig.names[0]}, not beside it: disparities would be nothing"
         )
     rect_from_ref = matrix_from_quat(rotation_between(to_others[1], flat))
     rect_from_rig = rect_from_ref @ rotations[0]
@@ -239,6 +234,12 @@ def rectify(rig: ApertureRig, projectors: Sequence[Projector]) -> Rectified:
         depth_factor=None if factor is None else factor.astype(np.float32),
         covered=tuple(covered),
     )
+
+
+def _shrunk_range(first: int, last: int, by: int, size: int) -> tuple[int, int]:
+    """The pixels, ``by`` times larger, that lie whole within a range; at least one."""
+    start = min(-(-first // by), size - 1)
+    return start, max(start, min((last + 1) // by, size) - 1)
 
 
 def _rays(projector: Projector, xy_px: Array) -> Array:

@@ -43,7 +43,7 @@ def noise_of(plane: NDArray[Any]) -> float:
 
 
 def smoothing(noise_codes: float) -> tuple[float, int]:
-    """Standard deviation in pixels over which to smooth (0: not at all), and the least difference of codes that tells."""
+    """Standard deviation in pixels over which to smooth (0: not), and the least difference of codes that tells."""
     width_px = _WIDTH_PX * float(np.sqrt(noise_codes / _NOISE_CODES))
     if width_px < _LEAST_PX:
         return 0.0, 0

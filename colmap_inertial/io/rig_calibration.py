@@ -1,0 +1,354 @@
+"""Calibrations of cameras that are mounted together, in the formats that people have."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.errors import FormatError
+from colmap_inertial.geometry import colmap_px_from_opencv, matrix_from_quat
+from colmap_inertial.io.capture_tables import CAMERA_MODELS
+from colmap_inertial.io.files import read_text
+from colmap_inertial.types import LengthUnit
+
+Matrix = NDArray[np.float64]
+Metres = Literal["m", "mm"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MountedCamera:
+    """One camera of a calibration.
+
+    Attributes
+    ----------
+    model, params
+        In COLMAP's terms.
+    size
+        Width and height; ``None`` where the calibration does not say, and the pictures do.
+    cam_from_rig
+        (4, 4).
+    """
+
+    model: str
+    params: tuple[float, ...]
+    size: tuple[int, int] | None
+    cam_from_rig: Matrix
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RigCalibration:
+    """Cameras by the names that the calibration gives them."""
+
+    path: Path
+    cameras: Mapping[str, MountedCamera]
+    length_unit: LengthUnit
+
+    def camera(self, name: str) -> MountedCamera:
+        """One of them; a :class:`FormatError` that lists them where there is none of that name."""
+        if name not in self.cameras:
+            raise FormatError(self.path, f"calibrates no camera {name!r}; it has {', '.join(self.cameras)}")
+        return self.cameras[name]
+
+
+def read_rig_calibration(path: Path, *, unit: Metres | None = None) -> RigCalibration:
+    """Read a calibration; the format is found by content.
+
+    Parameters
+    ----------
+    path
+        One of these:
+
+        - Kalibr's ``camchain.yaml``: cameras ``cam0``, ``cam1`` ...; metres.
+        - OpenCV's YAML (FileStorage): a map for each camera, by its name, with ``camera_matrix``,
+          ``distortion_coefficients``, ``image_width``, ``image_height`` as OpenCV's calibration sample writes them,
+          and ``R``, ``T`` of x_camera = R x_rig + T (left out for the one that is the rig's frame); or the stereo
+          sample's ``M1``, ``D1``, ``M2``, ``D2``, ``R``, ``T`` for cameras ``1`` and ``2``.
+        - COLMAP's ``rig_config.json`` with camera models: cameras by ``image_prefix`` without the slash at its end.
+        - The folder of a COLMAP model (``rigs.bin``, ``cameras.bin``) with one rig: cameras by their numbers.
+    unit
+        Of OpenCV's ``T``, where it is not metres; of COLMAP's lengths, which otherwise have none.
+
+    Raises
+    ------
+    FormatError
+        For what is none of these, or lacks something; the message says what.
+    """
+    path = Path(path)
+    if path.is_dir():
+        return _from_model(path, unit)
+    if path.suffix.lower() == ".json":
+        return _from_rig_config(path, unit)
+    if path.suffix.lower() not in (".yaml", ".yml"):
+        raise FormatError(
+            path,
+            "is no calibration of several cameras: give Kalibr's or OpenCV's YAML, COLMAP's rig_config.json, or the "
+            "folder of a COLMAP model with rigs.bin",
+        )
+    sheet = _read_yaml(path)
+    if all(isinstance(entry, dict) and "intrinsics" in entry for entry in sheet.values()) and sheet:
+        if unit not in (None, "m"):
+            raise FormatError(path, "Kalibr writes metres; leave out unit")
+        return RigCalibration(path=path, cameras=_kalibr(path, sheet), length_unit="m")
+    return RigCalibration(path=path, cameras=_opencv(path, sheet, 1e-3 if unit == "mm" else 1.0), length_unit="m")
+
+
+# --- Kalibr and OpenCV ----------------------------------------------------------------------------------------------
+
+
+def _kalibr(path: Path, sheet: dict[str, Any]) -> dict[str, MountedCamera]:
+    cameras: dict[str, MountedCamera] = {}
+    cam_from_rig = np.eye(4)
+    for index, name in enumerate(sorted(sheet, key=lambda n: (len(n), n))):
+        entry = sheet[name]
+        if entry.get("camera_model") != "pinhole":
+            raise FormatError(
+                path, f"{name}: camera_model {entry.get('camera_model')!r} is not known here (pinhole is)"
+            )
+        distortion = entry.get("distortion_model")
+        models = {"radtan": "OPENCV", "equidistant": "OPENCV_FISHEYE", "none": "PINHOLE"}
+        if distortion not in models:
+            raise FormatError(
+                path, f"{name}: distortion_model {distortion!r} is not known here ({', '.join(models)} are)"
+            )
+        fx, fy, cx, cy = _numbers(path, name, entry, "intrinsics", 4)
+        coefficients = [] if distortion == "none" else _numbers(path, name, entry, "distortion_coeffs", 4)
+        width, height = _numbers(path, name, entry, "resolution", 2)
+        if index > 0:
+            if "T_cn_cnm1" not in entry:
+                raise FormatError(path, f"{name}: T_cn_cnm1 (its pose against the camera before it) is missing")
+            step = np.array(_numbers(path, name, entry, "T_cn_cnm1", 16)).reshape(4, 4)
+            cam_from_rig = _checked_pose(path, f"{name}: T_cn_cnm1", step) @ cam_from_rig
+        cameras[name] = MountedCamera(
+            model=models[distortion],
+            params=(fx, fy, *_corner(cx, cy), *coefficients),
+            size=(int(width), int(height)),
+            cam_from_rig=cam_from_rig,
+        )
+    return cameras
+
+
+def _opencv(path: Path, sheet: dict[str, Any], metres: float) -> dict[str, MountedCamera]:
+    if "M1" in sheet and "M2" in sheet:
+        shared = {key: sheet[key] for key in ("image_width", "image_height") if key in sheet}
+        extrinsics = {key: sheet[key] for key in ("R", "T") if key in sheet}
+        if len(extrinsics) < 2:
+            raise FormatError(
+                path, "R and T of the second camera are missing: put intrinsics and extrinsics in one file"
+            )
+        pair = {
+            name: {"camera_matrix": sheet[f"M{name}"], "distortion_coefficients": sheet.get(f"D{name}"), **shared}
+            for name in ("1", "2")
+        }
+        pair["2"].update(extrinsics)
+        sheet = pair
+    cameras = {}
+    for name, entry in sheet.items():
+        if not isinstance(entry, dict) or "camera_matrix" not in entry:
+            continue
+        matrix = np.array(_numbers(path, name, entry, "camera_matrix", 9)).reshape(3, 3)
+        distortion = entry.get("distortion_coefficients")
+        coefficients = [] if distortion is None else _flat(path, f"{name}: distortion_coefficients", distortion)
+        if any(coefficients[8:]):
+            raise FormatError(path, f"{name}: prism or tilt coefficients are not known to COLMAP's cameras")
+        coefficients = [*coefficients, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0][:8]
+        full = any(coefficients[4:])
+        size = None
+        if "image_width" in entry and "image_height" in entry:
+            size = int(_number(path, name, entry, "image_width")), int(_number(path, name, entry, "image_height"))
+        pose = np.eye(4)
+        if ("R" in entry) != ("T" in entry):
+            raise FormatError(path, f"{name}: R and T belong together; one of them is missing")
+        if "R" in entry:
+            pose[:3, :3] = np.array(_numbers(path, name, entry, "R", 9)).reshape(3, 3)
+            pose[:3, 3] = metres * np.array(_numbers(path, name, entry, "T", 3))
+        cameras[name] = MountedCamera(
+            model="FULL_OPENCV" if full else "OPENCV",
+            params=(
+                matrix[0, 0],
+                matrix[1, 1],
+                *_corner(matrix[0, 2], matrix[1, 2]),
+                *coefficients[: 8 if full else 4],
+            ),
+            size=size,
+            cam_from_rig=_checked_pose(path, f"{name}: R", pose),
+        )
+    if not cameras:
+        raise FormatError(
+            path,
+            "holds no calibration of several cameras: neither Kalibr's cam0, cam1 with intrinsics, nor OpenCV's maps "
+            "with camera_matrix, nor M1, M2",
+        )
+    return cameras
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    import yaml
+
+    class Loader(yaml.SafeLoader):
+        """Knows OpenCV's matrices."""
+
+    def matrix(loader: yaml.SafeLoader, node: yaml.MappingNode) -> object:
+        return loader.construct_mapping(node, deep=True).get("data")
+
+    Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", matrix)
+    text = read_text(path)
+    if text.startswith("%YAML"):  # OpenCV's spelling of the version line, which YAML does not know
+        text = "#" + text
+    try:
+        sheet = yaml.load(text, Loader)
+    except yaml.MarkedYAMLError as error:
+        line = None if error.problem_mark is None else error.problem_mark.line + 1
+        raise FormatError(path, f"not valid YAML: {error.problem}", line=line) from None
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise FormatError(path, f"not valid YAML: {str(error).splitlines()[0]}") from None
+    if not isinstance(sheet, dict):
+        raise FormatError(path, "not a calibration: expected keys and values")
+    return {str(key): value for key, value in sheet.items()}
+
+
+# --- COLMAP ---------------------------------------------------------------------------------------------------------
+
+
+def _from_rig_config(path: Path, unit: Metres | None) -> RigCalibration:
+    try:
+        rigs = json.loads(read_text(path))
+    except (ValueError, RecursionError) as error:
+        raise FormatError(path, f"not valid JSON: {error}") from None
+    if not (isinstance(rigs, list) and rigs and all(isinstance(rig, dict) for rig in rigs)):
+        raise FormatError(path, "not a rig_config.json: expected a list of rigs")
+    if len(rigs) > 1:
+        raise FormatError(path, f"describes {len(rigs)} rigs; a multi-aperture camera is one")
+    cameras = {}
+    for entry in rigs[0].get("cameras", []):
+        name = str(entry.get("image_prefix", "")).rstrip("/")
+        model = entry.get("camera_model_name")
+        if model is None or "camera_params" not in entry:
+            raise FormatError(path, f"{name}: camera_model_name and camera_params are missing")
+        if model not in CAMERA_MODELS:
+            raise FormatError(path, f"{name}: camera model {model!r} is unknown")
+        pose = np.eye(4)
+        if not entry.get("ref_sensor", False):
+            quaternion = _numbers(path, name, entry, "cam_from_rig_rotation", 4)  # w first, as COLMAP's files have it
+            if abs(np.linalg.norm(quaternion) - 1) > 1e-3:
+                raise FormatError(path, f"{name}: cam_from_rig_rotation is no unit quaternion")
+            pose[:3, :3] = matrix_from_quat(np.roll(quaternion, -1))
+            pose[:3, 3] = _scale(unit) * np.array(_numbers(path, name, entry, "cam_from_rig_translation", 3))
+        params = tuple(_numbers(path, name, entry, "camera_params", CAMERA_MODELS[model][0]))
+        cameras[name] = MountedCamera(model=model, params=params, size=None, cam_from_rig=pose)
+    return RigCalibration(path=path, cameras=cameras, length_unit="model" if unit is None else "m")
+
+
+def _from_model(path: Path, unit: Metres | None) -> RigCalibration:
+    """``rigs.bin`` and ``cameras.bin`` (COLMAP's scene/reconstruction_io): little-endian records after a count."""
+    rigs, sheets = path / "rigs.bin", path / "cameras.bin"
+    for file in (rigs, sheets):
+        if not file.is_file():
+            raise FormatError(file, "is missing: the calibration must be a COLMAP model in binary format with rigs")
+    models = list(CAMERA_MODELS)
+
+    def read_cameras(take: Callable[[str], tuple[Any, ...]]) -> dict[int, tuple[str, tuple[int, int], Any]]:
+        found = {}
+        for _ in range(take("<Q")[0]):
+            number, model, width, height = take("<IiQQ")
+            if not 0 <= model < len(models):
+                raise FormatError(sheets, f"camera model {model} is unknown")
+            found[number] = models[model], (width, height), take(f"<{CAMERA_MODELS[models[model]][0]}d")
+        return found
+
+    def read_rigs(take: Callable[[str], tuple[Any, ...]]) -> list[dict[int, Matrix]]:
+        found = []
+        for _ in range(take("<Q")[0]):
+            _, count = take("<II")
+            poses = {}
+            for i in range(count):
+                kind, number = take("<iI")
+                pose = np.eye(4)
+                if i > 0:
+                    if not take("<B")[0]:
+                        raise FormatError(rigs, f"camera {number} has no pose in its rig")
+                    w, x, y, z, *translation = take("<7d")
+                    pose[:3, :3] = matrix_from_quat(np.array([x, y, z, w]))
+                    pose[:3, 3] = _scale(unit) * np.array(translation)
+                if kind == 0:
+                    poses[number] = pose
+            found.append(poses)
+        return found
+
+    cameras = _records(sheets, read_cameras)
+    found = [poses for poses in _records(rigs, read_rigs) if len(poses) > 1]
+    if len(found) != 1:
+        raise FormatError(rigs, f"holds {len(found)} rigs of several cameras; one is needed")
+    mounted = {}
+    for number, pose in found[0].items():
+        if number not in cameras:
+            raise FormatError(sheets, f"camera {number} of the rig is missing")
+        model, size, params = cameras[number]
+        mounted[str(number)] = MountedCamera(model=model, params=tuple(params), size=size, cam_from_rig=pose)
+    return RigCalibration(path=path, cameras=mounted, length_unit="model" if unit is None else "m")
+
+
+def _records(path: Path, read: Callable[[Callable[[str], tuple[Any, ...]]], Any]) -> Any:
+    data, at = path.read_bytes(), 0
+
+    def take(layout: str) -> tuple[Any, ...]:
+        nonlocal at
+        values = struct.unpack_from(layout, data, at)
+        at += struct.calcsize(layout)
+        return values
+
+    try:
+        return read(take)
+    except struct.error:
+        raise FormatError(path, "truncated") from None
+
+
+def _scale(unit: Metres | None) -> float:
+    return 1e-3 if unit == "mm" else 1.0
+
+
+# --- numbers --------------------------------------------------------------------------------------------------------
+
+
+def _corner(cx: float, cy: float) -> list[float]:
+    """A principal point counted from the top-left pixel's corner; OpenCV and Kalibr count from its centre."""
+    return [float(value) for value in colmap_px_from_opencv(np.array([cx, cy]))]
+
+
+def _checked_pose(path: Path, what: str, pose: Matrix) -> Matrix:
+    rotation = pose[:3, :3]
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
+        raise FormatError(path, f"{what} holds no rotation")
+    return pose
+
+
+def _flat(path: Path, what: str, value: object) -> list[float]:
+    try:
+        numbers = [float(item) for item in np.asarray(value, dtype=np.float64).ravel()]
+    except (TypeError, ValueError):
+        raise FormatError(path, f"{what}: {value!r} is not a list of numbers"[:300]) from None
+    if not np.isfinite(numbers).all():
+        raise FormatError(path, f"{what}: numbers must be finite")
+    return numbers
+
+
+def _numbers(path: Path, name: str, entry: Mapping[str, Any], key: str, count: int) -> list[float]:
+    if key not in entry:
+        raise FormatError(path, f"{name}: {key} is missing")
+    numbers = _flat(path, f"{name}: {key}", entry[key])
+    if len(numbers) != count:
+        raise FormatError(path, f"{name}: {key} must hold {count} numbers, found {len(numbers)}")
+    return numbers
+
+
+def _number(path: Path, name: str, entry: Mapping[str, Any], key: str) -> float:
+    return _numbers(path, name, entry, key, 1)[0]
+
+
+__all__ = ["MountedCamera", "RigCalibration", "read_rig_calibration"]
