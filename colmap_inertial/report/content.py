@@ -60,7 +60,14 @@ def gather(
     models = sorted(done["models"], key=lambda m: (m["metres_per_unit"] is None, -m["registered_images"], m["index"]))
     full = {model["index"] for model in models[:_MOST_MODELS]}
     shown = [_model(out, model, in_full=model["index"] in full) for model in models]
-    outcome = shown[0]["outcome"] if shown else outcome_of_stop(stopped or "COLMAP made no model.")
+    findings = _findings(out)
+    if shown:
+        outcome = shown[0]["outcome"]
+    else:
+        outcome = outcome_of_stop(stopped or "COLMAP made no model.", findings=bool(findings.get("findings")))
+    if len(shown) > 1:
+        said = f"COLMAP made {len(shown)} separate models. This is model {shown[0]['index']}; the others follow below."
+        outcome = {**outcome, "summary": [*outcome["summary"], said]}
     source = done.get("capture", capture) or str(out)
     return {
         "format": "colmap-inertial report",
@@ -69,7 +76,7 @@ def gather(
         "capture": source,
         "outcome": outcome,
         "models": shown,
-        "findings": _findings(out),
+        "findings": findings,
         "recording": None if recording is None else _of_recording(recording),
         "blur": _blur(done, recording, project=done.get("project") is not None),
         "crops": _crops(out, done),

@@ -366,7 +366,11 @@ def target_views(validation: dict[str, Any]) -> Figure:
     ]
     layout = _layout(240, showlegend=False)
     layout["margin"] = {**layout["margin"], "t": 12}
-    layout["xaxis"] = {"title": {"text": "pictures with the target"}, "zeroline": False}
+    layout["xaxis"] = {
+        "title": {"text": "pictures with the target"},
+        "dtick": max(1, round(len(views) / 8)),
+        "zeroline": False,
+    }
     layout["yaxis"] = {"title": {"text": "residual, rms (px)"}}
     return {"data": data, "layout": layout}
 

@@ -22,7 +22,7 @@ _TRUSTED_PCT, _WEAK_PCT = 100 * TRUSTED_HALF_WIDTH, 100 * WEAK_HALF_WIDTH
 
 def prose(text: str) -> str:
     """Text for a paragraph: escaped, numbers kept on one line with their units."""
-    return _UNIT.sub("\\1\N{NO-BREAK SPACE}\\2", escape(text.replace("m/s2", "m/s²")))
+    return _UNIT.sub("\\1\N{NO-BREAK SPACE}\\2", escape(text.replace("m/s2", "m/s²").replace("+-", "±")))
 
 
 def sentence(text: str) -> str:

@@ -190,7 +190,7 @@ def _scene(scene: Content, name: str, mark: str) -> Section:
     figure = Plot(figure=scene_figure(scene), label="The model in 3-D with the camera's path")
     return Section(
         anchor=f"scene{mark}",
-        short=f"{name}3-D",
+        short="" if name else "3-D",
         parts=(f"<h2>{escape(name)}Model and camera path</h2><p>{said}</p>", figure),
     )
 
@@ -223,7 +223,7 @@ def _rotation(signals: Content, name: str, mark: str) -> Section:
             f'<h3>As recorded</h3><p class="soft">{clocks}</p>',
             Plot(figure=before, label="Rates of rotation as recorded"),
         ]
-    return Section(anchor=f"rotation{mark}", short=f"{name}Turning", parts=parts)
+    return Section(anchor=f"rotation{mark}", short="" if name else "Turning", parts=parts)
 
 
 def _acceleration(signals: Content, name: str, mark: str) -> Section:
@@ -245,7 +245,7 @@ def _acceleration(signals: Content, name: str, mark: str) -> Section:
     figure = Plot(figure=figures.accelerations(acceleration), label="Accelerations of camera and accelerometer")
     return Section(
         anchor=f"acceleration{mark}",
-        short=f"{name}Acceleration",
+        short="" if name else "Acceleration",
         parts=(
             f"<h2>{escape(name)}Acceleration: camera against accelerometer</h2><p>{said}{alike} "
             f'<span class="soft">{averaged}</span></p>',
@@ -273,7 +273,7 @@ def _spectra(signals: Content, name: str, mark: str) -> Section:
     if "missing" not in turning:
         figure = figures.spectra(turning, unit="(°/s)", factor=math.degrees(1))
         parts += ["<h3>Turning</h3>", Plot(figure=figure, label="Spectra of rotation")]
-    return Section(anchor=f"spectra{mark}", short=f"{name}Spectra", parts=parts)
+    return Section(anchor=f"spectra{mark}", short="" if name else "Spectra", parts=parts)
 
 
 def _drift(model: Content, name: str, mark: str) -> Section:
@@ -287,7 +287,7 @@ def _drift(model: Content, name: str, mark: str) -> Section:
     figure = Plot(figure=figures.drift(model), label="Scale of parts of the recording")
     return Section(
         anchor=f"drift{mark}",
-        short=f"{name}Scale over time",
+        short="" if name else "Scale over time",
         parts=(
             f"<h2>{escape(name)}Scale along the recording</h2><p>Each part of the recording by itself against the "
             f"whole. {same} (By chance alone, differences as large come up in {100 * found['p_value']:.2g} % of "
@@ -327,7 +327,7 @@ def _target(found: Content, name: str, mark: str, out: Path) -> Section:
             "longer than they are.</p>",
             shown,
         ]
-    return Section(anchor=f"target{mark}", short=f"{name}Target", parts=parts)
+    return Section(anchor=f"target{mark}", short="" if name else "Target", parts=parts)
 
 
 def _blur(content: Content, out: Path) -> Section:

@@ -76,7 +76,7 @@ def outcome_of_model(model: dict[str, Any]) -> dict[str, Any]:
             "more. It has the right order of size and gravity points along an axis; do not measure by it without a "
             "check against a known length."
         )
-        todo = [_MOVE, _TARGET]
+        todo = [_MOVE] if model.get("validation") else [_MOVE, _TARGET]
     checked = model.get("validation")
     if checked and checked.get("scale_error_pct") is not None:
         word = "within" if checked["within_tolerance"] else "outside"
@@ -107,13 +107,13 @@ def _refused(model: dict[str, Any]) -> dict[str, Any]:
     return {"verdict": "refused", "headline": "No scale could be found", "summary": summary, "todo": todo}
 
 
-def outcome_of_stop(reason: str) -> dict[str, Any]:
-    """The same where a run ended before there was a model."""
+def outcome_of_stop(reason: str, *, findings: bool) -> dict[str, Any]:
+    """The same where a run ended before there was a model, with or without findings about the recording."""
     return {
         "verdict": "stopped",
         "headline": "Stopped before there was a scale",
         "summary": [reason[:1].upper() + reason[1:]],
-        "todo": ["What was found in the recording is listed below, each with what to do about it."],
+        "todo": ["What was found in the recording is listed below, each with what to do about it."] if findings else [],
     }
 
 
