@@ -15,7 +15,7 @@ import pytest
 
 from colmap_inertial.errors import FormatError, TimingError
 from colmap_inertial.io.capture import load_capture
-from colmap_inertial.io.frames import frame_source, read_frame_timing, read_frames, thin
+from colmap_inertial.io.frames import frame_source, read_frame_timing, read_frames, read_reduced, thin
 from colmap_inertial.io.video import decode_grey, decode_reduced, decode_video, video_stamps_ns
 
 VARIABLE_MS = (100, 133, 167, 250, 283, 400, 417, 450, 600, 633, 667, 700)
@@ -109,6 +109,21 @@ def test_grey_and_deep_video_keep_their_depth(tmp_path: Path) -> None:
     frame = next(read_frames(capture_of(tmp_path, 'file = "deep.mkv"'))[1])
     assert frame.image.shape == (48, 64, 3) and frame.image.dtype == np.uint16
     assert abs(frame.image.mean() / 257 - 20) < 3
+
+
+def test_some_frames_are_decoded_alone(tmp_path: Path) -> None:
+    write_video(tmp_path / "a.mp4")
+    capture = load_capture(capture_of(tmp_path, 'file = "a.mp4"'))
+    timing, frames = read_frames(capture)
+    every = list(frames)
+    _, some = read_frames(capture, only=timing.names[2:9:3])
+    for frame, expected in zip(some, every[2:9:3], strict=True):
+        assert frame.name == expected.name and frame.t_s == expected.t_s
+        np.testing.assert_array_equal(frame.image, expected.image)
+    assert list(read_frames(capture, only=())[1]) == []
+    small = list(read_reduced(capture, timing.names[2:9:3], 32))
+    assert [name for name, _ in small] == list(timing.names[2:9:3])
+    assert all(grey.shape == (24, 32) and grey.dtype == np.uint8 for _, grey in small)
 
 
 def test_memory_does_not_grow_with_the_number_of_frames(tmp_path: Path) -> None:

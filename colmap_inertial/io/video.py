@@ -141,10 +141,12 @@ def decode_grey(path: Path) -> Iterator[tuple[int, int, NDArray[np.uint8]]]:
 
 def _wanted(path: Path, wanted_ns: NDArray[np.int64]) -> Iterator[tuple[int, av.VideoFrame]]:
     """The frames with the wanted stamps, each of them whole."""
+    if len(wanted_ns) == 0:
+        return
     container, stream = _open(path)
     stream.thread_type = "AUTO"
     missing = set(wanted_ns.tolist())
-    first_ns = min(missing, default=0)
+    first_ns = min(missing)
     with container:
         for frame in _guarded(path, container.decode(stream)):
             if frame.pts is None or frame.time_base is None:

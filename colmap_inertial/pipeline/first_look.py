@@ -81,13 +81,7 @@ class FirstLook:
 def some_frames(capture: Capture, timing: FrameTiming, indices: Sequence[int]) -> Iterator[Frame]:
     """Some frames of a capture, in order of time; of a folder, no other is opened."""
     if not isinstance(capture.frames, ImageFolder):
-        wanted = {timing.names[i] for i in indices}
-        for frame in read_frames(capture)[1]:
-            if frame.name in wanted:
-                yield frame
-                wanted.remove(frame.name)
-                if not wanted:
-                    return
+        yield from read_frames(capture, only=[timing.names[i] for i in indices])[1]
         return
     for i in sorted(indices):
         image = read_image(capture.frames.folder / timing.names[i])

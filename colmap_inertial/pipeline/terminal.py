@@ -22,6 +22,8 @@ _STAGES = {
     "rendering": "Rendering",
     "video": "Video frames",
     "motion": "Camera motion",
+    "clocks": "Clocks",
+    "selection": "Selection",
     "calibration": "Calibration",
     "blur": "Blur",
     "frames": "Frames",
