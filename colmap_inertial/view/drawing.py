@@ -70,7 +70,7 @@ class Drawing:
 
     def point_size(self) -> float:
         """So that points cover a part of the area they lie in."""
-        return self.scene.reach * min(0.6 / max(len(self.scene.cloud.xyz), 1) ** 0.5, 1 / 150)
+        return self.scene.reach * min(0.75 / max(len(self.scene.cloud.xyz), 1) ** 0.5, 1 / 150)
 
     def _add_mesh(self) -> Any:
         mesh = self.scene.mesh
@@ -200,7 +200,7 @@ class Drawing:
         return self._api.add_label(name, text, position=position, anchor=anchor, font_screen_scale=size)
 
     def frustum(self, name: str, camera: int, image: NDArray[np.uint8] | None, *, through: bool = False) -> Any:
-        """Add a camera with its image; one that is looked ``through`` is larger, and its image transparent."""
+        """Add a camera with its image; larger than the others, so that it is seen; one looks ``through`` its image."""
         cameras = self.scene.cameras
         half_height, aspect = np.tan(0.5 * cameras.vertical_fov_rad[camera]), float(cameras.aspect[camera])
         if image is not None and through:
@@ -211,7 +211,7 @@ class Drawing:
             fov=float(cameras.vertical_fov_rad[camera]),
             aspect=aspect,
             # viser draws every frustum with the volume scale^3; we want the depth of the others
-            scale=self.camera_size * (1.5 if through else 1.0) * float(np.cbrt(half_height**2 * aspect / 3)),
+            scale=self.camera_size * (1.5 if through else 2.2) * float(np.cbrt(half_height**2 * aspect / 3)),
             thickness=2.0,
             thickness_units="screen",
             color=AMBER if through else BLUE,

@@ -80,6 +80,10 @@ class Viewer:
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="medium")
         server.gui.main_panel.dock_right()
         server.scene.set_up_direction(scene.up_in_world)
+        server.scene.configure_default_lights(cast_shadow=False)
+        if scene.mesh is None:  # what lights meshes evenly takes weak graphics cards many seconds to prepare
+            server.scene.configure_environment_map(None)
+            server.scene.add_light_ambient("/light", intensity=1.5)
         camera = server.initial_camera
         camera.fov, camera.near, camera.far = START_FOV_RAD, 2e-3 * scene.reach, 300 * scene.reach
         camera.up, camera.look_at, camera.position = scene.up_in_world, scene.centre, scene.start
