@@ -39,7 +39,7 @@ def write_text(path: Path, text: str) -> None:
             temporary.unlink(missing_ok=True)
 
 
-def write_json(path: Path, value: object) -> None:
+def write_json(path: Path, value: object, *, indent: int | None = 2) -> None:
     """Write ``value`` as JSON, whole or not at all.
 
     Parameters
@@ -49,13 +49,15 @@ def write_json(path: Path, value: object) -> None:
     value
         Mappings with text keys, sequences, dataclass instances (as objects of their fields), numpy arrays and scalars
         (as lists and numbers), paths (as text), text, numbers, booleans, ``None``.
+    indent
+        For people to read; ``None`` keeps long lists of numbers on one line.
 
     Raises
     ------
     ValueError
         For a number that is not finite (JSON has none) or a value of another type; the message names where it is.
     """
-    write_text(path, json.dumps(_plain(value, "$"), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+    write_text(path, json.dumps(_plain(value, "$"), indent=indent, ensure_ascii=False, allow_nan=False) + "\n")
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -62,7 +62,7 @@ def write_recording(
         "rolling_shutter": None if plan is None else _shutter_record(plan, timing),
     }
     workspace.report_data.mkdir(exist_ok=True)
-    write_json(recording_file(workspace.root), record)
+    write_json(recording_file(workspace.root), record, indent=None)
 
 
 def _shutter_record(plan: ImagingPlan, timing: FrameTiming) -> dict[str, Any] | None:
@@ -115,7 +115,7 @@ def write_model_record(
         "signals": signal_record(trajectory, imu, model.scale, gravity),
     }
     workspace.report_data.mkdir(exist_ok=True)
-    write_json(model_file(workspace.root, model.index), record)
+    write_json(model_file(workspace.root, model.index), record, indent=None)
 
 
 def report_result(result: ReconstructResult, capture: Capture, project: ProjectOptions | None = None) -> None:

@@ -90,7 +90,7 @@ def write_report(
     from colmap_inertial.report.page import page_of
 
     content = gather(out, result=result, stopped=stopped, capture=capture)
-    write_json(out / "report.json", content)
+    write_json(out / "report.json", content, indent=None)
     target = out / "report.html"
     write_text(target, page_of(content, out))
     return target
