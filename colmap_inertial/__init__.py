@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     )
     from colmap_inertial.pipeline.config import read_config
     from colmap_inertial.pipeline.existing import reconstruct_project
+    from colmap_inertial.report import write_report
     from colmap_inertial.scale import estimate_scale
     from colmap_inertial.smooth import smooth_trajectory
     from colmap_inertial.types import (
@@ -105,6 +106,7 @@ _HOMES = {
     "trajectory_from_model": "model",
     "undo_project": "model.project",
     "validate_model": "validate",
+    "write_report": "report",
     "write_calibration": "io.calibration",
 }
 
@@ -158,6 +160,7 @@ __all__ = [
     "undo_project",
     "validate_model",
     "write_calibration",
+    "write_report",
 ]
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import itertools
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -13,11 +14,13 @@ from colmap_inertial.errors import FormatError, InertialError, NotObservableErro
 from colmap_inertial.io.frames import read_frame_times
 from colmap_inertial.io.imu import read_imu
 from colmap_inertial.model import read_model
+from colmap_inertial.model.project import Applied
 from colmap_inertial.options import MappingOptions, ReconstructOptions, ScaleOptions
 from colmap_inertial.pipeline import MetricStage, ReconstructResult, run_models, silent
 from colmap_inertial.pipeline.colmap import check_names, image_pairs
 from colmap_inertial.pipeline.config import config_as_toml, read_config
 from colmap_inertial.pipeline.frames import read_frame_records, write_frames
+from colmap_inertial.pipeline.terminal import show_applied
 from colmap_inertial.pipeline.workspace import StageRunner, Workspace, canonical
 from colmap_inertial.types import CameraModel, Frame, FrameTiming
 
@@ -292,3 +295,10 @@ def test_names_that_colmap_s_pair_lists_cannot_hold_are_refused():
     check_names(["IMG_1.jpg", "ü#1.png"])
     with pytest.raises(FormatError, match="without spaces"):
         check_names(["IMG_1.jpg", "IMG 2.jpg"])
+
+
+def test_square_brackets_of_notes_and_paths_reach_the_terminal(capsys):
+    applied = Applied(out=Path("out [new]"), models={}, changes=(), unchanged={}, notes=("give it under [timing]",))
+    show_applied(applied)
+    shown = capsys.readouterr().out
+    assert "[timing]" in shown and "out [new]" in shown

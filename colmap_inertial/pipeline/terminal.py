@@ -6,6 +6,7 @@ import contextlib
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from colmap_inertial.diagnose import Diagnosis
 from colmap_inertial.errors import InertialError
@@ -18,6 +19,12 @@ from colmap_inertial.pipeline.imaging import ImagingPlan
 from colmap_inertial.types import CameraImuCalibration, ScaleEstimate
 from colmap_inertial.validate import Validation, validation_table
 
+if TYPE_CHECKING:
+    from rich.text import Text
+
+#: A label and what there is to say.
+Line = tuple[str, "str | Text"]
+
 _STAGES = {
     "rendering": "Rendering",
     "video": "Video frames",
@@ -25,6 +32,7 @@ _STAGES = {
     "clocks": "Clocks",
     "selection": "Selection",
     "calibration": "Calibration",
+    "survey": "Small models",
     "blur": "Blur",
     "frames": "Frames",
     "features": "Features",
@@ -63,10 +71,11 @@ def live_progress() -> Iterator[Progress]:
         yield progress
 
 
-def scale_lines(estimate: ScaleEstimate) -> list[tuple[str, str]]:
+def scale_lines(estimate: ScaleEstimate) -> list[Line]:
     """The estimate as labelled lines."""
-    colour = _COLOUR[estimate.verdict]
-    lines = [("Verdict", f"[bold {colour}]{estimate.verdict}[/]")]
+    from rich.text import Text
+
+    lines: list[Line] = [("Verdict", Text(estimate.verdict, f"bold {_COLOUR[estimate.verdict]}"))]
     if estimate.metres_per_unit is not None and estimate.ci95 is not None:
         low, high = estimate.ci95
         half_width = 50 * (high - low) / estimate.metres_per_unit
@@ -87,17 +96,19 @@ def scale_lines(estimate: ScaleEstimate) -> list[tuple[str, str]]:
     return lines
 
 
-def _show(title: str, lines: list[tuple[str, str]]) -> None:
+def _show(title: str, lines: Sequence[Line]) -> None:
     from rich.console import Console
     from rich.panel import Panel
     from rich.table import Table
+    from rich.text import Text
 
     table = Table.grid(padding=(0, 2))
     table.add_column(style="dim", no_wrap=True)
     table.add_column(overflow="fold")
     for label, text in lines:
-        table.add_row(label, text)
-    Console().print(Panel(table, title=title, title_align="left", expand=False))
+        # not as markup: square brackets of paths and tables are meant
+        table.add_row(label, Text(text) if isinstance(text, str) else text)
+    Console().print(Panel(table, title=Text(title), title_align="left", expand=False))
 
 
 def show_scale(estimate: ScaleEstimate, source: Path) -> None:
@@ -107,11 +118,15 @@ def show_scale(estimate: ScaleEstimate, source: Path) -> None:
 
 def show_applied(applied: Applied) -> None:
     """Print what was done to a project: each sub-model's scale, and what changed by kind."""
-    lines = []
+    from rich.text import Text
+
+    lines: list[Line] = []
     for index, (folder, scale) in applied.models.items():
         done = "kept its own units" if scale.similarity is None else f"lengths times {scale.similarity.scale:.6g}"
-        verdict = "" if scale.verdict is None else f" ([bold {_COLOUR[scale.verdict]}]{scale.verdict}[/])"
-        lines.append((f"Model {index}", f"{folder}: {done}{verdict}"))
+        said = Text(f"{folder}: {done}")
+        if scale.verdict is not None:
+            said.append_text(Text.assemble(" (", (scale.verdict, f"bold {_COLOUR[scale.verdict]}"), ")"))
+        lines.append((f"Model {index}", said))
         lines += [("", reason) for reason in scale.reasons if scale.similarity is None]
     kinds: dict[str, list[str]] = {}
     for change in applied.changes:
@@ -170,12 +185,12 @@ def show_validation(result: Validation) -> None:
     Console().print(validation_table(result))
 
 
-def imaging_lines(frames: Sequence[FrameRecord], plan: ImagingPlan) -> list[tuple[str, str]]:
+def imaging_lines(frames: Sequence[FrameRecord], plan: ImagingPlan) -> list[Line]:
     """What was done to the frames, as labelled lines."""
     counts = {action: sum(frame.action == action for frame in frames) for action in ("deblurred", "dropped")}
     done = ", ".join(f"{count} {action}" for action, count in counts.items() if count)
     view = plan.view
-    lines = [
+    lines: list[Line] = [
         ("Deblurring", f"{done} of {len(frames)} frames: {plan.deblur_note}" if done else plan.deblur_note),
         ("Shutter", plan.rolling_shutter_note),
     ]
@@ -200,7 +215,7 @@ def show_result(result: ReconstructResult) -> None:
     registered = f" of {used} registered ({len(frames)} frames)" if frames else ""
     for model in result.models:
         summary = model.summary
-        lines = [
+        lines: list[Line] = [
             ("Images", f"{summary['registered_images']}{registered}"),
             ("Points", f"{summary['points']}, mean reprojection error {summary['mean_reprojection_error_px']:.2f} px"),
             *(imaging_lines(frames, result.imaging) if frames else []),
