@@ -24,6 +24,7 @@ from colmap_inertial.pipeline import prior_calibration, reconstruct, silent
 from colmap_inertial.pipeline.deblur import deblur_capture
 from colmap_inertial.pipeline.imaging import plan_imaging, read_plan, with_stated_exposures, write_plan
 from colmap_inertial.pipeline.metadata import carry_metadata, stated_exposures_s
+from colmap_inertial.pipeline.selection import part_of
 from colmap_inertial.simulate import MotionOptions, make_motion
 
 QUICK = ReconstructOptions(mapping=MappingOptions(max_num_features=2000, first_octave=0), deterministic=True)
@@ -285,6 +286,10 @@ def test_a_stabilised_video_is_refused_where_asked_and_left_alone_otherwise(tmp_
     plan = plan_imaging(loaded, imu, timing, prior, deblur=None, rolling_shutter=None, **known)
     assert plan.frame_stages() == [] == plan.keypoint_stages()
     assert "stabilised" in plan.deblur_note and "stabilised" in plan.rolling_shutter_note
+    # where a few frames were chosen from the video, all of them are followed
+    few = part_of(timing, timing.names[::7])
+    with pytest.raises(NotObservableError, match="stabilised"):
+        plan_imaging(loaded, imu, few, prior, deblur=None, rolling_shutter="rectify", every=timing, **known)
 
 
 def test_rectifying_needs_a_readout(tmp_path, blurred):

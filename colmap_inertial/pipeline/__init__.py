@@ -176,11 +176,12 @@ def reconstruct(
         doubts = stop_or_doubt(diagnosis, force=options.force)
         runner = StageRunner(workspace)
         inputs = _inputs(loaded, timing)
+        every = timing
         selection = run_selection(runner, workspace, loaded, imu, timing, prior, options, inputs, progress)
         if len(selection.names) < len(timing.names):
             timing = part_of(timing, selection.names)
             _, frames = read_frames(loaded, only=timing.names)
-        plan = run_plan(runner, workspace, loaded, imu, timing, options, progress)
+        plan = run_plan(runner, workspace, loaded, imu, timing, options, progress, every=every)
         of_frames = list(plan.frame_stages() if frame_stages is None else frame_stages)
         of_keypoints = list(plan.keypoint_stages() if keypoint_stages is None else keypoint_stages)
         kept = CropKeeper.of(plan)
@@ -224,8 +225,13 @@ def run_plan(
     timing: FrameTiming,
     options: ReconstructOptions,
     progress: Progress,
+    *,
+    every: FrameTiming | None = None,
 ) -> ImagingPlan:
-    """What to do to frames and keypoints; with both switched off, nothing is looked at."""
+    """What to do to frames and keypoints; with both switched off, nothing is looked at.
+
+    ``every``: all frames of the video that ``timing``'s were chosen from.
+    """
     prior = prior_calibration(capture, options)
 
     def work(partial: Sequence[Path]) -> None:
@@ -237,6 +243,7 @@ def run_plan(
             deblur=options.deblur,
             rolling_shutter=options.rolling_shutter,
             scratch=workspace.stamps,
+            every=every,
             max_offset_s=options.scale.max_offset_s,
             num_threads=1 if options.deterministic else -1,
             seed=options.seed,

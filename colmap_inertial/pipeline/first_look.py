@@ -103,6 +103,7 @@ def look_first(
     timing: FrameTiming,
     prior: CameraImuCalibration,
     *,
+    every: FrameTiming | None = None,
     max_offset_s: float | None,
     scratch: Path,
     num_threads: int,
@@ -117,6 +118,8 @@ def look_first(
         The recording.
     prior
         What is known; used as it stands where that is enough.
+    every
+        All frames of the video that ``timing``'s were chosen from: pixels are followed from one to the next.
     max_offset_s
         Largest offset between the clocks.
     scratch
@@ -133,10 +136,11 @@ def look_first(
     """
     camera = guessed_camera(capture, timing)
     options = AlignOptions(max_offset_s=max_offset_s)
-    is_video = len(timing.t_s) > 1 and float(np.median(np.diff(timing.t_s))) <= _VIDEO_STEP_S
+    every = every or timing
+    is_video = len(every.t_s) > 1 and float(np.median(np.diff(every.t_s))) <= _VIDEO_STEP_S
     rotation_rad, offset_s = _sigmas(prior)
     declared = rotation_rad <= _GOOD_ROTATION_RAD and offset_s <= _GOOD_OFFSET_S
-    rotation = _followed(capture, timing, camera, progress) if is_video else None
+    rotation = _followed(capture, every, camera, progress) if is_video else None
     found: GyroView | NotObservableError
     models: tuple[pycolmap.Reconstruction, ...] = ()
     if declared:
@@ -145,7 +149,7 @@ def look_first(
     else:
         found, models = _by_model(capture, imu, timing, prior, options, scratch, num_threads, seed, progress)
         if isinstance(found, NotObservableError):
-            rotation = rotation or _followed(capture, timing, camera, progress)
+            rotation = rotation or _followed(capture, every, camera, progress)
             found = _by_pixels(rotation, imu, timing, prior, options, camera, found)
     if rotation is not None:
         known_s = None if isinstance(found, NotObservableError) else found.motion().offset_s

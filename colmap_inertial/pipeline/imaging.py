@@ -180,6 +180,7 @@ def plan_imaging(
     deblur: DeblurMethod | None,
     rolling_shutter: RollingShutterMethod | None,
     scratch: Path,
+    every: FrameTiming | None = None,
     max_offset_s: float | None = None,
     num_threads: int = -1,
     seed: int = 0,
@@ -197,6 +198,8 @@ def plan_imaging(
         ``None`` does what the recording allows; what is asked for by name and not possible is an error.
     scratch
         A folder for temporary files.
+    every
+        All frames of the video that ``timing``'s were chosen from.
     max_offset_s
         Largest offset between the clocks.
     num_threads, seed
@@ -233,6 +236,7 @@ def plan_imaging(
             imu,
             timing,
             prior,
+            every=every,
             max_offset_s=max_offset_s,
             scratch=scratch,
             num_threads=num_threads,
