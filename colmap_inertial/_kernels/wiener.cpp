@@ -4,6 +4,7 @@
 
 #include <algorithm>
 #include <atomic>
+#include <climits>
 #include <cmath>
 #include <cstring>
 #include <ctime>
@@ -126,14 +127,27 @@ class Encoder {
     std::vector<uint8_t> nearest_;
 };
 
-// Linear light of an image, smoothed, with its mirrored surroundings. Smoothed a band of rows at a time, so that what is
-// in between stays in the cache; a symmetric filter makes mirrored surroundings of mirrored surroundings.
+constexpr int BAND = 48;  // rows of a plane that are made together
+
+// What is read of a band of rows: nothing, or a range of columns.
+struct Span {
+    int first = INT_MAX, last = 0;
+    bool empty() const { return first >= last; }
+    void include(int from, int to) {
+        first = std::min(first, from);
+        last = std::max(last, to);
+    }
+};
+
+// Linear light of an image, smoothed, with its mirrored surroundings, where it is read. Smoothed a band of rows at a
+// time, so that what is in between stays in the cache; mirroring goes before smoothing or after it alike.
 template <class Code>
 class Filling {
   public:
-    Filling(Plane &plane, const Code *image, Image size, int channel, bool transposed, const Codec &codec,
-            const Table &table, const Simd &simd)
+    Filling(Plane &plane, const std::vector<Span> &spans, const Code *image, Image size, int channel, bool transposed,
+            const Codec &codec, const Table &table, const Simd &simd)
         : plane_(plane),
+          spans_(spans),
           image_(image + channel),
           codec_(codec),
           table_(table),
@@ -147,20 +161,26 @@ class Filling {
     }
 
     void run(int threads) {
-        in_parallel((minor_ + BAND - 1) / BAND, threads, [&](int i) { band(i * BAND, std::min(minor_, (i + 1) * BAND)); });
-        const int outside = plane_.height - minor_;
-        in_parallel(outside, threads, [&](int i) {
+        in_parallel(int(spans_.size()), threads, [&](int i) {
+            if (!spans_[size_t(i)].empty()) band(i * BAND, std::min(minor_, (i + 1) * BAND), spans_[size_t(i)]);
+        });
+        in_parallel(plane_.height - minor_, threads, [&](int i) {
             const int y = i < plane_.before_minor ? i - plane_.before_minor : minor_ + i - plane_.before_minor;
-            std::copy_n(line(mirrored(y, minor_)), plane_.width, line(y));
+            const int inside = mirrored(y, minor_);
+            const Span span = spans_[size_t(inside / BAND)];
+            if (span.empty()) return;
+            const int first = span.first == 0 ? 0 : plane_.before_major + span.first;
+            const int last = span.last == major_ ? plane_.width : plane_.before_major + span.last;
+            std::copy(line(inside) + first, line(inside) + last, line(y) + first);
         });
     }
 
   private:
-    static constexpr int BAND = 48, TOGETHER = 16;  // transposed, 16 rows lie on the same cache lines of the image
+    static constexpr int TOGETHER = 16;  // transposed, 16 rows lie on the same cache lines of the image
 
     float *line(int y) const { return plane_.data.get() + (y + plane_.before_minor) * plane_.stride; }
 
-    void band(int first, int last) {
+    void band(int first, int last, Span span) {
         const int radius = table_.radius;
         const size_t margin = size_t((radius + 15) / 16 * 16), pitch = (size_t(major_) + 2 * margin + 15) / 16 * 16;
         // light as it was decoded, and smoothed along the rows: room for as many as are alive
@@ -173,48 +193,53 @@ class Filling {
             float *raw[TOGETHER];
             for (int r = 0; r < count; ++r)
                 raw[r] = radius ? room.data() + size_t(r) * pitch + margin : line(y + r) + plane_.before_major;
-            decode(y, count, raw);
-            for (int r = 0; r < count && radius; ++r) along(raw[r], rows + size_t(y + r - low) * pitch);
+            decode(y, count, std::max(0, span.first - radius), std::min(major_, span.last + radius), raw);
+            for (int r = 0; r < count && radius; ++r) along(raw[r], span, rows + size_t(y + r - low) * pitch);
         }
         for (int y = first; y < last; ++y) {
             float *target = line(y) + plane_.before_major;
-            if (radius) across(rows + size_t(y - low) * pitch, ptrdiff_t(pitch), target);
-            for (int x = -plane_.before_major; x < 0; ++x) target[x] = target[mirrored(x, major_)];
-            for (int x = major_; x < plane_.width - plane_.before_major; ++x) target[x] = target[mirrored(x, major_)];
+            if (radius) combine(rows + size_t(y - low) * pitch, ptrdiff_t(pitch), span, target);
+            auto mirror = [&](int from, int to) {
+                for (int x = from; x < to; ++x) {
+                    const int inside = mirrored(x, major_);
+                    if (inside >= span.first && inside < span.last) target[x] = target[inside];
+                }
+            };
+            if (span.first == 0) mirror(-plane_.before_major, 0);
+            if (span.last == major_) mirror(major_, plane_.width - plane_.before_major);
         }
     }
 
-    void decode(int first, int count, float *const *target) const {
+    void decode(int first, int count, int from, int to, float *const *target) const {
         const Code *source[TOGETHER];
         for (int r = 0; r < count; ++r) source[r] = image_ + mirrored(first + r, minor_) * minor_step_;
         if (count == 1)
-            for (int x = 0; x < major_; ++x) target[0][x] = light_of(source[0][x * major_step_], codec_);
+            for (int x = from; x < to; ++x) target[0][x] = light_of(source[0][x * major_step_], codec_);
         else
-            for (int x = 0; x < major_; ++x)
+            for (int x = from; x < to; ++x)
                 for (int r = 0; r < count; ++r) target[r][x] = light_of(source[r][x * major_step_], codec_);
     }
 
-    void along(float *row, float *target) const {
-        const float *sources[1 + 2 * MOST_RADIUS] = {row};
+    void along(float *row, Span span, float *target) const {
         for (int k = 1; k <= table_.radius; ++k) {
-            row[-k] = row[mirrored(-k, major_)];
-            row[major_ - 1 + k] = row[mirrored(major_ - 1 + k, major_)];
-            sources[2 * k - 1] = row - k;
-            sources[2 * k] = row + k;
+            if (span.first < table_.radius) row[-k] = row[mirrored(-k, major_)];
+            if (span.last > major_ - table_.radius) row[major_ - 1 + k] = row[mirrored(major_ - 1 + k, major_)];
         }
-        simd_.combine(sources, table_.smoothing, table_.radius, target, major_);
+        combine(row, 1, span, target);
     }
 
-    void across(const float *row, ptrdiff_t pitch, float *target) const {
-        const float *sources[1 + 2 * MOST_RADIUS] = {row};
+    // Weighted sums of what lies `step` apart, of a range of columns.
+    void combine(const float *row, ptrdiff_t step, Span span, float *target) const {
+        const float *sources[1 + 2 * MOST_RADIUS] = {row + span.first};
         for (int k = 1; k <= table_.radius; ++k) {
-            sources[2 * k - 1] = row - k * pitch;
-            sources[2 * k] = row + k * pitch;
+            sources[2 * k - 1] = row + span.first - k * step;
+            sources[2 * k] = row + span.first + k * step;
         }
-        simd_.combine(sources, table_.smoothing, table_.radius, target, major_);
+        simd_.combine(sources, table_.smoothing, table_.radius, target + span.first, span.last - span.first);
     }
 
     Plane &plane_;
+    const std::vector<Span> &spans_;
     const Code *image_;
     const Codec &codec_;
     const Table &table_;
@@ -369,25 +394,51 @@ class Deblur {
   private:
     void decode() {
         for (const bool transposed : {false, true}) {
+            const int major = transposed ? size_.height : size_.width, minor = transposed ? size_.width : size_.height;
+            std::vector<Span> spans(size_t((minor + BAND - 1) / BAND));
             int reach = 0;
             float steepest = 0;
             bool needed = false;
-            for (int cell = 0; cell < field_.ny * field_.nx; ++cell)
-                if (field_.along_y[cell] == transposed && !faded(cell / field_.nx, cell % field_.nx)) {
+            for (int cy = 0; cy < field_.ny; ++cy)
+                for (int cx = 0; cx < field_.nx; ++cx) {
+                    const int cell = cy * field_.nx + cx;
+                    if (field_.along_y[cell] != transposed || faded(cy, cx)) continue;
                     needed = true;
-                    reach = std::max(reach, table_.reach[row_of(cell) + 1]);
-                    steepest = std::max(steepest, std::abs(field_.slope[cell]));
+                    const float steep = std::abs(field_.slope[cell]);
+                    const int along = table_.reach[row_of(cell) + 1], across = int(std::ceil(float(along) * steep)) + 1;
+                    reach = std::max(reach, along);
+                    steepest = std::max(steepest, steep);
+                    const int at_major = (transposed ? cy : cx) * CELL, at_minor = (transposed ? cx : cy) * CELL;
+                    include(spans, at_minor - across, at_minor + CELL + across, minor, at_major - along,
+                            at_major + CELL + along, major);
                 }
             if (!needed) continue;
             for (int channel = 0; channel < size_.channels; ++channel) {
                 Plane plane;
-                const int major = (transposed ? field_.ny : field_.nx) * CELL,
-                          minor = (transposed ? field_.nx : field_.ny) * CELL;
-                plane.allocate(major, minor, reach, steepest);
-                Filling<Code>(plane, image_, size_, channel, transposed, codec_, table_, simd_).run(threads_);
+                plane.allocate((transposed ? field_.ny : field_.nx) * CELL, (transposed ? field_.nx : field_.ny) * CELL,
+                               reach, steepest);
+                Filling<Code>(plane, spans, image_, size_, channel, transposed, codec_, table_, simd_).run(threads_);
                 planes_[transposed].push_back(std::move(plane));
             }
         }
+    }
+
+    // Rows [top, bottom) and columns [left, right), of which some are the mirror images of others inside.
+    static void include(std::vector<Span> &spans, int top, int bottom, int minor, int left, int right, int major) {
+        // as far inside the border as it reaches beyond it; where that is nearly everything, everything
+        auto within = [](int &from, int &to, int size) {
+            const int before = std::max(0, -from), beyond = std::max(0, to - size);
+            if (before >= size || beyond >= size) {
+                from = 0, to = size;
+                return;
+            }
+            const int low = std::min(std::max(0, from), size - 1 - beyond);
+            to = std::min(size, std::max(to, before + 1));
+            from = beyond > 0 ? std::max(0, low) : std::max(0, from);
+        };
+        within(top, bottom, minor);
+        within(left, right, major);
+        for (int i = top / BAND; i <= (bottom - 1) / BAND; ++i) spans[size_t(i)].include(left, right);
     }
 
     const float *corner(int cy, int cx) const { return field_.fade + size_t(cy) * (field_.nx + 1) + cx; }
