@@ -414,8 +414,10 @@ def test_noise_is_measured_and_clean_pictures_are_left_alone():
     for sigma in (2.0, 6.0):
         noisy = np.clip(clean + rng.normal(0, sigma, clean.shape), 0, 255).astype(np.uint8)
         assert noise_of(noisy) == pytest.approx(sigma, rel=0.15)
-    assert smoothing(0.3) == (0.0, 0)
-    assert smoothing(5.0)[0] > 1
+    even, rich = np.full((60, 80), 90, dtype=np.uint8), texture(80, 60, seed=0).astype(np.uint8)
+    assert smoothing(even, 0.3) == (0.0, 0)
+    assert smoothing(even, 5.0)[0] > 1
+    assert smoothing(rich, 5.0) == (0.0, 5)
     assert noise_of(np.zeros((4, 4), dtype=np.uint8)) == 0
 
 

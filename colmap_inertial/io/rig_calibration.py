@@ -197,7 +197,8 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     def matrix(loader: yaml.SafeLoader, node: yaml.MappingNode) -> object:
         return loader.construct_mapping(node, deep=True).get("data")
 
-    Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", matrix)
+    for tag in ("opencv-matrix", "opencv-nd-matrix"):  # OpenCV 5 writes the latter for one-dimensional arrays
+        Loader.add_constructor(f"tag:yaml.org,2002:{tag}", matrix)
     text = read_text(path)
     if text.startswith("%YAML"):  # OpenCV's spelling of the version line, which YAML does not know
         text = "#" + text

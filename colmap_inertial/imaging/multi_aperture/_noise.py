@@ -13,7 +13,9 @@ _EVEN = 0.1
 #: Noise of so many codes is smoothed over ``_WIDTH_PX`` (standard deviation of a Gaussian), more noise with its square
 #: root; below half a pixel nothing is.
 _NOISE_CODES, _WIDTH_PX, _LEAST_PX = 1.3, 0.7, 0.5
-#: Differences below so many standard deviations do not tell which of two pixels is brighter.
+#: Texture of so many times the noise, in windows of 5 x 5 pixels, stands out of it.
+_STANDS_OUT = 1.5
+#: In what was smoothed, differences below so many standard deviations do not tell which of two pixels is brighter.
 _TELLING = 1.5
 
 
@@ -42,10 +44,21 @@ def noise_of(plane: NDArray[Any]) -> float:
     return float(np.quantile(level, _EVEN) * np.sqrt(np.pi / 2) / 6) if level.size else 0.0
 
 
-def smoothing(noise_codes: float) -> tuple[float, int]:
-    """Standard deviation in pixels over which to smooth (0: not), and the least difference of codes that tells."""
+def smoothing(codes: NDArray[np.uint8], noise_codes: float) -> tuple[float, int]:
+    """Over how many pixels (standard deviation) to smooth before comparing, and the least difference that tells.
+
+    Nothing is smoothed where at least half of the picture has texture that stands out of the noise: there it would cost
+    more detail than it gains.
+    """
+    import cv2
+
     width_px = _WIDTH_PX * float(np.sqrt(noise_codes / _NOISE_CODES))
     if width_px < _LEAST_PX:
-        return 0.0, 0
+        return 0.0, round(noise_codes)
+    image = codes.astype(np.float32)
+    mean = cv2.blur(image, (5, 5))
+    variance = cv2.blur(image * image, (5, 5)) - mean * mean
+    if float(np.median(variance)) * 25 / 24 - noise_codes**2 > (_STANDS_OUT * noise_codes) ** 2:
+        return 0.0, round(noise_codes)
     left = noise_codes / (2 * np.sqrt(np.pi) * width_px)
     return width_px, round(_TELLING * np.sqrt(2) * left)

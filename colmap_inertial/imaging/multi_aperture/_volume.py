@@ -21,7 +21,7 @@ MOST = (2 * CENSUS_RADIUS + 1) ** 2 - 1
 #: A pixel that no view sees costs this share of the most: more than a good match, less than a poor one.
 _UNSEEN = 0.25
 #: Penalties for disparities that change by one candidate, and by more, in shares of the most that all views can cost.
-_SMALL, _JUMP = 0.15, 1.5
+_SMALL, _JUMP = 0.2, 2.0
 #: The jump's penalty is divided by the change of brightness over this many codes: edges of things are where they look
 #: different (Hirschmueller 2008, after equation 12).
 _EDGE_CODES = 8

@@ -96,7 +96,7 @@ def _codes(planes: Sequence[NDArray[Any]], canvas: Rectified) -> tuple[Codes, in
     codes, least = [], 0
     for i, plane in enumerate(planes):
         of_plane = codes_of(plane)
-        width_px, telling = smoothing(noise_of(of_plane))
+        width_px, telling = smoothing(of_plane, noise_of(of_plane))
         least = telling if i == 0 else least
         if width_px > 0:
             of_plane = np.asarray(cv2.GaussianBlur(of_plane, (0, 0), width_px))

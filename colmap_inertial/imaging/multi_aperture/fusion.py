@@ -158,7 +158,7 @@ def fuse_with(
             hidden |= missing
     colours = np.stack([roles[role] for role in COLOURS], axis=-1)
     if "luminance" in roles:
-        colours = _with_luminance(colours, roles["luminance"])
+        colours = with_luminance(colours, roles["luminance"])
     image = np.clip(np.rint(top * colours), 0, top).astype(planes[0].dtype)
     return Fused(
         image=image,
@@ -213,7 +213,7 @@ class _Grid:
         return np.clip(values, 0, 1), inside & self._nearest(self.found.visible[index - 1])
 
 
-def _with_luminance(colours: Real, luminance: Real) -> Real:
+def with_luminance(colours: Real, luminance: Real) -> Real:
     """Colours with the noise of luminance instead of their own, as far as they go with it."""
     import cv2
 

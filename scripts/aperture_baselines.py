@@ -1,0 +1,146 @@
+"""What multi-aperture fusion is measured against: no correction, pairs by themselves, OpenCV, graph cuts."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import breadth_first_order, maximum_flow
+
+from colmap_inertial.imaging.multi_aperture import Disparity, Rectified, fuse_apertures, rectify
+from colmap_inertial.imaging.multi_aperture.disparity import background
+from colmap_inertial.imaging.multi_aperture.fusion import COLOURS, with_luminance
+from colmap_inertial.model import colmap_camera
+from colmap_inertial.options import ApertureOptions
+from colmap_inertial.types import Aperture, ApertureRig
+
+Planes = list[NDArray[np.uint8]]
+
+
+def canvas_of(rig: ApertureRig) -> Rectified:
+    """The rig's canvas, with COLMAP's cameras."""
+    return rectify(rig, [colmap_camera(aperture.camera) for aperture in rig.apertures])
+
+
+def direct(planes: Planes, rig: ApertureRig) -> NDArray[np.uint8]:
+    """The colours on each other as they are."""
+    roles = [aperture.role for aperture in rig.apertures]
+    return np.stack([planes[roles.index(role)] for role in COLOURS], axis=-1)
+
+
+def pairwise(
+    planes: Planes, rig: ApertureRig, options: ApertureOptions
+) -> tuple[NDArray[np.uint8], list[NDArray[np.float32]]]:
+    """Each view matched with the reference alone, and warped by what that gives; all else as in the package.
+
+    Also the disparities of each pair, in pixels between the reference and its partner.
+    """
+    found: dict[str, NDArray[np.float32]] = {rig.reference.role: planes[0].astype(np.float32) / 255}
+    maps = []
+    partner = rig.apertures[1].cam_in_rig - rig.reference.cam_in_rig
+    for plane, aperture in zip(planes[1:], rig.apertures[1:], strict=True):
+        ratio = float(np.linalg.norm(aperture.cam_in_rig - rig.reference.cam_in_rig) / np.linalg.norm(partner))
+        # the view twice, so that there are three colours: costs and penalties double, the result stays
+        trio = [rig.reference, aperture, aperture]
+        apertures = tuple(
+            Aperture(**{**vars(a), "name": role, "role": role}) for a, role in zip(trio, COLOURS, strict=True)
+        )
+        limits = options.disparity_px
+        of_pair = ApertureOptions(
+            cost=options.cost,
+            step_px=options.step_px,
+            use_luminance=False,
+            disparity_px=None if limits is None else (ratio * limits[0], ratio * limits[1]),
+        )
+        pair = ApertureRig(apertures=apertures)
+        fused = fuse_apertures([planes[0], plane, plane], pair, canvas_of(pair), of_pair)
+        found[aperture.role] = fused.image[..., 1].astype(np.float32) / 255
+        maps.append(fused.disparity_px / ratio)
+    colours = np.stack([found[role] for role in COLOURS], axis=-1)
+    if options.use_luminance and "luminance" in found:
+        colours = with_luminance(colours, found["luminance"])
+    return np.clip(np.rint(255 * colours), 0, 255).astype(np.uint8), maps
+
+
+def opencv_disparity(
+    left: NDArray[np.uint8], right: NDArray[np.uint8], low_px: float, high_px: float
+) -> NDArray[np.float32]:
+    """StereoSGBM with eight paths, at the parameters of OpenCV's own sample; gaps as the package fills them."""
+    first = int(np.floor(low_px)) - 1
+    count = 16 * int(np.ceil((high_px + 2 - first) / 16))
+    side = 5
+    matcher = cv2.StereoSGBM_create(
+        minDisparity=first,
+        numDisparities=count,
+        blockSize=side,
+        P1=8 * side * side,
+        P2=32 * side * side,
+        disp12MaxDiff=1,
+        uniquenessRatio=10,
+        speckleWindowSize=100,
+        speckleRange=2,
+        mode=cv2.STEREO_SGBM_MODE_HH,
+    )
+    # beyond the border there is nothing to compare: OpenCV leaves a strip as wide as the search
+    reach = max(abs(first), abs(first + count)) + side
+    padded = [cv2.copyMakeBorder(p, 0, 0, reach, reach, cv2.BORDER_REPLICATE) for p in (left, right)]
+    found = matcher.compute(*padded)[:, reach:-reach].astype(np.float32) / 16
+    return background(found, found >= first)
+
+
+def as_disparity(disparity_px: NDArray[np.float32], views: int) -> Disparity:
+    """Somebody else's disparities, everywhere visible."""
+    everywhere = np.ones(disparity_px.shape, dtype=bool)
+    return Disparity(disparity_px=disparity_px, measured=everywhere, visible=np.repeat(everywhere[None], views, axis=0))
+
+
+def expansion_moves(
+    cost: NDArray[np.uint8], guide: NDArray[np.uint8], *, small: int, jump: NDArray[np.uint16], cycles: int = 2
+) -> NDArray[np.int64]:
+    """Labels by alpha-expansion (Boykov, Veksler, Zabih, PAMI 23(11), 2001) with scipy's maximum flow.
+
+    The energy is that of semi-global matching, on the four neighbours: ``small`` for labels that differ by one,
+    ``jump`` of the guide's difference for more. Terms that are not submodular are cut to what is (Rother et al., 2005).
+    """
+    height, width, labels = cost.shape
+    index = np.arange(height * width).reshape(height, width)
+    p = np.concatenate([index[:, :-1].ravel(), index[:-1].ravel()])
+    q = np.concatenate([index[:, 1:].ravel(), index[1:].ravel()])
+    codes = guide.ravel().astype(int)
+    # two neighbours each way, where the paths have eight: twice the penalty
+    limit = 2 * jump[np.abs(codes[p] - codes[q])].astype(np.int64)
+    data = cost.reshape(-1, labels).astype(np.int64)
+
+    def pair(a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.int64]:
+        d = np.abs(a - b)
+        return np.where(d == 0, 0, np.where(d == 1, 2 * small, np.maximum(limit, 2 * small)))
+
+    labelling = data.argmin(axis=1)
+    source, sink = height * width, height * width + 1
+    for _ in range(cycles):
+        for alpha in range(labels):
+            to = np.full_like(p, alpha)
+            keep, first, second = pair(labelling[p], labelling[q]), pair(to, labelling[q]), pair(labelling[p], to)
+            keep = np.minimum(keep, first + second)
+            # variable 1: takes alpha. E = keep (1-x)(1-y) + first x (1-y) + second (1-x) y
+            unary = data[:, alpha] - data[np.arange(len(data)), labelling]
+            np.add.at(unary, p, first - keep)
+            np.add.at(unary, q, -first)
+            edge = first + second - keep
+            rows = np.concatenate([p, np.full(len(unary), source), np.arange(len(unary))])
+            columns = np.concatenate([q, np.arange(len(unary)), np.full(len(unary), sink)])
+            # edge: paid where p keeps its label and q takes alpha
+            capacity = np.concatenate([edge, np.maximum(unary, 0), np.maximum(-unary, 0)])
+            used = capacity > 0
+            graph = coo_array(
+                (capacity[used].astype(np.int32), (rows[used], columns[used])), shape=(sink + 1, sink + 1)
+            ).tocsr()
+            flow = maximum_flow(graph, source, sink).flow
+            rest = graph - flow
+            rest.data[rest.data < 0] = 0
+            rest.eliminate_zeros()
+            reached = np.zeros(sink + 1, dtype=bool)
+            reached[breadth_first_order(rest, source, return_predecessors=False)] = True
+            labelling = np.where(reached[:source], labelling, alpha)
+    return labelling.reshape(height, width)
