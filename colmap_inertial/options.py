@@ -202,6 +202,8 @@ class ApertureOptions:
     behind infinity (default: found for each exposure in a smaller picture)."""
     step_px: float = 0.5
     """Spacing of the shifts that are tried; between them a parabola is fitted."""
+    luminance_cost: bool = True
+    """Also compare the luminance aperture with what the colours add up to, where there are all four."""
     use_luminance: bool = True
     """Let an aperture without colour filter lend its lower noise to the colours."""
     threads: int | None = None

@@ -183,15 +183,26 @@ def antinous_case(folder: Path, step: int, roles: str, noise: float) -> list[dic
     for light in (True, False) if noise else (True,):
         suffix = "" if light else ", no luminance"
         for cost in ("census", "mutual-information"):
-            options = ApertureOptions(cost=cost, disparity_px=limits, use_luminance=light)  # type: ignore[arg-type]
+            options = ApertureOptions(
+                cost=cost,  # type: ignore[arg-type]
+                disparity_px=limits,
+                use_luminance=light,
+                luminance_cost=False,
+            )
             start = time.perf_counter()
             fused = fuse_apertures(planes, rig, canvas, options)
             row(f"four views, {cost}{suffix}", fused.image, [fused.disparity_px], time.perf_counter() - start)
             start = time.perf_counter()
             image, maps = pairwise(planes, rig, options)
             row(f"pair by pair, {cost}{suffix}", image, maps, time.perf_counter() - start)
+    fused = fuse_apertures(planes, rig, canvas, ApertureOptions(cost="mutual-information", disparity_px=limits))
+    row("four views, mutual-information and luminance cost", fused.image, [fused.disparity_px], None)
+    start = time.perf_counter()
+    fused = fuse_apertures(planes, rig, canvas, ApertureOptions(disparity_px=limits))
+    seconds = time.perf_counter() - start
+    row("four views, census and luminance cost", fused.image, [fused.disparity_px], seconds)
     fused = fuse_apertures(planes, rig, canvas)
-    row("four views, census, range found", fused.image, [fused.disparity_px], None)
+    row("the same, range found (the default)", fused.image, [fused.disparity_px], None)
     start = time.perf_counter()
     found = opencv_disparity(planes[0], planes[1], *limits)
     image = fuse_with(planes, rig, canvas, as_disparity(found, 3)).image
@@ -260,13 +271,16 @@ def bench_cones(folder: Path) -> list[dict[str, Any]]:
     seen = known & (there >= 0) & (back > 0) & (np.abs(back - truth) <= 1)
     rows: list[dict[str, Any]] = []
 
-    def row(way: str, found: NDArray[Any]) -> None:
+    def row(way: str, found: NDArray[Any], measured: NDArray[np.bool_] | None = None) -> None:
         wrong = np.abs(found - truth) > 1
+        both = seen if measured is None else seen & measured
         rows.append(
             {
                 "way": way,
                 "wrong_seen_pct": 100 * float(wrong[seen].mean()),
                 "wrong_known_pct": 100 * float(wrong[known].mean()),
+                "measured_pct": None if measured is None else 100 * float(measured[seen].mean()),
+                "wrong_measured_pct": None if measured is None else 100 * float(wrong[both].mean()),
             }
         )
 
@@ -274,21 +288,24 @@ def bench_cones(folder: Path) -> list[dict[str, Any]]:
     grey = [cv2.cvtColor(p, cv2.COLOR_RGB2GRAY) for p in (left, right)]
     row("StereoSGBM, grey", opencv_disparity(grey[0], grey[1], *limits))
 
-    def ours(first: NDArray[np.uint8], second: NDArray[np.uint8], cost: str) -> NDArray[np.float32]:
+    def ours(
+        first: NDArray[np.uint8], second: NDArray[np.uint8], cost: str
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         rig = rig_of(("other", "other"), ((0, 0), (1, 0)), width, height)
         options = ApertureOptions(cost=cost, disparity_px=limits)  # type: ignore[arg-type]
-        return estimate_disparity([first, second], canvas_of(rig), options).disparity_px
+        found = estimate_disparity([first, second], canvas_of(rig), options)
+        return found.disparity_px, found.measured
 
-    row("census, grey", ours(grey[0], grey[1], "census"))
+    row("census, grey", *ours(grey[0], grey[1], "census"))
     for cost in ("census", "mutual-information"):
         of_cost = []
         for i in range(3):
             for j in range(3):
                 if i != j:
                     channels = [np.ascontiguousarray(p[..., c]) for p, c in ((left, i), (right, j))]
-                    row(f"{cost}, {'RGB'[i]} and {'RGB'[j]}", ours(channels[0], channels[1], cost))
+                    row(f"{cost}, {'RGB'[i]} and {'RGB'[j]}", *ours(channels[0], channels[1], cost))
                     of_cost.append(rows[-1])
-        mean = {k: float(np.mean([r[k] for r in of_cost])) for k in ("wrong_seen_pct", "wrong_known_pct")}
+        mean = {k: float(np.mean([r[k] for r in of_cost])) for k in rows[-1] if k != "way"}
         rows.append({"way": f"{cost}, channels split, mean", **mean})
     channels = [np.ascontiguousarray(p[..., c]) for p, c in ((left, 0), (right, 1))]
     row("StereoSGBM, R and G", opencv_disparity(channels[0], channels[1], *limits))

@@ -19,6 +19,7 @@ from colmap_inertial.imaging.multi_aperture import (
 from colmap_inertial.imaging.multi_aperture._fill import fill_hidden
 from colmap_inertial.imaging.multi_aperture._geometry import transfer, trifocal_tensor
 from colmap_inertial.imaging.multi_aperture._information import cost_tables
+from colmap_inertial.imaging.multi_aperture._light import adds_up, light_cost
 from colmap_inertial.imaging.multi_aperture._noise import noise_of, smoothing
 from colmap_inertial.imaging.multi_aperture._reference import matching_costs_reference, semi_global_reference
 from colmap_inertial.imaging.multi_aperture.disparity import background
@@ -406,6 +407,32 @@ def test_luminance_lends_its_lower_noise():
         for use in (True, False)
     )
     assert with_it > without + 4
+
+
+def test_the_luminance_cost_knows_what_the_colours_add_up_to():
+    base = texture(240, 200, seed=0)
+    colours = [base, 0.6 * base + 0.4 * texture(240, 200, seed=1), 0.7 * base + 0.3 * texture(240, 200, seed=2)]
+    planes, truth, rig = plane_views(160, 120, 5.0, (0.02, 0.01), colours=colours)
+    canvas = rectify(rig, projectors(rig))
+    roles = [aperture.role for aperture in rig.apertures]
+    assert adds_up(roles) and not adds_up(roles[:3])
+    found = light_cost(np.stack(planes), canvas, truth.astype(np.float32), roles, 24)
+    assert found is not None
+    assert np.allclose(found.blend[:3] / 256, 1 / 3, atol=0.02)
+    assert found.blend[3] == -256
+    assert found.table[0] == 0 and found.table[-1] == 24
+    with_it, without = (
+        estimate_disparity(
+            planes,
+            canvas,
+            ApertureOptions(threads=1, disparity_px=(0.0, 10.0), luminance_cost=use),
+            roles=roles,
+        )
+        for use in (True, False)
+    )
+    inner = (slice(16, -16), slice(16, -16))
+    errors = [np.abs(d.disparity_px - truth)[inner].mean() for d in (with_it, without)]
+    assert errors[0] < errors[1]
 
 
 def test_noise_is_measured_and_clean_pictures_are_left_alone():

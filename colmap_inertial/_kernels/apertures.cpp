@@ -66,6 +66,7 @@ class Band {
           mismatches_(size_t(pitch_)),
           sum_(size_t(pitch_)),
           seen_(size_t(pitch_)),
+          residual_(size_t(pitch_)),
           costs_(size_t(input.sides.candidates) * pitch_) {}
 
     void run(int begin, int end, uint8_t *cost) {
@@ -147,15 +148,11 @@ class Band {
 
     // The luminance cost: a weighted sum of all views that would be zero.
     void add_blend(int y, int d, uint8_t *costs) {
-        const auto [height, width, candidates, views, view_height, view_width] = in_.sides;
-        const uint8_t *reference = reference_row(y);
-        for (int x = 0; x < width; ++x) {
-            if (seen_[x] != views) continue;
-            int32_t sum = in_.blend[0] * reference[x] + in_.blend[views + 1];
-            for (int k = 0; k < views; ++k) sum += in_.blend[k + 1] * warped_row(k, d, y)[x];
-            const int32_t residual = std::min(255, std::abs(sum) >> 8);
-            costs[x] = uint8_t(std::min(255, costs[x] + in_.blend_table[residual]));
-        }
+        const int width = in_.sides.width, views = in_.sides.views;
+        std::fill_n(residual_.begin(), width, in_.blend[views + 1]);
+        simd_.weigh(reference_row(y), in_.blend[0], width, residual_.data());
+        for (int k = 0; k < views; ++k) simd_.weigh(warped_row(k, d, y), in_.blend[k + 1], width, residual_.data());
+        simd_.look_up(residual_.data(), seen_.data(), views, in_.blend_table, width, costs);
     }
 
     const CostInput &in_;
@@ -166,7 +163,9 @@ class Band {
     std::vector<uint16_t> blended_;
     std::vector<uint8_t> mismatches_;
     std::vector<uint16_t> sum_;
-    std::vector<uint8_t> seen_, costs_;
+    std::vector<uint8_t> seen_;
+    std::vector<int32_t> residual_;
+    std::vector<uint8_t> costs_;
 };
 
 // Runs the same work with 0 .. count - 1, in as many threads; what one throws is thrown again here.

@@ -122,6 +122,19 @@ void divide(const uint16_t *__restrict sum, const uint8_t *__restrict seen, cons
     }
 }
 
+void weigh(const uint8_t *__restrict row, int weight, int width, int32_t *__restrict sum) {
+    for (int x = 0; x < width; ++x) sum[x] += weight * int32_t(row[x]);
+}
+
+void look_up(const int32_t *__restrict sum, const uint8_t *__restrict seen, int views, const uint8_t *__restrict table,
+             int width, uint8_t *__restrict costs) {
+    for (int x = 0; x < width; ++x) {
+        const int32_t size = (sum[x] < 0 ? -sum[x] : sum[x]) >> 8;
+        const int32_t cost = costs[x] + (seen[x] == views ? table[size < 255 ? size : 255] : 0);
+        costs[x] = uint8_t(cost < 255 ? cost : 255);
+    }
+}
+
 void turn(const uint8_t *__restrict costs, ptrdiff_t pitch, int candidates, int width, uint8_t *__restrict cost) {
     constexpr int SIDE = 16;
     for (int x0 = 0; x0 < width; x0 += SIDE)
@@ -171,4 +184,4 @@ void advance(const uint16_t *cost, int padded, int small, const Step *steps, int
 }  // namespace
 
 extern const ApertureSimd JOIN(apertures_, SIMD) = {TEXT(SIMD), census,  census_bits, blend_rows, blend_columns,
-                                                        add,        divide,  turn,        advance};
+                                                        add,        divide,  weigh,  look_up,  turn,        advance};

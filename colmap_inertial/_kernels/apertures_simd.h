@@ -34,6 +34,11 @@ struct ApertureSimd {
     // costs[x] = min(255, (share[seen[x]] sum[x] + 128) / 256), or `unseen` where no view has seen it
     void (*divide)(const uint16_t *sum, const uint8_t *seen, const int32_t *share, int unseen, int width,
                    uint8_t *costs);
+    // sum[x] += weight row[x]
+    void (*weigh)(const uint8_t *row, int weight, int width, int32_t *sum);
+    // costs[x] = min(255, costs[x] + table[min(255, abs(sum[x]) / 256)]) where seen[x] is `views`
+    void (*look_up)(const int32_t *sum, const uint8_t *seen, int views, const uint8_t *table, int width,
+                    uint8_t *costs);
     // cost[x][d] = costs[d][x]
     void (*turn)(const uint8_t *costs, ptrdiff_t pitch, int candidates, int width, uint8_t *cost);
     // One pixel, several paths: after[p][d] and their least; `total` is what the paths sum up to.

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.imaging.multi_aperture._geometry import Rectified
+from colmap_inertial.imaging.multi_aperture._light import LightCost
 from colmap_inertial.types import Array
 
 Codes = NDArray[np.uint8]
@@ -45,12 +46,15 @@ class Views:
         (N - 1, 256, 256) costs by the codes of the reference and a view, 0 to ``MOST``; ``None`` is census.
     least
         Difference of codes below which census passes over a comparison.
+    light
+        What colours that do not add up to luminance cost in addition.
     """
 
     reference: Codes
     others: Codes
     tables: Codes | None = None
     least: int = 0
+    light: LightCost | None = None
 
 
 def candidates(low_px: float, high_px: float, step_px: float) -> Array:
@@ -114,6 +118,8 @@ def match(views: Views, canvas: Rectified, disparities_px: Array, *, threads: in
             radius=CENSUS_RADIUS,
             least=views.least,
             tables=views.tables,
+            blend=None if views.light is None else views.light.blend,
+            blend_table=None if views.light is None else views.light.table,
             threads=threads,
         )
         total = np.empty((last - first, width, padded), dtype=np.uint16)

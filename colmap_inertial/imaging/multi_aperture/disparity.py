@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 
 from colmap_inertial.imaging.multi_aperture._geometry import Rectified
 from colmap_inertial.imaging.multi_aperture._information import cost_tables
+from colmap_inertial.imaging.multi_aperture._light import adds_up, light_cost
 from colmap_inertial.imaging.multi_aperture._noise import noise_of, smoothing
 from colmap_inertial.imaging.multi_aperture._sampling import codes_of, on_canvas, shrunk
 from colmap_inertial.imaging.multi_aperture._volume import MOST, Views, candidates, match
 from colmap_inertial.options import ApertureOptions
+from colmap_inertial.types import SpectralRole
 
 Codes = NDArray[np.uint8]
 Real = NDArray[np.float32]
@@ -52,7 +54,11 @@ class Disparity:
 
 
 def estimate_disparity(
-    planes: Sequence[NDArray[Any]], canvas: Rectified, options: ApertureOptions | None = None
+    planes: Sequence[NDArray[Any]],
+    canvas: Rectified,
+    options: ApertureOptions | None = None,
+    *,
+    roles: Sequence[SpectralRole] = (),
 ) -> Disparity:
     """Match all apertures at once.
 
@@ -64,6 +70,8 @@ def estimate_disparity(
         From :func:`rectify`.
     options
         Defaults serve.
+    roles
+        Of the apertures; needed for the luminance cost.
 
     Notes
     -----
@@ -84,7 +92,11 @@ def estimate_disparity(
     tables = None
     if options.cost == "mutual-information":
         tables = _tables(reference, others, canvas, low, high, threads)
-    views = Views(reference=reference, others=others, tables=tables, least=least)
+    light = None
+    if options.luminance_cost and adds_up(roles):
+        rough = _rough(reference, others, canvas, low, high, threads)
+        light = light_cost(codes, canvas, rough, roles, MOST)
+    views = Views(reference=reference, others=others, tables=tables, least=least, light=light)
     found, total = match(views, canvas, candidates(low, high, options.step_px), threads=threads)
     return _settled(found, total, canvas, threads, even=bool(np.ptp(reference) == 0))
 
@@ -161,6 +173,17 @@ def _range_px(reference: Codes, others: Codes, canvas: Rectified, threads: int) 
     used = found[measured] if measured.any() else found
     limits = by * np.quantile(used, (_LOOK_OUTLIERS, 1 - _LOOK_OUTLIERS))
     return float(limits[0] - _LOOK_MARGIN_PX), float(limits[1] + _LOOK_MARGIN_PX)
+
+
+def _rough(reference: Codes, others: Codes, canvas: Rectified, low_px: float, high_px: float, threads: int) -> Real:
+    """Disparities by matching smaller pictures."""
+    import cv2
+
+    by = max(1, min(_LOOK_SHRINK, min(reference.shape) // _NARROWEST_PX))
+    views = Views(reference=shrunk(reference, by), others=np.stack([shrunk(view, by) for view in others]))
+    spaced = candidates(low_px / by, high_px / by, 0.5)
+    found, _ = match(views, canvas.shrunk(by), spaced, threads=threads)
+    return np.asarray(by * cv2.resize(found, reference.shape[::-1], interpolation=cv2.INTER_LINEAR))
 
 
 def _tables(

@@ -98,7 +98,8 @@ def fuse_apertures(
     """
     options = options or ApertureOptions()
     check_planes(planes, rig)
-    return fuse_with(planes, rig, canvas, estimate_disparity(planes, canvas, options), options)
+    roles = [aperture.role for aperture in rig.apertures]
+    return fuse_with(planes, rig, canvas, estimate_disparity(planes, canvas, options, roles=roles), options)
 
 
 def check_planes(planes: Sequence[NDArray[Any]], rig: ApertureRig) -> None:
