@@ -1,0 +1,462 @@
+"""What the documentation says is true: links lead somewhere, commands parse, files are read, examples run."""
+
+import ast
+import dataclasses
+import json
+import re
+import shlex
+import shutil
+import textwrap
+import tomllib
+from pathlib import Path
+
+import cv2
+import imu_files
+import numpy as np
+import pytest
+from batch_captures import FRAMES, TINY, tiny_capture
+from jsonschema import Draft202012Validator
+from report_runs import write_run
+from test_pipeline import copy_scene
+
+from colmap_inertial.batch import read_manifest
+from colmap_inertial.cli import main, parse
+from colmap_inertial.errors import MappingError
+from colmap_inertial.imaging.gate import RecordingVerdict
+from colmap_inertial.imaging.parallax import Parallax
+from colmap_inertial.imaging.selection import Chosen
+from colmap_inertial.io.calibration import calibration_prior
+from colmap_inertial.io.capture import Capture, Video, load_capture
+from colmap_inertial.io.capture_tables import ImuTables
+from colmap_inertial.io.files import write_json
+from colmap_inertial.io.frames import read_frame_times
+from colmap_inertial.io.imu import imu_formats, read_capture_imu
+from colmap_inertial.options import ReconstructOptions
+from colmap_inertial.pipeline import reconstruct
+from colmap_inertial.pipeline.config import config_as_toml
+from colmap_inertial.pipeline.dense import DenseResult
+from colmap_inertial.pipeline.frames import FrameRecord, FrameTreatment
+from colmap_inertial.pipeline.imaging import ImagingPlan
+from colmap_inertial.pipeline.result import frame_as_json, imaging_as_json
+from colmap_inertial.pipeline.selection import Selection
+from colmap_inertial.pipeline.stages import GyroView
+from colmap_inertial.report import write_report
+from colmap_inertial.types import CameraModel, FrameTiming
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
+TEXT = "\n".join(page.read_text() for page in PAGES)
+_FENCE = re.compile(r"^( *)```(\w*)\n(.*?)^ *```$", re.MULTILINE | re.DOTALL)
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    """The fenced blocks of one language."""
+    return [textwrap.dedent(body) for _, kind, body in _FENCE.findall(page.read_text()) if kind == language]
+
+
+def every(language: str) -> list:
+    """Those of all pages, named by page and number."""
+    return [
+        pytest.param(body, id=f"{page.relative_to(ROOT)}-{number}")
+        for page in PAGES
+        for number, body in enumerate(blocks(page, language), start=1)
+    ]
+
+
+def anchors(page: Path) -> set[str]:
+    """What links into a page may name, as GitHub makes it of headings."""
+    prose = _FENCE.sub("", page.read_text())
+    headings = re.findall(r"^#+ (.*)$", prose, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_link_leads_somewhere(page):
+    for link in re.findall(r"\]\(([^)\s]+)\)", _FENCE.sub("", page.read_text())):
+        if link.startswith(("http://", "https://")):
+            continue
+        path, _, anchor = link.partition("#")
+        target = (page.parent / path).resolve() if path else page
+        assert target.exists(), link
+        assert target.is_relative_to(ROOT), link
+        if anchor:
+            assert anchor in anchors(target), link
+
+
+def test_every_page_is_in_the_index():
+    index = {(DOCS / link).resolve() for link in re.findall(r"\]\(([^)#\s]+)", (DOCS / "README.md").read_text())}
+    assert {page for page in PAGES if page.is_relative_to(DOCS)} - {DOCS / "README.md"} <= index
+
+
+def commands() -> list:
+    found = []
+    for block in every("sh"):
+        for line in block.values[0].replace("\\\n", " ").splitlines():
+            words = shlex.split(line, comments=True)
+            if words and Path(words[0]).name == "colmap-inertial":
+                found.append(pytest.param(words[1:], id=" ".join(words[1:])[:70]))
+    return found
+
+
+@pytest.mark.parametrize("words", commands())
+def test_every_command_parses(words, tmp_path):
+    if "--config" in words:
+        (tmp_path / "config.toml").write_text(config_as_toml(ReconstructOptions()))
+        words[words.index("--config") + 1] = str(tmp_path / "config.toml")
+    parse(words)
+
+
+def test_commands_in_the_text_exist(capsys):
+    with pytest.raises(SystemExit):
+        parse(["--help"])
+    shown = capsys.readouterr().out
+    for verb in set(re.findall(r"`colmap-inertial ([a-z][\w-]*)", TEXT)):
+        assert re.search(rf"\b{verb}\b", shown), verb
+
+
+def test_every_option_of_reconstruct_is_explained(capsys):
+    with pytest.raises(SystemExit):
+        parse(["reconstruct", "--help"])
+    shown = capsys.readouterr().out
+    options = {
+        name for name in re.findall(r"(?<![^\s│])--[a-z][\w.-]*[a-z0-9]", shown) if not re.search(r"\bno-", name)
+    }
+    options -= {"--help", "--out"}  # the second one is that of align
+    assert len(options) > 20
+    # what the pages leave to --help: how COLMAP works, and reproducibility
+    left = {"--mapping.pairing", "--mapping.overlap", "--mapping.max-image-size", "--mapping.max-num-features"}
+    left |= {"--mapping.first-octave", "--deterministic", "--seed", "--scale.max-offset-s"}
+    assert "colmap-inertial COMMAND --help" in TEXT
+    assert left <= options
+    assert {option for option in options - left if not re.search(rf"{re.escape(option)}(?![\w-])", TEXT)} == set()
+
+
+# --- captures --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def imu(project):
+    """A handheld recording; its clock was started before it."""
+    recorded = project.recording.imu
+    return dataclasses.replace(recorded, epoch_ns=recorded.epoch_ns + 10**15)
+
+
+SHEET = """
+sensor_type: camera
+T_BS:
+  cols: 4
+  rows: 4
+  data: [1, 0, 0, 0.1, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+resolution: [752, 480]
+camera_model: pinhole
+intrinsics: [458.6, 457.3, 367.2, 248.4]
+distortion_model: radial-tangential
+distortion_coefficients: [-0.28, 0.07, 0.0002, 0.00002]
+"""
+
+
+def write_files(folder: Path, imu, names: set[str]) -> None:
+    """The files of a capture.toml, each as its recorder writes it."""
+    frame_ns = imu_files.stamps_ns(imu, imu.gyro_t_s[:: max(1, len(imu.gyro_t_s) // 60)])
+    times = "".join(f"{t}\n" for t in frame_ns)
+    for name in names:
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if name.startswith("GX"):
+            imu_files.write_gopro(path, imu)
+        elif name.startswith("DJI_") and path.suffix == ".MP4":
+            imu_files.write_dji(path)
+        elif path.suffix.lower() in (".mp4", ".mov") and not path.exists():
+            imu_files.write_mp4(path, [imu_files.video_track(len(frame_ns))])
+        elif path.suffix == ".gcsv":
+            imu_files.write_gcsv(path, imu)
+        elif path.suffix == ".zip":
+            imu_files.write_sensor_logger(folder, imu, standardised=True).rename(path)
+        elif path.suffix == ".bag":
+            imu_files.write_rosbag(path, imu)
+        elif name == "8653a2142b":
+            path.mkdir(exist_ok=True)
+            imu_files.write_stray_scanner(path, imu, frame_ns)
+        elif name.endswith("gyro.csv"):
+            imu_files.write_opencamera(folder, imu, frame_ns, name.removesuffix("gyro.csv"))
+        elif name == "mav0/imu0":
+            path.mkdir(parents=True, exist_ok=True)
+            head = "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
+            head += "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]"
+            write_table(path / "data.csv", imu, "ns", "rad/s", "m/s2", head)
+        elif path.suffix == ".yaml":
+            path.write_text(SHEET)
+        elif name == "imu.csv":
+            head = "t [s],gx [rad/s],gy [rad/s],gz [rad/s],ax [m/s2],ay [m/s2],az [m/s2]"
+            write_table(path, imu, "s", "rad/s", "m/s2", head)
+        elif name.endswith("cam1/data.csv"):
+            path.write_text("#timestamp [ns],filename\n" + "".join(f"{t},{t}.png\n" for t in frame_ns))
+        elif name == "frames.csv":
+            path.write_text("name,t_ns\n" + "".join(f"{i}.jpg,{t}\n" for i, t in enumerate(frame_ns)))
+        elif name == "clip_times.csv":
+            path.write_text(times)
+
+
+def write_table(path: Path, imu, time_unit: str, gyro_unit: str, accel_unit: str, header: str) -> None:
+    per_second = {"s": 1, "ms": 1e3, "us": 1e6, "ns": 1e9}[time_unit]
+    gyro = imu.gyro_rad_s if gyro_unit == "rad/s" else np.degrees(imu.gyro_rad_s)
+    accel = np.stack([np.interp(imu.gyro_t_s, imu.accel_t_s, column) for column in imu.accel_m_s2.T], axis=1)
+    accel = accel if accel_unit == "m/s2" else accel / 9.80665
+    t = imu.gyro_t_s - imu.gyro_t_s[0]
+    stamps = [str(round(x * per_second)) if time_unit != "s" else f"{x:.9f}" for x in t]
+    rows = [",".join([s, *(f"{v:.7f}" for v in (*g, *a))]) for s, g, a in zip(stamps, gyro, accel, strict=True)]
+    path.write_text("\n".join([header, *rows] if header else rows) + "\n")
+
+
+def names_in(values: object) -> set[str]:
+    """Every text of a capture.toml that may be a path."""
+    if isinstance(values, dict):
+        return set().union(*(names_in(value) for value in values.values()))
+    return {values} if isinstance(values, str) and re.search(r"\.\w+$|^mav0/imu0$|^8653", values) else set()
+
+
+@pytest.mark.parametrize("text", every("toml"))
+def test_every_toml_is_read(text, tmp_path, imu):
+    values = tomllib.loads(text)
+    if "capture" in values:
+        (tmp_path / "captures.toml").write_text(text)
+        assert len(read_manifest(tmp_path / "captures.toml")) == len(values["capture"])
+        return
+    if not {"images", "video"} & values.keys():  # one table of the reference
+        text = 'video = "clip.mp4"\n' + text
+    (tmp_path / "capture.toml").write_text(text)
+    tables = [values["imu"][s] for s in ("gyro", "accel") if "file" in values.get("imu", {}).get(s, {})]
+    write_files(tmp_path, imu, names_in(values))
+    capture = load_capture(tmp_path)
+    assert isinstance(capture, Capture)
+    if isinstance(capture.imu, ImuTables):
+        for table in tables:
+            write_described(tmp_path / table["file"], imu, capture.imu, table)
+    corrected = {"gyro", "accel"} & values.get("imu", {}).keys() and not tables
+    if capture.imu is None or corrected:
+        return
+    recording = read_capture_imu(capture)
+    assert recording.has_accel
+    if isinstance(capture.frames, Video) and capture.frames.frame_times is not None:
+        return  # one time for each frame of a video that nobody can decode here
+    if not isinstance(capture.frames, Video) and capture.frames is not None and capture.frames.times != "name":
+        assert len(read_frame_times(capture.frames.times).names) > 0
+
+
+def write_described(path: Path, imu, described: ImuTables, table: dict) -> None:
+    """A table with the columns that a capture.toml says it has; it holds both sensors, whichever is read from it."""
+    if described.gyro_axes is not None:  # the reader turns it back
+        imu = dataclasses.replace(imu, gyro_rad_s=imu.gyro_rad_s @ described.gyro_axes.matrix)
+    names = "t,gx,gy,gz,ax,ay,az" if isinstance(table["columns"][0], str) else ""
+    accel_unit = "m/s2" if described.accel is None else described.accel.unit
+    write_table(path, imu, table["time_unit"], described.gyro.unit, accel_unit, names)
+
+
+def test_the_reference_names_every_format_and_every_key():
+    page = (DOCS / "capture-toml.md").read_text()
+    assert {f.name for f in imu_formats() if f"`{f.name}`" not in page} == set()
+    keys = set()
+    for file in ("capture.py", "capture_tables.py"):
+        source = (ROOT / "colmap_inertial" / "io" / file).read_text()
+        reads = r"(?:file|text|number|numbers|matrix|choice|boolean|integer|positive|raw)"
+        keys |= set(re.findall(rf'\.{reads}\("([a-z_]+)"', source))
+    assert len(keys) > 30
+    assert {key for key in keys if f"{key}" not in page} == set()
+
+
+# --- findings and results --------------------------------------------------------------------------------------------
+
+
+def test_every_finding_is_explained():
+    codes = set()
+    for file in (ROOT / "colmap_inertial").rglob("*.py"):
+        text = file.read_text()
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.keyword) and node.arg == "code":
+                codes |= {n.value for n in ast.walk(node.value) if isinstance(n, ast.Constant)}
+        codes |= set(re.findall(r'code, what = "([a-z-]+)"', text))
+        codes |= set(re.findall(r'code: str = "([a-z-]+)"', text))
+        codes |= set(re.findall(r'\("((?:short|long)-gap)"', text))
+    codes = {code for code in codes if isinstance(code, str) and re.fullmatch(r"[a-z]+(-[a-z]+)*", code)}
+    codes -= {"mirrored"}  # what the message compares with
+    assert len(codes) > 50
+    explained = (DOCS / "filming.md").read_text()
+    assert {code for code in codes if f"`{code}`" not in explained} == set()
+
+
+def schema(name: str) -> Draft202012Validator:
+    content = json.loads((DOCS / "schemas" / f"{name}.schema.json").read_text())
+    Draft202012Validator.check_schema(content)
+    return Draft202012Validator(content)
+
+
+def wrong(name: str, content: object) -> list[str]:
+    """Where a JSON does not have the form that its schema describes."""
+    found = schema(name).iter_errors(content)
+    return [f"{'/'.join(map(str, e.absolute_path))}: {e.message[:300]}" for e in found]
+
+
+def properties(content: object) -> set[str]:
+    if isinstance(content, list):
+        return set().union(*map(properties, content))
+    if not isinstance(content, dict):
+        return set()
+    own = set(content.get("properties", {}))
+    return own.union(*(properties(value) for value in content.values()))
+
+
+@pytest.mark.parametrize("name", ["result", "scale", "diagnosis"])
+def test_every_field_of_a_schema_is_in_the_text(name):
+    page = (DOCS / "results.md").read_text()
+    names = properties(json.loads((DOCS / "schemas" / f"{name}.schema.json").read_text()))
+    assert {field for field in names if f"`{field}`" not in page} == set()
+
+
+@pytest.fixture(scope="module")
+def examples(tmp_path_factory, project):
+    """The folder in which the page on Python says that its examples stand, and what they leave in it."""
+    folder = tmp_path_factory.mktemp("examples")
+    copy_scene(folder / "capture", first=FRAMES)
+    (folder / "options.toml").write_text(config_as_toml(TINY))
+    shutil.copytree(project.model.parents[1], folder / "project")
+    (folder / "project" / "frames.csv").write_bytes(project.frame_times.read_bytes())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        before = list(imu_formats())
+        values: dict[str, object] = {"__name__": "__main__"}
+        try:
+            for number, code in enumerate(blocks(DOCS / "python.md", "python")):
+                exec(compile(code, f"python.md block {number + 1}", "exec"), values)
+        finally:
+            from colmap_inertial.io import imu as registry
+
+            registry._formats[:] = before
+    return folder, values
+
+
+def test_the_examples_in_python_run(examples):
+    folder, values = examples
+    result = values["result"]
+    assert {frame.action for frame in result.frames} == {"changed"}
+    assert values["estimate"].verdict == "trusted"
+    assert (folder / "metric_model" / "transform.json").is_file()
+    assert (folder / "project_metric" / "sparse" / "0").is_dir()
+
+
+@pytest.mark.parametrize("text", every("python"))
+def test_every_example_in_python_compiles(text):
+    compile(text, "block", "exec")
+
+
+def test_results_have_the_form_that_their_schemas_describe(examples, project, tmp_path):
+    folder, _ = examples
+    for run in ("out", "out_hooks"):
+        for name in ("result", "report", "diagnosis"):
+            assert wrong(name, json.loads((folder / run / f"{name}.json").read_text())) == []
+
+    flags = ["--imu", project.imu, "--frame-times", project.frame_times]
+    for args, code in (
+        (["scale", project.model, *flags, "--json", tmp_path / "scale.json"], 0),
+        (["scale", project.model, *flags, "--json", tmp_path / "short.json", "--first-s", 0.2], 3),
+        (["scale", project.model, *flags, "--json", tmp_path / "spectral.json", "--method", "spectral"], 0),
+        (["reconstruct", project.model.parents[1], tmp_path / "project", *flags], 0),
+        (["diagnose", project.model, *flags, "--json", tmp_path / "diagnosis.json"], 0),
+    ):
+        with pytest.raises(SystemExit) as stopped:
+            main(list(map(str, args)))
+        assert stopped.value.code == code, args
+    for name in ("scale", "short", "spectral"):
+        assert wrong("scale", json.loads((tmp_path / f"{name}.json").read_text())) == []
+    assert wrong("diagnosis", json.loads((tmp_path / "diagnosis.json").read_text())) == []
+    for name in ("result", "report"):
+        assert wrong(name, json.loads((tmp_path / "project" / f"{name}.json").read_text())) == []
+
+
+def test_a_stopped_run_and_one_with_every_section_fit_the_schema_of_the_report(tmp_path):
+    for kind in ("orbit", "constant_velocity"):
+        write_run(tmp_path / kind, kind=kind)
+        write_report(tmp_path / kind)
+        content = json.loads((tmp_path / kind / "report.json").read_text())
+        for finding in content["findings"]["findings"]:
+            finding.setdefault("numbers", {})  # the fixture's is shorter than those of diagnose
+        assert wrong("report", content) == []
+
+    capture = tiny_capture(tmp_path / "capture")
+    for path in (capture / "frames").iterdir():
+        cv2.imwrite(str(path), np.full((480, 640, 3), 120, np.uint8))
+    with pytest.raises(MappingError):
+        reconstruct(capture, tmp_path / "out", TINY)
+    for name in ("report", "diagnosis"):
+        assert wrong(name, json.loads((tmp_path / "out" / f"{name}.json").read_text())) == []
+
+
+def test_what_is_done_to_frames_has_the_form_that_the_schema_describes(imu, tmp_path):
+    """The parts of a result that only longer runs fill."""
+    timing = FrameTiming(names=("a.jpg", "b.jpg"), t_s=np.array([0.0, 0.1]))
+    camera = CameraModel(model="PINHOLE", width=640, height=480, params=(500.0, 500.0, 320.0, 240.0))
+    view = GyroView(imu=imu, timing=timing, calibration=calibration_prior(), camera=camera, source="model")
+    parallax = Parallax(
+        width=640, height=480, step_px=27, velocity_in_cam=np.ones(3), inverse_depth=np.full((19, 25), 0.5)
+    )
+    verdict = RecordingVerdict(trusted=None, support=5.0, extent_factor=1.0, frames=4, reason="so")
+    plan = ImagingPlan(view=view, deblur=((), verdict), parallaxes={"a.jpg": parallax}, rectify=True)
+    window = Chosen(
+        place=3, closed_by="start", ranked_by="blur", blur=np.nan, first=0, last=5, baseline=0.1, motion=np.nan
+    )
+    selection = Selection(names=("b.jpg",), frames=9, note="so", windows=(window,), offset_s=0.1, offset_from="pixels")
+    dense = DenseResult(folder=tmp_path / "dense_metric" / "0", images=4, depth_maps=0, waiting="depth maps")
+    treated = FrameTreatment(reason="so", blur_px=4.0, deblurred=True, kept_share=0.2, extent_factor=1.1)
+    record = FrameRecord(name="a.jpg", action="deblurred", camera=camera, treatment=treated)
+    write_json(
+        tmp_path / "parts.json",
+        {
+            "imaging": imaging_as_json(plan),
+            "selection": selection.as_json(),
+            "dense": dense.as_json(tmp_path),
+            "frame": frame_as_json(record, plan),
+        },
+    )
+    parts = json.loads((tmp_path / "parts.json").read_text())
+    content = schema("result").schema
+    fields = content["properties"]
+    for name, form in (
+        ("imaging", fields["imaging"]),
+        ("selection", fields["selection"]),
+        ("dense", content["$defs"]["dense"]),
+        ("frame", fields["frames"]["items"]),
+    ):
+        validator = Draft202012Validator({**form, "$defs": content["$defs"]})
+        assert [error.message for error in validator.iter_errors(parts[name])] == [], name
+
+
+def test_images_are_written_out_of_a_bag(tmp_path, monkeypatch):
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    image, header, time = (
+        store.types[name] for name in ("sensor_msgs/msg/Image", "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
+    )
+    rng = np.random.default_rng(0)
+    pictures = {1_700_000_000_000_000_000 + i: rng.integers(0, 255, (6, 8, 3), dtype=np.uint8) for i in (1, 2)}
+    with Writer(tmp_path / "flight.bag") as writer:
+        connection = writer.add_connection("/cam0/image_raw", image.__msgtype__, typestore=store)
+        for t, picture in pictures.items():
+            padded = np.concatenate([picture.reshape(6, -1), np.zeros((6, 3), np.uint8)], axis=1)  # rows are aligned
+            stamp = time(sec=t // 10**9, nanosec=t % 10**9)
+            message = image(
+                header=header(seq=0, stamp=stamp, frame_id="cam"),
+                height=6,
+                width=8,
+                encoding="rgb8",
+                is_bigendian=0,
+                step=27,
+                data=padded.ravel(),
+            )
+            writer.write(connection, t, bytes(store.serialize_ros1(message, image.__msgtype__)))
+    monkeypatch.chdir(tmp_path)
+    (code,) = blocks(DOCS / "devices" / "ros.md", "python")
+    exec(compile(code, "ros.md", "exec"), {})
+    for t, picture in pictures.items():
+        np.testing.assert_array_equal(cv2.imread(str(tmp_path / "frames" / f"{t}.png"))[:, :, ::-1], picture)
