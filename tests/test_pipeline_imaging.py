@@ -20,10 +20,11 @@ from colmap_inertial.io.frames import read_frames
 from colmap_inertial.io.imu import read_capture_imu
 from colmap_inertial.model import colmap_camera, read_model
 from colmap_inertial.options import MappingOptions, ReconstructOptions
-from colmap_inertial.pipeline import prior_calibration, reconstruct, silent
+from colmap_inertial.pipeline import first_look, imaging, prior_calibration, reconstruct, silent
 from colmap_inertial.pipeline.deblur import deblur_capture
 from colmap_inertial.pipeline.imaging import plan_imaging, read_plan, with_stated_exposures, write_plan
 from colmap_inertial.pipeline.metadata import carry_metadata, stated_exposures_s
+from colmap_inertial.pipeline.passing import find_parallaxes
 from colmap_inertial.pipeline.selection import part_of
 from colmap_inertial.simulate import MotionOptions, make_motion
 
@@ -204,18 +205,49 @@ def plan(tmp_path_factory, blurred):
     return plan_imaging(*parts(blurred), deblur=None, rolling_shutter=None, scratch=scratch, progress=silent)
 
 
-def test_blur_by_translation_is_known_to_a_fraction_of_a_pixel(scene, plan):
-    timing = plan.view.timing
-    assert set(plan.parallaxes) == set(timing.names) and "translation is counted in" in plan.deblur_note
+def blur_errors(scene, plan):
+    """Median distances from the true blur, px: by turning alone, and with the translation."""
     motion, camera = plan.view.motion(), colmap_camera(plan.view.camera)
     at = np.stack(np.meshgrid(np.arange(2, 24, 3), np.arange(2, 18, 3)), axis=-1).reshape(-1, 2)
     off = {"turning": [], "both": []}
-    for i, name in enumerate(timing.names):
+    for i, name in enumerate(plan.view.timing.names):
         true = scene.true_blur(i, 16 * at + 0.5)
-        for kind, parallax in (("turning", None), ("both", plan.parallaxes[name])):
+        for kind, parallax in (("turning", None), ("both", plan.parallaxes.get(name))):
             field = blur_field(motion, camera, plan.view.shutter(i), parallax=parallax)
             off[kind].append(np.linalg.norm(field.vector_px[at[:, 1], at[:, 0]] - true, axis=1))
-    assert np.median(off["both"]) < 0.4 and np.median(off["both"]) < 0.15 * np.median(off["turning"])
+    return np.median(off["turning"]), np.median(off["both"])
+
+
+def test_blur_by_translation_is_known_to_a_fraction_of_a_pixel(scene, plan):
+    assert set(plan.parallaxes) == set(plan.view.timing.names) and "translation is counted in" in plan.deblur_note
+    turning, both = blur_errors(scene, plan)
+    assert both < 0.4 and both < 0.15 * turning
+
+
+def test_a_long_recording_is_surveyed_in_parts(tmp_path, monkeypatch, scene, blurred):
+    monkeypatch.setattr(first_look, "_MOST_IN_PART", 12)
+    monkeypatch.setattr(first_look, "_MODEL_FRAMES", 12)
+    plan = plan_imaging(*parts(blurred), deblur=None, rolling_shutter=None, scratch=tmp_path, progress=silent)
+    assert len(plan.parallaxes) >= 20
+    turning, both = blur_errors(scene, plan)
+    assert both < 0.3 * turning
+
+
+def test_frames_too_blurred_for_a_small_model_are_deblurred_for_the_next(tmp_path, monkeypatch):
+    scene = CornerScene.make(exposure_s=0.06, readout_s=0.0, vigour=1.2)
+    capture = scene.write(tmp_path / "capture", extra=CALIBRATED)
+    registered = []
+
+    def watched(models, view, calibration):
+        registered.append(sum(model.num_reg_images() for model in models))
+        return find_parallaxes(models, view, calibration)
+
+    monkeypatch.setattr(imaging, "find_parallaxes", watched)
+    plan = plan_imaging(*parts(capture), deblur=None, rolling_shutter=None, scratch=tmp_path, progress=silent)
+    assert registered[0] < 0.75 * scene.frames and registered[-1] > 1.3 * registered[0]
+    assert len(plan.parallaxes) >= 20
+    turning, both = blur_errors(scene, plan)
+    assert both < 0.35 * turning
 
 
 def test_the_plan_reads_back_and_the_stage_keeps_order_and_memory(tmp_path, blurred, plan):

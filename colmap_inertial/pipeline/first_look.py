@@ -46,6 +46,8 @@ log = logging.getLogger(__name__)
 
 #: Frames of the small model: at most so many, at least so far apart; and how COLMAP makes it.
 _MODEL_FRAMES, _MODEL_SPACING_S = 60, 0.24
+#: Frames of one small model, where they are to cover a recording: the cost stays linear in its length.
+_MOST_IN_PART = 240
 _SMALL = MappingOptions(
     pairing="sequential", overlap=6, max_num_features=1500, first_octave=0, max_image_size=800, refine_intrinsics=None
 )
@@ -165,9 +167,16 @@ def look_first(
     return FirstLook(view=found, models=models)
 
 
+def survey_parts(timing: FrameTiming) -> list[list[str]]:
+    """Frames all along a recording, not too close together, in parts for small models of their own."""
+    names = [timing.names[i] for i in _spaced(timing, _MODEL_SPACING_S)]
+    return [part.tolist() for part in np.array_split(np.array(names, dtype=object), -(-len(names) // _MOST_IN_PART))]
+
+
 def survey(
     capture: Capture,
     view: GyroView,
+    names: Sequence[str],
     stages: Sequence[FrameStage],
     *,
     scratch: Path,
@@ -175,7 +184,7 @@ def survey(
     seed: int,
     progress: Progress,
 ) -> tuple[pycolmap.Reconstruction, ...]:
-    """COLMAP's small models of frames all along a recording; empty where it makes none.
+    """COLMAP's small models of some frames; empty where it makes none.
 
     Parameters
     ----------
@@ -183,8 +192,10 @@ def survey(
         The recording.
     view
         By which keypoints are rectified.
+    names
+        Of the frames, as :func:`survey_parts` has them.
     stages
-        That the frames go through.
+        That they go through.
     scratch
         A folder for temporary files.
     num_threads, seed
@@ -192,7 +203,6 @@ def survey(
     progress
         Called with ``"survey"``.
     """
-    names = [view.timing.names[i] for i in _spaced(view.timing, _MODEL_SPACING_S)]
     steps = itertools.count()
 
     def step(stage: str, done: int, total: int, /) -> None:

@@ -31,7 +31,7 @@ from colmap_inertial.io.images import read_image
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.options import DeblurMethod, RollingShutterMethod
 from colmap_inertial.pipeline.colmap import Progress
-from colmap_inertial.pipeline.first_look import guessed_camera, look_first, some_frames, survey
+from colmap_inertial.pipeline.first_look import guessed_camera, look_first, some_frames, survey, survey_parts
 from colmap_inertial.pipeline.frames import FrameRecord, encode_image
 from colmap_inertial.pipeline.metadata import stated_exposures_s
 from colmap_inertial.pipeline.passing import find_parallaxes
@@ -256,12 +256,12 @@ def plan_imaging(
     if why_not:
         return plan
 
-    def models(plan: ImagingPlan | None) -> tuple[pycolmap.Reconstruction, ...]:
+    def models(names: Sequence[str], plan: ImagingPlan | None) -> tuple[pycolmap.Reconstruction, ...]:
         if plan is None and look.models:
             return look.models
         stages = [] if plan is None else plan.frame_stages(drop=False)
         return survey(
-            capture, look.view, stages, scratch=scratch, num_threads=num_threads, seed=seed, progress=progress
+            capture, look.view, names, stages, scratch=scratch, num_threads=num_threads, seed=seed, progress=progress
         )
 
     return _deblurring(plan, look.view, capture, models, progress)
@@ -295,29 +295,44 @@ def _deblurring(
     plan: ImagingPlan,
     view: GyroView,
     capture: Capture,
-    models: Callable[[ImagingPlan | None], tuple[pycolmap.Reconstruction, ...]],
+    models: Callable[[Sequence[str], ImagingPlan | None], tuple[pycolmap.Reconstruction, ...]],
     progress: Progress,
 ) -> ImagingPlan:
     """The plan with what is to be deblurred, by the gyroscope and by what small models tell of the translation.
 
-    ``models`` makes them of the frames as filmed, or as a plan has them. Where frames were too blurred for a model,
+    ``models`` makes them of some frames as filmed, or as a plan has them. Where frames were too blurred for a model,
     those around them, and the IMU beyond, tell how to deblur them for the next one.
     """
     calibration = for_rectified(view.calibration) if plan.rectify else view.calibration
-    if not _blurred(_decisions(view, {})):
+    decisions = _decisions(view, {})
+    if not _blurred(decisions):
         return _decided(plan, view, capture, {}, progress)
-    found = models(None)
+    parts, place = survey_parts(view.timing), view.index()
+    begins_s = view.timing.t_s[[place[names[0]] for names in parts]]
+    surveyed = {name for names in parts for name in names}
+
+    def parts_of(names: set[str]) -> list[int]:
+        t_s = view.timing.t_s[[place[name] for name in names]]
+        return np.unique(np.searchsorted(begins_s, t_s, side="right") - 1).tolist()
+
+    found = {i: models(parts[i], None) for i in parts_of(_to_deblur(decisions))}
     for _ in range(_SURVEYS):
-        parallaxes = find_parallaxes(found, view, calibration)
+        known = [model for i in found for model in found[i]]
+        parallaxes = find_parallaxes(known, view, calibration)
         decided = _decided(plan, view, capture, parallaxes, progress)
-        lost = {d.name for d in _decisions(view, parallaxes) if d.action == "deblur"} - _registered(found)
+        lost = _to_deblur(_decisions(view, parallaxes)) & surveyed - _registered(known)
         if not parallaxes or not lost or not decided.frame_stages():
             break
-        again = models(decided)
-        if len(_registered(again)) <= len(_registered(found)):
+        again = {i: models(parts[i], decided) for i in parts_of(lost)}
+        better = {i: made for i, made in again.items() if len(_registered(made)) > len(_registered(found.get(i, ())))}
+        if not better:
             break
-        found = again
+        found |= better
     return decided
+
+
+def _to_deblur(decisions: Sequence[FrameDecision]) -> set[str]:
+    return {decision.name for decision in decisions if decision.action == "deblur"}
 
 
 def _registered(models: Sequence[pycolmap.Reconstruction]) -> set[str]:
