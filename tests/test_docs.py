@@ -45,7 +45,7 @@ from colmap_inertial.types import CameraModel, FrameTiming
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "example_scenes" / "README.md", *sorted(DOCS.rglob("*.md"))]
 TEXT = "\n".join(page.read_text() for page in PAGES)
 _FENCE = re.compile(r"^( *)```(\w*)\n(.*?)^ *```$", re.MULTILINE | re.DOTALL)
 
@@ -137,9 +137,17 @@ def test_every_option_of_reconstruct_is_explained(capsys):
 
 @pytest.fixture(scope="module")
 def imu(project):
-    """A handheld recording; its clock was started before it."""
+    """Twenty seconds of a handheld recording; the clock was started before it."""
     recorded = project.recording.imu
-    return dataclasses.replace(recorded, epoch_ns=recorded.epoch_ns + 10**15)
+    first, second = (t_s < recorded.gyro_t_s[0] + 20 for t_s in (recorded.gyro_t_s, recorded.accel_t_s))
+    return dataclasses.replace(
+        recorded,
+        gyro_t_s=recorded.gyro_t_s[first],
+        gyro_rad_s=recorded.gyro_rad_s[first],
+        accel_t_s=recorded.accel_t_s[second],
+        accel_m_s2=recorded.accel_m_s2[second],
+        epoch_ns=recorded.epoch_ns + 10**15,
+    )
 
 
 SHEET = """

@@ -1,6 +1,6 @@
 """``capture.toml``: one recording, described by the person who made it.
 
-Paths count from the file's folder, and nothing is guessed: a unit, axis or time that a file does not state is asked for.
+Paths count from the file's folder. Nothing is guessed: a unit, axis or time that a file does not state is asked for.
 ``docs/capture-toml.md`` describes every table and key.
 """
 
