@@ -293,6 +293,32 @@ def test_every_finding_is_explained():
     assert {code for code in codes if f"`{code}`" not in explained} == set()
 
 
+def said(folder: Path) -> list[str]:
+    """Every text in the code of a folder, with a line break for each value that is put in."""
+    found = []
+    for file in folder.rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.JoinedStr):
+                found.append("".join(p.value if isinstance(p, ast.Constant) else "\n" for p in node.values))
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                found.append(node.value)
+    return found
+
+
+def test_every_reason_in_the_text_is_one_that_is_printed():
+    page = (DOCS / "filming.md").read_text()
+    table = page[page.index("| reason (in part)") :].split("\n\n")[0]
+    texts = [text for folder in ("scale", "align", "pipeline") for text in said(ROOT / "colmap_inertial" / folder)]
+    phrases = [
+        part.strip()
+        for row in table.splitlines()[2:]
+        for part in re.split(r"\.\.\.|;|:|±|\(|\)", row.split("|")[1])
+        if len(part.strip()) > 8
+    ]
+    assert len(phrases) > 30
+    assert [phrase for phrase in phrases if not any(phrase in text for text in texts)] == []
+
+
 def schema(name: str) -> Draft202012Validator:
     content = json.loads((DOCS / "schemas" / f"{name}.schema.json").read_text())
     Draft202012Validator.check_schema(content)
