@@ -79,12 +79,13 @@ def _from_neighbours(
     near = np.where(inside, at_y * width + at_x, 0)
     here = guide[y, x]
     of_guide, of_values = guide.ravel()[near], values.ravel()[near]
-    weight = np.exp(-0.5 * ((of_guide - here[:, None]) / _ALIKE) ** 2)
-    weight *= np.exp(-np.abs(disparity_px.ravel()[near] - disparity_px[y, x][:, None]) / _SAME_DEPTH_PX)
-    weight *= np.exp(-0.5 * (dy**2 + dx**2) / (2 * spacing) ** 2)
+    unlike = 0.5 * ((of_guide - here[:, None]) / np.float32(_ALIKE)) ** 2
+    unlike += np.abs(disparity_px.ravel()[near] - disparity_px[y, x][:, None]) / np.float32(_SAME_DEPTH_PX)
+    unlike += (0.5 * (dy**2 + dx**2) / (2 * spacing) ** 2).astype(np.float32)
+    weight = np.exp(-unlike)
     weight *= inside & seen.ravel()[near]
     total = weight.sum(axis=1)
-    share = weight / np.maximum(total, 1e-12)[:, None]
+    share = weight / np.maximum(total, np.float32(1e-12))[:, None]
     mean_guide, mean_value = (share * of_guide).sum(axis=1), (share * of_values).sum(axis=1)
     variance = (share * of_guide**2).sum(axis=1) - mean_guide**2
     covariance = (share * of_guide * of_values).sum(axis=1) - mean_guide * mean_value

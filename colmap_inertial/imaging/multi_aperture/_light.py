@@ -18,6 +18,8 @@ Codes = NDArray[np.uint8]
 _WIDE = 3.0
 #: Rounds of least squares, each without what the one before left furthest off.
 _ROUNDS = 3
+#: Rows and columns of the picture that are fitted to: thousands of pixels are enough for four numbers.
+_EVERY = 3
 
 
 _NEEDED: tuple[SpectralRole, ...] = ("red", "green", "blue", "luminance")
@@ -61,9 +63,10 @@ def light_cost(
     most
         What a residual costs at most.
     """
-    aligned, inside = [codes[0].astype(np.float64)], np.ones(codes.shape[1:], dtype=bool)
+    first = codes[0][::_EVERY, ::_EVERY]
+    aligned, inside = [first.astype(np.float64)], np.ones(first.shape, dtype=bool)
     for k in range(1, len(codes)):
-        warped, there = seen_by(codes[k], canvas, k, disparity_px)
+        warped, there = seen_by(codes[k], canvas, k, disparity_px, _EVERY)
         aligned.append(warped.astype(np.float64))
         inside &= there
     means = {role: [i for i, other in enumerate(roles) if other == role] for role in _NEEDED}

@@ -51,18 +51,22 @@ def places(canvas: Rectified, index: int, disparity_px: Real, x: Real, y: Real) 
     return np.asarray(u, dtype=np.float32), np.asarray(v, dtype=np.float32)
 
 
-def seen_by(view: NDArray[Any], canvas: Rectified, index: int, disparity_px: Real) -> tuple[Real, NDArray[np.bool_]]:
+def seen_by(
+    view: NDArray[Any], canvas: Rectified, index: int, disparity_px: Real, every: int = 1
+) -> tuple[Real, NDArray[np.bool_]]:
     """What the reference sees on the canvas in another aperture's view, itself on the canvas; and whether it is there.
 
     Parameters
     ----------
     view
         (H, W) of aperture ``index`` on the canvas.
+    every
+        Only every so many rows and columns of the canvas.
     """
     import cv2
 
-    x, y = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in (canvas.width, canvas.height)))
-    u, v = places(canvas, index, disparity_px, x, y)
+    x, y = np.meshgrid(*(np.arange(0, n, every, dtype=np.float32) for n in (canvas.width, canvas.height)))
+    u, v = places(canvas, index, disparity_px[::every, ::every], x, y)
     left, right, top, bottom = canvas.covered[index]
     inside = (u >= left) & (u <= right) & (v >= top) & (v <= bottom)
     warped = cv2.remap(view.astype(np.float32), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -85,7 +84,7 @@ def estimate_disparity(
     comparisons that noise decides.
     """
     options = options or ApertureOptions()
-    threads = options.threads or len(os.sched_getaffinity(0))
+    threads = options.threads or 0  # 0: all processors
     codes, least = _codes(planes, canvas)
     reference, others = codes[0], codes[1:]
     low, high = options.disparity_px or _range_px(reference, others, canvas, threads)
