@@ -209,6 +209,35 @@ def test_planes_are_found_to_a_fraction_of_a_pixel(slope, middle_px):
     assert found.measured[inner].mean() > 0.98
 
 
+def test_apertures_that_are_turned_bent_and_set_back_see_a_wall_where_it_is():
+    rig = bent_rig()
+    cameras = projectors(rig)
+    depth_m = 0.8
+    pattern = texture(1200, 900, seed=12)
+    import cv2
+
+    reference, planes = rig.reference, []
+    for aperture, camera in zip(rig.apertures, cameras, strict=True):
+        x, y = np.meshgrid(np.arange(320) + 0.5, np.arange(240) + 0.5)
+        rays = np.column_stack([camera.cam_from_img(np.column_stack([x.ravel(), y.ravel()])), np.ones(x.size)])
+        back = [-1, -1, -1, 1]
+        in_rig = quat_rotate(aperture.cam_from_rig_xyzw * back, rays)
+        ray = quat_rotate(reference.cam_from_rig_xyzw, in_rig)
+        start = quat_rotate(reference.cam_from_rig_xyzw, aperture.cam_in_rig - reference.cam_in_rig)
+        hit = start + ray * ((depth_m - start[2]) / ray[:, 2])[:, None]
+        at = (hit[:, :2] * 900 + [600, 450]).reshape(240, 320, 2).astype(np.float32)
+        planes.append(np.rint(cv2.remap(pattern, at, None, cv2.INTER_LINEAR)).astype(np.uint8))
+    canvas = rectify(rig, cameras)
+    assert all(m is not None for m in canvas.image_from_canvas)
+    fused = fuse_apertures(planes, rig, canvas, ApertureOptions(threads=1))
+    inner = (slice(24, -24), slice(24, -24))
+    assert fused.measured[inner].mean() > 0.97
+    assert np.nanmedian(np.abs(fused.depth[inner] / depth_m - 1)) < 0.01
+    wanted = np.repeat(planes[0][..., None], 3, axis=-1)
+    assert psnr_db(fused.image[inner], wanted[inner]) > 33
+    assert psnr_db(np.stack(planes[:3], axis=-1)[inner], wanted[inner]) < 20
+
+
 def test_two_apertures_are_enough_for_disparity_and_not_for_colour():
     planes, truth, rig = plane_views(160, 120, 4.0, (0.0, 0.01))
     pair = ApertureRig(apertures=rig.apertures[:2])
