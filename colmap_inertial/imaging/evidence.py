@@ -30,6 +30,9 @@ _SHORTEST_PX, _LEAST_CONTRAST, _MOST_CLIPPED = 2.5, 0.01, 0.1
 #: Standard deviation of the smoothing of the cepstrum, px; power (of a tile's mean square 1) below which noise rules.
 _SMOOTHING_PX, _FLOOR = 0.8, 1e-7
 _FEWEST_TILES = 12
+#: More tiles are thinned out: support grows with the square root of their number, cost with it. Few serve where the
+#: gyroscope is trusted.
+_MOST_TILES, _FEW_TILES = 900, 200
 #: Cycles per pixel in which blur takes power from a direction before noise covers it.
 _BAND = (0.05, 0.25)
 #: The extents among which the prediction may be: dips at shorter lags are the texture's own.
@@ -47,8 +50,6 @@ class BlurEvidence:
         from it, less its median over all directions; and of the squares.
     mirrored, mirrored_square
         (FACTORS, 1) the same in the direction that a gyroscope with one axis flipped would predict.
-    fall_total
-        Sum over tiles of the logarithm of the power along the predicted blur against that across it.
     tiles
         How many were summed.
     """
@@ -57,16 +58,13 @@ class BlurEvidence:
     total_square: Array
     mirrored: Array
     mirrored_square: Array
-    fall_total: float
     tiles: int
 
     @classmethod
     def nothing(cls) -> BlurEvidence:
         """Of no image."""
         zero = np.zeros((len(FACTORS), len(TURNS_RAD)))
-        return cls(
-            total=zero, total_square=zero, mirrored=zero[:, :1], mirrored_square=zero[:, :1], fall_total=0.0, tiles=0
-        )
+        return cls(total=zero, total_square=zero, mirrored=zero[:, :1], mirrored_square=zero[:, :1], tiles=0)
 
     def __add__(self, other: BlurEvidence) -> BlurEvidence:
         return BlurEvidence(
@@ -74,7 +72,6 @@ class BlurEvidence:
             total_square=self.total_square + other.total_square,
             mirrored=self.mirrored + other.mirrored,
             mirrored_square=self.mirrored_square + other.mirrored_square,
-            fall_total=self.fall_total + other.fall_total,
             tiles=self.tiles + other.tiles,
         )
 
@@ -117,15 +114,6 @@ class BlurEvidence:
         return _PLAUSIBLE.start <= i < _PLAUSIBLE.stop
 
     @property
-    def fall(self) -> float:
-        """Natural logarithm of the power of fine detail along the predicted blur against that across it.
-
-        About -1 or less where a picture is blurred so; about 0 where it is sharp, or blurred otherwise: then textures
-        decide, and tiles are many.
-        """
-        return self.fall_total / max(self.tiles, 1)
-
-    @property
     def mirrored_support(self) -> float:
         """As ``support``, in the direction that a gyroscope with one axis flipped would predict.
 
@@ -134,9 +122,7 @@ class BlurEvidence:
         return float(self._depth(self.mirrored, self.mirrored_square)[_PLAUSIBLE].max())
 
 
-def blur_evidence(
-    image: NDArray[np.uint8] | NDArray[np.uint16], blur: BlurField, *, most_tiles: int = 900
-) -> BlurEvidence:
+def blur_evidence(image: NDArray[np.uint8] | NDArray[np.uint16], blur: BlurField) -> BlurEvidence:
     """Look for the blur that was predicted.
 
     Parameters
@@ -145,15 +131,52 @@ def blur_evidence(
         (H, W) or (H, W, 3), sRGB.
     blur
         Predicted, of the image's size.
-    most_tiles
-        More of them than this are thinned out: support grows with the square root of their number, cost with it.
 
     Returns
     -------
     Evidence in units of the prediction; of no tile where blur is short, or texture missing, all over.
     """
+    from scipy.fft import irfft2
+
+    found = _spectra(image, blur, _MOST_TILES)
+    if found is None:
+        return BlurEvidence.nothing()
+    logarithm, vectors = found
+    tile = logarithm.shape[1]
+    smooth = np.exp(-2 * (np.pi * _SMOOTHING_PX * np.fft.fftfreq(tile)) ** 2).astype(np.float32)
+    damped = logarithm * smooth[:, None] * smooth[: tile // 2 + 1]
+    cepstra = irfft2(damped, s=(tile, tile))
+    values = _at_lags(np.asarray(cepstra), vectors, TURNS_RAD)
+    level = np.median(values[:, :, 2:-1], axis=2, keepdims=True)
+    values -= level
+    mirrored = _at_lags(np.asarray(cepstra), vectors * [1, -1], TURNS_RAD[:1]) - level
+    return BlurEvidence(
+        total=values.sum(axis=0),
+        total_square=(values**2).sum(axis=0),
+        mirrored=mirrored.sum(axis=0),
+        mirrored_square=(mirrored**2).sum(axis=0),
+        tiles=len(values),
+    )
+
+
+def detail_fall(image: NDArray[np.uint8] | NDArray[np.uint16], blur: BlurField) -> float | None:
+    """How much less fine detail there is along the predicted blur than across it.
+
+    Returns
+    -------
+    Natural logarithm of the powers' ratio: about -1 or less where a picture is blurred so; about 0 where it is sharp,
+    or blurred otherwise: then textures decide, and tiles are many. ``None`` where there are too few to tell.
+    """
+    found = _spectra(image, blur, _FEW_TILES)
+    return None if found is None else float(_fall(*found).mean())
+
+
+def _spectra(
+    image: NDArray[np.uint8] | NDArray[np.uint16], blur: BlurField, most_tiles: int
+) -> tuple[NDArray[np.float32], Array] | None:
+    """(N, T, T // 2 + 1) log power of tiles, and their (N, 2) blur; ``None`` where there are too few to tell."""
     import cv2
-    from scipy.fft import irfft2, rfft2
+    from scipy.fft import rfft2
 
     light = _light(image)
     lengths = blur.extent_px()
@@ -164,7 +187,7 @@ def blur_evidence(
     if reduced > 1:
         size = (light.shape[1] // reduced, light.shape[0] // reduced)
         if min(size) == 0:
-            return BlurEvidence.nothing()
+            return None
         light = np.asarray(
             cv2.resize(light[: size[1] * reduced, : size[0] * reduced], size, interpolation=cv2.INTER_AREA)
         )
@@ -173,7 +196,7 @@ def blur_evidence(
         tile *= 2
     height, width = light.shape
     if min(height, width) < tile:
-        return BlurEvidence.nothing()
+        return None
     step = max(3 * tile // 4, int(np.ceil(np.sqrt(height * width / most_tiles))))
     top, left = (_starts(size, tile, step) for size in (height, width))
     windows = np.lib.stride_tricks.sliding_window_view(light, (tile, tile))[top[:, None], left].reshape(-1, tile, tile)
@@ -188,28 +211,12 @@ def blur_evidence(
     spread = windows.std(axis=(1, 2))
     usable &= spread > _LEAST_CONTRAST
     if usable.sum() < _FEWEST_TILES:
-        return BlurEvidence.nothing()
+        return None
     tiles = windows[usable]
     window = np.hanning(tile).astype(np.float32)
     tiles = (tiles - tiles.mean(axis=(1, 2), keepdims=True)) * (window[:, None] * window)
     power = np.abs(rfft2(tiles)) ** 2
-    smooth = np.exp(-2 * (np.pi * _SMOOTHING_PX * np.fft.fftfreq(tile)) ** 2).astype(np.float32)
-    logarithm = np.log(power + _FLOOR * tile**2)
-    fall = _fall(logarithm, vectors[usable])
-    damped = logarithm * smooth[:, None] * smooth[: tile // 2 + 1]
-    cepstra = irfft2(damped, s=(tile, tile))
-    values = _at_lags(np.asarray(cepstra), vectors[usable], TURNS_RAD)
-    level = np.median(values[:, :, 2:-1], axis=2, keepdims=True)
-    values -= level
-    mirrored = _at_lags(np.asarray(cepstra), vectors[usable] * [1, -1], TURNS_RAD[:1]) - level
-    return BlurEvidence(
-        total=values.sum(axis=0),
-        total_square=(values**2).sum(axis=0),
-        mirrored=mirrored.sum(axis=0),
-        mirrored_square=(mirrored**2).sum(axis=0),
-        fall_total=float(fall.sum()),
-        tiles=len(values),
-    )
+    return np.asarray(np.log(power + _FLOOR * tile**2)), vectors[usable]
 
 
 def _light(image: NDArray[np.uint8] | NDArray[np.uint16]) -> NDArray[np.float32]:
@@ -260,4 +267,4 @@ def _at_lags(cepstra: NDArray[np.float32], vectors: Array, turns_rad: Array) -> 
     return np.asarray(upper * (1 - part_y) + lower * part_y, dtype=np.float64)
 
 
-__all__ = ["FACTORS", "TURNS_RAD", "BlurEvidence", "blur_evidence"]
+__all__ = ["FACTORS", "TURNS_RAD", "BlurEvidence", "blur_evidence", "detail_fall"]

@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.imaging.blur_field import BlurField
-from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence
+from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence, detail_fall
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.imaging.psf import PredictedBlur
-from colmap_inertial.imaging.rolling_shutter import spread_nodes
 from colmap_inertial.types import Array
 
 Code = TypeVar("Code", np.uint8, np.uint16)
@@ -161,8 +160,6 @@ class GatedFrame:
         Share of the image that keeps its pixels because it was sharp already.
     extent_factor
         What the predicted extents were multiplied by, to agree with the images.
-    evidence
-        Of this frame, in units of the gyroscope's prediction; adds up over a recording.
     reason
         In words.
     """
@@ -171,7 +168,6 @@ class GatedFrame:
     deblurred: bool
     kept_share: float
     extent_factor: float
-    evidence: BlurEvidence
     reason: str
 
 
@@ -200,13 +196,9 @@ def deblur_gated(
         Thresholds.
     """
     options = options or GateOptions()
-    trusted = recording is not None and recording.trusted is True
-    evidence = blur_evidence(image, blur, most_tiles=_FEW_TILES if trusted else 900)
-    factor, reason = _judge(evidence, recording, options)
+    factor, reason = _judge(image, blur, recording, options)
     if factor is None:
-        return GatedFrame(
-            image=image, deblurred=False, kept_share=1.0, extent_factor=1.0, evidence=evidence, reason=reason
-        )
+        return GatedFrame(image=image, deblurred=False, kept_share=1.0, extent_factor=1.0, reason=reason)
     if factor != 1.0:
         blur = replace(blur, vector_px=(blur.vector_px * np.float32(factor)))
     if deblur is None:
@@ -214,9 +206,7 @@ def deblur_gated(
 
         deblur = wiener_deblur
     out, kept = keep_sharp(image, deblur(image, blur), blur)
-    return GatedFrame(
-        image=out, deblurred=True, kept_share=kept, extent_factor=factor, evidence=evidence, reason=reason
-    )
+    return GatedFrame(image=out, deblurred=True, kept_share=kept, extent_factor=factor, reason=reason)
 
 
 #: An extent is corrected where it is further off than small blur lets the dip drift, and where the dip is this clear.
@@ -230,8 +220,6 @@ _TOGETHER_SUPPORT = 4.5
 #: From so many on, a frame has a vote whether it is rather the gyroscope's direction, or the mirrored one.
 _VOTE = 2.5
 _FEWEST_FRAMES = 3
-#: Tiles that show whether a frame contradicts a gyroscope that is trusted.
-_FEW_TILES = 200
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -318,19 +306,21 @@ def _support(evidence: BlurEvidence) -> float:
 
 
 def _judge(
-    evidence: BlurEvidence, recording: RecordingVerdict | None, options: GateOptions
+    image: NDArray[Code], blur: BlurField, recording: RecordingVerdict | None, options: GateOptions
 ) -> tuple[float | None, str]:
     """The factor for the extents, or ``None`` for a frame to leave alone; and why."""
     if recording is not None and recording.trusted is False:
         return None, recording.reason
-    own = _support(evidence) if evidence.enough else 0.0
     if recording is not None and recording.trusted:
-        if evidence.enough and evidence.fall > _LEAST_FALL:
+        fall = detail_fall(image, blur)
+        if fall is not None and fall > _LEAST_FALL:
             return (
                 None,
                 "the image has as much detail along the predicted blur as across it, though other frames lack it",
             )
         return recording.extent_factor, recording.reason
+    evidence = blur_evidence(image, blur)
+    own = _support(evidence) if evidence.enough else 0.0
     if not evidence.enough:
         return None, "too little texture or blur to check the gyroscope's prediction against"
     if own < options.min_support:
@@ -368,9 +358,11 @@ def keep_sharp(image: NDArray[Code], deblurred: NDArray[Code], blur: BlurField) 
     codes = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     small = cv2.resize(codes, size, interpolation=cv2.INTER_AREA).astype(np.float32)
     grey: Picture = np.asarray(cv2.GaussianBlur(small, (0, 0), 0.5) / np.float32(np.iinfo(image.dtype).max))
-    along_x, along_y = (
-        spread_nodes(0.5 * blur.vector_px[..., i].astype(np.float64), *size, 0.5 * blur.step_px) for i in (0, 1)
-    )
+    nearest = [
+        np.minimum(np.rint(np.arange(n) * 2 / blur.step_px).astype(np.intp), nodes - 1)
+        for n, nodes in zip(size[::-1], blur.vector_px.shape, strict=False)
+    ]
+    along_x, along_y = (0.5 * blur.vector_px[..., i][nearest[0]][:, nearest[1]] for i in (0, 1))
     x, y = np.arange(size[0], dtype=np.float32), np.arange(size[1], dtype=np.float32)[:, None]
     half = 0.5 * _SPAN
     ends = [
