@@ -1,6 +1,9 @@
-"""What multi-aperture fusion is measured against: no correction, pairs by themselves, OpenCV, graph cuts."""
+"""What multi-aperture fusion is measured by and against: no correction, pairs by themselves, OpenCV, graph cuts."""
 
 from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -144,3 +147,35 @@ def expansion_moves(
             reached[breadth_first_order(rest, source, return_predecessors=False)] = True
             labelling = np.where(reached[:source], labelling, alpha)
     return labelling.reshape(height, width)
+
+
+def psnr_db(a: NDArray[Any], b: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> float:
+    error = (a.astype(float) - b.astype(float)) ** 2
+    return float(10 * np.log10(255**2 / (error if mask is None else error[mask]).mean()))
+
+
+def read_pfm(path: Path) -> NDArray[np.float64]:
+    with open(path, "rb") as file:
+        if file.readline().strip() != b"Pf":
+            raise ValueError(f"{path}: no grey PFM")
+        width, height = map(int, file.readline().split())
+        order = "<" if float(file.readline()) < 0 else ">"
+        return np.fromfile(file, f"{order}f4").reshape(height, width)[::-1].astype(np.float64)
+
+
+def seen_by(disparity: NDArray[np.float64], dy: float, dx: float, tolerance: float) -> NDArray[np.bool_]:
+    """Which pixels the view at (dx, dy) baselines sees, by the true disparity."""
+    height, width = disparity.shape
+    y, x = np.mgrid[:height, :width]
+    u, v = x - dx * disparity, y - dy * disparity
+    nearest = np.full(disparity.shape, -np.inf)
+    for oy in (0, 1):
+        for ox in (0, 1):
+            i, j = np.floor(u).astype(int) + ox, np.floor(v).astype(int) + oy
+            inside = (i >= 0) & (i < width) & (j >= 0) & (j < height)
+            np.maximum.at(nearest, (j[inside], i[inside]), disparity[inside])
+    i, j = np.rint(u).astype(int), np.rint(v).astype(int)
+    inside = (i >= 0) & (i < width) & (j >= 0) & (j < height)
+    seen = np.zeros(disparity.shape, dtype=bool)
+    seen[inside] = disparity[inside] >= nearest[j[inside], i[inside]] - tolerance
+    return seen

@@ -50,6 +50,9 @@ from aperture_baselines import (
     expansion_moves,
     opencv_disparity,
     pairwise,
+    psnr_db,
+    read_pfm,
+    seen_by,
 )
 from numpy.typing import NDArray
 
@@ -84,38 +87,6 @@ def rig_of(
             for i, (role, place) in enumerate(zip(roles, places, strict=True))
         )
     )
-
-
-def psnr_db(a: NDArray[Any], b: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> float:
-    error = (a.astype(float) - b.astype(float)) ** 2
-    return float(10 * np.log10(255**2 / (error if mask is None else error[mask]).mean()))
-
-
-def read_pfm(path: Path) -> NDArray[np.float64]:
-    with open(path, "rb") as file:
-        if file.readline().strip() != b"Pf":
-            raise ValueError(f"{path}: no grey PFM")
-        width, height = map(int, file.readline().split())
-        order = "<" if float(file.readline()) < 0 else ">"
-        return np.fromfile(file, f"{order}f4").reshape(height, width)[::-1].astype(np.float64)
-
-
-def seen_by(disparity: NDArray[np.float64], dy: float, dx: float, tolerance: float) -> NDArray[np.bool_]:
-    """Which pixels the view at (dx, dy) baselines sees, by the true disparity."""
-    height, width = disparity.shape
-    y, x = np.mgrid[:height, :width]
-    u, v = x - dx * disparity, y - dy * disparity
-    nearest = np.full(disparity.shape, -np.inf)
-    for oy in (0, 1):
-        for ox in (0, 1):
-            i, j = np.floor(u).astype(int) + ox, np.floor(v).astype(int) + oy
-            inside = (i >= 0) & (i < width) & (j >= 0) & (j < height)
-            np.maximum.at(nearest, (j[inside], i[inside]), disparity[inside])
-    i, j = np.rint(u).astype(int), np.rint(v).astype(int)
-    inside = (i >= 0) & (i < width) & (j >= 0) & (j < height)
-    seen = np.zeros(disparity.shape, dtype=bool)
-    seen[inside] = disparity[inside] >= nearest[j[inside], i[inside]] - tolerance
-    return seen
 
 
 # --- light field ----------------------------------------------------------------------------------------------------
