@@ -156,11 +156,43 @@ class ProjectOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ApertureOptions:
+    """How the pictures of a multi-aperture camera are fused."""
+
+    cost: Literal["census", "mutual-information"] = "census"
+    """What pixels of different colour are compared by: the order of brightness around them, or how their brightness
+    goes together over the whole picture."""
+    disparity_px: tuple[float, float] | None = None
+    """Least and largest shift between the reference and its partner to search, in pixels, below zero for what lies
+    behind infinity (default: found for each exposure in a smaller picture)."""
+    step_px: float = 0.5
+    """Spacing of the shifts that are tried; between them a parabola is fitted."""
+    luminance_cost: bool = True
+    """Also compare the luminance aperture with what the colours add up to, where there are all four."""
+    use_luminance: bool = True
+    """Let an aperture without colour filter lend its lower noise to the colours."""
+    depth: bool = False
+    """Also keep disparities (pixels) and depths (metres) as NumPy files; nan where they were not measured."""
+    threads: int | None = None
+    """Threads for one exposure; as many as the process may use where absent."""
+
+    def __post_init__(self) -> None:
+        if self.disparity_px is not None and not self.disparity_px[0] < self.disparity_px[1]:
+            raise ValueError(f"disparity_px: must be a lower and a higher limit, not {self.disparity_px}")
+        if not 0.1 <= self.step_px <= 2:
+            raise ValueError(f"step_px must be from 0.1 to 2, not {self.step_px:g}")
+        if self.threads is not None and self.threads < 1:
+            raise ValueError(f"threads must be at least 1, not {self.threads}")
+
+
+@dataclass(frozen=True, kw_only=True)
 class ReconstructOptions:
     """Everything that decides the result of a reconstruction, beside the capture itself."""
 
     frames: FrameOptions = field(default_factory=FrameOptions)
     """Which frames are used."""
+    apertures: ApertureOptions = field(default_factory=ApertureOptions)
+    """How the sub-images of a multi-aperture camera become frames."""
     deblur: DeblurMethod | None = None
     """Undo motion blur by the gyroscope before COLMAP sees a frame. Default: wiener, where exposure times are known
     and the pictures bear the gyroscope out."""
@@ -191,34 +223,6 @@ class ReconstructOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ApertureOptions:
-    """How the pictures of a multi-aperture camera are fused."""
-
-    cost: Literal["census", "mutual-information"] = "census"
-    """What pixels of different colour are compared by: the order of brightness around them, or how their brightness
-    goes together over the whole picture."""
-    disparity_px: tuple[float, float] | None = None
-    """Least and largest shift between the reference and its partner to search, in pixels, below zero for what lies
-    behind infinity (default: found for each exposure in a smaller picture)."""
-    step_px: float = 0.5
-    """Spacing of the shifts that are tried; between them a parabola is fitted."""
-    luminance_cost: bool = True
-    """Also compare the luminance aperture with what the colours add up to, where there are all four."""
-    use_luminance: bool = True
-    """Let an aperture without colour filter lend its lower noise to the colours."""
-    threads: int | None = None
-    """Threads for one exposure; as many as the process may use where absent."""
-
-    def __post_init__(self) -> None:
-        if self.disparity_px is not None and not self.disparity_px[0] < self.disparity_px[1]:
-            raise ValueError(f"disparity_px: must be a lower and a higher limit, not {self.disparity_px}")
-        if not 0.1 <= self.step_px <= 2:
-            raise ValueError(f"step_px must be from 0.1 to 2, not {self.step_px:g}")
-        if self.threads is not None and self.threads < 1:
-            raise ValueError(f"threads must be at least 1, not {self.threads}")
-
-
-@dataclass(frozen=True, kw_only=True)
 class FuseAperturesOptions:
     """What is made of the pictures of a multi-aperture camera."""
 
@@ -228,8 +232,6 @@ class FuseAperturesOptions:
     """Also write pictures that are sharp at this depth only, in metres (or in the calibration's own unit)."""
     lens_width: float = 1.0
     """Width of the lens that refocused pictures show, in distances between the reference and its partner."""
-    depth: bool = False
-    """Also write disparities (pixels) and depths (metres) as NumPy files; nan where they were not measured."""
 
     def __post_init__(self) -> None:
         if self.refocus is not None and not self.refocus > 0:

@@ -305,7 +305,9 @@ def bench_simulated(work: Path) -> dict[str, Any]:
     fused = work / "fused"
     shutil.rmtree(fused, ignore_errors=True)
     start = time.perf_counter()
-    pictures = fuse_captured(capture, fused, FuseAperturesOptions(depth=True), progress=lambda *_: None)
+    pictures = fuse_captured(
+        capture, fused, FuseAperturesOptions(fusion=ApertureOptions(depth=True)), progress=lambda *_: None
+    )
     seconds = (time.perf_counter() - start) / len(pictures)
     unfused = work / "unfused"
     shutil.rmtree(unfused, ignore_errors=True)

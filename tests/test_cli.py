@@ -20,7 +20,19 @@ def run(capsys, *args):
 
 
 @pytest.mark.parametrize(
-    "command", [[], ["reconstruct"], ["scale"], ["align"], ["validate"], ["view"], ["deblur"], ["batch"], ["simulate"]]
+    "command",
+    [
+        [],
+        ["reconstruct"],
+        ["scale"],
+        ["align"],
+        ["validate"],
+        ["view"],
+        ["deblur"],
+        ["fuse-apertures"],
+        ["batch"],
+        ["simulate"],
+    ],
 )
 def test_help_teaches(capsys, command):
     code, out, _ = run(capsys, *command, "--help")

@@ -1,6 +1,7 @@
 """Calibrations of multi-aperture cameras, captures that hold them, and the frames made of them."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -15,7 +16,8 @@ from colmap_inertial.io.apertures import SubImages
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.frames import read_frames
 from colmap_inertial.io.rig_calibration import read_rig_calibration
-from colmap_inertial.options import ApertureOptions, FuseAperturesOptions
+from colmap_inertial.options import ApertureOptions, FuseAperturesOptions, ReconstructOptions
+from colmap_inertial.pipeline import reconstruct
 from colmap_inertial.pipeline.apertures import ApertureStage, fuse_captured
 from colmap_inertial.simulate import MotionOptions, SceneRecipe, ShutterCamera
 from colmap_inertial.simulate.apertures import write_aperture_capture
@@ -275,7 +277,7 @@ def test_names_are_replaced_at_their_end():
 def test_exposures_are_fused_to_pictures_of_the_reference_s_names(tmp_path):
     planes = write_plane_capture(tmp_path / "capture")
     out = tmp_path / "out"
-    options = FuseAperturesOptions(fusion=SMALL, depth=True, refocus=1.0)
+    options = FuseAperturesOptions(fusion=replace(SMALL, depth=True), refocus=1.0)
     steps = []
     written = fuse_captured(tmp_path / "capture", out, options, progress=lambda *step: steps.append(step))
     assert [p.name for p in written] == ["shot0_0.png", "shot1_0.png"]
@@ -338,3 +340,35 @@ def test_a_simulated_capture_goes_through_the_stage(tmp_path):
         assert frame.camera is not None and frame.camera.params == model.params
         assert psnr_db(frame.image, wanted) > psnr_db(direct, wanted) + 8
         assert (tmp_path / "kept" / "depth" / f"{frame.name}.npy").is_file()
+
+
+def test_reconstruct_fuses_before_it_looks_for_features_and_again_where_a_sub_image_changed(tmp_path):
+    model = CameraModel(model="PINHOLE", width=160, height=120, params=(300.0, 300.0, 80.0, 60.0))
+    recipe = SceneRecipe(
+        format="png",
+        camera=ShutterCamera(model=model, exposure_s=0.001),
+        motion=MotionOptions(duration_s=2.0, radius_m=0.69, height_m=0.4, arc_deg=60.0, sweep_s=6.0),
+        frame_rate_hz=3.0,
+    )
+    toml = write_aperture_capture(recipe, tmp_path / "capture")
+    options = ReconstructOptions(apertures=ApertureOptions(threads=1, depth=True))
+
+    def stop(stage, done, total, /):
+        if stage == "features":
+            raise KeyboardInterrupt
+
+    out, alone = tmp_path / "out", tmp_path / "alone"
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(toml, out, options, progress=stop)
+    fuse_captured(toml, alone, FuseAperturesOptions(fusion=options.apertures), progress=lambda *_: None)
+    names = sorted(path.name for path in (alone / "images").iterdir())
+    assert len(names) == 6 and {f"{name}.npy" for name in names} == {
+        p.name for p in (out / "apertures/depth").iterdir()
+    }
+    before = {name: (out / "images" / name).read_bytes() for name in names}
+    assert before == {name: (alone / "images" / name).read_bytes() for name in names}
+    red = tmp_path / "capture" / "frames_red" / names[2]
+    cv2.imwrite(str(red), 255 - cv2.imread(str(red), cv2.IMREAD_UNCHANGED))
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(toml, out, options, progress=stop)
+    assert [name for name in names if (out / "images" / name).read_bytes() != before[name]] == [names[2]]

@@ -10,7 +10,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from colmap_inertial.options import ProjectOptions, ReconstructOptions
+from colmap_inertial.options import ApertureOptions, FuseAperturesOptions, ProjectOptions, ReconstructOptions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,6 +87,38 @@ class Deblur:
                 progress=progress,
             )
         show_deblurred(result)
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class FuseApertures:
+    """Make RGB pictures of a multi-aperture camera's sub-images, without reconstructing anything.
+
+    One disparity map from all apertures takes their parallax out. Writes OUT/images, seen through the first aperture,
+    with the names of its pictures; with --refocus OUT/refocused; with --depth OUT/disparity and OUT/depth.
+
+    Example: colmap-inertial fuse-apertures my_capture/capture.toml out --refocus 0.8
+    """
+
+    capture: Positional[Path]
+    """A capture.toml with [images] and [apertures], or a folder that holds one; no IMU is needed."""
+    out: Positional[Path]
+    """A new folder."""
+    refocus: float | None = None
+    """Also write pictures that are sharp at this depth only, in metres."""
+    lens_width: float = 1.0
+    """Width of the lens that refocused pictures show, in distances between the first two apertures."""
+    fusion: Annotated[ApertureOptions, arg(name="")] = dataclasses.field(default_factory=ApertureOptions)
+
+    def run(self) -> int:
+        """Run the command; returns the exit code."""
+        from colmap_inertial.pipeline.apertures import fuse_captured
+        from colmap_inertial.pipeline.terminal import live_progress
+
+        options = FuseAperturesOptions(fusion=self.fusion, refocus=self.refocus, lens_width=self.lens_width)
+        with live_progress() as progress:
+            written = fuse_captured(self.capture, self.out, options, progress=progress)
+        print(f"{len(written)} pictures in {self.out / 'images'}")
         return 0
 
 

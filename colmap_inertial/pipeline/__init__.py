@@ -15,7 +15,8 @@ from colmap_inertial.io.calibration import SHARED_CLOCK_OFFSET_S, for_another_re
 from colmap_inertial.io.capture import Capture, Video, load_capture
 from colmap_inertial.io.files import write_json, write_text
 from colmap_inertial.io.frames import frame_source, read_frames
-from colmap_inertial.options import ReconstructOptions
+from colmap_inertial.options import ApertureOptions, ReconstructOptions
+from colmap_inertial.pipeline.apertures import ApertureStage
 from colmap_inertial.pipeline.colmap import (
     KeypointStage,
     Progress,
@@ -129,8 +130,9 @@ def reconstruct(
     options
         See :class:`ReconstructOptions`.
     frame_stages, keypoint_stages, model_stages
-        The hooks. ``None`` means the default stages, an empty list none: :class:`DeblurStage` for frames and
-        :class:`RollingShutterStage` for keypoints, where the options and the recording allow them. The model stages
+        The hooks. ``None`` means the default stages, an empty list none: :class:`ApertureStage` for a multi-aperture
+        camera's frames, then :class:`DeblurStage`, and :class:`RollingShutterStage` for keypoints, where the options
+        and the recording allow them. The model stages
         must include one that makes the model metric, see :func:`default_model_stages`.
     progress
         Called with stage, steps done and steps in all.
@@ -182,7 +184,11 @@ def reconstruct(
             timing = part_of(timing, selection.names)
             _, frames = read_frames(loaded, only=timing.names)
         plan = run_plan(runner, workspace, loaded, imu, timing, options, progress, every=every)
-        of_frames = list(plan.frame_stages() if frame_stages is None else frame_stages)
+        of_frames: list[FrameStage] = (
+            [*fusing(loaded, workspace, options.apertures), *plan.frame_stages()]
+            if frame_stages is None
+            else list(frame_stages)
+        )
         of_keypoints = list(plan.keypoint_stages() if keypoint_stages is None else keypoint_stages)
         kept = CropKeeper.of(plan)
         run_frames(runner, workspace, loaded, timing, frames, of_frames, progress, kept=kept)
@@ -338,12 +344,22 @@ def run_frames(
     runner.run("frames", depends, [workspace.images, workspace.frames, *crops], work)
 
 
+def fusing(capture: Capture, workspace: Workspace, options: ApertureOptions) -> list[ApertureStage]:
+    """The stage that makes frames of a multi-aperture camera's sub-images; none for other cameras."""
+    if capture.apertures is None:
+        return []
+    keep = workspace.apertures if options.depth else None
+    return [ApertureStage(pictures=capture.apertures, options=options, keep=keep)]
+
+
 def _inputs(capture: Capture, timing: FrameTiming) -> list[object]:
     """What identifies the files that frames are read from."""
     source = frame_source(capture)
     paths = [] if source is None else [source / name for name in timing.names]
     if isinstance(capture.frames, Video):
         paths = [capture.frames.file]
+    if capture.apertures is not None:
+        paths += capture.apertures.files(timing.names)
     return [fingerprint(path) for path in paths]
 
 

@@ -144,7 +144,7 @@ def fuse_captured(
         target.parent.mkdir(parents=True, exist_ok=True)
         encode_image(target, fused.image, source)
         written.append(target)
-        if options.depth:
+        if options.fusion.depth:
             write_maps(out, name, fused)
         if options.refocus is not None:
             picture = refocus(

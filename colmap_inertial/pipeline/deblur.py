@@ -13,10 +13,10 @@ from colmap_inertial.io.files import write_json
 from colmap_inertial.io.frames import frame_source, read_frames
 from colmap_inertial.io.imu import read_capture_imu
 from colmap_inertial.options import ReconstructOptions
-from colmap_inertial.pipeline import logging_to, run_frames, run_plan, run_rectified
+from colmap_inertial.pipeline import fusing, logging_to, run_frames, run_plan, run_rectified
 from colmap_inertial.pipeline.colmap import Progress, check_names
 from colmap_inertial.pipeline.contact_sheet import write_contact_sheet
-from colmap_inertial.pipeline.frames import FrameRecord, read_frame_records
+from colmap_inertial.pipeline.frames import FrameRecord, FrameStage, read_frame_records
 from colmap_inertial.pipeline.imaging import ImagingPlan, with_stated_exposures
 from colmap_inertial.pipeline.result import frame_as_json, imaging_as_json
 from colmap_inertial.pipeline.workspace import StageRunner, Workspace
@@ -99,7 +99,10 @@ def deblur_capture(
     with workspace.locked(), logging_to(workspace.log):
         runner = StageRunner(workspace)
         plan = run_plan(runner, workspace, loaded, imu, timing, options, progress)
-        stages = plan.frame_stages(drop=False)
+        stages: list[FrameStage] = [
+            *fusing(loaded, workspace, options.apertures),
+            *plan.frame_stages(drop=False),
+        ]
         run_frames(runner, workspace, loaded, timing, frames, stages, progress)
         records = read_frame_records(workspace.frames)
         run_rectified(runner, workspace, records, plan.keypoint_stages(), progress)

@@ -35,6 +35,7 @@ _STAGES = {
     "survey": "Small models",
     "blur": "Blur",
     "frames": "Frames",
+    "fusing": "Fused",
     "features": "Features",
     "matches": "Matches",
     "mapping": "Mapping",

@@ -103,6 +103,11 @@ class Workspace:
         return self.root / "diagnosis.json"
 
     @property
+    def apertures(self) -> Path:
+        """Disparities and depths of a multi-aperture camera's frames, where they were asked for."""
+        return self.root / "apertures"
+
+    @property
     def report(self) -> Path:
         """For reading: everything in one page."""
         return self.root / "report.html"
