@@ -228,6 +228,84 @@ def test_frames_before_an_edit_list_s_beginning_are_no_frames_of_the_video(tmp_p
     np.testing.assert_allclose(levels, [20 + 15 * i % 220 for i in range(5, 25)], atol=3)
 
 
+@pytest.mark.parametrize("suffix", ["mp4", "mov"])
+@pytest.mark.parametrize("faststart", [True, False])
+@pytest.mark.parametrize(("from_start", "from_end"), [(55, 0), (0, 45), (37, 28)])
+def test_a_cut_longer_than_a_group_of_pictures_leaves_a_whole_video(
+    tmp_path: Path, suffix: str, faststart: bool, from_start: int, from_end: int
+) -> None:
+    """What phones write that trim without coding anew: all samples, and an edit list."""
+    stamps = tuple(range(0, 4000, 40))
+    video = write_video(tmp_path / f"a.{suffix}", stamps, faststart=faststart)
+    with av.open(str(video)) as container:
+        ticks_per_frame = round(0.04 / container.streams.video[0].time_base)
+    raw = video.read_bytes()
+    # one entry: version and flags, count, duration (of the movie's clock, milliseconds), media time
+    media_time = struct.unpack_from(">i", raw, raw.index(b"elst") + 16)[0] + from_start * ticks_per_frame
+    entry = struct.pack(">ii", (100 - from_start - from_end) * 40, media_time)
+    patched(video, b"elst", 8, entry)
+    expected_s = np.array(stamps[: 100 - from_start - from_end]) / 1e3
+    np.testing.assert_allclose(video_stamps_ns(video) * 1e-9, expected_s, atol=1e-6, rtol=0)
+    _, frames = read_frames(capture_of(tmp_path, f'file = "a.{suffix}"'))
+    levels = [float(frame.image.mean()) for frame in frames]
+    np.testing.assert_allclose(levels, [20 + 15 * i % 220 for i in range(from_start, 100 - from_end)], atol=3)
+    if faststart:
+        whole = video.read_bytes()
+        for share in (0.6, 0.9):
+            video.write_bytes(whole[: int(share * len(whole))])
+            with pytest.raises(FormatError, match=r"is cut off: it holds \d+ of the 100 frames"):
+                video_stamps_ns(video)
+
+
+def test_frames_that_the_camera_dropped_do_not_cut_an_avi_file_off(tmp_path: Path) -> None:
+    """They are empty chunks, which its header counts."""
+    shown = [0, 1, 2, 5, 6, 9, 10, 15]
+    video = tmp_path / "a.avi"
+    with av.open(str(video), "w") as container:
+        stream = container.add_stream("mjpeg", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 320, 240, "yuvj420p"
+        for place in shown:
+            frame = av.VideoFrame.from_ndarray(np.full((240, 320, 3), 20 + 10 * place, np.uint8), format="rgb24")
+            frame.pts, frame.time_base = place, Fraction(1, 30)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    with av.open(str(video)) as container:
+        assert container.streams.video[0].frames == 16
+    np.testing.assert_allclose(video_stamps_ns(video) * 1e-9, np.array(shown) / 30, atol=1e-6, rtol=0)
+    levels = [float(image.mean()) for _, image in decode_video(video, video_stamps_ns(video))]
+    np.testing.assert_allclose(levels, 20 + 10 * np.array(shown), atol=3)
+    whole = video.read_bytes()
+    for share in (0.6, 0.9):
+        video.write_bytes(whole[: int(share * len(whole))])
+        with pytest.raises(FormatError, match=r"is cut off: it holds \d of the 16 frames"):
+            video_stamps_ns(video)
+
+
+def test_a_change_of_size_is_refused_at_its_time(tmp_path: Path) -> None:
+    for name, size in (("a", (320, 240)), ("b", (160, 120))):
+        write_pattern(tmp_path / f"{name}.ts", 15, size=size, codec="mpeg2video")
+    video = tmp_path / "both.ts"
+    with av.open(str(video), "w") as container:
+        target, shift = None, 0
+        for name in ("a", "b"):
+            with av.open(str(tmp_path / f"{name}.ts")) as part:
+                source = part.streams.video[0]
+                target = target or container.add_stream_from_template(source)
+                for packet in part.demux(source):
+                    if packet.dts is not None:
+                        packet.pts, packet.dts = packet.pts + shift, packet.dts + shift
+                        packet.stream = target
+                        container.mux(packet)
+            shift = 15 * 3000
+    stamps = video_stamps_ns(video)
+    assert len(stamps) == 30
+    at = rf"from 320x240 to 160x120 at {stamps[15] * 1e-9:.3f} s"
+    for decoded in (decode_video(video, stamps), decode_reduced(video, stamps, 64)):
+        with pytest.raises(FormatError, match=at):
+            list(decoded)
+    assert len(list(decode_reduced(video, stamps[:14], 64))) == 14
+
+
 @pytest.mark.parametrize("turn", [90, 180, 270])
 def test_a_rotation_mark_leaves_the_sensor_s_rows_alone(tmp_path: Path, turn: int) -> None:
     video = write_pattern(tmp_path / "a.mp4", 6)

@@ -89,6 +89,11 @@ class Movie:
         ends = begin + track.size
         return [data[b:e] for b, e in zip(begin.tolist(), ends.tolist(), strict=True)]
 
+    def beyond(self, track: Track) -> Int:
+        """Which of a track's samples do not lie inside the file."""
+        length = self.path.stat().st_size
+        return np.flatnonzero((track.offset < 0) | (track.size < 0) | (track.offset + track.size > length))
+
     def contents(self, track: Track) -> tuple[bytes, Int]:
         """A track's samples one after the other, and (N,) where each begins; neighbours in the file are read at once.
 
@@ -97,8 +102,7 @@ class Movie:
         FormatError
             Where a sample lies beyond the end of the file, or samples overlap.
         """
-        length = self.path.stat().st_size
-        beyond = np.flatnonzero((track.offset < 0) | (track.size < 0) | (track.offset + track.size > length))
+        length, beyond = self.path.stat().st_size, self.beyond(track)
         if len(beyond):
             where = f"sample {beyond[0] + 1} of the {track.entry} track at byte {track.offset[beyond[0]]}"
             raise FormatError(self.path, f"is cut off or damaged: {where} ends beyond the file's {length} bytes")

@@ -6,6 +6,7 @@ BT.709 from 720 rows on where it says nothing, as players have it. Transfer curv
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -44,6 +45,7 @@ def video_stamps_ns(path: Path) -> NDArray[np.int64]:
         packets = _guarded(path, container.demux(stream))
         found = [(packet.pts, packet.is_discard) for packet in packets if packet.size > 0]
         listed, time_base, duration_s = stream.frames, stream.time_base, _stated_duration_s(stream)
+        kind = container.format.name
     stamps = [stamp for stamp, is_discarded in found if not is_discarded]
     known = [stamp for stamp in stamps if stamp is not None]
     t_ns = np.zeros(0, dtype=np.int64)
@@ -51,7 +53,10 @@ def video_stamps_ns(path: Path) -> NDArray[np.int64]:
         t_ns = np.array(sorted(_ns(stamp, time_base.numerator, time_base.denominator) for stamp in known), np.int64)
     last = f", the last at {t_ns[-1] * 1e-9:.3f} s" if len(t_ns) else ""
     if len(found) < listed:
-        raise FormatError(path, f"is cut off: it holds {len(found)} of the {listed} frames that its index lists{last}")
+        missing = _lost(path, kind, listed, listed - len(found))
+        if missing:
+            held = f"it holds {listed - missing} of the {listed} frames that its index lists"
+            raise FormatError(path, f"is cut off: {held}{last}")
     if not stamps:
         raise FormatError(path, "holds no video frames")
     if time_base is None or len(known) < len(stamps):
@@ -93,15 +98,7 @@ def decode_video(
     FormatError
         Where a wanted frame cannot be decoded whole, or has another size than those before.
     """
-    size: tuple[int, int] | None = None
     for t_ns, frame in _wanted(path, wanted_ns):
-        if size is None:
-            size = frame.width, frame.height
-        if (frame.width, frame.height) != size:
-            raise FormatError(
-                path,
-                f"changes its size from {size[0]}x{size[1]} to {frame.width}x{frame.height} at {t_ns * 1e-9:.3f} s",
-            )
         yield t_ns, _pixels(frame)
 
 
@@ -140,9 +137,10 @@ def decode_grey(path: Path) -> Iterator[tuple[int, int, NDArray[np.uint8]]]:
 
 
 def _wanted(path: Path, wanted_ns: NDArray[np.int64]) -> Iterator[tuple[int, av.VideoFrame]]:
-    """The frames with the wanted stamps, each of them whole."""
+    """The frames with the wanted stamps, each of them whole, and all of one size."""
     if len(wanted_ns) == 0:
         return
+    size: tuple[int, int] | None = None
     container, stream = _open(path)
     stream.thread_type = "AUTO"
     missing = set(wanted_ns.tolist())
@@ -158,6 +156,10 @@ def _wanted(path: Path, wanted_ns: NDArray[np.int64]) -> Iterator[tuple[int, av.
             if t_ns not in missing:
                 continue
             missing.discard(t_ns)
+            size = size or (frame.width, frame.height)
+            if (frame.width, frame.height) != size:
+                change = f"from {size[0]}x{size[1]} to {frame.width}x{frame.height}"
+                raise FormatError(path, f"changes its size {change} at {t_ns * 1e-9:.3f} s")
             yield t_ns, frame
             if not missing:
                 return
@@ -234,6 +236,37 @@ def _filmed(path: Path, container: InputContainer) -> VideoStream:
 def _area(stream: VideoStream) -> int:
     # a stream of no known codec has no size
     return int(getattr(stream, "width", 0) * getattr(stream, "height", 0))
+
+
+def _lost(path: Path, kind: str, listed: int, not_found: int) -> int:
+    """How many of the frames that an index lists lie beyond the end of the file, where FFmpeg gave fewer than it lists.
+
+    An intact file gives fewer, too: what an edit list cuts away is dropped by whole groups of pictures, and AVI counts
+    a frame that the camera dropped as an empty one.
+    """
+    if kind.startswith("mov,"):
+        movie = read_movie(path)
+        tracks = [track for track in movie.tracks if track.handler == "vide" and len(track.size) == listed]
+        return max((len(movie.beyond(track)) for track in tracks), default=0)
+    if kind == "avi" and not _ends_inside_riff(path):
+        return 0
+    return not_found
+
+
+def _ends_inside_riff(path: Path) -> bool:
+    """Whether an AVI file ends before its last RIFF list does: ``RIFF``, 32-bit size, contents, and so on."""
+    with open(path, "rb") as file:
+        length, at = file.seek(0, 2), 0
+        while at + 8 <= length:
+            file.seek(at)
+            name, size = struct.unpack("<4sI", file.read(8))
+            if name != b"RIFF":
+                return False
+            # some writers count the head of 8 bytes, too
+            if at + size > length:
+                return True
+            at += 8 + size + size % 2
+    return False
 
 
 def _stated_duration_s(stream: VideoStream) -> float | None:
