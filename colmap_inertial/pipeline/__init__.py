@@ -32,7 +32,6 @@ from colmap_inertial.pipeline.contact_sheet import CropKeeper
 from colmap_inertial.pipeline.frames import FrameRecord, FrameStage, read_frame_records, require_frames, write_frames
 from colmap_inertial.pipeline.imaging import (
     ImagingPlan,
-    for_rectified,
     plan_imaging,
     read_plan,
     with_stated_exposures,
@@ -46,8 +45,9 @@ from colmap_inertial.pipeline.readout import ReadoutStage
 from colmap_inertial.pipeline.reporting import report_result, reporting_stops, write_recording
 from colmap_inertial.pipeline.result import ModelResult, ReconstructResult
 from colmap_inertial.pipeline.selection import part_of, run_selection
-from colmap_inertial.pipeline.stages import DeblurStage, GyroView, RollingShutterStage
+from colmap_inertial.pipeline.stages import DeblurStage, GyroView, RollingShutterStage, for_rectified
 from colmap_inertial.pipeline.workspace import StageRunner, Workspace, fingerprint, remove
+from colmap_inertial.report import require_plotly
 from colmap_inertial.types import (
     Array,
     CameraImuCalibration,
@@ -154,6 +154,7 @@ def reconstruct(
         When the recording cannot give metres, as a stabilised video (``options.force`` goes on); when deblurring or
         rectifying was asked for by name, and the gyroscope does not belong to the pixels.
     """
+    require_plotly()
     loaded = load_capture(capture)
     if loaded.frames is None:
         raise FormatError(loaded.path, "has no frames: add [images] or [video]")
@@ -215,8 +216,8 @@ def reconstruct(
             selection=selection,
             seconds=runner.seconds,
         )
-        write_recording(workspace, imu, timing, plan)
-        report_result(result, loaded)
+        write_recording(workspace, imu, timing, rectifying)
+        result = report_result(result, loaded)
         if not result.waiting:  # else the run goes on later, and needs them
             remove(workspace.features)
         log.info("finished")

@@ -20,7 +20,6 @@ from colmap_inertial.model import colmap_camera
 from colmap_inertial.pipeline.first_look import some_frames
 from colmap_inertial.pipeline.frames import encode_image
 from colmap_inertial.pipeline.imaging import ImagingPlan
-from colmap_inertial.pipeline.stages import GyroView
 from colmap_inertial.types import Frame
 
 _FRAMES, _WIDTH, _HEIGHT, _GAP, _LABEL = 8, 420, 280, 6, 22
@@ -32,15 +31,17 @@ Part = tuple[int, int, int, int]
 _ARROWS_PX = 70
 
 
-def write_contact_sheet(path: Path, capture: Capture, view: GyroView, images: Path, names: Sequence[str]) -> None:
+def write_contact_sheet(path: Path, capture: Capture, plan: ImagingPlan, images: Path, names: Sequence[str]) -> None:
     """Write a PNG: one row for each of the first frames named; before on the left, after on the right.
 
     Parameters
     ----------
     path
         Of the PNG.
-    capture, view
+    capture
         The recording.
+    plan
+        By which it was deblurred.
     images
         Folder of the deblurred images.
     names
@@ -48,11 +49,15 @@ def write_contact_sheet(path: Path, capture: Capture, view: GyroView, images: Pa
     """
     import cv2
 
+    view = plan.view
+    if view is None:
+        raise ValueError("nothing was deblurred without a view")
     index = view.index()
     motion, camera = view.motion(), colmap_camera(view.camera)
     rows: dict[str, NDArray[np.uint8]] = {}
     for frame in some_frames(capture, view.timing, [index[name] for name in names[:_FRAMES]]):
-        field = blur_field(motion, camera, view.shutter(index[frame.name]))
+        parallax = plan.parallaxes.get(frame.name)
+        field = blur_field(motion, camera, view.shutter(index[frame.name]), parallax=parallax)
         before, after = _eight_bit(frame.image), _eight_bit(read_image(images / frame.name))
         top, left, height, width = _busiest(before)
         cut = [picture[top : top + height, left : left + width].copy() for picture in (before, after)]

@@ -108,7 +108,7 @@ def deblur_capture(
         run_rectified(runner, workspace, records, plan.keypoint_stages(), progress)
         shown = _shown(records)
         if sheet is not None and shown and plan.view is not None:
-            write_contact_sheet(sheet, loaded, plan.view, workspace.images, shown)
+            write_contact_sheet(sheet, loaded, plan, workspace.images, shown)
         written = sheet if sheet is not None and shown else None
         write_json(
             workspace.result,

@@ -23,7 +23,7 @@ from colmap_inertial.imaging.gate import (
 from colmap_inertial.imaging.parallax import Parallax
 from colmap_inertial.imaging.psf import blur_field, predicted_blur_px
 from colmap_inertial.imaging.rolling_shutter import rectify_image
-from colmap_inertial.io.calibration import SHARED_CLOCK_OFFSET_S, SMALLEST_READOUT_S
+from colmap_inertial.io.calibration import SHARED_CLOCK_OFFSET_S
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import read_json, write_json
 from colmap_inertial.io.frames import frame_source
@@ -37,7 +37,7 @@ from colmap_inertial.pipeline.metadata import stated_exposures_s
 from colmap_inertial.pipeline.passing import find_parallaxes
 from colmap_inertial.pipeline.stages import DeblurStage, GyroView, RollingShutterStage
 from colmap_inertial.pipeline.workspace import a_record_of_ours
-from colmap_inertial.types import CALIBRATION_PARAMETERS, CameraImuCalibration, CameraModel, FrameTiming, ImuRecording
+from colmap_inertial.types import CameraImuCalibration, CameraModel, FrameTiming, ImuRecording
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
@@ -51,9 +51,6 @@ _TELLING_PX = 4.0
 _MOST_OF_THEM = 0.95
 #: Standard deviations by which a frame must bear it out by itself, where others do not: with 4, some were made worse.
 _CLEAR_SUPPORT = 7.0
-#: Share of the readout that acts on poses after rectification.
-_LEFT_SHARE = 0.1
-_READOUT = CALIBRATION_PARAMETERS.index("readout_s")
 #: How often small models are made, at most, for more of the blurred frames.
 _SURVEYS = 4
 #: Frames by which the gyroscope is judged.
@@ -127,7 +124,7 @@ class ImagingPlan:
 
 def write_plan(path: Path, plan: ImagingPlan) -> None:
     """Write a plan for :func:`read_plan`."""
-    write_json(path, plan.as_json())
+    write_json(path, plan.as_json(), indent=None)
 
 
 def read_plan(path: Path, imu: ImuRecording, timing: FrameTiming) -> ImagingPlan:
@@ -303,40 +300,59 @@ def _deblurring(
     ``models`` makes them of some frames as filmed, or as a plan has them. Where frames were too blurred for a model,
     those around them, and the IMU beyond, tell how to deblur them for the next one.
     """
-    calibration = for_rectified(view.calibration) if plan.rectify else view.calibration
     decisions = _decisions(view, {})
     if not _blurred(decisions):
         return _decided(plan, view, capture, {}, progress)
     parts, place = survey_parts(view.timing), view.index()
     begins_s = view.timing.t_s[[place[names[0]] for names in parts]]
-    surveyed = {name for names in parts for name in names}
 
-    def parts_of(names: set[str]) -> list[int]:
-        t_s = view.timing.t_s[[place[name] for name in names]]
-        return np.unique(np.searchsorted(begins_s, t_s, side="right") - 1).tolist()
+    def by_part(names: set[str]) -> dict[int, set[str]]:
+        out: dict[int, set[str]] = {}
+        for name in names:
+            part = int(np.searchsorted(begins_s, view.timing.t_s[place[name]], side="right")) - 1
+            out.setdefault(part, set()).add(name)
+        return out
 
-    found = {i: models(parts[i], None) for i in parts_of(_to_deblur(decisions))}
+    found: dict[int, _Surveyed] = {}
+    lost, treated = by_part(_to_deblur(decisions)), None
     for _ in range(_SURVEYS):
-        known = [model for i in found for model in found[i]]
-        parallaxes = find_parallaxes(known, view, calibration)
-        decided = _decided(plan, view, capture, parallaxes, progress)
-        lost = _to_deblur(_decisions(view, parallaxes)) & surveyed - _registered(known)
-        if not parallaxes or not lost or not decided.frame_stages():
-            break
-        again = {i: models(parts[i], decided) for i in parts_of(lost)}
-        better = {i: made for i, made in again.items() if len(_registered(made)) > len(_registered(found.get(i, ())))}
+        better = False
+        for i in sorted(lost):
+            new = _Surveyed.of(models(parts[i], treated), view)
+            if i not in found or len(new.registered) > len(found[i].registered):
+                found[i], better = new, True
         if not better:
             break
-        found |= better
-    return decided
+        # of two parts that tell about a frame, its own goes first
+        parallaxes = {name: one for part in found.values() for name, one in part.parallaxes.items()}
+        own = by_part(set(parallaxes))
+        parallaxes |= {n: found[i].parallaxes[n] for i in found for n in own.get(i, ()) if n in found[i].parallaxes}
+        decisions = _decisions(view, parallaxes)
+        treated = _decided(plan, view, capture, parallaxes, progress)
+        registered = {name for part in found.values() for name in part.registered}
+        known = {i: names & set(parts[i]) - registered for i, names in by_part(_to_deblur(decisions)).items()}
+        lost = {i: names for i, names in known.items() if names}
+        if not parallaxes or not lost or not treated.frame_stages():
+            break
+    assert treated is not None
+    return treated
+
+
+@dataclass(frozen=True, eq=False)
+class _Surveyed:
+    """What the small models of a part of a recording tell."""
+
+    parallaxes: Mapping[str, Parallax]
+    registered: frozenset[str]
+
+    @classmethod
+    def of(cls, models: Sequence[pycolmap.Reconstruction], view: GyroView) -> _Surveyed:
+        registered = frozenset(model.image(i).name for model in models for i in model.reg_image_ids())
+        return cls(parallaxes=find_parallaxes(models, view), registered=registered)
 
 
 def _to_deblur(decisions: Sequence[FrameDecision]) -> set[str]:
     return {decision.name for decision in decisions if decision.action == "deblur"}
-
-
-def _registered(models: Sequence[pycolmap.Reconstruction]) -> set[str]:
-    return {model.image(i).name for model in models for i in model.reg_image_ids()}
 
 
 def _decisions(view: GyroView, parallaxes: Mapping[str, Parallax]) -> tuple[FrameDecision, ...]:
@@ -371,9 +387,10 @@ def _decided(
     progress("blur", len(chosen), len(chosen))
     verdict = _by_frame(judge_recording(evidence), evidence, [d.blur_px or 0.0 for d in chosen])
     note = f"{sum(d.action == 'deblur' for d in decisions)} of {len(decisions)} frames are blurred; {verdict.reason}"
-    if parallaxes:
-        note += f"; the camera's translation is counted in for {len(parallaxes)} frames"
-    return replace(plan, deblur=(decisions, verdict), parallaxes=parallaxes, deblur_note=note)
+    used = {name: parallaxes[name] for name in _to_deblur(decisions) if name in parallaxes}
+    if used:
+        note += f"; the camera's translation is counted in for {len(used)} frames"
+    return replace(plan, deblur=(decisions, verdict), parallaxes=used, deblur_note=note)
 
 
 def _keeping_ends(decisions: tuple[FrameDecision, ...]) -> tuple[FrameDecision, ...]:
@@ -405,17 +422,6 @@ def _by_frame(
         "by itself (close to things, the camera's translation blurs, too)"
     )
     return replace(verdict, trusted=None, reason=reason)
-
-
-def for_rectified(calibration: CameraImuCalibration) -> CameraImuCalibration:
-    """The calibration of a camera whose keypoints were rectified: hardly any readout is left.
-
-    Its standard deviation stands for what the camera's translation does within the readout, which stays.
-    """
-    cov = calibration.cov.copy()
-    cov[_READOUT, :] = cov[:, _READOUT] = 0.0
-    cov[_READOUT, _READOUT] = max(SMALLEST_READOUT_S, _LEFT_SHARE * calibration.readout_s) ** 2
-    return replace(calibration, readout_s=0.0, cov=cov)
 
 
 def write_rectified(

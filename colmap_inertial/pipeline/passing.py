@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,9 +19,9 @@ from colmap_inertial.imaging.parallax import Parallax, parallax_from_points
 from colmap_inertial.model import colmap_camera, trajectory_from_model
 from colmap_inertial.options import ScaleOptions
 from colmap_inertial.pipeline.metric import smoothed_path
-from colmap_inertial.pipeline.stages import GyroView
+from colmap_inertial.pipeline.stages import GyroView, for_rectified
 from colmap_inertial.scale import estimate_scale
-from colmap_inertial.types import Array, CameraImuCalibration, CameraTrajectory
+from colmap_inertial.types import Array, CameraTrajectory
 
 if TYPE_CHECKING:
     import pycolmap
@@ -36,62 +36,65 @@ _USABLE_SHARE, _SLOW_M_S = 0.3, 0.1
 _FEWEST_IMAGES = 8
 
 
-def find_parallaxes(
-    models: Sequence[pycolmap.Reconstruction], view: GyroView, calibration: CameraImuCalibration
-) -> dict[str, Parallax]:
-    """The parallax of the frames of a recording, by name; those without are of frames that no model tells about.
+def find_parallaxes(models: Sequence[pycolmap.Reconstruction], view: GyroView) -> dict[str, Parallax]:
+    """The parallax of frames, by name; those without are of frames that no model tells about.
 
     Parameters
     ----------
     models
-        Of frames of the recording, of rectified keypoints, the largest first.
+        Of frames of the recording, of rectified keypoints where there is a readout. Of several that tell about a frame,
+        the one counts that has it, or has one nearest to it.
     view
         Gyroscope, camera and times.
-    calibration
-        What is known of camera and IMU; of rectified keypoints.
     """
-    out: dict[str, Parallax] = {}
+    out: dict[str, tuple[float, Parallax]] = {}
     for model in models:
         if model.num_reg_images() >= _FEWEST_IMAGES:
-            for name, parallax in _of_model(model, view, calibration).items():
-                out.setdefault(name, parallax)
-    return out
+            for name, away_s, parallax in _of_model(model, view):
+                if name not in out or away_s < out[name][0]:
+                    out[name] = away_s, parallax
+    return {name: parallax for name, (_, parallax) in out.items()}
 
 
-def _of_model(model: pycolmap.Reconstruction, view: GyroView, calibration: CameraImuCalibration) -> dict[str, Parallax]:
+def _of_model(model: pycolmap.Reconstruction, view: GyroView) -> Iterator[tuple[str, float, Parallax]]:
+    """Names of frames, how far in time they are from the model's nearest one, and their parallax."""
+    calibration = for_rectified(view.calibration) if view.timing.readout_s else view.calibration
     trajectory, _ = trajectory_from_model(model, view.timing)
-    estimate = estimate_scale(trajectory, view.imu, calibration=calibration, options=ScaleOptions())
+    imu = view.recording()
+    estimate = estimate_scale(trajectory, imu, calibration=calibration, options=ScaleOptions())
     if estimate.metres_per_unit is None or estimate.gravity_in_world_m_s2 is None:
         log.info("no blur by translation: %s", "; ".join(estimate.reasons))
-        return {}
+        return
     metric = dataclasses.replace(
         trajectory, cam_in_world=trajectory.cam_in_world * estimate.metres_per_unit, length_unit="m", pose_cov=None
     )
-    times = dict(zip(view.timing.names, view.timing.pose_t_s().tolist(), strict=True))
-    gravity = estimate.gravity_in_world_m_s2
+    every_s = view.timing.pose_t_s()
+    around = np.flatnonzero(
+        (every_s >= trajectory.t_s[0] - _FARTHEST_S) & (every_s <= trajectory.t_s[-1] + _FARTHEST_S)
+    )
     try:
-        path = smoothed_path(metric, view.imu, estimate, gravity, also_at_s=np.array(list(times.values())))
+        path = smoothed_path(metric, imu, estimate, estimate.gravity_in_world_m_s2, also_at_s=every_s[around])
     except NotObservableError as error:
         log.info("no blur by translation: %s", error)
-        return {}
+        return
     seen = _points_seen(model, trajectory, estimate.metres_per_unit)
     camera, width, height = colmap_camera(view.camera), view.camera.width, view.camera.height
     rotation = matrix_from_quat(path.cam_from_world_xyzw)
     sigma = np.sqrt(np.trace(path.cov[:, 3:6, 3:6], axis1=1, axis2=2))
     known = sigma < _USABLE_SHARE * np.maximum(np.linalg.norm(path.velocity_in_world, axis=1), _SLOW_M_S)
-    out = {}
-    for name, t_s in times.items():
+    for k in around:
+        t_s = float(every_s[k])
         i = min(int(np.searchsorted(path.t_s, t_s - 1e-6)), len(path.t_s) - 1)
-        near = np.argsort(np.abs(trajectory.t_s - t_s))[:_NEIGHBOURS]
-        if abs(path.t_s[i] - t_s) > 1e-5 or not known[i] or abs(trajectory.t_s[near[0]] - t_s) > _FARTHEST_S:
+        away_s = np.abs(trajectory.t_s - t_s)
+        near = np.argsort(away_s)[:_NEIGHBOURS]
+        if abs(path.t_s[i] - t_s) > 1e-5 or not known[i] or away_s[near[0]] > _FARTHEST_S:
             continue
-        points = np.unique(np.concatenate([seen[k] for k in near]), axis=0)
+        points = np.unique(np.concatenate([seen[n] for n in near]), axis=0)
         in_cam = (points - path.cam_in_world[i]) @ rotation[i].T
         velocity = rotation[i] @ path.velocity_in_world[i]
         found = parallax_from_points(in_cam, velocity, camera, width=width, height=height)
         if found is not None:
-            out[name] = found
-    return out
+            yield view.timing.names[k], float(away_s[near[0]]), found
 
 
 def _points_seen(model: pycolmap.Reconstruction, trajectory: CameraTrajectory, factor: float) -> list[Array]:

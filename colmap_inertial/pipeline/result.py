@@ -53,6 +53,8 @@ class ReconstructResult:
     """Which frames were used, and why; ``None`` for an existing project."""
     project_metric: Path | None = None
     """The whole project in metres, where an existing one was given and not every scale was refused."""
+    report: Path | None = None
+    """The page for reading; ``None`` where it failed, for which ``log.txt`` has the reason."""
 
     @property
     def waiting(self) -> tuple[str, ...]:
@@ -88,8 +90,9 @@ class ReconstructResult:
 
 
 def imaging_as_json(plan: ImagingPlan) -> dict[str, object]:
-    """What was done beforehand and why, without the decision about each frame."""
-    return {key: value for key, value in plan.as_json().items() if key != "decisions"}
+    """What was done beforehand and why, without what concerns single frames."""
+    values = {key: value for key, value in plan.as_json().items() if key not in ("decisions", "parallaxes")}
+    return {**values, "frames_with_translation": len(plan.parallaxes)}
 
 
 def frame_as_json(record: FrameRecord, plan: ImagingPlan) -> dict[str, object]:
@@ -130,13 +133,14 @@ def result_as_json(result: ReconstructResult, capture: Capture) -> dict[str, obj
     root, plan = result.workspace.root, result.imaging
 
     def relative(path: Path | None) -> str | None:
-        if path is None or not path.is_relative_to(root):
-            return None if path is None else str(path)
-        return str(path.relative_to(root))
+        if path is None:
+            return None
+        # elsewhere, as an existing project's model: whatever folder one looks from
+        return str(path.relative_to(root) if path.is_relative_to(root) else path.resolve())
 
     return {
         "versions": {"colmap_inertial": __version__, "pycolmap": pycolmap.__version__},
-        "capture": str(capture.path),
+        "capture": str(capture.path.resolve()),
         "models": [
             {
                 "index": model.index,

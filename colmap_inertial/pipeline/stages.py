@@ -19,13 +19,26 @@ from colmap_inertial.imaging.parallax import Parallax
 from colmap_inertial.imaging.psf import blur_field
 from colmap_inertial.imaging.rolling_shutter import rectify_keypoints
 from colmap_inertial.imaging.wiener import LONGEST_PX, DeblurOptions, deblur
+from colmap_inertial.io.calibration import SMALLEST_READOUT_S
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.pipeline.frames import FrameTreatment
-from colmap_inertial.types import Array, CameraImuCalibration, CameraModel, Frame, FrameTiming, ImuRecording, Projector
+from colmap_inertial.types import (
+    CALIBRATION_PARAMETERS,
+    Array,
+    CameraImuCalibration,
+    CameraModel,
+    Frame,
+    FrameTiming,
+    ImuRecording,
+    Projector,
+)
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
 
+#: Share of the readout that acts on poses after rectification.
+_LEFT_SHARE = 0.1
+_READOUT = CALIBRATION_PARAMETERS.index("readout_s")
 #: Frames in work at once: enough for a desk computer's cores, few enough for its memory.
 _MOST_WORKERS = 4
 
@@ -61,18 +74,21 @@ class GyroView:
     source: str
     notes: tuple[str, ...] = ()
 
+    def recording(self) -> ImuRecording:
+        """The recording on a clock that runs as the camera's does; one offset holds for all of it."""
+        if self.clock_rate == 0:
+            return self.imu
+        return on_camera_rate(
+            self.imu,
+            self.calibration,
+            clock_rate=self.clock_rate,
+            middle_s=self.clock_middle_s,
+            trajectory_epoch_ns=self.timing.epoch_ns,
+        )
+
     def motion(self) -> GyroCamera:
         """The gyroscope on the camera's clock."""
-        imu = self.imu
-        if self.clock_rate != 0:
-            imu = on_camera_rate(
-                imu,
-                self.calibration,
-                clock_rate=self.clock_rate,
-                middle_s=self.clock_middle_s,
-                trajectory_epoch_ns=self.timing.epoch_ns,
-            )
-        return GyroCamera.of(imu, self.calibration, camera_epoch_ns=self.timing.epoch_ns)
+        return GyroCamera.of(self.recording(), self.calibration, camera_epoch_ns=self.timing.epoch_ns)
 
     def shutter(self, index: int) -> FrameShutter:
         """When the lines of one frame are exposed."""
@@ -222,4 +238,15 @@ class RollingShutterStage:
         return self._ready["parts"]
 
 
-__all__ = ["DeblurStage", "GyroView", "RollingShutterStage"]
+def for_rectified(calibration: CameraImuCalibration) -> CameraImuCalibration:
+    """The calibration of a camera whose keypoints were rectified: hardly any readout is left.
+
+    Its standard deviation stands for what the camera's translation does within the readout, which stays.
+    """
+    cov = calibration.cov.copy()
+    cov[_READOUT, :] = cov[:, _READOUT] = 0.0
+    cov[_READOUT, _READOUT] = max(SMALLEST_READOUT_S, _LEFT_SHARE * calibration.readout_s) ** 2
+    return replace(calibration, readout_s=0.0, cov=cov)
+
+
+__all__ = ["DeblurStage", "GyroView", "RollingShutterStage", "for_rectified"]

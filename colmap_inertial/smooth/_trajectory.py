@@ -71,7 +71,7 @@ def smooth_trajectory(
         (3,) IMU frame; zero if not given.
     also_at_s
         Instants without a pose, camera clock: between poses and beyond them the IMU goes on alone, and the covariance
-        grows. Instants that the IMU did not record are passed over.
+        grows. Instants before the IMU's first sample or after its last are passed over.
     options
         When to leave a pose out.
 
@@ -153,8 +153,9 @@ def _with_instants(model: _Model, felt: Felt, also_at_s: Array) -> _Model:
     t_s = np.concatenate([model.t_s, asked])
     order = np.argsort(t_s)
     t_s, posed = t_s[order], np.argsort(order)[: len(model.t_s)]
-    measured, left_out = np.zeros((len(t_s), 3)), np.ones(len(t_s), dtype=bool)
-    measured[posed], left_out[posed] = model.measured, model.left_out
+    measured = np.stack([np.interp(t_s, model.t_s, model.measured[:, k]) for k in range(3)], axis=1)
+    left_out = np.ones(len(t_s), dtype=bool)
+    left_out[posed] = model.left_out
     jumps = np.zeros(len(t_s) - 1, dtype=bool)
     jumps[posed[:-1]] = model.jumps
     gained, silent = felt.sums(t_s), ~felt.covers(t_s)
