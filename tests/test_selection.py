@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import re
 from collections import Counter
 from dataclasses import replace
 
@@ -10,15 +11,23 @@ import numpy as np
 import pytest
 from box_video import BoxVideo, film
 
+from colmap_inertial.flow import VisualRotation
+from colmap_inertial.geometry import quat_conjugate, quat_log, quat_multiply
+from colmap_inertial.gyro import GyroPath
+from colmap_inertial.imaging.gyro_camera import GyroCamera
+from colmap_inertial.imaging.psf import predicted_blur_px
 from colmap_inertial.imaging.selection import Ranked, WindowLimits, choose_frames
-from colmap_inertial.io.capture import load_capture
+from colmap_inertial.io.calibration import calibration_prior
+from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.frames import read_frame_timing, read_frames
 from colmap_inertial.io.imu import read_capture_imu
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.options import FrameOptions, MappingOptions, ReconstructOptions
 from colmap_inertial.pipeline import reconstruct
+from colmap_inertial.pipeline import selection as choosing
 from colmap_inertial.pipeline.selection import (
     Selection,
+    _Clocks,
     everything,
     part_of,
     read_selection,
@@ -29,7 +38,10 @@ from colmap_inertial.pipeline.selection import (
 )
 from colmap_inertial.pipeline.workspace import StageRunner, Workspace
 from colmap_inertial.simulate import MotionOptions
-from colmap_inertial.types import CameraModel
+from colmap_inertial.simulate.capture import make_scene
+from colmap_inertial.simulate.imu import IMU_PRESETS
+from colmap_inertial.simulate.recipe import SceneRecipe
+from colmap_inertial.types import CameraModel, FrameTiming
 
 
 def silent(*_: object) -> None:
@@ -162,6 +174,104 @@ def test_without_exposure_times_frames_are_ranked_by_angular_speed(turning, tmp_
     selection = select_frames(unknown, imu, timing, unknown.calibration, options=options, progress=silent)
     assert {window.ranked_by for window in selection.windows} == {"speed"}
     assert share_of_windows_mean(turning, selection) < 0.95
+
+
+#: Of the camera in the recording of several minutes.
+_PINHOLE = CameraModel(model="SIMPLE_PINHOLE", width=1920, height=1080, params=(1500.0, 960.0, 540.0))
+_LONG_S = 300.0
+
+
+def of_a_long_recording(
+    capture: Capture, monkeypatch: pytest.MonkeyPatch, *, clock_rate: float, followed_s: float, noise_rad: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, _Clocks]:
+    """Five minutes of turning: what the followed pixels tell is simulated.
+
+    Predicted blur, the true one, by how much the clocks are off for each frame, and what is known of them.
+    """
+    errors_off = dict.fromkeys(("gyro_scale_sd", "gyro_misalignment_sd", "gyro_bias_rad_s_sd", "clock_rate_sd"), 0.0)
+    recipe = SceneRecipe(
+        motion=MotionOptions(kind="pure_rotation", duration_s=_LONG_S),
+        imu=replace(IMU_PRESETS["phone"], clock_offset_s=(200.0, 200.0), **errors_off),
+        frame_rate_hz=10.0,
+        format="h264",
+    )
+    scene = make_scene(recipe)
+    true = scene.errors
+    assert true.clock_rate == 0
+    # stamps of a clock that runs at another rate; in the middle of the recording it shows the same
+    recording = scene.imu.recording
+    fixed_s = true.middle_s - true.gyro_time_offset_s
+    stretched = {
+        key: fixed_s + (getattr(recording, key) - fixed_s) * (1 + clock_rate) for key in ("gyro_t_s", "accel_t_s")
+    }
+    imu = replace(recording, **stretched)
+    timing = FrameTiming(
+        names=scene.names, t_s=scene.trigger_s, exposure_s=np.full(len(scene.names), 0.02), readout_s=0.0, epoch_ns=0
+    )
+    pose_t_s = timing.pose_t_s()
+    at = np.flatnonzero(pose_t_s < followed_s)
+    looking = scene.motion.world_from_cam_xyzw(pose_t_s[at])
+    turns = quat_log(quat_multiply(quat_conjugate(looking[:-1]), looking[1:]))
+    rotation = VisualRotation(
+        names=tuple(timing.names[i] for i in at),
+        t_s=pose_t_s[at],
+        turn_rad=turns + noise_rad * np.random.default_rng(2).standard_normal(turns.shape),
+        sigma_rad=np.full(len(turns), noise_rad),
+        support=np.full(len(turns), 100),
+    )
+    monkeypatch.setattr(choosing, "_followed", lambda *_: rotation)
+    clocks = choosing._clocks(replace(capture, camera=_PINHOLE), imu, timing, calibration_prior(), None, silent)
+    predicted, kind = choosing._predicted(clocks, timing)
+    assert kind == "blur"
+    exact = GyroCamera(
+        path=GyroPath(recording.gyro_t_s, recording.gyro_rad_s, np.zeros(3)),
+        cam_from_imu_xyzw=true.cam_from_imu_xyzw,
+        offset_s=true.gyro_time_offset_s + recording.epoch_ns * 1e-9,
+    )
+    blur = predicted_blur_px(exact, colmap_camera(_PINHOLE), timing, width=1920, height=1080).px
+    # a gyroscope sample is found at the time that the recording without a rate has for it
+    found_s = clocks.motion.path.t_s + clocks.motion.offset_s
+    true_s = recording.gyro_t_s + exact.offset_s
+    return predicted, blur, np.interp(pose_t_s, true_s, found_s - true_s), clocks
+
+
+@pytest.mark.parametrize("clock_rate", [1e-3, -1e-3])
+def test_a_clock_of_another_rate_ranks_all_of_a_long_recording(turning, monkeypatch, clock_rate):
+    """One part in a thousand is 0.3 s after five minutes."""
+    capture = load_capture(turning.folder)
+    predicted, true, late_s, clocks = of_a_long_recording(
+        capture, monkeypatch, clock_rate=clock_rate, followed_s=20.0, noise_rad=1e-4
+    )
+    assert np.isfinite(predicted).mean() > 0.98
+    assert np.abs(late_s).max() < 0.01
+    known = np.isfinite(predicted)
+    assert np.median(np.abs(predicted - true)[known]) < 0.05 * np.median(true)
+    # the camera's clock against the IMU's
+    said = re.search(r"rates ([+-]\d+) ppm apart, to (\d+) ppm", clocks.note)
+    assert abs(int(said[1]) + 1e6 * clock_rate) < 4 * int(said[2]) + 1
+
+
+def test_where_the_clock_rate_leaves_the_offset_open_the_pictures_decide(turning, monkeypatch):
+    capture = load_capture(turning.folder)
+    predicted, true, late_s, clocks = of_a_long_recording(
+        capture, monkeypatch, clock_rate=1e-3, followed_s=12.0, noise_rad=4e-3
+    )
+    known = np.isfinite(predicted)
+    assert known[:100].all() and not known[-300:].any()
+    # unknown from some time on, and within what is claimed until then
+    assert (np.diff(known.astype(int)) <= 0).all()
+    assert np.abs(late_s[known]).max() < 3 * 0.01
+    assert np.isfinite(true).all() and clocks.offset_sigma_s < 0.01
+
+
+def test_what_one_clock_stamped_keeps_step_all_along(turning, monkeypatch):
+    capture = replace(load_capture(turning.folder), shared_clock=True)
+    predicted, true, late_s, clocks = of_a_long_recording(
+        capture, monkeypatch, clock_rate=0.0, followed_s=12.0, noise_rad=4e-3
+    )
+    known = np.isfinite(predicted)
+    assert known.mean() > 0.98 and np.abs(late_s).max() < 0.01 and "ppm" not in clocks.note
+    assert np.median(np.abs(predicted - true)[known]) < 0.1 * np.median(true)
 
 
 def test_an_imu_that_ends_early_leaves_the_rest_to_the_pictures(turning):

@@ -44,6 +44,8 @@ _SLOT_S, _LOOKED_PX = 1 / 30, 960
 _FOLLOWED, _FOLLOWED_SPACING_S, _BEGIN_S = 300, 0.06, 5.0
 #: A rotation and an offset as good as these serve.
 _ROTATION_RAD, _OFFSET_S = 0.1, 0.01
+#: What one clock stamped has one rate, unless another is this many standard deviations, and this, from it.
+_SIGNIFICANT, _FAST_CLOCK = 5.0, 3e-4
 #: Blur below this, for a picture of 1920 px, cannot be seen.
 _SHARP_PX = 1.0
 #: Exposure is at most this where it is unknown; angular speed is looked at in so many instants of it.
@@ -66,7 +68,8 @@ class Selection:
         For each chosen frame; empty where all are used. Places count the capture's frames.
     offset_s, offset_sigma_s, offset_from
         Camera time = gyroscope stamp + offset, as used for ranking; ``offset_from`` is ``"capture"``, ``"pixels"`` or
-        ``None``.
+        ``None``. From pixels, it holds in the middle of the frames that were followed; elsewhere the difference between
+        the clocks' rates, which ``note`` states, adds to it.
     """
 
     names: tuple[str, ...]
@@ -205,7 +208,8 @@ def run_selection(
 class _Clocks:
     """What is known of gyroscope and camera before a reconstruction.
 
-    ``motion`` is ``None`` where the offset is unknown; its orientation counts only where ``oriented``.
+    ``motion`` is ``None`` where the offset is unknown; its orientation counts only where ``oriented``. The offset is as
+    good as ``offset_sigma_s`` at ``middle_s``, camera clock, and worse the farther from there.
     """
 
     motion: GyroCamera | None
@@ -215,6 +219,13 @@ class _Clocks:
     offset_s: float | None = None
     offset_sigma_s: float | None = None
     offset_from: str | None = None
+    rate_sigma: float = 0.0
+    middle_s: float = 0.0
+
+    def usable(self, t_s: Array) -> NDArray[np.bool_]:
+        """(N,) at which times the offset is good enough."""
+        sigma_s = 0.0 if self.offset_sigma_s is None else self.offset_sigma_s
+        return np.asarray(np.hypot(sigma_s, self.rate_sigma * (t_s - self.middle_s)) <= _OFFSET_S)
 
 
 def select_frames(
@@ -257,7 +268,7 @@ def select_frames(
         turning = np.full((len(looked), 3, 3), np.nan)
         if clocks.motion is not None and clocks.oriented:
             turning = clocks.motion.start_from_cam(pose_t_s)
-            turning[~clocks.motion.covers(pose_t_s, pose_t_s)] = np.nan
+            turning[~(clocks.motion.covers(pose_t_s, pose_t_s) & clocks.usable(pose_t_s))] = np.nan
         ranked = Ranked(
             t_s=timing.t_s[looked],
             blur=blur[looked],
@@ -315,7 +326,8 @@ def _predicted(clocks: _Clocks, timing: FrameTiming) -> tuple[Array, Ranking]:
         return np.full(len(timing.t_s), np.nan), "speed"
     if clocks.oriented and timing.exposure_s is not None:
         width, height = clocks.camera.width, clocks.camera.height
-        return predicted_blur_px(motion, colmap_camera(clocks.camera), timing, width=width, height=height).px, "blur"
+        blur = predicted_blur_px(motion, colmap_camera(clocks.camera), timing, width=width, height=height).px
+        return np.where(clocks.usable(timing.t_s), blur, np.nan), "blur"
     exposure_s = timing.exposure_s
     if exposure_s is None:
         step_s = float(np.median(np.diff(timing.t_s))) if len(timing.t_s) > 1 else np.inf
@@ -324,7 +336,8 @@ def _predicted(clocks: _Clocks, timing: FrameTiming) -> tuple[Array, Ranking]:
     at_s = timing.t_s[:, None] + span_s[:, None] * (np.arange(_INSTANTS) + 0.5) / _INSTANTS
     speed = np.linalg.norm(motion.rate_in_cam_rad_s(at_s.ravel()), axis=1).reshape(at_s.shape).mean(axis=1)
     loss = speed if timing.exposure_s is None else speed * exposure_s
-    return np.where(motion.covers(timing.t_s, timing.t_s + span_s), loss, np.nan), "speed"
+    known = motion.covers(timing.t_s, timing.t_s + span_s) & clocks.usable(timing.t_s)
+    return np.where(known, loss, np.nan), "speed"
 
 
 def _clocks(
@@ -357,14 +370,19 @@ def _clocks(
         known = replace(known, oriented=False, note=note, offset_sigma_s=offset_sigma_s)
     try:
         rotation = _followed(capture, timing, camera, progress)
-        found = align_clocks(
-            rotation.trajectory(), imu, prior=prior, options=AlignOptions(max_offset_s=max_offset_s)
-        ).calibration
+        aligned = align_clocks(rotation.trajectory(), imu, prior=prior, options=AlignOptions(max_offset_s=max_offset_s))
+        found, on_rate, rates, rate_sigma = aligned.calibration, imu, "", 0.0
+        fast = abs(aligned.clock_rate) > max(_SIGNIFICANT * aligned.clock_rate_sigma, _FAST_CLOCK)
+        if fast or not (capture.shared_clock or offset_sigma_s <= _OFFSET_S):
+            # corrected even where it may be zero: what is left of it is then as small as its deviation says
+            rate, rate_sigma = aligned.clock_rate, aligned.clock_rate_sigma
+            on_rate = aligned.on_camera_rate(imu, trajectory_epoch_ns=timing.epoch_ns)
+            rates = f", with rates {1e6 * rate:+.0f} ppm apart, to {1e6 * rate_sigma:.0f} ppm"
         sigma_s = found.sigma("gyro_time_offset_s")
         turned = max(found.sigma(f"rotation_{axis}_rad") for axis in "xyz")
         # what translation does to pixels looks like a bias of the gyroscope
         found = replace(found, gyro_bias_rad_s=prior.gyro_bias_rad_s)
-        motion = GyroCamera.of(imu, found, camera_epoch_ns=timing.epoch_ns)
+        motion = GyroCamera.of(on_rate, found, camera_epoch_ns=timing.epoch_ns)
         agreement = check_motion(rotation, motion)
         if turned > _ROTATION_RAD or sigma_s > _OFFSET_S or agreement.agrees is not True:
             raise NotObservableError("clock offset", agreement.reason)
@@ -378,10 +396,12 @@ def _clocks(
         motion=motion,
         oriented=True,
         camera=camera if capture.camera is not None else _with_focal(camera, agreement.gain),
-        note=f"the clocks' offset was found by following pixels, to {1e3 * sigma_s:.1f} ms",
+        note=f"the clocks' offset was found by following pixels, to {1e3 * sigma_s:.1f} ms{rates}",
         offset_s=found.gyro_time_offset_s,
         offset_sigma_s=sigma_s,
         offset_from="pixels",
+        rate_sigma=rate_sigma,
+        middle_s=aligned.middle_s,
     )
 
 
