@@ -8,7 +8,6 @@ import time
 from pathlib import Path
 
 import pytest
-from websockets.sync.client import connect
 
 #: WebGL without a graphics card.
 _FLAGS = [
@@ -34,6 +33,7 @@ class Page:
 
     def __init__(self, profile: Path, width: int = 1280, height: int = 800) -> None:
         size = f"--window-size={width},{height}"
+        connect = pytest.importorskip("websockets.sync.client").connect
         command = [chromium_or_skip(), *_FLAGS, size, f"--user-data-dir={profile}", "about:blank"]
         self._process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         self.errors: list[str] = []
@@ -57,7 +57,7 @@ class Page:
 
     def _address(self, profile: Path) -> str:
         port_file = profile / "DevToolsActivePort"
-        for _ in range(300):
+        for _ in range(1200):  # a minute: the first start on a busy machine takes long
             if port_file.is_file() and len(lines := port_file.read_text().splitlines()) == 2:
                 return f"ws://127.0.0.1:{lines[0]}{lines[1]}"
             time.sleep(0.05)
@@ -81,7 +81,7 @@ class Page:
             message["sessionId"] = self._session
         self._socket.send(json.dumps(message))
         while self._count not in self._answers:
-            self._listen(30)
+            self._listen(60)
         answer = self._answers.pop(self._count)
         assert "error" not in answer, f"{method}: {answer['error']}"
         return answer["result"]
@@ -102,7 +102,7 @@ class Page:
         elif method in ("Network.requestWillBeSent", "Network.webSocketCreated"):
             self.requests.append(params["request"]["url"] if "request" in params else params["url"])
 
-    def wait(self, expression: str, timeout_s: float = 30):
+    def wait(self, expression: str, timeout_s: float = 60):
         """The value of a JavaScript expression, once it is true."""
         end = time.monotonic() + timeout_s
         while True:

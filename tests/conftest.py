@@ -1,5 +1,6 @@
 """Fixtures shared by all tests."""
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +16,33 @@ def _one_blas_thread():
     """As the package's own entry points have it; tests also call what lies below them."""
     with one_blas_thread():
         yield
+
+
+class _Errors(logging.Handler):
+    def __init__(self) -> None:
+        super().__init__(logging.ERROR)
+        self.messages: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.messages.append(logging.Formatter().format(record))
+
+
+@pytest.fixture(scope="session")
+def report_failures():
+    """What went wrong with reports, which a run survives; a test that means it to happen empties the list."""
+    handler = _Errors()
+    logger = logging.getLogger("colmap_inertial.pipeline.reporting")
+    logger.addHandler(handler)
+    yield handler.messages
+    logger.removeHandler(handler)
+
+
+@pytest.fixture(autouse=True)
+def _no_report_fails(report_failures: list[str]):
+    yield
+    found = report_failures.copy()
+    report_failures.clear()
+    assert not found, "\n".join(found)
 
 
 @pytest.fixture(scope="session")

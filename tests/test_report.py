@@ -7,25 +7,35 @@ import html.parser
 import json
 import re
 import shutil
+import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
+import plotly.graph_objects as graph_objects
+import pycolmap
 import pytest
 from report_runs import HOSTILE, cloud, recorded, write_run
 
-from colmap_inertial.errors import FormatError, MappingError
+from colmap_inertial.cli import main
+from colmap_inertial.errors import FormatError, InertialError, MappingError
 from colmap_inertial.geometry import quat_exp, quat_rotate
+from colmap_inertial.io.calibration import calibration_prior
+from colmap_inertial.io.capture import Capture
+from colmap_inertial.io.files import write_json
 from colmap_inertial.model import trajectory_from_model
 from colmap_inertial.options import MappingOptions, ProjectOptions, ReconstructOptions
 from colmap_inertial.pipeline import reconstruct
 from colmap_inertial.pipeline.existing import reconstruct_project
-from colmap_inertial.report import signals, write_report
+from colmap_inertial.pipeline.reporting import reporting_stops
+from colmap_inertial.pipeline.workspace import Workspace
+from colmap_inertial.report import figures, signals, write_report
 from colmap_inertial.report.figure_3d import nice_length, scene_figure
 from colmap_inertial.report.scene import scene_record
 from colmap_inertial.report.series import MOST_POINTS, rounded, strided, thinned
 from colmap_inertial.report.signals import signal_record
 from colmap_inertial.report.words import outcome_of_model
+from colmap_inertial.scale import estimate_scale
 from colmap_inertial.types import CameraTrajectory, FrameTiming, ImuRecording, ScaleEstimate
 
 SCENE = Path(__file__).parents[1] / "example_scenes" / "desk"
@@ -130,7 +140,6 @@ def test_every_section_that_has_data_is_there_and_every_figure_has_its_place(ful
 
 
 def test_figures_are_what_plotly_takes(full):
-    graph_objects = pytest.importorskip("plotly.graph_objects")
     _, page = report_of(full[0])
     for figure in page.figures().values():
         graph_objects.Figure(figure)  # raises on any name or value that plotly does not know
@@ -218,6 +227,62 @@ def test_a_weak_scale_is_told_from_a_trusted_one():
     assert weak["todo"]
     assert "±10 %" in weak["summary"][0]
     assert "1 m" in weak["summary"][1]
+    assert weak["todo"][0].startswith("Film again")
+    narrow = outcome_of_model({**model, "ci95": [1.99, 2.01]})
+    assert not any("Film again" in text for text in narrow["todo"])
+    assert "reasons" in narrow["todo"][0]
+
+
+def test_parts_of_the_recording_are_judged_as_the_estimator_judges_them(full, tmp_path):
+    out = copy_of(full, tmp_path)
+    result = json.loads((out / "result.json").read_text(encoding="utf-8"))
+    drift = result["models"][0]["drift"]
+    drift |= {"p_value": 5e-3, "trend_log_per_s": 0.0, "trend_sigma_log_per_s": 1e-3}
+    assert "They agree within their uncertainty" in report_of_changed(out, result)[1].text
+    drift["trend_log_per_s"] = 4e-3  # steady: the estimator reports it whatever the parts scatter by
+    text = report_of_changed(out, result)[1].text
+    assert "They differ by more than chance explains" in text and "+24.00 ±12 % a minute" in text
+    drift |= {"p_value": 1e-4, "trend_log_per_s": 0.0}
+    assert "They differ by more than chance explains" in report_of_changed(out, result)[1].text
+    drift |= {"p_value": 0.5}
+    for part in drift["parts"][1:]:
+        part["sigma_log"] = 1e4
+    content, page = report_of_changed(out, result)
+    assert "too uncertain to tell" in page.text
+    assert f"{len(drift['parts']) - 1} of {len(drift['parts'])} parts tell no scale" in page.text
+    figure = figures.drift(content["models"][0])
+    assert len(figure["data"][0]["x"]) == 1
+    part = drift["parts"][0]
+    first_frame_s = content["models"][0]["signals"]["first_frame_s"]
+    assert figure["data"][0]["x"][0] == pytest.approx(0.5 * (part["begin_s"] + part["end_s"]) - first_frame_s)
+    drift["parts"][0]["sigma_log"] = 1e4
+    content, page = report_of_changed(out, result)
+    assert "too uncertain to tell" in page.text and "drift" in page.anchors()
+
+
+def test_used_frames_of_a_video_are_told(full, tmp_path):
+    out = copy_of(full, tmp_path)
+    result = json.loads((out / "result.json").read_text(encoding="utf-8"))
+    result["selection"] = {"frames": 900, "used": 120, "note": "the sharpest of each window", "left_out": []}
+    content, page = report_of_changed(out, result)
+    assert content["selection"] == {"frames": 900, "used": 120, "note": "the sharpest of each window"}
+    assert "120 of 900: the sharpest of each window" in page.text
+
+
+def test_why_there_is_no_target_and_there_are_no_crops(full, tmp_path):
+    out = copy_of(full, tmp_path)
+    result = json.loads((out / "result.json").read_text(encoding="utf-8"))
+    (out / "report_data" / "crops" / "crops.json").unlink()
+    result["models"][0]["validation"] = None
+    content, _ = report_of_changed(out, result)
+    assert "names no target" in content["models"][0]["validation"]["missing"]
+    assert "none differs" in content["crops"]["missing"]
+    for frame in result["frames"]:
+        frame["action"] = "passed"
+    del result["imaging"]
+    content, _ = report_of_changed(out, {**result, "project": {"imu": "x"}})
+    assert "not at hand" in content["models"][0]["validation"]["missing"]
+    assert "No frame was deblurred" in content["crops"]["missing"]
 
 
 def test_a_folder_without_a_run_is_refused(tmp_path):
@@ -412,6 +477,60 @@ def test_without_an_alignment_only_the_speed_of_turning_is_compared():
     assert "missing" in record["acceleration"]
 
 
+@pytest.mark.parametrize(
+    ("spoilt", "said"),
+    [
+        ({"accel_t_s": np.zeros(0), "accel_m_s2": np.zeros((0, 3))}, "no accelerometer"),
+        ({"accel_in_g": True}, "it is in g"),
+    ],
+)
+def test_a_recording_that_cannot_be_used_is_not_said_to_disagree_with_the_pictures(full, tmp_path, spoilt, said):
+    trajectory, imu, _, _, _ = recorded()
+    imu = dataclasses.replace(imu, **({"accel_m_s2": imu.accel_m_s2 / 9.80665} if "accel_in_g" in spoilt else spoilt))
+    estimate = estimate_scale(trajectory, imu)
+    assert estimate.verdict == "refused"
+    record = signal_record(trajectory, imu, estimate, None)
+    assert record["alignment"] == "not tried"
+    assert said in record["acceleration"]["missing"]
+    out = copy_of(full, tmp_path)
+    stored = json.loads((out / "report_data" / "model_0.json").read_text(encoding="utf-8"))
+    write_json(out / "report_data" / "model_0.json", {**stored, "signals": record})
+    result = json.loads((out / "result.json").read_text(encoding="utf-8"))
+    result["models"][0] |= {**estimate.as_json(), "excitation_m_s2": 0.5, "validation": None}
+    _, page = report_of_changed(out, result)
+    assert "could not be brought together" not in page.text
+    assert "cannot be used as it is" in page.text
+    assert "camera acceleration" not in page.text  # which would be of the scale that was refused
+    assert "COLMAP's own model (sparse/0) is complete" in page.text
+
+
+def test_a_camera_that_sees_all_around_has_a_place_too():
+    reconstruction = pycolmap.Reconstruction()
+    camera = pycolmap.Camera.create_from_model_name(1, "EQUIRECTANGULAR", 1.0, 640, 320)
+    assert camera.mean_focal_length() == 0
+    reconstruction.add_camera_with_trivial_rig(camera)
+    for i in range(3):
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([float(i), 0, 0]))
+        image = pycolmap.Image(name=f"{i}.jpg", camera_id=1, image_id=i + 1)
+        reconstruction.add_image_with_trivial_frame(image, pose)
+    timing = FrameTiming(names=("0.jpg", "1.jpg", "2.jpg"), t_s=np.arange(3.0) + 7)
+    trajectory, _ = trajectory_from_model(reconstruction, timing)
+    scene = scene_record(reconstruction, trajectory, None, first_frame_s=6.5)
+    assert (scene["cameras"]["half_width"], scene["cameras"]["half_height"]) == (0.5, 0.25)
+    assert scene["path"]["t_s"] == [0.5, 1.5, 2.5]
+    scene_figure(scene)
+
+
+def test_times_count_from_the_recording_s_first_frame():
+    trajectory, imu, estimate, gravity, _ = recorded()
+    late = signal_record(trajectory, imu, estimate, gravity, first_frame_s=float(trajectory.t_s[0]) - 5)
+    usual = signal_record(trajectory, imu, estimate, gravity)
+    for key in ("rotation", "acceleration"):
+        lines = [record[key]["camera" if key == "acceleration" else "after"] for record in (late, usual)]
+        a, b = (line[0] if key == "acceleration" else line["camera"][0] for line in lines)
+        np.testing.assert_allclose(np.array(a["t_s"]) - b["t_s"], 5, atol=2e-4)
+
+
 def test_the_scene_is_upright_and_holds_the_model():
     reconstruction = cloud()
     timing = FrameTiming(names=tuple(sorted(i.name for i in reconstruction.images.values())), t_s=np.arange(4.0))
@@ -487,6 +606,52 @@ def test_a_run_that_stops_says_why(tmp_path):
     assert str(stopped.value)[:40] in page.text
     assert content["title"] == "capture"
     assert page.anchors()[:2] == ["outcome", "findings"]
+
+
+def broken(*_, **__):
+    raise ZeroDivisionError("a report that nobody has seen before")
+
+
+def test_a_report_that_fails_costs_no_result_and_is_told(project, tmp_path, monkeypatch, report_failures, capsys):
+    source = ProjectOptions(imu=project.imu, frame_times=project.frame_times)
+    for place in ("report.page.page_of", "pipeline.reporting.scene_record"):
+        monkeypatch.setattr(f"colmap_inertial.{place}", broken)
+    out = tmp_path / "out"
+    arguments = ["--imu", str(project.imu), "--frame-times", str(project.frame_times)]
+    with pytest.raises(SystemExit) as ended:
+        main(["reconstruct", str(project.model.parents[1]), str(out), *arguments])
+    assert ended.value.code == 0
+    assert json.loads((out / "result.json").read_text())["models"][0]["metres_per_unit"] > 0
+    assert not (out / "report.html").exists() and not (out / "report.json").exists()
+    assert "failed, see" in capsys.readouterr().out
+    text = (out / "log.txt").read_text()
+    assert "ERROR what the report draws of model 0 failed" in text
+    assert "ERROR the report failed" in text and "ZeroDivisionError" in text
+    assert len(report_failures) == 2
+    report_failures.clear()
+    assert reconstruct_project(project.model.parents[1], tmp_path / "other", source).report is None
+    report_failures.clear()
+
+
+def test_a_failing_report_of_a_stop_hides_no_reason(tmp_path, monkeypatch, report_failures):
+    workspace, capture = Workspace(tmp_path), Capture(path=tmp_path, calibration=calibration_prior())
+    with pytest.raises(MappingError, match="nothing matches") as stopped, reporting_stops(workspace, capture):
+        raise MappingError("nothing matches")
+    assert stopped.value.__notes__ == [f"what was found, and what to do: {tmp_path / 'report.html'}"]
+    monkeypatch.setattr("colmap_inertial.pipeline.reporting.write_report", broken)
+    with pytest.raises(MappingError, match="nothing matches"), reporting_stops(workspace, capture):
+        raise MappingError("nothing matches")
+    assert len(report_failures) == 1
+    report_failures.clear()
+
+
+def test_a_missing_plotly_is_told_before_the_work(project, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "plotly", None)
+    with pytest.raises(InertialError, match="plotly"):
+        reconstruct(SCENE, tmp_path / "out")
+    with pytest.raises(InertialError, match="plotly"):
+        reconstruct_project(project.model.parents[1], tmp_path / "out", ProjectOptions(imu=project.imu))
+    assert not (tmp_path / "out").exists()
 
 
 def test_an_existing_project_gets_one_with_and_without_a_scale(project, tmp_path):

@@ -93,7 +93,7 @@ def main(args: Sequence[str] | None = None) -> None:
     try:
         code = command.run()
     except InertialError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {error}", *getattr(error, "__notes__", ()), sep="\n", file=sys.stderr)
         code = error.exit_code
     except KeyboardInterrupt:
         resumes = isinstance(command, Reconstruct | Deblur | Batch)

@@ -36,6 +36,7 @@ from colmap_inertial.pipeline.models import run_models, validated, with_dense
 from colmap_inertial.pipeline.reporting import report_result, write_recording
 from colmap_inertial.pipeline.result import ModelResult, ReconstructResult
 from colmap_inertial.pipeline.workspace import StageRunner, Workspace, fingerprint
+from colmap_inertial.report import require_plotly
 from colmap_inertial.types import FrameTiming, ImuRecording, ReadoutDirection, Similarity
 from colmap_inertial.validate import parse_target
 
@@ -111,6 +112,7 @@ def reconstruct_project(
             "holds no COLMAP model (sparse/ or a model folder), and --imu and the like belong to one: leave them out "
             "for a capture, which describes itself",
         )
+    require_plotly()
     _check_options(options)
     given = _given(project, source, options)
     prior_calibration(given.capture, options)  # a wrong file is said before the work, not after it
@@ -126,6 +128,8 @@ def reconstruct_project(
         timing, notes = _run_times(runner, workspace, given, models, images, progress)
         stages = default_model_stages(given.capture, given.imu, options)
         results = run_models(workspace, timing, given.imu, stages, runner, progress, found=models)
+        if target is not None and images is None:
+            notes = (*notes, "the target was not measured: the project has no images/; give --images DIR")
         results = tuple(_noted(result, notes) for result in results)
         if target is not None and images is not None:
             results = validated(workspace, results, target, images, progress)
@@ -136,7 +140,7 @@ def reconstruct_project(
             workspace=workspace, models=results, frames=(), seconds=runner.seconds, project_metric=metric
         )
         write_recording(workspace, given.imu, timing)
-        report_result(result, given.capture, project=source)
+        result = report_result(result, given.capture, project=source)
         log.info("finished")
     return result
 

@@ -9,19 +9,23 @@ import shutil
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from colmap_inertial.errors import InertialError, NotObservableError, TargetNotFoundError
+from colmap_inertial.errors import InertialError, NotObservableError, TargetNotFoundError, TimingError
 from colmap_inertial.model import Model, find_models, read_model, summarize, trajectory_from_model
 from colmap_inertial.options import ReconstructOptions
 from colmap_inertial.pipeline.colmap import Progress
 from colmap_inertial.pipeline.dense import run_dense
-from colmap_inertial.pipeline.metric import ModelStage, metric_trajectory, write_trajectory
+from colmap_inertial.pipeline.metric import MetricStage, ModelStage, metric_trajectory, write_trajectory
 from colmap_inertial.pipeline.readout import ReadoutStage
 from colmap_inertial.pipeline.reporting import write_model_record
 from colmap_inertial.pipeline.result import ModelResult
 from colmap_inertial.pipeline.workspace import StageRunner, Workspace, remove
-from colmap_inertial.types import FrameTiming, ImuRecording
+from colmap_inertial.types import FrameTiming, ImuRecording, ScaleEstimate
 from colmap_inertial.validate import Target, Validation, validate_model, write_pictures
+
+if TYPE_CHECKING:
+    import pycolmap
 
 log = logging.getLogger(__name__)
 
@@ -37,7 +41,13 @@ def run_models(
 ) -> tuple[ModelResult, ...]:
     """Every sub-model through the model stages, then to its final place; run again after an interruption.
 
-    The sub-models are those of ``sparse/``, or ``found`` by number elsewhere.
+    The sub-models are those of ``sparse/``, or ``found`` by number elsewhere. One with fewer than two timed images is
+    refused, and the others go on.
+
+    Raises
+    ------
+    TimingError
+        Where that is so of all.
     """
     start = time.perf_counter()
     scratch = workspace.stamps / "models"
@@ -45,9 +55,19 @@ def run_models(
     for path in (scratch, workspace.sparse_metric, workspace.validation, *stale):
         remove(path)
     results: list[ModelResult] = []
+    untimed: list[TimingError] = []
     found = find_models(workspace.sparse) if found is None else found
     for done, (index, folder) in enumerate(found.items()):
         progress("metric", done, len(found))
+        mapped = read_model(folder)
+        reason = _too_few_timed(mapped, timing)
+        if reason is not None:
+            if len(found) == 1:
+                raise reason
+            untimed.append(reason)
+            log.info("model %d: refused %s", index, reason)
+            results.append(_refused(index, mapped, folder, str(reason), stages))
+            continue
         shutil.copytree(folder, scratch / str(index))
         model = Model(folder=scratch / str(index), index=index, timing=timing)
         for stage in stages:
@@ -58,7 +78,7 @@ def run_models(
         result = ModelResult(
             index=index,
             scale=model.scale,
-            summary=summarize(read_model(folder)),
+            summary=summarize(mapped),
             sparse=folder,
             readout=next((one for one in settled if one is not None), None),
         )
@@ -78,10 +98,33 @@ def run_models(
         write_model_record(workspace, model, reconstruction, poses, imu)
         log.info("model %d: %s %s", index, result.scale.verdict, "; ".join(result.scale.reasons))
         results.append(result)
+    if untimed and len(untimed) == len(results):
+        raise untimed[0]
     remove(scratch)
     progress("metric", len(found), len(found))
     runner.seconds["metric"] = time.perf_counter() - start
     return tuple(results)
+
+
+def _too_few_timed(reconstruction: pycolmap.Reconstruction, timing: FrameTiming) -> TimingError | None:
+    names = set(timing.names)
+    if sum(reconstruction.image(i).name in names for i in reconstruction.reg_image_ids()) >= 2:
+        return None
+    try:
+        trajectory_from_model(reconstruction, timing)
+    except TimingError as error:
+        return error
+    return None
+
+
+def _refused(
+    index: int, reconstruction: pycolmap.Reconstruction, folder: Path, reason: str, stages: Sequence[ModelStage]
+) -> ModelResult:
+    method = next((stage.options.method for stage in stages if isinstance(stage, MetricStage)), "joint")
+    scale = ScaleEstimate(
+        metres_per_unit=None, sigma_log=None, ci95=None, verdict="refused", method=method, reasons=(reason,)
+    )
+    return ModelResult(index=index, scale=scale, summary=summarize(reconstruction), sparse=folder)
 
 
 def validated(

@@ -1,11 +1,15 @@
-"""What the pipeline keeps for the report, and the report itself, written when a run ends, however it ends."""
+"""What the pipeline keeps for the report, and the report itself: of finished runs, and of those the recording stops.
+
+A report that fails never costs a result, nor hides why a run stopped: the log says what went wrong with it.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,10 +19,10 @@ from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import write_json
 from colmap_inertial.model import Model, colmap_camera
 from colmap_inertial.options import ProjectOptions
-from colmap_inertial.pipeline.imaging import ImagingPlan
 from colmap_inertial.pipeline.metric import gravity_in_model
 from colmap_inertial.pipeline.result import ReconstructResult, result_as_json
-from colmap_inertial.pipeline.workspace import Workspace
+from colmap_inertial.pipeline.stages import RollingShutterStage
+from colmap_inertial.pipeline.workspace import Workspace, remove
 from colmap_inertial.report import write_report
 from colmap_inertial.report.content import model_file, recording_file
 from colmap_inertial.report.scene import scene_record
@@ -36,41 +40,39 @@ _SHUTTER_FRAMES, _GRID = 300, 9
 
 
 def write_recording(
-    workspace: Workspace, imu: ImuRecording, timing: FrameTiming, plan: ImagingPlan | None = None
+    workspace: Workspace, imu: ImuRecording, timing: FrameTiming, rectifying: Sequence[RollingShutterStage] = ()
 ) -> None:
-    """Keep what the report says of the recording: rates, times of the frames, what the rolling shutter does."""
+    """Keep what the report says of the recording: rates, times of the frames, what was done about a rolling shutter."""
 
     def rate_hz(t_s: Array) -> float | None:
         return float(1 / np.median(np.diff(t_s))) if len(t_s) > 1 else None
 
-    record: dict[str, Any] = {
-        "imu": {
-            "device": imu.device,
-            "gyro_hz": rate_hz(imu.gyro_t_s),
-            "accel_hz": rate_hz(imu.accel_t_s),
-            "duration_s": float(imu.gyro_t_s[-1] - imu.gyro_t_s[0]),
-        },
-        "frames": {
-            "count": len(timing.names),
-            "duration_s": float(timing.t_s[-1] - timing.t_s[0]),
-            "interval_s": float(np.median(np.diff(timing.t_s))) if len(timing.t_s) > 1 else None,
-            "names": list(timing.names),
-            "t_s": np.round(timing.t_s - timing.t_s[0], 4).tolist(),
-            "exposure_s": None if timing.exposure_s is None else rounded(timing.exposure_s, 4),
-            "readout_s": timing.readout_s,
-        },
-        "rolling_shutter": None if plan is None else _shutter_record(plan, timing),
-    }
-    workspace.report_data.mkdir(exist_ok=True)
-    write_json(recording_file(workspace.root), record, indent=None)
+    with _failures_logged("what the report says of the recording"):
+        record: dict[str, Any] = {
+            "imu": {
+                "device": imu.device,
+                "gyro_hz": rate_hz(imu.gyro_t_s),
+                "accel_hz": rate_hz(imu.accel_t_s),
+                "duration_s": float(imu.gyro_t_s[-1] - imu.gyro_t_s[0]),
+            },
+            "frames": {
+                "count": len(timing.names),
+                "duration_s": float(timing.t_s[-1] - timing.t_s[0]),
+                "interval_s": float(np.median(np.diff(timing.t_s))) if len(timing.t_s) > 1 else None,
+                "names": list(timing.names),
+                "t_s": np.round(timing.t_s - timing.t_s[0], 4).tolist(),
+                "exposure_s": None if timing.exposure_s is None else rounded(timing.exposure_s, 4),
+                "readout_s": timing.readout_s,
+            },
+            "rolling_shutter": _shutter_record(rectifying[0], timing) if rectifying else None,
+        }
+        workspace.report_data.mkdir(exist_ok=True)
+        write_json(recording_file(workspace.root), record, indent=None)
 
 
-def _shutter_record(plan: ImagingPlan, timing: FrameTiming) -> dict[str, Any] | None:
+def _shutter_record(stage: RollingShutterStage, timing: FrameTiming) -> dict[str, Any] | None:
     """By how much keypoints move: of some frames the largest shift, and that of the worst one over the image."""
-    stages = plan.keypoint_stages()
-    if not stages or plan.view is None:
-        return None
-    stage, camera = stages[0], colmap_camera(plan.view.camera)
+    camera = colmap_camera(stage.view.camera)
     x = (np.arange(_GRID) + 0.5) * camera.width / _GRID
     y = (np.arange(_GRID) + 0.5) * camera.height / _GRID
     grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
@@ -109,33 +111,62 @@ def write_model_record(
     """Keep what the report draws of one model: its scene, and camera against IMU."""
     if model.scale is None:
         raise ValueError("a model without a scale estimate has nothing to report")
-    gravity = gravity_in_model(model)
-    record = {
-        "scene": scene_record(reconstruction, trajectory, gravity),
-        "signals": signal_record(trajectory, imu, model.scale, gravity),
-    }
-    workspace.report_data.mkdir(exist_ok=True)
-    write_json(model_file(workspace.root, model.index), record, indent=None)
+    with _failures_logged(f"what the report draws of model {model.index}"):
+        gravity, first_frame_s = gravity_in_model(model), float(model.timing.t_s[0])
+        record = {
+            "scene": scene_record(reconstruction, trajectory, gravity, first_frame_s=first_frame_s),
+            "signals": signal_record(trajectory, imu, model.scale, gravity, first_frame_s=first_frame_s),
+        }
+        workspace.report_data.mkdir(exist_ok=True)
+        write_json(model_file(workspace.root, model.index), record, indent=None)
 
 
-def report_result(result: ReconstructResult, capture: Capture, project: ProjectOptions | None = None) -> None:
-    """Write the report, and then ``result.json``, whose presence says that the run is finished."""
-    content = result_as_json(result, capture)
+def report_result(
+    result: ReconstructResult, capture: Capture, project: ProjectOptions | None = None
+) -> ReconstructResult:
+    """Write the report, and then ``result.json``, whose presence says that the run is finished.
+
+    Returns
+    -------
+    The result with the path of its report; ``None`` where that failed.
+    """
+    workspace, content = result.workspace, result_as_json(result, capture)
     if project is not None:
-        content["project"] = dataclasses.asdict(project)
-    write_report(result.workspace.root, result=content)
-    write_json(result.workspace.result, content)
+        content["project"] = {
+            key: value.resolve() if isinstance(value, Path) else value
+            for key, value in dataclasses.asdict(project).items()
+        }
+    with _failures_logged("the report"):
+        # what a stopped run left there must not stand for this one
+        for old in (workspace.report, workspace.report.with_suffix(".json")):
+            remove(old)
+        result = dataclasses.replace(result, report=write_report(workspace.root, result=content))
+    write_json(workspace.result, content)
+    return result
 
 
 @contextlib.contextmanager
 def reporting_stops(workspace: Workspace, capture: Capture) -> Iterator[None]:
-    """Where a run stops without a result because of the recording, the report says why and what to do."""
+    """Where the recording gives no scale, or COLMAP no model, a report says why and what to do; other errors have none.
+
+    The error carries a note that names the page.
+    """
     try:
         yield
     except (NotObservableError, MappingError) as error:
-        write_report(workspace.root, stopped=str(error), capture=str(capture.path))
-        log.info("report: %s", workspace.report)
+        with _failures_logged("the report of the stop"):
+            page = write_report(workspace.root, stopped=str(error), capture=str(capture.path.resolve()))
+            error.add_note(f"what was found, and what to do: {page}")
         raise
+
+
+@contextlib.contextmanager
+def _failures_logged(what: str) -> Iterator[None]:
+    """Nothing that goes wrong with a report may cost what the run has found."""
+    try:
+        yield
+    except Exception:
+        log.exception("%s failed", what)
 
 
 __all__ = ["report_result", "reporting_stops", "write_model_record", "write_recording"]

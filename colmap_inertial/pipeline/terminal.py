@@ -237,7 +237,9 @@ def show_result(result: ReconstructResult) -> None:
         written = [path for path in paths if path is not None]
         lines += [
             ("Written" if i == 0 else "", str(path))
-            for i, path in enumerate([*written, result.workspace.result, result.workspace.report])
+            for i, path in enumerate([*written, result.workspace.result, *([result.report] if result.report else [])])
         ]
+        if result.report is None:
+            lines.append(("Report", f"failed, see {result.workspace.log}"))
         lines.append(("Time", ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in result.seconds.items())))
         _show(f"Model {model.index}", lines)

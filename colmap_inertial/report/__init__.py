@@ -20,6 +20,7 @@ largest values, ``null`` for gaps; three lines are x, y, z.
                    - ``validation``: as in ``result.json`` with ``pictures`` (paths), or missing
                    - ``scene``, ``signals``: see below, or missing
 ``findings``       ``checked`` and ``findings`` of ``diagnosis.json``, or missing
+``selection``      of a video's frames: ``frames``, ``used`` and ``note``; ``null`` where unknown
 ``recording``      ``imu`` (``device``, ``gyro_hz``, ``accel_hz``, ``duration_s``) and ``frames`` (``count``,
                    ``duration_s``, ``interval_s``, ``median_exposure_s``, ``readout_s``); ``null`` where unknown
 ``blur``           ``note``, ``counts`` by action, ``median_px``, ``largest_px``, ``frames`` (``name``, ``t_s``,
@@ -39,7 +40,8 @@ upright), ``points_in_model``, ``points`` (``xyz`` as three lists, ``rgb``), ``p
 ``path_length``, ``cameras`` (``xyz``, unit vectors ``right``, ``down``, ``ahead``, and the picture's ``half_width`` and
 ``half_height`` at distance 1).
 
-``signals``: ``duration_s``, ``frames``, and
+``signals``: ``duration_s``, ``frames``, ``first_frame_s`` (on the camera's clock: where ``t_s`` counts from),
+``alignment`` of camera and IMU (``found``, ``failed``, or ``not tried`` where the recording cannot be used), and
 
 - ``rotation``: ``same_clock_origin``; ``before``: ``camera`` (camera axes) and ``gyroscope`` (its own axes), three
   lines each, rad/s (with ``camera_size`` and ``gyroscope_size`` where they could not be aligned); ``after``: both in
@@ -53,9 +55,11 @@ upright), ``points_in_model``, ``points`` (``xyz`` as three lists, ``rgb``), ``p
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from colmap_inertial.errors import InertialError
 from colmap_inertial.io.files import write_json, write_text
 from colmap_inertial.report.content import gather
 
@@ -90,10 +94,21 @@ def write_report(
     from colmap_inertial.report.page import page_of
 
     content = gather(out, result=result, stopped=stopped, capture=capture)
+    page, target = page_of(content, out), out / "report.html"
     write_json(out / "report.json", content, indent=None)
-    target = out / "report.html"
-    write_text(target, page_of(content, out))
+    write_text(target, page)
     return target
 
 
-__all__ = ["write_report"]
+def require_plotly() -> None:
+    """Say at once that the report cannot be drawn, not after hours of mapping.
+
+    Raises
+    ------
+    InertialError
+    """
+    if find_spec("plotly") is None:
+        raise InertialError("plotly is not installed, which draws the report: pip install 'plotly>=6'")
+
+
+__all__ = ["require_plotly", "write_report"]

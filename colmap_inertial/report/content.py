@@ -59,7 +59,8 @@ def gather(
     done = result or {"models": [], "frames": [], "seconds": {}, "versions": {"colmap_inertial": __version__}}
     models = sorted(done["models"], key=lambda m: (m["metres_per_unit"] is None, -m["registered_images"], m["index"]))
     full = {model["index"] for model in models[:_MOST_MODELS]}
-    shown = [_model(out, model, in_full=model["index"] in full) for model in models]
+    project = done.get("project") is not None
+    shown = [_model(out, model, in_full=model["index"] in full, project=project) for model in models]
     findings = _findings(out)
     if shown:
         outcome = shown[0]["outcome"]
@@ -77,8 +78,9 @@ def gather(
         "outcome": outcome,
         "models": shown,
         "findings": findings,
+        "selection": _selection(done),
         "recording": None if recording is None else _of_recording(recording),
-        "blur": _blur(done, recording, project=done.get("project") is not None),
+        "blur": _blur(done, recording, project=project),
         "crops": _crops(out, done),
         "rolling_shutter": _rolling_shutter(done, recording),
         "project_metric": done.get("project_metric"),
@@ -86,6 +88,11 @@ def gather(
         "configuration": _configuration(out),
         "versions": done["versions"],
     }
+
+
+def _selection(done: Content) -> Content | None:
+    found = done.get("selection")
+    return None if found is None else {key: found[key] for key in ("frames", "used", "note")}
 
 
 def _missing(why: str) -> Content:
@@ -97,11 +104,10 @@ def _title(source: str) -> str:
     return (path.parent.name if path.name == "capture.toml" else path.name) or source
 
 
-def _model(out: Path, model: Content, *, in_full: bool) -> Content:
+def _model(out: Path, model: Content, *, in_full: bool, project: bool) -> Content:
     scale, ci95 = model["metres_per_unit"], model["ci95"]
     kept = {key: value for key, value in model.items() if key not in ("drift", "validation", "cov", "dense")}
     kept["half_width_pct"] = None if scale is None else half_width_pct(scale, ci95)
-    kept["outcome"] = outcome_of_model(model)
     drift = model.get("drift")
     if drift is None or scale is None:
         kept["drift"] = _missing(
@@ -111,24 +117,27 @@ def _model(out: Path, model: Content, *, in_full: bool) -> Content:
         )
     else:
         kept["drift"] = drift
-    kept["validation"] = _validation(out, model)
+    kept["validation"] = _validation(out, model, project=project)
     file = model_file(out, model["index"])
     if not in_full:
         why = f"Only the {_MOST_MODELS} largest models are shown in full."
         kept["scene"], kept["signals"] = _missing(why), _missing(why)
     elif not file.is_file():
-        why = "What it is drawn from was not kept."
+        why = "What it is drawn from was not kept; where that failed, log.txt says why."
         kept["scene"], kept["signals"] = _missing(why), _missing(why)
     else:
         kept |= read_json(file)
+    kept["outcome"] = outcome_of_model({**model, "signals": kept["signals"]})
     return kept
 
 
-def _validation(out: Path, model: Content) -> Content:
+def _validation(out: Path, model: Content, *, project: bool) -> Content:
     found = model.get("validation")
     if found is None:
         if model["metres_per_unit"] is None:
             return _missing("Without a scale there is nothing to measure a target with.")
+        if project:
+            return _missing("No target was named, or the project's images are not at hand (then the reasons say so).")
         return _missing("The capture names no target of known size ([target] in capture.toml).")
     if "error" in found:
         return _missing(f"The target could not be measured: {found['error']}.")
@@ -183,7 +192,9 @@ def _crops(out: Path, done: Content) -> Content:
     file = out / DATA_FOLDER / CROPS_FOLDER / "crops.json"
     crops = read_json(file)["crops"] if file.is_file() else []
     if not crops:
-        return _missing("No frame was changed, so there is nothing to show before and after.")
+        if any(frame["action"] == "deblurred" for frame in done["frames"]):
+            return _missing("Of the frames that were looked at before and after, none differs.")
+        return _missing("No frame was deblurred, so there is nothing to show before and after.")
     reason = {frame["name"]: frame["reason"] for frame in done["frames"]}
     folder = f"{DATA_FOLDER}/{CROPS_FOLDER}/"
     return {
@@ -199,7 +210,9 @@ def _rolling_shutter(done: Content, recording: Content | None) -> Content:
     if movement is None:
         note = done.get("imaging", {}).get("rolling_shutter")
         return _missing(f"Nothing was done about a rolling shutter{f': {note}' if note else ''}.")
-    return {"note": done["imaging"]["rolling_shutter"], "readout_s": recording["frames"]["readout_s"], **movement}  # type: ignore[index]
+    assert recording is not None
+    note = done.get("imaging", {}).get("rolling_shutter", "")
+    return {"note": note, "readout_s": recording["frames"]["readout_s"], **movement}
 
 
 def _configuration(out: Path) -> Content:

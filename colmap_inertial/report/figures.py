@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from colmap_inertial.report.words import digits
+from colmap_inertial.scale.verdict import WEAK_HALF_WIDTH, half_width
 
 Figure = dict[str, Any]
 Lines = Sequence[dict[str, list[float | None]]]
@@ -200,16 +201,27 @@ def spectra(spectrum: dict[str, Any], *, unit: str, factor: float = 1.0) -> Figu
     return {"data": data, "layout": layout}
 
 
+def informative_parts(parts: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The parts of a recording whose own scale is known well enough to be given, were it that of a model."""
+    return [part for part in parts if half_width(part["sigma_log"]) <= WEAK_HALF_WIDTH]
+
+
 def drift(model: dict[str, Any]) -> Figure:
-    """Scales of the parts of a recording against the scale of the whole, in per cent."""
-    whole, parts, width = model["metres_per_unit"], model["drift"]["parts"], model["half_width_pct"]
-    start = parts[0]["begin_s"]
+    """Scales of the parts of a recording that tell one against the scale of the whole, in per cent."""
+    whole, width = model["metres_per_unit"], model["half_width_pct"]
+    every = model["drift"]["parts"]
+    parts = informative_parts(every)
+    start = model["signals"].get("first_frame_s", every[0]["begin_s"])
     middle = [0.5 * (p["begin_s"] + p["end_s"]) - start for p in parts]
     off = [100 * (p["metres_per_unit"] / whole - 1) for p in parts]
-    reach = [100 * math.sinh(1.96 * p["sigma_log"]) for p in parts]
+    reach = [100 * half_width(p["sigma_log"]) for p in parts]
     band = {"type": "rect", "xref": "paper", "x0": 0, "x1": 1, "y0": -width, "y1": width, "line": {"width": 0}}
     layout = _layout(300, shapes=[{**band, "fillcolor": GOOD, "opacity": 0.13, "layer": "below"}])
-    layout["xaxis"] = {"title": {"text": _TIME}, "range": [0, parts[-1]["end_s"] - start], "zeroline": False}
+    layout["xaxis"] = {
+        "title": {"text": _TIME},
+        "range": [min(0.0, every[0]["begin_s"] - start), every[-1]["end_s"] - start],
+        "zeroline": False,
+    }
     most = 1.15 * max(1.3 * width, *(abs(o) + r for o, r in zip(off, reach, strict=True)))
     layout["yaxis"] = {"title": {"text": "off the whole (%)"}, "zeroline": True, "range": [-most, most]}
     data = [
@@ -379,6 +391,7 @@ __all__ = [
     "accelerations",
     "blur",
     "drift",
+    "informative_parts",
     "rotation_after",
     "rotation_before",
     "shutter_field",

@@ -22,7 +22,11 @@ _WORST_PX, _FEWEST_VIEWS, _FAR = 2.0, 3, 8.0
 
 
 def scene_record(
-    reconstruction: pycolmap.Reconstruction, trajectory: CameraTrajectory, gravity_in_world_m_s2: Array | None
+    reconstruction: pycolmap.Reconstruction,
+    trajectory: CameraTrajectory,
+    gravity_in_world_m_s2: Array | None,
+    *,
+    first_frame_s: float | None = None,
 ) -> dict[str, Any]:
     """A model turned upright, and thinned to a bounded size.
 
@@ -34,12 +38,15 @@ def scene_record(
         Its cameras in order of time, in metres where its scale is known.
     gravity_in_world_m_s2
         (3,) in the model's world; where unknown, the mean direction of the pictures' upper edges counts as up.
+    first_frame_s
+        When the recording's first frame was taken, on the trajectory's clock; without it, the first pose counts.
 
     Returns
     -------
     ``scene`` as ``colmap_inertial.report`` describes it.
     """
     world_from_cam = quat_conjugate(trajectory.cam_from_world_xyzw)
+    start_s = trajectory.t_s[0] if first_frame_s is None else first_frame_s
     down = gravity_in_world_m_s2
     if down is None:
         down = quat_rotate(world_from_cam, np.array([0.0, 1.0, 0.0])).mean(axis=0)
@@ -52,8 +59,7 @@ def scene_record(
     size = _extent(np.concatenate([xyz, centres]))
     digits = int(np.clip(4 - np.floor(np.log10(size)), 0, 9)) if size > 0 else 6
     axes = np.einsum("ij,njk->nik", matrix_from_quat(turn), matrix_from_quat(world_from_cam[some]))
-    camera = next(iter(reconstruction.cameras.values()))
-    focal = camera.mean_focal_length()
+    half_width, half_height = _picture(reconstruction)
     return {
         "unit": trajectory.length_unit,
         "gravity_known": gravity_in_world_m_s2 is not None,
@@ -61,7 +67,7 @@ def scene_record(
         "points_in_model": reconstruction.num_points3D(),
         "points": {"xyz": np.round(xyz.T, digits).tolist(), "rgb": [f"#{r:02x}{g:02x}{b:02x}" for r, g, b in rgb]},
         "path": {
-            "t_s": np.round(trajectory.t_s[poses] - trajectory.t_s[0], 3).tolist(),
+            "t_s": np.round(trajectory.t_s[poses] - start_s, 3).tolist(),
             "xyz": np.round(centres[poses].T, digits).tolist(),
         },
         "cameras": {
@@ -69,11 +75,20 @@ def scene_record(
             "right": np.round(axes[:, :, 0].T, 4).tolist(),
             "down": np.round(axes[:, :, 1].T, 4).tolist(),
             "ahead": np.round(axes[:, :, 2].T, 4).tolist(),
-            "half_width": round(0.5 * camera.width / focal, 4),
-            "half_height": round(0.5 * camera.height / focal, 4),
+            "half_width": round(half_width, 4),
+            "half_height": round(half_height, 4),
         },
         "path_length": float(np.sum(np.linalg.norm(np.diff(trajectory.cam_in_world, axis=0), axis=1))),
     }
+
+
+def _picture(reconstruction: pycolmap.Reconstruction) -> tuple[float, float]:
+    """Half of a picture's width and height at distance 1; a nominal size for cameras that see all around."""
+    images = reconstruction.reg_image_ids()
+    camera = reconstruction.camera(reconstruction.image(min(images)).camera_id)
+    focal = camera.mean_focal_length()
+    focal = focal if focal > 0 else max(camera.width, camera.height)
+    return 0.5 * camera.width / focal, 0.5 * camera.height / focal
 
 
 def _points(reconstruction: pycolmap.Reconstruction, centres: Array) -> tuple[Array, NDArray[np.uint8]]:
@@ -83,7 +98,8 @@ def _points(reconstruction: pycolmap.Reconstruction, centres: Array) -> tuple[Ar
     # a first choice bounds the work for models of millions of points
     for i in np.array(ids)[strided(len(ids), 6 * _MOST_POINTS)].tolist() if ids else []:
         point = reconstruction.points3D[i]
-        if point.track.length() >= _FEWEST_VIEWS and not point.error > _WORST_PX:
+        seen_well = point.track.length() >= _FEWEST_VIEWS and not point.error > _WORST_PX
+        if seen_well and np.isfinite(point.xyz).all():
             chosen.append(point)
     if not chosen:
         return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8)

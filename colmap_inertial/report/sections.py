@@ -14,6 +14,7 @@ from colmap_inertial.report.figure_3d import scene_figure
 from colmap_inertial.report.figures import Figure
 from colmap_inertial.report.markup import bars, facts, gauge, listing, pictures, prose, scale_text, sentence, table
 from colmap_inertial.report.words import digits, signed
+from colmap_inertial.scale.verdict import Z95, scale_drifts
 
 Content = dict[str, Any]
 
@@ -104,11 +105,14 @@ def _key_facts(content: Content, model: Content | None) -> Iterator[tuple[str, s
         path = model["scene"].get("path_length")
         if path is not None:
             yield "camera path", f"{digits(path, 3)} {'m' if model['scene']['unit'] == 'm' else 'model units'}"
-        if model["excitation_m_s2"] is not None:
+        if model["excitation_m_s2"] is not None and model["metres_per_unit"] is not None:
             yield "camera acceleration", f"{digits(model['excitation_m_s2'], 2)} m/s²"
         yield "method", model["method"]
         if model["gyro_time_offset_s"] is not None:
             yield "camera clock − IMU clock", f"{signed(model['gyro_time_offset_s'], 4)} s"
+    selection = content["selection"]
+    if selection is not None:
+        yield "frames used", f"{selection['used']} of {selection['frames']}: {selection['note']}"
     if recording is not None:
         frames, imu = recording["frames"], recording["imu"]
         interval = frames["interval_s"]
@@ -209,9 +213,10 @@ def _rotation(signals: Content, name: str, mark: str) -> Section:
         parts += ["<h3>After alignment</h3>", Plot(figure=after, label="Rates of rotation after alignment")]
     else:
         parts.append(
-            "<p>How fast the camera turned, by the pictures and by the gyroscope. They could not be brought together. "
-            "The two curves should have the same ups and downs at some shift in time; if they have not, this IMU "
-            "recording does not belong to these pictures, or one of them is not what it says.</p>"
+            "<p>How fast the camera turned, by the pictures and by the gyroscope. "
+            f"{'They' if signals.get('alignment') == 'not tried' else 'They could not be brought together. They'} "
+            "should have the same ups and downs at some shift in time; if they have not, this IMU recording does not "
+            "belong to these pictures, or one of them is not what it says.</p>"
         )
     if before is not None:
         clocks = (
@@ -278,23 +283,28 @@ def _spectra(signals: Content, name: str, mark: str) -> Section:
 
 def _drift(model: Content, name: str, mark: str) -> Section:
     found = model["drift"]
-    same = (
-        "They agree: the reconstruction keeps its scale."
-        if found["p_value"] > 0.01
-        else "They differ by more than chance explains: the reconstruction bends or breaks somewhere, and one scale "
-        "does not fit all of it."
-    )
-    figure = Plot(figure=figures.drift(model), label="Scale of parts of the recording")
-    return Section(
-        anchor=f"drift{mark}",
-        short="" if name else "Scale over time",
-        parts=(
-            f"<h2>{escape(name)}Scale along the recording</h2><p>Each part of the recording by itself against the "
-            f"whole. {same} (By chance alone, differences as large come up in {100 * found['p_value']:.2g} % of "
-            "cases.)</p>",
-            figure,
-        ),
-    )
+    telling, every = len(figures.informative_parts(found["parts"])), len(found["parts"])
+    trend, sigma = (60 * found[key] for key in ("trend_log_per_s", "trend_sigma_log_per_s"))
+    if scale_drifts(found["p_value"], trend, sigma):
+        said = (
+            "They differ by more than chance explains: the reconstruction bends or breaks somewhere, and one scale "
+            f"does not fit all of it. A steady change would be {signed(100 * trend)} ±{100 * Z95 * sigma:.2g} % a "
+            "minute."
+        )
+    elif telling < 2:
+        said = "The parts are too uncertain to tell whether the reconstruction keeps its scale."
+    else:
+        said = (
+            "They agree within their uncertainty: nothing shows that the reconstruction does not keep its scale. (By "
+            f"chance alone, differences as large come up in {100 * found['p_value']:.2g} % of cases.)"
+        )
+    if telling < every:
+        said += f" {every - telling} of {every} parts tell no scale by themselves and are not drawn."
+    text = f"<h2>{escape(name)}Scale along the recording</h2><p>Each part of the recording by itself against the whole."
+    parts: list[str | Plot] = [f"{text} {prose(said)}</p>"]
+    if telling:
+        parts.append(Plot(figure=figures.drift(model), label="Scale of parts of the recording"))
+    return Section(anchor=f"drift{mark}", short="" if name else "Scale over time", parts=parts)
 
 
 def _target(found: Content, name: str, mark: str, out: Path) -> Section:
@@ -333,8 +343,9 @@ def _target(found: Content, name: str, mark: str, out: Path) -> Section:
 def _blur(content: Content, out: Path) -> Section:
     found = content["blur"]
     parts: list[str | Plot] = [
-        f"<h2>Blur</h2><p>How far a point smears while a frame is exposed, as the gyroscope predicts it: "
-        f"{digits(found['median_px'], 2)} px in the median, {digits(found['largest_px'], 3)} px at most. "
+        f"<h2>Blur</h2><p>How far a point smears while a frame is exposed, as predicted from the gyroscope and, where "
+        f"it is known, the camera's translation: {digits(found['median_px'], 2)} px in the median, "
+        f"{digits(found['largest_px'], 3)} px at most. "
         f"{sentence(found['note'])}</p>",
         Plot(figure=figures.blur(found["frames"]), label="Predicted blur of each frame"),
     ]
@@ -351,7 +362,7 @@ def _shutter(content: Content, out: Path) -> Section:
     found = content["rolling_shutter"]
     worst = found["worst"]
     parts: list[str | Plot] = [
-        f"<h2>Rolling shutter</h2><p>{sentence(found['note'])} As the camera turns within the "
+        f"<h2>Rolling shutter</h2><p>{sentence(found['note']) if found['note'] else ''} As the camera turns within the "
         f"{digits(1000 * found['readout_s'], 3)} ms from the first line to the last, things lean; this is by how much "
         "keypoints were moved to where a global shutter would have seen them.</p>",
         Plot(figure=figures.shutter_over_time(found), label="Movement of keypoints in each frame"),

@@ -16,6 +16,7 @@ from colmap_inertial.geometry import quat_conjugate, quat_log, quat_multiply, qu
 from colmap_inertial.gyro import GyroPath
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.report.series import rounded, thinned
+from colmap_inertial.scale import check_units
 from colmap_inertial.smooth import Felt, smooth_attitude
 from colmap_inertial.threads import one_blas_thread
 from colmap_inertial.types import (
@@ -41,7 +42,12 @@ Record = dict[str, Any]
 
 @one_blas_thread()
 def signal_record(
-    trajectory: CameraTrajectory, imu: ImuRecording, estimate: ScaleEstimate, gravity_in_world_m_s2: Array | None
+    trajectory: CameraTrajectory,
+    imu: ImuRecording,
+    estimate: ScaleEstimate,
+    gravity_in_world_m_s2: Array | None,
+    *,
+    first_frame_s: float | None = None,
 ) -> Record:
     """What the report shows of camera and IMU, at most some thousand numbers for a recording of any length.
 
@@ -55,14 +61,22 @@ def signal_record(
         What was found about the two.
     gravity_in_world_m_s2
         (3,) in the trajectory's world; ``None`` where unknown.
+    first_frame_s
+        When the recording's first frame was taken, on the trajectory's clock; without it, the first pose counts.
 
     Returns
     -------
-    ``rotation``, ``acceleration``, ``rotation_spectrum`` and ``acceleration_spectrum``, as ``colmap_inertial.report``
+    ``first_frame_s``, ``alignment``, ``rotation``, ``acceleration`` and their spectra, as ``colmap_inertial.report``
     describes them.
     """
     calibration = estimate.calibration
-    record: Record = {"duration_s": float(np.ptp(trajectory.t_s)), "frames": len(trajectory)}
+    start_s = float(trajectory.t_s[0] if first_frame_s is None else first_frame_s)
+    record: Record = {
+        "duration_s": float(np.ptp(trajectory.t_s)),
+        "frames": len(trajectory),
+        "first_frame_s": start_s,
+        "alignment": "found" if calibration is not None else "failed",
+    }
     seen = _Rates.of(trajectory)
     aligned = None
     if calibration is not None:
@@ -75,19 +89,25 @@ def signal_record(
                 trajectory_epoch_ns=trajectory.epoch_ns,
             )
         aligned = GyroCamera.of(imu, calibration, camera_epoch_ns=trajectory.epoch_ns)
-    record["rotation"] = _rotation(trajectory, imu, seen, aligned)
+    record["rotation"] = _rotation(trajectory, imu, seen, aligned, start_s)
+    no_accel = "The recording has no accelerometer."
     if aligned is None or calibration is None:
         why = "Camera and IMU could not be brought together, so their {} cannot be compared."
+        # where these stand in the way, nobody tried (scale.estimate_scale)
+        problem = no_accel if not imu.has_accel else next(iter(check_units(imu)), None)
+        if problem is not None:
+            record["alignment"] = "not tried"
+            why = "Camera and IMU were not brought together: " + problem[:1].lower() + problem[1:]
         record["rotation_spectrum"] = {"missing": why.format("rotations")}
-        record["acceleration"] = record["acceleration_spectrum"] = {"missing": why.format("accelerations")}
+        why = why.format("accelerations") if imu.has_accel else no_accel
+        record["acceleration"] = record["acceleration_spectrum"] = {"missing": why}
         return record
     record["rotation_spectrum"] = _rotation_spectrum(seen, aligned)
     if not imu.has_accel:
-        why = "The recording has no accelerometer."
-        record["acceleration"] = record["acceleration_spectrum"] = {"missing": why}
+        record["acceleration"] = record["acceleration_spectrum"] = {"missing": no_accel}
         return record
     both = _Accelerations.of(trajectory, imu, calibration, estimate, gravity_in_world_m_s2)
-    record["acceleration"] = both.record()
+    record["acceleration"] = both.record(start_s)
     record["acceleration_spectrum"] = both.spectrum()
     return record
 
@@ -116,8 +136,9 @@ class _Rates:
         return np.where(known[:, None], rate, np.nan)
 
 
-def _rotation(trajectory: CameraTrajectory, imu: ImuRecording, seen: _Rates, aligned: GyroCamera | None) -> Record:
-    start_s = trajectory.t_s[0]
+def _rotation(
+    trajectory: CameraTrajectory, imu: ImuRecording, seen: _Rates, aligned: GyroCamera | None, start_s: float
+) -> Record:
     shift_s = clock_shift_s(trajectory, imu)
     gyro_s = imu.gyro_t_s + shift_s
     overlap = gyro_s[0] < trajectory.t_s[-1] and gyro_s[-1] > trajectory.t_s[0]
@@ -125,17 +146,18 @@ def _rotation(trajectory: CameraTrajectory, imu: ImuRecording, seen: _Rates, ali
     gyro_s = gyro_s - start_s if overlap else imu.gyro_t_s - imu.gyro_t_s[0]
     raw_s, raw = _averaged(gyro_s, imu.gyro_rad_s, max(seen.step_s, 0.02))
     times = seen.middle_s - start_s
-    near = (raw_s >= -2) & (raw_s <= times[-1] + 2)
+    before_s = times if overlap else seen.middle_s - trajectory.t_s[0]
+    near = (raw_s >= before_s[0] - 2) & (raw_s <= before_s[-1] + 2)
     record: Record = {
         "same_clock_origin": bool(overlap),
         "before": {
-            "camera": [thinned(times, column) for column in seen.rate_rad_s.T],
+            "camera": [thinned(before_s, column) for column in seen.rate_rad_s.T],
             "gyroscope": [thinned(raw_s[near], column[near]) for column in raw.T] if near.sum() > 1 else [],
         },
         "after": None,
     }
     if aligned is None:
-        record["before"]["camera_size"] = thinned(times, np.linalg.norm(seen.rate_rad_s, axis=1))
+        record["before"]["camera_size"] = thinned(before_s, np.linalg.norm(seen.rate_rad_s, axis=1))
         record["before"]["gyroscope_size"] = thinned(raw_s[near], np.linalg.norm(raw[near], axis=1))
         return record
     felt = seen.felt(aligned)
@@ -224,13 +246,13 @@ class _Accelerations:
         seen[torn] = felt[torn] = np.nan
         return t_s[reach:-reach], seen, felt
 
-    def record(self) -> Record:
+    def record(self, start_s: float) -> Record:
         reach = max(1, round(_REACH_S / self._step_s))
         t_s, seen, felt = self.over(reach)
         both = np.isfinite(seen).all(axis=1)
         if both.sum() < 3:
             return {"missing": "The accelerometer ran along with too few frames for a comparison."}
-        times = t_s - self._t_s[0]
+        times = t_s - start_s
         x, y = (a[both] - a[both].mean(axis=0) for a in (seen, felt))
         power = float(np.sqrt(np.sum(x**2) * np.sum(y**2)))
         return {

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from colmap_inertial.scale.verdict import TRUSTED_HALF_WIDTH
+
 #: Camera acceleration below which there is too little to weigh gravity against; what filming by hand usually has.
 _LITTLE_M_S2, _USUAL = 0.3, "0.5 to 2 m/s²"
 
@@ -21,7 +23,7 @@ _TARGET = (
     "To be independent of motion, put a printed board into the scene and name it in capture.toml ([target]), or scale "
     "the model by a length you measured."
 )
-_SHAPE = "COLMAP's own model in sparse/ is complete: its shape is not affected, only its size is unknown."
+_CHECK = "Look into what the reasons name; until then, check lengths against one that you know."
 
 
 def digits(value: float, count: int = 4) -> str:
@@ -49,7 +51,7 @@ def length_error(pct: float) -> str:
 
 
 def outcome_of_model(model: dict[str, Any]) -> dict[str, Any]:
-    """Headline, summary and advice for one model of ``result.json``.
+    """Headline, summary and advice for one model of ``result.json``, with ``signals`` where they were kept.
 
     Returns
     -------
@@ -76,7 +78,9 @@ def outcome_of_model(model: dict[str, Any]) -> dict[str, Any]:
             "more. It has the right order of size and gravity points along an axis; do not measure by it without a "
             "check against a known length."
         )
-        todo = [_MOVE] if model.get("validation") else [_MOVE, _TARGET]
+        # livelier motion narrows the interval; it mends nothing else
+        todo = [_MOVE if pct > 100 * TRUSTED_HALF_WIDTH else _CHECK]
+        todo += [] if model.get("validation") else [_TARGET]
     checked = model.get("validation")
     if checked and checked.get("scale_error_pct") is not None:
         word = "within" if checked["within_tolerance"] else "outside"
@@ -90,20 +94,28 @@ def outcome_of_model(model: dict[str, Any]) -> dict[str, Any]:
 def _refused(model: dict[str, Any]) -> dict[str, Any]:
     summary = ["The recording does not tell how large things are, so no number is given rather than a wrong one."]
     todo = [_MOVE, _RAW, _TARGET]
-    excitation = model.get("excitation_m_s2")
-    if excitation is not None and excitation < _LITTLE_M_S2:
-        summary.append(
-            f"The camera itself hardly sped up or slowed down: {digits(excitation, 2)} m/s², where filming by hand "
-            f"usually has {_USUAL}. An accelerometer feels no speed, so there was nothing to compare with the pictures."
-        )
-        todo = [_MOVE, _TARGET]
-    elif model.get("cam_from_imu_xyzw") is None:
+    signals = model.get("signals", {})
+    # by the accelerometer: what the camera shows has no unit without a scale
+    felt = signals.get("acceleration", {}).get("rms_accelerometer_m_s2")
+    if signals.get("alignment") == "not tried":
+        summary.append("The IMU recording cannot be used as it is, for the reasons below.")
+        todo = [_RAW, _TARGET]
+    elif signals.get("alignment") == "failed":
         summary.append(
             "Camera and IMU could not be brought together: check the reasons and the two curves of rotation below, "
             "which should look alike."
         )
         todo = [_RAW, _MOVE, _TARGET]
-    summary.append(_SHAPE)
+    elif felt is not None and felt < _LITTLE_M_S2:
+        summary.append(
+            f"The device hardly sped up or slowed down: its accelerometer felt {digits(felt, 2)} m/s² beside gravity, "
+            f"where filming by hand usually has {_USUAL}. It feels no speed, so there was nothing to compare with the "
+            "pictures."
+        )
+        todo = [_MOVE, _TARGET]
+    summary.append(
+        f"COLMAP's own model ({model['sparse']}) is complete: its shape is not affected, only its size is unknown."
+    )
     return {"verdict": "refused", "headline": "No scale could be found", "summary": summary, "todo": todo}
 
 

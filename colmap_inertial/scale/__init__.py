@@ -122,6 +122,8 @@ def _estimate_or_refuse(
         estimate = _estimate(trajectory, imu, aligned, options)
         return replace(
             estimate,
+            # also where there is no scale: it says what was found of camera and IMU
+            calibration=aligned if estimate.calibration is None else estimate.calibration,
             reasons=(*estimate.reasons, *said, *remarks(trajectory, imu, aligned)),
             clock_rate=rate,
             clock_middle_s=alignment.middle_s,

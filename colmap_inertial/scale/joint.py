@@ -23,15 +23,13 @@ from colmap_inertial.scale import _parameters as par
 from colmap_inertial.scale._fit import Fit, fit_jointly
 from colmap_inertial.scale._setup import prepare
 from colmap_inertial.scale.priors import PRIORS
-from colmap_inertial.scale.verdict import verdict_of
+from colmap_inertial.scale.verdict import scale_drifts, verdict_of
 from colmap_inertial.types import Array, CameraImuCalibration, CameraTrajectory, ImuRecording, ScaleEstimate
 
 _LARGEST_BIAS_M_S2 = 2.0
 #: Chi-square of the accelerometer's nine gains and axis errors against their prior: the 8 recordings that this was
 #: tried on have 3 to 9; by chance, 28 is exceeded once in a thousand.
 _LARGEST_GAIN_CHI2 = 28.0
-#: A drift of the scale is reported where chance would show as much once in a thousand recordings.
-_DRIFT_PROBABILITY, _DRIFT_SIGMAS = 1e-3, 3.29
 #: The accelerometer's noise between states over the motion's acceleration: 0.02 to 0.1 in good recordings, 0.4 and more
 #: where an axis is mirrored.
 _LARGEST_UNEXPLAINED = 0.25
@@ -182,8 +180,7 @@ def _checks(fit: Fit) -> list[str]:
             "its unit and the strength of gravity, or calibrate it by holding it still in six directions"
         )
     drift = fit.drift
-    trend = drift.trend_log_per_s / drift.trend_sigma_log_per_s
-    if drift.p_value < _DRIFT_PROBABILITY or abs(trend) > _DRIFT_SIGMAS:
+    if scale_drifts(drift.p_value, drift.trend_log_per_s, drift.trend_sigma_log_per_s):
         low, high = np.expm1(drift.log_ratio.min()), np.expm1(drift.log_ratio.max())
         out.append(
             f"the reconstruction's scale is not the same throughout: from {100 * low:+.1f} to {100 * high:+.1f} % in "

@@ -10,6 +10,8 @@ from colmap_inertial.types import Verdict
 #: Half-widths of the 95 % interval, relative to the scale, up to which a scale is trusted, and given at all.
 TRUSTED_HALF_WIDTH = 0.03
 WEAK_HALF_WIDTH = 0.30
+#: A drift of the scale is reported where chance would show as much once in a thousand recordings.
+_DRIFT_PROBABILITY, _DRIFT_SIGMAS = 1e-3, 3.29
 #: Two-sided 95 % quantile of the normal distribution.
 Z95 = 1.959963984540054
 
@@ -18,6 +20,17 @@ def half_width(sigma_log: float) -> float:
     """Half-width of the log-symmetric 95 % interval relative to the scale: ``(hi - lo) / (2 scale)``."""
     exponent = Z95 * sigma_log
     return math.sinh(exponent) if exponent < 700 else math.inf
+
+
+def scale_drifts(p_value: float, trend_log_per_s: float, trend_sigma_log_per_s: float) -> bool:
+    """Whether the scales of parts of a recording differ by more than chance, or steadily grow or shrink.
+
+    Parameters
+    ----------
+    p_value, trend_log_per_s, trend_sigma_log_per_s
+        Of a ``ScaleDrift``.
+    """
+    return p_value < _DRIFT_PROBABILITY or abs(trend_log_per_s) > _DRIFT_SIGMAS * trend_sigma_log_per_s
 
 
 def verdict_of(

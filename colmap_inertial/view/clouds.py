@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from colmap_inertial.errors import FormatError
 from colmap_inertial.io.ply import Element, read_ply_header
+from colmap_inertial.report.series import strided
 from colmap_inertial.types import Array
 
 if TYPE_CHECKING:
@@ -21,6 +22,8 @@ Colours = NDArray[np.uint8]
 #: Points seen by so few images, or this badly, are left out where enough others remain.
 _FEWEST_VIEWS, _WORST_PX, _ENOUGH = 3, 2.0, 0.3
 _GREY = 150
+#: What float32, the graphics card's numbers, can hold.
+_LARGEST = float(np.finfo(np.float32).max)
 #: The scene reaches as far as this share of its points, and of its cameras.
 _MOST_PER_CENT, _NEARLY_ALL_PER_CENT = 65, 95
 
@@ -61,11 +64,12 @@ def sparse_cloud(reconstruction: pycolmap.Reconstruction, most: int) -> Cloud:
     ids = np.array(sorted(reconstruction.point3D_ids()), dtype=np.uint64)
     points = reconstruction.points3D
     # a first choice bounds the work for models of millions of points
-    chosen = [points[i] for i in ids[_evenly(len(ids), 2 * most)].tolist()]
+    chosen = [points[i] for i in ids[strided(len(ids), 2 * most)].tolist()]
+    chosen = [p for p in chosen if np.abs(p.xyz).max() < _LARGEST]
     good = [p for p in chosen if p.track.length() >= _FEWEST_VIEWS and not p.error > _WORST_PX]
     if len(good) >= _ENOUGH * len(chosen):
         chosen = good
-    chosen = [chosen[i] for i in _evenly(len(chosen), most).tolist()]
+    chosen = [chosen[i] for i in strided(len(chosen), most).tolist()]
     rgb = np.array([p.color for p in chosen], dtype=np.uint8).reshape(-1, 3)
     if not rgb.any():  # a model without colours
         rgb = np.full_like(rgb, _GREY)
@@ -74,7 +78,7 @@ def sparse_cloud(reconstruction: pycolmap.Reconstruction, most: int) -> Cloud:
 
 
 def dense_cloud(path: Path, most: int) -> Cloud:
-    """At most ``most`` points of a PLY file, evenly chosen; only these are read.
+    """At most ``most`` points of a PLY file, evenly chosen; only these are read, and shown where they are finite.
 
     Raises
     ------
@@ -82,10 +86,13 @@ def dense_cloud(path: Path, most: int) -> Cloud:
         For what is no binary PLY file with points.
     """
     table, _ = _vertices(path)
-    some = np.asarray(table[_evenly(len(table), most)])
+    some = np.asarray(table[strided(len(table), most)])
+    xyz = _positions(some)
+    known = np.isfinite(xyz).all(axis=1)
+    some, xyz = some[known], xyz[known]
     rgb = _colours(some)
     return Cloud(
-        xyz=_positions(some),
+        xyz=xyz,
         rgb=np.full((len(some), 3), _GREY, np.uint8) if rgb is None else rgb,
         total=len(table),
         dense=True,
@@ -93,7 +100,7 @@ def dense_cloud(path: Path, most: int) -> Cloud:
 
 
 def read_mesh(path: Path, most_faces: int) -> Mesh | None:
-    """A PLY file of triangles; ``None`` where it has more than ``most_faces``, or none.
+    """A PLY file of triangles; ``None`` where it has more than ``most_faces``, or none. Without what is not finite.
 
     Raises
     ------
@@ -121,7 +128,13 @@ def read_mesh(path: Path, most_faces: int) -> Mesh | None:
     faces = np.memmap(path, dtype, "r", offset, (element.rows,))
     if not (faces["count"] == 3).all() or faces["index"].max() >= len(table):
         raise FormatError(path, "a mesh of other faces than triangles")
-    return Mesh(vertices=_positions(table), faces=faces["index"].astype(np.uint32), rgb=_colours(table))
+    vertices, index, rgb = _positions(table), faces["index"].astype(np.uint32), _colours(table)
+    known = np.asarray(np.isfinite(vertices).all(axis=1))
+    if not known.all():
+        renumbered = (np.cumsum(known) - 1).astype(np.uint32)
+        index = renumbered[index[np.all(known[index], axis=1)]]
+        vertices, rgb = vertices[known], None if rgb is None else rgb[known]
+    return Mesh(vertices=vertices, faces=index, rgb=rgb) if len(index) else None
 
 
 def _vertices(path: Path) -> tuple[Any, tuple[Element, int, str] | None]:
@@ -148,7 +161,8 @@ def _vertices(path: Path) -> tuple[Any, tuple[Element, int, str] | None]:
 
 
 def _positions(table: Any) -> NDArray[np.float32]:
-    return np.stack([table[name] for name in "xyz"], axis=1).astype(np.float32)
+    with np.errstate(over="ignore"):  # what float32 cannot hold is not finite, and left out like the rest of it
+        return np.stack([table[name] for name in "xyz"], axis=1).astype(np.float32)
 
 
 def _colours(table: Any) -> Colours | None:
@@ -156,12 +170,6 @@ def _colours(table: Any) -> Colours | None:
     if not set(names) <= set(table.dtype.names):
         return None
     return np.stack([table[name] for name in names], axis=1).astype(np.uint8)
-
-
-def _evenly(count: int, most: int) -> NDArray[np.intp]:
-    if count <= most:
-        return np.arange(count)
-    return np.unique(np.linspace(0, count - 1, most).round().astype(np.intp))
 
 
 def centre_and_reach(xyz: Array, cameras: Array) -> tuple[Array, float]:

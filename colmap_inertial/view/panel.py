@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from colmap_inertial.report.series import strided
 from colmap_inertial.view.measure import Measured, length_text
 from colmap_inertial.view.scene import Scene
 from colmap_inertial.view.sources import KnownDistance, TargetFacts
@@ -18,8 +19,8 @@ _ROWS = 8
 
 
 def _plain(text: str) -> str:
-    """Text of files, without meaning in Markdown or HTML."""
-    return re.sub(r"([\\`*_{}\[\]<>#|!~])", r"\\\1", text)
+    """Text of files on one line, without meaning in Markdown, HTML or MDX: all punctuation is escaped."""
+    return re.sub(r"([!-/:-@\[-`{-~])", r"\\\1", " ".join(text.split()))
 
 
 def _flag(colour: str, text: str, size: str) -> str:
@@ -77,11 +78,12 @@ def ground_text(scene: Scene) -> str:
     return "" if scene.ground is None else f"One cell of the grid is {length_text(scene.ground.step_m)}."
 
 
-def camera_text(scene: Scene, camera: int) -> str:
-    """Name and place of a camera."""
+def camera_text(scene: Scene, camera: int, problem: str = "") -> str:
+    """Name and place of a camera, and why its image is not shown."""
     unit = "m" if scene.scale.unit == "m" else "units"
     x, y, z = scene.cameras.cam_in_world[camera]
-    return f"**{_plain(scene.cameras.names[camera])}** at {x:.3f}, {y:.3f}, {z:.3f} {unit}"
+    text = f"**{_plain(scene.cameras.names[camera])}** at {x:.3f}, {y:.3f}, {z:.3f} {unit}"
+    return f"{text}\n\n{_plain(problem)}" if problem else text
 
 
 def measured_text(result: Measured) -> str:
@@ -108,7 +110,7 @@ def target_text(target: TargetFacts) -> str:
     """What the validation found, with known against measured distances by length."""
     low, high = target.ci95_pct
     lines = [
-        f"`{target.spec.replace('`', ' ')}` measures **{target.error_pct:+.2f} %** (95 %: {low:+.2f} to {high:+.2f})",
+        f"The target {_plain(target.spec)} measures **{target.error_pct:+.2f} %** (95 %: {low:+.2f} to {high:+.2f})",
         _table(target.distances),
     ]
     if not target.corners:
@@ -128,7 +130,7 @@ def _table(distances: Sequence[KnownDistance]) -> str:
         by_length.setdefault(round(distance.known_m * 1e5), []).append(distance.measured_m)
     lengths = sorted(by_length)
     if len(lengths) > _ROWS:
-        lengths = [lengths[i] for i in np.unique(np.linspace(0, len(lengths) - 1, _ROWS).round().astype(int))]
+        lengths = [lengths[i] for i in strided(len(lengths), _ROWS)]
     rows = [
         f"| {length / 100:.1f} | {1000 * float(np.mean(by_length[length])):.2f} | {len(by_length[length])} |"
         for length in lengths

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.errors import FormatError
 from colmap_inertial.geometry import quat_conjugate, quat_rotate
 from colmap_inertial.io.trajectories import read_tum
 from colmap_inertial.model import read_model
@@ -171,7 +170,7 @@ def load_scene(out: Path, *, model: int | None = None, max_points: int = 400_000
         raise ValueError(f"max_points must be positive, not {max_points}")
     source = find_source(Path(out), model)
     reconstruction = read_model(source.folder)
-    cameras = _cameras(reconstruction, source.folder)
+    cameras = _cameras(reconstruction)
     if source.fused is not None and source.fused.is_file():
         cloud = dense_cloud(source.fused, max_points)
     else:
@@ -208,14 +207,13 @@ def load_scene(out: Path, *, model: int | None = None, max_points: int = 400_000
     )
 
 
-def _cameras(reconstruction: pycolmap.Reconstruction, folder: Path) -> Cameras:
+def _cameras(reconstruction: pycolmap.Reconstruction) -> Cameras:
     images = sorted((reconstruction.image(i) for i in reconstruction.reg_image_ids()), key=lambda image: image.name)
     intrinsics = [reconstruction.camera(image.camera_id) for image in images]
     poses = np.array([image.cam_from_world().rotation.quat for image in images])
     height = np.array([camera.height for camera in intrinsics], dtype=np.float64)
     focal = np.array([camera.mean_focal_length() for camera in intrinsics])
-    if not (focal > 0).all():
-        raise FormatError(folder, "a camera's focal length is not positive")
+    focal = np.where(focal > 0, focal, height)  # those that see all around have none
     return Cameras(
         names=tuple(image.name for image in images),
         cam_in_world=np.array([image.projection_center() for image in images]),

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from colmap_inertial.errors import MissingExtraError, OutputError
 from colmap_inertial.geometry import quat_rotate
+from colmap_inertial.report.series import strided
 from colmap_inertial.types import Array
 from colmap_inertial.view import panel
 from colmap_inertial.view.drawing import RED, Drawing
@@ -170,8 +171,7 @@ class Viewer:
         with self._lock:
             self._remove("chosen")
             image, problem = self._image_of(camera, _PANEL_PX)
-            text = panel.camera_text(self.scene, camera)
-            self._about.content = text if image is not None else f"{text}\n\n{problem}"
+            self._about.content = panel.camera_text(self.scene, camera, problem)
             self._picture.visible = image is not None
             if image is not None:
                 self._picture.image = image
@@ -201,7 +201,7 @@ class Viewer:
             if not shown:
                 return
             count = len(self.scene.cameras)
-            for camera in np.unique(np.linspace(0, count - 1, min(count, _THUMBNAILS)).round().astype(int)).tolist():
+            for camera in strided(count, _THUMBNAILS).tolist():
                 image, _ = self._image_of(camera, _THUMBNAIL_PX)
                 if image is not None:
                     self._passing["thumbnails"].append(self._drawing.frustum(f"/thumbnails/{camera}", camera, image))

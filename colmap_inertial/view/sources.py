@@ -15,11 +15,9 @@ from colmap_inertial.io.files import read_json
 from colmap_inertial.model import TRANSFORM_FILE, find_models, is_metric, model_format
 from colmap_inertial.model.similarities import similarity_from_json
 from colmap_inertial.pipeline.workspace import Workspace, a_record_of_ours
+from colmap_inertial.scale.verdict import Z95
 from colmap_inertial.types import Array
 from colmap_inertial.types.recorded import LengthUnit
-
-#: 97.5 % quantile of the normal distribution.
-_Z95 = 1.959964
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -167,6 +165,7 @@ def _of_reconstruction(workspace: Workspace, index: int | None) -> ViewSource:
         dense = fields.get("dense") or {}
         validation = fields.get("validation")
         target = _target(validation) if metric and validation and "error" not in validation else None
+        given = (record.get("project") or {}).get("images")
         fused, mesh, path_file = dense.get("fused"), dense.get("mesh"), fields.get("trajectory")
         return ViewSource(
             folder=folder,
@@ -174,7 +173,13 @@ def _of_reconstruction(workspace: Workspace, index: int | None) -> ViewSource:
             others=tuple(models),
             scale=scale,
             down_in_world=down,
-            images=(workspace.images_rectified, workspace.images, *_image_folders(folder)),
+            images=(
+                workspace.images_rectified,
+                workspace.images,
+                *([root / given] if given else []),
+                workspace.project_metric / "images",
+                *_image_folders(folder),
+            ),
             fused=root / fused if fused else None,
             mesh=root / mesh if mesh else None,
             trajectory=root / path_file if path_file else None,
@@ -200,7 +205,7 @@ def _of_project(out: Path, index: int | None) -> ViewSource:
         path = folder / TRANSFORM_FILE
         similarity = similarity_from_json(path, read_json(path))
         sigma = float(np.sqrt(max(similarity.cov[0, 0], 0.0)))
-        factor = float(np.exp(_Z95 * sigma))
+        factor = float(np.exp(Z95 * sigma))
         scale = ScaleFacts(
             unit="m",
             metres_per_unit=similarity.scale,
