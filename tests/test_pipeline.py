@@ -132,6 +132,8 @@ def test_the_result_file_says_everything(finished):
     assert model["validation"]["within_tolerance"]
     assert {frame["action"] for frame in stored["frames"]} == {"passed"}
     assert "features: finished" in (out / "log.txt").read_text()
+    assert " ERROR " not in (out / "log.txt").read_text()
+    assert result.report == out / "report.html"
     assert "max_num_features = 1500" in (out / "config.toml").read_text()
     assert not (out / "features.db").exists()
     for name in json.loads((out / "frames.json").read_text())["frames"]:

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import itertools
+import shutil
 from pathlib import Path
 
 import cv2
@@ -10,7 +11,9 @@ import numpy as np
 import pycolmap
 import pytest
 
-from colmap_inertial.errors import FormatError, InertialError, NotObservableError, OutputExistsError
+from colmap_inertial.errors import FormatError, InertialError, NotObservableError, OutputExistsError, TimingError
+from colmap_inertial.io.calibration import calibration_prior
+from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.frames import read_frame_times
 from colmap_inertial.io.imu import read_imu
 from colmap_inertial.model import read_model
@@ -20,6 +23,7 @@ from colmap_inertial.pipeline import MetricStage, ReconstructResult, run_models,
 from colmap_inertial.pipeline.colmap import check_names, image_pairs
 from colmap_inertial.pipeline.config import config_as_toml, read_config
 from colmap_inertial.pipeline.frames import read_frame_records, write_frames
+from colmap_inertial.pipeline.reporting import report_result
 from colmap_inertial.pipeline.terminal import show_applied
 from colmap_inertial.pipeline.workspace import StageRunner, Workspace, canonical
 from colmap_inertial.types import CameraModel, Frame, FrameTiming
@@ -246,6 +250,32 @@ def test_each_sub_model_gets_its_own_scale_and_verdict(project, tmp_path):
     refused = dataclasses.replace(outcome, models=results[2:])
     with pytest.raises(NotObservableError):
         refused.exit_code()
+
+
+def test_a_sub_model_with_one_timed_image_is_refused_and_the_others_go_on(project, tmp_path):
+    workspace = Workspace(tmp_path / "out")
+    workspace.open(tmp_path / "capture.toml")
+    whole = read_model(project.model)
+    shutil.copytree(project.model, workspace.sparse / "0")
+    names = sorted(image.name for image in whole.images.values())
+    lonely = pycolmap.Reconstruction(whole)
+    for name in names[1:]:
+        lonely.deregister_frame(lonely.find_image_with_name(name).frame_id)
+    (workspace.sparse / "1").mkdir()
+    lonely.write_binary(str(workspace.sparse / "1"))
+    imu, timing = read_imu(project.imu), read_frame_times(project.frame_times)
+    stage = MetricStage(imu=imu, calibration=None, options=ScaleOptions(), world="z-up")
+    runner = StageRunner(workspace)
+    metric, refused = run_models(workspace, timing, imu, [stage], runner, silent)
+    assert metric.scale.verdict == "trusted"
+    assert refused.scale.verdict == "refused" and "1 of the model's 1 images" in refused.scale.reasons[0]
+    assert refused.summary["registered_images"] == 1
+    result = ReconstructResult(workspace=workspace, models=(metric, refused), frames=(), seconds={})
+    assert report_result(result, Capture(path=tmp_path, calibration=calibration_prior())).report is not None
+    assert result.exit_code() == 0
+    shutil.rmtree(workspace.sparse / "0")
+    with pytest.raises(TimingError, match="1 of the model's 1 images"):
+        run_models(workspace, timing, imu, [stage], runner, silent)
 
 
 def test_the_key_of_a_hook_knows_its_parameters_and_its_body():

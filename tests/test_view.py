@@ -13,6 +13,8 @@ import numpy as np
 import pycolmap
 import pytest
 from chromium import Page, chromium_or_skip
+from markdown_it import MarkdownIt
+from report_runs import HOSTILE
 
 from colmap_inertial.cli import main
 from colmap_inertial.errors import FormatError, MissingExtraError, OutputError
@@ -22,9 +24,11 @@ from colmap_inertial.model.project import apply_to_project
 from colmap_inertial.model.similarities import plain_factor
 from colmap_inertial.types import ScaleEstimate, Similarity
 from colmap_inertial.view import load_scene, measured, nearest_to_ray, round_length
+from colmap_inertial.view.clouds import dense_cloud, read_mesh
 from colmap_inertial.view.measure import ball_at_ray, length_text
-from colmap_inertial.view.panel import measured_text, scale_text, target_text
+from colmap_inertial.view.panel import camera_text, measured_text, scale_text, target_text
 from colmap_inertial.view.scene import START_FOV_RAD
+from colmap_inertial.view.sources import TargetFacts
 
 METRES_PER_UNIT = 0.25
 #: Gravity in the model's own world: neither along an axis nor of length 1.
@@ -287,6 +291,85 @@ def test_an_applied_project_is_metric_with_its_interval_or_without_one(tmp_path)
     scene = load_scene(tmp_path / "factor")
     assert (scene.scale.unit, scene.scale.relative_ci95, scene.gravity_known) == ("m", None, False)
     assert "uncertainty is not known" in scale_text(scene)
+
+
+def shown(text):
+    """What Markdown makes of a text: kinds of its pieces, and the words."""
+    tokens = [token for block in MarkdownIt().parse(text) for token in (block, *(block.children or []))]
+    return {token.type for token in tokens}, "".join(token.content for token in tokens if not token.children)
+
+
+def test_names_from_files_are_text_and_nothing_else(tmp_path):
+    name = f"{HOSTILE} {{alert(1)}} &lt; `a` **b** [c](javascript:alert(1)) |\n\n# d\n- e\nwww.example.org 1. ~~f~~"
+    once = " ".join(name.split())
+    write_result(tmp_path / "out", [dataclasses.replace(ESTIMATE, reasons=(name,))])
+    scene = load_scene(tmp_path / "out")
+    scene = dataclasses.replace(
+        scene, cameras=dataclasses.replace(scene.cameras, names=(name,) * len(scene.cameras.names))
+    )
+    target = TargetFacts(
+        spec=name, error_pct=1.0, ci95_pct=(0.5, 1.5), within_tolerance=True, distances=(), corners={"a": np.zeros(3)}
+    )
+    for text in (scale_text(scene), camera_text(scene, 0, name), target_text(target)):
+        kinds, words = shown(text)
+        assert once in words
+        assert not [kind for kind in kinds if kind.startswith(("html", "link", "image", "code", "heading", "em_"))]
+        # MDX also runs what stands in braces
+        assert not re.search(r"(?<!\\)[{}<>&]", text)
+
+
+def test_what_is_not_finite_is_left_out(tmp_path):
+    kind = [("x", "<f8"), ("y", "<f8"), ("z", "<f8")]
+    table = np.array([(0, 0, 0), (1, 0, 0), (np.nan, 0, 0), (0, 1, 0), (1e300, 0, 0)], dtype=kind)
+    corners = [(0, 1, 3), (1, 2, 3), (0, 1, 4)]
+    faces = np.array([(3, corner) for corner in corners], dtype=[("count", "u1"), ("index", "<i4", (3,))])
+    header = "ply\nformat binary_little_endian 1.0\nelement vertex 5\n"
+    header += "".join(f"property double {axis}\n" for axis in "xyz")
+    header += "element face 3\nproperty list uchar int vertex_indices\nend_header\n"
+    path = tmp_path / "mesh.ply"
+    path.write_bytes(header.encode() + table.tobytes() + faces.tobytes())
+    cloud, mesh = dense_cloud(path, 100), read_mesh(path, 100)
+    np.testing.assert_array_equal(cloud.xyz, [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    assert cloud.total == 5
+    np.testing.assert_array_equal(mesh.vertices, cloud.xyz)
+    np.testing.assert_array_equal(mesh.faces, [[0, 1, 2]])
+
+    model = synthesized(1)
+    ids = sorted(model.point3D_ids())
+    model.points3D[ids[0]].xyz = np.array([np.nan, 0, 0])
+    model.points3D[ids[1]].xyz = np.array([0, 1e300, 0])
+    (tmp_path / "model").mkdir()
+    model.write_binary(str(tmp_path / "model"))
+    scene = load_scene(tmp_path / "model")
+    assert len(scene.cloud.xyz) == len(ids) - 2
+    assert np.isfinite(scene.cloud.xyz).all() and np.isfinite(scene.reach)
+
+
+def test_cameras_that_see_all_around_are_drawn_with_a_nominal_field_of_view(tmp_path):
+    model = synthesized(1)
+    for camera in list(model.cameras.values()):
+        model.cameras[camera.camera_id].model = pycolmap.CameraModelId.EQUIRECTANGULAR
+        model.cameras[camera.camera_id].params = [camera.width, camera.height]
+    (tmp_path / "model").mkdir()
+    model.write_binary(str(tmp_path / "model"))
+    scene = load_scene(tmp_path / "model")
+    np.testing.assert_allclose(np.tan(0.5 * scene.cameras.vertical_fov_rad), 0.5)
+
+
+def test_images_of_an_existing_project_are_found(tmp_path):
+    out, images = tmp_path / "out", tmp_path / "pictures"
+    write_result(out, [ESTIMATE])
+    name = load_scene(out).cameras.names[0]
+    assert load_scene(out).image_of(0) is None
+    copied = out / "project_metric" / "images" / name
+    copied.parent.mkdir(parents=True)
+    copied.touch()
+    assert load_scene(out).image_of(0) == copied
+    images.mkdir()
+    (images / name).touch()
+    record = json.loads((out / "result.json").read_text())
+    (out / "result.json").write_text(json.dumps({**record, "project": {"images": str(images)}}))
+    assert load_scene(out).image_of(0) == images / name
 
 
 def test_what_cannot_be_shown_is_said(tmp_path, capsys):
