@@ -4,6 +4,7 @@ import dataclasses
 import datetime
 import json
 import shutil
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -22,6 +23,7 @@ from colmap_inertial.io.video_match import match_to_video
 from colmap_inertial.model import read_model
 from colmap_inertial.options import ProjectOptions, ReconstructOptions
 from colmap_inertial.pipeline.existing import is_project, reconstruct_project
+from colmap_inertial.view import load_scene
 
 
 @pytest.fixture(scope="module")
@@ -261,6 +263,43 @@ def test_a_refused_scale_leaves_no_metric_project_and_exits_3(box, tmp_path, cap
     assert stored["project_metric"] is None
     assert not (out / "project_metric").exists()
     assert not (out / "sparse_metric").exists()
+
+
+def test_the_model_of_a_refused_project_is_found_from_anywhere(box, tmp_path, monkeypatch):
+    described = tmp_path / "capture.toml"  # without an accelerometer, there is no scale
+    described.write_text(
+        f'[images]\nfolder = "{box.root / "images"}"\ntimes = "{box.frame_times}"\n[imu.gyro]\n'
+        f'file = "{box.imu / "gyroscope.txt"}"\ntime = 1\ntime_unit = "ns"\ncolumns = [2, 3, 4]\nunit = "rad/s"\n'
+    )
+    monkeypatch.chdir(box.root.parent)
+    out = tmp_path / "out"
+    source = ProjectOptions(imu=described, images=Path(box.root.name) / "images")
+    result = reconstruct_project(Path(box.root.name), out, source)
+    assert result.models[0].scale.verdict == "refused"
+    stored = json.loads((out / "result.json").read_text())
+    assert stored["models"][0]["sparse"] == str(box.root / "sparse" / "0")
+    assert stored["capture"] == str(box.root)
+    assert stored["project"]["images"] == str(box.root / "images")
+    monkeypatch.chdir(tmp_path)
+    scene = load_scene(out)
+    assert len(scene.cameras) == result.models[0].summary["registered_images"]
+    assert scene.image_of(0) == box.root / "images" / scene.cameras.names[0]
+    page = (out / "report.html").read_text()
+    assert "could not be brought together" not in page
+    assert "cannot be used as it is" in page
+
+
+def test_a_target_without_images_to_measure_it_in_is_said(box, tmp_path):
+    described = tmp_path / "capture.toml"
+    described.write_text(
+        f'[images]\nfolder = "{box.root / "images"}"\ntimes = "{box.frame_times}"\n[imu]\npath = "{box.imu}"\n'
+        '[target]\nspec = "aruco:DICT_4X4_50:0.1"\n'
+    )
+    project = poses_only(box, tmp_path / "project", box.names)
+    result = reconstruct_project(project, tmp_path / "out", ProjectOptions(imu=described))
+    assert any("the target was not measured" in reason for reason in result.models[0].scale.reasons)
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert "not at hand" in report["models"][0]["validation"]["missing"]
 
 
 def test_a_capture_toml_gives_imu_times_and_what_is_known_of_the_camera(box, tmp_path):
