@@ -1,3 +1,4 @@
+#include "arrays.h"
 #include "apertures.h"
 #include "dispatch.h"
 
@@ -19,16 +20,6 @@ template <class T, int N>
 using Of = nb::ndarray<T, nb::ndim<N>, nb::c_contig, nb::device::cpu>;
 template <class T, int N>
 using In = Of<const T, N>;
-
-void check(bool holds, const char *message) {
-    if (!holds) throw std::invalid_argument(message);
-}
-
-template <class Array, class... Sizes>
-bool is(const Array &array, Sizes... sizes) {
-    size_t axis = 0;
-    return (... && (array.shape(axis++) == size_t(sizes)));
-}
 
 const ApertureSimd *simd_named(const std::string &name) {
 #if defined(COLMAP_INERTIAL_X86_64)

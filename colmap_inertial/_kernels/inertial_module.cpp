@@ -1,3 +1,4 @@
+#include "arrays.h"
 #include "arrow_simd.h"
 #include "dispatch.h"
 #include "preintegration.h"
@@ -27,16 +28,6 @@ template <int N>
 using In = Of<const double, N>;
 template <int N>
 using Out = Of<double, N>;
-
-void check(bool holds, const char *message) {
-    if (!holds) throw std::invalid_argument(message);
-}
-
-template <class Array, class... Sizes>
-bool is(const Array &array, Sizes... sizes) {
-    size_t axis = 0;
-    return (... && (array.shape(axis++) == size_t(sizes)));
-}
 
 const ArrowSimd *arrow_named(const std::string &name) {
 #if defined(COLMAP_INERTIAL_X86_64)

@@ -39,6 +39,40 @@ def write_text(path: Path, text: str) -> None:
             temporary.unlink(missing_ok=True)
 
 
+def read_yaml(path: Path, what: str, loader: Any = None) -> dict[Any, Any]:
+    """Keys and values of a YAML file; also of OpenCV's, whose version line YAML does not know.
+
+    Parameters
+    ----------
+    path
+        Of the file.
+    what
+        It should be, for messages: "a calibration".
+    loader
+        A loader of PyYAML that knows tags of its own; the safe one if not given.
+
+    Raises
+    ------
+    FormatError
+        Where it cannot be read, is no YAML, or has no keys.
+    """
+    import yaml
+
+    text = read_text(path)
+    if text.startswith("%YAML:"):
+        text = "#" + text
+    try:
+        sheet = yaml.load(text, loader or yaml.SafeLoader)
+    except yaml.MarkedYAMLError as error:
+        line = None if error.problem_mark is None else error.problem_mark.line + 1
+        raise FormatError(path, f"not valid YAML: {error.problem}", line=line) from None
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise FormatError(path, f"not valid YAML: {str(error).splitlines()[0]}") from None
+    if not isinstance(sheet, dict):
+        raise FormatError(path, f"not {what}: expected keys and values")
+    return sheet
+
+
 def write_json(path: Path, value: object, *, indent: int | None = 2) -> None:
     """Write ``value`` as JSON, whole or not at all.
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from colmap_inertial.errors import FormatError
 from colmap_inertial.geometry import colmap_px_from_opencv, matrix_from_quat
 from colmap_inertial.io.capture_tables import CAMERA_MODELS
-from colmap_inertial.io.files import read_text
+from colmap_inertial.io.files import read_text, read_yaml
 from colmap_inertial.types import LengthUnit
 
 Matrix = NDArray[np.float64]
@@ -199,18 +199,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
 
     for tag in ("opencv-matrix", "opencv-nd-matrix"):  # OpenCV 5 writes the latter for one-dimensional arrays
         Loader.add_constructor(f"tag:yaml.org,2002:{tag}", matrix)
-    text = read_text(path)
-    if text.startswith("%YAML"):  # OpenCV's spelling of the version line, which YAML does not know
-        text = "#" + text
-    try:
-        sheet = yaml.load(text, Loader)
-    except yaml.MarkedYAMLError as error:
-        line = None if error.problem_mark is None else error.problem_mark.line + 1
-        raise FormatError(path, f"not valid YAML: {error.problem}", line=line) from None
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise FormatError(path, f"not valid YAML: {str(error).splitlines()[0]}") from None
-    if not isinstance(sheet, dict):
-        raise FormatError(path, "not a calibration: expected keys and values")
+    sheet = read_yaml(path, "a calibration", Loader)
     return {str(key): value for key, value in sheet.items()}
 
 

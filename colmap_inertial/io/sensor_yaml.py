@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from colmap_inertial.errors import FormatError
 from colmap_inertial.geometry import colmap_px_from_opencv
-from colmap_inertial.io.files import read_text
+from colmap_inertial.io.files import read_yaml
 from colmap_inertial.types import CameraModel, ImuNoise
 
 _NOISE_KEYS = {
@@ -30,7 +30,7 @@ def read_imu_noise(path: Path) -> ImuNoise | None:
     FormatError
         Where the sheet gives some of the four and not all, or not as numbers.
     """
-    sheet = _read(path)
+    sheet = read_yaml(path, "a sensor.yaml")
     given = [key for key in _NOISE_KEYS.values() if key in sheet]
     if not given:
         return None
@@ -47,7 +47,7 @@ def read_camera(path: Path) -> CameraModel:
     Pinhole with radial-tangential distortion is COLMAP's OPENCV, with equidistant distortion OPENCV_FISHEYE; the
     principal point is moved by half a pixel from OpenCV's origin to COLMAP's.
     """
-    sheet = _read(path)
+    sheet = read_yaml(path, "a sensor.yaml")
     if sheet.get("camera_model") != "pinhole":
         raise FormatError(path, f"camera_model {sheet.get('camera_model')!r} is not known here (pinhole is)")
     distortion = sheet.get("distortion_model")
@@ -70,7 +70,7 @@ def read_camera(path: Path) -> CameraModel:
 
 def read_body_from_sensor(path: Path) -> NDArray[np.float64]:
     """(4, 4) ``T_BS``: body frame from sensor frame, metres."""
-    sheet = _read(path)
+    sheet = read_yaml(path, "a sensor.yaml")
     entry = sheet.get("T_BS")
     if not isinstance(entry, dict):
         raise FormatError(path, "holds no T_BS with rows, cols and data")
@@ -79,24 +79,6 @@ def read_body_from_sensor(path: Path) -> NDArray[np.float64]:
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
         raise FormatError(path, "T_BS holds no rotation")
     return matrix
-
-
-def _read(path: Path) -> dict[str, Any]:
-    import yaml
-
-    text = read_text(path)
-    if text.startswith("%YAML:"):  # OpenCV's spelling of the version line, which YAML does not know
-        text = "#" + text
-    try:
-        sheet = yaml.safe_load(text)
-    except yaml.MarkedYAMLError as error:
-        line = None if error.problem_mark is None else error.problem_mark.line + 1
-        raise FormatError(path, f"not valid YAML: {error.problem}", line=line) from None
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise FormatError(path, f"not valid YAML: {str(error).splitlines()[0]}") from None
-    if not isinstance(sheet, dict):
-        raise FormatError(path, "not a sensor.yaml: expected keys and values")
-    return sheet
 
 
 def _numbers(path: Path, sheet: dict[str, Any], key: str, count: int) -> list[float]:
