@@ -8,7 +8,6 @@ import pytest
 from test_io_imu import HEADER, handheld, rows, write_csv
 
 from colmap_inertial.errors import FormatError
-from colmap_inertial.io import capture as capture_room
 from colmap_inertial.io.calibration import calibration_prior, write_calibration
 from colmap_inertial.io.capture import ImageFolder, Video, load_capture
 from colmap_inertial.io.capture_tables import CAMERA_MODELS, ImuPath, ImuTables
@@ -22,14 +21,80 @@ def write(folder: Path, text: str) -> Path:
     return folder / "capture.toml"
 
 
-def documented_example() -> str:
-    block = capture_room.__doc__.split(".. code-block:: toml")[1]
-    lines = [line[4:] for line in block.splitlines() if line.startswith("    ") or not line]
-    return "\n".join(lines)
+#: Every table and key, also those that exclude each other.
+EVERYTHING = """\
+[images]                        # a folder of pictures ...
+folder = "frames"
+pattern = "*_0.jpg"             # default: every picture in the folder
+times = "name"                  # the number in each file name is its time; or a CSV file: "frames.csv"
+time_unit = "ns"                # s, ms, us, ns; for a CSV only where its header does not say
+video = "clip.mp4"              # optional: the frames were cut from it; "diagnose" finds them there
+
+[video]                         # ... or a video; its own presentation stamps time the frames. A video with an IMU
+file = "clip.mp4"               # inside (GoPro, CAMM) needs no more than: video = "GX010001.MP4"
+frame_times = "clip_times.csv"  # optional: the recorder's own time of each frame, in place of the stamps
+time_unit = "ns"                # of frame_times, where its header does not say
+frames_per_s = 5                # optional: use about this many
+
+[timing]
+exposure_s = 0.004              # one exposure for all frames, where known
+readout_s = 0.021               # first to last row (rolling shutter); 0 = global shutter; leave out if unknown
+readout_direction = "down"      # down, up, right, left in the stored picture
+shared_clock = false            # true: frame times and IMU stamps come from one clock
+
+[camera]                        # leave out to let COLMAP calibrate
+model = "OPENCV"                # a COLMAP model
+width = 1920
+height = 1080
+params = [1500.0, 1500.0, 960.0, 540.0, 0.0, 0.0, 0.0, 0.0]
+pixel_origin = "corner"         # corner: COLMAP (top-left pixel's centre is 0.5, 0.5); center: OpenCV, Kalibr
+# or: sensor_yaml = "mav0/cam0/sensor.yaml"   (EuRoC; its T_BS also gives the calibration)
+
+[imu]
+path = "mav0/imu0"              # whatever read_imu knows, found by content
+format = "auto"
+
+[imu.gyro]                      # or, without path: any table, described
+file = "imu.csv"
+time = "t"                      # a name in the header, or a column number counted from 1
+time_unit = "s"
+columns = ["gx", "gy", "gz"]
+unit = "rad/s"                  # rad/s, deg/s
+axes = "y,-x,z"                 # x = the file's y, y = minus its x, z = its z
+mirrored = false                # true allows axes that change handedness (a left-handed file)
+
+[imu.accel]                     # may be missing: then no scale and no gravity, but deblurring
+file = "imu.csv"
+time = "t"
+time_unit = "s"
+columns = ["ax", "ay", "az"]
+unit = "m/s2"                   # m/s2, g
+
+[imu.noise]                     # data sheet, where known
+gyro_density_rad_s_rthz = 3e-4
+accel_density_m_s2_rthz = 2e-3
+gyro_walk_rad_s2_rthz = 2e-5
+accel_walk_m_s3_rthz = 3e-3
+
+[calibration]                   # all optional; what is missing is estimated
+file = "phone_calibration.json" # from "colmap-inertial align" of the same device; or:
+cam_from_imu = [[0, -1, 0], [-1, 0, 0], [0, 0, -1]]   # 3x3, or 4x4 with the lever arm; or cam_from_imu_xyzw
+rotation_sigma_rad = 0.01
+imu_in_cam_m = [0.03, 0.01, 0.0]
+imu_in_cam_sigma_m = 0.005
+gyro_time_offset_s = 0.0        # t_cam = t_stamp + offset
+accel_time_offset_s = 0.0
+time_offset_sigma_s = 0.002
+gyro_bias_rad_s = [0.0, 0.0, 0.0]
+gyro_bias_sigma_rad_s = 0.002
+
+[target]
+spec = "checkerboard:8x6:0.03"  # validated at the end of a reconstruction
+"""
 
 
-def test_the_documented_example_is_read(tmp_path: Path) -> None:
-    text = documented_example()
+def test_every_key_is_read(tmp_path: Path) -> None:
+    text = EVERYTHING
     write_calibration(tmp_path / "phone_calibration.json", calibration_prior())
     with pytest.raises(FormatError, match="not both"):
         load_capture(write(tmp_path, text))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_io_capture import documented_example
+from test_io_capture import EVERYTHING
 from test_io_frames import picture
 from test_io_imu import HEADER, handheld, rows
 from test_io_video import write_video
@@ -94,7 +94,7 @@ def calibration(folder: Path) -> Path:
 
 
 def capture(folder: Path) -> Path:
-    text = re.sub(r"\[video\].*?(?=\[timing\])", "", documented_example(), flags=re.S)
+    text = re.sub(r"\[video\].*?(?=\[timing\])", "", EVERYTHING, flags=re.S)
     text = re.sub(r'path = "mav0/imu0".*?\n|format = "auto"\n|file = "phone_calibration.json".*?\n', "", text)
     (folder / "capture.toml").write_text(text)
     return folder / "capture.toml"
