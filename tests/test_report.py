@@ -27,7 +27,8 @@ from colmap_inertial.model import trajectory_from_model
 from colmap_inertial.options import MappingOptions, ProjectOptions, ReconstructOptions
 from colmap_inertial.pipeline import reconstruct
 from colmap_inertial.pipeline.existing import reconstruct_project
-from colmap_inertial.pipeline.reporting import reporting_stops
+from colmap_inertial.pipeline.reporting import reporting_stops, write_recording
+from colmap_inertial.pipeline.stages import GyroView, RollingShutterStage
 from colmap_inertial.pipeline.workspace import Workspace
 from colmap_inertial.report import figures, signals, write_report
 from colmap_inertial.report.figure_3d import nice_length, scene_figure
@@ -36,7 +37,7 @@ from colmap_inertial.report.series import MOST_POINTS, rounded, strided, thinned
 from colmap_inertial.report.signals import signal_record
 from colmap_inertial.report.words import outcome_of_model
 from colmap_inertial.scale import estimate_scale
-from colmap_inertial.types import CameraTrajectory, FrameTiming, ImuRecording, ScaleEstimate
+from colmap_inertial.types import CameraModel, CameraTrajectory, FrameTiming, ImuRecording, ScaleDrift, ScaleEstimate
 
 SCENE = Path(__file__).parents[1] / "example_scenes" / "desk"
 
@@ -643,6 +644,32 @@ def test_a_failing_report_of_a_stop_hides_no_reason(tmp_path, monkeypatch, repor
         raise MappingError("nothing matches")
     assert len(report_failures) == 1
     report_failures.clear()
+
+
+def test_the_rolling_shutter_is_that_of_the_stages_in_use(project, tmp_path):
+    imu = project.recording.imu
+    timing = FrameTiming(names=("0.jpg", "1.jpg", "2.jpg"), t_s=imu.gyro_t_s[0] + 1 + np.arange(3.0), readout_s=0.02)
+    camera = CameraModel(model="PINHOLE", width=640, height=480, params=(500.0, 500.0, 320.0, 240.0))
+    view = GyroView(imu=imu, timing=timing, calibration=calibration_prior(), camera=camera, source="capture")
+    workspace = Workspace(tmp_path)
+    write_recording(workspace, imu, timing, [RollingShutterStage(view=view)])
+    record = json.loads((tmp_path / "report_data" / "recording.json").read_text())
+    assert record["rolling_shutter"]["worst"]["width"] == 640
+    assert max(record["rolling_shutter"]["largest_px"]) > 0
+    write_recording(workspace, imu, timing)
+    assert json.loads((tmp_path / "report_data" / "recording.json").read_text())["rolling_shutter"] is None
+
+
+def test_a_part_that_tells_nothing_of_its_scale_can_be_written():
+    two = {key: np.array([0.0, 1.0]) for key in ("begin_s", "end_s")}
+    drift = ScaleDrift(
+        **two, log_ratio=np.array([-1e5, 1e5]), sigma_log=np.array([1e5, 1e5]), chi2=0.0, dof=1, p_value=1.0,
+        trend_log_per_s=0.0, trend_sigma_log_per_s=1e5,
+    )  # fmt: skip
+    written = drift.as_json(1.0)
+    assert np.isfinite([part["metres_per_unit"] for part in written["parts"]]).all()
+    model = {"metres_per_unit": 1.0, "half_width_pct": 1.0, "drift": written, "signals": {}}
+    assert figures.drift(model)["data"][0]["x"] == []
 
 
 def test_a_missing_plotly_is_told_before_the_work(project, tmp_path, monkeypatch):

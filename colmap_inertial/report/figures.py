@@ -222,7 +222,7 @@ def drift(model: dict[str, Any]) -> Figure:
         "range": [min(0.0, every[0]["begin_s"] - start), every[-1]["end_s"] - start],
         "zeroline": False,
     }
-    most = 1.15 * max(1.3 * width, *(abs(o) + r for o, r in zip(off, reach, strict=True)))
+    most = 1.15 * max([1.3 * width, *(abs(o) + r for o, r in zip(off, reach, strict=True))])
     layout["yaxis"] = {"title": {"text": "off the whole (%)"}, "zeroline": True, "range": [-most, most]}
     data = [
         {

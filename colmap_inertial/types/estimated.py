@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -158,7 +159,8 @@ class ScaleDrift:
         for begin_s, end_s, log_ratio, sigma in zip(
             self.begin_s.tolist(), self.end_s.tolist(), self.log_ratio.tolist(), self.sigma_log.tolist(), strict=True
         ):
-            scale = None if metres_per_unit is None else metres_per_unit * float(np.exp(log_ratio))
+            # clipped: of a part that tells nothing, it may be anything
+            scale = None if metres_per_unit is None else metres_per_unit * math.exp(min(max(log_ratio, -600.0), 600.0))
             parts.append({"begin_s": begin_s, "end_s": end_s, "metres_per_unit": scale, "sigma_log": sigma})
         return {
             "parts": parts,
