@@ -6,6 +6,7 @@ import re
 import signal
 import subprocess
 import sys
+from functools import partial
 
 import cv2
 import model_project
@@ -442,7 +443,9 @@ def test_a_real_browser_shows_it_measures_and_looks_through_a_camera(out, tmp_pa
     chromium_or_skip()
     scene = load_scene(out[0])
     command = [sys.executable, "-m", "colmap_inertial", "view", str(out[0]), "--port", "0"]
-    server = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    # whoever runs the tests in the background lets their children ignore Ctrl-C
+    heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    server = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=heed)
     try:
         url = re.search(r"http://127\.0\.0\.1:\d+", server.stdout.readline())[0]
         page = Page(tmp_path / "profile", 900, 640)
