@@ -219,7 +219,7 @@ def of_a_long_recording(
         sigma_rad=np.full(len(turns), noise_rad),
         support=np.full(len(turns), 100),
     )
-    monkeypatch.setattr(choosing, "_followed", lambda *_: rotation)
+    monkeypatch.setattr(choosing, "followed", lambda *_, **__: rotation)
     clocks = choosing._clocks(replace(capture, camera=_PINHOLE), imu, timing, calibration_prior(), None, silent)
     predicted, kind = choosing._predicted(clocks, timing)
     assert kind == "blur"

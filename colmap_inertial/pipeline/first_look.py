@@ -53,6 +53,8 @@ _SMALL = MappingOptions(
 )
 #: Frames that are followed by their pixels: at most so many, not closer than this; a video has them closer than that.
 _FLOW_FRAMES, _FLOW_SPACING_S, _VIDEO_STEP_S = 300, 0.06, 0.13
+#: Where a quick look begins at the latest.
+_BEGIN_S = 5.0
 #: A declared calibration that is as good as this needs no search.
 _GOOD_ROTATION_RAD, _GOOD_OFFSET_S = 0.03, 0.005
 #: What is found must be as good as this.
@@ -142,7 +144,8 @@ def look_first(
     is_video = len(every.t_s) > 1 and float(np.median(np.diff(every.t_s))) <= _VIDEO_STEP_S
     rotation_rad, offset_s = _sigmas(prior)
     declared = rotation_rad <= _GOOD_ROTATION_RAD and offset_s <= _GOOD_OFFSET_S
-    rotation = _followed(capture, every, camera, progress) if is_video else None
+    along = _middle(every, _FLOW_SPACING_S, _FLOW_FRAMES)
+    rotation = followed(capture, every, camera, along, progress) if is_video else None
     found: GyroView | NotObservableError
     models: tuple[pycolmap.Reconstruction, ...] = ()
     if declared:
@@ -151,7 +154,7 @@ def look_first(
     else:
         found, models = _by_model(capture, imu, timing, prior, options, scratch, num_threads, seed, progress)
         if isinstance(found, NotObservableError):
-            rotation = rotation or _followed(capture, every, camera, progress)
+            rotation = rotation or followed(capture, every, camera, along, progress)
             found = _by_pixels(rotation, imu, timing, prior, options, camera, found)
     if rotation is not None:
         known_s = None if isinstance(found, NotObservableError) else found.motion().offset_s
@@ -243,14 +246,31 @@ def _spaced(timing: FrameTiming, spacing_s: float) -> list[int]:
     return kept
 
 
-def _followed(capture: Capture, timing: FrameTiming, camera: CameraModel, progress: Progress) -> VisualRotation:
-    indices = _middle(timing, _FLOW_SPACING_S, _FLOW_FRAMES)
+def near_the_beginning(timing: FrameTiming, spacing_s: float, most: int) -> list[int]:
+    """Frames of a video about so far apart, from a few seconds in at the latest: what lies before is decoded, too."""
+    usual_s = float(np.median(np.diff(timing.t_s))) if len(timing.t_s) > 1 else 0.0
+    kept = _spaced(timing, spacing_s - 0.25 * usual_s)
+    early = int(np.searchsorted(timing.t_s[kept], timing.t_s[0] + _BEGIN_S))
+    first = min(max(0, (len(kept) - most) // 2), early)
+    return kept[first : first + most]
+
+
+def followed(
+    capture: Capture,
+    timing: FrameTiming,
+    camera: CameraModel,
+    indices: Sequence[int],
+    progress: Progress,
+    *,
+    stage: str = "motion",
+) -> VisualRotation:
+    """The rotation between some frames, by their pixels; progress under the name of ``stage``."""
 
     def counted() -> Iterator[Frame]:
         for done, frame in enumerate(some_frames(capture, timing, indices)):
-            progress("motion", done, len(indices))
+            progress(stage, done, len(indices))
             yield frame
-        progress("motion", len(indices), len(indices))
+        progress(stage, len(indices), len(indices))
 
     with one_blas_thread():
         return measure_rotation(counted(), colmap_camera(camera), timing, FlowOptions())

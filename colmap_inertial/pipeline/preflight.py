@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from colmap_inertial.diagnose import Diagnosis, FramesInVideo, Recorded, diagnose, unreadable
 from colmap_inertial.errors import FormatError, InertialError, NotObservableError, TimingError
-from colmap_inertial.flow import FlowOptions, VisualRotation, measure_rotation
+from colmap_inertial.flow import VisualRotation
 from colmap_inertial.io.calibration import SHARED_CLOCK_OFFSET_S, for_another_recording, read_calibration
 from colmap_inertial.io.capture import Capture, ImageFolder, load_capture
 from colmap_inertial.io.files import write_json
@@ -22,12 +22,12 @@ from colmap_inertial.io.recorders import find_recording
 from colmap_inertial.io.trajectories import read_inertial_scale_poses, read_tum
 from colmap_inertial.io.video import decode_grey, video_stamps_ns
 from colmap_inertial.io.video_match import match_to_video
-from colmap_inertial.model import colmap_camera, read_model, trajectory_from_model
+from colmap_inertial.model import read_model, trajectory_from_model
 from colmap_inertial.pipeline.colmap import Progress
-from colmap_inertial.pipeline.first_look import guessed_camera, some_frames
+from colmap_inertial.pipeline.first_look import followed, guessed_camera, near_the_beginning
 from colmap_inertial.pipeline.imaging import with_stated_exposures
 from colmap_inertial.pipeline.sources import ScaleSource, check_output, only_model
-from colmap_inertial.types import CameraImuCalibration, CameraTrajectory, Frame, FrameTiming
+from colmap_inertial.types import CameraImuCalibration, CameraTrajectory, FrameTiming
 
 log = logging.getLogger(__name__)
 
@@ -38,8 +38,6 @@ T = TypeVar("T")
 _VIDEO_STEP_S = 0.13
 _FEW, _FEW_SPACING_S = 90, 0.09
 _MANY, _MANY_SPACING_S = 400, 0.03
-#: They are not from further in than this: what lies before them must be decoded, too.
-_BEGIN_S = 5.0
 #: Pictures that are looked for in the video they were cut from.
 _CUT = 60
 
@@ -154,7 +152,7 @@ def preflight(
     """The checks before a reconstruction: everything but what needs many pictures."""
     rotation = None
     if capture.frame_log is None or not capture.frame_log.stabilised:
-        rotation = followed(capture, timing, _FEW, _FEW_SPACING_S, progress)
+        rotation = _followed(capture, timing, _FEW, _FEW_SPACING_S, progress)
     return diagnose(
         Recorded(
             imu=raw.imu,
@@ -234,7 +232,7 @@ def _of_capture(capture: Capture, calibration: Path | None, progress: Progress) 
         timing = reading.attempt(lambda: with_stated_exposures(capture, read_frame_timing(capture)))
     if timing is not None:
         known = timing
-        rotation = reading.attempt(lambda: followed(capture, known, _MANY, _MANY_SPACING_S, progress))
+        rotation = reading.attempt(lambda: _followed(capture, known, _MANY, _MANY_SPACING_S, progress))
         in_video = reading.attempt(lambda: _find_in_video(capture, known, progress))
     prior = capture.calibration
     if calibration is not None:
@@ -253,29 +251,14 @@ def _of_capture(capture: Capture, calibration: Path | None, progress: Progress) 
     )
 
 
-def followed(
+def _followed(
     capture: Capture, timing: FrameTiming, most: int, spacing_s: float, progress: Progress
 ) -> VisualRotation | None:
-    """The rotation between frames from the middle of a video; ``None`` for pictures further apart."""
-    usual_s = float(np.median(np.diff(timing.t_s))) if len(timing.t_s) > 1 else np.inf
-    if usual_s > _VIDEO_STEP_S:
+    """The rotation between frames from the beginning of a video; ``None`` for pictures further apart."""
+    if len(timing.t_s) < 2 or float(np.median(np.diff(timing.t_s))) > _VIDEO_STEP_S:
         return None
-    kept = [0]
-    for i, t_s in enumerate(timing.t_s.tolist()):
-        if t_s - timing.t_s[kept[-1]] >= spacing_s - 0.25 * usual_s:
-            kept.append(i)
-    early = int(np.searchsorted(timing.t_s[kept], timing.t_s[0] + _BEGIN_S))
-    first = min(max(0, (len(kept) - most) // 2), early)
-    kept = kept[first : first + most]
-    camera = colmap_camera(guessed_camera(capture, timing))
-
-    def counted() -> Iterator[Frame]:
-        for done, frame in enumerate(some_frames(capture, timing, kept)):
-            progress("motion", done, len(kept))
-            yield frame
-        progress("motion", len(kept), len(kept))
-
-    return measure_rotation(counted(), camera, timing, FlowOptions())
+    indices = near_the_beginning(timing, spacing_s, most)
+    return followed(capture, timing, guessed_camera(capture, timing), indices, progress)
 
 
 def _find_in_video(capture: Capture, timing: FrameTiming, progress: Progress) -> FramesInVideo | None:

@@ -18,18 +18,18 @@ from numpy.typing import NDArray
 
 from colmap_inertial.align import AlignOptions, align_clocks
 from colmap_inertial.errors import NotObservableError
-from colmap_inertial.flow import VisualRotation, check_motion, measure_rotation
+from colmap_inertial.flow import check_motion
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.imaging.psf import predicted_blur_px
 from colmap_inertial.imaging.selection import Chosen, Ranked, Ranking, WindowLimits, choose_frames
 from colmap_inertial.io.calibration import SHARED_CLOCK_OFFSET_S
 from colmap_inertial.io.capture import Capture, Video
 from colmap_inertial.io.files import read_json, write_json
-from colmap_inertial.io.frames import read_frames, read_reduced
+from colmap_inertial.io.frames import read_reduced
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.options import FrameOptions, ReconstructOptions
 from colmap_inertial.pipeline.colmap import Progress
-from colmap_inertial.pipeline.first_look import guessed_camera
+from colmap_inertial.pipeline.first_look import followed, guessed_camera, near_the_beginning
 from colmap_inertial.pipeline.workspace import StageRunner, Workspace, a_record_of_ours, remove
 from colmap_inertial.threads import one_blas_thread
 from colmap_inertial.types import Array, CameraImuCalibration, CameraModel, FrameTiming, ImuRecording
@@ -40,8 +40,8 @@ Int = NDArray[np.intp]
 
 #: Of several frames within so much time, the least blurred one is looked at; pictures are looked at in this size.
 _SLOT_S, _LOOKED_PX = 1 / 30, 960
-#: Frames that are followed to find the offset between the clocks: how many, how far apart, from where at the latest.
-_FOLLOWED, _FOLLOWED_SPACING_S, _BEGIN_S = 300, 0.06, 5.0
+#: Frames that are followed to find the offset between the clocks: how many, how far apart.
+_FOLLOWED, _FOLLOWED_SPACING_S = 300, 0.06
 #: A rotation and an offset as good as these serve.
 _ROTATION_RAD, _OFFSET_S = 0.1, 0.01
 #: What one clock stamped has one rate, unless another is this many standard deviations, and this, from it.
@@ -369,7 +369,8 @@ def _clocks(
         note = "the recorder stamped frames and gyroscope by one clock"
         known = replace(known, oriented=False, note=note, offset_sigma_s=offset_sigma_s)
     try:
-        rotation = _followed(capture, timing, camera, progress)
+        indices = near_the_beginning(timing, _FOLLOWED_SPACING_S, _FOLLOWED)
+        rotation = followed(capture, timing, camera, indices, progress, stage="clocks")
         aligned = align_clocks(rotation.trajectory(), imu, prior=prior, options=AlignOptions(max_offset_s=max_offset_s))
         found, on_rate, rates, rate_sigma = aligned.calibration, imu, "", 0.0
         fast = abs(aligned.clock_rate) > max(_SIGNIFICANT * aligned.clock_rate_sigma, _FAST_CLOCK)
@@ -411,27 +412,6 @@ def _with_focal(camera: CameraModel, gain: tuple[float, float, float]) -> Camera
     if not known or not 0.4 < min(known) <= max(known) < 2.5:
         return camera
     return replace(camera, params=(camera.params[0] * float(np.mean(known)), *camera.params[1:]))
-
-
-def _followed(capture: Capture, timing: FrameTiming, camera: CameraModel, progress: Progress) -> VisualRotation:
-    """Rotation between frames, from the beginning of the recording: what lies before must be decoded, too."""
-    usual_s = float(np.median(np.diff(timing.t_s))) if len(timing.t_s) > 1 else np.inf
-    kept = [0]
-    for i, t_s in enumerate(timing.t_s.tolist()):
-        if t_s - timing.t_s[kept[-1]] >= _FOLLOWED_SPACING_S - 0.25 * usual_s:
-            kept.append(i)
-    early = int(np.searchsorted(timing.t_s[kept], timing.t_s[0] + _BEGIN_S))
-    first = min(max(0, (len(kept) - _FOLLOWED) // 2), early)
-    kept = kept[first : first + _FOLLOWED]
-    frames = read_frames(capture, only=[timing.names[i] for i in kept])[1]
-
-    def counted() -> Iterator[Any]:
-        for done, frame in enumerate(frames):
-            progress("clocks", done, len(kept))
-            yield frame
-        progress("clocks", len(kept), len(kept))
-
-    return measure_rotation(counted(), colmap_camera(camera), timing)
 
 
 __all__ = [
