@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.imaging.blur_field import BlurField
-from colmap_inertial.types import Array
 
 #: Side of a cell. The vector of its centre holds for all its pixels.
 CELL_PX = 16
@@ -50,12 +49,12 @@ class Cells:
             (corner[:-1] + np.minimum(corner[1:], n) - 1) / 2
             for corner, n in ((corner_y, blur.height), (corner_x, blur.width))
         )
-        centre = _sample(blur, centre_y, centre_x)
+        centre = blur.at(centre_y, centre_x)
         size = np.abs(centre)
         along_y = size[..., 1] > size[..., 0]
         major, minor = np.where(along_y, centre[..., ::-1].transpose(2, 0, 1), centre.transpose(2, 0, 1))
         slope = np.divide(minor, major, out=np.zeros_like(major), where=major != 0)
-        corner = _sample(blur, np.minimum(corner_y, blur.height - 1), np.minimum(corner_x, blur.width - 1))
+        corner = blur.at(np.minimum(corner_y, blur.height - 1), np.minimum(corner_x, blur.width - 1))
         low, high = FADE_PX
         fade = np.clip((np.hypot(corner[..., 0], corner[..., 1]) - low) / (high - low), 0, 1)
         return cls(
@@ -64,14 +63,3 @@ class Cells:
             along_y=np.ascontiguousarray(along_y),
             fade=np.ascontiguousarray(fade, dtype=np.float32),
         )
-
-
-def _sample(blur: BlurField, rows: Array, columns: Array) -> Array:
-    """(R, C, 2) the field at the crossings of rows and columns."""
-    (i, s), (j, t) = (np.divmod(np.asarray(at) / blur.step_px, 1) for at in (rows, columns))
-    i, j = i.astype(np.intp), j.astype(np.intp)
-    i_next, j_next = np.minimum(i + 1, len(blur.vector_px) - 1), np.minimum(j + 1, blur.vector_px.shape[1] - 1)
-    v, s, t = blur.vector_px.astype(np.float64), s[:, None, None], t[:, None]
-    upper = v[i][:, j] * (1 - t) + v[i][:, j_next] * t
-    lower = v[i_next][:, j] * (1 - t) + v[i_next][:, j_next] * t
-    return np.asarray(upper * (1 - s) + lower * s)

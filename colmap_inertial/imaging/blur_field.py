@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from colmap_inertial.imaging._bilinear import bilinear
 from colmap_inertial.types import Array
 
 
@@ -53,16 +56,14 @@ class BlurField:
         grid = np.broadcast_to(np.asarray(vector_px, dtype=np.float32), (*cls.nodes(width, height, step_px), 2))
         return cls(width=width, height=height, vector_px=grid, step_px=step_px)
 
+    def at(self, rows_px: NDArray[Any], columns_px: NDArray[Any]) -> Array:
+        """(R, C, 2) the field at the crossings of rows and columns of pixels, between them, too."""
+        nodes = self.vector_px.astype(np.float64)
+        return bilinear(nodes, np.asarray(rows_px) / self.step_px, np.asarray(columns_px) / self.step_px)
+
     def per_pixel(self) -> Array:
         """(height, width, 2) the field at every pixel."""
-        rows, row_part = np.divmod(np.arange(self.height) / self.step_px, 1)
-        columns, column_part = np.divmod(np.arange(self.width) / self.step_px, 1)
-        i, j = rows.astype(np.intp), columns.astype(np.intp)
-        i_next, j_next = np.minimum(i + 1, len(self.vector_px) - 1), np.minimum(j + 1, self.vector_px.shape[1] - 1)
-        v, s, t = self.vector_px.astype(np.float64), row_part[:, None, None], column_part[:, None]
-        upper = v[i][:, j] * (1 - t) + v[i][:, j_next] * t
-        lower = v[i_next][:, j] * (1 - t) + v[i_next][:, j_next] * t
-        return np.asarray(upper * (1 - s) + lower * s)
+        return self.at(np.arange(self.height), np.arange(self.width))
 
     def extent_px(self) -> Array:
         """(Gy, Gx) lengths of the vectors at the nodes."""
