@@ -6,7 +6,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-DeblurMethod = Literal["off", "wiener"]
+#: How blur is undone.
+BlurRemover = Literal["wiener", "deepgyro"]
+DeblurMethod = Literal["off", "wiener", "deepgyro"]
 RollingShutterMethod = Literal["off", "rectify"]
 WorldAxes = Literal["z-up", "y-down"]
 
@@ -195,7 +197,7 @@ class ReconstructOptions:
     """How the sub-images of a multi-aperture camera become frames."""
     deblur: DeblurMethod | None = None
     """Undo motion blur by the gyroscope before COLMAP sees a frame. Default: wiener, where exposure times are known
-    and the pictures bear the gyroscope out."""
+    and the pictures bear the gyroscope out. deepgyro: by a network (slower; needs the extra `restore`)."""
     rolling_shutter: RollingShutterMethod | None = None
     """Undo the rolling shutter by the gyroscope. Default: rectify, where the readout time is known."""
     mapping: MappingOptions = field(default_factory=MappingOptions)

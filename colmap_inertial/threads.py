@@ -1,9 +1,15 @@
-"""How many threads linear algebra may use."""
+"""How many threads there are, and how many linear algebra may use."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+
+
+def usable_processors() -> int:
+    """How many processors this process may use."""
+    return len(os.sched_getaffinity(0))
 
 
 @contextmanager

@@ -6,11 +6,17 @@ import dataclasses
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from colmap_inertial.options import ApertureOptions, FuseAperturesOptions, ProjectOptions, ReconstructOptions
+from colmap_inertial.options import (
+    ApertureOptions,
+    BlurRemover,
+    FuseAperturesOptions,
+    ProjectOptions,
+    ReconstructOptions,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,6 +71,9 @@ class Deblur:
     """A capture.toml, a folder that holds one, or an EuRoC/ASL dataset; it must know the exposure times."""
     out: Positional[Path]
     """A new folder for everything that is made."""
+    method: BlurRemover = "wiener"
+    """wiener: a Wiener filter along the blur of each pixel. deepgyro: a network, which also sees what the filter makes
+    of the picture (slower; needs the extra `restore`)."""
     calibration: Path | None = None
     """A calibration file of this device (from `colmap-inertial align --out`), used as a prior."""
     rectify: bool = False
@@ -81,6 +90,7 @@ class Deblur:
             result = deblur_capture(
                 self.capture,
                 self.out,
+                method=self.method,
                 calibration=self.calibration,
                 rectify=self.rectify,
                 sheet=self.sheet,
@@ -119,6 +129,46 @@ class FuseApertures:
         with live_progress() as progress:
             written = fuse_captured(self.capture, self.out, options, progress=progress)
         print(f"{len(written)} pictures in {self.out / 'images'}")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class FuseExposures:
+    """Make one clean, sharp picture of each short and long exposure, without reconstructing anything.
+
+    The long one is brought to the short one's geometry, by the gyroscope where there is one and by the pixels; a
+    network makes one picture of the two (needs the extra `restore`). Writes OUT/images with the short ones' names,
+    sizes, formats and metadata, as bright as the long ones, and OUT/result.json with what was done to each.
+
+    Example: colmap-inertial fuse-exposures my_capture/capture.toml out --fusion mertens
+    """
+
+    capture: Positional[Path]
+    """A capture.toml with [images] and [exposures], or a folder that holds one; times and an IMU are welcome."""
+    out: Positional[Path]
+    """A new folder."""
+    fusion: Literal["none", "mertens"] = "none"
+    """Blend the fused picture with the short exposure, which shows what clips in the long one."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """What the network runs on; auto: CUDA where onnxruntime has it."""
+    calibration: Path | None = None
+    """A calibration file of this device (from `colmap-inertial align --out`), used as a prior."""
+
+    def run(self) -> int:
+        """Run the command; returns the exit code."""
+        from colmap_inertial.pipeline.fuse_exposures import fuse_exposures_captured
+        from colmap_inertial.pipeline.terminal import live_progress
+
+        options = ExposureOptions(fusion=self.fusion, device=self.device)
+        with live_progress() as progress:
+            pairs = fuse_exposures_captured(
+                self.capture, self.out, options, calibration=self.calibration, progress=progress
+            )
+        fused = sum(pair.fused for pair in pairs)
+        print(f"{fused} of {len(pairs)} pairs fused in {self.out / 'images'}")
+        for pair in pairs:
+            if not pair.fused:
+                print(f"{pair.name} {pair.reason}")
         return 0
 
 

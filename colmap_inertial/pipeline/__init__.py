@@ -36,16 +36,22 @@ from colmap_inertial.pipeline.imaging import (
     read_plan,
     with_stated_exposures,
     write_plan,
-    write_rectified,
 )
 from colmap_inertial.pipeline.metric import MetricStage, ModelStage
 from colmap_inertial.pipeline.models import run_models, validated, with_dense
 from colmap_inertial.pipeline.preflight import preflight, read_checked_imu, stop_or_doubt
 from colmap_inertial.pipeline.readout import ReadoutStage
+from colmap_inertial.pipeline.rectified import write_rectified
 from colmap_inertial.pipeline.reporting import report_result, reporting_stops, write_recording
 from colmap_inertial.pipeline.result import ModelResult, ReconstructResult
 from colmap_inertial.pipeline.selection import part_of, run_selection
-from colmap_inertial.pipeline.stages import DeblurStage, GyroView, RollingShutterStage, for_rectified
+from colmap_inertial.pipeline.stages import (
+    DeblurStage,
+    GyroView,
+    RollingShutterStage,
+    for_rectified,
+    require_method,
+)
 from colmap_inertial.pipeline.workspace import StageRunner, Workspace, fingerprint, remove
 from colmap_inertial.report import require_plotly
 from colmap_inertial.types import (
@@ -155,6 +161,7 @@ def reconstruct(
         rectifying was asked for by name, and the gyroscope does not belong to the pixels.
     """
     require_plotly()
+    require_method(options.deblur)
     loaded = load_capture(capture)
     if loaded.frames is None:
         raise FormatError(loaded.path, "has no frames: add [images] or [video]")

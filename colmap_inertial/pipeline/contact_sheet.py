@@ -32,7 +32,8 @@ _ARROWS_PX = 70
 
 
 def write_contact_sheet(path: Path, capture: Capture, plan: ImagingPlan, images: Path, names: Sequence[str]) -> None:
-    """Write a PNG: one row for each of the first frames named; before on the left, after on the right.
+    """Write a PNG: one row for each of the first frames named; before on the left, after on the right with the
+    method that undid the blur.
 
     Parameters
     ----------
@@ -65,7 +66,7 @@ def write_contact_sheet(path: Path, capture: Capture, plan: ImagingPlan, images:
         length = float(np.percentile(field.extent_px(), 90))
         gap = np.full((height, _GAP, 3), 255, np.uint8)
         label = np.full((_LABEL, 2 * width + _GAP, 3), 255, np.uint8)
-        text = f"{frame.name}   {length:.1f} px   before | after"
+        text = f"{frame.name}   {length:.1f} px   before | {plan.method}"
         cv2.putText(label, text, (4, _LABEL - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
         rows[frame.name] = np.concatenate([label, np.concatenate([cut[0], gap, cut[1]], axis=1)])
     sheet = np.concatenate([rows[name] for name in names[:_FRAMES]])

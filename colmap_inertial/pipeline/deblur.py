@@ -12,13 +12,14 @@ from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.files import write_json
 from colmap_inertial.io.frames import frame_source, read_frames
 from colmap_inertial.io.imu import read_capture_imu
-from colmap_inertial.options import ReconstructOptions
+from colmap_inertial.options import BlurRemover, ReconstructOptions
 from colmap_inertial.pipeline import fusing, logging_to, run_frames, run_plan, run_rectified
 from colmap_inertial.pipeline.colmap import Progress, check_names
 from colmap_inertial.pipeline.contact_sheet import write_contact_sheet
 from colmap_inertial.pipeline.frames import FrameRecord, FrameStage, read_frame_records
 from colmap_inertial.pipeline.imaging import ImagingPlan, with_stated_exposures
 from colmap_inertial.pipeline.result import frame_as_json, imaging_as_json
+from colmap_inertial.pipeline.stages import require_method
 from colmap_inertial.pipeline.workspace import StageRunner, Workspace
 
 
@@ -48,6 +49,7 @@ def deblur_capture(
     capture: Path,
     out: Path,
     *,
+    method: BlurRemover = "wiener",
     calibration: Path | None = None,
     rectify: bool = False,
     sheet: Path | None = None,
@@ -62,6 +64,8 @@ def deblur_capture(
     out
         A folder that does not exist, or holds an unfinished run of the same capture. No frame is left out: those that
         cannot be deblurred are copied.
+    method
+        How blur is undone.
     calibration
         A calibration file of this device.
     rectify
@@ -75,9 +79,12 @@ def deblur_capture(
     ------
     NotObservableError
         Where the gyroscope does not belong to the pixels, as in stabilised video.
+    MissingExtraError
+        Where the method is a network, and onnxruntime is not installed.
     InertialError
         For what cannot be read or written.
     """
+    require_method(method)
     loaded = load_capture(capture)
     if loaded.frames is None:
         raise FormatError(loaded.path, "has no frames: add [images] or [video]")
@@ -92,7 +99,7 @@ def deblur_capture(
     timing = with_stated_exposures(loaded, timing)
     check_names(timing.names)
     options = ReconstructOptions(
-        deblur="wiener", rolling_shutter="rectify" if rectify else "off", calibration=calibration
+        deblur=method, rolling_shutter="rectify" if rectify else "off", calibration=calibration
     )
     workspace = Workspace(out)
     workspace.open(loaded.path)

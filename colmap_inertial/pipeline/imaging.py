@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -22,17 +21,14 @@ from colmap_inertial.imaging.gate import (
 )
 from colmap_inertial.imaging.parallax import Parallax
 from colmap_inertial.imaging.psf import blur_field, predicted_blur_px
-from colmap_inertial.imaging.rolling_shutter import rectify_image
 from colmap_inertial.io.calibration import SHARED_CLOCK_OFFSET_S
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import read_json, write_json
 from colmap_inertial.io.frames import frame_source
-from colmap_inertial.io.images import read_image
 from colmap_inertial.model import colmap_camera
-from colmap_inertial.options import DeblurMethod, RollingShutterMethod
+from colmap_inertial.options import BlurRemover, DeblurMethod, RollingShutterMethod
 from colmap_inertial.pipeline.colmap import Progress
 from colmap_inertial.pipeline.first_look import guessed_camera, look_first, some_frames, survey, survey_parts
-from colmap_inertial.pipeline.frames import FrameRecord, encode_image
 from colmap_inertial.pipeline.metadata import stated_exposures_s
 from colmap_inertial.pipeline.passing import find_parallaxes
 from colmap_inertial.pipeline.stages import DeblurStage, GyroView, RollingShutterStage
@@ -40,8 +36,6 @@ from colmap_inertial.pipeline.workspace import a_record_of_ours
 from colmap_inertial.types import CameraImuCalibration, CameraModel, FrameTiming, ImuRecording
 
 if TYPE_CHECKING:
-    from concurrent.futures import Future
-
     import pycolmap
 
 
@@ -69,6 +63,8 @@ class ImagingPlan:
         Gyroscope, camera and times; ``None`` where nothing is to be done.
     deblur
         Decisions and verdict for :class:`DeblurStage`; ``None`` where no frame is to be deblurred.
+    method
+        How blur is undone.
     parallaxes
         By frame name, where the camera's translation is known to blur.
     rectify
@@ -79,6 +75,7 @@ class ImagingPlan:
 
     view: GyroView | None = None
     deblur: tuple[tuple[FrameDecision, ...], RecordingVerdict] | None = None
+    method: BlurRemover = "wiener"
     parallaxes: Mapping[str, Parallax] = field(default_factory=dict)
     rectify: bool = False
     deblur_note: str = ""
@@ -91,7 +88,13 @@ class ImagingPlan:
         decisions, verdict = self.deblur
         gate = GateOptions() if verdict.trusted else GateOptions(min_support=_CLEAR_SUPPORT)
         stage = DeblurStage(
-            view=self.view, decisions=decisions, verdict=verdict, parallaxes=self.parallaxes, gate=gate, drop=drop
+            view=self.view,
+            decisions=decisions,
+            verdict=verdict,
+            parallaxes=self.parallaxes,
+            gate=gate,
+            drop=drop,
+            method=self.method,
         )
         return [stage]
 
@@ -104,6 +107,7 @@ class ImagingPlan:
         view = self.view
         return {
             "deblur": self.deblur_note,
+            "deblur_method": None if self.deblur is None else self.method,
             "rolling_shutter": self.rolling_shutter_note,
             "rectify": self.rectify,
             "calibration": None
@@ -152,6 +156,7 @@ def read_plan(path: Path, imu: ImuRecording, timing: FrameTiming) -> ImagingPlan
         return ImagingPlan(
             view=view,
             deblur=deblur,
+            method=values["deblur_method"] or "wiener",
             parallaxes={name: Parallax.from_json(parallax) for name, parallax in values["parallaxes"].items()},
             rectify=values["rectify"],
             deblur_note=values["deblur"],
@@ -217,7 +222,9 @@ def plan_imaging(
             "to the last"
         )
     plan = ImagingPlan(
-        rectify=rolling_shutter != "off" and bool(timing.readout_s), rolling_shutter_note=_shutter_note(timing)
+        method="deepgyro" if deblur == "deepgyro" else "wiener",
+        rectify=rolling_shutter != "off" and bool(timing.readout_s),
+        rolling_shutter_note=_shutter_note(timing),
     )
     if rolling_shutter == "off":
         plan = replace(plan, rolling_shutter_note="not asked for")
@@ -241,7 +248,7 @@ def plan_imaging(
             progress=progress,
         )
     except NotObservableError as error:
-        asked = [deblur == "wiener" and not why_not, rolling_shutter == "rectify" and plan.rectify]
+        asked = [deblur in ("wiener", "deepgyro") and not why_not, rolling_shutter == "rectify" and plan.rectify]
         if any(asked):
             raise
         untreated = f"frames stay as they were filmed: {error}"
@@ -390,6 +397,8 @@ def _decided(
     used = {name: parallaxes[name] for name in _to_deblur(decisions) if name in parallaxes}
     if used:
         note += f"; the camera's translation is counted in for {len(used)} frames"
+    if plan.method == "deepgyro" and verdict.trusted is not False:
+        note += "; the network DeepGyro undoes it"
     return replace(plan, deblur=(decisions, verdict), parallaxes=used, deblur_note=note)
 
 
@@ -424,56 +433,10 @@ def _by_frame(
     return replace(verdict, trusted=None, reason=reason)
 
 
-def write_rectified(
-    stage: RollingShutterStage, records: Sequence[FrameRecord], images: Path, target: Path, progress: Progress
-) -> None:
-    """Write the images that COLMAP saw as a global shutter would have taken them; what cannot be rectified is copied.
-
-    Parameters
-    ----------
-    stage
-        That rectified the keypoints.
-    records
-        Of all frames; those that were dropped have no image.
-    images, target
-        Folders of the images and of the rectified ones.
-    progress
-        Called with ``"rectified"``.
-    """
-    from concurrent.futures import ThreadPoolExecutor
-
-    view = stage.view
-    motion, camera, index = view.motion(), colmap_camera(view.camera), view.index()
-
-    def work(name: str) -> None:
-        source, out = images / name, target / name
-        out.parent.mkdir(parents=True, exist_ok=True)
-        if stage.covers(name):
-            original: Any = read_image(source)
-            image, _ = rectify_image(original, motion, camera, view.shutter(index[name]))
-            encode_image(out, image, source)
-        else:
-            out.write_bytes(source.read_bytes())
-
-    names = [record.name for record in records if record.action != "dropped"]
-    target.mkdir(parents=True)
-    waiting: deque[Future[None]] = deque()
-    with ThreadPoolExecutor(2) as pool:
-        for done, name in enumerate(names):
-            waiting.append(pool.submit(work, name))
-            if len(waiting) > 2:
-                waiting.popleft().result()
-            progress("rectified", done, len(names))
-        for future in waiting:
-            future.result()
-    progress("rectified", len(names), len(names))
-
-
 __all__ = [
     "ImagingPlan",
     "plan_imaging",
     "read_plan",
     "with_stated_exposures",
     "write_plan",
-    "write_rectified",
 ]

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -13,15 +12,20 @@ import numpy as np
 
 from colmap_inertial.align import on_camera_rate
 from colmap_inertial.errors import NotObservableError
+from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.gate import FrameDecision, GateOptions, RecordingVerdict, deblur_gated
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.parallax import Parallax
 from colmap_inertial.imaging.psf import blur_field
+from colmap_inertial.imaging.restoration import deepgyro, load_network, require_network
+from colmap_inertial.imaging.restoration.shipped import checksum
 from colmap_inertial.imaging.rolling_shutter import rectify_keypoints
 from colmap_inertial.imaging.wiener import LONGEST_PX, DeblurOptions, deblur
 from colmap_inertial.io.calibration import SMALLEST_READOUT_S
 from colmap_inertial.model import colmap_camera
+from colmap_inertial.options import BlurRemover, DeblurMethod
 from colmap_inertial.pipeline.frames import FrameTreatment
+from colmap_inertial.threads import usable_processors
 from colmap_inertial.types import (
     CALIBRATION_PARAMETERS,
     Array,
@@ -41,6 +45,18 @@ _LEFT_SHARE = 0.1
 _READOUT = CALIBRATION_PARAMETERS.index("readout_s")
 #: Frames in work at once: enough for a desk computer's cores, few enough for its memory.
 _MOST_WORKERS = 4
+
+
+def require_method(method: DeblurMethod | None) -> None:
+    """Say before any work where frames cannot be deblurred as they shall be.
+
+    Raises
+    ------
+    MissingExtraError, FormatError
+        Where a network is asked for, and what it runs in or its file is missing.
+    """
+    if method == "deepgyro":
+        require_network("deepgyro")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -120,6 +136,10 @@ class DeblurStage:
         Thresholds.
     drop
         Whether frames that are too blurred are left out.
+    method
+        How blur is undone: by a Wiener filter along it, or by the network DeepGyro.
+    weights
+        Checksum of the network; empty where there is none. It decides the frames as the options do.
     workers
         Frames in work at once; as many as the process has processors, up to four, where absent.
     """
@@ -130,22 +150,29 @@ class DeblurStage:
     parallaxes: Mapping[str, Parallax] = field(default_factory=dict)
     gate: GateOptions = field(default_factory=GateOptions)
     drop: bool = True
+    method: BlurRemover = "wiener"
+    weights: str = field(default="", init=False)
     workers: int | None = field(default=None, compare=False)
     _done: dict[str, FrameTreatment] = field(default_factory=dict, init=False, compare=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if self.method == "deepgyro":
+            object.__setattr__(self, "weights", checksum("deepgyro"))
 
     def __call__(self, frames: Iterator[Frame], /) -> Iterator[Frame]:
         """Deblur the frames, in order."""
         from concurrent.futures import ThreadPoolExecutor
 
+        remove = self._remover()
         motion, camera, index = self.view.motion(), colmap_camera(self.view.camera), self.view.index()
         decision_of = {decision.name: decision for decision in self.decisions}
-        workers = self.workers or min(_MOST_WORKERS, len(os.sched_getaffinity(0)))
+        workers = self.workers or min(_MOST_WORKERS, usable_processors())
 
         def treat(frame: Frame) -> tuple[Frame | None, FrameTreatment | None]:
             decision = decision_of.get(frame.name)
             if decision is None:
                 return frame, None
-            return self._treated(frame, decision, motion, camera, self.view.shutter(index[frame.name]))
+            return self._treated(frame, decision, motion, camera, self.view.shutter(index[frame.name]), remove)
 
         with ThreadPoolExecutor(workers) as pool:
             waiting: deque[tuple[str, Future[tuple[Frame | None, FrameTreatment | None]]]] = deque()
@@ -164,6 +191,12 @@ class DeblurStage:
         """What was decided about a frame that went through."""
         return self._done.get(name)
 
+    def _remover(self) -> Callable[[Any, BlurField], Any]:
+        """Undoes the blur of one frame in one thread."""
+        if self.method == "deepgyro":
+            return partial(deepgyro.deblur, network=load_network("deepgyro", threads=1))
+        return partial(deblur, options=DeblurOptions(threads=1))
+
     def _finished(self, name: str, future: Future[tuple[Frame | None, FrameTreatment | None]]) -> Iterator[Frame]:
         frame, treatment = future.result()
         if treatment is not None:
@@ -172,7 +205,13 @@ class DeblurStage:
             yield frame
 
     def _treated(
-        self, frame: Frame, decision: FrameDecision, motion: GyroCamera, camera: Projector, shutter: FrameShutter
+        self,
+        frame: Frame,
+        decision: FrameDecision,
+        motion: GyroCamera,
+        camera: Projector,
+        shutter: FrameShutter,
+        remove: Callable[[Any, BlurField], Any],
     ) -> tuple[Frame | None, FrameTreatment]:
         """The frame to go on with (``None`` drops it), and what to say about it."""
         said = FrameTreatment(reason=decision.reason, blur_px=decision.blur_px)
@@ -188,9 +227,8 @@ class DeblurStage:
             return frame, replace(said, reason=error.hint)
         if float(np.abs(blur.vector_px).max()) * 1.5 > LONGEST_PX:
             return frame, replace(said, reason=f"{decision.blur_px:.0f} px of blur are too long to be undone")
-        one_thread: Any = partial(deblur, options=DeblurOptions(threads=1))
         image: Any = frame.image  # either of two types of pixel, which the checker would keep apart
-        gated = deblur_gated(image, blur, recording=self.verdict, deblur=one_thread, options=self.gate)
+        gated = deblur_gated(image, blur, recording=self.verdict, deblur=remove, options=self.gate)
         said = replace(
             said,
             reason=gated.reason,
@@ -249,4 +287,4 @@ def for_rectified(calibration: CameraImuCalibration) -> CameraImuCalibration:
     return replace(calibration, readout_s=0.0, cov=cov)
 
 
-__all__ = ["DeblurStage", "GyroView", "RollingShutterStage", "for_rectified"]
+__all__ = ["DeblurStage", "GyroView", "RollingShutterStage", "for_rectified", "require_method"]

@@ -1,0 +1,63 @@
+"""Images that agree with rectified keypoints."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from colmap_inertial.imaging.rolling_shutter import rectify_image
+from colmap_inertial.io.images import read_image
+from colmap_inertial.model import colmap_camera
+from colmap_inertial.pipeline.colmap import Progress
+from colmap_inertial.pipeline.frames import FrameRecord, encode_image
+from colmap_inertial.pipeline.stages import RollingShutterStage
+
+if TYPE_CHECKING:
+    from concurrent.futures import Future
+
+
+def write_rectified(
+    stage: RollingShutterStage, records: Sequence[FrameRecord], images: Path, target: Path, progress: Progress
+) -> None:
+    """Write the images that COLMAP saw as a global shutter would have taken them; what cannot be rectified is copied.
+
+    Parameters
+    ----------
+    stage
+        That rectified the keypoints.
+    records
+        Of all frames; those that were dropped have no image.
+    images, target
+        Folders of the images and of the rectified ones.
+    progress
+        Called with ``"rectified"``.
+    """
+    from concurrent.futures import ThreadPoolExecutor
+
+    view = stage.view
+    motion, camera, index = view.motion(), colmap_camera(view.camera), view.index()
+
+    def work(name: str) -> None:
+        source, out = images / name, target / name
+        out.parent.mkdir(parents=True, exist_ok=True)
+        if stage.covers(name):
+            original: Any = read_image(source)
+            image, _ = rectify_image(original, motion, camera, view.shutter(index[name]))
+            encode_image(out, image, source)
+        else:
+            out.write_bytes(source.read_bytes())
+
+    names = [record.name for record in records if record.action != "dropped"]
+    target.mkdir(parents=True)
+    waiting: deque[Future[None]] = deque()
+    with ThreadPoolExecutor(2) as pool:
+        for done, name in enumerate(names):
+            waiting.append(pool.submit(work, name))
+            if len(waiting) > 2:
+                waiting.popleft().result()
+            progress("rectified", done, len(names))
+        for future in waiting:
+            future.result()
+    progress("rectified", len(names), len(names))
