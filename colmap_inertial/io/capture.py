@@ -25,6 +25,7 @@ from colmap_inertial.io.capture_tables import (
     read_camera,
     read_imu_table,
 )
+from colmap_inertial.io.exposures import LongExposures, read_exposures_table
 from colmap_inertial.io.gcsv import is_gcsv, read_gcsv_frames
 from colmap_inertial.io.imu_text import is_inertial_scale
 from colmap_inertial.io.recorders import Recording, find_recording
@@ -104,6 +105,8 @@ class Capture:
         What the recorder noted about the frames of the video; what the capture.toml says goes before it.
     apertures
         The sub-images that are fused to one frame; ``frames`` and ``camera`` are the reference aperture's.
+    exposures
+        The long exposures beside ``frames``, which are the short ones.
     """
 
     path: Path
@@ -118,6 +121,7 @@ class Capture:
     target: str | None = None
     frame_log: FrameLog | None = None
     apertures: AperturePictures | None = None
+    exposures: LongExposures | None = None
 
 
 def load_capture(path: Path) -> Capture:
@@ -171,13 +175,15 @@ def _from_toml(path: Path) -> Capture:
     shared_clock = timing.boolean("shared_clock")
     timing.finish()
     camera, body_from_cam = read_camera(root.section("camera"))
-    apertures = read_apertures_table(
-        root.section("apertures"), frames.folder if isinstance(frames, ImageFolder) else None
-    )
+    folder = frames.folder if isinstance(frames, ImageFolder) else None
+    apertures = read_apertures_table(root.section("apertures"), folder)
+    exposures = read_exposures_table(root.section("exposures"), folder)
     if apertures is not None:
         if camera is not None:
             root.fail("camera", "is given by the calibration under [apertures]; leave it out")
         camera = apertures.rig.reference.camera
+        if exposures is not None:
+            root.fail("exposures", "a capture has [apertures] or [exposures], not both")
     imu = read_imu_table(root.section("imu"))
     log = None
     if isinstance(frames, Video):
@@ -218,6 +224,7 @@ def _from_toml(path: Path) -> Capture:
         target=spec,
         frame_log=log,
         apertures=apertures,
+        exposures=exposures,
     )
 
 

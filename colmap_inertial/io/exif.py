@@ -19,7 +19,9 @@ _EXIF_HEADER = b"Exif\0\0"
 HEAD_BYTES = 256 * 1024
 #: Tags of EXIF (CIPA DC-008): the directory, and DateTimeOriginal, OffsetTimeOriginal, SubSecTimeOriginal in it.
 _DIRECTORY, _DATE, _OFFSET, _FRACTION = 0x8769, 0x9003, 0x9011, 0x9291
-_ASCII = 2
+#: ExposureTime, PhotographicSensitivity.
+_EXPOSURE_TIME, _SENSITIVITY = 0x829A, 0x8827
+_ASCII, _SHORT = 2, 3
 _EPOCH = datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
 
 
@@ -127,6 +129,31 @@ def _tiff(head: bytes) -> bytes | None:
         chunk = next((part for name, part in png_chunks(head) if name == b"eXIf"), None)
         return None if chunk is None else chunk[8 : 8 + struct.unpack_from(">I", chunk)[0]]
     return head if head[:4] in (b"II*\0", b"MM\0*") else None
+
+
+def exposure_of(head: bytes) -> tuple[float | None, float | None]:
+    """Exposure time in seconds and ISO sensitivity by the EXIF in the head of a file; ``None`` where it does not say.
+
+    ExposureTime is a fraction, PhotographicSensitivity a whole number (CIPA DC-008).
+    """
+    try:
+        found = exif_directory(head)
+    except (struct.error, KeyError):
+        found = None
+    if found is None:
+        return None, None
+    tiff, order, directory = found
+    exposure_s = iso = None
+    if _EXPOSURE_TIME in directory:
+        try:
+            at = struct.unpack(order + "I", directory[_EXPOSURE_TIME][2])[0]
+            numerator, denominator = struct.unpack_from(order + "II", tiff, at)
+        except struct.error:
+            numerator = denominator = 0
+        exposure_s = numerator / denominator if denominator else 0.0
+    if _SENSITIVITY in directory and directory[_SENSITIVITY][0] == _SHORT:
+        iso = float(struct.unpack_from(order + "H", directory[_SENSITIVITY][2])[0])
+    return exposure_s if exposure_s is not None and 0 < exposure_s < 10 else None, iso or None
 
 
 def jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:

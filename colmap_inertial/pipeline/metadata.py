@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import struct
 from pathlib import Path
 
 import numpy as np
 
-from colmap_inertial.io.exif import HEAD_BYTES, PNG, exif_directory, jpeg_segments, png_chunks
+from colmap_inertial.io.exif import HEAD_BYTES, PNG, exposure_of, jpeg_segments, png_chunks
 from colmap_inertial.types import Array
 
 #: Chunks of a PNG that say something about its pixels or where they come from.
 _PNG_CARRIED = (b"eXIf", b"iCCP", b"sRGB", b"gAMA", b"cHRM", b"pHYs", b"tIME", b"tEXt", b"zTXt", b"iTXt")
 #: JPEG application segments that belong to the coding of the pixels: JFIF's, and Adobe's colour transform.
 _JPEG_CODING = (0xE0, 0xEE)
-_EXPOSURE_TIME = 0x829A
 
 
 def carry_metadata(original: bytes, encoded: bytes) -> bytes:
@@ -42,7 +40,7 @@ def stated_exposures_s(paths: list[Path]) -> Array | None:
     found = []
     for path in paths:
         with open(path, "rb") as file:
-            exposure_s = _exposure_s(file.read(HEAD_BYTES))
+            exposure_s, _ = exposure_of(file.read(HEAD_BYTES))
         if exposure_s is None:
             return None
         found.append(exposure_s)
@@ -51,18 +49,3 @@ def stated_exposures_s(paths: list[Path]) -> Array | None:
 
 def _is_jpeg_metadata(marker: int) -> bool:
     return (0xE1 <= marker <= 0xEF and marker not in _JPEG_CODING) or marker == 0xFE
-
-
-def _exposure_s(head: bytes) -> float | None:
-    """ExposureTime of EXIF (CIPA DC-008): a fraction, in seconds."""
-    try:
-        found = exif_directory(head)
-        if found is None or _EXPOSURE_TIME not in found[2]:
-            return None
-        tiff, order, directory = found
-        at = struct.unpack(order + "I", directory[_EXPOSURE_TIME][2])[0]
-        numerator, denominator = struct.unpack_from(order + "II", tiff, at)
-    except (struct.error, KeyError):
-        return None
-    exposure_s = numerator / denominator if denominator else 0.0
-    return exposure_s if 0 < exposure_s < 10 else None
