@@ -188,6 +188,18 @@ class ApertureOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ExposureOptions:
+    """How pairs of a short and a long exposure become frames."""
+
+    fuse: bool = True
+    """Fuse them; otherwise the short ones are used as they were filmed."""
+    fusion: Literal["none", "mertens"] = "none"
+    """Blend the fused picture with the short exposure, which shows what clips in the long one."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """What the network runs on; auto: CUDA where onnxruntime has it."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class ReconstructOptions:
     """Everything that decides the result of a reconstruction, beside the capture itself."""
 
@@ -195,6 +207,8 @@ class ReconstructOptions:
     """Which frames are used."""
     apertures: ApertureOptions = field(default_factory=ApertureOptions)
     """How the sub-images of a multi-aperture camera become frames."""
+    exposures: ExposureOptions = field(default_factory=ExposureOptions)
+    """How pairs of a short and a long exposure become frames."""
     deblur: DeblurMethod | None = None
     """Undo motion blur by the gyroscope before COLMAP sees a frame. Default: wiener, where exposure times are known
     and the pictures bear the gyroscope out. deepgyro: by a network (slower; needs the extra `restore`)."""

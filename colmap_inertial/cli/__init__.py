@@ -12,7 +12,7 @@ import tyro
 from tyro.conf import subcommand
 
 from colmap_inertial import __version__
-from colmap_inertial.cli.captures import Batch, Deblur, FuseApertures, Reconstruct, Simulate
+from colmap_inertial.cli.captures import Batch, Deblur, FuseApertures, FuseExposures, Reconstruct, Simulate
 from colmap_inertial.cli.models import Align, Apply, Diagnose, Scale, Validate, View
 from colmap_inertial.errors import InertialError
 from colmap_inertial.options import ReconstructOptions
@@ -23,7 +23,20 @@ Exit codes: 0 done, 1 a check failed, 2 bad input, 3 not observable (scale refus
 5 target not found."""
 
 
-Command = Reconstruct | Scale | Apply | Align | Diagnose | Validate | View | Deblur | FuseApertures | Batch | Simulate
+Command = (
+    Reconstruct
+    | Scale
+    | Apply
+    | Align
+    | Diagnose
+    | Validate
+    | View
+    | Deblur
+    | FuseApertures
+    | FuseExposures
+    | Batch
+    | Simulate
+)
 _COMMANDS: dict[str, type[Command]] = {
     "reconstruct": Reconstruct,
     "scale": Scale,
@@ -34,6 +47,7 @@ _COMMANDS: dict[str, type[Command]] = {
     "view": View,
     "deblur": Deblur,
     "fuse-apertures": FuseApertures,
+    "fuse-exposures": FuseExposures,
     "batch": Batch,
     "simulate": Simulate,
 }

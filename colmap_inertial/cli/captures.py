@@ -13,6 +13,7 @@ from tyro.conf import Positional, arg
 from colmap_inertial.options import (
     ApertureOptions,
     BlurRemover,
+    ExposureOptions,
     FuseAperturesOptions,
     ProjectOptions,
     ReconstructOptions,

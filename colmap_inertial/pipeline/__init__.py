@@ -29,7 +29,9 @@ from colmap_inertial.pipeline.colmap import (
 )
 from colmap_inertial.pipeline.config import config_as_toml
 from colmap_inertial.pipeline.contact_sheet import CropKeeper
+from colmap_inertial.pipeline.exposures import ExposureStage, lsd2_fuser
 from colmap_inertial.pipeline.frames import FrameRecord, FrameStage, read_frame_records, require_frames, write_frames
+from colmap_inertial.pipeline.fuse_exposures import exposure_stage, for_pairs, fuses_pairs
 from colmap_inertial.pipeline.imaging import (
     ImagingPlan,
     plan_imaging,
@@ -137,9 +139,9 @@ def reconstruct(
         See :class:`ReconstructOptions`.
     frame_stages, keypoint_stages, model_stages
         The hooks. ``None`` means the default stages, an empty list none: :class:`ApertureStage` for a multi-aperture
-        camera's frames, then :class:`DeblurStage`, and :class:`RollingShutterStage` for keypoints, where the options
-        and the recording allow them. The model stages
-        must include one that makes the model metric, see :func:`default_model_stages`.
+        camera's frames, :class:`ExposureStage` for pairs of a short and a long exposure, :class:`DeblurStage` for all
+        others, and :class:`RollingShutterStage` for keypoints, where the options and the recording allow them. The
+        model stages must include one that makes the model metric, see :func:`default_model_stages`.
     progress
         Called with stage, steps done and steps in all.
 
@@ -165,6 +167,9 @@ def reconstruct(
     loaded = load_capture(capture)
     if loaded.frames is None:
         raise FormatError(loaded.path, "has no frames: add [images] or [video]")
+    pairs = frame_stages is None and fuses_pairs(loaded, options.exposures, deblur=options.deblur)
+    fuser = lsd2_fuser(options.exposures) if pairs else None
+    loaded = loaded if pairs else dataclasses.replace(loaded, exposures=None)
     raw = read_checked_imu(loaded, force=options.force)
     imu = raw.imu
     if loaded.target is not None:
@@ -191,9 +196,10 @@ def reconstruct(
         if len(selection.names) < len(timing.names):
             timing = part_of(timing, selection.names)
             _, frames = read_frames(loaded, only=timing.names)
-        plan = run_plan(runner, workspace, loaded, imu, timing, options, progress, every=every)
+        plan = run_plan(runner, workspace, loaded, imu, timing, options, progress, every=every, pairs=pairs)
+        fused = [exposure_stage(loaded, options.exposures, view=plan.view, fuser=fuser)] if pairs else []
         of_frames: list[FrameStage] = (
-            [*fusing(loaded, workspace, options.apertures), *plan.frame_stages()]
+            [*fusing(loaded, workspace, options.apertures), *fused, *plan.frame_stages()]
             if frame_stages is None
             else list(frame_stages)
         )
@@ -241,10 +247,12 @@ def run_plan(
     progress: Progress,
     *,
     every: FrameTiming | None = None,
+    pairs: bool = False,
 ) -> ImagingPlan:
     """What to do to frames and keypoints; with both switched off, nothing is looked at.
 
-    ``every``: all frames of the video that ``timing``'s were chosen from.
+    ``every``: all frames of the video that ``timing``'s were chosen from. ``pairs``: frames are fused of short and long
+    exposures, and not deblurred.
     """
     prior = prior_calibration(capture, options)
 
@@ -254,7 +262,7 @@ def run_plan(
             imu,
             timing,
             prior,
-            deblur=options.deblur,
+            deblur="off" if pairs else options.deblur,
             rolling_shutter=options.rolling_shutter,
             scratch=workspace.stamps,
             every=every,
@@ -263,6 +271,19 @@ def run_plan(
             seed=options.seed,
             progress=progress,
         )
+        if pairs:
+            plan = for_pairs(
+                plan,
+                capture,
+                imu,
+                timing,
+                prior,
+                scratch=workspace.stamps,
+                max_offset_s=options.scale.max_offset_s,
+                num_threads=1 if options.deterministic else -1,
+                seed=options.seed,
+                progress=progress,
+            )
         write_plan(partial[0], plan)
 
     depends = {
@@ -271,6 +292,7 @@ def run_plan(
         "timing": timing,
         "prior": prior,
         "deblur": options.deblur,
+        "pairs": pairs,
         "rolling_shutter": options.rolling_shutter,
         "max_offset_s": options.scale.max_offset_s,
         "deterministic": options.deterministic,
@@ -368,6 +390,8 @@ def _inputs(capture: Capture, timing: FrameTiming) -> list[object]:
         paths = [capture.frames.file]
     if capture.apertures is not None:
         paths += capture.apertures.files(timing.names)
+    if capture.exposures is not None:
+        paths += [*capture.exposures.files(timing.names), *filter(None, [capture.exposures.times])]
     return [fingerprint(path) for path in paths]
 
 
@@ -443,6 +467,7 @@ def _run_colmap(
 
 __all__ = [
     "DeblurStage",
+    "ExposureStage",
     "FrameStage",
     "GyroView",
     "KeypointStage",
