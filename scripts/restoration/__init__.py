@@ -1,0 +1,1 @@
+"""Training of the restoration networks: data, network, loop. Needs the extra ``train``."""

@@ -1,0 +1,210 @@
+"""Training samples of both networks: what a camera recorded, what the network is told, and the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.imaging.wiener import DeblurOptions, deblur
+from colmap_inertial.types import Array
+from restoration.camera import jpeg, noisy, sharpened, srgb
+from restoration.handheld import Handheld, captured, simulated
+from restoration.optics import ShotOptions, Shots, draw_shots
+from restoration.photographs import Album, photographs
+
+Codes = NDArray[np.uint8]
+
+#: Pieces are made so large, and lose this much at each edge, so that few see an edge as only pictures' edges are.
+SIDE, MARGIN = 256, 32
+_NODE_PX = 16
+#: Scenes reach so far beyond the pieces.
+_BEYOND_PX = 48
+#: Motion capture that is never trained on.
+HELD_OUT_MOTION = "room5"
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Samples:
+    """B samples, (B, S, S, 3) uint8 each, and (B, S / 2, S / 2, 3) float16 blur as the networks take it."""
+
+    picture: Codes
+    aid: Codes
+    blur: NDArray[np.float16]
+    truth: Codes
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Material:
+    """Photographs and motions, either those to train on or those to measure with."""
+
+    album: Album
+    motions: list[Handheld]
+
+    @classmethod
+    def load(cls, photos: Path, motion: Path | None, *, held_out: bool = False) -> Material:
+        """From a folder of photographs, and of motion capture; without it, the simulator's motion alone."""
+        motions = simulated(8, 1000 if held_out else 0)
+        if motion is not None:
+            files = [p for p in sorted(motion.glob("*.csv")) if (HELD_OUT_MOTION in p.name) == held_out]
+            if not files:
+                raise SystemExit(f"{motion} holds no motion capture (*.csv) of this kind")
+            motions += [piece for file in files for piece in captured(file)]
+        return cls(album=Album(photographs(photos, held_out=held_out)), motions=motions)
+
+
+Maker = Callable[[Material, int, np.random.Generator, str], Samples]
+
+
+def deepgyro_samples(material: Material, count: int, rng: np.random.Generator, device: str) -> Samples:
+    """Blurred pieces, the Wiener filter's result by a gyroscope with errors, and that gyroscope's blur.
+
+    One in eight is sharp and has a blur that is not there; in one in eight, the gyroscope is right.
+    """
+    generator = torch.Generator(device).manual_seed(int(rng.integers(2**62)))
+    longest = rng.choice([6.0, 14.0, 24.0, 36.0], p=[0.2, 0.3, 0.3, 0.2])
+    blur_px = rng.uniform(0.3 * longest, longest, count)
+    shots = draw_shots(material.motions, blur_px, rng, ShotOptions(side=SIDE), device)
+    false = torch.tensor(rng.random(count) < 0.125, device=device)
+    told = told_blur(shots, rng)
+    shots = replace(shots, exposure_s=torch.where(false, rng.uniform(0, 0.08) * shots.exposure_s, shots.exposure_s))
+    scene = _scenes(material.album, count, rng, device)
+    light = shots.render(scene, max(12, int(1.2 * longest)))
+    truth = srgb(shots.render(scene, 1))
+    picture = _bytes(_photographed(light, rng, generator, darkest=0.003, noisiest=0.02))
+    fields = _fields(told)
+    noise = DeblurOptions(threads=1)
+    aid = np.stack([deblur(np.ascontiguousarray(p), f, noise) for p, f in zip(picture, fields, strict=True)])
+    return _trimmed(picture, aid, fields, _bytes(truth))
+
+
+def told_blur(shots: Shots, rng: np.random.Generator) -> Tensor:
+    """(B, G, G, 2) blur at the nodes by a gyroscope with errors.
+
+    Errors are of clock (3 ms), extent (10 %), direction (3 degrees), turning (drift of 0.01 rad/s), the point about
+    which a roll turns (3 % of the focal length), and of what the camera's translation does: not known at all in one
+    of three. They are up to 1.6 times as large in some samples, and none at all in one of eight.
+    """
+    count, device = len(shots.t_s), shots.t_s.device
+
+    def normal(sd: float, *shape: int) -> Tensor:
+        return torch.tensor(sd * rng.standard_normal((count, *shape)), dtype=torch.float32, device=device)
+
+    drawn = rng.uniform(0, 1.6, count)
+    much = torch.tensor(np.where(rng.random(count) < 0.125, 0, drawn), dtype=torch.float32, device=device)
+    at = torch.arange(SIDE // _NODE_PX + 1, device=device) * float(_NODE_PX) + 0.5
+    late = normal(3e-3) * much
+    translated = torch.tensor(rng.random(count) > 1 / 3, device=device) | (much == 0)
+    drift = normal(0.01, 3) * much[:, None]
+    centre = normal(0.03, 2) * (much * shots.focal_px)[:, None]
+    turn = shots.turned(shots.t_s + late[:, None]) + drift[:, None] * shots.t_s[..., None]
+    wrong = replace(
+        shots,
+        turn_rad=turn,
+        moved_m=shots.moved_m * translated[:, None, None],
+        corner_px=shots.corner_px + centre,
+    )
+    vector = wrong.blur(at, at)
+    angle = normal(np.radians(3)) * much
+    factor = torch.exp(normal(0.1) * much)
+    cos, sin = (factor * torch.cos(angle))[:, None, None], (factor * torch.sin(angle))[:, None, None]
+    return torch.stack([cos * vector[..., 0] - sin * vector[..., 1], sin * vector[..., 0] + cos * vector[..., 1]], -1)
+
+
+def lsd2_samples(material: Material, count: int, rng: np.random.Generator, device: str) -> Samples:
+    """Short exposures, noisy, and long ones, blurred and not quite in place; the truth is the short one without noise.
+
+    As a network is given them: the short one brought to the long one's brightness, the long one aligned. In half of
+    them the blur of the long one is not known.
+    """
+    generator = torch.Generator(device).manual_seed(int(rng.integers(2**62)))
+    longest = rng.choice([4.0, 12.0, 24.0, 36.0], p=[0.15, 0.3, 0.3, 0.25])
+    blur_px = rng.uniform(0.2 * longest, longest, count)
+    exposure_s = np.exp(rng.uniform(np.log(0.02), np.log(0.1), count))
+    shots = draw_shots(material.motions, blur_px, rng, ShotOptions(side=SIDE), device, exposure_s=exposure_s)
+    told = told_blur(shots, rng)
+    scene = _scenes(material.album, count, rng, device)
+    ratio = torch.tensor(np.exp(rng.uniform(np.log(4), np.log(30), count)), dtype=torch.float32, device=device)
+    brief = replace(shots, exposure_s=shots.exposure_s / ratio)
+    # what is left of where the long one lies after alignment, and of its size and direction
+    off_px = torch.tensor(rng.standard_normal((count, 2)) * rng.gamma(1.0, 1.5, (count, 1)), dtype=torch.float32)
+    light = shots.render(scene, max(12, int(1.2 * longest)), shift_px=off_px.to(device))
+    clean = brief.render(scene, max(1, int(0.5 * longest)))
+    truth = srgb(brief.render(scene, 1))
+    aid = _bytes(_photographed(light, rng, generator, darkest=0.002, noisiest=0.01))
+    # colours of the short one differ a little, and its brightness is not matched exactly
+    tint = torch.tensor(1 + 0.04 * rng.standard_normal((count, 3)), dtype=torch.float32, device=device)
+    gain = torch.tensor(1 + 0.05 * rng.standard_normal(count), dtype=torch.float32, device=device)
+    tinted = (clean * (tint * gain[:, None])[:, :, None, None]).clamp(0, 1)
+    picture = _bytes(_photographed(tinted, rng, generator, darkest=0.015, noisiest=0.15))
+    vectors = torch.where(torch.tensor(rng.random(count) < 0.5)[:, None, None, None].to(device), told, 0 * told)
+    return _trimmed(picture, aid, _fields(vectors), _bytes(truth))
+
+
+def network_blur(field: BlurField) -> NDArray[np.float32]:
+    """(H / 2, W / 2, 3) of a field as the networks take it, at the middles of squares of 2 x 2 px."""
+    full = field.per_pixel()
+    x, y = (full[::2, ::2] + full[1::2, ::2] + full[::2, 1::2] + full[1::2, 1::2]).transpose(2, 0, 1) / 4
+    length = np.hypot(x, y)
+    double = 2 * np.arctan2(y, x)
+    return np.stack([length * np.cos(double), length * np.sin(double), length], axis=-1).astype(np.float32) / 32
+
+
+def _scenes(album: Album, count: int, rng: np.random.Generator, device: str) -> Tensor:
+    """(B, 3, S, S) light, of other brightness than the photographs', lamps brighter than white."""
+    side = SIDE + 2 * _BEYOND_PX
+    light = torch.from_numpy(np.stack([album.piece(side, rng) for _ in range(count)])).to(device).permute(0, 3, 1, 2)
+    bright = torch.tensor(np.exp(rng.uniform(np.log(0.4), np.log(1.3), count)), dtype=torch.float32, device=device)
+    lamps = torch.tensor(
+        np.where(rng.random(count) < 0.3, rng.uniform(1, 6, count), 0), dtype=torch.float32, device=device
+    )
+    lamp = ((light - 0.85) / 0.15).clamp(0, 1) * lamps[:, None, None, None]
+    grey = torch.tensor(rng.random(count) < 0.25, device=device)[:, None, None, None]
+    light = torch.where(grey, light.mean(dim=1, keepdim=True).expand_as(light), light)
+    return ((light + lamp) * bright[:, None, None, None]).contiguous()
+
+
+def _photographed(
+    light: Tensor, rng: np.random.Generator, generator: torch.Generator, *, darkest: float, noisiest: float
+) -> Tensor:
+    """Codes of light: clipping, noise of full scale's share at white between two limits, sRGB, sharpening, JPEG."""
+    count, device = len(light), light.device
+
+    def drawn(values: Array) -> Tensor:
+        return torch.tensor(values, dtype=torch.float32, device=device)
+
+    sigma = np.exp(rng.uniform(np.log(darkest), np.log(noisiest), count))
+    by_light = rng.random(count)
+    grain = drawn(np.where(rng.random(count) < 0.4, rng.uniform(0, 0.8, count), 0))
+    out = noisy(light.clamp(0, 1), drawn(sigma * np.sqrt(1 - by_light)), drawn(sigma**2 * by_light), grain, generator)
+    # pictures without colour have noise without colour
+    grey = (light[:, :1] == light[:, 1:2]).flatten(1).all(dim=1)[:, None, None, None]
+    code = srgb(torch.where(grey, out[:, :1].expand_as(out), out))
+    amount = drawn(np.where(rng.random(count) < 0.2, rng.uniform(0.2, 0.8, count), 0))
+    code = torch.where(amount[:, None, None, None] > 0, sharpened(code, amount), code)
+    code = (255 * code).round() / 255
+    packed = torch.tensor(rng.random(count) < 0.5, device=device)[:, None, None, None]
+    pressed = jpeg(code, drawn(rng.uniform(75, 98, count)), torch.tensor(rng.random(count) < 0.7, device=device))
+    return torch.where(packed, pressed, code)
+
+
+def _bytes(code: Tensor) -> Codes:
+    """(B, S, S, 3) of (B, 3, S, S) codes 0 to 1."""
+    return (255 * code).round().clamp(0, 255).byte().permute(0, 2, 3, 1).contiguous().cpu().numpy()
+
+
+def _fields(vectors: Tensor) -> list[BlurField]:
+    return [BlurField(width=SIDE, height=SIDE, vector_px=v, step_px=_NODE_PX) for v in vectors.cpu().numpy()]
+
+
+def _trimmed(picture: Codes, aid: Codes, fields: list[BlurField], truth: Codes) -> Samples:
+    inner = slice(MARGIN, SIDE - MARGIN)
+    half = slice(MARGIN // 2, (SIDE - MARGIN) // 2)
+    blur = np.stack([network_blur(field) for field in fields])[:, half, half].astype(np.float16)
+    return Samples(picture=picture[:, inner, inner], aid=aid[:, inner, inner], blur=blur, truth=truth[:, inner, inner])

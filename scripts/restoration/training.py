@@ -1,0 +1,196 @@
+"""The training loop that both networks share: seeded, resumable, on a GPU or on a processor that knows bfloat16."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.console import Console
+from torch import Tensor, nn
+
+from restoration.pool import Pool
+from restoration.samples import Samples
+
+console = Console(stderr=True)
+#: A squared error below this (in codes 0 to 1) counts linearly no more.
+_SMOOTH = 1e-3
+#: Weight of the difference of the spectra, which holds on to fine detail.
+_SPECTRAL = 0.05
+_KEEP_EVERY, _TELL_EVERY = 500, 100
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainOptions:
+    """What decides the result, beside samples and network."""
+
+    steps: int
+    batch: int = 8
+    rate: float = 1e-3
+    warm_up: int = 300
+    averaged: float = 0.999
+    seed: int = 0
+
+
+def train(
+    network: nn.Module, pool: Pool, held_out: Pool, folder: Path, options: TrainOptions, *, device: str
+) -> dict[str, Any]:
+    """Train, or go on where an interrupted run kept its state; returns the figures.
+
+    Parameters
+    ----------
+    network
+        Takes ``picture``, ``aid`` and ``blur``; ends with the running average of its weights.
+    folder
+        ``state.pt`` (the whole state, every 500 steps) and ``figures.json``.
+    """
+    torch.manual_seed(options.seed)
+    network = network.to(device).train().to(memory_format=torch.channels_last)
+    average = {name: value.detach().clone() for name, value in network.state_dict().items()}
+    optimiser = torch.optim.AdamW(network.parameters(), lr=options.rate, betas=(0.9, 0.95), weight_decay=1e-4)
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: _rate(step, options))
+    figures: dict[str, Any] = {"options": asdict(options), "held_out_psnr_db": {}, "seconds": 0.0}
+    first = 0
+    state_path = folder / "state.pt"
+    folder.mkdir(parents=True, exist_ok=True)
+    if state_path.exists():
+        state = torch.load(state_path, map_location=device, weights_only=True)
+        if state["figures"]["options"] != asdict(options):
+            raise SystemExit(f"{state_path} belongs to other options: name another folder")
+        network.load_state_dict(state["network"])
+        optimiser.load_state_dict(state["optimiser"])
+        schedule.load_state_dict(state["schedule"])
+        average, figures, first = state["average"], state["figures"], state["step"]
+        console.print(f"going on after {first} steps")
+    recent: list[float] = []
+    begun, before_s = time.monotonic(), figures["seconds"]
+    for step, samples in _batches(pool, options, first):
+        picture, aid, blur, truth = _tensors(samples, device)
+        with torch.autocast(device, dtype=torch.bfloat16):
+            restored = network(picture, aid, blur)
+        loss = _loss(restored.float(), truth)
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        nn.utils.clip_grad_norm_(network.parameters(), 0.5)
+        optimiser.step()
+        schedule.step()
+        with torch.no_grad():
+            share = min(options.averaged, (step + 1) / (step + 10))
+            for name, value in network.state_dict().items():
+                average[name].lerp_(value, 1 - share)
+        recent.append(loss.item())
+        figures["seconds"] = before_s + time.monotonic() - begun
+        last = step + 1 == options.steps
+        if (step + 1) % _TELL_EVERY == 0:
+            console.print(f"step {step + 1}: loss {np.mean(recent[-_TELL_EVERY:]):.5f}, {figures['seconds']:.0f} s")
+        if (step + 1) % _KEEP_EVERY == 0 or last:
+            if (step + 1) % (4 * _KEEP_EVERY) == 0 or last:
+                found = measured(network, average, held_out, device)
+                figures["held_out_psnr_db"][str(step + 1)] = found
+                console.print(f"step {step + 1}: held out {found}")
+            state = {
+                "network": network.state_dict(),
+                "average": average,
+                "optimiser": optimiser.state_dict(),
+                "schedule": schedule.state_dict(),
+                "figures": figures,
+                "step": step + 1,
+            }
+            torch.save(state, state_path.with_suffix(".new"))
+            state_path.with_suffix(".new").replace(state_path)
+            (folder / "figures.json").write_text(json.dumps(figures, indent=2) + "\n")
+    network.load_state_dict(average)
+    return figures
+
+
+def measured(network: nn.Module, weights: dict[str, Tensor], pool: Pool, device: str) -> dict[str, float]:
+    """Mean PSNR, dB, of what goes in and of what comes out with these weights."""
+    own = {name: value.clone() for name, value in network.state_dict().items()}
+    network.load_state_dict(weights)
+    network.eval()
+    total: dict[str, list[float]] = {"picture": [], "aid": [], "restored": []}
+    with torch.no_grad():
+        for start in range(0, len(pool), 8):
+            picture, aid, blur, truth = _tensors(pool.batch(range(start, min(start + 8, len(pool)))), device)
+            restored = network(picture, aid, blur).clamp(0, 1)
+            for name, value in (("picture", picture), ("aid", aid), ("restored", restored)):
+                total[name] += (-10 * (value - truth).square().mean(dim=(1, 2, 3)).log10()).tolist()
+    network.load_state_dict(own)
+    network.train()
+    return {name: round(float(np.mean(values)), 3) for name, values in total.items()}
+
+
+def _rate(step: int, options: TrainOptions) -> float:
+    """Factor on the learning rate: up from nothing, then down along a cosine."""
+    if step < options.warm_up:
+        return (step + 1) / options.warm_up
+    part = min((step - options.warm_up) / max(1, options.steps - options.warm_up), 1.0)
+    return 1e-3 + (1 - 1e-3) * 0.5 * (1 + float(np.cos(np.pi * part)))
+
+
+def _loss(restored: Tensor, truth: Tensor) -> Tensor:
+    error = restored - truth
+    smooth = (error.square() + _SMOOTH**2).sqrt().mean()
+    return smooth + _SPECTRAL * torch.fft.rfft2(error, norm="ortho").abs().mean()
+
+
+def _batches(pool: Pool, options: TrainOptions, first: int) -> Iterator[tuple[int, Samples]]:
+    """Steps with their samples, every sample once a round, turned and mirrored at random; read ahead."""
+    per_round = len(pool) // options.batch
+
+    def read(step: int) -> Samples:
+        turn, place = divmod(step, per_round)
+        order = np.random.default_rng([options.seed, turn]).permutation(len(pool))
+        samples = pool.batch(order[options.batch * place : options.batch * (place + 1)])
+        return turned(samples, np.random.default_rng([options.seed, turn, place]))
+
+    with ThreadPoolExecutor(1) as reader:
+        ahead = reader.submit(read, first) if first < options.steps else None
+        for step in range(first, options.steps):
+            assert ahead is not None
+            samples = ahead.result()
+            if step + 1 < options.steps:
+                ahead = reader.submit(read, step + 1)
+            yield step, samples
+
+
+def turned(samples: Samples, rng: np.random.Generator) -> Samples:
+    """All of a batch mirrored or transposed alike, and their colours exchanged; blur follows."""
+    flip_x, flip_y, transpose = rng.random(3) < 0.5
+    colours = rng.permutation(3)
+
+    def moved(array: Any) -> Any:
+        array = array[:, :, ::-1] if flip_x else array
+        array = array[:, ::-1] if flip_y else array
+        return array.swapaxes(1, 2) if transpose else array
+
+    # the double angle changes its sign when mirrored, and becomes its complement when transposed
+    signs = np.array([-1 if transpose else 1, -1 if flip_x != flip_y else 1, 1], dtype=np.float16)
+    return Samples(
+        picture=moved(samples.picture)[..., colours],
+        aid=moved(samples.aid)[..., colours],
+        truth=moved(samples.truth)[..., colours],
+        blur=moved(samples.blur) * signs,
+    )
+
+
+def _tensors(samples: Samples, device: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """(B, 3, H, W) float32, codes 0 to 1."""
+
+    def tensor(array: Any, scale: float) -> Tensor:
+        there = torch.from_numpy(np.ascontiguousarray(array)).to(device)
+        return (there.permute(0, 3, 1, 2).float() * scale).contiguous(memory_format=torch.channels_last)
+
+    code = 1 / 255
+    return (
+        tensor(samples.picture, code),
+        tensor(samples.aid, code),
+        tensor(samples.blur, 1.0),
+        tensor(samples.truth, code),
+    )

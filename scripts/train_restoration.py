@@ -1,0 +1,81 @@
+#!/usr/bin/env python3
+"""Train a restoration network, export it and write its model card.
+
+    python scripts/train_restoration.py deepgyro --photos FOLDER --motion FOLDER --work FOLDER
+
+PHOTOS are sharp photographs (.jpg, .png; any folder will do), MOTION holds motion capture of people who carry a camera
+(*.csv in TUM-VI's layout; without it the simulator's motion alone is used). One in five photographs and the motion of
+one recording are never trained on: figures come from those.
+
+Needs the extra ``train`` (PyTorch, ONNX). Uses a CUDA device where there is one. Started again with the same WORK
+folder, it goes on where it was. The defaults are what the shipped weights were made with, on two processor cores;
+on a GPU, train longer on more:
+
+    python scripts/train_restoration.py deepgyro --photos FOLDER --motion FOLDER --work FOLDER \\
+        --samples 40000 --steps 60000 --batch 16
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+
+import torch
+from restoration import samples
+from restoration.card import write_card
+from restoration.export import WEIGHTS, export
+from restoration.network import RestorationNet, parameters
+from restoration.pool import Sources, make_pool
+from restoration.training import TrainOptions, console, train
+
+#: What each network is trained on, how long, and how much of the second picture it takes at first.
+MAKERS = {"deepgyro": samples.deepgyro_samples, "lsd2": samples.lsd2_samples}
+STEPS = {"deepgyro": 16_000, "lsd2": 8_000}
+HELD_OUT = 128
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("name", choices=sorted(MAKERS))
+    parser.add_argument("--photos", type=Path, required=True)
+    parser.add_argument("--motion", type=Path)
+    parser.add_argument("--work", type=Path, required=True, help="for samples (0.4 MB each) and the state of training")
+    parser.add_argument("--samples", type=int, default=9600)
+    parser.add_argument("--steps", type=int)
+    parser.add_argument("--batch", type=int, default=8)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--begin-with", type=Path, help="state.pt of another network to begin with")
+    parser.add_argument("--out", type=Path, default=WEIGHTS, help="folder for NAME.onnx, its checksum and its card")
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cuda" if torch.cuda.is_available() else "cpu")
+    args = parser.parse_args()
+    cores = len(os.sched_getaffinity(0))
+    maker, work = MAKERS[args.name], args.work / args.name
+    pools = {
+        held_out: make_pool(
+            work / ("held_out" if held_out else "samples"),
+            maker,
+            Sources(photos=args.photos, motion=args.motion, held_out=held_out),
+            HELD_OUT if held_out else args.samples,
+            seed=args.seed + held_out,
+            device=args.device,
+            workers=cores,
+        )
+        for held_out in (True, False)
+    }
+    torch.set_num_threads(cores)
+    torch.manual_seed(args.seed)
+    network = RestorationNet()
+    if args.begin_with is not None:
+        network.load_state_dict(torch.load(args.begin_with, map_location="cpu", weights_only=True)["average"])
+    console.print(f"{args.name}: {parameters(network) / 1e6:.2f} million weights, on {args.device}")
+    options = TrainOptions(steps=args.steps or STEPS[args.name], batch=args.batch, seed=args.seed)
+    figures = train(network, pools[False], pools[True], work / "training", options, device=args.device)
+    target = args.out / f"{args.name}.onnx"
+    export(network, target)
+    write_card(target.with_suffix(".md"), args.name, network, figures, samples=len(pools[False]), device=args.device)
+    console.print(f"wrote {target} ({target.stat().st_size / 1e6:.1f} MB) and its card")
+
+
+if __name__ == "__main__":
+    main()

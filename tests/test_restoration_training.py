@@ -1,0 +1,216 @@
+"""Training of the restoration networks; needs the extra ``train``."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+pytest.importorskip("torch", reason="the extra `train` is not installed")
+pytest.importorskip("onnxruntime", reason="the extra `restore` is not installed")
+import torch
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
+from restoration import samples
+from restoration.camera import jpeg, noisy, srgb
+from restoration.export import export
+from restoration.handheld import simulated
+from restoration.network import RestorationNet
+from restoration.optics import ShotOptions, draw_shots
+from restoration.photographs import photographs
+from restoration.pool import Pool, Sources, make_pool
+from restoration.training import TrainOptions, train, turned
+
+from colmap_inertial.imaging.blur_field import BlurField
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory) -> Path:
+    """A folder of drawn pictures."""
+    folder, rng = tmp_path_factory.mktemp("photos"), np.random.default_rng(0)
+    for i in range(12):
+        picture = np.full((360, 400, 3), rng.integers(40, 200, 3), dtype=np.uint8)
+        for _ in range(60):
+            a, b = rng.integers(0, 400, (2, 2))
+            cv2.rectangle(picture, a.tolist(), b.tolist(), rng.integers(0, 255, 3).tolist(), int(rng.integers(1, 9)))
+        cv2.imwrite(str(folder / f"{i}.png"), picture)
+    return folder
+
+
+def drawn_shots(blur_px, seed):
+    rng = np.random.default_rng(seed)
+    return draw_shots(simulated(2, 3), np.asarray(blur_px), rng, ShotOptions(side=128, widths=(640, 1280)), "cpu")
+
+
+def test_a_point_smears_by_what_the_blur_field_says():
+    shots = drawn_shots([20.0, 14.0, 25.0], 3)
+    scene = torch.zeros(3, 3, 192, 192)
+    scene[:, :, 96, 96] = 1
+    smeared, sharp = shots.render(scene, 64)[:, 0].numpy(), shots.render(scene, 1)[:, 0].numpy()
+    at = np.arange(128) + 0.5
+
+    def moments(light):
+        weight = light / light.sum()
+        x, y = (weight.sum(0) * at).sum(), (weight.sum(1) * at).sum()
+        dx, dy = at - x, (at - y)[:, None]
+        return np.array([x, y]), 12 * np.array([(weight * m).sum() for m in (dx * dx, dy * dy, dx * dy)])
+
+    for i in range(3):
+        middle, spread = moments(smeared[i])
+        place, own = moments(sharp[i])
+        x, y = (float(v) for v in shots.blur(*torch.tensor(middle, dtype=torch.float32)[:, None])[i, 0, 0])
+        # a segment of length L has second moments of L^2 / 12; interpolation widens points by up to a pixel
+        np.testing.assert_allclose(spread - own, [x * x, y * y, x * y], atol=0.012 * (x * x + y * y) + 1)
+        np.testing.assert_allclose(middle, place, atol=0.15)
+    # as long as was wanted, but for what the rolling shutter makes of it
+    middle = torch.tensor([64.0])
+    np.testing.assert_allclose(shots.blur(middle, middle)[:, 0, 0].norm(dim=-1), [20, 14, 25], rtol=0.3)
+
+
+def test_jpeg_is_that_of_the_usual_library():
+    rng = np.random.default_rng(1)
+    picture = cv2.GaussianBlur(rng.integers(0, 256, (96, 128, 3)).astype(np.uint8), (0, 0), 1.5)
+    for quality in (50, 75, 95):
+        _, packed = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, quality])
+        expected = cv2.imdecode(packed, cv2.IMREAD_COLOR_RGB).astype(float)
+        code = torch.from_numpy(picture[..., ::-1].copy()).permute(2, 0, 1)[None].float() / 255
+        found = 255 * jpeg(code, torch.tensor([float(quality)]), torch.tensor([True]))[0].permute(1, 2, 0).numpy()
+        lost = np.abs(expected - picture[..., ::-1]).mean()
+        assert np.abs(found - expected).mean() < 0.35 * lost
+
+
+@pytest.mark.parametrize("grain", [0.0, 0.5, 1.0])
+def test_noise_is_as_strong_as_asked_for(grain):
+    light = torch.full((1, 3, 256, 256), 0.4)
+    found = noisy(
+        light, torch.tensor([0.02]), torch.tensor([0.001]), torch.tensor([grain]), torch.Generator().manual_seed(0)
+    )
+    assert float((found - light).std()) == pytest.approx((0.02**2 + 0.001 * 0.4) ** 0.5, rel=0.02)
+
+
+def test_srgb_is_that_of_the_package():
+    from colmap_inertial.imaging._transfer import srgb_from_linear
+
+    light = np.linspace(-0.1, 1.2, 500)
+    np.testing.assert_allclose(srgb(torch.tensor(light)), srgb_from_linear(light), atol=1e-7)
+
+
+def test_blur_turns_with_the_picture(photos):
+    size = samples.SIDE
+    rows = np.linspace(2, 9, BlurField.nodes(size, size)[0])[:, None, None] * [1.0, 0.3]
+    field = BlurField(width=size, height=size, vector_px=np.broadcast_to(rows, (*BlurField.nodes(size, size), 2)))
+    picture = np.random.default_rng(0).integers(0, 256, (1, size, size, 3), dtype=np.uint8)
+    one = samples.Samples(
+        picture=picture, aid=picture, truth=picture, blur=samples.network_blur(field)[None].astype(np.float16)
+    )
+    v = field.per_pixel()
+    ways = set()
+    for seed in range(30):
+        out = turned(one, np.random.default_rng(seed))
+        grey = out.picture.sum(axis=-1)[0]
+        for flip_x, flip_y, transpose in np.ndindex(2, 2, 2):
+            moved, w = picture.sum(axis=-1)[0], v
+            moved, w = (moved[:, ::-1], w[:, ::-1] * [-1, 1]) if flip_x else (moved, w)
+            moved, w = (moved[::-1], w[::-1] * [1, -1]) if flip_y else (moved, w)
+            moved, w = (moved.T, w.swapaxes(0, 1)[..., ::-1]) if transpose else (moved, w)
+            if np.array_equal(moved, grey):
+                ways.add((flip_x, flip_y, transpose))
+                x, y = w[::2, ::2].transpose(2, 0, 1)
+                length = np.hypot(x, y)
+                expected = np.stack([(x * x - y * y) / length, 2 * x * y / length, length], axis=-1) / 32
+                np.testing.assert_allclose(out.blur[0], expected, atol=0.01)
+    assert len(ways) == 8
+
+
+def test_held_out_photographs_are_never_trained_on(photos):
+    train_on, kept = photographs(photos, held_out=False), photographs(photos, held_out=True)
+    assert kept and train_on
+    assert sorted(train_on + kept) == sorted(photos.iterdir())
+
+
+@pytest.fixture(scope="module")
+def pools(photos, tmp_path_factory) -> tuple[Pool, Pool]:
+    """Sixteen samples to train on, and sixteen others."""
+    folder = tmp_path_factory.mktemp("pools")
+    return tuple(
+        make_pool(
+            folder / str(held_out),
+            samples.deepgyro_samples,
+            Sources(photos=photos, motion=None, held_out=held_out),
+            16,
+            seed=5,
+            device="cpu",
+            workers=1,
+        )
+        for held_out in (False, True)
+    )
+
+
+def test_an_interrupted_training_ends_as_one_that_was_not(pools, tmp_path, monkeypatch):
+    from restoration import training
+
+    monkeypatch.setattr(training, "_KEEP_EVERY", 2)
+    options = TrainOptions(steps=4, batch=4, warm_up=1)
+    weights = []
+    for name, stops in (("whole", False), ("parts", True)):
+        torch.manual_seed(0)
+        network = RestorationNet()
+        if stops:
+            torch.manual_seed(0)
+            with pytest.raises(RuntimeError, match="power cut"), monkeypatch.context() as context:
+                loss, calls = training._loss, []
+
+                def failing(*args, loss=loss, calls=calls):
+                    calls.append(1)
+                    if len(calls) == 4:
+                        raise RuntimeError("power cut")
+                    return loss(*args)
+
+                context.setattr(training, "_loss", failing)
+                train(network, *pools, tmp_path / name, options, device="cpu")
+            network = RestorationNet()
+        figures = train(network, *pools, tmp_path / name, options, device="cpu")
+        weights.append(network.state_dict())
+        assert set(figures["held_out_psnr_db"]["4"]) == {"picture", "aid", "restored"}
+    for name, value in weights[0].items():
+        torch.testing.assert_close(value, weights[1][name], rtol=0, atol=1e-6)
+
+
+def test_what_is_exported_computes_what_was_trained(pools, tmp_path):
+    import onnxruntime
+
+    torch.manual_seed(1)
+    network = RestorationNet()
+    for parameter in network.parameters():
+        parameter.data += 0.02 * torch.randn_like(parameter)
+    export(network, tmp_path / "some.onnx")
+    session = onnxruntime.InferenceSession(str(tmp_path / "some.onnx"), providers=["CPUExecutionProvider"])
+    picture, aid = torch.rand(2, 1, 3, 64, 96)
+    blur = torch.rand(1, 3, 32, 48)
+    inputs = {"picture": picture, "aid": aid, "blur": blur}
+    (found,) = session.run(None, {name: value.numpy() for name, value in inputs.items()})
+    with torch.no_grad():
+        np.testing.assert_allclose(found, network(picture, aid, blur).numpy(), atol=2e-3)
+
+
+def test_both_networks_samples_are_of_one_kind(pools, photos):
+    rng = np.random.default_rng(0)
+    material = samples.Material.load(photos, None)
+    for maker in (samples.deepgyro_samples, samples.lsd2_samples):
+        made = maker(material, 2, rng, "cpu")
+        inner = samples.SIDE - 2 * samples.MARGIN
+        assert made.picture.shape == made.aid.shape == made.truth.shape == (2, inner, inner, 3)
+        assert made.blur.shape == (2, inner // 2, inner // 2, 3) and np.isfinite(made.blur).all()
+        assert made.truth.std() > 10
+
+
+def test_a_clock_that_is_late_shows_the_blur_of_another_time():
+    shots = drawn_shots([15.0], 8)
+    middle = torch.tensor([64.0])
+    later = replace(shots, turn_rad=shots.turned(shots.t_s + 4e-3))
+    # the exposure 4 ms later, by the motion itself
+    moved = replace(shots, t_s=shots.t_s - 4e-3)
+    still = replace(later, moved_m=0 * shots.moved_m), replace(moved, moved_m=0 * shots.moved_m)
+    torch.testing.assert_close(still[0].blur(middle, middle), still[1].blur(middle, middle), rtol=0.02, atol=0.05)
