@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import nn
 
-from restoration.network import DOWN, UP, WIDTHS, parameters
+from restoration.network import DOWN, UP, WIDTHS, RestorationNet, parameters
 
 _PURPOSE = {
     "deepgyro": "Undoes motion blur that a gyroscope knows of, with errors. Takes the blurred picture, the result of "
@@ -25,9 +24,7 @@ computed (`scripts/restoration/`).
 """
 
 
-def write_card(
-    path: Path, name: str, network: nn.Module, figures: dict[str, Any], *, samples: int, device: str
-) -> None:
+def write_card(path: Path, name: str, figures: dict[str, Any], *, samples: int, device: str) -> None:
     """Write the card of a network, Markdown.
 
     Parameters
@@ -50,7 +47,7 @@ def write_card(
 
 {_PURPOSE[name]}
 
-- Architecture: residual U-Net at half the picture's size, {parameters(network) / 1e6:.2f} million weights; {WIDTHS}
+- Architecture: residual U-Net at half the picture's size, {parameters(RestorationNet()) / 1e6:.2f} million weights; {WIDTHS}
   channels at 1/2 to 1/16, {DOWN} blocks down, {UP} up (`scripts/restoration/network.py`). Half precision on disk.
 - Training: {samples} pieces of 192 x 192 px, {options["steps"]} steps of {options["batch"]}, AdamW,
   rate {options["rate"]} along a cosine, seed {options["seed"]}; {figures["seconds"] / 60:.0f} minutes on {machine},
