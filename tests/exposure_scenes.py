@@ -151,7 +151,7 @@ def coloured_wall(height, width, seed, *, lamps=6):
     return wall.astype(np.float32)
 
 
-def make_scene(seed, *, size=(480, 320), vigour=1.0, readout_s=READOUT_S, begin_s=None, lamps=6) -> PairScene:
+def make_scene(seed, *, size=(480, 320), vigour=1.0, readout_s=READOUT_S, lamps=6) -> PairScene:
     """A pair at a moment of a handheld recording at which the long exposure is blurred."""
     width, height = size
     f = 0.78 * width
@@ -165,7 +165,7 @@ def make_scene(seed, *, size=(480, 320), vigour=1.0, readout_s=READOUT_S, begin_
     motion = make_motion(MotionOptions(kind="pure_rotation", duration_s=PairScene.motion_s, vigour=vigour), rng)
     t = np.arange(1.0, PairScene.motion_s - 1, 0.05)
     speed = np.linalg.norm(motion.rate_in_cam_rad_s(t + DELAY_S + LONG_S / 2), axis=1)
-    start = float(t[np.argmin(np.abs(speed * LONG_S * f - 14))]) if begin_s is None else begin_s
+    start = float(t[np.argmin(np.abs(speed * LONG_S * f - 14))])
     short = FrameShutter(width=width, height=height, t_s=start, exposure_s=SHORT_S, readout_s=readout_s)
     long = replace(short, t_s=start + DELAY_S, exposure_s=LONG_S)
     middle = matrix_from_quat(motion.world_from_cam_xyzw(np.array([short.reference_s()])))[0]
@@ -178,3 +178,83 @@ def make_scene(seed, *, size=(480, 320), vigour=1.0, readout_s=READOUT_S, begin_
         long=long,
         seed=seed,
     )
+
+
+def later(scene, by_s) -> PairScene:
+    """Another pair of the same recording, before the same wall, which stands where the camera then looks."""
+    short, long = (replace(shutter, t_s=shutter.t_s + by_s) for shutter in (scene.short, scene.long))
+    middle = matrix_from_quat(scene.motion.world_from_cam_xyzw(np.array([short.reference_s()])))[0]
+    return replace(scene, wall_from_world=middle.T, short=short, long=long, seed=scene.seed + round(1000 * by_s))
+
+
+TOML = """\
+[images]
+folder = "short"
+times = "frames.csv"
+
+[exposures]
+folder = "long"
+times = "long.csv"
+short_iso = 1600
+long_iso = {long_iso}
+
+[timing]
+readout_s = 0.02
+shared_clock = true
+
+[imu]
+path = "imu.csv"
+
+[calibration]
+cam_from_imu_xyzw = {rotation}
+rotation_sigma_rad = 0.002
+gyro_time_offset_s = 0.0
+accel_time_offset_s = 0.0
+time_offset_sigma_s = 0.001
+
+[camera]
+model = "OPENCV"
+width = {width}
+height = {height}
+params = {params}
+pixel_origin = "corner"
+"""
+
+
+def write_pair_capture(folder, seed=3, *, pairs=3, size=(240, 160), suffix=".png") -> list[PairScene]:
+    """A capture of pairs with its gyroscope and accelerometer, all declared."""
+    first = make_scene(seed, size=size)
+    scenes = [first] + [later(first, 0.3 * (i + 1)) for i in range(pairs - 1)]
+    (folder / "short").mkdir(parents=True)
+    (folder / "long").mkdir()
+    tables = {"frames": ["name,t_s,exposure_s"], "long": ["name,t_s,exposure_s"]}
+    for i, scene in enumerate(scenes):
+        name = f"{i:03d}"
+        cv2.imwrite(str(folder / "short" / f"{name}.png"), scene.short_codes()[..., ::-1])
+        cv2.imwrite(str(folder / "long" / f"{name}{suffix}"), scene.long_codes()[..., ::-1])
+        tables["frames"].append(f"{name}.png,{scene.short.t_s:.6f},{SHORT_S}")
+        tables["long"].append(f"{name}{suffix},{scene.long.t_s:.6f},{LONG_S}")
+    for kind, rows in tables.items():
+        (folder / f"{kind}.csv").write_text("\n".join(rows) + "\n")
+    t = np.arange(0.0, PairScene.motion_s, 1 / 400)
+    imu_from_cam = matrix_from_quat(CAM_FROM_IMU).T
+    gyro = first.motion.rate_in_cam_rad_s(t) @ imu_from_cam.T
+    world_from_cam = matrix_from_quat(first.motion.world_from_cam_xyzw(t))
+    accel = np.einsum("ij,nkj,k->ni", imu_from_cam, np.swapaxes(world_from_cam, 1, 2), [0, 0, 9.81])
+    lines = ["t [s],gx [rad/s],gy [rad/s],gz [rad/s],ax [m/s2],ay [m/s2],az [m/s2]"]
+    lines += [",".join(f"{v:.7f}" for v in (s, *g, *a)) for s, g, a in zip(t, gyro, accel, strict=True)]
+    (folder / "imu.csv").write_text("\n".join(lines) + "\n")
+    text = TOML.format(
+        long_iso=1600 * GAIN * SHORT_S / LONG_S,
+        rotation=[float(v) for v in CAM_FROM_IMU],
+        width=size[0],
+        height=size[1],
+        params=[float(v) for v in first.camera.params],
+    )
+    (folder / "capture.toml").write_text(text)
+    return scenes
+
+
+def psnr_db(a, b) -> float:
+    """Of two pictures in codes of 8 bit."""
+    return float(10 * np.log10(255**2 / np.mean((a.astype(float) - b.astype(float)) ** 2)))

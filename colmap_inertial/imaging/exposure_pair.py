@@ -351,7 +351,8 @@ def _channel_gain(short: Codes, long: Codes, cell: int) -> float | None:
     good &= blackness <= max(_MOST_BLACK, min(ranked[-1], _BLACKEST) if len(ranked) else 0.0)
     if np.count_nonzero(good) < _LEAST_CELLS:
         return None
-    return float(np.exp(_weighted_median(np.log(bright[good] / dark[good]), bright[good])))
+    # by the light of both: that of one alone would prefer squares in which a shift between them makes it the brighter
+    return float(np.exp(_weighted_median(np.log(bright[good] / dark[good]), np.sqrt(bright[good] * dark[good]))))
 
 
 def _weighted_median(values: Array, weights: Array) -> float:
