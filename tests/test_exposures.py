@@ -1,0 +1,261 @@
+"""Short and long exposures brought together, against pairs whose gain, geometry and blur are known."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from exposure_scenes import COLOURS, GAIN, STEP_PX, codes, make_scene, psnr_db
+
+from colmap_inertial.errors import NotObservableError
+from colmap_inertial.imaging._transfer import linear_from_srgb
+from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.imaging.exposure_fusion import fuse_mertens
+from colmap_inertial.imaging.exposure_pair import (
+    PairGyro,
+    blur_seen_from_short,
+    brightened,
+    bring_together,
+    gyro_shift,
+    match_brightness,
+)
+from colmap_inertial.imaging.psf import blur_field
+from colmap_inertial.model import colmap_camera
+
+
+@pytest.fixture(scope="module", params=[0, 5, 8])
+def scene(request):
+    return make_scene(request.param)
+
+
+@pytest.fixture(scope="module")
+def pair(scene):
+    return scene.short_codes(), scene.long_codes()
+
+
+def nodes_of(scene):
+    rows, columns = BlurField.nodes(scene.camera.width, scene.camera.height)
+    grid = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1)
+    return STEP_PX * grid.reshape(-1, 2) + 0.5
+
+
+def gyro_of(scene, *, offset_s=0.0, camera=None):
+    camera = camera or colmap_camera(scene.camera)
+    return PairGyro(motion=scene.gyro(offset_s=offset_s), camera=camera, short=scene.short, long=scene.long)
+
+
+def errors_px(scene, found):
+    """Distances of a shift from the truth, where the long exposure has the point."""
+    nodes = nodes_of(scene)
+    true = scene.true_shift(nodes)
+    seen = ((nodes + true > 0) & (nodes + true < [scene.camera.width, scene.camera.height])).all(axis=1)
+    return np.linalg.norm(found.reshape(-1, 2) - true, axis=1)[seen]
+
+
+def test_the_gain_is_found_from_noisy_and_blurred_pictures(pair):
+    found = match_brightness(*pair)
+    # before they are aligned
+    assert found.gain == pytest.approx(GAIN, rel=0.05) and found.stated is None
+    assert found.colours == pytest.approx(COLOURS, rel=0.04)
+
+
+def test_what_is_stated_counts_while_the_pixels_bear_it_out(pair):
+    stated = match_brightness(*pair, stated=1.1 * GAIN)
+    assert stated.gain == 1.1 * GAIN and not stated.contradicts
+    wrong = match_brightness(*pair, stated=2 * GAIN)
+    assert wrong.gain == wrong.measured and wrong.contradicts and wrong.stated == 2 * GAIN
+
+
+def test_lamps_and_darkness_do_not_sway_the_gain():
+    rng = np.random.default_rng(1)
+    light = cv2.resize(
+        rng.uniform(0.02, 0.5, (12, 16, 3)).astype(np.float32), (480, 320), interpolation=cv2.INTER_CUBIC
+    )
+    light[:, :200] = 0.0
+    light[40:120, 300:400] = 30.0
+    noise = 0.001 * rng.standard_normal(light.shape)
+    found = match_brightness(codes(light / 15 + noise), codes(light))
+    assert found.gain == pytest.approx(15, rel=0.02)
+    assert found.colours == pytest.approx((1, 1, 1), rel=0.02)
+
+
+def test_colours_differ_within_limits_only():
+    rng = np.random.default_rng(2)
+    light = cv2.resize(
+        rng.uniform(0.05, 0.5, (12, 16, 3)).astype(np.float32), (480, 320), interpolation=cv2.INTER_CUBIC
+    )
+    found = match_brightness(codes(light / [10, 10, 60]), codes(light))
+    assert found.gain == pytest.approx(10, rel=0.02)
+    assert found.colours == pytest.approx((1, 1, 2), rel=0.02)
+
+
+def test_a_gain_that_nothing_tells_is_refused():
+    black, white = np.zeros((64, 96, 3), np.uint8), np.full((64, 96, 3), 255, np.uint8)
+    with pytest.raises(NotObservableError, match="give the exposure times"):
+        match_brightness(black, white)
+    assert match_brightness(black, white, stated=7.0).gain == 7.0
+    with pytest.raises(ValueError, match="shape"):
+        match_brightness(black, white[:32])
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_brightening_multiplies_linear_light(dtype):
+    short = np.random.default_rng(3).integers(0, np.iinfo(dtype).max, (20, 30, 3)).astype(dtype)
+    brightness = replace(match_brightness(short, short, stated=3.0), gain=3.0, colours=(1.0, 0.5, 1.2))
+    found = brightened(short, brightness)
+    light = linear_from_srgb(short / np.iinfo(dtype).max) * 3.0 * np.array([1.0, 0.5, 1.2])
+    assert found.dtype == np.float32
+    assert np.allclose(linear_from_srgb(found.astype(float)), np.minimum(light, 1), atol=1e-5)
+
+
+def test_the_gyroscope_tells_where_the_long_exposure_shows_what_the_short_one_does(scene):
+    gyro = gyro_of(scene)
+    found = gyro_shift(gyro.motion, gyro.camera, gyro.short, gyro.long)
+    true = scene.true_shift(nodes_of(scene))
+    assert np.median(np.linalg.norm(true, axis=1)) > 8
+    assert np.linalg.norm(found.reshape(-1, 2) - true, axis=1).max() < 0.1
+
+
+def test_a_global_shutter_shifts_by_one_rotation():
+    scene = make_scene(2, readout_s=0.0)
+    gyro = gyro_of(scene)
+    found = gyro_shift(gyro.motion, gyro.camera, gyro.short, gyro.long)
+    assert errors_px(scene, found).max() < 0.1
+
+
+def test_the_long_exposure_s_blur_is_known_in_the_short_one_s_geometry(scene):
+    gyro = gyro_of(scene)
+    shift = gyro_shift(gyro.motion, gyro.camera, gyro.short, gyro.long)
+    own = blur_field(gyro.motion, gyro.camera, gyro.long)
+    nodes, true = nodes_of(scene), scene.true_blur(nodes_of(scene))
+    inside = ((nodes + shift.reshape(-1, 2)) > 0).all(axis=1)
+    inside &= (nodes + shift.reshape(-1, 2) < [scene.camera.width, scene.camera.height]).all(axis=1)
+
+    def off(field):
+        found = field.vector_px.reshape(-1, 2)
+        return np.minimum(*(np.linalg.norm(found - sign * true, axis=1) for sign in (1, -1)))[inside]
+
+    assert np.median(np.linalg.norm(true, axis=1)) > 10
+    assert np.median(off(blur_seen_from_short(own, shift))) < 0.05
+    assert off(blur_seen_from_short(own, shift)).max() < 0.5
+    assert np.median(off(own)) > 3 * np.median(off(blur_seen_from_short(own, shift)))
+
+
+def test_a_blur_turns_with_the_picture():
+    own = BlurField.uniform(320, 240, (10.0, 0.0))
+    rows, columns = own.vector_px.shape[:2]
+    nodes = 16.0 * np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1)
+    angle = 0.2
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    seen = blur_seen_from_short(own, nodes @ (1.1 * turn).T - nodes)
+    assert np.allclose(seen.vector_px, [10 * np.cos(angle) / 1.1, -10 * np.sin(angle) / 1.1], atol=1e-4)
+
+
+def test_pairs_come_together_by_a_good_gyroscope_alone(scene, pair):
+    together = bring_together(*pair, gyro=gyro_of(scene))
+    registered = together.registered
+    assert registered.by_gyro and registered.alike and not together.gyro_note
+    assert np.median(errors_px(scene, registered.shift_px)) < 0.1
+    assert registered.agreement > registered.untouched + 0.3
+    assert together.blur is not None
+    assert np.percentile(together.blur.extent_px(), 90) == pytest.approx(
+        np.percentile(np.linalg.norm(scene.true_blur(nodes_of(scene)), axis=1), 90), rel=0.03
+    )
+    assert together.brightness.gain == pytest.approx(GAIN, rel=0.01)
+    assert together.brightness.colours == pytest.approx(COLOURS, rel=0.01)
+
+
+def test_pixels_mend_what_the_gyroscope_s_clock_does_wrong(scene, pair):
+    late = gyro_of(scene, offset_s=0.01)
+    before = errors_px(scene, gyro_shift(late.motion, late.camera, late.short, late.long))
+    together = bring_together(*pair, gyro=late)
+    assert together.registered.by_gyro and together.registered.by_pixels and together.blur is not None
+    assert np.median(errors_px(scene, together.registered.shift_px)) < min(0.6, 0.5 * np.median(before))
+
+
+def test_pixels_alone_bring_pairs_together(scene, pair):
+    together = bring_together(*pair)
+    assert together.registered.by_pixels and not together.registered.by_gyro and together.blur is None
+    # half the blur's unevenness through time: its centre is not mid-exposure
+    assert np.median(errors_px(scene, together.registered.shift_px)) < 1.0
+    assert together.gyro_note == "no gyroscope"
+
+
+def test_a_gyroscope_of_another_recording_is_left_out(scene, pair):
+    other = gyro_of(make_scene(77))
+    wrong = PairGyro(motion=other.motion, camera=other.camera, short=scene.short, long=scene.long)
+    together = bring_together(*pair, gyro=wrong)
+    assert not together.registered.by_gyro and together.blur is None
+    assert "do not bear out" in together.gyro_note
+    assert np.median(errors_px(scene, together.registered.shift_px)) < 1.0
+
+
+def test_an_unrecorded_exposure_leaves_the_pixels(scene, pair):
+    gone = replace(gyro_of(scene), long=replace(scene.long, t_s=scene.motion_s + 5))
+    together = bring_together(*pair, gyro=gone)
+    assert "does not cover" in together.gyro_note and together.registered.by_pixels and together.blur is None
+
+
+def test_the_aligned_long_exposure_agrees_with_its_true_picture(scene, pair):
+    together = bring_together(*pair, gyro=gyro_of(scene))
+    sharp = scene.sharp()
+    inner = (slice(20, -20), slice(20, -20))
+    good = together.covered[inner] & ~together.clipped[inner]
+    blurred = cv2.GaussianBlur(sharp, (0, 0), 4)[inner][good]
+    aligned, as_it_is = (255 * together.long)[inner][good], pair[1][inner][good]
+    assert psnr_db(aligned, blurred) > psnr_db(as_it_is, blurred) + 2
+    assert together.short.shape == together.long.shape == sharp.shape
+    assert together.short.dtype == together.long.dtype == np.float32
+    # what the long exposure does not cover is the short one's
+    assert np.array_equal(together.long[~together.covered], together.short[~together.covered])
+    assert 0.005 < (~together.covered).mean() < 0.3
+    # lamps
+    assert 0 < together.clipped.mean() < 0.1
+    assert np.median(together.long[together.clipped].max(axis=1)) > 0.98
+
+
+def test_grey_pictures_of_16_bit_come_together_too():
+    scene = make_scene(5)
+    short, long = (picture[..., 1] for picture in (scene.short_codes(dtype=np.uint16), scene.long_codes(np.uint16)))
+    together = bring_together(short, long, gyro=gyro_of(scene))
+    assert together.short.shape == together.long.shape == short.shape
+    assert together.brightness.gain == pytest.approx(GAIN, rel=0.02) and len(together.brightness.colours) == 1
+    assert np.median(errors_px(scene, together.registered.shift_px)) < 0.1
+
+
+def test_pictures_that_agree_already_are_not_moved():
+    scene = make_scene(5)
+    sharp = scene.sharp()
+    short = codes(linear_from_srgb(sharp / 255) / 8 + 0.001 * np.random.default_rng(4).standard_normal(sharp.shape))
+    together = bring_together(short, sharp)
+    assert not together.registered.by_pixels and not together.registered.by_gyro
+    assert not together.registered.shift_px.any() and together.covered.all()
+
+
+def test_pictures_of_different_views_are_told(scene, pair):
+    other = make_scene(31)
+    together = bring_together(pair[0], other.long_codes())
+    assert not together.registered.alike
+    # a wall without any detail contradicts nothing
+    rng = np.random.default_rng(5)
+    flat = np.full((120, 160, 3), 0.3)
+    assert bring_together(
+        codes(flat / 10 + 0.002 * rng.standard_normal(flat.shape)),
+        codes(flat + 0.001 * rng.standard_normal(flat.shape)),
+    ).registered.alike
+
+
+def test_exposure_fusion_is_opencv_s_and_brings_lamps_back():
+    rng = np.random.default_rng(6)
+    light = np.full((120, 160, 3), 0.2, np.float32) * rng.uniform(0.5, 1.0, (120, 160, 1)).astype(np.float32)
+    light[30:60, 40:80] = 2.0 + 3.0 * rng.uniform(size=(30, 40, 1))
+    short, long = codes(light / 8), codes(light)
+    found = fuse_mertens([short.astype(np.float32) / 255, long.astype(np.float32) / 255])
+    theirs = cv2.createMergeMertens(1.0, 1.0, 1.0).process([short, long])
+    assert np.abs(found - np.clip(theirs, 0, 1)).max() < 1e-5
+    assert long[30:60, 40:80].std() == 0 and found[34:56, 44:76].std() > 0.02
+    assert fuse_mertens([found[..., 0], found[..., 1]]).shape == (120, 160)
+    with pytest.raises(ValueError, match="two or more"):
+        fuse_mertens([found])
+    with pytest.raises(ValueError, match="one shape"):
+        fuse_mertens([found, found[:50]])
