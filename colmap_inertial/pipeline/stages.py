@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
@@ -156,6 +156,8 @@ class DeblurStage:
     _done: dict[str, FrameTreatment] = field(default_factory=dict, init=False, compare=False, repr=False)
 
     def __post_init__(self) -> None:
+        if self.method not in get_args(BlurRemover):
+            raise ValueError(f"method: wiener or deepgyro, not {self.method}")
         if self.method == "deepgyro":
             object.__setattr__(self, "weights", checksum("deepgyro"))
 

@@ -1,0 +1,187 @@
+"""Frames restored by a network in the pipeline: chosen by name, said in the result, never mixed with other frames."""
+
+import json
+import sys
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import small_networks as small
+from corner_scene import CALIBRATED, LENS, CornerScene
+from test_pipeline import contents
+from test_pipeline_imaging import QUICK, parts
+
+from colmap_inertial.cli import main
+from colmap_inertial.errors import FormatError, MissingExtraError, NotObservableError
+from colmap_inertial.imaging.restoration import shipped
+from colmap_inertial.io.frames import read_frames
+from colmap_inertial.pipeline import DeblurStage, imaging, reconstruct, silent
+from colmap_inertial.pipeline.deblur import deblur_capture
+from colmap_inertial.pipeline.frames import read_frame_records
+from colmap_inertial.pipeline.imaging import plan_imaging, read_plan, write_plan
+from colmap_inertial.pipeline.workspace import canonical
+from colmap_inertial.report.content import _blur
+
+DEEP = replace(QUICK, deblur="deepgyro")
+
+
+@pytest.fixture(scope="module")
+def blurred(tmp_path_factory):
+    """Pictures without loss, so that every pixel can be compared."""
+    scene = CornerScene.make(exposure_s=0.03, readout_s=0.0, frames=12)
+    return scene.write(tmp_path_factory.mktemp("blurred") / "capture", extra=CALIBRATED, suffix=".png")
+
+
+@pytest.fixture
+def weights(tmp_path, monkeypatch):
+    """A network in place of the package's that takes what lies halfway between the picture and the filter's result."""
+    folder = tmp_path / "weights"
+    small.write_weights(folder, deepgyro=small.mixing(0.5))
+    monkeypatch.setattr(shipped, "folder", lambda: folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def by_filter(tmp_path_factory, blurred):
+    out = tmp_path_factory.mktemp("by_filter") / "out"
+    return deblur_capture(blurred, out, progress=silent)
+
+
+def pictures(folder):
+    return {path.name: cv2.imread(str(path)).astype(int) for path in sorted(folder.iterdir())}
+
+
+def test_the_network_treats_the_frames_that_the_filter_would_and_the_result_says_so(
+    tmp_path, blurred, by_filter, weights, capsys
+):
+    sheet = tmp_path / "sheet.png"
+    with pytest.raises(SystemExit) as stopped:
+        main(["deblur", str(blurred), str(tmp_path / "out"), "--method", "deepgyro", "--sheet", str(sheet)])
+    assert stopped.value.code == 0 and "DeepGyro" in capsys.readouterr().out
+    stored = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert stored["imaging"]["deblur_method"] == "deepgyro"
+    assert "the network DeepGyro undoes it" in stored["imaging"]["deblur"]
+    before = json.loads(by_filter.workspace.result.read_text())
+    assert before["imaging"]["deblur_method"] == "wiener" and "DeepGyro" not in before["imaging"]["deblur"]
+    for new, old in zip(stored["frames"], before["frames"], strict=True):
+        assert (new["name"], new["action"]) == (old["name"], old["action"])
+        assert new["blur_px"] == pytest.approx(old["blur_px"], rel=0.02)  # small models are not the same twice
+    filmed, filtered, made = map(
+        pictures, (blurred / "frames", by_filter.workspace.images, tmp_path / "out" / "images")
+    )
+    deblurred = {frame["name"] for frame in stored["frames"] if frame["action"] == "deblurred"}
+    assert len(deblurred) >= 6
+    for name in filmed:
+        if name in deblurred:
+            # small models of treated frames tell of the translation: the blur is not quite the same
+            assert np.abs(made[name] - (filmed[name] + filtered[name]) / 2).mean() < 1
+            assert np.abs(made[name] - filmed[name]).max() > 20
+        else:
+            np.testing.assert_array_equal(made[name], filmed[name])
+    assert cv2.imread(str(sheet)).shape[1] > 2 * LENS.width
+
+
+def test_the_report_says_which_network_it_was(blurred, weights, tmp_path):
+    result = deblur_capture(blurred, tmp_path / "out", method="deepgyro", progress=silent)
+    done = json.loads(result.workspace.result.read_text())
+    frames = {"names": [frame["name"] for frame in done["frames"]], "t_s": list(range(len(done["frames"])))}
+    assert "DeepGyro" in str(_blur(done, {"frames": frames}, project=False)["note"])
+
+
+def stop_at_features(stage, done, total, /):
+    if stage == "features":
+        raise KeyboardInterrupt
+
+
+def test_a_resumed_run_does_not_mix_methods_or_networks(tmp_path, blurred, weights):
+    out = tmp_path / "out"
+
+    def images(options):
+        with pytest.raises(KeyboardInterrupt):
+            reconstruct(blurred, out, options, progress=stop_at_features)
+        return contents(out / "images")
+
+    def log():
+        return (out / "log.txt").read_text()
+
+    deep = images(DEEP)
+    assert images(DEEP) == deep and log().count("frames: finished in an earlier run") == 1
+    small.write_weights(weights, deepgyro=small.mixing(0.9))
+    trained = images(DEEP)
+    treated = {record.name for record in read_frame_records(out / "frames.json") if record.action == "deblurred"}
+    assert len(treated) >= 6 and {name for name in deep if deep[name] != trained[name]} == treated
+    by_filter = images(QUICK)
+    assert {name for name in deep if trained[name] != by_filter[name]} >= treated
+    assert log().count("frames: finished in an earlier run") == 1
+
+
+def test_a_stage_s_key_holds_method_and_network(blurred, weights, tmp_path):
+    plan = plan_imaging(*parts(blurred), deblur="deepgyro", rolling_shutter=None, scratch=tmp_path, progress=silent)
+    (stage,) = plan.frame_stages()
+    assert isinstance(stage, DeblurStage) and stage.weights == shipped.checksum("deepgyro")
+    by_filter = replace(stage, method="wiener")
+    assert by_filter.weights == "" and canonical(by_filter) != canonical(stage)
+    small.write_weights(weights, deepgyro=small.mixing(0.1))
+    assert canonical(replace(stage)) != canonical(stage)
+    with pytest.raises(ValueError, match="method"):
+        replace(stage, method="deepgiro")
+    # the plan of an earlier run says which
+    _, imu, timing, _ = parts(blurred)
+    write_plan(tmp_path / "plan.json", plan)
+    again = read_plan(tmp_path / "plan.json", imu, timing)
+    assert again.method == "deepgyro" and again.frame_stages()[0].method == "deepgyro"
+
+
+def test_workers_share_the_network_and_make_the_same_pixels(blurred, weights, tmp_path):
+    plan = plan_imaging(*parts(blurred), deblur="deepgyro", rolling_shutter=None, scratch=tmp_path, progress=silent)
+    (stage,) = plan.frame_stages()
+    loaded, *_ = parts(blurred)
+    one, three, filtered, filmed = (
+        [frame.image for frame in frames]
+        for frames in (
+            replace(stage, workers=1)(read_frames(loaded)[1]),
+            replace(stage, workers=3)(read_frames(loaded)[1]),
+            replace(stage, method="wiener")(read_frames(loaded)[1]),
+            read_frames(loaded)[1],
+        )
+    )
+    np.testing.assert_array_equal(one, three)
+    # half of whole codes; blur of half a pixel to a pixel fades out in both, and what was sharp stays
+    halfway = (np.array(filmed, np.float32) + np.array(filtered, np.float32)) / 2
+    off = np.abs(np.array(one) - halfway)
+    assert np.mean(off > 1) < 0.01 and np.abs(np.array(filmed) - halfway).max() > 20
+
+
+@pytest.mark.parametrize("lacking", ["onnxruntime", "network"])
+def test_what_is_missing_is_told_before_any_work(tmp_path, blurred, weights, lacking, monkeypatch, capsys):
+    if lacking == "onnxruntime":
+        monkeypatch.setitem(sys.modules, "onnxruntime", None)
+        error, words = MissingExtraError, "pip install 'colmap-inertial[restore]'"
+    else:
+        (weights / "deepgyro.onnx").unlink()
+        error, words = FormatError, "deepgyro.onnx: is missing"
+    out = tmp_path / "out"
+    with pytest.raises(error):
+        reconstruct(blurred, out, DEEP)
+    for args in (["deblur", "--method", "deepgyro"], ["reconstruct", "--deblur", "deepgyro"]):
+        with pytest.raises(SystemExit) as stopped:
+            main([args[0], str(blurred), str(out), *args[1:]])
+        assert stopped.value.code == 2 and words in " ".join(capsys.readouterr().err.split())
+    assert not out.exists()
+    # nobody else needs it
+    assert plan_imaging(*parts(blurred), deblur="wiener", rolling_shutter=None, scratch=tmp_path, progress=silent)
+
+
+@pytest.mark.parametrize("method", ["wiener", "deepgyro"])
+def test_asked_for_by_name_it_is_an_error_where_gyroscope_and_pixels_do_not_agree(
+    tmp_path, blurred, weights, method, monkeypatch
+):
+    def fails(*args, **kwargs):
+        raise NotObservableError("time offset", "so")
+
+    monkeypatch.setattr(imaging, "look_first", fails)
+    with pytest.raises(NotObservableError):
+        plan_imaging(*parts(blurred), deblur=method, rolling_shutter=None, scratch=tmp_path, progress=silent)
+    plan = plan_imaging(*parts(blurred), deblur=None, rolling_shutter=None, scratch=tmp_path, progress=silent)
+    assert plan.frame_stages() == [] and plan.as_json()["deblur_method"] is None
