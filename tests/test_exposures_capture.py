@@ -3,16 +3,20 @@
 import json
 import struct
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import small_networks as small
 from exposure_scenes import GAIN, LONG_S, SHORT_S, psnr_db, write_pair_capture
+from jsonschema import Draft202012Validator
 from test_pipeline import contents
 
 from colmap_inertial import pipeline
 from colmap_inertial.cli import main
 from colmap_inertial.errors import FormatError, InertialError, MissingExtraError, OutputExistsError, TimingError
+from colmap_inertial.imaging.restoration import shipped
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.frames import read_frame_timing, read_frames
 from colmap_inertial.options import ExposureOptions, ReconstructOptions
@@ -20,6 +24,8 @@ from colmap_inertial.pipeline import fuse_exposures, reconstruct, silent
 from colmap_inertial.pipeline.exposures import ExposureStage, Fuser
 from colmap_inertial.pipeline.frames import ExplainedStage
 from colmap_inertial.pipeline.fuse_exposures import fuse_exposures_captured
+
+DOCS = Path(__file__).parents[1] / "docs"
 
 
 def average(short, long, blur):
@@ -202,6 +208,11 @@ def test_pairs_become_pictures_of_the_short_ones_names(written, tmp_path):
     result = json.loads((tmp_path / "out" / "result.json").read_text())
     assert result["fuser"] == "average" and "aligned by the gyroscope and the pixels" in result["note"]
     assert [frame["name"] for frame in result["frames"]] == ["000.png", "001.png", "002.png"]
+    form = json.loads((DOCS / "schemas" / "exposures.schema.json").read_text())
+    Draft202012Validator.check_schema(form)
+    assert [error.message for error in Draft202012Validator(form).iter_errors(result)] == []
+    page = (DOCS / "results.md").read_text()
+    assert [key for key in form["properties"]["frames"]["items"]["properties"] if f"`{key}`" not in page] == []
     with pytest.raises(OutputExistsError):
         fuse_exposures_captured(folder, tmp_path / "out", fuser=AVERAGE, progress=silent)
 
@@ -379,6 +390,17 @@ def test_a_missing_partner_or_network_is_said_before_the_work(capture, tmp_path,
         main(["reconstruct", str(capture), str(tmp_path / "out")])
     assert "the long exposure of 001.png is missing" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_the_package_s_network_is_used_and_named(capture, tmp_path, monkeypatch):
+    small.write_weights(tmp_path / "weights", lsd2=small.mixing(0.5))
+    monkeypatch.setattr(shipped, "folder", lambda: tmp_path / "weights")
+    fuse_exposures_captured(capture, tmp_path / "net", ExposureOptions(device="cpu"), progress=silent)
+    fuse_exposures_captured(capture, tmp_path / "mean", fuser=AVERAGE, progress=silent)
+    for name in ("000.png", "001.png"):
+        two = [read(tmp_path / out / "images" / name).astype(int) for out in ("net", "mean")]
+        assert np.abs(two[0] - two[1]).max() <= 1
+    assert json.loads((tmp_path / "net" / "result.json").read_text())["fuser"] == f"lsd2 {shipped.checksum('lsd2')}"
 
 
 def test_the_command_fuses_and_says_what_it_did(capture, tmp_path, by_average, capsys):
