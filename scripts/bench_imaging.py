@@ -39,7 +39,17 @@ import imaging_metrics as metrics
 import imaging_shutter
 import numpy as np
 from imaging_metrics import Features, correct_matches, extract, psnr_db, repeatability, ssim
-from imaging_scenes import Grey, Light, Pair, drawn_walls, make_pairs, native_walls, photographed_walls
+from imaging_scenes import (
+    Colour,
+    Grey,
+    Light,
+    Pair,
+    drawn_walls,
+    make_pairs,
+    native_walls,
+    photographed_walls,
+    photographs,
+)
 from imaging_tables import print_report
 from rich.console import Console
 from rich.progress import track
@@ -91,8 +101,9 @@ def main() -> None:
     walls = drawn_walls(scenes, args.seed)
     kinds: dict[str, tuple[list[Light], tuple[int, int] | None]] = {"drawn": (walls, SIZE)}
     if args.photos is not None:
-        walls = photographed_walls(args.photos, scenes, args.seed)
-        native = native_walls(args.photos, scenes, args.seed)
+        pictures = photographs(args.photos)
+        walls = photographed_walls(pictures, scenes, args.seed)
+        native = native_walls(pictures, scenes, args.seed)
         kinds = {"photographs": (walls, SIZE), "whole photographs": (native, None)}
     sections: dict[str, Callable[[], Any]] = {
         "quality": lambda: {
@@ -142,19 +153,19 @@ def flat(pairs: Sequence[Sequence[T]]) -> list[T]:
     return [one for pair in pairs for one in pair]
 
 
-def features_of(images: Sequence[Grey]) -> list[Features]:
+def features_of(images: Sequence[Grey | Colour]) -> list[Features]:
     """Of a few images, two at a time."""
     with ThreadPoolExecutor(2) as pool:
         return list(pool.map(extract, images))
 
 
-def verdict_on(frames: Sequence[Grey], blurs: Sequence[BlurField]) -> RecordingVerdict:
+def verdict_on(frames: Sequence[Grey | Colour], blurs: Sequence[BlurField]) -> RecordingVerdict:
     """What the most blurred frames of a recording say of its gyroscope."""
     order = sorted(range(len(frames)), key=lambda i: -float(np.percentile(blurs[i].extent_px(), 90)))[:JUDGED]
     return judge_recording(blur_evidence(frames[i], blurs[i]) for i in order)
 
 
-def measured(pair: Pair, images: Sequence[Grey], sharp: Sequence[Grey]) -> dict[str, float]:
+def measured(pair: Pair, images: Sequence[Grey | Colour], sharp: Sequence[Grey | Colour]) -> dict[str, float]:
     """Every figure of one pair of frames."""
     features = features_of(images)
     correct, found = correct_matches(pair, *features)
@@ -243,7 +254,7 @@ def false_blur(pairs: Sequence[Pair]) -> dict[str, Any]:
         fields = [[pair.blur(i, error) for i in (0, 1)] for pair in pairs]
         verdict = verdict_on(flat(frames), flat(fields))
         out[error or "none"] = kept_share(pairs, frames, fields, verdict, before)
-    short = [_sharp_pair(pair) for pair in pairs]
+    short = [with_short_exposure(pair) for pair in pairs]
     frames = [[pair.frame(i) for i in (0, 1)] for pair in short]
     before = [correct_matches(pair, *features_of(two))[0] for pair, two in zip(short, frames, strict=True)]
     fields = [[pair.blur(i) for i in (0, 1)] for pair in pairs]
@@ -253,7 +264,7 @@ def false_blur(pairs: Sequence[Pair]) -> dict[str, Any]:
     return out
 
 
-def _sharp_pair(pair: Pair) -> Pair:
+def with_short_exposure(pair: Pair) -> Pair:
     """The same frames with a short exposure; mid-exposures stay."""
     shutters = tuple(
         replace(s, exposure_s=SHARP_S, t_s=s.t_s + 0.5 * ((s.exposure_s or 0.0) - SHARP_S)) for s in pair.shutters

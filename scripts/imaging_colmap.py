@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -30,16 +31,12 @@ WAYS = {
 
 def measure(*, quick: bool, console: Console) -> dict[str, Any]:
     """A lively desk with 10 px of blur and 20 ms readout, and one with so much blur that frames are lost."""
-    duration_s = 6.0 if quick else 12.0
-    motion = MotionOptions(kind="orbit", duration_s=duration_s, vigour=0.8, sweep_s=16.0, arc_deg=130.0)
-    base = SceneRecipe(seed=4, frame_rate_hz=2.5, quality=95, motion=motion)
-    base = replace(base, camera=replace(base.camera, readout_s=0.02, white_electrons=10000.0))
+    base = lively_desk(quick=quick)
     scenes = {"10 px": (base, 10.0), "heavy blur": (replace(base, seed=5), 19.0)}
     out = {}
     for name, (recipe, blur_px) in scenes.items():
-        exposed = with_blur(recipe, blur_px)
-        with tempfile.TemporaryDirectory() as folder, console.status(f"COLMAP, {name}"):
-            out[name] = _scene(exposed, Path(folder), blur_px)
+        with console.status(f"COLMAP, {name}"):
+            out[name] = reconstructed(recipe, blur_px, WAYS)
     mild, heavy = out["10 px"]["ways"], out["heavy blur"]["ways"]
     before, after = mild["as filmed"], mild["deblurred and rectified"]
     out["10 px"]["wanted"] = [
@@ -52,6 +49,14 @@ def measure(*, quick: bool, console: Console) -> dict[str, Any]:
         ("share registered, treated", heavy["deblurred and rectified"]["registered"] / count, 1.0, True),
     ]
     return out
+
+
+def lively_desk(*, quick: bool) -> SceneRecipe:
+    """A desk around which a handheld camera with 20 ms readout goes; exposure times are for `with_blur` to find."""
+    duration_s = 6.0 if quick else 12.0
+    motion = MotionOptions(kind="orbit", duration_s=duration_s, vigour=0.8, sweep_s=16.0, arc_deg=130.0)
+    base = SceneRecipe(seed=4, frame_rate_hz=2.5, quality=95, motion=motion)
+    return replace(base, camera=replace(base.camera, readout_s=0.02, white_electrons=10000.0))
 
 
 def with_blur(recipe: SceneRecipe, blur_px: float) -> SceneRecipe:
@@ -75,18 +80,22 @@ def with_blur(recipe: SceneRecipe, blur_px: float) -> SceneRecipe:
     return replace(recipe, camera=replace(recipe.camera, exposure_s=round(exposure_s, 5)))
 
 
-def _scene(recipe: SceneRecipe, folder: Path, blur_px: float) -> dict[str, Any]:
-    capture = write_capture(recipe, folder / "capture", workers=2)
-    truth = read_truth(folder / "capture" / "truth.json").trajectory
-    return {
-        "images": len(truth.names),
-        "blur_px": blur_px,
-        "exposure_s": recipe.camera.exposure_s,
-        "readout_s": recipe.camera.readout_s,
-        "ways": {
-            name: _run(capture, folder / str(i), options, truth) for i, (name, options) in enumerate(WAYS.items())
-        },
-    }
+def reconstructed(recipe: SceneRecipe, blur_px: float, ways: Mapping[str, ReconstructOptions]) -> dict[str, Any]:
+    """A scene with this blur, reconstructed in several ways."""
+    recipe = with_blur(recipe, blur_px)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        capture = write_capture(recipe, folder / "capture", workers=2)
+        truth = read_truth(folder / "capture" / "truth.json").trajectory
+        return {
+            "images": len(truth.names),
+            "blur_px": blur_px,
+            "exposure_s": recipe.camera.exposure_s,
+            "readout_s": recipe.camera.readout_s,
+            "ways": {
+                way: _run(capture, folder / str(i), options, truth) for i, (way, options) in enumerate(ways.items())
+            },
+        }
 
 
 def _run(capture: Path, out: Path, options: ReconstructOptions, truth: CameraTrajectory) -> dict[str, Any]:

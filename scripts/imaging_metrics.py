@@ -17,7 +17,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from imaging_scenes import Grey, Pair
+from imaging_scenes import Colour, Grey, Pair
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -63,8 +63,10 @@ def _extractor(first_octave: int) -> Any:
         return pycolmap.Sift(options, pycolmap.Device.cpu)
 
 
-def extract(image: Grey, first_octave: int | None = None) -> Features:
-    """COLMAP's SIFT at its defaults, but for the first octave (`set_first_octave`)."""
+def extract(image: Grey | Colour, first_octave: int | None = None) -> Features:
+    """COLMAP's SIFT at its defaults, but for the first octave (`set_first_octave`); of pictures in colour, of grey."""
+    if image.ndim == 3:
+        image = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
     keypoints, descriptors = _extractor(_first_octave if first_octave is None else first_octave).extract(image)
     points = np.asarray(keypoints[:, :2], dtype=np.float64)
     size = np.array(image.shape[::-1])
@@ -123,13 +125,13 @@ def repeatability(pair: Pair, a: Features, b: Features) -> tuple[float, float]:
     return float(share), float(distance[repeated].mean()) if repeated.any() else float("nan")
 
 
-def psnr_db(image: Grey, truth: Grey, margin: int = 30) -> float:
+def psnr_db(image: Grey | Colour, truth: Grey | Colour, margin: int = 30) -> float:
     """Peak signal to noise ratio, without a margin."""
     inside = (slice(margin, -margin),) * 2
     return float(10 * np.log10(255**2 / np.mean((image[inside].astype(np.float32) - truth[inside]) ** 2)))
 
 
-def ssim(image: Grey, truth: Grey, margin: int = 30) -> float:
+def ssim(image: Grey | Colour, truth: Grey | Colour, margin: int = 30) -> float:
     """Structural similarity (Wang et al. 2004): Gaussian window of 1.5 px, K1 = 0.01, K2 = 0.03."""
     a, b = (i[margin:-margin, margin:-margin].astype(np.float32) / 255 for i in (image, truth))
 

@@ -28,6 +28,9 @@ from colmap_inertial.simulate.textures import MATERIALS
 from colmap_inertial.types import Array, CameraModel, FrameTiming
 
 Grey = NDArray[np.uint8]
+#: Codes of three channels, RGB.
+Colour = NDArray[np.uint8]
+#: (H, W) or (H, W, 3)
 Light = NDArray[np.float32]
 
 DURATION_S = 60.0
@@ -53,6 +56,41 @@ def lens(width: int, height: int) -> CameraModel:
     )
 
 
+@dataclass(frozen=True, kw_only=True)
+class GyroErrors:
+    """What a gyroscope, or what is known of it, gets wrong.
+
+    Attributes
+    ----------
+    late_s
+        Its clock.
+    extent
+        Factor on the blur it predicts.
+    angle_rad
+        By which the blur it predicts is turned.
+    noise_rad_s
+        White, of each sample.
+    flipped
+        Its first axis.
+    """
+
+    late_s: float = 0.0
+    extent: float = 1.0
+    angle_rad: float = 0.0
+    noise_rad_s: float = GYRO_NOISE_RAD_S
+    flipped: bool = False
+
+
+NAMED_ERRORS = {
+    "": GyroErrors(),
+    "noise": GyroErrors(noise_rad_s=0.2),
+    "flipped axis": GyroErrors(flipped=True),
+    "20 % long": GyroErrors(extent=1.2),
+    "20 % short": GyroErrors(extent=0.8),
+    "10 ms late": GyroErrors(late_s=0.01),
+}
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Pair:
     """Two frames of one recording that see much the same part of a wall."""
@@ -71,33 +109,36 @@ class Pair:
     def frame(self, index: int, *, noise: float = NOISE, exposure_s: float | None = None) -> Grey:
         """A frame as filmed; with ``exposure_s``, around the same instants of mid-exposure."""
         shutter = self.shutters[index] if exposure_s is None else _shortened(self.shutters[index], exposure_s)
-        length = float(np.percentile(blur_field(self.gyro(), colmap_camera(self.model), shutter).extent_px(), 99))
-        samples = 1 if shutter.exposure_s == 0 else max(32, int(np.ceil(2 * length)))
-        light = _render(self, shutter, samples)
+        light = self.light(shutter)
         light += noise * np.random.default_rng([self.seed, index]).standard_normal(light.shape, dtype=np.float32)
         return np.asarray(np.rint(255 * srgb_from_linear(light)), dtype=np.uint8)
+
+    def light(self, shutter: FrameShutter) -> Light:
+        """What a frame of this shutter gathers, without noise and clipping; the wall's own light where it is still."""
+        length = float(np.percentile(blur_field(self.gyro(), colmap_camera(self.model), shutter).extent_px(), 99))
+        samples = 1 if shutter.exposure_s == 0 else max(32, int(np.ceil(2 * length)))
+        return _render(self, shutter, samples)
 
     def sharp(self, index: int) -> Grey:
         """The frame without blur or noise."""
         return self.frame(index, noise=0.0, exposure_s=0.0)
 
-    def gyro(self, error: str = "") -> GyroCamera:
+    def gyro(self, error: str | GyroErrors = "") -> GyroCamera:
         """The camera as its gyroscope knows it, or would with an error."""
+        errors = NAMED_ERRORS[error] if isinstance(error, str) else error
         t = np.arange(-1.0, DURATION_S + 1, 1 / GYRO_HZ)
         rate = self.motion.rate_in_cam_rad_s(t)
-        noise = {"noise": 0.2}.get(error, GYRO_NOISE_RAD_S)
-        rate = rate + noise * np.random.default_rng(self.seed).standard_normal(rate.shape)
-        if error == "flipped axis":
+        rate = rate + errors.noise_rad_s * np.random.default_rng(self.seed).standard_normal(rate.shape)
+        if errors.flipped:
             rate = rate * [-1, 1, 1]
-        offset_s = {"10 ms late": 0.01}.get(error, 0.0)
         path = GyroPath(t, rate @ matrix_from_quat(CAM_FROM_IMU), np.zeros(3))
-        return GyroCamera(path=path, cam_from_imu_xyzw=CAM_FROM_IMU, offset_s=offset_s)
+        return GyroCamera(path=path, cam_from_imu_xyzw=CAM_FROM_IMU, offset_s=errors.late_s)
 
-    def blur(self, index: int, error: str = "") -> BlurField:
+    def blur(self, index: int, error: str | GyroErrors = "") -> BlurField:
         """The blur that the gyroscope predicts."""
-        field = blur_field(self.gyro(error), colmap_camera(self.model), self.shutters[index])
-        factor = {"20 % long": 1.2, "20 % short": 0.8}.get(error, 1.0)
-        return replace(field, vector_px=field.vector_px * np.float32(factor))
+        errors = NAMED_ERRORS[error] if isinstance(error, str) else error
+        field = blur_field(self.gyro(errors), colmap_camera(self.model), self.shutters[index])
+        return erred(field, errors)
 
     def directions(self, index: int, points_px: Array) -> Array:
         """(N, 3) where points of a frame lie on the wall: true, each by the orientation of its own line."""
@@ -120,13 +161,20 @@ class Pair:
         return found
 
 
+def erred(field: BlurField, errors: GyroErrors) -> BlurField:
+    """A blur field with what is wrong about extents and directions."""
+    cos, sin = np.cos(errors.angle_rad), np.sin(errors.angle_rad)
+    turned = field.vector_px @ np.array([[cos, sin], [-sin, cos]], dtype=np.float32)
+    return replace(field, vector_px=turned * np.float32(errors.extent))
+
+
 def _shortened(shutter: FrameShutter, exposure_s: float) -> FrameShutter:
     assert shutter.exposure_s is not None
     return replace(shutter, exposure_s=exposure_s, t_s=shutter.t_s + 0.5 * (shutter.exposure_s - exposure_s))
 
 
 def _render(pair: Pair, shutter: FrameShutter, samples: int) -> Light:
-    """(H, W) light of a frame."""
+    """(H, W) or (H, W, 3) light of a frame."""
     model, wall = pair.model, pair.wall
     rows, columns = BlurField.nodes(model.width, model.height, NODE_PX)
     x, y = NODE_PX * np.arange(float(columns)) + 0.5, NODE_PX * np.arange(float(rows)) + 0.5
@@ -136,7 +184,7 @@ def _render(pair: Pair, shutter: FrameShutter, samples: int) -> Light:
     middle_s = shutter.middle_s(nodes[:, 0])
     exposure_s = shutter.exposure_s or 0.0
     scale = model.params[0]
-    total = np.zeros((model.height, model.width), dtype=np.float32)
+    total = np.zeros((model.height, model.width, *wall.shape[2:]), dtype=np.float32)
     for k in range(samples):
         turn = pair.turn(middle_s + exposure_s * ((k + 0.5) / samples - 0.5))
         seen = np.einsum("yij,yxj->yxi", turn, rays)
@@ -148,7 +196,13 @@ def _render(pair: Pair, shutter: FrameShutter, samples: int) -> Light:
 
 
 def make_pairs(
-    walls: Sequence[Light], blur_px: float, *, size: tuple[int, int] | None, seed: int, rate_rad_s: float | None = None
+    walls: Sequence[Light],
+    blur_px: float,
+    *,
+    size: tuple[int, int] | None,
+    seed: int,
+    rate_rad_s: float | None = None,
+    exposure_s: float = EXPOSURE_S,
 ) -> list[Pair]:
     """A pair of frames before each wall, both with about ``blur_px`` of blur (90th percentile).
 
@@ -161,6 +215,8 @@ def make_pairs(
         Width and height; ``None`` is each wall's own size.
     rate_rad_s
         Where given, instants are chosen by this speed of turning instead.
+    exposure_s
+        Of both frames.
     """
     pairs = []
     for i, wall in enumerate(walls):
@@ -170,13 +226,13 @@ def make_pairs(
             rng = np.random.default_rng([seed, i, attempt, int(10 * blur_px)])
             options = MotionOptions(kind="pure_rotation", duration_s=DURATION_S, vigour=VIGOUR)
             motion = make_motion(options, rng)
-            found = _instants(motion, model, blur_px, rate_rad_s, rng)
+            found = _instants(motion, model, blur_px, rate_rad_s, exposure_s, rng)
             if found is not None:
                 break
         else:
             raise ValueError(f"no two frames with {blur_px} px of blur in {20 * DURATION_S:.0f} s of motion")
         shutters = tuple(
-            FrameShutter(width=width, height=height, t_s=t, exposure_s=EXPOSURE_S, readout_s=READOUT_S) for t in found
+            FrameShutter(width=width, height=height, t_s=t, exposure_s=exposure_s, readout_s=READOUT_S) for t in found
         )
         middle = matrix_from_quat(motion.world_from_cam_xyzw(np.array([s.reference_s() for s in shutters])))
         forward = middle[:, :, 2].sum(axis=0)
@@ -198,11 +254,16 @@ def make_pairs(
 
 
 def _instants(
-    motion: Motion, model: CameraModel, blur_px: float, rate_rad_s: float | None, rng: np.random.Generator
+    motion: Motion,
+    model: CameraModel,
+    blur_px: float,
+    rate_rad_s: float | None,
+    exposure_s: float,
+    rng: np.random.Generator,
 ) -> tuple[float, float] | None:
     """Starts of exposure of two frames that suit, or ``None``."""
     t = np.arange(0.5, DURATION_S - 0.5, 1 / 60)
-    middle = t + 0.5 * (EXPOSURE_S + READOUT_S)
+    middle = t + 0.5 * (exposure_s + READOUT_S)
     if rate_rad_s is not None:
         of = np.linalg.norm(motion.rate_in_cam_rad_s(middle), axis=1) / rate_rad_s
     else:
@@ -213,7 +274,7 @@ def _instants(
             names=tuple(str(i) for i in range(len(t))),
             t_s=t,
             epoch_ns=0,
-            exposure_s=np.full(len(t), EXPOSURE_S),
+            exposure_s=np.full(len(t), exposure_s),
             readout_s=READOUT_S,
         )
         of = predicted_blur_px(gyro, colmap_camera(model), timing, width=model.width, height=model.height).px / blur_px
@@ -247,29 +308,28 @@ def photographs(folder: Path) -> list[Path]:
     return found
 
 
-def photographed_walls(folder: Path, count: int, seed: int) -> list[Light]:
+def photographed_walls(paths: Sequence[Path], count: int, seed: int, *, colour: bool = False) -> list[Light]:
     """Walls hung with photographs at their own size, 15 each, none twice while there are enough."""
-    paths, side = photographs(folder), 500
+    side = 500
     order = np.random.default_rng(seed).permutation(len(paths))
     walls = []
     for i in range(count):
         chosen = [paths[order[(15 * i + k) % len(paths)]] for k in range(15)]
-        patches = [_light(path, (side, side)) for path in chosen]
+        patches = [_light(path, (side, side), colour) for path in chosen]
         walls.append(np.vstack([np.hstack(patches[5 * r : 5 * r + 5]) for r in range(3)]))
     return walls
 
 
-def native_walls(folder: Path, count: int, seed: int) -> list[Light]:
-    """Whole photographs, the larger ones of a folder first."""
-    paths = photographs(folder)
+def native_walls(paths: Sequence[Path], count: int, seed: int, *, colour: bool = False) -> list[Light]:
+    """Whole photographs, the larger ones first."""
     sizes = {path: cv2.imread(str(path), cv2.IMREAD_GRAYSCALE).size for path in paths}
     large = sorted(paths, key=lambda path: (-sizes[path], path.name))[: 3 * count]
     chosen = np.random.default_rng(seed).permutation(len(large))[:count]
-    return [_light(large[k], None) for k in chosen]
+    return [_light(large[k], None, colour) for k in chosen]
 
 
-def _light(path: Path, size: tuple[int, int] | None) -> Light:
-    picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+def _light(path: Path, size: tuple[int, int] | None, colour: bool) -> Light:
+    picture = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB if colour else cv2.IMREAD_GRAYSCALE)
     if picture is None:
         raise SystemExit(f"bench_imaging: cannot read {path}")
     if size is not None:

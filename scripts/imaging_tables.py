@@ -24,7 +24,7 @@ def print_report(report: dict[str, Any], console: Console) -> None:
         "cost": _cost,
         "false_blur_10_px": _false_blur,
         "rolling_shutter": _shutter,
-        "colmap": _colmap,
+        "colmap": reconstructions,
     }
     for name, section in sections.items():
         if name in report:
@@ -37,7 +37,8 @@ def verdict(value: float, wanted: float, *, least: bool = True) -> str:
     return f"[{'green' if good else 'red'}]{'>=' if least else '<='} {wanted:g}[/]"
 
 
-def _table(title: str, *columns: str) -> Table:
+def table_of(title: str, *columns: str) -> Table:
+    """A table whose first column is text."""
     table = Table(title=title, title_justify="left")
     for i, column in enumerate(columns):
         table.add_column(column, justify="left" if i == 0 else "right")
@@ -45,7 +46,7 @@ def _table(title: str, *columns: str) -> Table:
 
 
 def _quality(kind: str, by_blur: dict[str, Any], console: Console) -> None:
-    table = _table(
+    table = table_of(
         f"Quality, {kind}: nothing -> gated default",
         *("blur px", "median", "deblurred", "correct matches", "ratio", "wanted"),
         *("least, median, most", "repeatability", "localisation px", "PSNR dB", "SSIM"),
@@ -69,7 +70,7 @@ def _quality(kind: str, by_blur: dict[str, Any], console: Console) -> None:
 
 
 def _other_ways(ways: dict[str, Any], console: Console) -> None:
-    table = _table("At 20 px", "way", "correct matches", "repeatability", "localisation px", "PSNR dB", "SSIM")
+    table = table_of("At 20 px", "way", "correct matches", "repeatability", "localisation px", "PSNR dB", "SSIM")
     for name, row in ways.items():
         measures = [
             f"{row[key]:.{digits}f}" if key in row else "-"
@@ -80,7 +81,7 @@ def _other_ways(ways: dict[str, Any], console: Console) -> None:
 
 
 def _cost(cost: dict[str, Any], console: Console) -> None:
-    table = _table(
+    table = table_of(
         f"Processor time, grey 1080p, {cost['blur_px']} px (median {cost['median_blur_px']}), 8 bit to 8 bit",
         *("way", "ms", "times ours", "wanted"),
     )
@@ -101,7 +102,7 @@ def _cost(cost: dict[str, Any], console: Console) -> None:
 
 
 def _false_blur(errors: dict[str, Any], console: Console) -> None:
-    table = _table(
+    table = table_of(
         "False blur, 10 px: correct matches against doing nothing",
         *("error", "kept", "wanted", "frames deblurred", "gyroscope trusted", "sigmas", "extents times"),
     )
@@ -119,7 +120,7 @@ def _false_blur(errors: dict[str, Any], console: Console) -> None:
 
 
 def _shutter(row: dict[str, Any], console: Console) -> None:
-    table = _table(
+    table = table_of(
         f"Rolling shutter, two views, readout {1e3 * row['readout_s']:.0f} ms, {row['rate_rad_s']:g} rad/s",
         *("keypoints", "rotation deg", "90th", "direction deg", "inliers"),
     )
@@ -137,9 +138,10 @@ def _shutter(row: dict[str, Any], console: Console) -> None:
     console.print(table)
 
 
-def _colmap(scenes: dict[str, Any], console: Console) -> None:
+def reconstructions(scenes: dict[str, Any], console: Console) -> None:
+    """Print what COLMAP made of scenes, by treatment."""
     for name, row in scenes.items():
-        table = _table(
+        table = table_of(
             f"COLMAP, {name}: {row['images']} images, {row['blur_px']:.0f} px, readout {1e3 * row['readout_s']:.0f} ms",
             *("treatment", "registered", "points", "camera error %", "rotation deg"),
         )
