@@ -70,11 +70,22 @@ def test_exposures_have_the_light_noise_and_blur_asked_for():
     rest = (gained / tint - truth)[middling]
     assert 1.4826 * np.median(np.abs(rest - np.median(rest))) == pytest.approx(NOISE, rel=0.25)
     assert np.percentile(one.true_blur().extent_px(), 90) == pytest.approx(BLUR_PX, rel=0.15)
-    # of what is larger than noise
-    detail = [cv2.Laplacian(cv2.GaussianBlur(x, (0, 0), 1.5), cv2.CV_32F).std() for x in (one.truth, one.long)]
-    assert detail[0] > 1.5 * detail[1]
+    # blur takes more from changes along it than from those across
+    along, across = (
+        _change(one.long, one.true_blur(), turn) / _change(one.truth, one.true_blur(), turn) for turn in (1, 1j)
+    )
+    assert along < 0.75 and along < 0.9 * across
     again = exposures.expose(wall(), BLUR_PX, RATIO, NOISE, size=SIZE, seed=4)
     assert np.array_equal(again.short, one.short) and np.array_equal(again.long, one.long)
+
+
+def _change(image, blur, turn):
+    """Mean change from pixel to pixel in the direction of the blur, times ``turn``."""
+    mean = blur.vector_px.reshape(-1, 2).mean(axis=0)
+    direction = complex(*mean) / abs(complex(*mean)) * turn
+    smooth = cv2.GaussianBlur(image, (0, 0), 1.5).astype(np.float32)
+    by_x, by_y = (cv2.Scharr(smooth, -1, *order) for order in ((1, 0), (0, 1)))
+    return np.abs(direction.real * by_x + direction.imag * by_y).mean()
 
 
 def test_true_blur_undoes_the_long_exposure_and_denoising_the_short_one():
