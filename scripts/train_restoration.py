@@ -36,7 +36,7 @@ MAKERS = {
     "lsd2": samples.lsd2_samples,
     "thesis_unet": samples.deepgyro_samples,
 }
-STEPS = {"deepgyro": 16_000, "lsd2": 8_000, "thesis_unet": 16_000}
+STEPS = {"deepgyro": 12_000, "lsd2": 7_000, "thesis_unet": 12_000}
 HELD_OUT = 128
 
 

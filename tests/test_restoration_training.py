@@ -24,6 +24,7 @@ from restoration.pool import Pool, Sources, make_pool
 from restoration.training import TrainOptions, train, turned
 
 from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.imaging.restoration._tiles import Span, blur_feed
 
 
 @pytest.fixture(scope="module")
@@ -102,9 +103,9 @@ def test_blur_turns_with_the_picture(photos):
     rows = np.linspace(2, 9, BlurField.nodes(size, size)[0])[:, None, None] * [1.0, 0.3]
     field = BlurField(width=size, height=size, vector_px=np.broadcast_to(rows, (*BlurField.nodes(size, size), 2)))
     picture = np.random.default_rng(0).integers(0, 256, (1, size, size, 3), dtype=np.uint8)
-    one = samples.Samples(
-        picture=picture, aid=picture, truth=picture, blur=samples.network_blur(field)[None].astype(np.float16)
-    )
+    whole = Span(begin=0, end=size, keep_begin=0, keep_end=size)
+    blur = blur_feed(field, whole, whole).transpose(0, 2, 3, 1).astype(np.float16)
+    one = samples.Samples(picture=picture, aid=picture, truth=picture, blur=blur)
     v = field.per_pixel()
     ways = set()
     for seed in range(30):

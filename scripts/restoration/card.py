@@ -47,8 +47,9 @@ def write_card(path: Path, name: str, figures: dict[str, Any], *, samples: int, 
 
 {_PURPOSE[name]}
 
-- Architecture: residual U-Net at half the picture's size, {parameters(RestorationNet()) / 1e6:.2f} million weights; {WIDTHS}
-  channels at 1/2 to 1/16, {DOWN} blocks down, {UP} up (`scripts/restoration/network.py`). Half precision on disk.
+- Architecture: residual U-Net at half the picture's size, {parameters(RestorationNet()) / 1e6:.2f} million weights;
+  {WIDTHS} channels at 1/2 to 1/16, {DOWN} blocks down, {UP} up (`scripts/restoration/network.py`). Half precision on
+  disk.
 - Training: {samples} pieces of 192 x 192 px, {options["steps"]} steps of {options["batch"]}, AdamW,
   rate {options["rate"]} along a cosine, seed {options["seed"]}; {figures["seconds"] / 60:.0f} minutes on {machine},
   PyTorch {torch.__version__}.

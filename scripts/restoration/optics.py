@@ -23,6 +23,7 @@ from restoration.handheld import Handheld
 _STEPS = 96
 #: Spacing of the pixels for which the mapping is worked out; between them it is bilinear, to 0.01 px.
 _NODE_PX = 8
+_LEAST_STRETCH = 0.2
 #: Motion is known for so much longer before and after, s: for clocks that are wrong.
 _SPARE_S = 0.012
 
@@ -90,7 +91,8 @@ class Shots:
         # how the picture at mid-exposure follows from the scene, for pixels one to the right and one below
         by_x, by_y = self.seen(x + 1, y, 0.0) - middle, self.seen(x, y + 1, 0.0) - middle
         along = self.seen(x, y, 0.5) - self.seen(x, y, -0.5)
-        across = by_x[..., 0] * by_y[..., 1] - by_x[..., 1] * by_y[..., 0]
+        # a picture that moves with the shutter would be blurred without end
+        across = (by_x[..., 0] * by_y[..., 1] - by_x[..., 1] * by_y[..., 0]).clamp_min(_LEAST_STRETCH)
         vx = (along[..., 0] * by_y[..., 1] - along[..., 1] * by_y[..., 0]) / across
         vy = (along[..., 1] * by_x[..., 0] - along[..., 0] * by_x[..., 1]) / across
         return torch.stack([vx, vy], dim=-1)

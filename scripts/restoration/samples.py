@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.imaging.restoration._tiles import Span, blur_feed
 from colmap_inertial.imaging.wiener import DeblurOptions, deblur
 from colmap_inertial.types import Array
 from restoration.camera import jpeg, noisy, sharpened, srgb
@@ -147,15 +148,6 @@ def lsd2_samples(material: Material, count: int, rng: np.random.Generator, devic
     return _trimmed(picture, aid, _fields(vectors), _bytes(truth))
 
 
-def network_blur(field: BlurField) -> NDArray[np.float32]:
-    """(H / 2, W / 2, 3) of a field as the networks take it, at the middles of squares of 2 x 2 px."""
-    full = field.per_pixel()
-    x, y = (full[::2, ::2] + full[1::2, ::2] + full[::2, 1::2] + full[1::2, 1::2]).transpose(2, 0, 1) / 4
-    length = np.hypot(x, y)
-    double = 2 * np.arctan2(y, x)
-    return np.stack([length * np.cos(double), length * np.sin(double), length], axis=-1).astype(np.float32) / 32
-
-
 def _scenes(album: Album, count: int, rng: np.random.Generator, device: str) -> Tensor:
     """(B, 3, S, S) light, of other brightness than the photographs', lamps brighter than white."""
     side = SIDE + 2 * _BEYOND_PX
@@ -206,5 +198,11 @@ def _fields(vectors: Tensor) -> list[BlurField]:
 def _trimmed(picture: Codes, aid: Codes, fields: list[BlurField], truth: Codes) -> Samples:
     inner = slice(MARGIN, SIDE - MARGIN)
     half = slice(MARGIN // 2, (SIDE - MARGIN) // 2)
-    blur = np.stack([network_blur(field) for field in fields])[:, half, half].astype(np.float16)
-    return Samples(picture=picture[:, inner, inner], aid=aid[:, inner, inner], blur=blur, truth=truth[:, inner, inner])
+    whole = Span(begin=0, end=SIDE, keep_begin=0, keep_end=SIDE)
+    blur = np.concatenate([blur_feed(field, whole, whole) for field in fields]).transpose(0, 2, 3, 1)
+    return Samples(
+        picture=picture[:, inner, inner],
+        aid=aid[:, inner, inner],
+        blur=blur[:, half, half].astype(np.float16),
+        truth=truth[:, inner, inner],
+    )
