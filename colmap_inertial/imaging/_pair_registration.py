@@ -93,9 +93,11 @@ def register(
         found = starts[-1]
     refined = [_refined(start, levels, step_px) for start in starts]
     worth = _WORTH if start_px is None else _WORTH_FROM_GYRO
-    for other in reversed(refined):
-        if other.agreement >= found.agreement + worth:
-            found = other
+    best = max(one.agreement for one in (found, *refined[1:]))
+    if refined[0].agreement >= best + worth:
+        found = refined[0]
+    elif refined[-1].agreement >= found.agreement + worth:
+        found = refined[-1]
     unlike = found.agreement < _UNLIKE and levels[-1].detail() > _DETAIL
     return replace(found, alike=not unlike)
 
