@@ -86,7 +86,11 @@ def test_jpeg_is_that_of_the_usual_library():
 def test_noise_is_as_strong_as_asked_for(grain):
     light = torch.full((1, 3, 256, 256), 0.4)
     found = noisy(
-        light, torch.tensor([0.02]), torch.tensor([0.001]), torch.tensor([grain]), torch.Generator().manual_seed(0)
+        light,
+        torch.full((1, 3), 0.02),
+        torch.full((1, 3), 0.001),
+        torch.tensor([grain]),
+        torch.Generator().manual_seed(0),
     )
     assert float((found - light).std()) == pytest.approx((0.02**2 + 0.001 * 0.4) ** 0.5, rel=0.02)
 

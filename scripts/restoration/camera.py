@@ -42,7 +42,7 @@ def noisy(light: Tensor, read: Tensor, shot: Tensor, grain: Tensor, generator: t
     light
         (B, 3, H, W)
     read, shot
-        (B,) of full scale.
+        (B, 3) of full scale, for each channel.
     grain
         (B,) share of the noise that is spread over neighbouring pixels, as demosaicing does; its strength stays.
     """
@@ -53,7 +53,7 @@ def noisy(light: Tensor, read: Tensor, shot: Tensor, grain: Tensor, generator: t
     g = grain[:, None, None, None]
     mixed = (1 - g) * white + g * coarse
     mixed = mixed / (((1 - g) + g * 0.25 / 0.375) ** 2 + g * g * (1 - (0.25 / 0.375) ** 2)).sqrt()
-    sigma = (read.square()[:, None, None, None] + shot[:, None, None, None] * light.clamp_min(0)).sqrt()
+    sigma = (read.square()[..., None, None] + shot[..., None, None] * light.clamp_min(0)).sqrt()
     return light + sigma * mixed
 
 

@@ -78,7 +78,7 @@ def deepgyro_samples(material: Material, count: int, rng: np.random.Generator, d
     scene = _scenes(material.album, count, rng, device)
     light = shots.render(scene, max(12, int(1.2 * longest)))
     truth = srgb(shots.render(scene, 1))
-    picture = _bytes(_photographed(light, rng, generator, darkest=0.003, noisiest=0.02))
+    picture = _bytes(_photographed(light, rng, generator, least=0.003, most=0.02))
     fields = _fields(told)
     noise = DeblurOptions(threads=1)
     aid = np.stack([deblur(np.ascontiguousarray(p), f, noise) for p, f in zip(picture, fields, strict=True)])
@@ -138,12 +138,18 @@ def lsd2_samples(material: Material, count: int, rng: np.random.Generator, devic
     light = shots.render(scene, max(12, int(1.2 * longest)), shift_px=off_px.to(device))
     clean = brief.render(scene, max(1, int(0.5 * longest)))
     truth = srgb(brief.render(scene, 1))
-    aid = _bytes(_photographed(light, rng, generator, darkest=0.002, noisiest=0.01))
+    aid = _bytes(_photographed(light, rng, generator, least=0.002, most=0.01))
     # colours of the short one differ a little, and its brightness is not matched exactly
     tint = torch.tensor(1 + 0.04 * rng.standard_normal((count, 3)), dtype=torch.float32, device=device)
+    tint = torch.where(_colourless(scene)[:, 0, 0], tint[:, :1], tint)
     gain = torch.tensor(1 + 0.05 * rng.standard_normal(count), dtype=torch.float32, device=device)
     tinted = (clean * (tint * gain[:, None])[:, :, None, None]).clamp(0, 1)
-    picture = _bytes(_photographed(tinted, rng, generator, darkest=0.015, noisiest=0.15))
+    picture = _bytes(_photographed(tinted, rng, generator, least=0.015, most=0.15, uneven=0.25))
+    for i in np.flatnonzero(rng.random(count) < 0.2):
+        # beyond the edge of the long one there is the short one
+        edge = MARGIN + int(rng.integers(1, 64))
+        where = [np.s_[:edge], np.s_[-edge:], np.s_[:, :edge], np.s_[:, -edge:]][rng.integers(4)]
+        aid[i][where] = picture[i][where]
     vectors = torch.where(torch.tensor(rng.random(count) < 0.5)[:, None, None, None].to(device), told, 0 * told)
     return _trimmed(picture, aid, _fields(vectors), _bytes(truth))
 
@@ -163,27 +169,42 @@ def _scenes(album: Album, count: int, rng: np.random.Generator, device: str) -> 
 
 
 def _photographed(
-    light: Tensor, rng: np.random.Generator, generator: torch.Generator, *, darkest: float, noisiest: float
+    light: Tensor,
+    rng: np.random.Generator,
+    generator: torch.Generator,
+    *,
+    least: float,
+    most: float,
+    uneven: float = 0.0,
 ) -> Tensor:
-    """Codes of light: clipping, noise of full scale's share at white between two limits, sRGB, sharpening, JPEG."""
+    """Codes of light: clipping, noise, sRGB, sharpening, JPEG.
+
+    The noise of white is from ``least`` to ``most`` of full scale; channels differ by a factor of ``1 + uneven``.
+    """
     count, device = len(light), light.device
 
     def drawn(values: Array) -> Tensor:
         return torch.tensor(values, dtype=torch.float32, device=device)
 
-    sigma = np.exp(rng.uniform(np.log(darkest), np.log(noisiest), count))
-    by_light = rng.random(count)
+    sigma = np.exp(rng.uniform(np.log(least), np.log(most), count))[:, None] * np.ones(3)
+    by_light = rng.random(count)[:, None]
     grain = drawn(np.where(rng.random(count) < 0.4, rng.uniform(0, 0.8, count), 0))
+    if uneven:
+        sigma *= np.exp(np.log1p(uneven) * rng.standard_normal(sigma.shape))
     out = noisy(light.clamp(0, 1), drawn(sigma * np.sqrt(1 - by_light)), drawn(sigma**2 * by_light), grain, generator)
     # pictures without colour have noise without colour
-    grey = (light[:, :1] == light[:, 1:2]).flatten(1).all(dim=1)[:, None, None, None]
-    code = srgb(torch.where(grey, out[:, :1].expand_as(out), out))
+    code = srgb(torch.where(_colourless(light), out[:, :1].expand_as(out), out))
     amount = drawn(np.where(rng.random(count) < 0.2, rng.uniform(0.2, 0.8, count), 0))
     code = torch.where(amount[:, None, None, None] > 0, sharpened(code, amount), code)
     code = (255 * code).round() / 255
     packed = torch.tensor(rng.random(count) < 0.5, device=device)[:, None, None, None]
     pressed = jpeg(code, drawn(rng.uniform(75, 98, count)), torch.tensor(rng.random(count) < 0.7, device=device))
     return torch.where(packed, pressed, code)
+
+
+def _colourless(light: Tensor) -> Tensor:
+    """(B, 1, 1, 1) which pictures have three equal channels."""
+    return (light == light[:, :1]).flatten(1).all(dim=1)[:, None, None, None]
 
 
 def _bytes(code: Tensor) -> Codes:
