@@ -13,7 +13,8 @@ Gyroscopes come without any error, and with the usual ones, drawn for each pair 
 blur 10 %, its direction 3 degrees (standard deviations), and 1 mrad/s of white noise on each sample at 400 Hz.
 
 ``deepgyro``: the frames as they are; the Wiener filter and DeepGyro behind the package's gate as ``--deblur`` has them,
-all frames of one blur judged as one recording; and both without the gate. Walls in 1080p and whole photographs.
+all frames of one blur judged as one recording (each pair has errors of its own, so the gate can mend the extents of
+single pairs no more than their mean); and both without the gate. Walls in 1080p and whole photographs.
 
 ``false_blur``: sharp frames with the blur field of blurred ones, as a wrong exposure time would give: the share of
 correct matches that is kept. Behind the gate twice: where other frames of the recording bear the gyroscope out, and
@@ -70,8 +71,8 @@ console = Console(stderr=True)
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--photos", type=Path, required=True, help="the folder of sharp photographs of the training")
-    parser.add_argument("--scenes", type=int, default=6, help="how many, of each kind")
-    parser.add_argument("--compared", type=int, default=4, help="scenes for false blur")
+    parser.add_argument("--scenes", type=int, default=4, help="how many, of each kind")
+    parser.add_argument("--compared", type=int, default=2, help="scenes for false blur")
     parser.add_argument("--pairs", type=int, default=9, help="of short and long exposures, for each noise")
     parser.add_argument("--seed", type=int, default=9)
     parser.add_argument("--threads", type=int, default=2, help="for one picture")
