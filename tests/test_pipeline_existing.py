@@ -326,6 +326,7 @@ def test_what_is_missing_or_makes_no_sense_is_said_before_any_work(box, video, t
         ([box.root, out, *csv, "--deblur", "wiener"], "--deblur"),
         ([box.root, out, *csv, "--rolling-shutter", "rectify"], "--rolling-shutter"),
         ([box.root, out, *csv, "--mapping.max-num-features", "500"], "--mapping.max-num-features"),
+        ([box.root, out, *csv, "--exposures.fusion", "mertens"], "--exposures.fusion"),
         ([box.imu, out, *csv], "holds no COLMAP model"),
         ([box.root, box.root / "metric", *csv], "lie within each other"),
         ([box.root, out, "--imu", box.imu, "--frame-times", tmp_path / "no.csv"], "no.csv"),

@@ -27,7 +27,7 @@ from colmap_inertial.model.copying import list_tree
 from colmap_inertial.model.layout import read_layout
 from colmap_inertial.model.project import apply_to_project
 from colmap_inertial.model.similarities import ModelScale
-from colmap_inertial.options import MappingOptions, ProjectOptions, ReconstructOptions
+from colmap_inertial.options import ProjectOptions, ReconstructOptions
 from colmap_inertial.pipeline import default_model_stages, logging_to, prior_calibration, silent
 from colmap_inertial.pipeline.colmap import Progress
 from colmap_inertial.pipeline.config import config_as_toml
@@ -147,9 +147,13 @@ def reconstruct_project(
 
 def _check_options(options: ReconstructOptions) -> None:
     """Refuse what has no meaning without mapping."""
-    default = MappingOptions()
-    fields = dataclasses.fields(MappingOptions)
-    named = [f"--mapping.{f.name}" for f in fields if getattr(options.mapping, f.name) != getattr(default, f.name)]
+    default = ReconstructOptions()
+    named = [
+        f"--{group}.{f.name}"
+        for group in ("mapping", "apertures", "exposures")
+        for f in dataclasses.fields(getattr(default, group))
+        if getattr(getattr(options, group), f.name) != getattr(getattr(default, group), f.name)
+    ]
     named += ["--deblur"] if options.deblur not in (None, "off") else []
     named += ["--rolling-shutter"] if options.rolling_shutter not in (None, "off") else []
     if named:
