@@ -10,7 +10,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 SIZES = {"picture": [1, 3, "h", "w"], "aid": [1, 3, "h", "w"], "blur": [1, 3, "hh", "hw"]}
 #: How far `coarse` looks: the dilated filter, then the mean of a square of 16 px, of which it is at most 15 px away.
-COARSE_REACH_PX = 48 + 15
+COARSE_REACH_PX = 170 + 15
 
 
 def network(nodes, constants=None, *, sizes=None, output="restored", kind=TensorProto.FLOAT):
@@ -51,9 +51,7 @@ def coarse():
     weights = rng.random((3, 1, 3, 3), np.float32)
     return network(
         [
-            helper.make_node(
-                "Conv", ["picture", "weights"], ["far"], group=3, dilations=[48, 48], pads=[48, 48, 48, 48]
-            ),
+            helper.make_node("Conv", ["picture", "weights"], ["far"], group=3, dilations=[170, 170], pads=[170] * 4),
             helper.make_node("AveragePool", ["far"], ["small"], kernel_shape=[16, 16], strides=[16, 16]),
             helper.make_node("Resize", ["small", "", "scales"], ["large"], mode="nearest"),
             helper.make_node("Add", ["large", "aid"], ["sum"]),

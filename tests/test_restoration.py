@@ -135,15 +135,15 @@ def test_pictures_that_do_not_go_together_are_a_mistake():
 def test_parts_cover_every_pixel_once_with_what_lies_around(seed):
     rng = np.random.default_rng(seed)
     height, width = (int(n) for n in rng.integers(1, 2500, 2))
-    most = int(rng.integers(300**2, 1500**2))
+    most = int(rng.integers(400**2, 1500**2))
     kept = np.zeros((height, width), int)
     for row, column in _tiles.tiles(height, width, most):
         assert row.size * column.size <= most
         for span, size in ((row, height), (column, width)):
             whole = -(-size // 16) * 16
             assert span.begin % 16 == span.end % 16 == 0 and span.begin >= 0 and span.end <= whole
-            assert span.begin == 0 or span.keep_begin - span.begin >= 96
-            assert span.end == whole or span.end - span.keep_end >= 96
+            assert span.begin == 0 or span.keep_begin - span.begin >= 192
+            assert span.end == whole or span.end - span.keep_end >= 192
         (rows, _), (columns, _) = row.kept(height), column.kept(width)
         kept[rows, columns] += 1
     assert (kept == 1).all()
@@ -153,23 +153,23 @@ def test_parts_cover_every_pixel_once_with_what_lies_around(seed):
 def test_a_network_never_sees_more_than_a_frame_of_full_hd(size):
     parts = [row.size * column.size for row, column in _tiles.tiles(*size)]
     assert max(parts) <= 1920 * 1088
-    assert sum(parts) < 1.35 * np.prod([-(-n // 16) * 16 for n in size])
+    assert sum(parts) < 1.75 * np.prod([-(-n // 16) * 16 for n in size])
     assert (len(parts) == 1) == (min(size) == 1080)
 
 
-@pytest.mark.parametrize("size", [(500, 700), (613, 431)])
+@pytest.mark.parametrize("size", [(500, 700), (613, 451)])
 @pytest.mark.parametrize("model", [small.coarse, small.box])
 def test_parts_do_not_show(monkeypatch, size, model):
-    assert small.COARSE_REACH_PX < _tiles.OVERLAP_PX
+    assert 182 < small.COARSE_REACH_PX <= _tiles.OVERLAP_PX
     a, b = picture(*size, np.float32), picture(*size, np.float32, seed=1)
     network = ready(model())
     whole = network.restore(a, b)
-    monkeypatch.setattr(_tiles, "tiles", partial(_tiles.tiles, most_px=350**2))
-    assert len(_tiles.tiles(*size)) >= 6
+    monkeypatch.setattr(_tiles, "tiles", partial(_tiles.tiles, most_px=420**2))
+    assert len(_tiles.tiles(*size)) >= 4
     assert np.abs(network.restore(a, b) - whole).max() < 1e-6
     # it would: less around them changes the result
     if model is small.coarse:
-        monkeypatch.setattr(_tiles, "OVERLAP_PX", 32)
+        monkeypatch.setattr(_tiles, "OVERLAP_PX", 160)
         assert np.abs(network.restore(a, b) - whole).max() > 1e-2
 
 
@@ -177,7 +177,7 @@ def test_blur_goes_to_its_part(monkeypatch):
     blur, a = turning(700, 500, longest_px=30), picture(500, 700, np.float32)
     network = ready(small.seeing_blur())
     whole = network.restore(a, a, blur)
-    monkeypatch.setattr(_tiles, "tiles", partial(_tiles.tiles, most_px=350**2))
+    monkeypatch.setattr(_tiles, "tiles", partial(_tiles.tiles, most_px=420**2))
     np.testing.assert_array_equal(network.restore(a, a, blur), whole)
 
 
@@ -394,7 +394,7 @@ def test_parts_of_the_package_s_networks_do_not_show(name, monkeypatch):
     a, blur = scene(480, 640), turning(640, 480, longest_px=25)
     b = wiener.deblur(a, blur)
     whole = network.restore(a / np.float32(255), b, blur)
-    monkeypatch.setattr(_tiles, "tiles", partial(_tiles.tiles, most_px=400**2))
+    monkeypatch.setattr(_tiles, "tiles", partial(_tiles.tiles, most_px=430**2))
     off = np.abs(network.restore(a / np.float32(255), b, blur) - whole)
     assert off.max() < 0.5 / 255
 

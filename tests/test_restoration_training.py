@@ -24,7 +24,7 @@ from restoration.pool import Pool, Sources, make_pool
 from restoration.training import TrainOptions, train, turned
 
 from colmap_inertial.imaging.blur_field import BlurField
-from colmap_inertial.imaging.restoration._tiles import Span, blur_feed
+from colmap_inertial.imaging.restoration._tiles import OVERLAP_PX, Span, blur_feed
 
 
 @pytest.fixture(scope="module")
@@ -198,6 +198,26 @@ def test_what_is_exported_computes_what_was_trained(pools, tmp_path):
     (found,) = session.run(None, {name: value.numpy() for name, value in inputs.items()})
     with torch.no_grad():
         np.testing.assert_allclose(found, network(picture, aid, blur).numpy(), atol=2e-3)
+
+
+def test_the_network_looks_no_further_than_its_parts_overlap(monkeypatch):
+    from restoration import network as networks
+
+    # every weight and slope 1e-3: what has any way to a pixel has a derivative
+    monkeypatch.setattr(networks.functional, "leaky_relu", lambda x, slope: x)
+    network = RestorationNet().double()
+    for parameter in network.parameters():
+        parameter.data.fill_(1e-3)
+    begin, end = 400, 416
+    seen = set()
+    for which in range(2):
+        pictures = [torch.ones(1, 3, 48, 832, dtype=torch.float64) for _ in range(2)]
+        pictures[which].requires_grad_()
+        restored = network(*pictures, torch.ones(1, 3, 24, 416, dtype=torch.float64))
+        (slope,) = torch.autograd.grad(restored[..., 16:32, begin:end].sum(), pictures[which])
+        (at,) = (slope != 0).any(dim=2).flatten(0, 1).any(dim=0).nonzero(as_tuple=True)
+        seen.add((begin - int(at.min()), int(at.max()) + 1 - end))
+    assert seen == {(182, 182)} and OVERLAP_PX >= 182
 
 
 def test_both_networks_samples_are_of_one_kind(pools, photos):

@@ -13,8 +13,8 @@ from colmap_inertial.imaging.blur_field import BlurField
 
 #: Sides of what a network sees are multiples of this, and so are the places of parts: it halves pictures four times.
 MULTIPLE = 16
-#: How far a network sees around what is kept of its result.
-OVERLAP_PX = 96
+#: How far a network sees around what is kept of its result: the package's look 182 px beyond squares of 16 px.
+OVERLAP_PX = 192
 #: Pixels that a network sees at once, as in 1920 x 1080; each takes about 250 bytes.
 MOST_PX = 1920 * 1088
 #: Length of blur that networks call 1.

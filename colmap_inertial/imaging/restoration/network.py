@@ -103,8 +103,8 @@ class Network:
 
         Notes
         -----
-        Large pictures go through in parts that overlap by 96 px; where the network looks no further, the result is the
-        same as in one piece. Beside the result, memory does not grow with the picture.
+        Large pictures go through in parts, each with 192 px around it; the package's networks look no further, so the
+        result is the same as in one piece. Beside the result, memory does not grow with the picture.
 
         Raises
         ------
