@@ -34,6 +34,11 @@ def srgb(light: Tensor) -> Tensor:
     return torch.where(light <= 0.0031308, 12.92 * light, 1.055 * light.clamp_min(1e-8) ** (1 / 2.4) - 0.055)
 
 
+def light_of(code: Tensor) -> Tensor:
+    """Linear light of codes 0 to 1."""
+    return torch.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
+
+
 def noisy(light: Tensor, read: Tensor, shot: Tensor, grain: Tensor, generator: torch.Generator) -> Tensor:
     """Light with noise of variance ``read^2 + shot light``.
 

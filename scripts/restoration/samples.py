@@ -15,7 +15,7 @@ from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.restoration._tiles import Span, blur_feed
 from colmap_inertial.imaging.wiener import DeblurOptions, deblur
 from colmap_inertial.types import Array
-from restoration.camera import jpeg, noisy, sharpened, srgb
+from restoration.camera import jpeg, light_of, noisy, sharpened, srgb
 from restoration.handheld import Handheld, captured, simulated
 from restoration.optics import ShotOptions, Shots, draw_shots
 from restoration.photographs import Album, photographs
@@ -144,7 +144,10 @@ def lsd2_samples(material: Material, count: int, rng: np.random.Generator, devic
     tint = torch.where(_colourless(scene)[:, 0, 0], tint[:, :1], tint)
     gain = torch.tensor(1 + 0.05 * rng.standard_normal(count), dtype=torch.float32, device=device)
     tinted = (clean * (tint * gain[:, None])[:, :, None, None]).clamp(0, 1)
-    picture = _bytes(_photographed(tinted, rng, generator, least=0.015, most=0.15, uneven=0.25))
+    # half of them stored as dark as they were
+    dimmed = torch.where(torch.tensor(rng.random(count) < 0.5, device=device), ratio.clamp_max(16), 1.0)
+    noisy_codes = _photographed(tinted, rng, generator, least=0.015, most=0.15, uneven=0.25, dimmed=dimmed)
+    picture = _bytes(noisy_codes)
     for i in np.flatnonzero(rng.random(count) < 0.2):
         # beyond the edge of the long one there is the short one
         edge = MARGIN + int(rng.integers(1, 64))
@@ -176,10 +179,12 @@ def _photographed(
     least: float,
     most: float,
     uneven: float = 0.0,
+    dimmed: Tensor | None = None,
 ) -> Tensor:
     """Codes of light: clipping, noise, sRGB, sharpening, JPEG.
 
-    The noise of white is from ``least`` to ``most`` of full scale; channels differ by a factor of ``1 + uneven``.
+    The noise of white is from ``least`` to ``most`` of full scale; channels differ by a factor of ``1 + uneven``. What
+    was stored (B,) times darker is brightened again.
     """
     count, device = len(light), light.device
 
@@ -193,13 +198,15 @@ def _photographed(
         sigma *= np.exp(np.log1p(uneven) * rng.standard_normal(sigma.shape))
     out = noisy(light.clamp(0, 1), drawn(sigma * np.sqrt(1 - by_light)), drawn(sigma**2 * by_light), grain, generator)
     # pictures without colour have noise without colour
-    code = srgb(torch.where(_colourless(light), out[:, :1].expand_as(out), out))
+    out = torch.where(_colourless(light), out[:, :1].expand_as(out), out)
+    code = srgb(out if dimmed is None else out / dimmed[:, None, None, None])
     amount = drawn(np.where(rng.random(count) < 0.2, rng.uniform(0.2, 0.8, count), 0))
     code = torch.where(amount[:, None, None, None] > 0, sharpened(code, amount), code)
     code = (255 * code).round() / 255
     packed = torch.tensor(rng.random(count) < 0.5, device=device)[:, None, None, None]
     pressed = jpeg(code, drawn(rng.uniform(75, 98, count)), torch.tensor(rng.random(count) < 0.7, device=device))
-    return torch.where(packed, pressed, code)
+    code = torch.where(packed, pressed, code)
+    return code if dimmed is None else srgb(light_of(code) * dimmed[:, None, None, None])
 
 
 def _colourless(light: Tensor) -> Tensor:
