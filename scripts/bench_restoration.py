@@ -14,7 +14,8 @@ blur 10 %, its direction 3 degrees (standard deviations), and 1 mrad/s of white 
 
 ``deepgyro``: the frames as they are; the Wiener filter and DeepGyro behind the package's gate as ``--deblur`` has them,
 all frames of one blur judged as one recording (each pair has errors of its own, so the gate can mend the extents of
-single pairs no more than their mean); and both without the gate. Walls in 1080p and whole photographs.
+single pairs no more than their mean); and both without the gate. Walls in 1080p and whole photographs. The yardstick
+is the thesis's U-Net, picture and blur alone, trained on the same samples (``--unet``).
 
 ``false_blur``: sharp frames with the blur field of blurred ones, as a wrong exposure time would give: the share of
 correct matches that is kept. Behind the gate twice: where other frames of the recording bear the gyroscope out, and
@@ -58,7 +59,7 @@ from restoration_weights import checksums, use_weights
 from rich.console import Console
 
 from colmap_inertial.imaging import wiener
-from colmap_inertial.imaging.restoration import deepgyro, load_network
+from colmap_inertial.imaging.restoration import Network, deepgyro, load_network
 from colmap_inertial.options import ReconstructOptions
 
 FALSE_BLURS_PX = (10.0, 20.0)
@@ -85,6 +86,9 @@ def main() -> None:
     )
     parser.add_argument(
         "--weights", type=Path, nargs="+", default=[], help="deepgyro.onnx, lsd2.onnx to use before the package's"
+    )
+    parser.add_argument(
+        "--unet", type=Path, help="also the U-Net of the thesis, as train_restoration.py thesis_unet wrote it (ONNX)"
     )
     parser.add_argument(
         "--quick", action="store_true", help="two scenes of 640 x 480, 10 and 20 px, a short reconstruction"
@@ -114,7 +118,11 @@ def run(args: argparse.Namespace) -> None:
 
     def ways() -> Ways:
         network = load_network("deepgyro", threads=args.threads)
-        return {"Wiener": wiener.deblur, "DeepGyro": partial(deepgyro.deblur, network=network)}
+        found: dict[str, Any] = {"Wiener": wiener.deblur, "DeepGyro": partial(deepgyro.deblur, network=network)}
+        if args.unet:
+            unet = Network.of(args.unet.read_bytes(), "deepgyro", source=str(args.unet), threads=args.threads)
+            found["thesis's U-Net"] = partial(deepgyro.deblur, network=unet)
+        return found
 
     def deepgyro_quality() -> dict[str, Any]:
         kinds = {"photographs": (walls[:scenes], size)}
