@@ -15,12 +15,20 @@ from test_pipeline import contents
 
 from colmap_inertial import pipeline
 from colmap_inertial.cli import main
-from colmap_inertial.errors import FormatError, InertialError, MissingExtraError, OutputExistsError, TimingError
+from colmap_inertial.errors import (
+    FormatError,
+    InertialError,
+    MissingExtraError,
+    NotObservableError,
+    OutputExistsError,
+    TimingError,
+)
 from colmap_inertial.imaging.restoration import shipped
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.frames import read_frame_timing, read_frames
 from colmap_inertial.options import ExposureOptions, ReconstructOptions
 from colmap_inertial.pipeline import fuse_exposures, reconstruct, silent
+from colmap_inertial.pipeline.deblur import deblur_capture
 from colmap_inertial.pipeline.exposures import ExposureStage, Fuser
 from colmap_inertial.pipeline.frames import ExplainedStage
 from colmap_inertial.pipeline.fuse_exposures import fuse_exposures_captured
@@ -233,6 +241,39 @@ def test_pictures_alone_are_enough(capture, tmp_path):
     assert "start or length of the long exposures is unknown" in note
 
 
+def test_exposure_times_tell_the_gain_without_a_gyroscope_too(capture, tmp_path):
+    text = (capture / "capture.toml").read_text()
+    (capture / "capture.toml").write_text(text.replace('[imu]\npath = "imu.csv"\n', ""))
+    pairs = fuse_exposures_captured(capture, tmp_path / "out", fuser=AVERAGE, progress=silent)
+    assert not pairs[0].by_gyro and pairs[0].gain_stated == pytest.approx(GAIN)
+
+
+def test_pictures_of_another_size_than_the_camera_s_are_named(capture, tmp_path):
+    for folder in ("short", "long"):
+        path = capture / folder / "001.png"
+        cv2.imwrite(str(path), cv2.imread(str(path))[:100])
+    with pytest.raises(FormatError, match=r"short/001.png: is 240x100, but the camera is 240x160"):
+        fuse_exposures_captured(capture, tmp_path / "out", fuser=AVERAGE, progress=silent)
+
+
+def test_colmap_is_quiet_while_it_looks_for_the_calibration(capture, tmp_path, monkeypatch):
+    import pycolmap
+
+    before, levels = pycolmap.logging.minloglevel, []
+
+    def look(*args, **options):
+        levels.append(pycolmap.logging.minloglevel)
+        raise NotObservableError("calibration", "so")
+
+    monkeypatch.setattr(fuse_exposures, "look_first", look)
+    pycolmap.logging.minloglevel = 0
+    try:
+        fuse_exposures_captured(capture, tmp_path / "out", fuser=AVERAGE, progress=silent)
+    finally:
+        pycolmap.logging.minloglevel = before
+    assert levels == [pycolmap.logging.Level.FATAL.value]
+
+
 def test_a_stated_gain_that_the_pixels_deny_is_said(capture, tmp_path):
     changed(capture, ("short_iso = 1600", "short_iso = 100"))
     pairs = fuse_exposures_captured(capture, tmp_path / "out", fuser=AVERAGE, progress=silent)
@@ -367,6 +408,13 @@ def test_the_short_exposures_alone_where_asked(written, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         reconstruct(folder, tmp_path / "out", options, progress=stop)
     assert contents(tmp_path / "out" / "images") == contents(folder / "short")
+
+
+def test_deblurring_needs_no_long_exposures(tmp_path):
+    write_pair_capture(tmp_path / "capture")
+    (tmp_path / "capture" / "long" / "001.png").unlink()
+    done = deblur_capture(tmp_path / "capture", tmp_path / "out", progress=silent)
+    assert contents(done.workspace.images) == contents(tmp_path / "capture" / "short")
 
 
 def test_a_fused_frame_is_not_deblurred_again(written, tmp_path):

@@ -45,12 +45,15 @@ class LongTiming:
 
     Attributes
     ----------
+    names
+        (F,) of the short ones that they belong to.
     t_s
         (F,) start of exposure of row 0, on the clock of the short ones.
     exposure_s
         (F,).
     """
 
+    names: tuple[str, ...]
     t_s: Array
     exposure_s: Array
 
@@ -128,7 +131,8 @@ class LongExposures:
         if self.times is None:
             if self.delay_s is None or self.exposure_s is None:
                 return None
-            return LongTiming(t_s=short.t_s + self.delay_s, exposure_s=np.full(len(short.names), self.exposure_s))
+            exposures_s = np.full(len(short.names), self.exposure_s)
+            return LongTiming(names=short.names, t_s=short.t_s + self.delay_s, exposure_s=exposures_s)
         stamps = stamps_of_csv(self.times, self.time_unit)
         place = {name: i for i, name in enumerate(stamps.names)}
         rows = []
@@ -148,7 +152,7 @@ class LongExposures:
         exposure_s = None if stamps.exposure_s is None else stamps.exposure_s[rows]
         if exposure_s is None and self.exposure_s is not None:
             exposure_s = np.full(len(rows), self.exposure_s)
-        return None if exposure_s is None else LongTiming(t_s=t_s, exposure_s=exposure_s)
+        return None if exposure_s is None else LongTiming(names=short.names, t_s=t_s, exposure_s=exposure_s)
 
     def stated_gain(
         self, short: Path, long: Path, *, short_exposure_s: float | None = None, long_exposure_s: float | None = None

@@ -11,6 +11,7 @@ from pathlib import Path
 from colmap_inertial import __version__
 from colmap_inertial.errors import FormatError, InertialError
 from colmap_inertial.gravity import gravity_in_cam
+from colmap_inertial.imaging.restoration.shipped import checksum
 from colmap_inertial.io.calibration import SHARED_CLOCK_OFFSET_S, for_another_recording, read_calibration
 from colmap_inertial.io.capture import Capture, Video, load_capture
 from colmap_inertial.io.files import write_json, write_text
@@ -23,6 +24,7 @@ from colmap_inertial.pipeline.colmap import (
     check_names,
     extract_features,
     image_pairs,
+    keep_colmap_quiet,
     map_images,
     match_features,
     write_gravity_priors,
@@ -197,7 +199,7 @@ def reconstruct(
             timing = part_of(timing, selection.names)
             _, frames = read_frames(loaded, only=timing.names)
         plan = run_plan(runner, workspace, loaded, imu, timing, options, progress, every=every, pairs=pairs)
-        fused = [exposure_stage(loaded, options.exposures, view=plan.view, fuser=fuser)] if pairs else []
+        fused = [exposure_stage(loaded, options.exposures, timing=timing, view=plan.view, fuser=fuser)] if pairs else []
         of_frames: list[FrameStage] = (
             [*fusing(loaded, workspace, options.apertures), *fused, *plan.frame_stages()]
             if frame_stages is None
@@ -292,6 +294,7 @@ def run_plan(
         "timing": timing,
         "prior": prior,
         "deblur": options.deblur,
+        "weights": checksum("deepgyro") if options.deblur == "deepgyro" else "",
         "pairs": pairs,
         "rolling_shutter": options.rolling_shutter,
         "max_offset_s": options.scale.max_offset_s,
@@ -328,9 +331,7 @@ def _gravity_priors(
 @contextlib.contextmanager
 def logging_to(path: Path) -> Iterator[None]:
     """Send this package's log to a file, and keep COLMAP's chatter off the terminal."""
-    import pycolmap
-
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
+    keep_colmap_quiet()
     logger = logging.getLogger("colmap_inertial")
     handler = logging.FileHandler(path, encoding="utf-8")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))

@@ -43,6 +43,13 @@ class KeypointStage(Protocol):
         ...
 
 
+def keep_colmap_quiet() -> None:
+    """Keep COLMAP's chatter off the terminal, from now on."""
+    import pycolmap
+
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
+
+
 def check_names(names: Sequence[str]) -> None:
     """Raise ``FormatError`` for an image name that COLMAP's lists of pairs cannot hold."""
     for name in names:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from colmap_inertial import __version__
@@ -85,7 +85,8 @@ def deblur_capture(
         For what cannot be read or written.
     """
     require_method(method)
-    loaded = load_capture(capture)
+    # of short and long exposures, the short ones alone
+    loaded = replace(load_capture(capture), exposures=None)
     if loaded.frames is None:
         raise FormatError(loaded.path, "has no frames: add [images] or [video]")
     if sheet is not None and sheet.exists():

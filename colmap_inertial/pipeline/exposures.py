@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -16,7 +16,7 @@ from colmap_inertial.errors import FormatError, NotObservableError
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.exposure_fusion import fuse_mertens
 from colmap_inertial.imaging.exposure_pair import ExposurePair, PairGyro, brightened, bring_together
-from colmap_inertial.imaging.gyro_camera import GyroCamera
+from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.restoration import load_network, lsd2, shipped
 from colmap_inertial.io.exposures import LongExposures, LongTiming
 from colmap_inertial.io.images import read_image
@@ -140,7 +140,7 @@ class ExposureStage:
     view
         Gyroscope, camera and times of the short ones; ``None`` aligns by the pixels alone.
     long
-        Times of the long ones, in the order of ``view``'s.
+        Times of the long ones; ``None`` where unknown, then, too, the pixels alone align.
     workers
         Pairs in work at once; as many as the process has processors, up to four, where absent.
     """
@@ -158,7 +158,8 @@ class ExposureStage:
         """Fuse the pairs, in order."""
         from concurrent.futures import ThreadPoolExecutor
 
-        work = partial(self._fused, gyro=self._gyro())
+        exposures_s = {} if self.long is None else dict(zip(self.long.names, self.long.exposure_s, strict=True))
+        work = partial(self._fused, gyro=self._gyro(), long_exposures_s=exposures_s)
         workers = self.workers or _workers()
         with ThreadPoolExecutor(workers) as pool:
             waiting: deque[Future[tuple[Frame, FusedPair]]] = deque()
@@ -194,27 +195,31 @@ class ExposureStage:
         view, long = self.view, self.long
         motion: GyroCamera = view.motion()
         camera: Projector = colmap_camera(view.camera)
-        index = view.index()
+        index, place = view.index(), {name: i for i, name in enumerate(long.names)}
 
         def of(name: str) -> PairGyro | None:
-            if name not in index:
+            if name not in index or name not in place:
                 return None
-            short = view.shutter(index[name])
-            later = replace(short, t_s=float(long.t_s[index[name]]), exposure_s=float(long.exposure_s[index[name]]))
+            short, i = view.shutter(index[name]), place[name]
+            later = replace(short, t_s=float(long.t_s[i]), exposure_s=float(long.exposure_s[i]))
             return PairGyro(motion=motion, camera=camera, short=short, long=later)
 
         return of
 
-    def _fused(self, frame: Frame, *, gyro: Callable[[str], PairGyro | None]) -> tuple[Frame, FusedPair]:
+    def _fused(
+        self, frame: Frame, *, gyro: Callable[[str], PairGyro | None], long_exposures_s: Mapping[str, float]
+    ) -> tuple[Frame, FusedPair]:
         path = self.pictures.path(frame.name)
         long = read_image(path)
         _require_alike(frame, path, long)
         times = gyro(frame.name)
+        if times is not None:
+            _require_size(self.folder / frame.name, frame, times.short)
         stated = self.pictures.stated_gain(
             self.folder / frame.name,
             path,
             short_exposure_s=frame.exposure_s,
-            long_exposure_s=None if times is None else times.long.exposure_s,
+            long_exposure_s=long_exposures_s.get(frame.name),
         )
         done = FusedPair(name=frame.name, long=str(path), fused=False, reason="")
         try:
@@ -252,6 +257,16 @@ def _require_alike(frame: Frame, path: Path, long: NDArray[Any]) -> None:
             path,
             f"holds {long.dtype} pixels, its short exposure {frame.name} {frame.image.dtype}; write both with the same "
             "depth",
+        )
+
+
+def _require_size(path: Path, frame: Frame, shutter: FrameShutter) -> None:
+    height, width = frame.image.shape[:2]
+    if (width, height) != (shutter.width, shutter.height):
+        raise FormatError(
+            path,
+            f"is {width}x{height}, but the camera is {shutter.width}x{shutter.height}; all pictures of a capture must "
+            "have the camera's size",
         )
 
 

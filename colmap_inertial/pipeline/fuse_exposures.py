@@ -17,7 +17,7 @@ from colmap_inertial.io.frames import image_names, read_frame_timing
 from colmap_inertial.io.images import read_image
 from colmap_inertial.io.imu import read_capture_imu
 from colmap_inertial.options import ExposureOptions
-from colmap_inertial.pipeline.colmap import Progress
+from colmap_inertial.pipeline.colmap import Progress, keep_colmap_quiet
 from colmap_inertial.pipeline.exposures import ExposureStage, FusedPair, Fuser, lsd2_fuser
 from colmap_inertial.pipeline.first_look import look_first
 from colmap_inertial.pipeline.frames import encode_image
@@ -110,24 +110,39 @@ def _no_gyro(exposures: LongExposures, timing: FrameTiming) -> str:
 
 
 def exposure_stage(
-    capture: Capture, options: ExposureOptions, *, view: GyroView | None, fuser: Fuser | None = None
+    capture: Capture,
+    options: ExposureOptions,
+    *,
+    timing: FrameTiming | None,
+    view: GyroView | None,
+    fuser: Fuser | None = None,
 ) -> ExposureStage:
-    """The stage for a capture with pairs; without a ``fuser``, the network that comes with the package.
+    """The stage for a capture with pairs.
+
+    Parameters
+    ----------
+    timing
+        Of the short exposures, where it is known.
+    view
+        Of the same; ``None`` where the pixels alone align pairs.
+    fuser
+        In place of the network that comes with the package.
 
     Raises
     ------
+    TimingError
+        As ``LongExposures.timing``.
     MissingExtraError, FormatError, InertialError
         As ``imaging.restoration.load_network``.
     """
     assert capture.exposures is not None and isinstance(capture.frames, ImageFolder)
-    long = None if view is None or view.timing.exposure_s is None else capture.exposures.timing(view.timing)
     return ExposureStage(
         pictures=capture.exposures,
         folder=capture.frames.folder,
         fuser=fuser or lsd2_fuser(options),
         fusion=options.fusion,
-        view=None if long is None else view,
-        long=long,
+        view=None if timing is None or timing.exposure_s is None else view,
+        long=None if timing is None else capture.exposures.timing(timing),
     )
 
 
@@ -186,9 +201,10 @@ def fuse_exposures_captured(
         plan = replace(plan, deblur_note=plan.deblur_note.replace("no gyroscope", "the frames have no times"))
     elif loaded.imu is not None:
         imu = read_capture_imu(loaded)
+        keep_colmap_quiet()
         with tempfile.TemporaryDirectory() as scratch:
             plan = for_pairs(plan, loaded, imu, timing, prior, scratch=Path(scratch), progress=progress)
-    stage = exposure_stage(loaded, options, view=plan.view, fuser=fuser)
+    stage = exposure_stage(loaded, options, timing=timing, view=plan.view, fuser=fuser)
     fused = stage(_frames(loaded, timing, names))
     for done, frame in enumerate(fused, start=1):
         source, target = loaded.frames.folder / frame.name, out / "images" / frame.name
