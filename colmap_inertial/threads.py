@@ -12,6 +12,14 @@ def usable_processors() -> int:
     return len(os.sched_getaffinity(0))
 
 
+def threads_beside(workers: int) -> int:
+    """How many threads a pool should count that workers share, each of which computes along with it as one of them.
+
+    Then no processor is idle, and none has two.
+    """
+    return max(1, usable_processors() - workers + 1)
+
+
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
     """Keep BLAS to one thread, as context or decorator.

@@ -5,6 +5,7 @@ import json
 import re
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -15,6 +16,7 @@ import pytest
 import small_networks as small
 from onnx import TensorProto, helper
 
+from colmap_inertial import threads
 from colmap_inertial.errors import FormatError, InertialError, MissingExtraError
 from colmap_inertial.imaging import wiener
 from colmap_inertial.imaging.blur_field import BlurField
@@ -200,6 +202,25 @@ def test_threads_are_as_many_as_asked_for_or_as_may_be_used():
         assert network._session.get_session_options().intra_op_num_threads == given
     with pytest.raises(ValueError, match="threads must be at least 1"):
         ready(small.mixing(), threads=0)
+
+
+@pytest.mark.parametrize(
+    ("processors", "workers", "expected"), [(1, 1, 1), (2, 2, 1), (4, 4, 1), (8, 4, 5), (16, 4, 13), (2, 4, 1)]
+)
+def test_workers_and_the_threads_they_share_are_as_many_as_processors(monkeypatch, processors, workers, expected):
+    monkeypatch.setattr(threads, "usable_processors", lambda: processors)
+    assert threads.threads_beside(workers) == expected
+
+
+def test_a_device_that_fails_is_told_with_what_to_do(monkeypatch):
+    class Failing:
+        def run(self, outputs, feeds):
+            raise RuntimeError("Failed to allocate memory for requested buffer of size 7\nat somewhere")
+
+    for device, advice in (("cuda", "CUDA_VISIBLE_DEVICES"), ("cpu", "half a gigabyte")):
+        network = replace(ready(small.mixing()), device=device, _session=Failing())
+        with pytest.raises(InertialError, match=rf"deepgyro failed on {device} \(Failed .* size 7\); .*{advice}"):
+            network.restore(picture(20, 30), picture(20, 30))
 
 
 # --- the files -----------------------------------------------------------------------------------------------------

@@ -12,11 +12,12 @@ from corner_scene import CALIBRATED, LENS, CornerScene
 from test_pipeline import contents
 from test_pipeline_imaging import QUICK, parts
 
+from colmap_inertial import threads
 from colmap_inertial.cli import main
 from colmap_inertial.errors import FormatError, MissingExtraError, NotObservableError
 from colmap_inertial.imaging.restoration import shipped
 from colmap_inertial.io.frames import read_frames
-from colmap_inertial.pipeline import DeblurStage, imaging, reconstruct, silent
+from colmap_inertial.pipeline import DeblurStage, imaging, reconstruct, silent, stages
 from colmap_inertial.pipeline.deblur import deblur_capture
 from colmap_inertial.pipeline.frames import read_frame_records
 from colmap_inertial.pipeline.imaging import plan_imaging, read_plan, write_plan
@@ -135,7 +136,7 @@ def test_a_stage_s_key_holds_method_and_network(blurred, weights, tmp_path):
     assert again.method == "deepgyro" and again.frame_stages()[0].method == "deepgyro"
 
 
-def test_workers_share_the_network_and_make_the_same_pixels(blurred, weights, tmp_path):
+def test_workers_share_the_network_and_make_the_same_pixels(blurred, weights, tmp_path, monkeypatch):
     plan = plan_imaging(*parts(blurred), deblur="deepgyro", rolling_shutter=None, scratch=tmp_path, progress=silent)
     (stage,) = plan.frame_stages()
     loaded, *_ = parts(blurred)
@@ -149,6 +150,12 @@ def test_workers_share_the_network_and_make_the_same_pixels(blurred, weights, tm
         )
     )
     np.testing.assert_array_equal(one, three)
+    asked = []
+    with monkeypatch.context() as context:
+        context.setattr(threads, "usable_processors", lambda: 16)
+        context.setattr(stages, "load_network", lambda name, **options: asked.append((name, options)))
+        list(replace(stage, workers=3)(iter([])))
+    assert asked == [("deepgyro", {"threads": 14})]
     # half of whole codes; blur of half a pixel to a pixel fades out in both, and what was sharp stays
     halfway = (np.array(filmed, np.float32) + np.array(filtered, np.float32)) / 2
     off = np.abs(np.array(one) - halfway)

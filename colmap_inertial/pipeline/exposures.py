@@ -24,7 +24,7 @@ from colmap_inertial.model import colmap_camera
 from colmap_inertial.options import ExposureOptions
 from colmap_inertial.pipeline.frames import FrameTreatment
 from colmap_inertial.pipeline.stages import GyroView
-from colmap_inertial.threads import usable_processors
+from colmap_inertial.threads import threads_beside, usable_processors
 from colmap_inertial.types import Frame, Projector
 
 if TYPE_CHECKING:
@@ -64,8 +64,7 @@ def lsd2_fuser(options: ExposureOptions | None = None) -> Fuser:
         As ``imaging.restoration.load_network``.
     """
     options = options or ExposureOptions()
-    threads = max(1, usable_processors() // _workers())
-    network = load_network("lsd2", device=options.device, threads=threads)
+    network = load_network("lsd2", device=options.device, threads=threads_beside(_workers()))
 
     def fuse(short: Light, long: Light, blur: BlurField | None) -> Light:
         return lsd2.fuse(short, long, blur=blur, network=network)

@@ -25,7 +25,7 @@ from colmap_inertial.io.calibration import SMALLEST_READOUT_S
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.options import BlurRemover, DeblurMethod
 from colmap_inertial.pipeline.frames import FrameTreatment
-from colmap_inertial.threads import usable_processors
+from colmap_inertial.threads import threads_beside, usable_processors
 from colmap_inertial.types import (
     CALIBRATION_PARAMETERS,
     Array,
@@ -165,10 +165,10 @@ class DeblurStage:
         """Deblur the frames, in order."""
         from concurrent.futures import ThreadPoolExecutor
 
-        remove = self._remover()
+        workers = self.workers or min(_MOST_WORKERS, usable_processors())
+        remove = self._remover(workers)
         motion, camera, index = self.view.motion(), colmap_camera(self.view.camera), self.view.index()
         decision_of = {decision.name: decision for decision in self.decisions}
-        workers = self.workers or min(_MOST_WORKERS, usable_processors())
 
         def treat(frame: Frame) -> tuple[Frame | None, FrameTreatment | None]:
             decision = decision_of.get(frame.name)
@@ -193,10 +193,10 @@ class DeblurStage:
         """What was decided about a frame that went through."""
         return self._done.get(name)
 
-    def _remover(self) -> Callable[[Any, BlurField], Any]:
-        """Undoes the blur of one frame in one thread."""
+    def _remover(self, workers: int) -> Callable[[Any, BlurField], Any]:
+        """Undoes the blur of one frame; ``workers`` call it at once."""
         if self.method == "deepgyro":
-            return partial(deepgyro.deblur, network=load_network("deepgyro", threads=1))
+            return partial(deepgyro.deblur, network=load_network("deepgyro", threads=threads_beside(workers)))
         return partial(deblur, options=DeblurOptions(threads=1))
 
     def _finished(self, name: str, future: Future[tuple[Frame | None, FrameTreatment | None]]) -> Iterator[Frame]:

@@ -26,6 +26,10 @@ _CUDA, _CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
 #: What networks take; all have three channels, "blur" half the height and width.
 _INPUTS = ("picture", "aid", "blur")
 _OUTPUT = "restored"
+_MORE_MEMORY = {
+    "cuda": "if memory is short, close what else uses the GPU, or hide it (CUDA_VISIBLE_DEVICES=) to use the processor",
+    "cpu": "if memory is short, make room: each picture in work takes about half a gigabyte",
+}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -39,7 +43,8 @@ class Network:
     device
         What it runs on.
     threads
-        For one picture, on the processor.
+        That a picture may use on the processor. Pictures that are restored at once share them, beside the thread of
+        each.
     """
 
     name: NetworkName
@@ -110,6 +115,8 @@ class Network:
         ------
         ValueError
             Where pictures are of another type, or do not go together.
+        InertialError
+            Where the device fails, as for want of memory.
         """
         _require_pictures(picture, aid, blur)
         result = np.empty_like(picture, order="C")
@@ -119,7 +126,13 @@ class Network:
                 "aid": _tiles.feed(aid, row, column),
                 "blur": _tiles.blur_feed(blur, row, column),
             }
-            (restored,) = self._session.run([_OUTPUT], feeds)
+            try:
+                (restored,) = self._session.run([_OUTPUT], feeds)
+            except Exception as error:  # as in _start
+                raise InertialError(
+                    f"the network {self.name} failed on {self.device} ({_first_line(error)}); "
+                    + _MORE_MEMORY[self.device]
+                ) from None
             _tiles.put(result, np.asarray(restored, dtype=np.float32)[0], row, column)
         return result
 
@@ -136,8 +149,8 @@ def load_network(name: NetworkName, *, device: Device = "auto", threads: int | N
     device
         ``"auto"``: CUDA where onnxruntime has it, else the processor.
     threads
-        For one picture, on the processor; as many as the process may use where absent. Where several threads restore
-        pictures of their own, one each is best.
+        That a picture may use on the processor; as many as the process may use where absent. Where several threads
+        restore pictures of their own, they share all but one of these, which each of them has for itself.
 
     Raises
     ------
