@@ -1,5 +1,6 @@
 """Captures of short and long exposures, and the frames made of them."""
 
+import errno
 import json
 import struct
 from dataclasses import replace
@@ -20,6 +21,7 @@ from colmap_inertial.errors import (
     InertialError,
     MissingExtraError,
     NotObservableError,
+    OutputError,
     OutputExistsError,
     TimingError,
 )
@@ -335,6 +337,15 @@ def test_damaged_and_unlike_partners_are_named(capture, tmp_path):
     (capture / "capture.toml").write_text('[images]\nfolder = "short"\n')
     with pytest.raises(FormatError, match=r"no pairs of exposures: add .images. and .exposures."):
         fuse("none")
+
+
+def test_a_full_disk_is_told(capture, tmp_path, monkeypatch):
+    def full(*args):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(fuse_exposures, "encode_image", full)
+    with pytest.raises(OutputError, match="is full .* remove the folder and start again"):
+        fuse_exposures_captured(capture, tmp_path / "out", fuser=AVERAGE, progress=silent)
 
 
 def test_the_stage_keeps_order_and_a_bounded_number_of_frames(written):

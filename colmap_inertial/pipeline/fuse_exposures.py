@@ -23,6 +23,7 @@ from colmap_inertial.pipeline.first_look import look_first
 from colmap_inertial.pipeline.frames import encode_image
 from colmap_inertial.pipeline.imaging import ImagingPlan, with_stated_exposures
 from colmap_inertial.pipeline.stages import GyroView
+from colmap_inertial.pipeline.workspace import full_disk_is_an_error
 from colmap_inertial.types import CameraImuCalibration, Frame, FrameTiming, ImuRecording
 
 
@@ -180,6 +181,8 @@ def fuse_exposures_captured(
         Where the network cannot run.
     OutputExistsError
         Where ``out`` exists.
+    OutputError
+        Where the disk is full.
     """
     options = options or ExposureOptions()
     loaded = load_capture(capture)
@@ -206,26 +209,27 @@ def fuse_exposures_captured(
             plan = for_pairs(plan, loaded, imu, timing, prior, scratch=Path(scratch), progress=progress)
     stage = exposure_stage(loaded, options, timing=timing, view=plan.view, fuser=fuser)
     fused = stage(_frames(loaded, timing, names))
-    for done, frame in enumerate(fused, start=1):
-        source, target = loaded.frames.folder / frame.name, out / "images" / frame.name
-        target.parent.mkdir(parents=True, exist_ok=True)
-        if stage.pairs()[-1].fused:
-            encode_image(target, frame.image, source)
-        else:
-            target.write_bytes(source.read_bytes())
-        progress("fusing", done, len(names))
-    write_json(
-        out / "result.json",
-        {
-            "versions": {"colmap_inertial": __version__},
-            "capture": str(loaded.path),
-            "source": str(loaded.frames.folder),
-            "note": plan.deblur_note,
-            "fuser": fuser.identity,
-            "fusion": options.fusion,
-            "frames": [asdict(pair) for pair in stage.pairs()],
-        },
-    )
+    with full_disk_is_an_error(out, "make room, remove the folder and start again"):
+        for done, frame in enumerate(fused, start=1):
+            source, target = loaded.frames.folder / frame.name, out / "images" / frame.name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            if stage.pairs()[-1].fused:
+                encode_image(target, frame.image, source)
+            else:
+                target.write_bytes(source.read_bytes())
+            progress("fusing", done, len(names))
+        write_json(
+            out / "result.json",
+            {
+                "versions": {"colmap_inertial": __version__},
+                "capture": str(loaded.path),
+                "source": str(loaded.frames.folder),
+                "note": plan.deblur_note,
+                "fuser": fuser.identity,
+                "fusion": options.fusion,
+                "frames": [asdict(pair) for pair in stage.pairs()],
+            },
+        )
     return stage.pairs()
 
 

@@ -195,15 +195,18 @@ class Workspace:
             yield
 
 
+_MAKE_ROOM = "make room and start again, it continues"
+
+
 @contextlib.contextmanager
-def full_disk_is_an_error(root: Path) -> Iterator[None]:
+def full_disk_is_an_error(root: Path, advice: str = _MAKE_ROOM) -> Iterator[None]:
     """Turn the system's complaint about a full disk (or a quota, or a limit of file sizes) into one of ours."""
     try:
         yield
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
             raise
-        raise OutputError(f"the disk of {root} is full ({error.strerror}); {_MAKE_ROOM}") from error
+        raise OutputError(f"the disk of {root} is full ({error.strerror}); {advice}") from error
 
 
 @contextlib.contextmanager
@@ -226,9 +229,6 @@ def require_room(folder: Path, num_bytes: int) -> None:
             f"the disk of {folder} is nearly full: {free / 1e6:.0f} MB are left, COLMAP's next step may need "
             f"{num_bytes / 1e6:.0f} MB; {_MAKE_ROOM}"
         )
-
-
-_MAKE_ROOM = "make room and start again, it continues"
 
 
 def canonical(value: object) -> object:
