@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -147,7 +147,7 @@ class ExposureStage:
     pictures: LongExposures
     folder: Path
     fuser: Fuser
-    fusion: str = "none"
+    fusion: Literal["none", "mertens"] = "none"
     view: GyroView | None = None
     long: LongTiming | None = None
     workers: int | None = field(default=None, compare=False)
