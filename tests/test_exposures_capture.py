@@ -344,7 +344,7 @@ def test_a_full_disk_is_told(capture, tmp_path, monkeypatch):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(fuse_exposures, "encode_image", full)
-    with pytest.raises(OutputError, match="is full .* remove the folder and start again"):
+    with pytest.raises(OutputError, match=r"is full .* remove the folder and start again"):
         fuse_exposures_captured(capture, tmp_path / "out", fuser=AVERAGE, progress=silent)
 
 
