@@ -107,7 +107,16 @@ class Exposures:
         return blur_seen_from_short(blur_field(exact.motion, exact.camera, exact.long), shift)
 
 
-def expose(wall: Light, blur_px: float, ratio: float, noise: float, *, size: tuple[int, int], seed: int) -> Exposures:
+def expose(
+    wall: Light,
+    blur_px: float,
+    ratio: float,
+    noise: float,
+    errors: GyroErrors,
+    *,
+    size: tuple[int, int],
+    seed: int,
+) -> Exposures:
     """Two exposures of a wall, and a view from elsewhere.
 
     Both exposures come from the same sensor: what is noise of photons and of reading in the short one is so in the long
@@ -137,7 +146,7 @@ def expose(wall: Light, blur_px: float, ratio: float, noise: float, *, size: tup
         long=filmed(pair.light(long_shutter), 1.0),
         truth=pair.sharp(0),
         view=pair.sharp(1),
-        errors=usual_errors(seed),
+        errors=errors,
         ratio=ratio,
     )
 
@@ -184,8 +193,8 @@ def _of_noise(
     walls: Sequence[Light], network: Network, noise: float, size: tuple[int, int], seed: int, console: Console
 ) -> dict[str, Any]:
     scenes = [
-        expose(wall, BLURS_PX[i % 3], RATIOS[i // 3 % 3], noise, size=size, seed=seed + i)
-        for i, wall in enumerate(walls)
+        expose(wall, BLURS_PX[i % 3], RATIOS[i // 3 % 3], noise, errors, size=size, seed=seed + i)
+        for i, (wall, errors) in enumerate(zip(walls, usual_errors(len(walls), seed), strict=True))
     ]
     joined = [scene.together() for scene in scenes]
     strength = best_strength([codes(pair.short) for pair in joined], [scene.truth for scene in scenes])

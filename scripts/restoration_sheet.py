@@ -35,14 +35,16 @@ def write_sheet(
 ) -> None:
     """A row for each scene; gyroscopes have the usual errors. What there is no network for is left out."""
     rows: list[tuple[list[str], list[Colour]]] = []
+    errors = usual_errors(SCENES, seed)
     for i, blur_px in enumerate(BLURS_PX if deblur else ()):
         pair = make_pairs([walls[i % len(walls)]], blur_px, size=size, seed=seed + 100 + i)[0]
-        image, blur, truth = pair.frame(0), pair.blur(0, usual_errors(pair.seed)), pair.sharp(0)
+        image, blur, truth = pair.frame(0), pair.blur(0, errors[i]), pair.sharp(0)
         assert deblur is not None
         pictures = [image, wiener.deblur(image, blur), deblur(image, blur), truth]
         rows.append(([f"blurred, {blur_px:g} px", "Wiener", "DeepGyro", "truth"], _crops(pictures, pair.blur(0))))
     for i, (blur_px, ratio, noise) in enumerate(PAIRS if lsd2 else ()):
-        scene = expose(walls[(i + len(BLURS_PX)) % len(walls)], blur_px, ratio, noise, size=size, seed=seed + 200 + i)
+        k = i + len(BLURS_PX)
+        scene = expose(walls[k % len(walls)], blur_px, ratio, noise, errors[k], size=size, seed=seed + 200 + i)
         joined = scene.together()
         assert lsd2 is not None
         fused = codes(fuse(joined.short, joined.long, blur=joined.blur, network=lsd2))

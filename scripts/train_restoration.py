@@ -8,7 +8,7 @@ PHOTOS are sharp photographs (.jpg, .png; any folder will do), MOTION holds moti
 one recording are never trained on: figures come from those.
 
 Needs the extra ``train`` (PyTorch, ONNX). Uses a CUDA device where there is one. Started again with the same WORK
-folder, it goes on where it was. The defaults are what the shipped weights were made with, on two processor cores;
+folder, it goes on where it was. The defaults are what the shipped weights were made with, on two processor cores.
 ``thesis_unet`` is the yardstick, a U-Net as DeepGyro's own on picture and blur alone; give it --out, the package does
 not ship it. On a GPU, train longer on more:
 
@@ -30,13 +30,14 @@ from restoration.network import RestorationNet, ThesisNet, parameters
 from restoration.pool import Sources, make_pool
 from restoration.training import TrainOptions, console, train
 
-#: What each network is trained on, and how long.
+#: What each network is trained on, how many of it, and how long.
 MAKERS = {
     "deepgyro": samples.deepgyro_samples,
     "lsd2": samples.lsd2_samples,
     "thesis_unet": samples.deepgyro_samples,
 }
-STEPS = {"deepgyro": 12_000, "lsd2": 7_000, "thesis_unet": 12_000}
+SAMPLES = {"deepgyro": 9600, "lsd2": 4800, "thesis_unet": 9600}
+STEPS = {"deepgyro": 12_000, "lsd2": 6_000, "thesis_unet": 12_000}
 HELD_OUT = 128
 
 
@@ -46,12 +47,12 @@ def main() -> None:
     parser.add_argument("--photos", type=Path, required=True)
     parser.add_argument("--motion", type=Path)
     parser.add_argument("--work", type=Path, required=True, help="for samples (0.4 MB each) and the state of training")
-    parser.add_argument("--samples", type=int, default=9600)
+    parser.add_argument("--samples", type=int)
     parser.add_argument("--steps", type=int)
     parser.add_argument("--batch", type=int, default=8)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--width", type=int, default=64, help="of thesis_unet: channels at full size")
-    parser.add_argument("--begin-with", type=Path, help="state.pt of another network to begin with")
+    parser.add_argument("--attribution", type=Path, help="text for the card: whose photographs and motion these are")
     parser.add_argument("--out", type=Path, default=WEIGHTS, help="folder for NAME.onnx, its checksum and its card")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cuda" if torch.cuda.is_available() else "cpu")
     args = parser.parse_args()
@@ -62,7 +63,7 @@ def main() -> None:
             work / ("held_out" if held_out else "samples"),
             maker,
             Sources(photos=args.photos, motion=args.motion, held_out=held_out),
-            HELD_OUT if held_out else args.samples,
+            HELD_OUT if held_out else args.samples or SAMPLES[args.name],
             seed=args.seed + held_out,
             device=args.device,
             workers=cores,
@@ -72,15 +73,20 @@ def main() -> None:
     torch.set_num_threads(cores)
     torch.manual_seed(args.seed)
     network = ThesisNet(args.width) if args.name == "thesis_unet" else RestorationNet()
-    if args.begin_with is not None:
-        network.load_state_dict(torch.load(args.begin_with, map_location="cpu", weights_only=True)["average"])
     console.print(f"{args.name}: {parameters(network) / 1e6:.2f} million weights, on {args.device}")
     options = TrainOptions(steps=args.steps or STEPS[args.name], batch=args.batch, seed=args.seed)
     figures = train(network, pools[False], pools[True], work / "training", options, device=args.device)
     target = args.out / f"{args.name}.onnx"
     export(network, target)
     if isinstance(network, RestorationNet):
-        write_card(target.with_suffix(".md"), args.name, figures, samples=len(pools[False]), device=args.device)
+        write_card(
+            target.with_suffix(".md"),
+            args.name,
+            figures,
+            samples=len(pools[False]),
+            device=args.device,
+            attribution=args.attribution.read_text() if args.attribution else "Not stated.",
+        )
     console.print(f"wrote {target} ({target.stat().st_size / 1e6:.1f} MB)")
 
 

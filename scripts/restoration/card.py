@@ -11,20 +11,16 @@ import torch
 from restoration.network import DOWN, UP, WIDTHS, RestorationNet, parameters
 
 _PURPOSE = {
-    "deepgyro": "Undoes motion blur that a gyroscope knows of, with errors. Takes the blurred picture, the result of "
-    "the directional Wiener filter, and the blur of each pixel.",
-    "lsd2": "Makes one clean picture of a short, noisy exposure and a long, blurred one. Takes the short one at the "
-    "long one's brightness, the long one aligned to it, and the long one's blur where it is known.",
+    "deepgyro": """\
+Undoes motion blur that a gyroscope knows of, with errors. Takes the blurred picture, the result of the directional
+Wiener filter, and the blur of each pixel.""",
+    "lsd2": """\
+Makes one clean picture of a short, noisy exposure and a long, blurred one. Takes the short one at the long one's
+brightness, the long one aligned to it, and the long one's blur where it is known.""",
 }
-_DATA = """\
-Photographs: CID22 (Cloudinary, CC BY-SA 4.0) and CLIC 2025 (photographers on Unsplash, Unsplash licence); one in five,
-by name, was held out. Motion: ground truth of TUM-VI rooms 1 and 3 (Schubert et al. 2018, CC BY 4.0) and the package's
-simulator; room 5 was held out. Nothing else was used. Blur, rolling shutter, noise, clipping, sharpening and JPEG are
-computed (`scripts/restoration/`).
-"""
 
 
-def write_card(path: Path, name: str, figures: dict[str, Any], *, samples: int, device: str) -> None:
+def write_card(path: Path, name: str, figures: dict[str, Any], *, samples: int, device: str, attribution: str) -> None:
     """Write the card of a network, Markdown.
 
     Parameters
@@ -35,37 +31,55 @@ def write_card(path: Path, name: str, figures: dict[str, Any], *, samples: int, 
         What :func:`restoration.training.train` returned.
     samples
         How many it was trained on.
+    device
+        That trained it.
+    attribution
+        Markdown: whose photographs and motion it was trained on.
     """
     machine = torch.cuda.get_device_name() if device == "cuda" else _processor()
-    options = figures["options"]
-    rows = [
-        f"| {step} | {f['picture']} | {f['aid']} | {f['restored']} |" for step, f in figures["held_out_psnr_db"].items()
-    ]
+    options, minutes = figures["options"], figures["seconds"] / 60
     first, second = ("blurred", "Wiener") if name == "deepgyro" else ("short", "long")
+    rows = "\n".join(
+        f"| {step} | {psnr['picture']:.2f} | {psnr['aid']:.2f} | {psnr['restored']:.2f} |"
+        for step, psnr in figures["held_out_psnr_db"].items()
+    )
     path.write_text(
-        f"""# {name}
+        f"""\
+# {name}
 
 {_PURPOSE[name]}
 
-- Architecture: residual U-Net at half the picture's size, {parameters(RestorationNet()) / 1e6:.2f} million weights;
-  {WIDTHS} channels at 1/2 to 1/16, {DOWN} blocks down, {UP} up (`scripts/restoration/network.py`). Half precision on
-  disk.
-- Training: {samples} pieces of 192 x 192 px, {options["steps"]} steps of {options["batch"]}, AdamW,
-  rate {options["rate"]} along a cosine, seed {options["seed"]}; {figures["seconds"] / 60:.0f} minutes on {machine},
-  PyTorch {torch.__version__}.
-- To make it again: `python scripts/train_restoration.py {name} --photos FOLDER --motion FOLDER --work FOLDER`
-- Licence of the weights: as the package's.
+| | |
+| --- | --- |
+| architecture | residual U-Net at half the picture's size, {parameters(RestorationNet()) / 1e6:.2f} million weights |
+| channels | {", ".join(map(str, WIDTHS))} at 1/2 to 1/16; {DOWN} blocks down, {UP} up |
+| file | ONNX, weights in half precision, arithmetic in single precision |
+| trained on | {samples} pieces of 192 x 192 px, {options["steps"]} steps of {options["batch"]} |
+| by | AdamW, rate {options["rate"]} down along a cosine, seed {options["seed"]}; PyTorch {torch.__version__} |
+| took | {minutes:.0f} minutes on {machine} |
+| licence | the package's; the weights contain none of the photographs |
+
+To make it again, with folders of photographs and motion capture:
+
+```sh
+python scripts/train_restoration.py {name} --photos PHOTOS --motion MOTION --work WORK \\
+    --samples {samples} --steps {options["steps"]} --batch {options["batch"]} --seed {options["seed"]}
+```
 
 ## Data and attribution
 
-{_DATA}
-## PSNR on held-out pieces, dB (photographs and motion never trained on)
+{attribution.strip()}
+
+## PSNR on held-out pieces, dB
+
+Of photographs and motion that it was never trained on, at all strengths of blur, noise and error.
 
 | steps | {first} | {second} | restored |
 | --- | --- | --- | --- |
+{rows}
+
+What it does to whole frames, features and reconstructions: `scripts/bench_restoration.py`.
 """
-        + "\n".join(rows)
-        + "\n\nWhat it does to whole frames, features and reconstructions: `scripts/bench_restoration.py`.\n"
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -13,11 +14,14 @@ import torch
 from numpy.typing import NDArray
 from rich.progress import track
 
+from restoration.photographs import photographs
 from restoration.samples import MARGIN, SIDE, Maker, Material, Samples
 
 #: Samples that are made together: they have much the same blur, and as many instants are rendered for each.
 BATCH = 16
 _ARRAYS = ("picture", "aid", "truth", "blur")
+#: Modules whose code decides what samples look like.
+_MAKING = ("camera", "handheld", "optics", "photographs", "samples")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +68,7 @@ def make_pool(
     """
     batches = -(-count // BATCH)
     side = SIDE - 2 * MARGIN
-    made = {"maker": maker.__name__, "batches": batches, "seed": seed, "held_out": sources.held_out}
+    made = {"maker": maker.__name__, "batches": batches, "seed": seed, "recipe": _recipe(sources)}
     folder.mkdir(parents=True, exist_ok=True)
     about = folder / "pool.json"
     if about.exists() and json.loads(about.read_text()) != made:
@@ -86,6 +90,16 @@ def make_pool(
         for i in track(todo, f"samples in {folder}"):
             _make(i)
     return Pool(folder)
+
+
+def _recipe(sources: Sources) -> str:
+    """What decides samples beside their seed: the code that makes them, and what it makes them of."""
+    code = [Path(__file__).with_name(f"{name}.py") for name in _MAKING]
+    used = [*photographs(sources.photos, held_out=sources.held_out)]
+    used += [] if sources.motion is None else sorted(sources.motion.glob("*.csv"))
+    digest = hashlib.sha256(b"".join(path.read_bytes() for path in code))
+    digest.update("\n".join(f"{path.name} {path.stat().st_size}" for path in used).encode())
+    return digest.hexdigest()[:16]
 
 
 _work: tuple[Maker, Material, Path, int, str] | None = None

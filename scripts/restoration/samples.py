@@ -138,7 +138,7 @@ def lsd2_samples(material: Material, count: int, rng: np.random.Generator, devic
     light = shots.render(scene, max(12, int(1.2 * longest)), shift_px=off_px.to(device))
     clean = brief.render(scene, max(1, int(0.5 * longest)))
     truth = srgb(brief.render(scene, 1))
-    aid = _bytes(_photographed(light, rng, generator, least=0.002, most=0.01))
+    aid = _bytes(_photographed(light, rng, generator, least=0.002, most=0.03))
     # colours of the short one differ a little, and its brightness is not matched exactly
     tint = torch.tensor(1 + 0.04 * rng.standard_normal((count, 3)), dtype=torch.float32, device=device)
     tint = torch.where(_colourless(scene)[:, 0, 0], tint[:, :1], tint)
