@@ -58,6 +58,7 @@ from restoration_tables import print_report
 from restoration_weights import checksums, use_weights
 from rich.console import Console
 
+from colmap_inertial.errors import InertialError
 from colmap_inertial.imaging import wiener
 from colmap_inertial.imaging.restoration import Network, deepgyro, load_network
 from colmap_inertial.options import ReconstructOptions
@@ -104,7 +105,10 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         if args.weights:
             use_weights(args.weights, Path(folder))
-        run(args)
+        try:
+            run(args)
+        except InertialError as error:
+            raise SystemExit(f"bench_restoration: {error}") from None
 
 
 def run(args: argparse.Namespace) -> None:
