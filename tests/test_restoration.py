@@ -416,8 +416,6 @@ def test_one_network_is_not_taken_for_the_other():
 
 @pytest.fixture(params=["deepgyro", "lsd2"])
 def name(request):
-    if not shipped.folder().joinpath("checksums.json").is_file():
-        pytest.skip("this checkout has no trained networks yet")
     return request.param
 
 
@@ -446,11 +444,11 @@ def test_the_example_in_the_documentation_runs(name):
     values: dict[str, object] = {}
     exec(compile(ast.parse(code), "imaging.md", "exec"), values)
     for made, flat in ((values["sharp"], 90), (values["clean"], 0.4)):
-        assert np.abs(np.asarray(made, float) / flat - 1).max() < 0.1
+        # the outermost pixels know less
+        assert np.abs(np.asarray(made, float)[8:-8, 8:-8] / flat - 1).max() < 0.03
 
 
 def test_checksums_name_the_files_that_are_there():
     there = {file.name for file in shipped.folder().iterdir() if file.name.endswith(".onnx")}
-    if not there:
-        pytest.skip("this checkout has no trained networks yet")
+    assert there == {"deepgyro.onnx", "lsd2.onnx"}
     assert set(json.loads(shipped.folder().joinpath("checksums.json").read_text())) == there
