@@ -136,6 +136,21 @@ def test_a_stage_s_key_holds_method_and_network(blurred, weights, tmp_path):
     assert again.method == "deepgyro" and again.frame_stages()[0].method == "deepgyro"
 
 
+def test_frames_need_not_speak_for_themselves_where_a_network_treats_them(blurred, weights, tmp_path):
+    plan = plan_imaging(*parts(blurred), deblur="deepgyro", rolling_shutter=None, scratch=tmp_path, progress=silent)
+    assert plan.deblur is not None
+    decisions, verdict = plan.deblur
+    # as in a recording of which only some frames bear the gyroscope out
+    plan = replace(plan, deblur=(decisions, replace(verdict, trusted=None)))
+    loaded, *_ = parts(blurred)
+    treated = {}
+    for method in ("wiener", "deepgyro"):
+        (stage,) = replace(plan, method=method).frame_stages(drop=False)
+        names = [frame.name for frame in stage(read_frames(loaded)[1])]
+        treated[method] = {name for name in names if (said := stage.treatment(name)) and said.deblurred}
+    assert treated["wiener"] < treated["deepgyro"]
+
+
 def test_workers_share_the_network_and_make_the_same_pixels(blurred, weights, tmp_path, monkeypatch):
     plan = plan_imaging(*parts(blurred), deblur="deepgyro", rolling_shutter=None, scratch=tmp_path, progress=silent)
     (stage,) = plan.frame_stages()

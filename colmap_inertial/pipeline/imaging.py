@@ -43,8 +43,9 @@ if TYPE_CHECKING:
 _TELLING_PX = 4.0
 #: A gyroscope that is borne out by this share of them is trusted for all frames.
 _MOST_OF_THEM = 0.95
-#: Standard deviations by which a frame must bear it out by itself, where others do not: with 4, some were made worse.
-_CLEAR_SUPPORT = 7.0
+#: Standard deviations by which a frame must bear it out by itself, where others do not. With 4, the filter made some
+#: worse; the network, which sees whether the filter's result can be true, is worth using unless a frame speaks against.
+_CLEAR_SUPPORT: dict[BlurRemover, float] = {"wiener": 7.0, "deepgyro": 0.0}
 #: How often small models are made, at most, for more of the blurred frames.
 _SURVEYS = 4
 #: Frames by which the gyroscope is judged.
@@ -55,7 +56,8 @@ _JUDGED_FRAMES = 14
 class ImagingPlan:
     """What is to be done to frames and keypoints, and why.
 
-    Where frames must bear out the gyroscope by themselves, they must do so clearly.
+    Where frames must bear out the gyroscope by themselves, they must do so clearly for the filter; for the network it
+    is enough that they do not speak against it.
 
     Attributes
     ----------
@@ -86,7 +88,7 @@ class ImagingPlan:
         if self.view is None or self.deblur is None:
             return []
         decisions, verdict = self.deblur
-        gate = GateOptions() if verdict.trusted else GateOptions(min_support=_CLEAR_SUPPORT)
+        gate = GateOptions() if verdict.trusted else GateOptions(min_support=_CLEAR_SUPPORT[self.method])
         stage = DeblurStage(
             view=self.view,
             decisions=decisions,
