@@ -1,10 +1,21 @@
-"""How many threads there are, and how many linear algebra may use."""
+"""How many threads there are, work that several of them share, and how many linear algebra may use."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING, TypeVar
+
+if TYPE_CHECKING:
+    from concurrent.futures import Future
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+#: Frames in work at once: enough for a desk computer's cores, few enough for its memory.
+_MOST_FRAMES = 4
 
 
 def usable_processors() -> int:
@@ -18,6 +29,32 @@ def threads_beside(workers: int) -> int:
     Then no processor is idle, and none has two.
     """
     return max(1, usable_processors() - workers + 1)
+
+
+def frames_at_once() -> int:
+    """How many frames to work on at once: one for each processor, but few."""
+    return min(_MOST_FRAMES, usable_processors())
+
+
+def in_order(work: Callable[[Item], Result], items: Iterable[Item], *, workers: int) -> Iterator[Result]:
+    """What becomes of items, in their order; ``workers`` are in work at once, and hardly more are held.
+
+    Where the caller stops early or an item fails, those that have not begun are given up.
+    """
+    from concurrent.futures import ThreadPoolExecutor
+
+    with ThreadPoolExecutor(workers) as pool:
+        waiting: deque[Future[Result]] = deque()
+        try:
+            for item in items:
+                waiting.append(pool.submit(work, item))
+                if len(waiting) > workers:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            for future in waiting:
+                future.cancel()
 
 
 @contextmanager

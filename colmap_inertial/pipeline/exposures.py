@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,19 +23,13 @@ from colmap_inertial.model import colmap_camera
 from colmap_inertial.options import ExposureOptions
 from colmap_inertial.pipeline.frames import FrameTreatment
 from colmap_inertial.pipeline.stages import GyroView
-from colmap_inertial.threads import threads_beside, usable_processors
+from colmap_inertial.threads import frames_at_once, in_order, threads_beside
 from colmap_inertial.types import Frame, Projector
-
-if TYPE_CHECKING:
-    from concurrent.futures import Future
 
 Light = NDArray[np.float32]
 #: Makes one picture of a short exposure as bright as the long one, the long one in its geometry, and the long one's
 #: blur: all float32 sRGB 0 to 1, of one shape.
 Fuse = Callable[[Light, Light, BlurField | None], Light]
-
-#: Pairs in work at once: enough for a desk computer's cores, few enough for its memory.
-_MOST_WORKERS = 4
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -64,7 +57,7 @@ def lsd2_fuser(options: ExposureOptions | None = None) -> Fuser:
         As ``imaging.restoration.load_network``.
     """
     options = options or ExposureOptions()
-    network = load_network("lsd2", device=options.device, threads=threads_beside(_workers()))
+    network = load_network("lsd2", device=options.device, threads=threads_beside(frames_at_once()))
 
     def fuse(short: Light, long: Light, blur: BlurField | None) -> Light:
         return lsd2.fuse(short, long, blur=blur, network=network)
@@ -155,23 +148,11 @@ class ExposureStage:
 
     def __call__(self, frames: Iterator[Frame], /) -> Iterator[Frame]:
         """Fuse the pairs, in order."""
-        from concurrent.futures import ThreadPoolExecutor
-
         exposures_s = {} if self.long is None else dict(zip(self.long.names, self.long.exposure_s, strict=True))
         work = partial(self._fused, gyro=self._gyro(), long_exposures_s=exposures_s)
-        workers = self.workers or _workers()
-        with ThreadPoolExecutor(workers) as pool:
-            waiting: deque[Future[tuple[Frame, FusedPair]]] = deque()
-            try:
-                for frame in frames:
-                    waiting.append(pool.submit(work, frame))
-                    if len(waiting) > workers:
-                        yield self._finished(waiting.popleft())
-                while waiting:
-                    yield self._finished(waiting.popleft())
-            finally:
-                for future in waiting:
-                    future.cancel()
+        for frame, done in in_order(work, frames, workers=self.workers or frames_at_once()):
+            self._done[frame.name] = done
+            yield frame
 
     def treatment(self, name: str, /) -> FrameTreatment | None:
         """What was decided about a frame that went through."""
@@ -181,11 +162,6 @@ class ExposureStage:
     def pairs(self) -> tuple[FusedPair, ...]:
         """What was done with each pair, in order."""
         return tuple(self._done.values())
-
-    def _finished(self, future: Future[tuple[Frame, FusedPair]]) -> Frame:
-        frame, done = future.result()
-        self._done[frame.name] = done
-        return frame
 
     def _gyro(self) -> Callable[[str], PairGyro | None]:
         """The gyroscope's part for each name."""
@@ -236,10 +212,6 @@ class ExposureStage:
         top = np.iinfo(frame.image.dtype).max
         image: Any = np.rint(top * np.clip(light, 0, 1)).astype(frame.image.dtype)  # either of two types of pixel
         return replace(frame, image=image), replace(done, fused=True, reason=_in_words(pair, path))
-
-
-def _workers() -> int:
-    return min(_MOST_WORKERS, usable_processors())
 
 
 def _require_alike(frame: Frame, path: Path, long: NDArray[Any]) -> None:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from colmap_inertial.imaging.rolling_shutter import rectify_image
 from colmap_inertial.io.images import read_image
@@ -13,9 +12,7 @@ from colmap_inertial.model import colmap_camera
 from colmap_inertial.pipeline.colmap import Progress
 from colmap_inertial.pipeline.frames import FrameRecord, encode_image
 from colmap_inertial.pipeline.stages import RollingShutterStage
-
-if TYPE_CHECKING:
-    from concurrent.futures import Future
+from colmap_inertial.threads import in_order
 
 
 def write_rectified(
@@ -34,8 +31,6 @@ def write_rectified(
     progress
         Called with ``"rectified"``.
     """
-    from concurrent.futures import ThreadPoolExecutor
-
     view = stage.view
     motion, camera, index = view.motion(), colmap_camera(view.camera), view.index()
 
@@ -51,13 +46,6 @@ def write_rectified(
 
     names = [record.name for record in records if record.action != "dropped"]
     target.mkdir(parents=True)
-    waiting: deque[Future[None]] = deque()
-    with ThreadPoolExecutor(2) as pool:
-        for done, name in enumerate(names):
-            waiting.append(pool.submit(work, name))
-            if len(waiting) > 2:
-                waiting.popleft().result()
-            progress("rectified", done, len(names))
-        for future in waiting:
-            future.result()
-    progress("rectified", len(names), len(names))
+    progress("rectified", 0, len(names))
+    for done, _ in enumerate(in_order(work, names, workers=2), start=1):
+        progress("rectified", done, len(names))

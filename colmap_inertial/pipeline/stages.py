@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, get_args
+from typing import Any, get_args
 
 import numpy as np
 
@@ -25,7 +24,7 @@ from colmap_inertial.io.calibration import SMALLEST_READOUT_S
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.options import BlurRemover, DeblurMethod
 from colmap_inertial.pipeline.frames import FrameTreatment
-from colmap_inertial.threads import threads_beside, usable_processors
+from colmap_inertial.threads import frames_at_once, in_order, threads_beside
 from colmap_inertial.types import (
     CALIBRATION_PARAMETERS,
     Array,
@@ -37,14 +36,9 @@ from colmap_inertial.types import (
     Projector,
 )
 
-if TYPE_CHECKING:
-    from concurrent.futures import Future
-
 #: Share of the readout that acts on poses after rectification.
 _LEFT_SHARE = 0.1
 _READOUT = CALIBRATION_PARAMETERS.index("readout_s")
-#: Frames in work at once: enough for a desk computer's cores, few enough for its memory.
-_MOST_WORKERS = 4
 
 
 def require_method(method: DeblurMethod | None) -> None:
@@ -163,31 +157,23 @@ class DeblurStage:
 
     def __call__(self, frames: Iterator[Frame], /) -> Iterator[Frame]:
         """Deblur the frames, in order."""
-        from concurrent.futures import ThreadPoolExecutor
-
-        workers = self.workers or min(_MOST_WORKERS, usable_processors())
+        workers = self.workers or frames_at_once()
         remove = self._remover(workers)
         motion, camera, index = self.view.motion(), colmap_camera(self.view.camera), self.view.index()
         decision_of = {decision.name: decision for decision in self.decisions}
 
-        def treat(frame: Frame) -> tuple[Frame | None, FrameTreatment | None]:
+        def treat(frame: Frame) -> tuple[str, Frame | None, FrameTreatment | None]:
             decision = decision_of.get(frame.name)
             if decision is None:
-                return frame, None
-            return self._treated(frame, decision, motion, camera, self.view.shutter(index[frame.name]), remove)
+                return frame.name, frame, None
+            shutter = self.view.shutter(index[frame.name])
+            return frame.name, *self._treated(frame, decision, motion, camera, shutter, remove)
 
-        with ThreadPoolExecutor(workers) as pool:
-            waiting: deque[tuple[str, Future[tuple[Frame | None, FrameTreatment | None]]]] = deque()
-            try:
-                for frame in frames:
-                    waiting.append((frame.name, pool.submit(treat, frame)))
-                    if len(waiting) > workers:
-                        yield from self._finished(*waiting.popleft())
-                while waiting:
-                    yield from self._finished(*waiting.popleft())
-            finally:
-                for _, future in waiting:
-                    future.cancel()
+        for name, frame, treatment in in_order(treat, frames, workers=workers):
+            if treatment is not None:
+                self._done[name] = treatment
+            if frame is not None:
+                yield frame
 
     def treatment(self, name: str, /) -> FrameTreatment | None:
         """What was decided about a frame that went through."""
@@ -198,13 +184,6 @@ class DeblurStage:
         if self.method == "deepgyro":
             return partial(deepgyro.deblur, network=load_network("deepgyro", threads=threads_beside(workers)))
         return partial(deblur, options=DeblurOptions(threads=1))
-
-    def _finished(self, name: str, future: Future[tuple[Frame | None, FrameTreatment | None]]) -> Iterator[Frame]:
-        frame, treatment = future.result()
-        if treatment is not None:
-            self._done[name] = treatment
-        if frame is not None:
-            yield frame
 
     def _treated(
         self,
