@@ -36,8 +36,8 @@ MAKERS = {
     "lsd2": samples.lsd2_samples,
     "thesis_unet": samples.deepgyro_samples,
 }
-SAMPLES = {"deepgyro": 9600, "lsd2": 4800, "thesis_unet": 9600}
-STEPS = {"deepgyro": 12_000, "lsd2": 6_000, "thesis_unet": 12_000}
+SAMPLES = {"deepgyro": 16_000, "lsd2": 4800, "thesis_unet": 16_000}
+STEPS = {"deepgyro": 36_000, "lsd2": 6_000, "thesis_unet": 36_000}
 HELD_OUT = 128
 
 

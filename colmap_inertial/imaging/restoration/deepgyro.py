@@ -20,9 +20,9 @@ from colmap_inertial.imaging.restoration.network import Network
 
 Code = TypeVar("Code", np.uint8, np.uint16)
 
-#: Trained on blurs of up to 36 px, the network is better than the filter up to some 60 px. Of blurs longer than the
+#: Trained on blurs of up to 40 px, the network is better than the filter up to some 70 px. Of blurs longer than the
 #: second the filter's result stays, of those shorter than the first the network's; between them, blended.
-LONGEST_PX = (50.0, 70.0)
+LONGEST_PX = (60.0, 80.0)
 
 
 def deblur(image: NDArray[Code], blur: BlurField, *, network: Network) -> NDArray[Code]:
