@@ -146,7 +146,7 @@ def lsd2_samples(material: Material, count: int, rng: np.random.Generator, devic
     tinted = (clean * (tint * gain[:, None])[:, :, None, None]).clamp(0, 1)
     # half of them stored as dark as they were
     dimmed = torch.where(torch.tensor(rng.random(count) < 0.5, device=device), ratio.clamp_max(16), 1.0)
-    noisy_codes = _photographed(tinted, rng, generator, least=0.015, most=0.3, uneven=0.25, dimmed=dimmed)
+    noisy_codes = _photographed(tinted, rng, generator, least=0.015, most=0.15, uneven=0.25, dimmed=dimmed)
     picture = _bytes(noisy_codes)
     for i in np.flatnonzero(rng.random(count) < 0.2):
         # beyond the edge of the long one there is the short one
