@@ -1,0 +1,96 @@
+"""Lines of code, functions with many parameters, and stage type tests, of this checkout or of a commit.
+
+    python scripts/count_code.py [--against COMMIT] [--parameters 8]
+
+Counts lines of the package that hold code: no docstrings, comments or blank lines. With ``--against``, modules that
+COMMIT has, too, under the same or another name as git follows it, are compared, and what is new is listed apart.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import io
+import subprocess
+import tokenize
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGE = "colmap_inertial"
+_NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
+
+
+def git(*words: str) -> str:
+    """What git prints."""
+    return subprocess.run(["git", "-C", str(ROOT), *words], check=True, capture_output=True, text=True).stdout
+
+
+def code_lines(text: str) -> int:
+    """Lines that hold code."""
+    held: set[int] = set()
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if token.type not in _NO_CODE:
+            held.update(range(token.start[0], token.end[0] + 1))
+    return len(held - _docstring_lines(text))
+
+
+def _docstring_lines(text: str) -> set[int]:
+    lines: set[int] = set()
+    for node in ast.walk(ast.parse(text)):
+        for child in ast.iter_child_nodes(node):
+            if (
+                isinstance(child, ast.Expr)
+                and isinstance(child.value, ast.Constant)
+                and isinstance(child.value.value, str)
+            ):
+                lines.update(range(child.lineno, (child.end_lineno or child.lineno) + 1))
+    return lines
+
+
+def with_many_parameters(text: str, least: int) -> Iterator[tuple[str, int]]:
+    """Functions and methods with so many parameters or more; ``self`` and ``cls`` do not count."""
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            every = [a.arg for a in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)]
+            count = len([name for name in every if name not in ("self", "cls")])
+            if count >= least:
+                yield node.name, count
+
+
+def modules(commit: str | None) -> dict[str, str]:
+    """The package's Python files by path, with their text."""
+    if commit is None:
+        return {str(p.relative_to(ROOT)): p.read_text() for p in sorted((ROOT / PACKAGE).rglob("*.py"))}
+    names = [n for n in git("ls-tree", "-r", "--name-only", commit, PACKAGE).splitlines() if n.endswith(".py")]
+    return {name: git("show", f"{commit}:{name}") for name in names}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--against", metavar="COMMIT")
+    parser.add_argument("--parameters", type=int, default=8)
+    given = parser.parse_args()
+    now = modules(None)
+    lines = {name: code_lines(text) for name, text in now.items()}
+    print(f"code lines: {sum(lines.values())} in {len(now)} modules")
+    many = [(name, *found) for name, text in now.items() for found in with_many_parameters(text, given.parameters)]
+    print(f"functions with {given.parameters} or more parameters: {len(many)}")
+    for name, function, count in many:
+        print(f"  {count:3d} {function}  ({name})")
+    if given.against is None:
+        return
+    before = modules(given.against)
+    old = {name: code_lines(text) for name, text in before.items()}
+    listed = git("diff", "--name-status", "-M40%", given.against, "--", PACKAGE).splitlines()
+    added = {row.split("\t")[1] for row in listed if row.startswith("A")}
+    removed = {row.split("\t")[1] for row in listed if row.startswith("D")}
+    kept = sum(count for name, count in lines.items() if name not in added)
+    print(f"\n{given.against}: {sum(old.values())} code lines in {len(old)} modules")
+    print(f"modules that existed: {sum(old.values())} -> {kept} ({100 * (kept / sum(old.values()) - 1):+.1f} %)")
+    print("new modules: " + (", ".join(f"{n} {lines[n]}" for n in sorted(added) if n in lines) or "none"))
+    print("modules that went: " + (", ".join(f"{n} {old[n]}" for n in sorted(removed) if n in old) or "none"))
+
+
+if __name__ == "__main__":
+    main()
