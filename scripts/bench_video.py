@@ -23,7 +23,7 @@ from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.io.capture import Capture, Video
 from colmap_inertial.io.frames import read_frame_timing, read_frames
 from colmap_inertial.options import FrameOptions
-from colmap_inertial.pipeline.selection import part_of, select_frames
+from colmap_inertial.precalibrate.selection import part_of, select_frames
 from colmap_inertial.types import CameraModel, ImuRecording
 
 WIDTH, HEIGHT, FPS, FOCAL_PX = 1920, 1080, 30, 1500.0

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from colmap_inertial.drivers.capture import reconstruct
 from colmap_inertial.errors import MappingError
 from colmap_inertial.geometry import matrix_from_quat
 from colmap_inertial.gyro import GyroPath
@@ -18,7 +19,6 @@ from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.imaging.psf import predicted_blur_px
 from colmap_inertial.model import colmap_camera, read_model
 from colmap_inertial.options import ReconstructOptions
-from colmap_inertial.pipeline import reconstruct
 from colmap_inertial.simulate import MotionOptions, SceneRecipe, make_scene, read_truth, write_capture
 from colmap_inertial.types import Array, CameraTrajectory, FrameTiming
 

@@ -31,7 +31,7 @@ class _Errors(logging.Handler):
 def report_failures():
     """What went wrong with reports, which a run survives; a test that means it to happen empties the list."""
     handler = _Errors()
-    logger = logging.getLogger("colmap_inertial.pipeline.reporting")
+    logger = logging.getLogger("colmap_inertial.drivers.reporting")
     logger.addHandler(handler)
     yield handler.messages
     logger.removeHandler(handler)

@@ -19,9 +19,9 @@ from colmap_inertial.batch import BatchCapture, needs_gpu, read_manifest, run_ba
 from colmap_inertial.batch.pools import available_memory, shares_of_this_machine
 from colmap_inertial.batch.task import CaptureStatus, read_status
 from colmap_inertial.cli import main, parse
+from colmap_inertial.drivers.capture import reconstruct
 from colmap_inertial.errors import FormatError, InertialError, MissingExtraError, OutputExistsError
 from colmap_inertial.options import ReconstructOptions
-from colmap_inertial.pipeline import reconstruct
 
 
 def table(out: Path) -> dict[str, dict[str, str]]:

@@ -27,11 +27,11 @@ from colmap_inertial.io.imu import read_capture_imu, read_imu
 from colmap_inertial.io.trajectories import read_inertial_scale
 from colmap_inertial.model import Model
 from colmap_inertial.options import ScaleOptions
-from colmap_inertial.pipeline.metric import MetricStage
-from colmap_inertial.pipeline.preflight import stop_or_doubt
+from colmap_inertial.precalibrate.preflight import stop_or_doubt
 from colmap_inertial.simulate.motion import MotionKind, MotionOptions
 from colmap_inertial.simulate.recording import RecordingOptions, SimulatedRecording, simulate_recording
 from colmap_inertial.simulate.render import colmap_camera
+from colmap_inertial.stages.metric import MetricStage
 from colmap_inertial.types import CameraModel, CameraTrajectory, Frame, FrameLog, FrameTiming, ImuRecording
 
 HANDHELD = [f"D{i}" for i in (1, 3, 5, 7, 9, 11, 13, 15)]

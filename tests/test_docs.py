@@ -21,6 +21,9 @@ from test_pipeline import copy_scene
 
 from colmap_inertial.batch import read_manifest
 from colmap_inertial.cli import main, parse
+from colmap_inertial.colmap.dense import DenseResult
+from colmap_inertial.drivers.capture import reconstruct
+from colmap_inertial.drivers.result import frame_as_json, imaging_as_json
 from colmap_inertial.errors import MappingError
 from colmap_inertial.imaging.gate import RecordingVerdict
 from colmap_inertial.imaging.parallax import Parallax
@@ -32,15 +35,12 @@ from colmap_inertial.io.files import write_json
 from colmap_inertial.io.frames import read_frame_times
 from colmap_inertial.io.imu import imu_formats, read_capture_imu
 from colmap_inertial.options import ReconstructOptions
-from colmap_inertial.pipeline import reconstruct
-from colmap_inertial.pipeline.config import config_as_toml
-from colmap_inertial.pipeline.dense import DenseResult
-from colmap_inertial.pipeline.frames import FrameRecord, FrameTreatment
-from colmap_inertial.pipeline.imaging import ImagingPlan
-from colmap_inertial.pipeline.result import frame_as_json, imaging_as_json
-from colmap_inertial.pipeline.selection import Selection
-from colmap_inertial.pipeline.stages import GyroView
+from colmap_inertial.precalibrate.plan import ImagingPlan
+from colmap_inertial.precalibrate.selection import Selection
 from colmap_inertial.report import write_report
+from colmap_inertial.run.config import config_as_toml
+from colmap_inertial.stages.frame_folder import FrameRecord, FrameTreatment
+from colmap_inertial.stages.gyro_view import GyroView
 from colmap_inertial.types import CameraModel, FrameTiming
 
 ROOT = Path(__file__).parents[1]
@@ -308,7 +308,11 @@ def said(folder: Path) -> list[str]:
 def test_every_reason_in_the_text_is_one_that_is_printed():
     page = (DOCS / "filming.md").read_text()
     table = page[page.index("| reason (in part)") :].split("\n\n")[0]
-    texts = [text for folder in ("scale", "align", "pipeline") for text in said(ROOT / "colmap_inertial" / folder)]
+    texts = [
+        text
+        for folder in ("scale", "align", "run", "stages", "colmap", "precalibrate", "drivers")
+        for text in said(ROOT / "colmap_inertial" / folder)
+    ]
     phrases = [
         part.strip()
         for row in table.splitlines()[2:]

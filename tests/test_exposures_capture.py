@@ -14,8 +14,12 @@ from exposure_scenes import GAIN, LONG_S, SHORT_S, psnr_db, write_pair_capture
 from jsonschema import Draft202012Validator
 from test_pipeline import contents
 
-from colmap_inertial import pipeline
 from colmap_inertial.cli import main
+from colmap_inertial.drivers import capture as driver
+from colmap_inertial.drivers import fuse_exposures
+from colmap_inertial.drivers.capture import reconstruct
+from colmap_inertial.drivers.deblur import deblur_capture
+from colmap_inertial.drivers.fuse_exposures import fuse_exposures_captured
 from colmap_inertial.errors import (
     FormatError,
     InertialError,
@@ -29,11 +33,9 @@ from colmap_inertial.imaging.restoration import shipped
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.frames import read_frame_timing, read_frames
 from colmap_inertial.options import ExposureOptions, ReconstructOptions
-from colmap_inertial.pipeline import fuse_exposures, reconstruct, silent
-from colmap_inertial.pipeline.deblur import deblur_capture
-from colmap_inertial.pipeline.exposures import ExposureStage, Fuser
-from colmap_inertial.pipeline.frames import ExplainedStage
-from colmap_inertial.pipeline.fuse_exposures import fuse_exposures_captured
+from colmap_inertial.run.progress import silent
+from colmap_inertial.stages.exposures import ExposureStage, Fuser
+from colmap_inertial.stages.frame_folder import ExplainedStage
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -380,7 +382,7 @@ def stop(stage, done, total, /):
 
 @pytest.fixture
 def by_average(monkeypatch):
-    monkeypatch.setattr(pipeline, "lsd2_fuser", lambda options: AVERAGE)
+    monkeypatch.setattr(driver, "lsd2_fuser", lambda options: AVERAGE)
     monkeypatch.setattr(fuse_exposures, "lsd2_fuser", lambda options: AVERAGE)
 
 
@@ -439,7 +441,7 @@ def test_a_missing_partner_or_network_is_said_before_the_work(capture, tmp_path,
     def missing(*args, **options):
         raise MissingExtraError("restore", "networks run in onnxruntime")
 
-    monkeypatch.setattr("colmap_inertial.pipeline.exposures.load_network", missing)
+    monkeypatch.setattr("colmap_inertial.stages.exposures.load_network", missing)
     for command in ("reconstruct", "fuse-exposures"):
         with pytest.raises(SystemExit) as end:
             main([command, str(capture), str(tmp_path / "out")])

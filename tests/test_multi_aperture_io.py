@@ -10,6 +10,8 @@ import pycolmap
 import pytest
 from aperture_scenes import plane_views, psnr_db
 
+from colmap_inertial.drivers.capture import reconstruct
+from colmap_inertial.drivers.fuse_apertures import fuse_captured
 from colmap_inertial.errors import FormatError, InertialError, OutputExistsError
 from colmap_inertial.geometry import so3_exp
 from colmap_inertial.io.apertures import SubImages
@@ -17,10 +19,9 @@ from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.frames import read_frames
 from colmap_inertial.io.rig_calibration import read_rig_calibration
 from colmap_inertial.options import ApertureOptions, FuseAperturesOptions, ReconstructOptions
-from colmap_inertial.pipeline import reconstruct
-from colmap_inertial.pipeline.apertures import ApertureStage, fuse_captured
 from colmap_inertial.simulate import MotionOptions, SceneRecipe, ShutterCamera
 from colmap_inertial.simulate.apertures import write_aperture_capture
+from colmap_inertial.stages.apertures import ApertureStage
 from colmap_inertial.types import CameraModel
 
 ROTATION = so3_exp(np.array([0.02, -0.03, 0.01]))

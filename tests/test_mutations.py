@@ -12,8 +12,8 @@ from colmap_inertial.batch.task import CaptureStatus, read_status, with_result, 
 from colmap_inertial.io.files import write_json
 from colmap_inertial.model.similarities import read_scales, read_similarity
 from colmap_inertial.options import ReconstructOptions
-from colmap_inertial.pipeline.config import config_as_toml, read_config
-from colmap_inertial.pipeline.frames import FrameRecord, FrameTreatment, read_frame_records
+from colmap_inertial.run.config import config_as_toml, read_config
+from colmap_inertial.stages.frame_folder import FrameRecord, FrameTreatment, read_frame_records
 from colmap_inertial.types import CameraModel
 
 MUTATIONS = 60

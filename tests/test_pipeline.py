@@ -12,12 +12,12 @@ import pycolmap
 import pytest
 
 from colmap_inertial.cli import main
+from colmap_inertial.drivers.capture import reconstruct
 from colmap_inertial.errors import FormatError, InertialError, NotObservableError, OutputExistsError
 from colmap_inertial.geometry import matrix_from_quat, quat_conjugate
 from colmap_inertial.io.trajectories import read_tum
 from colmap_inertial.model import read_model
 from colmap_inertial.options import MappingOptions, ReconstructOptions
-from colmap_inertial.pipeline import reconstruct
 from colmap_inertial.simulate.truth import read_truth, true_metres_per_unit
 
 SCENE = Path(__file__).parents[1] / "example_scenes" / "desk"

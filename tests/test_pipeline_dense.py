@@ -11,13 +11,13 @@ import pytest
 from box_project import HIGH, LOW, cast, off_the_walls, rays, shared_box
 from test_pipeline_existing import contents, run
 
+from colmap_inertial.colmap import dense as dense_stage
+from colmap_inertial.drivers.project import reconstruct_project
 from colmap_inertial.errors import InertialError
 from colmap_inertial.geometry import matrix_from_quat
 from colmap_inertial.io.ply import read_ply_header
 from colmap_inertial.model import read_model
 from colmap_inertial.options import DenseOptions, ProjectOptions, ReconstructOptions
-from colmap_inertial.pipeline import dense as dense_stage
-from colmap_inertial.pipeline.existing import reconstruct_project
 
 QUICK = ReconstructOptions(dense=True, dense_options=DenseOptions(max_image_size=96), deterministic=True)
 FLAGS = ["--dense", "--dense-options.max-image-size", "96", "--deterministic"]

@@ -12,6 +12,7 @@ import pytest
 from box_project import pictures, shared_box, with_exif, write_model, write_video
 
 from colmap_inertial.cli import main
+from colmap_inertial.drivers.project import is_project, reconstruct_project
 from colmap_inertial.errors import InertialError, TimingError
 from colmap_inertial.geometry import matrix_from_quat
 from colmap_inertial.io import sensor_yaml, video_match
@@ -22,7 +23,6 @@ from colmap_inertial.io.video import decode_grey
 from colmap_inertial.io.video_match import match_to_video
 from colmap_inertial.model import read_model
 from colmap_inertial.options import ProjectOptions, ReconstructOptions
-from colmap_inertial.pipeline.existing import is_project, reconstruct_project
 from colmap_inertial.view import load_scene
 
 
@@ -443,7 +443,7 @@ def test_euroc_keyframes_mapped_by_colmap(shared_data, tmp_path, capsys):
 
 
 def test_options_that_are_left_alone_pass():
-    from colmap_inertial.pipeline.existing import _check_options
+    from colmap_inertial.drivers.project import _check_options
 
     _check_options(ReconstructOptions(deblur="off", rolling_shutter="off", seed=4, deterministic=True))
     with pytest.raises(InertialError, match=r"--mapping\.first-octave, --deblur"):

@@ -13,19 +13,22 @@ from corner_scene import CALIBRATED, LENS, CornerScene
 from test_pipeline import contents
 
 from colmap_inertial.cli import main
+from colmap_inertial.drivers.capture import prior_calibration, reconstruct
+from colmap_inertial.drivers.deblur import deblur_capture
 from colmap_inertial.errors import InertialError, NotObservableError, OutputExistsError
 from colmap_inertial.imaging.psf import blur_field
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.frames import read_frames
+from colmap_inertial.io.image_metadata import carry_metadata, stated_exposures_s
 from colmap_inertial.io.imu import read_capture_imu
 from colmap_inertial.model import colmap_camera, read_model
 from colmap_inertial.options import MappingOptions, ReconstructOptions
-from colmap_inertial.pipeline import first_look, imaging, prior_calibration, reconstruct, silent
-from colmap_inertial.pipeline.deblur import deblur_capture
-from colmap_inertial.pipeline.imaging import plan_imaging, read_plan, with_stated_exposures, write_plan
-from colmap_inertial.pipeline.metadata import carry_metadata, stated_exposures_s
-from colmap_inertial.pipeline.passing import find_parallaxes
-from colmap_inertial.pipeline.selection import part_of
+from colmap_inertial.precalibrate import calibrate as first_look
+from colmap_inertial.precalibrate import plan as imaging
+from colmap_inertial.precalibrate.plan import plan_imaging, read_plan, with_stated_exposures, write_plan
+from colmap_inertial.precalibrate.selection import part_of
+from colmap_inertial.precalibrate.translation import find_parallaxes
+from colmap_inertial.run.progress import silent
 from colmap_inertial.simulate import MotionOptions, make_motion
 
 QUICK = ReconstructOptions(mapping=MappingOptions(max_num_features=2000, first_octave=0), deterministic=True)

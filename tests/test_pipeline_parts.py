@@ -11,6 +11,11 @@ import numpy as np
 import pycolmap
 import pytest
 
+from colmap_inertial.cli.terminal import show_applied
+from colmap_inertial.colmap.sparse import check_names, image_pairs
+from colmap_inertial.drivers.models import run_models
+from colmap_inertial.drivers.reporting import report_result
+from colmap_inertial.drivers.result import ReconstructResult
 from colmap_inertial.errors import FormatError, InertialError, NotObservableError, OutputExistsError, TimingError
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.io.capture import Capture
@@ -19,13 +24,12 @@ from colmap_inertial.io.imu import read_imu
 from colmap_inertial.model import read_model
 from colmap_inertial.model.project import Applied
 from colmap_inertial.options import MappingOptions, ReconstructOptions, ScaleOptions
-from colmap_inertial.pipeline import MetricStage, ReconstructResult, run_models, silent
-from colmap_inertial.pipeline.colmap import check_names, image_pairs
-from colmap_inertial.pipeline.config import config_as_toml, read_config
-from colmap_inertial.pipeline.frames import read_frame_records, write_frames
-from colmap_inertial.pipeline.reporting import report_result
-from colmap_inertial.pipeline.terminal import show_applied
-from colmap_inertial.pipeline.workspace import StageRunner, Workspace, canonical
+from colmap_inertial.run.config import config_as_toml, read_config
+from colmap_inertial.run.progress import silent
+from colmap_inertial.run.runner import StageRunner, canonical
+from colmap_inertial.run.workspace import Workspace
+from colmap_inertial.stages.frame_folder import read_frame_records, write_frames
+from colmap_inertial.stages.metric import MetricStage
 from colmap_inertial.types import CameraModel, Frame, FrameTiming
 
 

@@ -18,6 +18,9 @@ import pytest
 from report_runs import HOSTILE, cloud, recorded, write_run
 
 from colmap_inertial.cli import main
+from colmap_inertial.drivers.capture import reconstruct
+from colmap_inertial.drivers.project import reconstruct_project
+from colmap_inertial.drivers.reporting import reporting_stops, write_recording
 from colmap_inertial.errors import FormatError, InertialError, MappingError
 from colmap_inertial.geometry import quat_exp, quat_rotate
 from colmap_inertial.io.calibration import calibration_prior
@@ -25,18 +28,16 @@ from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import write_json
 from colmap_inertial.model import trajectory_from_model
 from colmap_inertial.options import MappingOptions, ProjectOptions, ReconstructOptions
-from colmap_inertial.pipeline import reconstruct
-from colmap_inertial.pipeline.existing import reconstruct_project
-from colmap_inertial.pipeline.reporting import reporting_stops, write_recording
-from colmap_inertial.pipeline.stages import GyroView, RollingShutterStage
-from colmap_inertial.pipeline.workspace import Workspace
 from colmap_inertial.report import figures, signals, write_report
 from colmap_inertial.report.figure_3d import nice_length, scene_figure
 from colmap_inertial.report.scene import scene_record
 from colmap_inertial.report.series import MOST_POINTS, rounded, strided, thinned
 from colmap_inertial.report.signals import signal_record
 from colmap_inertial.report.words import outcome_of_model
+from colmap_inertial.run.workspace import Workspace
 from colmap_inertial.scale import estimate_scale
+from colmap_inertial.stages.gyro_view import GyroView
+from colmap_inertial.stages.rolling_shutter import RollingShutterStage
 from colmap_inertial.types import CameraModel, CameraTrajectory, FrameTiming, ImuRecording, ScaleDrift, ScaleEstimate
 
 SCENE = Path(__file__).parents[1] / "example_scenes" / "desk"
@@ -615,7 +616,7 @@ def broken(*_, **__):
 
 def test_a_report_that_fails_costs_no_result_and_is_told(project, tmp_path, monkeypatch, report_failures, capsys):
     source = ProjectOptions(imu=project.imu, frame_times=project.frame_times)
-    for place in ("report.page.page_of", "pipeline.reporting.scene_record"):
+    for place in ("report.page.page_of", "drivers.reporting.scene_record"):
         monkeypatch.setattr(f"colmap_inertial.{place}", broken)
     out = tmp_path / "out"
     arguments = ["--imu", str(project.imu), "--frame-times", str(project.frame_times)]
@@ -639,7 +640,7 @@ def test_a_failing_report_of_a_stop_hides_no_reason(tmp_path, monkeypatch, repor
     with pytest.raises(MappingError, match="nothing matches") as stopped, reporting_stops(workspace, capture):
         raise MappingError("nothing matches")
     assert stopped.value.__notes__ == [f"what was found, and what to do: {tmp_path / 'report.html'}"]
-    monkeypatch.setattr("colmap_inertial.pipeline.reporting.write_report", broken)
+    monkeypatch.setattr("colmap_inertial.drivers.reporting.write_report", broken)
     with pytest.raises(MappingError, match="nothing matches"), reporting_stops(workspace, capture):
         raise MappingError("nothing matches")
     assert len(report_failures) == 1

@@ -14,15 +14,19 @@ from test_pipeline_imaging import QUICK, parts
 
 from colmap_inertial import threads
 from colmap_inertial.cli import main
+from colmap_inertial.drivers.capture import reconstruct
+from colmap_inertial.drivers.deblur import deblur_capture
 from colmap_inertial.errors import FormatError, MissingExtraError, NotObservableError
 from colmap_inertial.imaging.restoration import shipped
 from colmap_inertial.io.frames import read_frames
-from colmap_inertial.pipeline import DeblurStage, imaging, reconstruct, silent, stages
-from colmap_inertial.pipeline.deblur import deblur_capture
-from colmap_inertial.pipeline.frames import read_frame_records
-from colmap_inertial.pipeline.imaging import plan_imaging, read_plan, write_plan
-from colmap_inertial.pipeline.workspace import canonical
+from colmap_inertial.precalibrate import plan as imaging
+from colmap_inertial.precalibrate.plan import plan_imaging, read_plan, write_plan
 from colmap_inertial.report.content import _blur
+from colmap_inertial.run.progress import silent
+from colmap_inertial.run.runner import canonical
+from colmap_inertial.stages import deblur as stages
+from colmap_inertial.stages.deblur import DeblurStage
+from colmap_inertial.stages.frame_folder import read_frame_records
 
 DEEP = replace(QUICK, deblur="deepgyro")
 

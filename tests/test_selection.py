@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from box_video import BoxVideo, film
 
+from colmap_inertial.drivers.capture import reconstruct
 from colmap_inertial.flow import VisualRotation
 from colmap_inertial.geometry import quat_conjugate, quat_log, quat_multiply
 from colmap_inertial.gyro import GyroPath
@@ -23,9 +24,8 @@ from colmap_inertial.io.frames import read_frame_timing, read_frames
 from colmap_inertial.io.imu import read_capture_imu
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.options import FrameOptions, MappingOptions, ReconstructOptions
-from colmap_inertial.pipeline import reconstruct
-from colmap_inertial.pipeline import selection as choosing
-from colmap_inertial.pipeline.selection import (
+from colmap_inertial.precalibrate import selection as choosing
+from colmap_inertial.precalibrate.selection import (
     Selection,
     _Clocks,
     everything,
@@ -36,7 +36,8 @@ from colmap_inertial.pipeline.selection import (
     use_all,
     write_selection,
 )
-from colmap_inertial.pipeline.workspace import StageRunner, Workspace
+from colmap_inertial.run.runner import StageRunner
+from colmap_inertial.run.workspace import Workspace
 from colmap_inertial.simulate import MotionOptions
 from colmap_inertial.simulate.capture import make_scene
 from colmap_inertial.simulate.imu import IMU_PRESETS
@@ -347,7 +348,7 @@ def test_folders_and_thinned_videos_are_used_as_they_are(turning, tmp_path):
 
 def test_a_quick_camera_s_frames_are_ranked_before_they_are_decoded():
     """At 240 frames a second, the least blurred of each thirtieth is looked at."""
-    from colmap_inertial.pipeline.selection import _slots
+    from colmap_inertial.precalibrate.selection import _slots
 
     t_s = np.arange(480) / 240
     blur = np.random.default_rng(0).uniform(1, 9, 480)

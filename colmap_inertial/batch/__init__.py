@@ -34,7 +34,7 @@ from colmap_inertial.batch.task import (
 from colmap_inertial.errors import OutputError, OutputExistsError
 from colmap_inertial.io.files import write_json, write_text
 from colmap_inertial.options import ReconstructOptions
-from colmap_inertial.pipeline.config import config_as_toml
+from colmap_inertial.run.config import config_as_toml
 
 #: How often finished captures are collected and progress is shown.
 _POLL_S = 0.5

@@ -10,7 +10,7 @@ from typing import Any
 from colmap_inertial.errors import FormatError
 from colmap_inertial.io.toml_section import Section, read_toml
 from colmap_inertial.options import ProjectOptions, ReconstructOptions
-from colmap_inertial.pipeline.config import read_values, with_values
+from colmap_inertial.run.config import read_values, with_values
 
 #: What the batch itself writes into its output folder.
 _RESERVED = ("status", "summary.csv", "summary.json")

@@ -15,12 +15,12 @@ from pathlib import Path
 from typing import Any
 
 from colmap_inertial.batch.task import CaptureTask, Job, failed, read_status, with_result, write_status
+from colmap_inertial.drivers.capture import reconstruct
+from colmap_inertial.drivers.project import is_project, reconstruct_project
 from colmap_inertial.errors import InertialError
 from colmap_inertial.options import ProjectOptions
-from colmap_inertial.pipeline import reconstruct
-from colmap_inertial.pipeline.config import read_config
-from colmap_inertial.pipeline.existing import is_project, reconstruct_project
-from colmap_inertial.pipeline.workspace import Workspace
+from colmap_inertial.run.config import read_config
+from colmap_inertial.run.workspace import Workspace
 
 #: The task's paths, which JSON carries as text.
 _PATHS = ("capture", "out", "config", "status", "log", "run_file")

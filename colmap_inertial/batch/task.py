@@ -23,8 +23,8 @@ from typing import Any, Literal
 from colmap_inertial.errors import FormatError, InertialError, OutputError, TargetNotFoundError
 from colmap_inertial.io.files import read_json, write_json
 from colmap_inertial.options import ProjectOptions, ReconstructOptions
-from colmap_inertial.pipeline.config import read_config
-from colmap_inertial.pipeline.workspace import Workspace
+from colmap_inertial.run.config import read_config
+from colmap_inertial.run.workspace import Workspace
 
 State = Literal["waiting", "running", "done", "failed", "interrupted"]
 

@@ -73,7 +73,7 @@ def parse(args: Sequence[str]) -> Command:
 
 def _default_from_config(cls: type[Command], args: Sequence[str]) -> Command | None:
     """The command with its options from ``--config``, so that flags go before the file and the file before defaults."""
-    from colmap_inertial.pipeline.config import read_config
+    from colmap_inertial.run.config import read_config
 
     path = None
     for i, text in enumerate(args):

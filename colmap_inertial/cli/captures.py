@@ -44,9 +44,9 @@ class Reconstruct:
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.pipeline import reconstruct
-        from colmap_inertial.pipeline.existing import is_project, reconstruct_project
-        from colmap_inertial.pipeline.terminal import live_progress, show_result
+        from colmap_inertial.cli.terminal import live_progress, show_result
+        from colmap_inertial.drivers.capture import reconstruct
+        from colmap_inertial.drivers.project import is_project, reconstruct_project
 
         with live_progress() as progress:
             if self.project != ProjectOptions() or is_project(self.capture):
@@ -84,8 +84,8 @@ class Deblur:
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.pipeline.deblur import deblur_capture
-        from colmap_inertial.pipeline.terminal import live_progress, show_deblurred
+        from colmap_inertial.cli.terminal import live_progress, show_deblurred
+        from colmap_inertial.drivers.deblur import deblur_capture
 
         with live_progress() as progress:
             result = deblur_capture(
@@ -123,8 +123,8 @@ class FuseApertures:
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.pipeline.apertures import fuse_captured
-        from colmap_inertial.pipeline.terminal import live_progress
+        from colmap_inertial.cli.terminal import live_progress
+        from colmap_inertial.drivers.fuse_apertures import fuse_captured
 
         options = FuseAperturesOptions(fusion=self.fusion, refocus=self.refocus, lens_width=self.lens_width)
         with live_progress() as progress:
@@ -157,8 +157,8 @@ class FuseExposures:
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.pipeline.fuse_exposures import fuse_exposures_captured
-        from colmap_inertial.pipeline.terminal import live_progress
+        from colmap_inertial.cli.terminal import live_progress
+        from colmap_inertial.drivers.fuse_exposures import fuse_exposures_captured
 
         options = ExposureOptions(fusion=self.fusion, device=self.device)
         with live_progress() as progress:
@@ -242,7 +242,7 @@ class Simulate:
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.pipeline.terminal import live_progress
+        from colmap_inertial.cli.terminal import live_progress
         from colmap_inertial.simulate.capture import write_capture
         from colmap_inertial.simulate.recipe import load_recipe
 

@@ -48,8 +48,8 @@ class Scale:
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.pipeline.sources import ScaleSource, scale_source
-        from colmap_inertial.pipeline.terminal import show_scale
+        from colmap_inertial.cli.terminal import show_scale
+        from colmap_inertial.drivers.sources import ScaleSource, scale_source
 
         estimate = scale_source(
             ScaleSource(source=self.source, imu=self.imu, frame_times=self.frame_times, calibration=self.calibration),
@@ -104,9 +104,9 @@ class Apply:
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
+        from colmap_inertial.cli.terminal import live_progress, show_applied
         from colmap_inertial.model.project import apply_to_project, undo_project
         from colmap_inertial.model.similarities import plain_factor, read_scales, read_similarity
-        from colmap_inertial.pipeline.terminal import live_progress, show_applied
 
         scales: Any
         with live_progress() as progress:
@@ -153,8 +153,8 @@ class Align:
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.pipeline.sources import ScaleSource, align_source
-        from colmap_inertial.pipeline.terminal import show_calibration
+        from colmap_inertial.cli.terminal import show_calibration
+        from colmap_inertial.drivers.sources import ScaleSource, align_source
 
         source = ScaleSource(
             source=self.source, imu=self.imu, frame_times=self.frame_times, calibration=self.calibration
@@ -185,9 +185,9 @@ class Diagnose:
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.pipeline.preflight import diagnose_source
-        from colmap_inertial.pipeline.sources import ScaleSource
-        from colmap_inertial.pipeline.terminal import live_progress, show_diagnosis
+        from colmap_inertial.cli.terminal import live_progress, show_diagnosis
+        from colmap_inertial.drivers.diagnosis import diagnose_source
+        from colmap_inertial.drivers.sources import ScaleSource
 
         source = ScaleSource(
             source=self.source, imu=self.imu, frame_times=self.frame_times, calibration=self.calibration
@@ -232,8 +232,8 @@ class Validate:
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.pipeline.sources import validate_source
-        from colmap_inertial.pipeline.terminal import show_validation
+        from colmap_inertial.cli.terminal import show_validation
+        from colmap_inertial.drivers.sources import validate_source
 
         result = validate_source(
             self.model,

@@ -14,10 +14,10 @@ from colmap_inertial.geometry import matrix_from_quat
 from colmap_inertial.imaging._transfer import decode_table, srgb_from_linear
 from colmap_inertial.io.files import write_text
 from colmap_inertial.io.images import read_image
-from colmap_inertial.pipeline.frames import encode_image
 from colmap_inertial.simulate.capture import write_capture
 from colmap_inertial.simulate.recipe import SceneRecipe
 from colmap_inertial.simulate.render import ShutterCamera
+from colmap_inertial.stages.frame_folder import encode_image
 from colmap_inertial.types import SpectralRole
 
 #: Weights of linear RGB in luminance (ITU-R BT.709).

@@ -14,7 +14,7 @@ from colmap_inertial.geometry import quat_rotate
 from colmap_inertial.io.files import read_json
 from colmap_inertial.model import TRANSFORM_FILE, find_models, is_metric, model_format
 from colmap_inertial.model.similarities import similarity_from_json
-from colmap_inertial.pipeline.workspace import Workspace, a_record_of_ours
+from colmap_inertial.run.workspace import Workspace, a_record_of_ours
 from colmap_inertial.scale.verdict import Z95
 from colmap_inertial.types import Array
 from colmap_inertial.types.recorded import LengthUnit

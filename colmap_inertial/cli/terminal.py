@@ -1,0 +1,245 @@
+"""What the command line shows: progress, and one screen at the end."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from colmap_inertial.diagnose import Diagnosis
+from colmap_inertial.drivers.deblur import DeblurResult
+from colmap_inertial.drivers.result import ReconstructResult
+from colmap_inertial.errors import InertialError
+from colmap_inertial.model.project import Applied
+from colmap_inertial.precalibrate.plan import ImagingPlan
+from colmap_inertial.run.progress import Progress
+from colmap_inertial.stages.frame_folder import FrameRecord
+from colmap_inertial.types import CameraImuCalibration, ScaleEstimate
+from colmap_inertial.validate import Validation, validation_table
+
+if TYPE_CHECKING:
+    from rich.text import Text
+
+#: A label and what there is to say.
+Line = tuple[str, "str | Text"]
+
+_STAGES = {
+    "rendering": "Rendering",
+    "video": "Video frames",
+    "motion": "Camera motion",
+    "clocks": "Clocks",
+    "selection": "Selection",
+    "calibration": "Calibration",
+    "survey": "Small models",
+    "blur": "Blur",
+    "frames": "Frames",
+    "fusing": "Fused",
+    "features": "Features",
+    "matches": "Matches",
+    "mapping": "Mapping",
+    "rectified": "Rectified",
+    "metric": "Metric scale",
+    "validation": "Validation",
+    "apply": "Files",
+    "dense": "Dense",
+}
+_SEVERITY_COLOUR = {"info": "blue", "warning": "yellow", "error": "red"}
+_COLOUR = {"trusted": "green", "weak": "yellow", "refused": "red"}
+
+
+@contextlib.contextmanager
+def live_progress() -> Iterator[Progress]:
+    """A bar for each stage on standard error; plain lines where that is no terminal."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bars
+
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description:<13}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    tasks = {}
+    with Bars(*columns, console=console, disable=not console.is_terminal) as bars:
+
+        def progress(stage: str, done: int, total: int, /) -> None:
+            name = _STAGES.get(stage, stage)
+            if stage not in tasks:
+                tasks[stage] = bars.add_task(name, total=total)
+                if not console.is_terminal:
+                    console.print(f"{name} ...")
+            bars.update(tasks[stage], completed=done, total=total)
+
+        yield progress
+
+
+def scale_lines(estimate: ScaleEstimate) -> list[Line]:
+    """The estimate as labelled lines."""
+    from rich.text import Text
+
+    lines: list[Line] = [("Verdict", Text(estimate.verdict, f"bold {_COLOUR[estimate.verdict]}"))]
+    if estimate.metres_per_unit is not None and estimate.ci95 is not None:
+        low, high = estimate.ci95
+        half_width = 50 * (high - low) / estimate.metres_per_unit
+        lines.append(("Scale", f"{estimate.metres_per_unit:.6g} m per unit, +-{half_width:.2g} % (95 %)"))
+        lines.append(("Interval", f"{low:.6g} to {high:.6g} m per unit"))
+    lines += [("Reason" if i == 0 else "", text) for i, text in enumerate(estimate.reasons)]
+    calibration = estimate.calibration
+    if calibration is not None:
+        gyro, accel = calibration.gyro_time_offset_s, calibration.accel_time_offset_s
+        lines.append(
+            ("Time offset", f"gyro {gyro:+.4f} s, accelerometer {accel:+.4f} s (camera time = stamp + offset)")
+        )
+        bias = ", ".join(f"{value:+.4f}" for value in calibration.gyro_bias_rad_s)
+        lines.append(("Gyro bias", f"{bias} rad/s"))
+    if estimate.accel_bias_m_s2 is not None:
+        bias = ", ".join(f"{value:+.3f}" for value in estimate.accel_bias_m_s2)
+        lines.append(("Accel. bias", f"{bias} m/s2"))
+    return lines
+
+
+def _show(title: str, lines: Sequence[Line]) -> None:
+    from rich.console import Console
+    from rich.panel import Panel
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table.grid(padding=(0, 2))
+    table.add_column(style="dim", no_wrap=True)
+    table.add_column(overflow="fold")
+    for label, text in lines:
+        # not as markup: square brackets of paths and tables are meant
+        table.add_row(label, Text(text) if isinstance(text, str) else text)
+    Console().print(Panel(table, title=Text(title), title_align="left", expand=False))
+
+
+def show_scale(estimate: ScaleEstimate, source: Path) -> None:
+    """Print one scale estimate."""
+    _show(str(source), [*scale_lines(estimate), ("Method", f"{estimate.method}, {estimate.runtime_s:.2f} s")])
+
+
+def show_applied(applied: Applied) -> None:
+    """Print what was done to a project: each sub-model's scale, and what changed by kind."""
+    from rich.text import Text
+
+    lines: list[Line] = []
+    for index, (folder, scale) in applied.models.items():
+        done = "kept its own units" if scale.similarity is None else f"lengths times {scale.similarity.scale:.6g}"
+        said = Text(f"{folder}: {done}")
+        if scale.verdict is not None:
+            said.append_text(Text.assemble(" (", (scale.verdict, f"bold {_COLOUR[scale.verdict]}"), ")"))
+        lines.append((f"Model {index}", said))
+        lines += [("", reason) for reason in scale.reasons if scale.similarity is None]
+    kinds: dict[str, list[str]] = {}
+    for change in applied.changes:
+        kinds.setdefault(change.kind, []).append(f"{change.path} ({', '.join(change.changed)})")
+    for kind, paths in kinds.items():
+        more = f" and {len(paths) - 1} more" if len(paths) > 1 else ""
+        lines.append((kind.capitalize(), f"{paths[0]}{more}"))
+    lines.append(("Unchanged", ", ".join(f"{n} {how}" for how, n in applied.unchanged.items()) or "nothing"))
+    lines += [("Note", note) for note in applied.notes]
+    lines.append(("Written", str(applied.out)))
+    _show("Project", lines)
+
+
+def show_calibration(calibration: CameraImuCalibration, source: Path) -> None:
+    """Print what an alignment found, with standard deviations."""
+    rotation = ", ".join(f"{value:+.5f}" for value in calibration.cam_from_imu_xyzw)
+    spread_deg = max(math.degrees(calibration.sigma(f"rotation_{axis}_rad")) for axis in "xyz")
+    bias = ", ".join(f"{value:+.4f}" for value in calibration.gyro_bias_rad_s)
+    bias_spread = max(calibration.sigma(f"gyro_bias_{axis}_rad_s") for axis in "xyz")
+    offset, offset_ms = calibration.gyro_time_offset_s, 1e3 * calibration.sigma("gyro_time_offset_s")
+    _show(
+        str(source),
+        [
+            ("Rotation", f"camera from IMU, xyzw: {rotation}, +-{spread_deg:.2g} deg"),
+            ("Time offset", f"{offset:+.4f} s, +-{offset_ms:.2g} ms (camera time = stamp + offset)"),
+            ("Gyro bias", f"{bias} rad/s, +-{bias_spread:.2g}"),
+        ],
+    )
+
+
+def show_diagnosis(diagnosis: Diagnosis, source: Path) -> None:
+    """Print findings, worst first."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    checked = ", ".join(diagnosis.checked) or "nothing"
+    console = Console()
+    if not diagnosis.findings:
+        console.print(f"{escape(str(source))}: nothing found (looked at: {checked})")
+        return
+    table = Table(title=f"{escape(str(source))} (looked at: {checked})", title_justify="left", show_lines=True)
+    for column in ("Severity", "Code", "Found", "What to do"):
+        table.add_column(column, overflow="fold", no_wrap=column in ("Severity", "Code"))
+    for finding in diagnosis.findings:
+        colour = _SEVERITY_COLOUR[finding.severity]
+        severity = f"[bold {colour}]{finding.severity}[/]"
+        table.add_row(severity, finding.code, escape(finding.evidence), escape(finding.advice))
+    console.print(table)
+
+
+def show_validation(result: Validation) -> None:
+    """Print a validation."""
+    from rich.console import Console
+
+    Console().print(validation_table(result))
+
+
+def imaging_lines(frames: Sequence[FrameRecord], plan: ImagingPlan) -> list[Line]:
+    """What was done to the frames, as labelled lines."""
+    counts = {action: sum(frame.action == action for frame in frames) for action in ("deblurred", "dropped")}
+    done = ", ".join(f"{count} {action}" for action, count in counts.items() if count)
+    view = plan.view
+    lines: list[Line] = [
+        ("Deblurring", f"{done} of {len(frames)} frames: {plan.deblur_note}" if done else plan.deblur_note),
+        ("Shutter", plan.rolling_shutter_note),
+    ]
+    return [*lines, *(("", note) for note in (() if view is None else view.notes))]
+
+
+def show_deblurred(result: DeblurResult) -> None:
+    """Print what became of the images."""
+    written = [result.workspace.images, result.workspace.result]
+    if result.workspace.images_rectified.is_dir():
+        written.insert(1, result.workspace.images_rectified)
+    if result.sheet is not None:
+        written.append(result.sheet)
+    lines = imaging_lines(result.frames, result.imaging)
+    _show("Images", [*lines, *(("Written" if i == 0 else "", str(path)) for i, path in enumerate(written))])
+
+
+def show_result(result: ReconstructResult) -> None:
+    """Print the end of a reconstruction on one screen."""
+    frames = result.frames
+    used = sum(record.action != "dropped" for record in frames)
+    registered = f" of {used} registered ({len(frames)} frames)" if frames else ""
+    for model in result.models:
+        summary = model.summary
+        lines: list[Line] = [
+            ("Images", f"{summary['registered_images']}{registered}"),
+            ("Points", f"{summary['points']}, mean reprojection error {summary['mean_reprojection_error_px']:.2f} px"),
+            *(imaging_lines(frames, result.imaging) if frames else []),
+            *scale_lines(model.scale),
+        ]
+        if isinstance(model.validation, Validation) and model.validation.ci95_pct is not None:
+            low, high = model.validation.ci95_pct
+            error = f"{model.validation.scale_error_pct:+.2f} % (95 %: {low:+.2f} to {high:+.2f})"
+            lines.append(("Target", f"{model.validation.target.spec}: scale error {error}"))
+        elif isinstance(model.validation, InertialError):
+            lines.append(("Target", str(model.validation)))
+        dense = model.dense
+        made = [] if dense is None else [dense.fused, dense.mesh]
+        if dense is not None and not dense.waiting:
+            maps = f"{dense.depth_maps} depth maps of {dense.images} images"
+            lines.append(("Dense", f"{maps}, {dense.points} points, {dense.faces} faces"))
+        paths = (model.sparse_metric, model.trajectory, *made, result.project_metric)
+        written = [path for path in paths if path is not None]
+        lines += [
+            ("Written" if i == 0 else "", str(path))
+            for i, path in enumerate([*written, result.workspace.result, *([result.report] if result.report else [])])
+        ]
+        if result.report is None:
+            lines.append(("Report", f"failed, see {result.workspace.log}"))
+        lines.append(("Time", ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in result.seconds.items())))
+        _show(f"Model {model.index}", lines)

@@ -1,0 +1,1 @@
+"""COLMAP's own steps: features, matches, mapping, dense."""

@@ -1,0 +1,280 @@
+"""COLMAP's own stages: features, matches, mapping, with progress and nothing left half-written."""
+
+from __future__ import annotations
+
+import itertools
+import shutil
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from colmap_inertial.errors import FormatError, MappingError
+from colmap_inertial.model import colmap_camera, read_model
+from colmap_inertial.options import MappingOptions
+from colmap_inertial.run.progress import Progress
+from colmap_inertial.run.workspace import require_room
+from colmap_inertial.stages.protocols import KeypointStage
+from colmap_inertial.types import Array, CameraModel
+
+if TYPE_CHECKING:
+    import pycolmap
+
+#: Up to this many images every pair is matched; above it, neighbours in time.
+_EXHAUSTIVE_UP_TO = 150
+_EXTRACTION_BATCH = 16
+_MATCHING_BATCH = 400
+#: What a feature takes in the database at most, several orientations and SQLite's log included; likewise a pair.
+_FEATURE_BYTES = 500
+_PAIR_BYTES = 100_000
+
+
+def check_names(names: Sequence[str]) -> None:
+    """Raise ``FormatError`` for an image name that COLMAP's lists of pairs cannot hold."""
+    for name in names:
+        if len(name.split()) != 1 or name.startswith("#"):
+            raise FormatError(
+                Path(name), "COLMAP's lists of pairs cannot hold such a file name; rename it without spaces"
+            )
+
+
+def image_pairs(names: Sequence[str], options: MappingOptions) -> list[tuple[str, str]]:
+    """The pairs to match, by names in order of time."""
+    exhaustive = options.pairing == "exhaustive" or (options.pairing == "auto" and len(names) <= _EXHAUSTIVE_UP_TO)
+    if exhaustive:
+        return list(itertools.combinations(names, 2))
+    steps = set(range(1, options.overlap + 1))
+    steps |= {2**k for k in range(len(names).bit_length())}
+    return [(names[i], names[i + step]) for i in range(len(names)) for step in sorted(steps) if i + step < len(names)]
+
+
+def extract_features(
+    images: Path,
+    cameras: Mapping[str, CameraModel | None],
+    database: Path,
+    options: MappingOptions,
+    *,
+    keypoint_stages: Sequence[KeypointStage] = (),
+    num_threads: int = -1,
+    seed: int = 0,
+    progress: Progress,
+) -> None:
+    """SIFT on all images, one COLMAP camera for each distinct set of intrinsics, then the keypoint stages.
+
+    Parameters
+    ----------
+    images
+        Folder with the images.
+    cameras
+        Intrinsics by image name; ``None`` lets COLMAP guess them (from EXIF, else from the image size).
+    database
+        A path that does not exist yet.
+    """
+    import pycolmap
+
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.use_gpu = False
+    extraction.num_threads = num_threads
+    if options.max_image_size is not None:
+        extraction.max_image_size = options.max_image_size
+    extraction.sift.max_num_features = options.max_num_features
+    extraction.sift.first_octave = options.first_octave
+    pycolmap.set_random_seed(seed)
+    groups: dict[CameraModel | None, list[str]] = {}
+    for name, camera in cameras.items():
+        groups.setdefault(_intern(camera, groups), []).append(name)
+    done = 0
+    for camera, names in groups.items():
+        reader = pycolmap.ImageReaderOptions()
+        if camera is not None:
+            colmap_camera(camera)  # raises on wrong parameters before any work
+            reader.camera_model = camera.model
+            reader.camera_params = ",".join(repr(p) for p in camera.params)
+        for batch in _batches(sorted(names), _EXTRACTION_BATCH):
+            progress("features", done, len(cameras))
+            require_room(database.parent, len(batch) * options.max_num_features * _FEATURE_BYTES)
+            pycolmap.extract_features(
+                str(database),
+                str(images),
+                image_names=batch,
+                camera_mode=pycolmap.CameraMode.SINGLE,
+                reader_options=reader,
+                extraction_options=extraction,
+                device=pycolmap.Device.cpu,
+            )
+            with pycolmap.Database.open(str(database)) as opened:
+                first = opened.read_image_with_name(batch[0])
+                if first is None:
+                    raise MappingError(f"COLMAP could not read {images / batch[0]}")
+                reader.existing_camera_id = first.camera_id
+            done += len(batch)
+    progress("features", done, len(cameras))
+    if keypoint_stages:
+        _move_keypoints(database, keypoint_stages)
+
+
+def _intern(camera: CameraModel | None, known: Mapping[CameraModel | None, list[str]]) -> CameraModel | None:
+    """The equal camera among the known ones, so that frames of one device share one COLMAP camera."""
+    return next((k for k in known if k is not None and camera is not None and vars(k) == vars(camera)), camera)
+
+
+def _batches(items: Sequence[str], size: int) -> list[list[str]]:
+    return [list(items[i : i + size]) for i in range(0, len(items), size)]
+
+
+def _move_keypoints(database: Path, stages: Sequence[KeypointStage]) -> None:
+    import pycolmap
+
+    with pycolmap.Database.open(str(database)) as opened:
+        for image in opened.read_all_images():
+            keypoints = np.array(opened.read_keypoints(image.image_id))
+            xy_px = keypoints[:, :2].astype(np.float64)
+            for stage in stages:
+                moved = np.asarray(stage(image.name, xy_px), dtype=np.float64)
+                if moved.shape != xy_px.shape or not np.isfinite(moved).all():
+                    raise ValueError(
+                        f"keypoint stage {stage!r} must return finite (N, 2) coordinates, got {moved.shape}"
+                    )
+                xy_px = moved
+            keypoints[:, :2] = xy_px
+            opened.update_keypoints(image.image_id, keypoints)
+
+
+def match_features(
+    features: Path,
+    database: Path,
+    pairs: Sequence[tuple[str, str]],
+    *,
+    num_threads: int = -1,
+    seed: int = 0,
+    progress: Progress,
+) -> None:
+    """Match and verify the pairs in a copy of the features' database."""
+    import pycolmap
+
+    shutil.copyfile(features, database)
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.use_gpu = False
+    matching.num_threads = num_threads
+    pycolmap.set_random_seed(seed)
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = seed
+    lines = [f"{a} {b}" for a, b in pairs]
+    with tempfile.TemporaryDirectory() as folder:
+        listed = Path(folder) / "pairs.txt"
+        for i, batch in enumerate(_batches(lines, _MATCHING_BATCH)):
+            progress("matches", i * _MATCHING_BATCH, len(pairs))
+            require_room(database.parent, len(batch) * _PAIR_BYTES)
+            listed.write_text("\n".join(batch) + "\n")
+            pycolmap.match_image_pairs(
+                str(database),
+                matching_options=matching,
+                pairing_options=pycolmap.ImportedPairingOptions(match_list_path=str(listed)),
+                verification_options=verification,
+                device=pycolmap.Device.cpu,
+            )
+    progress("matches", len(pairs), len(pairs))
+
+
+def map_images(
+    database: Path,
+    images: Path,
+    sparse: Path,
+    options: MappingOptions,
+    *,
+    refine_intrinsics: bool,
+    num_images: int,
+    num_threads: int = -1,
+    seed: int = 0,
+    progress: Progress,
+) -> None:
+    """Run COLMAP's mapper; models are written to ``sparse/0``, ``sparse/1``, ...
+
+    Raises
+    ------
+    MappingError
+        When no model comes out.
+    """
+    import pycolmap
+
+    pycolmap.set_random_seed(seed)
+    sparse.mkdir(parents=True)
+    require_room(sparse, database.stat().st_size)
+    progress("mapping", 0, num_images)
+    if options.mapper == "incremental":
+        models = pycolmap.incremental_mapping(
+            str(database),
+            str(images),
+            str(sparse),
+            options=_incremental_options(refine_intrinsics, num_threads, seed),
+            next_image_callback=_counter(progress, num_images),
+        )
+    else:
+        models = pycolmap.global_mapping(
+            str(database),
+            str(images),
+            str(sparse),
+            options=_global_options(options, refine_intrinsics, num_threads, seed),
+        )
+    progress("mapping", num_images, num_images)
+    for folder in sparse.iterdir():
+        read_model(folder)  # COLMAP does not say when it could not write one whole
+    if not models:
+        raise MappingError(
+            "COLMAP found no model: too few matches between the frames. Film with more overlap, more texture or less "
+            "blur, or try --mapping.pairing exhaustive"
+        )
+
+
+def _counter(progress: Progress, total: int) -> Callable[[], None]:
+    count = itertools.count(1)
+
+    def registered() -> None:
+        progress("mapping", min(next(count), total), total)
+
+    return registered
+
+
+def _incremental_options(refine: bool, num_threads: int, seed: int) -> pycolmap.IncrementalPipelineOptions:
+    import pycolmap
+
+    pipeline = pycolmap.IncrementalPipelineOptions()
+    pipeline.num_threads = num_threads
+    pipeline.random_seed = seed
+    pipeline.ba_refine_focal_length = refine
+    pipeline.ba_refine_extra_params = refine
+    pipeline.mapper.abs_pose_refine_focal_length = refine
+    pipeline.mapper.abs_pose_refine_extra_params = refine
+    return pipeline
+
+
+def _global_options(
+    options: MappingOptions, refine: bool, num_threads: int, seed: int
+) -> pycolmap.GlobalPipelineOptions:
+    import pycolmap
+
+    pipeline = pycolmap.GlobalPipelineOptions()
+    pipeline.num_threads = num_threads
+    pipeline.random_seed = seed
+    pipeline.mapper.bundle_adjustment.refine_focal_length = refine
+    pipeline.mapper.bundle_adjustment.refine_extra_params = refine
+    pipeline.mapper.rotation_averaging.use_gravity = options.gravity_priors
+    return pipeline
+
+
+def write_gravity_priors(database: Path, gravity_in_cam: Mapping[str, Array]) -> None:
+    """Give images their gravity direction (down, camera frame) as COLMAP pose priors."""
+    import pycolmap
+
+    if not gravity_in_cam:
+        return
+    with pycolmap.Database.open(str(database)) as opened:
+        for image in opened.read_all_images():
+            direction = gravity_in_cam.get(image.name)
+            if direction is not None:
+                prior = pycolmap.PosePrior()
+                prior.gravity = direction / np.linalg.norm(direction)
+                prior.corr_data_id = image.data_id
+                opened.write_pose_prior(prior)

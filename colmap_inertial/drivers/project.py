@@ -1,0 +1,389 @@
+"""``reconstruct`` on a project that COLMAP has made already: no mapping, everything else."""
+
+from __future__ import annotations
+
+import dataclasses
+import fnmatch
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import get_args
+
+from colmap_inertial import __version__
+from colmap_inertial.drivers.capture import default_model_stages, prior_calibration
+from colmap_inertial.drivers.models import run_models, validated, with_dense
+from colmap_inertial.drivers.reporting import report_result, write_recording
+from colmap_inertial.drivers.result import ModelResult, ReconstructResult
+from colmap_inertial.errors import AlreadyMetricError, FormatError, InertialError, OutputError, TimingError
+from colmap_inertial.io.calibration import calibration_prior
+from colmap_inertial.io.capture import Capture, Video, load_capture
+from colmap_inertial.io.exif import stamps_of_exif
+from colmap_inertial.io.files import read_json, write_json, write_text
+from colmap_inertial.io.frame_times import FrameStamps, stamps_of_pattern
+from colmap_inertial.io.frames import read_frame_times, read_frame_timing
+from colmap_inertial.io.image_metadata import stated_exposures_s
+from colmap_inertial.io.imu import is_capture, read_capture_imu, read_imu
+from colmap_inertial.io.recorders import find_recording
+from colmap_inertial.io.video import video_stamps_ns
+from colmap_inertial.io.video_match import match_to_video
+from colmap_inertial.model import is_metric, model_format, read_model
+from colmap_inertial.model.copying import list_tree
+from colmap_inertial.model.layout import read_layout
+from colmap_inertial.model.project import apply_to_project
+from colmap_inertial.model.similarities import ModelScale
+from colmap_inertial.options import ProjectOptions, ReconstructOptions
+from colmap_inertial.report import require_plotly
+from colmap_inertial.run.config import config_as_toml
+from colmap_inertial.run.progress import Progress, silent
+from colmap_inertial.run.runner import StageRunner, fingerprint
+from colmap_inertial.run.session import logging_to
+from colmap_inertial.run.workspace import Workspace
+from colmap_inertial.types import FrameTiming, ImuRecording, ReadoutDirection, Similarity
+from colmap_inertial.validate import parse_target
+
+log = logging.getLogger(__name__)
+
+#: With fewer of the images found in the video, it is not theirs.
+_LEAST_SHARE = 0.5
+#: Digits of EXIF's fraction of a second that are as good as milliseconds.
+_FINE_DIGITS = 3
+_HOW_TIMES = (
+    "give --frame-times (a CSV with name,t_s), --name-times (times in the file names), --exif-times, or --video (the "
+    "one that the images were taken from)"
+)
+
+
+def is_project(path: Path) -> bool:
+    """Whether ``path`` holds a COLMAP model where a project has it, and is no capture by itself."""
+    if not _has_model(path):
+        return False
+    try:
+        load_capture(path)
+    except FormatError:
+        return not is_capture(path)
+    return False
+
+
+def _has_model(path: Path) -> bool:
+    places = (path, path / "sparse")
+    return any(
+        model_format(folder) is not None
+        or (folder.is_dir() and any(p.name.isdigit() and model_format(p) is not None for p in folder.iterdir()))
+        for folder in places
+    )
+
+
+def reconstruct_project(
+    project: Path,
+    out: Path,
+    source: ProjectOptions,
+    options: ReconstructOptions = ReconstructOptions(),
+    *,
+    progress: Progress = silent,
+) -> ReconstructResult:
+    """Make an existing COLMAP project metric, gravity along an axis, with everything that was made from it.
+
+    Parameters
+    ----------
+    project
+        A folder with a COLMAP model; it is only read.
+    out
+        A folder that does not exist, or holds an unfinished run on the same project, which is then continued.
+        ``sparse_metric/``, ``trajectory.tum`` and ``result.json`` are those of :func:`reconstruct`;
+        ``project_metric/`` is the whole project in metres.
+    source
+        The recording that ran along, and when the images were taken.
+    options
+        Those of mapping and of pixels must be left alone: the model is what it is.
+    progress
+        Called with stage, steps done and steps in all.
+
+    Raises
+    ------
+    FormatError, TimingError
+        For what is missing or cannot be read, naming the flag to give.
+    AlreadyMetricError
+        When the project carries a similarity of ours.
+    OutputError, OutputExistsError
+        When ``out`` holds something else, or lies in the project.
+    """
+    if not _has_model(project):
+        raise FormatError(
+            project,
+            "holds no COLMAP model (sparse/ or a model folder), and --imu and the like belong to one: leave them out "
+            "for a capture, which describes itself",
+        )
+    require_plotly()
+    _check_options(options)
+    given = _given(project, source, options)
+    prior_calibration(given.capture, options)  # a wrong file is said before the work, not after it
+    target = None if given.capture.target is None else parse_target(given.capture.target)
+    models = _models(project, out, source.keep)
+    images = _images(project, source, needed=options.dense or source.exif_times or source.video is not None)
+    workspace = Workspace(out)
+    workspace.open(project)
+    with workspace.locked(), logging_to(workspace.log):
+        log.info("colmap-inertial %s: %s -> %s", __version__, project, out)
+        write_text(workspace.config, config_as_toml(options))
+        runner = StageRunner(workspace)
+        timing, notes = _run_times(runner, workspace, given, models, images, progress)
+        stages = default_model_stages(given.capture, given.imu, options)
+        results = run_models(workspace, timing, given.imu, stages, runner, progress, found=models)
+        if target is not None and images is None:
+            notes = (*notes, "the target was not measured: the project has no images/; give --images DIR")
+        results = tuple(_noted(result, notes) for result in results)
+        if target is not None and images is not None:
+            results = validated(workspace, results, target, images, progress)
+        metric = _run_apply(runner, workspace, project, source, options, results, progress)
+        if options.dense and images is not None:
+            results = with_dense(runner, workspace, results, images, options, progress)
+        result = ReconstructResult(
+            workspace=workspace, models=results, frames=(), seconds=runner.seconds, project_metric=metric
+        )
+        write_recording(workspace, given.imu, timing)
+        result = report_result(result, given.capture, project=source)
+        log.info("finished")
+    return result
+
+
+def _check_options(options: ReconstructOptions) -> None:
+    """Refuse what has no meaning without mapping."""
+    default = ReconstructOptions()
+    named = [
+        f"--{group}.{f.name}"
+        for group in ("mapping", "apertures", "exposures")
+        for f in dataclasses.fields(getattr(default, group))
+        if getattr(getattr(options, group), f.name) != getattr(getattr(default, group), f.name)
+    ]
+    named += ["--deblur"] if options.deblur not in (None, "off") else []
+    named += ["--rolling-shutter"] if options.rolling_shutter not in (None, "off") else []
+    if named:
+        flags = ", ".join(flag.replace("_", "-") for flag in named)
+        raise InertialError(f"{flags}: an existing model is not mapped again, nor its images changed; leave it out")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Given:
+    """What the user gave beside the project.
+
+    Attributes
+    ----------
+    capture
+        What is known of the recording, in a capture's terms; its frames are those of a capture that was given.
+    """
+
+    source: ProjectOptions
+    capture: Capture
+    imu: ImuRecording
+
+
+def _given(project: Path, source: ProjectOptions, options: ReconstructOptions) -> _Given:
+    if source.imu is None:
+        raise FormatError(project, "is a COLMAP project and needs the recording that ran along: give --imu PATH")
+    times = source.frame_times
+    if times is not None and not times.exists():
+        raise FormatError(times, "no such file or folder")
+    described = [p for p in (source.imu, times) if p is not None and (is_capture(p) or find_recording(p) is not None)]
+    captures = [load_capture(path) for path in described]
+    imu = read_capture_imu(captures[0]) if described[:1] == [source.imu] else read_imu(source.imu)
+    capture = captures[0] if captures else Capture(path=project, calibration=calibration_prior())
+    frames = next((c.frames for c in captures if c.frames is not None), None)
+    own_clock = source.exif_times or (source.video is not None and not isinstance(frames, Video))
+    shared = any(c.shared_clock for c in captures) and not own_clock
+    capture = dataclasses.replace(capture, path=project, frames=frames, shared_clock=shared)
+    if source.video is not None:
+        capture = _with_video(capture, source.video, None if times in described else times)
+    elif times is None and source.name_times is None and not source.exif_times and frames is None:
+        raise TimingError(f"{project}: nothing says when its images were taken: {_HOW_TIMES}")
+    return _Given(source=source, capture=capture, imu=imu)
+
+
+def _with_video(capture: Capture, video: Path, times: Path | None) -> Capture:
+    """The capture with all frames of a video; what the recorder noted about them counts where it is the recorder's."""
+    frames = Video(file=video) if not isinstance(capture.frames, Video) else capture.frames
+    if not isinstance(capture.frames, Video) and (recording := find_recording(video)) is not None:
+        log_ = recording.log
+        capture = dataclasses.replace(capture, frame_log=log_)
+        if log_ is not None and capture.readout_s is None:
+            capture = dataclasses.replace(capture, readout_s=log_.readout_s, readout_direction=log_.readout_direction)
+    frames = dataclasses.replace(frames, file=video, frames_per_s=None)
+    return dataclasses.replace(
+        capture, frames=frames if times is None else dataclasses.replace(frames, frame_times=times)
+    )
+
+
+def _models(project: Path, out: Path, keep: Sequence[str]) -> dict[int, Path]:
+    """COLMAP's sub-models by number; what would stop ``apply`` at the end is said at once."""
+    inner, outer = out.resolve(), project.resolve()
+    if inner.is_relative_to(outer) or outer.is_relative_to(inner):
+        raise OutputError(f"{out} and {project} lie within each other; choose a folder elsewhere")
+    folders = [
+        folder
+        for folder in list_tree(project)[0]
+        if not any(fnmatch.fnmatch(str(p), pattern) for p in (folder, *folder.parents[:-1]) for pattern in keep)
+    ]
+    for folder in (Path(), *folders):
+        if is_metric(project / folder):
+            raise AlreadyMetricError(
+                f"{project / folder} already holds a metric scale; give COLMAP's own project, or leave the folder "
+                "as it is with --keep"
+            )
+    layout = read_layout(project, folders, one_for_all=False)
+    return {index: project / folder for index, folder in layout.submodels.items()}
+
+
+def _images(project: Path, source: ProjectOptions, *, needed: bool) -> Path | None:
+    folder = project / "images" if source.images is None else source.images
+    if folder.is_dir():
+        return folder
+    if source.images is not None or needed:
+        raise FormatError(folder, "no such folder of pictures; give the project's images with --images DIR")
+    return None
+
+
+def _run_times(
+    runner: StageRunner,
+    workspace: Workspace,
+    given: _Given,
+    models: dict[int, Path],
+    images: Path | None,
+    progress: Progress,
+) -> tuple[FrameTiming, tuple[str, ...]]:
+    """When the images were taken, and what the user should know about that."""
+    names: set[str] = set()
+    for folder in models.values():
+        model = read_model(folder)
+        names |= {model.image(i).name for i in model.reg_image_ids()}
+    ordered = sorted(names)
+
+    def work(partial: Sequence[Path]) -> None:
+        timing, notes = _times(given, ordered, images, progress)
+        write_json(partial[0], {"timing": timing, "notes": list(notes)})
+
+    inputs = [given.source.frame_times, given.source.video, given.source.imu, images]
+    depends = {
+        "source": given.source,
+        "models": [fingerprint(folder) for folder in models.values()],
+        "inputs": [fingerprint(path) for path in inputs if path is not None],
+    }
+    runner.run("times", depends, [workspace.frames], work)
+    stored = read_json(workspace.frames)
+    return FrameTiming(**stored["timing"]), tuple(stored["notes"])
+
+
+def _times(
+    given: _Given, names: Sequence[str], images: Path | None, progress: Progress
+) -> tuple[FrameTiming, tuple[str, ...]]:
+    source, capture = given.source, given.capture
+    notes: tuple[str, ...] = ()
+    if source.video is not None:
+        assert images is not None
+        timing, notes = _video_times(capture, source.video, images, names, progress)
+    elif source.exif_times:
+        assert images is not None
+        stamps, digits = stamps_of_exif(images, names)
+        timing = _timing(capture, stamps)
+        if digits < _FINE_DIGITS:
+            notes = (f"EXIF gives the frames' times to 1/{10**digits} s only",)
+    elif source.name_times is not None:
+        timing = _timing(capture, stamps_of_pattern(images or Path(), names, source.name_times))
+    elif source.frame_times is not None:
+        timing = read_frame_times(source.frame_times)
+        if timing.readout_s is None:
+            timing = dataclasses.replace(
+                timing, readout_s=capture.readout_s, readout_direction=capture.readout_direction
+            )
+    else:
+        timing = read_frame_timing(capture)
+    # an exposure that the pictures state belongs to the frames; one that they do not is no reason to stop
+    if timing.exposure_s is None and images is not None and all((images / name).is_file() for name in timing.names):
+        timing = dataclasses.replace(timing, exposure_s=stated_exposures_s([images / name for name in timing.names]))
+    return timing, notes
+
+
+def _timing(capture: Capture, stamps: FrameStamps) -> FrameTiming:
+    timing = stamps.timing(exposure_s=capture.exposure_s, readout_s=capture.readout_s)
+    return dataclasses.replace(timing, readout_direction=capture.readout_direction)
+
+
+def _video_times(
+    capture: Capture, video: Path, images: Path, names: Sequence[str], progress: Progress
+) -> tuple[FrameTiming, tuple[str, ...]]:
+    stamps_ns = video_stamps_ns(video)
+    every = read_frame_timing(capture)
+    match = match_to_video(video, images, names, progress=lambda done: progress("video", done, len(stamps_ns)))
+    if len(match.t_ns) < max(2, _LEAST_SHARE * len(names)):
+        example = next(iter(match.doubtful.items()), ("", ""))
+        raise TimingError(
+            f"{video}: {len(match.t_ns)} of {len(names)} images are one of its frames beyond doubt ({example[0]} "
+            f"{example[1]}): give the video that the images were taken from, or --frame-times"
+        )
+    name_of = {t_ns: name for name, t_ns in match.t_ns.items()}
+    kept = [i for i, t_ns in enumerate(stamps_ns.tolist()) if t_ns in name_of]
+    # counterclockwise, as the pictures were turned against the frames
+    directions: tuple[ReadoutDirection, ...] = ("down", "right", "up", "left")
+    assert set(directions) == set(get_args(ReadoutDirection))
+    turned = (directions.index(every.readout_direction) + match.quarter_turns) % 4
+    timing = FrameTiming(
+        names=tuple(name_of[int(stamps_ns[i])] for i in kept),
+        t_s=every.t_s[kept],
+        exposure_s=None if every.exposure_s is None else every.exposure_s[kept],
+        readout_s=every.readout_s,
+        readout_direction=directions[turned],
+        epoch_ns=every.epoch_ns,
+    )
+    notes = []
+    for why in sorted(set(match.doubtful.values())):
+        those = [name for name, reason in match.doubtful.items() if reason == why]
+        notes.append(f"{len(those)} of {len(names)} images have no time: each {why} (first: {those[0]})")
+    return timing, tuple(notes)
+
+
+def _noted(result: ModelResult, notes: Sequence[str]) -> ModelResult:
+    scale = result.scale
+    return dataclasses.replace(result, scale=dataclasses.replace(scale, reasons=(*scale.reasons, *notes)))
+
+
+def _run_apply(
+    runner: StageRunner,
+    workspace: Workspace,
+    project: Path,
+    source: ProjectOptions,
+    options: ReconstructOptions,
+    results: Sequence[ModelResult],
+    progress: Progress,
+) -> Path | None:
+    """The whole project in metres; ``None`` where every scale was refused."""
+    scales: dict[int | None, ModelScale] = {}
+    for result in results:
+        similarity = None
+        if result.sparse_metric is not None:
+            scale = result.scale
+            provenance = f"inertial scale, method {scale.method}, {scale.verdict}"
+            similarity = Similarity.from_scale(scale, world=options.world, provenance=provenance)
+        scales[result.index] = ModelScale(
+            similarity=similarity, verdict=result.scale.verdict, reasons=result.scale.reasons
+        )
+    if all(scale.similarity is None for scale in scales.values()):
+        return None
+
+    def work(partial: Sequence[Path]) -> None:
+        applied = apply_to_project(
+            project,
+            partial[0],
+            scales,
+            link=source.link,
+            keep=source.keep,
+            progress=lambda done, total: progress("apply", done, total),
+        )
+        for note in applied.notes:
+            log.info("%s", note)
+
+    depends = {
+        "scales": {str(index): scale.similarity for index, scale in scales.items()},
+        "project": fingerprint(project),
+        "source": source,
+    }
+    runner.run("apply", depends, [workspace.project_metric], work)
+    return workspace.project_metric

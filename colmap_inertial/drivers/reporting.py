@@ -1,0 +1,170 @@
+"""What the pipeline keeps for the report, and the report itself: of finished runs, and of those the recording stops.
+
+A report that fails never costs a result, nor hides why a run stopped: the log says what went wrong with it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import logging
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from colmap_inertial.drivers.result import ReconstructResult, result_as_json
+from colmap_inertial.errors import MappingError, NotObservableError
+from colmap_inertial.io.capture import Capture
+from colmap_inertial.io.files import write_json
+from colmap_inertial.model import Model, colmap_camera
+from colmap_inertial.options import ProjectOptions
+from colmap_inertial.report import write_report
+from colmap_inertial.report.content import model_file, recording_file
+from colmap_inertial.report.scene import scene_record
+from colmap_inertial.report.series import rounded, strided
+from colmap_inertial.report.signals import signal_record
+from colmap_inertial.run.runner import remove
+from colmap_inertial.run.workspace import Workspace
+from colmap_inertial.stages.metric import gravity_in_model
+from colmap_inertial.stages.rolling_shutter import RollingShutterStage
+from colmap_inertial.types import Array, CameraTrajectory, FrameTiming, ImuRecording
+
+if TYPE_CHECKING:
+    import pycolmap
+
+log = logging.getLogger(__name__)
+
+#: Frames for which the movement by the rolling shutter is computed, and points across an image.
+_SHUTTER_FRAMES, _GRID = 300, 9
+
+
+def write_recording(
+    workspace: Workspace, imu: ImuRecording, timing: FrameTiming, rectifying: Sequence[RollingShutterStage] = ()
+) -> None:
+    """Keep what the report says of the recording: rates, times of the frames, what was done about a rolling shutter."""
+
+    def rate_hz(t_s: Array) -> float | None:
+        return float(1 / np.median(np.diff(t_s))) if len(t_s) > 1 else None
+
+    with _failures_logged("what the report says of the recording"):
+        record: dict[str, Any] = {
+            "imu": {
+                "device": imu.device,
+                "gyro_hz": rate_hz(imu.gyro_t_s),
+                "accel_hz": rate_hz(imu.accel_t_s),
+                "duration_s": float(imu.gyro_t_s[-1] - imu.gyro_t_s[0]),
+            },
+            "frames": {
+                "count": len(timing.names),
+                "duration_s": float(timing.t_s[-1] - timing.t_s[0]),
+                "interval_s": float(np.median(np.diff(timing.t_s))) if len(timing.t_s) > 1 else None,
+                "names": list(timing.names),
+                "t_s": np.round(timing.t_s - timing.t_s[0], 4).tolist(),
+                "exposure_s": None if timing.exposure_s is None else rounded(timing.exposure_s, 4),
+                "readout_s": timing.readout_s,
+            },
+            "rolling_shutter": _shutter_record(rectifying[0], timing) if rectifying else None,
+        }
+        workspace.report_data.mkdir(exist_ok=True)
+        write_json(recording_file(workspace.root), record, indent=None)
+
+
+def _shutter_record(stage: RollingShutterStage, timing: FrameTiming) -> dict[str, Any] | None:
+    """By how much keypoints move: of some frames the largest shift, and that of the worst one over the image."""
+    camera = colmap_camera(stage.view.camera)
+    x = (np.arange(_GRID) + 0.5) * camera.width / _GRID
+    y = (np.arange(_GRID) + 0.5) * camera.height / _GRID
+    grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    shifts = []
+    for i in strided(len(timing.names), _SHUTTER_FRAMES).tolist():
+        if stage.covers(timing.names[i]):
+            shift = stage(timing.names[i], grid) - grid
+            if np.isfinite(shift).all():
+                shifts.append((i, shift))
+    if not shifts:
+        return None
+    largest = np.array([np.linalg.norm(shift, axis=1).max() for _, shift in shifts])
+    middle = np.array([np.median(np.linalg.norm(shift, axis=1)) for _, shift in shifts])
+    worst, field = shifts[int(np.argmax(largest))]
+    return {
+        "t_s": np.round(timing.t_s[[i for i, _ in shifts]] - timing.t_s[0], 3).tolist(),
+        "median_px": rounded(middle, 4),
+        "largest_px": rounded(largest, 4),
+        "worst": {
+            "name": timing.names[worst],
+            "width": camera.width,
+            "height": camera.height,
+            "at_px": np.round(grid, 1).tolist(),
+            "shift_px": np.round(field, 3).tolist(),
+        },
+    }
+
+
+def write_model_record(
+    workspace: Workspace,
+    model: Model,
+    reconstruction: pycolmap.Reconstruction,
+    trajectory: CameraTrajectory,
+    imu: ImuRecording,
+) -> None:
+    """Keep what the report draws of one model: its scene, and camera against IMU."""
+    if model.scale is None:
+        raise ValueError("a model without a scale estimate has nothing to report")
+    with _failures_logged(f"what the report draws of model {model.index}"):
+        gravity, first_frame_s = gravity_in_model(model), float(model.timing.t_s[0])
+        record = {
+            "scene": scene_record(reconstruction, trajectory, gravity, first_frame_s=first_frame_s),
+            "signals": signal_record(trajectory, imu, model.scale, gravity, first_frame_s=first_frame_s),
+        }
+        workspace.report_data.mkdir(exist_ok=True)
+        write_json(model_file(workspace.root, model.index), record, indent=None)
+
+
+def report_result(
+    result: ReconstructResult, capture: Capture, project: ProjectOptions | None = None
+) -> ReconstructResult:
+    """Write the report, and then ``result.json``, whose presence says that the run is finished.
+
+    Returns
+    -------
+    The result with the path of its report; ``None`` where that failed.
+    """
+    workspace, content = result.workspace, result_as_json(result, capture)
+    if project is not None:
+        content["project"] = {
+            key: value.resolve() if isinstance(value, Path) else value
+            for key, value in dataclasses.asdict(project).items()
+        }
+    with _failures_logged("the report"):
+        # what a stopped run left there must not stand for this one
+        for old in (workspace.report, workspace.report.with_suffix(".json")):
+            remove(old)
+        result = dataclasses.replace(result, report=write_report(workspace.root, result=content))
+    write_json(workspace.result, content)
+    return result
+
+
+@contextlib.contextmanager
+def reporting_stops(workspace: Workspace, capture: Capture) -> Iterator[None]:
+    """Where the recording gives no scale, or COLMAP no model, a report says why and what to do; other errors have none.
+
+    The error carries a note that names the page.
+    """
+    try:
+        yield
+    except (NotObservableError, MappingError) as error:
+        with _failures_logged("the report of the stop"):
+            page = write_report(workspace.root, stopped=str(error), capture=str(capture.path.resolve()))
+            error.add_note(f"what was found, and what to do: {page}")
+        raise
+
+
+@contextlib.contextmanager
+def _failures_logged(what: str) -> Iterator[None]:
+    """Nothing that goes wrong with a report may cost what the run has found."""
+    try:
+        yield
+    except Exception:
+        log.exception("%s failed", what)

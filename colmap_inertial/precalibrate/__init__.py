@@ -1,0 +1,1 @@
+"""What is decided before the reconstruction: the check, frames to use, calibration, treatment of frames."""

@@ -1,0 +1,437 @@
+"""What is done to the frames of a capture before COLMAP sees them, decided once and written down."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from colmap_inertial.errors import InertialError, NotObservableError
+from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence
+from colmap_inertial.imaging.gate import (
+    MUST_SHOW_PX,
+    FrameDecision,
+    GateOptions,
+    RecordingVerdict,
+    decide,
+    judge_recording,
+)
+from colmap_inertial.imaging.parallax import Parallax
+from colmap_inertial.imaging.psf import blur_field, predicted_blur_px
+from colmap_inertial.io.calibration import SHARED_CLOCK_OFFSET_S
+from colmap_inertial.io.capture import Capture
+from colmap_inertial.io.files import read_json, write_json
+from colmap_inertial.io.frames import frame_source
+from colmap_inertial.io.image_metadata import stated_exposures_s
+from colmap_inertial.model import colmap_camera
+from colmap_inertial.options import BlurRemover, DeblurMethod, RollingShutterMethod
+from colmap_inertial.precalibrate.calibrate import guessed_camera, look_first, some_frames, survey, survey_parts
+from colmap_inertial.precalibrate.translation import find_parallaxes
+from colmap_inertial.run.progress import Progress
+from colmap_inertial.run.workspace import a_record_of_ours
+from colmap_inertial.stages.deblur import DeblurStage
+from colmap_inertial.stages.gyro_view import GyroView
+from colmap_inertial.stages.rolling_shutter import RollingShutterStage
+from colmap_inertial.types import CameraImuCalibration, CameraModel, FrameTiming, ImuRecording
+
+if TYPE_CHECKING:
+    import pycolmap
+
+
+#: Blur below this cannot be told from the texture: where no frame has more, nothing is deblurred.
+_TELLING_PX = 4.0
+#: A gyroscope that is borne out by this share of them is trusted for all frames.
+_MOST_OF_THEM = 0.95
+#: Standard deviations by which a frame must bear it out by itself, where others do not. With 4, the filter made some
+#: worse; the network, which sees whether the filter's result can be true, is worth using unless a frame speaks against.
+_CLEAR_SUPPORT: dict[BlurRemover, float] = {"wiener": 7.0, "deepgyro": 0.0}
+#: How often small models are made, at most, for more of the blurred frames.
+_SURVEYS = 4
+#: Frames by which the gyroscope is judged.
+_JUDGED_FRAMES = 14
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ImagingPlan:
+    """What is to be done to frames and keypoints, and why.
+
+    Where frames must bear out the gyroscope by themselves, they must do so clearly for the filter; for the network it
+    is enough that they do not speak against it.
+
+    Attributes
+    ----------
+    view
+        Gyroscope, camera and times; ``None`` where nothing is to be done.
+    deblur
+        Decisions and verdict for :class:`DeblurStage`; ``None`` where no frame is to be deblurred.
+    method
+        How blur is undone.
+    parallaxes
+        By frame name, where the camera's translation is known to blur.
+    rectify
+        Whether the rolling shutter is undone.
+    deblur_note, rolling_shutter_note
+        What is done, or why not, in words.
+    """
+
+    view: GyroView | None = None
+    deblur: tuple[tuple[FrameDecision, ...], RecordingVerdict] | None = None
+    method: BlurRemover = "wiener"
+    parallaxes: Mapping[str, Parallax] = field(default_factory=dict)
+    rectify: bool = False
+    deblur_note: str = ""
+    rolling_shutter_note: str = ""
+
+    def frame_stages(self, *, drop: bool = True) -> list[DeblurStage]:
+        """The default frame stages; they need not drop what is too blurred."""
+        if self.view is None or self.deblur is None:
+            return []
+        decisions, verdict = self.deblur
+        gate = GateOptions() if verdict.trusted else GateOptions(min_support=_CLEAR_SUPPORT[self.method])
+        stage = DeblurStage(
+            view=self.view,
+            decisions=decisions,
+            verdict=verdict,
+            parallaxes=self.parallaxes,
+            gate=gate,
+            drop=drop,
+            method=self.method,
+        )
+        return [stage]
+
+    def keypoint_stages(self) -> list[RollingShutterStage]:
+        """The default keypoint stages."""
+        return [RollingShutterStage(view=self.view)] if self.view is not None and self.rectify else []
+
+    def as_json(self) -> dict[str, object]:
+        """In JSON types, without the recording."""
+        view = self.view
+        return {
+            "deblur": self.deblur_note,
+            "deblur_method": None if self.deblur is None else self.method,
+            "rolling_shutter": self.rolling_shutter_note,
+            "rectify": self.rectify,
+            "calibration": None
+            if view is None
+            else {
+                **asdict(view.calibration),
+                "clock_rate": view.clock_rate,
+                "clock_middle_s": view.clock_middle_s,
+                "source": view.source,
+                "notes": list(view.notes),
+            },
+            "camera": None if view is None else asdict(view.camera),
+            "verdict": None if self.deblur is None else asdict(self.deblur[1]),
+            "decisions": None if self.deblur is None else [asdict(decision) for decision in self.deblur[0]],
+            "parallaxes": {name: parallax.as_json() for name, parallax in self.parallaxes.items()},
+        }
+
+
+def write_plan(path: Path, plan: ImagingPlan) -> None:
+    """Write a plan for :func:`read_plan`."""
+    write_json(path, plan.as_json(), indent=None)
+
+
+def read_plan(path: Path, imu: ImuRecording, timing: FrameTiming) -> ImagingPlan:
+    """The plan that :func:`write_plan` wrote for the same recording."""
+    values: dict[str, Any] = read_json(path)
+    with a_record_of_ours(path):
+        view = None
+        if values["calibration"] is not None:
+            found = dict(values["calibration"])
+            camera = values["camera"]
+            view = GyroView(
+                imu=imu,
+                timing=timing,
+                clock_rate=found.pop("clock_rate"),
+                clock_middle_s=found.pop("clock_middle_s"),
+                source=found.pop("source"),
+                notes=tuple(found.pop("notes")),
+                calibration=CameraImuCalibration(**found),
+                camera=CameraModel(**{**camera, "params": tuple(camera["params"])}),
+            )
+        deblur = None
+        if values["decisions"] is not None:
+            decisions = tuple(FrameDecision(**decision) for decision in values["decisions"])
+            deblur = decisions, RecordingVerdict(**values["verdict"])
+        return ImagingPlan(
+            view=view,
+            deblur=deblur,
+            method=values["deblur_method"] or "wiener",
+            parallaxes={name: Parallax.from_json(parallax) for name, parallax in values["parallaxes"].items()},
+            rectify=values["rectify"],
+            deblur_note=values["deblur"],
+            rolling_shutter_note=values["rolling_shutter"],
+        )
+
+
+def with_stated_exposures(capture: Capture, timing: FrameTiming) -> FrameTiming:
+    """The timing with exposure times from the pictures' EXIF, where nothing else gives them."""
+    source = frame_source(capture)
+    if timing.exposure_s is not None or source is None:
+        return timing
+    stated = stated_exposures_s([source / name for name in timing.names])
+    return timing if stated is None else replace(timing, exposure_s=stated)
+
+
+def plan_imaging(
+    capture: Capture,
+    imu: ImuRecording,
+    timing: FrameTiming,
+    prior: CameraImuCalibration,
+    *,
+    deblur: DeblurMethod | None,
+    rolling_shutter: RollingShutterMethod | None,
+    scratch: Path,
+    every: FrameTiming | None = None,
+    max_offset_s: float | None = None,
+    num_threads: int = -1,
+    seed: int = 0,
+    progress: Progress,
+) -> ImagingPlan:
+    """Decide what is done to frames and keypoints.
+
+    Parameters
+    ----------
+    capture, imu, timing
+        The recording; see :func:`with_stated_exposures`.
+    prior
+        What is known of camera and IMU.
+    deblur, rolling_shutter
+        ``None`` does what the recording allows; what is asked for by name and not possible is an error.
+    scratch
+        A folder for temporary files.
+    every
+        All frames of the video that ``timing``'s were chosen from.
+    max_offset_s
+        Largest offset between the clocks.
+    num_threads, seed
+        Of COLMAP.
+    progress
+        Called with ``"motion"``, ``"calibration"``, ``"survey"`` and ``"blur"``.
+
+    Raises
+    ------
+    NotObservableError
+        Where deblurring or rectifying was asked for by name, and the gyroscope does not belong to the pixels.
+    InertialError
+        Where rectifying was asked for and the readout is unknown.
+    """
+    if rolling_shutter == "rectify" and timing.readout_s is None:
+        raise InertialError(
+            f"{capture.path}: undoing the rolling shutter needs readout_s under [timing], the time from the first row "
+            "to the last"
+        )
+    plan = ImagingPlan(
+        method="deepgyro" if deblur == "deepgyro" else "wiener",
+        rectify=rolling_shutter != "off" and bool(timing.readout_s),
+        rolling_shutter_note=_shutter_note(timing),
+    )
+    if rolling_shutter == "off":
+        plan = replace(plan, rolling_shutter_note="not asked for")
+    why_not = "not asked for" if deblur == "off" else _no_deblurring(capture, imu, timing)
+    plan = replace(plan, deblur_note=why_not)
+    if why_not and not plan.rectify:
+        return plan
+    if max_offset_s is None and capture.shared_clock:
+        max_offset_s = SHARED_CLOCK_OFFSET_S
+    try:
+        look = look_first(
+            capture,
+            imu,
+            timing,
+            prior,
+            every=every,
+            max_offset_s=max_offset_s,
+            scratch=scratch,
+            num_threads=num_threads,
+            seed=seed,
+            progress=progress,
+        )
+    except NotObservableError as error:
+        asked = [deblur in ("wiener", "deepgyro") and not why_not, rolling_shutter == "rectify" and plan.rectify]
+        if any(asked):
+            raise
+        untreated = f"frames stay as they were filmed: {error}"
+        return ImagingPlan(
+            deblur_note=why_not or untreated,
+            rolling_shutter_note=untreated if plan.rectify else plan.rolling_shutter_note,
+        )
+    plan = replace(plan, view=look.view)
+    if why_not:
+        return plan
+
+    def models(names: Sequence[str], plan: ImagingPlan | None) -> tuple[pycolmap.Reconstruction, ...]:
+        if plan is None and look.models:
+            return look.models
+        stages = [] if plan is None else plan.frame_stages(drop=False)
+        return survey(
+            capture, look.view, names, stages, scratch=scratch, num_threads=num_threads, seed=seed, progress=progress
+        )
+
+    return _deblurring(plan, look.view, capture, models, progress)
+
+
+def _shutter_note(timing: FrameTiming) -> str:
+    if timing.readout_s is None:
+        return "the readout is unknown: give readout_s under [timing] in capture.toml"
+    if timing.readout_s == 0:
+        return "global shutter"
+    return f"keypoints are rectified, readout {1e3 * timing.readout_s:.1f} ms"
+
+
+def _no_deblurring(capture: Capture, imu: ImuRecording, timing: FrameTiming) -> str:
+    """Why no frame of a recording can be deblurred; empty where some may be."""
+    if timing.exposure_s is None:
+        return (
+            "frames stay as they were filmed: the exposure time is unknown; give exposure_s under [timing] in "
+            "capture.toml, or a column of it in the frame times"
+        )
+    camera = guessed_camera(capture, timing)
+    rate = float(np.linalg.norm(imu.gyro_rad_s, axis=1).max())
+    most_px = rate * float(timing.exposure_s.max()) * 1.2 * colmap_camera(camera).mean_focal_length()
+    limit_px = max(_TELLING_PX, GateOptions().skip_below_px * max(camera.width, camera.height) / 1920)
+    if most_px < limit_px:
+        return f"no frame has more than {most_px:.1f} px of blur, by the quickest turn that the gyroscope felt"
+    return ""
+
+
+def _deblurring(
+    plan: ImagingPlan,
+    view: GyroView,
+    capture: Capture,
+    models: Callable[[Sequence[str], ImagingPlan | None], tuple[pycolmap.Reconstruction, ...]],
+    progress: Progress,
+) -> ImagingPlan:
+    """The plan with what is to be deblurred, by the gyroscope and by what small models tell of the translation.
+
+    ``models`` makes them of some frames as filmed, or as a plan has them. Where frames were too blurred for a model,
+    those around them, and the IMU beyond, tell how to deblur them for the next one.
+    """
+    decisions = _decisions(view, {})
+    if not _blurred(decisions):
+        return _decided(plan, view, capture, {}, progress)
+    parts, place = survey_parts(view.timing), view.index()
+    begins_s = view.timing.t_s[[place[names[0]] for names in parts]]
+
+    def by_part(names: set[str]) -> dict[int, set[str]]:
+        out: dict[int, set[str]] = {}
+        for name in names:
+            part = int(np.searchsorted(begins_s, view.timing.t_s[place[name]], side="right")) - 1
+            out.setdefault(part, set()).add(name)
+        return out
+
+    found: dict[int, _Surveyed] = {}
+    lost, treated = by_part(_to_deblur(decisions)), None
+    for _ in range(_SURVEYS):
+        better = False
+        for i in sorted(lost):
+            new = _Surveyed.of(models(parts[i], treated), view)
+            if i not in found or len(new.registered) > len(found[i].registered):
+                found[i], better = new, True
+        if not better:
+            break
+        # of two parts that tell about a frame, its own goes first
+        parallaxes = {name: one for part in found.values() for name, one in part.parallaxes.items()}
+        own = by_part(set(parallaxes))
+        parallaxes |= {n: found[i].parallaxes[n] for i in found for n in own.get(i, ()) if n in found[i].parallaxes}
+        decisions = _decisions(view, parallaxes)
+        treated = _decided(plan, view, capture, parallaxes, progress)
+        registered = {name for part in found.values() for name in part.registered}
+        known = {i: names & set(parts[i]) - registered for i, names in by_part(_to_deblur(decisions)).items()}
+        lost = {i: names for i, names in known.items() if names}
+        if not parallaxes or not lost or not treated.frame_stages():
+            break
+    assert treated is not None
+    return treated
+
+
+@dataclass(frozen=True, eq=False)
+class _Surveyed:
+    """What the small models of a part of a recording tell."""
+
+    parallaxes: Mapping[str, Parallax]
+    registered: frozenset[str]
+
+    @classmethod
+    def of(cls, models: Sequence[pycolmap.Reconstruction], view: GyroView) -> _Surveyed:
+        registered = frozenset(model.image(i).name for model in models for i in model.reg_image_ids())
+        return cls(parallaxes=find_parallaxes(models, view), registered=registered)
+
+
+def _to_deblur(decisions: Sequence[FrameDecision]) -> set[str]:
+    return {decision.name for decision in decisions if decision.action == "deblur"}
+
+
+def _decisions(view: GyroView, parallaxes: Mapping[str, Parallax]) -> tuple[FrameDecision, ...]:
+    """What to do with each frame, before any is looked at."""
+    width, height = view.camera.width, view.camera.height
+    motion, camera = view.motion(), colmap_camera(view.camera)
+    predicted = predicted_blur_px(motion, camera, view.timing, width=width, height=height, parallaxes=parallaxes)
+    return _keeping_ends(decide(predicted, view.timing.t_s, width=width, height=height, motion=motion))
+
+
+def _blurred(decisions: Sequence[FrameDecision]) -> list[FrameDecision]:
+    """The frames by which to judge, the most blurred first."""
+    telling = [d for d in decisions if d.action == "deblur" and (d.blur_px or 0) >= _TELLING_PX]
+    return sorted(telling, key=lambda d: -(d.blur_px or 0))[:_JUDGED_FRAMES]
+
+
+def _decided(
+    plan: ImagingPlan, view: GyroView, capture: Capture, parallaxes: Mapping[str, Parallax], progress: Progress
+) -> ImagingPlan:
+    decisions = _decisions(view, parallaxes)
+    chosen = _blurred(decisions)
+    if not chosen:
+        known = [d.blur_px for d in decisions if d.blur_px is not None]
+        most = f"{max(known):.1f} px" if known else "nothing"
+        return replace(plan, deblur_note=f"frames stay as they were filmed: the gyroscope predicts {most} of blur")
+    motion, camera, index = view.motion(), colmap_camera(view.camera), view.index()
+    evidence: list[BlurEvidence] = []
+    for frame in some_frames(capture, view.timing, [index[d.name] for d in chosen]):
+        progress("blur", len(evidence), len(chosen))
+        blur = blur_field(motion, camera, view.shutter(index[frame.name]), parallax=parallaxes.get(frame.name))
+        evidence.append(blur_evidence(frame.image, blur))
+    progress("blur", len(chosen), len(chosen))
+    verdict = _by_frame(judge_recording(evidence), evidence, [d.blur_px or 0.0 for d in chosen])
+    note = f"{sum(d.action == 'deblur' for d in decisions)} of {len(decisions)} frames are blurred; {verdict.reason}"
+    used = {name: parallaxes[name] for name in _to_deblur(decisions) if name in parallaxes}
+    if used:
+        note += f"; the camera's translation is counted in for {len(used)} frames"
+    if plan.method == "deepgyro" and verdict.trusted is not False:
+        note += "; the network DeepGyro undoes it"
+    return replace(plan, deblur=(decisions, verdict), parallaxes=used, deblur_note=note)
+
+
+def _keeping_ends(decisions: tuple[FrameDecision, ...]) -> tuple[FrameDecision, ...]:
+    """No frame is dropped before the first or after the last one that stays: nothing would bridge the gap."""
+    stay = [i for i, decision in enumerate(decisions) if decision.action != "drop"]
+    first, last = (stay[0], stay[-1]) if stay else (len(decisions), -1)
+    return tuple(
+        replace(d, action="deblur", reason=f"{d.blur_px:.0f} px of blur are too many, but no frame is beyond it")
+        if d.action == "drop" and not first < i < last
+        else d
+        for i, d in enumerate(decisions)
+    )
+
+
+def _by_frame(
+    verdict: RecordingVerdict, evidence: Sequence[BlurEvidence], blur_px: Sequence[float]
+) -> RecordingVerdict:
+    """The verdict, unless only some of the frames bear it out: then every frame must do so by itself.
+
+    So it is where the camera moves close to things: they blur by translation, too, which no gyroscope feels.
+    """
+    telling = [one for one, px in zip(evidence, blur_px, strict=True) if one.enough and px >= MUST_SHOW_PX]
+    least = GateOptions().min_support
+    shown = sum(one.support >= least and one.extent_is_plausible for one in telling)
+    if verdict.trusted is not True or shown >= _MOST_OF_THEM * len(telling):
+        return verdict
+    reason = (
+        f"{shown} of {len(telling)} frames that were looked at bear out the gyroscope's blur, so each frame must do so "
+        "by itself (close to things, the camera's translation blurs, too)"
+    )
+    return replace(verdict, trusted=None, reason=reason)

@@ -1,0 +1,106 @@
+"""What ``diagnose`` looks at, read from captures, sources of ``scale`` and IMU files; and the stop before mapping."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+
+from colmap_inertial.diagnose import Diagnosis, Recorded, diagnose
+from colmap_inertial.errors import FormatError, NotObservableError
+from colmap_inertial.flow import VisualRotation
+from colmap_inertial.io.calibration import SHARED_CLOCK_OFFSET_S
+from colmap_inertial.io.capture import Capture
+from colmap_inertial.io.imu import RawImu, read_raw_capture_imu
+from colmap_inertial.precalibrate.calibrate import followed, guessed_camera, near_the_beginning
+from colmap_inertial.run.progress import Progress
+from colmap_inertial.types import CameraImuCalibration, FrameTiming
+
+log = logging.getLogger(__name__)
+
+
+#: Frames that are followed by their pixels come at least so often; how many are, before a reconstruction and when
+#: asked to diagnose, and how far apart at least.
+_VIDEO_STEP_S = 0.13
+_FEW, _FEW_SPACING_S = 90, 0.09
+
+#: What makes a reconstruction in metres meaningless.
+STOPPING = frozenset({"stabilised", "gravity-removed", "imu-does-not-fit", "gyro-mirrored"})
+
+
+def read_checked_imu(capture: Capture, *, force: bool) -> RawImu:
+    """The inertial recording of a capture, refused where its numbers are implausible.
+
+    Parameters
+    ----------
+    force
+        Take one without gravity, too: its scale will be refused, its gyroscope still serves.
+
+    Raises
+    ------
+    FormatError, TimingError
+        As :func:`read_capture_imu`.
+    NotObservableError
+        Where gravity was taken out.
+    """
+    raw = read_raw_capture_imu(capture)
+    try:
+        raw.check()
+    except FormatError as error:
+        if error.code not in STOPPING:
+            raise
+        if not force:
+            raise NotObservableError("scale", f"{error} (--force goes on)") from None
+    return raw
+
+
+def preflight(
+    capture: Capture, raw: RawImu, timing: FrameTiming, prior: CameraImuCalibration, progress: Progress
+) -> Diagnosis:
+    """The checks before a reconstruction: everything but what needs many pictures."""
+    rotation = None
+    if capture.frame_log is None or not capture.frame_log.stabilised:
+        rotation = _followed(capture, timing, _FEW, _FEW_SPACING_S, progress)
+    return diagnose(
+        Recorded(
+            imu=raw.imu,
+            gyro_axes=raw.gyro_axes,
+            accel_axes=raw.accel_axes,
+            timing=timing,
+            log=capture.frame_log,
+            is_capture=True,
+            rotation=rotation,
+            camera=capture.camera,
+            calibration=prior,
+            max_offset_s=SHARED_CLOCK_OFFSET_S if capture.shared_clock else None,
+        )
+    )
+
+
+def stop_or_doubt(diagnosis: Diagnosis, *, force: bool) -> tuple[str, ...]:
+    """Stop where the recording cannot give metres; when forced to go on, the reasons not to trust them.
+
+    Raises
+    ------
+    NotObservableError
+        With the finding's words.
+    """
+    for finding in diagnosis.findings:
+        log.info("%s: %s: %s", finding.severity, finding.code, finding.evidence)
+    stopping = [finding for finding in diagnosis.findings if finding.code in STOPPING]
+    if stopping and not force:
+        first = stopping[0]
+        raise NotObservableError("scale", f"{first.evidence}; {first.advice} (--force goes on)")
+    for finding in stopping:
+        log.warning("forced to go on: %s", finding.evidence)
+    return tuple(f"{finding.evidence}; forced to go on" for finding in stopping)
+
+
+def _followed(
+    capture: Capture, timing: FrameTiming, most: int, spacing_s: float, progress: Progress
+) -> VisualRotation | None:
+    """The rotation between frames from the beginning of a video; ``None`` for pictures further apart."""
+    if len(timing.t_s) < 2 or float(np.median(np.diff(timing.t_s))) > _VIDEO_STEP_S:
+        return None
+    indices = near_the_beginning(timing, spacing_s, most)
+    return followed(capture, timing, guessed_camera(capture, timing), indices, progress)

@@ -1,0 +1,151 @@
+"""Steps in order, those that are done already skipped, each output whole or absent."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import functools
+import hashlib
+import json
+import logging
+import os
+import shutil
+import time
+import types
+import uuid
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from colmap_inertial import __version__
+from colmap_inertial.errors import FormatError, InertialError
+from colmap_inertial.io.files import read_json, write_json
+from colmap_inertial.run.workspace import Workspace
+
+log = logging.getLogger(__name__)
+
+
+def canonical(value: object) -> object:
+    """A value in JSON types, for hashing: dataclasses by field, paths as text, functions by name, body and closure.
+
+    A field that is declared with ``compare=False`` decides nothing and is left out.
+    """
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = {f.name: canonical(getattr(value, f.name)) for f in dataclasses.fields(value) if f.compare}
+        return {"type": f"{type(value).__module__}.{type(value).__qualname__}", **fields}
+    if isinstance(value, Mapping):
+        return {str(k): canonical(v) for k, v in value.items()}
+    if isinstance(value, enum.Enum):
+        return value.value
+    if isinstance(value, np.ndarray):
+        return hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, (list, tuple)):
+        return [canonical(v) for v in value]
+    if isinstance(value, (set, frozenset)):
+        return sorted((canonical(v) for v in value), key=repr)
+    if isinstance(value, Path):
+        return str(value)
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    if isinstance(value, functools.partial):
+        return ["partial", canonical(value.func), canonical(value.args), canonical(value.keywords)]
+    if isinstance(value, types.FunctionType):
+        cells = [canonical(cell.cell_contents) for cell in value.__closure__ or ()]
+        defaults = canonical([value.__defaults__, value.__kwdefaults__])
+        return [f"{value.__module__}.{value.__qualname__}", _code(value.__code__), cells, defaults]
+    if isinstance(value, types.MethodType):
+        return [canonical(value.__func__), canonical(value.__self__)]
+    # Anything else may hide what decides its result: a key of its own, so that nothing made with it is ever kept.
+    return f"{type(value).__module__}.{type(value).__qualname__} {uuid.uuid4()}"
+
+
+def _code(code: types.CodeType) -> list[object]:
+    """A function's body, without names of files and numbers of lines."""
+    constants = [_code(c) if isinstance(c, types.CodeType) else repr(c) for c in code.co_consts]
+    return [code.co_code.hex(), list(code.co_names), constants]
+
+
+def fingerprint(path: Path) -> list[object]:
+    """What identifies an input without reading it whole: names, sizes and modification times."""
+    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    stats = [(file, file.stat()) for file in files]
+    return [[str(file.resolve()), stat.st_size, stat.st_mtime_ns] for file, stat in stats]
+
+
+class StageRunner:
+    """Runs stages in order and skips those whose inputs and options are those of an earlier, finished run.
+
+    A stage's key hashes its options, its inputs and the key of the stage before it, so that a change anywhere reruns
+    everything downstream. A folder's existence proves nothing: only a stamp with the right key does.
+    """
+
+    def __init__(self, workspace: Workspace) -> None:
+        self._workspace = workspace
+        self._upstream = ""
+        self.seconds: dict[str, float] = {}
+
+    def run(
+        self, name: str, depends: Mapping[str, object], outputs: Sequence[Path], work: Callable[[list[Path]], None]
+    ) -> None:
+        """Run ``work`` unless its stamp holds.
+
+        Parameters
+        ----------
+        name
+            The stage.
+        depends
+            Everything that decides its output beside the stages before it.
+        outputs
+            What it writes. ``work`` gets temporary paths in their places, which are renamed when it returns.
+        work
+            Writes every temporary path; parent folders exist, the paths themselves do not.
+        """
+        text = json.dumps([name, __version__, self._upstream, canonical(depends)], sort_keys=True)
+        self._upstream = hashlib.sha256(text.encode()).hexdigest()
+        stamp = self._workspace.stamps / f"{name}.json"
+        done = _read_stamp(stamp)
+        if done is not None and done["key"] == self._upstream and all(path.exists() for path in outputs):
+            self.seconds[name] = done["seconds"]
+            log.info("%s: finished in an earlier run, kept", name)
+            return
+        stamp.unlink(missing_ok=True)
+        for path in outputs:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        partial = [path.with_name(f"{path.stem}.partial{path.suffix}") for path in outputs]
+        for path in (*outputs, *partial):
+            remove(path)
+        log.info("%s: started", name)
+        start = time.perf_counter()
+        try:
+            work(partial)
+        except (InertialError, OSError):
+            for path in partial:
+                remove(path)
+            raise
+        for source, target in zip(partial, outputs, strict=True):
+            os.replace(source, target)
+        self.seconds[name] = time.perf_counter() - start
+        write_json(stamp, {"key": self._upstream, "seconds": self.seconds[name]})
+        log.info("%s: finished in %.1f s", name, self.seconds[name])
+
+
+def _read_stamp(stamp: Path) -> dict[str, Any] | None:
+    if not stamp.is_file():
+        return None
+    try:
+        return read_json(stamp)
+    except FormatError:
+        return None
+
+
+def remove(path: Path) -> None:
+    """Remove a file or folder of our own, if it is there, with the side files of an SQLite database."""
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        for suffix in ("", "-journal", "-wal", "-shm"):
+            path.with_name(path.name + suffix).unlink(missing_ok=True)

@@ -1,0 +1,218 @@
+"""The output folder: where everything lies, what is finished, and how a stage's output appears whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import logging
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from colmap_inertial.errors import FormatError, OutputError, OutputExistsError
+from colmap_inertial.io.files import read_json, write_json
+from colmap_inertial.report.content import CROPS_FOLDER, DATA_FOLDER
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """Every path of an output folder, derived from its root."""
+
+    root: Path
+
+    @property
+    def images(self) -> Path:
+        """The frames that COLMAP sees."""
+        return self.root / "images"
+
+    @property
+    def images_rectified(self) -> Path:
+        """The same frames as a global shutter would have taken them, where the rolling shutter was undone."""
+        return self.root / "images_rectified"
+
+    @property
+    def selection(self) -> Path:
+        """Which frames of a video are used, and why."""
+        return self.root / "selection.json"
+
+    @property
+    def imaging(self) -> Path:
+        """Calibration from before the reconstruction, and what it means for each frame."""
+        return self.root / "imaging.json"
+
+    @property
+    def frames(self) -> Path:
+        """Names, times and treatment of the frames."""
+        return self.root / "frames.json"
+
+    @property
+    def features(self) -> Path:
+        """COLMAP's database before matching; removed at the end of a run."""
+        return self.root / "features.db"
+
+    @property
+    def database(self) -> Path:
+        """COLMAP's database."""
+        return self.root / "database.db"
+
+    @property
+    def sparse(self) -> Path:
+        """COLMAP's models, untouched."""
+        return self.root / "sparse"
+
+    @property
+    def sparse_metric(self) -> Path:
+        """The same models in metres."""
+        return self.root / "sparse_metric"
+
+    @property
+    def project_metric(self) -> Path:
+        """The whole project in metres, where an existing one was given."""
+        return self.root / "project_metric"
+
+    @property
+    def dense_metric(self) -> Path:
+        """Dense reconstructions of the metric models."""
+        return self.root / "dense_metric"
+
+    @property
+    def validation(self) -> Path:
+        """Pictures of the target in the frames."""
+        return self.root / "validation"
+
+    @property
+    def diagnosis(self) -> Path:
+        """What was found wrong with the recording before the reconstruction."""
+        return self.root / "diagnosis.json"
+
+    @property
+    def apertures(self) -> Path:
+        """Disparities and depths of a multi-aperture camera's frames, where they were asked for."""
+        return self.root / "apertures"
+
+    @property
+    def report(self) -> Path:
+        """For reading: everything in one page."""
+        return self.root / "report.html"
+
+    @property
+    def report_data(self) -> Path:
+        """What the report shows beside the results; with it, the report can be made again."""
+        return self.root / DATA_FOLDER
+
+    @property
+    def crops(self) -> Path:
+        """Parts of some frames before and after the frame stages."""
+        return self.report_data / CROPS_FOLDER
+
+    @property
+    def result(self) -> Path:
+        """Written last: its presence means that the run is finished."""
+        return self.root / "result.json"
+
+    @property
+    def config(self) -> Path:
+        """The resolved configuration, in the form that ``--config`` reads."""
+        return self.root / "config.toml"
+
+    @property
+    def log(self) -> Path:
+        """The run's log."""
+        return self.root / "log.txt"
+
+    @property
+    def stamps(self) -> Path:
+        """One JSON for each finished stage."""
+        return self.root / ".stages"
+
+    def trajectory(self, index: int, *, first: bool) -> Path:
+        """The smoothed metric trajectory of a model; the first one has the plain name."""
+        return self.root / ("trajectory.tum" if first else f"trajectory_{index}.tum")
+
+    def open(self, capture: Path) -> None:
+        """Create the folder, or take up a run of the same capture that is unfinished or waits for depth maps.
+
+        Raises
+        ------
+        OutputExistsError
+            When the folder holds a finished result, another capture's run, or something that is not ours.
+        """
+        owner = self.stamps / "capture.json"
+        if self.result.exists() and not (owner.is_file() and read_json(self.result).get("waiting")):
+            raise OutputExistsError(f"{self.root} holds a finished result; choose another folder or remove it")
+        if self.root.exists() and not self.root.is_dir():
+            raise OutputExistsError(f"{self.root} is a file; choose another output folder")
+        identity = {"capture": str(capture.resolve())}
+        if owner.is_file():
+            if read_json(owner) != identity:
+                raise OutputExistsError(
+                    f"{self.root} holds an unfinished run of another capture ({read_json(owner).get('capture')}); "
+                    "choose another folder or remove it"
+                )
+        elif self.root.is_dir() and any(p.name != self.stamps.name for p in self.root.iterdir()):
+            raise OutputExistsError(f"{self.root} is not empty; choose another output folder")
+        try:
+            self.stamps.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"{self.root} cannot be made: {error.strerror or error}") from error
+        write_json(owner, identity)
+
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep other runs out of the folder.
+
+        Raises
+        ------
+        OutputExistsError
+            While another run is at work in it.
+        OutputError
+            Where the disk is full.
+        """
+        with full_disk_is_an_error(self.root), open(self.stamps / "lock", "w") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise OutputExistsError(
+                    f"another run is at work in {self.root}; wait for it or choose another folder"
+                ) from None
+            yield
+
+
+_MAKE_ROOM = "make room and start again, it continues"
+
+
+@contextlib.contextmanager
+def full_disk_is_an_error(root: Path, advice: str = _MAKE_ROOM) -> Iterator[None]:
+    """Turn the system's complaint about a full disk (or a quota, or a limit of file sizes) into one of ours."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+            raise
+        raise OutputError(f"the disk of {root} is full ({error.strerror}); {advice}") from error
+
+
+@contextlib.contextmanager
+def a_record_of_ours(path: Path) -> Iterator[None]:
+    """While a record of an earlier run is taken apart: what does not fit means that it was changed since."""
+    try:
+        yield
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        raise FormatError(path, f"was damaged since it was written ({error}); remove it and start again") from None
+
+
+def require_room(folder: Path, num_bytes: int) -> None:
+    """Raise :class:`OutputError` where the disk of ``folder`` has less room left than ``num_bytes``.
+
+    For what COLMAP writes: its threads end the process when a database cannot grow, and its models end early.
+    """
+    free = shutil.disk_usage(folder).free
+    if free < num_bytes:
+        raise OutputError(
+            f"the disk of {folder} is nearly full: {free / 1e6:.0f} MB are left, COLMAP's next step may need "
+            f"{num_bytes / 1e6:.0f} MB; {_MAKE_ROOM}"
+        )

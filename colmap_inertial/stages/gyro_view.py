@@ -1,0 +1,70 @@
+"""A recording's gyroscope, camera and frame times, brought together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from colmap_inertial.align import on_camera_rate
+from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
+from colmap_inertial.types import (
+    CameraImuCalibration,
+    CameraModel,
+    FrameTiming,
+    ImuRecording,
+)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class GyroView:
+    """A recording's gyroscope, camera and frame times, brought together.
+
+    Attributes
+    ----------
+    imu
+        The recording, as it was read.
+    timing
+        Of all frames.
+    calibration
+        Rotation, time offset and gyroscope bias.
+    clock_rate, clock_middle_s
+        Change of the time offset per second, and the camera time at which it holds.
+    camera
+        Intrinsics.
+    source
+        Where the calibration comes from: ``"capture"``, ``"model"`` (a small one, made beforehand) or ``"pixels"``.
+    notes
+        What there is to say about it, in words.
+    """
+
+    imu: ImuRecording
+    timing: FrameTiming
+    calibration: CameraImuCalibration
+    clock_rate: float = 0.0
+    clock_middle_s: float = 0.0
+    camera: CameraModel
+    source: str
+    notes: tuple[str, ...] = ()
+
+    def recording(self) -> ImuRecording:
+        """The recording on a clock that runs as the camera's does; one offset holds for all of it."""
+        if self.clock_rate == 0:
+            return self.imu
+        return on_camera_rate(
+            self.imu,
+            self.calibration,
+            clock_rate=self.clock_rate,
+            middle_s=self.clock_middle_s,
+            trajectory_epoch_ns=self.timing.epoch_ns,
+        )
+
+    def motion(self) -> GyroCamera:
+        """The gyroscope on the camera's clock."""
+        return GyroCamera.of(self.recording(), self.calibration, camera_epoch_ns=self.timing.epoch_ns)
+
+    def shutter(self, index: int) -> FrameShutter:
+        """When the lines of one frame are exposed."""
+        return FrameShutter.of(self.timing, index, width=self.camera.width, height=self.camera.height)
+
+    def index(self) -> dict[str, int]:
+        """The place of each frame name."""
+        return {name: i for i, name in enumerate(self.timing.names)}

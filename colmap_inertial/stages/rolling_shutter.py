@@ -1,0 +1,73 @@
+"""The default keypoint stage: keypoints without the rolling shutter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from colmap_inertial.imaging.gyro_camera import GyroCamera
+from colmap_inertial.imaging.rolling_shutter import rectify_keypoints
+from colmap_inertial.io.calibration import SMALLEST_READOUT_S
+from colmap_inertial.model import colmap_camera
+from colmap_inertial.stages.gyro_view import GyroView
+from colmap_inertial.types import (
+    CALIBRATION_PARAMETERS,
+    Array,
+    CameraImuCalibration,
+    Projector,
+)
+
+#: Share of the readout that acts on poses after rectification.
+_LEFT_SHARE = 0.1
+
+
+_READOUT = CALIBRATION_PARAMETERS.index("readout_s")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RollingShutterStage:
+    """The keypoint stage that moves keypoints to where a global shutter would have seen them.
+
+    The instant is the one that poses hold, mid-exposure of the middle row. Keypoints of frames that the gyroscope does
+    not cover stay in place.
+
+    Attributes
+    ----------
+    view
+        Gyroscope, camera and times.
+    """
+
+    view: GyroView
+    _ready: dict[str, tuple[GyroCamera, Projector, dict[str, int]]] = field(
+        default_factory=dict, init=False, compare=False, repr=False
+    )
+
+    def __call__(self, name: str, keypoints_px: Array, /) -> Array:
+        """Move the keypoints of one image."""
+        if not self.covers(name):
+            return keypoints_px
+        motion, camera, index = self._parts()
+        shutter = self.view.shutter(index[name])
+        return np.asarray(rectify_keypoints(keypoints_px, motion, camera, shutter), dtype=np.float64)
+
+    def covers(self, name: str) -> bool:
+        """Whether the gyroscope recorded the whole readout of a frame."""
+        motion, _, index = self._parts()
+        return self.view.shutter(index[name]).covered_by(motion, reference=True)
+
+    def _parts(self) -> tuple[GyroCamera, Projector, dict[str, int]]:
+        if "parts" not in self._ready:
+            self._ready["parts"] = self.view.motion(), colmap_camera(self.view.camera), self.view.index()
+        return self._ready["parts"]
+
+
+def for_rectified(calibration: CameraImuCalibration) -> CameraImuCalibration:
+    """The calibration of a camera whose keypoints were rectified: hardly any readout is left.
+
+    Its standard deviation stands for what the camera's translation does within the readout, which stays.
+    """
+    cov = calibration.cov.copy()
+    cov[_READOUT, :] = cov[:, _READOUT] = 0.0
+    cov[_READOUT, _READOUT] = max(SMALLEST_READOUT_S, _LEFT_SHARE * calibration.readout_s) ** 2
+    return replace(calibration, readout_s=0.0, cov=cov)
