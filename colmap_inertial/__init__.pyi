@@ -1,70 +1,90 @@
-from .align import AlignOptions as AlignOptions
-from .align import align_camera_imu as align_camera_imu
-from .batch import BatchCapture as BatchCapture
-from .batch import BatchResult as BatchResult
-from .batch import CaptureStatus as CaptureStatus
-from .batch import read_manifest as read_manifest
-from .batch import run_batch as run_batch
-from .drivers.capture import default_model_stages as default_model_stages
+from .align import AlignOptions as AlignOptions, align_camera_imu as align_camera_imu
+from .batch import (
+    BatchCapture as BatchCapture,
+    BatchResult as BatchResult,
+    CaptureStatus as CaptureStatus,
+    read_manifest as read_manifest,
+    run_batch as run_batch,
+)
+from .colmap.sparse import KeypointRecord as KeypointRecord
 from .drivers.capture import reconstruct as reconstruct
+from .drivers.deblur import DeblurResult as DeblurResult, deblur_capture as deblur_capture
 from .drivers.project import reconstruct_project as reconstruct_project
-from .drivers.result import ModelResult as ModelResult
-from .drivers.result import ReconstructResult as ReconstructResult
-from .errors import AlreadyMetricError as AlreadyMetricError
-from .errors import FormatError as FormatError
-from .errors import InertialError as InertialError
-from .errors import MappingError as MappingError
-from .errors import MissingExtraError as MissingExtraError
-from .errors import NotObservableError as NotObservableError
-from .errors import OutputError as OutputError
-from .errors import OutputExistsError as OutputExistsError
-from .errors import TargetNotFoundError as TargetNotFoundError
-from .errors import TimingError as TimingError
-from .imaging.wiener import deblur as deblur
-from .io.calibration import read_calibration as read_calibration
-from .io.calibration import write_calibration as write_calibration
-from .io.capture import load_capture as load_capture
-from .io.frames import read_frame_times as read_frame_times
-from .io.frames import read_frames as read_frames
-from .io.imu import read_frame_log as read_frame_log
-from .io.imu import read_imu as read_imu
-from .model import Model as Model
-from .model import apply_similarity as apply_similarity
-from .model import find_models as find_models
-from .model import read_model as read_model
-from .model import trajectory_from_model as trajectory_from_model
-from .model.project import apply_to_project as apply_to_project
-from .model.project import undo_project as undo_project
-from .model.similarities import ModelScale as ModelScale
-from .model.similarities import read_scales as read_scales
-from .model.similarities import read_similarity as read_similarity
-from .options import MappingOptions as MappingOptions
-from .options import ProjectOptions as ProjectOptions
-from .options import ReconstructOptions as ReconstructOptions
-from .options import ScaleOptions as ScaleOptions
-from .options import ValidateOptions as ValidateOptions
+from .drivers.result import Fragment as Fragment, ModelResult as ModelResult, ReconstructResult as ReconstructResult
+from .errors import (
+    AlreadyMetricError as AlreadyMetricError,
+    FormatError as FormatError,
+    InertialError as InertialError,
+    MappingError as MappingError,
+    MissingExtraError as MissingExtraError,
+    NotObservableError as NotObservableError,
+    OutputError as OutputError,
+    OutputExistsError as OutputExistsError,
+    TargetNotFoundError as TargetNotFoundError,
+    TimingError as TimingError,
+)
+from .imaging.blur_field import BlurField as BlurField
+from .imaging.gyro_camera import FrameShutter as FrameShutter, GyroCamera as GyroCamera
+from .imaging.psf import blur_field as blur_field, frame_blur as frame_blur
+from .imaging.wiener import DeblurOptions as DeblurOptions, deblur as deblur
+from .io.calibration import read_calibration as read_calibration, write_calibration as write_calibration
+from .io.capture import Capture as Capture, load_capture as load_capture
+from .io.frames import read_frame_times as read_frame_times, read_frames as read_frames
+from .io.imu import read_frame_log as read_frame_log, read_imu as read_imu
+from .io.imu_formats import ImuFormat as ImuFormat
+from .model import (
+    Model as Model,
+    apply_similarity as apply_similarity,
+    colmap_camera as colmap_camera,
+    find_models as find_models,
+    read_model as read_model,
+    trajectory_from_model as trajectory_from_model,
+)
+from .model.project import apply_to_project as apply_to_project, undo_project as undo_project
+from .model.similarities import ModelScale as ModelScale, read_scales as read_scales, read_similarity as read_similarity
+from .options import (
+    BatchOptions as BatchOptions,
+    MappingOptions as MappingOptions,
+    ProjectOptions as ProjectOptions,
+    ReconstructOptions as ReconstructOptions,
+    ScaleOptions as ScaleOptions,
+    StageNames as StageNames,
+    ValidateOptions as ValidateOptions,
+)
 from .report import write_report as write_report
 from .run.config import read_config as read_config
+from .run.progress import Progress as Progress
 from .scale import estimate_scale as estimate_scale
 from .smooth import smooth_trajectory as smooth_trajectory
+from .stages.apertures import ApertureStage as ApertureStage
 from .stages.deblur import DeblurStage as DeblurStage
+from .stages.exposures import ExposureStage as ExposureStage
+from .stages.frame_folder import FrameRecord as FrameRecord
 from .stages.metric import MetricStage as MetricStage
-from .stages.protocols import FrameStage as FrameStage
-from .stages.protocols import KeypointStage as KeypointStage
-from .stages.protocols import ModelStage as ModelStage
+from .stages.protocols import FrameStage as FrameStage, KeypointStage as KeypointStage, ModelStage as ModelStage
 from .stages.readout import ReadoutStage as ReadoutStage
 from .stages.rolling_shutter import RollingShutterStage as RollingShutterStage
-from .types import CameraImuCalibration as CameraImuCalibration
-from .types import CameraModel as CameraModel
-from .types import CameraTrajectory as CameraTrajectory
-from .types import Frame as Frame
-from .types import FrameLog as FrameLog
-from .types import FrameTiming as FrameTiming
-from .types import ImuRecording as ImuRecording
-from .types import ScaleEstimate as ScaleEstimate
-from .types import Similarity as Similarity
-from .types import SmoothedTrajectory as SmoothedTrajectory
-from .validate import parse_target as parse_target
-from .validate import validate_model as validate_model
+from .types import (
+    AcceptedScale as AcceptedScale,
+    CameraImuCalibration as CameraImuCalibration,
+    CameraModel as CameraModel,
+    CameraTrajectory as CameraTrajectory,
+    Frame as Frame,
+    FrameLog as FrameLog,
+    FrameTiming as FrameTiming,
+    ImuNoise as ImuNoise,
+    ImuRecording as ImuRecording,
+    Keypoints as Keypoints,
+    ScaleEstimate as ScaleEstimate,
+    Similarity as Similarity,
+    SmoothedTrajectory as SmoothedTrajectory,
+    Treatment as Treatment,
+)
+from .validate import (
+    Target as Target,
+    Validation as Validation,
+    parse_target as parse_target,
+    validate_model as validate_model,
+)
 
 __version__: str

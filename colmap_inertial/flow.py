@@ -18,14 +18,13 @@ from colmap_inertial.geometry import (
     quat_conjugate,
     quat_cumulative,
     quat_exp,
-    quat_log,
-    quat_multiply,
     skew,
     so3_exp,
     so3_log,
 )
 from colmap_inertial.gyro import GyroPath
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
+from colmap_inertial.sampling import without_running_mean
 from colmap_inertial.types import Array, CameraTrajectory, Frame, FrameTiming, ImuRecording, Projector
 
 Grey = NDArray[np.uint8]
@@ -114,7 +113,7 @@ def measure_rotation(
         In order of time, all of one size; two are held at a time.
     camera
         Intrinsics with distortion, COLMAP's pixel coordinates. Without a calibration, a guess serves to find the clock
-        offset and the axes: a wrong focal length scales all rotations alike.
+        offset and the axes: a wrong focal length scales all rotations equally.
     timing
         Holds every frame; its readout, where known, gives each line a time of its own.
     options
@@ -179,8 +178,8 @@ class MotionCheck:
         Share of the rotation in the pictures that the gyroscope explains: one is all of it, below zero is worse than
         no gyroscope. ``None`` where too few frames, or too little rotation, could be compared.
     gain
-        (3,) rotation in the pictures per rotation felt, about each camera axis; negative means a flipped axis, NaN one
-        about which the camera hardly turned. A common factor above or below one points at the focal length.
+        (3,) rotation in the pictures per rotation measured, about each camera axis; negative means a flipped axis, NaN
+        one about which the camera hardly turned. A common factor above or below one points at the focal length.
     agrees
         ``None`` where that cannot be told.
     reason
@@ -193,15 +192,15 @@ class MotionCheck:
     reason: str
 
 
-#: The gyroscope must explain so much; an axis counts where it turned by more than this many times the noise.
-_LEAST_EXPLAINED, _TURNED = 0.5, 3.0
+#: The gyroscope must explain so much; an axis counts where it rotated by more than this many times the noise.
+_LEAST_EXPLAINED, _ROTATED_SIGMAS = 0.5, 3.0
 
 
 def check_motion(rotation: VisualRotation, motion: GyroCamera) -> MotionCheck:
     """Compare the rotation between frames with the gyroscope's, axis by axis.
 
-    Blur looks alike whichever way the camera turned; the way from frame to frame does not. So this tells a wrong sign,
-    exchanged axes and a wrong clock offset from the right ones.
+    Blur looks the same whichever way the camera turned; the way from frame to frame does not. So this tells a wrong
+    sign, exchanged axes and a wrong clock offset from the right ones.
 
     Parameters
     ----------
@@ -216,19 +215,18 @@ def check_motion(rotation: VisualRotation, motion: GyroCamera) -> MotionCheck:
         return MotionCheck(
             explained=None, gain=unknown, agrees=None, reason="too few pairs of frames to compare with the gyroscope"
         )
-    looking = motion.start_from_cam(rotation.t_s)
-    felt = so3_log(np.swapaxes(looking[:-1], 1, 2) @ looking[1:])[known]
-    seen, sigma = rotation.turn_rad[known], float(np.median(rotation.sigma_rad[known]))
-    size = np.sqrt(np.mean(seen**2))
-    if size < _TURNED * sigma:
+    inertial = motion.turn_rad(rotation.t_s)[known]
+    visual, sigma = rotation.turn_rad[known], float(np.median(rotation.sigma_rad[known]))
+    size = np.sqrt(np.mean(visual**2))
+    if size < _ROTATED_SIGMAS * sigma:
         return MotionCheck(explained=None, gain=unknown, agrees=None, reason="the camera hardly turned between frames")
     # the median copes with pairs that were measured wrongly
-    left, all_of_it = (float(np.median(np.sum(v**2, axis=1))) for v in (seen - felt, seen))
+    left, all_of_it = (float(np.median(np.sum(v**2, axis=1))) for v in (visual - inertial, visual))
     explained = 1 - left / max(all_of_it, 1e-12)
     gain = []
     for axis in range(3):
-        turned = np.sqrt(np.mean(felt[:, axis] ** 2)) > _TURNED * sigma
-        gain.append(float(seen[:, axis] @ felt[:, axis] / (felt[:, axis] @ felt[:, axis])) if turned else float("nan"))
+        x, y = inertial[:, axis], visual[:, axis]
+        gain.append(float(y @ x / (x @ x)) if np.sqrt(np.mean(x**2)) > _ROTATED_SIGMAS * sigma else float("nan"))
     flipped = ["xyz"[axis] for axis in range(3) if gain[axis] < -0.3]
     reason = f"the gyroscope explains {100 * max(explained, 0):.0f} % of the rotation between frames"
     if flipped:
@@ -273,24 +271,23 @@ def find_stabilisation(rotation: VisualRotation, imu: ImuRecording, *, offset_s:
     inside = path.covers(begin_s, end_s)
     if inside.sum() < 20:
         return Stabilisation(share=None, stabilised=None, reason="the gyroscope does not run along with the frames")
-    starts, ends = path.at(begin_s[inside])[0], path.at(end_s[inside])[0]
-    felt = quat_log(quat_multiply(quat_conjugate(starts), ends)) / (end_s - begin_s)[inside, None]
-    seen = rotation.turn_rad[known] / dt_s[known, None]
+    inertial = path.turn_rad(begin_s[inside], end_s[inside]) / (end_s - begin_s)[inside, None]
+    visual = rotation.turn_rad[known] / dt_s[known, None]
     noise = float(np.median(rotation.sigma_rad[known])) / step_s
     width = max(3, round(_QUICK_S / step_s))
-    quick_felt, quick_seen = _quick(felt, width), _quick(seen, width)
-    if quick_felt < _CLEAR * noise or quick_felt < 0.02:
+    quick_inertial, quick_visual = _quick(inertial, width), _quick(visual, width)
+    if quick_inertial < _CLEAR * noise or quick_inertial < 0.02:
         return Stabilisation(
             share=None, stabilised=None, reason="the camera was held too still to tell whether the video is stabilised"
         )
-    share = quick_seen / quick_felt
+    share = quick_visual / quick_inertial
     if share < _STABILISED_SHARE:
         return Stabilisation(
             share=share,
             stabilised=True,
-            reason=f"the pictures hold {100 * share:.0f} % of the quick rotation that the gyroscope felt: the video "
-            "was stabilised in the camera, so its gyroscope does not belong to its pixels; switch stabilisation off "
-            "and record again",
+            reason=f"the pictures hold {100 * share:.0f} % of the quick rotation that the gyroscope measured: the "
+            "video was stabilised in the camera, so its gyroscope does not belong to its pixels; switch stabilisation "
+            "off and record again",
         )
     return Stabilisation(
         share=share, stabilised=False, reason=f"the pictures hold {100 * share:.0f} % of the gyroscope's quick rotation"
@@ -299,10 +296,7 @@ def find_stabilisation(rotation: VisualRotation, imu: ImuRecording, *, offset_s:
 
 def _quick(rate: Array, width: int) -> float:
     """Robust size of what changes faster than the running mean over ``width`` samples."""
-    kernel = np.ones(width) / width
-    slow = np.stack([np.convolve(column, kernel, mode="valid") for column in rate.T], axis=1)
-    start = (width - 1) // 2
-    quick = np.linalg.norm(rate[start : start + len(slow)] - slow, axis=1)
+    quick = np.linalg.norm(without_running_mean(rate, width), axis=1)
     return float(np.sqrt(np.mean(np.sort(quick**2)[: max(1, int(0.98 * len(quick)))])))
 
 
@@ -376,7 +370,7 @@ def _matched(before: Grey, now: Grey, options: FlowOptions) -> tuple[NDArray[np.
     import cv2
 
     detector = cv2.SIFT.create(4 * options.corners)
-    (points_a, a), (points_b, b) = (detector.detectAndCompute(picture, None) for picture in (before, now))
+    (points_a, a), (points_b, b) = (detector.detectAndCompute(image, None) for image in (before, now))
     if a is None or b is None or min(len(a), len(b)) < options.min_support:
         return np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32)
     matches = cv2.BFMatcher(cv2.NORM_L2, crossCheck=True).match(a, b)
@@ -389,8 +383,8 @@ def _matched(before: Grey, now: Grey, options: FlowOptions) -> tuple[NDArray[np.
 def _fit_rate(first: Array, second: Array, span_s: Array, pixel_rad: float) -> tuple[Array, float, int] | None:
     """One angular velocity (rad/s, camera frame) that turns the rays of one frame into those of the next.
 
-    A ray seen at one time is seen ``span_s`` later turned by ``exp(-rate span_s)``. Draws of two rays, then iteratively
-    reweighted least squares with the weights of Geman and McClure; what translation moves counts as noise.
+    A ray seen at one time is seen ``span_s`` later rotated by ``exp(-rate span_s)``. Draws of two rays, then
+    iteratively reweighted least squares with the weights of Geman and McClure; what translation moves counts as noise.
 
     Returns
     -------
@@ -414,10 +408,10 @@ def _fit_rate(first: Array, second: Array, span_s: Array, pixel_rad: float) -> t
         return None
     rate, scatter = best, reach
     for _ in range(_ROUNDS):
-        turned = np.einsum("nij,nj->ni", so3_exp(-rate * span_s[:, None]), a)
-        residual = b - turned
-        # d(exp(-rate s) a) = s [turned]x d(rate), to first order
-        jacobian = span_s[:, None, None] * skew(turned)
+        rotated = np.einsum("nij,nj->ni", so3_exp(-rate * span_s[:, None]), a)
+        residual = b - rotated
+        # d(exp(-rate s) a) = s [rotated]x d(rate), to first order
+        jacobian = span_s[:, None, None] * skew(rotated)
         square = np.sum(residual**2, axis=1)
         near = square < (2 * reach) ** 2
         if near.sum() < 3:
@@ -447,14 +441,3 @@ def _from_two(a: Array, b: Array) -> Array | None:
         middle = middle / np.linalg.norm(middle)
         frames.append(np.stack([middle, normal / length, np.cross(middle, normal / length)], axis=1))
     return np.asarray(frames[1] @ frames[0].T)
-
-
-__all__ = [
-    "FlowOptions",
-    "MotionCheck",
-    "Stabilisation",
-    "VisualRotation",
-    "check_motion",
-    "find_stabilisation",
-    "measure_rotation",
-]

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.errors import NotObservableError
-from colmap_inertial.geometry import quat_conjugate, quat_cumulative, quat_exp, quat_rotate, slerp
+from colmap_inertial.geometry import quat_conjugate, quat_rotate
+from colmap_inertial.gyro import GyroPath
 from colmap_inertial.types import Array, CameraImuCalibration, FrameTiming, ImuRecording
 
 #: Hand and walking accelerations average out over this time; the gyro carries the attitude meanwhile.
@@ -19,7 +20,7 @@ def up_in_imu(imu: ImuRecording, gyro_bias_rad_s: Array, query_s: Array, accel_d
     """The direction against gravity in the IMU frame.
 
     The gyroscope gives the attitude relative to the first sample; in that slowly drifting frame the specific force is
-    averaged with a Gaussian window, forward and backward in time alike, so there is no lag.
+    averaged with a Gaussian window, forward and backward in time, so there is no lag.
 
     Parameters
     ----------
@@ -44,13 +45,9 @@ def up_in_imu(imu: ImuRecording, gyro_bias_rad_s: Array, query_s: Array, accel_d
     """
     if not imu.has_accel:
         raise NotObservableError("gravity", "the recording has no accelerometer; record it along with the gyroscope")
-    t = imu.gyro_t_s
-    rate = imu.gyro_rad_s - gyro_bias_rad_s
-    steps = quat_exp(0.5 * (rate[1:] + rate[:-1]) * np.diff(t)[:, None])
-    start_from_imu = quat_cumulative(steps)
-
+    path = GyroPath(imu.gyro_t_s, imu.gyro_rad_s, gyro_bias_rad_s)
     accel_t = imu.accel_t_s + accel_delay_s
-    force_in_start = quat_rotate(slerp(t, start_from_imu, accel_t), imu.accel_m_s2)
+    force_in_start = quat_rotate(path.at(accel_t)[0], imu.accel_m_s2)
     spacing = 0.1
     grid = np.arange(accel_t[0], accel_t[-1] + spacing, spacing)
     cell = np.clip(np.round((accel_t - grid[0]) / spacing).astype(int), 0, len(grid) - 1)
@@ -63,7 +60,7 @@ def up_in_imu(imu: ImuRecording, gyro_bias_rad_s: Array, query_s: Array, accel_d
     )
     mean = summed / np.maximum(weight, 1e-12)[:, None]
     up_in_start = np.stack([np.interp(query_s, grid, mean[:, k]) for k in range(3)], axis=1)
-    up = quat_rotate(quat_conjugate(slerp(t, start_from_imu, query_s)), up_in_start)
+    up = quat_rotate(quat_conjugate(path.at(query_s)[0]), up_in_start)
     return up / np.linalg.norm(up, axis=1, keepdims=True)
 
 

@@ -1,21 +1,34 @@
-"""The gyroscope integrated to orientations that can be read at any instant; for alignment and smoothing."""
+"""The gyroscope integrated to orientations that can be read at any instant, and brought to the camera's rate."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.geometry import matrix_from_quat, quat_cumulative, quat_exp, quat_multiply
-from colmap_inertial.types import Array
+from colmap_inertial.geometry import (
+    matrix_from_quat,
+    quat_conjugate,
+    quat_cumulative,
+    quat_exp,
+    quat_log,
+    quat_multiply,
+)
+from colmap_inertial.sampling import Coverage
+from colmap_inertial.types import Array, CameraImuCalibration, ImuRecording
 
 
 class GyroPath:
     """Orientation of the IMU along a recording, against its orientation at the first sample.
 
-    Between samples the rate is linear; the rotation follows from Magnus' series up to its second term, without which
-    coning motion looks like a bias.
+    This is how the package integrates a gyroscope. Between samples the rate is linear; the rotation follows from
+    Magnus' series up to its second term (without which coning motion looks like a bias): the error of the integration
+    itself is of the fourth order in the step between samples, that of interpolating a rate linearly of the second.
+    ``scale._preintegration`` does the same, compiled, on a finer interpolation, with its derivatives; only
+    ``scale._grouping``, over a sixteenth of a second, and ``io.consistency``, which looks for degrees, make do with
+    the midpoint rule of order two.
 
     Parameters
     ----------
@@ -25,30 +38,27 @@ class GyroPath:
         (N, 3) readings, IMU frame.
     bias_rad_s
         (3,) subtracted from the readings.
-    max_gap_s
-        A longer pause between samples is a gap: nothing is known about the rotation in it.
     """
 
-    def __init__(self, t_s: Array, rate_rad_s: Array, bias_rad_s: Array, *, max_gap_s: float = 0.1) -> None:
+    def __init__(self, t_s: Array, rate_rad_s: Array, bias_rad_s: Array) -> None:
         self.t_s = t_s
         self.rate_rad_s = rate_rad_s - bias_rad_s
         self._step_s = np.diff(t_s)
-        turns = _turn(self.rate_rad_s[:-1], self.rate_rad_s[1:], self._step_s)
-        self.start_from_imu_xyzw = quat_cumulative(turns)
-        self._gaps = np.concatenate([[0], np.cumsum(self._step_s > max_gap_s)])
+        self.start_from_imu_xyzw = quat_cumulative(_turn(self.rate_rad_s[:-1], self.rate_rad_s[1:], self._step_s))
+        self._coverage = Coverage(t_s)
 
     def covers(self, begin_s: Array, end_s: Array) -> NDArray[np.bool_]:
         """Which of the intervals lie inside the recording and contain no gap."""
-        top = len(self.t_s) - 1
-        first = np.searchsorted(self.t_s, begin_s, side="right") - 1
-        last = np.searchsorted(self.t_s, end_s, side="left")
-        gapless = self._gaps[np.clip(first, 0, top)] == self._gaps[np.clip(last, 0, top)]
-        return np.asarray((first >= 0) & (last <= top) & gapless)
+        return self._coverage.covers(begin_s, end_s)
 
     def at(self, query_s: Array) -> tuple[Array, Array]:
         """``start_from_imu`` quaternions (M, 4) and rates (M, 3) in rad/s at ``query_s``; the ends are continued."""
         i, since_s, rate = self._locate(query_s)
         return quat_multiply(self.start_from_imu_xyzw[i], _turn(self.rate_rad_s[i], rate, since_s)), rate
+
+    def turn_rad(self, begin_s: Array, end_s: Array) -> Array:
+        """(M, 3) rotation vectors ``begin_from_end`` of intervals, IMU frame."""
+        return quat_log(quat_multiply(quat_conjugate(self.at(begin_s)[0]), self.at(end_s)[0]))
 
     def bias_lever(self, query_s: Array) -> Array:
         """(M, 3, 3) integrals of ``start_from_imu`` from the first sample to ``query_s``, in seconds.
@@ -108,3 +118,30 @@ def _by_symmetric(rate: Array) -> Array:
     for entry, (i, j) in enumerate(((1, 2), (0, 2), (0, 1)), start=3):
         out[:, i, entry], out[:, j, entry] = rate[:, j], rate[:, i]
     return out
+
+
+def on_camera_rate(imu: ImuRecording, calibration: CameraImuCalibration, *, camera_epoch_ns: int) -> ImuRecording:
+    """A recording with stamps that keep step with the camera: the calibration's time offsets then hold throughout.
+
+    Parameters
+    ----------
+    imu
+        The recording as it was read. One whose clock keeps step is returned as it is.
+    calibration
+        Its clock rate, and when its offsets hold.
+    camera_epoch_ns
+        Epoch of the frame times that ``calibration.clock_middle_s`` is counted from.
+    """
+    rate = calibration.clock_rate
+    if rate == 0:
+        return imu
+    offset_s = calibration.gyro_time_offset_s + (imu.epoch_ns - camera_epoch_ns) * 1e-9
+    fixed_s = calibration.clock_middle_s - offset_s
+
+    def stretched(t_s: Array) -> Array:
+        return np.asarray(fixed_s + (t_s - fixed_s) / (1 - rate))
+
+    note = f"the IMU's clock is {1e6 * rate:+.0f} ppm off the camera's: its stamps were stretched to keep step"
+    return replace(
+        imu, gyro_t_s=stretched(imu.gyro_t_s), accel_t_s=stretched(imu.accel_t_s), repairs=(*imu.repairs, note)
+    )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Literal
 
@@ -148,6 +148,8 @@ class ProjectOptions:
     """Project: patterns of paths in it that are copied as they are, such as "old/*"."""
     link: bool = False
     """Project: hard links for files that do not change; an edit of one then changes the original, too."""
+    follow_links: bool = False
+    """Project: take what symbolic links out of it lead to into OUT/project_metric; without, they are refused."""
 
     def __post_init__(self) -> None:
         ways = (self.frame_times is not None and self.video is None, self.name_times is not None, self.exif_times)
@@ -230,12 +232,75 @@ class ReconstructOptions:
     """Seed of COLMAP's random sampling."""
     calibration: Path | None = None
     """A calibration file of this device (from `colmap-inertial align --out`), used as a prior."""
+    fragments: bool = False
+    """Make metric also what COLMAP made of fewer than 5 images, or of 1 % of those of its largest model."""
     force: bool = False
     """Go on where the check beforehand finds what makes metres meaningless; the verdict is then at most weak."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.seed < 2**31:
             raise ValueError(f"seed must be from 0 to 2147483647, not {self.seed}")
+
+
+#: How a list of stage names spells ``...``, the default stages.
+DEFAULT_STAGES = "..."
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageNames:
+    """The hooks of a reconstruction by name, for processes that import them themselves.
+
+    A name ``package.module:name`` (the second part may be dotted) is that of a stage itself: a function, or an
+    instance that can be called, no class. ``"..."`` stands for the default stages.
+    """
+
+    frame: tuple[str, ...] = (DEFAULT_STAGES,)
+    """Frame stages."""
+    keypoint: tuple[str, ...] = (DEFAULT_STAGES,)
+    """Keypoint stages."""
+    model: tuple[str, ...] = (DEFAULT_STAGES,)
+    """Model stages."""
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            names: tuple[str, ...] = getattr(self, f.name)
+            for name in names:
+                _check_stage_name(f.name, name)
+            if names.count(DEFAULT_STAGES) > 1:
+                raise ValueError(f'{f.name}: the default stages ("...") can stand in a list of stages once')
+
+    @property
+    def code(self) -> tuple[str, ...]:
+        """The names of code that is imported and run; empty where there are default stages alone."""
+        return tuple(n for n in (*self.frame, *self.keypoint, *self.model) if n != DEFAULT_STAGES)
+
+
+def _check_stage_name(kind: str, name: str) -> None:
+    module, _, path = name.partition(":")
+    if name != DEFAULT_STAGES and not all(part.isidentifier() for part in (*module.split("."), *path.split("."))):
+        raise ValueError(f'{kind}: {name!r} names no stage: write "module:name", or "..." for the default stages')
+    if module == "__main__":
+        raise ValueError(f"{kind}: {name!r} is found in this process only; put the stage into a module of its own")
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchOptions:
+    """Who works on the captures of a batch."""
+
+    workers: int | None = None
+    """Captures in work at once on this machine. Default: what processors and free memory allow."""
+    scheduler: str | None = None
+    """Address of a Dask scheduler (tcp://host:8786), whose workers do the work instead (needs the extra `cluster`)."""
+    attempts: int = 3
+    """How often a capture is started in all, where its process or its worker is killed."""
+
+    def __post_init__(self) -> None:
+        if self.workers is not None and self.workers < 1:
+            raise ValueError(f"workers must be at least 1, not {self.workers}")
+        if self.workers is not None and self.scheduler is not None:
+            raise ValueError("--workers are those of this machine; with --scheduler, the cluster has its own")
+        if not 1 <= self.attempts <= 100:
+            raise ValueError(f"attempts must be from 1 to 100, not {self.attempts}")
 
 
 @dataclass(frozen=True, kw_only=True)

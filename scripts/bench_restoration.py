@@ -60,8 +60,8 @@ from rich.console import Console
 
 from colmap_inertial.errors import InertialError
 from colmap_inertial.imaging import wiener
-from colmap_inertial.imaging.restoration import Network, deepgyro, load_network
 from colmap_inertial.options import ReconstructOptions
+from colmap_inertial.restoration import Network, deepgyro, load_network
 
 FALSE_BLURS_PX = (10.0, 20.0)
 #: Frames so large where all has to go fast.

@@ -24,6 +24,7 @@ from colmap_inertial.io.capture import Capture, Video
 from colmap_inertial.io.frames import read_frame_timing, read_frames
 from colmap_inertial.options import FrameOptions
 from colmap_inertial.precalibrate.selection import part_of, select_frames
+from colmap_inertial.run.context import Recording
 from colmap_inertial.types import CameraModel, ImuRecording
 
 WIDTH, HEIGHT, FPS, FOCAL_PX = 1920, 1080, 30, 1500.0
@@ -110,9 +111,8 @@ def measure(video: Path, minutes: int) -> None:
     timing = read_frame_timing(capture)
     index_s = time.perf_counter() - start
     start = time.perf_counter()
-    selection = select_frames(
-        capture, imu_of(minutes), timing, capture.calibration, options=FrameOptions(), progress=lambda *_: None
-    )
+    recording = Recording.of(capture, imu_of(minutes), timing, capture.calibration)
+    selection = select_frames(recording, FrameOptions(), lambda *_: None)
     select_s, select_mb = time.perf_counter() - start, peak_mb()
     start = time.perf_counter()
     used = part_of(timing, selection.names)

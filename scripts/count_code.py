@@ -1,4 +1,4 @@
-"""Lines of code, functions with many parameters, and stage type tests, of this checkout or of a commit.
+"""Lines of code, functions with many parameters, and type tests of stages, of this checkout and a commit before it.
 
     python scripts/count_code.py [--against COMMIT] [--parameters 8]
 
@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import ast
 import io
+import re
 import subprocess
 import tokenize
 from collections.abc import Iterator
@@ -78,6 +79,8 @@ def main() -> None:
     print(f"functions with {given.parameters} or more parameters: {len(many)}")
     for name, function, count in many:
         print(f"  {count:3d} {function}  ({name})")
+    tests = [name for name, text in now.items() if re.search(r"isinstance\([^()]*Stage\b", text)]
+    print(f"modules that test the type of a stage: {len(tests)} {' '.join(tests)}")
     if given.against is None:
         return
     before = modules(given.against)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from colmap_inertial import (
     BatchCapture,
+    BatchOptions,
     CaptureStatus,
     InertialError,
     ReconstructOptions,
@@ -48,7 +49,7 @@ def main() -> None:
     options = ReconstructOptions() if args.config is None else read_config(args.config, ReconstructOptions)
     folders = sorted(path.parent for path in args.folder.glob("*/capture.toml"))
     captures = [BatchCapture(name=folder.name, path=folder, options=options_for(folder, options)) for folder in folders]
-    result = run_batch(captures, args.out, scheduler=args.scheduler, watch=watch)
+    result = run_batch(captures, args.out, batch=BatchOptions(scheduler=args.scheduler), watch=watch)
 
     models = [(capture.name, model) for capture in result.captures for model in capture.models if model["ci95"]]
     for name, model in sorted(models, key=lambda item: item[1]["ci95"][0] / item[1]["ci95"][1]):

@@ -50,8 +50,8 @@ def main() -> None:
     parser.add_argument("--config", type=Path, help="options as TOML, such as OUT/config.toml of another run")
     args = parser.parse_args()
     options = ReconstructOptions() if args.config is None else read_config(args.config, ReconstructOptions)
-    # The list takes the place of the default frame stage, which is deblurring.
-    result = reconstruct(args.capture, args.out, options, frame_stages=[LocalContrast(below=args.below)])
+    # The dots stand for the default frame stages (deblurring): theirs first, then ours.
+    result = reconstruct(args.capture, args.out, options, frame_stages=[..., LocalContrast(below=args.below)])
     print(f"{sum(frame.action == 'changed' for frame in result.frames)} of {len(result.frames)} frames changed")
     for model in result.models:
         print(f"model {model.index}: {model.scale.verdict}, {model.scale.metres_per_unit} metres per unit")

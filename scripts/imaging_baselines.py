@@ -16,8 +16,8 @@ from imaging_scenes import Grey, Light
 from numpy.typing import NDArray
 from scipy.signal import fftconvolve
 
-from colmap_inertial.imaging._transfer import decode_table, srgb_from_linear
 from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.imaging.transfer import decode_table, srgb_from_linear
 from colmap_inertial.types import Array
 
 BLOCK_PX = 64

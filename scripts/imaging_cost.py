@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from colmap_inertial._kernels import _wiener
 from colmap_inertial.imaging import wiener
-from colmap_inertial.imaging._transfer import decode_table
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.evidence import blur_evidence
 from colmap_inertial.imaging.gate import deblur_gated, judge_recording
+from colmap_inertial.imaging.transfer import decode_table
 from colmap_inertial.imaging.wiener import DeblurOptions, deblur
 
 

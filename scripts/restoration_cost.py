@@ -18,7 +18,7 @@ from restoration_weights import use_weights
 
 from colmap_inertial.imaging import wiener
 from colmap_inertial.imaging.blur_field import BlurField
-from colmap_inertial.imaging.restoration import deepgyro, load_network
+from colmap_inertial.restoration import deepgyro, load_network
 
 THREADS = 2
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from colmap_inertial.geometry import matrix_from_quat, skew
 from colmap_inertial.scale.priors import PRIORS
 from colmap_inertial.simulate import ImuErrors, Motion, RecordingOptions, SimulatedRecording
-from colmap_inertial.simulate.imu import true_rate_rad_s, true_specific_force_m_s2
+from colmap_inertial.simulate.sensors import true_rate_rad_s, true_specific_force_m_s2
 
 Array = NDArray[np.float64]
 

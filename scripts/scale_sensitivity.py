@@ -42,10 +42,10 @@ _PRIVATE = {
     "_setup._NEAR_M": _setup,
     "_setup._FAR_M": _setup,
     "_noise._WEIGHT": _noise,
-    "_noise._MOST_ALIKE": _noise,
+    "_noise._LARGEST_CORRELATION": _noise,
     "_factors.ROBUST_SIGMAS": _factors,
 }
-_UPPER_BOUNDS = {"_noise._MOST_ALIKE": 1.0}
+_UPPER_BOUNDS = {"_noise._LARGEST_CORRELATION": 1.0}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +74,7 @@ def constants() -> dict[str, float | None]:
     """All that are varied, with their defaults; None where the calibration's covariance holds the value."""
     out: dict[str, float | None] = {f"PRIORS.{f.name}": getattr(PRIORS, f.name) for f in dataclasses.fields(PRIORS)}
     levels = dataclasses.fields(_noise.TYPICAL)
-    out |= {f"TYPICAL.{f.name}": getattr(_noise.TYPICAL, f.name) for f in levels if f.name != "rotation_alike"}
+    out |= {f"TYPICAL.{f.name}": getattr(_noise.TYPICAL, f.name) for f in levels if f.name != "rotation_excess"}
     out["JointOptions.states_hz"] = joint.JointOptions().states_hz
     out |= {name: getattr(module, name.partition(".")[2]) for name, module in _PRIVATE.items()}
     out |= {f"calibration.{name}": None for name in _IN_CALIBRATION}

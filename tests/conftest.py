@@ -10,6 +10,19 @@ import pytest
 from colmap_inertial.simulate import RecordingOptions, SimulatedRecording, simulate_recording
 from colmap_inertial.threads import one_blas_thread
 
+#: Files of the quick tier: each takes a few seconds at most.
+QUICK = Path(__file__).with_name("quick.txt").read_text().split()
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--quick", action="store_true", help="only the files named in tests/quick.txt")
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    if config.getoption("--quick") and collection_path.suffix == ".py":
+        return collection_path.name not in QUICK or None
+    return None
+
 
 @pytest.fixture(scope="session", autouse=True)
 def _one_blas_thread():

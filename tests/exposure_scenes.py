@@ -13,9 +13,9 @@ import numpy as np
 
 from colmap_inertial.geometry import matrix_from_quat, quat_exp
 from colmap_inertial.gyro import GyroPath
-from colmap_inertial.imaging._transfer import srgb_from_linear
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.rolling_shutter import spread_nodes
+from colmap_inertial.imaging.transfer import srgb_from_linear
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.simulate import Motion, MotionOptions, make_motion
 from colmap_inertial.types import CameraModel

@@ -425,8 +425,7 @@ def write_video_imu_capture(folder: Path, imu: ImuRecording, frame_ns: np.ndarra
 def write_rosbag(path: Path, imu: ImuRecording, *, kind: str = "ros1", apart: bool = False) -> Path:
     """``kind`` is ros1, sqlite3 or mcap; ``apart``: one topic for each sensor, the other sensor zero."""
     from rosbags.rosbag1 import Writer as Writer1
-    from rosbags.rosbag2 import StoragePlugin
-    from rosbags.rosbag2 import Writer as Writer2
+    from rosbags.rosbag2 import StoragePlugin, Writer as Writer2
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)

@@ -6,19 +6,20 @@ import numpy as np
 import pycolmap
 import pytest
 
-from colmap_inertial.align import AlignOptions, align_camera_imu, align_clocks
+from colmap_inertial.align import AlignOptions, _fit as fit, align_camera_imu, align_clocks
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.geometry import (
     matrix_from_quat,
     quat_conjugate,
+    quat_cumulative,
     quat_exp,
     quat_from_matrix,
     quat_log,
     quat_multiply,
     quat_normalize,
 )
-from colmap_inertial.gyro import GyroPath
-from colmap_inertial.io.calibration import calibration_prior
+from colmap_inertial.gyro import GyroPath, on_camera_rate
+from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.io.imu import read_imu
 from colmap_inertial.io.trajectories import read_inertial_scale
 from colmap_inertial.simulate import ImuOptions, MotionOptions, RecordingOptions, SfmOptions, simulate_recording
@@ -109,6 +110,21 @@ def test_gyro_path_follows_a_coning_motion_known_in_closed_form():
     assert np.abs(error).max() < 2e-5
 
 
+def test_gyro_path_integrates_a_linear_rate_to_the_fourth_order():
+    first, last = np.array([1.5, -0.4, 0.8]), np.array([-1.0, 2.0, 0.3])
+
+    def turn(steps):
+        t = np.linspace(0, 1, steps + 1)
+        return GyroPath(t, first + t[:, None] * (last - first), np.zeros(3)).at(np.ones(1))[0][0]
+
+    # a hundred thousand steps of a constant rate each
+    middle = (np.arange(100_000) + 0.5) / 100_000
+    truth = quat_cumulative(quat_exp((first + middle[:, None] * (last - first)) / 100_000))[-1]
+    coarse, fine = (np.linalg.norm(quat_log(quat_multiply(quat_conjugate(truth), turn(n)))) for n in (10, 20))
+    assert coarse < 1e-5
+    assert coarse / fine == pytest.approx(16, rel=0.1)
+
+
 def test_gyro_path_knows_how_a_bias_turns_an_interval():
     rng = np.random.default_rng(3)
     t = np.arange(0, 6, 1 / 200)
@@ -127,11 +143,55 @@ def test_gyro_path_knows_how_a_bias_turns_an_interval():
     assert np.allclose(actual, predicted, rtol=1e-3, atol=1e-10)
 
 
+def test_a_steady_turn_is_rate_times_time():
+    t, rate = np.arange(0, 2, 0.01), np.array([0.3, -0.5, 0.2])
+    path = GyroPath(t, np.tile(rate + 0.1, (len(t), 1)), np.full(3, 0.1))
+    begin_s, end_s = np.array([0.203, 1.0]), np.array([0.907, 1.5])
+    assert np.allclose(path.turn_rad(begin_s, end_s), (end_s - begin_s)[:, None] * rate)
+
+
 def test_gyro_path_knows_its_gaps_and_ends():
     t = np.concatenate([np.arange(0, 2, 0.01), np.arange(3, 5, 0.01)])
     path = GyroPath(t, np.zeros((len(t), 3)), np.zeros(3))
     begin, end = np.array([0.5, 1.5, 2.2, 3.5, -0.1, 4.5]), np.array([1.5, 3.5, 2.5, 4.5, 1.0, 5.5])
     assert path.covers(begin, end).tolist() == [True, False, False, True, False, False]
+
+
+# --- the fit
+
+
+def test_derivatives_of_the_residuals_are_those_of_finite_differences():
+    t = np.arange(0, 12, 1 / 400)
+    rate = np.stack([np.sin((1.1 + 0.4 * k) * t + k) for k in range(3)], axis=1)
+    path, offset_s, clock_rate = GyroPath(t, rate, np.zeros(3)), 0.7, 2e-3
+    cam_from_imu = quat_exp(np.array([0.5, -1.0, 0.3]))
+    t_cam_s = np.linspace(2, 11, 60)
+    middle_s = 6.0
+    stamps_s = t_cam_s - offset_s - clock_rate * (t_cam_s - middle_s)
+    trajectory = CameraTrajectory(
+        names=tuple(f"{k}" for k in range(60)),
+        t_s=t_cam_s,
+        cam_from_world_xyzw=quat_multiply(cam_from_imu, quat_conjugate(path.at(stamps_s)[0])),
+        cam_in_world=np.zeros((60, 3)),
+    )
+    nuisance = np.zeros(fit._N_NUISANCE)
+    nuisance[fit._RATE] = clock_rate
+    state = fit._State(cam_from_imu, offset_s, np.zeros(3), nuisance)
+
+    def residuals(step):
+        moved = state.moved(step)
+        return fit._residuals(trajectory, path, moved, moved.bias, middle_s)
+
+    count = fit._N + fit._N_NUISANCE
+    residual, jacobian, _ = residuals(np.zeros(count))
+    assert len(residual) == 59 and np.abs(residual).max() < 1e-7
+    for column in range(count):
+        step = np.zeros(count)
+        step[column] = 1e-5
+        difference = (residuals(step)[0] - residuals(-step)[0]) / 2e-5
+        scale = np.abs(difference).max()
+        assert scale > 0.01
+        np.testing.assert_allclose(jacobian[:, :, column], difference, atol=2e-3 * scale, err_msg=f"column {column}")
 
 
 # --- simulation: what is true is found
@@ -165,7 +225,7 @@ def test_covariance_is_exact_where_the_noise_is_white_and_the_rest_is_known():
     z = []
     for seed in range(60):
         simulated = simulate_recording(options, seed=seed)
-        prior = calibration_prior(readout_s=0.0)
+        prior = calibration_prior(Declared(readout_s=0.0))
         calibration = align_camera_imu(simulated.trajectory, simulated.imu, prior=prior)
         z.append(errors_in_sigmas(calibration, simulated.truth.calibration)[3:])
     rms = np.sqrt(np.mean(np.square(z), axis=0))
@@ -196,6 +256,39 @@ def test_the_imu_may_start_late_or_end_early(first, last):
     assert abs(calibration.gyro_time_offset_s - simulated.truth.calibration.gyro_time_offset_s) < 0.004
 
 
+def test_the_offset_of_drifting_clocks_holds_in_the_middle_of_what_both_recorded():
+    simulated = simulate_recording(RecordingOptions(imu=STATED), seed=5)
+    trajectory, imu = simulated.trajectory, simulated.imu
+    keep = (imu.gyro_t_s > imu.gyro_t_s[0] + 12) & (imu.gyro_t_s < imu.gyro_t_s[-1] - 4)
+    part = replace(imu, gyro_t_s=imu.gyro_t_s[keep], gyro_rad_s=imu.gyro_rad_s[keep])
+    found = align_clocks(trajectory, part).calibration
+    covered_s = part.gyro_t_s + simulated.truth.calibration.gyro_time_offset_s + clock_shift_s(trajectory, imu)
+    both = (trajectory.t_s > covered_s[0]) & (trajectory.t_s < covered_s[-1])
+    assert not both.all()
+    shared_s = trajectory.t_s[both]
+    assert found.clock_middle_s == pytest.approx(0.5 * (shared_s[0] + shared_s[-1]), abs=0.1)
+
+
+def test_variances_are_widened_to_those_of_errors_that_are_not_white():
+    # a mean of errors that go together over some twenty intervals, and seem to be white
+    rng, count, correlation = np.random.default_rng(4), 1200, 0.9
+    true, stated = [], []
+    for _ in range(60):
+        error = np.zeros(count)
+        for k, fresh in enumerate(np.sqrt(1 - correlation**2) * rng.standard_normal(count)):
+            error[k] = correlation * error[k - 1] + fresh
+        residual, jacobian = np.repeat(error[:, None], 3, axis=1), np.tile(np.eye(3), (count, 1, 1))
+        residual = residual - residual.mean(axis=0)
+        cov = fit._widened(np.eye(3) / count, residual, jacobian, np.ones(count))
+        assert np.allclose(cov, cov.T)
+        true.append(error.mean() ** 2)
+        stated.append(cov[0, 0])
+    assert np.mean(stated) == pytest.approx(np.mean(true), rel=0.5)
+    assert np.mean(stated) > 8 / count
+    white = rng.standard_normal((count, 3))
+    assert fit._widened(np.eye(3) / count, 0.1 * white, jacobian, np.ones(count)) == pytest.approx(np.eye(3) / count)
+
+
 def test_the_offset_is_between_raw_stamps_whatever_the_epochs():
     simulated = simulate_recording(RecordingOptions(motion=MotionOptions(duration_s=15.0)), seed=2)
     there = replace(simulated.trajectory, epoch_ns=1_700_000_000_000_000_000)
@@ -212,13 +305,29 @@ def test_clocks_that_run_at_different_rates_are_followed(rate):
     imu = simulated.imu
     drifting = replace(imu, gyro_t_s=imu.gyro_t_s * (1 + rate), accel_t_s=imu.accel_t_s * (1 + rate))
     alignment = align_clocks(simulated.trajectory, drifting)
-    assert alignment.clock_rate == pytest.approx(-rate, abs=max(3 * alignment.clock_rate_sigma, 2e-5))
-    steady = alignment.on_camera_rate(drifting, trajectory_epoch_ns=simulated.trajectory.epoch_ns)
+    assert alignment.calibration.clock_rate == pytest.approx(-rate, abs=max(3 * alignment.clock_rate_sigma, 2e-5))
+    steady = on_camera_rate(drifting, alignment.calibration, camera_epoch_ns=simulated.trajectory.epoch_ns)
     # the true time of each sample on the camera's clock
     true_s = imu.gyro_t_s + simulated.truth.calibration.gyro_time_offset_s
     found_s = steady.gyro_t_s + alignment.calibration.gyro_time_offset_s
     assert np.abs(found_s - true_s).max() < 0.004
     assert "ppm" in steady.repairs[-1]
+    assert alignment.drifts() and alignment.settled() is alignment.calibration
+
+
+def test_a_clock_rate_that_is_small_or_in_doubt_is_not_corrected():
+    simulated = simulate_recording(RecordingOptions(motion=MotionOptions(duration_s=15.0)), seed=2)
+    alignment = align_clocks(simulated.trajectory, simulated.imu)
+    for rate, sigma, certain in ((4e-4, 7e-5, True), (-4e-4, 7e-5, True), (4e-4, 9e-5, False), (2e-4, 1e-6, False)):
+        with_rate = replace(
+            alignment, calibration=replace(alignment.calibration, clock_rate=rate), clock_rate_sigma=sigma
+        )
+        assert with_rate.drifts() == certain
+        assert with_rate.settled().clock_rate == (rate if certain else 0.0)
+        assert with_rate.settled().clock_middle_s == alignment.calibration.clock_middle_s
+    assert on_camera_rate(simulated.imu, replace(alignment.calibration, clock_rate=0.0), camera_epoch_ns=0) is (
+        simulated.imu
+    )
 
 
 def test_jumps_of_the_poses_are_outvoted():
@@ -236,7 +345,7 @@ def test_jumps_of_the_poses_are_outvoted():
 
 def test_what_the_rotations_do_not_tell_comes_from_the_prior():
     simulated = simulate_recording(RecordingOptions(motion=MotionOptions(duration_s=15.0), imu=STATED), seed=1)
-    prior = calibration_prior(imu_in_cam_m=[0.03, -0.01, 0.0], readout_s=0.018)
+    prior = calibration_prior(Declared(imu_in_cam_m=[0.03, -0.01, 0.0], readout_s=0.018))
     calibration = align_camera_imu(simulated.trajectory, simulated.imu, prior=prior)
     assert np.allclose(calibration.imu_in_cam_m, [0.03, -0.01, 0.0])
     assert calibration.readout_s == 0.018
@@ -246,12 +355,22 @@ def test_what_the_rotations_do_not_tell_comes_from_the_prior():
     assert calibration.sigma("accel_time_offset_s") == pytest.approx(0.02, rel=0.15)
 
 
+def test_a_known_offset_is_between_raw_stamps_whatever_the_epochs():
+    simulated = simulate_recording(RecordingOptions(motion=MotionOptions(duration_s=15.0)), seed=2)
+    there = replace(simulated.trajectory, epoch_ns=simulated.trajectory.epoch_ns + 1_000_000_000_000)
+    known_s = simulated.truth.calibration.gyro_time_offset_s + 1000 + 0.002
+    for sigma_s, pulled_s in ((1e-5, 0.0), (0.5, -0.002)):
+        prior = calibration_prior(Declared(gyro_time_offset_s=known_s, time_offset_sigma_s=sigma_s))
+        calibration = align_camera_imu(there, simulated.imu, prior=prior)
+        assert calibration.gyro_time_offset_s - known_s == pytest.approx(pulled_s, abs=1e-3)
+
+
 def test_a_known_rotation_aligns_what_turns_about_one_axis_only():
     trajectory, imu = slow_turns([1])
     with pytest.raises(NotObservableError, match="two axes") as caught:
         align_camera_imu(trajectory, imu)
     assert caught.value.quantity == "camera-IMU rotation"
-    prior = calibration_prior(cam_from_imu_xyzw=[0, 0, 0, 1], rotation_sigma_rad=0.01)
+    prior = calibration_prior(Declared(cam_from_imu_xyzw=[0, 0, 0, 1], rotation_sigma_rad=0.01))
     calibration = align_camera_imu(trajectory, imu, prior=prior)
     assert calibration.gyro_time_offset_s == pytest.approx(123.0, abs=0.005)
     assert calibration.sigma("rotation_y_rad") == pytest.approx(0.01, rel=0.1)
@@ -320,7 +439,7 @@ def test_on_real_recordings_five_seconds_suffice_and_agree_with_a_minute(recordi
 
 def test_sparse_keyframes_of_a_drone_give_the_factory_s_rotation(shared_data):
     trajectory, imu = read_euroc(shared_data / "euroc_v101")
-    calibration = align_camera_imu(trajectory, imu, prior=calibration_prior(readout_s=0.0))
+    calibration = align_camera_imu(trajectory, imu, prior=calibration_prior(Declared(readout_s=0.0)))
     imu_from_cam = np.array(
         [
             [0.0148655429818, -0.999880929698, 0.00414029679422],

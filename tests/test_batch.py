@@ -21,7 +21,7 @@ from colmap_inertial.batch.task import CaptureStatus, read_status
 from colmap_inertial.cli import main, parse
 from colmap_inertial.drivers.capture import reconstruct
 from colmap_inertial.errors import FormatError, InertialError, MissingExtraError, OutputExistsError
-from colmap_inertial.options import ReconstructOptions
+from colmap_inertial.options import BatchOptions, ReconstructOptions
 
 
 def table(out: Path) -> dict[str, dict[str, str]]:
@@ -143,7 +143,7 @@ def test_a_wrong_manifest_is_named_before_any_work(capsys, tmp_path, text, words
 def test_flags_and_a_configuration_reach_every_capture(tmp_path):
     (tmp_path / "c.toml").write_text("seed = 4\n[mapping]\noverlap = 3\n")
     command = parse(["batch", "m", "out", "--config", str(tmp_path / "c.toml"), "--seed", "5", "--workers", "2"])
-    assert (command.options.seed, command.options.mapping.overlap, command.workers) == (5, 3, 2)
+    assert (command.options.seed, command.options.mapping.overlap, command.batch.workers) == (5, 3, 2)
 
 
 @pytest.mark.parametrize(
@@ -231,7 +231,9 @@ def test_a_killed_process_is_started_again_and_at_last_given_up(captures, tmp_pa
     assert (end.state, end.attempts) == ("done", 2)
     assert model_bytes(tmp_path / "once" / "hall") == alone["hall"]
     killed.clear()
-    (end,) = run_batch([hall], tmp_path / "ever", attempts=1, watch=kill(1, tmp_path / "ever")).captures
+    (end,) = run_batch(
+        [hall], tmp_path / "ever", batch=BatchOptions(attempts=1), watch=kill(1, tmp_path / "ever")
+    ).captures
     assert (end.state, end.exit_code) == ("failed", 1)
     assert "killed 1 times" in end.error
 
@@ -285,7 +287,7 @@ def test_dense_captures_want_a_gpu():
 def test_without_dask_the_extra_is_named(monkeypatch, manifest, tmp_path):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(MissingExtraError, match=r"colmap-inertial\[cluster\]"):
-        run_batch(manifest, tmp_path / "out", scheduler="tcp://127.0.0.1:1")
+        run_batch(manifest, tmp_path / "out", batch=BatchOptions(scheduler="tcp://127.0.0.1:1"))
 
 
 def dask(*args: object) -> subprocess.Popen[bytes]:
@@ -328,7 +330,7 @@ def test_a_cluster_loses_a_worker_and_no_capture(captures, cluster, tmp_path):
             workers[0].kill()
             workers[0].wait()
 
-    result = run_batch(entries, out, scheduler=address, watch=watch)
+    result = run_batch(entries, out, batch=BatchOptions(scheduler=address), watch=watch)
     assert workers[0].poll() == -signal.SIGKILL
     assert [c.state for c in result.captures] == ["done" if c.name != "05" else "failed" for c in result.captures]
     assert sorted(table(out)) == [f"{i:02}" for i in range(1, 13)]
@@ -352,7 +354,7 @@ def test_a_cluster_stops_when_the_batch_does(captures, cluster, tmp_path):
 
     entries = [BatchCapture(name=name, path=path, options=TINY) for name, path in found.items()]
     with pytest.raises(KeyboardInterrupt):
-        run_batch(entries, out, scheduler=address, watch=watch)
+        run_batch(entries, out, batch=BatchOptions(scheduler=address), watch=watch)
     eventually(lambda: not processes_of(out), 10)
     assert {row["state"] for row in table(out).values()} == {"interrupted"}
 
@@ -360,7 +362,7 @@ def test_a_cluster_stops_when_the_batch_does(captures, cluster, tmp_path):
 def test_a_scheduler_that_does_not_answer_is_said(monkeypatch, manifest, tmp_path):
     pytest.importorskip("distributed", reason="dask[distributed] is not installed")
     with pytest.raises(InertialError, match="no Dask scheduler answers"):
-        run_batch(manifest, tmp_path / "out", scheduler="nonsense://127.0.0.1:1")
+        run_batch(manifest, tmp_path / "out", batch=BatchOptions(scheduler="nonsense://127.0.0.1:1"))
     assert threading.active_count() < 20
 
 

@@ -15,7 +15,7 @@ import restoration_deblur
 import restoration_exposures as exposures
 from restoration_sheet import CROP_PX, write_sheet
 
-from colmap_inertial.imaging._transfer import decode_table
+from colmap_inertial.imaging.transfer import decode_table
 from colmap_inertial.imaging.wiener import deblur
 
 SIZE = (640, 480)

@@ -1,7 +1,6 @@
 """What is seeded into clean recordings is found by its code, which is absent from the clean ones."""
 
 import json
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -20,13 +19,12 @@ from colmap_inertial.errors import NotObservableError
 from colmap_inertial.flow import measure_rotation
 from colmap_inertial.geometry import quat_conjugate, quat_exp, quat_multiply, quat_rotate, so3_exp
 from colmap_inertial.imaging.gyro_camera import FrameShutter
-from colmap_inertial.io.calibration import calibration_prior
+from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.frames import read_frame_times
 from colmap_inertial.io.imu import read_capture_imu, read_imu
 from colmap_inertial.io.trajectories import read_inertial_scale
-from colmap_inertial.model import Model
-from colmap_inertial.options import ScaleOptions
+from colmap_inertial.model import Model, read_model
 from colmap_inertial.precalibrate.preflight import stop_or_doubt
 from colmap_inertial.simulate.motion import MotionKind, MotionOptions
 from colmap_inertial.simulate.recording import RecordingOptions, SimulatedRecording, simulate_recording
@@ -435,10 +433,10 @@ def test_what_is_wrong_with_pictures_is_found(film: Film, filmed: Recorded) -> N
 
 
 def test_a_calibration_that_turns_the_camera_is_found(filmed: Recorded) -> None:
-    right = calibration_prior(cam_from_imu_xyzw=CAM_FROM_IMU)
+    right = calibration_prior(Declared(cam_from_imu_xyzw=CAM_FROM_IMU))
     assert diagnose(replace(filmed, calibration=right)).findings == ()
     quarter = quat_multiply(quat_exp(np.array([0, 0, np.pi / 2])), CAM_FROM_IMU)
-    wrong = calibration_prior(cam_from_imu_xyzw=quarter)
+    wrong = calibration_prior(Declared(cam_from_imu_xyzw=quarter))
     assert found(diagnose(replace(filmed, calibration=wrong)), "declared-rotation") == "error"
 
 
@@ -519,15 +517,11 @@ def test_gravity_that_was_removed_stops_a_reconstruction_unless_forced(clean: di
 
 
 def test_a_forced_scale_is_at_most_weak(project: Project, tmp_path: Path) -> None:
-    timing = read_frame_times(project.frame_times)
+    timing, model = read_frame_times(project.frame_times), read_model(project.model)
     verdicts = {}
     for doubts in ((), ("the video was stabilised",)):
-        folder = tmp_path / f"model{len(doubts)}"
-        shutil.copytree(project.model, folder)
-        stage = MetricStage(
-            imu=project.recording.imu, calibration=None, options=ScaleOptions(), world="z-up", doubts=doubts
-        )
-        scale = stage(Model(folder=folder, index=0, timing=timing)).scale
+        stage = MetricStage(imu=project.recording.imu, calibration=None)
+        scale = stage(Model(reconstruction=model, colmap_index=0, timing=timing, doubts=doubts)).scale
         assert scale is not None and scale.reasons[: len(doubts)] == doubts
         verdicts[doubts] = scale.verdict
     assert list(verdicts.values()) == ["trusted", "weak"]

@@ -2,10 +2,13 @@
 
 import ast
 import dataclasses
+import importlib.util
 import json
 import re
 import shlex
 import shutil
+import subprocess
+import sys
 import textwrap
 import tomllib
 from pathlib import Path
@@ -19,11 +22,18 @@ from jsonschema import Draft202012Validator
 from report_runs import write_run
 from test_pipeline import copy_scene
 
+import colmap_inertial
 from colmap_inertial.batch import read_manifest
 from colmap_inertial.cli import main, parse
 from colmap_inertial.colmap.dense import DenseResult
 from colmap_inertial.drivers.capture import reconstruct
-from colmap_inertial.drivers.result import frame_as_json, imaging_as_json
+from colmap_inertial.drivers.result import (
+    Fragment,
+    ModelResult,
+    ReconstructResult,
+    frame_as_json,
+    imaging_as_json,
+)
 from colmap_inertial.errors import MappingError
 from colmap_inertial.imaging.gate import RecordingVerdict
 from colmap_inertial.imaging.parallax import Parallax
@@ -33,19 +43,25 @@ from colmap_inertial.io.capture import Capture, Video, load_capture
 from colmap_inertial.io.capture_tables import ImuTables
 from colmap_inertial.io.files import write_json
 from colmap_inertial.io.frames import read_frame_times
-from colmap_inertial.io.imu import imu_formats, read_capture_imu
+from colmap_inertial.io.imu import read_capture_imu
+from colmap_inertial.io.imu_formats import imu_formats
 from colmap_inertial.options import ReconstructOptions
 from colmap_inertial.precalibrate.plan import ImagingPlan
 from colmap_inertial.precalibrate.selection import Selection
 from colmap_inertial.report import write_report
 from colmap_inertial.run.config import config_as_toml
-from colmap_inertial.stages.frame_folder import FrameRecord, FrameTreatment
+from colmap_inertial.stages.frame_folder import FrameRecord
 from colmap_inertial.stages.gyro_view import GyroView
-from colmap_inertial.types import CameraModel, FrameTiming
+from colmap_inertial.types import CameraModel, FrameTiming, Treatment
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-PAGES = [ROOT / "README.md", ROOT / "example_scenes" / "README.md", *sorted(DOCS.rglob("*.md"))]
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    ROOT / "example_scenes" / "README.md",
+    *sorted(DOCS.rglob("*.md")),
+]
 TEXT = "\n".join(page.read_text() for page in PAGES)
 _FENCE = re.compile(r"^( *)```(\w*)\n(.*?)^ *```$", re.MULTILINE | re.DOTALL)
 
@@ -130,6 +146,95 @@ def test_every_option_of_reconstruct_is_explained(capsys):
     assert "colmap-inertial COMMAND --help" in TEXT
     assert left <= options
     assert {option for option in options - left if not re.search(rf"{re.escape(option)}(?![\w-])", TEXT)} == set()
+
+
+# --- the package from within -----------------------------------------------------------------------------------------
+
+
+def constants() -> dict[str, set[tuple[float, ...]]]:
+    """Numbers by name: of modules, and ``Name.field`` of dataclasses, of calls and of dictionaries."""
+    found: dict[str, set[tuple[float, ...]]] = {}
+
+    def note(name: str, node: ast.expr) -> None:
+        fields = [(k.arg, k.value) for k in node.keywords] if isinstance(node, ast.Call) else []
+        if isinstance(node, ast.Dict):
+            fields = [(k.value, v) for k, v in zip(node.keys, node.values, strict=True) if isinstance(k, ast.Constant)]
+        for field, value in fields:
+            note(f"{name}.{field}", value)
+        try:
+            value = eval(compile(ast.Expression(node), name, "eval"), {"__builtins__": {}})
+            found.setdefault(name, set()).add(tuple(map(float, np.atleast_1d(value))))
+        except (NameError, TypeError, ValueError):
+            pass  # no plain number
+
+    for file in (ROOT / "colmap_inertial").rglob("*.py"):
+        for node in ast.parse(file.read_text()).body:
+            if isinstance(node, ast.Assign):
+                (target,) = node.targets
+                if isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple):
+                    for name, value in zip(target.elts, node.value.elts, strict=True):
+                        note(name.id, value)
+                elif isinstance(target, ast.Name):
+                    note(target.id, node.value)
+            elif isinstance(node, ast.ClassDef):
+                for field in node.body:
+                    if isinstance(field, ast.AnnAssign) and field.value is not None:
+                        note(f"{node.name}.{field.target.id}", field.value)
+    for file in kernels():
+        for line in re.findall(r"^constexpr (?:int|float) (.*?);", file.read_text(), re.MULTILINE):
+            for name, value in re.findall(r"(\w+) = ([\d.]+)f?\b", line):
+                found.setdefault(name, set()).add((float(value),))
+    return found
+
+
+def kernels() -> list[Path]:
+    """The sources of the compiled kernels."""
+    return [file for file in (ROOT / "colmap_inertial" / "_kernels").iterdir() if file.suffix in (".cpp", ".h")]
+
+
+def test_the_constants_of_the_method_are_those_of_the_code():
+    page = (DOCS / "method.md").read_text()
+    table = page[page.index("| name | value |") :].split("\n\n")[0].splitlines()[2:]
+    rows = [[cell.strip() for cell in row.strip("|").split("|")] for row in table]
+    assert len(rows) > 60
+    known = constants()
+    said = [(row[0].strip("`"), tuple(map(float, row[1].split(",")))) for row in rows]
+    assert [(name, value, known.get(name)) for name, value in said if value not in known.get(name, ())] == []
+    places = [(row[0].strip("`").split(".")[0], ROOT / "colmap_inertial" / row[3].strip("`")) for row in rows]
+    for name, place in places:
+        files = [place] if place.is_file() else [place.with_suffix(".py"), *place.rglob("*.py")]
+        assert any(re.search(rf"\b{name}\b", file.read_text()) for file in files if file.is_file()), (name, place)
+
+
+def test_names_of_the_code_exist():
+    """Functions, types, fields and files that the pages on the package from within name."""
+    files = [*(ROOT / "colmap_inertial").rglob("*.py"), *kernels()]
+    source = "\n".join(file.read_text() for file in files)
+    for page in ("method.md", "architecture.md", "glossary.md"):
+        prose = _FENCE.sub("", (DOCS / page).read_text())
+        prose = re.sub(r"^\| \d* ?\|.*$", "", prose, flags=re.MULTILINE)  # the table of rooms
+        for path in re.findall(r"`([\w/]+\.py)`", prose):
+            assert (ROOT / "colmap_inertial" / path).is_file() or (ROOT / path).is_file(), path
+        words = re.findall(r"`((?:_[A-Z]|[A-Za-z])[\w.]*)(?:\(\))?`", prose)
+        words = [word for word in words if not re.search(r"\.(db|html|json|md|npz|py|toml|tum)$", word)]
+        names = {name for word in words for name in word.split(".") if re.search(r"_|[A-Z]", name)}
+        assert len(names) > 40
+        assert {name for name in names if not re.search(rf"\b{name}\b", source)} == set(), page
+
+
+def test_the_public_names_are_those_of_the_page_on_python():
+    public = set(colmap_inertial.__all__)
+    page = (DOCS / "python.md").read_text()
+    table = page[page.index("## The public names") :].split("\n\n")[2]
+    names = {name for row in table.splitlines()[2:] for name in re.findall(r"`(\w+)`", row.split("|")[1])}
+    assert names == public
+
+
+def test_every_field_of_a_result_is_on_the_page_on_python():
+    page = (DOCS / "python.md").read_text()
+    for kind, values in (("ReconstructResult", ReconstructResult), ("ModelResult", ModelResult), ("", Fragment)):
+        rows = page[page.index(f"| field of `{kind or 'ReconstructResult'}` |") :].split("\n\n")[0]
+        assert {f.name for f in dataclasses.fields(values) if f"`{f.name}`" not in rows} == set(), values
 
 
 # --- captures --------------------------------------------------------------------------------------------------------
@@ -229,7 +334,7 @@ def test_every_toml_is_read(text, tmp_path, imu):
     values = tomllib.loads(text)
     if "capture" in values:
         (tmp_path / "captures.toml").write_text(text)
-        assert len(read_manifest(tmp_path / "captures.toml")) == len(values["capture"])
+        assert len(read_manifest(tmp_path / "captures.toml", allow_stages=True)) == len(values["capture"])
         return
     if not {"images", "video"} & values.keys():  # one table of the reference
         text = 'video = "clip.mp4"\n' + text
@@ -290,7 +395,9 @@ def test_every_finding_is_explained():
     codes -= {"mirrored"}  # what the message compares with
     assert len(codes) > 50
     explained = (DOCS / "filming.md").read_text()
-    assert {code for code in codes if f"`{code}`" not in explained} == set()
+    rows = explained[explained.index("### The IMU by itself") :].splitlines()
+    listed = {code for row in rows if row.startswith("| `") for code in re.findall(r"`([a-z-]+)`", row.split("|")[1])}
+    assert listed == codes
 
 
 def said(folder: Path) -> list[str]:
@@ -361,22 +468,17 @@ def examples(tmp_path_factory, project):
     (folder / "project" / "frames.csv").write_bytes(project.frame_times.read_bytes())
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        before = list(imu_formats())
         values: dict[str, object] = {"__name__": "__main__"}
-        try:
-            for number, code in enumerate(blocks(DOCS / "python.md", "python")):
-                exec(compile(code, f"python.md block {number + 1}", "exec"), values)
-        finally:
-            from colmap_inertial.io import imu as registry
-
-            registry._formats[:] = before
+        for number, code in enumerate(blocks(DOCS / "python.md", "python")):
+            exec(compile(code, f"python.md block {number + 1}", "exec"), values)
     return folder, values
 
 
 def test_the_examples_in_python_run(examples):
     folder, values = examples
     result = values["result"]
-    assert {frame.action for frame in result.frames} == {"changed"}
+    assert {frame.action for frame in result.frames} == {"brightened"}
+    assert [treatment.stage for model in result.models for treatment in model.treatments] == ["well_seen"]
     assert values["estimate"].verdict == "trusted"
     assert (folder / "metric_model" / "transform.json").is_file()
     assert (folder / "project_metric" / "sparse" / "0").is_dir()
@@ -392,6 +494,16 @@ def test_results_have_the_form_that_their_schemas_describe(examples, project, tm
     for run in ("out", "out_hooks"):
         for name in ("result", "report", "diagnosis"):
             assert wrong(name, json.loads((folder / run / f"{name}.json").read_text())) == []
+    content = schema("result").schema
+    treatment = Draft202012Validator({**content["$defs"]["treatment"], "$defs": content["$defs"]})
+    frames, keypoints = (
+        json.loads((folder / "out_hooks" / f"{name}.json").read_text()) for name in ("frames", "keypoints")
+    )
+    assert {frozenset(record) for record in frames["frames"]} == {frozenset(("name", "action", "camera", "treatments"))}
+    assert {frozenset(record) for record in keypoints["images"]} == {frozenset(("name", "rectified", "treatments"))}
+    treatments = [one for record in [*frames["frames"], *keypoints["images"]] for one in record["treatments"]]
+    assert len(treatments) >= len(frames["frames"])
+    assert all(treatment.is_valid(one) for one in treatments)
 
     flags = ["--imu", project.imu, "--frame-times", project.frame_times]
     for args, code in (
@@ -444,15 +556,16 @@ def test_what_is_done_to_frames_has_the_form_that_the_schema_describes(imu, tmp_
     )
     selection = Selection(names=("b.jpg",), frames=9, note="so", windows=(window,), offset_s=0.1, offset_from="pixels")
     dense = DenseResult(folder=tmp_path / "dense_metric" / "0", images=4, depth_maps=0, waiting="depth maps")
-    treated = FrameTreatment(reason="so", blur_px=4.0, deblurred=True, kept_share=0.2, extent_factor=1.1)
-    record = FrameRecord(name="a.jpg", action="deblurred", camera=camera, treatment=treated)
+    values = {"blur_px": 4.0, "kept_share": 0.2, "extent_factor": 1.1}
+    treated = Treatment(stage="deblur", reason="so", action="deblurred", values=values)
+    record = FrameRecord(name="a.jpg", action="deblurred", camera=camera, treatments=(treated,))
     write_json(
         tmp_path / "parts.json",
         {
-            "imaging": imaging_as_json(plan),
+            "imaging": imaging_as_json(plan, {"a.jpg"}),
             "selection": selection.as_json(),
             "dense": dense.as_json(tmp_path),
-            "frame": frame_as_json(record, plan),
+            "frame": frame_as_json(record, plan, {"a.jpg"}),
         },
     )
     parts = json.loads((tmp_path / "parts.json").read_text())
@@ -498,3 +611,26 @@ def test_images_are_written_out_of_a_bag(tmp_path, monkeypatch):
     exec(compile(code, "ros.md", "exec"), {})
     for t, picture in pictures.items():
         np.testing.assert_array_equal(cv2.imread(str(tmp_path / "frames" / f"{t}.png"))[:, :, ::-1], picture)
+
+
+def test_the_examples_pass_a_type_checker(tmp_path):
+    """As a user's editor sees them: pyright's rules, and the package as it is typed."""
+    if importlib.util.find_spec("basedpyright") is None:
+        pytest.skip("basedpyright is not installed (extra dev)")
+    for page in ("python.md", "imaging.md", "exposures.md"):
+        blocks = re.findall(r"```python\n(.*?)```", (DOCS / page).read_text(), re.S)
+        (tmp_path / page.replace(".md", "_examples.py")).write_text("\n\n".join(blocks))
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.S)
+    # paths as text and plain numbers of a scale that was not refused
+    blocks.append(
+        "import colmap_inertial as ci\n"
+        "timing = ci.read_frame_times('frames.csv')\n"
+        "trajectory, _ = ci.trajectory_from_model(ci.read_model('sparse/0'), timing)\n"
+        "length_m: float = 2.0 * ci.estimate_scale(trajectory, ci.read_imu('imu.csv')).accepted.metres_per_unit\n"
+    )
+    (tmp_path / "readme_examples.py").write_text("\n\n".join(blocks))
+    settings = {"include": ["."], "typeCheckingMode": "standard", "extraPaths": [str(ROOT)]}
+    (tmp_path / "pyrightconfig.json").write_text(json.dumps(settings))
+    command = [sys.executable, "-m", "basedpyright", "--level", "error", "--pythonpath", sys.executable]
+    checked = subprocess.run([*command, "-p", str(tmp_path)], capture_output=True, text=True)
+    assert checked.returncode == 0, checked.stdout

@@ -15,8 +15,7 @@ from jsonschema import Draft202012Validator
 from test_pipeline import contents
 
 from colmap_inertial.cli import main
-from colmap_inertial.drivers import capture as driver
-from colmap_inertial.drivers import fuse_exposures
+from colmap_inertial.drivers import capture as driver, fuse_exposures
 from colmap_inertial.drivers.capture import reconstruct
 from colmap_inertial.drivers.deblur import deblur_capture
 from colmap_inertial.drivers.fuse_exposures import fuse_exposures_captured
@@ -29,13 +28,15 @@ from colmap_inertial.errors import (
     OutputExistsError,
     TimingError,
 )
-from colmap_inertial.imaging.restoration import shipped
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.frames import read_frame_timing, read_frames
 from colmap_inertial.options import ExposureOptions, ReconstructOptions
+from colmap_inertial.precalibrate import plan
+from colmap_inertial.restoration import shipped
 from colmap_inertial.run.progress import silent
+from colmap_inertial.run.workspace import Workspace
+from colmap_inertial.stages import frame_folder
 from colmap_inertial.stages.exposures import ExposureStage, Fuser
-from colmap_inertial.stages.frame_folder import ExplainedStage
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -225,8 +226,10 @@ def test_pairs_become_pictures_of_the_short_ones_names(written, tmp_path):
     assert [error.message for error in Draft202012Validator(form).iter_errors(result)] == []
     page = (DOCS / "results.md").read_text()
     assert [key for key in form["properties"]["frames"]["items"]["properties"] if f"`{key}`" not in page] == []
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").write_text("years of work")
     with pytest.raises(OutputExistsError):
-        fuse_exposures_captured(folder, tmp_path / "out", fuser=AVERAGE, progress=silent)
+        fuse_exposures_captured(folder, tmp_path / "mine", fuser=AVERAGE, progress=silent)
 
 
 def test_pictures_alone_are_enough(capture, tmp_path):
@@ -269,7 +272,7 @@ def test_colmap_is_quiet_while_it_looks_for_the_calibration(capture, tmp_path, m
         levels.append(pycolmap.logging.minloglevel)
         raise NotObservableError("calibration", "so")
 
-    monkeypatch.setattr(fuse_exposures, "look_first", look)
+    monkeypatch.setattr(plan, "precalibrate", look)
     pycolmap.logging.minloglevel = 0
     try:
         fuse_exposures_captured(capture, tmp_path / "out", fuser=AVERAGE, progress=silent)
@@ -345,9 +348,33 @@ def test_a_full_disk_is_told(capture, tmp_path, monkeypatch):
     def full(*args):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(fuse_exposures, "encode_image", full)
-    with pytest.raises(OutputError, match=r"is full .* remove the folder and start again"):
+    monkeypatch.setattr(frame_folder, "encode_image", full)
+    with pytest.raises(OutputError, match=r"is full .* make room and start again, it continues"):
         fuse_exposures_captured(capture, tmp_path / "out", fuser=AVERAGE, progress=silent)
+
+
+def test_a_stopped_run_is_gone_on_with_and_ends_as_if_undisturbed(capture, tmp_path):
+    fuse_exposures_captured(capture, tmp_path / "whole", fuser=AVERAGE, progress=silent)
+
+    def stop(stage, done, total, /):
+        if stage == "fusing" and done == 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fuse_exposures_captured(capture, tmp_path / "out", fuser=AVERAGE, progress=stop)
+    assert not (tmp_path / "out" / "images").exists() and not (tmp_path / "out" / "result.json").exists()
+    pairs = fuse_exposures_captured(capture, tmp_path / "out", fuser=AVERAGE, progress=silent)
+    assert contents(tmp_path / "out" / "images") == contents(tmp_path / "whole" / "images")
+    before = (tmp_path / "out" / "result.json").read_bytes()
+    # nothing is left to do; another fusion makes the pictures again
+    stages = []
+    again = fuse_exposures_captured(capture, tmp_path / "out", fuser=AVERAGE, progress=lambda s, *_: stages.append(s))
+    assert again == pairs and stages == [] and (tmp_path / "out" / "result.json").read_bytes() == before
+    options = ExposureOptions(fusion="mertens")
+    fuse_exposures_captured(capture, tmp_path / "out", options, fuser=AVERAGE, progress=silent)
+    assert contents(tmp_path / "out" / "images") != contents(tmp_path / "whole" / "images")
+    with Workspace(tmp_path / "out").locked(), pytest.raises(OutputExistsError, match="another run is at work"):
+        fuse_exposures_captured(capture, tmp_path / "out", options, fuser=AVERAGE, progress=silent)
 
 
 def test_the_stage_keeps_order_and_a_bounded_number_of_frames(written):
@@ -363,10 +390,9 @@ def test_the_stage_keeps_order_and_a_bounded_number_of_frames(written):
                 yield frame
 
     stage = ExposureStage(pictures=loaded.exposures, folder=folder / "short", fuser=AVERAGE, workers=2)
-    assert isinstance(stage, ExplainedStage)
     for frame in stage(frames()):
         yielded.append(frame.name)
-        assert frame.image.dtype == np.uint8 and "fused" in stage.treatment(frame.name).reason
+        assert frame.image.dtype == np.uint8 and "fused" in frame.treatments[-1].reason
     assert yielded == taken == [name for name in ("000.png", "001.png", "002.png") for _ in range(4)]
 
 
@@ -393,11 +419,11 @@ def test_reconstruct_fuses_before_it_looks_for_features(written, tmp_path, by_av
         reconstruct(folder, out, OPTIONS, progress=stop)
     fuse_exposures_captured(folder, alone, progress=silent)
     assert contents(out / "images") == contents(alone / "images")
-    plan = json.loads((out / "imaging.json").read_text())
-    assert plan["deblur"] == "short and long exposures are fused, aligned by the gyroscope and the pixels"
+    decided = json.loads((out / "imaging.json").read_text())
+    assert decided["deblur"] == "short and long exposures are fused, aligned by the gyroscope and the pixels"
     records = json.loads((out / "frames.json").read_text())["frames"]
     assert {r["action"] for r in records} == {"changed"}
-    assert all("aligned by the gyroscope" in r["treatment"]["reason"] for r in records)
+    assert all("aligned by the gyroscope" in r["treatments"][-1]["reason"] for r in records)
 
 
 def test_another_long_exposure_makes_the_frames_again(capture, tmp_path, by_average):

@@ -12,7 +12,7 @@ from colmap_inertial.geometry import matrix_from_quat, quat_exp
 from colmap_inertial.gyro import GyroPath
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.psf import blur_field, predicted_blur_px
-from colmap_inertial.io.calibration import calibration_prior
+from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.simulate import MotionOptions, make_motion, make_world
 from colmap_inertial.simulate.render import Renderer, ShutterCamera, colmap_camera
 from colmap_inertial.types import CameraModel, FrameTiming, ImuRecording
@@ -30,7 +30,7 @@ def turning(rate_in_cam, rate_hz=200.0, span_s=2.0):
     imu = ImuRecording(
         gyro_t_s=t, gyro_rad_s=np.tile(rate, (len(t), 1)), accel_t_s=[], accel_m_s2=np.zeros((0, 3)), epoch_ns=7_000_000
     )
-    calibration = calibration_prior(cam_from_imu_xyzw=CAM_FROM_IMU, gyro_time_offset_s=0.25)
+    calibration = calibration_prior(Declared(cam_from_imu_xyzw=CAM_FROM_IMU, gyro_time_offset_s=0.25))
     return GyroCamera.of(imu, calibration, camera_epoch_ns=3_000_000)
 
 
@@ -179,6 +179,34 @@ def test_the_camera_turns_as_the_motion_does_whatever_the_clocks():
     expected = np.swapaxes(matrix_from_quat(q[:-1]), 1, 2) @ matrix_from_quat(q[1:])
     np.testing.assert_allclose(turns, expected, atol=2e-5)
     np.testing.assert_allclose(gyro.rate_in_cam_rad_s(t), motion.rate_in_cam_rad_s(t), atol=1e-3)
+
+
+def test_camera_and_gyroscope_count_from_epochs_of_their_own():
+    t_s = np.arange(0.0, 4.0, 0.01)
+    rate = np.stack([0 * t_s, t_s, 0 * t_s], axis=1)  # tells the gyroscope's own time
+    imu = ImuRecording(
+        gyro_t_s=t_s, gyro_rad_s=rate, accel_t_s=[], accel_m_s2=np.zeros((0, 3)), epoch_ns=107_000_000_000
+    )
+    calibration = calibration_prior(Declared(cam_from_imu_xyzw=[0.0, 0.0, 0.0, 1.0], gyro_time_offset_s=-4.0))
+    gyro = GyroCamera.of(imu, calibration, camera_epoch_ns=102_000_000_000)
+    # the camera's 102 + 2.5 s are the gyroscope's 108.5 s: 1.5 s after its epoch
+    np.testing.assert_allclose(gyro.rate_in_cam_rad_s(np.array([2.5])), [[0.0, 1.5, 0.0]], atol=1e-9)
+    assert gyro.covers(np.array([2.5, 0.5]), np.array([2.6, 0.6])).tolist() == [True, False]
+
+
+@pytest.mark.parametrize("readout_s", [0.0, 0.03])
+def test_the_gyroscope_must_cover_the_last_line_s_exposure(readout_s):
+    gyro, camera = turning([0.1, 0.0, 0.0], span_s=2.0), colmap_camera(PINHOLE)
+    # the gyroscope's last sample is at 1.995 + 0.254 s
+    timing = FrameTiming(names=("a",), t_s=[2.22], exposure_s=[0.01], readout_s=readout_s)
+    predicted = predicted_blur_px(gyro, camera, timing, width=640, height=480)
+    assert np.isfinite(predicted.px[0]) == (readout_s == 0)
+    shutter = FrameShutter.of(timing, 0, width=640, height=480)
+    if readout_s:
+        with pytest.raises(NotObservableError, match="does not cover"):
+            blur_field(gyro, camera, shutter)
+    else:
+        blur_field(gyro, camera, shutter)
 
 
 def test_no_exposure_means_no_blur():

@@ -1,6 +1,7 @@
 """Calibrations: what is known before an estimate, and their file."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,8 +9,10 @@ import pytest
 
 from colmap_inertial.errors import FormatError
 from colmap_inertial.io.calibration import (
+    Declared,
     calibration_prior,
     for_another_recording,
+    largest_offset_s,
     read_calibration,
     write_calibration,
 )
@@ -44,6 +47,22 @@ def test_the_file_keeps_every_bit(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "c.json").read_text())["cov_parameters"] == list(CALIBRATION_PARAMETERS)
 
 
+def test_a_clock_rate_is_kept_and_clocks_that_keep_step_leave_no_trace(tmp_path: Path) -> None:
+    drifting = replace(known(), clock_rate=-2e-3, clock_middle_s=17.5)
+    write_calibration(tmp_path / "c.json", drifting)
+    back = read_calibration(tmp_path / "c.json")
+    assert (back.clock_rate, back.clock_middle_s) == (-2e-3, 17.5)
+    assert back.drift_s(np.array([17.5, 27.5])).tolist() == [0.0, -0.02]
+    assert for_another_recording(back, shared_clock=True).clock_rate == 0
+    write_calibration(tmp_path / "c.json", known())
+    assert not {"clock_rate", "clock_middle_s"} & json.loads((tmp_path / "c.json").read_text()).keys()
+
+
+def test_the_search_for_a_shared_clock_s_offset_is_narrow_unless_asked_otherwise() -> None:
+    assert largest_offset_s(True) == 1.0 and largest_offset_s(False) is None
+    assert largest_offset_s(True, 5.0) == largest_offset_s(False, 5.0) == 5.0
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -51,6 +70,8 @@ def test_the_file_keeps_every_bit(tmp_path: Path) -> None:
         ({"extra": 1}, "unknown: extra"),
         ({"readout_s": "fast"}, "readout_s"),
         ({"readout_s": [1]}, "single numbers"),
+        ({"clock_rate": [1]}, "single numbers"),
+        ({"clock_rate": 1.5}, "clock_rate"),
         ({"cam_from_imu_xyzw": [1, 1, 1, 1]}, "unit norm"),
         ({"gyro_bias_rad_s": [1, 2]}, "gyro_bias_rad_s"),
         ({"cov": [[1.0, 2.0], [3.0]]}, "shape"),
@@ -80,7 +101,7 @@ def test_where_nothing_is_known_the_prior_is_wide_but_ties_the_sensors_together(
 
 def test_what_is_known_is_narrow() -> None:
     prior = calibration_prior(
-        cam_from_imu_xyzw=[0, 0, 0, 1], imu_in_cam_m=[0.1, 0, 0], gyro_time_offset_s=3.0, readout_s=0.0
+        Declared(cam_from_imu_xyzw=[0, 0, 0, 1], imu_in_cam_m=[0.1, 0, 0], gyro_time_offset_s=3.0, readout_s=0.0)
     )
     assert prior.sigma("rotation_z_rad") == pytest.approx(0.01)
     assert prior.sigma("imu_in_cam_x_m") == pytest.approx(0.005)

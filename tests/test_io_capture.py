@@ -8,7 +8,7 @@ import pytest
 from test_io_imu import HEADER, handheld, rows, write_csv
 
 from colmap_inertial.errors import FormatError
-from colmap_inertial.io.calibration import calibration_prior, write_calibration
+from colmap_inertial.io.calibration import Declared, calibration_prior, write_calibration
 from colmap_inertial.io.capture import ImageFolder, Video, load_capture
 from colmap_inertial.io.capture_tables import CAMERA_MODELS, ImuPath, ImuTables
 from colmap_inertial.io.imu import read_imu
@@ -287,7 +287,8 @@ def test_calibration_matrix_gives_rotation_and_lever_arm(tmp_path: Path) -> None
 
 def test_a_calibration_file_is_a_prior_for_this_recording(tmp_path: Path) -> None:
     write_calibration(
-        tmp_path / "c.json", calibration_prior(cam_from_imu_xyzw=[1, 0, 0, 0], gyro_time_offset_s=5.0, readout_s=0.02)
+        tmp_path / "c.json",
+        calibration_prior(Declared(cam_from_imu_xyzw=[1, 0, 0, 0], gyro_time_offset_s=5.0, readout_s=0.02)),
     )
     calibration = load_capture(write(tmp_path, IMU + '[calibration]\nfile = "c.json"\n')).calibration
     assert calibration.cam_from_imu_xyzw.tolist() == [1, 0, 0, 0] and calibration.readout_s == 0.02

@@ -1,14 +1,16 @@
 """Atomic files and JSON."""
 
 import json
+import subprocess
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from colmap_inertial.errors import FormatError, OutputError
-from colmap_inertial.io.files import read_json, write_json, write_text
+from colmap_inertial.errors import FormatError, OutputError, OutputExistsError
+from colmap_inertial.io.files import locked, read_json, write_json, write_text
 
 
 @dataclass(frozen=True)
@@ -88,3 +90,32 @@ def test_a_missing_file_is_a_format_error(tmp_path: Path) -> None:
         read_json(tmp_path / "a.json")
     with pytest.raises(FormatError, match="cannot be read"):
         read_json(tmp_path)
+
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from colmap_inertial.io.files import locked
+with locked(Path(sys.argv[1]), "busy"):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_a_lock_is_held_by_one_and_let_go_of_when_its_holder_is_killed(tmp_path):
+    lock = tmp_path / "lock"
+    with locked(lock, "mine"):
+        with pytest.raises(OutputExistsError, match=r"^still mine$"), locked(lock, "still mine"):
+            pass
+        with pytest.raises(OutputExistsError, match=r"^waited$"), locked(lock, "waited", wait_s=0.1):
+            pass
+    holder = subprocess.Popen([sys.executable, "-c", HOLD, str(lock)], stdout=subprocess.PIPE, text=True)
+    assert holder.stdout is not None
+    with holder.stdout:
+        assert holder.stdout.readline() == "held\n"
+        with pytest.raises(OutputExistsError, match="of a process"), locked(lock, "of a process"):
+            pass
+        holder.kill()
+        holder.wait()
+    with locked(lock, "free"):
+        pass

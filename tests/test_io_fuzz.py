@@ -13,7 +13,7 @@ from test_io_imu import HEADER, handheld, rows
 from test_io_video import write_video
 
 from colmap_inertial.errors import InertialError
-from colmap_inertial.io.calibration import calibration_prior, read_calibration, write_calibration
+from colmap_inertial.io.calibration import Declared, calibration_prior, read_calibration, write_calibration
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.frames import read_frame_times, read_frames
 from colmap_inertial.io.images import read_image
@@ -89,7 +89,7 @@ def frame_times(folder: Path) -> Path:
 
 
 def calibration(folder: Path) -> Path:
-    write_calibration(folder / "c.json", calibration_prior(gyro_time_offset_s=1.0))
+    write_calibration(folder / "c.json", calibration_prior(Declared(gyro_time_offset_s=1.0)))
     return folder / "c.json"
 
 

@@ -6,10 +6,7 @@ import numpy as np
 import pytest
 
 from colmap_inertial.errors import FormatError, TimingError
-from colmap_inertial.io import imu as imu_room
-from colmap_inertial.io.imu import ImuFormat, imu_formats, read_imu, register_imu_format
-from colmap_inertial.io.units import DeclaredUnits
-from colmap_inertial.types import ImuRecording
+from colmap_inertial.io.imu import read_imu
 
 HEADER = "#timestamp [ns],w_x [rad s^-1],w_y [rad s^-1],w_z [rad s^-1],a_x [m s^-2],a_y [m s^-2],a_z [m s^-2]"
 EPOCH_NS = 1403715273262142976
@@ -175,6 +172,30 @@ def test_repeated_rows_are_merged_and_listed(clean: tuple[Path, list[str]]) -> N
     assert any("repeated" in repair for repair in imu.repairs)
 
 
+def test_rows_of_one_stamp_become_their_average(tmp_path: Path) -> None:
+    t_ns, gyro, accel = handheld()
+    # a pair and two triples; in the second one, two rows are equal and count each
+    again = np.array([50, 100, 100, 200, 200])
+    t_ns, gyro, accel = (np.insert(values, again, values[again], axis=0) for values in (t_ns, gyro, accel))
+    same = {50: slice(50, 52), 100: slice(101, 104), 200: slice(203, 206)}
+    assert all(len(set(t_ns[rows])) == 1 for rows in same.values())
+    gyro[50:52, 0], gyro[101:104, 1] = (0.1, 0.3), (0.1, 0.2, 0.6)
+    gyro[203:206, 2], accel[203:206, 0] = (0.4, 0.4, 0.1), (0.0, 0.0, 3.0)
+    imu = read_imu(write_csv(tmp_path / "imu.csv", rows(t_ns, gyro, accel)))
+    assert len(imu.gyro_t_s) == len(imu.accel_t_s) == 400
+    assert (np.diff(imu.gyro_t_s) > 0).all()
+    for index, three in same.items():
+        np.testing.assert_allclose(imu.gyro_rad_s[index], gyro[three].mean(axis=0), rtol=1e-12)
+        np.testing.assert_allclose(imu.accel_m_s2[index], accel[three].mean(axis=0), rtol=1e-12)
+    assert imu.gyro_rad_s[100, 1] == pytest.approx(0.3)
+    assert imu.gyro_rad_s[200, 2] == pytest.approx(0.3)
+    assert imu.accel_m_s2[200, 0] == pytest.approx(1.0)
+    others = np.setdiff1d(np.arange(400), list(same))
+    np.testing.assert_array_equal(imu.gyro_rad_s[others], handheld()[1][others])
+    assert "imu.csv: averaged 4 gyroscope rows that repeat a stamp with other values" in imu.repairs
+    assert "imu.csv: merged 1 repeated gyroscope rows" in imu.repairs
+
+
 def test_rows_without_a_value_are_dropped_and_listed(clean: tuple[Path, list[str]]) -> None:
     path, lines = clean
     cells = lines[7].split(",")
@@ -248,22 +269,6 @@ def test_a_dataset_with_several_imus_asks_which(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="imu0, mav0/imu1"):
         read_imu(tmp_path)
     assert len(read_imu(tmp_path / "mav0/imu1").gyro_t_s) == 400
-
-
-def test_a_new_family_joins_with_one_function(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(imu_room, "_formats", list(imu_formats()))
-
-    def read(path: Path, units: DeclaredUnits) -> ImuRecording:
-        _, gyro, accel = handheld(100)
-        t_s = np.arange(100) / 100
-        return ImuRecording(gyro_t_s=t_s, gyro_rad_s=gyro, accel_t_s=t_s, accel_m_s2=accel, device=path.name)
-
-    mine = ImuFormat(name="mine", layout="a .mine file", accepts=lambda path: path.suffix == ".mine", read=read)
-    register_imu_format(mine)
-    (tmp_path / "a.mine").write_bytes(b"\0")
-    assert read_imu(tmp_path / "a.mine").device == "a.mine"
-    with pytest.raises(ValueError, match="exists"):
-        register_imu_format(mine)
 
 
 @pytest.mark.parametrize(

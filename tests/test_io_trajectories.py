@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from colmap_inertial.errors import FormatError, InertialError, TimingError
-from colmap_inertial.io.trajectories import read_inertial_scale, read_tum, write_tum
+from colmap_inertial.io.trajectories import read_inertial_scale, read_inertial_scale_poses, read_tum, write_tum
 from colmap_inertial.types import CameraTrajectory
 
 EPOCH_NS = 1403715273262142976
@@ -22,6 +22,14 @@ def random_trajectory(n: int = 20) -> CameraTrajectory:
         cam_in_world=rng.normal(size=(n, 3)) * 100,
         epoch_ns=EPOCH_NS,
     )
+
+
+def test_poses_of_an_inertial_scale_folder_have_w_first_and_turn_the_world_into_the_camera(tmp_path: Path) -> None:
+    (tmp_path / "poses.txt").write_text("1000000000 1 2 3 0.8 0 0 0.6\n1500000000 1 2 4 1 0 0 0\n")
+    trajectory = read_inertial_scale_poses(tmp_path)
+    np.testing.assert_allclose(trajectory.cam_from_world_xyzw, [[0, 0, 0.6, 0.8], [0, 0, 0, 1]])
+    np.testing.assert_allclose(trajectory.cam_in_world, [[1, 2, 3], [1, 2, 4]])
+    assert trajectory.t_s.tolist() == [0.0, 0.5] and trajectory.epoch_ns == 1_000_000_000
 
 
 def test_tum_round_trip_keeps_nanoseconds_centres_and_rotations(tmp_path: Path) -> None:

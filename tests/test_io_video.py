@@ -5,6 +5,7 @@ import random
 import re
 import struct
 import tracemalloc
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from colmap_inertial.errors import FormatError, TimingError
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.frames import frame_source, read_frame_timing, read_frames, read_reduced, thin
 from colmap_inertial.io.video import decode_grey, decode_reduced, decode_video, video_stamps_ns
+from colmap_inertial.types import FrameLog
 
 VARIABLE_MS = (100, 133, 167, 250, 283, 400, 417, 450, 600, 633, 667, 700)
 
@@ -99,6 +101,31 @@ def test_thinning_takes_the_frame_nearest_to_each_tick(tmp_path: Path) -> None:
     for rate in (0.3, 1.0, 7.0, 29.0, 30.0, 1000.0):
         kept = thin(t_ns, rate)
         assert len(kept) == min(len(t_ns), round(t_ns[-1] / 1e9 * rate - 0.5) + 1)
+
+
+def test_frames_of_a_thinned_video_keep_the_exposures_that_the_recorder_noted(tmp_path: Path) -> None:
+    write_video(tmp_path / "a.mp4")
+    capture = load_capture(capture_of(tmp_path, 'file = "a.mp4"\nframes_per_s = 5'))
+    stamps_s = np.array(VARIABLE_MS) / 1e3
+    log = FrameLog(t_s=stamps_s, in_video_time=True, exposure_s=stamps_s / 100)
+    timing = read_frame_timing(replace(capture, frame_log=log))
+    assert 2 < len(timing.names) < len(VARIABLE_MS)
+    np.testing.assert_allclose(timing.exposure_s, (timing.t_s + 1e-9 * timing.epoch_ns) / 100, atol=1e-8)
+
+
+def test_stamps_are_rounded_to_the_nearest_nanosecond(tmp_path: Path) -> None:
+    base = Fraction(1, 30_000)
+    with av.open(str(tmp_path / "a.mp4"), "w") as container:
+        stream = container.add_stream("mpeg4", rate=Fraction(30_000, 1001))
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        stream.time_base = stream.codec_context.time_base = base
+        for i in range(6):
+            frame = av.VideoFrame.from_ndarray(np.full((48, 64, 3), 40 * i, np.uint8), format="rgb24")
+            frame = frame.reformat(format="yuv420p")
+            frame.pts, frame.time_base = 1001 * i, base
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    assert video_stamps_ns(tmp_path / "a.mp4").tolist() == [round(1001 * i * base * 10**9) for i in range(6)]
 
 
 def test_grey_and_deep_video_keep_their_depth(tmp_path: Path) -> None:

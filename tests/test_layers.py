@@ -13,10 +13,12 @@ PACKAGE = Path(__file__).parents[1] / "colmap_inertial"
 
 #: Each room may import itself and the rooms before it.
 ORDER = [
-    ("errors", "geometry", "options", "threads", "_kernels"),
+    ("errors", "geometry", "sampling", "options", "threads", "_kernels"),
     ("types",),
-    ("io", "gravity", "gyro"),
+    ("gyro",),
+    ("io", "gravity"),
     ("imaging",),
+    ("multi_aperture", "restoration", "exposure_pairs"),
     ("flow",),
     ("align", "smooth"),
     ("scale",),
@@ -31,7 +33,8 @@ ORDER = [
     ("cli",),
 ]
 RANK = {room: rank for rank, rooms in enumerate(ORDER) for room in rooms}
-ESTIMATORS = ("geometry", "types", "gravity", "gyro", "imaging", "flow", "align", "smooth", "scale")
+PIXELS = ("imaging", "multi_aperture", "restoration", "exposure_pairs")
+ESTIMATORS = ("geometry", "sampling", "types", "gravity", "gyro", *PIXELS, "flow", "align", "smooth", "scale")
 
 
 def room_of(path: Path) -> str:

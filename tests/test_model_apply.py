@@ -152,6 +152,22 @@ def test_text_meshes_by_opencv_move_and_keep_every_other_line(made, name):
     assert relative_error(points[:, 2], points[:, 0]) <= 1e-6
 
 
+def test_normals_of_an_obj_mesh_turn_and_keep_their_length(tmp_path):
+    normals = np.array([[0.6, 0.0, 0.8], [0.0, -1.0, 0.0], [2.0, 3.0, 6.0]])
+    points = np.array([[1.0, 2.0, 3.0], [-4.0, 0.5, 0.25]])
+    lines = [f"v {x} {y} {z} 0.5 0.5 0.5" for x, y, z in points] + [f"vn {x} {y} {z}" for x, y, z in normals]
+    (tmp_path / "a.obj").write_text("\n".join([*lines, "vt 0.25 0.75", "f 1//1 2//2 1//3", ""]))
+    changed = transform_obj(tmp_path / "a.obj", tmp_path / "b.obj", SIMILARITY)
+    assert changed == ("positions", "normals")
+    rows = [line.split() for line in (tmp_path / "b.obj").read_text().splitlines()]
+    assert rows[5:] == [["vt", "0.25", "0.75"], ["f", "1//1", "2//2", "1//3"]]
+    assert [row[4:] for row in rows[:2]] == 2 * [["0.5", "0.5", "0.5"]]
+    found = np.array([[float(value) for value in row[1:4]] for row in rows[:5]])
+    np.testing.assert_allclose(found[:2], moved(points), rtol=1e-12)
+    np.testing.assert_allclose(found[2:], normals @ ROTATION.T, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(found[2:], axis=1), [1.0, 1.0, 7.0], rtol=1e-12)
+
+
 def test_depth_maps_scale_and_unknown_depth_stays_unknown(made):
     maps = Path("dense") / "stereo" / "depth_maps"
     files = sorted(p.name for p in (made / "project" / maps).iterdir())
@@ -499,7 +515,7 @@ def test_a_stopped_run_leaves_nothing_that_looks_whole(project, tmp_path, number
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "project"]
 
 
-def test_links_are_kept_inside_and_followed_outside(project, tmp_path):
+def test_links_are_kept_inside_and_followed_outside_only_on_request(project, tmp_path):
     shutil.move(project / "images", tmp_path / "pictures")
     (project / "images").symlink_to(tmp_path / "pictures")
     (project / "dense" / "latest.ply").symlink_to("fused.ply")
@@ -508,7 +524,10 @@ def test_links_are_kept_inside_and_followed_outside(project, tmp_path):
     (tmp_path / "pictures" / "mask.txt").symlink_to("../mask.txt")
     (tmp_path / "mask.txt").write_text("outside")
     before = digest(tmp_path / "pictures")
-    apply_to_project(project, tmp_path / "out", SIMILARITY)
+    with pytest.raises(FormatError, match=r"images: is a link out of the project, to .*pictures; --follow-links"):
+        apply_to_project(project, tmp_path / "out", SIMILARITY)
+    assert not (tmp_path / "out").exists()
+    apply_to_project(project, tmp_path / "out", SIMILARITY, follow_links=True)
     out = tmp_path / "out"
     assert digest(tmp_path / "pictures") == before
     assert not (out / "images").is_symlink() and digest(out / "images") == before
@@ -519,7 +538,23 @@ def test_links_are_kept_inside_and_followed_outside(project, tmp_path):
     assert (out / "images" / "mask.txt").read_text() == "outside"
     (project / "loop").symlink_to(project)
     with pytest.raises(FormatError, match="leads back"):
-        apply_to_project(project, tmp_path / "again", SIMILARITY)
+        apply_to_project(project, tmp_path / "again", SIMILARITY, follow_links=True)
+
+
+def test_the_command_line_follows_links_only_on_request(project, tmp_path, capsys):
+    (tmp_path / "secret.txt").write_text("secret")
+    (project / "notes2.txt").symlink_to(tmp_path / "secret.txt")
+    command = ["apply", str(project), str(tmp_path / "out"), "--factor", "2"]
+    with pytest.raises(SystemExit) as stopped:
+        main(command)
+    assert stopped.value.code == 2
+    assert "notes2.txt: is a link out of the project" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(SystemExit) as stopped:
+        main([*command, "--follow-links"])
+    assert stopped.value.code == 0
+    assert (tmp_path / "out" / "notes2.txt").read_text() == "secret"
+    assert not (tmp_path / "out" / "notes2.txt").is_symlink()
 
 
 def test_hard_links_only_on_request_and_never_of_what_changes(project, tmp_path):

@@ -14,13 +14,13 @@ from colmap_inertial.drivers.capture import reconstruct
 from colmap_inertial.drivers.fuse_apertures import fuse_captured
 from colmap_inertial.errors import FormatError, InertialError, OutputExistsError
 from colmap_inertial.geometry import so3_exp
-from colmap_inertial.io.apertures import SubImages
+from colmap_inertial.io.aperture_images import SubImages
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.frames import read_frames
 from colmap_inertial.io.rig_calibration import read_rig_calibration
 from colmap_inertial.options import ApertureOptions, FuseAperturesOptions, ReconstructOptions
 from colmap_inertial.simulate import MotionOptions, SceneRecipe, ShutterCamera
-from colmap_inertial.simulate.apertures import write_aperture_capture
+from colmap_inertial.simulate.aperture_array import write_aperture_capture
 from colmap_inertial.stages.apertures import ApertureStage
 from colmap_inertial.types import CameraModel
 
@@ -290,8 +290,34 @@ def test_exposures_are_fused_to_pictures_of_the_reference_s_names(tmp_path):
     assert depth.shape == disparity.shape == (120, 160) and depth.dtype == np.float32
     assert np.nanmedian(depth * disparity) == pytest.approx(500 * 0.01, rel=1e-4)
     assert (out / "refocused" / "shot1_0.png").is_file()
+    # started again there is nothing to do; without depths, those are taken away
+    before = written[0].stat().st_mtime_ns
+    assert fuse_captured(tmp_path / "capture", out, options) == written
+    assert written[0].stat().st_mtime_ns == before
+    fuse_captured(tmp_path / "capture", out, replace(options, fusion=SMALL))
+    assert not (out / "depth").exists() and (out / "refocused").is_dir()
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "thesis.tex").write_text("years of work")
     with pytest.raises(OutputExistsError):
-        fuse_captured(tmp_path / "capture", out, options, progress=lambda *_: None)
+        fuse_captured(tmp_path / "capture", tmp_path / "other", options)
+
+
+def test_a_stopped_fusion_is_gone_on_with(tmp_path):
+    write_plane_capture(tmp_path / "capture", exposures=2)
+
+    def stop(stage, done, total, /):
+        raise KeyboardInterrupt
+
+    options = FuseAperturesOptions(fusion=replace(SMALL, depth=True))
+    with pytest.raises(KeyboardInterrupt):
+        fuse_captured(tmp_path / "capture", tmp_path / "out", options, progress=stop)
+    assert not (tmp_path / "out" / "images").exists()
+    fuse_captured(tmp_path / "capture", tmp_path / "out", options)
+    fuse_captured(tmp_path / "capture", tmp_path / "whole", options)
+    for kind in ("images", "depth", "disparity"):
+        one, two = ({p.name: p.read_bytes() for p in (tmp_path / o / kind).iterdir()} for o in ("out", "whole"))
+        assert one == two and len(one) == 2
+    assert not list((tmp_path / "out").glob("*.partial*"))
 
 
 def test_sub_images_of_another_size_or_depth_are_named(tmp_path):
@@ -305,7 +331,7 @@ def test_sub_images_of_another_size_or_depth_are_named(tmp_path):
     with pytest.raises(FormatError, match="write all with the same depth"):
         fuse_captured(tmp_path, tmp_path / "b", progress=lambda *_: None)
     small.unlink()
-    with pytest.raises(FormatError, match="no such picture"):
+    with pytest.raises(FormatError, match=r"shot0_2.png: no such file"):
         fuse_captured(tmp_path, tmp_path / "c", progress=lambda *_: None)
 
 

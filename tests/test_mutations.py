@@ -13,8 +13,8 @@ from colmap_inertial.io.files import write_json
 from colmap_inertial.model.similarities import read_scales, read_similarity
 from colmap_inertial.options import ReconstructOptions
 from colmap_inertial.run.config import config_as_toml, read_config
-from colmap_inertial.stages.frame_folder import FrameRecord, FrameTreatment, read_frame_records
-from colmap_inertial.types import CameraModel
+from colmap_inertial.stages.frame_folder import FrameRecord, read_frame_records
+from colmap_inertial.types import CameraModel, Treatment
 
 MUTATIONS = 60
 MODEL = {
@@ -50,8 +50,8 @@ def manifest(path: Path) -> None:
 
 def frames(path: Path) -> None:
     camera = CameraModel(model="PINHOLE", width=64, height=48, params=(50.0, 50.0, 32.0, 24.0))
-    treated = FrameTreatment(reason="sharp", blur_px=0.3)
-    records = [FrameRecord(name=f"{i}.jpg", action="passed", camera=camera, treatment=treated) for i in range(3)]
+    treated = Treatment(stage="deblur", reason="sharp", values={"blur_px": 0.3})
+    records = [FrameRecord(name=f"{i}.jpg", action="passed", camera=camera, treatments=(treated,)) for i in range(3)]
     write_json(path, {"frames": records})
 
 

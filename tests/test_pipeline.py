@@ -174,13 +174,23 @@ def test_a_model_without_a_unit_is_scaled_by_the_target(finished, truth, tmp_pat
 def test_a_finished_result_is_not_overwritten(finished, capsys):
     capture, out, _ = finished
     before = contents(out)
-    with pytest.raises(OutputExistsError, match="finished result"):
-        reconstruct(capture, out, QUICK)
+    again = reconstruct(capture, out, QUICK)
+    assert again.unchanged and [m.scale.metres_per_unit for m in again.models] == [
+        m.scale.metres_per_unit for m in finished[2].models
+    ]
+    assert again.models[0].validation.as_json() == finished[2].models[0].validation.as_json()
+    flags = ["--mapping.max-num-features", "1500", "--mapping.first-octave", "0", "--mapping.max-image-size", "480"]
     with pytest.raises(SystemExit) as stopped:
-        main(["reconstruct", str(capture), str(out)])
-    assert stopped.value.code == 2
-    assert "finished result" in capsys.readouterr().err
-    assert contents(out) == before
+        main(["reconstruct", str(capture), str(out), *flags])
+    assert stopped.value.code == 0
+    assert "nothing to do" in capsys.readouterr().out
+    after = contents(out)
+    assert {name for name in after if after[name] != before.get(name)} == {"log.txt"}
+    assert set(after) == set(before)
+    # somebody else's capture is not gone on with
+    other = copy_scene(out.parent / "other", first=4)
+    with pytest.raises(OutputExistsError, match="another capture"):
+        reconstruct(other, out, QUICK)
 
 
 def test_a_refused_scale_keeps_colmap_s_model_and_exits_3(finished, tmp_path, capsys):
@@ -254,14 +264,14 @@ def test_hooks_see_every_frame_keypoint_and_model(tmp_path):
                 yield dataclasses.replace(kept, image=kept.image // 2 + 60)
             kept = frame
 
-    def shift(name, keypoints_px):
-        seen[name] = keypoints_px + np.array([0.25, 0.0])
-        return seen[name]
+    def shift(keypoints):
+        seen[keypoints.name] = keypoints.xy_px + np.array([0.25, 0.0])
+        return dataclasses.replace(keypoints, xy_px=seen[keypoints.name])
 
     def refuse(model):
         from colmap_inertial.types import ScaleEstimate
 
-        models.append((model.index, read_model(model.folder).num_reg_images()))
+        models.append((model.colmap_index, model.reconstruction.num_reg_images()))
         estimate = ScaleEstimate(
             metres_per_unit=None, sigma_log=None, ci95=None, verdict="refused", method="joint", reasons=("mine",)
         )

@@ -49,12 +49,11 @@ def source(box):
 
 def world_from_metric(box, out):
     """Scale, rotation and shift from the metric model to the true world."""
-    (model,) = json.loads((out / "result.json").read_text())["models"]
     transform = json.loads((out / "sparse_metric" / "0" / "transform.json").read_text())
     truth = box.recording.truth
     world_from_model = matrix_from_quat(truth.model_from_world_xyzw).T
     model_from_metric = matrix_from_quat(np.array(transform["rotation_xyzw"])).T
-    ratio = truth.metres_per_unit / model["metres_per_unit"]
+    ratio = truth.metres_per_unit / transform["scale"]
     return (
         ratio,
         world_from_model @ model_from_metric,
@@ -147,9 +146,23 @@ def test_depth_maps_that_come_later_become_points_and_a_mesh_in_metres(unfinishe
     assert np.percentile(off_the_walls(surface), 90) < 0.02
     assert (out / "dense_metric" / "0" / "fused.ply.vis").is_file()
     assert contents(box.root) == before
-    code, _, err = run(capsys, "reconstruct", box.root, out, *flags)
-    assert code == 2
-    assert "finished result" in err
+    code, said, _ = run(capsys, "reconstruct", box.root, out, *flags)
+    assert code == 0
+    assert "nothing to do" in said
+
+
+def test_a_finished_project_is_gone_on_with(box, tmp_path, capsys):
+    out, flags = tmp_path / "out", ["--imu", box.imu, "--frame-times", box.frame_times]
+    code, _, err = run(capsys, "reconstruct", box.root, out, *flags, "--deterministic")
+    assert code == 0, err
+    before = contents(out / "sparse_metric")
+    log = (out / "log.txt").read_text()
+    code, _, err = run(capsys, "reconstruct", box.root, out, *flags, *FLAGS)
+    assert code == 2 and "waits for depth maps" in err
+    new = (out / "log.txt").read_text()[len(log) :]
+    assert "metric: finished in an earlier run, kept" in new and "apply: finished in an earlier run, kept" in new
+    assert contents(out / "sparse_metric") == before
+    assert (out / "dense_metric" / "0" / "images").is_dir()
 
 
 def test_with_cuda_it_goes_through_in_one_run(box, tmp_path, monkeypatch):

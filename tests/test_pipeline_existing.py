@@ -97,9 +97,35 @@ def test_a_project_with_a_csv_becomes_metric_whole(box, tmp_path, capsys):
     lengths = [np.sum(np.linalg.norm(np.diff(path, axis=0), axis=1)) for path in (track.cam_in_world, true)]
     assert lengths[0] == pytest.approx(lengths[1], rel=0.05)
     # a finished result stays
+    before = (out / "result.json").read_bytes()
     again = run(capsys, "reconstruct", box.root, out, "--imu", box.imu, "--frame-times", box.frame_times)
-    assert again[0] == 2
-    assert "finished result" in again[2]
+    assert again[0] == 0
+    assert "nothing to do" in again[1]
+    assert (out / "result.json").read_bytes() == before
+
+
+def test_a_project_is_checked_beforehand_and_force_goes_on(box, tmp_path, capsys):
+    out = tmp_path / "out"
+    flags = ["--imu", box.imu, "--frame-times", box.frame_times]
+    code, _, err = run(capsys, "reconstruct", box.root, out, *flags)
+    assert code == 0, err
+    assert "poses" in json.loads((out / "diagnosis.json").read_text())["checked"]
+    # a gyroscope of which one axis was mirrored
+    mirrored = tmp_path / "imu"
+    shutil.copytree(box.imu, mirrored)
+    table = mirrored / "gyroscope.txt"
+    rows = [line.split() for line in table.read_text().splitlines()]
+    table.write_text("".join(f"{t} {x} {y} {-float(z)}\n" for t, x, y, z in rows))
+    flags[1] = mirrored
+    code, _, err = run(capsys, "reconstruct", box.root, tmp_path / "stopped", *flags)
+    assert code == 3 and "--force" in err
+    assert not (tmp_path / "stopped" / "result.json").exists()
+    run(capsys, "reconstruct", box.root, tmp_path / "forced", *flags, "--force")
+    (model,) = json.loads((tmp_path / "forced" / "result.json").read_text())["models"]
+    assert model["verdict"] in ("weak", "refused")
+    assert "forced to go on" in model["reasons"][0]
+    codes = [f["code"] for f in json.loads((tmp_path / "forced" / "diagnosis.json").read_text())["findings"]]
+    assert "gyro-mirrored" in codes or "imu-does-not-fit" in codes
 
 
 def test_a_model_folder_alone_and_times_in_its_names(box, tmp_path, capsys):
@@ -255,7 +281,11 @@ def test_a_refused_scale_leaves_no_metric_project_and_exits_3(box, tmp_path, cap
         values = [row[1] for row in reversed(rows)]
         (imu / name).write_text("".join(f"{row[0]} {value}\n" for row, value in zip(rows, values, strict=True)))
     out = tmp_path / "out"
-    code, shown, _ = run(capsys, "reconstruct", box.root, out, "--imu", imu, "--frame-times", box.frame_times)
+    flags = ["--imu", imu, "--frame-times", box.frame_times]
+    code, _, err = run(capsys, "reconstruct", box.root, out, *flags)
+    assert code == 3 and "--force" in err and str(out / "report.html") in err
+    assert not (out / "result.json").exists()
+    code, shown, _ = run(capsys, "reconstruct", box.root, out, *flags, "--force")
     assert code == 3
     assert "refused" in shown
     stored = json.loads((out / "result.json").read_text())

@@ -13,9 +13,9 @@ from corner_scene import CALIBRATED, LENS, CornerScene
 from test_pipeline import contents
 
 from colmap_inertial.cli import main
-from colmap_inertial.drivers.capture import prior_calibration, reconstruct
+from colmap_inertial.drivers.capture import reconstruct
 from colmap_inertial.drivers.deblur import deblur_capture
-from colmap_inertial.errors import InertialError, NotObservableError, OutputExistsError
+from colmap_inertial.errors import InertialError, NotObservableError
 from colmap_inertial.imaging.psf import blur_field
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.frames import read_frames
@@ -23,11 +23,11 @@ from colmap_inertial.io.image_metadata import carry_metadata, stated_exposures_s
 from colmap_inertial.io.imu import read_capture_imu
 from colmap_inertial.model import colmap_camera, read_model
 from colmap_inertial.options import MappingOptions, ReconstructOptions
-from colmap_inertial.precalibrate import calibrate as first_look
-from colmap_inertial.precalibrate import plan as imaging
-from colmap_inertial.precalibrate.plan import plan_imaging, read_plan, with_stated_exposures, write_plan
+from colmap_inertial.precalibrate import calibrate as first_look, plan as imaging
+from colmap_inertial.precalibrate.plan import Treatments, plan_imaging, read_plan, with_stated_exposures, write_plan
 from colmap_inertial.precalibrate.selection import part_of
 from colmap_inertial.precalibrate.translation import find_parallaxes
+from colmap_inertial.run.context import Recording, RunContext, prior_calibration
 from colmap_inertial.run.progress import silent
 from colmap_inertial.simulate import MotionOptions, make_motion
 
@@ -168,9 +168,9 @@ def test_deblur_keeps_names_sizes_metadata_and_says_what_it_did(blurred, deblurr
 
 def test_a_finished_folder_is_not_touched_again(blurred, deblurred):
     before = contents(deblurred.workspace.root)
-    with pytest.raises(OutputExistsError, match="finished result"):
-        deblur_capture(blurred, deblurred.workspace.root, progress=silent)
-    assert contents(deblurred.workspace.root) == before
+    assert deblur_capture(blurred, deblurred.workspace.root, progress=silent).unchanged
+    after = contents(deblurred.workspace.root)
+    assert {name for name in before if before[name] != after[name]} <= {"log.txt"}
 
 
 def test_a_stopped_run_does_not_deblur_again(tmp_path, blurred):
@@ -199,13 +199,17 @@ def parts(capture):
     loaded = load_capture(capture)
     timing, _ = read_frames(loaded)
     timing = with_stated_exposures(loaded, timing)
-    return loaded, read_capture_imu(loaded), timing, prior_calibration(loaded, QUICK)
+    return Recording.of(loaded, read_capture_imu(loaded), timing, prior_calibration(loaded, None))
+
+
+def planned(recording, scratch, **asked):
+    return plan_imaging(recording, RunContext(scratch=scratch), Treatments(**asked))
 
 
 @pytest.fixture(scope="module")
 def plan(tmp_path_factory, blurred):
     scratch = tmp_path_factory.mktemp("plan")
-    return plan_imaging(*parts(blurred), deblur=None, rolling_shutter=None, scratch=scratch, progress=silent)
+    return planned(parts(blurred), scratch)
 
 
 def blur_errors(scene, plan):
@@ -230,7 +234,7 @@ def test_blur_by_translation_is_known_to_a_fraction_of_a_pixel(scene, plan):
 def test_a_long_recording_is_surveyed_in_parts(tmp_path, monkeypatch, scene, blurred):
     monkeypatch.setattr(first_look, "_MOST_IN_PART", 12)
     monkeypatch.setattr(first_look, "_MODEL_FRAMES", 12)
-    plan = plan_imaging(*parts(blurred), deblur=None, rolling_shutter=None, scratch=tmp_path, progress=silent)
+    plan = planned(parts(blurred), tmp_path)
     assert len(plan.parallaxes) >= 16  # four seconds hardly give a scale
     turning, both = blur_errors(scene, plan)
     assert both < 0.6 * turning
@@ -246,7 +250,7 @@ def test_frames_too_blurred_for_a_small_model_are_deblurred_for_the_next(tmp_pat
         return find_parallaxes(models, view)
 
     monkeypatch.setattr(imaging, "find_parallaxes", watched)
-    plan = plan_imaging(*parts(capture), deblur=None, rolling_shutter=None, scratch=tmp_path, progress=silent)
+    plan = planned(parts(capture), tmp_path)
     assert registered[0] < 0.75 * scene.frames and registered[-1] > 1.3 * registered[0]
     assert len(plan.parallaxes) >= 20
     turning, both = blur_errors(scene, plan)
@@ -254,7 +258,8 @@ def test_frames_too_blurred_for_a_small_model_are_deblurred_for_the_next(tmp_pat
 
 
 def test_the_plan_reads_back_and_the_stage_keeps_order_and_memory(tmp_path, blurred, plan):
-    loaded, imu, timing, _ = parts(blurred)
+    recording = parts(blurred)
+    loaded, imu, timing = recording.capture, recording.imu, recording.timing
     write_plan(tmp_path / "plan.json", plan)
     again = read_plan(tmp_path / "plan.json", imu, timing)
     write_plan(tmp_path / "again.json", again)
@@ -271,7 +276,7 @@ def test_the_plan_reads_back_and_the_stage_keeps_order_and_memory(tmp_path, blur
 
     for i, frame in enumerate(stage(frames())):
         assert frame.name == timing.names[i] and len(taken) <= i + 5
-    assert all(stage.treatment(name) is not None for name in timing.names)
+        assert [said.stage for said in frame.treatments] == ["deblur"] and frame.treatments[0].reason
 
 
 def test_unknown_exposure_leaves_every_frame_and_says_why(tmp_path, blurred):
@@ -279,7 +284,7 @@ def test_unknown_exposure_leaves_every_frame_and_says_why(tmp_path, blurred):
     shutil.copytree(blurred, capture)
     text = (capture / "capture.toml").read_text()
     (capture / "capture.toml").write_text(text.replace("exposure_s = 0.03\n", ""))
-    loaded, *_ = parts(capture)
+    loaded = parts(capture).capture
     timing = with_stated_exposures(loaded, read_frames(loaded)[0])
     np.testing.assert_allclose(timing.exposure_s, 0.04)  # by EXIF
     for path in (capture / "frames").iterdir():
@@ -314,26 +319,23 @@ def test_a_stabilised_video_is_refused_where_asked_and_left_alone_otherwise(tmp_
     assert stopped.value.code == 3
     assert "stabilised in the camera" in capsys.readouterr().err
     assert not (tmp_path / "out" / "result.json").exists() and not (tmp_path / "out" / "images").exists()
-    loaded, imu, timing, prior = parts(capture)
-    known = {"scratch": tmp_path, "progress": silent}
+    recording = parts(capture)
     with pytest.raises(NotObservableError, match="stabilised"):
-        plan_imaging(loaded, imu, timing, prior, deblur="off", rolling_shutter="rectify", **known)
-    plan = plan_imaging(loaded, imu, timing, prior, deblur=None, rolling_shutter=None, **known)
+        planned(recording, tmp_path, deblur="off", rolling_shutter="rectify")
+    plan = planned(recording, tmp_path)
     assert plan.frame_stages() == [] == plan.keypoint_stages()
     assert "stabilised" in plan.deblur_note and "stabilised" in plan.rolling_shutter_note
     # where a few frames were chosen from the video, all of them are followed
-    few = part_of(timing, timing.names[::7])
+    few = recording.using(part_of(recording.timing, recording.timing.names[::7]))
     with pytest.raises(NotObservableError, match="stabilised"):
-        plan_imaging(loaded, imu, few, prior, deblur=None, rolling_shutter="rectify", every=timing, **known)
+        planned(few, tmp_path, rolling_shutter="rectify")
 
 
 def test_rectifying_needs_a_readout(tmp_path, blurred):
-    loaded, imu, timing, prior = parts(blurred)
+    recording = parts(blurred)
+    unknown = recording.using(replace(recording.timing, readout_s=None))
     with pytest.raises(InertialError, match="readout_s"):
-        plan_imaging(
-            loaded, imu, replace(timing, readout_s=None), prior, deblur=None, rolling_shutter="rectify",
-            scratch=tmp_path, progress=silent,
-        )  # fmt: skip
+        planned(unknown, tmp_path, rolling_shutter="rectify")
 
 
 def test_metadata_of_png_and_jpeg_is_carried_over(tmp_path):

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import itertools
+import json
 import shutil
 from pathlib import Path
 
@@ -23,10 +24,12 @@ from colmap_inertial.io.frames import read_frame_times
 from colmap_inertial.io.imu import read_imu
 from colmap_inertial.model import read_model
 from colmap_inertial.model.project import Applied
-from colmap_inertial.options import MappingOptions, ReconstructOptions, ScaleOptions
+from colmap_inertial.options import MappingOptions, ReconstructOptions
 from colmap_inertial.run.config import config_as_toml, read_config
+from colmap_inertial.run.context import Recording, RunContext
 from colmap_inertial.run.progress import silent
-from colmap_inertial.run.runner import StageRunner, canonical
+from colmap_inertial.run.runner import StepRunner, canonical
+from colmap_inertial.run.session import Session
 from colmap_inertial.run.workspace import Workspace
 from colmap_inertial.stages.frame_folder import read_frame_records, write_frames
 from colmap_inertial.stages.metric import MetricStage
@@ -39,19 +42,23 @@ def test_a_stage_runs_once_and_again_when_anything_before_it_changes(tmp_path):
     calls = []
 
     def run(first_option):
-        runner = StageRunner(workspace)
-        for name, option in (("first", first_option), ("second", 7)):
+        runner = StepRunner(workspace)
+        for name, option, after in (("first", first_option, []), ("second", 7, ["first"]), ("aside", 7, [])):
             target = workspace.root / f"{name}.txt"
-            runner.run(name, {"option": option}, [target], lambda p, n=name: (calls.append(n), p[0].write_text(n)))
 
-    run(1)
-    run(1)
-    assert calls == ["first", "second"]
-    run(2)
-    assert calls == ["first", "second"] * 2
+            def work(partial, name=name):
+                calls.append(name)
+                partial[0].write_text(name)
+
+            runner.run(name, {"option": option}, [target], work, after=after)
+        return runner.worked
+
+    assert run(1) == calls == ["first", "second", "aside"]
+    assert run(1) == []
+    # what does not depend on the change is kept
+    assert run(2) == ["first", "second"]
     (workspace.root / "second.txt").unlink()
-    run(2)
-    assert calls == ["first", "second", "first", "second", "second"]
+    assert run(2) == ["second"]
 
 
 def test_an_interrupted_stage_leaves_nothing_that_counts_as_finished(tmp_path):
@@ -65,14 +72,14 @@ def test_an_interrupted_stage_leaves_nothing_that_counts_as_finished(tmp_path):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        StageRunner(workspace).run("mapping", {}, [target], half)
+        StepRunner(workspace).run("mapping", {}, [target], half)
     assert not target.exists()
 
     def whole(partial):
         partial[0].mkdir()
         (partial[0] / "b").write_text("whole")
 
-    StageRunner(workspace).run("mapping", {}, [target], whole)
+    StepRunner(workspace).run("mapping", {}, [target], whole)
     assert [p.name for p in target.iterdir()] == ["b"]
     assert not list(tmp_path.glob("*.partial*"))
 
@@ -82,7 +89,7 @@ def test_a_damaged_stamp_is_no_stamp(tmp_path):
     workspace.open(tmp_path / "capture.toml")
     calls = []
     for _ in range(2):
-        StageRunner(workspace).run("a", {}, [tmp_path / "a"], lambda p: (calls.append(1), p[0].write_text("x")))
+        StepRunner(workspace).run("a", {}, [tmp_path / "a"], lambda p: (calls.append(1), p[0].write_text("x")))
         (workspace.stamps / "a.json").write_text('{"key": "')
     assert len(calls) == 2
 
@@ -101,8 +108,10 @@ def test_a_folder_that_holds_something_else_is_left_alone(tmp_path):
     with pytest.raises(OutputExistsError, match="another capture"):
         other.open(tmp_path / "b" / "capture.toml")
     other.result.write_text("{}")
-    with pytest.raises(OutputExistsError, match="finished result"):
-        other.open(tmp_path / "a" / "capture.toml")
+    other.open(tmp_path / "a" / "capture.toml")  # a finished run can be gone on with
+    assert other.result.is_file()
+    with pytest.raises(OutputExistsError, match="another capture"):
+        other.open(tmp_path / "b" / "capture.toml")
 
 
 def test_the_resolved_configuration_reads_back_as_it_was(tmp_path):
@@ -173,7 +182,7 @@ def test_frames_that_no_stage_changed_are_copied_byte_for_byte(tmp_path):
 
     write_frames(
         frames,
-        timing,
+        timing.names,
         [invert_the_third_and_drop_the_fourth],
         source_folder=tmp_path / "in",
         images=tmp_path / "out",
@@ -196,7 +205,7 @@ def test_stages_cannot_rename_or_repeat_frames(tmp_path):
     def run(stage, count):
         timing, frames = frames_of(tmp_path / f"in{count}", count)
         kwargs = dict(source_folder=None, images=tmp_path / f"out{count}", records=tmp_path / "r", progress=silent)
-        write_frames(frames, timing, [stage], **kwargs)
+        write_frames(frames, timing.names, [stage], **kwargs)
 
     with pytest.raises(ValueError, match=r"'x\.jpg', which is no frame"):
         run(lambda stream: (dataclasses.replace(f, name="x.jpg") for f in stream), 4)
@@ -210,6 +219,15 @@ def test_pixels_in_a_frame_cannot_be_changed_in_place(tmp_path):
     _, frames = frames_of(tmp_path / "in")
     with pytest.raises(ValueError, match="read-only"):
         next(frames).image[0] = 1
+
+
+def session_in(workspace):
+    return Session(workspace=workspace, runner=StepRunner(workspace), context=RunContext(scratch=workspace.stamps))
+
+
+def recording_of(imu, timing):
+    capture = Capture(path=Path("capture.toml"), calibration=calibration_prior())
+    return Recording.of(capture, imu, timing, capture.calibration)
 
 
 def test_each_sub_model_gets_its_own_scale_and_verdict(project, tmp_path):
@@ -230,13 +248,15 @@ def test_each_sub_model_gets_its_own_scale_and_verdict(project, tmp_path):
     before = {p: p.read_bytes() for p in workspace.sparse.rglob("*.bin")}
     imu = read_imu(project.imu)
     timing = read_frame_times(project.frame_times)
-    stage = MetricStage(imu=imu, calibration=None, options=ScaleOptions(), world="z-up")
-    results = run_models(workspace, timing, imu, [stage], StageRunner(workspace), silent)
+    results, fragments = run_models(
+        session_in(workspace), recording_of(imu, timing), [MetricStage(imu=imu, calibration=None)], after=()
+    )
 
-    assert [result.index for result in results] == [0, 1, 3]
+    assert [(result.index, result.colmap_index) for result in results] == [(0, 0), (1, 1), (2, 3)]
+    assert fragments == ()
     truth = project.recording.truth.metres_per_unit
     for result in results[:2]:
-        expected = truth / factors[result.index]
+        expected = truth / factors[result.colmap_index]
         assert result.scale.metres_per_unit == pytest.approx(expected, rel=0.05)
         assert result.sparse_metric == workspace.sparse_metric / str(result.index)
     assert results[2].scale.verdict == "refused"
@@ -256,6 +276,61 @@ def test_each_sub_model_gets_its_own_scale_and_verdict(project, tmp_path):
         refused.exit_code()
 
 
+def sub_models(project, workspace, parts):
+    """Sub-models of the project's model, by COLMAP's number, of so many images each."""
+    whole = read_model(project.model)
+    names = sorted(image.name for image in whole.images.values())
+    for number, count in parts.items():
+        model = pycolmap.Reconstruction(whole)
+        for name in names[count:]:
+            model.deregister_frame(model.find_image_with_name(name).frame_id)
+        (workspace.sparse / str(number)).mkdir(parents=True)
+        model.write_binary(str(workspace.sparse / str(number)))
+
+
+def test_the_largest_model_comes_first_and_fragments_are_left_out_and_named(project, tmp_path):
+    workspace = Workspace(tmp_path / "out")
+    workspace.open(tmp_path / "capture.toml")
+    sub_models(project, workspace, {0: 3, 1: 1000, 2: 60, 4: 4})
+    imu, timing = read_imu(project.imu), read_frame_times(project.frame_times)
+    session, recording = session_in(workspace), recording_of(imu, timing)
+    models, fragments = run_models(session, recording, [MetricStage(imu=imu, calibration=None)], after=())
+    assert [(m.index, m.colmap_index, m.summary["registered_images"]) for m in models] == [(0, 1, 1000), (1, 2, 60)]
+    assert models[0].sparse == workspace.sparse / "1"
+    assert models[0].sparse_metric == workspace.sparse_metric / "0"
+    assert models[0].trajectory == workspace.root / "trajectory.tum"
+    assert [(f.colmap_index, f.registered_images, f.sparse) for f in fragments] == [
+        (4, 4, workspace.sparse / "4"),
+        (0, 3, workspace.sparse / "0"),
+    ]
+    result = ReconstructResult(workspace=workspace, models=models, fragments=fragments, seconds={})
+    report_result(session, result, recording.capture)
+    said = json.loads(workspace.result.read_text())
+    assert [model["colmap_index"] for model in said["models"]] == [1, 2]
+    assert [(f["colmap_index"], f["sparse"]) for f in said["fragments"]] == [(4, "sparse/4"), (0, "sparse/0")]
+    # a second look finds the same without making it again, another one with the fragments makes it again
+    session = session_in(workspace)
+    again, _ = run_models(session, recording, [MetricStage(imu=imu, calibration=None)], after=())
+    assert session.runner.worked == [] and [m.scale.ci95 for m in again] == [m.scale.ci95 for m in models]
+    every, none = run_models(
+        session_in(workspace), recording, [MetricStage(imu=imu, calibration=None)], after=(), fragments=True
+    )
+    assert [m.colmap_index for m in every] == [1, 2, 4, 0] and none == ()
+
+
+def test_metric_models_that_are_gone_are_made_again(project, tmp_path):
+    workspace = Workspace(tmp_path / "out")
+    workspace.open(tmp_path / "capture.toml")
+    sub_models(project, workspace, {0: 1000})
+    imu, timing = read_imu(project.imu), read_frame_times(project.frame_times)
+    recording, stages = recording_of(imu, timing), [MetricStage(imu=imu, calibration=None)]
+    run_models(session_in(workspace), recording, stages, after=())
+    shutil.rmtree(workspace.sparse_metric)
+    session = session_in(workspace)
+    run_models(session, recording, stages, after=())
+    assert session.runner.worked == ["metric"] and (workspace.sparse_metric / "0").is_dir()
+
+
 def test_a_sub_model_with_one_timed_image_is_refused_and_the_others_go_on(project, tmp_path):
     workspace = Workspace(tmp_path / "out")
     workspace.open(tmp_path / "capture.toml")
@@ -268,18 +343,18 @@ def test_a_sub_model_with_one_timed_image_is_refused_and_the_others_go_on(projec
     (workspace.sparse / "1").mkdir()
     lonely.write_binary(str(workspace.sparse / "1"))
     imu, timing = read_imu(project.imu), read_frame_times(project.frame_times)
-    stage = MetricStage(imu=imu, calibration=None, options=ScaleOptions(), world="z-up")
-    runner = StageRunner(workspace)
-    metric, refused = run_models(workspace, timing, imu, [stage], runner, silent)
+    session, recording = session_in(workspace), recording_of(imu, timing)
+    stages = [MetricStage(imu=imu, calibration=None)]
+    (metric, refused), _ = run_models(session, recording, stages, after=(), fragments=True)
     assert metric.scale.verdict == "trusted"
     assert refused.scale.verdict == "refused" and "1 of the model's 1 images" in refused.scale.reasons[0]
     assert refused.summary["registered_images"] == 1
     result = ReconstructResult(workspace=workspace, models=(metric, refused), frames=(), seconds={})
-    assert report_result(result, Capture(path=tmp_path, calibration=calibration_prior())).report is not None
+    assert report_result(session, result, recording.capture).report is not None
     assert result.exit_code() == 0
     shutil.rmtree(workspace.sparse / "0")
     with pytest.raises(TimingError, match="1 of the model's 1 images"):
-        run_models(workspace, timing, imu, [stage], runner, silent)
+        run_models(session_in(workspace), recording, stages, after=(), fragments=True)
 
 
 def test_the_key_of_a_hook_knows_its_parameters_and_its_body():
@@ -321,7 +396,7 @@ def test_a_stage_that_fails_for_a_reason_leaves_nothing_behind(tmp_path):
         raise InertialError("too few")
 
     with pytest.raises(InertialError, match="too few"):
-        StageRunner(workspace).run("frames", {}, [tmp_path / "images"], fail)
+        StepRunner(workspace).run("frames", {}, [tmp_path / "images"], fail)
     assert [p.name for p in tmp_path.iterdir()] == [".stages"]
 
 

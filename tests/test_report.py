@@ -34,6 +34,9 @@ from colmap_inertial.report.scene import scene_record
 from colmap_inertial.report.series import MOST_POINTS, rounded, strided, thinned
 from colmap_inertial.report.signals import signal_record
 from colmap_inertial.report.words import outcome_of_model
+from colmap_inertial.run.context import Recording, RunContext
+from colmap_inertial.run.runner import StepRunner
+from colmap_inertial.run.session import Session
 from colmap_inertial.run.workspace import Workspace
 from colmap_inertial.scale import estimate_scale
 from colmap_inertial.stages.gyro_view import GyroView
@@ -653,11 +656,14 @@ def test_the_rolling_shutter_is_that_of_the_stages_in_use(project, tmp_path):
     camera = CameraModel(model="PINHOLE", width=640, height=480, params=(500.0, 500.0, 320.0, 240.0))
     view = GyroView(imu=imu, timing=timing, calibration=calibration_prior(), camera=camera, source="capture")
     workspace = Workspace(tmp_path)
-    write_recording(workspace, imu, timing, [RollingShutterStage(view=view)])
+    session = Session(workspace=workspace, runner=StepRunner(workspace), context=RunContext(scratch=workspace.stamps))
+    capture = Capture(path=tmp_path, calibration=calibration_prior(), camera=camera)
+    recording = Recording.of(capture, imu, timing, capture.calibration)
+    write_recording(session, recording, [RollingShutterStage(view=view)], timing.names)
     record = json.loads((tmp_path / "report_data" / "recording.json").read_text())
     assert record["rolling_shutter"]["worst"]["width"] == 640
     assert max(record["rolling_shutter"]["largest_px"]) > 0
-    write_recording(workspace, imu, timing)
+    write_recording(session, recording)
     assert json.loads((tmp_path / "report_data" / "recording.json").read_text())["rolling_shutter"] is None
 
 
@@ -688,7 +694,7 @@ def test_an_existing_project_gets_one_with_and_without_a_scale(project, tmp_path
     content = json.loads((tmp_path / "out" / "report.json").read_text())
     assert content["models"][0]["metres_per_unit"] == result.models[0].scale.metres_per_unit
     assert content["models"][0]["signals"]["acceleration"]["correlation"] > 0.97
-    assert "missing" in content["findings"] and "missing" in content["blur"]
+    assert content["findings"]["checked"] and "missing" in content["blur"]
 
     other = tmp_path / "still"
     shutil.copytree(project.imu, other)
@@ -699,7 +705,10 @@ def test_an_existing_project_gets_one_with_and_without_a_scale(project, tmp_path
         )
     )
     refused = reconstruct_project(
-        project.model.parents[1], tmp_path / "none", ProjectOptions(imu=other, frame_times=project.frame_times)
+        project.model.parents[1],
+        tmp_path / "none",
+        ProjectOptions(imu=other, frame_times=project.frame_times),
+        ReconstructOptions(force=True),
     )
     content, page = json.loads((tmp_path / "none" / "report.json").read_text()), Page(tmp_path / "none" / "report.html")
     assert refused.models[0].scale.verdict == content["outcome"]["verdict"] == "refused"

@@ -20,8 +20,16 @@ from colmap_inertial import threads
 from colmap_inertial.errors import FormatError, InertialError, MissingExtraError
 from colmap_inertial.imaging import wiener
 from colmap_inertial.imaging.blur_field import BlurField
-from colmap_inertial.imaging.restoration import Network, _tiles, deepgyro, load_network, lsd2, require_network, shipped
-from colmap_inertial.imaging.restoration import network as networks
+from colmap_inertial.restoration import (
+    Network,
+    _tiles,
+    deepgyro,
+    load_network,
+    lsd2,
+    network as networks,
+    require_network,
+    shipped,
+)
 from colmap_inertial.threads import usable_processors
 
 ROOT = Path(__file__).parents[1]
@@ -120,13 +128,13 @@ def test_the_network_sees_length_and_double_angle_of_the_blur():
 
 def test_pictures_that_do_not_go_together_are_a_mistake():
     network, a = ready(small.mixing()), picture(32, 32)
-    with pytest.raises(ValueError, match="picture: uint8, uint16 or float32"):
+    with pytest.raises(ValueError, match="image: uint8, uint16 or float32"):
         network.restore(a.astype(np.float64), a)
-    with pytest.raises(ValueError, match=r"aid: of the picture's shape \(32, 32, 3\)"):
+    with pytest.raises(ValueError, match=r"aid: of the image's shape \(32, 32, 3\)"):
         network.restore(a, a[1:])
-    with pytest.raises(ValueError, match=r"picture: \(H, W\) or \(H, W, 3\)"):
+    with pytest.raises(ValueError, match=r"image: \(H, W\) or \(H, W, 3\)"):
         network.restore(a[..., :2], a[..., :2])
-    with pytest.raises(ValueError, match="blur: for 30 x 32 px, the picture has 32 x 32"):
+    with pytest.raises(ValueError, match="blur: for 30 x 32 px, the image has 32 x 32"):
         network.restore(a, a, BlurField.uniform(30, 32, (3, 0)))
 
 

@@ -10,18 +10,18 @@ import pytest
 import small_networks as small
 from corner_scene import CALIBRATED, LENS, CornerScene
 from test_pipeline import contents
-from test_pipeline_imaging import QUICK, parts
+from test_pipeline_imaging import QUICK, parts, planned
 
 from colmap_inertial import threads
 from colmap_inertial.cli import main
 from colmap_inertial.drivers.capture import reconstruct
 from colmap_inertial.drivers.deblur import deblur_capture
 from colmap_inertial.errors import FormatError, MissingExtraError, NotObservableError
-from colmap_inertial.imaging.restoration import shipped
 from colmap_inertial.io.frames import read_frames
 from colmap_inertial.precalibrate import plan as imaging
-from colmap_inertial.precalibrate.plan import plan_imaging, read_plan, write_plan
+from colmap_inertial.precalibrate.plan import read_plan, write_plan
 from colmap_inertial.report.content import _blur
+from colmap_inertial.restoration import shipped
 from colmap_inertial.run.progress import silent
 from colmap_inertial.run.runner import canonical
 from colmap_inertial.stages import deblur as stages
@@ -124,7 +124,7 @@ def test_a_resumed_run_does_not_mix_methods_or_networks(tmp_path, blurred, weigh
 
 
 def test_a_stage_s_key_holds_method_and_network(blurred, weights, tmp_path):
-    plan = plan_imaging(*parts(blurred), deblur="deepgyro", rolling_shutter=None, scratch=tmp_path, progress=silent)
+    plan = planned(parts(blurred), tmp_path, deblur="deepgyro")
     (stage,) = plan.frame_stages()
     assert isinstance(stage, DeblurStage) and stage.weights == shipped.checksum("deepgyro")
     by_filter = replace(stage, method="wiener")
@@ -134,31 +134,31 @@ def test_a_stage_s_key_holds_method_and_network(blurred, weights, tmp_path):
     with pytest.raises(ValueError, match="method"):
         replace(stage, method="deepgiro")
     # the plan of an earlier run says which
-    _, imu, timing, _ = parts(blurred)
+    recording = parts(blurred)
     write_plan(tmp_path / "plan.json", plan)
-    again = read_plan(tmp_path / "plan.json", imu, timing)
+    again = read_plan(tmp_path / "plan.json", recording.imu, recording.timing)
     assert again.method == "deepgyro" and again.frame_stages()[0].method == "deepgyro"
 
 
 def test_frames_need_not_speak_for_themselves_where_a_network_treats_them(blurred, weights, tmp_path):
-    plan = plan_imaging(*parts(blurred), deblur="deepgyro", rolling_shutter=None, scratch=tmp_path, progress=silent)
+    plan = planned(parts(blurred), tmp_path, deblur="deepgyro")
     assert plan.deblur is not None
     decisions, verdict = plan.deblur
     # as in a recording of which only some frames bear the gyroscope out
     plan = replace(plan, deblur=(decisions, replace(verdict, trusted=None)))
-    loaded, *_ = parts(blurred)
+    loaded = parts(blurred).capture
     treated = {}
     for method in ("wiener", "deepgyro"):
         (stage,) = replace(plan, method=method).frame_stages(drop=False)
-        names = [frame.name for frame in stage(read_frames(loaded)[1])]
-        treated[method] = {name for name in names if (said := stage.treatment(name)) and said.deblurred}
+        frames = list(stage(read_frames(loaded)[1]))
+        treated[method] = {frame.name for frame in frames if frame.treatments[-1].action == "deblurred"}
     assert treated["wiener"] < treated["deepgyro"]
 
 
 def test_workers_share_the_network_and_make_the_same_pixels(blurred, weights, tmp_path, monkeypatch):
-    plan = plan_imaging(*parts(blurred), deblur="deepgyro", rolling_shutter=None, scratch=tmp_path, progress=silent)
+    plan = planned(parts(blurred), tmp_path, deblur="deepgyro")
     (stage,) = plan.frame_stages()
-    loaded, *_ = parts(blurred)
+    loaded = parts(blurred).capture
     one, three, filtered, filmed = (
         [frame.image for frame in frames]
         for frames in (
@@ -198,7 +198,7 @@ def test_what_is_missing_is_told_before_any_work(tmp_path, blurred, weights, lac
         assert stopped.value.code == 2 and words in " ".join(capsys.readouterr().err.split())
     assert not out.exists()
     # nobody else needs it
-    assert plan_imaging(*parts(blurred), deblur="wiener", rolling_shutter=None, scratch=tmp_path, progress=silent)
+    assert planned(parts(blurred), tmp_path, deblur="wiener")
 
 
 @pytest.mark.parametrize("method", ["wiener", "deepgyro"])
@@ -208,8 +208,8 @@ def test_asked_for_by_name_it_is_an_error_where_gyroscope_and_pixels_do_not_agre
     def fails(*args, **kwargs):
         raise NotObservableError("time offset", "so")
 
-    monkeypatch.setattr(imaging, "look_first", fails)
+    monkeypatch.setattr(imaging, "precalibrate", fails)
     with pytest.raises(NotObservableError):
-        plan_imaging(*parts(blurred), deblur=method, rolling_shutter=None, scratch=tmp_path, progress=silent)
-    plan = plan_imaging(*parts(blurred), deblur=None, rolling_shutter=None, scratch=tmp_path, progress=silent)
+        planned(parts(blurred), tmp_path, deblur=method)
+    plan = planned(parts(blurred), tmp_path)
     assert plan.frame_stages() == [] and plan.as_json()["deblur_method"] is None

@@ -24,7 +24,7 @@ from restoration.pool import Pool, Sources, make_pool
 from restoration.training import TrainOptions, train, turned
 
 from colmap_inertial.imaging.blur_field import BlurField
-from colmap_inertial.imaging.restoration._tiles import OVERLAP_PX, Span, blur_feed
+from colmap_inertial.restoration._tiles import OVERLAP_PX, Span, blur_feed
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +96,7 @@ def test_noise_is_as_strong_as_asked_for(grain):
 
 
 def test_srgb_is_that_of_the_package():
-    from colmap_inertial.imaging._transfer import srgb_from_linear
+    from colmap_inertial.imaging.transfer import srgb_from_linear
 
     light = np.linspace(-0.1, 1.2, 500)
     np.testing.assert_allclose(srgb(torch.tensor(light)), srgb_from_linear(light), atol=1e-7)

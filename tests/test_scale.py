@@ -84,6 +84,15 @@ def test_the_default_estimate_is_right_and_says_how_long_it_took(recording):
     assert 0 < estimate.runtime_s < 60
 
 
+def test_clocks_that_run_at_different_rates_give_the_same_scale(recording):
+    imu = recording.imu
+    fast = replace(imu, gyro_t_s=imu.gyro_t_s * 1.01, accel_t_s=imu.accel_t_s * 1.01)
+    estimate = estimate_scale(recording.trajectory, fast)
+    assert estimate.verdict == "trusted"
+    assert estimate.metres_per_unit == pytest.approx(recording.truth.metres_per_unit, rel=0.01)
+    assert any("ppm off the camera's" in reason for reason in estimate.reasons)
+
+
 def test_a_gyroscope_alone_gives_no_scale(recording):
     alone = replace(recording.imu, accel_t_s=np.zeros(0), accel_m_s2=np.zeros((0, 3)))
     estimate = estimate_scale(recording.trajectory, alone)

@@ -5,21 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from colmap_inertial.align import align_camera_imu, calibration_prior
-from colmap_inertial.geometry import quat_from_matrix, so3_exp, so3_log
+from colmap_inertial.align import align_camera_imu
+from colmap_inertial.geometry import matrix_from_quat, quat_from_matrix, so3_exp, so3_log
+from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.options import ScaleOptions
-from colmap_inertial.scale import _factors as fac
-from colmap_inertial.scale import _parameters as par
-from colmap_inertial.scale import estimate_scale, first_seconds
+from colmap_inertial.scale import _factors as fac, _parameters as par, estimate_scale, first_seconds
 from colmap_inertial.scale._grouping import first_of_groups, group_frames
-from colmap_inertial.scale._noise import TYPICAL
-from colmap_inertial.scale._preintegration import Track, preintegrate
+from colmap_inertial.scale._noise import TYPICAL, typical_noise
+from colmap_inertial.scale._preintegration import SensorErrors, Track, Tracks, preintegrate
 from colmap_inertial.scale._setup import prepare
 from colmap_inertial.scale._solver import ArrowSystem
 from colmap_inertial.scale.joint import JointOptions, estimate_joint
 from colmap_inertial.simulate.motion import MotionOptions
 from colmap_inertial.simulate.recording import RecordingOptions, SfmOptions, simulate_recording
-from colmap_inertial.types import CameraTrajectory, ImuRecording
+from colmap_inertial.types import CAL, CameraTrajectory, ImuNoise, ImuRecording
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +43,7 @@ def run_through(nodes_s, gyro, accel, **changed):
     arguments = {
         "gyro_bias_rad_s": zero, "accel_bias_m_s2": zero, "gyro_gain": np.zeros((3, 3)), "accel_gain": np.zeros((3, 3))
     }  # fmt: skip
-    return preintegrate(nodes_s, gyro, accel, **{**arguments, **changed})
+    return preintegrate(nodes_s, Tracks(gyro=gyro, accel=accel), SensorErrors(**{**arguments, **changed}))
 
 
 def test_preintegration_agrees_with_fine_steps_of_the_motion():
@@ -196,6 +195,38 @@ def test_derivatives_of_all_residuals_are_those_of_finite_differences(recording,
             assert np.allclose(change, expected, atol=1e-2 * np.abs(expected).max() + 1e-7), name
 
 
+def test_readings_of_both_sensors_are_found_at_the_camera_times_at_which_they_were_taken(recording, calibration):
+    """Readings that are the camera time itself; the sensors' clocks are a quarter of a second apart."""
+    imu, shared = recording.imu, recording.truth.calibration
+    apart = replace(
+        calibration, gyro_time_offset_s=shared.gyro_time_offset_s, accel_time_offset_s=shared.gyro_time_offset_s + 0.25
+    )
+    t_s = imu.gyro_t_s + shared.gyro_time_offset_s
+    clocks = replace(
+        imu,
+        gyro_rad_s=np.tile(t_s[:, None], 3),
+        accel_t_s=imu.gyro_t_s - 0.25,
+        accel_m_s2=np.tile(t_s[:, None], 3),
+    )
+    data, _ = prepare(recording.trajectory, clocks, apart, gravity_m_s2=9.8, gravity_sigma_m_s2=0.02, states_hz=5.0)
+    for track in (data.tracks.gyro, data.tracks.accel):
+        assert np.allclose(track.at(data.t_s)[0], data.t_s[:, None], atol=1e-9)
+
+
+def test_a_gap_counts_in_the_interval_in_which_readings_are_missing():
+    t_s = np.arange(0, 4, 0.01)
+    gyro = Track.of(t_s, np.zeros((len(t_s), 3)))
+    pulse = np.where((t_s > 1.0) & (t_s < 1.3), 50.0, 0.0)[:, None] * np.ones(3)
+    kept = (t_s <= 1.0) | (t_s >= 1.3)
+    nodes_s = np.array([0.7, 1.35, 1.45, 1.95, 2.6])
+    # the accelerometer's stamps are half a second early: what it stamps 1.0 to 1.3 happens from 1.5 to 1.8
+    whole = run_through(nodes_s, gyro, Track.of(t_s, pulse), accel_delay_s=0.5)
+    gapped = run_through(nodes_s, gyro, Track.of(t_s[kept], pulse[kept]), accel_delay_s=0.5)
+    lost = np.linalg.norm(whole.velocity - gapped.velocity, axis=1) > 1e-6
+    assert lost.tolist() == [False, False, True, False]
+    assert (gapped.cov_gaps[:, 3, 3] > 0).tolist() == lost.tolist() and not whole.cov_gaps.any()
+
+
 def test_frames_of_a_video_are_grouped_and_keyframes_are_not():
     none = np.zeros(59)
     assert np.array_equal(first_of_groups(np.arange(60) / 30, 5.0, none), np.arange(0, 60, 6))
@@ -221,8 +252,10 @@ def test_a_group_tells_the_motion_at_its_mean_instant():
         world_from_imu @ cam_from_imu.T,
         np.outer(t_s, [1.0, 0, 0]),
         rate_hz=5.0,
-        gyro=Track.of(samples_s, np.tile(rate + 0.01, (len(samples_s), 1))),
-        accel=Track.of(samples_s, force_in_body),
+        tracks=Tracks(
+            gyro=Track.of(samples_s, np.tile(rate + 0.01, (len(samples_s), 1))),
+            accel=Track.of(samples_s, force_in_body),
+        ),
         gyro_bias_rad_s=np.full(3, 0.01),
         cam_from_imu=cam_from_imu,
     )
@@ -230,9 +263,129 @@ def test_a_group_tells_the_motion_at_its_mean_instant():
     assert groups.t_s == pytest.approx([middle_s]) and groups.count.tolist() == [6]
     body = so3_exp(middle_s * rate)
     assert np.allclose(groups.world_from_cam[0], body @ cam_from_imu.T, atol=1e-9)
-    assert np.allclose(body @ groups.thrown_m[0], 0.5 * np.mean((t_s - middle_s) ** 2) * force, atol=1e-8)
-    assert np.allclose(groups.turned[0], so3_exp((t_s - middle_s)[:, None] * rate).mean(axis=0), atol=1e-9)
+    assert np.allclose(body @ groups.displacement_m[0], 0.5 * np.mean((t_s - middle_s) ** 2) * force, atol=1e-8)
+    assert np.allclose(groups.rotation_since[0], so3_exp((t_s - middle_s)[:, None] * rate).mean(axis=0), atol=1e-9)
     assert np.allclose(groups.centre[0], [middle_s, 0, 0])
+
+
+def test_a_force_acts_on_a_group_s_frames_from_when_it_begins():
+    # A push that grows with time, on frames that lie unevenly about their mean instant
+    push, growth = np.array([1.0, 2.0, -0.5]), np.array([30.0, -20.0, 10.0])
+    t_s, samples_s = np.array([0.0, 1 / 30, 2 / 30, 5 / 30]), np.arange(-1, 2, 0.005)
+    groups = group_frames(
+        t_s,
+        np.tile(np.eye(3), (4, 1, 1)),
+        np.zeros((4, 3)),
+        rate_hz=5.0,
+        tracks=Tracks(
+            gyro=Track.of(samples_s, np.zeros((len(samples_s), 3))),
+            accel=Track.of(samples_s, push + growth * samples_s[:, None]),
+        ),
+        gyro_bias_rad_s=np.zeros(3),
+        cam_from_imu=np.eye(3),
+    )
+    since_s = t_s - t_s.mean()
+    expected = 0.5 * np.mean(since_s**2) * (push + growth * t_s.mean()) + np.mean(since_s**3) / 6 * growth
+    assert np.allclose(groups.displacement_m[0], expected, rtol=1e-2)
+
+
+def test_frames_are_turned_to_their_mean_instant_also_where_the_turn_speeds_up():
+    axis, cam_from_imu = np.array([0.48, -0.6, 0.64]), so3_exp(np.array([1.0, 0.3, 2.0]))
+    t_s, samples_s = np.array([0.0, 1 / 30, 2 / 30, 5 / 30]), np.arange(-1, 2, 0.005)
+
+    def turned(t_s):
+        return so3_exp(np.outer(0.8 * t_s + 2.5 * t_s**2, axis))
+
+    gyro = Track.of(samples_s, np.outer(0.8 + 5.0 * samples_s, axis))
+    groups = group_frames(
+        t_s,
+        turned(t_s) @ cam_from_imu.T,
+        np.zeros((4, 3)),
+        rate_hz=5.0,
+        tracks=Tracks(gyro=gyro, accel=gyro),
+        gyro_bias_rad_s=np.zeros(3),
+        cam_from_imu=cam_from_imu,
+    )
+    expected = turned(np.array([t_s.mean()]))[0] @ cam_from_imu.T
+    assert np.allclose(groups.world_from_cam[0], expected, atol=1e-6)
+
+
+def test_a_later_picture_shows_what_the_motion_brings(recording):
+    """The derivatives of the pictures by the time offset and the clock rate are how the camera moves."""
+    truth, trajectory = recording.truth, recording.trajectory.select(np.arange(0, 300, 15))
+    known = replace(truth.calibration, cov=np.diag([1e-6] * 12))
+    data, prior = prepare(trajectory, recording.imu, known, gravity_m_s2=9.8, gravity_sigma_m_s2=0.02, states_hz=5.0)
+    cam_from_imu, lever = matrix_from_quat(known.cam_from_imu_xyzw), np.array([0.3, -0.2, 0.1])
+
+    def states(t_s):
+        # the model's axes, in metres
+        model_from_cam = matrix_from_quat(truth.cam_from_model_xyzw(t_s)).transpose(0, 2, 1)
+        return {
+            "world_from_imu": model_from_cam @ cam_from_imu,
+            "imu_in_world_m": truth.metres_per_unit * truth.cam_in_model(t_s) + model_from_cam @ lever,
+        }
+
+    def velocity(t_s):
+        return (states(t_s + 1e-4)["imu_in_world_m"] - states(t_s - 1e-4)["imu_in_world_m"]) / 2e-4
+
+    rate_rad_s = truth.motion.rate_in_cam_rad_s(data.t_s) @ cam_from_imu
+    data = replace(data, groups=replace(data.groups, rate_rad_s=rate_rad_s))
+    x = replace(
+        prior.mean,
+        velocity_m_s=velocity(data.t_s),
+        gyro_bias_rad_s=np.zeros_like(prior.mean.gyro_bias_rad_s),
+        imu_in_cam_m=lever,
+        **states(data.t_s),
+    )
+    before = fac.visual_groups(data, TYPICAL, x, rate_rad_s, robust=False)
+    for column, late_s in ((par.DELAY, 1e-4), (par.CLOCK_RATE, 1e-4 * (data.t_s - par.middle_s(data.t_s)))):
+        # where the camera was when the picture was really taken, so much earlier by the IMU's clock
+        moved = replace(x, **states(data.t_s - late_s))
+        after = fac.visual_groups(data, TYPICAL, moved, rate_rad_s, robust=False)
+        z = np.zeros((par.N_GLOBALS, 1))
+        z[column] = 1e-4
+        for old, new in zip(before, after, strict=True):
+            predicted = old.apply(np.zeros((len(data.t_s), par.N_STATE, 1)), z)[:, :, 0]
+            change = new.residual - old.residual
+            assert np.abs(predicted).max() > 0.01
+            assert np.allclose(change, predicted, atol=0.02 * np.abs(predicted).max())
+
+
+def test_a_late_alignment_is_corrected_for_both_sensors(recording, calibration):
+    """Of two offsets that are known against each other, what is found of one holds for the other."""
+    delay_s = calibration.accel_time_offset_s - calibration.gyro_time_offset_s
+    cov = calibration.cov.copy()
+    cov[CAL.TIME_OFFSETS, :] = cov[:, CAL.TIME_OFFSETS] = 0.0
+    cov[CAL.TIME_OFFSETS, CAL.TIME_OFFSETS] = 0.002**2
+    known = replace(calibration, cov=cov)
+    late = replace(
+        known,
+        gyro_time_offset_s=calibration.gyro_time_offset_s + 0.005,
+        accel_time_offset_s=calibration.accel_time_offset_s + 0.005,
+    )
+    found = [estimate_joint(recording.trajectory, recording.imu, one).calibration for one in (known, late)]
+    for refined in found:
+        assert refined.gyro_time_offset_s == pytest.approx(found[0].gyro_time_offset_s, abs=3e-4)
+        assert refined.accel_time_offset_s - refined.gyro_time_offset_s == pytest.approx(delay_s, abs=3e-4)
+        into = np.zeros(CAL.COUNT)
+        into[CAL.ACCEL_TIME_OFFSET], into[CAL.GYRO_TIME_OFFSET] = 1, -1
+        # the delay between the sensors was known to 0.1 ms at worst
+        assert np.sqrt(into @ refined.cov @ into) < 1.01e-4
+
+
+def test_a_data_sheet_raises_the_noise_and_never_lowers_it():
+    levels = ("gyro_rad_s_rthz", "gyro_walk_rad_s_rts", "accel_m_s2_rthz", "accel_walk_m_s2_rts")
+
+    def noise(factor):
+        names = ("gyro_density_rad_s_rthz", "gyro_walk_rad_s2_rthz", "accel_density_m_s2_rthz", "accel_walk_m_s3_rthz")
+        typical = [getattr(TYPICAL, level) for level in levels]
+        return typical_noise(ImuNoise(**{n: factor * value for n, value in zip(names, typical, strict=True)}))
+
+    for level in levels:
+        assert getattr(noise(0.1)[0], level) == getattr(TYPICAL, level)
+        assert getattr(noise(10.0)[0], level) == pytest.approx(10 * getattr(TYPICAL, level))
+    assert noise(10.0)[1]["accel_m_s2_rthz"] == pytest.approx(10 * TYPICAL.accel_m_s2_rthz)
+    assert typical_noise(None)[0] == TYPICAL
 
 
 def test_scale_gravity_bias_and_calibration_are_recovered(recording, calibration):
@@ -249,6 +402,24 @@ def test_scale_gravity_bias_and_calibration_are_recovered(recording, calibration
     assert abs(refined.gyro_time_offset_s - truth.calibration.gyro_time_offset_s) < 4 * sigma[3] + 5e-4
     assert np.all(np.abs(refined.imu_in_cam_m - truth.calibration.imu_in_cam_m) < 4 * sigma[8:11])
     assert np.all(np.abs(refined.gyro_bias_rad_s - truth.calibration.gyro_bias_rad_s) < 4 * sigma[5:8] + 1e-3)
+
+
+def test_scale_and_gravity_err_together_as_the_covariance_says(recording, calibration):
+    """Another strength of gravity moves the scale by their covariance over the prior's variance."""
+    sigma, change = 0.1, 0.02
+    low, high = (
+        estimate_joint(
+            recording.trajectory,
+            recording.imu,
+            calibration,
+            JointOptions(gravity_m_s2=9.80665 + sign * change, gravity_sigma_m_s2=sigma),
+        )
+        for sign in (-1, 1)
+    )
+    moved = np.log(high.metres_per_unit / low.metres_per_unit)
+    down = low.gravity_in_world_m_s2 / np.linalg.norm(low.gravity_in_world_m_s2)
+    predicted = 0.5 * (low.cov + high.cov)[0, 1:4] @ down / sigma**2 * 2 * change
+    assert moved == pytest.approx(predicted, rel=0.2)
 
 
 def test_the_scale_of_the_model_drops_out(recording, calibration):
@@ -440,10 +611,12 @@ def test_real_keyframes_of_a_drone(shared_data):
     )
     cam_in_imu_m = np.array([-0.0216401454975, -0.064676986768, 0.00981073058949])
     prior = calibration_prior(
-        cam_from_imu_xyzw=quat_from_matrix(imu_from_cam.T),
-        imu_in_cam_m=-imu_from_cam.T @ cam_in_imu_m,
-        gyro_time_offset_s=0.0,
-        readout_s=0.0,
+        Declared(
+            cam_from_imu_xyzw=quat_from_matrix(imu_from_cam.T),
+            imu_in_cam_m=-imu_from_cam.T @ cam_in_imu_m,
+            gyro_time_offset_s=0.0,
+            readout_s=0.0,
+        )
     )
     estimate = estimate_scale(trajectory, imu, calibration=prior, options=ScaleOptions(max_offset_s=1.0))
     # From the camera centres of the motion capture

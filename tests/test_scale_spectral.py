@@ -8,7 +8,7 @@ import pytest
 
 from colmap_inertial.align import align_camera_imu
 from colmap_inertial.geometry import quat_exp, quat_multiply, so3_exp
-from colmap_inertial.io.calibration import calibration_prior
+from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.io.trajectories import read_inertial_scale
 from colmap_inertial.scale import _spectral_fit as spectral_fit
 from colmap_inertial.scale._spectra import Signals
@@ -27,7 +27,7 @@ RECORDINGS = ("D1", "D3", "D5", "D7", "D9", "D11", "D13", "D15")
 def known(simulated, **changes):
     """The true calibration as if it had been measured with the usual uncertainty."""
     truth = simulated.truth.calibration
-    return replace(truth, cov=calibration_prior(cam_from_imu_xyzw=truth.cam_from_imu_xyzw).cov, **changes)
+    return replace(truth, cov=calibration_prior(Declared(cam_from_imu_xyzw=truth.cam_from_imu_xyzw)).cov, **changes)
 
 
 def log_error(estimate, simulated):

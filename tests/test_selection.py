@@ -36,12 +36,14 @@ from colmap_inertial.precalibrate.selection import (
     use_all,
     write_selection,
 )
-from colmap_inertial.run.runner import StageRunner
+from colmap_inertial.run.context import Recording, RunContext
+from colmap_inertial.run.runner import StepRunner
+from colmap_inertial.run.session import Session
 from colmap_inertial.run.workspace import Workspace
 from colmap_inertial.simulate import MotionOptions
 from colmap_inertial.simulate.capture import make_scene
-from colmap_inertial.simulate.imu import IMU_PRESETS
 from colmap_inertial.simulate.recipe import SceneRecipe
+from colmap_inertial.simulate.sensors import IMU_PRESETS
 from colmap_inertial.types import CameraModel, FrameTiming
 
 
@@ -53,9 +55,12 @@ def selected(video: BoxVideo, **options: float) -> Selection:
     capture = load_capture(video.folder)
     timing = read_frame_timing(capture)
     imu = read_capture_imu(capture)
-    return select_frames(
-        capture, imu, timing, capture.calibration, options=FrameOptions(use="auto", **options), progress=silent
-    )
+    return chosen(capture, imu, timing, **options)
+
+
+def chosen(capture, imu, timing, **options: float) -> Selection:
+    recording = Recording.of(capture, imu, timing, capture.calibration)
+    return select_frames(recording, FrameOptions(use="auto", **options), silent)
 
 
 def places(selection: Selection) -> np.ndarray:
@@ -171,8 +176,7 @@ def test_without_exposure_times_frames_are_ranked_by_angular_speed(turning, tmp_
     timing = read_frame_timing(unknown)
     assert timing.exposure_s is None
     imu = read_capture_imu(unknown)
-    options = FrameOptions(use="auto")
-    selection = select_frames(unknown, imu, timing, unknown.calibration, options=options, progress=silent)
+    selection = chosen(unknown, imu, timing)
     assert {window.ranked_by for window in selection.windows} == {"speed"}
     assert share_of_windows_mean(turning, selection) < 0.95
 
@@ -221,7 +225,8 @@ def of_a_long_recording(
         support=np.full(len(turns), 100),
     )
     monkeypatch.setattr(choosing, "followed", lambda *_, **__: rotation)
-    clocks = choosing._clocks(replace(capture, camera=_PINHOLE), imu, timing, calibration_prior(), None, silent)
+    stretching = Recording.of(replace(capture, camera=_PINHOLE), imu, timing, calibration_prior())
+    clocks = choosing._clocks(replace(stretching, max_offset_s=None), silent)
     predicted, kind = choosing._predicted(clocks, timing)
     assert kind == "blur"
     exact = GyroCamera(
@@ -288,9 +293,7 @@ def test_an_imu_that_ends_early_leaves_the_rest_to_the_pictures(turning):
         accel_t_s=imu.accel_t_s[keep_accel],
         accel_m_s2=imu.accel_m_s2[keep_accel],
     )
-    selection = select_frames(
-        capture, short, timing, capture.calibration, options=FrameOptions(use="auto"), progress=silent
-    )
+    selection = chosen(capture, short, timing)
     ways = [window.ranked_by for window in selection.windows]
     assert ways[0] == "blur" and ways[-1] == "sharpness"
 
@@ -320,8 +323,10 @@ def test_a_finished_selection_is_kept_and_another_option_makes_a_new_one(turning
             if stage == "selection" and done == total:
                 runs.append(total)
 
-        runner = StageRunner(workspace)
-        return run_selection(runner, workspace, capture, imu, timing, capture.calibration, options, [], progress)
+        context = RunContext(scratch=workspace.stamps, progress=progress)
+        session = Session(workspace=workspace, runner=StepRunner(workspace), context=context)
+        recording = Recording.of(capture, imu, timing, capture.calibration)
+        return run_selection(session, recording, options.frames)
 
     first = run(ReconstructOptions())
     assert run(ReconstructOptions()).names == first.names and len(runs) == 1
@@ -377,9 +382,7 @@ def test_a_gyroscope_of_another_recording_does_not_rank(turning):
     imu = read_capture_imu(capture)
     other = replace(imu, gyro_rad_s=imu.gyro_rad_s[::-1] * [1.0, -1.0, 1.0])
     timing = read_frame_timing(capture)
-    selection = select_frames(
-        capture, other, timing, capture.calibration, options=FrameOptions(use="auto"), progress=silent
-    )
+    selection = chosen(capture, other, timing)
     assert selection.offset_from is None and {w.ranked_by for w in selection.windows} == {"sharpness"}
     assert "not known beforehand" in selection.note
     # the pictures alone do well, too

@@ -17,10 +17,16 @@ from colmap_inertial.geometry import (
     quat_rotate,
     slerp,
 )
-from colmap_inertial.io.calibration import calibration_prior
+from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.io.imu import read_imu
 from colmap_inertial.simulate import ImuOptions, MotionOptions, RecordingOptions, SfmOptions, simulate_recording
-from colmap_inertial.smooth import SmoothOptions, smooth_attitude, smooth_positions, smooth_trajectory
+from colmap_inertial.smooth import (
+    SmoothOptions,
+    WorldAcceleration,
+    smooth_attitude,
+    smooth_positions,
+    smooth_trajectory,
+)
 from colmap_inertial.smooth._chain import Chain
 from colmap_inertial.smooth._models import constant_acceleration, white_jerk
 from colmap_inertial.types import CameraTrajectory
@@ -187,7 +193,7 @@ def test_auxiliary_residuals_ignore_their_own_datum():
         )
 
     y, var = measured.cam_in_world, np.full(80, 1e-4)
-    wrong, jumped = chain(y, var).oddities()
+    wrong, jumped = chain(y, var).outlier_statistics()
     # leave pose 40 out: its deviation against the prediction from all others
     without = chain(y, np.where(np.arange(80) == 40, 1e10, var))
     deviation = y[40] - without.states[40, 0]
@@ -320,6 +326,33 @@ def test_errors_are_as_large_as_stated_for_video_and_for_keyframes(every, imu):
     assert 0.35 < acceleration < 1.5
     # the velocity's covariance prices in gains as bad as data sheets allow
     assert 0.1 < velocity < 1.9
+
+
+def test_an_acceleration_that_is_linear_between_samples_is_integrated_exactly():
+    t_s = np.array([0.0, 0.3, 0.5, 1.3, 1.4, 2.6])
+    start, growth = np.array([1.0, -2.0, 0.5]), np.array([3.0, 1.0, -2.0])
+    inertial = WorldAcceleration.integrated(t_s, start + growth * t_s[:, None])
+    at_s = np.array([0.0, 0.2, 0.5, 1.1, 2.6])[:, None]
+    expected = [start * at_s**2 / 2 + growth * at_s**3 / 6, start * at_s + growth * at_s**2 / 2]
+    assert np.allclose(inertial.sums(at_s[:, 0]), np.stack(expected, axis=1))
+
+
+@pytest.mark.parametrize("sensor", ["gyro", "accel"])
+def test_each_sensor_is_read_by_its_own_time_offset(sensor):
+    simulated = simulate_recording(RecordingOptions(motion=MotionOptions(duration_s=8.0)), seed=3)
+    smooth = smooth_simulated(simulated)
+    offset, t_s = f"{sensor}_time_offset_s", f"{sensor}_t_s"
+    calibration = simulated.truth.calibration
+    late = replace(
+        simulated,
+        imu=replace(simulated.imu, **{t_s: getattr(simulated.imu, t_s) - 0.25}),
+        truth=replace(
+            simulated.truth, calibration=replace(calibration, **{offset: getattr(calibration, offset) + 0.25})
+        ),
+    )
+    again = smooth_simulated(late)
+    assert np.allclose(again.cam_in_world, smooth.cam_in_world, atol=1e-6)
+    assert np.allclose(again.accel_in_world, smooth.accel_in_world, atol=1e-4)
 
 
 def test_the_imu_makes_keyframes_a_second_apart_into_a_path():
@@ -492,7 +525,7 @@ def test_velocities_between_sparse_keyframes_of_a_drone_agree_with_motion_captur
         length_unit="m",
         epoch_ns=int(t_ns[0]),
     )
-    prior = calibration_prior(readout_s=0.0, imu_in_cam_m=-imu_from_cam.T @ cam_in_imu)
+    prior = calibration_prior(Declared(readout_s=0.0, imu_in_cam_m=-imu_from_cam.T @ cam_in_imu))
     smooth = smooth_trajectory(
         trajectory,
         imu,

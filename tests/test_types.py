@@ -8,6 +8,7 @@ import pytest
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.geometry import matrix_from_quat, quat_rotate
 from colmap_inertial.types import (
+    CAL,
     CALIBRATION_PARAMETERS,
     CameraImuCalibration,
     CameraTrajectory,
@@ -135,6 +136,17 @@ def test_a_refused_scale_cannot_become_a_similarity():
     assert refused.as_json()["reasons"] == ["tripod"]
 
 
+def test_places_in_a_calibration_are_those_of_its_parameters():
+    names = np.array(CALIBRATION_PARAMETERS)
+    assert len(names) == CAL.COUNT
+    assert names[CAL.ROTATION].tolist() == [f"rotation_{axis}_rad" for axis in "xyz"]
+    assert names[[CAL.GYRO_TIME_OFFSET, CAL.ACCEL_TIME_OFFSET]].tolist() == names[CAL.TIME_OFFSETS].tolist()
+    assert names[CAL.TIME_OFFSETS].tolist() == ["gyro_time_offset_s", "accel_time_offset_s"]
+    assert names[CAL.GYRO_BIAS].tolist() == [f"gyro_bias_{axis}_rad_s" for axis in "xyz"]
+    assert names[CAL.LEVER_ARM].tolist() == [f"imu_in_cam_{axis}_m" for axis in "xyz"]
+    assert names[CAL.READOUT] == "readout_s"
+
+
 def test_calibration_sigmas_are_found_by_name():
     n = len(CALIBRATION_PARAMETERS)
     calibration = CameraImuCalibration(
@@ -147,5 +159,8 @@ def test_calibration_sigmas_are_found_by_name():
         cov=np.diag(np.arange(n) ** 2.0),
     )
     assert calibration.sigma("accel_time_offset_s") == 4
+    assert calibration.rotation_sigma_rad == 2
+    with pytest.raises(ValueError, match="clock_rate"):
+        dataclasses.replace(calibration, clock_rate=float("nan"))
     with pytest.raises(ValueError, match="not a covariance"):
         dataclasses.replace(calibration, cov=-np.eye(n))

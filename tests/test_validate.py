@@ -27,8 +27,13 @@ from validate_scenes import (
 from colmap_inertial.errors import FormatError, NotObservableError, TargetNotFoundError
 from colmap_inertial.geometry import colmap_px_from_opencv
 from colmap_inertial.options import ValidateOptions
-from colmap_inertial.validate import parse_target, validate_model, validation_table, write_pictures
-from colmap_inertial.validate import search as search_module
+from colmap_inertial.validate import (
+    parse_target,
+    search as search_module,
+    validate_model,
+    validation_table,
+    write_overlays,
+)
 from colmap_inertial.validate.detect import Detection, detect
 from colmap_inertial.validate.views import sight
 
@@ -129,7 +134,7 @@ def test_the_json_has_the_agreed_fields_and_the_table_says_the_same(sharp):
 
 def test_pictures_show_corners_on_frames_and_a_chart(sharp, tmp_path):
     result = sharp.validate()
-    files = write_pictures(result, sharp.images, tmp_path / "pictures", most_frames=3)
+    files = write_overlays(result, sharp.images, tmp_path / "pictures", most_frames=3)
     chart = ET.parse(files[0]).getroot()
     circles = [e for e in chart.iter() if e.tag.endswith("circle")]
     assert len(circles) >= 2 * len(result.distances)

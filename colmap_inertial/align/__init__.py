@@ -3,8 +3,8 @@
 Step 1 of Mustaniemi et al., "Inertial-based scale estimation for structure from motion on mobile devices" (IROS 2017),
 with three changes. Every offset at which the two recordings could coincide is searched, because clock origins are
 arbitrary, and clocks may run at different rates. Rotations over intervals between frames are compared instead of
-differentiated orientations, so that video and sparse keyframes are treated alike. And a result is refused where no
-offset is clearly better than the rest.
+differentiated orientations, so that video and sparse keyframes are treated in the same way. And a result is refused
+where no offset is clearly better than the rest.
 """
 
 from __future__ import annotations
@@ -14,13 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from colmap_inertial.align._clock_search import ClockFit, explained_at, intervals_of, search_offsets, spaced_frames
-from colmap_inertial.align._fit import (
-    OFFSET_UNKNOWN_FROM_S,
-    Alignment,
-    middle_of_overlap,
-    on_camera_rate,
-    refine_alignment,
-)
+from colmap_inertial.align._fit import OFFSET_UNKNOWN_FROM_S, Alignment, middle_of_overlap, refine_alignment
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.gyro import GyroPath
 from colmap_inertial.io.calibration import calibration_prior
@@ -72,7 +66,8 @@ def align_camera_imu(
 
     As :func:`align_clocks`, without the clock rate: for clocks that keep step, which all but action cameras' do.
     """
-    return align_clocks(trajectory, imu, prior=prior, options=options).calibration
+    found = align_clocks(trajectory, imu, prior=prior, options=options).calibration
+    return replace(found, clock_rate=0.0, clock_middle_s=0.0)
 
 
 @one_blas_thread()
@@ -121,12 +116,16 @@ def align_clocks(
     if span_s < _SHORTEST_S:
         hint = f"{span_s:.2f} s of poses are too short to compare with the gyroscope: record ten seconds or more"
         raise NotObservableError("time offset", hint)
-    lowest_s, highest_s = _range(trajectory, imu, prior, options)
-    path = GyroPath(imu.gyro_t_s, imu.gyro_rad_s, np.zeros(3))
+    search = _Search(
+        path=GyroPath(imu.gyro_t_s, imu.gyro_rad_s, np.zeros(3)),
+        offsets_s=_range(trajectory, imu, prior, options),
+        prior=prior,
+        options=options,
+    )
     rate = 0.0
-    start = _search(trajectory, path, lowest_s, highest_s, prior, options)
+    start = search.whole(trajectory)
     if isinstance(start, NotObservableError):
-        drifting = _search_parts(trajectory, path, lowest_s, highest_s, prior, options)
+        drifting = search.parts(trajectory)
         if drifting is None:
             raise start
         start, rate = drifting
@@ -149,88 +148,74 @@ def _range(
     return lowest_s, highest_s
 
 
-def _search(
-    trajectory: CameraTrajectory,
-    path: GyroPath,
-    lowest_s: float,
-    highest_s: float,
-    prior: CameraImuCalibration,
-    options: AlignOptions,
-) -> ClockFit | NotObservableError:
-    """The coarse fit, or the reason why there is none."""
-    intervals = intervals_of(trajectory, _SPACING_S)
-    rotation_known = max(prior.sigma(f"rotation_{axis}_rad") for axis in "xyz") < 0.2
-    for held in (None, prior.cam_from_imu_xyzw) if rotation_known else (None,):
-        fits = search_offsets(
-            intervals,
-            path,
-            lowest_s=lowest_s,
-            highest_s=highest_s,
-            min_overlap=options.min_overlap,
-            cam_from_imu_xyzw=held,
-        )
-        if not fits:
-            return NotObservableError(
-                "time offset",
-                "camera and IMU do not overlap at any offset that is allowed: check that the recordings belong "
-                "together and that their clocks are what was declared",
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Search:
+    """What the offset is sought by: the gyroscope, lowest and highest offset, what is known, thresholds."""
+
+    path: GyroPath
+    offsets_s: tuple[float, float]
+    prior: CameraImuCalibration
+    options: AlignOptions
+
+    def whole(self, trajectory: CameraTrajectory) -> ClockFit | NotObservableError:
+        """The coarse fit, or the reason why there is none."""
+        intervals = intervals_of(trajectory, _SPACING_S)
+        rotation_known, options = self.prior.rotation_sigma_rad < 0.2, self.options
+        for held in (None, self.prior.cam_from_imu_xyzw) if rotation_known else (None,):
+            fits = search_offsets(
+                intervals, self.path, self.offsets_s, min_overlap=options.min_overlap, cam_from_imu_xyzw=held
             )
-        best = fits[0]
-        rival = max([0.0, *(fit.log_likelihood for fit in fits[1:])])
-        explained = explained_at(intervals_of(trajectory, _CHECK_SPACING_S), path, best.offset_s, held)
-        if best.log_likelihood - rival >= options.min_log_likelihood and explained >= options.min_explained:
-            return best
-    seconds = intervals_of(trajectory, _SHORTEST_S)
-    if np.sqrt(np.mean(np.sum(seconds.turn_rad**2, axis=1) / seconds.dt_s)) < _STILL_RAD_RTS:
-        hint = "the camera hardly rotates: turn it about all three axes while recording"
-        return NotObservableError("camera-IMU rotation", hint)
-    if explained >= options.min_explained:
-        hint = (
-            "the rotations fit almost as well at another offset: record longer, with rotation that does not repeat "
-            "itself"
-        )
-    else:
-        hint = (
-            "at no offset does the gyroscope fit the camera's rotations clearly better than at the rest "
-            f"(it explains {100 * max(explained, 0):.0f} % of them): check that this IMU recording belongs to these "
-            "images and that the gyroscope's columns, axes and unit are right, or record longer with rotation about "
-            "all three axes"
-        )
-    return NotObservableError("time offset", hint)
+            if not fits:
+                return NotObservableError(
+                    "time offset",
+                    "camera and IMU do not overlap at any offset that is allowed: check that the recordings belong "
+                    "together and that their clocks are what was declared",
+                )
+            best = fits[0]
+            rival = max([0.0, *(fit.log_likelihood for fit in fits[1:])])
+            explained = explained_at(intervals_of(trajectory, _CHECK_SPACING_S), self.path, best.offset_s, held)
+            if best.log_likelihood - rival >= options.min_log_likelihood and explained >= options.min_explained:
+                return best
+        seconds = intervals_of(trajectory, _SHORTEST_S)
+        if np.sqrt(np.mean(np.sum(seconds.turn_rad**2, axis=1) / seconds.dt_s)) < _STILL_RAD_RTS:
+            hint = "the camera hardly rotates: turn it about all three axes while recording"
+            return NotObservableError("camera-IMU rotation", hint)
+        hint = "the rotations fit almost as well at another offset"
+        hint += ": record longer, with rotation that does not repeat itself"
+        if explained < options.min_explained:
+            hint = (
+                "at no offset does the gyroscope fit the camera's rotations clearly better than at the rest (it "
+                f"explains {100 * max(explained, 0):.0f} % of them): check that this IMU recording belongs to these "
+                "images and that the gyroscope's columns, axes and unit are right, or record longer with rotation "
+                "about all three axes"
+            )
+        return NotObservableError("time offset", hint)
+
+    def parts(self, trajectory: CameraTrajectory) -> tuple[ClockFit, float] | None:
+        """Offset in the middle and clock rate from short parts, if at least two of them agree on a steady drift."""
+        t_s = trajectory.t_s
+        if t_s[-1] - t_s[0] < 2 * _PART_S:
+            return None
+        found: list[tuple[float, ClockFit]] = []
+        for begin_s in np.linspace(t_s[0], t_s[-1] - _PART_S, _PARTS):
+            part = trajectory.select((t_s >= begin_s) & (t_s <= begin_s + _PART_S))
+            if len(part) >= 5:
+                fit = self.whole(part)
+                if isinstance(fit, ClockFit):
+                    found.append((begin_s + 0.5 * _PART_S, fit))
+        best: tuple[int, float, float] | None = None
+        for i, (time_i, fit_i) in enumerate(found):
+            for time_j, fit_j in found[i + 1 :]:
+                rate = (fit_j.offset_s - fit_i.offset_s) / (time_j - time_i)
+                at_zero_s = fit_i.offset_s - rate * time_i
+                agreeing = sum(abs(fit.offset_s - at_zero_s - rate * time) < _UNSTEADY_S for time, fit in found)
+                if abs(rate) <= _FASTEST_DRIFT and (best is None or agreeing > best[0]):
+                    best = (agreeing, rate, at_zero_s)
+        if best is None or best[0] < max(2, (len(found) + 1) // 2):
+            return None
+        _, rate, at_zero_s = best
+        middle_s = middle_of_overlap(trajectory, self.path.t_s, at_zero_s + rate * 0.5 * float(t_s[0] + t_s[-1]))
+        return replace(found[0][1], offset_s=at_zero_s + rate * middle_s), rate
 
 
-def _search_parts(
-    trajectory: CameraTrajectory,
-    path: GyroPath,
-    lowest_s: float,
-    highest_s: float,
-    prior: CameraImuCalibration,
-    options: AlignOptions,
-) -> tuple[ClockFit, float] | None:
-    """Offset in the middle and clock rate from short parts, if at least two of them agree on a steady drift."""
-    t_s = trajectory.t_s
-    if t_s[-1] - t_s[0] < 2 * _PART_S:
-        return None
-    found: list[tuple[float, ClockFit]] = []
-    for begin_s in np.linspace(t_s[0], t_s[-1] - _PART_S, _PARTS):
-        part = trajectory.select((t_s >= begin_s) & (t_s <= begin_s + _PART_S))
-        if len(part) >= 5:
-            fit = _search(part, path, lowest_s, highest_s, prior, options)
-            if isinstance(fit, ClockFit):
-                found.append((begin_s + 0.5 * _PART_S, fit))
-    best: tuple[int, float, float] | None = None
-    for i, (time_i, fit_i) in enumerate(found):
-        for time_j, fit_j in found[i + 1 :]:
-            rate = (fit_j.offset_s - fit_i.offset_s) / (time_j - time_i)
-            at_zero_s = fit_i.offset_s - rate * time_i
-            agreeing = sum(abs(fit.offset_s - at_zero_s - rate * time) < _UNSTEADY_S for time, fit in found)
-            if abs(rate) <= _FASTEST_DRIFT and (best is None or agreeing > best[0]):
-                best = (agreeing, rate, at_zero_s)
-    if best is None or best[0] < max(2, (len(found) + 1) // 2):
-        return None
-    _, rate, at_zero_s = best
-    middle_s = middle_of_overlap(trajectory, path.t_s, at_zero_s + rate * 0.5 * float(t_s[0] + t_s[-1]))
-    return replace(found[0][1], offset_s=at_zero_s + rate * middle_s), rate
-
-
-__all__ = ["OFFSET_UNKNOWN_FROM_S", "AlignOptions", "Alignment", "align_camera_imu", "align_clocks", "on_camera_rate"]
+__all__ = ["OFFSET_UNKNOWN_FROM_S", "AlignOptions", "Alignment", "align_camera_imu", "align_clocks"]

@@ -97,17 +97,16 @@ def spaced_frames(t_s: Array, spacing_s: float) -> NDArray[np.intp]:
 def intervals_of(trajectory: CameraTrajectory, spacing_s: float) -> Intervals:
     """Consecutive intervals of frames at least ``spacing_s`` apart."""
     keep = spaced_frames(trajectory.t_s, spacing_s)
-    t_s, cam_from_world = trajectory.t_s[keep], trajectory.cam_from_world_xyzw[keep]
-    turn = quat_log(quat_multiply(cam_from_world[:-1], quat_conjugate(cam_from_world[1:])))
+    t_s, pose = trajectory.t_s[keep], trajectory.cam_from_world_xyzw[keep]
+    turn = quat_log(quat_multiply(pose[:-1], quat_conjugate(pose[1:])))
     return Intervals(begin_s=t_s[:-1], end_s=t_s[1:], turn_rad=turn)
 
 
 def search_offsets(
     intervals: Intervals,
     path: GyroPath,
+    offsets_s: tuple[float, float],
     *,
-    lowest_s: float,
-    highest_s: float,
     min_overlap: float,
     cam_from_imu_xyzw: Array | None = None,
 ) -> list[ClockFit]:
@@ -119,8 +118,8 @@ def search_offsets(
         The camera's rotations.
     path
         The gyroscope, without any bias taken out.
-    lowest_s, highest_s
-        Range of the offset, between times since each recording's epoch.
+    offsets_s
+        Lowest and highest offset, between times since each recording's epoch.
     min_overlap
         Smallest overlap as a fraction of the shorter recording.
     cam_from_imu_xyzw
@@ -138,14 +137,13 @@ def search_offsets(
         offset_s, gain, per_second = _correlate(intervals, path, min_overlap, rotation)
     else:
         step_s = _SCAN_S
-        offset_s, gain, per_second = _scan(intervals, path, lowest_s, highest_s, min_overlap, rotation)
-    inside = (offset_s >= lowest_s - step_s) & (offset_s <= highest_s + step_s) & np.isfinite(gain)
+        offset_s, gain, per_second = _scan(intervals, path, offsets_s, min_overlap, rotation)
+    inside = (offset_s >= offsets_s[0] - step_s) & (offset_s <= offsets_s[1] + step_s) & np.isfinite(gain)
     offset_s, gain = offset_s[inside], gain[inside]
     compared = intervals.select(_evenly(len(intervals), _COMPARED_INTERVALS))
     fits = []
     for peak in _peaks(offset_s, gain):
-        nearby = offset_s[peak] + step_s * np.linspace(-1, 1, 9)
-        nearby = np.clip(nearby, lowest_s, highest_s)
+        nearby = np.clip(offset_s[peak] + step_s * np.linspace(-1, 1, 9), *offsets_s)
         fits.append(_closest(compared, path, nearby, per_second * intervals.dt_s.sum(), rotation))
     return sorted(fits, key=lambda fit: -fit.log_likelihood)
 
@@ -191,9 +189,9 @@ def _correlate(
 ) -> tuple[Array, Array, float]:
     """Gain at all offsets on a grid, for dense frames, by FFT of the angular velocities with their gaps masked."""
     swept = 0.5 * (path.rate_rad_s[1:] + path.rate_rad_s[:-1]) * np.diff(path.t_s)[:, None]
-    seen, seen_ok, begin_s = _on_grid(intervals.begin_s, intervals.end_s, intervals.turn_rad)
-    felt, felt_ok, imu_begin_s = _on_grid(path.t_s[:-1], path.t_s[1:], swept)
-    size = _fft_length(len(seen) + len(felt))
+    visual, visual_ok, begin_s = _on_grid(intervals.begin_s, intervals.end_s, intervals.turn_rad)
+    inertial, inertial_ok, imu_begin_s = _on_grid(path.t_s[:-1], path.t_s[1:], swept)
+    size = _fft_length(len(visual) + len(inertial))
 
     def spectrum(x: Array) -> NDArray[np.complex128]:
         return np.asarray(np.fft.rfft(x, size, axis=0), dtype=np.complex128)
@@ -201,12 +199,12 @@ def _correlate(
     def correlate(a: NDArray[np.complex128], b: NDArray[np.complex128]) -> Array:
         return np.asarray(np.fft.irfft(np.conj(a) * b, size, axis=0), dtype=np.float64)
 
-    v, g = spectrum(seen), spectrum(felt)
-    v_ok, g_ok = spectrum(seen_ok.astype(float))[:, None], spectrum(felt_ok.astype(float))[:, None]
+    v, g = spectrum(visual), spectrum(inertial)
+    v_ok, g_ok = spectrum(visual_ok.astype(float))[:, None], spectrum(inertial_ok.astype(float))[:, None]
     cells = np.maximum(np.round(correlate(v_ok, g_ok)), 0.0)
     sum_v, sum_g = correlate(v, g_ok), correlate(v_ok, g)
-    energy_v = correlate(spectrum(np.sum(seen**2, axis=1))[:, None], g_ok)
-    energy_g = correlate(v_ok, spectrum(np.sum(felt**2, axis=1))[:, None])
+    energy_v = correlate(spectrum(np.sum(visual**2, axis=1))[:, None], g_ok)
+    energy_g = correlate(v_ok, spectrum(np.sum(inertial**2, axis=1))[:, None])
     cross = np.stack([correlate(v[:, [i]], g) for i in range(3)], axis=1)
     count = np.maximum(cells, 1.0)
     energy_v = energy_v[:, 0] - np.sum(sum_v**2, axis=1) / count[:, 0]
@@ -214,11 +212,11 @@ def _correlate(
     cross -= sum_v[:, :, None] * sum_g[:, None, :] / count[:, :, None]
     left = energy_v + energy_g - 2 * _agreement(cross, rotation)
 
-    per_second = 3 / (_GRID_S * _redundancy(seen[seen_ok], felt[felt_ok]))
+    per_second = 3 / (_GRID_S * _redundancy(visual[visual_ok], inertial[inertial_ok]))
     gain = _gain(energy_v, left, per_second * _GRID_S * cells[:, 0])
-    gain[cells[:, 0] < max(1.0, min_overlap * min(seen_ok.sum(), felt_ok.sum()))] = np.nan
+    gain[cells[:, 0] < max(1.0, min_overlap * min(visual_ok.sum(), inertial_ok.sum()))] = np.nan
     lag = np.arange(size)
-    lag[lag >= len(felt)] -= size
+    lag[lag >= len(inertial)] -= size
     order = np.argsort(-lag)
     offset_s = np.asarray(begin_s - imu_begin_s - lag * _GRID_S, dtype=np.float64)
     return offset_s[order], gain[order], per_second
@@ -248,7 +246,7 @@ def _on_grid(begin_s: Array, end_s: Array, turn_rad: Array) -> tuple[Array, NDAr
     return np.where(covered[:, None], rate, 0.0), covered, start_s
 
 
-def _redundancy(seen: Array, felt: Array) -> float:
+def _redundancy(visual: Array, inertial: Array) -> float:
     """Cells per independent cell: Bartlett's sum over the products of the two autocorrelations."""
 
     def autocorrelation(x: Array) -> Array:
@@ -258,13 +256,13 @@ def _redundancy(seen: Array, felt: Array) -> float:
         out = np.asarray(np.fft.irfft(power, size)[: len(x)])
         return out / max(out[0], 1e-15)
 
-    a, b = autocorrelation(seen), autocorrelation(felt)
+    a, b = autocorrelation(visual), autocorrelation(inertial)
     reach = min(len(a), len(b), int(20 / _GRID_S))
     return max(1.0, float(1 + 2 * np.sum(a[1:reach] * b[1:reach])))
 
 
 def _scan(
-    intervals: Intervals, path: GyroPath, lowest_s: float, highest_s: float, min_overlap: float, rotation: Array | None
+    intervals: Intervals, path: GyroPath, offsets_s: tuple[float, float], min_overlap: float, rotation: Array | None
 ) -> tuple[Array, Array, float]:
     """Gain at a range of offsets, for sparse frames, from the rotations over the very intervals."""
     grid = np.arange(path.t_s[0], path.t_s[-1], _SCAN_S)
@@ -279,7 +277,7 @@ def _scan(
     offset_s = begin_s - grid[0] - lag * _SCAN_S
     needed_s = min_overlap * min(float(end_s - begin_s), float(path.t_s[-1] - path.t_s[0])) * some.dt_s.sum()
     needed_s /= float(end_s - begin_s)
-    allowed = (offset_s >= lowest_s - _SCAN_S) & (offset_s <= highest_s + _SCAN_S)
+    allowed = (offset_s >= offsets_s[0] - _SCAN_S) & (offset_s <= offsets_s[1] + _SCAN_S)
     offset_s, lag = offset_s[allowed], lag[allowed]
     effective = _effective_intervals(some)
     gain = np.full(len(lag), np.nan)
@@ -289,9 +287,9 @@ def _scan(
         inside = (i >= 0) & (j < len(grid))
         inside &= path.covers(grid[np.clip(i, 0, len(grid) - 1)], grid[np.clip(j, 0, len(grid) - 1)])
         i, j = np.clip(i, 0, len(grid) - 1), np.clip(j, 0, len(grid) - 1)
-        felt = quat_log(quat_multiply(quat_conjugate(attitude[i]), attitude[j]))
+        inertial = quat_log(quat_multiply(quat_conjugate(attitude[i]), attitude[j]))
         covered_s = np.sum(inside * some.dt_s, axis=1)
-        cross, energy_v, energy_g, _ = _moments(some, felt, inside)
+        cross, energy_v, energy_g, _ = _moments(some, inertial, inside)
         left = energy_v + energy_g - 2 * _agreement(cross, rotation)
         value = _gain(energy_v, left, 3 * effective * covered_s / some.dt_s.sum())
         gain[at] = np.where((covered_s >= needed_s) & (covered_s > 0), value, np.nan)
@@ -299,36 +297,36 @@ def _scan(
 
 
 def _effective_intervals(intervals: Intervals) -> float:
-    """Independent intervals: long ones weigh more, and neighbours that turn alike repeat each other."""
+    """Independent intervals: long ones weigh more, and neighbours whose rotations are correlated repeat each other."""
     dt_s = intervals.dt_s
     scaled = intervals.turn_rad / np.sqrt(dt_s)[:, None]
     energy = max(float(np.mean(np.sum(scaled**2, axis=1))), 1e-15)
     reach = min(6, len(dt_s) // 4 + 1)
-    alike = [float(np.mean(np.sum(scaled[k:] * scaled[:-k], axis=1))) / energy for k in range(1, reach)]
-    return float(dt_s.sum() ** 2 / np.sum(dt_s**2) / (1 + 2 * np.sum(np.square(alike))))
+    correlations = [float(np.mean(np.sum(scaled[k:] * scaled[:-k], axis=1))) / energy for k in range(1, reach)]
+    return float(dt_s.sum() ** 2 / np.sum(dt_s**2) / (1 + 2 * np.sum(np.square(correlations))))
 
 
 def _moments(
-    intervals: Intervals, felt_rad: Array, inside: NDArray[np.bool_]
+    intervals: Intervals, inertial_rad: Array, inside: NDArray[np.bool_]
 ) -> tuple[Array, Array, Array, tuple[Array, Array]]:
     """Cross moments (L, 3, 3) and energies (L,), (L,) of the interval rotations after a common rate is taken out.
 
-    ``felt_rad`` (L, K, 3) and ``inside`` (L, K) for L offsets. Intervals weigh by 1 / dt, as for a random walk.
+    ``inertial_rad`` (L, K, 3) and ``inside`` (L, K) for L offsets. Intervals weigh by 1 / dt, as for a random walk.
     Also returns the two common rates (L, 3), camera and IMU.
     """
     dt_s = intervals.dt_s
     weight = inside / dt_s
     total = np.maximum(np.sum(inside * dt_s, axis=1), 1e-12)[:, None]
     rate_v = (inside @ intervals.turn_rad) / total
-    rate_g = np.einsum("lk,lki->li", inside, felt_rad) / total
-    seen = intervals.turn_rad - dt_s[:, None] * rate_v[:, None, :]
-    felt = felt_rad - dt_s[:, None] * rate_g[:, None, :]
-    weighted = seen * weight[:, :, None]
-    cross = weighted.transpose(0, 2, 1) @ felt
+    rate_g = np.einsum("lk,lki->li", inside, inertial_rad) / total
+    visual = intervals.turn_rad - dt_s[:, None] * rate_v[:, None, :]
+    inertial = inertial_rad - dt_s[:, None] * rate_g[:, None, :]
+    weighted = visual * weight[:, :, None]
+    cross = weighted.transpose(0, 2, 1) @ inertial
     return (
         cross,
-        np.sum(weighted * seen, axis=(1, 2)),
-        np.sum(felt * felt * weight[:, :, None], axis=(1, 2)),
+        np.sum(weighted * visual, axis=(1, 2)),
+        np.sum(inertial * inertial * weight[:, :, None], axis=(1, 2)),
         (rate_v, rate_g),
     )
 
@@ -352,13 +350,12 @@ def _closest(
     intervals: Intervals, path: GyroPath, offset_s: Array, effective: float, rotation: Array | None
 ) -> ClockFit:
     """The best of a few neighbouring offsets, with its rotation and bias."""
-    felt, inside = [], []
+    inertial, inside = [], []
     for offset in offset_s:
-        begin, end = path.at(intervals.begin_s - offset)[0], path.at(intervals.end_s - offset)[0]
-        felt.append(quat_log(quat_multiply(quat_conjugate(begin), end)))
+        inertial.append(path.turn_rad(intervals.begin_s - offset, intervals.end_s - offset))
         inside.append(path.covers(intervals.begin_s - offset, intervals.end_s - offset))
     mask = np.stack(inside)
-    cross, energy_v, energy_g, (rate_v, rate_g) = _moments(intervals, np.stack(felt), mask)
+    cross, energy_v, energy_g, (rate_v, rate_g) = _moments(intervals, np.stack(inertial), mask)
     left = energy_v + energy_g - 2 * _agreement(cross, rotation)
     covered = np.sum(mask * intervals.dt_s, axis=1) / intervals.dt_s.sum()
     gain = _gain(energy_v, left, effective * covered)

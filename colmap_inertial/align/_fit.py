@@ -19,7 +19,8 @@ from colmap_inertial.geometry import (
 )
 from colmap_inertial.gyro import GyroPath
 from colmap_inertial.types import (
-    CALIBRATION_PARAMETERS,
+    CAL,
+    TYPICAL_NOISE,
     Array,
     CameraImuCalibration,
     CameraTrajectory,
@@ -30,10 +31,12 @@ from colmap_inertial.types import (
 #: A time offset with at least this standard deviation is unknown: its value carries nothing.
 OFFSET_UNKNOWN_FROM_S = 1e3
 #: Columns of the refinement among ``CALIBRATION_PARAMETERS``: rotation, gyroscope offset, gyroscope bias.
-_FITTED = np.array([0, 1, 2, 3, 5, 6, 7])
-_OTHERS = np.setdiff1d(np.arange(len(CALIBRATION_PARAMETERS)), _FITTED)
-#: White noise of a gyroscope whose data sheet is not at hand, rad/s/sqrt(Hz): phones have 1e-4 to 1e-3.
-_GYRO_DENSITY = 3e-4
+_FITTED = np.r_[CAL.ROTATION, CAL.GYRO_TIME_OFFSET, CAL.GYRO_BIAS]
+_OTHERS = np.setdiff1d(np.arange(CAL.COUNT), _FITTED)
+_TURN, _OFFSET, _BIAS = slice(0, 3), 3, slice(4, 7)
+#: A clock rate is corrected where it is this many standard deviations from zero, and faster than what the estimators
+#: allow for.
+_SIGNIFICANT, _FAST_CLOCK = 5.0, 3e-4
 #: Intervals whose residual is this many times its standard deviation lose weight fast: jumps of the poses.
 _OUTLIER_SIGMAS = 4.0
 _N, _N_NUISANCE = len(_FITTED), 19
@@ -57,69 +60,22 @@ class Alignment:
     Attributes
     ----------
     calibration
-        Its time offsets hold at ``middle_s``.
-    clock_rate, clock_rate_sigma
-        Change of the time offset per second: how much the camera's clock runs faster than the IMU's.
-    middle_s
-        The middle of the overlap, camera clock, since the trajectory's epoch.
+        With the clock rate that was fitted, be it significant or not; its time offsets hold in the middle of what both
+        recorded.
+    clock_rate_sigma
+        Standard deviation of the clock rate.
     """
 
     calibration: CameraImuCalibration
-    clock_rate: float
     clock_rate_sigma: float
-    middle_s: float
 
-    def on_camera_rate(self, imu: ImuRecording, *, trajectory_epoch_ns: int) -> ImuRecording:
-        """The recording with stamps that keep step with the camera; ``calibration`` then holds throughout.
+    def drifts(self, faster_than: float = _FAST_CLOCK) -> bool:
+        """Whether the clocks drift apart beyond doubt, and faster than what the estimators allow for (or as asked)."""
+        return abs(self.calibration.clock_rate) > max(_SIGNIFICANT * self.clock_rate_sigma, faster_than)
 
-        Parameters
-        ----------
-        imu
-            The recording that was aligned.
-        trajectory_epoch_ns
-            Epoch of the trajectory that it was aligned with.
-        """
-        return on_camera_rate(
-            imu,
-            self.calibration,
-            clock_rate=self.clock_rate,
-            middle_s=self.middle_s,
-            trajectory_epoch_ns=trajectory_epoch_ns,
-        )
-
-
-def on_camera_rate(
-    imu: ImuRecording,
-    calibration: CameraImuCalibration,
-    *,
-    clock_rate: float,
-    middle_s: float,
-    trajectory_epoch_ns: int,
-) -> ImuRecording:
-    """A recording with stamps that keep step with the camera; see :meth:`Alignment.on_camera_rate`.
-
-    Parameters
-    ----------
-    imu
-        The recording as it was read.
-    calibration
-        Its time offsets hold at ``middle_s``, camera clock, in seconds since ``trajectory_epoch_ns``.
-    clock_rate
-        Change of the time offset per second.
-    """
-    offset_s = calibration.gyro_time_offset_s + (imu.epoch_ns - trajectory_epoch_ns) * 1e-9
-    fixed_s = middle_s - offset_s
-
-    def stretched(t_s: Array) -> Array:
-        return np.asarray(fixed_s + (t_s - fixed_s) / (1 - clock_rate))
-
-    note = f"the IMU's clock is {1e6 * clock_rate:+.0f} ppm off the camera's: its stamps were stretched to keep step"
-    return replace(
-        imu,
-        gyro_t_s=stretched(imu.gyro_t_s),
-        accel_t_s=stretched(imu.accel_t_s),
-        repairs=(*imu.repairs, note),
-    )
+    def settled(self) -> CameraImuCalibration:
+        """The calibration to go on with: its clock rate is zero unless the clocks drift apart (:meth:`drifts`)."""
+        return self.calibration if self.drifts() else replace(self.calibration, clock_rate=0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,9 +89,9 @@ class _State:
 
     def moved(self, step: Array) -> _State:
         return _State(
-            quat_normalize(quat_multiply(quat_exp(step[:3]), self.rotation)),
-            self.offset_s + float(step[3]),
-            self.bias + step[4:_N],
+            quat_normalize(quat_multiply(quat_exp(step[_TURN]), self.rotation)),
+            self.offset_s + float(step[_OFFSET]),
+            self.bias + step[_BIAS],
             self.nuisance + step[_N:],
         )
 
@@ -178,7 +134,7 @@ def refine_alignment(
     state.nuisance[_RATE] = clock_rate
     middle_s = middle_of_overlap(trajectory, imu.gyro_t_s, start.offset_s)
     noise: tuple[float, float] | None = None
-    least_density = _GYRO_DENSITY if imu.noise is None else max(imu.noise.gyro_density_rad_s_rthz, 1e-6)
+    least_density = max((imu.noise or TYPICAL_NOISE).gyro_density_rad_s_rthz, 1e-6)
     for iteration in range(25):
         if iteration in (0, 2, 6):  # the path is linear enough in the bias between these
             path, path_bias = GyroPath(imu.gyro_t_s, imu.gyro_rad_s, state.bias), state.bias
@@ -206,29 +162,25 @@ def refine_alignment(
         information = np.einsum("kai,kaj->ij", white_jacobian, white_jacobian)
         gradient = np.einsum("kai,ka->i", white_jacobian, white_residual)
         step = -np.linalg.solve(information + prior_info, gradient + prior_info @ from_prior)
-        step[3] = np.clip(step[3], -0.1, 0.1)
+        step[_OFFSET] = np.clip(step[_OFFSET], -0.1, 0.1)
         state = state.moved(step)
         cov = np.linalg.inv(information + prior_info)
         if iteration > 8 and np.all(np.abs(step) < 1e-3 * np.sqrt(np.diag(cov))):
             break
     cov = _widened(cov, white_residual, white_jacobian, dt_s)
-    axis_sigma = float(np.sqrt(np.linalg.eigvalsh(cov[:3, :3])[-1]))
+    axis_sigma = float(np.sqrt(np.linalg.eigvalsh(cov[_TURN, _TURN])[-1]))
     if axis_sigma > _OPEN_ROTATION_RAD:
         hint = (
             f"known to no better than {np.degrees(axis_sigma):.0f} deg about one axis: turn the camera about at least "
             "two axes while recording"
         )
         raise NotObservableError("camera-IMU rotation", hint)
-    if cov[3, 3] > _OPEN_OFFSET_S**2 or abs(state.offset_s - start.offset_s) > 0.5:
+    if cov[_OFFSET, _OFFSET] > _OPEN_OFFSET_S**2 or abs(state.offset_s - start.offset_s) > 0.5:
         hint = "the rotation is too slow to place the clocks to a tenth of a second: turn the camera more briskly"
         raise NotObservableError("time offset", hint)
     fitted = _completed(prior, state.rotation, state.offset_s - shift_s, state.bias, cov[:_N, :_N])
-    return Alignment(
-        calibration=fitted,
-        clock_rate=float(state.nuisance[_RATE]),
-        clock_rate_sigma=float(np.sqrt(cov[-1, -1])),
-        middle_s=middle_s,
-    )
+    fitted = replace(fitted, clock_rate=float(state.nuisance[_RATE]), clock_middle_s=middle_s)
+    return Alignment(calibration=fitted, clock_rate_sigma=float(np.sqrt(cov[-1, -1])))
 
 
 def middle_of_overlap(trajectory: CameraTrajectory, imu_t_s: Array, offset_s: float) -> float:
@@ -281,27 +233,27 @@ def _residuals(
     change = by_bias @ bias_change + by_gain @ state.nuisance[_GAIN]
     turn = quat_multiply(turn, quat_exp(change))
     cam_from_gyro = quat_multiply(quat_exp(state.nuisance[_MOUNT]), state.rotation)
-    felt = quat_multiply(quat_multiply(cam_from_gyro, turn), quat_conjugate(cam_from_gyro))
-    felt_back = matrix_from_quat(quat_conjugate(felt))
+    inertial = quat_multiply(quat_multiply(cam_from_gyro, turn), quat_conjugate(cam_from_gyro))
+    inertial_back = matrix_from_quat(quat_conjugate(inertial))
     cam_from_world = trajectory.cam_from_world_xyzw
-    seen = quat_multiply(cam_from_world[:-1], quat_conjugate(cam_from_world[1:]))
-    residual = quat_log(quat_multiply(quat_conjugate(seen), felt))
+    visual = quat_multiply(cam_from_world[:-1], quat_conjugate(cam_from_world[1:]))
+    residual = quat_log(quat_multiply(quat_conjugate(visual), inertial))
     to_cam = matrix_from_quat(cam_from_gyro)
     rate_in_cam = rate @ to_cam.T
     # the shutter turns each frame by K rate: K[i, j] acts on axis i by the rate about j
     by_shutter = np.einsum("ai,kj->kaij", np.eye(3), rate_in_cam).reshape(-1, 3, 9)
-    by_shutter = felt_back @ by_shutter[:-1] - by_shutter[1:]
+    by_shutter = inertial_back @ by_shutter[:-1] - by_shutter[1:]
     residual += by_shutter @ state.nuisance[_SHUTTER]
-    by_offset = np.einsum("kij,kj->ki", felt_back, rate_in_cam[:-1]) - rate_in_cam[1:]
+    by_offset = np.einsum("kij,kj->ki", inertial_back, rate_in_cam[:-1]) - rate_in_cam[1:]
     jacobian = np.empty((len(residual), 3, _N + _N_NUISANCE))
-    jacobian[:, :, :3] = jacobian[:, :, _N:][:, :, _MOUNT] = felt_back - np.eye(3)
-    jacobian[:, :, 3] = by_offset
-    jacobian[:, :, 4:_N] = to_cam @ by_bias
+    jacobian[:, :, _TURN] = jacobian[:, :, _N:][:, :, _MOUNT] = inertial_back - np.eye(3)
+    jacobian[:, :, _OFFSET] = by_offset
+    jacobian[:, :, _BIAS] = to_cam @ by_bias
     jacobian[:, :, _N:][:, :, _GAIN] = to_cam @ by_gain
     jacobian[:, :, _N:][:, :, _SHUTTER] = by_shutter
-    moving = np.einsum("kij,kj->ki", felt_back, rate_in_cam[:-1] * since_s[:-1, None])
+    moving = np.einsum("kij,kj->ki", inertial_back, rate_in_cam[:-1] * since_s[:-1, None])
     jacobian[:, :, _N + _RATE] = moving - rate_in_cam[1:] * since_s[1:, None]
-    # in the world frame, errors of a pose enter the intervals before and after it alike, whatever the rotation
+    # in the world frame, errors of a pose enter the intervals before and after it equally, whatever the rotation
     to_world = matrix_from_quat(quat_conjugate(cam_from_world[1:]))[covered]
     residual = np.einsum("kij,kj->ki", to_world, residual[covered])
     return residual, to_world @ jacobian[covered], np.diff(trajectory.t_s)[covered]
@@ -390,8 +342,8 @@ def _completed(
     before = prior.cov[np.ix_(_FITTED, _FITTED)]
     follow = np.linalg.solve(before, prior.cov[np.ix_(_FITTED, _OTHERS)]).T
     moved = np.zeros(len(_FITTED))
-    moved[:3] = quat_log(quat_multiply(rotation, quat_conjugate(prior.cam_from_imu_xyzw)))
-    moved[3], moved[4:] = offset_s - prior.gyro_time_offset_s, bias - prior.gyro_bias_rad_s
+    moved[_TURN] = quat_log(quat_multiply(rotation, quat_conjugate(prior.cam_from_imu_xyzw)))
+    moved[_OFFSET], moved[_BIAS] = offset_s - prior.gyro_time_offset_s, bias - prior.gyro_bias_rad_s
     others = np.concatenate([[prior.accel_time_offset_s], prior.imu_in_cam_m, [prior.readout_s]])
     others = others + follow @ moved
     full = np.empty_like(prior.cov)

@@ -11,9 +11,9 @@ from __future__ import annotations
 import contextlib
 import csv
 import dataclasses
-import fcntl
 import io
 import itertools
+import os
 import time
 import uuid
 from collections.abc import Callable, Iterator, Sequence
@@ -32,8 +32,8 @@ from colmap_inertial.batch.task import (
     write_status,
 )
 from colmap_inertial.errors import OutputError, OutputExistsError
-from colmap_inertial.io.files import write_json, write_text
-from colmap_inertial.options import ReconstructOptions
+from colmap_inertial.io.files import StrPath, locked, write_json, write_text
+from colmap_inertial.options import BatchOptions, ReconstructOptions, StageNames
 from colmap_inertial.run.config import config_as_toml
 
 #: How often finished captures are collected and progress is shown.
@@ -76,14 +76,14 @@ def needs_gpu(options: ReconstructOptions) -> bool:
 
 
 def run_batch(
-    captures: Path | Sequence[BatchCapture],
-    out: Path,
+    captures: StrPath | Sequence[BatchCapture],
+    out: StrPath,
     options: ReconstructOptions = ReconstructOptions(),
     *,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    attempts: int = 3,
+    stages: StageNames = StageNames(),
+    batch: BatchOptions = BatchOptions(),
     watch: Watch = unwatched,
+    allow_stages: bool = False,
 ) -> BatchResult:
     """Reconstruct many captures; one that fails does not stop the rest.
 
@@ -95,49 +95,49 @@ def run_batch(
         A new folder, or that of an earlier run, which is then continued.
     options
         For captures that state none of their own in the manifest.
-    workers
-        Captures in work at once on this machine; by default as many as its processors and free memory allow. They
-        share the processors among them.
-    scheduler
-        Address of a Dask scheduler (``tcp://host:8786``), whose workers then do the work instead. They need this
-        package, and must see captures and output under the same paths. Captures that want a GPU go to workers that
-        offer one as a resource (``dask worker --resources GPU=1``).
-    attempts
-        How often a capture is started in all, where its process or worker is killed. Other failures are final.
+    stages
+        The hooks of captures that have none of their own, by name: each capture's process imports them.
+    batch
+        Who does the work. Captures on this machine share its processors among them. The workers of a Dask scheduler
+        need this package, and must see captures and output under the same paths; captures that want a GPU go to those
+        that offer one as a resource (``dask worker --resources GPU=1``).
     watch
         Called with the status of a capture whenever that changed.
+    allow_stages
+        As of :func:`read_manifest`.
 
     Raises
     ------
     FormatError
-        For a manifest that cannot be read. What is wrong with one capture is in its status instead.
+        For a manifest that cannot be read, or that names stages without leave. What is wrong with one capture is in
+        its status instead.
     OutputExistsError
         When another batch is at work in ``out``, or it is not a batch's folder.
     MissingExtraError
-        For a ``scheduler`` without Dask.
+        For a scheduler without Dask.
     """
-    if attempts < 1 or (workers is not None and workers < 1):
-        raise ValueError("attempts and workers must be at least 1")
-    entries = read_manifest(captures, options) if isinstance(captures, Path) else list(captures)
+    out = Path(out)
+    if isinstance(captures, str | os.PathLike):
+        captures = read_manifest(captures, options, allow_stages=allow_stages)
+    entries = list(captures)
     check_unique(entries, out)
     out = out.resolve()
     with _owned(out) as run:
-        tasks = [_task(entry, out, run, attempts) for entry in entries]
-        batch = _Batch(tasks, watch)
-        waiting = batch.begin()
-        if scheduler is not None:
-            pool = dask_pool(scheduler)
+        at_work = _Batch([_task(entry, stages, out, run, batch.attempts) for entry in entries], watch)
+        waiting = at_work.begin()
+        if batch.scheduler is not None:
+            pool = dask_pool(batch.scheduler)
         else:
-            pool = local_pool(shares_of_this_machine(max(1, len(waiting)), workers))
+            pool = local_pool(shares_of_this_machine(max(1, len(waiting)), batch.workers))
         try:
             if waiting:
                 with pool as ready, _stopping(out / "status" / "run"):
-                    batch.follow({task.name: ready.submit(task) for task in waiting})
+                    at_work.follow({task.name: ready.submit(task) for task in waiting})
         except BaseException:
-            batch.stop()
+            at_work.stop()
             raise
         finally:
-            result = BatchResult(out=out, captures=batch.statuses())
+            result = BatchResult(out=out, captures=at_work.statuses())
             write_summary(result)
     return result
 
@@ -163,18 +163,13 @@ def _owned(out: Path) -> Iterator[str]:
     status = out / "status"
     if out.exists() and not (out.is_dir() and (status.is_dir() or not any(out.iterdir()))):
         raise OutputExistsError(f"{out} is no batch's folder; choose a new one")
-    try:
-        status.mkdir(parents=True, exist_ok=True)
-        lock = (status / "lock").open("w")
-    except OSError as error:
-        raise OutputError(f"{out} cannot be made: {error.strerror or error}") from error
-    with lock:
+    busy = f"another batch is at work in {out}; wait for it or choose another folder"
+    with contextlib.ExitStack() as held:
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise OutputExistsError(
-                f"another batch is at work in {out}; wait for it or choose another folder"
-            ) from None
+            status.mkdir(parents=True, exist_ok=True)
+            held.enter_context(locked(status / "lock", busy))
+        except OSError as error:
+            raise OutputError(f"{out} cannot be made: {error.strerror or error}") from error
         run = uuid.uuid4().hex
         write_text(status / "run", run)
         try:
@@ -183,10 +178,11 @@ def _owned(out: Path) -> Iterator[str]:
             (status / "run").unlink(missing_ok=True)
 
 
-def _task(entry: BatchCapture, out: Path, run: str, attempts: int) -> CaptureTask:
+def _task(entry: BatchCapture, of_all: StageNames, out: Path, run: str, attempts: int) -> CaptureTask:
     status = out / "status"
     config = status / f"{entry.name}.toml"
-    write_text(config, config_as_toml(Job(options=entry.options, project=entry.project)))
+    stages = of_all if entry.stages is None else entry.stages
+    write_text(config, config_as_toml(Job(options=entry.options, project=entry.project, stages=stages)))
     return CaptureTask(
         name=entry.name,
         capture=entry.path.resolve(),
@@ -279,42 +275,28 @@ def write_summary(result: BatchResult) -> None:
     counts = {state: sum(c.state == state for c in result.captures) for state in ("done", "failed", "interrupted")}
     write_json(result.out / "summary.json", {**counts, "captures": result.captures})
     text = io.StringIO()
-    table = csv.DictWriter(text, _COLUMNS, lineterminator="\n")
+    table = csv.DictWriter(text, _row(CaptureStatus(name="")), lineterminator="\n")
     table.writeheader()
-    for capture in result.captures:
-        table.writerow(_row(capture))
+    table.writerows(_row(capture) for capture in result.captures)
     write_text(result.out / "summary.csv", text.getvalue())
-
-
-_COLUMNS = (
-    *(
-        "name",
-        "state",
-        "exit_code",
-        "verdict",
-        "metres_per_unit",
-        "ci95_low",
-        "ci95_high",
-        "registered_images",
-        "frames",
-    ),
-    *("models", "scale_error_pct", "seconds", "attempts", "host", "error"),
-)
 
 
 def _row(capture: CaptureStatus) -> dict[str, object]:
     best = max(capture.models, key=lambda model: model["registered_images"], default={})
     low, high = best.get("ci95") or (None, None)
     return {
-        **{
-            name: getattr(capture, name)
-            for name in ("name", "state", "exit_code", "frames", "attempts", "host", "error")
-        },
-        **{name: best.get(name) for name in ("verdict", "metres_per_unit", "registered_images", "scale_error_pct")},
+        "name": capture.name,
+        "state": capture.state,
+        "exit_code": capture.exit_code,
+        **{name: best.get(name) for name in ("verdict", "metres_per_unit")},
         "ci95_low": low,
         "ci95_high": high,
+        "registered_images": best.get("registered_images"),
+        "frames": capture.frames,
         "models": len(capture.models),
+        "scale_error_pct": best.get("scale_error_pct"),
         "seconds": round(capture.seconds, 1),
+        **{name: getattr(capture, name) for name in ("attempts", "host", "error")},
     }
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import os
 import queue
 import re
 import threading
@@ -16,11 +15,16 @@ from typing import Any, Protocol
 
 from colmap_inertial.batch.task import CaptureStatus, CaptureTask, run_capture
 from colmap_inertial.errors import InertialError, MissingExtraError
+from colmap_inertial.threads import usable_cores
 
 log = logging.getLogger(__name__)
 
 #: What a thread needs: 2.4 GB were measured for a picture of 12 megapixels with COLMAP's defaults.
 _MEMORY_PER_THREAD = 3 * 2**30
+
+
+#: Bytes that are taken to be free where the system does not say.
+_ASSUMED_MEMORY = 8 * 2**30
 
 
 class Pending(Protocol):
@@ -45,7 +49,10 @@ class Pool(Protocol):
 
 def available_memory() -> int:
     """Bytes that processes may still take on this machine, within the limits of its container."""
-    free = int(re.findall(r"MemAvailable:\s+(\d+) kB", Path("/proc/meminfo").read_text())[0]) * 1024
+    try:
+        free = int(re.findall(r"MemAvailable:\s+(\d+) kB", Path("/proc/meminfo").read_text())[0]) * 1024
+    except OSError:  # no Linux
+        free = _ASSUMED_MEMORY
     for folder in ("/sys/fs/cgroup", "/sys/fs/cgroup/memory"):
         for limit, used in (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes")):
             with contextlib.suppress(OSError, ValueError):
@@ -64,7 +71,7 @@ def shares_of_this_machine(captures: int, workers: int | None = None) -> list[li
     workers
         How many to work on at once, where that is decided already.
     """
-    cores = sorted(os.sched_getaffinity(0))
+    cores = usable_cores()
     if workers is None:
         cores = cores[: max(1, available_memory() // _MEMORY_PER_THREAD)]
         workers = min(len(cores), captures)
@@ -73,7 +80,7 @@ def shares_of_this_machine(captures: int, workers: int | None = None) -> list[li
 
 def number_of_gpus() -> int:
     """CUDA devices of this machine."""
-    return sum(re.fullmatch(r"nvidia\d+", path.name) is not None for path in Path("/dev").iterdir())
+    return sum(re.fullmatch(r"nvidia\d+", path.name) is not None for path in Path("/dev").glob("nvidia*"))
 
 
 class _Local:

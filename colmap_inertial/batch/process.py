@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-import fcntl
 import json
 import os
-import signal
 import sys
 import threading
 import time
@@ -14,13 +13,24 @@ import traceback
 from pathlib import Path
 from typing import Any
 
-from colmap_inertial.batch.task import CaptureTask, Job, failed, read_status, with_result, write_status
+from colmap_inertial.batch.task import (
+    CaptureTask,
+    Job,
+    failed,
+    kill_with_children,
+    read_status,
+    with_result,
+    write_status,
+)
 from colmap_inertial.drivers.capture import reconstruct
 from colmap_inertial.drivers.project import is_project, reconstruct_project
-from colmap_inertial.errors import InertialError
-from colmap_inertial.options import ProjectOptions
-from colmap_inertial.run.config import read_config
+from colmap_inertial.errors import InertialError, OutputExistsError
+from colmap_inertial.io.files import locked, write_text
+from colmap_inertial.options import ProjectOptions, StageNames
+from colmap_inertial.run.config import config_as_toml, read_config
+from colmap_inertial.run.progress import Progress
 from colmap_inertial.run.workspace import Workspace
+from colmap_inertial.stages.named import load_stages
 
 #: The task's paths, which JSON carries as text.
 _PATHS = ("capture", "out", "config", "status", "log", "run_file")
@@ -36,7 +46,7 @@ def main() -> None:
     cores = [int(core) for core in sys.argv[2].split(",") if core]
     task = CaptureTask(**{**values, **{key: Path(values[key]) for key in _PATHS}})
     threading.Thread(target=_end_with_the_parent, daemon=True).start()
-    if cores:
+    if cores and hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, cores)
     status = read_status(task.status)
     if status is None:
@@ -50,15 +60,9 @@ def main() -> None:
             last = now
             write_status(task.status, dataclasses.replace(status, stage=stage, steps_done=done, steps=total))
 
-    workspace = Workspace(task.out)
     try:
-        _wait_for(workspace)
-        job = read_config(task.config, Job)
-        if job.project != ProjectOptions() or is_project(task.capture):
-            reconstruct_project(task.capture, task.out, job.project, job.options, progress=progress)
-        else:
-            reconstruct(task.capture, task.out, job.options, progress=progress)
-        end = with_result(status, workspace.result)
+        _reconstruct(task, progress)
+        end = with_result(status, Workspace(task.out).result)
     except InertialError as error:
         print(f"error: {error}", file=sys.stderr)
         end = failed(status, str(error), error.exit_code)
@@ -68,23 +72,51 @@ def main() -> None:
     write_status(task.status, end)
 
 
+def _reconstruct(task: CaptureTask, progress: Progress) -> None:
+    job = read_config(task.config, Job)
+    existing = job.project != ProjectOptions() or is_project(task.capture)
+    if existing and job.stages != StageNames(model=job.stages.model):
+        raise InertialError(
+            "stages.frame and stages.keypoint: an existing model is not mapped again, nor its images changed; give "
+            "this capture stages of its own without them"
+        )
+    stages = load_stages(job.stages)
+    _begin(Workspace(task.out), job.stages)
+    if existing:
+        reconstruct_project(
+            task.capture, task.out, job.project, job.options, model_stages=stages.model, progress=progress
+        )
+    else:
+        reconstruct(
+            task.capture,
+            task.out,
+            job.options,
+            frame_stages=stages.frame,
+            keypoint_stages=stages.keypoint,
+            model_stages=stages.model,
+            progress=progress,
+        )
+
+
 def _end_with_the_parent() -> None:
     """The pipe from the parent closes when the parent ends, whatever ended it."""
-    sys.stdin.buffer.read()
-    os.killpg(os.getpgid(0), signal.SIGKILL)
+    os.read(sys.stdin.fileno(), 1)  # not through its buffer, whose lock would keep this process from ending in peace
+    kill_with_children(os.getpid())
 
 
-def _wait_for(workspace: Workspace) -> None:
-    """Wait until nobody else is at work in the folder; ``reconstruct`` complains if somebody stays."""
-    lock = workspace.stamps / "lock"
-    until = time.monotonic() + _LOCK_S
-    while lock.exists() and time.monotonic() < until:
-        with open(lock) as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                return
-            except BlockingIOError:
-                time.sleep(0.5)
+def _begin(workspace: Workspace, stages: StageNames) -> None:
+    """Wait until nobody else is at work in the folder, and write down which stages are from now on.
+
+    Before the work, for a process may be killed at any time. Whoever stays in the folder, or whatever else it holds,
+    ``reconstruct`` complains about.
+    """
+    root = workspace.root
+    vacant = not root.exists() or (root.is_dir() and not any(root.iterdir()))
+    if workspace.stamps.is_dir() or (vacant and stages != StageNames()):
+        with contextlib.suppress(OutputExistsError, OSError):
+            workspace.stamps.mkdir(parents=True, exist_ok=True)
+            with locked(workspace.lock, "", wait_s=_LOCK_S):
+                write_text(workspace.stage_names, config_as_toml(stages))
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from typing import Any, Literal
 
 from colmap_inertial.errors import FormatError, InertialError, OutputError, TargetNotFoundError
 from colmap_inertial.io.files import read_json, write_json
-from colmap_inertial.options import ProjectOptions, ReconstructOptions
+from colmap_inertial.options import ProjectOptions, ReconstructOptions, StageNames
 from colmap_inertial.run.config import read_config
 from colmap_inertial.run.workspace import Workspace
 
@@ -42,10 +42,13 @@ class Job:
         As for ``reconstruct``.
     project
         For an existing COLMAP project: the recording that ran along, and when its images were taken.
+    stages
+        The hooks.
     """
 
     options: ReconstructOptions = field(default_factory=ReconstructOptions)
     project: ProjectOptions = field(default_factory=ProjectOptions)
+    stages: StageNames = field(default_factory=StageNames)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,7 +159,8 @@ def failed(status: CaptureStatus, error: str, exit_code: int = 1) -> CaptureStat
 def finished_earlier(task: CaptureTask) -> CaptureStatus | None:
     """The end of a capture that has one already; ``None`` where there is work to do.
 
-    A result that was made from another capture or with other options is an error, not this capture's result.
+    A result that was made from another capture, with other options or with other stages is an error, not this
+    capture's result.
     """
     workspace, known = Workspace(task.out), read_status(task.status)
     if not workspace.result.exists():
@@ -171,12 +175,19 @@ def finished_earlier(task: CaptureTask) -> CaptureStatus | None:
         project = result.get("project", _plain(ProjectOptions()))
         if read_config(workspace.config, ReconstructOptions) != job.options or project != _plain(job.project):
             other = other or "set of options"
+        if made_with(workspace) != job.stages:
+            other = other or "set of stages"
         if other is not None:
             text = f"{task.out} holds the result of another {other}; remove it or choose another folder"
             return failed(status, text, FormatError.exit_code)
         return with_result(status, workspace.result)
     except FormatError as error:
         return failed(status, str(error), error.exit_code)
+
+
+def made_with(workspace: Workspace) -> StageNames:
+    """The stages that a folder is made with, as the process at work wrote them down."""
+    return read_config(workspace.stage_names, StageNames) if workspace.stage_names.is_file() else StageNames()
 
 
 def _plain(project: ProjectOptions) -> object:
@@ -281,6 +292,14 @@ def goes_on(task: CaptureTask) -> bool:
         return False
 
 
+def kill_with_children(pid: int) -> None:
+    """Kill a process that :func:`run_capture` started and all that it started; where there are no groups, it alone."""
+    if hasattr(os, "killpg"):
+        os.killpg(pid, signal.SIGKILL)
+    else:
+        os.kill(pid, signal.SIGTERM)
+
+
 def _attend(task: CaptureTask, cores: Sequence[int]) -> int | None:
     """Start the process and wait for it: its return code, or ``None`` where the batch was stopped meanwhile."""
     values = {f.name: getattr(task, f.name) for f in dataclasses.fields(task)}
@@ -303,7 +322,7 @@ def _attend(task: CaptureTask, cores: Sequence[int]) -> int | None:
                     return None
     finally:
         with contextlib.suppress(ProcessLookupError, PermissionError):
-            os.killpg(process.pid, signal.SIGKILL)
+            kill_with_children(process.pid)
         process.wait()
         if process.stdin is not None:
             process.stdin.close()

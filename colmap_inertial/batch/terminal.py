@@ -60,6 +60,3 @@ def show_batch(result: BatchResult) -> None:
     counts = {state: sum(c.state == state for c in result.captures) for state in _COLOUR}
     text = ", ".join(f"[{_COLOUR[state]}]{count} {state}[/]" for state, count in counts.items() if count)
     Console().print(f"{text} of {len(result.captures)}; {result.out / 'summary.csv'}", soft_wrap=True, highlight=False)
-
-
-__all__ = ["live_batch", "show_batch"]

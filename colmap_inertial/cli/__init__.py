@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -95,6 +96,18 @@ def _default_from_config(cls: type[Command], args: Sequence[str]) -> Command | N
 
 def main(args: Sequence[str] | None = None) -> None:
     """Entry point of ``colmap-inertial``."""
+    try:
+        try:
+            _main(args)
+        finally:
+            sys.stdout.flush()  # here, where it can be said what a failure means
+    except BrokenPipeError:
+        # whoever read has enough, as `head` does: end as a program that SIGPIPE ends
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(141)
+
+
+def _main(args: Sequence[str] | None) -> None:
     args = sys.argv[1:] if args is None else args
     if list(args) == ["--version"]:
         print(__version__)
@@ -110,7 +123,7 @@ def main(args: Sequence[str] | None = None) -> None:
         print(f"error: {error}", *getattr(error, "__notes__", ()), sep="\n", file=sys.stderr)
         code = error.exit_code
     except KeyboardInterrupt:
-        resumes = isinstance(command, Reconstruct | Deblur | Batch)
+        resumes = isinstance(command, Reconstruct | Deblur | FuseApertures | FuseExposures | Batch)
         again = "; started again with the same arguments, it continues" if resumes else ""
         print(f"interrupted{again}", file=sys.stderr)
         code = 130

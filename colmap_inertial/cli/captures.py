@@ -12,6 +12,7 @@ from tyro.conf import Positional, arg
 
 from colmap_inertial.options import (
     ApertureOptions,
+    BatchOptions,
     BlurRemover,
     ExposureOptions,
     FuseAperturesOptions,
@@ -25,7 +26,8 @@ class Reconstruct:
     """Turn images or video with an IMU recording into a COLMAP model in metres, gravity along an axis.
 
     Writes OUT/sparse (COLMAP's own model), OUT/sparse_metric (the same in metres), OUT/trajectory.tum, OUT/result.json;
-    with --dense also OUT/dense_metric. Started again after an interruption, it continues with the last finished stage.
+    with --dense also OUT/dense_metric. Started again after an interruption, or with other options, it makes only what
+    is not there yet or depends on them.
 
     CAPTURE may be an existing COLMAP project: give --imu, and when its images were taken. Nothing is mapped again, and
     OUT/project_metric is all of the project in metres.
@@ -36,7 +38,7 @@ class Reconstruct:
     capture: Positional[Path]
     """A capture.toml, a folder that holds one, an EuRoC/ASL dataset, or a COLMAP project."""
     out: Positional[Path]
-    """A new folder for everything that is made."""
+    """A new folder for everything that is made, or that of an earlier run on the same, which is gone on with."""
     project: Annotated[ProjectOptions, arg(name="")] = dataclasses.field(default_factory=ProjectOptions)
     options: Annotated[ReconstructOptions, arg(name="")] = dataclasses.field(default_factory=ReconstructOptions)
     config: Path | None = None
@@ -71,7 +73,7 @@ class Deblur:
     capture: Positional[Path]
     """A capture.toml, a folder that holds one, or an EuRoC/ASL dataset; it must know the exposure times."""
     out: Positional[Path]
-    """A new folder for everything that is made."""
+    """A new folder for everything that is made, or that of an earlier run on the same, which is gone on with."""
     method: BlurRemover = "wiener"
     """wiener: a Wiener filter along the blur of each pixel. deepgyro: a network, which also sees what the filter makes
     of the picture (slower; needs the extra `restore`)."""
@@ -114,7 +116,7 @@ class FuseApertures:
     capture: Positional[Path]
     """A capture.toml with [images] and [apertures], or a folder that holds one; no IMU is needed."""
     out: Positional[Path]
-    """A new folder."""
+    """A new folder, or that of an earlier run on the same capture, which is gone on with."""
     refocus: float | None = None
     """Also write pictures that are sharp at this depth only, in metres."""
     lens_width: float = 1.0
@@ -147,7 +149,7 @@ class FuseExposures:
     capture: Positional[Path]
     """A capture.toml with [images] and [exposures], or a folder that holds one; times and an IMU are welcome."""
     out: Positional[Path]
-    """A new folder."""
+    """A new folder, or that of an earlier run on the same capture, which is gone on with."""
     fusion: Literal["none", "mertens"] = "none"
     """Blend the fused picture with the short exposure, which shows what clips in the long one."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -178,9 +180,10 @@ class Batch:
     """Reconstruct many captures, each in a process of its own; one that fails does not stop the rest.
 
     MANIFEST is a TOML file with a [[capture]] table for each: path (from the manifest's folder), and optionally name,
-    config (a TOML file with options) and options; or a folder in which every folder is a capture. Writes OUT/NAME for
-    each capture as reconstruct does, OUT/status/NAME.json with how far it is, OUT/summary.csv and OUT/summary.json.
-    Started again, it takes up what has no result yet. Exit code 0 when every capture is done, 1 when one is not.
+    config (a TOML file with options), options and stages (with --allow-stages); or a folder in which every folder is a
+    capture. Writes OUT/NAME for each capture as reconstruct does, OUT/status/NAME.json with how far it is,
+    OUT/summary.csv and OUT/summary.json. Started again, it takes up what has no result yet. Exit code 0 when every
+    capture is done, 1 when one is not.
 
     Example: colmap-inertial batch captures.toml out
     """
@@ -189,23 +192,12 @@ class Batch:
     """A TOML file that lists captures, or a folder of captures."""
     out: Positional[Path]
     """A new folder, or that of an earlier run."""
-    workers: int | None = None
-    """Captures in work at once on this machine. Default: what processors and free memory allow."""
-    scheduler: str | None = None
-    """Address of a Dask scheduler (tcp://host:8786), whose workers do the work instead (needs the extra `cluster`)."""
-    attempts: int = 3
-    """How often a capture is started in all, where its process or its worker is killed."""
+    batch: Annotated[BatchOptions, arg(name="")] = dataclasses.field(default_factory=BatchOptions)
+    allow_stages: bool = False
+    """Import and run the stages that the manifest names: they are code that its author chose."""
     options: Annotated[ReconstructOptions, arg(name="")] = dataclasses.field(default_factory=ReconstructOptions)
     config: Path | None = None
     """TOML file with options for all; flags given here go before it, and what the manifest says before both."""
-
-    def __post_init__(self) -> None:
-        if self.workers is not None and self.workers < 1:
-            raise ValueError(f"workers must be at least 1, not {self.workers}")
-        if self.workers is not None and self.scheduler is not None:
-            raise ValueError("--workers are those of this machine; with --scheduler, the cluster has its own")
-        if not 1 <= self.attempts <= 100:
-            raise ValueError(f"attempts must be from 1 to 100, not {self.attempts}")
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
@@ -214,13 +206,7 @@ class Batch:
 
         with live_batch() as watch:
             result = run_batch(
-                self.manifest,
-                self.out,
-                self.options,
-                workers=self.workers,
-                scheduler=self.scheduler,
-                attempts=self.attempts,
-                watch=watch,
+                self.manifest, self.out, self.options, batch=self.batch, watch=watch, allow_stages=self.allow_stages
             )
         show_batch(result)
         return result.exit_code()

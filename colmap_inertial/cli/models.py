@@ -92,6 +92,8 @@ class Apply:
     """Hard links for files that do not change; an edit of one then changes the original, too."""
     keep: tuple[str, ...] = ()
     """Patterns of paths in PROJECT that are copied as they are, such as "old/*"."""
+    follow_links: bool = False
+    """Take what symbolic links out of PROJECT lead to into the copy; without, they are refused."""
 
     def __post_init__(self) -> None:
         given = (bool(self.scale), self.factor is not None, self.sim3 is not None, self.undo)
@@ -115,7 +117,9 @@ class Apply:
                 progress("apply", done, total)
 
             if self.undo:
-                applied = undo_project(self.project, self.out, link=self.link, progress=files)
+                applied = undo_project(
+                    self.project, self.out, link=self.link, follow_links=self.follow_links, progress=files
+                )
             else:
                 if self.sim3 is not None:
                     scales = read_similarity(self.sim3)
@@ -124,7 +128,13 @@ class Apply:
                 else:
                     scales = read_scales(self.scale, world=self.world)
                 applied = apply_to_project(
-                    self.project, self.out, scales, link=self.link, keep=self.keep, progress=files
+                    self.project,
+                    self.out,
+                    scales,
+                    link=self.link,
+                    keep=self.keep,
+                    follow_links=self.follow_links,
+                    progress=files,
                 )
         show_applied(applied)
         return 0
@@ -267,7 +277,7 @@ class View:
     port: int = 8080
     """Port to listen at; one that is taken makes way for the next free one, 0 takes any."""
     host: str = "127.0.0.1"
-    """Address to listen at: this machine alone, or 0.0.0.0 for everybody on the network."""
+    """Address to listen at: this machine alone, or 0.0.0.0 for everybody on the network who knows the address shown."""
 
     def __post_init__(self) -> None:
         if self.max_points < 1:
@@ -277,6 +287,7 @@ class View:
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
+        from colmap_inertial.cli.terminal import show_view
         from colmap_inertial.view.scene import load_scene
         from colmap_inertial.view.server import require_viser, serve
 
@@ -286,6 +297,6 @@ class View:
             scene,
             host=self.host,
             port=self.port,
-            ready=lambda url: print(f"{self.out} is shown at {url} (Ctrl-C ends this)", flush=True),
+            ready=lambda url: show_view(self.out, url, self.host),
         )
         return 0

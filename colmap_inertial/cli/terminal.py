@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from colmap_inertial.diagnose import Diagnosis
 from colmap_inertial.drivers.deblur import DeblurResult
-from colmap_inertial.drivers.result import ReconstructResult
+from colmap_inertial.drivers.result import ReconstructResult, shutter_note
 from colmap_inertial.errors import InertialError
 from colmap_inertial.model.project import Applied
 from colmap_inertial.precalibrate.plan import ImagingPlan
 from colmap_inertial.run.progress import Progress
+from colmap_inertial.run.workspace import Workspace
 from colmap_inertial.stages.frame_folder import FrameRecord
 from colmap_inertial.types import CameraImuCalibration, ScaleEstimate
 from colmap_inertial.validate import Validation, validation_table
+from colmap_inertial.view.guard import is_loopback
 
 if TYPE_CHECKING:
     from rich.text import Text
@@ -53,8 +55,7 @@ _COLOUR = {"trusted": "green", "weak": "yellow", "refused": "red"}
 def live_progress() -> Iterator[Progress]:
     """A bar for each stage on standard error; plain lines where that is no terminal."""
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
-    from rich.progress import Progress as Bars
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress as Bars, TextColumn, TimeElapsedColumn
 
     console = Console(stderr=True)
     columns = (TextColumn("{task.description:<13}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
@@ -144,7 +145,7 @@ def show_applied(applied: Applied) -> None:
 def show_calibration(calibration: CameraImuCalibration, source: Path) -> None:
     """Print what an alignment found, with standard deviations."""
     rotation = ", ".join(f"{value:+.5f}" for value in calibration.cam_from_imu_xyzw)
-    spread_deg = max(math.degrees(calibration.sigma(f"rotation_{axis}_rad")) for axis in "xyz")
+    spread_deg = math.degrees(calibration.rotation_sigma_rad)
     bias = ", ".join(f"{value:+.4f}" for value in calibration.gyro_bias_rad_s)
     bias_spread = max(calibration.sigma(f"gyro_bias_{axis}_rad_s") for axis in "xyz")
     offset, offset_ms = calibration.gyro_time_offset_s, 1e3 * calibration.sigma("gyro_time_offset_s")
@@ -186,40 +187,49 @@ def show_validation(result: Validation) -> None:
     Console().print(validation_table(result))
 
 
-def imaging_lines(frames: Sequence[FrameRecord], plan: ImagingPlan) -> list[Line]:
+def imaging_lines(frames: Sequence[FrameRecord], plan: ImagingPlan, rectified: Collection[str]) -> list[Line]:
     """What was done to the frames, as labelled lines."""
     counts = {action: sum(frame.action == action for frame in frames) for action in ("deblurred", "dropped")}
     done = ", ".join(f"{count} {action}" for action, count in counts.items() if count)
     view = plan.view
     lines: list[Line] = [
         ("Deblurring", f"{done} of {len(frames)} frames: {plan.deblur_note}" if done else plan.deblur_note),
-        ("Shutter", plan.rolling_shutter_note),
+        ("Shutter", shutter_note(plan, rectified)),
     ]
     return [*lines, *(("", note) for note in (() if view is None else view.notes))]
 
 
+def show_nothing_to_do(workspace: Workspace) -> None:
+    """Say that an earlier run's result stands."""
+    print(f"nothing to do: {workspace.root} holds the result of this capture with these options already")
+
+
 def show_deblurred(result: DeblurResult) -> None:
     """Print what became of the images."""
+    if result.unchanged:
+        show_nothing_to_do(result.workspace)
     written = [result.workspace.images, result.workspace.result]
     if result.workspace.images_rectified.is_dir():
         written.insert(1, result.workspace.images_rectified)
     if result.sheet is not None:
         written.append(result.sheet)
-    lines = imaging_lines(result.frames, result.imaging)
+    lines = imaging_lines(result.frames, result.imaging, result.rectified)
     _show("Images", [*lines, *(("Written" if i == 0 else "", str(path)) for i, path in enumerate(written))])
 
 
 def show_result(result: ReconstructResult) -> None:
     """Print the end of a reconstruction on one screen."""
+    if result.unchanged and not result.waiting:
+        show_nothing_to_do(result.workspace)
     frames = result.frames
-    used = sum(record.action != "dropped" for record in frames)
+    used = sum(record.used for record in frames)
     registered = f" of {used} registered ({len(frames)} frames)" if frames else ""
     for model in result.models:
         summary = model.summary
         lines: list[Line] = [
             ("Images", f"{summary['registered_images']}{registered}"),
             ("Points", f"{summary['points']}, mean reprojection error {summary['mean_reprojection_error_px']:.2f} px"),
-            *(imaging_lines(frames, result.imaging) if frames else []),
+            *(imaging_lines(frames, result.imaging, result.keypoints.rectified()) if frames else []),
             *scale_lines(model.scale),
         ]
         if isinstance(model.validation, Validation) and model.validation.ci95_pct is not None:
@@ -242,4 +252,21 @@ def show_result(result: ReconstructResult) -> None:
         if result.report is None:
             lines.append(("Report", f"failed, see {result.workspace.log}"))
         lines.append(("Time", ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in result.seconds.items())))
-        _show(f"Model {model.index}", lines)
+        number = "" if model.colmap_index == model.index else f" (COLMAP's {model.colmap_index})"
+        _show(f"Model {model.index}{number}", lines)
+    for fragment in result.fragments:
+        print(
+            f"COLMAP's model {fragment.colmap_index} is a fragment of {fragment.registered_images} images, left out; "
+            "--fragments makes it metric, too"
+        )
+
+
+def show_view(out: Path, url: str, host: str) -> None:
+    """Where a model is shown, and to whom."""
+    print(f"{out} is shown at {url} (Ctrl-C ends this)", flush=True)
+    if not is_loopback(host):
+        print(
+            f"listening at {host}: everybody on the network who learns this address sees the model and its images, and "
+            "nothing is encrypted; to look from elsewhere, ssh -L to this machine is safer",
+            flush=True,
+        )

@@ -19,13 +19,13 @@ import numpy as np
 from colmap_inertial.errors import FormatError, InertialError, OutputError, OutputExistsError
 from colmap_inertial.io.files import read_json, write_json
 from colmap_inertial.io.images import read_image
+from colmap_inertial.io.names import path_in
 from colmap_inertial.io.ply import read_ply_header
 from colmap_inertial.model import TRANSFORM_FILE, read_model
 from colmap_inertial.model.artefacts import check_map
 from colmap_inertial.options import DenseOptions
-from colmap_inertial.run.progress import Progress
-from colmap_inertial.run.runner import StageRunner, fingerprint, remove
-from colmap_inertial.run.workspace import Workspace
+from colmap_inertial.run.runner import fingerprint, remove
+from colmap_inertial.run.session import Session
 
 if TYPE_CHECKING:
     import pycolmap
@@ -40,7 +40,8 @@ _STEPS = 4
 #: Ends with the process that started it.
 _PATCH_MATCH = """
 import ctypes, signal, sys, zlib
-ctypes.CDLL(None).prctl(1, signal.SIGKILL)
+if sys.platform == "linux":
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)
 import pycolmap
 options = pycolmap.PatchMatchOptions()
 options.max_image_size = int(sys.argv[2])
@@ -89,16 +90,7 @@ class DenseResult:
         }
 
 
-def run_dense(
-    runner: StageRunner,
-    workspace: Workspace,
-    indices: Sequence[int],
-    images: Path,
-    options: DenseOptions,
-    *,
-    num_threads: int = -1,
-    progress: Progress,
-) -> dict[int, DenseResult]:
+def run_dense(session: Session, indices: Sequence[int], images: Path, options: DenseOptions) -> dict[int, DenseResult]:
     """Undistort, patch-match, fuse and mesh the metric models; lengths are metres because the models' are.
 
     Without CUDA there is no patch-match: depth maps that lie in the workspace already are used, otherwise the result
@@ -106,7 +98,7 @@ def run_dense(
 
     Parameters
     ----------
-    runner, workspace
+    session
         Of the run.
     indices
         Numbers of the models in ``sparse_metric/``.
@@ -114,10 +106,6 @@ def run_dense(
         The images that agree with the models: the rectified ones where the rolling shutter was undone.
     options
         See :class:`DenseOptions`.
-    num_threads
-        Of COLMAP; -1 uses all.
-    progress
-        Called with ``"dense"``.
 
     Raises
     ------
@@ -126,11 +114,11 @@ def run_dense(
     OutputExistsError
         Where depth maps lie in the workspace that were made from another model.
     """
-    steps = len(indices) * _STEPS
+    steps, progress = len(indices) * _STEPS, session.progress
     # all of them first: depth maps that come later then change nothing that others depend on
     names = {}
     for index in indices:
-        names[index] = _undistort(runner, workspace, index, images, options)
+        names[index] = _undistort(session, index, images, options)
         progress("dense", len(names), steps)
     found: dict[int, DenseResult] = {}
     for index in indices:
@@ -139,26 +127,23 @@ def run_dense(
         def step(n: int, done: int = done) -> None:
             progress("dense", done + n, steps)
 
-        folder = workspace.dense_metric / str(index)
-        found[index] = _densify(runner, index, folder, names[index], options, num_threads, step)
+        found[index] = _densify(session, index, names[index], options, step)
         step(_STEPS - 1)
     return found
 
 
 def _densify(
-    runner: StageRunner,
-    index: int,
-    folder: Path,
-    names: Sequence[str],
-    options: DenseOptions,
-    num_threads: int,
-    progress: Callable[[int], object],
+    session: Session, index: int, names: Sequence[str], options: DenseOptions, progress: Callable[[int], object]
 ) -> DenseResult:
     """Everything after undistortion."""
     import pycolmap
 
+    runner, num_threads = session.runner, session.context.num_threads
+    folder = session.workspace.dense_metric / str(index)
+    before = [f"dense_{index}_undistorted"]
+
     if pycolmap.has_cuda:
-        runner.run(f"dense_{index}_depth", {}, [], lambda _: patch_match(folder, options.max_image_size))
+        runner.run(f"dense_{index}_depth", {}, [], lambda _: patch_match(folder, options.max_image_size), after=before)
     kind, mapped = _depth_maps(folder, names)
     progress(1)
     result = DenseResult(folder=folder, images=len(names), depth_maps=len(mapped))
@@ -186,7 +171,7 @@ def _densify(
         os.replace(visible, partial[1])
 
     maps = [fingerprint(folder / "stereo" / f"{what}_maps") for what in ("depth", "normal")]
-    runner.run(f"dense_{index}_fused", {"maps": maps}, [fused, folder / "fused.ply.vis"], fuse)
+    runner.run(f"dense_{index}_fused", {"maps": maps}, [fused, folder / "fused.ply.vis"], fuse, after=before)
     progress(2)
     result = replace(result, fused=fused, points=_count(fused, "vertex"))
     if options.mesh == "none" or not result.points:
@@ -201,21 +186,21 @@ def _densify(
         if not partial[0].is_file():
             raise OutputError(f"{mesh}: COLMAP wrote no mesh; is the disk full?")
 
-    runner.run(f"dense_{index}_mesh", {"depth": poisson.depth, "trim": poisson.trim}, [mesh], surface)
+    depends = {"depth": poisson.depth, "trim": poisson.trim}
+    runner.run(f"dense_{index}_mesh", depends, [mesh], surface, after=[f"dense_{index}_fused"])
     return replace(result, mesh=mesh, faces=_count(mesh, "face"))
 
 
-def _undistort(
-    runner: StageRunner, workspace: Workspace, index: int, images: Path, options: DenseOptions
-) -> tuple[str, ...]:
+def _undistort(session: Session, index: int, images: Path, options: DenseOptions) -> tuple[str, ...]:
     """Write the dense workspace without depth maps; returns the names of its images."""
     import pycolmap
 
+    runner, workspace = session.runner, session.workspace
     model, folder = workspace.sparse_metric / str(index), workspace.dense_metric / str(index)
     folder.mkdir(parents=True, exist_ok=True)
     reconstruction = read_model(model)
     names = tuple(sorted(reconstruction.image(i).name for i in reconstruction.reg_image_ids()))
-    _check_images(images, reconstruction)
+    _check_images(images, model, reconstruction)
     # depth maps may have taken hours: they are never removed, and never used with another model
     identity = {"model": _digest(model), "max_image_size": options.max_image_size}
     record = folder / "made_from.json"
@@ -245,8 +230,8 @@ def _undistort(
         write_json(record, identity)
         remove(scratch)
 
-    depends = {**identity, "images": [fingerprint(images / name) for name in names]}
-    runner.run(f"dense_{index}_undistorted", depends, [folder / "images", folder / "sparse"], work)
+    depends = {**identity, "images": [fingerprint(path_in(images, name, model)) for name in names]}
+    runner.run(f"dense_{index}_undistorted", depends, [folder / "images", folder / "sparse"], work, after=["metric"])
     return names
 
 
@@ -259,12 +244,12 @@ def _digest(model: Path) -> str:
     return digest.hexdigest()
 
 
-def _check_images(images: Path, reconstruction: pycolmap.Reconstruction) -> None:
+def _check_images(images: Path, model: Path, reconstruction: pycolmap.Reconstruction) -> None:
     """COLMAP ends the process where an image is missing or has another size than its camera."""
     checked = set()
     for i in reconstruction.reg_image_ids():
         image = reconstruction.image(i)
-        path = images / image.name
+        path = path_in(images, image.name, model)
         if not path.is_file():
             raise FormatError(path, "no such picture, but the model has it; give the folder of its images")
         if image.camera_id not in checked:
@@ -278,7 +263,7 @@ def _check_images(images: Path, reconstruction: pycolmap.Reconstruction) -> None
 
 
 def _map_file(folder: Path, what: str, name: str, kind: str) -> Path:
-    return folder / "stereo" / f"{what}_maps" / f"{name}.{kind}.bin"
+    return path_in(folder / "stereo" / f"{what}_maps", f"{name}.{kind}.bin")
 
 
 def patch_match(folder: Path, max_image_size: int | None) -> None:

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import shutil
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from colmap_inertial.errors import FormatError, MappingError
-from colmap_inertial.model import colmap_camera, read_model
+from colmap_inertial.errors import FormatError, MappingError, OutputError
+from colmap_inertial.model import colmap_camera, find_models
+from colmap_inertial.model.binary import check_binary_model
 from colmap_inertial.options import MappingOptions
+from colmap_inertial.run.context import RunContext
 from colmap_inertial.run.progress import Progress
 from colmap_inertial.run.workspace import require_room
 from colmap_inertial.stages.protocols import KeypointStage
-from colmap_inertial.types import Array, CameraModel
+from colmap_inertial.types import Array, CameraModel, Keypoints, Treatment
 
 if TYPE_CHECKING:
     import pycolmap
@@ -29,6 +33,25 @@ _MATCHING_BATCH = 400
 #: What a feature takes in the database at most, several orientations and SQLite's log included; likewise a pair.
 _FEATURE_BYTES = 500
 _PAIR_BYTES = 100_000
+
+
+@contextlib.contextmanager
+def _writing(database: Path) -> Iterator[None]:
+    """Turn COLMAP's complaint that it cannot open a database of ours into one that says why that is.
+
+    Raises
+    ------
+    OutputError
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        if "database factory" not in str(error):
+            raise
+        raise OutputError(
+            f"{database}: COLMAP cannot write its database here: the disk is full, or a quota or a limit of file sizes "
+            "is reached; make room and start again, it continues"
+        ) from error
 
 
 def check_names(names: Sequence[str]) -> None:
@@ -57,10 +80,8 @@ def extract_features(
     options: MappingOptions,
     *,
     keypoint_stages: Sequence[KeypointStage] = (),
-    num_threads: int = -1,
-    seed: int = 0,
-    progress: Progress,
-) -> None:
+    context: RunContext,
+) -> KeypointRecords:
     """SIFT on all images, one COLMAP camera for each distinct set of intrinsics, then the keypoint stages.
 
     Parameters
@@ -71,17 +92,21 @@ def extract_features(
         Intrinsics by image name; ``None`` lets COLMAP guess them (from EXIF, else from the image size).
     database
         A path that does not exist yet.
+
+    Returns
+    -------
+    What the stages did to the keypoints of each image.
     """
     import pycolmap
 
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.use_gpu = False
-    extraction.num_threads = num_threads
+    extraction.num_threads = context.num_threads
     if options.max_image_size is not None:
         extraction.max_image_size = options.max_image_size
     extraction.sift.max_num_features = options.max_num_features
     extraction.sift.first_octave = options.first_octave
-    pycolmap.set_random_seed(seed)
+    pycolmap.set_random_seed(context.seed)
     groups: dict[CameraModel | None, list[str]] = {}
     for name, camera in cameras.items():
         groups.setdefault(_intern(camera, groups), []).append(name)
@@ -93,26 +118,26 @@ def extract_features(
             reader.camera_model = camera.model
             reader.camera_params = ",".join(repr(p) for p in camera.params)
         for batch in _batches(sorted(names), _EXTRACTION_BATCH):
-            progress("features", done, len(cameras))
+            context.progress("features", done, len(cameras))
             require_room(database.parent, len(batch) * options.max_num_features * _FEATURE_BYTES)
-            pycolmap.extract_features(
-                str(database),
-                str(images),
-                image_names=batch,
-                camera_mode=pycolmap.CameraMode.SINGLE,
-                reader_options=reader,
-                extraction_options=extraction,
-                device=pycolmap.Device.cpu,
-            )
-            with pycolmap.Database.open(str(database)) as opened:
+            with _writing(database):
+                pycolmap.extract_features(
+                    str(database),
+                    str(images),
+                    image_names=batch,
+                    camera_mode=pycolmap.CameraMode.SINGLE,
+                    reader_options=reader,
+                    extraction_options=extraction,
+                    device=pycolmap.Device.cpu,
+                )
+            with _writing(database), pycolmap.Database.open(str(database)) as opened:
                 first = opened.read_image_with_name(batch[0])
                 if first is None:
                     raise MappingError(f"COLMAP could not read {images / batch[0]}")
                 reader.existing_camera_id = first.camera_id
             done += len(batch)
-    progress("features", done, len(cameras))
-    if keypoint_stages:
-        _move_keypoints(database, keypoint_stages)
+    context.progress("features", done, len(cameras))
+    return _through_stages(database, keypoint_stages)
 
 
 def _intern(camera: CameraModel | None, known: Mapping[CameraModel | None, list[str]]) -> CameraModel | None:
@@ -124,32 +149,54 @@ def _batches(items: Sequence[str], size: int) -> list[list[str]]:
     return [list(items[i : i + size]) for i in range(0, len(items), size)]
 
 
-def _move_keypoints(database: Path, stages: Sequence[KeypointStage]) -> None:
+@dataclass(frozen=True, kw_only=True)
+class KeypointRecord:
+    """What the keypoint stages did to one image's keypoints; see :class:`~colmap_inertial.types.Keypoints`."""
+
+    name: str
+    rectified: bool = False
+    treatments: tuple[Treatment, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class KeypointRecords:
+    """The same for all images that COLMAP saw, in its order; empty where there were no stages."""
+
+    images: tuple[KeypointRecord, ...] = ()
+
+    def rectified(self) -> frozenset[str]:
+        """Names of the images whose keypoints are those of a global shutter."""
+        return frozenset(record.name for record in self.images if record.rectified)
+
+
+def _through_stages(database: Path, stages: Sequence[KeypointStage]) -> KeypointRecords:
     import pycolmap
 
-    with pycolmap.Database.open(str(database)) as opened:
+    if not stages:
+        return KeypointRecords()
+    records = []
+    with _writing(database), pycolmap.Database.open(str(database)) as opened:
         for image in opened.read_all_images():
-            keypoints = np.array(opened.read_keypoints(image.image_id))
-            xy_px = keypoints[:, :2].astype(np.float64)
+            stored = np.array(opened.read_keypoints(image.image_id))
+            keypoints = Keypoints(name=image.name, xy_px=stored[:, :2].astype(np.float64))
             for stage in stages:
-                moved = np.asarray(stage(image.name, xy_px), dtype=np.float64)
-                if moved.shape != xy_px.shape or not np.isfinite(moved).all():
-                    raise ValueError(
-                        f"keypoint stage {stage!r} must return finite (N, 2) coordinates, got {moved.shape}"
-                    )
-                xy_px = moved
-            keypoints[:, :2] = xy_px
-            opened.update_keypoints(image.image_id, keypoints)
+                moved = stage(keypoints)
+                if moved.name != keypoints.name or moved.xy_px.shape != keypoints.xy_px.shape:
+                    raise ValueError(f"keypoint stage {stage!r} must keep names, number and order of keypoints")
+                keypoints = moved
+            stored[:, :2] = keypoints.xy_px
+            opened.update_keypoints(image.image_id, stored)
+            records.append(
+                KeypointRecord(name=keypoints.name, rectified=keypoints.rectified, treatments=keypoints.treatments)
+            )
+    return KeypointRecords(images=tuple(records))
 
 
 def match_features(
     features: Path,
     database: Path,
     pairs: Sequence[tuple[str, str]],
-    *,
-    num_threads: int = -1,
-    seed: int = 0,
-    progress: Progress,
+    context: RunContext,
 ) -> None:
     """Match and verify the pairs in a copy of the features' database."""
     import pycolmap
@@ -157,25 +204,26 @@ def match_features(
     shutil.copyfile(features, database)
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False
-    matching.num_threads = num_threads
-    pycolmap.set_random_seed(seed)
+    matching.num_threads = context.num_threads
+    pycolmap.set_random_seed(context.seed)
     verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = seed
+    verification.ransac.random_seed = context.seed
     lines = [f"{a} {b}" for a, b in pairs]
     with tempfile.TemporaryDirectory() as folder:
         listed = Path(folder) / "pairs.txt"
         for i, batch in enumerate(_batches(lines, _MATCHING_BATCH)):
-            progress("matches", i * _MATCHING_BATCH, len(pairs))
+            context.progress("matches", i * _MATCHING_BATCH, len(pairs))
             require_room(database.parent, len(batch) * _PAIR_BYTES)
             listed.write_text("\n".join(batch) + "\n")
-            pycolmap.match_image_pairs(
-                str(database),
-                matching_options=matching,
-                pairing_options=pycolmap.ImportedPairingOptions(match_list_path=str(listed)),
-                verification_options=verification,
-                device=pycolmap.Device.cpu,
-            )
-    progress("matches", len(pairs), len(pairs))
+            with _writing(database):
+                pycolmap.match_image_pairs(
+                    str(database),
+                    matching_options=matching,
+                    pairing_options=pycolmap.ImportedPairingOptions(match_list_path=str(listed)),
+                    verification_options=verification,
+                    device=pycolmap.Device.cpu,
+                )
+    context.progress("matches", len(pairs), len(pairs))
 
 
 def map_images(
@@ -186,9 +234,7 @@ def map_images(
     *,
     refine_intrinsics: bool,
     num_images: int,
-    num_threads: int = -1,
-    seed: int = 0,
-    progress: Progress,
+    context: RunContext,
 ) -> None:
     """Run COLMAP's mapper; models are written to ``sparse/0``, ``sparse/1``, ...
 
@@ -199,28 +245,30 @@ def map_images(
     """
     import pycolmap
 
-    pycolmap.set_random_seed(seed)
+    pycolmap.set_random_seed(context.seed)
     sparse.mkdir(parents=True)
     require_room(sparse, database.stat().st_size)
-    progress("mapping", 0, num_images)
+    context.progress("mapping", 0, num_images)
     if options.mapper == "incremental":
         models = pycolmap.incremental_mapping(
             str(database),
             str(images),
             str(sparse),
-            options=_incremental_options(refine_intrinsics, num_threads, seed),
-            next_image_callback=_counter(progress, num_images),
+            options=_incremental_options(refine_intrinsics, context.num_threads, context.seed),
+            next_image_callback=_counter(context.progress, num_images),
         )
     else:
         models = pycolmap.global_mapping(
             str(database),
             str(images),
             str(sparse),
-            options=_global_options(options, refine_intrinsics, num_threads, seed),
+            options=_global_options(options, refine_intrinsics, context.num_threads, context.seed),
         )
-    progress("mapping", num_images, num_images)
+    context.progress("mapping", num_images, num_images)
     for folder in sparse.iterdir():
-        read_model(folder)  # COLMAP does not say when it could not write one whole
+        # COLMAP does not say when it could not write one whole
+        find_models(folder)
+        check_binary_model(folder)
     if not models:
         raise MappingError(
             "COLMAP found no model: too few matches between the frames. Film with more overlap, more texture or less "
@@ -270,7 +318,7 @@ def write_gravity_priors(database: Path, gravity_in_cam: Mapping[str, Array]) ->
 
     if not gravity_in_cam:
         return
-    with pycolmap.Database.open(str(database)) as opened:
+    with _writing(database), pycolmap.Database.open(str(database)) as opened:
         for image in opened.read_all_images():
             direction = gravity_in_cam.get(image.name)
             if direction is not None:

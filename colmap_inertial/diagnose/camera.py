@@ -11,9 +11,10 @@ from colmap_inertial.align import Alignment
 from colmap_inertial.diagnose.findings import Finding, Recorded, Severity
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.flow import find_stabilisation
-from colmap_inertial.geometry import quat_conjugate, quat_log, quat_multiply, quat_rotate, so3_log
+from colmap_inertial.geometry import quat_conjugate, quat_log, quat_multiply, quat_rotate
 from colmap_inertial.imaging.gyro_camera import GyroCamera
-from colmap_inertial.types import Array, CameraTrajectory, ImuRecording
+from colmap_inertial.sampling import without_running_mean
+from colmap_inertial.types import CameraTrajectory, ImuRecording
 
 #: Clock rates: phones keep within 1e-4, action cameras within 1 %; the scale is corrected for what is found.
 _RATE, _WRONG_RATE = 0.003, 0.012
@@ -29,7 +30,7 @@ _SLACK_FRAMES, _SLACK_SHARE, _LEAST_COVERED = 2.0, 0.03, 0.25
 _KNOWN_ROTATION_RAD, _OTHER_ROTATION_RAD = 0.2, 0.35
 #: Parts whose offsets are compared, how far they may be off, and how sharp a part's best offset must be.
 _PART_S, _PART_REACH_S, _PART_STEP_S, _UNEVEN_S, _PART_EXPLAINED = 3.0, 0.4, 0.01, 0.05, 0.6
-#: Quick rotation in the picture per rotation felt; translation is slow against it, and makes it a little less (0.92
+#: Quick rotation in the picture per rotation measured; translation is slow against it, and makes it a little less (0.92
 #: to 0.95 in rendered orbits about a desk, 1.00 before a far wall). A standard deviation above the third tells nothing.
 _QUICK_S, _USUAL_GAIN, _GAIN_SIGMA, _LEAST_QUICK_RAD_S = 0.35, (0.88, 1.08), 0.05, 0.03
 #: Visual acceleration: window of the quadratics, and the correlation that tells its sign.
@@ -72,7 +73,7 @@ def check_belonging(recorded: Recorded) -> Iterator[Finding]:
         stretched = replace(imu, gyro_t_s=begin_s + (imu.gyro_t_s - begin_s) * (1 + rate))
         found = recorded.align(stretched)
         if isinstance(found, Alignment):
-            yield _rate_finding((1 + rate) * (1 + found.clock_rate) - 1)
+            yield _rate_finding((1 + rate) * (1 + found.calibration.clock_rate) - 1)
             return
     span_s = float(np.ptp(turning.t_s))
     if span_s < _ENOUGH_S:
@@ -98,15 +99,12 @@ def _is_mirrored(turning: CameraTrajectory, imu: ImuRecording, aligned: Alignmen
     motion = GyroCamera.of(imu, aligned.calibration, camera_epoch_ns=turning.epoch_ns)
     step = max(1, round(_INTERVAL_S / float(np.median(np.diff(turning.t_s)))))
     poses = turning.select(slice(None, None, step))
-    t_s = poses.t_s - aligned.clock_rate * (poses.t_s - aligned.middle_s)
-    pose = poses.cam_from_world_xyzw
-    seen = quat_log(quat_multiply(pose[:-1], quat_conjugate(pose[1:])))
-    looking = motion.start_from_cam(t_s)
-    felt = so3_log(np.swapaxes(looking[:-1], 1, 2) @ looking[1:])
+    t_s = poses.t_s - aligned.calibration.drift_s(poses.t_s)
+    visual, inertial = poses.turn_rad(), motion.turn_rad(t_s)
     usable = motion.covers(t_s[:-1], t_s[1:]) & (np.diff(t_s) < 5 * _INTERVAL_S)
     if usable.sum() < 20:
         return False
-    cross = seen[usable].T @ felt[usable]
+    cross = visual[usable].T @ inertial[usable]
     singular = np.linalg.svd(cross, compute_uv=False)
     return bool(np.linalg.det(cross) < 0 and singular[2] > _MIRROR_SHARE * singular[0])
 
@@ -114,8 +112,8 @@ def _is_mirrored(turning: CameraTrajectory, imu: ImuRecording, aligned: Alignmen
 def check_clock_rate(recorded: Recorded) -> Iterator[Finding]:
     """A camera's clock that runs faster or slower than the IMU's."""
     aligned = recorded.aligned
-    if isinstance(aligned, Alignment) and abs(aligned.clock_rate) > max(_RATE, 5 * aligned.clock_rate_sigma):
-        yield _rate_finding(aligned.clock_rate)
+    if isinstance(aligned, Alignment) and aligned.drifts(faster_than=_RATE):
+        yield _rate_finding(aligned.calibration.clock_rate)
 
 
 def _rate_finding(rate: float) -> Finding:
@@ -140,9 +138,8 @@ def check_coverage(recorded: Recorded) -> Iterator[Finding]:
     begin_s, end_s = max(t_s[0] for t_s in sensors), min(t_s[-1] for t_s in sensors)
     span_s = float(frames.t_s[-1] - frames.t_s[0])
     slack_s = max(_SLACK_FRAMES * float(np.median(np.diff(frames.t_s))), _SLACK_SHARE * span_s)
-    aligned = recorded.aligned
-    if isinstance(aligned, Alignment):
-        shift_s = aligned.calibration.gyro_time_offset_s + (imu.epoch_ns - frames.epoch_ns) * 1e-9
+    shift_s = recorded.offset_s(frames.epoch_ns)
+    if shift_s is not None:
         missed_s = max(begin_s + shift_s - frames.t_s[0], 0) + max(frames.t_s[-1] - end_s - shift_s, 0)
     else:
         missed_s = span_s - (end_s - begin_s)
@@ -172,18 +169,14 @@ def check_stabilisation(recorded: Recorded) -> Iterator[Finding]:
         return
     if recorded.rotation is None or recorded.imu is None:
         return
-    aligned = recorded.aligned
-    offset_s = None
-    if isinstance(aligned, Alignment):
-        epochs_s = (recorded.imu.epoch_ns - recorded.rotation.epoch_ns) * 1e-9
-        offset_s = aligned.calibration.gyro_time_offset_s + epochs_s
+    offset_s = recorded.offset_s(recorded.rotation.epoch_ns)
     told = find_stabilisation(recorded.rotation, recorded.imu, offset_s=offset_s)
     if told.stabilised and told.share is not None:
         yield Finding(
             code="stabilised",
             severity="error",
-            evidence=f"the pictures hold {100 * told.share:.0f} % of the quick rotation that the gyroscope felt: the "
-            "video was stabilised in the camera",
+            evidence=f"the pictures hold {100 * told.share:.0f} % of the quick rotation that the gyroscope measured: "
+            "the video was stabilised in the camera",
             advice=advice,
             numbers={"share": told.share},
         )
@@ -194,7 +187,7 @@ def check_declared_rotation(recorded: Recorded) -> Iterator[Finding]:
     aligned, prior = recorded.aligned, recorded.calibration
     if not isinstance(aligned, Alignment) or prior is None:
         return
-    sigmas = [max(c.sigma(f"rotation_{axis}_rad") for axis in "xyz") for c in (prior, aligned.calibration)]
+    sigmas = [c.rotation_sigma_rad for c in (prior, aligned.calibration)]
     if max(sigmas) > _KNOWN_ROTATION_RAD:
         return
     turn = quat_multiply(aligned.calibration.cam_from_imu_xyzw, quat_conjugate(prior.cam_from_imu_xyzw))
@@ -223,7 +216,7 @@ def check_even_times(recorded: Recorded) -> Iterator[Finding]:
     for begin_s in turning.t_s[0] + _PART_S * np.arange(count):
         inside = np.flatnonzero((turning.t_s >= begin_s) & (turning.t_s < begin_s + _PART_S))
         middle_s = begin_s + 0.5 * _PART_S
-        drift_s = aligned.clock_rate * (middle_s - aligned.middle_s)
+        drift_s = float(aligned.calibration.drift_s(middle_s))
         found = _part_offset_s(turning.select(inside), motion, drift_s)
         if found is not None:
             middles.append(middle_s)
@@ -249,19 +242,17 @@ def _part_offset_s(part: CameraTrajectory, motion: GyroCamera, drift_s: float) -
     """What must be added to a part's offset so that the gyroscope explains it best."""
     if len(part) < 8:
         return None
-    pose = part.cam_from_world_xyzw
-    seen = quat_log(quat_multiply(pose[:-1], quat_conjugate(pose[1:])))
+    visual = part.turn_rad()
     shifts = np.arange(-_PART_REACH_S, _PART_REACH_S + 1e-9, _PART_STEP_S)
     left = np.full(len(shifts), np.inf)
     for i, shift_s in enumerate(shifts):
         t_s = part.t_s - drift_s - shift_s
         if not motion.covers(t_s[:1], t_s[-1:])[0]:
             continue
-        looking = motion.start_from_cam(t_s)
-        difference = seen - so3_log(np.swapaxes(looking[:-1], 1, 2) @ looking[1:])
+        difference = visual - motion.turn_rad(t_s)
         left[i] = np.median(np.sum((difference - difference.mean(axis=0)) ** 2, axis=1))
     best = int(np.argmin(left))
-    energy = float(np.median(np.sum((seen - seen.mean(axis=0)) ** 2, axis=1)))
+    energy = float(np.median(np.sum((visual - visual.mean(axis=0)) ** 2, axis=1)))
     if best in (0, len(left) - 1) or not np.isfinite(left[best - 1 : best + 2]).all():
         return None
     if left[best] > (1 - _PART_EXPLAINED) * energy:
@@ -280,37 +271,28 @@ def check_focal_length(recorded: Recorded) -> Iterator[Finding]:
     width = max(3, round(_QUICK_S / float(np.median(dt_s))))
     if known.sum() < 10 * width:
         return
-    looking = motion.start_from_cam(rotation.t_s)
-    felt = (so3_log(np.swapaxes(looking[:-1], 1, 2) @ looking[1:]) / dt_s[:, None])[known]
-    seen = (rotation.turn_rad / dt_s[:, None])[known]
-    quick_felt, quick_seen = _quick(felt, width)[:, :2], _quick(seen, width)[:, :2]
-    energy = float(np.sum(quick_felt**2))
-    if np.sqrt(energy / len(quick_felt)) < _LEAST_QUICK_RAD_S:
+    inertial = (motion.turn_rad(rotation.t_s) / dt_s[:, None])[known]
+    visual = (rotation.turn_rad / dt_s[:, None])[known]
+    quick_inertial, quick_visual = (without_running_mean(turn, width)[:, :2] for turn in (inertial, visual))
+    energy = float(np.sum(quick_inertial**2))
+    if np.sqrt(energy / len(quick_inertial)) < _LEAST_QUICK_RAD_S:
         return
-    gain = float(np.sum(quick_seen * quick_felt)) / energy
-    rest = quick_seen - gain * quick_felt
+    gain = float(np.sum(quick_visual * quick_inertial)) / energy
+    rest = quick_visual - gain * quick_inertial
     sigma = float(np.sqrt(np.mean(rest**2) * width / energy))
     if sigma < _GAIN_SIGMA and not _USUAL_GAIN[0] - sigma < gain < _USUAL_GAIN[1] + sigma:
         yield Finding(
             code="focal-length",
             severity="error",
-            evidence=f"the pictures turn {gain:.2f} times as far as the gyroscope felt: with the declared focal length "
-            f"of {camera.params[0]:.0f} px, about {camera.params[0] * gain:.0f} px would fit",
+            evidence=f"the pictures turn {gain:.2f} times as far as the gyroscope measured: with the declared focal "
+            f"length of {camera.params[0]:.0f} px, about {camera.params[0] * gain:.0f} px would fit",
             advice="leave out [camera] to let COLMAP calibrate, or give the intrinsics of this very video mode",
             numbers={"gain": gain, "gain_sigma": sigma},
         )
 
 
-def _quick(rate: Array, width: int) -> Array:
-    """What changes faster than the running mean over ``width`` samples."""
-    kernel = np.ones(width) / width
-    slow = np.stack([np.convolve(column, kernel, mode="valid") for column in rate.T], axis=1)
-    start = (width - 1) // 2
-    return np.asarray(rate[start : start + len(slow)] - slow)
-
-
 def check_accelerometer_sign(recorded: Recorded) -> Iterator[Finding]:
-    """Where a reconstruction shows how the camera sped up, the accelerometer must have felt that, not its opposite."""
+    """Where a reconstruction shows how the camera sped up, the accelerometer must show that, not its opposite."""
     aligned, imu, poses = recorded.aligned, recorded.imu, recorded.trajectory
     if not isinstance(aligned, Alignment) or imu is None or not imu.has_accel or poses is None:
         return
@@ -319,7 +301,7 @@ def check_accelerometer_sign(recorded: Recorded) -> Iterator[Finding]:
         yield Finding(
             code="accel-flipped",
             severity="error",
-            evidence="the accelerometer feels the opposite of the camera's acceleration (correlation "
+            evidence="the accelerometer measures the opposite of the camera's acceleration (correlation "
             f"{correlation:.2f}): its sign is flipped",
             advice='set axes = "-x,-y,-z" and mirrored = true under [imu.accel] in capture.toml',
             numbers={"correlation": correlation},
@@ -333,19 +315,19 @@ def acceleration_correlation(poses: CameraTrajectory, imu: ImuRecording, aligned
     if half < 3 or len(poses) < 40 * half:
         return None
     shift_s = aligned.calibration.accel_time_offset_s + (imu.epoch_ns - poses.epoch_ns) * 1e-9
-    t_s = poses.t_s - aligned.clock_rate * (poses.t_s - aligned.middle_s) - shift_s
+    t_s = poses.t_s - aligned.calibration.drift_s(poses.t_s) - shift_s
     time = step_s * np.arange(-half, half + 1)
     basis = np.stack([np.ones(len(time)), time, time**2], axis=1)
     second = 2 * np.linalg.pinv(basis)[2][::-1]
     mean = np.ones(len(time)) / len(time)
     force = np.stack([np.interp(t_s, imu.accel_t_s, column) for column in imu.accel_m_s2.T], axis=1)
     world_from_imu = quat_multiply(quat_conjugate(poses.cam_from_world_xyzw), aligned.calibration.cam_from_imu_xyzw)
-    felt = np.stack([np.convolve(c, mean, "valid") for c in quat_rotate(world_from_imu, force).T], axis=1)
-    seen = np.stack([np.convolve(c, second, "valid") for c in poses.cam_in_world.T], axis=1)
+    inertial = np.stack([np.convolve(c, mean, "valid") for c in quat_rotate(world_from_imu, force).T], axis=1)
+    visual = np.stack([np.convolve(c, second, "valid") for c in poses.cam_in_world.T], axis=1)
     even = np.abs(poses.t_s[2 * half :] - poses.t_s[: -2 * half] - 2 * half * step_s) < 0.1 * step_s
     even &= (t_s[half:-half] > imu.accel_t_s[0]) & (t_s[half:-half] < imu.accel_t_s[-1])
     width = 4 * half
-    felt, seen = _quick(felt[even], width), _quick(seen[even], width)
-    if len(felt) < width:
+    inertial, visual = without_running_mean(inertial[even], width), without_running_mean(visual[even], width)
+    if len(inertial) < width:
         return None
-    return float(np.sum(felt * seen) / max(np.sqrt(np.sum(felt**2) * np.sum(seen**2)), 1e-12))
+    return float(np.sum(inertial * visual) / max(np.sqrt(np.sum(inertial**2) * np.sum(visual**2)), 1e-12))

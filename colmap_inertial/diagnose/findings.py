@@ -142,8 +142,8 @@ class Recorded:
         Poses of a reconstruction.
     camera
         Intrinsics, as declared.
-    calibration, shared_clock
-        What is known of camera and IMU.
+    calibration, max_offset_s
+        What is known of camera and IMU, and the largest offset between their clocks.
     in_video
         Where pictures were found in the video they were taken from.
     """
@@ -176,6 +176,12 @@ class Recorded:
     def aligned(self) -> Alignment | NotObservableError | None:
         """Camera and IMU brought together; ``None`` where one of them is missing."""
         return None if self.imu is None else self.align(self.imu)
+
+    def offset_s(self, camera_epoch_ns: int) -> float | None:
+        """Camera time since that epoch = gyroscope time since its own + this; ``None`` where it was not found."""
+        if self.imu is None or not isinstance(self.aligned, Alignment):
+            return None
+        return self.aligned.calibration.gyro_time_offset_s + (self.imu.epoch_ns - camera_epoch_ns) * 1e-9
 
     def align(self, imu: ImuRecording) -> Alignment | NotObservableError | None:
         """The same with another reading of the gyroscope."""

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from colmap_inertial.align import Alignment
 from colmap_inertial.diagnose.findings import Finding, Recorded, Severity
 
 #: Frames come evenly where this share of their intervals is the usual one to within this; keyframes do not.
@@ -73,9 +72,8 @@ def check_exposure(recorded: Recorded) -> Iterator[Finding]:
     if timing is None or timing.exposure_s is None or imu is None:
         return
     rate = np.linalg.norm(imu.gyro_rad_s - np.median(imu.gyro_rad_s, axis=0), axis=1)
-    aligned = recorded.aligned
-    if isinstance(aligned, Alignment):
-        shift_s = aligned.calibration.gyro_time_offset_s + (imu.epoch_ns - timing.epoch_ns) * 1e-9
+    shift_s = recorded.offset_s(timing.epoch_ns)
+    if shift_s is not None:
         turning = np.interp(timing.t_s, imu.gyro_t_s + shift_s, rate)
     else:
         turning = np.full(len(timing.t_s), np.median(rate))
@@ -169,5 +167,5 @@ def _refers_to_rows(recorded: Recorded) -> bool:
     """Whether anything is declared that pictures in another orientation would belie."""
     readout_s = None if recorded.timing is None else recorded.timing.readout_s
     prior = recorded.calibration
-    calibrated = prior is not None and max(prior.sigma(f"rotation_{axis}_rad") for axis in "xyz") < 1
+    calibrated = prior is not None and prior.rotation_sigma_rad < 1
     return bool(readout_s) or calibrated or recorded.camera is not None

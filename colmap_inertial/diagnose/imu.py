@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from colmap_inertial.diagnose._sampling import integral_at
 from colmap_inertial.diagnose.findings import Finding, Recorded, Severity
 from colmap_inertial.errors import FormatError
 from colmap_inertial.io.plausible import find_implausible
+from colmap_inertial.sampling import PAUSE_STEPS, integral_at, is_gap
 from colmap_inertial.types import Array, ImuRecording
 
-#: A pause is longer than this many sampling intervals, and than this; over the second, much can happen in it.
-_PAUSE_INTERVALS, _PAUSE_S, _LONG_PAUSE_S = 3.5, 0.03, 0.5
+#: Pauses longer than this are findings (shorter ones cost nothing); over the second, much can happen in them.
+_PAUSE_S, _LONG_PAUSE_S = 0.03, 0.5
 #: Pauses that take up more than this share of a recording leave too little.
 _MOST_PAUSED = 0.2
 #: A reading is cut off where its very largest value comes so often, and so many times as often as any value near it
@@ -89,7 +89,7 @@ def check_pauses(recorded: Recorded) -> Iterator[Finding]:
     for sensor, t_s, _ in _sensors(recorded.imu):
         step_s = np.diff(t_s)
         usual_s = float(np.median(step_s))
-        pauses = step_s[step_s > max(_PAUSE_INTERVALS * usual_s, _PAUSE_S)]
+        pauses = step_s[is_gap(t_s, _PAUSE_S, steps=PAUSE_STEPS)]
         share = float(pauses.sum() / (t_s[-1] - t_s[0]))
         for code, some in (
             ("short-gap", pauses[pauses < _LONG_PAUSE_S]),

@@ -6,10 +6,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from colmap_inertial.diagnose._sampling import integral_at
 from colmap_inertial.diagnose.findings import Finding, Recorded
 from colmap_inertial.geometry import matrix_from_quat, skew
 from colmap_inertial.gyro import GyroPath
+from colmap_inertial.sampling import integral_at
 from colmap_inertial.types import CameraTrajectory, ImuRecording
 
 #: Specific force is compared with itself over windows this long, in means over steps this long.
@@ -17,9 +17,9 @@ _WINDOW_S, _STEP_S = 2.0, 0.05
 #: Below this (rms), nothing but sensor errors and the hand's tremor is left of the acceleration; errors of the axes
 #: leave some of gravity in it where the camera turns, in m/s2 per rad/s. Measured: 0.22 and more in clean recordings
 #: that turn by 0.3 rad/s, 0.11 and less in simulated ones on the spot that turn by 1.5.
-_FELT_M_S2, _FELT_PER_TURN_M_S = 0.08, 0.05
+_LEAST_ACCEL_M_S2, _ACCEL_PER_TURN_M_S = 0.08, 0.05
 #: A camera that turns slower than this (rms) stands on something.
-_TURNED_RAD_S = 0.02
+_ROTATED_RAD_S = 0.02
 #: A path is straight where it is this many times longer than its points lie off a steady glide.
 _STRAIGHT = 20.0
 _ADVICE = (
@@ -33,25 +33,25 @@ def check_motion_content(recorded: Recorded) -> Iterator[Finding]:
     imu = recorded.imu
     if imu is None or not imu.has_accel:
         return
-    felt = felt_acceleration_m_s2(imu)
+    accel = acceleration_rms_m_s2(imu)
     rate = imu.gyro_rad_s - np.median(imu.gyro_rad_s, axis=0)
-    turned = float(np.sqrt(np.mean(np.sum(rate**2, axis=1))))
-    if felt is None or felt > _FELT_M_S2 + _FELT_PER_TURN_M_S * turned:
+    rotated = float(np.sqrt(np.mean(np.sum(rate**2, axis=1))))
+    if accel is None or accel > _LEAST_ACCEL_M_S2 + _ACCEL_PER_TURN_M_S * rotated:
         return
-    numbers = {"acceleration_rms_m_s2": felt, "turning_rms_rad_s": turned}
-    found = f"the camera's acceleration is {felt:.3f} m/s2 (rms) once gravity is out"
+    numbers = {"acceleration_rms_m_s2": accel, "turning_rms_rad_s": rotated}
+    found = f"the camera's acceleration is {accel:.3f} m/s2 (rms) once gravity is out"
     if recorded.trajectory is not None and _glides(recorded.trajectory):
         code, what = "constant-velocity", "it glides at constant speed"
-    elif turned < _TURNED_RAD_S:
-        code, what = "no-motion", f"it turns by {turned:.3f} rad/s: it stood on a tripod or table"
+    elif rotated < _ROTATED_RAD_S:
+        code, what = "no-motion", f"it turns by {rotated:.3f} rad/s: it stood on a tripod or table"
     elif recorded.trajectory is not None:
-        code, what = "pure-rotation", f"it only turns, by {turned:.2f} rad/s"
+        code, what = "pure-rotation", f"it only turns, by {rotated:.2f} rad/s"
     else:
-        code, what = "no-acceleration", f"it turns by {turned:.2f} rad/s, but stays in place or glides"
+        code, what = "no-acceleration", f"it turns by {rotated:.2f} rad/s, but stays in place or glides"
     yield Finding(code=code, severity="error", evidence=f"{found}; {what}", advice=_ADVICE, numbers=numbers)
 
 
-def felt_acceleration_m_s2(imu: ImuRecording) -> float | None:
+def acceleration_rms_m_s2(imu: ImuRecording) -> float | None:
     """Rms of the acceleration that is left once gravity, drift, bias and a lever arm are out; ``None`` where short.
 
     The specific force, turned by the integrated gyroscope, is gravity plus acceleration. In each window what is

@@ -16,6 +16,7 @@ from colmap_inertial.imaging.psf import blur_field
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import write_json
 from colmap_inertial.io.images import read_image
+from colmap_inertial.io.names import path_in
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.precalibrate.calibrate import some_frames
 from colmap_inertial.precalibrate.plan import ImagingPlan
@@ -59,7 +60,7 @@ def write_contact_sheet(path: Path, capture: Capture, plan: ImagingPlan, images:
     for frame in some_frames(capture, view.timing, [index[name] for name in names[:_FRAMES]]):
         parallax = plan.parallaxes.get(frame.name)
         field = blur_field(motion, camera, view.shutter(index[frame.name]), parallax=parallax)
-        before, after = _eight_bit(frame.image), _eight_bit(read_image(images / frame.name))
+        before, after = _eight_bit(frame.image), _eight_bit(read_image(path_in(images, frame.name)))
         top, left, height, width = _busiest(before)
         cut = [picture[top : top + height, left : left + width].copy() for picture in (before, after)]
         _draw(cut[0], field, top, left)

@@ -8,23 +8,25 @@ from pathlib import Path
 
 from colmap_inertial import __version__
 from colmap_inertial.colmap.sparse import check_names
-from colmap_inertial.drivers.capture import fusing, run_frames, run_plan, run_rectified
 from colmap_inertial.drivers.contact_sheet import write_contact_sheet
+from colmap_inertial.drivers.frames import fusing, run_frames, run_plan, run_rectified
 from colmap_inertial.drivers.result import frame_as_json, imaging_as_json
 from colmap_inertial.errors import FormatError, InertialError, OutputError, OutputExistsError
 from colmap_inertial.io.capture import load_capture
-from colmap_inertial.io.files import write_json
+from colmap_inertial.io.files import StrPath, read_json, write_json
 from colmap_inertial.io.frames import frame_source, read_frames
 from colmap_inertial.io.imu import read_capture_imu
 from colmap_inertial.options import BlurRemover, ReconstructOptions
-from colmap_inertial.precalibrate.plan import ImagingPlan, with_stated_exposures
-from colmap_inertial.run.progress import Progress
-from colmap_inertial.run.runner import StageRunner
-from colmap_inertial.run.session import logging_to
+from colmap_inertial.precalibrate.plan import ImagingPlan, Treatments, with_stated_exposures
+from colmap_inertial.run.context import Recording, prior_calibration
+from colmap_inertial.run.progress import Progress, silent
+from colmap_inertial.run.session import open_session
 from colmap_inertial.run.workspace import Workspace
 from colmap_inertial.stages.deblur import require_method
-from colmap_inertial.stages.frame_folder import FrameRecord, read_frame_records
+from colmap_inertial.stages.frame_folder import FrameRecord
 from colmap_inertial.stages.protocols import FrameStage
+
+_SHEET = "sheet.json"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -41,23 +43,29 @@ class DeblurResult:
         What was decided beforehand, and why.
     sheet
         The contact sheet; ``None`` where none was asked for or no frame was deblurred.
+    unchanged
+        Whether there was nothing to do: the folder held this result already.
+    rectified
+        Names of the images that were rectified, too.
     """
 
     workspace: Workspace
     frames: tuple[FrameRecord, ...]
     imaging: ImagingPlan
     sheet: Path | None = None
+    unchanged: bool = False
+    rectified: frozenset[str] = frozenset()
 
 
 def deblur_capture(
-    capture: Path,
-    out: Path,
+    capture: StrPath,
+    out: StrPath,
     *,
     method: BlurRemover = "wiener",
     calibration: Path | None = None,
     rectify: bool = False,
     sheet: Path | None = None,
-    progress: Progress,
+    progress: Progress = silent,
 ) -> DeblurResult:
     """Write the frames of a capture deblurred, with their names, sizes, formats and metadata.
 
@@ -66,8 +74,8 @@ def deblur_capture(
     capture
         As for ``reconstruct``.
     out
-        A folder that does not exist, or holds an unfinished run of the same capture. No frame is left out: those that
-        cannot be deblurred are copied.
+        A folder that does not exist, or holds a run of the same capture, which is then gone on with. No frame is left
+        out: those that cannot be deblurred are copied.
     method
         How blur is undone.
     calibration
@@ -90,10 +98,10 @@ def deblur_capture(
     """
     require_method(method)
     # of short and long exposures, the short ones alone
-    loaded = replace(load_capture(capture), exposures=None)
+    loaded = replace(load_capture(Path(capture)), exposures=None)
     if loaded.frames is None:
         raise FormatError(loaded.path, "has no frames: add [images] or [video]")
-    if sheet is not None and sheet.exists():
+    if sheet is not None and sheet.exists() and not _is_ours(sheet, Path(out)):
         raise OutputExistsError(f"{sheet} exists; choose another name for the contact sheet")
     if sheet is not None and not sheet.parent.is_dir():
         raise OutputError(f"{sheet.parent} is no folder; create it first")
@@ -106,37 +114,49 @@ def deblur_capture(
     options = ReconstructOptions(
         deblur=method, rolling_shutter="rectify" if rectify else "off", calibration=calibration
     )
-    workspace = Workspace(out)
-    workspace.open(loaded.path)
-    with workspace.locked(), logging_to(workspace.log):
-        runner = StageRunner(workspace)
-        plan = run_plan(runner, workspace, loaded, imu, timing, options, progress)
+    recording = Recording.of(loaded, imu, timing, prior_calibration(loaded, calibration))
+    with open_session(Path(out), loaded.path, options, command="deblur", progress=progress) as session:
+        workspace = session.workspace
+        plan = run_plan(session, recording, Treatments(deblur=method, rolling_shutter=options.rolling_shutter))
         stages: list[FrameStage] = [
             *fusing(loaded, workspace, options.apertures),
             *plan.frame_stages(drop=False),
         ]
-        run_frames(runner, workspace, loaded, timing, frames, stages, progress)
-        records = read_frame_records(workspace.frames)
-        run_rectified(runner, workspace, records, plan.keypoint_stages(), progress)
+        records = run_frames(session, recording, frames, stages)
+        movers = plan.keypoint_stages()
+        rectified = frozenset(name for name in timing.names if any(mover.covers(name) for mover in movers))
+        run_rectified(session, records, rectified, movers)
         shown = _shown(records)
         if sheet is not None and shown and plan.view is not None:
+            write_json(workspace.stamps / _SHEET, {"sheet": str(sheet.resolve())})
             write_contact_sheet(sheet, loaded, plan, workspace.images, shown)
-        written = sheet if sheet is not None and shown else None
-        write_json(
-            workspace.result,
+        unchanged = session.finish(
             {
                 "versions": {"colmap_inertial": __version__},
                 "capture": str(loaded.path),
                 "source": None if (source := frame_source(loaded)) is None else str(source),
-                "imaging": imaging_as_json(plan),
-                "frames": [frame_as_json(record, plan) for record in records],
-                "seconds": runner.seconds,
-            },
+                "imaging": imaging_as_json(plan, rectified),
+                "frames": [frame_as_json(record, plan, rectified) for record in records],
+                "seconds": session.runner.seconds,
+            }
         )
-    return DeblurResult(workspace=workspace, frames=records, imaging=plan, sheet=written)
+        return DeblurResult(
+            workspace=workspace,
+            frames=records,
+            imaging=plan,
+            sheet=sheet if sheet is not None and shown else None,
+            unchanged=unchanged,
+            rectified=rectified,
+        )
+
+
+def _is_ours(sheet: Path, out: Path) -> bool:
+    """Whether an earlier run in the same folder wrote a contact sheet."""
+    record = Workspace(out).stamps / _SHEET
+    return record.is_file() and read_json(record).get("sheet") == str(sheet.resolve())
 
 
 def _shown(records: Sequence[FrameRecord]) -> list[str]:
     """Names of the deblurred frames, the most blurred first."""
-    deblurred = [r for r in records if r.action == "deblurred" and r.treatment is not None]
-    return [r.name for r in sorted(deblurred, key=lambda r: -((r.treatment and r.treatment.blur_px) or 0.0))]
+    deblurred = [record for record in records if record.action == "deblurred"]
+    return [record.name for record in sorted(deblurred, key=lambda record: -(record.value("blur_px") or 0.0))]

@@ -11,7 +11,7 @@ import numpy as np
 from colmap_inertial.diagnose import Diagnosis, FramesInVideo, Recorded, diagnose, unreadable
 from colmap_inertial.drivers.sources import ScaleSource, check_output, only_model
 from colmap_inertial.errors import FormatError, InertialError, TimingError
-from colmap_inertial.io.calibration import SHARED_CLOCK_OFFSET_S, for_another_recording, read_calibration
+from colmap_inertial.io.calibration import for_another_recording, largest_offset_s, read_calibration
 from colmap_inertial.io.capture import Capture, ImageFolder, load_capture
 from colmap_inertial.io.files import write_json
 from colmap_inertial.io.frames import read_frame_times, read_frame_timing
@@ -108,7 +108,7 @@ def collect(source: ScaleSource, progress: Progress) -> Recorded:
         timing=timing,
         trajectory=trajectory,
         calibration=calibration,
-        max_offset_s=SHARED_CLOCK_OFFSET_S if shared else None,
+        max_offset_s=largest_offset_s(shared),
     )
 
 
@@ -170,7 +170,7 @@ def _of_capture(capture: Capture, calibration: Path | None, progress: Progress) 
         rotation=rotation,
         camera=capture.camera,
         calibration=prior,
-        max_offset_s=SHARED_CLOCK_OFFSET_S if capture.shared_clock else None,
+        max_offset_s=largest_offset_s(capture.shared_clock),
         in_video=in_video,
     )
 

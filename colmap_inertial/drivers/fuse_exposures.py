@@ -1,39 +1,41 @@
-"""Captures of short and long exposures: what is decided before they are fused, and the pictures alone."""
+"""``fuse-exposures``: the pictures of pairs of a short and a long exposure alone."""
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
 from colmap_inertial import __version__
-from colmap_inertial.errors import FormatError, OutputExistsError
-from colmap_inertial.io.calibration import for_another_recording, read_calibration
+from colmap_inertial.drivers.frames import run_plan
+from colmap_inertial.errors import FormatError
 from colmap_inertial.io.capture import Capture, ImageFolder, load_capture
-from colmap_inertial.io.files import write_json
+from colmap_inertial.io.files import StrPath
 from colmap_inertial.io.frames import image_names, read_frame_timing
 from colmap_inertial.io.images import read_image
 from colmap_inertial.io.imu import read_capture_imu
+from colmap_inertial.io.names import path_in
+from colmap_inertial.io.records import structured
 from colmap_inertial.options import ExposureOptions
-from colmap_inertial.precalibrate.pairs import exposure_stage, for_pairs
-from colmap_inertial.precalibrate.plan import ImagingPlan, with_stated_exposures
-from colmap_inertial.run.progress import Progress
-from colmap_inertial.run.session import keep_colmap_quiet
-from colmap_inertial.run.workspace import full_disk_is_an_error
+from colmap_inertial.precalibrate.pairs import pair_stage
+from colmap_inertial.precalibrate.plan import ImagingPlan, Treatments, with_stated_exposures
+from colmap_inertial.run.context import Recording, prior_calibration
+from colmap_inertial.run.progress import Progress, silent
+from colmap_inertial.run.runner import fingerprint
+from colmap_inertial.run.session import open_session
 from colmap_inertial.stages.exposures import FusedPair, Fuser, lsd2_fuser
-from colmap_inertial.stages.frame_folder import encode_image
+from colmap_inertial.stages.frame_folder import read_frame_records, write_frames
 from colmap_inertial.types import Frame, FrameTiming
 
 
 def fuse_exposures_captured(
-    capture: Path,
-    out: Path,
+    capture: StrPath,
+    out: StrPath,
     options: ExposureOptions | None = None,
     *,
     calibration: Path | None = None,
     fuser: Fuser | None = None,
-    progress: Progress,
+    progress: Progress = silent,
 ) -> tuple[FusedPair, ...]:
     """Fuse every pair of a capture; without times or an IMU, the pixels alone align them.
 
@@ -42,7 +44,8 @@ def fuse_exposures_captured(
     capture
         A ``capture.toml`` with ``[images]`` and ``[exposures]``, or its folder.
     out
-        A folder that does not exist: ``images/`` with the short ones' names, formats and metadata, and ``result.json``.
+        A folder that does not exist, or holds a run of the same capture, which is then gone on with: ``images/`` with
+        the short ones' names, formats and metadata, and ``result.json``.
     options
         Defaults serve.
     calibration
@@ -59,57 +62,73 @@ def fuse_exposures_captured(
     MissingExtraError
         Where the network cannot run.
     OutputExistsError
-        Where ``out`` exists.
+        Where ``out`` holds something else.
     OutputError
         Where the disk is full.
     """
     options = options or ExposureOptions()
-    loaded = load_capture(capture)
+    loaded = load_capture(Path(capture))
     if loaded.exposures is None or not isinstance(loaded.frames, ImageFolder):
         raise FormatError(loaded.path, "describes no pairs of exposures: add [images] and [exposures]")
-    if out.exists():
-        raise OutputExistsError(f"{out} exists already; name a new folder")
-    prior = loaded.calibration
-    if calibration is not None:
-        prior = for_another_recording(read_calibration(calibration), shared_clock=loaded.shared_clock)
+    folder, names, timing = loaded.frames.folder, image_names(loaded.frames), None
+    prior = prior_calibration(loaded, calibration)
     fuser = fuser or lsd2_fuser(options)
-    timing, names = None, image_names(loaded.frames)
-    loaded.exposures.files(names)
+    long = loaded.exposures.files(names)
     if loaded.frames.times is not None:
         timing = with_stated_exposures(loaded, read_frame_timing(loaded))
         names = list(timing.names)
-    plan = ImagingPlan(deblur_note="short and long exposures are fused, aligned by the pixels alone: no gyroscope")
+    note = "short and long exposures are fused, aligned by the pixels alone: no gyroscope"
+    recording = None
     if timing is None:
-        plan = replace(plan, deblur_note=plan.deblur_note.replace("no gyroscope", "the frames have no times"))
+        note = note.replace("no gyroscope", "the frames have no times")
     elif loaded.imu is not None:
-        imu = read_capture_imu(loaded)
-        keep_colmap_quiet()
-        with tempfile.TemporaryDirectory() as scratch:
-            plan = for_pairs(plan, loaded, imu, timing, prior, scratch=Path(scratch), progress=progress)
-    stage = exposure_stage(loaded, options, timing=timing, view=plan.view, fuser=fuser)
-    fused = stage(_frames(loaded, timing, names))
-    with full_disk_is_an_error(out, "make room, remove the folder and start again"):
-        for done, frame in enumerate(fused, start=1):
-            source, target = loaded.frames.folder / frame.name, out / "images" / frame.name
-            target.parent.mkdir(parents=True, exist_ok=True)
-            if stage.pairs()[-1].fused:
-                encode_image(target, frame.image, source)
-            else:
-                target.write_bytes(source.read_bytes())
-            progress("fusing", done, len(names))
-        write_json(
-            out / "result.json",
+        recording = Recording.of(loaded, read_capture_imu(loaded), timing, prior)
+    with open_session(Path(out), loaded.path, options, command="fuse-exposures", progress=progress) as session:
+        workspace = session.workspace
+        plan = ImagingPlan(deblur_note=note)
+        if recording is not None:
+            plan = run_plan(session, recording, Treatments(deblur="off", rolling_shutter="off", pairs=True))
+        stage = pair_stage(
+            loaded,
+            options,
+            fuser,
+            view=None if timing is None or timing.exposure_s is None else plan.view,
+            long=None if timing is None else loaded.exposures.timing(timing),
+        )
+
+        def work(partial: Sequence[Path]) -> None:
+            write_frames(
+                _frames(loaded, timing, names),
+                names,
+                [stage],
+                source_folder=folder,
+                images=partial[0],
+                records=partial[1],
+                progress=lambda _, done, total: progress("fusing", done, total),
+                least=1,
+            )
+
+        depends = {
+            "capture": loaded,
+            "timing": timing,
+            "stage": stage,
+            "inputs": [fingerprint(path) for path in (*(path_in(folder, name) for name in names), *long)],
+        }
+        session.runner.run("frames", depends, [workspace.images, workspace.frames], work)
+        pairs = tuple(structured(FusedPair, record.value("pair")) for record in read_frame_records(workspace.frames))
+        session.finish(
             {
                 "versions": {"colmap_inertial": __version__},
                 "capture": str(loaded.path),
-                "source": str(loaded.frames.folder),
+                "source": str(folder),
                 "note": plan.deblur_note,
                 "fuser": fuser.identity,
                 "fusion": options.fusion,
-                "frames": [asdict(pair) for pair in stage.pairs()],
-            },
+                "frames": [asdict(pair) for pair in pairs],
+                "seconds": session.runner.seconds,
+            }
         )
-    return stage.pairs()
+        return pairs
 
 
 def _frames(capture: Capture, timing: FrameTiming | None, names: Sequence[str]) -> Iterator[Frame]:
@@ -118,7 +137,7 @@ def _frames(capture: Capture, timing: FrameTiming | None, names: Sequence[str]) 
         exposures_s = None if timing is None else timing.exposure_s
         yield Frame(
             name=name,
-            image=read_image(capture.frames.folder / name),
+            image=read_image(path_in(capture.frames.folder, name)),
             t_s=0.0 if timing is None else float(timing.t_s[i]),
             exposure_s=capture.exposure_s if exposures_s is None else float(exposures_s[i]),
             camera=capture.camera,

@@ -2,169 +2,295 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
-import os
-import shutil
-import time
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from colmap_inertial.colmap.dense import run_dense
 from colmap_inertial.drivers.reporting import write_model_record
-from colmap_inertial.drivers.result import ModelResult
-from colmap_inertial.errors import InertialError, NotObservableError, TargetNotFoundError, TimingError
-from colmap_inertial.model import Model, find_models, read_model, summarize, trajectory_from_model
-from colmap_inertial.options import ReconstructOptions
-from colmap_inertial.run.progress import Progress
-from colmap_inertial.run.runner import StageRunner, remove
-from colmap_inertial.run.workspace import Workspace
-from colmap_inertial.stages.metric import MetricStage, metric_trajectory, write_trajectory
+from colmap_inertial.drivers.result import Fragment, ModelResult, ScaledModel
+from colmap_inertial.errors import FormatError, NotObservableError, TargetNotFoundError, TimingError
+from colmap_inertial.io.records import read_record, write_record
+from colmap_inertial.model import (
+    Model,
+    doubted,
+    find_models,
+    model_format,
+    num_registered,
+    read_model,
+    summarize,
+    trajectory_from_model,
+    write_model,
+)
+from colmap_inertial.options import DenseOptions
+from colmap_inertial.run.context import Recording
+from colmap_inertial.run.runner import fingerprint, remove
+from colmap_inertial.run.session import Session
+from colmap_inertial.stages.metric import gravity_in_model, metric_trajectory, write_trajectory
 from colmap_inertial.stages.protocols import ModelStage
-from colmap_inertial.stages.readout import ReadoutStage
-from colmap_inertial.types import FrameTiming, ImuRecording, ScaleEstimate
-from colmap_inertial.validate import Target, Validation, validate_model, write_pictures
+from colmap_inertial.types import ScaleEstimate
+from colmap_inertial.validate import Target, Validation, validate_model, write_overlays
 
 if TYPE_CHECKING:
     import pycolmap
 
 log = logging.getLogger(__name__)
 
+#: COLMAP's models of fewer images, or of a smaller share of those of its largest one, are fragments.
+_FEWEST_IMAGES, _LEAST_SHARE = 5, 0.01
+_TRAJECTORY = re.compile(r"trajectory(_\d+)?(\.tum|_cov(\.partial)?\.npz)")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Made:
+    """What the model stages made of all models."""
+
+    models: tuple[ScaledModel, ...]
+    fragments: tuple[Fragment, ...]
+
 
 def run_models(
-    workspace: Workspace,
-    timing: FrameTiming,
-    imu: ImuRecording,
+    session: Session,
+    recording: Recording,
     stages: Sequence[ModelStage],
-    runner: StageRunner,
-    progress: Progress,
+    *,
+    rectified: bool = False,
     found: Mapping[int, Path] | None = None,
-) -> tuple[ModelResult, ...]:
-    """Every sub-model through the model stages, then to its final place; run again after an interruption.
+    fragments: bool = False,
+    after: Sequence[str] = ("mapping",),
+    read: Callable[[Path], pycolmap.Reconstruction] = read_model,
+) -> tuple[tuple[ModelResult, ...], tuple[Fragment, ...]]:
+    """Every sub-model through the model stages, then to its final place: the largest first, fragments left out.
 
-    The sub-models are those of ``sparse/``, or ``found`` by number elsewhere. One with fewer than two timed images is
-    refused, and the others go on.
+    One with fewer than two timed images is refused, and the others go on.
+
+    Parameters
+    ----------
+    session, recording, stages
+        Of the run.
+    rectified
+        Whether the models were mapped from keypoints without the rolling shutter.
+    found
+        The sub-models by COLMAP's number, where they are not those of ``sparse/``.
+    fragments
+        Treat fragments as models.
+    after
+        The step that made the sub-models, where one did.
+    read
+        Reads a sub-model.
 
     Raises
     ------
     TimingError
-        Where that is so of all.
+        Where no sub-model has two timed images.
     """
-    start = time.perf_counter()
-    scratch = workspace.stamps / "models"
-    stale = [*workspace.root.glob("trajectory*"), *workspace.report_data.glob("model_*.json")]
-    for path in (scratch, workspace.sparse_metric, workspace.validation, *stale):
-        remove(path)
-    results: list[ModelResult] = []
-    untimed: list[TimingError] = []
+    workspace = session.workspace
     found = find_models(workspace.sparse) if found is None else found
-    for done, (index, folder) in enumerate(found.items()):
-        progress("metric", done, len(found))
-        mapped = read_model(folder)
-        reason = _too_few_timed(mapped, timing)
-        if reason is not None:
-            if len(found) == 1:
-                raise reason
-            untimed.append(reason)
-            log.info("model %d: refused %s", index, reason)
-            results.append(_refused(index, mapped, folder, str(reason), stages))
-            continue
-        shutil.copytree(folder, scratch / str(index))
-        model = Model(folder=scratch / str(index), index=index, timing=timing)
-        for stage in stages:
-            model = stage(model)
-        if model.scale is None:
-            raise ValueError("the model stages must include one that estimates the scale; see default_model_stages")
-        settled = [stage.settled(index) for stage in stages if isinstance(stage, ReadoutStage)]
-        result = ModelResult(
-            index=index,
-            scale=model.scale,
-            summary=summarize(mapped),
-            sparse=folder,
-            readout=next((one for one in settled if one is not None), None),
-        )
-        if model.similarity is not None:
-            target = workspace.sparse_metric / str(index)
-            target.parent.mkdir(exist_ok=True)
-            os.replace(model.folder, target)
-            model = dataclasses.replace(model, folder=target)
-            first = not any(other.sparse_metric for other in results)
-            trajectory = workspace.trajectory(index, first=first)
-            result = dataclasses.replace(result, sparse_metric=target, trajectory=trajectory)
-        reconstruction = read_model(model.folder)
-        poses, _ = trajectory_from_model(reconstruction, timing)
-        if model.similarity is not None and result.trajectory is not None:
-            poses = metric_trajectory(poses)
-            write_trajectory(result.trajectory, model, poses, imu)
-        write_model_record(workspace, model, reconstruction, poses, imu)
-        log.info("model %d: %s %s", index, result.scale.verdict, "; ".join(result.scale.reasons))
-        results.append(result)
-    if untimed and len(untimed) == len(results):
-        raise untimed[0]
-    remove(scratch)
-    progress("metric", len(found), len(found))
-    runner.seconds["metric"] = time.perf_counter() - start
-    return tuple(results)
+    record = workspace.stamps / "models.json"
+
+    def work(partial: Sequence[Path]) -> None:
+        trajectories = [p for p in workspace.root.glob("trajectory*") if _TRAJECTORY.fullmatch(p.name)]
+        for path in (workspace.sparse_metric, *trajectories):
+            remove(path)
+        for path in workspace.report_data.glob("model_*.json"):
+            remove(path)
+        kept, left_out = _without_fragments(found, keep=fragments)
+        models = []
+        for index, number in enumerate(kept):
+            session.progress("metric", index, len(kept))
+            model = Model(
+                reconstruction=read(found[number]),
+                colmap_index=number,
+                timing=recording.timing,
+                rectified=rectified,
+                doubts=recording.doubts,
+            )
+            models.append(_through_stages(session, recording, stages, model, index, found[number]))
+        untimed = [reason for _, reason in models if reason is not None]
+        if len(untimed) == len(models):
+            raise untimed[0]
+        session.progress("metric", len(kept), len(kept))
+        small = [replace(one, sparse=_within(workspace.root, one.sparse)) for one in left_out]
+        write_record(partial[0], _Made(models=tuple(one for one, _ in models), fragments=tuple(small)))
+
+    depends = {
+        "recording": {name: getattr(recording, name) for name in ("imu", "timing", "doubts")},
+        "stages": stages,
+        "rectified": rectified,
+        "fragments": fragments,
+        "found": [fingerprint(folder) for folder in found.values()] if not after else [],
+    }
+    _forget_where_gone(record, workspace.root)
+    session.runner.run("metric", depends, [record], work, after=after)
+    made = read_record(record, _Made)
+    models = tuple(
+        ModelResult(**{f.name: getattr(one, f.name) for f in fields(one)}).within(workspace.root) for one in made.models
+    )
+    return models, tuple(replace(one, sparse=workspace.root / one.sparse) for one in made.fragments)
 
 
-def _too_few_timed(reconstruction: pycolmap.Reconstruction, timing: FrameTiming) -> TimingError | None:
-    names = set(timing.names)
+def _forget_where_gone(record: Path, root: Path) -> None:
+    """A record of models of which something is no longer there counts for nothing."""
+    if not record.is_file():
+        return
+    try:
+        models = read_record(record, _Made).models
+    except FormatError:
+        models = ()
+    paths = [path for one in models for path in (one.sparse_metric, one.trajectory) if path is not None]
+    if not models or not all((root / path).exists() for path in paths):
+        remove(record)
+
+
+def _without_fragments(found: Mapping[int, Path], *, keep: bool) -> tuple[list[int], list[Fragment]]:
+    """COLMAP's numbers of the models to go on with, the largest first; and what is too small."""
+    sizes = {number: num_registered(folder) for number, folder in found.items()}
+    order = sorted(found, key=lambda number: (-sizes[number], number))
+    least = 0.0 if keep else max(_FEWEST_IMAGES, _LEAST_SHARE * sizes[order[0]])
+    kept = [number for number in order if number == order[0] or sizes[number] >= least]
+    left_out = [Fragment(colmap_index=n, registered_images=sizes[n], sparse=found[n]) for n in order if n not in kept]
+    for fragment in left_out:
+        log.info("COLMAP's model %d is a fragment of %d images", fragment.colmap_index, fragment.registered_images)
+    return kept, left_out
+
+
+def _through_stages(
+    session: Session, recording: Recording, stages: Sequence[ModelStage], model: Model, index: int, sparse: Path
+) -> tuple[ScaledModel, TimingError | None]:
+    """What the stages make of one model of COLMAP's, and why not where its images have no times."""
+    one = ScaledModel(
+        index=index,
+        colmap_index=model.colmap_index,
+        scale=_refused("not looked at"),
+        summary=summarize(model.reconstruction),
+        sparse=_within(session.workspace.root, sparse),
+    )
+    reason = _too_few_timed(model)
+    if reason is not None:
+        log.info("model %d: refused %s", index, reason)
+        return replace(one, scale=_refused(str(reason))), reason
+    for stage in stages:
+        model = stage(model)
+    return _placed(session, recording, one, model), None
+
+
+def _placed(session: Session, recording: Recording, one: ScaledModel, model: Model) -> ScaledModel:
+    """A model that went through the stages, written to where it stays, with its path."""
+    workspace = session.workspace
+    if model.scale is None:
+        raise ValueError("the model stages must include one that estimates the scale, such as ... or MetricStage")
+    scale, similarity = doubted(model.scale, recording.doubts), model.similarity
+    if similarity is not None and scale.verdict == "refused":
+        raise ValueError("the model stages made a model metric whose scale they refused")
+    if similarity is not None and scale.verdict != model.scale.verdict:
+        similarity = replace(similarity, provenance=f"{similarity.provenance}; {scale.verdict}: {scale.reasons[0]}")
+    model = replace(model, scale=scale, similarity=similarity)
+    one = replace(one, scale=scale, treatments=model.treatments)
+    poses, _ = trajectory_from_model(model.reconstruction, model.timing)
+    if model.similarity is not None:
+        target = workspace.sparse_metric / str(one.index)
+        suffix = model_format(workspace.root / one.sparse) or ".bin"
+        write_model(model.reconstruction, target, model.similarity, suffix=suffix)
+        poses = metric_trajectory(poses)
+        one = replace(one, sparse_metric=_within(workspace.root, target))
+        if scale.calibration is not None and gravity_in_model(model) is not None:
+            trajectory = workspace.trajectory(one.index, first=not any(workspace.root.glob("trajectory*.tum")))
+            write_trajectory(trajectory, model, poses, recording.imu)
+            one = replace(one, trajectory=_within(workspace.root, trajectory))
+    write_model_record(workspace, one.index, model, poses, recording.imu)
+    log.info("model %d: %s %s", one.index, scale.verdict, "; ".join(scale.reasons))
+    return one
+
+
+def _within(root: Path, path: Path) -> Path:
+    """A path as it counts from ``root``; one elsewhere as it counts from anywhere."""
+    return path.relative_to(root) if path.is_relative_to(root) else path.resolve()
+
+
+def _too_few_timed(model: Model) -> TimingError | None:
+    names, reconstruction = set(model.timing.names), model.reconstruction
     if sum(reconstruction.image(i).name in names for i in reconstruction.reg_image_ids()) >= 2:
         return None
     try:
-        trajectory_from_model(reconstruction, timing)
+        trajectory_from_model(reconstruction, model.timing)
     except TimingError as error:
         return error
     return None
 
 
-def _refused(
-    index: int, reconstruction: pycolmap.Reconstruction, folder: Path, reason: str, stages: Sequence[ModelStage]
-) -> ModelResult:
-    method = next((stage.options.method for stage in stages if isinstance(stage, MetricStage)), "joint")
-    scale = ScaleEstimate(
-        metres_per_unit=None, sigma_log=None, ci95=None, verdict="refused", method=method, reasons=(reason,)
+def _refused(reason: str) -> ScaleEstimate:
+    return ScaleEstimate(
+        metres_per_unit=None, sigma_log=None, ci95=None, verdict="refused", method="none", reasons=(reason,)
     )
-    return ModelResult(index=index, scale=scale, summary=summarize(reconstruction), sparse=folder)
 
 
-def validated(
-    workspace: Workspace, models: Sequence[ModelResult], target: Target, images: Path, progress: Progress
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Checked:
+    """What came of measuring the target in a model; an error in its parts."""
+
+    found: Validation | None = None
+    unobservable: str | None = None
+    error: str = ""
+
+    def outcome(self) -> Validation | TargetNotFoundError | NotObservableError:
+        if self.found is not None:
+            return self.found
+        if self.unobservable is not None:
+            return NotObservableError(self.unobservable, self.error)
+        return TargetNotFoundError(self.error)
+
+
+def run_validation(
+    session: Session, models: Sequence[ModelResult], target: Target | None, images: Path | None
 ) -> tuple[ModelResult, ...]:
     """Measure the target in the metric models; one that cannot be measured does not undo its model."""
+    if target is None or images is None:
+        remove(session.workspace.validation)
+        return tuple(models)
     checked = []
+    for stale in session.workspace.validation.glob("[0-9]*"):
+        if stale.name not in {str(model.index) for model in models}:
+            remove(stale)
     for model in models:
+        pictures = session.workspace.validation / str(model.index)
         if model.sparse_metric is None:
+            remove(pictures)
             checked.append(model)
             continue
-        check: Validation | InertialError
-        try:
-            check = validate_model(
-                model.sparse_metric,
-                images,
-                target,
-                progress=lambda done, total: progress("validation", done, total),
-            )
-            write_pictures(check, images, workspace.validation / str(model.index))
-        except (TargetNotFoundError, NotObservableError) as error:
-            check = error
-        said = check if isinstance(check, InertialError) else f"scale error {check.scale_error_pct:+.3f} %"
+        metric = model.sparse_metric
+
+        def work(partial: Sequence[Path], metric: Path = metric, pictures: Path = pictures) -> None:
+            remove(pictures)
+            try:
+                found = validate_model(
+                    metric, images, target, progress=lambda done, total: session.progress("validation", done, total)
+                )
+            except TargetNotFoundError as error:
+                write_record(partial[0], _Checked(error=str(error)))
+            except NotObservableError as error:
+                write_record(partial[0], _Checked(unobservable=error.quantity, error=error.hint))
+            else:
+                write_overlays(found, images, pictures)
+                write_record(partial[0], _Checked(found=found))
+
+        record = session.workspace.stamps / f"validated_{model.index}.json"
+        after = ["metric", *session.runner.of("frames", "rectified")]
+        depends = {"target": target.spec, "images": [] if len(after) > 1 else fingerprint(images)}
+        session.runner.run(f"validation_{model.index}", depends, [record], work, after=after)
+        check = read_record(record, _Checked).outcome()
+        said = f"scale error {check.scale_error_pct:+.3f} %" if isinstance(check, Validation) else str(check)
         log.info("model %d: %s against %s", model.index, said, target.spec)
-        checked.append(dataclasses.replace(model, validation=check))
+        checked.append(replace(model, validation=check))
     return tuple(checked)
 
 
-def with_dense(
-    runner: StageRunner,
-    workspace: Workspace,
-    models: Sequence[ModelResult],
-    images: Path,
-    options: ReconstructOptions,
-    progress: Progress,
+def run_dense_models(
+    session: Session, models: Sequence[ModelResult], images: Path, options: DenseOptions
 ) -> tuple[ModelResult, ...]:
     """The models with their dense reconstructions, where they are metric."""
     metric = [model.index for model in models if model.sparse_metric is not None]
-    threads = 1 if options.deterministic else -1
-    dense = run_dense(runner, workspace, metric, images, options.dense_options, num_threads=threads, progress=progress)
-    return tuple(dataclasses.replace(model, dense=dense.get(model.index)) for model in models)
+    dense = run_dense(session, metric, images, options)
+    return tuple(replace(model, dense=dense.get(model.index)) for model in models)

@@ -4,43 +4,57 @@ from __future__ import annotations
 
 import dataclasses
 import fnmatch
+import functools
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import get_args
+from types import EllipsisType
+from typing import TYPE_CHECKING, Literal, get_args
 
-from colmap_inertial import __version__
-from colmap_inertial.drivers.capture import default_model_stages, prior_calibration
-from colmap_inertial.drivers.models import run_models, validated, with_dense
-from colmap_inertial.drivers.reporting import report_result, write_recording
-from colmap_inertial.drivers.result import ModelResult, ReconstructResult
+from colmap_inertial.drivers.capture import default_model_stages
+from colmap_inertial.drivers.models import run_dense_models, run_models, run_validation
+from colmap_inertial.drivers.reporting import report_result, reporting_stops, write_recording
+from colmap_inertial.drivers.result import Fragment, ModelResult, ReconstructResult
 from colmap_inertial.errors import AlreadyMetricError, FormatError, InertialError, OutputError, TimingError
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.io.capture import Capture, Video, load_capture
 from colmap_inertial.io.exif import stamps_of_exif
-from colmap_inertial.io.files import read_json, write_json, write_text
+from colmap_inertial.io.files import StrPath, write_json
 from colmap_inertial.io.frame_times import FrameStamps, stamps_of_pattern
 from colmap_inertial.io.frames import read_frame_times, read_frame_timing
 from colmap_inertial.io.image_metadata import stated_exposures_s
-from colmap_inertial.io.imu import is_capture, read_capture_imu, read_imu
+from colmap_inertial.io.imu import RawImu, is_capture, read_raw_capture_imu, read_raw_imu
+from colmap_inertial.io.names import path_in
 from colmap_inertial.io.recorders import find_recording
+from colmap_inertial.io.records import read_record, write_record
 from colmap_inertial.io.video import video_stamps_ns
 from colmap_inertial.io.video_match import match_to_video
-from colmap_inertial.model import is_metric, model_format, read_model
+from colmap_inertial.model import (
+    TRANSFORM_FILE,
+    is_metric,
+    model_format,
+    num_registered,
+    read_model,
+    trajectory_from_model,
+)
 from colmap_inertial.model.copying import list_tree
 from colmap_inertial.model.layout import read_layout
 from colmap_inertial.model.project import apply_to_project
-from colmap_inertial.model.similarities import ModelScale
+from colmap_inertial.model.similarities import ModelScale, read_similarity
 from colmap_inertial.options import ProjectOptions, ReconstructOptions
+from colmap_inertial.precalibrate.preflight import checked_imu, preflight, stop_or_doubt
 from colmap_inertial.report import require_plotly
-from colmap_inertial.run.config import config_as_toml
+from colmap_inertial.run.context import Recording, prior_calibration
 from colmap_inertial.run.progress import Progress, silent
-from colmap_inertial.run.runner import StageRunner, fingerprint
-from colmap_inertial.run.session import logging_to
-from colmap_inertial.run.workspace import Workspace
-from colmap_inertial.types import FrameTiming, ImuRecording, ReadoutDirection, Similarity
+from colmap_inertial.run.runner import fingerprint, remove
+from colmap_inertial.run.session import Session, open_session
+from colmap_inertial.stages.protocols import ModelStage, with_defaults
+from colmap_inertial.types import CameraTrajectory, FrameTiming, ReadoutDirection
 from colmap_inertial.validate import parse_target
+
+if TYPE_CHECKING:
+    import pycolmap
 
 log = logging.getLogger(__name__)
 
@@ -75,11 +89,12 @@ def _has_model(path: Path) -> bool:
 
 
 def reconstruct_project(
-    project: Path,
-    out: Path,
+    project: StrPath,
+    out: StrPath,
     source: ProjectOptions,
     options: ReconstructOptions = ReconstructOptions(),
     *,
+    model_stages: Sequence[ModelStage | EllipsisType] = (...,),
     progress: Progress = silent,
 ) -> ReconstructResult:
     """Make an existing COLMAP project metric, gravity along an axis, with everything that was made from it.
@@ -89,13 +104,15 @@ def reconstruct_project(
     project
         A folder with a COLMAP model; it is only read.
     out
-        A folder that does not exist, or holds an unfinished run on the same project, which is then continued.
+        A folder that does not exist, or holds a run on the same project, which is then gone on with.
         ``sparse_metric/``, ``trajectory.tum`` and ``result.json`` are those of :func:`reconstruct`;
         ``project_metric/`` is the whole project in metres.
     source
         The recording that ran along, and when the images were taken.
     options
         Those of mapping and of pixels must be left alone: the model is what it is.
+    model_stages
+        As of :func:`reconstruct`.
     progress
         Called with stage, steps done and steps in all.
 
@@ -107,7 +124,10 @@ def reconstruct_project(
         When the project carries a similarity of ours.
     OutputError, OutputExistsError
         When ``out`` holds something else, or lies in the project.
+    NotObservableError
+        When the recording cannot give metres (``options.force`` goes on).
     """
+    project, out = Path(project), Path(out)
     if not _has_model(project):
         raise FormatError(
             project,
@@ -117,34 +137,56 @@ def reconstruct_project(
     require_plotly()
     _check_options(options)
     given = _given(project, source, options)
-    prior_calibration(given.capture, options)  # a wrong file is said before the work, not after it
-    target = None if given.capture.target is None else parse_target(given.capture.target)
-    models = _models(project, out, source.keep)
+    capture = given.capture
+    raw = checked_imu(given.raw, force=options.force)
+    prior = prior_calibration(capture, options.calibration)
+    target = None if capture.target is None else parse_target(capture.target)
+    models = _models(project, out, source.keep, follow_links=source.follow_links)
     images = _images(project, source, needed=options.dense or source.exif_times or source.video is not None)
-    workspace = Workspace(out)
-    workspace.open(project)
-    with workspace.locked(), logging_to(workspace.log):
-        log.info("colmap-inertial %s: %s -> %s", __version__, project, out)
-        write_text(workspace.config, config_as_toml(options))
-        runner = StageRunner(workspace)
-        timing, notes = _run_times(runner, workspace, given, models, images, progress)
-        stages = default_model_stages(given.capture, given.imu, options)
-        results = run_models(workspace, timing, given.imu, stages, runner, progress, found=models)
+    read = functools.cache(read_model)
+    with (
+        open_session(
+            out, project, options, deterministic=options.deterministic, seed=options.seed, progress=progress
+        ) as session,
+        reporting_stops(session.workspace, capture),
+    ):
+        workspace = session.workspace
+        timing, notes = _run_times(session, given, models, images, read)
+        recording = Recording.of(capture, raw.imu, timing, prior, max_offset_s=options.scale.max_offset_s)
+        largest = read(models[max(models, key=lambda n: (num_registered(models[n]), -n))])
+        diagnosis = preflight(recording, raw, progress, model=_trajectory(largest, timing))
+        write_json(workspace.diagnosis, diagnosis.as_json())
+        recording = dataclasses.replace(recording, doubts=stop_or_doubt(diagnosis, force=options.force))
+        stages = with_defaults(model_stages, default_model_stages(recording, options))
+        results, fragments = run_models(
+            session, recording, stages, found=models, fragments=options.fragments, after=(), read=read
+        )
+        read.cache_clear()
         if target is not None and images is None:
             notes = (*notes, "the target was not measured: the project has no images/; give --images DIR")
         results = tuple(_noted(result, notes) for result in results)
-        if target is not None and images is not None:
-            results = validated(workspace, results, target, images, progress)
-        metric = _run_apply(runner, workspace, project, source, options, results, progress)
+        results = run_validation(session, results, target, images)
+        metric = _run_apply(session, project, source, options, results, fragments)
         if options.dense and images is not None:
-            results = with_dense(runner, workspace, results, images, options, progress)
+            results = run_dense_models(session, results, images, options.dense_options)
         result = ReconstructResult(
-            workspace=workspace, models=results, frames=(), seconds=runner.seconds, project_metric=metric
+            workspace=workspace,
+            models=results,
+            fragments=fragments,
+            seconds=session.runner.seconds,
+            project_metric=metric,
         )
-        write_recording(workspace, given.imu, timing)
-        result = report_result(result, given.capture, project=source)
-        log.info("finished")
+        write_recording(session, recording)
+        result = report_result(session, result, capture, project=source)
     return result
+
+
+def _trajectory(model: pycolmap.Reconstruction, timing: FrameTiming) -> CameraTrajectory | Literal["untimed"]:
+    """The poses of a model, where enough of its images have times."""
+    try:
+        return trajectory_from_model(model, timing)[0]
+    except TimingError:
+        return "untimed"
 
 
 def _check_options(options: ReconstructOptions) -> None:
@@ -175,7 +217,7 @@ class _Given:
 
     source: ProjectOptions
     capture: Capture
-    imu: ImuRecording
+    raw: RawImu
 
 
 def _given(project: Path, source: ProjectOptions, options: ReconstructOptions) -> _Given:
@@ -186,7 +228,7 @@ def _given(project: Path, source: ProjectOptions, options: ReconstructOptions) -
         raise FormatError(times, "no such file or folder")
     described = [p for p in (source.imu, times) if p is not None and (is_capture(p) or find_recording(p) is not None)]
     captures = [load_capture(path) for path in described]
-    imu = read_capture_imu(captures[0]) if described[:1] == [source.imu] else read_imu(source.imu)
+    raw = read_raw_capture_imu(captures[0]) if described[:1] == [source.imu] else read_raw_imu(source.imu)
     capture = captures[0] if captures else Capture(path=project, calibration=calibration_prior())
     frames = next((c.frames for c in captures if c.frames is not None), None)
     own_clock = source.exif_times or (source.video is not None and not isinstance(frames, Video))
@@ -196,7 +238,7 @@ def _given(project: Path, source: ProjectOptions, options: ReconstructOptions) -
         capture = _with_video(capture, source.video, None if times in described else times)
     elif times is None and source.name_times is None and not source.exif_times and frames is None:
         raise TimingError(f"{project}: nothing says when its images were taken: {_HOW_TIMES}")
-    return _Given(source=source, capture=capture, imu=imu)
+    return _Given(source=source, capture=capture, raw=raw)
 
 
 def _with_video(capture: Capture, video: Path, times: Path | None) -> Capture:
@@ -213,14 +255,14 @@ def _with_video(capture: Capture, video: Path, times: Path | None) -> Capture:
     )
 
 
-def _models(project: Path, out: Path, keep: Sequence[str]) -> dict[int, Path]:
+def _models(project: Path, out: Path, keep: Sequence[str], *, follow_links: bool) -> dict[int, Path]:
     """COLMAP's sub-models by number; what would stop ``apply`` at the end is said at once."""
     inner, outer = out.resolve(), project.resolve()
     if inner.is_relative_to(outer) or outer.is_relative_to(inner):
         raise OutputError(f"{out} and {project} lie within each other; choose a folder elsewhere")
     folders = [
         folder
-        for folder in list_tree(project)[0]
+        for folder in list_tree(project, follow_links=follow_links)[0]
         if not any(fnmatch.fnmatch(str(p), pattern) for p in (folder, *folder.parents[:-1]) for pattern in keep)
     ]
     for folder in (Path(), *folders):
@@ -242,34 +284,43 @@ def _images(project: Path, source: ProjectOptions, *, needed: bool) -> Path | No
     return None
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Times:
+    """When the images were taken, and what the user should know about that."""
+
+    timing: FrameTiming
+    notes: tuple[str, ...]
+
+
 def _run_times(
-    runner: StageRunner,
-    workspace: Workspace,
+    session: Session,
     given: _Given,
     models: dict[int, Path],
     images: Path | None,
-    progress: Progress,
+    read: Callable[[Path], pycolmap.Reconstruction],
 ) -> tuple[FrameTiming, tuple[str, ...]]:
     """When the images were taken, and what the user should know about that."""
-    names: set[str] = set()
-    for folder in models.values():
-        model = read_model(folder)
-        names |= {model.image(i).name for i in model.reg_image_ids()}
-    ordered = sorted(names)
 
     def work(partial: Sequence[Path]) -> None:
-        timing, notes = _times(given, ordered, images, progress)
-        write_json(partial[0], {"timing": timing, "notes": list(notes)})
+        names: set[str] = set()
+        for folder in models.values():
+            model = read(folder)
+            names |= {model.image(i).name for i in model.reg_image_ids()}
+        timing, notes = _times(given, sorted(names), images, session.progress)
+        write_record(partial[0], _Times(timing=timing, notes=notes))
 
-    inputs = [given.source.frame_times, given.source.video, given.source.imu, images]
+    frames = given.capture.frames
+    stated = frames.frame_times if isinstance(frames, Video) else None if frames is None else frames.times
+    inputs = [given.source.frame_times, given.source.video, images, stated if isinstance(stated, Path) else None]
     depends = {
-        "source": given.source,
+        "source": dataclasses.replace(given.source, keep=(), link=False),
+        "capture": dataclasses.replace(given.capture, target=None),
         "models": [fingerprint(folder) for folder in models.values()],
         "inputs": [fingerprint(path) for path in inputs if path is not None],
     }
-    runner.run("times", depends, [workspace.frames], work)
-    stored = read_json(workspace.frames)
-    return FrameTiming(**stored["timing"]), tuple(stored["notes"])
+    session.runner.run("times", depends, [session.workspace.frames], work)
+    found = read_record(session.workspace.frames, _Times)
+    return found.timing, found.notes
 
 
 def _times(
@@ -297,8 +348,10 @@ def _times(
     else:
         timing = read_frame_timing(capture)
     # an exposure that the pictures state belongs to the frames; one that they do not is no reason to stop
-    if timing.exposure_s is None and images is not None and all((images / name).is_file() for name in timing.names):
-        timing = dataclasses.replace(timing, exposure_s=stated_exposures_s([images / name for name in timing.names]))
+    if timing.exposure_s is None and images is not None:
+        paths = [path_in(images, name) for name in timing.names]
+        if all(path.is_file() for path in paths):
+            timing = dataclasses.replace(timing, exposure_s=stated_exposures_s(paths))
     return timing, notes
 
 
@@ -346,26 +399,28 @@ def _noted(result: ModelResult, notes: Sequence[str]) -> ModelResult:
 
 
 def _run_apply(
-    runner: StageRunner,
-    workspace: Workspace,
+    session: Session,
     project: Path,
     source: ProjectOptions,
     options: ReconstructOptions,
     results: Sequence[ModelResult],
-    progress: Progress,
+    fragments: Sequence[Fragment],
 ) -> Path | None:
     """The whole project in metres; ``None`` where every scale was refused."""
-    scales: dict[int | None, ModelScale] = {}
+    small = "a fragment of {} images: too small to be made metric (--fragments does it all the same)"
+    scales: dict[int | None, ModelScale] = {
+        one.colmap_index: ModelScale(similarity=None, verdict="refused", reasons=(small.format(one.registered_images),))
+        for one in fragments
+    }
     for result in results:
         similarity = None
         if result.sparse_metric is not None:
-            scale = result.scale
-            provenance = f"inertial scale, method {scale.method}, {scale.verdict}"
-            similarity = Similarity.from_scale(scale, world=options.world, provenance=provenance)
-        scales[result.index] = ModelScale(
+            similarity = read_similarity(result.sparse_metric / TRANSFORM_FILE)
+        scales[result.colmap_index] = ModelScale(
             similarity=similarity, verdict=result.scale.verdict, reasons=result.scale.reasons
         )
     if all(scale.similarity is None for scale in scales.values()):
+        remove(session.workspace.project_metric)
         return None
 
     def work(partial: Sequence[Path]) -> None:
@@ -375,7 +430,8 @@ def _run_apply(
             scales,
             link=source.link,
             keep=source.keep,
-            progress=lambda done, total: progress("apply", done, total),
+            follow_links=source.follow_links,
+            progress=lambda done, total: session.progress("apply", done, total),
         )
         for note in applied.notes:
             log.info("%s", note)
@@ -385,5 +441,5 @@ def _run_apply(
         "project": fingerprint(project),
         "source": source,
     }
-    runner.run("apply", depends, [workspace.project_metric], work)
-    return workspace.project_metric
+    session.runner.run("apply", depends, [session.workspace.project_metric], work)
+    return session.workspace.project_metric

@@ -1,4 +1,4 @@
-"""What the pipeline keeps for the report, and the report itself: of finished runs, and of those the recording stops.
+"""What a run keeps for the report, and the report itself: of finished runs, and of those the recording stops.
 
 A report that fails never costs a result, nor hides why a run stopped: the log says what went wrong with it.
 """
@@ -8,9 +8,9 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -18,21 +18,21 @@ from colmap_inertial.drivers.result import ReconstructResult, result_as_json
 from colmap_inertial.errors import MappingError, NotObservableError
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import write_json
-from colmap_inertial.model import Model, colmap_camera
+from colmap_inertial.model import Model
 from colmap_inertial.options import ProjectOptions
+from colmap_inertial.precalibrate.calibrate import guessed_camera
 from colmap_inertial.report import write_report
 from colmap_inertial.report.content import model_file, recording_file
 from colmap_inertial.report.scene import scene_record
 from colmap_inertial.report.series import rounded, strided
 from colmap_inertial.report.signals import signal_record
+from colmap_inertial.run.context import Recording
 from colmap_inertial.run.runner import remove
+from colmap_inertial.run.session import Session
 from colmap_inertial.run.workspace import Workspace
 from colmap_inertial.stages.metric import gravity_in_model
-from colmap_inertial.stages.rolling_shutter import RollingShutterStage
-from colmap_inertial.types import Array, CameraTrajectory, FrameTiming, ImuRecording
-
-if TYPE_CHECKING:
-    import pycolmap
+from colmap_inertial.stages.protocols import KeypointStage
+from colmap_inertial.types import Array, CameraTrajectory, ImuRecording, Keypoints
 
 log = logging.getLogger(__name__)
 
@@ -41,9 +41,13 @@ _SHUTTER_FRAMES, _GRID = 300, 9
 
 
 def write_recording(
-    workspace: Workspace, imu: ImuRecording, timing: FrameTiming, rectifying: Sequence[RollingShutterStage] = ()
+    session: Session,
+    recording: Recording,
+    stages: Sequence[KeypointStage] = (),
+    rectified: Collection[str] = (),
 ) -> None:
-    """Keep what the report says of the recording: rates, times of the frames, what was done about a rolling shutter."""
+    """Keep what the report says of the recording: rates, times of the frames, how ``stages`` rectified keypoints."""
+    workspace, imu, timing = session.workspace, recording.imu, recording.timing
 
     def rate_hz(t_s: Array) -> float | None:
         return float(1 / np.median(np.diff(t_s))) if len(t_s) > 1 else None
@@ -65,24 +69,34 @@ def write_recording(
                 "exposure_s": None if timing.exposure_s is None else rounded(timing.exposure_s, 4),
                 "readout_s": timing.readout_s,
             },
-            "rolling_shutter": _shutter_record(rectifying[0], timing) if rectifying else None,
+            "rolling_shutter": _shutter_record(stages, recording, rectified),
         }
         workspace.report_data.mkdir(exist_ok=True)
         write_json(recording_file(workspace.root), record, indent=None)
 
 
-def _shutter_record(stage: RollingShutterStage, timing: FrameTiming) -> dict[str, Any] | None:
+def _shutter_record(
+    stages: Sequence[KeypointStage], recording: Recording, rectified: Collection[str]
+) -> dict[str, Any] | None:
     """By how much keypoints move: of some frames the largest shift, and that of the worst one over the image."""
-    camera = colmap_camera(stage.view.camera)
+    if not rectified:
+        return None
+    timing, camera = recording.timing, guessed_camera(recording.capture, recording.timing)
     x = (np.arange(_GRID) + 0.5) * camera.width / _GRID
     y = (np.arange(_GRID) + 0.5) * camera.height / _GRID
     grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     shifts = []
-    for i in strided(len(timing.names), _SHUTTER_FRAMES).tolist():
-        if stage.covers(timing.names[i]):
-            shift = stage(timing.names[i], grid) - grid
-            if np.isfinite(shift).all():
-                shifts.append((i, shift))
+    those = [i for i, name in enumerate(timing.names) if name in rectified]
+    for i in (those[k] for k in strided(len(those), _SHUTTER_FRAMES).tolist()):
+        moved = Keypoints(name=timing.names[i], xy_px=grid)
+        try:
+            for stage in stages:
+                moved = stage(moved)
+        except Exception as error:  # a point far outside, or a visitor's stage that knows its own keypoints only
+            log.info("no movement of keypoints of %s for the report: %r", moved.name, error)
+            continue
+        if moved.rectified:
+            shifts.append((i, moved.xy_px - grid))
     if not shifts:
         return None
     largest = np.array([np.linalg.norm(shift, axis=1).max() for _, shift in shifts])
@@ -104,26 +118,26 @@ def _shutter_record(stage: RollingShutterStage, timing: FrameTiming) -> dict[str
 
 def write_model_record(
     workspace: Workspace,
+    index: int,
     model: Model,
-    reconstruction: pycolmap.Reconstruction,
     trajectory: CameraTrajectory,
     imu: ImuRecording,
 ) -> None:
     """Keep what the report draws of one model: its scene, and camera against IMU."""
     if model.scale is None:
         raise ValueError("a model without a scale estimate has nothing to report")
-    with _failures_logged(f"what the report draws of model {model.index}"):
+    with _failures_logged(f"what the report draws of model {index}"):
         gravity, first_frame_s = gravity_in_model(model), float(model.timing.t_s[0])
         record = {
-            "scene": scene_record(reconstruction, trajectory, gravity, first_frame_s=first_frame_s),
+            "scene": scene_record(model.reconstruction, trajectory, gravity, first_frame_s=first_frame_s),
             "signals": signal_record(trajectory, imu, model.scale, gravity, first_frame_s=first_frame_s),
         }
         workspace.report_data.mkdir(exist_ok=True)
-        write_json(model_file(workspace.root, model.index), record, indent=None)
+        write_json(model_file(workspace.root, index), record, indent=None)
 
 
 def report_result(
-    result: ReconstructResult, capture: Capture, project: ProjectOptions | None = None
+    session: Session, result: ReconstructResult, capture: Capture, project: ProjectOptions | None = None
 ) -> ReconstructResult:
     """Write the report, and then ``result.json``, whose presence says that the run is finished.
 
@@ -131,18 +145,23 @@ def report_result(
     -------
     The result with the path of its report; ``None`` where that failed.
     """
-    workspace, content = result.workspace, result_as_json(result, capture)
+    workspace = result.workspace
+    content = result_as_json(result, capture)
     if project is not None:
         content["project"] = {
             key: value.resolve() if isinstance(value, Path) else value
             for key, value in dataclasses.asdict(project).items()
         }
+    if session.stands(content):
+        session.finish(content)
+        report = workspace.report if workspace.report.is_file() else None
+        return dataclasses.replace(result, report=report, unchanged=True)
     with _failures_logged("the report"):
         # what a stopped run left there must not stand for this one
         for old in (workspace.report, workspace.report.with_suffix(".json")):
             remove(old)
         result = dataclasses.replace(result, report=write_report(workspace.root, result=content))
-    write_json(workspace.result, content)
+    session.finish(content)
     return result
 
 
@@ -155,6 +174,7 @@ def reporting_stops(workspace: Workspace, capture: Capture) -> Iterator[None]:
     try:
         yield
     except (NotObservableError, MappingError) as error:
+        workspace.unfinish()
         with _failures_logged("the report of the stop"):
             page = write_report(workspace.root, stopped=str(error), capture=str(capture.path.resolve()))
             error.add_note(f"what was found, and what to do: {page}")

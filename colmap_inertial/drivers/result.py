@@ -2,59 +2,137 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from collections.abc import Collection
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from colmap_inertial import __version__
 from colmap_inertial.colmap.dense import DenseResult
+from colmap_inertial.colmap.sparse import KeypointRecords
 from colmap_inertial.errors import InertialError, NotObservableError
 from colmap_inertial.geometry import quat_conjugate, quat_log, quat_multiply
 from colmap_inertial.io.capture import Capture
-from colmap_inertial.model.readout import Settled
 from colmap_inertial.precalibrate.plan import ImagingPlan
 from colmap_inertial.precalibrate.selection import Selection
 from colmap_inertial.run.workspace import Workspace
 from colmap_inertial.stages.frame_folder import FrameRecord
-from colmap_inertial.types import CameraImuCalibration, ScaleEstimate
+from colmap_inertial.types import CameraImuCalibration, ScaleEstimate, Treatment
 from colmap_inertial.validate import Validation
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ModelResult:
-    """What became of one of COLMAP's models; paths are ``None`` where the scale was refused."""
+class ScaledModel:
+    """What the model stages made of one of COLMAP's models; paths are ``None`` where the scale was refused.
+
+    Attributes
+    ----------
+    index
+        Its place: the models count from the one with the most images.
+    colmap_index
+        COLMAP's number, that of its folder in ``sparse/``.
+    scale
+        Metres per unit, interval and verdict.
+    summary
+        ``registered_images``, ``points``, ``observations``, ``mean_reprojection_error_px``.
+    sparse, sparse_metric
+        COLMAP's model, and the same in metres.
+    trajectory
+        The camera's smoothed path.
+    treatments
+        What the stages said.
+    """
 
     index: int
+    colmap_index: int
     scale: ScaleEstimate
     summary: dict[str, int | float]
     sparse: Path
     sparse_metric: Path | None = None
     trajectory: Path | None = None
+    treatments: tuple[Treatment, ...] = ()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ModelResult(ScaledModel):
+    """What became of one of COLMAP's models.
+
+    Attributes
+    ----------
+    validation
+        Against the capture's target, where it names one; an error says why the target could not be measured.
+    dense
+        Where it was asked for.
+    """
+
     validation: Validation | InertialError | None = None
-    """Against the capture's target, where it names one; an error says why the target could not be measured."""
     dense: DenseResult | None = None
-    """Where it was asked for."""
-    readout: Settled | None = None
-    """What the camera's translation within a rolling shutter's readout did to the model, where it was looked at."""
+
+    def within(self, root: Path) -> ModelResult:
+        """The same with paths that count from ``root`` made whole."""
+        paths = {name: getattr(self, name) for name in ("sparse", "sparse_metric", "trajectory")}
+        return replace(self, **{name: root / path for name, path in paths.items() if path is not None})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fragment:
+    """A model of COLMAP's that is too small to be made metric.
+
+    Attributes
+    ----------
+    colmap_index
+        COLMAP's number.
+    registered_images
+        How many images it holds.
+    sparse
+        Its folder.
+    """
+
+    colmap_index: int
+    registered_images: int
+    sparse: Path
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ReconstructResult:
-    """What ``reconstruct`` made; the same as ``result.json``."""
+    """What ``reconstruct`` made; the same as ``result.json``.
+
+    Attributes
+    ----------
+    workspace
+        The output folder.
+    models
+        The one with the most images first.
+    fragments
+        What was left out.
+    frames, keypoints
+        What happened to each frame, and to the keypoints of each image.
+    seconds
+        By step.
+    imaging
+        What was decided beforehand about frames and keypoints, and why.
+    selection
+        Which frames were used, and why; ``None`` for an existing project.
+    project_metric
+        The whole project in metres, where an existing one was given and not every scale was refused.
+    report
+        The page for reading; ``None`` where it failed, for which ``log.txt`` has the reason.
+    unchanged
+        Whether there was nothing to do: the folder held this result already.
+    """
 
     workspace: Workspace
     models: tuple[ModelResult, ...]
-    frames: tuple[FrameRecord, ...]
+    fragments: tuple[Fragment, ...] = ()
+    frames: tuple[FrameRecord, ...] = ()
+    keypoints: KeypointRecords = field(default_factory=KeypointRecords)
     seconds: dict[str, float]
     imaging: ImagingPlan = field(default_factory=ImagingPlan)
-    """What was done to frames and keypoints beforehand, and why."""
     selection: Selection | None = None
-    """Which frames were used, and why; ``None`` for an existing project."""
     project_metric: Path | None = None
-    """The whole project in metres, where an existing one was given and not every scale was refused."""
     report: Path | None = None
-    """The page for reading; ``None`` where it failed, for which ``log.txt`` has the reason."""
+    unchanged: bool = False
 
     @property
     def waiting(self) -> tuple[str, ...]:
@@ -89,24 +167,30 @@ class ReconstructResult:
         return failures[0] if len(failures) == len(checked) > 0 else 0
 
 
-def imaging_as_json(plan: ImagingPlan) -> dict[str, object]:
-    """What was done beforehand and why, without what concerns single frames."""
+def imaging_as_json(plan: ImagingPlan, rectified: Collection[str]) -> dict[str, object]:
+    """What was decided beforehand and why, without what concerns single frames; and whether any was rectified."""
     values = {key: value for key, value in plan.as_json().items() if key not in ("decisions", "parallaxes")}
+    values |= {"rectify": bool(rectified), "rolling_shutter": shutter_note(plan, rectified)}
     return {**values, "frames_with_translation": len(plan.parallaxes)}
 
 
-def frame_as_json(record: FrameRecord, plan: ImagingPlan) -> dict[str, object]:
+def shutter_note(plan: ImagingPlan, rectified: Collection[str]) -> str:
+    """What was done about a rolling shutter, in words, by the images whose keypoints were rectified."""
+    if rectified and not plan.rectify:
+        return f"{plan.rolling_shutter_note}, which rectified keypoints of {len(rectified)} images"
+    if plan.rectify and not rectified:
+        return "no keypoints are rectified: the gyroscope covers the whole readout of no image"
+    return plan.rolling_shutter_note
+
+
+def frame_as_json(record: FrameRecord, plan: ImagingPlan, rectified: Collection[str]) -> dict[str, object]:
     """What happened to one frame."""
-    treatment = record.treatment
-    rectified = record.action != "dropped" and any(stage.covers(record.name) for stage in plan.keypoint_stages())
     return {
         "name": record.name,
         "action": record.action,
-        "reason": plan.deblur_note if treatment is None else treatment.reason,
-        "blur_px": None if treatment is None else treatment.blur_px,
-        "kept_share": None if treatment is None else treatment.kept_share,
-        "extent_factor": None if treatment is None else treatment.extent_factor,
-        "rectified": rectified,
+        "reason": record.reason or (plan.deblur_note if record.action == "passed" else f"{record.action} by a stage"),
+        **{key: record.value(key) for key in ("blur_px", "kept_share", "extent_factor")},
+        "rectified": record.name in rectified,
     }
 
 
@@ -130,7 +214,7 @@ def result_as_json(result: ReconstructResult, capture: Capture) -> dict[str, obj
     """The content of ``result.json``."""
     import pycolmap
 
-    root, plan = result.workspace.root, result.imaging
+    root, plan, rectified = result.workspace.root, result.imaging, result.keypoints.rectified()
 
     def relative(path: Path | None) -> str | None:
         if path is None:
@@ -144,6 +228,7 @@ def result_as_json(result: ReconstructResult, capture: Capture) -> dict[str, obj
         "models": [
             {
                 "index": model.index,
+                "colmap_index": model.colmap_index,
                 **model.summary,
                 "sparse": relative(model.sparse),
                 "sparse_metric": relative(model.sparse_metric),
@@ -153,15 +238,17 @@ def result_as_json(result: ReconstructResult, capture: Capture) -> dict[str, obj
                 if plan.view is None
                 else _change(plan.view.calibration, model.scale.calibration),
                 "validation": _validation_as_json(model.validation),
-                "readout_translation": None if model.readout is None else asdict(model.readout),
+                "readout_translation": next((t.values for t in model.treatments if t.stage == "readout"), None),
+                "treatments": [asdict(treatment) for treatment in model.treatments],
                 "dense": model.dense and model.dense.as_json(root),
             }
             for model in result.models
         ],
+        "fragments": [{**asdict(fragment), "sparse": relative(fragment.sparse)} for fragment in result.fragments],
         "project_metric": relative(result.project_metric),
         "waiting": bool(result.waiting),
         "selection": result.selection and result.selection.as_json(),
-        "imaging": imaging_as_json(plan),
-        "frames": [frame_as_json(record, plan) for record in result.frames],
+        "imaging": imaging_as_json(plan, rectified),
+        "frames": [frame_as_json(record, plan, rectified) for record in result.frames],
         "seconds": result.seconds,
     }

@@ -11,12 +11,7 @@ import numpy as np
 
 from colmap_inertial.align import AlignOptions, align_camera_imu
 from colmap_inertial.errors import FormatError, InertialError, OutputError, OutputExistsError
-from colmap_inertial.io.calibration import (
-    SHARED_CLOCK_OFFSET_S,
-    for_another_recording,
-    read_calibration,
-    write_calibration,
-)
+from colmap_inertial.io.calibration import for_another_recording, largest_offset_s, read_calibration, write_calibration
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.files import read_json, write_json
 from colmap_inertial.io.frames import read_frame_times
@@ -27,7 +22,7 @@ from colmap_inertial.model import apply_similarity, find_models, is_metric, read
 from colmap_inertial.options import ScaleOptions, ValidateOptions
 from colmap_inertial.scale import estimate_scale, first_seconds, gravity_at_latitude_m_s2
 from colmap_inertial.types import CameraImuCalibration, CameraTrajectory, ImuRecording, ScaleEstimate, Similarity
-from colmap_inertial.validate import Validation, parse_target, validate_model, write_pictures
+from colmap_inertial.validate import Validation, parse_target, validate_model, write_overlays
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +48,7 @@ class ScaleSource:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Recording:
+class TimedPoses:
     """A trajectory with its IMU recording; ``start_s`` is when the camera began, where frame times tell."""
 
     trajectory: CameraTrajectory
@@ -64,7 +59,7 @@ class Recording:
     notes: Sequence[str] = ()
 
 
-def load_source(source: ScaleSource) -> Recording:
+def load_source(source: ScaleSource) -> TimedPoses:
     """Read a trajectory and the IMU recording that ran along.
 
     Raises
@@ -101,7 +96,7 @@ def load_source(source: ScaleSource) -> Recording:
     calibration = captures[0].calibration if captures else None
     if source.calibration is not None:
         calibration = for_another_recording(read_calibration(source.calibration), shared_clock=shared)
-    return Recording(
+    return TimedPoses(
         trajectory=trajectory, imu=imu, calibration=calibration, shared_clock=shared, start_s=start_s, notes=notes
     )
 
@@ -149,7 +144,7 @@ def align_source(source: ScaleSource, out: Path) -> CameraImuCalibration:
     """
     check_output(out, [source.source, source.imu, source.frame_times])
     recording = load_source(source)
-    options = AlignOptions(max_offset_s=SHARED_CLOCK_OFFSET_S if recording.shared_clock else None)
+    options = AlignOptions(max_offset_s=largest_offset_s(recording.shared_clock))
     found = align_camera_imu(recording.trajectory, recording.imu, prior=recording.calibration, options=options)
     write_calibration(out, found)
     return found
@@ -187,8 +182,8 @@ def scale_source(
     trajectory = recording.trajectory
     if first_s is not None:
         trajectory = first_seconds(trajectory, first_s, start_s=recording.start_s)
-    if recording.shared_clock and options.max_offset_s is None:
-        options = dataclasses.replace(options, max_offset_s=SHARED_CLOCK_OFFSET_S)
+    limit_s = largest_offset_s(recording.shared_clock, options.max_offset_s)
+    options = dataclasses.replace(options, max_offset_s=limit_s)
     estimate = estimate_scale(trajectory, recording.imu, calibration=recording.calibration, options=options)
     notes = (*estimate.reasons, *recording.imu.repairs, *recording.notes)
     estimate = dataclasses.replace(estimate, reasons=notes)
@@ -252,5 +247,5 @@ def validate_source(
     if json is not None:
         write_json(json, result.as_json())
     if pictures is not None:
-        write_pictures(result, images, pictures)
+        write_overlays(result, images, pictures)
     return result

@@ -23,3 +23,14 @@ def bilinear(grid: NDArray[Any], rows: Array, columns: Array) -> NDArray[Any]:
         here = grid.take(first, axis=axis)
         grid = here + part * (grid.take(following, axis=axis) - here)
     return grid
+
+
+def between_nodes(nodes: NDArray[Any], at: Array) -> Array:
+    """Bilinear values at (..., 2) fractional columns and rows of a (Gy, Gx, C) grid; beyond it, the edge's."""
+    rows, columns = nodes.shape[:2]
+    x, y = np.clip(at[..., 0], 0, columns - 1), np.clip(at[..., 1], 0, rows - 1)
+    j, i = np.minimum(x.astype(np.intp), columns - 2), np.minimum(y.astype(np.intp), rows - 2)
+    t, s = (x - j)[..., None], (y - i)[..., None]
+    upper = nodes[i, j] * (1 - t) + nodes[i, j + 1] * t
+    lower = nodes[i + 1, j] * (1 - t) + nodes[i + 1, j + 1] * t
+    return np.asarray(upper * (1 - s) + lower * s)

@@ -57,12 +57,6 @@ def blur_spectrum(extent_px: float, frequency: Array) -> Array:
     return np.sinc(extent_px * frequency)
 
 
-def wiener_spectrum(extent_px: float, frequency: Array, prior: Prior) -> Array:
-    """Transfer function of the unlimited Wiener filter."""
-    transfer = blur_spectrum(extent_px, frequency)
-    return np.asarray(transfer / (transfer**2 + prior.eps + prior.alpha * 4 * np.sin(np.pi * frequency) ** 2))
-
-
 @lru_cache(maxsize=4096)
 def optimal_taps(extent_px: float, prior: Prior, reach: float = REACH) -> Array:
     """Weights of the best filter that reaches ``ceil(reach extent_px) + 1`` pixels to either side.

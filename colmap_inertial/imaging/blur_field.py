@@ -25,7 +25,7 @@ class BlurField:
         ``j step_px``. The last nodes lie on or beyond the last row and column.
     vector_px
         (Gy, Gx, 2) float32 blur vectors (x, y) at the nodes, px: the end of the segment minus its beginning.
-        Between nodes the field is bilinear. A vector and its negative blur alike.
+        Between nodes the field is bilinear. A vector and its negative are the same blur.
     """
 
     width: int

@@ -1,15 +1,15 @@
 """What an image itself says about its motion blur: does it bear out the blur that the gyroscope predicts?
 
-A picture smeared by L pixels along a direction has a spectrum with zeros every 1/L, and therefore a dip in its
+An image smeared by L pixels along a direction has a spectrum with zeros every 1/L, and therefore a dip in its
 cepstrum (the inverse transform of the logarithm of its power spectrum) at that lag, in that direction and in no
-other. Tiles of the picture are compared at lags relative to the blur predicted for each of them, so that the whole
-picture, and many pictures of one recording, add up. The cepstrum of blurred pictures: Rom, "On the cepstrum of
+other. Tiles of the image are compared at lags relative to the blur predicted for each of them, so that the whole
+image, and many images of one recording, add up. The cepstrum of blurred images: Rom, "On the cepstrum of
 two-dimensional functions" (IEEE Trans. Information Theory, 1975).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
@@ -20,7 +20,7 @@ from colmap_inertial.types import Array
 
 #: Lags as factors of the predicted extent, and directions against the predicted one.
 FACTORS = np.arange(0.6, 1.5001, 0.05)
-TURNS_RAD = np.radians(np.arange(0.0, 180.0, 15.0))
+DIRECTIONS_RAD = np.radians(np.arange(0.0, 180.0, 15.0))
 #: Tiles are at least so large, and so many times the blur's length.
 _SMALLEST_TILE_PX, _TILE_BLURS = 64, 2.9
 #: Images with longer blur are looked at in half the size, a quarter and so on.
@@ -46,8 +46,8 @@ class BlurEvidence:
     Attributes
     ----------
     total, total_square
-        (FACTORS, TURNS_RAD) sums over tiles of the cepstrum at that factor of the predicted blur and that direction
-        from it, less its median over all directions; and of the squares.
+        (FACTORS, DIRECTIONS_RAD) sums over tiles of the cepstrum at that factor of the predicted blur and that
+        direction from it, less its median over all directions; and of the squares.
     mirrored, mirrored_square
         (FACTORS, 1) the same in the direction that a gyroscope with one axis flipped would predict.
     tiles
@@ -63,17 +63,11 @@ class BlurEvidence:
     @classmethod
     def nothing(cls) -> BlurEvidence:
         """Of no image."""
-        zero = np.zeros((len(FACTORS), len(TURNS_RAD)))
+        zero = np.zeros((len(FACTORS), len(DIRECTIONS_RAD)))
         return cls(total=zero, total_square=zero, mirrored=zero[:, :1], mirrored_square=zero[:, :1], tiles=0)
 
     def __add__(self, other: BlurEvidence) -> BlurEvidence:
-        return BlurEvidence(
-            total=self.total + other.total,
-            total_square=self.total_square + other.total_square,
-            mirrored=self.mirrored + other.mirrored,
-            mirrored_square=self.mirrored_square + other.mirrored_square,
-            tiles=self.tiles + other.tiles,
-        )
+        return BlurEvidence(**{f.name: getattr(self, f.name) + getattr(other, f.name) for f in fields(self)})
 
     @property
     def enough(self) -> bool:
@@ -82,7 +76,7 @@ class BlurEvidence:
 
     @cached_property
     def sigmas(self) -> Array:
-        """(FACTORS, TURNS_RAD) depth of the mean dip in its standard deviations: positive is a dip."""
+        """(FACTORS, DIRECTIONS_RAD) depth of the mean dip in its standard deviations: positive is a dip."""
         return self._depth(self.total, self.total_square)
 
     def _depth(self, total: Array, total_square: Array) -> Array:
@@ -146,10 +140,10 @@ def blur_evidence(image: NDArray[np.uint8] | NDArray[np.uint16], blur: BlurField
     smooth = np.exp(-2 * (np.pi * _SMOOTHING_PX * np.fft.fftfreq(tile)) ** 2).astype(np.float32)
     damped = logarithm * smooth[:, None] * smooth[: tile // 2 + 1]
     cepstra = irfft2(damped, s=(tile, tile))
-    values = _at_lags(np.asarray(cepstra), vectors, TURNS_RAD)
+    values = _at_lags(np.asarray(cepstra), vectors, DIRECTIONS_RAD)
     level = np.median(values[:, :, 2:-1], axis=2, keepdims=True)
     values -= level
-    mirrored = _at_lags(np.asarray(cepstra), vectors * [1, -1], TURNS_RAD[:1]) - level
+    mirrored = _at_lags(np.asarray(cepstra), vectors * [1, -1], DIRECTIONS_RAD[:1]) - level
     return BlurEvidence(
         total=values.sum(axis=0),
         total_square=(values**2).sum(axis=0),
@@ -164,7 +158,7 @@ def detail_fall(image: NDArray[np.uint8] | NDArray[np.uint16], blur: BlurField) 
 
     Returns
     -------
-    Natural logarithm of the powers' ratio: about -1 or less where a picture is blurred so; about 0 where it is sharp,
+    Natural logarithm of the powers' ratio: about -1 or less where an image is blurred so; about 0 where it is sharp,
     or blurred otherwise: then textures decide, and tiles are many. ``None`` where there are too few to tell.
     """
     found = _spectra(image, blur, _FEW_TILES)
@@ -249,10 +243,10 @@ def _fall(logarithm: NDArray[np.float32], vectors: Array) -> Array:
     return np.asarray((power * along).sum(1) / along.sum(1) - (power * across).sum(1) / across.sum(1))
 
 
-def _at_lags(cepstra: NDArray[np.float32], vectors: Array, turns_rad: Array) -> Array:
-    """(N, FACTORS, turns) values of (N, T, T) cepstra at the lags around (N, 2) blur vectors; bilinear."""
+def _at_lags(cepstra: NDArray[np.float32], vectors: Array, directions_rad: Array) -> Array:
+    """(N, FACTORS, directions) values of (N, T, T) cepstra at the lags around (N, 2) blur vectors; bilinear."""
     tile = cepstra.shape[1]
-    cosine, sine = np.cos(turns_rad), np.sin(turns_rad)
+    cosine, sine = np.cos(directions_rad), np.sin(directions_rad)
     along_x = vectors[:, 0, None] * cosine - vectors[:, 1, None] * sine
     along_y = vectors[:, 0, None] * sine + vectors[:, 1, None] * cosine
     x, y = (FACTORS[None, :, None] * v[:, None, :] for v in (along_x, along_y))
@@ -265,6 +259,3 @@ def _at_lags(cepstra: NDArray[np.float32], vectors: Array, turns_rad: Array) -> 
     rows = first + top * tile, first + (top + 1) % tile * tile
     upper, lower = (flat[row + left] * (1 - part_x) + flat[row + right] * part_x for row in rows)
     return np.asarray(upper * (1 - part_y) + lower * part_y, dtype=np.float64)
-
-
-__all__ = ["FACTORS", "TURNS_RAD", "BlurEvidence", "blur_evidence", "detail_fall"]

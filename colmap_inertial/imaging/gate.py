@@ -22,7 +22,7 @@ from colmap_inertial.imaging.psf import PredictedBlur
 from colmap_inertial.types import Array
 
 Code = TypeVar("Code", np.uint8, np.uint16)
-Picture = NDArray[np.float32]
+Light = NDArray[np.float32]
 Action = Literal["keep", "deblur", "drop"]
 
 
@@ -40,7 +40,7 @@ class GateOptions:
     """Longest pause that leaving out frames may open."""
 
     bridge_deg: float = 10.0
-    """Largest turn of the camera that leaving out frames may open."""
+    """Largest rotation of the camera that leaving out frames may open."""
 
     min_support: float = 4.0
     """Standard deviations by which one frame alone must show the predicted blur."""
@@ -97,7 +97,7 @@ def decide(
     width, height
         Size of the images.
     motion
-        Tells how far the camera turned across a gap; without it, only the pause counts.
+        Tells how far the camera rotated across a gap; without it, only the pause counts.
     options
         Thresholds.
     """
@@ -213,7 +213,7 @@ def deblur_gated(
 _CORRECTED_FROM, _CLEAR_SUPPORT = 0.1, 7.0
 #: Blur this long must show in a frame with texture.
 MUST_SHOW_PX = 8.0
-#: Blur takes at least this from the logarithm of the power along it; sharp pictures are at 0 +- 0.2.
+#: Blur takes at least this from the logarithm of the power along it; sharp images are at 0 +- 0.2.
 _LEAST_FALL = -0.35
 #: Standard deviations by which all frames together must show short blur: of wrong gyroscopes, none reached three.
 _TOGETHER_SUPPORT = 4.5
@@ -250,8 +250,8 @@ class RecordingVerdict:
 def judge_recording(evidence: Iterable[BlurEvidence], options: GateOptions | None = None) -> RecordingVerdict:
     """Judge gyroscope, axes, clock offset and exposure by several frames at once.
 
-    The median decides: a wrong axis still fits the frames in which it hardly turns. Where single frames say too little,
-    as short blurs do, all together decide, against what they say of a flipped axis.
+    The median decides: a wrong axis still fits the frames in which it hardly rotates. Where single frames say too
+    little, as short blurs do, all together decide, against what they say of a flipped axis.
 
     Parameters
     ----------
@@ -357,7 +357,7 @@ def keep_sharp(image: NDArray[Code], deblurred: NDArray[Code], blur: BlurField) 
     size = (max(1, width // 2), max(1, height // 2))
     codes = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     small = cv2.resize(codes, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-    grey: Picture = np.asarray(cv2.GaussianBlur(small, (0, 0), 0.5) / np.float32(np.iinfo(image.dtype).max))
+    grey: Light = np.asarray(cv2.GaussianBlur(small, (0, 0), 0.5) / np.float32(np.iinfo(image.dtype).max))
     nearest = [
         np.minimum(np.rint(np.arange(n) * 2 / blur.step_px).astype(np.intp), nodes - 1)
         for n, nodes in zip(size[::-1], blur.vector_px.shape, strict=False)
@@ -372,7 +372,7 @@ def keep_sharp(image: NDArray[Code], deblurred: NDArray[Code], blur: BlurField) 
     change = np.asarray(np.abs(ends[0] - ends[1]), dtype=np.float32)
     side = _BLOCK_PX // 2
 
-    def blocks(values: Picture, pick: Callable[..., Picture]) -> Picture:
+    def blocks(values: Light, pick: Callable[..., Light]) -> Light:
         padded = cv2.copyMakeBorder(values, 0, rows * side - size[1], 0, columns * side - size[0], cv2.BORDER_REPLICATE)
         # lines first: whole rows at a time
         return pick(pick(padded.reshape(rows, side, -1), axis=1).reshape(rows, columns, side), axis=2)
@@ -395,15 +395,3 @@ def keep_sharp(image: NDArray[Code], deblurred: NDArray[Code], blur: BlurField) 
             part = weight[band] if image.ndim == 2 else weight[band, :, None]
             out[band] = np.rint(deblurred[band] + part * (image[band].astype(np.float32) - deblurred[band]))
     return out, share
-
-
-__all__ = [
-    "FrameDecision",
-    "GateOptions",
-    "GatedFrame",
-    "RecordingVerdict",
-    "deblur_gated",
-    "decide",
-    "judge_recording",
-    "keep_sharp",
-]

@@ -1,4 +1,4 @@
-"""What turns a camera while it exposes: the gyroscope on the camera's clock, and the order in which lines expose."""
+"""How a camera rotates while it exposes: the gyroscope on the camera's clock, and the order in which lines expose."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.geometry import matrix_from_quat, quat_conjugate, quat_multiply, quat_rotate
+from colmap_inertial.geometry import matrix_from_quat, quat_conjugate, quat_multiply, quat_rotate, so3_log
 from colmap_inertial.gyro import GyroPath
 from colmap_inertial.types import (
     Array,
@@ -37,9 +37,7 @@ class GyroCamera:
     offset_s: float
 
     @classmethod
-    def of(
-        cls, imu: ImuRecording, calibration: CameraImuCalibration, *, camera_epoch_ns: int, max_gap_s: float = 0.1
-    ) -> GyroCamera:
+    def of(cls, imu: ImuRecording, calibration: CameraImuCalibration, *, camera_epoch_ns: int) -> GyroCamera:
         """The camera of a recording.
 
         Parameters
@@ -50,11 +48,9 @@ class GyroCamera:
             Rotation, time offset and gyroscope bias.
         camera_epoch_ns
             Epoch of the frame times (``FrameTiming.epoch_ns``).
-        max_gap_s
-            A longer pause between gyroscope samples is a gap.
         """
         return cls(
-            path=GyroPath(imu.gyro_t_s, imu.gyro_rad_s, calibration.gyro_bias_rad_s, max_gap_s=max_gap_s),
+            path=GyroPath(imu.gyro_t_s, imu.gyro_rad_s, calibration.gyro_bias_rad_s),
             cam_from_imu_xyzw=calibration.cam_from_imu_xyzw,
             offset_s=calibration.gyro_time_offset_s + (imu.epoch_ns - camera_epoch_ns) * 1e-9,
         )
@@ -69,6 +65,11 @@ class GyroCamera:
         start_from_imu, _ = self.path.at(t_s.ravel() - self.offset_s)
         start_from_cam = quat_multiply(start_from_imu, quat_conjugate(self.cam_from_imu_xyzw))
         return matrix_from_quat(start_from_cam).reshape(*t_s.shape, 3, 3)
+
+    def turn_rad(self, t_s: Array) -> Array:
+        """(N-1, 3) rotation vectors ``before_from_after`` between consecutive ones of (N,) times, camera frame."""
+        looking = self.start_from_cam(t_s)
+        return so3_log(np.swapaxes(looking[:-1], 1, 2) @ looking[1:])
 
     def rate_in_cam_rad_s(self, t_s: Array) -> Array:
         """(N, 3) angular velocities at (N,) times, camera frame."""
@@ -147,6 +148,3 @@ class FrameShutter:
         if reference:
             begin_s, end_s = min(begin_s, self.reference_s()), max(end_s, self.reference_s())
         return bool(motion.covers(np.array([begin_s]), np.array([end_s]))[0])
-
-
-__all__ = ["FrameShutter", "GyroCamera"]

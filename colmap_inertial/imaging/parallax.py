@@ -1,6 +1,6 @@
-"""What a camera's translation does to its picture: the part of the blur that no gyroscope feels.
+"""What a camera's translation does to its image: the part of the blur that no gyroscope measures.
 
-Close to things, a hand's translation blurs as much as its turning. It takes the camera's velocity and the depth of
+Close to things, a hand's translation blurs as much as its rotation. It takes the camera's velocity and the depth of
 what it sees, from a model of some sort; the lengths' unit is of no matter, as only velocity by depth counts.
 """
 
@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from colmap_inertial.imaging._bilinear import between_nodes
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.types import Array, Projector
 
@@ -62,14 +63,8 @@ class Parallax:
 
     def rate_at(self, x_px: Array, y_px: Array) -> Array:
         """(len(y), len(x), 3) velocity times inverse depth at a grid of image points (COLMAP's coordinates), 1/s."""
-        (i, s), (j, t) = (
-            _place(coordinate, self.step_px, size)
-            for coordinate, size in zip((y_px, x_px), self.inverse_depth.shape, strict=True)
-        )
-        s = s[:, None]
-        upper = self.inverse_depth[i][:, j] * (1 - t) + self.inverse_depth[i][:, j + 1] * t
-        lower = self.inverse_depth[i + 1][:, j] * (1 - t) + self.inverse_depth[i + 1][:, j + 1] * t
-        return np.asarray((upper * (1 - s) + lower * s)[..., None] * self.velocity_in_cam)
+        at = (np.stack(np.meshgrid(x_px, y_px), axis=-1) - 0.5) / self.step_px
+        return between_nodes(self.inverse_depth[..., None], at) * self.velocity_in_cam
 
     def as_json(self) -> dict[str, object]:
         """In JSON types; the unit of length becomes the median depth, and four digits are kept."""
@@ -86,13 +81,6 @@ class Parallax:
     def from_json(cls, values: Mapping[str, Any]) -> Parallax:
         """What :meth:`as_json` made."""
         return cls(**values)
-
-
-def _place(coordinate: Array, step_px: int, nodes: int) -> tuple[np.ndarray[tuple[int], np.dtype[np.intp]], Array]:
-    """The nodes before coordinates, and how far it is to the next ones."""
-    at = np.clip((np.asarray(coordinate) - 0.5) / step_px, 0, nodes - 1)
-    before = np.minimum(at.astype(np.intp), nodes - 2)
-    return before, at - before
 
 
 def parallax_from_points(
@@ -145,6 +133,3 @@ def parallax_from_points(
         velocity_in_cam=np.asarray(velocity_in_cam),
         inverse_depth=smooth.reshape(rows, columns).astype(np.float32),
     )
-
-
-__all__ = ["Parallax", "parallax_from_points"]

@@ -4,19 +4,67 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from colmap_inertial.errors import NotObservableError
+from colmap_inertial.gyro import on_camera_rate
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.parallax import Parallax
-from colmap_inertial.types import Array, FrameTiming, Projector
+from colmap_inertial.imaging.rolling_shutter import rays
+from colmap_inertial.types import Array, CameraImuCalibration, FrameTiming, ImuRecording, Projector
 
 #: Nodes at which the blur of a frame is predicted, and frames predicted together.
 _PREDICTED_COLUMNS, _PREDICTED_ROWS, _CHUNK = 7, 5, 512
-#: A picture that moves with the shutter would be blurred without end; what is felt of it stays finite.
+#: An image that moves with the shutter would be blurred without end; its blur is taken as finite.
 _LEAST_STRETCH = 0.2
+
+
+class Camera(Projector, Protocol):
+    """Intrinsics that know the size of their images; ``pycolmap.Camera`` is one."""
+
+    @property
+    def width(self) -> int: ...
+
+    @property
+    def height(self) -> int: ...
+
+
+def frame_blur(
+    name: str, imu: ImuRecording, calibration: CameraImuCalibration, timing: FrameTiming, camera: Camera
+) -> BlurField:
+    """The motion blur of one frame of a recording, which :func:`~colmap_inertial.imaging.wiener.deblur` undoes.
+
+    For many frames, make the :class:`GyroCamera` once and call :func:`blur_field` for each.
+
+    Parameters
+    ----------
+    name
+        Of the frame, as in ``timing``.
+    imu
+        Its gyroscope.
+    calibration
+        Rotation, time offset and gyroscope bias.
+    timing
+        Of all frames, with exposure times; a readout that is unknown counts as none.
+    camera
+        Intrinsics (``model.colmap_camera`` makes them of a :class:`~colmap_inertial.types.CameraModel`).
+
+    Raises
+    ------
+    ValueError
+        Where ``timing`` holds no such frame.
+    NotObservableError
+        As :func:`blur_field`.
+    """
+    if name not in timing.names:
+        raise ValueError(f"{name}: no such frame among the {len(timing.names)} of the timing")
+    imu = on_camera_rate(imu, calibration, camera_epoch_ns=timing.epoch_ns)
+    motion = GyroCamera.of(imu, calibration, camera_epoch_ns=timing.epoch_ns)
+    shutter = FrameShutter.of(timing, timing.names.index(name), width=camera.width, height=camera.height)
+    return blur_field(motion, camera, shutter)
 
 
 def blur_field(
@@ -44,7 +92,7 @@ def blur_field(
     shutter
         When the lines of this frame are exposed.
     parallax
-        Velocity and depths; without it, the camera only turns.
+        Velocity and depths; without it, the camera only rotates.
     step_px
         Distance of the field's nodes. At 16 px the field errs by some thousandths of a pixel between them.
 
@@ -60,7 +108,8 @@ def blur_field(
     rows, columns = BlurField.nodes(shutter.width, shutter.height, step_px)
     x, y = step_px * np.arange(float(columns)) + 0.5, step_px * np.arange(float(rows)) + 0.5
     rates = None if parallax is None else parallax.rate_at(x, y)[None]
-    vectors = _vectors(motion, camera, shutter, np.array([shutter.t_s]), np.array([shutter.exposure_s]), x, y, rates)[0]
+    one = _Exposures(shutter, np.array([shutter.t_s]), np.array([shutter.exposure_s]))
+    vectors = _vectors(motion, camera, one, x, y, rates)[0]
     return BlurField(
         width=shutter.width, height=shutter.height, vector_px=_filled(vectors).astype(np.float32), step_px=step_px
     )
@@ -126,7 +175,8 @@ def predicted_blur_px(
                 for rate, i in zip(rates, part, strict=True):
                     if timing.names[i] in parallaxes:
                         rate[:] = parallaxes[timing.names[i]].rate_at(x, y)
-                vectors = _vectors(motion, camera, shutter, timing.t_s[part], timing.exposure_s[part], x, y, rates)
+                exposures = _Exposures(shutter, timing.t_s[part], timing.exposure_s[part])
+                vectors = _vectors(motion, camera, exposures, x, y, rates)
                 lengths = np.hypot(vectors[..., 0], vectors[..., 1]).reshape(len(part), -1)
                 px[part] = np.nanpercentile(lengths, 90, axis=1)
     return PredictedBlur(names=timing.names, px=px, reasons=tuple(reasons))
@@ -139,35 +189,37 @@ _NO_EXPOSURE = (
 _NOT_COVERED = "the gyroscope does not cover the exposure of this frame, or pauses in it"
 
 
+@dataclass(frozen=True, eq=False)
+class _Exposures:
+    """Frames that have ``shutter``'s readout: (F,) when they begin to expose, and for how long."""
+
+    shutter: FrameShutter
+    t_s: Array
+    exposure_s: Array
+
+
 def _vectors(
-    motion: GyroCamera,
-    camera: Projector,
-    shutter: FrameShutter,
-    t_s: Array,
-    exposure_s: Array,
-    x: Array,
-    y: Array,
-    rates: Array | None,
+    motion: GyroCamera, camera: Projector, frames: _Exposures, x: Array, y: Array, rates: Array | None
 ) -> Array:
-    """(F, len(y), len(x), 2) blur vectors of F frames that have ``shutter``'s readout, at the nodes of a grid.
+    """(F, len(y), len(x), 2) blur vectors of F frames, at the nodes of a grid.
 
     ``rates``: (F, len(y), len(x), 3) velocity times inverse depth, 1/s.
     """
+    shutter, exposure_s = frames.shutter, frames.exposure_s
     nodes = np.stack(np.meshgrid(x, y), axis=-1)
-    rays = np.asarray(camera.cam_from_img(nodes.reshape(-1, 2)))[:, :2].reshape(nodes.shape)
-    rays = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=-1)
+    directions = rays(camera, nodes.reshape(-1, 2)).reshape(*nodes.shape[:2], 3)
     step_x, step_y = shutter.line_step_s
     by_column = shutter.readout_direction in ("right", "left")
     lines = nodes[0] if by_column else nodes[:, 0]
     # mid-exposure of each node's line against the start of its frame
     delay_s = shutter.middle_s(lines) - shutter.t_s - 0.5 * (shutter.exposure_s or 0.0)
-    middle_s = t_s[:, None] + 0.5 * exposure_s[:, None] + delay_s
+    middle_s = frames.t_s[:, None] + 0.5 * exposure_s[:, None] + delay_s
     half_s = 0.5 * exposure_s[:, None]
     middle = np.swapaxes(motion.start_from_cam(middle_s), -1, -2)
     ends = []
     for sign in (-1, 1):
         turn = middle @ motion.start_from_cam(middle_s + sign * half_s)
-        seen = np.einsum("fxij,yxj->fyxi" if by_column else "fyij,yxj->fyxi", turn, rays)
+        seen = np.einsum("fxij,yxj->fyxi" if by_column else "fyij,yxj->fyxi", turn, directions)
         if rates is not None:
             seen = seen + sign * half_s[:, None, :, None] * rates
         ends.append(np.asarray(camera.img_from_cam(seen.reshape(-1, 3))).reshape(*seen.shape[:3], 2))
@@ -191,6 +243,3 @@ def _filled(vectors: Array) -> Array:
         nearest = known[np.argmin(np.sum((known - node) ** 2, axis=1))]
         out[tuple(node)] = vectors[tuple(nearest)]
     return out
-
-
-__all__ = ["PredictedBlur", "blur_field", "predicted_blur_px"]

@@ -15,7 +15,7 @@ from colmap_inertial.types import Array, Projector
 
 Pixel = TypeVar("Pixel", np.uint8, np.uint16)
 
-#: Each round of the fixed-point iteration gains one to three digits: by how much less the picture moves within a
+#: Each round of the fixed-point iteration gains one to three digits: by how much less the image moves within a
 #: readout than the shutter does.
 _MOST_ROUNDS, _SETTLED_PX = 12, 1e-3
 
@@ -99,8 +99,7 @@ def rectify_image(
     if shutter.readout_s == 0:
         return image.copy(), np.ones((height, width), dtype=np.bool_)
     shift = _from_reference(motion, camera, shutter, step_px)
-    map_x = spread_nodes(shift[..., 0], width, height, step_px) + np.arange(width, dtype=np.float32)
-    map_y = spread_nodes(shift[..., 1], width, height, step_px) + np.arange(height, dtype=np.float32)[:, None]
+    map_x, map_y = sampling_maps(shift, width, height, step_px)
     covered = (map_x >= -0.5) & (map_x <= width - 0.5) & (map_y >= -0.5) & (map_y <= height - 0.5)
     out = cv2.remap(image, map_x, map_y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     out[~covered] = 0
@@ -114,7 +113,8 @@ def _check_covered(motion: GyroCamera, shutter: FrameShutter) -> None:
         )
 
 
-def _rays(camera: Projector, points: Array) -> Array:
+def rays(camera: Projector, points: Array) -> Array:
+    """(N, 3) directions of (N, 2) pixels in the camera frame, z = 1."""
     xy = np.asarray(camera.cam_from_img(points))[:, :2]
     return np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
 
@@ -123,23 +123,47 @@ def _to_reference(points: Array, motion: GyroCamera, camera: Projector, shutter:
     """(N, 2) where (N, 2) points of the frame are at the reference instant."""
     reference = motion.start_from_cam(np.array(shutter.reference_s()))
     seen = motion.start_from_cam(shutter.middle_s(points))
-    turned = np.einsum("ji,njk,nk->ni", reference, seen, _rays(camera, points))
-    return np.asarray(camera.img_from_cam(turned))
+    rotated = np.einsum("ji,njk,nk->ni", reference, seen, rays(camera, points))
+    return np.asarray(camera.img_from_cam(rotated))
 
 
 def _from_reference(motion: GyroCamera, camera: Projector, shutter: FrameShutter, step_px: int) -> Array:
     """(Gy, Gx, 2) what to add to a pixel at the reference instant to get to the frame's, at the nodes of a grid."""
-    rows, columns = BlurField.nodes(shutter.width, shutter.height, step_px)
-    nodes = np.stack(np.meshgrid(np.arange(float(columns)), np.arange(float(rows))), axis=-1).reshape(-1, 2)
-    target = colmap_px_from_opencv(step_px * nodes)
-    directions = _rays(camera, target) @ motion.start_from_cam(np.array(shutter.reference_s())).T
-    source = target
+    nodes = step_px * grid_nodes(*BlurField.nodes(shutter.width, shutter.height, step_px))
+    target = colmap_px_from_opencv(nodes.reshape(-1, 2))
+    directions = rays(camera, target) @ motion.start_from_cam(np.array(shutter.reference_s())).T
+    source = seen_by_lines(directions, target, motion, camera, shutter)
+    return np.asarray(source - target).reshape(nodes.shape)
+
+
+def seen_by_lines(
+    directions: Array, start: Array, motion: GyroCamera, camera: Projector, shutter: FrameShutter
+) -> Array:
+    """(N, 2) where a frame has (N, 3) directions that do not move, each when its own line exposes.
+
+    By fixed-point iteration from (N, 2) pixels near them; directions are in the frame of ``GyroCamera.start_from_cam``.
+    """
+    found = start
     for _ in range(_MOST_ROUNDS):
-        then = motion.start_from_cam(shutter.middle_s(np.where(np.isfinite(source), source, target)))
-        before, source = source, np.asarray(camera.img_from_cam(np.einsum("nji,nj->ni", then, directions)))
-        if not (np.abs(source - before) > _SETTLED_PX).any():
+        then = motion.start_from_cam(shutter.middle_s(np.where(np.isfinite(found), found, start)))
+        before, found = found, np.asarray(camera.img_from_cam(np.einsum("nji,nj->ni", then, directions)))
+        if not (np.abs(found - before) > _SETTLED_PX).any():
             break
-    return np.asarray(source - target).reshape(rows, columns, 2)
+    return found
+
+
+def grid_nodes(rows: int, columns: int) -> Array:
+    """(rows, columns, 2) column and row of each node."""
+    return np.stack(np.meshgrid(np.arange(float(columns)), np.arange(float(rows))), axis=-1)
+
+
+def sampling_maps(
+    shift_px: Array, width: int, height: int, step_px: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(H, W) columns and rows for ``cv2.remap``: each pixel's own and the shift there, given at (Gy, Gx, 2) nodes."""
+    x, y = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)[:, None]
+    spread_x, spread_y = (spread_nodes(shift_px[..., i], width, height, step_px) for i in (0, 1))
+    return spread_x + x, spread_y + y
 
 
 def spread_nodes(nodes: Array, width: int, height: int, step_px: float) -> NDArray[np.float32]:
@@ -163,6 +187,3 @@ def _reshaped(columns: Array, derivative: Array) -> Array:
     along = np.einsum("nij,nj->ni", derivative, np.stack([np.cos(angle), np.sin(angle)], axis=1))
     size = np.sqrt(np.abs(np.linalg.det(derivative)))
     return np.stack([scale * size, np.arctan2(along[:, 1], along[:, 0])], axis=1)
-
-
-__all__ = ["rectify_image", "rectify_keypoints", "spread_nodes"]

@@ -1,8 +1,8 @@
 """Which frames of a video to use: the least blurred of each stretch that brings enough baseline.
 
-A video is looked at in small grey pictures. Corners are followed from picture to picture; what they moved beyond the
+A video is looked at in small grey images. Corners are followed from image to image; what they moved beyond the
 camera's rotation is the baseline. From the last chosen frame on, a window closes when the baseline is enough, when the
-picture has moved so far that matching would suffer, or when it has lasted long enough; the least blurred frame of its
+image has moved so far that matching would suffer, or when it has lasted long enough; the least blurred frame of its
 second half is the next one chosen.
 """
 
@@ -21,10 +21,10 @@ from colmap_inertial.types import Array, Projector
 Grey = NDArray[np.uint8]
 #: Why a window was closed. start: the first frames; still: it lasted, and nothing moved; end: the last frames.
 Closing = Literal["start", "baseline", "motion", "interval", "still", "end"]
-#: By what the frames of a window were ranked: the blur or angular speed that the gyroscope predicts, or the picture.
+#: By what the frames of a window were ranked: the blur or angular speed that the gyroscope predicts, or the image.
 Ranking = Literal["blur", "speed", "sharpness"]
 
-#: Pictures are followed at this size; so many corners, and how far from there and back they may end, px of it.
+#: Images are followed at this size; so many corners, and how far from there and back they may end, px of it.
 _FOLLOWED_PX, _CORNERS, _ROUND_TRIP_PX = 480, 200, 0.7
 #: New corners are looked for when fewer than this share are left; fewer corners than this tell nothing.
 _REFILL, _FEWEST = 0.7, 12
@@ -33,7 +33,7 @@ _ROUNDS = 6
 
 @dataclass(frozen=True, kw_only=True)
 class WindowLimits:
-    """When a window closes. Lengths are shares of the picture's longer side, as medians over the picture.
+    """When a window closes. Lengths are shares of the image's longer side, as medians over the image.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class WindowLimits:
     motion, overlap
         All motion, and the share of corners that must stay in view.
     still, still_s
-        A picture that moved less than this waits so long.
+        An image that moved less than this waits so long.
     """
 
     shortest_s: float
@@ -65,7 +65,7 @@ class Ranked:
     t_s
         (L,) times, increasing.
     blur
-        (L,) what the frames are ranked by, the less the better; NaN where it is unknown: there, pictures are ranked.
+        (L,) what the frames are ranked by, the less the better; NaN where it is unknown: there, images are ranked.
     ranking
         What ``blur`` is.
     sharp_below
@@ -92,11 +92,11 @@ class Chosen:
     closed_by, ranked_by
         See :data:`Closing` and :data:`Ranking`.
     blur
-        By which it was ranked; NaN for pictures.
+        By which it was ranked; NaN for images.
     first, last
         The frames that it was chosen from.
     baseline, motion
-        Since the frame chosen before, shares of the picture's longer side; NaN where unknown.
+        Since the frame chosen before, shares of the image's longer side; NaN where unknown.
     """
 
     place: int
@@ -111,7 +111,7 @@ class Chosen:
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """A picture that was looked at: its corners by number, in shares of the longer side, and its sharpness."""
+    """An image that was looked at: its corners by number, in shares of the longer side, and its sharpness."""
 
     place: int
     ids: NDArray[np.int64]
@@ -120,14 +120,14 @@ class _Seen:
 
 
 def choose_frames(
-    pictures: Iterable[Grey], ranked: Ranked, limits: WindowLimits, camera: Projector, *, width: int, height: int
+    images: Iterable[Grey], ranked: Ranked, limits: WindowLimits, camera: Projector, *, width: int, height: int
 ) -> Iterator[Chosen]:
     """Choose frames while looking at them; memory holds one window.
 
     Parameters
     ----------
-    pictures
-        Grey pictures of the frames to look at, in order, each as large as cheap.
+    images
+        Grey images of the frames to look at, in order, each as large as cheap.
     ranked
         What is known of them beforehand.
     limits
@@ -141,8 +141,8 @@ def choose_frames(
     compare = _Compare(ranked.start_from_cam, camera, width, height)
     seen: list[_Seen] = []
     anchored, checked = False, 1  # how many of ``seen`` are settled
-    for place, picture in enumerate(pictures):
-        seen.append(follower.step(place, picture))
+    for place, image in enumerate(images):
+        seen.append(follower.step(place, image))
         if not anchored:
             if ranked.t_s[place] - ranked.t_s[0] < limits.shortest_s - 1e-6:
                 continue
@@ -173,7 +173,7 @@ def _closing(anchor: _Seen, now: _Seen, ranked: Ranked, limits: WindowLimits, co
     if motion >= limits.motion or overlap < limits.overlap:
         return "motion"
     still = motion < limits.still
-    # the next picture would be too late
+    # the next image would be too late
     after = min(now.place + 1, len(ranked.t_s) - 1)
     if ranked.t_s[after] - ranked.t_s[anchor.place] > (limits.still_s if still else limits.longest_s) + 1e-6:
         return "still" if still else "interval"
@@ -210,7 +210,7 @@ def _best(seen: list[_Seen], ranked: Ranked, closing: Closing) -> Chosen:
 
 
 class _Follower:
-    """Follows corners from picture to picture by pyramidal Lucas-Kanade, and adds new ones where they got few."""
+    """Follows corners from image to image by pyramidal Lucas-Kanade, and adds new ones where they got few."""
 
     def __init__(self) -> None:
         self._before: Grey | None = None
@@ -218,15 +218,15 @@ class _Follower:
         self._ids = np.zeros(0, np.int64)
         self._next = 0
 
-    def step(self, place: int, picture: Grey) -> _Seen:
+    def step(self, place: int, image: Grey) -> _Seen:
         import cv2
 
-        sharpness = float(np.mean(np.square(cv2.Laplacian(picture, cv2.CV_32F))))
-        scale = _FOLLOWED_PX / max(picture.shape)
-        now = picture
+        sharpness = float(np.mean(np.square(cv2.Laplacian(image, cv2.CV_32F))))
+        scale = _FOLLOWED_PX / max(image.shape)
+        now = image
         if scale < 1:
-            size = (max(1, round(picture.shape[1] * scale)), max(1, round(picture.shape[0] * scale)))
-            now = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+            size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
+            now = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
         if self._before is not None and self._before.shape != now.shape:
             self._xy, self._ids = self._xy[:0], self._ids[:0]
         elif self._before is not None and len(self._xy):
@@ -267,7 +267,7 @@ class _Follower:
 
 
 class _Compare:
-    """Motion between two pictures by the corners that both show."""
+    """Motion between two images by the corners that both show."""
 
     def __init__(self, start_from_cam: Array, camera: Projector, width: int, height: int) -> None:
         self._start_from_cam = start_from_cam
@@ -275,7 +275,7 @@ class _Compare:
         self._long_px = float(max(width, height))
 
     def __call__(self, before: _Seen, now: _Seen) -> tuple[float, float, float]:
-        """Baseline, motion (NaN where a picture shows too few corners) and share of corners that stayed."""
+        """Baseline, motion (NaN where an image shows too few corners) and share of corners that stayed."""
         if len(before.ids) < _FEWEST:
             return np.nan, np.nan, 1.0
         _, i, j = np.intersect1d(before.ids, now.ids, assume_unique=True, return_indices=True)
@@ -293,8 +293,8 @@ class _Compare:
         now_from_before = self._start_from_cam[now.place].T @ self._start_from_cam[before.place]
         if not np.isfinite(now_from_before).all():
             now_from_before = _fitted_rotation(first, second)
-        turned = np.asarray(self._camera.img_from_cam(first @ now_from_before.T)) / self._long_px
-        return float(np.nanmedian(np.linalg.norm(now.xy[j][known] - turned, axis=1))), motion, overlap
+        rotated = np.asarray(self._camera.img_from_cam(first @ now_from_before.T)) / self._long_px
+        return float(np.nanmedian(np.linalg.norm(now.xy[j][known] - rotated, axis=1))), motion, overlap
 
 
 def _fitted_rotation(first: Array, second: Array) -> Array:
@@ -302,17 +302,14 @@ def _fitted_rotation(first: Array, second: Array) -> Array:
     a, b = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (first, second))
     rotation = np.eye(3)
     for _ in range(_ROUNDS):
-        turned = a @ rotation.T
-        residual = b - turned
+        rotated = a @ rotation.T
+        residual = b - rotated
         square = np.sum(residual**2, axis=1)
         weight = 1 / (1 + square / max(float(np.median(square)), 1e-12)) ** 2
-        jacobian = -skew(turned)
+        jacobian = -skew(rotated)
         normal = np.einsum("n,nki,nkj->ij", weight, jacobian, jacobian) + 1e-12 * np.eye(3)
         step = np.linalg.solve(normal, np.einsum("n,nki,nk->i", weight, jacobian, residual))
         rotation = so3_exp(step) @ rotation
         if float(np.linalg.norm(step)) < 1e-7:
             break
     return rotation
-
-
-__all__ = ["Chosen", "Closing", "Ranked", "Ranking", "WindowLimits", "choose_frames"]

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from colmap_inertial.imaging._cells import Cells
 from colmap_inertial.imaging._taps import STEPS_PER_PX, Prior, TapTable, smoothing_px
-from colmap_inertial.imaging._transfer import decode_table, encode_table, srgb_from_linear
-from colmap_inertial.imaging._wiener_reference import filter_reference, lost_light_reference, share_reference
 from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.imaging.transfer import decode_table, encode_table
 
 Code = TypeVar("Code", np.uint8, np.uint16)
 Sample = TypeVar("Sample", np.uint8, np.uint16, np.float32)
@@ -65,7 +64,7 @@ def deblur(image: NDArray[Code], blur: BlurField, options: DeblurOptions | None 
     -----
     ``out(x, y) = sum_j w_j g(x + j, y + j slope)`` in linear light, ``w`` the optimal finite filter (`optimal_taps`)
     for the blur at the centre of a 16 px cell, ``g`` the image, smoothed a little (`smoothing_px`). Compiled; other
-    Python threads go on while it runs. The plain version is `deblur_reference`.
+    Python threads go on while it runs. The plain version that it is tested against is `tests/references/wiener.py`.
 
     Raises
     ------
@@ -75,24 +74,6 @@ def deblur(image: NDArray[Code], blur: BlurField, options: DeblurOptions | None 
     options = options or DeblurOptions()
     planes, cells, noise = _prepare(image, blur, options)
     result, _ = _compiled(planes, cells, _table(cells, noise), threads=options.threads)
-    return result.reshape(image.shape)
-
-
-def deblur_reference(image: NDArray[Code], blur: BlurField, options: DeblurOptions | None = None) -> NDArray[Code]:
-    """`deblur` in plain numpy; hundreds of times slower."""
-    planes, cells, noise = _prepare(image, blur, options or DeblurOptions())
-    table = _table(cells, noise)
-    top = np.iinfo(image.dtype).max
-    light = decode_table(image.dtype)[planes].astype(np.float64)
-    saturated = planes >= _saturated_code(image.dtype)
-    channels = range(planes.shape[2])
-    lost = np.any([lost_light_reference(light[..., c], saturated[..., c], cells) for c in channels], axis=0)
-    share = share_reference(lost, cells)
-    result = planes.copy()
-    for c in channels:
-        blended = light[..., c] + share * (filter_reference(light[..., c], cells, table) - light[..., c])
-        codes = np.floor(top * srgb_from_linear(blended) + 0.5).astype(image.dtype)
-        result[..., c] = np.where(share == 0, planes[..., c], codes)
     return result.reshape(image.shape)
 
 

@@ -17,15 +17,15 @@ import re
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_inertial.errors import FormatError
 from colmap_inertial.io.columns import split_unit
-from colmap_inertial.io.frame_times import stamps_of_log
+from colmap_inertial.io.files import first_line
+from colmap_inertial.io.frame_times import frame_log, stamps_of_log
 from colmap_inertial.io.imu_text import ordered, read_csv, recording
-from colmap_inertial.io.samples import Samples
+from colmap_inertial.io.samples import Samples, nearest
 from colmap_inertial.io.tables import Table, read_table
-from colmap_inertial.io.units import SENSOR_NAMES, TIME_UNITS_NS, DeclaredUnits, Quantity, seconds, to_si, unit_of
+from colmap_inertial.io.units import SENSOR_NAMES, TIME_UNITS_NS, DeclaredUnits, Quantity, unit_of
 from colmap_inertial.types import Array, FrameLog, ImuRecording
 
 _MARS_TABLES = ("gyro_accel.csv", "raw_accel_gyro.csv")
@@ -57,7 +57,7 @@ def read_opencamera(path: Path, units: DeclaredUnits) -> ImuRecording:
 def read_opencamera_frames(path: Path) -> FrameLog | None:
     """The time of each frame of the video, on the IMU's clock; ``None`` where they were not recorded."""
     file = _sibling(_one_gyro_file(path), "timestamps.csv")
-    return _log_of_times(stamps_of_log(file, "ns"), file) if file.is_file() else None
+    return frame_log(file, stamps_of_log(file, "ns")) if file.is_file() else None
 
 
 def is_mars(path: Path) -> bool:
@@ -80,18 +80,12 @@ def read_mars_frames(path: Path) -> FrameLog | None:
     if not times.is_file() and not details.is_file():
         return None
     if not details.is_file():
-        return _log_of_times(stamps_of_log(times), times)
+        return frame_log(times, stamps_of_log(times))
     table = read_table(details)
     taken_ns = stamps_of_log(details)
     frame_ns = stamps_of_log(times) if times.is_file() else taken_ns
-    _require_increasing(frame_ns, times if times.is_file() else details)
     order = np.argsort(taken_ns, kind="stable")
-    after = np.clip(np.searchsorted(taken_ns[order], frame_ns), 1, max(1, len(order) - 1))
-    if len(order) == 1:
-        after = np.zeros(len(frame_ns), dtype=np.intp)
-    before = np.maximum(after - 1, 0)
-    closer = np.abs(taken_ns[order[before]] - frame_ns) < np.abs(taken_ns[order[after]] - frame_ns)
-    row = order[np.where(closer, before, after)]
+    row = order[nearest(taken_ns[order], frame_ns)]
     matched = bool((np.abs(taken_ns[row] - frame_ns) <= _SAME_FRAME_NS).all())
 
     def column(pattern: str, *, time: bool = False) -> Array | None:
@@ -110,10 +104,9 @@ def read_mars_frames(path: Path) -> FrameLog | None:
 
     readout = column("framereadouttime|rollingshutterskew", time=True)
     readout_s = None if readout is None else float(np.median(readout))
-    return FrameLog(
-        t_s=seconds(frame_ns, int(frame_ns[0])),
-        epoch_ns=int(frame_ns[0]),
-        shared_clock=True,
+    return frame_log(
+        times if times.is_file() else details,
+        frame_ns,
         exposure_s=column("exposuretime|exposure", time=True),
         iso=column("iso"),
         focal_px=column("fx"),
@@ -146,12 +139,8 @@ def _sibling(gyro_file: Path, ending: str) -> Path:
 
 def _has_bare_rows(path: Path) -> bool:
     """Whether a file begins with a row of four numbers."""
-    try:
-        with open(path, encoding="utf-8-sig", errors="replace") as file:
-            cells = file.readline(1000).split(",")
-        return len(cells) == 4 and all(re.fullmatch(r"[-+.\deE]+", cell.strip()) for cell in cells)
-    except OSError:
-        return False
+    cells = first_line(path).split(",")
+    return len(cells) == 4 and all(re.fullmatch(r"[-+.\deE]+", cell.strip()) for cell in cells)
 
 
 def _bare_samples(path: Path, quantity: Quantity, unit: str) -> Samples:
@@ -162,18 +151,7 @@ def _bare_samples(path: Path, quantity: Quantity, unit: str) -> Samples:
             f"{table.width} cells where the {SENSOR_NAMES[quantity]}'s file has x,y,z,t_ns",
             line=int(table.line_numbers[0]),
         )
-    return ordered(table, quantity, table.stamps_ns(3, "ns"), to_si(table.numbers([0, 1, 2]), quantity, unit))
-
-
-def _log_of_times(frame_ns: NDArray[np.int64], path: Path) -> FrameLog:
-    _require_increasing(frame_ns, path)
-    return FrameLog(t_s=seconds(frame_ns, int(frame_ns[0])), epoch_ns=int(frame_ns[0]), shared_clock=True)
-
-
-def _require_increasing(frame_ns: NDArray[np.int64], path: Path) -> None:
-    bad = np.flatnonzero(np.diff(frame_ns) <= 0)
-    if len(bad):
-        raise FormatError(path, f"the time of frame {bad[0] + 2} is not after the one before")
+    return ordered(table, quantity, unit, table.stamps_ns(3, "ns"), table.numbers([0, 1, 2]))
 
 
 # --- MARS logger -----------------------------------------------------------------------------------------------------

@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.errors import FormatError
+from colmap_inertial.io.frame_times import frame_log
 from colmap_inertial.io.imu_text import recording
 from colmap_inertial.io.mp4 import Movie, Track, has_track, read_movie
-from colmap_inertial.io.samples import Samples, order_samples
-from colmap_inertial.io.units import SENSOR_NAMES, DeclaredUnits, Quantity, seconds, to_si
+from colmap_inertial.io.samples import Samples, nearest, order_samples
+from colmap_inertial.io.units import DeclaredUnits, Quantity
 from colmap_inertial.types import FrameLog, ImuRecording
 
 _EXPOSURE, _GYRO, _ACCEL = 1, 2, 3
@@ -48,8 +49,8 @@ def read_camm(path: Path, units: DeclaredUnits) -> ImuRecording:
         t_ns, data = packets[kind]
         if len(t_ns):
             with np.errstate(invalid="ignore"):  # a damaged file may hold signalling NaNs
-                values = to_si(data.view("<f4").astype(np.float64), quantity, unit)
-            found[kind] = order_samples(path, SENSOR_NAMES[quantity], t_ns, values)
+                values = data.view("<f4").astype(np.float64)
+            found[kind] = order_samples(path, quantity, unit, t_ns, values)
     if _GYRO not in found:
         raise FormatError(path, "its CAMM track holds no gyroscope samples (type 2)")
     return recording(found[_GYRO], found.get(_ACCEL))
@@ -64,39 +65,20 @@ def read_camm_frames(path: Path) -> FrameLog:
         Where the file is damaged or holds no video.
     """
     movie, track = _open(path)
-    video = movie.track(handler="vide")
-    if video is None or len(video.t_ns) == 0:
-        raise FormatError(path, "holds no video")
-    frame_ns = video.shown_ns(path)
+    frame_ns = movie.frame_times_ns()
     t_ns, data = _packets(movie, track)[_EXPOSURE]
     exposure_s = readout_s = None
     if len(t_ns):
         times = data.view("<i4").astype(np.float64) * 1e-9
-        nearest = near(t_ns, frame_ns)
-        exposure, skew = times[nearest, 0], float(np.median(times[:, 1]))
+        exposure, skew = times[nearest(t_ns, frame_ns), 0], float(np.median(times[:, 1]))
         exposure_s = exposure if ((exposure >= 0) & (exposure < 10)).all() else None
         readout_s = skew if 0 <= skew < 0.5 else None
-    return FrameLog(
-        t_s=seconds(frame_ns, int(frame_ns[0])),
-        epoch_ns=int(frame_ns[0]),
-        in_video_time=True,
-        shared_clock=True,
-        exposure_s=exposure_s,
-        readout_s=readout_s,
-    )
+    return frame_log(path, frame_ns, in_video_time=True, exposure_s=exposure_s, readout_s=readout_s)
 
 
 def _open(path: Path) -> tuple[Movie, Track]:
     movie = read_movie(path)
-    track = movie.track(entry="camm")
-    if track is None or len(track.size) == 0:
-        raise FormatError(path, "holds no camera motion metadata (a track of format camm)")
-    return movie, track
-
-
-def near(t_ns: NDArray[np.int64], frame_ns: NDArray[np.int64]) -> NDArray[np.intp]:
-    after = np.clip(np.searchsorted(t_ns, frame_ns), 1, len(t_ns) - 1)
-    return np.where(frame_ns - t_ns[after - 1] < t_ns[after] - frame_ns, after - 1, after)
+    return movie, movie.telemetry("camm", "camera motion metadata")
 
 
 def _packets(movie: Movie, track: Track) -> dict[int, tuple[NDArray[np.int64], NDArray[np.uint8]]]:

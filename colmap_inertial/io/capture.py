@@ -15,8 +15,8 @@ import numpy as np
 from colmap_inertial.errors import FormatError
 from colmap_inertial.geometry import quat_from_matrix
 from colmap_inertial.io import sensor_yaml
-from colmap_inertial.io.apertures import AperturePictures, read_apertures_table
-from colmap_inertial.io.calibration import calibration_prior
+from colmap_inertial.io.aperture_images import ApertureImages, read_apertures_table
+from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.io.capture_tables import (
     ImuPath,
     ImuTables,
@@ -26,6 +26,7 @@ from colmap_inertial.io.capture_tables import (
     read_imu_table,
 )
 from colmap_inertial.io.exposures import LongExposures, read_exposures_table
+from colmap_inertial.io.files import StrPath
 from colmap_inertial.io.gcsv import is_gcsv, read_gcsv_frames
 from colmap_inertial.io.imu_text import is_inertial_scale
 from colmap_inertial.io.recorders import Recording, find_recording
@@ -120,11 +121,11 @@ class Capture:
     calibration: CameraImuCalibration
     target: str | None = None
     frame_log: FrameLog | None = None
-    apertures: AperturePictures | None = None
+    apertures: ApertureImages | None = None
     exposures: LongExposures | None = None
 
 
-def load_capture(path: Path) -> Capture:
+def load_capture(path: StrPath) -> Capture:
     """Read a capture description.
 
     Parameters
@@ -140,6 +141,7 @@ def load_capture(path: Path) -> Capture:
     FormatError
         For an unknown key (the nearest known one is named), a value that cannot be, or a folder of no known layout.
     """
+    path = Path(path)
     path = Path(path)
     if path.is_dir():
         if (path / "capture.toml").is_file():
@@ -289,7 +291,7 @@ def _from_recording(path: Path, recording: Recording) -> Capture:
         shared_clock=shared_clock,
         camera=None if log is None else log.camera,
         imu=ImuPath(path=recording.imu, format=recording.format),
-        calibration=calibration_prior(readout_s=readout_s, shared_clock=shared_clock),
+        calibration=calibration_prior(Declared(readout_s=readout_s), shared_clock=shared_clock),
         frame_log=log,
     )
 
@@ -308,8 +310,10 @@ def _from_asl(path: Path, camera: Path, imu: Path) -> Capture:
         camera=model,
         imu=source,
         calibration=calibration_prior(
-            cam_from_imu_xyzw=None if cam_from_imu is None else quat_from_matrix(cam_from_imu[:3, :3]),
-            imu_in_cam_m=None if cam_from_imu is None else cam_from_imu[:3, 3],
+            Declared(
+                cam_from_imu_xyzw=None if cam_from_imu is None else quat_from_matrix(cam_from_imu[:3, :3]),
+                imu_in_cam_m=None if cam_from_imu is None else cam_from_imu[:3, 3],
+            ),
             shared_clock=True,
         ),
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +11,7 @@ from numpy.typing import NDArray
 from colmap_inertial.geometry import colmap_px_from_opencv, quat_from_matrix
 from colmap_inertial.io import sensor_yaml
 from colmap_inertial.io.calibration import (
-    KNOWN_GYRO_BIAS_RAD_S,
-    KNOWN_LEVER_ARM_M,
-    KNOWN_OFFSET_S,
-    KNOWN_ROTATION_RAD,
+    Declared,
     calibration_prior,
     for_another_recording,
     read_calibration,
@@ -183,19 +180,16 @@ def read_calibration_table(
         table.fail("imu_in_cam_m", "and the last column of cam_from_imu say the same; leave one out")
     if lever is None and has_lever and cam_from_imu is not None:
         lever = tuple(cam_from_imu[:3, 3].tolist())
-    return calibration_prior(
+    declared = Declared(
         cam_from_imu_xyzw=rotation,
         imu_in_cam_m=lever,
         gyro_time_offset_s=gyro_offset,
         accel_time_offset_s=accel_offset,
         gyro_bias_rad_s=bias,
         readout_s=readout_s,
-        shared_clock=shared_clock,
-        rotation_sigma_rad=sigmas["rotation_sigma_rad"] or KNOWN_ROTATION_RAD,
-        imu_in_cam_sigma_m=sigmas["imu_in_cam_sigma_m"] or KNOWN_LEVER_ARM_M,
-        time_offset_sigma_s=sigmas["time_offset_sigma_s"] or KNOWN_OFFSET_S,
-        gyro_bias_sigma_rad_s=sigmas["gyro_bias_sigma_rad_s"] or KNOWN_GYRO_BIAS_RAD_S,
+        **{key: sigma for key, sigma in sigmas.items() if sigma is not None},
     )
+    return calibration_prior(declared, shared_clock=shared_clock)
 
 
 def body_from_imu(imu: ImuPath) -> NDArray[np.float64]:
@@ -216,8 +210,7 @@ def _transform(table: Section, rows: list[list[float]]) -> NDArray[np.float64]:
         table.fail("cam_from_imu", f"must be a 3x3 or 4x4 matrix, found {shape[0]}x{shape[1]}")
     matrix = np.eye(4)
     matrix[: shape[0], : shape[1]] = rows
-    rotation = matrix[:3, :3]
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
+    if not sensor_yaml.is_rotation(matrix[:3, :3]):
         table.fail("cam_from_imu", "is not a rotation: rows must be perpendicular, of length 1, and right-handed")
     if not np.allclose(matrix[3], [0, 0, 0, 1]):
         table.fail("cam_from_imu", "must have 0, 0, 0, 1 as its last row")
@@ -227,13 +220,7 @@ def _transform(table: Section, rows: list[list[float]]) -> NDArray[np.float64]:
 def _noise(table: Section | None) -> ImuNoise | None:
     if table is None:
         return None
-    keys = (
-        "gyro_density_rad_s_rthz",
-        "accel_density_m_s2_rthz",
-        "gyro_walk_rad_s2_rthz",
-        "accel_walk_m_s3_rthz",
-    )
-    values = {key: table.number(key, low=0) for key in keys}
+    values = {f.name: table.number(f.name, low=0) for f in fields(ImuNoise)}
     table.finish()
     return ImuNoise(**{key: table.require(key, value) for key, value in values.items()})
 

@@ -11,7 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from colmap_inertial.errors import FormatError, TimingError
+from colmap_inertial.io.files import read_bytes
 from colmap_inertial.io.frame_times import FrameStamps, stamps_in_order
+from colmap_inertial.io.names import path_in
 
 PNG = b"\x89PNG\r\n\x1a\n"
 _EXIF_HEADER = b"Exif\0\0"
@@ -50,7 +52,7 @@ def stamps_of_exif(folder: Path, names: Sequence[str]) -> tuple[FrameStamps, int
     """
     t_ns, digits, offsets = [], [], []
     for name in names:
-        path = folder / name
+        path = path_in(folder, name)
         texts = _texts(path)
         fraction = texts.get(_FRACTION, "").strip()
         if not re.fullmatch(r"\d{2,9}", fraction):
@@ -82,13 +84,7 @@ def stamps_of_exif(folder: Path, names: Sequence[str]) -> tuple[FrameStamps, int
 
 def _texts(path: Path) -> dict[int, str]:
     """The text entries of a picture's EXIF directory."""
-    try:
-        with open(path, "rb") as file:
-            head = file.read(HEAD_BYTES)
-    except FileNotFoundError:
-        raise FormatError(path, "no such picture") from None
-    except OSError as error:
-        raise FormatError(path, f"cannot be read: {error.strerror or error}") from None
+    head = read_bytes(path, HEAD_BYTES, what="picture")
     try:
         found = exif_directory(head)
         if found is None:

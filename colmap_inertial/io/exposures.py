@@ -27,8 +27,9 @@ from pathlib import Path
 import numpy as np
 
 from colmap_inertial.errors import FormatError, TimingError
-from colmap_inertial.io.apertures import SubImages
+from colmap_inertial.io.aperture_images import SubImages, read_rename
 from colmap_inertial.io.exif import HEAD_BYTES, exposure_of
+from colmap_inertial.io.files import read_bytes
 from colmap_inertial.io.frame_times import stamps_of_csv
 from colmap_inertial.io.images import SUFFIXES
 from colmap_inertial.io.toml_section import Section
@@ -167,8 +168,7 @@ class LongExposures:
             (long, long_exposure_s or self.exposure_s, self.long_iso),
         ):
             if exposure_s is None or iso is None:
-                with open(path, "rb") as file:
-                    by_exif = exposure_of(file.read(HEAD_BYTES))
+                by_exif = exposure_of(read_bytes(path, HEAD_BYTES, what="picture"))
                 exposure_s, iso = exposure_s or by_exif[0], iso or by_exif[1]
             if not exposure_s or not iso:
                 return None
@@ -194,17 +194,13 @@ def read_exposures_table(table: Section | None, images: Path | None) -> LongExpo
     if images is None:
         table.fail(None, "belongs to [images], the folder of the short exposures, which is missing")
     folder = table.file("folder")
-    rename = table.raw("rename")
+    rename = read_rename(table)
     times, unit = table.file("times"), table.choice("time_unit", TIME_UNITS_NS)
     delay_s = table.number("long_delay_s", low=-_FARTHEST_S, high=_FARTHEST_S)
     exposure_s = table.positive("long_exposure_s")
     isos = table.positive("short_iso"), table.positive("long_iso")
     table.finish()
-    if rename is not None and not (
-        isinstance(rename, list) and len(rename) == 2 and all(isinstance(t, str) and t for t in rename)
-    ):
-        table.fail("rename", f"must be two texts, what is replaced by what; found {rename!r}")
-    source = SubImages(folder=folder or images, rename=None if rename is None else (rename[0], rename[1]))
+    source = SubImages(folder=folder or images, rename=rename)
     if source == SubImages(folder=images):
         table.fail(None, "has the same pictures as [images]; give folder or rename")
     if times is not None and delay_s is not None:
@@ -220,6 +216,3 @@ def read_exposures_table(table: Section | None, images: Path | None) -> LongExpo
         short_iso=isos[0],
         long_iso=isos[1],
     )
-
-
-__all__ = ["LongExposures", "LongTiming", "read_exposures_table"]

@@ -8,13 +8,16 @@ import json
 import math
 import os
 import secrets
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from colmap_inertial.errors import FormatError, OutputError
+from colmap_inertial.errors import FormatError, OutputError, OutputExistsError
+
+#: What users may give for a path.
+StrPath = str | os.PathLike[str]
 
 
 def write_text(path: Path, text: str) -> None:
@@ -37,6 +40,34 @@ def write_text(path: Path, text: str) -> None:
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def locked(path: Path, busy: str, *, wait_s: float = 0.0) -> Iterator[None]:
+    """Hold the lock file ``path``; the system lets go of it when this process ends, whatever ends it.
+
+    Raises
+    ------
+    OutputExistsError
+        That says ``busy``, where another process still holds it after ``wait_s``.
+    """
+    from filelock import FileLock, Timeout
+
+    lock = FileLock(path, thread_local=False)
+    try:
+        lock.acquire(timeout=wait_s, poll_interval=0.5, blocking=wait_s > 0)
+    except Timeout:
+        raise OutputExistsError(busy) from None
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def advise(handle: int, use: str) -> None:
+    """Tell the system how an open file is used (``"SEQUENTIAL"``, ``"DONTNEED"``), where it takes such advice."""
+    if hasattr(os, "posix_fadvise"):
+        os.posix_fadvise(handle, 0, 0, getattr(os, f"POSIX_FADV_{use}"))
 
 
 def read_yaml(path: Path, what: str, loader: Any = None) -> dict[Any, Any]:
@@ -116,12 +147,38 @@ def read_text(path: Path) -> str:
     FormatError
         Where the file is missing or cannot be read.
     """
+    return read_bytes(path).decode("utf-8-sig", errors="replace")
+
+
+def read_bytes(path: Path, size: int = -1, *, what: str = "file") -> bytes:
+    """The bytes of a file, or the first ``size`` of them; ``what`` it is, for the message.
+
+    Raises
+    ------
+    FormatError
+        Where the file is missing or cannot be read.
+    """
     try:
-        return path.read_bytes().decode("utf-8-sig", errors="replace")
+        with open(path, "rb") as file:
+            return file.read(size)
     except FileNotFoundError:
-        raise FormatError(path, "no such file") from None
+        raise FormatError(path, f"no such {what}") from None
     except OSError as error:
         raise FormatError(path, f"cannot be read: {error.strerror or error}") from None
+
+
+def first_line(path: Path) -> str:
+    """The beginning of a file's first line, to tell what it is; empty where it cannot be read."""
+    try:
+        with open(path, encoding="utf-8-sig", errors="replace") as file:
+            return file.readline(1000)
+    except OSError:
+        return ""
+
+
+def as_plain(value: object) -> Any:
+    """A value as :func:`read_json` gives it back after :func:`write_json`."""
+    return json.loads(json.dumps(_plain(value, "$"), allow_nan=False))
 
 
 def _no_constant(name: str) -> float:

@@ -7,6 +7,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from colmap_inertial.errors import FormatError, TimingError
 from colmap_inertial.io.columns import recognise, split_unit
 from colmap_inertial.io.tables import Table, read_table
 from colmap_inertial.io.units import TIME_UNITS_NS, seconds, stamps_ns, unit_of
-from colmap_inertial.types import Array, FrameTiming
+from colmap_inertial.types import Array, FrameLog, FrameTiming
 
 _NAME_COLUMNS = {"name", "filename", "file", "image", "imagename", "frame"}
 _EXPOSURE_COLUMNS = {"exposure", "exposuretime"}
@@ -165,6 +166,21 @@ def stamps_of_log(path: Path, time_unit: str | None = None) -> NDArray[np.int64]
     if table.width != 1:
         raise TimingError(f'{path} has {table.width} columns and no header; name the time column, for example "t_ns"')
     return table.stamps_ns(0, _required_unit(path, None, time_unit))
+
+
+def frame_log(path: Path, frame_ns: NDArray[np.int64], **noted: Any) -> FrameLog:
+    """The log of frames with these times, on the IMU's clock; ``noted`` are its other fields.
+
+    Raises
+    ------
+    FormatError
+        Where the times do not increase.
+    """
+    bad = np.flatnonzero(np.diff(frame_ns) <= 0)
+    if len(bad):
+        raise FormatError(path, f"the time of frame {bad[0] + 2} is not after the one before")
+    epoch_ns = int(frame_ns[0])
+    return FrameLog(t_s=seconds(frame_ns, epoch_ns), epoch_ns=epoch_ns, shared_clock=True, **noted)
 
 
 def _time_column(table: Table, declared: str | None) -> NDArray[np.int64]:

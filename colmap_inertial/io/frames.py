@@ -11,13 +11,17 @@ from numpy.typing import NDArray
 
 from colmap_inertial.errors import FormatError, TimingError
 from colmap_inertial.io.capture import Capture, ImageFolder, Video, load_capture
+from colmap_inertial.io.files import StrPath
 from colmap_inertial.io.frame_times import FrameStamps, stamps_of_csv, stamps_of_log, stamps_of_names
-from colmap_inertial.io.images import SUFFIXES, read_image
+from colmap_inertial.io.images import SUFFIXES, grey_8bit, read_image
+from colmap_inertial.io.names import path_in
 from colmap_inertial.io.video import decode_reduced, decode_video, frame_name, reduced, video_stamps_ns
 from colmap_inertial.types import Frame, FrameLog, FrameTiming
 
 
-def read_frames(capture: Capture | Path, *, only: Collection[str] | None = None) -> tuple[FrameTiming, Iterator[Frame]]:
+def read_frames(
+    capture: Capture | StrPath, *, only: Collection[str] | None = None
+) -> tuple[FrameTiming, Iterator[Frame]]:
     """The frames of a capture and when they were exposed.
 
     Parameters
@@ -42,7 +46,7 @@ def read_frames(capture: Capture | Path, *, only: Collection[str] | None = None)
     TimingError
         Where frames have no times; the message says how to give them.
     """
-    if isinstance(capture, Path):
+    if not isinstance(capture, Capture):
         capture = load_capture(capture)
     if isinstance(capture.frames, Video):
         stamps, source_ns = _video_frames(capture.frames, capture.frame_log)
@@ -64,20 +68,13 @@ def read_reduced(
     """
     if not isinstance(capture.frames, Video):
         for frame in read_frames(capture, only=names)[1]:
-            yield frame.name, reduced(_grey(frame.image), long_side_px)
+            yield frame.name, reduced(grey_8bit(frame.image), long_side_px)
         return
     stamps, source_ns = _video_frames(capture.frames, capture.frame_log)
     wanted = set(names)
     name_of = {int(t): name for t, name in zip(source_ns, stamps.names, strict=True) if name in wanted}
     for t_ns, grey in decode_reduced(capture.frames.file, np.array(list(name_of), dtype=np.int64), long_side_px):
         yield name_of[t_ns], grey
-
-
-def _grey(image: NDArray[np.uint8] | NDArray[np.uint16]) -> NDArray[np.uint8]:
-    import cv2
-
-    grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    return np.asarray(grey if grey.dtype == np.uint8 else grey >> 8, dtype=np.uint8)
 
 
 def _places(timing: FrameTiming, only: Collection[str] | None) -> NDArray[np.intp]:
@@ -101,7 +98,7 @@ def read_frame_timing(capture: Capture | Path) -> FrameTiming:
             raise FormatError(capture.path, "describes no frames; add [images] or [video]")
 
 
-def read_frame_times(path: Path) -> FrameTiming:
+def read_frame_times(path: StrPath) -> FrameTiming:
     """Frame times from a CSV (``name,t_s`` or ``name,t_ns``; optionally ``exposure_s``), or those of a capture.
 
     Raises
@@ -165,7 +162,7 @@ def image_names(source: ImageFolder) -> list[str]:
 def _decode_images(capture: Capture, timing: FrameTiming, places: NDArray[np.intp]) -> Iterator[Frame]:
     assert isinstance(capture.frames, ImageFolder)
     for i in places.tolist():
-        path = capture.frames.folder / timing.names[i]
+        path = path_in(capture.frames.folder, timing.names[i])
         yield _frame(capture, timing, i, path, read_image(path))
 
 
@@ -222,11 +219,11 @@ def _frame(
     camera = capture.camera
     if camera is not None and image.shape[:2] != (camera.height, camera.width):
         height, width = image.shape[:2]
-        turned = (height, width) == (camera.width, camera.height)
+        rotated = (height, width) == (camera.width, camera.height)
         raise FormatError(
             path,
             f"is {width}x{height}, but the camera is declared as {camera.width}x{camera.height} ({capture.path})"
-            + ("; pictures stay as the sensor was read, not turned by 90 degrees for display" if turned else ""),
+            + ("; pictures stay as the sensor was read, not turned by 90 degrees for display" if rotated else ""),
         )
     return Frame(
         name=timing.names[i],

@@ -16,10 +16,11 @@ from pathlib import Path
 import numpy as np
 
 from colmap_inertial.errors import FormatError
-from colmap_inertial.io.files import read_text
+from colmap_inertial.io.files import first_line, read_text
 from colmap_inertial.io.imu_text import ordered, recording
+from colmap_inertial.io.samples import Samples
 from colmap_inertial.io.tables import Table, parse_table
-from colmap_inertial.io.units import Axes, DeclaredUnits, to_si
+from colmap_inertial.io.units import Axes, DeclaredUnits, Quantity
 from colmap_inertial.types import FrameLog, ImuRecording, ReadoutDirection
 
 _FIRST_LINES = ("GYROFLOW IMU LOG", "CAMERA IMU LOG")
@@ -35,13 +36,7 @@ _LONGEST_HEADER = 1000
 
 def is_gcsv(path: Path) -> bool:
     """Whether ``path`` is a Gyroflow log."""
-    if not path.is_file():
-        return False
-    try:
-        with open(path, encoding="utf-8-sig", errors="replace") as file:
-            return file.readline(100).strip().startswith(_FIRST_LINES)
-    except OSError:
-        return False
+    return first_line(path).strip().startswith(_FIRST_LINES)
 
 
 def read_gcsv(path: Path, units: DeclaredUnits) -> ImuRecording:
@@ -61,16 +56,16 @@ def read_gcsv(path: Path, units: DeclaredUnits) -> ImuRecording:
         raise FormatError(path, "a time is not a number, or beyond 142 years; check tscale")
     stamps = t_ns.astype(np.int64)
 
-    columns = [names.index(f"g{axis}") for axis in "xyz"]
-    gyro = rows.numbers(columns) * _number(path, header, "gscale", 1.0)
-    samples = ordered(rows, "gyro", stamps, to_si(axes.apply(gyro), "gyro", units.gyro or "rad/s"))
-    accel_samples = None
-    if all(f"a{axis}" in names for axis in "xyz"):
-        columns = [names.index(f"a{axis}") for axis in "xyz"]
-        accel = rows.numbers(columns) * _number(path, header, "ascale", 1.0)
-        accel_samples = ordered(rows, "accel", stamps, to_si(axes.apply(accel), "accel", units.accel or "g"))
+    def samples(quantity: Quantity, unit: str) -> Samples:
+        letter = quantity[0]
+        values = rows.numbers([names.index(f"{letter}{axis}") for axis in "xyz"])
+        values = axes.apply(values * _number(path, header, f"{letter}scale", 1.0))
+        return ordered(rows, quantity, unit, stamps, values)
+
+    gyro = samples("gyro", units.gyro or "rad/s")
+    has_accel = all(f"a{axis}" in names for axis in "xyz")
     device = " ".join(header[key][0] for key in ("vendor", "id") if header.get(key, ("",))[0])
-    return recording(samples, accel_samples, device=device)
+    return recording(gyro, samples("accel", units.accel or "g") if has_accel else None, device=device)
 
 
 def read_gcsv_frames(path: Path) -> FrameLog:
@@ -131,7 +126,7 @@ def _orientation(path: Path, header: dict[str, tuple[str, int]]) -> Axes:
     """Which column is which axis; as written where the log does not say."""
     text, line = header.get("orientation", ("XYZ", 1))
     try:
-        return Axes.parse(",".join(("-" if letter.islower() else "") + letter for letter in text))
+        return Axes.of_letters(text)
     except ValueError:
         raise FormatError(
             path, f"orientation is {text[:40]!r}; expected three letters such as YxZ", line=line

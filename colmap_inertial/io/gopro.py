@@ -16,17 +16,19 @@ the quaternions w, x, z, y.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.errors import FormatError
+from colmap_inertial.io.frame_times import frame_log
 from colmap_inertial.io.gpmf import Entry, Stream, entries, read_streams
 from colmap_inertial.io.imu_text import recording
 from colmap_inertial.io.mp4 import Movie, has_track, read_movie
-from colmap_inertial.io.samples import Samples, order_samples
-from colmap_inertial.io.units import SENSOR_NAMES, SENSOR_UNITS, Axes, DeclaredUnits, Quantity, seconds, to_si, unit_of
+from colmap_inertial.io.samples import Samples, nearest, order_samples
+from colmap_inertial.io.units import SENSOR_UNITS, Axes, DeclaredUnits, Quantity, unit_of
 from colmap_inertial.types import Array, FrameLog, ImuRecording
 
 _SENSORS: dict[str, Quantity] = {"GYRO": "gyro", "ACCL": "accel"}
@@ -36,8 +38,8 @@ _WANTED = {*_SENSORS, *_OF_FRAMES, "IORI", "SROT"}
 #: Channel order by the firmware's first letters, where the stream does not say.
 _ORDER = {"HD5": "ZXY", "FS1": "yXZ"}
 _USUAL_ORDER = "YxZ"
-#: An image that is turned by more than this against the camera was stabilised.
-_TURNED_RAD = 0.005
+#: An image that is rotated by more than this against the camera was stabilised.
+_ROTATED_RAD = 0.005
 #: Samples of the last payload may be missing for so many frames at the end; they take the last one's.
 _MISSING_FRAMES = 2.5
 
@@ -55,27 +57,24 @@ def read_gopro(path: Path, units: DeclaredUnits) -> ImuRecording:
     FormatError
         Where there is no gyroscope, or the file is damaged.
     """
-    movie, payloads = _open(path)
-    streams = _streams(movie, payloads)
-    track = _telemetry(movie)
-    shift_ns, _ = _video_minus_stamp_ns(movie, streams, track)
-    found: dict[str, Samples] = {}
+    telemetry = _Telemetry.of(path)
+    found: dict[Quantity, Samples] = {}
     for key, quantity in _SENSORS.items():
-        if key not in streams:
+        stream = telemetry.streams.get(key)
+        if stream is None:
             continue
-        stream = streams[key]
         values = stream.values
         if values.shape[1] != 3:
             raise FormatError(path, f"the {key} stream has {values.shape[1]} channels, not 3")
-        t_ns = _sample_times_ns(path, stream, track) + shift_ns
-        declared = units.gyro if quantity == "gyro" else units.accel
-        values = to_si(values @ _axes(path, movie, stream).T, quantity, declared or _unit(path, stream, quantity))
-        found[key] = order_samples(path, SENSOR_NAMES[quantity], t_ns, values)
-    if "GYRO" not in found:
+        values = values @ _axes(path, telemetry.movie, stream).T
+        unit = getattr(units, quantity) or _unit(path, stream, quantity)
+        found[quantity] = order_samples(path, quantity, unit, telemetry.times_ns(key), values)
+    if "gyro" not in found:
         raise FormatError(
             path, "its telemetry holds no gyroscope (GYRO): HERO5 and later write one; older cameras have none"
         )
-    return recording(found["GYRO"], found.get("ACCL"), device=_device(movie, payloads, streams["GYRO"]))
+    device = _device(telemetry.movie, telemetry.streams["GYRO"])
+    return recording(found["gyro"], found.get("accel"), device=device)
 
 
 def read_gopro_frames(path: Path) -> FrameLog:
@@ -86,20 +85,14 @@ def read_gopro_frames(path: Path) -> FrameLog:
     FormatError
         Where the file is damaged or holds no video.
     """
-    movie, payloads = _open(path)
-    video = movie.track(handler="vide")
-    if video is None or len(video.t_ns) == 0:
-        raise FormatError(path, "holds no video")
-    streams = _streams(movie, payloads)
-    track = _telemetry(movie)
-    shift_ns, _ = _video_minus_stamp_ns(movie, streams, track)
-    frame_ns = video.shown_ns(path)
+    telemetry = _Telemetry.of(path)
+    frame_ns = telemetry.movie.frame_times_ns()
 
     def of_frames(key: str, channels: int) -> Array | None:
-        if key not in streams or streams[key].values.shape[1] != channels:
+        stream = telemetry.streams.get(key)
+        if stream is None or stream.values.shape[1] != channels:
             return None
-        t_ns = _sample_times_ns(path, streams[key], track) + shift_ns
-        found = _nearest(t_ns, streams[key].values, frame_ns)
+        found = _nearest(telemetry.times_ns(key), stream.values, frame_ns)
         # directions and orientations have a length, exposures a bound; what has not is damaged
         good = found is not None and np.isfinite(found).all() and (channels == 1 or np.linalg.norm(found, axis=1).all())
         return found if good else None
@@ -109,74 +102,71 @@ def read_gopro_frames(path: Path) -> FrameLog:
         iso = 100 * iso_hundreds
     up = of_frames("GRAV", 3)
     orientation, image = of_frames("CORI", 4), of_frames("IORI", 4)
-    settings = _settings(movie)
+    settings = _settings(telemetry.movie)
     stabilised, words = _stabilisation(settings, image)
-    return FrameLog(
-        t_s=seconds(frame_ns, int(frame_ns[0])),
-        epoch_ns=int(frame_ns[0]),
+    return frame_log(
+        path,
+        frame_ns,
         in_video_time=True,
-        shared_clock=True,
         exposure_s=None if exposure is None or not ((exposure >= 0) & (exposure < 10)).all() else exposure[:, 0],
         iso=None if iso is None else iso[:, 0],
-        readout_s=_readout_s(path, settings, streams),
+        readout_s=_readout_s(path, settings, telemetry.streams),
         stabilised=stabilised,
         stabilisation=words,
         up_in_imu=None if up is None else _unit_length(up[:, [0, 2, 1]]),
         start_from_imu_xyzw=None if orientation is None else _unit_length(orientation[:, [1, 3, 2, 0]]),
-        image_from_cam_xyzw=None if image is None else _unit_length(image[:, [1, 3, 2, 0]]),
     )
 
 
 # --- the pieces ------------------------------------------------------------------------------------------------------
 
 
-def _open(path: Path) -> tuple[Movie, list[bytes]]:
-    movie = read_movie(path)
-    track = movie.track(entry="gpmd")
-    if track is None or len(track.size) == 0:
-        raise FormatError(path, "holds no GoPro telemetry (a track of format gpmd)")
-    return movie, movie.samples(track)
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Telemetry:
+    """What the camera with the gyroscope wrote.
 
+    Attributes
+    ----------
+    streams
+        By key.
+    payload_ns
+        (P,) presentation times of the payloads.
+    shift_ns
+        What brings the streams' stamps to the video's clock.
+    """
 
-def _telemetry(movie: Movie) -> tuple[NDArray[np.int64], list[int]]:
-    """Presentation times of the payloads, and where they lie in the file."""
-    track = movie.track(entry="gpmd")
-    assert track is not None
-    return track.t_ns, track.offset.tolist()
+    movie: Movie
+    streams: dict[str, Stream]
+    payload_ns: NDArray[np.int64]
+    shift_ns: int = 0
 
+    @classmethod
+    def of(cls, path: Path) -> _Telemetry:
+        movie = read_movie(path)
+        track = movie.telemetry("gpmd", "GoPro telemetry")
+        found = read_streams(path, movie.samples(track), track.offset.tolist(), _WANTED)
+        camera = next((s.device for s in found if s.key == "GYRO"), None)
+        own = {s.key: s for s in reversed(found) if camera is None or s.device == camera}
+        plain = cls(movie=movie, streams=own, payload_ns=track.t_ns)
+        return replace(plain, shift_ns=plain._video_minus_stamp_ns())
 
-def _streams(movie: Movie, payloads: list[bytes]) -> dict[str, Stream]:
-    """The camera's streams by key: those of the device that has the gyroscope."""
-    _, offsets = _telemetry(movie)
-    found = read_streams(movie.path, payloads, offsets, _WANTED)
-    camera = next((s.device for s in found if s.key == "GYRO"), None)
-    own = [s for s in found if camera is None or s.device == camera]
-    return {stream.key: stream for stream in reversed(own)}
+    def times_ns(self, key: str) -> NDArray[np.int64]:
+        """(N,) when a stream's samples were taken, on the video's clock."""
+        try:
+            return self.streams[key].sample_times_ns(self.payload_ns) + self.shift_ns
+        except ValueError as error:
+            raise FormatError(self.movie.path, f"the {key} stream cannot be timed: {error}") from None
 
-
-def _sample_times_ns(path: Path, stream: Stream, track: tuple[NDArray[np.int64], list[int]]) -> NDArray[np.int64]:
-    try:
-        return stream.sample_times_ns(track[0])[0]
-    except ValueError as error:
-        raise FormatError(path, f"the {stream.key} stream cannot be timed: {error}") from None
-
-
-def _video_minus_stamp_ns(
-    movie: Movie, streams: dict[str, Stream], track: tuple[NDArray[np.int64], list[int]]
-) -> tuple[int, str]:
-    """What brings the streams' stamps to the video's clock, and the stream that tied them (empty: none)."""
-    video = movie.track(handler="vide")
-    gyro = streams.get("GYRO")
-    kind = "" if gyro is None else gyro.stamps(track[0])[1]
-    for key in _OF_FRAMES:
-        if video is None or len(video.t_ns) == 0 or key not in streams or streams[key].stamps(track[0])[1] != kind:
-            continue
+    def _video_minus_stamp_ns(self) -> int:
+        video, gyro = self.movie.track(handler="vide"), self.streams.get("GYRO")
+        stamps, kind = (None, "") if gyro is None else gyro.stamps(self.payload_ns)
         if kind == "track":
-            break
-        return int(video.t_ns.min() - _sample_times_ns(movie.path, streams[key], track)[0]), key
-    if gyro is None or kind == "track":
-        return 0, ""
-    return int(track[0][gyro.payload[0]] - gyro.stamps(track[0])[0][0]), ""
+            return 0
+        for key in _OF_FRAMES:
+            stream = self.streams.get(key)
+            if video is not None and len(video.t_ns) and stream and stream.stamps(self.payload_ns)[1] == kind:
+                return int(video.t_ns.min() - self.times_ns(key)[0])
+        return 0 if gyro is None or stamps is None else int(self.payload_ns[gyro.payload[0]] - stamps[0])
 
 
 def _unit(path: Path, stream: Stream, quantity: Quantity) -> str:
@@ -215,12 +205,12 @@ def _labels(letters: str) -> Array:
     """(3, 3) that sorts channels, named by letters such as ``YxZ``, into x, y, z; a small letter is the opposite."""
     if len(letters) != 3:
         raise ValueError(f"{letters!r} does not name three axes")
-    axes = Axes.parse(",".join(("-" if letter.islower() else "") + letter.lower() for letter in letters))
+    axes = Axes.of_letters(letters)
     # Axes reads "channel from axis"; a signed permutation's inverse is its transpose
     return np.asarray(axes.matrix.T)
 
 
-def _device(movie: Movie, payloads: list[bytes], gyro: Stream) -> str:
+def _device(movie: Movie, gyro: Stream) -> str:
     settings = _settings(movie)
     if "MINF" in settings:
         return settings["MINF"].text()
@@ -243,7 +233,7 @@ def _settings(movie: Movie) -> dict[str, Entry]:
 
 def _readout_s(path: Path, settings: dict[str, Entry], streams: dict[str, Stream]) -> float | None:
     if "OREN" in settings and settings["OREN"].text() not in ("", "U"):
-        # the camera hung upside down or on its side and turned the picture: which way its rows are read is not said
+        # the camera hung upside down or on its side and rotated the image: which way its rows are read is not said
         return None
     try:
         if "SROT" in settings:
@@ -266,8 +256,8 @@ def _stabilisation(settings: dict[str, Entry], image: Array | None) -> tuple[boo
         return True, words
     if image is not None:
         # half the angle's sine is what the vector part of a quaternion holds
-        turned = 2 * np.arcsin(np.clip(np.linalg.norm(_unit_length(image)[:, 1:], axis=1), 0, 1))
-        if float(np.sqrt(np.mean(turned**2))) > _TURNED_RAD:
+        angle_rad = 2 * np.arcsin(np.clip(np.linalg.norm(_unit_length(image)[:, 1:], axis=1), 0, 1))
+        if float(np.sqrt(np.mean(angle_rad**2))) > _ROTATED_RAD:
             return True, f"{words} IORI".strip()
         return False, words
     return (False if flag == "N" else None), words
@@ -278,8 +268,7 @@ def _nearest(t_ns: NDArray[np.int64], values: Array, frame_ns: NDArray[np.int64]
     step_ns = float(np.median(np.diff(t_ns)))
     if frame_ns[0] < t_ns[0] - _MISSING_FRAMES * step_ns or frame_ns[-1] > t_ns[-1] + _MISSING_FRAMES * step_ns:
         return None
-    after = np.clip(np.searchsorted(t_ns, frame_ns), 1, len(t_ns) - 1)
-    return values[np.where(frame_ns - t_ns[after - 1] < t_ns[after] - frame_ns, after - 1, after)]
+    return values[nearest(t_ns, frame_ns)]
 
 
 def _unit_length(rows: Array) -> Array:

@@ -122,13 +122,13 @@ class Stream:
                 return np.array(found, dtype=np.int64), kind
         return track_ns[self.payload], "track"
 
-    def sample_times_ns(self, track_ns: NDArray[np.int64]) -> tuple[NDArray[np.int64], str]:
-        """(N,) when each sample was taken, and by which clock; see :func:`spread`."""
+    def sample_times_ns(self, track_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        """(N,) when each sample was taken, by the clock of :meth:`stamps`; see :func:`spread`."""
         stamps, kind = self.stamps(track_ns)
         late_ns = 0
         if "TIMO" in self.about:
             late_ns = round(float(self.about["TIMO"].numbers()[0, 0]) * 1e9)
-        return spread(stamps, self.count, _REACH[kind], _LOST_SHARE[kind]) - late_ns, kind
+        return spread(stamps, self.count, _REACH[kind], _LOST_SHARE[kind]) - late_ns
 
 
 def entries(payload: bytes, begin: int = 0, end: int | None = None) -> Iterator[Entry]:

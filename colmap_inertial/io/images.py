@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.errors import FormatError
+from colmap_inertial.io.files import read_bytes
 
 #: File endings of pictures that both OpenCV and the published builds of pycolmap read (the latter read no WebP).
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".pgm", ".ppm")
@@ -28,12 +29,7 @@ def read_image(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
     """
     import cv2
 
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError:
-        raise FormatError(path, "no such picture") from None
-    except OSError as error:
-        raise FormatError(path, f"cannot be read: {error.strerror or error}") from None
+    data = read_bytes(path, what="picture")
     fault = _fault(data)
     if fault is not None:
         raise FormatError(path, f"{fault}; copy it again from its source, or take it out of the folder")
@@ -53,6 +49,14 @@ def read_image(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
     elif image.ndim == 3:
         image = np.ascontiguousarray(image[:, :, 0])
     return image
+
+
+def grey_8bit(image: NDArray[np.uint8] | NDArray[np.uint16]) -> NDArray[np.uint8]:
+    """(H, W) brightness of an image in 8 bit."""
+    import cv2
+
+    grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    return np.asarray(grey if grey.dtype == np.uint8 else grey >> 8, dtype=np.uint8)
 
 
 def _fault(data: bytes) -> str | None:

@@ -1,60 +1,34 @@
 """``read_imu``: one door for every kind of inertial recording, found by content.
 
-A new family of files joins with one function and one :class:`ImuFormat`; see :func:`register_imu_format`.
+Families of files, and how another package adds one: :mod:`colmap_inertial.io.imu_formats`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from colmap_inertial.errors import FormatError
-from colmap_inertial.io import android, camm, dji, gcsv, gopro, imu_text, ios, rosbag, video_imu_capture
+from colmap_inertial.io import imu_text
 from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.capture_tables import ImuPath
-from colmap_inertial.io.mp4 import is_mp4, read_movie
+from colmap_inertial.io.files import StrPath
+from colmap_inertial.io.imu_formats import find_imu_format
 from colmap_inertial.io.plausible import check_plausible
 from colmap_inertial.io.units import Axes, DeclaredUnits
 from colmap_inertial.types import FrameLog, ImuRecording
 
 
-@dataclass(frozen=True, kw_only=True)
-class ImuFormat:
-    """One family of inertial recordings.
-
-    Attributes
-    ----------
-    name
-        What ``format =`` and ``--imu-format`` call it.
-    layout
-        What such a recording looks like, for messages.
-    accepts
-        Whether a path holds one. Looks at names and first bytes; cheap, never raises for a readable path.
-    read
-        Reads it, given the units that the user declared in place of the file's.
-    frames
-        Reads what it says about the frames of the video, where such recordings can say anything; gives ``None`` where
-        this one does not.
-    """
-
-    name: str
-    layout: str
-    accepts: Callable[[Path], bool]
-    read: Callable[[Path, DeclaredUnits], ImuRecording]
-    frames: Callable[[Path], FrameLog | None] | None = None
-
-
-def read_imu(path: Path, *, format: str = "auto") -> ImuRecording:
+def read_imu(path: StrPath, *, format: str = "auto") -> ImuRecording:
     """Read an inertial recording: SI units, sorted, checked for plausibility.
 
     Parameters
     ----------
     path
-        A file or folder of one of :func:`imu_formats`, which includes a video with an IMU inside, or a ``capture.toml``
-        (or a folder that holds one).
+        A file or folder of one of the families, which include videos with an IMU inside, or a ``capture.toml`` (or a
+        folder that holds one).
     format
-        ``"auto"`` finds it by content; otherwise a name from :func:`imu_formats` or ``"capture"``.
+        ``"auto"`` finds it by content; otherwise the name of a family, or ``"capture"``.
 
     Returns
     -------
@@ -67,6 +41,7 @@ def read_imu(path: Path, *, format: str = "auto") -> ImuRecording:
     TimingError
         Where its stamps run backwards or cannot be in the stated unit.
     """
+    path = Path(path)
     raw = read_raw_imu(path, format=format)
     raw.check()
     return raw.imu
@@ -108,10 +83,10 @@ def read_raw_imu(path: Path, *, format: str = "auto") -> RawImu:
     path = Path(path)
     if format == "capture" or (format == "auto" and is_capture(path)):
         return read_raw_capture_imu(load_capture(path))
-    return RawImu(imu=_read_plain(path, format, DeclaredUnits()), path=path, accel_path=path)
+    return RawImu(imu=find_imu_format(path, format).read(path, DeclaredUnits()), path=path, accel_path=path)
 
 
-def read_frame_log(path: Path, *, format: str = "auto") -> FrameLog | None:
+def read_frame_log(path: StrPath, *, format: str = "auto") -> FrameLog | None:
     """What a recording says about the frames of its video: times, exposure, readout, stabilisation, intrinsics.
 
     Parameters
@@ -129,8 +104,8 @@ def read_frame_log(path: Path, *, format: str = "auto") -> FrameLog | None:
         Where the recording is damaged or of no known kind.
     """
     path = Path(path)
-    found = _format_of(path, format)
-    return None if found.frames is None else found.frames(path)
+    found = find_imu_format(Path(path), format)
+    return None if found.frames is None else found.frames(Path(path))
 
 
 def read_capture_imu(capture: Capture) -> ImuRecording:
@@ -147,7 +122,7 @@ def read_raw_capture_imu(capture: Capture) -> RawImu:
         raise FormatError(capture.path, "describes no inertial recording; add [imu] with path = ...")
     if isinstance(source, ImuPath):
         path = accel_path = source.path
-        imu = _read_plain(path, source.format, source.units)
+        imu = find_imu_format(path, source.format).read(path, source.units)
     else:
         path = accel_path = source.gyro.file
         if source.accel is not None:
@@ -165,131 +140,3 @@ def read_raw_capture_imu(capture: Capture) -> RawImu:
 def is_capture(path: Path) -> bool:
     """Whether ``path`` is a capture.toml or a folder that holds one."""
     return path.suffix.lower() == ".toml" or (path / "capture.toml").is_file()
-
-
-def imu_formats() -> tuple[ImuFormat, ...]:
-    """The known families, in the order in which they are tried."""
-    return tuple(_formats)
-
-
-def register_imu_format(added: ImuFormat) -> None:
-    """Make :func:`read_imu` know one more family; it is tried before those already known."""
-    if added.name in ("auto", "capture") or any(known.name == added.name for known in _formats):
-        raise ValueError(f'the IMU format "{added.name}" exists already')
-    _formats.insert(0, added)
-
-
-def _read_plain(path: Path, name: str, units: DeclaredUnits) -> ImuRecording:
-    return _format_of(path, name).read(path, units)
-
-
-def _format_of(path: Path, name: str) -> ImuFormat:
-    if not path.exists():
-        raise FormatError(path, "no such file or folder")
-    if name == "auto":
-        for candidate in _formats:
-            if candidate.accepts(path):
-                return candidate
-        if path.is_file() and is_mp4(path):
-            tracks = ", ".join(f"{track.handler} {track.entry}" for track in read_movie(path).tracks)
-            raise FormatError(path, f"is a video without an IMU that is known here; its tracks: {tracks or 'none'}")
-        known = "; ".join(candidate.layout for candidate in _formats)
-        raise FormatError(
-            path,
-            f"not an inertial recording known here ({known}); describe its files under [imu.gyro] and [imu.accel] in a "
-            "capture.toml",
-        )
-    for candidate in _formats:
-        if candidate.name == name:
-            return candidate
-    names = ", ".join(["auto", *(candidate.name for candidate in _formats), "capture"])
-    raise FormatError(path, f'unknown IMU format "{name}"; known are {names}')
-
-
-_formats: list[ImuFormat] = [
-    ImuFormat(
-        name="euroc",
-        layout="an ASL/EuRoC dataset with mav0/imu0/data.csv",
-        accepts=imu_text.is_euroc,
-        read=imu_text.read_euroc,
-    ),
-    ImuFormat(
-        name="inertial-scale",
-        layout="a folder with gyroscope.txt and accelerometer.txt",
-        accepts=imu_text.is_inertial_scale,
-        read=imu_text.read_inertial_scale_imu,
-    ),
-    ImuFormat(
-        name="gopro",
-        layout="a GoPro video (HERO5 and later, MAX, Fusion)",
-        accepts=gopro.is_gopro,
-        read=gopro.read_gopro,
-        frames=gopro.read_gopro_frames,
-    ),
-    ImuFormat(
-        name="camm",
-        layout="a video with a CAMM track",
-        accepts=camm.is_camm,
-        read=camm.read_camm,
-        frames=camm.read_camm_frames,
-    ),
-    ImuFormat(
-        name="dji",
-        layout="a DJI video, of which the message says what it can give",
-        accepts=dji.is_dji,
-        read=dji.read_dji,
-    ),
-    ImuFormat(
-        name="gcsv",
-        layout="a Gyroflow log (.gcsv)",
-        accepts=gcsv.is_gcsv,
-        read=gcsv.read_gcsv,
-        frames=gcsv.read_gcsv_frames,
-    ),
-    ImuFormat(
-        name="video-imu-capture",
-        layout="a VideoIMUCapture folder with video_meta.pb3",
-        accepts=video_imu_capture.is_video_imu_capture,
-        read=video_imu_capture.read_video_imu_capture,
-        frames=video_imu_capture.read_video_imu_capture_frames,
-    ),
-    ImuFormat(
-        name="mars",
-        layout="a MARS logger folder with gyro_accel.csv",
-        accepts=android.is_mars,
-        read=android.read_mars,
-        frames=android.read_mars_frames,
-    ),
-    ImuFormat(
-        name="opencamera",
-        layout="an OpenCamera-Sensors folder with *gyro.csv and *accel.csv",
-        accepts=android.is_opencamera,
-        read=android.read_opencamera,
-        frames=android.read_opencamera_frames,
-    ),
-    ImuFormat(
-        name="stray-scanner",
-        layout="a Stray Scanner folder with imu.csv",
-        accepts=ios.is_stray_scanner,
-        read=ios.read_stray_scanner,
-        frames=ios.read_stray_scanner_frames,
-    ),
-    ImuFormat(
-        name="sensor-logger",
-        layout="a Sensor Logger zip or folder with Gyroscope.csv",
-        accepts=ios.is_sensor_logger,
-        read=ios.read_sensor_logger,
-    ),
-    ImuFormat(
-        name="rosbag",
-        layout="a ROS 1 bag or ROS 2 recording",
-        accepts=rosbag.is_rosbag,
-        read=rosbag.read_rosbag,
-    ),
-    ImuFormat(
-        name="csv",
-        layout='a CSV file with a header such as "t [ns],gx [rad/s],...,az [m/s2]"',
-        accepts=imu_text.is_csv,
-        read=imu_text.read_csv,
-    ),
-]

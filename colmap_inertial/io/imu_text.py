@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from colmap_inertial.errors import FormatError
 from colmap_inertial.io.columns import recognise
+from colmap_inertial.io.files import first_line
 from colmap_inertial.io.samples import Samples, order_samples
 from colmap_inertial.io.sensor_yaml import read_imu_noise
 from colmap_inertial.io.tables import Table, read_table
-from colmap_inertial.io.units import SENSOR_NAMES, SENSOR_UNITS, DeclaredUnits, Quantity, seconds, to_si
+from colmap_inertial.io.units import SENSOR_NAMES, SENSOR_UNITS, DeclaredUnits, Quantity, seconds
 from colmap_inertial.types import Array, ImuNoise, ImuRecording
 
 _HOW_TO_DESCRIBE = (
@@ -58,19 +59,13 @@ def read_inertial_scale_imu(path: Path, units: DeclaredUnits) -> ImuRecording:
     """Read ``gyroscope.txt`` and ``accelerometer.txt``: rows ``t_ns x y z``, rad/s and m/s2."""
     if not is_inertial_scale(path):
         raise FormatError(path, "holds no gyroscope.txt and accelerometer.txt")
-    samples = []
-    for name, quantity, unit in (
-        ("gyroscope.txt", "gyro", units.gyro or "rad/s"),
-        ("accelerometer.txt", "accel", units.accel or "m/s2"),
-    ):
-        table = read_table(path / name)
-        if table.width != 4:
-            raise FormatError(
-                table.path, f"{table.width} columns; expected t_ns x y z", line=int(table.line_numbers[0])
-            )
-        values = to_si(table.numbers([1, 2, 3]), quantity, unit)  # type: ignore[arg-type]
-        samples.append(ordered(table, quantity, table.stamps_ns(0, "ns"), values))  # type: ignore[arg-type]
-    return recording(*samples)
+
+    def samples(quantity: Quantity, unit: str) -> Samples:
+        table = read_table(path / f"{SENSOR_NAMES[quantity]}.txt")
+        table.require_width("t_ns x y z")
+        return ordered(table, quantity, unit, table.stamps_ns(0, "ns"), table.numbers([1, 2, 3]))
+
+    return recording(samples("gyro", units.gyro or "rad/s"), samples("accel", units.accel or "m/s2"))
 
 
 def is_euroc(path: Path) -> bool:
@@ -123,11 +118,7 @@ def _imu_tables(folder: Path) -> list[Path]:
 
 def _is_imu_table(path: Path) -> bool:
     """Whether a data.csv is an IMU's (a camera's has file names instead of axes)."""
-    try:
-        with open(path, encoding="utf-8-sig", errors="replace") as file:
-            return "w_RS_S_x" in file.readline(1000)
-    except OSError:
-        return False
+    return "w_RS_S_x" in first_line(path)
 
 
 def _read_csv(path: Path, units: DeclaredUnits, noise: ImuNoise | None) -> ImuRecording:
@@ -168,8 +159,8 @@ def _read_csv(path: Path, units: DeclaredUnits, noise: ImuNoise | None) -> ImuRe
     gyro_unit, accel_unit = unit("gyro", 3, units.gyro), unit("accel", 3, units.accel)
     t_ns = table.stamps_ns(place["time", 0], unit("time", 1, None))
     numbers = table.numbers([place[sensor, axis] for sensor in ("gyro", "accel") for axis in range(3)])
-    gyro, accel = to_si(numbers[:, :3], "gyro", gyro_unit), to_si(numbers[:, 3:], "accel", accel_unit)
-    return recording(ordered(table, "gyro", t_ns, gyro), ordered(table, "accel", t_ns, accel), noise=noise)
+    gyro = ordered(table, "gyro", gyro_unit, t_ns, numbers[:, :3])
+    return recording(gyro, ordered(table, "accel", accel_unit, t_ns, numbers[:, 3:]), noise=noise)
 
 
 def _read_described(source: SensorTable, quantity: Quantity) -> Samples:
@@ -178,7 +169,7 @@ def _read_described(source: SensorTable, quantity: Quantity) -> Samples:
     table = read_table(source.file)
     values = table.numbers([column_index(table, column) for column in source.columns])
     t_ns = table.stamps_ns(column_index(table, source.time), source.time_unit)
-    return ordered(table, quantity, t_ns, to_si(values, quantity, source.unit))
+    return ordered(table, quantity, source.unit, t_ns, values)
 
 
 def column_index(table: Table, column: str | int) -> int:
@@ -194,10 +185,10 @@ def column_index(table: Table, column: str | int) -> int:
     return table.header.index(column)
 
 
-def ordered(table: Table, quantity: Quantity, t_ns: NDArray[np.int64], values: Array) -> Samples:
+def ordered(table: Table, quantity: Quantity, unit: str, t_ns: NDArray[np.int64], values: Array) -> Samples:
     """:func:`order_samples` of a table's rows."""
-    samples = order_samples(table.path, SENSOR_NAMES[quantity], t_ns, values, table.line_numbers)
-    return Samples(t_ns=samples.t_ns, values=samples.values, repairs=table.repairs + samples.repairs)
+    samples = order_samples(table.path, quantity, unit, t_ns, values, table.line_numbers)
+    return replace(samples, repairs=table.repairs + samples.repairs)
 
 
 def recording(gyro: Samples, accel: Samples | None, *, noise: ImuNoise | None = None, device: str = "") -> ImuRecording:

@@ -18,6 +18,7 @@ whether "Standardise Units & Frames" was on, which makes iOS write what Android 
 from __future__ import annotations
 
 import zipfile
+import zlib
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -25,18 +26,21 @@ from numpy.typing import NDArray
 
 from colmap_inertial.errors import FormatError
 from colmap_inertial.geometry import colmap_px_from_opencv
-from colmap_inertial.io.files import read_text
+from colmap_inertial.io.files import first_line, read_text
+from colmap_inertial.io.frame_times import frame_log
 from colmap_inertial.io.imu_text import ordered, recording
 from colmap_inertial.io.mp4 import is_mp4, read_movie
 from colmap_inertial.io.samples import Samples
 from colmap_inertial.io.tables import Table, parse_table, read_table
-from colmap_inertial.io.units import DeclaredUnits, seconds, to_si
+from colmap_inertial.io.units import DeclaredUnits, seconds
 from colmap_inertial.types import CameraModel, FrameLog, ImuRecording
 
 #: A median length up to this is g, above it m/s2: gravity gives 1 or 9.8.
 _G_BELOW = 3.0
 #: An unpacked table larger than this is no recording.
 _LARGEST_MEMBER = 1 << 31
+#: What the standard library raises for damaged archives is not documented as one class.
+_DAMAGED = (OSError, EOFError, KeyError, ValueError, RuntimeError, zipfile.BadZipFile, zlib.error)
 
 
 # --- Stray Scanner ---------------------------------------------------------------------------------------------------
@@ -45,13 +49,7 @@ _LARGEST_MEMBER = 1 << 31
 def is_stray_scanner(path: Path) -> bool:
     """Whether ``path`` is a Stray Scanner folder, or its imu.csv."""
     file = path if path.is_file() else path / "imu.csv"
-    if file.name != "imu.csv" or not file.is_file():
-        return False
-    try:
-        with open(file, encoding="utf-8-sig", errors="replace") as text:
-            return "alpha_x" in text.readline(1000)
-    except OSError:
-        return False
+    return file.name == "imu.csv" and "alpha_x" in first_line(file)
 
 
 def read_stray_scanner(path: Path, units: DeclaredUnits) -> ImuRecording:
@@ -63,8 +61,8 @@ def read_stray_scanner(path: Path, units: DeclaredUnits) -> ImuRecording:
     length = float(np.nanmedian(np.linalg.norm(accel, axis=1))) if len(accel) else 0.0
     unit = units.accel or ("g" if length < _G_BELOW else "m/s2")
     return recording(
-        ordered(table, "gyro", t_ns, to_si(gyro, "gyro", units.gyro or "rad/s")),
-        ordered(table, "accel", t_ns, to_si(accel, "accel", unit)),
+        ordered(table, "gyro", units.gyro or "rad/s", t_ns, gyro),
+        ordered(table, "accel", unit, t_ns, accel),
         device="Stray Scanner",
     )
 
@@ -76,18 +74,7 @@ def read_stray_scanner_frames(path: Path) -> FrameLog | None:
     if not file.is_file():
         return None
     table = read_table(file)
-    frame_ns = table.stamps_ns(_column(table, "timestamp"), "s")
-    bad = np.flatnonzero(np.diff(frame_ns) <= 0)
-    if len(bad):
-        raise FormatError(
-            file, "the frame's time is not after the one before", line=int(table.line_numbers[bad[0] + 1])
-        )
-    return FrameLog(
-        t_s=seconds(frame_ns, int(frame_ns[0])),
-        epoch_ns=int(frame_ns[0]),
-        shared_clock=True,
-        camera=_camera_matrix(folder),
-    )
+    return frame_log(file, table.stamps_ns(_column(table, "timestamp"), "s"), camera=_camera_matrix(folder))
 
 
 def _camera_matrix(folder: Path) -> CameraModel | None:
@@ -129,7 +116,7 @@ def read_sensor_logger(path: Path, units: DeclaredUnits) -> ImuRecording:
     if name is None:
         raise FormatError(path, "holds no Gyroscope.csv of Sensor Logger")
     table, t_ns, values = _sensor(path, members, name)
-    gyro = ordered(table, "gyro", t_ns, to_si(values, "gyro", units.gyro or "rad/s"))
+    gyro = ordered(table, "gyro", units.gyro or "rad/s", t_ns, values)
     return recording(gyro, _accelerometer(path, members, units), device="Sensor Logger")
 
 
@@ -156,7 +143,7 @@ def _accelerometer(path: Path, members: dict[str, str], units: DeclaredUnits) ->
         values = values + np.stack([np.interp(at, known, column) for column in gravity.T], axis=1)
         unit = "m/s2"
     sign = -1.0 if ios and not standardised else 1.0
-    return ordered(table, "accel", t_ns, to_si(sign * values, "accel", units.accel or unit))
+    return ordered(table, "accel", units.accel or unit, t_ns, sign * values)
 
 
 def _platform(path: Path, members: dict[str, str]) -> tuple[bool, bool]:
@@ -202,13 +189,8 @@ def _text(path: Path, member: str) -> str:
             if archive.getinfo(member).file_size > _LARGEST_MEMBER:
                 raise FormatError(path, f"its {member} unpacks to more than {_LARGEST_MEMBER >> 30} GiB")
             return archive.read(member).decode("utf-8-sig", errors="replace")
-    # what the standard library raises for damaged archives is not documented as one class
-    except (OSError, EOFError, KeyError, ValueError, RuntimeError, NotImplementedError, zipfile.BadZipFile) as error:
+    except _DAMAGED as error:
         raise FormatError(path, f"its {member} cannot be unpacked: {error}") from None
-    except Exception as error:
-        if type(error).__module__ == "zlib":
-            raise FormatError(path, f"its {member} cannot be unpacked: {error}") from None
-        raise
 
 
 def _column(table: Table, name: str) -> int:

@@ -54,19 +54,6 @@ class Track:
     width_px: int = 0
     height_px: int = 0
 
-    def shown_ns(self, path: Path) -> Int:
-        """(N,) presentation times in their order.
-
-        Raises
-        ------
-        FormatError
-            Where two samples are shown at one time; ``path`` is for the message.
-        """
-        shown = np.sort(self.t_ns)
-        if (np.diff(shown) <= 0).any():
-            raise FormatError(path, f"two samples of its {self.entry} track have the same time")
-        return shown
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Movie:
@@ -82,6 +69,29 @@ class Movie:
             (t for t in self.tracks if handler in (None, t.handler) and entry in (None, t.entry)),
             None,
         )
+
+    def telemetry(self, entry: str, what: str) -> Track:
+        """The track of a format, which holds ``what``; a :class:`FormatError` where there is none."""
+        track = self.track(entry=entry)
+        if track is None or len(track.size) == 0:
+            raise FormatError(self.path, f"holds no {what} (a track of format {entry})")
+        return track
+
+    def frame_times_ns(self) -> Int:
+        """(F,) presentation times of the video's frames, in order.
+
+        Raises
+        ------
+        FormatError
+            Where there is no video, or two frames are shown at one time.
+        """
+        video = self.track(handler="vide")
+        if video is None or len(video.t_ns) == 0:
+            raise FormatError(self.path, "holds no video")
+        shown = np.sort(video.t_ns)
+        if (np.diff(shown) <= 0).any():
+            raise FormatError(self.path, f"two samples of its {video.entry} track have the same time")
+        return shown
 
     def samples(self, track: Track) -> list[bytes]:
         """The contents of a track's samples, in their order."""

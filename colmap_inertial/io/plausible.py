@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -69,40 +70,25 @@ def find_implausible(
     """
     accel_path = path if accel_path is None else accel_path
     lengths = np.linalg.norm(imu.accel_m_s2, axis=1)
-    found = False
-    for problem in (
-        _problem(check_alive, imu.gyro_rad_s, "gyro", path),
-        _problem(check_alive, imu.accel_m_s2, "accel", accel_path) if imu.has_accel else None,
-        _problem(check_exchanged, imu, path) if imu.has_accel else None,
-    ):
-        if problem is not None:
-            found = True
-            yield problem
-    if found:
-        return
-    for problem in (
-        _problem(check_gravity, lengths, accel_path) if imu.has_accel else None,
-        _problem(check_rates, imu.gyro_rad_s, path),
-    ):
-        if problem is not None:
-            found = True
-            yield problem
-    if not found and imu.has_accel:
-        problem = _problem(check_consistent, imu, path, gyro_axes=gyro_axes, accel_axes=accel_axes)
-        if problem is not None:
-            yield problem
-
-
-def _problem(check: Callable[..., None], /, *args: object, **settings: object) -> FormatError | None:
-    try:
-        check(*args, **settings)
-    except FormatError as error:
-        return error
-    return None
+    sensors, units, axes = [partial(check_alive, imu.gyro_rad_s, "gyro", path)], [], []
+    if imu.has_accel:
+        sensors += [partial(check_alive, imu.accel_m_s2, "accel", accel_path), partial(check_exchanged, imu, path)]
+        units = [partial(check_gravity, lengths, accel_path)]
+        axes = [partial(check_consistent, imu, path, gyro_axes=gyro_axes, accel_axes=accel_axes)]
+    for checks in (sensors, [*units, partial(check_rates, imu.gyro_rad_s, path)], axes):
+        found = False
+        for check in checks:
+            try:
+                check()
+            except FormatError as problem:
+                found = True
+                yield problem
+        if found:
+            return
 
 
 def check_exchanged(imu: ImuRecording, path: Path) -> None:
-    """Refuse a gyroscope that feels gravity beside an accelerometer that does not."""
+    """Refuse a gyroscope that reads gravity beside an accelerometer that does not."""
     gyro = float(np.median(np.linalg.norm(imu.gyro_rad_s, axis=1)))
     accel = float(np.median(np.linalg.norm(imu.accel_m_s2, axis=1)))
     low, high = GRAVITY_BOUNDS_M_S2
@@ -229,7 +215,7 @@ def check_consistent(
     what = "mirrored" if np.linalg.det(best.matrix) < 0 else "turned against the accelerometer's"
     hint = f"set {setting('gyro', best.matrix)} in capture.toml"
     if what != "mirrored":
-        # A mirrored accelerometer looks like a turned gyroscope from here: a' = P a needs the rate det(P) P w. Only
+        # A mirrored accelerometer looks like a rotated gyroscope from here: a' = P a needs the rate det(P) P w. Only
         # the user can tell which; the wrong choice leaves both sensors mirrored against the camera.
         accel = -best.matrix.T
         hint += f", or, if {_mirroring(accel)}, set instead {setting('accel', accel)}"

@@ -6,18 +6,18 @@ through in chunks, and what the format lets one check on the way is checked: siz
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from io import BufferedReader
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.errors import FormatError
 from colmap_inertial.geometry import matrix_from_quat
+from colmap_inertial.io.files import advise
 from colmap_inertial.types import Similarity
 
 _CHUNK_BYTES = 512 << 10
@@ -75,7 +75,7 @@ class Header:
         return self.raw.count(b"\n")
 
 
-def read_ply_header(path: Path, file: IO[bytes]) -> Header:
+def read_ply_header(path: Path, file: BufferedReader) -> Header:
     """Read the header and leave the file behind it.
 
     Raises
@@ -136,7 +136,7 @@ def _add(path: Path, line: int, elements: list[Element], new: Property) -> None:
 
 
 def transform_ply(source: Path, target: Path, similarity: Similarity) -> tuple[str, ...]:
-    """Write a copy with positions ``x y z`` moved and normals ``nx ny nz`` turned, wherever an element has them.
+    """Write a copy with positions ``x y z`` moved and normals ``nx ny nz`` rotated, wherever an element has them.
 
     Parameters
     ----------
@@ -156,29 +156,21 @@ def transform_ply(source: Path, target: Path, similarity: Similarity) -> tuple[s
         For a file that is damaged, or holds what cannot be transformed.
     """
     with open(source, "rb") as file:
-        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_SEQUENTIAL)
+        advise(file.fileno(), "SEQUENTIAL")
         header = read_ply_header(source, file)
         vertices = next((e for e in header.elements if e.name == "vertex"), None)
         changed = () if vertices is None else _check_vertices(source, vertices)
         body = source.stat().st_size - len(header.raw)
-        with open(target, "wb", buffering=0) as out:
-            _write(out, header.raw)
+        with open(target, "wb") as out:
+            out.write(header.raw)
             n_vertices = 0 if vertices is None else vertices.rows
             chunks: Iterator[bytes | memoryview]
             if header.order is None:
                 chunks = _ascii(source, file, header, similarity)
             else:
                 chunks = _binary(source, file, header, header.order, body, n_vertices, similarity)
-            for chunk in chunks:
-                _write(out, chunk)
+            out.writelines(chunks)
     return changed
-
-
-def _write(out: IO[bytes], data: bytes | memoryview) -> None:
-    """A raw file may write less than it was given."""
-    view = memoryview(data)
-    while len(view):
-        view = view[out.write(view) :]
 
 
 def _check_vertices(path: Path, vertices: Element) -> tuple[str, ...]:
@@ -232,7 +224,7 @@ class Mover:
 
 
 def _binary(
-    path: Path, file: IO[bytes], header: Header, order: str, left: int, n_vertices: int, similarity: Similarity
+    path: Path, file: BufferedReader, header: Header, order: str, left: int, n_vertices: int, similarity: Similarity
 ) -> Iterator[memoryview]:
     for element in header.elements:
         smallest = sum(np.dtype(p.count or p.kind).itemsize for p in element.properties)
@@ -251,17 +243,13 @@ def _binary(
         raise FormatError(path, f"damaged: {left} bytes follow the last element")
 
 
-def _read(path: Path, file: IO[bytes], buffer: memoryview, element: Element) -> memoryview:
-    n = 0
-    while n < len(buffer):
-        got = file.readinto(buffer[n:])  # type: ignore[attr-defined]
-        if not got:
-            raise FormatError(path, f"truncated within element {element.name}")
-        n += got
+def _read(path: Path, file: BufferedReader, buffer: memoryview, element: Element) -> memoryview:
+    if file.readinto(buffer) < len(buffer):
+        raise FormatError(path, f"truncated within element {element.name}")
     return buffer
 
 
-def _binary_rows(path: Path, file: IO[bytes], element: Element, order: str, mover: Mover) -> Iterator[memoryview]:
+def _binary_rows(path: Path, file: BufferedReader, element: Element, order: str, mover: Mover) -> Iterator[memoryview]:
     dtype = element.dtype(order)
     per_chunk = max(1, _CHUNK_BYTES // dtype.itemsize)
     buffer = bytearray(min(per_chunk, element.rows) * dtype.itemsize)
@@ -272,19 +260,21 @@ def _binary_rows(path: Path, file: IO[bytes], element: Element, order: str, move
         yield data
 
 
-def _binary_lists(path: Path, file: IO[bytes], element: Element, order: str, n_vertices: int) -> Iterator[memoryview]:
-    """Copy rows with lists; rows whose lists are as long as the first row's are looked at all together."""
+def _binary_lists(
+    path: Path, file: BufferedReader, element: Element, order: str, n_vertices: int
+) -> Iterator[memoryview]:
+    """Copy rows with lists; rows whose lists are as long as the first row's are checked together."""
     rows_left, window = element.rows, 64
     while rows_left:
-        first = bytes(_one_row(path, file, element, order))
-        lengths = _lengths(element, order, first)
+        start = file.tell()
+        lengths = _lengths(path, file, element, order)
         fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
         for i, p in enumerate(element.properties):
             if p.count is not None:
                 fields.append((f"n{i}", order + p.count))
             fields.append((f"v{i}", order + p.kind, (lengths[i],)))
         dtype = np.dtype(fields)
-        file.seek(-len(first), 1)
+        file.seek(start)
         n = max(1, min(rows_left, window, _CHUNK_BYTES // dtype.itemsize))
         data = bytearray(file.read(n * dtype.itemsize))
         table = np.frombuffer(data[: len(data) // dtype.itemsize * dtype.itemsize], dtype)
@@ -300,39 +290,27 @@ def _binary_lists(path: Path, file: IO[bytes], element: Element, order: str, n_v
                     raise FormatError(path, f"damaged: a face refers to none of the {n_vertices} vertices")
         file.seek(good * dtype.itemsize - len(data), 1)
         rows_left -= good
-        # As far as rows have been alike, so far they are expected to be
+        # Rows are expected to be of one length for as long as they have been so far
         window = 2 * window if good == n else max(16, good)
         yield memoryview(data)[: good * dtype.itemsize]
 
 
-def _one_row(path: Path, file: IO[bytes], element: Element, order: str) -> bytes:
-    row = bytearray()
+def _lengths(path: Path, file: BufferedReader, element: Element, order: str) -> list[int]:
+    """Read one row: how many values each property has."""
+    lengths = []
     for p in element.properties:
         n = 1
         if p.count is not None:
             counted = _read(path, file, memoryview(bytearray(np.dtype(p.count).itemsize)), element)
-            row += counted
             n = int(np.frombuffer(counted, order + p.count)[0])
             if not 0 <= n <= _CHUNK_BYTES:
                 raise FormatError(path, f"damaged: a list of {n} values in element {element.name}")
-        row += _read(path, file, memoryview(bytearray(n * np.dtype(p.kind).itemsize)), element)
-    return bytes(row)
-
-
-def _lengths(element: Element, order: str, row: bytes) -> list[int]:
-    """Number of values of each property in one row."""
-    lengths, at = [], 0
-    for p in element.properties:
-        n = 1
-        if p.count is not None:
-            n = int(np.frombuffer(row, order + p.count, 1, at)[0])
-            at += np.dtype(p.count).itemsize
-        at += n * np.dtype(p.kind).itemsize
+        _read(path, file, memoryview(bytearray(n * np.dtype(p.kind).itemsize)), element)
         lengths.append(n)
     return lengths
 
 
-def _ascii(path: Path, file: IO[bytes], header: Header, similarity: Similarity) -> Iterator[bytes]:
+def _ascii(path: Path, file: BufferedReader, header: Header, similarity: Similarity) -> Iterator[bytes]:
     number = header.lines
     n_vertices = next((e.rows for e in header.elements if e.name == "vertex"), 0)
     for element in header.elements:
@@ -406,6 +384,6 @@ def _checked_tokens(path: Path, number: int, element: Element, line: bytes, n_ve
 def _integer(token: bytes, kind: str) -> int:
     value = float(token)
     limits = np.iinfo(kind)
-    if b"_" in token or value != int(value) or not limits.min <= value <= limits.max:
+    if b"_" in token or not limits.min <= value <= limits.max or value != int(value):
         raise ValueError(f"{token.decode('latin-1')} does not fit into {limits.bits} bits")
     return int(value)

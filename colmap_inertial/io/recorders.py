@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from colmap_inertial.io import android, camm, gopro, ios, video_imu_capture
+from colmap_inertial.io.imu_formats import imu_formats
 from colmap_inertial.types import FrameLog
 
 
@@ -30,24 +29,6 @@ class Recording:
     log: FrameLog | None
 
 
-#: Name, test, reader of the frame log, and the video's place in a recorder's folder.
-_VIDEOS: tuple[tuple[str, Callable[[Path], bool], Callable[[Path], FrameLog]], ...] = (
-    ("gopro", gopro.is_gopro, gopro.read_gopro_frames),
-    ("camm", camm.is_camm, camm.read_camm_frames),
-)
-_FOLDERS: tuple[tuple[str, Callable[[Path], bool], Callable[[Path], FrameLog | None], tuple[str, ...]], ...] = (
-    (
-        "video-imu-capture",
-        video_imu_capture.is_video_imu_capture,
-        video_imu_capture.read_video_imu_capture_frames,
-        ("video_recording.mp4",),
-    ),
-    ("mars", android.is_mars, android.read_mars_frames, ("movie.mp4", "movie.mov", "movie.MOV")),
-    ("opencamera", android.is_opencamera, android.read_opencamera_frames, ("*.mp4", "../VID_{name}.mp4")),
-    ("stray-scanner", ios.is_stray_scanner, ios.read_stray_scanner_frames, ("rgb.mp4",)),
-)
-
-
 def find_recording(path: Path) -> Recording | None:
     """The recording at ``path``: a video with an IMU inside, or a recorder's folder; ``None`` where it is neither.
 
@@ -56,15 +37,11 @@ def find_recording(path: Path) -> Recording | None:
     FormatError
         Where it is one of these, and damaged.
     """
-    if path.is_file():
-        for name, is_one, read in _VIDEOS:
-            if is_one(path):
-                return Recording(format=name, imu=path, video=path, log=read(path))
-        return None
-    if path.is_dir():
-        for name, accepts, read_log, places in _FOLDERS:
-            if accepts(path):
-                return Recording(format=name, imu=path, video=_video(path, places), log=read_log(path))
+    for one in imu_formats():
+        if one.video is not None and bool(one.video) == path.is_dir() and one.accepts(path):
+            video = _video(path, one.video) if one.video else path
+            noted = None if one.frames is None else one.frames(path)
+            return Recording(format=one.name, imu=path, video=video, log=noted)
     return None
 
 

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from colmap_inertial.errors import FormatError
 from colmap_inertial.geometry import colmap_px_from_opencv, matrix_from_quat
 from colmap_inertial.io.capture_tables import CAMERA_MODELS
-from colmap_inertial.io.files import read_text, read_yaml
+from colmap_inertial.io.files import read_bytes, read_text, read_yaml
+from colmap_inertial.io.sensor_yaml import Sheet, is_rotation
 from colmap_inertial.types import LengthUnit
 
 Matrix = NDArray[np.float64]
@@ -106,31 +107,13 @@ def _kalibr(path: Path, sheet: dict[str, Any]) -> dict[str, MountedCamera]:
     cameras: dict[str, MountedCamera] = {}
     cam_from_rig = np.eye(4)
     for index, name in enumerate(sorted(sheet, key=lambda n: (len(n), n))):
-        entry = sheet[name]
-        if entry.get("camera_model") != "pinhole":
-            raise FormatError(
-                path, f"{name}: camera_model {entry.get('camera_model')!r} is not known here (pinhole is)"
-            )
-        distortion = entry.get("distortion_model")
-        models = {"radtan": "OPENCV", "equidistant": "OPENCV_FISHEYE", "none": "PINHOLE"}
-        if distortion not in models:
-            raise FormatError(
-                path, f"{name}: distortion_model {distortion!r} is not known here ({', '.join(models)} are)"
-            )
-        fx, fy, cx, cy = _numbers(path, name, entry, "intrinsics", 4)
-        coefficients = [] if distortion == "none" else _numbers(path, name, entry, "distortion_coeffs", 4)
-        width, height = _numbers(path, name, entry, "resolution", 2)
+        entry = Sheet(path=path, values=sheet[name], part=name)
+        model, params, size = entry.pinhole("distortion_coeffs")
         if index > 0:
-            if "T_cn_cnm1" not in entry:
-                raise FormatError(path, f"{name}: T_cn_cnm1 (its pose against the camera before it) is missing")
-            step = np.array(_numbers(path, name, entry, "T_cn_cnm1", 16)).reshape(4, 4)
-            cam_from_rig = _checked_pose(path, f"{name}: T_cn_cnm1", step) @ cam_from_rig
-        cameras[name] = MountedCamera(
-            model=models[distortion],
-            params=(fx, fy, *_corner(cx, cy), *coefficients),
-            size=(int(width), int(height)),
-            cam_from_rig=cam_from_rig,
-        )
+            if "T_cn_cnm1" not in entry.values:
+                raise entry.fault("T_cn_cnm1 (its pose against the camera before it) is missing")
+            cam_from_rig = entry.pose("T_cn_cnm1", "T_cn_cnm1") @ cam_from_rig
+        cameras[name] = MountedCamera(model=model, params=params, size=size, cam_from_rig=cam_from_rig)
     return cameras
 
 
@@ -152,32 +135,31 @@ def _opencv(path: Path, sheet: dict[str, Any], metres: float) -> dict[str, Mount
     for name, entry in sheet.items():
         if not isinstance(entry, dict) or "camera_matrix" not in entry:
             continue
-        matrix = np.array(_numbers(path, name, entry, "camera_matrix", 9)).reshape(3, 3)
-        distortion = entry.get("distortion_coefficients")
-        coefficients = [] if distortion is None else _flat(path, f"{name}: distortion_coefficients", distortion)
+        given = Sheet(path=path, values=entry, part=name)
+        matrix = np.array(given.numbers("camera_matrix", 9)).reshape(3, 3)
+        key = "distortion_coefficients"
+        coefficients = [] if entry.get(key) is None else given.numbers(key)
         if any(coefficients[8:]):
-            raise FormatError(path, f"{name}: prism or tilt coefficients are not known to COLMAP's cameras")
+            raise given.fault("prism or tilt coefficients are not known to COLMAP's cameras")
         coefficients = [*coefficients, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0][:8]
         full = any(coefficients[4:])
         size = None
         if "image_width" in entry and "image_height" in entry:
-            size = int(_number(path, name, entry, "image_width")), int(_number(path, name, entry, "image_height"))
+            size = int(given.numbers("image_width", 1)[0]), int(given.numbers("image_height", 1)[0])
         pose = np.eye(4)
         if ("R" in entry) != ("T" in entry):
-            raise FormatError(path, f"{name}: R and T belong together; one of them is missing")
+            raise given.fault("R and T belong together; one of them is missing")
         if "R" in entry:
-            pose[:3, :3] = np.array(_numbers(path, name, entry, "R", 9)).reshape(3, 3)
-            pose[:3, 3] = metres * np.array(_numbers(path, name, entry, "T", 3))
+            pose[:3, :3] = np.array(given.numbers("R", 9)).reshape(3, 3)
+            pose[:3, 3] = metres * np.array(given.numbers("T", 3))
+            if not is_rotation(pose[:3, :3]):
+                raise given.fault("R holds no rotation")
+        centre = colmap_px_from_opencv(matrix[:2, 2]).tolist()
         cameras[name] = MountedCamera(
             model="FULL_OPENCV" if full else "OPENCV",
-            params=(
-                matrix[0, 0],
-                matrix[1, 1],
-                *_corner(matrix[0, 2], matrix[1, 2]),
-                *coefficients[: 8 if full else 4],
-            ),
+            params=(matrix[0, 0], matrix[1, 1], *centre, *coefficients[: 8 if full else 4]),
             size=size,
-            cam_from_rig=_checked_pose(path, f"{name}: R", pose),
+            cam_from_rig=pose,
         )
     if not cameras:
         raise FormatError(
@@ -218,19 +200,20 @@ def _from_rig_config(path: Path, unit: Metres | None) -> RigCalibration:
     cameras = {}
     for entry in rigs[0].get("cameras", []):
         name = str(entry.get("image_prefix", "")).rstrip("/")
+        given = Sheet(path=path, values=entry, part=name)
         model = entry.get("camera_model_name")
         if model is None or "camera_params" not in entry:
-            raise FormatError(path, f"{name}: camera_model_name and camera_params are missing")
+            raise given.fault("camera_model_name and camera_params are missing")
         if model not in CAMERA_MODELS:
-            raise FormatError(path, f"{name}: camera model {model!r} is unknown")
+            raise given.fault(f"camera model {model!r} is unknown")
         pose = np.eye(4)
         if not entry.get("ref_sensor", False):
-            quaternion = _numbers(path, name, entry, "cam_from_rig_rotation", 4)  # w first, as COLMAP's files have it
+            quaternion = given.numbers("cam_from_rig_rotation", 4)  # w first, as COLMAP's files have it
             if abs(np.linalg.norm(quaternion) - 1) > 1e-3:
-                raise FormatError(path, f"{name}: cam_from_rig_rotation is no unit quaternion")
+                raise given.fault("cam_from_rig_rotation is no unit quaternion")
             pose[:3, :3] = matrix_from_quat(np.roll(quaternion, -1))
-            pose[:3, 3] = _scale(unit) * np.array(_numbers(path, name, entry, "cam_from_rig_translation", 3))
-        params = tuple(_numbers(path, name, entry, "camera_params", CAMERA_MODELS[model][0]))
+            pose[:3, 3] = _scale(unit) * np.array(given.numbers("cam_from_rig_translation", 3))
+        params = tuple(given.numbers("camera_params", CAMERA_MODELS[model][0]))
         cameras[name] = MountedCamera(model=model, params=params, size=None, cam_from_rig=pose)
     return RigCalibration(path=path, cameras=cameras, length_unit="model" if unit is None else "m")
 
@@ -285,7 +268,7 @@ def _from_model(path: Path, unit: Metres | None) -> RigCalibration:
 
 
 def _records(path: Path, read: Callable[[Callable[[str], tuple[Any, ...]]], Any]) -> Any:
-    data, at = path.read_bytes(), 0
+    data, at = read_bytes(path), 0
 
     def take(layout: str) -> tuple[Any, ...]:
         nonlocal at
@@ -301,44 +284,3 @@ def _records(path: Path, read: Callable[[Callable[[str], tuple[Any, ...]]], Any]
 
 def _scale(unit: Metres | None) -> float:
     return 1e-3 if unit == "mm" else 1.0
-
-
-# --- numbers --------------------------------------------------------------------------------------------------------
-
-
-def _corner(cx: float, cy: float) -> list[float]:
-    """A principal point counted from the top-left pixel's corner; OpenCV and Kalibr count from its centre."""
-    return [float(value) for value in colmap_px_from_opencv(np.array([cx, cy]))]
-
-
-def _checked_pose(path: Path, what: str, pose: Matrix) -> Matrix:
-    rotation = pose[:3, :3]
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
-        raise FormatError(path, f"{what} holds no rotation")
-    return pose
-
-
-def _flat(path: Path, what: str, value: object) -> list[float]:
-    try:
-        numbers = [float(item) for item in np.asarray(value, dtype=np.float64).ravel()]
-    except (TypeError, ValueError):
-        raise FormatError(path, f"{what}: {value!r} is not a list of numbers"[:300]) from None
-    if not np.isfinite(numbers).all():
-        raise FormatError(path, f"{what}: numbers must be finite")
-    return numbers
-
-
-def _numbers(path: Path, name: str, entry: Mapping[str, Any], key: str, count: int) -> list[float]:
-    if key not in entry:
-        raise FormatError(path, f"{name}: {key} is missing")
-    numbers = _flat(path, f"{name}: {key}", entry[key])
-    if len(numbers) != count:
-        raise FormatError(path, f"{name}: {key} must hold {count} numbers, found {len(numbers)}")
-    return numbers
-
-
-def _number(path: Path, name: str, entry: Mapping[str, Any], key: str) -> float:
-    return _numbers(path, name, entry, key, 1)[0]
-
-
-__all__ = ["MountedCamera", "RigCalibration", "read_rig_calibration"]

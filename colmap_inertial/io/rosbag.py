@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from colmap_inertial.errors import FormatError, MissingExtraError
 from colmap_inertial.io.imu_text import recording
 from colmap_inertial.io.samples import Samples, order_samples
-from colmap_inertial.io.units import SENSOR_NAMES, DeclaredUnits, Quantity, to_si
+from colmap_inertial.io.units import SENSOR_NAMES, DeclaredUnits, Quantity
 from colmap_inertial.types import Array, ImuRecording
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ def read_rosbag(path: Path, units: DeclaredUnits) -> ImuRecording:
                 f"rosbags-convert --src {path.name} --dst one --include-topic {next(iter(with_it))}",
             )
         for t_ns, values in with_it.values():
-            found[quantity] = order_samples(path, SENSOR_NAMES[quantity], t_ns, to_si(values, quantity, unit))
+            found[quantity] = order_samples(path, quantity, unit, t_ns, values)
     if "gyro" not in found:
         raise FormatError(path, f"none of its IMU topics ({', '.join(topics)}) has a gyroscope that moves")
     return recording(found["gyro"], found.get("accel"))

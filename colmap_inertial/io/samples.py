@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.errors import FormatError, TimingError
+from colmap_inertial.io.units import SENSOR_NAMES, Quantity, to_si
 from colmap_inertial.types import Array
 
 #: A sample this far behind the newest one before it means that the clock was set back, not that rows changed places.
@@ -54,17 +55,24 @@ class Samples:
 
 
 def order_samples(
-    path: Path, what: str, t_ns: NDArray[np.int64], values: Array, line_numbers: NDArray[np.int64] | None = None
+    path: Path,
+    quantity: Quantity,
+    unit: str,
+    t_ns: NDArray[np.int64],
+    values: Array,
+    line_numbers: NDArray[np.int64] | None = None,
 ) -> Samples:
-    """Sort, merge and drop what is harmless.
+    """Samples in SI units; sort, merge and drop what is harmless.
 
     Rows without a sample, and a few with missing values, are dropped; rows up to half a second late are sorted in; rows
     that repeat a stamp are merged (equal values) or averaged (different ones). Each is listed.
 
     Parameters
     ----------
-    path, what
-        For messages: the file, and the sensor's name.
+    path
+        The file, for messages.
+    quantity, unit
+        The sensor, and the unit of the values.
     t_ns, values, line_numbers
         (N,), (N, 3), (N,) rows as they stand in the file; without line numbers, samples are counted.
 
@@ -75,102 +83,116 @@ def order_samples(
     TimingError
         For stamps that run backwards, jump back, repeat often, or cannot be in the stated unit.
     """
-    unit = "line"
-    if line_numbers is None:
-        unit, line_numbers = "sample", np.arange(1, len(t_ns) + 1)
-    repairs: list[str] = []
+    what, counted = SENSOR_NAMES[quantity], "sample" if line_numbers is None else "line"
+    numbers = np.arange(1, len(t_ns) + 1) if line_numbers is None else line_numbers
+    values = to_si(values, quantity, unit)
+    rows = _Rows(path=path, what=what, counted=counted, numbers=numbers, t_ns=t_ns, values=values)
+    rows = _merged(_sorted(_complete(rows)))
+    check_rate(path, what, rows.t_ns)
+    return Samples(t_ns=rows.t_ns, values=rows.values, repairs=rows.repairs)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Rows:
+    """One sensor's rows of a file, and how messages name them: by number of line or sample."""
+
+    path: Path
+    what: str
+    counted: str
+    numbers: NDArray[np.int64]
+    t_ns: NDArray[np.int64]
+    values: Array
+    repairs: tuple[Repair, ...] = ()
+
+    def taken(self, chosen: NDArray[np.bool_ | np.intp], text: str, *, code: str) -> _Rows:
+        """Some of the rows, or all in another order, and the sentence that says so."""
+        taken = replace(self, numbers=self.numbers[chosen], t_ns=self.t_ns[chosen], values=self.values[chosen])
+        return taken.repaired(text, code=code)
+
+    def repaired(self, text: str, *, code: str) -> _Rows:
+        return replace(self, repairs=(*self.repairs, Repair(f"{self.path.name}: {text}", code)))
+
+
+def _complete(rows: _Rows) -> _Rows:
+    """The rows that hold a sample."""
     # Loggers that write sensors of different rates to one table leave the cells of the others empty.
-    absent = np.asarray(np.isnan(values).all(axis=1))
+    absent = np.asarray(np.isnan(rows.values).all(axis=1))
     if absent.any():
-        repairs.append(
-            Repair(f"{path.name}: {int(absent.sum())} of {len(absent)} rows hold no {what} sample", code="empty-cells")
-        )
-        t_ns, values, line_numbers = t_ns[~absent], values[~absent], line_numbers[~absent]
-    finite = np.asarray((np.abs(values) < LARGEST_READING).all(axis=1))
+        text = f"{int(absent.sum())} of {len(absent)} rows hold no {rows.what} sample"
+        rows = rows.taken(~absent, text, code="empty-cells")
+    finite = np.asarray((np.abs(rows.values) < LARGEST_READING).all(axis=1))
     if not finite.all():
-        missing, first = int((~finite).sum()), int(line_numbers[np.argmin(finite)])
+        missing, first = int((~finite).sum()), int(rows.numbers[np.argmin(finite)])
         if missing > HARMLESS_SHARE * len(finite):
-            lacking = f"{missing} of {len(finite)} {what} rows lack a value (NaN or empty)"
-            raise FormatError(path, lacking, line=first if unit == "line" else None)
-        repairs.append(
-            Repair(
-                f"{path.name}: dropped {missing} {what} rows without a value (first: {unit} {first})",
-                code="samples-missing",
-            )
-        )
-        t_ns, values, line_numbers = t_ns[finite], values[finite], line_numbers[finite]
-    if len(t_ns) < 2:
-        raise FormatError(path, f"holds {len(t_ns)} {what} samples; at least two are needed")
-
-    newest = np.maximum.accumulate(t_ns)
-    late_ns = newest - t_ns
-    if late_ns.any():
-        worst = int(np.argmax(late_ns))
-        if (np.diff(t_ns) < 0).mean() > 0.5:
-            raise TimingError(
-                f"{path}: {what} stamps run backwards; is the file written in reverse order?", code="stamps-reversed"
-            )
-        if late_ns[worst] > LATEST_ARRIVAL_NS:
-            first = int(np.argmax(late_ns > LATEST_ARRIVAL_NS))
-            raise TimingError(
-                f"{path}, {unit} {line_numbers[first]}: the {what} stamp is {late_ns[first] * 1e-9:.3f} s behind one "
-                "before it; the clock was set back or a stamp is damaged: split or correct the file there",
-                code="stamps-jump-back",
-            )
-        repairs.append(
-            Repair(
-                f"{path.name}: sorted {int((late_ns > 0).sum())} {what} rows that came late", code="stamps-reordered"
-            )
-        )
-        order = np.argsort(t_ns, kind="stable")
-        t_ns, values, line_numbers = t_ns[order], values[order], line_numbers[order]
-
-    same = np.diff(t_ns) == 0
-    if same.any():
-        t_ns, values = _merge(path, what, t_ns, values, line_numbers, same, repairs, unit)
-        if len(t_ns) < 2:
-            raise TimingError(f"{path}: all {what} samples have one stamp; this is not the time column")
-    check_rate(path, what, t_ns)
-    return Samples(t_ns=t_ns, values=values, repairs=tuple(repairs))
+            lacking = f"{missing} of {len(finite)} {rows.what} rows lack a value (NaN or empty)"
+            raise FormatError(rows.path, lacking, line=first if rows.counted == "line" else None)
+        text = f"dropped {missing} {rows.what} rows without a value (first: {rows.counted} {first})"
+        rows = rows.taken(finite, text, code="samples-missing")
+    if len(rows.t_ns) < 2:
+        raise FormatError(rows.path, f"holds {len(rows.t_ns)} {rows.what} samples; at least two are needed")
+    return rows
 
 
-def _merge(
-    path: Path,
-    what: str,
-    t_ns: NDArray[np.int64],
-    values: Array,
-    line_numbers: NDArray[np.int64],
-    same: NDArray[np.bool_],
-    repairs: list[str],
-    unit: str,
-) -> tuple[NDArray[np.int64], Array]:
-    group = np.concatenate([[0], np.cumsum(~same)])
-    first = np.concatenate([[0], np.flatnonzero(~same) + 1])
-    differs = same & (values[1:] != values[:-1]).any(axis=1)
-    n_equal, n_different = int((same & ~differs).sum()), int(differs.sum())
-    if n_different > HARMLESS_SHARE * len(t_ns):
-        line = int(line_numbers[1 + np.argmax(differs)])
+def _sorted(rows: _Rows) -> _Rows:
+    """The rows in order of time."""
+    late_ns = np.maximum.accumulate(rows.t_ns) - rows.t_ns
+    if not late_ns.any():
+        return rows
+    if (np.diff(rows.t_ns) < 0).mean() > 0.5:
         raise TimingError(
-            f"{path}, {unit} {line}: {n_different} of {len(t_ns)} {what} samples repeat the stamp before them with "
-            "other values; the stamps are too coarse, or this is not the time column",
+            f"{rows.path}: {rows.what} stamps run backwards; is the file written in reverse order?",
+            code="stamps-reversed",
+        )
+    if late_ns.max() > LATEST_ARRIVAL_NS:
+        first = int(np.argmax(late_ns > LATEST_ARRIVAL_NS))
+        where = f"{rows.path}, {rows.counted} {rows.numbers[first]}"
+        raise TimingError(
+            f"{where}: the {rows.what} stamp is {late_ns[first] * 1e-9:.3f} s behind one before it; the clock was set "
+            "back or a stamp is damaged: split or correct the file there",
+            code="stamps-jump-back",
+        )
+    text = f"sorted {int((late_ns > 0).sum())} {rows.what} rows that came late"
+    return rows.taken(np.argsort(rows.t_ns, kind="stable"), text, code="stamps-reordered")
+
+
+def _merged(rows: _Rows) -> _Rows:
+    """One row for each stamp: the average of those that have it."""
+    same = np.diff(rows.t_ns) == 0
+    if not same.any():
+        return rows
+    differs = same & (rows.values[1:] != rows.values[:-1]).any(axis=1)
+    n_equal, n_different = int((same & ~differs).sum()), int(differs.sum())
+    if n_different > HARMLESS_SHARE * len(rows.t_ns):
+        raise TimingError(
+            f"{rows.path}, {rows.counted} {rows.numbers[1 + np.argmax(differs)]}: {n_different} of {len(rows.t_ns)} "
+            f"{rows.what} samples repeat the stamp before them with other values; the stamps are too coarse, or this "
+            "is not the time column",
             code="stamps-too-coarse",
         )
-    if n_equal:
-        repairs.append(Repair(f"{path.name}: merged {n_equal} repeated {what} rows", code="stamps-repeated"))
-    if n_different:
-        repairs.append(
-            Repair(
-                f"{path.name}: averaged {n_different} {what} rows that repeat a stamp with other values",
-                code="stamps-repeated",
-            )
-        )
-    merged = values[first]
+    group = np.concatenate([[0], np.cumsum(~same)])
+    first = np.concatenate([[0], np.flatnonzero(~same) + 1])
+    if len(first) < 2:
+        raise TimingError(f"{rows.path}: all {rows.what} samples have one stamp; this is not the time column")
+    values = rows.values[first]
     mixed = np.unique(group[1:][differs])
     if len(mixed):
-        sums = np.zeros_like(merged)
-        np.add.at(sums, group, values)
-        merged[mixed] = sums[mixed] / np.bincount(group)[mixed, None]
-    return t_ns[first], merged
+        sums = np.zeros_like(values)
+        np.add.at(sums, group, rows.values)
+        values[mixed] = sums[mixed] / np.bincount(group)[mixed, None]
+    rows = replace(rows, numbers=rows.numbers[first], t_ns=rows.t_ns[first], values=values)
+    for count, text in (
+        (n_equal, f"merged {n_equal} repeated {rows.what} rows"),
+        (n_different, f"averaged {n_different} {rows.what} rows that repeat a stamp with other values"),
+    ):
+        if count:
+            rows = rows.repaired(text, code="stamps-repeated")
+    return rows
+
+
+def nearest(t_ns: NDArray[np.int64], at_ns: NDArray[np.int64]) -> NDArray[np.intp]:
+    """(M,) which of the increasing times (N,) is nearest to each of (M,) others."""
+    after = np.clip(np.searchsorted(t_ns, at_ns), 1, len(t_ns) - 1)
+    return np.where(at_ns - t_ns[after - 1] < t_ns[after] - at_ns, after - 1, after)
 
 
 def check_rate(path: Path, what: str, t_ns: NDArray[np.int64]) -> None:

@@ -1,7 +1,9 @@
-"""The ``sensor.yaml`` of ASL/EuRoC datasets: intrinsics, extrinsics, IMU noise."""
+"""Sheets of numbers about sensors; the ``sensor.yaml`` of ASL/EuRoC datasets: intrinsics, extrinsics, IMU noise."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +21,75 @@ _NOISE_KEYS = {
     "gyro_walk_rad_s2_rthz": "gyroscope_random_walk",
     "accel_walk_m_s3_rthz": "accelerometer_random_walk",
 }
-_COLMAP_MODELS = {"radial-tangential": "OPENCV", "radtan": "OPENCV", "equidistant": "OPENCV_FISHEYE"}
+#: COLMAP's model for each name of a distortion of pinhole cameras: those of the ASL format, then Kalibr's.
+_COLMAP_MODELS = {
+    "radial-tangential": "OPENCV",
+    "radtan": "OPENCV",
+    "equidistant": "OPENCV_FISHEYE",
+    "none": "PINHOLE",
+}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Sheet:
+    """Keys and values of a sheet of numbers, or of one ``part`` of it, whose complaints name file and part."""
+
+    path: Path
+    values: Mapping[str, Any]
+    part: str = ""
+
+    def fault(self, reason: str) -> FormatError:
+        """What is wrong with it."""
+        return FormatError(self.path, f"{self.part}: {reason}"[:400] if self.part else reason[:400])
+
+    def numbers(self, key: str, count: int | None = None) -> list[float]:
+        """The finite numbers under a key: one, a list, or lists of them; ``count`` of them."""
+        if self.values.get(key) is None:
+            raise self.fault(f"{key} is missing")
+        value = self.values[key]
+        try:
+            numbers: list[float] = np.asarray(value, dtype=np.float64).ravel().tolist()
+        except (TypeError, ValueError):
+            raise self.fault(f"{key}: {value!r} is not a list of numbers") from None
+        if not np.isfinite(numbers).all():
+            raise self.fault(f"{key}: numbers must be finite")
+        if count is not None and len(numbers) != count:
+            raise self.fault(f"{key} must hold {count} numbers, found {len(numbers)}")
+        return numbers
+
+    def pose(self, key: str, what: str) -> NDArray[np.float64]:
+        """A (4, 4) matrix that moves and rotates."""
+        matrix = np.array(self.numbers(key, 16)).reshape(4, 4)
+        if not is_rotation(matrix[:3, :3]):
+            raise self.fault(f"{what} holds no rotation")
+        return matrix
+
+    def pinhole(self, coefficients: str) -> tuple[str, tuple[float, ...], tuple[int, int]]:
+        """Model and parameters in COLMAP's terms, width and height, of a pinhole camera of the ASL format or Kalibr's.
+
+        With radial-tangential distortion it is COLMAP's OPENCV, with equidistant distortion OPENCV_FISHEYE; the
+        principal point is moved by half a pixel from OpenCV's origin to COLMAP's.
+        """
+        if self.values.get("camera_model") != "pinhole":
+            raise self.fault(f"camera_model {self.values.get('camera_model')!r} is not known here (pinhole is)")
+        distortion = self.values.get("distortion_model")
+        if distortion not in _COLMAP_MODELS:
+            known = ", ".join(_COLMAP_MODELS)
+            raise self.fault(f"distortion_model {distortion!r} is not known here ({known} are)")
+        fx, fy, *centre = self.numbers("intrinsics", 4)
+        more = [] if distortion == "none" else self.numbers(coefficients, 4)
+        width, height = self.numbers("resolution", 2)
+        params = (fx, fy, *colmap_px_from_opencv(np.array(centre)).tolist(), *more)
+        return _COLMAP_MODELS[distortion], params, (int(width), int(height))
+
+
+def is_rotation(matrix: NDArray[np.float64]) -> bool:
+    """Whether a (3, 3) matrix is a rotation, to the precision that people write."""
+    return bool(np.abs(matrix @ matrix.T - np.eye(3)).max() <= 1e-3 and np.linalg.det(matrix) > 0)
+
+
+def _read(path: Path) -> Sheet:
+    return Sheet(path=path, values=read_yaml(path, "a sensor.yaml"))
 
 
 def read_imu_noise(path: Path) -> ImuNoise | None:
@@ -30,11 +100,10 @@ def read_imu_noise(path: Path) -> ImuNoise | None:
     FormatError
         Where the sheet gives some of the four and not all, or not as numbers.
     """
-    sheet = read_yaml(path, "a sensor.yaml")
-    given = [key for key in _NOISE_KEYS.values() if key in sheet]
-    if not given:
+    sheet = _read(path)
+    if not any(key in sheet.values for key in _NOISE_KEYS.values()):
         return None
-    values = {name: _numbers(path, sheet, key, 1)[0] for name, key in _NOISE_KEYS.items()}
+    values = {name: sheet.numbers(key, 1)[0] for name, key in _NOISE_KEYS.items()}
     try:
         return ImuNoise(**values)
     except ValueError as error:
@@ -42,54 +111,17 @@ def read_imu_noise(path: Path) -> ImuNoise | None:
 
 
 def read_camera(path: Path) -> CameraModel:
-    """The camera model of a camera's sheet, in COLMAP's terms.
-
-    Pinhole with radial-tangential distortion is COLMAP's OPENCV, with equidistant distortion OPENCV_FISHEYE; the
-    principal point is moved by half a pixel from OpenCV's origin to COLMAP's.
-    """
-    sheet = read_yaml(path, "a sensor.yaml")
-    if sheet.get("camera_model") != "pinhole":
-        raise FormatError(path, f"camera_model {sheet.get('camera_model')!r} is not known here (pinhole is)")
-    distortion = sheet.get("distortion_model")
-    if distortion not in _COLMAP_MODELS:
-        raise FormatError(path, f"distortion_model {distortion!r} is not known here ({', '.join(_COLMAP_MODELS)} are)")
-    fx, fy, cx, cy = _numbers(path, sheet, "intrinsics", 4)
-    coefficients = _numbers(path, sheet, "distortion_coefficients", 4)
-    width, height = _numbers(path, sheet, "resolution", 2)
-    centre = colmap_px_from_opencv(np.array([cx, cy]))
+    """The camera model of a camera's sheet, in COLMAP's terms; see :meth:`Sheet.pinhole`."""
+    model, params, (width, height) = _read(path).pinhole("distortion_coefficients")
     try:
-        return CameraModel(
-            model=_COLMAP_MODELS[distortion],
-            width=int(width),
-            height=int(height),
-            params=(fx, fy, float(centre[0]), float(centre[1]), *coefficients),
-        )
+        return CameraModel(model=model, width=width, height=height, params=params)
     except ValueError as error:
         raise FormatError(path, f"resolution: {error}") from None
 
 
 def read_body_from_sensor(path: Path) -> NDArray[np.float64]:
     """(4, 4) ``T_BS``: body frame from sensor frame, metres."""
-    sheet = read_yaml(path, "a sensor.yaml")
-    entry = sheet.get("T_BS")
+    entry = _read(path).values.get("T_BS")
     if not isinstance(entry, dict):
         raise FormatError(path, "holds no T_BS with rows, cols and data")
-    matrix = np.array(_numbers(path, entry, "data", 16)).reshape(4, 4)
-    rotation = matrix[:3, :3]
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
-        raise FormatError(path, "T_BS holds no rotation")
-    return matrix
-
-
-def _numbers(path: Path, sheet: dict[str, Any], key: str, count: int) -> list[float]:
-    value = sheet.get(key)
-    if value is None:
-        raise FormatError(path, f"{key} is missing")
-    items = value if isinstance(value, list) else [value]
-    try:
-        numbers = [float(item) for item in items]
-    except (TypeError, ValueError):
-        raise FormatError(path, f"{key}: {value!r} is not {'a number' if count == 1 else f'{count} numbers'}") from None
-    if len(numbers) != count or not np.isfinite(numbers).all():
-        raise FormatError(path, f"{key}: expected {count} finite number{'s' if count > 1 else ''}, found {value!r}")
-    return numbers
+    return Sheet(path=path, values=entry).pose("data", "T_BS")

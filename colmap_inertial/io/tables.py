@@ -50,6 +50,11 @@ class Table:
     def __len__(self) -> int:
         return len(self.lines)
 
+    def require_width(self, layout: str) -> None:
+        """Raise :class:`FormatError` unless there are as many columns as the layout has words."""
+        if self.width != len(layout.split()):
+            raise FormatError(self.path, f"{self.width} columns; expected {layout}", line=int(self.line_numbers[0]))
+
     def text(self, column: int) -> list[str]:
         """The cells of one zero-based column."""
         cells = (line.split(self.delimiter, column + 1)[column] for line in self.lines)

@@ -96,8 +96,7 @@ def read_inertial_scale_poses(folder: Path) -> CameraTrajectory:
 
 
 def _require_width(table: Table, layout: str) -> None:
-    if table.width != len(layout.split()):
-        raise FormatError(table.path, f"{table.width} columns; expected {layout}", line=int(table.line_numbers[0]))
+    table.require_width(layout)
     if len(table) < 2:
         raise FormatError(table.path, "holds one pose; a trajectory needs at least two")
 

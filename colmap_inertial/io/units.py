@@ -99,6 +99,11 @@ class Axes:
             raise ValueError(f'"{text}" must name x, y and z once each, with optional signs, like "y,-x,z"')
         return cls(matrix=matrix)
 
+    @classmethod
+    def of_letters(cls, text: str) -> Axes:
+        """The mapping that three letters spell, of which a small one is the opposite: ``"YxZ"`` is ``"y,-x,z"``."""
+        return cls.parse(",".join(("-" if letter.islower() else "") + letter for letter in text))
+
     @property
     def is_mirrored(self) -> bool:
         """Whether the mapping turns a right-handed frame into a left-handed one."""

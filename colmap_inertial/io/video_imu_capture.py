@@ -19,9 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.errors import FormatError
+from colmap_inertial.io.files import read_bytes
+from colmap_inertial.io.frame_times import frame_log
 from colmap_inertial.io.imu_text import recording
 from colmap_inertial.io.samples import Samples, order_samples
-from colmap_inertial.io.units import SENSOR_NAMES, DeclaredUnits, Quantity, seconds, to_si
+from colmap_inertial.io.units import DeclaredUnits, Quantity
 from colmap_inertial.types import Array, FrameLog, ImuRecording
 
 _FILE = "video_meta.pb3"
@@ -93,11 +95,6 @@ def read_video_imu_capture_frames(path: Path) -> FrameLog:
         rows.append(row)
     if len(t_ns) != len(rows) or not rows:
         raise FormatError(file, "holds no frames" if not rows else "a frame has no time")
-    frame_ns = np.array(t_ns, dtype=np.int64)
-    if (np.diff(frame_ns) <= 0).any():
-        raise FormatError(
-            file, f"the time of frame {2 + int(np.argmax(np.diff(frame_ns) <= 0))} is not after the one before"
-        )
 
     def column(name: str, factor: float, high: float) -> Array | None:
         values = np.array([row.get(name, np.nan) for row in rows]) * factor
@@ -105,10 +102,9 @@ def read_video_imu_capture_frames(path: Path) -> FrameLog:
 
     readout = column("readout", 1e-9, 0.5)
     stabilised, words = _stabilisation(file, data, lens_moves)
-    return FrameLog(
-        t_s=seconds(frame_ns, int(frame_ns[0])),
-        epoch_ns=int(frame_ns[0]),
-        shared_clock=True,
+    return frame_log(
+        file,
+        np.array(t_ns, dtype=np.int64),
         exposure_s=column("exposure", 1e-9, 10.0),
         iso=column("iso", 1.0, 1e7),
         focal_px=column("focal", 1.0, 1e6),
@@ -137,7 +133,7 @@ def _samples(file: Path, t_ns: NDArray[np.int64], rows: list[bytes], quantity: Q
         raise FormatError(file, f"IMU sample {wrong + 1} has {len(rows[wrong])} bytes where three floats have 12")
     with np.errstate(invalid="ignore"):  # a damaged file may hold signalling NaNs
         values = np.frombuffer(b"".join(rows), "<f4").astype(np.float64).reshape(-1, 3)
-    return order_samples(file, SENSOR_NAMES[quantity], t_ns[has], to_si(values, quantity, unit))
+    return order_samples(file, quantity, unit, t_ns[has], values)
 
 
 # --- protobuf --------------------------------------------------------------------------------------------------------
@@ -204,7 +200,4 @@ def _file(path: Path) -> Path:
 
 def _load(path: Path) -> tuple[Path, bytes]:
     file = _file(path)
-    try:
-        return file, file.read_bytes()
-    except OSError as error:
-        raise FormatError(file, f"cannot be read: {error.strerror}") from None
+    return file, read_bytes(file)

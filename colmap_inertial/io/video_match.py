@@ -11,20 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.errors import FormatError
-from colmap_inertial.io.images import read_image
+from colmap_inertial.io.images import grey_8bit, read_image
+from colmap_inertial.io.names import path_in
 from colmap_inertial.io.video import decode_grey
 
 Floats = NDArray[np.float32]
 
-#: Sides of the thumbnails: the small one chooses which frames are looked at closely, the large one decides.
+#: Sides of the thumbnails: the small one chooses which frames are compared closely, the large one decides.
 _SMALL, _LARGE = 40, 128
-#: A frame is looked at closely for the pictures for which it is among this many most alike so far.
+#: A frame is compared closely with the images for which it is among this many most similar ones so far.
 _CANDIDATES = 8
 #: Correlation below which a small thumbnail is no candidate, and a large one not the same picture.
-_LIKE, _SAME = 0.5, 0.95
-#: How far a picture may lie from its frame on the way to the next best one. The change from frame to frame is the
-#: measure, so that noise of coding, which has nothing of it, does not count.
-_ON_THE_WAY = 0.25
+_LEAST, _SAME = 0.5, 0.95
+#: How far an image may lie from its frame towards the next best one, as a fraction: the change from frame to frame is
+#: the measure, so that noise of coding, which has nothing of it, does not count.
+_MOST_FRACTION = 0.25
 #: Frames nearer to each other than this are the same but for rounding.
 _ROUNDING = 0.005
 
@@ -40,7 +41,7 @@ class VideoMatch:
     doubtful
         Why there is none, for the other pictures.
     quarter_turns
-        How often the pictures are turned by 90 degrees counterclockwise against the frames as stored.
+        How often the images are rotated by 90 degrees counterclockwise against the frames as stored.
     """
 
     t_ns: Mapping[str, int]
@@ -51,24 +52,24 @@ class VideoMatch:
 class _Candidates:
     """The two frames that look most like each picture so far."""
 
-    def __init__(self, pictures: NDArray[np.uint8]) -> None:
-        self._small = np.array([_normalised(_smaller(picture)) for picture in pictures])
-        self._large = np.ascontiguousarray(pictures)
-        self._likeness = np.full((len(pictures), _CANDIDATES), _LIKE, dtype=np.float32)
-        self.distance = np.full((len(pictures), 2), np.inf)
-        self._frames = np.zeros((len(pictures), 2, *pictures.shape[1:]), dtype=np.uint8)
-        self.t_ns = np.zeros((len(pictures), 2), dtype=np.int64)
+    def __init__(self, images: NDArray[np.uint8]) -> None:
+        self._small = np.array([_normalised(_smaller(image)) for image in images])
+        self._large = np.ascontiguousarray(images)
+        self._correlation = np.full((len(images), _CANDIDATES), _LEAST, dtype=np.float32)
+        self.distance = np.full((len(images), 2), np.inf)
+        self._frames = np.zeros((len(images), 2, *images.shape[1:]), dtype=np.uint8)
+        self.t_ns = np.zeros((len(images), 2), dtype=np.int64)
 
     def offer(self, t_ns: int, grey: NDArray[np.uint8]) -> None:
         """Compare a frame with all pictures."""
         thumbnail = _thumbnail(grey, _LARGE)
-        likeness = self._small @ _normalised(_smaller(thumbnail))
-        better = np.flatnonzero(likeness > self._likeness.min(axis=1))
+        correlation = self._small @ _normalised(_smaller(thumbnail))
+        better = np.flatnonzero(correlation > self._correlation.min(axis=1))
         if not len(better):
             return
         frame = _normalised(thumbnail)
         for i in better:
-            self._likeness[i, np.argmin(self._likeness[i])] = likeness[i]
+            self._correlation[i, np.argmin(self._correlation[i])] = correlation[i]
             distance = _distance(_normalised(self._large[i]), frame)
             place = 0 if distance < self.distance[i, 0] else 1
             if distance < self.distance[i, place]:
@@ -76,7 +77,7 @@ class _Candidates:
                     kept[i, 1] = kept[i, 0] if place == 0 else kept[i, 1]
                 self.distance[i, place], self._frames[i, place], self.t_ns[i, place] = distance, thumbnail, t_ns
 
-    def on_the_way(self, i: int) -> float:
+    def fraction_to_next(self, i: int) -> float:
         """Where picture ``i`` lies on the way from its best frame (0) to the next best (1); at most half-way."""
         first, second = self.distance[i]
         if not np.isfinite(second):
@@ -110,14 +111,13 @@ def match_to_video(
     FormatError
         For a picture or video that cannot be decoded.
     """
-    greys = (_grey(folder / name) for name in names)
-    pictures = np.array([_thumbnail(grey, _LARGE) for grey in greys])
+    thumbnails = np.array([_thumbnail(grey_8bit(read_image(path_in(folder, name))), _LARGE) for name in names])
     turns: dict[int, _Candidates] = {}
     for seen, (t_ns, angle, grey) in enumerate(decode_grey(video), start=1):
         if not turns:
             # which way round the angle is meant depends on who extracted the frames: let the pictures tell
             possible = {0: (0,), 180: (0, 2)}.get(abs(angle) % 360, (0, 1, 3))
-            turns = {turn: _Candidates(np.rot90(pictures, -turn, axes=(1, 2))) for turn in possible}
+            turns = {turn: _Candidates(np.rot90(thumbnails, -turn, axes=(1, 2))) for turn in possible}
         for candidates in turns.values():
             candidates.offer(t_ns, grey)
         progress(seen)
@@ -135,7 +135,7 @@ def _decided(candidates: _Candidates, names: Sequence[str]) -> tuple[dict[str, i
     for i, name in enumerate(names):
         if candidates.distance[i, 0] > np.sqrt(1 - _SAME):
             doubtful[name] = "is no frame of the video"
-        elif candidates.on_the_way(i) > _ON_THE_WAY:
+        elif candidates.fraction_to_next(i) > _MOST_FRACTION:
             doubtful[name] = "looks like several frames of the video"
         else:
             found[name] = int(candidates.t_ns[i, 0])
@@ -146,19 +146,10 @@ def _decided(candidates: _Candidates, names: Sequence[str]) -> tuple[dict[str, i
     return found, doubtful
 
 
-def _grey(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
-    import cv2
-
-    image = read_image(path)
-    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
-
-
-def _thumbnail(grey: NDArray[np.uint8] | NDArray[np.uint16], side: int) -> NDArray[np.uint8]:
+def _thumbnail(grey: NDArray[np.uint8], side: int) -> NDArray[np.uint8]:
     """(side, side) 8 bit, whatever the aspect; blurred a little, as resizing filters differ."""
     import cv2
 
-    if grey.dtype == np.uint16:
-        grey = np.asarray(grey >> 8, dtype=np.uint8)
     shrunk = cv2.resize(grey, (side, side), interpolation=cv2.INTER_AREA)
     return np.asarray(cv2.GaussianBlur(shrunk, (0, 0), 1.0), dtype=np.uint8)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 
 from colmap_inertial.errors import AlreadyMetricError, FormatError, OutputExistsError, TimingError
 from colmap_inertial.geometry import skew
-from colmap_inertial.io.files import read_json, write_json
+from colmap_inertial.io.files import StrPath, read_json, write_json
+from colmap_inertial.io.names import check_names
 from colmap_inertial.model.binary import check_binary_model
-from colmap_inertial.types import CameraModel, CameraTrajectory, FrameTiming, ScaleEstimate, Similarity
+from colmap_inertial.model.soundness import check_values
+from colmap_inertial.types import CameraModel, CameraTrajectory, FrameTiming, ScaleEstimate, Similarity, Treatment
 
 if TYPE_CHECKING:
     import pycolmap
@@ -38,34 +40,79 @@ class Model:
 
     Attributes
     ----------
-    folder
-        A COLMAP model that the stages may rewrite; never COLMAP's own output.
-    index
-        Its number in ``sparse/``.
+    reconstruction
+        The model in memory. A stage leaves it as it is and returns another one where it changes something
+        (``pycolmap.Reconstruction(model.reconstruction)`` is a copy).
+    colmap_index
+        COLMAP's number, that of its folder in ``sparse/``.
     timing
         When the frames were exposed.
+    rectified
+        Whether it was mapped from keypoints without the rolling shutter.
+    doubts
+        What was found wrong with the recording beforehand; with any of them, no scale is trusted.
     scale
         What the inertial estimate said; ``None`` before it.
     similarity
         What was applied to get here from COLMAP's model; ``None`` while it has COLMAP's own units.
+    treatments
+        What the stages before did, in order.
     """
 
-    folder: Path
-    index: int
+    reconstruction: pycolmap.Reconstruction
+    colmap_index: int
     timing: FrameTiming
+    rectified: bool = False
+    doubts: tuple[str, ...] = ()
     scale: ScaleEstimate | None = None
     similarity: Similarity | None = None
+    treatments: tuple[Treatment, ...] = ()
+
+    def scaled(self, estimate: ScaleEstimate, similarity: Similarity | None) -> Model:
+        """With a scale estimate, and where it was not refused in its units; doubts make it weak at most.
+
+        Raises
+        ------
+        AlreadyMetricError
+            Where a stage before has scaled the model.
+        """
+        if self.similarity is not None:
+            raise AlreadyMetricError(
+                f"model {self.colmap_index} was scaled by a stage before ({self.similarity.provenance}); one of them "
+                "must go"
+            )
+        reconstruction = self.reconstruction if similarity is None else transformed(self.reconstruction, similarity)
+        return replace(
+            self,
+            reconstruction=reconstruction,
+            scale=doubted(estimate, self.doubts),
+            similarity=similarity,
+        )
+
+
+def doubted(estimate: ScaleEstimate, doubts: Sequence[str]) -> ScaleEstimate:
+    """An estimate from a recording with doubts: they are among its reasons, and it is not trusted."""
+    if not doubts:
+        return estimate
+    said = estimate.reasons[: len(doubts)] == tuple(doubts)
+    return replace(
+        estimate,
+        verdict="weak" if estimate.verdict == "trusted" else estimate.verdict,
+        reasons=estimate.reasons if said else (*doubts, *estimate.reasons),
+    )
 
 
 def model_format(folder: Path) -> str | None:
     """``".bin"`` or ``".txt"`` where the folder holds a COLMAP model (binary first), else ``None``."""
-    for suffix in (".bin", ".txt"):
-        if all((folder / f"{name}{suffix}").is_file() for name in _MODEL_FILES):
-            return suffix
-    return None
+    return next(iter(model_formats(folder)), None)
 
 
-def find_models(folder: Path) -> dict[int, Path]:
+def model_formats(folder: Path) -> list[str]:
+    """The formats in which the folder holds a COLMAP model, binary first."""
+    return [s for s in (".bin", ".txt") if all((folder / f"{name}{s}").is_file() for name in _MODEL_FILES)]
+
+
+def find_models(folder: StrPath) -> dict[int, Path]:
     """The COLMAP models in a folder: itself (as number 0), or its numbered subfolders.
 
     Raises
@@ -73,6 +120,7 @@ def find_models(folder: Path) -> dict[int, Path]:
     FormatError
         When there is none.
     """
+    folder = Path(folder)
     if model_format(folder) is not None:
         return {0: folder}
     found = {}
@@ -85,7 +133,26 @@ def find_models(folder: Path) -> dict[int, Path]:
     return dict(sorted(found.items()))
 
 
-def read_model(folder: Path, suffix: str | None = None) -> pycolmap.Reconstruction:
+def num_registered(folder: Path) -> int:
+    """The number of registered images of a model, without reading it.
+
+    Raises
+    ------
+    FormatError
+        When the folder holds no model.
+    """
+    suffix = model_format(folder)
+    if suffix is None:
+        raise FormatError(folder, "no COLMAP model here (cameras, images and points3D, .bin or .txt)")
+    file = folder / f"images{suffix}"
+    if suffix == ".bin":
+        with open(file, "rb") as opened:
+            return int.from_bytes(opened.read(8), "little")
+    with open(file, "rb") as opened:  # two lines for each image
+        return sum(not line.startswith(b"#") for line in opened) // 2
+
+
+def read_model(folder: StrPath, suffix: str | None = None) -> pycolmap.Reconstruction:
     """Read a COLMAP model, binary or text.
 
     Parameters
@@ -98,25 +165,30 @@ def read_model(folder: Path, suffix: str | None = None) -> pycolmap.Reconstructi
     Raises
     ------
     FormatError
-        When the folder holds no model or a damaged one.
+        When the folder holds no model, a damaged one, or one whose names or numbers cannot be.
     """
-    import pycolmap
-
+    folder = Path(folder)
     suffix = suffix or model_format(folder)
     if suffix is None:
         raise FormatError(folder, "no COLMAP model here (cameras, images and points3D, .bin or .txt)")
     if suffix == ".bin":
         check_binary_model(folder)
-    reconstruction = pycolmap.Reconstruction()
     try:
-        if suffix == ".bin":
-            reconstruction.read_binary(str(folder))
-        else:
-            reconstruction.read_text(str(folder))
+        reconstruction = _read_from(folder, suffix)
     except (ValueError, RuntimeError, IndexError, MemoryError) as error:
         raise FormatError(folder, f"COLMAP cannot read this model: {error}") from error
     if reconstruction.num_reg_images() == 0:
         raise FormatError(folder, "the model has no registered image")
+    check_values(reconstruction, folder, suffix)
+    check_names((image.name for image in reconstruction.images.values()), folder / f"images{suffix}")
+    return reconstruction
+
+
+def _read_from(folder: Path, suffix: str) -> pycolmap.Reconstruction:
+    import pycolmap
+
+    reconstruction = pycolmap.Reconstruction()
+    (reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text)(str(folder))
     return reconstruction
 
 
@@ -248,7 +320,7 @@ def is_metric(folder: Path) -> bool:
     return (folder / TRANSFORM_FILE).is_file()
 
 
-def apply_similarity(source: Path, target: Path, similarity: Similarity) -> None:
+def apply_similarity(source: StrPath, target: StrPath, similarity: Similarity) -> None:
     """Write a transformed copy of a COLMAP model, in the source's format; the source stays as it is.
 
     Parameters
@@ -269,8 +341,7 @@ def apply_similarity(source: Path, target: Path, similarity: Similarity) -> None
     FormatError
         When the source is no COLMAP model.
     """
-    import pycolmap
-
+    source, target = Path(source), Path(target)
     if is_metric(source):
         provenance = read_json(source / TRANSFORM_FILE).get("provenance", "unknown")
         raise AlreadyMetricError(
@@ -278,18 +349,40 @@ def apply_similarity(source: Path, target: Path, similarity: Similarity) -> None
         )
     if target.exists():
         raise OutputExistsError(f"{target} exists already; choose another folder or remove it")
-    reconstruction = read_model(source)
+    write_model(transformed(read_model(source), similarity), target, similarity, suffix=model_format(source))
+
+
+def transformed(reconstruction: pycolmap.Reconstruction, similarity: Similarity) -> pycolmap.Reconstruction:
+    """A transformed copy of a model in memory."""
+    import pycolmap
+
+    copy = pycolmap.Reconstruction(reconstruction)
     rotation = pycolmap.Rotation3d(similarity.rotation_xyzw)
-    reconstruction.transform(pycolmap.Sim3d(similarity.scale, rotation, similarity.translation_m))
+    copy.transform(pycolmap.Sim3d(similarity.scale, rotation, similarity.translation_m))
+    return copy
+
+
+def write_model(
+    reconstruction: pycolmap.Reconstruction, target: Path, similarity: Similarity, *, suffix: str | None = ".bin"
+) -> None:
+    """Write a transformed model to a new folder, whole or not at all, with the similarity that was applied.
+
+    Parameters
+    ----------
+    suffix
+        ``".bin"`` or ``".txt"``.
+    """
     partial = target.with_name(target.name + ".partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
-    if model_format(source) == ".bin":
-        reconstruction.write_binary(str(partial))
-    else:
-        reconstruction.write_text(str(partial))
+    write_files(reconstruction, partial, suffix)
     write_json(partial / TRANSFORM_FILE, similarity_as_json(similarity))
     os.replace(partial, target)
+
+
+def write_files(reconstruction: pycolmap.Reconstruction, folder: Path, suffix: str | None) -> None:
+    """Write a model's files into a folder that is there, as ``".txt"`` or ``".bin"``."""
+    (reconstruction.write_text if suffix == ".txt" else reconstruction.write_binary)(str(folder))
 
 
 def mean_reprojection_error_px(reconstruction: pycolmap.Reconstruction) -> float:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Iterator
+from io import BufferedReader
 from pathlib import Path
 
 import numpy as np
 
 from colmap_inertial.errors import FormatError
 from colmap_inertial.geometry import matrix_from_quat
+from colmap_inertial.io.files import advise
 from colmap_inertial.types import Similarity
 
 _CHUNK_BYTES = 1 << 20
@@ -57,18 +58,16 @@ def transform_depth_map(source: Path, target: Path, similarity: Similarity) -> N
     view = memoryview(buffer)
     values = np.frombuffer(buffer, "<f4")
     scale = np.float32(similarity.scale)
-    with open(source, "rb", buffering=0) as file, open(target, "wb", buffering=0) as out:
-        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_SEQUENTIAL)
+    with open(source, "rb") as file, open(target, "wb") as out:
+        advise(file.fileno(), "SEQUENTIAL")
         out.write(file.read(header))
-        while n := file.readinto(view):  # regular files give less only at their end
+        while n := file.readinto(view):
             if n % 4:
                 raise FormatError(source, "truncated while it was read")
             part = values[: n // 4]
             with np.errstate(over="ignore", invalid="ignore"):
                 np.multiply(part, scale, out=part)
-            written = 0
-            while written < n:
-                written += out.write(view[written:n])
+            out.write(view[:n])
 
 
 def transform_options(source: Path, target: Path, similarity: Similarity) -> tuple[str, ...]:
@@ -138,10 +137,8 @@ def transform_obj(source: Path, target: Path, similarity: Similarity) -> tuple[s
     return tuple(name for key, name in ((b"v", "positions"), (b"vn", "normals")) if key in changed)
 
 
-def _lines(path: Path, file: object) -> Iterator[bytes]:
-    number = 0
-    while line := file.readline(_LONGEST_LINE):  # type: ignore[attr-defined]
-        number += 1
+def _lines(path: Path, file: BufferedReader) -> Iterator[bytes]:
+    for number, line in enumerate(iter(lambda: file.readline(_LONGEST_LINE), b""), start=1):
         if len(line) == _LONGEST_LINE:
             raise FormatError(path, "a line without end", line=number)
         yield line

@@ -1,4 +1,4 @@
-"""Whether COLMAP's binary model files are whole.
+"""Whether COLMAP's binary model files are whole, and their points somewhere.
 
 COLMAP's reader trusts every count: a damaged one makes it run for hours, ask for all memory, or go on with rubbish. So
 the records are counted here first, which takes a fraction of the time of reading them.
@@ -15,8 +15,11 @@ from colmap_inertial.errors import FormatError
 
 #: Number of parameters of COLMAP's camera models, by id.
 _CAMERA_PARAMETERS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2)
+#: No camera, pose or point has a number as large as this.
+LARGEST = 1e12
 _U32, _U64 = struct.Struct("<I"), struct.Struct("<Q")
 _CAMERA = struct.Struct("<IiQQ")
+_POINT = struct.Struct("<Qddd11xQ")
 
 
 class _Damaged(Exception):
@@ -77,9 +80,12 @@ def _images(data: mmap.mmap, count: int) -> int:
 
 
 def _points(data: mmap.mmap, count: int) -> int:
-    at, read = 8, _U64.unpack_from
+    at, read = 8, _POINT.unpack_from
     for _ in range(count):
-        at += 51 + 8 * read(data, at + 43)[0]
+        number, x, y, z, length = read(data, at)
+        if not (abs(x) < LARGEST and abs(y) < LARGEST and abs(z) < LARGEST):
+            raise _Damaged(f"point {number} lies at {x:g}, {y:g}, {z:g}")
+        at += 51 + 8 * length
     return at
 
 

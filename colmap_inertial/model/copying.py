@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import os
 import shutil
 import signal
@@ -15,12 +14,17 @@ from pathlib import Path
 from types import FrameType
 
 from colmap_inertial.errors import FormatError, OutputError, OutputExistsError
+from colmap_inertial.io.files import advise, locked
 
 #: Linux: share the blocks of another file (Btrfs, XFS, bcachefs, ...).
 _FICLONE = 0x40049409
 _FULL = {errno.ENOSPC: "the disk is full", errno.EDQUOT: "the quota is used up", errno.EFBIG: "the file is too large"}
 #: What a file system answers that cannot copy within the kernel.
 _NO_OFFLOAD = {errno.EXDEV, errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP, errno.ETXTBSY, errno.EPERM, errno.EIO}
+
+
+#: Windows has no SIGHUP.
+_ENDINGS = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
 
 
 class _Terminated(BaseException):
@@ -44,16 +48,14 @@ def new_folder(target: Path) -> Iterator[Path]:
     if os.path.lexists(target):
         raise OutputExistsError(f"{target} exists already; choose another folder or remove it")
     partial = target.with_name(f".{target.name}.colmap-inertial-partial")
+    lock = target.with_name(f".{target.name}.colmap-inertial-lock")
     with _ending_by_signal(), _as_output_error(target):
-        partial.mkdir(parents=True, exist_ok=True)
-        lock = os.open(partial, os.O_RDONLY | os.O_DIRECTORY)
-        try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with locked(lock, f"another process is writing {target}"):
             try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise OutputExistsError(f"another process is writing {target}") from None
-            try:
-                _empty(partial)
+                if partial.exists():
+                    shutil.rmtree(partial)
+                partial.mkdir()
                 yield partial
                 _flush(partial)
                 if os.path.lexists(target):
@@ -62,23 +64,19 @@ def new_folder(target: Path) -> Iterator[Path]:
             except BaseException:
                 shutil.rmtree(partial, ignore_errors=True)
                 raise
-        finally:
-            os.close(lock)
-
-
-def _empty(folder: Path) -> None:
-    for child in folder.iterdir():
-        if child.is_dir() and not child.is_symlink():
-            shutil.rmtree(child)
-        else:
-            child.unlink()
+            finally:
+                with contextlib.suppress(OSError):  # Windows removes it with the last one who holds it
+                    lock.unlink()
 
 
 def _flush(folder: Path) -> None:
     """Have the disk hold what was written before the rename says that it is whole.
 
-    File by file: to flush the file system is to wait for what everybody else wrote, too.
+    File by file: to flush the file system is to wait for what everybody else wrote, too. Windows, which flushes
+    neither folders nor files that are open for reading, is left to itself.
     """
+    if os.name != "posix":
+        return
     for parent, _, names in os.walk(folder, topdown=False):
         for path in (*(os.path.join(parent, name) for name in names), parent):
             if not os.path.islink(path):
@@ -114,7 +112,7 @@ def _ending_by_signal() -> Iterator[None]:
         if len(caught) == 1:  # a second one must not interrupt the cleaning up
             raise _Terminated
 
-    before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGHUP)}
+    before = {number: signal.signal(number, stop) for number in _ENDINGS}
     try:
         yield
     except _Terminated:
@@ -148,9 +146,11 @@ def copy_file(source: Path, target: Path, *, link: bool = False) -> str:
     how = "copied"
     with open(source, "rb", buffering=0) as src, open(target, "xb", buffering=0) as dst:
         try:
+            import fcntl
+
             fcntl.ioctl(dst.fileno(), _FICLONE, src.fileno())
             how = "reflinked"
-        except OSError:
+        except (ImportError, OSError):
             _copy_bytes(src.fileno(), dst.fileno(), os.fstat(src.fileno()).st_size)
     shutil.copystat(source, target)
     return how
@@ -160,14 +160,14 @@ def begin_writing(path: Path) -> None:
     """Have the disk start on a finished file, so that it works while the next ones are made."""
     handle = os.open(path, os.O_RDONLY)
     try:
-        os.posix_fadvise(handle, 0, 0, os.POSIX_FADV_DONTNEED)
+        advise(handle, "DONTNEED")
     finally:
         os.close(handle)
 
 
 def _copy_bytes(source: int, target: int, size: int) -> None:
     done = 0
-    while done < size:
+    while done < size and hasattr(os, "copy_file_range"):
         try:
             n = os.copy_file_range(source, target, min(size - done, 1 << 28))
         except OSError as error:
@@ -183,17 +183,26 @@ def _copy_bytes(source: int, target: int, size: int) -> None:
             view = view[os.write(target, view) :]
 
 
-def list_tree(root: Path) -> tuple[list[Path], list[Path], list[Path]]:
+def list_tree(root: Path, *, follow_links: bool = False) -> tuple[list[Path], list[Path], list[Path]]:
     """Folders, files and symbolic links below ``root``, as paths relative to it, in order.
 
     A relative link that stays below ``root`` is listed as a link; any other is followed, so that what it leads to is
     listed as a folder or file. A broken link is listed as a link.
 
+    Parameters
+    ----------
+    root
+        A folder.
+    follow_links
+        Follow links that lead out of it, too.
+
     Raises
     ------
     FormatError
-        For a link that leads back to where it is found, and for what is neither file, folder nor link.
+        For a link that leads out of ``root`` without ``follow_links``, one that leads back to where it is found, and
+        for what is neither file, folder nor link.
     """
+    inside = root.resolve()
     folders: list[Path] = []
     files: list[Path] = []
     links: list[Path] = []
@@ -210,7 +219,16 @@ def list_tree(root: Path) -> tuple[list[Path], list[Path], list[Path]]:
             path = folder / entry.name
             if entry.is_symlink() and _is_kept(root, path):
                 links.append(path)
-            elif entry.is_dir():
+                continue
+            if entry.is_symlink() and not follow_links:
+                real_target = (root / path).resolve()
+                if not real_target.is_relative_to(inside):
+                    raise FormatError(
+                        root / path,
+                        f"is a link out of the project, to {real_target}; --follow-links (follow_links=True) takes "
+                        "what it leads to into the copy",
+                    )
+            if entry.is_dir():
                 folders.append(path)
                 visit(path, above | {real})
             elif entry.is_file():

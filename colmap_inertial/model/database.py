@@ -129,6 +129,8 @@ def transform_database(
     try:
         with contextlib.closing(sqlite3.connect(target)) as database, database:
             return _transform(database, source, models, similarities, prior_models, rig_models)
+    except UnicodeDecodeError as error:
+        raise FormatError(source, f"SQLite cannot read it: {error}") from None
     except sqlite3.DatabaseError as error:
         code = {sqlite3.SQLITE_FULL: errno.ENOSPC, sqlite3.SQLITE_IOERR: errno.EIO}.get(
             getattr(error, "sqlite_errorcode", 0) & 0xFF

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import fnmatch
 import functools
-import os
 import shutil
 from collections import Counter
 from collections.abc import Callable, Collection, Generator, Mapping, Sequence
@@ -16,16 +15,24 @@ from typing import Any
 
 from colmap_inertial import __version__
 from colmap_inertial.errors import AlreadyMetricError, FormatError, InertialError, NotObservableError, OutputError
-from colmap_inertial.io.files import read_json, write_json
+from colmap_inertial.io.files import StrPath, read_json, write_json
 from colmap_inertial.io.ply import transform_ply
-from colmap_inertial.model import TRANSFORM_FILE, is_metric, model_format, read_model, similarity_as_json
+from colmap_inertial.model import (
+    TRANSFORM_FILE,
+    is_metric,
+    model_formats,
+    read_model,
+    similarity_as_json,
+    transformed,
+    write_files,
+)
 from colmap_inertial.model.artefacts import check_map, transform_depth_map, transform_obj, transform_options
 from colmap_inertial.model.binary import check_binary_model
 from colmap_inertial.model.copying import begin_writing, copy_file, list_tree, new_folder
 from colmap_inertial.model.database import SHARED_MEMORY, SIDE_FILES, is_database, transform_database
 from colmap_inertial.model.layout import Layout, read_layout
 from colmap_inertial.model.similarities import ModelScale, similarity_from_json, undoing
-from colmap_inertial.threads import one_blas_thread
+from colmap_inertial.threads import one_blas_thread, usable_processors
 from colmap_inertial.types import Similarity
 
 _MODEL_FILES = ("cameras", "images", "points3D", "rigs", "frames")
@@ -72,12 +79,13 @@ class Applied:
 
 
 def apply_to_project(
-    project: Path,
-    out: Path,
+    project: StrPath,
+    out: StrPath,
     scales: Similarity | Mapping[int | None, ModelScale],
     *,
     link: bool = False,
     keep: Sequence[str] = (),
+    follow_links: bool = False,
     progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> Applied:
     """Write a copy of a COLMAP project in which everything that carries length is transformed.
@@ -99,6 +107,8 @@ def apply_to_project(
         Make hard links of files that do not change. A later edit then reaches the original, too.
     keep
         Patterns, as in a shell, of paths in the project that are copied as they are.
+    follow_links
+        Copy what symbolic links out of the project lead to; without, they are refused.
     progress
         Called with the number of files done and of all.
 
@@ -109,11 +119,13 @@ def apply_to_project(
     NotObservableError
         When every scale was refused.
     FormatError
-        For an artefact that cannot be read, and where it cannot be told which sub-model something belongs to.
+        For an artefact that cannot be read, where it cannot be told which sub-model something belongs to, and for a
+        link out of the project.
     OutputError
         When ``out`` exists or cannot be written.
     """
-    work = _Work(project, out, keep)
+    project, out = Path(project), Path(out)
+    work = _Work(project, out, keep, follow_links)
     for folder in (Path(), *work.folders):
         if not work.is_kept(folder / TRANSFORM_FILE) and is_metric(project / folder):
             provenance = read_json(project / folder / TRANSFORM_FILE).get("provenance", "unknown")
@@ -128,10 +140,11 @@ def apply_to_project(
 
 
 def undo_project(
-    project: Path,
-    out: Path,
+    project: StrPath,
+    out: StrPath,
     *,
     link: bool = False,
+    follow_links: bool = False,
     progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> Applied:
     """Write a copy of what :func:`apply_to_project` made in the units that it had before.
@@ -143,6 +156,7 @@ def undo_project(
     OutputError
         When ``out`` exists or cannot be written.
     """
+    project, out = Path(project), Path(out)
     path = project / TRANSFORM_FILE
     record = read_json(path)
     try:
@@ -155,7 +169,7 @@ def undo_project(
         index: ModelScale(similarity=None if fields is None else undoing(similarity_from_json(path, fields)))
         for index, fields in models
     }
-    work = _Work(project, out, keep)
+    work = _Work(project, out, keep, follow_links)
     one = undoing(similarity_from_json(path, record)) if record.get("one_for_all") is True else None
     layout = read_layout(project, work.open_folders(), one_for_all=one is not None)
     if layout.submodels.keys() != by_model.keys():
@@ -188,14 +202,14 @@ def _by_model(
 class _Work:
     """One copy of a project, file by file."""
 
-    def __init__(self, project: Path, out: Path, keep: Sequence[str]) -> None:
+    def __init__(self, project: Path, out: Path, keep: Sequence[str], follow_links: bool) -> None:
         if not project.is_dir():
             raise FormatError(project, "no such folder")
         inner, outer = out.resolve(), project.resolve()
         if inner.is_relative_to(outer) or outer.is_relative_to(inner):
             raise OutputError(f"{out} and {project} lie within each other; choose a folder elsewhere")
         self._project, self._out, self._keep = project, out, tuple(keep)
-        self.folders, self._files, self._links = list_tree(project)
+        self.folders, self._files, self._links = list_tree(project, follow_links=follow_links)
         self._changes: list[Change] = []
         self._databases: dict[str, dict[str, Any]] = {}
         self._notes: list[str] = []
@@ -317,28 +331,21 @@ class _Work:
     def _write_model(
         self, folder: Path, partial: Path, index: int, similarity: Similarity | None, *, record: bool
     ) -> None:
-        import pycolmap
-
         source, target = self._project / folder, partial / folder
-        for suffix in (".bin", ".txt"):
-            if not all((source / f"{name}{suffix}").is_file() for name in _MODEL_FILES[:3]):
-                continue
+        for suffix in model_formats(source):
             model = read_model(source, suffix)
             if similarity is None:
                 for name in _MODEL_FILES:
                     if (source / f"{name}{suffix}").is_file():
                         copy_file(source / f"{name}{suffix}", target / f"{name}{suffix}")
                 continue
-            rotation = pycolmap.Rotation3d(similarity.rotation_xyzw)
-            model.transform(pycolmap.Sim3d(similarity.scale, rotation, similarity.translation_m))
             counts = model.num_reg_images(), model.num_points3D()
             # COLMAP does not notice a disk that is full
             try:
+                write_files(transformed(model, similarity), target, suffix)
                 if suffix == ".bin":
-                    model.write_binary(str(target))
                     check_binary_model(target)
                 else:
-                    model.write_text(str(target))
                     again = read_model(target, suffix)
                     if (again.num_reg_images(), again.num_points3D()) != counts:
                         raise FormatError(target, "truncated")
@@ -409,7 +416,7 @@ class _Work:
 
 def _side_by_side(jobs: Sequence[Callable[[], Change | str]]) -> Generator[Change | str, None, None]:
     """Results of the jobs in their order; a few at a time, as disk and processor take turns within one."""
-    with ThreadPoolExecutor(max_workers=min(4, os.cpu_count() or 1)) as pool:
+    with ThreadPoolExecutor(max_workers=min(4, usable_processors())) as pool:
         try:
             for future in [pool.submit(job) for job in jobs]:
                 yield future.result()
@@ -423,9 +430,7 @@ def _model_files(project: Path, models: Collection[Path]) -> set[Path]:
     return {
         folder / f"{name}{suffix}"
         for folder in models
-        if model_format(project / folder) is not None
-        for suffix in (".bin", ".txt")
-        if all((project / folder / f"{name}{suffix}").is_file() for name in _MODEL_FILES[:3])
+        for suffix in model_formats(project / folder)
         for name in _MODEL_FILES
     }
 

@@ -122,6 +122,3 @@ def _shift(
     for i, xy in zip(np.array(seen)[good], (at + shift)[good], strict=True):
         points[i].xy = xy
     return np.asarray(np.linalg.norm(shift[good], axis=1))
-
-
-__all__ = ["Settled", "settle_readout"]

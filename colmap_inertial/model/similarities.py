@@ -12,7 +12,7 @@ import numpy as np
 
 from colmap_inertial.errors import FormatError, InertialError, NotObservableError
 from colmap_inertial.geometry import matrix_from_quat, quat_conjugate
-from colmap_inertial.io.files import read_json
+from colmap_inertial.io.files import StrPath, read_json
 from colmap_inertial.model import similarity_as_json
 from colmap_inertial.options import WorldAxes
 from colmap_inertial.types import ScaleEstimate, Similarity
@@ -78,7 +78,7 @@ def similarity_from_json(path: Path, fields: Mapping[str, Any]) -> Similarity:
         raise FormatError(path, str(error)) from None
 
 
-def read_similarity(path: Path) -> Similarity:
+def read_similarity(path: StrPath) -> Similarity:
     """Read a similarity: a JSON object with ``scale``, ``rotation_xyzw``, ``translation_m``, ``cov``, ``provenance``.
 
     Raises
@@ -86,6 +86,7 @@ def read_similarity(path: Path) -> Similarity:
     FormatError
         For what is none; see :func:`similarity_from_json`.
     """
+    path = Path(path)
     return similarity_from_json(path, read_json(path))
 
 
@@ -157,15 +158,32 @@ def read_scales(sources: Sequence[str], *, world: WorldAxes = "z-up") -> dict[in
             models = content.get("models")
             entries = [(None, content)]
             if isinstance(models, list):
-                entries = [(m.get("index") if isinstance(m, dict) else None, m) for m in models]
+                entries = [(_colmap_index(m), m) for m in models]
                 if not all(isinstance(i, int) for i, _ in entries):
                     raise FormatError(path, "models: each needs an index")
+                found |= _fragments(path, content.get("fragments") or [])
         for key, fields in entries:
             if key in found or (None in found) != (key is None and bool(found)):
                 raise InertialError(f"{source}: two scales for one model; give each as NUMBER=FILE")
             found[key] = _model_scale(path, fields, world)
     if found and all(scale.similarity is None for scale in found.values()):
         raise NotObservableError("scale", "; ".join(reason for scale in found.values() for reason in scale.reasons))
+    return found
+
+
+def _colmap_index(fields: Any) -> Any:
+    """COLMAP's number of a model in a result; version 0.1 had no other."""
+    return fields.get("colmap_index", fields.get("index")) if isinstance(fields, dict) else None
+
+
+def _fragments(path: Path, entries: Any) -> dict[int | None, ModelScale]:
+    """What a result left out, which keeps its own units."""
+    found: dict[int | None, ModelScale] = {}
+    for entry in entries if isinstance(entries, list) else [None]:
+        number = _colmap_index(entry)
+        if not isinstance(number, int):
+            raise FormatError(path, "fragments: each needs a colmap_index")
+        found[number] = ModelScale(similarity=None, verdict="refused", reasons=("a fragment of few images",))
     return found
 
 

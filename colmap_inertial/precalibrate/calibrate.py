@@ -25,8 +25,10 @@ from colmap_inertial.flow import FlowOptions, VisualRotation, check_motion, find
 from colmap_inertial.io.capture import Capture, ImageFolder
 from colmap_inertial.io.frames import frame_source, read_frames
 from colmap_inertial.io.images import read_image
+from colmap_inertial.io.names import path_in
 from colmap_inertial.model import colmap_camera, find_models, read_model, trajectory_from_model
 from colmap_inertial.options import MappingOptions
+from colmap_inertial.run.context import Recording, RunContext
 from colmap_inertial.run.progress import Progress
 from colmap_inertial.stages.frame_folder import encode_image
 from colmap_inertial.stages.gyro_view import GyroView
@@ -39,7 +41,6 @@ from colmap_inertial.types import (
     CameraTrajectory,
     Frame,
     FrameTiming,
-    ImuRecording,
 )
 
 if TYPE_CHECKING:
@@ -62,14 +63,12 @@ _BEGIN_S = 5.0
 _GOOD_ROTATION_RAD, _GOOD_OFFSET_S = 0.03, 0.005
 #: What is found must be as good as this.
 _USABLE_ROTATION_RAD, _USABLE_OFFSET_S = 0.1, 0.01
-#: A clock rate is corrected where it is this many standard deviations from zero, and faster than this.
-_SIGNIFICANT, _FAST_CLOCK = 5.0, 3e-4
 #: COLMAP's guess of a focal length, in longer sides of the image.
 _GUESSED_FOCAL = 1.2
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class FirstLook:
+class Precalibration:
     """What there is before the reconstruction.
 
     Attributes
@@ -104,48 +103,26 @@ def guessed_camera(capture: Capture, timing: FrameTiming) -> CameraModel:
     return CameraModel(model="SIMPLE_PINHOLE", width=width, height=height, params=params)
 
 
-def look_first(
-    capture: Capture,
-    imu: ImuRecording,
-    timing: FrameTiming,
-    prior: CameraImuCalibration,
-    *,
-    every: FrameTiming | None = None,
-    max_offset_s: float | None,
-    scratch: Path,
-    num_threads: int,
-    seed: int,
-    progress: Progress,
-) -> FirstLook:
+def precalibrate(recording: Recording, context: RunContext) -> Precalibration:
     """Find the calibration that the treatment of frames needs.
 
     Parameters
     ----------
-    capture, imu, timing
-        The recording.
-    prior
-        What is known; used as it stands where that is enough.
-    every
-        All frames of the video that ``timing``'s were chosen from: pixels are followed from one to the next.
-    max_offset_s
-        Largest offset between the clocks.
-    scratch
-        A folder for temporary files.
-    num_threads, seed
-        Of COLMAP.
-    progress
-        Called with ``"calibration"``.
+    recording
+        What is known beforehand is used as it stands where that is enough. Pixels are followed through all frames of a
+        video.
+    context
+        ``progress`` is called with ``"motion"`` and ``"calibration"``.
 
     Raises
     ------
     NotObservableError
         Where the frames do not turn as the gyroscope does, or were stabilised.
     """
+    capture, timing, every, progress = recording.capture, recording.timing, recording.every, context.progress
     camera = guessed_camera(capture, timing)
-    options = AlignOptions(max_offset_s=max_offset_s)
-    every = every or timing
     is_video = len(every.t_s) > 1 and float(np.median(np.diff(every.t_s))) <= _VIDEO_STEP_S
-    rotation_rad, offset_s = _sigmas(prior)
+    rotation_rad, offset_s = _sigmas(recording.prior)
     declared = rotation_rad <= _GOOD_ROTATION_RAD and offset_s <= _GOOD_OFFSET_S
     along = _middle(every, _FLOW_SPACING_S, _FLOW_FRAMES)
     rotation = followed(capture, every, camera, along, progress) if is_video else None
@@ -153,15 +130,17 @@ def look_first(
     models: tuple[pycolmap.Reconstruction, ...] = ()
     if declared:
         notes = () if capture.camera is not None else (f"the focal length was guessed: {camera.params[0]:.0f} px",)
-        found = GyroView(imu=imu, timing=timing, calibration=prior, camera=camera, source="capture", notes=notes)
+        found = GyroView(
+            imu=recording.imu, timing=timing, calibration=recording.prior, camera=camera, source="capture", notes=notes
+        )
     else:
-        found, models = _by_model(capture, imu, timing, prior, options, scratch, num_threads, seed, progress)
+        found, models = _by_model(recording, context)
         if isinstance(found, NotObservableError):
             rotation = rotation or followed(capture, every, camera, along, progress)
-            found = _by_pixels(rotation, imu, timing, prior, options, camera, found)
+            found = _by_pixels(rotation, recording, camera, found)
     if rotation is not None:
         known_s = None if isinstance(found, NotObservableError) else found.motion().offset_s
-        stabilised = find_stabilisation(rotation, imu, offset_s=known_s)
+        stabilised = find_stabilisation(rotation, recording.imu, offset_s=known_s)
         if stabilised.stabilised:
             raise NotObservableError("the pixels' motion", stabilised.reason)
         if not isinstance(found, NotObservableError):
@@ -170,7 +149,7 @@ def look_first(
                 raise NotObservableError("the pixels' motion", agreement.reason)
     if isinstance(found, NotObservableError):
         raise found
-    return FirstLook(view=found, models=models)
+    return Precalibration(view=found, models=models)
 
 
 def survey_parts(timing: FrameTiming) -> list[list[str]]:
@@ -180,15 +159,7 @@ def survey_parts(timing: FrameTiming) -> list[list[str]]:
 
 
 def survey(
-    capture: Capture,
-    view: GyroView,
-    names: Sequence[str],
-    stages: Sequence[FrameStage],
-    *,
-    scratch: Path,
-    num_threads: int,
-    seed: int,
-    progress: Progress,
+    capture: Capture, view: GyroView, names: Sequence[str], stages: Sequence[FrameStage], context: RunContext
 ) -> tuple[pycolmap.Reconstruction, ...]:
     """COLMAP's small models of some frames; empty where it makes none.
 
@@ -202,35 +173,29 @@ def survey(
         Of the frames, as :func:`survey_parts` has them.
     stages
         That they go through.
-    scratch
-        A folder for temporary files.
-    num_threads, seed
-        Of COLMAP.
-    progress
-        Called with ``"survey"``.
+    context
+        ``progress`` is called with ``"survey"``.
     """
     steps = itertools.count()
 
     def step(stage: str, done: int, total: int, /) -> None:
-        progress("survey", min(next(steps), 10 * len(names)), 10 * len(names))
+        context.progress("survey", min(next(steps), 10 * len(names)), 10 * len(names))
 
-    with tempfile.TemporaryDirectory(dir=scratch) as folder:
+    with tempfile.TemporaryDirectory(dir=context.scratch) as folder:
         work = Path(folder)
-        images = _picture_folder(capture, view.timing, names, work, stages)
+        images = _image_folder(capture, view.timing, names, work, stages)
         try:
-            found = _small_models(
-                capture, images, names, work / "0", view, num_threads=num_threads, seed=seed, progress=step
-            )
+            found = _small_models(capture, images, names, work / "0", view, context.reporting(step))
         except (MappingError, FormatError) as error:
             log.info("no survey: %s", error)
             found = ()
-    progress("survey", 1, 1)
+    context.progress("survey", 1, 1)
     return found
 
 
 def _sigmas(calibration: CameraImuCalibration) -> tuple[float, float]:
     """Standard deviations of rotation (rad) and of the gyroscope's time offset (s)."""
-    rotation = max(calibration.sigma(f"rotation_{axis}_rad") for axis in "xyz")
+    rotation = calibration.rotation_sigma_rad
     return rotation, calibration.sigma("gyro_time_offset_s")
 
 
@@ -280,32 +245,19 @@ def followed(
 
 
 def _by_pixels(
-    rotation: VisualRotation,
-    imu: ImuRecording,
-    timing: FrameTiming,
-    prior: CameraImuCalibration,
-    options: AlignOptions,
-    camera: CameraModel,
-    instead_of: NotObservableError,
+    rotation: VisualRotation, recording: Recording, camera: CameraModel, instead_of: NotObservableError
 ) -> GyroView | NotObservableError:
     try:
-        view = _aligned(rotation.trajectory(), imu, timing, prior, options, camera, "pixels")
+        view = _aligned(rotation.trajectory(), recording, camera, "pixels")
     except NotObservableError as error:
         return NotObservableError(error.quantity, f"{error.hint} (nor by a small model: {instead_of})")
     # what translation does to pixels looks like a bias of the gyroscope
-    return replace(view, calibration=replace(view.calibration, gyro_bias_rad_s=prior.gyro_bias_rad_s))
+    return replace(view, calibration=replace(view.calibration, gyro_bias_rad_s=recording.prior.gyro_bias_rad_s))
 
 
-def _aligned(
-    trajectory: CameraTrajectory,
-    imu: ImuRecording,
-    timing: FrameTiming,
-    prior: CameraImuCalibration,
-    options: AlignOptions,
-    camera: CameraModel,
-    source: str,
-) -> GyroView:
-    found = align_clocks(trajectory, imu, prior=prior, options=options)
+def _aligned(trajectory: CameraTrajectory, recording: Recording, camera: CameraModel, source: str) -> GyroView:
+    options = AlignOptions(max_offset_s=recording.max_offset_s)
+    found = align_clocks(trajectory, recording.imu, prior=recording.prior, options=options)
     rotation_rad, offset_s = _sigmas(found.calibration)
     if rotation_rad > _USABLE_ROTATION_RAD or offset_s > _USABLE_OFFSET_S:
         raise NotObservableError(
@@ -313,33 +265,19 @@ def _aligned(
             f"before the reconstruction it is known to {math.degrees(rotation_rad):.1f} deg and "
             f"{1e3 * offset_s:.0f} ms, which is too little: give [calibration] in capture.toml",
         )
-    fast = abs(found.clock_rate) > max(_SIGNIFICANT * found.clock_rate_sigma, _FAST_CLOCK)
     return GyroView(
-        imu=imu,
-        timing=timing,
-        calibration=found.calibration,
-        clock_rate=found.clock_rate if fast else 0.0,
-        clock_middle_s=found.middle_s,
-        camera=camera,
-        source=source,
+        imu=recording.imu, timing=recording.timing, calibration=found.settled(), camera=camera, source=source
     )
 
 
 def _by_model(
-    capture: Capture,
-    imu: ImuRecording,
-    timing: FrameTiming,
-    prior: CameraImuCalibration,
-    options: AlignOptions,
-    scratch: Path,
-    num_threads: int,
-    seed: int,
-    progress: Progress,
+    recording: Recording, context: RunContext
 ) -> tuple[GyroView | NotObservableError, tuple[pycolmap.Reconstruction, ...]]:
     """The calibration by a small model; with a rolling shutter, by a second one of rectified keypoints.
 
     Also the models, where they are of all the recording.
     """
+    capture, timing = recording.capture, recording.timing
     indices = _middle(timing, _MODEL_SPACING_S, _MODEL_FRAMES)
     whole = len(indices) == len(_spaced(timing, _MODEL_SPACING_S))
     names = [timing.names[i] for i in indices]
@@ -347,30 +285,28 @@ def _by_model(
     steps = itertools.count()
 
     def step(stage: str, done: int, total: int, /) -> None:
-        progress("calibration", min(next(steps), 10 * len(names) * rounds), 10 * len(names) * rounds)
+        context.progress("calibration", min(next(steps), 10 * len(names) * rounds), 10 * len(names) * rounds)
 
     models: tuple[pycolmap.Reconstruction, ...] = ()
-    with tempfile.TemporaryDirectory(dir=scratch) as folder:
+    with tempfile.TemporaryDirectory(dir=context.scratch) as folder:
         work = Path(folder)
-        images = _picture_folder(capture, timing, names, work)
+        images = _image_folder(capture, timing, names, work)
         view: GyroView | None = None
         try:
             for i in range(rounds):
-                models = _small_models(
-                    capture, images, names, work / str(i), view, num_threads=num_threads, seed=seed, progress=step
-                )
+                models = _small_models(capture, images, names, work / str(i), view, context.reporting(step))
                 trajectory, _ = trajectory_from_model(models[0], timing)
-                view = _aligned(trajectory, imu, timing, prior, options, _camera_of(models[0]), "model")
+                view = _aligned(trajectory, recording, _camera_of(models[0]), "model")
         except (MappingError, FormatError) as error:
             return view or NotObservableError("camera-IMU calibration", str(error)), ()
         except NotObservableError as error:
             return view or error, ()
     assert view is not None
-    progress("calibration", 1, 1)
+    context.progress("calibration", 1, 1)
     return view, models if whole else ()
 
 
-def _picture_folder(
+def _image_folder(
     capture: Capture, timing: FrameTiming, names: Sequence[str], work: Path, stages: Sequence[FrameStage] = ()
 ) -> Path:
     """Where some frames are as pictures: with the capture, or written to a folder of work."""
@@ -383,7 +319,7 @@ def _picture_folder(
     for stage in stages:
         frames = stage(frames)
     for frame in frames:
-        target = images / frame.name
+        target = path_in(images, frame.name)
         target.parent.mkdir(parents=True, exist_ok=True)
         encode_image(target, frame.image)
     return images
@@ -395,21 +331,16 @@ def _small_models(
     names: Sequence[str],
     work: Path,
     view: GyroView | None,
-    *,
-    num_threads: int,
-    seed: int,
-    progress: Progress,
+    context: RunContext,
 ) -> tuple[pycolmap.Reconstruction, ...]:
     """COLMAP's models of some frames, the largest first; with a view, of rectified keypoints."""
     work.mkdir()
     features, database, sparse = work / "features.db", work / "database.db", work / "sparse"
     cameras = {name: capture.camera for name in names}
     stages = [] if view is None else [RollingShutterStage(view=view)]
-    extract_features(
-        images, cameras, features, _SMALL, keypoint_stages=stages, num_threads=num_threads, seed=seed, progress=progress
-    )
+    extract_features(images, cameras, features, _SMALL, keypoint_stages=stages, context=context)
     pairs = image_pairs(names, _SMALL)
-    match_features(features, database, pairs, num_threads=num_threads, seed=seed, progress=progress)
+    match_features(features, database, pairs, context)
     map_images(
         database,
         images,
@@ -417,9 +348,7 @@ def _small_models(
         _SMALL,
         refine_intrinsics=capture.camera is None,
         num_images=len(names),
-        num_threads=num_threads,
-        seed=seed,
-        progress=progress,
+        context=context,
     )
     models = [read_model(folder) for folder in find_models(sparse).values()]
     return tuple(sorted(models, key=lambda model: -int(model.num_reg_images())))

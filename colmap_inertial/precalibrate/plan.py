@@ -21,15 +21,16 @@ from colmap_inertial.imaging.gate import (
 )
 from colmap_inertial.imaging.parallax import Parallax
 from colmap_inertial.imaging.psf import blur_field, predicted_blur_px
-from colmap_inertial.io.calibration import SHARED_CLOCK_OFFSET_S
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import read_json, write_json
 from colmap_inertial.io.frames import frame_source
 from colmap_inertial.io.image_metadata import stated_exposures_s
+from colmap_inertial.io.names import path_in
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.options import BlurRemover, DeblurMethod, RollingShutterMethod
-from colmap_inertial.precalibrate.calibrate import guessed_camera, look_first, some_frames, survey, survey_parts
+from colmap_inertial.precalibrate.calibrate import guessed_camera, precalibrate, some_frames, survey, survey_parts
 from colmap_inertial.precalibrate.translation import find_parallaxes
+from colmap_inertial.run.context import Recording, RunContext
 from colmap_inertial.run.progress import Progress
 from colmap_inertial.run.workspace import a_record_of_ours
 from colmap_inertial.stages.deblur import DeblurStage
@@ -118,8 +119,6 @@ class ImagingPlan:
             if view is None
             else {
                 **asdict(view.calibration),
-                "clock_rate": view.clock_rate,
-                "clock_middle_s": view.clock_middle_s,
                 "source": view.source,
                 "notes": list(view.notes),
             },
@@ -146,8 +145,6 @@ def read_plan(path: Path, imu: ImuRecording, timing: FrameTiming) -> ImagingPlan
             view = GyroView(
                 imu=imu,
                 timing=timing,
-                clock_rate=found.pop("clock_rate"),
-                clock_middle_s=found.pop("clock_middle_s"),
                 source=found.pop("source"),
                 notes=tuple(found.pop("notes")),
                 calibration=CameraImuCalibration(**found),
@@ -173,45 +170,42 @@ def with_stated_exposures(capture: Capture, timing: FrameTiming) -> FrameTiming:
     source = frame_source(capture)
     if timing.exposure_s is not None or source is None:
         return timing
-    stated = stated_exposures_s([source / name for name in timing.names])
+    stated = stated_exposures_s([path_in(source, name) for name in timing.names])
     return timing if stated is None else replace(timing, exposure_s=stated)
 
 
-def plan_imaging(
-    capture: Capture,
-    imu: ImuRecording,
-    timing: FrameTiming,
-    prior: CameraImuCalibration,
-    *,
-    deblur: DeblurMethod | None,
-    rolling_shutter: RollingShutterMethod | None,
-    scratch: Path,
-    every: FrameTiming | None = None,
-    max_offset_s: float | None = None,
-    num_threads: int = -1,
-    seed: int = 0,
-    progress: Progress,
-) -> ImagingPlan:
+@dataclass(frozen=True, kw_only=True)
+class Treatments:
+    """What is to be done to frames and keypoints.
+
+    Attributes
+    ----------
+    deblur, rolling_shutter
+        ``None`` does what the recording allows; what is asked for by name and not possible is an error.
+    pairs
+        Whether frames are fused of short and long exposures, and not deblurred.
+    frames_by_others, keypoints_by_others
+        Whether the default frame or keypoint stages do not run, so that nothing is to be decided for them.
+    """
+
+    deblur: DeblurMethod | None = None
+    rolling_shutter: RollingShutterMethod | None = None
+    pairs: bool = False
+    frames_by_others: bool = False
+    keypoints_by_others: bool = False
+
+
+def plan_imaging(recording: Recording, context: RunContext, asked: Treatments) -> ImagingPlan:
     """Decide what is done to frames and keypoints.
 
     Parameters
     ----------
-    capture, imu, timing
-        The recording; see :func:`with_stated_exposures`.
-    prior
-        What is known of camera and IMU.
-    deblur, rolling_shutter
-        ``None`` does what the recording allows; what is asked for by name and not possible is an error.
-    scratch
-        A folder for temporary files.
-    every
-        All frames of the video that ``timing``'s were chosen from.
-    max_offset_s
-        Largest offset between the clocks.
-    num_threads, seed
-        Of COLMAP.
-    progress
-        Called with ``"motion"``, ``"calibration"``, ``"survey"`` and ``"blur"``.
+    recording
+        See :func:`with_stated_exposures`.
+    context
+        ``progress`` is called with ``"motion"``, ``"calibration"``, ``"survey"`` and ``"blur"``.
+    asked
+        What is to be done.
 
     Raises
     ------
@@ -220,83 +214,107 @@ def plan_imaging(
     InertialError
         Where rectifying was asked for and the readout is unknown.
     """
-    if rolling_shutter == "rectify" and timing.readout_s is None:
+    capture, timing = recording.capture, recording.timing
+    if asked.rolling_shutter == "rectify" and timing.readout_s is None:
         raise InertialError(
             f"{capture.path}: undoing the rolling shutter needs readout_s under [timing], the time from the first row "
             "to the last"
         )
+    why_not = _no_deblurring(recording, asked)
+    no_rectifying = _no_rectifying(timing, asked)
+    rectifying = f"keypoints are rectified, readout {1e3 * (timing.readout_s or 0):.1f} ms"
     plan = ImagingPlan(
-        method="deepgyro" if deblur == "deepgyro" else "wiener",
-        rectify=rolling_shutter != "off" and bool(timing.readout_s),
-        rolling_shutter_note=_shutter_note(timing),
+        method="deepgyro" if asked.deblur == "deepgyro" else "wiener",
+        rectify=not no_rectifying,
+        deblur_note=why_not,
+        rolling_shutter_note=no_rectifying or rectifying,
     )
-    if rolling_shutter == "off":
-        plan = replace(plan, rolling_shutter_note="not asked for")
-    why_not = "not asked for" if deblur == "off" else _no_deblurring(capture, imu, timing)
-    plan = replace(plan, deblur_note=why_not)
-    if why_not and not plan.rectify:
+    if why_not and not plan.rectify and not asked.pairs:
         return plan
-    if max_offset_s is None and capture.shared_clock:
-        max_offset_s = SHARED_CLOCK_OFFSET_S
+    no_gyro = _no_gyro_for_pairs(recording) if asked.pairs else ""
+    if not plan.rectify and no_gyro:
+        return replace(plan, deblur_note=_aligned_note(no_gyro))
     try:
-        look = look_first(
-            capture,
-            imu,
-            timing,
-            prior,
-            every=every,
-            max_offset_s=max_offset_s,
-            scratch=scratch,
-            num_threads=num_threads,
-            seed=seed,
-            progress=progress,
-        )
+        found = precalibrate(recording, context)
     except NotObservableError as error:
-        asked = [deblur in ("wiener", "deepgyro") and not why_not, rolling_shutter == "rectify" and plan.rectify]
-        if any(asked):
+        by_name = [
+            asked.deblur in ("wiener", "deepgyro") and not why_not,
+            asked.rolling_shutter == "rectify" and plan.rectify,
+        ]
+        if any(by_name):
             raise
         untreated = f"frames stay as they were filmed: {error}"
         return ImagingPlan(
-            deblur_note=why_not or untreated,
+            deblur_note=_aligned_note(str(error)) if asked.pairs else why_not or untreated,
             rolling_shutter_note=untreated if plan.rectify else plan.rolling_shutter_note,
         )
-    plan = replace(plan, view=look.view)
+    plan = replace(plan, view=found.view)
+    if asked.pairs:
+        return replace(plan, deblur_note=_aligned_note(no_gyro))
     if why_not:
         return plan
 
     def models(names: Sequence[str], plan: ImagingPlan | None) -> tuple[pycolmap.Reconstruction, ...]:
-        if plan is None and look.models:
-            return look.models
+        if plan is None and found.models:
+            return found.models
         stages = [] if plan is None else plan.frame_stages(drop=False)
-        return survey(
-            capture, look.view, names, stages, scratch=scratch, num_threads=num_threads, seed=seed, progress=progress
-        )
+        return survey(capture, found.view, names, stages, context)
 
-    return _deblurring(plan, look.view, capture, models, progress)
+    return _deblurring(plan, found.view, capture, models, context.progress)
 
 
-def _shutter_note(timing: FrameTiming) -> str:
+def _no_rectifying(timing: FrameTiming, asked: Treatments) -> str:
+    """Why keypoints are not rectified; empty where they are."""
+    if asked.keypoints_by_others:
+        return "left to the keypoint stages that were given"
+    if asked.rolling_shutter == "off":
+        return "not asked for"
     if timing.readout_s is None:
         return "the readout is unknown: give readout_s under [timing] in capture.toml"
-    if timing.readout_s == 0:
-        return "global shutter"
-    return f"keypoints are rectified, readout {1e3 * timing.readout_s:.1f} ms"
+    return "" if timing.readout_s else "global shutter"
 
 
-def _no_deblurring(capture: Capture, imu: ImuRecording, timing: FrameTiming) -> str:
+def _no_deblurring(recording: Recording, asked: Treatments) -> str:
     """Why no frame of a recording can be deblurred; empty where some may be."""
+    timing = recording.timing
+    if asked.frames_by_others:
+        return "left to the frame stages that were given"
+    if asked.deblur == "off" or asked.pairs:
+        return "not asked for"
     if timing.exposure_s is None:
         return (
             "frames stay as they were filmed: the exposure time is unknown; give exposure_s under [timing] in "
             "capture.toml, or a column of it in the frame times"
         )
-    camera = guessed_camera(capture, timing)
-    rate = float(np.linalg.norm(imu.gyro_rad_s, axis=1).max())
+    camera = guessed_camera(recording.capture, timing)
+    rate = float(np.linalg.norm(recording.imu.gyro_rad_s, axis=1).max())
     most_px = rate * float(timing.exposure_s.max()) * 1.2 * colmap_camera(camera).mean_focal_length()
     limit_px = max(_TELLING_PX, GateOptions().skip_below_px * max(camera.width, camera.height) / 1920)
     if most_px < limit_px:
         return f"no frame has more than {most_px:.1f} px of blur, by the quickest turn that the gyroscope felt"
     return ""
+
+
+def _no_gyro_for_pairs(recording: Recording) -> str:
+    """Why a gyroscope cannot align pairs of exposures; empty where it may."""
+    exposures, timing = recording.capture.exposures, recording.timing
+    if timing.exposure_s is None:
+        return (
+            "the short ones' exposure time is unknown; give exposure_s under [timing] in capture.toml, or a column of "
+            "it in the frame times"
+        )
+    if exposures is None or exposures.timing(timing) is None:
+        return (
+            "start or length of the long exposures is unknown; give times with a column exposure_s, or long_delay_s "
+            "and long_exposure_s, under [exposures] in capture.toml"
+        )
+    return ""
+
+
+def _aligned_note(no_gyro: str) -> str:
+    return "short and long exposures are fused, aligned by the " + (
+        f"pixels alone: {no_gyro}" if no_gyro else "gyroscope and the pixels"
+    )
 
 
 def _deblurring(

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import logging
+from typing import Literal
 
 import numpy as np
 
 from colmap_inertial.diagnose import Diagnosis, Recorded, diagnose
 from colmap_inertial.errors import FormatError, NotObservableError
 from colmap_inertial.flow import VisualRotation
-from colmap_inertial.io.calibration import SHARED_CLOCK_OFFSET_S
 from colmap_inertial.io.capture import Capture
-from colmap_inertial.io.imu import RawImu, read_raw_capture_imu
+from colmap_inertial.io.imu import RawImu
 from colmap_inertial.precalibrate.calibrate import followed, guessed_camera, near_the_beginning
+from colmap_inertial.run.context import Recording
 from colmap_inertial.run.progress import Progress
-from colmap_inertial.types import CameraImuCalibration, FrameTiming
+from colmap_inertial.types import CameraTrajectory, FrameTiming
 
 log = logging.getLogger(__name__)
 
@@ -28,8 +29,8 @@ _FEW, _FEW_SPACING_S = 90, 0.09
 STOPPING = frozenset({"stabilised", "gravity-removed", "imu-does-not-fit", "gyro-mirrored"})
 
 
-def read_checked_imu(capture: Capture, *, force: bool) -> RawImu:
-    """The inertial recording of a capture, refused where its numbers are implausible.
+def checked_imu(raw: RawImu, *, force: bool) -> RawImu:
+    """An inertial recording, refused where its numbers are implausible.
 
     Parameters
     ----------
@@ -38,12 +39,11 @@ def read_checked_imu(capture: Capture, *, force: bool) -> RawImu:
 
     Raises
     ------
-    FormatError, TimingError
-        As :func:`read_capture_imu`.
+    FormatError
+        As ``RawImu.check``.
     NotObservableError
         Where gravity was taken out.
     """
-    raw = read_raw_capture_imu(capture)
     try:
         raw.check()
     except FormatError as error:
@@ -55,11 +55,16 @@ def read_checked_imu(capture: Capture, *, force: bool) -> RawImu:
 
 
 def preflight(
-    capture: Capture, raw: RawImu, timing: FrameTiming, prior: CameraImuCalibration, progress: Progress
+    recording: Recording,
+    raw: RawImu,
+    progress: Progress,
+    *,
+    model: CameraTrajectory | Literal["untimed"] | None = None,
 ) -> Diagnosis:
-    """The checks before a reconstruction: everything but what needs many pictures."""
+    """The checks before a reconstruction, or of a ``model`` by its trajectory: all but what needs many images."""
+    capture, timing = recording.capture, recording.timing
     rotation = None
-    if capture.frame_log is None or not capture.frame_log.stabilised:
+    if model is None and (capture.frame_log is None or not capture.frame_log.stabilised):
         rotation = _followed(capture, timing, _FEW, _FEW_SPACING_S, progress)
     return diagnose(
         Recorded(
@@ -68,11 +73,12 @@ def preflight(
             accel_axes=raw.accel_axes,
             timing=timing,
             log=capture.frame_log,
-            is_capture=True,
+            is_capture=model is None,
             rotation=rotation,
             camera=capture.camera,
-            calibration=prior,
-            max_offset_s=SHARED_CLOCK_OFFSET_S if capture.shared_clock else None,
+            calibration=recording.prior,
+            trajectory=None if isinstance(model, str) else model,
+            max_offset_s=recording.max_offset_s,
         )
     )
 

@@ -19,21 +19,23 @@ from numpy.typing import NDArray
 from colmap_inertial.align import AlignOptions, align_clocks
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.flow import check_motion
+from colmap_inertial.gyro import on_camera_rate
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.imaging.psf import predicted_blur_px
 from colmap_inertial.imaging.selection import Chosen, Ranked, Ranking, WindowLimits, choose_frames
-from colmap_inertial.io.calibration import SHARED_CLOCK_OFFSET_S
 from colmap_inertial.io.capture import Capture, Video
 from colmap_inertial.io.files import read_json, write_json
 from colmap_inertial.io.frames import read_reduced
 from colmap_inertial.model import colmap_camera
-from colmap_inertial.options import FrameOptions, ReconstructOptions
+from colmap_inertial.options import FrameOptions
 from colmap_inertial.precalibrate.calibrate import followed, guessed_camera, near_the_beginning
+from colmap_inertial.run.context import Recording
 from colmap_inertial.run.progress import Progress
-from colmap_inertial.run.runner import StageRunner, remove
-from colmap_inertial.run.workspace import Workspace, a_record_of_ours
+from colmap_inertial.run.runner import remove
+from colmap_inertial.run.session import Session
+from colmap_inertial.run.workspace import a_record_of_ours
 from colmap_inertial.threads import one_blas_thread
-from colmap_inertial.types import Array, CameraImuCalibration, CameraModel, FrameTiming, ImuRecording
+from colmap_inertial.types import Array, CameraModel, FrameTiming
 
 log = logging.getLogger(__name__)
 
@@ -45,8 +47,6 @@ _SLOT_S, _LOOKED_PX = 1 / 30, 960
 _FOLLOWED, _FOLLOWED_SPACING_S = 300, 0.06
 #: A rotation and an offset as good as these serve.
 _ROTATION_RAD, _OFFSET_S = 0.1, 0.01
-#: What one clock stamped has one rate, unless another is this many standard deviations, and this, from it.
-_SIGNIFICANT, _FAST_CLOCK = 5.0, 3e-4
 #: Blur below this, for a picture of 1920 px, cannot be seen.
 _SHARP_PX = 1.0
 #: Exposure is at most this where it is unknown; angular speed is looked at in so many instants of it.
@@ -161,46 +161,19 @@ def read_selection(path: Path) -> Selection:
         return Selection(**{**values, "names": tuple(values["names"])}, windows=windows)
 
 
-def run_selection(
-    runner: StageRunner,
-    workspace: Workspace,
-    capture: Capture,
-    imu: ImuRecording,
-    timing: FrameTiming,
-    prior: CameraImuCalibration,
-    options: ReconstructOptions,
-    inputs: Sequence[object],
-    progress: Progress,
-) -> Selection:
-    """The frames to use, by :func:`select_frames` or all of them; ``inputs`` identify the files they are read from."""
-    why_all = use_all(capture, options.frames)
+def run_selection(session: Session, recording: Recording, options: FrameOptions) -> Selection:
+    """The frames to use, by :func:`select_frames` or all of them."""
+    selection_file = session.workspace.selection
+    why_all = use_all(recording.capture, options)
     if why_all:
-        remove(workspace.selection)
-        return everything(timing, why_all)
+        remove(selection_file)
+        return everything(recording.timing, why_all)
 
     def work(partial: Sequence[Path]) -> None:
-        found = select_frames(
-            capture,
-            imu,
-            timing,
-            prior,
-            options=options.frames,
-            max_offset_s=options.scale.max_offset_s,
-            progress=progress,
-        )
-        write_selection(partial[0], found)
+        write_selection(partial[0], select_frames(recording, options, session.progress))
 
-    depends = {
-        "capture": capture,
-        "imu": imu,
-        "timing": timing,
-        "prior": prior,
-        "frames": options.frames,
-        "max_offset_s": options.scale.max_offset_s,
-        "inputs": inputs,
-    }
-    runner.run("selection", depends, [workspace.selection], work)
-    selection = read_selection(workspace.selection)
+    session.runner.run("selection", {**recording.identity(), "frames": options}, [selection_file], work)
+    selection = read_selection(selection_file)
     log.info("frames: %s", selection.note)
     return selection
 
@@ -229,28 +202,15 @@ class _Clocks:
         return np.asarray(np.hypot(sigma_s, self.rate_sigma * (t_s - self.middle_s)) <= _OFFSET_S)
 
 
-def select_frames(
-    capture: Capture,
-    imu: ImuRecording,
-    timing: FrameTiming,
-    prior: CameraImuCalibration,
-    *,
-    options: FrameOptions,
-    max_offset_s: float | None = None,
-    progress: Progress,
-) -> Selection:
+def select_frames(recording: Recording, options: FrameOptions, progress: Progress) -> Selection:
     """Choose the frames to use: about ``min_fps`` to ``max_fps`` a second, each the least blurred of its window.
 
     Parameters
     ----------
-    capture, imu, timing
-        The recording; ``timing`` of all its frames.
-    prior
-        What is known of camera and IMU.
+    recording
+        With the timing of all its frames.
     options
         How many.
-    max_offset_s
-        Largest offset between the clocks.
     progress
         Called with ``"clocks"`` and ``"selection"``.
 
@@ -259,10 +219,9 @@ def select_frames(
     FormatError
         For a frame that cannot be decoded.
     """
+    capture, timing = recording.capture, recording.timing
     with one_blas_thread():
-        if max_offset_s is None and capture.shared_clock:
-            max_offset_s = SHARED_CLOCK_OFFSET_S
-        clocks = _clocks(capture, imu, timing, prior, max_offset_s, progress)
+        clocks = _clocks(recording, progress)
         blur, ranking = _predicted(clocks, timing)
         looked = _slots(timing.t_s, blur)
         pose_t_s = timing.pose_t_s()[looked]
@@ -341,16 +300,10 @@ def _predicted(clocks: _Clocks, timing: FrameTiming) -> tuple[Array, Ranking]:
     return np.where(known, loss, np.nan), "speed"
 
 
-def _clocks(
-    capture: Capture,
-    imu: ImuRecording,
-    timing: FrameTiming,
-    prior: CameraImuCalibration,
-    max_offset_s: float | None,
-    progress: Progress,
-) -> _Clocks:
+def _clocks(recording: Recording, progress: Progress) -> _Clocks:
+    capture, imu, timing, prior = recording.capture, recording.imu, recording.timing, recording.prior
     camera = guessed_camera(capture, timing)
-    rotation_rad = max(prior.sigma(f"rotation_{axis}_rad") for axis in "xyz")
+    rotation_rad = prior.rotation_sigma_rad
     offset_sigma_s = prior.sigma("gyro_time_offset_s")
     known = _Clocks(
         motion=GyroCamera.of(imu, prior, camera_epoch_ns=timing.epoch_ns),
@@ -372,16 +325,17 @@ def _clocks(
     try:
         indices = near_the_beginning(timing, _FOLLOWED_SPACING_S, _FOLLOWED)
         rotation = followed(capture, timing, camera, indices, progress, stage="clocks")
-        aligned = align_clocks(rotation.trajectory(), imu, prior=prior, options=AlignOptions(max_offset_s=max_offset_s))
+        options = AlignOptions(max_offset_s=recording.max_offset_s)
+        aligned = align_clocks(rotation.trajectory(), imu, prior=prior, options=options)
         found, on_rate, rates, rate_sigma = aligned.calibration, imu, "", 0.0
-        fast = abs(aligned.clock_rate) > max(_SIGNIFICANT * aligned.clock_rate_sigma, _FAST_CLOCK)
-        if fast or not (capture.shared_clock or offset_sigma_s <= _OFFSET_S):
-            # corrected even where it may be zero: what is left of it is then as small as its deviation says
-            rate, rate_sigma = aligned.clock_rate, aligned.clock_rate_sigma
-            on_rate = aligned.on_camera_rate(imu, trajectory_epoch_ns=timing.epoch_ns)
-            rates = f", with rates {1e6 * rate:+.0f} ppm apart, to {1e6 * rate_sigma:.0f} ppm"
+        if aligned.drifts() or not (capture.shared_clock or offset_sigma_s <= _OFFSET_S):
+            # what one clock stamped has one rate; another is corrected even where it may be zero: what is left of it is
+            # then as small as its deviation says
+            rate_sigma = aligned.clock_rate_sigma
+            on_rate = on_camera_rate(imu, found, camera_epoch_ns=timing.epoch_ns)
+            rates = f", with rates {1e6 * found.clock_rate:+.0f} ppm apart, to {1e6 * rate_sigma:.0f} ppm"
         sigma_s = found.sigma("gyro_time_offset_s")
-        turned = max(found.sigma(f"rotation_{axis}_rad") for axis in "xyz")
+        turned = found.rotation_sigma_rad
         # what translation does to pixels looks like a bias of the gyroscope
         found = replace(found, gyro_bias_rad_s=prior.gyro_bias_rad_s)
         motion = GyroCamera.of(on_rate, found, camera_epoch_ns=timing.epoch_ns)
@@ -403,7 +357,7 @@ def _clocks(
         offset_sigma_s=sigma_s,
         offset_from="pixels",
         rate_sigma=rate_sigma,
-        middle_s=aligned.middle_s,
+        middle_s=found.clock_middle_s,
     )
 
 

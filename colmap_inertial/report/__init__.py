@@ -35,9 +35,9 @@ largest values, ``null`` for gaps; three lines are x, y, z.
 ``versions``       of this package and of what it ran with
 =================  =====================================================================================================
 
-``scene``: ``unit`` (``m`` or ``model``), ``gravity_known``, ``display_from_model_xyzw`` (what turned the model
+``scene``: ``unit`` (``m`` or ``model``), ``gravity_known``, ``display_from_model_xyzw`` (what rotated the model
 upright), ``points_in_model``, ``points`` (``xyz`` as three lists, ``rgb``), ``path`` (``t_s``, ``xyz``),
-``path_length``, ``cameras`` (``xyz``, unit vectors ``right``, ``down``, ``ahead``, and the picture's ``half_width`` and
+``path_length``, ``cameras`` (``xyz``, unit vectors ``right``, ``down``, ``ahead``, and the image's ``half_width`` and
 ``half_height`` at distance 1).
 
 ``signals``: ``duration_s``, ``frames``, ``first_frame_s`` (on the camera's clock: where ``t_s`` counts from),
@@ -59,13 +59,13 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from colmap_inertial.errors import InertialError
-from colmap_inertial.io.files import write_json, write_text
+from colmap_inertial.errors import FormatError, InertialError
+from colmap_inertial.io.files import StrPath, write_json, write_text
 from colmap_inertial.report.content import gather
 
 
 def write_report(
-    out: Path, *, result: dict[str, Any] | None = None, stopped: str | None = None, capture: str | None = None
+    out: StrPath, *, result: dict[str, Any] | None = None, stopped: str | None = None, capture: str | None = None
 ) -> Path:
     """Write ``report.html`` and ``report.json`` of a run.
 
@@ -91,10 +91,19 @@ def write_report(
     OutputError
         Where it cannot be written.
     """
+    out = Path(out)
     from colmap_inertial.report.page import page_of
 
-    content = gather(out, result=result, stopped=stopped, capture=capture)
-    page, target = page_of(content, out), out / "report.html"
+    target = out / "report.html"
+    try:
+        content = gather(out, result=result, stopped=stopped, capture=capture)
+        page = page_of(content, out)
+    except (LookupError, TypeError, ValueError, ArithmeticError, AttributeError, RecursionError) as error:
+        told = f"{type(error).__name__}: {error}"
+        raise FormatError(
+            out,
+            f"its result.json, diagnosis.json, config.toml or report_data was damaged since it was written ({told})",
+        ) from error
     write_json(out / "report.json", content, indent=None)
     write_text(target, page)
     return target

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,8 @@ from colmap_inertial.report.words import half_width_pct, outcome_of_model, outco
 VERSION = 1
 #: What the pipeline keeps for the report alone, in an output folder.
 DATA_FOLDER, CROPS_FOLDER = "report_data", "crops"
-#: Models that are shown in full, the largest ones; frames in the plot of blur; pictures of the target.
-_MOST_MODELS, _MOST_FRAMES, _MOST_PICTURES = 3, 3000, 4
+#: Models that are shown in full, the largest ones; frames in the plot of blur; images of the target.
+_MOST_MODELS, _MOST_FRAMES, _MOST_IMAGES = 3, 3000, 4
 
 Content = dict[str, Any]
 
@@ -56,7 +57,8 @@ def gather(
     if result is None and stopped is None:
         result = read_json(out / "result.json")
     recording = read_json(recording_file(out)) if recording_file(out).is_file() else None
-    done = result or {"models": [], "frames": [], "seconds": {}, "versions": {"colmap_inertial": __version__}}
+    nothing: Content = {"models": [], "frames": [], "seconds": {}, "versions": {"colmap_inertial": __version__}}
+    done = nothing if result is None else result
     models = sorted(done["models"], key=lambda m: (m["metres_per_unit"] is None, -m["registered_images"], m["index"]))
     full = {model["index"] for model in models[:_MOST_MODELS]}
     project = done.get("project") is not None
@@ -108,25 +110,19 @@ def _model(out: Path, model: Content, *, in_full: bool, project: bool) -> Conten
     scale, ci95 = model["metres_per_unit"], model["ci95"]
     kept = {key: value for key, value in model.items() if key not in ("drift", "validation", "cov", "dense")}
     kept["half_width_pct"] = None if scale is None else half_width_pct(scale, ci95)
-    drift = model.get("drift")
-    if drift is None or scale is None:
-        kept["drift"] = _missing(
-            "There is no scale whose parts could be compared."
-            if scale is None
-            else "This method does not tell the scale of parts of the recording."
-        )
+    if scale is None:
+        kept["drift"] = _missing("There is no scale whose parts could be compared.")
     else:
-        kept["drift"] = drift
+        unknown = _missing("This method does not tell the scale of parts of the recording.")
+        kept["drift"] = model.get("drift") or unknown
     kept["validation"] = _validation(out, model, project=project)
     file = model_file(out, model["index"])
-    if not in_full:
-        why = f"Only the {_MOST_MODELS} largest models are shown in full."
-        kept["scene"], kept["signals"] = _missing(why), _missing(why)
-    elif not file.is_file():
-        why = "What it is drawn from was not kept; where that failed, log.txt says why."
-        kept["scene"], kept["signals"] = _missing(why), _missing(why)
-    else:
+    if in_full and file.is_file():
         kept |= read_json(file)
+    else:
+        failed = "What it is drawn from was not kept; where that failed, log.txt says why."
+        why = failed if in_full else f"Only the {_MOST_MODELS} largest models are shown in full."
+        kept["scene"], kept["signals"] = _missing(why), _missing(why)
     kept["outcome"] = outcome_of_model({**model, "signals": kept["signals"]})
     return kept
 
@@ -142,15 +138,15 @@ def _validation(out: Path, model: Content, *, project: bool) -> Content:
     if "error" in found:
         return _missing(f"The target could not be measured: {found['error']}.")
     folder = out / "validation" / str(model["index"])
-    pictures = sorted(folder.glob("*.jpg")) if folder.is_dir() else []
-    chosen = [str(pictures[i].relative_to(out)) for i in strided(len(pictures), _MOST_PICTURES)]
+    images = sorted(folder.glob("*.jpg")) if folder.is_dir() else []
+    chosen = [str(images[i].relative_to(out)) for i in strided(len(images), _MOST_IMAGES)]
     return {**found, "pictures": chosen}
 
 
 def _findings(out: Path) -> Content:
     file = out / "diagnosis.json"
     if not file.is_file():
-        return _missing("The recording was not looked at beforehand: an existing model was given.")
+        return _missing("The recording was not looked at beforehand, or what was found was not kept.")
     found = read_json(file)
     return {"checked": found["checked"], "findings": found["findings"]}
 
@@ -173,12 +169,9 @@ def _blur(done: Content, recording: Content | None, *, project: bool) -> Content
     blur_px = np.array([frame["blur_px"] for frame in known])
     some = strided(len(known), _MOST_FRAMES)
     worst = np.argsort(-blur_px, kind="stable")[: _MOST_FRAMES // 10] if len(some) < len(known) else some[:0]
-    counts: dict[str, int] = {}
-    for frame in done["frames"]:
-        counts[frame["action"]] = counts.get(frame["action"], 0) + 1
     return {
         "note": note,
-        "counts": counts,
+        "counts": dict(Counter(frame["action"] for frame in done["frames"])),
         "median_px": float(np.median(blur_px)),
         "largest_px": float(blur_px.max()),
         "frames": [
@@ -221,6 +214,3 @@ def _configuration(out: Path) -> Content:
         return _missing("The run ended before its configuration was written.")
     text = read_text(file)
     return {"toml": text, "values": tomllib.loads(text)}
-
-
-__all__ = ["CROPS_FOLDER", "DATA_FOLDER", "VERSION", "gather", "model_file", "recording_file"]

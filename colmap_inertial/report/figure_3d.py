@@ -108,7 +108,7 @@ def _lines(segments: Array, name: str, colour: str, width: float, **more: Any) -
 
 
 def _pyramids(cameras: dict[str, Any], depth: float) -> Array:
-    """(K, 10, 3) the outlines of pyramids from the cameras' centres to their pictures' corners."""
+    """(K, 10, 3) the outlines of pyramids from the cameras' centres to their images' corners."""
     centre, right, down, ahead = (np.array(cameras[k], dtype=np.float64).T for k in ("xyz", "right", "down", "ahead"))
     half = cameras["half_width"], cameras["half_height"]
     corners = [
@@ -136,17 +136,13 @@ def _scale_bar(low: Array, high: Array, step: float, unit: str) -> list[Figure]:
     start = np.array([low[0] + margin, low[1] + margin, low[2] + 0.2 * margin])
     end = start + np.array([step, 0.0, 0.0])
     bar = _lines(np.stack([start, end])[None], f"scale bar, {_length(step, unit)}", GOOD, 8)
-    label = {
-        "type": "scatter3d",
-        "mode": "text",
-        **_coordinates((0.5 * (start + end))[:, None]),
-        "text": [_length(step, unit)],
-        "textposition": "top center",
-        "textfont": {"size": 13, "color": GOOD},
-        "hoverinfo": "skip",
-        "showlegend": False,
-    }
-    return [bar, label]
+    return [bar, _label(0.5 * (start + end), _length(step, unit))]
+
+
+def _label(at: Array, text: str, **more: Any) -> Figure:
+    font = {"textposition": "top center", "textfont": {"size": 13, "color": GOOD}}
+    shown = {"type": "scatter3d", "mode": "text", "text": [text], "hoverinfo": "skip", "showlegend": False}
+    return {**shown, **_coordinates(at[:, None]), **font, **more}
 
 
 def _gravity(low: Array, high: Array, size: float) -> list[Figure]:
@@ -168,18 +164,4 @@ def _gravity(low: Array, high: Array, size: float) -> list[Figure]:
         "hoverinfo": "skip",
         "legendgroup": "gravity",
     }
-    label = {
-        "type": "scatter3d",
-        "mode": "text",
-        **_coordinates(top[:, None]),
-        "text": ["gravity"],
-        "textposition": "top center",
-        "textfont": {"size": 13, "color": GOOD},
-        "hoverinfo": "skip",
-        "showlegend": False,
-        "legendgroup": "gravity",
-    }
-    return [shaft, head, label]
-
-
-__all__ = ["nice_length", "scene_figure"]
+    return [shaft, head, _label(top, "gravity", legendgroup="gravity")]

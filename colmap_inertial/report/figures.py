@@ -54,6 +54,22 @@ def _line(line: dict[str, Any], name: str, colour: str, **more: Any) -> Figure:
     }
 
 
+def _dots(name: str, points: Sequence[tuple[float, float, str]], colour: str, opacity: float, tip: str) -> Figure:
+    """Points (x, y, text) that say what they are when pointed at."""
+    x, y, text = (list(column) for column in zip(*points, strict=True))
+    marker = {"color": colour, "size": 6, "opacity": opacity}
+    named = {"type": "scatter", "mode": "markers", "name": name, "text": text, "hovertemplate": tip}
+    return {**named, "x": x, "y": y, "marker": marker}
+
+
+def _axis(title: str, **more: Any) -> Figure:
+    return {"title": {"text": title}, **more}
+
+
+def _right_axis(title: str, overlaying: str, **more: Any) -> Figure:
+    return {"overlaying": overlaying, "side": "right", "showgrid": False, **_axis(title), **more}
+
+
 def _scaled(lines: Lines, factor: float) -> list[dict[str, Any]]:
     return [
         {"t_s": line["t_s"], "values": [None if v is None else round(v * factor, 5) for v in line["values"]]}
@@ -68,7 +84,7 @@ def _rows(
     gap, count = 0.05, len(titles)
     size = (1 - gap * (count - 1)) / count
     layout = _layout(170 * count + 60, hovermode="x unified" if not right_unit else "closest")
-    layout["xaxis"] = {"title": {"text": _TIME}, "anchor": f"y{count if count > 1 else ''}", "zeroline": False}
+    layout["xaxis"] = _axis(_TIME, anchor=f"y{count if count > 1 else ''}", zeroline=False)
     data = []
     for row, title in enumerate(titles):
         top = 1 - row * (size + gap)
@@ -81,24 +97,12 @@ def _rows(
         for name, colour, lines, side in sides:
             axis = f"y{key}" if side == "left" else f"y{row + 1 + count}"
             tip = unit if side == "left" else right_unit
-            data.append(
-                _line(
-                    lines[row],
-                    name,
-                    colour,
-                    yaxis=axis,
-                    showlegend=row == 0,
-                    hovertemplate=f"%{{x:.2f}} s: %{{y:.4g}} {tip}<extra>{name}</extra>",
-                )
-            )
+            hover = f"%{{x:.2f}} s: %{{y:.4g}} {tip}<extra>{name}</extra>"
+            data.append(_line(lines[row], name, colour, yaxis=axis, showlegend=row == 0, hovertemplate=hover))
         if right_unit:
-            layout[f"yaxis{row + 1 + count}"] = {
-                "overlaying": f"y{key}",
-                "side": "right",
-                "showgrid": False,
-                "zeroline": False,
-                "title": {"text": right_unit, "standoff": 4},
-            }
+            right = _right_axis(right_unit, f"y{key}", zeroline=False)
+            right["title"]["standoff"] = 4
+            layout[f"yaxis{row + 1 + count}"] = right
     if right_unit:
         layout["margin"] = {**layout["margin"], "r": 58}
     return {"data": data, "layout": layout}
@@ -117,14 +121,10 @@ def rotation_before(rotation: dict[str, Any]) -> Figure | None:
     before = rotation["before"]
     if not before["gyroscope"]:
         return None
-    sides = (("camera", "camera", CAMERA), ("gyroscope", "gyroscope", IMU))
-    if rotation["after"] is None and "camera_size" in before:
-        lines = [
-            (name, colour, _scaled([before[f"{key}_size"]], math.degrees(1)), "left") for key, name, colour in sides
-        ]
-        return _rows(lines, ["speed of turning"], unit="°/s")
-    lines = [(name, colour, _scaled(before[key], math.degrees(1)), "left") for key, name, colour in sides]
-    return _rows(lines, ["x", "y", "z"], unit="°/s")
+    sides = (("camera", CAMERA), ("gyroscope", IMU))
+    speeds_only = rotation["after"] is None and "camera_size" in before
+    shown = {key: [before[f"{key}_size"]] if speeds_only else before[key] for key, _ in sides}
+    return _rows(_in_degrees(shown, sides), ["angular speed"] if speeds_only else ["x", "y", "z"], unit="°/s")
 
 
 def rotation_after(rotation: dict[str, Any]) -> Figure | None:
@@ -132,9 +132,13 @@ def rotation_after(rotation: dict[str, Any]) -> Figure | None:
     after = rotation["after"]
     if after is None:
         return None
-    sides = (("gyroscope", "gyroscope", IMU), ("camera", "camera", CAMERA))
-    lines = [(name, colour, _scaled(after[key], math.degrees(1)), "left") for key, name, colour in sides]
-    return _underlaid(_rows(lines, ["x", "y", "z"], unit="°/s"))
+    return _underlaid(_rows(_in_degrees(after, (("gyroscope", IMU), ("camera", CAMERA))), ["x", "y", "z"], unit="°/s"))
+
+
+def _in_degrees(
+    record: dict[str, Any], sides: Sequence[tuple[str, str]]
+) -> list[tuple[str, str, list[dict[str, Any]], str]]:
+    return [(name, colour, _scaled(record[name], math.degrees(1)), "left") for name, colour in sides]
 
 
 def accelerations(acceleration: dict[str, Any]) -> Figure:
@@ -150,11 +154,11 @@ def accelerations(acceleration: dict[str, Any]) -> Figure:
     if metric:
         return _underlaid(figure)
     # without a unit the factor between the curves is open: zero in the middle of both, and what a hand does as measure
-    for row, (felt, seen) in enumerate(zip(acceleration["accelerometer"], acceleration["camera"], strict=True)):
+    for row, (imu, camera) in enumerate(zip(acceleration["accelerometer"], acceleration["camera"], strict=True)):
         key = "" if row == 0 else str(row + 1)
-        most = 1.1 * max(_HAND_M_S2, _peak(felt))
+        most = 1.1 * max(_HAND_M_S2, _peak(imu))
         figure["layout"][f"yaxis{key}"]["range"] = [-most, most]
-        most = 1.6 * _peak(seen) or 1.0
+        most = 1.6 * _peak(camera) or 1.0
         figure["layout"][f"yaxis{row + 4}"] |= {"range": [-most, most], "tickmode": "auto", "nticks": 5}
     return figure
 
@@ -187,16 +191,10 @@ def spectra(spectrum: dict[str, Any], *, unit: str, factor: float = 1.0) -> Figu
     layout = _layout(360)
     layout["showlegend"] = True
     decades = {"type": "log", "tickformat": "~g"}
-    layout["xaxis"] = {**decades, "title": {"text": "frequency (Hz)"}}
-    layout["yaxis"] = {**decades, "title": {"text": f"{unit}/√Hz"}}
+    layout["xaxis"] = _axis("frequency (Hz)", **decades)
+    layout["yaxis"] = _axis(f"{unit}/√Hz", **decades)
     if other:
-        layout["yaxis2"] = {
-            **decades,
-            "overlaying": "y",
-            "side": "right",
-            "showgrid": False,
-            "title": {"text": "model units/s²/√Hz"},
-        }
+        layout["yaxis2"] = _right_axis("model units/s²/√Hz", "y", **decades)
         layout["margin"] = {**layout["margin"], "r": 58}
     return {"data": data, "layout": layout}
 
@@ -217,13 +215,11 @@ def drift(model: dict[str, Any]) -> Figure:
     reach = [100 * half_width(p["sigma_log"]) for p in parts]
     band = {"type": "rect", "xref": "paper", "x0": 0, "x1": 1, "y0": -width, "y1": width, "line": {"width": 0}}
     layout = _layout(300, shapes=[{**band, "fillcolor": GOOD, "opacity": 0.13, "layer": "below"}])
-    layout["xaxis"] = {
-        "title": {"text": _TIME},
-        "range": [min(0.0, every[0]["begin_s"] - start), every[-1]["end_s"] - start],
-        "zeroline": False,
-    }
+    span = [min(0.0, every[0]["begin_s"] - start), every[-1]["end_s"] - start]
+    layout["xaxis"] = _axis(_TIME, range=span, zeroline=False)
     most = 1.15 * max([1.3 * width, *(abs(o) + r for o, r in zip(off, reach, strict=True))])
-    layout["yaxis"] = {"title": {"text": "off the whole (%)"}, "zeroline": True, "range": [-most, most]}
+    layout["yaxis"] = _axis("off the whole (%)", zeroline=True, range=[-most, most])
+    lengths = [0.5 * (p["end_s"] - p["begin_s"]) for p in parts]
     data = [
         {
             "type": "scatter",
@@ -232,13 +228,7 @@ def drift(model: dict[str, Any]) -> Figure:
             "x": middle,
             "y": off,
             "error_y": {"type": "data", "array": reach, "thickness": 1.5, "color": CAMERA},
-            "error_x": {
-                "type": "data",
-                "array": [0.5 * (p["end_s"] - p["begin_s"]) for p in parts],
-                "thickness": 3,
-                "width": 0,
-                "color": CAMERA,
-            },
+            "error_x": {"type": "data", "array": lengths, "thickness": 3, "width": 0, "color": CAMERA},
             "marker": {"color": CAMERA, "size": 9},
             "text": [f"{digits(p['metres_per_unit'])} m per unit" for p in parts],
             "hovertemplate": "%{y:+.2f} %, %{text}<extra></extra>",
@@ -261,22 +251,15 @@ def blur(frames: Sequence[dict[str, Any]]) -> Figure:
     for action, (name, colour) in _ACTIONS.items():
         those = [frame for frame in frames if frame["action"] == action and frame["t_s"] is not None]
         if those:
-            data.append(
-                {
-                    "type": "scatter",
-                    "mode": "markers",
-                    "name": f"{name} ({len(those)})",
-                    "x": [frame["t_s"] for frame in those],
-                    "y": [round(frame["blur_px"], 2) for frame in those],
-                    "text": [escape(frame["name"]) for frame in those],
-                    "marker": {"color": colour, "size": 6, "opacity": 0.85},
-                    "hovertemplate": "%{text}: %{y:.1f} px<extra></extra>",
-                }
-            )
-    layout = _layout(300)
-    layout["xaxis"] = {"title": {"text": _TIME}, "zeroline": False}
-    layout["yaxis"] = {"title": {"text": "blur (px)"}, "rangemode": "tozero"}
-    return {"data": data, "layout": layout}
+            points = [(frame["t_s"], round(frame["blur_px"], 2), escape(frame["name"])) for frame in those]
+            tip = "%{text}: %{y:.1f} px<extra></extra>"
+            data.append(_dots(f"{name} ({len(those)})", points, colour, 0.85, tip))
+    return {"data": data, "layout": _over_time(300, "blur (px)")}
+
+
+def _over_time(height: int, title: str) -> Figure:
+    axes = {"xaxis": _axis(_TIME, zeroline=False), "yaxis": _axis(title, rangemode="tozero")}
+    return _layout(height, **axes)
 
 
 def shutter_over_time(shutter: dict[str, Any]) -> Figure:
@@ -286,10 +269,7 @@ def shutter_over_time(shutter: dict[str, Any]) -> Figure:
         line = {"t_s": shutter["t_s"], "values": shutter[key]}
         tip = f"%{{x:.2f}} s: %{{y:.2f}} px<extra>{name}</extra>"
         data.append(_line(line, name, colour, hovertemplate=tip))
-    layout = _layout(280)
-    layout["xaxis"] = {"title": {"text": _TIME}, "zeroline": False}
-    layout["yaxis"] = {"title": {"text": "movement (px)"}, "rangemode": "tozero"}
-    return {"data": data, "layout": layout}
+    return {"data": data, "layout": _over_time(280, "movement (px)")}
 
 
 def shutter_field(worst: dict[str, Any]) -> Figure:
@@ -298,12 +278,14 @@ def shutter_field(worst: dict[str, Any]) -> Figure:
     largest = float(np.linalg.norm(shift, axis=1).max())
     times = max(1.0, round(0.09 * worst["width"] / max(largest, 1e-9)))
     ends = at + times * shift
-    x = [v for a, b in zip(at[:, 0], ends[:, 0], strict=True) for v in (round(a, 1), round(b, 1), None)]
-    y = [v for a, b in zip(at[:, 1], ends[:, 1], strict=True) for v in (round(a, 1), round(b, 1), None)]
+    x, y = (
+        [v for a, b in zip(at[:, i], ends[:, i], strict=True) for v in (round(a, 1), round(b, 1), None)] for i in (0, 1)
+    )
     length = [f"{v:.2f} px" for v in np.linalg.norm(shift, axis=1)]
     name = "movement" if times == 1 else f"movement, drawn {times:.0f} times longer"
+    line = {"color": IMU, "width": 1.6}
     data: list[Figure] = [
-        {"type": "scatter", "mode": "lines", "x": x, "y": y, "name": name, "hoverinfo": "skip"},
+        {"type": "scatter", "mode": "lines", "x": x, "y": y, "name": name, "line": line, "hoverinfo": "skip"},
         {
             "type": "scatter",
             "mode": "markers",
@@ -315,24 +297,13 @@ def shutter_field(worst: dict[str, Any]) -> Figure:
             "hovertemplate": "%{text}<extra></extra>",
         },
     ]
-    data[0]["line"] = {"color": IMU, "width": 1.6}
     layout = _layout(420)
     width, height, edge = worst["width"], worst["height"], 0.08
     outline = {"type": "rect", "x0": 0, "x1": width, "y0": 0, "y1": height, "line": {"color": QUIET, "width": 1}}
     layout["shapes"] = [outline]
-    layout["xaxis"] = {
-        "title": {"text": "x (px)"},
-        "range": [-edge * width, (1 + edge) * width],
-        "constrain": "domain",
-        "zeroline": False,
-    }
-    layout["yaxis"] = {
-        "title": {"text": "y (px)"},
-        "range": [(1 + edge) * height, -edge * height],
-        "scaleanchor": "x",
-        "constrain": "domain",
-        "zeroline": False,
-    }
+    across, down = [-edge * width, (1 + edge) * width], [(1 + edge) * height, -edge * height]
+    layout["xaxis"] = _axis("x (px)", range=across, constrain="domain", zeroline=False)
+    layout["yaxis"] = _axis("y (px)", range=down, scaleanchor="x", constrain="domain", zeroline=False)
     return {"data": data, "layout": layout}
 
 
@@ -344,26 +315,20 @@ def target_distances(validation: dict[str, Any]) -> Figure:
     for kind, colour in _SETS.items():
         those = [distance for distance in distances[::step] if distance["set"] == kind]
         if those:
-            data.append(
-                {
-                    "type": "scatter",
-                    "mode": "markers",
-                    "name": f"{kind} ({len(those)})",
-                    "x": [round(1000 * d["known_m"], 3) for d in those],
-                    "y": [round(1000 * d["residual_m"], 4) for d in those],
-                    "text": [escape(" to ".join(d["pair"])) for d in those],
-                    "marker": {"color": colour, "size": 6, "opacity": 0.75},
-                    "hovertemplate": "%{text}: %{x:.1f} mm, off by %{y:+.3f} mm<extra></extra>",
-                }
-            )
+            points = [
+                (round(1000 * d["known_m"], 3), round(1000 * d["residual_m"], 4), escape(" to ".join(d["pair"])))
+                for d in those
+            ]
+            tip = "%{text}: %{x:.1f} mm, off by %{y:+.3f} mm<extra></extra>"
+            data.append(_dots(f"{kind} ({len(those)})", points, colour, 0.75, tip))
     layout = _layout(320)
-    layout["xaxis"] = {"title": {"text": "known distance (mm)"}, "zeroline": False}
-    layout["yaxis"] = {"title": {"text": "measured − known (mm)"}, "zeroline": True}
+    layout["xaxis"] = _axis("known distance (mm)", zeroline=False)
+    layout["yaxis"] = _axis("measured − known (mm)", zeroline=True)
     return {"data": data, "layout": layout}
 
 
 def target_views(validation: dict[str, Any]) -> Figure:
-    """Residuals of the target's corners in each picture."""
+    """Residuals of the target's corners in each image."""
     views = validation["views"]
     data = [
         {
@@ -378,25 +343,6 @@ def target_views(validation: dict[str, Any]) -> Figure:
     ]
     layout = _layout(240, showlegend=False)
     layout["margin"] = {**layout["margin"], "t": 12}
-    layout["xaxis"] = {
-        "title": {"text": "pictures with the target"},
-        "dtick": max(1, round(len(views) / 8)),
-        "zeroline": False,
-    }
-    layout["yaxis"] = {"title": {"text": "residual, rms (px)"}}
+    layout["xaxis"] = _axis("images with the target", dtick=max(1, round(len(views) / 8)), zeroline=False)
+    layout["yaxis"] = _axis("residual, rms (px)")
     return {"data": data, "layout": layout}
-
-
-__all__ = [
-    "accelerations",
-    "blur",
-    "drift",
-    "informative_parts",
-    "rotation_after",
-    "rotation_before",
-    "shutter_field",
-    "shutter_over_time",
-    "spectra",
-    "target_distances",
-    "target_views",
-]

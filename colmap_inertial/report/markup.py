@@ -10,11 +10,12 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+from colmap_inertial.io.names import path_in
 from colmap_inertial.report.words import digits
 from colmap_inertial.scale.verdict import TRUSTED_HALF_WIDTH, WEAK_HALF_WIDTH
 
 _UNIT = re.compile(r"(\d) ((?:m|cm|mm|s|ms|px|Hz|m/s²|°/s)\b|%)")
-#: Pictures are embedded no wider than this.
+#: Images are embedded no wider than this.
 _WIDTH_PX, _QUALITY = 720, 78
 #: Half-widths of the 95 % interval, per cent, up to which a scale is trusted, and given at all.
 _TRUSTED_PCT, _WEAK_PCT = 100 * TRUSTED_HALF_WIDTH, 100 * WEAK_HALF_WIDTH
@@ -37,7 +38,7 @@ def scale_text(model: Mapping[str, Any]) -> str:
 
 
 def gauge(half_width_pct: float) -> str:
-    """Where the half-width of the interval lies between a tenth of a per cent and a hundred, as a picture."""
+    """Where the half-width of the interval lies between a tenth of a per cent and a hundred, as an image."""
     left, width, top = 10.0, 480.0, 26.0
 
     def at(pct: float) -> float:
@@ -101,13 +102,11 @@ def bars(seconds: Mapping[str, float]) -> str:
     return f'<div class="bars">{"".join(rows)}</div>'
 
 
-def pictures(
-    out: Path, paths: Sequence[str], *, classes: str = "pictures", captions: Sequence[str] | None = None
-) -> str:
-    """Pictures side by side, embedded; those that are gone are left out."""
+def images(out: Path, paths: Sequence[str], *, classes: str = "pictures", captions: Sequence[str] | None = None) -> str:
+    """Images side by side, embedded; those that are gone are left out."""
     shown = []
     for i, path in enumerate(paths):
-        data = _embedded(out / path)
+        data = _embedded(path_in(out, path))
         if data is not None:
             name = captions[i] if captions else Path(path).stem
             label = escape(name, quote=True)
@@ -118,16 +117,13 @@ def pictures(
 def _embedded(path: Path) -> str | None:
     import cv2
 
-    picture = cv2.imread(str(path), cv2.IMREAD_COLOR) if path.is_file() else None
-    if picture is None:
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR) if path.is_file() else None
+    if image is None:
         return None
-    height, width = picture.shape[:2]
+    height, width = image.shape[:2]
     if width > _WIDTH_PX:
-        picture = cv2.resize(picture, (_WIDTH_PX, round(height * _WIDTH_PX / width)), interpolation=cv2.INTER_AREA)
-        data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
+        image = cv2.resize(image, (_WIDTH_PX, round(height * _WIDTH_PX / width)), interpolation=cv2.INTER_AREA)
+        data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
     else:
         data = path.read_bytes()
     return f"data:image/jpeg;base64,{base64.b64encode(data).decode('ascii')}"
-
-
-__all__ = ["bars", "facts", "gauge", "listing", "pictures", "prose", "scale_text", "sentence", "table"]

@@ -31,7 +31,7 @@ def page_of(content: dict[str, Any], out: Path) -> str:
     content
         As ``colmap_inertial.report`` describes it.
     out
-        Folder that its pictures' paths start from.
+        Folder that its images' paths start from.
     """
     sections = list(sections_of(content, out))
     figures: dict[str, Figure] = {}
@@ -99,6 +99,3 @@ def _library() -> str:
 
 def _packed(data: bytes) -> str:
     return base64.b64encode(gzip.compress(data, 9, mtime=0)).decode("ascii")
-
-
-__all__ = ["page_of"]

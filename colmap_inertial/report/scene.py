@@ -28,7 +28,7 @@ def scene_record(
     *,
     first_frame_s: float | None = None,
 ) -> dict[str, Any]:
-    """A model turned upright, and thinned to a bounded size.
+    """A model rotated upright, and thinned to a bounded size.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ def scene_record(
     trajectory
         Its cameras in order of time, in metres where its scale is known.
     gravity_in_world_m_s2
-        (3,) in the model's world; where unknown, the mean direction of the pictures' upper edges counts as up.
+        (3,) in the model's world; where unknown, the mean direction of the images' upper edges counts as up.
     first_frame_s
         When the recording's first frame was taken, on the trajectory's clock; without it, the first pose counts.
 
@@ -50,20 +50,20 @@ def scene_record(
     down = gravity_in_world_m_s2
     if down is None:
         down = quat_rotate(world_from_cam, np.array([0.0, 1.0, 0.0])).mean(axis=0)
-    turn = rotation_between(down, np.array([0.0, 0.0, -1.0]))
-    centres = quat_rotate(turn, trajectory.cam_in_world)
+    upright = rotation_between(down, np.array([0.0, 0.0, -1.0]))
+    centres = quat_rotate(upright, trajectory.cam_in_world)
     xyz, rgb = _points(reconstruction, trajectory.cam_in_world)
-    xyz = quat_rotate(turn, xyz) if len(xyz) else xyz
+    xyz = quat_rotate(upright, xyz) if len(xyz) else xyz
     some = strided(len(centres), _MOST_CAMERAS)
     poses = strided(len(centres), _MOST_POSES)
     size = _extent(np.concatenate([xyz, centres]))
     digits = int(np.clip(4 - np.floor(np.log10(size)), 0, 9)) if size > 0 else 6
-    axes = np.einsum("ij,njk->nik", matrix_from_quat(turn), matrix_from_quat(world_from_cam[some]))
-    half_width, half_height = _picture(reconstruction)
+    axes = np.einsum("ij,njk->nik", matrix_from_quat(upright), matrix_from_quat(world_from_cam[some]))
+    half_width, half_height = _half_sides(reconstruction)
     return {
         "unit": trajectory.length_unit,
         "gravity_known": gravity_in_world_m_s2 is not None,
-        "display_from_model_xyzw": np.round(turn, 9).tolist(),
+        "display_from_model_xyzw": np.round(upright, 9).tolist(),
         "points_in_model": reconstruction.num_points3D(),
         "points": {"xyz": np.round(xyz.T, digits).tolist(), "rgb": [f"#{r:02x}{g:02x}{b:02x}" for r, g, b in rgb]},
         "path": {
@@ -82,8 +82,8 @@ def scene_record(
     }
 
 
-def _picture(reconstruction: pycolmap.Reconstruction) -> tuple[float, float]:
-    """Half of a picture's width and height at distance 1; a nominal size for cameras that see all around."""
+def _half_sides(reconstruction: pycolmap.Reconstruction) -> tuple[float, float]:
+    """Half of an image's width and height at distance 1; a nominal size for cameras that see all around."""
     images = reconstruction.reg_image_ids()
     camera = reconstruction.camera(reconstruction.image(min(images)).camera_id)
     focal = camera.mean_focal_length()
@@ -113,6 +113,3 @@ def _points(reconstruction: pycolmap.Reconstruction, centres: Array) -> tuple[Ar
 
 def _extent(xyz: Array) -> float:
     return float(np.ptp(xyz, axis=0).max()) if len(xyz) else 0.0
-
-
-__all__ = ["scene_record"]

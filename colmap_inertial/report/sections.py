@@ -12,7 +12,7 @@ from typing import Any
 from colmap_inertial.report import figures
 from colmap_inertial.report.figure_3d import scene_figure
 from colmap_inertial.report.figures import Figure
-from colmap_inertial.report.markup import bars, facts, gauge, listing, pictures, prose, scale_text, sentence, table
+from colmap_inertial.report.markup import bars, facts, gauge, images, listing, prose, scale_text, sentence, table
 from colmap_inertial.report.words import digits, signed
 from colmap_inertial.scale.verdict import Z95, scale_drifts
 
@@ -47,11 +47,9 @@ class Section:
 
 def sections_of(content: Content, out: Path) -> Iterator[Section]:
     """The sections that the run has data for, and at the end those it has not, with the reason."""
-    left_out: list[tuple[str, str]] = []
+    left_out = _LeftOut()
     yield _outcome(content)
-    if "missing" in content["findings"]:
-        left_out.append(("Findings", content["findings"]["missing"]))
-    else:
+    if left_out.has("Findings", content["findings"]):
         yield _findings(content["findings"])
     several = len(content["models"]) > 1
     for model in content["models"]:
@@ -61,19 +59,24 @@ def sections_of(content: Content, out: Path) -> Iterator[Section]:
             yield _model_head(model, mark)
         yield from _of_model(model, name, mark, left_out, out)
     for title, key, build in (("Blur", "blur", _blur), ("Rolling shutter", "rolling_shutter", _shutter)):
-        if "missing" in content[key]:
-            left_out.append((title, content[key]["missing"]))
-        else:
+        if left_out.has(title, content[key]):
             yield build(content, out)
-    if "missing" in content["crops"] and "missing" not in content["blur"]:
-        left_out.append(("Before and after", content["crops"]["missing"]))
+    if "missing" not in content["blur"]:
+        left_out.has("Before and after", content["crops"])
     yield _run(content)
     if left_out:
-        yield Section(
-            anchor="left-out",
-            short="Left out",
-            parts=("<h2>Left out</h2>", table(("Section", "Why"), left_out)),
-        )
+        parts = ("<h2>Left out</h2>", table(("Section", "Why"), left_out))
+        yield Section(anchor="left-out", short="Left out", parts=parts)
+
+
+class _LeftOut(list[tuple[str, str]]):
+    """Sections that the run has no data for, with the reason."""
+
+    def has(self, title: str, record: Content) -> bool:
+        """Whether there is data for a section; noted where not."""
+        if "missing" in record:
+            self.append((title, record["missing"]))
+        return "missing" not in record
 
 
 def _outcome(content: Content) -> Section:
@@ -155,31 +158,19 @@ def _model_head(model: Content, mark: str) -> Section:
     )
 
 
-def _of_model(model: Content, name: str, mark: str, left_out: list[tuple[str, str]], out: Path) -> Iterator[Section]:
+def _of_model(model: Content, name: str, mark: str, left_out: _LeftOut, out: Path) -> Iterator[Section]:
     scene, signals = model["scene"], model["signals"]
-    if "missing" in scene:
-        left_out.append((f"{name}Model in 3-D", scene["missing"]))
-    else:
+    if left_out.has(f"{name}Model in 3-D", scene):
         yield _scene(scene, name, mark)
-    if "missing" in signals:
-        left_out.append((f"{name}Camera against IMU", signals["missing"]))
-    else:
+    if left_out.has(f"{name}Camera against IMU", signals):
         yield _rotation(signals, name, mark)
-        for key, title, build in (
-            ("acceleration", "Acceleration", _acceleration),
-            ("acceleration_spectrum", "Spectra", _spectra),
-        ):
-            if "missing" in signals[key]:
-                left_out.append((f"{name}{title}", signals[key]["missing"]))
-            else:
-                yield build(signals, name, mark)
-    if "missing" in model["drift"]:
-        left_out.append((f"{name}Scale along the recording", model["drift"]["missing"]))
-    else:
+        if left_out.has(f"{name}Acceleration", signals["acceleration"]):
+            yield _acceleration(signals, name, mark)
+        if left_out.has(f"{name}Spectra", signals["acceleration_spectrum"]):
+            yield _spectra(signals, name, mark)
+    if left_out.has(f"{name}Scale along the recording", model["drift"]):
         yield _drift(model, name, mark)
-    if "missing" in model["validation"]:
-        left_out.append((f"{name}Target", model["validation"]["missing"]))
-    else:
+    if left_out.has(f"{name}Target", model["validation"]):
         yield _target(model["validation"], name, mark, out)
 
 
@@ -201,22 +192,22 @@ def _scene(scene: Content, name: str, mark: str) -> Section:
 
 def _rotation(signals: Content, name: str, mark: str) -> Section:
     rotation = signals["rotation"]
-    parts: list[str | Plot] = [f"<h2>{escape(name)}Turning: camera against gyroscope</h2>"]
+    parts: list[str | Plot] = [f"<h2>{escape(name)}Rotation: camera against gyroscope</h2>"]
     after, before = figures.rotation_after(rotation), figures.rotation_before(rotation)
     if after is not None:
         left, size = (math.degrees(rotation["after"][key]) for key in ("rms_difference_rad_s", "rms_rate_rad_s"))
         parts.append(
-            "<p>How fast the camera turned, by the pictures and by the gyroscope. Brought onto one clock and into the "
+            "<p>How fast the camera rotated, by the images and by the gyroscope. Brought onto one clock and into the "
             f"camera's axes, the curves should lie on each other: they differ by {digits(left, 2)} °/s where the "
-            f"camera turns with {digits(size, 2)} °/s (rms).</p>"
+            f"camera rotates at {digits(size, 2)} °/s (rms).</p>"
         )
         parts += ["<h3>After alignment</h3>", Plot(figure=after, label="Rates of rotation after alignment")]
     else:
         parts.append(
-            "<p>How fast the camera turned, by the pictures and by the gyroscope. "
+            "<p>How fast the camera rotated, by the images and by the gyroscope. "
             f"{'They' if signals.get('alignment') == 'not tried' else 'They could not be brought together. They'} "
             "should have the same ups and downs at some shift in time; if they have not, this IMU recording does not "
-            "belong to these pictures, or one of them is not what it says.</p>"
+            "belong to these images, or one of them is not what it says.</p>"
         )
     if before is not None:
         clocks = (
@@ -228,17 +219,17 @@ def _rotation(signals: Content, name: str, mark: str) -> Section:
             f'<h3>As recorded</h3><p class="soft">{clocks}</p>',
             Plot(figure=before, label="Rates of rotation as recorded"),
         ]
-    return Section(anchor=f"rotation{mark}", short="" if name else "Turning", parts=parts)
+    return Section(anchor=f"rotation{mark}", short="" if name else "Rotation", parts=parts)
 
 
 def _acceleration(signals: Content, name: str, mark: str) -> Section:
     acceleration = signals["acceleration"]
     correlation = acceleration["correlation"]
-    alike = "" if correlation is None else f" Their correlation is {correlation:.3f} (1 would be perfect)."
+    correlated = "" if correlation is None else f" Their correlation is {correlation:.3f} (1 would be perfect)."
     if acceleration["camera_unit"] == "m/s2":
         said = (
             "This is what the scale rests on: the metric camera path, differentiated twice, must show the acceleration "
-            "that the accelerometer felt (gravity and bias taken out)."
+            "that the accelerometer measured (gravity and bias taken out)."
         )
     else:
         said = (
@@ -252,7 +243,7 @@ def _acceleration(signals: Content, name: str, mark: str) -> Section:
         anchor=f"acceleration{mark}",
         short="" if name else "Acceleration",
         parts=(
-            f"<h2>{escape(name)}Acceleration: camera against accelerometer</h2><p>{said}{alike} "
+            f"<h2>{escape(name)}Acceleration: camera against accelerometer</h2><p>{said}{correlated} "
             f'<span class="soft">{averaged}</span></p>',
             figure,
         ),
@@ -274,10 +265,10 @@ def _spectra(signals: Content, name: str, mark: str) -> Section:
         "<h3>Acceleration</h3>",
         Plot(figure=figure, label="Spectra of acceleration"),
     ]
-    turning = signals["rotation_spectrum"]
-    if "missing" not in turning:
-        figure = figures.spectra(turning, unit="(°/s)", factor=math.degrees(1))
-        parts += ["<h3>Turning</h3>", Plot(figure=figure, label="Spectra of rotation")]
+    rotation = signals["rotation_spectrum"]
+    if "missing" not in rotation:
+        figure = figures.spectra(rotation, unit="(°/s)", factor=math.degrees(1))
+        parts += ["<h3>Rotation</h3>", Plot(figure=figure, label="Spectra of rotation")]
     return Section(anchor=f"spectra{mark}", short="" if name else "Spectra", parts=parts)
 
 
@@ -317,7 +308,7 @@ def _target(found: Content, name: str, mark: str, out: Path) -> Section:
             ("tolerance", f"{found['tolerance_pct']:g} %, {'kept' if found['within_tolerance'] else 'exceeded'}")
         )
     listed += [
-        ("pictures", f"{found['views_used']} used of {found['views_searched']} searched"),
+        ("images", f"{found['views_used']} used of {found['views_searched']} searched"),
         ("corners", f"{found['corners_used']} used, {found['corners_rejected']} rejected"),
         ("residual, rms", f"{found['rms_px']:.2f} px"),
     ]
@@ -326,11 +317,11 @@ def _target(found: Content, name: str, mark: str, out: Path) -> Section:
         figure = Plot(figure=figures.target_distances(found), label="Measured minus known distances")
         parts += ["<h3>Known distances</h3>", figure]
     if found["views"]:
-        figure = Plot(figure=figures.target_views(found), label="Residuals of the target in each picture")
-        parts += ["<h3>Corners in the pictures</h3>", figure]
+        figure = Plot(figure=figures.target_views(found), label="Residuals of the target in each image")
+        parts += ["<h3>Corners in the images</h3>", figure]
     if found["reasons"]:
         parts += ["<h3>What limits this</h3>", listing(found["reasons"])]
-    shown = pictures(out, found["pictures"])
+    shown = images(out, found["pictures"])
     if shown:
         parts += [
             '<p class="soft">Circles: corners as seen. Lines: towards where the fitted target projects, 30 times '
@@ -352,7 +343,7 @@ def _blur(content: Content, out: Path) -> Section:
     if "missing" not in content["crops"]:
         parts.append("<h3>Before and after</h3>")
         for pair in content["crops"]["pairs"]:
-            both = pictures(out, [pair["before"], pair["after"]], classes="pair", captions=("as filmed", "deblurred"))
+            both = images(out, [pair["before"], pair["after"]], classes="pair", captions=("as filmed", "deblurred"))
             caption = f"{pair['name']}, {digits(pair['blur_px'], 3)} px of blur"
             parts.append(f'{both}<p class="soft small">{escape(caption)}</p>')
     return Section(anchor="blur", short="Blur", parts=parts)
@@ -362,8 +353,8 @@ def _shutter(content: Content, out: Path) -> Section:
     found = content["rolling_shutter"]
     worst = found["worst"]
     parts: list[str | Plot] = [
-        f"<h2>Rolling shutter</h2><p>{sentence(found['note']) if found['note'] else ''} As the camera turns within the "
-        f"{digits(1000 * found['readout_s'], 3)} ms from the first line to the last, things lean; this is by how much "
+        f"<h2>Rolling shutter</h2><p>{sentence(found['note']) if found['note'] else ''} As the camera rotates within "
+        f"the {digits(1000 * found['readout_s'], 3)} ms from the first line to the last, things lean; this is how far "
         "keypoints were moved to where a global shutter would have seen them.</p>",
         Plot(figure=figures.shutter_over_time(found), label="Movement of keypoints in each frame"),
         f"<h3>The frame that needed it most: {escape(worst['name'])}</h3>",
@@ -414,6 +405,3 @@ def _run(content: Content) -> Section:
             f"<h3>Configuration</h3><details><summary>config.toml</summary><pre>{escape(toml)}</pre></details>"
         )
     return Section(anchor="run", short="The run", parts=parts)
-
-
-__all__ = ["Plot", "Section", "sections_of"]

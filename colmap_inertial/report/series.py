@@ -56,6 +56,3 @@ def strided(count: int, most: int) -> NDArray[np.intp]:
     if count <= most:
         return np.arange(count)
     return np.unique(np.linspace(0, count - 1, most).round().astype(np.intp))
-
-
-__all__ = ["MOST_POINTS", "rounded", "strided", "thinned"]

@@ -11,13 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.align import on_camera_rate
-from colmap_inertial.geometry import quat_conjugate, quat_log, quat_multiply, quat_rotate, rotation_between, so3_log
-from colmap_inertial.gyro import GyroPath
+from colmap_inertial.geometry import quat_conjugate, quat_rotate, rotation_between, so3_log
+from colmap_inertial.gyro import GyroPath, on_camera_rate
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.report.series import rounded, thinned
 from colmap_inertial.scale import check_units
-from colmap_inertial.smooth import Felt, smooth_attitude
+from colmap_inertial.smooth import WorldAcceleration, smooth_attitude
 from colmap_inertial.threads import one_blas_thread
 from colmap_inertial.types import (
     Array,
@@ -30,8 +29,8 @@ from colmap_inertial.types import (
 
 #: Positions are differentiated over this long: a millimetre of noise becomes 0.06 m/s2.
 _REACH_S = 0.2
-#: A longer pause between frames is a gap in the lines, as is a turn in one that may be one the other way round.
-_PAUSE_S, _HALF_TURN_RAD = 5.0, 2.5
+#: A longer pause between frames is a gap in the lines, as is a rotation in one that may be one the other way round.
+_PAUSE_S, _MOST_ROTATION_RAD = 5.0, 2.5
 #: Parts that spectra are averaged over; samples less even than this have none (share within a fifth of the usual step).
 _PART_S, _EVEN = 8.0, 0.9
 #: Points of a spectrum.
@@ -77,19 +76,12 @@ def signal_record(
         "first_frame_s": start_s,
         "alignment": "found" if calibration is not None else "failed",
     }
-    seen = _Rates.of(trajectory)
+    rates = _Rates.of(trajectory)
     aligned = None
     if calibration is not None:
-        if estimate.clock_rate != 0:
-            imu = on_camera_rate(
-                imu,
-                calibration,
-                clock_rate=estimate.clock_rate,
-                middle_s=estimate.clock_middle_s,
-                trajectory_epoch_ns=trajectory.epoch_ns,
-            )
+        imu = on_camera_rate(imu, calibration, camera_epoch_ns=trajectory.epoch_ns)
         aligned = GyroCamera.of(imu, calibration, camera_epoch_ns=trajectory.epoch_ns)
-    record["rotation"] = _rotation(trajectory, imu, seen, aligned, start_s)
+    record["rotation"] = _rotation(trajectory, imu, rates, aligned, start_s)
     no_accel = "The recording has no accelerometer."
     if aligned is None or calibration is None:
         why = "Camera and IMU could not be brought together, so their {} cannot be compared."
@@ -102,7 +94,7 @@ def signal_record(
         why = why.format("accelerations") if imu.has_accel else no_accel
         record["acceleration"] = record["acceleration_spectrum"] = {"missing": why}
         return record
-    record["rotation_spectrum"] = _rotation_spectrum(seen, aligned)
+    record["rotation_spectrum"] = _rotation_spectrum(rates, aligned)
     if not imu.has_accel:
         record["acceleration"] = record["acceleration_spectrum"] = {"missing": no_accel}
         return record
@@ -122,13 +114,12 @@ class _Rates:
 
     @classmethod
     def of(cls, trajectory: CameraTrajectory) -> _Rates:
-        t_s, pose = trajectory.t_s, trajectory.cam_from_world_xyzw
-        turn = quat_log(quat_multiply(pose[:-1], quat_conjugate(pose[1:])))
-        rate = turn / np.diff(t_s)[:, None]
-        rate[(np.diff(t_s) > _PAUSE_S) | (np.linalg.norm(turn, axis=1) > _HALF_TURN_RAD)] = np.nan
+        t_s, rotation = trajectory.t_s, trajectory.turn_rad()
+        rate = rotation / np.diff(t_s)[:, None]
+        rate[(np.diff(t_s) > _PAUSE_S) | (np.linalg.norm(rotation, axis=1) > _MOST_ROTATION_RAD)] = np.nan
         return cls(t_s[:-1], t_s[1:], rate)
 
-    def felt(self, motion: GyroCamera) -> Array:
+    def by_gyroscope(self, motion: GyroCamera) -> Array:
         """The gyroscope's rotation over the same intervals."""
         first, last = motion.start_from_cam(self.begin_s), motion.start_from_cam(self.end_s)
         rate = so3_log(np.swapaxes(first, 1, 2) @ last) / (self.end_s - self.begin_s)[:, None]
@@ -137,41 +128,45 @@ class _Rates:
 
 
 def _rotation(
-    trajectory: CameraTrajectory, imu: ImuRecording, seen: _Rates, aligned: GyroCamera | None, start_s: float
+    trajectory: CameraTrajectory, imu: ImuRecording, rates: _Rates, aligned: GyroCamera | None, start_s: float
 ) -> Record:
     shift_s = clock_shift_s(trajectory, imu)
     gyro_s = imu.gyro_t_s + shift_s
     overlap = gyro_s[0] < trajectory.t_s[-1] and gyro_s[-1] > trajectory.t_s[0]
     # clocks that have nothing in common are drawn from the first sample of each
     gyro_s = gyro_s - start_s if overlap else imu.gyro_t_s - imu.gyro_t_s[0]
-    raw_s, raw = _averaged(gyro_s, imu.gyro_rad_s, max(seen.step_s, 0.02))
-    times = seen.middle_s - start_s
-    before_s = times if overlap else seen.middle_s - trajectory.t_s[0]
+    raw_s, raw = _averaged(gyro_s, imu.gyro_rad_s, max(rates.step_s, 0.02))
+    times = rates.middle_s - start_s
+    before_s = times if overlap else rates.middle_s - trajectory.t_s[0]
     near = (raw_s >= before_s[0] - 2) & (raw_s <= before_s[-1] + 2)
     record: Record = {
         "same_clock_origin": bool(overlap),
         "before": {
-            "camera": [thinned(before_s, column) for column in seen.rate_rad_s.T],
+            "camera": [thinned(before_s, column) for column in rates.rate_rad_s.T],
             "gyroscope": [thinned(raw_s[near], column[near]) for column in raw.T] if near.sum() > 1 else [],
         },
         "after": None,
     }
     if aligned is None:
-        record["before"]["camera_size"] = thinned(before_s, np.linalg.norm(seen.rate_rad_s, axis=1))
+        record["before"]["camera_size"] = thinned(before_s, np.linalg.norm(rates.rate_rad_s, axis=1))
         record["before"]["gyroscope_size"] = thinned(raw_s[near], np.linalg.norm(raw[near], axis=1))
         return record
-    felt = seen.felt(aligned)
-    both = np.isfinite(felt).all(axis=1)
+    by_gyro = rates.by_gyroscope(aligned)
+    both = np.isfinite(by_gyro).all(axis=1)
     if not both.any():
         return record
-    left = (seen.rate_rad_s - felt)[both]
+    left = (rates.rate_rad_s - by_gyro)[both]
     record["after"] = {
-        "camera": [thinned(times, column) for column in seen.rate_rad_s.T],
-        "gyroscope": [thinned(times, column) for column in felt.T],
-        "rms_difference_rad_s": float(np.sqrt(np.mean(np.sum(left**2, axis=1)))),
-        "rms_rate_rad_s": float(np.sqrt(np.mean(np.sum(felt[both] ** 2, axis=1)))),
+        "camera": [thinned(times, column) for column in rates.rate_rad_s.T],
+        "gyroscope": [thinned(times, column) for column in by_gyro.T],
+        "rms_difference_rad_s": _rms(left),
+        "rms_rate_rad_s": _rms(by_gyro[both]),
     }
     return record
+
+
+def _rms(vectors: Array) -> float:
+    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
 
 
 def _averaged(t_s: Array, values: Array, width_s: float) -> tuple[Array, Array]:
@@ -182,13 +177,13 @@ def _averaged(t_s: Array, values: Array, width_s: float) -> tuple[Array, Array]:
     return t_s[0] + (found + 0.5) * width_s, sums / count[:, None]
 
 
-def _rotation_spectrum(seen: _Rates, aligned: GyroCamera) -> Record:
+def _rotation_spectrum(rates: _Rates, aligned: GyroCamera) -> Record:
     path: GyroPath = aligned.path
-    begin_s, end_s = seen.begin_s[0] - aligned.offset_s, seen.end_s[-1] - aligned.offset_s
+    begin_s, end_s = rates.begin_s[0] - aligned.offset_s, rates.end_s[-1] - aligned.offset_s
     during = (path.t_s >= begin_s) & (path.t_s <= end_s)
     return _spectra(
-        camera=(seen.middle_s, seen.rate_rad_s),
-        imu_at_frames=(seen.middle_s, seen.felt(aligned)),
+        camera=(rates.middle_s, rates.rate_rad_s),
+        imu_at_frames=(rates.middle_s, rates.by_gyroscope(aligned)),
         imu=(path.t_s[during], path.rate_rad_s[during]),
     )
 
@@ -196,10 +191,12 @@ def _rotation_spectrum(seen: _Rates, aligned: GyroCamera) -> Record:
 class _Accelerations:
     """Accelerations of the IMU's place by camera (K, 3) and accelerometer (K, 3), gravity-aligned, at ``t_s``."""
 
-    def __init__(self, trajectory: CameraTrajectory, path: Array, felt: Felt, metric: bool, step_s: float) -> None:
-        self._t_s, self._path, self._felt = trajectory.t_s, path, felt
-        self._sums = felt.sums(trajectory.t_s)[:, 0]
-        self._covered = np.concatenate([[0], np.cumsum(~felt.covers(trajectory.t_s))])
+    def __init__(
+        self, trajectory: CameraTrajectory, path: Array, inertial: WorldAcceleration, metric: bool, step_s: float
+    ) -> None:
+        self._t_s, self._path, self._inertial = trajectory.t_s, path, inertial
+        self._sums = inertial.sums(trajectory.t_s)[:, 0]
+        self._covered = np.concatenate([[0], np.cumsum(~inertial.covers(trajectory.t_s))])
         self._metric, self._step_s = metric, step_s
 
     @classmethod
@@ -213,19 +210,21 @@ class _Accelerations:
     ) -> _Accelerations:
         attitude = smooth_attitude(trajectory, imu, calibration)
         bias = np.zeros(3) if estimate.accel_bias_m_s2 is None else estimate.accel_bias_m_s2
-        felt = Felt.of(trajectory, imu, calibration, attitude, bias_m_s2=bias, gravity_in_world_m_s2=np.zeros(3))
-        during = (felt.t_s >= trajectory.t_s[0]) & (felt.t_s <= trajectory.t_s[-1])
-        weight = felt.accel_m_s2[during].mean(axis=0) if during.any() else felt.accel_m_s2.mean(axis=0)
+        inertial = WorldAcceleration.of(
+            trajectory, imu, calibration, attitude, bias_m_s2=bias, gravity_in_world_m_s2=np.zeros(3)
+        )
+        during = (inertial.t_s >= trajectory.t_s[0]) & (inertial.t_s <= trajectory.t_s[-1])
+        weight = inertial.accel_m_s2[during].mean(axis=0) if during.any() else inertial.accel_m_s2.mean(axis=0)
         down = -weight if gravity is None else gravity
         up = rotation_between(-down, np.array([0.0, 0.0, 1.0]))
-        felt = Felt.integrated(felt.t_s, quat_rotate(up, felt.accel_m_s2 + down))
+        inertial = WorldAcceleration.integrated(inertial.t_s, quat_rotate(up, inertial.accel_m_s2 + down))
         path = trajectory.cam_in_world
         metric = trajectory.length_unit == "m"
         if metric:
             lever = quat_rotate(quat_conjugate(calibration.cam_from_imu_xyzw), calibration.imu_in_cam_m)
             path = path + quat_rotate(attitude.world_from_imu_xyzw, lever)
         step_s = float(np.median(np.diff(trajectory.t_s)))
-        return cls(trajectory, quat_rotate(up, path - path.mean(axis=0)), felt, metric, step_s)
+        return cls(trajectory, quat_rotate(up, path - path.mean(axis=0)), inertial, metric, step_s)
 
     def over(self, reach: int) -> tuple[Array, Array, Array]:
         """Times, and accelerations by second differences over so many frames to both sides."""
@@ -234,44 +233,44 @@ class _Accelerations:
             return np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3))
         before, after = t_s[reach:-reach] - t_s[: -2 * reach], t_s[2 * reach :] - t_s[reach:-reach]
 
-        def bend(p: Array) -> Array:
+        def second_difference(p: Array) -> Array:
             slopes = (p[2 * reach :] - p[reach:-reach]) / after[:, None] - (p[reach:-reach] - p[: -2 * reach]) / (
                 before[:, None]
             )
             return 2 * slopes / (before + after)[:, None]
 
         gaps = self._covered[2 * reach :] != self._covered[: -2 * reach]
-        torn = gaps | (np.maximum(before, after) > max(_PAUSE_S, 3 * reach * self._step_s))
-        seen, felt = bend(self._path), bend(self._sums)
-        seen[torn] = felt[torn] = np.nan
-        return t_s[reach:-reach], seen, felt
+        broken = gaps | (np.maximum(before, after) > max(_PAUSE_S, 3 * reach * self._step_s))
+        by_camera, by_imu = second_difference(self._path), second_difference(self._sums)
+        by_camera[broken] = by_imu[broken] = np.nan
+        return t_s[reach:-reach], by_camera, by_imu
 
     def record(self, start_s: float) -> Record:
         reach = max(1, round(_REACH_S / self._step_s))
-        t_s, seen, felt = self.over(reach)
-        both = np.isfinite(seen).all(axis=1)
+        t_s, by_camera, by_imu = self.over(reach)
+        both = np.isfinite(by_camera).all(axis=1)
         if both.sum() < 3:
             return {"missing": "The accelerometer ran along with too few frames for a comparison."}
         times = t_s - start_s
-        x, y = (a[both] - a[both].mean(axis=0) for a in (seen, felt))
+        x, y = (a[both] - a[both].mean(axis=0) for a in (by_camera, by_imu))
         power = float(np.sqrt(np.sum(x**2) * np.sum(y**2)))
         return {
-            "camera": [thinned(times, column) for column in seen.T],
-            "accelerometer": [thinned(times, column) for column in felt.T],
+            "camera": [thinned(times, column) for column in by_camera.T],
+            "accelerometer": [thinned(times, column) for column in by_imu.T],
             "camera_unit": "m/s2" if self._metric else "units/s2",
             "averaged_over_s": 2 * reach * self._step_s,
             "correlation": float(np.sum(x * y)) / power if power > 0 else None,
-            "rms_camera": float(np.sqrt(np.mean(np.sum(x**2, axis=1)))),
-            "rms_accelerometer_m_s2": float(np.sqrt(np.mean(np.sum(y**2, axis=1)))),
+            "rms_camera": _rms(x),
+            "rms_accelerometer_m_s2": _rms(y),
         }
 
     def spectrum(self) -> Record:
-        t_s, seen, felt = self.over(1)
-        during = (self._felt.t_s >= self._t_s[0]) & (self._felt.t_s <= self._t_s[-1])
+        t_s, by_camera, by_imu = self.over(1)
+        during = (self._inertial.t_s >= self._t_s[0]) & (self._inertial.t_s <= self._t_s[-1])
         spectra = _spectra(
-            camera=(t_s, seen),
-            imu_at_frames=(t_s, felt),
-            imu=(self._felt.t_s[during], self._felt.accel_m_s2[during]),
+            camera=(t_s, by_camera),
+            imu_at_frames=(t_s, by_imu),
+            imu=(self._inertial.t_s[during], self._inertial.accel_m_s2[during]),
         )
         return {**spectra, "camera_unit": "m/s2" if self._metric else "units/s2"}
 
@@ -330,6 +329,3 @@ def _welch(values: Array, step_s: float, count: int) -> tuple[Array, Array]:
     spectra = np.fft.rfft((parts - parts.mean(axis=2, keepdims=True)) * window, axis=2)
     power = 2 * step_s / np.sum(window**2) * np.mean(np.abs(spectra) ** 2, axis=1)
     return np.asarray(np.fft.rfftfreq(count, step_s), dtype=np.float64), power
-
-
-__all__ = ["signal_record"]

@@ -12,7 +12,7 @@ _LITTLE_M_S2, _USUAL = 0.3, "0.5 to 2 m/s²"
 
 _MOVE = (
     "Film again, and move the camera itself: swing it by 20 cm or more, to and fro and up and down, about once a "
-    "second, all through the recording, for 10 s or longer. Turning on the spot, a tripod, or gliding at constant "
+    "second, all through the recording, for 10 s or longer. Rotating on the spot, a tripod, or gliding at constant "
     "speed tells nothing."
 )
 _RAW = (
@@ -85,7 +85,7 @@ def outcome_of_model(model: dict[str, Any]) -> dict[str, Any]:
     if checked and checked.get("scale_error_pct") is not None:
         word = "within" if checked["within_tolerance"] else "outside"
         summary.append(
-            f"Measured against the target in the pictures, lengths are {signed(checked['scale_error_pct'])} % off, "
+            f"Measured against the target in the images, lengths are {signed(checked['scale_error_pct'])} % off, "
             f"{word} the tolerance of {checked['tolerance_pct']:g} %."
         )
     return {"verdict": verdict, "headline": headline, "summary": summary, "todo": todo}
@@ -96,21 +96,21 @@ def _refused(model: dict[str, Any]) -> dict[str, Any]:
     todo = [_MOVE, _RAW, _TARGET]
     signals = model.get("signals", {})
     # by the accelerometer: what the camera shows has no unit without a scale
-    felt = signals.get("acceleration", {}).get("rms_accelerometer_m_s2")
+    accel_m_s2 = signals.get("acceleration", {}).get("rms_accelerometer_m_s2")
     if signals.get("alignment") == "not tried":
         summary.append("The IMU recording cannot be used as it is, for the reasons below.")
         todo = [_RAW, _TARGET]
     elif signals.get("alignment") == "failed":
         summary.append(
             "Camera and IMU could not be brought together: check the reasons and the two curves of rotation below, "
-            "which should look alike."
+            "which should look the same."
         )
         todo = [_RAW, _MOVE, _TARGET]
-    elif felt is not None and felt < _LITTLE_M_S2:
+    elif accel_m_s2 is not None and accel_m_s2 < _LITTLE_M_S2:
         summary.append(
-            f"The device hardly sped up or slowed down: its accelerometer felt {digits(felt, 2)} m/s² beside gravity, "
-            f"where filming by hand usually has {_USUAL}. It feels no speed, so there was nothing to compare with the "
-            "pictures."
+            f"The device hardly sped up or slowed down: its accelerometer measured {digits(accel_m_s2, 2)} m/s² beside "
+            f"gravity, where filming by hand usually has {_USUAL}. It measures no speed, so there was nothing to "
+            "compare with the images."
         )
         todo = [_MOVE, _TARGET]
     summary.append(
@@ -127,6 +127,3 @@ def outcome_of_stop(reason: str, *, findings: bool) -> dict[str, Any]:
         "summary": [reason[:1].upper() + reason[1:]],
         "todo": ["What was found in the recording is listed below, each with what to do about it."] if findings else [],
     }
-
-
-__all__ = ["digits", "half_width_pct", "length_error", "outcome_of_model", "outcome_of_stop", "signed"]

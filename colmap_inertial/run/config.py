@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from colmap_inertial.errors import FormatError
+from colmap_inertial.io.files import StrPath
 
 Options = TypeVar("Options")
 
@@ -36,7 +37,7 @@ def _plain(options: Any) -> dict[str, Any]:
     return plain
 
 
-def read_config(path: Path, cls: type[Options]) -> Options:
+def read_config(path: StrPath, cls: type[Options]) -> Options:
     """Options of type ``cls`` from a TOML file; what it does not name keeps its default.
 
     Raises
@@ -44,6 +45,7 @@ def read_config(path: Path, cls: type[Options]) -> Options:
     FormatError
         For a file that is no TOML, an unknown key (the nearest known one is named), or a value of the wrong type.
     """
+    path = Path(path)
     return _build(path, cls, read_values(path), "")
 
 
@@ -53,7 +55,7 @@ def read_values(path: Path) -> dict[str, Any]:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise FormatError(path, f"cannot be read: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # also no UTF-8, and a NUL in the path
         raise FormatError(path, f"is not valid TOML: {error}") from error
 
 
@@ -123,6 +125,8 @@ def _checked(path: Path, name: str, value: Any, hint: Any) -> Any:
             if value in typing.get_args(kind):
                 return value
         elif kind is Path and isinstance(value, str):
+            if "\0" in value:
+                raise FormatError(path, f"{name}: holds a NUL character")
             return Path(value)
         elif typing.get_origin(kind) is tuple:
             if isinstance(value, list) and all(isinstance(item, str) for item in value):

@@ -34,7 +34,8 @@ def canonical(value: object) -> object:
     """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = {f.name: canonical(getattr(value, f.name)) for f in dataclasses.fields(value) if f.compare}
-        return {"type": f"{type(value).__module__}.{type(value).__qualname__}", **fields}
+        kind = type(value)
+        return {"type": f"{kind.__module__}.{kind.__qualname__}", "methods": _methods(kind), **fields}
     if isinstance(value, Mapping):
         return {str(k): canonical(v) for k, v in value.items()}
     if isinstance(value, enum.Enum):
@@ -65,53 +66,97 @@ def canonical(value: object) -> object:
 
 def _code(code: types.CodeType) -> list[object]:
     """A function's body, without names of files and numbers of lines."""
-    constants = [_code(c) if isinstance(c, types.CodeType) else repr(c) for c in code.co_consts]
+    constants = [_code(c) if isinstance(c, types.CodeType) else _constant(c) for c in code.co_consts]
     return [code.co_code.hex(), list(code.co_names), constants]
+
+
+def _constant(value: object) -> object:
+    """A constant of a function, the same in every process: the order of a set is not."""
+    if isinstance(value, tuple | frozenset):
+        parts = [_constant(part) for part in value]
+        return parts if isinstance(value, tuple) else sorted(parts, key=repr)
+    return repr(value)
+
+
+def _methods(kind: type) -> dict[str, object]:
+    """The code of a visitor's class; our own is known by our version."""
+    if kind.__module__.split(".")[0] == __package__.split(".")[0]:
+        return {}
+    own = {name: value for name, value in vars(kind).items() if name == "__call__" or not name.startswith("__")}
+    return {name: canonical(value) for name, value in own.items() if isinstance(value, types.FunctionType)}
 
 
 def fingerprint(path: Path) -> list[object]:
     """What identifies an input without reading it whole: names, sizes and modification times."""
     files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
-    stats = [(file, file.stat()) for file in files]
+    try:
+        stats = [(file, file.stat()) for file in files]
+    except FileNotFoundError as error:
+        raise FormatError(error.filename, "no such file") from None
     return [[str(file.resolve()), stat.st_size, stat.st_mtime_ns] for file, stat in stats]
 
 
-class StageRunner:
-    """Runs stages in order and skips those whose inputs and options are those of an earlier, finished run.
+class StepRunner:
+    """Runs steps in order and skips those whose inputs and options are those of an earlier, finished run.
 
-    A stage's key hashes its options, its inputs and the key of the stage before it, so that a change anywhere reruns
-    everything downstream. A folder's existence proves nothing: only a stamp with the right key does.
+    A step's key hashes its options, its inputs and the keys of the steps that it takes the output of, so that a change
+    anywhere makes again what depends on it, and nothing else. A folder's existence proves nothing: only a stamp with
+    the right key does.
+
+    Attributes
+    ----------
+    seconds
+        By step, also of those that an earlier run did.
+    worked
+        The steps that this run did, in order.
     """
 
     def __init__(self, workspace: Workspace) -> None:
         self._workspace = workspace
-        self._upstream = ""
+        self._keys: dict[str, str] = {}
         self.seconds: dict[str, float] = {}
+        self.worked: list[str] = []
+
+    def of(self, *steps: str) -> list[str]:
+        """Those of the steps that belong to this run."""
+        return [step for step in steps if step in self._keys]
 
     def run(
-        self, name: str, depends: Mapping[str, object], outputs: Sequence[Path], work: Callable[[list[Path]], None]
+        self,
+        name: str,
+        depends: Mapping[str, object],
+        outputs: Sequence[Path],
+        work: Callable[[list[Path]], None],
+        *,
+        after: Sequence[str] = (),
     ) -> None:
         """Run ``work`` unless its stamp holds.
 
         Parameters
         ----------
         name
-            The stage.
+            The step.
         depends
-            Everything that decides its output beside the stages before it.
+            Everything that decides its output beside the steps before it.
         outputs
             What it writes. ``work`` gets temporary paths in their places, which are renamed when it returns.
         work
-            Writes every temporary path; parent folders exist, the paths themselves do not.
+            Writes every temporary path; parent folders exist, the paths themselves do not. It may run a step of its
+            own, whose time is not counted twice.
+        after
+            Steps whose output it takes.
         """
-        text = json.dumps([name, __version__, self._upstream, canonical(depends)], sort_keys=True)
-        self._upstream = hashlib.sha256(text.encode()).hexdigest()
+        upstream = [self._keys[step] for step in after]
+        text = json.dumps([name, __version__, upstream, canonical(depends)], sort_keys=True)
+        key = self._keys[name] = hashlib.sha256(text.encode()).hexdigest()
         stamp = self._workspace.stamps / f"{name}.json"
         done = _read_stamp(stamp)
-        if done is not None and done["key"] == self._upstream and all(path.exists() for path in outputs):
-            self.seconds[name] = done["seconds"]
+        if done is not None and done["key"] == key and all(path.exists() for path in outputs):
+            self.seconds |= {**done.get("inner", {}), name: done["seconds"]}
             log.info("%s: finished in an earlier run, kept", name)
             return
+        self._workspace.unfinish()
+        self.worked.append(name)
         stamp.unlink(missing_ok=True)
         for path in outputs:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -119,7 +164,7 @@ class StageRunner:
         for path in (*outputs, *partial):
             remove(path)
         log.info("%s: started", name)
-        start = time.perf_counter()
+        start, begun = time.perf_counter(), len(self.worked)
         try:
             work(partial)
         except (InertialError, OSError):
@@ -128,8 +173,9 @@ class StageRunner:
             raise
         for source, target in zip(partial, outputs, strict=True):
             os.replace(source, target)
-        self.seconds[name] = time.perf_counter() - start
-        write_json(stamp, {"key": self._upstream, "seconds": self.seconds[name]})
+        inner = {step: self.seconds[step] for step in self.worked[begun:]}
+        self.seconds[name] = time.perf_counter() - start - sum(inner.values())
+        write_json(stamp, {"key": key, "seconds": self.seconds[name], "inner": inner})
         log.info("%s: finished in %.1f s", name, self.seconds[name])
 
 

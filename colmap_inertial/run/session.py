@@ -1,15 +1,112 @@
-"""A run from its lock to its log."""
+"""A run from its lock to its log: what every driver does around its own steps."""
 
 from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
+from colmap_inertial import __version__
 from colmap_inertial.errors import InertialError
+from colmap_inertial.io.files import as_plain, read_json, write_json, write_text
+from colmap_inertial.run.config import config_as_toml
+from colmap_inertial.run.context import RunContext
+from colmap_inertial.run.progress import Progress
+from colmap_inertial.run.runner import StepRunner
+from colmap_inertial.run.workspace import Workspace
 
 log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Session:
+    """A run at work in its folder, which is its own until the end.
+
+    Attributes
+    ----------
+    workspace
+        The folder.
+    runner
+        Does the steps, or keeps them from an earlier run.
+    context
+        How the work is done.
+    """
+
+    workspace: Workspace
+    runner: StepRunner
+    context: RunContext
+
+    @property
+    def progress(self) -> Progress:
+        """Who hears how far it is."""
+        return self.context.progress
+
+    def stands(self, content: Mapping[str, object]) -> bool:
+        """Whether an earlier run's ``result.json`` says this already, and nothing had to be made again."""
+        if self.runner.worked or not self.workspace.result.is_file():
+            return False
+        known = read_json(self.workspace.result)
+        return {**known, "seconds": {}} == as_plain({**content, "seconds": {}})
+
+    def finish(self, content: Mapping[str, object]) -> bool:
+        """Write ``result.json``, whose presence says that the run is finished; returns whether it stood already."""
+        unchanged = self.stands(content)
+        if not unchanged:
+            write_json(self.workspace.result, content)
+        log.info("nothing to do" if unchanged else "finished")
+        return unchanged
+
+
+@contextlib.contextmanager
+def open_session(
+    out: Path,
+    source: Path,
+    options: object,
+    *,
+    command: str = "reconstruct",
+    deterministic: bool = False,
+    seed: int = 0,
+    progress: Progress,
+) -> Iterator[Session]:
+    """A session in ``out``: locked, its options written down, its log kept.
+
+    Parameters
+    ----------
+    out
+        A folder that does not exist, or holds a run on the same source, which is then gone on with.
+    source
+        The capture or project.
+    options
+        All that decides the result; a dataclass.
+    command
+        What is done; one folder is for one command.
+    deterministic
+        Whether one thread does it all.
+    seed, progress
+        As of :class:`RunContext`.
+
+    Raises
+    ------
+    OutputExistsError
+        When ``out`` holds something else, or another run is at work in it.
+    OutputError
+        Where it cannot be written, as on a full disk.
+    """
+    workspace = Workspace(out)
+    workspace.open(source, command)
+    with workspace.locked(), logging_to(workspace.log):
+        log.info("colmap-inertial %s: %s -> %s", __version__, source, out)
+        config = config_as_toml(options)
+        if not workspace.config.is_file() or workspace.config.read_text(encoding="utf-8") != config:
+            workspace.unfinish()
+            write_text(workspace.config, config)
+        runner = StepRunner(workspace)
+        threads = 1 if deterministic else -1
+        context = RunContext(scratch=workspace.stamps, num_threads=threads, seed=seed, progress=progress)
+        session = Session(workspace=workspace, runner=runner, context=context)
+        yield session
 
 
 @contextlib.contextmanager

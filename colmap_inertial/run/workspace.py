@@ -1,10 +1,9 @@
-"""The output folder: where everything lies, what is finished, and how a stage's output appears whole or not at all."""
+"""The output folder: where everything lies, what is finished, and how a step's output appears whole or not at all."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import logging
 import shutil
 from collections.abc import Iterator
@@ -12,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from colmap_inertial.errors import FormatError, OutputError, OutputExistsError
-from colmap_inertial.io.files import read_json, write_json
+from colmap_inertial.io.files import locked, read_json, write_json
 from colmap_inertial.report.content import CROPS_FOLDER, DATA_FOLDER
 
 log = logging.getLogger(__name__)
@@ -53,6 +52,11 @@ class Workspace:
     def features(self) -> Path:
         """COLMAP's database before matching; removed at the end of a run."""
         return self.root / "features.db"
+
+    @property
+    def keypoints(self) -> Path:
+        """What the keypoint stages did."""
+        return self.root / "keypoints.json"
 
     @property
     def database(self) -> Path:
@@ -126,40 +130,55 @@ class Workspace:
 
     @property
     def stamps(self) -> Path:
-        """One JSON for each finished stage."""
+        """One JSON for each finished step."""
         return self.root / ".stages"
+
+    @property
+    def stage_names(self) -> Path:
+        """Which stages it is made with, where a batch named them."""
+        return self.stamps / "stage_names.toml"
+
+    @property
+    def lock(self) -> Path:
+        """Held by the run that is at work in the folder."""
+        return self.stamps / "lock"
 
     def trajectory(self, index: int, *, first: bool) -> Path:
         """The smoothed metric trajectory of a model; the first one has the plain name."""
         return self.root / ("trajectory.tum" if first else f"trajectory_{index}.tum")
 
-    def open(self, capture: Path) -> None:
-        """Create the folder, or take up a run of the same capture that is unfinished or waits for depth maps.
+    def open(self, source: Path, command: str = "reconstruct") -> None:
+        """Create the folder, or take up a run of the same command on the same capture or project, finished or not.
 
         Raises
         ------
         OutputExistsError
-            When the folder holds a finished result, another capture's run, or something that is not ours.
+            When the folder holds another run, or something that is not ours.
         """
         owner = self.stamps / "capture.json"
-        if self.result.exists() and not (owner.is_file() and read_json(self.result).get("waiting")):
-            raise OutputExistsError(f"{self.root} holds a finished result; choose another folder or remove it")
         if self.root.exists() and not self.root.is_dir():
             raise OutputExistsError(f"{self.root} is a file; choose another output folder")
-        identity = {"capture": str(capture.resolve())}
+        identity = {"capture": str(source.resolve()), "command": command}
         if owner.is_file():
-            if read_json(owner) != identity:
-                raise OutputExistsError(
-                    f"{self.root} holds an unfinished run of another capture ({read_json(owner).get('capture')}); "
-                    "choose another folder or remove it"
-                )
+            known = {"command": command, **read_json(owner)}
+            for what in ("capture", "command"):
+                if known.get(what) != identity[what]:
+                    raise OutputExistsError(
+                        f"{self.root} holds a run of another {what} ({known.get(what)}); choose another folder or "
+                        "remove it"
+                    )
         elif self.root.is_dir() and any(p.name != self.stamps.name for p in self.root.iterdir()):
             raise OutputExistsError(f"{self.root} is not empty; choose another output folder")
         try:
             self.stamps.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise OutputError(f"{self.root} cannot be made: {error.strerror or error}") from error
-        write_json(owner, identity)
+        if not owner.is_file():
+            write_json(owner, identity)
+
+    def unfinish(self) -> None:
+        """Something is made again: what the result says no longer stands."""
+        self.result.unlink(missing_ok=True)
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
@@ -172,13 +191,8 @@ class Workspace:
         OutputError
             Where the disk is full.
         """
-        with full_disk_is_an_error(self.root), open(self.stamps / "lock", "w") as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise OutputExistsError(
-                    f"another run is at work in {self.root}; wait for it or choose another folder"
-                ) from None
+        busy = f"another run is at work in {self.root}; wait for it or choose another folder"
+        with full_disk_is_an_error(self.root), locked(self.lock, busy):
             yield
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from colmap_inertial.align import AlignOptions, align_clocks
 from colmap_inertial.errors import NotObservableError
+from colmap_inertial.gyro import on_camera_rate
 from colmap_inertial.io.plausible import GRAVITY_BOUNDS_M_S2, LARGEST_MEDIAN_RATE_RAD_S
 from colmap_inertial.io.units import STANDARD_GRAVITY_M_S2
 from colmap_inertial.options import ScaleOptions
@@ -16,10 +17,6 @@ from colmap_inertial.scale._remarks import remarks
 from colmap_inertial.scale.verdict import verdict_of
 from colmap_inertial.threads import one_blas_thread
 from colmap_inertial.types import CameraImuCalibration, CameraTrajectory, ImuRecording, ScaleEstimate
-
-#: A clock rate is corrected beforehand where it is this many standard deviations from zero and faster than what the
-#: estimators allow for.
-_SIGNIFICANT, _FAST_CLOCK = 5.0, 3e-4
 
 
 def gravity_at_latitude_m_s2(latitude_deg: float) -> float:
@@ -100,36 +97,29 @@ def _estimate_or_refuse(
     trajectory: CameraTrajectory, imu: ImuRecording, calibration: CameraImuCalibration | None, options: ScaleOptions
 ) -> ScaleEstimate:
     if not imu.has_accel:
-        return _refused(
+        return ScaleEstimate.refused(
             options.method,
             "the recording has no accelerometer, without which metres are unknown; record it too",
         )
     problems = check_units(imu)
     if problems:
-        return _refused(options.method, *problems)
+        return ScaleEstimate.refused(options.method, *problems)
     try:
         alignment = align_clocks(
             trajectory, imu, prior=calibration, options=AlignOptions(max_offset_s=options.max_offset_s)
         )
-        aligned = alignment.calibration
-        rate = alignment.clock_rate
-        said: tuple[str, ...] = ()
-        if abs(rate) > max(_SIGNIFICANT * alignment.clock_rate_sigma, _FAST_CLOCK):
-            stretched = alignment.on_camera_rate(imu, trajectory_epoch_ns=trajectory.epoch_ns)
-            said, imu = stretched.repairs[len(imu.repairs) :], stretched
-        else:
-            rate = 0.0
-        estimate = _estimate(trajectory, imu, aligned, options)
+        aligned = alignment.settled()
+        in_step = on_camera_rate(imu, aligned, camera_epoch_ns=trajectory.epoch_ns)
+        said = in_step.repairs[len(imu.repairs) :]
+        estimate = _estimate(trajectory, in_step, aligned, options)
         return replace(
             estimate,
             # also where there is no scale: it says what was found of camera and IMU
             calibration=aligned if estimate.calibration is None else estimate.calibration,
-            reasons=(*estimate.reasons, *said, *remarks(trajectory, imu, aligned)),
-            clock_rate=rate,
-            clock_middle_s=alignment.middle_s,
+            reasons=(*estimate.reasons, *said, *remarks(trajectory, in_step, aligned)),
         )
     except NotObservableError as error:
-        return _refused(options.method, f"{error.quantity}: {error.hint}")
+        return ScaleEstimate.refused(options.method, f"{error.quantity}: {error.hint}")
 
 
 def _estimate(
@@ -142,12 +132,6 @@ def _estimate(
     from colmap_inertial.scale.joint import JointOptions, estimate_joint
 
     return estimate_joint(trajectory, imu, calibration, JointOptions(gravity_m_s2=options.gravity_m_s2))
-
-
-def _refused(method: str, *reasons: str) -> ScaleEstimate:
-    return ScaleEstimate(
-        metres_per_unit=None, sigma_log=None, ci95=None, verdict="refused", method=method, reasons=reasons
-    )
 
 
 __all__ = [

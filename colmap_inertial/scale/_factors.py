@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from colmap_inertial.geometry import skew, so3_exp, so3_log
 from colmap_inertial.scale import _parameters as par
 from colmap_inertial.scale._parameters import Data, Estimate, Noise, Prior
-from colmap_inertial.scale._preintegration import Preintegrated, preintegrate
+from colmap_inertial.scale._preintegration import Preintegrated, SensorErrors, preintegrate
 from colmap_inertial.scale._solver import ArrowSystem
 from colmap_inertial.types import Array
 
@@ -127,16 +127,15 @@ def _mv(matrices: Array, vectors: Array) -> Array:
 
 def integrate(data: Data, x: Estimate) -> Preintegrated:
     """Preintegration between the nodes at the biases, gains and delays of ``x``."""
-    return preintegrate(
-        data.t_s - x.delay_s - x.clock_rate * (data.t_s - par.middle_s(data.t_s)),
-        data.gyro,
-        data.accel,
+    errors = SensorErrors(
         gyro_bias_rad_s=x.gyro_bias_rad_s[:-1],
         accel_bias_m_s2=x.accel_bias_m_s2 + x.accel_walk_m_s2[:-1],
         gyro_gain=x.gyro_gain,
         accel_gain=x.accel_gain,
         accel_delay_s=x.accel_delay_s,
     )
+    nodes_s = data.t_s - x.delay_s - x.clock_rate * (data.t_s - par.middle_s(data.t_s))
+    return preintegrate(nodes_s, data.tracks, errors)
 
 
 def still_near(then: Estimate, x: Estimate, t_s: Array, tolerance: float = 1.0) -> bool:
@@ -251,16 +250,16 @@ def visual_groups(data: Data, noise: Noise, x: Estimate, rate_rad_s: Array, *, r
     lever_body = x.cam_from_imu.T @ x.imu_in_cam_m
     smear = rate @ centre_by_rate.T + velocity @ centre_by_velocity.T
     half_spread_s2 = 0.5 * data.groups.spread_s2[:, None]
-    thrown = data.groups.thrown_m - half_spread_s2 * (x.accel_bias_m_s2 + x.accel_walk_m_s2)
-    thrown = thrown - _mv(data.groups.turned - np.eye(3), np.broadcast_to(lever_body, (k, 3)))
+    displacement = data.groups.displacement_m - half_spread_s2 * (x.accel_bias_m_s2 + x.accel_walk_m_s2)
+    displacement = displacement - _mv(data.groups.rotation_since - np.eye(3), np.broadcast_to(lever_body, (k, 3)))
     predicted = x.imu_in_world_m + _mv(camera, smear - x.imu_in_cam_m)
-    predicted = predicted + half_spread_s2 * x.gravity_m_s2 + _mv(x.world_from_imu, thrown)
+    predicted = predicted + half_spread_s2 * x.gravity_m_s2 + _mv(x.world_from_imu, displacement)
     camera_velocity = x.velocity_m_s - _mv(x.world_from_imu, np.cross(rate_rad_s, lever_body))
     centre = data.groups.centre * x.metres_per_unit - predicted - x.drift_m
     centre_here = np.zeros((k, 3, par.N_STATE))
     centre_here[:, :, par.POSITION] = -np.eye(3)
     centre_here[:, :, par.DRIFT] = -np.eye(3)
-    centre_here[:, :, par.THETA] = x.world_from_imu @ skew(thrown - lever_body)
+    centre_here[:, :, par.THETA] = x.world_from_imu @ skew(displacement - lever_body)
     centre_here[:, :, par.ACCEL_WALK] = half_spread_s2[:, :, None] * x.world_from_imu
     centre_here[:, :, par.VELOCITY] = -camera @ centre_by_velocity @ cam_from_world
     centre_z = np.zeros((k, 3, par.N_GLOBALS))
@@ -269,7 +268,7 @@ def visual_groups(data: Data, noise: Noise, x: Estimate, rate_rad_s: Array, *, r
     centre_z[:, :, par.ROTATION] = camera @ skew(x.imu_in_cam_m)
     centre_z[:, :, par.GRAVITY] = -half_spread_s2[:, :, None] * np.eye(3)
     centre_z[:, :, par.ACCEL_BIAS] = half_spread_s2[:, :, None] * x.world_from_imu
-    centre_z[:, :, par.LEVER] = x.world_from_imu @ data.groups.turned @ x.cam_from_imu.T
+    centre_z[:, :, par.LEVER] = x.world_from_imu @ data.groups.rotation_since @ x.cam_from_imu.T
     centre_z[:, :, par.DELAY] = camera_velocity
     centre_z[:, :, par.CLOCK_RATE] = camera_velocity * since_middle
 
@@ -297,7 +296,7 @@ def visual_groups(data: Data, noise: Noise, x: Estimate, rate_rad_s: Array, *, r
             rotation,
             rotation_here,
             rotation_z,
-            data.rotation_shape / (noise.rotation_rad * noise.rotation_alike),
+            data.rotation_shape / (noise.rotation_rad * noise.rotation_excess),
             par.VISUAL_GLOBALS,
         ),
         (centre, centre_here, centre_z, data.centre_shape / noise.centre_m, slice(0, par.N_GLOBALS)),

@@ -6,9 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from colmap_inertial.scale import _factors as fac
-from colmap_inertial.scale import _noise as levels
-from colmap_inertial.scale import _parameters as par
+from colmap_inertial.scale import _factors as fac, _noise as levels, _parameters as par
 from colmap_inertial.scale._drift import scale_drift
 from colmap_inertial.scale._parameters import Data, Estimate, Noise, Prior
 from colmap_inertial.scale.priors import PRIORS
@@ -99,8 +97,8 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
         sigma = float(np.sqrt(cov[par.SCALE, par.SCALE]))
         converged = step < 0.2 * sigma
         if iteration > 2:
-            alike = levels.alike(groups["rotation"], states, z)
-            noise, asked = levels.updated_noise(noise, start, floor, sums, alike, asked)
+            factor = levels.correlation_factor(groups["rotation"], states, z)
+            noise, asked = levels.updated_noise(noise, start, floor, sums, factor, asked)
         change = max(map(abs, asked.values()), default=1.0)
         settled = step < 0.03 * sigma and change < _SETTLED
         if settled and fac.still_near(there, x, data.t_s):

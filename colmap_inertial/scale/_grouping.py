@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.geometry import matrix_from_quat, quat_exp, quat_multiply, so3_exp, so3_log
-from colmap_inertial.scale._preintegration import Track
+from colmap_inertial.scale._preintegration import Tracks
 from colmap_inertial.types import Array
 
 #: Longest step of the integration from a group's mean instant to a frame.
@@ -41,9 +41,9 @@ class Groups:
         (K, 3) means of the centres.
     spread_s2
         (K,) mean squares of the frames' times about ``t_s``.
-    turned
+    rotation_since
         (K, 3, 3) means of the body's rotation since ``t_s``.
-    thrown_m
+    displacement_m
         (K, 3) means of what the readings of the accelerometer add to the position since ``t_s``, body frame at ``t_s``.
     rate_rad_s
         (K, 3) mean readings of the gyroscope, body frame.
@@ -55,8 +55,8 @@ class Groups:
     world_from_cam: Array
     centre: Array
     spread_s2: Array
-    turned: Array
-    thrown_m: Array
+    rotation_since: Array
+    displacement_m: Array
     rate_rad_s: Array
 
 
@@ -111,8 +111,7 @@ def group_frames(
     centre: Array,
     *,
     rate_hz: float,
-    gyro: Track,
-    accel: Track,
+    tracks: Tracks,
     gyro_bias_rad_s: Array,
     cam_from_imu: Array,
 ) -> Groups:
@@ -120,14 +119,14 @@ def group_frames(
 
     Parameters
     ----------
-    gyro, accel
+    tracks
         Readings over camera time; the frames lie inside.
     gyro_bias_rad_s
         (3,) subtracted from the readings.
     cam_from_imu
         (3, 3) from the alignment: its error matters little over the small rotations within a group.
     """
-    first = first_of_groups(t_s, rate_hz, gyro.gap_s(t_s[:-1], t_s[1:]) + accel.gap_s(t_s[:-1], t_s[1:]))
+    first = first_of_groups(t_s, rate_hz, tracks.gap_s(t_s))
     count = np.diff(first, append=len(t_s))
     group = np.repeat(np.arange(len(first)), count)
 
@@ -139,18 +138,20 @@ def group_frames(
     since_s = t_s - mean_s[group]
     steps = max(1, int(np.ceil(np.abs(since_s).max() / _STEP_S)))
     step_s = since_s / steps
-    turned = np.zeros((len(t_s), 4))
-    turned[:, 3] = 1.0
+    rotated = np.zeros((len(t_s), 4))
+    rotated[:, 3] = 1.0
+    # The midpoint rule, of order two in the step: on three recordings at 100 Hz its errors are at most 6e-5 rad and
+    # 4e-6 m against steps of 0.1 ms, a small part of what pictures err by.
     # Two integrations at once: each step's force, at its middle, acts on the position for the rest of the time
-    thrown = np.zeros((len(t_s), 3))
+    displacement = np.zeros((len(t_s), 3))
     for i in range(steps):
         middle_s = mean_s[group] + (i + 0.5) * step_s
-        half = quat_exp((gyro.at(middle_s)[0] - gyro_bias_rad_s) * (0.5 * step_s)[:, None])
-        turned = quat_multiply(turned, half)
-        force = (matrix_from_quat(turned) @ accel.at(middle_s)[0][:, :, None])[:, :, 0]
-        thrown += force * (step_s * (steps - i - 0.5) * step_s)[:, None]
-        turned = quat_multiply(turned, half)
-    turns = matrix_from_quat(turned)
+        half = quat_exp((tracks.gyro.at(middle_s)[0] - gyro_bias_rad_s) * (0.5 * step_s)[:, None])
+        rotated = quat_multiply(rotated, half)
+        force = (matrix_from_quat(rotated) @ tracks.accel.at(middle_s)[0][:, :, None])[:, :, 0]
+        displacement += force * (step_s * (steps - i - 0.5) * step_s)[:, None]
+        rotated = quat_multiply(rotated, half)
+    turns = matrix_from_quat(rotated)
     moved = world_from_cam @ (cam_from_imu @ turns.transpose(0, 2, 1) @ cam_from_imu.T)
     reference = moved[first][group]
     away = mean(so3_log(reference.transpose(0, 2, 1) @ moved))
@@ -161,7 +162,7 @@ def group_frames(
         world_from_cam=moved[first] @ so3_exp(away),
         centre=mean(centre),
         spread_s2=mean(since_s**2),
-        turned=mean(turns),
-        thrown_m=mean(thrown),
-        rate_rad_s=mean(gyro.at(t_s)[0]),
+        rotation_since=mean(turns),
+        displacement_m=mean(displacement),
+        rate_rad_s=mean(tracks.gyro.at(t_s)[0]),
     )

@@ -9,17 +9,15 @@ import numpy as np
 
 from colmap_inertial.scale._factors import Direct, Group
 from colmap_inertial.scale._parameters import Noise
-from colmap_inertial.types import Array, ImuNoise
+from colmap_inertial.types import JOINT_GYRO_NOISE, TYPICAL_NOISE, Array, ImuNoise
 
-#: Gyroscope: three times the data sheets of consumer MEMS (MPU-6500 1.7e-4, BMI160 1.2e-4, LSM6DS3 1.2e-4
-#: rad/s/sqrt(Hz)), accelerometer ten times, as sensors in use show (vibration, g-sensitivity, bandwidth, jitter).
 #: Visual errors: video of about a megapixel of a scene a few metres away. The gyroscope's levels and the
 #: accelerometer's walk are kept; the rest are starting values.
 TYPICAL = Noise(
-    gyro_rad_s_rthz=4.5e-4,
-    gyro_walk_rad_s_rts=1e-4,
-    accel_m_s2_rthz=5e-3,
-    accel_walk_m_s2_rts=3e-4,
+    gyro_rad_s_rthz=JOINT_GYRO_NOISE[0],
+    gyro_walk_rad_s_rts=JOINT_GYRO_NOISE[1],
+    accel_m_s2_rthz=TYPICAL_NOISE.accel_density_m_s2_rthz,
+    accel_walk_m_s2_rts=TYPICAL_NOISE.accel_walk_m_s3_rthz,
     rotation_rad=2e-3,
     centre_m=2e-3,
     drift_m_rts=1e-3,
@@ -35,7 +33,7 @@ _COMPONENTS = {
     "drift_m_rts": ("drift", slice(0, 3)),
 }
 #: Largest correlation between errors of neighbouring rotations that is believed.
-_MOST_ALIKE = 0.8
+_LARGEST_CORRELATION = 0.8
 #: How many residuals the starting value counts as.
 _WEIGHT = 10.0
 #: Largest change of a level in an iteration (logarithm), and largest factor by which changes are taken to shrink.
@@ -78,18 +76,18 @@ def sums_of_squares(
         count = len(group.residual) if group.weight is None else float(group.weight.sum())
         rows_each = rows.stop - rows.start
         if level == "rotation_rad":
-            squares *= noise.rotation_alike**2
+            squares *= noise.rotation_excess**2
         used = float(np.sum(signs[name][:, rows] * change[:, :, 1:])) / signs[name].shape[2]
         out[level] = squares, max(rows_each * count - used, 0.02 * rows_each * count)
     return out
 
 
-def alike(group: Group | Direct, states: Array, z: Array) -> float:
-    """``Noise.rotation_alike`` from the correlation of consecutive residuals after a step."""
+def correlation_factor(group: Group | Direct, states: Array, z: Array) -> float:
+    """``Noise.rotation_excess`` from the correlation of consecutive residuals after a step."""
     residual = group.residual + group.apply(states, z)[:, :, 0]
     squares = float(np.sum(residual**2))
     correlation = float(np.sum(residual[1:] * residual[:-1])) / squares if squares > 0 else 0.0
-    correlation = float(np.clip(correlation, 0.0, _MOST_ALIKE))
+    correlation = float(np.clip(correlation, 0.0, _LARGEST_CORRELATION))
     return float(np.sqrt((1 + correlation) / (1 - correlation)))
 
 
@@ -98,7 +96,7 @@ def updated_noise(
     start: Noise,
     floor: Mapping[str, float],
     sums: Mapping[str, tuple[float, float]],
-    rotation_alike: float,
+    rotation_excess: float,
     before: Mapping[str, float],
 ) -> tuple[Noise, dict[str, float]]:
     """New levels, and the logarithmic change of each that the residuals ask for.
@@ -121,4 +119,4 @@ def updated_noise(
         )
         new[level] = max(now * float(np.exp(step)), floor[level])
         asked[level] = float(np.log(new[level] / now)) if new[level] == floor[level] else change
-    return replace(noise, **new, rotation_alike=rotation_alike), asked
+    return replace(noise, **new, rotation_excess=rotation_excess), asked

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.geometry import so3_exp, so3_log
 from colmap_inertial.scale._grouping import Groups
-from colmap_inertial.scale._preintegration import Track
+from colmap_inertial.scale._preintegration import Tracks
 from colmap_inertial.types import Array
 
 # Columns of the globals: the scale, those that the IMU factors see, those that the visual factors see.
@@ -34,6 +35,20 @@ N_GLOBALS = 79
 THETA, POSITION, VELOCITY, GYRO_BIAS, ACCEL_WALK, DRIFT = (slice(3 * i, 3 * i + 3) for i in range(6))
 N_STATE = 18
 
+#: Where steps of the fields of :class:`Estimate` stand that change by addition: the states' and the globals.
+_ADDED_STATES = dict(velocity_m_s=VELOCITY, gyro_bias_rad_s=GYRO_BIAS, accel_walk_m_s2=ACCEL_WALK, drift_m=DRIFT)
+_ADDED_GLOBALS = dict(
+    accel_bias_m_s2=ACCEL_BIAS,
+    accel_delay_s=slice(ACCEL_DELAY, ACCEL_DELAY + 1),
+    gyro_gain=GYRO_GAIN,
+    accel_gain=ACCEL_GAIN,
+    imu_in_cam_m=LEVER,
+    delay_s=slice(DELAY, DELAY + 1),
+    clock_rate=slice(CLOCK_RATE, CLOCK_RATE + 1),
+    shutter=SHUTTER,
+    coupling_m=COUPLING,
+)
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Data:
@@ -51,7 +66,7 @@ class Data:
         rotation, as far as the covariances of the poses tell.
     broken
         (K - 1,) where the model's parts may be shifted against each other.
-    gyro, accel
+    tracks
         Readings over camera time, by the first guess of the offsets.
     """
 
@@ -60,8 +75,7 @@ class Data:
     centre_shape: Array
     coupling: Array
     broken: NDArray[np.bool_]
-    gyro: Track
-    accel: Track
+    tracks: Tracks
 
     @property
     def t_s(self) -> Array:
@@ -73,8 +87,8 @@ class Data:
 class Noise:
     """Standard deviations: densities of the sensors, walks per root of a second, visual errors per state.
 
-    ``rotation_alike`` is the factor by which errors of visual rotations weigh more than white ones of their size, since
-    those of neighbouring states are alike: ``sqrt((1 + c) / (1 - c))`` for a correlation ``c``.
+    ``rotation_excess`` is the factor by which errors of visual rotations weigh more than white ones of their size,
+    since those of neighbouring states are correlated: ``sqrt((1 + c) / (1 - c))`` for a correlation ``c``.
     """
 
     gyro_rad_s_rthz: float
@@ -84,7 +98,7 @@ class Noise:
     rotation_rad: float
     centre_m: float
     drift_m_rts: float
-    rotation_alike: float = 1.0
+    rotation_excess: float = 1.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -121,22 +135,15 @@ class Estimate:
             metres_per_unit=self.metres_per_unit * float(np.exp(-z[SCALE])),
             world_from_imu=self.world_from_imu @ so3_exp(states[:, THETA] - rate_rad_s * later),
             imu_in_world_m=self.imu_in_world_m + states[:, POSITION] - self.velocity_m_s * later,
-            velocity_m_s=self.velocity_m_s + states[:, VELOCITY],
-            gyro_bias_rad_s=self.gyro_bias_rad_s + states[:, GYRO_BIAS],
-            accel_walk_m_s2=self.accel_walk_m_s2 + states[:, ACCEL_WALK],
-            drift_m=self.drift_m + states[:, DRIFT],
             gravity_m_s2=self.gravity_m_s2 + z[GRAVITY],
-            accel_bias_m_s2=self.accel_bias_m_s2 + z[ACCEL_BIAS],
-            accel_delay_s=self.accel_delay_s + float(z[ACCEL_DELAY]),
-            gyro_gain=self.gyro_gain + z[GYRO_GAIN].reshape(3, 3),
-            accel_gain=self.accel_gain + z[ACCEL_GAIN].reshape(3, 3),
             cam_from_imu=so3_exp(z[ROTATION]) @ self.cam_from_imu,
-            imu_in_cam_m=self.imu_in_cam_m + z[LEVER],
-            delay_s=self.delay_s + float(z[DELAY]),
-            clock_rate=self.clock_rate + float(z[CLOCK_RATE]),
-            shutter=self.shutter + z[SHUTTER].reshape(4, 3, 3),
-            coupling_m=self.coupling_m + z[COUPLING].reshape(3, 3),
+            **{name: getattr(self, name) + states[:, columns] for name, columns in _ADDED_STATES.items()},
+            **{name: self._added(name, z[columns]) for name, columns in _ADDED_GLOBALS.items()},
         )
+
+    def _added(self, name: str, change: Array) -> Any:
+        before = getattr(self, name)
+        return before + change.reshape(np.shape(before))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -167,16 +174,9 @@ class Prior:
     def offset(self, x: Estimate) -> Array:
         """(79,) globals minus their expected values."""
         z, mean = np.zeros(N_GLOBALS), self.mean
-        z[ACCEL_BIAS] = x.accel_bias_m_s2 - mean.accel_bias_m_s2
-        z[ACCEL_DELAY] = x.accel_delay_s - mean.accel_delay_s
-        z[GYRO_GAIN] = (x.gyro_gain - mean.gyro_gain).ravel()
-        z[ACCEL_GAIN] = (x.accel_gain - mean.accel_gain).ravel()
         z[ROTATION] = so3_log(x.cam_from_imu @ mean.cam_from_imu.T)
-        z[LEVER] = x.imu_in_cam_m - mean.imu_in_cam_m
-        z[DELAY] = x.delay_s - mean.delay_s
-        z[CLOCK_RATE] = x.clock_rate - mean.clock_rate
-        z[SHUTTER] = (x.shutter - mean.shutter).ravel()
-        z[COUPLING] = (x.coupling_m - mean.coupling_m).ravel()
+        for name, columns in _ADDED_GLOBALS.items():
+            z[columns] = np.ravel(getattr(x, name) - getattr(mean, name))
         return z
 
 

@@ -21,13 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial._kernels import _inertial
-from colmap_inertial.geometry import matrix_from_quat, quat_conjugate, quat_cumulative, quat_exp, quat_multiply, skew
+from colmap_inertial.sampling import is_gap
 from colmap_inertial.types import Array
 
 #: Integration steps: as the samples come, within these. Steps of 5 instead of 2.5 ms change the scale by 0.003 %.
 _SHORTEST_STEP_S, _LONGEST_STEP_S = 0.0025, 0.005
-#: A longer pause between samples is a gap: what happened in it is unknown.
-LONGEST_PAUSE_S = 0.06
+#: A longer pause between samples is a gap. It is bridged and its price is in the covariance, so that shorter ones
+#: count here than where an interval with a gap is lost.
+_GAP_S = 0.06
 #: How far rate and acceleration may then be from the interpolation: a lively hand.
 _GAP_RATE_RAD_S, _GAP_ACCEL_M_S2 = 2.0, 10.0
 #: Half the span of the finite difference by the accelerometer's delay: vibration makes shorter ones meaningless.
@@ -47,7 +48,7 @@ class Track:
     paused_s: Array  # by each sample, the sum of the pauses before it
 
     def gap_s(self, begin_s: Array, end_s: Array) -> Array:
-        """How much of each interval from ``begin_s`` to ``end_s`` lies in pauses longer than ``LONGEST_PAUSE_S``."""
+        """How much of each interval from ``begin_s`` to ``end_s`` lies in gaps."""
         ends = np.interp(end_s, self.t_s, self.paused_s) - np.interp(begin_s, self.t_s, self.paused_s)
         return np.asarray(ends)
 
@@ -55,8 +56,7 @@ class Track:
     def of(cls, t_s: Array, value: Array) -> Track:
         """A track through samples ``value`` (N, 3) at times ``t_s`` (N,)."""
         slope = np.gradient(value, t_s, axis=0) if len(t_s) > 2 else np.repeat(np.diff(value, axis=0), 2, axis=0)
-        step = np.diff(t_s)
-        paused_s = np.concatenate([[0.0], np.cumsum(np.where(step > LONGEST_PAUSE_S, step, 0.0))])
+        paused_s = np.concatenate([[0.0], np.cumsum(np.where(is_gap(t_s, _GAP_S), np.diff(t_s), 0.0))])
         return cls(t_s=t_s, value=value, slope=slope, paused_s=paused_s)
 
     def at(self, query_s: Array) -> tuple[Array, Array]:
@@ -69,6 +69,40 @@ class Track:
         rise = y1 - y0
         c2, c3 = 3 * rise - 2 * m0 - m1, m0 + m1 - 2 * rise
         return y0 + x * (m0 + x * (c2 + x * c3)), (m0 + x * (2 * c2 + 3 * x * c3)) / step
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Tracks:
+    """Readings of gyroscope (rad/s) and accelerometer (m/s2) over one clock."""
+
+    gyro: Track
+    accel: Track
+
+    def gap_s(self, t_s: Array, accel_delay_s: float = 0.0) -> Array:
+        """(K,) seconds of gaps of the two sensors between K + 1 times; the delay is added to the accelerometer's."""
+        accel_s = t_s - accel_delay_s
+        return self.gyro.gap_s(t_s[:-1], t_s[1:]) + self.accel.gap_s(accel_s[:-1], accel_s[1:])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SensorErrors:
+    """What is wrong with the readings of K intervals.
+
+    Attributes
+    ----------
+    gyro_bias_rad_s, accel_bias_m_s2
+        (K, 3), one for each interval.
+    gyro_gain, accel_gain
+        (3, 3) gain errors E: ``rate = (I + E) reading - bias``.
+    accel_delay_s
+        Added to the accelerometer's times.
+    """
+
+    gyro_bias_rad_s: Array
+    accel_bias_m_s2: Array
+    gyro_gain: Array
+    accel_gain: Array
+    accel_delay_s: float = 0.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -112,36 +146,11 @@ class Preintegrated:
     rate_rad_s: Array
 
 
-def preintegrate(
-    nodes_s: Array,
-    gyro: Track,
-    accel: Track,
-    *,
-    gyro_bias_rad_s: Array,
-    accel_bias_m_s2: Array,
-    gyro_gain: Array,
-    accel_gain: Array,
-    accel_delay_s: float = 0.0,
-) -> Preintegrated:
-    """Integrate both sensors between consecutive nodes.
-
-    Parameters
-    ----------
-    nodes_s
-        (K + 1,) increasing times on the clock of the tracks.
-    gyro, accel
-        Readings, rad/s and m/s2.
-    gyro_bias_rad_s
-        (K, 3), one for each interval.
-    accel_bias_m_s2
-        (K, 3).
-    gyro_gain, accel_gain
-        (3, 3) gain errors E: ``rate = (I + E) reading - bias``.
-    accel_delay_s
-        Added to the accelerometer's times.
-    """
+def preintegrate(nodes_s: Array, tracks: Tracks, errors: SensorErrors) -> Preintegrated:
+    """Integrate both sensors between consecutive nodes, at (K + 1,) increasing times on the clock of the tracks."""
     nodes_s = np.ascontiguousarray(nodes_s)
-    k, steps = len(nodes_s) - 1, _steps(nodes_s, gyro, accel)
+    gyro, accel = tracks.gyro, tracks.accel
+    k, steps = len(nodes_s) - 1, integration_steps(nodes_s, tracks)
     shapes = {"rotation": (3, 3), "velocity": (3,), "position": (3,)}
     shapes |= {"cov_gyro": (9, 9), "by_gyro_bias": (9, 3), "by_accel_bias": (9, 3)}
     shapes |= {"by_gyro_gain": (9, 9), "by_accel_gain": (9, 9), "by_accel_delay": (9,)}
@@ -156,11 +165,11 @@ def preintegrate(
         accel_t_s=accel.t_s,
         accel=accel.value,
         accel_slope=accel.slope,
-        gyro_bias=gyro_bias_rad_s,
-        accel_bias=accel_bias_m_s2,
-        gyro_matrix=np.eye(3) + gyro_gain,
-        accel_matrix=np.eye(3) + accel_gain,
-        accel_delay_s=accel_delay_s,
+        gyro_bias=errors.gyro_bias_rad_s,
+        accel_bias=errors.accel_bias_m_s2,
+        gyro_matrix=np.eye(3) + errors.gyro_gain,
+        accel_matrix=np.eye(3) + errors.accel_gain,
+        accel_delay_s=errors.accel_delay_s,
         delay_step_s=DELAY_STEP_S,
         rate=rate_rad_s,
         **results,
@@ -168,21 +177,21 @@ def preintegrate(
     dt_s = np.diff(nodes_s)
     return Preintegrated(
         dt_s=dt_s,
-        cov_accel=_cov_accel(dt_s),
-        cov_gaps=_cov_gaps(nodes_s, gyro, accel, accel_delay_s),
+        cov_accel=accel_noise_cov(dt_s),
+        cov_gaps=gap_cov(nodes_s, tracks.gap_s(nodes_s, errors.accel_delay_s)),
         rate_rad_s=rate_rad_s,
         **results,
     )
 
 
-def _steps(nodes_s: Array, gyro: Track, accel: Track) -> NDArray[np.int64]:
+def integration_steps(nodes_s: Array, tracks: Tracks) -> NDArray[np.int64]:
     """In how many steps each interval is integrated."""
-    spacing = min(float(np.median(np.diff(track.t_s))) for track in (gyro, accel))
+    spacing = min(float(np.median(np.diff(track.t_s))) for track in (tracks.gyro, tracks.accel))
     step_s = float(np.clip(spacing, _SHORTEST_STEP_S, _LONGEST_STEP_S))
     return np.maximum(np.ceil(np.diff(nodes_s) / step_s).astype(np.int64), 2)
 
 
-def _cov_accel(dt: Array) -> Array:
+def accel_noise_cov(dt: Array) -> Array:
     """(K, 9, 9) covariance for white noise of the accelerometer of density one."""
     cov = np.zeros((len(dt), 9, 9))
     for row, col, moment in ((3, 3, dt), (3, 6, dt**2 / 2), (6, 3, dt**2 / 2), (6, 6, dt**3 / 3)):
@@ -190,96 +199,7 @@ def _cov_accel(dt: Array) -> Array:
     return cov
 
 
-def _cov_gaps(nodes_s: Array, gyro: Track, accel: Track, accel_delay_s: float) -> Array:
-    """(K, 9, 9) covariance for what gaps between samples hide."""
-    accel_s = nodes_s - accel_delay_s
-    gap = gyro.gap_s(nodes_s[:-1], nodes_s[1:]) + accel.gap_s(accel_s[:-1], accel_s[1:])
-    hidden = np.stack([_GAP_RATE_RAD_S * gap, _GAP_ACCEL_M_S2 * gap, _GAP_ACCEL_M_S2 * gap * np.diff(nodes_s)], axis=1)
-    return np.asarray(np.repeat(hidden**2, 3, axis=1)[:, :, None] * np.eye(9))
-
-
-def preintegrate_reference(
-    nodes_s: Array,
-    gyro: Track,
-    accel: Track,
-    *,
-    gyro_bias_rad_s: Array,
-    accel_bias_m_s2: Array,
-    gyro_gain: Array,
-    accel_gain: Array,
-    accel_delay_s: float = 0.0,
-) -> Preintegrated:
-    """As :func:`preintegrate`, in numpy."""
-    steps = _steps(nodes_s, gyro, accel)
-    dt = np.diff(nodes_s)
-    points = steps + 1
-    first = np.concatenate([[0], np.cumsum(points)[:-1]])
-    interval = np.repeat(np.arange(len(dt)), points)
-    h = (dt / steps)[interval]
-    since = (np.arange(len(interval)) - first[interval]) * h
-    t = nodes_s[interval] + since
-    is_last = np.zeros(len(t), dtype=bool)
-    is_last[first + steps] = True
-    weight = np.where(is_last, 0.5, 1.0) * h
-    weight[first] *= 0.5
-    h_step = np.where(is_last, 0.0, h)[:-1, None]
-
-    reading, _ = gyro.at(t)
-    rate = reading @ (np.eye(3) + gyro_gain).T - gyro_bias_rad_s[interval]
-    # Second-order Magnus expansion for a rate that changes linearly within the step
-    turn = h_step * (0.5 * (rate[:-1] + rate[1:])) + h_step**2 / 12 * np.cross(rate[:-1], rate[1:])
-    product = quat_cumulative(quat_exp(turn))
-    rotation = matrix_from_quat(quat_multiply(quat_conjugate(product[first])[interval], product))
-
-    reading_a, _ = accel.at(t - accel_delay_s)
-    later, _ = accel.at(t - accel_delay_s + DELAY_STEP_S)
-    earlier, _ = accel.at(t - accel_delay_s - DELAY_STEP_S)
-    slope_a = (later - earlier) / (2 * DELAY_STEP_S)
-    force = np.einsum("nij,nj->ni", rotation, reading_a @ (np.eye(3) + accel_gain).T - accel_bias_m_s2[interval])
-
-    def accumulated(increment: Array) -> Array:
-        total = np.concatenate([np.zeros((1, 3)), np.cumsum(increment, axis=0)])
-        return total - total[first][interval]
-
-    velocity = accumulated(0.5 * h_step * (force[:-1] + force[1:]))
-    position = accumulated(h_step * velocity[:-1] + h_step**2 / 6 * (2 * force[:-1] + force[1:]))
-    left = dt[interval] - since
-    end = first + steps
-    velocity_to_come = velocity[end][interval] - velocity
-    position_to_come = position[end][interval] - position - velocity * left[:, None]
-
-    def total(values: Array) -> Array:
-        return np.add.reduceat(values * weight.reshape(-1, *[1] * (values.ndim - 1)), first, axis=0)
-
-    g = np.empty((len(t), 9, 3))
-    g[:, :3] = np.eye(3)
-    g[:, 3:6] = -skew(velocity_to_come)
-    g[:, 6:] = -skew(position_to_come)
-    g_body = g @ rotation
-    k = len(dt)
-    by_accel_bias = np.zeros((k, 9, 3))
-    by_accel_bias[:, 3:6] = -total(rotation)
-    by_accel_bias[:, 6:] = -total(left[:, None, None] * rotation)
-    by_accel_gain = np.zeros((k, 9, 9))
-    lever = (rotation[:, :, :, None] * reading_a[:, None, None, :]).reshape(-1, 3, 9)
-    by_accel_gain[:, 3:6] = total(lever)
-    by_accel_gain[:, 6:] = total(left[:, None, None] * lever)
-    by_accel_delay = np.zeros((k, 9))
-    change = np.einsum("nij,nj->ni", rotation, slope_a)
-    by_accel_delay[:, 3:6] = -total(change)
-    by_accel_delay[:, 6:] = -total(left[:, None] * change)
-    return Preintegrated(
-        dt_s=dt,
-        rotation=rotation[end],
-        velocity=velocity[end],
-        position=position[end],
-        cov_gyro=total(g @ g.transpose(0, 2, 1)),
-        cov_accel=_cov_accel(dt),
-        cov_gaps=_cov_gaps(nodes_s, gyro, accel, accel_delay_s),
-        by_gyro_bias=-total(g_body),
-        by_accel_bias=by_accel_bias,
-        by_gyro_gain=total((g_body[:, :, :, None] * reading[:, None, None, :]).reshape(-1, 9, 9)),
-        by_accel_gain=by_accel_gain,
-        by_accel_delay=by_accel_delay,
-        rate_rad_s=np.concatenate([rate[first], rate[end[-1:]]]),
-    )
+def gap_cov(nodes_s: Array, gap_s: Array) -> Array:
+    """(K, 9, 9) covariance for what gaps of so many seconds between (K + 1,) nodes hide."""
+    hidden = [_GAP_RATE_RAD_S * gap_s, _GAP_ACCEL_M_S2 * gap_s, _GAP_ACCEL_M_S2 * gap_s * np.diff(nodes_s)]
+    return np.asarray(np.repeat(np.stack(hidden, axis=1) ** 2, 3, axis=1)[:, :, None] * np.eye(9))

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from colmap_inertial.sampling import PAUSE_STEPS, is_gap
 from colmap_inertial.types import Array, CameraImuCalibration, CameraTrajectory, ImuRecording, clock_shift_s
 
-#: A pause is longer than this many sampling intervals, and than this.
-_PAUSE_INTERVALS, _PAUSE_S = 3.5, 0.02
+#: Shorter pauses are not worth a sentence.
+_PAUSE_S = 0.02
 
 
 def remarks(trajectory: CameraTrajectory, imu: ImuRecording, calibration: CameraImuCalibration) -> tuple[str, ...]:
@@ -47,7 +48,7 @@ def _far_apart(trajectory: CameraTrajectory, imu: ImuRecording, calibration: Cam
 def _pauses(sensor: str, t_s: Array, trajectory: CameraTrajectory) -> str:
     step_s = np.diff(t_s)
     inside = (t_s[1:] > trajectory.t_s[0]) & (t_s[:-1] < trajectory.t_s[-1])
-    long_s = step_s[inside & (step_s > max(_PAUSE_INTERVALS * float(np.median(step_s)), _PAUSE_S))]
+    long_s = step_s[inside & is_gap(t_s, _PAUSE_S, steps=PAUSE_STEPS)]
     if len(long_s) == 0:
         return ""
     times = "once" if len(long_s) == 1 else f"{len(long_s)} times"

@@ -9,9 +9,9 @@ from colmap_inertial.geometry import matrix_from_quat
 from colmap_inertial.scale import _parameters as par
 from colmap_inertial.scale._grouping import find_breaks, group_frames
 from colmap_inertial.scale._parameters import Data, Estimate, Prior
-from colmap_inertial.scale._preintegration import Track
+from colmap_inertial.scale._preintegration import Track, Tracks
 from colmap_inertial.scale.priors import PRIORS
-from colmap_inertial.types import Array, CameraImuCalibration, CameraTrajectory, ImuRecording, clock_shift_s
+from colmap_inertial.types import CAL, Array, CameraImuCalibration, CameraTrajectory, ImuRecording, clock_shift_s
 
 #: Standard deviation of rows' times about the middle row, in readouts (uniform over the picture).
 _ROW_SPREAD = 12**-0.5
@@ -44,6 +44,7 @@ def prepare(
     gyro = Track.of(imu.gyro_t_s + (shift_s + calibration.gyro_time_offset_s), imu.gyro_rad_s)
     accel = Track.of(imu.accel_t_s + (shift_s + calibration.accel_time_offset_s), imu.accel_m_s2)
     margin_s = 0.02
+    tracks = Tracks(gyro=gyro, accel=accel)
     begin_s = max(gyro.t_s[0], accel.t_s[0]) + margin_s
     end_s = min(gyro.t_s[-1], accel.t_s[-1]) - margin_s
     inside = np.flatnonzero((trajectory.t_s >= begin_s) & (trajectory.t_s <= end_s))
@@ -59,8 +60,7 @@ def prepare(
             matrix_from_quat(trajectory.cam_from_world_xyzw[inside]).transpose(0, 2, 1),
             centre - centre.mean(axis=0),
             rate_hz=max(min(_MANY_STATES / span_s, states_hz), min(_FEWEST_HZ, states_hz)),
-            gyro=gyro,
-            accel=accel,
+            tracks=tracks,
             gyro_bias_rad_s=calibration.gyro_bias_rad_s,
             cam_from_imu=cam_from_imu,
         )
@@ -82,8 +82,7 @@ def prepare(
         centre_shape=centre_shape,
         coupling=coupling,
         broken=find_breaks(groups.t_s, groups.centre),
-        gyro=gyro,
-        accel=accel,
+        tracks=tracks,
     )
 
     world_from_imu = world_from_cam @ cam_from_imu
@@ -122,16 +121,17 @@ def _information(calibration: CameraImuCalibration) -> Array:
     """(79, 79) prior information of the globals; none for scale and gravity."""
     cov = calibration.cov
     variance = np.diagonal(cov)
-    accel_delay_s = float(np.sqrt(max(variance[3] + variance[4] - 2 * cov[3, 4], 1e-8)))
-    row_spread_s = _ROW_SPREAD * float(np.hypot(calibration.readout_s, np.sqrt(variance[11])))
+    gyro, accel = CAL.GYRO_TIME_OFFSET, CAL.ACCEL_TIME_OFFSET
+    accel_delay_s = float(np.sqrt(max(variance[gyro] + variance[accel] - 2 * cov[gyro, accel], 1e-8)))
+    row_spread_s = _ROW_SPREAD * float(np.hypot(calibration.readout_s, np.sqrt(variance[CAL.READOUT])))
     sigma = np.full(par.N_GLOBALS, np.inf)
     sigma[par.ACCEL_BIAS] = PRIORS.accel_bias_m_s2
     sigma[par.ACCEL_DELAY] = accel_delay_s
     sigma[par.GYRO_GAIN] = PRIORS.gyro_gain
     sigma[par.ACCEL_GAIN] = PRIORS.accel_gain
-    sigma[par.ROTATION] = np.maximum(_COUNTED_ONCE * np.sqrt(variance[0:3]), 1e-6)
-    sigma[par.LEVER] = np.maximum(np.sqrt(variance[8:11]), 1e-6)
-    sigma[par.DELAY] = np.clip(_COUNTED_ONCE * np.sqrt(variance[3]), 1e-6, 0.1)
+    sigma[par.ROTATION] = np.maximum(_COUNTED_ONCE * np.sqrt(variance[CAL.ROTATION]), 1e-6)
+    sigma[par.LEVER] = np.maximum(np.sqrt(variance[CAL.LEVER_ARM]), 1e-6)
+    sigma[par.DELAY] = np.clip(_COUNTED_ONCE * np.sqrt(variance[gyro]), 1e-6, 0.1)
     sigma[par.CLOCK_RATE] = PRIORS.clock_rate
     shutter = row_spread_s * np.array([1.0, 1 / _NEAR_M, _FAR_M, 1.0])
     sigma[par.SHUTTER] = np.maximum(np.repeat(shutter, 9), 1e-9)

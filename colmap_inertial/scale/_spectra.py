@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.geometry import matrix_from_quat, quat_conjugate
-from colmap_inertial.smooth import Felt, PositionSmoother, smooth_attitude
+from colmap_inertial.smooth import PositionSmoother, WorldAcceleration, smooth_attitude
 from colmap_inertial.types import Array, CameraImuCalibration, CameraTrajectory, ImuRecording, clock_shift_s
 
 #: Frames further apart than this sample motion of 1.2 Hz too thinly to differentiate it twice.
@@ -81,7 +81,7 @@ class Signals:
         """Smooth, differentiate, turn into the IMU frame.
 
         The accelerometer is integrated twice along the camera's path and goes through the very smoother that the
-        positions go through, as do the effects of bias and lever arm: what smoothing costs, it costs all alike.
+        positions go through, as do the effects of bias and lever arm: what smoothing costs, it costs all of them.
 
         Raises
         ------
@@ -93,7 +93,7 @@ class Signals:
         world_from_imu = matrix_from_quat(attitude.at(stamps_s)[0])
         force = np.einsum("kij,kj->ki", world_from_imu, imu.accel_m_s2)
         weight = force.mean(axis=0)  # taken out while integrating, for the sake of digits
-        felt = Felt.integrated(stamps_s, force - weight)
+        inertial = WorldAcceleration.integrated(stamps_s, force - weight)
 
         seen = trajectory.select((trajectory.t_s >= stamps_s[0]) & (trajectory.t_s <= stamps_s[-1]))
         if len(seen) < 6:
@@ -106,14 +106,16 @@ class Signals:
         smoother = PositionSmoother.of(seen)
         at_frames = matrix_from_quat(attitude.at(seen.t_s)[0])
         lever = at_frames @ matrix_from_quat(quat_conjugate(calibration.cam_from_imu_xyzw))
-        signals = [felt.sums(seen.t_s)[:, 0], *np.moveaxis(lever, 2, 0)]
-        signals += [Felt.integrated(stamps_s, world_from_imu[:, :, axis]).sums(seen.t_s)[:, 0] for axis in range(3)]
+        signals = [inertial.sums(seen.t_s)[:, 0], *np.moveaxis(lever, 2, 0)]
+        signals += [
+            WorldAcceleration.integrated(stamps_s, world_from_imu[:, :, axis]).sums(seen.t_s)[:, 0] for axis in range(3)
+        ]
         accel = smoother.accelerations_of(np.concatenate(signals, axis=1)).reshape(len(seen), 7, 3)
         gravity = np.broadcast_to(np.eye(3), (len(seen), 3, 3))
         in_world = np.concatenate([smoother.smoothed().accel_in_world[:, None], accel, gravity], axis=1)
         in_world[:, 1] += weight
         edge_s = _EDGE * smoother.time_constant_s
-        stretches = _stretches(seen.t_s, felt.covers(seen.t_s))
+        stretches = _stretches(seen.t_s, inertial.covers(seen.t_s))
         segments = tuple((first + edge_s, last - edge_s) for first, last in stretches)
         return cls(
             t_s=seen.t_s,

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.scale._spectra import Spectra
-from colmap_inertial.types import Array, CameraImuCalibration
+from colmap_inertial.types import CAL, Array, CameraImuCalibration
 
 Complex = NDArray[np.complex128]
 
@@ -135,7 +135,7 @@ class _Prior:
 
 def _prior(calibration: CameraImuCalibration) -> _Prior:
     cov = np.zeros((6, 6))
-    lever = calibration.cov[8:11, 8:11].copy()
+    lever = calibration.cov[CAL.LEVER_ARM, CAL.LEVER_ARM].copy()
     along = min(1.0, _LEVER_ALONG_AXIS_M / max(float(np.sqrt(lever[2, 2])), 1e-9))
     lever[2] *= along
     lever[:, 2] *= along
@@ -154,9 +154,9 @@ def _tangent(gravity: Array) -> Array:
 
 def _sides(data: Spectra, state: _State) -> tuple[Complex, Complex]:
     """(F, 3), (F, 3): the IMU's acceleration according to the camera, and according to the accelerometer."""
-    seen = state.scale * data.visual + data.lever_by @ state.lever
-    felt = data.inertial - data.bias_by @ state.bias + data.gravity_by @ state.gravity
-    return seen, felt
+    visual = state.scale * data.visual + data.lever_by @ state.lever
+    inertial = data.inertial - data.bias_by @ state.bias + data.gravity_by @ state.gravity
+    return visual, inertial
 
 
 def _linear_start(data: Spectra, prior: _Prior, gravity_m_s2: float) -> tuple[_State, _Noise]:
@@ -191,8 +191,8 @@ def _noise_of(data: Spectra, state: _State, before: _Noise) -> _Noise:
     """
     from scipy.optimize import minimize
 
-    seen, felt = _sides(data, state)
-    power = np.sum(np.abs(seen - felt) ** 2, axis=1)
+    visual, inertial = _sides(data, state)
+    power = np.sum(np.abs(visual - inertial) ** 2, axis=1)
     white = state.scale**2 * data.visual_noise
 
     def cost(logs: Array) -> float:
@@ -208,8 +208,8 @@ def _noise_of(data: Spectra, state: _State, before: _Noise) -> _Noise:
         bounds=[(least, 10.0), (0.0, 10.0)],
         options={"xatol": 0.02, "fatol": 0.02, "initial_simplex": start + np.array([[0, 0], [2.0, 0], [0, 2.0]])},
     )
-    inertial, visual = np.exp(found.x)
-    return _Noise(inertial=np.full(len(power), inertial), visual=visual * data.visual_noise)
+    level, factor = np.exp(found.x)
+    return _Noise(inertial=np.full(len(power), level), visual=factor * data.visual_noise)
 
 
 def _magnitudes(data: Spectra, noise: _Noise, prior: _Prior, state: _State) -> tuple[Array, Array]:
@@ -218,20 +218,20 @@ def _magnitudes(data: Spectra, noise: _Noise, prior: _Prior, state: _State) -> t
     The noise that belongs to the camera's side grows with the scale: as in total least squares, dividing by it keeps
     the scale from shrinking towards where there would be less of it.
     """
-    seen, felt = _sides(data, state)
+    visual, inertial = _sides(data, state)
     # a constant has a sign, not a phase: it keeps it, whatever the clocks do
     constant = (data.frequency_hz == 0)[:, None]
-    seen_by = np.concatenate([(state.scale * data.visual)[:, :, None], data.lever_by], axis=2)
-    felt_by = np.concatenate([-data.bias_by, data.gravity_by @ _tangent(state.gravity)], axis=2)
-    length_seen = np.where(constant, np.sign(seen.real), 1) * np.maximum(np.abs(seen), 1e-12)
-    length_felt = np.where(constant, np.sign(felt.real), 1) * np.maximum(np.abs(felt), 1e-12)
+    visual_by = np.concatenate([(state.scale * data.visual)[:, :, None], data.lever_by], axis=2)
+    inertial_by = np.concatenate([-data.bias_by, data.gravity_by @ _tangent(state.gravity)], axis=2)
+    visual_length = np.where(constant, np.sign(visual.real), 1) * np.maximum(np.abs(visual), 1e-12)
+    inertial_length = np.where(constant, np.sign(inertial.real), 1) * np.maximum(np.abs(inertial), 1e-12)
     power = noise.power(state.scale)[:, None]
     # of complex noise, half the power is along the signal
     weight = np.sqrt(np.where(constant, 1, 2) / power)
-    difference = (length_seen - length_felt) * weight
+    difference = (visual_length - inertial_length) * weight
     jacobian = np.empty((*difference.shape, _N))
-    jacobian[:, :, :4] = np.real(np.conj(seen)[:, :, None] * seen_by) / length_seen[:, :, None]
-    jacobian[:, :, 4:] = -np.real(np.conj(felt)[:, :, None] * felt_by) / length_felt[:, :, None]
+    jacobian[:, :, :4] = np.real(np.conj(visual)[:, :, None] * visual_by) / visual_length[:, :, None]
+    jacobian[:, :, 4:] = -np.real(np.conj(inertial)[:, :, None] * inertial_by) / inertial_length[:, :, None]
     jacobian *= weight[:, :, None]
     jacobian[:, :, _SCALE] -= difference * (state.scale**2 * noise.visual[:, None] / power)
     pull = np.zeros((6, _N))

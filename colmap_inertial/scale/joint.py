@@ -13,7 +13,7 @@ of the accelerometer and of the poses are estimated along (Forstner's variance c
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from colmap_inertial.scale._fit import Fit, fit_jointly
 from colmap_inertial.scale._setup import prepare
 from colmap_inertial.scale.priors import PRIORS
 from colmap_inertial.scale.verdict import scale_drifts, verdict_of
-from colmap_inertial.types import Array, CameraImuCalibration, CameraTrajectory, ImuRecording, ScaleEstimate
+from colmap_inertial.types import CAL, Array, CameraImuCalibration, CameraTrajectory, ImuRecording, ScaleEstimate
 
 _LARGEST_BIAS_M_S2 = 2.0
 #: Chi-square of the accelerometer's nine gains and axis errors against their prior: the 8 recordings that this was
@@ -95,14 +95,9 @@ def estimate_joint(
         )
         fit = fit_jointly(data, prior, imu.noise)
     except NotObservableError as error:
-        return ScaleEstimate(
-            metres_per_unit=None, sigma_log=None, ci95=None, verdict="refused", method="joint", reasons=(error.hint,)
-        )
+        return ScaleEstimate.refused("joint", error.hint)
     except np.linalg.LinAlgError:
-        reason = f"camera and IMU do not determine a scale together: {_RECORD_INSTEAD}"
-        return ScaleEstimate(
-            metres_per_unit=None, sigma_log=None, ci95=None, verdict="refused", method="joint", reasons=(reason,)
-        )
+        return ScaleEstimate.refused("joint", f"camera and IMU do not determine a scale together: {_RECORD_INSTEAD}")
     return _judged(fit, data.t_s, calibration)
 
 
@@ -193,23 +188,23 @@ def _checks(fit: Fit) -> list[str]:
 def _refined(fit: Fit, calibration: CameraImuCalibration) -> CameraImuCalibration:
     x = fit.estimate
     # Rows of CALIBRATION_PARAMETERS from the globals and the mean gyroscope bias
-    jacobian = np.zeros((12, par.N_GLOBALS))
-    jacobian[0:3, par.ROTATION] = np.eye(3)
-    jacobian[3:5, par.DELAY] = 1.0
-    jacobian[4, par.ACCEL_DELAY] = 1.0
-    jacobian[8:11, par.LEVER] = np.eye(3)
+    jacobian = np.zeros((CAL.COUNT, par.N_GLOBALS))
+    jacobian[CAL.ROTATION, par.ROTATION] = np.eye(3)
+    jacobian[CAL.TIME_OFFSETS, par.DELAY] = 1.0
+    jacobian[CAL.ACCEL_TIME_OFFSET, par.ACCEL_DELAY] = 1.0
+    jacobian[CAL.LEVER_ARM, par.LEVER] = np.eye(3)
     cov = jacobian @ fit.cov @ jacobian.T
     with_bias = jacobian @ fit.gyro_bias_with_globals
-    cov[:, 5:8] += with_bias
-    cov[5:8, :] += with_bias.T
-    cov[5:8, 5:8] = fit.gyro_bias_cov
-    cov[11, 11] = calibration.cov[11, 11]
-    return CameraImuCalibration(
+    cov[:, CAL.GYRO_BIAS] += with_bias
+    cov[CAL.GYRO_BIAS, :] += with_bias.T
+    cov[CAL.GYRO_BIAS, CAL.GYRO_BIAS] = fit.gyro_bias_cov
+    cov[CAL.READOUT, CAL.READOUT] = calibration.cov[CAL.READOUT, CAL.READOUT]
+    return replace(
+        calibration,
         cam_from_imu_xyzw=quat_from_matrix(x.cam_from_imu),
         gyro_time_offset_s=calibration.gyro_time_offset_s + x.delay_s,
         accel_time_offset_s=calibration.accel_time_offset_s + x.delay_s + x.accel_delay_s,
         gyro_bias_rad_s=x.gyro_bias_rad_s.mean(axis=0),
         imu_in_cam_m=x.imu_in_cam_m,
-        readout_s=calibration.readout_s,
         cov=0.5 * (cov + cov.T),
     )

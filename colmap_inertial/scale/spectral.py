@@ -73,11 +73,11 @@ def estimate_spectral(
             raise NotObservableError("scale", f"{needed}: record longer")
         fit = fit_spectra(signals.spectra(options.highest_hz), calibration, options.gravity_m_s2)
     except NotObservableError as error:
-        return _refused(calibration, error.hint)
+        return ScaleEstimate.refused("spectral", error.hint, calibration=calibration)
     checks, refusals = _checks(signals, calibration, options, fit)
     verdict, ci95, reasons = verdict_of(fit.metres_per_unit, fit.sigma_log, checks, refusals=refusals)
     if verdict == "refused":
-        return _refused(calibration, *reasons)
+        return ScaleEstimate.refused("spectral", *reasons, calibration=calibration)
     return ScaleEstimate(
         metres_per_unit=fit.metres_per_unit,
         sigma_log=fit.sigma_log,
@@ -120,18 +120,3 @@ def _checks(
                 f"the second half of the recording gives a scale {100 * np.expm1(apart):+.1f} % from the first"
             )
     return checks, refusals
-
-
-def _refused(calibration: CameraImuCalibration, *reasons: str) -> ScaleEstimate:
-    return ScaleEstimate(
-        metres_per_unit=None,
-        sigma_log=None,
-        ci95=None,
-        verdict="refused",
-        method="spectral",
-        reasons=reasons,
-        calibration=calibration,
-    )
-
-
-__all__ = ["SpectralOptions", "estimate_spectral"]

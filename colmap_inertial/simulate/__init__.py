@@ -6,7 +6,6 @@ would have recorded, with the truth beside it.
 """
 
 from colmap_inertial.simulate.capture import Scene, make_scene, write_capture
-from colmap_inertial.simulate.imu import IMU_PRESETS, ImuErrors, ImuOptions, draw_imu_errors, sample_imu
 from colmap_inertial.simulate.motion import Kinematics, Motion, MotionOptions, make_motion
 from colmap_inertial.simulate.recipe import SceneRecipe, load_recipe, recipe_text
 from colmap_inertial.simulate.recording import (
@@ -17,6 +16,7 @@ from colmap_inertial.simulate.recording import (
     simulate_recording,
 )
 from colmap_inertial.simulate.render import Renderer, ShutterCamera, develop
+from colmap_inertial.simulate.sensors import IMU_PRESETS, ImuErrors, ImuOptions, draw_imu_errors, sample_imu
 from colmap_inertial.simulate.truth import SceneTruth, read_truth, true_metres_per_unit
 from colmap_inertial.simulate.world import Board, Quad, World, make_world
 

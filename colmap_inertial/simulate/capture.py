@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from fractions import Fraction
 from functools import lru_cache, partial
 from multiprocessing import get_context
@@ -18,16 +18,16 @@ from colmap_inertial.errors import OutputExistsError
 from colmap_inertial.geometry import matrix_from_quat, quat_conjugate, quat_multiply, quat_normalize
 from colmap_inertial.io.files import write_json, write_text
 from colmap_inertial.io.video import frame_name
-from colmap_inertial.simulate.imu import (
+from colmap_inertial.simulate.motion import Motion, make_motion
+from colmap_inertial.simulate.recipe import SceneRecipe, recipe_text
+from colmap_inertial.simulate.render import Renderer, ShutterCamera, develop
+from colmap_inertial.simulate.sensors import (
     STANDARD_GRAVITY_M_S2,
     ImuErrors,
     SampledImu,
     draw_imu_errors,
     sample_imu,
 )
-from colmap_inertial.simulate.motion import Motion, make_motion
-from colmap_inertial.simulate.recipe import SceneRecipe, recipe_text
-from colmap_inertial.simulate.render import Renderer, ShutterCamera, develop
 from colmap_inertial.simulate.world import Board, World, WorldKind, make_world
 
 Array = NDArray[np.float64]
@@ -123,15 +123,15 @@ def write_capture(
     scene = make_scene(recipe)
     cameras = _cameras(recipe)
     total, done = len(cameras) * len(scene.names), 0
-    write = _write_video if recipe.format == "h264" else _write_pictures
+    write = _write_video if recipe.format == "h264" else _write_images
     with _processes(recipe, workers) as pool:
         for suffix in cameras:
             depth = folder / f"depth{suffix}" if recipe.depth_maps else None
             if depth is not None:
                 depth.mkdir()
             jobs = [(suffix, i, depth) for i in range(len(scene.names))]
-            pictures = map(partial(_render, scene), jobs) if pool is None else pool.map(_render_job, jobs)
-            for _ in write(scene, pictures, folder, suffix):
+            images = map(partial(_render, scene), jobs) if pool is None else pool.map(_render_job, jobs)
+            for _ in write(scene, images, folder, suffix):
                 done += 1
                 if progress is not None:
                     progress(done, total)
@@ -196,19 +196,19 @@ def _processes(recipe: SceneRecipe, workers: int) -> AbstractContextManager[Proc
     return ProcessPoolExecutor(workers, get_context("spawn"), initializer=_begin, initargs=(recipe,))
 
 
-def _write_pictures(scene: Scene, pictures: Iterator[Image], folder: Path, suffix: str) -> Iterator[None]:
+def _write_images(scene: Scene, images: Iterator[Image], folder: Path, suffix: str) -> Iterator[None]:
     import cv2
 
     target = folder / f"frames{suffix}"
     target.mkdir()
     options = [cv2.IMWRITE_JPEG_QUALITY, scene.recipe.quality] if scene.recipe.format == "jpeg" else []
-    for name, picture in zip(scene.names, pictures, strict=True):
-        if not cv2.imwrite(str(target / name), picture[..., ::-1], options):
+    for name, image in zip(scene.names, images, strict=True):
+        if not cv2.imwrite(str(target / name), image[..., ::-1], options):
             raise OSError(f"{target / name} could not be written")
         yield
 
 
-def _write_video(scene: Scene, pictures: Iterator[Image], folder: Path, suffix: str) -> Iterator[None]:
+def _write_video(scene: Scene, images: Iterator[Image], folder: Path, suffix: str) -> Iterator[None]:
     import av
 
     camera = scene.recipe.camera.model
@@ -221,8 +221,8 @@ def _write_video(scene: Scene, pictures: Iterator[Image], folder: Path, suffix: 
         stream.codec_context.thread_count = 1
         stream.options = {"crf": str(scene.recipe.crf), "threads": "1"}
         stream.codec_context.time_base = stream.time_base = Fraction(1, _TICKS_HZ)
-        for t_s, picture in zip(scene.trigger_s, pictures, strict=True):
-            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
+        for t_s, image in zip(scene.trigger_s, images, strict=True):
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
             frame.pts, frame.time_base = round(t_s * _TICKS_HZ), Fraction(1, _TICKS_HZ)
             container.mux(stream.encode(frame))
             yield
@@ -292,17 +292,6 @@ def _capture_toml(recipe: SceneRecipe) -> str:
     for sensor, unit in (("gyro", "rad/s"), ("accel", "m/s2")):
         lines += ["", f"[imu.{sensor}]", f'file = "{sensor}.csv"', 'time = "t"', 'time_unit = "s"']
         lines += ['columns = ["x", "y", "z"]', f'unit = "{unit}"']
-    noise = recipe.imu
-    lines += ["", "[imu.noise]"]
-    for name in (
-        "gyro_density_rad_s_rthz",
-        "accel_density_m_s2_rthz",
-        "gyro_walk_rad_s2_rthz",
-        "accel_walk_m_s3_rthz",
-    ):
-        lines += [f"{name} = {getattr(noise, name)!r}"]
+    lines += ["", "[imu.noise]", *(f"{name} = {value!r}" for name, value in asdict(recipe.imu.noise()).items())]
     lines += ["", "[target]", f'spec = "{recipe.board.spec()}"']
     return "\n".join(["# A simulated recording; recipe.toml made it, truth.json is its truth.", *lines]) + "\n"
-
-
-__all__ = ["Scene", "make_scene", "write_capture"]

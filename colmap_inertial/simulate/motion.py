@@ -256,7 +256,7 @@ def make_motion(options: MotionOptions, rng: np.random.Generator) -> Motion:
     The world's z axis points up; ``orbit`` circles its start, the others begin near it.
     """
     step_s = 1 / _KNOT_RATE_HZ
-    guard = 16  # samples beyond the margin, where the spline's boundary condition is felt
+    guard = 16  # samples beyond the margin, where the spline's boundary condition has an effect
     n = int(np.ceil((options.duration_s + 2 * MARGIN_S) * _KNOT_RATE_HZ)) + 2 * guard + 1
     start_s = -MARGIN_S - guard * step_s
     t = start_s + step_s * np.arange(n)
@@ -301,6 +301,3 @@ def make_motion(options: MotionOptions, rng: np.random.Generator) -> Motion:
         cam_in_world_m=position + np.array(options.start_m),
         world_from_cam_xyzw=quat_multiply(looking, quat_exp(turn)),
     )
-
-
-__all__ = ["MARGIN_S", "Kinematics", "Motion", "MotionKind", "MotionOptions", "make_motion"]

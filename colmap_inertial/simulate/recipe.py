@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar, get_args
 
 from colmap_inertial.io.toml_section import Section, read_toml
-from colmap_inertial.simulate.imu import IMU_PRESETS, ImuOptions
-from colmap_inertial.simulate.motion import MotionOptions
+from colmap_inertial.simulate.motion import MotionKind, MotionOptions
 from colmap_inertial.simulate.render import ShutterCamera
+from colmap_inertial.simulate.sensors import IMU_PRESETS, ImuOptions
 from colmap_inertial.simulate.world import Board, WorldKind
-from colmap_inertial.types import CameraModel
+from colmap_inertial.types import CameraModel, ReadoutDirection
 
 T = TypeVar("T")
 FrameFormat = Literal["jpeg", "png", "h264"]
@@ -24,10 +24,10 @@ _DEFAULT_CAMERA = ShutterCamera(
 )
 #: Fields that take one of a few texts.
 _CHOICES: dict[str, tuple[str, ...]] = {
-    "world": ("desk", "room"),
-    "format": ("jpeg", "png", "h264"),
-    "kind": ("orbit", "walk", "roam", "constant_velocity", "pure_rotation", "static"),
-    "readout_direction": ("down", "up", "right", "left"),
+    "world": get_args(WorldKind),
+    "format": get_args(FrameFormat),
+    "kind": get_args(MotionKind),
+    "readout_direction": get_args(ReadoutDirection),
 }
 
 
@@ -174,6 +174,3 @@ def _lines(values: Mapping[str, object]) -> list[str]:
         return repr(value)
 
     return [f"{key} = {toml(value)}" for key, value in values.items() if value is not None]
-
-
-__all__ = ["FrameFormat", "SceneRecipe", "load_recipe", "recipe_text"]

@@ -16,7 +16,8 @@ from colmap_inertial.geometry import (
     quat_rotate,
     skew,
 )
-from colmap_inertial.simulate.imu import (
+from colmap_inertial.simulate.motion import Motion, MotionOptions, make_motion
+from colmap_inertial.simulate.sensors import (
     STANDARD_GRAVITY_M_S2,
     ImuErrors,
     ImuOptions,
@@ -24,8 +25,7 @@ from colmap_inertial.simulate.imu import (
     draw_imu_errors,
     sample_imu,
 )
-from colmap_inertial.simulate.motion import Motion, MotionOptions, make_motion
-from colmap_inertial.types import CALIBRATION_PARAMETERS, CameraImuCalibration, CameraTrajectory, ImuRecording
+from colmap_inertial.types import CAL, CameraImuCalibration, CameraTrajectory, ImuRecording
 
 Array = NDArray[np.float64]
 
@@ -177,15 +177,15 @@ def _seen_by_sfm(motion: Motion, t_s: Array, options: SfmOptions, rng: np.random
     n, dt = len(t_s), 1 / options.frame_rate_hz
     k = motion.at(t_s)
     position, rotation = k.cam_in_world_m, k.world_from_cam_xyzw
-    # drift accumulates along the path: every step is turned and stretched by what has accumulated before it
+    # drift accumulates along the path: every step is rotated and stretched by what has accumulated before it
     walk = rng.standard_normal((n, 7)) * np.sqrt(dt)
     walk[0] = 0
-    turned = quat_exp(options.rotation_drift_rad_rts * np.cumsum(walk[:, :3], axis=0))
+    rotated = quat_exp(options.rotation_drift_rad_rts * np.cumsum(walk[:, :3], axis=0))
     stretch = np.exp(options.scale_drift_rts * np.cumsum(walk[:, 6:], axis=0))
     steps = np.diff(position, axis=0, prepend=np.zeros((1, 3)))
-    steps[1:] = quat_rotate(turned[1:], steps[1:] * stretch[1:])
+    steps[1:] = quat_rotate(rotated[1:], steps[1:] * stretch[1:])
     position = np.cumsum(steps + options.position_drift_m_rts * walk[:, 3:6], axis=0)
-    rotation = quat_multiply(turned, rotation)
+    rotation = quat_multiply(rotated, rotation)
 
     world_from_cam = matrix_from_quat(rotation)
     bias_s = rolling_shutter_bias_s(options.readout_s, options.scene_depth_m, rng)
@@ -233,7 +233,6 @@ def simulate_recording(options: RecordingOptions | None = None, *, seed: int) ->
         cam_from_world_xyzw=quat_conjugate(quat_multiply(model_from_world, world_from_cam)),
         cam_in_world=quat_rotate(model_from_world, position) / metres_per_unit + world_in_model,
     )
-    size = len(CALIBRATION_PARAMETERS)
     truth = RecordingTruth(
         motion=motion,
         metres_per_unit=metres_per_unit,
@@ -247,20 +246,10 @@ def simulate_recording(options: RecordingOptions | None = None, *, seed: int) ->
             gyro_bias_rad_s=imu.gyro_bias_rad_s.mean(axis=0),
             imu_in_cam_m=errors.imu_in_cam_m,
             readout_s=options.sfm.readout_s,
-            cov=np.zeros((size, size)),
+            cov=np.zeros((CAL.COUNT, CAL.COUNT)),
         ),
         accel_bias_m_s2=imu.accel_bias_m_s2.mean(axis=0),
         imu_errors=errors,
         imu=imu,
     )
     return SimulatedRecording(trajectory=trajectory, imu=imu.recording, truth=truth)
-
-
-__all__ = [
-    "RecordingOptions",
-    "RecordingTruth",
-    "SfmOptions",
-    "SimulatedRecording",
-    "rolling_shutter_bias_s",
-    "simulate_recording",
-]

@@ -11,21 +11,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.geometry import matrix_from_quat
+from colmap_inertial.model import colmap_camera
 from colmap_inertial.simulate.motion import Motion
 from colmap_inertial.simulate.world import World
 from colmap_inertial.types import CameraModel, ReadoutDirection
 
-if TYPE_CHECKING:
-    import pycolmap
-
 Array = NDArray[np.float64]
-Picture = NDArray[np.float32]
+FloatImage = NDArray[np.float32]
 
 _NEAR_M = 0.02
 #: Samples of a pixel: so many, and so many more for each pixel of blur. Against 256 samples the error is then about one
@@ -100,13 +97,13 @@ class _Atlas:
         lengths = [np.linalg.norm(q.edge_u_m) / q.texture.shape[1] for q in world.quads]
         self.texel_m = np.array(lengths, dtype=np.float32)
 
-    def look_up(self, quad: NDArray[np.intp], s: Picture, t: Picture, footprint_m: Picture) -> Picture:
+    def look_up(self, quad: NDArray[np.intp], s: FloatImage, t: FloatImage, footprint_m: FloatImage) -> FloatImage:
         """(N, 3) colours at fractions (s, t) of the edges, averaged over about ``footprint_m``."""
         detail = 2 * np.log2(np.maximum(footprint_m / self.texel_m[quad], np.float32(1)))
         level = np.minimum(np.rint(detail).astype(np.int64), self.levels - 1)
         return self._bilinear(quad * self.levels + level, s, t)
 
-    def _bilinear(self, index: NDArray[np.int64], s: Picture, t: Picture) -> Picture:
+    def _bilinear(self, index: NDArray[np.int64], s: FloatImage, t: FloatImage) -> FloatImage:
         width, height = self.width[index], self.height[index]
         u = np.clip(s * width - np.float32(0.5), 0, width - 1).astype(np.float32)
         v = np.clip(t * height - np.float32(0.5), 0, height - 1).astype(np.float32)
@@ -163,7 +160,7 @@ class Renderer:
         self._v = np.stack([q.edge_v_m for q in quads]) / self._size[:, 1:]
         self._rays: dict[CameraModel, tuple[Array, Array]] = {}
 
-    def linear(self, camera: ShutterCamera, motion: Motion, t_s: float) -> Picture:
+    def linear(self, camera: ShutterCamera, motion: Motion, t_s: float) -> FloatImage:
         """(H, W, 3) light that falls on each pixel during a frame triggered at ``t_s``, before noise."""
         starts = camera.line_start_s(t_s)
         samples = self._samples_needed(camera, motion, t_s)
@@ -218,7 +215,9 @@ class Renderer:
             longest = max(longest, float(np.max(shift / pixel)))
         return min(_MOST_SAMPLES, _SAMPLES + int(np.ceil(_SAMPLES_PER_PX * max(longest, 1.0))))
 
-    def _sample(self, camera: ShutterCamera, motion: Motion, instants: Array, offset: Array, samples: int) -> Picture:
+    def _sample(
+        self, camera: ShutterCamera, motion: Motion, instants: Array, offset: Array, samples: int
+    ) -> FloatImage:
         rays, slope = self._rays_of(camera.model)
         shifted = rays + slope @ offset
         lines = instants if camera.readout_s > 0 else instants[:1]
@@ -318,14 +317,7 @@ class Renderer:
         return out
 
 
-def colmap_camera(model: CameraModel) -> pycolmap.Camera:
-    """The pycolmap camera of a camera model."""
-    import pycolmap
-
-    return pycolmap.Camera(model=model.model, width=model.width, height=model.height, params=list(model.params))
-
-
-def develop(linear: Picture, camera: ShutterCamera, rng: np.random.Generator | None) -> NDArray[np.uint8]:
+def develop(linear: FloatImage, camera: ShutterCamera, rng: np.random.Generator | None) -> NDArray[np.uint8]:
     """(H, W, 3) 8-bit sRGB picture of linear light, with shot and read noise (none with ``rng`` None)."""
     light: NDArray[np.floating] = np.asarray(linear, dtype=np.float32)
     if rng is not None:
@@ -337,6 +329,3 @@ def develop(linear: Picture, camera: ShutterCamera, rng: np.random.Generator | N
     light = np.clip(light, 0, 1)
     srgb = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** np.float32(1 / 2.4) - 0.055)
     return np.asarray(np.round(255 * srgb), dtype=np.uint8)
-
-
-__all__ = ["Renderer", "ShutterCamera", "colmap_camera", "develop"]

@@ -178,17 +178,3 @@ MATERIALS: tuple[Callable[[np.random.Generator, int, int], Texture], ...] = (
     marble,
     carpet,
 )
-
-__all__ = [
-    "MATERIALS",
-    "Texture",
-    "carpet",
-    "checkerboard",
-    "clouds",
-    "fabric",
-    "marble",
-    "plaster",
-    "poster",
-    "terrazzo",
-    "wood",
-]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from colmap_inertial.errors import FormatError
 from colmap_inertial.io.files import read_json
-from colmap_inertial.types import CALIBRATION_PARAMETERS, CameraImuCalibration, CameraTrajectory
+from colmap_inertial.types import CAL, CameraImuCalibration, CameraTrajectory
 
 Array = NDArray[np.float64]
 
@@ -51,7 +51,6 @@ def read_truth(path: Path) -> SceneTruth:
     try:
         frames: list[dict[str, Any]] = values["frames"]
         calibration = values["calibration"]
-        size = len(CALIBRATION_PARAMETERS)
         return SceneTruth(
             trajectory=CameraTrajectory(
                 names=tuple(frame["name"] for frame in frames),
@@ -60,7 +59,7 @@ def read_truth(path: Path) -> SceneTruth:
                 cam_in_world=np.array([frame["cam_in_world_m"] for frame in frames]),
                 length_unit="m",
             ),
-            calibration=CameraImuCalibration(**calibration, cov=np.zeros((size, size))),
+            calibration=CameraImuCalibration(**calibration, cov=np.zeros((CAL.COUNT, CAL.COUNT))),
             accel_bias_m_s2=np.array(values["accel_bias_m_s2"], dtype=np.float64),
             target=values["target"]["spec"],
             target_corners_m=np.array(values["target"]["corners_in_world_m"], dtype=np.float64),
@@ -96,6 +95,3 @@ def true_metres_per_unit(names: tuple[str, ...], cam_in_world: Array, truth: Cam
     u, singular, vt = np.linalg.svd(true.T @ model)
     singular[2] *= np.sign(np.linalg.det(u @ vt))
     return float(singular.sum() / np.sum(model**2))
-
-
-__all__ = ["SceneTruth", "read_truth", "true_metres_per_unit"]

@@ -150,7 +150,7 @@ class _Builder:
         for corner, edge in ((top + y, x), (top + x + y, -y), (top + x, -x), (top, y)):
             self.quad(corner, edge, -z, textures.plaster, texel_m)
 
-    def pictures(self, low: Array, high: Array, count: int, texel_m: float) -> None:
+    def posters(self, low: Array, high: Array, count: int, texel_m: float) -> None:
         """Posters that hang a little off the walls, each in a place of its own along its wall."""
         slots = -(-count // 4)
         for i in range(count):
@@ -183,7 +183,7 @@ def _desk(builder: _Builder, board: Board) -> Array:
     rng = builder.rng
     low, high = np.array([-2.5, -2.5, -0.8]), np.array([2.5, 2.5, 1.7])
     builder.room(low, high, 0.004)
-    builder.pictures(low, high, 12, 0.003)
+    builder.posters(low, high, 12, 0.003)
     for i in range(10):  # furniture along the walls
         angle = 2 * np.pi * (i + rng.uniform(-0.3, 0.3)) / 10
         size = rng.uniform([0.4, 0.3, 0.3], [0.8, 0.6, 1.3])
@@ -237,7 +237,7 @@ def _room(builder: _Builder, board: Board) -> Array:
     rng = builder.rng
     low, high = np.array([-3.2, -2.8, -1.4]), np.array([3.2, 2.8, 1.3])
     builder.room(low, high, 0.004)
-    builder.pictures(low, high, 20, 0.003)
+    builder.posters(low, high, 20, 0.003)
     for i in range(14):
         angle = 2 * np.pi * (i + rng.uniform(-0.3, 0.3)) / 14
         size = rng.uniform([0.4, 0.3, 0.3], [0.9, 0.6, 1.6])
@@ -267,6 +267,3 @@ def make_world(kind: WorldKind, seed: int, board: Board | None = None) -> World:
     board = board or Board(square_m=0.04 if kind == "desk" else 0.08)
     corners = {"desk": _desk, "room": _room}[kind](builder, board)
     return World(quads=tuple(builder.quads), board=board, board_corners_m=corners)
-
-
-__all__ = ["Board", "Quad", "World", "WorldKind", "make_world"]

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from colmap_inertial.smooth._acceleration import WorldAcceleration
 from colmap_inertial.smooth._attitude import Attitude, smooth_attitude
-from colmap_inertial.smooth._felt import Felt
 from colmap_inertial.smooth._positions import PositionSmoother, SmoothOptions, smooth_positions
 from colmap_inertial.smooth._trajectory import smooth_trajectory
 
 __all__ = [
     "Attitude",
-    "Felt",
+    "WorldAcceleration",
     "PositionSmoother",
     "SmoothOptions",
     "smooth_attitude",

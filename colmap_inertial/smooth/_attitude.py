@@ -10,18 +10,24 @@ from numpy.typing import NDArray
 from colmap_inertial.geometry import quat_conjugate, quat_exp, quat_log, quat_multiply, quat_normalize, slerp
 from colmap_inertial.gyro import GyroPath
 from colmap_inertial.smooth._chain import Chain
-from colmap_inertial.smooth._models import most_likely, runs_of, worst_oddities
-from colmap_inertial.types import Array, CameraImuCalibration, CameraTrajectory, ImuRecording, clock_shift_s
+from colmap_inertial.smooth._models import most_likely, runs_of, worst_outliers
+from colmap_inertial.types import (
+    CAL,
+    TYPICAL_NOISE,
+    Array,
+    CameraImuCalibration,
+    CameraTrajectory,
+    ImuRecording,
+    clock_shift_s,
+)
 
-#: Noise of a gyroscope without data sheet: white (rad/s/sqrt(Hz)) and walk of the bias (rad/s/sqrt(s)).
-_GYRO_DENSITY, _GYRO_WALK = 3e-4, 3e-4
 #: Orientations from pictures err independently and, over about this time, together (as features come and go).
 _CORRELATION_S = 0.35
 #: Usual noise of orientations from pictures, rad: a start for the estimate, which may end far away.
 _USUAL_RAD, _SPREAD = 2e-3, 3.0
 #: Variance (rad2) that frees the correction where the gyroscope is silent.
 _FREE = 1e2
-_REACH_S, _ODD_CHI2, _ROUNDS = 0.5, 30.0, 4
+_REACH_S, _OUTLIER_CHI2, _ROUNDS = 0.5, 30.0, 4
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -46,10 +52,10 @@ class Attitude:
     def at(self, query_s: Array) -> tuple[Array, Array]:
         """``world_from_imu`` (M, 4) and angular velocity in the IMU frame (M, 3) in rad/s at camera times."""
         world_from_start = quat_multiply(self.world_from_imu_xyzw, quat_conjugate(self.path.at(self.t_s)[0]))
-        turned, rate = self.path.at(query_s)
+        start_from_imu, rate = self.path.at(query_s)
         # the correction of the gyroscope's drift changes slowly: between frames it follows the shortest way
         correction = slerp(self.t_s, world_from_start, np.clip(query_s, self.t_s[0], self.t_s[-1]))
-        return quat_normalize(quat_multiply(correction, turned)), rate
+        return quat_normalize(quat_multiply(correction, start_from_imu)), rate
 
 
 def smooth_attitude(trajectory: CameraTrajectory, imu: ImuRecording, calibration: CameraImuCalibration) -> Attitude:
@@ -76,15 +82,16 @@ def smooth_attitude(trajectory: CameraTrajectory, imu: ImuRecording, calibration
     steps = quat_log(quat_multiply(correction[1:], quat_conjugate(correction[:-1])))
     curve = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
     # an error of the bias is constant in the IMU's frame: as the IMU turns, it walks in the world's
-    bias_sigma = np.sqrt(np.trace(calibration.cov[5:8, 5:8]) / 3)
-    walk = _GYRO_WALK if imu.noise is None else imu.noise.gyro_walk_rad_s2_rthz
+    bias_sigma = np.sqrt(np.trace(calibration.cov[CAL.GYRO_BIAS, CAL.GYRO_BIAS]) / 3)
+    rate_rms = np.sqrt(np.mean(np.sum(path.rate_rad_s**2, axis=1)))
+    noise = imu.noise or TYPICAL_NOISE
     model = _Model(
         t_s=t_s,
         curve=curve,
         silent=~path.covers(t_s[:-1], t_s[1:]),
         left_out=np.zeros(len(t_s), dtype=bool),
-        density=_GYRO_DENSITY if imu.noise is None else imu.noise.gyro_density_rad_s_rthz,
-        walk=float(np.hypot(walk, bias_sigma * np.sqrt(np.mean(np.sum(path.rate_rad_s**2, axis=1))))),
+        density=noise.gyro_density_rad_s_rthz,
+        walk=float(np.hypot(noise.gyro_walk_rad_s2_rthz, bias_sigma * rate_rms)),
     )
     logs = np.log([_USUAL_RAD**2, _USUAL_RAD**2])
     for attempt in range(_ROUNDS):
@@ -92,8 +99,8 @@ def smooth_attitude(trajectory: CameraTrajectory, imu: ImuRecording, calibration
             run = model.select(runs_of(len(t_s)))
             logs = most_likely(run.chain, logs, expected=np.log([_USUAL_RAD**2] * 2), spread=_SPREAD)
         chain = model.chain(logs)
-        wrong, jumped = chain.oddities()
-        left_out, jumps = worst_oddities(t_s, wrong, jumped, limit=_ODD_CHI2, reach=_REACH_S)
+        wrong, jumped = chain.outlier_statistics()
+        left_out, jumps = worst_outliers(t_s, wrong, jumped, limit=_OUTLIER_CHI2, reach=_REACH_S)
         if not (left_out.any() or jumps.any()):
             break
         model = replace(model, left_out=model.left_out | left_out, silent=model.silent | jumps)

@@ -1,4 +1,4 @@
-"""A linear-Gaussian Markov chain observed with noise: smoothed states, their covariance, the likelihood, odd data.
+"""A linear-Gaussian Markov chain observed with noise: smoothed states, their covariance, the likelihood, outliers.
 
 This is the Rauch-Tung-Striebel smoother in its batch form: all times are solved at once by a banded Cholesky
 factorisation of the posterior precision, in linear time, and the covariances follow in one backward recursion. Axes
@@ -138,7 +138,7 @@ class Chain:
         """(T, n, n) covariance of the states of one axis."""
         return self._backward[0]
 
-    def oddities(self) -> tuple[Array, Array]:
+    def outlier_statistics(self) -> tuple[Array, Array]:
         """Auxiliary residuals (Harvey and Koopman 1992), squared: where the data contradict the model.
 
         Returns

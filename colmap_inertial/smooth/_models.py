@@ -38,13 +38,13 @@ def white_acceleration(dt_s: Array) -> Array:
     return out
 
 
-def worst_oddities(
+def worst_outliers(
     t: Array, wrong: Array, jumped: Array, *, limit: float, reach: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Which measurements (T,) to leave out and which transitions (T-1,) to free, after one look.
 
     Whatever exceeds ``limit`` competes; the worst wins, and silences everything within ``reach`` of its time, because
-    one odd pose makes its neighbours look odd.
+    an outlier makes its neighbours look like ones.
     """
     count = len(t)
     score = np.concatenate([wrong, jumped])

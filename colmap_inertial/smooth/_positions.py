@@ -9,15 +9,15 @@ from numpy.typing import NDArray
 
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.smooth._chain import Chain
-from colmap_inertial.smooth._models import constant_acceleration, white_jerk, worst_oddities
+from colmap_inertial.smooth._models import constant_acceleration, white_jerk, worst_outliers
 from colmap_inertial.types import Array, CameraTrajectory, SmoothedTrajectory
 
 #: Range of the smoother's time constant in frame intervals. Longer ones than the last would lose the digits of a
 #: double; they would smooth nothing but stillness any further.
 _SHORTEST, _LONGEST = 0.3, 50.0
-#: An oddity's neighbours within this many time constants feel it and are not judged in the same round.
+#: Neighbours of an outlier within this many time constants suffer from it and are not judged in the same round.
 _REACH = 4.0
-_ROUNDS, _MOST_ODD = 8, 0.1
+_ROUNDS, _MOST_OUTLIERS = 8, 0.1
 #: Factor on a variance that frees a measurement or a transition; least variance, relative to the path's: rounding.
 _FREE, _LEAST_VAR = 1e8, 1e-20
 
@@ -102,7 +102,7 @@ class PositionSmoother:
             left_out=np.zeros(count, dtype=bool),
             jumps=np.zeros(count - 1, dtype=bool),
         )
-        constant, chain = _without_oddities(model, options.outlier_chi2)
+        constant, chain = _without_outliers(model, options.outlier_chi2)
         return cls(
             trajectory=trajectory,
             noise_sigma=size * float(np.sqrt(np.median(chain.measured_var))),
@@ -139,7 +139,7 @@ class PositionSmoother:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Model:
-    """Normalised data, with time in frame intervals and length in rms deviations, and what was found odd in it."""
+    """Normalised data, with time in frame intervals and length in rms deviations, and its outliers."""
 
     t: Array
     measured: Array
@@ -182,16 +182,16 @@ class _Model:
         return constant, self.chain(constant, variance(self.chain(constant, 1.0)))
 
 
-def _without_oddities(model: _Model, limit: float) -> tuple[float, Chain]:
+def _without_outliers(model: _Model, limit: float) -> tuple[float, Chain]:
     """Leave out poses, and allow jumps, one neighbourhood at a time, until nothing contradicts the rest."""
     constant, chain = model.most_likely()
     for _ in range(_ROUNDS):
-        wrong, jumped = chain.oddities()
-        left_out, jumps = worst_oddities(model.t, wrong, jumped, limit=limit, reach=_REACH * constant)
+        wrong, jumped = chain.outlier_statistics()
+        left_out, jumps = worst_outliers(model.t, wrong, jumped, limit=limit, reach=_REACH * constant)
         left_out, jumps = model.left_out | left_out, model.jumps | jumps
         if left_out.sum() + jumps.sum() == model.left_out.sum() + model.jumps.sum():
             break
-        if left_out.sum() + jumps.sum() > _MOST_ODD * len(model.t):
+        if left_out.sum() + jumps.sum() > _MOST_OUTLIERS * len(model.t):
             break  # not outliers, but noise of another kind
         model = replace(model, left_out=left_out, jumps=jumps)
         constant, chain = model.most_likely()

@@ -9,13 +9,15 @@ from numpy.typing import NDArray
 
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.geometry import quat_conjugate, quat_multiply, quat_normalize, quat_rotate
+from colmap_inertial.gyro import on_camera_rate
+from colmap_inertial.smooth._acceleration import WorldAcceleration
 from colmap_inertial.smooth._attitude import Attitude, smooth_attitude
 from colmap_inertial.smooth._chain import Chain
-from colmap_inertial.smooth._felt import Felt
-from colmap_inertial.smooth._models import most_likely, runs_of, white_acceleration, white_jerk, worst_oddities
+from colmap_inertial.smooth._models import most_likely, runs_of, white_acceleration, white_jerk, worst_outliers
 from colmap_inertial.smooth._positions import SmoothOptions
 from colmap_inertial.threads import one_blas_thread
 from colmap_inertial.types import (
+    TYPICAL_NOISE,
     Array,
     CameraImuCalibration,
     CameraTrajectory,
@@ -23,7 +25,7 @@ from colmap_inertial.types import (
     SmoothedTrajectory,
 )
 
-#: Time over which errors of positions from pictures stay alike, as features come and go.
+#: Time over which errors of positions from images stay correlated, as features come and go.
 _CORRELATION_S = 0.35
 #: Usual standard deviations, as a weak prior of their estimates: white and correlated error of a position (m); white
 #: noise of the accelerometer with all that errs like it (m/s2/sqrt(Hz)); walk of what gravity, bias and tilt leave
@@ -35,8 +37,8 @@ _MOTION_S = 0.2
 _GAIN_SIGMA = 0.01
 #: An instant this close to a pose is that of the pose.
 _SAME_S = 1e-6
-#: Variance (m2) that frees a pose or a transition; how far an odd pose makes its neighbours look odd.
-_FREE, _REACH_S, _ROUNDS, _MOST_ODD = 1e4, 0.5, 5, 0.1
+#: Variance (m2) that frees a pose or a transition; how far an outlier makes its neighbours look like outliers.
+_FREE, _REACH_S, _ROUNDS, _MOST_OUTLIERS = 1e4, 0.5, 5, 0.1
 
 
 @one_blas_thread()
@@ -64,7 +66,7 @@ def smooth_trajectory(
     imu
         Both sensors; where they are silent, the camera alone is smoothed.
     calibration
-        Rotation, time offsets, gyroscope bias, lever arm.
+        Rotation, time offsets with their clock rate, gyroscope bias, lever arm.
     gravity_in_world_m_s2
         (3,) points down, in the trajectory's world.
     accel_bias_m_s2
@@ -94,12 +96,15 @@ def smooth_trajectory(
     if not imu.has_accel:
         hint = "the recording has no accelerometer; record it along with the gyroscope"
         raise NotObservableError("smooth motion", hint)
+    imu = on_camera_rate(imu, calibration, camera_epoch_ns=trajectory.epoch_ns)
     attitude = smooth_attitude(trajectory, imu, calibration)
     bias = np.zeros(3) if accel_bias_m_s2 is None else np.asarray(accel_bias_m_s2, dtype=np.float64)
     gravity = np.asarray(gravity_in_world_m_s2, dtype=np.float64)
-    felt = Felt.of(trajectory, imu, calibration, attitude, bias_m_s2=bias, gravity_in_world_m_s2=gravity)
+    inertial = WorldAcceleration.of(
+        trajectory, imu, calibration, attitude, bias_m_s2=bias, gravity_in_world_m_s2=gravity
+    )
     t_s = trajectory.t_s
-    silent = ~felt.covers(t_s)
+    silent = ~inertial.covers(t_s)
     if silent.all():
         raise NotObservableError("smoothed trajectory", "the IMU recorded during none of the frame intervals")
 
@@ -110,27 +115,27 @@ def smooth_trajectory(
     model = _Model(
         t_s=t_s,
         measured=trajectory.cam_in_world - origin + quat_rotate(world_from_imu, lever),
-        gained=felt.sums(t_s),
+        gained=inertial.sums(t_s),
         silent=silent,
         left_out=np.zeros(len(t_s), dtype=bool),
         jumps=np.zeros(len(t_s) - 1, dtype=bool),
-        motion_density=2 * _MOTION_S * felt.variance,
+        motion_density=2 * _MOTION_S * inertial.variance,
     )
-    model, logs = _without_oddities(model, options.outlier_chi2)
+    model, logs = _without_outliers(model, options.outlier_chi2)
     if also_at_s is not None:
-        model = _with_instants(model, felt, also_at_s)
+        model = _with_instants(model, inertial, also_at_s)
     chain, t_s = model.chain(logs), model.t_s
     world_from_imu, rate = attitude.at(t_s)
 
     states, cov = chain.states, chain.cov[:, :3, :3].copy()
     # acceleration of the IMU: the sample itself, and what was found to be missing
-    measured_accel, sampled = felt.at(t_s)
+    measured_accel, sampled = inertial.at(t_s)
     accel = states[:, 2] + measured_accel
-    cov[:, 2, 2] += np.where(sampled, felt.sample_variance, felt.variance)
+    cov[:, 2, 2] += np.where(sampled, inertial.sample_variance, inertial.variance)
     # from the IMU to the camera
     turning, centripetal = np.cross(rate, lever), np.cross(rate, np.cross(rate, lever))
-    spin = _rate_of_change(attitude, t_s, felt.step_s)
-    cov[:, 2, 2] += _spin_variance(imu, felt.step_s) * float(lever @ lever)
+    spin = _rate_of_change(attitude, t_s, inertial.step_s)
+    cov[:, 2, 2] += _spin_variance(imu, inertial.step_s) * float(lever @ lever)
     cov[:, 1, 1] += _GAIN_SIGMA**2 * float(np.mean(np.var(states[:, 1], axis=0)))
     return SmoothedTrajectory(
         t_s=t_s,
@@ -144,12 +149,12 @@ def smooth_trajectory(
     )
 
 
-def _with_instants(model: _Model, felt: Felt, also_at_s: Array) -> _Model:
+def _with_instants(model: _Model, inertial: WorldAcceleration, also_at_s: Array) -> _Model:
     """The model with states at instants that nothing was measured at."""
     asked = np.unique(np.asarray(also_at_s, dtype=np.float64))
     nearest = np.minimum(np.searchsorted(model.t_s, asked), len(model.t_s) - 1)
     new = np.minimum(np.abs(model.t_s[nearest] - asked), np.abs(model.t_s[nearest - 1] - asked)) > _SAME_S
-    asked = asked[new & (asked > felt.t_s[0]) & (asked < felt.t_s[-1])]
+    asked = asked[new & (asked > inertial.t_s[0]) & (asked < inertial.t_s[-1])]
     t_s = np.concatenate([model.t_s, asked])
     order = np.argsort(t_s)
     t_s, posed = t_s[order], np.argsort(order)[: len(model.t_s)]
@@ -158,7 +163,7 @@ def _with_instants(model: _Model, felt: Felt, also_at_s: Array) -> _Model:
     left_out[posed] = model.left_out
     jumps = np.zeros(len(t_s) - 1, dtype=bool)
     jumps[posed[:-1]] = model.jumps
-    gained, silent = felt.sums(t_s), ~felt.covers(t_s)
+    gained, silent = inertial.sums(t_s), ~inertial.covers(t_s)
     return replace(model, t_s=t_s, measured=measured, gained=gained, silent=silent, left_out=left_out, jumps=jumps)
 
 
@@ -169,13 +174,13 @@ def _rate_of_change(attitude: Attitude, t_s: Array, step_s: float) -> Array:
 
 def _spin_variance(imu: ImuRecording, step_s: float) -> float:
     """Of that angular acceleration, from the gyroscope's white noise."""
-    density = 3e-4 if imu.noise is None else imu.noise.gyro_density_rad_s_rthz
+    density = (imu.noise or TYPICAL_NOISE).gyro_density_rad_s_rthz
     return 2 * density**2 / step_s / (2 * step_s) ** 2
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Model:
-    """Positions of the IMU at the frames (T, 3), what the accelerometer gained until then (T, 2, 3), and what is odd.
+    """Positions of the IMU at the frames (T, 3), what the accelerometer gained until then (T, 2, 3), and the outliers.
 
     ``silent`` are intervals without accelerometer: motion of ``motion_density`` (white acceleration) fills them.
     """
@@ -232,7 +237,7 @@ class _Model:
         )
 
 
-def _without_oddities(model: _Model, limit: float) -> tuple[_Model, Array]:
+def _without_outliers(model: _Model, limit: float) -> tuple[_Model, Array]:
     """The model without the poses and with the jumps that contradict the rest, and its noise."""
     usual = 2 * np.log(_USUAL)
     logs = usual
@@ -241,11 +246,11 @@ def _without_oddities(model: _Model, limit: float) -> tuple[_Model, Array]:
             run = model.select(runs_of(len(model.t_s)))
             logs = most_likely(run.chain, logs, expected=usual, spread=_SPREAD)
         chain = model.chain(logs)
-        wrong, jumped = chain.oddities()
-        left_out, jumps = worst_oddities(model.t_s, wrong, jumped, limit=limit, reach=_REACH_S)
+        wrong, jumped = chain.outlier_statistics()
+        left_out, jumps = worst_outliers(model.t_s, wrong, jumped, limit=limit, reach=_REACH_S)
         left_out, jumps = model.left_out | left_out, model.jumps | jumps
         found = left_out.sum() + jumps.sum()
-        if found == model.left_out.sum() + model.jumps.sum() or found > _MOST_ODD * len(model.t_s):
+        if found == model.left_out.sum() + model.jumps.sum() or found > _MOST_OUTLIERS * len(model.t_s):
             break
         model = replace(model, left_out=left_out, jumps=jumps)
     return model, logs

@@ -11,7 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.errors import FormatError, InertialError
-from colmap_inertial.imaging.multi_aperture import (
+from colmap_inertial.io.aperture_images import ApertureImages
+from colmap_inertial.io.images import read_image
+from colmap_inertial.io.names import path_in
+from colmap_inertial.model import colmap_camera
+from colmap_inertial.multi_aperture import (
     Fused,
     Rectified,
     fuse_apertures,
@@ -19,11 +23,8 @@ from colmap_inertial.imaging.multi_aperture import (
     rectify,
     require_colours,
 )
-from colmap_inertial.io.apertures import AperturePictures
-from colmap_inertial.io.images import read_image
-from colmap_inertial.model import colmap_camera
 from colmap_inertial.options import ApertureOptions
-from colmap_inertial.types import Frame
+from colmap_inertial.types import Frame, Treatment
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -42,7 +43,7 @@ class ApertureStage:
         Folder for ``disparity/NAME.npy`` (px) and ``depth/NAME.npy`` (m), (H, W) float32; nothing is kept where absent.
     """
 
-    pictures: AperturePictures
+    pictures: ApertureImages
     options: ApertureOptions = field(default_factory=ApertureOptions)
     keep: Path | None = field(default=None, compare=False)
     _canvas: list[Rectified] = field(default_factory=list, init=False, compare=False, repr=False)
@@ -51,10 +52,19 @@ class ApertureStage:
         """Fuse the exposures, in order."""
         require_colours(self.pictures.rig)
         for frame in frames:
+            if frame.dropped:
+                yield frame
+                continue
             fused = self.fused(frame.name, frame.image)
             if self.keep is not None:
-                write_maps(self.keep, frame.name, fused)
-            yield replace(frame, image=fused.image, camera=self.pictures.rig.reference.camera)
+                write_maps(self.keep / "disparity", self.keep / "depth", frame.name, fused)
+            said = Treatment(stage="apertures", reason=f"fused of {len(self.pictures.rig.apertures)} sub-images")
+            yield replace(
+                frame,
+                image=fused.image,
+                camera=self.pictures.rig.reference.camera,
+                treatments=(*frame.treatments, said),
+            )
 
     def canvas(self) -> Rectified:
         """The rig's, worked out once."""
@@ -85,10 +95,10 @@ class ApertureStage:
         return fuse_apertures(planes, rig, self.canvas(), self.options)
 
 
-def write_maps(folder: Path, name: str, fused: Fused) -> None:
-    """Write ``disparity/NAME.npy`` and ``depth/NAME.npy``, float32, nan where nothing was measured."""
+def write_maps(disparities: Path, depths: Path, name: str, fused: Fused) -> None:
+    """Write ``NAME.npy`` into both folders, float32, nan where nothing was measured."""
     disparity = np.where(fused.measured, fused.disparity_px, np.float32(np.nan))
-    for kind, values in (("disparity", disparity), ("depth", fused.depth)):
-        target = folder / kind / f"{name}.npy"
+    for folder, values in ((disparities, disparity), (depths, fused.depth)):
+        target = path_in(folder, f"{name}.npy")
         target.parent.mkdir(parents=True, exist_ok=True)
         np.save(target, values.astype(np.float32))

@@ -1,4 +1,4 @@
-"""The default stages that treat frames by the gyroscope: deblurring, and keypoints without the rolling shutter."""
+"""The default frame stage that treats frames by the gyroscope: motion blur undone, or frames left out."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from colmap_inertial.imaging.gate import FrameDecision, GateOptions, RecordingVe
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.parallax import Parallax
 from colmap_inertial.imaging.psf import blur_field
-from colmap_inertial.imaging.restoration import deepgyro, load_network, require_network
-from colmap_inertial.imaging.restoration.shipped import checksum
 from colmap_inertial.imaging.wiener import LONGEST_PX, DeblurOptions, deblur
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.options import BlurRemover, DeblurMethod
-from colmap_inertial.stages.frame_folder import FrameTreatment
+from colmap_inertial.restoration import deepgyro, load_network, require_network
+from colmap_inertial.restoration.shipped import checksum
 from colmap_inertial.stages.gyro_view import GyroView
 from colmap_inertial.threads import frames_at_once, in_order, threads_beside
 from colmap_inertial.types import (
     Frame,
     Projector,
+    Treatment,
 )
 
 
@@ -79,7 +79,6 @@ class DeblurStage:
     method: BlurRemover = "wiener"
     weights: str = field(default="", init=False)
     workers: int | None = field(default=None, compare=False)
-    _done: dict[str, FrameTreatment] = field(default_factory=dict, init=False, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.method not in get_args(BlurRemover):
@@ -94,22 +93,13 @@ class DeblurStage:
         motion, camera, index = self.view.motion(), colmap_camera(self.view.camera), self.view.index()
         decision_of = {decision.name: decision for decision in self.decisions}
 
-        def treat(frame: Frame) -> tuple[str, Frame | None, FrameTreatment | None]:
+        def treat(frame: Frame) -> Frame:
             decision = decision_of.get(frame.name)
-            if decision is None:
-                return frame.name, frame, None
-            shutter = self.view.shutter(index[frame.name])
-            return frame.name, *self._treated(frame, decision, motion, camera, shutter, remove)
+            if decision is None or frame.dropped:
+                return frame
+            return self._treated(frame, decision, motion, camera, self.view.shutter(index[frame.name]), remove)
 
-        for name, frame, treatment in in_order(treat, frames, workers=workers):
-            if treatment is not None:
-                self._done[name] = treatment
-            if frame is not None:
-                yield frame
-
-    def treatment(self, name: str, /) -> FrameTreatment | None:
-        """What was decided about a frame that went through."""
-        return self._done.get(name)
+        yield from in_order(treat, frames, workers=workers)
 
     def _remover(self, workers: int) -> Callable[[Any, BlurField], Any]:
         """Undoes the blur of one frame; ``workers`` call it at once."""
@@ -125,28 +115,27 @@ class DeblurStage:
         camera: Projector,
         shutter: FrameShutter,
         remove: Callable[[Any, BlurField], Any],
-    ) -> tuple[Frame | None, FrameTreatment]:
-        """The frame to go on with (``None`` drops it), and what to say about it."""
-        said = FrameTreatment(reason=decision.reason, blur_px=decision.blur_px)
+    ) -> Frame:
+        """The frame to go on with, and what was decided about it."""
+
+        def said(reason: str, kept_share: float = 1.0, extent_factor: float = 1.0, action: str = "") -> Frame:
+            values = {"blur_px": decision.blur_px, "kept_share": kept_share, "extent_factor": extent_factor}
+            done = Treatment(stage="deblur", reason=reason, action=action, values=values)
+            return replace(frame, treatments=(*frame.treatments, done))
+
         if decision.action == "keep":
-            return frame, said
+            return said(decision.reason)
         if self.verdict.trusted is False:
-            return frame, replace(said, reason=self.verdict.reason)
+            return said(self.verdict.reason)
         if decision.action == "drop":
-            return (None if self.drop and self.verdict.trusted else frame), said
+            return replace(said(decision.reason), dropped=bool(self.drop and self.verdict.trusted))
         try:
             blur = blur_field(motion, camera, shutter, parallax=self.parallaxes.get(frame.name))
         except NotObservableError as error:
-            return frame, replace(said, reason=error.hint)
+            return said(error.hint)
         if float(np.abs(blur.vector_px).max()) * 1.5 > LONGEST_PX:
-            return frame, replace(said, reason=f"{decision.blur_px:.0f} px of blur are too long to be undone")
+            return said(f"{decision.blur_px:.0f} px of blur are too long to be undone")
         image: Any = frame.image  # either of two types of pixel, which the checker would keep apart
         gated = deblur_gated(image, blur, recording=self.verdict, deblur=remove, options=self.gate)
-        said = replace(
-            said,
-            reason=gated.reason,
-            deblurred=gated.deblurred,
-            kept_share=gated.kept_share,
-            extent_factor=gated.extent_factor,
-        )
-        return (replace(frame, image=gated.image) if gated.deblurred else frame), said
+        done = said(gated.reason, gated.kept_share, gated.extent_factor, "deblurred" if gated.deblurred else "")
+        return replace(done, image=gated.image) if gated.deblurred else done

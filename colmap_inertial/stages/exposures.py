@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -12,19 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.errors import FormatError, NotObservableError
+from colmap_inertial.exposure_pairs import ExposurePair, PairGyro, brightened, bring_together, fuse_mertens
 from colmap_inertial.imaging.blur_field import BlurField
-from colmap_inertial.imaging.exposure_fusion import fuse_mertens
-from colmap_inertial.imaging.exposure_pair import ExposurePair, PairGyro, brightened, bring_together
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
-from colmap_inertial.imaging.restoration import load_network, lsd2, shipped
 from colmap_inertial.io.exposures import LongExposures, LongTiming
 from colmap_inertial.io.images import read_image
+from colmap_inertial.io.names import path_in
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.options import ExposureOptions
-from colmap_inertial.stages.frame_folder import FrameTreatment
+from colmap_inertial.restoration import load_network, lsd2, shipped
 from colmap_inertial.stages.gyro_view import GyroView
 from colmap_inertial.threads import frames_at_once, in_order, threads_beside
-from colmap_inertial.types import Frame, Projector
+from colmap_inertial.types import Frame, Projector, Treatment
 
 Light = NDArray[np.float32]
 #: Makes one picture of a short exposure as bright as the long one, the long one in its geometry, and the long one's
@@ -54,7 +53,7 @@ def lsd2_fuser(options: ExposureOptions | None = None) -> Fuser:
     Raises
     ------
     MissingExtraError, FormatError, InertialError
-        As ``imaging.restoration.load_network``.
+        As ``restoration.load_network``.
     """
     options = options or ExposureOptions()
     network = load_network("lsd2", device=options.device, threads=threads_beside(frames_at_once()))
@@ -144,24 +143,17 @@ class ExposureStage:
     view: GyroView | None = None
     long: LongTiming | None = None
     workers: int | None = field(default=None, compare=False)
-    _done: dict[str, FusedPair] = field(default_factory=dict, init=False, compare=False, repr=False)
 
     def __call__(self, frames: Iterator[Frame], /) -> Iterator[Frame]:
         """Fuse the pairs, in order."""
         exposures_s = {} if self.long is None else dict(zip(self.long.names, self.long.exposure_s, strict=True))
         work = partial(self._fused, gyro=self._gyro(), long_exposures_s=exposures_s)
         for frame, done in in_order(work, frames, workers=self.workers or frames_at_once()):
-            self._done[frame.name] = done
-            yield frame
-
-    def treatment(self, name: str, /) -> FrameTreatment | None:
-        """What was decided about a frame that went through."""
-        done = self._done.get(name)
-        return None if done is None else FrameTreatment(reason=done.reason)
-
-    def pairs(self) -> tuple[FusedPair, ...]:
-        """What was done with each pair, in order."""
-        return tuple(self._done.values())
+            if done is None:
+                yield frame
+                continue
+            said = Treatment(stage="exposures", reason=done.reason, values={"pair": asdict(done)})
+            yield replace(frame, treatments=(*frame.treatments, said))
 
     def _gyro(self) -> Callable[[str], PairGyro | None]:
         """The gyroscope's part for each name."""
@@ -183,15 +175,17 @@ class ExposureStage:
 
     def _fused(
         self, frame: Frame, *, gyro: Callable[[str], PairGyro | None], long_exposures_s: Mapping[str, float]
-    ) -> tuple[Frame, FusedPair]:
+    ) -> tuple[Frame, FusedPair | None]:
+        if frame.dropped:
+            return frame, None
         path = self.pictures.path(frame.name)
         long = read_image(path)
         _require_alike(frame, path, long)
         times = gyro(frame.name)
         if times is not None:
-            _require_size(self.folder / frame.name, frame, times.short)
+            _require_size(path_in(self.folder, frame.name), frame, times.short)
         stated = self.pictures.stated_gain(
-            self.folder / frame.name,
+            path_in(self.folder, frame.name),
             path,
             short_exposure_s=frame.exposure_s,
             long_exposure_s=long_exposures_s.get(frame.name),

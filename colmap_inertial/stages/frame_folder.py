@@ -4,54 +4,20 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.errors import FormatError, InertialError
-from colmap_inertial.io.files import read_json, write_json
 from colmap_inertial.io.image_metadata import carry_metadata
+from colmap_inertial.io.names import path_in
+from colmap_inertial.io.records import read_record, write_record
 from colmap_inertial.run.progress import Progress
-from colmap_inertial.run.workspace import a_record_of_ours
 from colmap_inertial.stages.protocols import FrameStage
-from colmap_inertial.types import CameraModel, Frame, FrameTiming
-
-
-@dataclass(frozen=True, kw_only=True)
-class FrameTreatment:
-    """What a frame stage decided about one frame, and why.
-
-    Attributes
-    ----------
-    reason
-        In words.
-    blur_px
-        90th percentile over the image of the blur that the gyroscope predicts; ``None`` where unknown.
-    deblurred
-        Whether pixels were deblurred.
-    kept_share
-        Share of the image that kept its pixels.
-    extent_factor
-        What the predicted blur was multiplied by to agree with the images.
-    """
-
-    reason: str
-    blur_px: float | None = None
-    deblurred: bool = False
-    kept_share: float = 1.0
-    extent_factor: float = 1.0
-
-
-@runtime_checkable
-class ExplainedStage(Protocol):
-    """A frame stage that says what it did to each frame."""
-
-    def treatment(self, name: str, /) -> FrameTreatment | None:
-        """What was decided about a frame that went through; ``None`` where there is nothing to say."""
-        ...
+from colmap_inertial.types import CameraModel, Frame, Treatment
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,18 +29,39 @@ class FrameRecord:
     name
         Image name.
     action
-        ``"passed"``: the original file or pixels; ``"deblurred"``; ``"changed"``: by another frame stage;
-        ``"dropped"``: by a frame stage.
+        ``"passed"``: the original file or pixels; ``"dropped"``: by a frame stage; ``"changed"``: by a frame stage, or
+        the word that the stage itself has for it, such as ``"deblurred"``.
     camera
         Intrinsics that COLMAP starts from; ``None`` where COLMAP guesses.
-    treatment
-        What a stage that explains itself decided; ``None`` where there was none.
+    treatments
+        What the stages said.
     """
 
     name: str
     action: str
-    camera: CameraModel | None
-    treatment: FrameTreatment | None = None
+    camera: CameraModel | None = None
+    treatments: tuple[Treatment, ...] = ()
+
+    @property
+    def used(self) -> bool:
+        """Whether COLMAP sees it."""
+        return self.action != "dropped"
+
+    @property
+    def reason(self) -> str | None:
+        """Why, in the words of the last stage that said something; ``None`` where none did."""
+        return self.treatments[-1].reason if self.treatments else None
+
+    def value(self, key: str) -> Any:
+        """A figure that a stage gave; ``None`` where none did."""
+        return next((t.values[key] for t in reversed(self.treatments) if key in t.values), None)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameRecords:
+    """What happened to the frames of a capture, in order of time."""
+
+    frames: tuple[FrameRecord, ...]
 
 
 class _Originals:
@@ -101,13 +88,14 @@ class _Originals:
 
 def write_frames(
     frames: Iterator[Frame],
-    timing: FrameTiming,
+    names: Sequence[str],
     stages: Sequence[FrameStage],
     *,
     source_folder: Path | None,
     images: Path,
     records: Path,
     progress: Progress,
+    least: int = 3,
 ) -> None:
     """Run the frames through the stages and write them.
 
@@ -115,8 +103,8 @@ def write_frames(
     ----------
     frames
         Decoded frames in order of time.
-    timing
-        Of all frames that the capture has.
+    names
+        Of all these frames, in order.
     source_folder
         Where the original files lie, for image folders: a frame that no stage changed is copied, byte for byte.
     images
@@ -127,48 +115,49 @@ def write_frames(
     Raises
     ------
     InertialError
-        When fewer than three frames are left, which cannot become a model.
+        When fewer than ``least`` frames are left: three, where they are to become a model.
     """
     originals = _Originals()
     stream = originals.tap(frames)
     for stage in stages:
         stream = iter(stage(stream))
-    written: dict[str, FrameRecord] = {}
+    seen: dict[str, FrameRecord] = {}
     images.mkdir(parents=True)
-    known = set(timing.names)
+    known = set(names)
     for frame in stream:
-        if frame.name not in known or frame.name in written:
+        if frame.name not in known or frame.name in seen:
             raise ValueError(f"a frame stage yielded {frame.name!r}, which is no frame of the capture or came twice")
         original = originals.pop_through(frame.name)
-        passed = original is not None and _same_memory(original, frame.image)
-        target = images / frame.name
-        target.parent.mkdir(parents=True, exist_ok=True)
-        if passed and source_folder is not None:
-            shutil.copyfile(source_folder / frame.name, target)
-        else:
-            encode_image(target, frame.image, None if source_folder is None else source_folder / frame.name)
-        written[frame.name] = FrameRecord(
-            name=frame.name, action="passed" if passed else "changed", camera=frame.camera
+        action = "dropped" if frame.dropped else _write(frame, original, source_folder, images)
+        seen[frame.name] = FrameRecord(
+            name=frame.name,
+            action=action,
+            camera=None if frame.dropped else frame.camera,
+            treatments=frame.treatments,
         )
-        progress("frames", len(written), len(timing.names))
-    require_frames(len(written), of=len(timing.names))
-    every = [written.get(name) or FrameRecord(name=name, action="dropped", camera=None) for name in timing.names]
-    for stage in stages:
-        if isinstance(stage, ExplainedStage):
-            every = [_explained(record, stage.treatment(record.name)) for record in every]
-    write_json(records, {"frames": [asdict(record) for record in every]})
+        progress("frames", len(seen), len(names))
+    require_frames(sum(record.used for record in seen.values()), of=len(names), least=least)
+    every = tuple(seen.get(name) or FrameRecord(name=name, action="dropped") for name in names)
+    write_record(records, FrameRecords(frames=every))
 
 
-def _explained(record: FrameRecord, treatment: FrameTreatment | None) -> FrameRecord:
-    if treatment is None:
-        return record
-    action = "deblurred" if record.action == "changed" and treatment.deblurred else record.action
-    return replace(record, action=action, treatment=treatment)
+def _write(frame: Frame, original: NDArray[Any] | None, source_folder: Path | None, images: Path) -> str:
+    """Write the picture of a frame; returns what happened to it."""
+    source = None if source_folder is None else path_in(source_folder, frame.name)
+    target = path_in(images, frame.name)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    passed = original is not None and _same_memory(original, frame.image)
+    if passed and source is not None:
+        shutil.copyfile(source, target)
+    else:
+        encode_image(target, frame.image, source)
+    said = [treatment.action for treatment in frame.treatments if treatment.action]
+    return "passed" if passed else (said or ["changed"])[-1]
 
 
-def require_frames(count: int, *, of: int) -> None:
+def require_frames(count: int, *, of: int, least: int = 3) -> None:
     """Raise ``InertialError`` where there are too few frames for a model."""
-    if count < 3:
+    if count < least:
         raise InertialError(f"{count} frames are left of {of}; a model needs at least three")
 
 
@@ -199,12 +188,4 @@ def encode_image(target: Path, image: NDArray[Any], original: Path | None = None
 
 def read_frame_records(path: Path) -> tuple[FrameRecord, ...]:
     """The records that :func:`write_frames` wrote."""
-    records, values = [], read_json(path)
-    with a_record_of_ours(path):
-        for item in values["frames"]:
-            camera = item["camera"]
-            if camera is not None:
-                camera = CameraModel(**{**camera, "params": tuple(camera["params"])})
-            treatment = None if item["treatment"] is None else FrameTreatment(**item["treatment"])
-            records.append(FrameRecord(name=item["name"], action=item["action"], camera=camera, treatment=treatment))
-    return tuple(records)
+    return read_record(path, FrameRecords).frames

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from colmap_inertial.align import on_camera_rate
+from colmap_inertial.gyro import on_camera_rate
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.types import (
     CameraImuCalibration,
@@ -25,9 +25,7 @@ class GyroView:
     timing
         Of all frames.
     calibration
-        Rotation, time offset and gyroscope bias.
-    clock_rate, clock_middle_s
-        Change of the time offset per second, and the camera time at which it holds.
+        Rotation, time offset with its clock rate, and gyroscope bias.
     camera
         Intrinsics.
     source
@@ -39,23 +37,13 @@ class GyroView:
     imu: ImuRecording
     timing: FrameTiming
     calibration: CameraImuCalibration
-    clock_rate: float = 0.0
-    clock_middle_s: float = 0.0
     camera: CameraModel
     source: str
     notes: tuple[str, ...] = ()
 
     def recording(self) -> ImuRecording:
         """The recording on a clock that runs as the camera's does; one offset holds for all of it."""
-        if self.clock_rate == 0:
-            return self.imu
-        return on_camera_rate(
-            self.imu,
-            self.calibration,
-            clock_rate=self.clock_rate,
-            middle_s=self.clock_middle_s,
-            trajectory_epoch_ns=self.timing.epoch_ns,
-        )
+        return on_camera_rate(self.imu, self.calibration, camera_epoch_ns=self.timing.epoch_ns)
 
     def motion(self) -> GyroCamera:
         """The gyroscope on the camera's clock."""

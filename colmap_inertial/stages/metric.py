@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from colmap_inertial.align import on_camera_rate
 from colmap_inertial.geometry import quat_rotate
 from colmap_inertial.io.trajectories import write_tum
-from colmap_inertial.model import Model, apply_similarity, read_model, trajectory_from_model
+from colmap_inertial.model import Model, doubted, trajectory_from_model
 from colmap_inertial.options import ScaleOptions, WorldAxes
 from colmap_inertial.scale import estimate_scale
 from colmap_inertial.smooth import smooth_trajectory
+from colmap_inertial.stages.rolling_shutter import for_rectified
 from colmap_inertial.types import (
     Array,
     CameraImuCalibration,
@@ -41,31 +40,35 @@ class MetricStage:
         Of the scale estimate.
     world
         Where gravity points in the metric model.
-    doubts
-        What was found wrong with the recording beforehand; with any of them, no scale is trusted.
     """
 
     imu: ImuRecording
     calibration: CameraImuCalibration | None
-    options: ScaleOptions
-    world: WorldAxes
-    doubts: tuple[str, ...] = ()
+    options: ScaleOptions = field(default_factory=ScaleOptions)
+    world: WorldAxes = "z-up"
 
     def __call__(self, model: Model, /) -> Model:
         """Estimate and apply the scale."""
-        trajectory, notes = trajectory_from_model(read_model(model.folder), model.timing)
-        estimate = estimate_scale(trajectory, self.imu, calibration=self.calibration, options=self.options)
-        estimate = dataclasses.replace(estimate, reasons=(*self.doubts, *estimate.reasons, *self.imu.repairs, *notes))
-        if self.doubts and estimate.verdict == "trusted":
-            estimate = dataclasses.replace(estimate, verdict="weak")
-        if estimate.verdict == "refused":
-            return dataclasses.replace(model, scale=estimate)
-        similarity = Similarity.from_scale(
-            estimate, world=self.world, provenance=f"inertial scale, method {estimate.method}, {estimate.verdict}"
+        trajectory, notes = trajectory_from_model(model.reconstruction, model.timing)
+        estimate = estimate_scale(
+            trajectory, self.imu, calibration=of_model(self.calibration, model), options=self.options
         )
-        metric = model.folder.with_name(model.folder.name + "_metric")
-        apply_similarity(model.folder, metric, similarity)
-        return dataclasses.replace(model, folder=metric, scale=estimate, similarity=similarity)
+        estimate = replace(estimate, reasons=(*estimate.reasons, *self.imu.repairs, *notes))
+        estimate = doubted(estimate, model.doubts)
+        if estimate.verdict == "refused":
+            return model.scaled(estimate, None)
+        similarity = Similarity.from_scale(estimate, world=self.world, provenance=provenance(estimate))
+        return model.scaled(estimate, similarity)
+
+
+def provenance(estimate: ScaleEstimate) -> str:
+    """Where an inertial scale comes from, in words."""
+    return f"inertial scale, method {estimate.method}, {estimate.verdict}"
+
+
+def of_model(calibration: CameraImuCalibration | None, model: Model) -> CameraImuCalibration | None:
+    """What is known of the camera that a model was mapped for: of rectified keypoints, hardly any readout is left."""
+    return for_rectified(calibration) if model.rectified and calibration is not None else calibration
 
 
 def smoothed_path(
@@ -82,14 +85,6 @@ def smoothed_path(
     """
     if estimate.calibration is None:
         raise ValueError("a refused scale says nothing of the IMU")
-    if estimate.clock_rate != 0:
-        imu = on_camera_rate(
-            imu,
-            estimate.calibration,
-            clock_rate=estimate.clock_rate,
-            middle_s=estimate.clock_middle_s,
-            trajectory_epoch_ns=trajectory.epoch_ns,
-        )
     return smooth_trajectory(
         trajectory,
         imu,
@@ -102,7 +97,7 @@ def smoothed_path(
 
 def metric_trajectory(trajectory: CameraTrajectory) -> CameraTrajectory:
     """The trajectory of a model that is in metres, said to be so."""
-    return dataclasses.replace(trajectory, length_unit="m")
+    return replace(trajectory, length_unit="m")
 
 
 def gravity_in_model(model: Model) -> Array | None:

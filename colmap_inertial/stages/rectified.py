@@ -2,49 +2,61 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any
 
-from colmap_inertial.imaging.rolling_shutter import rectify_image
 from colmap_inertial.io.images import read_image
-from colmap_inertial.model import colmap_camera
+from colmap_inertial.io.names import path_in
 from colmap_inertial.run.progress import Progress
-from colmap_inertial.stages.frame_folder import FrameRecord, encode_image
-from colmap_inertial.stages.rolling_shutter import RollingShutterStage
+from colmap_inertial.stages.frame_folder import encode_image
+from colmap_inertial.stages.protocols import KeypointStage
 from colmap_inertial.threads import in_order
+
+#: Moves the pixels of a named image as a keypoint stage moves its keypoints.
+ImageMover = Callable[[str, Any], Any]
+
+
+def image_movers(stages: Sequence[KeypointStage]) -> list[ImageMover]:
+    """Those of the keypoint stages that can move pixels, too: by a method ``move_image(name, image)``."""
+    return [stage.move_image for stage in stages if hasattr(stage, "move_image")]
 
 
 def write_rectified(
-    stage: RollingShutterStage, records: Sequence[FrameRecord], images: Path, target: Path, progress: Progress
+    movers: Sequence[ImageMover],
+    names: Sequence[str],
+    rectified: Collection[str],
+    images: Path,
+    target: Path,
+    progress: Progress,
 ) -> None:
-    """Write the images that COLMAP saw as a global shutter would have taken them; what cannot be rectified is copied.
+    """Write the images that COLMAP saw as a global shutter would have taken them; what was not rectified is copied.
 
     Parameters
     ----------
-    stage
-        That rectified the keypoints.
-    records
-        Of all frames; those that were dropped have no image.
+    movers
+        Applied one after the other.
+    names
+        Of all images.
+    rectified
+        Names of those whose keypoints were rectified.
     images, target
         Folders of the images and of the rectified ones.
     progress
         Called with ``"rectified"``.
     """
-    view = stage.view
-    motion, camera, index = view.motion(), colmap_camera(view.camera), view.index()
 
     def work(name: str) -> None:
-        source, out = images / name, target / name
+        source, out = path_in(images, name), path_in(target, name)
         out.parent.mkdir(parents=True, exist_ok=True)
-        if stage.covers(name):
-            original: Any = read_image(source)
-            image, _ = rectify_image(original, motion, camera, view.shutter(index[name]))
+        if name in rectified:
+            image: Any = read_image(source)
+            for move in movers:
+                image = move(name, image)
             encode_image(out, image, source)
         else:
             out.write_bytes(source.read_bytes())
 
-    names = [record.name for record in records if record.action != "dropped"]
     target.mkdir(parents=True)
     progress("rectified", 0, len(names))
     for done, _ in enumerate(in_order(work, names, workers=2), start=1):

@@ -3,26 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from colmap_inertial.imaging.gyro_camera import GyroCamera
-from colmap_inertial.imaging.rolling_shutter import rectify_keypoints
+from colmap_inertial.imaging.rolling_shutter import rectify_image, rectify_keypoints
 from colmap_inertial.io.calibration import SMALLEST_READOUT_S
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.stages.gyro_view import GyroView
 from colmap_inertial.types import (
-    CALIBRATION_PARAMETERS,
+    CAL,
     Array,
     CameraImuCalibration,
+    Keypoints,
     Projector,
+    Treatment,
 )
 
 #: Share of the readout that acts on poses after rectification.
 _LEFT_SHARE = 0.1
-
-
-_READOUT = CALIBRATION_PARAMETERS.index("readout_s")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -43,13 +43,31 @@ class RollingShutterStage:
         default_factory=dict, init=False, compare=False, repr=False
     )
 
-    def __call__(self, name: str, keypoints_px: Array, /) -> Array:
+    def __call__(self, keypoints: Keypoints, /) -> Keypoints:
         """Move the keypoints of one image."""
+        name = keypoints.name
         if not self.covers(name):
-            return keypoints_px
+            said = Treatment(stage="rolling_shutter", reason="the gyroscope does not cover the whole readout")
+            return replace(keypoints, treatments=(*keypoints.treatments, said))
+        said = Treatment(stage="rolling_shutter", reason="undone by the gyroscope", action="rectified")
+        return replace(
+            keypoints,
+            xy_px=self.moved(name, keypoints.xy_px),
+            rectified=True,
+            treatments=(*keypoints.treatments, said),
+        )
+
+    def moved(self, name: str, xy_px: Array) -> Array:
+        """(N, 2) where a global shutter would have seen points of an image that the gyroscope covers."""
         motion, camera, index = self._parts()
-        shutter = self.view.shutter(index[name])
-        return np.asarray(rectify_keypoints(keypoints_px, motion, camera, shutter), dtype=np.float64)
+        return np.asarray(rectify_keypoints(xy_px, motion, camera, self.view.shutter(index[name])), dtype=np.float64)
+
+    def move_image(self, name: str, image: Any, /) -> Any:
+        """The pixels of one image as a global shutter would have taken them."""
+        if not self.covers(name):
+            return image
+        motion, camera, index = self._parts()
+        return rectify_image(image, motion, camera, self.view.shutter(index[name]))[0]
 
     def covers(self, name: str) -> bool:
         """Whether the gyroscope recorded the whole readout of a frame."""
@@ -68,6 +86,6 @@ def for_rectified(calibration: CameraImuCalibration) -> CameraImuCalibration:
     Its standard deviation stands for what the camera's translation does within the readout, which stays.
     """
     cov = calibration.cov.copy()
-    cov[_READOUT, :] = cov[:, _READOUT] = 0.0
-    cov[_READOUT, _READOUT] = max(SMALLEST_READOUT_S, _LEFT_SHARE * calibration.readout_s) ** 2
+    cov[CAL.READOUT, :] = cov[:, CAL.READOUT] = 0.0
+    cov[CAL.READOUT, CAL.READOUT] = max(SMALLEST_READOUT_S, _LEFT_SHARE * calibration.readout_s) ** 2
     return replace(calibration, readout_s=0.0, cov=cov)

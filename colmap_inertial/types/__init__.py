@@ -11,8 +11,10 @@ from __future__ import annotations
 from colmap_inertial.types._checks import Array
 from colmap_inertial.types.apertures import Aperture, ApertureRig, SpectralRole
 from colmap_inertial.types.estimated import (
+    CAL,
     CALIBRATION_PARAMETERS,
     DOWN_IN_WORLD,
+    AcceptedScale,
     CameraImuCalibration,
     ScaleDrift,
     ScaleEstimate,
@@ -21,6 +23,8 @@ from colmap_inertial.types.estimated import (
     Verdict,
 )
 from colmap_inertial.types.recorded import (
+    JOINT_GYRO_NOISE,
+    TYPICAL_NOISE,
     CameraModel,
     CameraTrajectory,
     Frame,
@@ -28,15 +32,21 @@ from colmap_inertial.types.recorded import (
     FrameTiming,
     ImuNoise,
     ImuRecording,
+    Keypoints,
     LengthUnit,
     Projector,
     ReadoutDirection,
+    Treatment,
     clock_shift_s,
 )
 
 __all__ = [
+    "CAL",
     "CALIBRATION_PARAMETERS",
     "DOWN_IN_WORLD",
+    "JOINT_GYRO_NOISE",
+    "TYPICAL_NOISE",
+    "AcceptedScale",
     "Aperture",
     "ApertureRig",
     "Array",
@@ -48,6 +58,7 @@ __all__ = [
     "FrameTiming",
     "ImuNoise",
     "ImuRecording",
+    "Keypoints",
     "LengthUnit",
     "Projector",
     "ReadoutDirection",
@@ -56,6 +67,7 @@ __all__ = [
     "Similarity",
     "SmoothedTrajectory",
     "SpectralRole",
+    "Treatment",
     "Verdict",
     "clock_shift_s",
 ]

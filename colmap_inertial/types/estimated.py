@@ -37,6 +37,18 @@ CALIBRATION_PARAMETERS = (
 )
 
 
+class CAL:
+    """Where they stand: indices of the numbers, slices of the vectors of ``CALIBRATION_PARAMETERS``."""
+
+    ROTATION = slice(0, 3)
+    GYRO_TIME_OFFSET, ACCEL_TIME_OFFSET = 3, 4
+    TIME_OFFSETS = slice(3, 5)
+    GYRO_BIAS = slice(5, 8)
+    LEVER_ARM = slice(8, 11)
+    READOUT = 11
+    COUNT = 12
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CameraImuCalibration:
     """How the camera and the IMU of one device relate.
@@ -55,6 +67,10 @@ class CameraImuCalibration:
         Rolling-shutter readout; 0 for a global shutter.
     cov
         (12, 12) in the order of ``CALIBRATION_PARAMETERS``. Wide where nothing is known.
+    clock_rate, clock_middle_s
+        Growth of the time offsets per second of the camera's clock (0 where the clocks keep step), and the camera
+        time, since the epoch of the frame times, at which the offsets hold. ``gyro.on_camera_rate`` makes of a
+        recording one for which they hold throughout.
     """
 
     cam_from_imu_xyzw: Array
@@ -64,21 +80,33 @@ class CameraImuCalibration:
     imu_in_cam_m: Array
     readout_s: float
     cov: Array
+    clock_rate: float = 0.0
+    clock_middle_s: float = 0.0
 
     def __post_init__(self) -> None:
-        n = len(CALIBRATION_PARAMETERS)
         set_fields(
             self,
             cam_from_imu_xyzw=checked_quaternions("cam_from_imu_xyzw", self.cam_from_imu_xyzw, (4,)),
             gyro_bias_rad_s=checked_array("gyro_bias_rad_s", self.gyro_bias_rad_s, (3,)),
             imu_in_cam_m=checked_array("imu_in_cam_m", self.imu_in_cam_m, (3,)),
-            cov=checked_covariance("cov", self.cov, (n, n)),
+            cov=checked_covariance("cov", self.cov, (CAL.COUNT, CAL.COUNT)),
         )
+        if not (abs(self.clock_rate) < 1 and math.isfinite(self.clock_middle_s)):
+            raise ValueError("clock_rate must lie between -1 and 1, clock_middle_s must be finite")
 
     def sigma(self, parameter: str) -> float:
         """Standard deviation of one of ``CALIBRATION_PARAMETERS``."""
         i = CALIBRATION_PARAMETERS.index(parameter)
         return float(np.sqrt(self.cov[i, i]))
+
+    @property
+    def rotation_sigma_rad(self) -> float:
+        """Standard deviation of the rotation about the camera axis about which it is known worst."""
+        return float(np.sqrt(np.diagonal(self.cov)[CAL.ROTATION].max()))
+
+    def drift_s(self, t_cam_s: Array) -> Array:
+        """How much the time offsets have grown since ``clock_middle_s``, at camera times of any shape."""
+        return np.asarray(self.clock_rate * (t_cam_s - self.clock_middle_s))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -172,6 +200,38 @@ class ScaleDrift:
         }
 
 
+#: What a scale's JSON says of the calibration, in this order, and where there is none.
+_CALIBRATED: dict[str, float | None] = {
+    "gyro_bias_rad_s": None,
+    "cam_from_imu_xyzw": None,
+    "imu_in_cam_m": None,
+    "gyro_time_offset_s": None,
+    "accel_time_offset_s": None,
+    "clock_rate": 0.0,
+    "clock_middle_s": 0.0,
+    "readout_s": None,
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class AcceptedScale:
+    """The numbers of a scale that was not refused.
+
+    Attributes
+    ----------
+    metres_per_unit
+        Metres per model unit.
+    sigma_log
+        Standard deviation of its logarithm.
+    ci95
+        Its 95 % interval.
+    """
+
+    metres_per_unit: float
+    sigma_log: float
+    ci95: tuple[float, float]
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ScaleEstimate:
     """Metres per model unit, with its uncertainty and a verdict.
@@ -192,9 +252,6 @@ class ScaleEstimate:
         (3,) IMU frame; the true specific force is the reading minus this.
     calibration
         The camera-IMU calibration that the estimate refined.
-    clock_rate, clock_middle_s
-        Change of the calibration's time offsets per second, 0 where the clocks keep step, and the camera time, since
-        the trajectory's epoch, at which the offsets hold.
     cov
         (7, 7) of log scale, gravity (m/s2, world frame), accelerometer bias (m/s2).
     chi2, dof
@@ -204,7 +261,7 @@ class ScaleEstimate:
     drift
         Whether the scale stays the same along the recording; ``None`` where the method does not tell.
     method
-        ``"spectral"`` or ``"joint"``.
+        ``"spectral"`` or ``"joint"``; ``"none"`` where nothing could be estimated.
     """
 
     metres_per_unit: float | None
@@ -216,8 +273,6 @@ class ScaleEstimate:
     gravity_in_world_m_s2: Array | None = None
     accel_bias_m_s2: Array | None = None
     calibration: CameraImuCalibration | None = None
-    clock_rate: float = 0.0
-    clock_middle_s: float = 0.0
     cov: Array | None = None
     chi2: float | None = None
     dof: int | None = None
@@ -239,13 +294,38 @@ class ScaleEstimate:
         if self.cov is not None:
             set_fields(self, cov=checked_covariance("cov", self.cov, (7, 7)))
 
+    @classmethod
+    def refused(cls, method: str, *reasons: str, calibration: CameraImuCalibration | None = None) -> ScaleEstimate:
+        """No scale, for these reasons."""
+        return cls(
+            metres_per_unit=None,
+            sigma_log=None,
+            ci95=None,
+            verdict="refused",
+            method=method,
+            reasons=reasons,
+            calibration=calibration,
+        )
+
+    @property
+    def accepted(self) -> AcceptedScale:
+        """The numbers, which a scale that was not refused has.
+
+        Raises
+        ------
+        NotObservableError
+            When it was refused.
+        """
+        if self.metres_per_unit is None or self.sigma_log is None or self.ci95 is None:
+            raise NotObservableError("scale", "; ".join(self.reasons))
+        return AcceptedScale(metres_per_unit=self.metres_per_unit, sigma_log=self.sigma_log, ci95=self.ci95)
+
     def as_json(self) -> dict[str, object]:
         """The estimate in JSON types; ``None`` where a refusal has no number."""
 
-        def plain(value: Array | None) -> object:
-            return None if value is None else value.tolist()
+        def plain(value: object) -> object:
+            return value.tolist() if isinstance(value, np.ndarray) else value
 
-        calibration = self.calibration
         return {
             "metres_per_unit": self.metres_per_unit,
             "ci95": None if self.ci95 is None else list(self.ci95),
@@ -254,14 +334,8 @@ class ScaleEstimate:
             "reasons": list(self.reasons),
             "gravity_in_world_m_s2": plain(self.gravity_in_world_m_s2),
             "accel_bias_m_s2": plain(self.accel_bias_m_s2),
-            "gyro_bias_rad_s": plain(None if calibration is None else calibration.gyro_bias_rad_s),
-            "cam_from_imu_xyzw": plain(None if calibration is None else calibration.cam_from_imu_xyzw),
-            "imu_in_cam_m": plain(None if calibration is None else calibration.imu_in_cam_m),
-            "gyro_time_offset_s": None if calibration is None else calibration.gyro_time_offset_s,
-            "accel_time_offset_s": None if calibration is None else calibration.accel_time_offset_s,
-            "clock_rate": self.clock_rate,
-            "clock_middle_s": self.clock_middle_s,
-            "readout_s": None if calibration is None else calibration.readout_s,
+            # where camera and IMU could not be brought together, these are unknown
+            **{name: plain(getattr(self.calibration, name, unknown)) for name, unknown in _CALIBRATED.items()},
             "cov": plain(self.cov),
             "chi2": self.chi2,
             "dof": self.dof,

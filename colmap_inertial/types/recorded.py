@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_inertial.geometry import quat_conjugate, quat_log, quat_multiply
 from colmap_inertial.types._checks import (
     Array,
     checked_array,
@@ -42,6 +44,17 @@ class ImuNoise:
         for name, value in vars(self).items():
             if not (np.isfinite(value) and value >= 0):
                 raise ValueError(f"{name}: must be finite and not negative")
+
+
+#: A phone's IMU where no data sheet is at hand: gyroscopes have 1e-4 to 1e-3 rad/s/sqrt(Hz). The accelerometer's white
+#: noise is ten times the data sheets' of consumer MEMS, as sensors in use show (vibration, bandwidth, jitter).
+TYPICAL_NOISE = ImuNoise(
+    gyro_density_rad_s_rthz=3e-4, accel_density_m_s2_rthz=5e-3, gyro_walk_rad_s2_rthz=3e-4, accel_walk_m_s3_rthz=3e-4
+)
+#: Density and walk of the gyroscope where its gains and axis errors are estimated along, as the joint fit does: three
+#: times the data sheets of consumer MEMS (MPU-6500 1.7e-4, BMI160 1.2e-4, LSM6DS3 1.2e-4), and a walk without what
+#: those errors add to it as the device turns.
+JOINT_GYRO_NOISE = (4.5e-4, 1e-4)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -120,6 +133,28 @@ class Projector(Protocol):
     def img_from_cam(self, cam_points: Array, /) -> Array: ...
 
 
+@dataclass(frozen=True, kw_only=True)
+class Treatment:
+    """What a stage decided about a frame, its keypoints or a model, and why; it travels with what it is about.
+
+    Attributes
+    ----------
+    stage
+        Which stage, in a word.
+    reason
+        In words.
+    action
+        What became of it, in a word (``"deblurred"``); empty where nothing was changed.
+    values
+        Figures, in JSON types.
+    """
+
+    stage: str
+    reason: str
+    action: str = ""
+    values: Mapping[str, object] = field(default_factory=dict)
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Frame:
     """One decoded frame on its way to feature extraction.
@@ -139,6 +174,11 @@ class Frame:
         From the first row to one past the last; 0 is a global shutter; ``None`` where unknown.
     camera
         ``None`` lets COLMAP calibrate.
+    dropped
+        Whether COLMAP shall not see it. A stage that yields a dropped frame can say why; one that is simply not
+        yielded is dropped without a reason.
+    treatments
+        What the stages before did, in order.
     """
 
     name: str
@@ -147,6 +187,8 @@ class Frame:
     exposure_s: float | None = None
     readout_s: float | None = None
     camera: CameraModel | None = None
+    dropped: bool = False
+    treatments: tuple[Treatment, ...] = ()
 
     def __post_init__(self) -> None:
         if self.image.ndim not in (2, 3) or self.image.dtype not in (np.uint8, np.uint16):
@@ -154,6 +196,31 @@ class Frame:
         view = self.image.view()
         view.setflags(write=False)
         set_fields(self, image=view)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Keypoints:
+    """Where the features of one image are, on their way to matching.
+
+    Attributes
+    ----------
+    name
+        The image's.
+    xy_px
+        (N, 2) COLMAP's pixel coordinates. A stage may move them, and keeps their number and order.
+    rectified
+        Whether they are where a global shutter would have seen them.
+    treatments
+        What the stages before did, in order.
+    """
+
+    name: str
+    xy_px: Array
+    rectified: bool = False
+    treatments: tuple[Treatment, ...] = ()
+
+    def __post_init__(self) -> None:
+        set_fields(self, xy_px=checked_array("xy_px", self.xy_px, (None, 2)))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -228,8 +295,6 @@ class FrameLog:
         (F, 3) unit vectors away from the ground, IMU frame, as the recorder's own filter saw them.
     start_from_imu_xyzw
         (F, 4) orientations of the device against the first frame's, by the recorder's own filter.
-    image_from_cam_xyzw
-        (F, 4) how the recorder turned each picture against its lens.
     """
 
     t_s: Array
@@ -246,7 +311,6 @@ class FrameLog:
     camera: CameraModel | None = None
     up_in_imu: Array | None = None
     start_from_imu_xyzw: Array | None = None
-    image_from_cam_xyzw: Array | None = None
 
     def __post_init__(self) -> None:
         t_s = checked_times("t_s", self.t_s)
@@ -254,9 +318,9 @@ class FrameLog:
         for name in ("exposure_s", "iso", "focal_px"):
             if getattr(self, name) is not None:
                 set_fields(self, **{name: checked_array(name, getattr(self, name), (len(t_s),))})
-        for name in ("start_from_imu_xyzw", "image_from_cam_xyzw"):
-            if getattr(self, name) is not None:
-                set_fields(self, **{name: checked_quaternions(name, getattr(self, name), (len(t_s), 4))})
+        if self.start_from_imu_xyzw is not None:
+            checked = checked_quaternions("start_from_imu_xyzw", self.start_from_imu_xyzw, (len(t_s), 4))
+            set_fields(self, start_from_imu_xyzw=checked)
         if self.up_in_imu is not None:
             set_fields(self, up_in_imu=checked_array("up_in_imu", self.up_in_imu, (len(t_s), 3)))
         if self.readout_s is not None and not 0 <= self.readout_s < 1:
@@ -307,16 +371,20 @@ class CameraTrajectory:
     def __len__(self) -> int:
         return len(self.t_s)
 
+    def turn_rad(self) -> Array:
+        """(F-1, 3) rotation vectors ``before_from_after`` of consecutive frames, camera frame."""
+        pose = self.cam_from_world_xyzw
+        return quat_log(quat_multiply(pose[:-1], quat_conjugate(pose[1:])))
+
     def select(self, keep: NDArray[np.bool_] | NDArray[np.intp] | slice) -> CameraTrajectory:
         """The poses that ``keep`` (mask, increasing indices or slice) picks."""
         index = np.arange(len(self))[keep]
-        return CameraTrajectory(
+        return replace(
+            self,
             names=tuple(self.names[i] for i in index),
             t_s=self.t_s[index],
             cam_from_world_xyzw=self.cam_from_world_xyzw[index],
             cam_in_world=self.cam_in_world[index],
-            length_unit=self.length_unit,
-            epoch_ns=self.epoch_ns,
             pose_cov=None if self.pose_cov is None else self.pose_cov[index],
         )
 

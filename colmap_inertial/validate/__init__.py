@@ -1,7 +1,7 @@
 """Is a reconstruction the right size? Checked with a target of known size in its images."""
 
 from colmap_inertial.validate.measure import validate_model
-from colmap_inertial.validate.pictures import write_pictures
+from colmap_inertial.validate.overlays import write_overlays
 from colmap_inertial.validate.result import (
     Corner,
     Distance,
@@ -25,5 +25,5 @@ __all__ = [
     "parse_target",
     "validate_model",
     "validation_table",
-    "write_pictures",
+    "write_overlays",
 ]

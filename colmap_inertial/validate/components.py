@@ -65,11 +65,11 @@ def normal_equations(obs: Observations, at: Placement) -> tuple[Normal, Array, A
     if not np.isfinite(residual).all():
         raise NotObservableError("scale", "the target was placed behind a camera that saw it")
     parts = len(at.rotation)
-    turned = np.exp(at.log_scale) * np.einsum("mij,mj->mi", at.rotation[obs.part], obs.target_m)
+    rotated = np.exp(at.log_scale) * np.einsum("mij,mj->mi", at.rotation[obs.part], obs.target_m)
     jac_world = jac @ obs.cam_from_world[obs.view]
     a = np.zeros((len(obs), 2, 1 + 6 * parts))
-    a[:, :, 0] = np.einsum("mij,mj->mi", jac_world, turned)
-    block = np.concatenate([-jac_world @ skew(turned), jac_world], axis=2)
+    a[:, :, 0] = np.einsum("mij,mj->mi", jac_world, rotated)
+    block = np.concatenate([-jac_world @ skew(rotated), jac_world], axis=2)
     columns = 1 + 6 * obs.part[:, None] + np.arange(6)
     np.put_along_axis(a, np.broadcast_to(columns[:, None, :], block.shape), block, axis=2)
 
@@ -140,6 +140,9 @@ def estimate_ratio(n: Normal) -> Array:
     # an error of this variance, in each dimension of its kind, is as large as its uncertainty from one view's corners
     unit = len(n.bb) * _DIMENSIONS / np.einsum("kvij,vji->k", n.shapes, n.bb)
     low, high = np.log(_NEGLIGIBLE / 4), np.log(_LARGEST)
+    none = np.zeros(len(unit))
+    if np.isinf(solve(*weighted(n, none)[1:3])[1]):  # the views leave the scale free: its equations cannot be solved
+        return none
 
     def cost(log_ratio: Array) -> tuple[float, Array]:
         ratio = unit * np.exp(log_ratio)
@@ -149,7 +152,6 @@ def estimate_ratio(n: Normal) -> Array:
     starts = [np.full(len(unit), np.log(r)) for r in (0.3, 10.0, 300.0, 1e4)]
     start = min(starts, key=lambda x: cost(x)[0])
     found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=[(low, high)] * len(unit))
-    none = np.zeros(len(unit))
     if restricted_likelihood(n, none)[0] - found.fun < _EVIDENCE:
         return none
     return np.where(np.exp(found.x) < _NEGLIGIBLE, 0.0, unit * np.exp(found.x))

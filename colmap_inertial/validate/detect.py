@@ -98,12 +98,16 @@ def _checkerboards(image: Grey, target: Target, thorough: bool) -> Iterator[Dete
         grid = xy.reshape(target.rows, target.columns, 2)
         refined, good = _refine(image, xy, 0.4 * _spacing_px(grid).ravel(), allowed_px=1.0 / factor)
         if good.sum() >= 6:
-            yield Detection(part=0, corner=np.flatnonzero(good), xy_px=colmap_px_from_opencv(refined[good]))
+            yield _detection(np.arange(len(xy)), refined, good)
         # paint over what was found, squares outside the inner corners included, and look again
         hull = cv2.convexHull(corners.reshape(-1, 1, 2)).reshape(-1, 2)
         centre = hull.mean(axis=0)
         grown = centre + (hull - centre) * (1 + 2.5 / (min(target.columns, target.rows) - 1))
         cv2.fillConvexPoly(small, np.round(grown).astype(np.int32), float(np.median(small)))
+
+
+def _detection(corner: Index, xy: Array, good: NDArray[np.bool_]) -> Detection:
+    return Detection(part=0, corner=corner[good], xy_px=colmap_px_from_opencv(xy[good]))
 
 
 def _shrunk(image: Grey) -> tuple[Grey, float]:
@@ -137,13 +141,10 @@ def _find_checkerboard(image: Grey, target: Target, *, fallback: bool) -> NDArra
 def _spacing_px(grid: Array) -> Array:
     """Distance of each corner of a grid (R, C, 2) to its nearest neighbour along the lines; nan where missing."""
     out = np.full(grid.shape[:2], np.inf)
-    for axis in (0, 1):
-        step = np.linalg.norm(np.diff(grid, axis=axis), axis=2)
-        step = np.where(np.isnan(step), np.inf, step)
-        ahead, behind = [(0, 0), (0, 0)], [(0, 0), (0, 0)]
-        ahead[axis], behind[axis] = (0, 1), (1, 0)
-        out = np.minimum(out, np.pad(step, ahead, constant_values=np.inf))
-        out = np.minimum(out, np.pad(step, behind, constant_values=np.inf))
+    for view, steps in ((out, grid), (out.T, grid.swapaxes(0, 1))):
+        step = np.nan_to_num(np.linalg.norm(np.diff(steps, axis=0), axis=2), nan=np.inf, posinf=np.inf)
+        for side in (view[:-1], view[1:]):
+            np.minimum(side, step, out=side)
     return out
 
 
@@ -260,7 +261,7 @@ def _aprilgrid(image: Grey, target: Target) -> list[Detection]:
         xy, good = _refine(image, corners[pick].reshape(-1, 2), half, allowed_px=np.inf)
         which = (4 * number[pick][:, None] + np.arange(4)).ravel()
         if good.sum() >= 4:
-            out.append(Detection(part=0, corner=which[good], xy_px=colmap_px_from_opencv(xy[good])))
+            out.append(_detection(which, xy, good))
     return out
 
 
@@ -294,7 +295,7 @@ def _charuco(image: Grey, target: Target) -> list[Detection]:
             half = spacing * min(0.4, 0.45 * (1 - target.marker_m / target.length_m))
             refined, good = _refine(image, start, half, allowed_px=2.0)
             if good.sum() >= 4:
-                out.append(Detection(part=0, corner=which[good], xy_px=colmap_px_from_opencv(refined[good])))
+                out.append(_detection(which, refined, good))
         if out or target.rows % 2:
             break
     return out

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.errors import NotObservableError, TargetNotFoundError
+from colmap_inertial.io.files import StrPath
 from colmap_inertial.options import ValidateOptions
 from colmap_inertial.threads import one_blas_thread
 from colmap_inertial.types import Array
@@ -40,7 +42,7 @@ _LEAST_CORNERS = 4
 _OUTLIER_SIGMA = 5.0
 _OUTLIER_VIEW = 4.0
 _WIDEST_LOG = float(np.log(1.3))
-_ODD_PART = 0.05
+_OUTLYING_PART = 0.05
 
 
 #: Smallest part of the images with sightings that must agree. Two boards in view leave half of them.
@@ -50,7 +52,7 @@ _SMALLEST_AGREEMENT = 0.2
 @one_blas_thread()
 def validate_model(
     model: Path | pycolmap.Reconstruction,
-    images: Path,
+    images: StrPath,
     target: Target,
     options: ValidateOptions | None = None,
     *,
@@ -87,6 +89,7 @@ def validate_model(
     NotObservableError
         When it is in one image only, or all views of it lie along one line.
     """
+    images = Path(images)
     options = ValidateOptions() if options is None else options
     views, missing = load_views(model, images)
     search = Search(views, target, options, progress)
@@ -124,30 +127,24 @@ def _require_agreement(search: Search, placed: dict[int, PartPlacement]) -> None
         )
 
 
-def _reject_odd_parts(search: Search, placed: dict[int, PartPlacement]) -> tuple[dict[int, PartPlacement], list[str]]:
+def _reject_outliers(search: Search, placed: dict[int, PartPlacement]) -> tuple[dict[int, PartPlacement], list[str]]:
     """Single markers whose size differs from the others' by more than 5 % are not what the description says."""
     logs = {p: part.placement.log_scale for p, part in placed.items()}
-    weight = {p: len(part.chosen) for p, part in placed.items()}
     order = sorted(logs, key=lambda p: logs[p])
-    half = 0.5 * sum(weight.values())
-    running, middle = 0.0, logs[order[0]]
-    for p in order:
-        running += weight[p]
-        if running >= half:
-            middle = logs[p]
-            break
-    odd = [p for p in placed if abs(logs[p] - middle) > _ODD_PART]
+    running = np.cumsum([len(placed[p].chosen) for p in order])
+    middle = logs[order[int(np.searchsorted(running, 0.5 * running[-1]))]]
+    outlying = [p for p in placed if abs(logs[p] - middle) > _OUTLYING_PART]
     reasons = [
         f"{search.target.part_name(p)} is left out: {100 * (np.exp(logs[p] - middle) - 1):+.1f} % against the others; "
         "does it have another size?"
-        for p in odd
+        for p in outlying
     ]
-    return {p: part for p, part in placed.items() if p not in odd}, reasons
+    return {p: part for p, part in placed.items() if p not in outlying}, reasons
 
 
 def _measure(search: Search, placed: dict[int, PartPlacement], missing: dict[str, str]) -> Validation:
     target, views, options = search.target, search.views, search.options
-    placed, reasons = _reject_odd_parts(search, placed)
+    placed, reasons = _reject_outliers(search, placed)
     index = {p: i for i, p in enumerate(sorted(placed))}
     sightings = [(search.parts[p][i], n, index[p]) for p in index for i, n in _zip(placed[p])]
     obs = observe(
@@ -397,9 +394,7 @@ def _remarks(search: Search, obs: Observations, fit: ScaleFit, views: tuple[View
     out = []
     if len(views) < 5:
         out.append(f"only {len(views)} views: the interval is wide because errors of the poses are hard to judge")
-    copies: dict[tuple[int, int], int] = {}
-    for s in search.sightings:
-        copies[s.view, s.part] = copies.get((s.view, s.part), 0) + 1
+    copies = Counter((s.view, s.part) for s in search.sightings)
     several = len({view for (view, _), count in copies.items() if count > 1})
     if several:
         out.append(f"{several} images show more than one such target; the one that most views agree on was measured")

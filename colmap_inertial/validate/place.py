@@ -260,6 +260,3 @@ def _similarity(source: Array, target: Array) -> Placement | None:
         rotation=rotation[None],
         centre=(mean_t - scale * rotation @ mean_s)[None],
     )
-
-
-__all__ = ["PartPlacement", "median_residual_px", "observe", "place_part"]

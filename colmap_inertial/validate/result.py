@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -176,14 +176,14 @@ class Validation:
     rms_px: float
     corner_noise_px: float
     pose_noise_px: float
-    distances: tuple[Distance, ...]
-    corners: tuple[Corner, ...]
-    views: tuple[ViewResiduals, ...]
-    views_rejected: tuple[RejectedView, ...]
     control: SetScale | None
     check: SetScale | None
     check_error_pct: float | None
     check_ci95_pct: tuple[float, float] | None
+    distances: tuple[Distance, ...]
+    corners: tuple[Corner, ...]
+    views: tuple[ViewResiduals, ...]
+    views_rejected: tuple[RejectedView, ...]
     reasons: tuple[str, ...]
 
     @property
@@ -194,52 +194,24 @@ class Validation:
     def as_json(self) -> dict[str, Any]:
         """Everything but pixel coordinates, ready for ``json.dump``."""
 
-        def of_set(scale: SetScale | None) -> dict[str, Any] | None:
-            if scale is None:
-                return None
-            return {
-                "metres_per_unit": scale.metres_per_unit,
-                "ci95": list(scale.ci95),
-                "corners": scale.corners,
-            }
+        kept = {field.name: getattr(self, field.name) for field in fields(self)}
+        kept["target"] = self.target.spec
+        kept["views"] = [{"name": v.name, "corners": len(v.corner), "rms_px": v.rms_px} for v in self.views]
+        found: dict[str, Any] = {}
+        for name, value in kept.items():
+            found[name] = _plain(value)
+            if name == "tolerance_pct":
+                found["within_tolerance"] = self.within_tolerance
+        return found
 
-        return {
-            "target": self.target.spec,
-            "unscaled": self.unscaled,
-            "tolerance_pct": self.tolerance_pct,
-            "within_tolerance": self.within_tolerance,
-            "scale_error_pct": self.scale_error_pct,
-            "ci95_pct": None if self.ci95_pct is None else list(self.ci95_pct),
-            "metres_per_unit": self.metres_per_unit,
-            "metres_per_unit_ci95": list(self.metres_per_unit_ci95),
-            "views_used": self.views_used,
-            "views_searched": self.views_searched,
-            "corners_used": self.corners_used,
-            "corners_rejected": self.corners_rejected,
-            "rms_px": self.rms_px,
-            "corner_noise_px": self.corner_noise_px,
-            "pose_noise_px": self.pose_noise_px,
-            "control": of_set(self.control),
-            "check": of_set(self.check),
-            "check_error_pct": self.check_error_pct,
-            "check_ci95_pct": None if self.check_ci95_pct is None else list(self.check_ci95_pct),
-            "distances": [
-                {
-                    "pair": list(d.pair),
-                    "known_m": d.known_m,
-                    "measured": d.measured,
-                    "residual_m": d.residual_m,
-                    "set": d.set,
-                }
-                for d in self.distances
-            ],
-            "corners": [{"name": c.name, "in_model": c.in_model.tolist()} for c in self.corners],
-            "views": [{"name": v.name, "corners": len(v.corner), "rms_px": v.rms_px} for v in self.views],
-            "views_rejected": [
-                {"name": v.name, "reason": v.reason, "residual_px": v.residual_px} for v in self.views_rejected
-            ],
-            "reasons": list(self.reasons),
-        }
+
+def _plain(value: Any) -> Any:
+    """JSON's types: tuples become lists, arrays their numbers, and values of ours objects."""
+    if is_dataclass(value):
+        return {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return [_plain(one) for one in value] if isinstance(value, (tuple, list)) else value
 
 
 def validation_table(result: Validation) -> Group:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
@@ -137,15 +138,14 @@ def _mirrored(search: Search) -> str | None:
 def _absence_hint(search: Search) -> str:
     if search.target.kind != "checkerboard":
         return "is the description right, and is the target large and sharp enough in the images?"
-    sizes: dict[tuple[int, int], int] = {}
+    sizes: Counter[tuple[int, int]] = Counter()
     for v in search.searched[:_HINT_VIEWS]:
         image = search.views[v].read()
         size = None if isinstance(image, str) else other_checkerboard(image)
         if size is not None:
-            size = (max(size), min(size))
-            sizes[size] = sizes.get(size, 0) + 1
+            sizes[max(size), min(size)] += 1
     if sizes:
-        size = max(sizes, key=lambda s: sizes[s])
+        size = max(sizes, key=sizes.__getitem__)
         if size != tuple(sorted((search.target.columns, search.target.rows), reverse=True)):
             return f"a board with {size[0]}x{size[1]} inner corners is visible: is the size in the description right?"
     return "COLSxROWS counts inner corners, one less than squares; the whole board must be in view, with a white rim"

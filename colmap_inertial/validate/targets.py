@@ -7,7 +7,7 @@ single markers are targets of their own (``part``) that share nothing but their 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Literal
 
@@ -101,8 +101,8 @@ class Target:
 
     spec: str
     kind: Kind
-    columns: int
-    rows: int
+    columns: int = 0
+    rows: int = 0
     length_m: float
     marker_m: float = 0.0
     gap: float = 0.0
@@ -204,14 +204,15 @@ def parse_target(text: str) -> Target:
         raise TargetSpecError(text, f"{len(fields)} fields after {kind}, not {len(wanted)}")
     if kind == "checkerboard":
         columns, rows = _size(text, fields[0], least=3)
-        return _grid(text, "checkerboard", columns, rows, (columns, rows), _length(text, "SQUARE_M", fields[1]))
+        return _grid(text, "checkerboard", columns, rows, _length(text, "SQUARE_M", fields[1]))
     if kind == "charuco":
         columns, rows = _size(text, fields[0], least=3)
         square_m, marker_m = _length(text, "SQUARE_M", fields[1]), _length(text, "MARKER_M", fields[2])
         if marker_m >= square_m:
             raise TargetSpecError(text, f"the marker ({marker_m} m) must be smaller than the square ({square_m} m)")
         dictionary = _dictionary(text, fields[3], columns * rows // 2)
-        return _grid(text, "charuco", columns, rows, (columns - 1, rows - 1), square_m, marker_m, dictionary)
+        board = _grid(text, "charuco", columns, rows, square_m)
+        return replace(board, marker_m=marker_m, dictionary=dictionary)
     if kind == "aprilgrid":
         columns, rows = _size(text, fields[0], least=1)
         gap = _number(text, "GAP", fields[2])
@@ -258,35 +259,24 @@ def _dictionary(spec: str, text: str, markers: int) -> str:
     return name
 
 
-def _grid(
-    spec: str,
-    kind: Literal["checkerboard", "charuco"],
-    columns: int,
-    rows: int,
-    corners: tuple[int, int],
-    square_m: float,
-    marker_m: float = 0.0,
-    dictionary: str = "",
-) -> Target:
-    nx, ny = corners
+def _grid(spec: str, kind: Literal["checkerboard", "charuco"], columns: int, rows: int, square_m: float) -> Target:
+    nx, ny = (columns, rows) if kind == "checkerboard" else (columns - 1, rows - 1)
     row, column = (a.ravel() for a in np.indices((ny, nx)))
     number = np.arange(nx * ny).reshape(ny, nx)
-    turns = [number]
+    rotations = [number]
     if kind == "checkerboard":  # markers tell where a ChArUco board begins
-        turns += [np.rot90(number, k) for k in ((1, 2, 3) if nx == ny else (2,))]
+        rotations += [np.rot90(number, k) for k in ((1, 2, 3) if nx == ny else (2,))]
     return Target(
         spec=spec,
         kind=kind,
         columns=columns,
         rows=rows,
         length_m=square_m,
-        marker_m=marker_m,
-        dictionary=dictionary,
         corners_m=_centred(column * square_m, row * square_m),
         part=np.zeros(nx * ny, dtype=np.intp),
         row=row,
         column=column,
-        relabelings=np.array([turn.ravel() for turn in turns]),
+        relabelings=np.array([r.ravel() for r in rotations]),
     )
 
 
@@ -323,8 +313,6 @@ def _markers(spec: str, dictionary: str, side_m: float) -> Target:
     return Target(
         spec=spec,
         kind="aruco",
-        columns=0,
-        rows=0,
         length_m=side_m,
         dictionary=dictionary,
         corners_m=np.tile(one, (count, 1)),

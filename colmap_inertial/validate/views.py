@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.errors import FormatError
+from colmap_inertial.io.names import path_in
 from colmap_inertial.model import model_format, read_model
 from colmap_inertial.types import Array
 from colmap_inertial.validate.detect import Detection
@@ -138,7 +139,7 @@ def load_views(model: Path | pycolmap.Reconstruction, images: Path) -> tuple[lis
     middle = np.median([image.projection_center() for image in posed], axis=0)
     views, missing = [], {}
     for image in posed:
-        path = images / image.name
+        path = path_in(images, image.name, model if isinstance(model, Path) else None)
         if not path.is_file():
             missing[image.name] = "no such file in the image folder"
             continue

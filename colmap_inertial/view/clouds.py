@@ -183,6 +183,3 @@ def centre_and_reach(xyz: Array, cameras: Array) -> tuple[Array, float]:
     poses = np.percentile(np.linalg.norm(cameras - middle, axis=1), _NEARLY_ALL_PER_CENT)
     reach = max(float(points), float(poses), 1e-6 * float(np.abs(every).max()), 1e-9)
     return middle, reach
-
-
-__all__ = ["Cloud", "Mesh", "centre_and_reach", "dense_cloud", "read_mesh", "sparse_cloud"]

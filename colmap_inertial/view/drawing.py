@@ -42,16 +42,8 @@ class Drawing:
 
     def _draw(self) -> None:
         """Everything that does not change; what belongs to one switch of the panel goes by one name."""
-        scene, add = self.scene, self._api
-        self.cloud = add.add_point_cloud(
-            "/points",
-            scene.cloud.xyz,
-            scene.cloud.rgb,
-            point_size=self.point_size(),
-            point_shape="circle",
-            point_shading="flat",
-            precision="float32",
-        )
+        scene = self.scene
+        self.cloud = self.points("/points", scene.cloud.xyz, scene.cloud.rgb, self.point_size(), point_shading="flat")
         self.parts["Points"] = [self.cloud]
         if scene.mesh is not None:
             self.parts["Mesh"] = [self._add_mesh()]
@@ -158,22 +150,12 @@ class Drawing:
         return [down_arrow, up_arrow, *labels]
 
     def _add_target(self) -> list[Any]:
-        scene, add = self.scene, self._api
+        scene = self.scene
         assert scene.target is not None
         corners = np.array(list(scene.target.corners.values()))
         spacing = max((float(np.linalg.norm(b - a)) for a, b in scene.target_lines[:1]), default=0.0)
         size = 0.2 * spacing or 0.01 * scene.reach
-        drawn: list[Any] = [
-            add.add_point_cloud(
-                "/target/corners",
-                corners,
-                GREEN,
-                point_size=size,
-                point_shape="circle",
-                point_shading="flat",
-                precision="float32",
-            )
-        ]
+        drawn: list[Any] = [self.points("/target/corners", corners, GREEN, size, point_shading="flat")]
         if len(scene.target_lines):
             drawn.append(self.lines("/target/lines", scene.target_lines, GREEN, 1.0))
         for i, distance in enumerate(scene.labelled):
@@ -190,6 +172,12 @@ class Drawing:
             )
             drawn.append(label)
         return drawn
+
+    def points(self, name: str, xyz: NDArray[Any], colours: Any, size: float, **more: Any) -> Any:
+        """Add points (N, 3) of one or (N, 3) colours, so large in the scene's units."""
+        return self._api.add_point_cloud(
+            name, xyz, colours, point_size=size, point_shape="circle", precision="float32", **more
+        )
 
     def lines(self, name: str, pieces: Array, colour: tuple[int, int, int], width_px: float) -> Any:
         """Add straight lines (N, 2, 3), as wide on the screen from everywhere."""
@@ -225,6 +213,3 @@ class Drawing:
 
 def _wxyz(xyzw: Array) -> Array:
     return np.roll(xyzw, 1, axis=-1)
-
-
-__all__ = ["AMBER", "BLUE", "Drawing", "GREEN", "RED"]

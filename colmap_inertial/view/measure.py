@@ -124,6 +124,3 @@ def _with_uncertainty(length_m: float, half_m: float) -> str:
         return length_text(length_m, digits=4)
     decimals = int(np.clip(1 - np.floor(np.log10(half)), 0, 9))
     return f"{value:.{decimals}f} ± {half:.{decimals}f} {unit}"
-
-
-__all__ = ["Measured", "ball_at_ray", "length_text", "measured", "nearest_to_ray", "round_length"]

@@ -136,16 +136,3 @@ def _table(distances: Sequence[KnownDistance]) -> str:
         for length in lengths
     ]
     return "\n".join(["| known, mm | measured, mm | pairs |", "|--:|--:|--:|", *rows])
-
-
-__all__ = [
-    "camera_text",
-    "contents_text",
-    "distance_label",
-    "ground_text",
-    "measured_text",
-    "scale_text",
-    "target_text",
-    "tolerance_html",
-    "verdict_html",
-]

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.geometry import quat_conjugate, quat_rotate
+from colmap_inertial.io.names import path_in
 from colmap_inertial.io.trajectories import read_tum
 from colmap_inertial.model import read_model
 from colmap_inertial.types import DOWN_IN_WORLD, Array
@@ -141,7 +142,8 @@ class Scene:
     def image_of(self, camera: int) -> Path | None:
         """The file of a camera's image; ``None`` where none of the folders has it."""
         name = self.cameras.names[camera]
-        return next((folder / name for folder in self.source.images if (folder / name).is_file()), None)
+        paths = (path_in(folder, name, self.source.folder) for folder in self.source.images if folder.is_dir())
+        return next((path for path in paths if path.is_file()), None)
 
     def pickable(self) -> NDArray[np.float64]:
         """(N, 3) points that one can measure between: the cloud's, and the target's corners."""
@@ -314,6 +316,3 @@ def _target_parts(target: TargetFacts | None) -> tuple[Array, tuple[KnownDistanc
         if len(labelled) == _LABELS:
             break
     return np.array(neighbours).reshape(-1, 2, 3), tuple(labelled)
-
-
-__all__ = ["START_FOV_RAD", "Cameras", "Ground", "Scene", "load_scene"]

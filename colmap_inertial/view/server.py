@@ -20,8 +20,9 @@ from colmap_inertial.report.series import strided
 from colmap_inertial.types import Array
 from colmap_inertial.view import panel
 from colmap_inertial.view.drawing import RED, Drawing
+from colmap_inertial.view.guard import Guard, guarding
+from colmap_inertial.view.images import read_preview
 from colmap_inertial.view.measure import ball_at_ray, measured, nearest_to_ray
-from colmap_inertial.view.pictures import read_picture
 from colmap_inertial.view.scene import START_FOV_RAD, Scene
 
 if TYPE_CHECKING:
@@ -53,11 +54,12 @@ class Viewer:
 
     def __init__(self, scene: Scene, *, host: str = "127.0.0.1", port: int = 8080) -> None:
         self.scene = scene
-        self._server = _start_server(host, port, f"colmap-inertial: {scene.out.absolute().name}")
+        self._guard = Guard(host=host)
+        self._server = _start_server(self._guard, port, f"colmap-inertial: {scene.out.absolute().name}")
         self._lock = threading.RLock()
         self._picked: list[Array] = []
-        #: What comes and goes: the chosen camera, thumbnails, the measured line.
-        self._passing: dict[str, list[Any]] = {"chosen": [], "thumbnails": [], "measure": []}
+        #: Handles that are removed again: the chosen camera, thumbnails, the measured line.
+        self._temporary: dict[str, list[Any]] = {"chosen": [], "thumbnails": [], "measure": []}
         self._image_of = functools.lru_cache(maxsize=64)(self._read_image)
         self._candidates = scene.pickable()
         self._set_stage()
@@ -66,10 +68,10 @@ class Viewer:
 
     @property
     def url(self) -> str:
-        """What to open in a browser."""
+        """What to open in a browser; whoever knows it sees the scene."""
         host = self._server.get_host()
         host = "localhost" if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
-        return f"http://{host}:{self._server.get_port()}"
+        return f"http://{host}:{self._server.get_port()}/{self._guard.token}"
 
     def close(self) -> None:
         """Stop listening."""
@@ -114,7 +116,7 @@ class Viewer:
         with gui.add_folder("Camera"):
             self._slider = gui.add_slider("Number", 0, max(len(scene.cameras) - 1, 1), 1, 0)
             self._about = gui.add_markdown("Click a camera, or move the slider.")
-            self._picture = gui.add_image(np.zeros((3, 4, 3), np.uint8), visible=False, format="jpeg")
+            self._image = gui.add_image(np.zeros((3, 4, 3), np.uint8), visible=False, format="jpeg")
         self._slider.on_update(self._slide)
         self._server.scene.on_click()(self._click)
         if scene.target is not None:
@@ -136,22 +138,18 @@ class Viewer:
 
     def _slide(self, event: Any) -> None:
         if event.client is not None:  # moved by a user, not by _choose
-            self._choose(min(int(self._slider.value), len(self.scene.cameras) - 1), event.client)
+            self._choose(min(max(int(self._slider.value), 0), len(self.scene.cameras) - 1), event.client)
 
     def _look_at_everything(self, client: viser.ClientHandle | None) -> None:
         scene = self.scene
         if client is None:
             return
-        with client.atomic():
-            client.camera.fov = START_FOV_RAD
-            client.camera.up_direction = scene.up_in_world
-            client.camera.position = scene.start
-            client.camera.look_at = scene.centre
+        _aim(client, scene.start, scene.centre, scene.up_in_world)
         with self._lock:
             self._remove("chosen")
 
     def _look_at_target(self, client: viser.ClientHandle | None) -> None:
-        target, up = self.scene.target, self.scene.up_in_world
+        target = self.scene.target
         if client is None or target is None:
             return
         corners = np.array(list(target.corners.values()))
@@ -159,11 +157,7 @@ class Viewer:
         size = float(np.linalg.norm(corners - middle, axis=1).max())
         # from the side from which the cameras saw it
         towards = self.scene.cameras.cam_in_world.mean(axis=0) - middle
-        with client.atomic():
-            client.camera.fov = START_FOV_RAD
-            client.camera.up_direction = up
-            client.camera.position = middle + 3.5 * size * towards / np.linalg.norm(towards)
-            client.camera.look_at = middle
+        _aim(client, middle + 3.5 * size * towards / np.linalg.norm(towards), middle, self.scene.up_in_world)
 
     def _choose(self, camera: int, client: viser.ClientHandle) -> None:
         """Show a camera's image, and look through it."""
@@ -172,28 +166,25 @@ class Viewer:
             self._remove("chosen")
             image, problem = self._image_of(camera, _PANEL_PX)
             self._about.content = panel.camera_text(self.scene, camera, problem)
-            self._picture.visible = image is not None
+            self._image.visible = image is not None
             if image is not None:
-                self._picture.image = image
+                self._image.image = image
             if int(self._slider.value) != camera:
                 self._slider.value = camera
-            self._passing["chosen"].append(self._drawing.frustum("/chosen", camera, image, through=True))
+            self._temporary["chosen"].append(self._drawing.frustum("/chosen", camera, image, through=True))
         rotation = cameras.world_from_cam_xyzw[camera]
         fov, aspect = float(cameras.vertical_fov_rad[camera]), float(cameras.aspect[camera])
         # the whole image fits, with a margin
         height = np.tan(0.5 * fov) * max(1.0, aspect / client.camera.aspect)
         ahead = quat_rotate(rotation, np.array([0.0, 0.0, 1.0]))
         centre = cameras.cam_in_world[camera]
-        with client.atomic():
-            client.camera.fov = float(2 * np.arctan(1.15 * height))
-            client.camera.up_direction = quat_rotate(rotation, np.array([0.0, -1.0, 0.0]))
-            client.camera.position = centre
-            client.camera.look_at = centre + 0.5 * self.scene.reach * ahead
+        up = quat_rotate(rotation, np.array([0.0, -1.0, 0.0]))
+        _aim(client, centre, centre + 0.5 * self.scene.reach * ahead, up, fov_rad=float(2 * np.arctan(1.15 * height)))
 
     def _remove(self, group: str) -> None:
-        for handle in self._passing[group]:
+        for handle in self._temporary[group]:
             handle.remove()
-        self._passing[group].clear()
+        self._temporary[group].clear()
 
     def _show_thumbnails(self, shown: bool) -> None:
         with self._lock:
@@ -204,10 +195,10 @@ class Viewer:
             for camera in strided(count, _THUMBNAILS).tolist():
                 image, _ = self._image_of(camera, _THUMBNAIL_PX)
                 if image is not None:
-                    self._passing["thumbnails"].append(self._drawing.frustum(f"/thumbnails/{camera}", camera, image))
+                    self._temporary["thumbnails"].append(self._drawing.frustum(f"/thumbnails/{camera}", camera, image))
 
     def _read_image(self, camera: int, width_px: int) -> tuple[NDArray[np.uint8] | None, str]:
-        return read_picture(self.scene.image_of(camera), width_px)
+        return read_preview(self.scene.image_of(camera), width_px)
 
     def _switch_measuring(self) -> None:
         with self._lock:
@@ -239,22 +230,15 @@ class Viewer:
                 return
             self._picked.append(self._candidates[found])
             points = np.array(self._picked)
-            ends = self._server.scene.add_point_cloud(
-                "/measure/ends",
-                points,
-                RED,
-                point_size=0.012 * self.scene.reach,
-                point_shape="circle",
-                precision="float32",
-            )
+            ends = self._drawing.points("/measure/ends", points, RED, 0.012 * self.scene.reach)
             if len(points) == 1:
-                self._passing["measure"].append(ends)
+                self._temporary["measure"].append(ends)
                 self._measured.content = "Click the second point."
                 return
             result = measured(points[0], points[1], self.scene.scale.unit, self.scene.scale.relative_ci95)
             line = self._drawing.lines("/measure/line", points[None], RED, 3.0)
             label = self._drawing.label("/measure/label", result.text, points.mean(axis=0), size=1.2)
-            self._passing["measure"] = [ends, line, label]
+            self._temporary["measure"] = [ends, line, label]
             self._measured.content = panel.measured_text(result)
 
     def _clear(self) -> None:
@@ -262,6 +246,15 @@ class Viewer:
             self._picked.clear()
             self._remove("measure")
             self._measured.content = "Click the first point." if self._measuring.value else ""
+
+
+def _aim(client: viser.ClientHandle, position: Array, at: Array, up: Array, *, fov_rad: float = START_FOV_RAD) -> None:
+    """Let somebody look from a position at a point."""
+    with client.atomic():
+        client.camera.fov = fov_rad
+        client.camera.up_direction = up
+        client.camera.position = position
+        client.camera.look_at = at
 
 
 def serve(scene: Scene, *, host: str, port: int, ready: Callable[[str], object]) -> None:
@@ -297,13 +290,20 @@ def require_viser() -> None:
         raise MissingExtraError("view", "the viewer runs in a browser with viser")
 
 
-def _start_server(host: str, port: int, label: str) -> viser.ViserServer:
+def _start_server(guard: Guard, port: int, label: str) -> viser.ViserServer:
     require_viser()
     import viser
 
-    port = _free_port(host, port)
+    port = _free_port(guard.host, port)
     with contextlib.redirect_stdout(io.StringIO()):  # it prints a table of its own
-        server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
+        server = None
+        try:
+            with guarding(guard):
+                server = viser.ViserServer(host=guard.host, port=port, label=label, verbose=False)
+        except OutputError:
+            if server is not None:
+                server.stop()
+            raise
     # viser lets any page that is connected ask for a tunnel to the internet
     server.request_share_url = lambda verbose=True: None
     return server
@@ -326,6 +326,3 @@ def _free_port(host: str, port: int) -> int:
     except (OSError, OverflowError) as error:
         raise OutputError(f"cannot listen at {host}, port {port}: {error}") from error
     raise OutputError(f"no port from {port} on is free at {host}; choose another with --port")
-
-
-__all__ = ["Viewer", "require_viser", "serve"]

@@ -12,6 +12,7 @@ import numpy as np
 from colmap_inertial.errors import FormatError
 from colmap_inertial.geometry import quat_rotate
 from colmap_inertial.io.files import read_json
+from colmap_inertial.io.names import path_in
 from colmap_inertial.model import TRANSFORM_FILE, find_models, is_metric, model_format
 from colmap_inertial.model.similarities import similarity_from_json
 from colmap_inertial.run.workspace import Workspace, a_record_of_ours
@@ -155,7 +156,10 @@ def _of_reconstruction(workspace: Workspace, index: int | None) -> ViewSource:
         chosen = _choose(root, sizes, index)
         fields = models[chosen]
         metric = fields["sparse_metric"] is not None
-        folder = root / (fields["sparse_metric"] if metric else fields["sparse"])
+        place = str(fields["sparse_metric"] if metric else fields["sparse"])
+        # of an existing project, COLMAP's own model lies where the user's project is; it is only read
+        elsewhere = not metric and record.get("project") is not None and Path(place).is_absolute()
+        folder = Path(place) if elsewhere else path_in(root, place, workspace.result)
         scale = _estimated(fields, "m" if metric else "model")
         gravity = fields["gravity_in_world_m_s2"]
         down = None if gravity is None else np.array(gravity, dtype=np.float64).reshape(3)
@@ -180,9 +184,9 @@ def _of_reconstruction(workspace: Workspace, index: int | None) -> ViewSource:
                 workspace.project_metric / "images",
                 *_image_folders(folder),
             ),
-            fused=root / fused if fused else None,
-            mesh=root / mesh if mesh else None,
-            trajectory=root / path_file if path_file else None,
+            fused=path_in(root, fused, workspace.result) if fused else None,
+            mesh=path_in(root, mesh, workspace.result) if mesh else None,
+            trajectory=path_in(root, path_file, workspace.result) if path_file else None,
             target=target,
         )
 
@@ -297,6 +301,3 @@ def _beside(out: Path, index: int, single: bool, name: str) -> Path | None:
     """A dense result of a project's model, in the places where COLMAP's commands put it."""
     places = [out / "dense" / str(index), out / "dense_metric" / str(index), *([out / "dense", out] if single else [])]
     return next((place / name for place in places if (place / name).is_file()), None)
-
-
-__all__ = ["KnownDistance", "ScaleFacts", "TargetFacts", "ViewSource", "find_source"]

@@ -14,7 +14,7 @@ from onnx import TensorProto, helper, numpy_helper
 from torch import nn
 
 #: The package's folder of weights.
-WEIGHTS = Path(__file__).parents[2] / "colmap_inertial" / "imaging" / "restoration" / "weights"
+WEIGHTS = Path(__file__).parents[2] / "colmap_inertial" / "restoration" / "weights"
 _OPSET = 17
 
 

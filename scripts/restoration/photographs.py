@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.imaging._transfer import decode_table
+from colmap_inertial.imaging.transfer import decode_table
 
 #: Every so many-th photograph is never trained on.
 _HELD_OUT_ONE_IN = 5

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from colmap_inertial.imaging.blur_field import BlurField
-from colmap_inertial.imaging.restoration._tiles import Span, blur_feed
 from colmap_inertial.imaging.wiener import DeblurOptions, deblur
+from colmap_inertial.restoration._tiles import Span, blur_feed
 from colmap_inertial.types import Array
 from restoration.camera import jpeg, light_of, noisy, sharpened, srgb
 from restoration.handheld import Handheld, captured, simulated

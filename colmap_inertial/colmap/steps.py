@@ -1,0 +1,89 @@
+"""Extract, keypoint stages, match, map: COLMAP's steps of a run, into ``database.db`` and ``sparse/``."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from colmap_inertial.colmap.sparse import (
+    KeypointRecords,
+    extract_features,
+    image_pairs,
+    map_images,
+    match_features,
+    write_gravity_priors,
+)
+from colmap_inertial.io.records import read_record, write_record
+from colmap_inertial.options import ReconstructOptions
+from colmap_inertial.run.session import Session
+from colmap_inertial.stages.frame_folder import FrameRecord
+from colmap_inertial.stages.protocols import KeypointStage
+from colmap_inertial.types import Array
+
+
+def run_colmap(
+    session: Session,
+    records: Sequence[FrameRecord],
+    stages: Sequence[KeypointStage],
+    gravity: Mapping[str, Array],
+    options: ReconstructOptions,
+) -> KeypointRecords:
+    """Make COLMAP's models of the frames that are used.
+
+    Parameters
+    ----------
+    records
+        Of all frames.
+    stages
+        Of keypoints.
+    gravity
+        By image name, for COLMAP's global mapper; empty where it shall not know.
+    options
+        Those of mapping count.
+
+    Returns
+    -------
+    What the stages did to keypoints.
+
+    Raises
+    ------
+    MappingError
+        When COLMAP finds no model.
+    """
+    workspace, runner, mapping, context = session.workspace, session.runner, options.mapping, session.context
+    cameras = {record.name: record.camera for record in records if record.used}
+
+    def features(partial: Sequence[Path]) -> None:
+        found = extract_features(
+            workspace.images, cameras, partial[0], mapping, keypoint_stages=stages, context=context
+        )
+        write_gravity_priors(partial[0], gravity)
+        write_record(partial[1], found)
+
+    extraction = [getattr(mapping, name) for name in ("max_image_size", "max_num_features", "first_octave")]
+    depends = {"extraction": extraction, **context.identity(), "stages": stages, "gravity": gravity}
+    pairing = {**depends, "pairing": mapping.pairing, "overlap": mapping.overlap}
+
+    def matches(partial: Sequence[Path]) -> None:
+        # the database holds the features, too: they are made when there are no matches, and need not stay
+        record = workspace.stamps / "keypoints_of_features.json"
+        runner.run("features", depends, [workspace.features, record], features, after=["frames"])
+        shutil.copyfile(record, partial[1])
+        match_features(workspace.features, partial[0], image_pairs(list(cameras), mapping), context)
+
+    def models(partial: Sequence[Path]) -> None:
+        refine = mapping.refine_intrinsics
+        map_images(
+            workspace.database,
+            workspace.images,
+            partial[0],
+            mapping,
+            refine_intrinsics=any(camera is None for camera in cameras.values()) if refine is None else refine,
+            num_images=len(cameras),
+            context=context,
+        )
+
+    runner.run("matches", pairing, [workspace.database, workspace.keypoints], matches, after=["frames"])
+    runner.run("mapping", {"mapping": mapping}, [workspace.sparse], models, after=["matches"])
+    return read_record(workspace.keypoints, KeypointRecords)

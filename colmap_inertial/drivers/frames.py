@@ -1,0 +1,126 @@
+"""The frames of a capture on their way to COLMAP: what is to be done, done, and written down."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from colmap_inertial.drivers.contact_sheet import CropKeeper
+from colmap_inertial.io.capture import Capture
+from colmap_inertial.io.frames import frame_source
+from colmap_inertial.options import ApertureOptions, ReconstructOptions
+from colmap_inertial.precalibrate.plan import ImagingPlan, Treatments, plan_imaging, read_plan, write_plan
+from colmap_inertial.restoration.shipped import checksum
+from colmap_inertial.run.context import Recording
+from colmap_inertial.run.runner import remove
+from colmap_inertial.run.session import Session
+from colmap_inertial.run.workspace import Workspace
+from colmap_inertial.stages.apertures import ApertureStage
+from colmap_inertial.stages.frame_folder import FrameRecord, read_frame_records, write_frames
+from colmap_inertial.stages.protocols import FrameStage, KeypointStage
+from colmap_inertial.stages.rectified import image_movers, write_rectified
+from colmap_inertial.types import Frame
+
+log = logging.getLogger(__name__)
+
+
+def ask_for_plan(
+    options: ReconstructOptions, frame_stages: Sequence[object], keypoint_stages: Sequence[object], *, pairs: bool
+) -> Treatments:
+    """What the options ask for, as far as the default stages are to do it."""
+    return Treatments(
+        deblur=options.deblur,
+        rolling_shutter=options.rolling_shutter,
+        pairs=pairs,
+        frames_by_others=... not in frame_stages,
+        keypoints_by_others=... not in keypoint_stages,
+    )
+
+
+def run_plan(session: Session, recording: Recording, asked: Treatments) -> ImagingPlan:
+    """What to do to frames and keypoints; where nothing is asked for, nothing is looked at."""
+
+    def work(partial: Sequence[Path]) -> None:
+        write_plan(partial[0], plan_imaging(recording, session.context, asked))
+
+    depends = {
+        **recording.identity(),
+        **session.context.identity(),
+        "asked": asked,
+        "weights": checksum("deepgyro") if asked.deblur == "deepgyro" else "",
+    }
+    imaging = session.workspace.imaging
+    session.runner.run("imaging", depends, [imaging], work)
+    plan = read_plan(imaging, recording.imu, recording.timing)
+    log.info("deblurring: %s", plan.deblur_note)
+    log.info("rolling shutter: %s", plan.rolling_shutter_note)
+    return plan
+
+
+def run_frames(
+    session: Session,
+    recording: Recording,
+    frames: Iterator[Frame],
+    stages: Sequence[FrameStage],
+    plan: ImagingPlan | None = None,
+) -> tuple[FrameRecord, ...]:
+    """The frames through the stages; with a plan, parts of some are kept before and after for the report."""
+    source, workspace = frame_source(recording.capture), session.workspace
+    kept = None if plan is None else CropKeeper.of(plan)
+
+    def work(partial: Sequence[Path]) -> None:
+        images, records = partial[:2]
+        through = stages if kept is None else (kept.before, *stages, kept.after)
+        names = recording.timing.names
+        write_frames(
+            frames, names, through, source_folder=source, images=images, records=records, progress=session.progress
+        )
+        if kept is not None:
+            kept.write(partial[2])
+
+    depends = {
+        "capture": replace(recording.capture, target=None),
+        "timing": recording.timing,
+        "inputs": recording.inputs(),
+        "stages": stages,
+        "kept": {} if kept is None else kept.blur_px,
+    }
+    crops = [] if kept is None else [workspace.crops]
+    session.runner.run("frames", depends, [workspace.images, workspace.frames, *crops], work)
+    return read_frame_records(workspace.frames)
+
+
+def fusing(capture: Capture, workspace: Workspace, options: ApertureOptions) -> list[ApertureStage]:
+    """The stage that makes frames of a multi-aperture camera's sub-images; none for other cameras."""
+    if capture.apertures is None:
+        return []
+    keep = workspace.apertures if options.depth else None
+    if keep is None:
+        remove(workspace.apertures)
+    return [ApertureStage(pictures=capture.apertures, options=options, keep=keep)]
+
+
+def run_rectified(
+    session: Session,
+    records: Sequence[FrameRecord],
+    rectified: Collection[str],
+    stages: Sequence[KeypointStage],
+) -> Path:
+    """Images that agree with the rectified keypoints, for whoever goes on from the model; returns their folder."""
+    workspace = session.workspace
+    movers = image_movers(stages)
+    if rectified and not movers:
+        log.warning("keypoints of %d images are rectified by a stage that moves no pixels", len(rectified))
+    if not rectified or not movers:
+        remove(workspace.images_rectified)
+        return workspace.images
+    names = [record.name for record in records if record.used]
+
+    def work(partial: Sequence[Path]) -> None:
+        write_rectified(movers, names, rectified, workspace.images, partial[0], session.progress)
+
+    depends = {"stages": stages, "rectified": sorted(rectified)}
+    session.runner.run("rectified", depends, [workspace.images_rectified], work, after=["frames"])
+    return workspace.images_rectified

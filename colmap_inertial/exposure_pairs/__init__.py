@@ -1,0 +1,29 @@
+"""Pairs of a short and a long exposure of one scene: brought together, or blended without any network.
+
+:func:`bring_together` matches their brightness and geometry for what makes one image of both
+(:mod:`colmap_inertial.restoration.lsd2`); :func:`fuse_mertens` blends exposures as they are.
+"""
+
+from colmap_inertial.exposure_pairs.mertens import fuse_mertens
+from colmap_inertial.exposure_pairs.pair import (
+    Brightness,
+    ExposurePair,
+    PairGyro,
+    blur_seen_from_short,
+    brightened,
+    bring_together,
+    gyro_shift,
+    match_brightness,
+)
+
+__all__ = [
+    "Brightness",
+    "ExposurePair",
+    "PairGyro",
+    "blur_seen_from_short",
+    "brightened",
+    "bring_together",
+    "fuse_mertens",
+    "gyro_shift",
+    "match_brightness",
+]

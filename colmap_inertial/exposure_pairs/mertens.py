@@ -1,0 +1,38 @@
+"""Exposure fusion: of images that were exposed differently, each part from where it shows most.
+
+After T. Mertens, J. Kautz, F. Van Reeth, Exposure Fusion (Pacific Graphics 2007), as OpenCV has it: contrast,
+saturation and a medium brightness give weights, by which the images are blended band by band.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+Light = NDArray[np.float32]
+
+
+def fuse_mertens(images: Sequence[Light]) -> Light:
+    """Blend images of the same view.
+
+    Parameters
+    ----------
+    images
+        Two or more, all (H, W) or (H, W, 3) float32, sRGB 0 to 1.
+
+    Returns
+    -------
+    Likewise; no light is guessed, so a lamp that clips in one image looks as it does in the other.
+    """
+    import cv2
+
+    if len(images) < 2 or any(image.shape != images[0].shape for image in images):
+        raise ValueError(f"two or more images of one shape, not {[image.shape for image in images]}")
+    if images[0].ndim not in (2, 3) or (images[0].ndim == 3 and images[0].shape[2] != 3):
+        raise ValueError(f"images: (H, W) or (H, W, 3), not {images[0].shape}")
+    # OpenCV divides by 255, whatever the type; of one channel it takes no saturation
+    scaled = [np.ascontiguousarray(255 * image, dtype=np.float32) for image in images]
+    merge = cv2.createMergeMertens(1.0, 1.0, 1.0)
+    return np.asarray(np.clip(merge.process(scaled), 0, 1), dtype=np.float32)

@@ -1,0 +1,272 @@
+"""The families of inertial recordings that are known: those of this package, and of other installed ones.
+
+A package adds a family by an entry point in the group ``colmap_inertial.imu_formats`` that leads to an
+:class:`ImuFormat`; in its ``pyproject.toml``::
+
+    [project.entry-points."colmap_inertial.imu_formats"]
+    mylog = "my_package:FORMAT"
+
+Every process finds it, wherever the package is installed. Families of other packages are tried before this package's
+own: whoever installs one means it, and the last one of ours accepts any CSV file whose header it can read. They cannot
+take the name of another one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import logging
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from colmap_inertial.errors import FormatError, InertialError
+from colmap_inertial.io import android, camm, dji, gcsv, gopro, imu_text, ios, rosbag, video_imu_capture
+from colmap_inertial.io.mp4 import is_mp4, read_movie
+from colmap_inertial.io.units import DeclaredUnits
+from colmap_inertial.types import FrameLog, ImuRecording
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
+
+log = logging.getLogger(__name__)
+
+#: The group of entry points that other packages use.
+ENTRY_POINTS = "colmap_inertial.imu_formats"
+#: What ``format =`` may also say.
+_RESERVED = ("auto", "capture")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImuFormat:
+    """One family of inertial recordings.
+
+    Attributes
+    ----------
+    name
+        What ``format =`` and ``--imu-format`` call it.
+    layout
+        What such a recording looks like, for messages.
+    accepts
+        Whether a path holds one. Looks at names and first bytes; cheap, never raises for a readable path.
+    read
+        Reads it, given the units that the user declared in place of the file's; a damaged recording is a
+        :class:`FormatError` or :class:`TimingError`.
+    frames
+        Reads what it says about the frames of the video, where such recordings can say anything; gives ``None`` where
+        this one does not.
+    video
+        Where the video lies of a recording that describes itself: patterns in its folder, of which the first counts
+        that fits one file, with ``{name}`` for the folder's name; empty where the recording is the video. ``None``:
+        such a recording is no capture without a capture.toml.
+    """
+
+    name: str
+    layout: str
+    accepts: Callable[[Path], bool]
+    read: Callable[[Path, DeclaredUnits], ImuRecording]
+    frames: Callable[[Path], FrameLog | None] | None = None
+    video: tuple[str, ...] | None = None
+
+
+def imu_formats() -> tuple[ImuFormat, ...]:
+    """The known families, in the order in which they are tried."""
+    return (*_of_other_packages(), *_OWN)
+
+
+def find_imu_format(path: Path, name: str = "auto") -> ImuFormat:
+    """The family of a recording.
+
+    Parameters
+    ----------
+    path
+        A file or folder.
+    name
+        Of the family; ``"auto"`` finds it by content.
+
+    Raises
+    ------
+    FormatError
+        Where there is none.
+    """
+    if not path.exists():
+        raise FormatError(path, "no such file or folder")
+    known = imu_formats()
+    found = next((one for one in known if (one.accepts(path) if name == "auto" else one.name == name)), None)
+    if found is not None:
+        return found
+    if name != "auto":
+        names = ", ".join(["auto", *(one.name for one in known), "capture"])
+        raise FormatError(path, f'unknown IMU format "{name}"; known are {names}')
+    if path.is_file() and is_mp4(path):
+        tracks = ", ".join(f"{track.handler} {track.entry}" for track in read_movie(path).tracks)
+        raise FormatError(path, f"is a video without an IMU that is known here; its tracks: {tracks or 'none'}")
+    layouts = "; ".join(one.layout for one in known)
+    raise FormatError(
+        path,
+        f"not an inertial recording known here ({layouts}); describe its files under [imu.gyro] and [imu.accel] in a "
+        "capture.toml",
+    )
+
+
+@functools.cache
+def _of_other_packages() -> tuple[ImuFormat, ...]:
+    from importlib.metadata import entry_points
+
+    names = {*_RESERVED, *(one.name for one in _OWN)}
+    found = []
+    for entry in entry_points(group=ENTRY_POINTS):
+        package = entry.dist.name if entry.dist is not None else entry.module
+        try:
+            one = _loaded(entry)
+            if one.name in names:
+                raise ValueError(f'the name "{one.name}" is taken')
+        except Exception as error:  # whatever another package does when it is imported
+            log.warning("the IMU format %s of the package %s is left out: %s", entry.name, package, _reason(error))
+            continue
+        names.add(one.name)
+        found.append(_guarded(one, package))
+    return tuple(found)
+
+
+def _loaded(entry: EntryPoint) -> ImuFormat:
+    one = entry.load()
+    if not isinstance(one, ImuFormat):
+        raise TypeError(f"{entry.value} is no ImuFormat")
+    return one
+
+
+def _guarded(one: ImuFormat, package: str) -> ImuFormat:
+    """The same family; where its functions raise what they should not, the message names the package."""
+    its = f"the IMU format {one.name} of the package {package}"
+
+    def accepts(path: Path) -> bool:
+        try:
+            return bool(one.accepts(path))
+        except Exception as error:
+            log.warning("%s: %s cannot tell whether it is one: %s", path, its, _reason(error))
+            return False
+
+    def read(path: Path, units: DeclaredUnits) -> ImuRecording:
+        with _as_format_error(path, its):
+            recording = one.read(path, units)
+            if not isinstance(recording, ImuRecording):
+                raise TypeError(f"read gives a {type(recording).__name__}, not an ImuRecording")
+            return recording
+
+    def frames(path: Path) -> FrameLog | None:
+        assert one.frames is not None
+        with _as_format_error(path, its):
+            return one.frames(path)
+
+    return replace(one, accepts=accepts, read=read, frames=None if one.frames is None else frames)
+
+
+@contextlib.contextmanager
+def _as_format_error(path: Path, its: str) -> Iterator[None]:
+    try:
+        yield
+    except InertialError:
+        raise
+    except Exception as error:
+        raise FormatError(path, f"{its} failed: {_reason(error)}") from error
+
+
+def _reason(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"
+
+
+_OWN: tuple[ImuFormat, ...] = (
+    ImuFormat(
+        name="euroc",
+        layout="an ASL/EuRoC dataset with mav0/imu0/data.csv",
+        accepts=imu_text.is_euroc,
+        read=imu_text.read_euroc,
+    ),
+    ImuFormat(
+        name="inertial-scale",
+        layout="a folder with gyroscope.txt and accelerometer.txt",
+        accepts=imu_text.is_inertial_scale,
+        read=imu_text.read_inertial_scale_imu,
+    ),
+    ImuFormat(
+        name="gopro",
+        layout="a GoPro video (HERO5 and later, MAX, Fusion)",
+        accepts=gopro.is_gopro,
+        read=gopro.read_gopro,
+        frames=gopro.read_gopro_frames,
+        video=(),
+    ),
+    ImuFormat(
+        name="camm",
+        layout="a video with a CAMM track",
+        accepts=camm.is_camm,
+        read=camm.read_camm,
+        frames=camm.read_camm_frames,
+        video=(),
+    ),
+    ImuFormat(
+        name="dji",
+        layout="a DJI video, of which the message says what it can give",
+        accepts=dji.is_dji,
+        read=dji.read_dji,
+    ),
+    ImuFormat(
+        name="gcsv",
+        layout="a Gyroflow log (.gcsv)",
+        accepts=gcsv.is_gcsv,
+        read=gcsv.read_gcsv,
+        frames=gcsv.read_gcsv_frames,
+    ),
+    ImuFormat(
+        name="video-imu-capture",
+        layout="a VideoIMUCapture folder with video_meta.pb3",
+        accepts=video_imu_capture.is_video_imu_capture,
+        read=video_imu_capture.read_video_imu_capture,
+        frames=video_imu_capture.read_video_imu_capture_frames,
+        video=("video_recording.mp4",),
+    ),
+    ImuFormat(
+        name="mars",
+        layout="a MARS logger folder with gyro_accel.csv",
+        accepts=android.is_mars,
+        read=android.read_mars,
+        frames=android.read_mars_frames,
+        video=("movie.mp4", "movie.mov", "movie.MOV"),
+    ),
+    ImuFormat(
+        name="opencamera",
+        layout="an OpenCamera-Sensors folder with *gyro.csv and *accel.csv",
+        accepts=android.is_opencamera,
+        read=android.read_opencamera,
+        frames=android.read_opencamera_frames,
+        video=("*.mp4", "../VID_{name}.mp4"),
+    ),
+    ImuFormat(
+        name="stray-scanner",
+        layout="a Stray Scanner folder with imu.csv",
+        accepts=ios.is_stray_scanner,
+        read=ios.read_stray_scanner,
+        frames=ios.read_stray_scanner_frames,
+        video=("rgb.mp4",),
+    ),
+    ImuFormat(
+        name="sensor-logger",
+        layout="a Sensor Logger zip or folder with Gyroscope.csv",
+        accepts=ios.is_sensor_logger,
+        read=ios.read_sensor_logger,
+    ),
+    ImuFormat(
+        name="rosbag",
+        layout="a ROS 1 bag or ROS 2 recording",
+        accepts=rosbag.is_rosbag,
+        read=rosbag.read_rosbag,
+    ),
+    ImuFormat(
+        name="csv",
+        layout='a CSV file with a header such as "t [ns],gx [rad/s],...,az [m/s2]"',
+        accepts=imu_text.is_csv,
+        read=imu_text.read_csv,
+    ),
+)

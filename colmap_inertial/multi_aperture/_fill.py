@@ -1,0 +1,100 @@
+"""Colours for pixels that an aperture does not see."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Real = NDArray[np.float32]
+
+#: Neighbours on a square grid: this many steps to each side, first as wide as the first spacing, then wider ones for
+#: pixels that have found too few.
+_STEPS, _SPACINGS_PX = 3, (3, 9, 27)
+#: How different a neighbour may be: share of full scale in the reference, disparity in px.
+_SIMILAR, _SAME_DEPTH_PX = 0.05, 1.0
+#: Sum of weights that makes a neighbourhood, and variance (share of full scale, squared) below which the reference
+#: says nothing about changes.
+_ENOUGH, _FLAT = 0.5, 3e-4
+#: Pixels worked on at once.
+_CHUNK = 1 << 16
+
+
+def fill_hidden(values: Real, seen: NDArray[np.bool_], guide: Real, disparity_px: Real) -> Real:
+    """A colour's values where it was not seen, from how it goes with the reference's colour nearby.
+
+    A line through (guide, value) of neighbours that are seen, of like brightness in the guide and of the same depth, by
+    weighted least squares: the local linear model of the guided filter (He, Sun, Tang, PAMI 35(6), 2013) with the
+    weights of a joint bilateral filter.
+
+    Parameters
+    ----------
+    values
+        (H, W), full scale 1.
+    seen
+        (H, W).
+    guide
+        (H, W) what the reference sees everywhere, full scale 1.
+    disparity_px
+        (H, W).
+    """
+    if seen.all():
+        return values
+    result = values.copy()
+    rows, columns = np.nonzero(~seen)
+    if not seen.any():
+        result[rows, columns] = guide[rows, columns]
+        return result
+    slope, offset = _line(values[seen], guide[seen])
+    for spacing in _SPACINGS_PX:
+        kept_rows, kept_columns = [], []
+        for start in range(0, len(rows), _CHUNK):
+            y, x = rows[start : start + _CHUNK], columns[start : start + _CHUNK]
+            found, weight = _from_neighbours(values, seen, guide, disparity_px, y, x, spacing)
+            enough = weight > _ENOUGH
+            result[y[enough], x[enough]] = found[enough]
+            kept_rows.append(y[~enough])
+            kept_columns.append(x[~enough])
+        rows, columns = np.concatenate(kept_rows), np.concatenate(kept_columns)
+        if not len(rows):
+            return result
+    result[rows, columns] = slope * guide[rows, columns] + offset
+    return result
+
+
+def _from_neighbours(
+    values: Real,
+    seen: NDArray[np.bool_],
+    guide: Real,
+    disparity_px: Real,
+    y: NDArray[np.intp],
+    x: NDArray[np.intp],
+    spacing: int,
+) -> tuple[Real, Real]:
+    """(n,) values and (n,) sums of weights."""
+    height, width = values.shape
+    side = spacing * np.arange(-_STEPS, _STEPS + 1)
+    dy, dx = (d.ravel() for d in np.meshgrid(side, side, indexing="ij"))
+    at_y, at_x = y[:, None] + dy, x[:, None] + dx
+    inside = (at_y >= 0) & (at_y < height) & (at_x >= 0) & (at_x < width)
+    near = np.where(inside, at_y * width + at_x, 0)
+    here = guide[y, x]
+    of_guide, of_values = guide.ravel()[near], values.ravel()[near]
+    difference = 0.5 * ((of_guide - here[:, None]) / np.float32(_SIMILAR)) ** 2
+    difference += np.abs(disparity_px.ravel()[near] - disparity_px[y, x][:, None]) / np.float32(_SAME_DEPTH_PX)
+    difference += (0.5 * (dy**2 + dx**2) / (2 * spacing) ** 2).astype(np.float32)
+    weight = np.exp(-difference)
+    weight *= inside & seen.ravel()[near]
+    total = weight.sum(axis=1)
+    share = weight / np.maximum(total, np.float32(1e-12))[:, None]
+    mean_guide, mean_value = (share * of_guide).sum(axis=1), (share * of_values).sum(axis=1)
+    variance = (share * of_guide**2).sum(axis=1) - mean_guide**2
+    covariance = (share * of_guide * of_values).sum(axis=1) - mean_guide * mean_value
+    found = mean_value + covariance / (np.maximum(variance, 0) + _FLAT) * (here - mean_guide)
+    return np.clip(found, 0, 1).astype(np.float32), total.astype(np.float32)
+
+
+def _line(values: Real, guide: Real) -> tuple[float, float]:
+    """Slope and offset of values over the guide, for what has no neighbours."""
+    mean_guide, mean_value = float(guide.mean()), float(values.mean())
+    slope = float(np.mean((guide - mean_guide) * (values - mean_value))) / (float(guide.var()) + _FLAT)
+    return slope, mean_value - slope * mean_guide

@@ -1,0 +1,121 @@
+"""What goes through a run together: what was recorded, and how the work is done."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from colmap_inertial.io.calibration import for_another_recording, largest_offset_s, read_calibration
+from colmap_inertial.io.capture import Capture, Video
+from colmap_inertial.io.frames import frame_source
+from colmap_inertial.io.names import path_in
+from colmap_inertial.run.progress import Progress, silent
+from colmap_inertial.run.runner import fingerprint
+from colmap_inertial.types import CameraImuCalibration, FrameTiming, ImuRecording
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Recording:
+    """One recording: its frames' times, the IMU that ran along, and what is known of both.
+
+    Attributes
+    ----------
+    capture
+        What describes it, and where its files are.
+    imu
+        Gyroscope and accelerometer.
+    timing
+        Of the frames to use.
+    prior
+        Camera and IMU, as far as they are known beforehand.
+    doubts
+        What was found wrong with it; with any of them, no scale is trusted.
+    every
+        Of all frames of the video that ``timing``'s were chosen from; ``timing`` itself where all are used.
+    max_offset_s
+        Largest offset between the clocks; ``None`` where it may be any.
+    """
+
+    capture: Capture
+    imu: ImuRecording
+    timing: FrameTiming
+    prior: CameraImuCalibration
+    doubts: tuple[str, ...] = ()
+    every: FrameTiming
+    max_offset_s: float | None = None
+
+    @classmethod
+    def of(
+        cls,
+        capture: Capture,
+        imu: ImuRecording,
+        timing: FrameTiming,
+        prior: CameraImuCalibration,
+        *,
+        max_offset_s: float | None = None,
+    ) -> Recording:
+        """A recording of which all frames are used; without a largest offset, that of a shared clock counts."""
+        limit_s = largest_offset_s(capture.shared_clock, max_offset_s)
+        return cls(capture=capture, imu=imu, timing=timing, prior=prior, every=timing, max_offset_s=limit_s)
+
+    def using(self, timing: FrameTiming) -> Recording:
+        """With some of its frames."""
+        return replace(self, timing=timing)
+
+    def identity(self) -> dict[str, object]:
+        """All that decides what is made of it."""
+        names = ("imu", "timing", "every", "prior", "max_offset_s")
+        return {
+            **{name: getattr(self, name) for name in names},
+            "capture": replace(self.capture, target=None),
+            "inputs": self.inputs(),
+        }
+
+    def inputs(self) -> list[object]:
+        """What identifies the files that frames are read from."""
+        capture, source = self.capture, frame_source(self.capture)
+        paths = [] if source is None else [path_in(source, name) for name in self.timing.names]
+        if isinstance(capture.frames, Video):
+            paths = [capture.frames.file]
+        if capture.apertures is not None:
+            paths += capture.apertures.files(self.timing.names)
+        if capture.exposures is not None:
+            paths += [*capture.exposures.files(self.timing.names), *filter(None, [capture.exposures.times])]
+        return [fingerprint(path) for path in paths]
+
+
+def prior_calibration(capture: Capture, given: Path | None) -> CameraImuCalibration:
+    """What is known of camera and IMU beforehand: from a calibration file where one is given, else from the capture."""
+    if given is None:
+        return capture.calibration
+    return for_another_recording(read_calibration(given), shared_clock=capture.shared_clock)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RunContext:
+    """How the work is done.
+
+    Attributes
+    ----------
+    scratch
+        A folder for temporary files.
+    num_threads
+        Of COLMAP; -1 uses all.
+    seed
+        Of COLMAP.
+    progress
+        Hears how far it is.
+    """
+
+    scratch: Path
+    num_threads: int = -1
+    seed: int = 0
+    progress: Progress = silent
+
+    def reporting(self, progress: Progress) -> RunContext:
+        """The same, heard by somebody else."""
+        return replace(self, progress=progress)
+
+    def identity(self) -> dict[str, object]:
+        """What decides a result: not who listens, nor where."""
+        return {"num_threads": self.num_threads, "seed": self.seed}

@@ -1,0 +1,58 @@
+"""Samples of a sensor over time: where they have gaps, and their integrals."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+#: A longer pause between samples of an IMU is a gap: nothing is known about the motion in it.
+GAP_S = 0.1
+#: A pause that is worth a word, even where it is shorter than that: so many times the usual step between samples.
+PAUSE_STEPS = 3.5
+
+
+def is_gap(t_s: Array, longer_than_s: float = GAP_S, *, steps: float = 0.0) -> NDArray[np.bool_]:
+    """(N-1,) which steps between samples at (N,) times are gaps.
+
+    Parameters
+    ----------
+    longer_than_s
+        No shorter pause is one.
+    steps
+        Nor is one of fewer than so many usual steps.
+    """
+    step_s = np.diff(t_s)
+    return np.asarray(step_s > max(longer_than_s, steps * float(np.median(step_s)) if steps else 0.0))
+
+
+class Coverage:
+    """What samples at (N,) times ``t_s`` cover without a gap."""
+
+    def __init__(self, t_s: Array) -> None:
+        self._t_s = t_s
+        self._gaps = np.concatenate([[0], np.cumsum(is_gap(t_s))])
+
+    def covers(self, begin_s: Array, end_s: Array) -> NDArray[np.bool_]:
+        """Which of the intervals lie inside the recording and contain no gap."""
+        top = len(self._t_s) - 1
+        first = np.searchsorted(self._t_s, begin_s, side="right") - 1
+        last = np.searchsorted(self._t_s, end_s, side="left")
+        gapless = self._gaps[np.clip(first, 0, top)] == self._gaps[np.clip(last, 0, top)]
+        return np.asarray((first >= 0) & (last <= top) & gapless)
+
+
+def integral_at(t_s: Array, values: Array, query_s: Array) -> Array:
+    """(..., 3) the integral of (N, 3) samples from the first one to query times of any shape, by trapezoids."""
+    areas = 0.5 * (values[1:] + values[:-1]) * np.diff(t_s)[:, None]
+    integral = np.concatenate([np.zeros((1, 3)), np.cumsum(areas, axis=0)])
+    return np.stack([np.interp(query_s, t_s, column) for column in integral.T], axis=-1)
+
+
+def without_running_mean(values: Array, width: int) -> Array:
+    """What of samples (N, k) changes faster than their running mean over ``width`` of them: (N - width + 1, k)."""
+    kernel = np.ones(width) / width
+    slow = np.stack([np.convolve(column, kernel, mode="valid") for column in values.T], axis=1)
+    start = (width - 1) // 2
+    return np.asarray(values[start : start + len(slow)] - slow)

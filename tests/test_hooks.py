@@ -1,0 +1,223 @@
+"""The hooks are equal doors: what a result says happened is what the stages did, whoever wrote them."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_pipeline import QUICK, contents, copy_scene
+
+from colmap_inertial import Frame, Keypoints, Model, ReconstructOptions, Treatment, reconstruct, write_calibration
+from colmap_inertial.stages.protocols import with_defaults
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    """The first frames of the desk, said to have a rolling shutter."""
+    folder = copy_scene(tmp_path_factory.mktemp("hooks") / "capture", first=16)
+    file = folder / "capture.toml"
+    text = file.read_text()
+    assert "readout_s = 0.0" in text
+    file.write_text(text.replace("readout_s = 0.0", "readout_s = 0.015", 1))
+    return folder
+
+
+def stored(out: Path) -> dict:
+    return json.loads((out / "result.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def bare(capture, tmp_path_factory):
+    """No stage at all before COLMAP."""
+    out, stages = tmp_path_factory.mktemp("bare") / "out", []
+    options = dataclasses.replace(QUICK, deterministic=True)
+    result = reconstruct(
+        capture, out, options, frame_stages=[], keypoint_stages=[], progress=lambda stage, *_: stages.append(stage)
+    )
+    return out, result, stages
+
+
+def test_without_keypoint_stages_nothing_is_said_to_be_rectified(bare):
+    out, result, stages = bare
+    said = stored(out)
+    assert not any(frame["rectified"] for frame in said["frames"])
+    assert said["imaging"]["rectify"] is False
+    assert "rectified" not in said["imaging"]["rolling_shutter"]
+    assert not (out / "images_rectified").exists()
+    assert result.keypoints.rectified() == frozenset()
+    # and nothing was prepared that no stage needs
+    assert not {"calibration", "survey", "motion", "blur"} & set(stages)
+    assert said["models"][0]["readout_translation"] is None
+
+
+def test_a_stage_beside_the_defaults_and_one_that_drops_with_a_reason(tmp_path):
+    capture = copy_scene(tmp_path / "capture", first=12)
+    names = sorted(path.name for path in (capture / "frames").iterdir())
+
+    def without_two(frames):
+        for frame in frames:
+            if frame.name == names[3]:
+                why = Treatment(stage="mine", reason="somebody walks by", values={"people": 1})
+                yield dataclasses.replace(frame, dropped=True, treatments=(*frame.treatments, why))
+            elif frame.name != names[5]:
+                yield frame
+
+    result = reconstruct(capture, tmp_path / "out", QUICK, frame_stages=[without_two, ...])
+    actions = {record.name: record.action for record in result.frames}
+    assert [name for name in names if actions[name] == "dropped"] == [names[3], names[5]]
+    assert sorted(path.name for path in (tmp_path / "out" / "images").iterdir()) == [
+        name for name in names if name not in (names[3], names[5])
+    ]
+    said = {frame["name"]: frame for frame in stored(tmp_path / "out")["frames"]}
+    assert said[names[3]]["reason"] == "somebody walks by"
+    (why,) = result.frames[3].treatments
+    assert why.values == {"people": 1}
+
+
+def test_dots_stand_for_the_defaults_once():
+    assert with_defaults([1, ..., 2], [7, 8]) == [1, 7, 8, 2]
+    assert with_defaults([], [7]) == [] and with_defaults([...], [7]) == [7]
+    with pytest.raises(ValueError, match="once"):
+        with_defaults([..., ...], [7])
+
+
+def test_what_a_visitor_s_keypoint_stage_did_is_what_the_result_says(capture, tmp_path):
+    moved = []
+
+    class Rectify:
+        def __call__(self, keypoints: Keypoints, /) -> Keypoints:
+            said = Treatment(stage="mine", reason="by hand", action="rectified")
+            return dataclasses.replace(
+                keypoints, xy_px=keypoints.xy_px, rectified=True, treatments=(*keypoints.treatments, said)
+            )
+
+        def move_image(self, name, image):
+            moved.append(name)
+            return 255 - image
+
+    models = []
+
+    def look(model: Model) -> Model:
+        models.append(model)
+        return model
+
+    out = tmp_path / "out"
+    result = reconstruct(capture, out, QUICK, frame_stages=[], keypoint_stages=[Rectify()], model_stages=[look, ...])
+    assert all(frame["rectified"] for frame in stored(out)["frames"])
+    assert len(moved) == 16 and len(list((out / "images_rectified").iterdir())) == 16
+    assert contents(out / "images_rectified") != contents(out / "images")
+    # the default model stages see a model of rectified keypoints, and finish what the keypoints began
+    assert models[0].rectified and not models[0].doubts
+    assert [treatment.stage for treatment in result.models[0].treatments] == ["readout"]
+    assert stored(out)["models"][0]["readout_translation"] is not None
+
+
+def test_doubts_are_enforced_after_the_stages_whoever_wrote_them(capture, bare, tmp_path, monkeypatch):
+    from colmap_inertial.drivers import capture as driver
+
+    monkeypatch.setattr(driver, "stop_or_doubt", lambda diagnosis, force: ("the video was stabilised",))
+    _, plain, _ = bare
+    trusted = dataclasses.replace(plain.models[0].scale, verdict="trusted")
+    seen = []
+
+    def mine(model: Model) -> Model:
+        seen.append(model.doubts)
+        return dataclasses.replace(model, scale=trusted)
+
+    options = ReconstructOptions(mapping=QUICK.mapping, force=True)
+    for stages in ([mine], [..., mine], [...]):
+        out = tmp_path / str(len(list(tmp_path.iterdir())))
+        result = reconstruct(capture, out, options, frame_stages=[], keypoint_stages=[], model_stages=stages)
+        (model,) = result.models
+        assert model.scale.verdict == "weak" and model.scale.reasons[0] == "the video was stabilised"
+        assert stored(out)["models"][0]["verdict"] == "weak"
+    transform = json.loads((out / "sparse_metric" / "0" / "transform.json").read_text())
+    assert transform["provenance"].endswith("weak")
+    assert seen == [("the video was stabilised",)] * 2
+
+
+def test_a_finished_run_is_gone_on_with_where_the_options_ask_for_more(capture, bare):
+    out, first, _ = bare
+    before = contents(out)
+    log = (out / "log.txt").read_text()
+    options = dataclasses.replace(QUICK, deterministic=True, world="y-down")
+    second = reconstruct(capture, out, options, frame_stages=[], keypoint_stages=[])
+    assert not second.unchanged
+    new = (out / "log.txt").read_text()[len(log) :]
+    for step in ("frames", "matches", "mapping"):
+        assert f"{step}: finished in an earlier run, kept" in new
+    assert "metric: started" in new and "features: started" not in new
+    after = contents(out)
+    kept = [name for name in before if name.startswith(("images/", "sparse/", "database"))]
+    assert len(kept) > 16 and all(before[name] == after[name] for name in kept)
+    assert before["sparse_metric/0/images.bin"] != after["sparse_metric/0/images.bin"]
+    assert second.models[0].scale.metres_per_unit == first.models[0].scale.metres_per_unit
+    # as if it had been asked for at once
+    again = reconstruct(capture, out, options, frame_stages=[], keypoint_stages=[])
+    assert again.unchanged
+    np.testing.assert_array_equal(again.models[0].scale.cov, second.models[0].scale.cov)
+    # and back
+    back = reconstruct(
+        capture, out, dataclasses.replace(QUICK, deterministic=True), frame_stages=[], keypoint_stages=[]
+    )
+    assert not back.unchanged
+    assert contents(out)["sparse_metric/0/images.bin"] == before["sparse_metric/0/images.bin"]
+
+
+def test_a_calibration_given_later_maps_nothing_again(capture, bare, tmp_path):
+    out, first, _ = bare
+    write_calibration(tmp_path / "device.json", first.models[0].scale.calibration)
+    before, log = contents(out), (out / "log.txt").read_text()
+    options = dataclasses.replace(QUICK, deterministic=True, calibration=tmp_path / "device.json")
+    second = reconstruct(capture, out, options, frame_stages=[], keypoint_stages=[])
+    new = (out / "log.txt").read_text()[len(log) :]
+    assert all(f"{step}: finished in an earlier run, kept" in new for step in ("frames", "matches", "mapping"))
+    assert "metric: started" in new and not second.unchanged
+    kept = [name for name in before if name.startswith(("images/", "sparse/", "database"))]
+    assert all(before[name] == contents(out)[name] for name in kept)
+    spread = [model.scale.calibration.sigma("gyro_time_offset_s") for model in (*first.models, *second.models)]
+    assert spread[1] < spread[0]
+
+
+def test_a_run_reads_each_model_from_disk_twice_at_most(capture, tmp_path, monkeypatch):
+    import pycolmap
+
+    from colmap_inertial import model
+
+    read, reads = model._read_from, []
+
+    def counted(folder, suffix):
+        reads.append(folder)
+        return read(folder, suffix)
+
+    monkeypatch.setattr(model, "_read_from", counted)
+    out = tmp_path / "out"
+    reconstruct(capture, out, QUICK, frame_stages=[], keypoint_stages=[])
+    counts = {folder: reads.count(folder) for folder in set(reads)}
+    assert set(counts) == {out / "sparse" / "0", out / "sparse_metric" / "0"} and max(counts.values()) <= 2
+    assert isinstance(read(out / "sparse" / "0", ".bin"), pycolmap.Reconstruction)
+
+
+def test_a_killed_change_of_a_finished_run_leaves_no_result_behind(capture, bare, tmp_path):
+    """While something is made again, result.json does not stand for it."""
+    out = bare[0]
+    seen = []
+
+    def stop(stage, done, total, /):
+        seen.append((out / "result.json").exists())
+        if stage == "metric":
+            raise KeyboardInterrupt
+
+    options = dataclasses.replace(QUICK, deterministic=True, world="y-down")
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(capture, out, options, frame_stages=[], keypoint_stages=[], progress=stop)
+    assert seen and not any(seen)
+    assert not (out / "result.json").exists()
+    assert reconstruct(capture, out, options, frame_stages=[], keypoint_stages=[]).models[0].sparse_metric is not None
+
+
+def test_a_frame_cannot_be_both_dropped_and_seen():
+    frame = Frame(name="a.jpg", image=np.zeros((4, 4), np.uint8), t_s=0.0)
+    assert not frame.dropped and frame.treatments == ()
+    assert dataclasses.replace(frame, dropped=True).dropped

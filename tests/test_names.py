@@ -1,0 +1,140 @@
+"""Names from outside never lead out of the folder that they belong to."""
+
+import json
+
+import cv2
+import model_project
+import numpy as np
+import pycolmap
+import pytest
+
+from colmap_inertial.batch import read_manifest
+from colmap_inertial.colmap.dense import _check_images
+from colmap_inertial.errors import FormatError
+from colmap_inertial.io.aperture_images import SubImages
+from colmap_inertial.io.exif import stamps_of_exif
+from colmap_inertial.io.names import check_names, path_in
+from colmap_inertial.model import read_model
+from colmap_inertial.report.markup import images
+from colmap_inertial.run.progress import silent
+from colmap_inertial.stages.frame_folder import write_frames
+from colmap_inertial.stages.rectified import write_rectified
+from colmap_inertial.types import Frame
+from colmap_inertial.validate.views import load_views
+from colmap_inertial.view.sources import find_source
+
+BAD = ["", ".", "/etc/passwd", "../a.png", "a/../../b.png", "a\\..\\b.png", "a\0.png", "x" * 256, "a/" + "\udfff" * 90]
+
+
+@pytest.fixture(scope="module")
+def model():
+    return model_project.sparse_model(np.random.default_rng(4))
+
+
+def written(model, folder, name, write="write_binary"):
+    """The model, its first image under another name."""
+    copy = pycolmap.Reconstruction(model)
+    copy.image(1).name = name
+    folder.mkdir(parents=True)
+    getattr(copy, write)(str(folder))
+    return folder
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_names_that_lead_away_are_refused_and_their_source_is_named(tmp_path, name):
+    with pytest.raises(FormatError, match=r"images\.bin.*names the file"):
+        check_names(["a.png", name], tmp_path / "images.bin")
+    with pytest.raises(FormatError, match="names the file"):
+        path_in(tmp_path, name)
+
+
+@pytest.mark.parametrize("name", ["a.png", "cam 0/Bild ü.png", "a..b/..c.png", "...x"])
+def test_ordinary_names_pass_there_or_not(tmp_path, name):
+    assert path_in(tmp_path, name) == tmp_path / name
+
+
+def test_links_may_lead_to_the_folder_and_within_it_but_not_out_of_it(tmp_path):
+    real = tmp_path / "real"
+    (real / "cam0").mkdir(parents=True)
+    (tmp_path / "link").symlink_to(real)
+    (real / "cam1").symlink_to("cam0")
+    (real / "out").symlink_to(tmp_path)
+    (real / "gone.png").symlink_to(tmp_path / "nowhere.png")
+    (real / "loop").symlink_to("loop")
+    assert path_in(tmp_path / "link", "cam1/a.png") == tmp_path / "link" / "cam1" / "a.png"
+    for name in ("out/a.png", "gone.png"):
+        with pytest.raises(FormatError, match="a link leads out of"):
+            path_in(tmp_path / "link", name, "model")
+    assert not path_in(real, "loop").is_file()
+
+
+@pytest.mark.parametrize("write", ["write_binary", "write_text"])
+@pytest.mark.parametrize("name", ["/abs.png", "../../up.png", "a/../../../x.png"])
+def test_a_model_with_such_a_name_is_not_read(tmp_path, model, name, write):
+    with pytest.raises(FormatError, match=r"images\.(bin|txt): names the file"):
+        read_model(written(model, tmp_path / "model", name, write))
+
+
+def test_readers_of_a_model_s_images_do_not_follow_links_out(tmp_path, model):
+    folder = written(model, tmp_path / "model", "sub/000.png")
+    pictures, secret = tmp_path / "images", tmp_path / "secret"
+    for place in (pictures, secret):
+        place.mkdir()
+        for name in model_project.NAMES:
+            blank = np.zeros((model_project.HEIGHT, model_project.WIDTH, 3), np.uint8)
+            assert cv2.imwrite(str(place / name), blank)
+    (pictures / "sub").symlink_to(secret)
+    with pytest.raises(FormatError, match="a link leads out of"):
+        _check_images(pictures, folder, read_model(folder))
+    with pytest.raises(FormatError, match="a link leads out of"):
+        load_views(folder, pictures)
+
+
+def test_tables_and_captures_do_not_lead_out(tmp_path):
+    with pytest.raises(FormatError, match=r'by "\.\."'):
+        SubImages(folder=tmp_path, rename=("a_", "../b_")).path("a_1.png")
+    with pytest.raises(FormatError, match="is absolute"):
+        stamps_of_exif(tmp_path, ["/etc/hostname"])
+    with pytest.raises(FormatError, match="names the file"):
+        images(tmp_path, ["../x.jpg"])
+
+
+@pytest.mark.parametrize("name", ["../up.png", "out/up.png"])
+def test_writers_stay_in_their_folder(tmp_path, name):
+    target, source = tmp_path / "images", tmp_path / "source"
+    source.mkdir()
+    (tmp_path / "outside").mkdir()
+
+    def linked(frames):
+        (target / "out").symlink_to(tmp_path / "outside")
+        yield from frames
+
+    frames = iter([Frame(name=name, image=np.zeros((4, 4), np.uint8), t_s=0.0)])
+    with pytest.raises(FormatError, match="names the file"):
+        write_frames(
+            frames, [name], [linked], source_folder=None, images=target, records=tmp_path / "r", progress=silent
+        )
+    (source / "out").symlink_to(tmp_path / "outside")
+    with pytest.raises(FormatError, match="names the file"):
+        write_rectified([], [name], (), source, tmp_path / "rectified", silent)
+    assert not list((tmp_path / "outside").iterdir())
+    assert not (tmp_path / "up.png").exists()
+
+
+def test_a_result_of_others_names_only_what_lies_in_its_folder(tmp_path, model):
+    out = tmp_path / "out"
+    (out / ".stages").mkdir(parents=True)
+    written(model, tmp_path / "elsewhere", "000.png")
+    record = {"index": 0, "registered_images": 6, "sparse": "../elsewhere", "sparse_metric": None, "verdict": "refused",
+              "reasons": [], "metres_per_unit": None, "ci95": None, "gravity_in_world_m_s2": None}  # fmt: skip
+    (out / "result.json").write_text(json.dumps({"models": [record]}))
+    with pytest.raises(FormatError, match=r"result\.json.*names the file"):
+        find_source(out)
+
+
+@pytest.mark.parametrize("name", ["..", "a/b", "/a", "x" * 300, "a\\u0000b"])
+def test_a_batch_s_names_are_those_of_folders(tmp_path, name):
+    manifest = tmp_path / "batch.toml"
+    manifest.write_text(f'[[capture]]\npath = "a"\nname = "{name}"\n')
+    with pytest.raises(FormatError, match="name"):
+        read_manifest(manifest)

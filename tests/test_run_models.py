@@ -1,0 +1,275 @@
+"""COLMAP's models on their way to metres: which go first, which are left out, what is said, what is made again."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pycolmap
+import pytest
+from conftest import write_project
+from test_pipeline_parts import recording_of, session_in
+
+from colmap_inertial.drivers.models import run_models
+from colmap_inertial.drivers.result import ModelResult, ReconstructResult, result_as_json
+from colmap_inertial.geometry import quat_exp, quat_multiply
+from colmap_inertial.imaging.gate import FrameDecision, RecordingVerdict
+from colmap_inertial.io.calibration import Declared, calibration_prior
+from colmap_inertial.io.capture import Capture
+from colmap_inertial.io.frames import read_frame_times
+from colmap_inertial.io.trajectories import read_tum
+from colmap_inertial.model import Model, num_registered, read_model
+from colmap_inertial.model.readout import Settled
+from colmap_inertial.precalibrate.plan import ImagingPlan
+from colmap_inertial.run.workspace import Workspace
+from colmap_inertial.simulate import ImuOptions, MotionOptions, RecordingOptions, SfmOptions, simulate_recording
+from colmap_inertial.stages import readout
+from colmap_inertial.stages.deblur import DeblurStage
+from colmap_inertial.stages.gyro_view import GyroView
+from colmap_inertial.stages.metric import MetricStage, gravity_in_model, of_model
+from colmap_inertial.stages.readout import ReadoutStage
+from colmap_inertial.stages.rolling_shutter import RollingShutterStage, for_rectified
+from colmap_inertial.types import (
+    CameraModel,
+    Frame,
+    FrameTiming,
+    ImuRecording,
+    Keypoints,
+    ScaleEstimate,
+    Similarity,
+)
+
+CAMERA = CameraModel(model="PINHOLE", width=640, height=480, params=(500.0, 500.0, 320.0, 240.0))
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory):
+    """Twenty seconds in a model of a unit of its own, and their IMU."""
+    options = RecordingOptions(
+        motion=MotionOptions(duration_s=20.0), sfm=SfmOptions(metres_per_unit=(2.5, 2.5)), imu=ImuOptions()
+    )
+    simulated = simulate_recording(options, seed=11)
+    # a camera's clock that began long ago
+    simulated = replace(simulated, trajectory=replace(simulated.trajectory, epoch_ns=5_000_000_000))
+    return write_project(tmp_path_factory.mktemp("project"), simulated)
+
+
+@pytest.fixture(scope="module")
+def whole(project):
+    """A model of a handheld recording with its times, and what the default stage makes of it."""
+    model = Model(
+        reconstruction=read_model(project.model), colmap_index=0, timing=read_frame_times(project.frame_times)
+    )
+    made = MetricStage(imu=project.recording.imu, calibration=None)(model)
+    assert made.scale.verdict == "trusted"
+    return model, made
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scaled:
+    """Gives models of at least and at most so many images the same scale estimate, and refuses it to the others."""
+
+    made: Model = field(compare=False)
+    least: int = 0
+    most: int = 1000
+
+    def __call__(self, model):
+        if not self.least <= model.reconstruction.num_reg_images() <= self.most:
+            return replace(model, scale=ScaleEstimate.refused("joint", "not this one"))
+        similarity = self.made.similarity
+        moved = pycolmap.Reconstruction(model.reconstruction)
+        moved.transform(
+            pycolmap.Sim3d(similarity.scale, pycolmap.Rotation3d(similarity.rotation_xyzw), similarity.translation_m)
+        )
+        return replace(model, reconstruction=moved, scale=self.made.scale, similarity=similarity)
+
+
+@pytest.fixture
+def run(project, whole, tmp_path):
+    """Runs the model stages on sub-models of so many images each, by number."""
+    workspace = Workspace(tmp_path / "out")
+    workspace.open(tmp_path / "capture.toml")
+    model, made = whole
+    names = sorted(image.name for image in model.reconstruction.images.values())
+
+    def run(sizes, *, doubts=(), least=0, most=1000, **more):
+        for number, size in sizes.items():
+            folder = workspace.sparse / str(number)
+            if not folder.exists():
+                part = pycolmap.Reconstruction(model.reconstruction)
+                for name in names[size:]:
+                    part.deregister_frame(part.find_image_with_name(name).frame_id)
+                folder.mkdir(parents=True)
+                part.write_binary(str(folder))
+        session = session_in(workspace)
+        recording = replace(recording_of(project.recording.imu, model.timing), doubts=doubts)
+        found = {number: workspace.sparse / str(number) for number in sizes}
+        run.session = session
+        return run_models(
+            session, recording, [Scaled(made=made, least=least, most=most)], found=found, after=(), **more
+        )
+
+    run.workspace = workspace
+    return run
+
+
+def test_the_largest_model_goes_first_and_fragments_are_left_out(run):
+    models, fragments = run({0: 40, 1: 4, 2: 90})
+    assert [(one.index, one.colmap_index, one.summary["registered_images"]) for one in models] == [
+        (0, 2, 90),
+        (1, 0, 40),
+    ]
+    assert [(one.colmap_index, one.registered_images) for one in fragments] == [(1, 4)]
+    assert num_registered(models[0].sparse_metric) == 90
+
+
+def test_fragments_are_treated_where_that_is_asked_for(run):
+    models, fragments = run({0: 30, 1: 40, 2: 4}, least=35, fragments=True)
+    assert [one.colmap_index for one in models] == [1, 0, 2] and fragments == ()
+    models, fragments = run({0: 30, 1: 40, 2: 4}, least=35)
+    assert [one.colmap_index for one in models] == [1, 0]
+    assert [one.colmap_index for one in fragments] == [2]
+
+
+def test_the_first_path_has_the_plain_name_and_those_of_models_that_are_gone_go(run):
+    run({0: 60, 1: 50, 2: 40})
+    assert sorted(path.name for path in run.workspace.root.glob("*.tum")) == [
+        "trajectory.tum",
+        "trajectory_1.tum",
+        "trajectory_2.tum",
+    ]
+    # the largest one is refused: the next one's path has the plain name
+    run({0: 60, 1: 50, 2: 40}, least=45, most=55)
+    assert sorted(path.name for path in run.workspace.root.glob("trajectory*")) == [
+        "trajectory.tum",
+        "trajectory_cov.npz",
+    ]
+    assert [path.name for path in run.workspace.sparse_metric.iterdir()] == ["1"]
+
+
+def test_doubts_make_any_stage_s_scale_weak_and_make_the_models_again(run):
+    sure, _ = run({0: 40})
+    assert sure[0].scale.verdict == "trusted"
+    doubts = ("the video was stabilised",)
+    doubted, _ = run({0: 40}, doubts=doubts)
+    assert doubted[0].scale.verdict == "weak" and doubted[0].scale.reasons[:1] == doubts
+    assert run.session.runner.worked == ["metric"]
+    run({0: 40}, doubts=doubts)
+    assert run.session.runner.worked == []
+
+
+def test_positions_and_covariances_of_a_path_have_the_same_stamps(run, project):
+    run({0: 40})
+    path = read_tum(run.workspace.root / "trajectory.tum")
+    stored = np.load(run.workspace.root / "trajectory_cov.npz")
+    np.testing.assert_allclose(stored["t_s"], path.t_s + path.epoch_ns * 1e-9, atol=1e-6, rtol=0)
+    assert stored["cov"].shape == (len(path.t_s), 9, 9)
+    assert stored["t_s"][0] >= 5
+
+
+def test_gravity_points_down_in_a_metric_model_and_as_it_was_in_colmap_s(whole, project):
+    model, made = whole
+    down = gravity_in_model(made)
+    np.testing.assert_allclose(down / np.linalg.norm(down), [0, 0, -1], atol=1e-9)
+    truth = project.recording.truth.gravity_in_world_m_s2
+    in_colmap_s = gravity_in_model(replace(made, similarity=None))
+    cosine = in_colmap_s @ truth / np.linalg.norm(in_colmap_s) / np.linalg.norm(truth)
+    assert np.degrees(np.arccos(cosine)) < 1
+    assert gravity_in_model(model) is None
+
+
+def test_scaling_leaves_the_model_that_it_was_made_from(whole):
+    model, made = whole
+    similarity = Similarity(scale=3.0, rotation_xyzw=[0, 0, 0, 1], translation_m=[1, 2, 3], cov=np.zeros((7, 7)))
+    image_id = model.reconstruction.reg_image_ids()[0]
+    before = np.array(model.reconstruction.image(image_id).projection_center())
+    moved = model.scaled(made.scale, similarity)
+    np.testing.assert_array_equal(model.reconstruction.image(image_id).projection_center(), before)
+    np.testing.assert_allclose(moved.reconstruction.image(image_id).projection_center(), 3 * before + [1, 2, 3])
+
+
+def test_text_models_count_their_images(whole, tmp_path):
+    model, _ = whole
+    model.reconstruction.write_text(str(tmp_path))
+    assert num_registered(tmp_path) == model.reconstruction.num_reg_images()
+
+
+def test_only_rectified_models_have_lost_their_readout(whole):
+    model, _ = whole
+    known = calibration_prior(Declared(readout_s=0.03))
+    assert of_model(known, model) is known and of_model(None, replace(model, rectified=True)) is None
+    left = of_model(known, replace(model, rectified=True))
+    assert left.readout_s == 0 and 0 < left.sigma("readout_s") < 0.1 * 0.03 + 1e-9
+    np.testing.assert_array_equal(left.cam_from_imu_xyzw, known.cam_from_imu_xyzw)
+    assert for_rectified(known).readout_s == 0
+
+
+def test_velocities_within_the_readout_are_in_the_model_s_unit(whole, project, monkeypatch):
+    given = {}
+
+    def settle(reconstruction, shutters, velocity, **more):
+        given.update(velocity)
+        return reconstruction, Settled(shift_px=0.0, before_px=1.0, after_px=1.0, accepted=False)
+
+    monkeypatch.setattr(readout, "settle_readout", settle)
+    model, _ = whole
+    imu = project.recording.imu
+    ReadoutStage(imu=imu, calibration=None, refine_intrinsics=False)(replace(model, rectified=True))
+    truth, names = project.recording.truth, list(given)[100:500:20]
+    t_of = dict(zip(model.timing.names, model.timing.pose_t_s(), strict=True))
+    shift_s = (model.timing.epoch_ns - project.recording.trajectory.epoch_ns) * 1e-9
+    t_s = np.array([t_of[name] for name in names]) + shift_s
+    true = (truth.cam_in_model(t_s + 1e-3) - truth.cam_in_model(t_s - 1e-3)) / 2e-3
+    found = np.array([given[name] for name in names])
+    assert np.linalg.norm(found - true) < 0.1 * np.linalg.norm(true)
+
+
+def test_the_change_of_the_calibration_is_the_angle_between_both(whole, project, tmp_path):
+    model, made = whole
+    turned = quat_multiply(quat_exp(np.radians([0.0, 3.0, 0.0])), made.scale.calibration.cam_from_imu_xyzw)
+    first = replace(made.scale.calibration, cam_from_imu_xyzw=turned, gyro_time_offset_s=5.0)
+    view = GyroView(imu=project.recording.imu, timing=model.timing, calibration=first, camera=CAMERA, source="capture")
+    one = ModelResult(index=0, colmap_index=0, scale=made.scale, summary={}, sparse=tmp_path / "sparse")
+    result = ReconstructResult(workspace=Workspace(tmp_path), models=(one,), seconds={}, imaging=ImagingPlan(view=view))
+    stored = result_as_json(result, Capture(path=tmp_path, calibration=first))["models"][0]["calibration_change"]
+    assert stored["rotation_deg"] == pytest.approx(3)
+    assert stored["gyro_time_offset_s"] == pytest.approx(made.scale.calibration.gyro_time_offset_s - 5)
+
+
+# --- stages by the gyroscope -----------------------------------------------------------------------------------------
+
+T_S = np.arange(0.0, 1.0, 0.005)
+PANNING = ImuRecording(
+    gyro_t_s=T_S,
+    gyro_rad_s=np.tile([0.0, 1.0, 0.0], (len(T_S), 1)),
+    accel_t_s=T_S,
+    accel_m_s2=np.tile([0.0, 0.0, 9.81], (len(T_S), 1)),
+)
+TIMING = FrameTiming(names=("a.jpg", "late.jpg"), t_s=[0.5, 5.0], exposure_s=[0.01, 0.01], readout_s=0.024)
+VIEW = GyroView(
+    imu=PANNING,
+    timing=TIMING,
+    calibration=calibration_prior(Declared(cam_from_imu_xyzw=[0.0, 0.0, 0.0, 1.0], gyro_time_offset_s=0.0)),
+    camera=CAMERA,
+    source="capture",
+)
+
+
+def test_keypoints_that_were_moved_are_said_to_be_rectified_and_others_are_not():
+    stage = RollingShutterStage(view=VIEW)
+    xy_px = np.array([[320.0, 0.5], [320.0, 240.5], [320.0, 479.5]])
+    moved = stage(Keypoints(name="a.jpg", xy_px=xy_px))
+    # half a readout before and after the middle row, the camera looks 0.012 rad to the left and to the right
+    turned_px = 500 * np.tan([-0.012, 0.0, 0.012])
+    np.testing.assert_allclose(moved.xy_px[:, 0], 320 + turned_px, atol=0.05)
+    assert moved.rectified
+    left = stage(Keypoints(name="late.jpg", xy_px=xy_px))
+    np.testing.assert_array_equal(left.xy_px, xy_px)
+    assert not left.rectified
+
+
+@pytest.mark.parametrize(("trusted", "drop", "gone"), [(True, True, True), (None, True, False), (True, False, False)])
+def test_frames_are_dropped_only_by_a_gyroscope_that_the_images_bear_out(trusted, drop, gone):
+    decision = FrameDecision(name="a.jpg", blur_px=90.0, action="drop", reason="too much blur")
+    verdict = RecordingVerdict(trusted=trusted, support=9.0, extent_factor=1.0, frames=9, reason="")
+    stage = DeblurStage(view=VIEW, decisions=(decision,), verdict=verdict, drop=drop, workers=1)
+    (frame,) = stage(iter([Frame(name="a.jpg", image=np.zeros((480, 640), np.uint8), t_s=0.5)]))
+    assert frame.dropped is gone and frame.treatments[-1].reason == "too much blur"

@@ -1,0 +1,544 @@
+"""What is made again and what is kept, step by step; what steps are given, and what they leave behind."""
+
+import contextlib
+import itertools
+import os
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from test_pipeline_parts import frames_of, recording_of, session_in
+
+from colmap_inertial.colmap import steps
+from colmap_inertial.colmap.sparse import (
+    KeypointRecords,
+    extract_features,
+    image_pairs,
+    map_images,
+    write_gravity_priors,
+)
+from colmap_inertial.diagnose import Recorded, diagnose
+from colmap_inertial.drivers import frames as framing, project as existing
+from colmap_inertial.drivers.frames import run_frames, run_plan, run_rectified
+from colmap_inertial.drivers.sources import check_output
+from colmap_inertial.errors import NotObservableError, OutputExistsError
+from colmap_inertial.io.calibration import Declared, calibration_prior, write_calibration
+from colmap_inertial.io.capture import Capture, ImageFolder
+from colmap_inertial.io.exposures import LongExposures, SubImages
+from colmap_inertial.io.files import write_json
+from colmap_inertial.io.video_match import VideoMatch
+from colmap_inertial.model import TRANSFORM_FILE
+from colmap_inertial.options import ExposureOptions, MappingOptions, ProjectOptions, ReconstructOptions
+from colmap_inertial.precalibrate import calibrate, plan as imaging
+from colmap_inertial.precalibrate.pairs import exposure_stage
+from colmap_inertial.precalibrate.plan import Treatments, plan_imaging
+from colmap_inertial.precalibrate.preflight import stop_or_doubt
+from colmap_inertial.precalibrate.selection import part_of
+from colmap_inertial.run.context import Recording, RunContext, prior_calibration
+from colmap_inertial.run.progress import silent
+from colmap_inertial.run.runner import StepRunner, fingerprint
+from colmap_inertial.run.session import Session, open_session
+from colmap_inertial.run.workspace import Workspace
+from colmap_inertial.simulate import MotionOptions, RecordingOptions, simulate_recording
+from colmap_inertial.stages.exposures import Fuser
+from colmap_inertial.stages.frame_folder import FrameRecord, write_frames
+from colmap_inertial.stages.gyro_view import GyroView
+from colmap_inertial.stages.rectified import write_rectified
+from colmap_inertial.types import CameraModel, FrameTiming, ImuRecording, Treatment
+
+NAMES = tuple(f"{i}.jpg" for i in range(6))
+TIMING = FrameTiming(names=NAMES, t_s=np.arange(6.0), exposure_s=[0.01, 0.02, 0.03, 0.04, 0.05, 0.06])
+T_S = np.arange(0.0, 6.0, 0.01)
+IMU = ImuRecording(
+    gyro_t_s=T_S,
+    gyro_rad_s=np.tile([0.0, 3.0, 0.0], (len(T_S), 1)),
+    accel_t_s=T_S,
+    accel_m_s2=np.tile([0.0, 0.0, 9.81], (len(T_S), 1)),
+)
+OFF = Treatments(deblur="off", rolling_shutter="off")
+CAMERA = CameraModel(model="PINHOLE", width=64, height=48, params=(60.0, 60.0, 32.0, 24.0))
+
+
+@pytest.fixture
+def workspace(tmp_path):
+    workspace = Workspace(tmp_path / "out")
+    workspace.open(tmp_path / "capture.toml")
+    return workspace
+
+
+def recording(**changes):
+    return replace(recording_of(IMU, TIMING), **changes)
+
+
+# --- what decides ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        pytest.param({"prior": calibration_prior(Declared(gyro_time_offset_s=1.0))}, id="calibration"),
+        pytest.param({"imu": replace(IMU, gyro_rad_s=2 * IMU.gyro_rad_s)}, id="gyroscope"),
+        pytest.param({"timing": replace(TIMING, readout_s=0.02)}, id="readout"),
+        pytest.param({"every": replace(TIMING, t_s=2 * TIMING.t_s)}, id="all frames"),
+        pytest.param({"max_offset_s": 0.5}, id="largest offset"),
+        pytest.param({"seed": 1}, id="seed"),
+        pytest.param({"asked": replace(OFF, pairs=True)}, id="treatment"),
+    ],
+)
+def test_all_that_decides_a_plan_makes_it_again(workspace, change):
+    def made(*, asked=OFF, seed=0, **changes):
+        context = RunContext(scratch=workspace.stamps, seed=seed)
+        session = Session(workspace=workspace, runner=StepRunner(workspace), context=context)
+        run_plan(session, recording(**changes), asked)
+        return session.runner.worked
+
+    assert [made(), made(), made(**change), made(**change)] == [["imaging"], [], ["imaging"], []]
+
+
+def test_another_network_makes_the_plan_again(workspace, monkeypatch):
+    def made(checksum):
+        monkeypatch.setattr(framing, "checksum", lambda name: f"{name} {checksum}")
+        session = session_in(workspace)
+        run_plan(session, recording(timing=replace(TIMING, exposure_s=None)), replace(OFF, deblur="deepgyro"))
+        return session.runner.worked
+
+    assert [made("a"), made("a"), made("b")] == [["imaging"], [], ["imaging"]]
+
+
+def test_a_picture_that_was_edited_makes_the_frames_again(workspace, tmp_path):
+    timing, _ = frames_of(tmp_path / "in")
+    capture = Capture(path=tmp_path, calibration=calibration_prior(), frames=ImageFolder(folder=tmp_path / "in"))
+    filmed = Recording.of(capture, IMU, timing, capture.calibration)
+
+    count = itertools.count()
+
+    def made():
+        session = session_in(workspace)
+        run_frames(session, filmed, frames_of(tmp_path / f"filmed {next(count)}")[1], [])
+        return session.runner.worked
+
+    assert [made(), made()] == [["frames"], []]
+    edited = tmp_path / "in" / "3.jpg"
+    data = bytearray(edited.read_bytes())
+    data[-10] ^= 1
+    edited.write_bytes(data)
+    assert made() == ["frames"]
+    assert (workspace.images / "3.jpg").read_bytes() == data
+
+
+def test_an_input_is_another_one_when_it_was_written_again(tmp_path):
+    path = tmp_path / "gyro.csv"
+    path.write_text("1.5")
+    os.utime(path, ns=(10**18, 10**18))
+    before = fingerprint(path)
+    assert fingerprint(path) == before
+    path.write_text("2.5")
+    os.utime(path, ns=(10**18, 10**18 + 10**6))
+    assert fingerprint(path) != before
+
+
+def test_a_calibration_of_another_recording_leaves_clocks_and_bias_open(tmp_path):
+    stated = Declared(gyro_time_offset_s=7.0, gyro_bias_rad_s=[0.1, 0.0, 0.0], cam_from_imu_xyzw=[0.0, 0.0, 1.0, 0.0])
+    write_calibration(tmp_path / "calibration.json", calibration_prior(stated))
+    capture = recording().capture
+    found = prior_calibration(capture, tmp_path / "calibration.json")
+    np.testing.assert_array_equal(found.cam_from_imu_xyzw, [0, 0, 1, 0])
+    assert found.rotation_sigma_rad < 0.1
+    assert found.sigma("gyro_time_offset_s") > 1e3 and found.sigma("gyro_bias_x_rad_s") > 0.05
+    assert prior_calibration(capture, None) is capture.calibration
+
+
+def test_some_frames_keep_their_own_times_and_exposures():
+    part = part_of(TIMING, ["4.jpg", "1.jpg"])
+    assert part.names == ("1.jpg", "4.jpg")
+    np.testing.assert_array_equal(part.t_s, [1.0, 4.0])
+    np.testing.assert_array_equal(part.exposure_s, [0.02, 0.05])
+    assert part_of(replace(TIMING, exposure_s=None), ["4.jpg"]).exposure_s is None
+
+
+# --- what steps leave behind -----------------------------------------------------------------------------------------
+
+
+def test_a_result_goes_when_anything_is_made_again_and_only_then(workspace):
+    def run(option):
+        workspace.result.write_text("{}")
+        target = workspace.root / "a.txt"
+        StepRunner(workspace).run("a", {"option": option}, [target], lambda partial: partial[0].write_text("x"))
+        return workspace.result.is_file()
+
+    assert [run(1), run(1), run(2)] == [False, True, False]
+
+
+def test_a_step_without_files_that_was_interrupted_is_not_finished(workspace):
+    made = []
+
+    def run(option, *, stopped=False):
+        def work(partial):
+            made.append(option)
+            if stopped:
+                raise KeyboardInterrupt
+
+        with contextlib.suppress(KeyboardInterrupt):
+            StepRunner(workspace).run("depth", {"option": option}, [], work)
+
+    run(1)
+    run(2, stopped=True)
+    run(1)
+    assert made == [1, 2, 1], "what the second one began may have replaced what the first one made"
+
+
+def test_a_session_is_alone_in_its_folder_and_another_configuration_undoes_the_result(tmp_path):
+    def session(seed=0):
+        options = replace(ReconstructOptions(), seed=seed)
+        return open_session(tmp_path / "out", tmp_path / "capture.toml", options, progress=silent)
+
+    with session() as first:
+        with pytest.raises(OutputExistsError, match="another run is at work"), session():
+            pass
+        first.finish({})
+    with session() as again:
+        assert again.finish({})
+    with session(seed=1) as other:
+        assert not other.workspace.result.exists() and not other.finish({})
+
+
+def test_dropped_frames_are_not_written_and_say_why(tmp_path):
+    timing, frames = frames_of(tmp_path / "in")
+
+    def drop_the_second(stream):
+        for frame in stream:
+            said = tuple(Treatment(stage=stage, reason=f"{stage} said so") for stage in ("first", "last"))
+            yield replace(frame, dropped=frame.name == "1.jpg", treatments=said)
+
+    paths = {"source_folder": tmp_path / "in", "images": tmp_path / "out", "records": tmp_path / "frames.json"}
+    write_frames(frames, timing.names, [drop_the_second], **paths, progress=silent)
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [n for n in timing.names if n != "1.jpg"]
+    records = framing.read_frame_records(tmp_path / "frames.json")
+    assert [record.name for record in records if not record.used] == ["1.jpg"]
+    assert {record.reason for record in records} == {"last said so"}
+
+
+def test_pictures_whose_keypoints_stayed_are_copied(tmp_path):
+    timing, _ = frames_of(tmp_path / "in")
+    write_rectified(
+        [lambda name, image: 255 - image], timing.names, {"2.jpg"}, tmp_path / "in", tmp_path / "out", silent
+    )
+    for name in timing.names:
+        same = (tmp_path / "out" / name).read_bytes() == (tmp_path / "in" / name).read_bytes()
+        assert same == (name != "2.jpg")
+
+
+def test_rectified_pictures_follow_the_frames(workspace, tmp_path):
+    frames_of(tmp_path / "in")
+    records = [FrameRecord(name=name, action="passed") for name in NAMES]
+
+    def mover(keypoints):
+        return keypoints
+
+    mover.move_image = lambda name, image: 255 - image
+
+    def made(option):
+        session = session_in(workspace)
+
+        def frames(partial):
+            partial[0].mkdir()
+            for name in NAMES:
+                cv2.imwrite(str(partial[0] / name), np.full((8, 8), option, np.uint8))
+
+        session.runner.run("frames", {"option": option}, [workspace.images], frames)
+        run_rectified(session, records, {"2.jpg"}, [mover])
+        return session.runner.worked
+
+    assert [made(10), made(10), made(90)] == [["frames", "rectified"], [], ["frames", "rectified"]]
+    assert cv2.imread(str(workspace.images_rectified / "2.jpg"))[0, 0, 0] == pytest.approx(165, abs=2)
+
+
+def test_an_earlier_result_that_is_an_input_is_not_written_over(tmp_path):
+    inputs = tmp_path / "inputs"
+    inputs.mkdir()
+    known = inputs / "calibration.json"
+    write_calibration(known, calibration_prior())
+    with pytest.raises(OutputExistsError, match="is an input"):
+        check_output(known, [inputs / ".." / "inputs" / "calibration.json"])
+    check_output(known, [inputs / "other.json"])  # an earlier result may be made again
+
+
+# --- COLMAP's steps --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def colmap(workspace, monkeypatch):
+    """COLMAP's steps without COLMAP: what they were given, and which of them worked."""
+    given = {}
+
+    def extract(images, cameras, database, options, *, keypoint_stages, context):
+        given["images"] = list(cameras)
+        database.write_text("features")
+        return KeypointRecords()
+
+    def match(features, database, pairs, context):
+        given["pairs"] = list(pairs)
+        database.write_text("matches")
+
+    def map_them(database, images, target, options, **more):
+        target.mkdir()
+
+    monkeypatch.setattr(steps, "extract_features", extract)
+    monkeypatch.setattr(steps, "match_features", match)
+    monkeypatch.setattr(steps, "map_images", map_them)
+    monkeypatch.setattr(steps, "write_gravity_priors", lambda database, gravity: given.update(gravity=gravity))
+
+    def run(records, *, gravity=None, overlap=10, frames=0):
+        session = session_in(workspace)
+        session.runner.run("frames", {"option": frames}, [workspace.images], lambda partial: partial[0].mkdir())
+        options = replace(ReconstructOptions(), mapping=MappingOptions(overlap=overlap))
+        steps.run_colmap(session, records, [], gravity or {}, options)
+        return session.runner.worked
+
+    run.given = given
+    return run
+
+
+def used(*names, dropped=()):
+    return [FrameRecord(name=n, action="dropped" if n in dropped else "passed", camera=CAMERA) for n in names]
+
+
+def test_colmap_is_given_the_frames_that_are_used(colmap):
+    colmap(used(*NAMES, dropped=("2.jpg",)))
+    kept = [name for name in NAMES if name != "2.jpg"]
+    assert colmap.given["images"] == kept
+    assert {name for pair in colmap.given["pairs"] for name in pair} == set(kept)
+
+
+def test_every_image_of_a_long_recording_is_matched_with_its_neighbours():
+    names = [f"{i:03}" for i in range(300)]
+    pairs = set(image_pairs(names, MappingOptions(overlap=3)))
+    assert {(names[i], names[i + step]) for step in (1, 2, 3) for i in range(300 - step)} <= pairs
+    assert all(a < b for a, b in pairs)
+
+
+def test_whatever_changes_matches_makes_a_new_model(colmap):
+    down = {"0.jpg": np.array([0.0, 1.0, 0.0])}
+    every = ["features", "matches", "mapping"]
+    # features are made inside of matches, and stay only until those are there
+    assert sorted(colmap(used(*NAMES))) == ["features", "frames", "mapping", "matches"]
+    assert colmap(used(*NAMES)) == []
+    assert sorted(colmap(used(*NAMES), overlap=3)) == ["mapping", "matches"]  # features do not depend on pairs
+    assert sorted(colmap(used(*NAMES), overlap=3, gravity=down)) == sorted(every)
+    assert colmap.given["gravity"] is down
+    assert sorted(colmap(used(*NAMES), overlap=3, gravity=down, frames=1)) == sorted([*every, "frames"])
+
+
+@pytest.fixture(scope="module")
+def features(tmp_path_factory):
+    """Two textured pictures through extraction, of which a stage rectifies one."""
+    folder = tmp_path_factory.mktemp("features")
+    rng = np.random.default_rng(0)
+    for name in ("a.png", "b.png"):
+        cv2.imwrite(str(folder / name), cv2.GaussianBlur(rng.integers(0, 255, (96, 128), np.uint8), (0, 0), 1.5))
+
+    def rectify_a(keypoints):
+        return replace(keypoints, rectified=keypoints.name == "a.png", xy_px=keypoints.xy_px + 1)
+
+    found = extract_features(
+        folder,
+        {"a.png": None, "b.png": None},
+        folder / "features.db",
+        MappingOptions(first_octave=0, max_num_features=50),
+        keypoint_stages=[rectify_a],
+        context=RunContext(scratch=folder, num_threads=1),
+    )
+    return folder / "features.db", found
+
+
+def test_it_is_recorded_whose_keypoints_are_those_of_a_global_shutter(features):
+    _, found = features
+    assert found.rectified() == {"a.png"} and len(found.images) == 2
+
+
+def test_gravity_priors_point_down_in_the_camera(features, tmp_path):
+    database, _ = features
+    write_gravity_priors(database, {"b.png": np.array([0.0, 9.81, 0.0])})
+    with pycolmap.Database.open(str(database)) as opened:
+        (prior,) = opened.read_all_pose_priors()
+        image = opened.read_image_with_name("b.png")
+        assert prior.corr_data_id.id == image.image_id
+    np.testing.assert_allclose(np.ravel(prior.gravity), [0.0, 1.0, 0.0])
+
+
+@pytest.mark.parametrize("refine", [True, False])
+def test_intrinsics_are_refined_where_that_is_asked_for(features, tmp_path, monkeypatch, refine):
+    asked = []
+
+    def mapping(database, images, target, options, **more):
+        asked.append(options)
+        return {0: None}
+
+    monkeypatch.setattr(pycolmap, "incremental_mapping", mapping)
+    map_images(
+        features[0],
+        tmp_path,
+        tmp_path / "sparse",
+        MappingOptions(),
+        refine_intrinsics=refine,
+        num_images=2,
+        context=RunContext(scratch=tmp_path),
+    )
+    (options,) = asked
+    assert options.ba_refine_focal_length == options.ba_refine_extra_params == refine
+    assert options.mapper.abs_pose_refine_focal_length == options.mapper.abs_pose_refine_extra_params == refine
+
+
+# --- before the reconstruction ---------------------------------------------------------------------------------------
+
+
+def test_the_longest_exposure_tells_whether_anything_may_be_blurred(tmp_path, monkeypatch):
+    def none(recording, context):
+        raise NotObservableError("the pixels' motion", "looked at")
+
+    monkeypatch.setattr(imaging, "precalibrate", none)
+    capture = replace(recording().capture, camera=CAMERA)
+
+    def note(exposure_s):
+        timing = replace(TIMING, exposure_s=exposure_s)
+        filmed = Recording.of(capture, IMU, timing, capture.calibration)
+        return plan_imaging(filmed, RunContext(scratch=tmp_path), replace(OFF, deblur=None)).deblur_note
+
+    # 3 rad/s and 60 px of focal length: 0.2 px in 1 ms, and 9 px in 50 ms
+    assert "no frame has more than" in note([0.001] * 6)
+    assert "looked at" in note([0.001] * 5 + [0.05])
+
+
+@pytest.mark.parametrize("exposure_s", [None, TIMING.exposure_s], ids=["unknown", "known"])
+def test_pairs_are_aligned_by_the_gyroscope_only_where_exposures_are_known(tmp_path, exposure_s):
+    long = LongExposures(source=SubImages(folder=tmp_path / "long"), delay_s=0.02, exposure_s=0.1)
+    capture = replace(recording().capture, frames=ImageFolder(folder=tmp_path), exposures=long)
+    filmed = recording(capture=capture, timing=replace(TIMING, exposure_s=exposure_s))
+    view = GyroView(imu=IMU, timing=filmed.timing, calibration=calibration_prior(), camera=CAMERA, source="capture")
+    stage = exposure_stage(filmed, ExposureOptions(), view, Fuser(fuse=lambda *pair: pair[0], identity="first"))
+    assert stage.view is (None if exposure_s is None else view)
+    np.testing.assert_allclose(stage.long.t_s, TIMING.t_s + 0.02)
+
+
+def test_a_mirrored_gyroscope_stops_a_reconstruction():
+    simulated = simulate_recording(RecordingOptions(motion=MotionOptions(duration_s=20.0)), seed=5)
+    imu = simulated.imu
+    exchanged = replace(imu, gyro_rad_s=imu.gyro_rad_s[:, [1, 0, 2]], accel_m_s2=imu.accel_m_s2[:, [1, 0, 2]])
+    assert stop_or_doubt(diagnose(Recorded(imu=imu, trajectory=simulated.trajectory)), force=False) == ()
+    told = diagnose(Recorded(imu=exchanged, trajectory=simulated.trajectory))
+    assert "gyro-mirrored" in told.codes
+    # the finding alone: whatever else such a recording shows
+    told = replace(told, findings=tuple(one for one in told.findings if one.code == "gyro-mirrored"))
+    with pytest.raises(NotObservableError, match="--force goes on"):
+        stop_or_doubt(told, force=False)
+    (doubt,) = stop_or_doubt(told, force=True)
+    assert doubt.endswith("forced to go on")
+
+
+def test_what_was_not_to_be_rectified_is_not():
+    plan = imaging.ImagingPlan(view=object())
+    assert plan.keypoint_stages() == []
+
+
+def test_no_frame_is_dropped_where_nothing_bridges_the_gap():
+    actions = ["drop", "keep", "drop", "deblur", "drop", "drop"]
+    decisions = tuple(
+        imaging.FrameDecision(name=str(i), blur_px=9.0, action=action, reason="") for i, action in enumerate(actions)
+    )
+    kept = [decision.action for decision in imaging._keeping_ends(decisions)]
+    assert kept == ["deblur", "keep", "drop", "deblur", "deblur", "deblur"]
+
+
+class Shown:
+    """What a frame says of the gyroscope's blur."""
+
+    enough = extent_is_plausible = True
+
+    def __init__(self, support):
+        self.support = support
+
+
+@pytest.mark.parametrize(("clear", "trusted"), [(20, True), (10, None), (1, None)])
+def test_a_gyroscope_is_trusted_for_all_frames_where_nearly_all_bear_it_out(clear, trusted):
+    verdict = imaging.RecordingVerdict(trusted=True, support=9.0, extent_factor=1.0, frames=20, reason="")
+    evidence = [Shown(20.0)] * clear + [Shown(-1.0)] * (20 - clear)
+    assert imaging._by_frame(verdict, evidence, [20.0] * 20).trusted is trusted
+
+
+def test_the_middle_of_a_recording_stands_for_it():
+    timing = FrameTiming(names=tuple(map(str, range(1000))), t_s=np.arange(1000) / 10)
+    chosen = timing.t_s[calibrate._middle(timing, 0.5, 60)]
+    assert len(chosen) == 60 and np.diff(chosen).min() >= 0.5 - 1e-9
+    assert 0.5 * (chosen[0] + chosen[-1]) == pytest.approx(50, abs=1)
+
+
+def test_the_largest_of_the_small_models_goes_first(tmp_path, monkeypatch):
+    def models(database, images, target, *rest, **more):
+        for number, frames in enumerate((3, 7, 5)):
+            options = pycolmap.SyntheticDatasetOptions()
+            options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, frames, 20
+            (target / str(number)).mkdir(parents=True)
+            pycolmap.synthesize_dataset(options).write_binary(str(target / str(number)))
+
+    monkeypatch.setattr(calibrate, "extract_features", lambda *args, **more: None)
+    monkeypatch.setattr(calibrate, "match_features", lambda *args, **more: None)
+    monkeypatch.setattr(calibrate, "map_images", models)
+    found = calibrate._small_models(
+        recording().capture, tmp_path, NAMES, tmp_path / "work", None, RunContext(scratch=tmp_path)
+    )
+    assert [model.num_reg_images() for model in found] == [7, 5, 3]
+
+
+# --- an existing project ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("turns", range(4))
+def test_the_readout_turns_with_the_pictures(tmp_path, monkeypatch, turns):
+    """Pictures of a video whose rows are read downwards, turned counterclockwise so many times."""
+    stamps_ns = np.arange(4) * 10**8
+    every = FrameTiming(names=tuple("abcd"), t_s=stamps_ns / 1e9, readout_s=0.02)
+    match = VideoMatch(t_ns={f"{i}.png": int(t) for i, t in enumerate(stamps_ns)}, doubtful={}, quarter_turns=turns)
+    monkeypatch.setattr(existing, "video_stamps_ns", lambda video: stamps_ns)
+    monkeypatch.setattr(existing, "read_frame_timing", lambda capture: every)
+    monkeypatch.setattr(existing, "match_to_video", lambda *args, **more: match)
+    capture = recording().capture
+    timing, _ = existing._video_times(capture, tmp_path / "a.mp4", tmp_path, list(match.t_ns), silent)
+    read_at = np.rot90(np.repeat(np.arange(5.0)[:, None], 5, axis=1), turns)
+    down, right = read_at[-1, 2] - read_at[0, 2], read_at[2, -1] - read_at[2, 0]
+    expected = {(4, 0): "down", (-4, 0): "up", (0, 4): "right", (0, -4): "left"}[int(down), int(right)]
+    assert timing.readout_direction == expected
+
+
+def test_another_scale_makes_the_project_again(workspace, tmp_path, monkeypatch):
+    project = tmp_path / "project"
+    project.mkdir()
+
+    class Done:
+        notes = ()
+
+    class Result:
+        colmap_index = 0
+        sparse_metric = workspace.sparse_metric / "0"
+
+        class scale:
+            verdict, reasons = "trusted", ()
+
+    def apply(project, out, scales, **more):
+        out.mkdir()
+        (out / "scale").write_text(str(scales[0].similarity.scale))
+        return Done
+
+    monkeypatch.setattr(existing, "apply_to_project", apply)
+    Result.sparse_metric.mkdir(parents=True)
+
+    def made(scale):
+        write_json(Result.sparse_metric / TRANSFORM_FILE, {"scale": scale})
+        session = session_in(workspace)
+        found = existing._run_apply(session, project, ProjectOptions(), ReconstructOptions(), [Result], [])
+        return session.runner.worked, (found / "scale").read_text()
+
+    assert made(2.0) == (["apply"], "2.0")
+    assert made(2.0) == ([], "2.0")
+    assert made(3.0) == (["apply"], "3.0")
