@@ -1,4 +1,5 @@
 from .align import AlignOptions as AlignOptions, align_camera_imu as align_camera_imu
+from .align.conventions import LikelyConvention as LikelyConvention, likely_convention as likely_convention
 from .batch import (
     BatchCapture as BatchCapture,
     BatchResult as BatchResult,
@@ -31,7 +32,12 @@ from .io.calibration import read_calibration as read_calibration, write_calibrat
 from .io.capture import Capture as Capture, load_capture as load_capture
 from .io.frames import read_frame_times as read_frame_times, read_frames as read_frames
 from .io.imu import read_frame_log as read_frame_log, read_imu as read_imu
+from .io.imu_calibration import (
+    read_imu_calibration as read_imu_calibration,
+    write_imu_calibration as write_imu_calibration,
+)
 from .io.imu_formats import ImuFormat as ImuFormat
+from .io.pose_convention import PoseConvention as PoseConvention
 from .model import (
     Model as Model,
     apply_similarity as apply_similarity,
@@ -52,9 +58,10 @@ from .options import (
     ValidateOptions as ValidateOptions,
 )
 from .report import write_report as write_report
+from .rest import RestCalibration as RestCalibration, calibrate_imu as calibrate_imu
 from .run.config import read_config as read_config
 from .run.progress import Progress as Progress
-from .scale import estimate_scale as estimate_scale
+from .scale import estimate_scale as estimate_scale, gravity_at_latitude_m_s2 as gravity_at_latitude_m_s2
 from .smooth import smooth_trajectory as smooth_trajectory
 from .stages.apertures import ApertureStage as ApertureStage
 from .stages.deblur import DeblurStage as DeblurStage
@@ -72,6 +79,7 @@ from .types import (
     Frame as Frame,
     FrameLog as FrameLog,
     FrameTiming as FrameTiming,
+    ImuCalibration as ImuCalibration,
     ImuNoise as ImuNoise,
     ImuRecording as ImuRecording,
     Keypoints as Keypoints,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 #: How blur is undone.
 BlurRemover = Literal["wiener", "deepgyro"]
@@ -65,6 +65,32 @@ class ScaleOptions:
             )
         if self.max_offset_s is not None and not self.max_offset_s > 0:
             raise ValueError(f"max_offset_s must be positive, not {self.max_offset_s:g}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class GravityOptions:
+    """How strong gravity is where something was recorded: a number, or the place; else what spans the Earth."""
+
+    gravity_m_s2: float | None = None
+    """Strength of gravity at the place, where it is known to four digits or better."""
+    latitude_deg: float | None = None
+    """Latitude of the place, from which the strength of gravity follows to 0.005 %."""
+    height_m: float | None = None
+    """Height of the place above the sea, with --latitude-deg; 1000 m are 0.03 %."""
+
+    def __post_init__(self) -> None:
+        if self.gravity_m_s2 is not None and not 9.7 <= self.gravity_m_s2 <= 9.9:
+            raise ValueError(
+                f"gravity_m_s2 must be from 9.7 to 9.9 (it is 9.76 to 9.84 on Earth), not {self.gravity_m_s2:g}"
+            )
+        if self.gravity_m_s2 is not None and self.latitude_deg is not None:
+            raise ValueError("--gravity-m-s2 and --latitude-deg both set the strength of gravity; give one of them")
+        if self.latitude_deg is not None and not -90 <= self.latitude_deg <= 90:
+            raise ValueError(f"latitude_deg must be from -90 to 90, not {self.latitude_deg:g}")
+        if self.height_m is not None and self.latitude_deg is None:
+            raise ValueError("--height-m goes with --latitude-deg")
+        if self.height_m is not None and not -1000 <= self.height_m <= 10000:
+            raise ValueError(f"height_m must be from -1000 to 10000, not {self.height_m:g}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -230,8 +256,9 @@ class ReconstructOptions:
     """Fixed seed and one thread: the same input gives the same model, bit for bit. Slower."""
     seed: int = 0
     """Seed of COLMAP's random sampling."""
-    calibration: Path | None = None
-    """A calibration file of this device (from `colmap-inertial align --out`), used as a prior."""
+    calibration: tuple[Path, ...] = ()
+    """Calibration files of this device: how camera and IMU relate (from `align --out`, used as a prior), the IMU's own
+    gains (from `calibrate-imu --out`), or both; each says what it holds."""
     fragments: bool = False
     """Make metric also what COLMAP made of fewer than 5 images, or of 1 % of those of its largest model."""
     force: bool = False
@@ -240,6 +267,9 @@ class ReconstructOptions:
     def __post_init__(self) -> None:
         if not 0 <= self.seed < 2**31:
             raise ValueError(f"seed must be from 0 to 2147483647, not {self.seed}")
+        given: Any = self.calibration
+        if given is None or isinstance(given, str | Path):  # one file may be given by itself
+            object.__setattr__(self, "calibration", () if given is None else (Path(given),))
 
 
 #: How a list of stage names spells ``...``, the default stages.

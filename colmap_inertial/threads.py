@@ -50,18 +50,22 @@ def in_order(work: Callable[[Item], Result], items: Iterable[Item], *, workers: 
     """
     from concurrent.futures import ThreadPoolExecutor
 
-    with ThreadPoolExecutor(workers) as pool:
-        waiting: deque[Future[Result]] = deque()
-        try:
-            for item in items:
-                waiting.append(pool.submit(work, item))
-                if len(waiting) > workers:
-                    yield waiting.popleft().result()
-            while waiting:
+    pool, stopped = ThreadPoolExecutor(workers), False
+    waiting: deque[Future[Result]] = deque()
+    try:
+        for item in items:
+            waiting.append(pool.submit(work, item))
+            if len(waiting) > workers:
                 yield waiting.popleft().result()
-        finally:
-            for future in waiting:
-                future.cancel()
+        while waiting:
+            yield waiting.popleft().result()
+    except GeneratorExit:
+        stopped = True
+        raise
+    finally:
+        # A caller that failed lets go of this, and the garbage collector ends it in whichever thread it runs: one of
+        # the pool's own cannot wait for itself.
+        pool.shutdown(wait=not stopped, cancel_futures=True)
 
 
 @contextmanager

@@ -1,13 +1,16 @@
 #!/usr/bin/env bash
-# Sets everything up and reconstructs the example scene, from images and IMU to metres.
+# Sets up what it needs and reconstructs the example scene, from images and IMU to metres.
 #   demo.sh [OUT]      OUT: a new folder for the result (default: out/desk)
 set -euo pipefail
 out=$(realpath -m "${1:-$(dirname "$0")/../out/desk}")
 cd "$(dirname "$0")/.."
+echo "demo: step 1 of 3: Python packages into .venv (650 MB on the disk; nothing is done where they are there)"
 bash scripts/setup.sh
 if [ -f "$out/result.json" ]; then
-  echo "demo: $out holds the result of an earlier run; remove it to run again"
+  echo "demo: step 2 of 3: $out holds the result of an earlier run; remove it to run again"
 else
+  echo "demo: step 2 of 3: reconstruct example_scenes/desk into $out"
   .venv/bin/colmap-inertial reconstruct example_scenes/desk "$out"
 fi
+echo "demo: step 3 of 3: compare with the scene's truth"
 .venv/bin/python scripts/compare_with_truth.py "$out" example_scenes/desk

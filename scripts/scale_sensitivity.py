@@ -16,7 +16,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from bench_scale import Window
 
 from colmap_inertial.align import align_camera_imu
 from colmap_inertial.errors import NotObservableError
-from colmap_inertial.scale import _factors, _noise, _setup, joint
+from colmap_inertial.scale import _factors, _noise, _setup, joint, priors
 from colmap_inertial.scale.priors import PRIORS
 from colmap_inertial.threads import one_blas_thread
 from colmap_inertial.types import Array, CameraImuCalibration
@@ -41,7 +41,8 @@ _PRIVATE = {
     "_setup._COUNTED_ONCE": _setup,
     "_setup._NEAR_M": _setup,
     "_setup._FAR_M": _setup,
-    "_noise._WEIGHT": _noise,
+    "joint._UNMODELLED_S": joint,
+    "_factors.CORRELATION_S": _factors,
     "_noise._LARGEST_CORRELATION": _noise,
     "_factors.ROBUST_SIGMAS": _factors,
 }
@@ -72,9 +73,11 @@ class Found:
 
 def constants() -> dict[str, float | None]:
     """All that are varied, with their defaults; None where the calibration's covariance holds the value."""
-    out: dict[str, float | None] = {f"PRIORS.{f.name}": getattr(PRIORS, f.name) for f in dataclasses.fields(PRIORS)}
+    known = [f.name for f in dataclasses.fields(PRIORS) if not f.name.startswith("calibrated")]
+    out: dict[str, float | None] = {f"PRIORS.{name}": getattr(PRIORS, name) for name in known}
     levels = dataclasses.fields(_noise.TYPICAL)
-    out |= {f"TYPICAL.{f.name}": getattr(_noise.TYPICAL, f.name) for f in levels if f.name != "rotation_excess"}
+    from_stream = ("rotation_excess", "gyro_rad_s_rthz", "accel_m_s2_rthz")
+    out |= {f"TYPICAL.{f.name}": getattr(_noise.TYPICAL, f.name) for f in levels if f.name not in from_stream}
     out["JointOptions.states_hz"] = joint.JointOptions().states_hz
     out |= {name: getattr(module, name.partition(".")[2]) for name, module in _PRIVATE.items()}
     out |= {f"calibration.{name}": None for name in _IN_CALIBRATION}
@@ -90,7 +93,9 @@ def applied(setting: Setting) -> Iterator[joint.JointOptions]:
         changed = dataclasses.replace(PRIORS, **{name: setting.of(getattr(PRIORS, name))})
         if name == "gravity_m_s2":
             options = joint.JointOptions(gravity_sigma_m_s2=changed.gravity_m_s2)
-        with mock.patch.object(_setup, "PRIORS", changed), mock.patch.object(joint, "PRIORS", changed):
+        with ExitStack() as stack:
+            for module in (_setup, joint, priors):
+                stack.enter_context(mock.patch.object(module, "PRIORS", changed))
             yield options
     elif place == "TYPICAL":
         typical = dataclasses.replace(_noise.TYPICAL, **{name: setting.of(getattr(_noise.TYPICAL, name))})

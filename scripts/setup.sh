@@ -1,12 +1,14 @@
 #!/usr/bin/env bash
-# Makes .venv in the checkout with colmap-inertial and what its tests need, and compiles its kernels. Installs missing
-# system packages with apt where it may; otherwise it says what is missing. Running it again is quick; after a change of
-# pyproject.toml or of the C++ sources it installs again.
+# Makes .venv in the checkout with colmap-inertial, and compiles its kernels. Installs missing system packages with apt
+# where it may; otherwise it says what is missing.
+#   setup.sh [EXTRA ...]    extras of pyproject.toml to install along: dev for the tests, view, ros, ... (default: none)
+# Running it again is quick; after a change of pyproject.toml or of the C++ sources, or with another extra, it installs
+# again, those of earlier times included.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
 python=""
-for candidate in python3.11 python3.12 python3.13 python3; do
+for candidate in python3.11 python3.12 python3.13 python3.14 python3; do
   if command -v "$candidate" >/dev/null && "$candidate" -c 'import sys; sys.exit(sys.version_info < (3, 11))'; then
     python=$candidate
     break
@@ -29,7 +31,7 @@ if [ ${#missing[@]} -gt 0 ]; then
     echo "setup: please install these packages and run this again: ${missing[*]}" >&2
     exit 2
   fi
-  echo "setup: installing ${missing[*]}"
+  echo "setup: installing ${missing[*]} with apt"
   $sudo apt-get update -qq
   DEBIAN_FRONTEND=noninteractive $sudo apt-get install -y -qq --no-install-recommends "${missing[@]}" >/dev/null
 fi
@@ -37,10 +39,15 @@ fi
 if ! .venv/bin/python -m pip --version >/dev/null 2>&1; then
   "$python" -m venv .venv
 fi
+# The stamp holds the extras that are there, one a line.
 stamp=.venv/.colmap-inertial
 sources=(pyproject.toml colmap_inertial/_kernels/{CMakeLists.txt,*.cpp,*.h})
-if [ ! -f "$stamp" ] || [ -n "$(find "${sources[@]}" -newer "$stamp" -print -quit)" ]; then
-  echo "setup: installing Python packages into .venv"
-  .venv/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
-  touch "$stamp"
+extras=$({ printf '%s\n' "$@"; cat "$stamp" 2>/dev/null || true; } | sed '/^$/d' | sort -u)
+if [ ! -f "$stamp" ] || [ "$extras" != "$(cat "$stamp")" ] ||
+  [ -n "$(find "${sources[@]}" -newer "$stamp" -print -quit)" ]; then
+  names=$(paste -sd, <<<"$extras")
+  echo "setup: installing Python packages${names:+ for $names} into .venv, and compiling; some minutes the first time"
+  .venv/bin/python -m pip install --disable-pip-version-check --progress-bar on --editable ".${names:+[$names]}" |
+    sed -un 's/^ *\(Downloading .*\|Using cached .*\)/  \1/p; s/^ *\(Building .*\)/  \1/p; s/^\(Installing\) collected packages.*/  \1/p'
+  printf '%s\n' "$extras" | sed '/^$/d' >"$stamp"
 fi

@@ -86,7 +86,7 @@ def test_a_manifest_gives_each_capture_its_options(tmp_path):
     assert (hall.name, hall.path, hall.options.seed) == ("hall", tmp_path / "captures" / "hall", 7)
     assert (yard.name, yard.path) == ("yard-2", tmp_path / "yard" / "second.mp4")
     assert (yard.options.seed, yard.options.world, yard.options.mapping.overlap) == (7, "y-down", 5)
-    assert yard.options.calibration == tmp_path / "phone.json"
+    assert yard.options.calibration == (tmp_path / "phone.json",)
     assert roof.name == "roof"
 
 
@@ -381,3 +381,13 @@ def test_a_worker_that_does_not_see_the_files_says_so(tmp_path):
 def test_an_unreadable_manifest_is_named(tmp_path):
     with pytest.raises(FormatError, match="no such file"):
         read_manifest(tmp_path / "none.toml")
+
+
+def test_what_a_killed_batch_left_half_written_is_removed(tmp_path):
+    (tmp_path / "m.toml").write_text('[[capture]]\npath = "none"\n')
+    (tmp_path / "out" / "status").mkdir(parents=True)
+    left = [tmp_path / "out" / ".summary.csv.1-0a1b2c3d.tmp", tmp_path / "out" / "status" / ".none.json.1-0a1b2c3d.tmp"]
+    for path in left:
+        path.touch()
+    run_batch(tmp_path / "m.toml", tmp_path / "out")
+    assert not any(path.exists() for path in left)

@@ -52,7 +52,7 @@ def test_the_installed_command_runs():
     done = subprocess.run(
         [sys.executable, "-m", "colmap_inertial", "--version"], capture_output=True, text=True, check=True
     )
-    assert done.stdout.strip() == "0.1.0"
+    assert done.stdout.strip() == "0.2.0"
 
 
 @pytest.mark.parametrize("method", ["joint", "spectral"])

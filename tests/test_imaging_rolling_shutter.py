@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from test_imaging_psf import FISHEYE, LENS, PINHOLE, handheld, room, shutter_of, turning
+from versions import version_of
 
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.geometry import matrix_from_quat
@@ -105,8 +106,10 @@ def test_image_and_keypoints_are_moved_alike():
             x = source
         else:
             back = rectify_keypoints(np.stack([x, source], axis=1) + 0.5, gyro, lens, shutter) - 0.5
-            # OpenCV's bicubic interpolation does not reproduce a ramp to better than this
-            np.testing.assert_allclose(back, np.stack([u, v], axis=1), atol=0.08)
+            # OpenCV's bicubic interpolation does not reproduce a ramp to better than this; OpenCV 4's at 29 points of
+            # half a million
+            atol = 0.08 if version_of("cv2") >= (5,) else 0.09
+            np.testing.assert_allclose(back, np.stack([u, v], axis=1), atol=atol)
 
 
 def test_a_global_shutter_and_no_keypoints_change_nothing():

@@ -22,7 +22,7 @@ ORDER = [
     ("flow",),
     ("align", "smooth"),
     ("scale",),
-    ("model",),
+    ("model", "rest"),
     ("validate", "diagnose", "report"),
     ("run",),
     ("stages",),

@@ -5,6 +5,7 @@ import shutil
 import numpy as np
 import pycolmap
 import pytest
+from versions import version_of
 
 from colmap_inertial.errors import AlreadyMetricError, FormatError, OutputExistsError, TimingError
 from colmap_inertial.geometry import matrix_from_quat, quat_exp, so3_log
@@ -180,9 +181,11 @@ def test_pose_covariances_are_the_scatter_of_resected_poses():
     assert trajectory.pose_cov is not None
     for name, cov in zip(trajectory.names, trajectory.pose_cov, strict=True):
         root = np.linalg.inv(np.linalg.cholesky(cov))
-        # Whitened scatter: the unit matrix, but for the factor of 250 draws and of the estimated noise of the pixels
+        # Whitened scatter: the unit matrix, but for the factor of 250 draws and of the estimated noise of the pixels.
+        # Before 4.2 pycolmap draws other scenes, whose worst direction comes out at 0.54 to 0.6.
+        low = 0.6 if version_of("pycolmap") >= (4, 2) else 0.5
         whitened = root @ scatter[name] @ root.T
-        assert np.all(np.linalg.eigvalsh(whitened) > 0.6) and np.all(np.linalg.eigvalsh(whitened) < 1.7)
+        assert np.all(np.linalg.eigvalsh(whitened) > low) and np.all(np.linalg.eigvalsh(whitened) < 1.7)
 
 
 def test_poses_without_enough_observations_have_no_covariance():

@@ -26,9 +26,9 @@ def saved(model, folder, suffix):
 
 
 def refuses(reason, suffix, value):
-    """COLMAP's own reader stops at a text that is no finite number."""
+    """COLMAP's own reader stops at a text that is no finite number; before 4.0.4 it is left to us."""
     own = suffix == ".txt" and not np.isfinite(value)
-    return pytest.raises(FormatError, match="COLMAP cannot read this model" if own else reason)
+    return pytest.raises(FormatError, match=f"COLMAP cannot read this model|{reason}" if own else reason)
 
 
 @pytest.mark.parametrize("suffix", [".bin", ".txt"])

@@ -13,7 +13,7 @@ import pycolmap
 import pytest
 
 from colmap_inertial.cli.terminal import show_applied
-from colmap_inertial.colmap.sparse import check_names, image_pairs
+from colmap_inertial.colmap.sparse import check_pair_names, image_pairs
 from colmap_inertial.drivers.models import run_models
 from colmap_inertial.drivers.reporting import report_result
 from colmap_inertial.drivers.result import ReconstructResult
@@ -401,9 +401,9 @@ def test_a_stage_that_fails_for_a_reason_leaves_nothing_behind(tmp_path):
 
 
 def test_names_that_colmap_s_pair_lists_cannot_hold_are_refused():
-    check_names(["IMG_1.jpg", "ü#1.png"])
+    check_pair_names(["IMG_1.jpg", "ü#1.png"])
     with pytest.raises(FormatError, match="without spaces"):
-        check_names(["IMG_1.jpg", "IMG 2.jpg"])
+        check_pair_names(["IMG_1.jpg", "IMG 2.jpg"])
 
 
 def test_square_brackets_of_notes_and_paths_reach_the_terminal(capsys):

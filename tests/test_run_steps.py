@@ -3,6 +3,8 @@
 import contextlib
 import itertools
 import os
+import threading
+import time
 from dataclasses import replace
 
 import cv2
@@ -46,6 +48,7 @@ from colmap_inertial.stages.exposures import Fuser
 from colmap_inertial.stages.frame_folder import FrameRecord, write_frames
 from colmap_inertial.stages.gyro_view import GyroView
 from colmap_inertial.stages.rectified import write_rectified
+from colmap_inertial.threads import in_order
 from colmap_inertial.types import CameraModel, FrameTiming, ImuRecording, Treatment
 
 NAMES = tuple(f"{i}.jpg" for i in range(6))
@@ -139,6 +142,45 @@ def test_an_input_is_another_one_when_it_was_written_again(tmp_path):
     assert fingerprint(path) != before
 
 
+@pytest.mark.parametrize(("size", "at"), [(3, 1), (4 << 20, 3_000_000), (20 << 20, 5), (20 << 20, (20 << 20) - 5)])
+def test_an_input_is_another_one_when_it_was_changed_with_size_and_time_kept(tmp_path, size, at):
+    path = tmp_path / "frame.png"
+    path.write_bytes(bytes(size))
+    os.utime(path, ns=(10**18, 10**18))
+    before = fingerprint(path)
+    (tmp_path / "link.png").hardlink_to(path)
+    path.chmod(0o600)
+    assert fingerprint(path) == before
+    with open(path, "r+b") as file:
+        file.seek(at)
+        file.write(b"x")
+    os.utime(path, ns=(10**18, 10**18))
+    assert fingerprint(path) != before
+
+
+def test_nothing_is_written_into_the_folder_of_a_run_that_is_at_work(tmp_path):
+    out = tmp_path / "out"
+    workspace = Workspace(out)
+    workspace.stamps.mkdir(parents=True)
+    with workspace.locked():
+        before = sorted(out.rglob("*"))
+        options = ReconstructOptions()
+        with (
+            pytest.raises(OutputExistsError, match="another run is at work"),
+            open_session(out, tmp_path / "capture.toml", options, pictures=(), progress=silent),
+        ):
+            pass
+        assert sorted(out.rglob("*")) == before
+    # another one had begun to make it meanwhile
+    workspace.open(tmp_path / "other.toml")
+    with (
+        pytest.raises(OutputExistsError, match="another capture"),
+        open_session(out, tmp_path / "capture.toml", options, pictures=(), progress=silent),
+    ):
+        pass
+    assert not workspace.log.exists()
+
+
 def test_a_calibration_of_another_recording_leaves_clocks_and_bias_open(tmp_path):
     stated = Declared(gyro_time_offset_s=7.0, gyro_bias_rad_s=[0.1, 0.0, 0.0], cam_from_imu_xyzw=[0.0, 0.0, 1.0, 0.0])
     write_calibration(tmp_path / "calibration.json", calibration_prior(stated))
@@ -192,7 +234,7 @@ def test_a_step_without_files_that_was_interrupted_is_not_finished(workspace):
 def test_a_session_is_alone_in_its_folder_and_another_configuration_undoes_the_result(tmp_path):
     def session(seed=0):
         options = replace(ReconstructOptions(), seed=seed)
-        return open_session(tmp_path / "out", tmp_path / "capture.toml", options, progress=silent)
+        return open_session(tmp_path / "out", tmp_path / "capture.toml", options, pictures=(), progress=silent)
 
     with session() as first:
         with pytest.raises(OutputExistsError, match="another run is at work"), session():
@@ -542,3 +584,38 @@ def test_another_scale_makes_the_project_again(workspace, tmp_path, monkeypatch)
     assert made(2.0) == (["apply"], "2.0")
     assert made(2.0) == ([], "2.0")
     assert made(3.0) == (["apply"], "3.0")
+
+
+def test_work_that_is_let_go_of_in_one_of_its_own_threads_ends(monkeypatch):
+    """As the garbage collector does after a failure, a full disk for one."""
+    ignored = []
+    monkeypatch.setattr("sys.unraisablehook", ignored.append)
+    holder, ended = {}, threading.Event()
+
+    def work(item):
+        if item == 1:
+            ended.wait(10)
+            holder.pop("stream").close()
+            ended.clear()
+        return item
+
+    holder["stream"] = in_order(work, range(5), workers=1)
+    assert next(holder["stream"]) == 0
+    ended.set()
+    until = time.monotonic() + 10
+    while ended.is_set() and time.monotonic() < until:
+        time.sleep(0.01)
+    assert not ended.is_set() and not ignored
+
+
+def test_what_a_killed_writer_left_is_removed_and_nothing_else(tmp_path):
+    out = tmp_path / "out"
+    options = ReconstructOptions()
+    with open_session(out, tmp_path / "capture.toml", options, pictures=(), progress=silent) as session:
+        stamps = session.workspace.stamps
+    left = [out / ".result.json.123-0a1b2c3d.tmp", stamps / ".frames.json.9-deadbeef.tmp"]
+    other = [out / ".mine.tmp", out / "a.123-0a1b2c3d.tmp"]
+    for path in (*left, *other):
+        path.touch()
+    with open_session(out, tmp_path / "capture.toml", options, pictures=(), progress=silent):
+        assert not any(path.exists() for path in left) and all(path.exists() for path in other)

@@ -1,6 +1,7 @@
 """The joint estimator: its parts against brute force, its results against simulated truth and real recordings."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,11 +12,12 @@ from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.options import ScaleOptions
 from colmap_inertial.scale import _factors as fac, _parameters as par, estimate_scale, first_seconds
 from colmap_inertial.scale._grouping import first_of_groups, group_frames
-from colmap_inertial.scale._noise import TYPICAL, typical_noise
+from colmap_inertial.scale._noise import TYPICAL, Expected, roughness
 from colmap_inertial.scale._preintegration import SensorErrors, Track, Tracks, preintegrate
 from colmap_inertial.scale._setup import prepare
 from colmap_inertial.scale._solver import ArrowSystem
 from colmap_inertial.scale.joint import JointOptions, estimate_joint
+from colmap_inertial.simulate import IMU_PRESETS
 from colmap_inertial.simulate.motion import MotionOptions
 from colmap_inertial.simulate.recording import RecordingOptions, SfmOptions, simulate_recording
 from colmap_inertial.types import CAL, CameraTrajectory, ImuNoise, ImuRecording
@@ -373,19 +375,61 @@ def test_a_late_alignment_is_corrected_for_both_sensors(recording, calibration):
         assert np.sqrt(into @ refined.cov @ into) < 1.01e-4
 
 
+def rough_data(gyro: float, accel: float) -> SimpleNamespace:
+    return SimpleNamespace(gyro_roughness_rad_s_rthz=gyro, accel_roughness_m_s2_rthz=accel)
+
+
 def test_a_data_sheet_raises_the_noise_and_never_lowers_it():
     levels = ("gyro_rad_s_rthz", "gyro_walk_rad_s_rts", "accel_m_s2_rthz", "accel_walk_m_s2_rts")
+    stream = rough_data(2e-4, 2e-3)
+    bare = Expected.of(stream, None).noise
 
-    def noise(factor):
+    def expected(factor):
         names = ("gyro_density_rad_s_rthz", "gyro_walk_rad_s2_rthz", "accel_density_m_s2_rthz", "accel_walk_m_s3_rthz")
-        typical = [getattr(TYPICAL, level) for level in levels]
-        return typical_noise(ImuNoise(**{n: factor * value for n, value in zip(names, typical, strict=True)}))
+        known = [getattr(bare, level) for level in levels]
+        return Expected.of(stream, ImuNoise(**{n: factor * value for n, value in zip(names, known, strict=True)}))
 
     for level in levels:
-        assert getattr(noise(0.1)[0], level) == getattr(TYPICAL, level)
-        assert getattr(noise(10.0)[0], level) == pytest.approx(10 * getattr(TYPICAL, level))
-    assert noise(10.0)[1]["accel_m_s2_rthz"] == pytest.approx(10 * TYPICAL.accel_m_s2_rthz)
-    assert typical_noise(None)[0] == TYPICAL
+        assert getattr(expected(0.1).noise, level) == getattr(bare, level)
+        assert getattr(expected(10.0).noise, level) == pytest.approx(10 * getattr(bare, level))
+    assert expected(10.0).floor["accel_m_s2_rthz"] == pytest.approx(10 * bare.accel_m_s2_rthz)
+
+
+def test_the_streams_tell_the_noise_of_quiet_sensors_and_bound_that_of_rough_ones():
+    quiet = Expected.of(rough_data(1.5e-4, 1.5e-3), None).noise
+    assert (quiet.gyro_rad_s_rthz, quiet.accel_m_s2_rthz) == (1.5e-4, 1.5e-3)
+    vibrating = Expected.of(rough_data(3e-3, 0.09), None).noise
+    assert 1e-4 < vibrating.gyro_rad_s_rthz < 1e-3
+    assert 0.004 < vibrating.accel_m_s2_rthz < 0.045
+
+
+@pytest.mark.parametrize("rate_hz", [100.0, 400.0])
+def test_roughness_is_the_density_of_white_noise_and_not_the_motion(rate_hz):
+    rng = np.random.default_rng(5)
+    t_s = np.arange(0.0, 20.0, 1 / rate_hz)
+    motion = 3.0 * np.sin(2 * np.pi * 1.5 * t_s)[:, None] * [1.0, 0.5, -0.7]
+    density = 2e-3
+    noisy = motion + density * np.sqrt(rate_hz) * rng.standard_normal((len(t_s), 3))
+    assert roughness(t_s, noisy) == pytest.approx(density, rel=0.05)
+    assert roughness(t_s[:3], noisy[:3]) == 0.0
+
+
+def test_a_lever_arm_along_the_optical_axis_is_found_where_the_device_is_no_phone():
+    """A rig has centimetres where a phone has millimetres: the prior gives way to the data, and the scale holds."""
+    options = RecordingOptions(
+        motion=MotionOptions(kind="roam", duration_s=30.0),
+        sfm=SfmOptions(position_drift_m_rts=0.0),
+        imu=replace(IMU_PRESETS["phone"], lever_arm_m_sd=(0.0, 0.0, 0.05)),
+    )
+    recording = max(
+        (simulate_recording(options, seed=seed) for seed in range(4)),
+        key=lambda one: abs(one.truth.calibration.imu_in_cam_m[2]),
+    )
+    true_m = recording.truth.calibration.imu_in_cam_m[2]
+    assert abs(true_m) > 0.04
+    estimate = estimate_scale(recording.trajectory, recording.imu)
+    assert estimate.calibration.imu_in_cam_m[2] == pytest.approx(true_m, abs=0.01)
+    assert estimate.ci95[0] < recording.truth.metres_per_unit < estimate.ci95[1]
 
 
 def test_scale_gravity_bias_and_calibration_are_recovered(recording, calibration):

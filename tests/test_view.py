@@ -370,7 +370,10 @@ def test_images_of_an_existing_project_are_found(tmp_path):
     (images / name).touch()
     record = json.loads((out / "result.json").read_text())
     (out / "result.json").write_text(json.dumps({**record, "project": {"images": str(images)}}))
-    assert load_scene(out).image_of(0) == images / name
+    assert load_scene(out).image_of(0) == copied  # a stranger's result may name any folder
+    assert load_scene(out, images=images).image_of(0) == images / name
+    with pytest.raises(FormatError, match="no such folder of images"):
+        load_scene(out, images=tmp_path / "none")
 
 
 def test_what_cannot_be_shown_is_said(tmp_path, capsys):

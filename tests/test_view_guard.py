@@ -92,20 +92,29 @@ def test_a_foreign_origin_gets_no_byte_of_the_scene(place, origin):
         assert get(port, f"/{token}", Origin=origin)[:2] == (403, b"Forbidden\n")
 
 
-@pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "127.0.0.1.evil.example", "192.0.2.7", "[::", ""])
+HOSTS = ["evil.example", "evil.example:80", "127.0.0.1.evil.example", "127.0.0.1@evil.example", "192.0.2.7", "0.0.0.0"]
+
+
+@pytest.mark.parametrize("host", [*HOSTS, "localhost.", "[::", "", "\xe9"])
 def test_another_host_name_gets_nothing(place, host):
     port, token = place
     assert get(port, f"/{token}", Host=host)[:2] == (403, b"Forbidden\n")
-    if "[" not in host and host:
+    if host and host.isascii() and not {"[", "@"} & set(host):
         assert refused(port, token, host=host) == (403, b"Forbidden\n")
 
 
-@pytest.mark.parametrize("wrong", ["", "x", "index.html", "{}x", "x{}", "x/{}", "%2e%2e/{}", "?{}"])
+@pytest.mark.parametrize("wrong", ["", "x", "index.html", "{}x", "x{}", "x/{}", "%2e%2e/{}", "?{}", "//{}"])
 def test_without_the_token_there_is_nothing(place, wrong):
     port, token = place
     path = wrong.replace("{}", token)
     assert get(port, f"/{path}")[:2] == (403, b"Forbidden\n")
     assert refused(port, path) == (403, b"Forbidden\n")
+
+
+def test_bytes_that_are_no_path_get_nothing(place):
+    with socket.create_connection(("127.0.0.1", place[0]), timeout=10) as raw:
+        raw.sendall(b"GET /\xff\xfe HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        assert raw.recv(1000).startswith(b"HTTP/1.1 403")
 
 
 def test_two_viewers_have_two_tokens(viewer):
@@ -118,9 +127,9 @@ def test_on_the_network_addresses_and_own_names_are_hosts_but_no_others():
     guard = Guard(host="0.0.0.0")
     path = f"/{guard.token}"
     for name in ("192.0.2.7:8080", "[2001:db8::1]:8080", "localhost:8080", socket.gethostname()):
-        assert guard.admits(path, [name], [f"http://{name}"], socket=True), name
-    assert not guard.admits(path, ["evil.example:8080"], ["http://evil.example:8080"], socket=True)
-    assert not guard.admits(path, ["localhost", "localhost"], [], socket=False)
+        assert guard.admits(path, [name], [f"http://{name}"], websocket=True), name
+    assert not guard.admits(path, ["evil.example:8080"], ["http://evil.example:8080"], websocket=True)
+    assert not guard.admits(path, ["localhost", "localhost"], [], websocket=False)
     assert [is_loopback(h) for h in ("127.0.0.1", "::1", "localhost", "0.0.0.0", "192.0.2.7")] == [1, 1, 1, 0, 0]
 
 

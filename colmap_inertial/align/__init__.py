@@ -108,20 +108,8 @@ def align_clocks(
         Where no offset is clearly better than the rest (another recording's IMU, no rotation, rotation that repeats
         itself), where the recordings cannot overlap, or where turning about one axis only leaves the rotation open.
     """
-    options = options or AlignOptions()
-    prior = prior or calibration_prior()
-    if len(trajectory) < 5:
-        raise NotObservableError("time offset", f"{len(trajectory)} poses are too few to compare with the gyroscope")
-    span_s = float(trajectory.t_s[-1] - trajectory.t_s[0])
-    if span_s < _SHORTEST_S:
-        hint = f"{span_s:.2f} s of poses are too short to compare with the gyroscope: record ten seconds or more"
-        raise NotObservableError("time offset", hint)
-    search = _Search(
-        path=GyroPath(imu.gyro_t_s, imu.gyro_rad_s, np.zeros(3)),
-        offsets_s=_range(trajectory, imu, prior, options),
-        prior=prior,
-        options=options,
-    )
+    search = _search(trajectory, imu, prior, options)
+    prior = search.prior
     rate = 0.0
     start = search.whole(trajectory)
     if isinstance(start, NotObservableError):
@@ -131,6 +119,42 @@ def align_clocks(
         start, rate = drifting
     keep = spaced_frames(trajectory.t_s, _SPACING_S)
     return refine_alignment(trajectory.select(keep), imu, start, prior, clock_rate=rate)
+
+
+def coarse_fit(
+    trajectory: CameraTrajectory,
+    imu: ImuRecording,
+    *,
+    prior: CameraImuCalibration | None = None,
+    options: AlignOptions | None = None,
+) -> ClockFit | NotObservableError:
+    """What :func:`align_clocks` starts from where the clocks keep step, with its evidence; or why there is nothing."""
+    try:
+        return _search(trajectory, imu, prior, options).whole(trajectory)
+    except NotObservableError as error:
+        return error
+
+
+def _search(
+    trajectory: CameraTrajectory,
+    imu: ImuRecording,
+    prior: CameraImuCalibration | None,
+    options: AlignOptions | None,
+) -> _Search:
+    options = options or AlignOptions()
+    prior = prior or calibration_prior()
+    if len(trajectory) < 5:
+        raise NotObservableError("time offset", f"{len(trajectory)} poses are too few to compare with the gyroscope")
+    span_s = float(trajectory.t_s[-1] - trajectory.t_s[0])
+    if span_s < _SHORTEST_S:
+        hint = f"{span_s:.2f} s of poses are too short to compare with the gyroscope: record ten seconds or more"
+        raise NotObservableError("time offset", hint)
+    return _Search(
+        path=GyroPath(imu.gyro_t_s, imu.gyro_rad_s, np.zeros(3)),
+        offsets_s=_range(trajectory, imu, prior, options),
+        prior=prior,
+        options=options,
+    )
 
 
 def _range(
@@ -218,4 +242,4 @@ class _Search:
         return replace(found[0][1], offset_s=at_zero_s + rate * middle_s), rate
 
 
-__all__ = ["OFFSET_UNKNOWN_FROM_S", "AlignOptions", "Alignment", "align_camera_imu", "align_clocks"]
+__all__ = ["OFFSET_UNKNOWN_FROM_S", "AlignOptions", "Alignment", "align_camera_imu", "align_clocks", "coarse_fit"]

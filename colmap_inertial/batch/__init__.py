@@ -32,7 +32,7 @@ from colmap_inertial.batch.task import (
     write_status,
 )
 from colmap_inertial.errors import OutputError, OutputExistsError
-from colmap_inertial.io.files import StrPath, locked, write_json, write_text
+from colmap_inertial.io.files import StrPath, locked, remove_temporaries, write_json, write_text
 from colmap_inertial.options import BatchOptions, ReconstructOptions, StageNames
 from colmap_inertial.run.config import config_as_toml
 
@@ -176,6 +176,7 @@ def _owned(out: Path) -> Iterator[str]:
             yield run
         finally:
             (status / "run").unlink(missing_ok=True)
+            remove_temporaries(out, status)
 
 
 def _task(entry: BatchCapture, of_all: StageNames, out: Path, run: str, attempts: int) -> CaptureTask:

@@ -14,7 +14,8 @@ from tyro.conf import subcommand
 
 from colmap_inertial import __version__
 from colmap_inertial.cli.captures import Batch, Deblur, FuseApertures, FuseExposures, Reconstruct, Simulate
-from colmap_inertial.cli.models import Align, Apply, Diagnose, Scale, Validate, View
+from colmap_inertial.cli.limits import exhausted, require_limits
+from colmap_inertial.cli.models import Align, Apply, CalibrateImu, Diagnose, Scale, Validate, View
 from colmap_inertial.errors import InertialError
 from colmap_inertial.options import ReconstructOptions
 
@@ -29,6 +30,7 @@ Command = (
     | Scale
     | Apply
     | Align
+    | CalibrateImu
     | Diagnose
     | Validate
     | View
@@ -43,6 +45,7 @@ _COMMANDS: dict[str, type[Command]] = {
     "scale": Scale,
     "apply": Apply,
     "align": Align,
+    "calibrate-imu": CalibrateImu,
     "diagnose": Diagnose,
     "validate": Validate,
     "view": View,
@@ -67,9 +70,30 @@ def parse(args: Sequence[str]) -> Command:
         default = _default_from_config(cls, args) if list(args[:1]) == [name] else None
         settings = subcommand(name) if default is None else subcommand(name, default=default)
         choices.append(Annotated[cls, settings])
+    args = _calibrations_last(args)
     command: Any = Union[tuple(choices)]  # noqa: UP007 (built at run time)
     config = (tyro.conf.PositionalMetavarFromFieldName,)
     return tyro.cli(command, prog="colmap-inertial", description=DESCRIPTION, args=list(args), config=config)
+
+
+def _calibrations_last(args: Sequence[str]) -> list[str]:
+    """The same with what follows ``--calibration`` at the end, where it does not swallow the paths of the command.
+
+    It takes one file, and a second one where that is another JSON file.
+    """
+    rest: list[str] = []
+    files: list[str] = []
+    remaining = list(args)
+    while remaining:
+        word = remaining.pop(0)
+        if word != "--calibration":
+            rest.append(word)
+            continue
+        files += remaining[:1]
+        del remaining[:1]
+        while remaining and remaining[0].lower().endswith(".json"):
+            files.append(remaining.pop(0))
+    return [*rest, "--calibration", *files] if files else rest
 
 
 def _default_from_config(cls: type[Command], args: Sequence[str]) -> Command | None:
@@ -118,6 +142,7 @@ def _main(args: Sequence[str] | None) -> None:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
     try:
+        require_limits()
         code = command.run()
     except InertialError as error:
         print(f"error: {error}", *getattr(error, "__notes__", ()), sep="\n", file=sys.stderr)
@@ -127,4 +152,10 @@ def _main(args: Sequence[str] | None) -> None:
         again = "; started again with the same arguments, it continues" if resumes else ""
         print(f"interrupted{again}", file=sys.stderr)
         code = 130
+    except (MemoryError, OSError, ImportError) as error:
+        said = exhausted(error)
+        if said is None:
+            raise
+        print(f"error: {said}", file=sys.stderr)
+        code = 2
     sys.exit(code)

@@ -41,20 +41,31 @@ class Reconstruct:
     """A new folder for everything that is made, or that of an earlier run on the same, which is gone on with."""
     project: Annotated[ProjectOptions, arg(name="")] = dataclasses.field(default_factory=ProjectOptions)
     options: Annotated[ReconstructOptions, arg(name="")] = dataclasses.field(default_factory=ReconstructOptions)
+    device: str | None = None
+    """Name of the device, under which calibrations were remembered (default: what the recording says)."""
+    remembered: bool = True
+    """Take what `align` and `calibrate-imu` remembered of the device, where neither --calibration nor the capture says
+    it; never with --deterministic."""
     config: Path | None = None
     """TOML file with options, as OUT/config.toml of an earlier run; flags given here go before it."""
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.cli.terminal import live_progress, show_result
+        from colmap_inertial.cli.terminal import live_progress, show_remembered, show_result
         from colmap_inertial.drivers.capture import reconstruct
         from colmap_inertial.drivers.project import is_project, reconstruct_project
+        from colmap_inertial.drivers.remembered import remembered_of
 
+        options = self.options
+        if self.remembered and not options.deterministic:
+            known = remembered_of(self.project.imu or self.capture, options.calibration, device=self.device)
+            show_remembered(known)
+            options = dataclasses.replace(options, calibration=(*options.calibration, *known.paths))
         with live_progress() as progress:
             if self.project != ProjectOptions() or is_project(self.capture):
-                result = reconstruct_project(self.capture, self.out, self.project, self.options, progress=progress)
+                result = reconstruct_project(self.capture, self.out, self.project, options, progress=progress)
             else:
-                result = reconstruct(self.capture, self.out, self.options, progress=progress)
+                result = reconstruct(self.capture, self.out, options, progress=progress)
         show_result(result)
         return result.exit_code()
 
@@ -77,8 +88,8 @@ class Deblur:
     method: BlurRemover = "wiener"
     """wiener: a Wiener filter along the blur of each pixel. deepgyro: a network, which also sees what the filter makes
     of the picture (slower; needs the extra `restore`)."""
-    calibration: Path | None = None
-    """A calibration file of this device (from `colmap-inertial align --out`), used as a prior."""
+    calibration: tuple[Path, ...] = ()
+    """Calibration files of this device: from `align --out`, from `calibrate-imu --out`, or both."""
     rectify: bool = False
     """Also write OUT/images_rectified, without the rolling shutter (needs its readout time)."""
     sheet: Path | None = None
@@ -154,8 +165,8 @@ class FuseExposures:
     """Blend the fused picture with the short exposure, which shows what clips in the long one."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """What the network runs on; auto: CUDA where onnxruntime has it."""
-    calibration: Path | None = None
-    """A calibration file of this device (from `colmap-inertial align --out`), used as a prior."""
+    calibration: tuple[Path, ...] = ()
+    """Calibration files of this device: from `align --out`, from `calibrate-imu --out`, or both."""
 
     def run(self) -> int:
         """Run the command; returns the exit code."""

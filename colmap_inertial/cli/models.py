@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from colmap_inertial.options import ScaleOptions, ValidateOptions, WorldAxes
+from colmap_inertial.options import GravityOptions, ScaleOptions, ValidateOptions, WorldAxes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,12 +30,18 @@ class Scale:
     """IMU recording: a file or folder of a known format, or a capture.toml."""
     frame_times: Path | None = None
     """When the images were taken: a CSV with columns name,t_s, or a capture.toml."""
-    calibration: Path | None = None
-    """A calibration file of this device, used as a prior."""
+    calibration: tuple[Path, ...] = ()
+    """Calibration files of this device: from `align --out`, from `calibrate-imu --out`, or both."""
     first_s: float | None = None
     """Use only this many seconds from the start of the camera's recording."""
     latitude_deg: float | None = None
     """Latitude of the recording, from which the strength of gravity follows."""
+    height_m: float | None = None
+    """Height of the recording above the sea, with --latitude-deg."""
+    device: str | None = None
+    """Name of the device, under which calibrations were remembered (default: what the recording says)."""
+    remembered: bool = True
+    """Take what `align` and `calibrate-imu` remembered of the device, where --calibration does not say it."""
     options: Annotated[ScaleOptions, arg(name="")] = dataclasses.field(default_factory=ScaleOptions)
     config: Path | None = None
     """TOML file as OUT/config.toml of a reconstruction: its [scale] table counts; flags given here go before it."""
@@ -45,18 +51,27 @@ class Scale:
             raise ValueError(f"first_s must be positive, not {self.first_s:g}")
         if self.latitude_deg is not None and not -90 <= self.latitude_deg <= 90:
             raise ValueError(f"latitude_deg must be from -90 to 90, not {self.latitude_deg:g}")
+        if self.height_m is not None and self.latitude_deg is None:
+            raise ValueError("--height-m goes with --latitude-deg")
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.cli.terminal import show_scale
+        from colmap_inertial.cli.terminal import show_remembered, show_scale
+        from colmap_inertial.drivers.remembered import remembered_of
         from colmap_inertial.drivers.sources import ScaleSource, scale_source
 
+        calibration = self.calibration
+        if self.remembered:
+            known = remembered_of(self.imu or self.source, calibration, device=self.device)
+            show_remembered(known)
+            calibration = (*calibration, *known.paths)
         estimate = scale_source(
-            ScaleSource(source=self.source, imu=self.imu, frame_times=self.frame_times, calibration=self.calibration),
+            ScaleSource(source=self.source, imu=self.imu, frame_times=self.frame_times, calibration=calibration),
             self.options,
             json=self.json,
             first_s=self.first_s,
             latitude_deg=self.latitude_deg,
+            height_m=self.height_m or 0.0,
         )
         show_scale(estimate, self.source)
         return 3 if estimate.verdict == "refused" else 0
@@ -158,18 +173,59 @@ class Align:
     """IMU recording: a file or folder of a known format, or a capture.toml."""
     frame_times: Path | None = None
     """When the images were taken: a CSV with columns name,t_s, or a capture.toml."""
-    calibration: Path | None = None
-    """An earlier calibration file of this device, used as a prior."""
+    calibration: tuple[Path, ...] = ()
+    """Earlier calibration files of this device: from `align --out`, from `calibrate-imu --out`, or both."""
+    remember: str | None = None
+    """Keep the calibration under this name of the device: `reconstruct` and `scale` then take it by themselves."""
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
         from colmap_inertial.cli.terminal import show_calibration
+        from colmap_inertial.drivers.remembered import remember
         from colmap_inertial.drivers.sources import ScaleSource, align_source
 
         source = ScaleSource(
             source=self.source, imu=self.imu, frame_times=self.frame_times, calibration=self.calibration
         )
-        show_calibration(align_source(source, self.out), self.source)
+        found = align_source(source, self.out)
+        kept = None if self.remember is None else remember(self.remember, self.out)
+        show_calibration(found, self.source, kept)
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrateImu:
+    """Gains, misalignments and biases of an IMU, from a recording in which it lay still in twelve attitudes or more.
+
+    Start the recording, lay the device still on its six sides, then leaning on six of its edges (a box or a book
+    helps), five seconds each, and turn it over in between; no tools, no right angles. The rests are found by
+    themselves. From nine attitudes on everything is determined; with six to eight, the misalignments are not; with
+    fewer, exit code 3. Give the latitude: the gains are no better than the strength of gravity is known.
+
+    The calibration file serves --calibration for recordings of the same device, beside that of align; a scale's
+    interval then no longer holds what the accelerometer's gain may be off. A page with what is left over in each rest
+    is written beside it. Calibrate again after a year, or where the device is much warmer or colder.
+
+    Example: colmap-inertial calibrate-imu rests.csv --latitude-deg 47.4 --height-m 400 --out phone_imu.json
+    """
+
+    recording: Positional[Path]
+    """IMU recording: a file or folder of a known format, or a capture.toml; no pictures are needed."""
+    out: Path
+    """Where to write the calibration (JSON); a page of the same name, ending in .html, is put beside it."""
+    gravity: Annotated[GravityOptions, arg(name="")] = dataclasses.field(default_factory=GravityOptions)
+    remember: str | None = None
+    """Keep the calibration under this name of the device: `reconstruct` and `scale` then take it by themselves."""
+
+    def run(self) -> int:
+        """Run the command; returns the exit code."""
+        from colmap_inertial.cli.terminal import show_imu_calibration
+        from colmap_inertial.drivers.imu_calibration import calibrate_source
+        from colmap_inertial.drivers.remembered import remember
+
+        found = calibrate_source(self.recording, self.out, self.gravity, device=self.remember)
+        kept = None if self.remember is None else remember(self.remember, self.out)
+        show_imu_calibration(found, self.recording, self.out, kept)
         return 0
 
 
@@ -190,8 +246,8 @@ class Diagnose:
     """IMU recording of a model or trajectory: a file or folder of a known format, or a capture.toml."""
     frame_times: Path | None = None
     """When the images were taken: a CSV with columns name,t_s, or a capture.toml."""
-    calibration: Path | None = None
-    """A calibration file of this device, used as a prior."""
+    calibration: tuple[Path, ...] = ()
+    """Calibration files of this device: from `align --out`, from `calibrate-imu --out`, or both."""
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
@@ -272,6 +328,8 @@ class View:
     """What reconstruct or apply wrote, or a COLMAP model folder."""
     model: int | None = None
     """Number of the model, where there are several; the largest otherwise."""
+    images: Path | None = None
+    """Folder with the model's images, where they are not beside the model."""
     max_points: int = 400_000
     """Show no more points than this, evenly chosen."""
     port: int = 8080
@@ -292,7 +350,7 @@ class View:
         from colmap_inertial.view.server import require_viser, serve
 
         require_viser()
-        scene = load_scene(self.out, model=self.model, max_points=self.max_points)
+        scene = load_scene(self.out, model=self.model, images=self.images, max_points=self.max_points)
         serve(
             scene,
             host=self.host,

@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING
 
 from colmap_inertial.diagnose import Diagnosis
 from colmap_inertial.drivers.deblur import DeblurResult
+from colmap_inertial.drivers.remembered import Remembered
 from colmap_inertial.drivers.result import ReconstructResult, shutter_note
 from colmap_inertial.errors import InertialError
 from colmap_inertial.model.project import Applied
 from colmap_inertial.precalibrate.plan import ImagingPlan
+from colmap_inertial.rest import RestCalibration
 from colmap_inertial.run.progress import Progress
 from colmap_inertial.run.workspace import Workspace
 from colmap_inertial.stages.frame_folder import FrameRecord
@@ -60,7 +62,8 @@ def live_progress() -> Iterator[Progress]:
     console = Console(stderr=True)
     columns = (TextColumn("{task.description:<13}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     tasks = {}
-    with Bars(*columns, console=console, disable=not console.is_terminal) as bars:
+    bars = Bars(*columns, console=console, disable=not console.is_terminal)
+    with bars if console.is_terminal else contextlib.nullcontext():  # rich before 14.3 ends hidden bars with a newline
 
         def progress(stage: str, done: int, total: int, /) -> None:
             name = _STAGES.get(stage, stage)
@@ -142,7 +145,47 @@ def show_applied(applied: Applied) -> None:
     _show("Project", lines)
 
 
-def show_calibration(calibration: CameraImuCalibration, source: Path) -> None:
+def show_remembered(known: Remembered) -> None:
+    """Say which calibrations of an earlier day are used, and how to do without."""
+    for path, kind in known.files:
+        print(f'{known.device}: uses the remembered calibration "{kind}", {path} (--no-remembered leaves it out)')
+
+
+def _kept(kept: Path | None) -> list[Line]:
+    return [] if kept is None else [("Remembered", f"{kept}; reconstruct and scale take it by the device's name")]
+
+
+def show_imu_calibration(found: RestCalibration, source: Path, out: Path, kept: Path | None) -> None:
+    """Print what the rests say of an IMU, with 95 % intervals."""
+    from rich.text import Text
+
+    from colmap_inertial.report.imu_calibration import gain_effect
+
+    calibration = found.calibration
+    colour = {"good": "green", "weak": "yellow"}[found.verdict]
+    lines: list[Line] = [("Verdict", Text(found.verdict, f"bold {colour}"))]
+    lines += [("Reason" if i == 0 else "", reason) for i, reason in enumerate(found.reasons)]
+    before, after = found.rms_pct(found.before_m_s2), found.rms_pct(found.after_m_s2)
+    lines += [
+        ("Rests", f"{len(found.rests)} in {calibration.attitudes} attitudes"),
+        ("Gravity", f"off by {before:.2g} % rms over the rests as read, by {after:.2g} % corrected"),
+    ]
+    for name, label in (("accel", "Accel. gain"), ("gyro", "Gyro gain")):
+        gains = [f"{100 * getattr(calibration, f'{name}_gain')[i, i]:+.3f}" for i in range(3)]
+        spread = 196 * max(calibration.sigma(f"{name}_gain_{axis}{axis}") for axis in "xyz")
+        lines.append((label, f"{', '.join(gains)} %, +-{spread:.2g} (95 %)"))
+    units = {"accel": ("accel_bias_m_s2", "m_s2", "m/s2"), "gyro": ("gyro_bias_rad_s", "rad_s", "rad/s")}
+    for name, (field, suffix, unit) in units.items():
+        bias = ", ".join(f"{value:+.4f}" for value in getattr(calibration, field))
+        spread = 1.96 * max(calibration.sigma(f"{name}_bias_{axis}_{suffix}") for axis in "xyz")
+        lines.append(
+            (f"{name.capitalize()}. bias" if name == "accel" else "Gyro bias", f"{bias} {unit}, +-{spread:.2g}")
+        )
+    lines += [("Scale", gain_effect(found)), ("Written", str(out)), ("", str(out.with_suffix(".html"))), *_kept(kept)]
+    _show(str(source), lines)
+
+
+def show_calibration(calibration: CameraImuCalibration, source: Path, kept: Path | None = None) -> None:
     """Print what an alignment found, with standard deviations."""
     rotation = ", ".join(f"{value:+.5f}" for value in calibration.cam_from_imu_xyzw)
     spread_deg = math.degrees(calibration.rotation_sigma_rad)
@@ -155,6 +198,7 @@ def show_calibration(calibration: CameraImuCalibration, source: Path) -> None:
             ("Rotation", f"camera from IMU, xyzw: {rotation}, +-{spread_deg:.2g} deg"),
             ("Time offset", f"{offset:+.4f} s, +-{offset_ms:.2g} ms (camera time = stamp + offset)"),
             ("Gyro bias", f"{bias} rad/s, +-{bias_spread:.2g}"),
+            *_kept(kept),
         ],
     )
 

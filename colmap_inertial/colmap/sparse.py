@@ -54,7 +54,7 @@ def _writing(database: Path) -> Iterator[None]:
         ) from error
 
 
-def check_names(names: Sequence[str]) -> None:
+def check_pair_names(names: Sequence[str]) -> None:
     """Raise ``FormatError`` for an image name that COLMAP's lists of pairs cannot hold."""
     for name in names:
         if len(name.split()) != 1 or name.startswith("#"):

@@ -26,6 +26,7 @@ CHECKS: tuple[Check, ...] = (
     imu.check_resolution,
     imu.check_delay,
     camera.check_stabilisation,
+    camera.check_pose_convention,
     camera.check_belonging,
     camera.check_clock_rate,
     camera.check_coverage,

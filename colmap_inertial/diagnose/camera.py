@@ -8,10 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from colmap_inertial.align import Alignment
+from colmap_inertial.align._acceleration import quick_accelerations
 from colmap_inertial.diagnose.findings import Finding, Recorded, Severity
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.flow import find_stabilisation
-from colmap_inertial.geometry import quat_conjugate, quat_log, quat_multiply, quat_rotate
+from colmap_inertial.geometry import quat_conjugate, quat_log, quat_multiply
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.sampling import without_running_mean
 from colmap_inertial.types import CameraTrajectory, ImuRecording
@@ -33,8 +34,8 @@ _PART_S, _PART_REACH_S, _PART_STEP_S, _UNEVEN_S, _PART_EXPLAINED = 3.0, 0.4, 0.0
 #: Quick rotation in the picture per rotation measured; translation is slow against it, and makes it a little less (0.92
 #: to 0.95 in rendered orbits about a desk, 1.00 before a far wall). A standard deviation above the third tells nothing.
 _QUICK_S, _USUAL_GAIN, _GAIN_SIGMA, _LEAST_QUICK_RAD_S = 0.35, (0.88, 1.08), 0.05, 0.03
-#: Visual acceleration: window of the quadratics, and the correlation that tells its sign.
-_ACCELERATION_S, _OPPOSITE = 0.5, -0.3
+#: The correlation of visual and inertial acceleration that tells its sign.
+_OPPOSITE = -0.3
 
 
 _MIRRORED = Finding(
@@ -49,6 +50,8 @@ _MIRRORED = Finding(
 def check_belonging(recorded: Recorded) -> Iterator[Finding]:
     """Whether at some offset the gyroscope turns as the camera does; if not, whether it would, read otherwise."""
     failed, imu, turning = recorded.aligned, recorded.imu, recorded.turning
+    if recorded.likely_convention is not None:
+        return
     if isinstance(failed, Alignment) and imu is not None and turning is not None:
         if _is_mirrored(turning, imu, failed):
             yield _MIRRORED
@@ -92,6 +95,19 @@ def check_belonging(recorded: Recorded) -> Iterator[Finding]:
         advice="check that this IMU recording belongs to these images, and the gyroscope's columns, axes and unit",
         numbers={"seconds": span_s},
     )
+
+
+def check_pose_convention(recorded: Recorded) -> Iterator[Finding]:
+    """Poses that fit the IMU if their table was written by another convention than it was read by."""
+    likely = recorded.likely_convention
+    if likely is not None:
+        yield Finding(
+            code="pose-convention",
+            severity="error",
+            evidence=likely.found,
+            advice=likely.advice,
+            numbers={"log_likelihood": likely.log_likelihood} if np.isfinite(likely.log_likelihood) else {},
+        )
 
 
 def _is_mirrored(turning: CameraTrajectory, imu: ImuRecording, aligned: Alignment) -> bool:
@@ -296,6 +312,8 @@ def check_accelerometer_sign(recorded: Recorded) -> Iterator[Finding]:
     aligned, imu, poses = recorded.aligned, recorded.imu, recorded.trajectory
     if not isinstance(aligned, Alignment) or imu is None or not imu.has_accel or poses is None:
         return
+    if recorded.likely_convention is not None:
+        return
     correlation = acceleration_correlation(poses, imu, aligned)
     if correlation is not None and correlation < _OPPOSITE:
         yield Finding(
@@ -310,24 +328,8 @@ def check_accelerometer_sign(recorded: Recorded) -> Iterator[Finding]:
 
 def acceleration_correlation(poses: CameraTrajectory, imu: ImuRecording, aligned: Alignment) -> float | None:
     """Correlation of visual and inertial acceleration in the world, without what is slow; ``None`` where sparse."""
-    step_s = float(np.median(np.diff(poses.t_s)))
-    half = round(0.5 * _ACCELERATION_S / step_s)
-    if half < 3 or len(poses) < 40 * half:
+    quick = quick_accelerations(poses, imu, aligned.calibration)
+    if quick is None:
         return None
-    shift_s = aligned.calibration.accel_time_offset_s + (imu.epoch_ns - poses.epoch_ns) * 1e-9
-    t_s = poses.t_s - aligned.calibration.drift_s(poses.t_s) - shift_s
-    time = step_s * np.arange(-half, half + 1)
-    basis = np.stack([np.ones(len(time)), time, time**2], axis=1)
-    second = 2 * np.linalg.pinv(basis)[2][::-1]
-    mean = np.ones(len(time)) / len(time)
-    force = np.stack([np.interp(t_s, imu.accel_t_s, column) for column in imu.accel_m_s2.T], axis=1)
-    world_from_imu = quat_multiply(quat_conjugate(poses.cam_from_world_xyzw), aligned.calibration.cam_from_imu_xyzw)
-    inertial = np.stack([np.convolve(c, mean, "valid") for c in quat_rotate(world_from_imu, force).T], axis=1)
-    visual = np.stack([np.convolve(c, second, "valid") for c in poses.cam_in_world.T], axis=1)
-    even = np.abs(poses.t_s[2 * half :] - poses.t_s[: -2 * half] - 2 * half * step_s) < 0.1 * step_s
-    even &= (t_s[half:-half] > imu.accel_t_s[0]) & (t_s[half:-half] < imu.accel_t_s[-1])
-    width = 4 * half
-    inertial, visual = without_running_mean(inertial[even], width), without_running_mean(visual[even], width)
-    if len(inertial) < width:
-        return None
+    inertial, visual = quick.inertial_m_s2, quick.visual
     return float(np.sum(inertial * visual) / max(np.sqrt(np.sum(inertial**2) * np.sum(visual**2)), 1e-12))

@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.align import Alignment, AlignOptions, align_clocks
+from colmap_inertial.align.conventions import LikelyConvention, likely_convention
 from colmap_inertial.errors import InertialError, NotObservableError
 from colmap_inertial.flow import VisualRotation
+from colmap_inertial.io.pose_convention import ARRAYS, PoseConvention
 from colmap_inertial.io.units import Axes
 from colmap_inertial.types import (
     CameraImuCalibration,
@@ -138,8 +140,8 @@ class Recorded:
         Whether the frames are those of a capture, which can be described better; poses alone cannot.
     rotation
         Between consecutive frames, by their pixels.
-    trajectory
-        Poses of a reconstruction.
+    trajectory, read_as
+        Poses of a reconstruction; the convention that they were read by.
     camera
         Intrinsics, as declared.
     calibration, max_offset_s
@@ -157,6 +159,7 @@ class Recorded:
     is_capture: bool = False
     rotation: VisualRotation | None = None
     trajectory: CameraTrajectory | None = None
+    read_as: PoseConvention = ARRAYS
     camera: CameraModel | None = None
     calibration: CameraImuCalibration | None = None
     max_offset_s: float | None = None
@@ -176,6 +179,16 @@ class Recorded:
     def aligned(self) -> Alignment | NotObservableError | None:
         """Camera and IMU brought together; ``None`` where one of them is missing."""
         return None if self.imu is None else self.align(self.imu)
+
+    @cached_property
+    def likely_convention(self) -> LikelyConvention | None:
+        """By which other convention the poses fit the IMU; ``None`` where they fit as read, or by none."""
+        if self.imu is None or self.trajectory is None:
+            return None
+        options = AlignOptions(max_offset_s=self.max_offset_s)
+        return likely_convention(
+            self.trajectory, self.imu, read_as=self.read_as, prior=self.calibration, options=options
+        )
 
     def offset_s(self, camera_epoch_ns: int) -> float | None:
         """Camera time since that epoch = gyroscope time since its own + this; ``None`` where it was not found."""

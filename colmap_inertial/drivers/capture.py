@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import EllipsisType
 
-from colmap_inertial.colmap.sparse import check_names
+from colmap_inertial.colmap.sparse import check_pair_names
 from colmap_inertial.colmap.steps import run_colmap
 from colmap_inertial.drivers.frames import ask_for_plan, fusing, run_frames, run_plan, run_rectified
 from colmap_inertial.drivers.models import run_dense_models, run_models, run_validation
@@ -17,15 +17,17 @@ from colmap_inertial.errors import FormatError, InertialError
 from colmap_inertial.gravity import gravity_in_cam
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.files import StrPath, write_json
-from colmap_inertial.io.frames import read_frames
+from colmap_inertial.io.frames import picture_folders, read_frames
 from colmap_inertial.io.imu import read_raw_capture_imu
+from colmap_inertial.io.imu_calibration import used_files
 from colmap_inertial.options import ReconstructOptions
 from colmap_inertial.precalibrate.pairs import exposure_stage, fuses_pairs
 from colmap_inertial.precalibrate.plan import with_stated_exposures
 from colmap_inertial.precalibrate.preflight import checked_imu, preflight, stop_or_doubt
 from colmap_inertial.precalibrate.selection import part_of, run_selection
 from colmap_inertial.report import require_plotly
-from colmap_inertial.run.context import Recording, prior_calibration
+from colmap_inertial.run.context import Recording, corrected_imu, prior_calibration
+from colmap_inertial.run.installed import warn_of_conflicts
 from colmap_inertial.run.progress import Progress, silent
 from colmap_inertial.run.runner import remove
 from colmap_inertial.run.session import open_session
@@ -109,6 +111,7 @@ def reconstruct(
         with_defaults(stages, [])  # a wrong list is said before the work, not after it
     if not model_stages:
         raise ValueError("model_stages: one must estimate the scale, such as ... or MetricStage")
+    warn_of_conflicts()
     require_plotly()
     require_method(options.deblur)
     loaded = load_capture(Path(capture))
@@ -122,15 +125,18 @@ def reconstruct(
     timing, frames = read_frames(loaded)
     timing = with_stated_exposures(loaded, timing)
     require_frames(len(timing.names), of=len(timing.names))
+    used = used_files(options.calibration)
     prior = prior_calibration(loaded, options.calibration)
-    recording = Recording.of(loaded, raw.imu, timing, prior, max_offset_s=options.scale.max_offset_s)
+    imu = corrected_imu(loaded, raw.imu, options.calibration)
+    recording = Recording.of(loaded, imu, timing, prior, max_offset_s=options.scale.max_offset_s)
     gravity = _gravity_priors(recording, options)
-    check_names(timing.names)
+    check_pair_names(timing.names)
     with (
         open_session(
             Path(out),
             loaded.path,
             options,
+            pictures=picture_folders(loaded),
             deterministic=options.deterministic,
             seed=options.seed,
             progress=progress,
@@ -173,7 +179,7 @@ def reconstruct(
             seconds=session.runner.seconds,
         )
         write_recording(session, recording, of_keypoints, keypoints.rectified())
-        result = report_result(session, result, loaded)
+        result = report_result(session, result, loaded, used)
         remove(workspace.features)
     return result
 

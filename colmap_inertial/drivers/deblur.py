@@ -7,18 +7,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from colmap_inertial import __version__
-from colmap_inertial.colmap.sparse import check_names
+from colmap_inertial.colmap.sparse import check_pair_names
 from colmap_inertial.drivers.contact_sheet import write_contact_sheet
 from colmap_inertial.drivers.frames import fusing, run_frames, run_plan, run_rectified
 from colmap_inertial.drivers.result import frame_as_json, imaging_as_json
 from colmap_inertial.errors import FormatError, InertialError, OutputError, OutputExistsError
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.files import StrPath, read_json, write_json
-from colmap_inertial.io.frames import frame_source, read_frames
+from colmap_inertial.io.frames import frame_source, picture_folders, read_frames
 from colmap_inertial.io.imu import read_capture_imu
+from colmap_inertial.io.imu_calibration import CalibrationFiles, as_paths
 from colmap_inertial.options import BlurRemover, ReconstructOptions
 from colmap_inertial.precalibrate.plan import ImagingPlan, Treatments, with_stated_exposures
-from colmap_inertial.run.context import Recording, prior_calibration
+from colmap_inertial.run.context import Recording, corrected_imu, prior_calibration
 from colmap_inertial.run.progress import Progress, silent
 from colmap_inertial.run.session import open_session
 from colmap_inertial.run.workspace import Workspace
@@ -62,7 +63,7 @@ def deblur_capture(
     out: StrPath,
     *,
     method: BlurRemover = "wiener",
-    calibration: Path | None = None,
+    calibration: CalibrationFiles = None,
     rectify: bool = False,
     sheet: Path | None = None,
     progress: Progress = silent,
@@ -79,7 +80,7 @@ def deblur_capture(
     method
         How blur is undone.
     calibration
-        A calibration file of this device.
+        Calibration files of this device, as of ``ReconstructOptions``.
     rectify
         Also write the images without their rolling shutter.
     sheet
@@ -110,12 +111,16 @@ def deblur_capture(
     imu = read_capture_imu(loaded)
     timing, frames = read_frames(loaded)
     timing = with_stated_exposures(loaded, timing)
-    check_names(timing.names)
+    check_pair_names(timing.names)
     options = ReconstructOptions(
-        deblur=method, rolling_shutter="rectify" if rectify else "off", calibration=calibration
+        deblur=method, rolling_shutter="rectify" if rectify else "off", calibration=as_paths(calibration)
     )
+    imu = corrected_imu(loaded, imu, calibration)
     recording = Recording.of(loaded, imu, timing, prior_calibration(loaded, calibration))
-    with open_session(Path(out), loaded.path, options, command="deblur", progress=progress) as session:
+    pictures = picture_folders(loaded)
+    with open_session(
+        Path(out), loaded.path, options, pictures=pictures, command="deblur", progress=progress
+    ) as session:
         workspace = session.workspace
         plan = run_plan(session, recording, Treatments(deblur=method, rolling_shutter=options.rolling_shutter))
         stages: list[FrameStage] = [

@@ -11,12 +11,14 @@ import numpy as np
 from colmap_inertial.diagnose import Diagnosis, FramesInVideo, Recorded, diagnose, unreadable
 from colmap_inertial.drivers.sources import ScaleSource, check_output, only_model
 from colmap_inertial.errors import FormatError, InertialError, TimingError
-from colmap_inertial.io.calibration import for_another_recording, largest_offset_s, read_calibration
+from colmap_inertial.io.calibration import largest_offset_s
 from colmap_inertial.io.capture import Capture, ImageFolder, load_capture
 from colmap_inertial.io.files import write_json
 from colmap_inertial.io.frames import read_frame_times, read_frame_timing
 from colmap_inertial.io.imu import RawImu, is_capture, read_raw_capture_imu, read_raw_imu
+from colmap_inertial.io.imu_calibration import CalibrationFiles, read_for_another
 from colmap_inertial.io.imu_text import is_inertial_scale
+from colmap_inertial.io.pose_convention import ARRAYS, COLMAP, INERTIAL_SCALE, TUM, PoseConvention
 from colmap_inertial.io.recorders import find_recording
 from colmap_inertial.io.trajectories import read_inertial_scale_poses, read_tum
 from colmap_inertial.io.video import decode_grey, video_stamps_ns
@@ -83,12 +85,15 @@ def collect(source: ScaleSource, progress: Progress) -> Recorded:
     reading = _Reading()
     timing: FrameTiming | None = None
     trajectory: CameraTrajectory | None = None
+    read_as = TUM
     times = source.frame_times or (source.imu if source.imu is not None and is_capture(source.imu) else None)
     if times is not None:
         timing = reading.attempt(lambda: read_frame_times(times))
     if inertial_scale:
         trajectory = reading.attempt(lambda: read_inertial_scale_poses(path))
+        read_as = INERTIAL_SCALE
     elif path.is_dir():
+        read_as = COLMAP
         if times is None:
             raise FormatError(path, "a COLMAP model has no frame times: give --frame-times, a CSV with name,t_s")
         if timing is not None:
@@ -100,13 +105,13 @@ def collect(source: ScaleSource, progress: Progress) -> Recorded:
     captures = [load_capture(p) for p in (source.imu, source.frame_times, path) if p is not None and is_capture(p)]
     shared = any(capture.shared_clock for capture in captures)
     calibration = captures[0].calibration if captures else None
-    if source.calibration is not None:
-        calibration = for_another_recording(read_calibration(source.calibration), shared_clock=shared)
+    calibration = read_for_another(source.calibration, shared_clock=shared).camera_imu or calibration
     return _recorded(
         reading,
         imu=lambda: read_raw_imu(path if source.imu is None else source.imu),
         timing=timing,
         trajectory=trajectory,
+        read_as=read_as,
         calibration=calibration,
         max_offset_s=largest_offset_s(shared),
     )
@@ -133,7 +138,9 @@ class _Reading:
             return None
 
 
-def _recorded(reading: _Reading, *, imu: Callable[[], RawImu] | None, **known: Any) -> Recorded:
+def _recorded(
+    reading: _Reading, *, imu: Callable[[], RawImu] | None, read_as: PoseConvention = ARRAYS, **known: Any
+) -> Recorded:
     raw = None if imu is None else reading.attempt(imu)
     if raw is None and all(value is None for value in known.values()):
         error = reading.refused[0]
@@ -145,11 +152,12 @@ def _recorded(reading: _Reading, *, imu: Callable[[], RawImu] | None, **known: A
         imu=None if raw is None else raw.imu,
         gyro_axes=None if raw is None else raw.gyro_axes,
         accel_axes=None if raw is None else raw.accel_axes,
+        read_as=read_as,
         **known,
     )
 
 
-def _of_capture(capture: Capture, calibration: Path | None, progress: Progress) -> Recorded:
+def _of_capture(capture: Capture, calibration: CalibrationFiles, progress: Progress) -> Recorded:
     reading = _Reading()
     timing = rotation = in_video = None
     if capture.frames is not None:
@@ -158,9 +166,8 @@ def _of_capture(capture: Capture, calibration: Path | None, progress: Progress) 
         known = timing
         rotation = reading.attempt(lambda: _followed(capture, known, _MANY, _MANY_SPACING_S, progress))
         in_video = reading.attempt(lambda: _find_in_video(capture, known, progress))
-    prior = capture.calibration
-    if calibration is not None:
-        prior = for_another_recording(read_calibration(calibration), shared_clock=capture.shared_clock)
+    # the readings stay the sensor's own: that is what the checks are about
+    prior = read_for_another(calibration, shared_clock=capture.shared_clock).camera_imu or capture.calibration
     return _recorded(
         reading,
         imu=None if capture.imu is None else lambda: read_raw_capture_imu(capture),

@@ -10,7 +10,7 @@ from colmap_inertial import __version__
 from colmap_inertial.errors import FormatError
 from colmap_inertial.io.capture import ImageFolder, load_capture
 from colmap_inertial.io.files import StrPath
-from colmap_inertial.io.frames import image_names
+from colmap_inertial.io.frames import image_names, picture_folders
 from colmap_inertial.io.images import read_image
 from colmap_inertial.io.names import path_in
 from colmap_inertial.multi_aperture import refocus, require_colours
@@ -63,7 +63,10 @@ def fuse_captured(
     stage = ApertureStage(pictures=loaded.apertures, options=options.fusion)
     require_colours(loaded.apertures.rig)
     canvas = stage.canvas()
-    with open_session(Path(out), loaded.path, options, command="fuse-apertures", progress=progress) as session:
+    pictures = picture_folders(loaded)
+    with open_session(
+        Path(out), loaded.path, options, pictures=pictures, command="fuse-apertures", progress=progress
+    ) as session:
         workspace = session.workspace
         root = workspace.root
         kinds = [

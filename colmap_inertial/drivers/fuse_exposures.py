@@ -11,15 +11,16 @@ from colmap_inertial.drivers.frames import run_plan
 from colmap_inertial.errors import FormatError
 from colmap_inertial.io.capture import Capture, ImageFolder, load_capture
 from colmap_inertial.io.files import StrPath
-from colmap_inertial.io.frames import image_names, read_frame_timing
+from colmap_inertial.io.frames import image_names, picture_folders, read_frame_timing
 from colmap_inertial.io.images import read_image
 from colmap_inertial.io.imu import read_capture_imu
+from colmap_inertial.io.imu_calibration import CalibrationFiles
 from colmap_inertial.io.names import path_in
 from colmap_inertial.io.records import structured
 from colmap_inertial.options import ExposureOptions
 from colmap_inertial.precalibrate.pairs import pair_stage
 from colmap_inertial.precalibrate.plan import ImagingPlan, Treatments, with_stated_exposures
-from colmap_inertial.run.context import Recording, prior_calibration
+from colmap_inertial.run.context import Recording, corrected_imu, prior_calibration
 from colmap_inertial.run.progress import Progress, silent
 from colmap_inertial.run.runner import fingerprint
 from colmap_inertial.run.session import open_session
@@ -33,7 +34,7 @@ def fuse_exposures_captured(
     out: StrPath,
     options: ExposureOptions | None = None,
     *,
-    calibration: Path | None = None,
+    calibration: CalibrationFiles = None,
     fuser: Fuser | None = None,
     progress: Progress = silent,
 ) -> tuple[FusedPair, ...]:
@@ -49,7 +50,7 @@ def fuse_exposures_captured(
     options
         Defaults serve.
     calibration
-        A calibration file of this device.
+        Calibration files of this device, as of ``ReconstructOptions``.
     fuser
         In place of the network that comes with the package.
     progress
@@ -82,8 +83,12 @@ def fuse_exposures_captured(
     if timing is None:
         note = note.replace("no gyroscope", "the frames have no times")
     elif loaded.imu is not None:
-        recording = Recording.of(loaded, read_capture_imu(loaded), timing, prior)
-    with open_session(Path(out), loaded.path, options, command="fuse-exposures", progress=progress) as session:
+        imu = corrected_imu(loaded, read_capture_imu(loaded), calibration)
+        recording = Recording.of(loaded, imu, timing, prior)
+    pictures = picture_folders(loaded)
+    with open_session(
+        Path(out), loaded.path, options, pictures=pictures, command="fuse-exposures", progress=progress
+    ) as session:
         workspace = session.workspace
         plan = ImagingPlan(deblur_note=note)
         if recording is not None:

@@ -25,6 +25,7 @@ from colmap_inertial.io.frame_times import FrameStamps, stamps_of_pattern
 from colmap_inertial.io.frames import read_frame_times, read_frame_timing
 from colmap_inertial.io.image_metadata import stated_exposures_s
 from colmap_inertial.io.imu import RawImu, is_capture, read_raw_capture_imu, read_raw_imu
+from colmap_inertial.io.imu_calibration import used_files
 from colmap_inertial.io.names import path_in
 from colmap_inertial.io.recorders import find_recording
 from colmap_inertial.io.records import read_record, write_record
@@ -45,7 +46,8 @@ from colmap_inertial.model.similarities import ModelScale, read_similarity
 from colmap_inertial.options import ProjectOptions, ReconstructOptions
 from colmap_inertial.precalibrate.preflight import checked_imu, preflight, stop_or_doubt
 from colmap_inertial.report import require_plotly
-from colmap_inertial.run.context import Recording, prior_calibration
+from colmap_inertial.run.context import Recording, corrected_imu, prior_calibration
+from colmap_inertial.run.installed import warn_of_conflicts
 from colmap_inertial.run.progress import Progress, silent
 from colmap_inertial.run.runner import fingerprint, remove
 from colmap_inertial.run.session import Session, open_session
@@ -127,6 +129,7 @@ def reconstruct_project(
     NotObservableError
         When the recording cannot give metres (``options.force`` goes on).
     """
+    warn_of_conflicts()
     project, out = Path(project), Path(out)
     if not _has_model(project):
         raise FormatError(
@@ -139,20 +142,28 @@ def reconstruct_project(
     given = _given(project, source, options)
     capture = given.capture
     raw = checked_imu(given.raw, force=options.force)
+    used = used_files(options.calibration)
     prior = prior_calibration(capture, options.calibration)
+    imu = corrected_imu(capture, raw.imu, options.calibration)
     target = None if capture.target is None else parse_target(capture.target)
     models = _models(project, out, source.keep, follow_links=source.follow_links)
     images = _images(project, source, needed=options.dense or source.exif_times or source.video is not None)
     read = functools.cache(read_model)
     with (
         open_session(
-            out, project, options, deterministic=options.deterministic, seed=options.seed, progress=progress
+            out,
+            project,
+            options,
+            pictures=() if images is None else (images,),
+            deterministic=options.deterministic,
+            seed=options.seed,
+            progress=progress,
         ) as session,
         reporting_stops(session.workspace, capture),
     ):
         workspace = session.workspace
         timing, notes = _run_times(session, given, models, images, read)
-        recording = Recording.of(capture, raw.imu, timing, prior, max_offset_s=options.scale.max_offset_s)
+        recording = Recording.of(capture, imu, timing, prior, max_offset_s=options.scale.max_offset_s)
         largest = read(models[max(models, key=lambda n: (num_registered(models[n]), -n))])
         diagnosis = preflight(recording, raw, progress, model=_trajectory(largest, timing))
         write_json(workspace.diagnosis, diagnosis.as_json())
@@ -177,7 +188,7 @@ def reconstruct_project(
             project_metric=metric,
         )
         write_recording(session, recording)
-        result = report_result(session, result, capture, project=source)
+        result = report_result(session, result, capture, used, project=source)
     return result
 
 

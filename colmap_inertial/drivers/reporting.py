@@ -137,7 +137,11 @@ def write_model_record(
 
 
 def report_result(
-    session: Session, result: ReconstructResult, capture: Capture, project: ProjectOptions | None = None
+    session: Session,
+    result: ReconstructResult,
+    capture: Capture,
+    calibration_files: Sequence[dict[str, str]] = (),
+    project: ProjectOptions | None = None,
 ) -> ReconstructResult:
     """Write the report, and then ``result.json``, whose presence says that the run is finished.
 
@@ -146,7 +150,7 @@ def report_result(
     The result with the path of its report; ``None`` where that failed.
     """
     workspace = result.workspace
-    content = result_as_json(result, capture)
+    content = {**result_as_json(result, capture), "calibration_files": list(calibration_files)}
     if project is not None:
         content["project"] = {
             key: value.resolve() if isinstance(value, Path) else value

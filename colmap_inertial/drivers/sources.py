@@ -10,13 +10,16 @@ from pathlib import Path
 import numpy as np
 
 from colmap_inertial.align import AlignOptions, align_camera_imu
-from colmap_inertial.errors import FormatError, InertialError, OutputError, OutputExistsError
-from colmap_inertial.io.calibration import for_another_recording, largest_offset_s, read_calibration, write_calibration
+from colmap_inertial.align.conventions import LikelyConvention, likely_convention
+from colmap_inertial.errors import FormatError, InertialError, NotObservableError, OutputError, OutputExistsError
+from colmap_inertial.io.calibration import largest_offset_s, write_calibration
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.files import read_json, write_json
 from colmap_inertial.io.frames import read_frame_times
 from colmap_inertial.io.imu import is_capture, read_imu
+from colmap_inertial.io.imu_calibration import CalibrationFiles, as_paths, read_for_another, used_files
 from colmap_inertial.io.imu_text import is_inertial_scale
+from colmap_inertial.io.pose_convention import COLMAP, INERTIAL_SCALE, TUM, PoseConvention
 from colmap_inertial.io.trajectories import read_inertial_scale, read_tum
 from colmap_inertial.model import apply_similarity, find_models, is_metric, read_model, trajectory_from_model
 from colmap_inertial.options import ScaleOptions, ValidateOptions
@@ -38,20 +41,24 @@ class ScaleSource:
     frame_times
         For a COLMAP model: CSV or capture.toml; where ``imu`` is a capture.toml, its frame times serve.
     calibration
-        A calibration file; where ``imu`` is a capture.toml, its calibration serves.
+        Calibration files; where ``imu`` is a capture.toml, its calibration serves.
     """
 
     source: Path
     imu: Path | None = None
     frame_times: Path | None = None
-    calibration: Path | None = None
+    calibration: CalibrationFiles = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TimedPoses:
-    """A trajectory with its IMU recording; ``start_s`` is when the camera began, where frame times tell."""
+    """A trajectory with its IMU recording; ``start_s`` is when the camera began, where frame times tell.
+
+    ``read_as`` is the convention that the poses were read by.
+    """
 
     trajectory: CameraTrajectory
+    read_as: PoseConvention
     imu: ImuRecording
     calibration: CameraImuCalibration | None
     shared_clock: bool
@@ -75,8 +82,10 @@ def load_source(source: ScaleSource) -> TimedPoses:
         raise FormatError(path, "needs the recording that ran along: give --imu PATH")
     notes: Sequence[str] = ()
     start_s = None
+    read_as = TUM
     if inertial_scale:
         trajectory, imu = read_inertial_scale(path)
+        read_as = INERTIAL_SCALE
     elif path.is_dir():
         times = source.frame_times or source.imu
         if times is None or (source.frame_times is None and not is_capture(times)):
@@ -84,6 +93,7 @@ def load_source(source: ScaleSource) -> TimedPoses:
         timing = read_frame_times(times)
         folder = only_model(path)
         trajectory, notes = trajectory_from_model(read_model(folder), timing)
+        read_as = COLMAP
         start_s = float(timing.pose_t_s()[0])
         if is_metric(folder):
             notes = (*notes, "this model is metric already: a scale of 1 says that it is right")
@@ -94,10 +104,20 @@ def load_source(source: ScaleSource) -> TimedPoses:
     captures = [load_capture(p) for p in (source.imu, source.frame_times, path) if p is not None and is_capture(p)]
     shared = any(capture.shared_clock for capture in captures)
     calibration = captures[0].calibration if captures else None
-    if source.calibration is not None:
-        calibration = for_another_recording(read_calibration(source.calibration), shared_clock=shared)
+    of_imu = captures[0].imu_calibration if captures else None
+    files = read_for_another(source.calibration, shared_clock=shared)
+    calibration, of_imu = files.camera_imu or calibration, files.imu or of_imu
+    if of_imu is not None:
+        imu = of_imu.corrected(imu)
+        calibration = None if calibration is None else of_imu.loosened(calibration)
     return TimedPoses(
-        trajectory=trajectory, imu=imu, calibration=calibration, shared_clock=shared, start_s=start_s, notes=notes
+        trajectory=trajectory,
+        read_as=read_as,
+        imu=imu,
+        calibration=calibration,
+        shared_clock=shared,
+        start_s=start_s,
+        notes=notes,
     )
 
 
@@ -127,7 +147,7 @@ def check_output(path: Path, inputs: Sequence[Path | None]) -> None:
             raise OutputExistsError(f"{path} is an input; choose another name for the result")
     if path.exists():
         try:
-            ours = {"metres_per_unit", "cam_from_imu_xyzw", "findings"} & set(read_json(path))
+            ours = {"metres_per_unit", "cam_from_imu_xyzw", "accel_gain", "findings"} & set(read_json(path))
         except FormatError:
             ours = set()
         if not ours:
@@ -140,14 +160,29 @@ def align_source(source: ScaleSource, out: Path) -> CameraImuCalibration:
     Raises
     ------
     NotObservableError
-        Where no offset between the clocks is better than the rest, or the camera hardly turned.
+        Where no offset between the clocks is better than the rest, or the camera hardly turned. Poses that fit by
+        another convention are named.
     """
     check_output(out, [source.source, source.imu, source.frame_times])
     recording = load_source(source)
     options = AlignOptions(max_offset_s=largest_offset_s(recording.shared_clock))
-    found = align_camera_imu(recording.trajectory, recording.imu, prior=recording.calibration, options=options)
+    try:
+        found = align_camera_imu(recording.trajectory, recording.imu, prior=recording.calibration, options=options)
+    except NotObservableError as error:
+        likely = _likely_convention(recording, recording.trajectory, options)
+        if likely is None:
+            raise
+        raise NotObservableError(error.quantity, likely.sentence) from error
     write_calibration(out, found)
     return found
+
+
+def _likely_convention(
+    recording: TimedPoses, trajectory: CameraTrajectory, options: AlignOptions
+) -> LikelyConvention | None:
+    return likely_convention(
+        trajectory, recording.imu, read_as=recording.read_as, prior=recording.calibration, options=options
+    )
 
 
 def scale_source(
@@ -157,6 +192,7 @@ def scale_source(
     json: Path,
     first_s: float | None = None,
     latitude_deg: float | None = None,
+    height_m: float = 0.0,
 ) -> ScaleEstimate:
     """Estimate the scale of an existing model or trajectory and write it.
 
@@ -170,14 +206,15 @@ def scale_source(
         Written whole, also when the scale is refused.
     first_s
         Use only the first seconds of the camera's recording, for the alignment too.
-    latitude_deg
-        Sets ``options.gravity_m_s2``.
+    latitude_deg, height_m
+        Set ``options.gravity_m_s2``.
     """
-    check_output(json, [source.source, source.imu, source.frame_times, source.calibration])
+    check_output(json, [source.source, source.imu, source.frame_times, *as_paths(source.calibration)])
     if latitude_deg is not None:
         if options.gravity_m_s2 != ScaleOptions().gravity_m_s2:
             raise InertialError("--gravity-m-s2 and --latitude-deg both set the strength of gravity; give one of them")
-        options = dataclasses.replace(options, gravity_m_s2=gravity_at_latitude_m_s2(latitude_deg))
+        options = dataclasses.replace(options, gravity_m_s2=gravity_at_latitude_m_s2(latitude_deg, height_m))
+    used = used_files(source.calibration)
     recording = load_source(source)
     trajectory = recording.trajectory
     if first_s is not None:
@@ -185,9 +222,13 @@ def scale_source(
     limit_s = largest_offset_s(recording.shared_clock, options.max_offset_s)
     options = dataclasses.replace(options, max_offset_s=limit_s)
     estimate = estimate_scale(trajectory, recording.imu, calibration=recording.calibration, options=options)
-    notes = (*estimate.reasons, *recording.imu.repairs, *recording.notes)
+    said = estimate.reasons
+    if estimate.verdict == "refused":
+        likely = _likely_convention(recording, trajectory, AlignOptions(max_offset_s=limit_s))
+        said = said if likely is None else (likely.sentence, *said)
+    notes = (*said, *recording.imu.repairs, *recording.notes)
     estimate = dataclasses.replace(estimate, reasons=notes)
-    write_json(json, estimate.as_json())
+    write_json(json, {**estimate.as_json(), "calibration_files": used})
     return estimate
 
 

@@ -30,6 +30,8 @@ KNOWN_GYRO_BIAS_RAD_S = 0.002
 KNOWN_READOUT_SHARE = 0.02
 SMALLEST_READOUT_S = 1e-4
 
+#: What a file of this module holds, under ``kind``; one without it is of this kind, too.
+CAMERA_IMU = "camera-imu"
 #: Fields that a file may lack, as those of clocks that keep step do.
 _CLOCK = {"clock_rate", "clock_middle_s"}
 
@@ -147,7 +149,7 @@ def for_another_recording(calibration: CameraImuCalibration, *, shared_clock: bo
 
 
 def write_calibration(path: StrPath, calibration: CameraImuCalibration) -> None:
-    """Write a calibration as JSON: the fields of :class:`CameraImuCalibration`, and the order of ``cov``.
+    """Write a calibration as JSON: its kind, the fields of :class:`CameraImuCalibration`, and the order of ``cov``.
 
     A clock rate and when the offsets hold are written where the clocks do not keep step.
     """
@@ -155,7 +157,7 @@ def write_calibration(path: StrPath, calibration: CameraImuCalibration) -> None:
     values = {field.name: getattr(calibration, field.name) for field in fields(calibration)}
     if calibration.clock_rate == 0:
         values = {name: value for name, value in values.items() if name not in _CLOCK}
-    write_json(path, {**values, "cov_parameters": list(CALIBRATION_PARAMETERS)})
+    write_json(path, {"kind": CAMERA_IMU, **values, "cov_parameters": list(CALIBRATION_PARAMETERS)})
 
 
 def read_calibration(path: StrPath) -> CameraImuCalibration:
@@ -167,8 +169,9 @@ def read_calibration(path: StrPath) -> CameraImuCalibration:
         Where a field is missing, unknown, of a wrong shape, or not finite.
     """
     path = Path(path)
-    path = Path(path)
     values = read_json(path)
+    if values.pop("kind", CAMERA_IMU) != CAMERA_IMU:
+        raise FormatError(path, "holds no calibration of a camera and an IMU (its kind is another)")
     order = values.pop("cov_parameters", list(CALIBRATION_PARAMETERS))
     if order != list(CALIBRATION_PARAMETERS):
         raise FormatError(path, "cov_parameters: the order of cov is not the one of this version")
@@ -180,7 +183,7 @@ def read_calibration(path: StrPath) -> CameraImuCalibration:
         )
         raise FormatError(path, f"not a calibration file ({what})")
     for name, value in values.items():
-        if not _is_numeric(value):
+        if not is_numeric(value):
             raise FormatError(path, f"{name}: expected numbers")
     scalars = ["gyro_time_offset_s", "accel_time_offset_s", "readout_s", *sorted(_CLOCK & values.keys())]
     if any(not isinstance(values[name], int | float) for name in scalars):
@@ -191,7 +194,8 @@ def read_calibration(path: StrPath) -> CameraImuCalibration:
         raise FormatError(path, str(error)) from None
 
 
-def _is_numeric(value: object) -> bool:
+def is_numeric(value: object) -> bool:
+    """Whether a value of a JSON file is a number, or lists of numbers."""
     if isinstance(value, list):
-        return all(_is_numeric(item) for item in value)
+        return all(is_numeric(item) for item in value)
     return isinstance(value, int | float) and not isinstance(value, bool)

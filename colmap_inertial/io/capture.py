@@ -32,7 +32,7 @@ from colmap_inertial.io.imu_text import is_inertial_scale
 from colmap_inertial.io.recorders import Recording, find_recording
 from colmap_inertial.io.toml_section import Section, read_toml
 from colmap_inertial.io.units import TIME_UNITS_NS
-from colmap_inertial.types import CameraImuCalibration, CameraModel, FrameLog, ReadoutDirection
+from colmap_inertial.types import CameraImuCalibration, CameraModel, FrameLog, ImuCalibration, ReadoutDirection
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,6 +100,10 @@ class Capture:
         ``None`` where nothing inertial was recorded.
     calibration
         What is known about camera and IMU; wide where nothing is.
+    imu_calibration
+        The IMU's own, where known; the recording is read without it.
+    device
+        What recorded it; empty where nobody said.
     target
         Specification of a calibration target in the scene.
     frame_log
@@ -119,6 +123,8 @@ class Capture:
     camera: CameraModel | None = None
     imu: ImuPath | ImuTables | None = None
     calibration: CameraImuCalibration
+    imu_calibration: ImuCalibration | None = None
+    device: str = ""
     target: str | None = None
     frame_log: FrameLog | None = None
     apertures: ApertureImages | None = None
@@ -202,9 +208,10 @@ def _from_toml(path: Path) -> Capture:
             if shared_clock is None and inside and frames.frame_times is None:
                 shared_clock = log.shared_clock
     shared_clock = bool(shared_clock)
-    calibration = read_calibration_table(
+    known = read_calibration_table(
         root.table("calibration"), body_from_cam=body_from_cam, imu=imu, readout_s=readout_s, shared_clock=shared_clock
     )
+    device = root.text("device")
     target = root.section("target")
     spec = None
     if target is not None:
@@ -222,7 +229,9 @@ def _from_toml(path: Path) -> Capture:
         shared_clock=shared_clock,
         camera=camera,
         imu=imu,
-        calibration=calibration,
+        calibration=known.camera_imu or calibration_prior(shared_clock=shared_clock),
+        imu_calibration=known.imu,
+        device=device or "",
         target=spec,
         frame_log=log,
         apertures=apertures,

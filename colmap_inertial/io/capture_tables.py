@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,16 +10,12 @@ from numpy.typing import NDArray
 
 from colmap_inertial.geometry import colmap_px_from_opencv, quat_from_matrix
 from colmap_inertial.io import sensor_yaml
-from colmap_inertial.io.calibration import (
-    Declared,
-    calibration_prior,
-    for_another_recording,
-    read_calibration,
-)
+from colmap_inertial.io.calibration import Declared, calibration_prior
+from colmap_inertial.io.imu_calibration import Calibrations, holds_imu_alone, read_for_another
 from colmap_inertial.io.imu_text import SensorTable
 from colmap_inertial.io.toml_section import Section
 from colmap_inertial.io.units import SENSOR_UNITS, TIME_UNITS_NS, Axes, DeclaredUnits, Quantity
-from colmap_inertial.types import CameraImuCalibration, CameraModel, ImuNoise
+from colmap_inertial.types import CameraModel, ImuNoise
 
 #: COLMAP's camera models: parameters, and where the principal point stands among them.
 CAMERA_MODELS = {
@@ -148,9 +144,9 @@ def read_calibration_table(
     imu: ImuPath | ImuTables | None,
     readout_s: float | None,
     shared_clock: bool,
-) -> CameraImuCalibration:
+) -> Calibrations:
     """The ``[calibration]`` table, completed by the sheets of camera and IMU and by ``[timing]``."""
-    file = table.file("file")
+    files = table.files("file")
     matrix, xyzw = table.matrix("cam_from_imu"), table.numbers("cam_from_imu_xyzw", 4)
     lever = table.numbers("imu_in_cam_m", 3)
     gyro_offset, accel_offset = table.number("gyro_time_offset_s"), table.number("accel_time_offset_s")
@@ -161,10 +157,11 @@ def read_calibration_table(
     }
     table.finish()
     stated = (matrix, xyzw, lever, gyro_offset, accel_offset, bias, *sigmas.values())
-    if file is not None:
-        if any(value is not None for value in stated):
-            table.fail("file", "gives the calibration; leave out the other keys of this table")
-        return for_another_recording(read_calibration(file), shared_clock=shared_clock)
+    if any(value is not None for value in stated) and not all(holds_imu_alone(file) for file in files):
+        table.fail("file", "gives the calibration; leave out the other keys of this table")
+    found = read_for_another(files, shared_clock=shared_clock)
+    if found.camera_imu is not None:
+        return found
     if matrix is not None and xyzw is not None:
         table.fail("cam_from_imu_xyzw", "and cam_from_imu say the same; leave one out")
     if xyzw is not None and abs(np.linalg.norm(xyzw) - 1) > 1e-3:
@@ -189,7 +186,7 @@ def read_calibration_table(
         readout_s=readout_s,
         **{key: sigma for key, sigma in sigmas.items() if sigma is not None},
     )
-    return calibration_prior(declared, shared_clock=shared_clock)
+    return replace(found, camera_imu=calibration_prior(declared, shared_clock=shared_clock))
 
 
 def body_from_imu(imu: ImuPath) -> NDArray[np.float64]:
@@ -243,6 +240,7 @@ def _sensor_table(table: Section, quantity: Quantity) -> tuple[SensorTable, Axes
     time_unit = table.choice("time_unit", TIME_UNITS_NS)
     columns = table.raw("columns")
     unit = table.choice("unit", SENSOR_UNITS[quantity])
+    zero, counts_per_unit = table.number("zero"), table.positive("counts_per_unit")
     axes = _axes(table)
     table.finish()
     for key, value in (
@@ -261,7 +259,16 @@ def _sensor_table(table: Section, quantity: Quantity) -> tuple[SensorTable, Axes
         table.fail("columns", "must be three columns, and another than time")
     assert file is not None and time_unit is not None and unit is not None
     x, y, z = columns
-    return SensorTable(file=file, time=time, time_unit=time_unit, columns=(x, y, z), unit=unit), axes
+    described = SensorTable(
+        file=file,
+        time=time,
+        time_unit=time_unit,
+        columns=(x, y, z),
+        unit=unit,
+        zero=zero or 0.0,
+        counts_per_unit=counts_per_unit or 1.0,
+    )
+    return described, axes
 
 
 def _is_column(value: object) -> bool:

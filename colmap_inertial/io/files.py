@@ -7,7 +7,9 @@ import dataclasses
 import json
 import math
 import os
+import re
 import secrets
+import stat
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,11 @@ from typing import Any
 import numpy as np
 
 from colmap_inertial.errors import FormatError, OutputError, OutputExistsError
+
+#: Tables, texts and pictures that are read whole are smaller.
+LARGEST_BYTES = 4 << 30
+
+_TEMPORARY = re.compile(r"\..+\.\d+-[0-9a-f]{8}\.tmp")
 
 #: What users may give for a path.
 StrPath = str | os.PathLike[str]
@@ -40,6 +47,14 @@ def write_text(path: Path, text: str) -> None:
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def remove_temporaries(*folders: Path) -> None:
+    """Remove what a process that was killed within :func:`write_text` left behind, where nobody else is at work."""
+    for folder in folders:
+        for path in folder.glob(".*.tmp"):
+            if _TEMPORARY.fullmatch(path.name):
+                path.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
@@ -159,16 +174,36 @@ def read_bytes(path: Path, size: int = -1, *, what: str = "file") -> bytes:
         Where the file is missing or cannot be read.
     """
     try:
+        require_regular(path)
         with open(path, "rb") as file:
+            if size < 0 and os.fstat(file.fileno()).st_size > LARGEST_BYTES:
+                raise FormatError(path, f"is larger than {LARGEST_BYTES >> 30} GiB; such a {what} is not read")
             return file.read(size)
     except FileNotFoundError:
         raise FormatError(path, f"no such {what}") from None
-    except OSError as error:
-        raise FormatError(path, f"cannot be read: {error.strerror or error}") from None
+    except (OSError, ValueError) as error:  # the latter for a NUL in the path
+        raise FormatError(path, f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
+
+
+def require_regular(path: Path) -> None:
+    """Refuse what never ends or never begins.
+
+    Raises
+    ------
+    FormatError
+        For a device, a pipe or a socket.
+    OSError
+        Where there is nothing.
+    """
+    mode = os.stat(path).st_mode
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise FormatError(path, "is a device, a pipe or a socket, not a file; copy what it gives into one")
 
 
 def first_line(path: Path) -> str:
     """The beginning of a file's first line, to tell what it is; empty where it cannot be read."""
+    if not path.is_file():
+        return ""
     try:
         with open(path, encoding="utf-8-sig", errors="replace") as file:
             return file.readline(1000)

@@ -117,6 +117,16 @@ def frame_source(capture: Capture) -> Path | None:
     return capture.frames.folder if isinstance(capture.frames, ImageFolder) else None
 
 
+def picture_folders(capture: Capture) -> tuple[Path, ...]:
+    """All folders that pictures of a capture are read from; empty where they come from a video."""
+    if not isinstance(capture.frames, ImageFolder):
+        return ()
+    more = [] if capture.apertures is None else [source.folder for source in capture.apertures.sources]
+    if capture.exposures is not None:
+        more.append(capture.exposures.source.folder)
+    return tuple(dict.fromkeys([capture.frames.folder, *more]))
+
+
 def _timing(capture: Capture, stamps: FrameStamps) -> FrameTiming:
     if capture.exposure_s is not None and isinstance(capture.frames, Video):
         # what the user states goes before what the recorder noted
@@ -151,6 +161,8 @@ def image_names(source: ImageFolder) -> list[str]:
     """Names relative to the folder, with forward slashes, as COLMAP has them."""
     if not source.folder.is_dir():
         raise FormatError(source.folder, "no such folder of pictures")
+    if source.pattern is not None and (Path(source.pattern).is_absolute() or ".." in Path(source.pattern).parts):
+        raise FormatError(source.folder, f"the pattern {source.pattern!r} leads out of it")
     found = source.folder.iterdir() if source.pattern is None else source.folder.glob(source.pattern)
     paths = [path for path in found if path.suffix.lower() in SUFFIXES and path.is_file()]
     if not paths:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from colmap_inertial.io.exif import HEAD_BYTES, PNG, exposure_of, jpeg_segments, png_chunks
+from colmap_inertial.io.files import read_bytes
 from colmap_inertial.types import Array
 
 #: Chunks of a PNG that say something about its pixels or where they come from.
@@ -39,8 +40,7 @@ def stated_exposures_s(paths: list[Path]) -> Array | None:
     """(F,) exposure times by the EXIF of JPEG, PNG or TIFF files; ``None`` where one of them does not say."""
     found = []
     for path in paths:
-        with open(path, "rb") as file:
-            exposure_s, _ = exposure_of(file.read(HEAD_BYTES))
+        exposure_s, _ = exposure_of(read_bytes(path, HEAD_BYTES, what="picture"))
         if exposure_s is None:
             return None
         found.append(exposure_s)

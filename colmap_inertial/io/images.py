@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 import zlib
 from pathlib import Path
@@ -15,6 +16,12 @@ from colmap_inertial.io.files import read_bytes
 #: File endings of pictures that both OpenCV and the published builds of pycolmap read (the latter read no WebP).
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".pgm", ".ppm")
 
+#: OpenCV's level of logging that says nothing.
+_SILENT = 0
+
+#: A picture of more pixels is not decoded.
+MOST_PIXELS = 250_000_000
+
 
 def read_image(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
     """Decode a picture: (H, W) or (H, W, 3) RGB, in the file's own depth, rows as stored.
@@ -25,21 +32,23 @@ def read_image(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
     Raises
     ------
     FormatError
-        Where the file is missing, damaged, cut off, or not 8 or 16 bit.
+        Where the file is missing, damaged, cut off, too large, or not 8 or 16 bit.
     """
     import cv2
 
     data = read_bytes(path, what="picture")
+    require_modest(path, data)
     fault = _fault(data)
     if fault is not None:
         raise FormatError(path, f"{fault}; copy it again from its source, or take it out of the folder")
-    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    logging = getattr(cv2.utils, "logging", cv2)  # before OpenCV 4.13 it stood in cv2 itself
+    level = logging.setLogLevel(_SILENT)
     try:
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         image = None
     finally:
-        cv2.utils.logging.setLogLevel(level)
+        logging.setLogLevel(level)
     if image is None:
         raise FormatError(path, "cannot be decoded: damaged, cut off, or no picture; take it out of the folder")
     if image.dtype not in (np.uint8, np.uint16):
@@ -49,6 +58,68 @@ def read_image(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
     elif image.ndim == 3:
         image = np.ascontiguousarray(image[:, :, 0])
     return image
+
+
+def require_modest(path: Path, data: bytes) -> None:
+    """Refuse a picture by what its header says, before it takes the memory.
+
+    Raises
+    ------
+    FormatError
+        For more than 250 megapixels.
+    """
+    size = _stated_size(data)
+    if size is not None and size[0] * size[1] > MOST_PIXELS:
+        raise FormatError(
+            path,
+            f"has {size[0]} x {size[1]} pixels; more than {MOST_PIXELS // 1_000_000} million are not decoded: make it "
+            "smaller, or take it out of the folder",
+        )
+
+
+def _stated_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height by the header of a PNG, JPEG, BMP, PGM, PPM or TIFF; ``None`` where it does not tell."""
+    try:
+        if data.startswith(b"\x89PNG\r\n\x1a\n"):
+            return struct.unpack_from(">II", data, 16)
+        if data.startswith(b"\xff\xd8"):
+            return _jpeg_size(data)
+        if data.startswith(b"BM"):
+            width, height = struct.unpack_from("<ii", data, 18)
+            return abs(width), abs(height)
+        if pnm := re.match(rb"P[1-6](?:\s|#[^\n]*\n)+(\d{1,9})(?:\s|#[^\n]*\n)+(\d{1,9})\s", data[:4096]):
+            return int(pnm[1]), int(pnm[2])
+        if data[:4] in (b"II*\0", b"MM\0*"):
+            return _tiff_size(data)
+    except (struct.error, IndexError):
+        pass
+    return None
+
+
+def _jpeg_size(data: bytes) -> tuple[int, int] | None:
+    at = 2
+    while data[at : at + 1] == b"\xff":
+        marker = data[at + 1]
+        if marker == 0xFF:
+            at += 1
+        elif 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # a start of frame
+            height, width = struct.unpack_from(">HH", data, at + 5)
+            return width, height
+        else:
+            at += 2 + struct.unpack_from(">H", data, at + 2)[0]
+    return None
+
+
+def _tiff_size(data: bytes) -> tuple[int, int] | None:
+    """By the first directory (TIFF 6.0): tags 256 and 257, SHORT or LONG."""
+    order = "<" if data.startswith(b"II") else ">"
+    start = struct.unpack_from(f"{order}I", data, 4)[0]
+    found = {}
+    for i in range(struct.unpack_from(f"{order}H", data, start)[0]):
+        tag, kind = struct.unpack_from(f"{order}HH", data, start + 2 + 12 * i)
+        if tag in (256, 257):
+            found[tag] = struct.unpack_from(order + ("H" if kind == 3 else "I"), data, start + 10 + 12 * i)[0]
+    return (found[256], found[257]) if len(found) == 2 else None
 
 
 def grey_8bit(image: NDArray[np.uint8] | NDArray[np.uint16]) -> NDArray[np.uint8]:

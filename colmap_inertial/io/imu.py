@@ -133,6 +133,7 @@ def read_raw_capture_imu(capture: Capture) -> RawImu:
         gyro_rad_s=imu.gyro_rad_s if source.gyro_axes is None else source.gyro_axes.apply(imu.gyro_rad_s),
         accel_m_s2=imu.accel_m_s2 if source.accel_axes is None else source.accel_axes.apply(imu.accel_m_s2),
         noise=imu.noise if source.noise is None else source.noise,
+        device=capture.device or imu.device,
     )
     return RawImu(imu=imu, path=path, accel_path=accel_path, gyro_axes=source.gyro_axes, accel_axes=source.accel_axes)
 

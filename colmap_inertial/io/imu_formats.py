@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING
 
 from colmap_inertial.errors import FormatError, InertialError
 from colmap_inertial.io import android, camm, dji, gcsv, gopro, imu_text, ios, rosbag, video_imu_capture
+from colmap_inertial.io.files import require_regular
 from colmap_inertial.io.mp4 import is_mp4, read_movie
 from colmap_inertial.io.units import DeclaredUnits
 from colmap_inertial.types import FrameLog, ImuRecording
@@ -92,6 +93,7 @@ def find_imu_format(path: Path, name: str = "auto") -> ImuFormat:
     """
     if not path.exists():
         raise FormatError(path, "no such file or folder")
+    require_regular(path)
     known = imu_formats()
     found = next((one for one in known if (one.accepts(path) if name == "auto" else one.name == name)), None)
     if found is not None:

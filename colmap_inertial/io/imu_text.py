@@ -36,6 +36,8 @@ class SensorTable:
         Columns of the stamps and of x, y, z: names in the header, or numbers counted from 1.
     time_unit, unit
         Of the stamps, and of the samples.
+    zero, counts_per_unit
+        Of raw counts: what the table says for nothing, and how many make one ``unit``.
     """
 
     file: Path
@@ -43,6 +45,8 @@ class SensorTable:
     time_unit: str
     columns: tuple[str | int, str | int, str | int]
     unit: str
+    zero: float = 0.0
+    counts_per_unit: float = 1.0
 
 
 def read_tables(gyro: SensorTable, accel: SensorTable | None) -> ImuRecording:
@@ -168,6 +172,8 @@ def _read_described(source: SensorTable, quantity: Quantity) -> Samples:
         raise ValueError(f"{source.unit} is not a unit of the {SENSOR_NAMES[quantity]}")
     table = read_table(source.file)
     values = table.numbers([column_index(table, column) for column in source.columns])
+    if source.zero != 0 or source.counts_per_unit != 1:
+        values = (values - source.zero) / source.counts_per_unit
     t_ns = table.stamps_ns(column_index(table, source.time), source.time_unit)
     return ordered(table, quantity, source.unit, t_ns, values)
 

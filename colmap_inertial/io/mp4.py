@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.errors import FormatError
+from colmap_inertial.io.files import require_regular
 
 Int = NDArray[np.int64]
 
@@ -130,6 +131,8 @@ class Movie:
 
 def is_mp4(path: Path) -> bool:
     """Whether a file begins like an MP4 or QuickTime file."""
+    if not path.is_file():
+        return False
     try:
         with open(path, "rb") as file:
             return file.read(8)[4:] in _FIRST_BOXES
@@ -156,6 +159,7 @@ def read_movie(path: Path) -> Movie:
         Where the file is missing, cut off before its index, or damaged; the message names the byte.
     """
     try:
+        require_regular(path)
         with open(path, "rb") as file:
             moov, start = _find_index(path, file)
     except OSError as error:

@@ -30,6 +30,8 @@ def is_rosbag(path: Path) -> bool:
     if path.is_dir():
         files = (path / "metadata.yaml").is_file()
         return files and any(file.suffix in (".db3", ".mcap") for file in path.iterdir())
+    if not path.is_file():
+        return False
     try:
         with open(path, "rb") as file:
             head = file.read(16)

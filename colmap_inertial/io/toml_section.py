@@ -92,6 +92,16 @@ class Section:
             self.fail(key, "holds a NUL character")
         return None if value is None else self.path.parent / value
 
+    def files(self, key: str) -> tuple[Path, ...]:
+        """A path, or a list of them, as of :meth:`file`; none where the key is absent."""
+        value = self._take(key)
+        if not isinstance(value, list):
+            path = self.file(key)
+            return () if path is None else (path,)
+        if not value or any(not isinstance(item, str) or not item.strip() or "\0" in item for item in value):
+            self.fail(key, f"must be a path in quotes, or a list of them, found {value!r}"[:300])
+        return tuple(self.path.parent / item for item in value)
+
     def boolean(self, key: str) -> bool | None:
         """``true`` or ``false``."""
         value = self._take(key)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.errors import FormatError, TimingError
+from colmap_inertial.io.files import require_regular
 from colmap_inertial.io.mp4 import is_mp4, read_movie
 
 if TYPE_CHECKING:
@@ -199,6 +200,8 @@ def _open(path: Path) -> tuple[InputContainer, VideoStream]:
     import av
 
     if not path.is_file():
+        if path.exists():
+            require_regular(path)
         raise FormatError(path, "no such video")
     try:
         container = av.open(str(path))

@@ -12,6 +12,7 @@ from colmap_inertial.errors import FormatError, NotObservableError
 from colmap_inertial.flow import VisualRotation
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.imu import RawImu
+from colmap_inertial.io.pose_convention import COLMAP
 from colmap_inertial.precalibrate.calibrate import followed, guessed_camera, near_the_beginning
 from colmap_inertial.run.context import Recording
 from colmap_inertial.run.progress import Progress
@@ -26,7 +27,7 @@ _VIDEO_STEP_S = 0.13
 _FEW, _FEW_SPACING_S = 90, 0.09
 
 #: What makes a reconstruction in metres meaningless.
-STOPPING = frozenset({"stabilised", "gravity-removed", "imu-does-not-fit", "gyro-mirrored"})
+STOPPING = frozenset({"stabilised", "gravity-removed", "pose-convention", "imu-does-not-fit", "gyro-mirrored"})
 
 
 def checked_imu(raw: RawImu, *, force: bool) -> RawImu:
@@ -78,6 +79,7 @@ def preflight(
             camera=capture.camera,
             calibration=recording.prior,
             trajectory=None if isinstance(model, str) else model,
+            read_as=COLMAP,
             max_offset_s=recording.max_offset_s,
         )
     )

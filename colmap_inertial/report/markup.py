@@ -10,6 +10,10 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from colmap_inertial.io.files import read_bytes
+from colmap_inertial.io.images import require_modest
 from colmap_inertial.io.names import path_in
 from colmap_inertial.report.words import digits
 from colmap_inertial.scale.verdict import TRUSTED_HALF_WIDTH, WEAK_HALF_WIDTH
@@ -117,13 +121,15 @@ def images(out: Path, paths: Sequence[str], *, classes: str = "pictures", captio
 def _embedded(path: Path) -> str | None:
     import cv2
 
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR) if path.is_file() else None
+    if not path.is_file():
+        return None
+    data = read_bytes(path)
+    require_modest(path, data)
+    image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR) if data else None
     if image is None:
         return None
     height, width = image.shape[:2]
     if width > _WIDTH_PX:
         image = cv2.resize(image, (_WIDTH_PX, round(height * _WIDTH_PX / width)), interpolation=cv2.INTER_AREA)
         data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
-    else:
-        data = path.read_bytes()
     return f"data:image/jpeg;base64,{base64.b64encode(data).decode('ascii')}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import gzip
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cache
 from html import escape
 from pathlib import Path
@@ -33,13 +33,30 @@ def page_of(content: dict[str, Any], out: Path) -> str:
     out
         Folder that its images' paths start from.
     """
-    sections = list(sections_of(content, out))
+    versions = ", ".join(f"{name} {number}" for name, number in content["versions"].items())
+    return document(
+        list(sections_of(content, out)),
+        title=content["title"],
+        verdict=content["outcome"]["verdict"],
+        source=content["capture"],
+        footer=f"{versions}. The same content for programs: report.json.",
+    )
+
+
+def document(sections: Sequence[Section], *, title: str, verdict: str, source: str, footer: str) -> str:
+    """A whole page of sections; the texts are plain, and escaped here.
+
+    Parameters
+    ----------
+    sections
+        In order; the first one is the outcome, with a place for links.
+    title, verdict, source, footer
+        What it is about, what was found (``"trusted"``, ``"weak"``, ``"refused"`` colour the page), where it came from.
+    """
     figures: dict[str, Figure] = {}
     body = "".join(_section(section, figures) for section in sections)
-    title = escape(content["title"])
-    verdict = escape(content["outcome"]["verdict"])
+    title, verdict = escape(title), escape(verdict)
     links = "".join(f'<a href="#{s.anchor}">{escape(s.short)}</a>' for s in sections[1:] if s.short)
-    versions = ", ".join(f"{name} {number}" for name, number in content["versions"].items())
     parts = [
         "<!DOCTYPE html>",
         f'<html lang="en" class="{verdict}"><head><meta charset="utf-8">',
@@ -47,10 +64,10 @@ def page_of(content: dict[str, Any], out: Path) -> str:
         '<meta name="viewport" content="width=device-width, initial-scale=1">',
         '<link rel="icon" href="data:,">',
         f"<title>{title}: {verdict}</title><style>{_asset('page.css')}</style></head><body>",
-        f'<header><h1>{title}</h1><p class="soft small">{escape(content["capture"])}</p></header>',
+        f'<header><h1>{title}</h1><p class="soft small">{escape(source)}</p></header>',
         f'<main><p id="notice" hidden></p><noscript><p>{_NO_SCRIPT}</p></noscript>',
         body.replace("<!--links-->", f"<nav>{links}</nav>" if links else "", 1),
-        f"</main><footer>{escape(versions)}. The same content for programs: report.json.</footer>",
+        f"</main><footer>{escape(footer)}</footer>",
     ]
     if figures:
         packed = json.dumps(figures, separators=(",", ":"), allow_nan=False)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from colmap_inertial.errors import FormatError
-from colmap_inertial.io.files import StrPath
+from colmap_inertial.io.files import StrPath, require_regular
 
 Options = TypeVar("Options")
 
@@ -33,8 +33,12 @@ def _plain(options: Any) -> dict[str, Any]:
         elif isinstance(value, Path):
             plain[f.name] = str(value.resolve())
         elif value is not None:
-            plain[f.name] = list(value) if isinstance(value, tuple) else value
+            plain[f.name] = [_plain_item(item) for item in value] if isinstance(value, tuple) else value
     return plain
+
+
+def _plain_item(item: object) -> object:
+    return str(item.resolve()) if isinstance(item, Path) else item
 
 
 def read_config(path: StrPath, cls: type[Options]) -> Options:
@@ -52,6 +56,7 @@ def read_config(path: StrPath, cls: type[Options]) -> Options:
 def read_values(path: Path) -> dict[str, Any]:
     """What a TOML file says, unchecked; a :class:`FormatError` for a file that is none."""
     try:
+        require_regular(path)
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise FormatError(path, f"cannot be read: {error.strerror}") from error
@@ -84,8 +89,14 @@ def _with_absolute_paths(stated: Any, values: Mapping[str, Any], folder: Path) -
         if dataclasses.is_dataclass(built):
             absolute[key] = _with_absolute_paths(built, value, folder)
         else:
-            absolute[key] = str((folder / built).resolve()) if isinstance(built, Path) else value
+            absolute[key] = _absolute(built, value, folder)
     return absolute
+
+
+def _absolute(built: object, value: object, folder: Path) -> object:
+    if isinstance(built, tuple):
+        return [_absolute(item, item, folder) for item in built]
+    return str((folder / built).resolve()) if isinstance(built, Path) else value
 
 
 def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
@@ -129,8 +140,10 @@ def _checked(path: Path, name: str, value: Any, hint: Any) -> Any:
                 raise FormatError(path, f"{name}: holds a NUL character")
             return Path(value)
         elif typing.get_origin(kind) is tuple:
-            if isinstance(value, list) and all(isinstance(item, str) for item in value):
-                return tuple(value)
+            of_paths = typing.get_args(kind)[0] is Path
+            items = [value] if of_paths and isinstance(value, str) else value
+            if isinstance(items, list) and all(isinstance(item, str) for item in items):
+                return tuple(_checked(path, name, item, Path) for item in items) if of_paths else tuple(items)
         elif kind is float and isinstance(value, (int, float)) and not isinstance(value, bool):
             return float(value)
         elif isinstance(kind, type) and type(value) is kind:

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from colmap_inertial.io.calibration import for_another_recording, largest_offset_s, read_calibration
+from colmap_inertial.io.calibration import largest_offset_s
 from colmap_inertial.io.capture import Capture, Video
 from colmap_inertial.io.frames import frame_source
+from colmap_inertial.io.imu_calibration import CalibrationFiles, read_calibrations, read_for_another
 from colmap_inertial.io.names import path_in
 from colmap_inertial.run.progress import Progress, silent
 from colmap_inertial.run.runner import fingerprint
@@ -84,11 +85,17 @@ class Recording:
         return [fingerprint(path) for path in paths]
 
 
-def prior_calibration(capture: Capture, given: Path | None) -> CameraImuCalibration:
+def prior_calibration(capture: Capture, given: CalibrationFiles) -> CameraImuCalibration:
     """What is known of camera and IMU beforehand: from a calibration file where one is given, else from the capture."""
-    if given is None:
-        return capture.calibration
-    return for_another_recording(read_calibration(given), shared_clock=capture.shared_clock)
+    files = read_for_another(given, shared_clock=capture.shared_clock)
+    calibration, of_imu = files.camera_imu or capture.calibration, files.imu or capture.imu_calibration
+    return calibration if of_imu is None else of_imu.loosened(calibration)
+
+
+def corrected_imu(capture: Capture, imu: ImuRecording, given: CalibrationFiles) -> ImuRecording:
+    """The recording as its IMU's own calibration corrects it, from a file or from the capture; else as it is."""
+    calibration = read_calibrations(given).imu or capture.imu_calibration
+    return imu if calibration is None else calibration.corrected(imu)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from colmap_inertial import __version__
 from colmap_inertial.errors import InertialError
-from colmap_inertial.io.files import as_plain, read_json, write_json, write_text
+from colmap_inertial.io.files import as_plain, read_json, remove_temporaries, write_json, write_text
 from colmap_inertial.run.config import config_as_toml
 from colmap_inertial.run.context import RunContext
 from colmap_inertial.run.progress import Progress
 from colmap_inertial.run.runner import StepRunner
-from colmap_inertial.run.workspace import Workspace
+from colmap_inertial.run.workspace import Workspace, require_apart
 
 log = logging.getLogger(__name__)
 
@@ -65,6 +65,7 @@ def open_session(
     source: Path,
     options: object,
     *,
+    pictures: Sequence[Path],
     command: str = "reconstruct",
     deterministic: bool = False,
     seed: int = 0,
@@ -80,6 +81,8 @@ def open_session(
         The capture or project.
     options
         All that decides the result; a dataclass.
+    pictures
+        Folders that pictures are read from; ``out`` may not lie in one.
     command
         What is done; one folder is for one command.
     deterministic
@@ -92,11 +95,16 @@ def open_session(
     OutputExistsError
         When ``out`` holds something else, or another run is at work in it.
     OutputError
-        Where it cannot be written, as on a full disk.
+        Where it cannot be written, as on a full disk, or lies among the pictures.
     """
+    require_apart(out, pictures)
     workspace = Workspace(out)
-    workspace.open(source, command)
-    with workspace.locked(), logging_to(workspace.log):
+    workspace.prepare(source, command)
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(workspace.locked())
+        workspace.open(source, command)
+        remove_temporaries(workspace.root, workspace.stamps, workspace.report_data)
+        stack.enter_context(logging_to(workspace.log))
         log.info("colmap-inertial %s: %s -> %s", __version__, source, out)
         config = config_as_toml(options)
         if not workspace.config.is_file() or workspace.config.read_text(encoding="utf-8") != config:

@@ -6,7 +6,7 @@ import contextlib
 import errno
 import logging
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -147,6 +147,11 @@ class Workspace:
         """The smoothed metric trajectory of a model; the first one has the plain name."""
         return self.root / ("trajectory.tum" if first else f"trajectory_{index}.tum")
 
+    @property
+    def owner(self) -> Path:
+        """Which command on which capture or project the folder is for."""
+        return self.stamps / "capture.json"
+
     def open(self, source: Path, command: str = "reconstruct") -> None:
         """Create the folder, or take up a run of the same command on the same capture or project, finished or not.
 
@@ -155,12 +160,28 @@ class Workspace:
         OutputExistsError
             When the folder holds another run, or something that is not ours.
         """
-        owner = self.stamps / "capture.json"
+        identity = self.prepare(source, command)
+        if not self.owner.is_file():
+            write_json(self.owner, identity)
+
+    def prepare(self, source: Path, command: str) -> dict[str, str]:
+        """Make room for the lock, in a folder that is new or ours; nothing else is written before it is held.
+
+        Returns
+        -------
+        dict
+            What the owner's record holds, or is to hold.
+
+        Raises
+        ------
+        OutputExistsError
+            As :meth:`open`.
+        """
         if self.root.exists() and not self.root.is_dir():
             raise OutputExistsError(f"{self.root} is a file; choose another output folder")
         identity = {"capture": str(source.resolve()), "command": command}
-        if owner.is_file():
-            known = {"command": command, **read_json(owner)}
+        if self.owner.is_file():
+            known = {"command": command, **read_json(self.owner)}
             for what in ("capture", "command"):
                 if known.get(what) != identity[what]:
                     raise OutputExistsError(
@@ -173,8 +194,7 @@ class Workspace:
             self.stamps.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise OutputError(f"{self.root} cannot be made: {error.strerror or error}") from error
-        if not owner.is_file():
-            write_json(owner, identity)
+        return identity
 
     def unfinish(self) -> None:
         """Something is made again: what the result says no longer stands."""
@@ -217,6 +237,18 @@ def a_record_of_ours(path: Path) -> Iterator[None]:
         yield
     except (LookupError, TypeError, ValueError, AttributeError) as error:
         raise FormatError(path, f"was damaged since it was written ({error}); remove it and start again") from None
+
+
+def require_apart(out: Path, pictures: Sequence[Path]) -> None:
+    """Raise :class:`OutputError` where an output would lie among the pictures that it is made from.
+
+    They would be taken for pictures of the capture when the command is given again.
+    """
+    for folder in pictures:
+        if out.resolve().is_relative_to(folder.resolve()):
+            raise OutputError(
+                f"{out} lies in {folder}, the folder of the capture's pictures; choose a folder outside of it"
+            )
 
 
 def require_room(folder: Path, num_bytes: int) -> None:

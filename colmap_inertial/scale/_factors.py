@@ -21,6 +21,9 @@ from colmap_inertial.types import Array
 
 #: Cauchy scale of the visual residuals, in standard deviations: a normal error loses 4 % of its weight on average.
 ROBUST_SIGMAS = 4.0
+#: Errors of visual centres are alike over about this long. Between .35 s, 1 s and a random walk the scale of a minute
+#: hardly changes; a drift that never comes back takes more of the motion in short clips.
+CORRELATION_S = 0.35
 #: How far a model's parts may be shifted against each other where it breaks.
 _BREAK_M = 10.0
 
@@ -39,6 +42,9 @@ class Group:
         (N, r, g) derivatives by the globals ``columns``.
     weight
         (N,) robust weights, already contained in the rest.
+    share
+        (N, r, r) part of the residuals' covariance (of their whitened one) that grows with the noise level which is
+        estimated from them; all of it where this is None.
     """
 
     residual: Array
@@ -48,6 +54,7 @@ class Group:
     columns: slice = field(default_factory=lambda: slice(0, 0))
     weight: Array | None = None
     first: int = 0
+    share: Array | None = None
 
     def apply(self, states: Array, z: Array) -> Array:
         """(N, r, q) changes of the residuals under q steps: states (K, m, q), globals (n, q)."""
@@ -88,6 +95,10 @@ class Direct:
         (N,) one over their standard deviation.
     step
         Whether it is the change to the next state.
+    keep
+        (N,) what of a state's numbers is expected in the next one; all of it where this is None.
+    share
+        As :class:`Group` has it.
     """
 
     residual: Array
@@ -96,11 +107,18 @@ class Direct:
     step: bool = False
     first: int = 0
     weight: Array | None = None
+    keep: Array | None = None
+    share: Array | None = None
 
     def apply(self, states: Array, z: Array) -> Array:
         """As :meth:`Group.apply`."""
         values = states[self.first : self.first + len(self.info) + self.step, self.columns]
-        return np.asarray(self.info[:, None, None] * (np.diff(values, axis=0) if self.step else values))
+        if self.step:
+            values = values[1:] - self._kept(values[:-1])
+        return np.asarray(self.info[:, None, None] * values)
+
+    def _kept(self, values: Array) -> Array:
+        return values if self.keep is None else np.asarray(self.keep[:, None, None] * values)
 
     def pull_back(self, values: Array, states: Array, z: Array) -> None:
         """As :meth:`Group.pull_back`."""
@@ -108,17 +126,18 @@ class Direct:
         pulled = self.info[:, None, None] * values
         if self.step:
             states[self.first + 1 : self.first + 1 + n, self.columns] += pulled
-            pulled = -pulled
+            pulled = -self._kept(pulled)
         states[self.first : self.first + n, self.columns] += pulled
 
     def add_to(self, system: ArrowSystem) -> None:
         """As :meth:`Group.add_to`."""
         n, squared = len(self.info), self.info**2
+        keep = np.ones(n) if self.keep is None else self.keep
         for i in range(self.columns.start, self.columns.stop):
-            system.diagonal[self.first : self.first + n, i, i] += squared
+            system.diagonal[self.first : self.first + n, i, i] += squared * keep**2
             if self.step:
                 system.diagonal[self.first + 1 : self.first + 1 + n, i, i] += squared
-                system.below[self.first : self.first + n, i, i] -= squared
+                system.below[self.first : self.first + n, i, i] -= squared * keep
 
 
 def _mv(matrices: Array, vectors: Array) -> Array:
@@ -216,6 +235,7 @@ def imu_group(noise: Noise, x: Estimate, pre: Preintegrated, *, rotation_only: b
         after=root @ after[:, rows],
         by_globals=root @ z[:, rows],
         columns=par.IMU_GLOBALS,
+        share=noise.accel_m_s2_rthz**2 * root @ pre.cov_accel[:, rows, rows] @ root.transpose(0, 2, 1),
     )
 
 
@@ -319,14 +339,26 @@ def visual_groups(data: Data, noise: Noise, x: Estimate, rate_rad_s: Array, *, r
     return groups[0], groups[1]
 
 
-def walk_group(
-    values: Array, columns: slice, sigma: float, dt_s: Array, broken: NDArray[np.bool_] | None = None
-) -> Direct:
-    """A random walk that grows by ``sigma`` in a second, and anyhow where it is ``broken``."""
+def walk_group(values: Array, columns: slice, sigma: float, dt_s: Array) -> Direct:
+    """A random walk that grows by ``sigma`` in a second."""
     info = 1 / (sigma * np.sqrt(dt_s))
-    if broken is not None:
-        info = np.where(broken, 1 / _BREAK_M, info)
     return Direct(residual=np.diff(values, axis=0) * info[:, None], columns=columns, info=info, step=True)
+
+
+def drift_group(values: Array, sigma: float, dt_s: Array, broken: NDArray[np.bool_]) -> Direct:
+    """The error that the visual centres drift by: alike over ``CORRELATION_S``, anything where it is ``broken``.
+
+    A Gauss-Markov process of the first order; over times that are short against its correlation it is a random walk
+    that grows by ``sigma`` in a second. Where a path breaks it is that throughout: what was shifted stays shifted.
+    """
+    if broken.any():
+        keep, info = np.ones(len(dt_s)), np.where(broken, 1 / _BREAK_M, 1 / (sigma * np.sqrt(dt_s)))
+    else:
+        keep = np.exp(-dt_s / CORRELATION_S)
+        info = 1 / (sigma * np.sqrt(0.5 * CORRELATION_S * (1 - keep**2)))
+    residual = (values[1:] - keep[:, None] * values[:-1]) * info[:, None]
+    share = np.where(broken, 0.0, 1.0)[:, None, None] * np.eye(3)
+    return Direct(residual=residual, columns=par.DRIFT, info=info, step=True, keep=keep, share=share)
 
 
 def state_group(values: Array, columns: slice, sigma: float, first: int = 0) -> Direct:
@@ -347,13 +379,13 @@ def all_groups(
         "centre": centre,
         "gyro_walk": walk_group(x.gyro_bias_rad_s, par.GYRO_BIAS, noise.gyro_walk_rad_s_rts, pre.dt_s),
         "accel_walk": walk_group(x.accel_walk_m_s2, par.ACCEL_WALK, noise.accel_walk_m_s2_rts, pre.dt_s),
-        "drift": walk_group(x.drift_m, par.DRIFT, noise.drift_m_rts, pre.dt_s, data.broken),
+        "drift": drift_group(x.drift_m, noise.drift_m_rts, pre.dt_s, data.broken),
         # Anchors of what only differences determine
         "gyro_bias": state_group(
             x.gyro_bias_rad_s[:1] - prior.mean.gyro_bias_rad_s[:1], par.GYRO_BIAS, prior.gyro_bias_sigma_rad_s
         ),
         "accel_zero": state_group(x.accel_walk_m_s2[middle : middle + 1], par.ACCEL_WALK, 1e-4, middle),
-        "drift_zero": state_group(x.drift_m[:1], par.DRIFT, 1e-4),
+        "drift_zero": state_group(x.drift_m[:1], par.DRIFT, noise.drift_m_rts * (0.5 * CORRELATION_S) ** 0.5),
         "speed": state_group(x.velocity_m_s, par.VELOCITY, prior.speed_sigma_m_s),
     }
 

@@ -8,14 +8,15 @@ import numpy as np
 
 from colmap_inertial.scale import _factors as fac, _noise as levels, _parameters as par
 from colmap_inertial.scale._drift import scale_drift
+from colmap_inertial.scale._noise import Expected, LevelSearch
 from colmap_inertial.scale._parameters import Data, Estimate, Noise, Prior
 from colmap_inertial.scale.priors import PRIORS
 from colmap_inertial.types import Array, ImuNoise, ScaleDrift
 
 _MAX_ITERATIONS, _MAX_ROTATION_ITERATIONS = 40, 4
 _PROBES = 4
-#: Noise levels (logarithms) at rest.
-_SETTLED = 0.03
+#: At rest: what the scale would still move by, in its standard deviations, and its variance would still change by.
+_SETTLED, _FEWEST_ITERATIONS = 0.1, 4
 #: A robust weight below this: five times as far off as errors usually are.
 _HARDLY = 0.35
 #: The scale changes by at most this factor (in the logarithm) in one iteration.
@@ -36,6 +37,11 @@ class Fit:
         (3, 3) covariance of the mean gyroscope bias and (79, 3) covariance with the globals.
     sums
         Sum of squares and expectation for each noise level.
+    level_variance, freedom
+        Variance of the logarithm of the scale that comes from the noise levels' own uncertainty, and degrees of freedom
+        that its variance rests on.
+    expected_accel_m_s2_rthz
+        The accelerometer's noise as its own stream and its data sheet have it.
     converged
         Whether the scale came to rest.
     drift
@@ -54,6 +60,9 @@ class Fit:
     gyro_bias_cov: Array
     gyro_bias_with_globals: Array
     sums: dict[str, tuple[float, float]]
+    level_variance: float
+    freedom: float
+    expected_accel_m_s2_rthz: float
     converged: bool
     drift: ScaleDrift
     excitation_m_s2: float
@@ -69,46 +78,49 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
     numpy.linalg.LinAlgError
         When the data leave the system singular.
     """
-    start, floor = levels.typical_noise(sheet)
-    noise = start
-    x = _rotations_first(data, noise, prior)
+    search = LevelSearch(expected=Expected.of(data, sheet), probes=_PROBES)
+    x = _rotations_first(data, search.noise, prior)
     scale = _moment_scale(data, x)
     x = replace(x, metres_per_unit=scale, imu_in_world_m=data.groups.centre * scale)
     signs: dict[str, Array] = {}
     converged = settled = False
-    asked: dict[str, float] = {}
+    variance = np.inf
     integrated, there = fac.integrate(data, x), x
     for iteration in range(_MAX_ITERATIONS):
         if settled or not fac.still_near(there, x, data.t_s, tolerance=4.0):
             integrated, there = fac.integrate(data, x), x
         pre = fac.corrected(integrated, there, x)
-        groups = fac.all_groups(data, noise, prior, x, pre, robust=iteration > 2)
+        prior = prior.seen_from(x.imu_in_cam_m)
+        groups = fac.all_groups(data, search.noise, prior, x, pre, robust=iteration > 2)
         signs = signs or levels.random_signs(groups, _PROBES)
         system, rhs, rhs_z = fac.normal_equations(list(groups.values()), prior, x)
-        rhs = np.concatenate([rhs, np.zeros((*rhs.shape[:2], _PROBES))], axis=2)
-        rhs_z = np.concatenate([rhs_z, np.zeros((len(rhs_z), _PROBES))], axis=1)
-        for name, group in groups.items():
-            group.pull_back(signs[name], rhs[:, :, 1:], rhs_z[:, 1:])
+        rhs = np.concatenate([rhs, np.zeros((*rhs.shape[:2], search.columns))], axis=2)
+        rhs_z = np.concatenate([rhs_z, np.zeros((len(rhs_z), search.columns))], axis=1)
+        search.add_columns(groups, signs, rhs[:, :, 1:], rhs_z[:, 1:])
         states, z, cov = system.solve(rhs, rhs_z)
-        sums = levels.sums_of_squares(noise, groups, signs, states, z)
         step = abs(float(z[par.SCALE, 0]))
         shrink = min(1.0, _LARGEST_STEP / max(step, 1e-12))
         x = x.moved(states[:, :, 0] * shrink, z[:, 0] * shrink, pre.rate_rad_s, data.t_s)
-        sigma = float(np.sqrt(cov[par.SCALE, par.SCALE]))
+        before, variance = variance, float(cov[par.SCALE, par.SCALE])
+        sigma = variance**0.5
         converged = step < 0.2 * sigma
         if iteration > 2:
-            factor = levels.correlation_factor(groups["rotation"], states, z)
-            noise, asked = levels.updated_noise(noise, start, floor, sums, factor, asked)
-        change = max(map(abs, asked.values()), default=1.0)
-        settled = step < 0.03 * sigma and change < _SETTLED
+            search.update(groups, signs, states, z)
+            moves = max(step, search.scale_moves())
+            settled = iteration > _FEWEST_ITERATIONS and moves < _SETTLED * sigma
+            settled = settled and abs(variance / before - 1) < _SETTLED
         if settled and fac.still_near(there, x, data.t_s):
             break
+    noise, sums = search.noise, search.sums
 
-    # Once more at the optimum: the mean gyroscope bias, and scales of the parts
+    # Once more at the optimum: the mean gyroscope bias, the scale's variance, and scales of the parts
     k = len(data.t_s)
-    mean_bias, mean_bias_z = np.zeros((k, par.N_STATE, 3)), np.zeros((par.N_GLOBALS, 3))
-    mean_bias[:, par.GYRO_BIAS] = np.eye(3) / k
-    states, z, cov = system.solve(mean_bias, mean_bias_z)
+    ends, ends_z = np.zeros((k, par.N_STATE, 4)), np.zeros((par.N_GLOBALS, 4))
+    ends[:, par.GYRO_BIAS, :3] = np.eye(3) / k
+    ends_z[par.SCALE, 3] = 1.0
+    states, z, cov = system.solve(ends, ends_z)
+    level_variance, freedom = search.scale_variance(groups, states[:, :, 3:], z[:, 3:])
+    states, z = states[:, :, :3], z[:, :3]
     inflation = max(1.0, *(squares / expected for squares, expected in sums.values()))
     drift = scale_drift(
         data,
@@ -127,6 +139,9 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
         gyro_bias_cov=np.mean(states[:, par.GYRO_BIAS], axis=0),
         gyro_bias_with_globals=z,
         sums=sums,
+        level_variance=level_variance,
+        freedom=freedom,
+        expected_accel_m_s2_rthz=search.expected.noise.accel_m_s2_rthz,
         converged=converged,
         drift=drift,
         excitation_m_s2=_excitation_m_s2(data, x),

@@ -68,6 +68,8 @@ class Data:
         (K - 1,) where the model's parts may be shifted against each other.
     tracks
         Readings over camera time, by the first guess of the offsets.
+    gyro_roughness_rad_s_rthz, accel_roughness_m_s2_rthz
+        Densities of white noise that would make the streams as rough as they are (``_noise.roughness``).
     """
 
     groups: Groups
@@ -76,6 +78,8 @@ class Data:
     coupling: Array
     broken: NDArray[np.bool_]
     tracks: Tracks
+    gyro_roughness_rad_s_rthz: float
+    accel_roughness_m_s2_rthz: float
 
     @property
     def t_s(self) -> Array:
@@ -162,6 +166,9 @@ class Prior:
         Of the first state's bias.
     speed_sigma_m_s
         Of every velocity: holds a keyframe between two long gaps.
+    flat_m
+        Half the thickness of a device of which nothing is known, None where the lever arm is: along the optical axis
+        the IMU lies as near to the camera in phones, and farther in rigs (Cauchy's distribution).
     """
 
     mean: Estimate
@@ -170,6 +177,15 @@ class Prior:
     gravity_sigma_m_s2: float
     gyro_bias_sigma_rad_s: float = 0.2
     speed_sigma_m_s: float = 10.0
+    flat_m: float | None = None
+
+    def seen_from(self, imu_in_cam_m: Array) -> Prior:
+        """The prior with the normal distribution in place of Cauchy's that pulls as much at a lever arm."""
+        if self.flat_m is None:
+            return self
+        info = self.info.copy()
+        info[LEVER.stop - 1, LEVER.stop - 1] = 2 / (self.flat_m**2 + float(imu_in_cam_m[2]) ** 2)
+        return replace(self, info=info)
 
     def offset(self, x: Estimate) -> Array:
         """(79,) globals minus their expected values."""

@@ -6,12 +6,23 @@ import numpy as np
 
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.geometry import matrix_from_quat
+from colmap_inertial.io.calibration import UNKNOWN_LEVER_ARM_M
 from colmap_inertial.scale import _parameters as par
 from colmap_inertial.scale._grouping import find_breaks, group_frames
+from colmap_inertial.scale._noise import roughness
 from colmap_inertial.scale._parameters import Data, Estimate, Prior
 from colmap_inertial.scale._preintegration import Track, Tracks
 from colmap_inertial.scale.priors import PRIORS
-from colmap_inertial.types import CAL, Array, CameraImuCalibration, CameraTrajectory, ImuRecording, clock_shift_s
+from colmap_inertial.types import (
+    CAL,
+    IMU_CAL,
+    Array,
+    CameraImuCalibration,
+    CameraTrajectory,
+    ImuCalibration,
+    ImuRecording,
+    clock_shift_s,
+)
 
 #: Standard deviation of rows' times about the middle row, in readouts (uniform over the picture).
 _ROW_SPREAD = 12**-0.5
@@ -83,6 +94,8 @@ def prepare(
         coupling=coupling,
         broken=find_breaks(groups.t_s, groups.centre),
         tracks=tracks,
+        gyro_roughness_rad_s_rthz=roughness(imu.gyro_t_s, imu.gyro_rad_s),
+        accel_roughness_m_s2_rthz=roughness(imu.accel_t_s, imu.accel_m_s2),
     )
 
     world_from_imu = world_from_cam @ cam_from_imu
@@ -110,15 +123,26 @@ def prepare(
     )
     prior = Prior(
         mean=mean,
-        info=_information(calibration),
+        info=_information(calibration, imu.calibration),
         gravity_m_s2=gravity_m_s2,
         gravity_sigma_m_s2=gravity_sigma_m_s2,
+        flat_m=UNKNOWN_LEVER_ARM_M[2] if _unknown_depth(calibration) else None,
     )
     return data, prior
 
 
-def _information(calibration: CameraImuCalibration) -> Array:
-    """(79, 79) prior information of the globals; none for scale and gravity."""
+def _unknown_depth(calibration: CameraImuCalibration) -> bool:
+    """Whether nothing was said of how far the IMU lies behind the camera."""
+    depth = CAL.LEVER_ARM.stop - 1
+    return bool(np.isclose(calibration.cov[depth, depth], UNKNOWN_LEVER_ARM_M[2] ** 2))
+
+
+def _information(calibration: CameraImuCalibration, of_imu: ImuCalibration | None) -> Array:
+    """(79, 79) prior information of the globals; none for scale and gravity.
+
+    The readings of a calibrated IMU are corrected already: the mean of its gains stays 0, and what is left of them is
+    as uncertain as the calibration says, and as they change with age and temperature.
+    """
     cov = calibration.cov
     variance = np.diagonal(cov)
     gyro, accel = CAL.GYRO_TIME_OFFSET, CAL.ACCEL_TIME_OFFSET
@@ -136,7 +160,13 @@ def _information(calibration: CameraImuCalibration) -> Array:
     shutter = row_spread_s * np.array([1.0, 1 / _NEAR_M, _FAR_M, 1.0])
     sigma[par.SHUTTER] = np.maximum(np.repeat(shutter, 9), 1e-9)
     sigma[par.COUPLING] = PRIORS.coupling_m
-    return np.diag(sigma**-2)
+    info = np.diag(sigma**-2)
+    if of_imu is not None:
+        here = np.r_[par.ACCEL_GAIN, par.GYRO_GAIN]
+        there = np.r_[IMU_CAL.ACCEL_GAIN, IMU_CAL.GYRO_GAIN]
+        gains = of_imu.cov[np.ix_(there, there)] + PRIORS.calibrated_gain**2 * np.eye(len(there))
+        info[np.ix_(here, here)] = np.linalg.inv(gains)
+    return info
 
 
 def _pose_shapes(pose_cov: Array | None, world_from_cam: Array) -> tuple[Array, Array, Array]:

@@ -8,7 +8,7 @@ sensors and the rate between the clocks, what a rolling shutter does to rotation
 centres go with errors of the rotations.
 The IMU enters through preintegration (Forster et al., "On-manifold preintegration", 2017). The noise sits on the visual
 centres, not on the inertial path that explains them: regression the other way round attenuates the scale. Noise levels
-of the accelerometer and of the poses are estimated along (Forstner's variance components).
+of the accelerometer and of the poses are estimated along (REML).
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from colmap_inertial.geometry import quat_from_matrix
 from colmap_inertial.scale import _parameters as par
 from colmap_inertial.scale._fit import Fit, fit_jointly
 from colmap_inertial.scale._setup import prepare
-from colmap_inertial.scale.priors import PRIORS
-from colmap_inertial.scale.verdict import scale_drifts, verdict_of
+from colmap_inertial.scale.priors import PRIORS, is_calibrated, model_scale_sigma
+from colmap_inertial.scale.verdict import scale_drifts, student_factor, verdict_of
 from colmap_inertial.types import CAL, Array, CameraImuCalibration, CameraTrajectory, ImuRecording, ScaleEstimate
 
 _LARGEST_BIAS_M_S2 = 2.0
@@ -33,6 +33,14 @@ _LARGEST_GAIN_CHI2 = 28.0
 #: The accelerometer's noise between states over the motion's acceleration: 0.02 to 0.1 in good recordings, 0.4 and more
 #: where an axis is mirrored.
 _LARGEST_UNEXPLAINED = 0.25
+#: Shorter clips say too little about their own noise for a number to be trusted.
+_SHORTEST_TRUSTED_S = 6.0
+#: Real visual errors are not those of the model (alike over .1 to 1 s and longer), which counts the more the shorter a
+#: clip is: standard deviations grow by this over its length. Measured on handheld and flown recordings with motion
+#: capture, cut to 3 to 20 s.
+_UNMODELLED_S = 1.5
+#: Standard deviation of what lies anywhere between none and all.
+_UNIFORM = 12**-0.5
 _RECORD_INSTEAD = (
     "move the camera itself back and forth by 20 cm or more, in several directions and briskly, for 10 s or longer, "
     "while it sees texture; panning, walking straight at one speed and a tripod cannot give a scale"
@@ -80,8 +88,9 @@ def estimate_joint(
     Returns
     -------
     ``method="joint"``. ``sigma_log`` combines the posterior standard deviation, inflated by chi-square where the fit is
-    worse than its noise, with ``PRIORS.model_scale`` and half of what noise in the fitted path may take from the
-    scale. ``verdict`` is ``"refused"`` where the data cannot give a scale, with the reason.
+    worse than its noise and widened as Student's distribution is where few residuals tell the noise, with
+    ``PRIORS.model_scale`` and what noise in the fitted path may take from the scale. ``verdict`` is ``"refused"``
+    where the data cannot give a scale, with the reason.
     """
     options = options or JointOptions()
     try:
@@ -98,24 +107,18 @@ def estimate_joint(
         return ScaleEstimate.refused("joint", error.hint)
     except np.linalg.LinAlgError:
         return ScaleEstimate.refused("joint", f"camera and IMU do not determine a scale together: {_RECORD_INSTEAD}")
-    return _judged(fit, data.t_s, calibration)
+    return _judged(fit, data.t_s, calibration, model_scale_sigma(is_calibrated(imu)))
 
 
-def _judged(fit: Fit, t_s: Array, calibration: CameraImuCalibration) -> ScaleEstimate:
+def _judged(fit: Fit, t_s: Array, calibration: CameraImuCalibration, floor: float) -> ScaleEstimate:
     x = fit.estimate
     squares = sum(s for s, _ in fit.sums.values())
     expected = sum(e for _, e in fit.sums.values())
-    worst = max(s / e for s, e in fit.sums.values())
-    variance = float(fit.cov[par.SCALE, par.SCALE]) * max(1.0, worst)
-    # The scale makes residuals orthogonal to the fitted path. That path follows the visual noise with as many degrees
-    # of freedom as the states take from the centres, which lowers the scale by this share where all noise is as
-    # modelled, and by none of it where it is not (as in real recordings): half of it counts as unknown
-    taken = 3 * len(t_s) - fit.sums["centre_m"][1] - fit.sums["drift_m_rts"][1]
-    share = 0.5 * variance * max(0.0, taken)
-    sigma_log = float(np.sqrt(variance + share**2 + PRIORS.model_scale**2))
-    verdict, ci95, reasons = verdict_of(x.metres_per_unit, sigma_log, refusals=_refusals(fit, t_s))
+    found = _scale_of(fit, t_s, floor)
+    metres_per_unit, sigma_log = found.metres_per_unit, found.sigma_log
+    verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, refusals=_refusals(fit, t_s))
     if verdict != "refused":
-        verdict, ci95, reasons = verdict_of(x.metres_per_unit, sigma_log, _checks(fit))
+        verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, _checks(fit, t_s))
     if fit.jumped:
         places = "one place" if fit.jumped == 1 else f"{fit.jumped} places"
         reasons = (*reasons, f"poses jump at {places}, which hardly counts")
@@ -125,7 +128,7 @@ def _judged(fit: Fit, t_s: Array, calibration: CameraImuCalibration) -> ScaleEst
     cov = fit.cov[np.ix_(keep, keep)] * signs[:, None] * signs
     cov[0, 0] = sigma_log**2
     return ScaleEstimate(
-        metres_per_unit=None if refused else x.metres_per_unit,
+        metres_per_unit=None if refused else metres_per_unit,
         sigma_log=None if refused else sigma_log,
         ci95=None if refused else ci95,
         verdict=verdict,
@@ -139,6 +142,37 @@ def _judged(fit: Fit, t_s: Array, calibration: CameraImuCalibration) -> ScaleEst
         dof=max(1, round(expected)),
         excitation_m_s2=fit.excitation_m_s2,
         drift=fit.drift,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Scale:
+    metres_per_unit: float
+    sigma_log: float
+
+
+def _scale_of(fit: Fit, t_s: Array, floor: float) -> _Scale:
+    """The scale and the standard deviation of its logarithm, with what the fit takes for granted put right.
+
+    The scale makes residuals orthogonal to the fitted path. That path follows the visual noise with as many degrees of
+    freedom as the states take from the centres; where the accelerometer is less noisy than the fit says, it follows
+    too willingly, which lowers the scale by ``share * (1 - true variance / fitted variance)``. Part of the fitted noise
+    is no white noise at all, but slow (rotors), and the rest is in the accelerometer's own stream or data sheet.
+    """
+    worst = max(s / e for s, e in fit.sums.values())
+    bare = float(fit.cov[par.SCALE, par.SCALE])
+    sigma = (bare * max(1.0, worst)) ** 0.5
+    taken = 3 * len(t_s) - fit.sums["centre_m"][1] - fit.sums["drift_m_rts"][1]
+    share = bare * max(0.0, taken)
+    overstated = max(0.0, 1 - (fit.expected_accel_m_s2_rthz / fit.noise.accel_m_s2_rthz) ** 2)
+    # To first order only: not by more than what the recording leaves open
+    shift = min(overstated * share, sigma)
+    student = student_factor(fit.freedom)
+    sigma *= student * (1 + _UNMODELLED_S / float(t_s[-1] - t_s[0]))
+    variance = sigma**2 + (student * _UNIFORM * share) ** 2 + fit.level_variance
+    return _Scale(
+        metres_per_unit=fit.estimate.metres_per_unit * float(np.exp(shift)),
+        sigma_log=float(np.sqrt(variance + floor**2)),
     )
 
 
@@ -165,9 +199,15 @@ def _refusals(fit: Fit, t_s: Array) -> list[str]:
     return out
 
 
-def _checks(fit: Fit) -> list[str]:
+def _checks(fit: Fit, t_s: Array) -> list[str]:
     """Findings that make the number doubtful, in the user's words."""
     out = []
+    span_s = float(t_s[-1] - t_s[0])
+    if span_s < _SHORTEST_TRUSTED_S:
+        out.append(
+            f"the clip is short ({span_s:.1f} s): it says little about its own noise; "
+            f"record {_SHORTEST_TRUSTED_S:.0f} s or more"
+        )
     if fit.gain_chi2 > _LARGEST_GAIN_CHI2:
         gains = ", ".join(f"{-100 * g:+.1f}" for g in np.diagonal(fit.estimate.accel_gain))
         out.append(

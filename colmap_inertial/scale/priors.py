@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from colmap_inertial.types import ImuRecording
+
 
 @dataclass(frozen=True, kw_only=True)
 class JointPriors:
@@ -29,6 +31,22 @@ class JointPriors:
     model_scale: float = 0.005
     """Scale of the part of the model that somebody measures against that of the camera's path: errors of the focal
     length and of the lens bend a model by tenths of a percent, and no inertial data show it."""
+    calibrated_gain: float = 0.001
+    """Each gain and axis error of a calibrated sensor, beside its calibration's own covariance: age and temperature."""
+    calibrated_model_scale: float = 0.0015
+    """``model_scale`` where the accelerometer's gain is known: what is left is the lens."""
 
 
 PRIORS = JointPriors()
+#: A gain that is known this well (standard deviation along any direction) counts as calibrated.
+KNOWN_GAIN = 0.0025
+
+
+def model_scale_sigma(calibrated: bool) -> float:
+    """Standard deviation of the model's scale against that of the camera's path, by whether the IMU is calibrated."""
+    return PRIORS.calibrated_model_scale if calibrated else PRIORS.model_scale
+
+
+def is_calibrated(imu: ImuRecording) -> bool:
+    """Whether the accelerometer's gain was corrected by a calibration that knows it well enough."""
+    return imu.calibration is not None and imu.calibration.gain_sigma <= KNOWN_GAIN

@@ -1,8 +1,8 @@
 """A world in which the truth is known.
 
 :func:`simulate_recording` makes poses and IMU samples without rendering, thousands of seconds in a second, for
-Monte-Carlo studies. :func:`write_capture` films a textured world as a :class:`SceneRecipe` says and writes what a user
-would have recorded, with the truth beside it.
+Monte-Carlo studies; :func:`simulate_rests` lays a device still in many attitudes. :func:`write_capture` films a
+textured world as a :class:`SceneRecipe` says and writes what a user would have recorded, with the truth beside it.
 """
 
 from colmap_inertial.simulate.capture import Scene, make_scene, write_capture
@@ -16,6 +16,7 @@ from colmap_inertial.simulate.recording import (
     simulate_recording,
 )
 from colmap_inertial.simulate.render import Renderer, ShutterCamera, develop
+from colmap_inertial.simulate.rests import RestOptions, SimulatedRests, simulate_rests
 from colmap_inertial.simulate.sensors import IMU_PRESETS, ImuErrors, ImuOptions, draw_imu_errors, sample_imu
 from colmap_inertial.simulate.truth import SceneTruth, read_truth, true_metres_per_unit
 from colmap_inertial.simulate.world import Board, Quad, World, make_world
@@ -32,12 +33,14 @@ __all__ = [
     "RecordingOptions",
     "RecordingTruth",
     "Renderer",
+    "RestOptions",
     "Scene",
     "SceneRecipe",
     "SceneTruth",
     "SfmOptions",
     "ShutterCamera",
     "SimulatedRecording",
+    "SimulatedRests",
     "World",
     "develop",
     "draw_imu_errors",
@@ -49,6 +52,7 @@ __all__ = [
     "recipe_text",
     "sample_imu",
     "simulate_recording",
+    "simulate_rests",
     "true_metres_per_unit",
     "write_capture",
 ]

@@ -22,8 +22,9 @@ from colmap_inertial.types.estimated import (
     SmoothedTrajectory,
     Verdict,
 )
+from colmap_inertial.types.imu_calibration import IMU_CAL, IMU_CALIBRATION_PARAMETERS, ImuCalibration
 from colmap_inertial.types.recorded import (
-    JOINT_GYRO_NOISE,
+    JOINT_GYRO_WALK_RAD_S_RTS,
     TYPICAL_NOISE,
     CameraModel,
     CameraTrajectory,
@@ -44,7 +45,9 @@ __all__ = [
     "CAL",
     "CALIBRATION_PARAMETERS",
     "DOWN_IN_WORLD",
-    "JOINT_GYRO_NOISE",
+    "IMU_CAL",
+    "IMU_CALIBRATION_PARAMETERS",
+    "JOINT_GYRO_WALK_RAD_S_RTS",
     "TYPICAL_NOISE",
     "AcceptedScale",
     "Aperture",
@@ -56,6 +59,7 @@ __all__ = [
     "Frame",
     "FrameLog",
     "FrameTiming",
+    "ImuCalibration",
     "ImuNoise",
     "ImuRecording",
     "Keypoints",

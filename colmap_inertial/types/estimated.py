@@ -19,6 +19,7 @@ from colmap_inertial.types._checks import (
     checked_times,
     set_fields,
 )
+from colmap_inertial.types.imu_calibration import ImuCalibration
 from colmap_inertial.types.recorded import LengthUnit
 
 Verdict = Literal["trusted", "weak", "refused"]
@@ -252,6 +253,8 @@ class ScaleEstimate:
         (3,) IMU frame; the true specific force is the reading minus this.
     calibration
         The camera-IMU calibration that the estimate refined.
+    imu_calibration
+        The IMU's own, by which the readings were corrected; ``None`` where they are as the sensor read.
     cov
         (7, 7) of log scale, gravity (m/s2, world frame), accelerometer bias (m/s2).
     chi2, dof
@@ -273,6 +276,7 @@ class ScaleEstimate:
     gravity_in_world_m_s2: Array | None = None
     accel_bias_m_s2: Array | None = None
     calibration: CameraImuCalibration | None = None
+    imu_calibration: ImuCalibration | None = None
     cov: Array | None = None
     chi2: float | None = None
     dof: int | None = None
@@ -336,6 +340,7 @@ class ScaleEstimate:
             "accel_bias_m_s2": plain(self.accel_bias_m_s2),
             # where camera and IMU could not be brought together, these are unknown
             **{name: plain(getattr(self.calibration, name, unknown)) for name, unknown in _CALIBRATED.items()},
+            "imu_calibration": None if self.imu_calibration is None else self.imu_calibration.summary(),
             "cov": plain(self.cov),
             "chi2": self.chi2,
             "dof": self.dof,

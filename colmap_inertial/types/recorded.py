@@ -18,6 +18,7 @@ from colmap_inertial.types._checks import (
     checked_times,
     set_fields,
 )
+from colmap_inertial.types.imu_calibration import ImuCalibration
 
 LengthUnit = Literal["model", "m"]
 ReadoutDirection = Literal["down", "up", "right", "left"]
@@ -51,10 +52,9 @@ class ImuNoise:
 TYPICAL_NOISE = ImuNoise(
     gyro_density_rad_s_rthz=3e-4, accel_density_m_s2_rthz=5e-3, gyro_walk_rad_s2_rthz=3e-4, accel_walk_m_s3_rthz=3e-4
 )
-#: Density and walk of the gyroscope where its gains and axis errors are estimated along, as the joint fit does: three
-#: times the data sheets of consumer MEMS (MPU-6500 1.7e-4, BMI160 1.2e-4, LSM6DS3 1.2e-4), and a walk without what
+#: Walk of the gyroscope's bias where its gains and axis errors are estimated along, as the joint fit does: without what
 #: those errors add to it as the device turns.
-JOINT_GYRO_NOISE = (4.5e-4, 1e-4)
+JOINT_GYRO_WALK_RAD_S_RTS = 1e-4
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -78,6 +78,8 @@ class ImuRecording:
         What recorded it, where known.
     noise
         The data sheet's noise, where the recording comes with one.
+    calibration
+        What the readings were corrected by (``ImuCalibration.corrected``); ``None`` where they are the sensor's own.
     """
 
     gyro_t_s: Array
@@ -88,6 +90,7 @@ class ImuRecording:
     repairs: tuple[str, ...] = ()
     device: str = ""
     noise: ImuNoise | None = None
+    calibration: ImuCalibration | None = None
 
     def __post_init__(self) -> None:
         gyro_t_s, accel_t_s = checked_times("gyro_t_s", self.gyro_t_s), checked_times("accel_t_s", self.accel_t_s)

@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.errors import FormatError
+from colmap_inertial.io.files import read_bytes
+from colmap_inertial.io.images import require_modest
 from colmap_inertial.io.names import path_in
 from colmap_inertial.model import model_format, read_model
 from colmap_inertial.types import Array
@@ -62,7 +64,13 @@ class View:
         """
         import cv2
 
-        image = cv2.imread(str(self.path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+        try:
+            data = read_bytes(self.path, what="picture")
+            require_modest(self.path, data)
+        except FormatError as error:
+            return error.reason
+        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags) if data else None
         if image is None:
             return "the image cannot be read"
         height, width = image.shape

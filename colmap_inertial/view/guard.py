@@ -14,13 +14,13 @@ import http
 import ipaddress
 import logging
 import math
+import re
 import secrets
 import socket
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
-from urllib.parse import urlsplit
 
 from colmap_inertial.errors import OutputError
 
@@ -48,6 +48,8 @@ _HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
 }
+#: An address in brackets or a name, and perhaps a port.
+_HOST = re.compile(r"(?:\[([0-9A-Fa-f:.]+)\]|([0-9A-Za-z._-]+))(?::\d{1,5})?")
 _patching = threading.Lock()
 
 
@@ -66,7 +68,7 @@ class Guard:
     host: str
     token: str = field(default_factory=lambda: secrets.token_urlsafe(24), repr=False)
 
-    def admits(self, path: str, hosts: list[str], origins: list[str], *, socket: bool) -> bool:
+    def admits(self, path: str, hosts: list[str], origins: list[str], *, websocket: bool) -> bool:
         """Whether a request may be answered.
 
         Parameters
@@ -75,16 +77,16 @@ class Guard:
             Of the request.
         hosts, origins
             All its headers ``Host`` and ``Origin``.
-        socket
+        websocket
             It asks for the websocket, for which browsers always state the origin.
         """
         if len(hosts) != 1 or not self._is_own(hosts[0]):
             return False
-        if len(origins) > 1 or (socket and not origins):
+        if len(origins) > 1 or (websocket and not origins):
             return False
         if origins and origins[0] not in (f"http://{hosts[0]}", f"https://{hosts[0]}"):
             return False
-        return secrets.compare_digest(_first(path).encode(), self.token.encode())
+        return secrets.compare_digest(_first(path).encode(errors="surrogateescape"), self.token.encode())
 
     def _is_own(self, host: str) -> bool:
         """Whether a ``Host`` header names this machine.
@@ -92,15 +94,19 @@ class Guard:
         A page that had its own name lead here (DNS rebinding) would pass for one of ours; an address cannot be made to
         do so. Any port: it may have been forwarded.
         """
+        found = _HOST.fullmatch(host)
+        if found is None:
+            return False
+        name = (found[1] or found[2]).lower()
+        known = {"localhost", self.host.lower()}
+        if not is_loopback(self.host):
+            own = socket.gethostname().lower()
+            known |= {own, f"{own}.local"}
         try:
-            name = urlsplit(f"//{host}").hostname or ""
-            ipaddress.ip_address(name)
+            address = ipaddress.ip_address(name)
         except ValueError:
-            names = {"localhost", self.host.lower()}
-            if not is_loopback(self.host):
-                names |= {socket.gethostname().lower(), socket.getfqdn().lower()}
-            return urlsplit(f"//{host}").hostname in names if host.isprintable() and "[" not in host else False
-        return not is_loopback(self.host) or ipaddress.ip_address(name).is_loopback
+            return name in known
+        return address.is_loopback or not is_loopback(self.host)
 
 
 def is_loopback(host: str) -> bool:
@@ -217,7 +223,7 @@ def _guarded_settings(guard: Guard, settings: dict[str, Any]) -> dict[str, Any]:
     def process_request(connection: Any, request: Any) -> Any:
         headers = request.headers
         wants_socket = bool(headers.get_all("Upgrade"))
-        if not guard.admits(request.path, headers.get_all("Host"), headers.get_all("Origin"), socket=wants_socket):
+        if not guard.admits(request.path, headers.get_all("Host"), headers.get_all("Origin"), websocket=wants_socket):
             return connection.respond(http.HTTPStatus.FORBIDDEN, "Forbidden\n")
         if wants_socket:
             if len(viewers) >= MOST_VIEWERS:

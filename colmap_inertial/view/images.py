@@ -16,7 +16,7 @@ def read_preview(path: Path | None, width_px: int) -> tuple[NDArray[np.uint8] | 
     import cv2
 
     if path is None:
-        return None, "Its image is not beside the model."
+        return None, "Its image is not beside the model; --images FOLDER says where it is."
     try:
         image = read_image(path)
     except FormatError as error:

@@ -151,7 +151,7 @@ class Scene:
         return np.concatenate([self.cloud.xyz.astype(np.float64), np.array(corners).reshape(-1, 3)])
 
 
-def load_scene(out: Path, *, model: int | None = None, max_points: int = 400_000) -> Scene:
+def load_scene(out: Path, *, model: int | None = None, images: Path | None = None, max_points: int = 400_000) -> Scene:
     """Load what is shown.
 
     Parameters
@@ -160,6 +160,8 @@ def load_scene(out: Path, *, model: int | None = None, max_points: int = 400_000
         What ``reconstruct`` or ``apply`` wrote, or any folder with a COLMAP model.
     model
         Number of the model; ``None`` takes the largest.
+    images
+        Folder with the model's images, where they are not beside it.
     max_points
         Show no more points than this, evenly chosen.
 
@@ -170,7 +172,7 @@ def load_scene(out: Path, *, model: int | None = None, max_points: int = 400_000
     """
     if max_points < 1:
         raise ValueError(f"max_points must be positive, not {max_points}")
-    source = find_source(Path(out), model)
+    source = find_source(Path(out), model, images=images)
     reconstruction = read_model(source.folder)
     cameras = _cameras(reconstruction)
     if source.fused is not None and source.fused.is_file():

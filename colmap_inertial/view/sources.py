@@ -118,7 +118,7 @@ class ViewSource:
     target: TargetFacts | None = None
 
 
-def find_source(out: Path, index: int | None = None) -> ViewSource:
+def find_source(out: Path, index: int | None = None, *, images: Path | None = None) -> ViewSource:
     """Find the model to show.
 
     Parameters
@@ -127,6 +127,9 @@ def find_source(out: Path, index: int | None = None) -> ViewSource:
         What ``reconstruct`` or ``apply`` wrote, or any folder with a COLMAP model.
     index
         Number of the model; ``None`` takes the largest.
+    images
+        Folder with the model's images, where they are not beside it. What a result says of such a folder is not
+        followed: the result may be a stranger's, and the folder one's own.
 
     Raises
     ------
@@ -135,17 +138,20 @@ def find_source(out: Path, index: int | None = None) -> ViewSource:
     """
     if not out.is_dir():
         raise FormatError(out, "no such folder; give what reconstruct or apply wrote, or a COLMAP model")
+    if images is not None and not images.is_dir():
+        raise FormatError(images, "no such folder of images")
+    given = () if images is None else (images,)
     workspace = Workspace(out)
     if workspace.result.is_file() and model_format(out) is None:
-        return _of_reconstruction(workspace, index)
+        return _of_reconstruction(workspace, index, given)
     if workspace.stamps.is_dir():
         raise FormatError(
             out, "the run that writes this folder is not finished; start it again with the same arguments, it continues"
         )
-    return _of_project(out, index)
+    return _of_project(out, index, given)
 
 
-def _of_reconstruction(workspace: Workspace, index: int | None) -> ViewSource:
+def _of_reconstruction(workspace: Workspace, index: int | None, given: tuple[Path, ...]) -> ViewSource:
     root = workspace.root
     record = read_json(workspace.result)
     with a_record_of_ours(workspace.result):
@@ -169,7 +175,6 @@ def _of_reconstruction(workspace: Workspace, index: int | None) -> ViewSource:
         dense = fields.get("dense") or {}
         validation = fields.get("validation")
         target = _target(validation) if metric and validation and "error" not in validation else None
-        given = (record.get("project") or {}).get("images")
         fused, mesh, path_file = dense.get("fused"), dense.get("mesh"), fields.get("trajectory")
         return ViewSource(
             folder=folder,
@@ -178,9 +183,9 @@ def _of_reconstruction(workspace: Workspace, index: int | None) -> ViewSource:
             scale=scale,
             down_in_world=down,
             images=(
+                *given,
                 workspace.images_rectified,
                 workspace.images,
-                *([root / given] if given else []),
                 workspace.project_metric / "images",
                 *_image_folders(folder),
             ),
@@ -191,7 +196,7 @@ def _of_reconstruction(workspace: Workspace, index: int | None) -> ViewSource:
         )
 
 
-def _of_project(out: Path, index: int | None) -> ViewSource:
+def _of_project(out: Path, index: int | None, given: tuple[Path, ...]) -> ViewSource:
     """A COLMAP model, or a project with models where COLMAP has them, as they are or as ``apply`` wrote them."""
     for place in (out, out / "sparse_metric", out / "sparse"):
         try:
@@ -224,7 +229,7 @@ def _of_project(out: Path, index: int | None) -> ViewSource:
         others=tuple(models),
         scale=scale,
         gravity_on_axis=on_axis,
-        images=tuple(_image_folders(folder)),
+        images=(*given, *_image_folders(folder)),
         fused=_beside(out, chosen, single, "fused.ply"),
         mesh=_beside(out, chosen, single, "meshed-poisson.ply"),
     )

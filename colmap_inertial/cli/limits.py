@@ -1,0 +1,54 @@
+"""Limits of the process: those that are too low are said before the work, those that are reached in a sentence.
+
+Libraries that are out of memory or of files end the process without one: OpenBLAS, COLMAP's threads, the loader.
+"""
+
+from __future__ import annotations
+
+import errno
+
+from colmap_inertial.errors import InertialError
+
+#: Address space to begin with, and for each thread: its stack, and what the allocator keeps for it. A reconstruction of
+#: small pictures takes 1.3 GB on two processors.
+LEAST_BYTES, THREAD_BYTES = 2 << 30, 128 << 20
+#: A reconstruction has 9 open at a time, a batch some for each process; systems allow 256 or more.
+LEAST_FILES = 64
+
+
+def require_limits() -> None:
+    """Refuse to begin with less than any command takes.
+
+    Raises
+    ------
+    InertialError
+        That says which limit, and how to raise it.
+    """
+    try:
+        import resource
+    except ImportError:  # Windows has none
+        return
+    from colmap_inertial.threads import usable_processors
+
+    least = LEAST_BYTES + THREAD_BYTES * usable_processors()
+    space, files = (resource.getrlimit(kind)[0] for kind in (resource.RLIMIT_AS, resource.RLIMIT_NOFILE))
+    if space != resource.RLIM_INFINITY and space < least:
+        raise InertialError(
+            f"only {space / 1e9:.2g} GB of memory are allowed to a process here, and {least / 1e9:.2g} GB are needed: "
+            f"raise the limit (ulimit -v {least >> 10})"
+        )
+    if files != resource.RLIM_INFINITY and files < LEAST_FILES:
+        raise InertialError(
+            f"only {files} files may be open at a time here, and {LEAST_FILES} are needed: raise the limit (ulimit -n "
+            f"{LEAST_FILES})"
+        )
+
+
+def exhausted(error: BaseException) -> str | None:
+    """A sentence for an exception that means that memory or files have run out; ``None`` for any other."""
+    number = error.errno if isinstance(error, OSError) else None
+    if isinstance(error, MemoryError) or number == errno.ENOMEM or "failed to map segment" in str(error):
+        return "the memory is used up: close other programs, or allow smaller pictures or fewer processes"
+    if number in (errno.EMFILE, errno.ENFILE):
+        return "too many files are open at a time: raise the limit (ulimit -n) and start again"
+    return None

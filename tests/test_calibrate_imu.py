@@ -1,0 +1,254 @@
+"""``calibrate-imu``: rests found, gains and biases with intervals that hold, and what they do for a scale."""
+
+import dataclasses
+import importlib.util
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from colmap_inertial import calibrate_imu, estimate_scale, gravity_at_latitude_m_s2
+from colmap_inertial.errors import NotObservableError
+from colmap_inertial.rest._rests import candidate_rests
+from colmap_inertial.simulate import RecordingOptions, RestOptions, simulate_recording, simulate_rests
+from colmap_inertial.simulate.sensors import IMU_PRESETS
+from colmap_inertial.types import IMU_CAL, IMU_CALIBRATION_PARAMETERS, ImuCalibration, ImuRecording
+
+ROOT = Path(__file__).parents[1]
+GAINS, BESIDE = np.array([0, 4, 8]), np.array([3, 6, 7])
+
+
+@pytest.fixture(scope="module")
+def study():
+    """The study script."""
+    spec = importlib.util.spec_from_file_location("study", ROOT / "scripts" / "study_calibrate_imu.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def calibrated(truth, *, gravity_m_s2=9.81):
+    return calibrate_imu(truth.recording, gravity_m_s2=gravity_m_s2, gravity_sigma_m_s2=5e-4)
+
+
+def blank(**changes) -> ImuCalibration:
+    fields = {
+        "accel_gain": np.zeros((3, 3)),
+        "accel_bias_m_s2": np.zeros(3),
+        "gyro_gain": np.zeros((3, 3)),
+        "gyro_bias_rad_s": np.zeros(3),
+        "cov": np.diag(np.arange(1.0, 25) ** 2 * 1e-8),
+        "gravity_m_s2": 9.81,
+        "attitudes": 12,
+    }
+    return ImuCalibration(**{**fields, **changes})
+
+
+def laid_down(ups, *, rest_s=4.0, turn_s=1.0, seed=0, hz=100.0) -> ImuRecording:
+    """A device without errors that lies with these directions up, and shakes on the way from one to the next."""
+    rng = np.random.default_rng(seed)
+    t_s = np.arange(int(len(ups) * (rest_s + turn_s) * hz)) / hz
+    index = (t_s / (rest_s + turn_s)).astype(int)
+    moving = t_s - index * (rest_s + turn_s) > rest_s
+    accel = 9.81 * np.asarray(ups)[index] + 0.02 * rng.standard_normal((len(t_s), 3))
+    gyro = 0.003 * rng.standard_normal((len(t_s), 3))
+    accel[moving] += 2 * rng.standard_normal((moving.sum(), 3))
+    gyro[moving] += rng.standard_normal((moving.sum(), 3))
+    return ImuRecording(gyro_t_s=t_s, gyro_rad_s=gyro, accel_t_s=t_s, accel_m_s2=accel)
+
+
+# --- what comes out --------------------------------------------------------------------------------------------------
+
+
+def test_intervals_hold_the_truth(study):
+    """A small part of the study; all of it: scripts/study_calibrate_imu.py."""
+    table = study.study(RestOptions(), 24, 500)
+    assert table.pop("runs") == {"refused": 0, "attitudes missed": 0}
+    inside = [row["inside"] for row in table.values()]
+    assert 92.0 <= np.mean(inside) <= 99.0
+    assert min(inside) >= 87.0
+    assert all(0.7 < row["z"] < 1.25 for row in table.values())
+    assert table["accel gain"]["error"] < 5e-4
+    assert table["accel misalignment"]["error"] < np.radians(0.05)
+    assert table["gyro gain"]["error"] < 1e-3
+
+
+def test_a_phone_is_found_out_and_its_readings_become_true():
+    truth = simulate_rests(RestOptions(), seed=3)
+    found = calibrated(truth)
+    assert found.verdict == "good"
+    assert found.rests.attitudes == len(found.rests) == 12
+    assert found.rms_pct(found.before_m_s2) > 0.5
+    assert found.rms_pct(found.after_m_s2) < 0.03
+    assert np.degrees(found.turn_residual_rad).max() < 0.3
+    calibration = found.calibration
+    np.testing.assert_array_equal(calibration.accel_gain[np.triu_indices(3, 1)], 0.0)
+    np.testing.assert_allclose(calibration.accel_gain, truth.accel_gain, atol=1e-3)
+    np.testing.assert_allclose(calibration.gyro_gain, truth.gyro_gain, atol=2e-3)
+    corrected = calibration.corrected(truth.recording)
+    assert corrected.calibration is calibration
+    assert "12 attitudes" in corrected.repairs[-1]
+    for rest, up in zip(range(12), truth.up_in_imu, strict=True):
+        inside = slice(*np.searchsorted(corrected.accel_t_s, [found.rests.begin_s[rest], found.rests.end_s[rest]]))
+        np.testing.assert_allclose(corrected.accel_m_s2[inside].mean(axis=0), 9.81 * up, atol=0.01)
+    with pytest.raises(ValueError, match="before"):
+        calibration.corrected(corrected)
+    with pytest.raises(ValueError, match="already"):
+        calibrate_imu(corrected)
+
+
+@pytest.mark.parametrize("attitudes", [6, 8])
+def test_few_attitudes_leave_misalignments_to_their_prior_and_say_so(attitudes):
+    truth = simulate_rests(RestOptions(attitudes=attitudes), seed=attitudes)
+    found = calibrated(truth)
+    assert found.verdict == "weak"
+    assert f"{attitudes} attitudes determine gains and biases of the accelerometer, not its misal" in found.reasons[0]
+    calibration = found.calibration
+    np.testing.assert_array_equal(calibration.accel_gain.ravel()[BESIDE], 0.0)
+    np.testing.assert_allclose(np.sqrt(np.diagonal(calibration.cov))[BESIDE], 2**0.5 * 0.005)
+    sigma = np.sqrt(np.diagonal(calibration.cov))[GAINS]
+    error = (calibration.accel_gain - truth.accel_gain).ravel()[GAINS]
+    assert np.all(np.abs(error) < 3.5 * sigma)
+    assert sigma.max() < 2e-3
+
+
+def test_what_is_too_little_is_refused_with_what_to_do():
+    with pytest.raises(NotObservableError, match=r"still in 5 attitudes only.*six sides.*six of its edges"):
+        calibrated(simulate_rests(RestOptions(attitudes=5), seed=1))
+    shaken = laid_down(np.eye(3), rest_s=0.5, turn_s=3.0)
+    with pytest.raises(NotObservableError, match="no rest was found"):
+        calibrate_imu(shaken)
+    # twelve attitudes about one axis, which always lies level: its gain shows nowhere
+    angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    around = np.stack([np.cos(angle), np.sin(angle), np.zeros(12)], axis=1)
+    with pytest.raises(NotObservableError, match="gain along z stays unknown"):
+        calibrate_imu(laid_down(around))
+    gyroscope = dataclasses.replace(shaken, accel_t_s=np.zeros(0), accel_m_s2=np.zeros((0, 3)))
+    with pytest.raises(NotObservableError, match="no accelerometer"):
+        calibrate_imu(gyroscope)
+
+
+def test_a_gyroscope_that_did_not_turn_about_an_axis_keeps_its_prior_there():
+    truth = simulate_rests(RestOptions(), seed=5)
+    recording = truth.recording
+    # the turns are lost: only the rests were kept
+    rests = candidate_rests(recording)[0]
+    kept = np.any(
+        [
+            (recording.gyro_t_s >= begin) & (recording.gyro_t_s <= end)
+            for begin, end in zip(rests.begin_s - 0.4, rests.end_s + 0.4, strict=True)
+        ],
+        axis=0,
+    )
+    cut = dataclasses.replace(recording, gyro_t_s=recording.gyro_t_s[kept], gyro_rad_s=recording.gyro_rad_s[kept])
+    found = calibrate_imu(cut, gravity_m_s2=9.81, gravity_sigma_m_s2=5e-4)
+    assert np.isnan(found.turn_residual_rad).all()
+    sigma = np.sqrt(np.diagonal(found.calibration.cov))
+    assert np.all(sigma[IMU_CAL.GYRO_GAIN] > 0.009)
+    np.testing.assert_allclose(found.calibration.gyro_gain, 0.0, atol=1e-12)
+    assert found.verdict == "weak"
+    assert any("gyroscope's gain about x, y and z" in reason for reason in found.reasons)
+    np.testing.assert_allclose(found.calibration.accel_gain, truth.accel_gain, atol=1e-3)
+
+
+def test_a_gyroscope_with_other_axes_is_left_alone_and_named():
+    truth = simulate_rests(RestOptions(), seed=6)
+    turned = dataclasses.replace(truth.recording, gyro_rad_s=truth.recording.gyro_rad_s[:, [1, 0, 2]])
+    found = calibrate_imu(turned, gravity_m_s2=9.81, gravity_sigma_m_s2=5e-4)
+    assert found.verdict == "weak"
+    assert any("does not turn as the accelerometer says" in reason for reason in found.reasons)
+    np.testing.assert_allclose(found.calibration.accel_gain, truth.accel_gain, atol=1e-3)
+    np.testing.assert_allclose(found.calibration.gyro_gain, 0.0, atol=1e-12)
+
+
+def test_unknown_gravity_is_counted_in_every_gain_and_said():
+    truth = simulate_rests(RestOptions(gravity_m_s2=9.79), seed=4)
+    found = calibrate_imu(truth.recording)
+    assert found.calibration.gain_sigma > 1.5e-3
+    assert "give the latitude" in found.reasons[-1]
+    known = calibrated(truth, gravity_m_s2=9.79)
+    assert known.calibration.gain_sigma < 5e-4
+    assert not any("latitude" in reason for reason in known.reasons)
+
+
+def test_a_calibrated_imu_narrows_the_interval_and_keeps_the_truth_in_it():
+    worse = dataclasses.replace(IMU_PRESETS["phone"], accel_scale_sd=0.01, gyro_scale_sd=0.01)
+    options = RecordingOptions(imu=worse)
+    widths = []
+    for seed in (1, 2):
+        recorded = simulate_recording(options, seed=seed)
+        rests = simulate_rests(RestOptions(imu=worse), seed=seed, errors=recorded.truth.imu_errors)
+        calibration = calibrated(rests).calibration
+        trajectory, imu, scale = recorded.trajectory, recorded.imu, recorded.truth.metres_per_unit
+        plain = estimate_scale(trajectory, imu)
+        better = estimate_scale(trajectory, imu, imu_calibration=calibration)
+        low, high = better.accepted.ci95
+        assert low < scale < high
+        assert better.imu_calibration is calibration
+        assert plain.imu_calibration is None
+        assert plain.as_json()["imu_calibration"] is None
+        json.dumps(better.as_json())
+        assert better.as_json()["imu_calibration"]["attitudes"] == 12
+        np.testing.assert_allclose(better.metres_per_unit, scale, rtol=0.01)
+        widths.append(better.accepted.sigma_log / plain.accepted.sigma_log)
+        again = estimate_scale(trajectory, calibration.corrected(imu))
+        assert again.metres_per_unit == better.metres_per_unit
+    assert max(widths) < 0.75
+
+
+# --- the values ------------------------------------------------------------------------------------------------------
+
+
+def test_a_calibration_is_checked_when_it_is_made():
+    for name, value in (
+        ("accel_gain", np.zeros((3, 2))),
+        ("gyro_gain", np.eye(3)),
+        ("cov", np.eye(23)),
+        ("gravity_m_s2", -9.8),
+        ("gravity_m_s2", np.nan),
+        ("temperature_c", np.inf),
+        ("attitudes", -1),
+    ):
+        with pytest.raises(ValueError, match=name):
+            blank(**{name: value})
+
+
+def test_standard_deviations_are_found_by_name_and_along_directions():
+    assert len(IMU_CALIBRATION_PARAMETERS) == IMU_CAL.COUNT == len(set(IMU_CALIBRATION_PARAMETERS))
+    assert IMU_CALIBRATION_PARAMETERS[IMU_CAL.GYRO_BIAS] == tuple(f"gyro_bias_{axis}_rad_s" for axis in "xyz")
+    assert blank().sigma("accel_gain_yx") == pytest.approx(4e-4)
+    cov = np.zeros((24, 24))
+    cov[3, 3] = 4e-6  # of yx alone: along (1, 1, 0) it counts half
+    assert blank(cov=cov).gain_sigma == pytest.approx(1e-3, rel=0.01)
+    common = np.zeros(24)
+    common[GAINS] = 2e-3
+    assert blank(cov=np.outer(common, common)).gain_sigma == pytest.approx(2e-3)
+
+
+def test_gravity_by_latitude_and_height():
+    # WGS 84: equator and poles; 0.3086 mGal a metre less upwards, a little less so higher up
+    assert gravity_at_latitude_m_s2(0) == pytest.approx(9.7803253359, abs=1e-10)
+    assert gravity_at_latitude_m_s2(-90) == pytest.approx(9.8321849379, abs=1e-9)
+    assert gravity_at_latitude_m_s2(45, 1000) - gravity_at_latitude_m_s2(45) == pytest.approx(-3.0848e-3, abs=2e-7)
+    fall = [gravity_at_latitude_m_s2(45, h) - gravity_at_latitude_m_s2(45, h + 1) for h in (0, 8000)]
+    assert fall[0] == pytest.approx(3.0855e-6, rel=1e-3)
+    assert fall[1] < fall[0]
+    for wrong in ((91, 0), (0, 20_000)):
+        with pytest.raises(ValueError, match="must be from"):
+            gravity_at_latitude_m_s2(*wrong)
+
+
+# --- real rests ------------------------------------------------------------------------------------------------------
+
+
+def test_the_rests_of_an_xsens_are_found_and_gravity_is_as_long_in_all(study, shared_data):
+    recording = study.read_xsens(shared_data / "imu_rest" / "xsens.csv.xz")
+    found = calibrate_imu(recording, gravity_m_s2=9.81744, gravity_sigma_m_s2=5e-4)
+    assert len(found.rests) == 38
+    assert found.verdict == "good"
+    assert found.rms_pct(found.before_m_s2) > 8.0
+    assert found.rms_pct(found.after_m_s2) < 0.02
+    assert found.calibration.device == "Xsens MTi"
+    # its nominal factor of rates is 31 % off; the authors' own calibration has 4778 counts per rad/s
+    np.testing.assert_allclose(np.diagonal(found.calibration.gyro_gain), 6258 / 4778 - 1, atol=0.006)

@@ -1,0 +1,68 @@
+"""Too little memory or too few files: a sentence before the work, or where they run out on the way."""
+
+import errno
+import subprocess
+import sys
+
+import pytest
+
+from colmap_inertial.cli import limits, main
+from colmap_inertial.cli.models import Scale
+from colmap_inertial.threads import usable_processors
+
+LIMITED = """
+import resource, sys
+kind = getattr(resource, sys.argv[1])
+resource.setrlimit(kind, (int(sys.argv[2]), resource.getrlimit(kind)[1]))
+from colmap_inertial.cli import main
+main(sys.argv[3:])
+"""
+ARGUMENTS = ("apply", "project", "out", "--factor", "2")
+
+
+@pytest.mark.parametrize(
+    ("kind", "least"),
+    [
+        ("RLIMIT_AS", limits.LEAST_BYTES + limits.THREAD_BYTES * usable_processors()),
+        ("RLIMIT_NOFILE", limits.LEAST_FILES),
+    ],
+)
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such limits")
+def test_a_limit_that_is_too_low_is_said_at_once(tmp_path, kind, least):
+    for value, said in ((least - 1, "raise the limit (ulimit -"), (least, "no such folder")):
+        command = [sys.executable, "-c", LIMITED, kind, str(value), *ARGUMENTS]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+        assert done.returncode == 2 and done.stderr.startswith("error: ") and len(done.stderr.splitlines()) == 1
+        assert said in done.stderr
+        assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (MemoryError(), "the memory is used up"),
+        (OSError(errno.ENOMEM, "Cannot allocate memory"), "the memory is used up"),
+        (ImportError("cv2.abi3.so: failed to map segment from shared object"), "the memory is used up"),
+        (OSError(errno.EMFILE, "Too many open files"), "too many files are open"),
+    ],
+)
+def test_what_runs_out_on_the_way_is_a_sentence(monkeypatch, capsys, error, said):
+    def run(self):
+        raise error
+
+    monkeypatch.setattr(Scale, "run", run)
+    with pytest.raises(SystemExit) as stopped:
+        main(["scale", "a", "--json", "b"])
+    assert stopped.value.code == 2
+    told = capsys.readouterr().err
+    assert told.startswith(f"error: {said}") and len(told.splitlines()) == 1
+
+
+@pytest.mark.parametrize("error", [OSError(errno.EIO, "Input/output error"), ImportError("no module"), KeyError("a")])
+def test_anything_else_keeps_its_traceback(monkeypatch, error):
+    def run(self):
+        raise error
+
+    monkeypatch.setattr(Scale, "run", run)
+    with pytest.raises(type(error)):
+        main(["scale", "a", "--json", "b"])

@@ -1,0 +1,49 @@
+"""A small part of ``scripts/study_fuzz.py``: each reader's files damaged a few times; its table counts what is."""
+
+import sys
+from pathlib import Path
+
+import pytest
+from fuzz_readers import READERS, Reader
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
+
+from study_fuzz import outcome, whole_files
+
+from colmap_inertial.errors import FormatError
+
+MUTANTS = 12
+
+
+@pytest.mark.parametrize("name", [name for name, reader in READERS.items() if reader.cost < 10])
+def test_only_errors_of_our_own_come_out(tmp_path, name):
+    reader = READERS[name]
+    files = whole_files(reader, tmp_path)
+    for number in range(max(2, round(MUTANTS / reader.cost))):
+        found, told = outcome(reader, tmp_path, files, (7, number))
+        assert found in ("read", "refused"), told
+
+
+def _fails(error: BaseException):
+    def read(folder: Path) -> None:
+        if (folder / "a").read_bytes() != b"whole":
+            raise error
+
+    return read
+
+
+def _build(folder: Path) -> list[Path]:
+    (folder / "a").write_bytes(b"whole")
+    return [folder / "a"]
+
+
+@pytest.mark.parametrize(
+    ("error", "counted"),
+    [(FormatError("a", "damaged"), "refused"), (KeyError("a"), "foreign"), (MemoryError(), "large")],
+)
+def test_each_outcome_is_counted_as_what_it_is(tmp_path, error, counted):
+    reader = Reader(_build, _fails(error))
+    files = whole_files(reader, tmp_path)
+    found = [outcome(reader, tmp_path, files, (0, number))[0] for number in range(20)]
+    assert counted in found and set(found) <= {"read", counted}
+    assert (tmp_path / "a").read_bytes() == b"whole"

@@ -1,0 +1,63 @@
+"""An output does not lie among the pictures that it is made from."""
+
+import pytest
+from batch_captures import TINY, tiny_capture
+
+from colmap_inertial.cli import main
+from colmap_inertial.drivers.capture import reconstruct
+from colmap_inertial.errors import FormatError, OutputError
+from colmap_inertial.io.capture import ImageFolder, load_capture
+from colmap_inertial.io.frames import image_names, picture_folders
+from colmap_inertial.run.progress import silent
+from colmap_inertial.run.session import open_session
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    return tiny_capture(tmp_path_factory.mktemp("apart") / "capture")
+
+
+def listing(folder):
+    return sorted(folder.rglob("*"))
+
+
+@pytest.mark.parametrize("out", ["", "out", "deep/er/out"])
+def test_an_output_among_the_pictures_is_refused(capture, tmp_path, out):
+    (folder,) = picture_folders(load_capture(capture))
+    before = listing(capture)
+    with pytest.raises(OutputError, match="the folder of the capture's pictures; choose a folder outside of it"):
+        reconstruct(capture, folder / out, TINY)
+    (tmp_path / "link").symlink_to(folder)
+    with pytest.raises(OutputError, match="the capture's pictures"):
+        reconstruct(capture, tmp_path / "link" / "out", TINY)
+    assert listing(capture) == before
+
+
+@pytest.mark.parametrize("command", ["reconstruct", "deblur"])
+def test_the_command_line_says_so(capture, capsys, command):
+    (folder,) = picture_folders(load_capture(capture))
+    before = listing(capture)
+    with pytest.raises(SystemExit) as stopped:
+        main([command, str(capture), str(folder / "out")])
+    assert stopped.value.code == 2
+    assert "choose a folder outside of it" in capsys.readouterr().err
+    assert listing(capture) == before
+
+
+def test_every_folder_of_pictures_counts_and_others_do_not(tmp_path):
+    for name in ("short", "long"):
+        (tmp_path / name).mkdir()
+    folders = (tmp_path / "short", tmp_path / "long")
+    with (
+        pytest.raises(OutputError, match="long"),
+        open_session(tmp_path / "long" / "out", tmp_path, TINY, pictures=folders, progress=silent),
+    ):
+        pass
+    with open_session(tmp_path / "longer", tmp_path, TINY, pictures=folders, progress=silent):
+        pass
+
+
+@pytest.mark.parametrize("pattern", ["../*.png", "/etc/*.png", "a/../../*"])
+def test_a_pattern_stays_in_its_folder(tmp_path, pattern):
+    with pytest.raises(FormatError, match="leads out of it"):
+        image_names(ImageFolder(folder=tmp_path, pattern=pattern))

@@ -1,0 +1,79 @@
+"""What a release carries: one version, licences, a citation, links that lead somewhere."""
+
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+import yaml
+
+import colmap_inertial
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
+sys.path.insert(0, str(ROOT / "scripts"))
+
+from index_readme import LINK, absolute  # noqa: E402
+
+
+def test_there_is_one_version_and_the_changelog_has_it():
+    version = PROJECT["project"]["version"]
+    assert colmap_inertial.__version__ == version
+    assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == version
+    assert f"\n## {version}\n" in (ROOT / "CHANGELOG.md").read_text()
+
+
+def test_the_citation_names_what_is_followed():
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert citation["authors"] == [{"name": "the colmap-inertial authors"}]
+    sources = " ".join((ROOT / "docs" / "method.md").read_text().lower().split())
+    assert len(citation["references"]) == 6
+    for reference in citation["references"]:
+        title = reference["title"].lower().replace("lsd2 - ", "lsd2: ")
+        assert title in sources and reference["authors"][0]["family-names"] == "Mustaniemi"
+
+
+def test_licences_of_what_is_compiled_in_go_along():
+    for name in PROJECT["project"]["license-files"]:
+        assert (ROOT / name).is_file()
+    text = (ROOT / "THIRD_PARTY_LICENSES.txt").read_text()
+    assert "nanobind" in text and "Redistributions in binary form" in text and "robin_map" in text
+
+
+def test_links_of_the_readme_lead_to_files_and_become_addresses(tmp_path):
+    text = (ROOT / "README.md").read_text()
+    targets = [target.split("#")[0] for _, target, _ in LINK.findall(text)]
+    assert len(targets) > 10 and all((ROOT / target).exists() for target in targets)
+    made = absolute(text, "https://code.example/it/", "0.2.0")
+    assert not LINK.search(made)
+    assert "](https://code.example/it/blob/v0.2.0/docs/results.md)" in made
+
+
+@pytest.mark.parametrize("urls", ["", '\n[project.urls]\nRepository = "https://code.example/it"\n'])
+def test_the_address_stands_in_one_place(tmp_path, urls):
+    (tmp_path / "scripts").mkdir()
+    shutil.copy(ROOT / "scripts" / "index_readme.py", tmp_path / "scripts")
+    (tmp_path / "pyproject.toml").write_text(f'[project]\nversion = "1.2"\n{urls}')
+    (tmp_path / "README.md").write_text("[a](docs/a.md#b) [c](#c) [d](https://d.example)")
+    done = subprocess.run([sys.executable, "scripts/index_readme.py"], cwd=tmp_path, capture_output=True, text=True)
+    text = (tmp_path / "README.md").read_text()
+    if urls:
+        assert done.returncode == 0
+        assert text == "[a](https://code.example/it/blob/v1.2/docs/a.md#b) [c](#c) [d](https://d.example)"
+    else:
+        assert done.returncode == 2 and "fill in [project.urls]" in done.stderr and "docs/a.md" in text
+
+
+@pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.name)
+def test_workflows_run_what_is_there(path):
+    text = path.read_text()
+    jobs = yaml.safe_load(text)["jobs"]
+    assert jobs and all(job["steps"] for job in jobs.values())
+    for name in re.findall(r"(?:scripts|tests)/[\w./]+", text):
+        assert (ROOT / name).is_file(), name
+    if "macos" in text:
+        assert "NOT VERIFIED YET" in text

@@ -1,0 +1,83 @@
+"""What sets the checks up: skips that count as failures, and the extras that a set-up remembers."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+TESTS = """
+import pytest
+
+def test_passes():
+    pass
+
+@pytest.mark.skip(reason="no browser")
+def test_marked():
+    pass
+
+def test_inside():
+    pytest.importorskip("no_such_module")
+
+@pytest.mark.xfail(reason="known")
+def test_known():
+    raise AssertionError
+"""
+
+
+@pytest.mark.parametrize(("switch", "outcome"), [([], "1 passed, 3 skipped, 1 xfailed"), (["--no-skips"], "")])
+def test_skips_are_failures_where_that_is_asked_for(tmp_path, switch, outcome):
+    for name in ("conftest.py", "quick.txt"):
+        shutil.copy(ROOT / "tests" / name, tmp_path)
+    (tmp_path / "pytest.ini").write_text("[pytest]\n")
+    (tmp_path / "test_some.py").write_text(TESTS)
+    (tmp_path / "test_whole.py").write_text('import pytest\npytest.importorskip("no_such_module")\n')
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *switch]
+    env = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True)
+    if not switch:
+        assert done.returncode == 0 and outcome in done.stdout, done.stdout
+        return
+    assert done.returncode != 0
+    assert "1 error" in done.stdout and "skipped, which --no-skips does not allow" in done.stdout
+    whole = [*command, "test_some.py"]
+    done = subprocess.run(whole, cwd=tmp_path, env=env, capture_output=True, text=True)
+    assert done.returncode == 1 and "1 failed, 1 passed, 1 xfailed, 1 error" in done.stdout, done.stdout
+    assert "skipped, which --no-skips does not allow: Skipped: no browser" in done.stdout
+
+
+@pytest.fixture
+def checkout(tmp_path):
+    """A checkout whose ``pip`` writes down what it is asked for."""
+    root = tmp_path / "checkout"
+    (root / "scripts").mkdir(parents=True)
+    shutil.copy(ROOT / "scripts" / "setup.sh", root / "scripts")
+    kernels = root / "colmap_inertial" / "_kernels"
+    kernels.mkdir(parents=True)
+    for path in (root / "pyproject.toml", *(kernels / name for name in ("CMakeLists.txt", "a.cpp", "a.h"))):
+        path.touch()
+    python = root / ".venv" / "bin" / "python"
+    python.parent.mkdir(parents=True)
+    python.write_text('#!/bin/sh\nshift 2\n[ "$1" = --version ] || echo "$*" >>asked.txt\n')
+    python.chmod(0o755)
+    return root
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler here")
+def test_the_set_up_knows_which_extras_are_there(checkout):
+    def asked(*extras):
+        (checkout / "asked.txt").unlink(missing_ok=True)
+        subprocess.run(["bash", "scripts/setup.sh", *extras], cwd=checkout, check=True, capture_output=True)
+        path = checkout / "asked.txt"
+        return path.read_text().split()[-1] if path.exists() else None
+
+    assert asked() == "."  # the demo needs no extra
+    assert asked() is None
+    assert asked("dev") == ".[dev]"
+    assert asked() is None and asked("dev") is None
+    assert asked("view") == ".[dev,view]"
+    os.utime(checkout / "pyproject.toml", (2**31, 2**31))
+    assert asked("dev") == ".[dev,view]"
