@@ -66,11 +66,9 @@ class Motion:
     t_s: Array
     world_from_cam: Array
     cam_in_world_m: Array
-    world_from_imu: Array
     imu_t_s: Array
     gyro_rad_s: Array
     accel_m_s2: Array
-    cam_from_imu: Array
 
 
 def _lines(path: Path) -> list[str]:
@@ -109,11 +107,9 @@ def read(folder: Path, name: str) -> Motion:
         t_s=t_s,
         world_from_cam=world_from_imu @ body_from_cam,
         cam_in_world_m=position + world_from_imu @ cam_in_body_m,
-        world_from_imu=world_from_imu,
         imu_t_s=imu_t_s,
         gyro_rad_s=imu[:, 1:4],
         accel_m_s2=imu[:, 4:7],
-        cam_from_imu=body_from_cam.T,
     )
 
 

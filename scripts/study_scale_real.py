@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Scale errors on recordings of other sensors: real IMUs, motion capture with errors such as a reconstruction has.
 
-    python scripts/study_scale_real.py FOLDER [--most 10] [--json FILE]
+    python scripts/study_scale_real.py FOLDER [--most 8] [--json FILE]
 
 FOLDER holds TUM-VI rooms and EuRoC flights (``real_imu.py``). Whole recordings and windows of 20, 10, 5 and 3 s, with
 errors of 0, .5, 2 and 5 mm that are alike over .1, .35 or 1 s, an arbitrary scale, axes and clock. The estimator is
