@@ -1,4 +1,4 @@
-"""Samples of a sensor over time: where they have gaps, and their integrals."""
+"""Samples of a sensor over time: where they have gaps or end at a ceiling, and their integrals."""
 
 from __future__ import annotations
 
@@ -11,6 +11,11 @@ Array = NDArray[np.float64]
 GAP_S = 0.1
 #: A pause that is worth a word, even where it is shorter than that: so many times the usual step between samples.
 PAUSE_STEPS = 3.5
+#: A reading is cut off where its very largest value comes so often, and so many times as often as any value near it
+#: (in parts of the usual range).
+_CUT_SAMPLES, _CUT_TIMES, _CUT_NEAR = 6, 3, 0.1
+#: Over this share of readings at the end of the range, the motion was lost and not only a knock.
+MUCH_CUT = 0.001
 
 
 def is_gap(t_s: Array, longer_than_s: float = GAP_S, *, steps: float = 0.0) -> NDArray[np.bool_]:
@@ -25,6 +30,31 @@ def is_gap(t_s: Array, longer_than_s: float = GAP_S, *, steps: float = 0.0) -> N
     """
     step_s = np.diff(t_s)
     return np.asarray(step_s > max(longer_than_s, steps * float(np.median(step_s)) if steps else 0.0))
+
+
+def at_ceiling(values: Array) -> NDArray[np.bool_]:
+    """(N, k) which samples (N, k) stand at their column's largest or smallest value, where these are far too many.
+
+    An end of a natural distribution is rare; one that is cut off is a common reading.
+    """
+    return np.stack([_column_at_ceiling(column) for column in values.T], axis=1)
+
+
+def _column_at_ceiling(values: Array) -> NDArray[np.bool_]:
+    out = np.zeros(len(values), dtype=bool)
+    levels, counts = np.unique(values, return_counts=True)
+    if len(levels) < 3:
+        return out
+    reach = _CUT_NEAR * float(np.ptp(np.percentile(values, [1, 99])))
+    for level in (levels[0], levels[-1]):
+        # a rounded reading may stand in the last digit
+        slack = 1e-6 * max(abs(float(level)), 1e-9)
+        at_end = np.abs(levels - level) <= slack
+        near = (np.abs(levels - level) <= reach) & ~at_end
+        usual = max(int(counts[near].max(initial=0)), int(counts[[1, -2]][int(level > levels[0])]))
+        if counts[at_end].sum() >= max(_CUT_SAMPLES, _CUT_TIMES * usual):
+            out |= np.abs(values - level) <= slack
+    return out
 
 
 class Coverage:

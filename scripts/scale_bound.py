@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.geometry import matrix_from_quat, skew
-from colmap_inertial.scale.priors import PRIORS
+from colmap_inertial.scale.priors import PRIORS, model_scale_sigma
 from colmap_inertial.simulate import ImuErrors, Motion, RecordingOptions, SimulatedRecording
 from colmap_inertial.simulate.sensors import true_rate_rad_s, true_specific_force_m_s2
 
@@ -49,7 +49,7 @@ class BoundPriors:
     time_offset_s: float = 1.0
     accel_delay_s: float = 0.02
     clock_rate: float = PRIORS.clock_rate
-    model_scale: float = PRIORS.model_scale
+    model_scale: float = model_scale_sigma(calibrated=False)
 
 
 # Columns of the errors. World frame, but for the biases (IMU frame) and the correlated error of rotations (camera).

@@ -177,3 +177,37 @@ def test_what_recordings_suffer_is_handled_and_listed(attempt, alter, said):
 def test_a_badly_calibrated_imu_is_not_trusted(attempt, alter):
     _, _, estimate = attempt(alter, seconds=60.0)
     assert estimate["verdict"] != "trusted" and estimate["reasons"]
+
+
+def filtered(force: np.ndarray) -> np.ndarray:
+    """A low-pass filter of the first order at 4 Hz, at 100 readings a second."""
+    from scipy.signal import lfilter, lfilter_zi
+
+    keep = np.exp(-2 * np.pi * 4 / 100)
+    start = lfilter_zi([1 - keep], [1, -keep])[:, None] * force[:1]
+    return lfilter([1 - keep], [1, -keep], force, axis=0, zi=start)[0]
+
+
+def late(force: np.ndarray) -> np.ndarray:
+    """The second axis one reading (10 ms) late."""
+    return np.stack([force[:, 0], np.roll(force[:, 1], 1), force[:, 2]], axis=1)
+
+
+@pytest.mark.parametrize(
+    ("alter", "said"),
+    [
+        pytest.param(values(ACCEL, filtered), "low-passed at about", id="low-pass-4-Hz"),
+        pytest.param(values(ACCEL, late), "axes are not read at the same time", id="axis-late"),
+        pytest.param(stamps((ACCEL,), lambda t: t[0] + 1.001 * (t - t[0])), "ppm off the gyroscope's", id="accel-rate"),
+        pytest.param(values(ACCEL, lambda x: 1.05 * x), "off in gain by", id="gain-5-%"),
+        pytest.param(values(ACCEL, lambda x: x * [1.05, 1, 1]), "off in gain by", id="gain-5-%-of-one-axis"),
+        pytest.param(values(ACCEL, lambda x: np.clip(x, -11, 11)), "stand at the end of its range", id="saturated"),
+    ],
+)
+def test_what_is_wrong_with_the_accelerometer_is_named_and_undone(attempt, shared_data, alter, said):
+    code, message, estimate = attempt(alter, seconds=60.0)
+    assert code == 0, message
+    assert estimate["verdict"] == "weak" and said in " ".join(estimate["reasons"])
+    truth = float((shared_data / "inertial_scale" / NAME / "groundtruth.txt").read_text())
+    assert estimate["ci95"][0] <= truth <= estimate["ci95"][1]
+    assert estimate["ci95"][1] / estimate["ci95"][0] < 1.05

@@ -18,6 +18,7 @@ from colmap_inertial.precalibrate.plan import ImagingPlan
 from colmap_inertial.rest import RestCalibration
 from colmap_inertial.run.progress import Progress
 from colmap_inertial.run.workspace import Workspace
+from colmap_inertial.scale.parts import parts_in_words
 from colmap_inertial.stages.frame_folder import FrameRecord
 from colmap_inertial.types import CameraImuCalibration, ScaleEstimate
 from colmap_inertial.validate import Validation, validation_table
@@ -86,6 +87,9 @@ def scale_lines(estimate: ScaleEstimate) -> list[Line]:
         half_width = 50 * (high - low) / estimate.metres_per_unit
         lines.append(("Scale", f"{estimate.metres_per_unit:.6g} m per unit, +-{half_width:.2g} % (95 %)"))
         lines.append(("Interval", f"{low:.6g} to {high:.6g} m per unit"))
+    if estimate.parts is not None:
+        made_of, advice = parts_in_words(estimate.parts)
+        lines += [("Made of", made_of), ("Narrower", advice)]
     lines += [("Reason" if i == 0 else "", text) for i, text in enumerate(estimate.reasons)]
     calibration = estimate.calibration
     if calibration is not None:

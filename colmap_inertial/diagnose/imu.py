@@ -10,16 +10,13 @@ import numpy as np
 from colmap_inertial.diagnose.findings import Finding, Recorded, Severity
 from colmap_inertial.errors import FormatError
 from colmap_inertial.io.plausible import find_implausible
-from colmap_inertial.sampling import PAUSE_STEPS, integral_at, is_gap
+from colmap_inertial.sampling import MUCH_CUT, PAUSE_STEPS, at_ceiling, integral_at, is_gap
 from colmap_inertial.types import Array, ImuRecording
 
 #: Pauses longer than this are findings (shorter ones cost nothing); over the second, much can happen in them.
 _PAUSE_S, _LONG_PAUSE_S = 0.03, 0.5
 #: Pauses that take up more than this share of a recording leave too little.
 _MOST_PAUSED = 0.2
-#: A reading is cut off where its very largest value comes so often, and so many times as often as any value near it
-#: (in parts of the usual range); over this share of the samples, the motion was lost and not only a knock.
-_CUT_SAMPLES, _CUT_TIMES, _CUT_NEAR, _CUT_SHARE = 6, 3, 0.25, 0.001
 #: Steps between readings, far coarser than any of today's sensors (12 bit over +-2 g: 0.01 m/s2; 16 bit over 2000
 #: deg/s: 0.001 rad/s); and the share of the signal that their rounding may take.
 _COARSE = {"gyroscope": 0.003, "accelerometer": 0.03}
@@ -127,36 +124,18 @@ def check_together(recorded: Recorded) -> Iterator[Finding]:
 def check_cut_off(recorded: Recorded) -> Iterator[Finding]:
     """Readings that end at a ceiling: the motion was faster than the sensor's range."""
     for sensor, _, values in _sensors(recorded.imu):
-        counts = {"xyz"[axis]: _at_ceiling(values[:, axis]) for axis in range(3)}
+        counts = dict(zip("xyz", at_ceiling(values).sum(axis=0).tolist(), strict=True))
         cut = {axis: count for axis, count in counts.items() if count}
         if cut:
             share = sum(cut.values()) / len(values)
             yield Finding(
                 code="saturated",
-                severity="error" if share > _CUT_SHARE else "warning",
+                severity="error" if share > MUCH_CUT else "warning",
                 evidence=f"{sum(cut.values())} of {len(values)} {sensor} samples stand at the end of the range "
                 f"({', '.join(f'{axis}: {count}' for axis, count in cut.items())})",
                 advice="move less violently, or give the sensor a wider range",
                 numbers={"samples": float(sum(cut.values())), "share": share},
             )
-
-
-def _at_ceiling(values: Array) -> int:
-    """How many samples of one axis stand at its largest or smallest value, where these are far too many."""
-    levels, counts = np.unique(values, return_counts=True)
-    if len(levels) < 3:
-        return 0
-    reach = _CUT_NEAR * float(np.ptp(np.percentile(values, [1, 99])))
-    count = 0
-    for level in (levels[0], levels[-1]):
-        # a rounded reading may stand in the last digit
-        at_end = np.abs(levels - level) <= 1e-6 * max(abs(float(level)), 1e-9)
-        near = (np.abs(levels - level) <= reach) & ~at_end
-        usual = max(int(counts[near].max(initial=0)), int(counts[[1, -2]][int(level > levels[0])]))
-        # an end of a natural distribution is rare; one that is cut off is a common reading
-        if counts[at_end].sum() >= max(_CUT_SAMPLES, _CUT_TIMES * usual):
-            count += int(counts[at_end].sum())
-    return count
 
 
 def check_resolution(recorded: Recorded) -> Iterator[Finding]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from colmap_inertial.scale.parts import parts_in_words
 from colmap_inertial.scale.verdict import TRUSTED_HALF_WIDTH
 
 #: Camera acceleration below which there is too little to weigh gravity against; what filming by hand usually has.
@@ -81,6 +82,9 @@ def outcome_of_model(model: dict[str, Any]) -> dict[str, Any]:
         # livelier motion narrows the interval; it mends nothing else
         todo = [_MOVE if pct > 100 * TRUSTED_HALF_WIDTH else _CHECK]
         todo += [] if model.get("validation") else [_TARGET]
+    if model.get("parts"):
+        made_of, advice = parts_in_words(model["parts"])
+        summary.append(f"What makes the interval so wide: {made_of.replace('+-', '±')}. To narrow it most, {advice}.")
     checked = model.get("validation")
     if checked and checked.get("scale_error_pct") is not None:
         word = "within" if checked["within_tolerance"] else "outside"

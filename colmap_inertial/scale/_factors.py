@@ -153,8 +153,12 @@ def integrate(data: Data, x: Estimate) -> Preintegrated:
         accel_gain=x.accel_gain,
         accel_delay_s=x.accel_delay_s,
     )
-    nodes_s = data.t_s - x.delay_s - x.clock_rate * (data.t_s - par.middle_s(data.t_s))
-    return preintegrate(nodes_s, data.tracks, errors)
+    return preintegrate(nodes_s(data, x), data.tracks, errors)
+
+
+def nodes_s(data: Data, x: Estimate) -> Array:
+    """(K,) times of the nodes on the clock of the tracks."""
+    return np.asarray(data.t_s - x.delay_s - x.clock_rate * (data.t_s - par.middle_s(data.t_s)))
 
 
 def still_near(then: Estimate, x: Estimate, t_s: Array, tolerance: float = 1.0) -> bool:
@@ -192,6 +196,12 @@ def corrected(pre: Preintegrated, then: Estimate, x: Estimate) -> Preintegrated:
     )
 
 
+def imu_root(noise: Noise, pre: Preintegrated, rows: slice = slice(0, 9)) -> Array:
+    """(K, r, r) square roots of the information of inertial increments."""
+    cov = noise.gyro_rad_s_rthz**2 * pre.cov_gyro + noise.accel_m_s2_rthz**2 * pre.cov_accel + pre.cov_gaps
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(cov[:, rows, rows])))
+
+
 def imu_group(noise: Noise, x: Estimate, pre: Preintegrated, *, rotation_only: bool = False) -> Group:
     """Rows: rotation, velocity, position between consecutive nodes."""
     k, dt = len(pre.dt_s), pre.dt_s[:, None]
@@ -226,9 +236,8 @@ def imu_group(noise: Noise, x: Estimate, pre: Preintegrated, *, rotation_only: b
     z[:, :, par.ACCEL_GAIN] = -pre.by_accel_gain
     z = z[:, :, par.IMU_GLOBALS]
 
-    cov = noise.gyro_rad_s_rthz**2 * pre.cov_gyro + noise.accel_m_s2_rthz**2 * pre.cov_accel + pre.cov_gaps
     rows = slice(0, 3) if rotation_only else slice(0, 9)
-    root = np.linalg.inv(np.linalg.cholesky(cov[:, rows, rows]))
+    root = imu_root(noise, pre, rows)
     return Group(
         residual=_mv(root, residual[:, rows]),
         here=root @ here[:, rows],

@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from colmap_inertial.scale import _factors as fac, _noise as levels, _parameters as par
+from colmap_inertial.scale import _factors as fac, _noise as levels, _parameters as par, _suspects as sus
 from colmap_inertial.scale._drift import scale_drift
 from colmap_inertial.scale._noise import Expected, LevelSearch
 from colmap_inertial.scale._parameters import Data, Estimate, Noise, Prior
-from colmap_inertial.scale.priors import PRIORS
+from colmap_inertial.scale.priors import model_scale_sigma
 from colmap_inertial.types import Array, ImuNoise, ScaleDrift
 
 _MAX_ITERATIONS, _MAX_ROTATION_ITERATIONS = 40, 4
@@ -52,6 +52,10 @@ class Fit:
         How many of the states' poses hardly count or lie behind a break of the path.
     gain_chi2
         Squared deviation of the accelerometer's nine gains and axis errors from their prior.
+    variance_parts
+        What the variance of the logarithm of the scale comes from, by the keys of ``parts.CAUSES``.
+    suspicions
+        What an accelerometer with faults that the model does not have would explain.
     """
 
     estimate: Estimate
@@ -68,6 +72,8 @@ class Fit:
     excitation_m_s2: float
     jumped: int
     gain_chi2: float
+    variance_parts: dict[str, float]
+    suspicions: list[sus.Suspicion]
 
 
 def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
@@ -90,10 +96,10 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
         if settled or not fac.still_near(there, x, data.t_s, tolerance=4.0):
             integrated, there = fac.integrate(data, x), x
         pre = fac.corrected(integrated, there, x)
-        prior = prior.seen_from(x.imu_in_cam_m)
-        groups = fac.all_groups(data, search.noise, prior, x, pre, robust=iteration > 2)
+        local = prior.at(x)
+        groups = fac.all_groups(data, search.noise, local, x, pre, robust=iteration > 2)
         signs = signs or levels.random_signs(groups, _PROBES)
-        system, rhs, rhs_z = fac.normal_equations(list(groups.values()), prior, x)
+        system, rhs, rhs_z = fac.normal_equations(list(groups.values()), local, x)
         rhs = np.concatenate([rhs, np.zeros((*rhs.shape[:2], search.columns))], axis=2)
         rhs_z = np.concatenate([rhs_z, np.zeros((len(rhs_z), search.columns))], axis=1)
         search.add_columns(groups, signs, rhs[:, :, 1:], rhs_z[:, 1:])
@@ -113,13 +119,19 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
             break
     noise, sums = search.noise, search.sums
 
-    # Once more at the optimum: the mean gyroscope bias, the scale's variance, and scales of the parts
+    # Once more at the optimum: the mean gyroscope bias, the scale's variance, suspicions, and scales of the parts
     k = len(data.t_s)
-    ends, ends_z = np.zeros((k, par.N_STATE, 4)), np.zeros((par.N_GLOBALS, 4))
+    where, own = sus.columns(data, x, noise)
+    imu = groups["imu"]
+    residual = (imu.residual[:, :, None] + imu.apply(states[:, :, :1], z[:, :1]))[:, :, 0]
+    ends, ends_z = np.zeros((k, par.N_STATE, 4 + own.shape[2])), np.zeros((par.N_GLOBALS, 4 + own.shape[2]))
     ends[:, par.GYRO_BIAS, :3] = np.eye(3) / k
     ends_z[par.SCALE, 3] = 1.0
+    imu.pull_back(own, ends[:, :, 4:], ends_z[:, 4:])
     states, z, cov = system.solve(ends, ends_z)
-    level_variance, freedom = search.scale_variance(groups, states[:, :, 3:], z[:, 3:])
+    suspicions = sus.suspicions(where, own, imu.apply(states[:, :, 4:], z[:, 4:]), residual)
+    variance_parts = _variance_parts(groups, local, x, states[:, :, 3:4], z[:, 3])
+    level_variance, freedom = search.scale_variance(groups, states[:, :, 3:4], z[:, 3:4])
     states, z = states[:, :, :3], z[:, :3]
     inflation = max(1.0, *(squares / expected for squares, expected in sums.values()))
     drift = scale_drift(
@@ -129,9 +141,8 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
         groups["centre"],
         (system, rhs[:, :, :1], rhs_z[:, :1]),
         inflation=inflation,
-        tolerated_log=PRIORS.model_scale,
+        tolerated_log=model_scale_sigma(calibrated=False),
     )
-    gain = x.accel_gain.ravel()
     return Fit(
         estimate=x,
         noise=noise,
@@ -146,8 +157,68 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
         drift=drift,
         excitation_m_s2=_excitation_m_s2(data, x),
         jumped=int(np.sum(data.broken)) + _jumped(groups["rotation"], groups["centre"]),
-        gain_chi2=float(gain @ prior.info[par.ACCEL_GAIN, par.ACCEL_GAIN] @ gain),
+        gain_chi2=prior.gain_chi2(x),
+        variance_parts=variance_parts,
+        suspicions=suspicions,
     )
+
+
+#: Which part of the scale's variance residuals and priors belong to.
+_PART_OF_GROUP = {
+    "imu": "gyro",
+    "gyro_walk": "gyro",
+    "gyro_bias": "gyro",
+    "accel_walk": "accel_bias",
+    "accel_zero": "accel_bias",
+    "rotation": "camera_path",
+    "centre": "camera_path",
+    "drift": "camera_path",
+    "drift_zero": "camera_path",
+    "speed": "camera_path",
+}
+_PART_OF_GLOBALS = {
+    "accel_gain": [par.ACCEL_GAIN],
+    "accel_bias": [par.ACCEL_BIAS],
+    "gyro": [par.GYRO_GAIN],
+    "camera_path": [par.SHUTTER, par.COUPLING],
+    "camera_imu": [
+        par.ROTATION,
+        par.LEVER,
+        slice(par.DELAY, par.CLOCK_RATE + 1),
+        slice(par.ACCEL_DELAY, par.ACCEL_DELAY + 1),
+    ],
+}
+
+
+def _variance_parts(
+    groups: dict[str, fac.Group | fac.Direct], prior: Prior, x: Estimate, states: Array, z: Array
+) -> dict[str, float]:
+    """The scale's variance, by the errors it comes from.
+
+    With the information ``A = sum J^T J``, the covariance's column ``c`` of the scale has ``c^T A c`` as its entry for
+    the scale: each residual's part of the variance is its change along ``c``, squared.
+
+    Parameters
+    ----------
+    states, z
+        (K, m, 1), (n,) that column.
+    """
+    parts = dict.fromkeys((*_PART_OF_GROUP.values(), *_PART_OF_GLOBALS, "accel_noise", "gravity"), 0.0)
+    for name, group in groups.items():
+        values = group.apply(states, z[:, None])
+        parts[_PART_OF_GROUP[name]] += float(np.sum(values**2))
+    imu = groups["imu"]
+    along = imu.apply(states, z[:, None])
+    parts["accel_noise"] = float(np.sum(along * levels.by_level(imu, along)))
+    parts["gyro"] -= parts["accel_noise"]
+    by_prior = z * (prior.info @ z)
+    for part, places in _PART_OF_GLOBALS.items():
+        parts[part] += sum(float(by_prior[place].sum()) for place in places)
+    up = x.gravity_m_s2 / float(np.linalg.norm(x.gravity_m_s2))
+    parts["gravity"] = float(up @ z[par.GRAVITY] / prior.gravity_sigma_m_s2) ** 2
+    # what errors of two sensors have in common counts for either, and may take from one
+    left = {name: max(variance, 0.0) for name, variance in parts.items()}
+    return {name: variance * float(z[par.SCALE]) / sum(left.values()) for name, variance in left.items()}
 
 
 def _rotations_first(data: Data, noise: Noise, prior: Prior) -> Estimate:

@@ -126,7 +126,7 @@ def group_frames(
     cam_from_imu
         (3, 3) from the alignment: its error matters little over the small rotations within a group.
     """
-    first = first_of_groups(t_s, rate_hz, tracks.gap_s(t_s))
+    first = first_of_groups(t_s, rate_hz, np.add(*tracks.gap_s(t_s)))
     count = np.diff(first, append=len(t_s))
     group = np.repeat(np.arange(len(first)), count)
 

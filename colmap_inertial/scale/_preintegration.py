@@ -15,7 +15,7 @@ are integrals over ``G``, so that nothing has to be propagated step by step.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,11 +53,20 @@ class Track:
         return np.asarray(ends)
 
     @classmethod
-    def of(cls, t_s: Array, value: Array) -> Track:
-        """A track through samples ``value`` (N, 3) at times ``t_s`` (N,)."""
-        slope = np.gradient(value, t_s, axis=0) if len(t_s) > 2 else np.repeat(np.diff(value, axis=0), 2, axis=0)
-        paused_s = np.concatenate([[0.0], np.cumsum(np.where(is_gap(t_s, _GAP_S), np.diff(t_s), 0.0))])
-        return cls(t_s=t_s, value=value, slope=slope, paused_s=paused_s)
+    def of(cls, t_s: Array, value: Array, lost: NDArray[np.bool_] | None = None) -> Track:
+        """A track through samples ``value`` (N, 3) at times ``t_s`` (N,).
+
+        ``lost`` are samples that say nothing: what they cover is a gap, however short.
+        """
+        kept = np.arange(len(t_s)) if lost is None else np.flatnonzero(~lost)
+        across = np.diff(kept) > 1
+        t_s, value = t_s[kept], value[kept]
+        paused_s = np.concatenate([[0.0], np.cumsum(np.where(across | is_gap(t_s, _GAP_S), np.diff(t_s), 0.0))])
+        return cls(t_s=t_s, value=value, slope=_slope(t_s, value), paused_s=paused_s)
+
+    def with_samples(self, t_s: Array, value: Array) -> Track:
+        """A track with as many other samples, and the same pauses."""
+        return replace(self, t_s=t_s, value=value, slope=_slope(t_s, value))
 
     def at(self, query_s: Array) -> tuple[Array, Array]:
         """Value and time derivative at ``query_s`` (M,); held constant outside the samples."""
@@ -71,6 +80,12 @@ class Track:
         return y0 + x * (m0 + x * (c2 + x * c3)), (m0 + x * (2 * c2 + 3 * x * c3)) / step
 
 
+def _slope(t_s: Array, value: Array) -> Array:
+    if len(t_s) > 2:
+        return np.asarray(np.gradient(value, t_s, axis=0))
+    return np.repeat(np.diff(value, axis=0), 2, axis=0)
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Tracks:
     """Readings of gyroscope (rad/s) and accelerometer (m/s2) over one clock."""
@@ -78,10 +93,10 @@ class Tracks:
     gyro: Track
     accel: Track
 
-    def gap_s(self, t_s: Array, accel_delay_s: float = 0.0) -> Array:
-        """(K,) seconds of gaps of the two sensors between K + 1 times; the delay is added to the accelerometer's."""
+    def gap_s(self, t_s: Array, accel_delay_s: float = 0.0) -> tuple[Array, Array]:
+        """(K,) seconds of gaps of gyroscope and accelerometer between K + 1 times; the delay is the accelerometer's."""
         accel_s = t_s - accel_delay_s
-        return self.gyro.gap_s(t_s[:-1], t_s[1:]) + self.accel.gap_s(accel_s[:-1], accel_s[1:])
+        return self.gyro.gap_s(t_s[:-1], t_s[1:]), self.accel.gap_s(accel_s[:-1], accel_s[1:])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -178,7 +193,7 @@ def preintegrate(nodes_s: Array, tracks: Tracks, errors: SensorErrors) -> Preint
     return Preintegrated(
         dt_s=dt_s,
         cov_accel=accel_noise_cov(dt_s),
-        cov_gaps=gap_cov(nodes_s, tracks.gap_s(nodes_s, errors.accel_delay_s)),
+        cov_gaps=gap_cov(nodes_s, *tracks.gap_s(nodes_s, errors.accel_delay_s)),
         rate_rad_s=rate_rad_s,
         **results,
     )
@@ -199,7 +214,9 @@ def accel_noise_cov(dt: Array) -> Array:
     return cov
 
 
-def gap_cov(nodes_s: Array, gap_s: Array) -> Array:
+def gap_cov(nodes_s: Array, gyro_gap_s: Array, accel_gap_s: Array) -> Array:
     """(K, 9, 9) covariance for what gaps of so many seconds between (K + 1,) nodes hide."""
-    hidden = [_GAP_RATE_RAD_S * gap_s, _GAP_ACCEL_M_S2 * gap_s, _GAP_ACCEL_M_S2 * gap_s * np.diff(nodes_s)]
+    # without its rotation a force has no direction
+    force_s = gyro_gap_s + accel_gap_s
+    hidden = [_GAP_RATE_RAD_S * gyro_gap_s, _GAP_ACCEL_M_S2 * force_s, _GAP_ACCEL_M_S2 * force_s * np.diff(nodes_s)]
     return np.asarray(np.repeat(np.stack(hidden, axis=1) ** 2, 3, axis=1)[:, :, None] * np.eye(9))

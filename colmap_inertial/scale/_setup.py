@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.geometry import matrix_from_quat
 from colmap_inertial.io.calibration import UNKNOWN_LEVER_ARM_M
+from colmap_inertial.sampling import at_ceiling
 from colmap_inertial.scale import _parameters as par
 from colmap_inertial.scale._grouping import find_breaks, group_frames
 from colmap_inertial.scale._noise import roughness
@@ -52,8 +54,9 @@ def prepare(
         When too few frames lie inside the IMU recording.
     """
     shift_s = clock_shift_s(trajectory, imu)
-    gyro = Track.of(imu.gyro_t_s + (shift_s + calibration.gyro_time_offset_s), imu.gyro_rad_s)
-    accel = Track.of(imu.accel_t_s + (shift_s + calibration.accel_time_offset_s), imu.accel_m_s2)
+    gyro_cut, accel_cut = cut_off(imu)
+    gyro = Track.of(imu.gyro_t_s + (shift_s + calibration.gyro_time_offset_s), imu.gyro_rad_s, gyro_cut)
+    accel = Track.of(imu.accel_t_s + (shift_s + calibration.accel_time_offset_s), imu.accel_m_s2, accel_cut)
     margin_s = 0.02
     tracks = Tracks(gyro=gyro, accel=accel)
     begin_s = max(gyro.t_s[0], accel.t_s[0]) + margin_s
@@ -96,6 +99,8 @@ def prepare(
         tracks=tracks,
         gyro_roughness_rad_s_rthz=roughness(imu.gyro_t_s, imu.gyro_rad_s),
         accel_roughness_m_s2_rthz=roughness(imu.accel_t_s, imu.accel_m_s2),
+        gyro_cut_share=float(gyro_cut.mean()),
+        accel_cut_share=float(accel_cut.mean()),
     )
 
     world_from_imu = world_from_cam @ cam_from_imu
@@ -129,6 +134,15 @@ def prepare(
         flat_m=UNKNOWN_LEVER_ARM_M[2] if _unknown_depth(calibration) else None,
     )
     return data, prior
+
+
+def cut_off(imu: ImuRecording) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """(N,), (M,) which samples of gyroscope and accelerometer stand at the end of the sensor's range on any axis."""
+    gyro, accel = imu.gyro_rad_s, imu.accel_m_s2
+    if imu.calibration is not None:
+        # digits that the corrections left behind would make one reading many
+        gyro, accel = (np.round(values, 9) for values in imu.calibration.uncorrected(gyro, accel))
+    return np.asarray(at_ceiling(gyro).any(axis=1)), np.asarray(at_ceiling(accel).any(axis=1))
 
 
 def _unknown_depth(calibration: CameraImuCalibration) -> bool:

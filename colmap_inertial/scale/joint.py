@@ -13,26 +13,39 @@ of the accelerometer and of the poses are estimated along (REML).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.geometry import quat_from_matrix
+from colmap_inertial.sampling import MUCH_CUT
 from colmap_inertial.scale import _parameters as par
 from colmap_inertial.scale._fit import Fit, fit_jointly
+from colmap_inertial.scale._parameters import Data, Prior
 from colmap_inertial.scale._setup import prepare
-from colmap_inertial.scale.priors import PRIORS, is_calibrated, model_scale_sigma
+from colmap_inertial.scale._suspects import Faults, worst
+from colmap_inertial.scale.priors import PRIORS, is_calibrated
 from colmap_inertial.scale.verdict import scale_drifts, student_factor, verdict_of
-from colmap_inertial.types import CAL, Array, CameraImuCalibration, CameraTrajectory, ImuRecording, ScaleEstimate
+from colmap_inertial.types import (
+    CAL,
+    Array,
+    CameraImuCalibration,
+    CameraTrajectory,
+    ImuNoise,
+    ImuRecording,
+    ScaleEstimate,
+)
 
 _LARGEST_BIAS_M_S2 = 2.0
-#: Chi-square of the accelerometer's nine gains and axis errors against their prior: the 8 recordings that this was
-#: tried on have 3 to 9; by chance, 28 is exceeded once in a thousand.
-_LARGEST_GAIN_CHI2 = 28.0
+#: Gains and sines of angles between axes.
+_LARGEST_GAIN = 0.2
 #: The accelerometer's noise between states over the motion's acceleration: 0.02 to 0.1 in good recordings, 0.4 and more
 #: where an axis is mirrored.
 _LARGEST_UNEXPLAINED = 0.25
+#: So many times at most is something wrong with the accelerometer looked for, undone, and the rest fitted again.
+_MOST_FAULTS = 4
 #: Shorter clips say too little about their own noise for a number to be trusted.
 _SHORTEST_TRUSTED_S = 6.0
 #: Real visual errors are not those of the model (alike over .1 to 1 s and longer), which counts the more the shorter a
@@ -102,23 +115,54 @@ def estimate_joint(
             gravity_sigma_m_s2=options.gravity_sigma_m_s2,
             states_hz=options.states_hz,
         )
-        fit = fit_jointly(data, prior, imu.noise)
+        fit, faults = _fit_soundly(data, prior, imu.noise)
     except NotObservableError as error:
         return ScaleEstimate.refused("joint", error.hint)
     except np.linalg.LinAlgError:
         return ScaleEstimate.refused("joint", f"camera and IMU do not determine a scale together: {_RECORD_INSTEAD}")
-    return _judged(fit, data.t_s, calibration, model_scale_sigma(is_calibrated(imu)))
+    wrong = [*faults.sentences(), *_cut_off(data)]
+    return _judged(fit, data.t_s, calibration, is_calibrated(imu), wrong)
 
 
-def _judged(fit: Fit, t_s: Array, calibration: CameraImuCalibration, floor: float) -> ScaleEstimate:
+def _fit_soundly(data: Data, prior: Prior, sheet: ImuNoise | None) -> tuple[Fit, Faults]:
+    """The fit, with what shows to be wrong with the accelerometer undone, and what that was."""
+    faults, sound = Faults(values={}), data
+    fit = fit_jointly(data, prior, sheet)
+    for _ in range(_MOST_FAULTS):
+        found = worst(fit.suspicions)
+        # a fit of what does not belong together explains nothing
+        if found is None or _refusals(fit, data.t_s):
+            break
+        faults = faults.with_found(found)
+        if not faults.can_be_undone:
+            break
+        sound = faults.undone(data)
+        fit = fit_jointly(sound, prior, sheet)
+    return fit, faults
+
+
+def _cut_off(data: Data) -> list[str]:
+    out = []
+    for sensor, share in (("gyroscope", data.gyro_cut_share), ("accelerometer", data.accel_cut_share)):
+        if share > MUCH_CUT:
+            out.append(
+                f"{100 * share:.2g} % of the {sensor}'s readings stand at the end of its range; they count as missing: "
+                "move less violently, or give the sensor a wider range"
+            )
+    return out
+
+
+def _judged(
+    fit: Fit, t_s: Array, calibration: CameraImuCalibration, calibrated: bool, wrong: Sequence[str]
+) -> ScaleEstimate:
     x = fit.estimate
     squares = sum(s for s, _ in fit.sums.values())
     expected = sum(e for _, e in fit.sums.values())
-    found = _scale_of(fit, t_s, floor)
+    found = _scale_of(fit, t_s, calibrated)
     metres_per_unit, sigma_log = found.metres_per_unit, found.sigma_log
     verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, refusals=_refusals(fit, t_s))
     if verdict != "refused":
-        verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, _checks(fit, t_s))
+        verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, [*wrong, *_checks(fit, t_s)])
     if fit.jumped:
         places = "one place" if fit.jumped == 1 else f"{fit.jumped} places"
         reasons = (*reasons, f"poses jump at {places}, which hardly counts")
@@ -142,6 +186,7 @@ def _judged(fit: Fit, t_s: Array, calibration: CameraImuCalibration, floor: floa
         dof=max(1, round(expected)),
         excitation_m_s2=fit.excitation_m_s2,
         drift=fit.drift,
+        parts=None if refused else found.parts,
     )
 
 
@@ -149,9 +194,10 @@ def _judged(fit: Fit, t_s: Array, calibration: CameraImuCalibration, floor: floa
 class _Scale:
     metres_per_unit: float
     sigma_log: float
+    parts: dict[str, float]
 
 
-def _scale_of(fit: Fit, t_s: Array, floor: float) -> _Scale:
+def _scale_of(fit: Fit, t_s: Array, calibrated: bool) -> _Scale:
     """The scale and the standard deviation of its logarithm, with what the fit takes for granted put right.
 
     The scale makes residuals orthogonal to the fitted path. That path follows the visual noise with as many degrees of
@@ -161,18 +207,21 @@ def _scale_of(fit: Fit, t_s: Array, floor: float) -> _Scale:
     """
     worst = max(s / e for s, e in fit.sums.values())
     bare = float(fit.cov[par.SCALE, par.SCALE])
-    sigma = (bare * max(1.0, worst)) ** 0.5
     taken = 3 * len(t_s) - fit.sums["centre_m"][1] - fit.sums["drift_m_rts"][1]
     share = bare * max(0.0, taken)
     overstated = max(0.0, 1 - (fit.expected_accel_m_s2_rthz / fit.noise.accel_m_s2_rthz) ** 2)
     # To first order only: not by more than what the recording leaves open
-    shift = min(overstated * share, sigma)
+    shift = min(overstated * share, (bare * max(1.0, worst)) ** 0.5)
     student = student_factor(fit.freedom)
-    sigma *= student * (1 + _UNMODELLED_S / float(t_s[-1] - t_s[0]))
-    variance = sigma**2 + (student * _UNIFORM * share) ** 2 + fit.level_variance
+    widened = max(1.0, worst) * (student * (1 + _UNMODELLED_S / float(t_s[-1] - t_s[0]))) ** 2
+    variances = {name: widened * variance for name, variance in fit.variance_parts.items()}
+    variances["noise_levels"] = (student * _UNIFORM * share) ** 2 + fit.level_variance
+    variances["accel_gain"] += 0.0 if calibrated else PRIORS.accel_model**2
+    variances["lens"] = PRIORS.lens**2
     return _Scale(
         metres_per_unit=fit.estimate.metres_per_unit * float(np.exp(shift)),
-        sigma_log=float(np.sqrt(variance + floor**2)),
+        sigma_log=sum(variances.values()) ** 0.5,
+        parts={name: variance**0.5 for name, variance in variances.items()},
     )
 
 
@@ -187,6 +236,13 @@ def _refusals(fit: Fit, t_s: Array) -> list[str]:
         out.append(
             f"the accelerometer would have to be off by {bias:.1f} m/s2, more than any working sensor is: check its "
             "unit (m/s2), its sign (at rest it reads +9.8 away from the ground) and its axes"
+        )
+    gain = float(np.abs(x.accel_gain).max())
+    if gain > _LARGEST_GAIN:
+        out.append(
+            f"the accelerometer's gains or axes would have to be off by {100 * gain:.0f} %, more than those of any "
+            "working sensor are: check its unit (m/s2), its sign (at rest it reads +9.8 away from the ground) and its "
+            "axes"
         )
     # Noise of the accelerometer averaged between states, against the acceleration that it should measure
     unexplained = fit.noise.accel_m_s2_rthz / float(np.sqrt(np.median(np.diff(t_s))))
@@ -208,11 +264,11 @@ def _checks(fit: Fit, t_s: Array) -> list[str]:
             f"the clip is short ({span_s:.1f} s): it says little about its own noise; "
             f"record {_SHORTEST_TRUSTED_S:.0f} s or more"
         )
-    if fit.gain_chi2 > _LARGEST_GAIN_CHI2:
+    if fit.gain_chi2 > par.LARGEST_GAIN_CHI2:
         gains = ", ".join(f"{-100 * g:+.1f}" for g in np.diagonal(fit.estimate.accel_gain))
         out.append(
-            f"the accelerometer seems to be off in gain by {gains} % on its axes, more than such sensors are: check "
-            "its unit and the strength of gravity, or calibrate it by holding it still in six directions"
+            f"the accelerometer seems to be off in gain by {gains} % on its axes, more than such sensors are, which "
+            "is allowed for: check its unit and the strength of gravity, or calibrate it (calibrate-imu)"
         )
     drift = fit.drift
     if scale_drifts(drift.p_value, drift.trend_log_per_s, drift.trend_sigma_log_per_s):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -263,6 +264,10 @@ class ScaleEstimate:
         Standard deviation of the camera's acceleration: what the scale rests on.
     drift
         Whether the scale stays the same along the recording; ``None`` where the method does not tell.
+    parts
+        What makes the interval as wide as it is: by cause (``scale.parts.CAUSES``), the standard deviation of the
+        logarithm that it alone would leave. Their squares add up to that of ``sigma_log``. ``None`` where the method
+        does not tell.
     method
         ``"spectral"`` or ``"joint"``; ``"none"`` where nothing could be estimated.
     """
@@ -282,6 +287,7 @@ class ScaleEstimate:
     dof: int | None = None
     excitation_m_s2: float | None = None
     drift: ScaleDrift | None = None
+    parts: Mapping[str, float] | None = None
     runtime_s: float = 0.0
 
     def __post_init__(self) -> None:
@@ -346,6 +352,7 @@ class ScaleEstimate:
             "dof": self.dof,
             "excitation_m_s2": self.excitation_m_s2,
             "drift": None if self.drift is None else self.drift.as_json(self.metres_per_unit),
+            "parts": None if self.parts is None else dict(self.parts),
             "method": self.method,
             "runtime_s": self.runtime_s,
         }

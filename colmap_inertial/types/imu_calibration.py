@@ -141,6 +141,12 @@ class ImuCalibration:
             repairs=(*imu.repairs, f"the IMU's readings were corrected by its calibration{attitudes}"),
         )
 
+    def uncorrected(self, gyro_rad_s: Array, accel_m_s2: Array) -> tuple[Array, Array]:
+        """(N, 3), (M, 3) what the sensors read where these are the true values."""
+        undo_gyro, undo_accel = (np.linalg.inv(np.eye(3) + gain).T for gain in (self.gyro_gain, self.accel_gain))
+        gyro, accel = gyro_rad_s + self.gyro_bias_rad_s, accel_m_s2 + self.accel_bias_m_s2
+        return np.asarray(gyro @ undo_gyro), np.asarray(accel @ undo_accel)
+
 
 def _directions(count: int) -> Array:
     """(count, 3) unit vectors evenly over half the sphere (Fibonacci's spiral)."""

@@ -85,7 +85,7 @@ def preintegrate_reference(nodes_s: Array, tracks: Tracks, errors: SensorErrors)
         position=position[end],
         cov_gyro=total(g @ g.transpose(0, 2, 1)),
         cov_accel=accel_noise_cov(dt),
-        cov_gaps=gap_cov(nodes_s, tracks.gap_s(nodes_s, errors.accel_delay_s)),
+        cov_gaps=gap_cov(nodes_s, *tracks.gap_s(nodes_s, errors.accel_delay_s)),
         by_gyro_bias=-total(g_body),
         by_accel_bias=by_accel_bias,
         by_gyro_gain=total((g_body[:, :, :, None] * reading[:, None, None, :]).reshape(-1, 9, 9)),

@@ -1,0 +1,196 @@
+"""A stream that is not what the sensor felt: named, undone where it can be, and never trusted."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from colmap_inertial.align import align_camera_imu
+from colmap_inertial.scale import _parameters as par, estimate_scale
+from colmap_inertial.scale._fit import fit_jointly
+from colmap_inertial.scale._preintegration import Track, Tracks, gap_cov
+from colmap_inertial.scale._setup import cut_off, prepare
+from colmap_inertial.scale._suspects import Faults, worst
+from colmap_inertial.scale.parts import CAUSES, parts_in_words
+from colmap_inertial.simulate.motion import MotionOptions
+from colmap_inertial.simulate.recording import RecordingOptions, simulate_recording
+from colmap_inertial.types import IMU_CAL, ImuCalibration
+
+
+@pytest.fixture(scope="module")
+def recording():
+    return simulate_recording(RecordingOptions(motion=MotionOptions(kind="roam", duration_s=40.0)), seed=7)
+
+
+def low_passed(imu, hz):
+    """A filter of the first order over samples as they come, as applications have it."""
+    out = imu.accel_m_s2.copy()
+    for i, step_s in enumerate(np.diff(imu.accel_t_s), start=1):
+        out[i] = out[i - 1] + (1 - np.exp(-2 * np.pi * hz * step_s)) * (out[i] - out[i - 1])
+    return replace(imu, accel_m_s2=out)
+
+
+def one_axis_late(imu, delay_s):
+    accel = imu.accel_m_s2.copy()
+    accel[:, 1] = np.interp(imu.accel_t_s - delay_s, imu.accel_t_s, accel[:, 1])
+    return replace(imu, accel_m_s2=accel)
+
+
+def stretched(imu, rate):
+    middle_s = imu.accel_t_s.mean()
+    return replace(imu, accel_t_s=middle_s + (imu.accel_t_s - middle_s) * (1 + rate))
+
+
+def saturated(imu, share):
+    limit = np.quantile(np.abs(imu.accel_m_s2).max(axis=1), 1 - share)
+    return replace(imu, accel_m_s2=np.clip(imu.accel_m_s2, -limit, limit))
+
+
+@pytest.mark.parametrize(
+    ("alter", "said", "value", "within"),
+    [
+        pytest.param(lambda imu: low_passed(imu, 2.0), r"low-passed at about ([\d.]+) Hz", 2.0, 0.5, id="2-hz"),
+        pytest.param(lambda imu: low_passed(imu, 4.0), r"low-passed at about ([\d.]+) Hz", 4.0, 0.8, id="4-hz"),
+        pytest.param(lambda imu: one_axis_late(imu, 0.01), r"y ([+-][\d.]+)", 6.7, 1.5, id="an-axis-late"),
+        pytest.param(lambda imu: stretched(imu, 1e-3), r"run ([+-]\d+) ppm", 1000, 60, id="a-clock-of-its-own"),
+        pytest.param(
+            lambda imu: replace(imu, accel_m_s2=1.05 * imu.accel_m_s2), r"by ([+-][\d.]+),", 5.0, 1.5, id="gain"
+        ),
+        pytest.param(lambda imu: saturated(imu, 0.03), r"([\d.]+) % of the accelerometer's", 3.0, 0.2, id="saturated"),
+    ],
+)
+def test_a_fault_of_the_accelerometer_is_named_and_undone(recording, alter, said, value, within):
+    estimate = estimate_scale(recording.trajectory, alter(recording.imu))
+    assert estimate.verdict == "weak"
+    found = [match for match in (re.search(said, reason) for reason in estimate.reasons) if match]
+    assert len(found) == 1, estimate.reasons
+    assert float(found[0][1]) == pytest.approx(value, abs=within)
+    assert estimate.ci95[0] < recording.truth.metres_per_unit < estimate.ci95[1]
+
+
+def test_a_path_that_was_smoothed_is_told_from_a_filtered_accelerometer(recording):
+    trajectory = recording.trajectory
+    kernel = np.exp(-0.5 * (np.arange(-9, 10) * np.median(np.diff(trajectory.t_s)) / 0.05) ** 2)
+    padded = np.pad(trajectory.cam_in_world, ((9, 9), (0, 0)), mode="edge")
+    smooth = np.stack([np.convolve(c, kernel / kernel.sum(), mode="valid") for c in padded.T], axis=1)
+    estimate = estimate_scale(replace(trajectory, cam_in_world=smooth), recording.imu)
+    assert estimate.verdict == "weak"
+    assert any("poses that were not smoothed" in reason for reason in estimate.reasons)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+def test_a_sound_accelerometer_raises_no_suspicion(seed):
+    sound = simulate_recording(RecordingOptions(motion=MotionOptions(kind="roam", duration_s=20.0)), seed=seed)
+    data, prior = prepared(sound)
+    found = {one.name: one.chi2 / len(one.value) for one in fit_jointly(data, prior, None).suspicions}
+    assert set(found) == {"bandwidth", "axes", "rate"} and max(found.values()) < 9
+
+
+def prepared(recording):
+    return prepare(
+        recording.trajectory,
+        recording.imu,
+        align_camera_imu(recording.trajectory, recording.imu),
+        gravity_m_s2=9.80665,
+        gravity_sigma_m_s2=0.02,
+        states_hz=8.0,
+    )
+
+
+def test_what_was_undone_is_suspected_no_more(recording):
+    altered = replace(recording, imu=one_axis_late(recording.imu, 0.012))
+    data, prior = prepared(altered)
+    found = worst(fit_jointly(data, prior, None).suspicions)
+    assert found.name == "axes" and found.chi2 > 100
+    undone = Faults(values={}).with_found(found).undone(data)
+    again = {one.name: one.chi2 for one in fit_jointly(undone, prior, None).suspicions}
+    assert again["axes"] < 0.1 * found.chi2
+
+
+def test_the_parts_of_the_variance_are_those_of_the_covariance(recording):
+    data, prior = prepared(recording)
+    fit = fit_jointly(data, prior, None)
+    variance = fit.cov[par.SCALE, par.SCALE]
+    assert sum(fit.variance_parts.values()) == pytest.approx(variance, rel=1e-9)
+    # one more measurement of a parameter with the prior's own information takes off its part, to first order
+    gravity = fit.estimate.gravity_m_s2 / np.linalg.norm(fit.estimate.gravity_m_s2)
+    with_scale = fit.cov[par.SCALE]
+    assert fit.variance_parts["gravity"] == pytest.approx((with_scale[par.GRAVITY] @ gravity / 0.02) ** 2, rel=1e-3)
+    gain, info = with_scale[par.ACCEL_GAIN], prior.info[par.ACCEL_GAIN, par.ACCEL_GAIN]
+    assert fit.variance_parts["accel_gain"] == pytest.approx(gain @ info @ gain, rel=1e-3)
+    assert fit.variance_parts["accel_noise"] > 0 and fit.variance_parts["camera_path"] > 0
+
+
+def test_the_interval_says_what_it_is_made_of_and_a_calibration_takes_its_part_off(recording):
+    cov = np.diag([1e-4**2] * IMU_CAL.COUNT)
+    known = ImuCalibration(
+        accel_gain=np.zeros((3, 3)),
+        accel_bias_m_s2=np.zeros(3),
+        gyro_gain=np.zeros((3, 3)),
+        gyro_bias_rad_s=np.zeros(3),
+        cov=cov,
+        gravity_m_s2=9.80665,
+        attitudes=24,
+    )
+    plain = estimate_scale(recording.trajectory, recording.imu)
+    better = estimate_scale(recording.trajectory, recording.imu, imu_calibration=known)
+    for estimate in (plain, better):
+        assert set(estimate.parts) == set(CAUSES)
+        assert sum(sigma**2 for sigma in estimate.parts.values()) == pytest.approx(estimate.sigma_log**2)
+    assert better.parts["accel_gain"] < 0.5 * plain.parts["accel_gain"]
+    said, advice = parts_in_words(plain.parts)
+    assert said.startswith("the accelerometer's gain +-") and "calibrate-imu" in advice
+    assert "calibrate-imu" not in parts_in_words(better.parts)[1]
+
+
+def test_cut_off_readings_are_found_behind_a_calibration(recording):
+    raw = saturated(recording.imu, 0.03)
+    rng = np.random.default_rng(5)
+    calibration = ImuCalibration(
+        accel_gain=np.tril(0.02 * rng.standard_normal((3, 3))),
+        accel_bias_m_s2=0.2 * rng.standard_normal(3),
+        gyro_gain=0.02 * rng.standard_normal((3, 3)),
+        gyro_bias_rad_s=0.01 * rng.standard_normal(3),
+        cov=np.eye(IMU_CAL.COUNT) * 1e-8,
+        gravity_m_s2=9.80665,
+        attitudes=12,
+    )
+    gyro, accel = cut_off(calibration.corrected(raw))
+    assert not gyro.any()
+    np.testing.assert_array_equal(accel, cut_off(raw)[1])
+    assert accel.mean() == pytest.approx(0.03, abs=0.002)
+
+
+def test_the_gyroscope_s_cut_off_readings_are_a_gap(recording):
+    imu = recording.imu
+    limit = np.quantile(np.abs(imu.gyro_rad_s), 0.99)
+    altered = replace(imu, gyro_rad_s=np.clip(imu.gyro_rad_s, -limit, limit))
+    data, _ = prepare(
+        recording.trajectory,
+        altered,
+        align_camera_imu(recording.trajectory, imu),
+        gravity_m_s2=9.80665,
+        gravity_sigma_m_s2=0.02,
+        states_hz=8.0,
+    )
+    assert data.gyro_cut_share > 0.01
+    assert data.tracks.gyro.paused_s[-1] == pytest.approx(data.gyro_cut_share * np.ptp(imu.gyro_t_s), rel=0.5)
+    estimate = estimate_scale(recording.trajectory, altered)
+    assert estimate.verdict == "weak" and any("of the gyroscope's readings" in reason for reason in estimate.reasons)
+    assert estimate.ci95[0] < recording.truth.metres_per_unit < estimate.ci95[1]
+
+
+def test_lost_samples_are_a_gap_of_their_own_sensor_however_short():
+    t_s = np.arange(0, 2, 0.01)
+    values = np.random.default_rng(0).standard_normal((len(t_s), 3))
+    lost = np.zeros(len(t_s), dtype=bool)
+    lost[50:53] = True
+    tracks = Tracks(gyro=Track.of(t_s, values), accel=Track.of(t_s, values, lost))
+    nodes_s = np.array([0.1, 0.3, 0.7, 1.0])
+    gyro_s, accel_s = tracks.gap_s(nodes_s)
+    np.testing.assert_allclose(gyro_s, 0)
+    np.testing.assert_allclose(accel_s, [0, 0.04, 0])
+    hidden = np.diagonal(gap_cov(nodes_s, gyro_s, accel_s)[1])
+    # the rotation does not suffer; the velocity may be off by 10 m/s2 for that long
+    np.testing.assert_allclose(hidden, np.repeat([0, 0.4, 0.4 * 0.4], 3) ** 2)
