@@ -1,7 +1,8 @@
 #!/usr/bin/env python3
 """Monte-Carlo study of the joint scale estimator on simulated recordings, against an independent bound.
 
-    python scripts/study_scale.py [--runs 1000] [--stressed 300] [--unobservable 200] [--json study.json]
+    python scripts/study_scale.py [--runs 1000] [--stressed 300] [--unobservable 200] [--faulty 300]
+                                  [--json study.json]
     python scripts/study_scale.py --only 1000017
 
 Recordings are drawn from what the estimator takes for granted (``scale/priors.py``), over phone, tablet and action
@@ -15,6 +16,8 @@ stressed       60 s, twice the accelerometer noise that the estimator assumes (t
                sensor, the sheet as without stress), and a drift of 1 cm/sqrt(s).
 unobservable   constant velocity, pure rotation, tripod, too short for its motion, stabilised video, and the IMU of
                another recording of the same kind.
+faulty         60 s of a sensor of its own (a third to thrice the preset's noise, of which no data sheet tells), with
+               one of the faults of ``scale_faults.py``. Most of them the bound knows nothing of.
 
 Each run has a seed that alone reproduces it: its millions tell the part, in the order above. Error and bound are those
 of the logarithm of the scale and contain the model's scale; ``scale_bound.py`` computes the bound from the truth.
@@ -39,6 +42,7 @@ from pathlib import Path
 
 import numpy as np
 from scale_bound import BoundPriors, bound_of
+from scale_faults import FAULTS
 
 from colmap_inertial.geometry import quat_conjugate, quat_exp, quat_multiply, quat_normalize
 from colmap_inertial.io.calibration import ACCEL_MINUS_GYRO_OFFSET_S
@@ -57,7 +61,9 @@ from colmap_inertial.simulate import (
 from colmap_inertial.threads import one_blas_thread
 from colmap_inertial.types import CameraTrajectory
 
-PARTS = ("handheld", "short", "stressed", "unobservable")
+PARTS = ("handheld", "short", "stressed", "unobservable", "faulty")
+#: Those whose scale could be known.
+OBSERVABLE = tuple(part for part in PARTS if part != "unobservable")
 PART_SIZE = 1_000_000
 DEVICES = ("phone", "tablet", "action_camera")
 KINDS = ("orbit", "roam", "walk")
@@ -117,6 +123,13 @@ def drawn(seed: int) -> tuple[RecordingOptions, str, str]:
     if part == "stressed":
         assumed = max(imu.accel_density_m_s2_rthz, TYPICAL.accel_m_s2_rthz)
         imu, drift_m_rts = replace(imu, accel_density_m_s2_rthz=2 * assumed), 0.01
+    if part == "faulty":
+        louder = float(np.exp(rng.uniform(-np.log(3), np.log(3))))
+        imu = replace(
+            imu,
+            accel_density_m_s2_rthz=louder * imu.accel_density_m_s2_rthz,
+            gyro_density_rad_s_rthz=louder * imu.gyro_density_rad_s_rthz,
+        )
     if futile:
         duration_s, speed_m_s = float(rng.uniform(10.0, 60.0)), float(rng.uniform(0.3, 1.5))
     if futile in ("constant_velocity", "pure_rotation", "static"):
@@ -149,6 +162,10 @@ def recorded(seed: int) -> tuple[SimulatedRecording, RecordingOptions, str, str]
     elif kind == "another_imu":
         other = simulate_recording(options, seed=seed + PART_SIZE // 2)
         recording = replace(recording, imu=replace(other.imu, noise=sheet))
+    elif PARTS[seed // PART_SIZE] == "faulty":
+        kind = list(FAULTS)[seed % len(FAULTS)]
+        recording = replace(recording, imu=replace(recording.imu, noise=None))
+        recording = FAULTS[kind](recording, np.random.default_rng([seed, 4]))
     return recording, options, kind, device
 
 
@@ -236,11 +253,12 @@ def summary(runs: Sequence[Run]) -> dict[str, float]:
 def groups(runs: Sequence[Run]) -> dict[str, list[Run]]:
     """Runs of each part but the unobservable ones, and those of its devices and motions."""
     out = {}
-    for part in PARTS[:3]:
+    for part in OBSERVABLE:
         of_part = [r for r in runs if r.part == part]
         if of_part:
             out[part] = of_part
-            for name, values in (("device", DEVICES), ("kind", KINDS)):
+            kinds = tuple(FAULTS) if part == "faulty" else KINDS
+            for name, values in (("device", DEVICES), ("kind", kinds)):
                 out |= {f"{part} {v}": [r for r in of_part if getattr(r, name) == v] for v in values}
     return {name: members for name, members in out.items() if members}
 
@@ -279,7 +297,7 @@ def show(runs: Sequence[Run]) -> None:
         label = "  " + name.split(" ")[1] if " " in name else name
         table.add_row(label, *(text(figures) for text in columns.values()), style="bold" if label == name else None)
     console.print(table)
-    for part in PARTS[:3]:
+    for part in OBSERVABLE:
         odd = [r for r in runs if r.part == part and (r.verdict != "trusted" or not r.inside)]
         counts = Counter(wording(reason) for r in odd for reason in r.reasons)
         for reason, count in counts.most_common(8):
@@ -341,6 +359,7 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=1000, help="of 60 s; a fifth as many short ones are added")
     parser.add_argument("--stressed", type=int, default=300)
     parser.add_argument("--unobservable", type=int, default=200)
+    parser.add_argument("--faulty", type=int, default=300)
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     parser.add_argument("--seed", type=int, default=0, help="number of the first run of each part")
     parser.add_argument("--json", type=Path, help="where to write figures and all runs")
@@ -349,7 +368,7 @@ def main() -> None:
     if arguments.only is not None:
         print(json.dumps(asdict(run(arguments.only)), indent=2))
         return
-    counts = (arguments.runs, arguments.runs // 5, arguments.stressed, arguments.unobservable)
+    counts = (arguments.runs, arguments.runs // 5, arguments.stressed, arguments.unobservable, arguments.faulty)
     begun_in = surroundings()
     runs = study(seeds(arguments.seed, counts), arguments.processes)
     show(runs)

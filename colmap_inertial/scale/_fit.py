@@ -129,7 +129,7 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
     ends_z[par.SCALE, 3] = 1.0
     imu.pull_back(own, ends[:, :, 4:], ends_z[:, 4:])
     states, z, cov = system.solve(ends, ends_z)
-    suspicions = sus.suspicions(where, own, imu.apply(states[:, :, 4:], z[:, 4:]), residual)
+    suspicions = sus.suspicions(where, own, imu.apply(states[:, :, 4:], z[:, 4:]), residual, z[par.SCALE, 4:])
     variance_parts = _variance_parts(groups, local, x, states[:, :, 3:4], z[:, 3])
     level_variance, freedom = search.scale_variance(groups, states[:, :, 3:4], z[:, 3:4])
     states, z = states[:, :, :3], z[:, :3]

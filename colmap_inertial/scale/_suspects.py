@@ -7,6 +7,7 @@ test of Rao, 1948): no second fit is needed to ask. In clean recordings the stat
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,8 +20,11 @@ from colmap_inertial.types import Array
 #: Squared deviation in standard deviations from which a suspicion counts. 935 clean recordings, real and simulated, had
 #: 23 at most.
 _LARGEST_CHI2 = 28.0
-#: Derivatives of readings are taken after smoothing by this: motion that the states resolve remains.
-_SMOOTH_S = 0.02
+#: The same, for each unknown, of what is left of a fault that was found.
+_LEFT_CHI2 = 0.25
+#: Derivatives of readings are taken after smoothing by this: to look for faults, where noise would hide them, and to
+#: undo them, where motion must not be lost.
+_SMOOTH_TO_FIND_S, _SMOOTH_TO_UNDO_S = 0.07, 0.02
 #: Noise (m/s2 per root of a hertz) behind a filter, which takes it along.
 _FILTERED_ACCEL = 2e-3
 #: The x, y and z axes' delays by the two unknowns of "axes": they leave the mean delay, which is fitted, alone.
@@ -37,16 +41,24 @@ class Suspicion:
         One of those in :func:`perturbations`.
     value, cov
         (q,), (q, q) of the unknowns, had they been fitted along.
+    by_scale
+        (q,) change of the logarithm of the scale with each.
     """
 
     name: str
     value: Array
     cov: Array
+    by_scale: Array
 
     @property
     def chi2(self) -> float:
         """Squared deviation from nothing, in standard deviations."""
         return float(self.value @ np.linalg.solve(self.cov, self.value))
+
+    @property
+    def scale_variance(self) -> float:
+        """What the uncertainty of the unknowns adds to the variance of the logarithm of the scale."""
+        return float(self.by_scale @ self.cov @ self.by_scale)
 
 
 def perturbations(accel: Track, middle_s: float) -> dict[str, list[Array]]:
@@ -55,7 +67,7 @@ def perturbations(accel: Track, middle_s: float) -> dict[str, list[Array]]:
     ``bandwidth`` (s2): to second order, and but for a delay, a low-pass filter takes from a signal what is proportional
     to its second derivative. ``axes`` (s): axes that are not read at the same time. ``rate``: a clock of its own.
     """
-    slope = np.gradient(_smooth(accel.t_s, accel.value), accel.t_s, axis=0)
+    slope = np.gradient(_smooth(accel.t_s, accel.value, _SMOOTH_TO_FIND_S), accel.t_s, axis=0)
     return {
         "bandwidth": [np.gradient(slope, accel.t_s, axis=0)],
         "axes": [slope * delays for delays in _AXES],
@@ -87,7 +99,9 @@ def columns(data: Data, x: Estimate, noise: Noise) -> tuple[dict[str, slice], Ar
     return where, fac.imu_root(noise, found[0]) @ by
 
 
-def suspicions(where: dict[str, slice], own: Array, explained: Array, residual: Array) -> list[Suspicion]:
+def suspicions(
+    where: dict[str, slice], own: Array, explained: Array, residual: Array, by_scale: Array
+) -> list[Suspicion]:
     """What the score tests say.
 
     Parameters
@@ -98,20 +112,25 @@ def suspicions(where: dict[str, slice], own: Array, explained: Array, residual: 
         (K, 9, q) what of the columns the fit's own parameters can do.
     residual
         (K, 9) whitened inertial residuals at the optimum.
+    by_scale
+        (q,) change of the logarithm of the scale with each column.
     """
     left = np.einsum("kri,krj->ij", own, own - explained)
     score = -np.einsum("kri,kr->i", own, residual)
     out = []
     for name, at in where.items():
         cov = np.linalg.inv(0.5 * (left[at, at] + left[at, at].T))
-        out.append(Suspicion(name=name, value=cov @ score[at], cov=cov))
+        out.append(Suspicion(name=name, value=cov @ score[at], cov=cov, by_scale=by_scale[at]))
     return out
 
 
-def worst(found: list[Suspicion]) -> Suspicion | None:
-    """The strongest suspicion that is more than chance, None where there is none."""
-    strongest = max(found, key=lambda suspicion: suspicion.chi2)
-    return strongest if strongest.chi2 > _LARGEST_CHI2 else None
+def worst(found: list[Suspicion], known: Collection[str] = ()) -> Suspicion | None:
+    """The strongest suspicion that is more than chance, None where there is none.
+
+    Of what is ``known`` to be wrong already, more than half a standard deviation that is left counts.
+    """
+    counts = [one for one in found if one.chi2 > (_LEFT_CHI2 * len(one.value) if one.name in known else _LARGEST_CHI2)]
+    return max(counts, key=lambda one: one.chi2, default=None)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -138,7 +157,7 @@ class Faults:
         """
         accel = data.tracks.accel
         t_s, value, rough = accel.t_s, accel.value, data.accel_roughness_m_s2_rthz
-        slope = np.gradient(_smooth(t_s, value), t_s, axis=0)
+        slope = np.gradient(_smooth(t_s, value, _SMOOTH_TO_UNDO_S), t_s, axis=0)
         if "bandwidth" in self.values:
             value = value + self._time_constant_s * slope
             # the filter took the noise, too, and it comes back
@@ -186,8 +205,8 @@ class Faults:
         return out
 
 
-def _smooth(t_s: Array, values: Array) -> Array:
-    width = _SMOOTH_S / float(np.median(np.diff(t_s)))
+def _smooth(t_s: Array, values: Array, over_s: float) -> Array:
+    width = over_s / float(np.median(np.diff(t_s)))
     reach = max(1, int(np.ceil(3 * width)))
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / width) ** 2)
     padded = np.pad(values, ((reach, reach), (0, 0)), mode="edge")

@@ -45,7 +45,7 @@ _LARGEST_GAIN = 0.2
 #: where an axis is mirrored.
 _LARGEST_UNEXPLAINED = 0.25
 #: So many times at most is something wrong with the accelerometer looked for, undone, and the rest fitted again.
-_MOST_FAULTS = 4
+_MOST_FAULTS = 6
 #: Shorter clips say too little about their own noise for a number to be trusted.
 _SHORTEST_TRUSTED_S = 6.0
 #: Real visual errors are not those of the model (alike over .1 to 1 s and longer), which counts the more the shorter a
@@ -120,6 +120,7 @@ def estimate_joint(
         return ScaleEstimate.refused("joint", error.hint)
     except np.linalg.LinAlgError:
         return ScaleEstimate.refused("joint", f"camera and IMU do not determine a scale together: {_RECORD_INSTEAD}")
+    fit.variance_parts["accel_faults"] = sum(s.scale_variance for s in fit.suspicions if s.name in faults.values)
     wrong = [*faults.sentences(), *_cut_off(data)]
     return _judged(fit, data.t_s, calibration, is_calibrated(imu), wrong)
 
@@ -129,7 +130,7 @@ def _fit_soundly(data: Data, prior: Prior, sheet: ImuNoise | None) -> tuple[Fit,
     faults, sound = Faults(values={}), data
     fit = fit_jointly(data, prior, sheet)
     for _ in range(_MOST_FAULTS):
-        found = worst(fit.suspicions)
+        found = worst(fit.suspicions, faults.values)
         # a fit of what does not belong together explains nothing
         if found is None or _refusals(fit, data.t_s):
             break

@@ -46,6 +46,9 @@ CAUSES: dict[str, Cause] = {
         advice="calibrate camera and IMU once (align), or give what is known of them",
     ),
     "gravity": Cause(words="the strength of gravity", advice="give the latitude"),
+    "accel_faults": Cause(
+        words="what was undone of the accelerometer's faults", advice="record what is undone here rightly"
+    ),
     "noise_levels": Cause(words="how little the clip says of its own noise", advice="record longer"),
 }
 
