@@ -150,6 +150,8 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / "imu" / f"{name}.txt").write_text("\n".join(rows) + "\n")
     write_tum(folder / "right.tum", recording.trajectory)
     write_tum(folder / "inverted.tum", reread(recording.trajectory, INVERTED, TUM))
+    both = PoseConvention(rotation="camera_from_world", order="wxyz")
+    write_tum(folder / "both.tum", reread(recording.trajectory, both, TUM))
     return folder
 
 
@@ -169,6 +171,11 @@ def test_commands_name_it(files: Path, capsys: pytest.CaptureFixture[str]) -> No
     assert exit_code("align", wrong, *imu, "--out", files / "calibration.json") == 3
     assert said in " ".join(capsys.readouterr().err.split())
     assert not (files / "calibration.json").exists()
+    # inverted and in the other order, rotations turn the right way again; the accelerometer tells
+    assert exit_code("align", files / "both.tum", *imu, "--out", files / "calibration.json") == 3
+    assert "inverted" in (err := " ".join(capsys.readouterr().err.split())) and "order w x y z" in err
+    assert not (files / "calibration.json").exists()
+    assert exit_code("align", files / "right.tum", *imu, "--out", files / "right.json") == 0
     assert exit_code("diagnose", wrong, *imu, "--json", files / "findings.json") == 1
     findings = json.loads((files / "findings.json").read_text())["findings"]
     assert [one["code"] for one in findings if one["severity"] == "error"] == ["pose-convention"]

@@ -161,7 +161,7 @@ def align_source(source: ScaleSource, out: Path) -> CameraImuCalibration:
     ------
     NotObservableError
         Where no offset between the clocks is better than the rest, or the camera hardly turned. Poses that fit by
-        another convention are named.
+        another convention are named, also where their rotations alone would do.
     """
     check_output(out, [source.source, source.imu, source.frame_times])
     recording = load_source(source)
@@ -169,12 +169,17 @@ def align_source(source: ScaleSource, out: Path) -> CameraImuCalibration:
     try:
         found = align_camera_imu(recording.trajectory, recording.imu, prior=recording.calibration, options=options)
     except NotObservableError as error:
-        likely = _likely_convention(recording, recording.trajectory, options)
-        if likely is None:
-            raise
-        raise NotObservableError(error.quantity, likely.sentence) from error
+        _refuse_another_convention(recording, options, error.quantity)
+        raise
+    _refuse_another_convention(recording, options, "rotation")
     write_calibration(out, found)
     return found
+
+
+def _refuse_another_convention(recording: TimedPoses, options: AlignOptions, quantity: str) -> None:
+    likely = _likely_convention(recording, recording.trajectory, options)
+    if likely is not None:
+        raise NotObservableError(quantity, likely.sentence)
 
 
 def _likely_convention(
