@@ -46,33 +46,11 @@ class MappingOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScaleOptions:
-    """How the scale is estimated."""
-
-    method: Literal["joint", "spectral"] = "joint"
-    """joint fits all measurements at once, video or keyframes; spectral is the thesis method, for video."""
-
-    gravity_m_s2: float = 9.80665
-    """Strength of gravity where the recording was made."""
-
-    max_offset_s: float | None = None
-    """Largest offset between the clocks of camera and IMU; 1 for a shared clock. Without it, all are searched."""
-
-    def __post_init__(self) -> None:
-        if not 9.7 <= self.gravity_m_s2 <= 9.9:
-            raise ValueError(
-                f"gravity_m_s2 must be from 9.7 to 9.9 (it is 9.76 to 9.84 on Earth), not {self.gravity_m_s2:g}"
-            )
-        if self.max_offset_s is not None and not self.max_offset_s > 0:
-            raise ValueError(f"max_offset_s must be positive, not {self.max_offset_s:g}")
-
-
-@dataclass(frozen=True, kw_only=True)
 class GravityOptions:
     """How strong gravity is where something was recorded: a number, or the place; else what spans the Earth."""
 
     gravity_m_s2: float | None = None
-    """Strength of gravity at the place, where it is known to four digits or better."""
+    """Strength of gravity at the place, where it is known to four digits or better (9.80665 says nothing of it)."""
     latitude_deg: float | None = None
     """Latitude of the place, from which the strength of gravity follows to 0.005 %."""
     height_m: float | None = None
@@ -91,6 +69,22 @@ class GravityOptions:
             raise ValueError("--height-m goes with --latitude-deg")
         if self.height_m is not None and not -1000 <= self.height_m <= 10000:
             raise ValueError(f"height_m must be from -1000 to 10000, not {self.height_m:g}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScaleOptions(GravityOptions):
+    """How the scale is estimated."""
+
+    method: Literal["joint", "spectral"] = "joint"
+    """joint fits all measurements at once, video or keyframes; spectral is the thesis method, for video."""
+
+    max_offset_s: float | None = None
+    """Largest offset between the clocks of camera and IMU; 1 for a shared clock. Without it, all are searched."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.max_offset_s is not None and not self.max_offset_s > 0:
+            raise ValueError(f"max_offset_s must be positive, not {self.max_offset_s:g}")
 
 
 @dataclass(frozen=True, kw_only=True)

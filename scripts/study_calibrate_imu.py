@@ -17,7 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from colmap_inertial.errors import NotObservableError
-from colmap_inertial.rest import KNOWN_GRAVITY_SIGMA_M_S2, RestCalibration, calibrate_imu
+from colmap_inertial.rest import RestCalibration, calibrate_imu
+from colmap_inertial.scale.priors import PRIORS
 from colmap_inertial.simulate import RestOptions, SimulatedRests, simulate_rests
 from colmap_inertial.types import IMU_CAL, ImuRecording
 
@@ -49,14 +50,14 @@ def errors_of(found: RestCalibration, truth: SimulatedRests) -> tuple[np.ndarray
 def study(options: RestOptions, runs: int, seed: int) -> dict[str, dict[str, float]]:
     """Coverage (per cent), and root mean squares of errors and of z, by kind of parameter."""
     errors, sigmas, refused, missed = [], [], 0, 0
-    off_m_s2 = KNOWN_GRAVITY_SIGMA_M_S2 * np.random.default_rng(seed).standard_normal(runs)
+    off_m_s2 = PRIORS.known_gravity_m_s2 * np.random.default_rng(seed).standard_normal(runs)
     for run in range(runs):
         truth = simulate_rests(options, seed=seed + run)
         try:
             found = calibrate_imu(
                 truth.recording,
                 gravity_m_s2=options.gravity_m_s2 + off_m_s2[run],
-                gravity_sigma_m_s2=KNOWN_GRAVITY_SIGMA_M_S2,
+                gravity_sigma_m_s2=PRIORS.known_gravity_m_s2,
             )
         except NotObservableError:
             refused += 1
@@ -108,7 +109,7 @@ def read_xsens(path: Path) -> ImuRecording:
 def show_xsens(path: Path) -> None:
     """Print what becomes of the real rests."""
     found = calibrate_imu(
-        read_xsens(path), gravity_m_s2=XSENS_GRAVITY_M_S2, gravity_sigma_m_s2=KNOWN_GRAVITY_SIGMA_M_S2
+        read_xsens(path), gravity_m_s2=XSENS_GRAVITY_M_S2, gravity_sigma_m_s2=PRIORS.known_gravity_m_s2
     )
     turns = np.degrees(found.turn_residual_rad)
     print(f"\nXsens: {len(found.rests)} rests in {found.rests.attitudes} attitudes, verdict {found.verdict}")

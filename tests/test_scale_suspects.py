@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from colmap_inertial.align import align_camera_imu
-from colmap_inertial.scale import _parameters as par, estimate_scale
+from colmap_inertial.options import ScaleOptions
+from colmap_inertial.scale import _parameters as par, estimate_scale, gravity_at_latitude_m_s2
 from colmap_inertial.scale._fit import fit_jointly
 from colmap_inertial.scale._preintegration import Track, Tracks, gap_cov
 from colmap_inertial.scale._setup import cut_off, prepare
@@ -142,6 +143,19 @@ def test_the_interval_says_what_it_is_made_of_and_a_calibration_takes_its_part_o
     said, advice = parts_in_words(plain.parts)
     assert said.startswith("the accelerometer's gain +-") and "calibrate-imu" in advice
     assert "calibrate-imu" not in parts_in_words(better.parts)[1]
+
+
+def test_the_latitude_takes_the_part_of_gravity_off(recording):
+    plain = estimate_scale(recording.trajectory, recording.imu)
+    placed = estimate_scale(
+        recording.trajectory, recording.imu, options=ScaleOptions(latitude_deg=45.0, height_m=100.0)
+    )
+    assert placed.parts["gravity"] < 0.1 * plain.parts["gravity"]
+    strength = np.linalg.norm(placed.gravity_in_world_m_s2)
+    assert strength == pytest.approx(gravity_at_latitude_m_s2(45.0, 100.0), abs=2e-3)
+    # standard gravity says nothing of the place
+    same = estimate_scale(recording.trajectory, recording.imu, options=ScaleOptions(gravity_m_s2=9.80665))
+    assert same.parts == plain.parts
 
 
 def test_cut_off_readings_are_found_behind_a_calibration(recording):

@@ -34,10 +34,6 @@ class Scale:
     """Calibration files of this device: from `align --out`, from `calibrate-imu --out`, or both."""
     first_s: float | None = None
     """Use only this many seconds from the start of the camera's recording."""
-    latitude_deg: float | None = None
-    """Latitude of the recording, from which the strength of gravity follows."""
-    height_m: float | None = None
-    """Height of the recording above the sea, with --latitude-deg."""
     device: str | None = None
     """Name of the device, under which calibrations were remembered (default: what the recording says)."""
     remembered: bool = True
@@ -49,10 +45,6 @@ class Scale:
     def __post_init__(self) -> None:
         if self.first_s is not None and not self.first_s > 0:
             raise ValueError(f"first_s must be positive, not {self.first_s:g}")
-        if self.latitude_deg is not None and not -90 <= self.latitude_deg <= 90:
-            raise ValueError(f"latitude_deg must be from -90 to 90, not {self.latitude_deg:g}")
-        if self.height_m is not None and self.latitude_deg is None:
-            raise ValueError("--height-m goes with --latitude-deg")
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
@@ -70,8 +62,6 @@ class Scale:
             self.options,
             json=self.json,
             first_s=self.first_s,
-            latitude_deg=self.latitude_deg,
-            height_m=self.height_m or 0.0,
         )
         show_scale(estimate, self.source)
         return 3 if estimate.verdict == "refused" else 0

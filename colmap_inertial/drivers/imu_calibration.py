@@ -10,22 +10,11 @@ from colmap_inertial.io.files import write_text
 from colmap_inertial.io.imu import read_raw_imu
 from colmap_inertial.io.imu_calibration import write_imu_calibration
 from colmap_inertial.io.plausible import check_alive
-from colmap_inertial.io.units import STANDARD_GRAVITY_M_S2
 from colmap_inertial.options import GravityOptions
 from colmap_inertial.report import require_plotly
 from colmap_inertial.report.imu_calibration import calibration_page
-from colmap_inertial.rest import KNOWN_GRAVITY_SIGMA_M_S2, RestCalibration, calibrate_imu
-from colmap_inertial.scale import check_units, gravity_at_latitude_m_s2
-from colmap_inertial.scale.priors import PRIORS
-
-
-def strength(gravity: GravityOptions) -> tuple[float, float]:
-    """Gravity and its standard deviation, m/s2, by what is known of the place."""
-    if gravity.gravity_m_s2 is not None:
-        return gravity.gravity_m_s2, KNOWN_GRAVITY_SIGMA_M_S2
-    if gravity.latitude_deg is not None:
-        return gravity_at_latitude_m_s2(gravity.latitude_deg, gravity.height_m or 0.0), KNOWN_GRAVITY_SIGMA_M_S2
-    return STANDARD_GRAVITY_M_S2, PRIORS.gravity_m_s2
+from colmap_inertial.rest import RestCalibration, calibrate_imu
+from colmap_inertial.scale import check_units, strength_of_gravity
 
 
 def calibrate_source(
@@ -66,7 +55,7 @@ def calibrate_source(
         problems = check_units(imu)
         if problems:
             raise FormatError(raw.path, "; ".join(problems))
-    gravity_m_s2, sigma = strength(gravity or GravityOptions())
+    gravity_m_s2, sigma = strength_of_gravity(gravity or GravityOptions())
     found = calibrate_imu(imu, gravity_m_s2=gravity_m_s2, gravity_sigma_m_s2=sigma, device=device)
     write_imu_calibration(out, found.calibration)
     write_text(page, calibration_page(found, source=str(recording.resolve())))

@@ -23,7 +23,7 @@ from colmap_inertial.io.pose_convention import COLMAP, INERTIAL_SCALE, TUM, Pose
 from colmap_inertial.io.trajectories import read_inertial_scale, read_tum
 from colmap_inertial.model import apply_similarity, find_models, is_metric, read_model, trajectory_from_model
 from colmap_inertial.options import ScaleOptions, ValidateOptions
-from colmap_inertial.scale import estimate_scale, first_seconds, gravity_at_latitude_m_s2
+from colmap_inertial.scale import estimate_scale, first_seconds
 from colmap_inertial.types import CameraImuCalibration, CameraTrajectory, ImuRecording, ScaleEstimate, Similarity
 from colmap_inertial.validate import Validation, parse_target, validate_model, write_overlays
 
@@ -196,8 +196,6 @@ def scale_source(
     *,
     json: Path,
     first_s: float | None = None,
-    latitude_deg: float | None = None,
-    height_m: float = 0.0,
 ) -> ScaleEstimate:
     """Estimate the scale of an existing model or trajectory and write it.
 
@@ -211,14 +209,8 @@ def scale_source(
         Written whole, also when the scale is refused.
     first_s
         Use only the first seconds of the camera's recording, for the alignment too.
-    latitude_deg, height_m
-        Set ``options.gravity_m_s2``.
     """
     check_output(json, [source.source, source.imu, source.frame_times, *as_paths(source.calibration)])
-    if latitude_deg is not None:
-        if options.gravity_m_s2 != ScaleOptions().gravity_m_s2:
-            raise InertialError("--gravity-m-s2 and --latitude-deg both set the strength of gravity; give one of them")
-        options = dataclasses.replace(options, gravity_m_s2=gravity_at_latitude_m_s2(latitude_deg, height_m))
     used = used_files(source.calibration)
     recording = load_source(source)
     trajectory = recording.trajectory

@@ -26,8 +26,6 @@ FULL_ATTITUDES, FEWEST_ATTITUDES = 9, 6
 #: Largest standard deviations of a good calibration, beside ``KNOWN_GAIN`` of the accelerometer's gains: of its
 #: misalignments (.1 degree), and of the gyroscope's gains.
 _GOOD_MISALIGNMENT, _GOOD_GYRO_GAIN = 0.002, 0.003
-#: Gravity by latitude and height is wrong by what lies under the ground: this much is rarely exceeded.
-KNOWN_GRAVITY_SIGMA_M_S2 = 5e-4
 #: A threshold is considered where it finds this share of the most attitudes that any finds.
 _MOST_ATTITUDES = 0.9
 #: A misalignment is that of one axis against another, each of which has the prior's.
@@ -245,7 +243,6 @@ def _listed(axes: list[str]) -> str:
 __all__ = [
     "FEWEST_ATTITUDES",
     "FULL_ATTITUDES",
-    "KNOWN_GRAVITY_SIGMA_M_S2",
     "RestCalibration",
     "calibrate_imu",
 ]

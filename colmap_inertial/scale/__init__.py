@@ -12,8 +12,9 @@ from colmap_inertial.errors import NotObservableError
 from colmap_inertial.gyro import on_camera_rate
 from colmap_inertial.io.plausible import GRAVITY_BOUNDS_M_S2, LARGEST_MEDIAN_RATE_RAD_S
 from colmap_inertial.io.units import STANDARD_GRAVITY_M_S2
-from colmap_inertial.options import ScaleOptions
+from colmap_inertial.options import GravityOptions, ScaleOptions
 from colmap_inertial.scale._remarks import remarks
+from colmap_inertial.scale.priors import PRIORS
 from colmap_inertial.scale.verdict import verdict_of
 from colmap_inertial.threads import one_blas_thread
 from colmap_inertial.types import CameraImuCalibration, CameraTrajectory, ImuCalibration, ImuRecording, ScaleEstimate
@@ -44,6 +45,18 @@ def gravity_at_latitude_m_s2(latitude_deg: float, height_m: float = 0.0) -> floa
     a, f, m = 6378137.0, 1 / 298.257223563, 0.00344978650684
     h = height_m / a
     return float(on_ellipsoid * (1 - 2 * (1 + f + m - 2 * f * sine_squared) * h + 3 * h**2))
+
+
+def strength_of_gravity(options: GravityOptions) -> tuple[float, float]:
+    """Gravity and its standard deviation, m/s2, by what is known of the place.
+
+    Standard gravity, given as such, says nothing of the place.
+    """
+    if options.gravity_m_s2 is not None and options.gravity_m_s2 != STANDARD_GRAVITY_M_S2:
+        return options.gravity_m_s2, PRIORS.known_gravity_m_s2
+    if options.latitude_deg is not None:
+        return gravity_at_latitude_m_s2(options.latitude_deg, options.height_m or 0.0), PRIORS.known_gravity_m_s2
+    return STANDARD_GRAVITY_M_S2, PRIORS.gravity_m_s2
 
 
 def first_seconds(trajectory: CameraTrajectory, seconds: float, *, start_s: float | None = None) -> CameraTrajectory:
@@ -149,13 +162,15 @@ def _estimate_or_refuse(
 def _estimate(
     trajectory: CameraTrajectory, imu: ImuRecording, calibration: CameraImuCalibration, options: ScaleOptions
 ) -> ScaleEstimate:
+    gravity_m_s2, sigma_m_s2 = strength_of_gravity(options)
     if options.method == "spectral":
         from colmap_inertial.scale.spectral import SpectralOptions, estimate_spectral
 
-        return estimate_spectral(trajectory, imu, calibration, SpectralOptions(gravity_m_s2=options.gravity_m_s2))
+        return estimate_spectral(trajectory, imu, calibration, SpectralOptions(gravity_m_s2=gravity_m_s2))
     from colmap_inertial.scale.joint import JointOptions, estimate_joint
 
-    return estimate_joint(trajectory, imu, calibration, JointOptions(gravity_m_s2=options.gravity_m_s2))
+    known = JointOptions(gravity_m_s2=gravity_m_s2, gravity_sigma_m_s2=sigma_m_s2)
+    return estimate_joint(trajectory, imu, calibration, known)
 
 
 __all__ = [
@@ -163,5 +178,6 @@ __all__ = [
     "estimate_scale",
     "first_seconds",
     "gravity_at_latitude_m_s2",
+    "strength_of_gravity",
     "verdict_of",
 ]

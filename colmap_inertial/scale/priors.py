@@ -29,6 +29,8 @@ class JointPriors:
     """Errors of visual centres by errors of visual rotations: of the size of the scene's depth."""
     gravity_m_s2: float = 0.02
     """Magnitude of gravity: 9.78 at the equator to 9.83 at the poles."""
+    known_gravity_m_s2: float = 5e-4
+    """The same where the latitude is known: what lies under the ground, 0.0003 m/s2 rms, is rarely more."""
     lens: float = 0.0015
     """Scale of the part of the model that somebody measures against that of the camera's path: errors of the focal
     length and of the lens bend a model by tenths of a percent, and no inertial data show it."""
