@@ -94,6 +94,12 @@ def test_scale_uses_no_later_frame_than_it_was_given(capsys, project, tmp_path):
     assert a["metres_per_unit"] == pytest.approx(b["metres_per_unit"], rel=1e-9)
 
 
+@pytest.mark.parametrize("after", [[], ["--json", "x.json"]], ids=["last", "before-an-option"])
+def test_a_calibration_without_a_file_is_an_error(capsys, project, after):
+    code, _, err = run(capsys, "scale", project.model, "--calibration", *after)
+    assert code == 2 and "--calibration takes a file" in err
+
+
 def test_align_writes_a_calibration_that_scale_takes_as_a_prior(capsys, project, tmp_path):
     files = ["--imu", project.imu, "--frame-times", project.frame_times]
     calibration = tmp_path / "phone.json"

@@ -64,6 +64,8 @@ def parse(args: Sequence[str]) -> Command:
     ------
     FormatError
         For a ``--config`` file that cannot be read.
+    InertialError
+        For ``--calibration`` without a file.
     """
     choices: list[Any] = []
     for name, cls in _COMMANDS.items():
@@ -89,8 +91,9 @@ def _calibrations_last(args: Sequence[str]) -> list[str]:
         if word != "--calibration":
             rest.append(word)
             continue
-        files += remaining[:1]
-        del remaining[:1]
+        if not remaining or remaining[0].startswith("--"):
+            raise InertialError("--calibration takes a file, or two: from `align --out`, from `calibrate-imu --out`")
+        files.append(remaining.pop(0))
         while remaining and remaining[0].lower().endswith(".json"):
             files.append(remaining.pop(0))
     return [*rest, "--calibration", *files] if files else rest
