@@ -52,6 +52,9 @@ class Fit:
         How many of the states' poses hardly count or lie behind a break of the path.
     gain_chi2
         Squared deviation of the accelerometer's nine gains and axis errors from their prior.
+    gain_surprise
+        The same against the prior as it was used in the end, over what chance makes of it: one standard deviation more
+        than is to be expected. At least 1.
     variance_parts
         What the variance of the logarithm of the scale comes from, by the keys of ``parts.CAUSES``.
     suspicions
@@ -72,6 +75,7 @@ class Fit:
     excitation_m_s2: float
     jumped: int
     gain_chi2: float
+    gain_surprise: float
     variance_parts: dict[str, float]
     suspicions: list[sus.Suspicion]
 
@@ -158,6 +162,7 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
         excitation_m_s2=_excitation_m_s2(data, x),
         jumped=int(np.sum(data.broken)) + _jumped(groups["rotation"], groups["centre"]),
         gain_chi2=prior.gain_chi2(x),
+        gain_surprise=_gain_surprise(local, x, cov),
         variance_parts=variance_parts,
         suspicions=suspicions,
     )
@@ -188,6 +193,17 @@ _PART_OF_GLOBALS = {
         slice(par.ACCEL_DELAY, par.ACCEL_DELAY + 1),
     ],
 }
+
+
+def _gain_surprise(prior: Prior, x: Estimate, cov: Array) -> float:
+    """How much farther from their prior the gains are than chance has it; see :class:`Fit`.
+
+    What of the gains the data do not determine stays at the prior's mean: ``9 - trace(information covariance)`` of them
+    are determined.
+    """
+    info = prior.info[par.ACCEL_GAIN, par.ACCEL_GAIN]
+    determined = max(0.0, len(info) - float(np.sum(info * cov[par.ACCEL_GAIN, par.ACCEL_GAIN])))
+    return max(1.0, prior.gain_chi2(x) / max(determined + (2 * determined) ** 0.5, 1e-9))
 
 
 def _variance_parts(

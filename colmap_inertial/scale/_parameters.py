@@ -176,6 +176,9 @@ class Prior:
     flat_m
         Half the thickness of a device of which nothing is known, None where the lever arm is: along the optical axis
         the IMU lies as near to the camera in phones, and farther in rigs (Cauchy's distribution).
+    heavy_gains
+        Whether gains of the accelerometer beyond ``LARGEST_GAIN_CHI2`` are pulled no more than there: one sensor in
+        many is off by far more than the rest.
     """
 
     mean: Estimate
@@ -185,16 +188,14 @@ class Prior:
     gyro_bias_sigma_rad_s: float = 0.2
     speed_sigma_m_s: float = 10.0
     flat_m: float | None = None
+    heavy_gains: bool = False
 
     def at(self, x: Estimate) -> Prior:
-        """The normal prior that pulls at an estimate as much as this one does.
-
-        Gains of an accelerometer that are beyond what the normal distribution allows have another, with heavy tails:
-        one sensor in many is off by far more than the rest.
-        """
+        """The normal prior that pulls at an estimate as much as this one does."""
         info = self.info.copy()
-        info[ACCEL_GAIN] *= min(1.0, LARGEST_GAIN_CHI2 / max(self.gain_chi2(x), 1e-9))
-        info[:, ACCEL_GAIN] = info[ACCEL_GAIN].T
+        if self.heavy_gains:
+            info[ACCEL_GAIN] *= min(1.0, LARGEST_GAIN_CHI2 / max(self.gain_chi2(x), 1e-9))
+            info[:, ACCEL_GAIN] = info[ACCEL_GAIN].T
         if self.flat_m is not None:
             info[LEVER.stop - 1, LEVER.stop - 1] = 2 / (self.flat_m**2 + float(x.imu_in_cam_m[2]) ** 2)
         return replace(self, info=info)

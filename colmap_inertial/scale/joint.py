@@ -130,6 +130,10 @@ def _fit_soundly(data: Data, prior: Prior, sheet: ImuNoise | None) -> tuple[Fit,
     faults, sound = Faults(values={}), data
     fit = fit_jointly(data, prior, sheet)
     for _ in range(_MOST_FAULTS):
+        if fit.gain_chi2 > par.LARGEST_GAIN_CHI2 and not prior.heavy_gains:
+            # not from the start: on its way a fit passes gains that it would not find back from
+            prior = replace(prior, heavy_gains=True)
+            fit = fit_jointly(sound, prior, sheet)
         found = worst(fit.suspicions, faults.values)
         # a fit of what does not belong together explains nothing
         if found is None or _refusals(fit, data.t_s):
@@ -216,6 +220,7 @@ def _scale_of(fit: Fit, t_s: Array, calibrated: bool) -> _Scale:
     student = student_factor(fit.freedom)
     widened = max(1.0, worst) * (student * (1 + _UNMODELLED_S / float(t_s[-1] - t_s[0]))) ** 2
     variances = {name: widened * variance for name, variance in fit.variance_parts.items()}
+    variances["accel_gain"] *= fit.gain_surprise
     variances["noise_levels"] = (student * _UNIFORM * share) ** 2 + fit.level_variance
     variances["accel_gain"] += 0.0 if calibrated else PRIORS.accel_model**2
     variances["lens"] = PRIORS.lens**2
