@@ -24,6 +24,7 @@ from .errors import (
     TargetNotFoundError as TargetNotFoundError,
     TimingError as TimingError,
 )
+from .export.whole import Exported as Exported, export_model as export_model
 from .imaging.blur_field import BlurField as BlurField
 from .imaging.gyro_camera import FrameShutter as FrameShutter, GyroCamera as GyroCamera
 from .imaging.psf import blur_field as blur_field, frame_blur as frame_blur
@@ -37,6 +38,7 @@ from .io.imu_calibration import (
     write_imu_calibration as write_imu_calibration,
 )
 from .io.imu_formats import ImuFormat as ImuFormat
+from .io.limits import reading_within as reading_within
 from .io.pose_convention import PoseConvention as PoseConvention
 from .model import (
     Model as Model,
@@ -52,6 +54,7 @@ from .options import (
     BatchOptions as BatchOptions,
     MappingOptions as MappingOptions,
     ProjectOptions as ProjectOptions,
+    ReadLimits as ReadLimits,
     ReconstructOptions as ReconstructOptions,
     ScaleOptions as ScaleOptions,
     StageNames as StageNames,

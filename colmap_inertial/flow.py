@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.geometry import (
+    cross,
     quat_conjugate,
     quat_cumulative,
     quat_exp,
@@ -394,19 +395,14 @@ def _fit_rate(first: Array, second: Array, span_s: Array, pixel_rad: float) -> t
     mean_s = float(np.mean(span_s))
     if mean_s <= 0:
         return None
-    best, most = np.zeros(3), -1
-    rng = np.random.default_rng(0)
     reach = _INLIER_PX * pixel_rad
-    for i, j in rng.integers(0, len(a), (_DRAWS, 2)):
-        rotation = _from_two(a[[i, j]], b[[i, j]])
-        if rotation is None:
-            continue
-        count = int(np.sum(np.linalg.norm(b - a @ rotation.T, axis=1) < reach))
-        if count > most:
-            best, most = -so3_log(rotation) / mean_s, count
+    draws = np.random.default_rng(0).integers(0, len(a), (_DRAWS, 2))
+    rotations = _from_two(a[draws], b[draws])
+    counts = [int(np.sum(np.linalg.norm(b - a @ rotation.T, axis=1) < reach)) for rotation in rotations]
+    most = max(counts, default=-1)
     if most < 3:
         return None
-    rate, scatter = best, reach
+    rate, scatter = -so3_log(rotations[counts.index(most)]) / mean_s, reach
     for _ in range(_ROUNDS):
         rotated = np.einsum("nij,nj->ni", so3_exp(-rate * span_s[:, None]), a)
         residual = b - rotated
@@ -429,15 +425,25 @@ def _fit_rate(first: Array, second: Array, span_s: Array, pixel_rad: float) -> t
     return rate, sigma, int(np.sum(square < reach**2))
 
 
-def _from_two(a: Array, b: Array) -> Array | None:
-    """The rotation that takes two directions to two others, as well as can be."""
+def _from_two(a: Array, b: Array) -> Array:
+    """Rotations that take two directions to two others, as well as can be; draws of nearly the same are left out.
+
+    Parameters
+    ----------
+    a, b
+        (N, 2, 3) draws of two directions.
+
+    Returns
+    -------
+    (M, 3, 3) of M draws, in their order.
+    """
+    normals = [cross(pair[:, 0], pair[:, 1]) for pair in (a, b)]
+    lengths = [np.linalg.norm(normal, axis=1, keepdims=True) for normal in normals]
+    apart = np.all([length[:, 0] >= 0.02 for length in lengths], axis=0)
     frames = []
-    for pair in (a, b):
-        normal = np.cross(pair[0], pair[1])
-        length = np.linalg.norm(normal)
-        if length < 0.02:
-            return None
-        middle = pair[0] + pair[1]
-        middle = middle / np.linalg.norm(middle)
-        frames.append(np.stack([middle, normal / length, np.cross(middle, normal / length)], axis=1))
-    return np.asarray(frames[1] @ frames[0].T)
+    for pair, normal, length in zip((a, b), normals, lengths, strict=True):
+        middle = pair[apart, 0] + pair[apart, 1]
+        middle = middle / np.linalg.norm(middle, axis=1, keepdims=True)
+        up = normal[apart] / length[apart]
+        frames.append(np.stack([middle, up, cross(middle, up)], axis=2))
+    return np.asarray(frames[1] @ np.swapaxes(frames[0], 1, 2))

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.geometry import (
+    cross,
     matrix_from_quat,
     quat_conjugate,
     quat_cumulative,
@@ -107,7 +108,7 @@ class GyroPath:
 def _turn(rate_before: Array, rate_after: Array, step_s: Array) -> Array:
     """Rotations (K, 4) over steps in which the rate goes linearly from one value to the other (Magnus, two terms)."""
     step = step_s[:, None]
-    return quat_exp(0.5 * step * (rate_before + rate_after) + step**2 / 12 * np.cross(rate_before, rate_after))
+    return quat_exp(0.5 * step * (rate_before + rate_after) + step**2 / 12 * cross(rate_before, rate_after))
 
 
 def _by_symmetric(rate: Array) -> Array:

@@ -11,6 +11,43 @@ BlurRemover = Literal["wiener", "deepgyro"]
 DeblurMethod = Literal["off", "wiener", "deepgyro"]
 RollingShutterMethod = Literal["off", "rectify"]
 WorldAxes = Literal["z-up", "y-down"]
+#: What an export is for: a program, or a format.
+ExportProgram = Literal[
+    "3dgs",
+    "gsplat",
+    "nerfstudio",
+    "brush",
+    "opensplat",
+    "instant-ngp",
+    "3dgs-deblur",
+    "metashape",
+    "bundler",
+    "ply",
+    "las",
+    "tum",
+    "csv",
+    "gltf",
+]
+ExportImages = Literal["rectified", "original"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadLimits:
+    """How large a file may be that is read: above any camera's and recorder's, below what takes all memory."""
+
+    megapixels: float = 250
+    """Pictures of more pixels (millions) are not decoded."""
+    table_columns: int = 10_000
+    """Tables of more columns are not read."""
+    file_gib: float = 4
+    """Texts, tables and pictures in larger files (GiB) are not read."""
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            if not getattr(self, f.name) > 0:
+                raise ValueError(f"limits.{f.name} must be positive, not {getattr(self, f.name):g}")
+        if self.megapixels > 1073:
+            raise ValueError(f"limits.megapixels: OpenCV decodes no more than 1073, not {self.megapixels:g}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,7 +154,8 @@ class DenseOptions:
     """How the dense reconstruction is made."""
 
     max_image_size: int | None = None
-    """Longer side in pixels of the undistorted images and their depth maps (default: as the images are)."""
+    """Longer side in pixels of the undistorted images and their depth maps (default: as the images are with CUDA, at
+    most 1200 without)."""
     mesh: Literal["poisson", "none"] = "poisson"
     """Surface of the fused points."""
 
@@ -169,7 +207,7 @@ class ProjectOptions:
     link: bool = False
     """Project: hard links for files that do not change; an edit of one then changes the original, too."""
     follow_links: bool = False
-    """Project: take what symbolic links out of it lead to into OUT/project_metric; without, they are refused."""
+    """Project: take what symbolic links out of it lead to into OUT; without, they are refused."""
 
     def __post_init__(self) -> None:
         ways = (self.frame_times is not None and self.video is None, self.name_times is not None, self.exif_times)
@@ -257,6 +295,8 @@ class ReconstructOptions:
     """Make metric also what COLMAP made of fewer than 5 images, or of 1 % of those of its largest model."""
     force: bool = False
     """Go on where the check beforehand finds what makes metres meaningless; the verdict is then at most weak."""
+    limits: ReadLimits = field(default_factory=ReadLimits)
+    """How large a file may be that is read."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.seed < 2**31:

@@ -6,6 +6,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from contextvars import copy_context
 from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
@@ -46,6 +47,8 @@ def frames_at_once() -> int:
 def in_order(work: Callable[[Item], Result], items: Iterable[Item], *, workers: int) -> Iterator[Result]:
     """What becomes of items, in their order; ``workers`` are in work at once, and hardly more are held.
 
+    What holds for the caller (a context variable) holds for the work.
+
     Where the caller stops early or an item fails, those that have not begun are given up.
     """
     from concurrent.futures import ThreadPoolExecutor
@@ -54,7 +57,7 @@ def in_order(work: Callable[[Item], Result], items: Iterable[Item], *, workers: 
     waiting: deque[Future[Result]] = deque()
     try:
         for item in items:
-            waiting.append(pool.submit(work, item))
+            waiting.append(pool.submit(copy_context().run, work, item))
             if len(waiting) > workers:
                 yield waiting.popleft().result()
         while waiting:

@@ -56,6 +56,7 @@ from aperture_baselines import (
 )
 from numpy.typing import NDArray
 
+from colmap_inertial import semi_global
 from colmap_inertial.drivers.fuse_apertures import fuse_captured
 from colmap_inertial.multi_aperture import _volume as volume, estimate_disparity, fuse_apertures, fuse_with, plane_of
 from colmap_inertial.multi_aperture.disparity import Disparity
@@ -201,12 +202,12 @@ def bench_graph_cuts(folder: Path) -> list[dict[str, Any]]:
         columns=columns,
         rows=rows,
         cost=cost,
-        share=volume.shares(3),
+        share=semi_global.shares(3),
         unseen=18,
         radius=2,
     )
     part, guide = np.ascontiguousarray(cost[crop]), np.ascontiguousarray(planes[0][crop])
-    small, jump = volume.jump_table(3)
+    small, jump = semi_global.jump_table(3)
     total = np.empty((*guide.shape, -(-len(spaced) // 32) * 32), dtype=np.uint16)
     start = time.perf_counter()
     _apertures.semi_global(part, guide, small=small, jump=jump, total=total)
@@ -410,7 +411,7 @@ def bench_cost() -> list[dict[str, Any]]:
                         "matching_cpu_s": matching[1],
                         "fusion_s": whole[0],
                         "fusion_cpu_s": whole[1],
-                        "volumes_mib": volume.strips(side, side * 3 * number)[0][3] * side * 3 * number / 2**20,
+                        "volumes_mib": semi_global.strips(side, side * 3 * number)[0][3] * side * 3 * number / 2**20,
                     }
                 )
     return rows

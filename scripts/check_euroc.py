@@ -1,6 +1,6 @@
 """Compare a metric model of EuRoC V1_01_easy with motion capture: scale error, up axis, camera centres.
 
-    python scripts/check_euroc.py OUT/sparse_metric/0 DATASET
+    python scripts/check_euroc.py OUT/sparse/0 DATASET
 
 DATASET is the folder with ``gt/`` and ``mav0/``. The scale error is the metric model's length over the true
 length, minus one, from a similarity between camera centres (Umeyama 1991). The true up is the accelerometer averaged in

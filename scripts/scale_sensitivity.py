@@ -73,7 +73,7 @@ class Found:
 
 def constants() -> dict[str, float | None]:
     """All that are varied, with their defaults; None where the calibration's covariance holds the value."""
-    known = [f.name for f in dataclasses.fields(PRIORS) if not f.name.startswith("calibrated")]
+    known = [f.name for f in dataclasses.fields(PRIORS) if not f.name.startswith(("calibrated", "known"))]
     out: dict[str, float | None] = {f"PRIORS.{name}": getattr(PRIORS, name) for name in known}
     levels = dataclasses.fields(_noise.TYPICAL)
     from_stream = ("rotation_excess", "gyro_rad_s_rthz", "accel_m_s2_rthz")

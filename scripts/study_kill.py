@@ -24,7 +24,7 @@ max_num_features = 1500
 first_octave = 0
 max_image_size = 480
 """
-COMPARED = ("images", "images_rectified", "sparse", "sparse_metric", "trajectory.tum")
+COMPARED = ("images", "sparse", "colmap/images", "colmap/sparse", "trajectory.tum")
 
 
 def contents(out: Path) -> dict[str, bytes]:

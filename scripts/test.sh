@@ -29,5 +29,8 @@ fi
 .venv/bin/ruff check .
 .venv/bin/ruff format --check .
 .venv/bin/mypy
-# A process for each core: one thread in each is enough. Tests of one file share what it sets up.
-OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 .venv/bin/python -m pytest --numprocesses auto --dist loadfile "$@"
+# A process for each core: one thread in each is enough. Tests of one file share what it sets up, and the slowest files
+# begin first (tests/slow.txt). Modules are compiled once, not in each of the processes that tests start.
+unset PYTHONDONTWRITEBYTECODE
+OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 .venv/bin/python -m pytest --numprocesses auto --dist loadfile \
+  --no-loadscope-reorder "$@"

@@ -23,5 +23,5 @@ def tiny_capture(folder: Path, *, frames: int = FRAMES) -> Path:
 
 def model_bytes(out: Path) -> dict[str, bytes]:
     """Every file of the models that a reconstruction made."""
-    found = [path for name in ("sparse", "sparse_metric") for path in (out / name).rglob("*") if path.is_file()]
+    found = [path for name in ("colmap/sparse", "sparse") for path in (out / name).rglob("*") if path.is_file()]
     return {str(path.relative_to(out)): path.read_bytes() for path in sorted(found)}

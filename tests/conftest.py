@@ -13,6 +13,9 @@ from colmap_inertial.threads import one_blas_thread
 #: Files of the quick tier: each takes a few seconds at most.
 QUICK = Path(__file__).with_name("quick.txt").read_text().split()
 
+#: Files that take longest, the longest first: a worker that is handed one of them last keeps the others waiting.
+SLOW = Path(__file__).with_name("slow.txt").read_text().split()
+
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--quick", action="store_true", help="only the files named in tests/quick.txt")
@@ -41,6 +44,11 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     if config.getoption("--quick") and collection_path.suffix == ".py":
         return collection_path.name not in QUICK or None
     return None
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    place = {name: i for i, name in enumerate(SLOW)}
+    items.sort(key=lambda item: place.get(item.path.name, len(place)))
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from far_scene import CAM_FROM_IMU, srgb
+from far_scene import CAM_FROM_IMU, rays_of, srgb
 
 from colmap_inertial.geometry import matrix_from_quat
 from colmap_inertial.imaging.gyro_camera import FrameShutter
@@ -52,32 +52,30 @@ class CornerScene:
     def picture(self, i, *, noise=0.006):
         """(H, W, 3) 8 bit sRGB."""
         shutter = self.shutter(i)
-        x, y = np.meshgrid(np.arange(LENS.width) + 0.5, np.arange(LENS.height) + 0.5)
-        flat = np.stack([x, y], axis=-1).reshape(-1, 2)
-        rays = np.asarray(colmap_camera(LENS).cam_from_img(flat))[:, :2].reshape(*x.shape, 2)
-        rays = np.concatenate([rays, np.ones((*x.shape, 1))], axis=-1)
+        pixels, rays = rays_of(LENS)
         samples = max(2, round(self.exposure_s * 400))
-        light = np.zeros((*x.shape, 3), np.float32)
+        light = np.zeros(rays.shape, np.float32)
         for k in range(samples):
-            t_s = shutter.middle_s(np.stack([x[:, 0], y[:, 0]], axis=-1)) + self.exposure_s * (
-                (k + 0.5) / samples - 0.5
-            )
+            t_s = shutter.middle_s(pixels[:, 0]) + self.exposure_s * ((k + 0.5) / samples - 0.5)
             rotation = matrix_from_quat(self.motion.world_from_cam_xyzw(t_s))
-            light += self._seen(self.motion.cam_in_world_m(t_s), np.einsum("yij,yxj->yxi", rotation, rays)) / samples
+            light += self._seen(self.motion.cam_in_world_m(t_s), rays @ np.swapaxes(rotation, 1, 2)) / samples
         light += noise * np.random.default_rng(i).standard_normal(light.shape)
         return np.round(255 * srgb(light)).astype(np.uint8)
 
     def _seen(self, centre, direction):
-        nearest, out = np.full(direction.shape[:2], np.inf), np.zeros(direction.shape, np.float32)
-        for (axis, place), texture in zip(PLANES, self.textures, strict=True):
-            with np.errstate(divide="ignore"):
-                along = (place - centre[:, None, axis]) / direction[..., axis]
-            closer = (along > 0) & (along < nearest)
-            nearest = np.where(closer, along, nearest)
-            point = centre[:, None] + np.where(closer, along, 0)[..., None] * direction
-            u, v = (np.mod(400 * point[..., k], 1024).astype(np.float32) for k in range(3) if k != axis)
-            seen = cv2.remap(texture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            out[closer] = seen[closer]
+        with np.errstate(divide="ignore"):
+            along = np.stack([(place - centre[:, None, axis]) / direction[..., axis] for axis, place in PLANES])
+        along[along <= 0] = np.inf
+        which, nearest = along.argmin(axis=0), along.min(axis=0)
+        hit = np.isfinite(nearest)
+        point = centre[:, None] + np.where(hit, nearest, 0)[..., None] * direction
+        texel = np.mod(400 * point, 1024).astype(np.float32)
+        out = np.zeros(direction.shape, np.float32)
+        for plane, ((axis, _), texture) in enumerate(zip(PLANES, self.textures, strict=True)):
+            here = hit & (which == plane)
+            if here.any():
+                u, v = (texel[..., k] for k in range(3) if k != axis)
+                out[here] = cv2.remap(texture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[here]
         return out
 
     def true_blur(self, i, xy):

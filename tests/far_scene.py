@@ -1,6 +1,7 @@
 """A flat texture infinitely far away, filmed by a camera that only turns: exact blur and rolling shutter, quickly."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -18,6 +19,15 @@ CAM_FROM_IMU = quat_exp(np.array([0.3, -2.1, 0.8]))
 def srgb(linear):
     light = np.clip(linear, 0, 1)
     return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+
+
+@lru_cache(maxsize=4)
+def rays_of(model):
+    """(H, W, 2) the middles of a camera's pixels, and (H, W, 3) their rays, z = 1. Nobody may change them."""
+    x, y = np.meshgrid(np.arange(model.width) + 0.5, np.arange(model.height) + 0.5)
+    pixels = np.stack([x, y], axis=-1)
+    rays = np.asarray(colmap_camera(model).cam_from_img(pixels.reshape(-1, 2)))[:, :2].reshape(pixels.shape)
+    return pixels, np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,17 +60,15 @@ class FarScene:
 
     def linear(self, model, shutter: FrameShutter, samples=1):
         """(H, W, 3) light: the mean of ``samples`` sharp pictures within the exposure of each line."""
-        x, y = np.meshgrid(np.arange(model.width) + 0.5, np.arange(model.height) + 0.5)
-        pixels = np.stack([x, y], axis=-1)
-        rays = np.asarray(colmap_camera(model).cam_from_img(pixels.reshape(-1, 2)))[:, :2].reshape(pixels.shape)
-        rays = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=-1)
+        pixels, rays = rays_of(model)
         by_column = shutter.readout_direction in ("right", "left")
         line_s = shutter.middle_s(pixels[0] if by_column else pixels[:, 0])
         total = np.zeros((model.height, model.width, 3), np.float32)
         scale = self.texture.shape[0] / (2 * self.half)
         for k in range(samples):
             turn = self.wall_from_cam(line_s + shutter.exposure_s * ((k + 0.5) / samples - 0.5))
-            seen = np.einsum("xij,yxj->yxi" if by_column else "yij,yxj->yxi", turn, rays)
+            back = np.swapaxes(turn, 1, 2)
+            seen = np.swapaxes(np.swapaxes(rays, 0, 1) @ back, 0, 1) if by_column else rays @ back
             u, v = (((seen[..., i] / seen[..., 2] + self.half) * scale - 0.5).astype(np.float32) for i in (0, 1))
             total += cv2.remap(self.texture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
         return total / samples

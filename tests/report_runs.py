@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -30,6 +31,7 @@ def cloud(num_points: int = 300) -> pycolmap.Reconstruction:
     return pycolmap.synthesize_dataset(options)
 
 
+@lru_cache(maxsize=4)
 def recorded(*, kind: str = "orbit", duration_s: float = 20.0, seed: int = 3):
     """Trajectory in metres where there is a scale, IMU, estimate, gravity in the trajectory's world, truth."""
     recording = simulate_recording(RecordingOptions(motion=MotionOptions(kind=kind, duration_s=duration_s)), seed=seed)
@@ -76,8 +78,8 @@ def write_run(
         "points": points,
         "observations": 4 * points,
         "mean_reprojection_error_px": 0.4,
-        "sparse": "sparse/0",
-        "sparse_metric": "sparse_metric/0" if metric else None,
+        "sparse": "colmap/sparse/0",
+        "sparse_metric": "sparse/0" if metric else None,
         "trajectory": "trajectory.tum" if metric else None,
         **estimate.as_json(),
         "reasons": [*estimate.reasons, f"something about {name}"],

@@ -58,7 +58,23 @@ def test_what_runs_out_on_the_way_is_a_sentence(monkeypatch, capsys, error, said
     assert told.startswith(f"error: {said}") and len(told.splitlines()) == 1
 
 
-@pytest.mark.parametrize("error", [OSError(errno.EIO, "Input/output error"), ImportError("no module"), KeyError("a")])
+def test_what_it_has_led_to_is_the_same_sentence(monkeypatch, capsys):
+    def run(self):
+        try:
+            raise ImportError("_core.so: failed to map segment from shared object")
+        except ImportError as error:
+            raise RuntimeError("Cannot import the backend.\nMake sure that you install it") from error
+
+    monkeypatch.setattr(Scale, "run", run)
+    with pytest.raises(SystemExit) as stopped:
+        main(["scale", "a", "--json", "b"])
+    assert stopped.value.code == 2
+    assert capsys.readouterr().err.startswith("error: the memory is used up")
+
+
+@pytest.mark.parametrize(
+    "error", [OSError(errno.EIO, "Input/output error"), ImportError("no module"), KeyError("a"), RuntimeError("b")]
+)
 def test_anything_else_keeps_its_traceback(monkeypatch, error):
     def run(self):
         raise error

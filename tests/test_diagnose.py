@@ -357,7 +357,7 @@ def test_an_imu_file_alone_is_diagnosed_and_what_is_none_is_bad_input(
 
 # --- pictures --------------------------------------------------------------------------------------------------------
 
-LENS = CameraModel(model="PINHOLE", width=320, height=240, params=(250, 250, 160, 120))
+LENS = CameraModel(model="PINHOLE", width=240, height=180, params=(187.5, 187.5, 120, 90))
 RATE_HZ = 15.0
 
 
@@ -395,7 +395,11 @@ def film() -> Film:
         readout_s=0.0,
     )
     frames = [
-        Frame(name=name, image=scene.picture(LENS, FrameShutter.of(timing, i, width=320, height=240)), t_s=t_s[i])
+        Frame(
+            name=name,
+            image=scene.picture(LENS, FrameShutter.of(timing, i, width=LENS.width, height=LENS.height)),
+            t_s=t_s[i],
+        )
         for i, name in enumerate(timing.names)
     ]
     return Film(frames=frames, timing=timing, imu=imu_of(scene, seconds=12.0))
@@ -410,7 +414,7 @@ def test_what_is_wrong_with_pictures_is_found(film: Film, filmed: Recorded) -> N
     clean = filmed
     assert diagnose(clean).findings == ()
     assert clean.rotation is not None
-    wider = replace(LENS, params=(300.0, 300.0, 160.0, 120.0))
+    wider = replace(LENS, params=(225.0, 225.0, 120.0, 90.0))
     assert found(diagnose(film.recorded(wider)), "focal-length") == "error"
 
     kernel = np.ones(15) / 15
@@ -449,7 +453,7 @@ def test_pictures_cut_wrongly_from_a_video_are_found(film: Film, tmp_path: Path,
     stamps_ms = 100 + np.cumsum(np.where(np.arange(60) // 15 % 2 == 0, 33, 50))
     with av.open(str(tmp_path / "clip.mp4"), "w") as container:
         stream = container.add_stream("libx264", rate=30, options={"crf": "15"})
-        stream.width, stream.height, stream.pix_fmt = 320, 240, "yuv420p"
+        stream.width, stream.height, stream.pix_fmt = LENS.width, LENS.height, "yuv420p"
         stream.time_base = stream.codec_context.time_base = Fraction(1, 1000)
         for frame, stamp in zip(film.frames[::2], stamps_ms.tolist(), strict=False):
             picture = av.VideoFrame.from_ndarray(frame.image, format="rgb24")

@@ -555,7 +555,7 @@ def test_what_is_done_to_frames_has_the_form_that_the_schema_describes(imu, tmp_
         place=3, closed_by="start", ranked_by="blur", blur=np.nan, first=0, last=5, baseline=0.1, motion=np.nan
     )
     selection = Selection(names=("b.jpg",), frames=9, note="so", windows=(window,), offset_s=0.1, offset_from="pixels")
-    dense = DenseResult(folder=tmp_path / "dense_metric" / "0", images=4, depth_maps=0, waiting="depth maps")
+    dense = DenseResult(folder=tmp_path / "dense" / "0", images=4, depth_maps=0, maps="plane sweep", waiting="none")
     values = {"blur_px": 4.0, "kept_share": 0.2, "extent_factor": 1.1}
     treated = Treatment(stage="deblur", reason="so", action="deblurred", values=values)
     record = FrameRecord(name="a.jpg", action="deblurred", camera=camera, treatments=(treated,))

@@ -33,6 +33,19 @@ def pair(scene):
     return scene.short_codes(), scene.long_codes()
 
 
+@pytest.fixture(scope="module")
+def together(scene, pair):
+    """With a good gyroscope."""
+    return bring_together(*pair, gyro=gyro_of(scene))
+
+
+@pytest.fixture(scope="module")
+def stranger():
+    """A pair of another place, and its long exposure."""
+    scene = make_scene(31)
+    return scene, scene.long_codes()
+
+
 def nodes_of(scene):
     rows, columns = BlurField.nodes(scene.camera.width, scene.camera.height)
     grid = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1)
@@ -151,8 +164,7 @@ def test_a_blur_turns_with_the_picture():
     assert np.allclose(seen.vector_px, [10 * np.cos(angle) / 1.1, -10 * np.sin(angle) / 1.1], atol=1e-4)
 
 
-def test_pairs_come_together_by_a_good_gyroscope_alone(scene, pair):
-    together = bring_together(*pair, gyro=gyro_of(scene))
+def test_pairs_come_together_by_a_good_gyroscope_alone(scene, together):
     registered = together.registered
     assert registered.by_gyro and registered.alike and not together.gyro_note
     assert np.median(errors_px(scene, registered.shift_px)) < 0.1
@@ -181,8 +193,8 @@ def test_pixels_alone_bring_pairs_together(scene, pair):
     assert together.gyro_note == "no gyroscope"
 
 
-def test_a_gyroscope_of_another_recording_is_left_out(scene, pair):
-    other = gyro_of(make_scene(77))
+def test_a_gyroscope_of_another_recording_is_left_out(scene, pair, stranger):
+    other = gyro_of(stranger[0])
     wrong = PairGyro(motion=other.motion, camera=other.camera, short=scene.short, long=scene.long)
     together = bring_together(*pair, gyro=wrong)
     assert not together.registered.by_gyro and together.blur is None
@@ -196,8 +208,7 @@ def test_an_unrecorded_exposure_leaves_the_pixels(scene, pair):
     assert "does not cover" in together.gyro_note and together.registered.by_pixels and together.blur is None
 
 
-def test_the_aligned_long_exposure_agrees_with_its_true_picture(scene, pair):
-    together = bring_together(*pair, gyro=gyro_of(scene))
+def test_the_aligned_long_exposure_agrees_with_its_true_picture(scene, pair, together):
     sharp = scene.sharp()
     inner = (slice(20, -20), slice(20, -20))
     good = together.covered[inner] & ~together.clipped[inner]
@@ -232,9 +243,8 @@ def test_pictures_that_agree_already_are_not_moved():
     assert not together.registered.shift_px.any() and together.covered.all()
 
 
-def test_pictures_of_different_views_are_told(scene, pair):
-    other = make_scene(31)
-    together = bring_together(pair[0], other.long_codes())
+def test_pictures_of_different_views_are_told(pair, stranger):
+    together = bring_together(pair[0], stranger[1])
     assert not together.registered.alike
     # a wall without any detail contradicts nothing
     rng = np.random.default_rng(5)

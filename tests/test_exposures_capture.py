@@ -2,6 +2,7 @@
 
 import errno
 import json
+import shutil
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -57,10 +58,16 @@ def written(tmp_path_factory):
     return folder, write_pair_capture(folder)
 
 
+@pytest.fixture(scope="module")
+def two_pairs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("two_pairs") / "capture"
+    write_pair_capture(folder, pairs=2)
+    return folder
+
+
 @pytest.fixture
-def capture(tmp_path):
-    write_pair_capture(tmp_path / "capture", pairs=2)
-    return tmp_path / "capture"
+def capture(two_pairs, tmp_path):
+    return shutil.copytree(two_pairs, tmp_path / "capture")
 
 
 def changed(folder, *pairs):
@@ -418,7 +425,7 @@ def test_reconstruct_fuses_before_it_looks_for_features(written, tmp_path, by_av
     with pytest.raises(KeyboardInterrupt):
         reconstruct(folder, out, OPTIONS, progress=stop)
     fuse_exposures_captured(folder, alone, progress=silent)
-    assert contents(out / "images") == contents(alone / "images")
+    assert contents(out / "colmap" / "images") == contents(alone / "images")
     decided = json.loads((out / "imaging.json").read_text())
     assert decided["deblur"] == "short and long exposures are fused, aligned by the gyroscope and the pixels"
     records = json.loads((out / "frames.json").read_text())["frames"]
@@ -426,18 +433,17 @@ def test_reconstruct_fuses_before_it_looks_for_features(written, tmp_path, by_av
     assert all("aligned by the gyroscope" in r["treatments"][-1]["reason"] for r in records)
 
 
-def test_another_long_exposure_makes_the_frames_again(capture, tmp_path, by_average):
+def test_another_long_exposure_makes_the_frames_again(written, tmp_path, by_average):
     out = tmp_path / "out"
-    write_pair_capture(tmp_path / "three")
-    capture = tmp_path / "three"
+    capture = shutil.copytree(written[0], tmp_path / "three")
     with pytest.raises(KeyboardInterrupt):
         reconstruct(capture, out, OPTIONS, progress=stop)
-    before = contents(out / "images")
+    before = contents(out / "colmap" / "images")
     brighter = read(capture / "long" / "001.png")[..., ::-1] // 2
     cv2.imwrite(str(capture / "long" / "001.png"), brighter)
     with pytest.raises(KeyboardInterrupt):
         reconstruct(capture, out, OPTIONS, progress=stop)
-    after = contents(out / "images")
+    after = contents(out / "colmap" / "images")
     assert [name for name in before if before[name] != after[name]] == ["001.png"]
 
 
@@ -446,11 +452,11 @@ def test_the_short_exposures_alone_where_asked(written, tmp_path):
     options = replace(OPTIONS, deblur="off", exposures=ExposureOptions(fuse=False))
     with pytest.raises(KeyboardInterrupt):
         reconstruct(folder, tmp_path / "out", options, progress=stop)
-    assert contents(tmp_path / "out" / "images") == contents(folder / "short")
+    assert contents(tmp_path / "out" / "colmap" / "images") == contents(folder / "short")
 
 
-def test_deblurring_needs_no_long_exposures(tmp_path):
-    write_pair_capture(tmp_path / "capture")
+def test_deblurring_needs_no_long_exposures(written, tmp_path):
+    shutil.copytree(written[0], tmp_path / "capture")
     (tmp_path / "capture" / "long" / "001.png").unlink()
     done = deblur_capture(tmp_path / "capture", tmp_path / "out", progress=silent)
     assert contents(done.workspace.images) == contents(tmp_path / "capture" / "short")

@@ -2,6 +2,9 @@
 
 import os
 import random
+import re
+import shutil
+import subprocess
 import sys
 from pathlib import Path
 
@@ -50,6 +53,61 @@ def test_a_fault_leaves_no_half_result_and_is_told_in_a_sentence(whole, tmp_path
     command, taken, expected = whole[name]
     told, wrong = one(command, kind, random.Random(3), taken, expected, tmp_path)
     assert not wrong, f"{told}\n{wrong}"
+
+
+#: As many files or as much memory as any command needs to begin with, of which so much is in use already that what is
+#: left runs out on the way: the refusal at the door does not see it.
+HELD = """
+import mmap, os, resource, sys
+from colmap_inertial.cli import limits, main
+from colmap_inertial.threads import usable_processors
+
+kind, left = sys.argv[1], int(sys.argv[2])
+if kind == "files":
+    resource.setrlimit(resource.RLIMIT_NOFILE, (limits.LEAST_FILES, limits.LEAST_FILES))
+    used = len(os.listdir("/proc/self/fd")) - 1
+    held = [os.open(os.devnull, os.O_RDONLY) for _ in range(limits.LEAST_FILES - used - left)]
+else:
+    least = limits.LEAST_BYTES + limits.THREAD_BYTES * usable_processors()
+    with open("/proc/self/statm") as file:
+        used = int(file.read().split()[0]) * mmap.PAGESIZE
+    held = mmap.mmap(-1, least - used - (left << 20), flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, prot=mmap.PROT_READ)
+    resource.setrlimit(resource.RLIMIT_AS, (least, least))
+main(sys.argv[3:])
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "lefts", "said"),
+    [
+        ("apply", "files", (4, 3, 2), "[Tt]oo many|unable to open"),
+        ("fuse-apertures", "files", (2, 1), "[Tt]oo many"),
+        ("fuse-apertures", "memory", (700, 600, 500), "the memory is used up"),
+    ],
+)
+def test_what_runs_out_on_the_way_is_a_sentence_and_no_half_result(whole, tmp_path, name, kind, lefts, said):
+    command, _, expected = whole[name]
+    out, failed = tmp_path / "out", 0
+    line = [part.replace("{out}", str(out)) for part in command.line]
+    for left in lefts:
+        held = [sys.executable, "-c", HELD, kind, str(left), *line]
+        done = subprocess.run(held, capture_output=True, text=True)
+        if done.returncode == 0:  # it was enough
+            assert command.made(out) == expected
+            shutil.rmtree(out)
+            continue
+        failed += 1
+        last = done.stderr.strip().splitlines()[-1]
+        assert done.returncode == 2 and re.match(f"error: .*({said})", last), done.stderr
+        assert faults_of(done.stderr, done.returncode, killed=False) == []
+        assert not command.done(out)
+        assert [path.name for path in tmp_path.iterdir() if path != out] == []
+        if kind == "memory":
+            break  # with less, libraries cannot be loaded, and some say so in words of their own
+    assert failed
+    undisturbed = subprocess.run([sys.executable, "-m", "colmap_inertial", *line], capture_output=True, text=True)
+    assert undisturbed.returncode == 0, undisturbed.stderr
+    assert command.made(out) == expected
 
 
 def test_what_is_wrong_is_seen(monkeypatch, tmp_path):

@@ -44,7 +44,8 @@ def test_without_keypoint_stages_nothing_is_said_to_be_rectified(bare):
     assert not any(frame["rectified"] for frame in said["frames"])
     assert said["imaging"]["rectify"] is False
     assert "rectified" not in said["imaging"]["rolling_shutter"]
-    assert not (out / "images_rectified").exists()
+    names = [frame["name"] for frame in said["frames"]]
+    assert all((out / "images" / name).samefile(out / "colmap" / "images" / name) for name in names)
     assert result.keypoints.rectified() == frozenset()
     # and nothing was prepared that no stage needs
     assert not {"calibration", "survey", "motion", "blur"} & set(stages)
@@ -105,8 +106,8 @@ def test_what_a_visitor_s_keypoint_stage_did_is_what_the_result_says(capture, tm
     out = tmp_path / "out"
     result = reconstruct(capture, out, QUICK, frame_stages=[], keypoint_stages=[Rectify()], model_stages=[look, ...])
     assert all(frame["rectified"] for frame in stored(out)["frames"])
-    assert len(moved) == 16 and len(list((out / "images_rectified").iterdir())) == 16
-    assert contents(out / "images_rectified") != contents(out / "images")
+    assert len(moved) == 16 and len(list((out / "images").iterdir())) == 16
+    assert contents(out / "images") != contents(out / "colmap" / "images")
     # the default model stages see a model of rectified keypoints, and finish what the keypoints began
     assert models[0].rectified and not models[0].doubts
     assert [treatment.stage for treatment in result.models[0].treatments] == ["readout"]
@@ -132,7 +133,7 @@ def test_doubts_are_enforced_after_the_stages_whoever_wrote_them(capture, bare, 
         (model,) = result.models
         assert model.scale.verdict == "weak" and model.scale.reasons[0] == "the video was stabilised"
         assert stored(out)["models"][0]["verdict"] == "weak"
-    transform = json.loads((out / "sparse_metric" / "0" / "transform.json").read_text())
+    transform = json.loads((out / "sparse" / "0" / "transform.json").read_text())
     assert transform["provenance"].endswith("weak")
     assert seen == [("the video was stabilised",)] * 2
 
@@ -149,9 +150,9 @@ def test_a_finished_run_is_gone_on_with_where_the_options_ask_for_more(capture, 
         assert f"{step}: finished in an earlier run, kept" in new
     assert "metric: started" in new and "features: started" not in new
     after = contents(out)
-    kept = [name for name in before if name.startswith(("images/", "sparse/", "database"))]
+    kept = [name for name in before if name.startswith(("images/", "colmap/"))]
     assert len(kept) > 16 and all(before[name] == after[name] for name in kept)
-    assert before["sparse_metric/0/images.bin"] != after["sparse_metric/0/images.bin"]
+    assert before["sparse/0/images.bin"] != after["sparse/0/images.bin"]
     assert second.models[0].scale.metres_per_unit == first.models[0].scale.metres_per_unit
     # as if it had been asked for at once
     again = reconstruct(capture, out, options, frame_stages=[], keypoint_stages=[])
@@ -162,7 +163,7 @@ def test_a_finished_run_is_gone_on_with_where_the_options_ask_for_more(capture, 
         capture, out, dataclasses.replace(QUICK, deterministic=True), frame_stages=[], keypoint_stages=[]
     )
     assert not back.unchanged
-    assert contents(out)["sparse_metric/0/images.bin"] == before["sparse_metric/0/images.bin"]
+    assert contents(out)["sparse/0/images.bin"] == before["sparse/0/images.bin"]
 
 
 def test_a_calibration_given_later_maps_nothing_again(capture, bare, tmp_path):
@@ -175,7 +176,7 @@ def test_a_calibration_given_later_maps_nothing_again(capture, bare, tmp_path):
     new = (out / "log.txt").read_text()[len(log) :]
     assert all(f"{step}: finished in an earlier run, kept" in new for step in ("frames", "matches", "mapping"))
     assert "metric: started" in new and not second.unchanged
-    kept = [name for name in before if name.startswith(("images/", "sparse/", "database"))]
+    kept = [name for name in before if name.startswith(("images/", "colmap/"))]
     assert all(before[name] == contents(out)[name] for name in kept)
     spread = [model.scale.calibration.rotation_sigma_rad for model in (*first.models, *second.models)]
     assert spread[1] < spread[0] / 2
@@ -196,8 +197,8 @@ def test_a_run_reads_each_model_from_disk_twice_at_most(capture, tmp_path, monke
     out = tmp_path / "out"
     reconstruct(capture, out, QUICK, frame_stages=[], keypoint_stages=[])
     counts = {folder: reads.count(folder) for folder in set(reads)}
-    assert set(counts) == {out / "sparse" / "0", out / "sparse_metric" / "0"} and max(counts.values()) <= 2
-    assert isinstance(read(out / "sparse" / "0", ".bin"), pycolmap.Reconstruction)
+    assert set(counts) == {out / "colmap" / "sparse" / "0", out / "sparse" / "0"} and max(counts.values()) <= 2
+    assert isinstance(read(out / "colmap" / "sparse" / "0", ".bin"), pycolmap.Reconstruction)
 
 
 def test_a_killed_change_of_a_finished_run_leaves_no_result_behind(capture, bare, tmp_path):

@@ -1,25 +1,32 @@
 """What would take all memory, or never end, is refused before it does."""
 
+import json
 import os
 import resource
 import struct
 import subprocess
 import sys
 import zlib
+from dataclasses import fields
 
 import cv2
 import numpy as np
 import pytest
+from test_pipeline import copy_scene
 
+from colmap_inertial.cli import _COMMANDS, main
+from colmap_inertial.drivers.capture import reconstruct
 from colmap_inertial.errors import FormatError, InertialError
-from colmap_inertial.io.files import LARGEST_BYTES, first_line, read_bytes, read_json, read_yaml
+from colmap_inertial.io.files import first_line, read_bytes, read_json, read_yaml
 from colmap_inertial.io.frame_times import stamps_of_csv
-from colmap_inertial.io.images import MOST_PIXELS, _stated_size, read_image
+from colmap_inertial.io.images import _stated_size, read_image
 from colmap_inertial.io.imu import read_imu
-from colmap_inertial.io.tables import MOST_COLUMNS, read_table
+from colmap_inertial.io.limits import read_limits, reading_within
+from colmap_inertial.io.tables import read_table
 from colmap_inertial.io.video import video_stamps_ns
-from colmap_inertial.options import ReconstructOptions
+from colmap_inertial.options import ReadLimits, ReconstructOptions
 from colmap_inertial.run.config import read_config
+from colmap_inertial.threads import in_order
 from colmap_inertial.view.images import read_preview
 
 
@@ -69,7 +76,7 @@ def test_the_size_is_told_by_the_header(tmp_path, suffix, dtype):
 
 
 def test_the_limit_is_above_any_camera():
-    assert MOST_PIXELS > 200e6
+    assert ReadLimits().megapixels > 200
 
 
 @pytest.mark.parametrize("delimiter", [",", " ", "\t", ";"])
@@ -81,8 +88,8 @@ def test_a_table_of_too_many_columns(tmp_path, delimiter, head):
         read_table(path)
     path.write_text("# " + delimiter.join(["a"] * 1_000_000) + "\n1,2\n3,4\n")
     assert read_table(path).header is None
-    path.write_text(delimiter.join(["1"] * MOST_COLUMNS) + "\n")
-    assert read_table(path).width == MOST_COLUMNS
+    path.write_text(delimiter.join(["1"] * ReadLimits().table_columns) + "\n")
+    assert read_table(path).width == ReadLimits().table_columns
 
 
 def test_a_gcsv_of_too_many_columns(tmp_path):
@@ -136,7 +143,77 @@ def test_a_capture_that_names_them(tmp_path):
 def test_a_file_too_large_to_be_read_whole(tmp_path):
     path = tmp_path / "sparse.csv"
     with open(path, "wb") as file:
-        file.truncate(LARGEST_BYTES + 1)
-    with pytest.raises(InertialError, match="is larger than 4 GiB"):
+        file.truncate(int(ReadLimits().file_gib * 2**30) + 1)
+    with pytest.raises(InertialError, match=r"is larger than 4 GiB; such a file is not read \(raise --limits"):
         read_table(path)
     assert read_bytes(path, 4) == bytes(4)
+
+
+@pytest.fixture
+def large(tmp_path):
+    """A picture, a table and a text that are too large for small limits, and their readers."""
+    assert cv2.imwrite(str(tmp_path / "a.png"), np.zeros((30, 40), np.uint8))
+    (tmp_path / "a.csv").write_text("1,2,3,4\n5,6,7,8\n")
+    (tmp_path / "a.gcsv").write_text("GYROFLOW IMU LOG\nversion,1.3\n" + "t," * 20 + "\n")
+    (tmp_path / "a.json").write_text(json.dumps({"rows": list(range(2000))}))
+    return [
+        (lambda: read_image(tmp_path / "a.png"), ReadLimits(megapixels=0.0011), "--limits.megapixels"),
+        (lambda: read_table(tmp_path / "a.csv"), ReadLimits(table_columns=3), "--limits.table-columns"),
+        (lambda: read_imu(tmp_path / "a.gcsv"), ReadLimits(table_columns=19), "--limits.table-columns"),
+        (lambda: read_json(tmp_path / "a.json"), ReadLimits(file_gib=2e-6), "--limits.file-gib"),
+    ]
+
+
+def test_limits_hold_where_they_are_set_and_nowhere_else(large):
+    for read, limits, option in large:
+        with reading_within(limits):
+            with pytest.raises(FormatError, match=option):
+                read()
+            # also in the threads that work for the caller
+            with pytest.raises(FormatError, match=option):
+                list(in_order(lambda _, read=read: read(), [1], workers=2))
+        assert read_limits() == ReadLimits()
+
+
+def test_the_same_files_are_read_without_them(large):
+    for i in (0, 1, 3):  # the gcsv has columns alone
+        large[i][0]()
+
+
+def test_a_raised_limit_lets_larger_files_in(tmp_path):
+    path = tmp_path / "wide.csv"
+    path.write_text(",".join(["1"] * 10_001) + "\n")
+    with pytest.raises(FormatError, match="columns"):
+        read_table(path)
+    with reading_within(ReadLimits(table_columns=10_001)):
+        assert read_table(path).width == 10_001
+    (tmp_path / "large.png").write_bytes(png(16000, 16000))
+    with reading_within(ReadLimits(megapixels=256)):
+        assert read_image(tmp_path / "large.png").shape == (16000, 16000)
+
+
+def test_every_command_takes_them(tmp_path, capsys):
+    scene = copy_scene(tmp_path / "capture", first=3)
+    (tmp_path / "config.toml").write_text("[limits]\ntable_columns = 3\n")
+    out, imu = str(tmp_path / "out"), str(scene / "gyro.csv")
+    for args in (
+        ["reconstruct", str(scene), out, "--limits.table-columns", "3"],
+        ["reconstruct", str(scene), out, "--config", str(tmp_path / "config.toml")],
+        ["deblur", str(scene), out, "--limits.table-columns", "3"],
+        ["diagnose", imu, "--limits.table-columns", "3"],
+    ):
+        with pytest.raises(SystemExit) as stopped:
+            main(args)
+        told = " ".join(capsys.readouterr().err.split())
+        assert stopped.value.code == 2 and "has more than 3 columns; such a table is not read" in told, told
+    assert not (tmp_path / "out").exists()
+    # as in the processes of a batch, which read what their capture is given
+    with pytest.raises(FormatError, match="more than 3 columns"):
+        reconstruct(scene, out, ReconstructOptions(limits=ReadLimits(table_columns=3)))
+    assert all("limits" in {f.name for f in fields(command)} | set(vars(command)) for command in _COMMANDS.values())
+
+
+@pytest.mark.parametrize("values", [{"megapixels": 0}, {"table_columns": -1}, {"file_gib": 0.0}, {"megapixels": 2000}])
+def test_impossible_limits_are_refused(values):
+    with pytest.raises(ValueError, match=next(iter(values))):
+        ReadLimits(**values)

@@ -15,10 +15,10 @@ PACKAGE = Path(__file__).parents[1] / "colmap_inertial"
 ORDER = [
     ("errors", "geometry", "sampling", "options", "threads", "_kernels"),
     ("types",),
-    ("gyro",),
+    ("gyro", "semi_global"),
     ("io", "gravity"),
     ("imaging",),
-    ("multi_aperture", "restoration", "exposure_pairs"),
+    ("multi_aperture", "restoration", "exposure_pairs", "sweep"),
     ("flow",),
     ("align", "smooth"),
     ("scale",),
@@ -30,11 +30,25 @@ ORDER = [
     ("precalibrate",),
     ("drivers",),
     ("simulate", "batch", "view"),
+    ("export",),
     ("cli",),
 ]
 RANK = {room: rank for rank, rooms in enumerate(ORDER) for room in rooms}
-PIXELS = ("imaging", "multi_aperture", "restoration", "exposure_pairs")
-ESTIMATORS = ("geometry", "sampling", "types", "gravity", "gyro", *PIXELS, "flow", "align", "smooth", "scale")
+PIXELS = ("semi_global", "imaging", "multi_aperture", "restoration", "exposure_pairs", "sweep")
+ESTIMATORS = (
+    "geometry",
+    "sampling",
+    "types",
+    "gravity",
+    "gyro",
+    "semi_global",
+    "sweep",
+    *PIXELS,
+    "flow",
+    "align",
+    "smooth",
+    "scale",
+)
 
 
 def room_of(path: Path) -> str:

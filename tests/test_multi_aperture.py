@@ -6,6 +6,7 @@ import pytest
 from aperture_scenes import FLAT, four_apertures, plane_views, projectors, psnr_db, read_pfm, texture
 from references.semi_global import matching_costs_reference, semi_global_reference
 
+from colmap_inertial import semi_global
 from colmap_inertial._kernels import _apertures
 from colmap_inertial.errors import InertialError
 from colmap_inertial.geometry import quat_exp, quat_rotate
@@ -39,7 +40,11 @@ def random_problem(height, width, candidates, views, seed=0):
     slope = rng.uniform(-0.3, 0.3, (views, candidates, 1))
     columns = (16 * np.arange(width) + start[0] + (np.arange(width) * slope).astype(int)).astype(np.int32)
     rows = (16 * np.arange(height) + start[1]).astype(np.int32)
-    return reference, others, {"columns": columns, "rows": rows, "share": volume.shares(views), "unseen": 6 * views}
+    return (
+        reference,
+        others,
+        {"columns": columns, "rows": rows, "share": semi_global.shares(views), "unseen": 6 * views},
+    )
 
 
 @pytest.mark.parametrize("instruction_set", INSTRUCTION_SETS)
@@ -76,7 +81,7 @@ def test_compiled_semi_global_matching_is_the_reference_s_bit_for_bit(sides, ins
     rng = np.random.default_rng(2)
     cost = rng.integers(0, 256, (height, width, candidates), dtype=np.uint8)
     guide = rng.integers(0, 256, (height, width), dtype=np.uint8)
-    for small, jump in (volume.jump_table(3), (4000, np.full(256, 4000, dtype=np.uint16))):
+    for small, jump in (semi_global.jump_table(3), (4000, np.full(256, 4000, dtype=np.uint16))):
         wanted = semi_global_reference(cost, guide, small=small, jump=jump)
         padded = -(-candidates // _apertures.PADDING) * _apertures.PADDING
         for threads in (1, 2):
@@ -263,7 +268,7 @@ def test_census_does_not_mind_a_monotone_change_of_brightness():
     half = (views // 2).astype(np.uint8) * 2  # distances between codes survive the curve below
     curve = np.clip(np.sort(np.random.default_rng(5).choice(200, 128, replace=False)), 0, 255).astype(np.uint8)
     columns, rows = canvas.sample_positions(np.rint(spaced))
-    arguments = {"columns": columns, "rows": rows, "share": volume.shares(3), "unseen": 0, "radius": 2}
+    arguments = {"columns": columns, "rows": rows, "share": semi_global.shares(3), "unseen": 0, "radius": 2}
     reference = (planes[0] // 2) * 2
     before = matching_costs_reference(reference, half, **arguments)
     after = matching_costs_reference(curve[reference // 2], curve[half // 2], **arguments)
@@ -296,8 +301,8 @@ def test_strips_give_what_the_whole_gives(monkeypatch):
     planes, _truth, rig = plane_views(96, 400, 4.0, (0.0, 0.005))
     canvas = rectify(rig, projectors(rig))
     whole = estimate_disparity(planes, canvas, PLANE)
-    monkeypatch.setattr(volume, "_MEMORY", 96 * (36 + 2 * 64) * 180)
-    assert len(volume.strips(400, 96 * (36 + 2 * 64))) > 3
+    monkeypatch.setattr(semi_global, "_MEMORY", 96 * (36 + 2 * 64) * 180)
+    assert len(semi_global.strips(400, 96 * (36 + 2 * 64))) > 3
     in_strips = estimate_disparity(planes, canvas, PLANE)
     assert (np.abs(whole.disparity_px - in_strips.disparity_px) > 0.1).mean() < 0.01
 
@@ -305,10 +310,10 @@ def test_strips_give_what_the_whole_gives(monkeypatch):
 def test_memory_is_bounded():
     for height, width, candidates in ((3000, 4000, 128), (200, 100, 20), (9000, 12000, 256)):
         row = width * (candidates + 2 * candidates)
-        parts = volume.strips(height, row)
+        parts = semi_global.strips(height, row)
         assert [p[0] for p in parts] == [0, *[p[1] for p in parts[:-1]]]
         assert parts[-1][1] == height
-        assert max(last - first for *_, first, last in parts) * row <= max(volume._MEMORY, 98 * row)
+        assert max(last - first for *_, first, last in parts) * row <= max(semi_global._MEMORY, 98 * row)
 
 
 @pytest.mark.parametrize("shape", [(1, 40), (40, 1), (1, 1), (5, 7)])

@@ -392,10 +392,10 @@ def test_reconstruct_fuses_before_it_looks_for_features_and_again_where_a_sub_im
     assert len(names) == 6 and {f"{name}.npy" for name in names} == {
         p.name for p in (out / "apertures/depth").iterdir()
     }
-    before = {name: (out / "images" / name).read_bytes() for name in names}
+    before = {name: (out / "colmap" / "images" / name).read_bytes() for name in names}
     assert before == {name: (alone / "images" / name).read_bytes() for name in names}
     red = tmp_path / "capture" / "frames_red" / names[2]
     cv2.imwrite(str(red), 255 - cv2.imread(str(red), cv2.IMREAD_UNCHANGED))
     with pytest.raises(KeyboardInterrupt):
         reconstruct(toml, out, options, progress=stop)
-    assert [name for name in names if (out / "images" / name).read_bytes() != before[name]] == [names[2]]
+    assert [name for name in names if (out / "colmap" / "images" / name).read_bytes() != before[name]] == [names[2]]

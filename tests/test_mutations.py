@@ -21,7 +21,7 @@ MODEL = {
     "index": 0,
     "registered_images": 3,
     "points": 100,
-    "sparse_metric": "sparse_metric/0",
+    "sparse_metric": "sparse/0",
     "metres_per_unit": 0.5,
     "sigma_log": 0.01,
     "ci95": [0.49, 0.51],

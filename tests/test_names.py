@@ -18,7 +18,7 @@ from colmap_inertial.model import read_model
 from colmap_inertial.report.markup import images
 from colmap_inertial.run.progress import silent
 from colmap_inertial.stages.frame_folder import write_frames
-from colmap_inertial.stages.rectified import write_rectified
+from colmap_inertial.stages.rectified import write_images
 from colmap_inertial.types import Frame
 from colmap_inertial.validate.views import load_views
 from colmap_inertial.view.sources import find_source
@@ -116,7 +116,7 @@ def test_writers_stay_in_their_folder(tmp_path, name):
         )
     (source / "out").symlink_to(tmp_path / "outside")
     with pytest.raises(FormatError, match="names the file"):
-        write_rectified([], [name], (), source, tmp_path / "rectified", silent)
+        write_images([], [name], (), source, tmp_path / "rectified", silent)
     assert not list((tmp_path / "outside").iterdir())
     assert not (tmp_path / "up.png").exists()
 

@@ -51,7 +51,7 @@ def finished(tmp_path_factory):
     stages = []
     result = reconstruct(capture, root / "out", QUICK, progress=lambda stage, done, total: stages.append((stage, done)))
     assert contents(capture) == before
-    assert list(dict(stages)) == ["frames", "features", "matches", "mapping", "metric", "validation"]
+    assert list(dict(stages)) == ["frames", "features", "matches", "mapping", "images", "metric", "validation"]
     return capture, root / "out", result
 
 
@@ -91,10 +91,10 @@ def test_z_points_up(finished, truth):
 
 def test_the_metric_model_is_colmap_s_model_scaled(finished):
     _, out, result = finished
-    assert not (out / "sparse" / "0" / "transform.json").exists()
-    transform = json.loads((out / "sparse_metric" / "0" / "transform.json").read_text())
-    names, before = centres(out / "sparse" / "0")
-    after_names, after = centres(out / "sparse_metric" / "0")
+    assert not (out / "colmap" / "sparse" / "0" / "transform.json").exists()
+    transform = json.loads((out / "sparse" / "0" / "transform.json").read_text())
+    names, before = centres(out / "colmap" / "sparse" / "0")
+    after_names, after = centres(out / "sparse" / "0")
     assert names == after_names
     expected = transform["scale"] * before @ matrix_from_quat(np.array(transform["rotation_xyzw"])).T
     np.testing.assert_allclose(after, expected, atol=1e-9)
@@ -104,7 +104,7 @@ def test_the_metric_model_is_colmap_s_model_scaled(finished):
 def test_the_trajectory_is_smooth_metric_and_says_how_well_it_is_known(finished, truth):
     _, out, _ = finished
     track = read_tum(out / "trajectory.tum")
-    model_names, found = centres(out / "sparse_metric" / "0")
+    model_names, found = centres(out / "sparse" / "0")
     assert len(track) == len(model_names)
     by_name = dict(zip(model_names, found, strict=True))
     ordered = np.array([by_name[name] for name in sorted(by_name)])
@@ -117,7 +117,7 @@ def test_the_trajectory_is_smooth_metric_and_says_how_well_it_is_known(finished,
     assert 1e-5 < np.median(sigma_m) < 0.02
     # rotations are those of the cameras
     q = quat_conjugate(track.cam_from_world_xyzw)
-    first = read_model(out / "sparse_metric" / "0").find_image_with_name(sorted(by_name)[0])
+    first = read_model(out / "sparse" / "0").find_image_with_name(sorted(by_name)[0])
     assert abs(np.dot(q[0], first.cam_from_world().rotation.inverse().quat)) > 0.9999
 
 
@@ -143,7 +143,7 @@ def test_the_result_file_says_everything(finished):
 
 def test_a_model_without_a_unit_is_scaled_by_the_target(finished, truth, tmp_path, capsys):
     _, out, _ = finished
-    command = ["validate", str(out / "sparse" / "0"), "--images", str(out / "images")]
+    command = ["validate", str(out / "colmap" / "sparse" / "0"), "--images", str(out / "images")]
     target, metric = tmp_path / "v.json", tmp_path / "metric"
     pictures = tmp_path / "pictures"
     flags = ["--unscaled", "--apply", str(metric), "--json", str(target), "--pictures", str(pictures)]
@@ -152,16 +152,19 @@ def test_a_model_without_a_unit_is_scaled_by_the_target(finished, truth, tmp_pat
     assert stopped.value.code == 0
     found = json.loads(target.read_text())
     assert found["scale_error_pct"] is None
-    scale = true_metres_per_unit(*centres(out / "sparse" / "0"), truth.trajectory)
+    scale = true_metres_per_unit(*centres(out / "colmap" / "sparse" / "0"), truth.trajectory)
     assert found["metres_per_unit"] == pytest.approx(scale, rel=0.003)
     assert true_metres_per_unit(*centres(metric), truth.trajectory) == pytest.approx(1, rel=0.003)
     assert found["control"]["corners"] + found["check"]["corners"] == found["corners_used"]
     assert abs(found["check_error_pct"]) < 0.3
     assert (pictures / "distances.svg").is_file()
 
-    # the metric copy passes, another square size does not, another target is not there
-    for source, spec, code in ((metric, "8x6:0.04", 0), (metric, "8x6:0.05", 1), (metric, "5x4:0.04", 5)):
-        command[1] = str(source)
+    # the metric copy passes, another square size does not, another target is not there: every sixth picture tells
+    command[1], command[3] = str(metric), str(tmp_path / "some")
+    (tmp_path / "some").mkdir()
+    for picture in sorted((out / "images").iterdir())[::6]:
+        shutil.copy(picture, tmp_path / "some")
+    for spec, code in (("8x6:0.04", 0), ("8x6:0.05", 1), ("5x4:0.04", 5)):
         with pytest.raises(SystemExit) as stopped:
             main([*command, "--target", f"checkerboard:{spec}"])
         assert stopped.value.code == code
@@ -216,8 +219,8 @@ def test_a_refused_scale_keeps_colmap_s_model_and_exits_3(finished, tmp_path, ca
         result.exit_code()
     stored = json.loads((unfinished / "result.json").read_text())
     assert stored["models"][0]["metres_per_unit"] is None
-    assert (unfinished / "sparse" / "0").is_dir()
-    assert not (unfinished / "sparse_metric").exists()
+    assert (unfinished / "colmap" / "sparse" / "0").is_dir()
+    assert not (unfinished / "sparse").exists()
     assert not list(unfinished.glob("trajectory*"))
 
 
@@ -240,14 +243,14 @@ def test_killed_at_every_stage_it_ends_as_if_undisturbed(tmp_path):
     capture = copy_scene(tmp_path / "capture", first=16)
     undisturbed = reconstruct(capture, tmp_path / "whole", DETERMINISTIC)
     killed = tmp_path / "killed"
-    for stage in ("frames", "features", "matches", "mapping", "metric"):
+    for stage in ("frames", "features", "matches", "mapping", "images", "metric"):
         command = [sys.executable, "-c", KILLED, str(capture), str(killed), stage, str(Path(__file__).parent)]
         assert subprocess.run(command, capture_output=True).returncode == -9
         assert not (killed / "result.json").exists()
     resumed = reconstruct(capture, killed, DETERMINISTIC)
     kept = (killed / "log.txt").read_text().count("finished in an earlier run, kept")
     assert kept >= 4
-    for folder in ("images", "sparse", "sparse_metric"):
+    for folder in ("images", "sparse", "colmap/images", "colmap/sparse"):
         assert contents(tmp_path / "whole" / folder) == contents(killed / folder), folder
     assert [m.scale.metres_per_unit for m in undisturbed.models] == [m.scale.metres_per_unit for m in resumed.models]
     assert not list(killed.rglob("*.partial*"))
@@ -291,7 +294,7 @@ def test_hooks_see_every_frame_keypoint_and_model(tmp_path):
     assert models
     assert models[0][0] == 0
     assert result.models[0].scale.reasons == ("mine",)
-    with pycolmap.Database.open(str(tmp_path / "out" / "database.db")) as database:
+    with pycolmap.Database.open(str(tmp_path / "out" / "colmap" / "database.db")) as database:
         for image in database.read_all_images():
             stored = np.array(database.read_keypoints(image.image_id))
             np.testing.assert_allclose(stored[:, :2], seen[image.name], atol=1e-4)

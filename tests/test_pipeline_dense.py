@@ -1,4 +1,4 @@
-"""The dense stage: undistortion, fusion and meshing by COLMAP; depth maps are cast, as it needs CUDA for them."""
+"""The dense stage: undistortion, fusion and meshing by COLMAP; depth maps by our sweep, or cast for patch-match's."""
 
 import dataclasses
 import json
@@ -11,12 +11,13 @@ import pytest
 from box_project import HIGH, LOW, cast, off_the_walls, rays, shared_box
 from test_pipeline_existing import contents, run
 
-from colmap_inertial.colmap import dense as dense_stage
+from colmap_inertial.colmap import dense as dense_stage, depth_maps
 from colmap_inertial.drivers.project import reconstruct_project
 from colmap_inertial.errors import InertialError
 from colmap_inertial.geometry import matrix_from_quat
 from colmap_inertial.io.ply import read_ply_header
 from colmap_inertial.model import read_model
+from colmap_inertial.model.depth_maps import read_map
 from colmap_inertial.options import DenseOptions, ProjectOptions, ReconstructOptions
 
 QUICK = ReconstructOptions(dense=True, dense_options=DenseOptions(max_image_size=96), deterministic=True)
@@ -31,16 +32,21 @@ def box(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def waiting(box, tmp_path_factory):
-    """Everything but the depth maps. Tests must not change it."""
+    """Everything but the depth maps, which patch-match is to make. Tests must not change it."""
     out = tmp_path_factory.mktemp("dense") / "out"
-    result = reconstruct_project(box.root, out, source(box), QUICK)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pycolmap, "has_cuda", True)
+        patch.setattr(dense_stage, "patch_match", lambda *_: None)
+        result = reconstruct_project(box.root, out, source(box), QUICK)
     return out, result
 
 
 @pytest.fixture
 def unfinished(waiting, tmp_path):
-    """A copy to change."""
-    return shutil.copytree(waiting[0], tmp_path / "out")
+    """A copy to change, in which patch-match has not run."""
+    out = shutil.copytree(waiting[0], tmp_path / "out")
+    (out / ".stages" / "dense_0_depth.json").unlink()
+    return out
 
 
 def source(box):
@@ -49,7 +55,7 @@ def source(box):
 
 def world_from_metric(box, out):
     """Scale, rotation and shift from the metric model to the true world."""
-    transform = json.loads((out / "sparse_metric" / "0" / "transform.json").read_text())
+    transform = json.loads((out / "sparse" / "0" / "transform.json").read_text())
     truth = box.recording.truth
     world_from_model = matrix_from_quat(truth.model_from_world_xyzw).T
     model_from_metric = matrix_from_quat(np.array(transform["rotation_xyzw"])).T
@@ -63,7 +69,7 @@ def world_from_metric(box, out):
 
 def cast_depth_maps(box, out, *, kind="geometric", only=None):
     """What patch-match would find for the workspace's images, in the model's own unit."""
-    folder = out / "dense_metric" / "0"
+    folder = out / "dense" / "0"
     ratio, rotation, shift = world_from_metric(box, out)
     model = read_model(folder / "sparse")
     for i in list(model.reg_image_ids())[:only]:
@@ -93,41 +99,40 @@ def vertices(path):
     return np.stack([rows[axis].astype(float) for axis in "xyz"], axis=1)
 
 
-def test_without_cuda_all_but_the_depth_maps_is_made(waiting, box):
+def test_where_patch_match_finds_nothing_all_but_the_depth_maps_is_made(waiting, box):
     out, result = waiting
     dense = result.models[0].dense
     assert (dense.images, dense.depth_maps, dense.fused) == (len(box.names), 0, None)
-    assert "pycolmap-cuda12" in dense.waiting
-    assert "patch_match_stereo" in dense.waiting
-    folder = out / "dense_metric" / "0"
+    assert "no depth maps" in dense.waiting
+    folder = out / "dense" / "0"
     assert len(list((folder / "images").iterdir())) == len(box.names)
-    metric, undistorted = read_model(out / "sparse_metric" / "0"), read_model(folder / "sparse")
+    metric, undistorted = read_model(out / "sparse" / "0"), read_model(folder / "sparse")
     for i in metric.reg_image_ids():
         np.testing.assert_allclose(undistorted.image(i).projection_center(), metric.image(i).projection_center())
     assert (folder / "sparse" / "transform.json").is_file()
     assert (folder / "stereo" / "patch-match.cfg").is_file()
     assert json.loads((out / "result.json").read_text())["waiting"] is True
-    assert (out / "project_metric").is_dir()
+    assert json.loads((folder / "made_from.json").read_text())["maps"] == "patch-match"
+    assert (out / "transform.json").is_file() and (out / "images").is_dir()
 
 
 def test_depth_maps_that_come_later_become_points_and_a_mesh_in_metres(unfinished, box, capsys):
     out = unfinished
     flags = ["--imu", box.imu, "--frame-times", box.frame_times, *FLAGS]
     before = contents(box.root)
-    code, _, err = run(capsys, "reconstruct", box.root, out, *flags)
-    assert code == 2
-    assert "waits for depth maps" in err
     cast_depth_maps(box, out)
     code, shown, err = run(capsys, "reconstruct", box.root, out, *flags)
     assert code == 0, err
     assert "120 depth maps" in shown
     log = (out / "log.txt").read_text()
-    assert log.count("dense_0_undistorted: finished in an earlier run, kept") == 2
+    assert log.count("dense_0_undistorted: finished in an earlier run, kept") == 1
 
     (model,) = json.loads((out / "result.json").read_text())["models"]
     dense = model["dense"]
     assert dense["waiting"] is None
-    assert dense["mesh"] == "dense_metric/0/meshed-poisson.ply"
+    assert dense["maps"] == "patch-match"
+    assert dense["coverage"] == 1
+    assert dense["mesh"] == "dense/0/meshed-poisson.ply"
     points, mesh = vertices(out / dense["fused"]), vertices(out / dense["mesh"])
     assert len(points) == dense["points"] > 5000
     assert dense["faces"] > 5000
@@ -144,25 +149,57 @@ def test_depth_maps_that_come_later_become_points_and_a_mesh_in_metres(unfinishe
     assert np.percentile(off_the_walls(true), 99) < 1e-4
     surface = ratio * mesh @ rotation.T + shift
     assert np.percentile(off_the_walls(surface), 90) < 0.02
-    assert (out / "dense_metric" / "0" / "fused.ply.vis").is_file()
+    assert (out / "dense" / "0" / "fused.ply.vis").is_file()
     assert contents(box.root) == before
     code, said, _ = run(capsys, "reconstruct", box.root, out, *flags)
     assert code == 0
     assert "nothing to do" in said
 
 
-def test_a_finished_project_is_gone_on_with(box, tmp_path, capsys):
+def test_a_finished_project_is_gone_on_with_by_the_sweep(box, tmp_path, capsys):
+    """Without CUDA: exit code 0, a cloud and a mesh in metres, and what was measured of them."""
     out, flags = tmp_path / "out", ["--imu", box.imu, "--frame-times", box.frame_times]
     code, _, err = run(capsys, "reconstruct", box.root, out, *flags, "--deterministic")
     assert code == 0, err
-    before = contents(out / "sparse_metric")
+    before = contents(out / "sparse")
     log = (out / "log.txt").read_text()
-    code, _, err = run(capsys, "reconstruct", box.root, out, *flags, *FLAGS)
-    assert code == 2 and "waits for depth maps" in err
+    code, shown, err = run(capsys, "reconstruct", box.root, out, *flags, *FLAGS)
+    assert code == 0, err
+    assert "depth maps of 120 images" in shown
     new = (out / "log.txt").read_text()[len(log) :]
     assert "metric: finished in an earlier run, kept" in new and "apply: finished in an earlier run, kept" in new
-    assert contents(out / "sparse_metric") == before
-    assert (out / "dense_metric" / "0" / "images").is_dir()
+    assert contents(out / "sparse") == before
+    (model,) = json.loads((out / "result.json").read_text())["models"]
+    dense = model["dense"]
+    assert (dense["images"], dense["maps"], dense["waiting"]) == (120, "plane sweep", None)
+    assert dense["depth_maps"] > 110
+    assert dense["coverage"] > 0.5
+    assert dense["points"] > 2000 and dense["faces"] > 2000
+    ratio, rotation, shift = world_from_metric(box, out)
+    away = off_the_walls(ratio * vertices(out / dense["fused"]) @ rotation.T + shift)
+    assert np.median(away) < 0.03, np.quantile(away, (0.25, 0.5, 0.75, 0.9))
+    away = off_the_walls(ratio * vertices(out / dense["mesh"]) @ rotation.T + shift)
+    assert np.median(away) < 0.03, np.quantile(away, (0.25, 0.5, 0.75, 0.9))
+    assert not list((out / ".stages").glob("sweep_*"))
+    # maps that somebody removed are made again; maps of the other maker are not mixed with them
+    stereo = out / "dense" / "0" / "stereo"
+    maps = sorted(path.name for path in (stereo / "depth_maps").iterdir())
+    (stereo / "depth_maps" / maps[0]).rename(tmp_path / "kept.bin")
+    code, _, err = run(capsys, "reconstruct", box.root, out, *flags, *FLAGS)
+    assert code == 0, err
+    assert (stereo / "depth_maps" / maps[0]).read_bytes() == (tmp_path / "kept.bin").read_bytes()
+    (stereo / "depth_maps" / maps[0].replace("geometric", "photometric")).write_bytes(b"")
+    code, _, err = run(capsys, "reconstruct", box.root, out, *flags, *FLAGS)
+    assert code == 2
+    assert "the plane sweep made them" in err
+    (stereo / "depth_maps" / maps[0].replace("geometric", "photometric")).unlink()
+    # those of other options are replaced
+    code, _, err = run(
+        capsys, "reconstruct", box.root, out, *flags, *FLAGS, "--dense-options.max-image-size", "64",
+        "--dense-options.mesh", "none",
+    )  # fmt: skip
+    assert code == 0, err
+    assert read_map(stereo / "depth_maps" / maps[0]).shape == (48, 64)
 
 
 def test_with_cuda_it_goes_through_in_one_run(box, tmp_path, monkeypatch):
@@ -171,7 +208,7 @@ def test_with_cuda_it_goes_through_in_one_run(box, tmp_path, monkeypatch):
     def patch_match(workspace, max_image_size):
         calls.append(max_image_size)
         # the result file is not there yet, but the scale is in the model
-        estimate = json.loads((out / "sparse_metric" / "0" / "transform.json").read_text())["scale"]
+        estimate = json.loads((out / "sparse" / "0" / "transform.json").read_text())["scale"]
         (out / "result.json").write_text(json.dumps({"models": [{"metres_per_unit": estimate}]}))
         cast_depth_maps(box, out, only=100)
         (out / "result.json").unlink()
@@ -194,7 +231,7 @@ def test_with_cuda_it_goes_through_in_one_run(box, tmp_path, monkeypatch):
 
 
 def test_half_written_depth_maps_are_made_again(unfinished, box, monkeypatch):
-    torn = unfinished / "dense_metric" / "0" / "stereo" / "depth_maps" / f"{box.names[0]}.geometric.bin"
+    torn = unfinished / "dense" / "0" / "stereo" / "depth_maps" / f"{box.names[0]}.geometric.bin"
     torn.write_bytes(b"96&72&1&" + bytes(100))
 
     def run_colmap(command, **_):
@@ -203,7 +240,7 @@ def test_half_written_depth_maps_are_made_again(unfinished, box, monkeypatch):
         return subprocess.CompletedProcess(command, 0, "", "")
 
     monkeypatch.setattr(pycolmap, "has_cuda", True)
-    monkeypatch.setattr(dense_stage.subprocess, "run", run_colmap)
+    monkeypatch.setattr(depth_maps.subprocess, "run", run_colmap)
     no_mesh = dataclasses.replace(QUICK, dense_options=DenseOptions(max_image_size=96, mesh="none"))
     assert reconstruct_project(box.root, unfinished, source(box), no_mesh).exit_code() == 0
 
@@ -212,7 +249,7 @@ def test_a_patch_match_that_fails_is_said(unfinished, box, monkeypatch):
     monkeypatch.setattr(pycolmap, "has_cuda", True)  # which it has not
     with pytest.raises(InertialError, match=r"patch-match ended with code 1: ValueError.* CUDA"):
         reconstruct_project(box.root, unfinished, source(box), QUICK)
-    assert (unfinished / "sparse_metric" / "0").is_dir()
+    assert (unfinished / "sparse" / "0").is_dir()
 
 
 def test_damaged_depth_maps_and_those_of_other_options_are_named(unfinished, box, capsys):
@@ -223,7 +260,7 @@ def test_damaged_depth_maps_and_those_of_other_options_are_named(unfinished, box
     )  # fmt: skip
     assert code == 2
     assert "depth maps of another model or other options" in err
-    broken = next((unfinished / "dense_metric" / "0" / "stereo" / "normal_maps").glob("*.bin"))
+    broken = next((unfinished / "dense" / "0" / "stereo" / "normal_maps").glob("*.bin"))
     broken.write_bytes(broken.read_bytes()[:-8])
     code, _, err = run(capsys, "reconstruct", box.root, unfinished, *flags)
     assert code == 2

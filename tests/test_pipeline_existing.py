@@ -22,6 +22,8 @@ from colmap_inertial.io.trajectories import read_tum
 from colmap_inertial.io.video import decode_grey
 from colmap_inertial.io.video_match import match_to_video
 from colmap_inertial.model import read_model
+from colmap_inertial.model.project import apply_to_project
+from colmap_inertial.model.similarities import read_similarity
 from colmap_inertial.options import ProjectOptions, ReconstructOptions
 from colmap_inertial.view import load_scene
 
@@ -79,17 +81,18 @@ def test_a_project_with_a_csv_becomes_metric_whole(box, tmp_path, capsys):
     model = assert_metric(box, out)
     assert "120" in shown
     assert model["sparse"] == str(box.root / "sparse" / "0")
-    assert not (out / "sparse").exists()
-    # the metric model, the same in the copy of the whole project, and what carries no length
-    metric, whole = read_model(out / "sparse_metric" / "0"), read_model(out / "project_metric" / "sparse" / "0")
+    assert not (out / "colmap").exists()
+    # the metric model, the same as apply makes it, and what carries no length
+    apply_to_project(box.root, tmp_path / "applied", read_similarity(out / "sparse" / "0" / "transform.json"))
+    metric, whole = (read_model(folder / "sparse" / "0") for folder in (out, tmp_path / "applied"))
     for i in metric.reg_image_ids():
         centre = metric.image(i).projection_center()
-        np.testing.assert_allclose(whole.image(i).projection_center(), centre, atol=1e-12)
+        np.testing.assert_array_equal(whole.image(i).projection_center(), centre)
     original = read_model(box.root / "sparse" / "0")
-    assert whole.num_points3D() == original.num_points3D()
-    assert (out / "project_metric" / "transform.json").is_file()
+    assert whole.num_points3D() == metric.num_points3D() == original.num_points3D()
+    assert (out / "transform.json").is_file()
     for name in ("notes.txt", f"images/{box.names[7]}"):
-        assert (out / "project_metric" / name).read_bytes() == (box.root / name).read_bytes()
+        assert (out / name).read_bytes() == (box.root / name).read_bytes()
     # gravity is along z, the path as long as the true one
     track = read_tum(out / "trajectory.tum")
     true = box.recording.truth.motion.cam_in_world_m(box.recording.trajectory.t_s[list(box.frames)])
@@ -136,7 +139,7 @@ def test_a_model_folder_alone_and_times_in_its_names(box, tmp_path, capsys):
     code, _, err = run(capsys, "reconstruct", project / "sparse" / "0", out, *flags, "cam0_{ns}_*", "--world", "y-down")
     assert code == 0, err
     assert_metric(box, out)
-    assert (out / "project_metric" / "images.bin").is_file()
+    assert (out / "sparse" / "0" / "images.bin").is_file()
     code, _, err = run(capsys, "reconstruct", project, tmp_path / "out2", *flags, "cam1_{ns}_*")
     assert code == 2
     assert "does not fit" in err
@@ -291,8 +294,8 @@ def test_a_refused_scale_leaves_no_metric_project_and_exits_3(box, tmp_path, cap
     stored = json.loads((out / "result.json").read_text())
     assert stored["models"][0]["metres_per_unit"] is None
     assert stored["project_metric"] is None
-    assert not (out / "project_metric").exists()
-    assert not (out / "sparse_metric").exists()
+    assert not (out / "sparse").exists() and not (out / "images").exists()
+    assert not (out / "transform.json").exists()
 
 
 def test_the_model_of_a_refused_project_is_found_from_anywhere(box, tmp_path, monkeypatch):
@@ -394,7 +397,7 @@ def test_each_sub_model_has_its_own_scale(box, tmp_path):
     result = reconstruct_project(project, out, ProjectOptions(imu=box.imu, frame_times=box.frame_times))
     scales = [model.scale.metres_per_unit for model in result.models]
     assert scales[0] / scales[1] == pytest.approx(2, rel=1e-3)
-    models = [read_model(out / "project_metric" / "sparse" / str(i)) for i in (0, 1)]
+    models = [read_model(out / "sparse" / str(i)) for i in (0, 1)]
     first, last = 1, len(box.names)
     spans = [m.image(first).projection_center() - m.image(last).projection_center() for m in models]
     assert np.linalg.norm(spans[0]) == pytest.approx(np.linalg.norm(spans[1]), rel=1e-3)
@@ -416,12 +419,12 @@ def test_an_interrupted_run_continues(box, tmp_path):
     with pytest.raises(Stopped):
         reconstruct_project(box.root, out, source, progress=stop)
     assert not (out / "result.json").exists()
-    assert not (out / "project_metric").exists()
+    assert not (out / "transform.json").exists() and not (out / "images").exists()
     first = reconstruct_project(box.root, out, source)
     assert "times: finished in an earlier run, kept" in (out / "log.txt").read_text()
     whole = reconstruct_project(box.root, tmp_path / "whole", source)
     assert first.models[0].scale.metres_per_unit == whole.models[0].scale.metres_per_unit
-    assert contents(out / "project_metric" / "sparse") == contents(tmp_path / "whole" / "project_metric" / "sparse")
+    assert contents(out / "sparse") == contents(tmp_path / "whole" / "sparse")
     assert not list(out.rglob("*partial*"))
 
 
@@ -451,7 +454,7 @@ def test_euroc_keyframes_mapped_by_colmap(shared_data, tmp_path, capsys):
     flags = ["--imu", data / "mav0" / "imu0", "--name-times", "ns", "--scale.max-offset-s", "1"]
     code, _, err = run(capsys, "reconstruct", data / "colmap_sparse", out, *flags)
     assert code == 0, err
-    metric = read_model(out / "sparse_metric" / "0")
+    metric = read_model(out / "sparse" / "0")
     # the truth is the IMU's pose; the camera sits beside it
     rows = np.loadtxt(data / "gt" / "V1_01_easy.csv", delimiter=",", comments="#", skiprows=1)
     cam_in_imu = sensor_yaml.read_body_from_sensor(data / "mav0" / "cam0" / "sensor.yaml")[:3, 3]

@@ -94,13 +94,15 @@ def test_the_metric_model_lacks_the_camera_s_translation_within_the_readout_too(
 
 def test_images_and_model_agree_where_keypoints_were_rectified(rolling):
     _, root, _ = rolling
-    names = {path.name for path in (root / "on" / "images").iterdir()}
-    assert {path.name for path in (root / "on" / "images_rectified").iterdir()} == names
-    before, after = (cv2.imread(str(root / "on" / folder / "0007.jpg")) for folder in ("images", "images_rectified"))
+    names = {path.name for path in (root / "on" / "colmap" / "images").iterdir()}
+    assert {path.name for path in (root / "on" / "images").iterdir()} == names
+    before, after = (cv2.imread(str(root / "on" / folder / "0007.jpg")) for folder in ("colmap/images", "images"))
     assert before.shape == after.shape and np.abs(before.astype(int) - after).mean() > 2
     # what COLMAP saw are the very files of the capture
     for name in names:
-        assert (root / "on" / "images" / name).read_bytes() == (root / "capture" / "frames" / name).read_bytes()
+        assert (root / "on" / "colmap" / "images" / name).read_bytes() == (
+            root / "capture" / "frames" / name
+        ).read_bytes()
 
 
 def test_the_result_shows_the_calibration_from_before_and_after(rolling):
@@ -113,7 +115,7 @@ def test_the_result_shows_the_calibration_from_before_and_after(rolling):
     assert all(frame["rectified"] and frame["action"] == "passed" for frame in stored["frames"])
     assert "readout 30.0 ms" in stored["imaging"]["rolling_shutter"]
     assert off.imaging.view is None and off.imaging.deblur_note == "not asked for"
-    assert not (root / "off" / "images_rectified").exists()
+    assert contents(root / "off" / "images") == contents(root / "off" / "colmap" / "images")
 
 
 @pytest.fixture(scope="module")
@@ -180,19 +182,19 @@ def test_a_stopped_run_does_not_deblur_again(tmp_path, blurred):
 
     with pytest.raises(KeyboardInterrupt):
         reconstruct(blurred, tmp_path / "out", QUICK, progress=stop)
-    before = contents(tmp_path / "out" / "images")
+    before = contents(tmp_path / "out" / "colmap" / "images")
     stages = []
     with pytest.raises(KeyboardInterrupt):
         reconstruct(
             blurred, tmp_path / "out", QUICK, progress=lambda s, d, t, /: (stages.append(s), stop(s, d, t))
         )  # fmt: skip
-    assert set(stages) == {"features"} and contents(tmp_path / "out" / "images") == before
+    assert set(stages) == {"features"} and contents(tmp_path / "out" / "colmap" / "images") == before
     log = (tmp_path / "out" / "log.txt").read_text()
     assert "imaging: finished in an earlier run" in log and "frames: finished in an earlier run" in log
     # another decision makes the frames again
     with pytest.raises(KeyboardInterrupt):
         reconstruct(blurred, tmp_path / "out", replace(QUICK, deblur="off"), progress=stop)
-    assert contents(tmp_path / "out" / "images") == contents(blurred / "frames")
+    assert contents(tmp_path / "out" / "colmap" / "images") == contents(blurred / "frames")
 
 
 def parts(capture):

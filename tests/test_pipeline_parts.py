@@ -243,9 +243,9 @@ def test_each_sub_model_gets_its_own_scale_and_verdict(project, tmp_path):
         for name in set(names) - set(part):
             model.deregister_frame(model.find_image_with_name(name).frame_id)
         model.transform(pycolmap.Sim3d(factors[index], pycolmap.Rotation3d(), np.zeros(3)))
-        (workspace.sparse / str(index)).mkdir(parents=True)
-        model.write_binary(str(workspace.sparse / str(index)))
-    before = {p: p.read_bytes() for p in workspace.sparse.rglob("*.bin")}
+        (workspace.colmap_sparse / str(index)).mkdir(parents=True)
+        model.write_binary(str(workspace.colmap_sparse / str(index)))
+    before = {p: p.read_bytes() for p in workspace.colmap_sparse.rglob("*.bin")}
     imu = read_imu(project.imu)
     timing = read_frame_times(project.frame_times)
     results, fragments = run_models(
@@ -258,17 +258,19 @@ def test_each_sub_model_gets_its_own_scale_and_verdict(project, tmp_path):
     for result in results[:2]:
         expected = truth / factors[result.colmap_index]
         assert result.scale.metres_per_unit == pytest.approx(expected, rel=0.05)
-        assert result.sparse_metric == workspace.sparse_metric / str(result.index)
+        assert result.sparse_metric == workspace.sparse / str(result.index)
     assert results[2].scale.verdict == "refused"
     assert results[2].sparse_metric is None
-    assert sorted(p.name for p in workspace.sparse_metric.iterdir()) == ["0", "1"]
+    assert sorted(p.name for p in workspace.sparse.iterdir()) == ["0", "1"]
     assert sorted(p.name for p in workspace.root.glob("trajectory*")) == [
         "trajectory.tum",
         "trajectory_1.tum",
         "trajectory_1_cov.npz",
+        "trajectory_1_motion.json",
         "trajectory_cov.npz",
+        "trajectory_motion.json",
     ]
-    assert {p: p.read_bytes() for p in workspace.sparse.rglob("*.bin")} == before
+    assert {p: p.read_bytes() for p in workspace.colmap_sparse.rglob("*.bin")} == before
     outcome = ReconstructResult(workspace=workspace, models=results, frames=(), seconds={})
     assert outcome.exit_code() == 0
     refused = dataclasses.replace(outcome, models=results[2:])
@@ -284,8 +286,8 @@ def sub_models(project, workspace, parts):
         model = pycolmap.Reconstruction(whole)
         for name in names[count:]:
             model.deregister_frame(model.find_image_with_name(name).frame_id)
-        (workspace.sparse / str(number)).mkdir(parents=True)
-        model.write_binary(str(workspace.sparse / str(number)))
+        (workspace.colmap_sparse / str(number)).mkdir(parents=True)
+        model.write_binary(str(workspace.colmap_sparse / str(number)))
 
 
 def test_the_largest_model_comes_first_and_fragments_are_left_out_and_named(project, tmp_path):
@@ -296,18 +298,21 @@ def test_the_largest_model_comes_first_and_fragments_are_left_out_and_named(proj
     session, recording = session_in(workspace), recording_of(imu, timing)
     models, fragments = run_models(session, recording, [MetricStage(imu=imu, calibration=None)], after=())
     assert [(m.index, m.colmap_index, m.summary["registered_images"]) for m in models] == [(0, 1, 1000), (1, 2, 60)]
-    assert models[0].sparse == workspace.sparse / "1"
-    assert models[0].sparse_metric == workspace.sparse_metric / "0"
+    assert models[0].sparse == workspace.colmap_sparse / "1"
+    assert models[0].sparse_metric == workspace.sparse / "0"
     assert models[0].trajectory == workspace.root / "trajectory.tum"
     assert [(f.colmap_index, f.registered_images, f.sparse) for f in fragments] == [
-        (4, 4, workspace.sparse / "4"),
-        (0, 3, workspace.sparse / "0"),
+        (4, 4, workspace.colmap_sparse / "4"),
+        (0, 3, workspace.colmap_sparse / "0"),
     ]
     result = ReconstructResult(workspace=workspace, models=models, fragments=fragments, seconds={})
     report_result(session, result, recording.capture)
     said = json.loads(workspace.result.read_text())
     assert [model["colmap_index"] for model in said["models"]] == [1, 2]
-    assert [(f["colmap_index"], f["sparse"]) for f in said["fragments"]] == [(4, "sparse/4"), (0, "sparse/0")]
+    assert [(f["colmap_index"], f["sparse"]) for f in said["fragments"]] == [
+        (4, "colmap/sparse/4"),
+        (0, "colmap/sparse/0"),
+    ]
     # a second look finds the same without making it again, another one with the fragments makes it again
     session = session_in(workspace)
     again, _ = run_models(session, recording, [MetricStage(imu=imu, calibration=None)], after=())
@@ -325,23 +330,23 @@ def test_metric_models_that_are_gone_are_made_again(project, tmp_path):
     imu, timing = read_imu(project.imu), read_frame_times(project.frame_times)
     recording, stages = recording_of(imu, timing), [MetricStage(imu=imu, calibration=None)]
     run_models(session_in(workspace), recording, stages, after=())
-    shutil.rmtree(workspace.sparse_metric)
+    shutil.rmtree(workspace.sparse)
     session = session_in(workspace)
     run_models(session, recording, stages, after=())
-    assert session.runner.worked == ["metric"] and (workspace.sparse_metric / "0").is_dir()
+    assert session.runner.worked == ["metric"] and (workspace.sparse / "0").is_dir()
 
 
 def test_a_sub_model_with_one_timed_image_is_refused_and_the_others_go_on(project, tmp_path):
     workspace = Workspace(tmp_path / "out")
     workspace.open(tmp_path / "capture.toml")
     whole = read_model(project.model)
-    shutil.copytree(project.model, workspace.sparse / "0")
+    shutil.copytree(project.model, workspace.colmap_sparse / "0")
     names = sorted(image.name for image in whole.images.values())
     lonely = pycolmap.Reconstruction(whole)
     for name in names[1:]:
         lonely.deregister_frame(lonely.find_image_with_name(name).frame_id)
-    (workspace.sparse / "1").mkdir()
-    lonely.write_binary(str(workspace.sparse / "1"))
+    (workspace.colmap_sparse / "1").mkdir()
+    lonely.write_binary(str(workspace.colmap_sparse / "1"))
     imu, timing = read_imu(project.imu), read_frame_times(project.frame_times)
     session, recording = session_in(workspace), recording_of(imu, timing)
     stages = [MetricStage(imu=imu, calibration=None)]
@@ -352,7 +357,7 @@ def test_a_sub_model_with_one_timed_image_is_refused_and_the_others_go_on(projec
     result = ReconstructResult(workspace=workspace, models=(metric, refused), frames=(), seconds={})
     assert report_result(session, result, recording.capture).report is not None
     assert result.exit_code() == 0
-    shutil.rmtree(workspace.sparse / "0")
+    shutil.rmtree(workspace.colmap_sparse / "0")
     with pytest.raises(TimingError, match="1 of the model's 1 images"):
         run_models(session_in(workspace), recording, stages, after=(), fragments=True)
 

@@ -51,7 +51,7 @@ def test_commands_run_without_what_only_linux_has(project, tmp_path: Path) -> No
         ["scale", project.model, "--imu", project.imu, "--frame-times", project.frame_times, "--json", "scale.json"],
         ["apply", project.model.parents[1], metric, "--scale", "scale.json"],
         ["reconstruct", scene, out, "--config", "tiny.toml"],
-        ["validate", out / "sparse_metric" / "0", "--images", out / "images", "--target", spec],
+        ["validate", out / "sparse" / "0", "--images", out / "images", "--target", spec],
     ]
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", ELSEWHERE, json.dumps([[str(word) for word in c] for c in commands])],

@@ -290,6 +290,17 @@ def test_why_there_is_no_target_and_there_are_no_crops(full, tmp_path):
     assert "No frame was deblurred" in content["crops"]["missing"]
 
 
+def test_a_folder_of_an_earlier_layout_still_has_its_report(full, tmp_path):
+    out = copy_of(full, tmp_path)
+    result = json.loads((out / "result.json").read_text(encoding="utf-8"))
+    result["models"][0] |= {"sparse": "sparse/0", "sparse_metric": "sparse_metric/0"}
+    content, page = report_of_changed(out, {**result, "project_metric": "project_metric"})
+    assert content["models"][0]["sparse_metric"] == "sparse_metric/0"
+    assert re.search(r"project_metric\s*the whole project in metres", page.text)
+    _, page = report_of_changed(out, {**result, "project_metric": "."})
+    assert re.search(r"this folder\s*the whole project in metres", page.text)
+
+
 def test_a_folder_without_a_run_is_refused(tmp_path):
     with pytest.raises(FormatError, match="no such file"):
         write_report(tmp_path)
@@ -506,7 +517,7 @@ def test_a_recording_that_cannot_be_used_is_not_said_to_disagree_with_the_pictur
     assert "could not be brought together" not in page.text
     assert "cannot be used as it is" in page.text
     assert "camera acceleration" not in page.text  # which would be of the scale that was refused
-    assert "COLMAP's own model (sparse/0) is complete" in page.text
+    assert "COLMAP's own model (colmap/sparse/0) is complete" in page.text
 
 
 def test_a_camera_that_sees_all_around_has_a_place_too():
@@ -592,7 +603,7 @@ def test_reconstruct_writes_it_and_a_continued_run_does_too(tmp_path):
 
     (out / "result.json").unlink()
     (out / "report.html").unlink()
-    shutil.rmtree(out / "sparse_metric", ignore_errors=True)
+    shutil.rmtree(out / "sparse", ignore_errors=True)
     reconstruct(capture, out, quick)
     assert Page(out / "report.html").anchors() == page.anchors()
 

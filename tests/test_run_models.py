@@ -92,7 +92,7 @@ def run(project, whole, tmp_path):
 
     def run(sizes, *, doubts=(), least=0, most=1000, **more):
         for number, size in sizes.items():
-            folder = workspace.sparse / str(number)
+            folder = workspace.colmap_sparse / str(number)
             if not folder.exists():
                 part = pycolmap.Reconstruction(model.reconstruction)
                 for name in names[size:]:
@@ -101,7 +101,7 @@ def run(project, whole, tmp_path):
                 part.write_binary(str(folder))
         session = session_in(workspace)
         recording = replace(recording_of(project.recording.imu, model.timing), doubts=doubts)
-        found = {number: workspace.sparse / str(number) for number in sizes}
+        found = {number: workspace.colmap_sparse / str(number) for number in sizes}
         run.session = session
         return run_models(
             session, recording, [Scaled(made=made, least=least, most=most)], found=found, after=(), **more
@@ -141,8 +141,23 @@ def test_the_first_path_has_the_plain_name_and_those_of_models_that_are_gone_go(
     assert sorted(path.name for path in run.workspace.root.glob("trajectory*")) == [
         "trajectory.tum",
         "trajectory_cov.npz",
+        "trajectory_motion.json",
     ]
-    assert [path.name for path in run.workspace.sparse_metric.iterdir()] == ["1"]
+    assert [path.name for path in run.workspace.sparse.iterdir()] == ["1"]
+
+
+def test_a_scale_that_is_refused_takes_the_models_in_metres_away(run):
+    run({0: 60})
+    assert (run.workspace.sparse / "0").is_dir()
+    models, _ = run({0: 60}, least=70)
+    assert models[0].sparse_metric is None and not run.workspace.sparse.exists()
+
+
+def test_a_project_s_models_keep_their_numbers(run):
+    models, _ = run({0: 40, 2: 90}, numbered=True)
+    assert [(one.index, one.colmap_index, one.sparse_metric.name) for one in models] == [(2, 2, "2"), (0, 0, "0")]
+    assert [one.trajectory.name for one in models] == ["trajectory.tum", "trajectory_0.tum"]
+    assert num_registered(run.workspace.sparse / "2") == 90
 
 
 def test_doubts_make_any_stage_s_scale_weak_and_make_the_models_again(run):

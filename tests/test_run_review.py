@@ -68,9 +68,12 @@ def test_a_folder_is_for_one_command(tmp_path):
     workspace.open(tmp_path / "capture.toml")
     with pytest.raises(OutputExistsError, match=r"another command \(reconstruct\)"):
         workspace.open(tmp_path / "capture.toml", "deblur")
-    # a run of version 0.1 did not say which
+    # 0.2 and before laid out their folders otherwise
     (workspace.stamps / "capture.json").write_text(json.dumps({"capture": str((tmp_path / "capture.toml").resolve())}))
-    workspace.open(tmp_path / "capture.toml", "deblur")
+    before = sorted(workspace.root.rglob("*"))
+    with pytest.raises(OutputExistsError, match=r"another version, .* choose another folder, or remove this one"):
+        workspace.open(tmp_path / "capture.toml")
+    assert sorted(workspace.root.rglob("*")) == before
 
 
 def test_nothing_to_do_means_that_the_same_would_be_said(tmp_path):

@@ -22,8 +22,8 @@ from colmap_inertial.colmap.sparse import (
     write_gravity_priors,
 )
 from colmap_inertial.diagnose import Recorded, diagnose
-from colmap_inertial.drivers import frames as framing, project as existing
-from colmap_inertial.drivers.frames import run_frames, run_plan, run_rectified
+from colmap_inertial.drivers import frames as framing, placed, project as existing
+from colmap_inertial.drivers.frames import run_frames, run_images, run_plan
 from colmap_inertial.drivers.sources import check_output
 from colmap_inertial.errors import NotObservableError, OutputExistsError
 from colmap_inertial.io.calibration import Declared, calibration_prior, write_calibration
@@ -32,6 +32,7 @@ from colmap_inertial.io.exposures import LongExposures, SubImages
 from colmap_inertial.io.files import write_json
 from colmap_inertial.io.video_match import VideoMatch
 from colmap_inertial.model import TRANSFORM_FILE
+from colmap_inertial.model.similarities import ModelScale, plain_factor
 from colmap_inertial.options import ExposureOptions, MappingOptions, ProjectOptions, ReconstructOptions
 from colmap_inertial.precalibrate import calibrate, plan as imaging
 from colmap_inertial.precalibrate.pairs import exposure_stage
@@ -47,7 +48,7 @@ from colmap_inertial.simulate import MotionOptions, RecordingOptions, simulate_r
 from colmap_inertial.stages.exposures import Fuser
 from colmap_inertial.stages.frame_folder import FrameRecord, write_frames
 from colmap_inertial.stages.gyro_view import GyroView
-from colmap_inertial.stages.rectified import write_rectified
+from colmap_inertial.stages.rectified import write_images
 from colmap_inertial.threads import in_order
 from colmap_inertial.types import CameraModel, FrameTiming, ImuRecording, Treatment
 
@@ -119,7 +120,7 @@ def test_a_picture_that_was_edited_makes_the_frames_again(workspace, tmp_path):
 
     def made():
         session = session_in(workspace)
-        run_frames(session, filmed, frames_of(tmp_path / f"filmed {next(count)}")[1], [])
+        run_frames(session, filmed, frames_of(tmp_path / f"filmed {next(count)}")[1], [], workspace.images)
         return session.runner.worked
 
     assert [made(), made()] == [["frames"], []]
@@ -264,9 +265,7 @@ def test_dropped_frames_are_not_written_and_say_why(tmp_path):
 
 def test_pictures_whose_keypoints_stayed_are_copied(tmp_path):
     timing, _ = frames_of(tmp_path / "in")
-    write_rectified(
-        [lambda name, image: 255 - image], timing.names, {"2.jpg"}, tmp_path / "in", tmp_path / "out", silent
-    )
+    write_images([lambda name, image: 255 - image], timing.names, {"2.jpg"}, tmp_path / "in", tmp_path / "out", silent)
     for name in timing.names:
         same = (tmp_path / "out" / name).read_bytes() == (tmp_path / "in" / name).read_bytes()
         assert same == (name != "2.jpg")
@@ -289,12 +288,12 @@ def test_rectified_pictures_follow_the_frames(workspace, tmp_path):
             for name in NAMES:
                 cv2.imwrite(str(partial[0] / name), np.full((8, 8), option, np.uint8))
 
-        session.runner.run("frames", {"option": option}, [workspace.images], frames)
-        run_rectified(session, records, {"2.jpg"}, [mover])
+        session.runner.run("frames", {"option": option}, [workspace.colmap_images], frames)
+        run_images(session, records, {"2.jpg"}, [mover])
         return session.runner.worked
 
-    assert [made(10), made(10), made(90)] == [["frames", "rectified"], [], ["frames", "rectified"]]
-    assert cv2.imread(str(workspace.images_rectified / "2.jpg"))[0, 0, 0] == pytest.approx(165, abs=2)
+    assert [made(10), made(10), made(90)] == [["frames", "images"], [], ["frames", "images"]]
+    assert cv2.imread(str(workspace.images / "2.jpg"))[0, 0, 0] == pytest.approx(165, abs=2)
 
 
 def test_an_earlier_result_that_is_an_input_is_not_written_over(tmp_path):
@@ -393,6 +392,24 @@ def features(tmp_path_factory):
         context=RunContext(scratch=folder, num_threads=1),
     )
     return folder / "features.db", found
+
+
+def test_colmap_numbers_images_by_name_whichever_thread_comes_to_an_end_first(tmp_path):
+    rng = np.random.default_rng(0)
+    names = [f"{i}.png" for i in range(6)]
+    for i, name in enumerate(names):  # the first take longest
+        picture = np.full((400, 400), 128, np.uint8)
+        seen = picture[:, : 400 if i < 2 else 40]
+        seen[:] = cv2.GaussianBlur(rng.integers(0, 255, seen.shape, np.uint8), (0, 0), 1.5)
+        cv2.imwrite(str(tmp_path / name), picture)
+    context = RunContext(scratch=tmp_path, num_threads=6)
+    cameras = dict.fromkeys(reversed(names))
+    extract_features(tmp_path, cameras, tmp_path / "x.db", MappingOptions(max_num_features=200), context=context)
+    with pycolmap.Database.open(str(tmp_path / "x.db")) as database:
+        found = {image.image_id: image.name for image in database.read_all_images()}
+        assert [found[i] for i in sorted(found)] == names
+        assert all(len(database.read_keypoints(i)) for i in found)
+        assert len({image.camera_id for image in database.read_all_images()}) == len(database.read_all_cameras())
 
 
 def test_it_is_recorded_whose_keypoints_are_those_of_a_global_shutter(features):
@@ -558,31 +575,30 @@ def test_another_scale_makes_the_project_again(workspace, tmp_path, monkeypatch)
     project.mkdir()
 
     class Done:
-        notes = ()
-
-    class Result:
-        colmap_index = 0
-        sparse_metric = workspace.sparse_metric / "0"
-
-        class scale:
-            verdict, reasons = "trusted", ()
+        notes, models = (), {}
 
     def apply(project, out, scales, **more):
         out.mkdir()
         (out / "scale").write_text(str(scales[0].similarity.scale))
+        write_json(out / TRANSFORM_FILE, {"models": [], "files": []})
         return Done
 
-    monkeypatch.setattr(existing, "apply_to_project", apply)
-    Result.sparse_metric.mkdir(parents=True)
+    monkeypatch.setattr(placed, "apply_to_project", apply)
 
     def made(scale):
-        write_json(Result.sparse_metric / TRANSFORM_FILE, {"scale": scale})
         session = session_in(workspace)
-        found = existing._run_apply(session, project, ProjectOptions(), ReconstructOptions(), [Result], [])
-        return session.runner.worked, (found / "scale").read_text()
+        scales = {0: ModelScale(similarity=scale and plain_factor(scale))}
+        found = placed.place_project(session, project, ProjectOptions(), {0: project}, scales)
+        return session.runner.worked, found and (found / "scale").read_text()
 
     assert made(2.0) == (["apply"], "2.0")
     assert made(2.0) == ([], "2.0")
+    assert made(3.0) == (["apply"], "3.0")
+    # what is gone comes again, and goes where no scale is accepted any more
+    (workspace.root / "scale").unlink()
+    assert made(3.0) == (["apply"], "3.0")
+    assert made(None) == ([], None)
+    assert [path.name for path in workspace.root.iterdir()] == [workspace.stamps.name]
     assert made(3.0) == (["apply"], "3.0")
 
 

@@ -30,7 +30,7 @@ def test_known():
 
 @pytest.mark.parametrize(("switch", "outcome"), [([], "1 passed, 3 skipped, 1 xfailed"), (["--no-skips"], "")])
 def test_skips_are_failures_where_that_is_asked_for(tmp_path, switch, outcome):
-    for name in ("conftest.py", "quick.txt"):
+    for name in ("conftest.py", "quick.txt", "slow.txt"):
         shutil.copy(ROOT / "tests" / name, tmp_path)
     (tmp_path / "pytest.ini").write_text("[pytest]\n")
     (tmp_path / "test_some.py").write_text(TESTS)
@@ -47,6 +47,13 @@ def test_skips_are_failures_where_that_is_asked_for(tmp_path, switch, outcome):
     done = subprocess.run(whole, cwd=tmp_path, env=env, capture_output=True, text=True)
     assert done.returncode == 1 and "1 failed, 1 passed, 1 xfailed, 1 error" in done.stdout, done.stdout
     assert "skipped, which --no-skips does not allow: Skipped: no browser" in done.stdout
+
+
+@pytest.mark.parametrize("name", ["quick.txt", "slow.txt"])
+def test_the_lists_name_files_that_are_there(name):
+    listed = (ROOT / "tests" / name).read_text().split()
+    assert len(set(listed)) == len(listed)
+    assert [file for file in listed if not (ROOT / "tests" / file).is_file()] == []
 
 
 @pytest.fixture

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -64,23 +65,29 @@ def synthesized(seed, frames=12, points=400):
     return model
 
 
-def write_result(root, estimates, world="z-up", validation=None):
-    """An output folder as ``reconstruct`` leaves it, with a model for each estimate; returns these models."""
+OLD = ("sparse", "sparse_metric")
+
+
+def write_result(root, estimates, world="z-up", validation=None, places=("colmap/sparse", "sparse")):
+    """An output folder as ``reconstruct`` leaves it, with a model for each estimate; returns these models.
+
+    ``places``: where COLMAP's models are, and those in metres; ``OLD`` before the folder itself was the project.
+    """
     (root / ".stages").mkdir(parents=True)
     models, records = [], []
     for index, estimate in enumerate(estimates):
         model = synthesized(index + 1, frames=8 + 4 * index)
         models.append(model)
-        sparse = root / "sparse" / str(index)
+        sparse = root / places[0] / str(index)
         sparse.mkdir(parents=True)
         model.write_binary(str(sparse))
         metric = None
         if estimate.verdict != "refused":
-            metric = f"sparse_metric/{index}"
-            (root / "sparse_metric").mkdir(exist_ok=True)
+            metric = f"{places[1]}/{index}"
+            (root / places[1]).mkdir(exist_ok=True)
             apply_similarity(sparse, root / metric, Similarity.from_scale(estimate, world=world, provenance="a test"))
         records.append(
-            {"index": index, "registered_images": model.num_reg_images(), "sparse": f"sparse/{index}",
+            {"index": index, "registered_images": model.num_reg_images(), "sparse": f"{places[0]}/{index}",
              "sparse_metric": metric, "trajectory": None, "validation": validation, "dense": None, **estimate.as_json()}
         )  # fmt: skip
     (root / "result.json").write_text(json.dumps({"models": records}))
@@ -357,12 +364,39 @@ def test_cameras_that_see_all_around_are_drawn_with_a_nominal_field_of_view(tmp_
     np.testing.assert_allclose(np.tan(0.5 * scene.cameras.vertical_fov_rad), 0.5)
 
 
+@pytest.mark.parametrize(
+    ("places", "images"),
+    [
+        (("colmap/sparse", "sparse"), ("images",)),
+        (OLD, ("images_rectified", "images")),
+        (OLD, ("images",)),
+        (OLD, ("project_metric/images",)),
+    ],
+)
+def test_folders_of_both_layouts_are_shown_in_metres_with_the_images_that_fit(tmp_path, places, images):
+    out = tmp_path / "out"
+    (model,) = write_result(out, [ESTIMATE], places=places)
+    for image in model.images.values():
+        for folder in images:
+            (out / folder / image.name).parent.mkdir(parents=True, exist_ok=True)
+            (out / folder / image.name).touch()
+    scene = load_scene(out)
+    assert scene.source.scale.unit == "m"
+    np.testing.assert_allclose(scene.cloud.xyz, places_in_m(model)[0], atol=1e-5)
+    assert scene.image_of(0) == out / images[0] / scene.cameras.names[0]
+    # and what is left of it when somebody keeps the project alone
+    shutil.rmtree(out / ".stages")
+    (out / "result.json").unlink()
+    scene = load_scene(out)
+    assert scene.source.scale.unit == "m" and scene.source.folder == out / places[1] / "0"
+
+
 def test_images_of_an_existing_project_are_found(tmp_path):
     out, images = tmp_path / "out", tmp_path / "pictures"
     write_result(out, [ESTIMATE])
     name = load_scene(out).cameras.names[0]
     assert load_scene(out).image_of(0) is None
-    copied = out / "project_metric" / "images" / name
+    copied = out / "images" / name
     copied.parent.mkdir(parents=True)
     copied.touch()
     assert load_scene(out).image_of(0) == copied

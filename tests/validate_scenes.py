@@ -60,6 +60,12 @@ def default_camera(width=640, height=480) -> pycolmap.Camera:
     return camera
 
 
+def _within(xy: np.ndarray, low, high) -> np.ndarray:
+    """Which points (n, 2) lie in a rectangle."""
+    (x, y), (x0, y0), (x1, y1) = xy.T, np.broadcast_to(low, 2), np.broadcast_to(high, 2)
+    return (x >= x0) & (x < x1) & (y >= y0) & (y < y1)
+
+
 def checkerboard(target: Target, *, centre=(0.0, 0.0)) -> Texture:
     """Grey values of a checkerboard with a white rim, as a function of the plane's coordinates (n, 2)."""
     first = target.corners_m[0, :2] + centre
@@ -67,8 +73,8 @@ def checkerboard(target: Target, *, centre=(0.0, 0.0)) -> Texture:
     def grey(xy: np.ndarray) -> np.ndarray:
         u = (xy - first) / target.length_m
         size = np.array([target.columns, target.rows])
-        on_board = ((u > -1) & (u < size)).all(axis=1)
-        on_paper = ((u > -2) & (u < size + 1)).all(axis=1)
+        on_board = _within(u, -1, size)
+        on_paper = _within(u, -2, size + 1)
         dark = np.floor(u).astype(int).sum(axis=1) % 2 == 0
         return np.where(on_board, np.where(dark, DARK, LIGHT), np.where(on_paper, LIGHT, np.nan))
 
@@ -81,8 +87,8 @@ def cells(bits: np.ndarray, side_m: float, lower_left=(0.0, 0.0), *, rim: float 
     def grey(xy: np.ndarray) -> np.ndarray:
         n = len(bits)
         u = (xy - lower_left) / side_m * n
-        inside = ((u >= 0) & (u < n)).all(axis=1)
-        paper = ((u >= -rim) & (u < n + rim)).all(axis=1)
+        inside = _within(u, 0, n)
+        paper = _within(u, -rim, n + rim)
         index = np.clip(np.floor(u).astype(int), 0, n - 1)
         return np.where(inside, np.where(bits[index[:, 1], index[:, 0]], LIGHT, DARK), np.where(paper, LIGHT, np.nan))
 
@@ -100,8 +106,8 @@ def charuco(target: Target) -> Texture:
 
     def grey(xy: np.ndarray) -> np.ndarray:
         u = xy + extent / 2
-        inside = ((u >= 0) & (u < extent)).all(axis=1)
-        paper = ((u >= -target.length_m) & (u < extent + target.length_m)).all(axis=1)
+        inside = _within(u, 0, extent)
+        paper = _within(u, -target.length_m, extent + target.length_m)
         index = np.clip((u / target.length_m * scale).astype(int), 0, np.array(size) * scale - 1)
         return np.where(inside, np.where(bits[index[:, 1], index[:, 0]], LIGHT, DARK), np.where(paper, LIGHT, np.nan))
 
@@ -125,8 +131,8 @@ def aprilgrid(target: Target, *, centre=(0.0, 0.0)) -> Texture:
 
     def squares(xy: np.ndarray) -> np.ndarray:
         u = xy - lower_left
-        on_board = ((u > -gap) & (u < extent + gap)).all(axis=1)
-        paper = ((u > -2 * gap) & (u < extent + 2 * gap)).all(axis=1)
+        on_board = _within(u, -gap, extent + gap)
+        paper = _within(u, -2 * gap, extent + 2 * gap)
         between = ((u + gap) % (tag + gap) < gap).all(axis=1)
         return np.where(on_board & between, DARK, np.where(paper, LIGHT, np.nan))
 

@@ -71,8 +71,12 @@ def unwatched(status: CaptureStatus, /) -> None:
 
 
 def needs_gpu(options: ReconstructOptions) -> bool:
-    """Whether a capture is to have a GPU to itself: where its options ask for dense reconstruction."""
-    return options.dense
+    """Whether a capture is to have a GPU to itself: where COLMAP makes its depth maps there."""
+    if not options.dense:
+        return False
+    import pycolmap
+
+    return bool(pycolmap.has_cuda)
 
 
 def run_batch(

@@ -26,6 +26,7 @@ from colmap_inertial.drivers.capture import reconstruct
 from colmap_inertial.drivers.project import is_project, reconstruct_project
 from colmap_inertial.errors import InertialError, OutputExistsError
 from colmap_inertial.io.files import locked, write_text
+from colmap_inertial.io.limits import reading_within
 from colmap_inertial.options import ProjectOptions, StageNames
 from colmap_inertial.run.config import config_as_toml, read_config
 from colmap_inertial.run.progress import Progress
@@ -74,7 +75,8 @@ def main() -> None:
 
 def _reconstruct(task: CaptureTask, progress: Progress) -> None:
     job = read_config(task.config, Job)
-    existing = job.project != ProjectOptions() or is_project(task.capture)
+    with reading_within(job.options.limits):
+        existing = job.project != ProjectOptions() or is_project(task.capture)
     if existing and job.stages != StageNames(model=job.stages.model):
         raise InertialError(
             "stages.frame and stages.keypoint: an existing model is not mapped again, nor its images changed; give "

@@ -15,7 +15,7 @@ from tyro.conf import subcommand
 from colmap_inertial import __version__
 from colmap_inertial.cli.captures import Batch, Deblur, FuseApertures, FuseExposures, Reconstruct, Simulate
 from colmap_inertial.cli.limits import exhausted, require_limits
-from colmap_inertial.cli.models import Align, Apply, CalibrateImu, Diagnose, Scale, Validate, View
+from colmap_inertial.cli.models import Align, Apply, CalibrateImu, Diagnose, Export, Scale, Validate, View
 from colmap_inertial.errors import InertialError
 from colmap_inertial.options import ReconstructOptions
 
@@ -34,6 +34,7 @@ Command = (
     | Diagnose
     | Validate
     | View
+    | Export
     | Deblur
     | FuseApertures
     | FuseExposures
@@ -49,6 +50,7 @@ _COMMANDS: dict[str, type[Command]] = {
     "diagnose": Diagnose,
     "validate": Validate,
     "view": View,
+    "export": Export,
     "deblur": Deblur,
     "fuse-apertures": FuseApertures,
     "fuse-exposures": FuseExposures,
@@ -144,9 +146,12 @@ def _main(args: Sequence[str] | None) -> None:
     except (InertialError, ValueError) as error:  # options check their own values when they are built
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
+    from colmap_inertial.io.limits import reading_within
+
     try:
         require_limits()
-        code = command.run()
+        with reading_within(command.limits):
+            code = command.run()
     except InertialError as error:
         print(f"error: {error}", *getattr(error, "__notes__", ()), sep="\n", file=sys.stderr)
         code = error.exit_code
@@ -155,7 +160,7 @@ def _main(args: Sequence[str] | None) -> None:
         again = "; started again with the same arguments, it continues" if resumes else ""
         print(f"interrupted{again}", file=sys.stderr)
         code = 130
-    except (MemoryError, OSError, ImportError) as error:
+    except (MemoryError, OSError, ImportError, RuntimeError) as error:
         said = exhausted(error)
         if said is None:
             raise

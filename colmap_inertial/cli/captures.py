@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from colmap_inertial.cli.limits import Reader
 from colmap_inertial.options import (
     ApertureOptions,
     BatchOptions,
@@ -17,6 +18,7 @@ from colmap_inertial.options import (
     ExposureOptions,
     FuseAperturesOptions,
     ProjectOptions,
+    ReadLimits,
     ReconstructOptions,
 )
 
@@ -25,12 +27,13 @@ from colmap_inertial.options import (
 class Reconstruct:
     """Turn images or video with an IMU recording into a COLMAP model in metres, gravity along an axis.
 
-    Writes OUT/sparse (COLMAP's own model), OUT/sparse_metric (the same in metres), OUT/trajectory.tum, OUT/result.json;
-    with --dense also OUT/dense_metric. Started again after an interruption, or with other options, it makes only what
-    is not there yet or depends on them.
+    OUT is a COLMAP project in metres: OUT/images, OUT/sparse, and with --dense OUT/dense; beside it are
+    OUT/trajectory.tum, OUT/report.html and OUT/result.json. What COLMAP saw and made, in its own units, is in
+    OUT/colmap. Without an accepted scale there is no OUT/sparse. Started again after an interruption, or with other
+    options, it makes only what is not there yet or depends on them.
 
     CAPTURE may be an existing COLMAP project: give --imu, and when its images were taken. Nothing is mapped again, and
-    OUT/project_metric is all of the project in metres.
+    OUT is all of the project in metres.
 
     Example: colmap-inertial reconstruct my_capture/capture.toml out
     """
@@ -48,6 +51,11 @@ class Reconstruct:
     it; never with --deterministic."""
     config: Path | None = None
     """TOML file with options, as OUT/config.toml of an earlier run; flags given here go before it."""
+
+    @property
+    def limits(self) -> ReadLimits:
+        """How large a file may be that is read."""
+        return self.options.limits
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
@@ -71,7 +79,7 @@ class Reconstruct:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Deblur:
+class Deblur(Reader):
     """Undo the motion blur of images by the gyroscope, without reconstructing anything.
 
     Writes OUT/images with the frames' names, sizes, formats and metadata, and OUT/result.json with what happened to
@@ -91,7 +99,7 @@ class Deblur:
     calibration: tuple[Path, ...] = ()
     """Calibration files of this device: from `align --out`, from `calibrate-imu --out`, or both."""
     rectify: bool = False
-    """Also write OUT/images_rectified, without the rolling shutter (needs its readout time)."""
+    """Undo the rolling shutter, too (needs its readout time); OUT/colmap/images are those with it."""
     sheet: Path | None = None
     """Write a PNG with parts of the most blurred frames before and after."""
 
@@ -115,7 +123,7 @@ class Deblur:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FuseApertures:
+class FuseApertures(Reader):
     """Make RGB pictures of a multi-aperture camera's sub-images, without reconstructing anything.
 
     One disparity map from all apertures takes their parallax out. Writes OUT/images, seen through the first aperture,
@@ -147,7 +155,7 @@ class FuseApertures:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FuseExposures:
+class FuseExposures(Reader):
     """Make one clean, sharp picture of each short and long exposure, without reconstructing anything.
 
     The long one is brought to the short one's geometry, by the gyroscope where there is one and by the pixels; a
@@ -210,6 +218,11 @@ class Batch:
     config: Path | None = None
     """TOML file with options for all; flags given here go before it, and what the manifest says before both."""
 
+    @property
+    def limits(self) -> ReadLimits:
+        """How large a file may be that is read."""
+        return self.options.limits
+
     def run(self) -> int:
         """Run the command; returns the exit code."""
         from colmap_inertial.batch import run_batch
@@ -224,7 +237,7 @@ class Batch:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Simulate:
+class Simulate(Reader):
     """Make a simulated capture with known truth: a desk or room, filmed by a hand, with the IMU that ran along.
 
     Example: colmap-inertial simulate example_scenes/rolling_shutter/recipe.toml my_scene

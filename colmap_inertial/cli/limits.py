@@ -1,4 +1,4 @@
-"""Limits of the process: those that are too low are said before the work, those that are reached in a sentence.
+"""Limits: of files, as options of every command; of the process, which are said before the work or where reached.
 
 Libraries that are out of memory or of files end the process without one: OpenBLAS, COLMAP's threads, the loader.
 """
@@ -6,14 +6,24 @@ Libraries that are out of memory or of files end the process without one: OpenBL
 from __future__ import annotations
 
 import errno
+from dataclasses import dataclass, field
 
 from colmap_inertial.errors import InertialError
+from colmap_inertial.options import ReadLimits
 
 #: Address space to begin with, and for each thread: its stack, and what the allocator keeps for it. A reconstruction of
 #: small pictures takes 1.3 GB on two processors.
 LEAST_BYTES, THREAD_BYTES = 2 << 30, 128 << 20
 #: A reconstruction has 9 open at a time, a batch some for each process; systems allow 256 or more.
 LEAST_FILES = 64
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reader:
+    """What all commands have."""
+
+    limits: ReadLimits = field(default_factory=ReadLimits)
+    """How large a file may be that is read."""
 
 
 def require_limits() -> None:
@@ -44,11 +54,16 @@ def require_limits() -> None:
         )
 
 
-def exhausted(error: BaseException) -> str | None:
-    """A sentence for an exception that means that memory or files have run out; ``None`` for any other."""
-    number = error.errno if isinstance(error, OSError) else None
-    if isinstance(error, MemoryError) or number == errno.ENOMEM or "failed to map segment" in str(error):
-        return "the memory is used up: close other programs, or allow smaller pictures or fewer processes"
-    if number in (errno.EMFILE, errno.ENFILE):
-        return "too many files are open at a time: raise the limit (ulimit -n) and start again"
+def exhausted(error: BaseException | None) -> str | None:
+    """A sentence for an exception that means that memory or files have run out, or that one such has led to.
+
+    ``None`` for any other. pycolmap says only that it cannot be imported, and how it is installed.
+    """
+    while error is not None:
+        number = error.errno if isinstance(error, OSError) else None
+        if isinstance(error, MemoryError) or number == errno.ENOMEM or "failed to map segment" in str(error):
+            return "the memory is used up: close other programs, or allow smaller pictures or fewer processes"
+        if number in (errno.EMFILE, errno.ENFILE):
+            return "too many files are open at a time: raise the limit (ulimit -n) and start again"
+        error = error.__cause__ or error.__context__
     return None

@@ -9,11 +9,19 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from colmap_inertial.options import GravityOptions, ScaleOptions, ValidateOptions, WorldAxes
+from colmap_inertial.cli.limits import Reader
+from colmap_inertial.options import (
+    ExportImages,
+    ExportProgram,
+    GravityOptions,
+    ScaleOptions,
+    ValidateOptions,
+    WorldAxes,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scale:
+class Scale(Reader):
     """Metres per unit of an existing model or trajectory, without mapping.
 
     SOURCE is a COLMAP model folder (needs --imu and --frame-times), a trajectory in TUM format (needs --imu), or an
@@ -68,7 +76,7 @@ class Scale:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Apply:
+class Apply(Reader):
     """Make a whole COLMAP project metric: sparse models, dense workspaces, point clouds, meshes, database.
 
     OUT mirrors PROJECT, which is only read; it appears whole or not at all, and OUT/transform.json says what was done.
@@ -146,7 +154,7 @@ class Apply:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Align:
+class Align(Reader):
     """Rotation, time offset and gyro bias between the camera and the IMU of one device, from one recording.
 
     Needs no scale, only a camera that turned. The calibration file serves --calibration for later recordings of the
@@ -184,7 +192,7 @@ class Align:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CalibrateImu:
+class CalibrateImu(Reader):
     """Gains, misalignments and biases of an IMU, from a recording in which it lay still in twelve attitudes or more.
 
     Start the recording, lay the device still on its six sides, then leaning on six of its edges (a box or a book
@@ -220,7 +228,7 @@ class CalibrateImu:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Diagnose:
+class Diagnose(Reader):
     """What is wrong with a recording, and what to do, before any reconstruction.
 
     Exit code 1 when something makes a scale wrong or impossible, 0 when nothing is worse than a warning.
@@ -255,20 +263,20 @@ class Diagnose:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Validate:
+class Validate(Reader):
     """Compare the size of a model with a target of known size in its images.
 
     TARGET is checkerboard:COLSxROWS:SQUARE_M (inner corners), charuco:COLSxROWS:SQUARE_M:MARKER_M:DICT (squares),
     aprilgrid:COLSxROWS:TAG_M:GAP (GAP = gap / tag), or aruco:DICT:SIDE_M. Exit code 0 within the tolerance, 1 outside
     it, 5 when the target is not found.
 
-    Example: colmap-inertial validate out/sparse_metric/0 --images out/images --target checkerboard:8x6:0.03
+    Example: colmap-inertial validate out/sparse/0 --images out/images --target checkerboard:8x6:0.03
     """
 
     model: Positional[Path]
     """COLMAP model folder."""
     images: Path
-    """Folder with the model's images (the rectified ones where the rolling shutter was undone)."""
+    """Folder with the model's images (OUT/images of a reconstruction)."""
     target: str
     """What to look for, as above."""
     json: Path | None = None
@@ -305,7 +313,64 @@ class Validate:
 
 
 @dataclass(frozen=True, kw_only=True)
-class View:
+class Export(Reader):
+    """Write a finished model as other programs read it, in metres and with up where it was.
+
+    Without --for, DIR is one folder for all splatting and NeRF trainers: images/ (undistorted, the principal point in
+    the middle), sparse/0 (COLMAP), sparse_pc.ply, transforms.json, export.json. With --for, also the command line with
+    which that program keeps metres and up. 3dgs-deblur gets velocities, instant-ngp poses of first and last rows. Other
+    formats: metashape and bundler (cameras and undistorted images), ply and las (sparse points), tum, csv and gltf (the
+    camera's path). las and gltf need the extra packages [las] and [gltf].
+
+    A refused scale is refused here, too (exit code 3), unless --unscaled is given.
+
+    Example: colmap-inertial export out/hall hall_splat --for gsplat
+    """
+
+    out: Positional[Path]
+    """What reconstruct or apply wrote, or a COLMAP model folder; it is only read."""
+    dir: Positional[Path]
+    """A new or empty folder outside of OUT; it appears whole or not at all."""
+    program: Annotated[ExportProgram | None, arg(name="for")] = None
+    """The program or format; all trainers without it."""
+    images: ExportImages = "rectified"
+    """rectified: those that agree with the model; original: those with their rolling shutter, as COLMAP saw them."""
+    model: int | None = None
+    """Number of the model, where there are several; the largest otherwise."""
+    image_folder: Path | None = None
+    """Folder with the model's images, where they are not beside the model."""
+    capture: Path | None = None
+    """With --images original: the capture that the run was made of, for frames that it deblurred or changed."""
+    unscaled: bool = False
+    """Export a model without a scale, too: its units are not metres."""
+
+    def __post_init__(self) -> None:
+        if self.capture is not None and self.images != "original":
+            raise ValueError("--capture goes with --images original")
+
+    def run(self) -> int:
+        """Run the command; returns the exit code."""
+        from colmap_inertial.cli.terminal import live_progress, show_exported
+        from colmap_inertial.export.whole import export_model
+
+        with live_progress() as progress:
+            made = export_model(
+                self.out,
+                self.dir,
+                self.program,
+                images=self.images,
+                model=self.model,
+                image_folder=self.image_folder,
+                capture=self.capture,
+                unscaled=self.unscaled,
+                progress=progress,
+            )
+        show_exported(made)
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class View(Reader):
     """Show a reconstruction in the browser: points, cameras, gravity, a scale bar, the target; and measure in it.
 
     OUT is what reconstruct or apply wrote, or a COLMAP model folder. A model without a scale is shown in its own units,

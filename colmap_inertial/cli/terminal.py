@@ -13,6 +13,7 @@ from colmap_inertial.drivers.deblur import DeblurResult
 from colmap_inertial.drivers.remembered import Remembered
 from colmap_inertial.drivers.result import ReconstructResult, shutter_note
 from colmap_inertial.errors import InertialError
+from colmap_inertial.export.whole import Exported
 from colmap_inertial.model.project import Applied
 from colmap_inertial.precalibrate.plan import ImagingPlan
 from colmap_inertial.rest import RestCalibration
@@ -44,11 +45,12 @@ _STAGES = {
     "features": "Features",
     "matches": "Matches",
     "mapping": "Mapping",
-    "rectified": "Rectified",
+    "images": "Images",
     "metric": "Metric scale",
     "validation": "Validation",
     "apply": "Files",
     "dense": "Dense",
+    "export": "Pictures",
 }
 _SEVERITY_COLOUR = {"info": "blue", "warning": "yellow", "error": "red"}
 _COLOUR = {"trusted": "green", "weak": "yellow", "refused": "red"}
@@ -257,8 +259,8 @@ def show_deblurred(result: DeblurResult) -> None:
     if result.unchanged:
         show_nothing_to_do(result.workspace)
     written = [result.workspace.images, result.workspace.result]
-    if result.workspace.images_rectified.is_dir():
-        written.insert(1, result.workspace.images_rectified)
+    if result.workspace.colmap.is_dir():
+        written.insert(1, result.workspace.colmap_images)
     if result.sheet is not None:
         written.append(result.sheet)
     lines = imaging_lines(result.frames, result.imaging, result.rectified)
@@ -302,11 +304,47 @@ def show_result(result: ReconstructResult) -> None:
         lines.append(("Time", ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in result.seconds.items())))
         number = "" if model.colmap_index == model.index else f" (COLMAP's {model.colmap_index})"
         _show(f"Model {model.index}{number}", lines)
+    print(_layout_in_a_line(result))
     for fragment in result.fragments:
         print(
             f"COLMAP's model {fragment.colmap_index} is a fragment of {fragment.registered_images} images, left out; "
             "--fragments makes it metric, too"
         )
+
+
+def _layout_in_a_line(result: ReconstructResult) -> str:
+    """Where what is metric lies, and where what is not."""
+    workspace = result.workspace
+    if all(model.sparse_metric is None for model in result.models):
+        where = {str(model.sparse) for model in result.models}
+        return f"no scale is accepted, so that nothing here is in metres: COLMAP's own is {', '.join(sorted(where))}"
+    if result.project_metric is not None:
+        return f"{workspace.root} is the whole project in metres"
+    made = [path.name for path in (workspace.images, workspace.sparse, workspace.dense) if path.is_dir()]
+    return f"{workspace.root} is a COLMAP project in metres ({', '.join(made)}); in COLMAP's units: {workspace.colmap}"
+
+
+def show_exported(made: Exported) -> None:
+    """Print what was exported, and the command line that keeps metres and up."""
+    from rich.text import Text
+
+    several = (
+        f" of {len(made.others)}; --model takes {', '.join(map(str, made.others))}" if len(made.others) > 1 else ""
+    )
+    unit = "metres" if made.unit == "m" else Text("unknown: not metres", "bold red")
+    lines: list[Line] = [
+        ("Model", f"{made.model}{several}"),
+        ("Unit", unit),
+        *([("Images", str(made.images))] if made.images else []),
+        *([("Points", str(made.points))] if made.points else []),
+        *(("Note", note) for note in made.notes),
+        *([("Use", made.says)] if made.says else []),
+        ("Written", str(made.folder)),
+    ]
+    _show("Export" if made.program is None else f"Export for {made.program}", lines)
+    if made.command:
+        # not in the panel, which would break the line that is to be copied
+        print(made.command)
 
 
 def show_view(out: Path, url: str, host: str) -> None:

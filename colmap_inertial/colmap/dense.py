@@ -1,4 +1,7 @@
-"""From a metric model to depth maps, a fused point cloud and a mesh in metres, by COLMAP."""
+"""From a metric model to depth maps, a fused point cloud and a mesh in metres.
+
+Depth maps are made by COLMAP's patch-match where pycolmap has CUDA, else by our plane sweep; the rest is COLMAP's.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +10,6 @@ import logging
 import math
 import os
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,16 +17,27 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from colmap_inertial.errors import FormatError, InertialError, OutputError, OutputExistsError
+from colmap_inertial.colmap.depth_maps import (
+    MadeFrom,
+    Maker,
+    coverage,
+    found_maps,
+    map_file,
+    patch_match,
+    settle_maker,
+)
+from colmap_inertial.colmap.fusion import fuse_maps
+from colmap_inertial.colmap.swept import SweptWorkspace
+from colmap_inertial.errors import FormatError, OutputError
 from colmap_inertial.io.files import read_json, write_json
 from colmap_inertial.io.images import read_image
 from colmap_inertial.io.names import path_in
 from colmap_inertial.io.ply import read_ply_header
 from colmap_inertial.model import TRANSFORM_FILE, read_model
-from colmap_inertial.model.artefacts import check_map
 from colmap_inertial.options import DenseOptions
 from colmap_inertial.run.runner import fingerprint, remove
 from colmap_inertial.run.session import Session
+from colmap_inertial.run.workspace import a_record_of_ours
 
 if TYPE_CHECKING:
     import pycolmap
@@ -36,17 +48,9 @@ log = logging.getLogger(__name__)
 _LEAST_DEPTH, _MOST_DEPTH = 6, 13
 #: COLMAP cuts away what is sampled three levels (8 times) more coarsely than the finest; so do we.
 _TRIM_LEVELS = 3
-_STEPS = 4
-#: Ends with the process that started it.
-_PATCH_MATCH = """
-import ctypes, signal, sys, zlib
-if sys.platform == "linux":
-    ctypes.CDLL(None).prctl(1, signal.SIGKILL)
-import pycolmap
-options = pycolmap.PatchMatchOptions()
-options.max_image_size = int(sys.argv[2])
-pycolmap.patch_match_stereo(sys.argv[1], options=options)
-"""
+
+#: Undistortion, fusion and mesh are one each of what progress counts; the depth maps between are one or one by one.
+_STEPS = 3
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -59,17 +63,23 @@ class DenseResult:
         COLMAP's dense workspace.
     images, depth_maps
         How many undistorted images there are, and how many of them have a depth map.
+    maps
+        Who made the depth maps: patch-match or plane sweep.
+    coverage
+        Share of the maps' pixels that have a depth.
     fused, points
         The point cloud (PLY); ``None`` while depth maps are missing.
     mesh, faces
         Its surface (PLY); ``None`` where none was asked for, or there are no points.
     waiting
-        What the user has to do for it to go on; empty where it is finished.
+        Why it cannot go on; empty where it is finished.
     """
 
     folder: Path
     images: int
     depth_maps: int
+    maps: Maker
+    coverage: float = 0.0
     fused: Path | None = None
     points: int = 0
     mesh: Path | None = None
@@ -82,6 +92,8 @@ class DenseResult:
             "folder": str(self.folder.relative_to(root)),
             "images": self.images,
             "depth_maps": self.depth_maps,
+            "maps": self.maps,
+            "coverage": self.coverage,
             "fused": self.fused and str(self.fused.relative_to(root)),
             "points": self.points,
             "mesh": self.mesh and str(self.mesh.relative_to(root)),
@@ -91,17 +103,14 @@ class DenseResult:
 
 
 def run_dense(session: Session, indices: Sequence[int], images: Path, options: DenseOptions) -> dict[int, DenseResult]:
-    """Undistort, patch-match, fuse and mesh the metric models; lengths are metres because the models' are.
-
-    Without CUDA there is no patch-match: depth maps that lie in the workspace already are used, otherwise the result
-    waits for them.
+    """Undistort, find depths, fuse and mesh the metric models; lengths are metres because the models' are.
 
     Parameters
     ----------
     session
         Of the run.
     indices
-        Numbers of the models in ``sparse_metric/``.
+        Numbers of the models in ``sparse/``.
     images
         The images that agree with the models: the rectified ones where the rolling shutter was undone.
     options
@@ -112,49 +121,74 @@ def run_dense(session: Session, indices: Sequence[int], images: Path, options: D
     FormatError
         For an image or depth map that is missing or damaged.
     OutputExistsError
-        Where depth maps lie in the workspace that were made from another model.
+        Where depth maps of patch-match lie in the workspace that were made from another model.
     """
-    steps, progress = len(indices) * _STEPS, session.progress
+    prepared: dict[int, _Prepared] = {}
+    for index in indices:
+        prepared[index] = _prepare(session, index, images, options)
+    done, total = 0, sum(model.steps for model in prepared.values())
+
+    def step() -> None:
+        nonlocal done
+        done += 1
+        session.progress("dense", done, total)
+
     # all of them first: depth maps that come later then change nothing that others depend on
-    names = {}
     for index in indices:
-        names[index] = _undistort(session, index, images, options)
-        progress("dense", len(names), steps)
+        _undistort(session, index, images, prepared[index])
+        step()
     found: dict[int, DenseResult] = {}
-    for index in indices:
-        done = len(indices) + (_STEPS - 1) * len(found)
-
-        def step(n: int, done: int = done) -> None:
-            progress("dense", done + n, steps)
-
-        found[index] = _densify(session, index, names[index], options, step)
-        step(_STEPS - 1)
+    for before, index in enumerate(indices, 1):
+        found[index] = _densify(session, index, prepared[index], options, step)
+        # what was kept, or was not needed, counts as done
+        done = max(done, len(indices) + sum(prepared[i].steps - 1 for i in indices[:before]) - 1)
+        step()
     return found
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Prepared:
+    """What is to be made of a model.
+
+    Attributes
+    ----------
+    names
+        Of its images, sorted.
+    made_from
+        What decides its depth maps, and who makes them.
+    has_maps
+        Whether some are there already.
+    """
+
+    names: tuple[str, ...]
+    made_from: MadeFrom
+    has_maps: bool
+
+    @property
+    def steps(self) -> int:
+        """How many there are to hear of."""
+        return _STEPS + (2 * len(self.names) if self.made_from.maps == "plane sweep" else 1)
+
+
 def _densify(
-    session: Session, index: int, names: Sequence[str], options: DenseOptions, progress: Callable[[int], object]
+    session: Session, index: int, prepared: _Prepared, options: DenseOptions, progress: Callable[[], object]
 ) -> DenseResult:
     """Everything after undistortion."""
     import pycolmap
 
     runner, num_threads = session.runner, session.context.num_threads
-    folder = session.workspace.dense_metric / str(index)
+    folder, names, maker = session.workspace.dense / str(index), prepared.names, prepared.made_from.maps
     before = [f"dense_{index}_undistorted"]
-
-    if pycolmap.has_cuda:
-        runner.run(f"dense_{index}_depth", {}, [], lambda _: patch_match(folder, options.max_image_size), after=before)
-    kind, mapped = _depth_maps(folder, names)
-    progress(1)
-    result = DenseResult(folder=folder, images=len(names), depth_maps=len(mapped))
+    if maker == "plane sweep":
+        _sweep(session, index, prepared, progress)
+    elif pycolmap.has_cuda:
+        size = prepared.made_from.max_image_size
+        runner.run(f"dense_{index}_depth", {"maps": maker}, [], lambda _: patch_match(folder, size), after=before)
+        progress()
+    kind, mapped = found_maps(folder, names)
+    result = DenseResult(folder=folder, images=len(names), depth_maps=len(mapped), maps=maker)
     if not mapped:
-        waiting = (
-            f"{folder} waits for depth maps: COLMAP makes them on a CUDA GPU only, and this pycolmap is built without "
-            "CUDA. Replace it (pip uninstall pycolmap; pip install pycolmap-cuda12), or run 'colmap patch_match_stereo "
-            f"--workspace_path {folder}' elsewhere and copy its stereo folder back; then give the same command again"
-        )
-        if pycolmap.has_cuda:
-            waiting = f"{folder} has no depth maps: COLMAP found no images that see enough of the same"
+        waiting = f"{folder} has no depth maps: no two images see enough of the same under a fit angle"
         log.warning("%s", waiting)
         return replace(result, waiting=waiting)
     if len(mapped) < len(names):
@@ -162,18 +196,19 @@ def _densify(
     fused, mesh = folder / "fused.ply", folder / "meshed-poisson.ply"
 
     def fuse(partial: Sequence[Path]) -> None:
-        fusion = pycolmap.StereoFusionOptions()
-        fusion.num_threads = num_threads
-        pycolmap.stereo_fusion(str(partial[0]), str(folder), input_type=kind, options=fusion, output_type="PLY")
-        visible = partial[0].with_name(partial[0].name + ".vis")
-        if not visible.is_file():
-            raise OutputError(f"{fused}: COLMAP did not write the fused points; is the disk full?")
-        os.replace(visible, partial[1])
+        scratch = session.workspace.stamps / "fusion"
+        targets = partial[0], partial[1]
+        fuse_maps(folder, mapped, targets, maker=maker, kind=kind, scratch=scratch, num_threads=num_threads)
+        write_json(partial[2], {"coverage": coverage(folder, mapped, kind)})
 
     maps = [fingerprint(folder / "stereo" / f"{what}_maps") for what in ("depth", "normal")]
-    runner.run(f"dense_{index}_fused", {"maps": maps}, [fused, folder / "fused.ply.vis"], fuse, after=before)
-    progress(2)
-    result = replace(result, fused=fused, points=_count(fused, "vertex"))
+    record = session.workspace.stamps / f"dense_{index}_measured.json"
+    outputs = [fused, folder / "fused.ply.vis", record]
+    runner.run(f"dense_{index}_fused", {"maps": maps}, outputs, fuse, after=before)
+    progress()
+    with a_record_of_ours(record):
+        covered = float(read_json(record)["coverage"])
+    result = replace(result, fused=fused, points=_count(fused, "vertex"), coverage=covered)
     if options.mesh == "none" or not result.points:
         remove(mesh)
         return result
@@ -191,31 +226,50 @@ def _densify(
     return replace(result, mesh=mesh, faces=_count(mesh, "face"))
 
 
-def _undistort(session: Session, index: int, images: Path, options: DenseOptions) -> tuple[str, ...]:
-    """Write the dense workspace without depth maps; returns the names of its images."""
-    import pycolmap
-
-    runner, workspace = session.runner, session.workspace
-    model, folder = workspace.sparse_metric / str(index), workspace.dense_metric / str(index)
-    folder.mkdir(parents=True, exist_ok=True)
+def _prepare(session: Session, index: int, images: Path, options: DenseOptions) -> _Prepared:
+    """Look at what there is, and decide who makes the depth maps; removes old ones of our own."""
+    model, folder = session.workspace.sparse / str(index), session.workspace.dense / str(index)
     reconstruction = read_model(model)
     names = tuple(sorted(reconstruction.image(i).name for i in reconstruction.reg_image_ids()))
     _check_images(images, model, reconstruction)
-    # depth maps may have taken hours: they are never removed, and never used with another model
-    identity = {"model": _digest(model), "max_image_size": options.max_image_size}
-    record = folder / "made_from.json"
-    has_maps = any(file.is_file() for file in (folder / "stereo").glob("*_maps/**/*"))
-    if has_maps and not (record.is_file() and read_json(record) == identity):
-        raise OutputExistsError(
-            f"{folder / 'stereo'} holds depth maps of another model or other options; rename or remove {folder}"
-        )
+    made_from, has_maps = settle_maker(folder, digest(model), options.max_image_size)
+    return _Prepared(names=names, made_from=made_from, has_maps=has_maps)
+
+
+def _sweep(session: Session, index: int, prepared: _Prepared, progress: Callable[[], object]) -> None:
+    """Depth maps by our own sweep; those that a run made that was cut off are kept."""
+    folder, stamps = session.workspace.dense / str(index), session.workspace.stamps
+    record, raw = stamps / f"dense_{index}_depth_maps.json", stamps / f"sweep_{index}"
+    if record.is_file() and not all(map_file(folder, "depth", n).is_file() for n in read_json(record).get("names", [])):
+        record.unlink()  # somebody removed them
+
+    def work(partial: Sequence[Path]) -> None:
+        swept = SweptWorkspace(folder, raw)
+        swept.begin({"made_from": prepared.made_from, "images": fingerprint(folder / "images")})
+        threads = session.context.num_threads
+        swept.sweep(0 if threads < 0 else threads, progress)
+        write_json(partial[0], {"names": [n for n in prepared.names if map_file(folder, "depth", n).is_file()]})
+        remove(raw)
+
+    depends = {"maps": prepared.made_from.maps}
+    session.runner.run(f"dense_{index}_depth", depends, [record], work, after=[f"dense_{index}_undistorted"])
+
+
+def _undistort(session: Session, index: int, images: Path, prepared: _Prepared) -> None:
+    """Write the dense workspace without depth maps."""
+    import pycolmap
+
+    runner, workspace = session.runner, session.workspace
+    model, folder = workspace.sparse / str(index), workspace.dense / str(index)
+    folder.mkdir(parents=True, exist_ok=True)
+    names, made_from = prepared.names, prepared.made_from
 
     def work(partial: Sequence[Path]) -> None:
         scratch = workspace.stamps / "dense"
         remove(scratch)
         scratch.mkdir(parents=True)
         undistortion = pycolmap.UndistortCameraOptions()
-        undistortion.max_image_size = options.max_image_size or -1
+        undistortion.max_image_size = made_from.max_image_size or -1
         pycolmap.undistort_images(str(scratch), str(model), str(images), undistort_options=undistortion)
         lost = [name for name in names if not (scratch / "images" / name).is_file()]
         if lost:
@@ -224,24 +278,27 @@ def _undistort(session: Session, index: int, images: Path, options: DenseOptions
         for source, target in zip((scratch / "images", scratch / "sparse"), partial, strict=True):
             os.replace(source, target)
         for path in scratch.iterdir():
-            if not has_maps or path.name != "stereo":
+            if not prepared.has_maps or path.name != "stereo":
                 remove(folder / path.name)
                 os.replace(path, folder / path.name)
-        write_json(record, identity)
         remove(scratch)
 
-    depends = {**identity, "images": [fingerprint(path_in(images, name, model)) for name in names]}
+    depends = {
+        "model": made_from.model,
+        "max_image_size": made_from.max_image_size,
+        "images": [fingerprint(path_in(images, name, model)) for name in names],
+    }
     runner.run(f"dense_{index}_undistorted", depends, [folder / "images", folder / "sparse"], work, after=["metric"])
-    return names
+    made_from.write(folder)
 
 
-def _digest(model: Path) -> str:
+def digest(model: Path) -> str:
     """Of a model's poses and cameras."""
-    digest = hashlib.sha256()
+    found = hashlib.sha256()
     for path in sorted(model.iterdir()):
         if path.stem in ("cameras", "images", "rigs", "frames"):
-            digest.update(path.read_bytes())
-    return digest.hexdigest()
+            found.update(path.read_bytes())
+    return found.hexdigest()
 
 
 def _check_images(images: Path, model: Path, reconstruction: pycolmap.Reconstruction) -> None:
@@ -260,56 +317,6 @@ def _check_images(images: Path, model: Path, reconstruction: pycolmap.Reconstruc
                 raise FormatError(
                     path, f"is {width}x{height}, but its camera in the model is {camera.width}x{camera.height}"
                 )
-
-
-def _map_file(folder: Path, what: str, name: str, kind: str) -> Path:
-    return path_in(folder / "stereo" / f"{what}_maps", f"{name}.{kind}.bin")
-
-
-def patch_match(folder: Path, max_image_size: int | None) -> None:
-    """COLMAP's patch-match on a dense workspace, in a process of its own: where CUDA fails it ends the process.
-
-    Raises
-    ------
-    InertialError
-        When it fails; the depth maps that are done stay.
-    """
-    # COLMAP keeps the maps that are there, so that half-written ones must go first
-    for path in (folder / "stereo").glob("*_maps/**/*.bin"):
-        try:
-            check_map(path, 1 if "depth_maps" in path.parts else 3)
-        except FormatError:
-            remove(path)
-    command = [sys.executable, "-c", _PATCH_MATCH, str(folder), str(max_image_size or -1)]
-    done = subprocess.run(command, capture_output=True, text=True, errors="replace")
-    if done.returncode:
-        said = (done.stderr.strip().splitlines() or ["no message"])[-1]
-        raise InertialError(
-            f"{folder}: COLMAP's patch-match ended with code {done.returncode}: {said}. Started again, it continues "
-            "with the next depth map"
-        )
-
-
-def _depth_maps(folder: Path, names: Sequence[str]) -> tuple[str, list[str]]:
-    """The kind of depth map that is there, and the images that have one and its normals, all of them checked.
-
-    Raises
-    ------
-    FormatError
-        For a map that is damaged: COLMAP would end the process over it.
-    """
-    for kind in ("geometric", "photometric"):
-        mapped = [n for n in names if all(_map_file(folder, w, n, kind).is_file() for w in ("depth", "normal"))]
-        if mapped:
-            for name in mapped:
-                sizes = []
-                for what, channels in (("depth", 1), ("normal", 3)):
-                    path = _map_file(folder, what, name, kind)
-                    sizes.append((path.stat().st_size - check_map(path, channels)) // channels)
-                if sizes[0] != sizes[1]:
-                    raise FormatError(_map_file(folder, "normal", name, kind), "is not as large as its depth map")
-            return kind, mapped
-    return "geometric", []
 
 
 def _octree(fused: Path, model: pycolmap.Reconstruction) -> tuple[int, float]:

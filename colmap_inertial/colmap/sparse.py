@@ -121,6 +121,16 @@ def extract_features(
             context.progress("features", done, len(cameras))
             require_room(database.parent, len(batch) * options.max_num_features * _FEATURE_BYTES)
             with _writing(database):
+                # in their order, and not in that in which threads come to their ends: COLMAP numbers them as they come,
+                # and begins its model by the numbers
+                pycolmap.Database.open(str(database)).close()
+                pycolmap.import_images(
+                    str(database),
+                    str(images),
+                    image_names=batch,
+                    camera_mode=pycolmap.CameraMode.SINGLE,
+                    options=reader,
+                )
                 pycolmap.extract_features(
                     str(database),
                     str(images),

@@ -1,4 +1,4 @@
-"""Extract, keypoint stages, match, map: COLMAP's steps of a run, into ``database.db`` and ``sparse/``."""
+"""Extract, keypoint stages, match, map: COLMAP's steps of a run, into ``colmap/``."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def run_colmap(
 
     def features(partial: Sequence[Path]) -> None:
         found = extract_features(
-            workspace.images, cameras, partial[0], mapping, keypoint_stages=stages, context=context
+            workspace.colmap_images, cameras, partial[0], mapping, keypoint_stages=stages, context=context
         )
         write_gravity_priors(partial[0], gravity)
         write_record(partial[1], found)
@@ -68,15 +68,15 @@ def run_colmap(
     def matches(partial: Sequence[Path]) -> None:
         # the database holds the features, too: they are made when there are no matches, and need not stay
         record = workspace.stamps / "keypoints_of_features.json"
-        runner.run("features", depends, [workspace.features, record], features, after=["frames"])
+        runner.run("features", depends, [workspace.colmap_features, record], features, after=["frames"])
         shutil.copyfile(record, partial[1])
-        match_features(workspace.features, partial[0], image_pairs(list(cameras), mapping), context)
+        match_features(workspace.colmap_features, partial[0], image_pairs(list(cameras), mapping), context)
 
     def models(partial: Sequence[Path]) -> None:
         refine = mapping.refine_intrinsics
         map_images(
-            workspace.database,
-            workspace.images,
+            workspace.colmap_database,
+            workspace.colmap_images,
             partial[0],
             mapping,
             refine_intrinsics=any(camera is None for camera in cameras.values()) if refine is None else refine,
@@ -84,6 +84,6 @@ def run_colmap(
             context=context,
         )
 
-    runner.run("matches", pairing, [workspace.database, workspace.keypoints], matches, after=["frames"])
-    runner.run("mapping", {"mapping": mapping}, [workspace.sparse], models, after=["matches"])
+    runner.run("matches", pairing, [workspace.colmap_database, workspace.keypoints], matches, after=["frames"])
+    runner.run("mapping", {"mapping": mapping}, [workspace.colmap_sparse], models, after=["matches"])
     return read_record(workspace.keypoints, KeypointRecords)

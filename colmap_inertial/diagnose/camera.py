@@ -261,12 +261,11 @@ def _part_offset_s(part: CameraTrajectory, motion: GyroCamera, drift_s: float) -
     visual = part.turn_rad()
     shifts = np.arange(-_PART_REACH_S, _PART_REACH_S + 1e-9, _PART_STEP_S)
     left = np.full(len(shifts), np.inf)
-    for i, shift_s in enumerate(shifts):
-        t_s = part.t_s - drift_s - shift_s
-        if not motion.covers(t_s[:1], t_s[-1:])[0]:
-            continue
-        difference = visual - motion.turn_rad(t_s)
-        left[i] = np.median(np.sum((difference - difference.mean(axis=0)) ** 2, axis=1))
+    t_s = part.t_s - drift_s - shifts[:, None]
+    covered = motion.covers(t_s[:, 0], t_s[:, -1])
+    difference = visual - motion.turn_rad(t_s[covered])
+    spread = difference - difference.mean(axis=1, keepdims=True)
+    left[covered] = np.median(np.sum(spread**2, axis=2), axis=1)
     best = int(np.argmin(left))
     energy = float(np.median(np.sum((visual - visual.mean(axis=0)) ** 2, axis=1)))
     if best in (0, len(left) - 1) or not np.isfinite(left[best - 1 : best + 2]).all():

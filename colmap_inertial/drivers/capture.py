@@ -9,7 +9,7 @@ from types import EllipsisType
 
 from colmap_inertial.colmap.sparse import check_pair_names
 from colmap_inertial.colmap.steps import run_colmap
-from colmap_inertial.drivers.frames import ask_for_plan, fusing, run_frames, run_plan, run_rectified
+from colmap_inertial.drivers.frames import ask_for_plan, fusing, run_frames, run_images, run_plan
 from colmap_inertial.drivers.models import run_dense_models, run_models, run_validation
 from colmap_inertial.drivers.reporting import report_result, reporting_stops, write_recording
 from colmap_inertial.drivers.result import ReconstructResult
@@ -20,6 +20,7 @@ from colmap_inertial.io.files import StrPath, write_json
 from colmap_inertial.io.frames import picture_folders, read_frames
 from colmap_inertial.io.imu import read_raw_capture_imu
 from colmap_inertial.io.imu_calibration import used_files
+from colmap_inertial.io.limits import reading_within
 from colmap_inertial.options import ReconstructOptions
 from colmap_inertial.precalibrate.pairs import exposure_stage, fuses_pairs
 from colmap_inertial.precalibrate.plan import with_stated_exposures
@@ -107,6 +108,19 @@ def reconstruct(
         When the recording cannot give metres, as a stabilised video (``options.force`` goes on); when deblurring or
         rectifying was asked for by name, and the gyroscope does not belong to the pixels.
     """
+    with reading_within(options.limits):
+        return _reconstruct(Path(capture), Path(out), options, frame_stages, keypoint_stages, model_stages, progress)
+
+
+def _reconstruct(
+    capture: Path,
+    out: Path,
+    options: ReconstructOptions,
+    frame_stages: Sequence[FrameStage | EllipsisType],
+    keypoint_stages: Sequence[KeypointStage | EllipsisType],
+    model_stages: Sequence[ModelStage | EllipsisType],
+    progress: Progress,
+) -> ReconstructResult:
     for stages in (frame_stages, keypoint_stages, model_stages):
         with_defaults(stages, [])  # a wrong list is said before the work, not after it
     if not model_stages:
@@ -114,7 +128,7 @@ def reconstruct(
     warn_of_conflicts()
     require_plotly()
     require_method(options.deblur)
-    loaded = load_capture(Path(capture))
+    loaded = load_capture(capture)
     if loaded.frames is None:
         raise FormatError(loaded.path, "has no frames: add [images] or [video]")
     pairs = ... in frame_stages and fuses_pairs(loaded, options.exposures, deblur=options.deblur)
@@ -133,7 +147,7 @@ def reconstruct(
     check_pair_names(timing.names)
     with (
         open_session(
-            Path(out),
+            out,
             loaded.path,
             options,
             pictures=picture_folders(loaded),
@@ -158,9 +172,9 @@ def reconstruct(
         defaults: list[FrameStage] = [*fusing(loaded, workspace, options.apertures), *fused, *plan.frame_stages()]
         of_frames = with_defaults(frame_stages, defaults)
         of_keypoints = with_defaults(keypoint_stages, plan.keypoint_stages())
-        records = run_frames(session, recording, frames, of_frames, plan)
+        records = run_frames(session, recording, frames, of_frames, workspace.colmap_images, plan)
         keypoints = run_colmap(session, records, of_keypoints, gravity, options)
-        images = run_rectified(session, records, keypoints.rectified(), of_keypoints)
+        images = run_images(session, records, keypoints.rectified(), of_keypoints)
         of_models = with_defaults(model_stages, default_model_stages(recording, options))
         models, fragments = run_models(
             session, recording, of_models, rectified=bool(keypoints.rectified()), fragments=options.fragments
@@ -180,7 +194,7 @@ def reconstruct(
         )
         write_recording(session, recording, of_keypoints, keypoints.rectified())
         result = report_result(session, result, loaded, used)
-        remove(workspace.features)
+        remove(workspace.colmap_features)
     return result
 
 

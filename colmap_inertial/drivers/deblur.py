@@ -9,7 +9,7 @@ from pathlib import Path
 from colmap_inertial import __version__
 from colmap_inertial.colmap.sparse import check_pair_names
 from colmap_inertial.drivers.contact_sheet import write_contact_sheet
-from colmap_inertial.drivers.frames import fusing, run_frames, run_plan, run_rectified
+from colmap_inertial.drivers.frames import fusing, run_frames, run_images, run_plan
 from colmap_inertial.drivers.result import frame_as_json, imaging_as_json
 from colmap_inertial.errors import FormatError, InertialError, OutputError, OutputExistsError
 from colmap_inertial.io.capture import load_capture
@@ -21,6 +21,7 @@ from colmap_inertial.options import BlurRemover, ReconstructOptions
 from colmap_inertial.precalibrate.plan import ImagingPlan, Treatments, with_stated_exposures
 from colmap_inertial.run.context import Recording, corrected_imu, prior_calibration
 from colmap_inertial.run.progress import Progress, silent
+from colmap_inertial.run.runner import remove
 from colmap_inertial.run.session import open_session
 from colmap_inertial.run.workspace import Workspace
 from colmap_inertial.stages.deblur import require_method
@@ -37,7 +38,7 @@ class DeblurResult:
     Attributes
     ----------
     workspace
-        ``images/``, with ``rectify`` also ``images_rectified/``.
+        ``images/``; with ``rectify`` also ``colmap/images/``, what they were rectified from.
     frames
         What happened to each frame.
     imaging
@@ -82,7 +83,7 @@ def deblur_capture(
     calibration
         Calibration files of this device, as of ``ReconstructOptions``.
     rectify
-        Also write the images without their rolling shutter.
+        Write the images without their rolling shutter, and beside them, in ``colmap/images/``, with it.
     sheet
         Where to write a PNG with parts of the most blurred frames before and after.
     progress
@@ -127,14 +128,19 @@ def deblur_capture(
             *fusing(loaded, workspace, options.apertures),
             *plan.frame_stages(drop=False),
         ]
-        records = run_frames(session, recording, frames, stages)
+        deblurred = workspace.colmap_images if rectify else workspace.images
+        if not rectify:
+            remove(workspace.colmap)
+            session.runner.forget("images")
+        records = run_frames(session, recording, frames, stages, deblurred)
         movers = plan.keypoint_stages()
         rectified = frozenset(name for name in timing.names if any(mover.covers(name) for mover in movers))
-        run_rectified(session, records, rectified, movers)
+        if rectify:
+            run_images(session, records, rectified, movers)
         shown = _shown(records)
         if sheet is not None and shown and plan.view is not None:
             write_json(workspace.stamps / _SHEET, {"sheet": str(sheet.resolve())})
-            write_contact_sheet(sheet, loaded, plan, workspace.images, shown)
+            write_contact_sheet(sheet, loaded, plan, deblurred, shown)
         unchanged = session.finish(
             {
                 "versions": {"colmap_inertial": __version__},

@@ -20,7 +20,7 @@ from colmap_inertial.run.workspace import Workspace
 from colmap_inertial.stages.apertures import ApertureStage
 from colmap_inertial.stages.frame_folder import FrameRecord, read_frame_records, write_frames
 from colmap_inertial.stages.protocols import FrameStage, KeypointStage
-from colmap_inertial.stages.rectified import image_movers, write_rectified
+from colmap_inertial.stages.rectified import image_movers, write_images
 from colmap_inertial.types import Frame
 
 log = logging.getLogger(__name__)
@@ -64,18 +64,19 @@ def run_frames(
     recording: Recording,
     frames: Iterator[Frame],
     stages: Sequence[FrameStage],
+    images: Path,
     plan: ImagingPlan | None = None,
 ) -> tuple[FrameRecord, ...]:
-    """The frames through the stages; with a plan, parts of some are kept before and after for the report."""
+    """The frames through the stages into the folder ``images``; with a plan, parts of some are kept for the report."""
     source, workspace = frame_source(recording.capture), session.workspace
     kept = None if plan is None else CropKeeper.of(plan)
 
     def work(partial: Sequence[Path]) -> None:
-        images, records = partial[:2]
+        written, records = partial[:2]
         through = stages if kept is None else (kept.before, *stages, kept.after)
         names = recording.timing.names
         write_frames(
-            frames, names, through, source_folder=source, images=images, records=records, progress=session.progress
+            frames, names, through, source_folder=source, images=written, records=records, progress=session.progress
         )
         if kept is not None:
             kept.write(partial[2])
@@ -86,9 +87,10 @@ def run_frames(
         "inputs": recording.inputs(),
         "stages": stages,
         "kept": {} if kept is None else kept.blur_px,
+        "images": images.relative_to(workspace.root),
     }
     crops = [] if kept is None else [workspace.crops]
-    session.runner.run("frames", depends, [workspace.images, workspace.frames, *crops], work)
+    session.runner.run("frames", depends, [images, workspace.frames, *crops], work)
     return read_frame_records(workspace.frames)
 
 
@@ -102,25 +104,23 @@ def fusing(capture: Capture, workspace: Workspace, options: ApertureOptions) -> 
     return [ApertureStage(pictures=capture.apertures, options=options, keep=keep)]
 
 
-def run_rectified(
+def run_images(
     session: Session,
     records: Sequence[FrameRecord],
     rectified: Collection[str],
     stages: Sequence[KeypointStage],
 ) -> Path:
-    """Images that agree with the rectified keypoints, for whoever goes on from the model; returns their folder."""
+    """Images that agree with the keypoints, for whoever goes on from the model; returns their folder."""
     workspace = session.workspace
     movers = image_movers(stages)
     if rectified and not movers:
         log.warning("keypoints of %d images are rectified by a stage that moves no pixels", len(rectified))
-    if not rectified or not movers:
-        remove(workspace.images_rectified)
-        return workspace.images
+    moved = frozenset(rectified) if movers else frozenset()
     names = [record.name for record in records if record.used]
 
     def work(partial: Sequence[Path]) -> None:
-        write_rectified(movers, names, rectified, workspace.images, partial[0], session.progress)
+        write_images(movers, names, moved, workspace.colmap_images, partial[0], session.progress)
 
-    depends = {"stages": stages, "rectified": sorted(rectified)}
-    session.runner.run("rectified", depends, [workspace.images_rectified], work, after=["frames"])
-    return workspace.images_rectified
+    depends = {"stages": stages if moved else (), "rectified": sorted(moved)}
+    session.runner.run("images", depends, [workspace.images], work, after=["frames"])
+    return workspace.images

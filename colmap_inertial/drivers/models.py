@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING
 from colmap_inertial.colmap.dense import run_dense
 from colmap_inertial.drivers.reporting import write_model_record
 from colmap_inertial.drivers.result import Fragment, ModelResult, ScaledModel
+from colmap_inertial.drivers.standing import settle_dense
 from colmap_inertial.errors import FormatError, NotObservableError, TargetNotFoundError, TimingError
 from colmap_inertial.io.records import read_record, write_record
 from colmap_inertial.model import (
@@ -29,7 +29,7 @@ from colmap_inertial.options import DenseOptions
 from colmap_inertial.run.context import Recording
 from colmap_inertial.run.runner import fingerprint, remove
 from colmap_inertial.run.session import Session
-from colmap_inertial.stages.metric import gravity_in_model, metric_trajectory, write_trajectory
+from colmap_inertial.stages.metric import gravity_in_model, metric_trajectory, motion_file, write_trajectory
 from colmap_inertial.stages.protocols import ModelStage
 from colmap_inertial.types import ScaleEstimate
 from colmap_inertial.validate import Target, Validation, validate_model, write_overlays
@@ -41,7 +41,6 @@ log = logging.getLogger(__name__)
 
 #: COLMAP's models of fewer images, or of a smaller share of those of its largest one, are fragments.
 _FEWEST_IMAGES, _LEAST_SHARE = 5, 0.01
-_TRAJECTORY = re.compile(r"trajectory(_\d+)?(\.tum|_cov(\.partial)?\.npz)")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +59,7 @@ def run_models(
     rectified: bool = False,
     found: Mapping[int, Path] | None = None,
     fragments: bool = False,
+    numbered: bool = False,
     after: Sequence[str] = ("mapping",),
     read: Callable[[Path], pycolmap.Reconstruction] = read_model,
 ) -> tuple[tuple[ModelResult, ...], tuple[Fragment, ...]]:
@@ -74,9 +74,11 @@ def run_models(
     rectified
         Whether the models were mapped from keypoints without the rolling shutter.
     found
-        The sub-models by COLMAP's number, where they are not those of ``sparse/``.
+        The sub-models by COLMAP's number, where they are not those of ``colmap/sparse/``.
     fragments
         Treat fragments as models.
+    numbered
+        Keep COLMAP's numbers, as an existing project's other parts go by them.
     after
         The step that made the sub-models, where one did.
     read
@@ -88,19 +90,18 @@ def run_models(
         Where no sub-model has two timed images.
     """
     workspace = session.workspace
-    found = find_models(workspace.sparse) if found is None else found
+    found = find_models(workspace.colmap_sparse) if found is None else found
     record = workspace.stamps / "models.json"
 
     def work(partial: Sequence[Path]) -> None:
-        trajectories = [p for p in workspace.root.glob("trajectory*") if _TRAJECTORY.fullmatch(p.name)]
-        for path in (workspace.sparse_metric, *trajectories):
+        for path in (workspace.sparse, *workspace.trajectories()):
             remove(path)
         for path in workspace.report_data.glob("model_*.json"):
             remove(path)
         kept, left_out = _without_fragments(found, keep=fragments)
         models = []
-        for index, number in enumerate(kept):
-            session.progress("metric", index, len(kept))
+        for place, number in enumerate(kept):
+            session.progress("metric", place, len(kept))
             model = Model(
                 reconstruction=read(found[number]),
                 colmap_index=number,
@@ -108,6 +109,7 @@ def run_models(
                 rectified=rectified,
                 doubts=recording.doubts,
             )
+            index = number if numbered else place
             models.append(_through_stages(session, recording, stages, model, index, found[number]))
         untimed = [reason for _, reason in models if reason is not None]
         if len(untimed) == len(models):
@@ -121,6 +123,7 @@ def run_models(
         "stages": stages,
         "rectified": rectified,
         "fragments": fragments,
+        "numbered": numbered,
         "found": [fingerprint(folder) for folder in found.values()] if not after else [],
     }
     _forget_where_gone(record, workspace.root)
@@ -129,6 +132,7 @@ def run_models(
     models = tuple(
         ModelResult(**{f.name: getattr(one, f.name) for f in fields(one)}).within(workspace.root) for one in made.models
     )
+    settle_dense(workspace, {one.index: one.sparse_metric for one in models if one.sparse_metric is not None})
     return models, tuple(replace(one, sparse=workspace.root / one.sparse) for one in made.fragments)
 
 
@@ -141,6 +145,7 @@ def _forget_where_gone(record: Path, root: Path) -> None:
     except FormatError:
         models = ()
     paths = [path for one in models for path in (one.sparse_metric, one.trajectory) if path is not None]
+    paths += [motion_file(one.trajectory) for one in models if one.trajectory is not None]
     if not models or not all((root / path).exists() for path in paths):
         remove(record)
 
@@ -191,7 +196,7 @@ def _placed(session: Session, recording: Recording, one: ScaledModel, model: Mod
     one = replace(one, scale=scale, treatments=model.treatments)
     poses, _ = trajectory_from_model(model.reconstruction, model.timing)
     if model.similarity is not None:
-        target = workspace.sparse_metric / str(one.index)
+        target = workspace.sparse / str(one.index)
         suffix = model_format(workspace.root / one.sparse) or ".bin"
         write_model(model.reconstruction, target, model.similarity, suffix=suffix)
         poses = metric_trajectory(poses)
@@ -277,7 +282,7 @@ def run_validation(
                 write_record(partial[0], _Checked(found=found))
 
         record = session.workspace.stamps / f"validated_{model.index}.json"
-        after = ["metric", *session.runner.of("frames", "rectified")]
+        after = ["metric", *session.runner.of("frames", "images")]
         depends = {"target": target.spec, "images": [] if len(after) > 1 else fingerprint(images)}
         session.runner.run(f"validation_{model.index}", depends, [record], work, after=after)
         check = read_record(record, _Checked).outcome()

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 from colmap_inertial.drivers.capture import default_model_stages
 from colmap_inertial.drivers.models import run_dense_models, run_models, run_validation
+from colmap_inertial.drivers.placed import place_project, require_free_names
 from colmap_inertial.drivers.reporting import report_result, reporting_stops, write_recording
 from colmap_inertial.drivers.result import Fragment, ModelResult, ReconstructResult
 from colmap_inertial.errors import AlreadyMetricError, FormatError, InertialError, OutputError, TimingError
@@ -26,6 +27,7 @@ from colmap_inertial.io.frames import read_frame_times, read_frame_timing
 from colmap_inertial.io.image_metadata import stated_exposures_s
 from colmap_inertial.io.imu import RawImu, is_capture, read_raw_capture_imu, read_raw_imu
 from colmap_inertial.io.imu_calibration import used_files
+from colmap_inertial.io.limits import reading_within
 from colmap_inertial.io.names import path_in
 from colmap_inertial.io.recorders import find_recording
 from colmap_inertial.io.records import read_record, write_record
@@ -41,7 +43,6 @@ from colmap_inertial.model import (
 )
 from colmap_inertial.model.copying import list_tree
 from colmap_inertial.model.layout import read_layout
-from colmap_inertial.model.project import apply_to_project
 from colmap_inertial.model.similarities import ModelScale, read_similarity
 from colmap_inertial.options import ProjectOptions, ReconstructOptions
 from colmap_inertial.precalibrate.preflight import checked_imu, preflight, stop_or_doubt
@@ -49,8 +50,9 @@ from colmap_inertial.report import require_plotly
 from colmap_inertial.run.context import Recording, corrected_imu, prior_calibration
 from colmap_inertial.run.installed import warn_of_conflicts
 from colmap_inertial.run.progress import Progress, silent
-from colmap_inertial.run.runner import fingerprint, remove
+from colmap_inertial.run.runner import fingerprint
 from colmap_inertial.run.session import Session, open_session
+from colmap_inertial.run.workspace import Workspace
 from colmap_inertial.stages.protocols import ModelStage, with_defaults
 from colmap_inertial.types import CameraTrajectory, FrameTiming, ReadoutDirection
 from colmap_inertial.validate import parse_target
@@ -106,9 +108,8 @@ def reconstruct_project(
     project
         A folder with a COLMAP model; it is only read.
     out
-        A folder that does not exist, or holds a run on the same project, which is then gone on with.
-        ``sparse_metric/``, ``trajectory.tum`` and ``result.json`` are those of :func:`reconstruct`;
-        ``project_metric/`` is the whole project in metres.
+        A folder that does not exist, or holds a run on the same project, which is then gone on with. It becomes the
+        whole project in metres, with ``trajectory.tum``, ``result.json`` and the report of :func:`reconstruct`.
     source
         The recording that ran along, and when the images were taken.
     options
@@ -125,12 +126,24 @@ def reconstruct_project(
     AlreadyMetricError
         When the project carries a similarity of ours.
     OutputError, OutputExistsError
-        When ``out`` holds something else, or lies in the project.
+        When ``out`` holds something else, or lies in the project, or something in the project has a name that the run
+        needs.
     NotObservableError
         When the recording cannot give metres (``options.force`` goes on).
     """
+    with reading_within(options.limits):
+        return _reconstruct(Path(project), Path(out), source, options, model_stages, progress)
+
+
+def _reconstruct(
+    project: Path,
+    out: Path,
+    source: ProjectOptions,
+    options: ReconstructOptions,
+    model_stages: Sequence[ModelStage | EllipsisType],
+    progress: Progress,
+) -> ReconstructResult:
     warn_of_conflicts()
-    project, out = Path(project), Path(out)
     if not _has_model(project):
         raise FormatError(
             project,
@@ -147,6 +160,7 @@ def reconstruct_project(
     imu = corrected_imu(capture, raw.imu, options.calibration)
     target = None if capture.target is None else parse_target(capture.target)
     models = _models(project, out, source.keep, follow_links=source.follow_links)
+    require_free_names(project, Workspace(out), dense=options.dense)
     images = _images(project, source, needed=options.dense or source.exif_times or source.video is not None)
     read = functools.cache(read_model)
     with (
@@ -170,14 +184,14 @@ def reconstruct_project(
         recording = dataclasses.replace(recording, doubts=stop_or_doubt(diagnosis, force=options.force))
         stages = with_defaults(model_stages, default_model_stages(recording, options))
         results, fragments = run_models(
-            session, recording, stages, found=models, fragments=options.fragments, after=(), read=read
+            session, recording, stages, found=models, fragments=options.fragments, numbered=True, after=(), read=read
         )
         read.cache_clear()
         if target is not None and images is None:
             notes = (*notes, "the target was not measured: the project has no images/; give --images DIR")
         results = tuple(_noted(result, notes) for result in results)
         results = run_validation(session, results, target, images)
-        metric = _run_apply(session, project, source, options, results, fragments)
+        metric = place_project(session, project, source, models, _scales(results, fragments))
         if options.dense and images is not None:
             results = run_dense_models(session, results, images, options.dense_options)
         result = ReconstructResult(
@@ -409,15 +423,8 @@ def _noted(result: ModelResult, notes: Sequence[str]) -> ModelResult:
     return dataclasses.replace(result, scale=dataclasses.replace(scale, reasons=(*scale.reasons, *notes)))
 
 
-def _run_apply(
-    session: Session,
-    project: Path,
-    source: ProjectOptions,
-    options: ReconstructOptions,
-    results: Sequence[ModelResult],
-    fragments: Sequence[Fragment],
-) -> Path | None:
-    """The whole project in metres; ``None`` where every scale was refused."""
+def _scales(results: Sequence[ModelResult], fragments: Sequence[Fragment]) -> dict[int | None, ModelScale]:
+    """What is applied to each sub-model of the project, by COLMAP's number."""
     small = "a fragment of {} images: too small to be made metric (--fragments does it all the same)"
     scales: dict[int | None, ModelScale] = {
         one.colmap_index: ModelScale(similarity=None, verdict="refused", reasons=(small.format(one.registered_images),))
@@ -430,27 +437,4 @@ def _run_apply(
         scales[result.colmap_index] = ModelScale(
             similarity=similarity, verdict=result.scale.verdict, reasons=result.scale.reasons
         )
-    if all(scale.similarity is None for scale in scales.values()):
-        remove(session.workspace.project_metric)
-        return None
-
-    def work(partial: Sequence[Path]) -> None:
-        applied = apply_to_project(
-            project,
-            partial[0],
-            scales,
-            link=source.link,
-            keep=source.keep,
-            follow_links=source.follow_links,
-            progress=lambda done, total: session.progress("apply", done, total),
-        )
-        for note in applied.notes:
-            log.info("%s", note)
-
-    depends = {
-        "scales": {str(index): scale.similarity for index, scale in scales.items()},
-        "project": fingerprint(project),
-        "source": source,
-    }
-    session.runner.run("apply", depends, [session.workspace.project_metric], work)
-    return session.workspace.project_metric
+    return scales

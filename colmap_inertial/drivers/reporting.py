@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from colmap_inertial.drivers.result import ReconstructResult, result_as_json
+from colmap_inertial.drivers.standing import withdraw
 from colmap_inertial.errors import MappingError, NotObservableError
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import write_json
@@ -173,12 +174,13 @@ def report_result(
 def reporting_stops(workspace: Workspace, capture: Capture) -> Iterator[None]:
     """Where the recording gives no scale, or COLMAP no model, a report says why and what to do; other errors have none.
 
-    The error carries a note that names the page.
+    What an earlier run made metric no longer stands. The error carries a note that names the page.
     """
     try:
         yield
     except (NotObservableError, MappingError) as error:
         workspace.unfinish()
+        withdraw(workspace)
         with _failures_logged("the report of the stop"):
             page = write_report(workspace.root, stopped=str(error), capture=str(capture.path.resolve()))
             error.add_note(f"what was found, and what to do: {page}")

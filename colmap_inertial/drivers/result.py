@@ -29,15 +29,16 @@ class ScaledModel:
     Attributes
     ----------
     index
-        Its place: the models count from the one with the most images.
+        Its number in ``sparse/``: the models count from the one with the most images; those of an existing project
+        keep COLMAP's numbers.
     colmap_index
-        COLMAP's number, that of its folder in ``sparse/``.
+        COLMAP's number, that of its folder in ``colmap/sparse/`` or in the project.
     scale
         Metres per unit, interval and verdict.
     summary
         ``registered_images``, ``points``, ``observations``, ``mean_reprojection_error_px``.
     sparse, sparse_metric
-        COLMAP's model, and the same in metres.
+        COLMAP's model in ``colmap/sparse/`` or in the project, and the same in metres, in ``sparse/``.
     trajectory
         The camera's smoothed path.
     treatments
@@ -115,7 +116,8 @@ class ReconstructResult:
     selection
         Which frames were used, and why; ``None`` for an existing project.
     project_metric
-        The whole project in metres, where an existing one was given and not every scale was refused.
+        The whole project in metres, which is the output folder itself, where an existing one was given and not every
+        scale was refused.
     report
         The page for reading; ``None`` where it failed, for which ``log.txt`` has the reason.
     unchanged

@@ -67,9 +67,9 @@ class GyroCamera:
         return matrix_from_quat(start_from_cam).reshape(*t_s.shape, 3, 3)
 
     def turn_rad(self, t_s: Array) -> Array:
-        """(N-1, 3) rotation vectors ``before_from_after`` between consecutive ones of (N,) times, camera frame."""
+        """(..., N-1, 3) rotations ``before_from_after`` between consecutive ones of (..., N) times, camera frame."""
         looking = self.start_from_cam(t_s)
-        return so3_log(np.swapaxes(looking[:-1], 1, 2) @ looking[1:])
+        return so3_log(np.swapaxes(looking[..., :-1, :, :], -1, -2) @ looking[..., 1:, :, :])
 
     def rate_in_cam_rad_s(self, t_s: Array) -> Array:
         """(N, 3) angular velocities at (N,) times, camera frame."""

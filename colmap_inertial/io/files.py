@@ -17,9 +17,7 @@ from typing import Any
 import numpy as np
 
 from colmap_inertial.errors import FormatError, OutputError, OutputExistsError
-
-#: Tables, texts and pictures that are read whole are smaller.
-LARGEST_BYTES = 4 << 30
+from colmap_inertial.io.limits import read_limits
 
 _TEMPORARY = re.compile(r"\..+\.\d+-[0-9a-f]{8}\.tmp")
 
@@ -176,8 +174,12 @@ def read_bytes(path: Path, size: int = -1, *, what: str = "file") -> bytes:
     try:
         require_regular(path)
         with open(path, "rb") as file:
-            if size < 0 and os.fstat(file.fileno()).st_size > LARGEST_BYTES:
-                raise FormatError(path, f"is larger than {LARGEST_BYTES >> 30} GiB; such a {what} is not read")
+            largest_gib = read_limits().file_gib
+            if size < 0 and os.fstat(file.fileno()).st_size > largest_gib * (1 << 30):
+                raise FormatError(
+                    path,
+                    f"is larger than {largest_gib:g} GiB; such a {what} is not read (raise --limits.file-gib)",
+                )
             return file.read(size)
     except FileNotFoundError:
         raise FormatError(path, f"no such {what}") from None

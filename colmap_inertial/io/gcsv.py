@@ -18,8 +18,9 @@ import numpy as np
 from colmap_inertial.errors import FormatError
 from colmap_inertial.io.files import first_line, read_text
 from colmap_inertial.io.imu_text import ordered, recording
+from colmap_inertial.io.limits import read_limits
 from colmap_inertial.io.samples import Samples
-from colmap_inertial.io.tables import MOST_COLUMNS, Table, parse_table
+from colmap_inertial.io.tables import Table, parse_table, too_wide
 from colmap_inertial.io.units import Axes, DeclaredUnits, Quantity
 from colmap_inertial.types import FrameLog, ImuRecording, ReadoutDirection
 
@@ -99,8 +100,8 @@ def _read(path: Path) -> tuple[dict[str, tuple[str, int]], Table]:
         raise FormatError(path, f"does not begin with {_FIRST_LINES[0]}", line=1)
     header: dict[str, tuple[str, int]] = {}
     for number, line in enumerate(lines[1:_LONGEST_HEADER], start=2):
-        if line.count(",") >= MOST_COLUMNS:
-            raise FormatError(path, f"has more than {MOST_COLUMNS} columns; such a table is not read", line=number)
+        if line.count(",") >= read_limits().table_columns:
+            raise too_wide(path, number)
         cells = [cell.strip() for cell in line.split(",")]
         if cells[0].lower() in ("t", "time") and len(cells) > 3:
             names = [cell.lower() for cell in cells]

@@ -12,15 +12,13 @@ from numpy.typing import NDArray
 
 from colmap_inertial.errors import FormatError
 from colmap_inertial.io.files import read_bytes
+from colmap_inertial.io.limits import read_limits
 
 #: File endings of pictures that both OpenCV and the published builds of pycolmap read (the latter read no WebP).
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".pgm", ".ppm")
 
 #: OpenCV's level of logging that says nothing.
 _SILENT = 0
-
-#: A picture of more pixels is not decoded.
-MOST_PIXELS = 250_000_000
 
 
 def read_image(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
@@ -66,14 +64,14 @@ def require_modest(path: Path, data: bytes) -> None:
     Raises
     ------
     FormatError
-        For more than 250 megapixels.
+        For more pixels than the limits allow.
     """
-    size = _stated_size(data)
-    if size is not None and size[0] * size[1] > MOST_PIXELS:
+    size, most = _stated_size(data), read_limits().megapixels
+    if size is not None and size[0] * size[1] > 1e6 * most:
         raise FormatError(
             path,
-            f"has {size[0]} x {size[1]} pixels; more than {MOST_PIXELS // 1_000_000} million are not decoded: make it "
-            "smaller, or take it out of the folder",
+            f"has {size[0]} x {size[1]} pixels; more than {most:g} million are not decoded: make it smaller, take it "
+            "out of the folder, or raise --limits.megapixels",
         )
 
 

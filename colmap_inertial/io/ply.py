@@ -1,4 +1,4 @@
-"""PLY files moved by a similarity: positions and normals change, every other byte stays.
+"""PLY files moved by a similarity: positions, normals and what splats have change, every other byte stays.
 
 Any PLY: ASCII, binary little- or big-endian, whatever elements, properties, lists and comments it has. The file passes
 through in chunks, and what the format lets one check on the way is checked: sizes, counts, indices of faces.
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from colmap_inertial.errors import FormatError
 from colmap_inertial.geometry import matrix_from_quat
 from colmap_inertial.io.files import advise
+from colmap_inertial.io.splats import SplatMover, fault_of_splats, moved_fields
 from colmap_inertial.types import Similarity
 
 _CHUNK_BYTES = 512 << 10
@@ -30,8 +31,8 @@ _TYPES = {
 }
 _BYTE_ORDERS = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}
 _POSITION, _NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
-#: Sizes and colours of Gaussian splats turn with the model in ways that this module does not know.
-_SPLAT = {"scale_0", "rot_0"}
+#: What a file of Gaussian splats has; of those that pack them into other fields, nothing is known here.
+_OF_SPLATS = {"scale_0", "rot_0", "packed_position"}
 
 
 @dataclass(frozen=True)
@@ -186,11 +187,30 @@ def _check_vertices(path: Path, vertices: Element) -> tuple[str, ...]:
             if kinds[name].count is not None or kinds[name].kind[0] != "f":
                 raise FormatError(path, f"the vertices' {name} is no floating-point number: it cannot be transformed")
         changed.append(label)
-    if kinds.keys() >= _SPLAT:
-        raise FormatError(path, "Gaussian splats cannot be transformed yet; leave the file out with --keep")
+    if is_splats(set(kinds)):
+        fault = fault_of_splats(set(kinds))
+        moved = [] if fault is not None else [kinds[name] for name in moved_fields(set(kinds))]
+        if any(p.kind[0] != "f" or p.count is not None for p in moved):
+            fault = "are no floating-point numbers"
+        if fault is not None:
+            raise FormatError(
+                path, f"its Gaussian splats cannot be transformed, as they {fault}; leave the file out with --keep"
+            )
+        changed += ["sizes", "rotations", *(["colours"] if "f_rest_0" in kinds else [])]
     if changed and vertices.has_list:
         raise FormatError(path, "vertices with a list property cannot be transformed; leave the file out with --keep")
     return tuple(changed)
+
+
+def is_splats(names: set[str]) -> bool:
+    """Whether vertices with these properties are Gaussian splats."""
+    return not names.isdisjoint(_OF_SPLATS)
+
+
+def _mover(similarity: Similarity, element: Element) -> Mover | SplatMover:
+    """What moves the rows of an element."""
+    names = {p.name for p in element.properties} if element.name == "vertex" else set()
+    return SplatMover(similarity, names) if is_splats(names) else Mover(similarity, names)
 
 
 class Mover:
@@ -233,9 +253,7 @@ def _binary(
         if element.has_list:
             walked = _binary_lists(path, file, element, order, n_vertices)
         else:
-            names = {p.name for p in element.properties}
-            mover = Mover(similarity, names if element.name == "vertex" else set())
-            walked = _binary_rows(path, file, element, order, mover)
+            walked = _binary_rows(path, file, element, order, _mover(similarity, element))
         for chunk in walked:
             left -= len(chunk)
             yield chunk
@@ -249,7 +267,9 @@ def _read(path: Path, file: BufferedReader, buffer: memoryview, element: Element
     return buffer
 
 
-def _binary_rows(path: Path, file: BufferedReader, element: Element, order: str, mover: Mover) -> Iterator[memoryview]:
+def _binary_rows(
+    path: Path, file: BufferedReader, element: Element, order: str, mover: Mover | SplatMover
+) -> Iterator[memoryview]:
     dtype = element.dtype(order)
     per_chunk = max(1, _CHUNK_BYTES // dtype.itemsize)
     buffer = bytearray(min(per_chunk, element.rows) * dtype.itemsize)
@@ -315,7 +335,7 @@ def _ascii(path: Path, file: BufferedReader, header: Header, similarity: Similar
     n_vertices = next((e.rows for e in header.elements if e.name == "vertex"), 0)
     for element in header.elements:
         names = [p.name for p in element.properties]
-        mover = Mover(similarity, set(names) if element.name == "vertex" else set())
+        mover = _mover(similarity, element)
         columns = [names.index(name) for name in mover.names]
         dtype = np.dtype([(name, element.properties[i].kind) for name, i in zip(mover.names, columns, strict=True)])
         left = element.rows

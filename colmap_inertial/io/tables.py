@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from colmap_inertial.errors import FormatError
 from colmap_inertial.io.files import read_text
+from colmap_inertial.io.limits import read_limits
 from colmap_inertial.io.units import stamps_ns
 from colmap_inertial.types import Array
 
-#: Of no recording are there more columns.
-MOST_COLUMNS = 10_000
 _BLANK_OR_COMMENT = re.compile(r"\n\s*(\n|#|\Z)")
 
 
@@ -142,8 +141,9 @@ def parse_table(path: Path, text: str) -> Table:
         lines, numbers = [line for line, kept in zip(lines, keep, strict=True) if kept], numbers[keep]
 
     delimiter = _delimiter(lines[min(1, len(lines) - 1)])
-    if any(_width(line, delimiter) > MOST_COLUMNS for line in lines[:2]):
-        raise FormatError(path, f"has more than {MOST_COLUMNS} columns; such a table is not read", line=int(numbers[0]))
+    most = read_limits().table_columns
+    if any(_width(line, delimiter, most) > most for line in lines[:2]):
+        raise too_wide(path, int(numbers[0]))
     header: tuple[str, ...] | None = None
     header_text = ""
     if _is_header(lines[0], delimiter):
@@ -155,7 +155,7 @@ def parse_table(path: Path, text: str) -> Table:
     width = len(lines[0].split(delimiter))
     if header is None:
         for line in reversed(comments):
-            if _width(line, delimiter) <= MOST_COLUMNS and len(_header_cells(line, delimiter)) == width:
+            if _width(line, delimiter, most) <= most and len(_header_cells(line, delimiter)) == width:
                 header_text, header = line.strip(), _header_cells(line, delimiter)
                 break
     elif len(header) != width:
@@ -165,7 +165,7 @@ def parse_table(path: Path, text: str) -> Table:
         repairs.append(f"{path.name}: dropped the last line ({numbers[-1]}), which is cut off")
         lines, numbers = lines[:-1], numbers[:-1]
     if delimiter is None:
-        widths = [_width(line, None) for line in lines]
+        widths = [_width(line, None, most) for line in lines]
     else:
         widths = [line.count(delimiter) + 1 for line in lines]
     if widths.count(width) != len(widths):
@@ -184,9 +184,16 @@ def parse_table(path: Path, text: str) -> Table:
     )
 
 
-def _width(line: str, delimiter: str | None) -> int:
-    """Number of cells, counted up to a few more than are allowed."""
-    return len(line.split(None, MOST_COLUMNS)) if delimiter is None else line.count(delimiter) + 1
+def too_wide(path: Path, line: int) -> FormatError:
+    """The error for a table of more columns than the limits allow."""
+    most = read_limits().table_columns
+    reason = f"has more than {most} columns; such a table is not read (raise --limits.table-columns)"
+    return FormatError(path, reason, line=line)
+
+
+def _width(line: str, delimiter: str | None, most: int) -> int:
+    """Number of cells, counted up to one more than are allowed."""
+    return len(line.split(None, most)) if delimiter is None else line.count(delimiter) + 1
 
 
 def _is_comment(line: str) -> bool:

@@ -112,6 +112,12 @@ def model_formats(folder: Path) -> list[str]:
     return [s for s in (".bin", ".txt") if all((folder / f"{name}{s}").is_file() for name in _MODEL_FILES)]
 
 
+def model_files(folder: Path, suffix: str) -> list[Path]:
+    """The files of a model that are there in one format, rigs and frames among them."""
+    names = (*_MODEL_FILES, "rigs", "frames")
+    return [folder / f"{name}{suffix}" for name in names if (folder / f"{name}{suffix}").is_file()]
+
+
 def find_models(folder: StrPath) -> dict[int, Path]:
     """The COLMAP models in a folder: itself (as number 0), or its numbered subfolders.
 

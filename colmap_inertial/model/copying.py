@@ -32,8 +32,10 @@ class _Terminated(BaseException):
 
 
 @contextlib.contextmanager
-def new_folder(target: Path) -> Iterator[Path]:
+def new_folder(target: Path, *, into_empty: bool = False) -> Iterator[Path]:
     """A temporary folder beside ``target`` that takes its name at the end; after a failure nothing is left of it.
+
+    With ``into_empty``, the target may be a folder that is there and holds nothing.
 
     SIGTERM and SIGHUP count as failures, too: the process cleans up before it ends by them. What a killed process left
     behind is removed by the next one.
@@ -45,7 +47,7 @@ def new_folder(target: Path) -> Iterator[Path]:
     OutputError
         When it cannot be written; says so when the disk is full.
     """
-    if os.path.lexists(target):
+    if _is_taken(target, into_empty):
         raise OutputExistsError(f"{target} exists already; choose another folder or remove it")
     partial = target.with_name(f".{target.name}.colmap-inertial-partial")
     lock = target.with_name(f".{target.name}.colmap-inertial-lock")
@@ -58,15 +60,34 @@ def new_folder(target: Path) -> Iterator[Path]:
                 partial.mkdir()
                 yield partial
                 _flush(partial)
-                if os.path.lexists(target):
+                if _is_taken(target, into_empty):
                     raise OutputExistsError(f"{target} appeared in the meantime; choose another folder")
+                if os.path.lexists(target):
+                    target.rmdir()
                 os.rename(partial, target)
             except BaseException:
-                shutil.rmtree(partial, ignore_errors=True)
+                _remove(partial)
                 raise
             finally:
                 with contextlib.suppress(OSError):  # Windows removes it with the last one who holds it
                     lock.unlink()
+
+
+def _is_taken(target: Path, into_empty: bool) -> bool:
+    """Whether something is there that would be lost."""
+    if into_empty and target.is_dir() and not target.is_symlink():
+        return any(target.iterdir())
+    return os.path.lexists(target)
+
+
+def _remove(folder: Path) -> None:
+    """Remove a folder as far as can be, one open at a time: ``shutil.rmtree`` holds all above it, too."""
+    for parent, folders, names in os.walk(folder, topdown=False):
+        for path in (os.path.join(parent, name) for name in (*folders, *names)):
+            with contextlib.suppress(OSError):
+                (os.rmdir if os.path.isdir(path) and not os.path.islink(path) else os.unlink)(path)
+    with contextlib.suppress(OSError):
+        folder.rmdir()
 
 
 def _flush(folder: Path) -> None:

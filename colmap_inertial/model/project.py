@@ -9,6 +9,7 @@ import shutil
 from collections import Counter
 from collections.abc import Callable, Collection, Generator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextvars import copy_context
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from colmap_inertial.io.ply import transform_ply
 from colmap_inertial.model import (
     TRANSFORM_FILE,
     is_metric,
+    model_files,
     model_formats,
     read_model,
     similarity_as_json,
@@ -31,15 +33,15 @@ from colmap_inertial.model.binary import check_binary_model
 from colmap_inertial.model.copying import begin_writing, copy_file, list_tree, new_folder
 from colmap_inertial.model.database import SHARED_MEMORY, SIDE_FILES, is_database, transform_database
 from colmap_inertial.model.layout import Layout, read_layout
+from colmap_inertial.model.nerf import cameras_are_those_of, is_transforms, transform_transforms
 from colmap_inertial.model.similarities import ModelScale, similarity_from_json, undoing
 from colmap_inertial.threads import one_blas_thread, usable_processors
 from colmap_inertial.types import Similarity
 
-_MODEL_FILES = ("cameras", "images", "points3D", "rigs", "frames")
 #: Formats that carry length and are left as they are; the user is told.
 _FOREIGN = (
     *(".stl", ".off", ".glb", ".gltf", ".fbx", ".dae", ".las", ".laz", ".pcd", ".xyz", ".pts", ".e57", ".splat"),
-    *(".mvs", ".nvm", ".out"),
+    *(".mvs", ".nvm", ".out", ".ksplat", ".spz", ".sog"),
 )
 
 
@@ -86,6 +88,7 @@ def apply_to_project(
     link: bool = False,
     keep: Sequence[str] = (),
     follow_links: bool = False,
+    only_metric: bool = False,
     progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> Applied:
     """Write a copy of a COLMAP project in which everything that carries length is transformed.
@@ -109,6 +112,8 @@ def apply_to_project(
         Patterns, as in a shell, of paths in the project that are copied as they are.
     follow_links
         Copy what symbolic links out of the project lead to; without, they are refused.
+    only_metric
+        Leave out sub-models with a refused scale and what was made from them; without, they keep their own units.
     progress
         Called with the number of files done and of all.
 
@@ -136,7 +141,9 @@ def apply_to_project(
     one = scales if isinstance(scales, Similarity) else None
     layout = read_layout(project, work.open_folders(), one_for_all=one is not None)
     by_model = _by_model(project, layout, scales)
-    return work.run(layout, by_model, one, link=link, progress=progress)
+    left = [index for index, scale in by_model.items() if only_metric and scale.similarity is None]
+    work.leave_out(layout, left)
+    return work.run(layout, by_model, one, link=link, progress=progress, left=left)
 
 
 def undo_project(
@@ -163,13 +170,14 @@ def undo_project(
         keep = [str(pattern) for pattern in record["keep"]]
         models = [(int(m["index"]), m["similarity"]) for m in record["models"]]
         database = {name: (list(d["prior_models"]), list(d["rig_models"])) for name, d in record["databases"].items()}
+        beside = [str(pattern) for pattern in record.get("beside", [])]
     except (KeyError, TypeError, ValueError, AttributeError):
         raise FormatError(path, "not the record of a project that colmap-inertial apply wrote") from None
     by_model = {
         index: ModelScale(similarity=None if fields is None else undoing(similarity_from_json(path, fields)))
         for index, fields in models
     }
-    work = _Work(project, out, keep, follow_links)
+    work = _Work(project, out, keep, follow_links, beside)
     one = undoing(similarity_from_json(path, record)) if record.get("one_for_all") is True else None
     layout = read_layout(project, work.open_folders(), one_for_all=one is not None)
     if layout.submodels.keys() != by_model.keys():
@@ -202,14 +210,19 @@ def _by_model(
 class _Work:
     """One copy of a project, file by file."""
 
-    def __init__(self, project: Path, out: Path, keep: Sequence[str], follow_links: bool) -> None:
+    def __init__(
+        self, project: Path, out: Path, keep: Sequence[str], follow_links: bool, beside: Sequence[str] = ()
+    ) -> None:
         if not project.is_dir():
             raise FormatError(project, "no such folder")
         inner, outer = out.resolve(), project.resolve()
         if inner.is_relative_to(outer) or outer.is_relative_to(inner):
             raise OutputError(f"{out} and {project} lie within each other; choose a folder elsewhere")
         self._project, self._out, self._keep = project, out, tuple(keep)
-        self.folders, self._files, self._links = list_tree(project, follow_links=follow_links)
+        found = list_tree(project, follow_links=follow_links)
+        self.folders, self._files, self._links = (
+            [p for p in paths if not any(fnmatch.fnmatch(p.parts[0], pattern) for pattern in beside)] for paths in found
+        )
         self._changes: list[Change] = []
         self._databases: dict[str, dict[str, Any]] = {}
         self._notes: list[str] = []
@@ -222,6 +235,17 @@ class _Work:
         """Folders that are not kept as they are."""
         return [folder for folder in self.folders if not self.is_kept(folder)]
 
+    def leave_out(self, layout: Layout, left: Collection[int]) -> None:
+        """Leave out some of the sub-models, and what was made from them."""
+        gone = {folder for folder, index in (*layout.owners.items(), *layout.workspaces.items()) if index in left}
+
+        def staying(paths: Sequence[Path]) -> list[Path]:
+            return [path for path in paths if not gone.intersection((path, *path.parents))]
+
+        self.folders, self._files, self._links = map(staying, (self.folders, self._files, self._links))
+        for index in left:
+            self._notes.append(f"{layout.submodels[index]} and what was made from it is left out: its scale is refused")
+
     @one_blas_thread()
     def run(
         self,
@@ -233,8 +257,9 @@ class _Work:
         progress: Callable[[int, int], object],
         undo: bool = False,
         database: Mapping[str, tuple[Collection[int], Collection[int]]] | None = None,
+        left: Collection[int] = (),
     ) -> Applied:
-        """Write everything, then give it its name."""
+        """Write everything but the sub-models that are ``left`` out, then give it its name."""
         similarities = {index: scale.similarity for index, scale in by_model.items()}
         models = _model_files(self._project, layout.owners)
         skipped = {folder / TRANSFORM_FILE for folder in (Path(), *layout.owners)} if undo else set()
@@ -247,7 +272,8 @@ class _Work:
                 (partial / path).symlink_to((self._project / path).readlink())
                 unchanged["link"] += 1
             for folder, index in layout.owners.items():
-                self._write_model(folder, partial, index, one or similarities[index], record=not undo)
+                if index not in left:
+                    self._write_model(folder, partial, index, one or similarities[index], record=not undo)
             todo = [p for p in self._files if p not in models and p not in skipped and not self._is_side_file(p)]
             databases: list[Path] = []
             jobs: list[Callable[[], Change | str]] = []
@@ -256,6 +282,8 @@ class _Work:
                 if kind == "database":
                     databases.append(path)
                     continue
+                if kind == "transforms" and not self._is_of_a_model(layout, path):
+                    kind = None
                 owner = None if one is not None or kind is None else self._owner(layout, path)
                 similarity = one if owner is None else similarities[owner]
                 if kind is None and path.suffix.lower() in _FOREIGN and not self.is_kept(path):
@@ -280,7 +308,7 @@ class _Work:
                 self._notes.append(f"copied in their old units, as their formats are not transformed: {told}")
             applied = Applied(
                 out=self._out,
-                models={index: (str(layout.submodels[index]), scale) for index, scale in by_model.items()},
+                models={i: (str(layout.submodels[i]), scale) for i, scale in by_model.items() if i not in left},
                 changes=tuple(self._changes),
                 unchanged=dict(unchanged),
                 notes=tuple(self._notes),
@@ -310,6 +338,13 @@ class _Work:
         shutil.copymode(source, target)
         return Change(path=str(path), kind=kind, changed=changed, model=owner) if changed else "copied"
 
+    def _is_of_a_model(self, layout: Layout, path: Path) -> bool:
+        """Whether cameras of a NeRF trainer are those of the models here; the user hears where they are not."""
+        if cameras_are_those_of(self._project / path, layout.placed):
+            return True
+        self._notes.append(f"{path}: copied as it is, as its cameras do not stand where those of a model do")
+        return False
+
     def _owner(self, layout: Layout, path: Path) -> int:
         owner = layout.owner(path)
         if owner is None:
@@ -335,9 +370,8 @@ class _Work:
         for suffix in model_formats(source):
             model = read_model(source, suffix)
             if similarity is None:
-                for name in _MODEL_FILES:
-                    if (source / f"{name}{suffix}").is_file():
-                        copy_file(source / f"{name}{suffix}", target / f"{name}{suffix}")
+                for path in model_files(source, suffix):
+                    copy_file(path, target / path.name)
                 continue
             counts = model.num_reg_images(), model.num_points3D()
             # COLMAP does not notice a disk that is full
@@ -418,7 +452,7 @@ def _side_by_side(jobs: Sequence[Callable[[], Change | str]]) -> Generator[Chang
     """Results of the jobs in their order; a few at a time, as disk and processor take turns within one."""
     with ThreadPoolExecutor(max_workers=min(4, usable_processors())) as pool:
         try:
-            for future in [pool.submit(job) for job in jobs]:
+            for future in [pool.submit(copy_context().run, job) for job in jobs]:
                 yield future.result()
         except BaseException:
             pool.shutdown(cancel_futures=True)
@@ -428,10 +462,10 @@ def _side_by_side(jobs: Sequence[Callable[[], Change | str]]) -> Generator[Chang
 def _model_files(project: Path, models: Collection[Path]) -> set[Path]:
     """The files of COLMAP's models, which COLMAP reads and writes itself."""
     return {
-        folder / f"{name}{suffix}"
+        path.relative_to(project)
         for folder in models
         for suffix in model_formats(project / folder)
-        for name in _MODEL_FILES
+        for path in model_files(project / folder, suffix)
     }
 
 
@@ -447,6 +481,8 @@ def _kind(file: Path, path: Path) -> str | None:
     if suffix == ".obj":
         with open(file, "rb") as head:
             return None if b"\0" in head.read(1024) else "obj"  # a compiler's object file has the same ending
+    if is_transforms(path):
+        return "transforms"
     return {".ply": "ply", ".ini": "options"}.get(suffix) or ("database" if is_database(file) else None)
 
 
@@ -460,4 +496,5 @@ _WRITERS: dict[str, Callable[[Path, Path, Similarity], tuple[str, ...]]] = {
     "ply": transform_ply,
     "obj": transform_obj,
     "options": transform_options,
+    "transforms": transform_transforms,
 }

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.multi_aperture._geometry import Rectified
 from colmap_inertial.multi_aperture._sampling import seen_by
+from colmap_inertial.semi_global import LightCost
 from colmap_inertial.types import SpectralRole
 
 Codes = NDArray[np.uint8]
@@ -23,22 +23,6 @@ _EVERY = 3
 
 
 _NEEDED: tuple[SpectralRole, ...] = ("red", "green", "blue", "luminance")
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class LightCost:
-    """What :func:`_apertures.matching_costs` takes.
-
-    Attributes
-    ----------
-    blend
-        (N + 1) weights of the reference, of the views, and a constant, in 1/256: their sum would be zero.
-    table
-        (256,) costs of what it is instead, in codes.
-    """
-
-    blend: NDArray[np.int32]
-    table: Codes
 
 
 def adds_up(roles: Sequence[SpectralRole]) -> bool:

@@ -1,60 +1,15 @@
-"""Matching costs of all candidates, and the disparity with the least sum of costs along paths."""
+"""Which disparities are tried on a canvas, and what comes of matching them."""
 
 from __future__ import annotations
-
-import itertools
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.multi_aperture._geometry import Rectified
-from colmap_inertial.multi_aperture._light import LightCost
+from colmap_inertial.semi_global import Views, match_candidates
 from colmap_inertial.types import Array
 
-Codes = NDArray[np.uint8]
 Real = NDArray[np.float32]
-
-#: Pixels from the centre of the census window to its sides: 5 x 5 pixels, 24 comparisons.
-CENSUS_RADIUS = 2
-#: What a view can cost at most, of either kind.
-MOST = (2 * CENSUS_RADIUS + 1) ** 2 - 1
-#: A pixel that no view sees costs this share of the most: more than a good match, less than a poor one.
-_UNSEEN = 0.25
-#: Penalties for disparities that change by one candidate, and by more, in shares of the most that all views can cost.
-_SMALL, _JUMP = 0.2, 2.0
-#: The jump's penalty is divided by the change of brightness over this many codes: edges of things are where they look
-#: different (Hirschmueller 2008, after equation 12).
-_EDGE_CODES = 8
-#: Bytes of costs and their sums that are held at once; larger images are matched in strips.
-_MEMORY = 512 * 2**20
-#: Rows that strips share with their neighbours on each side.
-_OVERLAP = 48
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Views:
-    """Images on the canvas.
-
-    Attributes
-    ----------
-    reference
-        (H, W) codes.
-    others
-        (N - 1, H, W).
-    tables
-        (N - 1, 256, 256) costs by the codes of the reference and a view, 0 to ``MOST``; ``None`` is census.
-    least
-        Difference of codes below which census passes over a comparison.
-    light
-        What colours that do not add up to luminance cost in addition.
-    """
-
-    reference: Codes
-    others: Codes
-    tables: Codes | None = None
-    least: int = 0
-    light: LightCost | None = None
 
 
 def candidates(low_px: float, high_px: float, step_px: float) -> Array:
@@ -63,84 +18,21 @@ def candidates(low_px: float, high_px: float, step_px: float) -> Array:
     return np.asarray(step_px * np.arange(first, last + 1))
 
 
-def jump_table(views: int) -> tuple[int, NDArray[np.uint16]]:
-    """The small penalty, and (256,) that of a jump by the change of the reference's code."""
-    most = MOST * _counted(views)
-    small = round(_SMALL * most)
-    jump = _JUMP * most / np.maximum(1, np.arange(256) / _EDGE_CODES)
-    return small, np.maximum(small + 1, np.floor(jump)).astype(np.uint16)
-
-
-def shares(views: int) -> NDArray[np.int32]:
-    """(views + 1,) factors in 1/256: a cost counts as if all views saw the pixel, and stays below 256."""
-    by = np.maximum(1, np.arange(views + 1))
-    return np.asarray(np.rint(256 * _counted(views) / by), dtype=np.int32)
-
-
-def _counted(views: int) -> int:
-    """The views that a cost of one byte can hold; those of more are scaled down."""
-    return min(views, 255 // MOST)
-
-
 def match(views: Views, canvas: Rectified, disparities_px: Array, *, threads: int) -> tuple[Real, NDArray[np.uint16]]:
-    """Semi-global matching of all views at once.
+    """Match all views at once.
 
     Parameters
     ----------
+    views
+        On the canvas.
     disparities_px
         (D,) equally spaced candidates.
 
     Returns
     -------
-    (H, W) disparities with the least sum of costs, between candidates where a parabola says so, and that sum.
+    (H, W) disparities with the least sum of costs, and that sum.
     """
-    from colmap_inertial._kernels import _apertures
-
-    height, width = views.reference.shape
-    count, number = len(views.others), len(disparities_px)
     columns, rows = canvas.sample_positions(disparities_px)
-    small, jump = jump_table(count)
-    padded = -(-number // _apertures.PADDING) * _apertures.PADDING
-    disparity = np.empty((height, width), dtype=np.float32)
-    sums = np.empty((height, width), dtype=np.uint16)
+    best, sums = match_candidates(views, columns, rows, threads=threads)
     step_px = disparities_px[1] - disparities_px[0]
-    for begin, end, first, last in strips(height, width * (number + 2 * padded)):
-        part = np.ascontiguousarray(views.reference[first:last])
-        cost = np.empty((last - first, width, number), dtype=np.uint8)
-        _apertures.matching_costs(
-            part,
-            views.others,
-            columns=columns,
-            rows=np.ascontiguousarray(rows[:, :, first:last]),
-            cost=cost,
-            share=shares(count),
-            unseen=round(_UNSEEN * MOST * _counted(count)),
-            radius=CENSUS_RADIUS,
-            least=views.least,
-            tables=views.tables,
-            blend=None if views.light is None else views.light.blend,
-            blend_table=None if views.light is None else views.light.table,
-            threads=threads,
-        )
-        total = np.empty((last - first, width, padded), dtype=np.uint16)
-        _apertures.semi_global(cost, part, small=small, jump=jump, total=total, threads=threads)
-        del cost
-        least, index = (np.empty(part.shape, dtype=np.uint16) for _ in range(2))
-        aside = np.empty(part.shape, dtype=np.float32)
-        _apertures.winners(total, least=least, index=index, aside=aside, candidates=number, threads=threads)
-        inner = slice(begin - first, end - first)
-        disparity[begin:end] = (disparities_px[0] + step_px * (index + aside))[inner]
-        sums[begin:end] = least[inner]
-    return disparity, sums
-
-
-def strips(height: int, bytes_a_row: int) -> list[tuple[int, int, int, int]]:
-    """Rows of the result (begin, end) and rows to work on (first, last) for each strip that fits the memory."""
-    fits = max(1, _MEMORY // bytes_a_row - 2 * _OVERLAP)
-    if height * bytes_a_row <= _MEMORY:
-        fits = height
-    count = -(-height // fits)
-    edges = [height * i // count for i in range(count + 1)]
-    return [
-        (begin, end, max(0, begin - _OVERLAP), min(height, end + _OVERLAP)) for begin, end in itertools.pairwise(edges)
-    ]
+    return (disparities_px[0] + step_px * best).astype(np.float32), sums

@@ -14,8 +14,9 @@ from colmap_inertial.multi_aperture._information import cost_tables
 from colmap_inertial.multi_aperture._light import adds_up, light_cost
 from colmap_inertial.multi_aperture._noise import noise_of, smoothing
 from colmap_inertial.multi_aperture._sampling import codes_of, on_canvas, shrunk
-from colmap_inertial.multi_aperture._volume import MOST, Views, candidates, match
+from colmap_inertial.multi_aperture._volume import candidates, match
 from colmap_inertial.options import ApertureOptions
+from colmap_inertial.semi_global import MOST, Views
 from colmap_inertial.types import SpectralRole
 
 Codes = NDArray[np.uint8]

@@ -387,7 +387,7 @@ def _run(content: Content) -> Section:
     models = content["models"]
     written = [(name, model[name]) for model in models for name in ("sparse", "sparse_metric", "trajectory")]
     written += [("project_metric", content["project_metric"])]
-    listed = [(path, _WRITTEN[name]) for name, path in written if path is not None]
+    listed = [("this folder" if path == "." else path, _WRITTEN[name]) for name, path in written if path is not None]
     if listed:
         parts += ["<h3>Written</h3>", table(("Where", "What"), listed)]
     if len(models) > 1:

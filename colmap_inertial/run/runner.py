@@ -153,6 +153,10 @@ class StepRunner:
         """Those of the steps that belong to this run."""
         return [step for step in steps if step in self._keys]
 
+    def forget(self, name: str) -> None:
+        """Have a step made again: what it made is gone."""
+        (self._workspace.stamps / f"{name}.json").unlink(missing_ok=True)
+
     def run(
         self,
         name: str,

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fnmatch
 import logging
+import re
 import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -16,6 +18,10 @@ from colmap_inertial.report.content import CROPS_FOLDER, DATA_FOLDER
 
 log = logging.getLogger(__name__)
 
+#: Counts changes of the layout: 2 since the folder itself is a project in metres.
+_LAYOUT = 2
+_TRAJECTORY = re.compile(r"trajectory(_\d+)?(\.tum|_cov(\.partial)?\.npz|_motion\.json)")
+
 
 @dataclass(frozen=True)
 class Workspace:
@@ -25,13 +31,48 @@ class Workspace:
 
     @property
     def images(self) -> Path:
-        """The frames that COLMAP sees."""
+        """The images that agree with the metric models, and whatever else is made from them."""
         return self.root / "images"
 
     @property
-    def images_rectified(self) -> Path:
-        """The same frames as a global shutter would have taken them, where the rolling shutter was undone."""
-        return self.root / "images_rectified"
+    def sparse(self) -> Path:
+        """The models in metres; none where no scale is accepted."""
+        return self.root / "sparse"
+
+    @property
+    def dense(self) -> Path:
+        """Dense reconstructions of the metric models."""
+        return self.root / "dense"
+
+    @property
+    def earlier(self) -> Path:
+        """Dense reconstructions with depth maps whose model is no longer there."""
+        return self.root / "earlier"
+
+    @property
+    def colmap(self) -> Path:
+        """COLMAP's own project: what it saw and made, untouched, in its arbitrary units."""
+        return self.root / "colmap"
+
+    @property
+    def colmap_images(self) -> Path:
+        """The frames that COLMAP sees."""
+        return self.colmap / "images"
+
+    @property
+    def colmap_database(self) -> Path:
+        """COLMAP's database."""
+        return self.colmap / "database.db"
+
+    @property
+    def colmap_features(self) -> Path:
+        """The database before matching; removed at the end of a run."""
+        return self.colmap / "features.db"
+
+    @property
+    def colmap_sparse(self) -> Path:
+        """COLMAP's models."""
+        return self.colmap / "sparse"
 
     @property
     def selection(self) -> Path:
@@ -49,39 +90,9 @@ class Workspace:
         return self.root / "frames.json"
 
     @property
-    def features(self) -> Path:
-        """COLMAP's database before matching; removed at the end of a run."""
-        return self.root / "features.db"
-
-    @property
     def keypoints(self) -> Path:
         """What the keypoint stages did."""
         return self.root / "keypoints.json"
-
-    @property
-    def database(self) -> Path:
-        """COLMAP's database."""
-        return self.root / "database.db"
-
-    @property
-    def sparse(self) -> Path:
-        """COLMAP's models, untouched."""
-        return self.root / "sparse"
-
-    @property
-    def sparse_metric(self) -> Path:
-        """The same models in metres."""
-        return self.root / "sparse_metric"
-
-    @property
-    def project_metric(self) -> Path:
-        """The whole project in metres, where an existing one was given."""
-        return self.root / "project_metric"
-
-    @property
-    def dense_metric(self) -> Path:
-        """Dense reconstructions of the metric models."""
-        return self.root / "dense_metric"
 
     @property
     def validation(self) -> Path:
@@ -147,6 +158,27 @@ class Workspace:
         """The smoothed metric trajectory of a model; the first one has the plain name."""
         return self.root / ("trajectory.tum" if first else f"trajectory_{index}.tum")
 
+    def trajectories(self) -> list[Path]:
+        """The trajectories of all models, with their covariances."""
+        return [path for path in self.root.glob("trajectory*") if _TRAJECTORY.fullmatch(path.name)]
+
+    @property
+    def own_names(self) -> tuple[str, ...]:
+        """Names that are the run's own where the folder is an existing project in metres; patterns, as in a shell."""
+        report = (self.report, self.report.with_suffix(".json"), self.report_data)
+        files = (self.result, self.config, self.log, self.diagnosis, self.frames, *report)
+        names = (path.name for path in (*files, self.validation, self.earlier, self.stamps))
+        return (*names, "trajectory*.tum", "trajectory*_cov.npz", "trajectory*_motion.json")
+
+    def is_own(self, name: str) -> bool:
+        """Whether a name is among them."""
+        return any(fnmatch.fnmatchcase(name, pattern) for pattern in self.own_names)
+
+    @property
+    def placed(self) -> Path:
+        """What came into the folder from an existing project."""
+        return self.stamps / "placed.json"
+
     @property
     def owner(self) -> Path:
         """Which command on which capture or project the folder is for."""
@@ -164,7 +196,7 @@ class Workspace:
         if not self.owner.is_file():
             write_json(self.owner, identity)
 
-    def prepare(self, source: Path, command: str) -> dict[str, str]:
+    def prepare(self, source: Path, command: str) -> dict[str, str | int]:
         """Make room for the lock, in a folder that is new or ours; nothing else is written before it is held.
 
         Returns
@@ -179,9 +211,14 @@ class Workspace:
         """
         if self.root.exists() and not self.root.is_dir():
             raise OutputExistsError(f"{self.root} is a file; choose another output folder")
-        identity = {"capture": str(source.resolve()), "command": command}
+        identity: dict[str, str | int] = {"capture": str(source.resolve()), "command": command, "layout": _LAYOUT}
         if self.owner.is_file():
-            known = {"command": command, **read_json(self.owner)}
+            known = read_json(self.owner)
+            if known.get("layout") != _LAYOUT:
+                raise OutputExistsError(
+                    f"{self.root} holds a run of another version, which laid its folders out otherwise: choose another "
+                    "folder, or remove this one (view and write_report still read it)"
+                )
             for what in ("capture", "command"):
                 if known.get(what) != identity[what]:
                     raise OutputExistsError(
@@ -214,6 +251,40 @@ class Workspace:
         busy = f"another run is at work in {self.root}; wait for it or choose another folder"
         with full_disk_is_an_error(self.root), locked(self.lock, busy):
             yield
+
+
+@dataclass(frozen=True, kw_only=True)
+class Places:
+    """Where a finished folder may hold what others go on with, the best first; not each of them is there.
+
+    Attributes
+    ----------
+    images, sparse, dense
+        Images that agree with the metric models, those models, dense reconstructions of them.
+    seen
+        The images that COLMAP saw, with their rolling shutter.
+    rectified
+        Those without it, where it was undone.
+    """
+
+    images: tuple[Path, ...]
+    sparse: tuple[Path, ...]
+    dense: tuple[Path, ...]
+    seen: Path
+    rectified: Path
+
+
+def places_of(root: Path) -> Places:
+    """The places of a finished folder, also of one that 0.2 or a version before it made."""
+    now, before = Workspace(root), root / "images_rectified"
+    apart = now.colmap_images.is_dir()
+    return Places(
+        images=(before, now.images, root / "project_metric" / "images"),
+        sparse=(root / "sparse_metric", now.sparse),
+        dense=(now.dense, root / "dense_metric"),
+        seen=now.colmap_images if apart else now.images,
+        rectified=now.images if apart else before,
+    )
 
 
 _MAKE_ROOM = "make room and start again, it continues"

@@ -13,8 +13,8 @@ from colmap_inertial.simulate.sensors import (
     Array,
     ImuErrors,
     ImuOptions,
-    _Sensor,
     draw_imu_errors,
+    sensors_of,
 )
 from colmap_inertial.types import ImuRecording
 
@@ -107,27 +107,7 @@ def simulate_rests(options: RestOptions, *, seed: int, errors: ImuErrors | None 
             attitude = matrix_from_quat(turns[i].attitude(since_s))
             force[moving] = options.gravity_m_s2 * np.einsum("nji,j->ni", attitude, up)
             force[moving] += turns[i].handled_m_s2(since_s, rng)
-    imu = options.imu
-    gyroscope = _Sensor(
-        rate_hz=imu.gyro_rate_hz,
-        offset_s=0.0,
-        matrix=errors.gyro_matrix,
-        bias=errors.gyro_bias_rad_s,
-        walk=imu.gyro_walk_rad_s2_rthz,
-        density=imu.gyro_density_rad_s_rthz,
-        limit=imu.gyro_range_rad_s,
-        step=imu.gyro_resolution_rad_s,
-    )
-    accelerometer = _Sensor(
-        rate_hz=imu.accel_rate_hz,
-        offset_s=0.0,
-        matrix=errors.accel_matrix,
-        bias=errors.accel_bias_m_s2,
-        walk=imu.accel_walk_m_s3_rthz,
-        density=imu.accel_density_m_s2_rthz,
-        limit=imu.accel_range_m_s2,
-        step=imu.accel_resolution_m_s2,
-    )
+    gyroscope, accelerometer = sensors_of(options.imu, errors)
     gyro, gyro_bias = gyroscope.readings(rate, rng)
     accel, accel_bias = accelerometer.readings(force, rng)
     turned, lower = _triangular(np.asarray(np.linalg.inv(np.eye(3) + errors.accel_matrix)))

@@ -239,7 +239,7 @@ class SampledImu:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class _Sensor:
+class Sensor:
     """Gyroscope or accelerometer of one device on one day; units are those of its readings."""
 
     rate_hz: float
@@ -272,6 +272,31 @@ class _Sensor:
         return out, biases
 
 
+def sensors_of(options: ImuOptions, errors: ImuErrors) -> tuple[Sensor, Sensor]:
+    """Gyroscope and accelerometer of a device."""
+    gyroscope = Sensor(
+        rate_hz=options.gyro_rate_hz,
+        offset_s=errors.gyro_time_offset_s,
+        matrix=errors.gyro_matrix,
+        bias=errors.gyro_bias_rad_s,
+        walk=options.gyro_walk_rad_s2_rthz,
+        density=options.gyro_density_rad_s_rthz,
+        limit=options.gyro_range_rad_s,
+        step=options.gyro_resolution_rad_s,
+    )
+    accelerometer = Sensor(
+        rate_hz=options.accel_rate_hz,
+        offset_s=errors.accel_time_offset_s,
+        matrix=errors.accel_matrix,
+        bias=errors.accel_bias_m_s2,
+        walk=options.accel_walk_m_s3_rthz,
+        density=options.accel_density_m_s2_rthz,
+        limit=options.accel_range_m_s2,
+        step=options.accel_resolution_m_s2,
+    )
+    return gyroscope, accelerometer
+
+
 def sample_imu(
     motion: Motion,
     errors: ImuErrors,
@@ -292,26 +317,7 @@ def sample_imu(
     """
     lead, lag = rng.uniform(*options.lead_s, size=2)
     interval = (-float(lead), duration_s + float(lag))
-    gyroscope = _Sensor(
-        rate_hz=options.gyro_rate_hz,
-        offset_s=errors.gyro_time_offset_s,
-        matrix=errors.gyro_matrix,
-        bias=errors.gyro_bias_rad_s,
-        walk=options.gyro_walk_rad_s2_rthz,
-        density=options.gyro_density_rad_s_rthz,
-        limit=options.gyro_range_rad_s,
-        step=options.gyro_resolution_rad_s,
-    )
-    accelerometer = _Sensor(
-        rate_hz=options.accel_rate_hz,
-        offset_s=errors.accel_time_offset_s,
-        matrix=errors.accel_matrix,
-        bias=errors.accel_bias_m_s2,
-        walk=options.accel_walk_m_s3_rthz,
-        density=options.accel_density_m_s2_rthz,
-        limit=options.accel_range_m_s2,
-        step=options.accel_resolution_m_s2,
-    )
+    gyroscope, accelerometer = sensors_of(options, errors)
     gyro_t_s, accel_t_s = (sensor.stamps_s(errors, interval, rng) for sensor in (gyroscope, accelerometer))
     gyro_t_cam_s = errors.t_cam_s(gyro_t_s, errors.gyro_time_offset_s)
     accel_t_cam_s = errors.t_cam_s(accel_t_s, errors.accel_time_offset_s)

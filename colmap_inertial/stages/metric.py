@@ -8,7 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from colmap_inertial.geometry import quat_rotate
+from colmap_inertial.geometry import quat_rotate, so3_log
+from colmap_inertial.gyro import on_camera_rate
+from colmap_inertial.imaging.gyro_camera import GyroCamera
+from colmap_inertial.io.records import write_record
 from colmap_inertial.io.trajectories import write_tum
 from colmap_inertial.model import Model, doubted, trajectory_from_model
 from colmap_inertial.options import ScaleOptions, WorldAxes
@@ -18,12 +21,17 @@ from colmap_inertial.stages.rolling_shutter import for_rectified
 from colmap_inertial.types import (
     Array,
     CameraImuCalibration,
+    CameraMotion,
     CameraTrajectory,
     ImuRecording,
     ScaleEstimate,
     Similarity,
     SmoothedTrajectory,
 )
+
+#: An angular velocity is the mean over this time, and over so many samples of the gyroscope, on each side of the
+#: instant: one reading has all of its noise, and a hand turns otherwise a few hundredths of a second later.
+_RATE_HALF_S, _LEAST_SAMPLES = 7e-3, 2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,13 +117,13 @@ def gravity_in_model(model: Model) -> Array | None:
 
 
 def write_trajectory(path: Path, model: Model, trajectory: CameraTrajectory, imu: ImuRecording) -> None:
-    """Write the smoothed metric camera path of a model as TUM text, and its covariance beside it.
+    """Write the smoothed metric camera path of a model as TUM text, its covariance and motion beside it.
 
     Parameters
     ----------
     path
         ``trajectory*.tum``; the covariance goes to ``trajectory*_cov.npz`` with ``t_s`` (T,) and ``cov`` (T, 9, 9) of
-        position, velocity and acceleration.
+        position, velocity and acceleration; velocities by frame to :func:`motion_file`.
     model
         A model that a stage made metric.
     trajectory
@@ -132,3 +140,40 @@ def write_trajectory(path: Path, model: Model, trajectory: CameraTrajectory, imu
     partial = target.with_name(f"{path.stem}_cov.partial.npz")
     np.savez_compressed(partial, t_s=smoothed.t_s + smoothed.epoch_ns * 1e-9, cov=smoothed.cov)
     os.replace(partial, target)
+    write_record(motion_file(path), _motion(model, trajectory, smoothed, imu, estimate.calibration))
+
+
+def motion_file(trajectory: Path) -> Path:
+    """Where the motion during each frame (``types.CameraMotion``) lies beside a smoothed path."""
+    return trajectory.with_name(f"{trajectory.stem}_motion.json")
+
+
+def _motion(
+    model: Model,
+    trajectory: CameraTrajectory,
+    smoothed: SmoothedTrajectory,
+    imu: ImuRecording,
+    calibration: CameraImuCalibration,
+) -> CameraMotion:
+    """Velocities of a model's frames, without those during which the gyroscope was silent."""
+    timing = model.timing
+    gyro = on_camera_rate(imu, calibration, camera_epoch_ns=timing.epoch_ns)
+    camera = GyroCamera.of(gyro, calibration, camera_epoch_ns=timing.epoch_ns)
+    place = {name: i for i, name in enumerate(timing.names)}
+    index = np.array([place[name] for name in trajectory.names])
+    exposure_s = None if timing.exposure_s is None else timing.exposure_s[index]
+    half_s = max(_RATE_HALF_S, _LEAST_SAMPLES * float(np.median(np.diff(gyro.gyro_t_s))))
+    begin_s, end_s = trajectory.t_s - half_s, trajectory.t_s + half_s
+    seen = camera.covers(begin_s, end_s)
+    before, after = (camera.start_from_cam(t_s[seen]) for t_s in (begin_s, end_s))
+    rate = so3_log(np.swapaxes(before, 1, 2) @ after) / (2 * half_s)
+    return CameraMotion(
+        names=tuple(name for name, kept in zip(trajectory.names, seen, strict=True) if kept),
+        t_s=trajectory.t_s[seen],
+        velocity_in_world_m_s=smoothed.velocity_in_world[seen],
+        angular_velocity_in_cam_rad_s=rate,
+        exposure_s=None if exposure_s is None else exposure_s[seen],
+        readout_s=timing.readout_s,
+        readout_direction=timing.readout_direction,
+        epoch_ns=trajectory.epoch_ns,
+    )

@@ -1,4 +1,4 @@
-"""Images that agree with rectified keypoints."""
+"""Images that agree with the model."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 
 from colmap_inertial.io.images import read_image
 from colmap_inertial.io.names import path_in
+from colmap_inertial.model.copying import copy_file
 from colmap_inertial.run.progress import Progress
 from colmap_inertial.stages.frame_folder import encode_image
 from colmap_inertial.stages.protocols import KeypointStage
@@ -22,7 +23,7 @@ def image_movers(stages: Sequence[KeypointStage]) -> list[ImageMover]:
     return [stage.move_image for stage in stages if hasattr(stage, "move_image")]
 
 
-def write_rectified(
+def write_images(
     movers: Sequence[ImageMover],
     names: Sequence[str],
     rectified: Collection[str],
@@ -30,7 +31,9 @@ def write_rectified(
     target: Path,
     progress: Progress,
 ) -> None:
-    """Write the images that COLMAP saw as a global shutter would have taken them; what was not rectified is copied.
+    """Write the images that COLMAP saw as a global shutter would have taken them.
+
+    What was not rectified is the same file under a second name (a hard link), or a copy where the file system has none.
 
     Parameters
     ----------
@@ -41,9 +44,9 @@ def write_rectified(
     rectified
         Names of those whose keypoints were rectified.
     images, target
-        Folders of the images and of the rectified ones.
+        Folders of the images that COLMAP saw, and of those that are written.
     progress
-        Called with ``"rectified"``.
+        Called with ``"images"``.
     """
 
     def work(name: str) -> None:
@@ -55,9 +58,9 @@ def write_rectified(
                 image = move(name, image)
             encode_image(out, image, source)
         else:
-            out.write_bytes(source.read_bytes())
+            copy_file(source, out, link=True)
 
     target.mkdir(parents=True)
-    progress("rectified", 0, len(names))
+    progress("images", 0, len(names))
     for done, _ in enumerate(in_order(work, names, workers=2), start=1):
-        progress("rectified", done, len(names))
+        progress("images", done, len(names))

@@ -15,7 +15,7 @@ from colmap_inertial.io.files import read_json
 from colmap_inertial.io.names import path_in
 from colmap_inertial.model import TRANSFORM_FILE, find_models, is_metric, model_format
 from colmap_inertial.model.similarities import similarity_from_json
-from colmap_inertial.run.workspace import Workspace, a_record_of_ours
+from colmap_inertial.run.workspace import Workspace, a_record_of_ours, places_of
 from colmap_inertial.scale.verdict import Z95
 from colmap_inertial.types import Array
 from colmap_inertial.types.recorded import LengthUnit
@@ -184,9 +184,7 @@ def _of_reconstruction(workspace: Workspace, index: int | None, given: tuple[Pat
             down_in_world=down,
             images=(
                 *given,
-                workspace.images_rectified,
-                workspace.images,
-                workspace.project_metric / "images",
+                *places_of(root).images,
                 *_image_folders(folder),
             ),
             fused=path_in(root, fused, workspace.result) if fused else None,
@@ -198,7 +196,7 @@ def _of_reconstruction(workspace: Workspace, index: int | None, given: tuple[Pat
 
 def _of_project(out: Path, index: int | None, given: tuple[Path, ...]) -> ViewSource:
     """A COLMAP model, or a project with models where COLMAP has them, as they are or as ``apply`` wrote them."""
-    for place in (out, out / "sparse_metric", out / "sparse"):
+    for place in (out, *places_of(out).sparse):
         try:
             models = find_models(place)
             break
@@ -304,5 +302,6 @@ def _image_folders(folder: Path) -> list[Path]:
 
 def _beside(out: Path, index: int, single: bool, name: str) -> Path | None:
     """A dense result of a project's model, in the places where COLMAP's commands put it."""
-    places = [out / "dense" / str(index), out / "dense_metric" / str(index), *([out / "dense", out] if single else [])]
+    dense = places_of(out).dense
+    places = [*(place / str(index) for place in dense), *([*dense, out] if single else [])]
     return next((place / name for place in places if (place / name).is_file()), None)

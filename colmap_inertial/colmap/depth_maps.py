@@ -1,0 +1,184 @@
+"""The depth maps of a dense workspace: who made them, which are there, and COLMAP's patch-match."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from colmap_inertial.errors import FormatError, InertialError, OutputExistsError
+from colmap_inertial.io.files import read_json, write_json
+from colmap_inertial.io.names import path_in
+from colmap_inertial.model.artefacts import check_map
+from colmap_inertial.model.depth_maps import read_map
+from colmap_inertial.run.runner import remove
+
+Maker = Literal["patch-match", "plane sweep"]
+
+#: Longer side of pictures that the sweep works on where the user names none: its work grows with its cube.
+_SWEPT_SIZE = 1200
+_RECORD = "made_from.json"
+#: Ends with the process that started it.
+_PATCH_MATCH = """
+import ctypes, signal, sys, zlib
+if sys.platform == "linux":
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)
+import pycolmap
+options = pycolmap.PatchMatchOptions()
+options.max_image_size = int(sys.argv[2])
+pycolmap.patch_match_stereo(sys.argv[1], options=options)
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MadeFrom:
+    """What a workspace's depth maps are made from; stands in it as ``made_from.json``.
+
+    Attributes
+    ----------
+    model
+        Digest of the model's poses and cameras.
+    max_image_size
+        Longer side of the undistorted images; ``None`` is as they are.
+    maps
+        Who makes the maps.
+    """
+
+    model: str
+    max_image_size: int | None
+    maps: Maker
+
+    def write(self, folder: Path) -> None:
+        """Write it into a workspace that does not say it already."""
+        path, values = folder / _RECORD, asdict(self)
+        if not (path.is_file() and read_json(path) == values):
+            write_json(path, values)
+
+
+def has_depth_maps(folder: Path) -> bool:
+    """Whether a dense workspace holds depth or normal maps."""
+    return any(file.is_file() for file in (folder / "stereo").glob("*_maps/**/*"))
+
+
+def model_of(folder: Path) -> str | None:
+    """The digest of the model that a dense workspace of ours was made from; ``None`` for any other folder."""
+    record = folder / _RECORD
+    return str(read_json(record).get("model")) if record.is_file() else None
+
+
+def settle_maker(folder: Path, model: str, max_image_size: int | None) -> tuple[MadeFrom, bool]:
+    """Decide who makes a workspace's depth maps, and tell whether some are there.
+
+    Whoever began goes on: maps of two makers are never mixed. Maps of patch-match may have taken hours, or came from
+    elsewhere; they are never removed, and never used with another model. Our own are removed where they do not fit.
+
+    Parameters
+    ----------
+    folder
+        The workspace, whether it is there or not.
+    model
+        Digest of the model.
+    max_image_size
+        What the user asks for.
+
+    Raises
+    ------
+    OutputExistsError
+        Where maps of patch-match lie there that were made from something else, or beside those of the sweep.
+    """
+    import pycolmap
+
+    maps = [file for file in (folder / "stereo").glob("*_maps/**/*.bin") if file.is_file()]
+    here: Maker = "patch-match" if pycolmap.has_cuda else "plane sweep"
+    if not maps:
+        return _made_from(model, max_image_size, here), False
+    record = folder / _RECORD
+    known = read_json(record) if record.is_file() else {}
+    # an earlier version's record does not say: only patch-match made maps then
+    maker: Maker = "plane sweep" if known.get("maps") == "plane sweep" else "patch-match"
+    if maker == "plane sweep" and any(file.name.endswith(".photometric.bin") for file in maps):
+        raise OutputExistsError(
+            f"{folder / 'stereo'} holds maps of COLMAP's patch-match, but {record} says that the plane sweep made "
+            'them; remove depth_maps and normal_maps, or, where patch-match made them all, write "maps": "patch-match" '
+            "there"
+        )
+    wanted = _made_from(model, max_image_size, maker)
+    if all(known.get(key) == getattr(wanted, key) for key in ("model", "max_image_size")):
+        return wanted, True
+    if maker == "patch-match":
+        raise OutputExistsError(
+            f"{folder / 'stereo'} holds depth maps of another model or other options; rename or remove {folder}"
+        )
+    for file in maps:
+        remove(file)
+    return _made_from(model, max_image_size, here), False
+
+
+def _made_from(model: str, max_image_size: int | None, maker: Maker) -> MadeFrom:
+    size = max_image_size or (_SWEPT_SIZE if maker == "plane sweep" else None)
+    return MadeFrom(model=model, max_image_size=size, maps=maker)
+
+
+def map_file(folder: Path, what: str, name: str, kind: str = "geometric") -> Path:
+    """Where a workspace has the map of a picture; ``what`` is depth or normal."""
+    return path_in(folder / "stereo" / f"{what}_maps", f"{name}.{kind}.bin")
+
+
+def patch_match(folder: Path, max_image_size: int | None) -> None:
+    """COLMAP's patch-match on a dense workspace, in a process of its own: where CUDA fails it ends the process.
+
+    Raises
+    ------
+    InertialError
+        When it fails; the depth maps that are done stay.
+    """
+    # COLMAP keeps the maps that are there, so that half-written ones must go first
+    for path in (folder / "stereo").glob("*_maps/**/*.bin"):
+        try:
+            check_map(path, 1 if "depth_maps" in path.parts else 3)
+        except FormatError:
+            remove(path)
+    command = [sys.executable, "-c", _PATCH_MATCH, str(folder), str(max_image_size or -1)]
+    done = subprocess.run(command, capture_output=True, text=True, errors="replace")
+    if done.returncode:
+        said = (done.stderr.strip().splitlines() or ["no message"])[-1]
+        raise InertialError(
+            f"{folder}: COLMAP's patch-match ended with code {done.returncode}: {said}. Started again, it continues "
+            "with the next depth map"
+        )
+
+
+def found_maps(folder: Path, names: Sequence[str]) -> tuple[str, list[str]]:
+    """The kind of depth map that is there, and the images that have one and its normals, all of them checked.
+
+    Raises
+    ------
+    FormatError
+        For a map that is damaged: COLMAP would end the process over it.
+    """
+    for kind in ("geometric", "photometric"):
+        mapped = [n for n in names if all(map_file(folder, w, n, kind).is_file() for w in ("depth", "normal"))]
+        if mapped:
+            for name in mapped:
+                sizes = []
+                for what, channels in (("depth", 1), ("normal", 3)):
+                    path = map_file(folder, what, name, kind)
+                    sizes.append((path.stat().st_size - check_map(path, channels)) // channels)
+                if sizes[0] != sizes[1]:
+                    raise FormatError(map_file(folder, "normal", name, kind), "is not as large as its depth map")
+            return kind, mapped
+    return "geometric", []
+
+
+def coverage(folder: Path, names: Sequence[str], kind: str) -> float:
+    """Share of the pixels of these pictures' depth maps that have a depth."""
+    known = pixels = 0
+    for name in names:
+        depth = read_map(map_file(folder, "depth", name, kind))
+        known, pixels = known + int(np.count_nonzero(depth > 0)), pixels + depth.size
+    return known / pixels if pixels else 0.0

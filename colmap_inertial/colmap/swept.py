@@ -1,0 +1,146 @@
+"""Depth and normal maps of a dense workspace by our own plane sweep, where there is no CUDA for COLMAP's patch-match.
+
+First the depths of each picture by itself, which are kept aside; then, where others agree with them, the maps that
+COLMAP's fusion reads. Both file by file, so that a sweep that was cut off goes on where it was.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.colmap.depth_maps import map_file
+from colmap_inertial.geometry import opencv_px_from_colmap
+from colmap_inertial.io.files import as_plain, read_json, write_json
+from colmap_inertial.io.images import read_image
+from colmap_inertial.io.names import path_in
+from colmap_inertial.model import read_model
+from colmap_inertial.model.depth_maps import read_map, write_map
+from colmap_inertial.run.runner import remove
+from colmap_inertial.sweep import (
+    DepthView,
+    Partner,
+    Pinhole,
+    Sights,
+    agreed_depth,
+    chosen_partners,
+    depth_range,
+    normals_of,
+    partner_scores,
+    sweep_depth,
+)
+from colmap_inertial.threads import frames_at_once, in_order
+
+#: Partners to match with (fewer measure less, more cost time), and views to ask for agreement.
+PARTNERS, WITNESSES = 4, 8
+
+
+@dataclass(frozen=True)
+class SweptWorkspace:
+    """A dense workspace of COLMAP's, and where depths are kept that nothing confirmed yet."""
+
+    folder: Path
+    raw: Path
+
+    def begin(self, identity: object) -> None:
+        """Go on with a sweep of the same pictures and model, or remove what there is of another one."""
+        record, content = self.raw / "made_from.json", as_plain({"identity": identity})
+        if record.is_file() and read_json(record) == content:
+            return
+        remove(self.raw)
+        for name in self.names:
+            for what in ("depth", "normal"):
+                remove(map_file(self.folder, what, name))
+        self.raw.mkdir(parents=True)
+        write_json(record, content)
+
+    def sweep(self, threads: int, progress: Callable[[], object]) -> None:
+        """Write the maps of all pictures that have partners; ``progress`` is called twice for each picture.
+
+        Parameters
+        ----------
+        threads
+            0 takes all processors.
+        """
+        for view in range(len(self.names)):
+            self._match(view, threads)
+            progress()
+        workers = threads or frames_at_once()
+        for _ in in_order(self._confirm, range(len(self.names)), workers=workers):
+            progress()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the pictures, in the order of the views."""
+        return self._scene[0]
+
+    @property
+    def sights(self) -> Sights:
+        """Cameras and the points that they see."""
+        return self._scene[1]
+
+    @cached_property
+    def _scene(self) -> tuple[tuple[str, ...], Sights]:
+        model = read_model(self.folder / "sparse")
+        ids = sorted(model.points3D)
+        points = np.array([model.points3D[i].xyz for i in ids]).reshape(-1, 3)
+        images = sorted((model.image(i) for i in model.reg_image_ids()), key=lambda image: image.name)
+        views, observed = [], []
+        for image in images:
+            camera, pose = model.camera(image.camera_id), image.cam_from_world()
+            fx, fy, cx, cy = camera.params
+            views.append(
+                Pinhole(
+                    width=camera.width,
+                    height=camera.height,
+                    focal_px=np.array([fx, fy]),
+                    centre_px=opencv_px_from_colmap(np.array([cx, cy])),
+                    cam_from_world=pose.rotation.matrix(),
+                    cam_in_world=image.projection_center(),
+                )
+            )
+            seen = np.array([p.point3D_id for p in image.points2D if p.has_point3D()], dtype=np.int64)
+            observed.append(np.searchsorted(ids, seen).astype(np.int64))
+        return tuple(image.name for image in images), Sights.of(views, points, observed)
+
+    def _raw_file(self, view: int) -> Path:
+        return path_in(self.raw, f"{self.names[view]}.bin")
+
+    def _match(self, view: int, threads: int) -> None:
+        """The depths of one picture by its partners."""
+        target, sights = self._raw_file(view), self.sights
+        depths = depth_range(sights, view)
+        if target.is_file() or depths is None:
+            return
+        chosen = chosen_partners(sights, view, partner_scores(sights, view), PARTNERS)
+        if chosen:
+            partners = [Partner(codes=self._grey(k), camera=sights.views[k]) for k in chosen]
+            write_map(target, sweep_depth(self._grey(view), sights.views[view], partners, depths, threads=threads))
+
+    def _confirm(self, view: int) -> None:
+        """The maps of one picture: depths that other pictures' depths agree with, and their normals."""
+        files = [map_file(self.folder, what, self.names[view]) for what in ("depth", "normal")]
+        if not self._raw_file(view).is_file() or all(file.is_file() for file in files):
+            return
+        scores = partner_scores(self.sights, view)
+        best = np.argsort(-scores, kind="stable")[:WITNESSES]
+        witnesses = [int(k) for k in best if scores[k] > 0 and self._raw_file(int(k)).is_file()]
+        depth = agreed_depth(self._depth_view(view), (self._depth_view(k) for k in witnesses))
+        write_map(files[0], depth)
+        write_map(files[1], normals_of(depth, self.sights.views[view]))
+
+    def _depth_view(self, view: int) -> DepthView:
+        return DepthView(depth=read_map(self._raw_file(view)), camera=self.sights.views[view])
+
+    def _grey(self, view: int) -> NDArray[np.uint8]:
+        import cv2
+
+        picture = read_image(path_in(self.folder / "images", self.names[view]))
+        if picture.dtype == np.uint16:
+            picture = (picture >> 8).astype(np.uint8)
+        return np.asarray(picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), dtype=np.uint8)

@@ -1,0 +1,136 @@
+"""``transforms.json`` of NeRF trainers under a similarity."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from colmap_inertial.errors import FormatError
+from colmap_inertial.geometry import matrix_from_quat
+from colmap_inertial.io.files import read_json
+from colmap_inertial.model.database import PlacedModel
+from colmap_inertial.types import Array, Similarity
+
+_MATRICES = ("transform_matrix", "transform_matrix_start", "transform_matrix_end")
+#: Its cameras are a model's when they stand closer to them than this share of their extent.
+_SAME_FRAME = 0.01
+
+
+def is_transforms(path: Path) -> bool:
+    """Whether a file is named like NeRF trainers' cameras."""
+    return path.suffix == ".json" and path.name.startswith("transforms")
+
+
+def cameras_are_those_of(path: Path, placed: Sequence[PlacedModel]) -> bool:
+    """Whether the file's cameras stand where those of one of the models do, once ``applied_transform`` is undone.
+
+    Some programs write cameras that they have turned, moved and scaled without saying how: a similarity of the model is
+    none of theirs.
+    """
+    values = _frames(path)
+    if values is None:
+        return False
+    back = np.linalg.inv(_applied(path, values))
+    found = {
+        PurePosixPath(str(frame.get("file_path", ""))).name: (back @ _matrix(path, frame["transform_matrix"]))[:3, 3]
+        for frame in values["frames"]
+    }
+    # some leave out the ending
+    found |= {PurePosixPath(name).stem: centre for name, centre in found.items()}
+    for model in placed:
+        pairs = []
+        for name, centre in model.centres.items():
+            path_of = PurePosixPath(name)
+            pairs.append((centre, found.get(path_of.name, found.get(path_of.stem))))
+        distances = [float(np.linalg.norm(a - b)) for a, b in pairs if b is not None]
+        enough = 2 * len(distances) >= min(len(model.centres), len(values["frames"])) > 0
+        if enough and float(np.median(distances)) <= max(_SAME_FRAME * model.extent(), 1e-9):
+            return True
+    return False
+
+
+def transform_transforms(source: Path, target: Path, similarity: Similarity) -> tuple[str, ...]:
+    """Write a copy with its cameras moved, and what goes along: velocities, up, instant-ngp's box.
+
+    ``applied_transform`` stays: the similarity acts on the world before it.
+
+    Raises
+    ------
+    FormatError
+        For matrices that are none.
+    """
+    values = _frames(source)
+    if values is None:
+        return ()
+    applied, moving = _applied(source, values), np.eye(4)
+    moving[:3, :3] = similarity.scale * matrix_from_quat(similarity.rotation_xyzw)
+    moving[:3, 3] = similarity.translation_m
+    moving = applied @ moving @ np.linalg.inv(applied)
+    rotation = moving[:3, :3] / similarity.scale
+    changed = ["cameras"]
+    for frame in values["frames"]:
+        for name in _MATRICES:
+            if name in frame:
+                pose = _matrix(source, frame[name])
+                pose[:3, 3] = moving[:3, :3] @ pose[:3, 3] + moving[:3, 3]
+                pose[:3, :3] = rotation @ pose[:3, :3]
+                frame[name] = pose.tolist()
+        if "camera_linear_velocity" in frame:
+            velocity = similarity.scale * _vector(source, frame["camera_linear_velocity"])
+            frame["camera_linear_velocity"] = velocity.tolist()
+            changed.append("velocities")
+    if "up" in values:
+        values["up"] = (rotation @ _vector(source, values["up"])).tolist()
+        changed.append("up")
+    if "scale" in values and "offset" in values:
+        scale, offset = float(values["scale"]), _vector(source, values["offset"])
+        middle = moving[:3, :3] @ ((0.5 - offset) / scale) + moving[:3, 3]
+        values["scale"] = scale / similarity.scale
+        values["offset"] = (0.5 - values["scale"] * middle).tolist()
+        changed.append("box")
+    target.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
+    return tuple(dict.fromkeys(changed))
+
+
+def _frames(path: Path) -> dict[str, Any] | None:
+    """The content, where it is one of cameras."""
+    try:
+        values = read_json(path)
+    except FormatError:  # whatever else has this name
+        return None
+    frames = values.get("frames")
+    cameras = isinstance(frames, list) and frames and all(isinstance(f, dict) and _MATRICES[0] in f for f in frames)
+    return values if cameras else None
+
+
+def _applied(path: Path, values: Mapping[str, Any]) -> Array:
+    """(4, 4) what was done to the model's world before the cameras were written."""
+    given = values.get("applied_transform")
+    return np.eye(4) if given is None else _matrix(path, given)
+
+
+def _matrix(path: Path, value: object) -> Array:
+    """(4, 4) of 3 or 4 rows."""
+    try:
+        matrix = np.array(value, dtype=np.float64)
+        if matrix.shape == (3, 4):
+            matrix = np.concatenate([matrix, [[0.0, 0.0, 0.0, 1.0]]])
+        if matrix.shape == (4, 4) and abs(np.linalg.det(matrix)) > 0:  # not where one of them is nan
+            return matrix
+    except (TypeError, ValueError):
+        pass
+    raise FormatError(path, "a transform that is no matrix of 3 or 4 rows of 4 numbers; leave the file out with --keep")
+
+
+def _vector(path: Path, value: object) -> Array:
+    try:
+        vector = np.array(value, dtype=np.float64)
+        if vector.shape == (3,):
+            return vector
+    except (TypeError, ValueError):
+        pass
+    raise FormatError(path, "a vector that is not three numbers; leave the file out with --keep")

@@ -1,0 +1,155 @@
+"""Matching of several views: costs of all candidates, and the candidate with the least sum of them along paths."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Codes = NDArray[np.uint8]
+Real = NDArray[np.float32]
+
+#: Pixels from the centre of the census window to its sides: 5 x 5 pixels, 24 comparisons.
+CENSUS_RADIUS = 2
+#: What a view can cost at most, of either kind.
+MOST = (2 * CENSUS_RADIUS + 1) ** 2 - 1
+#: A pixel that no view sees costs this share of the most: more than a good match, less than a poor one.
+_UNSEEN = 0.25
+#: Penalties for disparities that change by one candidate, and by more, in shares of the most that all views can cost.
+_SMALL, _JUMP = 0.2, 2.0
+#: The jump's penalty is divided by the change of brightness over this many codes: edges of things are where they look
+#: different (Hirschmueller 2008, after equation 12).
+_EDGE_CODES = 8
+#: Bytes of costs and their sums that are held at once; larger images are matched in strips.
+_MEMORY = 512 * 2**20
+#: Rows that strips share with their neighbours on each side.
+_OVERLAP = 48
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LightCost:
+    """A cost of all views together: a weighted sum of their codes that would be zero.
+
+    Attributes
+    ----------
+    blend
+        (N + 1) weights of the reference, of the views, and a constant, in 1/256.
+    table
+        (256,) costs of what the sum is instead, in codes.
+    """
+
+    blend: NDArray[np.int32]
+    table: Codes
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Views:
+    """Pictures to compare, and how.
+
+    Attributes
+    ----------
+    reference
+        (H, W) codes.
+    others
+        (N, Hv, Wv) codes of the other views, each turned to the reference's orientation.
+    least
+        Difference of codes below which census passes over a comparison.
+    tables
+        (N, 256, 256) costs by the codes of the reference and a view, 0 to ``MOST``; ``None`` is census.
+    light
+        What colours that do not add up to luminance cost in addition.
+    """
+
+    reference: Codes
+    others: Codes
+    least: int = 0
+    tables: Codes | None = None
+    light: LightCost | None = None
+
+
+def jump_table(views: int) -> tuple[int, NDArray[np.uint16]]:
+    """The small penalty, and (256,) that of a jump by the change of the reference's code."""
+    most = MOST * _counted(views)
+    small = round(_SMALL * most)
+    jump = _JUMP * most / np.maximum(1, np.arange(256) / _EDGE_CODES)
+    return small, np.maximum(small + 1, np.floor(jump)).astype(np.uint16)
+
+
+def shares(views: int) -> NDArray[np.int32]:
+    """(views + 1,) factors in 1/256: a cost counts as if all views saw the pixel, and stays below 256."""
+    by = np.maximum(1, np.arange(views + 1))
+    return np.asarray(np.rint(256 * _counted(views) / by), dtype=np.int32)
+
+
+def _counted(views: int) -> int:
+    """The views that a cost of one byte can hold; those of more are scaled down."""
+    return min(views, 255 // MOST)
+
+
+def match_candidates(
+    views: Views, columns: NDArray[np.int32], rows: NDArray[np.int32], *, threads: int
+) -> tuple[Real, NDArray[np.uint16]]:
+    """Semi-global matching of all views at once (Hirschmueller, PAMI 30(2), 2008).
+
+    Parameters
+    ----------
+    columns, rows
+        (N, D, W) and (N, D, H): where the reference's columns and rows lie in each view if a candidate is true, in
+        1/16 px; outside of the view where it does not have them.
+    threads
+        0 takes all processors.
+
+    Returns
+    -------
+    (H, W) candidates with the least sum of costs, between two where a parabola says so, and that sum.
+    """
+    from colmap_inertial._kernels import _apertures
+
+    height, width = views.reference.shape
+    count, number = columns.shape[:2]
+    small, jump = jump_table(count)
+    padded = -(-number // _apertures.PADDING) * _apertures.PADDING
+    best = np.empty((height, width), dtype=np.float32)
+    sums = np.empty((height, width), dtype=np.uint16)
+    for begin, end, first, last in strips(height, width * (number + 2 * padded)):
+        part = np.ascontiguousarray(views.reference[first:last])
+        cost = np.empty((last - first, width, number), dtype=np.uint8)
+        _apertures.matching_costs(
+            part,
+            views.others,
+            columns=columns,
+            rows=np.ascontiguousarray(rows[:, :, first:last]),
+            cost=cost,
+            share=shares(count),
+            unseen=round(_UNSEEN * MOST * _counted(count)),
+            radius=CENSUS_RADIUS,
+            least=views.least,
+            tables=views.tables,
+            blend=None if views.light is None else views.light.blend,
+            blend_table=None if views.light is None else views.light.table,
+            threads=threads,
+        )
+        total = np.empty((last - first, width, padded), dtype=np.uint16)
+        _apertures.semi_global(cost, part, small=small, jump=jump, total=total, threads=threads)
+        del cost
+        least, index = (np.empty(part.shape, dtype=np.uint16) for _ in range(2))
+        aside = np.empty(part.shape, dtype=np.float32)
+        _apertures.winners(total, least=least, index=index, aside=aside, candidates=number, threads=threads)
+        inner = slice(begin - first, end - first)
+        best[begin:end] = (index + aside)[inner]
+        sums[begin:end] = least[inner]
+    return best, sums
+
+
+def strips(height: int, bytes_a_row: int) -> list[tuple[int, int, int, int]]:
+    """Rows of the result (begin, end) and rows to work on (first, last) for each strip that fits the memory."""
+    fits = max(1, _MEMORY // bytes_a_row - 2 * _OVERLAP)
+    if height * bytes_a_row <= _MEMORY:
+        fits = height
+    count = -(-height // fits)
+    edges = [height * i // count for i in range(count + 1)]
+    return [
+        (begin, end, max(0, begin - _OVERLAP), min(height, end + _OVERLAP)) for begin, end in itertools.pairwise(edges)
+    ]

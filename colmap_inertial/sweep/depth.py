@@ -1,0 +1,174 @@
+"""Depth of one picture: partners are turned to its orientation, where a plane's depth moves and shrinks them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.semi_global import Views, match_candidates
+from colmap_inertial.sweep.pinhole import Pinhole
+from colmap_inertial.types import Array
+
+Codes = NDArray[np.uint8]
+Real = NDArray[np.float32]
+
+#: Between two candidates a thing moves by this much in the partner where it moves most.
+_STEP_PX = 1.0
+_LEAST_CANDIDATES, _MOST_CANDIDATES = 16, 512
+#: Census passes over comparisons of codes that differ by less: noise and JPEG decide them.
+_LEAST_CODES = 2
+#: A turned view is at most so much larger than the reference: beyond, it is stretched more than it shows.
+_LARGEST = 1.6
+#: A partner that stands this close to a plane, as a share of its depth, does not see it well.
+_CLOSEST = 0.2
+#: Points of a side of the grid by which the part of a view that is needed is found.
+_GRID = 33
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Partner:
+    """Another picture that sees some of the same.
+
+    Attributes
+    ----------
+    codes
+        (H, W) grey values.
+    camera
+        What took it.
+    """
+
+    codes: Codes
+    camera: Pinhole
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Canvas:
+    """A partner's view turned to the reference's orientation: pixel (u, v) of it is (u + left, v + top) there."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+    canvas_from_view: Array
+    baseline: Array
+
+
+def sweep_depth(
+    codes: Codes, camera: Pinhole, partners: Sequence[Partner], depths: tuple[float, float], *, threads: int
+) -> Real:
+    """Find what depth each pixel has.
+
+    Parameters
+    ----------
+    codes
+        (H, W) grey values of the reference.
+    camera
+        What took it.
+    partners
+        Pictures to compare with, at least one.
+    depths
+        Nearest and farthest, in the model's unit.
+    threads
+        0 takes all processors.
+
+    Returns
+    -------
+    (H, W) depths; 0 where the best candidate is one of the ends: it may lie beyond.
+
+    Notes
+    -----
+    Planes parallel to the picture, equally spaced in inverse depth (Collins, CVPR 1996). Once a partner is turned to
+    the reference's orientation, a plane moves and shrinks its picture, so that columns and rows are looked up apart.
+    Costs (census) are summed over the partners that see a pixel, and the depths found by semi-global matching.
+    """
+    near, far = depths
+    turned = [(canvas, p) for p in partners if (canvas := _canvas(camera, p.camera, depths)) is not None]
+    if not turned:
+        return np.zeros(codes.shape, dtype=np.float32)
+    inverse = _candidates(camera, [canvas.baseline for canvas, _ in turned], near, far)
+    shape = max(canvas.height for canvas, _ in turned), max(canvas.width for canvas, _ in turned)
+    others = np.zeros((len(turned), *shape), dtype=np.uint8)
+    columns = np.empty((len(turned), len(inverse), camera.width), dtype=np.int32)
+    rows = np.empty((len(turned), len(inverse), camera.height), dtype=np.int32)
+    for k, (canvas, partner) in enumerate(turned):
+        others[k, : canvas.height, : canvas.width] = _turned(partner.codes, canvas)
+        columns[k] = _positions(camera, canvas, inverse, 0)
+        rows[k] = _positions(camera, canvas, inverse, 1)
+    views = Views(reference=codes, others=others, least=_LEAST_CODES)
+    best, _ = match_candidates(views, columns, rows, threads=threads)
+    known = (best > 0) & (best < len(inverse) - 1)
+    found = inverse[0] + (inverse[1] - inverse[0]) * best.astype(np.float64)
+    return np.where(known, 1 / found, 0).astype(np.float32)
+
+
+def _candidates(camera: Pinhole, baselines: Sequence[Array], near: float, far: float) -> Array:
+    """(D,) inverse depths, the farthest first."""
+    moves = [np.hypot(b[0], b[1]) + 0.5 * abs(b[2]) for b in baselines]
+    count = float(camera.focal_px.max()) * max(moves) * (1 / near - 1 / far) / _STEP_PX + 1
+    return np.linspace(1 / far, 1 / near, int(np.clip(np.ceil(count), _LEAST_CANDIDATES, _MOST_CANDIDATES)))
+
+
+def _place(camera: Pinhole, baseline: Array, inverse: Array, axis: int) -> tuple[Array, Array]:
+    """(D, n) where columns (axis 0) or rows (1) of the reference lie in a turned view; (D, 1) how they shrink."""
+    at = np.arange((camera.width, camera.height)[axis], dtype=np.float64)
+    focal, centre = camera.focal_px[axis], camera.centre_px[axis]
+    shrinks = 1 - inverse[:, None] * baseline[2]
+    moved = at - centre - focal * inverse[:, None] * baseline[axis]
+    return moved / np.maximum(shrinks, _CLOSEST) + centre, shrinks
+
+
+def _canvas(camera: Pinhole, view: Pinhole, depths: tuple[float, float]) -> _Canvas | None:
+    """What a view shows of what the reference sees between two depths; ``None`` where it shows nothing of it."""
+    baseline = camera.cam_from_world @ (view.cam_in_world - camera.cam_in_world)
+    turn = camera.cam_from_world @ view.cam_from_world.T
+    canvas_from_view = camera.matrix @ turn @ np.linalg.inv(view.matrix)
+    inverse = np.linspace(1 / depths[1], 1 / depths[0], 9)
+    ranges = []
+    for axis in (0, 1):
+        place, shrinks = _place(camera, baseline, inverse, axis)
+        place = place[shrinks[:, 0] >= _CLOSEST]
+        if not place.size:
+            return None
+        ranges.append(np.linspace(place.min(), place.max(), _GRID))
+    # which of that the view has
+    grid = np.stack([*np.meshgrid(*ranges), np.ones((_GRID, _GRID))], axis=-1) @ np.linalg.inv(canvas_from_view).T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x, y = grid[..., 0] / grid[..., 2], grid[..., 1] / grid[..., 2]
+    inside = (grid[..., 2] > 0) & (x >= 0) & (x <= view.width - 1) & (y >= 0) & (y <= view.height - 1)
+    limits = []
+    for axis, most in ((0, camera.width), (1, camera.height)):
+        hit = np.flatnonzero(inside.any(axis=axis))
+        if not len(hit):
+            return None
+        # a cell more on each side, as the border lies somewhere within
+        low, high = ranges[axis][max(0, hit[0] - 1)], ranges[axis][min(_GRID - 1, hit[-1] + 1)]
+        excess = max(0.0, high - low - _LARGEST * most) / 2
+        limits.append((int(np.floor(low + excess)), int(np.ceil(high - excess))))
+    (left, right), (top, bottom) = limits
+    return _Canvas(
+        left=left,
+        top=top,
+        width=right - left + 1,
+        height=bottom - top + 1,
+        canvas_from_view=np.array([[1.0, 0, -left], [0, 1, -top], [0, 0, 1]]) @ canvas_from_view,
+        baseline=baseline,
+    )
+
+
+def _positions(camera: Pinhole, canvas: _Canvas, inverse: Array, axis: int) -> NDArray[np.int32]:
+    """(D, n) columns or rows of the canvas in 1/16 px, -1 where it has none."""
+    start, size = ((canvas.left, canvas.width), (canvas.top, canvas.height))[axis]
+    place, shrinks = _place(camera, canvas.baseline, inverse, axis)
+    place = place - start
+    usable = (place >= 0) & (place <= size - 1) & (shrinks >= _CLOSEST)
+    return np.where(usable, np.rint(16 * place), -1).astype(np.int32)
+
+
+def _turned(codes: Codes, canvas: _Canvas) -> Codes:
+    import cv2
+
+    size = (canvas.width, canvas.height)
+    return np.asarray(cv2.warpPerspective(codes, canvas.canvas_from_view, size, flags=cv2.INTER_LINEAR))

@@ -1,0 +1,385 @@
+"""The output folder: a project in metres while its scale stands, nothing stale, nobody's own files touched."""
+
+import json
+import os
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from model_project import NAMES, write_project
+from test_io_ply import SIMILARITY
+from test_pipeline import copy_scene
+from test_pipeline_parts import session_in
+
+from colmap_inertial.cli.terminal import show_result
+from colmap_inertial.colmap import dense as dense_room
+from colmap_inertial.drivers import deblur
+from colmap_inertial.drivers.frames import run_images
+from colmap_inertial.drivers.placed import place_project, placed_paths, require_free_names
+from colmap_inertial.drivers.reporting import reporting_stops
+from colmap_inertial.drivers.result import ModelResult, ReconstructResult
+from colmap_inertial.drivers.standing import settle_dense
+from colmap_inertial.errors import AlreadyMetricError, MappingError, OutputError, OutputExistsError
+from colmap_inertial.io.calibration import calibration_prior
+from colmap_inertial.io.capture import Capture
+from colmap_inertial.model import read_model, transformed, write_model
+from colmap_inertial.model.project import apply_to_project, undo_project
+from colmap_inertial.model.similarities import ModelScale, plain_factor
+from colmap_inertial.options import ProjectOptions
+from colmap_inertial.precalibrate.plan import ImagingPlan
+from colmap_inertial.run.workspace import Workspace
+from colmap_inertial.stages.frame_folder import FrameRecord
+from colmap_inertial.types import ScaleEstimate
+
+SCALE = ModelScale(similarity=SIMILARITY, verdict="trusted")
+REFUSED = ModelScale(similarity=None, verdict="refused", reasons=("the camera stood still",))
+
+
+def contents(folder):
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+@pytest.fixture(scope="module")
+def colmap_project(tmp_path_factory):
+    """A project by COLMAP, its model as text and binary. Tests must not change it."""
+    root = tmp_path_factory.mktemp("layout") / "project"
+    write_project(root)
+    return root
+
+
+@pytest.fixture
+def workspace(tmp_path):
+    workspace = Workspace(tmp_path / "out")
+    workspace.open(tmp_path / "project")
+    return workspace
+
+
+# --- images ----------------------------------------------------------------------------------------------------------
+
+
+def images_made(workspace, names, moved=(), stages=()):
+    session = session_in(workspace)
+
+    def frames(partial):
+        partial[0].mkdir()
+        for name in names:
+            (partial[0] / name).parent.mkdir(exist_ok=True)
+            (partial[0] / name).write_text(f"{name} as filmed")
+
+    session.runner.run("frames", {"moved": sorted(moved)}, [workspace.colmap_images], frames)
+    records = [FrameRecord(name=name, action="passed") for name in names]
+    run_images(session, records, frozenset(moved), stages)
+    return session.runner.worked
+
+
+def test_images_that_nothing_moved_take_no_room_and_outlive_colmap_s(workspace):
+    names = ["a.jpg", "left/b.jpg"]
+    assert images_made(workspace, names) == ["frames", "images"]
+    assert images_made(workspace, names) == []
+    assert all((workspace.images / name).samefile(workspace.colmap_images / name) for name in names)
+    shutil.rmtree(workspace.colmap)
+    assert contents(workspace.images) == {name: f"{name} as filmed".encode() for name in names}
+
+
+def test_without_hard_links_images_are_copied(workspace, monkeypatch):
+    def refuse(*_):
+        raise OSError("no such thing here")
+
+    monkeypatch.setattr(os, "link", refuse)
+    images_made(workspace, ["a.jpg"])
+    assert not (workspace.images / "a.jpg").samefile(workspace.colmap_images / "a.jpg")
+    assert contents(workspace.images) == contents(workspace.colmap_images)
+
+
+class Plan(ImagingPlan):
+    """Nothing to deblur, and a rolling shutter in one picture."""
+
+    def frame_stages(self, **_):
+        return []
+
+    def keypoint_stages(self):
+        def mover(keypoints):
+            return keypoints
+
+        mover.covers = lambda name: name == "000000.jpg"
+        mover.move_image = lambda name, image: 255 - image
+        return [mover]
+
+
+def test_deblurred_images_are_rectified_where_that_is_asked_for(tmp_path, monkeypatch):
+    monkeypatch.setattr(deblur, "run_plan", lambda *_: Plan())
+    capture = copy_scene(tmp_path / "capture", first=3)
+    filmed = contents(capture / "frames")
+
+    def made(*, rectify):
+        done = deblur.deblur_capture(capture, tmp_path / "out", rectify=rectify)
+        return contents(done.workspace.images), done.workspace.colmap_images
+
+    for _ in range(2):  # there and back
+        images, colmap_images = made(rectify=False)
+        assert images == filmed and not colmap_images.parent.exists()
+        images, colmap_images = made(rectify=True)
+        assert contents(colmap_images) == filmed
+        assert {name for name in filmed if images[name] != filmed[name]} == {"000000.jpg"}
+
+
+# --- nothing metric without its model --------------------------------------------------------------------------------
+
+
+def dense_of(workspace, index, *, maps=False):
+    """A dense workspace of ours, as far as it matters here."""
+    folder = workspace.dense / str(index)
+    (folder / "stereo" / "depth_maps").mkdir(parents=True)
+    if maps:
+        (folder / "stereo" / "depth_maps" / "a.geometric.bin").write_text("hours")
+    (folder / "fused.ply").write_text("points")
+    identity = {"model": dense_room.digest(workspace.sparse / str(index)), "max_image_size": 100}
+    (folder / "made_from.json").write_text(json.dumps(identity))
+    (workspace.stamps / f"dense_{index}_fused.json").write_text("{}")
+    return folder
+
+
+def metric_model(workspace, colmap_project, factor, index=0):
+    shutil.rmtree(workspace.sparse / str(index), ignore_errors=True)
+    similarity = plain_factor(factor)
+    model = transformed(read_model(colmap_project / "sparse" / "0"), similarity)
+    write_model(model, workspace.sparse / str(index), similarity)
+    return {index: workspace.sparse / str(index)}
+
+
+def test_a_dense_reconstruction_goes_with_its_model(workspace, colmap_project):
+    models = metric_model(workspace, colmap_project, 2.0) | metric_model(workspace, colmap_project, 5.0, index=1)
+    folder = dense_of(workspace, 0)
+    mine = workspace.dense / "1"
+    mine.mkdir()
+    (mine / "fused.ply").write_text("by somebody else")
+    settle_dense(workspace, models)
+    assert (folder / "fused.ply").is_file()
+    settle_dense(workspace, models | metric_model(workspace, colmap_project, 3.0))
+    assert not folder.exists() and not workspace.earlier.exists()
+    assert not list(workspace.stamps.glob("dense_*"))  # what is gone is made again
+    assert contents(mine) == {"fused.ply": b"by somebody else"}
+    settle_dense(workspace, {})
+    assert contents(workspace.dense) == {"1/fused.ply": b"by somebody else"}
+
+
+def test_depth_maps_are_set_aside_and_come_back_with_their_model(workspace, colmap_project):
+    folder = dense_of(workspace, 0) if metric_model(workspace, colmap_project, 2.0) else None
+    (folder / "stereo" / "depth_maps" / "a.geometric.bin").write_text("hours")
+    before = contents(folder)
+    other = metric_model(workspace, colmap_project, 3.0)
+    settle_dense(workspace, other)
+    assert not workspace.dense.exists()
+    assert contents(workspace.earlier / "dense" / "0") == before
+    dense_of(workspace, 0, maps=True)
+    settle_dense(workspace, {})  # refused
+    assert sorted(path.name for path in (workspace.earlier / "dense").iterdir()) == ["0", "0-2"]
+    settle_dense(workspace, metric_model(workspace, colmap_project, 2.0))
+    assert contents(folder) == before
+    assert [path.name for path in (workspace.earlier / "dense").iterdir()] == ["0-2"]
+
+
+def test_a_run_that_stops_leaves_nothing_metric_of_an_earlier_one(workspace, colmap_project, tmp_path):
+    metric_model(workspace, colmap_project, 2.0)
+    dense_of(workspace, 0)
+    kept = [workspace.images, workspace.colmap_sparse]
+    for folder in kept:
+        folder.mkdir(parents=True)
+    for name in ("result.json", "trajectory.tum", "trajectory_1.tum", "trajectory_cov.npz", "trajectory_mine.txt"):
+        (workspace.root / name).touch()
+    capture = Capture(path=tmp_path, calibration=calibration_prior())
+    with pytest.raises(MappingError), reporting_stops(workspace, capture):
+        raise MappingError("COLMAP found no model")
+    left = {path.name for path in workspace.root.iterdir()}
+    assert left == {"images", "colmap", "trajectory_mine.txt", "report.html", "report.json", workspace.stamps.name}
+
+
+# --- an existing project ---------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Placing:
+    """Puts a project into the folder around metric models, as ``reconstruct_project`` does."""
+
+    workspace: Workspace
+    project: Path
+
+    def __call__(self, submodels=("sparse/0",), scales=(SCALE,), **options):
+        folders = {i: self.project / folder for i, folder in enumerate(submodels)}
+        for index, scale in enumerate(scales):
+            place = self.workspace.sparse / str(index)
+            if scale.similarity is not None and not place.exists():
+                model = transformed(read_model(folders[index], ".bin"), scale.similarity)
+                write_model(model, place, scale.similarity)
+        session = session_in(self.workspace)
+        source = ProjectOptions(**options)
+        found = place_project(session, self.project, source, folders, dict(enumerate(scales)))
+        return session.runner.worked, found
+
+    def names(self):
+        return {path.name for path in self.workspace.root.iterdir()} - {self.workspace.stamps.name}
+
+
+@pytest.fixture
+def placing(workspace, colmap_project, tmp_path):
+    return Placing(workspace, Path(shutil.copytree(colmap_project, tmp_path / "project")))
+
+
+def test_the_folder_is_the_project_as_apply_would_make_it(placing, tmp_path):
+    before = contents(placing.project)
+    assert placing() == (["apply"], placing.workspace.root)
+    assert placing() == ([], placing.workspace.root)
+    assert contents(placing.project) == before
+    apply_to_project(placing.project, tmp_path / "applied", SIMILARITY)
+    expected, made = contents(tmp_path / "applied"), contents(placing.workspace.root)
+    made = {name: data for name, data in made.items() if not name.startswith(placing.workspace.stamps.name)}
+    assert made.keys() == expected.keys()
+    # the record names what it was made from, and by what; the database is SQLite's
+    differing = {name for name in made if made[name] != expected[name]}
+    assert differing <= {"transform.json", "dense/sparse/transform.json", "sparse/0/transform.json", "database.db"}
+
+
+def test_what_is_gone_comes_again_and_nothing_stays_without_a_scale(placing):
+    placing()
+    before = contents(placing.workspace.images)
+    (placing.project / "images" / NAMES[0]).unlink()
+    shutil.rmtree(placing.workspace.images)
+    assert placing()[0] == ["apply"]
+    assert contents(placing.workspace.images).keys() == before.keys() - {NAMES[0]}
+    # the project lost a file at the top: so does its copy
+    (placing.project / "notes.txt").unlink()
+    assert placing()[0] == ["apply"] and "notes.txt" not in placing.names()
+    shutil.rmtree(placing.workspace.sparse)
+    assert placing(scales=(REFUSED,)) == ([], None)
+    assert placing.names() == set() and placed_paths(placing.workspace) == []
+
+
+def test_a_run_killed_while_it_places_leaves_nothing_behind_for_the_next(placing, monkeypatch):
+    replace, count = os.replace, [0]
+
+    def killed(source, target):
+        if Path(target).parent == placing.workspace.root:
+            count[0] += 1
+            if count[0] == 3:
+                raise KeyboardInterrupt
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", killed)
+    with pytest.raises(KeyboardInterrupt):
+        placing()
+    monkeypatch.undo()
+    (placing.project / "notes.txt").unlink()
+    assert placing()[0] == ["apply"]
+    assert placing.names() == {"images", "sparse", "dense", "database.db", "project.ini", "transform.json"}
+    assert not (placing.workspace.stamps / "project").exists()
+
+
+@pytest.mark.parametrize("place", ["", "0", "sparse"])
+def test_wherever_the_model_lies_it_comes_to_sparse(workspace, colmap_project, tmp_path, place):
+    project = tmp_path / "project"
+    shutil.copytree(colmap_project / "sparse" / "0", project / place)
+    (project / place / "points.obj").write_text("v 1 2 3\n")
+    (project / "notes.txt").write_text("in March")
+    placing = Placing(workspace, project)
+    placing(submodels=(place,))
+    side = set() if place == "" else {"points.obj"}
+    assert placing.names() == {"sparse", "notes.txt", "transform.json"} | ({"points.obj"} - side)
+    kinds = [
+        f"{name}{suffix}" for name in ("cameras", "images", "points3D", "rigs", "frames") for suffix in (".bin", ".txt")
+    ]
+    assert {path.name for path in (workspace.sparse / "0").iterdir()} == {*kinds, "transform.json"} | side
+    assert json.loads((workspace.root / "transform.json").read_text())["models"][0]["folder"] == "sparse/0"
+    binary, text = (read_model(workspace.sparse / "0", suffix) for suffix in (".bin", ".txt"))
+    for i in binary.point3D_ids():
+        np.testing.assert_allclose(text.point3D(i).xyz, binary.point3D(i).xyz, rtol=1e-12)
+
+
+def test_text_follows_what_a_model_stage_made(placing):
+    model = transformed(read_model(placing.project / "sparse" / "0"), SIMILARITY)
+    model.delete_point3D(min(model.point3D_ids()))
+    write_model(model, placing.workspace.sparse / "0", SIMILARITY)
+    placing()
+    for suffix in (".bin", ".txt"):
+        assert read_model(placing.workspace.sparse / "0", suffix).num_points3D() == model.num_points3D()
+
+
+def test_a_refused_sub_model_and_what_was_made_from_it_are_left_out(placing):
+    import pycolmap
+
+    moved = read_model(placing.project / "sparse" / "0")
+    moved.transform(pycolmap.Sim3d(3.0, pycolmap.Rotation3d(), np.array([9.0, 0.0, 0.0])))
+    (placing.project / "sparse" / "1").mkdir()
+    moved.write_binary(str(placing.project / "sparse" / "1"))
+    (placing.project / "sparse" / "points.txt").write_text("of neither")
+    (placing.project / "project.ini").unlink()  # it cannot be told whose depths it limits
+    placing(submodels=("sparse/0", "sparse/1"), scales=(REFUSED, SCALE))
+    assert sorted(path.name for path in placing.workspace.sparse.iterdir()) == ["1", "points.txt"]
+    assert "dense" not in placing.names()  # it was made from the other one
+    assert {"images", "database.db", "notes.txt"} <= placing.names()
+    record = json.loads((placing.workspace.root / "transform.json").read_text())
+    assert [(model["index"], model["folder"]) for model in record["models"]] == [(1, "sparse/1")]
+
+
+def test_the_whole_project_can_be_taken_back(placing, tmp_path):
+    placing()
+    root = placing.workspace.root
+    for name in ("result.json", "report.html", "trajectory_1.tum", "validation/0/a.png"):
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text("ours")
+    with pytest.raises(AlreadyMetricError):
+        apply_to_project(root, tmp_path / "twice", plain_factor(2.0))
+    undo_project(root, tmp_path / "back")
+    assert contents(tmp_path / "back").keys() == contents(placing.project).keys()
+    old, new = (read_model(folder / "sparse" / "0") for folder in (placing.project, tmp_path / "back"))
+    for i in old.point3D_ids():
+        np.testing.assert_allclose(new.point3D(i).xyz, old.point3D(i).xyz, atol=1e-9)
+
+
+def test_names_that_the_run_needs_are_said_before_any_work(placing):
+    require_free_names(placing.project, placing.workspace, dense=False)
+    with pytest.raises(OutputError, match=r"dense comes along in metres: leave out --dense"):
+        require_free_names(placing.project, placing.workspace, dense=True)
+    for name in ("log.txt", "report.html", "trajectory_2.tum", ".stages"):
+        (placing.project / name).touch()
+        with pytest.raises(OutputError, match=rf"{name} has a name that the output folder needs"):
+            require_free_names(placing.project, placing.workspace, dense=False)
+        (placing.project / name).unlink()
+
+
+def test_what_is_not_of_the_project_is_not_written_over(placing):
+    (placing.workspace.root / "notes.txt").write_text("mine")
+    with pytest.raises(OutputExistsError, match=r"notes\.txt stands where the project's is to come"):
+        placing()
+    assert (placing.workspace.root / "notes.txt").read_text() == "mine"
+    assert "images" not in placing.names()
+
+
+def test_a_project_s_own_dense_folder_goes_with_the_project(placing):
+    placing()
+    (placing.workspace.dense / "made_from.json").write_text('{"model": "another"}')
+    settle_dense(placing.workspace, {})
+    assert (placing.workspace.dense / "fused.ply").is_file()
+
+
+# --- what is said ----------------------------------------------------------------------------------------------------
+
+
+def test_the_screen_says_the_layout_in_a_line(workspace, capsys):
+    summary = {"registered_images": 3, "points": 1, "observations": 3, "mean_reprojection_error_px": 0.5}
+    refused = ScaleEstimate.refused("joint", "the camera stood still")
+    model = ModelResult(index=0, colmap_index=0, scale=refused, summary=summary, sparse=workspace.colmap_sparse / "0")
+    show_result(ReconstructResult(workspace=workspace, models=(model,), seconds={}))
+    said = capsys.readouterr().out.splitlines()[-1]
+    assert said == f"no scale is accepted, so that nothing here is in metres: COLMAP's own is {model.sparse}"
+    for folder in (workspace.images, workspace.sparse):
+        folder.mkdir(parents=True)
+    metric = ModelResult(**{**vars(model), "sparse_metric": workspace.sparse / "0"})
+    show_result(ReconstructResult(workspace=workspace, models=(metric,), seconds={}))
+    said = capsys.readouterr().out.splitlines()[-1]
+    assert said == (
+        f"{workspace.root} is a COLMAP project in metres (images, sparse); in COLMAP's units: {workspace.colmap}"
+    )
+    show_result(ReconstructResult(workspace=workspace, models=(metric,), seconds={}, project_metric=workspace.root))
+    assert capsys.readouterr().out.splitlines()[-1] == f"{workspace.root} is the whole project in metres"

@@ -1,0 +1,186 @@
+"""The plane sweep, part by part, against a room whose depths and normals are closed forms."""
+
+import numpy as np
+import pytest
+from sweep_scenes import camera, depth_of, depth_view, partner, picture_of, rays, sights_of
+
+from colmap_inertial.sweep import (
+    DepthView,
+    Sights,
+    agreed_depth,
+    chosen_partners,
+    depth_range,
+    normals_of,
+    partner_scores,
+    sweep_depth,
+)
+from colmap_inertial.sweep.depth import _canvas, _positions
+
+REFERENCE = camera((0.1, -0.4, 0.3))
+#: On different sides; turned, also about their own axis; nearer and farther; another lens.
+AROUND = (
+    camera((0.4, -0.4, 0.3), (0, 4, 0)),
+    camera((-0.2, -0.5, 0.35), (3, -5, 12)),
+    camera((0.15, -0.4, 0.55), (-4, 0, -25), width=100, height=110, focal=(80.0, 80.0)),
+    camera((0.0, -0.1, 0.1), (2, 2, 3)),
+)
+
+
+def test_a_point_of_one_camera_is_found_in_another():
+    one, other = REFERENCE, AROUND[2]
+    matrix, offset = other.seen_from(one)
+    pixel, depth = np.array([31.0, 57.0, 1.0]), 2.3
+    world = one.cam_from_world.T @ (np.linalg.inv(one.matrix) @ pixel * depth) + one.cam_in_world
+    seen = other.cam_from_world @ (world - other.cam_in_world)
+    u = other.focal_px * seen[:2] / seen[2] + other.centre_px
+    found = matrix @ pixel * depth + offset
+    np.testing.assert_allclose([*found[:2] / found[2], found[2]], [*u, seen[2]], rtol=1e-12)
+
+
+def test_partners_are_weighed_as_by_loops_over_points():
+    views = (REFERENCE, *AROUND, camera((0.1, -0.4, 0.3), (0, 60, 0)), camera((0.1, -0.4, 0.31)))
+    sights = sights_of(views)
+    scores = partner_scores(sights, 0)
+    for k in range(1, len(views)):
+        shared = set(sights.of_view[0].tolist()) & set(sights.of_view[k].tolist())
+        total = 0.0
+        for point in shared:
+            a, b = (sights.points[point] - views[i].cam_in_world for i in (0, k))
+            angle = np.degrees(np.arccos(min(1.0, a @ b / np.linalg.norm(a) / np.linalg.norm(b))))
+            total += np.exp(-0.5 * ((angle - 8) / (4 if angle < 8 else 8)) ** 2)
+        turned = views[k].cam_from_world[2] @ views[0].cam_from_world[2] < np.cos(np.radians(50))
+        assert scores[k] == pytest.approx(0 if turned or len(shared) < 20 else total, rel=1e-6), k
+    assert scores[0] == 0
+    assert scores[5] == 0, "looks elsewhere"
+    assert 0 < scores[6] < scores[1], "too near to measure depth"
+
+
+def test_views_that_share_few_points_are_no_partners():
+    sights = sights_of((REFERENCE, AROUND[0]), points=600)
+    few = np.intersect1d(*sights.of_view)[:19]
+    less = Sights.of(sights.views, sights.points, [sights.of_view[0], few])
+    assert partner_scores(sights, 0)[1] > 0 == partner_scores(less, 0)[1]
+    assert chosen_partners(less, 0, partner_scores(less, 0), 4) == ()
+
+
+def test_partners_on_other_sides_go_before_more_of_the_same():
+    views = [REFERENCE, *(camera((0.1 + x, -0.4, 0.3 + z)) for x, z in ((0.4, 0), (0.41, 0), (0.39, 0), (0, 0.4)))]
+    sights = sights_of(views)
+    scores = np.array([0, 10.0, 9.9, 9.8, 6.0])
+    assert chosen_partners(sights, 0, scores, 2) == (1, 4)
+    assert set(chosen_partners(sights, 0, scores, 9)) == {1, 2, 3, 4}
+
+
+def test_the_range_of_depths_holds_what_is_seen():
+    sights = sights_of((REFERENCE,), points=4000)
+    near, far = depth_range(sights, 0)
+    depth, _ = depth_of(REFERENCE)
+    assert near < depth.min() and depth.max() < far < 1.6 * depth.max()
+    assert depth_range(Sights.of([REFERENCE], sights.points, [np.zeros(0, dtype=int)]), 0) is None
+
+
+@pytest.mark.parametrize("view", AROUND)
+def test_a_candidate_leads_where_the_partner_sees_the_point(view):
+    depths = (0.6, 6.0)
+    canvas = _canvas(REFERENCE, view, depths)
+    inverse = np.linspace(1 / depths[1], 1 / depths[0], 7)
+    columns, rows = (_positions(REFERENCE, canvas, inverse, axis) for axis in (0, 1))
+    matrix, offset = view.seen_from(REFERENCE)
+    compared = 0
+    for d, q in enumerate(inverse):
+        for x, y in ((0, 0), (60, 40), (119, 3), (17, 89)):
+            seen = matrix @ np.array([x, y, 1.0]) / q + offset
+            px = seen[:2] / seen[2]
+            inside = seen[2] > 0 and (px >= 1).all() and px[0] <= view.width - 2 and px[1] <= view.height - 2
+            at = np.array([columns[d, x], rows[d, y]])
+            if inside:
+                turned = canvas.canvas_from_view @ [*px, 1.0]
+                np.testing.assert_allclose(at / 16, turned[:2] / turned[2], atol=1 / 31)
+                compared += 1
+    assert compared > 8
+
+
+def test_depths_of_a_room_are_found():
+    truth, _ = depth_of(REFERENCE)
+    near, far = 0.7 * truth.min(), 1.3 * truth.max()
+    found = sweep_depth(picture_of(REFERENCE), REFERENCE, [partner(v) for v in AROUND], (near, far), threads=1)
+    assert found.shape == truth.shape
+    inner = np.s_[4:-4, 4:-4]
+    error = np.abs(found - truth)[inner] / truth[inner]
+    # a baseline moves things by 12 px at most: 1 % of the depth is an eighth of a pixel
+    assert np.mean(error < 0.01) > 0.9
+    assert np.mean(error < 0.02) > 0.98
+    assert np.median(error) < 0.007
+    # threads change nothing
+    twice = sweep_depth(picture_of(REFERENCE), REFERENCE, [partner(v) for v in AROUND], (near, far), threads=2)
+    assert np.array_equal(found, twice)
+
+
+def test_what_lies_outside_of_the_range_is_not_known():
+    truth, _ = depth_of(REFERENCE)
+    beyond = (1.2 * truth.max(), 2 * truth.max())
+    found = sweep_depth(picture_of(REFERENCE), REFERENCE, [partner(v) for v in AROUND], beyond, threads=1)
+    assert np.mean(found == 0) > 0.9
+    behind = camera((0.1, -0.4, 0.3), (0, 180, 0))
+    nothing = sweep_depth(picture_of(REFERENCE), REFERENCE, [partner(behind)], (1, 5), threads=1)
+    assert not nothing.any()
+
+
+def test_depths_stay_where_another_view_agrees():
+    exact = depth_view(REFERENCE)
+    others = [depth_view(v) for v in AROUND]
+    kept = agreed_depth(exact, others)
+    assert np.mean(kept > 0) > 0.9
+    error = np.abs(kept / exact.depth - 1)[kept > 0]
+    # depths are looked up at the nearest pixel: it may be the other side of an edge
+    assert np.mean(error < 0.004) > 0.97
+    assert error.max() < 0.02
+    # wrong where nobody says so
+    wrong = exact.depth.copy()
+    wrong[20:50, 30:70] *= 1.2
+    judged = agreed_depth(DepthView(depth=wrong, camera=REFERENCE), others)
+    assert not judged[22:48, 32:68].any()
+    assert np.array_equal(judged[60:, 80:], kept[60:, 80:])
+    # unknown here or there
+    hole = exact.depth.copy()
+    hole[:45] = 0
+    assert not agreed_depth(DepthView(depth=hole, camera=REFERENCE), others)[:45].any()
+    blind = [DepthView(depth=np.zeros_like(other.depth), camera=other.camera) for other in others]
+    assert not agreed_depth(exact, blind).any()
+    assert not agreed_depth(exact, []).any()
+
+
+def test_agreeing_depths_are_averaged():
+    exact, other = depth_view(REFERENCE), depth_view(AROUND[0])
+    off = DepthView(depth=exact.depth * np.float32(1.006), camera=REFERENCE)
+    kept = agreed_depth(off, [other])
+    ratio = (kept / exact.depth)[kept > 0]
+    assert np.median(ratio) == pytest.approx(1.003, abs=7e-4)
+
+
+def test_normals_of_a_room():
+    depth, truth = depth_of(REFERENCE)
+    normals = normals_of(depth.astype("f4"), REFERENCE)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1, atol=1e-5)
+    assert (np.sum(normals * rays(REFERENCE), axis=-1) < 0).all()
+    angle = np.degrees(np.arccos(np.clip(np.sum(normals * truth, axis=-1), -1, 1)))
+    assert np.median(angle) < 0.1
+    # edges of the room take part in few windows
+    assert np.mean(angle < 2) > 0.9
+    noisy = depth * (1 + np.random.default_rng(2).normal(0, 0.002, depth.shape))
+    angle = np.degrees(np.arccos(np.clip(np.sum(normals_of(noisy.astype("f4"), REFERENCE) * truth, axis=-1), -1, 1)))
+    assert np.median(angle) < 8
+
+
+def test_normals_do_not_reach_over_steps_and_gaps():
+    flat = camera((0, 0, 0), shift=(0, 0))
+    depth = np.full((90, 120), 2.0, dtype="f4")
+    depth[:, 60:] = 3.0
+    depth[40:50] = 0
+    normals = normals_of(depth, flat)
+    np.testing.assert_allclose(normals[depth > 0], np.tile([0, 0, -1.0], (int((depth > 0).sum()), 1)), atol=1e-4)
+    assert not normals[40:50].any()
+    alone = np.zeros_like(depth)
+    alone[5, 7] = 1.0
+    ray = rays(flat)[5, 7]
+    np.testing.assert_allclose(normals_of(alone, flat)[5, 7], -ray / np.linalg.norm(ray), atol=1e-6)
