@@ -87,7 +87,7 @@ class GravityOptions:
     """How strong gravity is where something was recorded: a number, or the place; else what spans the Earth."""
 
     gravity_m_s2: float | None = None
-    """Strength of gravity at the place, where it is known to four digits or better (9.80665 says nothing of it)."""
+    """Strength of gravity at the place, known to four digits or better; 9.80665 and 9.81 say nothing of the place."""
     latitude_deg: float | None = None
     """Latitude of the place, from which the strength of gravity follows to 0.005 %."""
     height_m: float | None = None

@@ -83,7 +83,7 @@ def temperature(imu: ImuRecording, rng: Generator) -> ImuRecording:
 
 
 def gain(imu: ImuRecording, rng: Generator) -> ImuRecording:
-    """Gains and axes of the accelerometer off by 2 to 5 %."""
+    """Gains and axes of the accelerometer off by up to 2 to 5 %."""
     size = rng.uniform(0.02, 0.05)
     return replace(imu, accel_m_s2=imu.accel_m_s2 @ (np.eye(3) + size * rng.uniform(-1, 1, (3, 3))).T)
 

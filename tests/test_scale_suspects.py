@@ -16,7 +16,7 @@ from colmap_inertial.scale._suspects import Faults, worst
 from colmap_inertial.scale.parts import CAUSES, parts_in_words
 from colmap_inertial.simulate.motion import MotionOptions
 from colmap_inertial.simulate.recording import RecordingOptions, simulate_recording
-from colmap_inertial.types import IMU_CAL, ImuCalibration
+from colmap_inertial.types import CAL, IMU_CAL, ImuCalibration
 
 
 @pytest.fixture(scope="module")
@@ -70,14 +70,66 @@ def test_a_fault_of_the_accelerometer_is_named_and_undone(recording, alter, said
     assert estimate.ci95[0] < recording.truth.metres_per_unit < estimate.ci95[1]
 
 
-def test_a_path_that_was_smoothed_is_told_from_a_filtered_accelerometer(recording):
+@pytest.mark.parametrize("width_s", [0.05, 0.12])
+@pytest.mark.parametrize("kind", ["roam", "walk"])
+def test_a_path_that_was_smoothed_gives_no_scale(kind, width_s):
+    recording = simulate_recording(RecordingOptions(motion=MotionOptions(kind=kind, duration_s=40.0)), seed=5)
     trajectory = recording.trajectory
-    kernel = np.exp(-0.5 * (np.arange(-9, 10) * np.median(np.diff(trajectory.t_s)) / 0.05) ** 2)
-    padded = np.pad(trajectory.cam_in_world, ((9, 9), (0, 0)), mode="edge")
+    kernel = np.exp(-0.5 * (np.arange(-15, 16) * np.median(np.diff(trajectory.t_s)) / width_s) ** 2)
+    padded = np.pad(trajectory.cam_in_world, ((15, 15), (0, 0)), mode="edge")
     smooth = np.stack([np.convolve(c, kernel / kernel.sum(), mode="valid") for c in padded.T], axis=1)
     estimate = estimate_scale(replace(trajectory, cam_in_world=smooth), recording.imu)
-    assert estimate.verdict == "weak"
-    assert any("poses that were not smoothed" in reason for reason in estimate.reasons)
+    assert estimate.verdict == "refused" and estimate.metres_per_unit is None
+    # wider ones may leave nothing that fits at all
+    if width_s < 0.1:
+        assert any("poses that were not smoothed" in reason for reason in estimate.reasons)
+
+
+def test_a_filter_without_delay_is_the_accelerometer_s_where_the_delay_is_known(recording):
+    imu = recording.imu
+    kernel = np.exp(-0.5 * (np.arange(-40, 41) * np.median(np.diff(imu.accel_t_s)) / 0.05) ** 2)
+    padded = np.pad(imu.accel_m_s2, ((40, 40), (0, 0)), mode="edge")
+    smooth = np.stack([np.convolve(c, kernel / kernel.sum(), mode="valid") for c in padded.T], axis=1)
+    known = align_camera_imu(recording.trajectory, imu)
+    cov = known.cov.copy()
+    cov[CAL.ACCEL_TIME_OFFSET] = cov[CAL.GYRO_TIME_OFFSET]
+    cov[:, CAL.ACCEL_TIME_OFFSET] = cov[:, CAL.GYRO_TIME_OFFSET]
+    cov[CAL.ACCEL_TIME_OFFSET, CAL.ACCEL_TIME_OFFSET] += 1e-8
+    estimate = estimate_scale(
+        recording.trajectory, replace(imu, accel_m_s2=smooth), calibration=replace(known, cov=cov)
+    )
+    assert estimate.verdict == "weak" and any("low-passed" in reason for reason in estimate.reasons)
+    assert estimate.ci95[0] < recording.truth.metres_per_unit < estimate.ci95[1]
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.9, 0.98])
+def test_gains_that_a_calibration_ties_together_are_no_surprise(recording, correlation):
+    cov = np.eye(IMU_CAL.COUNT) * 1e-8
+    gains = np.r_[IMU_CAL.ACCEL_GAIN, IMU_CAL.GYRO_GAIN]
+    tie = np.kron(np.array([[1, correlation], [correlation, 1]]), np.eye(9)) * 2e-3**2
+    cov[np.ix_(gains, gains)] = tie
+    known = ImuCalibration(
+        accel_gain=np.zeros((3, 3)),
+        accel_bias_m_s2=np.zeros(3),
+        gyro_gain=np.zeros((3, 3)),
+        gyro_bias_rad_s=np.zeros(3),
+        cov=cov,
+        gravity_m_s2=9.80665,
+        attitudes=24,
+    )
+    estimate = estimate_scale(recording.trajectory, recording.imu, imu_calibration=known)
+    assert estimate.verdict == "trusted" and estimate.parts["accel_gain"] < 0.002
+
+
+def test_a_stream_that_is_cut_off_throughout_is_refused_for_that(recording):
+    imu = recording.imu
+    ends = np.where(imu.accel_m_s2 > np.median(imu.accel_m_s2, axis=0), 1.0, -1.0) * [5.0, 6.0, 7.0]
+    ends[::7, 0] = 0.1  # a third level; the other axes stand at an end
+    estimate = estimate_scale(recording.trajectory, replace(imu, accel_m_s2=ends + np.array([0, 0, 4.0])))
+    assert estimate.verdict == "refused"
+    hard = np.clip(imu.accel_m_s2, -8.0, 8.0)
+    estimate = estimate_scale(recording.trajectory, replace(imu, accel_m_s2=hard))
+    assert estimate.verdict != "trusted" and any("end of its range" in reason for reason in estimate.reasons)
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3, 4])
@@ -114,6 +166,7 @@ def test_the_parts_of_the_variance_are_those_of_the_covariance(recording):
     fit = fit_jointly(data, prior, None)
     variance = fit.cov[par.SCALE, par.SCALE]
     assert sum(fit.variance_parts.values()) == pytest.approx(variance, rel=1e-9)
+    assert max(fit.variance_parts.values()) < variance
     # one more measurement of a parameter with the prior's own information takes off its part, to first order
     gravity = fit.estimate.gravity_m_s2 / np.linalg.norm(fit.estimate.gravity_m_s2)
     with_scale = fit.cov[par.SCALE]

@@ -50,10 +50,11 @@ def gravity_at_latitude_m_s2(latitude_deg: float, height_m: float = 0.0) -> floa
 def strength_of_gravity(options: GravityOptions) -> tuple[float, float]:
     """Gravity and its standard deviation, m/s2, by what is known of the place.
 
-    Standard gravity, given as such, says nothing of the place.
+    Standard gravity, or a number of two decimals (9.81), says nothing of the place.
     """
-    if options.gravity_m_s2 is not None and options.gravity_m_s2 != STANDARD_GRAVITY_M_S2:
-        return options.gravity_m_s2, PRIORS.known_gravity_m_s2
+    given = options.gravity_m_s2
+    if given is not None and given != STANDARD_GRAVITY_M_S2:
+        return given, PRIORS.gravity_m_s2 if round(given, 2) == given else PRIORS.known_gravity_m_s2
     if options.latitude_deg is not None:
         return gravity_at_latitude_m_s2(options.latitude_deg, options.height_m or 0.0), PRIORS.known_gravity_m_s2
     return STANDARD_GRAVITY_M_S2, PRIORS.gravity_m_s2

@@ -45,6 +45,10 @@ class Group:
     share
         (N, r, r) part of the residuals' covariance (of their whitened one) that grows with the noise level which is
         estimated from them; all of it where this is None.
+    root
+        (N, r, r) what the residuals were whitened by, where somebody else needs it.
+    gaps
+        (N, r, r) part of the residuals' covariance that stands for readings that are missing; None without any.
     """
 
     residual: Array
@@ -55,6 +59,8 @@ class Group:
     weight: Array | None = None
     first: int = 0
     share: Array | None = None
+    root: Array | None = None
+    gaps: Array | None = None
 
     def apply(self, states: Array, z: Array) -> Array:
         """(N, r, q) changes of the residuals under q steps: states (K, m, q), globals (n, q)."""
@@ -196,12 +202,6 @@ def corrected(pre: Preintegrated, then: Estimate, x: Estimate) -> Preintegrated:
     )
 
 
-def imu_root(noise: Noise, pre: Preintegrated, rows: slice = slice(0, 9)) -> Array:
-    """(K, r, r) square roots of the information of inertial increments."""
-    cov = noise.gyro_rad_s_rthz**2 * pre.cov_gyro + noise.accel_m_s2_rthz**2 * pre.cov_accel + pre.cov_gaps
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(cov[:, rows, rows])))
-
-
 def imu_group(noise: Noise, x: Estimate, pre: Preintegrated, *, rotation_only: bool = False) -> Group:
     """Rows: rotation, velocity, position between consecutive nodes."""
     k, dt = len(pre.dt_s), pre.dt_s[:, None]
@@ -237,7 +237,8 @@ def imu_group(noise: Noise, x: Estimate, pre: Preintegrated, *, rotation_only: b
     z = z[:, :, par.IMU_GLOBALS]
 
     rows = slice(0, 3) if rotation_only else slice(0, 9)
-    root = imu_root(noise, pre, rows)
+    cov = noise.gyro_rad_s_rthz**2 * pre.cov_gyro + noise.accel_m_s2_rthz**2 * pre.cov_accel + pre.cov_gaps
+    root = np.linalg.inv(np.linalg.cholesky(cov[:, rows, rows]))
     return Group(
         residual=_mv(root, residual[:, rows]),
         here=root @ here[:, rows],
@@ -245,6 +246,8 @@ def imu_group(noise: Noise, x: Estimate, pre: Preintegrated, *, rotation_only: b
         by_globals=root @ z[:, rows],
         columns=par.IMU_GLOBALS,
         share=noise.accel_m_s2_rthz**2 * root @ pre.cov_accel[:, rows, rows] @ root.transpose(0, 2, 1),
+        root=root,
+        gaps=root @ pre.cov_gaps[:, rows, rows] @ root.transpose(0, 2, 1) if pre.cov_gaps.any() else None,
     )
 
 

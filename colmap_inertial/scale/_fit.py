@@ -19,6 +19,8 @@ _PROBES = 4
 _SETTLED, _FEWEST_ITERATIONS = 0.1, 4
 #: A robust weight below this: five times as far off as errors usually are.
 _HARDLY = 0.35
+#: Fewer of the gains than this are never said to be determined: no surprise is made of nothing.
+_LEAST_DETERMINED = 0.3
 #: The scale changes by at most this factor (in the logarithm) in one iteration.
 _LARGEST_STEP = 0.3
 
@@ -125,8 +127,9 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
 
     # Once more at the optimum: the mean gyroscope bias, the scale's variance, suspicions, and scales of the parts
     k = len(data.t_s)
-    where, own = sus.columns(data, x, noise)
     imu = groups["imu"]
+    assert isinstance(imu, fac.Group)
+    where, own = sus.columns(data, x, imu)
     residual = (imu.residual[:, :, None] + imu.apply(states[:, :, :1], z[:, :1]))[:, :, 0]
     ends, ends_z = np.zeros((k, par.N_STATE, 4 + own.shape[2])), np.zeros((par.N_GLOBALS, 4 + own.shape[2]))
     ends[:, par.GYRO_BIAS, :3] = np.eye(3) / k
@@ -201,9 +204,9 @@ def _gain_surprise(prior: Prior, x: Estimate, cov: Array) -> float:
     What of the gains the data do not determine stays at the prior's mean: ``9 - trace(information covariance)`` of them
     are determined.
     """
-    info = prior.info[par.ACCEL_GAIN, par.ACCEL_GAIN]
-    determined = max(0.0, len(info) - float(np.sum(info * cov[par.ACCEL_GAIN, par.ACCEL_GAIN])))
-    return max(1.0, prior.gain_chi2(x) / max(determined + (2 * determined) ** 0.5, 1e-9))
+    info = prior.gain_info
+    determined = max(_LEAST_DETERMINED, len(info) - float(np.sum(info * cov[par.ACCEL_GAIN, par.ACCEL_GAIN])))
+    return max(1.0, prior.gain_chi2(x) / (determined + (2 * determined) ** 0.5))
 
 
 def _variance_parts(
@@ -219,14 +222,17 @@ def _variance_parts(
     states, z
         (K, m, 1), (n,) that column.
     """
-    parts = dict.fromkeys((*_PART_OF_GROUP.values(), *_PART_OF_GLOBALS, "accel_noise", "gravity"), 0.0)
+    others = ("accel_noise", "lost_readings", "gravity")
+    parts = dict.fromkeys((*_PART_OF_GROUP.values(), *_PART_OF_GLOBALS, *others), 0.0)
     for name, group in groups.items():
         values = group.apply(states, z[:, None])
         parts[_PART_OF_GROUP[name]] += float(np.sum(values**2))
     imu = groups["imu"]
     along = imu.apply(states, z[:, None])
     parts["accel_noise"] = float(np.sum(along * levels.by_level(imu, along)))
-    parts["gyro"] -= parts["accel_noise"]
+    if isinstance(imu, fac.Group) and imu.gaps is not None:
+        parts["lost_readings"] = float(np.sum(along * (imu.gaps @ along)))
+    parts["gyro"] -= parts["accel_noise"] + parts["lost_readings"]
     by_prior = z * (prior.info @ z)
     for part, places in _PART_OF_GLOBALS.items():
         parts[part] += sum(float(by_prior[place].sum()) for place in places)

@@ -194,16 +194,23 @@ class Prior:
         """The normal prior that pulls at an estimate as much as this one does."""
         info = self.info.copy()
         if self.heavy_gains:
-            info[ACCEL_GAIN] *= min(1.0, LARGEST_GAIN_CHI2 / max(self.gain_chi2(x), 1e-9))
-            info[:, ACCEL_GAIN] = info[ACCEL_GAIN].T
+            kept = min(1.0, LARGEST_GAIN_CHI2 / max(self.gain_chi2(x), 1e-9))
+            info[ACCEL_GAIN, ACCEL_GAIN] -= (1 - kept) * self.gain_info
         if self.flat_m is not None:
             info[LEVER.stop - 1, LEVER.stop - 1] = 2 / (self.flat_m**2 + float(x.imu_in_cam_m[2]) ** 2)
         return replace(self, info=info)
 
+    @property
+    def gain_info(self) -> Array:
+        """(9, 9) information of the accelerometer's gains, whatever the gyroscope's are."""
+        across = self.info[ACCEL_GAIN, GYRO_GAIN]
+        explained = across @ np.linalg.solve(self.info[GYRO_GAIN, GYRO_GAIN], across.T)
+        return np.asarray(self.info[ACCEL_GAIN, ACCEL_GAIN] - explained)
+
     def gain_chi2(self, x: Estimate) -> float:
         """Squared deviation of the accelerometer's nine gains and axis errors, in standard deviations."""
         gain = (x.accel_gain - self.mean.accel_gain).ravel()
-        return float(gain @ self.info[ACCEL_GAIN, ACCEL_GAIN] @ gain)
+        return float(gain @ self.gain_info @ gain)
 
     def offset(self, x: Estimate) -> Array:
         """(79,) globals minus their expected values."""

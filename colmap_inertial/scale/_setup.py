@@ -32,7 +32,7 @@ _ROW_SPREAD = 12**-0.5
 _NEAR_M, _FAR_M = 1.0, 2.0
 #: An alignment's covariance stems from the very data that are used again here.
 _COUNTED_ONCE = 5.0
-_MIN_STATES = 8
+_MIN_STATES, _FEWEST_READINGS = 8, 4
 #: Recordings with more states than the first have fewer of them in a second, down to the second.
 _MANY_STATES, _FEWEST_HZ = 2400.0, 2.0
 
@@ -55,6 +55,13 @@ def prepare(
     """
     shift_s = clock_shift_s(trajectory, imu)
     gyro_cut, accel_cut = cut_off(imu)
+    for sensor, cut in (("gyroscope", gyro_cut), ("accelerometer", accel_cut)):
+        if np.sum(~cut) < _FEWEST_READINGS:
+            raise NotObservableError(
+                "scale",
+                f"nearly all of the {sensor}'s readings stand at the end of its range: move less violently, or give "
+                "the sensor a wider range",
+            )
     gyro = Track.of(imu.gyro_t_s + (shift_s + calibration.gyro_time_offset_s), imu.gyro_rad_s, gyro_cut)
     accel = Track.of(imu.accel_t_s + (shift_s + calibration.accel_time_offset_s), imu.accel_m_s2, accel_cut)
     margin_s = 0.02

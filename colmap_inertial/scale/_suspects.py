@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from colmap_inertial.scale import _factors as fac, _parameters as par
-from colmap_inertial.scale._parameters import Data, Estimate, Noise
+from colmap_inertial.scale._parameters import Data, Estimate, Prior
 from colmap_inertial.scale._preintegration import Preintegrated, SensorErrors, Track, Tracks, preintegrate
 from colmap_inertial.types import Array
 
@@ -22,6 +22,8 @@ from colmap_inertial.types import Array
 _LARGEST_CHI2 = 28.0
 #: The same, for each unknown, of what is left of a fault that was found.
 _LEFT_CHI2 = 0.25
+#: What is left of a column after the fit's own parameters, in parts of all of them: less is rounding.
+_NOTHING_LEFT = 1e-12
 #: Derivatives of readings are taken after smoothing by this: to look for faults, where noise would hide them, and to
 #: undo them, where motion must not be lost.
 _SMOOTH_TO_FIND_S, _SMOOTH_TO_UNDO_S = 0.07, 0.02
@@ -75,8 +77,8 @@ def perturbations(accel: Track, middle_s: float) -> dict[str, list[Array]]:
     }
 
 
-def columns(data: Data, x: Estimate, noise: Noise) -> tuple[dict[str, slice], Array]:
-    """Where each suspicion's unknowns stand, and their columns (K, 9, q) of the whitened inertial residuals."""
+def columns(data: Data, x: Estimate, imu: fac.Group) -> tuple[dict[str, slice], Array]:
+    """Where each suspicion's unknowns stand, and their columns (K, 9, q) of the whitened inertial residuals ``imu``."""
     k, accel = len(data.t_s) - 1, data.tracks.accel
     errors = SensorErrors(
         gyro_bias_rad_s=x.gyro_bias_rad_s[:-1],
@@ -96,7 +98,7 @@ def columns(data: Data, x: Estimate, noise: Noise) -> tuple[dict[str, slice], Ar
             for change in changes
         ]
     by = np.stack([np.concatenate([np.zeros((k, 3)), -pre.velocity, -pre.position], axis=1) for pre in found], axis=2)
-    return where, fac.imu_root(noise, found[0]) @ by
+    return where, np.asarray(imu.root @ by)
 
 
 def suspicions(
@@ -119,7 +121,10 @@ def suspicions(
     score = -np.einsum("kri,kr->i", own, residual)
     out = []
     for name, at in where.items():
-        cov = np.linalg.inv(0.5 * (left[at, at] + left[at, at].T))
+        block = 0.5 * (left[at, at] + left[at, at].T)
+        if np.linalg.eigvalsh(block)[0] <= _NOTHING_LEFT * np.trace(left):
+            continue  # the fit's own parameters can do all of it
+        cov = np.linalg.inv(block)
         out.append(Suspicion(name=name, value=cov @ score[at], cov=cov, by_scale=by_scale[at]))
     return out
 
@@ -127,10 +132,15 @@ def suspicions(
 def worst(found: list[Suspicion], known: Collection[str] = ()) -> Suspicion | None:
     """The strongest suspicion that is more than chance, None where there is none.
 
-    Of what is ``known`` to be wrong already, more than half a standard deviation that is left counts.
+    Of what is ``known`` to be wrong already, more than half a standard deviation that is left counts. The camera's path
+    is suspected last: what else is wrong with an accelerometer may look like it.
     """
     counts = [one for one in found if one.chi2 > (_LEFT_CHI2 * len(one.value) if one.name in known else _LARGEST_CHI2)]
-    return max(counts, key=lambda one: one.chi2, default=None)
+    return max(counts, key=lambda one: (not _is_of_path(one), one.chi2), default=None)
+
+
+def _is_of_path(suspicion: Suspicion) -> bool:
+    return suspicion.name == "bandwidth" and float(suspicion.value[0]) > 0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -145,15 +155,23 @@ class Faults:
         return Faults(values={**self.values, suspicion.name: before + suspicion.value})
 
     @property
-    def can_be_undone(self) -> bool:
-        """Whether all of it lies with the accelerometer. A path that was smoothed does not."""
-        return float(self.values.get("bandwidth", np.zeros(1))[0]) <= 0
+    def path_is_smoothed(self) -> bool:
+        """Whether it is the camera's path, and not the accelerometer, that lacks what is quick."""
+        return "bandwidth" in self.values and float(self.values["bandwidth"][0]) > 0
+
+    def loosened(self, prior: Prior) -> Prior:
+        """The prior where the delay of a filter is not known: it may be none, or all of its time constant."""
+        if "bandwidth" not in self.values:
+            return prior
+        info, at = prior.info.copy(), par.ACCEL_DELAY
+        info[at, at] = 1 / (1 / info[at, at] + self._time_constant_s**2)
+        return replace(prior, info=info)
 
     def undone(self, data: Data) -> Data:
         """The data of a recording with the readings that a sound accelerometer would have given.
 
         A filter is taken as one of the first order, which applications' are: the reading plus its time constant times
-        its derivative. The scale is found with the delay of such a filter fitted along.
+        its derivative. The delay of such a filter is fitted along.
         """
         accel = data.tracks.accel
         t_s, value, rough = accel.t_s, accel.value, data.accel_roughness_m_s2_rthz
@@ -186,7 +204,7 @@ class Faults:
             out.append(
                 f"the accelerometer was low-passed at about {hz:.2g} Hz; that is undone as far as it can be: record it "
                 "unfiltered (raw)"
-                if self.can_be_undone
+                if not self.path_is_smoothed
                 else "the camera's path is smoother than what the accelerometer felt, as if low-passed at about "
                 f"{hz:.2g} Hz: give poses that were not smoothed"
             )

@@ -101,9 +101,10 @@ def estimate_joint(
     Returns
     -------
     ``method="joint"``. ``sigma_log`` combines the posterior standard deviation, inflated by chi-square where the fit is
-    worse than its noise and widened as Student's distribution is where few residuals tell the noise, with
-    ``PRIORS.model_scale`` and what noise in the fitted path may take from the scale. ``verdict`` is ``"refused"``
-    where the data cannot give a scale, with the reason.
+    worse than its noise and widened as Student's distribution is where few residuals tell the noise, with the floor
+    (``priors.model_scale_sigma``), what noise in the fitted path may take from the scale, and how uncertain it is what
+    was undone of the accelerometer's faults. ``verdict`` is ``"refused"`` where the data cannot give a scale, with the
+    reason.
     """
     options = options or JointOptions()
     try:
@@ -122,7 +123,8 @@ def estimate_joint(
         return ScaleEstimate.refused("joint", f"camera and IMU do not determine a scale together: {_RECORD_INSTEAD}")
     fit.variance_parts["accel_faults"] = sum(s.scale_variance for s in fit.suspicions if s.name in faults.values)
     wrong = [*faults.sentences(), *_cut_off(data)]
-    return _judged(fit, data.t_s, calibration, is_calibrated(imu), wrong)
+    # what was taken from a path nobody can put back: its scale is too large by more than any interval says
+    return _judged(fit, data.t_s, calibration, is_calibrated(imu), wrong, worthless=faults.path_is_smoothed)
 
 
 def _fit_soundly(data: Data, prior: Prior, sheet: ImuNoise | None) -> tuple[Fit, Faults]:
@@ -133,16 +135,16 @@ def _fit_soundly(data: Data, prior: Prior, sheet: ImuNoise | None) -> tuple[Fit,
         if fit.gain_chi2 > par.LARGEST_GAIN_CHI2 and not prior.heavy_gains:
             # not from the start: on its way a fit passes gains that it would not find back from
             prior = replace(prior, heavy_gains=True)
-            fit = fit_jointly(sound, prior, sheet)
+            fit = fit_jointly(sound, faults.loosened(prior), sheet)
         found = worst(fit.suspicions, faults.values)
         # a fit of what does not belong together explains nothing
         if found is None or _refusals(fit, data.t_s):
             break
         faults = faults.with_found(found)
-        if not faults.can_be_undone:
+        if faults.path_is_smoothed:
             break
         sound = faults.undone(data)
-        fit = fit_jointly(sound, prior, sheet)
+        fit = fit_jointly(sound, faults.loosened(prior), sheet)
     return fit, faults
 
 
@@ -158,15 +160,18 @@ def _cut_off(data: Data) -> list[str]:
 
 
 def _judged(
-    fit: Fit, t_s: Array, calibration: CameraImuCalibration, calibrated: bool, wrong: Sequence[str]
+    fit: Fit, t_s: Array, calibration: CameraImuCalibration, calibrated: bool, wrong: Sequence[str], *, worthless: bool
 ) -> ScaleEstimate:
     x = fit.estimate
     squares = sum(s for s, _ in fit.sums.values())
     expected = sum(e for _, e in fit.sums.values())
     found = _scale_of(fit, t_s, calibrated)
     metres_per_unit, sigma_log = found.metres_per_unit, found.sigma_log
-    verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, refusals=_refusals(fit, t_s))
-    if verdict != "refused":
+    refusals = [*_refusals(fit, t_s), *(wrong if worthless else ())]
+    verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, refusals=refusals)
+    if verdict == "refused":
+        reasons = (*reasons, *(() if worthless else wrong))
+    else:
         verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, [*wrong, *_checks(fit, t_s)])
     if fit.jumped:
         places = "one place" if fit.jumped == 1 else f"{fit.jumped} places"

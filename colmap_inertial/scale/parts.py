@@ -35,6 +35,9 @@ CAUSES: dict[str, Cause] = {
         advice="calibrate the lens, close loops while filming, or scale by a target of known size",
     ),
     "accel_noise": Cause(words="the accelerometer's noise", advice=_LONGER),
+    "lost_readings": Cause(
+        words="readings that are missing", advice="record without pauses, and within the ranges of the sensors"
+    ),
     "accel_bias": Cause(words="the accelerometer's bias", advice=_TURN),
     "camera_path": Cause(
         words="the camera's path",
