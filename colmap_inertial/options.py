@@ -69,7 +69,7 @@ class MappingOptions:
     gravity_priors: bool = False
     """Global mapper only: start it from each frame's gravity direction, by the IMU (needs a calibration)."""
     refine_intrinsics: bool | None = None
-    """Let bundle adjustment change the camera. Default: only where the capture declares none."""
+    """Let bundle adjustment change the camera. Not given: only where the capture declares none."""
 
     def __post_init__(self) -> None:
         if self.overlap < 1:
@@ -169,7 +169,7 @@ class FrameOptions:
     """Which frames are used."""
 
     use: Literal["auto", "all"] | None = None
-    """auto: as many as the motion needs, each the least blurred around. Default: auto for a video, all pictures of a
+    """auto: as many as the motion needs, each the least blurred around. Not given: auto for a video, all pictures of a
     folder."""
     min_fps: float = 4.0
     """At least so many frames a second, while the picture moves. The scale's error does not grow down to 4; at 2 it
@@ -270,10 +270,10 @@ class ReconstructOptions:
     exposures: ExposureOptions = field(default_factory=ExposureOptions)
     """How pairs of a short and a long exposure become frames."""
     deblur: DeblurMethod | None = None
-    """Undo motion blur by the gyroscope before COLMAP sees a frame. Default: wiener, where exposure times are known
+    """Undo motion blur by the gyroscope before COLMAP sees a frame. Not given: wiener, where exposure times are known
     and the pictures bear the gyroscope out. deepgyro: by a network (slower; needs the extra `restore`)."""
     rolling_shutter: RollingShutterMethod | None = None
-    """Undo the rolling shutter by the gyroscope. Default: rectify, where the readout time is known."""
+    """Undo the rolling shutter by the gyroscope. Not given: rectify, where the readout time is known."""
     mapping: MappingOptions = field(default_factory=MappingOptions)
     """How COLMAP builds the model."""
     scale: ScaleOptions = field(default_factory=ScaleOptions)
@@ -352,7 +352,7 @@ class BatchOptions:
     """Who works on the captures of a batch."""
 
     workers: int | None = None
-    """Captures in work at once on this machine. Default: what processors and free memory allow."""
+    """Captures in work at once on this machine. Not given: what processors and free memory allow."""
     scheduler: str | None = None
     """Address of a Dask scheduler (tcp://host:8786), whose workers do the work instead (needs the extra `cluster`)."""
     attempts: int = 3

@@ -1,6 +1,7 @@
 """The command as a user calls it: exit codes, messages, files."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -8,7 +9,7 @@ import sys
 import numpy as np
 import pytest
 
-from colmap_inertial.cli import main
+from colmap_inertial.cli import _COMMANDS, _options, main
 
 
 def run(capsys, *args):
@@ -46,6 +47,46 @@ def test_a_wrong_flag_exits_2_and_names_it(capsys):
     code, _, err = run(capsys, "scale", "x", "--json", "y", "--metod", "joint")
     assert code == 2
     assert "--metod" in err
+
+
+@pytest.mark.parametrize(
+    ("args", "meant"),
+    [
+        (["scal", "x"], "there is no command scal; did you mean scale?"),
+        (["recontruct"], "there is no command recontruct; did you mean reconstruct?"),
+        (["scale", "x", "--frame-time", "y"], "scale has no option --frame-time; did you mean --frame-times?"),
+        (["reconstruct", "x", "--rolling-shuter=off"], "no option --rolling-shuter; did you mean --rolling-shutter?"),
+        (["diagnose", "--jsn"], "diagnose has no option --jsn; did you mean --json?"),
+        (["zzzz"], "there is no command zzzz ("),
+    ],
+)
+def test_what_is_mistyped_is_named_also_where_something_is_missing(capsys, args, meant):
+    code, _, err = run(capsys, *args)
+    assert code == 2 and meant in err
+    assert len(err.splitlines()) == 1
+
+
+@pytest.mark.parametrize("command", _COMMANDS)
+def test_every_option_of_the_help_is_known(capsys, monkeypatch, command):
+    monkeypatch.setenv("COLUMNS", "80")
+    _, out, _ = run(capsys, command, "--help")
+    rows = re.findall(r"^\W (--[a-z].*)", out, re.MULTILINE)
+    shown = {option for row in rows for option in re.findall(r"--[a-z][a-z.0-9-]*", row)}
+    assert shown and shown <= set(_options(_COMMANDS[command]))
+
+
+def test_options_are_known_by_both_spellings(capsys):
+    code, _, err = run(capsys, "fuse_apertures", "no_capture", "out", "--lens_width", "2")
+    assert code == 2 and "no_capture" in err and "option" not in err
+
+
+@pytest.mark.parametrize("columns", ["80", "140"])
+def test_help_mentions_version_and_completion_and_no_none_to_type(capsys, monkeypatch, columns):
+    monkeypatch.setenv("COLUMNS", columns)
+    _, out, _ = run(capsys, "--help")
+    assert "--version" in out and "--tyro-print-completion" in out
+    _, out, _ = run(capsys, "reconstruct", "--help")
+    assert "{None}" not in out and "Default:" not in out
 
 
 def test_the_installed_command_runs():
@@ -284,7 +325,7 @@ def test_an_imu_shorter_than_the_recording_is_mentioned(capsys, project, tmp_pat
         capsys, "scale", project.model, "--imu", imu, "--frame-times", project.frame_times, "--json", target
     )
     assert code in (0, 3)
-    assert "the IMU runs along with" in " ".join(json.loads(target.read_text())["reasons"])
+    assert "the IMU runs along with" in " ".join(json.loads(target.read_text())["notes"])
 
 
 def test_validate_does_not_write_into_a_folder_of_pictures(capsys, project, tmp_path):

@@ -26,11 +26,14 @@ from trainer_readers import READERS, deblur_fork, inria, nerfstudio_data, ply
 from colmap_inertial.cli import main, parse
 from colmap_inertial.errors import FormatError, MissingExtraError, NotObservableError, OutputError, OutputExistsError
 from colmap_inertial.export.names import flat_names
+from colmap_inertial.export.pictures import _is_plain
 from colmap_inertial.export.pinhole_model import needed_cameras, pinhole_model
 from colmap_inertial.export.points import write_las
 from colmap_inertial.export.programs import PROGRAMS
+from colmap_inertial.export.source import ExportSource, Picture
+from colmap_inertial.export.transforms import Exposure, with_velocities
 from colmap_inertial.export.undistort import Undistortion
-from colmap_inertial.export.whole import export_model
+from colmap_inertial.export.whole import _notes_on, export_model
 from colmap_inertial.geometry import matrix_from_quat
 from colmap_inertial.io.ply import read_ply_header
 from colmap_inertial.model import read_model, write_model
@@ -38,6 +41,7 @@ from colmap_inertial.model.project import apply_to_project
 from colmap_inertial.model.similarities import plain_factor
 from colmap_inertial.options import ExportProgram
 from colmap_inertial.types import Similarity
+from colmap_inertial.view.sources import ScaleFacts, ViewSource
 
 METRIC = Similarity(
     scale=1.0,
@@ -358,6 +362,8 @@ def test_a_model_without_a_scale_is_exported_with_unscaled_alone(known, tmp_path
     assert made.unit == "model" and "not metres" in record["unit"] and record["up_in_world"] is None
     assert any("not metres" in note for note in record["notes"])
     assert not (tmp_path / "refused").exists()
+    export_model(out, tmp_path / "survey", "metashape", image_folder=known.out / "images", unscaled=True)
+    assert "metre" not in (tmp_path / "survey" / "cameras.xml").read_text()
 
 
 def test_a_picture_of_another_size_is_refused(known, tmp_path):
@@ -368,6 +374,65 @@ def test_a_picture_of_another_size_is_refused(known, tmp_path):
             cv2.imwrite(str(pictures / name), np.zeros((20, 20, 3), np.uint8))
     with pytest.raises(FormatError, match="20 x 20 pixels"):
         export_model(known.out, tmp_path / "new", image_folder=pictures)
+
+
+def test_pictures_that_say_how_to_turn_them_are_written_anew(tmp_path):
+    """A reader that heeds an orientation would turn what the model did not."""
+    from PIL import Image
+
+    pixels = np.random.default_rng(0).integers(0, 255, (8, 10, 3), np.uint8)
+    turned = Image.Exif()
+    turned[0x0112] = 6
+    for name, exif, plain in (("a.png", None, True), ("b.png", turned, False), ("c.jpg", turned, False)):
+        Image.fromarray(pixels).save(tmp_path / name, **({} if exif is None else {"exif": exif}))
+        assert _is_plain(tmp_path / name, Path(name), pixels) is plain, name
+
+
+def test_rectified_pictures_in_place_of_filmed_ones_are_told():
+    pictures = {"a.png": Picture(path=Path("a.png"), rectified=True), "b.png": Picture(path=Path("b.png"))}
+    (note,) = _notes_on(pictures, "original")
+    assert note.startswith("1 pictures are rectified")
+    assert _notes_on(pictures, "rectified") == []
+
+
+def test_poses_for_deblurring_are_those_of_the_exported_middle_row():
+    """Where the principal point is off the middle, the exported picture begins further down, and later."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    content = {"frames": [{"file_path": "images/a.png", "transform_matrix": matrix.tolist()}]}
+    moved = Exposure(
+        velocity_in_cam_m_s=np.array([2.0, 0.0, 0.0]),
+        angular_velocity_in_cam_rad_s=np.array([0.0, 0.0, -10.0]),
+        exposure_s=0.0,
+        readout_s=0.02,
+        late_s=0.001,
+    )
+    (frame,) = with_velocities(content, {"a.png": moved})["frames"]
+    found = np.array(frame["transform_matrix"])
+    np.testing.assert_allclose(found[:3, 3], [0, 0.002, 0], atol=1e-12)
+    # -z of COLMAP's camera is z of OpenGL's
+    np.testing.assert_allclose(found[:3, 0], [-np.sin(0.01), np.cos(0.01), 0], atol=1e-12)
+
+
+def test_a_run_s_rectified_pictures_are_known_by_any_path(tmp_path, monkeypatch):
+    images = tmp_path / "out" / "images"
+    images.mkdir(parents=True)
+    (images / "a.png").touch()
+    monkeypatch.chdir(tmp_path)
+    found = ViewSource(folder=Path("out/sparse/0"), index=0, others=(0,), scale=ScaleFacts(unit="m"), images=(images,))
+    source = ExportSource(
+        found=found, model=None, up_in_world=None, gravity_in_world_m_s2=None, motion=None,
+        treated={"a.png": ("passed", True)},
+    )  # fmt: skip
+    assert source.pictures(Path("out"), ["a.png"], "rectified")["a.png"].rectified
+
+
+def test_instant_ngp_needs_no_velocities(known, tmp_path):
+    """What ``apply`` wrote has none."""
+    made = export_model(known.out, tmp_path / "made", "instant-ngp")
+    meta = json.loads((tmp_path / "made" / "transforms.json").read_text())
+    assert len(meta["frames"]) == made.images and "transform_matrix_start" not in meta["frames"][0]
+    assert any("no velocities" in note for note in made.notes)
 
 
 def test_the_page_has_the_command_lines_that_are_printed():
@@ -636,6 +701,7 @@ def test_metashape_projects_points_to_where_pictures_show_them(known, tmp_path):
     """By the camera model of its manual: u = w / 2 + cx + x f + x b1 + y b2, v = h / 2 + cy + y f."""
     export_model(known.out, tmp_path / "made", "metashape")
     chunk = ElementTree.parse(tmp_path / "made" / "cameras.xml").getroot().find("chunk")
+    assert 'UNIT["metre",1' in chunk.find("reference").text
     transform = chunk.find("components/component/transform")
     assert transform.find("rotation").text.split() == [str(float(v)) for v in np.eye(3).ravel()]
     assert float(transform.find("scale").text) == 1

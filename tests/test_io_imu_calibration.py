@@ -312,7 +312,7 @@ def test_scale_takes_what_is_remembered_of_its_device_and_says_so(capsys, projec
     assert [entry["kind"] for entry in used["calibration_files"]] == ["camera-imu", "imu"]
     assert 'tablet: uses the remembered calibration "imu"' in said
     assert used["imu_calibration"]["attitudes"] == 12
-    assert any("corrected by its calibration in 12 attitudes" in reason for reason in used["reasons"])
+    assert any("corrected by its calibration in 12 attitudes" in note for note in used["notes"])
     assert used["sigma_log"] < plain["sigma_log"]
     given, said = scale("--device", "tablet", "--calibration", tmp_path / "imu.json")
     assert 'calibration "imu"' not in said and 'calibration "camera-imu"' in said

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 from model_project import NAMES, write_project
 from test_io_ply import SIMILARITY
@@ -15,13 +16,14 @@ from test_pipeline_parts import session_in
 
 from colmap_inertial.cli.terminal import show_result
 from colmap_inertial.colmap import dense as dense_room
+from colmap_inertial.colmap.depth_maps import MadeFrom
 from colmap_inertial.drivers import deblur
 from colmap_inertial.drivers.frames import run_images
-from colmap_inertial.drivers.placed import place_project, placed_paths, require_free_names
+from colmap_inertial.drivers.placed import place_project, placed_paths, remove_placed, require_free_names
 from colmap_inertial.drivers.reporting import reporting_stops
 from colmap_inertial.drivers.result import ModelResult, ReconstructResult
 from colmap_inertial.drivers.standing import settle_dense
-from colmap_inertial.errors import AlreadyMetricError, MappingError, OutputError, OutputExistsError
+from colmap_inertial.errors import AlreadyMetricError, FormatError, MappingError, OutputError, OutputExistsError
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.model import read_model, transformed, write_model
@@ -29,7 +31,7 @@ from colmap_inertial.model.project import apply_to_project, undo_project
 from colmap_inertial.model.similarities import ModelScale, plain_factor
 from colmap_inertial.options import ProjectOptions
 from colmap_inertial.precalibrate.plan import ImagingPlan
-from colmap_inertial.run.workspace import Workspace
+from colmap_inertial.run.workspace import Workspace, places_of
 from colmap_inertial.stages.frame_folder import FrameRecord
 from colmap_inertial.types import ScaleEstimate
 
@@ -81,6 +83,16 @@ def test_images_that_nothing_moved_take_no_room_and_outlive_colmap_s(workspace):
     assert all((workspace.images / name).samefile(workspace.colmap_images / name) for name in names)
     shutil.rmtree(workspace.colmap)
     assert contents(workspace.images) == {name: f"{name} as filmed".encode() for name in names}
+
+
+def test_which_images_are_rectified_does_not_hang_on_colmap_s_folder(tmp_path):
+    now, before = tmp_path / "now", tmp_path / "before"
+    for folder in (now / "images", before / "images", before / "images_rectified"):
+        folder.mkdir(parents=True)
+    assert (places_of(now).rectified, places_of(now).seen) == (now / "images", now / "images")
+    assert (places_of(before).rectified, places_of(before).seen) == (before / "images_rectified", before / "images")
+    (now / "colmap" / "images").mkdir(parents=True)
+    assert (places_of(now).rectified, places_of(now).seen) == (now / "images", now / "colmap" / "images")
 
 
 def test_without_hard_links_images_are_copied(workspace, monkeypatch):
@@ -172,13 +184,35 @@ def test_depth_maps_are_set_aside_and_come_back_with_their_model(workspace, colm
     other = metric_model(workspace, colmap_project, 3.0)
     settle_dense(workspace, other)
     assert not workspace.dense.exists()
-    assert contents(workspace.earlier / "dense" / "0") == before
+    assert contents(workspace.earlier / "dense" / "0") == before | {".stages/dense_0_fused.json": b"{}"}
+    assert not list(workspace.stamps.glob("dense_*"))  # another one is made whole
     dense_of(workspace, 0, maps=True)
     settle_dense(workspace, {})  # refused
     assert sorted(path.name for path in (workspace.earlier / "dense").iterdir()) == ["0", "0-2"]
     settle_dense(workspace, metric_model(workspace, colmap_project, 2.0))
     assert contents(folder) == before
+    assert [path.name for path in workspace.stamps.glob("dense_*")] == ["dense_0_fused.json"]  # and is not made again
     assert [path.name for path in (workspace.earlier / "dense").iterdir()] == ["0-2"]
+
+
+def test_a_dense_reconstruction_that_was_cut_off_early_goes_with_its_model(workspace, colmap_project, monkeypatch):
+    models = metric_model(workspace, colmap_project, 2.0)
+    session = session_in(workspace)
+    session.runner.run("metric", {}, [], lambda _: None)
+
+    def cut_off(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pycolmap, "undistort_images", cut_off)
+    made_from = MadeFrom(model=dense_room.digest(models[0]), max_image_size=None, maps="plane sweep")
+    prepared = dense_room._Prepared(names=(), made_from=made_from, has_maps=False)
+    with pytest.raises(KeyboardInterrupt):
+        dense_room._undistort(session, 0, workspace.images, prepared)
+    settle_dense(workspace, models)
+    assert (workspace.dense / "0").is_dir()
+    (workspace.stamps / "sweep_0").mkdir()
+    settle_dense(workspace, {})
+    assert not workspace.dense.exists() and not (workspace.stamps / "sweep_0").exists()
 
 
 def test_a_run_that_stops_leaves_nothing_metric_of_an_earlier_one(workspace, colmap_project, tmp_path):
@@ -274,6 +308,19 @@ def test_a_run_killed_while_it_places_leaves_nothing_behind_for_the_next(placing
     assert placing()[0] == ["apply"]
     assert placing.names() == {"images", "sparse", "dense", "database.db", "project.ini", "transform.json"}
     assert not (placing.workspace.stamps / "project").exists()
+
+
+@pytest.mark.parametrize("name", [".", "../mine", "a/../../mine", "link/file.txt"])
+def test_a_record_of_what_was_placed_cannot_name_what_lies_elsewhere(workspace, tmp_path, name):
+    """An output folder may come from a stranger; what its record names is removed."""
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (mine / "file.txt").touch()
+    (workspace.root / "link").symlink_to(mine)
+    workspace.placed.write_text(json.dumps({"paths": [name]}))
+    with pytest.raises(FormatError, match=r"placed\.json"):
+        remove_placed(workspace)
+    assert (mine / "file.txt").is_file() and workspace.owner.is_file()
 
 
 @pytest.mark.parametrize("place", ["", "0", "sparse"])

@@ -150,6 +150,19 @@ def test_figures_are_what_plotly_takes(full):
         graph_objects.Figure(figure)  # raises on any name or value that plotly does not know
 
 
+def test_notes_stand_apart_from_reasons_and_earlier_results_have_none(tmp_path):
+    out = tmp_path / "out"
+    result = write_run(out, kind="constant_velocity")
+    (model,) = result["models"]
+    write_json(out / "result.json", {**result, "models": [{**model, "notes": ["poses jump, which hardly counts"]}]})
+    _, page = report_of(out)
+    assert page.text.index("Reasons") < page.text.index("Notes") < page.text.index("oses jump, which hardly counts")
+    del model["notes"]
+    write_json(out / "result.json", result)
+    content, page = report_of(out)
+    assert content["models"][0]["notes"] == [] and "Notes" not in page.text
+
+
 def test_a_refused_scale_has_no_number_and_says_what_to_do(tmp_path):
     out = tmp_path / "out"
     result = write_run(out, kind="constant_velocity")

@@ -8,7 +8,8 @@ import pytest
 from conftest import write_project
 from test_pipeline_parts import recording_of, session_in
 
-from colmap_inertial.drivers.models import run_models
+from colmap_inertial.drivers import models
+from colmap_inertial.drivers.models import run_models, run_validation
 from colmap_inertial.drivers.result import ModelResult, ReconstructResult, result_as_json
 from colmap_inertial.geometry import quat_exp, quat_multiply
 from colmap_inertial.imaging.gate import FrameDecision, RecordingVerdict
@@ -36,6 +37,7 @@ from colmap_inertial.types import (
     ScaleEstimate,
     Similarity,
 )
+from colmap_inertial.validate import Validation, parse_target
 
 CAMERA = CameraModel(model="PINHOLE", width=640, height=480, params=(500.0, 500.0, 320.0, 240.0))
 
@@ -288,3 +290,47 @@ def test_frames_are_dropped_only_by_a_gyroscope_that_the_images_bear_out(trusted
     stage = DeblurStage(view=VIEW, decisions=(decision,), verdict=verdict, drop=drop, workers=1)
     (frame,) = stage(iter([Frame(name="a.jpg", image=np.zeros((480, 640), np.uint8), t_s=0.5)]))
     assert frame.dropped is gone and frame.treatments[-1].reason == "too much blur"
+
+
+# --- a target --------------------------------------------------------------------------------------------------------
+
+
+def test_pictures_of_a_target_come_back_with_their_model(tmp_path, monkeypatch):
+    """Those of a refused model, or without a target, go; the step must not be kept for what it no longer has."""
+    workspace = Workspace(tmp_path / "out")
+    workspace.open(tmp_path / "capture.toml")
+    target = parse_target("checkerboard:8x6:0.03")
+    found = Validation(
+        **dict.fromkeys(("tolerance_pct", "rms_px", "corner_noise_px", "pose_noise_px", "metres_per_unit"), 1.0),
+        **dict.fromkeys(("views_used", "views_searched", "corners_used", "corners_rejected"), 1),
+        **dict.fromkeys(("distances", "corners", "views", "views_rejected", "reasons"), ()),
+        **dict.fromkeys(("control", "check", "check_error_pct", "check_ci95_pct", "ci95_pct")),
+        target=target,
+        unscaled=False,
+        scale_error_pct=0.5,
+        metres_per_unit_ci95=(0.9, 1.1),
+    )
+    monkeypatch.setattr(models, "validate_model", lambda *_, **__: found)
+    monkeypatch.setattr(models, "write_overlays", lambda found, images, folder: folder.mkdir(parents=True))
+    refused = ModelResult(index=0, colmap_index=0, scale=of_refused(), summary={}, sparse=tmp_path / "model")
+    accepted = replace(refused, sparse_metric=workspace.sparse / "0")
+    pictures, images = workspace.validation / "0", tmp_path / "images"
+    images.mkdir()
+
+    def measured(model, target):
+        session = session_in(workspace)
+        session.runner.run("metric", {}, [], lambda _: None)
+        run_validation(session, [model], target, images)
+        return "validation_0" in session.runner.worked, pictures.is_dir()
+
+    assert measured(accepted, target) == (True, True)
+    assert measured(accepted, target) == (False, True)
+    for gone in ((refused, target), (accepted, None)):
+        assert measured(*gone) == (False, False)
+        assert measured(accepted, target) == (True, True)
+
+
+def of_refused():
+    return ScaleEstimate(
+        metres_per_unit=None, sigma_log=None, ci95=None, verdict="refused", method="none", reasons=("it stood still",)
+    )

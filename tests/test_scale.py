@@ -90,7 +90,7 @@ def test_clocks_that_run_at_different_rates_give_the_same_scale(recording):
     estimate = estimate_scale(recording.trajectory, fast)
     assert estimate.verdict == "trusted"
     assert estimate.metres_per_unit == pytest.approx(recording.truth.metres_per_unit, rel=0.01)
-    assert any("ppm off the camera's" in reason for reason in estimate.reasons)
+    assert any("ppm off the camera's" in note for note in estimate.notes)
 
 
 def test_a_gyroscope_alone_gives_no_scale(recording):

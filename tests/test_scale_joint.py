@@ -522,7 +522,7 @@ def test_a_pause_of_the_imu_is_bridged_and_named(recording, calibration):
     )  # fmt: skip
     estimate = estimate_scale(recording.trajectory, holed)
     assert estimate.ci95[0] < recording.truth.metres_per_unit < estimate.ci95[1]
-    assert any("gyroscope pauses once, for 0.6" in reason for reason in estimate.reasons)
+    assert any("gyroscope pauses once, for 0.6" in note for note in estimate.notes)
 
 
 @pytest.mark.parametrize("shift_m", [0.05, 0.5])
@@ -531,7 +531,7 @@ def test_a_break_of_the_path_does_no_harm_and_is_named(recording, calibration, s
     centre[280:] += np.array([1.0, -0.5, 0.3]) * shift_m / recording.truth.metres_per_unit
     estimate = estimate_joint(replace(recording.trajectory, cam_in_world=centre), recording.imu, calibration)
     assert estimate.ci95[0] < recording.truth.metres_per_unit < estimate.ci95[1]
-    assert shift_m < 0.1 or any("jump" in reason for reason in estimate.reasons)
+    assert shift_m < 0.1 or any("jump" in note for note in estimate.notes)
 
 
 @pytest.mark.parametrize("kind", ["static", "pure_rotation", "constant_velocity"])

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Union
+from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 import tyro
 from tyro.conf import subcommand
@@ -22,8 +23,12 @@ from colmap_inertial.options import ReconstructOptions
 DESCRIPTION = """Metric, gravity-aligned COLMAP models from the gyroscope and accelerometer that filmed along.
 
 Exit codes: 0 done, 1 a check failed, 2 bad input, 3 not observable (scale refused), 4 mapping failed,
-5 target not found."""
+5 target not found.
 
+--version prints the version; --tyro-print-completion bash (zsh, tcsh) a script that completes names and options."""
+
+#: Values of positional arguments go by their names; an option that is not given is left out, not given as None.
+_CONFIG = (tyro.conf.PositionalMetavarFromFieldName, tyro.conf.DisallowNone)
 
 Command = (
     Reconstruct
@@ -67,8 +72,9 @@ def parse(args: Sequence[str]) -> Command:
     FormatError
         For a ``--config`` file that cannot be read.
     InertialError
-        For ``--calibration`` without a file.
+        For ``--calibration`` without a file, and for a command or an option that there is not, with the nearest one.
     """
+    _require_known(args)
     choices: list[Any] = []
     for name, cls in _COMMANDS.items():
         default = _default_from_config(cls, args) if list(args[:1]) == [name] else None
@@ -76,8 +82,44 @@ def parse(args: Sequence[str]) -> Command:
         choices.append(Annotated[cls, settings])
     args = _calibrations_last(args)
     command: Any = Union[tuple(choices)]  # noqa: UP007 (built at run time)
-    config = (tyro.conf.PositionalMetavarFromFieldName,)
-    return tyro.cli(command, prog="colmap-inertial", description=DESCRIPTION, args=list(args), config=config)
+    return tyro.cli(command, prog="colmap-inertial", description=DESCRIPTION, args=list(args), config=_CONFIG)
+
+
+def _require_known(args: Sequence[str]) -> None:
+    """Refuse a command or an option that there is not, also where something else is missing."""
+    if not args or args[0].startswith("-"):
+        return
+    cls = _COMMANDS.get(args[0].replace("_", "-"))
+    if cls is None:
+        raise InertialError(f"there is no command {args[0]}{_nearest(args[0], _COMMANDS)} (--help lists them)")
+    words = [word.partition("=")[0] for word in args[1:] if word.startswith("--") and word != "--"]
+    if not words or "--help" in words:
+        return
+    options = _options(cls)
+    for word in words:
+        if word.replace("_", "-") not in options:
+            raise InertialError(
+                f"{args[0]} has no option {word}{_nearest(word, options)} ({args[0]} --help lists them)"
+            )
+
+
+def _options(cls: type[Any], prefix: str = "") -> list[str]:
+    """All options of a command, as tyro names those of its fields."""
+    options = ["--tyro-print-completion"]
+    for field, hint in get_type_hints(cls, include_extras=True).items():
+        kind, *settings = get_args(hint) if get_origin(hint) is Annotated else (hint,)
+        named = [setting.name for setting in settings if getattr(setting, "name", None) is not None]
+        name = named[0] if named else field.replace("_", "-")
+        if isinstance(kind, type) and dataclasses.is_dataclass(kind):
+            options += _options(kind, f"{prefix}{name}." if name else prefix)
+        else:
+            options += [f"--{prefix}{name}", *([f"--{prefix}no-{name}"] if bool in (kind, *get_args(kind)) else [])]
+    return options
+
+
+def _nearest(word: str, known: Iterable[str]) -> str:
+    like = difflib.get_close_matches(word, list(known), n=1)
+    return f"; did you mean {like[0]}?" if like else ""
 
 
 def _calibrations_last(args: Sequence[str]) -> list[str]:

@@ -69,11 +69,13 @@ class Reconstruct:
             known = remembered_of(self.project.imu or self.capture, options.calibration, device=self.device)
             show_remembered(known)
             options = dataclasses.replace(options, calibration=(*options.calibration, *known.paths))
-        with live_progress() as progress:
+        with live_progress() as screen:
             if self.project != ProjectOptions() or is_project(self.capture):
-                result = reconstruct_project(self.capture, self.out, self.project, options, progress=progress)
+                result = reconstruct_project(
+                    self.capture, self.out, self.project, options, progress=screen, findings=screen.findings
+                )
             else:
-                result = reconstruct(self.capture, self.out, options, progress=progress)
+                result = reconstruct(self.capture, self.out, options, progress=screen, findings=screen.findings)
         show_result(result)
         return result.exit_code()
 

@@ -17,7 +17,6 @@ from colmap_inertial.export.whole import Exported
 from colmap_inertial.model.project import Applied
 from colmap_inertial.precalibrate.plan import ImagingPlan
 from colmap_inertial.rest import RestCalibration
-from colmap_inertial.run.progress import Progress
 from colmap_inertial.run.workspace import Workspace
 from colmap_inertial.scale.parts import parts_in_words
 from colmap_inertial.stages.frame_folder import FrameRecord
@@ -26,6 +25,8 @@ from colmap_inertial.validate import Validation, validation_table
 from colmap_inertial.view.guard import is_loopback
 
 if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.progress import Progress as Bars, TaskID
     from rich.text import Text
 
 #: A label and what there is to say.
@@ -56,27 +57,46 @@ _SEVERITY_COLOUR = {"info": "blue", "warning": "yellow", "error": "red"}
 _COLOUR = {"trusted": "green", "weak": "yellow", "refused": "red"}
 
 
+class Screen:
+    """Standard error during a command: a bar for each stage, plain lines where that is no terminal."""
+
+    def __init__(self, console: Console, bars: Bars) -> None:
+        self._console, self._bars = console, bars
+        self._tasks: dict[str, TaskID] = {}
+
+    def __call__(self, stage: str, done: int, total: int, /) -> None:
+        """Show how far a stage is."""
+        name = _STAGES.get(stage, stage)
+        if stage not in self._tasks:
+            self._tasks[stage] = self._bars.add_task(name, total=total)
+            if not self._console.is_terminal:
+                self._console.print(f"{name} ...")
+        self._bars.update(self._tasks[stage], completed=done, total=total)
+
+    def findings(self, diagnosis: Diagnosis) -> None:
+        """Say what was found before the work: errors and warnings; above the bars, and whole lines in a pipe."""
+        from rich.text import Text
+
+        found = [finding for finding in diagnosis.findings if finding.severity != "info"]
+        for finding in found:
+            severity = (f"{finding.severity}: ", f"bold {_SEVERITY_COLOUR[finding.severity]}")
+            said = Text.assemble(severity, f"{finding.evidence}; {finding.advice}", (f" ({finding.code})", "dim"))
+            self._console.print(said, soft_wrap=not self._console.is_terminal)
+        if diagnosis.worst == "error":
+            self._console.print("an error makes a scale wrong or impossible; Ctrl-C ends the run")
+
+
 @contextlib.contextmanager
-def live_progress() -> Iterator[Progress]:
-    """A bar for each stage on standard error; plain lines where that is no terminal."""
+def live_progress() -> Iterator[Screen]:
+    """The screen of a command that takes a while."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress as Bars, TextColumn, TimeElapsedColumn
 
     console = Console(stderr=True)
     columns = (TextColumn("{task.description:<13}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    tasks = {}
     bars = Bars(*columns, console=console, disable=not console.is_terminal)
     with bars if console.is_terminal else contextlib.nullcontext():  # rich before 14.3 ends hidden bars with a newline
-
-        def progress(stage: str, done: int, total: int, /) -> None:
-            name = _STAGES.get(stage, stage)
-            if stage not in tasks:
-                tasks[stage] = bars.add_task(name, total=total)
-                if not console.is_terminal:
-                    console.print(f"{name} ...")
-            bars.update(tasks[stage], completed=done, total=total)
-
-        yield progress
+        yield Screen(console, bars)
 
 
 def scale_lines(estimate: ScaleEstimate) -> list[Line]:
@@ -93,6 +113,7 @@ def scale_lines(estimate: ScaleEstimate) -> list[Line]:
         made_of, advice = parts_in_words(estimate.parts)
         lines += [("Made of", made_of), ("Narrower", advice)]
     lines += [("Reason" if i == 0 else "", text) for i, text in enumerate(estimate.reasons)]
+    lines += [("Note" if i == 0 else "", text) for i, text in enumerate(estimate.notes)]
     calibration = estimate.calibration
     if calibration is not None:
         gyro, accel = calibration.gyro_time_offset_s, calibration.accel_time_offset_s

@@ -263,6 +263,7 @@ def _undistort(session: Session, index: int, images: Path, prepared: _Prepared) 
     model, folder = workspace.sparse / str(index), workspace.dense / str(index)
     folder.mkdir(parents=True, exist_ok=True)
     names, made_from = prepared.names, prepared.made_from
+    made_from.write(folder)  # before there is anything that must not outlive the model
 
     def work(partial: Sequence[Path]) -> None:
         scratch = workspace.stamps / "dense"
@@ -289,7 +290,6 @@ def _undistort(session: Session, index: int, images: Path, prepared: _Prepared) 
         "images": [fingerprint(path_in(images, name, model)) for name in names],
     }
     runner.run(f"dense_{index}_undistorted", depends, [folder / "images", folder / "sparse"], work, after=["metric"])
-    made_from.write(folder)
 
 
 def digest(model: Path) -> str:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import EllipsisType
 
 from colmap_inertial.colmap.sparse import check_pair_names
 from colmap_inertial.colmap.steps import run_colmap
+from colmap_inertial.diagnose import Diagnosis
 from colmap_inertial.drivers.frames import ask_for_plan, fusing, run_frames, run_images, run_plan
 from colmap_inertial.drivers.models import run_dense_models, run_models, run_validation
 from colmap_inertial.drivers.reporting import report_result, reporting_stops, write_recording
@@ -71,6 +72,7 @@ def reconstruct(
     keypoint_stages: Sequence[KeypointStage | EllipsisType] = (...,),
     model_stages: Sequence[ModelStage | EllipsisType] = (...,),
     progress: Progress = silent,
+    findings: Callable[[Diagnosis], None] = lambda _: None,
 ) -> ReconstructResult:
     """Turn images or video with an IMU recording into COLMAP models in metres, gravity along an axis.
 
@@ -90,6 +92,8 @@ def reconstruct(
         recording allow them. The model stages must include one that makes the model metric.
     progress
         Called with stage, steps done and steps in all.
+    findings
+        Called with what the check beforehand found, before the work and before a refusal that it leads to.
 
     Returns
     -------
@@ -109,7 +113,9 @@ def reconstruct(
         rectifying was asked for by name, and the gyroscope does not belong to the pixels.
     """
     with reading_within(options.limits):
-        return _reconstruct(Path(capture), Path(out), options, frame_stages, keypoint_stages, model_stages, progress)
+        return _reconstruct(
+            Path(capture), Path(out), options, frame_stages, keypoint_stages, model_stages, progress, findings
+        )
 
 
 def _reconstruct(
@@ -120,6 +126,7 @@ def _reconstruct(
     keypoint_stages: Sequence[KeypointStage | EllipsisType],
     model_stages: Sequence[ModelStage | EllipsisType],
     progress: Progress,
+    findings: Callable[[Diagnosis], None],
 ) -> ReconstructResult:
     for stages in (frame_stages, keypoint_stages, model_stages):
         with_defaults(stages, [])  # a wrong list is said before the work, not after it
@@ -161,6 +168,7 @@ def _reconstruct(
         write_recording(session, recording)  # a run that stops reports it, too
         diagnosis = preflight(recording, raw, progress)
         write_json(workspace.diagnosis, diagnosis.as_json())
+        findings(diagnosis)
         doubts = stop_or_doubt(diagnosis, force=options.force)
         recording = dataclasses.replace(recording, doubts=doubts)
         selection = run_selection(session, recording, options.frames)

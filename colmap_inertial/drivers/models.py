@@ -282,6 +282,8 @@ def run_validation(
                 write_record(partial[0], _Checked(found=found))
 
         record = session.workspace.stamps / f"validated_{model.index}.json"
+        if record.is_file() and not pictures.is_dir() and read_record(record, _Checked).found is not None:
+            remove(record)  # the pictures went while there was no such model or target
         after = ["metric", *session.runner.of("frames", "images")]
         depends = {"target": target.spec, "images": [] if len(after) > 1 else fingerprint(images)}
         session.runner.run(f"validation_{model.index}", depends, [record], work, after=after)

@@ -6,10 +6,11 @@ import logging
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
-from colmap_inertial.errors import FormatError, OutputError, OutputExistsError
+from colmap_inertial.errors import OutputError, OutputExistsError
 from colmap_inertial.io.files import read_json, write_json
+from colmap_inertial.io.names import check_names, path_in
 from colmap_inertial.io.records import read_record, write_record
 from colmap_inertial.model import TRANSFORM_FILE, model_files, model_format, model_formats, read_model, write_files
 from colmap_inertial.model.project import apply_to_project
@@ -110,9 +111,10 @@ def placed_paths(workspace: Workspace) -> list[Path]:
     """What came from the project into the folder; a killed run may have left part of it."""
     if not workspace.placed.is_file():
         return []
-    names = [Path(name) for name in read_record(workspace.placed, _Placed).paths]
-    if any(name.is_absolute() or ".." in name.parts for name in names):
-        raise FormatError(workspace.placed, "names a path out of the folder; remove it and start again")
+    names = read_record(workspace.placed, _Placed).paths
+    check_names(names, workspace.placed)
+    for folder in {PurePosixPath(name).parent.as_posix() for name in names} - {"."}:
+        path_in(workspace.root, folder, workspace.placed)
     return [workspace.root / name for name in names]
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from types import EllipsisType
 from typing import TYPE_CHECKING, Literal, get_args
 
+from colmap_inertial.diagnose import Diagnosis
 from colmap_inertial.drivers.capture import default_model_stages
 from colmap_inertial.drivers.models import run_dense_models, run_models, run_validation
 from colmap_inertial.drivers.placed import place_project, require_free_names
@@ -100,6 +101,7 @@ def reconstruct_project(
     *,
     model_stages: Sequence[ModelStage | EllipsisType] = (...,),
     progress: Progress = silent,
+    findings: Callable[[Diagnosis], None] = lambda _: None,
 ) -> ReconstructResult:
     """Make an existing COLMAP project metric, gravity along an axis, with everything that was made from it.
 
@@ -118,6 +120,8 @@ def reconstruct_project(
         As of :func:`reconstruct`.
     progress
         Called with stage, steps done and steps in all.
+    findings
+        Called with what the check beforehand found, before the work and before a refusal that it leads to.
 
     Raises
     ------
@@ -132,7 +136,7 @@ def reconstruct_project(
         When the recording cannot give metres (``options.force`` goes on).
     """
     with reading_within(options.limits):
-        return _reconstruct(Path(project), Path(out), source, options, model_stages, progress)
+        return _reconstruct(Path(project), Path(out), source, options, model_stages, progress, findings)
 
 
 def _reconstruct(
@@ -142,6 +146,7 @@ def _reconstruct(
     options: ReconstructOptions,
     model_stages: Sequence[ModelStage | EllipsisType],
     progress: Progress,
+    findings: Callable[[Diagnosis], None],
 ) -> ReconstructResult:
     warn_of_conflicts()
     if not _has_model(project):
@@ -181,6 +186,7 @@ def _reconstruct(
         largest = read(models[max(models, key=lambda n: (num_registered(models[n]), -n))])
         diagnosis = preflight(recording, raw, progress, model=_trajectory(largest, timing))
         write_json(workspace.diagnosis, diagnosis.as_json())
+        findings(diagnosis)
         recording = dataclasses.replace(recording, doubts=stop_or_doubt(diagnosis, force=options.force))
         stages = with_defaults(model_stages, default_model_stages(recording, options))
         results, fragments = run_models(
@@ -420,7 +426,7 @@ def _video_times(
 
 def _noted(result: ModelResult, notes: Sequence[str]) -> ModelResult:
     scale = result.scale
-    return dataclasses.replace(result, scale=dataclasses.replace(scale, reasons=(*scale.reasons, *notes)))
+    return dataclasses.replace(result, scale=dataclasses.replace(scale, notes=(*scale.notes, *notes)))
 
 
 def _scales(results: Sequence[ModelResult], fragments: Sequence[Fragment]) -> dict[int | None, ModelScale]:

@@ -219,12 +219,12 @@ def scale_source(
     limit_s = largest_offset_s(recording.shared_clock, options.max_offset_s)
     options = dataclasses.replace(options, max_offset_s=limit_s)
     estimate = estimate_scale(trajectory, recording.imu, calibration=recording.calibration, options=options)
-    said = estimate.reasons
     if estimate.verdict == "refused":
         likely = _likely_convention(recording, trajectory, AlignOptions(max_offset_s=limit_s))
-        said = said if likely is None else (likely.sentence, *said)
-    notes = (*said, *recording.imu.repairs, *recording.notes)
-    estimate = dataclasses.replace(estimate, reasons=notes)
+        if likely is not None:
+            estimate = dataclasses.replace(estimate, reasons=(likely.sentence, *estimate.reasons))
+    notes = (*estimate.notes, *recording.imu.repairs, *recording.notes)
+    estimate = dataclasses.replace(estimate, notes=notes)
     write_json(json, {**estimate.as_json(), "calibration_files": used})
     return estimate
 

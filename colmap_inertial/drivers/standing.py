@@ -15,6 +15,9 @@ from colmap_inertial.run.workspace import Workspace
 
 log = logging.getLogger(__name__)
 
+#: In a reconstruction that is set aside: which of its steps are finished.
+_STEPS = ".stages"
+
 
 def withdraw(workspace: Workspace) -> None:
     """Take away everything metric: there is no accepted scale, or none any more."""
@@ -45,15 +48,18 @@ def settle_dense(workspace: Workspace, models: Mapping[int, Path]) -> None:
         known, index = model_of(folder), int(folder.name) if folder.name.isdigit() else -1
         if known is None or known == of.get(index):
             continue
-        for stamp in workspace.stamps.glob(f"dense_{folder.name}_*.json"):
-            remove(stamp)
+        steps = list(workspace.stamps.glob(f"dense_{folder.name}_*.json"))
         if has_depth_maps(folder):
+            (folder / _STEPS).mkdir(exist_ok=True)
+            for step in steps:
+                os.replace(step, folder / _STEPS / step.name)
             aside = _free_name(workspace.earlier / workspace.dense.name / folder.name)
             aside.parent.mkdir(parents=True, exist_ok=True)
             os.replace(folder, aside)
             log.warning("the depth maps in %s are not of the model that is there now: kept in %s", folder, aside)
         else:
-            remove(folder)
+            for path in (*steps, workspace.stamps / f"sweep_{folder.name}", folder):
+                remove(path)
     for index, known in of.items():
         place = workspace.dense / str(index)
         back = (path for path in sorted(workspace.earlier.glob("*/*")) if model_of(path) == known)
@@ -61,6 +67,10 @@ def settle_dense(workspace: Workspace, models: Mapping[int, Path]) -> None:
             place.parent.mkdir(exist_ok=True)
             os.replace(found, place)
             log.info("the dense reconstruction in %s is of the model that is there now: %s", found, place)
+        if (place / _STEPS).is_dir() and model_of(place) == known:
+            for step in (place / _STEPS).glob(f"dense_{index}_*.json"):
+                os.replace(step, workspace.stamps / step.name)
+            remove(place / _STEPS)
     for folder in (workspace.earlier / workspace.dense.name, workspace.earlier, workspace.dense):
         if folder.is_dir() and not any(folder.iterdir()):
             folder.rmdir()

@@ -21,11 +21,12 @@ _LOCAL_METRES = (
 )
 
 
-def write_metashape(path: Path, views: list[View]) -> None:
+def write_metashape(path: Path, views: list[View], *, metres: bool) -> None:
     """Write cameras as Agisoft Metashape imports them (File, Import, Import Cameras): XML of version 1.5.
 
     Its focal length is that of the rows; ``b1`` is what columns have more. Transforms are world_from_camera, x right, y
-    down, z forward, and the chunk's own is none: the world is the model's.
+    down, z forward, and the chunk's own is none: the world is the model's. Where
+    that is in metres, the chunk says so.
     """
     document = ElementTree.Element("document", version="1.5.0")
     chunk = ElementTree.SubElement(document, "chunk", label="colmap-inertial", enabled="true")
@@ -56,7 +57,8 @@ def write_metashape(path: Path, views: list[View]) -> None:
         pose[:3, :3] = matrix_from_quat(quat_conjugate(view.cam_from_world_xyzw))
         pose[:3, 3] = view.cam_in_world
         ElementTree.SubElement(ElementTree.SubElement(shot, "camera", fields), "transform").text = _text(pose)
-    ElementTree.SubElement(chunk, "reference").text = _LOCAL_METRES
+    if metres:
+        ElementTree.SubElement(chunk, "reference").text = _LOCAL_METRES
     ElementTree.indent(document)
     text = ElementTree.tostring(document, encoding="unicode")
     write_text(path, f'<?xml version="1.0" encoding="UTF-8"?>\n{text}\n')

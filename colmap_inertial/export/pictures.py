@@ -86,4 +86,8 @@ def _is_plain(source: Path, target: Path, image: NDArray[Any]) -> bool:
     """Whether a file is what trainers read, as it is; an orientation in its metadata some of them would heed."""
     suffix = {".jpeg": ".jpg"}.get(source.suffix.lower(), source.suffix.lower())
     plain = image.ndim == 3 and image.dtype == np.uint8 and suffix == target.suffix
-    return plain and b"Exif" not in source.read_bytes()[: 1 << 16]
+    if not plain:
+        return False
+    with open(source, "rb") as file:
+        head = file.read(1 << 16)
+    return b"Exif" not in head and b"eXIf" not in head  # in JPEG, in PNG

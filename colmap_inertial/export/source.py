@@ -117,7 +117,7 @@ class ExportSource:
                 f"the picture of its image {name!r} is missing (in {looked}); say where: --image-folder",
             )
         action, was_rectified = self.treated.get(name, ("passed", False))
-        moved = was_rectified and path.is_relative_to(rectified)
+        moved = was_rectified and path.resolve().is_relative_to(rectified.resolve())
         return Picture(path=path, rectified=moved, sharpened=action == "deblurred", agrees=moved or not was_rectified)
 
 

@@ -114,6 +114,8 @@ def transforms(views: Sequence[View], xyz: Array, up_in_world: Array) -> dict[st
 def with_velocities(content: Mapping[str, Any], exposures: Mapping[str, Exposure]) -> dict[str, Any]:
     """The same for the deblurring fork of splatfacto: velocities in OpenGL camera axes, exposure and readout.
 
+    It takes a pose for that of the picture's middle row, so that each is brought to it.
+
     Frames without velocities are left out: it wants them of all or of none.
     """
     frames = []
@@ -123,6 +125,7 @@ def with_velocities(content: Mapping[str, Any], exposures: Mapping[str, Exposure
             frames.append(
                 {
                     **frame,
+                    "transform_matrix": _at(np.array(frame["transform_matrix"]), moved, moved.late_s).tolist(),
                     "camera_linear_velocity": (OPENGL_FROM_CAM @ moved.velocity_in_cam_m_s).tolist(),
                     "camera_angular_velocity": (OPENGL_FROM_CAM @ moved.angular_velocity_in_cam_rad_s).tolist(),
                 }

@@ -184,7 +184,7 @@ class _Work:
             images, points = len(views), len(xyz)
             (partial / "images").mkdir()
             if self.program == "metashape":
-                write_metashape(partial / "cameras.xml", views)
+                write_metashape(partial / "cameras.xml", views, metres=found.scale.unit == "m")
             elif self.program == "bundler":
                 model = pinhole_model(self.model, cameras, self.names)
                 write_bundler(partial / "bundle.out", partial / "list.txt", views, model)
@@ -285,6 +285,10 @@ class _Work:
         cameras: Mapping[int, Undistortion],
         notes: list[str],
     ) -> dict[str, Any]:
+        motion = self.source.motion
+        if self.program == "instant-ngp" and (motion is None or not motion.names):
+            notes.append("no velocities are known: each picture has one pose, as if it was taken in an instant")
+            return content
         exposures = exposures_of(self.model, self.source, pictures, cameras, notes)
         named = {self.names[name]: one for name, one in exposures.items()}
         if self.program == "instant-ngp":
@@ -341,6 +345,9 @@ def _notes_on(pictures: Mapping[str, Picture], kind: ExportImages) -> list[str]:
             f"{bent} pictures have their rolling shutter, which the model lacks: they agree with it in the middle "
             "row alone, unless the program models the shutter"
         )
+    moved = sum(picture.rectified for picture in pictures.values())
+    if moved and kind == "original":
+        notes.append(f"{moved} pictures are rectified: those with their rolling shutter (colmap/images) are gone")
     sharpened = sum(picture.sharpened for picture in pictures.values())
     if sharpened and kind == "original":
         notes.append(f"{sharpened} pictures are deblurred; with --capture, they are taken from it as they were filmed")

@@ -109,6 +109,7 @@ def _title(source: str) -> str:
 def _model(out: Path, model: Content, *, in_full: bool, project: bool) -> Content:
     scale, ci95 = model["metres_per_unit"], model["ci95"]
     kept = {key: value for key, value in model.items() if key not in ("drift", "validation", "cov", "dense")}
+    kept.setdefault("notes", [])  # earlier runs had all of it among the reasons
     kept["half_width_pct"] = None if scale is None else half_width_pct(scale, ci95)
     if scale is None:
         kept["drift"] = _missing("There is no scale whose parts could be compared.")
@@ -133,7 +134,7 @@ def _validation(out: Path, model: Content, *, project: bool) -> Content:
         if model["metres_per_unit"] is None:
             return _missing("Without a scale there is nothing to measure a target with.")
         if project:
-            return _missing("No target was named, or the project's images are not at hand (then the reasons say so).")
+            return _missing("No target was named, or the project's images are not at hand (then the notes say so).")
         return _missing("The capture names no target of known size ([target] in capture.toml).")
     if "error" in found:
         return _missing(f"The target could not be measured: {found['error']}.")

@@ -88,8 +88,9 @@ def _outcome(content: Content) -> Section:
         parts.append(gauge(model["half_width_pct"]))
     parts += [f"<p>{prose(text)}</p>" for text in outcome["summary"]]
     if model is not None and model["reasons"]:
-        word = "Reasons" if outcome["verdict"] != "trusted" else "Remarks"
-        parts += [f"<h3>{word}</h3>", listing(model["reasons"])]
+        parts += ["<h3>Reasons</h3>", listing(model["reasons"])]
+    if model is not None and model["notes"]:
+        parts += ["<h3>Notes</h3>", listing(model["notes"])]
     if outcome["todo"]:
         parts += ["<h3>What to do</h3>", listing(outcome["todo"])]
     parts.append(facts(_key_facts(content, model)))
@@ -153,6 +154,8 @@ def _model_head(model: Content, mark: str) -> Section:
     if model["metres_per_unit"] is not None:
         parts.append(f'<p class="number">{scale_text(model)}</p>')
     parts += [f"<p>{model['registered_images']} images, {model['points']} points.</p>", listing(model["reasons"])]
+    if model["notes"]:
+        parts += ["<h3>Notes</h3>", listing(model["notes"])]
     return Section(
         anchor=f"model{mark}", short=f"Model {model['index']}", parts=parts, classes=f"outcome {outcome['verdict']}"
     )

@@ -277,13 +277,13 @@ class Places:
 def places_of(root: Path) -> Places:
     """The places of a finished folder, also of one that 0.2 or a version before it made."""
     now, before = Workspace(root), root / "images_rectified"
-    apart = now.colmap_images.is_dir()
     return Places(
         images=(before, now.images, root / "project_metric" / "images"),
         sparse=(root / "sparse_metric", now.sparse),
         dense=(now.dense, root / "dense_metric"),
-        seen=now.colmap_images if apart else now.images,
-        rectified=now.images if apart else before,
+        # colmap/ may have been removed: without it, images/ is still what it was
+        seen=now.colmap_images if now.colmap_images.is_dir() else now.images,
+        rectified=before if before.is_dir() else now.images,
     )
 
 

@@ -154,7 +154,7 @@ def _estimate_or_refuse(
             estimate,
             # also where there is no scale: it says what was found of camera and IMU
             calibration=aligned if estimate.calibration is None else estimate.calibration,
-            reasons=(*estimate.reasons, *said, *remarks(trajectory, in_step, aligned)),
+            notes=(*estimate.notes, *said, *remarks(trajectory, in_step, aligned)),
         )
     except NotObservableError as error:
         return ScaleEstimate.refused(options.method, f"{error.quantity}: {error.hint}")

@@ -173,9 +173,10 @@ def _judged(
         reasons = (*reasons, *(() if worthless else wrong))
     else:
         verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, [*wrong, *_checks(fit, t_s)])
+    notes: tuple[str, ...] = ()
     if fit.jumped:
         places = "one place" if fit.jumped == 1 else f"{fit.jumped} places"
-        reasons = (*reasons, f"poses jump at {places}, which hardly counts")
+        notes = (f"poses jump at {places}, which hardly counts",)
     refused = verdict == "refused"
     keep = [par.SCALE, *range(par.GRAVITY.start, par.ACCEL_BIAS.stop)]
     signs = np.array([-1.0, *[1.0] * 6])
@@ -188,6 +189,7 @@ def _judged(
         verdict=verdict,
         method="joint",
         reasons=reasons,
+        notes=notes,
         gravity_in_world_m_s2=x.gravity_m_s2,
         accel_bias_m_s2=x.accel_bias_m_s2,
         calibration=_refined(fit, calibration),

@@ -61,7 +61,7 @@ class MetricStage:
         estimate = estimate_scale(
             trajectory, self.imu, calibration=of_model(self.calibration, model), options=self.options
         )
-        estimate = replace(estimate, reasons=(*estimate.reasons, *self.imu.repairs, *notes))
+        estimate = replace(estimate, notes=(*estimate.notes, *self.imu.repairs, *notes))
         estimate = doubted(estimate, model.doubts)
         if estimate.verdict == "refused":
             return model.scaled(estimate, None)

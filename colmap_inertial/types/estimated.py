@@ -289,7 +289,9 @@ class ScaleEstimate:
     ci95
         95 % interval of ``metres_per_unit``; ``None`` when refused.
     verdict, reasons
-        What to make of it, and why, in words for the user.
+        What to make of it, and what decided that, in words for the user.
+    notes
+        What else the user should know: repairs, pauses, clocks; none of it decided the verdict.
     gravity_in_world_m_s2
         (3,) points down, in the source model's frame; ``None`` where it could not be estimated.
     accel_bias_m_s2
@@ -331,6 +333,7 @@ class ScaleEstimate:
     drift: ScaleDrift | None = None
     parts: Mapping[str, float] | None = None
     runtime_s: float = 0.0
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         numbers = (self.metres_per_unit, self.sigma_log, self.ci95)
@@ -384,6 +387,7 @@ class ScaleEstimate:
             "sigma_log": self.sigma_log,
             "verdict": self.verdict,
             "reasons": list(self.reasons),
+            "notes": list(self.notes),
             "gravity_in_world_m_s2": plain(self.gravity_in_world_m_s2),
             "accel_bias_m_s2": plain(self.accel_bias_m_s2),
             # where camera and IMU could not be brought together, these are unknown
