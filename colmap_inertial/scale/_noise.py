@@ -44,6 +44,9 @@ _LARGEST_CORRELATION = 0.8
 #: Largest change of a level in an iteration (logarithm); where it turns back, the next may be this much of the last at
 #: most, and grows by the other factor as long as it keeps its direction.
 _LARGEST_CHANGE, _TURNED, _KEPT = 0.9, 0.4, 2.5
+#: Where levels that explain the same (noise of the centres and their drift) do not come to rest in so many steps, the
+#: largest change shrinks by the factor with each further one.
+_PATIENCE, _TIRING = 30, 0.6
 
 
 def roughness(t_s: Array, values: Array) -> float:
@@ -148,6 +151,7 @@ class LevelSearch:
     by_scale: Array = field(default_factory=lambda: np.zeros(len(_LEVELS)))
     wanted: Array = field(default_factory=lambda: np.ones(len(_LEVELS)))
     _last: Array = field(default_factory=lambda: np.zeros(len(_LEVELS)))
+    _steps: int = 0
     _limit: Array = field(default_factory=lambda: np.full(len(_LEVELS), 2 * _LARGEST_CHANGE))
 
     def __post_init__(self) -> None:
@@ -210,7 +214,9 @@ class LevelSearch:
         step = np.linalg.solve(self.information, 0.5 * (squares - right) - prior * (now - mean))
         self.wanted = np.where((now <= floor + 1e-6) & (step < 0), 0.0, step)
         turned = self._last * step < 0
-        self._limit = np.where(turned, _TURNED * self._limit, np.minimum(_KEPT * self._limit, 2 * _LARGEST_CHANGE))
+        self._steps += 1
+        most = 2 * _LARGEST_CHANGE * self._left
+        self._limit = np.minimum(np.where(turned, _TURNED * self._limit, _KEPT * self._limit), most)
         self._last = np.clip(step, -self._limit, self._limit)
         new = np.exp(0.5 * np.maximum(now + self._last, floor))
         self.noise = replace(
@@ -221,7 +227,12 @@ class LevelSearch:
 
     def scale_moves(self) -> float:
         """How much the logarithm of the scale would change with the step that the levels want to make."""
-        return abs(float(np.sum(self.by_scale * np.clip(self.wanted, -3.0, 3.0))))
+        return abs(float(np.sum(self.by_scale * np.clip(self.wanted, -3.0 * self._left, 3.0 * self._left))))
+
+    @property
+    def _left(self) -> float:
+        """What is left of the largest change."""
+        return float(_TIRING ** max(0, self._steps - _PATIENCE))
 
     def scale_variance(self, groups: Groups, states: Array, z: Array) -> tuple[float, float]:
         """What the levels' own uncertainty means for the scale.
