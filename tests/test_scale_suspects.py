@@ -233,14 +233,7 @@ def test_the_gyroscope_s_cut_off_readings_are_a_gap(recording):
     imu = recording.imu
     limit = np.quantile(np.abs(imu.gyro_rad_s), 0.99)
     altered = replace(imu, gyro_rad_s=np.clip(imu.gyro_rad_s, -limit, limit))
-    data, _ = prepare(
-        recording.trajectory,
-        altered,
-        align_camera_imu(recording.trajectory, imu),
-        gravity_m_s2=9.80665,
-        gravity_sigma_m_s2=0.02,
-        states_hz=8.0,
-    )
+    data, _ = prepared(replace(recording, imu=altered))
     assert data.gyro_cut_share > 0.01
     assert data.tracks.gyro.paused_s[-1] == pytest.approx(data.gyro_cut_share * np.ptp(imu.gyro_t_s), rel=0.5)
     estimate = estimate_scale(recording.trajectory, altered)

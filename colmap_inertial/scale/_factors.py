@@ -47,8 +47,6 @@ class Group:
         estimated from them; all of it where this is None.
     root
         (N, r, r) what the residuals were whitened by, where somebody else needs it.
-    gaps
-        (N, r, r) part of the residuals' covariance that stands for readings that are missing; None without any.
     """
 
     residual: Array
@@ -60,7 +58,6 @@ class Group:
     first: int = 0
     share: Array | None = None
     root: Array | None = None
-    gaps: Array | None = None
 
     def apply(self, states: Array, z: Array) -> Array:
         """(N, r, q) changes of the residuals under q steps: states (K, m, q), globals (n, q)."""
@@ -247,7 +244,6 @@ def imu_group(noise: Noise, x: Estimate, pre: Preintegrated, *, rotation_only: b
         columns=par.IMU_GLOBALS,
         share=noise.accel_m_s2_rthz**2 * root @ pre.cov_accel[:, rows, rows] @ root.transpose(0, 2, 1),
         root=root,
-        gaps=root @ pre.cov_gaps[:, rows, rows] @ root.transpose(0, 2, 1) if pre.cov_gaps.any() else None,
     )
 
 

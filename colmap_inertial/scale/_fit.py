@@ -137,7 +137,7 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
     imu.pull_back(own, ends[:, :, 4:], ends_z[:, 4:])
     states, z, cov = system.solve(ends, ends_z)
     suspicions = sus.suspicions(where, own, imu.apply(states[:, :, 4:], z[:, 4:]), residual, z[par.SCALE, 4:])
-    variance_parts = _variance_parts(groups, local, x, states[:, :, 3:4], z[:, 3])
+    variance_parts = _variance_parts(groups, local, x, pre.cov_gaps, states[:, :, 3:4], z[:, 3])
     level_variance, freedom = search.scale_variance(groups, states[:, :, 3:4], z[:, 3:4])
     states, z = states[:, :, :3], z[:, :3]
     inflation = max(1.0, *(squares / expected for squares, expected in sums.values()))
@@ -210,7 +210,7 @@ def _gain_surprise(prior: Prior, x: Estimate, cov: Array) -> float:
 
 
 def _variance_parts(
-    groups: dict[str, fac.Group | fac.Direct], prior: Prior, x: Estimate, states: Array, z: Array
+    groups: dict[str, fac.Group | fac.Direct], prior: Prior, x: Estimate, cov_gaps: Array, states: Array, z: Array
 ) -> dict[str, float]:
     """The scale's variance, by the errors it comes from.
 
@@ -219,6 +219,8 @@ def _variance_parts(
 
     Parameters
     ----------
+    cov_gaps
+        (K, 9, 9) part of the covariance of the inertial increments that stands for missing readings.
     states, z
         (K, m, 1), (n,) that column.
     """
@@ -230,8 +232,9 @@ def _variance_parts(
     imu = groups["imu"]
     along = imu.apply(states, z[:, None])
     parts["accel_noise"] = float(np.sum(along * levels.by_level(imu, along)))
-    if isinstance(imu, fac.Group) and imu.gaps is not None:
-        parts["lost_readings"] = float(np.sum(along * (imu.gaps @ along)))
+    assert isinstance(imu, fac.Group) and imu.root is not None
+    unwhitened = imu.root.transpose(0, 2, 1) @ along
+    parts["lost_readings"] = float(np.sum(unwhitened * (cov_gaps @ unwhitened)))
     parts["gyro"] -= parts["accel_noise"] + parts["lost_readings"]
     by_prior = z * (prior.info @ z)
     for part, places in _PART_OF_GLOBALS.items():

@@ -121,7 +121,8 @@ def estimate_joint(
         return ScaleEstimate.refused("joint", error.hint)
     except np.linalg.LinAlgError:
         return ScaleEstimate.refused("joint", f"camera and IMU do not determine a scale together: {_RECORD_INSTEAD}")
-    fit.variance_parts["accel_faults"] = sum(s.scale_variance for s in fit.suspicions if s.name in faults.values)
+    left_open = sum(one.scale_variance for one in fit.suspicions if one.name in faults.values)
+    fit = replace(fit, variance_parts={**fit.variance_parts, "accel_faults": left_open})
     wrong = [*faults.sentences(), *_cut_off(data)]
     # what was taken from a path nobody can put back: its scale is too large by more than any interval says
     return _judged(fit, data.t_s, calibration, is_calibrated(imu), wrong, worthless=faults.path_is_smoothed)
