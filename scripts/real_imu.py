@@ -78,9 +78,10 @@ def _lines(path: Path) -> list[str]:
 
 
 @functools.lru_cache
-def read(folder: Path, name: str) -> Motion:
-    """One of ``RECORDINGS`` below a folder."""
+def read(folder: Path, name: str, *, whole: bool = False) -> Motion:
+    """One of ``RECORDINGS`` below a folder; ``whole`` with every pose of the motion capture."""
     (body_from_cam, cam_in_body_m), every = RECORDINGS[name]
+    every = 1 if whole else every
     lines = _lines(folder / f"{name}_imu.csv.xz")
     imu = np.loadtxt(lines, delimiter=",")
     stamps = np.array([int(line.partition(",")[0]) for line in lines])

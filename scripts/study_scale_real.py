@@ -1,13 +1,14 @@
 #!/usr/bin/env python3
 """Scale errors on recordings of other sensors: real IMUs, motion capture with errors such as a reconstruction has.
 
-    python scripts/study_scale_real.py FOLDER [--most 8] [--json FILE]
+    python scripts/study_scale_real.py FOLDER [--most 8] [--calibrated] [--json FILE]
 
 FOLDER holds TUM-VI rooms and EuRoC flights (``real_imu.py``). Whole recordings and windows of 20, 10, 5 and 3 s, with
 errors of 0, .5, 2 and 5 mm that are alike over .1, .35 or 1 s, an arbitrary scale, axes and clock. The estimator is
 told nothing of it. Each row: how many, signed mean, mean and rms of the error in %, how many 95 % intervals hold the
 truth (of those that were given), how many are trusted and of these right, rms of error over standard deviation, median
-half-width, refusals. Errors of 0 mm are the recordings' own.
+half-width, refusals. Errors of 0 mm are the recordings' own. With ``--calibrated`` the handheld ones alone, each with
+the accelerometer calibrated by the motion capture of the others (``capture_gains.py``).
 """
 
 from __future__ import annotations
@@ -21,11 +22,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-from real_imu import Window, recorded, windows
+from capture_gains import calibration_by
+from real_imu import HANDHELD, RECORDINGS, Window, recorded, windows
 
 from colmap_inertial.scale import estimate_scale
 from colmap_inertial.scale.verdict import Z95
 from colmap_inertial.threads import one_blas_thread
+from colmap_inertial.types import ImuCalibration
 
 LENGTHS_S = (np.inf, 20.0, 10.0, 5.0, 3.0)
 NOISES_M = (0.0, 0.0005, 0.002, 0.005)
@@ -42,11 +45,19 @@ class Outcome:
     reasons: tuple[str, ...]
 
 
+def calibrations(folder: Path) -> dict[str, ImuCalibration]:
+    """Of each handheld recording, by the others."""
+    names = [name for name, (rig, _) in RECORDINGS.items() if rig is HANDHELD]
+    return {name: calibration_by(folder, tuple(other for other in names if other != name)) for name in names}
+
+
 @one_blas_thread()
-def run(task: tuple[Path, Window]) -> Outcome:
+def run(task: tuple[Path, Window, ImuCalibration | None]) -> Outcome:
     """Estimate the scale of a window and compare."""
-    folder, window = task
+    folder, window, calibration = task
     trajectory, imu, truth = recorded(folder, window)
+    if calibration is not None:
+        imu = calibration.corrected(imu)
     estimate = estimate_scale(trajectory, imu)
     given = estimate.metres_per_unit
     return Outcome(
@@ -102,12 +113,15 @@ def main() -> None:
     parser.add_argument("--noises", nargs="+", type=float, default=NOISES_M, help="errors of the centres, m")
     parser.add_argument("--most", type=int, default=8, help="windows of a length in each recording")
     parser.add_argument("--seed", type=int, default=0, help="number of the first window")
+    parser.add_argument("--calibrated", action="store_true", help="handheld ones, calibrated by each other's")
     parser.add_argument("--json", type=Path, help="write every outcome")
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
     args = parser.parse_args()
     found = windows(args.folder, tuple(args.lengths), tuple(args.noises), most=args.most, first=args.seed)
+    known = calibrations(args.folder) if args.calibrated else {}
+    tasks = [(args.folder, w, known.get(w.recording)) for w in found if not args.calibrated or w.recording in known]
     with multiprocessing.Pool(args.processes) as pool:
-        outcomes = pool.map(run, [(args.folder, window) for window in found], chunksize=1)
+        outcomes = pool.map(run, tasks, chunksize=1)
     print(
         f"{'':<18}{'n':>4}{'signed':>8}{'mean':>7}{'rms':>7}{'inside':>8}{'trusted':>9}{'right':>7}{'z rms':>7}", end=""
     )
