@@ -73,6 +73,7 @@ from .stages.frame_folder import FrameRecord as FrameRecord
 from .stages.metric import MetricStage as MetricStage
 from .stages.protocols import FrameStage as FrameStage, KeypointStage as KeypointStage, ModelStage as ModelStage
 from .stages.readout import ReadoutStage as ReadoutStage
+from .stages.refine import RefineStage as RefineStage
 from .stages.rolling_shutter import RollingShutterStage as RollingShutterStage
 from .types import (
     AcceptedScale as AcceptedScale,

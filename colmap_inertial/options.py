@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 #: How blur is undone.
-BlurRemover = Literal["wiener", "deepgyro"]
-DeblurMethod = Literal["off", "wiener", "deepgyro"]
+BlurRemover = Literal["wiener", "path", "deepgyro"]
+DeblurMethod = Literal["off", "wiener", "path", "deepgyro"]
 RollingShutterMethod = Literal["off", "rectify"]
+RefineMethod = Literal["off", "inertial"]
 WorldAxes = Literal["z-up", "y-down"]
 #: What an export is for: a program, or a format.
 ExportProgram = Literal[
@@ -66,6 +67,8 @@ class MappingOptions:
     """SIFT: -1 starts at twice the image size (COLMAP's default), 0 at the image size (three times faster)."""
     mapper: Literal["incremental", "global"] = "incremental"
     """COLMAP's mapper."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """What finds and matches features; auto: CUDA where pycolmap has it, but for a deterministic run."""
     gravity_priors: bool = False
     """Global mapper only: start it from each frame's gravity direction, by the IMU (needs a calibration)."""
     refine_intrinsics: bool | None = None
@@ -190,24 +193,25 @@ class ProjectOptions:
     """An existing COLMAP project in place of a capture: the recording that ran along, and when images were taken."""
 
     imu: Path | None = None
-    """Project: IMU recording, a file or folder of a known format, or a capture.toml."""
+    """IMU recording: a file or folder of a known format, or a capture.toml."""
     frame_times: Path | None = None
-    """Project: CSV with columns name,t_s, or a capture.toml; with --video, the time of each of its frames."""
+    """When the images were taken: a CSV with columns name,t_s, or a capture.toml; with --video, the time of each of its
+    frames."""
     name_times: str | None = None
-    """Project: times are in the file names: the unit (s, ms, us, ns) of the longest number, its place as in
+    """Times are in the file names: the unit (s, ms, us, ns) of the longest number, its place as in
     cam0_{ns}_*, or a date as in PXL_%Y%m%d_%H%M%S%f."""
     exif_times: bool = False
-    """Project: times are in the images' EXIF, with fractions of a second."""
+    """Times are in the images' EXIF, with fractions of a second."""
     video: Path | None = None
-    """Project: images are frames of this video, and are found in it by their content."""
+    """The images are frames of this video, and are found in it by their content."""
     images: Path | None = None
-    """Project: folder of the project's images (default: images in the project)."""
+    """Folder of the project's images (default: images in the project)."""
     keep: tuple[str, ...] = ()
-    """Project: patterns of paths in it that are copied as they are, such as "old/*"."""
+    """Patterns of paths in it that are copied as they are, such as "old/*"."""
     link: bool = False
-    """Project: hard links for files that do not change; an edit of one then changes the original, too."""
+    """Hard links for files that do not change; an edit of one then changes the original, too."""
     follow_links: bool = False
-    """Project: take what symbolic links out of it lead to into OUT; without, they are refused."""
+    """Take what symbolic links out of it lead to into OUT; without, they are refused."""
 
     def __post_init__(self) -> None:
         ways = (self.frame_times is not None and self.video is None, self.name_times is not None, self.exif_times)
@@ -215,6 +219,27 @@ class ProjectOptions:
             raise ValueError(
                 "give one of --frame-times, --name-times, --exif-times and --video (--frame-times may go with --video)"
             )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReferenceOptions:
+    """Where the metres of a project come from, and what is known of its size."""
+
+    scale_from: Literal["imu", "target", "distance"] = "imu"
+    """Where metres come from: the IMU; or, of an existing project and without any IMU, a target of known size in its
+    images, or one known distance."""
+    target: str | None = None
+    """With --scale-from: the target, as of `validate --target`; of a distance between markers, what they are."""
+    between: tuple[str, str] | None = None
+    """With --scale-from distance: the numbers of two markers, or two points as x,y,z in the units of the model."""
+    distance: str | None = None
+    """With --scale-from distance: metres between them and how well they are known (standard deviation), as in
+    4.20+-0.01."""
+
+    def __post_init__(self) -> None:
+        given = [name for name in ("target", "between", "distance") if getattr(self, name) is not None]
+        if self.scale_from == "imu" and given:
+            raise ValueError(f"--{given[0]} goes with --scale-from target or --scale-from distance")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -271,17 +296,24 @@ class ReconstructOptions:
     """How pairs of a short and a long exposure become frames."""
     deblur: DeblurMethod | None = None
     """Undo motion blur by the gyroscope before COLMAP sees a frame. Not given: wiener, where exposure times are known
-    and the pictures bear the gyroscope out. deepgyro: by a network (slower; needs the extra `restore`)."""
+    and the pictures bear the gyroscope out. path: along the same path by a filter that expects few and strong edges
+    (slower). deepgyro: by a network (slower; needs the extra `restore`)."""
     rolling_shutter: RollingShutterMethod | None = None
     """Undo the rolling shutter by the gyroscope. Not given: rectify, where the readout time is known."""
     mapping: MappingOptions = field(default_factory=MappingOptions)
     """How COLMAP builds the model."""
     scale: ScaleOptions = field(default_factory=ScaleOptions)
     """How metres come from the IMU."""
+    refine: RefineMethod = "off"
+    """inertial: fit pictures, rolling shutter and IMU together, so that the metric model bends and drifts less; it
+    stays as it is where that predicts observations no better."""
     world: WorldAxes = "z-up"
     """Axes of the metric model: z away from the ground, or y towards it, as COLMAP's own cameras have it."""
+    georeference: bool = False
+    """Find out where on Earth the model stands, by the positions (GPS) in the video's telemetry or the pictures' EXIF:
+    heading and place, never the scale."""
     dense: bool = False
-    """Go on to depth maps (needs CUDA), a fused point cloud and a mesh in metres."""
+    """Go on to depth maps (quicker with CUDA), a fused point cloud and a mesh in metres."""
     dense_options: DenseOptions = field(default_factory=DenseOptions)
     """How the dense reconstruction is made."""
     deterministic: bool = False

@@ -174,8 +174,18 @@ def channels(values: np.ndarray, order: str) -> np.ndarray:
     return values[:, ["XYZ".index(letter.upper()) for letter in order]] * sign
 
 
-def write_gopro(path: Path, imu: ImuRecording, style: GoPro = MAX, *, frames: int | None = None) -> Path:
-    """A GoPro video whose first frame is at the first gyroscope stamp; payloads last 1.001 s."""
+def write_gopro(
+    path: Path,
+    imu: ImuRecording,
+    style: GoPro = MAX,
+    *,
+    frames: int | None = None,
+    gps: tuple[bytes, np.ndarray, np.ndarray, int] | None = None,
+) -> Path:
+    """A GoPro video whose first frame is at the first gyroscope stamp; payloads last 1.001 s.
+
+    ``gps``: GPS5 or GPS9, times, (N, 3) latitude, longitude, height, and which payload has no fix.
+    """
     t0, end = float(imu.gyro_t_s[0]), float(imu.gyro_t_s[-1])
     frames = round((end - t0) * 30000 / 1001) if frames is None else frames
     counts = max(2, int(np.ceil((end - t0) / 1.001)))
@@ -197,6 +207,9 @@ def write_gopro(path: Path, imu: ImuRecording, style: GoPro = MAX, *, frames: in
             inside = np.flatnonzero((t_s >= begin) & (t_s < stop)) if begin > t0 else np.flatnonzero(t_s < stop)
             if len(inside):
                 streams.append(_gopro_stream(key, t_s[inside[0]], values[inside], unit, inside[-1] + 1, style))
+        if gps is not None:
+            inside = (gps[1] >= begin) & (gps[1] < stop)
+            streams.append(_gopro_gps(gps[0], gps[1][inside], gps[2][inside], len(payloads) != gps[3]))
         about = [klv(b"DVID", b"L", 4, b"\0\0\0\1"), text(b"DVNM", b"Camera")]
         if style.clock == "DEVC":
             about.append(klv(b"TICK", b"L", 4, struct.pack(">I", round((begin + 1000) * 1e3))))
@@ -206,6 +219,20 @@ def write_gopro(path: Path, imu: ImuRecording, style: GoPro = MAX, *, frames: in
         data.append((b"GPMF", style.settings + bytes(64)))
     telemetry = Mp4Track(b"meta", b"gpmd", payloads, [1001] * len(payloads), timescale=1000)
     return write_mp4(path, [video_track(frames), telemetry], data)
+
+
+def _gopro_gps(key: bytes, t_s: np.ndarray, place: np.ndarray, fix: bool) -> bytes:
+    head = klv(b"STMP", b"J", 8, struct.pack(">Q", round((float(t_s[0]) + 1000) * 1e6)))
+    whole = np.rint(place * [1e7, 1e7, 1e3]).astype(int)
+    if key == b"GPS9":
+        head += text(b"TYPE", b"lllllllSS")
+        head += klv(b"SCAL", b"l", 4, struct.pack(">9l", 10**7, 10**7, 1000, 1000, 100, 1, 1000, 100, 1))
+        rows = b"".join(struct.pack(">7l2H", *row, 0, 0, 9000, 0, 140, 3 if fix else 0) for row in whole.tolist())
+        return nest(b"STRM", head, klv(b"GPS9", b"?", 32, rows))
+    head += klv(b"GPSF", b"L", 4, struct.pack(">I", 3 if fix else 0)) + klv(b"GPSP", b"S", 2, struct.pack(">H", 140))
+    head += text(b"GPSA", b"MSLV") + klv(b"SCAL", b"l", 4, struct.pack(">5l", 10**7, 10**7, 1000, 1000, 100))
+    rows = b"".join(struct.pack(">5l", *row, 0, 0) for row in whole.tolist())
+    return nest(b"STRM", head, klv(b"GPS5", b"l", 20, rows))
 
 
 def _gopro_stream(key: bytes, t_s: float, values: np.ndarray, unit: bytes, total: int, style: GoPro) -> bytes:
@@ -238,8 +265,11 @@ def _gopro_stream(key: bytes, t_s: float, values: np.ndarray, unit: bytes, total
 # --- other videos ----------------------------------------------------------------------------------------------------
 
 
-def write_camm(path: Path, imu: ImuRecording, *, frames: int = 60) -> Path:
-    """Gyroscope, accelerometer and one exposure for each frame, in one track with a tick of a microsecond."""
+def write_camm(path: Path, imu: ImuRecording, *, frames: int = 60, fixes: np.ndarray | None = None) -> Path:
+    """Gyroscope, accelerometer and one exposure for each frame, in one track with a tick of a microsecond.
+
+    ``fixes``: (N, 4) seconds, latitude, longitude, height.
+    """
     t0 = float(imu.gyro_t_s[0])
     packets = [(t, 2, struct.pack("<3f", *v)) for t, v in zip(imu.gyro_t_s - t0, imu.gyro_rad_s, strict=True)]
     packets += [
@@ -247,6 +277,8 @@ def write_camm(path: Path, imu: ImuRecording, *, frames: int = 60) -> Path:
     ]
     packets += [(i * 1001 / 30000, 1, struct.pack("<ii", 4_000_000, 21_000_000)) for i in range(frames)]
     packets += [(0.0, 7, struct.pack("<3f", 20.0, 0.0, 40.0))]
+    for t, lat, lon, up in np.zeros((0, 4)) if fixes is None else fixes:
+        packets.append((t, 6, struct.pack("<diddfff4f", 1e9 + t, 3, lat, lon, up, 2.5, 4.0, 0, 0, 0, 1)))
     packets.sort(key=lambda packet: packet[0])
     ticks = np.rint(np.array([t for t, _, _ in packets]) * 1e6).astype(int)
     samples = [struct.pack("<HH", 0, kind) + body for _, kind, body in packets]
@@ -376,6 +408,30 @@ def write_sensor_logger(
             f"3,phone,2026-01-01_12-00-00,{platform},1.30,abc,Gyroscope|Accelerometer,10|10,{str(standardised).lower()}"
         )
         archive.writestr("Metadata.csv", f"{head}\n{row}\n")
+    return path
+
+
+def write_phyphox(
+    folder: Path, imu: ImuRecording, *, delimiter: str = ",", decimal: str = ".", linear: bool = False
+) -> Path:
+    """A zip as phyphox exports it; ``linear`` leaves out the acceleration with gravity."""
+    sensors = {
+        "Gyroscope.csv": ("Gyroscope {} (rad/s)", imu.gyro_t_s, imu.gyro_rad_s),
+        "Linear Acceleration.csv" if linear else "Accelerometer.csv": (
+            "Linear Acceleration {} (m/s^2)" if linear else "Acceleration {} (m/s^2)",
+            imu.accel_t_s,
+            imu.accel_m_s2,
+        ),
+    }
+    path = folder / "Experiment 2026-01-01 12-00-00.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, (title, t_s, values) in sensors.items():
+            lines = [delimiter.join(f'"{cell}"' for cell in ("Time (s)", *(title.format(axis) for axis in "xyz")))]
+            for t, row in zip(t_s, values, strict=True):
+                lines.append(delimiter.join(f"{v:.9E}".replace(".", decimal) for v in (t, *row)))
+            archive.writestr(name, "\n".join(lines) + "\n")
+        archive.writestr("meta/device.csv", '"property","value"\n"deviceModel","phone"\n')
+        archive.writestr("meta/time.csv", '"event","experiment time","system time"\n"START",0.0E0,1.7E9\n')
     return path
 
 

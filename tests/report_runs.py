@@ -12,6 +12,7 @@ import pycolmap
 from colmap_inertial.geometry import quat_rotate
 from colmap_inertial.io.files import write_json
 from colmap_inertial.report.content import CROPS_FOLDER, DATA_FOLDER
+from colmap_inertial.report.photogrammetry import photogrammetry_record
 from colmap_inertial.report.scene import scene_record
 from colmap_inertial.report.signals import signal_record
 from colmap_inertial.scale import estimate_scale
@@ -111,8 +112,11 @@ def write_run(
     }
     write_json(out / "result.json", result)
     for i in range(models):
+        scene = scene_record(cloud(points), trajectory, gravity)
+        upright = np.array(scene["display_from_model_xyzw"])
         record = {
-            "scene": scene_record(cloud(points), trajectory, gravity),
+            "scene": scene,
+            "photogrammetry": photogrammetry_record(cloud(points), upright, unit=scene["unit"]),
             "signals": signal_record(trajectory, imu, estimate, gravity),
         }
         write_json(data / f"model_{i}.json", record)

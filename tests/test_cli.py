@@ -70,7 +70,7 @@ def test_what_is_mistyped_is_named_also_where_something_is_missing(capsys, args,
 def test_every_option_of_the_help_is_known(capsys, monkeypatch, command):
     monkeypatch.setenv("COLUMNS", "80")
     _, out, _ = run(capsys, command, "--help")
-    rows = re.findall(r"^\W (--[a-z].*)", out, re.MULTILINE)
+    rows = re.findall(r"^  (--[a-z].*?)(?:  |$)", out, re.MULTILINE)
     shown = {option for row in rows for option in re.findall(r"--[a-z][a-z.0-9-]*", row)}
     assert shown and shown <= set(_options(_COMMANDS[command]))
 
@@ -85,8 +85,49 @@ def test_help_mentions_version_and_completion_and_no_none_to_type(capsys, monkey
     monkeypatch.setenv("COLUMNS", columns)
     _, out, _ = run(capsys, "--help")
     assert "--version" in out and "--tyro-print-completion" in out
+    for command in _COMMANDS:
+        _, out, _ = run(capsys, command, "--help")
+        assert "{None}" not in out and "Default:" not in out and "default: None" not in out
+        assert max(map(len, out.splitlines())) <= int(columns)
+
+
+def test_common_options_come_first_and_those_of_all_commands_are_the_same(capsys):
     _, out, _ = run(capsys, "reconstruct", "--help")
-    assert "{None}" not in out and "Default:" not in out
+    places = [out.index(f"\n  {option}") for option in ("--dense", "--imu", "--json", "--mapping.pairing")]
+    places += [out.index(f"\n  {option}") for option in ("--apertures.cost", "--limits.megapixels")]
+    assert places == sorted(places)
+    for command in _COMMANDS:
+        _, out, _ = run(capsys, command, "-h")
+        assert all(f"\n  {option}" in out for option in ("--json PATH", "--quiet", "--verbose"))
+
+
+def test_an_option_is_spelled_the_same_with_and_without_its_group():
+    from colmap_inertial.cli import parse
+
+    for option in ("--latitude-deg", "--scale.latitude-deg"):
+        assert parse(["scale", "x", option, "47"]).options.latitude_deg == 47
+        assert parse(["reconstruct", "x", "y", f"{option}=47"]).options.scale.latitude_deg == 47
+        assert parse(["calibrate-imu", "x", "--out", "y", option, "47"]).gravity.latitude_deg == 47
+    assert parse(["reconstruct", "x", "y", "--no-refine-intrinsics"]).options.mapping.refine_intrinsics is False
+
+
+def test_an_option_of_two_groups_needs_its_group(capsys):
+    code, _, err = run(capsys, "reconstruct", "x", "y", "--max-image-size", "900")
+    assert code == 2 and "--mapping.max-image-size and --dense-options.max-image-size" in err
+
+
+@pytest.mark.parametrize("command", ["reconstruct", "diagnose"])
+def test_a_video_without_an_imu_and_one_that_is_none_say_so(capsys, tmp_path, command):
+    from imu_files import video_track, write_mp4
+
+    video = tmp_path / "clip.mp4"
+    write_mp4(video, [video_track(3)])
+    out = [tmp_path / "out"] if command == "reconstruct" else []
+    code, _, err = run(capsys, command, video, *out)
+    assert code == 2 and "is a video without an IMU that is known here" in err and "[video] and [imu]" in err
+    video.write_text("hello, I am a text\n")
+    code, _, err = run(capsys, command, video, *out)
+    assert code == 2 and "is named like a video and is none that is known here: it begins with text" in err
 
 
 def test_the_installed_command_runs():

@@ -305,22 +305,27 @@ def test_fusion_brings_back_what_clips(written, tmp_path):
     assert clipped[1] < clipped[0]
 
 
-def test_a_pair_that_shows_different_things_stays_as_filmed(capture, tmp_path):
+def test_of_a_pair_that_shows_different_things_the_better_one_is_taken(capture, tmp_path):
     rng = np.random.default_rng(0)
     other = cv2.resize(rng.uniform(20, 220, (20, 30, 3)), (240, 160), interpolation=cv2.INTER_CUBIC)
     cv2.imwrite(str(capture / "long" / "001.png"), np.clip(other, 0, 255).astype(np.uint8))
     first, second = fuse_exposures_captured(capture, tmp_path / "out", fuser=AVERAGE, progress=silent)
     assert first.fused and not second.fused and "does not show the same" in second.reason
-    kept = (tmp_path / "out" / "images" / "001.png").read_bytes()
-    assert kept == (capture / "short" / "001.png").read_bytes()
+    # the short one, as bright as the long one
+    assert second.used == "short" and second.reason.startswith("is the short exposure, ")
+    kept, dark = (read(folder / "001.png") for folder in (tmp_path / "out" / "images", capture / "short"))
+    assert second.gain == pytest.approx(GAIN) and kept.mean() > 2.5 * dark.mean()
 
 
-def test_a_black_short_exposure_stays_as_filmed(capture, tmp_path):
+def test_in_place_of_a_black_short_exposure_the_long_one_is_taken(capture, tmp_path):
     text = (capture / "capture.toml").read_text()
     (capture / "capture.toml").write_text("\n".join(line for line in text.splitlines() if "_iso" not in line))
     cv2.imwrite(str(capture / "short" / "000.png"), np.zeros((160, 240, 3), np.uint8))
     first, second = fuse_exposures_captured(capture, tmp_path / "out", fuser=AVERAGE, progress=silent)
-    assert not first.fused and "stays as it was filmed: too little of the pictures" in first.reason and second.fused
+    assert not first.fused and first.used == "long" and second.fused and second.used == "both"
+    assert first.reason.startswith("is the long exposure as it is, and not fused: too little of the pictures")
+    images = [read(folder / "000.png") for folder in (tmp_path / "out" / "images", capture / "long")]
+    assert np.array_equal(*images)
 
 
 def test_damaged_and_unlike_partners_are_named(capture, tmp_path):
@@ -504,5 +509,5 @@ def test_the_command_fuses_and_says_what_it_did(capture, tmp_path, by_average, c
         main(["fuse-exposures", str(capture / "capture.toml"), str(tmp_path / "out"), "--fusion", "mertens"])
     assert end.value.code == 0
     shown = capsys.readouterr().out
-    assert "1 of 2 pairs fused" in shown and "000.png stays as it was filmed" in shown
+    assert "1 of 2 pairs fused" in shown and "000.png is the long exposure as it is" in shown
     assert json.loads((tmp_path / "out" / "result.json").read_text())["fusion"] == "mertens"

@@ -319,6 +319,27 @@ def test_a_video_without_an_imu_says_so(tmp_path: Path) -> None:
         read_imu(path)
 
 
+@pytest.mark.parametrize(("delimiter", "decimal"), [(",", "."), (";", ","), ("\t", ".")])
+def test_phyphox_is_read_whatever_delimiter_was_chosen(tmp_path: Path, imu: ImuRecording, delimiter, decimal) -> None:
+    import zipfile
+
+    path = imu_files.write_phyphox(tmp_path, imu, delimiter=delimiter, decimal=decimal)
+    assert [one.name for one in imu_formats() if one.accepts(path)] == ["phyphox"]
+    found = read_imu(path)
+    assert found.device == "phyphox"
+    np.testing.assert_allclose(found.gyro_rad_s, imu.gyro_rad_s, rtol=1e-8, atol=1e-12)
+    np.testing.assert_allclose(found.accel_m_s2, imu.accel_m_s2, rtol=1e-8)
+    np.testing.assert_allclose(np.diff(found.gyro_t_s), np.diff(imu.gyro_t_s), atol=2e-8)
+    with zipfile.ZipFile(path) as archive:
+        archive.extractall(tmp_path / "unpacked")
+    np.testing.assert_array_equal(read_imu(tmp_path / "unpacked").accel_m_s2, found.accel_m_s2)
+
+
+def test_phyphox_without_gravity_says_what_to_record(tmp_path: Path, imu: ImuRecording) -> None:
+    with pytest.raises(FormatError, match=r"without gravity; record Accelerometer"):
+        read_imu(imu_files.write_phyphox(tmp_path, imu, linear=True))
+
+
 def test_sensor_logger_without_its_platform_or_gravity_is_refused(tmp_path: Path, imu: ImuRecording) -> None:
     import zipfile
 

@@ -22,7 +22,8 @@ ORDER = [
     ("flow",),
     ("align", "smooth"),
     ("scale",),
-    ("model", "rest"),
+    ("model", "rest", "georeference"),
+    ("refine",),
     ("validate", "diagnose", "report"),
     ("run",),
     ("stages",),
@@ -48,6 +49,8 @@ ESTIMATORS = (
     "align",
     "smooth",
     "scale",
+    "georeference",
+    "refine",
 )
 
 

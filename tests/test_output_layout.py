@@ -92,6 +92,8 @@ def test_which_images_are_rectified_does_not_hang_on_colmap_s_folder(tmp_path):
     assert (places_of(now).rectified, places_of(now).seen) == (now / "images", now / "images")
     assert (places_of(before).rectified, places_of(before).seen) == (before / "images_rectified", before / "images")
     (now / "colmap" / "images").mkdir(parents=True)
+    assert places_of(now).seen == now / "images"  # no run of ours made it
+    (now / ".stages").mkdir()
     assert (places_of(now).rectified, places_of(now).seen) == (now / "images", now / "colmap" / "images")
 
 
@@ -417,16 +419,19 @@ def test_the_screen_says_the_layout_in_a_line(workspace, capsys):
     summary = {"registered_images": 3, "points": 1, "observations": 3, "mean_reprojection_error_px": 0.5}
     refused = ScaleEstimate.refused("joint", "the camera stood still")
     model = ModelResult(index=0, colmap_index=0, scale=refused, summary=summary, sparse=workspace.colmap_sparse / "0")
-    show_result(ReconstructResult(workspace=workspace, models=(model,), seconds={}))
-    said = capsys.readouterr().out.splitlines()[-1]
+    show_result(ReconstructResult(workspace=workspace, models=(model,), seconds={}), Path("capture"))
+    said = capsys.readouterr().out.splitlines()[-2]
     assert said == f"no scale is accepted, so that nothing here is in metres: COLMAP's own is {model.sparse}"
     for folder in (workspace.images, workspace.sparse):
         folder.mkdir(parents=True)
     metric = ModelResult(**{**vars(model), "sparse_metric": workspace.sparse / "0"})
-    show_result(ReconstructResult(workspace=workspace, models=(metric,), seconds={}))
-    said = capsys.readouterr().out.splitlines()[-1]
+    show_result(ReconstructResult(workspace=workspace, models=(metric,), seconds={}), Path("capture"))
+    said = capsys.readouterr().out.splitlines()[-2]
     assert said == (
         f"{workspace.root} is a COLMAP project in metres (images, sparse); in COLMAP's units: {workspace.colmap}"
     )
-    show_result(ReconstructResult(workspace=workspace, models=(metric,), seconds={}, project_metric=workspace.root))
-    assert capsys.readouterr().out.splitlines()[-1] == f"{workspace.root} is the whole project in metres"
+    show_result(
+        ReconstructResult(workspace=workspace, models=(metric,), seconds={}, project_metric=workspace.root),
+        Path("capture"),
+    )
+    assert capsys.readouterr().out.splitlines()[-2] == f"{workspace.root} is the whole project in metres"

@@ -144,6 +144,15 @@ def test_deblurred_images_see_more_of_the_scene(tmp_path, scene, blurred):
     assert on.imaging.view.source == "capture"
     low, high = on.models[0].scale.ci95
     assert low < high and on.models[0].scale.verdict != "refused"
+    # COLMAP saw the deblurred frames smoothed; who goes on from the model does not
+    for record in on.frames:
+        seen, made = (tmp_path / "on" / folder / record.name for folder in ("colmap/images", "images"))
+        if record.action == "deblurred":
+            sharper = edges(cv2.imread(str(made))) / edges(cv2.imread(str(seen)))
+            assert sharper > 1.1 and exif() in seen.read_bytes() and exif() in made.read_bytes()
+        else:
+            assert seen.read_bytes() == made.read_bytes()
+    assert contents(tmp_path / "off" / "images") == contents(tmp_path / "off" / "colmap" / "images")
 
 
 def test_deblur_keeps_names_sizes_metadata_and_says_what_it_did(blurred, deblurred):
@@ -279,6 +288,19 @@ def test_the_plan_reads_back_and_the_stage_keeps_order_and_memory(tmp_path, blur
     for i, frame in enumerate(stage(frames())):
         assert frame.name == timing.names[i] and len(taken) <= i + 5
         assert [said.stage for said in frame.treatments] == ["deblur"] and frame.treatments[0].reason
+
+
+@pytest.mark.parametrize("said_s", [0.015, 0.06])
+def test_exposure_times_that_are_wrong_by_a_common_factor_are_corrected_and_said(tmp_path, blurred, said_s):
+    capture = tmp_path / "capture"
+    shutil.copytree(blurred, capture)
+    text = (capture / "capture.toml").read_text()
+    (capture / "capture.toml").write_text(text.replace("exposure_s = 0.03\n", f"exposure_s = {said_s}\n"))
+    plan = planned(parts(capture), tmp_path)
+    assert plan.deblur is not None
+    verdict = plan.deblur[1]
+    assert verdict.trusted is True and verdict.extent_factor == pytest.approx(0.03 / said_s, rel=0.15)
+    assert "exposure times are wrong" in plan.deblur_note
 
 
 def test_unknown_exposure_leaves_every_frame_and_says_why(tmp_path, blurred):

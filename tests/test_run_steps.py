@@ -6,6 +6,7 @@ import os
 import threading
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -14,6 +15,7 @@ import pytest
 from test_pipeline_parts import frames_of, recording_of, session_in
 
 from colmap_inertial.colmap import steps
+from colmap_inertial.colmap.pairing import MatchRecord
 from colmap_inertial.colmap.sparse import (
     KeypointRecords,
     extract_features,
@@ -35,6 +37,7 @@ from colmap_inertial.model import TRANSFORM_FILE
 from colmap_inertial.model.similarities import ModelScale, plain_factor
 from colmap_inertial.options import ExposureOptions, MappingOptions, ProjectOptions, ReconstructOptions
 from colmap_inertial.precalibrate import calibrate, plan as imaging
+from colmap_inertial.precalibrate.judge import Looked, by_frame
 from colmap_inertial.precalibrate.pairs import exposure_stage
 from colmap_inertial.precalibrate.plan import Treatments, plan_imaging
 from colmap_inertial.precalibrate.preflight import stop_or_doubt
@@ -263,6 +266,35 @@ def test_dropped_frames_are_not_written_and_say_why(tmp_path):
     assert {record.reason for record in records} == {"last said so"}
 
 
+def test_colmap_sees_a_frame_smoothed_and_everybody_else_as_it_is(tmp_path):
+    timing, frames = frames_of(tmp_path / "in")
+    rng = np.random.default_rng(2)
+
+    def restored(stream):
+        for frame in stream:
+            image = rng.integers(0, 256, frame.image.shape).astype(np.uint8)
+            yield replace(frame, image=image, smoothing_px=2.0) if frame.name in ("1.jpg", "2.jpg") else frame
+
+    seen, kept = tmp_path / "seen", tmp_path / "kept"
+    records = tmp_path / "frames.json"
+    paths = {"source_folder": tmp_path / "in", "images": seen, "records": records, "unsmoothed": kept}
+    write_frames(frames, timing.names, [restored], **paths, progress=silent)
+    assert sorted(path.name for path in kept.iterdir()) == ["1.jpg", "2.jpg"]
+    assert [record.action for record in framing.read_frame_records(records)].count("changed") == 2
+    write_images(
+        [lambda name, image: 255 - image], timing.names, {"2.jpg"}, seen, tmp_path / "out", silent, unsmoothed=kept
+    )
+    spread = {
+        name: [float(cv2.imread(str(tmp_path / folder / name)).std()) for folder in ("seen", "kept", "out")]
+        for name in ("1.jpg", "2.jpg")
+    }
+    assert all(smooth < 0.5 * itself and abs(out - itself) < 0.05 * itself for smooth, itself, out in spread.values())
+    assert (tmp_path / "out" / "1.jpg").samefile(kept / "1.jpg")
+    assert (tmp_path / "out" / "0.jpg").read_bytes() == (tmp_path / "in" / "0.jpg").read_bytes()
+    with pytest.raises(ValueError, match="smoothing_px"):
+        replace(next(frames_of(tmp_path / "more")[1]), smoothing_px=-1.0)
+
+
 def test_pictures_whose_keypoints_stayed_are_copied(tmp_path):
     timing, _ = frames_of(tmp_path / "in")
     write_images([lambda name, image: 255 - image], timing.names, {"2.jpg"}, tmp_path / "in", tmp_path / "out", silent)
@@ -319,15 +351,16 @@ def colmap(workspace, monkeypatch):
         database.write_text("features")
         return KeypointRecords()
 
-    def match(features, database, pairs, context):
-        given["pairs"] = list(pairs)
+    def match(features, database, recording, camera, options, context):
+        given["matched"] = list(recording.timing.names)
         database.write_text("matches")
+        return MatchRecord(device="cpu", pairing="exhaustive", images=2, pairs=1, matched=1, verified=1, gyroscope="")
 
     def map_them(database, images, target, options, **more):
         target.mkdir()
 
     monkeypatch.setattr(steps, "extract_features", extract)
-    monkeypatch.setattr(steps, "match_features", match)
+    monkeypatch.setattr(steps, "match_capture", match)
     monkeypatch.setattr(steps, "map_images", map_them)
     monkeypatch.setattr(steps, "write_gravity_priors", lambda database, gravity: given.update(gravity=gravity))
 
@@ -335,7 +368,11 @@ def colmap(workspace, monkeypatch):
         session = session_in(workspace)
         session.runner.run("frames", {"option": frames}, [workspace.images], lambda partial: partial[0].mkdir())
         options = replace(ReconstructOptions(), mapping=MappingOptions(overlap=overlap))
-        steps.run_colmap(session, records, [], gravity or {}, options)
+        names = tuple(record.name for record in records if record.used)
+        seen = SimpleNamespace(
+            timing=FrameTiming(names=names, t_s=np.arange(len(names)) * 0.1), imu=None, prior=None, max_offset_s=None
+        )
+        steps.run_colmap(session, seen, records, [], gravity or {}, options)
         return session.runner.worked
 
     run.given = given
@@ -350,7 +387,7 @@ def test_colmap_is_given_the_frames_that_are_used(colmap):
     colmap(used(*NAMES, dropped=("2.jpg",)))
     kept = [name for name in NAMES if name != "2.jpg"]
     assert colmap.given["images"] == kept
-    assert {name for pair in colmap.given["pairs"] for name in pair} == set(kept)
+    assert colmap.given["matched"] == kept
 
 
 def test_every_image_of_a_long_recording_is_matched_with_its_neighbours():
@@ -515,15 +552,22 @@ class Shown:
 
     enough = extent_is_plausible = True
 
-    def __init__(self, support):
+    def __init__(self, support, other=0.0):
         self.support = support
+        self.sigmas = np.full((19, 12), other)
 
 
 @pytest.mark.parametrize(("clear", "trusted"), [(20, True), (10, None), (1, None)])
 def test_a_gyroscope_is_trusted_for_all_frames_where_nearly_all_bear_it_out(clear, trusted):
     verdict = imaging.RecordingVerdict(trusted=True, support=9.0, extent_factor=1.0, frames=20, reason="")
-    evidence = [Shown(20.0)] * clear + [Shown(-1.0)] * (20 - clear)
-    assert imaging._by_frame(verdict, evidence, [20.0] * 20).trusted is trusted
+    clearly, hardly = Looked(Shown(20.0), -1.5, 20.0), Looked(Shown(-1.0), -0.3, 20.0)
+    assert by_frame(verdict, [clearly] * clear + [hardly] * (20 - clear)).trusted is trusted
+    # a faint dip is none of a wrong gyroscope where detail lacks along the blur, and no other direction has a dip
+    faintly, elsewhere = Looked(Shown(1.0), -0.9, 20.0), Looked(Shown(1.0, other=6.0), -0.9, 20.0)
+    assert by_frame(verdict, [clearly] * clear + [faintly] * (20 - clear)).trusted is True
+    assert by_frame(verdict, [clearly] * clear + [elsewhere] * (20 - clear)).trusted is trusted
+    # short blur tells nothing
+    assert by_frame(verdict, [clearly] * clear + [replace(hardly, blur_px=5.0)] * (20 - clear)).trusted is True
 
 
 def test_the_middle_of_a_recording_stands_for_it():

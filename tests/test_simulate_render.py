@@ -170,3 +170,7 @@ def test_same_seed_same_world_and_picture():
     noisy = [develop(pictures[0], camera, np.random.default_rng(1)) for _ in range(2)]
     np.testing.assert_array_equal(*noisy)
     assert np.isfinite(Renderer(a).depth_m(camera, motion, 1.0)).all()
+
+
+def test_posters_smaller_than_their_smallest_shapes_can_be_printed():
+    assert len(make_world("desk", 11).quads) > 100

@@ -2,6 +2,8 @@
 
 import io
 import json
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,7 +12,8 @@ from rich.console import Console
 from rich.progress import Progress as Bars
 
 from colmap_inertial.cli import main
-from colmap_inertial.cli.terminal import Screen, show_scale
+from colmap_inertial.cli.screen import Screen, Stage
+from colmap_inertial.cli.terminal import show_scale
 from colmap_inertial.diagnose import Diagnosis, Finding
 from colmap_inertial.simulate import MotionOptions, RecordingOptions, simulate_recording
 from colmap_inertial.types import ScaleEstimate
@@ -75,6 +78,58 @@ def test_what_the_check_beforehand_finds_is_said_before_the_work(still, tmp_path
     assert found < work and "(no-motion)" in err[found:work]
 
 
+@pytest.mark.parametrize("width", [80, 140, None], ids=["80", "140", "piped"])
+def test_a_finding_that_stops_the_run_is_left_to_the_error(width):
+    stops = Finding(code="stabilised", severity="error", evidence="the video is stabilised", advice="film without it")
+    screen, file = screen_of(width)
+    screen.findings(Diagnosis(findings=(stops, CUT)), stops=True)
+    said = " ".join(file.getvalue().split())
+    assert "saturated" in said and "stabilised" not in said and "Ctrl-C" not in said
+    screen, file = screen_of(width)
+    screen.findings(Diagnosis(findings=(stops, CUT)))
+    assert "the video is stabilised" in " ".join(file.getvalue().split())
+
+
+def test_a_pipe_has_a_line_for_each_stage_and_few_of_how_far_it_is():
+    now = [0.0]
+    file = io.StringIO()
+    console = Console(file=file, width=80)
+    screen = Screen(console, Bars(console=console, disable=True), now=lambda: now[0])
+    for step in ("frames", "matches"):
+        screen.kept(step)
+    screen.began("mapping", [])
+    for done in range(101):
+        screen("mapping", done, 100)
+        now[0] += 1
+    screen("metric", 0, 1)
+    lines = file.getvalue().splitlines()
+    assert lines[:3] == ["kept from the earlier run: frames, matches", "Mapping ...", "Mapping 10/100, 1:30 left"]
+    assert lines[-2:] == ["Mapping 100/100, took 1:40", "Metric scale ..."] and len(lines) == 13
+    assert not screen.unchanged
+
+
+def test_the_time_left_is_by_what_this_run_did_and_runs_down():
+    stage = Stage(0.0, 40, 100)
+    assert stage.ends_in(5.0) == ""  # nothing done yet
+    stage.moved(30.0, 50, 100)
+    assert stage.left_s(30.0) == pytest.approx(150)
+    assert stage.left_s(40.0) == pytest.approx(140) and stage.ends_in(40.0) == "2:20 left"
+    stage.moved(60.0, 100, 100)
+    assert stage.ends_in(60.0) == ""
+    assert Stage(0.0, 0, 0).left_s(9.0) is None
+
+
+def test_before_the_first_step_is_done_the_bytes_written_move(tmp_path):
+    database = tmp_path / "database.db"
+    stage = Stage(0.0, 0, 990, [database])
+    assert stage.count() == "0/990"
+    database.write_bytes(bytes(3_000_000))
+    (tmp_path / "database.db-wal").write_bytes(bytes(9_000_000))
+    assert stage.count() == "0/990 (12 MB)"
+    stage.moved(1.0, 400, 990)
+    assert stage.count() == "400/990"
+
+
 def estimate(verdict, reasons, notes):
     number = {"metres_per_unit": 2.0, "sigma_log": 0.02, "ci95": (1.9, 2.1)}
     if verdict == "refused":
@@ -98,9 +153,50 @@ def test_only_what_decided_the_verdict_stands_as_reason(verdict, width, monkeypa
     assert max(map(len, out.splitlines())) <= int(width)
 
 
-def test_a_scale_says_apart_what_its_recording_has(project, tmp_path, capsys):
-    from dataclasses import replace
+def test_json_goes_to_standard_output_alone(project, capsys):
+    args = ["scale", project.model, "--imu", project.imu, "--frame-times", project.frame_times, "--json", "-"]
+    code, out, err = run(capsys, *args)
+    assert code == 0 and err == ""
+    found = json.loads(out)
+    assert found["verdict"] in ("trusted", "weak") and found["ci95"]
 
+
+def test_without_json_a_scale_is_looked_at(project, capsys):
+    files = ["--imu", project.imu, "--frame-times", project.frame_times]
+    code, out, _ = run(capsys, "scale", project.model, *files)
+    assert code == 0 and "m per unit" in out and "Verdict" in out
+    code, out, err = run(capsys, "scale", project.model, *files, "--quiet")
+    assert (code, out, err) == (0, "", "")
+
+
+def test_an_error_is_json_too_where_json_was_asked_for(tmp_path, capsys):
+    code, out, err = run(capsys, "scale", tmp_path / "nowhere", "--json", "-")
+    assert code == 2 and "no such file" in err
+    assert json.loads(out) == {"error": err.removeprefix("error: ").strip(), "exit_code": 2}
+
+
+def test_quiet_and_verbose_are_not_given_together(capsys):
+    code, _, err = run(capsys, "diagnose", "x", "--quiet", "--verbose")
+    assert code == 2 and "one of --quiet and --verbose" in err
+
+
+def test_verbose_prints_the_log_of_a_run_and_json_says_that_nothing_was_done(project, tmp_path, capsys):
+    args = ["reconstruct", project.model, tmp_path / "out", "--imu", project.imu, "--frame-times", project.frame_times]
+    code, out, err = run(capsys, *args, "--verbose", "--json", "-")
+    first = json.loads(out)
+    assert code == 0 and (first["unchanged"], first["exit_code"]) == (False, 0)
+    assert " INFO metric: started" in err
+    code, out, err = run(capsys, *args, "--json", "-")
+    again = json.loads(out)
+    assert code == 0 and again["unchanged"] and " INFO " not in err
+    assert again["models"] == first["models"]
+    code, out, err = run(capsys, *args)
+    assert code == 0 and out.startswith("nothing to do: kept from the earlier run")
+    code, out, err = run(capsys, *args, "--quiet")
+    assert (code, out, err) == (0, "", "")
+
+
+def test_a_scale_says_apart_what_its_recording_has(project, tmp_path, capsys):
     far = replace(
         project.recording, imu=replace(project.recording.imu, epoch_ns=project.recording.imu.epoch_ns + 10**12)
     )
@@ -115,3 +211,77 @@ def test_a_scale_says_apart_what_its_recording_has(project, tmp_path, capsys):
     assert not any(said in reason for reason in found["reasons"]) and any(said in note for note in found["notes"])
     (line,) = (line for line in out.splitlines() if said in line)
     assert "Note" in line
+
+
+def test_a_batch_says_what_was_found_in_each_capture_once(capsys):
+    from colmap_inertial.batch.task import CaptureStatus
+    from colmap_inertial.batch.terminal import live_batch
+
+    found = "error: it hardly moves [at 3 s]; swing it (no-motion)"
+    with live_batch() as watch:
+        for done in range(3):
+            watch(
+                CaptureStatus(
+                    name="hall", state="running", stage="matches", steps_done=done, steps=9, findings=(found,)
+                )
+            )
+        ended = CaptureStatus(
+            name="yard", state="failed", exit_code=3, error="scale: it hardly moves [at 3 s]; swing it"
+        )
+        watch(replace(ended, findings=(found, "warning: 2 % are cut; use a wider range (saturated)")))
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == f"hall {found}" and "".join(lines).count("no-motion") == 1
+    assert lines[1] == "yard warning: 2 % are cut; use a wider range (saturated)"
+    with live_batch(quiet=True) as watch:
+        watch(ended)
+    assert capsys.readouterr().err == ""
+
+
+@pytest.fixture(scope="module")
+def made(project, tmp_path_factory):
+    """An existing project in metres, and the arguments that made it."""
+    out = tmp_path_factory.mktemp("made") / "out"
+    args = ["reconstruct", project.model, out, "--imu", project.imu, "--frame-times", project.frame_times]
+    with pytest.raises(SystemExit):
+        main([*map(str, args), "--quiet"])
+    return args
+
+
+@pytest.mark.parametrize("columns", ["80", "140"])
+def test_the_last_screen_begins_with_metres_and_ends_with_the_next_command(made, columns, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", columns)
+    _, out, _ = run(capsys, *made)
+    lines = out.splitlines()
+    box = [line for line in lines if line.startswith("\u2502")]
+    assert re.match(r"\u2502 Metres +10 m are 10 m to within \d+(\.\d)? cm", box[0])
+    assert [line.split()[1] for line in box if line.split()[1] in ("Verdict", "Scale", "Images", "Written")] == [
+        "Verdict", "Scale", "Images", "Written",
+    ]  # fmt: skip
+    assert max(map(len, box)) <= int(columns)
+    assert lines[-1] == f"next: colmap-inertial view {made[2]}"
+
+
+def test_a_refused_scale_ends_with_what_to_look_at(still, tmp_path, capsys):
+    args = ["--imu", still.imu, "--frame-times", still.frame_times]
+    code, out, err = run(capsys, "reconstruct", still.model, tmp_path / "out", *args)
+    assert code == 3 and "no metres: the recording does not tell how large things are" in " ".join(out.split())
+    assert out.splitlines()[-1] == f"next: colmap-inertial diagnose {still.model}"
+    assert err.splitlines()[-1] == "error: no scale is accepted, for the reasons above"
+    assert err.count("(no-motion)") == 1
+
+
+@pytest.mark.parametrize(
+    ("checked", "words"),
+    [
+        (("gyroscope", "accelerometer", "frame times"), "whether camera and gyroscope belong together"),
+        (("gyroscope", "frame times", "pictures"), "gravity and scale (no accelerometer)"),
+        (("gyroscope", "accelerometer", "frame times", "pictures"), ""),
+    ],
+)
+def test_nothing_found_says_what_was_not_checked(checked, words, capsys):
+    from colmap_inertial.cli.terminal import show_diagnosis
+
+    for findings in ((), (CUT,)):
+        show_diagnosis(Diagnosis(findings=findings, checked=checked), Path("capture"))
+        last = capsys.readouterr().out.splitlines()[-1]
+        assert last.startswith(f"not checked: {words}") if words else "not checked" not in last

@@ -1,4 +1,4 @@
-"""Linear algebra and integration of `colmap_inertial.scale` and `.align`. Results are written in place."""
+"""Linear algebra and integration of `colmap_inertial.scale`, `.align` and `.refine`. Results are written in place."""
 
 from numpy import int64
 from numpy.typing import NDArray
@@ -78,6 +78,29 @@ def whiten_tridiagonal(diagonal: Array, below: Array, sides: Array) -> float:
     """Divide `sides` (N, c) by the Cholesky factor of a tridiagonal matrix; half the logarithm of its determinant.
 
     The latter is nan where the matrix is not positive definite.
+    """
+
+def reduce_points(
+    *,
+    first: NDArray[int64],
+    column: NDArray[int64],
+    by_frame: Array,
+    by_shared: Array,
+    by_point: Array,
+    residual: Array,
+    damping: float,
+    band: Array,
+    border: Array,
+    corner: Array,
+    rhs: Array,
+    rhs_shared: Array,
+    inverse: Array,
+    pull: Array,
+) -> bool:
+    """Add the normal equations of a bundle adjustment without its P points; False where they lie outside the band.
+
+    Observations (M), point by point from `first` (P + 1): their frames' `column`, derivatives (M, 2, 9), (M, 2, q),
+    (M, 2, 3) and residuals (M, 2). The band (n, width + 1) has the lower triangle, column by column.
     """
 
 def instruction_sets() -> list[str]:

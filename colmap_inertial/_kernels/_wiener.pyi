@@ -28,6 +28,23 @@ def deblur(
 ) -> tuple[float, float]:
     """Write the deblurred (H, W, C) image into `result`; returns the processor time of decoding and of filtering, s."""
 
+def blend(
+    image: NDArray[Code],
+    light: NDArray[np.float32],
+    result: NDArray[Code],
+    *,
+    extent_px: NDArray[np.float32],
+    slope: NDArray[np.float32],
+    along_y: NDArray[np.bool_],
+    fade: NDArray[np.float32],
+    decode: NDArray[np.float32],
+    encode: NDArray[np.float32],
+    saturated: int,
+    threads: int = 0,
+    instruction_set: str = "",
+) -> None:
+    """Write the codes of `light`, which another filter made of the (H, W, C) image, into `result`."""
+
 def peak_multiply_adds(instruction_set: str = "", seconds: float = 0.2) -> float:
     """Fused multiply-adds a second that one core reaches in registers, each lane counted."""
 

@@ -1,6 +1,7 @@
 #include "arrays.h"
 #include "arrow_simd.h"
 #include "dispatch.h"
+#include "points.h"
 #include "preintegration.h"
 
 #include <nanobind/nanobind.h>
@@ -188,6 +189,26 @@ double whiten_tridiagonal(In<1> diagonal, In<1> below, Out<2> sides) {
     return logarithm;
 }
 
+// Adds the normal equations of a bundle adjustment without its points; see the stub.
+bool reduce_points_of(Of<const int64_t, 1> first, Of<const int64_t, 1> column, In<3> by_frame, In<3> by_shared,
+                      In<3> by_point, In<2> residual, double damping, Out<2> band, Out<2> border, Out<2> corner,
+                      Out<1> rhs, Out<1> rhs_shared, Out<3> inverse, Out<2> pull) {
+    const size_t m = column.shape(0), n = rhs.shape(0), q = rhs_shared.shape(0), p = pull.shape(0);
+    check(is(by_frame, m, 2, FRAME) && is(by_shared, m, 2, q) && is(by_point, m, 2, 3) && is(residual, m, 2),
+          "derivatives: not of one size");
+    check(is(border, n, q) && is(corner, q, q) && is(inverse, p, 3, 3) && is(first, p + 1) && is(band, n, band.shape(1)),
+          "results: not of the size of the derivatives");
+    check(first(0) == 0 && size_t(first(p)) == m && band.shape(1) >= size_t(STATE), "first: not up to the last one");
+    for (size_t i = 0; i < p; ++i) check(first(i) <= first(i + 1), "first: must not fall");
+    for (size_t i = 0; i < m; ++i) check(column(i) >= 0 && size_t(column(i) + STATE) <= n, "column: outside the band");
+    const Seen seen{ptrdiff_t(p), ptrdiff_t(q), first.data(), column.data(), by_frame.data(), by_shared.data(),
+                    by_point.data(), residual.data(), damping};
+    const Reduced out{ptrdiff_t(band.shape(1)), band.data(), border.data(), corner.data(),
+                      rhs.data(), rhs_shared.data(), inverse.data(), pull.data()};
+    nb::gil_scoped_release release;
+    return reduce_points(seen, out);
+}
+
 std::vector<std::string> instruction_sets() {
     std::vector<std::string> names;
     for (const char *name : {"base", "avx2", "avx512"})
@@ -218,5 +239,10 @@ NB_MODULE(_inertial, module) {
                nb::arg("rate").noconvert());
     module.def("whiten_tridiagonal", &whiten_tridiagonal, nb::arg("diagonal"), nb::arg("below"),
                nb::arg("sides").noconvert());
+    module.def("reduce_points", &reduce_points_of, nb::kw_only(), nb::arg("first"), nb::arg("column"),
+               nb::arg("by_frame"), nb::arg("by_shared"), nb::arg("by_point"), nb::arg("residual"), nb::arg("damping"),
+               nb::arg("band").noconvert(), nb::arg("border").noconvert(), nb::arg("corner").noconvert(),
+               nb::arg("rhs").noconvert(), nb::arg("rhs_shared").noconvert(), nb::arg("inverse").noconvert(),
+               nb::arg("pull").noconvert());
     module.def("instruction_sets", &instruction_sets);
 }

@@ -219,6 +219,32 @@ class Deblur {
         return {double(middle - start) / CLOCKS_PER_SEC, double(end - middle) / CLOCKS_PER_SEC};
     }
 
+    // The result of another filter, as linear light, in place of its own.
+    void blend(const float *light) {
+        lost_light_.find(image_, codec_, threads_);
+        in_parallel(field_.ny, threads_, [&](int cy) {
+            for (int cx = 0; cx < field_.nx; ++cx) {
+                if (faded(cy, cx)) {
+                    copy(cy, cx);
+                    continue;
+                }
+                float share[CELL][CELL];
+                const bool blended = shares(cy, cx, share);
+                const int rows = std::min(CELL, size_.height - cy * CELL),
+                          columns = std::min(CELL, size_.width - cx * CELL);
+                for (int channel = 0; channel < size_.channels; ++channel) {
+                    alignas(64) float tile[CELL * CELL] = {};
+                    for (int y = 0; y < rows; ++y)
+                        for (int x = 0; x < columns; ++x)
+                            tile[y * CELL + x] = light[(size_t(cy * CELL + y) * size_t(size_.width) +
+                                                        size_t(cx * CELL + x)) * size_t(size_.channels) +
+                                                       size_t(channel)];
+                    write(cy, cx, channel, tile, false, blended ? share : nullptr);
+                }
+            }
+        });
+    }
+
   private:
     void decode() {
         for (const bool transposed : {false, true}) {
@@ -382,6 +408,16 @@ Seconds deblur(const Code *image, Code *result, Image size, const Field &field, 
     return Deblur<Code>(image, result, size, field, table, codec, simd, threads > 0 ? threads : usable_threads()).run();
 }
 
+template <class Code>
+void blend(const Code *image, const float *light, Code *result, Image size, const Field &field, const Codec &codec,
+           const Simd &simd, int threads) {
+    const Table none{};
+    Deblur<Code>(image, result, size, field, none, codec, simd, threads > 0 ? threads : usable_threads()).blend(light);
+}
+
+template void blend(const uint8_t *, const float *, uint8_t *, Image, const Field &, const Codec &, const Simd &, int);
+template void blend(const uint16_t *, const float *, uint16_t *, Image, const Field &, const Codec &, const Simd &,
+                    int);
 template Seconds deblur(const uint8_t *, uint8_t *, Image, const Field &, const Table &, const Codec &, const Simd &,
                         int);
 template Seconds deblur(const uint16_t *, uint16_t *, Image, const Field &, const Table &, const Codec &, const Simd &,

@@ -49,3 +49,9 @@ struct Seconds {
 template <class Code>
 Seconds deblur(const Code *image, Code *result, Image size, const Field &field, const Table &table, const Codec &codec,
                const Simd &simd, int threads);
+
+// The codes of what another filter made of the image, as linear light: as `deblur`, of which it takes the share of the
+// result and the image's own codes where that is zero.
+template <class Code>
+void blend(const Code *image, const float *light, Code *result, Image size, const Field &field, const Codec &codec,
+           const Simd &simd, int threads);

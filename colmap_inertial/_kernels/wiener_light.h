@@ -1,6 +1,7 @@
 // Linear light of an image in planes that the filter can read: mirrored surroundings, smoothed, rows or columns.
 #pragma once
 
+#include "in_parallel.h"
 #include "wiener.h"
 
 #include <algorithm>
@@ -11,26 +12,6 @@
 #include <thread>
 #include <type_traits>
 #include <vector>
-
-// Calls work(i) for 0 <= i < count, every i once.
-template <class Work>
-void in_parallel(int count, int threads, const Work &work) {
-    std::atomic<int> next{0};
-    auto loop = [&] {
-        for (int i; (i = next.fetch_add(1, std::memory_order_relaxed)) < count;) work(i);
-    };
-    std::vector<std::thread> others;
-    for (int t = 1; t < std::min(threads, count); ++t) others.emplace_back(loop);
-    loop();
-    for (auto &thread : others) thread.join();
-}
-
-inline int mirrored(int index, int size) {
-    if (size == 1) return 0;
-    const int period = 2 * size - 2;
-    index = std::abs(index) % period;
-    return std::min(index, period - index);
-}
 
 // Linear light with its mirrored surroundings. Transposed for cells whose major axis is y, so that the taps always
 // run along the rows.

@@ -67,6 +67,32 @@ std::pair<double, double> deblur_image(In<Code, 3> image, Out<Code> result, In<f
     return {seconds.decode, seconds.filter};
 }
 
+template <class Code>
+void blend_image(In<Code, 3> image, In<float, 3> light, Out<Code> result, In<float, 2> extent_px, In<float, 2> slope,
+                 In<bool, 2> along_y, In<float, 2> fade, In<float, 1> decode, In<float, 1> encode, int saturated,
+                 int threads, const std::string &instruction_set) {
+    const int height = int(image.shape(0)), width = int(image.shape(1));
+    const int ny = (height + CELL - 1) / CELL, nx = (width + CELL - 1) / CELL;
+    auto is = [](const auto &array, size_t rows, size_t columns) {
+        return array.shape(0) == rows && array.shape(1) == columns;
+    };
+    check(height > 0 && width > 0 && image.shape(2) > 0, "image: empty");
+    check(is(result, image.shape(0), image.shape(1)) && result.shape(2) == image.shape(2) &&
+              is(light, image.shape(0), image.shape(1)) && light.shape(2) == image.shape(2),
+          "light, result: not the shape of image");
+    check(is(extent_px, ny, nx) && is(slope, ny, nx) && is(along_y, ny, nx),
+          "extent_px, slope, along_y: not one value for each cell");
+    check(is(fade, ny + 1, nx + 1), "fade: not one value for each corner");
+    check(decode.shape(0) == size_t(1) << (8 * sizeof(Code)), "decode: not one value for each code");
+    check(encode.shape(0) >= 3, "encode: too short");
+    const Field field{ny, nx, extent_px.data(), slope.data(), along_y.data(), fade.data()};
+    const Codec codec{decode.data(), encode.data(), int(encode.shape(0)) - 2, saturated};
+    const Simd &simd = simd_for(instruction_set);
+    nb::gil_scoped_release release;
+    blend(image.data(), light.data(), result.data(), Image{height, width, int(image.shape(2))}, field, codec, simd,
+          threads);
+}
+
 // Multiply-adds a second, lanes counted singly, that one core does on numbers in registers: the best of several runs.
 double peak_multiply_adds(const std::string &instruction_set, double seconds) {
     const Simd &simd = simd_for(instruction_set);
@@ -94,6 +120,15 @@ std::vector<std::string> instruction_sets() {
 }
 
 template <class Code>
+void define_blend(nb::module_ &module) {
+    module.def("blend", &blend_image<Code>, nb::arg("image").noconvert(), nb::arg("light").noconvert(),
+               nb::arg("result").noconvert(), nb::kw_only(), nb::arg("extent_px").noconvert(),
+               nb::arg("slope").noconvert(), nb::arg("along_y").noconvert(), nb::arg("fade").noconvert(),
+               nb::arg("decode").noconvert(), nb::arg("encode").noconvert(), nb::arg("saturated"),
+               nb::arg("threads") = 0, nb::arg("instruction_set") = "");
+}
+
+template <class Code>
 void define(nb::module_ &module) {
     module.def("deblur", &deblur_image<Code>, nb::arg("image").noconvert(), nb::arg("result").noconvert(),
                nb::kw_only(), nb::arg("extent_px").noconvert(), nb::arg("slope").noconvert(),
@@ -107,6 +142,8 @@ void define(nb::module_ &module) {
 
 NB_MODULE(_wiener, module) {
     define<uint8_t>(module);
+    define_blend<uint8_t>(module);
+    define_blend<uint16_t>(module);
     define<uint16_t>(module);
     define<float>(module);
     module.def("peak_multiply_adds", &peak_multiply_adds, nb::arg("instruction_set") = "", nb::arg("seconds") = 0.2);

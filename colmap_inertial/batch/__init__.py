@@ -56,10 +56,13 @@ class BatchResult:
         The batch's folder.
     captures
         Every capture, in the manifest's order.
+    unchanged
+        Whether there was nothing to do: every capture had its end already.
     """
 
     out: Path
     captures: tuple[CaptureStatus, ...]
+    unchanged: bool = False
 
     def exit_code(self) -> int:
         """0 where every capture is done, else 1."""
@@ -141,7 +144,7 @@ def run_batch(
             at_work.stop()
             raise
         finally:
-            result = BatchResult(out=out, captures=at_work.statuses())
+            result = BatchResult(out=out, captures=at_work.statuses(), unchanged=not waiting)
             write_summary(result)
     return result
 

@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 import traceback
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from colmap_inertial.batch.task import (
     with_result,
     write_status,
 )
+from colmap_inertial.diagnose import Diagnosis
 from colmap_inertial.drivers.capture import reconstruct
 from colmap_inertial.drivers.project import is_project, reconstruct_project
 from colmap_inertial.errors import InertialError, OutputExistsError
@@ -49,9 +51,10 @@ def main() -> None:
     threading.Thread(target=_end_with_the_parent, daemon=True).start()
     if cores and hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, cores)
-    status = read_status(task.status)
-    if status is None:
+    known = read_status(task.status)
+    if known is None:
         raise SystemExit(f"{task.status} cannot be read")
+    status = known
     last = 0.0
 
     def progress(stage: str, done: int, total: int, /) -> None:
@@ -61,8 +64,16 @@ def main() -> None:
             last = now
             write_status(task.status, dataclasses.replace(status, stage=stage, steps_done=done, steps=total))
 
+    def findings(diagnosis: Diagnosis) -> None:
+        nonlocal status
+        said = (f for f in diagnosis.findings if f.severity != "info")
+        status = dataclasses.replace(
+            status, findings=tuple(f"{f.severity}: {f.evidence}; {f.advice} ({f.code})" for f in said)
+        )
+        write_status(task.status, status)
+
     try:
-        _reconstruct(task, progress)
+        _reconstruct(task, progress, findings)
         end = with_result(status, Workspace(task.out).result)
     except InertialError as error:
         print(f"error: {error}", file=sys.stderr)
@@ -73,7 +84,7 @@ def main() -> None:
     write_status(task.status, end)
 
 
-def _reconstruct(task: CaptureTask, progress: Progress) -> None:
+def _reconstruct(task: CaptureTask, progress: Progress, findings: Callable[[Diagnosis], None]) -> None:
     job = read_config(task.config, Job)
     with reading_within(job.options.limits):
         existing = job.project != ProjectOptions() or is_project(task.capture)
@@ -86,7 +97,13 @@ def _reconstruct(task: CaptureTask, progress: Progress) -> None:
     _begin(Workspace(task.out), job.stages)
     if existing:
         reconstruct_project(
-            task.capture, task.out, job.project, job.options, model_stages=stages.model, progress=progress
+            task.capture,
+            task.out,
+            job.project,
+            job.options,
+            model_stages=stages.model,
+            progress=progress,
+            findings=findings,
         )
     else:
         reconstruct(
@@ -97,6 +114,7 @@ def _reconstruct(task: CaptureTask, progress: Progress) -> None:
             keypoint_stages=stages.keypoint,
             model_stages=stages.model,
             progress=progress,
+            findings=findings,
         )
 
 

@@ -112,6 +112,8 @@ class CaptureStatus:
         From ``result.json``: for each model its number, verdict, metres per unit with interval, images and checks.
     frames
         Frames of the capture.
+    findings
+        Errors and warnings of the check beforehand, in words.
     run
         Which run of the batch wrote this.
     """
@@ -128,6 +130,7 @@ class CaptureStatus:
     host: str = ""
     models: tuple[Mapping[str, Any], ...] = ()
     frames: int | None = None
+    findings: tuple[str, ...] = ()
     run: str = field(default="", compare=False)
 
     @property
@@ -140,7 +143,8 @@ def read_status(path: Path) -> CaptureStatus | None:
     """The status in a file; ``None`` where there is none."""
     try:
         values = read_json(path)
-        return CaptureStatus(**{**values, "models": tuple(values.get("models", ()))})
+        lists = {key: tuple(values.get(key, ())) for key in ("models", "findings")}
+        return CaptureStatus(**{**values, **lists})
     except (FormatError, TypeError):
         return None
 

@@ -23,18 +23,26 @@ def _outcome(status: CaptureStatus) -> str:
 
 
 @contextlib.contextmanager
-def live_batch() -> Iterator[Watch]:
+def live_batch(*, quiet: bool = False) -> Iterator[Watch]:
     """A bar for each capture in work on standard error; a line for each that ends."""
     from rich.console import Console
     from rich.markup import escape
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    console = Console(stderr=True, quiet=quiet)
+    clock = (TextColumn("clock"), TimeElapsedColumn())
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), *clock)
     bars = Progress(*columns, console=console, disable=not console.is_terminal)
     running = {}
+    told: set[str] = set()
 
     def watch(status: CaptureStatus, /) -> None:
+        if status.findings and status.name not in told:
+            told.add(status.name)
+            for finding in status.findings:
+                # what ends a capture is in its last line, too
+                if status.error is None or finding.partition(": ")[2].partition("; ")[0] not in status.error:
+                    console.print(f"{escape(status.name)} {escape(finding)}", soft_wrap=True, highlight=False)
         if status.state == "running":
             if status.name not in running:
                 running[status.name] = bars.add_task(status.name, total=None)
@@ -49,7 +57,7 @@ def live_batch() -> Iterator[Watch]:
                 f"[{colour}]{status.state}[/] {escape(status.name)} {escape(_outcome(status))}", soft_wrap=True
             )
 
-    with bars:
+    with bars if console.is_terminal else contextlib.nullcontext():
         yield watch
 
 
@@ -59,4 +67,6 @@ def show_batch(result: BatchResult) -> None:
 
     counts = {state: sum(c.state == state for c in result.captures) for state in _COLOUR}
     text = ", ".join(f"[{_COLOUR[state]}]{count} {state}[/]" for state, count in counts.items() if count)
+    if result.unchanged:
+        print("nothing to do: kept from the earlier run")
     Console().print(f"{text} of {len(result.captures)}; {result.out / 'summary.csv'}", soft_wrap=True, highlight=False)

@@ -2,28 +2,35 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import difflib
 import os
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Union
 
 import tyro
 from tyro.conf import subcommand
 
 from colmap_inertial import __version__
 from colmap_inertial.cli.captures import Batch, Deblur, FuseApertures, FuseExposures, Reconstruct, Simulate
+from colmap_inertial.cli.help import options_of, print_help, print_overview
 from colmap_inertial.cli.limits import exhausted, require_limits
 from colmap_inertial.cli.models import Align, Apply, CalibrateImu, Diagnose, Export, Scale, Validate, View
+from colmap_inertial.cli.signals import INTERRUPTED, TERMINATED, Terminated, answering_signals
+from colmap_inertial.cli.speech import Speaker, log_on_terminal, print_json
 from colmap_inertial.errors import InertialError
-from colmap_inertial.options import ReconstructOptions
+from colmap_inertial.options import ProjectOptions, ReconstructOptions, ReferenceOptions
 
 DESCRIPTION = """Metric, gravity-aligned COLMAP models from the gyroscope and accelerometer that filmed along.
 
-Exit codes: 0 done, 1 a check failed, 2 bad input, 3 not observable (scale refused), 4 mapping failed,
-5 target not found.
+Begin with `colmap-inertial diagnose CAPTURE`, which says in a minute what a recording can give; then `colmap-inertial
+reconstruct CAPTURE OUT`.
+
+Exit codes: 0 done (also where there was nothing to do), 1 a check failed, 2 bad input, 3 not observable (scale
+refused), 4 mapping failed, 5 target not found, 130 interrupted.
 
 --version prints the version; --tyro-print-completion bash (zsh, tcsh) a script that completes names and options."""
 
@@ -46,26 +53,33 @@ Command = (
     | Batch
     | Simulate
 )
-_COMMANDS: dict[str, type[Command]] = {
-    "reconstruct": Reconstruct,
-    "scale": Scale,
-    "apply": Apply,
-    "align": Align,
-    "calibrate-imu": CalibrateImu,
-    "diagnose": Diagnose,
-    "validate": Validate,
-    "view": View,
-    "export": Export,
-    "deblur": Deblur,
-    "fuse-apertures": FuseApertures,
-    "fuse-exposures": FuseExposures,
-    "batch": Batch,
-    "simulate": Simulate,
+#: By what they begin with.
+_GROUPS: dict[str, dict[str, type[Command]]] = {
+    "From a recording to metres": {"diagnose": Diagnose, "reconstruct": Reconstruct, "batch": Batch},
+    "With a model that exists": {"scale": Scale, "apply": Apply, "validate": Validate, "view": View, "export": Export},
+    "Calibrate a device": {"align": Align, "calibrate-imu": CalibrateImu},
+    "Pictures alone": {"deblur": Deblur, "fuse-apertures": FuseApertures, "fuse-exposures": FuseExposures},
+    "Practise": {"simulate": Simulate},
 }
+_COMMANDS: dict[str, type[Command]] = {name: cls for group in _GROUPS.values() for name, cls in group.items()}
+#: Options that most people use, by field; in the help they come first. Without an entry all do, in their order.
+_COMMON: dict[str, tuple[str, ...]] = {
+    "reconstruct": ("dense", "calibration", "deblur", "rolling_shutter", "world", "config", "force"),
+    "batch": ("workers", "config", "dense", "allow_stages"),
+    "scale": ("imu", "frame_times", "calibration", "json"),
+    "align": ("imu", "frame_times", "out", "remember"),
+    "diagnose": ("imu", "frame_times", "json"),
+    "validate": ("images", "target", "tolerance", "pictures"),
+    "apply": ("scale", "factor", "sim3", "undo", "world"),
+    "export": ("program", "images", "model"),
+}
+_HELP = ("-h", "--help")
 
 
 def parse(args: Sequence[str]) -> Command:
     """The command that the arguments describe; exits with code 2 and a message when they describe none.
+
+    ``--help`` prints its page and exits with code 0.
 
     Raises
     ------
@@ -74,6 +88,18 @@ def parse(args: Sequence[str]) -> Command:
     InertialError
         For ``--calibration`` without a file, and for a command or an option that there is not, with the nearest one.
     """
+    if not args or args[0] in _HELP:
+        print_overview(DESCRIPTION, _GROUPS)
+        sys.exit(0 if args else 2)
+    name = args[0].replace("_", "-")
+    if name in _COMMANDS and any(word in _HELP for word in args[1:]):
+        titles = {
+            ProjectOptions: "An existing COLMAP project in place of a capture",
+            ReferenceOptions: "Metres of an existing project without an IMU",
+        }
+        print_help(name, _COMMANDS[name], _COMMON.get(name, ()), titles, Speaker)
+        sys.exit(0)
+    args = [*args[:1], *_spelled_out(args)]
     _require_known(args)
     choices: list[Any] = []
     for name, cls in _COMMANDS.items():
@@ -85,16 +111,46 @@ def parse(args: Sequence[str]) -> Command:
     return tyro.cli(command, prog="colmap-inertial", description=DESCRIPTION, args=list(args), config=_CONFIG)
 
 
+def _spelled_out(args: Sequence[str]) -> list[str]:
+    """What follows the command, with each option as that command has it.
+
+    The name of an option's group may be left out, and may stand where there is none: ``--latitude-deg`` and
+    ``--scale.latitude-deg`` are the same in every command.
+
+    Raises
+    ------
+    InertialError
+        For an option that belongs to several groups.
+    """
+    cls = _COMMANDS.get(args[0].replace("_", "-"))
+    if cls is None:
+        return list(args[1:])
+    known = _options(cls)
+    words = []
+    for word in args[1:]:
+        name, equals, value = word.partition("=")
+        plain = "--" + name.removeprefix("--").replace("_", "-")
+        if name.startswith("--") and len(name) > 2 and plain not in known:
+            last = plain.rpartition(".")[2].removeprefix("--")
+            meant = [option for option in known if option.rpartition(".")[2].removeprefix("--") == last]
+            if len(meant) > 1:
+                raise InertialError(f"{args[0]}: which of {' and '.join(meant)} is meant by {name}?")
+            grouped = "." in plain and "." in "".join(meant)
+            word = f"{meant[0]}{equals}{value}" if meant and not grouped else word
+        words.append(word)
+    return words
+
+
 def _require_known(args: Sequence[str]) -> None:
     """Refuse a command or an option that there is not, also where something else is missing."""
     if not args or args[0].startswith("-"):
+        if args and args[0] not in (*_HELP, "--version", "--tyro-print-completion"):
+            raise InertialError(f"a command comes first, before {args[0]} (--help lists them)")
         return
     cls = _COMMANDS.get(args[0].replace("_", "-"))
     if cls is None:
         raise InertialError(f"there is no command {args[0]}{_nearest(args[0], _COMMANDS)} (--help lists them)")
     words = [word.partition("=")[0] for word in args[1:] if word.startswith("--") and word != "--"]
-    if not words or "--help" in words:
-        return
     options = _options(cls)
     for word in words:
         if word.replace("_", "-") not in options:
@@ -103,17 +159,15 @@ def _require_known(args: Sequence[str]) -> None:
             )
 
 
-def _options(cls: type[Any], prefix: str = "") -> list[str]:
-    """All options of a command, as tyro names those of its fields."""
+def _options(cls: type[Any]) -> list[str]:
+    """All options of a command, and the other form of each switch."""
     options = ["--tyro-print-completion"]
-    for field, hint in get_type_hints(cls, include_extras=True).items():
-        kind, *settings = get_args(hint) if get_origin(hint) is Annotated else (hint,)
-        named = [setting.name for setting in settings if getattr(setting, "name", None) is not None]
-        name = named[0] if named else field.replace("_", "-")
-        if isinstance(kind, type) and dataclasses.is_dataclass(kind):
-            options += _options(kind, f"{prefix}{name}." if name else prefix)
-        else:
-            options += [f"--{prefix}{name}", *([f"--{prefix}no-{name}"] if bool in (kind, *get_args(kind)) else [])]
+    for option in options_of(cls):
+        if option.positional:
+            continue
+        first = option.names[0]
+        at = first.rfind(".") + 1 or 2
+        options += [first] if option.value else [first, f"{first[:at]}no-{first[at:]}"]
     return options
 
 
@@ -192,16 +246,23 @@ def _main(args: Sequence[str] | None) -> None:
 
     try:
         require_limits()
-        with reading_within(command.limits):
+        with contextlib.ExitStack() as around:
+            if not isinstance(command, View):  # Ctrl-C is how that one ends
+                around.enter_context(answering_signals())
+            around.enter_context(reading_within(command.limits))
+            if command.verbose:
+                around.enter_context(log_on_terminal())
             code = command.run()
     except InertialError as error:
-        print(f"error: {error}", *getattr(error, "__notes__", ()), sep="\n", file=sys.stderr)
         code = error.exit_code
-    except KeyboardInterrupt:
+        if command.answers_in_json:
+            print_json({"error": str(error), "exit_code": code})
+        print(f"error: {error}", *getattr(error, "__notes__", ()), sep="\n", file=sys.stderr)
+    except KeyboardInterrupt as stop:
         resumes = isinstance(command, Reconstruct | Deblur | FuseApertures | FuseExposures | Batch)
         again = "; started again with the same arguments, it continues" if resumes else ""
         print(f"interrupted{again}", file=sys.stderr)
-        code = 130
+        code = TERMINATED if isinstance(stop, Terminated) else INTERRUPTED
     except (MemoryError, OSError, ImportError, RuntimeError) as error:
         said = exhausted(error)
         if said is None:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from colmap_inertial.cli.limits import Reader
+from colmap_inertial.cli.speech import Reader, Speaker
 from colmap_inertial.options import (
     ApertureOptions,
     BatchOptions,
@@ -20,11 +21,12 @@ from colmap_inertial.options import (
     ProjectOptions,
     ReadLimits,
     ReconstructOptions,
+    ReferenceOptions,
 )
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reconstruct:
+class Reconstruct(Speaker):
     """Turn images or video with an IMU recording into a COLMAP model in metres, gravity along an axis.
 
     OUT is a COLMAP project in metres: OUT/images, OUT/sparse, and with --dense OUT/dense; beside it are
@@ -33,7 +35,8 @@ class Reconstruct:
     options, it makes only what is not there yet or depends on them.
 
     CAPTURE may be an existing COLMAP project: give --imu, and when its images were taken. Nothing is mapped again, and
-    OUT is all of the project in metres.
+    OUT is all of the project in metres. Without an IMU, or where its scale is refused (the project is then OUT/colmap),
+    --scale-from takes the metres from a target or a known distance.
 
     Example: colmap-inertial reconstruct my_capture/capture.toml out
     """
@@ -43,6 +46,7 @@ class Reconstruct:
     out: Positional[Path]
     """A new folder for everything that is made, or that of an earlier run on the same, which is gone on with."""
     project: Annotated[ProjectOptions, arg(name="")] = dataclasses.field(default_factory=ProjectOptions)
+    reference: Annotated[ReferenceOptions, arg(name="")] = dataclasses.field(default_factory=ReferenceOptions)
     options: Annotated[ReconstructOptions, arg(name="")] = dataclasses.field(default_factory=ReconstructOptions)
     device: str | None = None
     """Name of the device, under which calibrations were remembered (default: what the recording says)."""
@@ -59,25 +63,70 @@ class Reconstruct:
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.cli.terminal import live_progress, show_remembered, show_result
+        from colmap_inertial.cli.screen import live_progress
+        from colmap_inertial.cli.terminal import show_remembered, show_result
+        from colmap_inertial.diagnose import Diagnosis
         from colmap_inertial.drivers.capture import reconstruct
         from colmap_inertial.drivers.project import is_project, reconstruct_project
         from colmap_inertial.drivers.remembered import remembered_of
+        from colmap_inertial.errors import InertialError
+        from colmap_inertial.io.files import read_json
 
+        self.check_json(self.capture, self.project.imu, self.project.frame_times)
+        if self.reference.scale_from != "imu":
+            return self._by_reference()
         options = self.options
         if self.remembered and not options.deterministic:
             known = remembered_of(self.project.imu or self.capture, options.calibration, device=self.device)
-            show_remembered(known)
+            if self.talks:
+                show_remembered(known)
             options = dataclasses.replace(options, calibration=(*options.calibration, *known.paths))
-        with live_progress() as screen:
+        with live_progress(self) as screen:
+
+            def findings(diagnosis: Diagnosis) -> None:
+                screen.findings(diagnosis, stops=not options.force)
+
             if self.project != ProjectOptions() or is_project(self.capture):
                 result = reconstruct_project(
-                    self.capture, self.out, self.project, options, progress=screen, findings=screen.findings
+                    self.capture, self.out, self.project, options, progress=screen, findings=findings
                 )
             else:
-                result = reconstruct(self.capture, self.out, options, progress=screen, findings=screen.findings)
-        show_result(result)
-        return result.exit_code()
+                result = reconstruct(self.capture, self.out, options, progress=screen, findings=findings)
+        code, stopped = 0, None
+        try:
+            code = result.exit_code()
+        except InertialError as error:
+            code, stopped = error.exit_code, str(error)
+        content = {
+            **read_json(result.workspace.result),
+            "out": self.out,
+            "unchanged": result.unchanged,
+            "exit_code": code,
+            "error": stopped,
+        }
+        self.tell(lambda: show_result(result, self.capture), content)
+        if stopped is not None:
+            said = "no scale is accepted, for the reasons above" if self.talks and code == 3 else stopped
+            print(f"error: {said}", file=sys.stderr)
+        return code
+
+    def _by_reference(self) -> int:
+        from colmap_inertial.cli.screen import live_progress
+        from colmap_inertial.cli.terminal import show_reference
+        from colmap_inertial.drivers.project import is_project
+        from colmap_inertial.drivers.reference import scale_project_by
+        from colmap_inertial.errors import FormatError
+
+        if not is_project(self.capture):
+            raise FormatError(
+                self.capture,
+                "is no COLMAP project, and --scale-from scales one: map it with COLMAP, or give OUT/colmap of a run "
+                "whose scale was refused",
+            )
+        with live_progress(self) as screen:
+            found = scale_project_by(self.capture, self.out, self.reference, self.project, progress=screen)
+        self.tell(lambda: show_reference(found), {**found.as_json(), "out": found.out, "exit_code": 0})
+        return 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,8 +145,9 @@ class Deblur(Reader):
     out: Positional[Path]
     """A new folder for everything that is made, or that of an earlier run on the same, which is gone on with."""
     method: BlurRemover = "wiener"
-    """wiener: a Wiener filter along the blur of each pixel. deepgyro: a network, which also sees what the filter makes
-    of the picture (slower; needs the extra `restore`)."""
+    """wiener: a Wiener filter along the path of each pixel. path: along the same path, a filter that expects few and
+    strong edges (slower). deepgyro: a network, which also sees what a filter makes of the picture (slower;
+    needs the extra `restore`)."""
     calibration: tuple[Path, ...] = ()
     """Calibration files of this device: from `align --out`, from `calibrate-imu --out`, or both."""
     rectify: bool = False
@@ -107,10 +157,13 @@ class Deblur(Reader):
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.cli.terminal import live_progress, show_deblurred
+        from colmap_inertial.cli.screen import live_progress
+        from colmap_inertial.cli.terminal import show_deblurred
         from colmap_inertial.drivers.deblur import deblur_capture
+        from colmap_inertial.io.files import read_json
 
-        with live_progress() as progress:
+        self.check_json(self.capture)
+        with live_progress(self) as progress:
             result = deblur_capture(
                 self.capture,
                 self.out,
@@ -120,7 +173,8 @@ class Deblur(Reader):
                 sheet=self.sheet,
                 progress=progress,
             )
-        show_deblurred(result)
+        content = {**read_json(result.workspace.result), "out": self.out, "unchanged": result.unchanged}
+        self.tell(lambda: show_deblurred(result), content)
         return 0
 
 
@@ -146,13 +200,18 @@ class FuseApertures(Reader):
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.cli.terminal import live_progress
+        from colmap_inertial.cli.screen import live_progress
+        from colmap_inertial.cli.terminal import show_fused
         from colmap_inertial.drivers.fuse_apertures import fuse_captured
+        from colmap_inertial.io.files import read_json
+        from colmap_inertial.run.workspace import Workspace
 
         options = FuseAperturesOptions(fusion=self.fusion, refocus=self.refocus, lens_width=self.lens_width)
-        with live_progress() as progress:
-            written = fuse_captured(self.capture, self.out, options, progress=progress)
-        print(f"{len(written)} pictures in {self.out / 'images'}")
+        self.check_json(self.capture)
+        with live_progress(self) as screen:
+            written = fuse_captured(self.capture, self.out, options, progress=screen)
+        content = {**read_json(Workspace(self.out).result), "out": self.out, "unchanged": screen.unchanged}
+        self.tell(lambda: show_fused([f"{len(written)} pictures in {self.out / 'images'}"], screen), content)
         return 0
 
 
@@ -180,24 +239,28 @@ class FuseExposures(Reader):
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.cli.terminal import live_progress
+        from colmap_inertial.cli.screen import live_progress
+        from colmap_inertial.cli.terminal import show_fused
         from colmap_inertial.drivers.fuse_exposures import fuse_exposures_captured
+        from colmap_inertial.io.files import read_json
+        from colmap_inertial.run.workspace import Workspace
 
         options = ExposureOptions(fusion=self.fusion, device=self.device)
-        with live_progress() as progress:
+        self.check_json(self.capture)
+        with live_progress(self) as screen:
             pairs = fuse_exposures_captured(
-                self.capture, self.out, options, calibration=self.calibration, progress=progress
+                self.capture, self.out, options, calibration=self.calibration, progress=screen
             )
         fused = sum(pair.fused for pair in pairs)
-        print(f"{fused} of {len(pairs)} pairs fused in {self.out / 'images'}")
-        for pair in pairs:
-            if not pair.fused:
-                print(f"{pair.name} {pair.reason}")
+        said = [f"{fused} of {len(pairs)} pairs fused in {self.out / 'images'}"]
+        said += [f"{pair.name} {pair.reason}" for pair in pairs if not pair.fused]
+        content = {**read_json(Workspace(self.out).result), "out": self.out, "unchanged": screen.unchanged}
+        self.tell(lambda: show_fused(said, screen), content)
         return 0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Batch:
+class Batch(Speaker):
     """Reconstruct many captures, each in a process of its own; one that fails does not stop the rest.
 
     MANIFEST is a TOML file with a [[capture]] table for each: path (from the manifest's folder), and optionally name,
@@ -229,12 +292,20 @@ class Batch:
         """Run the command; returns the exit code."""
         from colmap_inertial.batch import run_batch
         from colmap_inertial.batch.terminal import live_batch, show_batch
+        from colmap_inertial.io.files import read_json
 
-        with live_batch() as watch:
+        self.check_json(self.manifest)
+        with live_batch(quiet=self.quiet) as watch:
             result = run_batch(
                 self.manifest, self.out, self.options, batch=self.batch, watch=watch, allow_stages=self.allow_stages
             )
-        show_batch(result)
+        content = {
+            **read_json(self.out / "summary.json"),
+            "out": self.out,
+            "unchanged": result.unchanged,
+            "exit_code": result.exit_code(),
+        }
+        self.tell(lambda: show_batch(result), content)
         return result.exit_code()
 
 
@@ -254,14 +325,15 @@ class Simulate(Reader):
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.cli.terminal import live_progress
+        from colmap_inertial.cli.screen import live_progress
         from colmap_inertial.simulate.capture import write_capture
         from colmap_inertial.simulate.recipe import load_recipe
 
+        self.check_json(self.recipe)
         recipe = load_recipe(self.recipe)
-        with live_progress() as progress:
+        with live_progress(self) as progress:
             capture = write_capture(
                 recipe, self.out, workers=self.workers, progress=lambda done, total: progress("rendering", done, total)
             )
-        print(capture)
+        self.tell(lambda: print(capture), {"out": self.out, "capture": capture})
         return 0

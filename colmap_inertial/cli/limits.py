@@ -6,24 +6,14 @@ Libraries that are out of memory or of files end the process without one: OpenBL
 from __future__ import annotations
 
 import errno
-from dataclasses import dataclass, field
 
 from colmap_inertial.errors import InertialError
-from colmap_inertial.options import ReadLimits
 
 #: Address space to begin with, and for each thread: its stack, and what the allocator keeps for it. A reconstruction of
 #: small pictures takes 1.3 GB on two processors.
 LEAST_BYTES, THREAD_BYTES = 2 << 30, 128 << 20
 #: A reconstruction has 9 open at a time, a batch some for each process; systems allow 256 or more.
 LEAST_FILES = 64
-
-
-@dataclass(frozen=True, kw_only=True)
-class Reader:
-    """What all commands have."""
-
-    limits: ReadLimits = field(default_factory=ReadLimits)
-    """How large a file may be that is read."""
 
 
 def require_limits() -> None:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from colmap_inertial.cli.limits import Reader
+from colmap_inertial.cli.speech import Reader
 from colmap_inertial.options import (
     ExportImages,
     ExportProgram,
@@ -19,21 +19,22 @@ from colmap_inertial.options import (
     WorldAxes,
 )
 
+if TYPE_CHECKING:
+    from colmap_inertial.model.project import Applied
+
 
 @dataclass(frozen=True, kw_only=True)
 class Scale(Reader):
     """Metres per unit of an existing model or trajectory, without mapping.
 
     SOURCE is a COLMAP model folder (needs --imu and --frame-times), a trajectory in TUM format (needs --imu), or an
-    InertialScale folder. Exit code 3 when the recording cannot give a scale; the JSON then says why.
+    InertialScale folder. Exit code 3 when the recording cannot give a scale; the reasons then say why.
 
     Example: colmap-inertial scale project/sparse/0 --imu imu.csv --frame-times frames.csv --json scale.json
     """
 
     source: Positional[Path]
     """COLMAP model folder, TUM trajectory, or InertialScale folder."""
-    json: Path
-    """Where to write the estimate."""
     imu: Path | None = None
     """IMU recording: a file or folder of a known format, or a capture.toml."""
     frame_times: Path | None = None
@@ -58,20 +59,21 @@ class Scale(Reader):
         """Run the command; returns the exit code."""
         from colmap_inertial.cli.terminal import show_remembered, show_scale
         from colmap_inertial.drivers.remembered import remembered_of
-        from colmap_inertial.drivers.sources import ScaleSource, scale_source
+        from colmap_inertial.drivers.sources import ScaleSource, scale_as_json, scale_source
 
         calibration = self.calibration
         if self.remembered:
             known = remembered_of(self.imu or self.source, calibration, device=self.device)
-            show_remembered(known)
+            if self.talks:
+                show_remembered(known)
             calibration = (*calibration, *known.paths)
         estimate = scale_source(
             ScaleSource(source=self.source, imu=self.imu, frame_times=self.frame_times, calibration=calibration),
             self.options,
-            json=self.json,
+            json=self.json_file,
             first_s=self.first_s,
         )
-        show_scale(estimate, self.source)
+        self.tell(lambda: show_scale(estimate, self.source), scale_as_json(estimate, calibration), written=True)
         return 3 if estimate.verdict == "refused" else 0
 
 
@@ -119,12 +121,14 @@ class Apply(Reader):
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.cli.terminal import live_progress, show_applied
+        from colmap_inertial.cli.screen import live_progress
+        from colmap_inertial.cli.terminal import show_applied
         from colmap_inertial.model.project import apply_to_project, undo_project
         from colmap_inertial.model.similarities import plain_factor, read_scales, read_similarity
 
         scales: Any
-        with live_progress() as progress:
+        self.check_json(self.sim3)
+        with live_progress(self) as progress:
 
             def files(done: int, total: int) -> None:
                 progress("apply", done, total)
@@ -149,8 +153,28 @@ class Apply(Reader):
                     follow_links=self.follow_links,
                     progress=files,
                 )
-        show_applied(applied)
+        self.tell(lambda: show_applied(applied), _applied_as_json(applied))
         return 0
+
+
+def _applied_as_json(applied: Applied) -> dict[str, Any]:
+    models = [
+        {
+            "index": index,
+            "folder": folder,
+            "scale": None if scale.similarity is None else scale.similarity.scale,
+            "verdict": scale.verdict,
+            "reasons": scale.reasons,
+        }
+        for index, (folder, scale) in applied.models.items()
+    ]
+    return {
+        "out": applied.out,
+        "models": models,
+        "changes": applied.changes,
+        "files_kept": applied.unchanged,
+        "notes": applied.notes,
+    }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,13 +205,17 @@ class Align(Reader):
         from colmap_inertial.cli.terminal import show_calibration
         from colmap_inertial.drivers.remembered import remember
         from colmap_inertial.drivers.sources import ScaleSource, align_source
+        from colmap_inertial.io.files import read_json
 
         source = ScaleSource(
             source=self.source, imu=self.imu, frame_times=self.frame_times, calibration=self.calibration
         )
+        self.check_json(self.source, self.imu, self.frame_times, self.out)
         found = align_source(source, self.out)
         kept = None if self.remember is None else remember(self.remember, self.out)
-        show_calibration(found, self.source, kept)
+        self.tell(
+            lambda: show_calibration(found, self.source, kept), {**read_json(self.out), "out": self.out, "kept": kept}
+        )
         return 0
 
 
@@ -220,10 +248,13 @@ class CalibrateImu(Reader):
         from colmap_inertial.cli.terminal import show_imu_calibration
         from colmap_inertial.drivers.imu_calibration import calibrate_source
         from colmap_inertial.drivers.remembered import remember
+        from colmap_inertial.io.files import read_json
 
+        self.check_json(self.recording, self.out)
         found = calibrate_source(self.recording, self.out, self.gravity, device=self.remember)
         kept = None if self.remember is None else remember(self.remember, self.out)
-        show_imu_calibration(found, self.recording, self.out, kept)
+        content = {**read_json(self.out), "out": self.out, "kept": kept, "verdict": found.verdict}
+        self.tell(lambda: show_imu_calibration(found, self.recording, self.out, kept), content)
         return 0
 
 
@@ -238,8 +269,6 @@ class Diagnose(Reader):
 
     source: Positional[Path]
     """A capture, COLMAP model folder, TUM trajectory, InertialScale folder, or IMU recording."""
-    json: Path | None = None
-    """Where to write the findings."""
     imu: Path | None = None
     """IMU recording of a model or trajectory: a file or folder of a known format, or a capture.toml."""
     frame_times: Path | None = None
@@ -249,16 +278,17 @@ class Diagnose(Reader):
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.cli.terminal import live_progress, show_diagnosis
+        from colmap_inertial.cli.screen import live_progress
+        from colmap_inertial.cli.terminal import show_diagnosis
         from colmap_inertial.drivers.diagnosis import diagnose_source
         from colmap_inertial.drivers.sources import ScaleSource
 
         source = ScaleSource(
             source=self.source, imu=self.imu, frame_times=self.frame_times, calibration=self.calibration
         )
-        with live_progress() as progress:
-            found = diagnose_source(source, json=self.json, progress=progress)
-        show_diagnosis(found, self.source)
+        with live_progress(self) as progress:
+            found = diagnose_source(source, json=self.json_file, progress=progress)
+        self.tell(lambda: show_diagnosis(found, self.source), found.as_json(), written=True)
         return 1 if found.worst == "error" else 0
 
 
@@ -267,7 +297,8 @@ class Validate(Reader):
     """Compare the size of a model with a target of known size in its images.
 
     TARGET is checkerboard:COLSxROWS:SQUARE_M (inner corners), charuco:COLSxROWS:SQUARE_M:MARKER_M:DICT (squares),
-    aprilgrid:COLSxROWS:TAG_M:GAP (GAP = gap / tag), or aruco:DICT:SIDE_M. Exit code 0 within the tolerance, 1 outside
+    aprilgrid:COLSxROWS:TAG_M:GAP (GAP = gap / tag), or aruco:DICT:SIDE_M; +- after the length says how well it is known
+    (standard deviation), as in checkerboard:8x6:0.03+-0.0001. Exit code 0 within the tolerance, 1 outside
     it, 5 when the target is not found.
 
     Example: colmap-inertial validate out/sparse/0 --images out/images --target checkerboard:8x6:0.03
@@ -279,8 +310,6 @@ class Validate(Reader):
     """Folder with the model's images (OUT/images of a reconstruction)."""
     target: str
     """What to look for, as above."""
-    json: Path | None = None
-    """Where to write the result."""
     pictures: Path | None = None
     """Folder for frames with the corners drawn in and a plot of the distances."""
     tolerance: float = 2.0
@@ -289,6 +318,10 @@ class Validate(Reader):
     """The model claims no unit: report the factor that makes it metric; always passes."""
     apply: Path | None = None
     """With --unscaled: a new folder for the model in metres, scaled by the control distances alone."""
+    bars: Path | None = None
+    """Scale bars: a CSV with marker_a,marker_b,length_m of single markers and, where known, sigma_m."""
+    check_points: Path | None = None
+    """Check points: a CSV with marker,x,y,z of single markers in metres and, where known, sigma_m."""
 
     def __post_init__(self) -> None:
         if not 0 < self.tolerance < 100:
@@ -304,11 +337,13 @@ class Validate(Reader):
             self.images,
             self.target,
             ValidateOptions(tolerance_pct=self.tolerance, unscaled=self.unscaled),
-            json=self.json,
+            json=self.json_file,
             pictures=self.pictures,
             apply=self.apply,
+            bars=self.bars,
+            check_points=self.check_points,
         )
-        show_validation(result)
+        self.tell(lambda: show_validation(result), result.as_json(), written=True)
         return 0 if result.within_tolerance else 1
 
 
@@ -340,20 +375,27 @@ class Export(Reader):
     image_folder: Path | None = None
     """Folder with the model's images, where they are not beside the model."""
     capture: Path | None = None
-    """With --images original: the capture that the run was made of, for frames that it deblurred or changed."""
+    """The capture that the run was made of: with --images original for frames that it deblurred or changed, with
+    --georeference for its positions."""
+    georeference: bool = False
+    """Also say where on Earth everything is (georeference.json, columns of cameras.csv, LAS points in UTM): as the run
+    found it, else by the positions (GPS) of the capture or in the pictures' EXIF."""
     unscaled: bool = False
     """Export a model without a scale, too: its units are not metres."""
 
     def __post_init__(self) -> None:
-        if self.capture is not None and self.images != "original":
-            raise ValueError("--capture goes with --images original")
+        if self.capture is not None and self.images != "original" and not self.georeference:
+            raise ValueError("--capture goes with --images original or --georeference")
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.cli.terminal import live_progress, show_exported
+        from colmap_inertial.cli.screen import live_progress
+        from colmap_inertial.cli.terminal import show_exported
         from colmap_inertial.export.whole import export_model
+        from colmap_inertial.io.files import read_json
 
-        with live_progress() as progress:
+        self.check_json(self.out, self.dir)
+        with live_progress(self) as progress:
             made = export_model(
                 self.out,
                 self.dir,
@@ -362,10 +404,11 @@ class Export(Reader):
                 model=self.model,
                 image_folder=self.image_folder,
                 capture=self.capture,
+                georeference=self.georeference,
                 unscaled=self.unscaled,
                 progress=progress,
             )
-        show_exported(made)
+        self.tell(lambda: show_exported(made), {**read_json(made.folder / "export.json"), "folder": made.folder})
         return 0
 
 
@@ -410,6 +453,6 @@ class View(Reader):
             scene,
             host=self.host,
             port=self.port,
-            ready=lambda url: show_view(self.out, url, self.host),
+            ready=lambda url: self.tell(lambda: show_view(self.out, url, self.host), {"out": self.out, "url": url}),
         )
         return 0

@@ -1,109 +1,73 @@
-"""What the command line shows: progress, and one screen at the end."""
+"""What the command line shows at the end: one screen."""
 
 from __future__ import annotations
 
-import contextlib
 import math
-from collections.abc import Collection, Iterator, Sequence
+import shlex
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from colmap_inertial.cli.screen import SEVERITY_COLOUR, Screen
 from colmap_inertial.diagnose import Diagnosis
 from colmap_inertial.drivers.deblur import DeblurResult
+from colmap_inertial.drivers.reference import Reference
 from colmap_inertial.drivers.remembered import Remembered
 from colmap_inertial.drivers.result import ReconstructResult, shutter_note
 from colmap_inertial.errors import InertialError
 from colmap_inertial.export.whole import Exported
+from colmap_inertial.georeference import Georeference
 from colmap_inertial.model.project import Applied
 from colmap_inertial.precalibrate.plan import ImagingPlan
+from colmap_inertial.report.words import half_width_pct, length_error, not_checked
 from colmap_inertial.rest import RestCalibration
 from colmap_inertial.run.workspace import Workspace
 from colmap_inertial.scale.parts import parts_in_words
+from colmap_inertial.scale.verdict import Z95
 from colmap_inertial.stages.frame_folder import FrameRecord
 from colmap_inertial.types import CameraImuCalibration, ScaleEstimate
 from colmap_inertial.validate import Validation, validation_table
 from colmap_inertial.view.guard import is_loopback
 
 if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.progress import Progress as Bars, TaskID
     from rich.text import Text
 
 #: A label and what there is to say.
 Line = tuple[str, "str | Text"]
 
-_STAGES = {
-    "rendering": "Rendering",
-    "video": "Video frames",
-    "motion": "Camera motion",
-    "clocks": "Clocks",
-    "selection": "Selection",
-    "calibration": "Calibration",
-    "survey": "Small models",
-    "blur": "Blur",
-    "frames": "Frames",
-    "fusing": "Fused",
-    "features": "Features",
-    "matches": "Matches",
-    "mapping": "Mapping",
-    "images": "Images",
-    "metric": "Metric scale",
-    "validation": "Validation",
-    "apply": "Files",
-    "dense": "Dense",
-    "export": "Pictures",
-}
-_SEVERITY_COLOUR = {"info": "blue", "warning": "yellow", "error": "red"}
 _COLOUR = {"trusted": "green", "weak": "yellow", "refused": "red"}
 
 
-class Screen:
-    """Standard error during a command: a bar for each stage, plain lines where that is no terminal."""
-
-    def __init__(self, console: Console, bars: Bars) -> None:
-        self._console, self._bars = console, bars
-        self._tasks: dict[str, TaskID] = {}
-
-    def __call__(self, stage: str, done: int, total: int, /) -> None:
-        """Show how far a stage is."""
-        name = _STAGES.get(stage, stage)
-        if stage not in self._tasks:
-            self._tasks[stage] = self._bars.add_task(name, total=total)
-            if not self._console.is_terminal:
-                self._console.print(f"{name} ...")
-        self._bars.update(self._tasks[stage], completed=done, total=total)
-
-    def findings(self, diagnosis: Diagnosis) -> None:
-        """Say what was found before the work: errors and warnings; above the bars, and whole lines in a pipe."""
-        from rich.text import Text
-
-        found = [finding for finding in diagnosis.findings if finding.severity != "info"]
-        for finding in found:
-            severity = (f"{finding.severity}: ", f"bold {_SEVERITY_COLOUR[finding.severity]}")
-            said = Text.assemble(severity, f"{finding.evidence}; {finding.advice}", (f" ({finding.code})", "dim"))
-            self._console.print(said, soft_wrap=not self._console.is_terminal)
-        if diagnosis.worst == "error":
-            self._console.print("an error makes a scale wrong or impossible; Ctrl-C ends the run")
+def headline(estimate: ScaleEstimate) -> str:
+    """What a user wants to know first: how far off ten metres may be."""
+    if estimate.metres_per_unit is None or estimate.ci95 is None:
+        return "no metres: the recording does not tell how large things are"
+    error = length_error(half_width_pct(estimate.metres_per_unit, estimate.ci95))
+    if estimate.verdict == "trusted":
+        return f"10 m are 10 m to within {error}"
+    return f"10 m may be off by {error}, or by more for the reasons below: check a known length before you measure"
 
 
-@contextlib.contextmanager
-def live_progress() -> Iterator[Screen]:
-    """The screen of a command that takes a while."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress as Bars, TextColumn, TimeElapsedColumn
-
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description:<13}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    bars = Bars(*columns, console=console, disable=not console.is_terminal)
-    with bars if console.is_terminal else contextlib.nullcontext():  # rich before 14.3 ends hidden bars with a newline
-        yield Screen(console, bars)
+def next_command(result: ReconstructResult, source: Path) -> str:
+    """What to type next, by how a reconstruction ended."""
+    out, best = result.workspace.root, result.models[0]
+    if all(model.sparse_metric is None for model in result.models):
+        return shlex.join(["colmap-inertial", "diagnose", str(source)])
+    if isinstance(best.validation, Validation) and not best.validation.within_tolerance:
+        return shlex.join(["colmap-inertial", "diagnose", str(source)])
+    if best.scale.verdict == "weak" and best.validation is None and best.sparse_metric is not None:
+        images = result.workspace.images
+        words = ["colmap-inertial", "validate", str(best.sparse_metric), "--images", str(images), "--target"]
+        return f"{shlex.join(words)} checkerboard:8x6:0.03"
+    return shlex.join(["colmap-inertial", "view", str(out)])
 
 
 def scale_lines(estimate: ScaleEstimate) -> list[Line]:
-    """The estimate as labelled lines."""
+    """The estimate as labelled lines, the first of them what a user wants to know."""
     from rich.text import Text
 
-    lines: list[Line] = [("Verdict", Text(estimate.verdict, f"bold {_COLOUR[estimate.verdict]}"))]
+    lines: list[Line] = [("Metres", Text(headline(estimate), "bold"))]
+    lines.append(("Verdict", Text(estimate.verdict, f"bold {_COLOUR[estimate.verdict]}")))
     if estimate.metres_per_unit is not None and estimate.ci95 is not None:
         low, high = estimate.ci95
         half_width = 50 * (high - low) / estimate.metres_per_unit
@@ -240,15 +204,23 @@ def show_diagnosis(diagnosis: Diagnosis, source: Path) -> None:
     console = Console()
     if not diagnosis.findings:
         console.print(f"{escape(str(source))}: nothing found (looked at: {checked})")
+        _say_not_checked(diagnosis)
         return
     table = Table(title=f"{escape(str(source))} (looked at: {checked})", title_justify="left", show_lines=True)
     for column in ("Severity", "Code", "Found", "What to do"):
         table.add_column(column, overflow="fold", no_wrap=column in ("Severity", "Code"))
     for finding in diagnosis.findings:
-        colour = _SEVERITY_COLOUR[finding.severity]
+        colour = SEVERITY_COLOUR[finding.severity]
         severity = f"[bold {colour}]{finding.severity}[/]"
         table.add_row(severity, finding.code, escape(finding.evidence), escape(finding.advice))
     console.print(table)
+    _say_not_checked(diagnosis)
+
+
+def _say_not_checked(diagnosis: Diagnosis) -> None:
+    left = not_checked(diagnosis.checked)
+    if left:
+        print(f"not checked: {left}")
 
 
 def show_validation(result: Validation) -> None:
@@ -272,7 +244,33 @@ def imaging_lines(frames: Sequence[FrameRecord], plan: ImagingPlan, rectified: C
 
 def show_nothing_to_do(workspace: Workspace) -> None:
     """Say that an earlier run's result stands."""
-    print(f"nothing to do: {workspace.root} holds the result of this capture with these options already")
+    print(f"nothing to do: kept from the earlier run; {workspace.root} holds the result of this with these options")
+
+
+def show_reference(found: Reference) -> None:
+    """Print where a project's metres come from, and how good they are."""
+    low, high = found.ci95
+    pct = half_width_pct(found.metres_per_unit, found.ci95)
+    _show(
+        "Project",
+        [
+            ("Metres", f"10 m are 10 m to within {length_error(pct)}"),
+            ("From", found.made_of),
+            ("Scale", f"{found.metres_per_unit:.6g} m per unit, +-{pct:.2g} % (95 %)"),
+            ("Interval", f"{low:.6g} to {high:.6g} m per unit"),
+            *(("Note" if i == 0 else "", note) for i, note in enumerate(found.notes)),
+            ("Written", str(found.out)),
+        ],
+    )
+    print(f"next: {shlex.join(['colmap-inertial', 'view', str(found.out)])}")
+
+
+def show_fused(lines: Sequence[str], screen: Screen) -> None:
+    """Print what became of the pictures of several lenses or exposures."""
+    if screen.unchanged:
+        print("nothing to do: kept from the earlier run")
+    for line in lines:
+        print(line)
 
 
 def show_deblurred(result: DeblurResult) -> None:
@@ -288,8 +286,16 @@ def show_deblurred(result: DeblurResult) -> None:
     _show("Images", [*lines, *(("Written" if i == 0 else "", str(path)) for i, path in enumerate(written))])
 
 
-def show_result(result: ReconstructResult) -> None:
-    """Print the end of a reconstruction on one screen."""
+def _on_map(found: Georeference | InertialError) -> str:
+    if isinstance(found, InertialError):
+        return str(found)
+    heading, place = Z95 * found.heading_sigma_deg, Z95 * found.position_sigma_m
+    at = f"{found.latitude_deg:.6f}, {found.longitude_deg:.6f}"
+    return f"{at}: heading +-{heading:.1f} degrees, place +-{place:.1f} m, by {found.used} positions"
+
+
+def show_result(result: ReconstructResult, source: Path) -> None:
+    """Print the end of a reconstruction of ``source`` on one screen; the last line is what to type next."""
     if result.unchanged and not result.waiting:
         show_nothing_to_do(result.workspace)
     frames = result.frames
@@ -298,10 +304,10 @@ def show_result(result: ReconstructResult) -> None:
     for model in result.models:
         summary = model.summary
         lines: list[Line] = [
+            *scale_lines(model.scale),
             ("Images", f"{summary['registered_images']}{registered}"),
             ("Points", f"{summary['points']}, mean reprojection error {summary['mean_reprojection_error_px']:.2f} px"),
             *(imaging_lines(frames, result.imaging, result.keypoints.rectified()) if frames else []),
-            *scale_lines(model.scale),
         ]
         if isinstance(model.validation, Validation) and model.validation.ci95_pct is not None:
             low, high = model.validation.ci95_pct
@@ -309,6 +315,8 @@ def show_result(result: ReconstructResult) -> None:
             lines.append(("Target", f"{model.validation.target.spec}: scale error {error}"))
         elif isinstance(model.validation, InertialError):
             lines.append(("Target", str(model.validation)))
+        if model.georeference is not None:
+            lines.append(("On the map", _on_map(model.georeference)))
         dense = model.dense
         made = [] if dense is None else [dense.fused, dense.mesh]
         if dense is not None and not dense.waiting:
@@ -325,12 +333,18 @@ def show_result(result: ReconstructResult) -> None:
         lines.append(("Time", ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in result.seconds.items())))
         number = "" if model.colmap_index == model.index else f" (COLMAP's {model.colmap_index})"
         _show(f"Model {model.index}{number}", lines)
+    if all(model.sparse_metric is None for model in result.models) and result.workspace.colmap_sparse.is_dir():
+        print(
+            f"metres by hand: colmap-inertial reconstruct {shlex.quote(str(result.workspace.colmap))} NEW_FOLDER "
+            "--scale-from target --target ..., or --scale-from distance (--help)"
+        )
     print(_layout_in_a_line(result))
     for fragment in result.fragments:
         print(
             f"COLMAP's model {fragment.colmap_index} is a fragment of {fragment.registered_images} images, left out; "
             "--fragments makes it metric, too"
         )
+    print(f"next: {next_command(result, source)}")
 
 
 def _layout_in_a_line(result: ReconstructResult) -> str:

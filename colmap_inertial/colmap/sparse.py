@@ -9,11 +9,11 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from colmap_inertial.errors import FormatError, MappingError, OutputError
+from colmap_inertial.errors import FormatError, InertialError, MappingError, OutputError
 from colmap_inertial.model import colmap_camera, find_models
 from colmap_inertial.model.binary import check_binary_model
 from colmap_inertial.options import MappingOptions
@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 #: Up to this many images every pair is matched; above it, neighbours in time.
 _EXHAUSTIVE_UP_TO = 150
 _EXTRACTION_BATCH = 16
-_MATCHING_BATCH = 400
+#: Each batch reads its images' features anew.
+_MATCHING_BATCH = 1600
 #: What a feature takes in the database at most, several orientations and SQLite's log included; likewise a pair.
 _FEATURE_BYTES = 500
 _PAIR_BYTES = 100_000
@@ -54,6 +55,23 @@ def _writing(database: Path) -> Iterator[None]:
         ) from error
 
 
+def mapping_device(options: MappingOptions, *, deterministic: bool) -> Literal["cpu", "cuda"]:
+    """What features are found and matched on.
+
+    Raises
+    ------
+    InertialError
+        Where CUDA is asked for and pycolmap has none.
+    """
+    import pycolmap
+
+    if options.device == "auto":
+        return "cuda" if pycolmap.has_cuda and not deterministic else "cpu"
+    if options.device == "cuda" and not pycolmap.has_cuda:
+        raise InertialError("--mapping.device cuda: this pycolmap has none; install pycolmap-cuda12, or leave it out")
+    return options.device
+
+
 def check_pair_names(names: Sequence[str]) -> None:
     """Raise ``FormatError`` for an image name that COLMAP's lists of pairs cannot hold."""
     for name in names:
@@ -63,10 +81,14 @@ def check_pair_names(names: Sequence[str]) -> None:
             )
 
 
+def matches_every_pair(count: int, options: MappingOptions) -> bool:
+    """Whether every pair of so many images is matched, and not only neighbours in time."""
+    return options.pairing == "exhaustive" or (options.pairing == "auto" and count <= _EXHAUSTIVE_UP_TO)
+
+
 def image_pairs(names: Sequence[str], options: MappingOptions) -> list[tuple[str, str]]:
     """The pairs to match, by names in order of time."""
-    exhaustive = options.pairing == "exhaustive" or (options.pairing == "auto" and len(names) <= _EXHAUSTIVE_UP_TO)
-    if exhaustive:
+    if matches_every_pair(len(names), options):
         return list(itertools.combinations(names, 2))
     steps = set(range(1, options.overlap + 1))
     steps |= {2**k for k in range(len(names).bit_length())}
@@ -100,7 +122,7 @@ def extract_features(
     import pycolmap
 
     extraction = pycolmap.FeatureExtractionOptions()
-    extraction.use_gpu = False
+    extraction.use_gpu = context.device == "cuda"
     extraction.num_threads = context.num_threads
     if options.max_image_size is not None:
         extraction.max_image_size = options.max_image_size
@@ -138,7 +160,7 @@ def extract_features(
                     camera_mode=pycolmap.CameraMode.SINGLE,
                     reader_options=reader,
                     extraction_options=extraction,
-                    device=pycolmap.Device.cpu,
+                    device=pycolmap.Device(context.device),
                 )
             with _writing(database), pycolmap.Database.open(str(database)) as opened:
                 first = opened.read_image_with_name(batch[0])
@@ -209,11 +231,19 @@ def match_features(
     context: RunContext,
 ) -> None:
     """Match and verify the pairs in a copy of the features' database."""
+    shutil.copyfile(features, database)
+    match_pairs(database, pairs, context)
+
+
+def match_pairs(
+    database: Path, pairs: Sequence[tuple[str, str]], context: RunContext, *, done: int = 0, total: int | None = None
+) -> None:
+    """Match and verify the pairs in a database that holds features; ``done`` of ``total`` are matched already."""
     import pycolmap
 
-    shutil.copyfile(features, database)
+    total = len(pairs) if total is None else total
     matching = pycolmap.FeatureMatchingOptions()
-    matching.use_gpu = False
+    matching.use_gpu = context.device == "cuda"
     matching.num_threads = context.num_threads
     pycolmap.set_random_seed(context.seed)
     verification = pycolmap.TwoViewGeometryOptions()
@@ -221,8 +251,8 @@ def match_features(
     lines = [f"{a} {b}" for a, b in pairs]
     with tempfile.TemporaryDirectory() as folder:
         listed = Path(folder) / "pairs.txt"
-        for i, batch in enumerate(_batches(lines, _MATCHING_BATCH)):
-            context.progress("matches", i * _MATCHING_BATCH, len(pairs))
+        for batch in _batches(lines, _MATCHING_BATCH):
+            context.progress("matches", done, total)
             require_room(database.parent, len(batch) * _PAIR_BYTES)
             listed.write_text("\n".join(batch) + "\n")
             with _writing(database):
@@ -231,9 +261,10 @@ def match_features(
                     matching_options=matching,
                     pairing_options=pycolmap.ImportedPairingOptions(match_list_path=str(listed)),
                     verification_options=verification,
-                    device=pycolmap.Device.cpu,
+                    device=pycolmap.Device(context.device),
                 )
-    context.progress("matches", len(pairs), len(pairs))
+            done += len(batch)
+    context.progress("matches", done, total)
 
 
 def map_images(

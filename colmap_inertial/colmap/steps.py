@@ -6,16 +6,11 @@ import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from colmap_inertial.colmap.sparse import (
-    KeypointRecords,
-    extract_features,
-    image_pairs,
-    map_images,
-    match_features,
-    write_gravity_priors,
-)
+from colmap_inertial.colmap.pairing import MatchRecord, match_capture
+from colmap_inertial.colmap.sparse import KeypointRecords, extract_features, map_images, write_gravity_priors
 from colmap_inertial.io.records import read_record, write_record
 from colmap_inertial.options import ReconstructOptions
+from colmap_inertial.run.context import Recording
 from colmap_inertial.run.session import Session
 from colmap_inertial.stages.frame_folder import FrameRecord
 from colmap_inertial.stages.protocols import KeypointStage
@@ -24,15 +19,18 @@ from colmap_inertial.types import Array
 
 def run_colmap(
     session: Session,
+    recording: Recording,
     records: Sequence[FrameRecord],
     stages: Sequence[KeypointStage],
     gravity: Mapping[str, Array],
     options: ReconstructOptions,
-) -> KeypointRecords:
+) -> tuple[KeypointRecords, MatchRecord]:
     """Make COLMAP's models of the frames that are used.
 
     Parameters
     ----------
+    recording
+        With the times of these frames.
     records
         Of all frames.
     stages
@@ -44,7 +42,7 @@ def run_colmap(
 
     Returns
     -------
-    What the stages did to keypoints.
+    What the stages did to keypoints, and which pairs were matched.
 
     Raises
     ------
@@ -63,14 +61,21 @@ def run_colmap(
 
     extraction = [getattr(mapping, name) for name in ("max_image_size", "max_num_features", "first_octave")]
     depends = {"extraction": extraction, **context.identity(), "stages": stages, "gravity": gravity}
-    pairing = {**depends, "pairing": mapping.pairing, "overlap": mapping.overlap}
+    pairing = {
+        **depends,
+        "pairing": [mapping.pairing, mapping.overlap],
+        "gyroscope": [recording.imu, recording.timing, recording.prior, recording.max_offset_s],
+    }
+    outputs = [workspace.colmap_database, workspace.keypoints, workspace.matches]
 
     def matches(partial: Sequence[Path]) -> None:
         # the database holds the features, too: they are made when there are no matches, and need not stay
         record = workspace.stamps / "keypoints_of_features.json"
         runner.run("features", depends, [workspace.colmap_features, record], features, after=["frames"])
         shutil.copyfile(record, partial[1])
-        match_features(workspace.colmap_features, partial[0], image_pairs(list(cameras), mapping), context)
+        known = next(iter(cameras.values()), None)
+        matched = match_capture(workspace.colmap_features, partial[0], recording, known, mapping, context)
+        write_record(partial[2], matched)
 
     def models(partial: Sequence[Path]) -> None:
         refine = mapping.refine_intrinsics
@@ -84,6 +89,6 @@ def run_colmap(
             context=context,
         )
 
-    runner.run("matches", pairing, [workspace.colmap_database, workspace.keypoints], matches, after=["frames"])
+    runner.run("matches", pairing, outputs, matches, after=["frames"])
     runner.run("mapping", {"mapping": mapping}, [workspace.colmap_sparse], models, after=["matches"])
-    return read_record(workspace.keypoints, KeypointRecords)
+    return read_record(workspace.keypoints, KeypointRecords), read_record(workspace.matches, MatchRecord)

@@ -7,10 +7,11 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import EllipsisType
 
-from colmap_inertial.colmap.sparse import check_pair_names
+from colmap_inertial.colmap.sparse import check_pair_names, mapping_device
 from colmap_inertial.colmap.steps import run_colmap
 from colmap_inertial.diagnose import Diagnosis
 from colmap_inertial.drivers.frames import ask_for_plan, fusing, run_frames, run_images, run_plan
+from colmap_inertial.drivers.georeference import positions_of, run_georeference
 from colmap_inertial.drivers.models import run_dense_models, run_models, run_validation
 from colmap_inertial.drivers.reporting import report_result, reporting_stops, write_recording
 from colmap_inertial.drivers.result import ReconstructResult
@@ -39,6 +40,8 @@ from colmap_inertial.stages.frame_folder import require_frames
 from colmap_inertial.stages.metric import MetricStage
 from colmap_inertial.stages.protocols import FrameStage, KeypointStage, ModelStage, with_defaults
 from colmap_inertial.stages.readout import ReadoutStage
+from colmap_inertial.stages.refine import RefineStage
+from colmap_inertial.stages.rolling_shutter import RollingShutterStage
 from colmap_inertial.types import Array
 from colmap_inertial.validate import parse_target
 
@@ -46,21 +49,33 @@ from colmap_inertial.validate import parse_target
 _GRAVITY_ROTATION_RAD = 0.2
 
 
-def default_model_stages(recording: Recording, options: ReconstructOptions) -> list[ModelStage]:
-    """What stands for ``...`` in ``model_stages``."""
+def default_model_stages(
+    recording: Recording, options: ReconstructOptions, keypoint_stages: Sequence[KeypointStage] = ()
+) -> list[ModelStage]:
+    """What stands for ``...`` in ``model_stages``, after these keypoint stages."""
     scale = dataclasses.replace(options.scale, max_offset_s=recording.max_offset_s)
-    refine = options.mapping.refine_intrinsics
+    asked = options.mapping.refine_intrinsics
+    refine_intrinsics = recording.capture.camera is None if asked is None else asked
     readout = ReadoutStage(
         imu=recording.imu,
         calibration=recording.prior,
         options=scale,
-        refine_intrinsics=recording.capture.camera is None if refine is None else refine,
+        refine_intrinsics=refine_intrinsics,
         num_threads=1 if options.deterministic else -1,
     )
-    return [
-        readout,
-        MetricStage(imu=recording.imu, calibration=recording.prior, options=scale, world=options.world),
-    ]
+    metric = MetricStage(imu=recording.imu, calibration=recording.prior, options=scale, world=options.world)
+    if options.refine == "off":
+        return [readout, metric]
+    # only what moved keypoints all by itself can say from where
+    shutters = [stage for stage in keypoint_stages if isinstance(stage, RollingShutterStage)]
+    refined = RefineStage(
+        imu=recording.imu,
+        calibration=recording.prior,
+        options=scale,
+        refine_intrinsics=refine_intrinsics,
+        shutter=shutters[0] if len(shutters) == len(keypoint_stages) == 1 else None,
+    )
+    return [readout, metric, refined]
 
 
 def reconstruct(
@@ -88,8 +103,8 @@ def reconstruct(
     frame_stages, keypoint_stages, model_stages
         The hooks. ``...`` stands for the default stages: :class:`ApertureStage` for a multi-aperture camera's frames,
         :class:`ExposureStage` for pairs of a short and a long exposure, :class:`DeblurStage` for all others;
-        :class:`RollingShutterStage`; :class:`ReadoutStage` and :class:`MetricStage`, where the options and the
-        recording allow them. The model stages must include one that makes the model metric.
+        :class:`RollingShutterStage`; :class:`ReadoutStage`, :class:`MetricStage` and :class:`RefineStage`, where the
+        options and the recording allow them. The model stages must include one that makes the model metric.
     progress
         Called with stage, steps done and steps in all.
     findings
@@ -152,6 +167,8 @@ def _reconstruct(
     recording = Recording.of(loaded, imu, timing, prior, max_offset_s=options.scale.max_offset_s)
     gravity = _gravity_priors(recording, options)
     check_pair_names(timing.names)
+    fixes = positions_of(loaded, timing.names) if options.georeference else None
+    device = mapping_device(options.mapping, deterministic=options.deterministic)
     with (
         open_session(
             out,
@@ -160,6 +177,7 @@ def _reconstruct(
             pictures=picture_folders(loaded),
             deterministic=options.deterministic,
             seed=options.seed,
+            device=device,
             progress=progress,
         ) as session,
         reporting_stops(session.workspace, loaded),
@@ -181,13 +199,18 @@ def _reconstruct(
         of_frames = with_defaults(frame_stages, defaults)
         of_keypoints = with_defaults(keypoint_stages, plan.keypoint_stages())
         records = run_frames(session, recording, frames, of_frames, workspace.colmap_images, plan)
-        keypoints = run_colmap(session, records, of_keypoints, gravity, options)
+        used_timing = part_of(recording.timing, [record.name for record in records if record.used])
+        # pairs are chosen by what the capture itself holds: a calibration that is given later maps nothing again
+        plain_imu = corrected_imu(loaded, raw.imu, None)
+        seen = Recording.of(loaded, plain_imu, used_timing, prior_calibration(loaded, None))
+        keypoints, matching = run_colmap(session, seen, records, of_keypoints, gravity, options)
         images = run_images(session, records, keypoints.rectified(), of_keypoints)
-        of_models = with_defaults(model_stages, default_model_stages(recording, options))
+        of_models = with_defaults(model_stages, default_model_stages(recording, options, of_keypoints))
         models, fragments = run_models(
             session, recording, of_models, rectified=bool(keypoints.rectified()), fragments=options.fragments
         )
         models = run_validation(session, models, target, images)
+        models = run_georeference(session, models, fixes, recording.timing, options.world)
         if options.dense:
             models = run_dense_models(session, models, images, options.dense_options)
         result = ReconstructResult(
@@ -196,6 +219,7 @@ def _reconstruct(
             fragments=fragments,
             frames=records,
             keypoints=keypoints,
+            matching=matching,
             imaging=plan,
             selection=selection,
             seconds=session.runner.seconds,

@@ -126,7 +126,7 @@ def deblur_capture(
         plan = run_plan(session, recording, Treatments(deblur=method, rolling_shutter=options.rolling_shutter))
         stages: list[FrameStage] = [
             *fusing(loaded, workspace, options.apertures),
-            *plan.frame_stages(drop=False),
+            *plan.frame_stages(drop=False, smoothing=False),
         ]
         deblurred = workspace.colmap_images if rectify else workspace.images
         if not rectify:

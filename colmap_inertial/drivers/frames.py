@@ -72,14 +72,21 @@ def run_frames(
     kept = None if plan is None else CropKeeper.of(plan)
 
     def work(partial: Sequence[Path]) -> None:
-        written, records = partial[:2]
+        written, records, unsmoothed = partial[:3]
         through = stages if kept is None else (kept.before, *stages, kept.after)
         names = recording.timing.names
         write_frames(
-            frames, names, through, source_folder=source, images=written, records=records, progress=session.progress
+            frames,
+            names,
+            through,
+            source_folder=source,
+            images=written,
+            records=records,
+            progress=session.progress,
+            unsmoothed=unsmoothed,
         )
         if kept is not None:
-            kept.write(partial[2])
+            kept.write(partial[3])
 
     depends = {
         "capture": replace(recording.capture, target=None),
@@ -90,7 +97,7 @@ def run_frames(
         "images": images.relative_to(workspace.root),
     }
     crops = [] if kept is None else [workspace.crops]
-    session.runner.run("frames", depends, [images, workspace.frames, *crops], work)
+    session.runner.run("frames", depends, [images, workspace.frames, workspace.unsmoothed, *crops], work)
     return read_frame_records(workspace.frames)
 
 
@@ -119,7 +126,7 @@ def run_images(
     names = [record.name for record in records if record.used]
 
     def work(partial: Sequence[Path]) -> None:
-        write_images(movers, names, moved, workspace.colmap_images, partial[0], session.progress)
+        write_images(movers, names, moved, workspace.colmap_images, partial[0], session.progress, workspace.unsmoothed)
 
     depends = {"stages": stages if moved else (), "rectified": sorted(moved)}
     session.runner.run("images", depends, [workspace.images], work, after=["frames"])

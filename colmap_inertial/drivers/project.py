@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 from colmap_inertial.diagnose import Diagnosis
 from colmap_inertial.drivers.capture import default_model_stages
+from colmap_inertial.drivers.georeference import positions_of, run_georeference
 from colmap_inertial.drivers.models import run_dense_models, run_models, run_validation
 from colmap_inertial.drivers.placed import place_project, require_free_names
 from colmap_inertial.drivers.reporting import report_result, reporting_stops, write_recording
@@ -166,7 +167,9 @@ def _reconstruct(
     target = None if capture.target is None else parse_target(capture.target)
     models = _models(project, out, source.keep, follow_links=source.follow_links)
     require_free_names(project, Workspace(out), dense=options.dense)
-    images = _images(project, source, needed=options.dense or source.exif_times or source.video is not None)
+    pictures = options.dense or source.exif_times or source.video is not None
+    filmed = isinstance(capture.frames, Video)
+    images = _images(project, source, needed=pictures or (options.georeference and not filmed))
     read = functools.cache(read_model)
     with (
         open_session(
@@ -182,13 +185,14 @@ def _reconstruct(
     ):
         workspace = session.workspace
         timing, notes = _run_times(session, given, models, images, read)
+        fixes = positions_of(capture, _registered(models, read), images) if options.georeference else None
         recording = Recording.of(capture, imu, timing, prior, max_offset_s=options.scale.max_offset_s)
         largest = read(models[max(models, key=lambda n: (num_registered(models[n]), -n))])
         diagnosis = preflight(recording, raw, progress, model=_trajectory(largest, timing))
         write_json(workspace.diagnosis, diagnosis.as_json())
         findings(diagnosis)
         recording = dataclasses.replace(recording, doubts=stop_or_doubt(diagnosis, force=options.force))
-        stages = with_defaults(model_stages, default_model_stages(recording, options))
+        stages = with_defaults(model_stages, default_model_stages(recording, _as_mapped(options)))
         results, fragments = run_models(
             session, recording, stages, found=models, fragments=options.fragments, numbered=True, after=(), read=read
         )
@@ -197,6 +201,7 @@ def _reconstruct(
             notes = (*notes, "the target was not measured: the project has no images/; give --images DIR")
         results = tuple(_noted(result, notes) for result in results)
         results = run_validation(session, results, target, images)
+        results = run_georeference(session, results, fixes, timing, options.world)
         metric = place_project(session, project, source, models, _scales(results, fragments))
         if options.dense and images is not None:
             results = run_dense_models(session, results, images, options.dense_options)
@@ -220,6 +225,13 @@ def _trajectory(model: pycolmap.Reconstruction, timing: FrameTiming) -> CameraTr
         return "untimed"
 
 
+def _as_mapped(options: ReconstructOptions) -> ReconstructOptions:
+    """The options, with a project's cameras held where a refinement is not asked to change them, too."""
+    if options.refine == "off" or options.mapping.refine_intrinsics is not None:
+        return options
+    return dataclasses.replace(options, mapping=dataclasses.replace(options.mapping, refine_intrinsics=False))
+
+
 def _check_options(options: ReconstructOptions) -> None:
     """Refuse what has no meaning without mapping."""
     default = ReconstructOptions()
@@ -228,6 +240,7 @@ def _check_options(options: ReconstructOptions) -> None:
         for group in ("mapping", "apertures", "exposures")
         for f in dataclasses.fields(getattr(default, group))
         if getattr(getattr(options, group), f.name) != getattr(getattr(default, group), f.name)
+        and not (f.name == "refine_intrinsics" and options.refine != "off")
     ]
     named += ["--deblur"] if options.deblur not in (None, "off") else []
     named += ["--rolling-shutter"] if options.rolling_shutter not in (None, "off") else []
@@ -333,11 +346,7 @@ def _run_times(
     """When the images were taken, and what the user should know about that."""
 
     def work(partial: Sequence[Path]) -> None:
-        names: set[str] = set()
-        for folder in models.values():
-            model = read(folder)
-            names |= {model.image(i).name for i in model.reg_image_ids()}
-        timing, notes = _times(given, sorted(names), images, session.progress)
+        timing, notes = _times(given, _registered(models, read), images, session.progress)
         write_record(partial[0], _Times(timing=timing, notes=notes))
 
     frames = given.capture.frames
@@ -352,6 +361,12 @@ def _run_times(
     session.runner.run("times", depends, [session.workspace.frames], work)
     found = read_record(session.workspace.frames, _Times)
     return found.timing, found.notes
+
+
+def _registered(models: dict[int, Path], read: Callable[[Path], pycolmap.Reconstruction]) -> list[str]:
+    """Names of all images of the models."""
+    found = [read(folder) for folder in models.values()]
+    return sorted({model.image(i).name for model in found for i in model.reg_image_ids()})
 
 
 def _times(

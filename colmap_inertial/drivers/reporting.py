@@ -8,6 +8,8 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import logging
+import platform
+import time
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -24,6 +26,7 @@ from colmap_inertial.options import ProjectOptions
 from colmap_inertial.precalibrate.calibrate import guessed_camera
 from colmap_inertial.report import write_report
 from colmap_inertial.report.content import model_file, recording_file
+from colmap_inertial.report.photogrammetry import photogrammetry_record
 from colmap_inertial.report.scene import scene_record
 from colmap_inertial.report.series import rounded, strided
 from colmap_inertial.report.signals import signal_record
@@ -33,6 +36,7 @@ from colmap_inertial.run.session import Session
 from colmap_inertial.run.workspace import Workspace
 from colmap_inertial.stages.metric import gravity_in_model
 from colmap_inertial.stages.protocols import KeypointStage
+from colmap_inertial.threads import usable_processors
 from colmap_inertial.types import Array, CameraTrajectory, ImuRecording, Keypoints
 
 log = logging.getLogger(__name__)
@@ -71,6 +75,11 @@ def write_recording(
                 "readout_s": timing.readout_s,
             },
             "rolling_shutter": _shutter_record(stages, recording, rectified),
+            "made": {
+                "date": time.strftime("%Y-%m-%d"),
+                "machine": f"{platform.system()} {platform.machine()}",
+                "processors": usable_processors(),
+            },
         }
         workspace.report_data.mkdir(exist_ok=True)
         write_json(recording_file(workspace.root), record, indent=None)
@@ -129,8 +138,12 @@ def write_model_record(
         raise ValueError("a model without a scale estimate has nothing to report")
     with _failures_logged(f"what the report draws of model {index}"):
         gravity, first_frame_s = gravity_in_model(model), float(model.timing.t_s[0])
+        scene = scene_record(model.reconstruction, trajectory, gravity, first_frame_s=first_frame_s)
         record = {
-            "scene": scene_record(model.reconstruction, trajectory, gravity, first_frame_s=first_frame_s),
+            "scene": scene,
+            "photogrammetry": photogrammetry_record(
+                model.reconstruction, np.array(scene["display_from_model_xyzw"]), unit=scene["unit"]
+            ),
             "signals": signal_record(trajectory, imu, model.scale, gravity, first_frame_s=first_frame_s),
         }
         workspace.report_data.mkdir(exist_ok=True)

@@ -10,9 +10,11 @@ import numpy as np
 
 from colmap_inertial import __version__
 from colmap_inertial.colmap.dense import DenseResult
+from colmap_inertial.colmap.pairing import MatchRecord
 from colmap_inertial.colmap.sparse import KeypointRecords
 from colmap_inertial.errors import InertialError, NotObservableError
 from colmap_inertial.geometry import quat_conjugate, quat_log, quat_multiply
+from colmap_inertial.georeference import Georeference
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.precalibrate.plan import ImagingPlan
 from colmap_inertial.precalibrate.selection import Selection
@@ -63,11 +65,14 @@ class ModelResult(ScaledModel):
     ----------
     validation
         Against the capture's target, where it names one; an error says why the target could not be measured.
+    georeference
+        Where on Earth it stands, where that was asked for; an error says why that stays open.
     dense
         Where it was asked for.
     """
 
     validation: Validation | InertialError | None = None
+    georeference: Georeference | InertialError | None = None
     dense: DenseResult | None = None
 
     def within(self, root: Path) -> ModelResult:
@@ -109,6 +114,8 @@ class ReconstructResult:
         What was left out.
     frames, keypoints
         What happened to each frame, and to the keypoints of each image.
+    matching
+        Which pairs of images were matched, and why not the rest; ``None`` for an existing project.
     seconds
         By step.
     imaging
@@ -129,6 +136,7 @@ class ReconstructResult:
     fragments: tuple[Fragment, ...] = ()
     frames: tuple[FrameRecord, ...] = ()
     keypoints: KeypointRecords = field(default_factory=KeypointRecords)
+    matching: MatchRecord | None = None
     seconds: dict[str, float]
     imaging: ImagingPlan = field(default_factory=ImagingPlan)
     selection: Selection | None = None
@@ -208,8 +216,8 @@ def _change(first: CameraImuCalibration, refined: CameraImuCalibration | None) -
     }
 
 
-def _validation_as_json(check: Validation | InertialError | None) -> object:
-    return {"error": str(check)} if isinstance(check, InertialError) else check and check.as_json()
+def _measured_as_json(found: Validation | Georeference | InertialError | None) -> object:
+    return {"error": str(found)} if isinstance(found, InertialError) else found and found.as_json()
 
 
 def result_as_json(result: ReconstructResult, capture: Capture) -> dict[str, object]:
@@ -239,7 +247,8 @@ def result_as_json(result: ReconstructResult, capture: Capture) -> dict[str, obj
                 "calibration_change": None
                 if plan.view is None
                 else _change(plan.view.calibration, model.scale.calibration),
-                "validation": _validation_as_json(model.validation),
+                "validation": _measured_as_json(model.validation),
+                "georeference": _measured_as_json(model.georeference),
                 "readout_translation": next((t.values for t in model.treatments if t.stage == "readout"), None),
                 "treatments": [asdict(treatment) for treatment in model.treatments],
                 "dense": model.dense and model.dense.as_json(root),
@@ -251,6 +260,7 @@ def result_as_json(result: ReconstructResult, capture: Capture) -> dict[str, obj
         "waiting": bool(result.waiting),
         "selection": result.selection and result.selection.as_json(),
         "imaging": imaging_as_json(plan, rectified),
+        "matching": result.matching and asdict(result.matching),
         "frames": [frame_as_json(record, plan, rectified) for record in result.frames],
         "seconds": result.seconds,
     }

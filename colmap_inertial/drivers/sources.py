@@ -25,7 +25,14 @@ from colmap_inertial.model import apply_similarity, find_models, is_metric, read
 from colmap_inertial.options import ScaleOptions, ValidateOptions
 from colmap_inertial.scale import estimate_scale, first_seconds
 from colmap_inertial.types import CameraImuCalibration, CameraTrajectory, ImuRecording, ScaleEstimate, Similarity
-from colmap_inertial.validate import Validation, parse_target, validate_model, write_overlays
+from colmap_inertial.validate import (
+    Validation,
+    parse_target,
+    validate_model,
+    with_bars,
+    with_check_points,
+    write_overlays,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,6 +137,10 @@ def only_model(path: Path) -> Path:
     return next(iter(models.values()))
 
 
+#: One of these is in every JSON file that a command writes.
+_OURS = frozenset({"metres_per_unit", "cam_from_imu_xyzw", "accel_gain", "findings", "out", "exit_code"})
+
+
 def check_output(path: Path, inputs: Sequence[Path | None]) -> None:
     """Refuse, before any work, an output that would replace anything but an earlier result of ours.
 
@@ -147,10 +158,10 @@ def check_output(path: Path, inputs: Sequence[Path | None]) -> None:
             raise OutputExistsError(f"{path} is an input; choose another name for the result")
     if path.exists():
         try:
-            ours = {"metres_per_unit", "cam_from_imu_xyzw", "accel_gain", "findings"} & set(read_json(path))
+            keys = set(read_json(path))
         except FormatError:
-            ours = set()
-        if not ours:
+            keys = set()
+        if not keys & _OURS:
             raise OutputExistsError(f"{path} exists and is no earlier result; choose another name or remove it")
 
 
@@ -194,10 +205,10 @@ def scale_source(
     source: ScaleSource,
     options: ScaleOptions,
     *,
-    json: Path,
+    json: Path | None = None,
     first_s: float | None = None,
 ) -> ScaleEstimate:
-    """Estimate the scale of an existing model or trajectory and write it.
+    """Estimate the scale of an existing model or trajectory.
 
     Parameters
     ----------
@@ -206,12 +217,12 @@ def scale_source(
     options
         Of the estimate.
     json
-        Written whole, also when the scale is refused.
+        Where to write it, also when the scale is refused.
     first_s
         Use only the first seconds of the camera's recording, for the alignment too.
     """
-    check_output(json, [source.source, source.imu, source.frame_times, *as_paths(source.calibration)])
-    used = used_files(source.calibration)
+    if json is not None:
+        check_output(json, [source.source, source.imu, source.frame_times, *as_paths(source.calibration)])
     recording = load_source(source)
     trajectory = recording.trajectory
     if first_s is not None:
@@ -225,8 +236,14 @@ def scale_source(
             estimate = dataclasses.replace(estimate, reasons=(likely.sentence, *estimate.reasons))
     notes = (*estimate.notes, *recording.imu.repairs, *recording.notes)
     estimate = dataclasses.replace(estimate, notes=notes)
-    write_json(json, {**estimate.as_json(), "calibration_files": used})
+    if json is not None:
+        write_json(json, scale_as_json(estimate, source.calibration))
     return estimate
+
+
+def scale_as_json(estimate: ScaleEstimate, calibration: CalibrationFiles = None) -> dict[str, object]:
+    """What ``scale --json`` writes: the estimate, and the calibration files that it used."""
+    return {**estimate.as_json(), "calibration_files": used_files(calibration)}
 
 
 def validate_source(
@@ -238,6 +255,8 @@ def validate_source(
     json: Path | None = None,
     pictures: Path | None = None,
     apply: Path | None = None,
+    bars: Path | None = None,
+    check_points: Path | None = None,
 ) -> Validation:
     """Measure a target in a model and write what was found.
 
@@ -251,6 +270,8 @@ def validate_source(
         Where to write the result, and frames with the corners drawn in.
     apply
         Where to write the model in metres, scaled by the control distances; for a model without a unit only.
+    bars, check_points
+        Tables of distances between markers, and of their coordinates.
 
     Raises
     ------
@@ -267,7 +288,13 @@ def validate_source(
     if apply is not None and not options.unscaled:
         raise InertialError("--apply scales a model that claims no unit: add --unscaled")
     folder = only_model(model)
+    if (bars is not None or check_points is not None) and parsed.kind != "aruco":
+        raise InertialError("--bars and --check-points name markers: give a target of markers, as aruco:DICT:SIDE_M")
     result = validate_model(folder, images, parsed, options)
+    if bars is not None:
+        result = with_bars(result, bars)
+    if check_points is not None:
+        result = with_check_points(result, check_points)
     if apply is not None:
         if result.control is None:
             raise InertialError("too few corners to keep control and check distances apart; --apply needs more views")

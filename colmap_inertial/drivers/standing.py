@@ -45,7 +45,7 @@ def settle_dense(workspace: Workspace, models: Mapping[int, Path]) -> None:
         return
     of = {index: digest(model) for index, model in models.items()}
     for folder in sorted(workspace.dense.glob("*")):
-        known, index = model_of(folder), int(folder.name) if folder.name.isdigit() else -1
+        known, index = model_of(folder), int(folder.name) if folder.name.isdecimal() and folder.name.isascii() else -1
         if known is None or known == of.get(index):
             continue
         steps = list(workspace.stamps.glob(f"dense_{folder.name}_*.json"))

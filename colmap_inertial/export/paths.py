@@ -20,10 +20,13 @@ from colmap_inertial.types import Array, CameraMotion, CameraTrajectory
 if TYPE_CHECKING:
     from pygltflib import GLTF2
 
+    from colmap_inertial.georeference import Georeference
+
 _COLUMNS = (
     *("name", "t_s", "x", "y", "z", "qx", "qy", "qz", "qw"),
     *("vx_m_s", "vy_m_s", "vz_m_s", "wx_rad_s", "wy_rad_s", "wz_rad_s"),
 )
+_PLACE = ("latitude_deg", "longitude_deg", "height_m")
 _GLTF_UP = np.array([0.0, 1.0, 0.0])
 #: Where a drawn camera begins to see, metres.
 _NEAR_M = 0.01
@@ -44,16 +47,23 @@ def smoothed_path(trajectory: Path | None, model: Path) -> CameraTrajectory:
     return read_tum(trajectory)
 
 
-def write_cameras(path: Path, views: list[View], motion: CameraMotion | None, originals: dict[str, str]) -> None:
+def write_cameras(
+    path: Path,
+    views: list[View],
+    motion: CameraMotion | None,
+    originals: dict[str, str],
+    on_map: Georeference | None = None,
+) -> None:
     """Write a row for each image: its time, pose and velocities, where they are known.
 
     Columns: image name; seconds on the camera's clock; camera centre; rotation world_from_camera (x right, y down, z
-    forward); velocity in the world; angular velocity in the camera's axes.
+    forward); velocity in the world; angular velocity in the camera's axes; with ``on_map`` latitude, longitude and
+    height (WGS84).
     """
     place = {} if motion is None else {name: i for i, name in enumerate(motion.names)}
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
-    rows.writerow(_COLUMNS)
+    rows.writerow(_COLUMNS if on_map is None else (*_COLUMNS, *_PLACE))
     for view in views:
         name = originals[view.name]
         pose = (*view.cam_in_world, *quat_conjugate(view.cam_from_world_xyzw))
@@ -64,7 +74,8 @@ def write_cameras(path: Path, views: list[View], motion: CameraMotion | None, or
             time = f"{'-' if total_ns < 0 else ''}{abs(total_ns) // 10**9}.{abs(total_ns) % 10**9:09d}"
             both = (*motion.velocity_in_world_m_s[index], *motion.angular_velocity_in_cam_rad_s[index])
             moving = [f"{value:.9g}" for value in both]
-        rows.writerow([name, time, *(f"{value:.12g}" for value in pose), *moving])
+        place_on_map = [] if on_map is None else on_map.geodetic(view.cam_in_world[None])[0].tolist()
+        rows.writerow([name, time, *(f"{value:.12g}" for value in pose), *moving, *(f"{v:.12g}" for v in place_on_map)])
     write_text(path, text.getvalue())
 
 

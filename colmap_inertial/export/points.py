@@ -14,6 +14,8 @@ from colmap_inertial.types import Array
 if TYPE_CHECKING:
     import pycolmap
 
+    from colmap_inertial.georeference import Georeference
+
 #: Step of the integers that LAS keeps coordinates in, model units.
 _LAS_STEP, _LAS_RANGE = 1e-6, 2**31 - 1
 
@@ -48,12 +50,21 @@ def require_laspy() -> None:
     """Raise :class:`MissingExtraError` where laspy is not installed."""
     try:
         import laspy  # noqa: F401
+        import pyproj  # noqa: F401
     except ImportError:
-        raise MissingExtraError("las", "LAS files are written by laspy") from None
+        raise MissingExtraError("las", "LAS files are written by laspy, and put on the map by pyproj") from None
 
 
-def write_las(path: Path, xyz: Array, rgb: NDArray[np.uint8]) -> None:
+def utm_epsg(latitude_deg: float, longitude_deg: float) -> int:
+    """EPSG's number of the UTM zone (WGS84) of a place, without the exceptions around Norway."""
+    zone = int((longitude_deg + 180) // 6) % 60 + 1
+    return (32600 if latitude_deg >= 0 else 32700) + zone
+
+
+def write_las(path: Path, xyz: Array, rgb: NDArray[np.uint8], on_map: Georeference | None = None) -> None:
     """Write points as LAS 1.2, point format 2: coordinates to a micrometre where they allow it, 16-bit colours.
+
+    With ``on_map`` in UTM (WGS84) of the zone that the model lies in, and the file says so; else in the model's world.
 
     Raises
     ------
@@ -64,6 +75,14 @@ def write_las(path: Path, xyz: Array, rgb: NDArray[np.uint8]) -> None:
     import laspy
 
     header = laspy.LasHeader(point_format=2, version="1.2")
+    if on_map is not None:
+        import pyproj
+
+        crs = pyproj.CRS.from_epsg(utm_epsg(on_map.latitude_deg, on_map.longitude_deg))
+        header.add_crs(crs)
+        latitude, longitude, height = on_map.geodetic(xyz).T
+        east, north = pyproj.Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(longitude, latitude)
+        xyz = np.stack([east, north, height], axis=1)
     # 32-bit integers: the step grows with what is far away
     offset = np.floor(xyz.min(axis=0)) if len(xyz) else np.zeros(3)
     reach = float(np.abs(xyz - offset).max(initial=0.0))

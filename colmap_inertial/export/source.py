@@ -9,17 +9,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from colmap_inertial.drivers.georeference import on_earth, positions_of, read_georeference
 from colmap_inertial.errors import FormatError, NotObservableError
+from colmap_inertial.georeference import Georeference
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import read_json
 from colmap_inertial.io.frames import read_frame_timing
 from colmap_inertial.io.names import path_in
+from colmap_inertial.io.positions import positions_in_pictures
 from colmap_inertial.io.records import read_record
 from colmap_inertial.model import read_model
 from colmap_inertial.options import ExportImages
 from colmap_inertial.run.workspace import Workspace, a_record_of_ours, places_of
 from colmap_inertial.stages.metric import motion_file
-from colmap_inertial.types import DOWN_IN_WORLD, Array, CameraMotion
+from colmap_inertial.types import DOWN_IN_WORLD, Array, CameraMotion, CameraTrajectory
 from colmap_inertial.view.sources import ViewSource, find_source
 
 if TYPE_CHECKING:
@@ -159,6 +162,50 @@ def read_source(
         gravity_in_world_m_s2=down,
         motion=motion,
         treated=_treated(Workspace(out)),
+    )
+
+
+def placed_on_earth(out: Path, source: ExportSource, capture: Capture | None) -> Georeference:
+    """Where on Earth a model stands: as its run found it, else by the positions of the capture or of its pictures.
+
+    Raises
+    ------
+    FormatError
+        Where there are no positions.
+    NotObservableError
+        Where they leave the heading open, or the model is not metric.
+    """
+    if source.found.scale.unit != "m" or source.up_in_world is None:
+        raise NotObservableError("heading", "only a model in metres, with gravity known, stands anywhere on Earth")
+    known = read_georeference(Workspace(out).georeference, source.found.index)
+    if known is not None:
+        return known
+    path = _path(source)
+    folder = next((folder for folder in source.found.images if folder.is_dir()), None)
+    if capture is not None:
+        fixes = positions_of(capture, path.names)
+    elif folder is not None:
+        fixes = positions_in_pictures(folder, path.names)
+    else:
+        raise FormatError(source.found.folder, "its pictures are not beside it: give --capture or --image-folder")
+    if fixes.names is None and source.motion is None:
+        raise FormatError(source.found.folder, "the run kept no times of its images, which positions in a video go by")
+    return on_earth(fixes, path, source.up_in_world)
+
+
+def _path(source: ExportSource) -> CameraTrajectory:
+    """The images in order of time; where their times were not kept, in order of their names, a second apart."""
+    images = {image.name: image for image in map(source.model.image, source.model.reg_image_ids())}
+    motion = source.motion
+    timed = [] if motion is None else [(t, name) for t, name in zip(motion.t_s, motion.names, strict=True)]
+    rows = [(t, name) for t, name in timed if name in images] or list(enumerate(sorted(images)))
+    poses = [images[name].cam_from_world() for _, name in rows]
+    return CameraTrajectory(
+        names=tuple(name for _, name in rows),
+        t_s=np.array([t for t, _ in rows], dtype=np.float64),
+        epoch_ns=0 if motion is None else motion.epoch_ns,
+        cam_from_world_xyzw=np.array([pose.rotation.quat for pose in poses]),
+        cam_in_world=np.array([images[name].projection_center() for _, name in rows]),
     )
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial import __version__
+from colmap_inertial.drivers.georeference import cameras_as_json
 from colmap_inertial.errors import OutputError
 from colmap_inertial.export.cameras import write_bundler, write_metashape
 from colmap_inertial.export.exposures import exposures_of
@@ -20,9 +21,10 @@ from colmap_inertial.export.pictures import Job, write_pictures
 from colmap_inertial.export.pinhole_model import needed_cameras, pinhole_model
 from colmap_inertial.export.points import require_laspy, sparse_points, write_las, write_ply
 from colmap_inertial.export.programs import PROGRAMS, command_line
-from colmap_inertial.export.source import ExportSource, Picture, read_source
+from colmap_inertial.export.source import ExportSource, Picture, placed_on_earth, read_source
 from colmap_inertial.export.transforms import View, transforms, with_row_poses, with_velocities
 from colmap_inertial.export.undistort import Undistortion
+from colmap_inertial.georeference import Georeference
 from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.files import StrPath, write_json
 from colmap_inertial.io.frames import read_frames
@@ -86,6 +88,7 @@ def export_model(
     model: int | None = None,
     image_folder: StrPath | None = None,
     capture: StrPath | None = None,
+    georeference: bool = False,
     unscaled: bool = False,
     progress: Progress = silent,
 ) -> Exported:
@@ -107,7 +110,11 @@ def export_model(
     image_folder
         Folder with the model's pictures, where they are not beside it.
     capture
-        With ``images="original"``: the capture that the run was made of, for frames that it deblurred or changed.
+        The capture that the run was made of: with ``images="original"`` for frames that it deblurred or changed, with
+        ``georeference`` for its positions.
+    georeference
+        Also say where on Earth everything is: ``georeference.json``, columns of ``cameras.csv``, and LAS points in UTM.
+        As the run found it, else by the positions of the capture or of the pictures' EXIF.
     unscaled
         Export a model without a scale in its own units.
     progress
@@ -122,14 +129,15 @@ def export_model(
     FormatError
         Where there is no model, a picture is missing or of another size, or a lens cannot be undistorted.
     NotObservableError
-        Where the scale was refused; where ``program`` needs velocities and none were kept.
+        Where the scale was refused; where ``program`` needs velocities and none were kept; where positions leave the
+        heading open.
     OutputError
         Where ``folder`` holds something, lies within ``out``, or cannot be written.
     MissingExtraError
         Where a format needs a package that is not installed.
     """
-    if capture is not None and images != "original":
-        raise ValueError('capture goes with images="original"')
+    if capture is not None and images != "original" and not georeference:
+        raise ValueError('capture goes with images="original" or georeference')
     out, folder = Path(out), Path(folder)
     inner, outer = folder.resolve(), out.resolve()
     if inner.is_relative_to(outer) or outer.is_relative_to(inner):
@@ -141,7 +149,9 @@ def export_model(
         out, model=model, image_folder=None if image_folder is None else Path(image_folder), unscaled=unscaled
     )
     filmed = None if capture is None else load_capture(Path(capture))
-    work = _Work(out=out, source=source, program=program, capture=filmed)
+    on_map = placed_on_earth(out, source, filmed) if georeference else None
+    filmed = filmed if images == "original" else None
+    work = _Work(out=out, source=source, program=program, capture=filmed, on_map=on_map)
     with new_folder(folder, into_empty=True) as partial:
         made = work.write(partial, images, progress)
         command = "" if program is None else command_line(program, folder)
@@ -158,6 +168,7 @@ class _Work:
     source: ExportSource
     program: ExportProgram | None
     capture: Capture | None
+    on_map: Georeference | None
 
     def __post_init__(self) -> None:
         self.model = self.source.model
@@ -173,6 +184,12 @@ class _Work:
         found, notes = self.source.found, self._notes()
         cameras = self._cameras(square=self.program == "bundler")
         views, (xyz, rgb) = self._views(cameras), sparse_points(self.model)
+        if self.on_map is not None:
+            centres = np.array([view.cam_in_world for view in views])
+            named = tuple(view.name for view in views)
+            content = {**self.on_map.as_json(), "cameras": cameras_as_json(self.on_map, named, centres)}
+            write_json(partial / "georeference.json", content)
+            notes += self.on_map.notes
         images = points = 0
         if self.program in _WITHOUT_PICTURES:
             self._write_format(partial, views, xyz, rgb)
@@ -216,12 +233,12 @@ class _Work:
             up = " ".join(f"{value:.6g}" for value in self.up_in_world)
             write_ply(partial / "points.ply", xyz, rgb, (f"unit: {unit}", f"up: {up}"))
         elif self.program == "las":
-            write_las(partial / "points.las", xyz, rgb)
+            write_las(partial / "points.las", xyz, rgb, self.on_map)
         elif self.program == "tum":
             write_tum(partial / "trajectory.tum", smoothed_path(found.trajectory, found.folder))
         elif self.program == "csv":
             originals = {new: old for old, new in self.names.items()}
-            write_cameras(partial / "cameras.csv", views, self.source.motion, originals)
+            write_cameras(partial / "cameras.csv", views, self.source.motion, originals, self.on_map)
         else:
             smoothed = None if found.trajectory is None else smoothed_path(found.trajectory, found.folder)
             write_gltf(partial / "scene.glb", views, smoothed, xyz, rgb, self.up_in_world)

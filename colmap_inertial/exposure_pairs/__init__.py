@@ -4,6 +4,7 @@
 (:mod:`colmap_inertial.restoration.lsd2`); :func:`fuse_mertens` blends exposures as they are.
 """
 
+from colmap_inertial.exposure_pairs.alone import Alone, better_alone
 from colmap_inertial.exposure_pairs.mertens import fuse_mertens
 from colmap_inertial.exposure_pairs.pair import (
     Brightness,
@@ -12,17 +13,21 @@ from colmap_inertial.exposure_pairs.pair import (
     blur_seen_from_short,
     brightened,
     bring_together,
+    first_brightness,
     gyro_shift,
     match_brightness,
 )
 
 __all__ = [
+    "Alone",
     "Brightness",
     "ExposurePair",
     "PairGyro",
+    "better_alone",
     "blur_seen_from_short",
     "brightened",
     "bring_together",
+    "first_brightness",
     "fuse_mertens",
     "gyro_shift",
     "match_brightness",

@@ -36,8 +36,10 @@ _CELLS_ALONG, _LEAST_CELL_PX = 40, 12
 _MOST_CLIPPED, _MOST_BLACK, _LEAST_CELLS = 0.01, 0.1, 12
 #: Where so few are left, those with the least black serve, as long as half of their pixels are not.
 _BLACKEST = 0.5
-#: What is stated is believed while the pixels agree to this factor.
-_AGREE = 1.25
+#: Of squares that are compared by rank alone, those with more clipped pixels are the brightest.
+_CLIPPED_SQUARE = 0.2
+#: What is stated is believed while the pixels agree to this factor; before they are aligned, to the second.
+_AGREE, _AGREE_UNALIGNED = 1.25, 2.0
 #: Colours differ between exposures by no more than this factor (phones at night reach 1.5): more would be a mistake.
 _MOST_COLOUR = 2.0
 #: A gain beyond this shows nothing but noise.
@@ -117,6 +119,32 @@ def match_brightness(short: Codes, long: Codes, *, stated: float | None = None) 
     return Brightness(
         gain=float(np.clip(gain, 1 / MOST_GAIN, MOST_GAIN)),
         colours=tuple(float(np.exp(c)) for c in colours),
+        measured=measured,
+        stated=stated,
+    )
+
+
+def first_brightness(short: Codes, long: Codes, *, stated: float | None = None) -> Brightness:
+    """The gain between two exposures that may lie far from each other.
+
+    Not what lies in one place is compared, but what is equally bright among all squares of each image. What is stated
+    is taken where that agrees to a factor of two or tells nothing. Parameters and errors are those of
+    :func:`match_brightness`, which is exact where the images are aligned.
+    """
+    cell = max(_LEAST_CELL_PX, max(short.shape[:2]) // _CELLS_ALONG)
+    dark, bright = (image.reshape(*image.shape[:2], -1) for image in (short, long))
+    found = [_ranked_gain(dark[..., c], bright[..., c], cell) for c in range(dark.shape[2])]
+    telling = np.array([np.log(gain) for gain in found if gain is not None])
+    measured = float(np.exp(np.median(telling))) if len(telling) else None
+    if stated is not None and (measured is None or abs(np.log(measured / stated)) <= np.log(_AGREE_UNALIGNED)):
+        gain = stated
+    elif measured is not None:
+        gain = measured
+    else:
+        return match_brightness(short, long, stated=stated)
+    return Brightness(
+        gain=float(np.clip(gain, 1 / MOST_GAIN, MOST_GAIN)),
+        colours=(1.0,) * dark.shape[2],
         measured=measured,
         stated=stated,
     )
@@ -272,7 +300,7 @@ def bring_together(
     """
     import cv2
 
-    brightness = match_brightness(short, long, stated=stated_gain)
+    brightness = first_brightness(short, long, stated=stated_gain)
     shift, note = None, ""
     if gyro is None:
         note = "no gyroscope"
@@ -300,9 +328,10 @@ def bring_together(
     covered = (map_x >= 0) & (map_x <= width - 1) & (map_y >= 0) & (map_y <= height - 1)
     seen = cv2.remap(long, map_x, map_y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     lost = cv2.remap(clipped.astype(np.uint8), map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) > 0
-    # once more of what they have in common, if that is enough
-    with contextlib.suppress(NotObservableError):
-        brightness = match_brightness(short, np.where(_like(covered, seen), seen, 0), stated=stated_gain)
+    # exactly, of what they have in common, if that is enough
+    if registered.alike:
+        with contextlib.suppress(NotObservableError):
+            brightness = match_brightness(short, np.where(_like(covered, seen), seen, 0), stated=stated_gain)
     matched = brightened(short, brightness)
     aligned = np.where(_like(covered, seen), seen.astype(np.float32) / np.float32(top), matched)
     return ExposurePair(
@@ -319,19 +348,8 @@ def bring_together(
 
 def _channel_gain(short: Codes, long: Codes, cell: int) -> float | None:
     """Weighted median over squares of one channel; ``None`` where too few tell."""
-    import cv2
-
-    height, width = short.shape
-    size = (max(1, width // cell), max(1, height // cell))
-
-    def mean(values: NDArray[np.float32]) -> Array:
-        return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_AREA), dtype=np.float64)
-
-    top = np.iinfo(short.dtype).max
-    dark, bright = (mean(decode_table(image.dtype)[image]) for image in (short, long))
-    clipped = [mean((image >= np.ceil(CLIPPED * top)).astype(np.float32)) for image in (short, long)]
-    # codes below the first of 8 bits: what noise takes below black is lost, and what is left is too bright
-    black = [mean((image <= top // 256).astype(np.float32)) for image in (short, long)]
+    (dark, *of_short), (bright, *of_long) = _squares(short, cell), _squares(long, cell)
+    clipped, black = zip(of_short, of_long, strict=True)
     good = (np.maximum(*clipped) <= _MOST_CLIPPED) & (dark > 0) & (bright > 0)
     blackness = np.maximum(*black)
     ranked = np.sort(blackness[good])[: 2 * _LEAST_CELLS]
@@ -340,6 +358,42 @@ def _channel_gain(short: Codes, long: Codes, cell: int) -> float | None:
         return None
     # by the light of both: that of one alone would prefer squares in which a shift between them makes it the brighter
     return float(np.exp(_weighted_median(np.log(bright[good] / dark[good]), np.sqrt(bright[good] * dark[good]))))
+
+
+def _ranked_gain(short: Codes, long: Codes, cell: int) -> float | None:
+    """Likewise of squares of the same rank in brightness, between those that are black and those that clip."""
+    (dark, *of_short), (bright, *of_long) = _squares(short, cell), _squares(long, cell)
+    clipped, black = (
+        max(float((of_one[k] > most).mean()) for of_one in (of_short, of_long))
+        for k, most in ((0, _CLIPPED_SQUARE), (1, _BLACKEST))
+    )
+    first, end = int(np.ceil(black * dark.size)), int((1 - clipped) * dark.size)
+    if end - first < _LEAST_CELLS:
+        return None
+    a, b = np.sort(dark.ravel())[first:end], np.sort(bright.ravel())[first:end]
+    good = (a > 0) & (b > 0)
+    if np.count_nonzero(good) < _LEAST_CELLS:
+        return None
+    return float(np.exp(_weighted_median(np.log(b[good] / a[good]), np.sqrt(a[good] * b[good]))))
+
+
+def _squares(image: Codes, cell: int) -> tuple[Array, Array, Array]:
+    """Mean light of one channel's squares, and which share of them clips and is black."""
+    import cv2
+
+    height, width = image.shape
+    size = (max(1, width // cell), max(1, height // cell))
+    top = np.iinfo(image.dtype).max
+
+    def mean(values: NDArray[Any]) -> Array:
+        return np.asarray(cv2.resize(values.astype(np.float32), size, interpolation=cv2.INTER_AREA), dtype=np.float64)
+
+    # codes below the first of 8 bits: what noise takes below black is lost, and what is left is too bright
+    return (
+        mean(decode_table(image.dtype)[image]),
+        mean(image >= np.ceil(CLIPPED * top)),
+        mean(image <= top // 256),
+    )
 
 
 def _weighted_median(values: Array, weights: Array) -> float:

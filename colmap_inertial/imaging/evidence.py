@@ -52,6 +52,8 @@ class BlurEvidence:
         (FACTORS, 1) the same in the direction that a gyroscope with one axis flipped would predict.
     tiles
         How many were summed.
+    extent_px
+        Sum of the lengths of their predicted blur.
     """
 
     total: Array
@@ -59,6 +61,7 @@ class BlurEvidence:
     mirrored: Array
     mirrored_square: Array
     tiles: int
+    extent_px: float = 0.0
 
     @classmethod
     def nothing(cls) -> BlurEvidence:
@@ -150,6 +153,7 @@ def blur_evidence(image: NDArray[np.uint8] | NDArray[np.uint16], blur: BlurField
         mirrored=mirrored.sum(axis=0),
         mirrored_square=(mirrored**2).sum(axis=0),
         tiles=len(values),
+        extent_px=float(np.hypot(vectors[:, 0], vectors[:, 1]).sum()),
     )
 
 

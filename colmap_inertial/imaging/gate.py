@@ -16,8 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.imaging.blur_path import BlurPath
 from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence, detail_fall
 from colmap_inertial.imaging.gyro_camera import GyroCamera
+from colmap_inertial.imaging.path_filters import path_wiener
 from colmap_inertial.imaging.psf import PredictedBlur
 from colmap_inertial.types import Array
 
@@ -191,26 +193,24 @@ def deblur_gated(
         What its frames say together (:func:`judge_recording`). Without it, only frames that show the blur clearly by
         themselves are deblurred.
     deblur
-        ``wiener.deblur`` by default.
+        ``path_wiener`` along the field's lines by default.
     options
         Thresholds.
     """
     options = options or GateOptions()
-    factor, reason = _judge(image, blur, recording, options)
+    factor, reason = judge_frame(image, blur, recording, options)
     if factor is None:
         return GatedFrame(image=image, deblurred=False, kept_share=1.0, extent_factor=1.0, reason=reason)
     if factor != 1.0:
         blur = replace(blur, vector_px=(blur.vector_px * np.float32(factor)))
-    if deblur is None:
-        from colmap_inertial.imaging.wiener import deblur as wiener_deblur
-
-        deblur = wiener_deblur
-    out, kept = keep_sharp(image, deblur(image, blur), blur)
+    restored = path_wiener(image, BlurPath.straight(blur)) if deblur is None else deblur(image, blur)
+    out, kept = keep_sharp(image, restored, blur)
     return GatedFrame(image=out, deblurred=True, kept_share=kept, extent_factor=factor, reason=reason)
 
 
-#: An extent is corrected where it is further off than small blur lets the dip drift, and where the dip is this clear.
-_CORRECTED_FROM, _CLEAR_SUPPORT = 0.1, 7.0
+#: An extent is corrected where it is further off than small blur lets the dip drift, as a share and in px, and where
+#: the dip is this clear.
+_CORRECTED_FROM, _DRIFT_PX, _CLEAR_SUPPORT = 0.1, 1.2, 7.0
 #: Blur this long must show in a frame with texture.
 MUST_SHOW_PX = 8.0
 #: Blur takes at least this from the logarithm of the power along it; sharp images are at 0 +- 0.2.
@@ -298,17 +298,19 @@ def _mended(evidence: BlurEvidence) -> float:
     """The factor that the extents need."""
     factor = evidence.extent_factor
     clear = evidence.support >= _CLEAR_SUPPORT and evidence.extent_is_plausible
-    return factor if clear and abs(factor - 1) > _CORRECTED_FROM else 1.0
+    mean_px = evidence.extent_px / max(evidence.tiles, 1)
+    drift = max(_CORRECTED_FROM, _DRIFT_PX / mean_px if mean_px > 0 else 0.0)
+    return factor if clear and abs(factor - 1) > drift else 1.0
 
 
 def _support(evidence: BlurEvidence) -> float:
     return evidence.support if evidence.extent_is_plausible else min(evidence.support, 0.0)
 
 
-def _judge(
+def judge_frame(
     image: NDArray[Code], blur: BlurField, recording: RecordingVerdict | None, options: GateOptions
 ) -> tuple[float | None, str]:
-    """The factor for the extents, or ``None`` for a frame to leave alone; and why."""
+    """The factor for the extents, or ``None`` for a frame to leave alone; and why. Arguments as of `deblur_gated`."""
     if recording is not None and recording.trusted is False:
         return None, recording.reason
     if recording is not None and recording.trusted:

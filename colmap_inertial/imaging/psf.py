@@ -11,6 +11,7 @@ import numpy as np
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.gyro import on_camera_rate
 from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.imaging.blur_path import BlurPath, middles, samples_for
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.parallax import Parallax
 from colmap_inertial.imaging.rolling_shutter import rays
@@ -112,6 +113,66 @@ def blur_field(
     vectors = _vectors(motion, camera, one, x, y, rates)[0]
     return BlurField(
         width=shutter.width, height=shutter.height, vector_px=_filled(vectors).astype(np.float32), step_px=step_px
+    )
+
+
+def blur_path(
+    motion: GyroCamera,
+    camera: Projector,
+    shutter: FrameShutter,
+    *,
+    parallax: Parallax | None = None,
+    extent_factor: float = 1.0,
+    step_px: int = 64,
+) -> BlurPath:
+    """The curve that each pixel of a frame smears along, of which :func:`blur_field` gives the chord.
+
+    Light that reaches pixel x of a line exposed around t_m at time t comes from what stands, at t_m, at
+    ``x + u = project(R(t_m)' R(t) ray(x) + (t - t_m) v / z(x))``. The sharp picture of a rolling shutter has it on
+    another line, exposed d u later (d seconds per pixel), when it has moved on by ``-u' d (x + q - x)``, u' the path's
+    own speed in the middle of the exposure: ``q = u - u' (d u) / (1 + d u')``.
+
+    Parameters
+    ----------
+    motion, camera, shutter, parallax
+        As for :func:`blur_field`.
+    extent_factor
+        By which the exposure is longer than the shutter says, around the same middle.
+    step_px
+        Distance of the nodes.
+
+    Raises
+    ------
+    NotObservableError
+        As :func:`blur_field`.
+    """
+    chords = blur_field(motion, camera, shutter, parallax=parallax, step_px=step_px).extent_px()
+    assert shutter.exposure_s is not None
+    exposure_s = extent_factor * shutter.exposure_s
+    since_s = exposure_s * middles(samples_for(extent_factor * float(chords.max())))
+    rows, columns = BlurField.nodes(shutter.width, shutter.height, step_px)
+    x, y = step_px * np.arange(float(columns)) + 0.5, step_px * np.arange(float(rows)) + 0.5
+    nodes = np.stack(np.meshgrid(x, y), axis=-1)
+    directions = rays(camera, nodes.reshape(-1, 2)).reshape(*nodes.shape[:2], 3)
+    by_column = shutter.readout_direction in ("right", "left")
+    middle_s = shutter.middle_s(nodes[0] if by_column else nodes[:, 0])
+    turn = np.swapaxes(motion.start_from_cam(middle_s), -1, -2) @ motion.start_from_cam(middle_s + since_s[:, None])
+    seen = np.einsum("sxij,yxj->syxi" if by_column else "syij,yxj->syxi", turn, directions)
+    if parallax is not None:
+        seen = seen + since_s[:, None, None, None] * parallax.rate_at(x, y)
+    path = np.asarray(camera.img_from_cam(seen.reshape(-1, 3))).reshape(*seen.shape[:3], 2) - nodes
+    step_s = np.array(shutter.line_step_s)
+    if exposure_s > 0 and step_s.any():
+        before, after = (len(since_s) - 1) // 2 - 1, len(since_s) // 2 + 1
+        speed = (path[after] - path[before]) / (since_s[after] - since_s[before])
+        stretch = np.maximum(1 + speed @ step_s, _LEAST_STRETCH)
+        path = path - ((path @ step_s) / stretch)[..., None] * speed
+    filled = _filled(np.moveaxis(path, 0, 2).reshape(rows, columns, -1)).reshape(rows, columns, -1, 2)
+    return BlurPath(
+        width=shutter.width,
+        height=shutter.height,
+        path_px=np.moveaxis(filled, 2, 0).astype(np.float32),
+        step_px=step_px,
     )
 
 

@@ -2,7 +2,8 @@
 
 Each sample of the track, little-endian: two reserved bytes, a 16-bit type, the data. Type 1 holds the exposure of a
 pixel and the rolling shutter's skew (nanoseconds, 32 bit each), 2 the gyroscope (rad/s), 3 the accelerometer (m/s2),
-both three floats along the camera's axes; 0 and 4 to 7 are orientations, positions and the magnetometer. A sample's
+both three floats along the camera's axes; 5 latitude, longitude (degrees) and height (metres) as doubles; 6 the same
+with the time, the kind of fix and accuracies; 0, 4 and 7 are orientations and the magnetometer. A sample's
 time is the track's, on the movie's clock (Google's Camera Motion Metadata Spec).
 """
 
@@ -19,9 +20,20 @@ from colmap_inertial.io.imu_text import recording
 from colmap_inertial.io.mp4 import Movie, Track, has_track, read_movie
 from colmap_inertial.io.samples import Samples, nearest, order_samples
 from colmap_inertial.io.units import DeclaredUnits, Quantity
-from colmap_inertial.types import FrameLog, ImuRecording
+from colmap_inertial.types import Array, FrameLog, ImuRecording, PositionFixes
 
-_EXPOSURE, _GYRO, _ACCEL = 1, 2, 3
+_EXPOSURE, _GYRO, _ACCEL, _PLACE, _FIX = 1, 2, 3, 5, 6
+_FIX_ROW = np.dtype(
+    [
+        ("t", "<f8"),
+        ("kind", "<i4"),
+        ("lat", "<f8"),
+        ("lon", "<f8"),
+        ("height", "<f4"),
+        ("sigma", "<f4"),
+        ("rest", "V20"),
+    ]
+)
 #: Bytes of each type's data; a sample may hold several packets.
 _LENGTHS = {0: 12, 1: 8, 2: 12, 3: 12, 4: 12, 5: 24, 6: 56, 7: 12}
 
@@ -76,19 +88,56 @@ def read_camm_frames(path: Path) -> FrameLog:
     return frame_log(path, frame_ns, in_video_time=True, exposure_s=exposure_s, readout_s=readout_s)
 
 
+def read_camm_positions(path: Path) -> PositionFixes | None:
+    """Where the receiver was, on the video's clock; ``None`` where the track has no positions.
+
+    Raises
+    ------
+    FormatError
+        Where the file is damaged.
+    """
+    packets = _packets(*_open(path))
+    t_ns, data = packets[_FIX]
+    sigma: Array
+    with np.errstate(invalid="ignore"):  # a damaged file may hold signalling NaNs
+        if len(t_ns):
+            rows = data.view(_FIX_ROW)[:, 0]
+            place = np.stack([rows["lat"], rows["lon"], rows["height"].astype(np.float64)], axis=1)
+            place[rows["kind"] < 3, 2] = np.nan
+            sigma, good = rows["sigma"].astype(np.float64), rows["kind"] >= 2
+        else:
+            t_ns, data = packets[_PLACE]
+            place = data.view("<f8").astype(np.float64)
+            sigma, good = np.full(len(place), np.nan), np.ones(len(place), dtype=bool)
+        good = good & (np.abs(place[:, 0]) <= 90) & (np.abs(place[:, 1]) <= 180) & ~np.isinf(place[:, 2])
+    if not good.any():
+        return None
+    return PositionFixes(
+        latitude_deg=place[good, 0],
+        longitude_deg=place[good, 1],
+        height_m=place[good, 2],
+        sigma_m=np.where(sigma[good] > 0, sigma[good], np.nan),
+        t_ns=t_ns[good],
+        height_above="ellipsoid",
+        source=f"CAMM track of {path.name}",
+    )
+
+
 def _open(path: Path) -> tuple[Movie, Track]:
     movie = read_movie(path)
     return movie, movie.telemetry("camm", "camera motion metadata")
 
 
 def _packets(movie: Movie, track: Track) -> dict[int, tuple[NDArray[np.int64], NDArray[np.uint8]]]:
-    """Times (N,) and data (N, bytes) of the packets of the three types that are used."""
+    """Times (N,) and data (N, bytes) of the packets of the types that are used."""
     raw, begin = movie.contents(track)
     data = np.frombuffer(raw, np.uint8)
     at, end, t_ns = begin, begin + track.size, track.t_ns
     lengths = np.full(65536, -1)
     lengths[list(_LENGTHS)] = list(_LENGTHS.values())
-    parts: dict[int, list[tuple[NDArray[np.int64], NDArray[np.uint8]]]] = {_EXPOSURE: [], _GYRO: [], _ACCEL: []}
+    parts: dict[int, list[tuple[NDArray[np.int64], NDArray[np.uint8]]]] = {
+        kind: [] for kind in (_EXPOSURE, _GYRO, _ACCEL, _PLACE, _FIX)
+    }
     while len(at):
         if (at + 4 > end).any():
             raise FormatError(movie.path, "is damaged: a sample of the camm track is shorter than its head")

@@ -28,6 +28,7 @@ from colmap_inertial.io.capture_tables import (
 from colmap_inertial.io.exposures import LongExposures, read_exposures_table
 from colmap_inertial.io.files import StrPath
 from colmap_inertial.io.gcsv import is_gcsv, read_gcsv_frames
+from colmap_inertial.io.imu_formats import refuse_video
 from colmap_inertial.io.imu_text import is_inertial_scale
 from colmap_inertial.io.recorders import Recording, find_recording
 from colmap_inertial.io.toml_section import Section, read_toml
@@ -159,6 +160,7 @@ def load_capture(path: StrPath) -> Capture:
         recording = find_recording(path)
         if recording is not None:
             return _from_recording(path, recording)
+        refuse_video(path)
         raise FormatError(
             path,
             "a capture is described by a .toml file or a folder, unless it is a video with an IMU inside; write a "

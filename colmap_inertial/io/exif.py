@@ -1,4 +1,4 @@
-"""When pictures were taken, by their own EXIF: only where it tells more than whole seconds."""
+"""When and where pictures were taken, by their own EXIF: times only where they tell more than whole seconds."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import datetime
 import re
 import struct
 from collections.abc import Iterator, Sequence
+from math import nan
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from colmap_inertial.errors import FormatError, TimingError
 from colmap_inertial.io.files import read_bytes
 from colmap_inertial.io.frame_times import FrameStamps, stamps_in_order
 from colmap_inertial.io.names import path_in
+from colmap_inertial.types import HeightDatum
 
 PNG = b"\x89PNG\r\n\x1a\n"
 _EXIF_HEADER = b"Exif\0\0"
@@ -24,6 +26,9 @@ _DIRECTORY, _DATE, _OFFSET, _FRACTION = 0x8769, 0x9003, 0x9011, 0x9291
 #: ExposureTime, PhotographicSensitivity.
 _EXPOSURE_TIME, _SENSITIVITY = 0x829A, 0x8827
 _ASCII, _SHORT = 2, 3
+#: The directory of positions, and in it GPSLatitudeRef, GPSLatitude, GPSLongitudeRef, GPSLongitude, GPSAltitudeRef,
+#: GPSAltitude, GPSHPositioningError.
+_GPS, _LAT_REF, _LAT, _LON_REF, _LON, _HEIGHT_REF, _HEIGHT, _ERROR = 0x8825, 1, 2, 3, 4, 5, 6, 31
 _EPOCH = datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
 
 
@@ -150,6 +155,53 @@ def exposure_of(head: bytes) -> tuple[float | None, float | None]:
     if _SENSITIVITY in directory and directory[_SENSITIVITY][0] == _SHORT:
         iso = float(struct.unpack_from(order + "H", directory[_SENSITIVITY][2])[0])
     return exposure_s if exposure_s is not None and 0 < exposure_s < 10 else None, iso or None
+
+
+def position_of(head: bytes) -> tuple[float, float, float, float, HeightDatum] | None:
+    """Where a picture was taken, by the EXIF in the head of its file; ``None`` where it does not say.
+
+    Returns
+    -------
+    latitude_deg, longitude_deg, height_m, sigma_m, height_above
+        nan where the height or the error is not stated (CIPA DC-008, table 15).
+    """
+    try:
+        tiff = _tiff(head)
+        order = {b"II": "<", b"MM": ">"}.get(b"" if tiff is None else tiff[:2])
+        if tiff is None or order is None:
+            return None
+        first = _entries(tiff, order, struct.unpack_from(order + "I", tiff, 4)[0])
+        gps = _entries(tiff, order, struct.unpack_from(order + "I", first[_GPS][2])[0])
+        latitude = _angle_deg(tiff, order, gps[_LAT], gps[_LAT_REF], "NS")
+        longitude = _angle_deg(tiff, order, gps[_LON], gps[_LON_REF], "EW")
+        height, error = (_fractions(tiff, order, gps[tag], 1)[0] if tag in gps else nan for tag in (_HEIGHT, _ERROR))
+        side = gps[_HEIGHT_REF][2][0] if _HEIGHT_REF in gps else 0
+    except (struct.error, KeyError, IndexError, ValueError):
+        return None
+    if not (abs(latitude) <= 90 and abs(longitude) <= 180):
+        return None
+    datum: HeightDatum = "ellipsoid" if side in (2, 3) else "sea"  # 2 and 3: EXIF 3.0, above and below the ellipsoid
+    return latitude, longitude, -height if side in (1, 3) else height, error if error > 0 else nan, datum
+
+
+def _angle_deg(
+    tiff: bytes, order: str, angle: tuple[int, int, bytes], side: tuple[int, int, bytes], letters: str
+) -> float:
+    """Degrees, minutes and seconds as degrees, negative on the second side."""
+    letter = _text(tiff, order, *side).strip().upper()
+    if len(letter) != 1 or letter not in letters:
+        raise ValueError(letter)
+    degrees, minutes, seconds = _fractions(tiff, order, angle, 3)
+    return (degrees + minutes / 60 + seconds / 3600) * (1 if letter == letters[0] else -1)
+
+
+def _fractions(tiff: bytes, order: str, entry: tuple[int, int, bytes], count: int) -> list[float]:
+    """Unsigned fractions."""
+    at = struct.unpack(order + "I", entry[2])[0]
+    numbers = struct.unpack_from(f"{order}{2 * count}I", tiff, at)
+    if entry[1] != count or 0 in numbers[1::2]:
+        raise ValueError(numbers)
+    return [above / below for above, below in zip(numbers[::2], numbers[1::2], strict=True)]
 
 
 def jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:

@@ -12,12 +12,17 @@ Of the frames: exposure (``SHUT``), ISO (``ISOE``; ``ISOG`` times 100), readout 
 HERO8, per frame before; only where the camera stood upright, ``OREN``), stabilisation (``EISE``, ``EISA``, or an image
 orientation ``IORI`` that moves), gravity (``GRAV``), camera orientation (``CORI``). The vectors are written x, z, y and
 the quaternions w, x, z, y.
+
+Of the place: ``GPS5`` (latitude, longitude, height; two speeds), with the fix (``GPSF``: 2 or 3) and the dilution of
+precision times 100 (``GPSP``) of each payload, or ``GPS9`` (HERO11), with both for each sample. ``GPSA`` says what
+heights count from.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,12 +34,17 @@ from colmap_inertial.io.imu_text import recording
 from colmap_inertial.io.mp4 import Movie, has_track, read_movie
 from colmap_inertial.io.samples import Samples, nearest, order_samples
 from colmap_inertial.io.units import SENSOR_UNITS, Axes, DeclaredUnits, Quantity, unit_of
-from colmap_inertial.types import Array, FrameLog, ImuRecording
+from colmap_inertial.types import Array, FrameLog, HeightDatum, ImuRecording, PositionFixes
 
 _SENSORS: dict[str, Quantity] = {"GYRO": "gyro", "ACCL": "accel"}
 #: Streams with one sample for each frame, the best one first.
 _OF_FRAMES = ("SHUT", "ISOE", "ISOG", "CORI", "GRAV")
-_WANTED = {*_SENSORS, *_OF_FRAMES, "IORI", "SROT"}
+_POSITIONS = ("GPS9", "GPS5")
+_WANTED = {*_SENSORS, *_OF_FRAMES, *_POSITIONS, "GPSF", "GPSP", "IORI", "SROT"}
+#: Standard deviation of a position, metres, where the dilution of precision is 1.
+_UNDILUTED_M = 1.5
+#: Beyond this dilution of precision a position says nothing.
+_MOST_DILUTED = 10.0
 #: Channel order by the firmware's first letters, where the stream does not say.
 _ORDER = {"HD5": "ZXY", "FS1": "yXZ"}
 _USUAL_ORDER = "YxZ"
@@ -118,6 +128,43 @@ def read_gopro_frames(path: Path) -> FrameLog:
     )
 
 
+def read_gopro_positions(path: Path) -> PositionFixes | None:
+    """Where a GoPro's receiver was, on the video's clock; ``None`` where it wrote nothing or never had a fix.
+
+    Raises
+    ------
+    FormatError
+        Where the file is damaged.
+    """
+    telemetry = _Telemetry.of(path)
+    key = next((key for key in _POSITIONS if key in telemetry.streams), None)
+    if key is None:
+        return None
+    stream = telemetry.streams[key]
+    if stream.values.shape[1] < (9 if key == "GPS9" else 3):
+        raise FormatError(path, f"the {key} stream has {stream.values.shape[1]} channels")
+    values, t_ns = stream.values, telemetry.times_ns(key)
+    if key == "GPS9":
+        diluted, fix = values[:, 7], values[:, 8]
+    else:
+        fix = _of_payloads(telemetry.streams.get("GPSF"), stream, default=3.0)
+        diluted = _of_payloads(telemetry.streams.get("GPSP"), stream, default=100.0) / 100
+    inside = (np.abs(values[:, 0]) <= 90) & (np.abs(values[:, 1]) <= 180) & np.isfinite(values[:, :3]).all(axis=1)
+    good = inside & (fix >= 2) & (diluted > 0) & (diluted <= _MOST_DILUTED)
+    if not good.any():
+        return None
+    datum = {"MSLV": "sea", "WGS8": "ellipsoid"}.get(stream.text("GPSA")[:4], "unknown")
+    return PositionFixes(
+        latitude_deg=values[good, 0],
+        longitude_deg=values[good, 1],
+        height_m=np.where(fix[good] >= 3, values[good, 2], np.nan),
+        sigma_m=_UNDILUTED_M * diluted[good],
+        t_ns=t_ns[good],
+        height_above=cast(HeightDatum, datum),
+        source=f"{key} of {path.name}",
+    )
+
+
 # --- the pieces ------------------------------------------------------------------------------------------------------
 
 
@@ -167,6 +214,12 @@ class _Telemetry:
             if video is not None and len(video.t_ns) and stream and stream.stamps(self.payload_ns)[1] == kind:
                 return int(video.t_ns.min() - self.times_ns(key)[0])
         return 0 if gyro is None or stamps is None else int(self.payload_ns[gyro.payload[0]] - stamps[0])
+
+
+def _of_payloads(about: Stream | None, stream: Stream, default: float) -> Array:
+    """(N,) what is said once a payload, for each sample of a stream."""
+    said = {} if about is None else {p: float(rows[0, 0]) for p, rows in zip(about.payload, about.data, strict=True)}
+    return np.repeat([said.get(payload, default) for payload in stream.payload], stream.count)
 
 
 def _unit(path: Path, stream: Stream, quantity: Quantity) -> str:

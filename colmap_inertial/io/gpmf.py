@@ -6,7 +6,8 @@ device (``DVID``, ``DVNM``), ``STRM`` one of its streams, whose last entry is th
 ``SCAL`` divides, ``SIUN`` names the unit, ``STMP`` (microseconds; HERO8 and later, MAX, Fusion) or ``TICK``
 (milliseconds) stamps the payload's first sample, ``TSMP`` counts the samples so far, ``TIMO`` says by how many seconds
 they are late. ``ORIN`` names the camera's axis that each channel measures (small letters: its opposite), ``MTRX`` turns
-the channels into the axes that ``ORIO`` names. Described in github.com/gopro/gpmf-parser; the clocks are up to 1 % off.
+the channels into the axes that ``ORIO`` names. ``TYPE`` has a letter for each channel of a compound (type ``?``).
+Described in github.com/gopro/gpmf-parser; the clocks are up to 1 % off.
 """
 
 from __future__ import annotations
@@ -39,7 +40,9 @@ _TYPES = {
     b"J": ">u8",
 }
 _FIXED_POINT = {b"q": 2.0**16, b"Q": 2.0**32}
-_NESTED = b"\0"
+_NESTED, _COMPOUND = b"\0", b"?"
+#: What describes the sample after it, and is no sample: ``SCAL`` does not divide it.
+_UNSCALED = ("GPSF", "GPSP")
 #: By the kind of stamp: payloads to either side that smooth it (milliseconds jitter by two, microseconds by 0.02,
 #: payloads without stamps by a few samples), and how much more time than usual for its samples means a loss.
 _REACH = {"STMP": 2, "TICK": 15, "track": 15}
@@ -57,14 +60,24 @@ class Entry:
     data: bytes
     at: int
 
-    def numbers(self) -> Array:
-        """(count, channels) values; fixed-point types as fractions."""
+    def numbers(self, members: str = "") -> Array:
+        """(count, channels) values; fixed-point types as fractions. ``members``: types of a compound entry's."""
+        if self.type == _COMPOUND:
+            return self._compound(members)
         kind = _TYPES.get(self.type)
         if kind is None or self.size % np.dtype(kind).itemsize:
             raise ValueError(f"{self.key} holds samples of {self.size} bytes of type {self.type!r}")
         with np.errstate(invalid="ignore"):  # a damaged file may hold signalling NaNs
             values = np.frombuffer(self.data, kind).astype(np.float64).reshape(self.count, -1)
         return values / _FIXED_POINT.get(self.type, 1.0)
+
+    def _compound(self, members: str) -> Array:
+        kinds = [_TYPES.get(letter.encode("latin-1")) for letter in members]
+        rows = np.dtype([(f"f{i}", kind) for i, kind in enumerate(kinds) if kind is not None])
+        if not kinds or None in kinds or rows.itemsize != self.size:
+            raise ValueError(f"{self.key} holds samples of {self.size} bytes of the types {members!r}")
+        values = np.frombuffer(self.data, rows)
+        return np.stack([values[name].astype(np.float64) for name in rows.names or ()], axis=1)
 
     def text(self) -> str:
         """The contents as text, up to the first zero."""
@@ -199,8 +212,8 @@ def _read_device(device: Entry, index: int, found: dict[tuple[str, str, str], St
 def _append(stream: Stream, index: int, data: Entry, inside: dict[str, Entry]) -> None:
     if data.count == 0:
         return
-    values = data.numbers()
-    if "SCAL" in inside:
+    values = data.numbers(inside["TYPE"].text() if "TYPE" in inside else "")
+    if "SCAL" in inside and data.key not in _UNSCALED:
         scale = inside["SCAL"].numbers().ravel()
         if len(scale) not in (1, values.shape[1]) or not (np.isfinite(scale) & (scale != 0)).all():
             raise ValueError(f"{data.key} has {values.shape[1]} channels and the scale {scale.tolist()}")

@@ -22,8 +22,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from colmap_inertial.errors import FormatError, InertialError
-from colmap_inertial.io import android, camm, dji, gcsv, gopro, imu_text, ios, rosbag, video_imu_capture
-from colmap_inertial.io.files import require_regular
+from colmap_inertial.io import android, camm, dji, gcsv, gopro, imu_text, ios, phyphox, rosbag, video_imu_capture
+from colmap_inertial.io.files import read_bytes, require_regular
 from colmap_inertial.io.mp4 import is_mp4, read_movie
 from colmap_inertial.io.units import DeclaredUnits
 from colmap_inertial.types import FrameLog, ImuRecording
@@ -101,15 +101,42 @@ def find_imu_format(path: Path, name: str = "auto") -> ImuFormat:
     if name != "auto":
         names = ", ".join(["auto", *(one.name for one in known), "capture"])
         raise FormatError(path, f'unknown IMU format "{name}"; known are {names}')
-    if path.is_file() and is_mp4(path):
-        tracks = ", ".join(f"{track.handler} {track.entry}" for track in read_movie(path).tracks)
-        raise FormatError(path, f"is a video without an IMU that is known here; its tracks: {tracks or 'none'}")
+    refuse_video(path)
     layouts = "; ".join(one.layout for one in known)
     raise FormatError(
         path,
         f"not an inertial recording known here ({layouts}); describe its files under [imu.gyro] and [imu.accel] in a "
         "capture.toml",
     )
+
+
+#: What names of videos end with.
+_VIDEOS = (".mp4", ".mov", ".m4v", ".360", ".lrv", ".insv", ".avi", ".mkv")
+
+
+def refuse_video(path: Path) -> None:
+    """Say what is missing where a video holds no IMU that is known here, or is none but in name.
+
+    Raises
+    ------
+    FormatError
+        For such a file; nothing is said of others.
+    """
+    if not path.is_file():
+        return
+    if is_mp4(path):
+        tracks = ", ".join(f"{track.handler} {track.entry}" for track in read_movie(path).tracks)
+        raise FormatError(
+            path,
+            f"is a video without an IMU that is known here; its tracks: {tracks or 'none'}; where the IMU was recorded "
+            "beside it, describe both in a capture.toml ([video] and [imu]); without one, map it with COLMAP and give "
+            "metres by a target or a known distance (reconstruct PROJECT OUT --scale-from)",
+        )
+    if path.suffix.lower() in _VIDEOS:
+        begins = read_bytes(path, 16)
+        text = bool(begins) and all(32 <= byte < 127 or byte in b"\t\r\n" for byte in begins)
+        what = "begins with text" if text else "is empty" if not begins else "has no index of an MP4 or QuickTime file"
+        raise FormatError(path, f"is named like a video and is none that is known here: it {what}")
 
 
 @functools.cache
@@ -258,6 +285,12 @@ _OWN: tuple[ImuFormat, ...] = (
         layout="a Sensor Logger zip or folder with Gyroscope.csv",
         accepts=ios.is_sensor_logger,
         read=ios.read_sensor_logger,
+    ),
+    ImuFormat(
+        name="phyphox",
+        layout="a phyphox export (zip or folder) with a gyroscope",
+        accepts=phyphox.is_phyphox,
+        read=phyphox.read_phyphox,
     ),
     ImuFormat(
         name="rosbag",

@@ -17,30 +17,25 @@ whether "Standardise Units & Frames" was on, which makes iOS write what Android 
 
 from __future__ import annotations
 
-import zipfile
-import zlib
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.errors import FormatError
 from colmap_inertial.geometry import colmap_px_from_opencv
-from colmap_inertial.io.files import first_line, read_text
+from colmap_inertial.io.files import first_line
 from colmap_inertial.io.frame_times import frame_log
 from colmap_inertial.io.imu_text import ordered, recording
 from colmap_inertial.io.mp4 import is_mp4, read_movie
 from colmap_inertial.io.samples import Samples
 from colmap_inertial.io.tables import Table, parse_table, read_table
 from colmap_inertial.io.units import DeclaredUnits, seconds
+from colmap_inertial.io.zipped import head_of, members_of, text_of
 from colmap_inertial.types import CameraModel, FrameLog, ImuRecording
 
 #: A median length up to this is g, above it m/s2: gravity gives 1 or 9.8.
 _G_BELOW = 3.0
-#: An unpacked table larger than this is no recording.
-_LARGEST_MEMBER = 1 << 31
-#: What the standard library raises for damaged archives is not documented as one class.
-_DAMAGED = (OSError, EOFError, KeyError, ValueError, RuntimeError, zipfile.BadZipFile, zlib.error)
 
 
 # --- Stray Scanner ---------------------------------------------------------------------------------------------------
@@ -97,10 +92,20 @@ def _camera_matrix(folder: Path) -> CameraModel | None:
 # --- Sensor Logger ---------------------------------------------------------------------------------------------------
 
 
+_GYROSCOPES = ("Gyroscope.csv", "GyroscopeUncalibrated.csv")
+
+
 def is_sensor_logger(path: Path) -> bool:
     """Whether ``path`` is a Sensor Logger zip or folder."""
-    tables = {"Gyroscope.csv", "GyroscopeUncalibrated.csv"}
-    return bool(tables & _members(path).keys())
+    members = members_of(path)
+    return any(name in members and _is_its_table(path, members[name]) for name in _GYROSCOPES)
+
+
+def _is_its_table(path: Path, member: str) -> bool:
+    """Whether a table has the columns of Sensor Logger: phyphox has files of the same name."""
+    header = head_of(path, member)
+    # a damaged one is left to its reader
+    return not header or "time" in {cell.strip().strip('"') for cell in header.split(",")}
 
 
 def read_sensor_logger(path: Path, units: DeclaredUnits) -> ImuRecording:
@@ -111,8 +116,8 @@ def read_sensor_logger(path: Path, units: DeclaredUnits) -> ImuRecording:
     FormatError
         Where nothing says on which platform it was recorded, on which the accelerometer's sign depends.
     """
-    members = _members(path)
-    name = next((n for n in ("Gyroscope.csv", "GyroscopeUncalibrated.csv") if n in members), None)
+    members = members_of(path)
+    name = next((n for n in _GYROSCOPES if n in members), None)
     if name is None:
         raise FormatError(path, "holds no Gyroscope.csv of Sensor Logger")
     table, t_ns, values = _sensor(path, members, name)
@@ -149,7 +154,7 @@ def _accelerometer(path: Path, members: dict[str, str], units: DeclaredUnits) ->
 def _platform(path: Path, members: dict[str, str]) -> tuple[bool, bool]:
     """Whether it was iOS, and whether units and frames were standardised."""
     if "Metadata.csv" in members:
-        lines = [line.split(",") for line in _text(path, members["Metadata.csv"]).splitlines() if line.strip()]
+        lines = [line.split(",") for line in text_of(path, members["Metadata.csv"]).splitlines() if line.strip()]
         if len(lines) >= 2:
             row = {key.strip().lower(): value.strip().lower() for key, value in zip(lines[0], lines[1], strict=False)}
             if row.get("platform") in ("ios", "android"):
@@ -162,35 +167,9 @@ def _platform(path: Path, members: dict[str, str]) -> tuple[bool, bool]:
 
 
 def _sensor(path: Path, members: dict[str, str], name: str) -> tuple[Table, NDArray[np.int64], NDArray[np.float64]]:
-    table = parse_table(path / name if path.is_dir() else path, _text(path, members[name]))
+    table = parse_table(path / name if path.is_dir() else path, text_of(path, members[name]))
     values = table.numbers([_column(table, axis) for axis in "xyz"])
     return table, table.stamps_ns(_column(table, "time"), "ns"), values
-
-
-def _members(path: Path) -> dict[str, str]:
-    """The tables of a recording: file name to where it lies. A zip may hold them in one folder."""
-    if path.is_dir():
-        return {file.name: file.name for file in path.glob("*.csv")}
-    try:
-        if not path.is_file() or not zipfile.is_zipfile(path):
-            return {}
-        with zipfile.ZipFile(path) as archive:
-            names = [info.filename for info in archive.infolist() if info.filename.endswith(".csv")]
-    except (OSError, zipfile.BadZipFile, ValueError, NotImplementedError):
-        return {}
-    return {PurePosixPath(name).name: name for name in names if len(PurePosixPath(name).parts) <= 2}
-
-
-def _text(path: Path, member: str) -> str:
-    if path.is_dir():
-        return read_text(path / member)
-    try:
-        with zipfile.ZipFile(path) as archive:
-            if archive.getinfo(member).file_size > _LARGEST_MEMBER:
-                raise FormatError(path, f"its {member} unpacks to more than {_LARGEST_MEMBER >> 30} GiB")
-            return archive.read(member).decode("utf-8-sig", errors="replace")
-    except _DAMAGED as error:
-        raise FormatError(path, f"its {member} cannot be unpacked: {error}") from None
 
 
 def _column(table: Table, name: str) -> int:

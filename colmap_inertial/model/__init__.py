@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,7 +18,15 @@ from colmap_inertial.io.files import StrPath, read_json, write_json
 from colmap_inertial.io.names import check_names
 from colmap_inertial.model.binary import check_binary_model
 from colmap_inertial.model.soundness import check_values
-from colmap_inertial.types import CameraModel, CameraTrajectory, FrameTiming, ScaleEstimate, Similarity, Treatment
+from colmap_inertial.types import (
+    Array,
+    CameraModel,
+    CameraTrajectory,
+    FrameTiming,
+    ScaleEstimate,
+    Similarity,
+    Treatment,
+)
 
 if TYPE_CHECKING:
     import pycolmap
@@ -57,6 +65,8 @@ class Model:
         What was applied to get here from COLMAP's model; ``None`` while it has COLMAP's own units.
     treatments
         What the stages before did, in order.
+    observed_px
+        By image name, (N, 2) where its keypoints were when COLMAP mapped them, where a stage moved them since.
     """
 
     reconstruction: pycolmap.Reconstruction
@@ -67,6 +77,7 @@ class Model:
     scale: ScaleEstimate | None = None
     similarity: Similarity | None = None
     treatments: tuple[Treatment, ...] = ()
+    observed_px: Mapping[str, Array] = field(default_factory=dict)
 
     def scaled(self, estimate: ScaleEstimate, similarity: Similarity | None) -> Model:
         """With a scale estimate, and where it was not refused in its units; doubts make it weak at most.

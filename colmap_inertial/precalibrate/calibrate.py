@@ -30,7 +30,7 @@ from colmap_inertial.model import colmap_camera, find_models, read_model, trajec
 from colmap_inertial.options import MappingOptions
 from colmap_inertial.run.context import Recording, RunContext
 from colmap_inertial.run.progress import Progress
-from colmap_inertial.stages.frame_folder import encode_image
+from colmap_inertial.stages.frame_folder import encode_image, seen_by_colmap
 from colmap_inertial.stages.gyro_view import GyroView
 from colmap_inertial.stages.protocols import FrameStage
 from colmap_inertial.stages.rolling_shutter import RollingShutterStage
@@ -321,7 +321,7 @@ def _image_folder(
     for frame in frames:
         target = path_in(images, frame.name)
         target.parent.mkdir(parents=True, exist_ok=True)
-        encode_image(target, frame.image)
+        encode_image(target, seen_by_colmap(frame))
     return images
 
 

@@ -5,22 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
 from colmap_inertial.errors import InertialError, NotObservableError
-from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence
 from colmap_inertial.imaging.gate import (
-    MUST_SHOW_PX,
     FrameDecision,
     GateOptions,
     RecordingVerdict,
     decide,
-    judge_recording,
 )
 from colmap_inertial.imaging.parallax import Parallax
-from colmap_inertial.imaging.psf import blur_field, predicted_blur_px
+from colmap_inertial.imaging.psf import predicted_blur_px
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import read_json, write_json
 from colmap_inertial.io.frames import frame_source
@@ -28,12 +25,13 @@ from colmap_inertial.io.image_metadata import stated_exposures_s
 from colmap_inertial.io.names import path_in
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.options import BlurRemover, DeblurMethod, RollingShutterMethod
-from colmap_inertial.precalibrate.calibrate import guessed_camera, precalibrate, some_frames, survey, survey_parts
+from colmap_inertial.precalibrate.calibrate import guessed_camera, precalibrate, survey, survey_parts
+from colmap_inertial.precalibrate.judge import judge_frames
 from colmap_inertial.precalibrate.translation import find_parallaxes
 from colmap_inertial.run.context import Recording, RunContext
 from colmap_inertial.run.progress import Progress
 from colmap_inertial.run.workspace import a_record_of_ours
-from colmap_inertial.stages.deblur import DeblurStage
+from colmap_inertial.stages.deblur import SMOOTHING_PX, DeblurStage
 from colmap_inertial.stages.gyro_view import GyroView
 from colmap_inertial.stages.rolling_shutter import RollingShutterStage
 from colmap_inertial.types import CameraImuCalibration, CameraModel, FrameTiming, ImuRecording
@@ -44,11 +42,11 @@ if TYPE_CHECKING:
 
 #: Blur below this cannot be told from the texture: where no frame has more, nothing is deblurred.
 _TELLING_PX = 4.0
-#: A gyroscope that is borne out by this share of them is trusted for all frames.
-_MOST_OF_THEM = 0.95
 #: Standard deviations by which a frame must bear it out by itself, where others do not. With 4, the filter made some
 #: worse; the network, which sees whether the filter's result can be true, is worth using unless a frame speaks against.
-_CLEAR_SUPPORT: dict[BlurRemover, float] = {"wiener": 7.0, "deepgyro": 0.0}
+_CLEAR_SUPPORT: dict[BlurRemover, float] = {"wiener": 7.0, "path": 7.0, "deepgyro": 0.0}
+#: What the note says of methods other than the default.
+_SAID_OF = {"deepgyro": "; the network DeepGyro undoes it", "path": "; the half-quadratic filter undoes it"}
 #: How often small models are made, at most, for more of the blurred frames.
 _SURVEYS = 4
 #: Frames by which the gyroscope is judged.
@@ -86,8 +84,8 @@ class ImagingPlan:
     deblur_note: str = ""
     rolling_shutter_note: str = ""
 
-    def frame_stages(self, *, drop: bool = True) -> list[DeblurStage]:
-        """The default frame stages; they need not drop what is too blurred."""
+    def frame_stages(self, *, drop: bool = True, smoothing: bool = True) -> list[DeblurStage]:
+        """The default frame stages; they need not drop what is too blurred, nor have COLMAP see it smoothed."""
         if self.view is None or self.deblur is None:
             return []
         decisions, verdict = self.deblur
@@ -100,6 +98,7 @@ class ImagingPlan:
             gate=gate,
             drop=drop,
             method=self.method,
+            smoothing_px=SMOOTHING_PX if smoothing else 0.0,
         )
         return [stage]
 
@@ -224,7 +223,7 @@ def plan_imaging(recording: Recording, context: RunContext, asked: Treatments) -
     no_rectifying = _no_rectifying(timing, asked)
     rectifying = f"keypoints are rectified, readout {1e3 * (timing.readout_s or 0):.1f} ms"
     plan = ImagingPlan(
-        method="deepgyro" if asked.deblur == "deepgyro" else "wiener",
+        method="wiener" if asked.deblur is None or asked.deblur == "off" else asked.deblur,
         rectify=not no_rectifying,
         deblur_note=why_not,
         rolling_shutter_note=no_rectifying or rectifying,
@@ -238,7 +237,7 @@ def plan_imaging(recording: Recording, context: RunContext, asked: Treatments) -
         found = precalibrate(recording, context)
     except NotObservableError as error:
         by_name = [
-            asked.deblur in ("wiener", "deepgyro") and not why_not,
+            asked.deblur in get_args(BlurRemover) and not why_not,
             asked.rolling_shutter == "rectify" and plan.rectify,
         ]
         if any(by_name):
@@ -270,7 +269,9 @@ def _no_rectifying(timing: FrameTiming, asked: Treatments) -> str:
     if asked.rolling_shutter == "off":
         return "not asked for"
     if timing.readout_s is None:
-        return "the readout is unknown: give readout_s under [timing] in capture.toml"
+        return (
+            "the readout is unknown: give readout_s under [timing] in capture.toml (docs/devices says where to find it)"
+        )
     return "" if timing.readout_s else "global shutter"
 
 
@@ -407,20 +408,13 @@ def _decided(
         known = [d.blur_px for d in decisions if d.blur_px is not None]
         most = f"{max(known):.1f} px" if known else "nothing"
         return replace(plan, deblur_note=f"frames stay as they were filmed: the gyroscope predicts {most} of blur")
-    motion, camera, index = view.motion(), colmap_camera(view.camera), view.index()
-    evidence: list[BlurEvidence] = []
-    for frame in some_frames(capture, view.timing, [index[d.name] for d in chosen]):
-        progress("blur", len(evidence), len(chosen))
-        blur = blur_field(motion, camera, view.shutter(index[frame.name]), parallax=parallaxes.get(frame.name))
-        evidence.append(blur_evidence(frame.image, blur))
-    progress("blur", len(chosen), len(chosen))
-    verdict = _by_frame(judge_recording(evidence), evidence, [d.blur_px or 0.0 for d in chosen])
+    verdict = judge_frames(view, capture, chosen, parallaxes, progress)
     note = f"{sum(d.action == 'deblur' for d in decisions)} of {len(decisions)} frames are blurred; {verdict.reason}"
     used = {name: parallaxes[name] for name in _to_deblur(decisions) if name in parallaxes}
     if used:
         note += f"; the camera's translation is counted in for {len(used)} frames"
-    if plan.method == "deepgyro" and verdict.trusted is not False:
-        note += "; the network DeepGyro undoes it"
+    if plan.method in _SAID_OF and verdict.trusted is not False:
+        note += _SAID_OF[plan.method]
     return replace(plan, deblur=(decisions, verdict), parallaxes=used, deblur_note=note)
 
 
@@ -434,22 +428,3 @@ def _keeping_ends(decisions: tuple[FrameDecision, ...]) -> tuple[FrameDecision, 
         else d
         for i, d in enumerate(decisions)
     )
-
-
-def _by_frame(
-    verdict: RecordingVerdict, evidence: Sequence[BlurEvidence], blur_px: Sequence[float]
-) -> RecordingVerdict:
-    """The verdict, unless only some of the frames bear it out: then every frame must do so by itself.
-
-    So it is where the camera moves close to things: they blur by translation, too, which no gyroscope feels.
-    """
-    telling = [one for one, px in zip(evidence, blur_px, strict=True) if one.enough and px >= MUST_SHOW_PX]
-    least = GateOptions().min_support
-    shown = sum(one.support >= least and one.extent_is_plausible for one in telling)
-    if verdict.trusted is not True or shown >= _MOST_OF_THEM * len(telling):
-        return verdict
-    reason = (
-        f"{shown} of {len(telling)} frames that were looked at bear out the gyroscope's blur, so each frame must do so "
-        "by itself (close to things, the camera's translation blurs, too)"
-    )
-    return replace(verdict, trusted=None, reason=reason)

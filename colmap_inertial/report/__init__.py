@@ -18,7 +18,7 @@ largest values, ``null`` for gaps; three lines are x, y, z.
                    - ``half_width_pct`` of the interval; ``outcome`` as above
                    - ``drift``: as in ``result.json``, or missing
                    - ``validation``: as in ``result.json`` with ``pictures`` (paths), or missing
-                   - ``scene``, ``signals``: see below, or missing
+                   - ``scene``, ``photogrammetry``, ``signals``: see below, or missing
 ``findings``       ``checked`` and ``findings`` of ``diagnosis.json``, or missing
 ``selection``      of a video's frames: ``frames``, ``used`` and ``note``; ``null`` where unknown
 ``recording``      ``imu`` (``device``, ``gyro_hz``, ``accel_hz``, ``duration_s``) and ``frames`` (``count``,
@@ -29,6 +29,7 @@ largest values, ``null`` for gaps; three lines are x, y, z.
 ``rolling_shutter``  ``note``, ``readout_s``, ``t_s``, ``median_px``, ``largest_px`` (movement of keypoints in each of
                    some frames), ``worst`` (``name``, ``width``, ``height``, ``at_px``, ``shift_px`` over a grid), or
                    missing
+``made``           ``date``, ``machine``, ``processors``; ``null`` of earlier runs
 ``project_metric``  the whole project in metres, where an existing one was given, or ``null``
 ``seconds``        by stage
 ``configuration``  ``toml`` text and ``values``, or missing
@@ -39,6 +40,13 @@ largest values, ``null`` for gaps; three lines are x, y, z.
 upright), ``points_in_model``, ``points`` (``xyz`` as three lists, ``rgb``), ``path`` (``t_s``, ``xyz``),
 ``path_length``, ``cameras`` (``xyz``, unit vectors ``right``, ``down``, ``ahead``, and the image's ``half_width`` and
 ``half_height`` at distance 1).
+
+``photogrammetry``: ``unit``, ``cameras`` (``camera_id``, ``model``, ``width``, ``height``, ``images``, ``params``,
+``field_of_view_deg``, ``distortion``: ``at_px`` and ``shift_px``), ``images`` (``name``, ``observations``, ``rms_px``
+of their residuals, ``gsd``: length of a pixel at the median depth), ``sensor`` (residuals in ``columns`` times ``rows``
+cells: ``count``, ``mean_x_px``, ``mean_y_px``, ``rms_px``), ``tracks`` (``mean`` length, ``counts`` of points seen by
+2, 3, ..., 12 or more images), ``extent`` along x, y and up, ``ground`` (``x0``, ``y0``, ``step``, and
+the ``images`` that see each square from above).
 
 ``signals``: ``duration_s``, ``frames``, ``first_frame_s`` (on the camera's clock: where ``t_s`` counts from),
 ``alignment`` of camera and IMU (``found``, ``failed``, or ``not tried`` where the recording cannot be used), and

@@ -17,6 +17,8 @@ from colmap_inertial.report.words import half_width_pct, outcome_of_model, outco
 VERSION = 1
 #: What the pipeline keeps for the report alone, in an output folder.
 DATA_FOLDER, CROPS_FOLDER = "report_data", "crops"
+#: Of a model in ``result.json``, what the page shows otherwise or not.
+_NOT_SHOWN = ("drift", "validation", "cov", "dense")
 #: Models that are shown in full, the largest ones; frames in the plot of blur; images of the target.
 _MOST_MODELS, _MOST_FRAMES, _MOST_IMAGES = 3, 3000, 4
 
@@ -82,6 +84,7 @@ def gather(
         "findings": findings,
         "selection": _selection(done),
         "recording": None if recording is None else _of_recording(recording),
+        "made": None if recording is None else recording.get("made"),
         "blur": _blur(done, recording, project=project),
         "crops": _crops(out, done),
         "rolling_shutter": _rolling_shutter(done, recording),
@@ -108,7 +111,7 @@ def _title(source: str) -> str:
 
 def _model(out: Path, model: Content, *, in_full: bool, project: bool) -> Content:
     scale, ci95 = model["metres_per_unit"], model["ci95"]
-    kept = {key: value for key, value in model.items() if key not in ("drift", "validation", "cov", "dense")}
+    kept = {key: value for key, value in model.items() if key not in _NOT_SHOWN}
     kept.setdefault("notes", [])  # earlier runs had all of it among the reasons
     kept["half_width_pct"] = None if scale is None else half_width_pct(scale, ci95)
     if scale is None:
@@ -124,6 +127,7 @@ def _model(out: Path, model: Content, *, in_full: bool, project: bool) -> Conten
         failed = "What it is drawn from was not kept; where that failed, log.txt says why."
         why = failed if in_full else f"Only the {_MOST_MODELS} largest models are shown in full."
         kept["scene"], kept["signals"] = _missing(why), _missing(why)
+    kept.setdefault("photogrammetry", _missing("It was not kept: an earlier version made this run."))
     kept["outcome"] = outcome_of_model({**model, "signals": kept["signals"]})
     return kept
 

@@ -149,7 +149,10 @@ def accelerations(acceleration: dict[str, Any]) -> Figure:
         ("camera", CAMERA, acceleration["camera"], "left" if metric else "right"),
     )
     figure = _rows(
-        sides, ["sideways 1", "sideways 2", "up"], unit="m/s²", right_unit="" if metric else "model units/s²"
+        sides,
+        ["level 1", "level 2", "up"],
+        unit="m/s²",
+        right_unit="" if metric else "model units/s²",
     )
     if metric:
         return _underlaid(figure)
@@ -190,13 +193,20 @@ def spectra(spectrum: dict[str, Any], *, unit: str, factor: float = 1.0) -> Figu
         data.append(trace)
     layout = _layout(360)
     layout["showlegend"] = True
-    decades = {"type": "log", "tickformat": "~g"}
-    layout["xaxis"] = _axis("frequency (Hz)", **decades)
-    layout["yaxis"] = _axis(f"{unit}/√Hz", **decades)
+    left = [trace["y"] for trace in data if trace["yaxis"] == "y"]
+    layout["xaxis"] = _axis("frequency (Hz)", **_decades([trace["x"] for trace in data]))
+    layout["yaxis"] = _axis(f"{unit}/√Hz", **_decades(left))
     if other:
-        layout["yaxis2"] = _right_axis("model units/s²/√Hz", "y", **decades)
+        layout["yaxis2"] = _right_axis("model units/s²/√Hz", "y", **_decades([data[-1]["y"]]))
         layout["margin"] = {**layout["margin"], "r": 58}
     return {"data": data, "layout": layout}
+
+
+def _decades(columns: Sequence[Sequence[float | None]]) -> Figure:
+    """A logarithmic axis; over more than two decades with ticks at tens alone, which do not run into each other."""
+    known = [value for column in columns for value in column if value is not None and value > 0]
+    wide = bool(known) and math.log10(max(known) / min(known)) > 2
+    return {"type": "log", "tickformat": "~g", "dtick": 1 if wide else "D2"}
 
 
 def informative_parts(parts: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -10,7 +10,7 @@ from colmap_inertial import __version__
 from colmap_inertial.report.figures import BAD, IMU, QUIET, Figure
 from colmap_inertial.report.markup import facts, listing, table
 from colmap_inertial.report.page import document
-from colmap_inertial.report.sections import Plot, Section
+from colmap_inertial.report.parts import Plot, Section
 from colmap_inertial.rest import RestCalibration
 from colmap_inertial.scale.priors import KNOWN_GAIN, model_scale_sigma
 from colmap_inertial.scale.verdict import Z95

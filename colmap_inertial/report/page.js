@@ -23,10 +23,13 @@
   const narrow = () => window.innerWidth < 640;
 
   // Colours of text, grids and lines come from the page, so that light and dark agree with it.
-  const dressed = (layout) => {
-    const ink = style("--ink"), soft = style("--soft"), rule = style("--rule"), paper = style("--paper");
+  const screen = () => ({
+    ink: style("--ink"), soft: style("--soft"), rule: style("--rule"), paper: style("--paper"), small: narrow(),
+  });
+  const print = () => ({ ink: "#000", soft: "#444", rule: "#ccc", paper: "#fff", small: false });
+  const dressed = (layout, { ink, soft, rule, paper, small } = screen()) => {
     const out = { ...layout, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)" };
-    out.font = { family: getComputedStyle(document.body).fontFamily, size: narrow() ? 11 : 12.5, color: ink };
+    out.font = { family: getComputedStyle(document.body).fontFamily, size: small ? 11 : 12.5, color: ink };
     out.hoverlabel = { bgcolor: paper, bordercolor: rule, font: { color: ink } };
     out.modebar = { bgcolor: "rgba(0,0,0,0)", color: soft, activecolor: ink };
     out.legend = { ...out.legend, bgcolor: "rgba(0,0,0,0)" };
@@ -40,7 +43,7 @@
       for (const key of ["xaxis", "yaxis", "zaxis"]) {
         out.scene[key] = { ...out.scene[key], gridcolor: rule, zerolinecolor: rule, color: soft };
       }
-      if (narrow()) {
+      if (small) {
         const { x, y, z } = out.scene.camera.eye;
         out.scene.camera = { ...out.scene.camera, eye: { x: 1.4 * x, y: 1.4 * y, z: 1.4 * z } };
         out.height = Math.min(out.height, Math.round(0.62 * window.innerHeight));
@@ -48,8 +51,8 @@
     } else {
       // a finger scrolls the page; a mouse zooms
       out.dragmode = touch ? false : "zoom";
-      if (narrow() && out.yaxis?.scaleanchor) out.height = Math.min(out.height, Math.round(0.8 * window.innerWidth) + 50);
-      if (narrow()) out.margin = { ...out.margin, l: 48, r: Math.min(out.margin.r, 46) };
+      if (small && out.yaxis?.scaleanchor) out.height = Math.min(out.height, Math.round(0.8 * window.innerWidth) + 50);
+      if (small) out.margin = { ...out.margin, l: 48, r: Math.min(out.margin.r, 46) };
     }
     return out;
   };
@@ -96,4 +99,23 @@
     }
   });
   root.dataset.plots = failed.length ? "failed" : "drawn";
+
+  // Paper takes still pictures, made beforehand: printing waits for nobody.
+  for (const div of plots) {
+    const figure = figures[div.dataset.figure], still = new Image();
+    if (!div.classList.contains("drawn")) continue;
+    try {
+      const layout = dressed(figure.layout, print());
+      const size = { width: 690, height: figure.layout.scene ? 520 : figure.layout.height };
+      const format = figure.layout.scene ? { format: "png", scale: 2 } : { format: "svg" };
+      still.src = await Plotly.toImage({ data: figure.data, layout: { ...layout, ...size } }, { ...format, ...size });
+      still.className = "still";
+      still.alt = div.getAttribute("aria-label");
+      div.after(still);
+    } catch {
+      // the plot itself is printed then
+    }
+    await new Promise((resume) => setTimeout(resume));
+  }
+  root.dataset.stills = "made";
 })();

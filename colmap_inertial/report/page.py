@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from colmap_inertial.report.figures import Figure
-from colmap_inertial.report.sections import Section, sections_of
+from colmap_inertial.report.parts import Section
+from colmap_inertial.report.sections import sections_of
 
 _HERE = Path(__file__).parent
 #: Nothing may be loaded from anywhere, whatever the page holds. (plotly.js builds some of its shaders by evaluation.)
@@ -34,6 +35,9 @@ def page_of(content: dict[str, Any], out: Path) -> str:
         Folder that its images' paths start from.
     """
     versions = ", ".join(f"{name} {number}" for name, number in content["versions"].items())
+    made = content["made"]
+    if made is not None:
+        versions = f"{made['date']}, {versions}, {made['machine']}, {made['processors']} processors"
     return document(
         list(sections_of(content, out)),
         title=content["title"],

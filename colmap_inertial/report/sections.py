@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
 from html import escape
 from pathlib import Path
 from typing import Any
 
 from colmap_inertial.report import figures
 from colmap_inertial.report.figure_3d import scene_figure
-from colmap_inertial.report.figures import Figure
 from colmap_inertial.report.markup import bars, facts, gauge, images, listing, prose, scale_text, sentence, table
-from colmap_inertial.report.words import digits, signed
+from colmap_inertial.report.parts import Plot, Section
+from colmap_inertial.report.photogrammetry_sections import camera_section, residual_section, survey_section
+from colmap_inertial.report.words import digits, not_checked, signed
 from colmap_inertial.scale.verdict import Z95, scale_drifts
 
 Content = dict[str, Any]
 
+_METHODS = {"joint": "all measurements in one fit", "spectral": "spectra of both sensors"}
 #: What the paths of a result are.
 _WRITTEN = {
     "sparse": "COLMAP's own model",
@@ -25,24 +26,6 @@ _WRITTEN = {
     "trajectory": "the camera's smoothed path in metres",
     "project_metric": "the whole project in metres",
 }
-
-
-@dataclass(frozen=True, kw_only=True)
-class Plot:
-    """A figure, and what it shows in words for those who cannot see it."""
-
-    figure: Figure
-    label: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class Section:
-    """One card of the page; ``short`` is its name in the list of links."""
-
-    anchor: str
-    short: str
-    parts: Sequence[str | Plot]
-    classes: str = ""
 
 
 def sections_of(content: Content, out: Path) -> Iterator[Section]:
@@ -111,7 +94,7 @@ def _key_facts(content: Content, model: Content | None) -> Iterator[tuple[str, s
             yield "camera path", f"{digits(path, 3)} {'m' if model['scene']['unit'] == 'm' else 'model units'}"
         if model["excitation_m_s2"] is not None and model["metres_per_unit"] is not None:
             yield "camera acceleration", f"{digits(model['excitation_m_s2'], 2)} m/s²"
-        yield "method", model["method"]
+        yield "how the scale was found", _METHODS.get(model["method"]) or str(model["method"])
         if model["gyro_time_offset_s"] is not None:
             yield "camera clock − IMU clock", f"{signed(model['gyro_time_offset_s'], 4)} s"
     selection = content["selection"]
@@ -132,6 +115,8 @@ def _findings(found: Content) -> Section:
     parts = ["<h2>Before the reconstruction</h2>"]
     checked = ", ".join(found["checked"])
     looked = f' <span class="soft">Looked at: {escape(checked)}.</span>' if checked else ""
+    left = not_checked(found["checked"])
+    looked += f" <b>Not checked</b>: {escape(left)}." if left else ""
     if not found["findings"]:
         parts.append(f"<p>Nothing was found wrong with the recording.{looked}</p>")
     else:
@@ -142,7 +127,7 @@ def _findings(found: Content) -> Section:
             f'<div class="finding {severity}"><p><b>{severity}</b> <span class="soft">{escape(finding["code"])}</span>'
             f"</p><p>{sentence(finding['evidence'])}</p><p>What to do: {sentence(finding['advice'])}</p></div>"
         )
-    return Section(anchor="findings", short="Findings", parts=parts)
+    return Section(anchor="findings", short="Before", parts=parts)
 
 
 def _model_head(model: Content, mark: str) -> Section:
@@ -165,6 +150,10 @@ def _of_model(model: Content, name: str, mark: str, left_out: _LeftOut, out: Pat
     scene, signals = model["scene"], model["signals"]
     if left_out.has(f"{name}Model in 3-D", scene):
         yield _scene(scene, name, mark)
+        if left_out.has(f"{name}Survey, residuals and camera", model["photogrammetry"]):
+            yield survey_section(model["photogrammetry"], scene, model.get("georeference"), name, mark)
+            yield residual_section(model["photogrammetry"], name, mark)
+            yield camera_section(model["photogrammetry"], name, mark)
     if left_out.has(f"{name}Camera against IMU", signals):
         yield _rotation(signals, name, mark)
         if left_out.has(f"{name}Acceleration", signals["acceleration"]):
@@ -232,7 +221,7 @@ def _acceleration(signals: Content, name: str, mark: str) -> Section:
     if acceleration["camera_unit"] == "m/s2":
         said = (
             "This is what the scale rests on: the metric camera path, differentiated twice, must show the acceleration "
-            "that the accelerometer measured (gravity and bias taken out)."
+            "that the accelerometer measured (gravity and bias taken out), in two level directions and upwards."
         )
     else:
         said = (
@@ -315,7 +304,18 @@ def _target(found: Content, name: str, mark: str, out: Path) -> Section:
         ("corners", f"{found['corners_used']} used, {found['corners_rejected']} rejected"),
         ("residual, rms", f"{found['rms_px']:.2f} px"),
     ]
+    lengths = found.get("lengths")
+    if lengths is not None:
+        listed.append(
+            (
+                "errors of lengths",
+                f"rms {1000 * lengths['rms_m']:.3g} mm, largest {1000 * lengths['largest_m']:+.3g} mm",
+            )
+        )
+        listed.append(("longest length", f"{digits(lengths['longest_m'], 3)} m, {lengths['directions']} directions"))
     parts.append(facts(listed))
+    if lengths is not None:
+        parts.append(f"<p>The check proves that {prose(lengths['proves'])}.</p>")
     if found["distances"]:
         figure = Plot(figure=figures.target_distances(found), label="Measured minus known distances")
         parts += ["<h3>Known distances</h3>", figure]

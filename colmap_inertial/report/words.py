@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 from colmap_inertial.scale.parts import parts_in_words
@@ -21,8 +21,8 @@ _RAW = (
     "the camera's stabilisation switched off."
 )
 _TARGET = (
-    "To be independent of motion, put a printed board into the scene and name it in capture.toml ([target]), or scale "
-    "the model by a length you measured."
+    "To be independent of motion, put a printed board into the scene and name it in capture.toml ([target]), or give "
+    "metres by a length you measured: reconstruct OUT/colmap NEW_FOLDER --scale-from distance, or --scale-from target."
 )
 _CHECK = "Look into what the reasons name; until then, check lengths against one that you know."
 
@@ -49,6 +49,21 @@ def length_error(pct: float) -> str:
     if metres >= 1:
         return f"{metres:.2g} m"
     return f"{100 * metres:.2g} cm" if metres >= 0.01 else f"{1000 * metres:.2g} mm"
+
+
+def not_checked(checked: Collection[str]) -> str:
+    """What a check beforehand had nothing to look at, where that leaves a doubt; empty otherwise."""
+    if "gyroscope" not in checked:
+        return ""
+    said = []
+    if "accelerometer" not in checked:
+        said.append("gravity and scale (no accelerometer)")
+    if not {"pictures", "poses"} & set(checked):
+        said.append(
+            "whether camera and gyroscope belong together, their axes and clocks (no pictures close enough in time to "
+            "be followed, and no poses)"
+        )
+    return "; ".join(said)
 
 
 def outcome_of_model(model: dict[str, Any]) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 from colmap_inertial.io.calibration import largest_offset_s
 from colmap_inertial.io.capture import Capture, Video
@@ -110,6 +111,8 @@ class RunContext:
         Of COLMAP; -1 uses all.
     seed
         Of COLMAP.
+    device
+        What COLMAP finds and matches features on.
     progress
         Hears how far it is.
     """
@@ -117,6 +120,7 @@ class RunContext:
     scratch: Path
     num_threads: int = -1
     seed: int = 0
+    device: Literal["cpu", "cuda"] = "cpu"
     progress: Progress = silent
 
     def reporting(self, progress: Progress) -> RunContext:
@@ -125,4 +129,4 @@ class RunContext:
 
     def identity(self) -> dict[str, object]:
         """What decides a result: not who listens, nor where."""
-        return {"num_threads": self.num_threads, "seed": self.seed}
+        return {"num_threads": self.num_threads, "seed": self.seed, "device": self.device}

@@ -2,13 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 
 class Progress(Protocol):
     """Receives progress: how many of ``total`` steps of ``stage`` are done. ``total`` is 0 where unknown."""
 
     def __call__(self, stage: str, done: int, total: int, /) -> None: ...
+
+
+@runtime_checkable
+class HearsSteps(Protocol):
+    """What a receiver of progress may also be told: which steps a run does, and which it keeps."""
+
+    def kept(self, step: str, /) -> None:
+        """An earlier run finished this step, and it stands."""
+
+    def began(self, step: str, outputs: Sequence[Path], /) -> None:
+        """A step begins, which writes these files and folders."""
 
 
 def silent(stage: str, done: int, total: int, /) -> None:

@@ -22,6 +22,7 @@ import numpy as np
 from colmap_inertial import __version__
 from colmap_inertial.errors import FormatError, InertialError
 from colmap_inertial.io.files import read_json, write_json
+from colmap_inertial.run.progress import HearsSteps, Progress, silent
 from colmap_inertial.run.workspace import Workspace
 
 log = logging.getLogger(__name__)
@@ -143,8 +144,9 @@ class StepRunner:
         The steps that this run did, in order.
     """
 
-    def __init__(self, workspace: Workspace) -> None:
+    def __init__(self, workspace: Workspace, heard_by: Progress = silent) -> None:
         self._workspace = workspace
+        self._heard_by = heard_by if isinstance(heard_by, HearsSteps) else None
         self._keys: dict[str, str] = {}
         self.seconds: dict[str, float] = {}
         self.worked: list[str] = []
@@ -190,6 +192,8 @@ class StepRunner:
         if done is not None and done["key"] == key and all(path.exists() for path in outputs):
             self.seconds |= {**done.get("inner", {}), name: done["seconds"]}
             log.info("%s: finished in an earlier run, kept", name)
+            if self._heard_by is not None:
+                self._heard_by.kept(name)
             return
         self._workspace.unfinish()
         self.worked.append(name)
@@ -200,6 +204,8 @@ class StepRunner:
         for path in (*outputs, *partial):
             remove(path)
         log.info("%s: started", name)
+        if self._heard_by is not None:
+            self._heard_by.began(name, partial)
         start, begun = time.perf_counter(), len(self.worked)
         try:
             work(partial)

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import signal
+import threading
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from colmap_inertial import __version__
 from colmap_inertial.errors import InertialError
@@ -69,6 +72,7 @@ def open_session(
     command: str = "reconstruct",
     deterministic: bool = False,
     seed: int = 0,
+    device: Literal["cpu", "cuda"] = "cpu",
     progress: Progress,
 ) -> Iterator[Session]:
     """A session in ``out``: locked, its options written down, its log kept.
@@ -87,7 +91,7 @@ def open_session(
         What is done; one folder is for one command.
     deterministic
         Whether one thread does it all.
-    seed, progress
+    seed, device, progress
         As of :class:`RunContext`.
 
     Raises
@@ -110,9 +114,9 @@ def open_session(
         if not workspace.config.is_file() or workspace.config.read_text(encoding="utf-8") != config:
             workspace.unfinish()
             write_text(workspace.config, config)
-        runner = StepRunner(workspace)
+        runner = StepRunner(workspace, progress)
         threads = 1 if deterministic else -1
-        context = RunContext(scratch=workspace.stamps, num_threads=threads, seed=seed, progress=progress)
+        context = RunContext(scratch=workspace.stamps, num_threads=threads, seed=seed, device=device, progress=progress)
         session = Session(workspace=workspace, runner=runner, context=context)
         yield session
 
@@ -142,4 +146,9 @@ def keep_colmap_quiet() -> None:
     """Keep COLMAP's chatter off the terminal, from now on."""
     import pycolmap
 
+    # its logging library takes this signal away from us, and answers it with a trace of its own
+    if threading.current_thread() is threading.main_thread():
+        ours = signal.getsignal(signal.SIGTERM)
+        if ours is not None:
+            signal.signal(signal.SIGTERM, ours)
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value

@@ -95,9 +95,19 @@ class Workspace:
         return self.root / "keypoints.json"
 
     @property
+    def matches(self) -> Path:
+        """Which pairs of images were matched, and why not the rest."""
+        return self.stamps / "matches_made.json"
+
+    @property
     def validation(self) -> Path:
         """Pictures of the target in the frames."""
         return self.root / "validation"
+
+    @property
+    def georeference(self) -> Path:
+        """Where on Earth the metric models and their images stand."""
+        return self.root / "georeference.json"
 
     @property
     def diagnosis(self) -> Path:
@@ -166,13 +176,18 @@ class Workspace:
     def own_names(self) -> tuple[str, ...]:
         """Names that are the run's own where the folder is an existing project in metres; patterns, as in a shell."""
         report = (self.report, self.report.with_suffix(".json"), self.report_data)
-        files = (self.result, self.config, self.log, self.diagnosis, self.frames, *report)
+        files = (self.result, self.config, self.log, self.diagnosis, self.georeference, self.frames, *report)
         names = (path.name for path in (*files, self.validation, self.earlier, self.stamps))
         return (*names, "trajectory*.tum", "trajectory*_cov.npz", "trajectory*_motion.json")
 
     def is_own(self, name: str) -> bool:
         """Whether a name is among them."""
         return any(fnmatch.fnmatchcase(name, pattern) for pattern in self.own_names)
+
+    @property
+    def unsmoothed(self) -> Path:
+        """Frames as they are, of which COLMAP sees smoothed ones."""
+        return self.stamps / "unsmoothed"
 
     @property
     def placed(self) -> Path:
@@ -281,8 +296,8 @@ def places_of(root: Path) -> Places:
         images=(before, now.images, root / "project_metric" / "images"),
         sparse=(root / "sparse_metric", now.sparse),
         dense=(now.dense, root / "dense_metric"),
-        # colmap/ may have been removed: without it, images/ is still what it was
-        seen=now.colmap_images if now.colmap_images.is_dir() else now.images,
+        # colmap/ may have been removed, and then images/ is still what it was; a stranger's project may have its own
+        seen=now.colmap_images if now.colmap_images.is_dir() and now.stamps.is_dir() else now.images,
         rectified=before if before.is_dir() else now.images,
     )
 

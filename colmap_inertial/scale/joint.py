@@ -200,6 +200,12 @@ def _judged(
         excitation_m_s2=fit.excitation_m_s2,
         drift=fit.drift,
         parts=None if refused else found.parts,
+        noise=ImuNoise(
+            gyro_density_rad_s_rthz=fit.noise.gyro_rad_s_rthz,
+            accel_density_m_s2_rthz=fit.noise.accel_m_s2_rthz,
+            gyro_walk_rad_s2_rthz=fit.noise.gyro_walk_rad_s_rts,
+            accel_walk_m_s3_rthz=fit.noise.accel_walk_m_s2_rts,
+        ),
     )
 
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from fractions import Fraction
 from functools import lru_cache, partial
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +21,7 @@ from colmap_inertial.errors import OutputExistsError
 from colmap_inertial.geometry import matrix_from_quat, quat_conjugate, quat_multiply, quat_normalize
 from colmap_inertial.io.files import write_json, write_text
 from colmap_inertial.io.video import frame_name
+from colmap_inertial.model.copying import new_folder
 from colmap_inertial.simulate.motion import Motion, make_motion
 from colmap_inertial.simulate.recipe import SceneRecipe, recipe_text
 from colmap_inertial.simulate.render import Renderer, ShutterCamera, develop
@@ -102,7 +106,7 @@ def write_capture(
     Parameters
     ----------
     folder
-        Must not exist, or be empty.
+        Must not exist, or be empty; it appears whole or not at all.
     workers
         Processes that render.
     progress
@@ -119,7 +123,14 @@ def write_capture(
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise OutputExistsError(f"{folder} exists already; name a new folder")
-    folder.mkdir(parents=True, exist_ok=True)
+    with new_folder(folder, into_empty=True) as partial_folder:
+        _write_capture(recipe, partial_folder, workers, progress)
+    return folder / "capture.toml"
+
+
+def _write_capture(
+    recipe: SceneRecipe, folder: Path, workers: int, progress: Callable[[int, int], None] | None
+) -> None:
     scene = make_scene(recipe)
     cameras = _cameras(recipe)
     total, done = len(cameras) * len(scene.names), 0
@@ -147,7 +158,6 @@ def write_capture(
     write_text(folder / "recipe.toml", recipe_text(recipe))
     write_json(folder / "truth.json", _truth(scene))
     write_text(folder / "capture.toml", _capture_toml(recipe))
-    return folder / "capture.toml"
 
 
 # --- rendering, in this process or in several ---------------------------------------------------------------------
@@ -183,17 +193,33 @@ _SCENE: list[Scene] = []
 
 
 def _begin(recipe: SceneRecipe) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that waits for this one ends it
+    threading.Thread(target=_end_with_the_parent, daemon=True).start()
     _SCENE.append(make_scene(recipe))
+
+
+def _end_with_the_parent() -> None:
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _render_job(job: _Job) -> Image:
     return _render(_SCENE[-1], job)
 
 
-def _processes(recipe: SceneRecipe, workers: int) -> AbstractContextManager[ProcessPoolExecutor | None]:
+@contextmanager
+def _processes(recipe: SceneRecipe, workers: int) -> Iterator[ProcessPoolExecutor | None]:
     if workers <= 1:
-        return nullcontext()
-    return ProcessPoolExecutor(workers, get_context("spawn"), initializer=_begin, initargs=(recipe,))
+        yield None
+        return
+    with ProcessPoolExecutor(workers, get_context("spawn"), initializer=_begin, initargs=(recipe,)) as pool:
+        try:
+            yield pool
+        except BaseException:
+            pool.shutdown(cancel_futures=True)  # the frames that are in work take a second or two
+            raise
 
 
 def _write_images(scene: Scene, images: Iterator[Image], folder: Path, suffix: str) -> Iterator[None]:

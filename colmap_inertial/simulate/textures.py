@@ -94,7 +94,7 @@ def poster(rng: np.random.Generator, height: int, width: int) -> Texture:
     image = _mix(
         _colour(rng, 0.2), _colour(rng, 0.2), 0.5 + 0.3 * clouds(rng, height, width, coarsest_px=width / 2, octaves=3)
     )
-    _shapes(rng, image, int(40 + height * width / 1500), 3, min(height, width) / 4)
+    _shapes(rng, image, int(40 + height * width / 1500), 3, max(3.0, min(height, width) / 4))
     for _ in range(int(2 + height / 60)):
         _writing(rng, image, size_px=float(np.exp(rng.uniform(np.log(8), np.log(max(10, height / 9))))))
     return image

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any, get_args
 
 import numpy as np
 
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.imaging.blur_field import BlurField
-from colmap_inertial.imaging.gate import FrameDecision, GateOptions, RecordingVerdict, deblur_gated
+from colmap_inertial.imaging.blur_path import BlurPath
+from colmap_inertial.imaging.gate import FrameDecision, GateOptions, RecordingVerdict, judge_frame, keep_sharp
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.parallax import Parallax
-from colmap_inertial.imaging.psf import blur_field
-from colmap_inertial.imaging.wiener import LONGEST_PX, DeblurOptions, deblur
+from colmap_inertial.imaging.path_filters import half_quadratic, path_wiener
+from colmap_inertial.imaging.psf import blur_field, blur_path
+from colmap_inertial.imaging.wiener import LONGEST_PX, DeblurOptions
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.options import BlurRemover, DeblurMethod
 from colmap_inertial.restoration import deepgyro, load_network, require_network
@@ -27,6 +28,15 @@ from colmap_inertial.types import (
     Projector,
     Treatment,
 )
+
+#: Standard deviation of the Gaussian, in linear light, by which COLMAP sees a deblurred frame smoothed: what a filter
+#: leaves of noise and ringing takes more matches than the finest detail gives.
+SMOOTHING_PX = 1.2
+#: A frame of which more than this share stays as it was is not smoothed.
+_MOSTLY_KEPT = 0.5
+
+#: Undoes the blur of an image: along lines, or along the path.
+_Remover = Callable[[Any, BlurField, BlurPath], Any]
 
 
 def require_method(method: DeblurMethod | None) -> None:
@@ -63,7 +73,9 @@ class DeblurStage:
     drop
         Whether frames that are too blurred are left out.
     method
-        How blur is undone: by a Wiener filter along it, or by the network DeepGyro.
+        How blur is undone: along its path by a Wiener filter, or a half-quadratic one, or by the network DeepGyro.
+    smoothing_px
+        Standard deviation of the Gaussian by which COLMAP sees deblurred frames smoothed.
     weights
         Checksum of the network; empty where there is none. It decides the frames as the options do.
     workers
@@ -77,12 +89,13 @@ class DeblurStage:
     gate: GateOptions = field(default_factory=GateOptions)
     drop: bool = True
     method: BlurRemover = "wiener"
+    smoothing_px: float = SMOOTHING_PX
     weights: str = field(default="", init=False)
     workers: int | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
         if self.method not in get_args(BlurRemover):
-            raise ValueError(f"method: wiener or deepgyro, not {self.method}")
+            raise ValueError(f"method: {', '.join(get_args(BlurRemover))}, not {self.method}")
         if self.method == "deepgyro":
             object.__setattr__(self, "weights", checksum("deepgyro"))
 
@@ -101,11 +114,13 @@ class DeblurStage:
 
         yield from in_order(treat, frames, workers=workers)
 
-    def _remover(self, workers: int) -> Callable[[Any, BlurField], Any]:
+    def _remover(self, workers: int) -> _Remover:
         """Undoes the blur of one frame; ``workers`` call it at once."""
         if self.method == "deepgyro":
-            return partial(deepgyro.deblur, network=load_network("deepgyro", threads=threads_beside(workers)))
-        return partial(deblur, options=DeblurOptions(threads=1))
+            network = load_network("deepgyro", threads=threads_beside(workers))
+            return lambda image, lines, _: deepgyro.deblur(image, lines, network=network)
+        restore = half_quadratic if self.method == "path" else path_wiener
+        return lambda image, _, path: restore(image, path, DeblurOptions(threads=1))
 
     def _treated(
         self,
@@ -114,7 +129,7 @@ class DeblurStage:
         motion: GyroCamera,
         camera: Projector,
         shutter: FrameShutter,
-        remove: Callable[[Any, BlurField], Any],
+        remove: _Remover,
     ) -> Frame:
         """The frame to go on with, and what was decided about it."""
 
@@ -129,13 +144,20 @@ class DeblurStage:
             return said(self.verdict.reason)
         if decision.action == "drop":
             return replace(said(decision.reason), dropped=bool(self.drop and self.verdict.trusted))
+        parallax = self.parallaxes.get(frame.name)
         try:
-            blur = blur_field(motion, camera, shutter, parallax=self.parallaxes.get(frame.name))
+            blur = blur_field(motion, camera, shutter, parallax=parallax)
         except NotObservableError as error:
             return said(error.hint)
         if float(np.abs(blur.vector_px).max()) * 1.5 > LONGEST_PX:
             return said(f"{decision.blur_px:.0f} px of blur are too long to be undone")
         image: Any = frame.image  # either of two types of pixel, which the checker would keep apart
-        gated = deblur_gated(image, blur, recording=self.verdict, deblur=remove, options=self.gate)
-        done = said(gated.reason, gated.kept_share, gated.extent_factor, "deblurred" if gated.deblurred else "")
-        return replace(done, image=gated.image) if gated.deblurred else done
+        factor, reason = judge_frame(image, blur, self.verdict, self.gate)
+        if factor is None:
+            return said(reason)
+        if factor != 1.0:
+            blur = replace(blur, vector_px=blur.vector_px * np.float32(factor))
+        path = blur_path(motion, camera, shutter, parallax=parallax, extent_factor=factor)
+        out, kept = keep_sharp(image, remove(image, blur, path), blur)
+        smoothing_px = self.smoothing_px if kept < _MOSTLY_KEPT else 0.0
+        return replace(said(reason, kept, factor, "deblurred"), image=out, smoothing_px=smoothing_px)

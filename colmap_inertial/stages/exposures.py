@@ -12,7 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.errors import FormatError, NotObservableError
-from colmap_inertial.exposure_pairs import ExposurePair, PairGyro, brightened, bring_together, fuse_mertens
+from colmap_inertial.exposure_pairs import (
+    Brightness,
+    ExposurePair,
+    PairGyro,
+    better_alone,
+    brightened,
+    bring_together,
+    fuse_mertens,
+)
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.io.exposures import LongExposures, LongTiming
@@ -73,7 +81,9 @@ class FusedPair:
     name, long
         Of the frame, and the file of its long exposure.
     fused
-        Whether one picture was made of them; else the short one stays as it was filmed.
+        Whether one picture was made of them.
+    used
+        ``both``, or the better one of the two: the short one, brightened, or the long one as it is.
     reason
         In words.
     gain, colours
@@ -95,6 +105,7 @@ class FusedPair:
     name: str
     long: str
     fused: bool
+    used: Literal["both", "short", "long"]
     reason: str
     gain: float | None = None
     colours: tuple[float, ...] | None = None
@@ -190,22 +201,43 @@ class ExposureStage:
             short_exposure_s=frame.exposure_s,
             long_exposure_s=long_exposures_s.get(frame.name),
         )
-        done = FusedPair(name=frame.name, long=str(path), fused=False, reason="")
+        done = FusedPair(name=frame.name, long=str(path), fused=False, used="short", reason="")
         try:
             pair = bring_together(frame.image, long, gyro=times, stated_gain=stated)
         except NotObservableError as error:
-            return frame, replace(done, reason=f"stays as it was filmed: {error.hint}")
+            return _alone(frame, long, None, done, error.hint)
         done = _described(done, pair)
         if not pair.registered.alike:
-            what = f"stays as it was filmed: {path.name} does not show the same (correlation {done.agreement:.2f})"
-            return frame, replace(done, reason=what)
+            why = f"{path.name} does not show the same (correlation {done.agreement:.2f})"
+            return _alone(frame, long, pair.brightness, done, why)
         light = self.fuser.fuse(pair.short, pair.long, pair.blur)
         if self.fusion == "mertens":
             dark = brightened(frame.image, replace(pair.brightness, gain=1.0))
             light = fuse_mertens([dark, light])
-        top = np.iinfo(frame.image.dtype).max
-        image: Any = np.rint(top * np.clip(light, 0, 1)).astype(frame.image.dtype)  # either of two types of pixel
-        return replace(frame, image=image), replace(done, fused=True, reason=_in_words(pair, path))
+        done = replace(done, fused=True, used="both", reason=_in_words(pair, path))
+        return _with_light(frame, light), done
+
+
+def _alone(
+    frame: Frame, long: NDArray[Any], brightness: Brightness | None, done: FusedPair, why: str
+) -> tuple[Frame, FusedPair]:
+    """The better one of the two, never a dark one."""
+    alone = better_alone(frame.image, long, brightness)
+    what = (
+        "the long exposure as it is"
+        if alone.used == "long"
+        else f"the short exposure, {alone.gain:.3g} times as bright"
+    )
+    said = replace(done, used=alone.used, reason=f"is {what}, and not fused: {why}")
+    if alone.used == "short":
+        said = replace(said, gain=alone.gain)
+    return _with_light(frame, alone.image), said
+
+
+def _with_light(frame: Frame, light: Light) -> Frame:
+    top = np.iinfo(frame.image.dtype).max
+    image: Any = np.rint(top * np.clip(light, 0, 1)).astype(frame.image.dtype)  # either of two types of pixel
+    return replace(frame, image=image)
 
 
 def _require_alike(frame: Frame, path: Path, long: NDArray[Any]) -> None:

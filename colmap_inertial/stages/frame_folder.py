@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.errors import FormatError, InertialError
+from colmap_inertial.imaging.path_filters import smoothed
 from colmap_inertial.io.image_metadata import carry_metadata
 from colmap_inertial.io.names import path_in
 from colmap_inertial.io.records import read_record, write_record
@@ -96,6 +97,7 @@ def write_frames(
     records: Path,
     progress: Progress,
     least: int = 3,
+    unsmoothed: Path | None = None,
 ) -> None:
     """Run the frames through the stages and write them.
 
@@ -109,6 +111,9 @@ def write_frames(
         Where the original files lie, for image folders: a frame that no stage changed is copied, byte for byte.
     images
         Written: the folder for COLMAP.
+    unsmoothed
+        Written: the folder for frames as they are, of which COLMAP is to see smoothed ones. Without it, those are
+        nowhere.
     records
         Written: a JSON with one :class:`FrameRecord` for each frame of the capture.
 
@@ -123,12 +128,14 @@ def write_frames(
         stream = iter(stage(stream))
     seen: dict[str, FrameRecord] = {}
     images.mkdir(parents=True)
+    if unsmoothed is not None:
+        unsmoothed.mkdir(parents=True)
     known = set(names)
     for frame in stream:
         if frame.name not in known or frame.name in seen:
             raise ValueError(f"a frame stage yielded {frame.name!r}, which is no frame of the capture or came twice")
         original = originals.pop_through(frame.name)
-        action = "dropped" if frame.dropped else _write(frame, original, source_folder, images)
+        action = "dropped" if frame.dropped else _write(frame, original, source_folder, images, unsmoothed)
         seen[frame.name] = FrameRecord(
             name=frame.name,
             action=action,
@@ -141,18 +148,32 @@ def write_frames(
     write_record(records, FrameRecords(frames=every))
 
 
-def _write(frame: Frame, original: NDArray[Any] | None, source_folder: Path | None, images: Path) -> str:
+def _write(
+    frame: Frame, original: NDArray[Any] | None, source_folder: Path | None, images: Path, unsmoothed: Path | None
+) -> str:
     """Write the picture of a frame; returns what happened to it."""
     source = None if source_folder is None else path_in(source_folder, frame.name)
     target = path_in(images, frame.name)
     target.parent.mkdir(parents=True, exist_ok=True)
     passed = original is not None and _same_memory(original, frame.image)
-    if passed and source is not None:
+    if frame.smoothing_px > 0 and unsmoothed is not None:
+        itself = path_in(unsmoothed, frame.name)
+        itself.parent.mkdir(parents=True, exist_ok=True)
+        encode_image(itself, frame.image, source)
+    if frame.smoothing_px > 0:
+        encode_image(target, seen_by_colmap(frame), source)
+    elif passed and source is not None:
         shutil.copyfile(source, target)
     else:
         encode_image(target, frame.image, source)
     said = [treatment.action for treatment in frame.treatments if treatment.action]
     return "passed" if passed else (said or ["changed"])[-1]
+
+
+def seen_by_colmap(frame: Frame) -> NDArray[Any]:
+    """The picture of a frame that features are extracted from."""
+    image: Any = frame.image  # either of two types of pixel
+    return smoothed(image, frame.smoothing_px) if frame.smoothing_px > 0 else image
 
 
 def require_frames(count: int, *, of: int, least: int = 3) -> None:

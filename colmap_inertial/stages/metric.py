@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -28,6 +29,8 @@ from colmap_inertial.types import (
     Similarity,
     SmoothedTrajectory,
 )
+
+log = logging.getLogger(__name__)
 
 #: An angular velocity is the mean over this time, and over so many samples of the gyroscope, on each side of the
 #: instant: one reading has all of its noise, and a hand turns otherwise a few hundredths of a second later.
@@ -123,7 +126,7 @@ def write_trajectory(path: Path, model: Model, trajectory: CameraTrajectory, imu
     ----------
     path
         ``trajectory*.tum``; the covariance goes to ``trajectory*_cov.npz`` with ``t_s`` (T,) and ``cov`` (T, 9, 9) of
-        position, velocity and acceleration; velocities by frame to :func:`motion_file`.
+        position, velocity and acceleration (none of a refined model); velocities by frame to :func:`motion_file`.
     model
         A model that a stage made metric.
     trajectory
@@ -137,10 +140,19 @@ def write_trajectory(path: Path, model: Model, trajectory: CameraTrajectory, imu
     smoothed = smoothed_path(trajectory, imu, estimate, gravity)
     write_tum(path, smoothed)
     target = path.with_name(f"{path.stem}_cov.npz")
-    partial = target.with_name(f"{path.stem}_cov.partial.npz")
+    if any(one.stage == "refine" and one.action for one in model.treatments):
+        # the IMU made these poses already: smoothed by it once more, they would seem far surer than they are
+        log.info("%s: no covariance of a refined path is written; result.json has its drift", path.name)
+        target.unlink(missing_ok=True)
+    else:
+        _write_covariance(target, smoothed)
+    write_record(motion_file(path), _motion(model, trajectory, smoothed, imu, estimate.calibration))
+
+
+def _write_covariance(target: Path, smoothed: SmoothedTrajectory) -> None:
+    partial = target.with_name(f"{target.stem}.partial.npz")
     np.savez_compressed(partial, t_s=smoothed.t_s + smoothed.epoch_ns * 1e-9, cov=smoothed.cov)
     os.replace(partial, target)
-    write_record(motion_file(path), _motion(model, trajectory, smoothed, imu, estimate.calibration))
 
 
 def motion_file(trajectory: Path) -> Path:

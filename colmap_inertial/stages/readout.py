@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import logging
 from dataclasses import asdict, dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.imaging.gyro_camera import FrameShutter
@@ -12,7 +15,10 @@ from colmap_inertial.model.readout import settle_readout
 from colmap_inertial.options import ScaleOptions
 from colmap_inertial.scale import estimate_scale
 from colmap_inertial.stages.metric import of_model, smoothed_path
-from colmap_inertial.types import CameraImuCalibration, ImuRecording, Treatment
+from colmap_inertial.types import Array, CameraImuCalibration, ImuRecording, Treatment
+
+if TYPE_CHECKING:
+    import pycolmap
 
 log = logging.getLogger(__name__)
 
@@ -91,4 +97,11 @@ class ReadoutStage:
             model,
             reconstruction=settled if what.accepted else reconstruction,
             treatments=(*model.treatments, done),
+            observed_px=_keypoints_of(reconstruction) if what.accepted else {},
         )
+
+
+def _keypoints_of(reconstruction: pycolmap.Reconstruction) -> dict[str, Array]:
+    """By image name, (N, 2) where a model has its keypoints."""
+    images = (reconstruction.image(i) for i in reconstruction.reg_image_ids())
+    return {image.name: np.array([point.xy for point in image.points2D]).reshape(-1, 2) for image in images}

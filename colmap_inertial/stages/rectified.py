@@ -30,8 +30,9 @@ def write_images(
     images: Path,
     target: Path,
     progress: Progress,
+    unsmoothed: Path | None = None,
 ) -> None:
-    """Write the images that COLMAP saw as a global shutter would have taken them.
+    """Write the images that COLMAP saw as they are without smoothing, and as a global shutter would have taken them.
 
     What was not rectified is the same file under a second name (a hard link), or a copy where the file system has none.
 
@@ -47,10 +48,14 @@ def write_images(
         Folders of the images that COLMAP saw, and of those that are written.
     progress
         Called with ``"images"``.
+    unsmoothed
+        Folder of those images as they are that COLMAP saw smoothed.
     """
 
     def work(name: str) -> None:
         source, out = path_in(images, name), path_in(target, name)
+        if unsmoothed is not None and path_in(unsmoothed, name).is_file():
+            source = path_in(unsmoothed, name)
         out.parent.mkdir(parents=True, exist_ok=True)
         if name in rectified:
             image: Any = read_image(source)

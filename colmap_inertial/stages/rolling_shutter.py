@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from colmap_inertial.imaging.gyro_camera import GyroCamera
-from colmap_inertial.imaging.rolling_shutter import rectify_image, rectify_keypoints
+from colmap_inertial.imaging.rolling_shutter import rays, rectify_image, rectify_keypoints, seen_by_lines
 from colmap_inertial.io.calibration import SMALLEST_READOUT_S
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.stages.gyro_view import GyroView
@@ -61,6 +61,16 @@ class RollingShutterStage:
         """(N, 2) where a global shutter would have seen points of an image that the gyroscope covers."""
         motion, camera, index = self._parts()
         return np.asarray(rectify_keypoints(xy_px, motion, camera, self.view.shutter(index[name])), dtype=np.float64)
+
+    def as_exposed(self, name: str, xy_px: Array) -> Array:
+        """The inverse of :meth:`moved`: where the shutter had points (N, 2); as they are where it did not move them."""
+        motion, camera, index = self._parts()
+        if name not in index or not self.covers(name):
+            return xy_px
+        shutter = self.view.shutter(index[name])
+        reference = motion.start_from_cam(np.array(shutter.reference_s()))
+        found = seen_by_lines(rays(camera, xy_px) @ reference.T, xy_px, motion, camera, shutter)
+        return np.where(np.isfinite(found), found, xy_px)
 
     def move_image(self, name: str, image: Any, /) -> Any:
         """The pixels of one image as a global shutter would have taken them."""

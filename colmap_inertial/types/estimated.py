@@ -21,7 +21,7 @@ from colmap_inertial.types._checks import (
     set_fields,
 )
 from colmap_inertial.types.imu_calibration import ImuCalibration
-from colmap_inertial.types.recorded import LengthUnit, ReadoutDirection
+from colmap_inertial.types.recorded import ImuNoise, LengthUnit, ReadoutDirection
 
 Verdict = Literal["trusted", "weak", "refused"]
 
@@ -312,6 +312,8 @@ class ScaleEstimate:
         What makes the interval as wide as it is: by cause (``scale.parts.CAUSES``), the standard deviation of the
         logarithm that it alone would leave. Their squares add up to that of ``sigma_log``. ``None`` where the method
         does not tell.
+    noise
+        Of the IMU, as the fit found it in the recording; ``None`` where the method does not tell.
     method
         ``"spectral"`` or ``"joint"``; ``"none"`` where nothing could be estimated.
     """
@@ -332,6 +334,7 @@ class ScaleEstimate:
     excitation_m_s2: float | None = None
     drift: ScaleDrift | None = None
     parts: Mapping[str, float] | None = None
+    noise: ImuNoise | None = None
     runtime_s: float = 0.0
     notes: tuple[str, ...] = ()
 

@@ -177,6 +177,9 @@ class Frame:
         From the first row to one past the last; 0 is a global shutter; ``None`` where unknown.
     camera
         ``None`` lets COLMAP calibrate.
+    smoothing_px
+        Standard deviation of the Gaussian by which COLMAP sees the image smoothed, in linear light; everybody else has
+        the image as it is. 0 does nothing.
     dropped
         Whether COLMAP shall not see it. A stage that yields a dropped frame can say why; one that is simply not
         yielded is dropped without a reason.
@@ -190,10 +193,13 @@ class Frame:
     exposure_s: float | None = None
     readout_s: float | None = None
     camera: CameraModel | None = None
+    smoothing_px: float = 0.0
     dropped: bool = False
     treatments: tuple[Treatment, ...] = ()
 
     def __post_init__(self) -> None:
+        if not 0 <= self.smoothing_px < 100:
+            raise ValueError(f"{self.name}: smoothing_px must be from 0 to below 100, not {self.smoothing_px:g}")
         if self.image.ndim not in (2, 3) or self.image.dtype not in (np.uint8, np.uint16):
             raise ValueError(f"{self.name}: an image is (H, W) or (H, W, 3), uint8 or uint16")
         view = self.image.view()

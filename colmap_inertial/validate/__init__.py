@@ -1,5 +1,6 @@
 """Is a reconstruction the right size? Checked with a target of known size in its images."""
 
+from colmap_inertial.validate.markers import distance_between, with_bars, with_check_points
 from colmap_inertial.validate.measure import validate_model
 from colmap_inertial.validate.overlays import write_overlays
 from colmap_inertial.validate.result import (
@@ -22,8 +23,11 @@ __all__ = [
     "TargetSpecError",
     "Validation",
     "ViewResiduals",
+    "distance_between",
     "parse_target",
     "validate_model",
     "validation_table",
+    "with_bars",
+    "with_check_points",
     "write_overlays",
 ]

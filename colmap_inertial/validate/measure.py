@@ -12,10 +12,13 @@ from numpy.typing import NDArray
 
 from colmap_inertial.errors import NotObservableError, TargetNotFoundError
 from colmap_inertial.io.files import StrPath
+from colmap_inertial.model import read_model
 from colmap_inertial.options import ValidateOptions
+from colmap_inertial.scale.verdict import Z95
 from colmap_inertial.threads import one_blas_thread
 from colmap_inertial.types import Array
 from colmap_inertial.validate.fit import ScaleFit, fit_scale
+from colmap_inertial.validate.lengths import check_lengths, model_diagonal
 from colmap_inertial.validate.observations import Observations, Placement, triangulate
 from colmap_inertial.validate.place import PartPlacement, median_residual_px, observe
 from colmap_inertial.validate.result import (
@@ -107,7 +110,7 @@ def validate_model(
         search.look_closer(outside)
         placed = search.place()
     _require_agreement(search, placed)
-    return _measure(search, placed, missing)
+    return _measure(search, placed, missing, _diagonal(model))
 
 
 def _require_agreement(search: Search, placed: dict[int, PartPlacement]) -> None:
@@ -142,7 +145,14 @@ def _reject_outliers(search: Search, placed: dict[int, PartPlacement]) -> tuple[
     return {p: part for p, part in placed.items() if p not in outlying}, reasons
 
 
-def _measure(search: Search, placed: dict[int, PartPlacement], missing: dict[str, str]) -> Validation:
+def _diagonal(model: Path | pycolmap.Reconstruction) -> float | None:
+    found = read_model(model) if isinstance(model, Path) else model
+    return model_diagonal(np.array([point.xyz for point in found.points3D.values()]).reshape(-1, 3))
+
+
+def _measure(
+    search: Search, placed: dict[int, PartPlacement], missing: dict[str, str], diagonal: float | None
+) -> Validation:
     target, views, options = search.target, search.views, search.options
     placed, reasons = _reject_outliers(search, placed)
     index = {p: i for i, p in enumerate(sorted(placed))}
@@ -158,6 +168,7 @@ def _measure(search: Search, placed: dict[int, PartPlacement], missing: dict[str
     everything = obs
     obs, fit, dropped = fit_without_outliers(obs, start)
     half = fit.half_width_log()
+    of_target = 0.0 if target.sigma_m is None else Z95 * target.sigma_m / target.length_m
     if not half < _WIDEST_LOG:
         raise NotObservableError(
             "scale",
@@ -165,6 +176,8 @@ def _measure(search: Search, placed: dict[int, PartPlacement], missing: dict[str
             "more views from different sides are needed",
             sigma=min(fit.sigma_log, 9.99),
         )
+    if of_target:
+        half = float(np.hypot(half, of_target))
     log_scale = fit.placement.log_scale
     error, ci = _per_cent(log_scale), (_per_cent(log_scale - half), _per_cent(log_scale + half))
     seen = np.zeros(len(target.part), dtype=bool)
@@ -180,7 +193,7 @@ def _measure(search: Search, placed: dict[int, PartPlacement], missing: dict[str
         check_error, check_ci = _per_cent(difference), (_per_cent(difference - both), _per_cent(difference + both))
     else:
         reasons.append("too few corners to keep a control and a check set apart")
-    control, check = _set_scale(control_fit), _set_scale(check_fit)
+    control, check = _set_scale(control_fit, of_target), _set_scale(check_fit, of_target)
     to_metres = 1.0
     if options.unscaled:
         to_metres = float(np.exp(-log_scale)) if control is None else control.metres_per_unit
@@ -188,6 +201,11 @@ def _measure(search: Search, placed: dict[int, PartPlacement], missing: dict[str
     view_results = _view_results(search, sightings, obs, fit, everything)
     pose_px = fit.residual_px - fit.corner_residual_px
     position = _positions(target, obs, fit)
+    distances = _distances(target, position, control_corner, to_metres)
+    corners = tuple(
+        Corner(name=target.label(i), in_model=position[i] + views[0].origin_in_model)
+        for i in np.flatnonzero(np.isfinite(position[:, 0])).tolist()
+    )
     return Validation(
         target=target,
         unscaled=options.unscaled,
@@ -203,11 +221,8 @@ def _measure(search: Search, placed: dict[int, PartPlacement], missing: dict[str
         rms_px=_rms(fit.residual_px),
         corner_noise_px=fit.noise.corner_px,
         pose_noise_px=_rms(pose_px),
-        distances=_distances(target, position, control_corner, to_metres),
-        corners=tuple(
-            Corner(name=target.label(i), in_model=position[i] + views[0].origin_in_model)
-            for i in np.flatnonzero(np.isfinite(position[:, 0])).tolist()
-        ),
+        distances=distances,
+        corners=corners,
         views=view_results,
         views_rejected=rejected,
         control=control,
@@ -215,6 +230,7 @@ def _measure(search: Search, placed: dict[int, PartPlacement], missing: dict[str
         check_error_pct=check_error,
         check_ci95_pct=check_ci,
         reasons=tuple(reasons + _remarks(search, obs, fit, view_results)),
+        lengths=check_lengths(distances, corners, diagonal, to_metres),
     )
 
 
@@ -285,11 +301,12 @@ def _fit_set(obs: Observations, fit: ScaleFit, pick: NDArray[np.bool_]) -> tuple
     return (out, len(part)) if out.half_width_log() < _WIDEST_LOG else None
 
 
-def _set_scale(of: tuple[ScaleFit, int] | None) -> SetScale | None:
+def _set_scale(of: tuple[ScaleFit, int] | None, of_target: float) -> SetScale | None:
     if of is None:
         return None
     fit, corners = of
     log, half = fit.placement.log_scale, fit.half_width_log()
+    half = float(np.hypot(half, of_target)) if of_target else half
     return SetScale(
         metres_per_unit=float(np.exp(-log)),
         ci95=(float(np.exp(-log - half)), float(np.exp(-log + half))),
@@ -401,7 +418,14 @@ def _remarks(search: Search, obs: Observations, fit: ScaleFit, views: tuple[View
     if fit.noise.pose_ratio.any():
         shared = _rms(fit.residual_px - fit.corner_residual_px)
         out.append(f"errors of the model's poses move the target by {shared:.2f} px; the interval allows for them")
-    out.append("the interval does not hold errors of the target itself: measure the print")
+    sigma_m, length_m = search.target.sigma_m, search.target.length_m
+    if sigma_m is None:
+        out.append(
+            "the interval does not hold errors of the target itself: measure the print, and say how well you know it "
+            "(+- in the description)"
+        )
+    else:
+        out.append(f"the interval holds that the target is known to {100 * sigma_m / length_m:.2g} %")
     if len(search.searched) < len(search.views):
         out.append(f"{len(search.views) - len(search.searched)} images were not searched: enough views were found")
     return out

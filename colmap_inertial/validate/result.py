@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.types import Array
+from colmap_inertial.validate.lengths import LengthCheck
 from colmap_inertial.validate.targets import Target
 
 if TYPE_CHECKING:
@@ -119,6 +120,60 @@ class SetScale:
     corners: int
 
 
+@dataclass(frozen=True, kw_only=True)
+class ScaleBar:
+    """A known distance between the centres of two markers.
+
+    Attributes
+    ----------
+    markers
+        Their numbers.
+    known_m, sigma_m
+        The length, and how well it is known (standard deviation), where that was said.
+    measured
+        In the model; model units.
+    residual_m
+        Measured minus known, as of :class:`Distance`.
+    """
+
+    markers: tuple[int, int]
+    known_m: float
+    sigma_m: float | None
+    measured: float
+    residual_m: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CheckPoint:
+    """A marker whose coordinates are known: its number, and (3,) model minus known, along the known axes."""
+
+    marker: int
+    residual_m: Array
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CheckPoints:
+    """Markers with known coordinates, onto which the model was moved and turned.
+
+    Attributes
+    ----------
+    points
+        Each of them.
+    rmse_m
+        (3,) root mean square error along each axis.
+    rmse_horizontal_m, rmse_vertical_m
+        Over x and y, and along z, with the points' own accuracy in it where it is known (ASPRS 2023).
+    sigma_m
+        The points' own accuracy: standard deviation of a coordinate.
+    """
+
+    points: tuple[CheckPoint, ...]
+    rmse_m: Array
+    rmse_horizontal_m: float
+    rmse_vertical_m: float
+    sigma_m: float | None
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Validation:
     """Size of a reconstruction against a target of known size.
@@ -160,6 +215,10 @@ class Validation:
         Scale error that the check corners show after scaling by the control corners.
     reasons
         What limits the result, in words.
+    lengths
+        Errors of the known distances, how long they are and what they prove.
+    bars, check_points
+        Distances between markers and coordinates of markers, where those were given.
     """
 
     target: Target
@@ -185,6 +244,9 @@ class Validation:
     views: tuple[ViewResiduals, ...]
     views_rejected: tuple[RejectedView, ...]
     reasons: tuple[str, ...]
+    lengths: LengthCheck | None = None
+    bars: tuple[ScaleBar, ...] = ()
+    check_points: CheckPoints | None = None
 
     @property
     def within_tolerance(self) -> bool:
@@ -238,6 +300,16 @@ def validation_table(result: Validation) -> Group:
     if result.unscaled and result.check_error_pct is not None and result.check_ci95_pct is not None:
         low, high = result.check_ci95_pct
         figures.add_row("control against check", f"{result.check_error_pct:+.3f} %  (95 %: {low:+.3f} to {high:+.3f})")
+    if result.lengths is not None:
+        lengths = result.lengths
+        figures.add_row(
+            "length errors",
+            f"rms {1000 * lengths.rms_m:.3g} mm, largest {1000 * lengths.largest_m:+.3g} mm of {lengths.count}",
+        )
+        share = (
+            "" if lengths.longest_share is None else f", {100 * lengths.longest_share:.2g} % of the model's diagonal"
+        )
+        figures.add_row("longest length", f"{lengths.longest_m:.3g} m{share}; {lengths.directions} directions")
     figures.add_row("images", f"{result.views_used} used of {result.views_searched} searched")
     figures.add_row("corner observations", f"{result.corners_used} used, {result.corners_rejected} rejected")
     figures.add_row(
@@ -245,6 +317,17 @@ def validation_table(result: Validation) -> Group:
         f"{result.rms_px:.3f} px rms; corner noise {result.corner_noise_px:.3f} px per coordinate, "
         f"pose errors {result.pose_noise_px:.3f} px",
     )
+    for bar in result.bars:
+        figures.add_row(
+            f"bar {bar.markers[0]} to {bar.markers[1]}",
+            f"{bar.known_m:.6g} m, off by {1000 * bar.residual_m:+.3g} mm",
+        )
+    if result.check_points is not None:
+        points = result.check_points
+        figures.add_row(
+            f"{len(points.points)} check points",
+            f"RMSE {1000 * points.rmse_horizontal_m:.3g} mm level, {1000 * points.rmse_vertical_m:.3g} mm upwards",
+        )
     parts: list[Table | Text] = [figures]
     if result.distances:
         parts.append(_distance_table(result))
@@ -255,7 +338,12 @@ def validation_table(result: Validation) -> Group:
         for reason, count in Counter(view.reason for view in result.views_rejected).most_common():
             rejected.add_row(str(count), reason)
         parts.append(rejected)
-    parts += [Text(f"- {reason}") for reason in result.reasons]
+    said = (
+        result.reasons
+        if result.lengths is None
+        else (f"the check proves that {result.lengths.proves}", *result.reasons)
+    )
+    parts += [Text(f"- {reason}") for reason in said]
     return Group(*parts)
 
 

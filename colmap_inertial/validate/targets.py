@@ -88,6 +88,8 @@ class Target:
         Gap between the tags of an AprilGrid, divided by the tag's side; 0 elsewhere.
     dictionary
         Name in :data:`DICTIONARIES`; empty for a checkerboard.
+    sigma_m
+        How well ``length_m`` is known, as a standard deviation; ``None`` where the description does not say.
     corners_m
         (N, 3) corners in the frame of their part, z = 0.
     part
@@ -107,6 +109,7 @@ class Target:
     marker_m: float = 0.0
     gap: float = 0.0
     dictionary: str = ""
+    sigma_m: float | None = None
     corners_m: Array
     part: Index
     row: Index
@@ -188,13 +191,16 @@ def parse_target(text: str) -> Target:
     text
         ``checkerboard:COLSxROWS:SQUARE_M`` (inner corners), ``charuco:COLSxROWS:SQUARE_M:MARKER_M:DICT`` (squares),
         ``aprilgrid:COLSxROWS:TAG_M:GAP`` (tags of Kalibr's AprilGrid, gap divided by the tag's side), or
-        ``aruco:DICT:SIDE_M`` (single markers). Lengths are metres.
+        ``aruco:DICT:SIDE_M`` (single markers). Lengths are metres; the first one may be followed by ``+-`` and how
+        well it is known (standard deviation), as in ``checkerboard:9x6:0.025+-0.0001``.
 
     Raises
     ------
     TargetSpecError
         When the description is not one of these; the message says which field is wrong and what is expected.
     """
+    if "+-" in text:
+        return _with_sigma(text)
     kind, *fields = (field.strip() for field in text.split(":"))
     kind = kind.lower()
     if kind not in _FORMS:
@@ -222,6 +228,20 @@ def parse_target(text: str) -> Target:
         return _aprilgrid(text, columns, rows, _length(text, "TAG_M", fields[1]), gap)
     dictionary = _dictionary(text, fields[0], 1)
     return _markers(text, dictionary, _length(text, "SIDE_M", fields[1]))
+
+
+def _with_sigma(text: str) -> Target:
+    """The target of a description that says how well its length is known."""
+    before, _, after = text.partition("+-")
+    number, colon, rest = after.partition(":")
+    target = parse_target(f"{before.strip()}{colon}{rest}")
+    sigma_m = _length(text, "what follows +-", number)
+    length = before.rpartition(":")[2].strip()
+    if float(length) != target.length_m:
+        raise TargetSpecError(text, "+- belongs to the side of a square, tag or marker")
+    if sigma_m > 0.2 * target.length_m:
+        raise TargetSpecError(text, f"+- {sigma_m:g} m is more than a fifth of the length")
+    return replace(target, spec=text, sigma_m=sigma_m)
 
 
 def _number(spec: str, name: str, text: str) -> float:

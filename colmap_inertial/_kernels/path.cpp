@@ -1,0 +1,307 @@
+#include "path.h"
+
+#include "in_parallel.h"
+
+#include <cmath>
+#include <cstring>
+#include <memory>
+#include <mutex>
+
+namespace {
+
+constexpr double PI = 3.14159265358979323846;
+
+using Floats = std::unique_ptr<float[]>;
+
+Floats floats(size_t count) { return Floats(new float[count]()); }
+
+Floats unset(size_t count) { return Floats(new float[count]); }
+
+// What is the same for all tiles.
+struct Common {
+    Square square;
+    size_t count;  // of a spectrum, with what does not count
+    std::vector<float> twiddles;
+    Floats flattened;  // square of the frequency + flat_below^2, what the prior divides by
+    Floats band;       // 1 where the prior is fitted, 2 where the other half has the same, else 0
+    Floats fitted;     // that times the square of the frequency
+    Floats gradient;   // power of differences
+    Floats high;       // 1 or 2 above a frequency, else 0
+    double window_power;
+
+    explicit Common(const Tiles &tiles) : square{tiles.side, tiles.side + 16, tiles.side / 2 + 16} {
+        count = size_t(square.side) * size_t(square.half);
+        twiddles = twiddles_of(square.side);
+        double power = 0;
+        for (int i = 0; i < tiles.side; ++i) power += double(tiles.window_in[i]) * double(tiles.window_in[i]);
+        window_power = power * power;
+    }
+
+    template <class Value>
+    Floats over_frequencies(Value value, float rest) const {
+        Floats out = unset(count);
+        const int side = square.side, half = square.half;
+        for (int x = 0; x < side; ++x) {
+            const double fx = double(x <= side / 2 ? x : x - side) / side;
+            for (int y = 0; y < half; ++y)
+                out[size_t(x) * half + y] =
+                    y <= side / 2 ? float(value(fx, double(y) / side, y % (side / 2) ? 2.0 : 1.0)) : rest;
+        }
+        return out;
+    }
+};
+
+// Memory of one thread.
+struct Room {
+    Floats tile, other, power, scratch, real[6], cos_x, sin_x, cos_y, sin_y;
+    Spectrum spectrum, transfer, data;
+
+    Room(const Common &common, int samples) {
+        const size_t side = size_t(common.square.side), pitch = size_t(common.square.pitch);
+        tile = floats(side * pitch);
+        other = floats(side * pitch);
+        power = floats(common.count);
+        scratch = floats(room_of(common.square));
+        for (auto &plane : real) plane = floats(common.count);
+        spectrum = {real[0].get(), real[1].get()};
+        transfer = {real[2].get(), real[3].get()};
+        data = {real[4].get(), real[5].get()};
+        cos_x = floats((side / 2 + 1) * size_t(samples));
+        sin_x = floats((side / 2 + 1) * size_t(samples));
+        cos_y = floats(size_t(common.square.half) * size_t(samples));
+        sin_y = floats(size_t(common.square.half) * size_t(samples));
+    }
+};
+
+class Filter {
+  public:
+    Filter(const Light &light, const Tiles &tiles, const PathSimd &simd, int threads)
+        : light_(light), tiles_(tiles), simd_(simd), threads_(threads), common_(tiles) {
+        height_ = (tiles.rows - 1) * tiles.hop + tiles.side;
+        width_ = (tiles.columns - 1) * tiles.hop + tiles.side;
+    }
+
+    void filter(const Model &model, float *result) {
+        const double flat = double(model.flat_below) * model.flat_below;
+        common_.flattened =
+            common_.over_frequencies([&](double x, double y, double) { return x * x + y * y + flat; }, 1);
+        const auto times_in_band = [&](double x, double y, double times) {
+            const double square = x * x + y * y, low = model.fitted_from, high = model.fitted_to;
+            return square > low * low && square < high * high ? times : 0.0;
+        };
+        common_.band = common_.over_frequencies(times_in_band, 0);
+        common_.fitted = common_.over_frequencies(
+            [&](double x, double y, double times) { return times_in_band(x, y, times) * (x * x + y * y); }, 0);
+        common_.gradient = common_.over_frequencies(
+            [](double x, double y, double) {
+                const double along = std::sin(PI * x), down = std::sin(PI * y);
+                return 4 * (along * along + down * down) + 1e-12;
+            },
+            1);
+        std::fill(result, result + size_t(light_.height) * light_.width * light_.channels, 0.0f);
+        extend();
+        // Tiles that do not touch go together. So every pixel is added up in the same order, whatever the threads.
+        for (const int phase : {0, 1, 2, 3}) {
+            const int top = phase / 2, left = phase % 2;
+            const int rows = (tiles_.rows - top + 1) / 2, columns = (tiles_.columns - left + 1) / 2;
+            in_parallel(rows * columns, threads_, [&](int i) {
+                std::unique_ptr<Room> room = take();
+                filter_tile(top + 2 * (i / columns), left + 2 * (i % columns), model, *room, result);
+                give(std::move(room));
+            });
+        }
+    }
+
+    std::vector<float> noise(float above, float share, int every) {
+        common_.high = common_.over_frequencies(
+            [&](double x, double y, double times) {
+                return x * x + y * y > double(above) * above ? times : 0.0;
+            },
+            0);
+        extend();
+        const int rows = (tiles_.rows + every - 1) / every, columns = (tiles_.columns + every - 1) / every;
+        std::vector<float> found(size_t(light_.channels) * rows * columns * 3);
+        in_parallel(rows * columns, threads_, [&](int i) {
+            std::unique_ptr<Room> room = take();
+            const int row = every * (i / columns), column = every * (i % columns);
+            find_transfer(row, column, *room);
+            for (int channel = 0; channel < light_.channels; ++channel) {
+                const float mean = load_tile(row, column, channel, *room);
+                double sums[2];
+                simd_.quiet(common_.count, room->transfer, room->spectrum, common_.high.get(), share * share, sums);
+                float *out = found.data() + (size_t(channel) * rows * columns + i) * 3;
+                out[0] = mean;
+                out[1] = sums[1] > 0 ? float(sums[0] / sums[1] / common_.window_power) : 0.0f;
+                out[2] = float(sums[1]);
+            }
+            give(std::move(room));
+        });
+        return found;
+    }
+
+  private:
+    // The image in planes, mirrored about its borders as far as the tiles go.
+    void extend() {
+        planes_ = unset(size_t(light_.channels) * height_ * width_);
+        std::vector<int> columns(size_t(width_), 0);
+        for (int x = 0; x < width_; ++x) columns[x] = mirrored(x - tiles_.before, light_.width) * light_.channels;
+        in_parallel(height_, threads_, [&](int y) {
+            const float *row = light_.values +
+                               size_t(mirrored(y - tiles_.before, light_.height)) * light_.width * light_.channels;
+            for (int channel = 0; channel < light_.channels; ++channel) {
+                float *out = planes_.get() + (size_t(channel) * height_ + y) * width_;
+                for (int x = 0; x < width_; ++x) out[x] = row[columns[x] + channel];
+            }
+        });
+    }
+
+    // Rooms are used again: to make one takes as long as to filter a tile.
+    std::unique_ptr<Room> take() {
+        {
+            const std::lock_guard<std::mutex> guard(lock_);
+            if (!rooms_.empty()) {
+                std::unique_ptr<Room> room = std::move(rooms_.back());
+                rooms_.pop_back();
+                return room;
+            }
+        }
+        return std::make_unique<Room>(common_, tiles_.samples);
+    }
+
+    void give(std::unique_ptr<Room> room) {
+        const std::lock_guard<std::mutex> guard(lock_);
+        rooms_.push_back(std::move(room));
+    }
+
+    void find_transfer(int row, int column, Room &room) const {
+        const int samples = tiles_.samples, half = common_.square.half, side = tiles_.side;
+        const float *path = tiles_.paths + (size_t(row) * tiles_.columns + column) * samples * 2;
+        for (int k = 0; k < samples; ++k) {
+            turns(2 * PI * double(path[2 * k]) / side, side / 2 + 1, room.cos_x.get() + k, room.sin_x.get() + k,
+                  samples);
+            turns(2 * PI * double(path[2 * k + 1]) / side, side / 2 + 1, room.cos_y.get() + size_t(k) * half,
+                  room.sin_y.get() + size_t(k) * half, 1);
+        }
+        simd_.transfer(common_.square, samples, room.cos_x.get(), room.sin_x.get(), room.cos_y.get(), room.sin_y.get(),
+                       room.transfer);
+    }
+
+    // Cosines and sines of the multiples of an angle.
+    static void turns(double angle, int count, float *cosines, float *sines, ptrdiff_t step) {
+        const double c = std::cos(angle), s = std::sin(angle);
+        double re = 1, im = 0;
+        for (int i = 0; i < count; ++i) {
+            cosines[i * step] = float(re);
+            sines[i * step] = float(im);
+            const double next = re * c - im * s;
+            im = re * s + im * c;
+            re = next;
+        }
+        // The highest frequency has no sign: of a curve, its two halves would not agree. It is left out.
+        cosines[(count - 1) * step] = sines[(count - 1) * step] = 0;
+    }
+
+    // Transforms a tile, without its mean and windowed; returns the mean.
+    float load_tile(int row, int column, int channel, Room &room) const {
+        const int side = tiles_.side, pitch = common_.square.pitch;
+        const float *from = planes_.get() + (size_t(channel) * height_ + row * tiles_.hop) * width_ +
+                            column * tiles_.hop;
+        double sum = 0;
+        for (int y = 0; y < side; ++y) {
+            float of_row = 0;
+            for (int x = 0; x < side; ++x) of_row += from[size_t(y) * width_ + x];
+            sum += double(of_row);
+        }
+        const float mean = float(sum / (double(side) * side));
+        for (int y = 0; y < side; ++y) {
+            const float *line = from + size_t(y) * width_;
+            float *out = room.tile.get() + size_t(y) * pitch;
+            const float weight = tiles_.window_in[y];
+            for (int x = 0; x < side; ++x) out[x] = (line[x] - mean) * (weight * tiles_.window_in[x]);
+        }
+        simd_.forward(common_.square, common_.twiddles.data(), room.tile.get(), room.spectrum, room.scratch.get());
+        return mean;
+    }
+
+    void filter_tile(int row, int column, const Model &model, Room &room, float *result) const {
+        const Square &square = common_.square;
+        const float *twiddles = common_.twiddles.data();
+        const size_t count = common_.count;
+        const float scale = 1.0f / (float(square.side) * float(square.side));
+        find_transfer(row, column, room);
+        for (int channel = 0; channel < light_.channels; ++channel) {
+            const float mean = load_tile(row, column, channel, room);
+            const float *line = model.noise + 2 * channel;
+            const float noise = std::max(line[0] + line[1] * mean, model.least_noise * model.least_noise);
+            double sums[3];
+            simd_.correlate(count, room.transfer, room.spectrum, common_.fitted.get(), common_.band.get(),
+                            room.power.get(), room.data, sums);
+            // (a column of zeros beside the spectrum has a power of zero, and a prior of one)
+            const double excess = sums[0] / common_.window_power - double(noise) * sums[1];
+            const float signal = std::max(float(excess / std::max(sums[2], 1e-30)), model.least_signal * noise);
+            simd_.divide(count, room.data, room.power.get(), common_.flattened.get(),
+                         model.noise_factor * noise / signal, scale, room.spectrum);
+            simd_.inverse(square, twiddles, room.spectrum, room.tile.get(), room.scratch.get());
+            for (int round = 0; round < model.rounds; ++round) {
+                const float splitting = model.splitting[round];
+                const float threshold = 2.0f * std::pow(2.0f / 3.0f / splitting, 0.75f);
+                simd_.shrink(square, room.tile.get(), splitting, threshold, room.other.get(), room.scratch.get());
+                simd_.forward(square, twiddles, room.other.get(), room.spectrum, room.scratch.get());
+                simd_.blend(count, room.data, room.power.get(), common_.gradient.get(),
+                            splitting * noise / (model.data_weight * 1e-4f), scale, room.spectrum);
+                simd_.inverse(square, twiddles, room.spectrum, room.tile.get(), room.scratch.get());
+            }
+            add(row, column, channel, mean, room, result);
+        }
+    }
+
+    void add(int row, int column, int channel, float mean, const Room &room, float *result) const {
+        const int first_y = row * tiles_.hop - tiles_.before, first_x = column * tiles_.hop - tiles_.before;
+        const int from_x = std::max(0, -first_x), to_x = std::min(tiles_.side, light_.width - first_x);
+        for (int y = std::max(0, -first_y); y < std::min(tiles_.side, light_.height - first_y); ++y) {
+            const float weight = tiles_.window_out[y];
+            if (weight == 0) continue;
+            const float *from = room.tile.get() + size_t(y) * common_.square.pitch;
+            float *out = result + (size_t(first_y + y) * light_.width + first_x) * light_.channels + channel;
+            for (int x = from_x; x < to_x; ++x)
+                out[x * light_.channels] += weight * tiles_.window_out[x] * (from[x] + mean);
+        }
+    }
+
+    Light light_;
+    Tiles tiles_;
+    const PathSimd &simd_;
+    int threads_, height_, width_;
+    Common common_;
+    Floats planes_;
+    std::mutex lock_;
+    std::vector<std::unique_ptr<Room>> rooms_;
+};
+
+}  // namespace
+
+std::vector<float> twiddles_of(int side) {
+    std::vector<float> out;
+    for (int n = side; n >= 4; n /= 4)
+        for (int p = 0; p < n / 4; ++p)
+            for (int power = 1; power <= 3; ++power) {
+                const double angle = -2 * PI * double(p) * power / n;
+                out.push_back(float(std::cos(angle)));
+                out.push_back(float(std::sin(angle)));
+            }
+    return out;
+}
+
+size_t room_of(const Square &square) {
+    return 8 * (size_t(MOST_LANES) * size_t(square.side) + size_t(APART));
+}
+
+void filter_along(const Light &light, const Tiles &tiles, const Model &model, float *result, const PathSimd &simd,
+                  int threads) {
+    Filter(light, tiles, simd, threads).filter(model, result);
+}
+
+std::vector<float> noise_along(const Light &light, const Tiles &tiles, float above, float share, int every,
+                               const PathSimd &simd, int threads) {
+    return Filter(light, tiles, simd, threads).noise(above, share, every);
+}

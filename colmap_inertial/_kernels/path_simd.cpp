@@ -1,0 +1,376 @@
+// Compiled once for each instruction set; no standard headers beyond the C ones, as in wiener_simd.cpp.
+#include "path_simd.h"
+
+#include <stdint.h>
+#include <string.h>
+
+#define JOIN_(a, b) a##b
+#define JOIN(a, b) JOIN_(a, b)
+#define TEXT_(a) #a
+#define TEXT(a) TEXT_(a)
+
+namespace {
+
+#if defined(__AVX512F__)
+constexpr int LANES = 16;
+#elif defined(__AVX2__)
+constexpr int LANES = 8;
+#else
+constexpr int LANES = 4;
+#endif
+
+typedef float Vector __attribute__((vector_size(4 * LANES)));
+typedef int32_t Integers __attribute__((vector_size(4 * LANES)));
+typedef float Four __attribute__((vector_size(16)));
+typedef int32_t FourIntegers __attribute__((vector_size(16)));
+
+inline Vector load(const float *at) {
+    Vector v;
+    memcpy(&v, at, sizeof v);
+    return v;
+}
+
+inline void store(float *at, Vector v) { memcpy(at, &v, sizeof v); }
+
+struct Complex {
+    Vector re, im;
+};
+
+// Rows of numbers with real and imaginary parts apart.
+struct Rows {
+    float *re, *im;
+    ptrdiff_t stride;
+    Complex get(int i) const { return {load(re + i * stride), load(im + i * stride)}; }
+    void set(int i, Vector a, Vector b) const {
+        store(re + i * stride, a);
+        store(im + i * stride, b);
+    }
+};
+
+inline void put_turned(const Rows &to, int i, Vector re, Vector im, const float *w) {
+    to.set(i, w[0] * re - w[1] * im, w[0] * im + w[1] * re);
+}
+
+// One pass of Stockham's transform: `n` points are left to be combined, `s` transforms of them lie interleaved.
+void four_at_once(const Rows &from, const Rows &to, int n, int s, const float *twiddles) {
+    const int m = n / 4;
+    for (int p = 0; p < m; ++p) {
+        const float *w = twiddles + 6 * p;
+        for (int q = 0; q < s; ++q) {
+            const Complex a = from.get(q + s * p), b = from.get(q + s * (p + m)), c = from.get(q + s * (p + 2 * m)),
+                          d = from.get(q + s * (p + 3 * m));
+            const Vector sum_re = a.re + c.re, sum_im = a.im + c.im, less_re = a.re - c.re, less_im = a.im - c.im;
+            const Vector other_re = b.re + d.re, other_im = b.im + d.im;
+            const Vector turn_re = d.im - b.im, turn_im = b.re - d.re;  // i (b - d)
+            const int at = q + s * 4 * p;
+            to.set(at, sum_re + other_re, sum_im + other_im);
+            put_turned(to, at + s, less_re - turn_re, less_im - turn_im, w);
+            put_turned(to, at + 2 * s, sum_re - other_re, sum_im - other_im, w + 2);
+            put_turned(to, at + 3 * s, less_re + turn_re, less_im + turn_im, w + 4);
+        }
+    }
+}
+
+void two_at_once(const Rows &from, const Rows &to, int s) {
+    for (int q = 0; q < s; ++q) {
+        const Complex a = from.get(q), b = from.get(q + s);
+        to.set(q, a.re + b.re, a.im + b.im);
+        to.set(q + s, a.re - b.re, a.im - b.im);
+    }
+}
+
+// Transforms LANES columns of `side` numbers each. `room`: four times LANES * side + APART floats. Little memory fits the first-level
+// cache: where the number of passes is even, what is written in the end serves in between, too.
+void transform(int side, const float *twiddles, Rows from, Rows to, float *room) {
+    const ptrdiff_t size = ptrdiff_t(side) * LANES + APART;
+    int passes = 0;
+    for (int n = side; n > 1; n /= 4) ++passes;
+    const Rows rooms[2] = {{room, room + size, LANES},
+                           passes % 2 ? Rows{room + 2 * size, room + 3 * size, LANES} : to};
+    int n = side, s = 1, next = 0;
+    while (n > 1) {
+        const bool last = n == 4 || n == 2;
+        const Rows target = last ? to : rooms[next];
+        if (n == 2) {
+            two_at_once(from, target, s);
+            n = 1;
+        } else {
+            four_at_once(from, target, n, s, twiddles);
+            twiddles += 6 * (n / 4);
+            n /= 4;
+            s *= 4;
+        }
+        from = target;
+        next = 1 - next;
+    }
+}
+
+void transpose(const float *from, ptrdiff_t from_pitch, int rows, int columns, float *to, ptrdiff_t to_pitch) {
+    for (int i = 0; i < rows; i += 4)
+        for (int j = 0; j < columns; j += 4) {
+            Four a, b, c, d;
+            const float *at = from + i * from_pitch + j;
+            memcpy(&a, at, 16);
+            memcpy(&b, at + from_pitch, 16);
+            memcpy(&c, at + 2 * from_pitch, 16);
+            memcpy(&d, at + 3 * from_pitch, 16);
+            const Four ab = __builtin_shuffle(a, b, FourIntegers{0, 4, 1, 5}),
+                       ab2 = __builtin_shuffle(a, b, FourIntegers{2, 6, 3, 7}),
+                       cd = __builtin_shuffle(c, d, FourIntegers{0, 4, 1, 5}),
+                       cd2 = __builtin_shuffle(c, d, FourIntegers{2, 6, 3, 7});
+            const Four out[4] = {__builtin_shuffle(ab, cd, FourIntegers{0, 1, 4, 5}),
+                                 __builtin_shuffle(ab, cd, FourIntegers{2, 3, 6, 7}),
+                                 __builtin_shuffle(ab2, cd2, FourIntegers{0, 1, 4, 5}),
+                                 __builtin_shuffle(ab2, cd2, FourIntegers{2, 3, 6, 7})};
+            for (int k = 0; k < 4; ++k) memcpy(to + (j + k) * to_pitch + i, &out[k], 16);
+        }
+}
+
+// Columns x and x + side / 2 are transformed as one column of complex numbers. Of their spectra, rows 0 and side / 2
+// are real and go as real and imaginary part of row 0; the rows after it are those up to side / 2.
+void forward(const Square &square, const float *twiddles, const float *tile, Spectrum out, float *room) {
+    const int side = square.side, middle = side / 2;
+    const ptrdiff_t pitch = square.pitch, half = square.half, size = ptrdiff_t(side) * LANES + APART;
+    const Rows column{room + 4 * size, room + 5 * size, LANES};
+    float *pixels = const_cast<float *>(tile);
+    for (int x = 0; x < middle; x += LANES) {
+        transform(side, twiddles, {pixels + x, pixels + x + middle, pitch}, column, room);
+        // turned in small squares: what is in between stays in the cache
+        for (int k = 0; k < middle; k += LANES) {
+            float parts[4][LANES * LANES];
+            for (int i = 0; i < LANES; ++i) {
+                const Complex a = column.get(k + i), b = column.get(k + i ? side - k - i : middle);
+                const bool real = k + i == 0;
+                store(parts[0] + i * LANES, real ? a.re : 0.5f * (a.re + b.re));
+                store(parts[1] + i * LANES, real ? b.re : 0.5f * (a.im - b.im));
+                store(parts[2] + i * LANES, real ? a.im : 0.5f * (a.im + b.im));
+                store(parts[3] + i * LANES, real ? b.im : 0.5f * (b.re - a.re));
+            }
+            const ptrdiff_t at = x * half + k, other = (x + middle) * half + k;
+            transpose(parts[0], LANES, LANES, LANES, out.re + at, half);
+            transpose(parts[1], LANES, LANES, LANES, out.im + at, half);
+            transpose(parts[2], LANES, LANES, LANES, out.re + other, half);
+            transpose(parts[3], LANES, LANES, LANES, out.im + other, half);
+        }
+    }
+    for (int k = 0; k < middle; k += LANES)
+        transform(side, twiddles, {out.re + k, out.im + k, half}, {out.re + k, out.im + k, half}, room);
+    for (int x = 0; x < side; ++x)
+        for (int k = middle; k < half; ++k) out.re[x * half + k] = out.im[x * half + k] = 0;
+    for (int x = 0; x <= middle; ++x) {
+        const ptrdiff_t i = x * half, j = ((side - x) % side) * half;
+        const float a_re = out.re[i], a_im = out.im[i], b_re = out.re[j], b_im = out.im[j];
+        out.re[i] = out.re[j] = 0.5f * (a_re + b_re);
+        out.im[i] = 0.5f * (a_im - b_im);
+        out.im[j] = -out.im[i];
+        out.re[i + middle] = out.re[j + middle] = 0.5f * (a_im + b_im);
+        out.im[i + middle] = 0.5f * (b_re - a_re);
+        out.im[j + middle] = -out.im[i + middle];
+    }
+}
+
+void inverse(const Square &square, const float *twiddles, Spectrum in, float *tile, float *room) {
+    const int side = square.side, middle = side / 2;
+    const ptrdiff_t pitch = square.pitch, half = square.half, size = ptrdiff_t(side) * LANES + APART;
+    const Rows column{room + 4 * size, room + 5 * size, LANES};
+    for (int x = 0; x < side; ++x) {
+        float *re = in.re + x * half, *im = in.im + x * half;
+        const float a_re = re[0], a_im = im[0];
+        re[0] = a_re - im[middle];
+        im[0] = a_im + re[middle];
+    }
+    // real and imaginary parts swapped, the transform is the inverse
+    for (int k = 0; k < middle; k += LANES)
+        transform(side, twiddles, {in.im + k, in.re + k, half}, {in.im + k, in.re + k, half}, room);
+    for (int x = 0; x < middle; x += LANES) {
+        for (int k = 0; k < middle; k += LANES) {
+            float parts[4][LANES * LANES];
+            const ptrdiff_t at = x * half + k, other = (x + middle) * half + k;
+            transpose(in.re + at, half, LANES, LANES, parts[0], LANES);
+            transpose(in.im + at, half, LANES, LANES, parts[1], LANES);
+            transpose(in.re + other, half, LANES, LANES, parts[2], LANES);
+            transpose(in.im + other, half, LANES, LANES, parts[3], LANES);
+            for (int i = 0; i < LANES; ++i) {
+                const Vector a_re = load(parts[0] + i * LANES), a_im = load(parts[1] + i * LANES),
+                             b_re = load(parts[2] + i * LANES), b_im = load(parts[3] + i * LANES);
+                if (k + i == 0) {
+                    column.set(0, a_re, b_re);
+                    column.set(middle, a_im, b_im);
+                    continue;
+                }
+                column.set(k + i, a_re - b_im, a_im + b_re);
+                column.set(side - k - i, a_re + b_im, b_re - a_im);
+            }
+        }
+        transform(side, twiddles, {column.im, column.re, LANES}, {tile + x + middle, tile + x, pitch}, room);
+    }
+}
+
+// Rows x and -x share their sums of products.
+void transfer(const Square &square, int samples, const float *cos_x, const float *sin_x, const float *cos_y,
+              const float *sin_y, Spectrum out) {
+    const int side = square.side, middle = side / 2;
+    const ptrdiff_t half = square.half;
+    const float share = 1.0f / float(samples);
+    for (int k = 0; k < half; k += LANES)
+        for (int x = 0; x <= middle; x += 2) {
+            Vector cc[2] = {}, ss[2] = {}, cs[2] = {}, sc[2] = {};
+            const int second = x < middle ? x + 1 : x;
+            const float *cosines[2] = {cos_x + x * ptrdiff_t(samples), cos_x + second * ptrdiff_t(samples)};
+            const float *sines[2] = {sin_x + x * ptrdiff_t(samples), sin_x + second * ptrdiff_t(samples)};
+            for (int i = 0; i < samples; ++i) {
+                const Vector c = load(cos_y + i * half + k), s = load(sin_y + i * half + k);
+#pragma GCC unroll 2
+                for (int r = 0; r < 2; ++r) {
+                    cc[r] += cosines[r][i] * c;
+                    ss[r] += sines[r][i] * s;
+                    cs[r] += cosines[r][i] * s;
+                    sc[r] += sines[r][i] * c;
+                }
+            }
+            for (int r = 0; r < 2; ++r) {
+                const int row = x + r;
+                if (row > middle) break;
+                store(out.re + row * half + k, share * (cc[r] - ss[r]));
+                store(out.im + row * half + k, share * (cs[r] + sc[r]));
+                if (row == 0 || row == middle) continue;
+                store(out.re + (side - row) * half + k, share * (cc[r] + ss[r]));
+                store(out.im + (side - row) * half + k, share * (cs[r] - sc[r]));
+            }
+        }
+}
+
+inline double total(Vector v) {
+    double sum = 0;
+    for (int i = 0; i < LANES; ++i) sum += double(v[i]);
+    return sum;
+}
+
+// Sums of a row at a time: single precision would lose digits over a whole tile.
+constexpr size_t SUMMED = 1024;
+
+void correlate(size_t count, Spectrum transfer, Spectrum spectrum, const float *weight, const float *band,
+               float *power, Spectrum data, double *sums) {
+    sums[0] = sums[1] = sums[2] = 0;
+    for (size_t first = 0; first < count; first += SUMMED) {
+        Vector seen = {}, once = {}, twice = {};
+        const size_t end = first + SUMMED < count ? first + SUMMED : count;
+        for (size_t i = first; i < end; i += LANES) {
+            const Vector k_re = load(transfer.re + i), k_im = load(transfer.im + i), g_re = load(spectrum.re + i),
+                         g_im = load(spectrum.im + i), w = load(weight + i);
+            const Vector p = k_re * k_re + k_im * k_im;
+            store(power + i, p);
+            store(data.re + i, k_re * g_re + k_im * g_im);
+            store(data.im + i, k_re * g_im - k_im * g_re);
+            seen += w * p * (g_re * g_re + g_im * g_im);
+            once += w * p;
+            twice += load(band + i) * p * p;
+        }
+        sums[0] += total(seen);
+        sums[1] += total(once);
+        sums[2] += total(twice);
+    }
+}
+
+void quiet(size_t count, Spectrum transfer, Spectrum spectrum, const float *weight, float limit, double *sums) {
+    sums[0] = sums[1] = 0;
+    for (size_t first = 0; first < count; first += SUMMED) {
+        Vector seen = {}, times = {};
+        const size_t end = first + SUMMED < count ? first + SUMMED : count;
+        for (size_t i = first; i < end; i += LANES) {
+            const Vector k_re = load(transfer.re + i), k_im = load(transfer.im + i), g_re = load(spectrum.re + i),
+                         g_im = load(spectrum.im + i);
+            const Vector w = k_re * k_re + k_im * k_im < limit ? load(weight + i) : Vector{};
+            seen += w * (g_re * g_re + g_im * g_im);
+            times += w;
+        }
+        sums[0] += total(seen);
+        sums[1] += total(times);
+    }
+}
+
+void divide(size_t count, Spectrum data, const float *power, const float *other, float factor, float scale,
+            Spectrum out) {
+    for (size_t i = 0; i < count; i += LANES) {
+        const Vector share = scale / (load(power + i) + factor * load(other + i));
+        store(out.re + i, share * load(data.re + i));
+        store(out.im + i, share * load(data.im + i));
+    }
+}
+
+void blend(size_t count, Spectrum data, const float *power, const float *other, float factor, float scale,
+           Spectrum out) {
+    for (size_t i = 0; i < count; i += LANES) {
+        const Vector share = scale / (load(power + i) + factor * load(other + i));
+        store(out.re + i, share * (load(data.re + i) + factor * load(out.re + i)));
+        store(out.im + i, share * (load(data.im + i) + factor * load(out.im + i)));
+    }
+}
+
+inline Vector one_over_cube_root(Vector v) {
+    Integers bits;
+    memcpy(&bits, &v, sizeof bits);
+    const Vector third = __builtin_convertvector(bits, Vector) * (1.0f / 3.0f);
+    bits = 0x54a2fa8c - __builtin_convertvector(third, Integers);
+    Vector root;
+    memcpy(&root, &bits, sizeof root);
+    for (int round = 0; round < 2; ++round) root = root * (4.0f / 3.0f - (1.0f / 3.0f) * v * root * root * root);
+    return root;
+}
+
+inline bool any(Integers lanes) {
+    int64_t parts[LANES / 2];
+    memcpy(parts, &lanes, sizeof parts);
+    int64_t found = 0;
+    for (int i = 0; i < LANES / 2; ++i) found |= parts[i];
+    return found != 0;
+}
+
+// What minimises |w|^(2/3) + splitting / 2 (w - gradient)^2, by three rounds.
+inline Vector shrunk(Vector gradient, float step, float threshold) {
+    const Vector zero = {}, size = gradient < zero ? -gradient : gradient;
+    if (!any(size >= threshold)) return zero;
+    Vector w = size;
+    for (int round = 0; round < 3; ++round) {
+        const Vector least = zero + 1e-9f;
+        w = size - step * one_over_cube_root(w < least ? least : w);
+        w = w < zero ? zero : w;
+    }
+    w = size < threshold ? zero : w;
+    return gradient < zero ? -w : w;
+}
+
+void shrink(const Square &square, const float *tile, float splitting, float threshold, float *out, float *room) {
+    const int side = square.side;
+    const ptrdiff_t pitch = square.pitch;
+    const float step = 2.0f / 3.0f / splitting;
+    float *along = room + MOST_LANES, *above = along + pitch + MOST_LANES, *first = above + pitch,
+          *padded = first + pitch + MOST_LANES;
+    auto down = [&](int y, float *to) {
+        const float *row = tile + y * pitch, *next = tile + ((y + 1) % side) * pitch;
+        for (int x = 0; x < side; x += LANES) store(to + x, shrunk(load(next + x) - load(row + x), step, threshold));
+    };
+    down(side - 1, above);  // what the first row takes from the last one
+    memcpy(first, above, sizeof(float) * size_t(side));
+    for (int y = 0; y < side; ++y) {
+        const float *row = tile + y * pitch;
+        memcpy(padded, row, sizeof(float) * size_t(side));
+        padded[side] = row[0];
+        for (int x = 0; x < side; x += LANES)
+            store(along + x, shrunk(load(padded + x + 1) - load(padded + x), step, threshold));
+        along[-1] = along[side - 1];
+        for (int x = 0; x < side; x += LANES)
+            store(out + y * pitch + x, load(along + x - 1) - load(along + x) + load(above + x));
+        if (y < side - 1)
+            down(y, above);
+        else
+            memcpy(above, first, sizeof(float) * size_t(side));
+        for (int x = 0; x < side; x += LANES)
+            store(out + y * pitch + x, load(out + y * pitch + x) - load(above + x));
+    }
+}
+
+}  // namespace
+
+extern const PathSimd JOIN(path_simd_, SIMD) = {TEXT(SIMD), forward, inverse, transfer, correlate,
+                                                quiet,      divide,  blend,   shrink};

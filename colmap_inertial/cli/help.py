@@ -1,0 +1,253 @@
+"""``--help``: what a command does, its common options first, then the others by what they are about.
+
+The words are those beside the fields of the commands' classes; nothing is said twice.
+"""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import inspect
+import shutil
+import sys
+import textwrap
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+#: Words for the values of options, where the type alone says too little.
+_VALUES = {Path: "PATH", int: "N", float: "NUMBER", str: "TEXT"}
+_BY_NAME = {"device": "NAME", "remember": "NAME", "target": "TARGET", "model": "N", "keep": "PATTERN"}
+_WIDEST, _NARROWEST, _COLUMN = 100, 40, 28
+
+
+@dataclass(frozen=True, kw_only=True)
+class Option:
+    """One option or argument of a command.
+
+    Attributes
+    ----------
+    names
+        As they are typed; for an argument, its place holder.
+    group
+        What its group is called in front of its name, as ``"mapping"``; empty without one.
+    field
+        Name of the field.
+    value
+        What follows the name; empty for a switch.
+    text
+        What it does.
+    default
+        In words; empty where there is none to tell.
+    positional, required
+        Whether it is an argument, and whether it must be there.
+    source
+        The class that has it.
+    """
+
+    names: tuple[str, ...]
+    group: str
+    field: str
+    value: str
+    text: str
+    default: str
+    positional: bool
+    required: bool
+    source: type[Any]
+
+
+def options_of(cls: type[Any], prefix: str = "") -> list[Option]:
+    """All options of a command in the order of its fields, those of nested values in their places."""
+    found: list[Option] = []
+    hints, words = get_type_hints(cls, include_extras=True), _words(cls)
+    for f in dataclasses.fields(cls):
+        hint = hints[f.name]
+        kind, *settings = get_args(hint) if get_origin(hint) is Annotated else (hint,)
+        named = [setting.name for setting in settings if getattr(setting, "name", None) is not None]
+        name = named[0] if named else f.name.replace("_", "-")
+        if isinstance(kind, type) and dataclasses.is_dataclass(kind):
+            found += options_of(kind, f"{prefix}{name}." if name else prefix)
+            continue
+        positional = any("POSITIONAL" in str(setting).upper() for setting in settings)
+        default = f.default if f.default_factory is dataclasses.MISSING else f.default_factory()
+        found.append(
+            Option(
+                names=(f.name.upper(),) if positional else _names(kind, prefix, name, default),
+                group=prefix.rstrip("."),
+                field=f.name,
+                value="" if positional else _value(kind, name),
+                text=words.get(f.name, ""),
+                default=_default(default, words.get(f.name, "")),
+                positional=positional,
+                required=default is dataclasses.MISSING,
+                source=next(one for one in reversed(cls.__mro__) if f.name in vars(one).get("__annotations__", ())),
+            )
+        )
+    return found
+
+
+def _names(kind: Any, prefix: str, name: str, default: object) -> tuple[str, ...]:
+    if bool not in _kinds(kind):
+        return (f"--{prefix}{name}",)
+    both = (f"--{prefix}{name}", f"--{prefix}no-{name}")
+    return both[:1] if default is False else both
+
+
+def _kinds(kind: Any) -> tuple[Any, ...]:
+    """The types that a value may have, ``None`` left out."""
+    if get_origin(kind) in (Union, UnionType):
+        return tuple(inner for one in get_args(kind) if one is not NoneType for inner in _kinds(one))
+    return (kind,)
+
+
+def _value(kind: Any, name: str) -> str:
+    (one,) = _kinds(kind)
+    if one is bool:
+        return ""
+    if get_origin(one) is Literal:
+        return "{" + ",".join(map(str, get_args(one))) + "}"
+    if get_origin(one) is tuple:
+        inner = get_args(one)
+        single = _value(inner[0], name)
+        return f"{single} ..." if len(inner) == 2 and inner[1] is Ellipsis else " ".join([single] * len(inner))
+    return _BY_NAME.get(name, _VALUES[one])
+
+
+def _default(default: object, text: str) -> str:
+    """What counts where an option is not given; empty where its text says so, and where that is nothing."""
+    if default is dataclasses.MISSING or default is None or default == () or isinstance(default, bool):
+        return ""
+    if "default" in text.lower():
+        return ""
+    return f"{default:g}" if isinstance(default, float) else str(default)
+
+
+def _words(cls: type[Any]) -> dict[str, str]:
+    """The text below each field of a class and of those that it is made of."""
+    found: dict[str, str] = {}
+    for one in reversed(cls.__mro__):
+        if not dataclasses.is_dataclass(one):
+            continue
+        (tree,) = ast.parse(textwrap.dedent(inspect.getsource(one))).body
+        assert isinstance(tree, ast.ClassDef)
+        for field, text in zip(tree.body, tree.body[1:], strict=False):
+            match field, text:
+                case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(words))):
+                    found[name] = " ".join(words.split())
+    return found
+
+
+def print_help(
+    name: str, cls: type[Any], common: Sequence[str], titles: Mapping[type[Any], str], everywhere: type[Any]
+) -> None:
+    """Print one command's page.
+
+    Parameters
+    ----------
+    name, cls
+        The command.
+    common
+        Fields whose options come first, in this order.
+    titles
+        Of groups that have no name to type, by the class that has their options.
+    everywhere
+        The class with the options of all commands, which come last.
+    """
+    page = _Page()
+    options = options_of(cls)
+    arguments = [option for option in options if option.positional]
+    rest = [option for option in options if not option.positional]
+    page.line(f"usage: colmap-inertial {name} {' '.join(a.names[0] for a in arguments)} [OPTIONS]".replace("  ", " "))
+    for paragraph in inspect.cleandoc(cls.__doc__ or "").split("\n\n"):
+        page.paragraph(paragraph)
+    page.group("Arguments", arguments)
+    first = [o for wanted in common for o in rest if o.field == wanted and not o.group]
+    first = [o for o in rest if o.required and o not in first] + first
+    page.group("Options", first)
+    left = [option for option in rest if option not in first]
+    own = [o for o in left if not o.group and o.source not in (*titles, everywhere)]
+    page.group("Less common" if first else "Options", own)
+    for kind, title in titles.items():
+        page.group(title, [o for o in left if not o.group and o.source is kind])
+    page.group("Of every command", [o for o in left if o.source is everywhere], more=[("-h, --help", "This page.")])
+    groups = dict.fromkeys(o.group for o in left if o.group)
+    for group in sorted(groups, key=lambda group: group in _LAST):
+        page.group(_TITLES.get(group, group.capitalize()), [o for o in left if o.group == group])
+
+
+#: Titles of groups by what stands in front of their options; and those that fewest people need.
+_TITLES = {
+    "frames": "Choice of frames",
+    "apertures": "Multi-aperture cameras",
+    "exposures": "Pairs of exposures",
+    "mapping": "How COLMAP builds the model",
+    "scale": "How metres come from the IMU",
+    "dense-options": "Dense reconstruction",
+    "limits": "How large files may be",
+}
+_LAST = ("apertures", "exposures", "limits")
+
+
+def print_overview(about: str, groups: Mapping[str, Mapping[str, type[Any]]]) -> None:
+    """Print the page of all commands, by what they begin with."""
+    page = _Page()
+    page.line("usage: colmap-inertial COMMAND ... (colmap-inertial COMMAND --help explains it)")
+    for paragraph in inspect.cleandoc(about).split("\n\n"):
+        page.paragraph(paragraph)
+    for title, commands in groups.items():
+        page.heading(title)
+        for name, cls in commands.items():
+            page.entry(name, inspect.cleandoc(cls.__doc__ or "").partition("\n\n")[0])
+
+
+class _Page:
+    """Lines that fit the terminal, headings bold where it can."""
+
+    def __init__(self) -> None:
+        self._width = max(_NARROWEST, min(shutil.get_terminal_size().columns, _WIDEST))
+        self._bold = ("\033[1m", "\033[0m") if sys.stdout.isatty() else ("", "")
+
+    def line(self, text: str) -> None:
+        print(textwrap.fill(text, self._width, subsequent_indent="       ", break_on_hyphens=False))
+
+    def paragraph(self, text: str) -> None:
+        print()
+        print(textwrap.fill(" ".join(text.split()), self._width, break_on_hyphens=False, break_long_words=False))
+
+    def heading(self, text: str) -> None:
+        print(f"\n{self._bold[0]}{text}:{self._bold[1]}")
+
+    def entry(self, name: str, text: str) -> None:
+        indent = " " * _COLUMN
+        lines = textwrap.wrap(
+            " ".join(text.split()), self._width - _COLUMN, break_on_hyphens=False, break_long_words=False
+        )
+        label = f"  {name}"
+        if len(label) >= self._width:  # choices, which are many
+            print(textwrap.fill(label.replace(",", ", "), self._width, subsequent_indent=" " * 6))
+        elif len(label) >= _COLUMN:
+            print(label)
+        else:
+            print(f"{label:<{_COLUMN}}{lines.pop(0) if lines else ''}".rstrip())
+        for text_line in lines:
+            print(f"{indent}{text_line}")
+
+    def group(self, title: str, options: Iterable[Option], more: Sequence[tuple[str, str]] = ()) -> None:
+        entries = [(_label(option), _said(option)) for option in options]
+        if not entries:
+            return
+        self.heading(title)
+        for label, text in [*entries, *more]:
+            self.entry(label, text)
+
+
+def _label(option: Option) -> str:
+    return " ".join(filter(None, [", ".join(option.names), option.value]))
+
+
+def _said(option: Option) -> str:
+    marks = ["(required)"] if option.required and not option.positional else []
+    marks += [f"[{option.default}]"] if option.default else []
+    return " ".join([option.text, *marks])

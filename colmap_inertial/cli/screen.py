@@ -1,0 +1,228 @@
+"""Standard error while a command is at work: findings, bars, what is kept; lines where it is no terminal."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from colmap_inertial.cli.speech import Speaker
+from colmap_inertial.diagnose import Diagnosis
+from colmap_inertial.precalibrate.preflight import STOPPING
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.progress import Progress as Bars, TaskID
+
+_STAGES = {
+    "rendering": "Rendering",
+    "video": "Video frames",
+    "motion": "Camera motion",
+    "clocks": "Clocks",
+    "selection": "Selection",
+    "calibration": "Calibration",
+    "survey": "Small models",
+    "blur": "Blur",
+    "frames": "Frames",
+    "fusing": "Fused",
+    "features": "Features",
+    "matches": "Matches",
+    "mapping": "Mapping",
+    "images": "Images",
+    "metric": "Metric scale",
+    "validation": "Validation",
+    "apply": "Files",
+    "dense": "Dense",
+    "export": "Pictures",
+}
+SEVERITY_COLOUR = {"info": "blue", "warning": "yellow", "error": "red"}
+
+#: In a pipe, a stage that takes longer says how far it is no more often than this.
+_LINE_S = 10.0
+
+
+def clock(seconds: float) -> str:
+    """A duration as minutes and seconds, with hours where there are any."""
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes // 60}:{minutes % 60:02}:{rest:02}" if minutes >= 60 else f"{minutes}:{rest:02}"
+
+
+class Stage:
+    """How far one stage is, and how long it will take.
+
+    A stage that goes on where an earlier run was begins above zero; what that run did does not count for its speed.
+    """
+
+    def __init__(self, now_s: float, done: int, total: int, outputs: Sequence[Path] = ()) -> None:
+        self._outputs = outputs
+        self._from, self._begun_s, self._moved_s = done, now_s, now_s
+        self.done, self.total = done, total
+
+    def moved(self, now_s: float, done: int, total: int) -> None:
+        """So many steps are done."""
+        if done != self.done:
+            self._moved_s = now_s
+        self.done, self.total = done, total
+
+    def seconds(self, now_s: float) -> float:
+        """How long it has been at work."""
+        return now_s - self._begun_s
+
+    def left_s(self, now_s: float) -> float | None:
+        """How long it will take at the speed so far; ``None`` before there is one, and where the end is unknown."""
+        if self.done <= self._from or not self.total:
+            return None
+        each_s = (self._moved_s - self._begun_s) / (self.done - self._from)
+        return max(0.0, (self.total - self.done) * each_s - (now_s - self._moved_s))
+
+    def count(self) -> str:
+        """Steps done, and of how many; before the first one is done, what has been written."""
+        counted = f"{self.done}/{self.total}" if self.total else ""
+        written = sum(_size(path) for path in self._outputs) if self.done <= self._from else 0
+        return f"{counted} ({written / 1e6:.0f} MB)" if counted and written > 1e6 else counted
+
+    def ends_in(self, now_s: float) -> str:
+        """The same in words; empty at its end."""
+        if self.total and self.done >= self.total:
+            return ""
+        left_s = self.left_s(now_s)
+        return "" if left_s is None else f"{clock(left_s)} left"
+
+
+def _size(path: Path) -> int:
+    """Bytes of a file, and of the log that SQLite keeps beside a database."""
+    size = 0
+    for file in (path, path.with_name(f"{path.name}-wal")):
+        with contextlib.suppress(OSError):
+            size += file.stat().st_size if file.is_file() else 0
+    return size
+
+
+class Screen:
+    """What is seen of a command at work."""
+
+    def __init__(self, console: Console, bars: Bars, now: Callable[[], float] = time.monotonic) -> None:
+        self._console, self._bars, self._now = console, bars, now
+        self._tasks: dict[str, TaskID] = {}
+        self._stages: dict[str, Stage] = {}
+        self._said_s: dict[str, float] = {}
+        self._ended: set[str] = set()
+        self._outputs: dict[str, Sequence[Path]] = {}
+        self._kept: list[str] = []
+        self._worked = False
+
+    @property
+    def unchanged(self) -> bool:
+        """Whether all steps were kept from an earlier run."""
+        return not self._worked
+
+    def __call__(self, stage: str, done: int, total: int, /) -> None:
+        """Show how far a stage is."""
+        now = self._now()
+        if stage not in self._stages:
+            self._say_kept()
+            self._stages[stage] = Stage(now, done, total, self._outputs.get(stage, ()))
+            self._tasks[stage] = self._bars.add_task(_named(stage), total=None, stage=self._stages[stage])
+            self._line(f"{_named(stage)} ...")
+            self._said_s[stage] = now
+        known = self._stages[stage]
+        known.moved(now, done, total)
+        self._bars.update(self._tasks[stage], completed=done, total=total if done else None)
+        if stage in self._ended or now - self._said_s[stage] < _LINE_S:
+            return
+        self._said_s[stage] = now
+        if total and done >= total:
+            self._ended.add(stage)
+            self._line(f"{_named(stage)} {done}/{total}, took {clock(known.seconds(now))}")
+        else:
+            counted = f"{done}/{total}" if total else f"{done}"
+            self._line(", ".join(filter(None, [f"{_named(stage)} {counted}", known.ends_in(now)])))
+
+    def kept(self, step: str, /) -> None:
+        """A step of an earlier run stands."""
+        self._kept.append(step)
+
+    def began(self, step: str, outputs: Sequence[Path], /) -> None:
+        """A step begins."""
+        self._worked = True
+        self._outputs[step] = tuple(outputs)
+        self._say_kept()
+
+    def _say_kept(self) -> None:
+        if self._kept:
+            names = ", ".join(_named(stage).lower() for stage in self._kept)
+            self._kept.clear()
+            self._console.print(f"kept from the earlier run: {names}", soft_wrap=not self._console.is_terminal)
+
+    def _line(self, text: str) -> None:
+        if not self._console.is_terminal:
+            self._console.print(text, soft_wrap=True, highlight=False)
+
+    def findings(self, diagnosis: Diagnosis, *, stops: bool = False) -> None:
+        """Say what was found before the work: errors and warnings; above the bars, and whole lines in a pipe.
+
+        Parameters
+        ----------
+        diagnosis
+            What was found.
+        stops
+            Whether a finding that makes metres meaningless ends the run: the first one is then left to the error that
+            says so.
+        """
+        from rich.text import Text
+
+        found = [finding for finding in diagnosis.findings if finding.severity != "info"]
+        stopping = next((finding for finding in found if stops and finding.code in STOPPING), None)
+        for finding in found:
+            if finding is stopping:
+                continue
+            severity = (f"{finding.severity}: ", f"bold {SEVERITY_COLOUR[finding.severity]}")
+            said = Text.assemble(severity, f"{finding.evidence}; {finding.advice}", (f" ({finding.code})", "dim"))
+            self._console.print(said, soft_wrap=not self._console.is_terminal)
+        if diagnosis.worst == "error" and stopping is None:
+            self._console.print("an error makes a scale wrong or impossible; Ctrl-C ends the run")
+
+
+def _named(stage: str) -> str:
+    return _STAGES.get(stage, stage.replace("_", " ").capitalize())
+
+
+@contextlib.contextmanager
+def live_progress(speaker: Speaker) -> Iterator[Screen]:
+    """The screen of a command that takes a while."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress as Bars, ProgressColumn, SpinnerColumn, Task, TextColumn
+    from rich.text import Text
+
+    class Count(ProgressColumn):
+        """Steps done, and of how many."""
+
+        def render(self, task: Task) -> Text:
+            stage: Stage = task.fields["stage"]
+            return Text(stage.count(), "progress.download")
+
+    class Clock(ProgressColumn):
+        """How long a stage has been at work, and how long it will be."""
+
+        def render(self, task: Task) -> Text:
+            stage: Stage = task.fields["stage"]
+            seconds = task.finished_time if task.finished_time is not None else task.elapsed
+            left = "" if task.finished else stage.ends_in(time.monotonic())
+            return Text.assemble("clock ", (clock(seconds or 0.0), "progress.elapsed"), f", {left}" if left else "")
+
+    console = Console(stderr=True, quiet=speaker.quiet)
+    columns: tuple[Any, ...] = (
+        SpinnerColumn(finished_text=" "),
+        TextColumn("{task.description:<13}"),
+        BarColumn(bar_width=24),
+        Count(),
+        Clock(),
+    )
+    # the log goes line by line beside no bars
+    shown = console.is_terminal and not speaker.quiet and not speaker.verbose
+    bars = Bars(*columns, console=console, disable=not shown)
+    with bars if shown else contextlib.nullcontext():  # rich before 14.3 ends hidden bars with a newline
+        screen = Screen(console, bars)
+        yield screen

@@ -1,0 +1,121 @@
+"""What every command says and how: words for people, JSON for scripts, nothing, or all of the log."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from colmap_inertial.options import ReadLimits
+
+#: ``--json -``.
+_STANDARD_OUTPUT = Path("-")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Speaker:
+    """The options that all commands have. Errors go to standard error, whatever they say."""
+
+    json: Path | None = None
+    """Also write the result as JSON there; - is standard output, which then holds nothing else."""
+    quiet: bool = False
+    """Say nothing but errors: no progress, no findings, no result."""
+    verbose: bool = False
+    """Also print the log."""
+
+    def __post_init__(self) -> None:
+        if self.quiet and self.verbose:
+            raise ValueError("give one of --quiet and --verbose")
+
+    @property
+    def answers_in_json(self) -> bool:
+        """Whether standard output is for a program."""
+        return self.json == _STANDARD_OUTPUT
+
+    @property
+    def talks(self) -> bool:
+        """Whether standard output is for a person."""
+        return not self.quiet and not self.answers_in_json
+
+    @property
+    def json_file(self) -> Path | None:
+        """The file that the result is wanted in."""
+        return None if self.answers_in_json else self.json
+
+    def check_json(self, *inputs: Path | None) -> None:
+        """Refuse, before the work, a file for the JSON that is an input or not of ours."""
+        from colmap_inertial.drivers.sources import check_output
+
+        if self.json_file is not None:
+            check_output(self.json_file, inputs)
+
+    def tell(self, show: Callable[[], None], content: Mapping[str, Any], *, written: bool = False) -> None:
+        """Say how it ended.
+
+        Parameters
+        ----------
+        show
+            Prints it for a person.
+        content
+            The same for a program.
+        written
+            Whether the file that ``--json`` names has been written already.
+        """
+        if self.talks:
+            show()
+        if self.answers_in_json:
+            print_json(content)
+        elif self.json is not None and not written:
+            from colmap_inertial.io.files import write_json
+
+            write_json(self.json, content)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reader(Speaker):
+    """What commands without options of a reconstruction have besides."""
+
+    limits: ReadLimits = field(default_factory=ReadLimits)
+    """How large a file may be that is read."""
+
+
+def print_json(content: Mapping[str, Any]) -> None:
+    """Print one JSON object."""
+    from colmap_inertial.io.files import as_plain
+
+    print(json.dumps(as_plain(content), indent=1, allow_nan=False))
+
+
+class _StandardError(logging.StreamHandler[Any]):
+    """Writes to whatever standard error is at that time, which a bar may have taken over."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s", "%H:%M:%S"))
+
+    @property
+    def stream(self) -> Any:
+        return sys.stderr
+
+    @stream.setter
+    def stream(self, _: Any) -> None:
+        """What the parent class wants to keep."""
+
+
+@contextlib.contextmanager
+def log_on_terminal() -> Iterator[None]:
+    """This package's log on standard error."""
+    logger = logging.getLogger("colmap_inertial")
+    handler, level = _StandardError(), logger.level
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
+        logger.removeHandler(handler)

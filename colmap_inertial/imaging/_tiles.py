@@ -1,0 +1,104 @@
+"""How an image is divided for filters in the Fourier domain: overlapping tiles with one path of blur each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.imaging.blur_path import BlurPath
+from colmap_inertial.types import Array
+
+#: Parts of a tile's side: a margin that is left out, since the filter has less than all of the blur there, and a ramp
+#: over which neighbours are blended. What is left of the side between the ramps is flat.
+_MARGIN, _RAMP = 48 / 256, 64 / 256
+#: With shorter blur, tiles need less of both.
+_SHORT_MARGIN, _SHORT_RAMP = 40 / 256, 48 / 256
+#: Up to so many px of blur, tiles of the shortest side are laid out for short blur; above, for long blur. A side is at
+#: least so many times as long as the blur.
+SHORT_BLUR_PX, _SIDES = 25.0, 5.0
+_SHORTEST_SIDE, _LONGEST_SIDE = 256, 2048
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tiling:
+    """Squares that cover an image and more: the first begins before its corner.
+
+    Attributes
+    ----------
+    width, height
+        Size of the image, px.
+    side
+        Of a tile, px, a power of two.
+    margin
+        That the result leaves out at each of a tile's borders; the input fades to nothing over it.
+    ramp
+        Over which neighbours are blended.
+    """
+
+    width: int
+    height: int
+    side: int
+    margin: int
+    ramp: int
+
+    @classmethod
+    def covering(cls, width: int, height: int, extent_px: float) -> Tiling:
+        """For an image with blur of at most this length."""
+        side = _SHORTEST_SIDE
+        while side < _SIDES * extent_px and side < _LONGEST_SIDE:
+            side *= 2
+        short = extent_px <= SHORT_BLUR_PX
+        margin, ramp = (_SHORT_MARGIN, _SHORT_RAMP) if short else (_MARGIN, _RAMP)
+        return cls(width=width, height=height, side=side, margin=int(margin * side), ramp=int(ramp * side))
+
+    @property
+    def hop(self) -> int:
+        """Distance between neighbours."""
+        return self.side - 2 * self.margin - self.ramp
+
+    @property
+    def before(self) -> int:
+        """How far the first tile begins before the image."""
+        return self.margin + self.ramp
+
+    @property
+    def count(self) -> tuple[int, int]:
+        """Rows and columns of tiles: the flat part of the last ones reaches the image's end."""
+        flat = self.hop - self.ramp
+        rows, columns = (max(0, -(-(n - flat) // self.hop)) + 1 for n in (self.height, self.width))
+        return rows, columns
+
+    def paths(self, path: BlurPath) -> NDArray[np.float32]:
+        """(Ty, Tx, S, 2) the path in the middle of each tile, or at the image's border where that lies beyond."""
+        middles = (
+            np.clip(self.hop * np.arange(n) - self.before + self.side / 2 - 0.5, 0, size - 1)
+            for n, size in zip(self.count, (self.height, self.width), strict=True)
+        )
+        return np.ascontiguousarray(path.at(*middles), dtype=np.float32)
+
+    def window_in(self) -> NDArray[np.float32]:
+        """(side,) by which rows and columns of a tile are multiplied before it is transformed."""
+        rise = np.sin(0.5 * np.pi * (np.arange(self.margin) + 0.5) / self.margin) ** 2
+        return self._mirrored(np.concatenate([rise, np.ones(self.side // 2 - self.margin)]))
+
+    def window_out(self) -> NDArray[np.float32]:
+        """(side,) shares of a tile in the result; those of neighbours add up to one."""
+        rise = np.sin(0.5 * np.pi * (np.arange(self.ramp) + 0.5) / self.ramp) ** 2
+        flat = np.ones(self.side // 2 - self.margin - self.ramp)
+        return self._mirrored(np.concatenate([np.zeros(self.margin), rise, flat]))
+
+    def sources(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """Rows and columns of the image that those of the tiled area show: mirrored about its border pixels."""
+        out = []
+        for n, size in zip(self.count, (self.height, self.width), strict=True):
+            at = np.abs(np.arange((n - 1) * self.hop + self.side) - self.before)
+            period = max(1, 2 * (size - 1))
+            at = at % period
+            out.append(np.minimum(at, period - at).astype(np.int32) if size > 1 else np.zeros(len(at), np.int32))
+        return out[0], out[1]
+
+    @staticmethod
+    def _mirrored(half: Array) -> NDArray[np.float32]:
+        return np.concatenate([half, half[::-1]]).astype(np.float32)

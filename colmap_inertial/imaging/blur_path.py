@@ -1,0 +1,94 @@
+"""Motion blur of an image as the curve that each pixel smears along."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.imaging._bilinear import bilinear
+from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.types import Array
+
+#: Samples of the exposure; of longer blur, one for each so many pixels.
+SAMPLES, SAMPLE_PX = 17, 2.0
+#: A path that leaves its chord by less than this is taken as straight.
+STRAIGHT_BELOW_PX = 0.5
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BlurPath:
+    """Where the light that a pixel gathered while it was exposed stands in the sharp picture.
+
+    The blurred picture is ``g(x) = mean over k of L(x + q_k(x))``, ``L`` the sharp picture of the same shutter. The
+    path q has a sign and a middle of its own: reversed in time it is another one where it is curved.
+
+    Attributes
+    ----------
+    width, height
+        Size of the image, px.
+    step_px
+        Distance of the nodes, which lie as those of a `BlurField`; between them the path is bilinear.
+    path_px
+        (S, Gy, Gx, 2) float32 q (x, y) at the middles of S equal parts of the exposure, px.
+    """
+
+    width: int
+    height: int
+    path_px: np.ndarray[tuple[int, int, int, int], np.dtype[np.float32]]
+    step_px: int = 64
+
+    def __post_init__(self) -> None:
+        if self.width <= 0 or self.height <= 0 or self.step_px <= 0:
+            raise ValueError("width, height and step_px must be positive")
+        path = np.array(self.path_px, dtype=np.float32)
+        nodes = BlurField.nodes(self.width, self.height, self.step_px)
+        if path.ndim != 4 or len(path) < 2 or path.shape[1:] != (*nodes, 2):
+            raise ValueError(f"path_px: shape {path.shape}, expected (2 or more, {nodes[0]}, {nodes[1]}, 2)")
+        if not np.isfinite(path).all():
+            raise ValueError("path_px: must be finite")
+        path.setflags(write=False)
+        object.__setattr__(self, "path_px", path)
+
+    @classmethod
+    def straight(cls, field: BlurField) -> BlurPath:
+        """Along the centred lines of a field."""
+        samples = samples_for(float(field.extent_px().max(initial=0)))
+        path = (middles(samples)[:, None, None, None] * field.vector_px).astype(np.float32)
+        return cls(width=field.width, height=field.height, step_px=field.step_px, path_px=path)
+
+    def field(self) -> BlurField:
+        """The chords: ends of the paths minus their beginnings."""
+        samples = len(self.path_px)
+        chord = (self.path_px[-1] - self.path_px[0]) * np.float32(samples / (samples - 1))
+        return BlurField(width=self.width, height=self.height, step_px=self.step_px, vector_px=chord)
+
+    def departure_px(self) -> float:
+        """How far a path leaves a line along its chord at the most, anywhere in the image."""
+        path = self.path_px - self.path_px.mean(axis=0)
+        chord = self.field().vector_px
+        line = middles(len(path))[:, None, None, None] * chord
+        return float(np.hypot(*np.moveaxis(path - line, -1, 0)).max())
+
+    def extent_px(self) -> float:
+        """The longest way that a path covers along x or y or in all, anywhere in the image."""
+        samples = len(self.path_px)
+        span = np.ptp(self.path_px, axis=0) * samples / (samples - 1)
+        return float(np.hypot(span[..., 0], span[..., 1]).max())
+
+    def at(self, rows_px: NDArray[Any], columns_px: NDArray[Any]) -> Array:
+        """(R, C, S, 2) the path at the crossings of rows and columns of pixels, between them, too."""
+        nodes = np.moveaxis(self.path_px, 0, 2).astype(np.float64)
+        return bilinear(nodes, np.asarray(rows_px) / self.step_px, np.asarray(columns_px) / self.step_px)
+
+
+def samples_for(extent_px: float) -> int:
+    """How many samples of the exposure blur of this length takes."""
+    return max(SAMPLES, int(np.ceil(extent_px / SAMPLE_PX)))
+
+
+def middles(samples: int) -> Array:
+    """(S,) the middles of equal parts of an exposure that lasts from -1/2 to 1/2."""
+    return (np.arange(samples) + 0.5) / samples - 0.5

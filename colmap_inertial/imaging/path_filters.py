@@ -1,0 +1,227 @@
+"""Deconvolution of motion blur along curved paths, in tiles by Fourier transforms.
+
+Two filters: Wiener's with the spectrum of natural images, and one that expects gradients to be few and strong
+(half-quadratic splitting with a hyper-Laplacian prior; Krishnan and Fergus, "Fast image deconvolution using
+hyper-Laplacian priors", 2009).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.imaging._cells import Cells
+from colmap_inertial.imaging._tiles import Tiling
+from colmap_inertial.imaging.blur_path import BlurPath
+from colmap_inertial.imaging.transfer import ENCODE_STEPS, decode_table, encode_table, srgb_from_linear
+from colmap_inertial.imaging.wiener import LONGEST_PX, DeblurOptions, saturated_code
+from colmap_inertial.types import Array
+
+Code = TypeVar("Code", np.uint8, np.uint16)
+
+#: Noise counts so many times: for JPEG's errors, and for paths that change within a tile.
+NOISE_FACTOR = 8.0
+#: Cycles per pixel below which the spectrum of natural images, 1 / f^2, is flat, and between which it is fitted.
+FLAT_BELOW, FITTED = 0.01, (0.02, 0.3)
+#: Least share of the noise that a tile's spectrum has at one cycle per pixel, and least noise, of full scale.
+LEAST_SIGNAL, LEAST_NOISE = 0.002, 1e-3
+#: Frequencies at which a tile shows its noise: this high, and left with no more than this share by the blur. So many
+#: must do so. Of many tiles, about so many are looked at.
+NOISE_ABOVE, NOISE_SHARE, _NOISE_COUNT, _NOISE_TILES = 0.2, 0.08, 200, 20
+#: Weight of the data against gradients to the power 2/3 where noise is 1 % of full scale; those of the splitting.
+DATA_WEIGHT, SPLITTING = 1000.0, (8.0, 32.0, 128.0)
+
+
+def path_wiener(image: NDArray[Code], path: BlurPath, options: DeblurOptions | None = None) -> NDArray[Code]:
+    """Undo motion blur along a path by Wiener's filter.
+
+    Parameters
+    ----------
+    image
+        (H, W) or (H, W, channels), uint8 or uint16, sRGB.
+    path
+        Of the image's size.
+    options
+        Defaults serve.
+
+    Returns
+    -------
+    A new image of the same shape and type. Pixels whose blur is below half a pixel, and those near a clipped lamp or
+    glint (two blur lengths), are the input's, bit for bit.
+
+    Notes
+    -----
+    In linear light, in tiles of 256 px or more that overlap: ``W = conj(K) S / (|K|^2 S + c n)``, K the mean of
+    ``exp(2 pi i f q)`` over the path q in the middle of the tile, ``S = A / (f^2 + .01^2)`` the spectrum of natural
+    images, A fitted to the tile, n the variance of the noise at the tile's light, `NOISE_FACTOR` times. Compiled;
+    other Python threads go on while it runs. The plain version is `tests/references/path_filters.py`.
+
+    Raises
+    ------
+    ValueError
+        Where the image is of another type, the path of another size, or longer than `LONGEST_PX`.
+    """
+    return _filtered(image, path, options or DeblurOptions(), ())
+
+
+def half_quadratic(image: NDArray[Code], path: BlurPath, options: DeblurOptions | None = None) -> NDArray[Code]:
+    """Undo motion blur along a path, expecting few and strong gradients; all else as :func:`path_wiener`.
+
+    Wiener's result is the first guess. In turn, what its gradients w should be is found by minimising
+    ``|w|^(2/3) + b / 2 (w - gradient)^2``, and the picture that has these gradients and, blurred, is the one seen;
+    b grows (`SPLITTING`).
+    """
+    return _filtered(image, path, options or DeblurOptions(), SPLITTING)
+
+
+def smoothed(image: NDArray[Code], sigma_px: float) -> NDArray[Code]:
+    """An image smoothed by a Gaussian in linear light, as feature extraction likes it after a filter."""
+    import cv2
+
+    light = np.asarray(cv2.GaussianBlur(_light(image), (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT_101))
+    if image.dtype == np.uint8:  # the table is fine enough for 256 codes
+        codes = encode_table(image.dtype)[np.rint(light * np.float32(ENCODE_STEPS)).astype(np.intp)]
+    else:
+        codes = np.iinfo(image.dtype).max * srgb_from_linear(light.astype(np.float64)).astype(np.float32)
+    return np.rint(codes).astype(image.dtype)
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Variance of an image's noise in linear light, full scale = 1, as a line over the light."""
+
+    dark: float
+    by_light: float
+
+    @classmethod
+    def fitted(cls, found: Array) -> Noise:
+        """To the light and the variance of (N, 2) tiles, some of which show more than noise: by least distances."""
+        if not len(found):
+            return cls(LEAST_NOISE**2, 0.0)
+        light, variance = found.T
+        weight = np.ones(len(found))
+        dark, by_light = 0.0, 0.0
+        for _ in range(10):
+            mean_light, mean_variance = np.average(light, weights=weight), np.average(variance, weights=weight)
+            spread = np.average((light - mean_light) ** 2, weights=weight)
+            slope = np.average((light - mean_light) * (variance - mean_variance), weights=weight) / max(spread, 1e-12)
+            by_light = float(np.clip(slope, 0, mean_variance / max(mean_light, 1e-12)))
+            dark = float(mean_variance - by_light * mean_light)
+            weight = 1 / np.maximum(np.abs(variance - dark - by_light * light), 0.1 * mean_variance + 1e-12)
+        return cls(dark, by_light)
+
+
+def noise_along(
+    light: NDArray[np.float32], tiling: Tiling, paths: NDArray[np.float32], threads: int = 0
+) -> tuple[Noise, ...]:
+    """Of each channel of (H, W, C) linear light: what shows at frequencies that the blur leaves nothing of.
+
+    So the errors of compression count, and those of the path.
+    """
+    from colmap_inertial._kernels import _path
+
+    found = _path.noise(
+        light,
+        paths=paths,
+        window_in=tiling.window_in(),
+        hop=tiling.hop,
+        before=tiling.before,
+        above=NOISE_ABOVE,
+        share=NOISE_SHARE,
+        every=max(1, round((tiling.count[0] * tiling.count[1] / _NOISE_TILES) ** 0.5)),
+        threads=threads,
+    )
+    channels = np.reshape(found, (light.shape[2], -1, 3))
+    return tuple(Noise.fitted(tiles[tiles[:, 2] >= _NOISE_COUNT, :2]) for tiles in channels)
+
+
+def filter_along(
+    light: NDArray[np.float32],
+    tiling: Tiling,
+    paths: NDArray[np.float32],
+    noise: Sequence[Noise],
+    splitting: Sequence[float],
+    *,
+    threads: int = 0,
+    instruction_set: str = "",
+) -> NDArray[np.float32]:
+    """(H, W, C) linear light without blur; without splitting, by Wiener's filter."""
+    from colmap_inertial._kernels import _path
+
+    result = np.empty_like(light)
+    _path.filter(
+        light,
+        result,
+        paths=paths,
+        window_in=tiling.window_in(),
+        window_out=tiling.window_out(),
+        hop=tiling.hop,
+        before=tiling.before,
+        noise=np.array([[n.dark, n.by_light] for n in noise], dtype=np.float32),
+        least_noise=LEAST_NOISE,
+        noise_factor=NOISE_FACTOR,
+        flat_below=FLAT_BELOW,
+        fitted_from=FITTED[0],
+        fitted_to=FITTED[1],
+        least_signal=LEAST_SIGNAL,
+        data_weight=DATA_WEIGHT,
+        splitting=np.array(splitting, dtype=np.float32),
+        threads=threads,
+        instruction_set=instruction_set,
+    )
+    return result
+
+
+def _light(image: NDArray[Any]) -> NDArray[np.float32]:
+    """Linear light of codes."""
+    if image.dtype == np.uint8:
+        import cv2
+
+        return np.asarray(cv2.LUT(image, decode_table(image.dtype)), dtype=np.float32)
+    return decode_table(image.dtype)[image]
+
+
+def _filtered(
+    image: NDArray[Code], path: BlurPath, options: DeblurOptions, splitting: Sequence[float]
+) -> NDArray[Code]:
+    from colmap_inertial._kernels import _wiener
+
+    if image.dtype not in (np.uint8, np.uint16) or image.ndim not in (2, 3) or 0 in image.shape:
+        raise ValueError(f"image: (H, W) or (H, W, channels) of uint8 or uint16, not {image.shape} of {image.dtype}")
+    height, width = image.shape[:2]
+    if (height, width) != (path.height, path.width):
+        raise ValueError(f"path: for {path.width} x {path.height} px, the image has {width} x {height}")
+    extent_px = path.extent_px()
+    if extent_px > LONGEST_PX:
+        raise ValueError(f"path: {extent_px:.0f} px long; at most {LONGEST_PX:.0f} can be undone")
+    threads = options.threads or 0
+    tiling = Tiling.covering(width, height, extent_px)
+    paths = tiling.paths(path)
+    planes = np.ascontiguousarray(image).reshape(height, width, -1)
+    light = _light(planes).reshape(planes.shape)
+    channels = planes.shape[2]
+    if options.noise is None:
+        noise = noise_along(light, tiling, paths, threads)
+    else:
+        noise = (Noise(options.noise**2, 0.0),) * channels
+    sharp = filter_along(light, tiling, paths, noise, splitting, threads=threads)
+    cells = Cells.of(path.field())
+    result = np.empty_like(planes)
+    _wiener.blend(
+        planes,
+        sharp,
+        result,
+        extent_px=cells.extent_px,
+        slope=cells.slope,
+        along_y=cells.along_y,
+        fade=cells.fade,
+        decode=decode_table(image.dtype),
+        encode=encode_table(image.dtype),
+        saturated=saturated_code(image.dtype),
+        threads=threads,
+    )
+    return result.reshape(image.shape)

@@ -1,0 +1,101 @@
+"""phyphox: what its "Export data" writes as CSV, a zip or the folder in it, with one table for each sensor.
+
+``Gyroscope.csv`` and ``Accelerometer.csv`` have ``Time (s)`` and columns such as ``Gyroscope x (rad/s)`` and
+``Acceleration x (m/s^2)``, on one clock that starts with the experiment. ``Linear Acceleration`` is without gravity.
+Delimiters and the decimal sign are as chosen when exporting (phyphox.org). The sign is Android's.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.errors import FormatError
+from colmap_inertial.io.imu_text import ordered, recording
+from colmap_inertial.io.samples import Samples
+from colmap_inertial.io.tables import Table, parse_table
+from colmap_inertial.io.units import DeclaredUnits
+from colmap_inertial.io.zipped import head_of, members_of, text_of
+from colmap_inertial.types import ImuRecording
+
+#: A line of the header of a table of phyphox, and of what sensor it is.
+_TIME = re.compile(r'^"?Time \(s\)"?', re.IGNORECASE)
+_GYRO, _ACCEL = r"gyroscope {} \(rad/s\)", r"acceleration {} \(m/s(\^2|²)\)"
+
+
+def is_phyphox(path: Path) -> bool:
+    """Whether ``path`` is an export of phyphox with a gyroscope: its tables begin with a time in seconds, named so."""
+    members = members_of(path)
+    return any(_kind(head_of(path, members[name])) == "gyro" for name in sorted(members) if _may_be(name))
+
+
+def read_phyphox(path: Path, units: DeclaredUnits) -> ImuRecording:
+    """Read an export of phyphox; the accelerometer may be missing.
+
+    Raises
+    ------
+    FormatError
+        Where there is no gyroscope, or an accelerometer without gravity alone.
+    """
+    members = members_of(path)
+    found: dict[str, Samples] = {}
+    linear = False
+    for name in sorted(members):
+        if not _may_be(name):
+            continue
+        kind = _kind(head_of(path, members[name]))
+        linear = linear or kind == "linear"
+        if kind == "gyro" and "gyro" not in found:
+            found["gyro"] = _samples(path, members[name], name, "gyro", _GYRO, units.gyro or "rad/s")
+        elif kind == "accel" and "accel" not in found:
+            found["accel"] = _samples(path, members[name], name, "accel", _ACCEL, units.accel or "m/s2")
+    if "gyro" not in found:
+        raise FormatError(path, "holds no gyroscope of phyphox; record Gyroscope (and Accelerometer) in one experiment")
+    if "accel" not in found and linear:
+        raise FormatError(
+            path, "its Linear Acceleration is without gravity; record Accelerometer (acceleration with g) instead"
+        )
+    return recording(found["gyro"], found.get("accel"), device="phyphox")
+
+
+def _may_be(name: str) -> bool:
+    """Whether a table may hold samples: those in meta/ describe the experiment."""
+    return name.lower() not in ("device.csv", "time.csv")
+
+
+def _kind(header: str) -> str | None:
+    header = header.lower()
+    if not _TIME.match(header):
+        return None
+    if re.search(_GYRO.format("x"), header):
+        return "gyro"
+    if re.search(_ACCEL.format("x"), header):
+        return "linear" if "linear acceleration" in header else "accel"
+    return None
+
+
+def _samples(path: Path, member: str, name: str, quantity: str, pattern: str, unit: str) -> Samples:
+    text = text_of(path, member)
+    if _decimal_comma(text):
+        text = text.replace(",", ".")
+    table = parse_table(path / name if path.is_dir() else path, text)
+    columns = [_column(table, pattern.format(axis)) for axis in "xyz"]
+    values: NDArray[np.float64] = table.numbers(columns)
+    t_ns = table.stamps_ns(_column(table, r"time \(s\)"), "s")
+    return ordered(table, "gyro" if quantity == "gyro" else "accel", unit, t_ns, values)
+
+
+def _decimal_comma(text: str) -> bool:
+    """Whether numbers have a comma: then columns are apart by a semicolon or a tab."""
+    header, _, rest = text.partition("\n")
+    return (";" in header or "\t" in header) and "," in rest.partition("\n")[0]
+
+
+def _column(table: Table, pattern: str) -> int:
+    for place, cell in enumerate(table.header or ()):
+        if re.fullmatch(pattern, cell.strip().lower()):
+            return place
+    raise FormatError(table.path, f"has no column like {pattern!r}; the header is: {table.header_text[:200]}")

@@ -1,0 +1,68 @@
+"""Positions of a satellite receiver that a capture carries: in its video's telemetry, or in its pictures."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from colmap_inertial.errors import FormatError
+from colmap_inertial.io.camm import is_camm, read_camm_positions
+from colmap_inertial.io.exif import HEAD_BYTES, position_of
+from colmap_inertial.io.files import read_bytes
+from colmap_inertial.io.gopro import is_gopro, read_gopro_positions
+from colmap_inertial.io.names import path_in
+from colmap_inertial.types import PositionFixes
+
+
+def positions_in_video(video: Path) -> PositionFixes:
+    """Positions in a video's telemetry, on the video's clock.
+
+    Raises
+    ------
+    FormatError
+        Where there are none, or the file is damaged.
+    """
+    found = None
+    if is_gopro(video):
+        found = read_gopro_positions(video)
+    elif is_camm(video):
+        found = read_camm_positions(video)
+    if found is None:
+        raise FormatError(
+            video,
+            "its telemetry holds no positions (GPS5 or GPS9 of GoPro with a fix, or CAMM): nothing to georeference by",
+        )
+    return found
+
+
+def positions_in_pictures(folder: Path, names: Sequence[str]) -> PositionFixes:
+    """Positions in the EXIF of pictures; those without one are left out.
+
+    Raises
+    ------
+    FormatError
+        Where none has a position, or a picture is missing.
+    """
+    rows, named = [], []
+    for name in names:
+        path = path_in(folder, name)
+        if (found := position_of(read_bytes(path, HEAD_BYTES, what="picture"))) is not None:
+            rows.append(found)
+            named.append(name)
+    if not rows:
+        raise FormatError(
+            folder, f"none of its {len(names)} pictures has a position in its EXIF: nothing to georeference by"
+        )
+    latitude, longitude, height, sigma = np.array([row[:4] for row in rows]).T
+    return PositionFixes(
+        latitude_deg=latitude,
+        longitude_deg=longitude,
+        height_m=height,
+        sigma_m=sigma,
+        names=tuple(named),
+        height_above=Counter(row[4] for row in rows).most_common(1)[0][0],
+        source=f"EXIF of {len(named)} of {len(names)} pictures",
+    )

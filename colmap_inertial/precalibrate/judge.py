@@ -1,0 +1,151 @@
+"""What some of the frames say of the gyroscope, before any is treated."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence, detail_fall
+from colmap_inertial.imaging.gate import MUST_SHOW_PX, FrameDecision, GateOptions, RecordingVerdict, judge_recording
+from colmap_inertial.imaging.parallax import Parallax
+from colmap_inertial.imaging.psf import blur_field
+from colmap_inertial.io.capture import Capture
+from colmap_inertial.model import colmap_camera
+from colmap_inertial.precalibrate.calibrate import some_frames
+from colmap_inertial.run.progress import Progress
+from colmap_inertial.stages.gyro_view import GyroView
+
+#: A gyroscope that is borne out by this share of them is trusted for all frames.
+_MOST_OF_THEM = 0.95
+#: A frame whose dip is faint bears the gyroscope out, too, where it has so much less detail along the blur than across
+#: it (logarithm of the power), and no other direction shows a dip this deep.
+_CLEAR_FALL, _OTHER_SUPPORT = -0.6, 4.0
+#: Where the pictures do not bear the gyroscope out, exposure times may be wrong by a common factor; these are tried.
+#: Twice the blur shows a dip, too, where the right one shows a deeper one.
+_EXPOSURE_FACTORS, _EXPOSURE_SUPPORT = (0.5, 2.0), 10.0
+
+
+def judge_frames(
+    view: GyroView,
+    capture: Capture,
+    chosen: Sequence[FrameDecision],
+    parallaxes: Mapping[str, Parallax],
+    progress: Progress,
+) -> RecordingVerdict:
+    """Judge the gyroscope by some frames.
+
+    Parameters
+    ----------
+    view
+        Gyroscope, camera and times.
+    capture
+        Where the frames are.
+    chosen
+        The frames to look at, blurred ones.
+    parallaxes
+        By frame name, where the camera's translation is known to blur.
+    progress
+        Called with ``"blur"``.
+
+    Returns
+    -------
+    Whether it is trusted for all frames, or every frame must bear it out by itself. Where the pictures bear it out but
+    for exposure times that are wrong by one factor, that is corrected, and said.
+    """
+    looked = _look(view, capture, chosen, parallaxes, progress)
+    verdict = by_frame(judge_recording([one.evidence for one in looked]), looked)
+    factors: tuple[float, ...] = _EXPOSURE_FACTORS
+    if verdict.trusted is True:
+        long_blur = np.median([one.blur_px for one in looked]) >= 2 * MUST_SHOW_PX
+        factors = tuple(factor for factor in factors if factor < 1 and long_blur)
+    return _with_other_exposures(verdict, factors, view, capture, chosen, parallaxes, looked, progress)
+
+
+@dataclass(frozen=True, eq=False)
+class Looked:
+    """What one picture says: its dips, how much less detail it has along the blur, and the blur that was predicted."""
+
+    evidence: BlurEvidence
+    fall: float | None
+    blur_px: float
+
+    @property
+    def shows(self) -> bool:
+        """Whether it bears the gyroscope out."""
+        one = self.evidence
+        if not one.extent_is_plausible:
+            return False
+        other = float(one.sigmas[:, 2:-1].max())
+        faint = self.fall is not None and self.fall <= _CLEAR_FALL and other < _OTHER_SUPPORT
+        return one.support >= GateOptions().min_support or faint
+
+
+def _look(
+    view: GyroView,
+    capture: Capture,
+    chosen: Sequence[FrameDecision],
+    parallaxes: Mapping[str, Parallax],
+    progress: Progress,
+    factor: float = 1.0,
+) -> list[Looked]:
+    """What some frames say of the blur that is predicted, or of so many times as much."""
+    motion, camera, index = view.motion(), colmap_camera(view.camera), view.index()
+    blur_px = {decision.name: factor * (decision.blur_px or 0.0) for decision in chosen}
+    looked: list[Looked] = []
+    for frame in some_frames(capture, view.timing, [index[d.name] for d in chosen]):
+        progress("blur", len(looked), len(chosen))
+        blur = blur_field(motion, camera, view.shutter(index[frame.name]), parallax=parallaxes.get(frame.name))
+        if factor != 1.0:
+            blur = replace(blur, vector_px=blur.vector_px * np.float32(factor))
+        fall = detail_fall(frame.image, blur)
+        looked.append(Looked(blur_evidence(frame.image, blur), fall, blur_px[frame.name]))
+    progress("blur", len(chosen), len(chosen))
+    return looked
+
+
+def _with_other_exposures(
+    verdict: RecordingVerdict,
+    factors: Sequence[float],
+    view: GyroView,
+    capture: Capture,
+    chosen: Sequence[FrameDecision],
+    parallaxes: Mapping[str, Parallax],
+    looked: Sequence[Looked],
+    progress: Progress,
+) -> RecordingVerdict:
+    """The verdict, or where all exposure times are wrong by one factor, that of the pictures with it corrected."""
+    best, deepest = verdict, _together([one.evidence for one in looked])
+    for factor in factors:
+        others = _look(view, capture, chosen, parallaxes, progress, factor)
+        evidence = [one.evidence for one in others]
+        found, support = by_frame(judge_recording(evidence), others), _together(evidence)
+        if found.trusted is True and support >= _EXPOSURE_SUPPORT and support > deepest:
+            whole = factor * found.extent_factor
+            reason = (
+                f"the images bear out the gyroscope's blur ({support:.0f} standard deviations), but for its extent, "
+                f"which is multiplied by {whole:.2f}: the exposure times are wrong by this factor"
+            )
+            best, deepest = replace(found, extent_factor=whole, reason=reason), support
+    return best
+
+
+def _together(evidence: Sequence[BlurEvidence]) -> float:
+    return sum(evidence, BlurEvidence.nothing()).support
+
+
+def by_frame(verdict: RecordingVerdict, looked: Sequence[Looked]) -> RecordingVerdict:
+    """The verdict, unless only some of the frames bear it out: then every frame must do so by itself.
+
+    So it is where the camera moves close to things: they blur by translation, too, which no gyroscope feels.
+    """
+    telling = [one for one in looked if one.evidence.enough and one.blur_px >= MUST_SHOW_PX]
+    shown = sum(one.shows for one in telling)
+    if verdict.trusted is not True or shown >= _MOST_OF_THEM * len(telling):
+        return verdict
+    reason = (
+        f"{shown} of {len(telling)} frames that were looked at bear out the gyroscope's blur, so each frame must do so "
+        "by itself (close to things, the camera's translation blurs, too)"
+    )
+    return replace(verdict, trusted=None, reason=reason)

@@ -1,0 +1,1 @@
+"""Bundle adjustment with the IMU and the rolling shutter in it."""

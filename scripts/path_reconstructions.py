@@ -1,0 +1,66 @@
+"""Whole reconstructions of small simulated scenes by every way to undo blur, for ``bench_path.py --colmap``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, get_args
+
+import imaging_colmap
+import numpy as np
+from rich.console import Console
+
+from colmap_inertial.options import DeblurMethod, ReconstructOptions
+from colmap_inertial.simulate import SceneRecipe
+
+BLURS_PX = (10.0, 20.0)
+_FIRST_SEED = 20
+
+
+def scenes(count: int) -> dict[str, tuple[SceneRecipe, float]]:
+    """Desks about which a lively hand carries a camera with 20 ms readout, each with either blur."""
+    out = {}
+    for i in range(count):
+        seed, blur_px = _FIRST_SEED + i // len(BLURS_PX), BLURS_PX[i % len(BLURS_PX)]
+        out[f"scene {seed}, {blur_px:g} px"] = replace(imaging_colmap.lively_desk(quick=True), seed=seed), blur_px
+    return out
+
+
+def measure(
+    report: dict[str, Any], methods: Sequence[str], count: int, *, console: Console, keep: Callable[[], None]
+) -> None:
+    """Adds ``colmap``: figures of each scene as they come, then what is wanted of their medians."""
+    known = [name for name in methods if name in get_args(DeblurMethod)]
+    ways = {
+        "as filmed": ReconstructOptions(deblur="off", rolling_shutter="off"),
+        "rectified": ReconstructOptions(deblur="off"),
+        **{name: ReconstructOptions(deblur=name) for name in known},
+    }
+    found: dict[str, Any] = {}
+    report["colmap"] = {"scenes": found, "wanted": []}
+    for name, (recipe, blur_px) in scenes(count).items():
+        with console.status(f"COLMAP, {name}"):
+            found[name] = imaging_colmap.reconstructed(recipe, blur_px, ways)
+        report["colmap"]["wanted"] = [line for way in known for line in wanted(found, way)]
+        keep()
+
+
+def wanted(found: dict[str, Any], way: str) -> list[tuple[str, float, float, bool]]:
+    """Label, value, what is wanted, and whether at least."""
+    rows = [row["ways"] for row in found.values()]
+
+    def ratio(key: str, to: str) -> float:
+        return float(np.nanmedian([row[way][key] / max(row[to][key], 1e-9) for row in rows]))
+
+    # where half of the images are found untreated, all must be
+    shares = [
+        row["ways"][way]["registered"] / row["images"]
+        for row in found.values()
+        if row["ways"]["rectified"]["registered"] >= 0.5 * row["images"]
+    ]
+    return [
+        (f"{way}: camera error / as filmed", ratio("centre_error_pct", "as filmed"), 1 / 12, False),
+        (f"{way}: camera error / rectified", ratio("centre_error_pct", "rectified"), 0.8, False),
+        (f"{way}: points / rectified", ratio("points", "rectified"), 1.5, True),
+        (f"{way}: least share of images registered", min(shares, default=float("nan")), 1.0, True),
+    ]

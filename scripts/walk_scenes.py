@@ -1,0 +1,167 @@
+"""A walk around a room back to its start, filmed towards its walls, on which the same posters may hang many times."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from colmap_inertial.geometry import quat_exp, quat_from_matrix, quat_multiply
+from colmap_inertial.io.files import write_json, write_text
+from colmap_inertial.simulate import (
+    IMU_PRESETS,
+    Board,
+    Motion,
+    Quad,
+    Renderer,
+    ShutterCamera,
+    World,
+    develop,
+    draw_imu_errors,
+    render as rendering,
+    sample_imu,
+    textures,
+)
+from colmap_inertial.simulate.motion import MARGIN_S
+from colmap_inertial.types import Array, CameraModel
+
+CAMERA = ShutterCamera(
+    model=CameraModel(model="PINHOLE", width=480, height=360, params=(380.0, 380.0, 240.0, 180.0)), exposure_s=0.001
+)
+#: Half the room, and half the path, whose corners are rounded.
+HALF_M, PATH_M, HEIGHT_M = np.array([5.0, 4.0]), np.array([3.2, 2.2]), 2.6
+#: Knots of the path.
+RATE_HZ = 60.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Walk:
+    """A walk: of how many frames at which rate, how many times around, and whether posters repeat."""
+
+    seed: int
+    frames: int = 400
+    frame_rate_hz: float = 10.0
+    laps: float = 1.08
+    repeated: bool = False
+
+
+def world_of(walk: Walk) -> World:
+    """Plaster, posters and boxes; ``repeated``: every other poster is one of two, of one size, on all walls."""
+    rng = np.random.default_rng([walk.seed, 1])
+    up = np.array([0.0, 0.0, 1.0])
+    designs = [textures.poster(rng, 240, 300) for _ in range(2)]
+    quads = []
+    corners = HALF_M * np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]])
+    for wall in range(4):
+        start, end = (np.array([*corners[(wall + k) % 4], HEIGHT_M]) for k in (0, 1))
+        along = (end - start) / np.linalg.norm(end - start)
+        length = float(np.linalg.norm(end - start))
+        inwards = np.cross(along, up)
+        plaster = textures.plaster(rng, 260, round(100 * length))
+        quads.append(Quad(corner_m=start, edge_u_m=end - start, edge_v_m=-HEIGHT_M * up, texture=plaster))
+        for place in range(round(length / 1.2)):
+            same = walk.repeated and rng.random() < 0.5
+            size = np.array([0.9, 0.75]) if same else rng.uniform([0.5, 0.4], [1.1, 1.0])
+            left = (place + rng.uniform(0, 0.15)) * length / round(length / 1.2)
+            drawn = (round(300 * size[1]), round(300 * size[0]))
+            texture = designs[rng.integers(len(designs))] if same else textures.poster(rng, *drawn)
+            corner = start + left * along + rng.uniform(0.02, 0.1) * inwards - rng.uniform(0.4, 0.9) * up
+            quads.append(Quad(corner_m=corner, edge_u_m=size[0] * along, edge_v_m=-size[1] * up, texture=texture))
+            # something that stands before the wall, here and nowhere else
+            width, depth, height = rng.uniform([0.3, 0.2, 0.4], [0.8, 0.6, 1.2])
+            front = start + (left + rng.uniform(0, 0.5)) * along + depth * inwards - (HEIGHT_M - height) * up
+            for corner, edge in (
+                (front, width * along),
+                (front - depth * inwards, depth * inwards),
+                (front + width * along, -depth * inwards),
+            ):
+                face = textures.poster(rng, round(300 * height), max(8, round(300 * float(np.linalg.norm(edge)))))
+                quads.append(Quad(corner_m=corner, edge_u_m=edge, edge_v_m=-height * up, texture=face))
+    x, y = np.array([2 * HALF_M[0], 0, 0]), np.array([0, 2 * HALF_M[1], 0])
+    floor = textures.carpet(rng, 800, 1000)
+    quads.append(Quad(corner_m=np.array([-HALF_M[0], HALF_M[1], 0]), edge_u_m=x, edge_v_m=-y, texture=floor))
+    return World(quads=tuple(quads), board=Board(), board_corners_m=np.zeros((0, 3)))
+
+
+def motion_of(walk: Walk) -> Motion:
+    """Along a rounded rectangle, looking outwards and a little ahead, with a hand's sway."""
+    rng = np.random.default_rng([walk.seed, 2])
+    duration_s = walk.frames / walk.frame_rate_hz
+    count = int((duration_s + 2 * MARGIN_S) * RATE_HZ) + 33
+    t_s = -MARGIN_S - 16 / RATE_HZ + np.arange(count) / RATE_HZ
+    phase = 2 * np.pi * walk.laps * t_s / duration_s
+    # a superellipse; the camera looks along its normal
+    cosine, sine = np.cos(phase), np.sin(phase)
+    across = np.stack([np.sign(c) * np.abs(c) ** 0.5 for c in (cosine, sine)], axis=1) * PATH_M
+    smooth = np.ones(61) / 61
+    across = np.stack([np.convolve(np.pad(c, 30, mode="edge"), smooth, mode="valid") for c in across.T], axis=1)
+    sway = [sum(a * np.sin(2 * np.pi * f * t_s + p) for a, f, p in _tones(rng)) for _ in range(6)]
+    position = np.stack([across[:, 0], across[:, 1], np.full(count, 1.4)], axis=1) + 0.02 * np.stack(sway[:3], axis=1)
+    out = np.stack([cosine / PATH_M[0], sine / PATH_M[1], 0 * phase], axis=1)
+    out /= np.linalg.norm(out, axis=1, keepdims=True)
+    right = np.stack([out[:, 1], -out[:, 0], 0 * phase], axis=1)
+    looking = quat_from_matrix(np.stack([right, np.cross(out, right), out], axis=-1))
+    hand = quat_exp(0.06 * np.stack(sway[3:], axis=1))
+    return Motion(
+        start_s=float(t_s[0]),
+        step_s=1 / RATE_HZ,
+        cam_in_world_m=position,
+        world_from_cam_xyzw=quat_multiply(looking, hand),
+    )
+
+
+def _tones(rng: np.random.Generator) -> list[tuple[float, float, float]]:
+    return [(rng.uniform(0.5, 1.0), f * rng.uniform(0.9, 1.1), rng.uniform(0, 6.3)) for f in (0.3, 0.7, 1.3, 1.9)]
+
+
+def write_walk(walk: Walk, folder: Path) -> Path:
+    """The capture of a walk, unless it is there already; returns its ``capture.toml``."""
+    described = folder / "capture.toml"
+    if described.is_file():
+        return described
+    (folder / "frames").mkdir(parents=True, exist_ok=True)
+    motion, duration_s = motion_of(walk), walk.frames / walk.frame_rate_hz
+    rng = np.random.default_rng([walk.seed, 3])
+    options = IMU_PRESETS["phone"]
+    imu = sample_imu(motion, draw_imu_errors(options, duration_s, rng), options, duration_s=duration_s, rng=rng)
+    trigger_s = np.arange(walk.frames) / walk.frame_rate_hz
+    names = [f"{i:06d}.jpg" for i in range(walk.frames)]
+    for name, picture in zip(names, _pictures(walk, motion, trigger_s), strict=True):
+        cv2.imwrite(str(folder / "frames" / name), picture[..., ::-1])
+    for sensor, t_s, values in (
+        ("gyro", imu.recording.gyro_t_s, imu.recording.gyro_rad_s),
+        ("accel", imu.recording.accel_t_s, imu.recording.accel_m_s2),
+    ):
+        rows = [f"{t:.7f},{x:.6f},{y:.6f},{z:.6f}" for t, (x, y, z) in zip(t_s, values, strict=True)]
+        write_text(folder / f"{sensor}.csv", "\n".join(["t,x,y,z", *rows]) + "\n")
+    rows = [f"{name},{t:.9f}" for name, t in zip(names, trigger_s, strict=True)]
+    write_text(folder / "frames.csv", "\n".join(["name,t_s", *rows]) + "\n")
+    middle_s = np.array([CAMERA.middle_s(t) for t in trigger_s.tolist()])
+    write_json(
+        folder / "truth.json",
+        {
+            "names": names,
+            "cam_in_world_m": motion.cam_in_world_m(middle_s),
+            "world_from_cam_xyzw": motion.world_from_cam_xyzw(middle_s),
+        },
+    )
+    model = CAMERA.model
+    lines = ["[images]", 'folder = "frames"', 'times = "frames.csv"', "[timing]"]
+    lines += [f"exposure_s = {CAMERA.exposure_s!r}", "readout_s = 0.0", "[camera]", f'model = "{model.model}"']
+    lines += [f"width = {model.width}", f"height = {model.height}", f"params = {list(model.params)!r}"]
+    lines += ['pixel_origin = "corner"']
+    for sensor, unit in (("gyro", "rad/s"), ("accel", "m/s2")):
+        lines += [f"[imu.{sensor}]", f'file = "{sensor}.csv"', 'time = "t"', 'time_unit = "s"']
+        lines += ['columns = ["x", "y", "z"]', f'unit = "{unit}"']
+    write_text(described, "\n".join(lines) + "\n")
+    return described
+
+
+def _pictures(walk: Walk, motion: Motion, trigger_s: Array) -> Iterator[np.ndarray]:
+    rendering._SAMPLES = 4  # a third of the rays: it is features that count here
+    renderer = Renderer(world_of(walk))
+    for index, t_s in enumerate(trigger_s.tolist()):
+        yield develop(renderer.linear(CAMERA, motion, t_s), CAMERA, np.random.default_rng([walk.seed, 4, index]))

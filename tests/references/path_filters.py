@@ -1,0 +1,152 @@
+"""The filters along paths of blur in numpy: slow, plain, and the truth that the compiled ones are tested against."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.imaging._tiles import Tiling
+from colmap_inertial.imaging.path_filters import (
+    DATA_WEIGHT,
+    FITTED,
+    FLAT_BELOW,
+    LEAST_NOISE,
+    LEAST_SIGNAL,
+    NOISE_ABOVE,
+    NOISE_FACTOR,
+    NOISE_SHARE,
+    Noise,
+)
+from colmap_inertial.types import Array
+
+
+def filter_reference(
+    light: NDArray[np.float32], tiling: Tiling, paths: NDArray[np.float32], noise: Noise, splitting: tuple[float, ...]
+) -> Array:
+    """(H, W) linear light without blur, each tile by itself."""
+    window_out = np.outer(tiling.window_out(), tiling.window_out())
+    total = np.zeros(tuple(map(len, tiling.sources())))
+    for tile, mean, path, frequencies, window, place in tiles(light, tiling, paths):
+        variance = max(noise.dark + noise.by_light * mean, LEAST_NOISE**2)
+        total[place] += window_out * (filter_tile(tile, path, frequencies, window, variance, splitting) + mean)
+    begin = tiling.before
+    return total[begin : begin + tiling.height, begin : begin + tiling.width]
+
+
+def noise_reference(light: NDArray[np.float32], tiling: Tiling, paths: NDArray[np.float32]) -> Array:
+    """(N, 3) mean light of each tile, the variance of its noise, and how many frequencies show it."""
+    found = []
+    for tile, mean, path, frequencies, window, _ in tiles(light, tiling, paths):
+        shows = frequencies.square > NOISE_ABOVE**2
+        shows &= np.abs(transfer_of(path, frequencies)) < NOISE_SHARE
+        power = np.abs(np.fft.rfft2(tile)) ** 2 / np.sum(window**2)
+        count = (frequencies.times * shows).sum()
+        found.append((mean, (frequencies.times * power)[shows].sum() / max(count, 1), count))
+    return np.array(found)
+
+
+def tiles(light: NDArray[np.float32], tiling: Tiling, paths: NDArray[np.float32]) -> Iterator[tuple[Any, ...]]:
+    """Each tile without its mean and windowed, the mean, the path, what is the same for all, and its place."""
+    rows, columns = tiling.sources()
+    window = np.outer(tiling.window_in(), tiling.window_in()).astype(np.float64)
+    frequencies = Frequencies.of(tiling.side)
+    for i in range(paths.shape[0]):
+        for j in range(paths.shape[1]):
+            place = tuple(slice(k * tiling.hop, k * tiling.hop + tiling.side) for k in (i, j))
+            tile = light[rows[place[0]]][:, columns[place[1]]].astype(np.float64)
+            mean = tile.mean()
+            yield (tile - mean) * window, mean, paths[i, j], frequencies, window, place
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Frequencies:
+    """Of a square's real transform.
+
+    Attributes
+    ----------
+    x, y
+        (T // 2 + 1,) and (T,) cycles per pixel.
+    square
+        (T, T // 2 + 1) sum of their squares.
+    gradient
+        (T, T // 2 + 1) power that the differences to the next pixel along x and y have of each.
+    fitted
+        (T, T // 2 + 1) which of them the spectrum of natural images is fitted to.
+    times
+        (T // 2 + 1,) how often the whole transform has them.
+    """
+
+    x: Array
+    y: Array
+    square: Array
+    gradient: Array
+    fitted: NDArray[np.bool_]
+    times: Array
+
+    @classmethod
+    def of(cls, side: int) -> Frequencies:
+        x, y = np.asarray(np.fft.rfftfreq(side)), np.asarray(np.fft.fftfreq(side))
+        square = x**2 + y[:, None] ** 2
+        gradient = 4 * (np.sin(np.pi * x) ** 2 + np.sin(np.pi * y[:, None]) ** 2)
+        low, high = FITTED
+        fitted = (square > low**2) & (square < high**2)
+        times = np.where(np.arange(len(x)) % (side // 2), 2.0, 1.0)
+        return cls(x=x, y=y, square=square, gradient=gradient, fitted=fitted, times=times)
+
+
+def filter_tile(
+    tile: Array,
+    path: NDArray[Any],
+    frequencies: Frequencies,
+    window: Array,
+    noise: float,
+    splitting: tuple[float, ...],
+) -> Array:
+    """A (T, T) tile without mean, already windowed, deblurred along an (S, 2) path; noise as a variance."""
+    spectrum = np.fft.rfft2(tile)
+    transfer = transfer_of(path, frequencies)
+    power = np.abs(transfer) ** 2
+    signal = signal_at_one(np.abs(spectrum) ** 2 / np.sum(window**2), power, frequencies, noise)
+    prior = signal / (frequencies.square + FLAT_BELOW**2)
+    wiener = np.conj(transfer) * prior / (power * prior + NOISE_FACTOR * noise) * spectrum
+    sharp = np.fft.irfft2(wiener, tile.shape)
+    weight = DATA_WEIGHT * 1e-4 / noise
+    data = weight * np.conj(transfer) * spectrum
+    for b in splitting:
+        kept = [shrunk(np.roll(sharp, -1, axis) - sharp, b) for axis in (0, 1)]
+        back = sum(np.roll(w, 1, axis) - w for axis, w in enumerate(kept))
+        found = (data + b * np.fft.rfft2(back)) / (weight * power + b * (frequencies.gradient + 1e-12))
+        sharp = np.fft.irfft2(found, tile.shape)
+    return sharp
+
+
+def transfer_of(path: NDArray[Any], frequencies: Frequencies) -> NDArray[np.complex128]:
+    """(T, T // 2 + 1) by what blur along an (S, 2) path multiplies each frequency: mean of ``exp(2 pi i f q)``.
+
+    Zero at the highest frequencies, which have no sign.
+    """
+    along_x, along_y = (
+        np.exp(2j * np.pi * f[:, None] * path[:, k]) for k, f in enumerate((frequencies.x, frequencies.y))
+    )
+    along_x[-1] = along_y[len(along_y) // 2] = 0
+    return along_y @ along_x.T / len(path)
+
+
+def signal_at_one(power_seen: Array, transfer: Array, frequencies: Frequencies, noise: float) -> float:
+    """Power of the sharp tile at one cycle per pixel, where it falls as ``1 / f^2``: by least squares of the excess."""
+    band = frequencies.fitted * frequencies.times
+    excess = (band * frequencies.square * transfer * (power_seen - noise)).sum()
+    return max(float(excess / (band * transfer**2).sum()), LEAST_SIGNAL * noise)
+
+
+def shrunk(gradient: Array, splitting: float) -> Array:
+    """What minimises ``|w|^(2/3) + splitting / 2 (w - gradient)^2``, by three rounds; 0 where that is less."""
+    size = np.abs(gradient)
+    w = size
+    for _ in range(3):
+        w = np.maximum(size - 2 / 3 / splitting * np.maximum(w, 1e-9) ** (-1 / 3), 0)
+    return np.where(size < 2 * (2 / 3 / splitting) ** 0.75, 0, np.sign(gradient) * w)

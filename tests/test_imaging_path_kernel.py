@@ -1,0 +1,178 @@
+"""The compiled filters along paths against the plain ones."""
+
+import numpy as np
+import pytest
+from references.path_filters import filter_reference, noise_reference
+
+from colmap_inertial._kernels import _path
+from colmap_inertial.imaging import path_filters
+from colmap_inertial.imaging._tiles import Tiling
+from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.imaging.blur_path import BlurPath, middles
+from colmap_inertial.imaging.path_filters import Noise, filter_along, half_quadratic, noise_along, path_wiener, smoothed
+from colmap_inertial.imaging.transfer import decode_table
+from colmap_inertial.imaging.wiener import DeblurOptions
+
+SETS = _path.instruction_sets()
+
+
+def bent(width, height, extent=(14.0, -6.0), bend=3.0):
+    """A path that changes from place to place."""
+    straight = BlurPath.straight(BlurField.uniform(width, height, extent, step_px=64))
+    s = middles(len(straight.path_px))[:, None, None, None]
+    growing = 1 + 0.2 * np.linspace(-1, 1, straight.path_px.shape[2])[:, None]
+    path = straight.path_px * growing + bend * (4 * s**2) * np.array([0.3, 1.0])
+    return BlurPath(width=width, height=height, path_px=path.astype(np.float32))
+
+
+def light_of(width, height, channels=1, seed=3):
+    """Blocks and a slope, with noise."""
+    rng = np.random.default_rng(seed)
+    coarse = rng.random((height // 12 + 2, width // 12 + 2, channels))
+    blocks = coarse.repeat(12, axis=0).repeat(12, axis=1)[:height, :width]
+    slope = np.linspace(0.1, 1, width)[:, None]
+    return (blocks * slope + 0.01 * rng.standard_normal((height, width, channels))).astype(np.float32)
+
+
+@pytest.mark.parametrize("instruction_set", SETS)
+@pytest.mark.parametrize("side", [32, 64, 256, 512])
+def test_a_tile_s_transform_is_numpy_s_and_comes_back(side, instruction_set):
+    tile = np.random.default_rng(side).standard_normal((side, side)).astype(np.float32)
+    spectrum, back = np.empty((side, side // 2 + 1, 2), np.float32), np.empty_like(tile)
+    _path.transform(tile, spectrum, back, instruction_set)
+    expected = np.fft.fft(np.fft.rfft(tile, axis=0), axis=1).T
+    np.testing.assert_allclose(spectrum[..., 0] + 1j * spectrum[..., 1], expected, atol=2e-6 * side)
+    np.testing.assert_allclose(back / side**2, tile, atol=3e-6)
+
+
+@pytest.mark.parametrize("instruction_set", SETS)
+@pytest.mark.parametrize("splitting", [(), path_filters.SPLITTING], ids=["wiener", "half-quadratic"])
+def test_both_filters_are_the_plain_ones(splitting, instruction_set):
+    width, height = 330, 210
+    path, light = bent(width, height), light_of(width, height)
+    tiling = Tiling.covering(width, height, path.extent_px())
+    paths, noise = tiling.paths(path), Noise(2e-5, 1e-4)
+    found = filter_along(light, tiling, paths, [noise], splitting, threads=2, instruction_set=instruction_set)
+    expected = filter_reference(light[..., 0], tiling, paths, noise, splitting)
+    assert np.abs(found[..., 0] - light[..., 0]).max() > 0.1
+    # a gradient at the threshold may fall on either side of it
+    off = np.abs(found[..., 0] - expected)
+    assert np.quantile(off, 0.998) < 2e-4 and off.max() < (0.02 if splitting else 2e-4)
+
+
+def test_noise_is_what_the_plain_version_sees():
+    width, height = 330, 210
+    path, light = bent(width, height, (24.0, 5.0)), light_of(width, height)
+    tiling = Tiling.covering(width, height, path.extent_px())
+    paths = tiling.paths(path)
+    expected = noise_reference(light[..., 0], tiling, paths)
+    found = np.reshape(
+        _path.noise(
+            light,
+            paths=paths,
+            window_in=tiling.window_in(),
+            hop=tiling.hop,
+            before=tiling.before,
+            above=path_filters.NOISE_ABOVE,
+            share=path_filters.NOISE_SHARE,
+            every=1,
+        ),
+        (-1, 3),
+    )
+    np.testing.assert_allclose(found, expected, rtol=0.02)
+
+
+def test_noise_is_found_as_it_grows_with_light_also_among_edges():
+    width, height = 900, 700
+    rng = np.random.default_rng(1)
+    light = np.broadcast_to(np.linspace(0.02, 0.9, width), (height, width)).copy()
+    light += np.sqrt(1e-5 + 2e-4 * light) * rng.standard_normal(light.shape)
+    light[300:340, 200:600] = 0.9  # sharp, as no blurred picture is
+    light = light[..., None].astype(np.float32)
+    path = bent(width, height, (24.0, 5.0))
+    tiling = Tiling.covering(width, height, path.extent_px())
+    (noise,) = noise_along(light, tiling, tiling.paths(path))
+    np.testing.assert_allclose(noise.dark + 0.5 * noise.by_light, 1.1e-4, rtol=0.15)
+    assert noise.by_light > 1e-4
+    assert Noise.fitted(np.zeros((0, 2))).dark > 0
+
+
+def test_threads_change_no_bit_and_colours_do_not_mix():
+    width, height = 700, 400
+    path, light = bent(width, height), light_of(width, height, channels=3)
+    tiling = Tiling.covering(width, height, path.extent_px())
+    paths, noise = tiling.paths(path), [Noise(1e-4, 0.0)] * 3
+    one, many = (filter_along(light, tiling, paths, noise, (8.0,), threads=n) for n in (1, 3))
+    np.testing.assert_array_equal(one, many)
+    for c in range(3):
+        alone = filter_along(np.ascontiguousarray(light[..., c : c + 1]), tiling, paths, noise[:1], (8.0,))
+        np.testing.assert_allclose(one[..., c], alone[..., 0], atol=1e-6)
+
+
+@pytest.mark.parametrize("extent_px", [3.0, 20.0, 21.0, 60.0, 200.0])
+def test_tiles_add_up_to_one_wherever_there_is_image(extent_px):
+    tiling = Tiling.covering(1000, 333, extent_px)
+    assert tiling.margin >= min(0.6 * extent_px, 0.15 * tiling.side) and tiling.hop > tiling.ramp
+    rows, columns = tiling.count
+    window = tiling.window_out()
+    for count, size in ((rows, 333), (columns, 1000)):
+        total = np.zeros((count - 1) * tiling.hop + tiling.side)
+        for k in range(count):
+            total[k * tiling.hop : k * tiling.hop + tiling.side] += window
+        np.testing.assert_allclose(total[tiling.before : tiling.before + size], 1, atol=1e-6)
+    rows, columns = tiling.sources()
+    np.testing.assert_array_equal(rows[tiling.before - 2 : tiling.before + 335], [2, 1, *range(333), 331, 330])
+
+
+def test_a_tile_has_the_path_of_its_middle():
+    width, height = 600, 400
+    path = bent(width, height)
+    tiling = Tiling.covering(width, height, path.extent_px())
+    rows, columns = tiling.count
+    paths = tiling.paths(path)
+    assert paths.shape == (rows, columns, len(path.path_px), 2)
+    middle = 2 * tiling.hop - tiling.before + tiling.side / 2 - 0.5
+    np.testing.assert_allclose(
+        paths[1, 2], path.at(np.array([tiling.hop + middle - 2 * tiling.hop]), np.array([middle]))[0, 0]
+    )
+
+
+@pytest.mark.parametrize("restore", [path_wiener, half_quadratic])
+def test_pixels_without_blur_and_around_what_is_clipped_stay(restore):
+    width, height = 400, 300
+    light = light_of(width, height)[..., 0]
+    image = np.clip(40 + 150 * light, 0, 240).astype(np.uint8)
+    image[140:160, 190:210] = 255
+    still = BlurPath(width=width, height=height, path_px=np.zeros((17, 6, 8, 2)))
+    np.testing.assert_array_equal(restore(image, still), image)
+    path = bent(width, height, (9.0, 0.0), bend=0.0)
+    out = restore(image, path)
+    np.testing.assert_array_equal(out[140:160, 175:225], image[140:160, 175:225])
+    assert (out[:100] != image[:100]).mean() > 0.5
+    deep = restore(image.astype(np.uint16) * 257, path)
+    assert deep.dtype == np.uint16 and np.abs(deep / 257 - out).max() < 1.5
+    colours = restore(np.stack([image] * 3, axis=-1), path, DeblurOptions(threads=2))
+    np.testing.assert_array_equal(colours, np.stack([out] * 3, axis=-1))
+
+
+def test_what_does_not_fit_is_refused():
+    path = BlurPath.straight(BlurField.uniform(64, 48, (9.0, 0.0)))
+    with pytest.raises(ValueError, match="path: for 64 x 48 px"):
+        path_wiener(np.zeros((40, 64), np.uint8), path)
+    with pytest.raises(ValueError, match="uint8 or uint16"):
+        path_wiener(np.zeros((48, 64), np.float32), path)
+    with pytest.raises(ValueError, match="600 px long"):
+        half_quadratic(np.zeros((48, 64), np.uint8), BlurPath.straight(BlurField.uniform(64, 48, (600.0, 0.0))))
+
+
+def test_smoothing_is_in_linear_light_and_keeps_the_type():
+    image = np.zeros((41, 41), np.uint8)
+    image[20, 20] = 255
+    for codes in (image, image.astype(np.uint16) * 257):
+        table = decode_table(codes.dtype)
+        out = table[smoothed(codes, 1.2)]
+        at = np.arange(-4, 5)
+        weights = np.exp(-0.5 * (at / 1.2) ** 2)
+        np.testing.assert_allclose(out[20, 16:25], weights / weights.sum() ** 2, atol=0.003)
+    flat = np.full((30, 30, 3), 77, np.uint8)
+    np.testing.assert_array_equal(smoothed(flat, 1.2), flat)

@@ -1,0 +1,336 @@
+"""Which pairs of images are matched: headings by the gyroscope, its bias by matches, votes, loops."""
+
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+import pytest
+
+from colmap_inertial.colmap import loops, pairing, sparse
+from colmap_inertial.colmap.gyro_bias import RayPairs, bias_correction
+from colmap_inertial.colmap.headings import Headings, find_headings
+from colmap_inertial.colmap.loops import candidates, close_loops, key_frames
+from colmap_inertial.colmap.pairing import match_capture
+from colmap_inertial.colmap.sparse import mapping_device
+from colmap_inertial.colmap.two_views import TwoViews, compare, count_verified, forget
+from colmap_inertial.colmap.votes import Voters
+from colmap_inertial.errors import InertialError, NotObservableError
+from colmap_inertial.geometry import quat_from_matrix, so3_exp
+from colmap_inertial.io.calibration import Declared, calibration_prior
+from colmap_inertial.options import MappingOptions
+from colmap_inertial.run.context import RunContext
+from colmap_inertial.types import CAL, CameraModel, FrameTiming, ImuRecording
+
+CAMERA = CameraModel(model="PINHOLE", width=480, height=360, params=(400.0, 400.0, 240.0, 180.0))
+BIAS = np.array([0.004, -0.01, 0.02])
+
+
+def imu_of(t_s, rate_rad_s):
+    """A gyroscope that turns about the camera's y axis, with a bias."""
+    still = np.tile([0.0, 0.0, 9.8], (len(t_s), 1))
+    return ImuRecording(gyro_t_s=t_s, gyro_rad_s=rate_rad_s + BIAS, accel_t_s=t_s, accel_m_s2=still)
+
+
+def calibration_of(bias_sigma=1e-3):
+    known = calibration_prior(
+        Declared(cam_from_imu_xyzw=[0, 0, 0, 1.0], imu_in_cam_m=[0, 0, 0.0], gyro_time_offset_s=0.0)
+    )
+    cov = np.array(known.cov)
+    cov[CAL.GYRO_BIAS, CAL.GYRO_BIAS] = bias_sigma**2 * np.eye(3)
+    return replace(known, gyro_bias_rad_s=BIAS, cov=cov)
+
+
+def headings_of(angle_deg, t_s, bias_sigma=1e-3, bias=BIAS):
+    """Of frames that look along angles about the vertical, (N,)."""
+    fine_s = np.arange(t_s[0] - 1, t_s[-1] + 1, 0.005)
+    angle = np.interp(fine_s, t_s, np.radians(angle_deg))
+    rate = np.zeros((len(fine_s), 3))
+    rate[:, 1] = np.gradient(angle, fine_s)
+    timing = FrameTiming(names=tuple(f"{i:04}" for i in range(len(t_s))), t_s=t_s, readout_s=0.0)
+    calibration = replace(calibration_of(bias_sigma), gyro_bias_rad_s=bias)
+    return Headings.of(imu_of(fine_s, rate), calibration, timing, CAMERA)
+
+
+def pair(i, j):
+    return np.array([i]), np.array([j])
+
+
+def test_frames_that_look_apart_are_told_from_those_that_may_share_something():
+    headings = headings_of([0.0, 60.0, 120.0, 180.0], np.array([0.0, 5.0, 10.0, 15.0]))
+    assert [bool(headings.see_nothing_in_common(*pair(0, k))[0]) for k in (1, 2, 3)] == [False, True, True]
+
+
+def test_a_heading_that_is_unsure_rules_nothing_out():
+    t_s = np.array([0.0, 5.0, 100.0])
+    assert headings_of([0.0, 10.0, 150.0], t_s).see_nothing_in_common(*pair(0, 2))[0]
+    unsure = headings_of([0.0, 10.0, 150.0], t_s, bias_sigma=0.02)
+    assert not unsure.see_nothing_in_common(*pair(0, 2))[0]
+    assert unsure.sigma_rad(*pair(0, 2))[0] > np.radians(60) > unsure.sigma_rad(*pair(0, 1))[0]
+
+
+def test_across_a_gap_of_the_gyroscope_nothing_is_known():
+    t_s = np.array([0.0, 5.0])
+    known = headings_of([0.0, 150.0], t_s)
+    apart = replace(known, part=np.array([0, 1]))
+    assert known.see_nothing_in_common(*pair(0, 1))[0]
+    assert not apart.see_nothing_in_common(*pair(0, 1))[0]
+    assert apart.agree(*pair(0, 1), np.eye(3)[None])[0]
+
+
+def test_what_a_change_of_the_bias_does_to_headings_is_what_their_covariance_says():
+    t_s = np.array([0.0, 20.0])
+    change = np.array([2e-3, 0, 0])
+    before, after = headings_of([0.0, 40.0], t_s), headings_of([0.0, 40.0], t_s, bias=BIAS + change)
+    lever = before.bias_lever_s[1] - before.bias_lever_s[0]
+    moved = after.start_from_cam[0].T @ after.start_from_cam[1]
+    expected = before.start_from_cam[0].T @ so3_exp(-(lever @ change)) @ before.start_from_cam[1]
+    assert moved == pytest.approx(expected, abs=2e-4)
+
+
+def test_a_rotation_that_the_gyroscope_contradicts_is_told():
+    headings = headings_of([0.0, 30.0], np.array([0.0, 5.0]))
+    true = headings.start_from_cam[0].T @ headings.start_from_cam[1]
+    assert headings.agree(*pair(0, 1), true[None])[0]
+    assert not headings.agree(*pair(0, 1), (true @ so3_exp(np.radians([0, 12.0, 0])))[None])[0]
+
+
+def test_a_wide_lens_sees_more_in_common():
+    t_s = np.array([0.0, 5.0])
+    wide = CameraModel(model="PINHOLE", width=800, height=600, params=(200.0, 200.0, 400.0, 300.0))
+    timing = FrameTiming(names=("a", "b"), t_s=t_s, readout_s=0.0)
+    imu = imu_of(np.arange(-1, 7, 0.01), np.zeros((800, 3)))
+    assert Headings.of(imu, calibration_of(), timing, wide).apart_rad == pytest.approx(2 * np.arctan(2))
+    assert Headings.of(imu, calibration_of(), timing, CAMERA).apart_rad == pytest.approx(np.pi / 2)
+    assert Headings.of(imu, calibration_of(), timing, None).apart_rad == pytest.approx(np.pi / 2)
+
+
+# --- the gyroscope's bias --------------------------------------------------------------------------------------------
+
+
+def ray_pairs_of(headings, rng, *, noise_px=0.5, wall=False):
+    """Matches of neighbours in a scene of some depth, or of a plain wall, seen by a camera that moves sideways."""
+    count = len(headings.t_s)
+    depth = np.full(100, 2.0) if wall else rng.uniform(1.5, 4.0, 100)
+    first, second, rays = [], [], []
+    for i in range(count - 2):
+        for j in (i + 1, i + 2):
+            seen = np.column_stack([rng.uniform(-0.5, 0.5, (100, 2)), np.ones(100)]) * depth[:, None]
+            there = (seen - [0.1 * (j - i), 0, 0]) @ (headings.start_from_cam[i].T @ headings.start_from_cam[j])
+            both = np.stack([seen / seen[:, 2:], there / there[:, 2:]])
+            both[..., :2] += rng.normal(0, noise_px / 400, (2, 100, 2))
+            first.append(i)
+            second.append(j)
+            rays.append(both / np.linalg.norm(both, axis=-1, keepdims=True))
+    stacked = np.array(rays)
+    places = np.array(first), np.array(second)
+    return RayPairs(
+        first=places[0], second=places[1], pixel_rad=1 / 400, rays_first=stacked[:, 0], rays_second=stacked[:, 1]
+    )
+
+
+@pytest.mark.parametrize("wall", [False, True])
+def test_the_bias_is_found_by_matches_of_neighbours_also_before_a_wall(wall):
+    t_s = np.arange(40) * 0.3
+    true = headings_of(30 * np.sin(t_s), t_s)
+    wrong = headings_of(30 * np.sin(t_s), t_s, bias=BIAS + np.array([0.01, -0.03, 0.02]))
+    pairs = ray_pairs_of(true, np.random.default_rng(0), wall=wall)
+    change, cov = bias_correction(pairs, wrong.start_from_cam, wrong.bias_lever_s)
+    off = change - [-0.01, 0.03, -0.02]
+    assert np.abs(off).max() < (0.01 if wall else 2e-3)
+    assert off @ np.linalg.solve(cov, off) < 16
+
+
+def test_matches_that_suit_no_bias_are_refused():
+    t_s = np.arange(40) * 0.3
+    headings = headings_of(30 * np.sin(t_s), t_s)
+    pairs = ray_pairs_of(headings, np.random.default_rng(0), noise_px=5)
+    with pytest.raises(NotObservableError, match="suit no bias"):
+        bias_correction(pairs, headings.start_from_cam, headings.bias_lever_s)
+    with pytest.raises(NotObservableError, match="too few"):
+        bias_correction(pairs.only(np.arange(len(pairs.first)) < 3), headings.start_from_cam, headings.bias_lever_s)
+
+
+# --- votes and loops -------------------------------------------------------------------------------------------------
+
+
+def described(rng, count=600):
+    """Descriptors as COLMAP stores them."""
+    vectors = np.abs(rng.normal(size=(count, 128)))
+    return np.round(512 * vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.uint8)
+
+
+@pytest.fixture
+def database(tmp_path):
+    """Three images with features: the first two share descriptors."""
+    rng = np.random.default_rng(1)
+    path = tmp_path / "database.db"
+    shared, places = described(rng), rng.uniform(0, 360, (600, 2))
+    with pycolmap.Database.open(str(path)) as opened:
+        camera = pycolmap.Camera(model="PINHOLE", width=480, height=360, params=CAMERA.params)
+        identifier = opened.write_camera(camera)
+        rig = pycolmap.Rig()
+        rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, identifier))
+        opened.write_rig(rig)
+        for name, own in (("a", shared), ("b", shared[::-1]), ("c", described(rng))):
+            image = opened.write_image(pycolmap.Image(name=name, camera_id=identifier))
+            keypoints = np.zeros((len(own), 6), dtype=np.float32)
+            keypoints[:, :2] = {"a": places, "b": places[::-1] + 20}.get(name, rng.uniform(0, 360, places.shape))
+            keypoints[:, 2] = keypoints[:, 5] = np.linspace(*((5, 1) if name == "b" else (1, 5)), len(own))
+            opened.write_keypoints(image, keypoints)
+            opened.write_descriptors(
+                image, pycolmap.FeatureDescriptors(type=pycolmap.FeatureExtractorType.SIFT, data=own)
+            )
+    return path
+
+
+def test_images_that_share_features_have_votes(database):
+    voters = Voters.of(database, ["a", "b", "c"])
+    votes = voters.count(np.array([0, 0]), np.array([1, 2]))
+    assert voters.plenty.all() and len(voters.descriptors[0]) == 500
+    assert votes[0] > 400 and votes[1] < 4
+
+
+def test_few_features_do_not_rule_a_pair_out(database):
+    voters = Voters.of(database, ["a", "b"])
+    few = replace(voters, descriptors=(voters.descriptors[0], voters.descriptors[1][:30]))
+    assert few.plenty.tolist() == [True, False]
+
+
+def test_frames_a_second_apart_are_looked_at_and_at_most_a_thousand():
+    assert np.diff(key_frames(np.arange(100) * 0.25)).tolist() == [4] * 24
+    assert len(key_frames(np.arange(5000) * 1.0)) <= 1001
+
+
+def test_candidates_are_the_best_of_a_frame():
+    i, j = np.array([0, 0, 0, 0, 0, 1]), np.array([20, 21, 22, 23, 24, 24])
+    votes = np.array([30, 20, 8, 10, 9, 2])
+    assert candidates(votes, i, j).tolist() == [True, True, True, True, True, False]
+    i, j = np.zeros(5, dtype=np.intp), np.full(5, 20)
+    assert candidates(np.array([30, 20, 8, 10, 9]), i, j).tolist() == [True, True, False, True, False]
+
+
+def closing(monkeypatch, seen, votes):
+    """Close loops among 40 frames a second apart, of which ``seen`` gives rotation and coverage of verified pairs."""
+    t_s = np.arange(40.0)
+    headings = headings_of(np.linspace(0, 360, 40), t_s)
+    names = [f"{i:04}" for i in range(40)]
+    forgotten = []
+
+    def compared(database, pairs):
+        turned, covered = np.full((len(pairs), 3, 3), np.nan), np.zeros(len(pairs))
+        for place, (a, b) in enumerate(pairs):
+            known = seen(int(a), int(b))
+            if known is not None:
+                off, covered[place] = known
+                true = headings.start_from_cam[int(a)].T @ headings.start_from_cam[int(b)]
+                turned[place] = true @ so3_exp(np.radians(off) * np.array([0, 1.0, 0]))
+        return TwoViews(first_from_second=turned, covered=covered)
+
+    class Counted:
+        def count(self, i, j):
+            return np.array([votes(a, b) for a, b in zip(i.tolist(), j.tolist(), strict=True)])
+
+    monkeypatch.setattr(loops, "compare", compared)
+    monkeypatch.setattr(loops, "forget", lambda database, pairs: forgotten.extend(pairs))
+    found = close_loops(None, names, headings, Counted(), 10, lambda pairs: None)
+    return found, forgotten
+
+
+def test_a_place_that_is_seen_again_closes_a_loop(monkeypatch):
+    again = {(a, b) for a in range(3) for b in range(37, 40)}
+    found, _ = closing(monkeypatch, lambda a, b: (0, 0.9) if (a, b) in again else None, lambda a, b: 20 * (b - a > 36))
+    assert set(found.closed) <= again and len(found.closed) >= 6
+
+
+@pytest.mark.parametrize(
+    "seen",
+    [
+        lambda a, b: (40, 0.9) if b - a > 36 else None,
+        lambda a, b: (0, 0.3) if b - a > 36 else None,
+        lambda a, b: (0, 0.9) if (a, b) == (0, 39) else None,
+    ],
+    ids=["turned otherwise", "covers little", "alone"],
+)
+def test_what_looks_alike_and_is_not_the_same_closes_none(monkeypatch, seen):
+    found, forgotten = closing(monkeypatch, seen, lambda a, b: 20 * (b - a > 36))
+    assert found.closed == () and len(forgotten) == found.candidates > 0 and found.refused > 0
+
+
+def test_where_the_gyroscope_looked_elsewhere_no_loop_is_sought(monkeypatch):
+    found, _ = closing(monkeypatch, lambda a, b: None, lambda a, b: 20)
+    assert 0 < found.compared < 30 * 31 / 2
+
+
+# --- the whole -------------------------------------------------------------------------------------------------------
+
+
+def test_pairs_without_a_gyroscope_are_those_of_before(database, tmp_path, monkeypatch):
+    matched = []
+    monkeypatch.setattr(pairing, "match_pairs", lambda db, pairs, context, **_: matched.extend(pairs))
+
+    def refused(*_):
+        raise NotObservableError("time offset", "no")
+
+    monkeypatch.setattr(pairing, "find_headings", refused)
+    timing = FrameTiming(names=("a", "b", "c"), t_s=np.arange(3.0))
+    recording = type("Recording", (), {"timing": timing})()
+    record = match_capture(
+        database, tmp_path / "out.db", recording, CAMERA, MappingOptions(), RunContext(scratch=tmp_path)
+    )
+    assert sorted(matched) == [("a", "b"), ("a", "c"), ("b", "c")]
+    assert record.matched == record.pairs == 3 and record.apart == record.unlike == 0
+    assert "not used" in record.gyroscope and record.heading_sigma_deg is None
+
+
+def test_matches_are_verified_counted_and_forgotten(database, tmp_path):
+    context = RunContext(scratch=tmp_path, num_threads=1)
+    sparse.match_pairs(database, [("a", "b"), ("a", "c")], context)
+    assert count_verified(database) == 1
+    views = compare(database, [("a", "b"), ("a", "c")])
+    assert np.isfinite(views.first_from_second).all(axis=(1, 2)).tolist() == [True, False]
+    assert views.covered[0] > 0.9 and views.covered[1] == 0
+    forget(database, [("a", "b")])
+    assert count_verified(database) == 0
+    with pycolmap.Database.open(str(database)) as opened:
+        assert not opened.exists_matches(1, 2) and opened.exists_matches(1, 3)
+
+
+def test_cuda_is_used_where_it_is_and_asked_for_only_there(monkeypatch):
+    monkeypatch.setattr(pycolmap, "has_cuda", False)
+    assert mapping_device(MappingOptions(), deterministic=False) == "cpu"
+    with pytest.raises(InertialError, match="has none"):
+        mapping_device(MappingOptions(device="cuda"), deterministic=False)
+    monkeypatch.setattr(pycolmap, "has_cuda", True)
+    assert mapping_device(MappingOptions(), deterministic=False) == "cuda"
+    assert mapping_device(MappingOptions(), deterministic=True) == "cpu"
+    assert mapping_device(MappingOptions(device="cpu"), deterministic=False) == "cpu"
+
+
+def test_headings_are_found_by_the_turns_of_the_pictures():
+    t_s = np.arange(60) * 0.3
+    angles = 40 * np.sin(0.9 * t_s) + 5 * t_s
+    true = headings_of(angles, t_s)
+    fine_s = np.arange(-1, 20, 0.005)
+    rate = np.zeros((len(fine_s), 3))
+    rate[:, 1] = np.gradient(np.radians(np.interp(fine_s, t_s, angles)), fine_s)
+    turned = np.swapaxes(true.start_from_cam[:-1], 1, 2) @ true.start_from_cam[1:]
+    turn = np.array([[0, np.arctan2(r[0, 2], r[0, 0]), 0] for r in turned])
+    timing = FrameTiming(names=tuple(map(str, range(60))), t_s=t_s, readout_s=0.0)
+    prior = calibration_prior(
+        Declared(cam_from_imu_xyzw=quat_from_matrix(np.eye(3)), gyro_time_offset_s=0.0, time_offset_sigma_s=0.01)
+    )
+    recording = type(
+        "Recording", (), {"timing": timing, "imu": imu_of(fine_s, rate), "prior": prior, "max_offset_s": 1.0}
+    )()
+    found = find_headings(recording, turn, ray_pairs_of(true, np.random.default_rng(0)), CAMERA)
+    assert found.calibration.gyro_bias_rad_s == pytest.approx(BIAS, abs=3e-3)
+
+
+def test_a_capture_too_short_for_loops_has_none(monkeypatch):
+    headings = headings_of([0.0, 5.0, 10.0], np.arange(3.0))
+    monkeypatch.setattr(loops, "forget", lambda database, pairs: None)
+    empty = TwoViews(first_from_second=np.zeros((0, 3, 3)), covered=np.zeros(0))
+    monkeypatch.setattr(loops, "compare", lambda database, pairs: empty)
+    voters = Voters(descriptors=(), xy_px=())
+    found = close_loops(None, ["a", "b", "c"], headings, voters, 10, lambda pairs: None)
+    assert found.compared == found.candidates == found.refused == 0 and found.closed == ()

@@ -1,0 +1,88 @@
+"""Metres without an IMU: from a target, from the distance of two markers, from the distance of two points."""
+
+import json
+import shutil
+
+import numpy as np
+import pycolmap
+import pytest
+from test_cli import run
+from test_validate_lengths import validated
+
+from colmap_inertial.drivers import reference as rooms
+from colmap_inertial.drivers.reference import scale_project_by
+from colmap_inertial.errors import InertialError, NotObservableError
+from colmap_inertial.options import ReferenceOptions
+
+
+@pytest.fixture
+def bare(project, tmp_path):
+    """A project of COLMAP's alone."""
+    shutil.copytree(project.model, tmp_path / "bare" / "sparse" / "0")
+    (tmp_path / "bare" / "images").mkdir()
+    return tmp_path / "bare"
+
+
+def test_a_known_distance_of_two_points_makes_a_project_metric(bare, tmp_path, capsys):
+    before = pycolmap.Reconstruction(str(bare / "sparse" / "0"))
+    images = sorted(before.reg_image_ids())
+    ends = [before.image(i).projection_center() for i in (images[0], images[-1])]
+    between = [",".join(f"{v:.12g}" for v in end) for end in ends]
+    out = tmp_path / "out"
+    args = ["--scale-from", "distance", "--between", *between, "--distance", "2.5+-0.01"]
+    code, said, err = run(capsys, "reconstruct", bare, out, *args)
+    assert code == 0, err
+    assert "10 m are 10 m to within 7.8 cm" in said and said.splitlines()[-1] == f"next: colmap-inertial view {out}"
+    after = pycolmap.Reconstruction(str(out / "sparse" / "0"))
+    a, b = (after.image(i).projection_center() for i in (images[0], images[-1]))
+    assert np.linalg.norm(a - b) == pytest.approx(2.5)
+    found = json.loads((out / "scale.json").read_text())
+    assert found["scale_from"] == "distance" and "2.5+-0.01 m" in found["made_of"]
+    low, high = found["ci95"]
+    assert np.log(high / low) == pytest.approx(2 * 1.96 * 0.004, rel=1e-3)
+    assert "which way is up is not known" in found["notes"][0]
+    provenance = json.loads((out / "transform.json").read_text())
+    assert "distance of 2.5+-0.01 m" in json.dumps(provenance)
+    code, said, _ = run(capsys, "reconstruct", bare, tmp_path / "again", *args, "--json", "-")
+    assert code == 0 and json.loads(said)["metres_per_unit"] == pytest.approx(found["metres_per_unit"])
+
+
+def test_markers_and_targets_give_their_scale(bare, tmp_path, monkeypatch):
+    monkeypatch.setattr(rooms, "validate_model", lambda *_, **__: validated(0.5, unscaled=True))
+    markers = {"target": "aruco:DICT_4X4_50:0.1", "scale_from": "distance"}
+    known = ReferenceOptions(**markers, between=("0", "1"), distance="2.1+-0.001")
+    found = scale_project_by(bare, tmp_path / "markers", known)
+    assert found.metres_per_unit == pytest.approx(2.1 / 4)
+    assert found.validation is not None
+    target = scale_project_by(
+        bare, tmp_path / "target", ReferenceOptions(scale_from="target", target="aruco:DICT_4X4_50:0.1")
+    )
+    assert target.metres_per_unit == pytest.approx(0.5) and target.made_of.startswith("target aruco")
+    with pytest.raises(NotObservableError, match="marker 9 was not measured in the model; measured: 0, 1, 2, 3, 7"):
+        scale_project_by(bare, tmp_path / "no", ReferenceOptions(**markers, between=("0", "9"), distance="2.1+-0.001"))
+    assert not (tmp_path / "no").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"scale_from": "target"}, "--scale-from target needs the target"),
+        ({"scale_from": "distance"}, "needs --between A B"),
+        ({"scale_from": "distance", "between": ("1,2,3", "4,5,6"), "distance": "2.5"}, "how well they are known"),
+        ({"scale_from": "distance", "between": ("1,2,3", "4,5,6"), "distance": "0+-1"}, "how well they are known"),
+        ({"scale_from": "distance", "between": ("1,2,3", "3"), "distance": "2+-0.1"}, "needs what they are: --target"),
+        ({"scale_from": "distance", "between": ("a,b,c", "3"), "distance": "2+-0.1"}, "a point is x,y,z"),
+        ({"scale_from": "distance", "between": ("1,2,3", "1,2,3"), "distance": "2+-0.1"}, "are the same place"),
+    ],
+)
+def test_what_is_missing_is_named(bare, tmp_path, options, words):
+    with pytest.raises(InertialError, match=words):
+        scale_project_by(bare, tmp_path / "out", ReferenceOptions(**options))
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_capture_is_told_what_to_give_and_options_without_their_way_are_refused(tmp_path, capsys):
+    code, _, err = run(capsys, "reconstruct", tmp_path, tmp_path / "out", "--scale-from", "target", "--target", "x")
+    assert code == 2 and "is no COLMAP project" in err and "OUT/colmap" in err
+    code, _, err = run(capsys, "reconstruct", tmp_path, tmp_path / "out", "--distance", "2+-0.1")
+    assert code == 2 and "--distance goes with --scale-from" in err

@@ -1,0 +1,386 @@
+"""Bundle adjustment with the IMU and the rolling shutter in it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from refine_walk import PINHOLE, known_of, nudged, problem_of, tracks_of, walk
+
+from colmap_inertial.errors import NotObservableError
+from colmap_inertial.refine import _inertial, _seen, judge, setup, solve as solver
+from colmap_inertial.refine._system import Order, System
+from colmap_inertial.refine.solve import _evaluate, _weighted, factored, held_out, solve
+from colmap_inertial.refine.values import FreeCamera
+
+
+def steps_of(x, kind, column):
+    """Zero steps, with a one in a column of the states, the shared numbers, or the points."""
+    frames, shared, points = len(x.velocity_m_s), x.columns.count, len(x.points_m)
+    step = [np.zeros((frames, 15)), np.zeros(shared), np.zeros((points, 3))]
+    step[kind][..., column] = 1.0
+    return step
+
+
+def slope(function, x, kind, column, size=1e-6):
+    """Central difference of a function of the estimate."""
+    step = steps_of(x, kind, column)
+    ends = [function(x.moved(*(sign * size * part for part in step))) for sign in (1, -1)]
+    return (ends[0] - ends[1]) / (2 * size)
+
+
+@pytest.fixture(scope="module", params=[0.0, 0.025], ids=["global", "rolling"])
+def small(request):
+    options = walk(4.0, readout_s=request.param, points_per_m=100.0)
+    tracks = tracks_of(options)
+    problem, start, seen = problem_of(tracks, options)
+    return tracks, problem, start, seen
+
+
+def test_derivatives_of_observations_are_those_of_finite_differences(small):
+    _, problem, start, _ = small
+    x = nudged(start, np.random.default_rng(0))
+    at = _seen.project(problem, x, problem.observations)
+    by = _seen.derivatives(problem, x, problem.observations, at)
+
+    def residual(y):
+        return _seen.project(problem, y, problem.observations).residual
+
+    for kind, values in ((0, by.by_frame), (1, by.by_shared), (2, by.by_point)):
+        for column in range(values.shape[2]):
+            expected = slope(residual, x, kind, column)
+            assert np.abs(values[:, :, column] - expected).max() < 1e-5 * (1 + np.abs(expected).max())
+
+
+def test_what_derivatives_leave_out_is_a_hundredth_of_a_pixel(small):
+    _, problem, start, _ = small
+
+    def residual(y):
+        return _seen.project(problem, y, problem.observations).residual
+
+    for column in range(9, 15):  # by biases: what a milliradian a second and a hundredth of a m/s2 do
+        assert np.abs(slope(residual, start, 0, column)).max() * 1e-3 < 0.02
+
+
+@pytest.mark.parametrize("name", ["imu", "walk", "states"])
+def test_derivatives_of_the_imu_are_those_of_finite_differences(small, name):
+    _, problem, start, _ = small
+    x = nudged(start, np.random.default_rng(1))
+
+    def rows(y):
+        return _inertial.all_rows(problem, y)[name]
+
+    at = rows(x)
+    count = len(at.residual)
+    whole = np.zeros((*at.residual.shape, len(x.velocity_m_s), 15))
+    whole[np.arange(count), :, np.arange(count)] = at.here
+    if at.after is not None:
+        whole[np.arange(count), :, np.arange(count) + 1] = at.after
+    # a quarter of a second's readings are not linear in their bias, nor whitened alike
+    for column in range(15):
+        expected = slope(lambda y: rows(y).residual, x, 0, column)
+        found = whole[..., column].sum(axis=2)
+        assert np.abs(found - expected).max() < 5e-3 * (1 + np.abs(whole[..., column]).max())
+    if at.by_shared is not None:
+        # the delay's derivative is one over 20 ms, as vibration makes shorter ones meaningless
+        others = [column for column in range(x.columns.count) if column != x.columns.accel_delay]
+        for column in others:
+            expected = slope(lambda y: rows(y).residual, x, 1, column)
+            assert np.abs(at.by_shared[:, :, column] - expected).max() < 5e-3 * (1 + np.abs(expected).max())
+
+
+def dense(problem, at, by, residual):
+    """The whole system without taking points out: (information, right-hand side)."""
+    x, observations = at.estimate, problem.observations
+    frames, points, shared = len(x.velocity_m_s), len(x.points_m), x.columns.count
+    n = 15 * frames
+    rows = []
+    for o, (f, p) in enumerate(zip(observations.frame, observations.point, strict=True)):
+        block = np.zeros((2, n + shared + 3 * points))
+        block[:, 15 * f : 15 * f + 9] = by.by_frame[o]
+        block[:, n : n + by.by_shared.shape[2]] = by.by_shared[o]
+        block[:, n + shared + 3 * p : n + shared + 3 * p + 3] = by.by_point[o]
+        rows.append((block, residual[o]))
+    for one in at.rows.values():
+        for i in range(len(one.residual)):
+            block = np.zeros((one.here.shape[1], n + shared + 3 * points))
+            block[:, 15 * i : 15 * i + 15] = one.here[i]
+            if one.after is not None:
+                block[:, 15 * i + 15 : 15 * i + 30] = one.after[i]
+            if one.by_shared is not None:
+                block[:, n : n + shared] = one.by_shared[i]
+            rows.append((block, one.residual[i]))
+    jacobian, values = np.concatenate([r[0] for r in rows]), np.concatenate([r[1] for r in rows])
+    info, rhs = jacobian.T @ jacobian, -jacobian.T @ values
+    info[n : n + shared, n : n + shared] += problem.prior.info
+    rhs[n : n + shared] -= problem.prior.info @ at.offset
+    return info, rhs
+
+
+@pytest.mark.parametrize("folded", [False, True])
+def test_the_compiled_step_and_covariance_are_those_of_the_whole_system(folded):
+    options = walk(4.0, readout_s=0.02, points_per_m=30.0, frame_rate_hz=3.0)
+    problem, start, _ = problem_of(tracks_of(options), options)
+    x = nudged(start, np.random.default_rng(2))
+    at = _evaluate(problem, x, problem.observations)
+    by, residual = _weighted(problem, at)
+    order = Order.of(problem.observations, len(x.velocity_m_s))
+    if folded:
+        order = Order(place=np.random.default_rng(0).permutation(len(order.place)), width=15 * len(order.place) - 1)
+    prior = (problem.prior.info, -problem.prior.info @ at.offset)
+    system = System.build(order, problem.observations, by, residual, at.rows, prior, damping=0.0)
+    solved = system.factored()
+    states, shared, points = solved.step(system, problem.observations, by)
+    info, rhs = dense(problem, at, by, residual)
+    unit = 1 / np.sqrt(np.diagonal(info))
+    scaled = np.linalg.inv(info * unit[:, None] * unit)
+    expected = unit * (scaled @ (unit * rhs))
+    n, q = states.size, len(shared)
+    sigma = unit * np.sqrt(np.diagonal(scaled))
+    found = np.concatenate([states.ravel(), shared, points.ravel()])
+    assert np.abs((found - expected) / sigma).max() < 1e-3
+    cov = (scaled * unit[:, None] * unit)[n : n + q, n : n + q]
+    assert np.sqrt(np.diagonal(solved.shared_cov())) == pytest.approx(np.sqrt(np.diagonal(cov)), rel=1e-4)
+
+
+def test_frames_stand_in_order_of_time_unless_a_loop_closes():
+    options = walk(12.0, points_per_m=40.0)
+    problem, start, _ = problem_of(tracks_of(options), options)
+    frames, observations = len(start.velocity_m_s), problem.observations
+    plain = Order.of(observations, frames)
+    assert plain.width < 0.8 * 15 * frames
+    # the last frame sees what the first saw
+    first = np.flatnonzero(observations.frame == 0)[0]
+    frame = observations.frame.copy()
+    frame[np.flatnonzero(observations.point == observations.point[first])[-1]] = frames - 1
+    closed = Order.of(replace(observations, frame=frame), frames)
+    assert sorted(closed.place) == list(range(frames))
+    assert closed.width < 15 * (frames - 1)
+
+
+def test_a_walk_is_found_from_a_start_that_is_off(small):
+    tracks, problem, start, _ = small
+    rng = np.random.default_rng(3)
+    solution = solve(problem, nudged(start, rng, 2e-3))
+    assert solution.converged
+    again = solve(problem, start)
+    assert solution.cost == pytest.approx(again.cost, abs=0.2)
+    centres = setup.at_middle_lines(problem, again.estimate).cam_in_world
+    truth = tracks.motion.cam_in_world_m(tracks.timing.pose_t_s())
+    change = centres - centres.mean(axis=0) - (truth - truth.mean(axis=0))
+    assert np.sqrt(np.mean(np.sum(change**2, axis=1))) < 0.02
+    if tracks.timing.readout_s:
+        assert again.estimate.readout_s == pytest.approx(0.025, abs=1e-3)
+
+
+def test_two_solutions_are_the_same_bit_for_bit(small):
+    _, problem, start, _ = small
+    a, b = solve(problem, start).estimate, solve(problem, start).estimate
+    assert np.array_equal(a.imu_in_world_m, b.imu_in_world_m)
+    assert np.array_equal(a.points_m, b.points_m)
+
+
+def test_a_frame_that_the_imu_did_not_record_hangs_on_the_pictures():
+    options = walk(6.0, points_per_m=100.0)
+    tracks = tracks_of(options)
+    imu, names = tracks.imu, tracks.timing.names
+    keep = tracks.imu.gyro_t_s < tracks.imu.gyro_t_s[0] + 5.5
+    short = replace(tracks, imu=replace(imu, gyro_t_s=imu.gyro_t_s[keep], gyro_rad_s=imu.gyro_rad_s[keep]))
+    problem, start, _ = problem_of(short, options)
+    assert 0 < problem.inertial.linked.sum() < len(names) - 1
+    solution = solve(problem, start)
+    assert solution.converged
+    off = setup.at_middle_lines(problem, solution.estimate).cam_in_world
+    assert np.linalg.norm(off - tracks.motion.cam_in_world_m(tracks.timing.pose_t_s()), axis=1).max() < 0.1
+
+
+def test_what_only_damping_holds_is_not_at_rest(small, monkeypatch):
+    _, problem, start, _ = small
+    off = nudged(start, np.random.default_rng(3), 2e-3)
+    free = solve(problem, off)
+    monkeypatch.setattr(solver, "_FIRST_DAMPING", 1e7)
+    held = solve(problem, off)
+    assert held.converged
+    assert held.cost == pytest.approx(free.cost, abs=0.2)
+    # where no step gains anything, nothing rests
+    monkeypatch.setattr(solver, "_evaluate", lambda *given: replace(_evaluate(*given), cost=0.0))
+    assert not solve(problem, off).converged
+
+
+@pytest.mark.parametrize("fewest", [0, 2])
+def test_frames_that_hardly_see_anything_stop_nothing(small, fewest):
+    _, problem, start, _ = small
+    seen = problem.observations
+    keep = np.ones(len(seen.frame), dtype=bool)
+    for frame in (5, len(start.velocity_m_s) - 1):
+        keep[np.flatnonzero(seen.frame == frame)[fewest:]] = False
+    problem = replace(problem, observations=seen.select(keep))
+    linked = problem.inertial.linked.copy()
+    linked[-1] = False  # nor does the IMU hold the last one
+    problem = replace(problem, inertial=replace(problem.inertial, linked=linked))
+    rng = np.random.default_rng(4)
+    off = nudged(start, rng)
+    alone = solve(setup.pictures_alone(problem, problem.observations.xy_px), off)
+    whole = solve(problem, off)
+    assert alone.converged
+    assert whole.converged
+    assert not np.array_equal(alone.estimate.points_m, off.points_m)
+    sigma = np.sqrt(np.diagonal(factored(problem, whole.estimate).shared_cov()))
+    assert np.isfinite(sigma).all()
+
+
+def test_a_recording_of_less_than_half_is_refused():
+    options = walk(6.0, points_per_m=100.0)
+    tracks = tracks_of(options)
+    imu = tracks.imu
+    keep = imu.gyro_t_s < imu.gyro_t_s[0] + 2.0
+    short = replace(tracks, imu=replace(imu, gyro_t_s=imu.gyro_t_s[keep], gyro_rad_s=imu.gyro_rad_s[keep]))
+    with pytest.raises(NotObservableError, match="less than half"):
+        problem_of(short, options)
+
+
+def test_points_behind_the_camera_are_no_gain(small):
+    _, problem, start, _ = small
+    behind = replace(start, points_m=start.points_m - 100.0)
+    assert not _seen.project(problem, behind, problem.observations).seen.all()
+    assert _evaluate(problem, behind, problem.observations).cost > _evaluate(problem, start, problem.observations).cost
+    assert (
+        held_out(problem, behind, problem.observations).mean() > held_out(problem, start, problem.observations).mean()
+    )
+
+
+def test_a_point_behind_all_cameras_stops_nothing(small):
+    _, problem, start, _ = small
+    points = start.points_m.copy()
+    points[3] -= 100.0 * (points[3] - start.imu_in_world_m.mean(axis=0))
+    solution = solve(problem, replace(start, points_m=points))
+    assert np.isfinite(solution.cost)
+    assert np.isfinite(solution.estimate.points_m).all()
+
+
+@pytest.mark.parametrize("model", ["SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV"])
+def test_every_camera_model_of_colmap_is_differentiated(model):
+    params = {
+        "SIMPLE_RADIAL": (1000.0, 640.0, 480.0, -0.05),
+        "OPENCV": (1000.0, 990.0, 640.0, 480.0, -0.05, 0.01, 0.001, -0.002),
+        "OPENCV_FISHEYE": (700.0, 690.0, 640.0, 480.0, -0.01, 0.002, 0.0, 0.0),
+        "FULL_OPENCV": (1000.0, 990.0, 640.0, 480.0, -0.05, 0.01, 0.001, -0.002, 0.0, 0.01, 0.0, 0.0),
+    }[model]
+    options = walk(3.0, points_per_m=60.0, camera=replace(PINHOLE, model=model, params=params))
+    problem, start, _ = problem_of(tracks_of(options), options)
+    every = FreeCamera(model=problem.cameras[0].model, free=tuple(range(len(params))))
+    problem, x = replace(problem, cameras=(every,)), replace(start, intrinsics=np.array(params))
+    at = _seen.project(problem, x, problem.observations)
+    by = _seen.derivatives(problem, x, problem.observations, at)
+    for kind, values, columns in ((0, by.by_frame, range(6)), (1, by.by_shared, range(9, 9 + len(params)))):
+        for column in columns:
+            expected = slope(lambda y: _seen.project(problem, y, problem.observations).residual, x, kind, column)
+            assert np.abs(values[:, :, column] - expected).max() < 1e-4 * (1 + np.abs(expected).max())
+
+
+def test_a_gap_of_the_gyroscope_links_nothing():
+    options = walk(6.0, points_per_m=60.0)
+    tracks = tracks_of(options)
+    imu = tracks.imu
+    since_s = imu.gyro_t_s - imu.gyro_t_s[0]
+    keep = (since_s < 3.0) | (since_s > 4.0)
+    gappy = replace(tracks, imu=replace(imu, gyro_t_s=imu.gyro_t_s[keep], gyro_rad_s=imu.gyro_rad_s[keep]))
+    whole, gap = (problem_of(one, options)[0] for one in (tracks, gappy))
+    t_s = gap.inertial.tracks.gyro.t_s
+    begin_s, end_s = t_s[int(np.argmax(np.diff(t_s))) + np.arange(2)]
+    nodes_s = gap.inertial.nodes_s
+    across = (nodes_s[1:] > begin_s) & (nodes_s[:-1] < end_s)
+    assert across.sum() > 2
+    assert whole.inertial.linked.all()
+    assert not gap.inertial.linked[across].any()
+    assert gap.inertial.linked[~across].sum() >= (~across).sum() - 2
+    # each chain's residuals less its velocities; nothing of what hangs between
+    chains = 2
+    assert judge._freedom(gap) == 6 * gap.inertial.linked.sum() - 3 * chains
+    assert judge._freedom(whole) == 6 * whole.inertial.linked.sum() - 3
+
+
+def test_speed_costs_nothing_where_the_imu_says_it(small):
+    _, problem, start, _ = small
+    fast = replace(start, velocity_m_s=start.velocity_m_s + 30.0)
+    rows = _inertial.state_rows(problem, fast)
+    assert np.all(rows.residual[:, 6:9] == 0.0)
+    alone = replace(problem, inertial=replace(problem.inertial, linked=np.zeros_like(problem.inertial.linked)))
+    assert np.all(_inertial.state_rows(alone, fast).residual[:, 6:9] > 2.0)
+
+
+def test_an_offset_beyond_the_readings_that_were_looked_up_is_refused(small):
+    _, problem, start, _ = small
+    assert judge._too_late(problem, replace(start, offset_s=0.009)) == ""
+    assert "11 ms" in judge._too_late(problem, replace(start, offset_s=-0.011))
+    drifting = replace(start, offset_s=0.009, clock_rate=0.002 / np.ptp(problem.inertial.nodes_s) * 2)
+    assert "11 ms" in judge._too_late(problem, drifting)
+
+
+def test_what_is_held_out_must_be_predicted_better_than_chance_does(small):
+    _, problem, start, _ = small
+    rests = solver._solution(_evaluate(problem, start, problem.observations), 1, converged=True)
+    assert judge._doubt(rests, rests, 1.0, -0.02, 0.01) == ""
+    for change, spread in ((-0.009, 0.01), (0.0, 0.0), (-1.0, np.inf)):
+        assert "no better" in judge._doubt(rests, rests, 1.0, change, spread)
+
+
+def test_what_is_held_out_leaves_each_point_enough(small):
+    _, problem, _, _ = small
+    chosen = judge._chosen(problem.observations)
+    assert 0.05 < chosen.mean() < 0.12
+    left = problem.observations.select(~chosen)
+    assert np.diff(left.first).min() >= 2
+
+
+def test_the_model_that_is_written_is_the_one_that_was_found(small):
+    tracks, problem, start, seen = small
+    model = tracks.reconstruction()
+    about = start.imu_in_world_m.mean(axis=0)
+    back = setup.written_back(model, seen, problem, start, about=about, scale=1.0)
+    for image_id in model.reg_image_ids():
+        a, b = model.image(image_id), back.image(image_id)
+        assert b.projection_center() == pytest.approx(a.projection_center(), abs=1e-9)
+    for point_id, point in model.points3D.items():
+        assert back.points3D[point_id].xyz == pytest.approx(point.xyz, abs=1e-9)
+    # all lines at once: what noise leaves of a true model
+    assert back.compute_mean_reprojection_error() < 0.7
+    larger = setup.written_back(model, seen, problem, start, about=about, scale=2.0)
+    assert larger.compute_mean_reprojection_error() == pytest.approx(back.compute_mean_reprojection_error(), rel=1e-6)
+
+
+def test_standard_deviations_of_the_calibration_are_honest(small):
+    tracks, problem, start, _ = small
+    x = solve(problem, start).estimate
+    sigma = np.sqrt(np.diagonal(factored(problem, x).shared_cov()))
+    assert np.all(np.abs(x.imu_in_cam_m - tracks.calibration.imu_in_cam_m) < 4 * sigma[3:6])
+    assert abs(x.offset_s) < 4 * sigma[6]
+    assert abs(x.offset_s) < 3e-4
+
+
+def test_known_numbers_stay_where_they_are(small):
+    tracks, _, _, _ = small
+    options = walk(4.0, readout_s=tracks.timing.readout_s or 0.0, points_per_m=100.0)
+    problem, start, _ = problem_of(tracks, options, refine_intrinsics=False)
+    assert problem.cameras[0].free == ()
+    x = solve(problem, start).estimate
+    assert _seen.cameras_of(problem, x)[0].params == tracks.camera.params
+    assert known_of(tracks, options).prior.readout_s == 0.0
+
+
+def test_the_drift_map_names_what_was_stretched_and_how_sure_it_is(small, monkeypatch):
+    _, problem, start, seen = small
+    monkeypatch.setattr(judge, "_PART_S", 1.0)
+    half = len(seen.t_s) // 2
+    middle = start.imu_in_world_m[half]
+    longer = start.imu_in_world_m.copy()
+    longer[half:] = middle + 1.1 * (longer[half:] - middle)
+    solved = factored(problem, start)
+    parts = judge.drift_map(problem, start, replace(start, imu_in_world_m=longer), seen.t_s, solved)
+    assert len(parts) == 4
+    assert parts[-1].percent - parts[0].percent == pytest.approx(10.0, abs=1.5)
+    # by the whole covariance
+    n = solved.solved.shape[0]
+    cov, _ = solved.solve(np.eye(n), np.zeros((start.columns.count, n)))
+    columns = 15 * solved.order.place[-1] + np.arange(3, 6)
+    assert np.array(parts[-1].end_sigma_m) == pytest.approx(np.sqrt(np.diagonal(cov)[columns]), rel=1e-6)
+    assert 0 < parts[0].sigma_percent < 50

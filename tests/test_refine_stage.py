@@ -1,0 +1,290 @@
+"""The stage that refines a metric model, and when it does not."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+import pytest
+from refine_walk import tracks_of, walk
+
+from colmap_inertial import read_model, reconstruct_project
+from colmap_inertial.drivers.capture import default_model_stages
+from colmap_inertial.io.calibration import Declared, calibration_prior
+from colmap_inertial.io.capture import Capture
+from colmap_inertial.model import Model
+from colmap_inertial.options import ProjectOptions, ReconstructOptions
+from colmap_inertial.refine import judge
+from colmap_inertial.refine.solve import held_out, solve
+from colmap_inertial.run.context import Recording
+from colmap_inertial.stages.gyro_view import GyroView
+from colmap_inertial.stages.metric import MetricStage
+from colmap_inertial.stages.readout import ReadoutStage
+from colmap_inertial.stages.refine import RefineStage
+from colmap_inertial.stages.rolling_shutter import RollingShutterStage
+
+UNKNOWN = calibration_prior()
+
+
+def adjusted(model):
+    """COLMAP's bundle adjustment."""
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = options.refine_principal_point = False
+    getattr(options, "ceres", options).solver_options.num_threads = 1
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in model.reg_image_ids():
+        config.add_image(image_id)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+    model.update_point_3d_errors()
+    return model
+
+
+def centres_of(model):
+    images = sorted((model.image(i) for i in model.reg_image_ids()), key=lambda image: image.name)
+    return np.array([image.projection_center() for image in images])
+
+
+def error_of(centres, truth):
+    """Root mean square after a similarity (Umeyama)."""
+    a, b = centres - centres.mean(0), truth - truth.mean(0)
+    u, d, vt = np.linalg.svd(b.T @ a)
+    sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
+    scale = np.trace(np.diag(d) @ sign) / np.sum(a**2)
+    return float(np.sqrt(np.mean(np.sum((scale * a @ (u @ sign @ vt).T - b) ** 2, axis=1))))
+
+
+@pytest.fixture(scope="module")
+def walked():
+    """A walk of 25 m, and COLMAP's model of it in metres."""
+    tracks = tracks_of(walk(25.0, points_per_m=80.0))
+    model = Model(reconstruction=adjusted(tracks.reconstruction()), colmap_index=0, timing=tracks.timing)
+    return tracks, MetricStage(imu=tracks.imu, calibration=UNKNOWN)(model)
+
+
+@pytest.fixture(scope="module")
+def rolled():
+    """A walk of 25 m with a rolling shutter, keypoints rectified, and COLMAP's model of it in metres."""
+    tracks = tracks_of(walk(25.0, readout_s=0.025, points_per_m=80.0))
+    known = calibration_prior(Declared(readout_s=0.025))
+    view = GyroView(
+        imu=tracks.imu, timing=tracks.timing, calibration=tracks.calibration, camera=tracks.camera, source="capture"
+    )
+    shutter, xy_px = RollingShutterStage(view=view), tracks.xy_px.copy()
+    for i, name in enumerate(tracks.timing.names):
+        xy_px[tracks.frame == i] = shutter.moved(name, xy_px[tracks.frame == i])
+    model = Model(
+        reconstruction=adjusted(tracks.reconstruction(xy_px)), colmap_index=0, timing=tracks.timing, rectified=True
+    )
+    model = ReadoutStage(imu=tracks.imu, calibration=known, refine_intrinsics=False, num_threads=1)(model)
+    return tracks, shutter, known, MetricStage(imu=tracks.imu, calibration=known)(model)
+
+
+def refined_by(imu, model, **fields):
+    stage = RefineStage(**{"imu": imu, "calibration": UNKNOWN, "refine_intrinsics": False, **fields})
+    made = stage(model)
+    return made, made.treatments[-1]
+
+
+def test_a_walk_bends_less_and_keeps_its_size_and_up(walked):
+    tracks, model = walked
+    made, said = refined_by(tracks.imu, model)
+    truth = tracks.motion.cam_in_world_m(tracks.timing.pose_t_s())
+    before, after = centres_of(model.reconstruction), centres_of(made.reconstruction)
+    assert said.action == "refined"
+    assert error_of(after, truth) < 0.9 * error_of(before, truth)
+    assert np.std(after, axis=0).sum() == pytest.approx(np.std(before, axis=0).sum(), rel=1e-3)
+    assert said.values["after_px"] < said.values["before_px"]
+    assert said.values["chi2"] < 1.5
+    assert len(said.values["drift"]) == 2
+    assert made.scale.notes[-1] == f"the model was {said.reason}"
+    json.dumps(said.values)
+    # the model is as whole as before
+    assert made.reconstruction.compute_num_observations() == model.reconstruction.compute_num_observations()
+    assert made.reconstruction.compute_mean_reprojection_error() < 0.7
+    up = np.array([image.cam_from_world().rotation.matrix() for image in made.reconstruction.images.values()])
+    assert np.isfinite(up).all()
+
+
+def test_the_calibration_is_the_refined_one(walked):
+    tracks, model = walked
+    made, _ = refined_by(tracks.imu, model)
+    found, true = made.scale.calibration, tracks.calibration
+    assert found.gyro_time_offset_s == pytest.approx(true.gyro_time_offset_s, abs=3e-4)
+    assert np.abs(found.imu_in_cam_m - true.imu_in_cam_m).max() < 4 * max(
+        found.sigma(f"imu_in_cam_{axis}_m") for axis in "xyz"
+    )
+    assert made.scale.metres_per_unit == model.scale.metres_per_unit
+
+
+def test_a_rolling_shutter_is_part_of_it(rolled):
+    tracks, shutter, known, model = rolled
+    made, said = refined_by(tracks.imu, model, calibration=known, shutter=shutter)
+    truth = tracks.motion.cam_in_world_m(tracks.timing.pose_t_s())
+    assert said.action == "refined"
+    assert error_of(centres_of(made.reconstruction), truth) < 0.7 * error_of(centres_of(model.reconstruction), truth)
+    assert said.values["readout_s"] == pytest.approx(0.025, rel=0.03)
+    assert not made.observed_px
+
+
+def test_a_model_whose_images_still_have_the_rolling_shutter_is_left_as_it_is(rolled):
+    tracks, _, known, model = rolled
+    made, said = refined_by(tracks.imu, replace(model, rectified=False), calibration=known)
+    assert "still have the rolling shutter" in said.reason
+    assert made.reconstruction is model.reconstruction
+
+
+def test_keypoints_go_back_to_where_the_shutter_had_them(rolled):
+    tracks, shutter, _, _ = rolled
+    name = tracks.timing.names[7]
+    exposed = tracks.xy_px[tracks.frame == 7]
+    assert shutter.as_exposed(name, shutter.moved(name, exposed)) == pytest.approx(exposed, abs=5e-3)
+    assert np.array_equal(shutter.as_exposed("another.jpg", exposed), exposed)
+
+
+def test_the_readout_s_stage_remembers_where_keypoints_were(rolled):
+    tracks, shutter, _, model = rolled
+    name = tracks.timing.names[7]
+    if "readout" in [one.stage for one in model.treatments if one.action]:
+        mapped = model.observed_px[name]
+        assert mapped == pytest.approx(shutter.moved(name, tracks.xy_px[tracks.frame == 7]), abs=1e-6)
+
+
+def test_images_without_a_time_hang_on_the_pictures(walked):
+    tracks, model = walked
+    keep = np.arange(len(model.timing.names)) % 7 != 3
+    names = tuple(name for name, kept in zip(model.timing.names, keep, strict=True) if kept)
+    timing = replace(model.timing, names=names, t_s=model.timing.t_s[keep])
+    made, said = refined_by(tracks.imu, replace(model, timing=timing))
+    truth = tracks.motion.cam_in_world_m(tracks.timing.pose_t_s())
+    assert said.action == "refined"
+    assert error_of(centres_of(made.reconstruction), truth) < error_of(centres_of(model.reconstruction), truth)
+
+
+def test_an_imu_that_contradicts_the_pictures_leaves_the_model_as_it_is(walked):
+    tracks, model = walked
+    imu = replace(tracks.imu, accel_m_s2=tracks.imu.accel_m_s2[:, [1, 0, 2]] * [1.0, 1.0, 1.0])
+    made, said = refined_by(imu, model)
+    assert said.action == ""
+    assert said.reason.startswith("left as it is: ")
+    assert made.reconstruction is model.reconstruction
+
+
+def test_what_predicts_worse_is_not_believed(walked, monkeypatch):
+    tracks, model = walked
+    # as if the refined model predicted what the other one does, and the other way round
+    monkeypatch.setattr(judge, "held_out", lambda problem, x, seen: held_out(problem, x, seen) * _sign(problem))
+    made, said = refined_by(tracks.imu, model)
+    assert "no better with the IMU" in said.reason
+    assert not said.values["accepted"]
+    assert made.reconstruction is model.reconstruction
+
+
+def test_what_takes_too_much_memory_is_left_as_it_is(walked, monkeypatch):
+    tracks, model = walked
+    monkeypatch.setattr(judge, "_MOST_BYTES", 100_000)
+    made, said = refined_by(tracks.imu, model)
+    assert "GB" in said.reason
+    assert made.reconstruction is model.reconstruction
+
+
+def test_what_does_not_come_to_rest_is_not_believed(walked, monkeypatch):
+    tracks, model = walked
+    for restless, why in ((0, "pictures alone"), (1, "the refinement does not"), (2, "with all observations")):
+        count = iter(range(3))
+
+        def solved(problem, start, restless=restless, count=count):
+            one = solve(problem, start)
+            return replace(one, converged=next(count) != restless)
+
+        monkeypatch.setattr(judge, "solve", solved)
+        made, said = refined_by(tracks.imu, model)
+        assert why in said.reason
+        assert "come to rest" in said.reason
+        assert made.reconstruction is model.reconstruction
+
+
+def test_what_nothing_is_known_about_is_not_believed(walked, monkeypatch):
+    tracks, model = walked
+
+    def failed(problem, x):
+        raise np.linalg.LinAlgError
+
+    monkeypatch.setattr(judge, "factored", failed)
+    made, said = refined_by(tracks.imu, model)
+    assert "how sure" in said.reason
+    assert said.values["chi2"] < 1.5
+    assert made.reconstruction is model.reconstruction
+
+
+def _sign(problem):
+    return 0.5 if problem.inertial is None else 1.0
+
+
+@pytest.mark.parametrize("spoil", ["late", "gain"])
+def test_a_false_imu_does_no_harm(walked, spoil):
+    tracks, model = walked
+    imu = tracks.imu
+    if spoil == "late":
+        imu = replace(imu, gyro_t_s=imu.gyro_t_s + 0.03, accel_t_s=imu.accel_t_s + 0.03)
+    else:
+        imu = replace(imu, accel_m_s2=imu.accel_m_s2 * 1.05)
+    made, _ = refined_by(imu, model)
+    truth = tracks.motion.cam_in_world_m(tracks.timing.pose_t_s())
+    assert error_of(centres_of(made.reconstruction), truth) < 1.05 * error_of(centres_of(model.reconstruction), truth)
+
+
+def test_what_cannot_be_refined_is_said(walked):
+    tracks, model = walked
+    for other, why in (
+        (replace(model, similarity=None), "it has no scale"),
+        (replace(model, scale=replace(model.scale, noise=None)), "the joint method does"),
+        (replace(model, rectified=True), "cannot say from where"),
+        (replace(model, scale=replace(model.scale, parts={"accel_faults": 1e-3})), "has faults"),
+        (replace(model, timing=replace(model.timing, t_s=model.timing.t_s + 1e4)), "less than half"),
+    ):
+        made, said = refined_by(tracks.imu, other)
+        assert why in said.reason
+        assert made.reconstruction is model.reconstruction
+    empty = pycolmap.Reconstruction(model.reconstruction)
+    for point_id in list(empty.point3D_ids()):
+        empty.delete_point3D(point_id)
+    assert "points" in refined_by(tracks.imu, replace(model, reconstruction=empty))[1].reason
+
+
+def test_without_the_option_the_stages_are_what_they_were(walked):
+    tracks, _ = walked
+    recording = Recording.of(Capture(path="none", calibration=UNKNOWN), tracks.imu, tracks.timing, UNKNOWN)
+    stages = default_model_stages(recording, ReconstructOptions())
+    assert [type(stage) for stage in stages] == [ReadoutStage, MetricStage]
+    stages = default_model_stages(recording, ReconstructOptions(refine="inertial"))
+    assert [type(stage) for stage in stages] == [ReadoutStage, MetricStage, RefineStage]
+
+
+def test_an_existing_project_is_refined(walked, tmp_path):
+    tracks, _ = walked
+    project = tmp_path / "project"
+    (project / "sparse" / "0").mkdir(parents=True)
+    adjusted(tracks.reconstruction()).write_binary(str(project / "sparse" / "0"))
+    rows = [f"{name},{t_s:.9f}" for name, t_s in zip(tracks.timing.names, tracks.timing.t_s.tolist(), strict=True)]
+    times, imu = tmp_path / "times.csv", tmp_path / "imu"
+    times.write_text("name,t_s\n" + "\n".join(rows) + "\n")
+    imu.mkdir()
+    for name, t_s, values in (
+        ("gyroscope.txt", tracks.imu.gyro_t_s, tracks.imu.gyro_rad_s),
+        ("accelerometer.txt", tracks.imu.accel_t_s, tracks.imu.accel_m_s2),
+    ):
+        stamps = np.rint((t_s + 1000) * 1e9).astype(np.int64)
+        lines = [f"{t} {x:.8f} {y:.8f} {z:.8f}" for t, (x, y, z) in zip(stamps.tolist(), values, strict=True)]
+        (imu / name).write_text("\n".join(lines) + "\n")
+    source = ProjectOptions(imu=imu, frame_times=times)
+    result = reconstruct_project(project, tmp_path / "out", source, ReconstructOptions(refine="inertial"))
+    said = json.loads((tmp_path / "out" / "result.json").read_text())["models"][0]["treatments"][-1]
+    assert (said["stage"], said["action"]) == ("refine", "refined")
+    truth = tracks.motion.cam_in_world_m(tracks.timing.pose_t_s())
+    made, mapped = read_model(tmp_path / "out" / "sparse" / "0"), read_model(project / "sparse" / "0")
+    assert error_of(centres_of(made), truth) < error_of(centres_of(mapped), truth)
+    assert result.models[0].trajectory is not None
+    # the IMU would count twice
+    assert (tmp_path / "out" / "trajectory.tum").exists()
+    assert not (tmp_path / "out" / "trajectory_cov.npz").exists()

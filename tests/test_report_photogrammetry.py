@@ -1,0 +1,143 @@
+"""What the report says as photogrammetrists know it, and how the page prints."""
+
+import base64
+import json
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from chromium import Page
+from jsonschema import Draft202012Validator
+from report_runs import write_run
+
+from colmap_inertial.report import write_report
+from colmap_inertial.report.photogrammetry import photogrammetry_record
+
+ROOT = Path(__file__).parents[1]
+UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+@pytest.fixture(scope="module")
+def synthetic():
+    """A model with 0.5 px of noise in its keypoints, and a lens that bends."""
+    pycolmap.set_random_seed(3)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 1, 8
+    options.num_points3D = 400
+    options.camera_model_id = pycolmap.CameraModelId.SIMPLE_RADIAL
+    options.camera_params = [1280.0, 512.0, 384.0, 0.1]
+    model = pycolmap.synthesize_dataset(options)
+    noise = pycolmap.SyntheticNoiseOptions()
+    noise.point2D_stddev = 0.5
+    pycolmap.synthesize_noise(noise, model)
+    return model
+
+
+@pytest.fixture(scope="module")
+def record(synthetic):
+    return photogrammetry_record(synthetic, UPRIGHT, unit="m")
+
+
+def test_residuals_are_those_of_the_noise(synthetic, record):
+    rms = [image["rms_px"] for image in record["images"]]
+    assert len(rms) == 8 and np.mean(rms) == pytest.approx(0.5 * np.sqrt(2), rel=0.1)
+    sensor = record["sensor"]
+    assert sum(sensor["count"]) == sum(image["observations"] for image in record["images"])
+    weights = np.array(sensor["count"], dtype=float)
+    squares = np.array([0 if v is None else v for v in sensor["rms_px"]]) ** 2
+    assert np.sqrt((weights * squares).sum() / weights.sum()) == pytest.approx(0.5 * np.sqrt(2), rel=0.1)
+
+
+def test_tracks_and_overlap_count_images(synthetic, record):
+    tracks = record["tracks"]
+    assert sum(tracks["counts"]) == synthetic.num_points3D()
+    assert tracks["mean"] == pytest.approx(synthetic.compute_mean_track_length())
+    seen = [value for row in record["ground"]["images"] for value in row]
+    assert 0 < max(seen) <= 8
+
+
+def test_the_ground_sampling_distance_is_depth_over_focal_length(synthetic, record):
+    image = next(synthetic.image(i) for i in synthetic.reg_image_ids() if synthetic.image(i).name)
+    found = next(one["gsd"] for one in record["images"] if one["name"] == image.name)
+    pose = image.cam_from_world()
+    depths = [(pose * synthetic.point3D(p.point3D_id).xyz)[2] for p in image.get_observation_points2D()]
+    assert found == pytest.approx(np.median(depths) / 1280, rel=1e-9)
+
+
+def test_the_camera_is_there_with_its_distortion(record):
+    (camera,) = record["cameras"]
+    assert camera["params"]["f"] == 1280 and camera["images"] == 8
+    at, shift = np.array(camera["distortion"]["at_px"]), np.array(camera["distortion"]["shift_px"])
+    outward = ((at - [512, 384]) * shift).sum(axis=1)
+    corner = np.argmax(np.linalg.norm(at - [512, 384], axis=1))
+    assert (outward >= -1e-6).all() and np.linalg.norm(shift[corner]) > 10  # a positive radial term moves points out
+
+
+def with_survey(out, record):
+    """A finished run whose report has all sections."""
+    write_run(out)
+    file = out / "report_data" / "model_0.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), "photogrammetry": record}))
+    return write_report(out)
+
+
+def test_the_content_keeps_to_its_schema(tmp_path, record):
+    with_survey(tmp_path / "run", record)
+    content = json.loads((tmp_path / "run" / "report.json").read_text())
+    schema = json.loads((ROOT / "docs" / "schemas" / "report.schema.json").read_text())
+    of_model = schema["properties"]["models"]["items"]["properties"]["photogrammetry"]
+    Draft202012Validator({**of_model, "$defs": schema["$defs"]}).validate(content["models"][0]["photogrammetry"])
+    assert set(content) == set(schema["properties"]) == set(schema["required"])
+    page = (tmp_path / "run" / "report.html").read_text()
+    for words in ("Camera calibration", "Reprojection residuals", "Overlap, from above", "ground sampling distance"):
+        assert words in page
+
+
+#: Of each plot: whether it is shown, and where its still picture lies.
+BOXES = """JSON.stringify([...document.querySelectorAll('.plot')].map((plot) => {
+    const still = plot.nextElementSibling, box = still.getBoundingClientRect();
+    return {
+        shown: getComputedStyle(plot).display, left: box.left, right: box.right, height: box.height,
+        natural: still.naturalWidth,
+    };
+}))"""
+#: Puts the number of colours of the model's still picture into the title.
+INK = """(() => {
+    const still = document.querySelector('#scene .still');
+    const canvas = Object.assign(document.createElement('canvas'), {width: 300, height: 220});
+    const brush = canvas.getContext('2d');
+    brush.drawImage(still, 0, 0, 300, 220);
+    const pixels = brush.getImageData(0, 0, 300, 220).data, colours = new Set();
+    for (let i = 0; i < pixels.length; i += 4) {
+        if (pixels[i + 3]) colours.add(pixels[i] * 65536 + pixels[i + 1] * 256 + pixels[i + 2]);
+    }
+    document.title = colours.size;
+})()"""
+
+
+def test_it_prints_on_a4_with_still_pictures_and_nothing_cut(tmp_path, record):
+    report = with_survey(tmp_path / "run", record)
+    page = Page(tmp_path / "profile")
+    try:
+        page.open(report.as_uri())
+        page.wait('document.documentElement.dataset.stills === "made"', 120)
+        printed = base64.b64decode(page.call("Page.printToPDF", preferCSSPageSize=True, printBackground=True)["data"])
+        page.call("Emulation.setEmulatedMedia", media="print")
+        # A4 without its margins, at 96 dots an inch
+        page.call("Emulation.setDeviceMetricsOverride", width=688, height=1006, deviceScaleFactor=1, mobile=False)
+        page.settle()
+        boxes = json.loads(page.evaluate(BOXES))
+        wide = page.evaluate("document.documentElement.scrollWidth")
+        page.evaluate(INK)
+        page.settle()
+        colours = int(page.evaluate("document.title"))
+    finally:
+        page.close()
+    assert len(boxes) > 10
+    for box in boxes:
+        assert box["shown"] == "none" and box["natural"] > 0
+        assert box["left"] >= 0 and box["right"] <= 689 and box["height"] < 500
+    assert wide <= 689
+    assert colours > 20  # the model is on its picture
+    assert b"/MediaBox [0 0 594" in printed or b"/MediaBox [0 0 595" in printed
