@@ -102,13 +102,9 @@ def test_a_filter_without_delay_is_the_accelerometer_s_where_the_delay_is_known(
     assert estimate.ci95[0] < recording.truth.metres_per_unit < estimate.ci95[1]
 
 
-@pytest.mark.parametrize("correlation", [0.0, 0.9, 0.98])
-def test_gains_that_a_calibration_ties_together_are_no_surprise(recording, correlation):
-    cov = np.eye(IMU_CAL.COUNT) * 1e-8
-    gains = np.r_[IMU_CAL.ACCEL_GAIN, IMU_CAL.GYRO_GAIN]
-    tie = np.kron(np.array([[1, correlation], [correlation, 1]]), np.eye(9)) * 2e-3**2
-    cov[np.ix_(gains, gains)] = tie
-    known = ImuCalibration(
+def without_errors(cov):
+    """A calibration that found nothing to correct, this sure."""
+    return ImuCalibration(
         accel_gain=np.zeros((3, 3)),
         accel_bias_m_s2=np.zeros(3),
         gyro_gain=np.zeros((3, 3)),
@@ -117,6 +113,15 @@ def test_gains_that_a_calibration_ties_together_are_no_surprise(recording, corre
         gravity_m_s2=9.80665,
         attitudes=24,
     )
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.9, 0.98])
+def test_gains_that_a_calibration_ties_together_are_no_surprise(recording, correlation):
+    cov = np.eye(IMU_CAL.COUNT) * 1e-8
+    gains = np.r_[IMU_CAL.ACCEL_GAIN, IMU_CAL.GYRO_GAIN]
+    tie = np.kron(np.array([[1, correlation], [correlation, 1]]), np.eye(9)) * 2e-3**2
+    cov[np.ix_(gains, gains)] = tie
+    known = without_errors(cov)
     estimate = estimate_scale(recording.trajectory, recording.imu, imu_calibration=known)
     assert estimate.verdict == "trusted" and estimate.parts["accel_gain"] < 0.002
 
@@ -178,15 +183,7 @@ def test_the_parts_of_the_variance_are_those_of_the_covariance(recording):
 
 def test_the_interval_says_what_it_is_made_of_and_a_calibration_takes_its_part_off(recording):
     cov = np.diag([1e-4**2] * IMU_CAL.COUNT)
-    known = ImuCalibration(
-        accel_gain=np.zeros((3, 3)),
-        accel_bias_m_s2=np.zeros(3),
-        gyro_gain=np.zeros((3, 3)),
-        gyro_bias_rad_s=np.zeros(3),
-        cov=cov,
-        gravity_m_s2=9.80665,
-        attitudes=24,
-    )
+    known = without_errors(cov)
     plain = estimate_scale(recording.trajectory, recording.imu)
     better = estimate_scale(recording.trajectory, recording.imu, imu_calibration=known)
     for estimate in (plain, better):

@@ -14,8 +14,6 @@ from colmap_inertial.types import Array
 
 #: Samples of the exposure; of longer blur, one for each so many pixels.
 SAMPLES, SAMPLE_PX = 17, 2.0
-#: A path that leaves its chord by less than this is taken as straight.
-STRAIGHT_BELOW_PX = 0.5
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
