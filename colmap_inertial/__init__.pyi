@@ -70,6 +70,7 @@ from .stages.apertures import ApertureStage as ApertureStage
 from .stages.deblur import DeblurStage as DeblurStage
 from .stages.exposures import ExposureStage as ExposureStage
 from .stages.frame_folder import FrameRecord as FrameRecord
+from .stages.join import JoinStage as JoinStage
 from .stages.metric import MetricStage as MetricStage
 from .stages.protocols import FrameStage as FrameStage, KeypointStage as KeypointStage, ModelStage as ModelStage
 from .stages.readout import ReadoutStage as ReadoutStage
@@ -83,9 +84,11 @@ from .types import (
     Frame as Frame,
     FrameLog as FrameLog,
     FrameTiming as FrameTiming,
+    Gap as Gap,
     ImuCalibration as ImuCalibration,
     ImuNoise as ImuNoise,
     ImuRecording as ImuRecording,
+    JoinedPart as JoinedPart,
     Keypoints as Keypoints,
     ScaleEstimate as ScaleEstimate,
     Similarity as Similarity,

@@ -74,6 +74,11 @@ class VisualRotation:
     support: NDArray[np.intp]
     epoch_ns: int = 0
 
+    @property
+    def step_s(self) -> float:
+        """The usual time between frames."""
+        return float(np.median(np.diff(self.t_s)))
+
     def trajectory(self) -> CameraTrajectory:
         """The longest unbroken run of frames, as orientations chained from its first frame; positions are zero.
 
@@ -131,7 +136,7 @@ def measure_rotation(
     for frame in frames:
         height, width = frame.image.shape[:2]
         shutter = FrameShutter.of(timing, index[frame.name], width=width, height=height)
-        now = (_reduced(frame.image, options), shutter)
+        now = (reduced(frame.image, options), shutter)
         if before is not None:
             pair = _pair_rotation(before, now, camera, options)
             turns.append(np.full(3, np.nan) if pair is None else pair[0])
@@ -310,7 +315,7 @@ _INLIER_PX, _SCATTER_FLOOR_PX = 3.0, 0.05
 _DRAWS, _ROUNDS = 100, 15
 
 
-def _reduced(image: NDArray[np.uint8] | NDArray[np.uint16], options: FlowOptions) -> Grey:
+def reduced(image: NDArray[np.uint8] | NDArray[np.uint16], options: FlowOptions) -> Grey:
     import cv2
 
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import cached_property
 
@@ -19,6 +20,9 @@ from colmap_inertial.geometry import (
 )
 from colmap_inertial.sampling import Coverage
 from colmap_inertial.types import Array, CameraImuCalibration, ImuRecording
+
+#: Order of the differences by which noise is told from motion; what the median of a normal distribution's sizes is.
+_DIFFERENCES, _NORMAL_MEDIAN = 5, 0.6745
 
 
 class GyroPath:
@@ -56,6 +60,18 @@ class GyroPath:
         """``start_from_imu`` quaternions (M, 4) and rates (M, 3) in rad/s at ``query_s``; the ends are continued."""
         i, since_s, rate = self._locate(query_s)
         return quat_multiply(self.start_from_imu_xyzw[i], _turn(self.rate_rad_s[i], rate, since_s)), rate
+
+    @cached_property
+    def noise_rad_s_rthz(self) -> float:
+        """Density of white noise, at most: what each reading has of its own.
+
+        Of differences of the fifth order, which leave little of any motion that is slow against the readings.
+        """
+        if len(self.rate_rad_s) <= _DIFFERENCES:
+            return 0.0
+        own = np.abs(np.diff(self.rate_rad_s, n=_DIFFERENCES, axis=0))
+        of_each = float(np.median(own)) / (_NORMAL_MEDIAN * np.sqrt(math.comb(2 * _DIFFERENCES, _DIFFERENCES)))
+        return float(of_each * np.sqrt(np.median(self._step_s)))
 
     def turn_rad(self, begin_s: Array, end_s: Array) -> Array:
         """(M, 3) rotation vectors ``begin_from_end`` of intervals, IMU frame."""

@@ -11,6 +11,7 @@ BlurRemover = Literal["wiener", "path", "deepgyro"]
 DeblurMethod = Literal["off", "wiener", "path", "deepgyro"]
 RollingShutterMethod = Literal["off", "rectify"]
 RefineMethod = Literal["off", "inertial"]
+JoinMethod = Literal["off", "inertial"]
 WorldAxes = Literal["z-up", "y-down"]
 #: What an export is for: a program, or a format.
 ExportProgram = Literal[
@@ -128,6 +129,21 @@ class ScaleOptions(GravityOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
+class JoinOptions:
+    """Up to where separate models are joined by the IMU: standard deviations, along the worst direction."""
+
+    sigma_m: float = 0.1
+    """Of the position after a gap as seen from before it (m)."""
+    sigma_deg: float = 1.0
+    """Of the direction."""
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            if not getattr(self, f.name) > 0:
+                raise ValueError(f"join_options.{f.name} must be positive, not {getattr(self, f.name):g}")
+
+
+@dataclass(frozen=True, kw_only=True)
 class ValidateOptions:
     """How to validate a model."""
 
@@ -159,8 +175,9 @@ class DenseOptions:
     max_image_size: int | None = None
     """Longer side in pixels of the undistorted images and their depth maps (default: as the images are with CUDA, at
     most 1200 without)."""
-    mesh: Literal["poisson", "none"] = "poisson"
-    """Surface of the fused points."""
+    mesh: Literal["poisson", "tsdf", "none"] = "poisson"
+    """poisson: surface of the fused points, by COLMAP. tsdf: of the depth maps, by Open3D (the extra "mesh"); finer and
+    five times as fast, open where little was seen."""
 
     def __post_init__(self) -> None:
         if self.max_image_size is not None and self.max_image_size < 64:
@@ -226,8 +243,8 @@ class ReferenceOptions:
     """Where the metres of a project come from, and what is known of its size."""
 
     scale_from: Literal["imu", "target", "distance"] = "imu"
-    """Where metres come from: the IMU; or, of an existing project and without any IMU, a target of known size in its
-    images, or one known distance."""
+    """Where metres come from: the IMU; or, without any IMU, a target of known size in the images, or one known
+    distance."""
     target: str | None = None
     """With --scale-from: the target, as of `validate --target`; of a distance between markers, what they are."""
     between: tuple[str, str] | None = None
@@ -304,6 +321,11 @@ class ReconstructOptions:
     """How COLMAP builds the model."""
     scale: ScaleOptions = field(default_factory=ScaleOptions)
     """How metres come from the IMU."""
+    join: JoinMethod = "off"
+    """inertial: where COLMAP made several models of one recording, bring those into one that what the IMU felt between
+    them places surely enough."""
+    join_options: JoinOptions = field(default_factory=JoinOptions)
+    """Up to where they are joined."""
     refine: RefineMethod = "off"
     """inertial: fit pictures, rolling shutter and IMU together, so that the metric model bends and drifts less; it
     stays as it is where that predicts observations no better."""

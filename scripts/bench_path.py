@@ -2,7 +2,7 @@
 
     python scripts/bench_path.py --photos FOLDER --motion FOLDER [--every S] [--most N] [--exposures S ...]
         [--methods NAME ...] [--octaves 0 -1] [--only SECTION ...] [--cache FOLDER] [--json FILE]
-    python scripts/bench_path.py --colmap [--methods NAME ...] [--scenes N]
+    python scripts/bench_path.py --colmap [--methods NAME ...] [--scenes N] [--widths PX ...]
 
 Held-out photographs (``restoration/photographs.py``) hang on a wall at infinity before a camera of 1280 x 720 px with
 1000 px of focal length that turns as the gyroscope of TUM-VI's room 5 did, by a reckoning of its own
@@ -14,7 +14,9 @@ more than ``--most-px`` are left out and counted, as the package leaves such fra
 ``quality``: both frames of each pair treated alike. Correct matches of COLMAP's SIFT are those within 3 px of the true
 transfer, on the output for features; ratios to untreated frames are of the sums, their median over pairs, and their
 mean. PSNR is of the output for people, against the frame without blur, noise and JPEG. The gyroscope is exact, or wrong
-in three ways at once (signs drawn for each pair): exposure 10 % too long or short, clock 3 ms, direction 3 degrees.
+in three ways at once (signs drawn for each pair): exposure 10 % too long or short, clock 3 ms, direction 3 degrees. The
+filters are told what a usual calibration says of itself (0.5 ms, 0.3 degrees), or for ``errors`` these errors;
+``--gyros`` has the other way round, too.
 
 ``gate``: the package's gate over each exposure's frames as one recording: which share of the blurred ones it treats, by
 bin, and which share of their matches remains of frames that are sharp while the gyroscope says that they are blurred
@@ -22,7 +24,8 @@ bin, and which share of their matches remains of frames that are sharp while the
 
 ``cost``: processor time of a grey 1080p frame at 10, 20 and 40 px, as a ratio to the straight filter's in the same run.
 
-``--colmap``: whole reconstructions of simulated scenes at 10 and 20 px by ``--deblur`` methods.
+``--colmap``: whole reconstructions of simulated scenes at 10 and 20 px by ``--deblur`` methods, each with the default
+smoothing of what features see, and with the ``--widths``.
 """
 
 from __future__ import annotations
@@ -61,12 +64,15 @@ def main() -> None:
     parser.add_argument("--size", type=int, nargs=2, default=(1280, 720))
     parser.add_argument("--methods", nargs="+", choices=tuple(METHODS), default=tuple(METHODS))
     parser.add_argument("--octaves", type=int, nargs="+", choices=(0, -1), default=(0, -1), help="first ones of SIFT")
-    parser.add_argument("--gyros", nargs="+", choices=path_scenes.GYROS, default=path_scenes.GYROS)
+    parser.add_argument("--gyros", nargs="+", choices=tuple(path_scenes.GYROS), default=("exact", "errors"))
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", nargs="+", choices=SECTIONS, default=SECTIONS)
     parser.add_argument("--cache", type=Path, help="keep rendered frames there")
     parser.add_argument("--colmap", action="store_true", help="reconstructions, and nothing else")
     parser.add_argument("--scenes", type=int, default=8, help="of them")
+    parser.add_argument(
+        "--widths", type=float, nargs="*", default=(), help="of smoothing, px: reconstructions with each"
+    )
     parser.add_argument("--json", type=Path, help="also write all figures there")
     args = parser.parse_args()
     if not args.colmap and args.photos is None:
@@ -80,7 +86,7 @@ def main() -> None:
             args.json.write_text(json.dumps(report, indent=2) + "\n")
 
     if args.colmap:
-        path_reconstructions.measure(report, args.methods, args.scenes, console=console, keep=keep)
+        path_reconstructions.measure(report, args.methods, args.scenes, args.widths, console=console, keep=keep)
     else:
         takes = path_scenes.takes(
             args.photos,

@@ -1,6 +1,7 @@
 """The whole run against bare COLMAP: processor time, registered images, camera error, loops.
 
-    python scripts/bench_whole.py FOLDER [--euroc DATASET] [--walk FRAMES] [--repeated SCENES] [--json FILE]
+    python scripts/bench_whole.py FOLDER [--euroc DATASET] [--walk FRAMES] [--loop FRAMES] [--repeated SCENES]
+        [--drawn] [--json FILE]
 
 FOLDER takes captures and reconstructions. ``--euroc``: the 100 keyframes of V1_01_easy (DATASET has ``keyframes/``,
 ``mav0/`` and ``gt/``), bare COLMAP matching every pair. ``--walk``: a simulated walk around a room back to its start
@@ -10,8 +11,14 @@ defaults), in processes of their own, one thread each; processor time is that of
 Camera error: rms distance of the camera centres from the truth after a similarity. Loop error: of frames at the end,
 how far they lie from the frame at the start that is truly nearest, against the truth.
 
-``--repeated``: walks of 100 frames past posters that hang many times; of the pairs that close loops, those whose
-cameras are in truth more than 2 m apart or look more than 60 degrees apart are false.
+``--loop``: the loop's error of a walk around a room, with its loops closed, and of the same features matched
+sequentially with a linear overlap (``quadratic_overlap`` off, no loops), both mapped alike; features are synthesised
+(``walk_features.py``).
+
+``--repeated``: walks of 160 frames past posters that hang many times (``SCENES`` below, a seed each). A pair that
+closes a loop is false where less than half of its matches join what is the same place in truth (within 15 cm). A frame
+that comes back to where an earlier one was (half a metre, 20 degrees) is missed where no true loop is within four
+frames of it. Features are synthesised, so that copies look the same as they can; ``--drawn``: found in drawn pictures.
 """
 
 from __future__ import annotations
@@ -22,24 +29,44 @@ import resource
 import shutil
 import subprocess
 import sys
+import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import yaml
 from check_euroc import similarity
-from walk_scenes import Walk, write_walk
+from walk_features import write_features
+from walk_scenes import Scene, Walk, places_m, world_of, write_walk
 
+from colmap_inertial.colmap.pairing import match_capture
+from colmap_inertial.colmap.sparse import extract_features, map_images
 from colmap_inertial.geometry import matrix_from_quat, quat_rotate, slerp
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.files import read_json
+from colmap_inertial.io.frames import read_frames
+from colmap_inertial.io.imu import read_capture_imu
 from colmap_inertial.model import find_models, read_model
 from colmap_inertial.options import MappingOptions
+from colmap_inertial.run.context import Recording, RunContext
+from colmap_inertial.run.session import keep_colmap_quiet
 from colmap_inertial.types import Array
 
 Figures = dict[str, float]
 #: Of a walk, frames at the start and at the end between which the loop's error is measured.
 ENDS = 0.06
-NEAR_M, SAME_DEG = 2.0, 60.0
+#: What walks of ``--repeated`` go past, by their seeds; further ones begin again.
+SCENES: tuple[Scene, ...] = (
+    *("mixed", "mixed", "mixed", "copies", "copies", "copies", "tiled", "corridor", "corridor", "tiled corridor"),
+)
+#: Neighbours that are matched; farther apart than twice as many frames, a pair is a loop.
+OVERLAP = 4
+#: Likewise for the loop's error.
+LOOP_OVERLAP = 5
+#: Matches join the same place within this; a frame is back within this and looking this way, or a loop is near it.
+SAME_M, BACK_M, BACK_DEG, BESIDE = 0.15, 0.5, 20.0, 4
+#: Synthesised features: for the loop's error, and for repeated texture.
+LOOP_DENSITY, REPEATED_DENSITY = 1.2, 1.5
 
 
 def bare(capture: Path, out: Path, *, sequential: bool) -> None:
@@ -154,41 +181,137 @@ def true_centres(folder: Path) -> dict[str, Array]:
     return dict(zip(truth["names"], np.array(truth["cam_in_world_m"]), strict=True))
 
 
-def false_loops(folder: Path) -> Figures:
-    """Of the loops that matching closes, how many are false."""
-    from colmap_inertial.colmap import pairing
-    from colmap_inertial.colmap.sparse import extract_features
-    from colmap_inertial.io.frames import read_frames
-    from colmap_inertial.io.imu import read_capture_imu
-    from colmap_inertial.run.context import Recording, RunContext
-    from colmap_inertial.run.session import keep_colmap_quiet
-
-    keep_colmap_quiet()
+def recorded(folder: Path) -> Recording:
+    """A capture, read."""
     capture = load_capture(folder)
     timing, _ = read_frames(capture)
-    recording = Recording.of(capture, read_capture_imu(capture), timing, capture.calibration)
-    context, options = RunContext(scratch=folder, num_threads=1), MappingOptions(pairing="sequential")
+    return Recording.of(capture, read_capture_imu(capture), timing, capture.calibration)
+
+
+def false_loops(walk: Walk, folder: Path) -> Figures:
+    """Of the loops that matching closes, how many are false, and what it misses."""
+    keep_colmap_quiet()
+    write_walk(walk, folder)
+    recording, context = recorded(folder), RunContext(scratch=folder, num_threads=1)
+    camera, names = recording.capture.camera, recording.timing.names
+    options = MappingOptions(pairing="sequential", overlap=OVERLAP)
     features, database = folder / "features.db", folder / "database.db"
-    if not features.is_file():
-        extract_features(
-            folder / "frames", dict.fromkeys(timing.names, capture.camera), features, options, context=context
-        )
-    database.unlink(missing_ok=True)
-    record = pairing.match_capture(features, database, recording, capture.camera, options, context)
+    if not features.is_file() and walk.drawn:
+        extract_features(folder / "frames", dict.fromkeys(names, camera), features, options, context=context)
+    elif not features.is_file():
+        write_features(walk, names, features, density=REPEATED_DENSITY)
+    for left in folder.glob(f"{database.name}*"):
+        left.unlink()
+    begun_s = time.process_time()
+    record = match_capture(features, database, recording, camera, options, context)
+    processor_s = time.process_time() - begun_s
     truth = read_json(folder / "truth.json")
-    centre, looking = (
-        np.array(truth["cam_in_world_m"]),
-        matrix_from_quat(np.array(truth["world_from_cam_xyzw"]))[:, :, 2],
+    centre, turned = np.array(truth["cam_in_world_m"]), matrix_from_quat(np.array(truth["world_from_cam_xyzw"]))
+    right = {pair: share >= 0.5 for pair, share in true_shares(walk, names, centre, turned, database).items()}
+    loops = {pair: true for pair, true in right.items() if pair[1] - pair[0] > 2 * OVERLAP}
+    apart_m = np.linalg.norm(centre[:, None] - centre, axis=2)
+    apart_deg = np.degrees(np.arccos(np.clip(turned[..., 2] @ turned[..., 2].T, -1, 1)))
+    later = np.arange(len(names)) - np.arange(len(names))[:, None] > 2 * OVERLAP
+    back = np.flatnonzero(((apart_m < BACK_M) & (apart_deg < BACK_DEG) & later).any(axis=0))
+    closing = np.array([pair[1] for pair, true in loops.items() if true])
+    found = np.array([bool((np.abs(closing - j) <= BESIDE).any()) for j in back], dtype=np.bool_)
+    return {
+        "processor_s": processor_s,
+        "candidates": record.loop_candidates,
+        "refused": record.loops_refused,
+        "closed": len(loops),
+        "false": sum(not true for true in loops.values()),
+        "false_neighbours": sum(not true for pair, true in right.items() if pair not in loops),
+        "back": len(back),
+        "missed": int((~found).sum()),
+        "heading": record.heading_sigma_deg if record.heading_sigma_deg is not None else float("nan"),
+    }
+
+
+def true_shares(
+    walk: Walk, names: Sequence[str], centre: Array, turned: Array, database: Path
+) -> dict[tuple[int, int], float]:
+    """Of each verified pair of frames, the share of its matches that join what is the same place in truth."""
+    import pycolmap
+
+    world, place = world_of(walk), {name: i for i, name in enumerate(names)}
+    shares = {}
+    with pycolmap.Database.open(str(database)) as opened:
+        images = {image.name: image for image in opened.read_all_images()}
+        camera = opened.read_all_cameras()[0]
+        for pair in verified_pairs(database):
+            both = sorted(pair)
+            matches = opened.read_two_view_geometry(*(images[name].image_id for name in both)).inlier_matches
+            some = np.array(matches)[np.linspace(0, len(matches) - 1, min(60, len(matches))).astype(int)]
+            met = []
+            for name, mine in zip(both, some.T, strict=True):
+                xy_px = np.array(opened.read_keypoints(images[name].image_id))[mine, :2].astype(np.float64)
+                seen = np.asarray(camera.cam_from_img(xy_px))[:, :2]
+                rays = np.column_stack([seen, np.ones(len(seen))]) @ turned[place[name]].T
+                met.append(places_m(world, np.tile(centre[place[name]], (len(rays), 1)), rays))
+            off_m = np.linalg.norm(met[0] - met[1], axis=1)
+            shares[place[both[0]], place[both[1]]] = float(np.mean(off_m < SAME_M))
+    return shares
+
+
+def matched_in_line(features: Path, database: Path, overlap: int) -> Figures:
+    """Match each frame with the next ones, and no others, in a copy of the features."""
+    import pycolmap
+
+    shutil.copyfile(features, database)
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.use_gpu, matching.num_threads = False, 1
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = 0
+    pairing = pycolmap.SequentialPairingOptions(overlap=overlap, quadratic_overlap=False)
+    pycolmap.match_sequential(
+        str(database),
+        matching_options=matching,
+        pairing_options=pairing,
+        verification_options=verification,
+        device=pycolmap.Device.cpu,
     )
-    place = {name: i for i, name in enumerate(truth["names"])}
-    closed, false = 0, 0
-    for first, second in verified_pairs(database):
-        i, j = sorted((place[first], place[second]))
-        if j - i > 2 * options.overlap:
-            closed += 1
-            apart = np.degrees(np.arccos(np.clip(looking[i] @ looking[j], -1, 1)))
-            false += bool(np.linalg.norm(centre[i] - centre[j]) > NEAR_M or apart > SAME_DEG)
-    return {"closed": closed, "false": false, "refused": record.loops_refused, "candidates": record.loop_candidates}
+    return {"loops_closed": 0, "verified": len(verified_pairs(database))}
+
+
+def loop_errors(walk: Walk, folder: Path) -> dict[str, Figures]:
+    """The loop's error where it is closed, and where it is not."""
+    keep_colmap_quiet()
+    write_walk(walk, folder)
+    recording, context = recorded(folder), RunContext(scratch=folder, num_threads=1)
+    camera, names = recording.capture.camera, recording.timing.names
+    options = MappingOptions(pairing="sequential", overlap=LOOP_OVERLAP)
+    truth, features = true_centres(folder), folder / "features.db"
+    if not features.is_file():
+        write_features(walk, names, features, density=LOOP_DENSITY)
+    found: dict[str, Figures] = {}
+    for kind in ("open", "closed"):
+        database, models = folder / f"{kind}.db", folder / kind
+        shutil.rmtree(models, ignore_errors=True)
+        for left in folder.glob(f"{database.name}*"):
+            left.unlink()
+        begun_s = time.process_time()
+        if kind == "open":
+            told = matched_in_line(features, database, options.overlap)
+        else:
+            record = match_capture(features, database, recording, camera, options, context)
+            told = {"loops_closed": record.loops_closed, "verified": record.verified}
+        matched_s = time.process_time()
+        map_images(
+            database,
+            folder / "frames",
+            models,
+            options,
+            refine_intrinsics=False,
+            num_images=len(names),
+            context=context,
+        )
+        told |= {"matching_s": matched_s - begun_s, "mapping_s": time.process_time() - matched_s}
+        told["peak_mib"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        found[kind] = told | judged(models, truth, walk=True)
+        print(json.dumps({kind: found[kind]}), flush=True)
+    found["closed"]["of_open"] = found["closed"]["loop_error_m"] / found["open"]["loop_error_m"]
+    return found
 
 
 def verified_pairs(database: Path) -> list[tuple[str, str]]:
@@ -207,7 +330,10 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--euroc", type=Path, help="folder of the data set")
     parser.add_argument("--walk", type=int, default=0, help="frames")
+    parser.add_argument("--loop", type=int, default=0, help="frames")
     parser.add_argument("--repeated", type=int, default=0, help="scenes")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first scene")
+    parser.add_argument("--drawn", action="store_true", help="find the scenes' features in drawn pictures")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--bare-sequential", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--bare-exhaustive", type=Path, help=argparse.SUPPRESS)
@@ -225,10 +351,15 @@ def main() -> None:
         capture = write_walk(Walk(seed=100, frames=args.walk, frame_rate_hz=args.walk / 37.5), folder)
         found["walk"] = both(capture, folder, true_centres(folder), sequential=True)
         print(json.dumps({"walk": found["walk"]}, indent=1), flush=True)
-    for seed in range(args.repeated):
-        folder = args.folder / f"repeated{seed}"
-        write_walk(Walk(seed=seed, frames=100, frame_rate_hz=3.0, laps=1.15, repeated=True), folder)
-        found[folder.name] = false_loops(folder)
+    if args.loop:
+        walk = Walk(seed=100, frames=args.loop, frame_rate_hz=args.loop / 40, drawn=False)
+        found["loop"] = loop_errors(walk, args.folder / f"loop{args.loop}")
+        print(json.dumps({"loop": found["loop"]}, indent=1), flush=True)
+    for seed in range(args.first, args.first + args.repeated):
+        folder = args.folder / f"{'drawn' if args.drawn else 'repeated'}{seed}"
+        scene, wide = SCENES[seed % len(SCENES)], 320 if args.drawn else 480
+        walk = Walk(seed=seed, frames=160, frame_rate_hz=3.2, laps=1.15, scene=scene, width=wide, drawn=args.drawn)
+        found[folder.name] = {"scene": scene, **false_loops(walk, folder)}
         print(json.dumps({folder.name: found[folder.name]}), flush=True)
     if args.json:
         args.json.write_text(json.dumps(found, indent=1) + "\n")

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from rich.console import Console
@@ -19,6 +20,7 @@ from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.imaging.psf import predicted_blur_px
 from colmap_inertial.model import colmap_camera, read_model
 from colmap_inertial.options import ReconstructOptions
+from colmap_inertial.precalibrate import plan
 from colmap_inertial.simulate import MotionOptions, SceneRecipe, make_scene, read_truth, write_capture
 from colmap_inertial.types import Array, CameraTrajectory, FrameTiming
 
@@ -80,8 +82,14 @@ def with_blur(recipe: SceneRecipe, blur_px: float) -> SceneRecipe:
     return replace(recipe, camera=replace(recipe.camera, exposure_s=round(exposure_s, 5)))
 
 
-def reconstructed(recipe: SceneRecipe, blur_px: float, ways: Mapping[str, ReconstructOptions]) -> dict[str, Any]:
-    """A scene with this blur, reconstructed in several ways."""
+def reconstructed(
+    recipe: SceneRecipe,
+    blur_px: float,
+    ways: Mapping[str, ReconstructOptions],
+    widths_px: Mapping[str, float] | None = None,
+) -> dict[str, Any]:
+    """A scene with this blur, reconstructed in several ways, some with another smoothing of what features see."""
+    widths_px = widths_px or {}
     recipe = with_blur(recipe, blur_px)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -93,15 +101,19 @@ def reconstructed(recipe: SceneRecipe, blur_px: float, ways: Mapping[str, Recons
             "exposure_s": recipe.camera.exposure_s,
             "readout_s": recipe.camera.readout_s,
             "ways": {
-                way: _run(capture, folder / str(i), options, truth) for i, (way, options) in enumerate(ways.items())
+                way: _run(capture, folder / str(i), options, truth, widths_px.get(way, plan.SMOOTHING_PX))
+                for i, (way, options) in enumerate(ways.items())
             },
         }
 
 
-def _run(capture: Path, out: Path, options: ReconstructOptions, truth: CameraTrajectory) -> dict[str, Any]:
+def _run(
+    capture: Path, out: Path, options: ReconstructOptions, truth: CameraTrajectory, width_px: float
+) -> dict[str, Any]:
     """Of the largest model, as it is handed on."""
     try:
-        result = reconstruct(capture, out, options)
+        with patch.object(plan, "SMOOTHING_PX", width_px):
+            result = reconstruct(capture, out, options)
     except MappingError:
         return {"registered": 0, "points": 0, "centre_error_pct": float("nan"), "rotation_deg": float("nan")}
     largest = max(result.models, key=lambda model: model.summary["registered_images"])

@@ -150,7 +150,7 @@ def _gated(image: Grey, known: Known, verdict: RecordingVerdict) -> Grey | None:
     # the package leaves frames with less blur alone, before any picture is asked
     if factor is None or float(np.percentile(field.extent_px(), 90)) < LEAST_PX * image.shape[1] / 1920:
         return None
-    scaled = replace(field, vector_px=field.vector_px * np.float32(factor))
+    scaled = field.times(factor)
     out, kept = keep_sharp(image, path_wiener(image, blur_path(*known, extent_factor=factor), _ONE), scaled)
     return smoothed(out, SMOOTHED_PX) if kept < MOSTLY_KEPT else out
 

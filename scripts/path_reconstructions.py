@@ -27,7 +27,13 @@ def scenes(count: int) -> dict[str, tuple[SceneRecipe, float]]:
 
 
 def measure(
-    report: dict[str, Any], methods: Sequence[str], count: int, *, console: Console, keep: Callable[[], None]
+    report: dict[str, Any],
+    methods: Sequence[str],
+    count: int,
+    widths_px: Sequence[float],
+    *,
+    console: Console,
+    keep: Callable[[], None],
 ) -> None:
     """Adds ``colmap``: figures of each scene as they come, then what is wanted of their medians."""
     known = [name for name in methods if name in get_args(DeblurMethod)]
@@ -36,12 +42,15 @@ def measure(
         "rectified": ReconstructOptions(deblur="off"),
         **{name: ReconstructOptions(deblur=name) for name in known},
     }
+    others = {f"{name}, {width:g} px": (name, width) for name in known for width in widths_px}
+    ways |= {way: ReconstructOptions(deblur=name) for way, (name, _) in others.items()}
+    widths = {way: width for way, (_, width) in others.items()}
     found: dict[str, Any] = {}
     report["colmap"] = {"scenes": found, "wanted": []}
     for name, (recipe, blur_px) in scenes(count).items():
         with console.status(f"COLMAP, {name}"):
-            found[name] = imaging_colmap.reconstructed(recipe, blur_px, ways)
-        report["colmap"]["wanted"] = [line for way in known for line in wanted(found, way)]
+            found[name] = imaging_colmap.reconstructed(recipe, blur_px, ways, widths)
+        report["colmap"]["wanted"] = [line for way in (*known, *others) for line in wanted(found, way)]
         keep()
 
 

@@ -17,7 +17,7 @@ from turning_world import Array, Light, Moment, Turning, TurningCamera
 
 from colmap_inertial.geometry import quat_exp
 from colmap_inertial.gyro import GyroPath
-from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
+from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera, MotionErrors
 from colmap_inertial.imaging.transfer import srgb_from_linear
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.types import CameraModel, Projector
@@ -32,9 +32,18 @@ READOUT_S, INTERVAL_S = 0.02, 0.2
 NOISE, JPEG = 0.01, 90
 #: Instants of an exposure, and of longer blur, one each so many px.
 SAMPLES, SAMPLE_PX = 112, 0.3
-#: The gyroscope: right; or exposure, clock and direction wrong at once.
-GYROS = ("exact", "errors")
 EXTENT, LATE_S, ANGLE_RAD = 0.1, 3e-3, np.radians(3.0)
+#: What a calibration says of itself: a usual one, and one as bad as these errors.
+GOOD = MotionErrors(rotation_cov_rad2=np.radians(0.3) ** 2 * np.eye(3), offset_sigma_s=5e-4)
+BAD = MotionErrors(rotation_cov_rad2=ANGLE_RAD**2 * np.eye(3), offset_sigma_s=LATE_S, extent_sigma=EXTENT)
+#: The gyroscope, whether it is wrong, and what the package is told of it: right; or exposure, clock and direction wrong
+#: at once, and known to be; and each with what is told of the other.
+GYROS = {
+    "exact": (False, GOOD),
+    "errors": (True, BAD),
+    "exact but doubted": (False, BAD),
+    "errors unsaid": (True, GOOD),
+}
 #: Of a frame that is sharp.
 SHARP_S = 2e-4
 
@@ -65,8 +74,8 @@ class Pair:
     def known(self, index: int, gyro: str, moment: Moment | None = None) -> Known:
         """What the package is told of a frame."""
         rng = np.random.default_rng([self.seed, 99])
-        wrong = rng.choice([-1.0, 1.0], 3) * (gyro == "errors")
-        return _known(self.camera, moment or self.moments[index], wrong)
+        is_wrong, errors = GYROS[gyro]
+        return _known(self.camera, moment or self.moments[index], rng.choice([-1.0, 1.0], 3) * is_wrong, errors)
 
     def correct_matches(self, a: Features, b: Features) -> tuple[int, int]:
         """How many matches are correct, and how many there are."""
@@ -179,7 +188,7 @@ def shortened(moment: Moment) -> Moment:
     return replace(moment, exposure_s=SHARP_S, t_s=moment.t_s + 0.5 * (moment.exposure_s - SHARP_S))
 
 
-def _known(camera: TurningCamera, moment: Moment, wrong: Array) -> Known:
+def _known(camera: TurningCamera, moment: Moment, wrong: Array, errors: MotionErrors) -> Known:
     width, height = camera.size
     f = camera.focal_px
     model = CameraModel(model="PINHOLE", width=width, height=height, params=(f, f, width / 2, height / 2))
@@ -189,6 +198,7 @@ def _known(camera: TurningCamera, moment: Moment, wrong: Array) -> Known:
         path=path,
         cam_from_imu_xyzw=quat_exp(np.array([0.0, 0.0, ANGLE_RAD * wrong[0]])),
         offset_s=LATE_S * float(wrong[1]),
+        errors=errors,
     )
     exposure_s = moment.exposure_s * (1 + EXTENT * float(wrong[2]))
     # the middle of a row's exposure stays; OpenCV's row 0 is COLMAP's 0.5

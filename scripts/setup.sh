@@ -47,7 +47,8 @@ if [ ! -f "$stamp" ] || [ "$extras" != "$(cat "$stamp")" ] ||
   [ -n "$(find "${sources[@]}" -newer "$stamp" -print -quit)" ]; then
   names=$(paste -sd, <<<"$extras")
   echo "setup: installing Python packages${names:+ for $names} into .venv, and compiling; some minutes the first time"
-  .venv/bin/python -m pip install --disable-pip-version-check --progress-bar on --editable ".${names:+[$names]}" |
+  # Modules are compiled when they are first used: most never are.
+  .venv/bin/python -m pip install --disable-pip-version-check --progress-bar on --no-compile --editable ".${names:+[$names]}" |
     sed -un 's/^ *\(Downloading .*\|Using cached .*\)/  \1/p; s/^ *\(Building .*\)/  \1/p; s/^\(Installing\) collected packages.*/  \1/p'
   printf '%s\n' "$extras" | sed '/^$/d' >"$stamp"
 fi

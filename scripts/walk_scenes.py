@@ -1,10 +1,16 @@
-"""A walk around a room back to its start, filmed towards its walls, on which the same posters may hang many times."""
+"""Walks past walls on which the same posters may hang many times: around a room back to its start, or along a corridor.
+
+What a pixel of a frame truly shows is told by `places_m`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import itertools
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -28,31 +34,56 @@ from colmap_inertial.simulate import (
 from colmap_inertial.simulate.motion import MARGIN_S
 from colmap_inertial.types import Array, CameraModel
 
-CAMERA = ShutterCamera(
-    model=CameraModel(model="PINHOLE", width=480, height=360, params=(380.0, 380.0, 240.0, 180.0)), exposure_s=0.001
-)
 #: Half the room, and half the path, whose corners are rounded.
 HALF_M, PATH_M, HEIGHT_M = np.array([5.0, 4.0]), np.array([3.2, 2.2]), 2.6
+#: A corridor's length, how far its wall is from who walks along it, and how fast that is.
+LENGTH_M, AWAY_M, SPEED_M_S = 40.0, 2.2, 0.6
+#: From one copy to the next.
+PERIOD_M = 1.25
 #: Knots of the path.
 RATE_HZ = 60.0
+
+Kind = Callable[[np.random.Generator, int, int], textures.Texture]
+Paint = Callable[[Kind, np.random.Generator, int, int], textures.Texture]
+Scene = Literal["room", "mixed", "copies", "tiled", "corridor", "tiled corridor"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Walk:
-    """A walk: of how many frames at which rate, how many times around, and whether posters repeat."""
+    """A walk: of how many frames at which rate, past what, how many times around, and how wide its pictures are.
+
+    Where they are not ``drawn``, they are blank: their features come from `walk_features`.
+
+    ``scene``: a ``room`` in which everything is unlike; ``mixed``: in it, every other poster is one of two, of one
+    size, on all walls; ``copies``: nothing but one poster at equal distances, on plaster; ``tiled``: the plaster is the
+    same from each poster to the next, too; likewise a ``corridor`` with one wall, and nobody turns round.
+    """
 
     seed: int
     frames: int = 400
     frame_rate_hz: float = 10.0
     laps: float = 1.08
-    repeated: bool = False
+    scene: Scene = "room"
+    width: int = 480
+    drawn: bool = True
+
+    def camera(self) -> ShutterCamera:
+        """A pinhole of 64 degrees."""
+        height = self.width * 3 // 4
+        params = (self.width * 19 / 24, self.width * 19 / 24, self.width / 2, height / 2)
+        model = CameraModel(model="PINHOLE", width=self.width, height=height, params=params)
+        return ShutterCamera(model=model, exposure_s=0.001)
 
 
+@cache
 def world_of(walk: Walk) -> World:
-    """Plaster, posters and boxes; ``repeated``: every other poster is one of two, of one size, on all walls."""
+    """All that there is to see on a walk."""
     rng = np.random.default_rng([walk.seed, 1])
+    paint = _drawn if walk.drawn else _blank
+    if walk.scene in ("copies", "tiled", "corridor", "tiled corridor"):
+        return _copies(walk, rng, paint)
     up = np.array([0.0, 0.0, 1.0])
-    designs = [textures.poster(rng, 240, 300) for _ in range(2)]
+    designs = [paint(textures.poster, rng, 240, 300) for _ in range(2)]
     quads = []
     corners = HALF_M * np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]])
     for wall in range(4):
@@ -60,14 +91,14 @@ def world_of(walk: Walk) -> World:
         along = (end - start) / np.linalg.norm(end - start)
         length = float(np.linalg.norm(end - start))
         inwards = np.cross(along, up)
-        plaster = textures.plaster(rng, 260, round(100 * length))
+        plaster = paint(textures.plaster, rng, 260, round(100 * length))
         quads.append(Quad(corner_m=start, edge_u_m=end - start, edge_v_m=-HEIGHT_M * up, texture=plaster))
         for place in range(round(length / 1.2)):
-            same = walk.repeated and rng.random() < 0.5
+            same = walk.scene == "mixed" and rng.random() < 0.5
             size = np.array([0.9, 0.75]) if same else rng.uniform([0.5, 0.4], [1.1, 1.0])
             left = (place + rng.uniform(0, 0.15)) * length / round(length / 1.2)
             drawn = (round(300 * size[1]), round(300 * size[0]))
-            texture = designs[rng.integers(len(designs))] if same else textures.poster(rng, *drawn)
+            texture = designs[rng.integers(len(designs))] if same else paint(textures.poster, rng, *drawn)
             corner = start + left * along + rng.uniform(0.02, 0.1) * inwards - rng.uniform(0.4, 0.9) * up
             quads.append(Quad(corner_m=corner, edge_u_m=size[0] * along, edge_v_m=-size[1] * up, texture=texture))
             # something that stands before the wall, here and nowhere else
@@ -78,16 +109,60 @@ def world_of(walk: Walk) -> World:
                 (front - depth * inwards, depth * inwards),
                 (front + width * along, -depth * inwards),
             ):
-                face = textures.poster(rng, round(300 * height), max(8, round(300 * float(np.linalg.norm(edge)))))
+                face = paint(
+                    textures.poster, rng, round(300 * height), max(8, round(300 * float(np.linalg.norm(edge))))
+                )
                 quads.append(Quad(corner_m=corner, edge_u_m=edge, edge_v_m=-height * up, texture=face))
     x, y = np.array([2 * HALF_M[0], 0, 0]), np.array([0, 2 * HALF_M[1], 0])
-    floor = textures.carpet(rng, 800, 1000)
+    floor = paint(textures.carpet, rng, 800, 1000)
     quads.append(Quad(corner_m=np.array([-HALF_M[0], HALF_M[1], 0]), edge_u_m=x, edge_v_m=-y, texture=floor))
     return World(quads=tuple(quads), board=Board(), board_corners_m=np.zeros((0, 3)))
 
 
+def _drawn(kind: Kind, rng: np.random.Generator, height: int, width: int) -> textures.Texture:
+    return kind(rng, height, width)
+
+
+def _blank(kind: Kind, rng: np.random.Generator, height: int, width: int) -> textures.Texture:
+    return np.zeros((2, 2, 3), dtype=np.float32)
+
+
+def _copies(walk: Walk, rng: np.random.Generator, paint: Paint) -> World:
+    """Walls with one poster at equal distances, and nothing else."""
+    up, design = np.array([0.0, 0.0, 1.0]), paint(textures.poster, rng, 240, 300)
+    if "corridor" in walk.scene:
+        corners = np.array([[-LENGTH_M / 2, AWAY_M], [LENGTH_M / 2, AWAY_M]])
+    else:
+        corners = HALF_M * np.array([[-1, 1], [1, 1], [1, -1], [-1, -1], [-1, 1]])
+    tile = paint(textures.plaster, rng, 260, round(100 * PERIOD_M))
+    quads = []
+    for start, end in itertools.pairwise(np.column_stack([corners, np.full(len(corners), HEIGHT_M)])):
+        along = (end - start) / np.linalg.norm(end - start)
+        count = int(np.linalg.norm(end - start) / PERIOD_M)
+        for place in range(count):
+            left, wide = start + place * PERIOD_M * along, PERIOD_M * along
+            plaster = tile if "tiled" in walk.scene else paint(textures.plaster, rng, 260, round(100 * PERIOD_M))
+            quads.append(Quad(corner_m=left, edge_u_m=wide, edge_v_m=-HEIGHT_M * up, texture=plaster))
+            corner = left + 0.2 * along + 0.02 * np.cross(along, up) - 0.8 * up
+            quads.append(Quad(corner_m=corner, edge_u_m=0.9 * along, edge_v_m=-0.75 * up, texture=design))
+    return World(quads=tuple(quads), board=Board(), board_corners_m=np.zeros((0, 3)))
+
+
+def places_m(world: World, from_m: Array, rays: Array) -> Array:
+    """(N, 3) what rays (N, 3) from points (N, 3) meet first; NaN where nothing."""
+    nearest = np.full(len(rays), np.inf)
+    for quad in world.quads:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            away = (quad.corner_m - from_m) @ quad.normal / (rays @ quad.normal)
+        on = from_m + away[:, None] * rays - quad.corner_m
+        u, v = (on @ edge / (edge @ edge) for edge in (quad.edge_u_m, quad.edge_v_m))
+        hit = (away > 0) & (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1) & (rays @ quad.normal < 0)
+        nearest = np.where(hit & (away < nearest), away, nearest)
+    return np.asarray(from_m + np.where(np.isfinite(nearest), nearest, np.nan)[:, None] * rays)
+
+
 def motion_of(walk: Walk) -> Motion:
-    """Along a rounded rectangle, looking outwards and a little ahead, with a hand's sway."""
+    """Along a rounded rectangle or a corridor, looking at the wall and a little ahead, with a hand's sway."""
     rng = np.random.default_rng([walk.seed, 2])
     duration_s = walk.frames / walk.frame_rate_hz
     count = int((duration_s + 2 * MARGIN_S) * RATE_HZ) + 33
@@ -99,8 +174,11 @@ def motion_of(walk: Walk) -> Motion:
     smooth = np.ones(61) / 61
     across = np.stack([np.convolve(np.pad(c, 30, mode="edge"), smooth, mode="valid") for c in across.T], axis=1)
     sway = [sum(a * np.sin(2 * np.pi * f * t_s + p) for a, f, p in _tones(rng)) for _ in range(6)]
-    position = np.stack([across[:, 0], across[:, 1], np.full(count, 1.4)], axis=1) + 0.02 * np.stack(sway[:3], axis=1)
     out = np.stack([cosine / PATH_M[0], sine / PATH_M[1], 0 * phase], axis=1)
+    if "corridor" in walk.scene:
+        across = np.stack([SPEED_M_S * (t_s - duration_s / 2), 0 * t_s], axis=1)
+        out = np.tile([0.3, 1.0, 0.0], (count, 1))
+    position = np.stack([across[:, 0], across[:, 1], np.full(count, 1.4)], axis=1) + 0.02 * np.stack(sway[:3], axis=1)
     out /= np.linalg.norm(out, axis=1, keepdims=True)
     right = np.stack([out[:, 1], -out[:, 0], 0 * phase], axis=1)
     looking = quat_from_matrix(np.stack([right, np.cross(out, right), out], axis=-1))
@@ -129,7 +207,9 @@ def write_walk(walk: Walk, folder: Path) -> Path:
     imu = sample_imu(motion, draw_imu_errors(options, duration_s, rng), options, duration_s=duration_s, rng=rng)
     trigger_s = np.arange(walk.frames) / walk.frame_rate_hz
     names = [f"{i:06d}.jpg" for i in range(walk.frames)]
-    for name, picture in zip(names, _pictures(walk, motion, trigger_s), strict=True):
+    camera = walk.camera()
+    blank = itertools.repeat(np.zeros((camera.model.height, camera.model.width, 3), dtype=np.uint8), len(names))
+    for name, picture in zip(names, _pictures(walk, motion, trigger_s) if walk.drawn else blank, strict=True):
         cv2.imwrite(str(folder / "frames" / name), picture[..., ::-1])
     for sensor, t_s, values in (
         ("gyro", imu.recording.gyro_t_s, imu.recording.gyro_rad_s),
@@ -139,7 +219,7 @@ def write_walk(walk: Walk, folder: Path) -> Path:
         write_text(folder / f"{sensor}.csv", "\n".join(["t,x,y,z", *rows]) + "\n")
     rows = [f"{name},{t:.9f}" for name, t in zip(names, trigger_s, strict=True)]
     write_text(folder / "frames.csv", "\n".join(["name,t_s", *rows]) + "\n")
-    middle_s = np.array([CAMERA.middle_s(t) for t in trigger_s.tolist()])
+    middle_s = np.array([camera.middle_s(t) for t in trigger_s.tolist()])
     write_json(
         folder / "truth.json",
         {
@@ -148,9 +228,9 @@ def write_walk(walk: Walk, folder: Path) -> Path:
             "world_from_cam_xyzw": motion.world_from_cam_xyzw(middle_s),
         },
     )
-    model = CAMERA.model
+    model = camera.model
     lines = ["[images]", 'folder = "frames"', 'times = "frames.csv"', "[timing]"]
-    lines += [f"exposure_s = {CAMERA.exposure_s!r}", "readout_s = 0.0", "[camera]", f'model = "{model.model}"']
+    lines += [f"exposure_s = {camera.exposure_s!r}", "readout_s = 0.0", "[camera]", f'model = "{model.model}"']
     lines += [f"width = {model.width}", f"height = {model.height}", f"params = {list(model.params)!r}"]
     lines += ['pixel_origin = "corner"']
     for sensor, unit in (("gyro", "rad/s"), ("accel", "m/s2")):
@@ -161,7 +241,8 @@ def write_walk(walk: Walk, folder: Path) -> Path:
 
 
 def _pictures(walk: Walk, motion: Motion, trigger_s: Array) -> Iterator[np.ndarray]:
-    rendering._SAMPLES = 4  # a third of the rays: it is features that count here
-    renderer = Renderer(world_of(walk))
+    # a third of the rays: it is features that count here; of small pictures, a quarter of these
+    rendering._SAMPLES, rendering._SAMPLES_PER_PX = (4, rendering._SAMPLES_PER_PX) if walk.width > 400 else (2, 0.0)
+    renderer, camera = Renderer(world_of(walk)), walk.camera()
     for index, t_s in enumerate(trigger_s.tolist()):
-        yield develop(renderer.linear(CAMERA, motion, t_s), CAMERA, np.random.default_rng([walk.seed, 4, index]))
+        yield develop(renderer.linear(camera, motion, t_s), camera, np.random.default_rng([walk.seed, 4, index]))

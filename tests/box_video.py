@@ -86,14 +86,19 @@ def _atlas(seed: int) -> np.ndarray:
 
 
 def _picture(atlas: np.ndarray, rotation: np.ndarray, centre: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    looking = rays @ rotation.T
-    far, wall = _hit(centre, looking)
-    point = (centre + far[..., None] * looking - LOW_M) / (HIGH_M - LOW_M)
-    axis = wall // 2
-    u = np.where(axis == 0, point[..., 1], point[..., 0])
-    v = np.where(axis == 2, point[..., 1], point[..., 2])
-    map_x = (u * 510).astype(np.float32)
-    map_y = (wall * 512 + np.clip(v, 0, 1) * 510).astype(np.float32)
+    """(H, W) what is seen along (3, H * W) rays; an axis after the other and in single precision, which is quicker."""
+    looking = rotation.astype(np.float32) @ rays
+    low, high = ((wall - centre).astype(np.float32) for wall in (LOW_M, HIGH_M))
+    with np.errstate(divide="ignore"):
+        ways = [np.where(ray == 0, np.inf, np.where(ray > 0, high[k], low[k]) / ray) for k, ray in enumerate(looking)]
+    far = np.minimum(np.minimum(ways[0], ways[1]), ways[2])
+    x, y, z = ((far * ray - low[k]) / (high[k] - low[k]) for k, ray in enumerate(looking))
+    at_x, at_z = ways[0] == far, ways[2] == far
+    u, v = np.where(at_x, y, x), np.where(at_z, y, z)
+    axis = np.where(at_x, 0, np.where(at_z, 2, 1))
+    wall = 2 * axis + np.choose(axis, looking > 0)
+    map_x = (u * 510).astype(np.float32).reshape(HEIGHT, WIDTH)
+    map_y = (wall * 512 + np.clip(v, 0, 1) * 510).astype(np.float32).reshape(HEIGHT, WIDTH)
     return cv2.remap(atlas, map_x, map_y, cv2.INTER_LINEAR)
 
 
@@ -111,7 +116,8 @@ def film(
     camera = ShutterCamera(model=model, exposure_s=exposure_s)
     scene = make_scene(SceneRecipe(motion=motion, frame_rate_hz=frame_rate_hz, camera=camera, format="h264", seed=seed))
     x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    rays = np.stack([(x - WIDTH / 2) / FOCAL, (y - HEIGHT / 2) / FOCAL, np.ones_like(x)], axis=-1)
+    rays = np.stack([(x - WIDTH / 2) / FOCAL, (y - HEIGHT / 2) / FOCAL, np.ones_like(x)])
+    rays = rays.reshape(3, -1).astype(np.float32)
     atlas = _atlas(seed)
     folder.mkdir(parents=True)
     with av.open(str(folder / "clip.mp4"), "w") as container:

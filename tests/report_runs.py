@@ -111,14 +111,14 @@ def write_run(
         "seconds": {"frames": 3.0, "mapping": 20.0, "metric": 1.5},
     }
     write_json(out / "result.json", result)
+    seen = cloud(points)
+    scene = scene_record(seen, trajectory, gravity)
+    record = {
+        "scene": scene,
+        "photogrammetry": photogrammetry_record(seen, np.array(scene["display_from_model_xyzw"]), unit=scene["unit"]),
+        "signals": signal_record(trajectory, imu, estimate, gravity),
+    }
     for i in range(models):
-        scene = scene_record(cloud(points), trajectory, gravity)
-        upright = np.array(scene["display_from_model_xyzw"])
-        record = {
-            "scene": scene,
-            "photogrammetry": photogrammetry_record(cloud(points), upright, unit=scene["unit"]),
-            "signals": signal_record(trajectory, imu, estimate, gravity),
-        }
         write_json(data / f"model_{i}.json", record)
     finding = {"code": "saturated", "severity": "error", "evidence": f"{name} hits the end", "advice": f"mind {name}"}
     write_json(

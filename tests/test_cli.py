@@ -72,7 +72,7 @@ def test_every_option_of_the_help_is_known(capsys, monkeypatch, command):
     _, out, _ = run(capsys, command, "--help")
     rows = re.findall(r"^  (--[a-z].*?)(?:  |$)", out, re.MULTILINE)
     shown = {option for row in rows for option in re.findall(r"--[a-z][a-z.0-9-]*", row)}
-    assert shown and shown <= set(_options(_COMMANDS[command]))
+    assert shown and shown <= set(_options(command))
 
 
 def test_options_are_known_by_both_spellings(capsys):

@@ -37,6 +37,14 @@ def test_a_limit_that_is_too_low_is_said_at_once(tmp_path, kind, least):
         assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such limits")
+def test_a_limit_that_numpy_cannot_be_loaded_within_is_said_too(tmp_path):
+    command = [sys.executable, "-c", LIMITED, "RLIMIT_AS", str(64 << 20), *ARGUMENTS]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1
+    assert done.stderr.startswith("error: only 0.067 GB of memory are allowed to a process here")
+
+
 @pytest.mark.parametrize(
     ("error", "said"),
     [

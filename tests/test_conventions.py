@@ -58,7 +58,7 @@ def test_simulated_poses_in_another_convention_are_named(read_as: PoseConvention
         assert likely.log_likelihood > 12
 
 
-@pytest.mark.parametrize("name", ["D1", "D7", "D9", "D11"])
+@pytest.mark.parametrize("name", ["D1", "D11"])
 def test_real_poses_in_another_convention_are_named(shared_data: Path, name: str) -> None:
     trajectory, imu = read_inertial_scale(shared_data / "inertial_scale" / name)
     named = {}
@@ -93,14 +93,14 @@ FAULTS: list[tuple[str, Callable[[ImuRecording], ImuRecording]]] = [
 def test_what_is_wrong_with_the_imu_is_not_blamed_on_the_poses(
     shared_data: Path, alter: Callable[[ImuRecording], ImuRecording]
 ) -> None:
-    for name in ("D1", "D7", "D11"):
+    for name in ("D7", "D9"):
         trajectory, imu = read_inertial_scale(shared_data / "inertial_scale" / name)
         assert likely_convention(trajectory, alter(imu)) is None, name
 
 
 @pytest.mark.parametrize("kind", ["static", "pure_rotation", "constant_velocity", "walk", "roam"])
 def test_right_poses_are_not_named_whatever_the_motion(kind: MotionKind) -> None:
-    for seed in range(3):
+    for seed in range(2):
         recording = simulated(seed, kind)
         # the origin far away, where translations of camera_from_world move most
         far = replace(

@@ -1,5 +1,7 @@
 """The compiled filters along paths against the plain ones."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from references.path_filters import filter_reference, noise_reference
@@ -47,13 +49,15 @@ def test_a_tile_s_transform_is_numpy_s_and_comes_back(side, instruction_set):
 
 @pytest.mark.parametrize("instruction_set", SETS)
 @pytest.mark.parametrize("splitting", [(), path_filters.SPLITTING], ids=["wiener", "half-quadratic"])
-def test_both_filters_are_the_plain_ones(splitting, instruction_set):
+@pytest.mark.parametrize("cov_px2", [(0.0, 0.0, 0.0), (2.0, -0.5, 0.7)], ids=["certain", "doubtful"])
+def test_both_filters_are_the_plain_ones(cov_px2, splitting, instruction_set):
     width, height = 330, 210
-    path, light = bent(width, height), light_of(width, height)
+    path, light = replace(bent(width, height), cov_px2=cov_px2), light_of(width, height)
     tiling = Tiling.covering(width, height, path.extent_px())
     paths, noise = tiling.paths(path), Noise(2e-5, 1e-4)
-    found = filter_along(light, tiling, paths, [noise], splitting, threads=2, instruction_set=instruction_set)
-    expected = filter_reference(light[..., 0], tiling, paths, noise, splitting)
+    spreads = tiling.spreads(path)
+    found = filter_along(light, tiling, paths, spreads, [noise], splitting, threads=2, instruction_set=instruction_set)
+    expected = filter_reference(light[..., 0], tiling, paths, spreads, noise, splitting)
     assert np.abs(found[..., 0] - light[..., 0]).max() > 0.1
     # a gradient at the threshold may fall on either side of it
     off = np.abs(found[..., 0] - expected)
@@ -102,10 +106,11 @@ def test_threads_change_no_bit_and_colours_do_not_mix():
     path, light = bent(width, height), light_of(width, height, channels=3)
     tiling = Tiling.covering(width, height, path.extent_px())
     paths, noise = tiling.paths(path), [Noise(1e-4, 0.0)] * 3
-    one, many = (filter_along(light, tiling, paths, noise, (8.0,), threads=n) for n in (1, 3))
+    one, many = (filter_along(light, tiling, paths, tiling.spreads(path), noise, (8.0,), threads=n) for n in (1, 3))
     np.testing.assert_array_equal(one, many)
     for c in range(3):
-        alone = filter_along(np.ascontiguousarray(light[..., c : c + 1]), tiling, paths, noise[:1], (8.0,))
+        one_plane = np.ascontiguousarray(light[..., c : c + 1])
+        alone = filter_along(one_plane, tiling, paths, tiling.spreads(path), noise[:1], (8.0,))
         np.testing.assert_allclose(one[..., c], alone[..., 0], atol=1e-6)
 
 

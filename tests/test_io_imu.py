@@ -1,5 +1,6 @@
 """Inertial readers: exact stamps, units, repairs, refusals, and agreement with an independent parser."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -145,6 +146,27 @@ def test_an_unclear_header_is_shown_with_what_to_write(tmp_path: Path, header: s
     message = str(caught.value)
     assert said in message and "[imu.gyro]" in message and 'file = "unclear.csv"' in message
     assert header is None or header.strip("#") in message or said in message
+    if said == "no header":
+        assert 'time = 1, time_unit = "ns", columns = [2, 3, 4], unit = "rad/s"' in message
+        assert 'columns = [5, 6, 7], unit = "m/s2"' in message
+
+
+def test_the_hint_for_a_table_says_what_its_numbers_look_like(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    accel, rate = rng.normal([0, 0, 9.8], 0.3, (50, 3)), rng.normal(0, 40, (50, 3))
+    lines = [
+        f"{i},{7 + i * 5.0:.3f},{','.join(f'{v:.4f}' for v in (*a, *w))}"
+        for i, (a, w) in enumerate(zip(accel, rate, strict=True))
+    ]
+    path = write_csv(tmp_path / "own.csv", lines, "row,clock,ux,uy,uz,rx,ry,rz")
+    with pytest.raises(FormatError) as caught:
+        read_imu(path)
+    message = str(caught.value)
+    assert 'time = "clock", time_unit = "ms", columns = ["rx", "ry", "rz"], unit = "deg/s"' in message
+    assert 'columns = ["ux", "uy", "uz"], unit = "m/s2"' in message
+    path = write_csv(tmp_path / "words.csv", ["1,2,x", "2,3,y"], "a,b,c")
+    with pytest.raises(FormatError, match=re.escape('time = ..., time_unit = "...", columns = [...]')):
+        read_imu(path)
 
 
 def test_a_cut_off_last_line_is_dropped_and_listed(clean: tuple[Path, list[str]]) -> None:

@@ -20,10 +20,11 @@ ORDER = [
     ("imaging",),
     ("multi_aperture", "restoration", "exposure_pairs", "sweep"),
     ("flow",),
+    ("turns",),
     ("align", "smooth"),
     ("scale",),
     ("model", "rest", "georeference"),
-    ("refine",),
+    ("refine", "join"),
     ("validate", "diagnose", "report"),
     ("run",),
     ("stages",),
@@ -46,11 +47,13 @@ ESTIMATORS = (
     "sweep",
     *PIXELS,
     "flow",
+    "turns",
     "align",
     "smooth",
     "scale",
     "georeference",
     "refine",
+    "join",
 )
 
 

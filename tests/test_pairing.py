@@ -6,14 +6,23 @@ import numpy as np
 import pycolmap
 import pytest
 
-from colmap_inertial.colmap import loops, pairing, sparse
+from colmap_inertial.colmap import loops, pairing, sparse, way as way_module
 from colmap_inertial.colmap.gyro_bias import RayPairs, bias_correction
 from colmap_inertial.colmap.headings import Headings, find_headings
-from colmap_inertial.colmap.loops import candidates, close_loops, key_frames
+from colmap_inertial.colmap.loops import candidates, close_loops, key_frames, without_contradictions
 from colmap_inertial.colmap.pairing import match_capture
 from colmap_inertial.colmap.sparse import mapping_device
-from colmap_inertial.colmap.two_views import TwoViews, compare, count_verified, forget
+from colmap_inertial.colmap.two_views import (
+    Return,
+    TwoViews,
+    compare,
+    count_verified,
+    forget,
+    returns,
+    sightings_of,
+)
 from colmap_inertial.colmap.votes import Voters
+from colmap_inertial.colmap.way import Sightings, Way, find_way, joined
 from colmap_inertial.errors import InertialError, NotObservableError
 from colmap_inertial.geometry import quat_from_matrix, so3_exp
 from colmap_inertial.io.calibration import Declared, calibration_prior
@@ -209,9 +218,26 @@ def test_candidates_are_the_best_of_a_frame():
     assert candidates(np.array([30, 20, 8, 10, 9]), i, j).tolist() == [True, True, False, True, False]
 
 
-def closing(monkeypatch, seen, votes):
-    """Close loops among 40 frames a second apart, of which ``seen`` gives rotation and coverage of verified pairs."""
+def way_along(centre):
+    """A way through centres (N, 3), with one point before each frame."""
+    none = np.zeros(0, dtype=np.intp)
+    sightings = Sightings(frame=none, point=none, feature=none, rays=np.zeros((0, 3)))
+    return Way(part=np.zeros(len(centre), dtype=np.intp), centre=centre, points=np.zeros((0, 3)), sightings=sightings)
+
+
+def circle(count=40):
+    """Around, and back to the start."""
+    angle = np.linspace(0, 2 * np.pi, count)
+    return 2 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+
+
+def closing(monkeypatch, seen, votes, *, centre=None, said=None):
+    """Close loops among 40 frames a second apart, of which ``seen`` gives rotation and coverage of verified pairs.
+
+    What the matches say of where the second frame is: ``said``, or as it is on the way through ``centre``.
+    """
     t_s = np.arange(40.0)
+    way = way_along(circle() if centre is None else centre)
     headings = headings_of(np.linspace(0, 360, 40), t_s)
     names = [f"{i:04}" for i in range(40)]
     forgotten = []
@@ -230,9 +256,18 @@ def closing(monkeypatch, seen, votes):
         def count(self, i, j):
             return np.array([votes(a, b) for a, b in zip(i.tolist(), j.tolist(), strict=True)])
 
+    def returned(database, names, pairs, way):
+        told = []
+        for i, j in pairs:
+            step = way.centre[j] - way.centre[i] if said is None else said(i, j)
+            turned = headings.start_from_cam[j]
+            told.append(Return(step=step, start_from_second=turned, ratio=1.0, depth=2.0, matches=100))
+        return told
+
     monkeypatch.setattr(loops, "compare", compared)
+    monkeypatch.setattr(loops, "returns", returned)
     monkeypatch.setattr(loops, "forget", lambda database, pairs: forgotten.extend(pairs))
-    found = close_loops(None, names, headings, Counted(), 10, lambda pairs: None)
+    found = close_loops(None, names, headings, way, Counted(), 10, lambda pairs: None)
     return found, forgotten
 
 
@@ -254,6 +289,88 @@ def test_a_place_that_is_seen_again_closes_a_loop(monkeypatch):
 def test_what_looks_alike_and_is_not_the_same_closes_none(monkeypatch, seen):
     found, forgotten = closing(monkeypatch, seen, lambda a, b: 20 * (b - a > 36))
     assert found.closed == () and len(forgotten) == found.candidates > 0 and found.refused > 0
+
+
+def test_what_the_way_leads_past_closes_no_loop(monkeypatch):
+    """Along a corridor, each door looks like the one before."""
+    ahead = np.stack([np.linspace(0, 8, 40), np.zeros(40), np.zeros(40)], axis=1)
+    found, _ = closing(
+        monkeypatch, lambda a, b: (0, 0.9), lambda a, b: 20, centre=ahead, said=lambda i, j: np.array([0.1, 0, 0])
+    )
+    assert found.candidates > 0 and found.closed == ()
+
+
+def test_of_loops_that_contradict_each_other_only_those_with_by_far_the_most_matches_stay():
+    t_s = np.arange(40.0)
+    headings, way = headings_of(np.linspace(0, 360, 40), t_s), way_along(circle())
+
+    def said(pairs, matches, off=0.0):
+        return {
+            (i, j): Return(
+                step=way.centre[j] - way.centre[i] + [off, 0, 0],
+                start_from_second=headings.start_from_cam[j],
+                ratio=1.0,
+                depth=1.0,
+                matches=matches,
+            )
+            for i, j in pairs
+        }
+
+    true, shifted = [(0, 37), (1, 38), (2, 39)], [(0, 38), (1, 39)]
+    assert without_contradictions({}, headings, way, 10) == set()
+    assert without_contradictions(said(true, 100), headings, way, 10) == set(true)
+    both = {**said(true, 100), **said(shifted, 60, off=1.5)}
+    assert without_contradictions(both, headings, way, 10) == set(true)
+    both = {**said(true, 100), **said(shifted, 150, off=1.5)}
+    assert without_contradictions(both, headings, way, 10) == set()
+
+
+def sightings_along(centre, start_from_cam, rng, *, noise_rad=1e-3, reach=2.5):
+    """What frames that look ahead (z) see of points within reach of theirs, each for a few frames."""
+    frame, point, rays = [], [], []
+    points = centre[rng.integers(len(centre), size=1500)] + rng.uniform(-1, 1, (1500, 3)) * [3, 3, 1]
+    for k, at in enumerate(centre):
+        away = (points - at) @ start_from_cam[k]
+        mine = np.flatnonzero((away[:, 2] > 0.5) & (np.linalg.norm(away, axis=1) < reach) & (rng.random(1500) < 0.7))
+        ray = points[mine] - at + noise_rad * rng.standard_normal((len(mine), 3))
+        frame.append(np.full(len(mine), k))
+        point.append(mine)
+        rays.append(ray / np.linalg.norm(ray, axis=1)[:, None])
+    which = np.concatenate(point)
+    return Sightings(frame=np.concatenate(frame), point=which, feature=which, rays=np.concatenate(rays))
+
+
+def test_the_way_is_found_up_to_its_length_and_is_as_sure_as_it_says():
+    count = 60
+    centre = circle(count)
+    headings = headings_of(np.linspace(0, 360, count), 0.5 * np.arange(count))
+    way = find_way(sightings_along(centre, headings.start_from_cam, np.random.default_rng(3)), count)
+    assert (way.part == 0).all()
+    scale = np.linalg.norm(way.centre[10] - way.centre[0]) / np.linalg.norm(centre[10] - centre[0])
+    i, j = np.zeros(5, dtype=np.intp), np.array([10, 20, 30, 45, 59])
+    off = way.centre[j] - way.centre[i] - scale * (centre[j] - centre[i])
+    covariance = way.covariance(i, j, np.full(5, 0.01)) + (0.02 * scale) ** 2 * np.eye(3)
+    assert np.linalg.norm(off, axis=1).max() < 0.5 * scale
+    assert (np.sum(off * np.linalg.solve(covariance, off[..., None])[..., 0], axis=1) < 16.3).all()
+    # all of the way was left at its first frame
+    rest = way.centre[20] - way.centre[:21]
+    assert way.covariance(i[:1], np.array([20]), np.zeros(1))[0] == pytest.approx(way_module.DRIFT**2 * rest.T @ rest)
+
+
+def test_a_way_that_nothing_leads_across_has_two_parts():
+    count = 30
+    headings = headings_of(np.linspace(0, 180, count), 0.5 * np.arange(count))
+    found = sightings_along(circle(count), headings.start_from_cam, np.random.default_rng(0))
+    split = replace(found, point=np.where(found.frame < 15, found.point, found.point + 1500))
+    way = find_way(split, count)
+    assert way.known(np.array([0, 20]), np.array([10, 29])).all()
+    assert not way.known(np.array([10]), np.array([20]))[0]
+
+
+def test_matches_that_join_two_features_of_one_frame_make_no_point():
+    pairs = [(0, 1, np.array([[0, 0], [1, 1]])), (1, 2, np.array([[0, 0], [1, 1]])), (0, 2, np.array([[2, 1]]))]
+    frame, feature, point = joined([3, 2, 2], pairs)
+    assert frame.tolist() == [0, 1, 2] and feature.tolist() == [0, 0, 0] and point.tolist() == [0, 0, 0]
 
 
 def test_where_the_gyroscope_looked_elsewhere_no_loop_is_sought(monkeypatch):
@@ -280,6 +397,23 @@ def test_pairs_without_a_gyroscope_are_those_of_before(database, tmp_path, monke
     assert sorted(matched) == [("a", "b"), ("a", "c"), ("b", "c")]
     assert record.matched == record.pairs == 3 and record.apart == record.unlike == 0
     assert "not used" in record.gyroscope and record.heading_sigma_deg is None
+
+
+def test_without_a_gyroscope_a_long_capture_matches_neighbours_only(database, tmp_path, monkeypatch):
+    matched = []
+    monkeypatch.setattr(pairing, "match_pairs", lambda db, pairs, context, **_: matched.extend(pairs))
+
+    def refused(*_):
+        raise NotObservableError("time offset", "no")
+
+    monkeypatch.setattr(pairing, "turns_rad", refused)
+    names = tuple(f"{i:03}" for i in range(40))
+    recording = type("Recording", (), {"timing": FrameTiming(names=names, t_s=np.arange(40.0))})()
+    options = MappingOptions(pairing="sequential", overlap=3)
+    record = match_capture(database, tmp_path / "out.db", recording, CAMERA, options, RunContext(scratch=tmp_path))
+    steps = sorted({int(b) - int(a) for a, b in matched})
+    assert steps == [1, 2, 3, 4] and record.far == (40 - 8) + (40 - 16) + (40 - 32)
+    assert record.matched == len(matched) == record.pairs - record.far and record.loops_closed == 0
 
 
 def test_matches_are_verified_counted_and_forgotten(database, tmp_path):
@@ -332,5 +466,76 @@ def test_a_capture_too_short_for_loops_has_none(monkeypatch):
     empty = TwoViews(first_from_second=np.zeros((0, 3, 3)), covered=np.zeros(0))
     monkeypatch.setattr(loops, "compare", lambda database, pairs: empty)
     voters = Voters(descriptors=(), xy_px=())
-    found = close_loops(None, ["a", "b", "c"], headings, voters, 10, lambda pairs: None)
+    found = close_loops(None, ["a", "b", "c"], headings, way_along(circle(3)), voters, 10, lambda pairs: None)
     assert found.compared == found.candidates == found.refused == 0 and found.closed == ()
+
+
+def written(path, xy_px, matched):
+    """A database of images' keypoints by name, and of verified matches: feature k of one with which of the other."""
+    with pycolmap.Database.open(str(path)) as opened:
+        camera = opened.write_camera(pycolmap.Camera(model="PINHOLE", width=480, height=360, params=CAMERA.params))
+        rig = pycolmap.Rig()
+        rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera))
+        opened.write_rig(rig)
+        images = [opened.write_image(pycolmap.Image(name=name, camera_id=camera)) for name in xy_px]
+        for image, at in zip(images, xy_px.values(), strict=True):
+            opened.write_keypoints(image, np.pad(at, ((0, 0), (0, 4))).astype(np.float32))
+        for (i, j), other in matched.items():
+            views = pycolmap.TwoViewGeometry()
+            views.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+            views.inlier_matches = np.stack([np.arange(len(other)), other], axis=1).astype(np.uint32)
+            opened.write_two_view_geometry(images[i], images[j], views)
+    return path
+
+
+def test_points_are_those_that_three_frames_saw_and_rays_are_turned(tmp_path):
+    rng = np.random.default_rng(5)
+    xy = {name: rng.uniform(10, 350, (50, 2)) for name in "abc"}
+    path = written(tmp_path / "database.db", xy, {(0, 1): np.arange(50), (1, 2): np.arange(40)[::-1]})
+    turned = so3_exp(np.array([[0, 0, 0], [0, 0.2, 0], [0.1, 0, 0]]))
+    found = sightings_of(path, list("abc"), [(0, 1), (1, 2)], turned)
+    assert found.frame.tolist() == [0] * 40 + [1] * 40 + [2] * 40
+    of_c = found.feature[found.frame == 2][np.argsort(found.point[found.frame == 2])]
+    of_a = found.feature[found.frame == 0][np.argsort(found.point[found.frame == 0])]
+    assert (of_a + of_c == 39).all()
+    there = np.column_stack([(xy["c"][found.feature[80:]] - [240, 180]) / 400, np.ones(40)]) @ turned[2].T
+    assert found.rays[80:] == pytest.approx(there / np.linalg.norm(there, axis=1)[:, None], abs=1e-6)
+
+
+def test_a_frame_is_placed_by_points_that_another_one_knew(tmp_path):
+    """The way is twice as long at the first frame as at the second; a fifth of the matches joins what it should not."""
+    rng = np.random.default_rng(4)
+    points = rng.uniform([-1, -1, 3], [1, 1, 5], (60, 3))
+    turned, centre = so3_exp(np.array([0, 0.1, 0.02])), np.array([0.4, -0.1, 0.2])
+    seen = (points - centre) @ turned
+    xy = [400 * p[:, :2] / p[:, 2:] + [240, 180] for p in (points, seen)]
+    second = np.arange(60)
+    second[:12] = np.roll(second[:12], 5)
+    path = written(tmp_path / "database.db", dict(zip("ab", xy, strict=True)), {(0, 1): second})
+    half = 0.5 * (points - centre) + [7, 7, 7]
+    sightings = Sightings(
+        frame=np.repeat([0, 1], 60),
+        point=np.arange(120),
+        feature=np.tile(np.arange(60), 2),
+        rays=np.zeros((120, 3)),
+    )
+    way = Way(
+        part=np.zeros(2, dtype=np.intp),
+        centre=np.array([[0, 0, 0], [7.0, 7, 7]]),
+        points=np.concatenate([points, half]),
+        sightings=sightings,
+    )
+    told = returns(path, ["a", "b"], [(0, 1)], way)[0]
+    assert told is not None and told.matches == 48
+    assert told.step == pytest.approx(centre, abs=1e-3)
+    assert told.start_from_second == pytest.approx(turned, abs=1e-3)
+    assert told.ratio == pytest.approx(2.0, rel=1e-2)
+    few = replace(way, points=np.where(np.arange(120)[:, None] < 50, np.nan, way.points))
+    assert returns(path, ["a", "b"], [(0, 1)], few) == [None]
+
+
+def test_batches_of_pairs_grow_and_hold_every_pair_once():
+    pairs = [f"{i} {i + 1}" for i in range(5000)]
+    found = sparse.growing_batches(pairs)
+    assert [len(batch) for batch in found] == [100, 200, 400, 800, 1600, 1600, 300]
+    assert [pair for batch in found for pair in batch] == pairs and sparse.growing_batches([]) == []

@@ -4,7 +4,9 @@ import dataclasses
 import json
 import shutil
 import subprocess
+import sys
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -12,12 +14,13 @@ from box_project import HIGH, LOW, cast, off_the_walls, rays, shared_box
 from test_pipeline_existing import contents, run
 
 from colmap_inertial.colmap import dense as dense_stage, depth_maps
+from colmap_inertial.colmap.tsdf import tsdf_mesh
 from colmap_inertial.drivers.project import reconstruct_project
 from colmap_inertial.errors import InertialError
 from colmap_inertial.geometry import matrix_from_quat
 from colmap_inertial.io.ply import read_ply_header
 from colmap_inertial.model import read_model
-from colmap_inertial.model.depth_maps import read_map
+from colmap_inertial.model.depth_maps import read_map, write_map
 from colmap_inertial.options import DenseOptions, ProjectOptions, ReconstructOptions
 
 QUICK = ReconstructOptions(dense=True, dense_options=DenseOptions(max_image_size=96), deterministic=True)
@@ -250,6 +253,69 @@ def test_a_patch_match_that_fails_is_said(unfinished, box, monkeypatch):
     with pytest.raises(InertialError, match=r"patch-match ended with code 1: ValueError.* CUDA"):
         reconstruct_project(box.root, unfinished, source(box), QUICK)
     assert (unfinished / "sparse" / "0").is_dir()
+
+
+def need_open3d():
+    try:
+        import open3d  # noqa: F401
+    except (ImportError, OSError) as error:
+        pytest.skip(f"open3d cannot be loaded: {error}")
+
+
+@pytest.mark.parametrize(("maker", "at"), [("plane sweep", 0.5), ("patch-match", 0.0)])
+def test_a_mesh_by_distances_takes_pixels_where_their_maker_does(tmp_path, maker, at):
+    """A slanted plane seen from one place: half a pixel would move it by 10 mm."""
+    need_open3d()
+    camera = pycolmap.Camera(
+        camera_id=1, model="PINHOLE", width=200, height=150, params=[180.0, 180.0, 100.0, 75.0]
+    )  # fmt: skip
+    model, normal, distance = pycolmap.Reconstruction(), np.array([-0.8, 0.0, -0.6]), -1.5
+    model.add_camera_with_trivial_rig(camera)
+    pixel_y, pixel_x = np.indices((150, 200)) + at
+    rays_of = np.stack([(pixel_x - 100) / 180, (pixel_y - 75) / 180, np.ones((150, 200))], axis=-1)
+    depth = distance / (rays_of @ normal)
+    for i in range(1, 5):
+        image = pycolmap.Image(name=f"{i}.png", camera_id=1, image_id=i)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+        write_map(tmp_path / "stereo" / "depth_maps" / f"{i}.png.geometric.bin", depth.astype(np.float32))
+        (tmp_path / "images").mkdir(exist_ok=True)
+        cv2.imwrite(str(tmp_path / "images" / f"{i}.png"), np.full((150, 200, 3), 128, np.uint8))
+    (tmp_path / "sparse").mkdir()
+    model.write_binary(str(tmp_path / "sparse"))
+    tsdf_mesh(tmp_path, [f"{i}.png" for i in range(1, 5)], tmp_path / "mesh.ply", maker=maker, kind="geometric")
+    found = vertices(tmp_path / "mesh.ply")
+    assert len(found) > 1000
+    assert abs(np.mean(found @ normal - distance)) < 0.002
+
+
+def test_a_mesh_by_distances_lies_on_the_walls_and_replaces_the_other(unfinished, box, capsys):
+    need_open3d()
+    cast_depth_maps(box, unfinished)
+    other = unfinished / "dense" / "0" / "meshed-poisson.ply"
+    other.write_bytes(b"of an earlier run")
+    flags = ["--imu", box.imu, "--frame-times", box.frame_times, *FLAGS]
+    code, _, err = run(capsys, "reconstruct", box.root, unfinished, *flags, "--dense-options.mesh", "tsdf")
+    assert code == 0, err
+    (model,) = json.loads((unfinished / "result.json").read_text())["models"]
+    assert model["dense"]["mesh"] == "dense/0/meshed-tsdf.ply"
+    assert not other.exists()
+    ratio, rotation, shift = world_from_metric(box, unfinished)
+    mesh = vertices(unfinished / "dense" / "0" / "meshed-tsdf.ply")
+    assert model["dense"]["faces"] > 5000
+    surface = ratio * mesh @ rotation.T + shift
+    # a pixel of these pictures covers about 25 mm
+    away = off_the_walls(surface)
+    assert np.median(away) < 0.02 and np.percentile(away, 90) < 0.04, np.quantile(away, (0.5, 0.9))
+    # from wall to wall
+    assert np.all(surface.max(axis=0) - surface.min(axis=0) > 0.9 * (HIGH - LOW))
+
+
+def test_a_mesh_that_nothing_can_make_is_said_before_the_work(box, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    flags = ["--imu", box.imu, "--frame-times", box.frame_times, *FLAGS]
+    code, _, err = run(capsys, "reconstruct", box.root, tmp_path / "out", *flags, "--dense-options.mesh", "tsdf")
+    assert code == 2
+    assert "colmap-inertial[mesh]" in err and not (tmp_path / "out").exists()
 
 
 def test_damaged_depth_maps_and_those_of_other_options_are_named(unfinished, box, capsys):

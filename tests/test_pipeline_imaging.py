@@ -31,7 +31,7 @@ from colmap_inertial.run.context import Recording, RunContext, prior_calibration
 from colmap_inertial.run.progress import silent
 from colmap_inertial.simulate import MotionOptions, make_motion
 
-QUICK = ReconstructOptions(mapping=MappingOptions(max_num_features=2000, first_octave=0), deterministic=True)
+QUICK = ReconstructOptions(mapping=MappingOptions(max_num_features=1000, first_octave=0), deterministic=True)
 OFF = replace(QUICK, deblur="off", rolling_shutter="off")
 
 

@@ -248,7 +248,7 @@ def test_each_sub_model_gets_its_own_scale_and_verdict(project, tmp_path):
     before = {p: p.read_bytes() for p in workspace.colmap_sparse.rglob("*.bin")}
     imu = read_imu(project.imu)
     timing = read_frame_times(project.frame_times)
-    results, fragments = run_models(
+    results, fragments, _ = run_models(
         session_in(workspace), recording_of(imu, timing), [MetricStage(imu=imu, calibration=None)], after=()
     )
 
@@ -296,7 +296,7 @@ def test_the_largest_model_comes_first_and_fragments_are_left_out_and_named(proj
     sub_models(project, workspace, {0: 3, 1: 1000, 2: 60, 4: 4})
     imu, timing = read_imu(project.imu), read_frame_times(project.frame_times)
     session, recording = session_in(workspace), recording_of(imu, timing)
-    models, fragments = run_models(session, recording, [MetricStage(imu=imu, calibration=None)], after=())
+    models, fragments, _ = run_models(session, recording, [MetricStage(imu=imu, calibration=None)], after=())
     assert [(m.index, m.colmap_index, m.summary["registered_images"]) for m in models] == [(0, 1, 1000), (1, 2, 60)]
     assert models[0].sparse == workspace.colmap_sparse / "1"
     assert models[0].sparse_metric == workspace.sparse / "0"
@@ -315,9 +315,9 @@ def test_the_largest_model_comes_first_and_fragments_are_left_out_and_named(proj
     ]
     # a second look finds the same without making it again, another one with the fragments makes it again
     session = session_in(workspace)
-    again, _ = run_models(session, recording, [MetricStage(imu=imu, calibration=None)], after=())
+    again, *_ = run_models(session, recording, [MetricStage(imu=imu, calibration=None)], after=())
     assert session.runner.worked == [] and [m.scale.ci95 for m in again] == [m.scale.ci95 for m in models]
-    every, none = run_models(
+    every, none, _ = run_models(
         session_in(workspace), recording, [MetricStage(imu=imu, calibration=None)], after=(), fragments=True
     )
     assert [m.colmap_index for m in every] == [1, 2, 4, 0] and none == ()
@@ -350,7 +350,7 @@ def test_a_sub_model_with_one_timed_image_is_refused_and_the_others_go_on(projec
     imu, timing = read_imu(project.imu), read_frame_times(project.frame_times)
     session, recording = session_in(workspace), recording_of(imu, timing)
     stages = [MetricStage(imu=imu, calibration=None)]
-    (metric, refused), _ = run_models(session, recording, stages, after=(), fragments=True)
+    (metric, refused), *_ = run_models(session, recording, stages, after=(), fragments=True)
     assert metric.scale.verdict == "trusted"
     assert refused.scale.verdict == "refused" and "1 of the model's 1 images" in refused.scale.reasons[0]
     assert refused.summary["registered_images"] == 1

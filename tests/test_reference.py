@@ -1,18 +1,23 @@
 """Metres without an IMU: from a target, from the distance of two markers, from the distance of two points."""
 
+import dataclasses
 import json
 import shutil
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
 from test_cli import run
 from test_validate_lengths import validated
 
-from colmap_inertial.drivers import reference as rooms
-from colmap_inertial.drivers.reference import scale_project_by
-from colmap_inertial.errors import InertialError, NotObservableError
+from colmap_inertial.cli.terminal import show_reference
+from colmap_inertial.drivers import bare as bare_rooms, reference as rooms
+from colmap_inertial.drivers.reference import Reference, scale_project_by
+from colmap_inertial.errors import InertialError, NotObservableError, TargetNotFoundError
 from colmap_inertial.options import ReferenceOptions
+from colmap_inertial.validate.lengths import LengthCheck
 
 
 @pytest.fixture
@@ -81,8 +86,101 @@ def test_what_is_missing_is_named(bare, tmp_path, options, words):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_capture_is_told_what_to_give_and_options_without_their_way_are_refused(tmp_path, capsys):
+@pytest.fixture
+def pictures(tmp_path, project, monkeypatch):
+    """A folder of pictures, which COLMAP is not asked to map: it gives the project's model, and a smaller one."""
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    for i in range(4):
+        cv2.imwrite(str(folder / f"{i}.png"), np.full((8, 8), i, np.uint8))
+    mapped = []
+
+    def map_images(database, images, sparse, *_, **__):
+        mapped.append(sorted(path.name for path in images.iterdir()))
+        for number in "01":
+            shutil.copytree(project.model, sparse / number)
+
+    def written(path):
+        path.write_bytes(b"")
+
+    monkeypatch.setattr(bare_rooms, "extract_features", lambda images, cameras, database, *_, **__: written(database))
+    monkeypatch.setattr(bare_rooms, "match_features", lambda features, database, *_: None)
+    monkeypatch.setattr(bare_rooms, "map_images", map_images)
+    return folder, mapped
+
+
+def test_pictures_alone_are_mapped_and_scaled(pictures, tmp_path, monkeypatch, capsys):
+    folder, mapped = pictures
+    out = tmp_path / "out"
+    args = ["reconstruct", folder, out, "--scale-from", "target", "--target", "aruco:DICT_4X4_50:0.1"]
+
+    def nothing_found(*_, **__):
+        raise TargetNotFoundError("no marker was found")
+
+    monkeypatch.setattr(rooms, "validate_model", nothing_found)
+    code, _, err = run(capsys, *args)
+    assert code == 5 and "no marker was found" in err
+    assert [path.name for path in out.iterdir()] == ["colmap"] and len(mapped) == 1
+    monkeypatch.setattr(rooms, "validate_model", lambda *_, **__: validated(0.5, unscaled=True))
+    code, said, err = run(capsys, *args)
+    assert code == 0, err
+    assert "10 m are 10 m to within" in said
+    assert mapped == [["0.png", "1.png", "2.png", "3.png"]]  # not a second time
+    assert sorted(path.name for path in out.iterdir()) == ["colmap", "images", "scale.json", "sparse", "transform.json"]
+    found = json.loads((out / "scale.json").read_text())
+    assert found["scale_from"] == "target" and found["metres_per_unit"] == pytest.approx(0.5)
+    told = " ".join(found["notes"])
+    assert "which way is up is not known" in told and "no IMU was used" in told and "1 more models" in told
+    assert [path.name for path in (out / "sparse").iterdir()] == ["0"]
+    before, after = (pycolmap.Reconstruction(str(path / "sparse" / "0")) for path in (out / "colmap", out))
+    i = before.reg_image_ids()[0]
+    ratio = np.linalg.norm(after.image(i).projection_center()) / np.linalg.norm(before.image(i).projection_center())
+    assert ratio == pytest.approx(0.5)
+    code, _, err = run(capsys, *args)
+    assert code == 2 and "exists" in err
+    assert sorted(path.name for path in folder.iterdir()) == ["0.png", "1.png", "2.png", "3.png"]
+
+
+def test_what_pictures_alone_cannot_give_is_refused_before_the_mapping(pictures, tmp_path, capsys):
+    folder, mapped = pictures
+    points = ["--scale-from", "distance", "--between", "1,2,3", "4,5,6", "--distance", "2+-0.1"]
+    code, _, err = run(capsys, "reconstruct", folder, tmp_path / "out", *points)
+    assert code == 2 and "needs the model that they are of" in err
+    code, _, err = run(capsys, "reconstruct", folder, tmp_path / "out", "--scale-from", "target")
+    assert code == 2 and "needs the target" in err
+    assert mapped == [] and not (tmp_path / "out").exists()
+
+
+def test_options_without_their_way_are_refused(tmp_path, capsys):
     code, _, err = run(capsys, "reconstruct", tmp_path, tmp_path / "out", "--scale-from", "target", "--target", "x")
-    assert code == 2 and "is no COLMAP project" in err and "OUT/colmap" in err
+    assert code == 2 and "target" in err
     code, _, err = run(capsys, "reconstruct", tmp_path, tmp_path / "out", "--distance", "2+-0.1")
     assert code == 2 and "--distance goes with --scale-from" in err
+
+
+def test_a_small_target_vouches_for_no_more_than_its_own_place(capsys):
+    for share, said in ((0.05, True), (0.7, False)):
+        lengths = LengthCheck(
+            count=9,
+            rms_m=0.0,
+            largest_m=0.0,
+            longest_m=0.3,
+            diagonal_m=6.0,
+            longest_share=share,
+            directions=2,
+            proves="",
+        )
+        validation = dataclasses.replace(validated(0.5, unscaled=True), lengths=lengths)
+        show_reference(
+            Reference(
+                out=Path("out"),
+                scale_from="target",
+                metres_per_unit=0.5,
+                ci95=(0.499, 0.501),
+                made_of="a target",
+                notes=(),
+                validation=validation,
+            )
+        )
+        words = " ".join(capsys.readouterr().out.replace("│", " ").split())
+        assert ("as far as the target reaches" in words) is said

@@ -18,6 +18,7 @@ from colmap_inertial.refine import judge
 from colmap_inertial.refine.solve import held_out, solve
 from colmap_inertial.run.context import Recording
 from colmap_inertial.stages.gyro_view import GyroView
+from colmap_inertial.stages.join import JoinStage
 from colmap_inertial.stages.metric import MetricStage
 from colmap_inertial.stages.readout import ReadoutStage
 from colmap_inertial.stages.refine import RefineStage
@@ -150,9 +151,8 @@ def test_keypoints_go_back_to_where_the_shutter_had_them(rolled):
 def test_the_readout_s_stage_remembers_where_keypoints_were(rolled):
     tracks, shutter, _, model = rolled
     name = tracks.timing.names[7]
-    if "readout" in [one.stage for one in model.treatments if one.action]:
-        mapped = model.observed_px[name]
-        assert mapped == pytest.approx(shutter.moved(name, tracks.xy_px[tracks.frame == 7]), abs=1e-6)
+    assert "readout" in [one.stage for one in model.treatments if one.action]
+    assert model.observed_px[name] == pytest.approx(shutter.moved(name, tracks.xy_px[tracks.frame == 7]), abs=1e-6)
 
 
 def test_images_without_a_time_hang_on_the_pictures(walked):
@@ -257,11 +257,27 @@ def test_what_cannot_be_refined_is_said(walked):
     assert "points" in refined_by(tracks.imu, replace(model, reconstruction=empty))[1].reason
 
 
-def test_without_the_option_the_stages_are_what_they_were(walked):
-    tracks, _ = walked
+def test_without_the_option_the_model_is_what_it_was(walked):
+    tracks, model = walked
+    mapped = pycolmap.Reconstruction(model.reconstruction)
+    similarity = model.similarity
+    rotation = pycolmap.Rotation3d(similarity.rotation_xyzw)
+    mapped.transform(pycolmap.Sim3d(similarity.scale, rotation, similarity.translation_m).inverse())
+    model = MetricStage(imu=tracks.imu, calibration=UNKNOWN)(replace(model, reconstruction=mapped, similarity=None))
     recording = Recording.of(Capture(path="none", calibration=UNKNOWN), tracks.imu, tracks.timing, UNKNOWN)
     stages = default_model_stages(recording, ReconstructOptions())
     assert [type(stage) for stage in stages] == [ReadoutStage, MetricStage]
+    joining = default_model_stages(recording, ReconstructOptions(join="inertial"))
+    assert [type(stage) for stage in joining] == [ReadoutStage, MetricStage, JoinStage]
+    made = Model(reconstruction=mapped, colmap_index=0, timing=tracks.timing)
+    for stage in stages:
+        made = stage(made)
+    # the very model that the scale alone makes, nothing said of a refinement
+    assert np.array_equal(centres_of(made.reconstruction), centres_of(model.reconstruction))
+    points, same = ({i: p.xyz for i, p in one.reconstruction.points3D.items()} for one in (made, model))
+    assert points.keys() == same.keys() and all(np.array_equal(points[i], same[i]) for i in points)
+    assert [one.stage for one in made.treatments if one.stage == "refine"] == []
+    assert made.scale.metres_per_unit == model.scale.metres_per_unit
     stages = default_model_stages(recording, ReconstructOptions(refine="inertial"))
     assert [type(stage) for stage in stages] == [ReadoutStage, MetricStage, RefineStage]
 

@@ -604,7 +604,7 @@ def first_frames(folder, count):
 
 def test_reconstruct_writes_it_and_a_continued_run_does_too(tmp_path):
     capture = first_frames(tmp_path / "capture", 14)
-    quick = ReconstructOptions(mapping=MappingOptions(max_num_features=1000, first_octave=0, max_image_size=480))
+    quick = ReconstructOptions(mapping=MappingOptions(max_num_features=600, first_octave=0, max_image_size=320))
     out = tmp_path / "out"
     result = reconstruct(capture, out, quick)
     content, page = json.loads((out / "report.json").read_text()), Page(out / "report.html")

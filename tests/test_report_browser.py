@@ -18,6 +18,18 @@ pytestmark = pytest.mark.skipif(
     CHROMIUM is None or DRIVER is None, reason="no Chromium here (apt-get install chromium chromium-driver)"
 )
 
+#: Still pictures for paper take as long as the plots; test_report_photogrammetry.py looks at them.
+NO_STILLS = """
+    let plotly;
+    Object.defineProperty(window, "Plotly", {
+        get: () => plotly,
+        set: (value) => {
+            const toImage = value.toImage;
+            value.toImage = (what, ...how) => what instanceof Element ? toImage(what, ...how) : Promise.reject("still");
+            plotly = value;
+        },
+    });
+"""
 WIDTHS = {"desktop": (1280, 900, False), "phone": (390, 844, True)}
 
 
@@ -41,6 +53,8 @@ def browser():
     options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
     driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(DRIVER))
     driver.set_script_timeout(60)
+    driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": NO_STILLS})
+    driver.shown = None
     yield driver
     driver.quit()
 
@@ -61,6 +75,7 @@ def pages(tmp_path_factory):
 class Visit:
     """A page that was opened and has drawn what it has to draw."""
 
+    asked: tuple
     driver: object
     console: list[str]
     requests: list[str]
@@ -70,6 +85,11 @@ class Visit:
 
 
 def visit(driver, page: Path, width: str, *, dark: bool = False, wait: bool = True) -> Visit:
+    """Opens a page and waits for its plots; the one that is on the screen already is not loaded again."""
+    asked = (page, width, dark)
+    if driver.shown is not None and driver.shown.asked == asked:
+        return driver.shown
+    driver.shown = None
     across, down, mobile = WIDTHS[width]
     screen = {"width": across, "height": down, "deviceScaleFactor": 1, "mobile": mobile}
     driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
@@ -86,12 +106,12 @@ def visit(driver, page: Path, width: str, *, dark: bool = False, wait: bool = Tr
     console = [f"{line['level']}: {line['message']}" for line in driver.get_log("browser")]
     events = [json.loads(line["message"])["message"] for line in driver.get_log("performance")]
     sent = [event["params"]["request"]["url"] for event in events if event["method"] == "Network.requestWillBeSent"]
-    return Visit(driver=driver, console=console, requests=sent)
+    driver.shown = Visit(asked=asked, driver=driver, console=console, requests=sent)
+    return driver.shown
 
 
-@pytest.mark.parametrize("width", WIDTHS)
-@pytest.mark.parametrize("kind", ["full", "refused"])
-def test_every_plot_is_drawn_without_errors_or_requests(browser, pages, kind, width):
+def drawn(browser, pages, kind, width) -> Visit:
+    """A page of which every plot is drawn, without errors or requests."""
     seen = visit(browser, pages[kind], width)
     assert seen.script("return document.documentElement.dataset.plots") == "drawn"
     assert not [line for line in seen.console if line.startswith("SEVERE")]
@@ -111,6 +131,26 @@ def test_every_plot_is_drawn_without_errors_or_requests(browser, pages, kind, wi
     assert seen.script("return document.querySelectorAll('.plot').length") >= (12 if kind == "full" else 5)
     assert seen.script("return [...document.images].every(image => image.complete && image.naturalWidth > 0)")
     assert_nothing_overflows(seen, width)
+    return seen
+
+
+# Loading a page takes seconds: tests of one that stands on the screen follow each other.
+
+
+@pytest.mark.parametrize(("kind", "width"), [("refused", "phone"), ("full", "phone"), ("full", "desktop")])
+def test_every_plot_is_drawn_without_errors_or_requests(browser, pages, kind, width):
+    drawn(browser, pages, kind, width)
+
+
+def test_names_are_shown_and_not_run(browser, pages):
+    seen = visit(browser, pages["full"], "desktop")
+    assert seen.script("return document.title").startswith(HOSTILE.rsplit("/", 1)[1])  # a folder's name
+    text = seen.script("return document.body.innerText")
+    assert "<script>alert" in text
+    for leaked in ("DecompressionStream", "use strict", "function(", "undefined", "NaN", "[object"):
+        assert leaked not in text
+    assert seen.script("return [...document.querySelectorAll('[onerror]')].length") == 0
+    assert seen.script("return document.querySelectorAll('img[src=\"x\"]').length") == 0
 
 
 def test_a_run_that_stopped_has_a_page_without_plots(browser, pages):
@@ -131,19 +171,8 @@ def assert_nothing_overflows(seen: Visit, width: str) -> None:
     assert outside == []
 
 
-def test_names_are_shown_and_not_run(browser, pages):
-    seen = visit(browser, pages["full"], "desktop")
-    assert seen.script("return document.title").startswith(HOSTILE.rsplit("/", 1)[1])  # a folder's name
-    text = seen.script("return document.body.innerText")
-    assert "<script>alert" in text
-    for leaked in ("DecompressionStream", "use strict", "function(", "undefined", "NaN", "[object"):
-        assert leaked not in text
-    assert seen.script("return [...document.querySelectorAll('[onerror]')].length") == 0
-    assert seen.script("return document.querySelectorAll('img[src=\"x\"]').length") == 0
-
-
 def test_the_cloud_is_really_there_and_can_be_turned(browser, pages):
-    seen = visit(browser, pages["refused"], "desktop")
+    seen = drawn(browser, pages, "refused", "desktop")
     # a WebGL canvas is empty once shown: plotly draws it again for a picture
     picture = """
         const done = arguments[arguments.length - 1];
@@ -192,6 +221,7 @@ def test_it_follows_a_dark_screen(browser, pages):
 
 
 def test_text_and_tables_stand_without_scripts(browser, pages):
+    browser.shown = None
     browser.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": True})
     try:
         browser.get(pages["refused"].as_uri())
@@ -205,6 +235,7 @@ def test_text_and_tables_stand_without_scripts(browser, pages):
 
 
 def test_a_browser_that_cannot_unpack_says_so(browser, pages):
+    browser.shown = None
     old = browser.execute_cdp_cmd(
         "Page.addScriptToEvaluateOnNewDocument", {"source": "delete window.DecompressionStream"}
     )

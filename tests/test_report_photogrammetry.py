@@ -11,6 +11,7 @@ from chromium import Page
 from jsonschema import Draft202012Validator
 from report_runs import write_run
 
+from colmap_inertial.model.intrinsics import intrinsics_sigma
 from colmap_inertial.report import write_report
 from colmap_inertial.report.photogrammetry import photogrammetry_record
 
@@ -55,6 +56,31 @@ def test_tracks_and_overlap_count_images(synthetic, record):
     assert tracks["mean"] == pytest.approx(synthetic.compute_mean_track_length())
     seen = [value for row in record["ground"]["images"] for value in row]
     assert 0 < max(seen) <= 8
+
+
+def test_the_uncertainty_of_intrinsics_is_their_scatter_over_models(synthetic):
+    found, sigma = [], []
+    for seed in range(12):
+        model = pycolmap.Reconstruction(synthetic)
+        noise = pycolmap.SyntheticNoiseOptions()
+        noise.point2D_stddev = 0.5
+        pycolmap.set_random_seed(seed)
+        pycolmap.synthesize_noise(noise, model)
+        options = pycolmap.BundleAdjustmentOptions()
+        options.print_summary = False
+        pycolmap.bundle_adjustment(model, options)
+        model.update_point_3d_errors()
+        (camera,) = model.cameras.values()
+        before = camera.params.copy()
+        (one,) = intrinsics_sigma(model).values()
+        np.testing.assert_array_equal(next(iter(model.cameras.values())).params, before)
+        assert np.isfinite(one).tolist() == [True, False, False, True]
+        found.append(before[[0, 3]])
+        sigma.append(one[[0, 3]])
+    scatter, told = np.std(found, axis=0, ddof=1), np.mean(sigma, axis=0)
+    # half of the variance, the noise that the model had before, is the same in all
+    ratio = 2**0.5 * scatter / told
+    assert ((ratio > 0.6) & (ratio < 1.6)).all(), ratio
 
 
 def test_the_ground_sampling_distance_is_depth_over_focal_length(synthetic, record):

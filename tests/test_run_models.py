@@ -1,5 +1,6 @@
 """COLMAP's models on their way to metres: which go first, which are left out, what is said, what is made again."""
 
+import shutil
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -10,21 +11,27 @@ from test_pipeline_parts import recording_of, session_in
 
 from colmap_inertial.drivers import models
 from colmap_inertial.drivers.models import run_models, run_validation
+from colmap_inertial.drivers.project import _scales
 from colmap_inertial.drivers.result import ModelResult, ReconstructResult, result_as_json
-from colmap_inertial.geometry import quat_exp, quat_multiply
+from colmap_inertial.errors import FormatError, TimingError
+from colmap_inertial.geometry import quat_exp, quat_multiply, quat_rotate
 from colmap_inertial.imaging.gate import FrameDecision, RecordingVerdict
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.frames import read_frame_times
 from colmap_inertial.io.trajectories import read_tum
 from colmap_inertial.model import Model, num_registered, read_model
+from colmap_inertial.model.project import apply_to_project, undo_project
 from colmap_inertial.model.readout import Settled
+from colmap_inertial.model.similarities import ModelScale, plain_factor, read_similarity
 from colmap_inertial.precalibrate.plan import ImagingPlan
+from colmap_inertial.report import content
 from colmap_inertial.run.workspace import Workspace
 from colmap_inertial.simulate import ImuOptions, MotionOptions, RecordingOptions, SfmOptions, simulate_recording
 from colmap_inertial.stages import readout
 from colmap_inertial.stages.deblur import DeblurStage
 from colmap_inertial.stages.gyro_view import GyroView
+from colmap_inertial.stages.join import JoinStage
 from colmap_inertial.stages.metric import MetricStage, gravity_in_model, of_model
 from colmap_inertial.stages.readout import ReadoutStage
 from colmap_inertial.stages.rolling_shutter import RollingShutterStage, for_rectified
@@ -33,6 +40,7 @@ from colmap_inertial.types import (
     Frame,
     FrameTiming,
     ImuRecording,
+    JoinedPart,
     Keypoints,
     ScaleEstimate,
     Similarity,
@@ -84,6 +92,39 @@ class Scaled:
         return replace(model, reconstruction=moved, scale=self.made.scale, similarity=similarity)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Joins:
+    """Joins all models into the first, each moved along by its own number of metres."""
+
+    def __call__(self, model):
+        return model
+
+    def join(self, models):
+        parts = tuple(
+            JoinedPart(
+                **dict.fromkeys(("begin_s", "end_s", "sigma_m", "sigma_deg"), 0.0),
+                colmap_index=model.colmap_index,
+                images=model.reconstruction.num_reg_images(),
+                verdict="trusted",
+                sigma_log=0.01,
+                similarity=along(model.similarity, model.colmap_index),
+            )
+            for model in models
+        )
+        return (replace(models[0], parts=parts),), ()
+
+
+def along(similarity, metres):
+    return replace(similarity, translation_m=similarity.translation_m + np.array([metres, 0.0, 0.0]))
+
+
+def without_an_image(model):
+    """A stage that changes what COLMAP made."""
+    changed = pycolmap.Reconstruction(model.reconstruction)
+    changed.deregister_frame(changed.image(max(changed.reg_image_ids())).frame_id)
+    return replace(model, reconstruction=changed)
+
+
 @pytest.fixture
 def run(project, whole, tmp_path):
     """Runs the model stages on sub-models of so many images each, by number."""
@@ -92,7 +133,7 @@ def run(project, whole, tmp_path):
     model, made = whole
     names = sorted(image.name for image in model.reconstruction.images.values())
 
-    def run(sizes, *, doubts=(), least=0, most=1000, **more):
+    def run(sizes, *, doubts=(), least=0, most=1000, then=(), **more):
         for number, size in sizes.items():
             folder = workspace.colmap_sparse / str(number)
             if not folder.exists():
@@ -106,8 +147,8 @@ def run(project, whole, tmp_path):
         found = {number: workspace.colmap_sparse / str(number) for number in sizes}
         run.session = session
         return run_models(
-            session, recording, [Scaled(made=made, least=least, most=most)], found=found, after=(), **more
-        )
+            session, recording, [Scaled(made=made, least=least, most=most), *then], found=found, after=(), **more
+        )[:2]
 
     run.workspace = workspace
     return run
@@ -160,6 +201,84 @@ def test_a_project_s_models_keep_their_numbers(run):
     assert [(one.index, one.colmap_index, one.sparse_metric.name) for one in models] == [(2, 2, "2"), (0, 0, "0")]
     assert [one.trajectory.name for one in models] == ["trajectory.tum", "trajectory_0.tum"]
     assert num_registered(run.workspace.sparse / "2") == 90
+
+
+def test_models_that_may_be_joined_are_numbered_with_those_that_were_refused(run, project):
+    joining = JoinStage(imu=project.recording.imu, calibration=None)
+    for sizes in ({0: 90, 1: 1}, {0: 1, 1: 90}):
+        models, _ = run(sizes, then=[joining], fragments=True)
+        largest = max(sizes, key=sizes.get)
+        assert [(one.index, one.colmap_index, one.scale.verdict) for one in models] == [
+            (0, largest, "trusted"),
+            (1, 1 - largest, "refused"),
+        ]
+        assert [path.name for path in run.workspace.sparse.iterdir()] == ["0"]
+        shutil.rmtree(run.workspace.colmap_sparse)
+    models, _ = run({3: 90, 1: 1}, then=[joining], fragments=True, numbered=True)
+    assert [(one.index, one.colmap_index) for one in models] == [(3, 3), (1, 1)]
+    with pytest.raises(TimingError, match="1 of the model's 1 images"):
+        run({1: 1, 6: 1}, then=[joining], fragments=True)
+
+
+def test_parts_of_a_project_s_joined_model_stand_by_themselves_as_the_stages_made_them(run, whole):
+    def made():
+        return run({0: 60, 1: 40}, then=[without_an_image, Joins()], numbered=True)[0]
+
+    (one,) = made()
+    part = run.workspace.sparse / "1"
+    assert num_registered(run.workspace.colmap_sparse / "1") == 40 and num_registered(part) == 39
+    name = sorted(image.name for image in read_model(part).images.values())[7]
+    there, similarity = whole[0].reconstruction.find_image_with_name(name).projection_center(), one.parts[1].similarity
+    moved = similarity.scale * quat_rotate(similarity.rotation_xyzw, there) + similarity.translation_m
+    np.testing.assert_allclose(read_model(part).find_image_with_name(name).projection_center(), moved, atol=1e-9)
+    assert read_similarity(part / "transform.json").scale == similarity.scale
+    # apply --undo must know that it cannot take them apart
+    scales = _scales([one], ())
+    assert scales[0].joined_of == (0, 1) and scales[1].joined_of == ()
+    # a part's folder that is gone is made again
+    shutil.rmtree(part)
+    made()
+    assert run.session.runner.worked == ["metric"] and num_registered(part) == 39
+    made()
+    assert run.session.runner.worked == []
+
+
+def test_a_project_that_was_joined_is_not_taken_back(project, tmp_path):
+    shutil.copytree(project.model, tmp_path / "project" / "sparse" / "0")
+    scale = ModelScale(similarity=plain_factor(2.0), joined_of=(0, 3))
+    apply_to_project(tmp_path / "project", tmp_path / "metric", {0: scale})
+    with pytest.raises(FormatError, match=r"transform\.json: model 0 was joined of the models 0, 3, which cannot"):
+        undo_project(tmp_path / "metric", tmp_path / "back")
+    assert not (tmp_path / "back").exists()
+
+
+def test_the_report_says_of_a_joined_model_what_is_known():
+    model = {"joined_of": [{"colmap_index": 0}, {"colmap_index": 2}]}
+    gap = {"first": 0, "second": 2, "joined": True, "seconds": 1.0, "sigma_m": None, "sigma_deg": None}
+    for gaps in ([], [gap]):
+        assert content._joined(model, gaps) == "COLMAP made 2 models of it, which were joined into one."
+    assert "to 3.0 cm and 0.50 degrees" in content._joined(model, [gap | {"sigma_m": 0.03, "sigma_deg": 0.5}])
+
+
+def test_no_covariance_is_written_of_a_joined_path(run):
+    run({0: 60, 1: 40})
+    assert (run.workspace.root / "trajectory_cov.npz").is_file()
+    run({0: 60, 1: 40}, then=[Joins()])
+    assert sorted(path.name for path in run.workspace.root.glob("trajectory*")) == [
+        "trajectory.tum",
+        "trajectory_motion.json",
+    ]
+
+
+def test_counts_are_colmap_s_own_but_for_joined_models(run):
+    images = {}
+    for then in ([without_an_image], [without_an_image, Joins()]):
+        (one, *_), _ = run({0: 60, 1: 40}, then=then)
+        images[len(one.parts)] = one.summary["registered_images"]
+    assert images == {0: 60, 2: 59}
+    imu = JoinStage(imu=PANNING, calibration=None)
+    (first, *_), _ = run({0: 60, 1: 1}, then=[without_an_image, imu], fragments=True)
+    assert first.summary["registered_images"] == 60 and num_registered(first.sparse_metric) == 59
 
 
 def test_doubts_make_any_stage_s_scale_weak_and_make_the_models_again(run):

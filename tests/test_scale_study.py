@@ -135,7 +135,7 @@ def test_a_seed_alone_reproduces_a_run(scripts):
 
 def test_short_recordings_are_covered_and_close_to_the_bound(scripts):
     _, study = scripts
-    runs = [study.run(seed) for seed in study.seeds(100, (0, 24, 0, 0))]
+    runs = [study.run(seed) for seed in study.seeds(100, (0, 16, 0, 0))]
     figures = study.summary(runs)
     given = figures["runs"] - figures["refused"]
     assert figures["refused"] <= 1

@@ -8,8 +8,10 @@ from colmap_inertial.sweep import (
     DepthView,
     Sights,
     agreed_depth,
+    agreement,
     chosen_partners,
     depth_range,
+    normals,
     normals_of,
     partner_scores,
     sweep_depth,
@@ -148,6 +150,18 @@ def test_depths_stay_where_another_view_agrees():
     blind = [DepthView(depth=np.zeros_like(other.depth), camera=other.camera) for other in others]
     assert not agreed_depth(exact, blind).any()
     assert not agreed_depth(exact, []).any()
+
+
+def test_it_makes_no_difference_how_many_rows_are_worked_on_at_once(monkeypatch):
+    exact, others = depth_view(REFERENCE), [depth_view(v) for v in AROUND]
+    found = []
+    for rows in (7, 10_000):
+        monkeypatch.setattr(agreement, "ROWS_AT_ONCE", rows)
+        monkeypatch.setattr(normals, "ROWS_AT_ONCE", rows)
+        depth = agreed_depth(exact, others)
+        found.append((depth, normals_of(depth, REFERENCE)))
+    for few, all_of_them in zip(*found, strict=True):
+        assert np.array_equal(few, all_of_them)
 
 
 def test_agreeing_depths_are_averaged():

@@ -8,6 +8,7 @@ def filter(
     result: NDArray[np.float32],
     *,
     paths: NDArray[np.float32],
+    spread: NDArray[np.float32],
     window_in: NDArray[np.float32],
     window_out: NDArray[np.float32],
     hop: int,

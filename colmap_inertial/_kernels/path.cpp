@@ -27,11 +27,14 @@ struct Common {
     Floats fitted;     // that times the square of the frequency
     Floats gradient;   // power of differences
     Floats high;       // 1 or 2 above a frequency, else 0
+    Floats vertical;   // frequencies of the columns
     double window_power;
 
     explicit Common(const Tiles &tiles) : square{tiles.side, tiles.side + 16, tiles.side / 2 + 16} {
         count = size_t(square.side) * size_t(square.half);
         twiddles = twiddles_of(square.side);
+        vertical = floats(size_t(square.half));
+        for (int y = 0; y <= square.side / 2; ++y) vertical[y] = float(y) / float(square.side);
         double power = 0;
         for (int i = 0; i < tiles.side; ++i) power += double(tiles.window_in[i]) * double(tiles.window_in[i]);
         window_power = power * power;
@@ -53,19 +56,21 @@ struct Common {
 
 // Memory of one thread.
 struct Room {
-    Floats tile, other, power, scratch, real[6], cos_x, sin_x, cos_y, sin_y;
-    Spectrum spectrum, transfer, data;
+    Floats tile, other, power, doubt, scratch, real[8], cos_x, sin_x, cos_y, sin_y;
+    Spectrum spectrum, transfer, data, lean;
 
     Room(const Common &common, int samples) {
         const size_t side = size_t(common.square.side), pitch = size_t(common.square.pitch);
         tile = floats(side * pitch);
         other = floats(side * pitch);
         power = floats(common.count);
+        doubt = floats(common.count);
         scratch = floats(room_of(common.square));
         for (auto &plane : real) plane = floats(common.count);
         spectrum = {real[0].get(), real[1].get()};
         transfer = {real[2].get(), real[3].get()};
         data = {real[4].get(), real[5].get()};
+        lean = {real[6].get(), real[7].get()};
         cos_x = floats((side / 2 + 1) * size_t(samples));
         sin_x = floats((side / 2 + 1) * size_t(samples));
         cos_y = floats(size_t(common.square.half) * size_t(samples));
@@ -186,6 +191,28 @@ class Filter {
                        room.transfer);
     }
 
+    // How uncertain the transfer is. The mean over the path, weighted by the time since the middle of the exposure, is
+    // how it changes with the chord. Takes what `find_transfer` left. Whether there is any doubt.
+    bool find_doubt(int row, int column, Room &room) const {
+        const float *spread = tiles_.spread + (size_t(row) * tiles_.columns + column) * 3;
+        if (spread[0] <= 0 && spread[2] <= 0) {
+            std::fill_n(room.doubt.get(), common_.count, 0.0f);
+            return false;
+        }
+        const int samples = tiles_.samples;
+        for (int x = 0; x <= tiles_.side / 2; ++x)
+            for (int k = 0; k < samples; ++k) {
+                const float since = (float(k) + 0.5f) / float(samples) - 0.5f;
+                room.cos_x[size_t(x) * samples + k] *= since;
+                room.sin_x[size_t(x) * samples + k] *= since;
+            }
+        simd_.transfer(common_.square, samples, room.cos_x.get(), room.sin_x.get(), room.cos_y.get(), room.sin_y.get(),
+                       room.lean);
+        simd_.doubt(common_.square, room.lean, common_.vertical.get(), spread[0], spread[1], spread[2],
+                    room.doubt.get());
+        return true;
+    }
+
     // Cosines and sines of the multiples of an angle.
     static void turns(double angle, int count, float *cosines, float *sines, ptrdiff_t step) {
         const double c = std::cos(angle), s = std::sin(angle);
@@ -229,18 +256,21 @@ class Filter {
         const size_t count = common_.count;
         const float scale = 1.0f / (float(square.side) * float(square.side));
         find_transfer(row, column, room);
+        const bool doubtful = find_doubt(row, column, room);
         for (int channel = 0; channel < light_.channels; ++channel) {
             const float mean = load_tile(row, column, channel, room);
             const float *line = model.noise + 2 * channel;
             const float noise = std::max(line[0] + line[1] * mean, model.least_noise * model.least_noise);
             double sums[3];
-            simd_.correlate(count, room.transfer, room.spectrum, common_.fitted.get(), common_.band.get(),
-                            room.power.get(), room.data, sums);
+            simd_.correlate(count, room.transfer, room.doubt.get(), room.spectrum, common_.fitted.get(),
+                            common_.band.get(), room.power.get(), room.data, sums);
             // (a column of zeros beside the spectrum has a power of zero, and a prior of one)
             const double excess = sums[0] / common_.window_power - double(noise) * sums[1];
             const float signal = std::max(float(excess / std::max(sums[2], 1e-30)), model.least_signal * noise);
-            simd_.divide(count, room.data, room.power.get(), common_.flattened.get(),
-                         model.noise_factor * noise / signal, scale, room.spectrum);
+            const float unlike = model.noise_factor * noise / signal;
+            simd_.divide(count, room.data, room.power.get(), common_.flattened.get(), unlike, scale, room.spectrum);
+            if (doubtful && model.rounds)
+                simd_.weigh(count, room.doubt.get(), common_.flattened.get(), unlike, room.power.get(), room.data);
             simd_.inverse(square, twiddles, room.spectrum, room.tile.get(), room.scratch.get());
             for (int round = 0; round < model.rounds; ++round) {
                 const float splitting = model.splitting[round];

@@ -10,6 +10,7 @@ struct Tiles {
     int side, hop, before;    // of a tile; between neighbours; how far the first begins before the image
     int samples;              // of a path
     const float *paths;       // (rows, columns, samples, 2)
+    const float *spread;      // (rows, columns, 3) variances xx, xy, yy of their chords
     const float *window_in;   // (side,)
     const float *window_out;  // (side,)
 };

@@ -42,7 +42,7 @@ void check_side(size_t side) {
     check(side >= 32 && side <= 8192 && (side & (side - 1)) == 0, "side: must be a power of two from 32 to 8192");
 }
 
-Tiles tiles_of(const In<float, 4> &paths, const In<float, 1> &window_in, const In<float, 1> &window_out, int hop,
+Tiles tiles_of(const In<float, 4> &paths, const float *spread, const In<float, 1> &window_in, const In<float, 1> &window_out, int hop,
                int before) {
     check_side(window_in.shape(0));
     check(window_out.shape(0) == window_in.shape(0), "window_out: not of a tile's side");
@@ -54,7 +54,7 @@ Tiles tiles_of(const In<float, 4> &paths, const In<float, 1> &window_in, const I
     check(paths.size() > 0 && paths.shape(3) == 2, "paths: not one path for each tile");
     check(hop > 0 && before >= 0 && last - first <= 2 * hop, "hop: too short for the window");
     return {int(paths.shape(0)), int(paths.shape(1)), side,           hop, before, int(paths.shape(2)), paths.data(),
-            window_in.data(),    window_out.data()};
+            spread,              window_in.data(),     window_out.data()};
 }
 
 Light light_of(const In<float, 3> &light) {
@@ -62,7 +62,7 @@ Light light_of(const In<float, 3> &light) {
     return {int(light.shape(0)), int(light.shape(1)), int(light.shape(2)), light.data()};
 }
 
-void filter(In<float, 3> light, Of<float, 3> result, In<float, 4> paths, In<float, 1> window_in,
+void filter(In<float, 3> light, Of<float, 3> result, In<float, 4> paths, In<float, 3> spread, In<float, 1> window_in,
             In<float, 1> window_out, int hop, int before, In<float, 2> noise, float least_noise, float noise_factor,
             float flat_below, float fitted_from, float fitted_to, float least_signal, float data_weight,
             In<float, 1> splitting, int threads, const std::string &instruction_set) {
@@ -70,7 +70,8 @@ void filter(In<float, 3> light, Of<float, 3> result, In<float, 4> paths, In<floa
     check(is(result, light.shape(0), light.shape(1), light.shape(2)), "result: not the shape of light");
     check(is(noise, light.shape(2), 2), "noise: not two values for each channel");
     check(least_noise > 0 && noise_factor > 0 && data_weight > 0, "least_noise, noise_factor, data_weight: positive");
-    const Tiles tiles = tiles_of(paths, window_in, window_out, hop, before);
+    check(is(spread, paths.shape(0), paths.shape(1), 3), "spread: not three values for each tile");
+    const Tiles tiles = tiles_of(paths, spread.data(), window_in, window_out, hop, before);
     const Model model{noise_factor, flat_below,  fitted_from,
                       fitted_to,    least_signal, least_noise,
                       noise.data(), data_weight, int(splitting.shape(0)),
@@ -86,7 +87,7 @@ std::vector<float> noise(In<float, 3> light, In<float, 4> paths, In<float, 1> wi
     const Light source = light_of(light);
     check(every > 0, "every: positive");
     // nothing is put together: any window does for the check
-    const Tiles tiles = tiles_of(paths, window_in, window_in, std::max(hop, int(window_in.shape(0))), before);
+    const Tiles tiles = tiles_of(paths, nullptr, window_in, window_in, std::max(hop, int(window_in.shape(0))), before);
     Tiles placed = tiles;
     placed.hop = hop;
     check(hop > 0, "hop: positive");
@@ -131,7 +132,8 @@ std::vector<std::string> instruction_sets() {
 
 NB_MODULE(_path, module) {
     module.def("filter", &filter, nb::arg("light").noconvert(), nb::arg("result").noconvert(), nb::kw_only(),
-               nb::arg("paths").noconvert(), nb::arg("window_in").noconvert(), nb::arg("window_out").noconvert(),
+               nb::arg("paths").noconvert(), nb::arg("spread").noconvert(), nb::arg("window_in").noconvert(),
+               nb::arg("window_out").noconvert(),
                nb::arg("hop"), nb::arg("before"), nb::arg("noise").noconvert(), nb::arg("least_noise"),
                nb::arg("noise_factor"), nb::arg("flat_below"), nb::arg("fitted_from"), nb::arg("fitted_to"),
                nb::arg("least_signal"), nb::arg("data_weight"), nb::arg("splitting").noconvert(),

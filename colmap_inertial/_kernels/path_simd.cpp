@@ -249,8 +249,23 @@ inline double total(Vector v) {
 // Sums of a row at a time: single precision would lose digits over a whole tile.
 constexpr size_t SUMMED = 1024;
 
-void correlate(size_t count, Spectrum transfer, Spectrum spectrum, const float *weight, const float *band,
-               float *power, Spectrum data, double *sums) {
+void doubt(const Square &square, Spectrum lean, const float *frequencies, float xx, float xy, float yy, float *out) {
+    constexpr float TURN_SQUARED = 39.4784176f;
+    const int side = square.side;
+    const ptrdiff_t half = square.half;
+    for (int x = 0; x < side; ++x) {
+        const float fx = float(x <= side / 2 ? x : x - side) / float(side);
+        for (ptrdiff_t y = 0; y < half; y += LANES) {
+            const ptrdiff_t at = x * half + y;
+            const Vector re = load(lean.re + at), im = load(lean.im + at), fy = load(frequencies + y);
+            const Vector along = xx * fx * fx + fy * (2.0f * xy * fx + yy * fy);
+            store(out + at, TURN_SQUARED * along * (re * re + im * im));
+        }
+    }
+}
+
+void correlate(size_t count, Spectrum transfer, const float *doubt, Spectrum spectrum, const float *weight,
+               const float *band, float *power, Spectrum data, double *sums) {
     sums[0] = sums[1] = sums[2] = 0;
     for (size_t first = 0; first < count; first += SUMMED) {
         Vector seen = {}, once = {}, twice = {};
@@ -258,7 +273,7 @@ void correlate(size_t count, Spectrum transfer, Spectrum spectrum, const float *
         for (size_t i = first; i < end; i += LANES) {
             const Vector k_re = load(transfer.re + i), k_im = load(transfer.im + i), g_re = load(spectrum.re + i),
                          g_im = load(spectrum.im + i), w = load(weight + i);
-            const Vector p = k_re * k_re + k_im * k_im;
+            const Vector p = k_re * k_re + k_im * k_im + load(doubt + i);
             store(power + i, p);
             store(data.re + i, k_re * g_re + k_im * g_im);
             store(data.im + i, k_re * g_im - k_im * g_re);
@@ -269,6 +284,15 @@ void correlate(size_t count, Spectrum transfer, Spectrum spectrum, const float *
         sums[0] += total(seen);
         sums[1] += total(once);
         sums[2] += total(twice);
+    }
+}
+
+void weigh(size_t count, const float *doubt, const float *other, float factor, float *power, Spectrum data) {
+    for (size_t i = 0; i < count; i += LANES) {
+        const Vector d = load(doubt + i), certain = factor * load(other + i), share = certain / (certain + d);
+        store(power + i, share * (load(power + i) - d));
+        store(data.re + i, share * load(data.re + i));
+        store(data.im + i, share * load(data.im + i));
     }
 }
 
@@ -372,5 +396,5 @@ void shrink(const Square &square, const float *tile, float splitting, float thre
 
 }  // namespace
 
-extern const PathSimd JOIN(path_simd_, SIMD) = {TEXT(SIMD), forward, inverse, transfer, correlate,
-                                                quiet,      divide,  blend,   shrink};
+extern const PathSimd JOIN(path_simd_, SIMD) = {TEXT(SIMD), forward, inverse, transfer, doubt, correlate,
+                                                weigh,      quiet,   divide,   blend, shrink};

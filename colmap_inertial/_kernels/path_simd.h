@@ -32,10 +32,16 @@ struct PathSimd {
     // samples rows of `half` cosines and sines along y
     void (*transfer)(const Square &square, int samples, const float *cos_x, const float *sin_x, const float *cos_y,
                      const float *sin_y, Spectrum out);
-    // power = |transfer|^2, data = conj(transfer) spectrum; sums of weight |spectrum|^2 power, weight power and
+    // variance of the transfer: (2 pi)^2 f' C f |lean|^2, C of xx, xy, yy, where lean is how the transfer changes with a
+    // chord; frequencies: `half` vertical ones
+    void (*doubt)(const Square &square, Spectrum lean, const float *frequencies, float xx, float xy, float yy,
+                  float *out);
+    // power = |transfer|^2 + doubt, data = conj(transfer) spectrum; sums of weight |spectrum|^2 power, weight power and
     // band power^2
-    void (*correlate)(size_t count, Spectrum transfer, Spectrum spectrum, const float *weight, const float *band,
-                      float *power, Spectrum data, double *sums);
+    void (*correlate)(size_t count, Spectrum transfer, const float *doubt, Spectrum spectrum, const float *weight,
+                      const float *band, float *power, Spectrum data, double *sums);
+    // each frequency by the share w = factor other / (factor other + doubt): power = w (power - doubt), data = w data
+    void (*weigh)(size_t count, const float *doubt, const float *other, float factor, float *power, Spectrum data);
     // sum of weight |spectrum|^2 and of weight where |transfer|^2 < limit
     void (*quiet)(size_t count, Spectrum transfer, Spectrum spectrum, const float *weight, float limit, double *sums);
     // out = scale data / (power + factor other)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import difflib
+import functools
 import os
 import sys
 from collections.abc import Iterable, Sequence
@@ -122,10 +123,10 @@ def _spelled_out(args: Sequence[str]) -> list[str]:
     InertialError
         For an option that belongs to several groups.
     """
-    cls = _COMMANDS.get(args[0].replace("_", "-"))
-    if cls is None:
+    command = args[0].replace("_", "-")
+    if command not in _COMMANDS:
         return list(args[1:])
-    known = _options(cls)
+    known = _options(command)
     words = []
     for word in args[1:]:
         name, equals, value = word.partition("=")
@@ -147,11 +148,11 @@ def _require_known(args: Sequence[str]) -> None:
         if args and args[0] not in (*_HELP, "--version", "--tyro-print-completion"):
             raise InertialError(f"a command comes first, before {args[0]} (--help lists them)")
         return
-    cls = _COMMANDS.get(args[0].replace("_", "-"))
-    if cls is None:
+    command = args[0].replace("_", "-")
+    if command not in _COMMANDS:
         raise InertialError(f"there is no command {args[0]}{_nearest(args[0], _COMMANDS)} (--help lists them)")
     words = [word.partition("=")[0] for word in args[1:] if word.startswith("--") and word != "--"]
-    options = _options(cls)
+    options = _options(command)
     for word in words:
         if word.replace("_", "-") not in options:
             raise InertialError(
@@ -159,16 +160,17 @@ def _require_known(args: Sequence[str]) -> None:
             )
 
 
-def _options(cls: type[Any]) -> list[str]:
+@functools.cache
+def _options(command: str) -> tuple[str, ...]:
     """All options of a command, and the other form of each switch."""
     options = ["--tyro-print-completion"]
-    for option in options_of(cls):
+    for option in options_of(_COMMANDS[command], with_text=False):
         if option.positional:
             continue
         first = option.names[0]
         at = first.rfind(".") + 1 or 2
         options += [first] if option.value else [first, f"{first[:at]}no-{first[at:]}"]
-    return options
+    return tuple(options)
 
 
 def _nearest(word: str, known: Iterable[str]) -> str:
@@ -238,6 +240,7 @@ def _main(args: Sequence[str] | None) -> None:
         print(__version__)
         return
     try:
+        require_limits(to_load=True)
         command = parse(args)
     except (InertialError, ValueError) as error:  # options check their own values when they are built
         print(f"error: {error}", file=sys.stderr)

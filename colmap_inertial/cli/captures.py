@@ -35,14 +35,15 @@ class Reconstruct(Speaker):
     options, it makes only what is not there yet or depends on them.
 
     CAPTURE may be an existing COLMAP project: give --imu, and when its images were taken. Nothing is mapped again, and
-    OUT is all of the project in metres. Without an IMU, or where its scale is refused (the project is then OUT/colmap),
-    --scale-from takes the metres from a target or a known distance.
+    OUT is all of the project in metres. Without an IMU --scale-from takes the metres from a target or a known distance:
+    of a folder of pictures, a video, a capture, or a project (OUT/colmap of a run whose scale was refused).
 
     Example: colmap-inertial reconstruct my_capture/capture.toml out
     """
 
     capture: Positional[Path]
-    """A capture.toml, a folder that holds one, an EuRoC/ASL dataset, or a COLMAP project."""
+    """A capture.toml, a folder that holds one, an EuRoC/ASL dataset, or a COLMAP project; with --scale-from target or
+    distance also a folder of pictures or a video."""
     out: Positional[Path]
     """A new folder for everything that is made, or that of an earlier run on the same, which is gone on with."""
     project: Annotated[ProjectOptions, arg(name="")] = dataclasses.field(default_factory=ProjectOptions)
@@ -113,18 +114,15 @@ class Reconstruct(Speaker):
     def _by_reference(self) -> int:
         from colmap_inertial.cli.screen import live_progress
         from colmap_inertial.cli.terminal import show_reference
+        from colmap_inertial.drivers.bare import reconstruct_by
         from colmap_inertial.drivers.project import is_project
         from colmap_inertial.drivers.reference import scale_project_by
-        from colmap_inertial.errors import FormatError
 
-        if not is_project(self.capture):
-            raise FormatError(
-                self.capture,
-                "is no COLMAP project, and --scale-from scales one: map it with COLMAP, or give OUT/colmap of a run "
-                "whose scale was refused",
-            )
         with live_progress(self) as screen:
-            found = scale_project_by(self.capture, self.out, self.reference, self.project, progress=screen)
+            if is_project(self.capture):
+                found = scale_project_by(self.capture, self.out, self.reference, self.project, progress=screen)
+            else:
+                found = reconstruct_by(self.capture, self.out, self.reference, self.options, progress=screen)
         self.tell(lambda: show_reference(found), {**found.as_json(), "out": found.out, "exit_code": 0})
         return 0
 

@@ -12,12 +12,19 @@ from colmap_inertial.errors import InertialError
 #: Address space to begin with, and for each thread: its stack, and what the allocator keeps for it. A reconstruction of
 #: small pictures takes 1.3 GB on two processors.
 LEAST_BYTES, THREAD_BYTES = 2 << 30, 128 << 20
+#: Arguments are read with numpy. With less than this, and as much for each thread, it ends in OpenBLAS's words.
+LOADING_BYTES = 256 << 20
 #: A reconstruction has 9 open at a time, a batch some for each process; systems allow 256 or more.
 LEAST_FILES = 64
 
 
-def require_limits() -> None:
+def require_limits(*, to_load: bool = False) -> None:
     """Refuse to begin with less than any command takes.
+
+    Parameters
+    ----------
+    to_load
+        Only where it is less than reading the arguments takes.
 
     Raises
     ------
@@ -31,7 +38,10 @@ def require_limits() -> None:
     from colmap_inertial.threads import usable_processors
 
     least = LEAST_BYTES + THREAD_BYTES * usable_processors()
+    loaded = LOADING_BYTES + THREAD_BYTES * usable_processors()
     space, files = (resource.getrlimit(kind)[0] for kind in (resource.RLIMIT_AS, resource.RLIMIT_NOFILE))
+    if to_load and (space == resource.RLIM_INFINITY or space >= loaded):
+        return
     if space != resource.RLIM_INFINITY and space < least:
         raise InertialError(
             f"only {space / 1e9:.2g} GB of memory are allowed to a process here, and {least / 1e9:.2g} GB are needed: "

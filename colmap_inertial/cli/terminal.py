@@ -25,7 +25,7 @@ from colmap_inertial.run.workspace import Workspace
 from colmap_inertial.scale.parts import parts_in_words
 from colmap_inertial.scale.verdict import Z95
 from colmap_inertial.stages.frame_folder import FrameRecord
-from colmap_inertial.types import CameraImuCalibration, ScaleEstimate
+from colmap_inertial.types import CameraImuCalibration, Gap, JoinedPart, ScaleEstimate
 from colmap_inertial.validate import Validation, validation_table
 from colmap_inertial.view.guard import is_loopback
 
@@ -251,10 +251,16 @@ def show_reference(found: Reference) -> None:
     """Print where a project's metres come from, and how good they are."""
     low, high = found.ci95
     pct = half_width_pct(found.metres_per_unit, found.ci95)
+    # a small target says how long things are where it lies, and no more
+    lengths = None if found.validation is None else found.validation.lengths
+    small = found.scale_from == "target" and lengths is not None and lengths.is_short
     _show(
         "Project",
         [
-            ("Metres", f"10 m are 10 m to within {length_error(pct)}"),
+            (
+                "Metres",
+                f"10 m are 10 m to within {length_error(pct)}{', as far as the target reaches' if small else ''}",
+            ),
             ("From", found.made_of),
             ("Scale", f"{found.metres_per_unit:.6g} m per unit, +-{pct:.2g} % (95 %)"),
             ("Interval", f"{low:.6g} to {high:.6g} m per unit"),
@@ -309,6 +315,8 @@ def show_result(result: ReconstructResult, source: Path) -> None:
             ("Points", f"{summary['points']}, mean reprojection error {summary['mean_reprojection_error_px']:.2f} px"),
             *(imaging_lines(frames, result.imaging, result.keypoints.rectified()) if frames else []),
         ]
+        if model.parts:
+            lines.append(("Joined", _joined(model.parts, result.gaps)))
         if isinstance(model.validation, Validation) and model.validation.ci95_pct is not None:
             low, high = model.validation.ci95_pct
             error = f"{model.validation.scale_error_pct:+.2f} % (95 %: {low:+.2f} to {high:+.2f})"
@@ -344,7 +352,22 @@ def show_result(result: ReconstructResult, source: Path) -> None:
             f"COLMAP's model {fragment.colmap_index} is a fragment of {fragment.registered_images} images, left out; "
             "--fragments makes it metric, too"
         )
+    for gap in result.gaps:
+        if not gap.joined:
+            print(f"COLMAP's models {gap.first} and {gap.second}, {gap.seconds:.1f} s apart, stay apart: {gap.reason}")
     print(f"next: {next_command(result, source)}")
+
+
+def _joined(parts: Sequence[JoinedPart], gaps: Sequence[Gap]) -> str:
+    """What a model was joined of, and how sure that is."""
+    inside = {part.colmap_index for part in parts}
+    across = [
+        f"{gap.seconds:.1f} s to {100 * (gap.sigma_m or 0.0):.1f} cm, {gap.sigma_deg:.2f} degrees"
+        for gap in gaps
+        if gap.joined and {gap.first, gap.second} <= inside
+    ]
+    numbers = ", ".join(str(part.colmap_index) for part in parts)
+    return f"COLMAP's models {numbers}; 1 sigma across: {'; '.join(across)}"
 
 
 def _layout_in_a_line(result: ReconstructResult) -> str:

@@ -28,6 +28,7 @@ from colmap_inertial.colmap.depth_maps import (
 )
 from colmap_inertial.colmap.fusion import fuse_maps
 from colmap_inertial.colmap.swept import SweptWorkspace
+from colmap_inertial.colmap.tsdf import tsdf_mesh
 from colmap_inertial.errors import FormatError, OutputError
 from colmap_inertial.io.files import read_json, write_json
 from colmap_inertial.io.images import read_image
@@ -193,7 +194,7 @@ def _densify(
         return replace(result, waiting=waiting)
     if len(mapped) < len(names):
         log.warning("model %d: no depth map of %s", index, ", ".join(sorted(set(names) - set(mapped))))
-    fused, mesh = folder / "fused.ply", folder / "meshed-poisson.ply"
+    fused, mesh = folder / "fused.ply", folder / f"meshed-{options.mesh}.ply"
 
     def fuse(partial: Sequence[Path]) -> None:
         scratch = session.workspace.stamps / "fusion"
@@ -209,19 +210,27 @@ def _densify(
     with a_record_of_ours(record):
         covered = float(read_json(record)["coverage"])
     result = replace(result, fused=fused, points=_count(fused, "vertex"), coverage=covered)
+    for other in folder.glob("meshed-*.ply"):
+        if other != mesh or not result.points:
+            remove(other)
     if options.mesh == "none" or not result.points:
-        remove(mesh)
         return result
-    poisson = pycolmap.PoissonMeshingOptions()
-    poisson.num_threads = num_threads
-    poisson.depth, poisson.trim = _octree(fused, read_model(folder / "sparse"))
+    if options.mesh == "tsdf":
+        depends: dict[str, object] = {"maps": maps}
 
-    def surface(partial: Sequence[Path]) -> None:
-        pycolmap.poisson_meshing(str(fused), str(partial[0]), poisson)
-        if not partial[0].is_file():
-            raise OutputError(f"{mesh}: COLMAP wrote no mesh; is the disk full?")
+        def surface(partial: Sequence[Path]) -> None:
+            tsdf_mesh(folder, mapped, partial[0], maker=maker, kind=kind)
+    else:
+        poisson = pycolmap.PoissonMeshingOptions()
+        poisson.num_threads = num_threads
+        poisson.depth, poisson.trim = _octree(fused, read_model(folder / "sparse"))
+        depends = {"depth": poisson.depth, "trim": poisson.trim}
 
-    depends = {"depth": poisson.depth, "trim": poisson.trim}
+        def surface(partial: Sequence[Path]) -> None:
+            pycolmap.poisson_meshing(str(fused), str(partial[0]), poisson)
+            if not partial[0].is_file():
+                raise OutputError(f"{mesh}: COLMAP wrote no mesh; is the disk full?")
+
     runner.run(f"dense_{index}_mesh", depends, [mesh], surface, after=[f"dense_{index}_fused"])
     return replace(result, mesh=mesh, faces=_count(mesh, "face"))
 

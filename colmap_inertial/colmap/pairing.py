@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from colmap_inertial.colmap.headings import Headings, find_headings
 from colmap_inertial.colmap.loops import close_loops
 from colmap_inertial.colmap.sparse import image_pairs, match_pairs, matches_every_pair
-from colmap_inertial.colmap.two_views import count_verified, ray_pairs, turns_rad
+from colmap_inertial.colmap.two_views import count_verified, ray_pairs, sightings_of, turns_rad
 from colmap_inertial.colmap.votes import Voters
+from colmap_inertial.colmap.way import find_way
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.options import MappingOptions
 from colmap_inertial.run.context import Recording, RunContext
@@ -29,6 +30,8 @@ Int = NDArray[np.intp]
 _LEAST_VOTES = 4
 #: Images so many places apart are matched first, and in any case: the gyroscope is calibrated by them.
 _CLOSE = (1, 2, 4)
+#: The way is found by images so many places apart: farther apart, some join copies of what is there many times.
+_NEXT = 2
 #: Where neighbours are matched, those within so many times the overlap are no loop.
 _NEAR = 2
 
@@ -46,19 +49,21 @@ class MatchRecord:
     images, pairs
         How many there are, and pairs by the pairing.
     far
-        Pairs of neighbours far apart in time that were left out, as loops are sought in their place.
+        Pairs of neighbours far apart in time that were left out: loops are sought in their place, where the gyroscope
+        is of use.
     apart
         Pairs that were ruled out as the gyroscope says that the camera looked elsewhere.
     unlike
         Pairs that were ruled out as their largest features show nothing in common.
     loops_compared
-        Pairs of frames about a second apart and far apart in time whose largest features were compared, as the
-        gyroscope does not rule them out.
+        Pairs of frames about a second apart and far apart in time whose largest features were compared, as neither the
+        gyroscope nor the way rules them out.
     loop_candidates
         Pairs that were matched as they may close a loop.
     loops_refused
         Of these, pairs that COLMAP verified and that were left out: their matches cover too little of both pictures,
-        turn the camera otherwise than the gyroscope, or stand alone.
+        turn the camera otherwise than the gyroscope, bring it elsewhere than the way does, contradict other loops, or
+        stand alone.
     loops_closed
         Of these, pairs that stay.
     matched, verified
@@ -97,9 +102,10 @@ def match_capture(
     """Match and verify pairs of a recording's images in a copy of the features' database.
 
     Images close in time come first: how the camera turned between them gives the gyroscope's calibration, and with it
-    the heading of all frames. Pairs that look apart are left out then, and so are pairs whose largest features have
-    nothing in common. Of a capture too long for every pair, loops are closed. Where the gyroscope does not turn as the
-    images do, all pairs are matched.
+    the heading of all frames. Pairs that look apart are left out then, and where every pair is matched, those whose
+    largest features have nothing in common. Of a capture too long for every pair, loops are closed. Where the gyroscope
+    does not turn as the images do, all other pairs are matched; but nothing could tell a loop from a copy, and so none
+    is closed.
 
     Parameters
     ----------
@@ -119,7 +125,9 @@ def match_capture(
     every_pair = matches_every_pair(len(names), options)
     kept: dict[str, int] = {}
     sigma_deg = None
-    rest = [pair for pair in pairs if place[pair[1]] - place[pair[0]] not in _CLOSE]
+    i, j = _places([pair for pair in pairs if place[pair[1]] - place[pair[0]] not in _CLOSE], place)
+    far = np.zeros(len(i), dtype=np.bool_) if every_pair else j - i > _NEAR * options.overlap
+    i, j = i[~far], j[~far]
     headings: Headings | None = None
     try:
         turn_rad = turns_rad(database, names)
@@ -129,15 +137,15 @@ def match_capture(
     else:
         note = "the frames turn as the gyroscope does"
         sigma_deg = _widest_deg(headings)
-        i, j = _places(rest, place)
-        far = np.zeros(len(i), dtype=np.bool_) if every_pair else j - i > _NEAR * options.overlap
-        i, j = i[~far], j[~far]
         away = headings.see_nothing_in_common(i, j)
         i, j = i[~away], j[~away]
         voters = Voters.of(database, names)
-        alike = (voters.count(i, j) >= _LEAST_VOTES) | ~(voters.plenty[i] & voters.plenty[j])
-        rest = [(names[a], names[b]) for a, b in zip(i[alike], j[alike], strict=True)]
-        kept = {"far": int(far.sum()), "apart": int(away.sum()), "unlike": int((~alike).sum())}
+        alike = np.ones(len(i), dtype=np.bool_)
+        if every_pair:
+            alike = (voters.count(i, j) >= _LEAST_VOTES) | ~(voters.plenty[i] & voters.plenty[j])
+        i, j = i[alike], j[alike]
+        kept = {"apart": int(away.sum()), "unlike": int((~alike).sum())}
+    rest = [(names[a], names[b]) for a, b in zip(i.tolist(), j.tolist(), strict=True)]
     match_pairs(database, rest, context, done=len(pairs) - len(rest), total=len(pairs))
     matched = len(close) + len(rest)
     if headings is not None and not every_pair:
@@ -145,7 +153,9 @@ def match_capture(
         def match(more: Sequence[tuple[str, str]]) -> None:
             match_pairs(database, more, context, done=len(pairs), total=len(pairs) + len(more))
 
-        loops = close_loops(database, names, headings, voters, _NEAR * options.overlap + 1, match)
+        next_ones = [pair for pair in close if pair[1] - pair[0] <= _NEXT]
+        way = find_way(sightings_of(database, names, next_ones, headings.start_from_cam), len(names))
+        loops = close_loops(database, names, headings, way, voters, _NEAR * options.overlap + 1, match)
         matched += loops.candidates
         kept |= {
             "loops_compared": loops.compared,
@@ -158,6 +168,7 @@ def match_capture(
         pairing="exhaustive" if every_pair else "sequential",
         images=len(names),
         pairs=len(pairs),
+        far=int(far.sum()),
         matched=matched,
         verified=count_verified(database),
         gyroscope=note,

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 #: Up to this many images every pair is matched; above it, neighbours in time.
 _EXHAUSTIVE_UP_TO = 150
 _EXTRACTION_BATCH = 16
-#: Each batch reads its images' features anew.
-_MATCHING_BATCH = 1600
+#: Each batch reads its images' features anew; the first are small, so that one sees soon how quickly it goes.
+_FIRST_MATCHING_BATCH, _MATCHING_BATCH = 100, 1600
 #: What a feature takes in the database at most, several orientations and SQLite's log included; likewise a pair.
 _FEATURE_BYTES = 500
 _PAIR_BYTES = 100_000
@@ -181,6 +181,15 @@ def _batches(items: Sequence[str], size: int) -> list[list[str]]:
     return [list(items[i : i + size]) for i in range(0, len(items), size)]
 
 
+def growing_batches(pairs: Sequence[str]) -> list[list[str]]:
+    """Pairs in batches to match, each twice as large as the one before, up to a limit."""
+    batches, begin, size = [], 0, _FIRST_MATCHING_BATCH
+    while begin < len(pairs):
+        batches.append(list(pairs[begin : begin + size]))
+        begin, size = begin + size, min(2 * size, _MATCHING_BATCH)
+    return batches
+
+
 @dataclass(frozen=True, kw_only=True)
 class KeypointRecord:
     """What the keypoint stages did to one image's keypoints; see :class:`~colmap_inertial.types.Keypoints`."""
@@ -251,7 +260,7 @@ def match_pairs(
     lines = [f"{a} {b}" for a, b in pairs]
     with tempfile.TemporaryDirectory() as folder:
         listed = Path(folder) / "pairs.txt"
-        for batch in _batches(lines, _MATCHING_BATCH):
+        for batch in growing_batches(lines):
             context.progress("matches", done, total)
             require_room(database.parent, len(batch) * _PAIR_BYTES)
             listed.write_text("\n".join(batch) + "\n")

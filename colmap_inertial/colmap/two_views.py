@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.colmap.gyro_bias import RayPairs
+from colmap_inertial.colmap.way import Sightings, Way, joined
 from colmap_inertial.geometry import matrix_from_quat, so3_log
 from colmap_inertial.types import Array
 
@@ -24,6 +25,8 @@ Bool = NDArray[np.bool_]
 _LEAST_MATCHES = 30
 #: Matches of a pair that the gyroscope's bias is sought by.
 _RAYS = 100
+#: Points of the way by which a frame is placed, how far off they may lie, and how many of those matched must not.
+_LEAST_PLACED, _PLACED_PX, _PLACED_SHARE = 12, 8.0, 0.7
 #: A picture in cells, and the features that a cell must have for it to count.
 _COLUMNS, _ROWS, _LEAST_FEATURES = 8, 6, 3
 
@@ -143,6 +146,104 @@ def ray_pairs(database: Path, names: Sequence[str], pairs: Sequence[tuple[int, i
         rays_first=stacked[:, 0],
         rays_second=stacked[:, 1],
     )
+
+
+def sightings_of(
+    database: Path, names: Sequence[str], pairs: Sequence[tuple[int, int]], start_from_cam: Array
+) -> Sightings:
+    """What the verified matches of pairs of frames say of points, with (N, 3, 3) orientations of the frames."""
+    import pycolmap
+
+    matches = []
+    with pycolmap.Database.open(str(database)) as opened:
+        images = {image.name: image for image in opened.read_all_images()}
+        cameras = {camera.camera_id: camera for camera in opened.read_all_cameras()}
+        counts = [opened.num_keypoints_for_image(images[name].image_id) for name in names]
+        for i, j in pairs:
+            found = opened.read_two_view_geometry(images[names[i]].image_id, images[names[j]].image_id).inlier_matches
+            if len(found) >= _LEAST_MATCHES:
+                matches.append((i, j, np.array(found, dtype=np.intp)))
+        frame, feature, point = joined(counts, matches)
+        rays = np.zeros((len(frame), 3))
+        bounds = np.searchsorted(frame, np.arange(len(names) + 1))
+        for k, name in enumerate(names):
+            mine, image = slice(bounds[k], bounds[k + 1]), images[name]
+            if bounds[k] == bounds[k + 1]:
+                continue
+            xy_px = np.array(opened.read_keypoints(image.image_id))[feature[mine], :2]
+            seen = np.asarray(cameras[image.camera_id].cam_from_img(xy_px.astype(np.float64)))[:, :2]
+            ray = np.column_stack([seen, np.ones(len(seen))]) @ start_from_cam[k].T
+            rays[mine] = ray / np.linalg.norm(ray, axis=1, keepdims=True)
+    return Sightings(frame=frame, point=point, feature=feature, rays=rays)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Return:
+    """Where a frame is by points that another one, long before or after, had seen.
+
+    Attributes
+    ----------
+    step
+        (3,) from the first frame to the second, in the length of the way at the first.
+    start_from_second
+        (3, 3) orientation of the second.
+    ratio
+        Length of the way at the first frame over that at the second.
+    depth
+        How far away the points are.
+    matches
+        How many points there are.
+    """
+
+    step: Array
+    start_from_second: Array
+    ratio: float
+    depth: float
+    matches: int
+
+
+def returns(database: Path, names: Sequence[str], pairs: Sequence[tuple[int, int]], way: Way) -> list[Return | None]:
+    """What the verified matches of pairs say; ``None`` where too few of them are points of the way that fit."""
+    import pycolmap
+
+    options = pycolmap.AbsolutePoseEstimationOptions()
+    options.ransac.max_error, options.ransac.random_seed = _PLACED_PX, 0
+    said: list[Return | None] = []
+    with pycolmap.Database.open(str(database)) as opened:
+        images = {image.name: image for image in opened.read_all_images()}
+        cameras = {camera.camera_id: camera for camera in opened.read_all_cameras()}
+        for i, j in pairs:
+            said.append(None)
+            one, two = images[names[i]], images[names[j]]
+            matches = np.array(opened.read_two_view_geometry(one.image_id, two.image_id).inlier_matches, dtype=np.intp)
+            (of_one, at_one), (of_two, at_two) = way.seen(i), way.seen(j)
+            _, mine, place = np.intersect1d(matches[:, 0], of_one, return_indices=True)
+            if len(mine) < _LEAST_PLACED:
+                continue
+            xy_px = np.array(opened.read_keypoints(two.image_id))[matches[mine, 1], :2].astype(np.float64)
+            points = at_one[place]
+            found = pycolmap.estimate_and_refine_absolute_pose(
+                xy_px, points, cameras[two.camera_id], estimation_options=options
+            )
+            if found is None or found["num_inliers"] < max(_LEAST_PLACED, _PLACED_SHARE * len(mine)):
+                continue
+            second_from_start = found["cam_from_world"]
+            centre = -second_from_start.rotation.matrix().T @ second_from_start.translation
+            fit = np.array(found["inlier_mask"])
+            away = np.linalg.norm(points - centre, axis=1)
+            _, both, other = np.intersect1d(matches[mine, 1], of_two, return_indices=True)
+            usable = fit[both]
+            if usable.sum() < _LEAST_PLACED // 2:
+                continue
+            there = np.linalg.norm(at_two[other[usable]] - way.centre[j], axis=1)
+            said[-1] = Return(
+                step=centre - way.centre[i],
+                start_from_second=second_from_start.rotation.matrix().T,
+                ratio=float(np.median(away[both[usable]] / there)),
+                depth=float(np.median(away[fit])),
+                matches=int(fit.sum()),
+            )
+    return said
 
 
 def count_verified(database: Path) -> int:

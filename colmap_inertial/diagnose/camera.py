@@ -9,20 +9,25 @@ import numpy as np
 
 from colmap_inertial.align import Alignment
 from colmap_inertial.align._acceleration import quick_accelerations
-from colmap_inertial.diagnose.findings import Finding, Recorded, Severity
+from colmap_inertial.diagnose.findings import UNIT_FACTORS, Finding, Recorded, Severity
 from colmap_inertial.errors import NotObservableError
-from colmap_inertial.flow import find_stabilisation
 from colmap_inertial.geometry import quat_conjugate, quat_log, quat_multiply
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.sampling import without_running_mean
 from colmap_inertial.types import CameraTrajectory, ImuRecording
 
 #: Clock rates: phones keep within 1e-4, action cameras within 1 %; the scale is corrected for what is found.
-_RATE, _WRONG_RATE = 0.003, 0.012
+_RATE, _WRONG_RATE, _WRONG_FRAME_RATE = 0.003, 0.012, 0.1
 #: Intervals over which rotations are compared, and how strong the axis must be that turns the wrong way.
 _INTERVAL_S, _MIRROR_SHARE = 0.1, 0.03
-#: Rates beyond what an alignment follows, which are tried where it finds nothing.
+#: Rates beyond what an alignment follows, which are tried where it finds nothing; and frame rates that are taken for
+#: one another (24, 25, 30, 50, 60 and half or double of them), as the IMU's seconds per second of frames.
 _TRIED_RATES = (0.02, -0.02, 0.03, -0.03, 0.04, -0.04)
+_TRIED_FRAME_RATES = (0.8, 1.25, 5 / 6, 1.2, 0.5, 2.0, 0.6, 5 / 3)
+#: What is wrong with a gyroscope's own numbers keeps it from fitting the camera: it is named once.
+_OF_THE_GYROSCOPE = frozenset({*UNIT_FACTORS, "sensors-exchanged", "dead-sensor", "dead-axis"})
+#: Of pictures far apart so many pairs must have been compared for a gyroscope not to belong to them.
+_ENOUGH_PAIRS = 12
 #: A recording that is shorter may simply not have turned enough.
 _ENOUGH_S = 8.0
 #: The IMU may miss so many frames, and this share of them; below the last, too little is left.
@@ -60,6 +65,11 @@ def check_belonging(recorded: Recorded) -> Iterator[Finding]:
         return
     if recorded.log is not None and recorded.log.stabilised:
         return
+    if any(problem.code in _OF_THE_GYROSCOPE for problem in recorded.implausible):
+        return
+    if recorded.wrong_unit is not None:
+        yield _unit_finding(recorded.wrong_unit)
+        return
     if failed.quantity != "time offset":
         yield Finding(
             code="rotation-too-little",
@@ -68,16 +78,12 @@ def check_belonging(recorded: Recorded) -> Iterator[Finding]:
             advice="turn the camera about all three axes while recording; clocks and axes cannot be checked without",
         )
         return
-    if isinstance(recorded.align(replace(imu, gyro_rad_s=-imu.gyro_rad_s)), Alignment):
-        yield _MIRRORED
+    otherwise = _as_it_would_fit(recorded, imu)
+    if otherwise is not None:
+        yield otherwise
         return
-    for rate in _TRIED_RATES:
-        begin_s = imu.gyro_t_s[0]
-        stretched = replace(imu, gyro_t_s=begin_s + (imu.gyro_t_s - begin_s) * (1 + rate))
-        found = recorded.align(stretched)
-        if isinstance(found, Alignment):
-            yield _rate_finding((1 + rate) * (1 + found.calibration.clock_rate) - 1)
-            return
+    if recorded.stabilisation is not None and recorded.stabilisation.stabilised:
+        return
     span_s = float(np.ptp(turning.t_s))
     if span_s < _ENOUGH_S:
         yield Finding(
@@ -88,12 +94,70 @@ def check_belonging(recorded: Recorded) -> Iterator[Finding]:
             numbers={"seconds": span_s},
         )
         return
+    if recorded.trajectory is None and not recorded.is_dense and len(turning) <= _ENOUGH_PAIRS:
+        yield Finding(
+            code="pictures-too-few",
+            severity="info",
+            evidence=f"only {len(turning) - 1} pictures that follow each other share enough to be compared with the "
+            "gyroscope, and it fits them at no offset",
+            advice="take pictures closer together, or film; after a reconstruction diagnose its model",
+            numbers={"pairs": len(turning) - 1.0},
+        )
+        return
     yield Finding(
         code="imu-does-not-fit",
         severity="error",
         evidence=failed.hint.split(":")[0],
         advice="check that this IMU recording belongs to these images, and the gyroscope's columns, axes and unit",
         numbers={"seconds": span_s},
+    )
+
+
+def _as_it_would_fit(recorded: Recorded, imu: ImuRecording) -> Finding | None:
+    """What makes the gyroscope turn as the camera does: another sign, rate, frame rate, or offset."""
+    if isinstance(recorded.align(replace(imu, gyro_rad_s=-imu.gyro_rad_s)), Alignment):
+        return _MIRRORED
+    begin_s = imu.gyro_t_s[0]
+    for tried in (*(1 + rate for rate in _TRIED_RATES), *_TRIED_FRAME_RATES):
+        # a frame of the same motion lasts longer, so that it turns slower
+        slower = replace(imu, gyro_t_s=begin_s + (imu.gyro_t_s - begin_s) * tried, gyro_rad_s=imu.gyro_rad_s / tried)
+        found = recorded.align(slower)
+        if isinstance(found, Alignment):
+            rate = tried * (1 + found.calibration.clock_rate)
+            return _rate_finding(rate - 1) if abs(tried - 1) < _WRONG_FRAME_RATE else _frame_rate_finding(rate)
+    if recorded.max_offset_s is None:
+        return None
+    found = recorded.align(imu, any_offset=True)
+    if not isinstance(found, Alignment):
+        return None
+    offset_s = found.calibration.gyro_time_offset_s
+    return Finding(
+        code="clock-offset",
+        severity="error",
+        evidence=f"camera and gyroscope fit where their stamps are {offset_s:+.3f} s apart, which one clock does not "
+        "allow",
+        advice="leave out shared_clock = true under [timing] in capture.toml, or correct the stamps; a known offset "
+        "goes under [calibration]",
+        numbers={"offset_s": offset_s},
+    )
+
+
+def _unit_finding(code: str) -> Finding:
+    factor = UNIT_FACTORS[code]
+    if factor < 1:
+        found = "the gyroscope turns as the camera does, but 57.3 times as far: its numbers are in deg/s"
+        unit = "deg/s"
+    else:
+        found = (
+            "the gyroscope turns as the camera does, but a 57.3th as far: rad/s were converted as if they were deg/s"
+        )
+        unit = "rad/s"
+    return Finding(
+        code=code,
+        severity="error",
+        evidence=found,
+        advice=f'set unit = "{unit}" under [imu.gyro] in capture.toml',
+        numbers={"gain": 1 / factor},
     )
 
 
@@ -144,6 +208,18 @@ def _rate_finding(rate: float) -> Finding:
     )
 
 
+def _frame_rate_finding(rate: float) -> Finding:
+    """Frame times by a wrong frame rate; ``rate`` is how many seconds of frames the IMU's second is."""
+    return Finding(
+        code="frame-rate",
+        severity="error",
+        evidence=f"the frames fit the gyroscope if {rate:.3g} times as many come in a second as are stated: they were "
+        "timed by another frame rate than they were filmed with",
+        advice="give the video itself as [video], or times as the recorder stamped them",
+        numbers={"rate": rate},
+    )
+
+
 def check_coverage(recorded: Recorded) -> Iterator[Finding]:
     """An IMU that was started late or stopped early."""
     imu = recorded.imu
@@ -183,11 +259,9 @@ def check_stabilisation(recorded: Recorded) -> Iterator[Finding]:
             advice=advice,
         )
         return
-    if recorded.rotation is None or recorded.imu is None:
-        return
-    offset_s = recorded.offset_s(recorded.rotation.epoch_ns)
-    told = find_stabilisation(recorded.rotation, recorded.imu, offset_s=offset_s)
-    if told.stabilised and told.share is not None:
+    told = recorded.stabilisation
+    # numbers in another unit look like it
+    if told is not None and told.stabilised and told.share is not None and recorded.wrong_unit is None:
         yield Finding(
             code="stabilised",
             severity="error",
@@ -279,6 +353,8 @@ def check_focal_length(recorded: Recorded) -> Iterator[Finding]:
     """A focal length that is too long makes all rotation in the picture too small, about both of its axes."""
     aligned, rotation, imu, camera = recorded.aligned, recorded.rotation, recorded.imu, recorded.camera
     if not isinstance(aligned, Alignment) or rotation is None or imu is None or camera is None:
+        return
+    if not recorded.is_dense:
         return
     motion = GyroCamera.of(imu, aligned.calibration, camera_epoch_ns=rotation.epoch_ns)
     known = np.isfinite(rotation.turn_rad).all(axis=1) & motion.covers(rotation.t_s[:-1], rotation.t_s[1:])

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -12,8 +13,9 @@ from numpy.typing import NDArray
 
 from colmap_inertial.align import Alignment, AlignOptions, align_clocks
 from colmap_inertial.align.conventions import LikelyConvention, likely_convention
-from colmap_inertial.errors import InertialError, NotObservableError
-from colmap_inertial.flow import VisualRotation
+from colmap_inertial.errors import FormatError, InertialError, NotObservableError
+from colmap_inertial.flow import Stabilisation, VisualRotation, find_stabilisation
+from colmap_inertial.io.plausible import find_implausible
 from colmap_inertial.io.pose_convention import ARRAYS, PoseConvention
 from colmap_inertial.io.units import Axes
 from colmap_inertial.types import (
@@ -166,6 +168,19 @@ class Recorded:
     in_video: FramesInVideo | None = None
 
     @cached_property
+    def implausible(self) -> tuple[FormatError, ...]:
+        """What a reader would refuse the inertial samples for."""
+        if self.imu is None:
+            return ()
+        found = find_implausible(self.imu, Path("IMU"), gyro_axes=self.gyro_axes, accel_axes=self.accel_axes)
+        return tuple(found)
+
+    @property
+    def is_dense(self) -> bool:
+        """Whether pictures were followed closely enough that what is quick shows in them."""
+        return self.rotation is not None and len(self.rotation.t_s) > 1 and self.rotation.step_s <= FOLLOWED_S
+
+    @cached_property
     def turning(self) -> CameraTrajectory | None:
         """The camera's rotation: of the reconstruction, else of the pixels."""
         if self.trajectory is not None or self.rotation is None:
@@ -179,6 +194,23 @@ class Recorded:
     def aligned(self) -> Alignment | NotObservableError | None:
         """Camera and IMU brought together; ``None`` where one of them is missing."""
         return None if self.imu is None else self.align(self.imu)
+
+    @cached_property
+    def stabilisation(self) -> Stabilisation | None:
+        """What the pictures tell of stabilisation; ``None`` without them."""
+        if self.rotation is None or self.imu is None:
+            return None
+        return find_stabilisation(self.rotation, self.imu, offset_s=self.offset_s(self.rotation.epoch_ns))
+
+    @cached_property
+    def wrong_unit(self) -> str | None:
+        """The code of the unit in which the gyroscope would turn as the camera does; ``None`` where none is needed."""
+        if self.imu is None or not isinstance(self.aligned, NotObservableError):
+            return None
+        for code, factor in UNIT_FACTORS.items():
+            if isinstance(self.align(replace(self.imu, gyro_rad_s=factor * self.imu.gyro_rad_s)), Alignment):
+                return code
+        return None
 
     @cached_property
     def likely_convention(self) -> LikelyConvention | None:
@@ -196,14 +228,14 @@ class Recorded:
             return None
         return self.aligned.calibration.gyro_time_offset_s + (self.imu.epoch_ns - camera_epoch_ns) * 1e-9
 
-    def align(self, imu: ImuRecording) -> Alignment | NotObservableError | None:
-        """The same with another reading of the gyroscope."""
+    def align(self, imu: ImuRecording, *, any_offset: bool = False) -> Alignment | NotObservableError | None:
+        """The same with another reading of the gyroscope, or at any offset of the clocks."""
         if self.turning is None:
             return None
-        options = AlignOptions(max_offset_s=self.max_offset_s)
+        options = AlignOptions(max_offset_s=None if any_offset else self.max_offset_s)
         if self.trajectory is None:
             # the camera's translation is in the pixels' motion, and no gyroscope explains it
-            options = AlignOptions(max_offset_s=self.max_offset_s, min_explained=PIXELS_EXPLAINED)
+            options = replace(options, min_explained=PIXELS_EXPLAINED)
         try:
             return align_clocks(self.turning, imu, prior=self.calibration, options=options)
         except NotObservableError as error:
@@ -212,3 +244,7 @@ class Recorded:
 
 #: What a gyroscope must explain of the rotation that pixels show, where no reconstruction tells it from translation.
 PIXELS_EXPLAINED = 0.5
+#: Numbers of a gyroscope times this are rad/s, where they were in the other unit than they were declared in.
+UNIT_FACTORS = {"gyro-in-deg": np.pi / 180, "gyro-not-in-deg": 180 / np.pi}
+#: Pictures closer together than this (median) are followed; those further apart are compared two by two.
+FOLLOWED_S = 0.15

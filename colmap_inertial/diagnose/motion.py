@@ -31,7 +31,8 @@ _ADVICE = (
 def check_motion_content(recorded: Recorded) -> Iterator[Finding]:
     """Accelerations are all that tells metres; rest, turning on the spot and gliding have none."""
     imu = recorded.imu
-    if imu is None or not imu.has_accel:
+    # of numbers in other units no motion is told
+    if imu is None or not imu.has_accel or recorded.implausible or recorded.wrong_unit is not None:
         return
     accel = acceleration_rms_m_s2(imu)
     rate = imu.gyro_rad_s - np.median(imu.gyro_rad_s, axis=0)

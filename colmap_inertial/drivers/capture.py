@@ -9,6 +9,7 @@ from types import EllipsisType
 
 from colmap_inertial.colmap.sparse import check_pair_names, mapping_device
 from colmap_inertial.colmap.steps import run_colmap
+from colmap_inertial.colmap.tsdf import require_mesh_maker
 from colmap_inertial.diagnose import Diagnosis
 from colmap_inertial.drivers.frames import ask_for_plan, fusing, run_frames, run_images, run_plan
 from colmap_inertial.drivers.georeference import positions_of, run_georeference
@@ -37,6 +38,7 @@ from colmap_inertial.run.session import open_session
 from colmap_inertial.stages.deblur import require_method
 from colmap_inertial.stages.exposures import lsd2_fuser
 from colmap_inertial.stages.frame_folder import require_frames
+from colmap_inertial.stages.join import JoinStage
 from colmap_inertial.stages.metric import MetricStage
 from colmap_inertial.stages.protocols import FrameStage, KeypointStage, ModelStage, with_defaults
 from colmap_inertial.stages.readout import ReadoutStage
@@ -64,8 +66,14 @@ def default_model_stages(
         num_threads=1 if options.deterministic else -1,
     )
     metric = MetricStage(imu=recording.imu, calibration=recording.prior, options=scale, world=options.world)
+    joining: list[ModelStage] = []
+    if options.join == "inertial":
+        limits = options.join_options
+        joining = [
+            JoinStage(imu=recording.imu, calibration=recording.prior, options=scale, limits=limits, world=options.world)
+        ]
     if options.refine == "off":
-        return [readout, metric]
+        return [readout, metric, *joining]
     # only what moved keypoints all by itself can say from where
     shutters = [stage for stage in keypoint_stages if isinstance(stage, RollingShutterStage)]
     refined = RefineStage(
@@ -75,7 +83,7 @@ def default_model_stages(
         refine_intrinsics=refine_intrinsics,
         shutter=shutters[0] if len(shutters) == len(keypoint_stages) == 1 else None,
     )
-    return [readout, metric, refined]
+    return [readout, metric, *joining, refined]
 
 
 def reconstruct(
@@ -103,8 +111,9 @@ def reconstruct(
     frame_stages, keypoint_stages, model_stages
         The hooks. ``...`` stands for the default stages: :class:`ApertureStage` for a multi-aperture camera's frames,
         :class:`ExposureStage` for pairs of a short and a long exposure, :class:`DeblurStage` for all others;
-        :class:`RollingShutterStage`; :class:`ReadoutStage`, :class:`MetricStage` and :class:`RefineStage`, where the
-        options and the recording allow them. The model stages must include one that makes the model metric.
+        :class:`RollingShutterStage`; :class:`ReadoutStage`, :class:`MetricStage`, :class:`JoinStage` and
+        :class:`RefineStage`, where the options and the recording allow them. The model stages must include one that
+        makes the model metric.
     progress
         Called with stage, steps done and steps in all.
     findings
@@ -149,6 +158,7 @@ def _reconstruct(
         raise ValueError("model_stages: one must estimate the scale, such as ... or MetricStage")
     warn_of_conflicts()
     require_plotly()
+    require_mesh_maker(options)
     require_method(options.deblur)
     loaded = load_capture(capture)
     if loaded.frames is None:
@@ -206,7 +216,7 @@ def _reconstruct(
         keypoints, matching = run_colmap(session, seen, records, of_keypoints, gravity, options)
         images = run_images(session, records, keypoints.rectified(), of_keypoints)
         of_models = with_defaults(model_stages, default_model_stages(recording, options, of_keypoints))
-        models, fragments = run_models(
+        models, fragments, gaps = run_models(
             session, recording, of_models, rectified=bool(keypoints.rectified()), fragments=options.fragments
         )
         models = run_validation(session, models, target, images)
@@ -217,6 +227,7 @@ def _reconstruct(
             workspace=workspace,
             models=models,
             fragments=fragments,
+            gaps=gaps,
             frames=records,
             keypoints=keypoints,
             matching=matching,

@@ -25,7 +25,7 @@ from colmap_inertial.io.video import decode_grey, video_stamps_ns
 from colmap_inertial.io.video_match import match_to_video
 from colmap_inertial.model import read_model, trajectory_from_model
 from colmap_inertial.precalibrate.plan import with_stated_exposures
-from colmap_inertial.precalibrate.preflight import _followed
+from colmap_inertial.precalibrate.preflight import _followed, compared
 from colmap_inertial.run.progress import Progress
 from colmap_inertial.types import CameraTrajectory, FrameTiming
 
@@ -86,7 +86,14 @@ def collect(source: ScaleSource, progress: Progress) -> Recorded:
     timing: FrameTiming | None = None
     trajectory: CameraTrajectory | None = None
     read_as = TUM
-    times = source.frame_times or (source.imu if source.imu is not None and is_capture(source.imu) else None)
+    times = source.frame_times
+    if (
+        times is None
+        and source.imu is not None
+        and is_capture(source.imu)
+        and load_capture(source.imu).frames is not None
+    ):
+        times = source.imu
     if times is not None:
         timing = reading.attempt(lambda: read_frame_times(times))
     if inertial_scale:
@@ -94,6 +101,7 @@ def collect(source: ScaleSource, progress: Progress) -> Recorded:
         read_as = INERTIAL_SCALE
     elif path.is_dir():
         read_as = COLMAP
+        only_model(path)
         if times is None:
             raise FormatError(path, "a COLMAP model has no frame times: give --frame-times, a CSV with name,t_s")
         if timing is not None:
@@ -164,7 +172,9 @@ def _of_capture(capture: Capture, calibration: CalibrationFiles, progress: Progr
         timing = reading.attempt(lambda: with_stated_exposures(capture, read_frame_timing(capture)))
     if timing is not None:
         known = timing
-        rotation = reading.attempt(lambda: _followed(capture, known, _MANY, _MANY_SPACING_S, progress))
+        rotation = reading.attempt(
+            lambda: _followed(capture, known, _MANY, _MANY_SPACING_S, progress) or compared(capture, known, progress)
+        )
         in_video = reading.attempt(lambda: _find_in_video(capture, known, progress))
     # the readings stay the sensor's own: that is what the checks are about
     prior = read_for_another(calibration, shared_clock=capture.shared_clock).camera_imu or capture.calibration

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from colmap_inertial.colmap.dense import run_dense
 from colmap_inertial.drivers.reporting import write_model_record
@@ -23,15 +23,17 @@ from colmap_inertial.model import (
     read_model,
     summarize,
     trajectory_from_model,
+    transformed,
     write_model,
 )
+from colmap_inertial.model.similarities import undoing
 from colmap_inertial.options import DenseOptions
 from colmap_inertial.run.context import Recording
 from colmap_inertial.run.runner import fingerprint, remove
 from colmap_inertial.run.session import Session
 from colmap_inertial.stages.metric import gravity_in_model, metric_trajectory, motion_file, write_trajectory
-from colmap_inertial.stages.protocols import ModelStage
-from colmap_inertial.types import ScaleEstimate
+from colmap_inertial.stages.protocols import JoiningStage, ModelStage
+from colmap_inertial.types import Gap, JoinedPart, ScaleEstimate
 from colmap_inertial.validate import Target, Validation, validate_model, write_overlays
 
 if TYPE_CHECKING:
@@ -43,12 +45,18 @@ log = logging.getLogger(__name__)
 _FEWEST_IMAGES, _LEAST_SHARE = 5, 0.01
 
 
+#: A model that went through the first stages, ``None`` where it was refused before, and what is known of it.
+_Begun: TypeAlias = "tuple[ScaledModel, Model | None]"
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Made:
-    """What the model stages made of all models."""
+    """What the model stages made of all models; the folders of parts of joined ones are ``beside`` theirs."""
 
     models: tuple[ScaledModel, ...]
     fragments: tuple[Fragment, ...]
+    gaps: tuple[Gap, ...] = ()
+    beside: tuple[Path, ...] = ()
 
 
 def run_models(
@@ -62,10 +70,11 @@ def run_models(
     numbered: bool = False,
     after: Sequence[str] = ("mapping",),
     read: Callable[[Path], pycolmap.Reconstruction] = read_model,
-) -> tuple[tuple[ModelResult, ...], tuple[Fragment, ...]]:
+) -> tuple[tuple[ModelResult, ...], tuple[Fragment, ...], tuple[Gap, ...]]:
     """Every sub-model through the model stages, then to its final place: the largest first, fragments left out.
 
-    One with fewer than two timed images is refused, and the others go on.
+    One with fewer than two timed images is refused, and the others go on. A stage that joins models takes all of them
+    at once; any other one after the other. Beside models and fragments come the gaps between models that it found.
 
     Parameters
     ----------
@@ -99,24 +108,26 @@ def run_models(
         for path in workspace.report_data.glob("model_*.json"):
             remove(path)
         kept, left_out = _without_fragments(found, keep=fragments)
-        models = []
-        for place, number in enumerate(kept):
-            session.progress("metric", place, len(kept))
-            model = Model(
+        read_in = (
+            Model(
                 reconstruction=read(found[number]),
                 colmap_index=number,
                 timing=recording.timing,
                 rectified=rectified,
                 doubts=recording.doubts,
             )
-            index = number if numbered else place
-            models.append(_through_stages(session, recording, stages, model, index, found[number]))
-        untimed = [reason for _, reason in models if reason is not None]
-        if len(untimed) == len(models):
-            raise untimed[0]
-        session.progress("metric", len(kept), len(kept))
+            for number in kept
+        )
+        place_of = {number: number if numbered else place for place, number in enumerate(kept)}
+        made, gaps = _through_stages(session, recording, stages, read_in, place_of, found, numbered=numbered)
         small = [replace(one, sparse=_within(workspace.root, one.sparse)) for one in left_out]
-        write_record(partial[0], _Made(models=tuple(one for one, _ in models), fragments=tuple(small)))
+        beside = tuple(
+            _within(workspace.root, workspace.sparse / str(part.colmap_index))
+            for one in made
+            if numbered
+            for part in _others(one)
+        )
+        write_record(partial[0], _Made(models=tuple(made), fragments=tuple(small), gaps=gaps, beside=beside))
 
     depends = {
         "recording": {name: getattr(recording, name) for name in ("imu", "timing", "doubts")},
@@ -128,12 +139,12 @@ def run_models(
     }
     _forget_where_gone(record, workspace.root)
     session.runner.run("metric", depends, [record], work, after=after)
-    made = read_record(record, _Made)
+    said = read_record(record, _Made)
     models = tuple(
-        ModelResult(**{f.name: getattr(one, f.name) for f in fields(one)}).within(workspace.root) for one in made.models
+        ModelResult(**{f.name: getattr(one, f.name) for f in fields(one)}).within(workspace.root) for one in said.models
     )
     settle_dense(workspace, {one.index: one.sparse_metric for one in models if one.sparse_metric is not None})
-    return models, tuple(replace(one, sparse=workspace.root / one.sparse) for one in made.fragments)
+    return models, tuple(replace(one, sparse=workspace.root / one.sparse) for one in said.fragments), said.gaps
 
 
 def _forget_where_gone(record: Path, root: Path) -> None:
@@ -141,10 +152,11 @@ def _forget_where_gone(record: Path, root: Path) -> None:
     if not record.is_file():
         return
     try:
-        models = read_record(record, _Made).models
+        said = read_record(record, _Made)
     except FormatError:
-        models = ()
-    paths = [path for one in models for path in (one.sparse_metric, one.trajectory) if path is not None]
+        said = _Made(models=(), fragments=())
+    models, paths = said.models, list(said.beside)
+    paths += [path for one in models for path in (one.sparse_metric, one.trajectory) if path is not None]
     paths += [motion_file(one.trajectory) for one in models if one.trajectory is not None]
     if not models or not all((root / path).exists() for path in paths):
         remove(record)
@@ -163,23 +175,106 @@ def _without_fragments(found: Mapping[int, Path], *, keep: bool) -> tuple[list[i
 
 
 def _through_stages(
-    session: Session, recording: Recording, stages: Sequence[ModelStage], model: Model, index: int, sparse: Path
-) -> tuple[ScaledModel, TimingError | None]:
-    """What the stages make of one model of COLMAP's, and why not where its images have no times."""
-    one = ScaledModel(
-        index=index,
-        colmap_index=model.colmap_index,
-        scale=_refused("not looked at"),
-        summary=summarize(model.reconstruction),
-        sparse=_within(session.workspace.root, sparse),
-    )
-    reason = _too_few_timed(model)
-    if reason is not None:
-        log.info("model %d: refused %s", index, reason)
-        return replace(one, scale=_refused(str(reason))), reason
+    session: Session,
+    recording: Recording,
+    stages: Sequence[ModelStage],
+    models: Iterator[Model],
+    place_of: Mapping[int, int],
+    found: Mapping[int, Path],
+    *,
+    numbered: bool,
+) -> tuple[list[ScaledModel], tuple[Gap, ...]]:
+    """What the stages make of COLMAP's models; without one that joins them, one is in memory at a time.
+
+    Raises
+    ------
+    TimingError
+        Where no model has two timed images.
+    """
+    several = len(place_of) > 1
+    at = next((i for i, stage in enumerate(stages) if several and isinstance(stage, JoiningStage)), len(stages))
+    untimed: list[TimingError] = []
+
+    def begun() -> Iterator[_Begun]:
+        for done, model in enumerate(models):
+            session.progress("metric", done, len(place_of))
+            # COLMAP's own counts, whatever the stages make of the model
+            one = ScaledModel(
+                index=place_of[model.colmap_index],
+                colmap_index=model.colmap_index,
+                scale=_refused("not looked at"),
+                summary=summarize(model.reconstruction),
+                sparse=_within(session.workspace.root, found[model.colmap_index]),
+            )
+            reason = _too_few_timed(model)
+            if reason is None:
+                yield one, _after(stages[:at], model)
+            else:
+                untimed.append(reason)
+                yield replace(one, scale=_refused(str(reason))), None
+
+    going: Iterable[_Begun] = begun()
+    gaps: tuple[Gap, ...] = ()
+    staged: dict[int, Model] = {}
+    if at < len(stages):
+        joining = stages[at]
+        assert isinstance(joining, JoiningStage)
+        going = list(going)
+        if numbered:
+            staged = {model.colmap_index: model for _, model in going if model is not None}
+        going, gaps = _joined(joining, going, numbered=numbered)
+    made: list[ScaledModel] = []
+    for one, model in going:
+        if model is None:
+            log.info("model %d: refused %s", one.index, "; ".join(one.scale.reasons))
+            made.append(one)
+            continue
+        made.append(_placed(session, recording, one, _after(stages[at + 1 :], model)))
+        if numbered:
+            _write_parts(session, model, staged, found)
+    if len(untimed) == len(place_of):
+        raise untimed[0]
+    session.progress("metric", len(place_of), len(place_of))
+    return made, gaps
+
+
+def _joined(joining: JoiningStage, begun: Sequence[_Begun], *, numbered: bool) -> tuple[list[_Begun], tuple[Gap, ...]]:
+    """What a stage makes of all models at once, the largest first; what was joined into one leaves its numbers free."""
+    of_number = {one.colmap_index: one for one, _ in begun}
+    models, gaps = joining.join([model for _, model in begun if model is not None])
+    left: list[_Begun] = [(one, None) for one, model in begun if model is None]
+    for model in models:
+        one = of_number[model.colmap_index]
+        left.append((replace(one, summary=summarize(model.reconstruction)) if model.parts else one, model))
+    left.sort(key=lambda each: (-each[0].summary["registered_images"], each[0].colmap_index))
+    return [(one if numbered else replace(one, index=i), model) for i, (one, model) in enumerate(left)], gaps
+
+
+def _write_parts(session: Session, model: Model, staged: Mapping[int, Model], found: Mapping[int, Path]) -> None:
+    """The other parts of a joined model by themselves, in its world: what a project made from them goes by them.
+
+    As the stages before the joining left them.
+    """
+    for part in _others(model):
+        before = staged[part.colmap_index]
+        own = before.reconstruction
+        if before.similarity is not None:
+            own = transformed(own, undoing(before.similarity))
+        target = session.workspace.sparse / str(part.colmap_index)
+        moved = transformed(own, part.similarity)
+        write_model(moved, target, part.similarity, suffix=model_format(found[part.colmap_index]))
+
+
+def _others(model: Model | ScaledModel) -> list[JoinedPart]:
+    """The parts of a joined model but the first, whose number it has."""
+    return [part for part in model.parts if part.colmap_index != model.colmap_index]
+
+
+def _after(stages: Sequence[ModelStage], model: Model) -> Model:
+    """What stages make of a model, one after the other."""
     for stage in stages:
         model = stage(model)
-    return _placed(session, recording, one, model), None
+    return model
 
 
 def _placed(session: Session, recording: Recording, one: ScaledModel, model: Model) -> ScaledModel:
@@ -193,7 +288,7 @@ def _placed(session: Session, recording: Recording, one: ScaledModel, model: Mod
     if similarity is not None and scale.verdict != model.scale.verdict:
         similarity = replace(similarity, provenance=f"{similarity.provenance}; {scale.verdict}: {scale.reasons[0]}")
     model = replace(model, scale=scale, similarity=similarity)
-    one = replace(one, scale=scale, treatments=model.treatments)
+    one = replace(one, scale=scale, treatments=model.treatments, parts=model.parts)
     poses, _ = trajectory_from_model(model.reconstruction, model.timing)
     if model.similarity is not None:
         target = workspace.sparse / str(one.index)

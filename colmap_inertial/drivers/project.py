@@ -12,6 +12,7 @@ from pathlib import Path
 from types import EllipsisType
 from typing import TYPE_CHECKING, Literal, get_args
 
+from colmap_inertial.colmap.tsdf import require_mesh_maker
 from colmap_inertial.diagnose import Diagnosis
 from colmap_inertial.drivers.capture import default_model_stages
 from colmap_inertial.drivers.georeference import positions_of, run_georeference
@@ -157,6 +158,7 @@ def _reconstruct(
             "for a capture, which describes itself",
         )
     require_plotly()
+    require_mesh_maker(options)
     _check_options(options)
     given = _given(project, source, options)
     capture = given.capture
@@ -193,7 +195,7 @@ def _reconstruct(
         findings(diagnosis)
         recording = dataclasses.replace(recording, doubts=stop_or_doubt(diagnosis, force=options.force))
         stages = with_defaults(model_stages, default_model_stages(recording, _as_mapped(options)))
-        results, fragments = run_models(
+        results, fragments, gaps = run_models(
             session, recording, stages, found=models, fragments=options.fragments, numbered=True, after=(), read=read
         )
         read.cache_clear()
@@ -209,6 +211,7 @@ def _reconstruct(
             workspace=workspace,
             models=results,
             fragments=fragments,
+            gaps=gaps,
             seconds=session.runner.seconds,
             project_metric=metric,
         )
@@ -266,7 +269,9 @@ class _Given:
 
 def _given(project: Path, source: ProjectOptions, options: ReconstructOptions) -> _Given:
     if source.imu is None:
-        raise FormatError(project, "is a COLMAP project and needs the recording that ran along: give --imu PATH")
+        stated = (source.frame_times, source.name_times, source.video, source.exif_times or None)
+        when = "" if any(way is not None for way in stated) else f"; and when its images were taken: {_HOW_TIMES}"
+        raise FormatError(project, f"is a COLMAP project and needs the recording that ran along: give --imu PATH{when}")
     times = source.frame_times
     if times is not None and not times.exists():
         raise FormatError(times, "no such file or folder")
@@ -456,6 +461,14 @@ def _scales(results: Sequence[ModelResult], fragments: Sequence[Fragment]) -> di
         if result.sparse_metric is not None:
             similarity = read_similarity(result.sparse_metric / TRANSFORM_FILE)
         scales[result.colmap_index] = ModelScale(
-            similarity=similarity, verdict=result.scale.verdict, reasons=result.scale.reasons
+            similarity=similarity,
+            verdict=result.scale.verdict,
+            reasons=result.scale.reasons,
+            joined_of=tuple(part.colmap_index for part in result.parts),
         )
+        for part in result.parts:
+            if part.colmap_index != result.colmap_index:
+                scales[part.colmap_index] = ModelScale(
+                    similarity=part.similarity, verdict=part.verdict, reasons=result.scale.reasons
+                )
     return scales

@@ -22,6 +22,12 @@ from colmap_inertial.validate.markers import marker_centres
 
 #: What the folder keeps beside the project: where its metres come from.
 REFERENCE_FILE = "scale.json"
+_NO_TARGET = "--scale-from target needs the target: --target checkerboard:COLSxROWS:SQUARE_M or another"
+_NO_DISTANCE = (
+    "--scale-from distance needs --between A B (two marker numbers, or two points as x,y,z of the model) and "
+    "--distance METRES+-SIGMA"
+)
+_NO_MARKERS = "--between with markers needs what they are: --target aruco:DICT:SIDE_M"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -143,9 +149,29 @@ def scale_project_by(
     return found
 
 
+def check_reference(reference: ReferenceOptions) -> None:
+    """Refuse, before any work, what is not given or cannot be.
+
+    Raises
+    ------
+    InertialError
+        With all that is missing.
+    """
+    if reference.scale_from == "target" and reference.target is None:
+        raise InertialError(_NO_TARGET)
+    if reference.scale_from == "distance":
+        if reference.between is None or reference.distance is None:
+            raise InertialError(_NO_DISTANCE)
+        _length(reference.distance)
+        if reference.target is None and not all("," in end for end in reference.between):
+            raise InertialError(_NO_MARKERS)
+    if reference.target is not None:
+        parse_target(reference.target)
+
+
 def _by_target(validation: Validation | None) -> tuple[float, float, str]:
     if validation is None:
-        raise InertialError("--scale-from target needs the target: --target checkerboard:COLSxROWS:SQUARE_M or another")
+        raise InertialError(_NO_TARGET)
     # by half of its corners, so that the others can tell how right that is
     control = validation.control
     scale = validation.metres_per_unit if control is None else control.metres_per_unit
@@ -157,10 +183,7 @@ def _by_target(validation: Validation | None) -> tuple[float, float, str]:
 def _by_distance(reference: ReferenceOptions, validation: Validation | None) -> tuple[float, float, str]:
     between, distance = reference.between, reference.distance
     if between is None or distance is None:
-        raise InertialError(
-            "--scale-from distance needs --between A B (two marker numbers, or two points as x,y,z of the model) and "
-            "--distance METRES+-SIGMA"
-        )
+        raise InertialError(_NO_DISTANCE)
     metres, sigma_m = _length(distance)
     places, noise = zip(*(_place(text, validation) for text in between), strict=True)
     measured = float(np.linalg.norm(places[0] - places[1]))
@@ -191,7 +214,7 @@ def _place(text: str, validation: Validation | None) -> tuple[Array, float]:
     if not text.isdecimal():
         raise InertialError(f'--between "{text}": write the number of a marker, or a point as x,y,z')
     if validation is None or validation.target.kind != "aruco":
-        raise InertialError("--between with markers needs what they are: --target aruco:DICT:SIDE_M")
+        raise InertialError(_NO_MARKERS)
     centres = marker_centres(validation)
     if int(text) not in centres:
         seen = ", ".join(map(str, sorted(centres))) or "none"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +16,12 @@ from colmap_inertial.errors import InertialError, NotObservableError
 from colmap_inertial.geometry import quat_conjugate, quat_log, quat_multiply
 from colmap_inertial.georeference import Georeference
 from colmap_inertial.io.capture import Capture
+from colmap_inertial.model import similarity_as_json
 from colmap_inertial.precalibrate.plan import ImagingPlan
 from colmap_inertial.precalibrate.selection import Selection
 from colmap_inertial.run.workspace import Workspace
 from colmap_inertial.stages.frame_folder import FrameRecord
-from colmap_inertial.types import CameraImuCalibration, ScaleEstimate, Treatment
+from colmap_inertial.types import CameraImuCalibration, Gap, JoinedPart, ScaleEstimate, Treatment
 from colmap_inertial.validate import Validation
 
 
@@ -45,6 +46,8 @@ class ScaledModel:
         The camera's smoothed path.
     treatments
         What the stages said.
+    parts
+        What it was joined of; empty where it is one of COLMAP's models.
     """
 
     index: int
@@ -55,6 +58,7 @@ class ScaledModel:
     sparse_metric: Path | None = None
     trajectory: Path | None = None
     treatments: tuple[Treatment, ...] = ()
+    parts: tuple[JoinedPart, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -112,6 +116,8 @@ class ReconstructResult:
         The one with the most images first.
     fragments
         What was left out.
+    gaps
+        What lies between COLMAP's models, and whether they were joined across it.
     frames, keypoints
         What happened to each frame, and to the keypoints of each image.
     matching
@@ -134,6 +140,7 @@ class ReconstructResult:
     workspace: Workspace
     models: tuple[ModelResult, ...]
     fragments: tuple[Fragment, ...] = ()
+    gaps: tuple[Gap, ...] = ()
     frames: tuple[FrameRecord, ...] = ()
     keypoints: KeypointRecords = field(default_factory=KeypointRecords)
     matching: MatchRecord | None = None
@@ -220,6 +227,11 @@ def _measured_as_json(found: Validation | Georeference | InertialError | None) -
     return {"error": str(found)} if isinstance(found, InertialError) else found and found.as_json()
 
 
+def _part_as_json(part: JoinedPart) -> dict[str, object]:
+    values = {f.name: getattr(part, f.name) for f in fields(part)}
+    return {**values, "similarity": similarity_as_json(part.similarity)}
+
+
 def result_as_json(result: ReconstructResult, capture: Capture) -> dict[str, object]:
     """The content of ``result.json``."""
     import pycolmap
@@ -250,12 +262,14 @@ def result_as_json(result: ReconstructResult, capture: Capture) -> dict[str, obj
                 "validation": _measured_as_json(model.validation),
                 "georeference": _measured_as_json(model.georeference),
                 "readout_translation": next((t.values for t in model.treatments if t.stage == "readout"), None),
+                "joined_of": [_part_as_json(part) for part in model.parts],
                 "treatments": [asdict(treatment) for treatment in model.treatments],
                 "dense": model.dense and model.dense.as_json(root),
             }
             for model in result.models
         ],
         "fragments": [{**asdict(fragment), "sparse": relative(fragment.sparse)} for fragment in result.fragments],
+        "gaps": [asdict(gap) for gap in result.gaps],
         "project_metric": relative(result.project_metric),
         "waiting": bool(result.waiting),
         "selection": result.selection and result.selection.as_json(),

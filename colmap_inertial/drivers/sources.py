@@ -85,8 +85,8 @@ def load_source(source: ScaleSource) -> TimedPoses:
     if not path.exists():
         raise FormatError(path, "no such file or folder")
     inertial_scale = path.is_dir() and is_inertial_scale(path)
-    if source.imu is None and not inertial_scale:
-        raise FormatError(path, "needs the recording that ran along: give --imu PATH")
+    if not inertial_scale:
+        _require_all(source)
     notes: Sequence[str] = ()
     start_s = None
     read_as = TUM
@@ -95,8 +95,7 @@ def load_source(source: ScaleSource) -> TimedPoses:
         read_as = INERTIAL_SCALE
     elif path.is_dir():
         times = source.frame_times or source.imu
-        if times is None or (source.frame_times is None and not is_capture(times)):
-            raise FormatError(path, "a COLMAP model has no frame times: give --frame-times, a CSV with name,t_s")
+        assert times is not None
         timing = read_frame_times(times)
         folder = only_model(path)
         trajectory, notes = trajectory_from_model(read_model(folder), timing)
@@ -128,8 +127,34 @@ def load_source(source: ScaleSource) -> TimedPoses:
     )
 
 
+def _require_all(source: ScaleSource) -> None:
+    """Refuse a model or trajectory without its recording or times, naming all that is missing at once."""
+    path, missing = source.source, []
+    if path.is_dir():
+        only_model(path)
+    if source.imu is None:
+        missing.append("the recording that ran along: give --imu PATH")
+    if path.is_dir() and source.frame_times is None and not (source.imu is not None and is_capture(source.imu)):
+        missing.append("the times of its images: give --frame-times, a CSV with name,t_s")
+    if missing:
+        raise FormatError(path, f"needs {'; and '.join(missing)}")
+
+
 def only_model(path: Path) -> Path:
-    models = find_models(path)
+    """The one model in a folder.
+
+    Raises
+    ------
+    FormatError
+        Where there are several, or none; of a project, with the place of its models.
+    """
+    try:
+        models = find_models(path)
+    except FormatError:
+        if not (path / "sparse").is_dir():
+            raise
+        inside = next(iter(find_models(path / "sparse").values()))
+        raise FormatError(path, f"is a whole project: give one of its models, {inside}") from None
     if len(models) > 1:
         raise FormatError(
             path, f"holds {len(models)} models; give one of them, for example {next(iter(models.values()))}"

@@ -72,11 +72,18 @@ class Tiling:
 
     def paths(self, path: BlurPath) -> NDArray[np.float32]:
         """(Ty, Tx, S, 2) the path in the middle of each tile, or at the image's border where that lies beyond."""
-        middles = (
+        return np.ascontiguousarray(path.at(*self._middles()), dtype=np.float32)
+
+    def spreads(self, path: BlurPath) -> NDArray[np.float32]:
+        """(Ty, Tx, 3) covariance of the chords there."""
+        return np.ascontiguousarray(path.cov_at(*self._middles()), dtype=np.float32)
+
+    def _middles(self) -> tuple[Array, Array]:
+        rows, columns = (
             np.clip(self.hop * np.arange(n) - self.before + self.side / 2 - 0.5, 0, size - 1)
             for n, size in zip(self.count, (self.height, self.width), strict=True)
         )
-        return np.ascontiguousarray(path.at(*middles), dtype=np.float32)
+        return rows, columns
 
     def window_in(self) -> NDArray[np.float32]:
         """(side,) by which rows and columns of a tile are multiplied before it is transformed."""

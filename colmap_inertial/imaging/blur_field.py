@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -26,12 +26,15 @@ class BlurField:
     vector_px
         (Gy, Gx, 2) float32 blur vectors (x, y) at the nodes, px: the end of the segment minus its beginning.
         Between nodes the field is bilinear. A vector and its negative are the same blur.
+    cov_px2
+        (Gy, Gx, 3) float32 covariance of each (xx, xy, yy), px^2, or what spreads to that; nothing where it is certain.
     """
 
     width: int
     height: int
     vector_px: np.ndarray[tuple[int, int, int], np.dtype[np.float32]]
     step_px: int = 16
+    cov_px2: NDArray[np.float32] = field(default_factory=lambda: np.zeros(3, np.float32))
 
     def __post_init__(self) -> None:
         if self.width <= 0 or self.height <= 0 or self.step_px <= 0:
@@ -44,6 +47,7 @@ class BlurField:
             raise ValueError("vector_px: must be finite")
         vector.setflags(write=False)
         object.__setattr__(self, "vector_px", vector)
+        object.__setattr__(self, "cov_px2", spread_cov(self.cov_px2, expected[:2]))
 
     @staticmethod
     def nodes(width: int, height: int, step_px: int = 16) -> tuple[int, int]:
@@ -65,6 +69,26 @@ class BlurField:
         """(height, width, 2) the field at every pixel."""
         return self.at(np.arange(self.height), np.arange(self.width))
 
+    def times(self, factor: float) -> BlurField:
+        """So many times as long."""
+        return replace(
+            self, vector_px=self.vector_px * np.float32(factor), cov_px2=self.cov_px2 * np.float32(factor**2)
+        )
+
     def extent_px(self) -> Array:
         """(Gy, Gx) lengths of the vectors at the nodes."""
         return np.asarray(np.hypot(self.vector_px[..., 0], self.vector_px[..., 1]), dtype=np.float64)
+
+    def unsure_share(self) -> float:
+        """How far off the vectors may be against their length, over the image."""
+        off, whole = float(self.cov_px2[..., ::2].sum()), float(np.sum(self.vector_px.astype(np.float64) ** 2))
+        return (off / whole) ** 0.5 if whole > 0 else 0.0
+
+
+def spread_cov(cov_px2: NDArray[np.float32], nodes: tuple[int, int]) -> NDArray[np.float32]:
+    """(Gy, Gx, 3) checked, not to be written to."""
+    cov = np.broadcast_to(np.asarray(cov_px2, dtype=np.float32), (*nodes, 3)).copy()
+    if not (np.isfinite(cov).all() and (cov[..., ::2] >= 0).all()):
+        raise ValueError("cov_px2: must be finite, with variances that are not negative")
+    cov.setflags(write=False)
+    return cov

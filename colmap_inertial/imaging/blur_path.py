@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.imaging._bilinear import bilinear
-from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.imaging.blur_field import BlurField, spread_cov
 from colmap_inertial.types import Array
 
 #: Samples of the exposure; of longer blur, one for each so many pixels.
@@ -31,12 +31,15 @@ class BlurPath:
         Distance of the nodes, which lie as those of a `BlurField`; between them the path is bilinear.
     path_px
         (S, Gy, Gx, 2) float32 q (x, y) at the middles of S equal parts of the exposure, px.
+    cov_px2
+        (Gy, Gx, 3) float32 covariance of its chord, as that of a `BlurField`.
     """
 
     width: int
     height: int
     path_px: np.ndarray[tuple[int, int, int, int], np.dtype[np.float32]]
     step_px: int = 64
+    cov_px2: NDArray[np.float32] = field(default_factory=lambda: np.zeros(3, np.float32))
 
     def __post_init__(self) -> None:
         if self.width <= 0 or self.height <= 0 or self.step_px <= 0:
@@ -49,19 +52,31 @@ class BlurPath:
             raise ValueError("path_px: must be finite")
         path.setflags(write=False)
         object.__setattr__(self, "path_px", path)
+        object.__setattr__(self, "cov_px2", spread_cov(self.cov_px2, nodes))
 
     @classmethod
-    def straight(cls, field: BlurField) -> BlurPath:
-        """Along the centred lines of a field."""
-        samples = samples_for(float(field.extent_px().max(initial=0)))
-        path = (middles(samples)[:, None, None, None] * field.vector_px).astype(np.float32)
-        return cls(width=field.width, height=field.height, step_px=field.step_px, path_px=path)
+    def straight(cls, lines: BlurField) -> BlurPath:
+        """Along the centred lines of a lines."""
+        samples = samples_for(float(lines.extent_px().max(initial=0)))
+        path = (middles(samples)[:, None, None, None] * lines.vector_px).astype(np.float32)
+        return cls(width=lines.width, height=lines.height, step_px=lines.step_px, path_px=path, cov_px2=lines.cov_px2)
 
     def field(self) -> BlurField:
         """The chords: ends of the paths minus their beginnings."""
         samples = len(self.path_px)
         chord = (self.path_px[-1] - self.path_px[0]) * np.float32(samples / (samples - 1))
-        return BlurField(width=self.width, height=self.height, step_px=self.step_px, vector_px=chord)
+        return BlurField(
+            width=self.width, height=self.height, step_px=self.step_px, vector_px=chord, cov_px2=self.cov_px2
+        )
+
+    def as_certain(self) -> BlurPath:
+        """Without its covariance."""
+        return replace(self, cov_px2=np.zeros(3, np.float32))
+
+    def cov_at(self, rows_px: NDArray[Any], columns_px: NDArray[Any]) -> Array:
+        """(R, C, 3) covariance of the chord at the crossings of rows and columns of pixels."""
+        nodes = self.cov_px2.astype(np.float64)
+        return bilinear(nodes, np.asarray(rows_px) / self.step_px, np.asarray(columns_px) / self.step_px)
 
     def departure_px(self) -> float:
         """How far a path leaves a line along its chord at the most, anywhere in the image."""

@@ -9,7 +9,7 @@ in a deblurred frame that were sharp before keep their pixels.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal, TypeVar
 
 import numpy as np
@@ -202,7 +202,7 @@ def deblur_gated(
     if factor is None:
         return GatedFrame(image=image, deblurred=False, kept_share=1.0, extent_factor=1.0, reason=reason)
     if factor != 1.0:
-        blur = replace(blur, vector_px=(blur.vector_px * np.float32(factor)))
+        blur = blur.times(factor)
     restored = path_wiener(image, BlurPath.straight(blur)) if deblur is None else deblur(image, blur)
     out, kept = keep_sharp(image, restored, blur)
     return GatedFrame(image=out, deblurred=True, kept_share=kept, extent_factor=factor, reason=reason)
@@ -213,6 +213,9 @@ def deblur_gated(
 _CORRECTED_FROM, _DRIFT_PX, _CLEAR_SUPPORT = 0.1, 1.2, 7.0
 #: Blur this long must show in a frame with texture.
 MUST_SHOW_PX = 8.0
+#: A blur that is known no better than this, as a share of its length, is left alone: a filter along a line that is off
+#: by a third or 20 degrees loses what it wins.
+MOST_UNSURE = 0.25
 #: Blur takes at least this from the logarithm of the power along it; sharp images are at 0 +- 0.2.
 _LEAST_FALL = -0.35
 #: Standard deviations by which all frames together must show short blur: of wrong gyroscopes, none reached three.
@@ -313,6 +316,9 @@ def judge_frame(
     """The factor for the extents, or ``None`` for a frame to leave alone; and why. Arguments as of `deblur_gated`."""
     if recording is not None and recording.trusted is False:
         return None, recording.reason
+    unsure = blur.unsure_share()
+    if unsure > MOST_UNSURE:
+        return None, f"noise and calibration of the gyroscope leave {unsure:.0%} of the blur's length uncertain"
     if recording is not None and recording.trusted:
         fall = detail_fall(image, blur)
         if fall is not None and fall > _LEAST_FALL:

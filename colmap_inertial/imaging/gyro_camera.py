@@ -2,20 +2,60 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.geometry import matrix_from_quat, quat_conjugate, quat_multiply, quat_rotate, so3_log
+from colmap_inertial.geometry import matrix_from_quat, quat_conjugate, quat_multiply, quat_rotate, skew, so3_log
 from colmap_inertial.gyro import GyroPath
 from colmap_inertial.types import (
+    CAL,
     Array,
     CameraImuCalibration,
     FrameTiming,
     ImuRecording,
     ReadoutDirection,
 )
+
+#: Standard deviation of what is known of blur's length: exposure times are nominal, as are focal lengths.
+EXTENT_SIGMA = 0.03
+#: Nobody knows a bias worse than this, even unasked: what is said of it for a fit to find is wider.
+MOST_BIAS_RAD_S = 0.01
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MotionErrors:
+    """How far off a camera's turning may be, by its gyroscope.
+
+    Attributes
+    ----------
+    rotation_cov_rad2
+        (3, 3) of the camera's axes against the gyroscope's, in the camera frame.
+    offset_sigma_s
+        Standard deviation of the clock's offset.
+    rate_cov_rad2_s2
+        (3, 3) of rates that are wrong alike throughout an exposure (the bias), camera frame.
+    extent_sigma
+        Standard deviation of the length of an exposure, as a share.
+    """
+
+    rotation_cov_rad2: Array = field(default_factory=lambda: np.zeros((3, 3)))
+    offset_sigma_s: float = 0.0
+    rate_cov_rad2_s2: Array = field(default_factory=lambda: np.zeros((3, 3)))
+    extent_sigma: float = EXTENT_SIGMA
+
+    @classmethod
+    def of(cls, calibration: CameraImuCalibration) -> MotionErrors:
+        """As a calibration's covariance says."""
+        turn = matrix_from_quat(calibration.cam_from_imu_xyzw)
+        bias = calibration.cov[CAL.GYRO_BIAS, CAL.GYRO_BIAS]
+        bias = bias * min(1.0, MOST_BIAS_RAD_S**2 / max(float(np.diagonal(bias).max()), 1e-30))
+        return cls(
+            rotation_cov_rad2=calibration.cov[CAL.ROTATION, CAL.ROTATION],
+            offset_sigma_s=calibration.sigma("gyro_time_offset_s"),
+            rate_cov_rad2_s2=turn @ bias @ turn.T,
+        )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -30,11 +70,14 @@ class GyroCamera:
         (4,) rotation.
     offset_s
         Camera time = time of ``path`` + this.
+    errors
+        Of what is known of these; the gyroscope's noise shows in its readings.
     """
 
     path: GyroPath
     cam_from_imu_xyzw: Array
     offset_s: float
+    errors: MotionErrors = field(default_factory=MotionErrors)
 
     @classmethod
     def of(cls, imu: ImuRecording, calibration: CameraImuCalibration, *, camera_epoch_ns: int) -> GyroCamera:
@@ -53,6 +96,7 @@ class GyroCamera:
             path=GyroPath(imu.gyro_t_s, imu.gyro_rad_s, calibration.gyro_bias_rad_s),
             cam_from_imu_xyzw=calibration.cam_from_imu_xyzw,
             offset_s=calibration.gyro_time_offset_s + (imu.epoch_ns - camera_epoch_ns) * 1e-9,
+            errors=MotionErrors.of(calibration),
         )
 
     def covers(self, begin_s: Array, end_s: Array) -> NDArray[np.bool_]:
@@ -70,6 +114,20 @@ class GyroCamera:
         """(..., N-1, 3) rotations ``before_from_after`` between consecutive ones of (..., N) times, camera frame."""
         looking = self.start_from_cam(t_s)
         return so3_log(np.swapaxes(looking[..., :-1, :, :], -1, -2) @ looking[..., 1:, :, :])
+
+    def turn_cov_rad2(self, middle_s: Array, exposure_s: float) -> Array:
+        """(N, 3, 3) covariance of how far the camera turns in exposures around (N,) instants, camera frame."""
+        errors = self.errors
+        ends = np.stack([middle_s - 0.5 * exposure_s, middle_s + 0.5 * exposure_s], axis=-1)
+        turn = self.turn_rad(ends)[:, 0]
+        tilted = skew(turn)
+        grown = self.rate_in_cam_rad_s(ends[:, 1]) - self.rate_in_cam_rad_s(ends[:, 0])
+        cov = tilted @ errors.rotation_cov_rad2 @ np.swapaxes(tilted, -1, -2)
+        cov += errors.extent_sigma**2 * turn[:, :, None] * turn[:, None]
+        cov += errors.offset_sigma_s**2 * grown[:, :, None] * grown[:, None]
+        # noise bends the path as much as it lengthens it, and counts as length twice
+        noise = 2 * self.path.noise_rad_s_rthz**2 * exposure_s
+        return np.asarray(cov + exposure_s**2 * errors.rate_cov_rad2_s2 + noise * np.eye(3))
 
     def rate_in_cam_rad_s(self, t_s: Array) -> Array:
         """(N, 3) angular velocities at (N,) times, camera frame."""

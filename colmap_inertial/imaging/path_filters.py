@@ -143,6 +143,7 @@ def filter_along(
     light: NDArray[np.float32],
     tiling: Tiling,
     paths: NDArray[np.float32],
+    spreads: NDArray[np.float32],
     noise: Sequence[Noise],
     splitting: Sequence[float],
     *,
@@ -157,6 +158,7 @@ def filter_along(
         light,
         result,
         paths=paths,
+        spread=spreads,
         window_in=tiling.window_in(),
         window_out=tiling.window_out(),
         hop=tiling.hop,
@@ -208,7 +210,7 @@ def _filtered(
         noise = noise_along(light, tiling, paths, threads)
     else:
         noise = (Noise(options.noise**2, 0.0),) * channels
-    sharp = filter_along(light, tiling, paths, noise, splitting, threads=threads)
+    sharp = filter_along(light, tiling, paths, tiling.spreads(path), noise, splitting, threads=threads)
     cells = Cells.of(path.field())
     result = np.empty_like(planes)
     _wiener.blend(

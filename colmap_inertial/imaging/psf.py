@@ -21,6 +21,8 @@ from colmap_inertial.types import Array, CameraImuCalibration, FrameTiming, ImuR
 _PREDICTED_COLUMNS, _PREDICTED_ROWS, _CHUNK = 7, 5, 512
 #: An image that moves with the shutter would be blurred without end; its blur is taken as finite.
 _LEAST_STRETCH = 0.2
+#: By which the camera is turned to find what its errors do.
+_SMALL_TURN_RAD = 1e-4
 
 
 class Camera(Projector, Protocol):
@@ -112,7 +114,11 @@ def blur_field(
     one = _Exposures(shutter, np.array([shutter.t_s]), np.array([shutter.exposure_s]))
     vectors = _vectors(motion, camera, one, x, y, rates)[0]
     return BlurField(
-        width=shutter.width, height=shutter.height, vector_px=_filled(vectors).astype(np.float32), step_px=step_px
+        width=shutter.width,
+        height=shutter.height,
+        vector_px=_filled(vectors).astype(np.float32),
+        step_px=step_px,
+        cov_px2=_filled(_vector_cov(motion, camera, shutter, x, y)).astype(np.float32),
     )
 
 
@@ -146,10 +152,10 @@ def blur_path(
     NotObservableError
         As :func:`blur_field`.
     """
-    chords = blur_field(motion, camera, shutter, parallax=parallax, step_px=step_px).extent_px()
+    field = blur_field(motion, camera, shutter, parallax=parallax, step_px=step_px).times(extent_factor)
     assert shutter.exposure_s is not None
     exposure_s = extent_factor * shutter.exposure_s
-    since_s = exposure_s * middles(samples_for(extent_factor * float(chords.max())))
+    since_s = exposure_s * middles(samples_for(float(field.extent_px().max())))
     rows, columns = BlurField.nodes(shutter.width, shutter.height, step_px)
     x, y = step_px * np.arange(float(columns)) + 0.5, step_px * np.arange(float(rows)) + 0.5
     nodes = np.stack(np.meshgrid(x, y), axis=-1)
@@ -173,6 +179,7 @@ def blur_path(
         height=shutter.height,
         path_px=np.moveaxis(filled, 2, 0).astype(np.float32),
         step_px=step_px,
+        cov_px2=field.cov_px2,
     )
 
 
@@ -289,6 +296,22 @@ def _vectors(
         per_s = vector / exposure_s[:, None, None, None]
     stretch = 1 + np.nan_to_num(per_s[..., 0]) * step_x + np.nan_to_num(per_s[..., 1]) * step_y
     return np.asarray(vector / np.maximum(stretch, _LEAST_STRETCH)[..., None])
+
+
+def _vector_cov(motion: GyroCamera, camera: Projector, shutter: FrameShutter, x: Array, y: Array) -> Array:
+    """(len(y), len(x), 3) covariance xx, xy, yy of blur vectors at the nodes of a grid, by the errors of the turn."""
+    nodes = np.stack(np.meshgrid(x, y), axis=-1)
+    directions = rays(camera, nodes.reshape(-1, 2))
+    lever = np.empty((*nodes.shape, 3))
+    for axis in range(3):
+        turned = directions + _SMALL_TURN_RAD * np.cross(np.eye(3)[axis], directions)
+        moved = np.asarray(camera.img_from_cam(turned)).reshape(nodes.shape) - nodes
+        lever[..., axis] = moved / _SMALL_TURN_RAD
+    by_column = shutter.readout_direction in ("right", "left")
+    middle_s = shutter.middle_s(nodes[0] if by_column else nodes[:, 0])
+    turn = motion.turn_cov_rad2(middle_s, shutter.exposure_s or 0.0)
+    cov = lever @ (turn[None] if by_column else turn[:, None]) @ np.swapaxes(lever, -1, -2)
+    return np.stack([cov[..., 0, 0], cov[..., 0, 1], cov[..., 1, 1]], axis=-1)
 
 
 def _filled(vectors: Array) -> Array:

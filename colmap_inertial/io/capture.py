@@ -30,6 +30,7 @@ from colmap_inertial.io.files import StrPath
 from colmap_inertial.io.gcsv import is_gcsv, read_gcsv_frames
 from colmap_inertial.io.imu_formats import refuse_video
 from colmap_inertial.io.imu_text import is_inertial_scale
+from colmap_inertial.io.readouts import readout_of_video
 from colmap_inertial.io.recorders import Recording, find_recording
 from colmap_inertial.io.toml_section import Section, read_toml
 from colmap_inertial.io.units import TIME_UNITS_NS
@@ -91,6 +92,8 @@ class Capture:
         Pictures or video; ``None`` where there are none.
     exposure_s, readout_s
         ``None`` where unknown; a readout of 0 is a global shutter.
+    readout_source
+        Where the readout comes from, if neither the user nor the recorder said it.
     readout_direction
         In the stored picture.
     shared_clock
@@ -119,6 +122,7 @@ class Capture:
     frames: ImageFolder | Video | None = None
     exposure_s: float | None = None
     readout_s: float | None = None
+    readout_source: str = ""
     readout_direction: ReadoutDirection = "down"
     shared_clock: bool = False
     camera: CameraModel | None = None
@@ -210,6 +214,9 @@ def _from_toml(path: Path) -> Capture:
             if shared_clock is None and inside and frames.frame_times is None:
                 shared_clock = log.shared_clock
     shared_clock = bool(shared_clock)
+    published = readout_of_video(frames.file) if isinstance(frames, Video) and readout_s is None else None
+    if published is not None:
+        readout_s = published.readout_s
     known = read_calibration_table(
         root.table("calibration"), body_from_cam=body_from_cam, imu=imu, readout_s=readout_s, shared_clock=shared_clock
     )
@@ -227,6 +234,7 @@ def _from_toml(path: Path) -> Capture:
         frames=frames,
         exposure_s=exposure_s,
         readout_s=readout_s,
+        readout_source="" if published is None else str(published),
         readout_direction=readout_direction or "down",
         shared_clock=shared_clock,
         camera=camera,
@@ -285,7 +293,8 @@ def _from_folder(path: Path) -> Capture:
     raise FormatError(
         path,
         "is no capture by itself: it holds no capture.toml, and is neither an ASL/EuRoC dataset (cam0/data.csv, "
-        "cam0/data/, imu0/data.csv) nor an InertialScale folder; describe it in a capture.toml",
+        "cam0/data/, imu0/data.csv) nor an InertialScale folder; describe it in a capture.toml (pictures without an "
+        "IMU: reconstruct --scale-from target or distance)",
     )
 
 

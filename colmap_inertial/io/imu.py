@@ -119,7 +119,11 @@ def read_raw_capture_imu(capture: Capture) -> RawImu:
     """The inertial recording of a capture, as :func:`read_raw_imu` gives it."""
     source = capture.imu
     if source is None:
-        raise FormatError(capture.path, "describes no inertial recording; add [imu] with path = ...")
+        raise FormatError(
+            capture.path,
+            "describes no inertial recording; add [imu] with path = ..., or take the metres from a target or a known "
+            "distance (reconstruct --scale-from)",
+        )
     if isinstance(source, ImuPath):
         path = accel_path = source.path
         imu = find_imu_format(path, source.format).read(path, source.units)

@@ -129,8 +129,8 @@ def refuse_video(path: Path) -> None:
         raise FormatError(
             path,
             f"is a video without an IMU that is known here; its tracks: {tracks or 'none'}; where the IMU was recorded "
-            "beside it, describe both in a capture.toml ([video] and [imu]); without one, map it with COLMAP and give "
-            "metres by a target or a known distance (reconstruct PROJECT OUT --scale-from)",
+            "beside it, describe both in a capture.toml ([video] and [imu]); without one, a target or a known distance "
+            "gives metres (reconstruct VIDEO OUT --scale-from target)",
         )
     if path.suffix.lower() in _VIDEOS:
         begins = read_bytes(path, 16)

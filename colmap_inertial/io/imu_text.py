@@ -11,17 +11,12 @@ from numpy.typing import NDArray
 from colmap_inertial.errors import FormatError
 from colmap_inertial.io.columns import recognise
 from colmap_inertial.io.files import first_line
+from colmap_inertial.io.guess import how_to_describe
 from colmap_inertial.io.samples import Samples, order_samples
 from colmap_inertial.io.sensor_yaml import read_imu_noise
 from colmap_inertial.io.tables import Table, read_table
 from colmap_inertial.io.units import SENSOR_NAMES, SENSOR_UNITS, DeclaredUnits, Quantity, seconds
 from colmap_inertial.types import Array, ImuNoise, ImuRecording
-
-_HOW_TO_DESCRIBE = (
-    'describe the file in a capture.toml: [imu.gyro] file = "{name}", time = 1, time_unit = "s", columns = [2, 3, 4], '
-    'unit = "rad/s"; [imu.accel] the same with columns = [5, 6, 7], unit = "m/s2" (columns count from 1; time_unit s, '
-    "ms, us or ns; unit rad/s or deg/s, m/s2 or g; each key on a line of its own)"
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,7 +122,7 @@ def _is_imu_table(path: Path) -> bool:
 
 def _read_csv(path: Path, units: DeclaredUnits, noise: ImuNoise | None) -> ImuRecording:
     table = read_table(path)
-    how = _HOW_TO_DESCRIBE.format(name=path.name)
+    how = how_to_describe(table)
     if table.header is None:
         raise FormatError(path, f"has no header that names its columns; {how}", line=int(table.line_numbers[0]))
     try:

@@ -132,8 +132,9 @@ def _accelerometer(path: Path, members: dict[str, str], units: DeclaredUnits) ->
         if "Accelerometer.csv" in members:
             raise FormatError(
                 path,
-                "its Accelerometer.csv is without gravity; record Gravity, Total Acceleration or the uncalibrated "
-                "accelerometer as well",
+                "its Accelerometer.csv is without gravity; export TotalAcceleration.csv, Gravity.csv or "
+                "AccelerometerUncalibrated.csv as well (in the app: Total Acceleration, Gravity, or Accelerometer "
+                "Uncalibrated)",
             )
         return None
     ios, standardised = _platform(path, members)

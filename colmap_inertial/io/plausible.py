@@ -154,6 +154,12 @@ def check_gravity(lengths_m_s2: Array, path: Path) -> None:
             f'{found}: m/s2 were converted as if they were g; set unit = "m/s2" under [imu.accel] in capture.toml',
             code="accel-not-in-g",
         )
+    if steady and low <= 0.5 * median <= high:
+        raise FormatError(
+            path,
+            f"{found}: gravity was added twice, or the readings are doubled; give the accelerometer as it was logged",
+            code="gravity-doubled",
+        )
     if not steady:
         raise FormatError(
             path,

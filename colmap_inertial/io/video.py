@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -194,6 +195,41 @@ def _brightness(frame: av.VideoFrame) -> NDArray[np.uint8]:
     if bits == 8:
         return rows[:, : frame.width]
     return np.asarray(rows[:, : 2 * frame.width].view("<u2") >> (bits - 8), dtype=np.uint8)
+
+
+@dataclass(frozen=True, kw_only=True)
+class VideoMode:
+    """The camera that a video names, and how it filmed: size of the stored pictures, mean frame rate."""
+
+    make: str
+    model: str
+    width: int
+    height: int
+    rate_hz: float
+
+
+#: Where QuickTime and Android write maker and model of the camera.
+_MAKES = ("com.apple.quicktime.make", "com.android.manufacturer", "make")
+_MODELS = ("com.apple.quicktime.model", "com.android.model", "model")
+
+
+def video_mode(path: Path) -> VideoMode | None:
+    """Camera and mode of a video; ``None`` where it names no camera.
+
+    Raises
+    ------
+    FormatError
+        Where it is no video.
+    """
+    container, stream = _open(path)
+    with container:
+        said = container.metadata
+        make, model = (next((said[key] for key in keys if key in said), "") for keys in (_MAKES, _MODELS))
+        if not make or not model or not stream.average_rate:
+            return None
+        return VideoMode(
+            make=make, model=model, width=stream.width, height=stream.height, rate_hz=float(stream.average_rate)
+        )
 
 
 def _open(path: Path) -> tuple[InputContainer, VideoStream]:

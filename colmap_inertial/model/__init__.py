@@ -23,6 +23,7 @@ from colmap_inertial.types import (
     CameraModel,
     CameraTrajectory,
     FrameTiming,
+    JoinedPart,
     ScaleEstimate,
     Similarity,
     Treatment,
@@ -67,6 +68,8 @@ class Model:
         What the stages before did, in order.
     observed_px
         By image name, (N, 2) where its keypoints were when COLMAP mapped them, where a stage moved them since.
+    parts
+        What it was joined of; empty where it is one of COLMAP's models.
     """
 
     reconstruction: pycolmap.Reconstruction
@@ -78,6 +81,7 @@ class Model:
     similarity: Similarity | None = None
     treatments: tuple[Treatment, ...] = ()
     observed_px: Mapping[str, Array] = field(default_factory=dict)
+    parts: tuple[JoinedPart, ...] = ()
 
     def scaled(self, estimate: ScaleEstimate, similarity: Similarity | None) -> Model:
         """With a scale estimate, and where it was not refused in its units; doubts make it weak at most.

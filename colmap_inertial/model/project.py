@@ -34,7 +34,7 @@ from colmap_inertial.model.copying import begin_writing, copy_file, list_tree, n
 from colmap_inertial.model.database import SHARED_MEMORY, SIDE_FILES, is_database, transform_database
 from colmap_inertial.model.layout import Layout, read_layout
 from colmap_inertial.model.nerf import cameras_are_those_of, is_transforms, transform_transforms
-from colmap_inertial.model.similarities import ModelScale, similarity_from_json, undoing
+from colmap_inertial.model.similarities import ModelScale, require_not_joined, similarity_from_json, undoing
 from colmap_inertial.threads import one_blas_thread, usable_processors
 from colmap_inertial.types import Similarity
 
@@ -159,18 +159,18 @@ def undo_project(
     Raises
     ------
     FormatError
-        When the project holds no ``transform.json`` of ours.
+        When the project holds no ``transform.json`` of ours, or a joined model.
     OutputError
         When ``out`` exists or cannot be written.
     """
     project, out = Path(project), Path(out)
-    path = project / TRANSFORM_FILE
-    record = read_json(path)
+    record = read_json(path := project / TRANSFORM_FILE)
     try:
         keep = [str(pattern) for pattern in record["keep"]]
         models = [(int(m["index"]), m["similarity"]) for m in record["models"]]
         database = {name: (list(d["prior_models"]), list(d["rig_models"])) for name, d in record["databases"].items()}
         beside = [str(pattern) for pattern in record.get("beside", [])]
+        require_not_joined(path, {int(m["index"]): [int(i) for i in m.get("joined_of", [])] for m in record["models"]})
     except (KeyError, TypeError, ValueError, AttributeError):
         raise FormatError(path, "not the record of a project that colmap-inertial apply wrote") from None
     by_model = {

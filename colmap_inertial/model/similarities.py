@@ -28,16 +28,20 @@ class ModelScale:
         ``None`` where the scale was refused: the sub-model keeps its own units.
     verdict, reasons
         Of the scale estimate; ``None`` and empty where the user gave the similarity.
+    joined_of
+        The sub-models whose images it holds as well since it was joined of them; empty where it is one by itself.
     """
 
     similarity: Similarity | None
     verdict: str | None = None
     reasons: tuple[str, ...] = ()
+    joined_of: tuple[int, ...] = ()
 
     def as_json(self) -> dict[str, object]:
         """The fields in JSON types."""
         similarity = None if self.similarity is None else similarity_as_json(self.similarity)
-        return {"verdict": self.verdict, "reasons": list(self.reasons), "similarity": similarity}
+        joined = {"joined_of": list(self.joined_of)} if self.joined_of else {}
+        return {"verdict": self.verdict, "reasons": list(self.reasons), "similarity": similarity, **joined}
 
 
 def similarity_from_json(path: Path, fields: Mapping[str, Any]) -> Similarity:
@@ -119,6 +123,17 @@ def undoing(similarity: Similarity) -> Similarity:
         cov=np.zeros((7, 7)),
         provenance=f"undoes: {similarity.provenance}",
     )
+
+
+def require_not_joined(path: Path, parts: Mapping[int, Sequence[int]]) -> None:
+    """Raise :class:`FormatError` where a model was joined of several, by number: it cannot be taken apart again."""
+    for index, numbers in parts.items():
+        if numbers:
+            raise FormatError(
+                path,
+                f"model {index} was joined of the models {', '.join(map(str, numbers))}, which cannot be taken apart "
+                "again: the project that it was made from is as it was; --join off keeps its models apart",
+            )
 
 
 def read_scales(sources: Sequence[str], *, world: WorldAxes = "z-up") -> dict[int | None, ModelScale]:

@@ -98,7 +98,7 @@ def _look(
         progress("blur", len(looked), len(chosen))
         blur = blur_field(motion, camera, view.shutter(index[frame.name]), parallax=parallaxes.get(frame.name))
         if factor != 1.0:
-            blur = replace(blur, vector_px=blur.vector_px * np.float32(factor))
+            blur = blur.times(factor)
         fall = detail_fall(frame.image, blur)
         looked.append(Looked(blur_evidence(frame.image, blur), fall, blur_px[frame.name]))
     progress("blur", len(chosen), len(chosen))

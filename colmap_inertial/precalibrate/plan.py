@@ -221,7 +221,8 @@ def plan_imaging(recording: Recording, context: RunContext, asked: Treatments) -
         )
     why_not = _no_deblurring(recording, asked)
     no_rectifying = _no_rectifying(timing, asked)
-    rectifying = f"keypoints are rectified, readout {1e3 * (timing.readout_s or 0):.1f} ms"
+    source = f" ({capture.readout_source})" if capture.readout_source else ""
+    rectifying = f"keypoints are rectified, readout {1e3 * (timing.readout_s or 0):.1f} ms{source}"
     plan = ImagingPlan(
         method="wiener" if asked.deblur is None or asked.deblur == "off" else asked.deblur,
         rectify=not no_rectifying,

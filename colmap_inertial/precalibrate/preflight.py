@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
 from typing import Literal
 
 import numpy as np
@@ -13,10 +14,13 @@ from colmap_inertial.flow import VisualRotation
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.imu import RawImu
 from colmap_inertial.io.pose_convention import COLMAP
-from colmap_inertial.precalibrate.calibrate import followed, guessed_camera, near_the_beginning
+from colmap_inertial.model import colmap_camera
+from colmap_inertial.precalibrate.calibrate import followed, guessed_camera, near_the_beginning, some_frames
 from colmap_inertial.run.context import Recording
 from colmap_inertial.run.progress import Progress
-from colmap_inertial.types import CameraTrajectory, FrameTiming
+from colmap_inertial.threads import one_blas_thread
+from colmap_inertial.turns import measure_turns
+from colmap_inertial.types import CameraTrajectory, Frame, FrameTiming
 
 log = logging.getLogger(__name__)
 
@@ -25,9 +29,23 @@ log = logging.getLogger(__name__)
 #: asked to diagnose, and how far apart at least.
 _VIDEO_STEP_S = 0.13
 _FEW, _FEW_SPACING_S = 90, 0.09
+#: Pictures further apart that are compared two by two.
+_COMPARED = 60
 
 #: What makes a reconstruction in metres meaningless.
-STOPPING = frozenset({"stabilised", "gravity-removed", "pose-convention", "imu-does-not-fit", "gyro-mirrored"})
+STOPPING = frozenset(
+    {
+        "stabilised",
+        "gravity-removed",
+        "pose-convention",
+        "imu-does-not-fit",
+        "gyro-mirrored",
+        "gyro-in-deg",
+        "gyro-not-in-deg",
+        "frame-rate",
+        "clock-offset",
+    }
+)
 
 
 def checked_imu(raw: RawImu, *, force: bool) -> RawImu:
@@ -48,7 +66,7 @@ def checked_imu(raw: RawImu, *, force: bool) -> RawImu:
     try:
         raw.check()
     except FormatError as error:
-        if error.code not in STOPPING:
+        if error.code != "gravity-removed":
             raise
         if not force:
             raise NotObservableError("scale", f"{error} (--force goes on)") from None
@@ -95,7 +113,7 @@ def stop_or_doubt(diagnosis: Diagnosis, *, force: bool) -> tuple[str, ...]:
     """
     for finding in diagnosis.findings:
         log.info("%s: %s: %s", finding.severity, finding.code, finding.evidence)
-    stopping = [finding for finding in diagnosis.findings if finding.code in STOPPING]
+    stopping = [finding for finding in diagnosis.findings if finding.code in STOPPING and finding.severity == "error"]
     if stopping and not force:
         first = stopping[0]
         raise NotObservableError("scale", f"{first.evidence}; {first.advice} (--force goes on)")
@@ -112,3 +130,21 @@ def _followed(
         return None
     indices = near_the_beginning(timing, spacing_s, most)
     return followed(capture, timing, guessed_camera(capture, timing), indices, progress)
+
+
+def compared(capture: Capture, timing: FrameTiming, progress: Progress) -> VisualRotation | None:
+    """The rotation between pictures that are too far apart in time to be followed; ``None`` for fewer than five."""
+    if len(timing.t_s) < 5:
+        return None
+    first = max(0, (len(timing.t_s) - _COMPARED) // 2)
+    indices = range(first, min(first + _COMPARED, len(timing.t_s)))
+
+    def counted() -> Iterator[Frame]:
+        for done, frame in enumerate(some_frames(capture, timing, indices)):
+            progress("motion", done, len(indices))
+            yield frame
+        progress("motion", len(indices), len(indices))
+
+    camera = colmap_camera(guessed_camera(capture, timing))
+    with one_blas_thread():
+        return measure_turns(counted(), camera, timing)

@@ -19,6 +19,7 @@ largest values, ``null`` for gaps; three lines are x, y, z.
                    - ``drift``: as in ``result.json``, or missing
                    - ``validation``: as in ``result.json`` with ``pictures`` (paths), or missing
                    - ``scene``, ``photogrammetry``, ``signals``: see below, or missing
+``gaps``           between COLMAP's models, as in ``result.json``
 ``findings``       ``checked`` and ``findings`` of ``diagnosis.json``, or missing
 ``selection``      of a video's frames: ``frames``, ``used`` and ``note``; ``null`` where unknown
 ``recording``      ``imu`` (``device``, ``gyro_hz``, ``accel_hz``, ``duration_s``) and ``frames`` (``count``,
@@ -42,11 +43,11 @@ upright), ``points_in_model``, ``points`` (``xyz`` as three lists, ``rgb``), ``p
 ``half_height`` at distance 1).
 
 ``photogrammetry``: ``unit``, ``cameras`` (``camera_id``, ``model``, ``width``, ``height``, ``images``, ``params``,
-``field_of_view_deg``, ``distortion``: ``at_px`` and ``shift_px``), ``images`` (``name``, ``observations``, ``rms_px``
-of their residuals, ``gsd``: length of a pixel at the median depth), ``sensor`` (residuals in ``columns`` times ``rows``
-cells: ``count``, ``mean_x_px``, ``mean_y_px``, ``rms_px``), ``tracks`` (``mean`` length, ``counts`` of points seen by
-2, 3, ..., 12 or more images), ``extent`` along x, y and up, ``ground`` (``x0``, ``y0``, ``step``, and
-the ``images`` that see each square from above).
+``sigma`` of those that were free, ``field_of_view_deg``, ``distortion``: ``at_px`` and ``shift_px``), ``images``
+(``name``, ``observations``, ``rms_px`` of their residuals, ``gsd``: length of a pixel at the median depth), ``sensor``
+(residuals in ``columns`` times ``rows`` cells: ``count``, ``mean_x_px``, ``mean_y_px``, ``rms_px``), ``tracks``
+(``mean`` length, ``counts`` of points seen by 2, 3, ..., 12 or more images), ``extent`` along x, y and up, ``ground``
+(``x0``, ``y0``, ``step``, and the ``images`` that see each square from above).
 
 ``signals``: ``duration_s``, ``frames``, ``first_frame_s`` (on the camera's clock: where ``t_s`` counts from),
 ``alignment`` of camera and IMU (``found``, ``failed``, or ``not tried`` where the recording cannot be used), and

@@ -70,8 +70,11 @@ def gather(
         outcome = shown[0]["outcome"]
     else:
         outcome = outcome_of_stop(stopped or "COLMAP made no model.", findings=bool(findings.get("findings")))
+    gaps = done.get("gaps", [])
+    if shown and shown[0]["joined_of"]:
+        outcome = {**outcome, "summary": [*outcome["summary"], _joined(shown[0], gaps)]}
     if len(shown) > 1:
-        said = f"COLMAP made {len(shown)} separate models. This is model {shown[0]['index']}; the others follow below."
+        said = f"There are {len(shown)} separate models. This is model {shown[0]['index']}; the others follow below."
         outcome = {**outcome, "summary": [*outcome["summary"], said]}
     source = done.get("capture", capture) or str(out)
     return {
@@ -81,6 +84,7 @@ def gather(
         "capture": source,
         "outcome": outcome,
         "models": shown,
+        "gaps": gaps,
         "findings": findings,
         "selection": _selection(done),
         "recording": None if recording is None else _of_recording(recording),
@@ -93,6 +97,22 @@ def gather(
         "configuration": _configuration(out),
         "versions": done["versions"],
     }
+
+
+def _joined(model: Content, gaps: list[Content]) -> str:
+    """What a model was joined of, in a sentence."""
+    inside = {part["colmap_index"] for part in model["joined_of"]}
+    across = [
+        gap for gap in gaps if gap["joined"] and gap["sigma_m"] is not None and {gap["first"], gap["second"]} <= inside
+    ]
+    if not across:  # a stage of somebody's own need not say how well it knows them
+        return f"COLMAP made {len(inside)} models of it, which were joined into one."
+    worst = max(across, key=lambda gap: gap["sigma_m"])
+    return (
+        f"COLMAP made {len(inside)} models of it, which what the IMU felt between them made one; the gap that is known "
+        f"worst, of {worst['seconds']:.1f} s, to {100 * worst['sigma_m']:.1f} cm and {worst['sigma_deg']:.2f} degrees "
+        "(1 sigma)."
+    )
 
 
 def _selection(done: Content) -> Content | None:
@@ -112,6 +132,7 @@ def _title(source: str) -> str:
 def _model(out: Path, model: Content, *, in_full: bool, project: bool) -> Content:
     scale, ci95 = model["metres_per_unit"], model["ci95"]
     kept = {key: value for key, value in model.items() if key not in _NOT_SHOWN}
+    kept.setdefault("joined_of", [])
     kept.setdefault("notes", [])  # earlier runs had all of it among the reasons
     kept["half_width_pct"] = None if scale is None else half_width_pct(scale, ci95)
     if scale is None:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.geometry import quat_rotate
+from colmap_inertial.model.intrinsics import intrinsics_sigma
 from colmap_inertial.report.series import rounded, strided
 from colmap_inertial.types import Array
 
@@ -52,9 +53,10 @@ def photogrammetry_record(
     seen = [
         _seen(reconstruction.camera(images[i].camera_id), images[i], place) for i in strided(len(images), _MOST_IMAGES)
     ]
+    sigma = intrinsics_sigma(reconstruction)
     return {
         "unit": unit,
-        "cameras": [_camera(reconstruction, i, image_ids) for i in _most_used(reconstruction, image_ids)],
+        "cameras": [_camera(reconstruction, i, image_ids, sigma.get(i)) for i in _most_used(reconstruction, image_ids)],
         "images": [
             {"name": s.name, "observations": len(s.residual_px), "rms_px": _rms(s.residual_px), "gsd": s.gsd}
             for s in seen
@@ -100,7 +102,9 @@ def _most_used(reconstruction: pycolmap.Reconstruction, image_ids: list[int]) ->
     return sorted(set(used), key=lambda i: (-used.count(i), i))[:_MOST_CAMERAS]
 
 
-def _camera(reconstruction: pycolmap.Reconstruction, camera_id: int, image_ids: list[int]) -> dict[str, Any]:
+def _camera(
+    reconstruction: pycolmap.Reconstruction, camera_id: int, image_ids: list[int], sigma: Array | None
+) -> dict[str, Any]:
     """Intrinsics, field of view, and by how much the lens moves points from where a pinhole would have them."""
     camera = reconstruction.camera(camera_id)
     names = [name.strip() for name in camera.params_info.split(",")]
@@ -120,6 +124,9 @@ def _camera(reconstruction: pycolmap.Reconstruction, camera_id: int, image_ids: 
         "height": camera.height,
         "images": sum(reconstruction.image(i).camera_id == camera_id for i in image_ids),
         "params": dict(zip(names, (float(p) for p in camera.params), strict=True)),
+        "sigma": {}
+        if sigma is None
+        else {name: float(s) for name, s in zip(names, sigma, strict=True) if np.isfinite(s)},
         "field_of_view_deg": rounded(np.array(field), 2),
         "distortion": {
             "at_px": np.round(at[good], 1).tolist(),

@@ -106,7 +106,8 @@ def camera_section(survey: Content, name: str, mark: str) -> Section:
     """Intrinsics and distortion of each camera."""
     parts: list[str | Plot] = [
         f"<h2>{escape(name)}Camera calibration</h2>",
-        "<p>Intrinsics as the model has them, in pixels of the images; COLMAP gives no uncertainties of them.</p>",
+        "<p>Intrinsics as the model has them, in pixels of the images. ± is their standard deviation by the scatter of "
+        "the residuals, with the principal point held; what the camera model cannot describe is not in it.</p>",
     ]
     for camera in survey["cameras"]:
         field = " × ".join(f"{value:.1f}°" for value in camera["field_of_view_deg"])
@@ -114,8 +115,12 @@ def camera_section(survey: Content, name: str, mark: str) -> Section:
             f"<h3>Camera {camera['camera_id']}: {escape(camera['model'])}</h3><p>{camera['width']} × "
             f"{camera['height']} pixels, {field}, {camera['images']} images.</p>"
         )
-        rows = [(key, _PARAMETERS.get(key, "distortion"), f"{v:.6g}") for key, v in camera["params"].items()]
-        parts.append(table(("Parameter", "What", "Value"), rows, numbers=(2,)))
+        sigma = camera.get("sigma", {})
+        rows = [
+            (key, _PARAMETERS.get(key, "distortion"), f"{v:.6g}", f"{sigma[key]:.2g}" if key in sigma else "")
+            for key, v in camera["params"].items()
+        ]
+        parts.append(table(("Parameter", "What", "Value", "±"), rows, numbers=(2, 3)))
         if any(abs(v) > 0 for shift in camera["distortion"]["shift_px"] for v in shift):
             parts += [
                 "<p>Where the lens puts points, from where a pinhole would:</p>",

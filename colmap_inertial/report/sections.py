@@ -380,6 +380,15 @@ def _shutter(content: Content, out: Path) -> Section:
     return Section(anchor="shutter", short="Rolling shutter", parts=parts)
 
 
+def _gap_row(gap: Content) -> tuple[str, str, str, str, str]:
+    position, direction = (
+        "unknown" if gap[name] is None else digits(factor * gap[name], 2)
+        for name, factor in (("sigma_m", 100), ("sigma_deg", 1))
+    )
+    became = gap["reason"] if gap["joined"] else f"apart: {gap['reason']}"
+    return f"{gap['first']}, {gap['second']}", f"{gap['seconds']:.2f}", position, direction, str(became)
+
+
 def _run(content: Content) -> Section:
     parts = ["<h2>The run</h2>"]
     if content["seconds"]:
@@ -402,6 +411,10 @@ def _run(content: Content) -> Section:
             )
         head = ("Model", "Verdict", "One unit is", "Images", "Method")
         parts += ["<h3>Models</h3>", table(head, rows, numbers=(3,))]
+    if content["gaps"]:
+        rows = [_gap_row(gap) for gap in content["gaps"]]
+        head = ("COLMAP's models", "Gap (s)", "Position (cm)", "Direction (°)", "What became of it")
+        parts += ["<h3>Gaps between COLMAP's models</h3>", table(head, rows, numbers=(1, 2, 3))]
     toml = content["configuration"].get("toml")
     if toml:
         parts.append(

@@ -58,11 +58,13 @@ def not_checked(checked: Collection[str]) -> str:
     said = []
     if "accelerometer" not in checked:
         said.append("gravity and scale (no accelerometer)")
-    if not {"pictures", "poses"} & set(checked):
+    if not {"pictures", "pictures far apart", "poses"} & set(checked):
         said.append(
-            "whether camera and gyroscope belong together, their axes and clocks (no pictures close enough in time to "
-            "be followed, and no poses)"
+            "whether camera and gyroscope belong together, their axes, unit and clocks (no poses, and no pictures that "
+            "show enough of the same)"
         )
+    elif "pictures far apart" in checked:
+        said.append("stabilisation and focal length (the pictures are too far apart in time)")
     return "; ".join(said)
 
 

@@ -143,11 +143,7 @@ def _estimate_or_refuse(
     if problems:
         return ScaleEstimate.refused(options.method, *problems)
     try:
-        alignment = align_clocks(
-            trajectory, imu, prior=calibration, options=AlignOptions(max_offset_s=options.max_offset_s)
-        )
-        aligned = alignment.settled()
-        in_step = on_camera_rate(imu, aligned, camera_epoch_ns=trajectory.epoch_ns)
+        in_step, aligned = in_step_with(trajectory, imu, calibration, options)
         said = in_step.repairs[len(imu.repairs) :]
         estimate = _estimate(trajectory, in_step, aligned, options)
         return replace(
@@ -158,6 +154,17 @@ def _estimate_or_refuse(
         )
     except NotObservableError as error:
         return ScaleEstimate.refused(options.method, f"{error.quantity}: {error.hint}")
+
+
+def in_step_with(
+    trajectory: CameraTrajectory, imu: ImuRecording, calibration: CameraImuCalibration | None, options: ScaleOptions
+) -> tuple[ImuRecording, CameraImuCalibration]:
+    """A recording on the camera's rate, and how camera and IMU relate, from a calibration that may be wide."""
+    alignment = align_clocks(
+        trajectory, imu, prior=calibration, options=AlignOptions(max_offset_s=options.max_offset_s)
+    )
+    aligned = alignment.settled()
+    return on_camera_rate(imu, aligned, camera_epoch_ns=trajectory.epoch_ns), aligned
 
 
 def _estimate(

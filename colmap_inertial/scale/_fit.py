@@ -10,6 +10,7 @@ from colmap_inertial.scale import _factors as fac, _noise as levels, _parameters
 from colmap_inertial.scale._drift import scale_drift
 from colmap_inertial.scale._noise import Expected, LevelSearch
 from colmap_inertial.scale._parameters import Data, Estimate, Noise, Prior
+from colmap_inertial.scale._solver import ArrowSystem
 from colmap_inertial.scale.priors import model_scale_sigma
 from colmap_inertial.types import Array, ImuNoise, ScaleDrift
 
@@ -61,6 +62,9 @@ class Fit:
         What the variance of the logarithm of the scale comes from, by the keys of ``parts.CAUSES``.
     suspicions
         What an accelerometer with faults that the model does not have would explain.
+    system, rate_rad_s, prior_info
+        The normal equations at the end, (K, 3) angular velocities at the nodes, and (79, 79) what of the globals'
+        information is the prior's.
     """
 
     estimate: Estimate
@@ -80,6 +84,9 @@ class Fit:
     gain_surprise: float
     variance_parts: dict[str, float]
     suspicions: list[sus.Suspicion]
+    system: ArrowSystem
+    rate_rad_s: Array
+    prior_info: Array
 
 
 def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
@@ -168,6 +175,9 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
         gain_surprise=_gain_surprise(local, x, cov),
         variance_parts=variance_parts,
         suspicions=suspicions,
+        system=system,
+        rate_rad_s=pre.rate_rad_s,
+        prior_info=local.info,
     )
 
 

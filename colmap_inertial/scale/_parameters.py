@@ -61,6 +61,8 @@ class Data:
     ----------
     groups
         Visual rotations and centres in model units, about their mean.
+    origin
+        (3,) that mean, in the model's world.
     rotation_shape, centre_shape
         (K, 3, 3) square roots of the information of the visual rotation (camera frame) and of the centre (world frame)
         given the rotation, for a noise level of one.
@@ -78,6 +80,7 @@ class Data:
     """
 
     groups: Groups
+    origin: Array
     rotation_shape: Array
     centre_shape: Array
     coupling: Array

@@ -99,6 +99,7 @@ def prepare(
     rotation_shape, centre_shape, coupling = _pose_shapes(pose_cov, world_from_cam)
     data = Data(
         groups=groups,
+        origin=centre.mean(axis=0),
         rotation_shape=rotation_shape,
         centre_shape=centre_shape,
         coupling=coupling,

@@ -108,15 +108,7 @@ def estimate_joint(
     """
     options = options or JointOptions()
     try:
-        data, prior = prepare(
-            trajectory,
-            imu,
-            calibration,
-            gravity_m_s2=options.gravity_m_s2,
-            gravity_sigma_m_s2=options.gravity_sigma_m_s2,
-            states_hz=options.states_hz,
-        )
-        fit, faults = _fit_soundly(data, prior, imu.noise)
+        data, fit, faults = fit_path(trajectory, imu, calibration, options)
     except NotObservableError as error:
         return ScaleEstimate.refused("joint", error.hint)
     except np.linalg.LinAlgError:
@@ -126,6 +118,29 @@ def estimate_joint(
     wrong = [*faults.sentences(), *_cut_off(data)]
     # what was taken from a path nobody can put back: its scale is too large by more than any interval says
     return _judged(fit, data.t_s, calibration, is_calibrated(imu), wrong, worthless=faults.path_is_smoothed)
+
+
+def fit_path(
+    trajectory: CameraTrajectory, imu: ImuRecording, calibration: CameraImuCalibration, options: JointOptions
+) -> tuple[Data, Fit, Faults]:
+    """The measurements as they came, their fit, and what was wrong with the accelerometer.
+
+    Raises
+    ------
+    NotObservableError
+        When too few frames lie inside the IMU recording.
+    numpy.linalg.LinAlgError
+        When the data leave the system singular.
+    """
+    data, prior = prepare(
+        trajectory,
+        imu,
+        calibration,
+        gravity_m_s2=options.gravity_m_s2,
+        gravity_sigma_m_s2=options.gravity_sigma_m_s2,
+        states_hz=options.states_hz,
+    )
+    return data, *_fit_soundly(data, prior, imu.noise)
 
 
 def _fit_soundly(data: Data, prior: Prior, sheet: ImuNoise | None) -> tuple[Fit, Faults]:
@@ -166,7 +181,7 @@ def _judged(
     x = fit.estimate
     squares = sum(s for s, _ in fit.sums.values())
     expected = sum(e for _, e in fit.sums.values())
-    found = _scale_of(fit, t_s, calibrated)
+    found = scale_of(fit, t_s, calibrated)
     metres_per_unit, sigma_log = found.metres_per_unit, found.sigma_log
     refusals = [*_refusals(fit, t_s), *(wrong if worthless else ())]
     verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, refusals=refusals)
@@ -210,13 +225,24 @@ def _judged(
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Scale:
+class FoundScale:
+    """What a fit says of the scale.
+
+    Attributes
+    ----------
+    metres_per_unit, sigma_log, parts
+        As :class:`ScaleEstimate` has them.
+    widened
+        Factor on variances of the fit: squares beyond their expectation, few degrees of freedom, what no model has.
+    """
+
     metres_per_unit: float
     sigma_log: float
     parts: dict[str, float]
+    widened: float
 
 
-def _scale_of(fit: Fit, t_s: Array, calibrated: bool) -> _Scale:
+def scale_of(fit: Fit, t_s: Array, calibrated: bool) -> FoundScale:
     """The scale and the standard deviation of its logarithm, with what the fit takes for granted put right.
 
     The scale makes residuals orthogonal to the fitted path. That path follows the visual noise with as many degrees of
@@ -238,10 +264,11 @@ def _scale_of(fit: Fit, t_s: Array, calibrated: bool) -> _Scale:
     variances["noise_levels"] = (student * _UNIFORM * share) ** 2 + fit.level_variance
     variances["accel_gain"] += 0.0 if calibrated else PRIORS.accel_model**2
     variances["lens"] = PRIORS.lens**2
-    return _Scale(
+    return FoundScale(
         metres_per_unit=fit.estimate.metres_per_unit * float(np.exp(shift)),
         sigma_log=sum(variances.values()) ** 0.5,
         parts={name: variance**0.5 for name, variance in variances.items()},
+        widened=widened,
     )
 
 

@@ -156,8 +156,9 @@ class DeblurStage:
         if factor is None:
             return said(reason)
         if factor != 1.0:
-            blur = replace(blur, vector_px=blur.vector_px * np.float32(factor))
-        path = blur_path(motion, camera, shutter, parallax=parallax, extent_factor=factor)
+            blur = blur.times(factor)
+        # filters that reckon with a path's errors leave more of long blur's ghosts, which match each other
+        path = blur_path(motion, camera, shutter, parallax=parallax, extent_factor=factor).as_certain()
         out, kept = keep_sharp(image, remove(image, blur, path), blur)
         smoothing_px = self.smoothing_px if kept < _MOSTLY_KEPT else 0.0
         return replace(said(reason, kept, factor, "deblurred"), image=out, smoothing_px=smoothing_px)

@@ -126,7 +126,8 @@ def write_trajectory(path: Path, model: Model, trajectory: CameraTrajectory, imu
     ----------
     path
         ``trajectory*.tum``; the covariance goes to ``trajectory*_cov.npz`` with ``t_s`` (T,) and ``cov`` (T, 9, 9) of
-        position, velocity and acceleration (none of a refined model); velocities by frame to :func:`motion_file`.
+        position, velocity and acceleration (none of a refined or joined model); velocities by frame to
+        :func:`motion_file`.
     model
         A model that a stage made metric.
     trajectory
@@ -143,6 +144,10 @@ def write_trajectory(path: Path, model: Model, trajectory: CameraTrajectory, imu
     if any(one.stage == "refine" and one.action for one in model.treatments):
         # the IMU made these poses already: smoothed by it once more, they would seem far surer than they are
         log.info("%s: no covariance of a refined path is written; result.json has its drift", path.name)
+        target.unlink(missing_ok=True)
+    elif model.parts:
+        # smoothing knows nothing of how surely each part was placed
+        log.info("%s: no covariance of a joined path is written; result.json has that of each part", path.name)
         target.unlink(missing_ok=True)
     else:
         _write_covariance(target, smoothed)

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from types import EllipsisType
-from typing import Protocol, TypeVar
+from typing import Protocol, TypeVar, runtime_checkable
 
 from colmap_inertial.model import Model
-from colmap_inertial.types import Frame, Keypoints
+from colmap_inertial.types import Frame, Gap, Keypoints
 
 Stage = TypeVar("Stage")
 
@@ -37,6 +37,15 @@ class ModelStage(Protocol):
 
     def __call__(self, model: Model, /) -> Model:
         """Return the model, or another one made from it."""
+        ...
+
+
+@runtime_checkable
+class JoiningStage(Protocol):
+    """A model stage that takes all models of a run at once."""
+
+    def join(self, models: Sequence[Model], /) -> tuple[tuple[Model, ...], tuple[Gap, ...]]:
+        """Return the models to go on with, and what lies between those that came, the largest first."""
         ...
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.sweep.pinhole import Pinhole
+from colmap_inertial.sweep.pinhole import ROWS_AT_ONCE, Pinhole
 
 Real = NDArray[np.float32]
 
@@ -43,8 +43,19 @@ def normals_of(depth: Real, camera: Pinhole) -> Real:
     middle = np.asarray(cv2.medianBlur(inverse, 5))
     middle = np.where(np.abs(middle - inverse) > _SAME_SHARE * inverse, inverse, middle)
     room = np.pad(inverse, _RADIUS)
+    out = np.empty((height, width, 3), dtype=np.float32)
+    for begin in range(0, height, ROWS_AT_ONCE):
+        end = min(height, begin + ROWS_AT_ONCE)
+        rows = slice(begin, end)
+        out[rows] = _of_rows(known[rows], middle[rows], room[begin : end + 2 * _RADIUS], begin, camera)
+    return out
+
+
+def _of_rows(known: NDArray[np.bool_], middle: Real, room: Real, begin: int, camera: Pinhole) -> Real:
+    """Of rows ``begin ...``; ``room`` is their inverse depth with the neighbours around."""
+    height, width = known.shape
     tolerance = _SAME_SHARE * middle
-    count, sx, sy, sxx, sxy, syy, sq, sxq, syq = (np.zeros(depth.shape, dtype=np.float32) for _ in range(9))
+    count, sx, sy, sxx, sxy, syy, sq, sxq, syq = (np.zeros(known.shape, dtype=np.float32) for _ in range(9))
     for dy in range(-_RADIUS, _RADIUS + 1):
         for dx in range(-_RADIUS, _RADIUS + 1):
             away = room[_RADIUS + dy : _RADIUS + dy + height, _RADIUS + dx : _RADIUS + dx + width] - middle
@@ -68,7 +79,8 @@ def normals_of(depth: Real, camera: Pinhole) -> Real:
     slope_x, slope_y = np.where(flat, slope_x, 0), np.where(flat, slope_y, 0)
     level = middle + (sq - slope_x * sx - slope_y * sy) * share
     (fx, fy), (cx, cy) = camera.focal_px.astype(np.float32), camera.centre_px.astype(np.float32)
-    y, x = (axis.astype(np.float32) for axis in np.indices(depth.shape))
+    y, x = (axis.astype(np.float32) for axis in np.indices(known.shape))
+    y += np.float32(begin)
     normal = np.stack([slope_x * fx, slope_y * fy, level + slope_x * (cx - x) + slope_y * (cy - y)], axis=-1)
     ray = np.stack([(x - cx) / fx, (y - cy) / fy, np.ones_like(x)], axis=-1)
     normal = np.where(flat[..., None], normal, ray)

@@ -8,6 +8,9 @@ import numpy as np
 
 from colmap_inertial.types import Array
 
+#: Rows of a picture that are worked on at once: what is made of them stays in the cache, and little memory is held.
+ROWS_AT_ONCE = 64
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Pinhole:

@@ -24,6 +24,7 @@ from colmap_inertial.types.estimated import (
     Verdict,
 )
 from colmap_inertial.types.imu_calibration import IMU_CAL, IMU_CALIBRATION_PARAMETERS, ImuCalibration
+from colmap_inertial.types.joined import Gap, JoinedPart
 from colmap_inertial.types.positions import HeightDatum, PositionFixes
 from colmap_inertial.types.recorded import (
     JOINT_GYRO_WALK_RAD_S_RTS,
@@ -62,10 +63,12 @@ __all__ = [
     "Frame",
     "FrameLog",
     "FrameTiming",
+    "Gap",
     "HeightDatum",
     "ImuCalibration",
     "ImuNoise",
     "ImuRecording",
+    "JoinedPart",
     "Keypoints",
     "LengthUnit",
     "PositionFixes",

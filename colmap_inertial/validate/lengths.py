@@ -57,6 +57,11 @@ class LengthCheck:
     directions: int
     proves: str
 
+    @property
+    def is_short(self) -> bool:
+        """Whether the lengths say little of the whole model."""
+        return self.longest_share is not None and self.longest_share < _SHORT
+
 
 def check_lengths(
     distances: Sequence[Distance], corners: Sequence[Corner], diagonal: float | None, to_metres: float

@@ -229,7 +229,7 @@ def _of_project(out: Path, index: int | None, given: tuple[Path, ...]) -> ViewSo
         gravity_on_axis=on_axis,
         images=(*given, *_image_folders(folder)),
         fused=_beside(out, chosen, single, "fused.ply"),
-        mesh=_beside(out, chosen, single, "meshed-poisson.ply"),
+        mesh=_beside(out, chosen, single, "meshed-tsdf.ply") or _beside(out, chosen, single, "meshed-poisson.ply"),
     )
 
 

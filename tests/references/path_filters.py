@@ -25,14 +25,21 @@ from colmap_inertial.types import Array
 
 
 def filter_reference(
-    light: NDArray[np.float32], tiling: Tiling, paths: NDArray[np.float32], noise: Noise, splitting: tuple[float, ...]
+    light: NDArray[np.float32],
+    tiling: Tiling,
+    paths: NDArray[np.float32],
+    spreads: NDArray[np.float32],
+    noise: Noise,
+    splitting: tuple[float, ...],
 ) -> Array:
     """(H, W) linear light without blur, each tile by itself."""
     window_out = np.outer(tiling.window_out(), tiling.window_out())
     total = np.zeros(tuple(map(len, tiling.sources())))
-    for tile, mean, path, frequencies, window, place in tiles(light, tiling, paths):
+    for (tile, mean, path, frequencies, window, place), spread in zip(
+        tiles(light, tiling, paths), spreads.reshape(-1, 3), strict=True
+    ):
         variance = max(noise.dark + noise.by_light * mean, LEAST_NOISE**2)
-        total[place] += window_out * (filter_tile(tile, path, frequencies, window, variance, splitting) + mean)
+        total[place] += window_out * (filter_tile(tile, path, spread, frequencies, window, variance, splitting) + mean)
     begin = tiling.before
     return total[begin : begin + tiling.height, begin : begin + tiling.width]
 
@@ -101,25 +108,34 @@ class Frequencies:
 def filter_tile(
     tile: Array,
     path: NDArray[Any],
+    spread: NDArray[Any],
     frequencies: Frequencies,
     window: Array,
     noise: float,
     splitting: tuple[float, ...],
 ) -> Array:
-    """A (T, T) tile without mean, already windowed, deblurred along an (S, 2) path; noise as a variance."""
+    """A (T, T) tile without mean, already windowed, deblurred along an (S, 2) path; noise as a variance.
+
+    ``spread`` is the covariance xx, xy, yy of the path's chord.
+    """
     spectrum = np.fft.rfft2(tile)
     transfer = transfer_of(path, frequencies)
-    power = np.abs(transfer) ** 2
+    doubt = doubt_of(path, spread, frequencies)
+    power = np.abs(transfer) ** 2 + doubt
     signal = signal_at_one(np.abs(spectrum) ** 2 / np.sum(window**2), power, frequencies, noise)
     prior = signal / (frequencies.square + FLAT_BELOW**2)
     wiener = np.conj(transfer) * prior / (power * prior + NOISE_FACTOR * noise) * spectrum
     sharp = np.fft.irfft2(wiener, tile.shape)
     weight = DATA_WEIGHT * 1e-4 / noise
-    data = weight * np.conj(transfer) * spectrum
+    # what the path is not known to do to the sharp picture adds to the noise of a frequency
+    certain = NOISE_FACTOR * noise / (NOISE_FACTOR * noise + doubt * prior)
+    data = weight * certain * np.conj(transfer) * spectrum
     for b in splitting:
         kept = [shrunk(np.roll(sharp, -1, axis) - sharp, b) for axis in (0, 1)]
         back = sum(np.roll(w, 1, axis) - w for axis, w in enumerate(kept))
-        found = (data + b * np.fft.rfft2(back)) / (weight * power + b * (frequencies.gradient + 1e-12))
+        found = (data + b * np.fft.rfft2(back)) / (
+            weight * certain * (power - doubt) + b * (frequencies.gradient + 1e-12)
+        )
         sharp = np.fft.irfft2(found, tile.shape)
     return sharp
 
@@ -134,6 +150,22 @@ def transfer_of(path: NDArray[Any], frequencies: Frequencies) -> NDArray[np.comp
     )
     along_x[-1] = along_y[len(along_y) // 2] = 0
     return along_y @ along_x.T / len(path)
+
+
+def doubt_of(path: NDArray[Any], spread: NDArray[Any], frequencies: Frequencies) -> Array:
+    """(T, T // 2 + 1) variance of the transfer of a path whose chord has the covariance xx, xy, yy, px^2.
+
+    An error w of the chord moves the path by ``s w``, s from -1/2 to 1/2 over the exposure, and the transfer by
+    ``2 pi i (f . w) mean(s exp(2 pi i f q))``.
+    """
+    since = (np.arange(len(path)) + 0.5) / len(path) - 0.5
+    along_x, along_y = (
+        np.exp(2j * np.pi * f[:, None] * path[:, k]) for k, f in enumerate((frequencies.x, frequencies.y))
+    )
+    along_x[-1] = along_y[len(along_y) // 2] = 0
+    lean = along_y @ (since * along_x).T / len(path)
+    x, y = frequencies.x, frequencies.y[:, None]
+    return 4 * np.pi**2 * (spread[0] * x**2 + 2 * spread[1] * x * y + spread[2] * y**2) * np.abs(lean) ** 2
 
 
 def signal_at_one(power_seen: Array, transfer: Array, frequencies: Frequencies, noise: float) -> float:

@@ -1,0 +1,163 @@
+"""A surface by a truncated signed distance function (Curless and Levoy, SIGGRAPH 1996), in Open3D.
+
+Depth maps are brought in one by one, so that memory grows with the surface and not with the pictures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from colmap_inertial.colmap.depth_maps import Maker, map_file
+from colmap_inertial.errors import InertialError, MissingExtraError, OutputError
+from colmap_inertial.io.images import read_image
+from colmap_inertial.io.names import path_in
+from colmap_inertial.model import read_model
+from colmap_inertial.model.depth_maps import Real, read_map
+from colmap_inertial.options import ReconstructOptions
+from colmap_inertial.types import Array
+
+if TYPE_CHECKING:
+    import pycolmap
+
+#: Which of the depths counts as near: what was filmed for its own sake, not what stands behind.
+_NEAR = 0.25
+#: Side of a voxel in pixels where it is near, and how far from the surface distances are kept, in voxels. On the
+#: example scene 2 to 3 px are alike; twice the truncation blunts it.
+VOXEL_PX, TRUNCATION_VOXELS = 2.5, 4.0
+#: What is so many times farther than what is near is coarser than the voxels: it would take most of the memory.
+FARTHEST = 3.0
+#: Surfaces that fewer pictures saw are left out.
+LEAST_SEEN = 3.0
+#: Voxels on a side of the blocks that memory comes in, blocks in the beginning, and the most of them: about 3 GB.
+_BLOCK, _BLOCKS, _MOST_BLOCKS = 8, 10_000, 400_000
+
+
+def require_mesh_maker(options: ReconstructOptions) -> None:
+    """Load Open3D where it is to make the mesh: what is missing is said before the work.
+
+    Raises
+    ------
+    MissingExtraError
+        Where it is not installed.
+    InertialError
+        Where it is, but a library of the system is missing.
+    """
+    if options.dense and options.dense_options.mesh == "tsdf":
+        _open3d()
+
+
+def _open3d() -> ModuleType:
+    try:
+        import open3d
+    except ModuleNotFoundError:
+        raise MissingExtraError("mesh", "dense_options.mesh tsdf is made by open3d") from None
+    except (ImportError, OSError) as error:
+        raise InertialError(
+            f"open3d cannot be loaded ({error}); on Debian: apt install libusb-1.0-0 libgl1 libgomp1 libx11-6, or take "
+            "--dense-options.mesh poisson"
+        ) from error
+    return open3d
+
+
+def tsdf_mesh(folder: Path, names: Sequence[str], target: Path, *, maker: Maker, kind: str) -> None:
+    """Write the surface of a workspace's depth maps as a coloured mesh (PLY).
+
+    Parameters
+    ----------
+    folder
+        The workspace, with ``images/``, ``sparse/`` and maps.
+    names
+        Of the pictures that have maps.
+    target
+        File to write.
+    maker, kind
+        Whose maps, and which of them: patch-match takes a pixel's ray at its corner, the sweep at its centre.
+
+    Raises
+    ------
+    MissingExtraError, InertialError
+        See :func:`require_mesh_maker`; where the surface is too large for its voxels.
+    OutputError
+        Where nothing was written.
+    """
+    o3d = _open3d()
+    core = o3d.core
+    model = read_model(folder / "sparse")
+    images = {image.name: image for image in (model.image(i) for i in model.reg_image_ids())}
+    files = {name: map_file(folder, "depth", name, kind) for name in names}
+    typical = [_typical(read_map(files[name]), model.camera(images[name].camera_id)) for name in names]
+    near_m, pixel_m = np.median(typical, axis=0)
+    voxel_m, far_m = VOXEL_PX * float(pixel_m), FARTHEST * float(near_m)
+    grid = o3d.t.geometry.VoxelBlockGrid(
+        attr_names=("tsdf", "weight", "color"),
+        attr_dtypes=(core.float32, core.uint16, core.uint16),
+        attr_channels=((1), (1), (3)),
+        voxel_size=voxel_m,
+        block_resolution=_BLOCK,
+        block_count=_BLOCKS,
+        device=core.Device("CPU:0"),
+    )
+    for name in sorted(names):
+        depth, image = read_map(files[name]), images[name]
+        depth = np.where(depth <= far_m, depth, np.float32(0))
+        if not depth.any():
+            continue
+        camera, cam_from_world = model.camera(image.camera_id), np.eye(4)
+        cam_from_world[:3] = image.cam_from_world().matrix()
+        seen = o3d.t.geometry.Image(np.ascontiguousarray(depth))
+        shown = o3d.t.geometry.Image(_colours(path_in(folder / "images", name)))
+        matrix, pose = core.Tensor(_matrix(camera.params, maker)), core.Tensor(cam_from_world)
+        limits = (1.0, far_m, TRUNCATION_VOXELS)
+        blocks = grid.compute_unique_block_coordinates(seen, matrix, pose, *limits)
+        grid.integrate(blocks, seen, shown, matrix, pose, *limits)
+        if grid.hashmap().size() > _MOST_BLOCKS:
+            raise InertialError(
+                f"{target}: the surface is too large for voxels of {1000 * voxel_m:.1f} mm; shrink the pictures "
+                "(--dense-options.max-image-size), or take --dense-options.mesh poisson"
+            )
+    mesh = _in_order(o3d, grid.extract_triangle_mesh(weight_threshold=LEAST_SEEN))
+    if not o3d.t.io.write_triangle_mesh(str(target), mesh) or not target.is_file():
+        raise OutputError(f"{target}: open3d wrote no mesh; is the disk full?")
+
+
+def _in_order(o3d: ModuleType, mesh: Any) -> Any:
+    """The mesh in single precision, its vertices and faces sorted: Open3D's threads leave them in any order."""
+    positions = mesh.vertex.positions.numpy().astype(np.float32)
+    order = np.lexsort(positions.T[::-1])
+    place = np.empty(len(order), dtype=np.int64)
+    place[order] = np.arange(len(order))
+    faces = place[mesh.triangle.indices.numpy()]
+    # the same vertex first, the same way round
+    first = np.argmin(faces, axis=1)[:, None]
+    faces = np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1)
+    faces = faces[np.lexsort(faces.T[::-1])]
+    tensor = o3d.core.Tensor
+    out = o3d.t.geometry.TriangleMesh(tensor(positions[order]), tensor(faces.astype(np.int32)))
+    out.vertex.normals = tensor(mesh.vertex.normals.numpy()[order].astype(np.float32))
+    out.vertex.colors = tensor(mesh.vertex.colors.numpy()[order])
+    return out
+
+
+def _typical(depth: Real, camera: pycolmap.Camera) -> tuple[float, float]:
+    """What is near in a map, and what a pixel covers there."""
+    known = depth[depth > 0]
+    near = float(np.quantile(known, _NEAR)) if len(known) else 0.0
+    return near, near / float(camera.mean_focal_length())
+
+
+def _matrix(params: Array, maker: Maker) -> Array:
+    """(3, 3) intrinsics. Open3D rounds down: the depth of a pixel holds for all of it, counted from its corner."""
+    fx, fy, cx, cy = params
+    aside = 0.0 if maker == "plane sweep" else 0.5
+    return np.array([[fx, 0, cx + aside], [0, fy, cy + aside], [0, 0, 1]])
+
+
+def _colours(path: Path) -> Real:
+    picture = read_image(path)
+    shares = picture.astype(np.float32) / np.float32(np.iinfo(picture.dtype).max)
+    return shares if shares.ndim == 3 else np.stack([shares] * 3, axis=2)

@@ -1,0 +1,255 @@
+"""Walks cut into two or three models by seconds without texture: how well the IMU brings them together again.
+
+    python scripts/study_join.py [--parts 2] [--gaps 1 2 4] [--seeds 1 2] [--spoil thrown] [--sigma-m .1] [--out F]
+    python scripts/study_join.py --recordings FOLDER [--begins 6 25]
+
+Points beside the way are tracked as features are (no pictures are rendered), and nothing is seen for some seconds.
+COLMAP's own bundle adjustment makes a model of each part, with its errors, in a world and units of its own; each gets
+its scale from a phone's IMU, and the stage joins them.
+
+Errors are those of the first image after a gap as seen from the last one before it (cm, degrees), with one standard
+deviation along the worst direction, and whether the error lies within the 95 % region of its covariance. ``--spoil``
+falsifies what cannot be joined: another recording's IMU within the gap, an IMU that was silent for half a second of it,
+a later part that moved elsewhere in between (the device thrown, or a part of another recording), a clock that jumps by
+half a second within the gap.
+
+``--recordings`` cuts real ones instead (a folder of InertialScale, as ``bench_scale.py`` takes it): two parts from so
+many seconds on, each fitted by itself; the truth is the path of the whole recording in its true scale.
+"""
+
+import argparse
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from bench_scale import recordings_in
+from study_refine import adjusted
+
+from colmap_inertial.geometry import matrix_from_quat, quat_exp, so3_log
+from colmap_inertial.io.calibration import calibration_prior
+from colmap_inertial.io.trajectories import read_inertial_scale
+from colmap_inertial.join.judge import Ends, ends_of, join_parts
+from colmap_inertial.join.links import find_links
+from colmap_inertial.join.solve import Placed
+from colmap_inertial.join.values import Part
+from colmap_inertial.model import Model
+from colmap_inertial.options import JoinOptions, ScaleOptions
+from colmap_inertial.scale.posterior import FittedPath
+from colmap_inertial.simulate.motion import MotionOptions
+from colmap_inertial.simulate.tracks import TrackOptions, Tracks, simulate_tracks
+from colmap_inertial.stages.join import JoinStage
+from colmap_inertial.stages.metric import MetricStage
+from colmap_inertial.types import ImuRecording
+
+#: Seconds of each part; 95 % quantile of chi-square with three degrees of freedom.
+PART_S, CHI2_95 = 12.0, 7.815
+
+
+def walk(seconds: float) -> TrackOptions:
+    """A walk with a phone."""
+    motion = MotionOptions(kind="walk", duration_s=seconds, speed_m_s=1.0, vigour=0.6, look_deg=40.0)
+    return TrackOptions(motion=motion, vibration_m_s2=0.3, points_per_m=60.0)
+
+
+def part_of(tracks: Tracks, begin_s: float, end_s: float, rng: np.random.Generator) -> pycolmap.Reconstruction:
+    """COLMAP's model of a part of a walk, in a world and units of its own."""
+    model = tracks.reconstruction()
+    for image_id, t_s in enumerate(tracks.timing.pose_t_s().tolist(), start=1):
+        if not begin_s <= t_s <= end_s:
+            model.deregister_frame(model.image(image_id).frame_id)
+    for point_id in list(model.point3D_ids()):
+        if model.points3D[point_id].track.length() < 3:
+            model.delete_point3D(point_id)
+    model = adjusted(model)
+    turn = pycolmap.Rotation3d(quat_exp(rng.standard_normal(3)))
+    model.transform(pycolmap.Sim3d(float(rng.uniform(0.3, 3.0)), turn, rng.standard_normal(3)))
+    return model
+
+
+def spoiled(imu: ImuRecording, how: str, spans: list[tuple[float, float]], offset_s: float, seed: int) -> ImuRecording:
+    """The recording, or what is false of it between the first two parts."""
+    begin_s, end_s = spans[0][1] - offset_s, spans[1][0] - offset_s
+    inside = [(t_s > begin_s) & (t_s < end_s) for t_s in (imu.gyro_t_s, imu.accel_t_s)]
+    if how == "other":
+        other = simulate_tracks(walk(spans[-1][1]), seed=seed + 1000).imu
+        values = []
+        for mine, t_s, theirs_s, theirs, own in (
+            (inside[0], imu.gyro_t_s, other.gyro_t_s, other.gyro_rad_s, imu.gyro_rad_s),
+            (inside[1], imu.accel_t_s, other.accel_t_s, other.accel_m_s2, imu.accel_m_s2),
+        ):
+            values.append(own.copy())
+            shifted_s = t_s[mine] - t_s[0] + theirs_s[0]
+            values[-1][mine] = np.stack([np.interp(shifted_s, theirs_s, theirs[:, k]) for k in range(3)], axis=1)
+        return replace(imu, gyro_rad_s=values[0], accel_m_s2=values[1])
+    if how == "silent":
+        kept = [
+            ~(t & (s > begin_s + 0.25) & (s < begin_s + 0.75))
+            for t, s in zip(inside, (imu.gyro_t_s, imu.accel_t_s), strict=True)
+        ]
+        return replace(
+            imu,
+            gyro_t_s=imu.gyro_t_s[kept[0]],
+            gyro_rad_s=imu.gyro_rad_s[kept[0]],
+            accel_t_s=imu.accel_t_s[kept[1]],
+            accel_m_s2=imu.accel_m_s2[kept[1]],
+        )
+    if how == "clock":
+        middle_s = 0.5 * (begin_s + end_s)
+        later = [t_s + 0.5 * (t_s > middle_s) for t_s in (imu.gyro_t_s, imu.accel_t_s)]
+        return replace(imu, gyro_t_s=later[0], accel_t_s=later[1])
+    if how == "thrown":  # an impact that the sensor does not follow: 2 m/s are gone
+        late = inside[1] & (imu.accel_t_s > end_s - 0.1)
+        values = imu.accel_m_s2.copy()
+        values[late] += np.array([20.0, 0.0, 0.0])
+        return replace(imu, accel_m_s2=values)
+    return imu
+
+
+def judged(
+    fitted: list[Part],
+    imu: ImuRecording,
+    limits: JoinOptions,
+    truth: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
+) -> list[dict[str, Any]]:
+    """The gaps between parts, and errors across them; the truth is (N, 3, 3) world_from_cam and (N, 3) by times."""
+    joined = join_parts(fitted, imu, limits)
+    out: list[dict[str, Any]] = []
+    for gap in joined.gaps:
+        one: dict[str, Any] = {"joined": gap.joined, "reason": gap.reason}
+        one |= {"sigma_m": gap.sigma_m, "sigma_deg": gap.sigma_deg, "chi2": gap.chi2, "dof": gap.dof}
+        out.append(one)
+        for group in joined.groups:
+            members = [fitted[k] for k in group.parts]
+            for link in find_links(members):
+                if (members[link.first].number, members[link.second].number) == (gap.first, gap.second):
+                    one |= error_across(members, group.placed, ends_of(members, link), truth)
+    return out
+
+
+def error_across(
+    parts: list[Part], placed: Placed, ends: Ends, truth: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+) -> dict[str, Any]:
+    """Of the first image after a gap as seen from the last one before it."""
+    poses = []
+    for k, image in zip(ends.pair, ends.images, strict=True):
+        place, part = placed.placements[k], parts[k]
+        at = place.points(part.trajectory.cam_in_world[image : image + 1])[0]
+        poses.append((place.rotation @ part.world_from_cam[image], at, float(part.trajectory.t_s[image])))
+    true, centres = truth(np.array([pose[2] for pose in poses]))
+    turn = poses[0][0].T @ poses[1][0] @ (true[0].T @ true[1]).T
+    away = poses[0][0].T @ (poses[1][1] - poses[0][1]) - true[0].T @ (centres[1] - centres[0])
+    error = np.concatenate([poses[0][0] @ so3_log(turn), poses[0][0] @ away])
+    cov = ends.cov(parts, placed)
+    inside = [
+        bool(error[part] @ np.linalg.solve(cov[part, part], error[part]) < CHI2_95)
+        for part in (slice(3, 6), slice(0, 3))
+    ]
+    return {
+        "error_m": float(np.linalg.norm(error[3:])),
+        "error_deg": float(np.degrees(np.linalg.norm(error[:3]))),
+        "inside_m": inside[0],
+        "inside_deg": inside[1],
+    }
+
+
+def cut_recording(folder: Path, begin_s: float, gap_s: float, limits: JoinOptions) -> list[dict[str, Any]]:
+    """Two parts of a real recording."""
+    path, imu = read_inertial_scale(folder)
+    metres = float((folder / "groundtruth.txt").read_text())
+    fitted = []
+    for k in range(2):
+        first_s = path.t_s[0] + begin_s + k * (PART_S + gap_s)
+        part = path.select((path.t_s >= first_s) & (path.t_s <= first_s + PART_S))
+        fitted.append(Part(number=k, trajectory=part, path=FittedPath.of(part, imu, None, ScaleOptions())))
+
+    def truth(t_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        at = np.searchsorted(path.t_s, t_s - 1e-6)
+        return matrix_from_quat(path.cam_from_world_xyzw[at]).transpose(0, 2, 1), metres * path.cam_in_world[at]
+
+    out = judged(fitted, imu, limits, truth)
+    for one in out:
+        one |= {"seed": f"{folder.name} from {begin_s:g} s", "gap_s": gap_s}
+    return out
+
+
+def studied(parts: int, gap_s: float, seed: int, spoil: str, limits: JoinOptions) -> list[dict[str, Any]]:
+    """One walk, its gaps."""
+    spans = [(k * (PART_S + gap_s), k * (PART_S + gap_s) + PART_S) for k in range(parts)]
+    tracks, rng = simulate_tracks(walk(spans[-1][1] + 0.3), seed=seed), np.random.default_rng(seed)
+    imu = spoiled(tracks.imu, spoil, spans, tracks.calibration.gyro_time_offset_s, seed)
+    prior = calibration_prior()
+    metric = MetricStage(imu=imu, calibration=prior)
+    models = []
+    for k, (begin_s, end_s) in enumerate(spans):
+        model = part_of(tracks, begin_s, end_s, rng)
+        models.append(metric(Model(reconstruction=model, colmap_index=k, timing=tracks.timing)))
+    stage = JoinStage(imu=imu, calibration=prior, limits=limits)
+    usable = [model for model in models if model.similarity is not None]
+    fitted = [stage.part(model) for model in usable]
+
+    def truth(t_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        state = tracks.motion.at(t_s)
+        return matrix_from_quat(state.world_from_cam_xyzw), state.cam_in_world_m
+
+    out = judged(fitted, imu, limits, truth)
+    for one in out:
+        one |= {"seed": seed, "gap_s": gap_s}
+    if len(usable) < len(models):
+        refused = [model.colmap_index for model in models if model.similarity is None]
+        out.append({"seed": seed, "gap_s": gap_s, "joined": False, "reason": f"scale of {refused} refused"})
+    return out
+
+
+def main() -> None:
+    pycolmap.logging.minloglevel = 3
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--parts", type=int, default=2)
+    parser.add_argument("--gaps", type=float, nargs="+", default=[1.0, 2.0, 4.0])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--spoil", choices=("", "other", "silent", "thrown", "clock"), default="")
+    parser.add_argument("--sigma-m", type=float, default=JoinOptions.sigma_m)
+    parser.add_argument("--sigma-deg", type=float, default=JoinOptions.sigma_deg)
+    parser.add_argument("--recordings", type=Path)
+    parser.add_argument("--begins", type=float, nargs="+", default=[6.0, 25.0])
+    parser.add_argument("--out", type=Path)
+    asked = parser.parse_args()
+    limits, results = JoinOptions(sigma_m=asked.sigma_m, sigma_deg=asked.sigma_deg), []
+    for gap_s in asked.gaps:
+        if asked.recordings is None:
+            walks = (studied(asked.parts, gap_s, seed, asked.spoil, limits) for seed in asked.seeds)
+        else:
+            folders = recordings_in(asked.recordings)
+            walks = (cut_recording(folder, begin, gap_s, limits) for folder in folders for begin in asked.begins)
+        for walk_gaps in walks:
+            for one in walk_gaps:
+                results.append(one)
+                found = ""
+                if "error_m" in one:
+                    found = (
+                        f"error {100 * one['error_m']:.1f} cm {one['error_deg']:.2f} deg, inside {one['inside_m']} "
+                        f"{one['inside_deg']}; "
+                    )
+                if one.get("sigma_m") is not None:
+                    found += f"sigma {100 * one['sigma_m']:.1f} cm {one['sigma_deg']:.2f} deg, chi2 {one['chi2']:.1f}; "
+                print(f"{gap_s:g} s, {one['seed']}: {found}{one['reason']}", flush=True)
+                if asked.out is not None:
+                    asked.out.write_text(json.dumps(results, indent=1))
+        of_gap = [one for one in results if one["gap_s"] == gap_s]
+        told = [one for one in of_gap if "error_m" in one]
+        line = f"{gap_s:g} s: {sum(one['joined'] for one in of_gap)} of {len(of_gap)} joined"
+        if told:
+            median = [float(np.median([one[name] for one in told])) for name in ("error_m", "error_deg")]
+            inside = [sum(one[name] for one in told) for name in ("inside_m", "inside_deg")]
+            line += (
+                f"; median error {100 * median[0]:.1f} cm {median[1]:.2f} deg; within the 95 % region {inside[0]} and "
+                f"{inside[1]} of {len(told)}"
+            )
+        print(line, flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,108 @@
+"""Parts that must stay apart: poses, motion or mounting of which contradict each other."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from refine_walk import walk
+
+from colmap_inertial.geometry import matrix_from_quat, quat_conjugate, quat_exp, quat_multiply, quat_rotate
+from colmap_inertial.io.calibration import calibration_prior
+from colmap_inertial.join.judge import ends_of, join_parts, worst
+from colmap_inertial.join.links import find_links
+from colmap_inertial.join.values import Part
+from colmap_inertial.options import JoinOptions, ScaleOptions
+from colmap_inertial.scale.posterior import FittedPath
+from colmap_inertial.simulate.tracks import simulate_tracks
+from colmap_inertial.stages.join import _sigma_log
+from colmap_inertial.types import CameraTrajectory
+
+LIMITS = JoinOptions()
+T_S = 0.3 + np.arange(29 * 15) / 15
+
+
+@pytest.fixture(scope="module")
+def walked():
+    """A walk of 30 m with a phone, hardly anything seen of it."""
+    return simulate_tracks(walk(30.0, points_per_m=2.0, vibration_m_s2=0.2), seed=3)
+
+
+def part_of(tracks, t_s, number, *, shifted=None, shift_m=(0.0, 0.0, 0.0), mounted_m=(0.0, 0.0, 0.0)):
+    """The true poses with a little noise in a world of its own, some of them shifted; the camera mounted elsewhere."""
+    rng = np.random.default_rng(number)
+    state = tracks.motion.at(t_s)
+    centre = state.cam_in_world_m + matrix_from_quat(state.world_from_cam_xyzw) @ np.array(mounted_m)
+    if shifted is not None:
+        centre[shifted] += shift_m
+    cam_from_world = quat_conjugate(np.asarray(state.world_from_cam_xyzw))
+    cam_from_world = quat_multiply(quat_exp(5e-4 * rng.standard_normal((len(t_s), 3))), cam_from_world)
+    turn = quat_exp(rng.standard_normal(3))
+    path = CameraTrajectory(
+        names=tuple(f"{t:.4f}" for t in t_s),
+        t_s=t_s,
+        cam_from_world_xyzw=quat_multiply(cam_from_world, quat_conjugate(turn)),
+        cam_in_world=quat_rotate(turn, centre + 2e-3 * rng.standard_normal((len(t_s), 3))),
+        epoch_ns=tracks.timing.epoch_ns,
+        length_unit="m",
+    )
+    fitted = FittedPath.of(path, tracks.imu, calibration_prior(), ScaleOptions())
+    return Part(number=number, trajectory=path, path=fitted)
+
+
+@pytest.fixture(scope="module")
+def inside(walked):
+    """What lies in the hole of another part."""
+    return part_of(walked, T_S[(T_S > 10) & (T_S < 18)], 1)
+
+
+@pytest.mark.parametrize("shift_m", [0.0, 0.3])
+def test_a_part_in_a_hole_is_held_to_the_poses_on_both_sides(walked, inside, shift_m):
+    t_s = np.concatenate([T_S[T_S < 9], T_S[T_S > 19]])
+    around = part_of(walked, t_s, 0, shifted=t_s > 15, shift_m=(shift_m, 0, 0))
+    joined = join_parts([around, inside], walked.imu, LIMITS)
+    (gap,) = joined.gaps
+    assert 1.0 < gap.seconds < 1.2
+    assert gap.joined == (shift_m == 0)
+    if shift_m:
+        assert "the poses before and after it contradict" in gap.reason
+    else:
+        (group,) = joined.groups
+        parts = [around, inside]
+        sigmas = [worst(ends_of(parts, link).cov(parts, group.placed))[0] for link in find_links(parts)]
+        assert gap.sigma_m == pytest.approx(max(sigmas))
+
+
+@pytest.mark.parametrize("shift_m", [0.0, 1.0])
+def test_parts_that_two_by_two_agree_are_joined_only_where_all_agree(walked, inside, shift_m):
+    t_s = np.concatenate([T_S[(T_S > 3.5) & (T_S < 8.5)], T_S[T_S > 19]])
+    last = part_of(walked, t_s, 2, shifted=t_s < 10, shift_m=(shift_m, 0, 0))
+    parts = [part_of(walked, T_S[T_S < 9], 0), inside, last]
+    joined = join_parts(parts, walked.imu, LIMITS)
+    assert [group.parts for group in joined.groups] == ([(0, 1, 2)] if not shift_m else [(0, 2)])
+
+
+def test_an_error_of_the_imu_within_the_gap_does_not_become_one_of_the_scale(walked):
+    parts = [part_of(walked, T_S[T_S < 8], 0), part_of(walked, T_S[(T_S > 9) & (T_S < 13.5)], 1)]
+    ends = [parts[0].path.stamps_s(np.array([len(parts[0].path.nodes_s) - 1])), parts[1].path.stamps_s(np.array([0]))]
+    middle_s = 0.5 * float(ends[0][0] + ends[1][0])
+    for wrong in (0.3, -0.3):
+        forces = walked.imu.accel_m_s2.copy()
+        forces[np.abs(walked.imu.accel_t_s - middle_s) < 0.2] += [wrong, 0, 0]
+        (gap,) = join_parts(parts, replace(walked.imu, accel_m_s2=forces), LIMITS).gaps
+        assert not gap.joined and "contradicts the motion" in gap.reason
+
+
+@pytest.mark.parametrize("mounted_m", [0.0, 0.11])
+def test_two_cameras_are_not_one_device(walked, mounted_m):
+    first = part_of(walked, T_S[T_S < 8.5], 0)
+    other = part_of(walked, T_S[(T_S > 9.5) & (T_S < 17)], 1, mounted_m=(mounted_m, 0, 0))
+    (gap,) = join_parts([first, other], walked.imu, LIMITS).gaps
+    assert gap.joined == (mounted_m == 0)
+    assert gap.joined or "is mounted to the IMU otherwise" in gap.reason
+
+
+def test_ties_that_are_off_never_widen_a_scale_beyond_its_own():
+    scale, part = SimpleNamespace(sigma_log=0.01), SimpleNamespace(path=SimpleNamespace(scale=(1.0, 6e-5)))
+    assert _sigma_log(scale, part, 1e-3) == pytest.approx(0.01)
+    assert _sigma_log(scale, part, 2e-5) == pytest.approx(6e-5**0.5)
