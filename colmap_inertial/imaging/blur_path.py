@@ -56,7 +56,7 @@ class BlurPath:
 
     @classmethod
     def straight(cls, lines: BlurField) -> BlurPath:
-        """Along the centred lines of a lines."""
+        """Along the centred lines of a field."""
         samples = samples_for(float(lines.extent_px().max(initial=0)))
         path = (middles(samples)[:, None, None, None] * lines.vector_px).astype(np.float32)
         return cls(width=lines.width, height=lines.height, step_px=lines.step_px, path_px=path, cov_px2=lines.cov_px2)
