@@ -49,6 +49,30 @@ class FlowOptions:
             raise ValueError("long_side_px must be 64 or more, min_support 8 or more, corners at least min_support")
 
 
+#: Corners of a pair of frames that are kept.
+_MOST_TRACKS = 80
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Tracks:
+    """Some of the corners that were seen in two frames: 80 at most, strong and weak ones alike.
+
+    Attributes
+    ----------
+    place
+        (N, 2, 2) where in the first and the second picture: down and across, as shares of the picture from its middle.
+    rays
+        (N, 2, 2) their rays, z = 1.
+    """
+
+    place: Array
+    rays: Array
+
+
+#: What a pair of frames shows that shares too little.
+_NO_TRACKS = Tracks(place=np.zeros((0, 2, 2)), rays=np.zeros((0, 2, 2)))
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class VisualRotation:
     """Rotations between consecutive frames.
@@ -65,6 +89,8 @@ class VisualRotation:
         (F - 1,) standard deviation of each by the scatter of its tracks; the camera's translation adds to it.
     support
         (F - 1,) tracks that agree.
+    tracks
+        (F - 1) what was followed in each pair; empty where pictures were not followed.
     """
 
     names: tuple[str, ...]
@@ -72,6 +98,7 @@ class VisualRotation:
     turn_rad: Array
     sigma_rad: Array
     support: NDArray[np.intp]
+    tracks: tuple[Tracks, ...] = ()
     epoch_ns: int = 0
 
     @property
@@ -132,6 +159,7 @@ def measure_rotation(
     turns: list[Array] = []
     sigmas: list[float] = []
     support: list[int] = []
+    tracks: list[Tracks] = []
     before: tuple[Grey, FrameShutter] | None = None
     for frame in frames:
         height, width = frame.image.shape[:2]
@@ -142,6 +170,7 @@ def measure_rotation(
             turns.append(np.full(3, np.nan) if pair is None else pair[0])
             sigmas.append(np.nan if pair is None else pair[1])
             support.append(0 if pair is None else pair[2])
+            tracks.append(_NO_TRACKS if pair is None else pair[3])
         names.append(frame.name)
         before = now
     return VisualRotation(
@@ -150,6 +179,7 @@ def measure_rotation(
         turn_rad=np.array(turns).reshape(-1, 3),
         sigma_rad=np.array(sigmas),
         support=np.array(support, dtype=np.intp),
+        tracks=tuple(tracks),
         epoch_ns=timing.epoch_ns,
     )
 
@@ -328,8 +358,8 @@ def reduced(image: NDArray[np.uint8] | NDArray[np.uint16], options: FlowOptions)
 
 def _pair_rotation(
     before: tuple[Grey, FrameShutter], now: tuple[Grey, FrameShutter], camera: Projector, options: FlowOptions
-) -> tuple[Array, float, int] | None:
-    """Rotation vector of ``before_from_now``, its standard deviation, and how many tracks agree."""
+) -> tuple[Array, float, int, Tracks] | None:
+    """Rotation vector of ``before_from_now``, its standard deviation, how many tracks agree, and all of them."""
     shutters = before[1], now[1]
     dt_s = shutters[1].reference_s() - shutters[0].reference_s()
     height, width = now[0].shape
@@ -352,7 +382,11 @@ def _pair_rotation(
         found = _fit_rate(first, second, span_s, pixel_rad)
         if found is not None and found[2] >= options.min_support:
             rate, sigma_rad_s, count = found
-            return rate * dt_s, sigma_rad_s * abs(dt_s), count
+            size = np.array([shutters[1].width, shutters[1].height])
+            place = np.stack([(p[ok] / size - 0.5)[:, ::-1] for p in points], axis=1)
+            some = np.unique(np.linspace(0, len(place) - 1, min(len(place), _MOST_TRACKS)).astype(np.intp))
+            tracks = Tracks(place=place[some], rays=np.stack([first[some, :2], second[some, :2]], axis=1))
+            return rate * dt_s, sigma_rad_s * abs(dt_s), count, tracks
     return None
 
 

@@ -103,6 +103,11 @@ class Georeference:
     source: str = ""
     notes: tuple[str, ...] = ()
 
+    def __post_init__(self) -> None:
+        at = (self.latitude_deg, self.longitude_deg, self.height_m)
+        if not (np.isfinite(at).all() and abs(at[0]) <= 90 and abs(at[1]) <= 360):
+            raise ValueError(f"latitude, longitude and height of {at} are no place on Earth")
+
     @property
     def heading_sigma_deg(self) -> float:
         """Standard deviation of the turn about the vertical."""

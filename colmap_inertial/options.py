@@ -117,7 +117,8 @@ class ScaleOptions(GravityOptions):
     """How the scale is estimated."""
 
     method: Literal["joint", "spectral"] = "joint"
-    """joint fits all measurements at once, video or keyframes; spectral is the thesis method, for video."""
+    """joint fits all measurements at once, video or keyframes; spectral compares spectra of accelerations, for
+    video."""
 
     max_offset_s: float | None = None
     """Largest offset between the clocks of camera and IMU; 1 for a shared clock. Without it, all are searched."""
@@ -133,9 +134,9 @@ class JoinOptions:
     """Up to where separate models are joined by the IMU: standard deviations, along the worst direction."""
 
     sigma_m: float = 0.1
-    """Of the position after a gap as seen from before it (m)."""
+    """Largest standard deviation of the position after a gap, as seen from before it (m)."""
     sigma_deg: float = 1.0
-    """Of the direction."""
+    """Largest one of the direction (degrees)."""
 
     def __post_init__(self) -> None:
         for f in fields(self):
@@ -321,9 +322,9 @@ class ReconstructOptions:
     """How COLMAP builds the model."""
     scale: ScaleOptions = field(default_factory=ScaleOptions)
     """How metres come from the IMU."""
-    join: JoinMethod = "off"
+    join: JoinMethod = "inertial"
     """inertial: where COLMAP made several models of one recording, bring those into one that what the IMU felt between
-    them places surely enough."""
+    them places surely enough; off: each stays by itself."""
     join_options: JoinOptions = field(default_factory=JoinOptions)
     """Up to where they are joined."""
     refine: RefineMethod = "off"

@@ -40,7 +40,6 @@ from colmap_inertial.model import read_model
 from colmap_inertial.model.depth_maps import read_map
 from colmap_inertial.run.workspace import Workspace
 from colmap_inertial.simulate import (
-    Renderer,
     Scene,
     SceneRecipe,
     ShutterCamera,
@@ -115,7 +114,7 @@ def recipe_of(scene: str) -> SceneRecipe:
 def truth_of(folder: Path, recipe: SceneRecipe, truth_file: Path) -> Truth:
     """Of a dense workspace of a simulated capture."""
     scene, truth = make_scene(recipe), read_truth(truth_file)
-    renderer = Renderer(scene.world())
+    renderer = scene.renderer()
     model = read_model(folder / "sparse")
     images = sorted((model.image(i) for i in model.reg_image_ids()), key=lambda image: image.name)
     names = tuple(image.name for image in images)
@@ -285,7 +284,7 @@ def render(model: pycolmap.Reconstruction, recipe: SceneRecipe, capture: Path, f
     import cv2
 
     scene = make_scene(recipe)
-    renderer, index = Renderer(scene.world()), {name: i for i, name in enumerate(scene.names)}
+    renderer, index = scene.renderer(), {name: i for i, name in enumerate(scene.names)}
     (folder / "images").mkdir(parents=True)
     for camera in model.cameras.values():
         camera.rescale(width / camera.width)

@@ -61,7 +61,7 @@ from colmap_inertial.drivers.fuse_apertures import fuse_captured
 from colmap_inertial.multi_aperture import _volume as volume, estimate_disparity, fuse_apertures, fuse_with, plane_of
 from colmap_inertial.multi_aperture.disparity import Disparity
 from colmap_inertial.options import ApertureOptions, FuseAperturesOptions
-from colmap_inertial.simulate import MotionOptions, Renderer, SceneRecipe, ShutterCamera, make_scene
+from colmap_inertial.simulate import MotionOptions, SceneRecipe, ShutterCamera, make_scene
 from colmap_inertial.simulate.aperture_array import write_aperture_capture
 from colmap_inertial.types import Aperture, ApertureRig, CameraModel
 
@@ -321,7 +321,7 @@ def bench_simulated(work: Path) -> dict[str, Any]:
         "direct": mapped(unfused, recipe, work),
     }
     scene = make_scene(replace(recipe, rig={}))
-    renderer = Renderer(scene.world())
+    renderer = scene.renderer()
     errors, measured, gains = [], [], []
     for i, path in enumerate(pictures):
         depth = np.load(fused / "depth" / f"{path.name}.npy")

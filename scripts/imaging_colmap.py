@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -22,8 +23,11 @@ from colmap_inertial.model import colmap_camera, read_model
 from colmap_inertial.options import ReconstructOptions
 from colmap_inertial.precalibrate import plan
 from colmap_inertial.simulate import MotionOptions, SceneRecipe, make_scene, read_truth, write_capture
+from colmap_inertial.stages.deblur import MOST_SMOOTHING_PX, SMOOTHING, DeblurStage
 from colmap_inertial.types import Array, CameraTrajectory, FrameTiming
 
+#: Share of the blur at which any blur is smoothed alike.
+_OF_ANY_BLUR = 1e9
 WAYS = {
     "as filmed": ReconstructOptions(deblur="off", rolling_shutter="off"),
     "rectified": ReconstructOptions(deblur="off", rolling_shutter="rectify"),
@@ -95,24 +99,25 @@ def reconstructed(
         folder = Path(name)
         capture = write_capture(recipe, folder / "capture", workers=2)
         truth = read_truth(folder / "capture" / "truth.json").trajectory
+        # the same options with another smoothing go on from the same plan
+        out = {way: folder / str([*ways.values()].index(options)) for way, options in ways.items()}
         return {
             "images": len(truth.names),
             "blur_px": blur_px,
             "exposure_s": recipe.camera.exposure_s,
             "readout_s": recipe.camera.readout_s,
-            "ways": {
-                way: _run(capture, folder / str(i), options, truth, widths_px.get(way, plan.SMOOTHING_PX))
-                for i, (way, options) in enumerate(ways.items())
-            },
+            "ways": {way: _run(capture, out[way], options, truth, widths_px.get(way)) for way, options in ways.items()},
         }
 
 
 def _run(
-    capture: Path, out: Path, options: ReconstructOptions, truth: CameraTrajectory, width_px: float
+    capture: Path, out: Path, options: ReconstructOptions, truth: CameraTrajectory, width_px: float | None
 ) -> dict[str, Any]:
-    """Of the largest model, as it is handed on."""
+    """Of the largest model, as it is handed on; ``width_px``: smoothing of any blur, in place of the package's."""
+    share, most_px = (SMOOTHING, MOST_SMOOTHING_PX) if width_px is None else (_OF_ANY_BLUR, width_px)
+    stage = partial(DeblurStage, most_smoothing_px=most_px)
     try:
-        with patch.object(plan, "SMOOTHING_PX", width_px):
+        with patch.object(plan, "SMOOTHING", share), patch.object(plan, "DeblurStage", stage):
             result = reconstruct(capture, out, options)
     except MappingError:
         return {"registered": 0, "points": 0, "centre_error_pct": float("nan"), "rotation_deg": float("nan")}

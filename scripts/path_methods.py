@@ -23,10 +23,9 @@ from colmap_inertial.imaging.path_filters import half_quadratic, path_wiener, sm
 from colmap_inertial.imaging.psf import blur_field, blur_path
 from colmap_inertial.imaging.wiener import DeblurOptions, deblur
 from colmap_inertial.restoration import Network, deepgyro, load_network
+from colmap_inertial.stages.deblur import MOST_SMOOTHING_PX, smoothing_for
 from colmap_inertial.types import Projector
 
-#: For features, of what comes out of a filter.
-SMOOTHED_PX = 1.2
 #: Costs are measured at these blurs, px, of a frame of this size.
 COSTS_PX, COST_SIZE = (10.0, 20.0, 40.0), (1920, 1080)
 #: Frames of 1920 px with less blur are left alone; one of which more stays as it was is not smoothed (`DeblurStage`).
@@ -44,8 +43,12 @@ class Made:
     for_people: Grey
 
 
-def _both(image: Grey) -> Made:
-    return Made(for_features=smoothed(image, SMOOTHED_PX), for_people=image)
+def _both(image: Grey, blur: BlurField) -> Made:
+    return Made(for_features=smoothed(image, _width_px(blur)), for_people=image)
+
+
+def _width_px(blur: BlurField) -> float:
+    return smoothing_for(float(np.percentile(blur.extent_px(), 90)))
 
 
 @cache
@@ -53,8 +56,8 @@ def _network() -> Network:
     return load_network("deepgyro", device="cpu", threads=1)
 
 
-def _smoothed_alone(image: Grey, *_: object) -> Made:
-    return _both(image)
+def _smoothed_alone(image: Grey, motion: GyroCamera, camera: Projector, shutter: FrameShutter) -> Made:
+    return _both(image, blur_field(motion, camera, shutter))
 
 
 def _straight(image: Grey, motion: GyroCamera, camera: Projector, shutter: FrameShutter) -> Made:
@@ -63,19 +66,23 @@ def _straight(image: Grey, motion: GyroCamera, camera: Projector, shutter: Frame
 
 
 def _straight_smoothed(image: Grey, motion: GyroCamera, camera: Projector, shutter: FrameShutter) -> Made:
-    return _both(deblur(image, blur_field(motion, camera, shutter), _ONE))
+    blur = blur_field(motion, camera, shutter)
+    return _both(deblur(image, blur, _ONE), blur)
 
 
 def _wiener(image: Grey, motion: GyroCamera, camera: Projector, shutter: FrameShutter) -> Made:
-    return _both(path_wiener(image, blur_path(motion, camera, shutter), _ONE))
+    path = blur_path(motion, camera, shutter)
+    return _both(path_wiener(image, path, _ONE), path.field())
 
 
 def _path(image: Grey, motion: GyroCamera, camera: Projector, shutter: FrameShutter) -> Made:
-    return _both(half_quadratic(image, blur_path(motion, camera, shutter), _ONE))
+    path = blur_path(motion, camera, shutter)
+    return _both(half_quadratic(image, path, _ONE), path.field())
 
 
 def _deepgyro(image: Grey, motion: GyroCamera, camera: Projector, shutter: FrameShutter) -> Made:
-    return _both(deepgyro.deblur(image, blur_field(motion, camera, shutter), network=_network()))
+    blur = blur_field(motion, camera, shutter)
+    return _both(deepgyro.deblur(image, blur, network=_network()), blur)
 
 
 #: ``straight`` is the filter along straight lines as it was, ``untreated, smoothed`` the frame without any filter.
@@ -152,7 +159,7 @@ def _gated(image: Grey, known: Known, verdict: RecordingVerdict) -> Grey | None:
         return None
     scaled = field.times(factor)
     out, kept = keep_sharp(image, path_wiener(image, blur_path(*known, extent_factor=factor), _ONE), scaled)
-    return smoothed(out, SMOOTHED_PX) if kept < MOSTLY_KEPT else out
+    return smoothed(out, _width_px(scaled)) if kept < MOSTLY_KEPT else out
 
 
 # --- cost -------------------------------------------------------------------------------------------------------------
@@ -174,7 +181,7 @@ def cost(take: Take, methods: Sequence[str], repeat: int = 5) -> dict[str, Any]:
             "path": lambda image=image, path=path: half_quadratic(image, path, _ONE),
             "deepgyro": lambda image=image, field=field: deepgyro.deblur(image, field, network=_network()),
         }
-        ms = {"smoothing": _least_ms(lambda image=image: smoothed(image, SMOOTHED_PX), repeat)}
+        ms = {"smoothing": _least_ms(lambda image=image: smoothed(image, MOST_SMOOTHING_PX), repeat)}
         ms |= {name: _least_ms(work, repeat) for name, work in works.items() if name in ("straight", *methods)}
         ms["finding the path"] = _least_ms(lambda known=known: blur_path(*known), repeat)
         out[f"{wanted_px:g}"] = {

@@ -28,7 +28,7 @@ from bench_scale import Window
 
 from colmap_inertial.align import align_camera_imu
 from colmap_inertial.errors import NotObservableError
-from colmap_inertial.scale import _factors, _noise, _setup, joint, priors
+from colmap_inertial.scale import _factors, _noise, _parameters, _setup, joint, priors
 from colmap_inertial.scale.priors import PRIORS
 from colmap_inertial.threads import one_blas_thread
 from colmap_inertial.types import Array, CameraImuCalibration
@@ -42,7 +42,7 @@ _PRIVATE = {
     "_setup._NEAR_M": _setup,
     "_setup._FAR_M": _setup,
     "joint._UNMODELLED_S": joint,
-    "_factors.CORRELATION_S": _factors,
+    "_parameters.DRIFT_S": _parameters,
     "_noise._LARGEST_CORRELATION": _noise,
     "_factors.ROBUST_SIGMAS": _factors,
 }

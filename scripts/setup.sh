@@ -3,7 +3,8 @@
 # where it may; otherwise it says what is missing.
 #   setup.sh [EXTRA ...]    extras of pyproject.toml to install along: dev for the tests, view, ros, ... (default: none)
 # Running it again is quick; after a change of pyproject.toml or of the C++ sources, or with another extra, it installs
-# again, those of earlier times included.
+# again, those of earlier times included. What pip is told by its own variables holds (PIP_EXTRA_INDEX_URL, PIP_FIND_LINKS):
+# so torch comes without CUDA.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -24,6 +25,15 @@ missing=()
 command -v g++ >/dev/null || missing+=("g++")
 "$python" -c 'import os, sys, sysconfig; sys.exit(not os.path.exists(sysconfig.get_path("include") + "/Python.h"))' ||
   missing+=("libpython3-dev")
+# The stamp holds the extras that are there, one a line.
+stamp=.venv/.colmap-inertial
+extras=$({ printf '%s\n' "$@"; cat "$stamp" 2>/dev/null || true; } | sed '/^$/d' | sort -u)
+# What open3d's wheels take from the system.
+if grep -qxE 'mesh|complete' <<<"$extras"; then
+  for pair in libusb-1.0.so.0=libusb-1.0-0 libGL.so.1=libgl1 libgomp.so.1=libgomp1 libX11.so.6=libx11-6; do
+    "$python" -c "import ctypes; ctypes.CDLL('${pair%%=*}')" 2>/dev/null || missing+=("${pair#*=}")
+  done
+fi
 if [ ${#missing[@]} -gt 0 ]; then
   sudo=""
   if [ "$(id -u)" -ne 0 ]; then sudo="sudo -n"; fi
@@ -39,10 +49,7 @@ fi
 if ! .venv/bin/python -m pip --version >/dev/null 2>&1; then
   "$python" -m venv .venv
 fi
-# The stamp holds the extras that are there, one a line.
-stamp=.venv/.colmap-inertial
 sources=(pyproject.toml colmap_inertial/_kernels/{CMakeLists.txt,*.cpp,*.h})
-extras=$({ printf '%s\n' "$@"; cat "$stamp" 2>/dev/null || true; } | sed '/^$/d' | sort -u)
 if [ ! -f "$stamp" ] || [ "$extras" != "$(cat "$stamp")" ] ||
   [ -n "$(find "${sources[@]}" -newer "$stamp" -print -quit)" ]; then
   names=$(paste -sd, <<<"$extras")

@@ -103,7 +103,8 @@ def clean_recordings(shared: Path, seed: int) -> list[Base]:
     found = [
         simulated(seed + 1),
         simulated(seed + 2, "walk", "tablet"),
-        simulated(seed + 3, "roam", "action_camera"),
+        # a clock that is 0.3 % off is a fault, which the preset's own 0.2 % (one sigma) would draw now and then
+        simulated(seed + 3, "roam", "action_camera", clock_rate_sd=5e-4),
         simulated(seed + 4, "orbit", "phone", gyro_rate_hz=400.0, accel_rate_hz=100.0),
         simulated(seed + 5, "roam", "tablet", 20.0),
         simulated(seed + 6, "walk", "phone", vigour=0.5),

@@ -10,8 +10,8 @@ its scale from a phone's IMU, and the stage joins them.
 Errors are those of the first image after a gap as seen from the last one before it (cm, degrees), with one standard
 deviation along the worst direction, and whether the error lies within the 95 % region of its covariance. ``--spoil``
 falsifies what cannot be joined: another recording's IMU within the gap, an IMU that was silent for half a second of it,
-a later part that moved elsewhere in between (the device thrown, or a part of another recording), a clock that jumps by
-half a second within the gap.
+a later part that moved elsewhere in between (the device thrown, or a part of another recording), a clock that loses a
+fifth of a second within the gap.
 
 ``--recordings`` cuts real ones instead (a folder of InertialScale, as ``bench_scale.py`` takes it): two parts from so
 many seconds on, each fitted by itself; the truth is the path of the whole recording in its true scale.
@@ -98,8 +98,12 @@ def spoiled(imu: ImuRecording, how: str, spans: list[tuple[float, float]], offse
             accel_m_s2=imu.accel_m_s2[kept[1]],
         )
     if how == "clock":
-        middle_s = 0.5 * (begin_s + end_s)
-        later = [t_s + 0.5 * (t_s > middle_s) for t_s in (imu.gyro_t_s, imu.accel_t_s)]
+        # it loses time little by little: no pause between the readings tells of it
+        lost_s = 0.2
+        later = [
+            t_s - 0.5 * np.clip(t_s - 0.5 * (begin_s + end_s) + lost_s, 0, 2 * lost_s)
+            for t_s in (imu.gyro_t_s, imu.accel_t_s)
+        ]
         return replace(imu, gyro_t_s=later[0], accel_t_s=later[1])
     if how == "thrown":  # an impact that the sensor does not follow: 2 m/s are gone
         late = inside[1] & (imu.accel_t_s > end_s - 0.1)

@@ -1,10 +1,12 @@
 """What the tight refinement does to simulated walks: camera centres, drift of scale, and the calibration.
 
-    python scripts/study_refine.py [--metres 100] [--readout-ms 0] [--seeds 1 2] [--spoil late] [--out F]
+    python scripts/study_refine.py [--metres 100] [--readout-ms 0] [--undeclared] [--seeds 1 2] [--spoil late] [--out F]
+    python scripts/study_refine.py --loop [--seeds 1 2]
 
 Points beside the way are tracked as features are (no pictures are rendered), and COLMAP's own bundle adjustment makes
 the model of them: the start, which drifts as real models do. With a readout, keypoints are rectified and the model goes
-through the readout's stage first, as in a run.
+through the readout's stage first, as in a run. ``--undeclared``: nobody says so, and keypoints stay as they are.
+``--loop``: around a ring and back, where each point is known again.
 
 Errors are those of the camera centres after one similarity, in millimetres; drift is the
 scale of the last third of the path over that of the first, in per cent; of the calibration, error and normalised error
@@ -93,15 +95,22 @@ def walk(metres: float, readout_s: float, *, noise_px: float = 0.5) -> TrackOpti
     return TrackOptions(motion=motion, readout_s=readout_s, vibration_m_s2=0.3, noise_px=noise_px)
 
 
-def studied(options: TrackOptions, seed: int, spoil: str) -> dict[str, Any]:
+def ring() -> TrackOptions:
+    """Most of the way around a ring of 38 m, and back."""
+    motion = MotionOptions(kind="orbit", duration_s=60.0, vigour=0.6, radius_m=6.0, arc_deg=330.0, sweep_s=30.0)
+    return TrackOptions(motion=motion, vibration_m_s2=0.3, frame_rate_hz=3.0, points_per_m=8.0, life_s=1e3)
+
+
+def studied(options: TrackOptions, seed: int, spoil: str, *, declared: bool = True) -> dict[str, Any]:
     """One walk through the stages."""
     tracks = simulate_tracks(options, seed=seed)
+    readout_s = options.readout_s if declared else 0.0
     rng = np.random.default_rng(seed)
     imu = spoiled(tracks.imu, tracks, spoil, options, seed)
     true, shutter, xy_px = tracks.calibration, None, tracks.xy_px
-    declared = Declared(readout_s=options.readout_s) if options.readout_s else None
-    prior = calibration_prior(declared)
-    if options.readout_s:
+    prior = calibration_prior(Declared(readout_s=readout_s) if readout_s else None)
+    timing = tracks.timing if declared else replace(tracks.timing, readout_s=None)
+    if readout_s:
         # as good as a calibration from pixels
         known = replace(
             true,
@@ -119,7 +128,7 @@ def studied(options: TrackOptions, seed: int, spoil: str) -> dict[str, Any]:
     mapped = adjusted(tracks.reconstruction(xy_px))
     seconds = {"bundle_adjustment": time.perf_counter() - begin_s}
     truth = tracks.motion.cam_in_world_m(tracks.timing.pose_t_s())
-    model = Model(reconstruction=mapped, colmap_index=0, timing=tracks.timing, rectified=shutter is not None)
+    model = Model(reconstruction=mapped, colmap_index=0, timing=timing, rectified=shutter is not None)
     out: dict[str, Any] = {
         "seed": seed,
         "observations": len(tracks.frame),
@@ -137,6 +146,8 @@ def studied(options: TrackOptions, seed: int, spoil: str) -> dict[str, Any]:
     said = model.treatments[-1]
     out |= {"after": compared(centres_of(model.reconstruction), truth), "said": said.reason, "values": said.values}
     out["accepted"], out["seconds"] = said.action == "refined", seconds
+    if "readout_s" in said.values:
+        out["readout"] = [1e3 * said.values[name] for name in ("readout_s", "readout_sigma_s")]
     if out["accepted"]:
         out["calibration"] = judged_calibration(model, tracks)
     return out
@@ -167,7 +178,7 @@ def judged_calibration(model: Model, tracks: Tracks) -> dict[str, Any]:
             "accel_delay": accel / accel_sigma,
         },
     }
-    if true.readout_s:
+    if true.readout_s and "readout_s" in values:
         error = values["readout_s"] - true.readout_s
         out["readout_pct"] = 100 * error / true.readout_s
         out["normalised"]["readout"] = error / values["readout_sigma_s"]
@@ -179,19 +190,22 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--metres", type=float, default=100.0)
     parser.add_argument("--readout-ms", type=float, default=0.0)
+    parser.add_argument("--loop", action="store_true")
+    parser.add_argument("--undeclared", action="store_true")
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--spoil", choices=("", "other", "late", "flipped", "gain"), default="")
     parser.add_argument("--out", type=Path)
     asked = parser.parse_args()
-    options, results = walk(asked.metres, asked.readout_ms * 1e-3), []
+    options, results = ring() if asked.loop else walk(asked.metres, asked.readout_ms * 1e-3), []
     for seed in asked.seeds:
-        one = studied(options, seed, asked.spoil)
+        one = studied(options, seed, asked.spoil, declared=not asked.undeclared)
         results.append(one)
         colmap, before, after = (one[k] for k in ("colmap", "before", "after"))
         print(
             f"seed {seed}: COLMAP {colmap['rms_mm']:.1f} before {before['rms_mm']:.1f} after {after['rms_mm']:.1f} mm; "
             f"drift {colmap['drift_pct']:+.2f} {before['drift_pct']:+.2f} -> {after['drift_pct']:+.2f} %; "
-            f"{one['scale']['verdict']}; {one['said']}; seconds {one['seconds']}; {one.get('calibration', '')}",
+            f"{one['scale']['verdict']}; {one['said']}; seconds {one['seconds']}; readout {one.get('readout', '')} ms; "
+            f"{one.get('calibration', '')}",
             flush=True,
         )
         if asked.out is not None:

@@ -2,14 +2,10 @@
 
 from pathlib import Path
 
-from test_pipeline import copy_scene
+from test_pipeline import DETERMINISTIC, copy_scene
 
-from colmap_inertial.options import MappingOptions, ReconstructOptions
-
-#: Four seconds a capture, and a scale that is trusted.
-TINY = ReconstructOptions(
-    mapping=MappingOptions(max_num_features=600, first_octave=0, max_image_size=320), deterministic=True
-)
+#: Three seconds a capture, and a scale that is trusted.
+TINY = DETERMINISTIC
 FRAMES = 16
 
 

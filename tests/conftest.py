@@ -1,5 +1,6 @@
 """Fixtures shared by all tests."""
 
+import gc
 import logging
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,15 @@ QUICK = Path(__file__).with_name("quick.txt").read_text().split()
 
 #: Files that take longest, the longest first: a worker that is handed one of them last keeps the others waiting.
 SLOW = Path(__file__).with_name("slow.txt").read_text().split()
+
+
+# What is imported and collected stays to the end: nobody needs to look through it for garbage again and again.
+gc.disable()
+
+
+def pytest_collection_finish() -> None:
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -18,6 +18,9 @@ from colmap_inertial.types import CameraModel
 LENS = CameraModel(model="PINHOLE", width=400, height=300, params=(340, 340, 200, 150))
 #: Planes as the axis that they stand on and where; the IMU's clock against the camera's.
 PLANES = ((2, -0.4), (1, 1.4), (0, -1.6), (0, 1.6))
+#: Side of a plane's texture, at 400 px a metre: no place is seen twice. Copies of a place match each other, the better
+#: the pictures are, and fold the model.
+SIDE = 1536
 IMU_CLOCK_S = 11.0
 
 
@@ -32,13 +35,13 @@ class CornerScene:
     readout_s: float
 
     @classmethod
-    def make(cls, *, exposure_s, readout_s, frames=24, seed=5, vigour=1.0):
+    def make(cls, *, exposure_s, readout_s, frames=24, seed=5, vigour=1.0, side=SIDE):
         rng = np.random.default_rng(seed)
         options = MotionOptions(
             kind="orbit", duration_s=frames / 3, heading_deg=-90.0, vigour=vigour, radius_m=1.6, arc_deg=40,
             sweep_s=frames / 3,
         )  # fmt: skip
-        textures = np.stack([poster(rng, 1024, 1024) for _ in PLANES])
+        textures = np.stack([poster(rng, side, side) for _ in PLANES])
         return cls(
             motion=make_motion(options, rng), textures=textures, frames=frames, exposure_s=exposure_s,
             readout_s=readout_s,
@@ -83,8 +86,9 @@ class CornerScene:
         nearest[~hit] = 0
         x, y, z = (400 * (centre[:, None, k] + nearest * direction[..., k]) for k in range(3))
         u, v = np.where(axis == 0, y, x), np.where(axis == 2, y, z)
-        u, v = (at - 1024 * np.floor(at / 1024) for at in (u, v))
-        v += 1025 * plane.astype(np.float32)
+        side = self.textures.shape[1]
+        u, v = (at - side * np.floor(at / side) for at in (u, v))
+        v += (side + 1) * plane.astype(np.float32)
         out = cv2.remap(self._atlas, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         out[~hit] = 0
         return out

@@ -316,6 +316,66 @@ def _inverse(values: np.ndarray, order: str) -> np.ndarray:
     return out
 
 
+#: Letters by which ``telemetry-parser`` reads each camera's axes, and the name and columns of its log.
+RUNCAMS = {
+    "Runcam 5 Orange": ("RC_GyroData0001.csv", "time,rx,ry,rz,ax,ay,az", "xzY"),
+    "GOCam GR": ("gyroData0001.csv", "time,x,y,z,ax,ay,az", "xZy"),
+    "Thumb": ("Thumb0001.csv", "time,x,y,z,ax,ay,az", "Yxz"),
+    "Mobius Maxi 4K": ("IMU0001.csv", "time,rx,ry,rz,ax,ay,az,temp", "yxz"),
+}
+
+
+def write_runcam(folder: Path, imu: ImuRecording, camera: str) -> Path:
+    """Counts of 500 deg/s (Thumb: 1000) and 2 g; one clock for both sensors, in milliseconds."""
+    name, header, order = RUNCAMS[camera]
+    range_rad_s = np.deg2rad(1000 if camera == "Thumb" else 500)
+    gyro = _inverse(imu.gyro_rad_s, order) / range_rad_s * 32768
+    accel = _inverse(imu.accel_m_s2, order) / (2 * GRAVITY_M_S2) * 32768
+    if camera == "Runcam 5 Orange":
+        accel = np.column_stack([-accel[:, 2], accel[:, 0], accel[:, 1]])
+    last = [25] if header.endswith("temp") else []
+    rows = [
+        ",".join(
+            map(str, [f"{1e3 * (t - imu.gyro_t_s[0]):.3f}", *np.rint(g).astype(int), *np.rint(a).astype(int), *last])
+        )
+        for t, g, a in zip(imu.gyro_t_s, gyro, accel, strict=True)
+    ]
+    path = folder / name
+    path.write_text("\n".join([header, *rows]) + "\n")
+    return path
+
+
+#: The same of Insta360's cameras.
+INSTA360S = {
+    "Insta360 Go": "xyZ",
+    "Insta360 GO 2": "yXZ",
+    "Insta360 OneR": "yXZ",
+    "Insta360 OneRS": "yxz",
+}
+
+
+def write_insta360(path: Path, imu: ImuRecording, camera: str, *, counts: bool, readout_ms: float = 0.0) -> Path:
+    """A video's end: records one after another, each with its kind and size behind it, and the mark."""
+    order = INSTA360S[camera]
+    gyro, accel = (_inverse(values, order) for values in (imu.gyro_rad_s, imu.accel_m_s2))
+    samples = b""
+    for t, g, a in zip(imu.gyro_t_s, gyro, accel, strict=True):
+        samples += struct.pack("<Q", round((1e6 if counts else 1e3) * (t - imu.gyro_t_s[0])))
+        if counts:
+            whole = np.rint([*a / (16 * GRAVITY_M_S2) * 32768, *np.rad2deg(g) / 2000 * 32768]) + 32768
+            samples += struct.pack("<6H", *whole.astype(int))
+        else:
+            samples += struct.pack("<6d", *a / GRAVITY_M_S2, *g)
+    said = message(2, camera.encode()) + varint(25 << 3 | 1) + struct.pack("<d", readout_ms)
+    said += number(62, 1) if counts else b""
+    records = b"".join(
+        data + bytes([1, kind]) + struct.pack("<I", len(data)) for kind, data in ((3, samples), (1, said))
+    )
+    end = bytes(32) + struct.pack("<II", len(records) + 72, 3) + b"8db42d694ccc418790edff439fe026bf"
+    path.write_bytes(bytes(4096) + records + end)
+    return path
+
+
 def write_opencamera(folder: Path, imu: ImuRecording, frame_ns: np.ndarray, name: str = "VID_20260101_120000_") -> Path:
     for ending, t_s, values in (("gyro", imu.gyro_t_s, imu.gyro_rad_s), ("accel", imu.accel_t_s, imu.accel_m_s2)):
         lines = [f"{x:.8f},{y:.8f},{z:.8f},{t}" for t, (x, y, z) in zip(stamps_ns(imu, t_s), values, strict=True)]

@@ -23,6 +23,7 @@ from colmap_inertial.cli import main, parse
 from colmap_inertial.drivers.capture import reconstruct
 from colmap_inertial.errors import FormatError, InertialError, MissingExtraError, OutputExistsError
 from colmap_inertial.options import BatchOptions, ReconstructOptions
+from colmap_inertial.run.config import config_as_toml
 
 
 def table(out: Path) -> dict[str, dict[str, str]]:
@@ -241,9 +242,9 @@ def test_a_killed_process_is_started_again_and_at_last_given_up(captures, tmp_pa
 
 def test_ctrl_c_stops_every_process_and_the_batch_continues_afterwards(captures, manifest, tmp_path):
     _, alone = captures
-    (manifest.parent / "options.toml").write_text(
-        "deterministic = true\n[mapping]\nmax_num_features = 600\nfirst_octave = 0\nmax_image_size = 320\n"
-    )
+    (manifest.parent / "options.toml").write_text(config_as_toml(TINY))
+    # of these, the first is waited for in the end
+    manifest.write_text('[[capture]]\npath = "hall"\n[[capture]]\npath = "broken"\n')
     out = tmp_path / "out"
     command = [sys.executable, "-m", "colmap_inertial", "batch", manifest, out, "--config", tmp_path / "options.toml"]
     # whoever runs the tests in the background lets their children ignore Ctrl-C

@@ -13,7 +13,7 @@ from colmap_inertial.colmap.swept import SweptWorkspace
 from colmap_inertial.geometry import matrix_from_quat, so3_exp
 from colmap_inertial.io.files import write_json
 from colmap_inertial.model.depth_maps import write_map
-from colmap_inertial.simulate import MotionOptions, Renderer, SceneRecipe, ShutterCamera, develop, make_scene
+from colmap_inertial.simulate import MotionOptions, SceneRecipe, ShutterCamera, develop, make_scene
 from colmap_inertial.simulate.capture import _truth
 from colmap_inertial.types import CameraModel
 
@@ -42,7 +42,7 @@ def scene(tmp_path_factory):
     """A dense workspace made from the truth, swept; the truth; the pictures' names."""
     root = tmp_path_factory.mktemp("bench")
     folder, made = root / "workspace", make_scene(RECIPE)
-    renderer, rng = Renderer(made.world()), np.random.default_rng(1)
+    renderer, rng = made.renderer(), np.random.default_rng(1)
     middle_s = np.array([CAMERA.middle_s(float(t)) for t in made.trigger_s])
     xyzw, centres = made.camera_pose(CAMERA, middle_s)
     turns = matrix_from_quat(xyzw)

@@ -425,7 +425,10 @@ def test_what_is_wrong_with_pictures_is_found(film: Film, filmed: Recorded) -> N
     long = replace(film.timing, exposure_s=np.full(len(film.timing.t_s), 0.04))
     assert found(diagnose(replace(clean, timing=long)), "exposure-too-long") == "warning"
     undeclared = replace(film.timing, readout_s=None)
-    assert found(diagnose(replace(clean, timing=undeclared)), "readout-unknown") == "warning"
+    told = diagnose(replace(clean, timing=undeclared))
+    assert found(told, "readout-unknown") == "warning"
+    measured = next(finding for finding in told.findings if finding.code == "readout-unknown")
+    assert "readout_s = 0.0000 under" in measured.advice and measured.numbers["readout_sigma_s"] < 0.002
 
     other = imu_of(FarScene.make(seed=8, duration_s=12.0, texture=np.zeros((2, 2, 3), np.float32)), seconds=12.0)
     assert found(diagnose(replace(clean, imu=other)), "imu-does-not-fit") == "error"

@@ -331,6 +331,12 @@ def test_names_are_flat_without_dots_and_unique_without_regard_to_case():
     assert all(name.count(".") == 1 and "/" not in name and len(name) < 120 for name in found.values())
 
 
+def test_many_names_of_one_stem_take_no_longer_each():
+    names = ["\u00e9" * (1 + i % 50) + "/" * (i % 2) + "\u00e8" * (1 + i // 50) + ".jpg" for i in range(60_000)]
+    found = flat_names(names)
+    assert len(set(found.values())) == len(set(names)) > 50_000
+
+
 # --- what is refused -------------------------------------------------------------------------------------------------
 
 

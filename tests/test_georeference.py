@@ -3,6 +3,7 @@
 import csv
 import json
 import shutil
+import struct
 from dataclasses import dataclass, replace
 
 import imu_files
@@ -11,7 +12,7 @@ import pytest
 from box_project import shared_box
 from test_io_recorders import recorded
 
-from colmap_inertial.drivers.georeference import located
+from colmap_inertial.drivers.georeference import located, read_georeference
 from colmap_inertial.drivers.project import reconstruct_project
 from colmap_inertial.errors import FormatError, NotObservableError
 from colmap_inertial.export.whole import export_model
@@ -183,6 +184,19 @@ def test_it_comes_back_from_its_json():
     assert again.as_json() == found.as_json()
 
 
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("latitude_deg", "91"), ("longitude_deg", "1e300"), ("longitude_deg", "1e999"), ("height_m", "1e999")],
+)
+def test_no_place_on_earth_is_taken_from_a_file(tmp_path, key, value):
+    content = walk(7).fitted().as_json()
+    content["origin"][key] = 123456789
+    text = json.dumps({"models": [{"model": 0, **content}]}).replace("123456789", value)
+    (tmp_path / "georeference.json").write_text(text)
+    with pytest.raises(FormatError, match="was damaged since it was written"):
+        read_georeference(tmp_path / "georeference.json", 0)
+
+
 def test_positions_meet_the_path_by_name_or_by_time():
     path = CameraTrajectory(
         names=("a", "b", "c"),
@@ -241,6 +255,10 @@ def test_camm_positions_are_read(tmp_path):
     np.testing.assert_allclose(np.diff(found.t_ns), 0.25e9, atol=2e3)
     with pytest.raises(FormatError, match="no positions"):
         positions_in_video(imu_files.write_camm(tmp_path / "b.mp4", imu))
+    # an endless error is one that is not known
+    stated, endless = (struct.pack("<ff", sigma, 4.0) for sigma in (2.5, np.inf))
+    (tmp_path / "a.mp4").write_bytes((tmp_path / "a.mp4").read_bytes().replace(stated, endless))
+    assert np.isnan(positions_in_video(tmp_path / "a.mp4").sigma_m).all()
 
 
 def with_position(path, latitude, longitude, height, *, below=False):

@@ -1,6 +1,7 @@
 """Damaged recordings of cameras and apps: an error of ours that names the file, never a crash, never a hang."""
 
 import struct
+import zipfile
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,7 @@ from test_io_recorders import FRAME_NS, recorded
 from colmap_inertial.errors import FormatError, InertialError
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.imu import read_frame_log, read_imu
+from colmap_inertial.io.zipped import text_of
 from colmap_inertial.types import ImuRecording
 
 MUTATIONS = 200
@@ -195,3 +197,16 @@ def test_text_that_is_not_utf_8_names_the_line(tmp_path: Path, imu: ImuRecording
     lines[20] = b"1,\xff\xfe,3,4,5,6,7"
     path.write_bytes(b"\n".join(lines))
     assert "line 21" in refused(path)
+
+
+def test_a_table_said_to_be_larger_than_its_zip_is_refused_without_asking_for_so_much_memory(
+    tmp_path: Path, imu: ImuRecording
+) -> None:
+    path, _ = zipped(tmp_path, imu)
+    with zipfile.ZipFile(path) as archive:
+        info = next(info for info in archive.infolist() if info.filename.endswith(".csv"))
+    data = path.read_bytes()
+    at = data.index(b"PK\1\2")  # the first entry of the directory; at 20 its compressed size
+    path.write_bytes(data[: at + 20] + struct.pack("<I", 2**31 - 2) + data[at + 24 :])
+    with pytest.raises(FormatError, match="larger than the file"):
+        text_of(path, info.filename)

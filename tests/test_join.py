@@ -223,24 +223,27 @@ def test_motion_that_the_imu_contradicts_stays_apart(walked, halves, sensor):
     assert gap.chi2 > 100 * gap.dof
 
 
-def test_a_clock_that_jumps_in_the_gap_is_seen(walked, halves):
+@pytest.mark.parametrize("lost_s", [0.2, 0.02])
+def test_a_clock_that_changes_in_the_gap_is_seen(walked, halves, lost_s):
     models, parts = halves
     imu = walked.imu
     middle_s = 0.5 * (imu.gyro_t_s[0] + imu.gyro_t_s[-1]) + 0.8
-    jumped = replace(
-        imu,
-        gyro_t_s=imu.gyro_t_s + 0.2 * (imu.gyro_t_s > middle_s),
-        accel_t_s=imu.accel_t_s + 0.2 * (imu.accel_t_s > middle_s),
-    )
+
+    def squeezed(t_s):
+        # stamps lose the time little by little: no hole tells of it
+        return t_s - 0.5 * np.clip(t_s - middle_s + 0.5 * lost_s, 0, 2 * lost_s)
+
+    jumped = replace(imu, gyro_t_s=squeezed(imu.gyro_t_s), accel_t_s=squeezed(imu.accel_t_s))
     later = JoinStage(imu=jumped, calibration=UNKNOWN).part(models[1])
     (gap,) = join_parts([parts[0], later], jumped, LIMITS).gaps
     assert not gap.joined
+    assert "about the IMU itself" in gap.reason and "clock changed" in gap.reason
 
 
 def test_the_stage_makes_one_model_of_two(walked, halves):
     models, _ = halves
     stage = JoinStage(imu=walked.imu, calibration=UNKNOWN)
-    (whole,), (gap,) = stage.join(models)
+    (whole,), (gap,) = stage.join_models(models)
     assert gap.joined and stage(models[0]) is models[0]
     assert (whole.colmap_index, [part.colmap_index for part in whole.parts]) == (0, [0, 1])
     assert whole.reconstruction.num_reg_images() == sum(m.reconstruction.num_reg_images() for m in models)
@@ -266,6 +269,9 @@ def test_the_stage_makes_one_model_of_two(walked, halves):
             name = moved.image(image_id).name
             there = whole.reconstruction.find_image_with_name(name).projection_center()
             assert moved.image(image_id).projection_center() == pytest.approx(there, abs=1e-6)
+        # scale and up are no surer than those of the world
+        assert part.similarity.cov[0, 0] ** 0.5 == pytest.approx(part.sigma_log, rel=1e-6)
+        assert np.linalg.eigvalsh(part.similarity.cov[1:4, 1:4] - whole.similarity.cov[1:4, 1:4])[0] > -1e-12
     first, last = whole.parts
     assert (first.sigma_m, first.sigma_deg) == (0.0, 0.0)
     assert last.sigma_m > gap.sigma_m * 0.5 and last.begin_s - first.end_s == pytest.approx(gap.seconds)
@@ -283,12 +289,17 @@ def test_a_refused_model_stays_apart_and_so_does_one_alone(walked, halves):
     models, _ = halves
     stage = JoinStage(imu=walked.imu, calibration=UNKNOWN)
     refused = replace(models[1], similarity=None)
-    kept, (gap,) = stage.join([models[0], refused])
+    kept, (gap,) = stage.join_models([models[0], refused])
     assert kept == (models[0], refused)
     assert not gap.joined and gap.reason == "the scale of model 1 was refused"
-    assert stage.join(models[:1]) == ((models[0],), ())
+    assert stage.join_models(models[:1]) == ((models[0],), ())
     none = [replace(model, similarity=None) for model in models]
-    assert stage.join(none)[0] == tuple(none) and len(stage.join(none)[1]) == 1
+    assert stage.join_models(none)[0] == tuple(none) and len(stage.join_models(none)[1]) == 1
+
+
+def group_of(parts, tracks):
+    (group,) = join_parts(parts, tracks.imu, LIMITS).groups
+    return group.placed
 
 
 def test_images_that_both_have_tie_two_models(walked):
@@ -307,7 +318,9 @@ def test_images_that_both_have_tie_two_models(walked):
     wrong[shared.in_second[1]] += 3.0
     spoiled = replace(parts[1], trajectory=replace(parts[1].trajectory, cam_in_world=wrong))
     assert len(find_shared([parts[0], spoiled])[0].in_first) == 3
-    (whole,), (gap,) = stage.join(models)
+    (whole,), (gap,) = stage.join_models(models)
+    # both parts' fits have the readings of the overlap: they count once
+    assert group_of(parts, walked).inflation >= (10.6 + 8.4 - 0.5) / 18.0
     assert gap.joined and gap.shared_images == 4 and gap.seconds < 0
     assert "4 images that both have" in gap.reason
     assert gap.sigma_m < 0.02
@@ -333,10 +346,15 @@ def small_models():
     return cut(tracks, [(0.0, 1.6), (1.1, 3.0)], noise_m=0.0, noise_rad=0.0)
 
 
+def same_images(first, second):
+    names = [{one.image(i).name for i in one.reg_image_ids()} for one in (first, second)]
+    return {(0, 1): names[0] & names[1]}
+
+
 def test_models_become_one_with_every_observation_once():
     first, second = small_models()
     second.camera(1).params = first.camera(1).params * 1.001
-    whole = merged([first, second])
+    whole = merged([first, second], same_images(first, second))
     names = {one.image(i).name for one in (first, second) for i in one.reg_image_ids()}
     assert {whole.image(i).name for i in whole.reg_image_ids()} == names
     # numbers are the database's, cameras that were refined apart stay apart
@@ -358,11 +376,25 @@ def test_models_become_one_with_every_observation_once():
             assert whole.image(element.image_id).points2D[element.point2D_idx].point3D_id == point_id
 
 
+def test_of_an_image_whose_poses_differ_only_the_first_one_s_observations_stay():
+    first, second = small_models()
+    (both,) = same_images(first, second).values()
+    wrong = sorted(both)[1]
+    whole = merged([first, second], {(0, 1): both - {wrong}})
+    every = merged([first, second], {(0, 1): both})
+    image_id = first.find_image_with_name(wrong).image_id
+    assert whole.image(image_id).num_points3D == first.image(image_id).num_points3D
+    assert every.image(image_id).num_points3D > first.image(image_id).num_points3D
+    # a third model's owner is the one whose pose stayed
+    other = merged([first, second, second], {(0, 1): both, (1, 2): both})
+    assert other.num_points3D() == every.num_points3D()
+
+
 def test_numbers_that_clash_become_new_ones(tmp_path):
     first, second = small_models()
     for image_id in second.reg_image_ids():
         second.image(image_id).name = f"other-{second.image(image_id).name}"
-    whole = merged([first, second])
+    whole = merged([first, second], {})
     assert whole.num_reg_images() == first.num_reg_images() + second.num_reg_images()
     assert whole.num_points3D() == first.num_points3D() + second.num_points3D()
     whole.write_binary(str(tmp_path))
@@ -381,7 +413,7 @@ def test_a_project_of_two_models_becomes_one(walked, tmp_path, capsys):
     models = cut(walked, [(0.0, 9.2), (10.2, 18.0)])
     source = project_of(walked, models, tmp_path / "project")
     out = tmp_path / "out"
-    result = reconstruct_project(tmp_path / "project", out, source, ReconstructOptions(join="inertial"))
+    result = reconstruct_project(tmp_path / "project", out, source, ReconstructOptions())
     (gap,), (one,) = result.gaps, result.models
     assert gap.joined and gap.reason == "joined by the IMU"
     whole = read_model(out / "sparse" / "0")
@@ -408,6 +440,6 @@ def test_a_project_of_two_models_becomes_one(walked, tmp_path, capsys):
     made = export_model(out, tmp_path / "path", "tum")
     assert (made.model, made.unit) == (0, "m")
     # asked not to, they stay apart
-    apart = reconstruct_project(tmp_path / "project", out, source, ReconstructOptions())
+    apart = reconstruct_project(tmp_path / "project", out, source, ReconstructOptions(join="off"))
     assert [model.colmap_index for model in apart.models] == [0, 1] and apart.gaps == ()
     assert read_model(out / "sparse" / "0").num_reg_images() == models[0].num_reg_images()

@@ -15,7 +15,7 @@ from colmap_inertial.join.values import Part
 from colmap_inertial.options import JoinOptions, ScaleOptions
 from colmap_inertial.scale.posterior import FittedPath
 from colmap_inertial.simulate.tracks import simulate_tracks
-from colmap_inertial.stages.join import _sigma_log
+from colmap_inertial.stages.join import _cameras, _sigma_log
 from colmap_inertial.types import CameraTrajectory
 
 LIMITS = JoinOptions()
@@ -103,6 +103,67 @@ def test_two_cameras_are_not_one_device(walked, mounted_m):
 
 
 def test_ties_that_are_off_never_widen_a_scale_beyond_its_own():
-    scale, part = SimpleNamespace(sigma_log=0.01), SimpleNamespace(path=SimpleNamespace(scale=(1.0, 6e-5)))
-    assert _sigma_log(scale, part, 1e-3) == pytest.approx(0.01)
-    assert _sigma_log(scale, part, 2e-5) == pytest.approx(6e-5**0.5)
+    model = SimpleNamespace(scale=SimpleNamespace(sigma_log=0.01))
+    part = SimpleNamespace(path=SimpleNamespace(scale=(1.0, 6e-5)))
+    for inflation, sigma_log in ((50.0, 0.01), (1.0, 6e-5**0.5)):
+        placed = SimpleNamespace(inflation=inflation, cov=2e-5 * np.eye(14))
+        assert _sigma_log(model, part, placed, 1) == pytest.approx(sigma_log)
+
+
+def test_frames_by_turns_are_no_surer_than_all_of_them(walked):
+    t_s = T_S[T_S < 17]
+    halves = [part_of(walked, t_s[k::2], k) for k in (0, 1)]
+    joined = join_parts(halves, walked.imu, LIMITS)
+    (group,) = joined.groups
+    placed = group.placed
+    assert placed.inflation > 1.9
+    own = part_of(walked, t_s, 2).path.scale[1]
+    for k in (0, 1):
+        assert min(placed.inflation * placed.cov[7 * k, 7 * k], halves[k].path.scale[1]) > 0.8 * own
+
+
+def test_pictures_of_two_cameras_stay_apart(walked):
+    first = part_of(walked, T_S[T_S < 8.5], 0)
+    other = part_of(walked, T_S[(T_S > 9.5) & (T_S < 17)], 1)
+    for cameras, joined in (((), True), (("1", "2"), True), (("2",), False)):
+        parts = [replace(first, cameras=frozenset({"1"})), replace(other, cameras=frozenset(cameras))]
+        (gap,) = join_parts(parts, walked.imu, LIMITS).gaps
+        assert gap.joined == joined
+        assert joined or "other cameras" in gap.reason
+
+
+def test_images_that_lie_otherwise_in_either_part_keep_them_apart(walked):
+    first = part_of(walked, T_S[T_S < 9.5], 0)
+    t_s = T_S[(T_S > 8.5) & (T_S < 17)]
+    other = part_of(walked, t_s, 1)
+    both = int((t_s < 9.5).sum())
+    # a third of them turned, a third elsewhere
+    third = both // 3 + 1
+    cam_from_world, centres = other.trajectory.cam_from_world_xyzw.copy(), other.trajectory.cam_in_world.copy()
+    cam_from_world[:third] = quat_multiply(quat_exp(np.array([0, 0.2, 0])), cam_from_world[:third])
+    centres[third : 2 * third] += [0.5, 0, 0]
+    moved = replace(other.trajectory, cam_from_world_xyzw=cam_from_world, cam_in_world=centres)
+    other = replace(other, trajectory=moved)
+    (gap,) = join_parts([first, other], walked.imu, LIMITS).gaps
+    assert not gap.joined
+    assert gap.reason == f"the {both} images that both have lie otherwise in one than in the other"
+
+
+def test_two_models_of_one_piece_are_not_joined(walked):
+    parts = [part_of(walked, T_S[T_S < 9.5], 0), part_of(walked, T_S[T_S < 8.5], 1)]
+    (gap,) = join_parts(parts, walked.imu, LIMITS).gaps
+    assert not gap.joined and "two models of one piece" in gap.reason
+
+
+def test_cameras_are_told_apart_by_number_and_by_folder():
+    def names_of(images):
+        at = dict(enumerate(images))
+        model = SimpleNamespace(
+            reg_image_ids=lambda: list(at), image=lambda i: SimpleNamespace(camera_id=at[i][0], name=at[i][1])
+        )
+        return _cameras(model)
+
+    assert names_of([(1, "a.jpg"), (1, "b.jpg"), (2, "c.jpg"), (1, "d.jpg")]) == {"1", "2"}
+    # one to an image: they say nothing, folders do
+    assert names_of([(1, "left/a.jpg"), (2, "left/b.jpg"), (3, "left/c.jpg")]) == {"left/"}
+    assert names_of([(7, "a.jpg")]) == {"7"}

@@ -539,3 +539,14 @@ def test_batches_of_pairs_grow_and_hold_every_pair_once():
     found = sparse.growing_batches(pairs)
     assert [len(batch) for batch in found] == [100, 200, 400, 800, 1600, 1600, 300]
     assert [pair for batch in found for pair in batch] == pairs and sparse.growing_batches([]) == []
+    assert [len(batch) for batch in sparse.growing_batches(pairs, first=1600)] == [1600, 1600, 1600, 200]
+
+
+def test_once_some_are_matched_batches_are_large(database, tmp_path, monkeypatch):
+    told = []
+    monkeypatch.setattr(pycolmap, "match_image_pairs", lambda *_, **__: None)
+    context = RunContext(scratch=tmp_path, progress=lambda _, done, total: told.append(done))
+    pairs = [("a", "b")] * 700
+    sparse.match_pairs(database, pairs, context, total=1400)
+    sparse.match_pairs(database, pairs, context, done=700, total=1400)
+    assert told == [0, 100, 300, 700, 700, 1400]

@@ -25,7 +25,9 @@ SCENE = Path(__file__).parents[1] / "example_scenes" / "desk"
 FINE = ReconstructOptions(mapping=MappingOptions(max_num_features=1000, first_octave=0, max_image_size=480))
 #: Enough for a model and a scale of its first frames; three times faster again.
 QUICK = ReconstructOptions(mapping=MappingOptions(max_num_features=600, first_octave=0, max_image_size=320))
-DETERMINISTIC = dataclasses.replace(QUICK, deterministic=True)
+DETERMINISTIC = dataclasses.replace(
+    QUICK, deterministic=True, mapping=dataclasses.replace(QUICK.mapping, max_image_size=240)
+)
 
 
 def copy_scene(folder: Path, *, first: int | None = None) -> Path:
@@ -55,6 +57,14 @@ def finished(tmp_path_factory):
     assert contents(capture) == before
     assert list(dict(stages)) == ["frames", "features", "matches", "mapping", "images", "metric", "validation"]
     return capture, root / "out", result
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The first frames, reconstructed undisturbed: (capture, out, result). Tests must not change it."""
+    root = tmp_path_factory.mktemp("whole")
+    capture = copy_scene(root / "capture", first=16)
+    return capture, root / "out", reconstruct(capture, root / "out", DETERMINISTIC)
 
 
 @pytest.fixture(scope="module")
@@ -199,8 +209,8 @@ def test_a_finished_result_is_not_overwritten(finished, capsys):
         reconstruct(other, out, FINE)
 
 
-def test_a_refused_scale_keeps_colmap_s_model_and_exits_3(finished, tmp_path, capsys):
-    capture, out, _ = finished
+def test_a_refused_scale_keeps_colmap_s_model_and_exits_3(whole, tmp_path, capsys):
+    capture, out, _ = whole
     unfinished = tmp_path / "out"
     shutil.copytree(out, unfinished)
     (unfinished / "result.json").unlink()
@@ -213,7 +223,7 @@ def test_a_refused_scale_keeps_colmap_s_model_and_exits_3(finished, tmp_path, ca
             values = [row.split(",", 1)[1] for row in reversed(rows)]
             lines = [f"{t},{v}" for t, v in zip(stamps, values, strict=True)]
             (capture / f"{name}.csv").write_text("\n".join([header, *lines]) + "\n")
-        result = reconstruct(capture, unfinished, FINE)
+        result = reconstruct(capture, unfinished, DETERMINISTIC)
     finally:
         (capture / "gyro.csv").write_text(gyro)
         (capture / "accel.csv").write_text(accel)
@@ -255,9 +265,8 @@ for stage in sys.argv[4:]:
 """
 
 
-def test_killed_at_every_stage_it_ends_as_if_undisturbed(tmp_path):
-    capture = copy_scene(tmp_path / "capture", first=16)
-    undisturbed = reconstruct(capture, tmp_path / "whole", DETERMINISTIC)
+def test_killed_at_every_stage_it_ends_as_if_undisturbed(whole, tmp_path):
+    capture, out, undisturbed = whole
     killed = tmp_path / "killed"
     stages = ("frames", "features", "matches", "mapping", "images", "metric")
     command = [sys.executable, "-c", KILLED, str(capture), str(killed), str(Path(__file__).parent), *stages]
@@ -267,7 +276,7 @@ def test_killed_at_every_stage_it_ends_as_if_undisturbed(tmp_path):
     kept = (killed / "log.txt").read_text().count("finished in an earlier run, kept")
     assert kept >= 4
     for folder in ("images", "sparse", "colmap/images", "colmap/sparse"):
-        assert contents(tmp_path / "whole" / folder) == contents(killed / folder), folder
+        assert contents(out / folder) == contents(killed / folder), folder
     assert [m.scale.metres_per_unit for m in undisturbed.models] == [m.scale.metres_per_unit for m in resumed.models]
     assert not list(killed.rglob("*.partial*"))
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -14,7 +15,7 @@ from box_project import HIGH, LOW, cast, off_the_walls, rays, shared_box
 from test_pipeline_existing import contents, run
 
 from colmap_inertial.colmap import dense as dense_stage, depth_maps
-from colmap_inertial.colmap.tsdf import tsdf_mesh
+from colmap_inertial.colmap.tsdf import require_mesh_maker, tsdf_mesh
 from colmap_inertial.drivers.project import reconstruct_project
 from colmap_inertial.errors import InertialError
 from colmap_inertial.geometry import matrix_from_quat
@@ -316,6 +317,20 @@ def test_a_mesh_that_nothing_can_make_is_said_before_the_work(box, tmp_path, cap
     code, _, err = run(capsys, "reconstruct", box.root, tmp_path / "out", *flags, "--dense-options.mesh", "tsdf")
     assert code == 2
     assert "colmap-inertial[mesh]" in err and not (tmp_path / "out").exists()
+
+
+def test_a_mesh_maker_that_lacks_a_library_is_said_and_not_loaded(tmp_path, monkeypatch):
+    (tmp_path / "open3d.py").write_text("raise OSError('libusb-1.0.so.0: cannot open shared object file')")
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
+    monkeypatch.syspath_prepend(tmp_path)
+    options = dataclasses.replace(QUICK, dense_options=DenseOptions(mesh="tsdf"))
+    assert options.dense
+    with pytest.raises(InertialError, match=r"libusb-1\.0\.so\.0: cannot open.*apt install libusb"):
+        require_mesh_maker(options)
+    assert "open3d" not in sys.modules
+    (tmp_path / "open3d.py").write_text("")
+    require_mesh_maker(options)
+    assert "open3d" not in sys.modules
 
 
 def test_damaged_depth_maps_and_those_of_other_options_are_named(unfinished, box, capsys):

@@ -70,7 +70,7 @@ def centre_error_m(folder, scene):
 def rolling(tmp_path_factory):
     """A capture with 30 ms of readout, reconstructed without and with treatment."""
     root = tmp_path_factory.mktemp("rolling")
-    scene = CornerScene.make(exposure_s=0.004, readout_s=0.03)
+    scene = CornerScene.make(exposure_s=0.004, readout_s=0.03, frames=18)
     capture = scene.write(root / "capture")
     before = contents(capture)
     results = [reconstruct(capture, root / name, options) for name, options in (("off", OFF), ("on", QUICK))]
@@ -135,7 +135,22 @@ def deblurred(tmp_path_factory, blurred):
     return deblur_capture(blurred, out / "out", sheet=out / "sheet.png", progress=silent)
 
 
-def test_deblurred_images_see_more_of_the_scene(tmp_path, scene, blurred):
+def stop(stage, done, total, /):
+    if stage == "features":
+        raise KeyboardInterrupt
+
+
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory, blurred):
+    """A run that was stopped when its pictures were made. Tests must not change it."""
+    out = tmp_path_factory.mktemp("stopped") / "out"
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(blurred, out, QUICK, progress=stop)
+    return out
+
+
+def test_deblurred_images_see_more_of_the_scene(tmp_path, scene, blurred, stopped):
+    shutil.copytree(stopped, tmp_path / "on")
     off, on = (reconstruct(blurred, tmp_path / name, o) for name, o in (("off", OFF), ("on", QUICK)))
     before, after = off.models[0].summary, on.models[0].summary
     assert after["registered_images"] >= before["registered_images"]
@@ -149,7 +164,9 @@ def test_deblurred_images_see_more_of_the_scene(tmp_path, scene, blurred):
         seen, made = (tmp_path / "on" / folder / record.name for folder in ("colmap/images", "images"))
         if record.action == "deblurred":
             sharper = edges(cv2.imread(str(made))) / edges(cv2.imread(str(seen)))
-            assert sharper > 1.1 and exif() in seen.read_bytes() and exif() in made.read_bytes()
+            # of short blur, hardly
+            assert sharper > (1.1 if record.value("blur_px") > 12 else 1)
+            assert exif() in seen.read_bytes() and exif() in made.read_bytes()
         else:
             assert seen.read_bytes() == made.read_bytes()
     assert contents(tmp_path / "off" / "images") == contents(tmp_path / "off" / "colmap" / "images")
@@ -184,14 +201,9 @@ def test_a_finished_folder_is_not_touched_again(blurred, deblurred):
     assert {name for name in before if before[name] != after[name]} <= {"log.txt"}
 
 
-def test_a_stopped_run_does_not_deblur_again(tmp_path, blurred):
-    def stop(stage, done, total, /):
-        if stage == "features":
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        reconstruct(blurred, tmp_path / "out", QUICK, progress=stop)
-    before = contents(tmp_path / "out" / "colmap" / "images")
+def test_a_stopped_run_does_not_deblur_again(tmp_path, blurred, stopped):
+    shutil.copytree(stopped, tmp_path / "out")
+    before = contents(stopped / "colmap" / "images")
     stages = []
     with pytest.raises(KeyboardInterrupt):
         reconstruct(
@@ -218,9 +230,8 @@ def planned(recording, scratch, **asked):
 
 
 @pytest.fixture(scope="module")
-def plan(tmp_path_factory, blurred):
-    scratch = tmp_path_factory.mktemp("plan")
-    return planned(parts(blurred), scratch)
+def plan(deblurred):
+    return deblurred.imaging
 
 
 def blur_errors(scene, plan):
@@ -252,7 +263,8 @@ def test_a_long_recording_is_surveyed_in_parts(tmp_path, monkeypatch, scene, blu
 
 
 def test_frames_too_blurred_for_a_small_model_are_deblurred_for_the_next(tmp_path, monkeypatch):
-    scene = CornerScene.make(exposure_s=0.06, readout_s=0.0, vigour=1.2)
+    # walls with copies, on which a small model of blurred frames breaks
+    scene = CornerScene.make(exposure_s=0.06, readout_s=0.0, vigour=1.2, side=1024)
     capture = scene.write(tmp_path / "capture", extra=CALIBRATED)
     registered = []
 

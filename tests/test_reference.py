@@ -77,6 +77,8 @@ def test_markers_and_targets_give_their_scale(bare, tmp_path, monkeypatch):
         ({"scale_from": "distance", "between": ("1,2,3", "4,5,6"), "distance": "0+-1"}, "how well they are known"),
         ({"scale_from": "distance", "between": ("1,2,3", "3"), "distance": "2+-0.1"}, "needs what they are: --target"),
         ({"scale_from": "distance", "between": ("a,b,c", "3"), "distance": "2+-0.1"}, "a point is x,y,z"),
+        ({"scale_from": "distance", "between": ("1,2,nan", "3,4,5"), "distance": "2+-0.1"}, "a point is x,y,z"),
+        ({"scale_from": "distance", "between": ("1,2,3", "1e999,0,0"), "distance": "2+-0.1"}, "a point is x,y,z"),
         ({"scale_from": "distance", "between": ("1,2,3", "1,2,3"), "distance": "2+-0.1"}, "are the same place"),
     ],
 )
@@ -139,6 +141,26 @@ def test_pictures_alone_are_mapped_and_scaled(pictures, tmp_path, monkeypatch, c
     code, _, err = run(capsys, *args)
     assert code == 2 and "exists" in err
     assert sorted(path.name for path in folder.iterdir()) == ["0.png", "1.png", "2.png", "3.png"]
+
+
+@pytest.mark.parametrize("content", ["[]", "{}", "3", '{"left_out": ["x"]}', '{"left_out": 3}'])
+def test_a_changed_record_of_the_mapping_is_named(pictures, tmp_path, capsys, content):
+    folder, _ = pictures
+    (tmp_path / "out" / "colmap").mkdir(parents=True)
+    (tmp_path / "out" / "colmap" / "made_from.json").write_text(content)
+    args = ["--scale-from", "target", "--target", "aruco:DICT_4X4_50:0.1"]
+    code, _, err = run(capsys, "reconstruct", folder, tmp_path / "out", *args)
+    assert code == 2 and "made_from.json: " in " ".join(err.split())
+
+
+def test_a_picture_that_a_link_leads_out_is_not_taken_along(pictures, tmp_path, capsys):
+    folder, mapped = pictures
+    (tmp_path / "secret").write_bytes(b"secret")
+    (folder / "4.png").symlink_to(tmp_path / "secret")
+    args = ["--scale-from", "target", "--target", "aruco:DICT_4X4_50:0.1"]
+    code, _, err = run(capsys, "reconstruct", folder, tmp_path / "out", *args)
+    assert code == 2 and "4.png" in err and "links are not followed" in " ".join(err.split())
+    assert mapped == [] and not (tmp_path / "out").exists()
 
 
 def test_what_pictures_alone_cannot_give_is_refused_before_the_mapping(pictures, tmp_path, capsys):

@@ -9,7 +9,7 @@ from refine_walk import PINHOLE, known_of, nudged, problem_of, tracks_of, walk
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.refine import _inertial, _seen, judge, setup, solve as solver
 from colmap_inertial.refine._system import Order, System
-from colmap_inertial.refine.solve import _evaluate, _weighted, factored, held_out, solve
+from colmap_inertial.refine.solve import _evaluate, _plausible, _weighted, factored, held_out, solve
 from colmap_inertial.refine.values import FreeCamera
 
 
@@ -310,10 +310,22 @@ def test_speed_costs_nothing_where_the_imu_says_it(small):
 
 def test_an_offset_beyond_the_readings_that_were_looked_up_is_refused(small):
     _, problem, start, _ = small
-    assert judge._too_late(problem, replace(start, offset_s=0.009)) == ""
-    assert "11 ms" in judge._too_late(problem, replace(start, offset_s=-0.011))
-    drifting = replace(start, offset_s=0.009, clock_rate=0.002 / np.ptp(problem.inertial.nodes_s) * 2)
-    assert "11 ms" in judge._too_late(problem, drifting)
+    reach_s = problem.inertial.turning.half_span_s - 0.5 * abs(start.readout_s)
+    near_s, far_s = reach_s - 0.001, reach_s + 0.001
+    assert judge._too_late(problem, replace(start, offset_s=near_s)) == ""
+    assert f"by {1e3 * far_s:.0f} ms" in judge._too_late(problem, replace(start, offset_s=-far_s))
+    drifting = replace(start, offset_s=near_s, clock_rate=0.002 / np.ptp(problem.inertial.nodes_s) * 2)
+    assert f"by {1e3 * far_s:.0f} ms" in judge._too_late(problem, drifting)
+    longer = replace(start, offset_s=near_s, readout_s=start.readout_s + 0.004)
+    assert "a readout of" in judge._too_late(problem, longer)
+
+
+def test_a_step_that_leaves_no_camera_is_not_tried(small):
+    _, _, start, _ = small
+    for factor, plausible in ((1.4, True), (1.6, False), (-1.0, False)):
+        numbers = start.intrinsics.copy()
+        numbers[0] *= factor
+        assert _plausible(start, replace(start, intrinsics=numbers)) == plausible
 
 
 def test_what_is_held_out_must_be_predicted_better_than_chance_does(small):

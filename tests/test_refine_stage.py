@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -9,7 +10,9 @@ import pytest
 from refine_walk import tracks_of, walk
 
 from colmap_inertial import read_model, reconstruct_project
+from colmap_inertial.drivers import frames
 from colmap_inertial.drivers.capture import default_model_stages
+from colmap_inertial.drivers.frames import as_refined
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.model import Model
@@ -140,6 +143,34 @@ def test_a_model_whose_images_still_have_the_rolling_shutter_is_left_as_it_is(ro
     assert made.reconstruction is model.reconstruction
 
 
+def test_a_readout_that_was_not_declared_is_found_and_told(rolled):
+    tracks, _, _, _ = rolled
+    timing = replace(tracks.timing, readout_s=None)
+    model = Model(reconstruction=adjusted(tracks.reconstruction()), colmap_index=0, timing=timing)
+    model = MetricStage(imu=tracks.imu, calibration=UNKNOWN)(model)
+    made, said = refined_by(tracks.imu, model)
+    assert said.values["readout_s"] == pytest.approx(0.025, rel=0.03)
+    assert "declare the readout, which is 2" in said.reason
+    assert said.action == "" and made.reconstruction is model.reconstruction
+
+
+def test_a_global_shutter_needs_no_declaration(walked):
+    tracks, model = walked
+    assert model.timing.readout_s is None
+    made, said = refined_by(tracks.imu, model)
+    assert said.action == "refined"
+    assert abs(said.values["readout_s"]) < 1e-3
+    # what fewer than two images see is no part of it
+    lonely = pycolmap.Reconstruction(model.reconstruction)
+    point_id = min(lonely.point3D_ids())
+    places = [(element.image_id, element.point2D_idx) for element in lonely.points3D[point_id].track.elements]
+    for image_id, place in places[1:]:
+        lonely.points3D[point_id].track.delete_element(image_id, place)
+        lonely.image(image_id).reset_point3D_for_point2D(place)
+    made, said = refined_by(tracks.imu, replace(model, reconstruction=lonely))
+    assert said.action == "refined" and point_id not in made.reconstruction.points3D
+
+
 def test_keypoints_go_back_to_where_the_shutter_had_them(rolled):
     tracks, shutter, _, _ = rolled
     name = tracks.timing.names[7]
@@ -153,6 +184,26 @@ def test_the_readout_s_stage_remembers_where_keypoints_were(rolled):
     name = tracks.timing.names[7]
     assert "readout" in [one.stage for one in model.treatments if one.action]
     assert model.observed_px[name] == pytest.approx(shutter.moved(name, tracks.xy_px[tracks.frame == 7]), abs=1e-6)
+
+
+def test_images_are_rectified_as_the_refined_model_has_the_shutter(rolled):
+    tracks, shutter, known, model = rolled
+    off = replace(tracks.calibration, gyro_time_offset_s=tracks.calibration.gyro_time_offset_s + 2e-3)
+    narrow = replace(tracks.camera, params=(1020.0, 1020.0, *tracks.camera.params[2:]))
+    wrong = shutter.refined(off, 0.0235, narrow)
+    made, _ = refined_by(tracks.imu, model, calibration=known, shutter=shutter)
+    result = SimpleNamespace(treatments=made.treatments, scale=made.scale, sparse_metric="of the model")
+    left = SimpleNamespace(treatments=(), scale=made.scale, sparse_metric="of another")
+    assert as_refined([wrong], [left]) == [wrong]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(frames, "read_model", lambda folder: made.reconstruction)
+        (refined,) = as_refined([wrong], [left, result])
+    away = []
+    for stage in (wrong, refined):
+        moved = [stage.moved(tracks.timing.names[i], tracks.xy_px[tracks.frame == i]) for i in range(0, 100, 10)]
+        true = [shutter.moved(tracks.timing.names[i], tracks.xy_px[tracks.frame == i]) for i in range(0, 100, 10)]
+        away.append(np.median(np.linalg.norm(np.concatenate(moved) - np.concatenate(true), axis=1)))
+    assert away[1] < 0.2 * away[0] and away[1] < 0.1
 
 
 def test_images_without_a_time_hang_on_the_pictures(walked):
@@ -265,9 +316,9 @@ def test_without_the_option_the_model_is_what_it_was(walked):
     mapped.transform(pycolmap.Sim3d(similarity.scale, rotation, similarity.translation_m).inverse())
     model = MetricStage(imu=tracks.imu, calibration=UNKNOWN)(replace(model, reconstruction=mapped, similarity=None))
     recording = Recording.of(Capture(path="none", calibration=UNKNOWN), tracks.imu, tracks.timing, UNKNOWN)
-    stages = default_model_stages(recording, ReconstructOptions())
+    stages = default_model_stages(recording, ReconstructOptions(join="off"))
     assert [type(stage) for stage in stages] == [ReadoutStage, MetricStage]
-    joining = default_model_stages(recording, ReconstructOptions(join="inertial"))
+    joining = default_model_stages(recording, ReconstructOptions())
     assert [type(stage) for stage in joining] == [ReadoutStage, MetricStage, JoinStage]
     made = Model(reconstruction=mapped, colmap_index=0, timing=tracks.timing)
     for stage in stages:
@@ -279,7 +330,7 @@ def test_without_the_option_the_model_is_what_it_was(walked):
     assert [one.stage for one in made.treatments if one.stage == "refine"] == []
     assert made.scale.metres_per_unit == model.scale.metres_per_unit
     stages = default_model_stages(recording, ReconstructOptions(refine="inertial"))
-    assert [type(stage) for stage in stages] == [ReadoutStage, MetricStage, RefineStage]
+    assert [type(stage) for stage in stages] == [ReadoutStage, MetricStage, JoinStage, RefineStage]
 
 
 def test_an_existing_project_is_refined(walked, tmp_path):
@@ -306,6 +357,12 @@ def test_an_existing_project_is_refined(walked, tmp_path):
     made, mapped = read_model(tmp_path / "out" / "sparse" / "0"), read_model(project / "sparse" / "0")
     assert error_of(centres_of(made), truth) < error_of(centres_of(mapped), truth)
     assert result.models[0].trajectory is not None
-    # the IMU would count twice
+    # smoothed once more, the IMU would count twice: the refinement's own covariance, against the first image
     assert (tmp_path / "out" / "trajectory.tum").exists()
-    assert not (tmp_path / "out" / "trajectory_cov.npz").exists()
+    stored = np.load(tmp_path / "out" / "trajectory_cov.npz")
+    assert stored["cov"].shape == (len(tracks.timing.names), 3, 3)
+    assert stored["t_s"] - stored["t_s"][0] == pytest.approx(tracks.timing.t_s - tracks.timing.t_s[0], abs=1e-6)
+    sigma_m = np.sqrt(np.trace(stored["cov"], axis1=1, axis2=2))
+    assert sigma_m[0] < 1e-3 < 10 * sigma_m[-1] and sigma_m[-1] > 2 * sigma_m[10]
+    last = said["values"]["drift"][-1]["end_sigma_m"]
+    assert np.sqrt(np.diagonal(stored["cov"][-1])) == pytest.approx(last, rel=1e-6)

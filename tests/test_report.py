@@ -16,6 +16,7 @@ import plotly.graph_objects as graph_objects
 import pycolmap
 import pytest
 from report_runs import HOSTILE, cloud, recorded, write_run
+from test_pipeline import QUICK, SCENE, copy_scene
 
 from colmap_inertial.cli import main
 from colmap_inertial.drivers.capture import reconstruct
@@ -27,8 +28,9 @@ from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import write_json
 from colmap_inertial.model import trajectory_from_model
-from colmap_inertial.options import MappingOptions, ProjectOptions, ReconstructOptions
+from colmap_inertial.options import ProjectOptions, ReconstructOptions
 from colmap_inertial.report import figures, signals, write_report
+from colmap_inertial.report.content import _path_in_words
 from colmap_inertial.report.figure_3d import nice_length, scene_figure
 from colmap_inertial.report.scene import scene_record
 from colmap_inertial.report.series import MOST_POINTS, rounded, strided, thinned
@@ -42,8 +44,6 @@ from colmap_inertial.scale import estimate_scale
 from colmap_inertial.stages.gyro_view import GyroView
 from colmap_inertial.stages.rolling_shutter import RollingShutterStage
 from colmap_inertial.types import CameraModel, CameraTrajectory, FrameTiming, ImuRecording, ScaleDrift, ScaleEstimate
-
-SCENE = Path(__file__).parents[1] / "example_scenes" / "desk"
 
 
 class Page(html.parser.HTMLParser):
@@ -591,22 +591,10 @@ def test_grid_cells_are_round_lengths():
 # The pipeline
 
 
-def first_frames(folder, count):
-    """A copy of the example scene with its first frames only."""
-    shutil.copytree(SCENE, folder)
-    table = folder / "frames.csv"
-    rows = table.read_text().splitlines()
-    table.write_text("\n".join(rows[: count + 1]) + "\n")
-    for row in rows[count + 1 :]:
-        (folder / "frames" / row.split(",")[0]).unlink()
-    return folder
-
-
 def test_reconstruct_writes_it_and_a_continued_run_does_too(tmp_path):
-    capture = first_frames(tmp_path / "capture", 14)
-    quick = ReconstructOptions(mapping=MappingOptions(max_num_features=600, first_octave=0, max_image_size=320))
+    capture = copy_scene(tmp_path / "capture", first=14)
     out = tmp_path / "out"
-    result = reconstruct(capture, out, quick)
+    result = reconstruct(capture, out, QUICK)
     content, page = json.loads((out / "report.json").read_text()), Page(out / "report.html")
     written = json.loads((out / "result.json").read_text())
     assert content["models"][0]["metres_per_unit"] == written["models"][0]["metres_per_unit"]
@@ -620,7 +608,7 @@ def test_reconstruct_writes_it_and_a_continued_run_does_too(tmp_path):
     (out / "result.json").unlink()
     (out / "report.html").unlink()
     shutil.rmtree(out / "sparse", ignore_errors=True)
-    reconstruct(capture, out, quick)
+    reconstruct(capture, out, QUICK)
     assert Page(out / "report.html").anchors() == page.anchors()
 
     again = write_report(out)  # from the folder alone
@@ -628,7 +616,7 @@ def test_reconstruct_writes_it_and_a_continued_run_does_too(tmp_path):
 
 
 def test_a_run_that_stops_says_why(tmp_path):
-    capture = first_frames(tmp_path / "capture", 4)
+    capture = copy_scene(tmp_path / "capture", first=4)
     for path in (capture / "frames").iterdir():
         cv2.imwrite(str(path), np.full((480, 640, 3), 120, np.uint8))
     with pytest.raises(MappingError) as stopped:
@@ -741,3 +729,16 @@ def test_an_existing_project_gets_one_with_and_without_a_scale(project, tmp_path
     assert refused.models[0].scale.verdict == content["outcome"]["verdict"] == "refused"
     assert content["models"][0]["signals"]["rotation"]["after"] is None
     assert "could not be brought together" in page.text
+
+
+def test_a_long_path_is_said_to_bend_and_a_refined_one_how_much_it_did():
+    done = {"stage": "refine", "action": "refined", "values": {"drift": [{"percent": -0.31}, {"percent": 0.2}]}}
+    left = {"stage": "refine", "action": "", "values": {}}
+    for treatments, length, said in (
+        ([], 12.0, []),
+        ([], 85.2, ["Its path is 85 m long: --refine inertial fits the IMU to it, too, against bends and drift."]),
+        ([left], 85.2, []),
+        ([done], 12.0, ["The IMU took drift out of its path: parts of it were stretched by -0.31 to +0.20 %."]),
+    ):
+        model = {"treatments": treatments, "sparse_metric": "sparse/0", "scene": {"path_length": length}}
+        assert _path_in_words(model) == said

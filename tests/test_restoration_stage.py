@@ -1,8 +1,9 @@
 """Frames restored by a network in the pipeline: chosen by name, said in the result, never mixed with other frames."""
 
+import io
 import json
 import sys
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import replace
 
 import cv2
@@ -78,14 +79,23 @@ def pictures(folder):
     return {path.name: cv2.imread(str(path)).astype(int) for path in sorted(folder.iterdir())}
 
 
-def test_the_network_treats_the_frames_that_the_filter_would_and_the_result_says_so(
-    tmp_path, blurred, by_filter, weights, capsys
-):
-    sheet = tmp_path / "sheet.png"
-    with pytest.raises(SystemExit) as stopped:
-        main(["deblur", str(blurred), str(tmp_path / "out"), "--method", "deepgyro", "--sheet", str(sheet)])
-    assert stopped.value.code == 0 and "DeepGyro" in capsys.readouterr().out
-    stored = json.loads((tmp_path / "out" / "result.json").read_text())
+@pytest.fixture(scope="module")
+def by_network(tmp_path_factory, blurred):
+    """What the command makes with the network of ``weights``, and a contact sheet: (folder, what it says)."""
+    root, said = tmp_path_factory.mktemp("by_network"), io.StringIO()
+    small.write_weights(root / "weights", deepgyro=small.mixing(0.5))
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(said), pytest.raises(SystemExit) as stopped:
+        patch.setattr(shipped, "folder", lambda: root / "weights")
+        sheet = root / "sheet.png"
+        main(["deblur", str(blurred), str(root / "out"), "--method", "deepgyro", "--sheet", str(sheet)])
+    assert stopped.value.code == 0
+    return root, said.getvalue()
+
+
+def test_the_network_treats_the_frames_that_the_filter_would_and_the_result_says_so(blurred, by_filter, by_network):
+    root, said = by_network
+    assert "DeepGyro" in said
+    stored = json.loads((root / "out" / "result.json").read_text())
     assert stored["imaging"]["deblur_method"] == "deepgyro"
     assert "the network DeepGyro undoes it" in stored["imaging"]["deblur"]
     before = json.loads(by_filter.workspace.result.read_text())
@@ -94,9 +104,7 @@ def test_the_network_treats_the_frames_that_the_filter_would_and_the_result_says
     for new, old in zip(stored["frames"], before["frames"], strict=True):
         assert (new["name"], new["action"]) == (old["name"], old["action"])
         assert new["blur_px"] == pytest.approx(old["blur_px"], rel=0.02)
-    filmed, filtered, made = map(
-        pictures, (blurred / "frames", by_filter.workspace.images, tmp_path / "out" / "images")
-    )
+    filmed, filtered, made = map(pictures, (blurred / "frames", by_filter.workspace.images, root / "out" / "images"))
     deblurred = {frame["name"] for frame in stored["frames"] if frame["action"] == "deblurred"}
     assert len(deblurred) >= 6
     for name in filmed:
@@ -106,12 +114,11 @@ def test_the_network_treats_the_frames_that_the_filter_would_and_the_result_says
             assert np.abs(made[name] - filmed[name]).max() > 20
         else:
             np.testing.assert_array_equal(made[name], filmed[name])
-    assert cv2.imread(str(sheet)).shape[1] > 2 * LENS.width
+    assert cv2.imread(str(root / "sheet.png")).shape[1] > 2 * LENS.width
 
 
-def test_the_report_says_which_network_it_was(blurred, weights, tmp_path):
-    result = deblur_capture(blurred, tmp_path / "out", method="deepgyro", progress=silent)
-    done = json.loads(result.workspace.result.read_text())
+def test_the_report_says_which_network_it_was(by_network):
+    done = json.loads((by_network[0] / "out" / "result.json").read_text())
     frames = {"names": [frame["name"] for frame in done["frames"]], "t_s": list(range(len(done["frames"])))}
     assert "DeepGyro" in str(_blur(done, {"frames": frames}, project=False)["note"])
 

@@ -29,7 +29,7 @@ from colmap_inertial.report import content
 from colmap_inertial.run.workspace import Workspace
 from colmap_inertial.simulate import ImuOptions, MotionOptions, RecordingOptions, SfmOptions, simulate_recording
 from colmap_inertial.stages import readout
-from colmap_inertial.stages.deblur import DeblurStage
+from colmap_inertial.stages.deblur import MOST_SMOOTHING_PX, DeblurStage, smoothing_for
 from colmap_inertial.stages.gyro_view import GyroView
 from colmap_inertial.stages.join import JoinStage
 from colmap_inertial.stages.metric import MetricStage, gravity_in_model, of_model
@@ -99,7 +99,7 @@ class Joins:
     def __call__(self, model):
         return model
 
-    def join(self, models):
+    def join_models(self, models):
         parts = tuple(
             JoinedPart(
                 **dict.fromkeys(("begin_s", "end_s", "sigma_m", "sigma_deg"), 0.0),
@@ -400,6 +400,10 @@ def test_keypoints_that_were_moved_are_said_to_be_rectified_and_others_are_not()
     left = stage(Keypoints(name="late.jpg", xy_px=xy_px))
     np.testing.assert_array_equal(left.xy_px, xy_px)
     assert not left.rectified
+
+
+def test_long_blur_is_smoothed_for_features_more_than_short_up_to_a_limit():
+    assert smoothing_for(5) < smoothing_for(10) < smoothing_for(30) == smoothing_for(60) == MOST_SMOOTHING_PX
 
 
 @pytest.mark.parametrize(("trusted", "drop", "gone"), [(True, True, True), (None, True, False), (True, False, False)])

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -10,13 +11,14 @@ from colmap_inertial.align import align_camera_imu
 from colmap_inertial.geometry import matrix_from_quat, quat_from_matrix, so3_exp, so3_log
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.options import ScaleOptions
-from colmap_inertial.scale import _factors as fac, _parameters as par, estimate_scale, first_seconds
+from colmap_inertial.scale import _factors as fac, _parameters as par, _setup, estimate_scale, first_seconds
 from colmap_inertial.scale._grouping import first_of_groups, group_frames
-from colmap_inertial.scale._noise import TYPICAL, Expected, roughness
+from colmap_inertial.scale._noise import GROUP_OF, TYPICAL, Expected, roughness
 from colmap_inertial.scale._preintegration import SensorErrors, Track, Tracks, preintegrate
 from colmap_inertial.scale._setup import prepare
 from colmap_inertial.scale._solver import ArrowSystem
-from colmap_inertial.scale.joint import JointOptions, estimate_joint
+from colmap_inertial.scale.joint import JointOptions, estimate_joint, fit_path, scale_of
+from colmap_inertial.scale.priors import PRIORS
 from colmap_inertial.simulate import IMU_PRESETS
 from colmap_inertial.simulate.motion import MotionOptions
 from colmap_inertial.simulate.recording import RecordingOptions, SfmOptions, simulate_recording
@@ -162,6 +164,7 @@ def test_derivatives_of_all_residuals_are_those_of_finite_differences(recording,
         imu_in_cam_m=np.array([0.03, -0.02, 0.01]),
         shutter=1e-5 * rng.standard_normal((4, 3, 3)),
         coupling_m=0.5 * rng.standard_normal((3, 3)),
+        accel_gain=0.05 * rng.standard_normal((3, 3)),
     )
 
     def residuals(moved):
@@ -553,6 +556,78 @@ def test_a_wrong_accelerometer_is_never_trusted(recording, calibration, wrong):
     imu = replace(recording.imu, accel_m_s2=recording.imu.accel_m_s2 @ wrong.T)
     estimate = estimate_joint(recording.trajectory, imu, calibration)
     assert estimate.verdict == "refused"
+
+
+def shaken(seed: int, white_m_s2_rthz: float, slow_m_s2_rts: float, duration_s: float = 40.0):
+    """A recording whose accelerometer has white noise, and errors that stay for half a second, with vibration."""
+    sfm = SfmOptions(position_white_m=0.001, position_correlated_m=0.001)
+    motion = MotionOptions(kind="roam", duration_s=duration_s)
+    recording = simulate_recording(RecordingOptions(motion=motion, sfm=sfm), seed=seed)
+    imu, rng = recording.imu, np.random.default_rng([9, seed])
+    t_s = imu.accel_t_s
+    error = white_m_s2_rthz / np.sqrt(np.median(np.diff(t_s))) * rng.standard_normal((len(t_s), 3))
+    error += np.diff(0.7 * rng.standard_normal((len(t_s) + 1, 3)), axis=0)  # next to nothing at low frequencies
+    slow = slow_m_s2_rts * 0.5 * rng.standard_normal(3)
+    for i, dt_s in enumerate([0.0, *np.diff(t_s)]):
+        keep = np.exp(-dt_s / 0.5)
+        slow = keep * slow + slow_m_s2_rts * 0.5 * np.sqrt(1 - keep**2) * rng.standard_normal(3)
+        error[i] += slow
+    imu = replace(imu, accel_m_s2=imu.accel_m_s2 + error)
+    return recording, imu, align_camera_imu(recording.trajectory, imu)
+
+
+def test_noise_of_the_accelerometer_does_not_look_like_a_smaller_gain():
+    gains = []
+    for seed in range(4):
+        recording, imu, calibration = shaken(seed, 0.1, 0.0)
+        with mock.patch.object(_setup, "PRIORS", replace(PRIORS, accel_gain=0.03)):
+            _, fit, _ = fit_path(recording.trajectory, imu, calibration, JointOptions())
+        assert fit.noise.accel_m_s2_rthz == pytest.approx(0.1, rel=0.2)
+        gains.append(np.trace(fit.estimate.accel_gain) / 3)
+    # noise is a hundredth of the motion's variance, which a regression on the readings takes from the gain
+    assert abs(np.mean(gains)) < 0.006
+
+
+def test_errors_of_a_shaken_accelerometer_that_stay_for_a_while_are_told_from_white_noise():
+    for seed in range(2):
+        recording, imu, calibration = shaken(seed, 0.0, 0.06)
+        data, fit, _ = fit_path(recording.trajectory, imu, calibration, JointOptions())
+        assert fit.noise.accel_slow_m_s2_rts == pytest.approx(0.06, rel=0.35)
+        assert fit.noise.accel_m_s2_rthz < 0.015
+        found = scale_of(fit, data.t_s, False)
+        error = np.log(found.metres_per_unit / recording.truth.metres_per_unit)
+        assert abs(error) < 1.96 * found.sigma_log
+
+
+def test_what_residuals_lose_to_the_fit_is_the_trace_of_a_dense_inverse(recording, calibration):
+    data, prior = prepare(
+        first_seconds(recording.trajectory, 3.0), recording.imu, calibration,
+        gravity_m_s2=9.8, gravity_sigma_m_s2=0.02, states_hz=5.0,
+    )  # fmt: skip
+    k, m, n = len(data.t_s), par.N_STATE, par.N_GLOBALS
+    x = replace(prior.mean, velocity_m_s=0.3 * np.random.default_rng(1).standard_normal((k, 3)))
+    groups = fac.all_groups(data, TYPICAL, prior, x, fac.integrate(data, x), robust=True)
+    system, _, _ = fac.normal_equations(list(groups.values()), prior, x)
+    inverse = system.inverted()
+    dense = np.zeros((k * m + n, k * m + n))
+    for i in range(k):
+        at = slice(i * m, (i + 1) * m)
+        dense[at, at], dense[k * m :, at] = system.diagonal[i], system.border[i].T
+        if i + 1 < k:
+            dense[(i + 1) * m : (i + 2) * m, at] = system.below[i]
+    dense[k * m :, k * m :] = system.corner
+    dense = np.tril(dense) + np.tril(dense, -1).T
+    unit = 1 / np.sqrt(np.diagonal(dense))
+    scaled = dense * unit[:, None] * unit
+    cov = np.linalg.inv(scaled) * unit[:, None] * unit
+    assert np.allclose(inverse.cov, cov[k * m :, k * m :], rtol=1e-6, atol=1e-9 * np.abs(inverse.cov).max())
+    steps = np.eye(k * m + n)
+    for name in set(GROUP_OF.values()):
+        group = groups[name]
+        jacobian = group.apply(steps[: k * m].reshape(k, m, -1), steps[k * m :])
+        after = np.einsum("kri,ij,ksj->krs", jacobian, cov, jacobian)
+        share = np.eye(after.shape[1]) if group.share is None else group.share
+        assert group.explained(inverse) == pytest.approx(np.sum(after * share), rel=1e-6), name
 
 
 def test_a_wrong_gain_is_named():

@@ -15,7 +15,7 @@ from colmap_inertial.scale._drift import chi2_tail
 from colmap_inertial.scale._preintegration import Preintegrated, SensorErrors, Track, Tracks, preintegrate
 from colmap_inertial.scale._solver import ArrowSystem
 
-SIZES = [(1, 18, 79, 1), (2, 18, 79, 5), (3, 18, 79, 5), (3, 5, 4, 2), (2, 7, 0, 3), (40, 1, 1, 9), (480, 18, 79, 5)]
+SIZES = [(1, 21, 79, 1), (2, 21, 79, 5), (3, 21, 79, 5), (3, 5, 4, 2), (2, 7, 0, 3), (40, 1, 1, 9), (480, 21, 79, 5)]
 
 
 def random_system(rng, states: int, size: int, n_globals: int) -> ArrowSystem:
@@ -58,7 +58,7 @@ def test_arrow_systems_are_solved_as_by_lapack(sizes):
 
 
 @pytest.mark.parametrize("instruction_set", _inertial.instruction_sets())
-@pytest.mark.parametrize("sizes", [(30, 18, 79, 5), (9, 5, 4, 2), (8, 13, 20, 3)], ids=str)
+@pytest.mark.parametrize("sizes", [(30, 21, 79, 5), (9, 5, 4, 2), (8, 13, 20, 3)], ids=str)
 def test_every_instruction_set_eliminates_and_substitutes_alike(instruction_set, sizes):
     k, m, n, q = sizes
     system, rhs, _ = with_sides(np.random.default_rng(1), *sizes)
@@ -82,6 +82,13 @@ def test_every_instruction_set_eliminates_and_substitutes_alike(instruction_set,
     sides = rhs * unit[:, :, None]
     factor.substitute(sides)
     assert close(sides.reshape(k * m, q), np.linalg.solve(dense, scaled))
+    truth = np.linalg.inv(dense).reshape(k, m, k, m)
+    here, beside = np.empty((k, m, m)), np.empty((k - 1, m, m))
+    factor.selected_inverse(here, beside)
+    assert close(here, np.stack([truth[i, :, i] for i in range(k)]))
+    assert close(beside, np.stack([truth[i, :, i + 1] for i in range(k - 1)]))
+    with pytest.raises(ValueError, match="size of the chain"):
+        factor.selected_inverse(beside, here)
 
 
 @pytest.mark.parametrize("instruction_set", ["", *_inertial.instruction_sets()])
@@ -90,7 +97,7 @@ def test_every_instruction_set_eliminates_and_substitutes_alike(instruction_set,
 )
 def test_information_of_residuals_is_added_as_by_numpy(instruction_set, rows, with_after, n_globals):
     rng = np.random.default_rng(8)
-    states, size, first, column = 37, 18, 2, 3
+    states, size, first, column = 37, 21, 2, 3
     here, after = rng.standard_normal((2, states, rows, size))
     z = rng.standard_normal((states, rows, n_globals)) if n_globals else None
     system, truth = (random_system(np.random.default_rng(9), 40, size, n_globals + 4) for _ in range(2))

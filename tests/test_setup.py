@@ -88,3 +88,22 @@ def test_the_set_up_knows_which_extras_are_there(checkout):
     assert asked("view") == ".[dev,view]"
     os.utime(checkout / "pyproject.toml", (2**31, 2**31))
     assert asked("dev") == ".[dev,view]"
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler here")
+@pytest.mark.parametrize("extra", ["complete", "mesh", "dev"])
+def test_the_set_up_installs_what_open3d_takes_from_the_system(checkout, tmp_path, extra):
+    tools = tmp_path / "tools"
+    tools.mkdir()
+    written = {
+        "python3.11": f'case "$*" in *libGL.so.1*|*libX11.so.6*) exit 1;; esac\nexec {sys.executable} "$@"\n',
+        "apt-get": f'echo "$*" >>{tmp_path}/apt.txt\n',
+        "sudo": 'shift\nexec "$@"\n',
+    }
+    for name, text in written.items():
+        (tools / name).write_text("#!/bin/sh\n" + text)
+        (tools / name).chmod(0o755)
+    env = os.environ | {"PATH": f"{tools}:{os.environ['PATH']}"}
+    subprocess.run(["bash", "scripts/setup.sh", extra], cwd=checkout, env=env, check=True, capture_output=True)
+    asked = (tmp_path / "apt.txt").read_text() if (tmp_path / "apt.txt").exists() else ""
+    assert ("libgl1" in asked.split() and "libx11-6" in asked.split()) == (extra != "dev")

@@ -1,11 +1,23 @@
 """What a check proves: length errors, scale bars, check points, the target's own uncertainty."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from colmap_inertial.errors import FormatError, NotObservableError
+from colmap_inertial.drivers.sources import validate_source
+from colmap_inertial.errors import FormatError, InertialError, NotObservableError
 from colmap_inertial.geometry import quat_exp, quat_rotate
-from colmap_inertial.validate import Corner, Distance, TargetSpecError, Validation, parse_target, with_bars
+from colmap_inertial.options import ValidateOptions
+from colmap_inertial.validate import (
+    Corner,
+    Distance,
+    TargetSpecError,
+    Validation,
+    parse_target,
+    with_bars,
+    with_other_target,
+)
 from colmap_inertial.validate.lengths import check_lengths, model_diagonal
 from colmap_inertial.validate.markers import distance_between, with_check_points
 
@@ -75,6 +87,42 @@ def test_check_points_leave_the_models_own_error(tmp_path):
     table.write_text("\n".join(["marker,x,y,z", *rows[:3]]).replace(",0.002", "") + "\n")
     with pytest.raises(NotObservableError, match="3 check points; 4 are needed"):
         with_check_points(validated(), table)
+
+
+def board(spec, middle, scale=1.0, *, left_out=()):
+    """A board around a place in metres, in a model whose unit is 1/scale metres."""
+    target = parse_target(spec)
+    at = quat_rotate(quat_exp(np.array([0.3, -0.2, 0.5])), target.corners_m) + middle
+    corners = [Corner(name=target.label(i), in_model=place / scale) for i, place in enumerate(at) if i not in left_out]
+    return replace(validated(scale), target=target, corners=tuple(corners))
+
+
+def test_the_distance_between_two_boards_is_a_length_to_check_by():
+    first = board("checkerboard:8x6:0.03", [0.2, 0.1, 0.0], left_out=range(9))
+    other = board("checkerboard:9x6:0.05", [0.2, 4.1, 3.0], left_out=(0, 1, 2))
+    apart = with_other_target(first, other, 5.01, 0.002).apart
+    assert (apart.other, apart.known_m, apart.sigma_m) == ("checkerboard:9x6:0.05", 5.01, 0.002)
+    assert apart.measured == pytest.approx(5) and apart.residual_m == pytest.approx(-0.01)
+    unscaled = replace(board("checkerboard:8x6:0.03", [0.2, 0.1, 0.0], 0.5), unscaled=True)
+    assert with_other_target(unscaled, board("checkerboard:9x6:0.05", [0.2, 4.1, 3.0], 0.5), 5.0).apart.measured == 10
+    with pytest.raises(NotObservableError, match="too few corners of checkerboard:8x6"):
+        with_other_target(board("checkerboard:8x6:0.03", [0, 0, 0], left_out=range(3, 48)), other, 5.0)
+
+
+@pytest.mark.parametrize(
+    ("target", "other", "words"),
+    [
+        ("checkerboard:8x6:0.03", ("checkerboard:8x6:0.03", "4"), "must be another board"),
+        ("aruco:DICT_4X4_50:0.1", ("checkerboard:8x6:0.03", "4"), "go into --bars"),
+        ("checkerboard:8x6:0.03", ("checkerboard:9x6:0.03", "four"), "write metres between"),
+        ("checkerboard:8x6:0.03", ("checkerboard:9x6:0.03", "4+-5"), "write metres between"),
+    ],
+)
+def test_a_second_board_that_cannot_be_used_is_refused_before_the_search(tmp_path, target, other, words):
+    for name in ("cameras", "images", "points3D"):
+        (tmp_path / f"{name}.txt").write_text("")
+    with pytest.raises(InertialError, match=words):
+        validate_source(tmp_path, tmp_path, target, ValidateOptions(), other=other)
 
 
 def test_the_distance_of_two_markers():

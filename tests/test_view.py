@@ -28,8 +28,9 @@ from colmap_inertial.model.similarities import plain_factor
 from colmap_inertial.types import ScaleEstimate, Similarity
 from colmap_inertial.view import load_scene, measured, nearest_to_ray, round_length
 from colmap_inertial.view.clouds import dense_cloud, read_mesh
+from colmap_inertial.view.drawing import AMBER, BLUE, path_colours
 from colmap_inertial.view.measure import ball_at_ray, length_text
-from colmap_inertial.view.panel import camera_text, measured_text, scale_text, target_text
+from colmap_inertial.view.panel import camera_text, contents_text, measured_text, scale_text, target_text
 from colmap_inertial.view.scene import START_FOV_RAD
 from colmap_inertial.view.sources import TargetFacts
 
@@ -253,6 +254,27 @@ def test_the_target_has_its_corners_lines_and_known_distances(out):
     assert "| 100.0 | 101.00 | 3 |" in target_text(scene.target)
     old = dataclasses.replace(scene.target, corners={})
     assert "not in this result" in target_text(old)
+
+
+def test_the_path_says_where_the_refinement_stretched_it(tmp_path):
+    write_result(tmp_path, [ESTIMATE])
+    rows = [f"{100 + t:.6f} {t} 0 0 0 0 0 1" for t in range(21)]
+    (tmp_path / "trajectory.tum").write_text("\n".join(rows) + "\n")
+    path = tmp_path / "result.json"
+    record = json.loads(path.read_text())
+    drift = [{"begin_s": b, "end_s": b + 10, "percent": p, "sigma_percent": 0.1} for b, p in ((50, -0.4), (60, 0.2))]
+    done = {"stage": "refine", "reason": "refined", "action": "refined", "values": {"drift": drift}}
+    record["models"][0] |= {"trajectory": "trajectory.tum", "treatments": [done]}
+    path.write_text(json.dumps(record))
+    scene = load_scene(tmp_path)
+    assert scene.path_percent[:, 0] == pytest.approx(np.interp(np.arange(20), [5, 15], [-0.4, 0.2]))
+    colours = path_colours(scene.path_percent)
+    assert colours.shape == scene.path.shape
+    assert tuple(colours[0, 0]) == BLUE and colours[-1, 1, 0] > colours[10, 0, 0] - 10
+    assert "by up to 0.4 %" in contents_text(scene)
+    record["models"][0]["treatments"] = []
+    path.write_text(json.dumps(record))
+    assert load_scene(tmp_path).path_percent is None and path_colours(None) == AMBER
 
 
 def test_the_largest_model_is_shown_unless_another_is_asked_for(tmp_path):

@@ -6,10 +6,13 @@ from numpy.typing import NDArray
 from colmap_inertial.types import Array
 
 class ArrowFactor:
-    """Cholesky factor of a chain of states."""
+    """Cholesky factor of a chain of states, its rows and columns scaled by `unit`."""
 
     def substitute(self, sides: Array) -> None:
         """Solve for `sides` (K, m, q) in place; the matrix is the one with its rows and columns scaled by `unit`."""
+
+    def selected_inverse(self, diagonal: Array, right: Array) -> None:
+        """The inverse's blocks on the diagonal (K, m, m) and to the right of it (K - 1, m, m), scaled likewise."""
 
 def eliminate(
     diagonal: Array,

@@ -211,6 +211,40 @@ void substitute(const Chain &chain, const Factor &factor, double *x) {
     }
 }
 
+size_t inverse_work(const Chain &chain) { return size_t(5 * chain.size * padded(chain.size)); }
+
+// With X = U_k^-1 right_k and the inverse N of the block after: -X N to the right, (U_k' U_k)^-1 + X N X' here (Takahashi,
+// Fagan and Chin 1973).
+void selected_inverse(const Chain &chain, const Factor &factor, double *diagonal, double *right, double *work) {
+    const ptrdiff_t m = chain.size, pitch = padded(m), block = m * pitch;
+    double *here = work, *next = work + block, *tie = work + 2 * block, *turned = work + 3 * block;
+    double *beside = work + 4 * block;
+    for (ptrdiff_t k = chain.states - 1; k >= 0; --k) {
+        const double *upper = factor.diagonal + k * block;
+        memset(here, 0, size_t(block) * sizeof(double));
+        for (ptrdiff_t i = 0; i < m; ++i) here[i * pitch + i] = 1;
+        solve_forward(upper, pitch, here, pitch, m, pitch);
+        solve_backward(upper, pitch, here, pitch, m, pitch);
+        if (k + 1 < chain.states) {
+            memcpy(tie, factor.right + k * block, size_t(block) * sizeof(double));
+            solve_backward(upper, pitch, tie, pitch, m, pitch);
+            memset(beside, 0, size_t(block) * sizeof(double));
+            subtract_product(beside, pitch, Matrix{tie, pitch, 1}, next, pitch, m, m, pitch);
+            memset(turned, 0, size_t(block) * sizeof(double));
+            for (ptrdiff_t i = 0; i < m; ++i)
+                for (ptrdiff_t j = 0; j < m; ++j) turned[i * pitch + j] = tie[j * pitch + i];
+            subtract_product(here, pitch, Matrix{beside, pitch, 1}, turned, pitch, m, m, pitch);
+            for (ptrdiff_t i = 0; i < m; ++i)
+                memcpy(right + (k * m + i) * m, beside + i * pitch, size_t(m) * sizeof(double));
+        }
+        for (ptrdiff_t i = 0; i < m; ++i)
+            memcpy(diagonal + (k * m + i) * m, here + i * pitch, size_t(m) * sizeof(double));
+        double *swapped = here;
+        here = next;
+        next = swapped;
+    }
+}
+
 // to[i * to_row + j] -= from[i * from_row + j]
 void subtract(double *__restrict to, ptrdiff_t to_row, const double *__restrict from, ptrdiff_t from_row,
               ptrdiff_t rows, ptrdiff_t columns) {
@@ -266,4 +300,5 @@ void add_rows(const Rows &rows, const Sums &sums, double *work) {
 
 }  // namespace
 
-extern const ArrowSimd JOIN(arrow_, SIMD) = {TEXT(SIMD), work, eliminate, substitute, rows_work, add_rows};
+extern const ArrowSimd JOIN(arrow_, SIMD) = {
+    TEXT(SIMD), work, eliminate, substitute, inverse_work, selected_inverse, rows_work, add_rows};

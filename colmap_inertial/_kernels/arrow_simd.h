@@ -47,6 +47,11 @@ struct ArrowSimd {
     bool (*eliminate)(const Chain &chain, const Factor &factor, double *products, double *work);
     // Solves U' U x = b in place: (K, m, padded(q)).
     void (*substitute)(const Chain &chain, const Factor &factor, double *x);
+    // Doubles of memory, aligned to 64 bytes, that selected_inverse needs.
+    size_t (*inverse_work)(const Chain &chain);
+    // The blocks of the inverse of U' U where the chain has blocks: on the diagonal (K, m, m), to the right of it
+    // (K - 1, m, m).
+    void (*selected_inverse)(const Chain &chain, const Factor &factor, double *diagonal, double *right, double *work);
     // Doubles of memory, aligned to 64 bytes, that add_rows needs.
     size_t (*rows_work)(const Rows &rows);
     // Adds the information of residuals: the products of their derivatives.

@@ -75,6 +75,15 @@ class ArrowFactor {
             for (ptrdiff_t j = 0; j < q; ++j) values[i * q + j] = x.get()[i * pitch + j];
     }
 
+    void selected_inverse(Out<3> diagonal, Out<3> right) const {
+        const size_t k = size_t(chain_.states), m = size_t(chain_.size);
+        check(is(diagonal, k, m, m) && is(right, k - 1, m, m), "diagonal, right: not of the size of the chain");
+        double *here = diagonal.data(), *beside = right.data();
+        nb::gil_scoped_release release;
+        const Memory work = memory_for(simd_.inverse_work(chain_));
+        simd_.selected_inverse(chain_, factor(), here, beside, work.get());
+    }
+
    private:
     Chain chain_;  // its sizes
     const ArrowSimd &simd_;
@@ -220,7 +229,9 @@ std::vector<std::string> instruction_sets() {
 
 NB_MODULE(_inertial, module) {
     nb::class_<ArrowFactor>(module, "ArrowFactor")
-        .def("substitute", &ArrowFactor::substitute, nb::arg("sides").noconvert());
+        .def("substitute", &ArrowFactor::substitute, nb::arg("sides").noconvert())
+        .def("selected_inverse", &ArrowFactor::selected_inverse, nb::arg("diagonal").noconvert(),
+             nb::arg("right").noconvert());
     module.def("eliminate", &eliminate_chain, nb::rv_policy::take_ownership, nb::arg("diagonal"), nb::arg("below"),
                nb::arg("border"), nb::arg("rhs"), nb::arg("unit"), nb::arg("products").noconvert(), nb::kw_only(),
                nb::arg("instruction_set") = "");

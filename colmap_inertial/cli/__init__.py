@@ -71,6 +71,7 @@ _COMMON: dict[str, tuple[str, ...]] = {
     "align": ("imu", "frame_times", "out", "remember"),
     "diagnose": ("imu", "frame_times", "json"),
     "validate": ("images", "target", "tolerance", "pictures"),
+    "calibrate-imu": ("out", "latitude_deg", "height_m", "remember"),
     "apply": ("scale", "factor", "sim3", "undo", "world"),
     "export": ("program", "images", "model"),
 }
@@ -96,7 +97,7 @@ def parse(args: Sequence[str]) -> Command:
     if name in _COMMANDS and any(word in _HELP for word in args[1:]):
         titles = {
             ProjectOptions: "An existing COLMAP project in place of a capture",
-            ReferenceOptions: "Metres of an existing project without an IMU",
+            ReferenceOptions: "Metres without an IMU",
         }
         print_help(name, _COMMANDS[name], _COMMON.get(name, ()), titles, Speaker)
         sys.exit(0)

@@ -42,8 +42,8 @@ class Reconstruct(Speaker):
     """
 
     capture: Positional[Path]
-    """A capture.toml, a folder that holds one, an EuRoC/ASL dataset, or a COLMAP project; with --scale-from target or
-    distance also a folder of pictures or a video."""
+    """A capture.toml or a folder that holds one; a video or a recorder's folder with the IMU in it (GoPro, phones); an
+    EuRoC/ASL dataset; or a COLMAP project. With --scale-from target or distance also pictures or a video without."""
     out: Positional[Path]
     """A new folder for everything that is made, or that of an earlier run on the same, which is gone on with."""
     project: Annotated[ProjectOptions, arg(name="")] = dataclasses.field(default_factory=ProjectOptions)

@@ -187,6 +187,7 @@ _TITLES = {
     "exposures": "Pairs of exposures",
     "mapping": "How COLMAP builds the model",
     "scale": "How metres come from the IMU",
+    "join-options": "How sure a join by the IMU must be",
     "dense-options": "Dense reconstruction",
     "limits": "How large files may be",
 }

@@ -34,7 +34,8 @@ class Scale(Reader):
     """
 
     source: Positional[Path]
-    """COLMAP model folder, TUM trajectory, or InertialScale folder."""
+    """COLMAP model folder, trajectory in TUM format (a text file of t x y z qx qy qz qw), or InertialScale folder (text
+    files of camera and IMU)."""
     imu: Path | None = None
     """IMU recording: a file or folder of a known format, or a capture.toml."""
     frame_times: Path | None = None
@@ -188,7 +189,8 @@ class Align(Reader):
     """
 
     source: Positional[Path]
-    """COLMAP model folder, TUM trajectory, or InertialScale folder."""
+    """COLMAP model folder, trajectory in TUM format (a text file of t x y z qx qy qz qw), or InertialScale folder (text
+    files of camera and IMU)."""
     out: Path
     """Where to write the calibration (JSON)."""
     imu: Path | None = None
@@ -268,7 +270,8 @@ class Diagnose(Reader):
     """
 
     source: Positional[Path]
-    """A capture, COLMAP model folder, TUM trajectory, InertialScale folder, or IMU recording."""
+    """What would be reconstructed: a capture.toml, a video or a recorder's folder. Or an IMU recording alone; or a
+    COLMAP model folder, TUM trajectory or InertialScale folder."""
     imu: Path | None = None
     """IMU recording of a model or trajectory: a file or folder of a known format, or a capture.toml."""
     frame_times: Path | None = None
@@ -322,6 +325,8 @@ class Validate(Reader):
     """Scale bars: a CSV with marker_a,marker_b,length_m of single markers and, where known, sigma_m."""
     check_points: Path | None = None
     """Check points: a CSV with marker,x,y,z of single markers in metres and, where known, sigma_m."""
+    other_target: tuple[str, str] | None = None
+    """A second board in the scene, as of --target, and the metres between the middles of both, as in 4.03+-0.002."""
 
     def __post_init__(self) -> None:
         if not 0 < self.tolerance < 100:
@@ -342,6 +347,7 @@ class Validate(Reader):
             apply=self.apply,
             bars=self.bars,
             check_points=self.check_points,
+            other=self.other_target,
         )
         self.tell(lambda: show_validation(result), result.as_json(), written=True)
         return 0 if result.within_tolerance else 1

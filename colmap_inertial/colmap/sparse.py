@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 #: Up to this many images every pair is matched; above it, neighbours in time.
 _EXHAUSTIVE_UP_TO = 150
 _EXTRACTION_BATCH = 16
-#: Each batch reads its images' features anew; the first are small, so that one sees soon how quickly it goes.
+#: Each batch indexes its images' features anew, an image as dear as a pair; the first are small, so that one sees soon
+#: how quickly it goes.
 _FIRST_MATCHING_BATCH, _MATCHING_BATCH = 100, 1600
 #: What a feature takes in the database at most, several orientations and SQLite's log included; likewise a pair.
 _FEATURE_BYTES = 500
@@ -181,9 +182,9 @@ def _batches(items: Sequence[str], size: int) -> list[list[str]]:
     return [list(items[i : i + size]) for i in range(0, len(items), size)]
 
 
-def growing_batches(pairs: Sequence[str]) -> list[list[str]]:
+def growing_batches(pairs: Sequence[str], *, first: int = _FIRST_MATCHING_BATCH) -> list[list[str]]:
     """Pairs in batches to match, each twice as large as the one before, up to a limit."""
-    batches, begin, size = [], 0, _FIRST_MATCHING_BATCH
+    batches, begin, size = [], 0, first
     while begin < len(pairs):
         batches.append(list(pairs[begin : begin + size]))
         begin, size = begin + size, min(2 * size, _MATCHING_BATCH)
@@ -260,7 +261,8 @@ def match_pairs(
     lines = [f"{a} {b}" for a, b in pairs]
     with tempfile.TemporaryDirectory() as folder:
         listed = Path(folder) / "pairs.txt"
-        for batch in growing_batches(lines):
+        # how quickly it goes is seen already where some are matched
+        for batch in growing_batches(lines, first=_MATCHING_BATCH if done else _FIRST_MATCHING_BATCH):
             context.progress("matches", done, total)
             require_room(database.parent, len(batch) * _PAIR_BYTES)
             listed.write_text("\n".join(batch) + "\n")

@@ -5,7 +5,10 @@ Depth maps are brought in one by one, so that memory grows with the surface and 
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -38,7 +41,9 @@ _BLOCK, _BLOCKS, _MOST_BLOCKS = 8, 10_000, 400_000
 
 
 def require_mesh_maker(options: ReconstructOptions) -> None:
-    """Load Open3D where it is to make the mesh: what is missing is said before the work.
+    """See whether Open3D can be loaded where it is to make the mesh: what is missing is said before the work.
+
+    In a process of its own: it takes 200 MB, which COLMAP may need until the mesh is made.
 
     Raises
     ------
@@ -48,19 +53,33 @@ def require_mesh_maker(options: ReconstructOptions) -> None:
         Where it is, but a library of the system is missing.
     """
     if options.dense and options.dense_options.mesh == "tsdf":
-        _open3d()
+        if find_spec("open3d") is None:
+            raise _missing()
+        tried = subprocess.run(
+            [sys.executable, "-c", "import open3d"], capture_output=True, text=True, errors="replace"
+        )
+        if tried.returncode:
+            raise _unloadable((tried.stderr.strip().splitlines() or [f"exit code {tried.returncode}"])[-1])
+
+
+def _missing() -> MissingExtraError:
+    return MissingExtraError("mesh", "dense_options.mesh tsdf is made by open3d")
+
+
+def _unloadable(why: str) -> InertialError:
+    return InertialError(
+        f"open3d cannot be loaded ({why}); on Debian: apt install libusb-1.0-0 libgl1 libgomp1 libx11-6, or take "
+        "--dense-options.mesh poisson"
+    )
 
 
 def _open3d() -> ModuleType:
     try:
         import open3d
     except ModuleNotFoundError:
-        raise MissingExtraError("mesh", "dense_options.mesh tsdf is made by open3d") from None
+        raise _missing() from None
     except (ImportError, OSError) as error:
-        raise InertialError(
-            f"open3d cannot be loaded ({error}); on Debian: apt install libusb-1.0-0 libgl1 libgomp1 libx11-6, or take "
-            "--dense-options.mesh poisson"
-        ) from error
+        raise _unloadable(str(error)) from error
     return open3d
 
 

@@ -6,7 +6,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from colmap_inertial.align import Alignment
 from colmap_inertial.diagnose.findings import Finding, Recorded, Severity
+from colmap_inertial.errors import NotObservableError
+from colmap_inertial.gyro import on_camera_rate
+from colmap_inertial.imaging.gyro_camera import GyroCamera
+from colmap_inertial.shutter import ReadoutEstimate, estimate_readout
 
 #: Frames come evenly where this share of their intervals is the usual one to within this; keyframes do not.
 _EVEN_SHARE, _EVEN = 0.8, 0.1
@@ -96,14 +101,45 @@ def check_exposure(recorded: Recorded) -> Iterator[Finding]:
 
 
 def check_readout(recorded: Recorded) -> Iterator[Finding]:
-    """A capture that does not say how its shutter runs."""
-    if recorded.is_capture and recorded.timing is not None and recorded.timing.readout_s is None:
+    """A capture that does not say how its shutter runs; where the pictures show it, how long it takes."""
+    if not recorded.is_capture or recorded.timing is None or recorded.timing.readout_s is not None:
+        return
+    evidence = "nothing says whether the camera has a rolling shutter, as nearly all phones do"
+    try:
+        found = _readout(recorded)
+    except NotObservableError as error:
         yield Finding(
             code="readout-unknown",
             severity="warning",
-            evidence="nothing says whether the camera has a rolling shutter, as nearly all phones do",
+            evidence=f"{evidence}; {error.hint}",
             advice="give readout_s under [timing] in capture.toml (0 for a global shutter), so that it is undone",
         )
+        return
+    lines = f"readout_s = {found.readout_s:.4f}"
+    if found.direction != "down":
+        lines += f' and readout_direction = "{found.direction}"'
+    yield Finding(
+        code="readout-unknown",
+        severity="warning",
+        evidence=f"{evidence}; by the pictures and the gyroscope, reading a frame takes {found}"
+        + ("" if found.readout_s else ", as a global shutter"),
+        advice=f"write {lines} under [timing] in capture.toml, so that it is undone",
+        numbers={"readout_s": found.readout_s, "readout_sigma_s": found.sigma_s, "pairs": float(found.pairs)},
+    )
+
+
+def _readout(recorded: Recorded) -> ReadoutEstimate:
+    """By what was followed from frame to frame, and the gyroscope as it was aligned."""
+    rotation, aligned, imu = recorded.rotation, recorded.aligned, recorded.imu
+    if rotation is not None and not recorded.is_dense:
+        raise NotObservableError("readout", "pictures that are this far apart in time do not tell it; a video does")
+    if rotation is None or imu is None or not isinstance(aligned, Alignment):
+        raise NotObservableError("readout", "a video and its gyroscope would tell, where they fit each other")
+    if recorded.stabilisation is not None and recorded.stabilisation.stabilised:
+        raise NotObservableError("readout", "a stabilised video tells nothing of it")
+    settled = aligned.settled()
+    kept = on_camera_rate(imu, settled, camera_epoch_ns=rotation.epoch_ns)
+    return estimate_readout(rotation, GyroCamera.of(kept, settled, camera_epoch_ns=rotation.epoch_ns))
 
 
 def check_cut_from_video(recorded: Recorded) -> Iterator[Finding]:

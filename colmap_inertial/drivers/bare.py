@@ -33,7 +33,7 @@ from colmap_inertial.options import ProjectOptions, ReconstructOptions, Referenc
 from colmap_inertial.run.context import RunContext
 from colmap_inertial.run.progress import Progress, silent
 from colmap_inertial.run.session import keep_colmap_quiet
-from colmap_inertial.run.workspace import require_apart
+from colmap_inertial.run.workspace import a_record_of_ours, require_apart
 from colmap_inertial.stages.frame_folder import encode_image, require_frames
 
 #: Of a video, so many frames a second, where its capture does not say.
@@ -114,7 +114,9 @@ def _is_mapped(out: Path, made_from: dict[str, object]) -> bool:
     shutil.rmtree(out / "metric", ignore_errors=True)
     if {path.name for path in out.iterdir()} != {"colmap"}:
         return False
-    known = read_json(record)
+    with a_record_of_ours(record):
+        known = read_json(record)
+        list(map(int, known["left_out"]))
     if any(known.get(key) != value for key, value in made_from.items()):
         raise OutputExistsError(f"{out} holds a model of other pictures or options; choose another folder or remove it")
     return True
@@ -191,7 +193,7 @@ def _written(capture: Capture, names: list[str], images: Path) -> Iterator[None]
         for name in names:
             target = path_in(images, name)
             target.parent.mkdir(parents=True, exist_ok=True)
-            copy_file(capture.frames.folder / name, target)
+            copy_file(path_in(capture.frames.folder, name), target)
             yield
         return
     images.mkdir(parents=True)

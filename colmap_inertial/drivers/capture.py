@@ -11,7 +11,7 @@ from colmap_inertial.colmap.sparse import check_pair_names, mapping_device
 from colmap_inertial.colmap.steps import run_colmap
 from colmap_inertial.colmap.tsdf import require_mesh_maker
 from colmap_inertial.diagnose import Diagnosis
-from colmap_inertial.drivers.frames import ask_for_plan, fusing, run_frames, run_images, run_plan
+from colmap_inertial.drivers.frames import as_refined, ask_for_plan, fusing, run_frames, run_images, run_plan
 from colmap_inertial.drivers.georeference import positions_of, run_georeference
 from colmap_inertial.drivers.models import run_dense_models, run_models, run_validation
 from colmap_inertial.drivers.reporting import report_result, reporting_stops, write_recording
@@ -214,11 +214,16 @@ def _reconstruct(
         plain_imu = corrected_imu(loaded, raw.imu, None)
         seen = Recording.of(loaded, plain_imu, used_timing, prior_calibration(loaded, None))
         keypoints, matching = run_colmap(session, seen, records, of_keypoints, gravity, options)
-        images = run_images(session, records, keypoints.rectified(), of_keypoints)
         of_models = with_defaults(model_stages, default_model_stages(recording, options, of_keypoints))
+        # images agree with the model as it is in the end
+        refining = any(isinstance(stage, RefineStage) and stage.shutter is not None for stage in of_models)
+        if not refining:
+            images = run_images(session, records, keypoints.rectified(), of_keypoints)
         models, fragments, gaps = run_models(
             session, recording, of_models, rectified=bool(keypoints.rectified()), fragments=options.fragments
         )
+        if refining:
+            images = run_images(session, records, keypoints.rectified(), as_refined(of_keypoints, models))
         models = run_validation(session, models, target, images)
         models = run_georeference(session, models, fixes, recording.timing, options.world)
         if options.dense:

@@ -8,8 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from colmap_inertial.drivers.contact_sheet import CropKeeper
+from colmap_inertial.drivers.result import ModelResult
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.frames import frame_source
+from colmap_inertial.model import read_model
 from colmap_inertial.options import ApertureOptions, ReconstructOptions
 from colmap_inertial.precalibrate.plan import ImagingPlan, Treatments, plan_imaging, read_plan, write_plan
 from colmap_inertial.restoration.shipped import checksum
@@ -21,7 +23,8 @@ from colmap_inertial.stages.apertures import ApertureStage
 from colmap_inertial.stages.frame_folder import FrameRecord, read_frame_records, write_frames
 from colmap_inertial.stages.protocols import FrameStage, KeypointStage
 from colmap_inertial.stages.rectified import image_movers, write_images
-from colmap_inertial.types import Frame
+from colmap_inertial.stages.rolling_shutter import RollingShutterStage
+from colmap_inertial.types import CameraModel, Frame
 
 log = logging.getLogger(__name__)
 
@@ -109,6 +112,28 @@ def fusing(capture: Capture, workspace: Workspace, options: ApertureOptions) -> 
     if keep is None:
         remove(workspace.apertures)
     return [ApertureStage(pictures=capture.apertures, options=options, keep=keep)]
+
+
+def as_refined(stages: Sequence[KeypointStage], models: Sequence[ModelResult]) -> list[KeypointStage]:
+    """The stages with clocks, readout and camera as the largest model that was refined has them."""
+    for model in models:
+        said = next((one for one in model.treatments if one.stage == "refine" and one.action), None)
+        if said is None or model.sparse_metric is None or model.scale.calibration is None:
+            continue
+        readout_s = said.values["readout_s"]
+        assert isinstance(readout_s, float)
+        cameras = read_model(model.sparse_metric).cameras
+        camera = cameras[min(cameras)]
+        intrinsics = CameraModel(
+            model=camera.model.name, width=camera.width, height=camera.height, params=tuple(camera.params)
+        )
+        return [
+            stage.refined(model.scale.calibration, readout_s, intrinsics)
+            if isinstance(stage, RollingShutterStage)
+            else stage
+            for stage in stages
+        ]
+    return list(stages)
 
 
 def run_images(

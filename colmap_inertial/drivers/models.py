@@ -241,7 +241,7 @@ def _through_stages(
 def _joined(joining: JoiningStage, begun: Sequence[_Begun], *, numbered: bool) -> tuple[list[_Begun], tuple[Gap, ...]]:
     """What a stage makes of all models at once, the largest first; what was joined into one leaves its numbers free."""
     of_number = {one.colmap_index: one for one, _ in begun}
-    models, gaps = joining.join([model for _, model in begun if model is not None])
+    models, gaps = joining.join_models([model for _, model in begun if model is not None])
     left: list[_Begun] = [(one, None) for one, model in begun if model is None]
     for model in models:
         one = of_number[model.colmap_index]

@@ -208,10 +208,13 @@ def _place(text: str, validation: Validation | None) -> tuple[Array, float]:
     parts = text.split(",")
     if len(parts) == 3:
         try:
-            return np.array([float(part) for part in parts]), 0.0
+            place = np.array([float(part) for part in parts])
         except ValueError:
-            raise InertialError(f'--between "{text}": a point is x,y,z in the units of the model') from None
-    if not text.isdecimal():
+            place = np.full(3, np.nan)
+        if not np.isfinite(place).all():
+            raise InertialError(f'--between "{text}": a point is x,y,z in the units of the model')
+        return place, 0.0
+    if not text.isdecimal() or len(text) > 9:
         raise InertialError(f'--between "{text}": write the number of a marker, or a point as x,y,z')
     if validation is None or validation.target.kind != "aruco":
         raise InertialError(_NO_MARKERS)

@@ -31,6 +31,7 @@ from colmap_inertial.validate import (
     validate_model,
     with_bars,
     with_check_points,
+    with_other_target,
     write_overlays,
 )
 
@@ -282,6 +283,7 @@ def validate_source(
     apply: Path | None = None,
     bars: Path | None = None,
     check_points: Path | None = None,
+    other: tuple[str, str] | None = None,
 ) -> Validation:
     """Measure a target in a model and write what was found.
 
@@ -297,6 +299,9 @@ def validate_source(
         Where to write the model in metres, scaled by the control distances; for a model without a unit only.
     bars, check_points
         Tables of distances between markers, and of their coordinates.
+    other
+        Specification of a second target in the scene, and the metres between the middles of both, as ``4.03`` or
+        ``4.03+-0.002`` with how well they are known.
 
     Raises
     ------
@@ -315,7 +320,14 @@ def validate_source(
     folder = only_model(model)
     if (bars is not None or check_points is not None) and parsed.kind != "aruco":
         raise InertialError("--bars and --check-points name markers: give a target of markers, as aruco:DICT:SIDE_M")
+    second = None if other is None else (parse_target(other[0]), *_metres_apart(other[1]))
+    if second is not None and "aruco" in (parsed.kind, second[0].kind):
+        raise InertialError("--other-target is for two boards; distances between single markers go into --bars")
+    if second is not None and second[0].spec == parsed.spec:
+        raise InertialError("--other-target must be another board than --target: nobody could tell them apart")
     result = validate_model(folder, images, parsed, options)
+    if second is not None:
+        result = with_other_target(result, validate_model(folder, images, second[0], options), second[1], second[2])
     if bars is not None:
         result = with_bars(result, bars)
     if check_points is not None:
@@ -339,3 +351,15 @@ def validate_source(
     if pictures is not None:
         write_overlays(result, images, pictures)
     return result
+
+
+def _metres_apart(text: str) -> tuple[float, float | None]:
+    """A length, and its standard deviation where that is said."""
+    length, said, sigma = text.partition("+-")
+    try:
+        metres, sigma_m = float(length), float(sigma) if said else None
+    except ValueError:
+        metres, sigma_m = float("nan"), None
+    if not 0 < metres < float("inf") or (sigma_m is not None and not 0 < sigma_m < metres):
+        raise InertialError(f'--other-target ... "{text}": write metres between the two middles, as in 4.03+-0.002')
+    return metres, sigma_m

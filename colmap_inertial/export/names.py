@@ -30,14 +30,17 @@ def flat_names(names: Iterable[str]) -> dict[str, str]:
     """
     found: dict[str, str] = {}
     taken: set[str] = set()
+    tried: dict[str, int] = {}
     for name in sorted(names):
         path = PurePosixPath(name.replace("\\", "/"))
         suffix = ".jpg" if path.suffix.lower() in _JPEG else ".png"
         stem = re.sub(r"[^A-Za-z0-9_-]+", "_", "_".join((*path.parts[:-1], path.stem)))[-_LONGEST:]
-        candidate, number = stem, 1
+        # those of one stem go on counting where the one before stopped
+        candidate, number = stem, tried.get(stem.lower(), 1)
         while candidate.lower() in taken:
             number += 1
             candidate = f"{stem}_{number}"
+        tried[stem.lower()] = number
         taken.add(candidate.lower())
         found[name] = candidate + suffix
     return found

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -68,10 +68,6 @@ class BlurPath:
         return BlurField(
             width=self.width, height=self.height, step_px=self.step_px, vector_px=chord, cov_px2=self.cov_px2
         )
-
-    def as_certain(self) -> BlurPath:
-        """Without its covariance."""
-        return replace(self, cov_px2=np.zeros(3, np.float32))
 
     def cov_at(self, rows_px: NDArray[Any], columns_px: NDArray[Any]) -> Array:
         """(R, C, 3) covariance of the chord at the crossings of rows and columns of pixels."""

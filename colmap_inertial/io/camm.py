@@ -116,7 +116,7 @@ def read_camm_positions(path: Path) -> PositionFixes | None:
         latitude_deg=place[good, 0],
         longitude_deg=place[good, 1],
         height_m=place[good, 2],
-        sigma_m=np.where(sigma[good] > 0, sigma[good], np.nan),
+        sigma_m=np.where((sigma[good] > 0) & np.isfinite(sigma[good]), sigma[good], np.nan),
         t_ns=t_ns[good],
         height_above="ellipsoid",
         source=f"CAMM track of {path.name}",

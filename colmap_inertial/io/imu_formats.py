@@ -22,7 +22,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from colmap_inertial.errors import FormatError, InertialError
-from colmap_inertial.io import android, camm, dji, gcsv, gopro, imu_text, ios, phyphox, rosbag, video_imu_capture
+from colmap_inertial.io import (
+    android,
+    camm,
+    dji,
+    gcsv,
+    gopro,
+    imu_text,
+    ios,
+    phyphox,
+    rosbag,
+    telemetry,
+    video_imu_capture,
+)
 from colmap_inertial.io.files import read_bytes, require_regular
 from colmap_inertial.io.mp4 import is_mp4, read_movie
 from colmap_inertial.io.units import DeclaredUnits
@@ -297,6 +309,13 @@ _OWN: tuple[ImuFormat, ...] = (
         layout="a ROS 1 bag or ROS 2 recording",
         accepts=rosbag.is_rosbag,
         read=rosbag.read_rosbag,
+    ),
+    ImuFormat(
+        name="telemetry",
+        layout="a log of a RunCam, iFlight, Thumb or Mobius camera, or an Insta360 video",
+        accepts=telemetry.is_telemetry,
+        read=telemetry.read_telemetry,
+        frames=telemetry.read_telemetry_frames,
     ),
     ImuFormat(
         name="csv",

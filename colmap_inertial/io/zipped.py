@@ -52,7 +52,10 @@ def text_of(path: Path, member: str) -> str:
         return read_text(path / member)
     try:
         with zipfile.ZipFile(path) as archive:
-            if archive.getinfo(member).file_size > _LARGEST_MEMBER:
+            told = archive.getinfo(member)
+            if told.compress_size > path.stat().st_size:  # as much memory would be asked for as it says
+                raise FormatError(path, f"its {member} cannot be unpacked: it is said to be larger than the file")
+            if told.file_size > _LARGEST_MEMBER:
                 raise FormatError(path, f"its {member} unpacks to more than {_LARGEST_MEMBER >> 30} GiB")
             return archive.read(member).decode("utf-8-sig", errors="replace")
     except _DAMAGED as error:

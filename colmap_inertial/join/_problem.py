@@ -162,6 +162,12 @@ def gravity_of(problem: Problem, at: At, k: int) -> Array:
     return np.asarray(at.rotation[k] @ (problem.known[k].gravity_m_s2 + change))
 
 
+def accel_gain_of(problem: Problem, at: At) -> Array:
+    """(3, 3) the device's, as it is thought of now."""
+    change = at.y[problem.shared : problem.placed][post.ACCEL_GAIN]
+    return np.asarray(problem.known[problem.held].accel_gain + change.reshape(3, 3))
+
+
 def felt_between(problem: Problem, at: At, begin: End, end: End) -> Preintegrated:
     """What the IMU felt, by the device as it is thought of now."""
     reference, y = problem.known[problem.held], at.y[problem.shared : problem.placed]
@@ -169,7 +175,7 @@ def felt_between(problem: Problem, at: At, begin: End, end: End) -> Preintegrate
         gyro_bias_rad_s=0.5 * (begin.gyro_bias_rad_s + end.gyro_bias_rad_s)[None],
         accel_bias_m_s2=0.5 * (begin.accel_bias_m_s2 + end.accel_bias_m_s2)[None],
         gyro_gain=reference.gyro_gain + y[post.GYRO_GAIN].reshape(3, 3),
-        accel_gain=reference.accel_gain + y[post.ACCEL_GAIN].reshape(3, 3),
+        accel_gain=accel_gain_of(problem, at),
         accel_delay_s=reference.accel_delay_s + float(y[post.ACCEL_DELAY]),
     )
     return preintegrate(np.array([begin.stamp_s, end.stamp_s]), problem.ties.tracks, errors)
@@ -186,11 +192,12 @@ def joint_terms(problem: Problem, at: At, begin: End, end: End) -> par.Estimate:
         gyro_bias_rad_s=np.stack([begin.gyro_bias_rad_s, end.gyro_bias_rad_s]),
         accel_walk_m_s2=np.stack([begin.accel_bias_m_s2, end.accel_bias_m_s2]),
         drift_m=zeros,
+        accel_slow_m_s2=zeros,
         gravity_m_s2=gravity_of(problem, at, problem.held),
         accel_bias_m_s2=np.zeros(3),
         accel_delay_s=0.0,
         gyro_gain=none,
-        accel_gain=none,
+        accel_gain=accel_gain_of(problem, at),
         cam_from_imu=np.eye(3),
         imu_in_cam_m=np.zeros(3),
         delay_s=0.0,

@@ -8,6 +8,7 @@ import numpy as np
 
 from colmap_inertial.geometry import skew, so3_log
 from colmap_inertial.join._problem import At, End, Equations, Problem, columns_of, felt_between, gravity_of, joint_terms
+from colmap_inertial.join.doubts import LEAST_STAMP_S
 from colmap_inertial.join.values import Link, SharedImages
 from colmap_inertial.scale import _parameters as par, posterior as post
 from colmap_inertial.scale._factors import imu_group
@@ -18,8 +19,6 @@ from colmap_inertial.types import Array
 _ONE_GRAVITY_M_S2 = 1e-4
 #: Step of the differences by the stamps: vibration makes shorter ones meaningless.
 _STAMP_STEP_S = 2e-3
-#: Stamps are no better than this.
-_LEAST_STAMP_S = 1e-5
 
 
 def _link_noise(problem: Problem, link: Link) -> par.Noise:
@@ -29,7 +28,7 @@ def _link_noise(problem: Problem, link: Link) -> par.Noise:
         one,
         gyro_rad_s_rthz=max(one.gyro_rad_s_rthz, other.gyro_rad_s_rthz),
         gyro_walk_rad_s_rts=max(one.gyro_walk_rad_s_rts, other.gyro_walk_rad_s_rts),
-        accel_m_s2_rthz=max(one.accel_m_s2_rthz, other.accel_m_s2_rthz),
+        accel_m_s2_rthz=max(one.accel_density_m_s2_rthz, other.accel_density_m_s2_rthz),
         accel_walk_m_s2_rts=max(one.accel_walk_m_s2_rts, other.accel_walk_m_s2_rts),
     )
 
@@ -123,7 +122,7 @@ def _add_clock(problem: Problem, at: At, link: Link, equations: Equations) -> No
     end = End.of(problem, at, link.second, link.to_node)
     one, other = problem.known[link.first], problem.known[link.second]
     dt_s = float(other.t_s[j] - one.t_s[i])
-    info = 1 / float(np.hypot(PRIORS.clock_rate * dt_s, _LEAST_STAMP_S))
+    info = 1 / float(np.hypot(PRIORS.clock_rate * dt_s, LEAST_STAMP_S))
     columns, by = [], []
     for k, known, node, sign in ((link.first, one, i, 1.0), (link.second, other, j, -1.0)):
         columns += [problem.own(k) + post.DELAY, problem.own(k) + post.CLOCK_RATE]

@@ -11,9 +11,10 @@ import numpy as np
 
 from colmap_inertial.geometry import skew, so3_log
 from colmap_inertial.join._problem import Ties
+from colmap_inertial.join.doubts import at_most, clocks_differ, most, plainly_apart, times_counted, unlike
 from colmap_inertial.join.links import find_links, find_shared
 from colmap_inertial.join.solve import Placed, place
-from colmap_inertial.join.values import Link, Part, SharedImages
+from colmap_inertial.join.values import Link, Part, SharedImages, pair_of
 from colmap_inertial.options import JoinOptions
 from colmap_inertial.types import Array, Gap, ImuRecording
 
@@ -23,14 +24,10 @@ Tie = TypeVar("Tie", Link, SharedImages)
 _LONGEST_S = 60.0
 #: So long the IMU may be silent in it (a sample at the end of its range), at the price of a gap.
 _LONGEST_SILENT_S = 0.06
-#: Parts contradict each other where chance makes what they differ by no oftener than so many standard deviations ...
-_SURE_SIGMA = 4.0
-#: ... of squares that are this many times larger in real recordings than noise makes them.
-_ALLOWANCE = 2.0
 #: Numbers of the device that a part tells once more, and those that each link adds: biases and clock.
 _ALONE, _ALONE_BY_LINK = 26, 7
-#: Numbers that say how the camera is mounted, and where it is.
-_OF_MOUNT, _OF_POSE = 6, 6
+#: Numbers that say where a camera is.
+_OF_POSE = 6
 _OF_THE_IMU = "the two contradict each other about the IMU itself: its biases, gains, or clock changed in between"
 
 
@@ -44,10 +41,13 @@ class Together:
         Places of the parts; the first one is held.
     placed
         Where they come to lie, in this order.
+    shared
+        Images whose poses agree, by places within ``parts``.
     """
 
     parts: tuple[int, ...]
     placed: Placed
+    shared: tuple[SharedImages, ...]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -84,16 +84,20 @@ def join_parts(parts: Sequence[Part], imu: ImuRecording, limits: JoinOptions) ->
     if len(parts) < 2:
         return Joined(groups=(), gaps=())
     links, shared = find_links(parts), find_shared(parts)
-    pairs = sorted({_pair(one) for one in links} | {_pair(one) for one in shared})
+    apart = plainly_apart(parts, shared)
+    pairs = sorted({pair_of(one) for one in links} | {pair_of(one) for one in shared} | apart.keys())
     # readings that a part's own fit has already do not count again where images say where the other one lies
-    both = {_pair(one) for one in shared}
-    usable = [one for one in _unbroken(parts, imu, links) if _pair(one) not in both or not overlaps(parts, one)]
+    both = {pair_of(one) for one in shared}
+    usable = [one for one in _unbroken(parts, imu, links) if pair_of(one) not in both or not overlaps(parts, one)]
     gaps: dict[tuple[int, int], Gap] = {}
     groups: dict[int, tuple[int, ...]] = {k: (k,) for k in range(len(parts))}
     trials: dict[tuple[int, ...], Trial] = {}
-    against: set[tuple[int, int]] = set()
+    against = set(apart)
     for pair in pairs:
-        gap = _gap(parts, pair, [one for one in links if _pair(one) == pair], _of(shared, pair))
+        gap = _gap(parts, pair, [one for one in links if pair_of(one) == pair], _of(shared, pair))
+        if pair in apart:
+            gaps[pair] = replace(gap, reason=apart[pair])
+            continue
         if pair not in both and not _of(usable, pair):
             gaps[pair] = replace(gap, reason=_why_unlinked(parts, imu, _of(links, pair)))
             continue
@@ -128,7 +132,9 @@ def join_parts(parts: Sequence[Part], imu: ImuRecording, limits: JoinOptions) ->
     for members in dict.fromkeys(group for group in groups.values() if len(group) > 1):
         trial = trials[members]
         assert trial.placed is not None
-        together.append(Together(parts=members, placed=trial.placed))
+        place_of = {k: i for i, k in enumerate(members)}
+        images = tuple(_renumbered(one, place_of) for one in shared if pair_of(one) in _in(members))
+        together.append(Together(parts=members, placed=trial.placed, shared=images))
         for pair in _in(members) & gaps.keys():
             gap = gaps[pair]
             others = "in one model by way of others" if not gap.joined else gap.reason
@@ -136,12 +142,8 @@ def join_parts(parts: Sequence[Part], imu: ImuRecording, limits: JoinOptions) ->
     return Joined(groups=tuple(together), gaps=tuple(gaps.values()))
 
 
-def _pair(one: Link | SharedImages) -> tuple[int, int]:
-    return min(one.first, one.second), max(one.first, one.second)
-
-
 def _of(ties: Sequence[Tie], pair: tuple[int, int]) -> list[Tie]:
-    return [one for one in ties if _pair(one) == pair]
+    return [one for one in ties if pair_of(one) == pair]
 
 
 def _in(members: Sequence[int]) -> set[tuple[int, int]]:
@@ -251,12 +253,12 @@ def _tried(
     nothing = Trial(placed=None, chi2=None, dof=None, sigmas={}, contradiction="")
     one_of = [parts[k] for k in members]
     place_of = {k: i for i, k in enumerate(members)}
-    inside = [_renumbered(one, place_of) for one in links if _pair(one) in _in(members)]
-    images = [_renumbered(one, place_of) for one in shared if _pair(one) in _in(members)]
+    inside = [_renumbered(one, place_of) for one in links if pair_of(one) in _in(members)]
+    images = [_renumbered(one, place_of) for one in shared if pair_of(one) in _in(members)]
     every: list[Link | SharedImages] = [*inside, *images]
-    unlike = (unlike_device(one_of[i], one_of[j]) for i, j in {_pair(one) for one in every})
-    if max(unlike) > _ALLOWANCE * most(_OF_MOUNT):
-        why = "the camera of one is mounted to the IMU otherwise than that of the other"
+    why = next(filter(None, (unlike(one_of[i], one_of[j]) for i, j in {pair_of(one) for one in every})), "")
+    why = why or (_OF_THE_IMU if any(clocks_differ(one_of, one) for one in inside) else "")
+    if why:
         return replace(nothing, contradiction=why)
     ties = Ties.of(imu, inside, images)
     before = None
@@ -266,26 +268,26 @@ def _tried(
     except np.linalg.LinAlgError:
         alone = 0.0 if before is None else before.squares
         why = "what the IMU felt in it fits no place of one in the other"
-        if alone > _ALLOWANCE * most(_alone_dof(len(members), inside)):
+        if alone > at_most(_alone_dof(len(members), inside)):
             why = _OF_THE_IMU
         return replace(nothing, contradiction=why)
     # heading and place are all that parts do not know of each other
     independent = sum(6 * one.weight * len(one.in_first) for one in images)
     dof = max(1, round(9 * len(inside) + independent) - 4 * (len(members) - 1))
     chi2, alone_dof = max(0.0, placed.squares - before.squares), _alone_dof(len(members), inside)
-    placed = replace(placed, inflation=max(1.0, chi2 / dof, before.squares / alone_dof))
+    placed = replace(placed, inflation=max(1.0, chi2 / dof, before.squares / alone_dof) * times_counted(one_of))
     sigmas: dict[tuple[int, int], tuple[float, float]] = {}
     farthest = 0.0
     misfits = [*placed.misfits, *(_apart(one_of, placed, one) for one in images)]
     for tie, misfit in zip(every, misfits, strict=True):
         cov = ends_of(one_of, tie).cov(one_of, placed)
         farthest = max(farthest, float(misfit @ np.linalg.solve(cov, misfit)))
-        pair = (members[_pair(tie)[0]], members[_pair(tie)[1]])
+        pair = (members[pair_of(tie)[0]], members[pair_of(tie)[1]])
         sigmas[pair] = tuple(np.maximum(sigmas.get(pair, (0.0, 0.0)), worst(cov)).tolist())
     why = ""
-    if before.squares > _ALLOWANCE * most(alone_dof):
+    if before.squares > at_most(alone_dof):
         why = _OF_THE_IMU
-    elif chi2 > _ALLOWANCE * most(dof):
+    elif chi2 > at_most(dof):
         why = (
             f"what the IMU felt in it contradicts the motion before and after it ({chi2:.0f} times the squares of one "
             f"standard deviation, where chance makes {dof})"
@@ -301,23 +303,6 @@ def _tried(
 def _alone_dof(count: int, links: Sequence[Link]) -> int:
     """What parts say of one device: shared numbers, strength of gravity, and of each link biases and clock."""
     return _ALONE * (count - 1) + _ALONE_BY_LINK * len(links)
-
-
-def most(dof: int) -> float:
-    """What chance hardly makes of a sum of squares over variances: as far out as so many standard deviations.
-
-    By Wilson and Hilferty's root: the third root of chi-square is next to normal.
-    """
-    share = 2 / (9 * dof)
-    return float(dof * (1 - share + _SURE_SIGMA * share**0.5) ** 3)
-
-
-def unlike_device(one: Part, other: Part) -> float:
-    """Squares over variances of how the camera is mounted to the IMU in two parts: rotation and lever arm."""
-    (a, b), at = (part.path.at(np.array([0])) for part in (one, other)), np.r_[-6:0]
-    away = np.concatenate([so3_log(a.cam_from_imu @ b.cam_from_imu.T), a.imu_in_cam_m - b.imu_in_cam_m])
-    cov = a.cov[np.ix_(at, at)] + b.cov[np.ix_(at, at)]
-    return float(away @ np.linalg.solve(cov, away))
 
 
 def _apart(parts: Sequence[Part], placed: Placed, images: SharedImages) -> Array:

@@ -9,7 +9,7 @@ import numpy as np
 
 from colmap_inertial.geometry import so3_log
 from colmap_inertial.join.values import Link, Part, SharedImages
-from colmap_inertial.scale._factors import CORRELATION_S
+from colmap_inertial.scale._parameters import DRIFT_S
 
 #: Links between the same two parts: the shortest ones; more say little beyond.
 _MOST_LINKS = 4
@@ -58,7 +58,7 @@ def find_shared(parts: Sequence[Part]) -> list[SharedImages]:
             continue
         mine, theirs = mine[agree], theirs[agree]
         span_s = float(np.ptp(one.trajectory.t_s[mine]))
-        independent = min(len(mine), 1 + span_s / CORRELATION_S)
+        independent = min(len(mine), 1 + span_s / DRIFT_S)
         out.append(
             SharedImages(first=a, second=b, in_first=mine, in_second=theirs, weight=float(independent / len(mine)))
         )

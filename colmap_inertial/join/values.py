@@ -26,11 +26,14 @@ class Part:
         Its poses, in metres.
     path
         The same fitted to the IMU once more: what is known of its motion.
+    cameras
+        Names for its cameras, by which those of two parts are told apart; empty where they are not known.
     """
 
     number: int
     trajectory: CameraTrajectory
     path: FittedPath
+    cameras: frozenset[str] = frozenset()
 
     @property
     def world_from_cam(self) -> Array:
@@ -79,6 +82,11 @@ class SharedImages:
     in_first: Index
     in_second: Index
     weight: float
+
+
+def pair_of(tie: Link | SharedImages) -> tuple[int, int]:
+    """The places of the two parts, the larger part first."""
+    return min(tie.first, tie.second), max(tie.first, tie.second)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

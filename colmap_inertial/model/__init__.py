@@ -70,6 +70,9 @@ class Model:
         By image name, (N, 2) where its keypoints were when COLMAP mapped them, where a stage moved them since.
     parts
         What it was joined of; empty where it is one of COLMAP's models.
+    position_covs
+        By image name, (3, 3) covariance of its position against the first one's, where a stage says so: of all, or of
+        some.
     """
 
     reconstruction: pycolmap.Reconstruction
@@ -82,6 +85,7 @@ class Model:
     treatments: tuple[Treatment, ...] = ()
     observed_px: Mapping[str, Array] = field(default_factory=dict)
     parts: tuple[JoinedPart, ...] = ()
+    position_covs: Mapping[str, Array] = field(default_factory=dict)
 
     def scaled(self, estimate: ScaleEstimate, similarity: Similarity | None) -> Model:
         """With a scale estimate, and where it was not refused in its units; doubts make it weak at most.
@@ -371,6 +375,12 @@ def apply_similarity(source: StrPath, target: StrPath, similarity: Similarity) -
     if target.exists():
         raise OutputExistsError(f"{target} exists already; choose another folder or remove it")
     write_model(transformed(read_model(source), similarity), target, similarity, suffix=model_format(source))
+
+
+def has_rigs(reconstruction: pycolmap.Reconstruction) -> bool:
+    """Whether any of the registered frames is of a rig of several cameras."""
+    frames = map(reconstruction.frame, reconstruction.reg_frame_ids())
+    return any(reconstruction.rig(number).num_sensors() > 1 for number in {frame.rig_id for frame in frames})
 
 
 def transformed(reconstruction: pycolmap.Reconstruction, similarity: Similarity) -> pycolmap.Reconstruction:

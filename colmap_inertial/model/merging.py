@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,29 +14,42 @@ if TYPE_CHECKING:
 _SAME_PX = 1e-3
 
 
-def merged(models: Sequence[pycolmap.Reconstruction]) -> pycolmap.Reconstruction:
+def merged(
+    models: Sequence[pycolmap.Reconstruction], agreeing: Mapping[tuple[int, int], Collection[str]]
+) -> pycolmap.Reconstruction:
     """One model of all images and points; the first one's stay as they are.
 
     Images that several have keep the pose of the first one that has them, and of two observations of one keypoint the
-    first. Numbers of images and frames stay where they are free, as they are in models of one database; points get new
-    ones. Cameras of one number whose parameters differ, as each model refined its own, stay apart.
+    first; where the poses differ, the first one's observations are all that is kept. Numbers of images and frames stay
+    where they are free, as they are in models of one database; points get new ones. Cameras of one number whose
+    parameters differ, as each model refined its own, stay apart.
 
     Parameters
     ----------
     models
         In one world already; one camera to a frame.
+    agreeing
+        By places of two models, the earlier one first: names of images whose poses in both agree.
     """
     import pycolmap
 
     whole = pycolmap.Reconstruction(models[0])
     whole.tear_down()  # images that have no pose, as a mapper leaves them, would keep their numbers
-    for model in models[1:]:
-        _add(whole, model)
+    owner = dict.fromkeys(_names(models[0]), 0)
+    for k, model in enumerate(models[1:], start=1):
+        names = _names(model)
+        _add(whole, model, {name for name in names if name in agreeing.get((owner.get(name, k), k), ())})
+        owner = dict.fromkeys(names, k) | owner
     whole.update_point_3d_errors()
     return whole
 
 
-def _add(whole: pycolmap.Reconstruction, model: pycolmap.Reconstruction) -> None:
+def _names(model: pycolmap.Reconstruction) -> list[str]:
+    return [model.image(i).name for i in model.reg_image_ids()]
+
+
+def _add(whole: pycolmap.Reconstruction, model: pycolmap.Reconstruction, agreeing: Collection[str]) -> None:
+    """Add images that are not there yet, and points; of images that are, only observations of those that agree."""
     import pycolmap
 
     by_name = {whole.image(i).name: i for i in whole.reg_image_ids()}
@@ -47,7 +60,8 @@ def _add(whole: pycolmap.Reconstruction, model: pycolmap.Reconstruction) -> None
         image = model.image(old)
         if image.name in by_name:
             number[old] = by_name[image.name]
-            kept[old] = _free_keypoints(whole.image(number[old]), image)
+            there = whole.image(number[old])
+            kept[old] = _free_keypoints(there, image) if image.name in agreeing else set()
         else:
             number[old] = _add_image(whole, image, camera_of[image.camera_id])
     for point_id in sorted(model.point3D_ids()):

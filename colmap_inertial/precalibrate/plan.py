@@ -31,7 +31,7 @@ from colmap_inertial.precalibrate.translation import find_parallaxes
 from colmap_inertial.run.context import Recording, RunContext
 from colmap_inertial.run.progress import Progress
 from colmap_inertial.run.workspace import a_record_of_ours
-from colmap_inertial.stages.deblur import SMOOTHING_PX, DeblurStage
+from colmap_inertial.stages.deblur import SMOOTHING, DeblurStage
 from colmap_inertial.stages.gyro_view import GyroView
 from colmap_inertial.stages.rolling_shutter import RollingShutterStage
 from colmap_inertial.types import CameraImuCalibration, CameraModel, FrameTiming, ImuRecording
@@ -98,7 +98,7 @@ class ImagingPlan:
             gate=gate,
             drop=drop,
             method=self.method,
-            smoothing_px=SMOOTHING_PX if smoothing else 0.0,
+            smoothing=SMOOTHING if smoothing else 0.0,
         )
         return [stage]
 

@@ -53,6 +53,7 @@ def as_joint(x: Estimate, down: Array) -> par.Estimate:
         gyro_bias_rad_s=x.gyro_bias_rad_s,
         accel_walk_m_s2=x.accel_bias_m_s2,
         drift_m=zeros,
+        accel_slow_m_s2=zeros,
         gravity_m_s2=x.gravity_m_s2 * down,
         accel_bias_m_s2=np.zeros(3),
         accel_delay_s=x.accel_delay_s,
@@ -77,6 +78,7 @@ def joint_noise(noise: ImuNoise) -> par.Noise:
         rotation_rad=TYPICAL.rotation_rad,
         centre_m=TYPICAL.centre_m,
         drift_m_rts=TYPICAL.drift_m_rts,
+        accel_slow_m_s2_rts=TYPICAL.accel_slow_m_s2_rts,
     )
 
 

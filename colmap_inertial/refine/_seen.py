@@ -48,7 +48,7 @@ def turning_around(nodes_s: Array, tracks: Tracks, half_span_s: float) -> Turnin
     powers = np.linalg.pinv(_KNOTS[:, None] ** np.arange(1, 6)) @ turn
     powers = powers / half_span_s ** np.arange(1, 6)[:, None]
     force = tracks.accel.at(times_s.ravel())[0].reshape(count, len(since_s), 3).mean(axis=1)
-    return Turning(powers=powers, force_m_s2=force)
+    return Turning(powers=powers, force_m_s2=force, half_span_s=half_span_s)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

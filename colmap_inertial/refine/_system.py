@@ -13,6 +13,9 @@ from colmap_inertial.refine._inertial import Rows
 from colmap_inertial.refine._seen import Derivatives
 from colmap_inertial.refine.values import N_SEEN, N_STATE, POSITION, Index, Observations
 
+#: Frames whose covariance is solved for at once.
+_AT_ONCE = 20
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Order:
@@ -218,6 +221,18 @@ class Factored:
         rhs = sides.reshape(count, -1).T
         states, _ = self.solve(rhs, np.zeros((len(self.corner[0]), count)))
         return np.sqrt(np.einsum("nk,nk->k", rhs, states))
+
+    def position_covs(self, frames: Index) -> Array:
+        """(K, 3, 3) covariances of K frames' positions."""
+        out = []
+        for some in np.array_split(frames, -(-len(frames) // _AT_ONCE)):
+            sides = np.zeros((len(some), 3, len(self.order.place), N_STATE))
+            sides[np.arange(len(some))[:, None], np.arange(3), self.order.place[some][:, None], POSITION] = np.eye(3)
+            rhs = sides.reshape(3 * len(some), -1).T
+            states, _ = self.solve(rhs, np.zeros((len(self.corner[0]), 3 * len(some))))
+            left, right = (one.reshape(-1, len(some), 3) for one in (rhs, states))
+            out.append(np.einsum("nki,nkj->kij", left, right))
+        return np.concatenate(out)
 
     def shared_cov(self) -> Array:
         """(Q, Q) covariance of what is shared."""

@@ -10,13 +10,17 @@ from numpy.typing import NDArray
 
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.refine._system import Factored, Order
-from colmap_inertial.refine.setup import MARGIN_S, at_middle_lines, measured_sigma_px, pictures_alone
+from colmap_inertial.refine.setup import at_middle_lines, measured_sigma_px, pictures_alone
 from colmap_inertial.refine.solve import Solution, factored, held_out, solve
-from colmap_inertial.refine.values import Estimate, Observations, Problem
+from colmap_inertial.refine.values import READOUT, Estimate, Observations, Problem
 from colmap_inertial.types import Array
 
 #: Every so many observations of points with at least so many is held out.
 _EVERY, _FEWEST = 10, 4
+#: A readout that was not declared is one where it is longer, and so many standard deviations long.
+_LEAST_READOUT_S, _SURE_SIGMA = 1e-3, 3.0
+#: Positions whose covariance is told.
+_MOST_COVS = 400
 #: Length of a part of the path whose drift is told.
 _PART_S = 10.0
 #: Of the normal equations; more would take hours, too.
@@ -72,6 +76,10 @@ class Judged:
         (Q, Q) covariance of what is shared; ``None`` where it is not believed.
     drift
         How the scale changed along the path; empty where it is not believed.
+    position_covs
+        (3, 3) covariances of positions against the first one's, by frames: all, or evenly chosen ones.
+    readout
+        One that was not declared (s), and its standard deviation; ``None`` where it was, or nothing was found.
     steps
         Of all solutions.
     """
@@ -88,10 +96,14 @@ class Judged:
     sigma_px: float
     shared_cov: Array | None
     drift: tuple[Stretched, ...]
+    position_covs: dict[int, Array]
+    readout: tuple[float, float] | None
     steps: int
 
 
-def refine(problem: Problem, start: Estimate, at_once_px: Array, t_s: Array) -> Judged:
+def refine(
+    problem: Problem, start: Estimate, at_once_px: Array, t_s: Array, *, readout_declared: bool = True
+) -> Judged:
     """Refine, without a tenth of the observations first; with all of them where that predicts the tenth.
 
     Parameters
@@ -102,6 +114,8 @@ def refine(problem: Problem, start: Estimate, at_once_px: Array, t_s: Array) -> 
         (M, 2) observations as COLMAP's model has them: what pictures alone are judged by.
     t_s
         (F,) times of the frames; nan without one.
+    readout_declared
+        Otherwise the images were not rectified: where they turn out to have one, the model stays as it is.
 
     Raises
     ------
@@ -127,10 +141,12 @@ def refine(problem: Problem, start: Estimate, at_once_px: Array, t_s: Array) -> 
     # pictures alone may fit worse than with a rolling shutter: the IMU's own squares are the least that it costs
     freedom = _freedom(problem)
     chi2 = max(2 * (seen.cost - seen_alone.cost), seen.squares["imu"]) / freedom
-    reason = _doubt(seen_alone, seen, chi2, mean, spread) or _too_late(problem, seen.estimate)
+    readout = None if readout_declared or not seen.converged else _readout(_part(problem, kept), seen.estimate)
+    reason = _rolling(readout) or _doubt(seen_alone, seen, chi2, mean, spread) or _too_late(problem, seen.estimate)
     steps, final = seen_alone.steps + seen.steps, start
     cov: Array | None = None
     drift: tuple[Stretched, ...] = ()
+    position_covs: dict[int, Array] = {}
     if not reason:
         whole = solve(problem, seen.estimate)
         steps += whole.steps
@@ -143,6 +159,9 @@ def refine(problem: Problem, start: Estimate, at_once_px: Array, t_s: Array) -> 
         else:
             final, cov = whole.estimate, solved.shared_cov()
             drift = drift_map(problem, start, final, t_s, solved)
+            timed = np.flatnonzero(np.isfinite(t_s))
+            some = timed[:: -(-len(timed) // _MOST_COVS)]
+            position_covs = dict(zip(some.tolist(), solved.position_covs(some), strict=True))
     return Judged(
         estimate=final,
         accepted=not reason,
@@ -156,6 +175,8 @@ def refine(problem: Problem, start: Estimate, at_once_px: Array, t_s: Array) -> 
         sigma_px=sigma_px,
         shared_cov=cov,
         drift=drift,
+        position_covs=position_covs,
+        readout=readout,
         steps=steps,
     )
 
@@ -180,6 +201,26 @@ def _freedom(problem: Problem) -> float:
     return float(max(1, 9 * int(problem.inertial.linked.sum()) - 3 * int(problem.inertial.touched.sum())))
 
 
+def _readout(problem: Problem, x: Estimate) -> tuple[float, float] | None:
+    """What the readout came to and its standard deviation, in seconds; None where nothing says how sure that is."""
+    try:
+        cov = factored(problem, x).shared_cov()
+    except np.linalg.LinAlgError:
+        return None
+    return x.readout_s, float(cov[READOUT, READOUT]) ** 0.5
+
+
+def _rolling(readout: tuple[float, float] | None) -> str:
+    """Why a model stays as it is whose images turn out to have a rolling shutter; empty where they have none."""
+    if readout is None or abs(readout[0]) < max(_LEAST_READOUT_S, _SURE_SIGMA * readout[1]):
+        return ""
+    upwards = "" if readout[0] > 0 else ", from the last line to the first"
+    return (
+        "its images have a rolling shutter, and would not agree with the refined poses: declare the readout, which is "
+        f"{1e3 * abs(readout[0]):.1f} +- {1e3 * readout[1]:.1f} ms{upwards}"
+    )
+
+
 def _doubt(alone: Solution, seen: Solution, chi2: float, change: float, spread: float) -> str:
     """Why a refinement is not believed; empty where it is."""
     if not alone.converged:
@@ -197,14 +238,17 @@ def _doubt(alone: Solution, seen: Solution, chi2: float, change: float, spread: 
 
 
 def _too_late(problem: Problem, x: Estimate) -> str:
-    """Why clocks are too far apart; empty where the readings around each frame reach as far."""
+    """Why clocks are too far apart, or a readout too long; empty where the readings around each frame reach as far."""
     assert problem.inertial is not None
     inertial = problem.inertial
     times_s = inertial.nodes_s[inertial.touched] - inertial.middle_s
     shift_s = float(np.abs(x.offset_s + x.clock_rate * times_s).max())
-    if shift_s <= MARGIN_S:
+    if shift_s + 0.5 * abs(x.readout_s) <= inertial.turning.half_span_s:
         return ""
-    return f"the time offset would move by {1e3 * shift_s:.0f} ms, farther than readings were looked up: declare it"
+    return (
+        f"the time offset would move by {1e3 * shift_s:.0f} ms, with a readout of {1e3 * abs(x.readout_s):.0f} ms, "
+        "farther than readings were looked up: declare them"
+    )
 
 
 def _as_px(costs: Array, sigma_px: float) -> float:

@@ -49,8 +49,8 @@ if TYPE_CHECKING:
 _ROTATION_RAD, _OFFSET_S, _INTRINSIC_SHARE = 0.05, 0.02, 0.1
 #: Of a readout that is none.
 _NO_READOUT_S = 1e-9
-#: Readings are looked up as far beyond the readout around a node.
-MARGIN_S = 0.01
+#: Readings are looked up as far beyond the readout around a node; one that is not declared is hardly longer than this.
+_MARGIN_S, _LONGEST_READOUT_S = 0.01, 0.04
 #: Of normal errors in two coordinates, the median of the squares' sum is so many variances.
 _MEDIAN_OF_SQUARES = 2 * np.log(2)
 _LEAST_PX = 0.05
@@ -152,9 +152,9 @@ def read_seen(reconstruction: pycolmap.Reconstruction, timing: FrameTiming) -> S
 
 def lines_of(seen: Seen, timing: FrameTiming, xy_px: Array) -> Array:
     """(M,) how much later than the middle line each observation was exposed, in readouts."""
-    if not timing.readout_s:
-        return np.zeros(len(xy_px))
     out = np.zeros(len(xy_px))
+    if timing.readout_s == 0:
+        return out
     index = {name: i for i, name in enumerate(timing.names)}
     one = replace(timing, readout_s=0.5)  # of any length: shares are asked for
     for i, camera in enumerate(seen.cameras):
@@ -167,11 +167,17 @@ def lines_of(seen: Seen, timing: FrameTiming, xy_px: Array) -> Array:
 def keypoints_of(seen: Seen, keypoints_px: Mapping[str, Array]) -> Array:
     """(M, 2) observations by image names' keypoints (N, 2); as the model has them where there are none."""
     out = seen.observations.xy_px.copy()
-    for i, name in enumerate(seen.names):
+    for name, mine in zip(seen.names, _by_frame(seen), strict=True):
         if name in keypoints_px:
-            mine = seen.observations.frame == i
             out[mine] = keypoints_px[name][seen.place[mine]]
     return out
+
+
+def _by_frame(seen: Seen) -> list[Index]:
+    """Which observations each frame has."""
+    frames = seen.observations.frame
+    order = np.argsort(frames, kind="stable")
+    return np.split(order, np.searchsorted(frames[order], np.arange(1, len(seen.names))))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -214,7 +220,7 @@ def make_problem(
     Raises
     ------
     NotObservableError
-        Where the IMU recorded hardly any of the frames.
+        Where the IMU recorded hardly any of the frames, or these see nothing.
     """
     calibration = known.calibration
     imu = on_camera_rate(imu, calibration, camera_epoch_ns=timing.epoch_ns)
@@ -226,10 +232,12 @@ def make_problem(
         gyro=Track.of(imu.gyro_t_s + shift_s, imu.gyro_rad_s, gyro_cut),
         accel=Track.of(imu.accel_t_s + shift_s + delay_s, imu.accel_m_s2, accel_cut),
     )
+    if not len(seen.observations.frame):
+        raise NotObservableError("refinement", "no two of its images see the same point")
     timed = np.isfinite(seen.t_s)
     begin_s = max(tracks.gyro.t_s[0], tracks.accel.t_s[0])
     end_s = min(tracks.gyro.t_s[-1], tracks.accel.t_s[-1])
-    half_s = 0.5 * (timing.readout_s or 0.0) + MARGIN_S
+    half_s = 0.5 * (_LONGEST_READOUT_S if timing.readout_s is None else timing.readout_s) + _MARGIN_S
     with np.errstate(invalid="ignore"):
         inside = timed & (seen.t_s > begin_s + half_s) & (seen.t_s < end_s - half_s)
     nodes_s = np.where(timed, seen.t_s, 0.0)
@@ -339,7 +347,7 @@ def _information(start: Estimate, known: Known, imu: ImuRecording, timing: Frame
     sigma[ROTATION], sigma[OFFSET] = _ROTATION_RAD, _OFFSET_S
     sigma[LEVER] = np.maximum(np.sqrt(variance[CAL.LEVER_ARM]), 1e-6)
     sigma[CLOCK_RATE] = PRIORS.clock_rate
-    sigma[READOUT] = np.sqrt(variance[CAL.READOUT]) if timing.readout_s else _NO_READOUT_S
+    sigma[READOUT] = np.sqrt(variance[CAL.READOUT]) if timing.readout_s != 0 else _NO_READOUT_S
     sigma[FIRST_INTRINSIC : at.seen.stop] = _INTRINSIC_SHARE * np.maximum(np.abs(start.intrinsics), 1.0)
     sigma[at.accel_delay] = np.sqrt(max(variance[gyro] + variance[accel] - 2 * cov[gyro, accel], 1e-8))
     sigma[at.gyro_gain], sigma[at.accel_gain] = PRIORS.gyro_gain, PRIORS.accel_gain
@@ -413,21 +421,25 @@ def written_back(
     about: Array,
     scale: float = 1.0,
 ) -> pycolmap.Reconstruction:
-    """A copy of a model with the poses, points, observations and cameras of a solution, stretched about a point."""
+    """A copy of a model with the poses, points, observations and cameras of a solution, stretched about a point.
+
+    Points that fewer than two of its images see were no part of it, and go.
+    """
     import pycolmap
 
     written = at_middle_lines(problem, x)
     copy = pycolmap.Reconstruction(reconstruction)
     centres = about + scale * (written.cam_in_world - about)
-    for i, image_id in enumerate(seen.image_ids):
+    for i, (image_id, mine) in enumerate(zip(seen.image_ids, _by_frame(seen), strict=True)):
         rotation = written.cam_from_world[i]
         image = copy.image(image_id)
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ centres[i])
         copy.frame(image.frame_id).set_cam_from_world(image.camera_id, pose)
-        mine = np.flatnonzero(seen.observations.frame == i)
         points2D = image.points2D
         for o in mine:
             points2D[int(seen.place[o])].xy = written.xy_px[o]
+    for point_id in set(copy.point3D_ids()) - set(seen.point_ids):
+        copy.delete_point3D(point_id)
     for point_id, xyz in zip(seen.point_ids, about + scale * (x.points_m - about), strict=True):
         copy.points3D[point_id].xyz = xyz
     for camera_id, camera in zip(seen.camera_ids, cameras_of(problem, x), strict=True):

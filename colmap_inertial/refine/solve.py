@@ -16,6 +16,8 @@ _MAX_STEPS = 40
 #: Where a step promises less of the squares' sum (in variances), it is at rest.
 _SETTLED = 0.1
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-9, 1e8
+#: A step to cameras whose numbers differ by more than this share (or as much of 1) is not tried.
+_LARGEST_CHANGE = 0.5
 #: With more damping, every step promises little: what seems to rest then is pushed once more with less.
 _REST_DAMPING = 1e-3
 
@@ -103,13 +105,17 @@ def solve(problem: Problem, start: Estimate) -> Solution:
             if step is None:
                 damping, growth = damping * growth, 2 * growth
                 continue
+            moved = at.estimate.moved(*step)
+            if not _plausible(start, moved):
+                damping, growth = damping * growth, 2 * growth
+                continue
             promised = _promised(problem, at, by, residual, step, observations)
             if promised < _SETTLED:
                 if damping <= _REST_DAMPING or pushed:
                     return _solution(at, steps, converged=damping <= _REST_DAMPING)
                 damping, growth, pushed = _REST_DAMPING, 2.0, True
                 continue
-            tried = _evaluate(problem, at.estimate.moved(*step), observations)
+            tried = _evaluate(problem, moved, observations)
             ratio = (at.cost - tried.cost) / promised
             gained = ratio > 1e-4
             if gained:
@@ -130,6 +136,12 @@ def _step(system: System, observations: Observations, by: Derivatives) -> tuple[
     except np.linalg.LinAlgError:
         return None
     return step if all(np.isfinite(part).all() for part in step) else None
+
+
+def _plausible(start: Estimate, moved: Estimate) -> bool:
+    """Whether a step leaves a camera that can be one: a focal length keeps its sign and size."""
+    away = np.abs(moved.intrinsics - start.intrinsics)
+    return bool(np.all(away <= _LARGEST_CHANGE * np.maximum(np.abs(start.intrinsics), 1.0)))
 
 
 def _promised(

@@ -101,10 +101,13 @@ class Turning:
         (F, 5, 3) of the reading's rotation vector, by the powers 1 to 5 of the seconds since then.
     force_m_s2
         (F, 3) mean reading of the accelerometer.
+    half_span_s
+        How long before and after these instants.
     """
 
     powers: Array
     force_m_s2: Array
+    half_span_s: float
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

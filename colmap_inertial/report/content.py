@@ -17,6 +17,8 @@ from colmap_inertial.report.words import half_width_pct, outcome_of_model, outco
 VERSION = 1
 #: What the pipeline keeps for the report alone, in an output folder.
 DATA_FOLDER, CROPS_FOLDER = "report_data", "crops"
+#: Paths longer than this bend and drift enough to say so (m).
+_LONG_PATH_M = 30.0
 #: Of a model in ``result.json``, what the page shows otherwise or not.
 _NOT_SHOWN = ("drift", "validation", "cov", "dense")
 #: Models that are shown in full, the largest ones; frames in the plot of blur; images of the target.
@@ -73,6 +75,8 @@ def gather(
     gaps = done.get("gaps", [])
     if shown and shown[0]["joined_of"]:
         outcome = {**outcome, "summary": [*outcome["summary"], _joined(shown[0], gaps)]}
+    if shown:
+        outcome = {**outcome, "summary": [*outcome["summary"], *_path_in_words(shown[0])]}
     if len(shown) > 1:
         said = f"There are {len(shown)} separate models. This is model {shown[0]['index']}; the others follow below."
         outcome = {**outcome, "summary": [*outcome["summary"], said]}
@@ -97,6 +101,21 @@ def gather(
         "configuration": _configuration(out),
         "versions": done["versions"],
     }
+
+
+def _path_in_words(model: Content) -> list[str]:
+    """What the refinement did to a model's path, in a sentence; or that it could."""
+    done = [one for one in model.get("treatments", []) if one["stage"] == "refine"]
+    if not done:
+        length = model.get("scene", {}).get("path_length")
+        if model.get("sparse_metric") is None or length is None or length < _LONG_PATH_M:
+            return []
+        return [f"Its path is {length:.0f} m long: --refine inertial fits the IMU to it, too, against bends and drift."]
+    percent = [part["percent"] for part in done[-1]["values"].get("drift", [])]
+    if not done[-1]["action"] or not percent:
+        return []
+    low, high = (f"{value:+.2f}" for value in (min(percent), max(percent)))
+    return [f"The IMU took drift out of its path: parts of it were stretched by {low} to {high} %."]
 
 
 def _joined(model: Content, gaps: list[Content]) -> str:

@@ -16,14 +16,11 @@ from colmap_inertial.geometry import skew, so3_exp, so3_log
 from colmap_inertial.scale import _parameters as par
 from colmap_inertial.scale._parameters import Data, Estimate, Noise, Prior
 from colmap_inertial.scale._preintegration import Preintegrated, SensorErrors, preintegrate
-from colmap_inertial.scale._solver import ArrowSystem
+from colmap_inertial.scale._solver import ArrowSystem, Inverse
 from colmap_inertial.types import Array
 
 #: Cauchy scale of the visual residuals, in standard deviations: a normal error loses 4 % of its weight on average.
 ROBUST_SIGMAS = 4.0
-#: Errors of visual centres are alike over about this long. Between .35 s, 1 s and a random walk the scale of a minute
-#: hardly changes; a drift that never comes back takes more of the motion in short clips.
-CORRELATION_S = 0.35
 #: How far a model's parts may be shifted against each other where it breaks.
 _BREAK_M = 10.0
 
@@ -79,6 +76,24 @@ class Group:
             flat = self.by_globals.reshape(-1, self.by_globals.shape[2])
             z[self.columns] += flat.T @ values.reshape(len(flat), -1)
 
+    def explained(self, inverse: Inverse) -> float:
+        """How many of the residuals' degrees of freedom the fit takes: the trace of their covariance after it."""
+        n = len(self.residual)
+        here, after = inverse.here[self.first :], inverse.here[self.first + 1 :]
+        cov = self.here @ here[:n] @ self.here.transpose(0, 2, 1)
+        along = -self.here @ inverse.followed[self.first : self.first + n]
+        if self.after is not None:
+            cov += self.after @ after[:n] @ self.after.transpose(0, 2, 1)
+            cross = self.here @ inverse.beside[self.first : self.first + n] @ self.after.transpose(0, 2, 1)
+            cov += cross + cross.transpose(0, 2, 1)
+            along -= self.after @ inverse.followed[self.first + 1 : self.first + 1 + n]
+        if self.by_globals is not None:
+            along[:, :, self.columns] += self.by_globals
+        # as one product: many small ones take several times as long
+        along = (along.reshape(-1, along.shape[2]) @ inverse.root).reshape(along.shape)
+        cov += along @ along.transpose(0, 2, 1)
+        return float(np.trace(cov, axis1=1, axis2=2).sum() if self.share is None else np.sum(self.share * cov))
+
     def add_to(self, system: ArrowSystem) -> None:
         """Add the group's information."""
         system.add(self.here, self.after, self.by_globals, first=self.first, column=self.columns.start)
@@ -132,6 +147,22 @@ class Direct:
             pulled = -self._kept(pulled)
         states[self.first : self.first + n, self.columns] += pulled
 
+    def explained(self, inverse: Inverse) -> float:
+        """As :meth:`Group.explained`; of the share, the diagonal."""
+        last = self.first + len(self.info)
+        own = np.s_[:, self.columns, self.columns]
+        cov = np.diagonal(inverse.here[self.first : last][own], axis1=1, axis2=2)
+        along = inverse.followed[self.first : last, self.columns]
+        if self.step:
+            keep = np.ones(len(self.info)) if self.keep is None else self.keep
+            beside = np.diagonal(inverse.beside[self.first : last][own], axis1=1, axis2=2)
+            after = np.diagonal(inverse.here[self.first + 1 : last + 1][own], axis1=1, axis2=2)
+            cov = after + keep[:, None] * (keep[:, None] * cov - 2 * beside)
+            along = inverse.followed[self.first + 1 : last + 1, self.columns] - keep[:, None, None] * along
+        along = (along.reshape(-1, along.shape[2]) @ inverse.root).reshape(along.shape)
+        cov = (cov + np.sum(along**2, axis=2)) * self.info[:, None] ** 2
+        return float(np.sum(cov if self.share is None else cov * np.diagonal(self.share, axis1=1, axis2=2)))
+
     def add_to(self, system: ArrowSystem) -> None:
         """As :meth:`Group.add_to`."""
         n, squared = len(self.info), self.info**2
@@ -151,7 +182,7 @@ def integrate(data: Data, x: Estimate) -> Preintegrated:
     """Preintegration between the nodes at the biases, gains and delays of ``x``."""
     errors = SensorErrors(
         gyro_bias_rad_s=x.gyro_bias_rad_s[:-1],
-        accel_bias_m_s2=x.accel_bias_m_s2 + x.accel_walk_m_s2[:-1],
+        accel_bias_m_s2=x.accel_biases_m_s2[:-1],
         gyro_gain=x.gyro_gain,
         accel_gain=x.accel_gain,
         accel_delay_s=x.accel_delay_s,
@@ -182,7 +213,7 @@ def corrected(pre: Preintegrated, then: Estimate, x: Estimate) -> Preintegrated:
     """Increments that were integrated for the estimate ``then``, for ``x``, to first order."""
     gyro_gain, accel_gain = x.gyro_gain - then.gyro_gain, x.accel_gain - then.accel_gain
     gyro_bias = x.gyro_bias_rad_s - then.gyro_bias_rad_s
-    accel_bias = x.accel_bias_m_s2 + x.accel_walk_m_s2 - then.accel_bias_m_s2 - then.accel_walk_m_s2
+    accel_bias = x.accel_biases_m_s2 - then.accel_biases_m_s2
     change = (
         _mv(pre.by_gyro_bias, gyro_bias[:-1])
         + _mv(pre.by_accel_bias, accel_bias[:-1])
@@ -219,7 +250,7 @@ def imu_group(noise: Noise, x: Estimate, pre: Preintegrated, *, rotation_only: b
     here[:, 6:9, par.VELOCITY] = -body_from_world * dt[:, :, None]
     here[:, 6:9, par.POSITION] = -body_from_world
     here[:, :, par.GYRO_BIAS] = -pre.by_gyro_bias
-    here[:, :, par.ACCEL_WALK] = -pre.by_accel_bias
+    here[:, :, par.ACCEL_WALK] = here[:, :, par.ACCEL_SLOW] = -pre.by_accel_bias
     after[:, 0:3, par.THETA] = (np.eye(3) + half_twist) @ pre.rotation
     after[:, 3:6, par.VELOCITY] = body_from_world
     after[:, 6:9, par.POSITION] = body_from_world
@@ -231,6 +262,16 @@ def imu_group(noise: Noise, x: Estimate, pre: Preintegrated, *, rotation_only: b
     z[:, :, par.ACCEL_DELAY] = -pre.by_accel_delay
     z[:, :, par.GYRO_GAIN] = -pre.by_gyro_gain
     z[:, :, par.ACCEL_GAIN] = -pre.by_accel_gain
+    # The noise sits on the readings: what they differ by counts as they have it, before the gains. Squares of what is
+    # left behind the gains would be least where gains make the noise small
+    reading_from_force = np.linalg.inv(np.eye(3) + x.accel_gain)
+    for rows in (slice(3, 6), slice(6, 9)):
+        residual[:, rows] = residual[:, rows] @ reading_from_force.T
+        for by in (here, after, z):
+            by[:, rows] = reading_from_force @ by[:, rows]
+        for i in range(3):
+            gains = slice(par.ACCEL_GAIN.start + 3 * i, par.ACCEL_GAIN.start + 3 * i + 3)
+            z[:, rows, gains] -= reading_from_force[:, i, None] * residual[:, None, rows]
     z = z[:, :, par.IMU_GLOBALS]
 
     rows = slice(0, 3) if rotation_only else slice(0, 9)
@@ -278,7 +319,7 @@ def visual_groups(data: Data, noise: Noise, x: Estimate, rate_rad_s: Array, *, r
     lever_body = x.cam_from_imu.T @ x.imu_in_cam_m
     smear = rate @ centre_by_rate.T + velocity @ centre_by_velocity.T
     half_spread_s2 = 0.5 * data.groups.spread_s2[:, None]
-    displacement = data.groups.displacement_m - half_spread_s2 * (x.accel_bias_m_s2 + x.accel_walk_m_s2)
+    displacement = data.groups.displacement_m - half_spread_s2 * x.accel_biases_m_s2
     displacement = displacement - _mv(data.groups.rotation_since - np.eye(3), np.broadcast_to(lever_body, (k, 3)))
     predicted = x.imu_in_world_m + _mv(camera, smear - x.imu_in_cam_m)
     predicted = predicted + half_spread_s2 * x.gravity_m_s2 + _mv(x.world_from_imu, displacement)
@@ -288,7 +329,9 @@ def visual_groups(data: Data, noise: Noise, x: Estimate, rate_rad_s: Array, *, r
     centre_here[:, :, par.POSITION] = -np.eye(3)
     centre_here[:, :, par.DRIFT] = -np.eye(3)
     centre_here[:, :, par.THETA] = x.world_from_imu @ skew(displacement - lever_body)
-    centre_here[:, :, par.ACCEL_WALK] = half_spread_s2[:, :, None] * x.world_from_imu
+    centre_here[:, :, par.ACCEL_WALK] = centre_here[:, :, par.ACCEL_SLOW] = (
+        half_spread_s2[:, :, None] * x.world_from_imu
+    )
     centre_here[:, :, par.VELOCITY] = -camera @ centre_by_velocity @ cam_from_world
     centre_z = np.zeros((k, 3, par.N_GLOBALS))
     # The noise sits on the visual centre, so a change of log u scales the prediction: total least squares
@@ -353,20 +396,22 @@ def walk_group(values: Array, columns: slice, sigma: float, dt_s: Array) -> Dire
     return Direct(residual=np.diff(values, axis=0) * info[:, None], columns=columns, info=info, step=True)
 
 
-def drift_group(values: Array, sigma: float, dt_s: Array, broken: NDArray[np.bool_]) -> Direct:
-    """The error that the visual centres drift by: alike over ``CORRELATION_S``, anything where it is ``broken``.
+def lasting_group(
+    values: Array, columns: slice, sigma: float, lasting_s: float, dt_s: Array, broken: NDArray[np.bool_]
+) -> Direct:
+    """An error that is alike over ``lasting_s``, and anything where it is ``broken``.
 
-    A Gauss-Markov process of the first order; over times that are short against its correlation it is a random walk
-    that grows by ``sigma`` in a second. Where a path breaks it is that throughout: what was shifted stays shifted.
+    A Gauss-Markov process of the first order; over times that are short against ``lasting_s`` it is a random walk that
+    grows by ``sigma`` in a second. Where it breaks it is that throughout: what was shifted stays shifted.
     """
     if broken.any():
         keep, info = np.ones(len(dt_s)), np.where(broken, 1 / _BREAK_M, 1 / (sigma * np.sqrt(dt_s)))
     else:
-        keep = np.exp(-dt_s / CORRELATION_S)
-        info = 1 / (sigma * np.sqrt(0.5 * CORRELATION_S * (1 - keep**2)))
+        keep = np.exp(-dt_s / lasting_s)
+        info = 1 / (sigma * np.sqrt(0.5 * lasting_s * (1 - keep**2)))
     residual = (values[1:] - keep[:, None] * values[:-1]) * info[:, None]
     share = np.where(broken, 0.0, 1.0)[:, None, None] * np.eye(3)
-    return Direct(residual=residual, columns=par.DRIFT, info=info, step=True, keep=keep, share=share)
+    return Direct(residual=residual, columns=columns, info=info, step=True, keep=keep, share=share)
 
 
 def state_group(values: Array, columns: slice, sigma: float, first: int = 0) -> Direct:
@@ -387,13 +432,24 @@ def all_groups(
         "centre": centre,
         "gyro_walk": walk_group(x.gyro_bias_rad_s, par.GYRO_BIAS, noise.gyro_walk_rad_s_rts, pre.dt_s),
         "accel_walk": walk_group(x.accel_walk_m_s2, par.ACCEL_WALK, noise.accel_walk_m_s2_rts, pre.dt_s),
-        "drift": drift_group(x.drift_m, noise.drift_m_rts, pre.dt_s, data.broken),
+        "drift": lasting_group(x.drift_m, par.DRIFT, noise.drift_m_rts, par.DRIFT_S, pre.dt_s, data.broken),
+        "accel_slow": lasting_group(
+            x.accel_slow_m_s2,
+            par.ACCEL_SLOW,
+            noise.accel_slow_m_s2_rts,
+            par.ACCEL_SLOW_S,
+            pre.dt_s,
+            np.zeros_like(data.broken),
+        ),
         # Anchors of what only differences determine
         "gyro_bias": state_group(
             x.gyro_bias_rad_s[:1] - prior.mean.gyro_bias_rad_s[:1], par.GYRO_BIAS, prior.gyro_bias_sigma_rad_s
         ),
         "accel_zero": state_group(x.accel_walk_m_s2[middle : middle + 1], par.ACCEL_WALK, 1e-4, middle),
-        "drift_zero": state_group(x.drift_m[:1], par.DRIFT, noise.drift_m_rts * (0.5 * CORRELATION_S) ** 0.5),
+        "drift_zero": state_group(x.drift_m[:1], par.DRIFT, noise.drift_m_rts * (0.5 * par.DRIFT_S) ** 0.5),
+        "accel_slow_zero": state_group(
+            x.accel_slow_m_s2[:1], par.ACCEL_SLOW, noise.accel_slow_m_s2_rts * (0.5 * par.ACCEL_SLOW_S) ** 0.5
+        ),
         "speed": state_group(x.velocity_m_s, par.VELOCITY, prior.speed_sigma_m_s),
     }
 
@@ -406,7 +462,7 @@ def rotation_groups(
     rotation, _ = visual_groups(data, noise, x, pre.rate_rad_s, robust=True)
     held = {
         str(columns): state_group(np.zeros((k, 3)), columns, 1.0)
-        for columns in (par.POSITION, par.VELOCITY, par.ACCEL_WALK, par.DRIFT)
+        for columns in (par.POSITION, par.VELOCITY, par.ACCEL_WALK, par.DRIFT, par.ACCEL_SLOW)
     }
     return {
         "imu": imu_group(noise, x, pre, rotation_only=True),

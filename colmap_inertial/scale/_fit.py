@@ -15,8 +15,7 @@ from colmap_inertial.scale.priors import model_scale_sigma
 from colmap_inertial.types import Array, ImuNoise, ScaleDrift
 
 _MAX_ITERATIONS, _MAX_ROTATION_ITERATIONS = 40, 4
-_PROBES = 4
-#: At rest: what the scale would still move by, in its standard deviations, and its variance would still change by.
+#: At rest: what the scale would still move by, in its standard deviations.
 _SETTLED, _FEWEST_ITERATIONS = 0.1, 4
 #: A robust weight below this: five times as far off as errors usually are.
 _HARDLY = 0.35
@@ -97,52 +96,45 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
     numpy.linalg.LinAlgError
         When the data leave the system singular.
     """
-    search = LevelSearch(expected=Expected.of(data, sheet), probes=_PROBES)
+    search = LevelSearch(expected=Expected.of(data, sheet))
     x = _rotations_first(data, search.noise, prior)
     scale = _moment_scale(data, x)
     x = replace(x, metres_per_unit=scale, imu_in_world_m=data.groups.centre * scale)
-    signs: dict[str, Array] = {}
     converged = settled = False
-    variance = np.inf
     integrated, there = fac.integrate(data, x), x
     for iteration in range(_MAX_ITERATIONS):
-        if settled or not fac.still_near(there, x, data.t_s, tolerance=4.0):
+        if settled or not fac.still_near(there, x, data.t_s, tolerance=4.0 if iteration <= _FEWEST_ITERATIONS else 1.0):
             integrated, there = fac.integrate(data, x), x
         pre = fac.corrected(integrated, there, x)
         local = prior.at(x)
         groups = fac.all_groups(data, search.noise, local, x, pre, robust=iteration > 2)
-        signs = signs or levels.random_signs(groups, _PROBES)
         system, rhs, rhs_z = fac.normal_equations(list(groups.values()), local, x)
-        rhs = np.concatenate([rhs, np.zeros((*rhs.shape[:2], search.columns))], axis=2)
-        rhs_z = np.concatenate([rhs_z, np.zeros((len(rhs_z), search.columns))], axis=1)
-        search.add_columns(groups, signs, rhs[:, :, 1:], rhs_z[:, 1:])
-        states, z, cov = system.solve(rhs, rhs_z)
+        inverse = system.inverted()
+        states, z = inverse.solve(rhs, rhs_z)
         step = abs(float(z[par.SCALE, 0]))
         shrink = min(1.0, _LARGEST_STEP / max(step, 1e-12))
         x = x.moved(states[:, :, 0] * shrink, z[:, 0] * shrink, pre.rate_rad_s, data.t_s)
-        before, variance = variance, float(cov[par.SCALE, par.SCALE])
-        sigma = variance**0.5
+        cov = inverse.cov
+        sigma = float(cov[par.SCALE, par.SCALE]) ** 0.5
         converged = step < 0.2 * sigma
-        if iteration > 2:
-            search.update(groups, signs, states, z)
-            moves = max(step, search.scale_moves())
-            settled = iteration > _FEWEST_ITERATIONS and moves < _SETTLED * sigma
-            settled = settled and abs(variance / before - 1) < _SETTLED
-        if settled and fac.still_near(there, x, data.t_s):
+        search.update(groups, inverse, states, z, moving=not settled)
+        if settled:
             break
+        moves = max(step, search.scale_moves())
+        settled = iteration >= _FEWEST_ITERATIONS and moves < _SETTLED * sigma and search.at_rest
     noise, sums = search.noise, search.sums
 
-    # Once more at the optimum: the mean gyroscope bias, the scale's variance, suspicions, and scales of the parts
+    # Once more: the mean gyroscope bias, the scale's variance, suspicions, and scales of the parts
     k = len(data.t_s)
     imu = groups["imu"]
     assert isinstance(imu, fac.Group)
     where, own = sus.columns(data, x, imu)
-    residual = (imu.residual[:, :, None] + imu.apply(states[:, :, :1], z[:, :1]))[:, :, 0]
+    residual = (imu.residual[:, :, None] + imu.apply(states, z))[:, :, 0]
     ends, ends_z = np.zeros((k, par.N_STATE, 4 + own.shape[2])), np.zeros((par.N_GLOBALS, 4 + own.shape[2]))
     ends[:, par.GYRO_BIAS, :3] = np.eye(3) / k
     ends_z[par.SCALE, 3] = 1.0
     imu.pull_back(own, ends[:, :, 4:], ends_z[:, 4:])
-    states, z, cov = system.solve(ends, ends_z)
+    states, z = inverse.solve(ends, ends_z)
     suspicions = sus.suspicions(where, own, imu.apply(states[:, :, 4:], z[:, 4:]), residual, z[par.SCALE, 4:])
     variance_parts = _variance_parts(groups, local, x, pre.cov_gaps, states[:, :, 3:4], z[:, 3])
     level_variance, freedom = search.scale_variance(groups, states[:, :, 3:4], z[:, 3:4])
@@ -153,7 +145,7 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
         x,
         noise,
         groups["centre"],
-        (system, rhs[:, :, :1], rhs_z[:, :1]),
+        (system, rhs, rhs_z),
         inflation=inflation,
         tolerated_log=model_scale_sigma(calibrated=False),
     )
@@ -187,6 +179,8 @@ _PART_OF_GROUP = {
     "gyro_walk": "gyro",
     "gyro_bias": "gyro",
     "accel_walk": "accel_bias",
+    "accel_slow": "accel_noise",
+    "accel_slow_zero": "accel_noise",
     "accel_zero": "accel_bias",
     "rotation": "camera_path",
     "centre": "camera_path",
@@ -234,18 +228,19 @@ def _variance_parts(
     states, z
         (K, m, 1), (n,) that column.
     """
-    others = ("accel_noise", "lost_readings", "gravity")
+    others = ("lost_readings", "gravity")
     parts = dict.fromkeys((*_PART_OF_GROUP.values(), *_PART_OF_GLOBALS, *others), 0.0)
     for name, group in groups.items():
         values = group.apply(states, z[:, None])
         parts[_PART_OF_GROUP[name]] += float(np.sum(values**2))
     imu = groups["imu"]
     along = imu.apply(states, z[:, None])
-    parts["accel_noise"] = float(np.sum(along * levels.by_level(imu, along)))
+    white = float(np.sum(along * levels.by_level(imu, along)))
+    parts["accel_noise"] += white
     assert isinstance(imu, fac.Group) and imu.root is not None
     unwhitened = imu.root.transpose(0, 2, 1) @ along
     parts["lost_readings"] = float(np.sum(unwhitened * (cov_gaps @ unwhitened)))
-    parts["gyro"] -= parts["accel_noise"] + parts["lost_readings"]
+    parts["gyro"] -= white + parts["lost_readings"]
     by_prior = z * (prior.info @ z)
     for part, places in _PART_OF_GLOBALS.items():
         parts[part] += sum(float(by_prior[place].sum()) for place in places)

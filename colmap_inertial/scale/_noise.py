@@ -13,6 +13,7 @@ import numpy as np
 
 from colmap_inertial.scale._factors import Direct, Group
 from colmap_inertial.scale._parameters import Data, Noise
+from colmap_inertial.scale._solver import Inverse
 from colmap_inertial.types import JOINT_GYRO_WALK_RAD_S_RTS, TYPICAL_NOISE, Array, ImuNoise
 
 Groups = Mapping[str, Group | Direct]
@@ -27,26 +28,54 @@ TYPICAL = Noise(
     rotation_rad=2e-3,
     centre_m=1e-3,
     drift_m_rts=4e-3,
+    accel_slow_m_s2_rts=1e-3,
 )
 #: No estimate may fall below these: pixels and samples are not finer.
-_FLOOR = {"accel_m_s2_rthz": 3e-4, "rotation_rad": 5e-5, "centre_m": 5e-5, "drift_m_rts": 1e-5}
+_FLOOR = {
+    "accel_m_s2_rthz": 3e-4,
+    "rotation_rad": 5e-5,
+    "centre_m": 5e-5,
+    "drift_m_rts": 1e-5,
+    "accel_slow_m_s2_rts": 1e-4,
+}
 #: Which residuals speak for which level. The gyroscope's is not among them: a slow error of the visual rotations looks
 #: just like a noisy gyroscope, and real SfM has the one while real gyroscopes are not the other.
-GROUP_OF = {"accel_m_s2_rthz": "imu", "rotation_rad": "rotation", "centre_m": "centre", "drift_m_rts": "drift"}
+GROUP_OF = {
+    "accel_m_s2_rthz": "imu",
+    "rotation_rad": "rotation",
+    "centre_m": "centre",
+    "drift_m_rts": "drift",
+    "accel_slow_m_s2_rts": "accel_slow",
+}
 _LEVELS = tuple(GROUP_OF)
-#: Standard deviations of the logarithm of a level before anything is known of the recording.
-_SPREAD = {"accel_m_s2_rthz": 0.2, "rotation_rad": 2.0, "centre_m": 2.0, "drift_m_rts": 2.0}
+#: Standard deviations of the logarithm of a level before anything is known of the recording: of a device in a hand,
+#: with no slow errors of its accelerometer to speak of, and of one that vibrates.
+_SPREAD = {"accel_m_s2_rthz": 0.2, "rotation_rad": 2.0, "centre_m": 2.0, "drift_m_rts": 2.0, "accel_slow_m_s2_rts": 0.5}
+_SHAKEN = {**_SPREAD, "accel_m_s2_rthz": 1.0, "accel_slow_m_s2_rts": 2.0}
+#: What vibration does to an accelerometer: its most probable value where there is any; and where a search starts, with
+#: little white noise, that asks whether it is this.
+_SHAKEN_SLOW, _SLOW_START, _QUIET_START = 1e-2, 6e-2, 3e-3
 #: White noise of a gyroscope and an accelerometer, rad/s and m/s2 per root of a hertz: least and most of the first,
 #: most of the second. Streams that are rougher record motion or vibration.
 _LEAST_GYRO, _MOST_GYRO, _LEAST_ACCEL, _MOST_ACCEL = 1e-4, 3e-4, 5e-4, 4e-3
+#: Ten times the noise of the noisiest sensor: rotors and engines, not hands (.034 at most in what was recorded).
+_VIBRATES = 0.04
 #: Largest correlation between errors of neighbouring rotations that is believed.
 _LARGEST_CORRELATION = 0.8
-#: Largest change of a level in an iteration (logarithm); where it turns back, the next may be this much of the last at
-#: most, and grows by the other factor as long as it keeps its direction.
-_LARGEST_CHANGE, _TURNED, _KEPT = 0.9, 0.4, 2.5
-#: Where levels that explain the same (noise of the centres and their drift) do not come to rest in so many steps, the
-#: largest change shrinks by the factor with each further one.
-_PATIENCE, _TIRING = 30, 0.6
+#: Part of a level's residuals that is left to it at least. In a hand a hundredth: where camera and IMU do not belong
+#: together, noise of the one would otherwise grow to metres and explain the other away. Where a device vibrates, that
+#: much would take noise for none that explains all but a little.
+_LEAST_LEFT, _LEAST_LEFT_SHAKEN = 1e-2, 1e-6
+#: First steps go by sums of squares, of the slow share of an error by its whole logarithm; then Newton's, damped
+#: (Levenberg): so much at first, and by these factors more where a step leads no nearer, less where it does.
+_BY_SQUARES, _DAMPED, _MORE, _LESS = 3, 0.3, 3.0, 0.4
+_LEAST_DAMPING, _MOST_DAMPING = 0.03, 10.0
+#: Largest changes of a variance's logarithm in a step: at first, and then.
+_LARGEST_FIRST, _LARGEST_CHANGE = 3.0, 1.8
+#: Where levels that explain the same do not come to rest in so many steps, that shrinks by the factor with each more.
+_PATIENCE, _TIRING = 25, 0.6
+#: At rest: the likelihood has no more than this to gain, as standard deviations of the levels (Newton's decrement).
+_AT_REST = 0.5
 
 
 def roughness(t_s: Array, values: Array) -> float:
@@ -67,10 +96,27 @@ def roughness(t_s: Array, values: Array) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class Expected:
-    """What is known of the levels beforehand: their most probable values, and the least that is possible."""
+    """What is known of the levels beforehand.
+
+    Attributes
+    ----------
+    noise
+        The most probable values.
+    floor
+        The least that is possible.
+    spread
+        Standard deviations of the logarithms.
+    start
+        Where the search for the greatest likelihood begins.
+    least_left
+        What part of the residuals of a level counts as left to it at least.
+    """
 
     noise: Noise
     floor: Mapping[str, float]
+    spread: Mapping[str, float]
+    start: Noise
+    least_left: float
 
     @classmethod
     def of(cls, data: Data, sheet: ImuNoise | None) -> Expected:
@@ -78,33 +124,34 @@ class Expected:
 
         The white noise of a sensor is in its stream, and so is all that is quicker than the states: motion, and above
         all vibration, of which only a part harms. Up to what sensors have, an accelerometer's stream counts as its
-        noise; what is rougher, as the geometric mean of both.
+        noise; what is rougher, as the geometric mean of both, of which little is certain. What vibration does may be
+        white noise or an error that stays for a while (it changes with the load on the rotors), which the search finds
+        if it begins there; from white noise it may not.
         """
         gyro = float(np.clip(data.gyro_roughness_rad_s_rthz, _LEAST_GYRO, _MOST_GYRO))
-        noise = replace(TYPICAL, gyro_rad_s_rthz=gyro, accel_m_s2_rthz=_stream_noise(data))
-        if sheet is None:
-            return cls(noise=noise, floor=_FLOOR)
-        noise = replace(
-            noise,
-            gyro_rad_s_rthz=max(noise.gyro_rad_s_rthz, sheet.gyro_density_rad_s_rthz),
-            gyro_walk_rad_s_rts=max(noise.gyro_walk_rad_s_rts, sheet.gyro_walk_rad_s2_rthz),
-            accel_m_s2_rthz=max(noise.accel_m_s2_rthz, sheet.accel_density_m_s2_rthz),
-            accel_walk_m_s2_rts=max(noise.accel_walk_m_s2_rts, sheet.accel_walk_m_s3_rthz),
-        )
-        least = max(_FLOOR["accel_m_s2_rthz"], sheet.accel_density_m_s2_rthz)
-        return cls(noise=noise, floor={**_FLOOR, "accel_m_s2_rthz": least})
-
-
-def _stream_noise(data: Data) -> float:
-    """The accelerometer's noise (m/s2 per root of a hertz) as its own stream has it; see :class:`Expected`."""
-    rough = max(data.accel_roughness_m_s2_rthz, _LEAST_ACCEL)
-    return rough if rough < _MOST_ACCEL else float(np.sqrt(rough * _MOST_ACCEL))
-
-
-def random_signs(groups: Groups, count: int) -> dict[str, Array]:
-    """(N, r, count) signs for each group, the same in every call."""
-    rng = np.random.default_rng(0)
-    return {name: rng.choice([-1.0, 1.0], (*group.residual.shape, count)) for name, group in groups.items()}
+        rough = max(data.accel_roughness_m_s2_rthz, _LEAST_ACCEL)
+        noise = replace(TYPICAL, gyro_rad_s_rthz=gyro, accel_m_s2_rthz=rough)
+        floor, spread = _FLOOR, _SPREAD
+        if rough > _MOST_ACCEL:
+            noise = replace(noise, accel_m_s2_rthz=float(np.sqrt(rough * _MOST_ACCEL)))
+        if rough > _VIBRATES:
+            noise, spread = replace(noise, accel_slow_m_s2_rts=_SHAKEN_SLOW), _SHAKEN
+        if sheet is not None:
+            noise = replace(
+                noise,
+                gyro_rad_s_rthz=max(noise.gyro_rad_s_rthz, sheet.gyro_density_rad_s_rthz),
+                gyro_walk_rad_s_rts=max(noise.gyro_walk_rad_s_rts, sheet.gyro_walk_rad_s2_rthz),
+                accel_m_s2_rthz=max(noise.accel_m_s2_rthz, sheet.accel_density_m_s2_rthz),
+                accel_walk_m_s2_rts=max(noise.accel_walk_m_s2_rts, sheet.accel_walk_m_s3_rthz),
+            )
+            least = max(_FLOOR["accel_m_s2_rthz"], sheet.accel_density_m_s2_rthz)
+            floor = {**_FLOOR, "accel_m_s2_rthz": least}
+        start = replace(noise, accel_slow_m_s2_rts=TYPICAL.accel_slow_m_s2_rts)
+        if spread is _SHAKEN:
+            quiet = max(floor["accel_m_s2_rthz"], min(noise.accel_m_s2_rthz, _QUIET_START))
+            start = replace(noise, accel_m_s2_rthz=quiet, accel_slow_m_s2_rts=_SLOW_START)
+        left = _LEAST_LEFT if spread is _SPREAD else _LEAST_LEFT_SHAKEN
+        return cls(noise=noise, floor=floor, spread=spread, start=start, least_left=left)
 
 
 def correlation_factor(group: Group | Direct, states: Array, z: Array) -> float:
@@ -128,9 +175,7 @@ class LevelSearch:
     Attributes
     ----------
     expected
-        Prior, and where the search starts.
-    probes
-        How many random vectors estimate the traces (Hutchinson).
+        Prior.
     noise
         Where it stands.
     sums
@@ -140,94 +185,107 @@ class LevelSearch:
     by_scale
         (L,) change of the logarithm of ``u`` with the logarithm of each variance.
     wanted
-        (L,) changes of the logarithms of the variances that the last step was to make, before any limit.
+        (L,) changes of the logarithms of the variances that lead to the greatest likelihood, to first order.
+    decrement
+        What is left to gain: the length of that step in standard deviations of the levels.
     """
 
     expected: Expected
-    probes: int
     noise: Noise = field(init=False)
     sums: dict[str, tuple[float, float]] = field(default_factory=dict)
     information: Array = field(default_factory=lambda: np.eye(len(_LEVELS)))
     by_scale: Array = field(default_factory=lambda: np.zeros(len(_LEVELS)))
     wanted: Array = field(default_factory=lambda: np.ones(len(_LEVELS)))
-    _last: Array = field(default_factory=lambda: np.zeros(len(_LEVELS)))
+    decrement: float = np.inf
+    _damping: float = _DAMPED
+    _before: float = np.inf
     _steps: int = 0
-    _limit: Array = field(default_factory=lambda: np.full(len(_LEVELS), 2 * _LARGEST_CHANGE))
 
     def __post_init__(self) -> None:
-        self.noise = self.expected.noise
+        self.noise = self.expected.start
 
-    @property
-    def columns(self) -> int:
-        """How many right-hand sides :meth:`add_columns` fills."""
-        return self.probes + len(_LEVELS)
-
-    def add_columns(self, groups: Groups, signs: Mapping[str, Array], rhs: Array, rhs_z: Array) -> None:
-        """Fill right-hand sides (K, m, columns), (n, columns): random signs, then each level's residuals."""
-        for name, group in groups.items():
-            group.pull_back(signs[name], rhs[:, :, : self.probes], rhs_z[:, : self.probes])
-        for j, level in enumerate(_LEVELS, start=self.probes):
-            group = groups[GROUP_OF[level]]
-            values = by_level(group, group.residual[:, :, None])
-            group.pull_back(values, rhs[:, :, j : j + 1], rhs_z[:, j : j + 1])
-
-    def update(self, groups: Groups, signs: Mapping[str, Array], states: Array, z: Array) -> None:
-        """A step of the levels, given a step of all else and the solutions for :meth:`add_columns` after it."""
-        changes = {level: groups[GROUP_OF[level]].apply(states, z) for level in _LEVELS}
-        residual = {level: groups[GROUP_OF[level]].residual[:, :, None] for level in _LEVELS}
-        information = np.zeros((len(_LEVELS), len(_LEVELS)))
+    def update(self, groups: Groups, inverse: Inverse, states: Array, z: Array, *, moving: bool) -> None:
+        """What a step (K, m, 1), (n, 1) of all else and the inverse of its equations say; levels go along if moving."""
+        squares, right, counts = np.zeros((3, len(_LEVELS)))
+        own = []
+        rhs, rhs_z = np.zeros((*states.shape[:2], len(_LEVELS))), np.zeros((len(z), len(_LEVELS)))
         for i, level in enumerate(_LEVELS):
-            group, change = groups[GROUP_OF[level]], changes[level]
-            moved = residual[level] + change[:, :, :1]
-            squares = float(np.sum(moved * by_level(group, moved)))
+            group = groups[GROUP_OF[level]]
+            moved = group.residual[:, :, None] + group.apply(states, z)
+            own.append(by_level(group, moved))
+            squares[i] = float(np.sum(moved * own[i]))
             if level == "rotation_rad":
-                squares *= self.noise.rotation_excess**2
+                squares[i] *= self.noise.rotation_excess**2
             count = group.residual.shape[1] * (
                 len(group.residual) if group.weight is None else float(group.weight.sum())
             )
             if group.share is not None:
                 count = float(np.trace(group.share, axis1=1, axis2=2).sum())
-            probed = by_level(group, signs[GROUP_OF[level]]) * change[:, :, 1 : 1 + self.probes]
-            used = float(np.sum(probed)) / self.probes
-            self.sums[level] = squares, max(count - used, 0.01 * count)
-            own = by_level(group, residual[level])
-            followed = np.einsum("kri,krj->j", own, change[:, :, 1 + self.probes :])
-            information[i] = -0.5 * followed
-            information[i, i] += 0.5 * float(np.sum(own**2))
-        self.by_scale = z[0, 1 + self.probes :]
-        self._step(0.5 * (information + information.T), groups["rotation"], states, z)
+            counts[i], right[i] = count, max(count - group.explained(inverse), self.expected.least_left * count)
+            group.pull_back(own[i], rhs[:, :, i : i + 1], rhs_z[:, i : i + 1])
+        # a hundredth of the residuals, or they tell nothing of how much larger than expected they are
+        told = np.maximum(right, 0.01 * counts)
+        self.sums = {level: (float(squares[i]), float(told[i])) for i, level in enumerate(_LEVELS)}
+        followed, followed_z = inverse.solve(rhs, rhs_z)
+        self.by_scale = followed_z[0]
+        average = np.zeros((len(_LEVELS), len(_LEVELS)))
+        for i, level in enumerate(_LEVELS):
+            change = groups[GROUP_OF[level]].apply(followed, followed_z)
+            average[i] = -0.5 * np.einsum("kri,krj->j", own[i], change)
+            average[i, i] += 0.5 * float(np.sum(own[i] ** 2))
+        noise = self._next(0.5 * (average + average.T), squares, right)
+        if moving:
+            self.noise = replace(noise, rotation_excess=correlation_factor(groups["rotation"], states, z))
 
-    def _step(self, information: Array, rotation: Group | Direct, states: Array, z: Array) -> None:
-        squares, right = np.array([self.sums[level] for level in _LEVELS]).T
-        # Where residuals are smaller than their level says, so is the information in them
-        smaller = np.sqrt(np.maximum(1.0, right / np.maximum(squares, 1e-9)))
-        information = information * smaller[:, None] * smaller
+    def _next(self, average: Array, squares: Array, right: Array) -> Noise:
         # Rotations hardly depend on the other levels; their correlation changes along with their level
         at = _LEVELS.index("rotation_rad")
-        information[at, :] = information[:, at] = 0.0
-        information[at, at] = 0.5 * max(squares[at], right[at])
+        others = np.arange(len(_LEVELS)) != at
+        average[at, :] = average[:, at] = 0.0
+        average[at, at] = 0.5 * max(squares[at], right[at])
         now = 2 * np.log([getattr(self.noise, level) for level in _LEVELS])
         mean = 2 * np.log([getattr(self.expected.noise, level) for level in _LEVELS])
         floor = 2 * np.log([self.expected.floor[level] for level in _LEVELS])
-        prior = 1 / (2 * np.array([_SPREAD[level] for level in _LEVELS])) ** 2
-        self.information = information + np.diag(prior)
-        step = np.linalg.solve(self.information, 0.5 * (squares - right) - prior * (now - mean))
-        self.wanted = np.where((now <= floor + 1e-6) & (step < 0), 0.0, step)
-        turned = self._last * step < 0
+        prior = 1 / (2 * np.array([self.expected.spread[level] for level in _LEVELS])) ** 2
+        self.information = average + np.diag(prior)
+        gradient = 0.5 * (squares - right) - prior * (now - mean)
+        free = ~((now <= floor + 1e-6) & (gradient < 0))
+
+        def newton(damping: float) -> Array:
+            step = np.zeros(len(_LEVELS))
+            stiff = np.diag(np.where(others, damping * 0.5 * np.maximum(np.maximum(right, squares), 1.0), 0.0))
+            step[free] = np.linalg.solve((self.information + stiff)[np.ix_(free, free)], gradient[free])
+            return step
+
+        self.wanted = newton(0.0)
+        self.decrement = float(max(gradient[free & others] @ self.wanted[free & others], 0.0)) ** 0.5
         self._steps += 1
-        most = 2 * _LARGEST_CHANGE * self._left
-        self._limit = np.minimum(np.where(turned, _TURNED * self._limit, _KEPT * self._limit), most)
-        self._last = np.clip(step, -self._limit, self._limit)
-        new = np.exp(0.5 * np.maximum(now + self._last, floor))
-        self.noise = replace(
-            self.noise,
-            **dict(zip(_LEVELS, map(float, new), strict=True)),
-            rotation_excess=correlation_factor(rotation, states, z),
-        )
+        if self._steps <= _BY_SQUARES:
+            # an accelerometer's noise is known beforehand better than the rest
+            part = np.where(np.array(_LEVELS) == "accel_m_s2_rthz", 0.5, 1.0)
+            step = np.clip(
+                part * np.log(np.maximum(squares, 1e-9) / np.maximum(right, 1e-9)), -_LARGEST_FIRST, _LARGEST_FIRST
+            )
+        else:
+            if self.decrement > self._before:
+                self._damping = min(max(_MORE * self._damping, _LEAST_DAMPING), _MOST_DAMPING)
+            elif np.isfinite(self._before):
+                self._damping = _LESS * self._damping if self._damping > 1e-3 else 0.0
+            self._before = self.decrement
+            most = _LARGEST_CHANGE * self._left
+            step = np.clip(newton(self._damping), -most, most)
+        new = np.exp(0.5 * np.maximum(now + step, floor))
+        return replace(self.noise, **dict(zip(_LEVELS, map(float, new), strict=True)))
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the likelihood has hardly more to gain."""
+        return self.decrement * self._left < _AT_REST
 
     def scale_moves(self) -> float:
         """How much the logarithm of the scale would change with the step that the levels want to make."""
-        return abs(float(np.sum(self.by_scale * np.clip(self.wanted, -3.0 * self._left, 3.0 * self._left))))
+        most = _LARGEST_FIRST * self._left
+        return abs(float(self.by_scale @ np.clip(self.wanted, -most, most)))
 
     @property
     def _left(self) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -33,13 +34,23 @@ N_GLOBALS = 79
 #: tried on have 3 to 9; by chance, 28 is exceeded once in a thousand.
 LARGEST_GAIN_CHI2 = 28.0
 
-# Columns of a state. The last two are random walks: of the accelerometer's bias around its value in the middle of the
-# recording, and of the error that the visual centres drift by.
-THETA, POSITION, VELOCITY, GYRO_BIAS, ACCEL_WALK, DRIFT = (slice(3 * i, 3 * i + 3) for i in range(6))
-N_STATE = 18
+# Columns of a state. The last three are errors that stay for a while: a random walk of the accelerometer's bias around
+# its value in the middle of the recording, what the visual centres drift by, and what vibration does to the bias.
+THETA, POSITION, VELOCITY, GYRO_BIAS, ACCEL_WALK, DRIFT, ACCEL_SLOW = (slice(3 * i, 3 * i + 3) for i in range(7))
+N_STATE = 21
+#: Errors of visual centres, and of an accelerometer that vibrates, are alike over about these times. Between .35 s, 1 s
+#: and a random walk of the centres the scale of a minute hardly changes; a drift that never comes back takes more of
+#: the motion in short clips.
+DRIFT_S, ACCEL_SLOW_S = 0.35, 0.5
 
 #: Where steps of the fields of :class:`Estimate` stand that change by addition: the states' and the globals.
-_ADDED_STATES = dict(velocity_m_s=VELOCITY, gyro_bias_rad_s=GYRO_BIAS, accel_walk_m_s2=ACCEL_WALK, drift_m=DRIFT)
+_ADDED_STATES = dict(
+    velocity_m_s=VELOCITY,
+    gyro_bias_rad_s=GYRO_BIAS,
+    accel_walk_m_s2=ACCEL_WALK,
+    drift_m=DRIFT,
+    accel_slow_m_s2=ACCEL_SLOW,
+)
 _ADDED_GLOBALS = dict(
     accel_bias_m_s2=ACCEL_BIAS,
     accel_delay_s=slice(ACCEL_DELAY, ACCEL_DELAY + 1),
@@ -101,6 +112,8 @@ class Data:
 class Noise:
     """Standard deviations: densities of the sensors, walks per root of a second, visual errors per state.
 
+    ``drift_m_rts`` and ``accel_slow_m_s2_rts`` are what a Gauss-Markov process grows by in a short time.
+
     ``rotation_excess`` is the factor by which errors of visual rotations weigh more than white ones of their size,
     since those of neighbouring states are correlated: ``sqrt((1 + c) / (1 - c))`` for a correlation ``c``.
     """
@@ -112,7 +125,17 @@ class Noise:
     rotation_rad: float
     centre_m: float
     drift_m_rts: float
+    accel_slow_m_s2_rts: float
     rotation_excess: float = 1.0
+
+    @property
+    def accel_density_m_s2_rthz(self) -> float:
+        """White noise that would do over seconds what noise and slow errors of the accelerometer do together."""
+        return math.hypot(self.accel_m_s2_rthz, self.accel_slow_m_s2_rts * ACCEL_SLOW_S)
+
+    def accel_m_s2(self, dt_s: float) -> float:
+        """Standard deviation of the accelerometer's mean over so short a time."""
+        return math.hypot(self.accel_m_s2_rthz / dt_s**0.5, self.accel_slow_m_s2_rts * (0.5 * ACCEL_SLOW_S) ** 0.5)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -126,6 +149,7 @@ class Estimate:
     gyro_bias_rad_s: Array  # (K, 3)
     accel_walk_m_s2: Array  # (K, 3)
     drift_m: Array  # (K, 3)
+    accel_slow_m_s2: Array  # (K, 3)
     gravity_m_s2: Array  # (3,) world frame
     accel_bias_m_s2: Array  # (3,)
     accel_delay_s: float  # beyond the gyroscope's, and beyond the first guess
@@ -138,8 +162,13 @@ class Estimate:
     shutter: Array  # (4, 3, 3): rotation by rate, rotation by velocity, centre by rate, centre by velocity
     coupling_m: Array  # (3, 3): beyond Data.coupling
 
+    @property
+    def accel_biases_m_s2(self) -> Array:
+        """(K, 3) all that is subtracted from the accelerometer's readings."""
+        return self.accel_bias_m_s2 + self.accel_walk_m_s2 + self.accel_slow_m_s2
+
     def moved(self, states: Array, z: Array, rate_rad_s: Array, t_s: Array) -> Estimate:
-        """The estimate after a step of the states (K, 18) and the globals (79,).
+        """The estimate after a step of the states (K, 21) and the globals (79,).
 
         A later IMU clock makes each node an earlier instant of the IMU: rotations and positions move along.
         """

@@ -122,6 +122,7 @@ def prepare(
         gyro_bias_rad_s=zeros + calibration.gyro_bias_rad_s,
         accel_walk_m_s2=zeros,
         drift_m=zeros,
+        accel_slow_m_s2=zeros,
         gravity_m_s2=-mean_force * gravity_m_s2 / max(float(np.linalg.norm(mean_force)), 1e-9),
         accel_bias_m_s2=np.zeros(3),
         accel_delay_s=0.0,

@@ -91,6 +91,28 @@ class ArrowSystem:
         factor.substitute(rest)
         return rest * unit[:, :, None], x_globals, cov
 
+    def inverted(self) -> Inverse:
+        """The inverse, as far as the system has blocks.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            When the matrix is not positive definite.
+        """
+        (k, m), n = self.diagonal.shape[:2], len(self.corner)
+        unit, _ = self.scaling(np.zeros((k, m, 0)))
+        products = np.empty((n, n))
+        factor = _inertial.eliminate(self.diagonal, self.below, self.border, np.zeros((k, m, 0)), unit, products)
+        if factor is None:
+            raise np.linalg.LinAlgError("the normal equations are singular")
+        root = self._root_of_globals(products)
+        here, beside = np.empty((k, m, m)), np.empty((k - 1, m, m))
+        factor.selected_inverse(here, beside)
+        here *= unit[:, :, None] * unit[:, None, :]
+        beside *= unit[:-1, :, None] * unit[1:, None, :]
+        followed = _of_chain(factor, unit, self.border)
+        return Inverse(unit=unit, factor=factor, here=here, beside=beside, followed=followed, root=root)
+
     def scaling(self, rhs_states: Array) -> tuple[Array, Array]:
         """What makes the diagonal one, and the right-hand sides multiplied by it.
 
@@ -104,12 +126,59 @@ class ArrowSystem:
     def solve_globals(self, products: Array, rhs_globals: Array) -> tuple[Array, Array]:
         """The globals and their covariance, from the products of ``L^-1 border`` with ``L^-1 [border, rhs]``."""
         n = len(self.corner)
-        schur = self.corner - products[:, :n]
+        root = self._root_of_globals(products[:, :n])
+        cov = root @ root.T
+        return cov @ (rhs_globals - products[:, n:]), cov
+
+    def _root_of_globals(self, products: Array) -> Array:
+        """An upper triangle (n, n) that is, times its transpose, the covariance of the globals."""
+        schur = self.corner - products
         schur = 0.5 * (schur + schur.T)
         spread = np.diagonal(schur)
         if not (spread > 0).all():
             raise np.linalg.LinAlgError("a global parameter is not determined")
         spread = 1 / np.sqrt(spread)
         inverse = np.linalg.inv(np.linalg.cholesky(schur * spread[:, None] * spread))
-        cov = (inverse.T @ inverse) * spread[:, None] * spread
-        return cov @ (rhs_globals - products[:, n:]), cov
+        return np.asarray(inverse.T * spread[:, None])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Inverse:
+    """The inverse of an arrow system, as far as traces with the information of residuals need it.
+
+    Attributes
+    ----------
+    unit, factor
+        (K, m) scaling of the chain of states, and its factor.
+    here, beside
+        (K, m, m), (K - 1, m, m) blocks of the chain's inverse: of a state, and of a state with the next.
+    followed
+        (K, m, n) the chain's inverse times its border: how states follow the globals.
+    root
+        (n, n) upper triangle; times its transpose, the covariance of the globals.
+    """
+
+    unit: Array
+    factor: _inertial.ArrowFactor
+    here: Array
+    beside: Array
+    followed: Array
+    root: Array
+
+    @property
+    def cov(self) -> Array:
+        """(n, n) of the globals."""
+        return np.asarray(self.root @ self.root.T)
+
+    def solve(self, rhs_states: Array, rhs_globals: Array) -> tuple[Array, Array]:
+        """States (K, m, q) and globals (n, q) for q right-hand sides."""
+        flat = self.followed.reshape(-1, len(self.root))
+        z = self.cov @ (rhs_globals - flat.T @ rhs_states.reshape(len(flat), -1))
+        return _of_chain(self.factor, self.unit, rhs_states) - self.followed @ z, z
+
+
+def _of_chain(factor: _inertial.ArrowFactor, unit: Array, rhs: Array) -> Array:
+    """(K, m, q) solution of the chain alone."""
+    rest = rhs * unit[:, :, None]
+    factor.substitute(rest)
+    return np.asarray(rest * unit[:, :, None])

@@ -217,7 +217,7 @@ def _judged(
         parts=None if refused else found.parts,
         noise=ImuNoise(
             gyro_density_rad_s_rthz=fit.noise.gyro_rad_s_rthz,
-            accel_density_m_s2_rthz=fit.noise.accel_m_s2_rthz,
+            accel_density_m_s2_rthz=fit.noise.accel_density_m_s2_rthz,
             gyro_walk_rad_s2_rthz=fit.noise.gyro_walk_rad_s_rts,
             accel_walk_m_s3_rthz=fit.noise.accel_walk_m_s2_rts,
         ),
@@ -253,7 +253,9 @@ def scale_of(fit: Fit, t_s: Array, calibrated: bool) -> FoundScale:
     worst = max(s / e for s, e in fit.sums.values())
     bare = float(fit.cov[par.SCALE, par.SCALE])
     taken = 3 * len(t_s) - fit.sums["centre_m"][1] - fit.sums["drift_m_rts"][1]
-    share = bare * max(0.0, taken)
+    # A gain follows the noise the other way, so that what both have in common stays where it is
+    gains = fit.cov[par.SCALE, par.ACCEL_GAIN].reshape(3, 3)
+    share = max(0.0, bare + float(np.trace(gains)) / 3) * max(0.0, taken)
     overstated = max(0.0, 1 - (fit.expected_accel_m_s2_rthz / fit.noise.accel_m_s2_rthz) ** 2)
     # To first order only: not by more than what the recording leaves open
     shift = min(overstated * share, (bare * max(1.0, worst)) ** 0.5)
@@ -292,7 +294,7 @@ def _refusals(fit: Fit, t_s: Array) -> list[str]:
             "axes"
         )
     # Noise of the accelerometer averaged between states, against the acceleration that it should measure
-    unexplained = fit.noise.accel_m_s2_rthz / float(np.sqrt(np.median(np.diff(t_s))))
+    unexplained = fit.noise.accel_m_s2(float(np.median(np.diff(t_s))))
     if unexplained > _LARGEST_UNEXPLAINED * fit.excitation_m_s2:
         out.append(
             f"the accelerometer and the camera's motion disagree by {unexplained:.2f} m/s2, where the motion itself is "

@@ -67,8 +67,12 @@ class Scene:
     names: tuple[str, ...]
 
     def world(self) -> World:
-        """The world that is filmed (takes seconds to build)."""
-        return make_world(self.recipe.world, self.recipe.seed, self.recipe.board)
+        """The world that is filmed."""
+        return self.renderer().world
+
+    def renderer(self) -> Renderer:
+        """Renders that world; takes seconds to build, and is kept until one of another world is asked for."""
+        return _renderer(self.recipe.world, self.recipe.seed, self.recipe.board)
 
     def camera_pose(self, camera: ShutterCamera, t_s: Array) -> tuple[Array, Array]:
         """(N, 4) cam_from_world_xyzw and (N, 3) camera centres in metres of a camera of the rig at (N,) times."""
@@ -177,7 +181,7 @@ def _render(scene: Scene, job: _Job) -> Image:
     suffix, index, depth = job
     recipe = scene.recipe
     camera = _cameras(recipe)[suffix]
-    renderer = _renderer(recipe.world, recipe.seed, recipe.board)
+    renderer = scene.renderer()
     t_s = float(scene.trigger_s[index])
     if depth is not None:
         depth_m = renderer.depth_m(camera, scene.motion, camera.middle_s(t_s))
@@ -279,7 +283,7 @@ def _truth(scene: Scene) -> dict[str, object]:
         "gravity_in_world_m_s2": [0.0, 0.0, -STANDARD_GRAVITY_M_S2],
         "target": {
             "spec": recipe.board.spec(),
-            "corners_in_world_m": _renderer(recipe.world, recipe.seed, recipe.board).world.board_corners_m,
+            "corners_in_world_m": scene.world().board_corners_m,
         },
         "calibration": {
             "cam_from_imu_xyzw": quat_normalize(quat_multiply(cam_from_body, errors.cam_from_imu_xyzw)),

@@ -76,24 +76,25 @@ class _Atlas:
     def __init__(self, world: World) -> None:
         import cv2
 
-        pieces, start, shape, used = [], [], [], 0
         self.levels = 17
-        for quad in world.quads:
+        shapes = np.array([_pyramid_shapes(quad.texture, self.levels) for quad in world.quads], dtype=np.int64)
+        self.height, self.width = shapes.reshape(-1, 2).T.copy()
+        # one more row and column, so that the right and lower neighbours always exist
+        sizes = (self.height + 1) * (self.width + 1)
+        self.start = np.cumsum(sizes) - sizes
+        self.texels = np.empty((int(sizes.sum()), 3), dtype=np.float32)
+        for i, quad in enumerate(world.quads):
             pyramid = [quad.texture]
             for level in range(self.levels):
+                at = i * self.levels + level
+                height, width = int(self.height[at]), int(self.width[at])
                 if level:
-                    source, ratio = (pyramid[-2], 2.0) if level > 1 else (pyramid[-1], np.sqrt(2))
-                    size = [max(1, int(np.ceil(n / ratio))) for n in source.shape[1::-1]]
-                    smaller = cv2.resize(source, size, interpolation=cv2.INTER_AREA)
-                    pyramid.append(np.asarray(smaller, dtype=np.float32))
-                # one more row and column, so that the right and lower neighbours always exist
-                pieces.append(np.pad(pyramid[-1], ((0, 1), (0, 1), (0, 0)), mode="edge").reshape(-1, 3))
-                start.append(used)
-                shape.append(pyramid[-1].shape[:2])
-                used += pieces[-1].shape[0]
-        self.texels = np.concatenate(pieces)
-        self.start = np.array(start, dtype=np.int64)
-        self.height, self.width = np.array(shape, dtype=np.int64).T.copy()
+                    source = pyramid[max(level - 2, 0)]
+                    pyramid.append(cv2.resize(source, (width, height), interpolation=cv2.INTER_AREA))
+                place = self.texels[self.start[at] : self.start[at] + sizes[at]].reshape(height + 1, width + 1, 3)
+                place[:-1, :-1] = pyramid[-1].reshape(height, width, 3)
+                place[-1, :-1] = place[-2, :-1]
+                place[:, -1] = place[:, -2]
         lengths = [np.linalg.norm(q.edge_u_m) / q.texture.shape[1] for q in world.quads]
         self.texel_m = np.array(lengths, dtype=np.float32)
 
@@ -117,6 +118,15 @@ class _Atlas:
         lower += fu * (take(bottom + 1, axis=0) - lower)
         upper += fv * (lower - upper)
         return np.asarray(upper)
+
+
+def _pyramid_shapes(texture: FloatImage, levels: int) -> list[tuple[int, int]]:
+    """(height, width) of each level: of the second by the square root of two, of each other by two from two before."""
+    shapes = [(texture.shape[0], texture.shape[1])]
+    for level in range(1, levels):
+        source, ratio = (shapes[-2], 2.0) if level > 1 else (shapes[-1], np.sqrt(2))
+        shapes.append((max(1, int(np.ceil(source[0] / ratio))), max(1, int(np.ceil(source[1] / ratio)))))
+    return shapes
 
 
 @cache

@@ -29,14 +29,20 @@ from colmap_inertial.types import (
     Treatment,
 )
 
-#: Standard deviation of the Gaussian, in linear light, by which COLMAP sees a deblurred frame smoothed: what a filter
-#: leaves of noise and ringing takes more matches than the finest detail gives.
-SMOOTHING_PX = 1.2
+#: Standard deviation of the Gaussian, in linear light, by which COLMAP sees a deblurred frame smoothed, as a share of
+#: its blur's length, and at most, px: what a filter leaves of noise and ringing grows with the blur, and moves cameras;
+#: of short blur, it leaves detail that gives more points than smoothing does.
+SMOOTHING, MOST_SMOOTHING_PX = 0.06, 1.2
 #: A frame of which more than this share stays as it was is not smoothed.
 _MOSTLY_KEPT = 0.5
 
 #: Undoes the blur of an image: along lines, or along the path.
 _Remover = Callable[[Any, BlurField, BlurPath], Any]
+
+
+def smoothing_for(blur_px: float, share: float = SMOOTHING, most_px: float = MOST_SMOOTHING_PX) -> float:
+    """Standard deviation (px) of the Gaussian by which COLMAP sees a frame smoothed that had so much blur."""
+    return min(share * blur_px, most_px)
 
 
 def require_method(method: DeblurMethod | None) -> None:
@@ -74,8 +80,9 @@ class DeblurStage:
         Whether frames that are too blurred are left out.
     method
         How blur is undone: along its path by a Wiener filter, or a half-quadratic one, or by the network DeepGyro.
-    smoothing_px
-        Standard deviation of the Gaussian by which COLMAP sees deblurred frames smoothed.
+    smoothing, most_smoothing_px
+        Standard deviation of the Gaussian by which COLMAP sees deblurred frames smoothed, as a share of the blur's
+        length, and at most.
     weights
         Checksum of the network; empty where there is none. It decides the frames as the options do.
     workers
@@ -89,7 +96,8 @@ class DeblurStage:
     gate: GateOptions = field(default_factory=GateOptions)
     drop: bool = True
     method: BlurRemover = "wiener"
-    smoothing_px: float = SMOOTHING_PX
+    smoothing: float = SMOOTHING
+    most_smoothing_px: float = MOST_SMOOTHING_PX
     weights: str = field(default="", init=False)
     workers: int | None = field(default=None, compare=False)
 
@@ -157,8 +165,8 @@ class DeblurStage:
             return said(reason)
         if factor != 1.0:
             blur = blur.times(factor)
-        # filters that reckon with a path's errors leave more of long blur's ghosts, which match each other
-        path = blur_path(motion, camera, shutter, parallax=parallax, extent_factor=factor).as_certain()
+        path = blur_path(motion, camera, shutter, parallax=parallax, extent_factor=factor)
         out, kept = keep_sharp(image, remove(image, blur, path), blur)
-        smoothing_px = self.smoothing_px if kept < _MOSTLY_KEPT else 0.0
+        width_px = smoothing_for(factor * (decision.blur_px or 0.0), self.smoothing, self.most_smoothing_px)
+        smoothing_px = width_px if kept < _MOSTLY_KEPT else 0.0
         return replace(said(reason, kept, factor, "deblurred"), image=out, smoothing_px=smoothing_px)

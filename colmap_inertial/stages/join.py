@@ -6,6 +6,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,8 +20,9 @@ from colmap_inertial.geometry import (
     skew,
 )
 from colmap_inertial.join.judge import Together, join_parts, relative_cov, worst
+from colmap_inertial.join.solve import Placed
 from colmap_inertial.join.values import Part, Placement
-from colmap_inertial.model import Model, trajectory_from_model, transformed
+from colmap_inertial.model import Model, has_rigs, trajectory_from_model, transformed
 from colmap_inertial.model.merging import merged
 from colmap_inertial.options import JoinOptions, ScaleOptions, WorldAxes
 from colmap_inertial.scale.posterior import FittedPath
@@ -39,6 +41,9 @@ from colmap_inertial.types import (
     Treatment,
 )
 
+if TYPE_CHECKING:
+    import pycolmap
+
 log = logging.getLogger(__name__)
 
 
@@ -46,8 +51,8 @@ log = logging.getLogger(__name__)
 class JoinStage:
     """Joins metric models of one recording; those that nothing places surely enough stay apart.
 
-    Comes after the scale. It takes all models at once (:meth:`join`); one alone stays as it is. Each joined model is in
-    the world of its largest part, gravity and scale as all parts together have them.
+    Comes after the scale. It takes all models at once (:meth:`join_models`); one alone stays as it is. Each joined
+    model is in the world of its largest part, gravity and scale as all parts together have them.
 
     Attributes
     ----------
@@ -73,7 +78,7 @@ class JoinStage:
         """One model by itself: it stays as it is."""
         return model
 
-    def join(self, models: Sequence[Model], /) -> tuple[tuple[Model, ...], tuple[Gap, ...]]:
+    def join_models(self, models: Sequence[Model], /) -> tuple[tuple[Model, ...], tuple[Gap, ...]]:
         """Join what can be joined; the joined models in the places of their largest parts.
 
         Parameters
@@ -124,11 +129,11 @@ class JoinStage:
             raise NotObservableError("place", f"the scale of model {model.colmap_index} was refused")
         if scale.method != "joint":
             raise NotObservableError("place", "scales of the joint method alone say how the models moved at their ends")
-        if any(len(frame.image_ids) > 1 for frame in map(reconstruction.frame, reconstruction.reg_frame_ids())):
+        if has_rigs(reconstruction):
             raise NotObservableError("place", f"the cameras of model {model.colmap_index} are a rig")
         trajectory = metric_trajectory(trajectory_from_model(reconstruction, model.timing)[0])
         path = FittedPath.of(trajectory, self.imu, of_model(self.calibration, model), self.options)
-        return Part(number=model.colmap_index, trajectory=trajectory, path=path)
+        return Part(number=model.colmap_index, trajectory=trajectory, path=path, cameras=_cameras(reconstruction))
 
     def _whole(self, members: Sequence[Model], parts: Sequence[Part], group: Together) -> Model:
         """One model of several, in the world of the first."""
@@ -149,9 +154,17 @@ class JoinStage:
                 cov=np.zeros((7, 7)),
             )
             pieces.append(transformed(model.reconstruction, moved))
-            own = placed.inflation * placed.cov[7 * k : 7 * k + 7, 7 * k : 7 * k + 7]
-            cov = _similarity_cov(own, up, placement)
+            if k == 0:
+                # its own up and scale are as uncertain as before, at most
+                cov = _with_scale(first.similarity.cov, _sigma_log(first, parts[0], placed, 0))
+            else:
+                own = placed.inflation * placed.cov[7 * k : 7 * k + 7, 7 * k : 7 * k + 7]
+                cov = _similarity_cov(own, up, placement)
             placements.append(_after(moved, model.similarity, cov))
+        placements[1:] = [
+            _of_world(one, _left_of_scale(model, part), placements[0].cov[1:4, 1:4])
+            for one, model, part in zip(placements[1:], members[1:], parts[1:], strict=True)
+        ]
         about = [_part_of(model, parts, group, k, placements[k]) for k, model in enumerate(members)]
         numbers = ", ".join(str(model.colmap_index) for model in members)
         reason = f"joined of COLMAP's models {numbers}, {sum(part.images for part in about)} images"
@@ -160,18 +173,30 @@ class JoinStage:
         done = Treatment(stage="join", reason=reason, action="joined", values={"parts": len(members)})
         return replace(
             first,
-            reconstruction=merged(pieces),
+            reconstruction=merged(pieces, _agreeing(parts, group)),
             scale=replace(scale, notes=(*scale.notes, f"the model was {reason}")),
-            similarity=replace(
-                placements[0],
-                # its own up and scale are as uncertain as before, at most
-                cov=_with_scale(first.similarity.cov, about[0].sigma_log),
-                provenance=f"{first.similarity.provenance}; {reason}",
-            ),
+            similarity=replace(placements[0], provenance=f"{first.similarity.provenance}; {reason}"),
             treatments=(*first.treatments, done),
             observed_px={name: xy for model in reversed(members) for name, xy in model.observed_px.items()},
             parts=tuple(about),
         )
+
+
+def _cameras(reconstruction: pycolmap.Reconstruction) -> frozenset[str]:
+    """Names for a model's cameras: their numbers; where nearly each image has one of its own, the images' folders."""
+    images = [reconstruction.image(i) for i in reconstruction.reg_image_ids()]
+    numbers = {image.camera_id for image in images}
+    if len(numbers) > max(1, len(images) // 2):
+        return frozenset(image.name.rpartition("/")[0] + "/" for image in images)
+    return frozenset(map(str, numbers))
+
+
+def _agreeing(parts: Sequence[Part], group: Together) -> dict[tuple[int, int], frozenset[str]]:
+    """By places of two parts: names of images whose poses agree."""
+    return {
+        (one.first, one.second): frozenset(parts[one.first].trajectory.names[i] for i in one.in_first)
+        for one in group.shared
+    }
 
 
 def _spans(models: Sequence[Model]) -> list[tuple[float, float, int]]:
@@ -228,12 +253,28 @@ def _after(moved: Similarity, before: Similarity, cov: Array) -> Similarity:
     )
 
 
-def _sigma_log(scale: ScaleEstimate, part: Part, joined_variance: float) -> float:
+def _of_world(similarity: Similarity, scale_variance: float, cov_of_up: Array) -> Similarity:
+    """A part's similarity with what is not known of the world itself: a length's size, and where up is."""
+    by = np.zeros((7, 4))
+    # both about the world's origin
+    by[0, 0], by[4:, 0] = 1.0, similarity.translation_m
+    by[1:4, 1:], by[4:, 1:] = np.eye(3), -skew(similarity.translation_m)
+    cov = np.zeros((4, 4))
+    cov[0, 0], cov[1:, 1:] = scale_variance, cov_of_up
+    return replace(similarity, cov=similarity.cov + by @ cov @ by.T)
+
+
+def _left_of_scale(model: Model, part: Part) -> float:
+    """What the fit itself does not say of a scale's variance: lens, accelerometer and more."""
+    assert model.scale is not None and model.scale.sigma_log is not None
+    return max(0.0, model.scale.sigma_log**2 - part.path.scale[1])
+
+
+def _sigma_log(model: Model, part: Part, placed: Placed, k: int) -> float:
     """Of a scale once joined: what the fit left of it goes down, all the rest stays."""
-    assert scale.sigma_log is not None
-    own = part.path.scale[1]
-    rest = max(0.0, scale.sigma_log**2 - own)
-    return float((min(own, joined_variance) + rest) ** 0.5)
+    # where the ties are off by more than noise makes them, the scale gains less by them
+    joined = placed.inflation * float(placed.cov[7 * k, 7 * k])
+    return float((min(part.path.scale[1], joined) + _left_of_scale(model, part)) ** 0.5)
 
 
 def _part_of(model: Model, parts: Sequence[Part], group: Together, k: int, similarity: Similarity) -> JoinedPart:
@@ -249,8 +290,7 @@ def _part_of(model: Model, parts: Sequence[Part], group: Together, k: int, simil
         begin_s=float(part.trajectory.t_s[0]),
         end_s=float(part.trajectory.t_s[-1]),
         verdict=model.scale.verdict,
-        # where the ties are off by more than noise makes them, the scale gains less by them
-        sigma_log=_sigma_log(model.scale, part, placed.inflation * float(placed.cov[7 * k, 7 * k])),
+        sigma_log=_sigma_log(model, part, placed, k),
         similarity=similarity,
         sigma_m=sigma_m,
         sigma_deg=float(np.degrees(sigma_rad)),

@@ -126,8 +126,8 @@ def write_trajectory(path: Path, model: Model, trajectory: CameraTrajectory, imu
     ----------
     path
         ``trajectory*.tum``; the covariance goes to ``trajectory*_cov.npz`` with ``t_s`` (T,) and ``cov`` (T, 9, 9) of
-        position, velocity and acceleration (none of a refined or joined model); velocities by frame to
-        :func:`motion_file`.
+        position, velocity and acceleration; of a refined model (K, 3, 3) of positions against the first one's, at 400
+        of them at most; none of a joined one that was not refined. Velocities by frame go to :func:`motion_file`.
     model
         A model that a stage made metric.
     trajectory
@@ -143,20 +143,21 @@ def write_trajectory(path: Path, model: Model, trajectory: CameraTrajectory, imu
     target = path.with_name(f"{path.stem}_cov.npz")
     if any(one.stage == "refine" and one.action for one in model.treatments):
         # the IMU made these poses already: smoothed by it once more, they would seem far surer than they are
-        log.info("%s: no covariance of a refined path is written; result.json has its drift", path.name)
-        target.unlink(missing_ok=True)
+        told = [i for i, name in enumerate(trajectory.names) if name in model.position_covs]
+        covs = np.array([model.position_covs[trajectory.names[i]] for i in told]).reshape(-1, 3, 3)
+        _write_covariance(target, trajectory.t_s[told] + trajectory.epoch_ns * 1e-9, covs)
     elif model.parts:
         # smoothing knows nothing of how surely each part was placed
         log.info("%s: no covariance of a joined path is written; result.json has that of each part", path.name)
         target.unlink(missing_ok=True)
     else:
-        _write_covariance(target, smoothed)
+        _write_covariance(target, smoothed.t_s + smoothed.epoch_ns * 1e-9, smoothed.cov)
     write_record(motion_file(path), _motion(model, trajectory, smoothed, imu, estimate.calibration))
 
 
-def _write_covariance(target: Path, smoothed: SmoothedTrajectory) -> None:
+def _write_covariance(target: Path, t_s: Array, cov: Array) -> None:
     partial = target.with_name(f"{target.stem}.partial.npz")
-    np.savez_compressed(partial, t_s=smoothed.t_s + smoothed.epoch_ns * 1e-9, cov=smoothed.cov)
+    np.savez_compressed(partial, t_s=t_s, cov=cov)
     os.replace(partial, target)
 
 

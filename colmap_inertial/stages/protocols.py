@@ -44,7 +44,7 @@ class ModelStage(Protocol):
 class JoiningStage(Protocol):
     """A model stage that takes all models of a run at once."""
 
-    def join(self, models: Sequence[Model], /) -> tuple[tuple[Model, ...], tuple[Gap, ...]]:
+    def join_models(self, models: Sequence[Model], /) -> tuple[tuple[Model, ...], tuple[Gap, ...]]:
         """Return the models to go on with, and what lies between those that came, the largest first."""
         ...
 

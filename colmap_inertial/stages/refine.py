@@ -11,7 +11,7 @@ import numpy as np
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.geometry import quat_from_matrix
 from colmap_inertial.io.calibration import calibration_prior
-from colmap_inertial.model import Model
+from colmap_inertial.model import Model, has_rigs
 from colmap_inertial.options import ScaleOptions
 from colmap_inertial.refine.judge import Judged, refine, size_of
 from colmap_inertial.refine.setup import (
@@ -89,7 +89,7 @@ class RefineStage:
             return f"it has fewer than {_FEWEST_IMAGES} images"
         if reconstruction.num_points3D() < _FEWEST_POINTS:
             return f"it has fewer than {_FEWEST_POINTS} points"
-        if any(len(frame.image_ids) > 1 for frame in map(reconstruction.frame, reconstruction.reg_frame_ids())):
+        if has_rigs(reconstruction):
             return "its cameras are a rig"
         if model.timing.readout_s and not model.rectified:
             return "its images still have the rolling shutter, and would not agree with the refined poses"
@@ -102,11 +102,14 @@ class RefineStage:
     def _refined(self, model: Model) -> Model:
         seen = read_seen(model.reconstruction, model.timing)
         problem, start = make_problem(seen, model.timing, self.imu, self._known(model), self._exposed_px(model, seen))
-        judged = refine(problem, start, seen.observations.xy_px, seen.t_s)
+        declared = model.timing.readout_s is not None
+        judged = refine(problem, start, seen.observations.xy_px, seen.t_s, readout_declared=declared)
         figures = {
             name: getattr(judged, name)
             for name in ("accepted", "held_out", "before_px", "after_px", "change", "change_sigma", "chi2", "sigma_px")
         }
+        if judged.readout is not None:
+            figures |= dict(zip(("readout_s", "readout_sigma_s"), judged.readout, strict=True))
         heard = (
             f"{judged.held_out} observations that were held out: {judged.before_px:.4f} -> {judged.after_px:.4f} px; "
             f"the IMU costs {judged.chi2:.2f} of what its noise explains"
@@ -121,9 +124,9 @@ class RefineStage:
         reconstruction = written_back(model.reconstruction, seen, problem, x, about=about, scale=scale)
         assert model.scale is not None and model.scale.calibration is not None
         calibration = _refined_calibration(model.scale.calibration, problem, judged)
-        done = replace(
-            model, reconstruction=reconstruction, scale=replace(model.scale, calibration=calibration), observed_px={}
-        )
+        refined = replace(model.scale, calibration=calibration, accel_bias_m_s2=x.accel_bias_m_s2.mean(axis=0))
+        covs = {seen.names[i]: cov for i, cov in judged.position_covs.items()}
+        done = replace(model, reconstruction=reconstruction, scale=refined, observed_px={}, position_covs=covs)
         return _said(done, f"refined by the IMU ({heard})", action="refined", **figures)
 
     def _exposed_px(self, model: Model, seen: Seen) -> Array:

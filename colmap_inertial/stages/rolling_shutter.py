@@ -16,6 +16,7 @@ from colmap_inertial.types import (
     CAL,
     Array,
     CameraImuCalibration,
+    CameraModel,
     Keypoints,
     Projector,
     Treatment,
@@ -83,6 +84,11 @@ class RollingShutterStage:
         """Whether the gyroscope recorded the whole readout of a frame."""
         motion, _, index = self._parts()
         return self.view.shutter(index[name]).covered_by(motion, reference=True)
+
+    def refined(self, calibration: CameraImuCalibration, readout_s: float, camera: CameraModel) -> RollingShutterStage:
+        """The stage with another calibration, readout and camera."""
+        timing = replace(self.view.timing, readout_s=readout_s)
+        return RollingShutterStage(view=replace(self.view, calibration=calibration, timing=timing, camera=camera))
 
     def _parts(self) -> tuple[GyroCamera, Projector, dict[str, int]]:
         if "parts" not in self._ready:

@@ -63,7 +63,7 @@ class JoinedPart:
     verdict, sigma_log
         Of its own scale, and the standard deviation of the logarithm of its scale once joined.
     similarity
-        From COLMAP's sub-model to the joined one; its covariance against the largest part.
+        From COLMAP's sub-model to the joined one.
     sigma_m, sigma_deg
         Of its middle against the largest part, along the direction that is known worst: gaps, and what its own scale
         and direction leave open; 0 for the largest part itself.

@@ -1,6 +1,6 @@
 """Is a reconstruction the right size? Checked with a target of known size in its images."""
 
-from colmap_inertial.validate.markers import distance_between, with_bars, with_check_points
+from colmap_inertial.validate.markers import distance_between, with_bars, with_check_points, with_other_target
 from colmap_inertial.validate.measure import validate_model
 from colmap_inertial.validate.overlays import write_overlays
 from colmap_inertial.validate.result import (
@@ -29,5 +29,6 @@ __all__ = [
     "validation_table",
     "with_bars",
     "with_check_points",
+    "with_other_target",
     "write_overlays",
 ]

@@ -1,4 +1,4 @@
-"""Single markers as ends of known lengths and as points with known coordinates: scale bars and check points."""
+"""Ends of known lengths and points with known coordinates: scale bars and check points of markers; two targets."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from colmap_inertial.errors import FormatError, NotObservableError
 from colmap_inertial.io.files import read_text
 from colmap_inertial.types import Array
-from colmap_inertial.validate.result import CheckPoint, CheckPoints, ScaleBar, Validation
+from colmap_inertial.validate.result import CheckPoint, CheckPoints, ScaleBar, TargetDistance, Validation
 
 #: Points that a rigid motion needs, with one to spare.
 _LEAST_POINTS = 4
@@ -88,6 +88,47 @@ def with_check_points(validation: Validation, path: Path) -> Validation:
     return replace(validation, check_points=found)
 
 
+def with_other_target(
+    validation: Validation, other: Validation, known_m: float, sigma_m: float | None = None
+) -> Validation:
+    """A validation with the distance between the middles of its target and of another one in the same model.
+
+    Parameters
+    ----------
+    validation, other
+        Of two different targets in one model.
+    known_m, sigma_m
+        The distance, and how well it is known (standard deviation).
+    """
+    measured = float(np.linalg.norm(middle_of(validation) - middle_of(other)))
+    apart = TargetDistance(
+        other=other.target.spec,
+        known_m=known_m,
+        sigma_m=sigma_m,
+        measured=measured,
+        residual_m=measured * _to_metres(validation) - known_m,
+    )
+    return replace(validation, apart=apart)
+
+
+def middle_of(validation: Validation) -> Array:
+    """(3,) middle of a board in the model: where its drawing, laid on the corners that were measured, has it.
+
+    Raises
+    ------
+    NotObservableError
+        Where too few corners were measured, or all on one line.
+    """
+    target = validation.target
+    places = {target.label(corner): place for corner, place in enumerate(target.corners_m)}
+    drawn = np.array([places[corner.name] for corner in validation.corners]).reshape(-1, 3)
+    seen = np.array([corner.in_model for corner in validation.corners]).reshape(-1, 3)
+    if len(drawn) < _LEAST_POINTS or np.linalg.matrix_rank(drawn - drawn.mean(axis=0), tol=1e-9) < 2:
+        raise NotObservableError("distance", f"too few corners of {target.spec} were measured to tell its middle")
+    units = float(np.sqrt(np.sum((seen - seen.mean(axis=0)) ** 2) / np.sum((drawn - drawn.mean(axis=0)) ** 2)))
+    return _moved_onto(np.vstack([drawn * units, np.zeros((1, 3))]), seen)[-1]
+
+
 def distance_between(validation: Validation, a: int, b: int) -> float:
     """Between the centres of two markers; model units.
 
@@ -104,9 +145,10 @@ def distance_between(validation: Validation, a: int, b: int) -> float:
 
 
 def _moved_onto(source: Array, target: Array) -> Array:
-    """(N, 3) points turned and moved onto others, by least squares (Kabsch 1976)."""
-    about, onto = source.mean(axis=0), target.mean(axis=0)
-    u, _, vt = np.linalg.svd((source - about).T @ (target - onto))
+    """(N, 3) points, of which the first (M, 3) are turned and moved onto others, by least squares (Kabsch 1976)."""
+    fitted = source[: len(target)]
+    about, onto = fitted.mean(axis=0), target.mean(axis=0)
+    u, _, vt = np.linalg.svd((fitted - about).T @ (target - onto))
     turn = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
     return (source - about) @ u @ turn @ vt + onto
 

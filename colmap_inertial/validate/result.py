@@ -143,6 +143,25 @@ class ScaleBar:
     residual_m: float
 
 
+@dataclass(frozen=True, kw_only=True)
+class TargetDistance:
+    """A known distance between the middles of two targets in one scene.
+
+    Attributes
+    ----------
+    other
+        The second target's specification.
+    known_m, sigma_m, measured, residual_m
+        As of :class:`ScaleBar`.
+    """
+
+    other: str
+    known_m: float
+    sigma_m: float | None
+    measured: float
+    residual_m: float
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CheckPoint:
     """A marker whose coordinates are known: its number, and (3,) model minus known, along the known axes."""
@@ -217,8 +236,8 @@ class Validation:
         What limits the result, in words.
     lengths
         Errors of the known distances, how long they are and what they prove.
-    bars, check_points
-        Distances between markers and coordinates of markers, where those were given.
+    bars, check_points, apart
+        Distances between markers, coordinates of markers and the distance to another target, where those were given.
     """
 
     target: Target
@@ -247,6 +266,7 @@ class Validation:
     lengths: LengthCheck | None = None
     bars: tuple[ScaleBar, ...] = ()
     check_points: CheckPoints | None = None
+    apart: TargetDistance | None = None
 
     @property
     def within_tolerance(self) -> bool:
@@ -322,6 +342,9 @@ def validation_table(result: Validation) -> Group:
             f"bar {bar.markers[0]} to {bar.markers[1]}",
             f"{bar.known_m:.6g} m, off by {1000 * bar.residual_m:+.3g} mm",
         )
+    if result.apart is not None:
+        apart = result.apart
+        figures.add_row(f"to {apart.other}", f"{apart.known_m:.6g} m, off by {1000 * apart.residual_m:+.3g} mm")
     if result.check_points is not None:
         points = result.check_points
         figures.add_row(

@@ -49,7 +49,7 @@ class Drawing:
             self.parts["Mesh"] = [self._add_mesh()]
         self.parts["Cameras"] = self._add_cameras()
         if len(scene.path):
-            line = self.lines("/path", scene.path, AMBER, 2.0)
+            line = self.lines("/path", scene.path, path_colours(scene.path_percent), 2.0)
             self.parts["Path"] = [line]
         if scene.ground is not None:
             self.parts["Ground"] = self._add_ground()
@@ -179,8 +179,8 @@ class Drawing:
             name, xyz, colours, point_size=size, point_shape="circle", precision="float32", **more
         )
 
-    def lines(self, name: str, pieces: Array, colour: tuple[int, int, int], width_px: float) -> Any:
-        """Add straight lines (N, 2, 3), as wide on the screen from everywhere."""
+    def lines(self, name: str, pieces: Array, colour: tuple[int, int, int] | NDArray[np.uint8], width_px: float) -> Any:
+        """Add straight lines (N, 2, 3), as wide on the screen from everywhere; of one colour, or of their ends'."""
         return self._api.add_line_segments(name, pieces, colour, thickness=width_px, thickness_units="screen")
 
     def label(self, name: str, text: str, position: Array, *, anchor: Any = "center-center", size: float = 1.0) -> Any:
@@ -209,6 +209,16 @@ class Drawing:
             cast_shadow=False,
             receive_shadow=False,
         )
+
+
+def path_colours(percent: Array | None) -> tuple[int, int, int] | NDArray[np.uint8]:
+    """Of a path: amber; towards red where it was stretched and towards blue where it was shortened, (S, 2, 3)."""
+    if percent is None:
+        return AMBER
+    share = percent / max(float(np.abs(percent).max(initial=0.0)), 1e-9)
+    towards = np.where(share[..., None] > 0, RED, BLUE)
+    colours: NDArray[np.uint8] = np.rint(AMBER + np.abs(share[..., None]) * (towards - AMBER)).astype(np.uint8)
+    return colours
 
 
 def _wxyz(xyzw: Array) -> Array:

@@ -68,6 +68,9 @@ def contents_text(scene: Scene) -> str:
     if len(scene.source.others) > 1:
         others = ", ".join(map(str, scene.source.others))
         lines.append(f"Model {scene.source.index} of {others} (`--model`)")
+    if scene.path_percent is not None:
+        most = float(np.abs(scene.path_percent).max(initial=0.0))
+        lines.append(f"Along the path, red was stretched by the refinement and blue shortened, by up to {most:.2g} %.")
     if scene.mesh_note:
         lines.append(_plain(scene.mesh_note))
     return "\n\n".join(lines)

@@ -101,8 +101,8 @@ class Scene:
         Why there is no mesh, where a file is there.
     cameras
         All of them.
-    path
-        (S, 2, 3) pieces of the camera's path.
+    path, path_percent
+        (S, 2, 3) pieces of the camera's path; (S, 2) by how much a refinement stretched it there, ``None`` without one.
     up_in_world
         (3,) unit vector.
     gravity_known
@@ -124,6 +124,7 @@ class Scene:
     mesh_note: str
     cameras: Cameras
     path: Array
+    path_percent: Array | None
     up_in_world: Array
     gravity_known: bool
     centre: Array
@@ -191,6 +192,7 @@ def load_scene(out: Path, *, model: int | None = None, images: Path | None = Non
     seen = near if ground is None else np.concatenate([near, ground.bar])
     start = centre + _distance(side, reach, up, seen - centre) * side
     lines, labelled = _target_parts(source.target)
+    path, path_percent = _path(source, cameras)
     return Scene(
         out=Path(out),
         source=source,
@@ -198,7 +200,8 @@ def load_scene(out: Path, *, model: int | None = None, images: Path | None = Non
         mesh=mesh,
         mesh_note=mesh_note,
         cameras=cameras,
-        path=_path(source, cameras),
+        path=path,
+        path_percent=path_percent,
         up_in_world=up,
         gravity_known=known,
         centre=centre,
@@ -238,15 +241,25 @@ def _up(source: ViewSource, cameras: Cameras) -> tuple[Array, bool]:
     return (edges / length if length > 1e-6 else np.array([0.0, 0.0, 1.0])), False
 
 
-def _path(source: ViewSource, cameras: Cameras) -> Array:
-    """Pieces of the smoothed path where there is one, else between cameras in the order of their names."""
-    places = cameras.cam_in_world
+def _path(source: ViewSource, cameras: Cameras) -> tuple[Array, Array | None]:
+    """Pieces of the smoothed path where there is one, else between cameras in the order of their names; its stretch."""
+    places, percent = cameras.cam_in_world, None
     if source.trajectory is not None and source.trajectory.is_file():
-        places = read_tum(source.trajectory).cam_in_world
-    places = places[:: -(-len(places) // _MOST_PIECES)]
-    pieces = np.stack([places[:-1], places[1:]], axis=1)
+        trajectory = read_tum(source.trajectory)
+        places = trajectory.cam_in_world
+        if source.stretched:
+            # both begin with the first image
+            middles_s = [0.5 * (part.begin_s + part.end_s) - source.stretched[0].begin_s for part in source.stretched]
+            percent = np.interp(trajectory.t_s, middles_s, [part.percent for part in source.stretched])
+    every = -(-len(places) // _MOST_PIECES)
+    pieces = _pieces(places[::every])
     length = np.linalg.norm(pieces[:, 1] - pieces[:, 0], axis=1)
-    return pieces[length <= _GAP * np.median(length)] if len(pieces) else pieces
+    shown = length <= _GAP * np.median(length) if len(pieces) else np.zeros(0, dtype=np.bool_)
+    return pieces[shown], None if percent is None else _pieces(percent[::every])[shown]
+
+
+def _pieces(values: Array) -> Array:
+    return np.stack([values[:-1], values[1:]], axis=1)
 
 
 def _side(centre: Array, reach: float, up: Array, cameras: Cameras) -> Array:

@@ -79,6 +79,15 @@ class TargetFacts:
     corners: Mapping[str, Array]
 
 
+@dataclass(frozen=True, kw_only=True)
+class StretchedPart:
+    """By how many per cent the refinement stretched a part of the path against the whole; times, camera clock."""
+
+    begin_s: float
+    end_s: float
+    percent: float
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ViewSource:
     """A model to show.
@@ -103,6 +112,8 @@ class ViewSource:
         Files made from it; ``None`` where there are none.
     target
         Where it was validated.
+    stretched
+        The drift that a refinement took out of it, part by part.
     """
 
     folder: Path
@@ -116,6 +127,7 @@ class ViewSource:
     mesh: Path | None = None
     trajectory: Path | None = None
     target: TargetFacts | None = None
+    stretched: tuple[StretchedPart, ...] = ()
 
 
 def find_source(out: Path, index: int | None = None, *, images: Path | None = None) -> ViewSource:
@@ -191,7 +203,16 @@ def _of_reconstruction(workspace: Workspace, index: int | None, given: tuple[Pat
             mesh=path_in(root, mesh, workspace.result) if mesh else None,
             trajectory=path_in(root, path_file, workspace.result) if path_file else None,
             target=target,
+            stretched=_stretched(fields),
         )
+
+
+def _stretched(fields: Mapping[str, Any]) -> tuple[StretchedPart, ...]:
+    done = [one for one in fields.get("treatments", []) if one["stage"] == "refine" and one["action"]]
+    parts = done[-1]["values"].get("drift", []) if done else []
+    return tuple(
+        StretchedPart(**{name: float(part[name]) for name in ("begin_s", "end_s", "percent")}) for part in parts
+    )
 
 
 def _of_project(out: Path, index: int | None, given: tuple[Path, ...]) -> ViewSource:

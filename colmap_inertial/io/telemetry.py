@@ -1,0 +1,116 @@
+"""Cameras that the package ``telemetry-parser`` reads (extra ``devices``): RunCam and its kin, Insta360.
+
+Only its raw samples, units, scales and orientations are taken; the conversion is ours. A reading's letters say which of
+the file's axes is x, y, z, a small letter its opposite. RunCam 5, iFlight and Thumb write counts into a CSV that only
+its name tells from others; Mobius adds a temperature. Insta360 appends records to its video: six numbers a sample,
+either counts, or rad/s and g. None of these makers documents its axes: where gyroscope and accelerometer do not turn
+together, the checks of every recording say so.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from colmap_inertial.errors import FormatError, MissingExtraError
+from colmap_inertial.io.files import first_line
+from colmap_inertial.io.imu_text import recording
+from colmap_inertial.io.samples import Samples, order_samples
+from colmap_inertial.io.units import SENSOR_NAMES, Axes, DeclaredUnits, Quantity
+from colmap_inertial.types import Array, FrameLog, ImuRecording
+
+#: Names of logs of counts, and the columns with which they begin; the columns that tell Mobius by itself.
+_NAMES = re.compile(r"(RC_GyroData|gyroDat[ae]|Thumb).*\.csv", re.IGNORECASE)
+_COLUMNS = re.compile(r"time,r?x,r?y,r?z(,ax,ay,az)?$")
+_MOBIUS = "time,rx,ry,rz,ax,ay,az,temp"
+#: An Insta360 video ends with this.
+_INSTA360 = b"8db42d694ccc418790edff439fe026bf"
+#: Its units in our spelling.
+_UNITS = {"deg/s": "deg/s", "rad/s": "rad/s", "g": "g", "m/s²": "m/s2"}
+#: A readout that is longer, is none.
+_LONGEST_READOUT_S = 0.5
+
+
+def is_telemetry(path: Path) -> bool:
+    """Whether ``path`` is a log of a RunCam, iFlight, Thumb or Mobius camera, or a video of an Insta360."""
+    if not path.is_file():
+        return False
+    if path.suffix.lower() == ".csv":
+        header = first_line(path).strip().replace(" ", "")
+        return header == _MOBIUS or (_NAMES.fullmatch(path.name) is not None and _COLUMNS.match(header) is not None)
+    with path.open("rb") as file:
+        if file.seek(0, 2) < len(_INSTA360):
+            return False
+        file.seek(-len(_INSTA360), 2)
+        return file.read() == _INSTA360
+
+
+def read_telemetry(path: Path, units: DeclaredUnits) -> ImuRecording:
+    """Read the IMU of such a recording; the accelerometer may be missing.
+
+    Raises
+    ------
+    MissingExtraError
+        Where ``telemetry-parser`` is not installed.
+    FormatError
+        Where it cannot read the recording, or finds no gyroscope in it.
+    """
+    camera, found = _parsed(path)
+    gyro = _samples(path, found, "gyro", units.gyro)
+    if gyro is None:
+        raise FormatError(path, f"holds no gyroscope; {camera} writes one where gyro data is switched on")
+    return recording(gyro, _samples(path, found, "accel", units.accel), device=camera)
+
+
+def read_telemetry_frames(path: Path) -> FrameLog | None:
+    """The readout that an Insta360 states of its frames; ``None`` where it states none."""
+    _, found = _parsed(path)
+    said = found.get("Default", {}).get("Metadata")
+    readout_s = 1e-3 * float(said.get("rolling_shutter_time") or 0.0) if isinstance(said, dict) else 0.0
+    if not 0 < readout_s < _LONGEST_READOUT_S:
+        return None
+    return FrameLog(t_s=np.zeros(0), readout_s=readout_s)
+
+
+def _parsed(path: Path) -> tuple[str, dict[str, dict[str, Any]]]:
+    """The camera's name, and what telemetry-parser found, by group and tag."""
+    try:
+        import telemetry_parser
+    except ImportError:
+        raise MissingExtraError("devices", f"{path} is read by telemetry-parser") from None
+    try:
+        parser = telemetry_parser.Parser(str(path))
+        parts = parser.telemetry()
+    except BaseException as error:
+        # what panics in Rust is no Exception
+        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
+            raise
+        raise FormatError(path, f"telemetry-parser cannot read it: {str(error) or type(error).__name__}") from None
+    found: dict[str, dict[str, Any]] = {}
+    for part in parts:
+        for group, tags in part.items():
+            found.setdefault(group, {}).update(tags)
+    camera, model = (str(name or "") for name in (parser.camera, parser.model))
+    return model if model.lower().startswith(camera.lower()) else f"{camera} {model}".strip(), found
+
+
+def _samples(path: Path, found: dict[str, dict[str, Any]], quantity: Quantity, declared: str | None) -> Samples | None:
+    tags = found.get({"gyro": "Gyroscope", "accel": "Accelerometer"}[quantity], {})
+    rows = tags.get("Data")
+    if not rows:
+        return None
+    try:
+        t_s = np.array([row["t"] for row in rows], dtype=np.float64)
+        values: Array = np.array([[row[axis] for axis in "xyz"] for row in rows], dtype=np.float64)
+        unit = _UNITS[tags["Unit"]]
+        scale = tags.get("Scale")
+        axes = Axes.of_letters(tags["Orientation"])
+    except (KeyError, TypeError, ValueError) as error:
+        what = SENSOR_NAMES[quantity]
+        raise FormatError(path, f"telemetry-parser gives a {what} that is not understood here: {error}") from None
+    # a damaged stamp stays one: the checks of samples name it
+    t_ns = np.rint(np.nan_to_num(np.clip(t_s, -4e9, 4e9), nan=4e9) * 1e9).astype(np.int64)
+    return order_samples(path, quantity, declared or unit, t_ns, axes.apply(values / (scale or 1.0)))
