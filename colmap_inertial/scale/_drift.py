@@ -13,7 +13,7 @@ import numpy as np
 from colmap_inertial.scale import _parameters as par
 from colmap_inertial.scale._factors import Direct, Group
 from colmap_inertial.scale._parameters import Data, Estimate, Noise
-from colmap_inertial.scale._solver import ArrowSystem
+from colmap_inertial.scale._solver import Inverse
 from colmap_inertial.types import Array, ScaleDrift
 
 #: Length of a part, and how many there are at most.
@@ -37,7 +37,7 @@ def scale_drift(
     x: Estimate,
     noise: Noise,
     centre: Group | Direct,
-    solution: tuple[ArrowSystem, Array, Array],
+    solution: tuple[Inverse, Array, Array],
     *,
     inflation: float,
     tolerated_log: float,
@@ -51,13 +51,13 @@ def scale_drift(
     centre
         Residuals of the visual centres at ``x``.
     solution
-        The normal equations with the right-hand sides (K, m, 1), (n, 1) of the step to the optimum.
+        The inverse of the normal equations with the right-hand sides (K, m, 1), (n, 1) of the step to the optimum.
     inflation
         By how much variances are larger than the noise levels say.
     tolerated_log
         Standard deviation of the parts' scales that is no drift to speak of.
     """
-    system, rhs, rhs_z = solution
+    inverse, rhs, rhs_z = solution
     span_s = float(data.t_s[-1] - data.t_s[0])
     parts = int(np.clip(round(span_s / _PART_S), 2, _MOST_PARTS))
     edges_s = np.linspace(data.t_s[0], data.t_s[-1], parts + 1)
@@ -73,7 +73,7 @@ def scale_drift(
 
     pulled, pulled_z = np.zeros((len(path), par.N_STATE, parts)), np.zeros((par.N_GLOBALS, parts))
     centre.pull_back(columns, pulled, pulled_z)
-    states, z, _ = system.solve(np.concatenate([rhs, pulled], axis=2), np.concatenate([rhs_z, pulled_z], axis=1))
+    states, z = inverse.solve(np.concatenate([rhs, pulled], axis=2), np.concatenate([rhs_z, pulled_z], axis=1))
     follow = centre.apply(states, z)
     residual = centre.residual + follow[:, :, 0]
     information = np.einsum("kiw,kiv->wv", columns, columns - follow[:, :, 1:])

@@ -145,7 +145,7 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
         x,
         noise,
         groups["centre"],
-        (system, rhs, rhs_z),
+        (inverse, rhs, rhs_z),
         inflation=inflation,
         tolerated_log=model_scale_sigma(calibrated=False),
     )
