@@ -102,6 +102,14 @@ def residual_section(survey: Content, name: str, mark: str) -> Section:
     return Section(anchor=f"residuals{mark}", short="" if name else "Residuals", parts=parts)
 
 
+def _with_sigma(value: float, sigma: float | None) -> tuple[str, str]:
+    """A value to the second digit of its standard deviation, and that."""
+    if sigma is None or not sigma > 0:
+        return f"{value:.6g}", ""
+    decimals = max(0, 1 - math.floor(math.log10(sigma)))
+    return f"{value:.{decimals}f}", f"{sigma:.{decimals}f}"
+
+
 def camera_section(survey: Content, name: str, mark: str) -> Section:
     """Intrinsics and distortion of each camera."""
     parts: list[str | Plot] = [
@@ -117,7 +125,7 @@ def camera_section(survey: Content, name: str, mark: str) -> Section:
         )
         sigma = camera.get("sigma", {})
         rows = [
-            (key, _PARAMETERS.get(key, "distortion"), f"{v:.6g}", f"{sigma[key]:.2g}" if key in sigma else "")
+            (key, _PARAMETERS.get(key, "distortion"), *_with_sigma(v, sigma.get(key)))
             for key, v in camera["params"].items()
         ]
         parts.append(table(("Parameter", "What", "Value", "±"), rows, numbers=(2, 3)))

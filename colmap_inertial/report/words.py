@@ -86,15 +86,13 @@ def outcome_of_model(model: dict[str, Any]) -> dict[str, Any]:
     todo = []
     if verdict == "trusted":
         headline = "The scale can be trusted"
-        summary.append(
-            f"In the metric model, 10 m are 10 m to within ±{length_error(pct)}, and gravity points along an axis."
-        )
+        summary.append(f"In the metric model, 10 m are 10 m to within ±{length_error(pct)}, and it stands upright.")
     else:
         headline = "The scale is rough"
         summary.append(
             f"In the metric model, 10 m may be off by {length_error(pct)} or, if what is listed below is at fault, by "
-            "more. It has the right order of size and gravity points along an axis; do not measure by it without a "
-            "check against a known length."
+            "more. It has the right order of size and stands upright; do not measure by it without a check against a "
+            "known length."
         )
         # livelier motion narrows the interval; it mends nothing else
         todo = [_MOVE if pct > 100 * TRUSTED_HALF_WIDTH else _CHECK]
