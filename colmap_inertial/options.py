@@ -58,7 +58,7 @@ class MappingOptions:
 
     pairing: Literal["auto", "exhaustive", "sequential"] = "auto"
     """Which images are matched: every pair, neighbours in time, or `auto`: every pair up to 150 images."""
-    overlap: int = 10
+    overlap: int = 4
     """Sequential pairing: match each frame with this many next ones, and with the 1, 2, 4, 8, ... th after it."""
     max_image_size: int | None = None
     """Longer side in pixels above which images are shrunk for feature extraction (COLMAP's default: 3200)."""

@@ -32,8 +32,8 @@ _LEAST_VOTES = 4
 _CLOSE = (1, 2, 4)
 #: The way is found by images so many places apart: farther apart, some join copies of what is there many times.
 _NEXT = 2
-#: Where neighbours are matched, those within so many times the overlap are no loop.
-_NEAR = 2
+#: Where neighbours are matched, frames at most so many places apart, or within the overlap, are no loop.
+_NEAR = 20
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,7 +126,8 @@ def match_capture(
     kept: dict[str, int] = {}
     sigma_deg = None
     i, j = _places([pair for pair in pairs if place[pair[1]] - place[pair[0]] not in _CLOSE], place)
-    far = np.zeros(len(i), dtype=np.bool_) if every_pair else j - i > _NEAR * options.overlap
+    near = max(_NEAR, options.overlap)
+    far = np.zeros(len(i), dtype=np.bool_) if every_pair else j - i > near
     i, j = i[~far], j[~far]
     headings: Headings | None = None
     try:
@@ -155,7 +156,7 @@ def match_capture(
 
         next_ones = [pair for pair in close if pair[1] - pair[0] <= _NEXT]
         way = find_way(sightings_of(database, names, next_ones, headings.start_from_cam), len(names))
-        loops = close_loops(database, names, headings, way, voters, _NEAR * options.overlap + 1, match)
+        loops = close_loops(database, names, headings, way, voters, near + 1, match)
         matched += loops.candidates
         kept |= {
             "loops_compared": loops.compared,
