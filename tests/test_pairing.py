@@ -412,7 +412,7 @@ def test_without_a_gyroscope_a_long_capture_matches_neighbours_only(database, tm
     options = MappingOptions(pairing="sequential", overlap=3)
     record = match_capture(database, tmp_path / "out.db", recording, CAMERA, options, RunContext(scratch=tmp_path))
     steps = sorted({int(b) - int(a) for a, b in matched})
-    assert steps == [1, 2, 3, 4, 8, 16] and record.far == 40 - 32
+    assert steps == [1, 2, 3, 4] and record.far == (40 - 8) + (40 - 16) + (40 - 32)
     assert record.matched == len(matched) == record.pairs - record.far and record.loops_closed == 0
 
 

@@ -32,8 +32,8 @@ _LEAST_VOTES = 4
 _CLOSE = (1, 2, 4)
 #: The way is found by images so many places apart: farther apart, some join copies of what is there many times.
 _NEXT = 2
-#: Where neighbours are matched, frames at most so many places apart, or within the overlap, are no loop.
-_NEAR = 20
+#: Where neighbours are matched, those within so many times the overlap are no loop.
+_NEAR = 2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,7 +126,7 @@ def match_capture(
     kept: dict[str, int] = {}
     sigma_deg = None
     i, j = _places([pair for pair in pairs if place[pair[1]] - place[pair[0]] not in _CLOSE], place)
-    near = max(_NEAR, options.overlap)
+    near = _NEAR * options.overlap
     far = np.zeros(len(i), dtype=np.bool_) if every_pair else j - i > near
     i, j = i[~far], j[~far]
     headings: Headings | None = None
