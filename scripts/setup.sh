@@ -54,7 +54,9 @@ if [ ! -f "$stamp" ] || [ "$extras" != "$(cat "$stamp")" ] ||
   [ -n "$(find "${sources[@]}" -newer "$stamp" -print -quit)" ]; then
   names=$(paste -sd, <<<"$extras")
   echo "setup: installing Python packages${names:+ for $names} into .venv, and compiling; some minutes the first time"
-  # Modules are compiled when they are first used: most never are.
+  # make compiles one file at a time where nobody says otherwise. Python's modules are compiled when they are first
+  # used: most never are.
+  export CMAKE_BUILD_PARALLEL_LEVEL="${CMAKE_BUILD_PARALLEL_LEVEL:-$(getconf _NPROCESSORS_ONLN)}"
   .venv/bin/python -m pip install --disable-pip-version-check --progress-bar on --no-compile --editable ".${names:+[$names]}" |
     sed -un 's/^ *\(Downloading .*\|Using cached .*\)/  \1/p; s/^ *\(Building .*\)/  \1/p; s/^\(Installing\) collected packages.*/  \1/p'
   printf '%s\n' "$extras" | sed '/^$/d' >"$stamp"

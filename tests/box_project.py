@@ -103,8 +103,8 @@ def shared_box(tmp_path_factory) -> BoxProject:
     return _built[0]
 
 
-def build(root: Path) -> BoxProject:
-    """Write everything: 20 s of a hand's motion, 120 images."""
+def build(root: Path, *, every: int = EVERY) -> BoxProject:
+    """Write everything: 20 s of a hand's motion, an image of every so many frames: 120."""
     options = RecordingOptions(
         motion=MotionOptions(duration_s=20),
         sfm=SfmOptions(
@@ -116,7 +116,7 @@ def build(root: Path) -> BoxProject:
     )
     recording = simulate_recording(options, seed=21)
     given = write_project(root / "given", recording)
-    frames = range(2, len(recording.trajectory), EVERY)
+    frames = range(2, len(recording.trajectory), every)
     box = BoxProject(root / "project", given.frame_times, given.imu, recording, frames)
     (box.root / "images").mkdir(parents=True)
     for name, image in zip(box.names, pictures(recording, frames), strict=True):

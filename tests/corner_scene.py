@@ -1,7 +1,8 @@
 """A textured corner of a room, filmed by a hand: exact blur and rolling shutter with parallax, in seconds."""
 
+import copy
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import cv2
@@ -24,6 +25,13 @@ SIDE = 1536
 IMU_CLOCK_S = 11.0
 
 
+@lru_cache(maxsize=2)
+def _posters(seed, side):
+    """What hangs on the planes, which takes seconds to print, and the generator as it is then."""
+    rng = np.random.default_rng(seed)
+    return np.stack([poster(rng, side, side) for _ in PLANES]), rng
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CornerScene:
     """The corner, the hand's motion and the shutter."""
@@ -36,14 +44,13 @@ class CornerScene:
 
     @classmethod
     def make(cls, *, exposure_s, readout_s, frames=24, seed=5, vigour=1.0, side=SIDE):
-        rng = np.random.default_rng(seed)
+        textures, rng = _posters(seed, side)
         options = MotionOptions(
             kind="orbit", duration_s=frames / 3, heading_deg=-90.0, vigour=vigour, radius_m=1.6, arc_deg=40,
             sweep_s=frames / 3,
         )  # fmt: skip
-        textures = np.stack([poster(rng, side, side) for _ in PLANES])
         return cls(
-            motion=make_motion(options, rng), textures=textures, frames=frames, exposure_s=exposure_s,
+            motion=make_motion(options, copy.deepcopy(rng)), textures=textures, frames=frames, exposure_s=exposure_s,
             readout_s=readout_s,
         )  # fmt: skip
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_pipeline import QUICK, contents, copy_scene
+from test_pipeline import DETERMINISTIC, contents, copy_scene
 
 from colmap_inertial import Frame, Keypoints, Model, ReconstructOptions, Treatment, reconstruct, write_calibration
 from colmap_inertial.stages.protocols import with_defaults
@@ -31,7 +31,7 @@ def stored(out: Path) -> dict:
 def bare(capture, tmp_path_factory):
     """No stage at all before COLMAP."""
     out, stages = tmp_path_factory.mktemp("bare") / "out", []
-    options = dataclasses.replace(QUICK, deterministic=True)
+    options = DETERMINISTIC
     result = reconstruct(
         capture, out, options, frame_stages=[], keypoint_stages=[], progress=lambda stage, *_: stages.append(stage)
     )
@@ -64,7 +64,7 @@ def test_a_stage_beside_the_defaults_and_one_that_drops_with_a_reason(tmp_path):
             elif frame.name != names[5]:
                 yield frame
 
-    result = reconstruct(capture, tmp_path / "out", QUICK, frame_stages=[without_two, ...])
+    result = reconstruct(capture, tmp_path / "out", DETERMINISTIC, frame_stages=[without_two, ...])
     actions = {record.name: record.action for record in result.frames}
     assert [name for name in names if actions[name] == "dropped"] == [names[3], names[5]]
     assert sorted(path.name for path in (tmp_path / "out" / "images").iterdir()) == [
@@ -104,7 +104,9 @@ def test_what_a_visitor_s_keypoint_stage_did_is_what_the_result_says(capture, tm
         return model
 
     out = tmp_path / "out"
-    result = reconstruct(capture, out, QUICK, frame_stages=[], keypoint_stages=[Rectify()], model_stages=[look, ...])
+    result = reconstruct(
+        capture, out, DETERMINISTIC, frame_stages=[], keypoint_stages=[Rectify()], model_stages=[look, ...]
+    )
     assert all(frame["rectified"] for frame in stored(out)["frames"])
     assert len(moved) == 16 and len(list((out / "images").iterdir())) == 16
     assert contents(out / "images") != contents(out / "colmap" / "images")
@@ -126,7 +128,7 @@ def test_doubts_are_enforced_after_the_stages_whoever_wrote_them(capture, bare, 
         seen.append(model.doubts)
         return dataclasses.replace(model, scale=trusted)
 
-    options = ReconstructOptions(mapping=QUICK.mapping, force=True)
+    options = ReconstructOptions(mapping=DETERMINISTIC.mapping, force=True)
     out = tmp_path / "out"  # mapped once
     for stages in ([mine], [..., mine], [...]):
         result = reconstruct(capture, out, options, frame_stages=[], keypoint_stages=[], model_stages=stages)
@@ -142,7 +144,7 @@ def test_a_finished_run_is_gone_on_with_where_the_options_ask_for_more(capture, 
     out, first, _ = bare
     before = contents(out)
     log = (out / "log.txt").read_text()
-    options = dataclasses.replace(QUICK, deterministic=True, world="y-down")
+    options = dataclasses.replace(DETERMINISTIC, world="y-down")
     second = reconstruct(capture, out, options, frame_stages=[], keypoint_stages=[])
     assert not second.unchanged
     new = (out / "log.txt").read_text()[len(log) :]
@@ -159,9 +161,7 @@ def test_a_finished_run_is_gone_on_with_where_the_options_ask_for_more(capture, 
     assert again.unchanged
     np.testing.assert_array_equal(again.models[0].scale.cov, second.models[0].scale.cov)
     # and back
-    back = reconstruct(
-        capture, out, dataclasses.replace(QUICK, deterministic=True), frame_stages=[], keypoint_stages=[]
-    )
+    back = reconstruct(capture, out, DETERMINISTIC, frame_stages=[], keypoint_stages=[])
     assert not back.unchanged
     assert contents(out)["sparse/0/images.bin"] == before["sparse/0/images.bin"]
 
@@ -171,7 +171,7 @@ def test_a_calibration_given_later_maps_nothing_again(capture, bare, tmp_path):
     known = first.models[0].scale.calibration
     write_calibration(tmp_path / "device.json", dataclasses.replace(known, cov=known.cov / 100))
     before, log = contents(out), (out / "log.txt").read_text()
-    options = dataclasses.replace(QUICK, deterministic=True, calibration=tmp_path / "device.json")
+    options = dataclasses.replace(DETERMINISTIC, calibration=tmp_path / "device.json")
     second = reconstruct(capture, out, options, frame_stages=[], keypoint_stages=[])
     new = (out / "log.txt").read_text()[len(log) :]
     assert all(f"{step}: finished in an earlier run, kept" in new for step in ("frames", "matches", "mapping"))
@@ -195,7 +195,7 @@ def test_a_run_reads_each_model_from_disk_twice_at_most(capture, tmp_path, monke
 
     monkeypatch.setattr(model, "_read_from", counted)
     out = tmp_path / "out"
-    reconstruct(capture, out, QUICK, frame_stages=[], keypoint_stages=[])
+    reconstruct(capture, out, DETERMINISTIC, frame_stages=[], keypoint_stages=[])
     counts = {folder: reads.count(folder) for folder in set(reads)}
     assert set(counts) == {out / "colmap" / "sparse" / "0", out / "sparse" / "0"} and max(counts.values()) <= 2
     assert isinstance(read(out / "colmap" / "sparse" / "0", ".bin"), pycolmap.Reconstruction)
@@ -211,7 +211,7 @@ def test_a_killed_change_of_a_finished_run_leaves_no_result_behind(capture, bare
         if stage == "metric":
             raise KeyboardInterrupt
 
-    options = dataclasses.replace(QUICK, deterministic=True, world="y-down")
+    options = dataclasses.replace(DETERMINISTIC, world="y-down")
     with pytest.raises(KeyboardInterrupt):
         reconstruct(capture, out, options, frame_stages=[], keypoint_stages=[], progress=stop)
     assert seen and not any(seen)

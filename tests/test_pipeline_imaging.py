@@ -120,7 +120,7 @@ def test_the_result_shows_the_calibration_from_before_and_after(rolling):
 
 @pytest.fixture(scope="module")
 def scene():
-    return CornerScene.make(exposure_s=0.03, readout_s=0.0)
+    return CornerScene.make(exposure_s=0.03, readout_s=0.0, frames=18)
 
 
 @pytest.fixture(scope="module")
@@ -254,10 +254,10 @@ def test_blur_by_translation_is_known_to_a_fraction_of_a_pixel(scene, plan):
 
 
 def test_a_long_recording_is_surveyed_in_parts(tmp_path, monkeypatch, scene, blurred):
-    monkeypatch.setattr(first_look, "_MOST_IN_PART", 12)
-    monkeypatch.setattr(first_look, "_MODEL_FRAMES", 12)
+    monkeypatch.setattr(first_look, "_MOST_IN_PART", 9)
+    monkeypatch.setattr(first_look, "_MODEL_FRAMES", 9)
     plan = planned(parts(blurred), tmp_path)
-    assert len(plan.parallaxes) >= 16  # four seconds hardly give a scale
+    assert len(plan.parallaxes) >= 12  # three seconds hardly give a scale
     turning, both = blur_errors(scene, plan)
     assert both < 0.6 * turning
 

@@ -8,12 +8,13 @@ import pytest
 from colmap_inertial.geometry import matrix_from_quat, quat_exp, quat_from_matrix
 from colmap_inertial.simulate import Motion, MotionOptions, make_motion
 from colmap_inertial.simulate.render import Renderer, ShutterCamera, colmap_camera, develop
+from colmap_inertial.simulate.textures import poster
 from colmap_inertial.simulate.world import Board, Quad, World, make_world
 from colmap_inertial.types import CameraModel
 
 WIDE = CameraModel(model="OPENCV", width=96, height=64, params=(80, 82, 47, 33, 0.08, -0.1, 0.001, -0.0005))
 #: A small part of a picture of 640 x 480.
-SMALL = CameraModel(model="OPENCV", width=64, height=48, params=(400, 404, 31, 25, 0.08, -0.1, 0.001, -0.0005))
+SMALL = CameraModel(model="OPENCV", width=48, height=32, params=(400, 404, 23, 17, 0.08, -0.1, 0.001, -0.0005))
 
 
 @pytest.fixture(scope="module")
@@ -167,17 +168,6 @@ def test_cameras_of_a_rig_see_the_parallax_of_their_baseline():
     np.testing.assert_allclose(a[8:-8, 12:-12], b[8:-8, 8:-16], atol=2e-3)
 
 
-def test_same_seed_same_world_and_picture(world, desk):
-    again = make_world("desk", 3)
-    assert len(world.quads) > 100
-    assert all(np.array_equal(p.texture, q.texture) for p, q in zip(world.quads, again.quads, strict=True))
-    motion, camera = handheld(), ShutterCamera(model=WIDE)
-    pictures = [renderer.linear(camera, motion, 1.0) for renderer in (desk, Renderer(middle_of(again)))]
-    np.testing.assert_array_equal(*pictures)
-    noisy = [develop(pictures[0], camera, np.random.default_rng(1)) for _ in range(2)]
-    np.testing.assert_array_equal(*noisy)
-
-
 def test_a_room_is_closed_all_around():
     room = make_world("room", 5)
     assert len(room.quads) > 100
@@ -187,4 +177,5 @@ def test_a_room_is_closed_all_around():
 
 
 def test_posters_smaller_than_their_smallest_shapes_can_be_printed():
-    assert len(make_world("desk", 11).quads) > 100
+    for side in (4, 9, 12):
+        assert poster(np.random.default_rng(side), side, 3 * side).shape == (side, 3 * side, 3)

@@ -65,7 +65,7 @@ def test_residuals_and_their_derivative_agree_with_colmaps_projection():
 def test_the_interval_covers_the_truth_as_often_as_it_says_under_corner_noise():
     rng = np.random.default_rng(2026)
     hits, log_scales, widths = 0, [], []
-    runs = 220
+    runs = 140
     for _ in range(runs):
         _, fit, _ = fit_without_outliers(simulate(rng, 8, noise_px=0.3), START)
         log_scales.append(fit.placement.log_scale)
@@ -85,14 +85,14 @@ def test_the_interval_covers_the_truth_as_often_as_it_says_under_corner_noise():
 )
 def test_the_interval_allows_for_pose_errors_of_the_model(errors):
     rng = np.random.default_rng(3)
-    fits = [fit_scale(simulate(rng, 12, **errors), START) for _ in range(60)]
+    fits = [fit_scale(simulate(rng, 12, **errors), START) for _ in range(40)]
     assert 0.9 <= coverage(fits) <= 0.99
     assert np.median([fit.noise.corner_px for fit in fits]) == pytest.approx(0.3, rel=0.05)
 
 
 def test_treating_corners_as_independent_would_not():
     rng = np.random.default_rng(3)
-    observations = [simulate(rng, 12, orbit_rad=6e-4, range_m=6e-4) for _ in range(40)]
+    observations = [simulate(rng, 12, orbit_rad=6e-4, range_m=6e-4) for _ in range(24)]
     fits = [fit_scale(obs, START) for obs in observations]
     naive = [fit_scale(obs, START, noise=_no_pose_errors(fit)) for obs, fit in zip(observations, fits, strict=True)]
     assert coverage(naive) < 0.8 < coverage(fits)
@@ -147,7 +147,7 @@ def test_sizes_of_pose_errors_are_recovered():
 
 def test_without_pose_errors_none_are_assumed():
     rng = np.random.default_rng(6)
-    none = [not fit_scale(simulate(rng, 8), START).noise.pose_ratio.any() for _ in range(60)]
+    none = [not fit_scale(simulate(rng, 8), START).noise.pose_ratio.any() for _ in range(30)]
     assert np.mean(none) > 0.7
 
 
