@@ -479,7 +479,7 @@ def rolling(tmp_path_factory):
     root = tmp_path_factory.mktemp("rolling")
     scene = CornerScene.make(exposure_s=0.004, readout_s=0.03)
     options = ReconstructOptions(
-        mapping=MappingOptions(max_num_features=900, first_octave=0), deblur="off", deterministic=True
+        mapping=MappingOptions(max_num_features=700, first_octave=0), deblur="off", deterministic=True
     )
     reconstruct(scene.write(root / "capture", extra=CALIBRATED), root / "out", options)
     return scene, root / "out"

@@ -61,13 +61,14 @@ def browser():
 
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory):
-    """Reports by kind: everything there, with names that a page must not run; a refused scale; a run that stopped."""
+    """Reports by kind: everything there, with names that a page must not run; a refused scale; two; a stopped run."""
     root = tmp_path_factory.mktemp("reports")
-    write_run(root / "full", name=HOSTILE, models=2)
+    write_run(root / "full", name=HOSTILE)
     write_run(root / "refused", kind="constant_velocity")
+    write_run(root / "both refused", kind="constant_velocity", models=2)
     (root / "stopped").mkdir()
     stopped = root / "stopped"
-    page = {kind: write_report(root / kind) for kind in ("full", "refused")}
+    page = {kind: write_report(root / kind) for kind in ("full", "refused", "both refused")}
     return page | {"stopped": write_report(stopped, stopped="the video was stabilised", capture="capture.toml")}
 
 
@@ -128,7 +129,8 @@ def drawn(browser, pages, kind, width) -> Visit:
     assert seen.script("return document.querySelectorAll('.gl-container canvas').length") == len(
         seen.script("return [...document.querySelectorAll('section[id^=scene] .plot')]")
     )
-    assert seen.script("return document.querySelectorAll('.plot').length") >= (12 if kind == "full" else 5)
+    least = {"full": 12, "refused": 5, "both refused": 10}[kind]
+    assert seen.script("return document.querySelectorAll('.plot').length") >= least
     assert seen.script("return [...document.images].every(image => image.complete && image.naturalWidth > 0)")
     assert_nothing_overflows(seen, width)
     return seen
@@ -137,7 +139,7 @@ def drawn(browser, pages, kind, width) -> Visit:
 # Loading a page takes seconds: tests of one that stands on the screen follow each other.
 
 
-@pytest.mark.parametrize(("kind", "width"), [("refused", "phone"), ("full", "phone"), ("full", "desktop")])
+@pytest.mark.parametrize(("kind", "width"), [("both refused", "phone"), ("full", "phone"), ("full", "desktop")])
 def test_every_plot_is_drawn_without_errors_or_requests(browser, pages, kind, width):
     drawn(browser, pages, kind, width)
 

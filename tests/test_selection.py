@@ -74,6 +74,25 @@ def share_of_windows_mean(video: BoxVideo, selection: Selection) -> float:
     return float(np.median(shares))
 
 
+_followed: dict[tuple[object, ...], VisualRotation] = {}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _followed_once():
+    """Pixels of a video that are asked for again are not followed again: the answer is the same, and takes seconds."""
+    follow = choosing.followed
+
+    def known(capture, timing, camera, indices, progress, *, stage="motion"):
+        key = (capture.path, camera.params, timing.pose_t_s().tobytes(), tuple(indices))
+        if key not in _followed:
+            _followed[key] = follow(capture, timing, camera, indices, progress, stage=stage)
+        return _followed[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(choosing, "followed", known)
+        yield
+
+
 @pytest.fixture(scope="module")
 def orbiting(tmp_path_factory) -> BoxVideo:
     """Handheld around the middle of the box, looking at it, 16 ms of exposure."""
@@ -299,6 +318,7 @@ def test_an_imu_that_ends_early_leaves_the_rest_to_the_pictures(turning):
 
 
 def test_a_selection_is_the_same_twice_and_comes_back_from_its_file(turning, of_turning, tmp_path):
+    _followed.clear()
     first, second = of_turning, selected(turning)
     for selection in (first, second):
         write_selection(tmp_path / "a.json", selection)
@@ -390,7 +410,7 @@ def test_a_gyroscope_of_another_recording_does_not_rank(turning):
 
 
 def test_a_video_is_reconstructed_from_the_chosen_frames(orbiting, of_orbiting, tmp_path):
-    mapping = MappingOptions(max_num_features=1500, first_octave=0)
+    mapping = MappingOptions(max_num_features=700, first_octave=0)
     options = ReconstructOptions(deblur="off", mapping=mapping)
     result = reconstruct(orbiting.folder, tmp_path / "out", options)
     stored = json.loads((tmp_path / "out" / "result.json").read_text())

@@ -119,24 +119,28 @@ def aprilgrid(target: Target, *, centre=(0.0, 0.0)) -> Texture:
     tag, gap = target.length_m, target.gap * target.length_m
     lower_left = target.corners_m[0, :2] + centre
     extent = np.array([target.columns, target.rows]) * (tag + gap) - gap
-    tags = [
-        cells(
-            np.flipud(np.rot90(marker_bits("DICT_APRILTAG_36h11", i, border=2), 2)),
-            tag,
-            lower_left + np.array([i % target.columns, i // target.columns]) * (tag + gap),
-            rim=0,
-        )
-        for i in range(target.columns * target.rows)
-    ]
+    bits = np.stack(
+        [
+            np.flipud(np.rot90(marker_bits("DICT_APRILTAG_36h11", i, border=2), 2))
+            for i in range(target.columns * target.rows)
+        ]
+    )
+    side = bits.shape[1]
 
-    def squares(xy: np.ndarray) -> np.ndarray:
+    def grey(xy: np.ndarray) -> np.ndarray:
         u = xy - lower_left
+        place = np.floor(u / (tag + gap)).astype(int)
+        within = u - place * (tag + gap)
+        column, row = np.clip(place, 0, [target.columns - 1, target.rows - 1]).T
+        on_tag = _within(place, 0, [target.columns, target.rows]) & (within < tag).all(axis=1)
+        x, y = np.clip((within / tag * side).astype(int), 0, side - 1).T
         on_board = _within(u, -gap, extent + gap)
         paper = _within(u, -2 * gap, extent + 2 * gap)
         between = ((u + gap) % (tag + gap) < gap).all(axis=1)
-        return np.where(on_board & between, DARK, np.where(paper, LIGHT, np.nan))
+        around = np.where(on_board & between, DARK, np.where(paper, LIGHT, np.nan))
+        return np.where(on_tag, np.where(bits[row * target.columns + column, y, x], LIGHT, DARK), around)
 
-    return over(*tags, squares)
+    return grey
 
 
 def marker_bits(dictionary: str, number: int, border: int = 1) -> np.ndarray:
