@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from colmap_inertial.simulate import RecordingOptions, SimulatedRecording, simulate_recording
+from colmap_inertial.simulate import MotionOptions, RecordingOptions, SimulatedRecording, simulate_recording
 from colmap_inertial.threads import one_blas_thread
 
 #: Files of the quick tier: each takes a few seconds at most.
@@ -153,5 +153,6 @@ def write_project(folder: Path, recording: SimulatedRecording) -> Project:
 
 @pytest.fixture(scope="session")
 def project(tmp_path_factory) -> Project:
-    """A handheld recording of 40 s, its clocks hundreds of seconds apart, as files. Tests must not change it."""
-    return write_project(tmp_path_factory.mktemp("project"), simulate_recording(RecordingOptions(), seed=11))
+    """A handheld recording of 20 s, its clocks hundreds of seconds apart, as files. Tests must not change it."""
+    options = RecordingOptions(motion=MotionOptions(duration_s=20.0))
+    return write_project(tmp_path_factory.mktemp("project"), simulate_recording(options, seed=11))

@@ -199,7 +199,7 @@ def test_derivatives_of_the_residuals_are_those_of_finite_differences():
 
 def test_errors_are_as_large_as_stated_over_simulated_recordings():
     z = []
-    for seed in range(60):
+    for seed in range(40):
         readout_s = abs(np.random.default_rng(seed).normal(0, 0.02))
         options = RecordingOptions(
             motion=MotionOptions(duration_s=15.0), imu=STATED, sfm=SfmOptions(readout_s=readout_s)
@@ -207,7 +207,7 @@ def test_errors_are_as_large_as_stated_over_simulated_recordings():
         simulated = simulate_recording(options, seed=seed)
         z.append(errors_in_sigmas(align_camera_imu(simulated.trajectory, simulated.imu), simulated.truth.calibration))
     inside = np.mean(np.abs(z) < 1.96, axis=0)
-    assert inside.min() > 0.86  # 95 % less three standard deviations
+    assert inside.min() > 0.86  # 95 % less two and a half standard deviations
     assert np.sqrt(np.mean(np.square(z))) > 0.3  # and not by stating the moon
 
 

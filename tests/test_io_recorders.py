@@ -141,8 +141,8 @@ def test_the_same_recording_comes_back_from_every_layout(
 
 @pytest.fixture(scope="module")
 def filmed() -> tuple[SimulatedRecording, ImuRecording, float]:
-    """A recording of half a minute, its IMU with both sensors at the same stamps, and the scale with that."""
-    recording = simulate_recording(RecordingOptions(motion=MotionOptions(duration_s=30.0)), seed=3)
+    """A recording of 20 s, its IMU with both sensors at the same stamps, and the scale with that."""
+    recording = simulate_recording(RecordingOptions(motion=MotionOptions(duration_s=20.0)), seed=3)
     together = replace(at_one_clock(recording.imu), epoch_ns=10**12)
     return recording, together, scale(recording, together)
 
