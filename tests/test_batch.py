@@ -299,21 +299,38 @@ def dask(*args: object) -> subprocess.Popen[bytes]:
     return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
 
 
-@pytest.fixture
-def cluster(tmp_path):
-    """A Dask scheduler and two workers of one thread each: (address, worker processes)."""
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory):
+    """A Dask scheduler and two workers of one thread each: (address, worker processes). The last test kills one."""
     pytest.importorskip("distributed", reason="dask[distributed] is not installed")
-    described = tmp_path / "scheduler.json"
+    root = tmp_path_factory.mktemp("cluster")
+    described = root / "scheduler.json"
     running = [dask("scheduler", "--host", "127.0.0.1", "--port", 0, "--no-dashboard", "--scheduler-file", described)]
     eventually(lambda: described.is_file() and described.read_text().endswith("}"))
     address = json.loads(described.read_text())["address"]
     for name in ("one", "two"):
-        flags = ("--nthreads", 1, "--no-nanny", "--no-dashboard", "--name", name, "--local-directory", tmp_path / name)
+        flags = ("--nthreads", 1, "--no-nanny", "--no-dashboard", "--name", name, "--local-directory", root / name)
         running.append(dask("worker", address, *flags))
     yield address, running[1:]
     for process in running:
         process.kill()
         process.wait()
+
+
+def test_a_cluster_stops_when_the_batch_does(captures, cluster, tmp_path):
+    found, _ = captures
+    address, _ = cluster
+    out = tmp_path / "out"
+
+    def watch(status: CaptureStatus) -> None:
+        if status.state == "running" and status.stage:
+            raise KeyboardInterrupt
+
+    entries = [BatchCapture(name=name, path=path, options=TINY) for name, path in found.items()]
+    with pytest.raises(KeyboardInterrupt):
+        run_batch(entries, out, batch=BatchOptions(scheduler=address), watch=watch)
+    eventually(lambda: not processes_of(out), 10)
+    assert {row["state"] for row in table(out).values()} == {"interrupted"}
 
 
 @pytest.mark.slow
@@ -343,22 +360,6 @@ def test_a_cluster_loses_a_worker_and_no_capture(captures, cluster, tmp_path):
     assert max(c.attempts for c in result.captures) <= 2
     for i in (1, 2):
         assert model_bytes(out / f"{i:02}") == alone["hall" if i % 2 else "yard"], i
-
-
-def test_a_cluster_stops_when_the_batch_does(captures, cluster, tmp_path):
-    found, _ = captures
-    address, _ = cluster
-    out = tmp_path / "out"
-
-    def watch(status: CaptureStatus) -> None:
-        if status.state == "running" and status.stage:
-            raise KeyboardInterrupt
-
-    entries = [BatchCapture(name=name, path=path, options=TINY) for name, path in found.items()]
-    with pytest.raises(KeyboardInterrupt):
-        run_batch(entries, out, batch=BatchOptions(scheduler=address), watch=watch)
-    eventually(lambda: not processes_of(out), 10)
-    assert {row["state"] for row in table(out).values()} == {"interrupted"}
 
 
 def test_a_scheduler_that_does_not_answer_is_said(monkeypatch, manifest, tmp_path):
