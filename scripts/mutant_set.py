@@ -1572,6 +1572,20 @@ MUTANTS = (
         ("refine_stage::test_what_predicts_worse_is_not_believed",),
     ),
     Mutant(
+        "refine/motion.py",
+        "    by_state[:, _SPEED, GYRO_BIAS] = swinging",
+        "    by_state[:, _SPEED, GYRO_BIAS] = -swinging",
+        "sign of what the gyroscope's bias does to the camera's velocity",
+        ("refine::test_derivatives_of_the_camera_s_motion_are_those_of_finite_differences",),
+    ),
+    Mutant(
+        "stages/metric.py",
+        "    if model.motion is not None:",
+        "    if False:",
+        "the path of a refined model is smoothed once more",
+        ("refine_stage::test_an_existing_project_is_refined",),
+    ),
+    Mutant(
         "refine/setup.py",
         "centres = about + scale * (written.cam_in_world - about)",
         "centres = written.cam_in_world",

@@ -9,6 +9,7 @@ from refine_walk import PINHOLE, known_of, nudged, problem_of, tracks_of, walk
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.refine import _inertial, _seen, judge, setup, solve as solver
 from colmap_inertial.refine._system import Order, System
+from colmap_inertial.refine.motion import moving
 from colmap_inertial.refine.solve import _evaluate, _plausible, _weighted, factored, held_out, solve
 from colmap_inertial.refine.values import FreeCamera
 
@@ -49,6 +50,33 @@ def test_derivatives_of_observations_are_those_of_finite_differences(small):
         for column in range(values.shape[2]):
             expected = slope(residual, x, kind, column)
             assert np.abs(values[:, :, column] - expected).max() < 1e-5 * (1 + np.abs(expected).max())
+
+
+def test_derivatives_of_the_camera_s_motion_are_those_of_finite_differences(small):
+    _, problem, start, _ = small
+    x = replace(nudged(start, np.random.default_rng(3)), offset_s=4e-3)
+    x = replace(x, imu_in_cam_m=np.array([0.05, -0.08, 0.02]))
+    by, centres = moving(problem, x), setup.at_middle_lines(problem, x).cam_in_world
+
+    def motion(y):
+        written = setup.at_middle_lines(problem, y).cam_in_world
+        return np.concatenate([written, moving(problem, y).velocity_m_s], axis=1)
+
+    assert motion(x)[:, :3] == pytest.approx(centres)
+    for kind, values in ((0, by.by_state), (1, by.by_shared)):
+        for column in range(values.shape[2]):
+            expected = slope(motion, x, kind, column, size=1e-5)
+            # what gravity's strength and the accelerometer's gains do within an offset is left out, and how the arm
+            # swings faster and faster, of which an offset of microseconds makes nothing
+            bound = 6e-3 if kind == 0 or column not in (6, 7) else 0.5
+            bound = 0.05 if kind == 1 and column >= x.columns.accel_gain.start else bound
+            away = np.abs(values[:, :, column] - expected)
+            assert away[:, :3].max() < 6e-3 * (1 + np.abs(expected).max())
+            assert away.max() < bound * (1 + np.abs(expected).max())
+    # and the velocity is how the position changes with time
+    later = setup.at_middle_lines(problem, replace(x, offset_s=x.offset_s - 1e-4)).cam_in_world
+    before = setup.at_middle_lines(problem, replace(x, offset_s=x.offset_s + 1e-4)).cam_in_world
+    assert by.velocity_m_s == pytest.approx((later - before) / 2e-4, abs=2e-3)
 
 
 def test_what_derivatives_leave_out_is_a_hundredth_of_a_pixel(small):
@@ -387,12 +415,19 @@ def test_the_drift_map_names_what_was_stretched_and_how_sure_it_is(small, monkey
     longer = start.imu_in_world_m.copy()
     longer[half:] = middle + 1.1 * (longer[half:] - middle)
     solved = factored(problem, start)
-    parts = judge.drift_map(problem, start, replace(start, imu_in_world_m=longer), seen.t_s, solved)
+    by = moving(problem, start)
+    parts = judge.drift_map(problem, start, replace(start, imu_in_world_m=longer), seen.t_s, solved, by)
     assert len(parts) == 4
     assert parts[-1].percent - parts[0].percent == pytest.approx(10.0, abs=1.5)
     # by the whole covariance
-    n = solved.solved.shape[0]
-    cov, _ = solved.solve(np.eye(n), np.zeros((start.columns.count, n)))
-    columns = 15 * solved.order.place[-1] + np.arange(3, 6)
-    assert np.array(parts[-1].end_sigma_m) == pytest.approx(np.sqrt(np.diagonal(cov)[columns]), rel=1e-6)
+    n, shared = solved.solved.shape[0], start.columns.count
+    cov = np.concatenate(solved.solve(np.eye(n, n + shared), np.eye(shared, n + shared, n)))
+    first, last = 15 * solved.order.place[[0, -1]]
+    jacobian = np.zeros((6, n + shared))
+    jacobian[:, last : last + 15], jacobian[:, n:] = by.by_state[-1], by.by_shared[-1]
+    jacobian[:3, first : first + 15] -= by.by_state[0, :3]
+    jacobian[:3, n:] -= by.by_shared[0, :3]
+    (found,) = solved.motion_covs(np.array([len(seen.t_s) - 1]), by)
+    assert found == pytest.approx(jacobian @ cov @ jacobian.T, rel=1e-5, abs=1e-12)
+    assert np.array(parts[-1].end_sigma_m) == pytest.approx(np.sqrt(np.diagonal(found)[:3]), rel=1e-9)
     assert 0 < parts[0].sigma_percent < 50

@@ -15,6 +15,8 @@ from colmap_inertial.drivers.capture import default_model_stages
 from colmap_inertial.drivers.frames import as_refined
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.io.capture import Capture
+from colmap_inertial.io.records import read_record
+from colmap_inertial.io.trajectories import read_tum
 from colmap_inertial.model import Model
 from colmap_inertial.options import ProjectOptions, ReconstructOptions
 from colmap_inertial.refine import judge
@@ -26,6 +28,7 @@ from colmap_inertial.stages.metric import MetricStage
 from colmap_inertial.stages.readout import ReadoutStage
 from colmap_inertial.stages.refine import RefineStage
 from colmap_inertial.stages.rolling_shutter import RollingShutterStage
+from colmap_inertial.types import CameraMotion
 
 UNKNOWN = calibration_prior()
 
@@ -50,12 +53,17 @@ def centres_of(model):
 
 
 def error_of(centres, truth):
-    """Root mean square after a similarity (Umeyama)."""
+    """Root mean square after a similarity."""
+    return float(np.sqrt(np.mean(np.sum(fitted(centres, truth)[1] ** 2, axis=1))))
+
+
+def fitted(centres, truth):
+    """Scale (Umeyama), and (N, 3) what is left."""
     a, b = centres - centres.mean(0), truth - truth.mean(0)
     u, d, vt = np.linalg.svd(b.T @ a)
     sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
     scale = np.trace(np.diag(d) @ sign) / np.sum(a**2)
-    return float(np.sqrt(np.mean(np.sum((scale * a @ (u @ sign @ vt).T - b) ** 2, axis=1))))
+    return scale, scale * a @ (u @ sign @ vt).T - b
 
 
 @pytest.fixture(scope="module")
@@ -357,12 +365,26 @@ def test_an_existing_project_is_refined(walked, tmp_path):
     made, mapped = read_model(tmp_path / "out" / "sparse" / "0"), read_model(project / "sparse" / "0")
     assert error_of(centres_of(made), truth) < error_of(centres_of(mapped), truth)
     assert result.models[0].trajectory is not None
-    # smoothed once more, the IMU would count twice: the refinement's own covariance, against the first image
-    assert (tmp_path / "out" / "trajectory.tum").exists()
+    # smoothed once more, the IMU would count twice: poses, velocities and covariance are the refinement's own
+    path = read_tum(tmp_path / "out" / "trajectory.tum")
+    assert path.cam_in_world == pytest.approx(centres_of(made), abs=1e-9)
     stored = np.load(tmp_path / "out" / "trajectory_cov.npz")
-    assert stored["cov"].shape == (len(tracks.timing.names), 3, 3)
+    assert stored["cov"].shape == (len(tracks.timing.names), 6, 6)
     assert stored["t_s"] - stored["t_s"][0] == pytest.approx(tracks.timing.t_s - tracks.timing.t_s[0], abs=1e-6)
-    sigma_m = np.sqrt(np.trace(stored["cov"], axis1=1, axis2=2))
+    sigma_m = np.sqrt(np.trace(stored["cov"][:, :3, :3], axis1=1, axis2=2))
     assert sigma_m[0] < 1e-3 < 10 * sigma_m[-1] and sigma_m[-1] > 2 * sigma_m[10]
     last = said["values"]["drift"][-1]["end_sigma_m"]
-    assert np.sqrt(np.diagonal(stored["cov"][-1])) == pytest.approx(last, rel=1e-6)
+    scale = said["values"]["size_before"]
+    assert np.sqrt(np.diagonal(stored["cov"][-1])[:3]) == pytest.approx(scale * np.array(last), rel=1e-6)
+    motion = read_record(tmp_path / "out" / "trajectory_motion.json", CameraMotion)
+    assert motion.names == tracks.timing.names
+    speed, true = (
+        np.linalg.norm(one, axis=1)
+        for one in (motion.velocity_in_world_m_s, tracks.motion.at(tracks.timing.pose_t_s()).velocity_in_world_m_s)
+    )
+    # and the velocities are as sure as they say, of one size with the path
+    size, _ = fitted(path.cam_in_world, truth)
+    off = size * speed - true
+    sigma_m_s = np.sqrt(np.trace(stored["cov"][:, 3:, 3:], axis1=1, axis2=2) / 3)
+    assert np.sqrt(np.mean(off**2)) < 5e-3
+    assert 0.2 < np.sqrt(np.mean((off / sigma_m_s) ** 2)) < 1.5

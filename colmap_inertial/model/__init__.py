@@ -26,6 +26,7 @@ from colmap_inertial.types import (
     JoinedPart,
     ScaleEstimate,
     Similarity,
+    SolvedMotion,
     Treatment,
 )
 
@@ -70,9 +71,8 @@ class Model:
         By image name, (N, 2) where its keypoints were when COLMAP mapped them, where a stage moved them since.
     parts
         What it was joined of; empty where it is one of COLMAP's models.
-    position_covs
-        By image name, (3, 3) covariance of its position against the first one's, where a stage says so: of all, or of
-        some.
+    motion
+        How the camera moved, where a stage solved for it; without it, the path is smoothed.
     """
 
     reconstruction: pycolmap.Reconstruction
@@ -85,7 +85,7 @@ class Model:
     treatments: tuple[Treatment, ...] = ()
     observed_px: Mapping[str, Array] = field(default_factory=dict)
     parts: tuple[JoinedPart, ...] = ()
-    position_covs: Mapping[str, Array] = field(default_factory=dict)
+    motion: SolvedMotion | None = None
 
     def scaled(self, estimate: ScaleEstimate, similarity: Similarity | None) -> Model:
         """With a scale estimate, and where it was not refused in its units; doubts make it weak at most.

@@ -88,7 +88,7 @@ def poses_at(problem: Problem, x: Estimate, frame: Index, line: Array) -> Poses:
             force=still,
         )
     turning = problem.inertial.turning
-    since_s = line * x.readout_s - x.offset_s - x.clock_rate * _since_middle_s(problem, frame)
+    since_s = line * x.readout_s - x.offset_s - x.clock_rate * since_middle_s(problem, frame)
     powers, t = turning.powers[frame], since_s[:, None]
     reading, rate = np.zeros((len(frame), 3)), np.zeros((len(frame), 3))
     for k in range(4, -1, -1):
@@ -117,7 +117,7 @@ def poses_at(problem: Problem, x: Estimate, frame: Index, line: Array) -> Poses:
     )
 
 
-def _since_middle_s(problem: Problem, frame: Index) -> Array:
+def since_middle_s(problem: Problem, frame: Index) -> Array:
     """(M,) of frames' nodes, for the clock rate."""
     if problem.inertial is None:
         return np.zeros(len(frame))
@@ -226,7 +226,7 @@ def derivatives(problem: Problem, x: Estimate, observations: Observations, at: P
     by_shared[:, :, ROTATION] = -by_cam @ skew(at.in_cam - x.imu_in_cam_m)
     by_shared[:, :, LEVER] = by_cam
     by_shared[:, :, OFFSET] = -by_time
-    by_shared[:, :, CLOCK_RATE] = -_since_middle_s(problem, observations.frame)[:, None] * by_time
+    by_shared[:, :, CLOCK_RATE] = -since_middle_s(problem, observations.frame)[:, None] * by_time
     by_shared[:, :, READOUT] = observations.line[:, None] * by_time
     by_shared[:, :, FIRST_INTRINSIC : x.columns.seen.stop] = by_intrinsics
     if rolling:

@@ -11,6 +11,7 @@ from colmap_inertial._kernels import _inertial
 from colmap_inertial.geometry import Array
 from colmap_inertial.refine._inertial import Rows
 from colmap_inertial.refine._seen import Derivatives
+from colmap_inertial.refine.motion import Moving
 from colmap_inertial.refine.values import N_SEEN, N_STATE, POSITION, Index, Observations
 
 #: Frames whose covariance is solved for at once.
@@ -222,16 +223,22 @@ class Factored:
         states, _ = self.solve(rhs, np.zeros((len(self.corner[0]), count)))
         return np.sqrt(np.einsum("nk,nk->k", rhs, states))
 
-    def position_covs(self, frames: Index) -> Array:
-        """(K, 3, 3) covariances of K frames' positions."""
-        out = []
+    def motion_covs(self, frames: Index, by: Moving) -> Array:
+        """(K, 6, 6) covariances of K frames' positions against the first frame's, and velocities."""
+        out, place = [], self.order.place
         for some in np.array_split(frames, -(-len(frames) // _AT_ONCE)):
-            sides = np.zeros((len(some), 3, len(self.order.place), N_STATE))
-            sides[np.arange(len(some))[:, None], np.arange(3), self.order.place[some][:, None], POSITION] = np.eye(3)
-            rhs = sides.reshape(3 * len(some), -1).T
-            states, _ = self.solve(rhs, np.zeros((len(self.corner[0]), 3 * len(some))))
-            left, right = (one.reshape(-1, len(some), 3) for one in (rhs, states))
-            out.append(np.einsum("nki,nkj->kij", left, right))
+            count = len(some)
+            sides = np.zeros((count, 6, len(place), N_STATE))
+            sides[np.arange(count)[:, None], np.arange(6), place[some][:, None]] = by.by_state[some]
+            sides[:, :3, place[0]] -= by.by_state[0, :3]
+            sides_shared = by.by_shared[some]
+            sides_shared[:, :3] -= by.by_shared[0, :3]
+            rhs, rhs_shared = sides.reshape(6 * count, -1).T, sides_shared.reshape(6 * count, -1).T
+            cov = np.zeros((count, 6, 6))
+            for side, solved in zip((rhs, rhs_shared), self.solve(rhs, rhs_shared), strict=True):
+                left, right = (one.reshape(-1, count, 6) for one in (side, solved))
+                cov += np.einsum("nki,nkj->kij", left, right)
+            out.append(0.5 * (cov + cov.transpose(0, 2, 1)))
         return np.concatenate(out)
 
     def shared_cov(self) -> Array:

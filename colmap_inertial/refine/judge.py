@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.refine._system import Factored, Order
+from colmap_inertial.refine.motion import Moving, moving
 from colmap_inertial.refine.setup import at_middle_lines, measured_sigma_px, pictures_alone
 from colmap_inertial.refine.solve import Solution, factored, held_out, solve
 from colmap_inertial.refine.values import READOUT, Estimate, Observations, Problem
@@ -19,7 +20,7 @@ from colmap_inertial.types import Array
 _EVERY, _FEWEST = 10, 4
 #: A readout that was not declared is one where it is longer, and so many standard deviations long.
 _LEAST_READOUT_S, _SURE_SIGMA = 1e-3, 3.0
-#: Positions whose covariance is told.
+#: Frames whose covariance is told.
 _MOST_COVS = 400
 #: Length of a part of the path whose drift is told.
 _PART_S = 10.0
@@ -76,8 +77,11 @@ class Judged:
         (Q, Q) covariance of what is shared; ``None`` where it is not believed.
     drift
         How the scale changed along the path; empty where it is not believed.
-    position_covs
-        (3, 3) covariances of positions against the first one's, by frames: all, or evenly chosen ones.
+    velocity_m_s
+        (F, 3) of the camera's centre in the world; nan where the IMU says nothing of it, and where it is not believed.
+    motion_covs
+        (6, 6) covariances of position against the first frame's and of velocity, by frames: all, or evenly chosen
+        ones.
     readout
         One that was not declared (s), and its standard deviation; ``None`` where it was, or nothing was found.
     steps
@@ -96,7 +100,8 @@ class Judged:
     sigma_px: float
     shared_cov: Array | None
     drift: tuple[Stretched, ...]
-    position_covs: dict[int, Array]
+    velocity_m_s: Array
+    motion_covs: dict[int, Array]
     readout: tuple[float, float] | None
     steps: int
 
@@ -146,7 +151,8 @@ def refine(
     steps, final = seen_alone.steps + seen.steps, start
     cov: Array | None = None
     drift: tuple[Stretched, ...] = ()
-    position_covs: dict[int, Array] = {}
+    velocity_m_s = np.full_like(start.velocity_m_s, np.nan)
+    motion_covs: dict[int, Array] = {}
     if not reason:
         whole = solve(problem, seen.estimate)
         steps += whole.steps
@@ -158,10 +164,13 @@ def refine(
             reason = "nothing says how sure it would be"
         else:
             final, cov = whole.estimate, solved.shared_cov()
-            drift = drift_map(problem, start, final, t_s, solved)
+            by = moving(problem, final)
+            drift = drift_map(problem, start, final, t_s, solved, by)
             timed = np.flatnonzero(np.isfinite(t_s))
             some = timed[:: -(-len(timed) // _MOST_COVS)]
-            position_covs = dict(zip(some.tolist(), solved.position_covs(some), strict=True))
+            motion_covs = dict(zip(some.tolist(), solved.motion_covs(some, by), strict=True))
+            assert problem.inertial is not None
+            velocity_m_s = np.where(problem.inertial.touched[:, None], by.velocity_m_s, np.nan)
     return Judged(
         estimate=final,
         accepted=not reason,
@@ -175,7 +184,8 @@ def refine(
         sigma_px=sigma_px,
         shared_cov=cov,
         drift=drift,
-        position_covs=position_covs,
+        velocity_m_s=velocity_m_s,
+        motion_covs=motion_covs,
         readout=readout,
         steps=steps,
     )
@@ -255,7 +265,9 @@ def _as_px(costs: Array, sigma_px: float) -> float:
     return float(sigma_px * np.sqrt(np.mean(costs))) if len(costs) else 0.0
 
 
-def drift_map(problem: Problem, start: Estimate, x: Estimate, t_s: Array, solved: Factored) -> tuple[Stretched, ...]:
+def drift_map(
+    problem: Problem, start: Estimate, x: Estimate, t_s: Array, solved: Factored, by: Moving
+) -> tuple[Stretched, ...]:
     """How the refinement changed the scale along a path, and how sure it is of it.
 
     Parameters
@@ -264,8 +276,8 @@ def drift_map(problem: Problem, start: Estimate, x: Estimate, t_s: Array, solved
         The refinement, from where to where.
     t_s
         (F,) times of the frames; nan without one.
-    solved
-        The information at ``x``.
+    solved, by
+        The information at ``x``, and the camera's motion there.
     """
     before, after = (at_middle_lines(problem, one).cam_in_world for one in (start, x))
     timed = np.isfinite(t_s)
@@ -275,12 +287,9 @@ def drift_map(problem: Problem, start: Estimate, x: Estimate, t_s: Array, solved
         parts = [np.flatnonzero((t_s >= begin_s) & (t_s <= end_s)) for begin_s, end_s in pairwise(edges)]
     whole = size_of(before[timed]) / size_of(after[timed])
     by_log = np.stack([_by_log_size(after, np.flatnonzero(timed)), *(_by_log_size(after, part) for part in parts)])
-    ends = np.zeros((len(parts), 3, *after.shape))
-    for i, part in enumerate(parts):
-        if len(part):
-            ends[i, :, part[-1]] = np.eye(3)
-    sides = np.concatenate([by_log[1:] - by_log[0], ends.reshape(-1, *after.shape)])
-    sigma = solved.position_sigmas(sides)
+    sigma = solved.position_sigmas(by_log[1:] - by_log[0])
+    last = np.array([part[-1] if len(part) else 0 for part in parts])
+    end_sigma_m = np.sqrt(np.diagonal(solved.motion_covs(last, by), axis1=1, axis2=2)[:, :3])
     out = []
     for i, (part, (begin_s, end_s)) in enumerate(zip(parts, pairwise(edges), strict=True)):
         sizes = [size_of(centres[part]) if len(part) > 1 else 0.0 for centres in (before, after)]
@@ -291,7 +300,7 @@ def drift_map(problem: Problem, start: Estimate, x: Estimate, t_s: Array, solved
                     end_s=end_s,
                     percent=100 * (whole * sizes[1] / sizes[0] - 1),
                     sigma_percent=100 * float(sigma[i]),
-                    end_sigma_m=tuple(sigma[len(parts) + 3 * i : len(parts) + 3 * i + 3].tolist()),
+                    end_sigma_m=tuple(end_sigma_m[i].tolist()),
                 )
             )
     return tuple(out)

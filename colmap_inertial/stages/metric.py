@@ -120,14 +120,17 @@ def gravity_in_model(model: Model) -> Array | None:
 
 
 def write_trajectory(path: Path, model: Model, trajectory: CameraTrajectory, imu: ImuRecording) -> None:
-    """Write the smoothed metric camera path of a model as TUM text, its covariance and motion beside it.
+    """Write the metric camera path of a model as TUM text, its covariance and motion beside it.
+
+    It is smoothed by the IMU; where a stage solved for the motion already, it is what that stage found.
 
     Parameters
     ----------
     path
         ``trajectory*.tum``; the covariance goes to ``trajectory*_cov.npz`` with ``t_s`` (T,) and ``cov`` (T, 9, 9) of
-        position, velocity and acceleration; of a refined model (K, 3, 3) of positions against the first one's, at 400
-        of them at most; none of a joined one that was not refined. Velocities by frame go to :func:`motion_file`.
+        position, velocity and acceleration; of a refined model (K, 6, 6) of position against the first one's and of
+        velocity, at 400 of them at most; none of a joined one that was not refined. Velocities by frame go to
+        :func:`motion_file`.
     model
         A model that a stage made metric.
     trajectory
@@ -138,21 +141,27 @@ def write_trajectory(path: Path, model: Model, trajectory: CameraTrajectory, imu
     estimate, gravity = model.scale, gravity_in_model(model)
     if estimate is None or model.similarity is None or estimate.calibration is None or gravity is None:
         raise ValueError("only a metric model has a metric trajectory")
-    smoothed = smoothed_path(trajectory, imu, estimate, gravity)
-    write_tum(path, smoothed)
     target = path.with_name(f"{path.stem}_cov.npz")
-    if any(one.stage == "refine" and one.action for one in model.treatments):
-        # the IMU made these poses already: smoothed by it once more, they would seem far surer than they are
-        told = [i for i, name in enumerate(trajectory.names) if name in model.position_covs]
-        covs = np.array([model.position_covs[trajectory.names[i]] for i in told]).reshape(-1, 3, 3)
+    if model.motion is not None:
+        # the IMU made these poses already: smoothed by it once more, they would be worse, and seem far surer
+        solved = model.motion
+        write_tum(path, trajectory)
+        told = [i for i, name in enumerate(trajectory.names) if name in solved.cov]
+        covs = np.array([solved.cov[trajectory.names[i]] for i in told]).reshape(-1, 6, 6)
         _write_covariance(target, trajectory.t_s[told] + trajectory.epoch_ns * 1e-9, covs)
-    elif model.parts:
-        # smoothing knows nothing of how surely each part was placed
-        log.info("%s: no covariance of a joined path is written; result.json has that of each part", path.name)
-        target.unlink(missing_ok=True)
+        unknown = np.full(3, np.nan)
+        velocity = np.array([solved.velocity_in_world.get(name, unknown) for name in trajectory.names])
     else:
-        _write_covariance(target, smoothed.t_s + smoothed.epoch_ns * 1e-9, smoothed.cov)
-    write_record(motion_file(path), _motion(model, trajectory, smoothed, imu, estimate.calibration))
+        smoothed = smoothed_path(trajectory, imu, estimate, gravity)
+        write_tum(path, smoothed)
+        velocity = smoothed.velocity_in_world
+        if model.parts:
+            # smoothing knows nothing of how surely each part was placed
+            log.info("%s: no covariance of a joined path is written; result.json has that of each part", path.name)
+            target.unlink(missing_ok=True)
+        else:
+            _write_covariance(target, smoothed.t_s + smoothed.epoch_ns * 1e-9, smoothed.cov)
+    write_record(motion_file(path), _motion(model, trajectory, velocity, imu, estimate.calibration))
 
 
 def _write_covariance(target: Path, t_s: Array, cov: Array) -> None:
@@ -169,11 +178,11 @@ def motion_file(trajectory: Path) -> Path:
 def _motion(
     model: Model,
     trajectory: CameraTrajectory,
-    smoothed: SmoothedTrajectory,
+    velocity_in_world: Array,
     imu: ImuRecording,
     calibration: CameraImuCalibration,
 ) -> CameraMotion:
-    """Velocities of a model's frames, without those during which the gyroscope was silent."""
+    """Velocities of a model's frames, but those during which the gyroscope was silent, and those that are nan."""
     timing = model.timing
     gyro = on_camera_rate(imu, calibration, camera_epoch_ns=timing.epoch_ns)
     camera = GyroCamera.of(gyro, calibration, camera_epoch_ns=timing.epoch_ns)
@@ -182,13 +191,13 @@ def _motion(
     exposure_s = None if timing.exposure_s is None else timing.exposure_s[index]
     half_s = max(_RATE_HALF_S, _LEAST_SAMPLES * float(np.median(np.diff(gyro.gyro_t_s))))
     begin_s, end_s = trajectory.t_s - half_s, trajectory.t_s + half_s
-    seen = camera.covers(begin_s, end_s)
+    seen = camera.covers(begin_s, end_s) & np.isfinite(velocity_in_world).all(axis=1)
     before, after = (camera.start_from_cam(t_s[seen]) for t_s in (begin_s, end_s))
     rate = so3_log(np.swapaxes(before, 1, 2) @ after) / (2 * half_s)
     return CameraMotion(
         names=tuple(name for name, kept in zip(trajectory.names, seen, strict=True) if kept),
         t_s=trajectory.t_s[seen],
-        velocity_in_world_m_s=smoothed.velocity_in_world[seen],
+        velocity_in_world_m_s=velocity_in_world[seen],
         angular_velocity_in_cam_rad_s=rate,
         exposure_s=None if exposure_s is None else exposure_s[seen],
         readout_s=timing.readout_s,

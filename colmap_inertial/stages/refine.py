@@ -28,7 +28,7 @@ from colmap_inertial.scale import strength_of_gravity
 from colmap_inertial.stages.metric import gravity_in_model
 from colmap_inertial.stages.rolling_shutter import RollingShutterStage
 from colmap_inertial.threads import one_blas_thread
-from colmap_inertial.types import CAL, Array, CameraImuCalibration, ImuRecording, Treatment
+from colmap_inertial.types import CAL, Array, CameraImuCalibration, ImuRecording, SolvedMotion, Treatment
 
 log = logging.getLogger(__name__)
 
@@ -125,8 +125,8 @@ class RefineStage:
         assert model.scale is not None and model.scale.calibration is not None
         calibration = _refined_calibration(model.scale.calibration, problem, judged)
         refined = replace(model.scale, calibration=calibration, accel_bias_m_s2=x.accel_bias_m_s2.mean(axis=0))
-        covs = {seen.names[i]: cov for i, cov in judged.position_covs.items()}
-        done = replace(model, reconstruction=reconstruction, scale=refined, observed_px={}, position_covs=covs)
+        motion = _motion(seen, judged, scale)
+        done = replace(model, reconstruction=reconstruction, scale=refined, observed_px={}, motion=motion)
         return _said(done, f"refined by the IMU ({heard})", action="refined", **figures)
 
     def _exposed_px(self, model: Model, seen: Seen) -> Array:
@@ -166,6 +166,15 @@ def _said(model: Model, reason: str, *, action: str = "", **values: object) -> M
     if scale is not None and model.similarity is not None:
         scale = replace(scale, notes=(*scale.notes, f"the model was {reason}"))
     return replace(model, treatments=(*model.treatments, done), scale=scale)
+
+
+def _motion(seen: Seen, judged: Judged, scale: float) -> SolvedMotion:
+    """The camera's motion in the model that is written, which is stretched."""
+    velocity = scale * judged.velocity_m_s
+    return SolvedMotion(
+        velocity_in_world={seen.names[i]: velocity[i] for i in np.flatnonzero(np.isfinite(velocity).all(axis=1))},
+        cov={seen.names[i]: scale**2 * cov for i, cov in judged.motion_covs.items()},
+    )
 
 
 def _calibration_figures(judged: Judged) -> dict[str, object]:

@@ -21,6 +21,7 @@ from colmap_inertial.types.estimated import (
     ScaleEstimate,
     Similarity,
     SmoothedTrajectory,
+    SolvedMotion,
     Verdict,
 )
 from colmap_inertial.types.imu_calibration import IMU_CAL, IMU_CALIBRATION_PARAMETERS, ImuCalibration
@@ -78,6 +79,7 @@ __all__ = [
     "ScaleEstimate",
     "Similarity",
     "SmoothedTrajectory",
+    "SolvedMotion",
     "SpectralRole",
     "Treatment",
     "Verdict",

@@ -193,6 +193,29 @@ class CameraMotion:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class SolvedMotion:
+    """How a camera moved, where a stage solved for poses and velocities together.
+
+    Attributes
+    ----------
+    velocity_in_world
+        By image name, (3,) of the camera's centre, in the model's world and units a second; of images whose velocity is
+        known.
+    cov
+        By image name, (6, 6) covariance of its position against the first one's, and of its velocity: of all images, or
+        of some.
+    """
+
+    velocity_in_world: Mapping[str, Array]
+    cov: Mapping[str, Array]
+
+    def __post_init__(self) -> None:
+        velocity = {name: checked_array(name, one, (3,)) for name, one in self.velocity_in_world.items()}
+        cov = {name: checked_covariance(name, one, (6, 6)) for name, one in self.cov.items()}
+        set_fields(self, velocity_in_world=velocity, cov=cov)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ScaleDrift:
     """Scales of parts of a recording against the scale of the whole, and whether they are the same.
 
