@@ -1586,6 +1586,13 @@ MUTANTS = (
         ("refine_stage::test_an_existing_project_is_refined",),
     ),
     Mutant(
+        "stages/refine.py",
+        "    return any(later[0] < earlier[1] for earlier, later in pairwise(spans))",
+        "    return False",
+        "two cameras at work at once are refined as one",
+        ("refine_stage::test_what_cannot_be_refined_is_said",),
+    ),
+    Mutant(
         "refine/setup.py",
         "centres = about + scale * (written.cam_in_world - about)",
         "centres = written.cam_in_world",

@@ -35,7 +35,7 @@ from colmap_inertial.stages.metric import MetricStage
 from colmap_inertial.stages.readout import ReadoutStage
 from colmap_inertial.stages.refine import RefineStage
 from colmap_inertial.stages.rolling_shutter import RollingShutterStage
-from colmap_inertial.types import CAL, ImuRecording
+from colmap_inertial.types import CAL, CameraImuCalibration, ImuRecording
 
 
 def adjusted(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
@@ -153,6 +153,17 @@ def studied(options: TrackOptions, seed: int, spoil: str, *, declared: bool = Tr
     return out
 
 
+def axes_deg(
+    found: CameraImuCalibration, gain: list[list[float]], true: CameraImuCalibration, matrix: np.ndarray
+) -> float:
+    """Angle between a sensor's own axes in the camera, as found and as they are: nearest rotations of skew ones."""
+    turns = []
+    for calibration, errors in ((found, np.eye(3) + np.array(gain)), (true, np.linalg.inv(np.eye(3) + matrix))):
+        u, _, vt = np.linalg.svd(matrix_from_quat(calibration.cam_from_imu_xyzw) @ errors)
+        turns.append(u @ vt)
+    return float(np.degrees(np.linalg.norm(so3_log(turns[0] @ turns[1].T))))
+
+
 def judged_calibration(model: Model, tracks: Tracks) -> dict[str, Any]:
     """Errors of the refined calibration, and over their standard deviations."""
     found, true, values = model.scale.calibration, tracks.calibration, model.treatments[-1].values
@@ -168,6 +179,10 @@ def judged_calibration(model: Model, tracks: Tracks) -> dict[str, Any]:
     lever = found.imu_in_cam_m - true.imu_in_cam_m
     out = {
         "rotation_deg": np.degrees(turn).tolist(),
+        "axes_deg": {
+            sensor: axes_deg(found, values[f"{sensor}_gain"], true, getattr(tracks.errors, f"{sensor}_matrix"))
+            for sensor in ("gyro", "accel")
+        },
         "lever_mm": (1e3 * lever).tolist(),
         "offset_ms": 1e3 * offset,
         "accel_delay_ms": 1e3 * accel,

@@ -66,6 +66,24 @@ def fitted(centres, truth):
     return scale, scale * a @ (u @ sign @ vt).T - b
 
 
+def two_cameras(model, second):
+    """A model of which some images are those of a second camera."""
+    built = pycolmap.Reconstruction()
+    for camera_id in (1, 2):
+        built.add_camera_with_trivial_rig(pycolmap.Camera(**{**model.camera(1).todict(), "camera_id": camera_id}))
+    image_ids = sorted(model.reg_image_ids())
+    of_second = set(image_ids[second])
+    for image_id in image_ids:
+        old = model.image(image_id)
+        keypoints = np.array([point.xy for point in old.points2D])
+        camera_id = 2 if image_id in of_second else 1
+        image = pycolmap.Image(name=old.name, keypoints=keypoints, camera_id=camera_id, image_id=image_id)
+        built.add_image_with_trivial_frame(image, old.cam_from_world())
+    for point in model.points3D.values():
+        built.add_point3D(point.xyz, point.track)
+    return built
+
+
 @pytest.fixture(scope="module")
 def walked():
     """A walk of 25 m, and COLMAP's model of it in metres."""
@@ -141,6 +159,7 @@ def test_a_rolling_shutter_is_part_of_it(rolled):
     assert said.action == "refined"
     assert error_of(centres_of(made.reconstruction), truth) < 0.7 * error_of(centres_of(model.reconstruction), truth)
     assert said.values["readout_s"] == pytest.approx(0.025, rel=0.03)
+    assert made.motion.readout_s == said.values["readout_s"] != made.timing.readout_s
     assert not made.observed_px
 
 
@@ -310,6 +329,11 @@ def test_what_cannot_be_refined_is_said(walked):
         made, said = refined_by(tracks.imu, other)
         assert why in said.reason
         assert made.reconstruction is model.reconstruction
+    # a second camera, which took every other image; one after the other would be a camera that was set anew
+    for second, why in ((slice(1, None, 2), "in turns"), (slice(50, None), "")):
+        stage = RefineStage(imu=tracks.imu, calibration=UNKNOWN, refine_intrinsics=False)
+        said = stage._why_not(replace(model, reconstruction=two_cameras(model.reconstruction, second)))
+        assert why in said and bool(said) == bool(why)
     empty = pycolmap.Reconstruction(model.reconstruction)
     for point_id in list(empty.point3D_ids()):
         empty.delete_point3D(point_id)

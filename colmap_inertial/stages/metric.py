@@ -183,7 +183,7 @@ def _motion(
     calibration: CameraImuCalibration,
 ) -> CameraMotion:
     """Velocities of a model's frames, but those during which the gyroscope was silent, and those that are nan."""
-    timing = model.timing
+    timing, solved = model.timing, model.motion
     gyro = on_camera_rate(imu, calibration, camera_epoch_ns=timing.epoch_ns)
     camera = GyroCamera.of(gyro, calibration, camera_epoch_ns=timing.epoch_ns)
     place = {name: i for i, name in enumerate(timing.names)}
@@ -200,7 +200,7 @@ def _motion(
         velocity_in_world_m_s=velocity_in_world[seen],
         angular_velocity_in_cam_rad_s=rate,
         exposure_s=None if exposure_s is None else exposure_s[seen],
-        readout_s=timing.readout_s,
+        readout_s=timing.readout_s if solved is None or solved.readout_s is None else solved.readout_s,
         readout_direction=timing.readout_direction,
         epoch_ns=trajectory.epoch_ns,
     )

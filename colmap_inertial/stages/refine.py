@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from dataclasses import asdict, dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -89,8 +90,8 @@ class RefineStage:
             return f"it has fewer than {_FEWEST_IMAGES} images"
         if reconstruction.num_points3D() < _FEWEST_POINTS:
             return f"it has fewer than {_FEWEST_POINTS} points"
-        if has_rigs(reconstruction):
-            return "its cameras are a rig"
+        if has_rigs(reconstruction) or (not model.parts and _alternate(model)):
+            return "several cameras took its images in turns, and each has its own place beside the IMU"
         if model.timing.readout_s and not model.rectified:
             return "its images still have the rolling shutter, and would not agree with the refined poses"
         if estimate.parts is not None and estimate.parts.get("accel_faults"):
@@ -125,7 +126,7 @@ class RefineStage:
         assert model.scale is not None and model.scale.calibration is not None
         calibration = _refined_calibration(model.scale.calibration, problem, judged)
         refined = replace(model.scale, calibration=calibration, accel_bias_m_s2=x.accel_bias_m_s2.mean(axis=0))
-        motion = _motion(seen, judged, scale)
+        motion = _motion(seen, judged, scale, readout_s=x.readout_s if model.timing.readout_s else None)
         done = replace(model, reconstruction=reconstruction, scale=refined, observed_px={}, motion=motion)
         return _said(done, f"refined by the IMU ({heard})", action="refined", **figures)
 
@@ -158,6 +159,18 @@ class RefineStage:
         )
 
 
+def _alternate(model: Model) -> bool:
+    """Whether one camera was at work while another one was: two devices, or a rig that nobody declared."""
+    t_of = dict(zip(model.timing.names, model.timing.pose_t_s().tolist(), strict=True))
+    times_s: dict[int, list[float]] = {}
+    for image_id in model.reconstruction.reg_image_ids():
+        image = model.reconstruction.image(image_id)
+        if image.name in t_of:
+            times_s.setdefault(image.camera_id, []).append(t_of[image.name])
+    spans = sorted((min(times), max(times)) for times in times_s.values())
+    return any(later[0] < earlier[1] for earlier, later in pairwise(spans))
+
+
 def _said(model: Model, reason: str, *, action: str = "", **values: object) -> Model:
     """The model with what was decided; a note beside its scale says it on the terminal and in the report."""
     log.info("model %d: %s", model.colmap_index, reason)
@@ -168,12 +181,13 @@ def _said(model: Model, reason: str, *, action: str = "", **values: object) -> M
     return replace(model, treatments=(*model.treatments, done), scale=scale)
 
 
-def _motion(seen: Seen, judged: Judged, scale: float) -> SolvedMotion:
+def _motion(seen: Seen, judged: Judged, scale: float, *, readout_s: float | None) -> SolvedMotion:
     """The camera's motion in the model that is written, which is stretched."""
     velocity = scale * judged.velocity_m_s
     return SolvedMotion(
         velocity_in_world={seen.names[i]: velocity[i] for i in np.flatnonzero(np.isfinite(velocity).all(axis=1))},
         cov={seen.names[i]: scale**2 * cov for i, cov in judged.motion_covs.items()},
+        readout_s=readout_s,
     )
 
 
@@ -188,6 +202,8 @@ def _calibration_figures(judged: Judged) -> dict[str, object]:
         "imu_in_cam_m": x.imu_in_cam_m.tolist(),
         "imu_in_cam_sigma_m": sigma[LEVER].tolist(),
         "intrinsics": x.intrinsics.tolist(),
+        "gyro_gain": x.gyro_gain.tolist(),
+        "accel_gain": x.accel_gain.tolist(),
     }
 
 

@@ -204,10 +204,13 @@ class SolvedMotion:
     cov
         By image name, (6, 6) covariance of its position against the first one's, and of its velocity: of all images, or
         of some.
+    readout_s
+        Of the pictures as they were filmed; ``None`` where it was not solved for.
     """
 
     velocity_in_world: Mapping[str, Array]
     cov: Mapping[str, Array]
+    readout_s: float | None = None
 
     def __post_init__(self) -> None:
         velocity = {name: checked_array(name, one, (3,)) for name, one in self.velocity_in_world.items()}
