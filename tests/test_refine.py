@@ -407,6 +407,13 @@ def test_known_numbers_stay_where_they_are(small):
     assert known_of(tracks, options).prior.readout_s == 0.0
 
 
+def test_points_stand_in_order_of_time(small):
+    _, problem, _, seen = small
+    first = problem.observations.frame[problem.observations.first[:-1]]
+    assert np.all(np.diff(first) >= 0) and len(seen.point_ids) == len(first)
+    assert sorted(seen.point_ids) != list(seen.point_ids)
+
+
 def test_the_drift_map_names_what_was_stretched_and_how_sure_it_is(small, monkeypatch):
     _, problem, start, seen = small
     monkeypatch.setattr(judge, "_PART_S", 1.0)

@@ -75,7 +75,7 @@ class Seen:
     cam_from_world, cam_in_world
         (F, 3, 3), (F, 3).
     point_ids, points
-        (P,), (P, 3) with two observations or more.
+        (P,), (P, 3) with two observations or more, in order of the first one's time.
     observations
         Where COLMAP has them.
     place
@@ -110,17 +110,18 @@ def read_seen(reconstruction: pycolmap.Reconstruction, timing: FrameTiming) -> S
     place: list[int] = []
     ids: list[int] = []
     xyz: list[Array] = []
-    for point_id in sorted(reconstruction.point3D_ids()):
-        one = reconstruction.points3D[point_id]
-        elements = [(number[e.image_id], e.point2D_idx) for e in one.track.elements if e.image_id in number]
-        if len(elements) < 2:
-            continue
-        elements.sort()
+    tracks = []
+    for point_id, one in reconstruction.points3D.items():
+        elements = sorted((number[e.image_id], e.point2D_idx) for e in one.track.elements if e.image_id in number)
+        if len(elements) > 1:
+            tracks.append((elements[0][0], int(point_id), elements, one.xyz))
+    # by time: what is worked on one after the other then lies side by side in memory
+    for _, point_id, elements, point_m in sorted(tracks, key=lambda track: track[:2]):
         frame += [e[0] for e in elements]
         place += [e[1] for e in elements]
         point += [len(ids)] * len(elements)
-        ids.append(int(point_id))
-        xyz.append(one.xyz)
+        ids.append(point_id)
+        xyz.append(point_m)
     frames, places = np.array(frame, dtype=np.int64), np.array(place, dtype=np.int64)
     first = np.cumsum([0, *(len(k) for k in keypoints)])
     every = np.concatenate(keypoints)
