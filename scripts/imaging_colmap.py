@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -91,8 +92,12 @@ def reconstructed(
     blur_px: float,
     ways: Mapping[str, ReconstructOptions],
     widths_px: Mapping[str, float] | None = None,
+    said: Callable[[str, dict[str, Any]], None] = lambda way, figures: None,
 ) -> dict[str, Any]:
-    """A scene with this blur, reconstructed in several ways, some with another smoothing of what features see."""
+    """A scene with this blur, reconstructed in several ways, some with another smoothing of what features see.
+
+    ``said`` hears of each way as it ends.
+    """
     widths_px = widths_px or {}
     recipe = with_blur(recipe, blur_px)
     with tempfile.TemporaryDirectory() as name:
@@ -101,12 +106,16 @@ def reconstructed(
         truth = read_truth(folder / "capture" / "truth.json").trajectory
         # the same options with another smoothing go on from the same plan
         out = {way: folder / str([*ways.values()].index(options)) for way, options in ways.items()}
+        found = {}
+        for way, options in ways.items():
+            found[way] = _run(capture, out[way], options, truth, widths_px.get(way))
+            said(way, found[way])
         return {
             "images": len(truth.names),
             "blur_px": blur_px,
             "exposure_s": recipe.camera.exposure_s,
             "readout_s": recipe.camera.readout_s,
-            "ways": {way: _run(capture, out[way], options, truth, widths_px.get(way)) for way, options in ways.items()},
+            "ways": found,
         }
 
 
@@ -116,6 +125,7 @@ def _run(
     """Of the largest model, as it is handed on; ``width_px``: smoothing of any blur, in place of the package's."""
     share, most_px = (SMOOTHING, MOST_SMOOTHING_PX) if width_px is None else (_OF_ANY_BLUR, width_px)
     stage = partial(DeblurStage, most_smoothing_px=most_px)
+    begin_s = time.process_time()
     try:
         with patch.object(plan, "SMOOTHING", share), patch.object(plan, "DeblurStage", stage):
             result = reconstruct(capture, out, options)
@@ -133,6 +143,9 @@ def _run(
     relative = np.einsum("nij,nkj->nik", rotations, matrix_from_quat(truth.cam_from_world_xyzw[at]))
     angle = np.degrees(np.arccos(np.clip(0.5 * (np.trace(relative, axis1=1, axis2=2) - 1), -1, 1)))
     extent = np.linalg.norm(truth.cam_in_world[:, None] - truth.cam_in_world, axis=2).max()
+    estimate = largest.scale
+    # what is read is in metres by the estimate, where there is one: then the similarity has its error
+    ends = None if estimate.ci95 is None else np.array(estimate.ci95) / (scale * (estimate.metres_per_unit or np.nan))
     return {
         "registered": len(images),
         "points": best.num_points3D(),
@@ -141,7 +154,11 @@ def _run(
         "centre_error_pct": float(100 * np.sqrt(np.mean(np.sum((centres - true) ** 2, axis=1))) / extent),
         "rotation_deg": float(np.median(angle)),
         "deblurring": result.imaging.deblur_note,
-        "scale_verdict": largest.scale.verdict,
+        "deblurred": sum(frame.action == "deblurred" for frame in result.frames),
+        "scale_verdict": estimate.verdict,
+        "scale_error_pct": None if ends is None else 100 * (1 / scale - 1),
+        "scale_ci95_pct": None if ends is None else [float(round(100 * (end - 1), 2)) for end in ends],
+        "cpu_s": round(time.process_time() - begin_s),
     }
 
 

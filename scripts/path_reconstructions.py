@@ -49,7 +49,12 @@ def measure(
     report["colmap"] = {"scenes": found, "wanted": []}
     for name, (recipe, blur_px) in scenes(count).items():
         with console.status(f"COLMAP, {name}"):
-            found[name] = imaging_colmap.reconstructed(recipe, blur_px, ways, widths)
+
+            def said(way: str, one: dict[str, Any], name: str = name) -> None:
+                figures = ", ".join(f"{key} {value}" for key, value in one.items() if key != "deblurring")
+                console.print(f"{name}, {way}: {figures}", highlight=False, soft_wrap=True)
+
+            found[name] = imaging_colmap.reconstructed(recipe, blur_px, ways, widths, said)
         report["colmap"]["wanted"] = [line for way in (*known, *others) for line in wanted(found, way)]
         keep()
 
@@ -67,9 +72,12 @@ def wanted(found: dict[str, Any], way: str) -> list[tuple[str, float, float, boo
         for row in found.values()
         if row["ways"]["rectified"]["registered"] >= 0.5 * row["images"]
     ]
+    spans = [row["ways"][way].get("scale_ci95_pct") for row in found.values()]
+    held = [low <= 0 <= high for low, high in filter(None, spans)]
     return [
         (f"{way}: camera error / as filmed", ratio("centre_error_pct", "as filmed"), 1 / 12, False),
         (f"{way}: camera error / rectified", ratio("centre_error_pct", "rectified"), 0.8, False),
         (f"{way}: points / rectified", ratio("points", "rectified"), 1.5, True),
         (f"{way}: least share of images registered", min(shares, default=float("nan")), 1.0, True),
+        (f"{way}: share of {len(held)} scales inside their intervals", float(np.mean(held or [np.nan])), 0.9, True),
     ]
