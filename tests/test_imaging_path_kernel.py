@@ -142,6 +142,20 @@ def test_a_tile_has_the_path_of_its_middle():
     )
 
 
+def test_a_path_that_changes_within_a_tile_is_as_uncertain_there():
+    width, height, roll_rad = 1025, 1025, 0.02
+    y, x = np.mgrid[0:17, 0:17] * 64.0 - 512
+    chords = np.stack([30 - roll_rad * y, 10 + roll_rad * x], axis=-1).astype(np.float32)
+    path = BlurPath.straight(BlurField(width=width, height=height, vector_px=chords, step_px=64))
+    tiling = Tiling.covering(width, height, path.extent_px())
+    inner = tiling.side - 2 * tiling.margin
+    middle = tuple(n // 2 for n in tiling.count)
+    np.testing.assert_allclose(
+        tiling.spreads(path)[middle], np.array([1, 0, 1]) * (roll_rad * inner) ** 2 / 12, atol=1e-4
+    )
+    assert not tiling.spreads(BlurPath.straight(BlurField.uniform(width, height, (30.0, 10.0), step_px=64))).any()
+
+
 @pytest.mark.parametrize("restore", [path_wiener, half_quadratic])
 def test_pixels_without_blur_and_around_what_is_clipped_stay(restore):
     width, height = 400, 300

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_inertial.imaging._bilinear import bilinear
 from colmap_inertial.imaging.blur_path import BlurPath
 from colmap_inertial.types import Array
 
@@ -75,8 +76,23 @@ class Tiling:
         return np.ascontiguousarray(path.at(*self._middles()), dtype=np.float32)
 
     def spreads(self, path: BlurPath) -> NDArray[np.float32]:
-        """(Ty, Tx, 3) covariance of the chords there."""
-        return np.ascontiguousarray(path.cov_at(*self._middles()), dtype=np.float32)
+        """(Ty, Tx, 3) covariance of the chords there: how uncertain they are, and how they change within the tile.
+
+        To a filter with one path for all of a tile, the latter is no other than the former. A chord that changes
+        evenly by d from one end of the tile's inner square to the other has the variance ``d^2 / 12``.
+        """
+        rows, columns = self._middles()
+        out = path.cov_at(rows, columns)
+        chords, step = path.field().vector_px.astype(np.float64), path.step_px
+        reach = self.side / 2 - self.margin
+        ends_y, ends_x = (
+            [np.clip(at + end, 0, size - 1) / step for end in (-reach, reach)]
+            for at, size in ((rows, self.height), (columns, self.width))
+        )
+        for (y0, y1), (x0, x1) in ((ends_y, [columns / step] * 2), ([rows / step] * 2, ends_x)):
+            change = bilinear(chords, y1, x1) - bilinear(chords, y0, x0)
+            out = out + change[..., [0, 0, 1]] * change[..., [0, 1, 1]] / 12
+        return np.ascontiguousarray(out, dtype=np.float32)
 
     def _middles(self) -> tuple[Array, Array]:
         rows, columns = (
