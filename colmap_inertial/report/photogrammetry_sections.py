@@ -13,6 +13,7 @@ from colmap_inertial.report.words import digits
 
 Content = dict[str, Any]
 
+_MOST_DECIMALS = 6
 #: What COLMAP calls the parameters of its cameras.
 _PARAMETERS = {
     "f": "focal length",
@@ -103,10 +104,12 @@ def residual_section(survey: Content, name: str, mark: str) -> Section:
 
 
 def _with_sigma(value: float, sigma: float | None) -> tuple[str, str]:
-    """A value to the second digit of its standard deviation, and that."""
+    """A value to the second digit of its standard deviation, and that; at most six decimals, for the narrowest page."""
     if sigma is None or not sigma > 0:
         return f"{value:.6g}", ""
     decimals = max(0, 1 - math.floor(math.log10(sigma)))
+    if decimals > _MOST_DECIMALS:
+        return f"{value:.6g}", f"{sigma:.2g}"
     return f"{value:.{decimals}f}", f"{sigma:.{decimals}f}"
 
 
