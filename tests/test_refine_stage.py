@@ -330,7 +330,7 @@ def test_what_cannot_be_refined_is_said(walked):
         assert why in said.reason
         assert made.reconstruction is model.reconstruction
     # a second camera, which took every other image; one after the other would be a camera that was set anew
-    for second, why in ((slice(1, None, 2), "in turns"), (slice(50, None), "")):
+    for second, why in ((slice(1, None, 2), "several cameras"), (slice(50, None), "")):
         stage = RefineStage(imu=tracks.imu, calibration=UNKNOWN, refine_intrinsics=False)
         said = stage._why_not(replace(model, reconstruction=two_cameras(model.reconstruction, second)))
         assert why in said and bool(said) == bool(why)

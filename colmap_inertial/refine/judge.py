@@ -166,11 +166,13 @@ def refine(
             final, cov = whole.estimate, solved.shared_cov()
             by = moving(problem, final)
             drift = drift_map(problem, start, final, t_s, solved, by)
-            timed = np.flatnonzero(np.isfinite(t_s))
-            some = timed[:: -(-len(timed) // _MOST_COVS)]
-            motion_covs = dict(zip(some.tolist(), solved.motion_covs(some, by), strict=True))
             assert problem.inertial is not None
-            velocity_m_s = np.where(problem.inertial.touched[:, None], by.velocity_m_s, np.nan)
+            # where the IMU says nothing, the covariance of a velocity is a prior's
+            moved = problem.inertial.touched
+            told = np.flatnonzero(np.isfinite(t_s) & moved)
+            some = told[:: -(-len(told) // _MOST_COVS) or 1]
+            motion_covs = dict(zip(some.tolist(), solved.motion_covs(some, by), strict=True))
+            velocity_m_s = np.where(moved[:, None], by.velocity_m_s, np.nan)
     return Judged(
         estimate=final,
         accepted=not reason,

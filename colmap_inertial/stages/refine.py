@@ -91,7 +91,7 @@ class RefineStage:
         if reconstruction.num_points3D() < _FEWEST_POINTS:
             return f"it has fewer than {_FEWEST_POINTS} points"
         if has_rigs(reconstruction) or (not model.parts and _alternate(model)):
-            return "several cameras took its images in turns, and each has its own place beside the IMU"
+            return "several cameras took its images, and each has its own place beside the IMU"
         if model.timing.readout_s and not model.rectified:
             return "its images still have the rolling shutter, and would not agree with the refined poses"
         if estimate.parts is not None and estimate.parts.get("accel_faults"):
