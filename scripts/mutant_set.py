@@ -1587,10 +1587,31 @@ MUTANTS = (
     ),
     Mutant(
         "stages/refine.py",
-        "    return any(later[0] < earlier[1] for earlier, later in pairwise(spans))",
+        "    return returns > _MOST_RETURNS * len(used)",
         "    return False",
         "two cameras at work at once are refined as one",
         ("refine_stage::test_what_cannot_be_refined_is_said",),
+    ),
+    Mutant(
+        "stages/refine.py",
+        "    return returns > _MOST_RETURNS * len(used)",
+        "    return returns > 0",
+        "a camera that zoomed and came back is taken for two",
+        ("refine_stage::test_what_cannot_be_refined_is_said",),
+    ),
+    Mutant(
+        "refine/judge.py",
+        "np.flatnonzero(np.isfinite(t_s) & moved)",
+        "np.flatnonzero(np.isfinite(t_s))",
+        "images that the IMU says nothing of are as sure as a prior",
+        ("refine_stage::test_images_beyond_the_recording_have_no_covariance_of_motion",),
+    ),
+    Mutant(
+        "types/motion.py",
+        "<= _UNMOVED * (1 + np.linalg.norm(solved))",
+        "<= 1 + np.linalg.norm(solved)",
+        "what was solved holds of images that a stage moved since",
+        ("refine_stage::test_images_beyond_the_recording_have_no_covariance_of_motion",),
     ),
     Mutant(
         "refine/setup.py",

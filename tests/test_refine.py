@@ -67,7 +67,7 @@ def test_derivatives_of_the_camera_s_motion_are_those_of_finite_differences(smal
         for column in range(values.shape[2]):
             expected = slope(motion, x, kind, column, size=1e-5)
             # what gravity's strength and the accelerometer's gains do within an offset is left out, and how the arm
-            # swings faster and faster, of which an offset of microseconds makes nothing
+            # swings ever faster, of which an offset of microseconds makes nothing
             bound = 6e-3 if kind == 0 or column not in (6, 7) else 0.5
             bound = 0.05 if kind == 1 and column >= x.columns.accel_gain.start else bound
             away = np.abs(values[:, :, column] - expected)

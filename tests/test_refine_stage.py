@@ -244,6 +244,32 @@ def test_images_without_a_time_hang_on_the_pictures(walked):
     assert error_of(centres_of(made.reconstruction), truth) < error_of(centres_of(model.reconstruction), truth)
 
 
+def test_images_beyond_the_recording_have_no_covariance_of_motion(walked):
+    tracks, model = walked
+    until_s = tracks.imu.gyro_t_s[0] + 0.7 * (tracks.imu.gyro_t_s[-1] - tracks.imu.gyro_t_s[0])
+    gyro, accel = tracks.imu.gyro_t_s < until_s, tracks.imu.accel_t_s < until_s
+    short = replace(
+        tracks.imu,
+        gyro_t_s=tracks.imu.gyro_t_s[gyro],
+        gyro_rad_s=tracks.imu.gyro_rad_s[gyro],
+        accel_t_s=tracks.imu.accel_t_s[accel],
+        accel_m_s2=tracks.imu.accel_m_s2[accel],
+    )
+    made, said = refined_by(short, model)
+    assert said.action == "refined"
+    names = np.array(tracks.timing.names)
+    felt = tracks.timing.pose_t_s() - tracks.calibration.gyro_time_offset_s < until_s
+    assert set(made.motion.cov) == set(made.motion.velocity_in_world) <= set(names[felt])
+    assert len(made.motion.cov) >= felt.sum() - 2
+    assert set(made.motion.cam_in_world) == set(names)
+    # what a stage moves afterwards is not what was solved
+    centres = centres_of(made.reconstruction)
+    assert made.motion.of(tuple(names), centres).cov.keys() == made.motion.cov.keys()
+    centres[5:] += 1e-3
+    assert set(made.motion.of(tuple(names), centres).cov) == set(names[:5])
+    assert set(made.motion.of(tuple(names), centres).velocity_in_world) == set(names[:5])
+
+
 def test_an_imu_that_contradicts_the_pictures_leaves_the_model_as_it_is(walked):
     tracks, model = walked
     imu = replace(tracks.imu, accel_m_s2=tracks.imu.accel_m_s2[:, [1, 0, 2]] * [1.0, 1.0, 1.0])
@@ -329,8 +355,15 @@ def test_what_cannot_be_refined_is_said(walked):
         made, said = refined_by(tracks.imu, other)
         assert why in said.reason
         assert made.reconstruction is model.reconstruction
-    # a second camera, which took every other image; one after the other would be a camera that was set anew
-    for second, why in ((slice(1, None, 2), "several cameras"), (slice(50, None), "")):
+    # a second camera, which took every other image, in a part of a joined model, too; one camera may be set anew, zoom
+    # and come back, or take one picture with other settings
+    for second, why in (
+        (slice(1, None, 2), "several cameras"),
+        (slice(1, 40, 2), "several cameras"),
+        (slice(50, None), ""),
+        (slice(40, 60), ""),
+        (slice(30, 31), ""),
+    ):
         stage = RefineStage(imu=tracks.imu, calibration=UNKNOWN, refine_intrinsics=False)
         said = stage._why_not(replace(model, reconstruction=two_cameras(model.reconstruction, second)))
         assert why in said and bool(said) == bool(why)
@@ -411,4 +444,4 @@ def test_an_existing_project_is_refined(walked, tmp_path):
     off = size * speed - true
     sigma_m_s = np.sqrt(np.trace(stored["cov"][:, 3:, 3:], axis1=1, axis2=2) / 3)
     assert np.sqrt(np.mean(off**2)) < 5e-3
-    assert 0.2 < np.sqrt(np.mean((off / sigma_m_s) ** 2)) < 1.5
+    assert 0.4 < np.sqrt(np.mean((off / sigma_m_s) ** 2)) < 1.5

@@ -71,8 +71,8 @@ def moving(problem: Problem, x: Estimate) -> Moving:
     velocity = poses.velocity_m_s + np.einsum("nij,nj->ni", now, swing)
     if problem.inertial is not None:
         force = np.einsum("nij,nj->ni", start, poses.force) + x.gravity_m_s2 * problem.inertial.down
-        curved = np.einsum("nij,nj->ni", now, cross(poses.rate, swing))
-        by_time = np.concatenate([velocity, force + curved], axis=1)
+        # that the arm swings faster and faster is nothing within an offset
+        by_time = np.concatenate([velocity, force], axis=1)
         by_shared[:, :, OFFSET] = -by_time
         by_shared[:, :, CLOCK_RATE] = -since_middle_s(problem, frames)[:, None] * by_time
         by_gain = -swinging[:, :, :, None] * problem.inertial.turning.powers[:, 0][:, None, None, :]

@@ -144,7 +144,7 @@ def write_trajectory(path: Path, model: Model, trajectory: CameraTrajectory, imu
     target = path.with_name(f"{path.stem}_cov.npz")
     if model.motion is not None:
         # the IMU made these poses already: smoothed by it once more, they would be worse, and seem far surer
-        solved = model.motion
+        solved = model.motion.of(trajectory.names, trajectory.cam_in_world)
         write_tum(path, trajectory)
         told = [i for i, name in enumerate(trajectory.names) if name in solved.cov]
         covs = np.array([solved.cov[trajectory.names[i]] for i in told]).reshape(-1, 6, 6)

@@ -6,6 +6,7 @@ import logging
 import time
 from dataclasses import asdict, dataclass, field, replace
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -31,9 +32,14 @@ from colmap_inertial.stages.rolling_shutter import RollingShutterStage
 from colmap_inertial.threads import one_blas_thread
 from colmap_inertial.types import CAL, Array, CameraImuCalibration, ImuRecording, SolvedMotion, Treatment
 
+if TYPE_CHECKING:
+    import pycolmap
+
 log = logging.getLogger(__name__)
 
 _FEWEST_IMAGES, _FEWEST_POINTS = 10, 50
+#: One camera comes back to settings that it had before in fewer of its images than this.
+_MOST_RETURNS = 0.1
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -90,7 +96,7 @@ class RefineStage:
             return f"it has fewer than {_FEWEST_IMAGES} images"
         if reconstruction.num_points3D() < _FEWEST_POINTS:
             return f"it has fewer than {_FEWEST_POINTS} points"
-        if has_rigs(reconstruction) or (not model.parts and _alternate(model)):
+        if has_rigs(reconstruction) or _alternate(model):
             return "several cameras took its images, and each has its own place beside the IMU"
         if model.timing.readout_s and not model.rectified:
             return "its images still have the rolling shutter, and would not agree with the refined poses"
@@ -126,7 +132,8 @@ class RefineStage:
         assert model.scale is not None and model.scale.calibration is not None
         calibration = _refined_calibration(model.scale.calibration, problem, judged)
         refined = replace(model.scale, calibration=calibration, accel_bias_m_s2=x.accel_bias_m_s2.mean(axis=0))
-        motion = _motion(seen, judged, scale, readout_s=x.readout_s if model.timing.readout_s else None)
+        readout_s = x.readout_s if model.timing.readout_s else None
+        motion = _motion(reconstruction, seen, judged, scale, readout_s=readout_s)
         done = replace(model, reconstruction=reconstruction, scale=refined, observed_px={}, motion=motion)
         return _said(done, f"refined by the IMU ({heard})", action="refined", **figures)
 
@@ -160,15 +167,16 @@ class RefineStage:
 
 
 def _alternate(model: Model) -> bool:
-    """Whether one camera was at work while another one was: two devices, or a rig that nobody declared."""
+    """Whether cameras take turns: two devices, or a rig that nobody declared; not one that zoomed, and back."""
     t_of = dict(zip(model.timing.names, model.timing.pose_t_s().tolist(), strict=True))
-    times_s: dict[int, list[float]] = {}
-    for image_id in model.reconstruction.reg_image_ids():
-        image = model.reconstruction.image(image_id)
-        if image.name in t_of:
-            times_s.setdefault(image.camera_id, []).append(t_of[image.name])
-    spans = sorted((min(times), max(times)) for times in times_s.values())
-    return any(later[0] < earlier[1] for earlier, later in pairwise(spans))
+    images = [model.reconstruction.image(image_id) for image_id in model.reconstruction.reg_image_ids()]
+    used = [one.camera_id for one in sorted((i for i in images if i.name in t_of), key=lambda i: t_of[i.name])]
+    met = set(used[:1])
+    returns = 0
+    for before, camera_id in pairwise(used):
+        returns += camera_id != before and camera_id in met
+        met.add(camera_id)
+    return returns > _MOST_RETURNS * len(used)
 
 
 def _said(model: Model, reason: str, *, action: str = "", **values: object) -> Model:
@@ -181,10 +189,14 @@ def _said(model: Model, reason: str, *, action: str = "", **values: object) -> M
     return replace(model, treatments=(*model.treatments, done), scale=scale)
 
 
-def _motion(seen: Seen, judged: Judged, scale: float, *, readout_s: float | None) -> SolvedMotion:
+def _motion(
+    written: pycolmap.Reconstruction, seen: Seen, judged: Judged, scale: float, *, readout_s: float | None
+) -> SolvedMotion:
     """The camera's motion in the model that is written, which is stretched."""
     velocity = scale * judged.velocity_m_s
+    images = (written.image(image_id) for image_id in seen.image_ids)
     return SolvedMotion(
+        cam_in_world={image.name: image.projection_center() for image in images},
         velocity_in_world={seen.names[i]: velocity[i] for i in np.flatnonzero(np.isfinite(velocity).all(axis=1))},
         cov={seen.names[i]: scale**2 * cov for i, cov in judged.motion_covs.items()},
         readout_s=readout_s,

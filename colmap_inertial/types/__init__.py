@@ -16,16 +16,15 @@ from colmap_inertial.types.estimated import (
     DOWN_IN_WORLD,
     AcceptedScale,
     CameraImuCalibration,
-    CameraMotion,
     ScaleDrift,
     ScaleEstimate,
     Similarity,
     SmoothedTrajectory,
-    SolvedMotion,
     Verdict,
 )
 from colmap_inertial.types.imu_calibration import IMU_CAL, IMU_CALIBRATION_PARAMETERS, ImuCalibration
 from colmap_inertial.types.joined import Gap, JoinedPart
+from colmap_inertial.types.motion import CameraMotion, SolvedMotion
 from colmap_inertial.types.positions import HeightDatum, PositionFixes
 from colmap_inertial.types.recorded import (
     JOINT_GYRO_WALK_RAD_S_RTS,

@@ -21,7 +21,7 @@ from colmap_inertial.types._checks import (
     set_fields,
 )
 from colmap_inertial.types.imu_calibration import ImuCalibration
-from colmap_inertial.types.recorded import ImuNoise, LengthUnit, ReadoutDirection
+from colmap_inertial.types.recorded import ImuNoise, LengthUnit
 
 Verdict = Literal["trusted", "weak", "refused"]
 
@@ -148,74 +148,6 @@ class SmoothedTrajectory:
             cam_from_world_xyzw=checked_quaternions("cam_from_world_xyzw", self.cam_from_world_xyzw, (n, 4)),
             cov=checked_covariance("cov", self.cov, (n, 9, 9)),
         )
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class CameraMotion:
-    """How a camera moved while each of its frames was exposed, and how long its shutter took.
-
-    Attributes
-    ----------
-    names
-        (F,) image names, in order of time.
-    t_s
-        (F,) the instants that poses hold, mid-exposure of the middle row: camera clock, seconds since ``epoch_ns``.
-    velocity_in_world_m_s
-        (F, 3) of the camera's centre, in the world of the metric model.
-    angular_velocity_in_cam_rad_s
-        (F, 3) camera axes (x right, y down, z forward).
-    exposure_s
-        (F,) exposure times, or ``None`` where unknown.
-    readout_s, readout_direction
-        Of the pictures as they were filmed, as in :class:`FrameTiming`.
-    """
-
-    names: tuple[str, ...]
-    t_s: Array
-    velocity_in_world_m_s: Array
-    angular_velocity_in_cam_rad_s: Array
-    exposure_s: Array | None = None
-    readout_s: float | None = None
-    readout_direction: ReadoutDirection = "down"
-    epoch_ns: int = 0
-
-    def __post_init__(self) -> None:
-        t_s = checked_times("t_s", self.t_s)
-        n = len(t_s)
-        if len(self.names) != n:
-            raise ValueError("one name for each instant")
-        set_fields(self, names=tuple(self.names), t_s=t_s)
-        for name in ("velocity_in_world_m_s", "angular_velocity_in_cam_rad_s"):
-            # without any frame, JSON keeps no shape
-            set_fields(self, **{name: checked_array(name, np.reshape(getattr(self, name), (-1, 3)), (n, 3))})
-        if self.exposure_s is not None:
-            set_fields(self, exposure_s=checked_array("exposure_s", self.exposure_s, (n,)))
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class SolvedMotion:
-    """How a camera moved, where a stage solved for poses and velocities together.
-
-    Attributes
-    ----------
-    velocity_in_world
-        By image name, (3,) of the camera's centre, in the model's world and units a second; of images whose velocity is
-        known.
-    cov
-        By image name, (6, 6) covariance of its position against the first one's, and of its velocity: of all images, or
-        of some.
-    readout_s
-        Of the pictures as they were filmed; ``None`` where it was not solved for.
-    """
-
-    velocity_in_world: Mapping[str, Array]
-    cov: Mapping[str, Array]
-    readout_s: float | None = None
-
-    def __post_init__(self) -> None:
-        velocity = {name: checked_array(name, one, (3,)) for name, one in self.velocity_in_world.items()}
-        cov = {name: checked_covariance(name, one, (6, 6)) for name, one in self.cov.items()}
-        set_fields(self, velocity_in_world=velocity, cov=cov)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
