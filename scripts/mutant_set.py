@@ -184,6 +184,13 @@ MUTANTS = (
     ),
     Mutant(
         "scale/_noise.py",
+        "accel_m_s2_rthz=_MOST_ACCEL, accel_slow",
+        "accel_m_s2_rthz=float(np.sqrt(rough * _MOST_ACCEL)), accel_slow",
+        "vibration is expected to be white noise",
+        ("scale_joint::test_the_streams_tell_the_noise_of_quiet_sensors_and_bound_that_of_rough_ones",),
+    ),
+    Mutant(
+        "scale/_noise.py",
         "gyro_rad_s_rthz=max(noise.gyro_rad_s_rthz",
         "gyro_rad_s_rthz=min(noise.gyro_rad_s_rthz",
         "a data sheet lowers the noise instead of raising it",
