@@ -7,7 +7,7 @@ that a rolling shutter does not bend the result. Chained, the rotations are what
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -362,13 +362,8 @@ def _pair_rotation(
     """Rotation vector of ``before_from_now``, its standard deviation, how many tracks agree, and all of them."""
     shutters = before[1], now[1]
     dt_s = shutters[1].reference_s() - shutters[0].reference_s()
-    height, width = now[0].shape
-    to_full = np.array([shutters[1].width / width, shutters[1].height / height])
-    for matched in (_tracked, _matched):
-        pairs = matched(before[0], now[0], options)
-        if len(pairs[0]) < options.min_support:
-            continue
-        points = [(p.astype(np.float64) + 0.5) * to_full for p in pairs]
+    size = np.array([shutters[1].width, shutters[1].height])
+    for points in followed_points(before[0], now[0], shutters[1], options):
         rays = [np.asarray(camera.cam_from_img(p))[:, :2] for p in points]
         ok = np.isfinite(rays[0]).all(axis=1) & np.isfinite(rays[1]).all(axis=1)
         if ok.sum() < options.min_support:
@@ -376,18 +371,31 @@ def _pair_rotation(
         first, second = (np.concatenate([r[ok], np.ones((ok.sum(), 1))], axis=1) for r in rays)
         span_s = shutters[1].middle_s(points[1][ok]) - shutters[0].middle_s(points[0][ok])
         # one pixel of the reduced picture as an angle, in the middle of the picture
-        centre = np.array([[shutters[1].width / 2, shutters[1].height / 2]])
-        beside = np.asarray(camera.cam_from_img(np.concatenate([centre, centre + to_full])))[:, :2]
+        centre = 0.5 * size[None]
+        beside = np.asarray(camera.cam_from_img(np.concatenate([centre, centre + size / now[0].shape[::-1]])))[:, :2]
         pixel_rad = float(np.linalg.norm(np.diff(beside, axis=0))) / np.sqrt(2)
         found = _fit_rate(first, second, span_s, pixel_rad)
         if found is not None and found[2] >= options.min_support:
             rate, sigma_rad_s, count = found
-            size = np.array([shutters[1].width, shutters[1].height])
             place = np.stack([(p[ok] / size - 0.5)[:, ::-1] for p in points], axis=1)
             some = np.unique(np.linspace(0, len(place) - 1, min(len(place), _MOST_TRACKS)).astype(np.intp))
             tracks = Tracks(place=place[some], rays=np.stack([first[some, :2], second[some, :2]], axis=1))
             return rate * dt_s, sigma_rad_s * abs(dt_s), count, tracks
     return None
+
+
+def followed_points(
+    before: Grey, now: Grey, shutter: FrameShutter, options: FlowOptions
+) -> Iterator[tuple[Array, Array]]:
+    """(N, 2) points that were followed from one reduced picture to the other, px of the picture as it is.
+
+    Corners that were tracked come first, then features that were matched; ways that tell too little are left out.
+    """
+    to_full = np.array([shutter.width, shutter.height]) / now.shape[::-1]
+    for matched in (_tracked, _matched):
+        first, second = ((p.astype(np.float64) + 0.5) * to_full for p in matched(before, now, options))
+        if len(first) >= options.min_support:
+            yield first, second
 
 
 def _tracked(before: Grey, now: Grey, options: FlowOptions) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -1278,6 +1278,27 @@ MUTANTS = (
         ("run_steps::test_the_longest_exposure_tells_whether_anything_may_be_blurred",),
     ),
     Mutant(
+        "precalibrate/plan.py",
+        "others = [i for i in range(len(parts)) if i not in lost]",
+        "others: list[int] = []",
+        "a camera that only slides is not found",
+        ("imaging_sliding::test_a_camera_that_slides_past_a_wall_is_found_and_its_frames_become_sharper",),
+    ),
+    Mutant(
+        "precalibrate/sliding.py",
+        "exposure_s[pair.name] * pair.speed_px_s(projector, motion)",
+        "max(exposure_s.values()) + pair.speed_px_s(projector, motion)",
+        "what moves from frame to frame counts as what smears",
+        ("imaging_sliding::test_no_small_model_is_made_where_sliding_blurs_nothing",),
+    ),
+    Mutant(
+        "slide.py",
+        "turn = np.swapaxes(motion.start_from_cam(at_s[1]), -1, -2) @ motion.start_from_cam(at_s[0])",
+        "turn = np.swapaxes(motion.start_from_cam(at_s[0]), -1, -2) @ motion.start_from_cam(at_s[1])",
+        "the camera's turn is added instead of taken out",
+        ("imaging_sliding::test_what_the_gyroscope_felt_is_taken_out_of_how_points_move",),
+    ),
+    Mutant(
         "precalibrate/pairs.py",
         "view=None if timing.exposure_s is None else view",
         "view=view",

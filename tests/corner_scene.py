@@ -60,12 +60,12 @@ class CornerScene:
             readout_s=self.readout_s,
         )  # fmt: skip
 
-    def picture(self, i, *, noise=0.006):
-        """(H, W, 3) 8 bit sRGB."""
+    def picture(self, i, *, noise=0.006, sharp=False):
+        """(H, W, 3) 8 bit sRGB; sharp, each line as it is in the middle of its exposure."""
         shutter = self.shutter(i)
         pixels, rays = rays_of(LENS)
         rays = rays.astype(np.float32)
-        samples = max(2, round(self.exposure_s * 400))
+        samples = 1 if sharp else max(2, round(self.exposure_s * 400))
         light = np.zeros(rays.shape, np.float32)
         for k in range(samples):
             t_s = shutter.middle_s(pixels[:, 0]) + self.exposure_s * ((k + 0.5) / samples - 0.5)

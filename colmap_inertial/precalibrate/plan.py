@@ -27,6 +27,7 @@ from colmap_inertial.model import colmap_camera
 from colmap_inertial.options import BlurRemover, DeblurMethod, RollingShutterMethod
 from colmap_inertial.precalibrate.calibrate import guessed_camera, precalibrate, survey, survey_parts
 from colmap_inertial.precalibrate.judge import judge_frames
+from colmap_inertial.precalibrate.sliding import most_by_sliding_px, sliding_parts
 from colmap_inertial.precalibrate.translation import find_parallaxes
 from colmap_inertial.run.context import Recording, RunContext
 from colmap_inertial.run.progress import Progress
@@ -219,7 +220,7 @@ def plan_imaging(recording: Recording, context: RunContext, asked: Treatments) -
             f"{capture.path}: undoing the rolling shutter needs readout_s under [timing], the time from the first row "
             "to the last"
         )
-    why_not = _no_deblurring(recording, asked)
+    why_not = _no_deblurring(recording, asked, context.progress)
     no_rectifying = _no_rectifying(timing, asked)
     source = f" ({capture.readout_source})" if capture.readout_source else ""
     rectifying = f"keypoints are rectified, readout {1e3 * (timing.readout_s or 0):.1f} ms{source}"
@@ -260,7 +261,11 @@ def plan_imaging(recording: Recording, context: RunContext, asked: Treatments) -
         stages = [] if plan is None else plan.frame_stages(drop=False)
         return survey(capture, found.view, names, stages, context)
 
-    return _deblurring(plan, found.view, capture, models, context.progress)
+    def sliding(parts: Sequence[Sequence[str]]) -> list[bool]:
+        camera = found.view.camera
+        return sliding_parts(recording, camera, parts, _limit_px(camera), context.progress, motion=found.view.motion())
+
+    return _deblurring(plan, found.view, capture, models, sliding, context.progress)
 
 
 def _no_rectifying(timing: FrameTiming, asked: Treatments) -> str:
@@ -276,7 +281,12 @@ def _no_rectifying(timing: FrameTiming, asked: Treatments) -> str:
     return "" if timing.readout_s else "global shutter"
 
 
-def _no_deblurring(recording: Recording, asked: Treatments) -> str:
+def _limit_px(camera: CameraModel) -> float:
+    """Blur of which a frame must have more to be looked at and treated, px of the picture as it is."""
+    return max(_TELLING_PX, GateOptions().skip_below_px * max(camera.width, camera.height) / 1920)
+
+
+def _no_deblurring(recording: Recording, asked: Treatments, progress: Progress) -> str:
     """Why no frame of a recording can be deblurred; empty where some may be."""
     timing = recording.timing
     if asked.frames_by_others:
@@ -291,10 +301,15 @@ def _no_deblurring(recording: Recording, asked: Treatments) -> str:
     camera = guessed_camera(recording.capture, timing)
     rate = float(np.linalg.norm(recording.imu.gyro_rad_s, axis=1).max())
     most_px = rate * float(timing.exposure_s.max()) * 1.2 * colmap_camera(camera).mean_focal_length()
-    limit_px = max(_TELLING_PX, GateOptions().skip_below_px * max(camera.width, camera.height) / 1920)
-    if most_px < limit_px:
-        return f"no frame has more than {most_px:.1f} px of blur, by the quickest turn that the gyroscope felt"
-    return ""
+    limit_px = _limit_px(camera)
+    if most_px >= limit_px:
+        return ""
+    why_not = f"no frame has more than {most_px:.1f} px of blur, by the quickest turn that the gyroscope felt"
+    if most_by_sliding_px(timing, camera) < limit_px:
+        return why_not
+    if any(sliding_parts(recording, camera, survey_parts(timing), limit_px, progress)):
+        return ""
+    return f"{why_not}, and by how far pixels move from frame to frame"
 
 
 def _no_gyro_for_pairs(recording: Recording) -> str:
@@ -324,16 +339,16 @@ def _deblurring(
     view: GyroView,
     capture: Capture,
     models: Callable[[Sequence[str], ImagingPlan | None], tuple[pycolmap.Reconstruction, ...]],
+    sliding: Callable[[Sequence[Sequence[str]]], Sequence[bool]],
     progress: Progress,
 ) -> ImagingPlan:
     """The plan with what is to be deblurred, by the gyroscope and by what small models tell of the translation.
 
     ``models`` makes them of some frames as filmed, or as a plan has them. Where frames were too blurred for a model,
-    those around them, and the IMU beyond, tell how to deblur them for the next one.
+    those around them, and the IMU beyond, tell how to deblur them for the next one. ``sliding`` says in which of some
+    parts frames are blurred although the camera does not turn: of these small models are made, too.
     """
     decisions = _decisions(view, {})
-    if not _blurred(decisions):
-        return _decided(plan, view, capture, {}, progress)
     parts, place = survey_parts(view.timing), view.index()
     begins_s = view.timing.t_s[[place[names[0]] for names in parts]]
 
@@ -344,8 +359,13 @@ def _deblurring(
             out.setdefault(part, set()).add(name)
         return out
 
+    lost = by_part(_to_deblur(decisions)) if _blurred(decisions) else {}
+    others = [i for i in range(len(parts)) if i not in lost]
+    lost |= {i: set() for i, slides in zip(others, sliding([parts[i] for i in others]), strict=True) if slides}
+    if not lost:
+        return _decided(plan, view, capture, {}, progress)
     found: dict[int, _Surveyed] = {}
-    lost, treated = by_part(_to_deblur(decisions)), None
+    treated = None
     for _ in range(_SURVEYS):
         better = False
         for i in sorted(lost):
