@@ -12,9 +12,10 @@ Features are COLMAP's own SIFT, at its defaults but for ``--first-octave``, matc
 correct within 3 px of the true transfer; matches are summed over the scenes. PSNR and SSIM are against the frame
 without blur and noise.
 
-Sections: quality by blur; other ways at 20 px (with ``dropped``: leaving such frames out leaves nothing to match);
-processor time of a grey 1080p frame; false blur (share of the matches of doing nothing that the gate keeps);
-the rolling shutter in two views; with ``--colmap``, whole reconstructions with and without the treatment.
+Sections: quality by blur; which share of the truly blurred frames is treated; other ways at 20 px (with ``dropped``:
+leaving such frames out leaves nothing to match); processor time of a grey 1080p frame; false blur (share of the matches
+of doing nothing that the gate keeps, with each of the package's filters); the rolling shutter in two views; with
+``--colmap``, whole reconstructions with and without the treatment.
 """
 
 from __future__ import annotations
@@ -55,8 +56,10 @@ from rich.console import Console
 from rich.progress import track
 
 from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.imaging.blur_path import BlurPath
 from colmap_inertial.imaging.evidence import blur_evidence
-from colmap_inertial.imaging.gate import RecordingVerdict, deblur_gated, judge_recording
+from colmap_inertial.imaging.gate import GateOptions, RecordingVerdict, deblur_gated, judge_frame, judge_recording
+from colmap_inertial.imaging.path_filters import half_quadratic, path_wiener
 from colmap_inertial.imaging.wiener import deblur
 
 SIZE = (1920, 1080)
@@ -66,9 +69,14 @@ ERRORS = ("noise", "flipped axis", "20 % long", "20 % short", "10 ms late")
 SHARP_S = 0.0002
 #: As many frames judge a recording, the most blurred ones.
 JUDGED = 14
-SECTIONS = ("quality", "other_ways_20_px", "cost", "false_blur_10_px", "rolling_shutter", "colmap")
+SECTIONS = ("quality", "treated", "other_ways_20_px", "cost", "false_blur_10_px", "rolling_shutter", "colmap")
 console = Console(stderr=True)
 T = TypeVar("T")
+#: The package's filters, by the names that ``--deblur`` gives them.
+FILTERS: dict[str, Callable[[Grey, BlurField], Grey]] = {
+    "wiener": lambda image, blur: path_wiener(image, BlurPath.straight(blur)),
+    "path": lambda image, blur: half_quadratic(image, BlurPath.straight(blur)),
+}
 
 
 def main() -> None:
@@ -108,6 +116,10 @@ def main() -> None:
     sections: dict[str, Callable[[], Any]] = {
         "quality": lambda: {
             kind: {f"{blur:g}": quality(wall, size, blur, args.seed, kind) for blur in blurs}
+            for kind, (wall, size) in kinds.items()
+        },
+        "treated": lambda: {
+            kind: {f"{blur:g}": treated(make_pairs(wall, blur, size=size, seed=args.seed)) for blur in blurs}
             for kind, (wall, size) in kinds.items()
         },
         "other_ways_20_px": lambda: other_ways(make_pairs(walls[:compared], 20.0, size=SIZE, seed=args.seed)),
@@ -221,6 +233,22 @@ def quality(
     }
 
 
+def treated(pairs: Sequence[Pair]) -> dict[str, Any]:
+    """How many frames go through the gate with a right gyroscope: all are blurred."""
+    frames = [pair.frame(i) for pair in pairs for i in (0, 1)]
+    blurs = [pair.blur(i) for pair in pairs for i in (0, 1)]
+    verdict = verdict_on(frames, blurs)
+    judged = [judge_frame(image, blur, verdict, GateOptions()) for image, blur in zip(frames, blurs, strict=True)]
+    return {
+        "frames": len(frames),
+        "treated": sum(factor is not None for factor, _ in judged),
+        "trusted": verdict.trusted,
+        "support": round(verdict.support, 1),
+        "extent_factor": round(verdict.extent_factor, 3),
+        "left_alone": sorted({reason for factor, reason in judged if factor is None}),
+    }
+
+
 def other_ways(pairs: Sequence[Pair]) -> dict[str, Any]:
     """The gated default, the filter without the gate, and what others do, on the same frames."""
     frames = [[pair.frame(i) for i in (0, 1)] for pair in pairs]
@@ -245,7 +273,7 @@ def other_ways(pairs: Sequence[Pair]) -> dict[str, Any]:
 
 
 def false_blur(pairs: Sequence[Pair]) -> dict[str, Any]:
-    """Correct matches of the gated default with a wrong gyroscope, as a share of those of doing nothing."""
+    """Correct matches of the gated filters with a wrong gyroscope, as a share of those of doing nothing."""
     frames = [[pair.frame(i) for i in (0, 1)] for pair in pairs]
     before = [correct_matches(pair, *features_of(two))[0] for pair, two in zip(pairs, frames, strict=True)]
     trusted = verdict_on(flat(frames), [pair.blur(i) for pair in pairs for i in (0, 1)])
@@ -253,15 +281,26 @@ def false_blur(pairs: Sequence[Pair]) -> dict[str, Any]:
     for error in track(("", *ERRORS), "false blur", console=console):
         fields = [[pair.blur(i, error) for i in (0, 1)] for pair in pairs]
         verdict = verdict_on(flat(frames), flat(fields))
-        out[error or "none"] = kept_share(pairs, frames, fields, verdict, before)
+        out[error or "none"] = by_filter(pairs, frames, fields, verdict, before)
     short = [with_short_exposure(pair) for pair in pairs]
     frames = [[pair.frame(i) for i in (0, 1)] for pair in short]
     before = [correct_matches(pair, *features_of(two))[0] for pair, two in zip(short, frames, strict=True)]
     fields = [[pair.blur(i) for i in (0, 1)] for pair in pairs]
     alone = verdict_on(flat(frames), flat(fields))
-    out["sharp recording"] = kept_share(short, frames, fields, alone, before)
-    out["sharp frames among blurred ones"] = kept_share(short, frames, fields, trusted, before)
+    out["sharp recording"] = by_filter(short, frames, fields, alone, before)
+    out["sharp frames among blurred ones"] = by_filter(short, frames, fields, trusted, before)
     return out
+
+
+def by_filter(
+    pairs: Sequence[Pair],
+    frames: Sequence[Sequence[Grey]],
+    fields: Sequence[Sequence[BlurField]],
+    verdict: RecordingVerdict,
+    before: Sequence[int],
+) -> dict[str, Any]:
+    """What the gate leaves of the matches, with each of the filters."""
+    return {name: kept_share(pairs, frames, fields, verdict, before, way) for name, way in FILTERS.items()}
 
 
 def with_short_exposure(pair: Pair) -> Pair:
@@ -278,11 +317,12 @@ def kept_share(
     fields: Sequence[Sequence[BlurField]],
     verdict: RecordingVerdict,
     before: Sequence[int],
+    way: Callable[[Grey, BlurField], Grey] | None = None,
 ) -> dict[str, Any]:
     """Correct matches through the gate against those of doing nothing."""
     after, deblurred = 0, 0
     for pair, images, blurs, untouched in zip(pairs, frames, fields, before, strict=True):
-        gated = [deblur_gated(a, b, recording=verdict) for a, b in zip(images, blurs, strict=True)]
+        gated = [deblur_gated(a, b, recording=verdict, deblur=way) for a, b in zip(images, blurs, strict=True)]
         deblurred += sum(g.deblurred for g in gated)
         changed = any(g.deblurred for g in gated)
         after += correct_matches(pair, *features_of([g.image for g in gated]))[0] if changed else untouched

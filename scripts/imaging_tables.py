@@ -10,7 +10,8 @@ from rich.table import Table
 
 #: Least ratio of correct matches, by blur.
 MATCHES_WANTED = {"6": 1.4, "10": 1.9, "20": 3.3, "30": 6.0}
-KEPT_WANTED = 0.95
+#: Least share of a sharp frame's matches that is kept, and of blurred frames that are treated.
+KEPT_WANTED, TREATED_WANTED = 0.98, 0.9
 
 
 def print_report(report: dict[str, Any], console: Console) -> None:
@@ -19,6 +20,8 @@ def print_report(report: dict[str, Any], console: Console) -> None:
     console.print(", ".join(f"{key} {value}" for key, value in about.items()), style="dim", highlight=False)
     for kind, by_blur in report.get("quality", {}).items():
         _quality(kind, by_blur, console)
+    for kind, by_blur in report.get("treated", {}).items():
+        _treated(kind, by_blur, console)
     sections = {
         "other_ways_20_px": _other_ways,
         "cost": _cost,
@@ -101,21 +104,49 @@ def _cost(cost: dict[str, Any], console: Console) -> None:
         )
 
 
-def _false_blur(errors: dict[str, Any], console: Console) -> None:
+def _treated(kind: str, by_blur: dict[str, Any], console: Console) -> None:
     table = table_of(
-        "False blur, 10 px: correct matches against doing nothing",
-        *("error", "kept", "wanted", "frames deblurred", "gyroscope trusted", "sigmas", "extents times"),
+        f"Blurred frames that are treated, {kind}",
+        *(
+            "blur px",
+            "treated",
+            "wanted",
+            "gyroscope trusted",
+            "sigmas",
+            "extents times",
+            "why the others are left alone",
+        ),
     )
-    for name, row in errors.items():
+    for blur, row in by_blur.items():
         table.add_row(
-            name,
-            f"{row['kept']:.3f}",
-            verdict(row["kept"], KEPT_WANTED),
-            f"{row['deblurred_frames']}/{row['frames']}",
+            blur,
+            f"{row['treated']}/{row['frames']}",
+            verdict(row["treated"] / row["frames"], TREATED_WANTED),
             str(row["trusted"]),
             f"{row['support']:.1f}",
             f"{row['extent_factor']:.2f}",
+            "; ".join(row["left_alone"]),
         )
+    console.print(table)
+
+
+def _false_blur(errors: dict[str, Any], console: Console) -> None:
+    table = table_of(
+        "False blur, 10 px: correct matches against doing nothing",
+        *("error", "filter", "kept", "wanted", "frames deblurred", "gyroscope trusted", "sigmas", "extents times"),
+    )
+    for error, by_filter in errors.items():
+        for name, row in by_filter.items():
+            table.add_row(
+                error,
+                name,
+                f"{row['kept']:.3f}",
+                verdict(row["kept"], KEPT_WANTED),
+                f"{row['deblurred_frames']}/{row['frames']}",
+                str(row["trusted"]),
+                f"{row['support']:.1f}",
+                f"{row['extent_factor']:.2f}",
+            )
     console.print(table)
 
 

@@ -6,6 +6,7 @@
 #include <cstring>
 #include <memory>
 #include <mutex>
+#include <numeric>
 
 namespace {
 
@@ -25,6 +26,7 @@ struct Common {
     Floats flattened;  // square of the frequency + flat_below^2, what the prior divides by
     Floats band;       // 1 where the prior is fitted, 2 where the other half has the same, else 0
     Floats fitted;     // that times the square of the frequency
+    int reach;         // where both end, along x and y
     Floats gradient;   // power of differences
     Floats high;       // 1 or 2 above a frequency, else 0
     Floats vertical;   // frequencies of the columns
@@ -84,6 +86,13 @@ class Filter {
         : light_(light), tiles_(tiles), simd_(simd), threads_(threads), common_(tiles) {
         height_ = (tiles.rows - 1) * tiles.hop + tiles.side;
         width_ = (tiles.columns - 1) * tiles.hop + tiles.side;
+        // of the result, only columns that count are transformed back
+        begin_ = 0, end_ = tiles.side;
+        while (begin_ < end_ && tiles.window_out[begin_] == 0) ++begin_;
+        while (end_ > begin_ && tiles.window_out[end_ - 1] == 0) --end_;
+        first_ = begin_ / MOST_LANES * MOST_LANES;
+        columns_ = (end_ - first_ + 2 * MOST_LANES - 1) / (2 * MOST_LANES) * MOST_LANES;
+        first_ = std::min(first_, tiles.side - 2 * columns_);
     }
 
     void filter(const Model &model, float *result) {
@@ -95,9 +104,11 @@ class Filter {
             return square > low * low && square < high * high ? times : 0.0;
         };
         common_.band = common_.over_frequencies(times_in_band, 0);
+        common_.reach = std::min(int(std::ceil(model.fitted_to * tiles_.side)), tiles_.side / 2);
         common_.fitted = common_.over_frequencies(
             [&](double x, double y, double times) { return times_in_band(x, y, times) * (x * x + y * y); }, 0);
-        common_.gradient = common_.over_frequencies(
+        if (model.rounds)
+            common_.gradient = common_.over_frequencies(
             [](double x, double y, double) {
                 const double along = std::sin(PI * x), down = std::sin(PI * y);
                 return 4 * (along * along + down * down) + 1e-12;
@@ -224,8 +235,6 @@ class Filter {
             im = re * s + im * c;
             re = next;
         }
-        // The highest frequency has no sign: of a curve, its two halves would not agree. It is left out.
-        cosines[(count - 1) * step] = sines[(count - 1) * step] = 0;
     }
 
     // Transforms a tile, without its mean and windowed; returns the mean.
@@ -233,13 +242,12 @@ class Filter {
         const int side = tiles_.side, pitch = common_.square.pitch;
         const float *from = planes_.get() + (size_t(channel) * height_ + row * tiles_.hop) * width_ +
                             column * tiles_.hop;
-        double sum = 0;
-        for (int y = 0; y < side; ++y) {
-            float of_row = 0;
-            for (int x = 0; x < side; ++x) of_row += from[size_t(y) * width_ + x];
-            sum += double(of_row);
-        }
-        const float mean = float(sum / (double(side) * side));
+        // columns side by side: a sum along a row would wait for itself
+        float *sums = room.scratch.get();
+        std::fill_n(sums, side, 0.0f);
+        for (int y = 0; y < side; ++y)
+            for (int x = 0; x < side; ++x) sums[x] += from[size_t(y) * width_ + x];
+        const float mean = float(std::accumulate(sums, sums + side, 0.0) / (double(side) * side));
         for (int y = 0; y < side; ++y) {
             const float *line = from + size_t(y) * width_;
             float *out = room.tile.get() + size_t(y) * pitch;
@@ -262,16 +270,22 @@ class Filter {
             const float *line = model.noise + 2 * channel;
             const float noise = std::max(line[0] + line[1] * mean, model.least_noise * model.least_noise);
             double sums[3];
-            simd_.correlate(count, room.transfer, room.doubt.get(), room.spectrum, common_.fitted.get(),
-                            common_.band.get(), room.power.get(), room.data, sums);
-            // (a column of zeros beside the spectrum has a power of zero, and a prior of one)
+            simd_.fit(square, common_.reach, room.transfer, room.doubt.get(), room.spectrum, common_.fitted.get(),
+                      common_.band.get(), sums);
             const double excess = sums[0] / common_.window_power - double(noise) * sums[1];
             const float signal = std::max(float(excess / std::max(sums[2], 1e-30)), model.least_signal * noise);
             const float unlike = model.noise_factor * noise / signal;
-            simd_.divide(count, room.data, room.power.get(), common_.flattened.get(), unlike, scale, room.spectrum);
+            if (model.rounds)
+                simd_.correlate(count, room.transfer, room.doubt.get(), room.spectrum, room.power.get(), room.data);
+            // (a column of zeros beside the spectrum has a power of zero, and a prior of one)
+            simd_.restore(count, room.transfer, room.doubt.get(), common_.flattened.get(), unlike, scale, room.spectrum);
             if (doubtful && model.rounds)
                 simd_.weigh(count, room.doubt.get(), common_.flattened.get(), unlike, room.power.get(), room.data);
-            simd_.inverse(square, twiddles, room.spectrum, room.tile.get(), room.scratch.get());
+            const auto back = [&](bool last) {
+                simd_.inverse(square, twiddles, room.spectrum, last ? first_ : 0, last ? columns_ : square.side / 2,
+                              room.tile.get(), room.scratch.get());
+            };
+            back(model.rounds == 0);
             for (int round = 0; round < model.rounds; ++round) {
                 const float splitting = model.splitting[round];
                 const float threshold = 2.0f * std::pow(2.0f / 3.0f / splitting, 0.75f);
@@ -279,7 +293,7 @@ class Filter {
                 simd_.forward(square, twiddles, room.other.get(), room.spectrum, room.scratch.get());
                 simd_.blend(count, room.data, room.power.get(), common_.gradient.get(),
                             splitting * noise / (model.data_weight * 1e-4f), scale, room.spectrum);
-                simd_.inverse(square, twiddles, room.spectrum, room.tile.get(), room.scratch.get());
+                back(round == model.rounds - 1);
             }
             add(row, column, channel, mean, room, result);
         }
@@ -287,10 +301,9 @@ class Filter {
 
     void add(int row, int column, int channel, float mean, const Room &room, float *result) const {
         const int first_y = row * tiles_.hop - tiles_.before, first_x = column * tiles_.hop - tiles_.before;
-        const int from_x = std::max(0, -first_x), to_x = std::min(tiles_.side, light_.width - first_x);
-        for (int y = std::max(0, -first_y); y < std::min(tiles_.side, light_.height - first_y); ++y) {
+        const int from_x = std::max(begin_, -first_x), to_x = std::min(end_, light_.width - first_x);
+        for (int y = std::max(begin_, -first_y); y < std::min(end_, light_.height - first_y); ++y) {
             const float weight = tiles_.window_out[y];
-            if (weight == 0) continue;
             const float *from = room.tile.get() + size_t(y) * common_.square.pitch;
             float *out = result + (size_t(first_y + y) * light_.width + first_x) * light_.channels + channel;
             for (int x = from_x; x < to_x; ++x)
@@ -301,7 +314,7 @@ class Filter {
     Light light_;
     Tiles tiles_;
     const PathSimd &simd_;
-    int threads_, height_, width_;
+    int threads_, height_, width_, begin_, end_, first_, columns_;
     Common common_;
     Floats planes_;
     std::mutex lock_;

@@ -116,7 +116,7 @@ void transform(In<float, 2> tile, Of<float, 3> spectrum, Of<float, 2> back, cons
             out[0] = re[size_t(x) * square.half + y];
             out[1] = im[size_t(x) * square.half + y];
         }
-    simd.inverse(square, twiddles.data(), {re.data(), im.data()}, pixels.data(), room.data());
+    simd.inverse(square, twiddles.data(), {re.data(), im.data()}, 0, side / 2, pixels.data(), room.data());
     for (int y = 0; y < side; ++y)
         std::copy_n(pixels.begin() + ptrdiff_t(y) * square.pitch, side, back.data() + size_t(y) * side);
 }

@@ -169,7 +169,7 @@ void forward(const Square &square, const float *twiddles, const float *tile, Spe
     }
 }
 
-void inverse(const Square &square, const float *twiddles, Spectrum in, float *tile, float *room) {
+void inverse(const Square &square, const float *twiddles, Spectrum in, int first, int count, float *tile, float *room) {
     const int side = square.side, middle = side / 2;
     const ptrdiff_t pitch = square.pitch, half = square.half, size = ptrdiff_t(side) * LANES + APART;
     const Rows column{room + 4 * size, room + 5 * size, LANES};
@@ -182,10 +182,10 @@ void inverse(const Square &square, const float *twiddles, Spectrum in, float *ti
     // real and imaginary parts swapped, the transform is the inverse
     for (int k = 0; k < middle; k += LANES)
         transform(side, twiddles, {in.im + k, in.re + k, half}, {in.im + k, in.re + k, half}, room);
-    for (int x = 0; x < middle; x += LANES) {
+    for (int x = first; x < first + count; x += LANES) {
         for (int k = 0; k < middle; k += LANES) {
             float parts[4][LANES * LANES];
-            const ptrdiff_t at = x * half + k, other = (x + middle) * half + k;
+            const ptrdiff_t at = x * half + k, other = (x + count) * half + k;
             transpose(in.re + at, half, LANES, LANES, parts[0], LANES);
             transpose(in.im + at, half, LANES, LANES, parts[1], LANES);
             transpose(in.re + other, half, LANES, LANES, parts[2], LANES);
@@ -202,22 +202,22 @@ void inverse(const Square &square, const float *twiddles, Spectrum in, float *ti
                 column.set(side - k - i, a_re + b_im, b_re - a_im);
             }
         }
-        transform(side, twiddles, {column.im, column.re, LANES}, {tile + x + middle, tile + x, pitch}, room);
+        transform(side, twiddles, {column.im, column.re, LANES}, {tile + x + count, tile + x, pitch}, room);
     }
 }
 
-// Rows x and -x share their sums of products.
+// Rows x and -x share their sums of products. The highest frequencies have no sign: of a curve, their two halves would not
+// agree. They are left out, as is what does not count.
 void transfer(const Square &square, int samples, const float *cos_x, const float *sin_x, const float *cos_y,
               const float *sin_y, Spectrum out) {
     const int side = square.side, middle = side / 2;
     const ptrdiff_t half = square.half;
     const float share = 1.0f / float(samples);
-    for (int k = 0; k < half; k += LANES)
-        for (int x = 0; x <= middle; x += 2) {
+    for (int k = 0; k < middle; k += LANES)
+        for (int x = 0; x < middle; x += 2) {
             Vector cc[2] = {}, ss[2] = {}, cs[2] = {}, sc[2] = {};
-            const int second = x < middle ? x + 1 : x;
-            const float *cosines[2] = {cos_x + x * ptrdiff_t(samples), cos_x + second * ptrdiff_t(samples)};
-            const float *sines[2] = {sin_x + x * ptrdiff_t(samples), sin_x + second * ptrdiff_t(samples)};
+            const float *cosines[2] = {cos_x + x * ptrdiff_t(samples), cos_x + (x + 1) * ptrdiff_t(samples)};
+            const float *sines[2] = {sin_x + x * ptrdiff_t(samples), sin_x + (x + 1) * ptrdiff_t(samples)};
             for (int i = 0; i < samples; ++i) {
                 const Vector c = load(cos_y + i * half + k), s = load(sin_y + i * half + k);
 #pragma GCC unroll 2
@@ -230,14 +230,15 @@ void transfer(const Square &square, int samples, const float *cos_x, const float
             }
             for (int r = 0; r < 2; ++r) {
                 const int row = x + r;
-                if (row > middle) break;
                 store(out.re + row * half + k, share * (cc[r] - ss[r]));
                 store(out.im + row * half + k, share * (cs[r] + sc[r]));
-                if (row == 0 || row == middle) continue;
+                if (row == 0) continue;
                 store(out.re + (side - row) * half + k, share * (cc[r] + ss[r]));
                 store(out.im + (side - row) * half + k, share * (cs[r] - sc[r]));
             }
         }
+    for (int x = 0; x < side; ++x)
+        for (int k = x == middle ? 0 : middle; k < half; ++k) out.re[x * half + k] = out.im[x * half + k] = 0;
 }
 
 inline double total(Vector v) {
@@ -264,19 +265,18 @@ void doubt(const Square &square, Spectrum lean, const float *frequencies, float 
     }
 }
 
-void correlate(size_t count, Spectrum transfer, const float *doubt, Spectrum spectrum, const float *weight,
-               const float *band, float *power, Spectrum data, double *sums) {
+void fit(const Square &square, int reach, Spectrum transfer, const float *doubt, Spectrum spectrum, const float *weight,
+         const float *band, double *sums) {
+    const int side = square.side;
+    const ptrdiff_t half = square.half;
     sums[0] = sums[1] = sums[2] = 0;
-    for (size_t first = 0; first < count; first += SUMMED) {
+    for (int x = 0; x < side; ++x) {
+        if (x > reach && x < side - reach) continue;
         Vector seen = {}, once = {}, twice = {};
-        const size_t end = first + SUMMED < count ? first + SUMMED : count;
-        for (size_t i = first; i < end; i += LANES) {
+        for (ptrdiff_t i = x * half; i <= x * half + reach; i += LANES) {
             const Vector k_re = load(transfer.re + i), k_im = load(transfer.im + i), g_re = load(spectrum.re + i),
                          g_im = load(spectrum.im + i), w = load(weight + i);
             const Vector p = k_re * k_re + k_im * k_im + load(doubt + i);
-            store(power + i, p);
-            store(data.re + i, k_re * g_re + k_im * g_im);
-            store(data.im + i, k_re * g_im - k_im * g_re);
             seen += w * p * (g_re * g_re + g_im * g_im);
             once += w * p;
             twice += load(band + i) * p * p;
@@ -284,6 +284,27 @@ void correlate(size_t count, Spectrum transfer, const float *doubt, Spectrum spe
         sums[0] += total(seen);
         sums[1] += total(once);
         sums[2] += total(twice);
+    }
+}
+
+void restore(size_t count, Spectrum transfer, const float *doubt, const float *other, float factor, float scale,
+             Spectrum spectrum) {
+    for (size_t i = 0; i < count; i += LANES) {
+        const Vector k_re = load(transfer.re + i), k_im = load(transfer.im + i), g_re = load(spectrum.re + i),
+                     g_im = load(spectrum.im + i);
+        const Vector share = scale / (k_re * k_re + k_im * k_im + load(doubt + i) + factor * load(other + i));
+        store(spectrum.re + i, share * (k_re * g_re + k_im * g_im));
+        store(spectrum.im + i, share * (k_re * g_im - k_im * g_re));
+    }
+}
+
+void correlate(size_t count, Spectrum transfer, const float *doubt, Spectrum spectrum, float *power, Spectrum data) {
+    for (size_t i = 0; i < count; i += LANES) {
+        const Vector k_re = load(transfer.re + i), k_im = load(transfer.im + i), g_re = load(spectrum.re + i),
+                     g_im = load(spectrum.im + i);
+        store(power + i, k_re * k_re + k_im * k_im + load(doubt + i));
+        store(data.re + i, k_re * g_re + k_im * g_im);
+        store(data.im + i, k_re * g_im - k_im * g_re);
     }
 }
 
@@ -310,15 +331,6 @@ void quiet(size_t count, Spectrum transfer, Spectrum spectrum, const float *weig
         }
         sums[0] += total(seen);
         sums[1] += total(times);
-    }
-}
-
-void divide(size_t count, Spectrum data, const float *power, const float *other, float factor, float scale,
-            Spectrum out) {
-    for (size_t i = 0; i < count; i += LANES) {
-        const Vector share = scale / (load(power + i) + factor * load(other + i));
-        store(out.re + i, share * load(data.re + i));
-        store(out.im + i, share * load(data.im + i));
     }
 }
 
@@ -396,5 +408,5 @@ void shrink(const Square &square, const float *tile, float splitting, float thre
 
 }  // namespace
 
-extern const PathSimd JOIN(path_simd_, SIMD) = {TEXT(SIMD), forward, inverse, transfer, doubt, correlate,
-                                                weigh,      quiet,   divide,   blend, shrink};
+extern const PathSimd JOIN(path_simd_, SIMD) = {TEXT(SIMD), forward,   inverse, transfer, doubt, fit,
+                                                restore,    correlate, weigh,   quiet,    blend, shrink};

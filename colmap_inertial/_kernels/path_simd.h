@@ -26,8 +26,10 @@ struct PathSimd {
     const char *name;
     // room: eight times MOST_LANES * side + APART floats, of no content before and after
     void (*forward)(const Square &square, const float *twiddles, const float *tile, Spectrum out, float *room);
-    // spoils the spectrum; not normalised
-    void (*inverse)(const Square &square, const float *twiddles, Spectrum in, float *tile, float *room);
+    // spoils the spectrum; not normalised. Of the tile, columns from `first` on, twice `count` (a whole tile is 0 and half
+    // the side), multiples of MOST_LANES
+    void (*inverse)(const Square &square, const float *twiddles, Spectrum in, int first, int count, float *tile,
+                    float *room);
     // transfer = mean over k of exp(i (x ax_k + y ay_k)), from (side / 2 + 1) x samples cosines and sines along x and
     // samples rows of `half` cosines and sines along y
     void (*transfer)(const Square &square, int samples, const float *cos_x, const float *sin_x, const float *cos_y,
@@ -36,17 +38,20 @@ struct PathSimd {
     // chord; frequencies: `half` vertical ones
     void (*doubt)(const Square &square, Spectrum lean, const float *frequencies, float xx, float xy, float yy,
                   float *out);
-    // power = |transfer|^2 + doubt, data = conj(transfer) spectrum; sums of weight |spectrum|^2 power, weight power and
-    // band power^2
-    void (*correlate)(size_t count, Spectrum transfer, const float *doubt, Spectrum spectrum, const float *weight,
-                      const float *band, float *power, Spectrum data, double *sums);
+    // with power = |transfer|^2 + doubt, sums of weight |spectrum|^2 power, weight power and band power^2, over
+    // frequencies up to `reach` along x and y
+    void (*fit)(const Square &square, int reach, Spectrum transfer, const float *doubt, Spectrum spectrum,
+                const float *weight, const float *band, double *sums);
+    // spectrum = scale conj(transfer) spectrum / (|transfer|^2 + doubt + factor other)
+    void (*restore)(size_t count, Spectrum transfer, const float *doubt, const float *other, float factor, float scale,
+                    Spectrum spectrum);
+    // power = |transfer|^2 + doubt, data = conj(transfer) spectrum
+    void (*correlate)(size_t count, Spectrum transfer, const float *doubt, Spectrum spectrum, float *power,
+                      Spectrum data);
     // each frequency by the share w = factor other / (factor other + doubt): power = w (power - doubt), data = w data
     void (*weigh)(size_t count, const float *doubt, const float *other, float factor, float *power, Spectrum data);
     // sum of weight |spectrum|^2 and of weight where |transfer|^2 < limit
     void (*quiet)(size_t count, Spectrum transfer, Spectrum spectrum, const float *weight, float limit, double *sums);
-    // out = scale data / (power + factor other)
-    void (*divide)(size_t count, Spectrum data, const float *power, const float *other, float factor, float scale,
-                   Spectrum out);
     // out = scale (data + factor out) / (power + factor other)
     void (*blend)(size_t count, Spectrum data, const float *power, const float *other, float factor, float scale,
                   Spectrum out);

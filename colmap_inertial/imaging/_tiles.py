@@ -19,7 +19,7 @@ _SHORT_MARGIN, _SHORT_RAMP = 40 / 256, 48 / 256
 #: Up to so many px of blur, tiles of the shortest side are laid out for short blur; above, for long blur. A side is at
 #: least so many times as long as the blur.
 SHORT_BLUR_PX, _SIDES = 25.0, 5.0
-_SHORTEST_SIDE, _LONGEST_SIDE = 256, 2048
+SHORTEST_SIDE, _LONGEST_SIDE = 256, 2048
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +47,7 @@ class Tiling:
     @classmethod
     def covering(cls, width: int, height: int, extent_px: float) -> Tiling:
         """For an image with blur of at most this length."""
-        side = _SHORTEST_SIDE
+        side = SHORTEST_SIDE
         while side < _SIDES * extent_px and side < _LONGEST_SIDE:
             side *= 2
         short = extent_px <= SHORT_BLUR_PX

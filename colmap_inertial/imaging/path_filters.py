@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.imaging._cells import Cells
-from colmap_inertial.imaging._tiles import Tiling
+from colmap_inertial.imaging._tiles import SHORTEST_SIDE, Tiling
 from colmap_inertial.imaging.blur_path import BlurPath
 from colmap_inertial.imaging.transfer import ENCODE_STEPS, decode_table, encode_table, srgb_from_linear
 from colmap_inertial.imaging.wiener import LONGEST_PX, DeblurOptions, saturated_code
@@ -30,7 +30,7 @@ FLAT_BELOW, FITTED = 0.01, (0.02, 0.3)
 #: Least share of the noise that a tile's spectrum has at one cycle per pixel, and least noise, of full scale.
 LEAST_SIGNAL, LEAST_NOISE = 0.002, 1e-3
 #: Frequencies at which a tile shows its noise: this high, and left with no more than this share by the blur. So many
-#: must do so. Of many tiles, about so many are looked at.
+#: must do so. Of many tiles, about so many of the shortest side are looked at; of longer ones, which show more, fewer.
 NOISE_ABOVE, NOISE_SHARE, _NOISE_COUNT, _NOISE_TILES = 0.2, 0.08, 200, 20
 #: Weight of the data against gradients to the power 2/3 where noise is 1 % of full scale; those of the splitting.
 DATA_WEIGHT, SPLITTING = 1000.0, (8.0, 32.0, 128.0)
@@ -132,7 +132,7 @@ def noise_along(
         before=tiling.before,
         above=NOISE_ABOVE,
         share=NOISE_SHARE,
-        every=max(1, round((tiling.count[0] * tiling.count[1] / _NOISE_TILES) ** 0.5)),
+        every=max(1, round((tiling.count[0] * tiling.count[1] * tiling.side / SHORTEST_SIDE / _NOISE_TILES) ** 0.5)),
         threads=threads,
     )
     channels = np.reshape(found, (light.shape[2], -1, 3))
