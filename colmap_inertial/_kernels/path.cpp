@@ -93,6 +93,12 @@ class Filter {
         first_ = begin_ / MOST_LANES * MOST_LANES;
         columns_ = (end_ - first_ + 2 * MOST_LANES - 1) / (2 * MOST_LANES) * MOST_LANES;
         first_ = std::min(first_, tiles.side - 2 * columns_);
+        for (int ends = 0; ends < 4; ++ends) {
+            shares_[ends].assign(tiles.window_out, tiles.window_out + tiles.side);
+            const auto middle = shares_[ends].begin() + tiles.side / 2;
+            if (ends & 1) std::fill(shares_[ends].begin(), middle, 1.0f);
+            if (ends & 2) std::fill(middle, shares_[ends].end(), 1.0f);
+        }
     }
 
     void filter(const Model &model, float *result) {
@@ -299,15 +305,21 @@ class Filter {
         }
     }
 
+    // Shares of a tile: nothing lies beyond the first and the last one, with which they would be blended.
+    const float *shares(int place, int count) const {
+        return shares_[(place == 0 ? 1 : 0) + (place == count - 1 ? 2 : 0)].data();
+    }
+
     void add(int row, int column, int channel, float mean, const Room &room, float *result) const {
+        const float *down = shares(row, tiles_.rows), *along = shares(column, tiles_.columns);
         const int first_y = row * tiles_.hop - tiles_.before, first_x = column * tiles_.hop - tiles_.before;
         const int from_x = std::max(begin_, -first_x), to_x = std::min(end_, light_.width - first_x);
         for (int y = std::max(begin_, -first_y); y < std::min(end_, light_.height - first_y); ++y) {
-            const float weight = tiles_.window_out[y];
+            const float weight = down[y];
             const float *from = room.tile.get() + size_t(y) * common_.square.pitch;
             float *out = result + (size_t(first_y + y) * light_.width + first_x) * light_.channels + channel;
             for (int x = from_x; x < to_x; ++x)
-                out[x * light_.channels] += weight * tiles_.window_out[x] * (from[x] + mean);
+                out[x * light_.channels] += weight * along[x] * (from[x] + mean);
         }
     }
 
@@ -315,6 +327,7 @@ class Filter {
     Tiles tiles_;
     const PathSimd &simd_;
     int threads_, height_, width_, begin_, end_, first_, columns_;
+    std::vector<float> shares_[4];
     Common common_;
     Floats planes_;
     std::mutex lock_;

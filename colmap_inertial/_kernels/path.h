@@ -12,7 +12,7 @@ struct Tiles {
     const float *paths;       // (rows, columns, samples, 2)
     const float *spread;      // (rows, columns, 3) variances xx, xy, yy of their chords
     const float *window_in;   // (side,)
-    const float *window_out;  // (side,)
+    const float *window_out;  // (side,) shares of a tile between others; at the image's border its outer half is ones
 };
 
 struct Light {

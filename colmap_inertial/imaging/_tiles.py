@@ -24,7 +24,7 @@ SHORTEST_SIDE, _LONGEST_SIDE = 256, 2048
 
 @dataclass(frozen=True, kw_only=True)
 class Tiling:
-    """Squares that cover an image and more: the first begins before its corner.
+    """Squares that cover an image and more: the first begins before its corner, by its margin.
 
     Attributes
     ----------
@@ -62,13 +62,12 @@ class Tiling:
     @property
     def before(self) -> int:
         """How far the first tile begins before the image."""
-        return self.margin + self.ramp
+        return self.margin
 
     @property
     def count(self) -> tuple[int, int]:
-        """Rows and columns of tiles: the flat part of the last ones reaches the image's end."""
-        flat = self.hop - self.ramp
-        rows, columns = (max(0, -(-(n - flat) // self.hop)) + 1 for n in (self.height, self.width))
+        """Rows and columns of tiles: all but the margin of the last ones reaches the image's end."""
+        rows, columns = (max(1, -(-(n - self.ramp) // self.hop)) for n in (self.height, self.width))
         return rows, columns
 
     def paths(self, path: BlurPath) -> NDArray[np.float32]:
@@ -107,10 +106,22 @@ class Tiling:
         return self._mirrored(np.concatenate([rise, np.ones(self.side // 2 - self.margin)]))
 
     def window_out(self) -> NDArray[np.float32]:
-        """(side,) shares of a tile in the result; those of neighbours add up to one."""
+        """(side,) shares of a tile in the result; those of neighbours add up to one.
+
+        Of the first tile the half before its middle counts in full, of the last one that behind it (:meth:`shares`).
+        """
         rise = np.sin(0.5 * np.pi * (np.arange(self.ramp) + 0.5) / self.ramp) ** 2
         flat = np.ones(self.side // 2 - self.margin - self.ramp)
         return self._mirrored(np.concatenate([np.zeros(self.margin), rise, flat]))
+
+    def shares(self, place: int, count: int) -> NDArray[np.float32]:
+        """(side,) shares of one of several tiles in a row: beyond both ends there is nothing to blend with."""
+        out = self.window_out()
+        if place == 0:
+            out[: self.side // 2] = 1
+        if place == count - 1:
+            out[self.side // 2 :] = 1
+        return out
 
     def sources(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         """Rows and columns of the image that those of the tiled area show: mirrored about its border pixels."""

@@ -33,13 +33,14 @@ def filter_reference(
     splitting: tuple[float, ...],
 ) -> Array:
     """(H, W) linear light without blur, each tile by itself."""
-    window_out = np.outer(tiling.window_out(), tiling.window_out())
+    rows, columns = tiling.count
+    shares = [np.outer(tiling.shares(i, rows), tiling.shares(j, columns)) for i in range(rows) for j in range(columns)]
     total = np.zeros(tuple(map(len, tiling.sources())))
-    for (tile, mean, path, frequencies, window, place), spread in zip(
-        tiles(light, tiling, paths), spreads.reshape(-1, 3), strict=True
+    for (tile, mean, path, frequencies, window, place), spread, share in zip(
+        tiles(light, tiling, paths), spreads.reshape(-1, 3), shares, strict=True
     ):
         variance = max(noise.dark + noise.by_light * mean, LEAST_NOISE**2)
-        total[place] += window_out * (filter_tile(tile, path, spread, frequencies, window, variance, splitting) + mean)
+        total[place] += share * (filter_tile(tile, path, spread, frequencies, window, variance, splitting) + mean)
     begin = tiling.before
     return total[begin : begin + tiling.height, begin : begin + tiling.width]
 
