@@ -718,6 +718,13 @@ MUTANTS = (
         ("imaging_path_kernel::test_a_tile_has_the_path_of_its_middle",),
     ),
     Mutant(
+        "imaging/_tiles.py",
+        "-(-(n - self.ramp) // self.hop)",
+        "-(-(n + self.ramp) // self.hop)",
+        "tiles are laid out beyond the image",
+        ("imaging_path_kernel::test_tiles_add_up_to_one_wherever_there_is_image",),
+    ),
+    Mutant(
         "stages/rectified.py",
         "source = path_in(unsmoothed, name)",
         "source = path_in(images, name)",
