@@ -466,7 +466,7 @@ def test_every_field_of_a_schema_is_in_the_text(name):
 def examples(tmp_path_factory, project):
     """The folder in which the page on Python says that its examples stand, and what they leave in it."""
     folder = tmp_path_factory.mktemp("examples")
-    copy_scene(folder / "capture", first=FRAMES)
+    copy_scene(folder / "capture", first=FRAMES, target=True)
     (folder / "options.toml").write_text(config_as_toml(TINY))
     shutil.copytree(project.model.parents[1], folder / "project")
     (folder / "project" / "frames.csv").write_bytes(project.frame_times.read_bytes())

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -194,8 +195,11 @@ def test_a_run_reads_each_model_from_disk_twice_at_most(capture, tmp_path, monke
         return read(folder, suffix)
 
     monkeypatch.setattr(model, "_read_from", counted)
-    out = tmp_path / "out"
-    reconstruct(capture, out, DETERMINISTIC, frame_stages=[], keypoint_stages=[])
+    measured, out = tmp_path / "capture", tmp_path / "out"
+    shutil.copytree(capture, measured)
+    with (measured / "capture.toml").open("a") as file:
+        file.write('[target]\nspec = "checkerboard:8x6:0.04"\n')
+    reconstruct(measured, out, DETERMINISTIC, frame_stages=[], keypoint_stages=[])
     counts = {folder: reads.count(folder) for folder in set(reads)}
     assert set(counts) == {out / "colmap" / "sparse" / "0", out / "sparse" / "0"} and max(counts.values()) <= 2
     assert isinstance(read(out / "colmap" / "sparse" / "0", ".bin"), pycolmap.Reconstruction)

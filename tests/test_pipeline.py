@@ -30,9 +30,12 @@ DETERMINISTIC = dataclasses.replace(
 )
 
 
-def copy_scene(folder: Path, *, first: int | None = None) -> Path:
-    """A copy of the example scene, or of its first frames."""
+def copy_scene(folder: Path, *, first: int | None = None, target: bool = False) -> Path:
+    """A copy of the example scene, or of its first frames; with its target, a run measures that in seconds more."""
     shutil.copytree(SCENE, folder)
+    if not target:
+        text = (folder / "capture.toml").read_text()
+        (folder / "capture.toml").write_text(text[: text.index("[target]")])
     if first is not None:
         table = folder / "frames.csv"
         rows = table.read_text().splitlines()
@@ -50,7 +53,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 def finished(tmp_path_factory):
     """Ten seconds of the scene, reconstructed once: (capture, out, result). Tests must not change it."""
     root = tmp_path_factory.mktemp("desk")
-    capture = copy_scene(root / "capture", first=30)
+    capture = copy_scene(root / "capture", first=30, target=True)
     before = contents(capture)
     stages = []
     result = reconstruct(capture, root / "out", FINE, progress=lambda stage, done, total: stages.append((stage, done)))

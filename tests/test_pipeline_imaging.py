@@ -70,7 +70,7 @@ def centre_error_m(folder, scene):
 def rolling(tmp_path_factory):
     """A capture with 30 ms of readout, reconstructed without and with treatment."""
     root = tmp_path_factory.mktemp("rolling")
-    scene = CornerScene.make(exposure_s=0.004, readout_s=0.03, frames=18)
+    scene = CornerScene.make(exposure_s=0.004, readout_s=0.03, frames=13)
     capture = scene.write(root / "capture")
     before = contents(capture)
     results = [reconstruct(capture, root / name, options) for name, options in (("off", OFF), ("on", QUICK))]

@@ -7,7 +7,7 @@ import tomllib
 from pathlib import Path
 
 from batch_captures import FRAMES, TINY
-from test_pipeline import copy_scene
+from test_pipeline import SCENE, copy_scene
 
 from colmap_inertial.run.config import config_as_toml
 
@@ -46,7 +46,7 @@ def test_commands_run_without_what_only_linux_has(project, tmp_path: Path) -> No
     scene = copy_scene(tmp_path / "scene", first=FRAMES)
     (tmp_path / "tiny.toml").write_text(config_as_toml(TINY))
     out, metric = tmp_path / "out", tmp_path / "metric"
-    spec = tomllib.loads((scene / "capture.toml").read_text())["target"]["spec"]
+    spec = tomllib.loads((SCENE / "capture.toml").read_text())["target"]["spec"]
     commands = [
         ["scale", project.model, "--imu", project.imu, "--frame-times", project.frame_times, "--json", "scale.json"],
         ["apply", project.model.parents[1], metric, "--scale", "scale.json"],

@@ -59,8 +59,14 @@ class Normal:
     count: int
 
 
-def normal_equations(obs: Observations, at: Placement) -> tuple[Normal, Array, Array]:
-    """Normal equations at a placement, with the pose derivatives (M, 2, 6) and the residuals (M, 2)."""
+def _derivatives(obs: Observations, at: Placement) -> tuple[Array, Array, Array, Array]:
+    """Those of the corners by the placement (M, 2, p), and what :func:`linearise` gives.
+
+    Raises
+    ------
+    NotObservableError
+        When a corner lies behind its camera.
+    """
     residual, in_cam, jac = linearise(obs, at)
     if not np.isfinite(residual).all():
         raise NotObservableError("scale", "the target was placed behind a camera that saw it")
@@ -72,7 +78,19 @@ def normal_equations(obs: Observations, at: Placement) -> tuple[Normal, Array, A
     block = np.concatenate([-jac_world @ skew(rotated), jac_world], axis=2)
     columns = 1 + 6 * obs.part[:, None] + np.arange(6)
     np.put_along_axis(a, np.broadcast_to(columns[:, None, :], block.shape), block, axis=2)
+    return a, residual, in_cam, jac
 
+
+def plain_equations(obs: Observations, at: Placement) -> tuple[Array, Array, float]:
+    """Normal matrix (p, p), right side (p,) and the residuals' sum of squares where poses have no errors."""
+    a, residual, _, _ = _derivatives(obs, at)
+    flat, y = a.reshape(-1, a.shape[2]), residual.ravel()
+    return flat.T @ flat, flat.T @ y, float(y @ y)
+
+
+def normal_equations(obs: Observations, at: Placement) -> tuple[Normal, Array, Array]:
+    """Normal equations at a placement, with the pose derivatives (M, 2, 6) and the residuals (M, 2)."""
+    a, residual, in_cam, jac = _derivatives(obs, at)
     views, first = np.unique(obs.view, return_index=True)
     ends = np.append(first[1:], len(obs))
     unit = float(np.median(np.linalg.norm(in_cam, axis=1)))

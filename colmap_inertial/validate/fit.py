@@ -20,6 +20,7 @@ from colmap_inertial.validate.components import (
     POSE_ERRORS,
     estimate_ratio,
     normal_equations,
+    plain_equations,
     satterthwaite_dof,
     solve,
     weighted,
@@ -159,24 +160,28 @@ def settle(
     NotObservableError
         When it does not settle or a corner comes to lie behind its camera.
     """
-    plain = pose_ratio is None or not pose_ratio.any()
-    ratio = np.zeros(len(POSE_ERRORS)) if pose_ratio is None else pose_ratio
-    n = normal_equations(obs, at)[0]
+    ratio = None if pose_ratio is None or not pose_ratio.any() else pose_ratio
+    equations = _equations(obs, at, ratio)
     for _ in range(most_iterations):
-        _, s, rhs, now = weighted(n, ratio)
+        s, rhs, now = equations
         step = solve(s, rhs)[0]
-        if rhs @ step <= _SETTLED * now / n.count + _LEAST_PX2:
+        if rhs @ step <= _SETTLED * now / (2 * len(obs)) + _LEAST_PX2:
             return at
         size = max(abs(step[0]), float(np.abs(step[1:].reshape(-1, 6)[:, :3]).max()))
         step *= min(1.0, 0.5 / max(size, 1e-300))
         for _ in range(20):
             residual = linearise(obs, _moved(at, step))[0]
-            if np.isfinite(residual).all() and (not plain or np.sum(residual**2) <= now):
+            if np.isfinite(residual).all() and (ratio is not None or np.sum(residual**2) <= now):
                 break
             step = 0.5 * step
         at = _moved(at, step)
-        n = normal_equations(obs, at)[0]
+        equations = _equations(obs, at, ratio)
     raise NotObservableError("scale", "the fit of the target does not settle; the views may be too close together")
+
+
+def _equations(obs: Observations, at: Placement, ratio: Array | None) -> tuple[Array, Array, float]:
+    """Normal matrix, right side and cost, with these pose errors; ``None`` for none."""
+    return plain_equations(obs, at) if ratio is None else weighted(normal_equations(obs, at)[0], ratio)[1:]
 
 
 def _moved(at: Placement, step: Array) -> Placement:
