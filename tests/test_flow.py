@@ -15,6 +15,7 @@ from colmap_inertial.flow import FlowOptions, check_motion, find_stabilisation, 
 from colmap_inertial.geometry import matrix_from_quat, quat_conjugate, quat_log, quat_multiply
 from colmap_inertial.gyro import GyroPath
 from colmap_inertial.imaging.gyro_camera import FrameShutter
+from colmap_inertial.shutter import estimate_readout
 from colmap_inertial.simulate.render import colmap_camera
 from colmap_inertial.types import CameraModel, Frame, FrameTiming, ImuRecording
 
@@ -55,10 +56,18 @@ def film(scene):
     return filmed(scene)
 
 
+@pytest.fixture(scope="module")
+def rotation(film):
+    """What its pictures tell."""
+    frames, timing = film
+    return measure_rotation(frames, colmap_camera(LENS), timing)
+
+
 @pytest.mark.parametrize("model", [LENS, FISHEYE], ids=lambda m: m.model)
-def test_rotations_are_right_with_any_lens_and_a_rolling_shutter(scene, film, model):
+def test_rotations_are_right_with_any_lens_and_a_rolling_shutter(scene, film, rotation, model):
     frames, timing = film if model is LENS else filmed(scene, model)
-    rotation = measure_rotation(frames, colmap_camera(model), timing)
+    if model is not LENS:
+        rotation = measure_rotation(frames, colmap_camera(model), timing)
     error = rotation.turn_rad - true_turns(scene, timing)
     assert np.isfinite(error).all()
     # a pixel is 4 mrad; the rate changes while a frame is read
@@ -76,14 +85,18 @@ def test_frames_far_apart_are_matched_by_features(scene):
     assert np.isfinite(error).mean() > 0.8 and np.nanmedian(error) < 1e-2
 
 
-def test_the_gyroscope_is_aligned_before_any_reconstruction_exists(scene, film):
-    frames, timing = film
-    track = measure_rotation(frames, colmap_camera(LENS), timing).trajectory()
+def test_the_gyroscope_is_aligned_before_any_reconstruction_exists(scene, rotation):
+    track = rotation.trajectory()
     gyro = scene.gyro(late_s=0.0)
     found = align_camera_imu(track, recorded(gyro))
     assert found.gyro_time_offset_s == pytest.approx(-11.0, abs=min(0.003, 4 * found.sigma("gyro_time_offset_s")))
     turn = quat_log(quat_multiply(found.cam_from_imu_xyzw, quat_conjugate(gyro.cam_from_imu_xyzw)))
     assert np.linalg.norm(turn) < np.radians(1.5)
+
+
+def test_the_readout_is_found_in_the_pictures(scene, rotation):
+    found = estimate_readout(rotation, scene.gyro(noise_rad_s=0.003))
+    assert abs(found.readout_s - 0.03) < max(3 * found.sigma_s, 1e-3) and found.direction == "down"
 
 
 def test_a_pair_that_tells_nothing_breaks_the_chain_and_the_longest_run_is_kept(scene, film):
@@ -100,10 +113,8 @@ def test_a_pair_that_tells_nothing_breaks_the_chain_and_the_longest_run_is_kept(
         measure_rotation(blank, colmap_camera(LENS), timing).trajectory()
 
 
-def test_pictures_without_the_gyroscope_s_rotation_were_stabilised(scene, film):
-    frames, timing = film
+def test_pictures_without_the_gyroscope_s_rotation_were_stabilised(scene, rotation):
     imu = recorded(scene.gyro())
-    rotation = measure_rotation(frames, colmap_camera(LENS), timing)
     for offset_s in (None, -11.0):
         finding = find_stabilisation(rotation, imu, offset_s=offset_s)
         assert finding.stabilised is False and finding.share == pytest.approx(1.0, abs=0.15)
@@ -116,9 +127,7 @@ def test_pictures_without_the_gyroscope_s_rotation_were_stabilised(scene, film):
     assert find_stabilisation(replace(rotation, t_s=rotation.t_s * 10), imu).stabilised is None
 
 
-def test_a_flipped_axis_is_told_from_the_way_between_frames(scene, film):
-    frames, timing = film
-    rotation = measure_rotation(frames, colmap_camera(LENS), timing)
+def test_a_flipped_axis_is_told_from_the_way_between_frames(scene, rotation):
     gyro = scene.gyro()
     right = check_motion(rotation, gyro)
     assert right.agrees and right.explained > 0.98

@@ -379,7 +379,7 @@ def test_gravity_priors_need_a_calibration_and_the_global_mapper(tmp_path):
 
 
 def test_gravity_priors_turn_the_global_mapper_s_world(tmp_path, truth):
-    capture = copy_scene(tmp_path / "capture", first=20)
+    capture = copy_scene(tmp_path / "capture", first=14)
     calibration = truth.calibration
     with open(capture / "capture.toml", "a") as file:
         file.write(

@@ -1,5 +1,6 @@
 """The report in a real browser, off the disk: all is drawn, nothing is loaded, nothing overflows, no name is run."""
 
+import base64
 import json
 import shutil
 import time
@@ -18,10 +19,10 @@ pytestmark = pytest.mark.skipif(
     CHROMIUM is None or DRIVER is None, reason="no Chromium here (apt-get install chromium chromium-driver)"
 )
 
-#: Still pictures for paper take as long as the plots; test_report_photogrammetry.py looks at them.
+#: Still pictures for paper take as long as the plots: made on the page alone that is printed.
 NO_STILLS = """
     let plotly;
-    Object.defineProperty(window, "Plotly", {
+    if (location.search !== "?stills") Object.defineProperty(window, "Plotly", {
         get: () => plotly,
         set: (value) => {
             const toImage = value.toImage;
@@ -99,7 +100,8 @@ def visit(driver, page: Path, width: str, *, dark: bool = False, wait: bool = Tr
     driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [scheme]})
     driver.get_log("browser")
     driver.get_log("performance")
-    driver.get(page.as_uri())
+    stills = page.parent.name == "full" and width == "desktop"
+    driver.get(page.as_uri() + "?stills" * stills)
     until = time.monotonic() + 60
     while wait and not driver.execute_script("return document.documentElement.dataset.plots"):
         assert time.monotonic() < until, "the plots were not drawn within a minute"
@@ -111,12 +113,13 @@ def visit(driver, page: Path, width: str, *, dark: bool = False, wait: bool = Tr
     return driver.shown
 
 
-def drawn(browser, pages, kind, width) -> Visit:
+def drawn(browser, pages, kind, width, *, dark=False) -> Visit:
     """A page of which every plot is drawn, without errors or requests."""
-    seen = visit(browser, pages[kind], width)
+    seen = visit(browser, pages[kind], width, dark=dark)
     assert seen.script("return document.documentElement.dataset.plots") == "drawn"
     assert not [line for line in seen.console if line.startswith("SEVERE")]
-    assert [url for url in seen.requests if not url.startswith(("data:", "blob:"))] == [pages[kind].as_uri()]
+    asked = [url.removesuffix("?stills") for url in seen.requests if not url.startswith(("data:", "blob:"))]
+    assert asked == [pages[kind].as_uri()]
     empty = seen.script(
         """return [...document.querySelectorAll('.plot')].filter(div => {
              const cloud = div.querySelector('.gl-container canvas');
@@ -131,7 +134,11 @@ def drawn(browser, pages, kind, width) -> Visit:
     )
     least = {"full": 12, "refused": 5, "both refused": 10}[kind]
     assert seen.script("return document.querySelectorAll('.plot').length") >= least
-    assert seen.script("return [...document.images].every(image => image.complete && image.naturalWidth > 0)")
+    assert seen.script(
+        """return [...document.querySelectorAll('img:not(.still)')].every(
+             image => image.complete && image.naturalWidth > 0
+           )"""
+    )
     assert_nothing_overflows(seen, width)
     return seen
 
@@ -155,13 +162,6 @@ def test_names_are_shown_and_not_run(browser, pages):
     assert seen.script("return document.querySelectorAll('img[src=\"x\"]').length") == 0
 
 
-def test_a_run_that_stopped_has_a_page_without_plots(browser, pages):
-    seen = visit(browser, pages["stopped"], "phone", wait=False)
-    assert not [line for line in seen.console if line.startswith("SEVERE")]
-    assert "The video was stabilised" in seen.script("return document.body.innerText")
-    assert_nothing_overflows(seen, "phone")
-
-
 def assert_nothing_overflows(seen: Visit, width: str) -> None:
     across = WIDTHS[width][0]
     assert seen.script("return document.documentElement.scrollWidth") <= across
@@ -174,7 +174,7 @@ def assert_nothing_overflows(seen: Visit, width: str) -> None:
 
 
 def test_the_cloud_is_really_there_and_can_be_turned(browser, pages):
-    seen = drawn(browser, pages, "refused", "desktop")
+    seen = visit(browser, pages["full"], "desktop")
     # a WebGL canvas is empty once shown: plotly draws it again for a picture
     picture = """
         const done = arguments[arguments.length - 1];
@@ -205,12 +205,72 @@ def test_the_cloud_is_really_there_and_can_be_turned(browser, pages):
     assert before != after
 
 
+#: Of each plot: whether it is shown, and where its still picture lies.
+BOXES = """JSON.stringify([...document.querySelectorAll('.plot')].map((plot) => {
+    const still = plot.nextElementSibling, box = still.getBoundingClientRect();
+    return {
+        shown: getComputedStyle(plot).display, left: box.left, right: box.right, height: box.height,
+        natural: still.naturalWidth,
+    };
+}))"""
+#: The number of colours of the model's still picture.
+INK = """(() => {
+    const still = document.querySelector('#scene .still');
+    const canvas = Object.assign(document.createElement('canvas'), {width: 300, height: 220});
+    const brush = canvas.getContext('2d');
+    brush.drawImage(still, 0, 0, 300, 220);
+    const pixels = brush.getImageData(0, 0, 300, 220).data, colours = new Set();
+    for (let i = 0; i < pixels.length; i += 4) {
+        if (pixels[i + 3]) colours.add(pixels[i] * 65536 + pixels[i + 1] * 256 + pixels[i + 2]);
+    }
+    return colours.size;
+})()"""
+
+#: Until eight frames are drawn.
+SETTLE = """
+    let n = 0;
+    const next = () => ++n > 8 ? arguments[0]() : requestAnimationFrame(next);
+    next();
+"""
+
+
+def test_it_prints_on_a4_with_still_pictures_and_nothing_cut(browser, pages):
+    seen = visit(browser, pages["full"], "desktop")
+    until = time.monotonic() + 120
+    while seen.script("return document.documentElement.dataset.stills") != "made":
+        assert time.monotonic() < until, "the still pictures were not made"
+        time.sleep(0.1)
+    paper = {"preferCSSPageSize": True, "printBackground": True}
+    printed = base64.b64decode(browser.execute_cdp_cmd("Page.printToPDF", paper)["data"])
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
+    # A4 without its margins, at 96 dots an inch
+    sheet = {"width": 688, "height": 1006, "deviceScaleFactor": 1, "mobile": False}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", sheet)
+    try:
+        browser.execute_async_script(SETTLE)
+        boxes = json.loads(seen.script(f"return {BOXES}"))
+        wide = seen.script("return document.documentElement.scrollWidth")
+        colours = seen.script(f"return {INK}")
+    finally:
+        across, down, mobile = WIDTHS["desktop"]
+        screen = {"width": across, "height": down, "deviceScaleFactor": 1, "mobile": mobile}
+        browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
+        browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})
+    assert len(boxes) > 10
+    for box in boxes:
+        assert box["shown"] == "none" and box["natural"] > 0
+        assert box["left"] >= 0 and box["right"] <= 689 and box["height"] < 500
+    assert wide <= 689
+    assert colours > 20  # the model is on its picture
+    assert b"/MediaBox [0 0 594" in printed or b"/MediaBox [0 0 595" in printed
+
+
 def test_it_follows_a_dark_screen(browser, pages):
     colour = "return getComputedStyle(document.body).backgroundColor"
     tick = "return getComputedStyle(document.querySelector('#rotation .plot .xtick text')).fill"
-    light = visit(browser, pages["refused"], "desktop")
+    light = visit(browser, pages["full"], "desktop")
     bright = [light.script(colour), light.script(tick)]
-    dark = visit(browser, pages["refused"], "desktop", dark=True)
+    dark = drawn(browser, pages, "refused", "desktop", dark=True)
     dim = [dark.script(colour), dark.script(tick)]
     assert all(a != b for a, b in zip(bright, dim, strict=True))
     browser.execute_cdp_cmd(
@@ -220,6 +280,13 @@ def test_it_follows_a_dark_screen(browser, pages):
     while [dark.script(colour), dark.script(tick)] != bright:
         assert time.monotonic() < until, "the plots did not follow"
         time.sleep(0.1)
+
+
+def test_a_run_that_stopped_has_a_page_without_plots(browser, pages):
+    seen = visit(browser, pages["stopped"], "phone", wait=False)
+    assert not [line for line in seen.console if line.startswith("SEVERE")]
+    assert "The video was stabilised" in seen.script("return document.body.innerText")
+    assert_nothing_overflows(seen, "phone")
 
 
 def test_text_and_tables_stand_without_scripts(browser, pages):

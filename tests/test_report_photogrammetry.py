@@ -1,13 +1,11 @@
-"""What the report says as photogrammetrists know it, and how the page prints."""
+"""What the report says as photogrammetrists know it."""
 
-import base64
 import json
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 import pytest
-from chromium import Page
 from jsonschema import Draft202012Validator
 from report_runs import write_run
 
@@ -118,52 +116,3 @@ def test_the_content_keeps_to_its_schema(tmp_path, record):
     page = (tmp_path / "run" / "report.html").read_text()
     for words in ("Camera calibration", "Reprojection residuals", "Overlap, from above", "ground sampling distance"):
         assert words in page
-
-
-#: Of each plot: whether it is shown, and where its still picture lies.
-BOXES = """JSON.stringify([...document.querySelectorAll('.plot')].map((plot) => {
-    const still = plot.nextElementSibling, box = still.getBoundingClientRect();
-    return {
-        shown: getComputedStyle(plot).display, left: box.left, right: box.right, height: box.height,
-        natural: still.naturalWidth,
-    };
-}))"""
-#: Puts the number of colours of the model's still picture into the title.
-INK = """(() => {
-    const still = document.querySelector('#scene .still');
-    const canvas = Object.assign(document.createElement('canvas'), {width: 300, height: 220});
-    const brush = canvas.getContext('2d');
-    brush.drawImage(still, 0, 0, 300, 220);
-    const pixels = brush.getImageData(0, 0, 300, 220).data, colours = new Set();
-    for (let i = 0; i < pixels.length; i += 4) {
-        if (pixels[i + 3]) colours.add(pixels[i] * 65536 + pixels[i + 1] * 256 + pixels[i + 2]);
-    }
-    document.title = colours.size;
-})()"""
-
-
-def test_it_prints_on_a4_with_still_pictures_and_nothing_cut(tmp_path, record):
-    report = with_survey(tmp_path / "run", record)
-    page = Page(tmp_path / "profile")
-    try:
-        page.open(report.as_uri())
-        page.wait('document.documentElement.dataset.stills === "made"', 120)
-        printed = base64.b64decode(page.call("Page.printToPDF", preferCSSPageSize=True, printBackground=True)["data"])
-        page.call("Emulation.setEmulatedMedia", media="print")
-        # A4 without its margins, at 96 dots an inch
-        page.call("Emulation.setDeviceMetricsOverride", width=688, height=1006, deviceScaleFactor=1, mobile=False)
-        page.settle()
-        boxes = json.loads(page.evaluate(BOXES))
-        wide = page.evaluate("document.documentElement.scrollWidth")
-        page.evaluate(INK)
-        page.settle()
-        colours = int(page.evaluate("document.title"))
-    finally:
-        page.close()
-    assert len(boxes) > 10
-    for box in boxes:
-        assert box["shown"] == "none" and box["natural"] > 0
-        assert box["left"] >= 0 and box["right"] <= 689 and box["height"] < 500
-    assert wide <= 689
-    assert colours > 20  # the model is on its picture
-    assert b"/MediaBox [0 0 594" in printed or b"/MediaBox [0 0 595" in printed

@@ -410,7 +410,7 @@ def test_a_gyroscope_of_another_recording_does_not_rank(turning):
 
 
 def test_a_video_is_reconstructed_from_the_chosen_frames(orbiting, of_orbiting, tmp_path):
-    mapping = MappingOptions(max_num_features=700, first_octave=0)
+    mapping = MappingOptions(max_num_features=600, first_octave=0, pairing="sequential", overlap=4)
     options = ReconstructOptions(deblur="off", mapping=mapping)
     result = reconstruct(orbiting.folder, tmp_path / "out", options)
     stored = json.loads((tmp_path / "out" / "result.json").read_text())

@@ -1,17 +1,13 @@
-"""The readout of a rolling shutter, from pictures and the gyroscope."""
+"""The readout of a rolling shutter, from what pictures and the gyroscope tell; from pictures: test_flow.py."""
 
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from far_scene import FarScene
-from test_flow import LENS, filmed
 
 from colmap_inertial.errors import NotObservableError
-from colmap_inertial.flow import measure_rotation
 from colmap_inertial.shutter import estimate_readout
-from colmap_inertial.simulate.render import colmap_camera
 
 sys.path.append(str(Path(__file__).parents[1] / "scripts"))
 
@@ -26,13 +22,6 @@ def test_the_readout_is_found_and_as_sure_as_it_says(motion, readout_s, directio
     found = Film(motion=motion, readout_s=readout_s, seed=1, direction=direction).run()
     assert found.direction == direction and found.sigma_s < 1e-3
     assert abs(found.readout_s - readout_s) < 3 * found.sigma_s
-
-
-def test_real_pictures_tell_it_as_well():
-    scene = FarScene.make()
-    frames, timing = filmed(scene, readout_s=0.03)
-    found = estimate_readout(measure_rotation(frames, colmap_camera(LENS), timing), scene.gyro(noise_rad_s=0.003))
-    assert abs(found.readout_s - 0.03) < max(3 * found.sigma_s, 1e-3) and found.direction == "down"
 
 
 def test_a_camera_that_hardly_turns_tells_nothing():

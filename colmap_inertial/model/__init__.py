@@ -299,16 +299,16 @@ def _pose_covariances(
     -------
     ``None`` where an image's observations do not determine its pose.
     """
-    covariances = []
+    covariances, places = [], {i: point.xyz for i, point in reconstruction.points3D.items()}
     for image in images:
         camera = reconstruction.camera(image.camera_id)
-        seen = [point for point in image.points2D if point.has_point3D()]
+        seen = image.get_observation_points2D()
         seen = seen[:: -(-len(seen) // _MOST_OBSERVATIONS) or 1]
         if len(seen) < _FEWEST_OBSERVATIONS:
             return None
         pose = image.cam_from_world()
         rotation = pose.rotation.matrix()
-        world = np.array([reconstruction.points3D[point.point3D_id].xyz for point in seen])
+        world = np.array([places[point.point3D_id] for point in seen])
         cam = world @ rotation.T + pose.translation
         error_px = camera.img_from_cam(cam) - np.array([point.xy for point in seen])
         squares = np.sum(error_px**2, axis=1)

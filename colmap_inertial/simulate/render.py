@@ -314,17 +314,15 @@ class Renderer:
         low, high = image.min(axis=(1, 2)) - margin, image.max(axis=(1, 2)) + margin
         low[behind], high[behind] = -np.inf, np.inf
         low[gone] = np.inf
-        bounds = (y.min(axis=1), y.max(axis=1), x.min(axis=0), x.max(axis=0))
-        out = []
-        for q in range(len(low)):
-            rows = np.flatnonzero((bounds[1] >= low[q, 1]) & (bounds[0] <= high[q, 1]))
-            columns = np.flatnonzero((bounds[3] >= low[q, 0]) & (bounds[2] <= high[q, 0]))
-            out.append(
-                (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
-                if len(rows) and len(columns)
-                else (slice(0, 0), slice(0, 0))
-            )
-        return out
+        rows = _spans((y.max(axis=1) >= low[:, 1:]) & (y.min(axis=1) <= high[:, 1:]))
+        columns = _spans((x.max(axis=0) >= low[:, :1]) & (x.min(axis=0) <= high[:, :1]))
+        return list(zip(rows, columns, strict=True))
+
+
+def _spans(inside: NDArray[np.bool_]) -> list[slice]:
+    """For each row of (Q, N), from the first to the last that is true."""
+    first, last = inside.argmax(axis=1), inside.shape[1] - inside[:, ::-1].argmax(axis=1)
+    return [slice(a, b) for a, b in zip(first.tolist(), np.where(inside.any(axis=1), last, 0).tolist(), strict=True)]
 
 
 def develop(linear: FloatImage, camera: ShutterCamera, rng: np.random.Generator | None) -> NDArray[np.uint8]:
