@@ -54,10 +54,42 @@ if [ ! -f "$stamp" ] || [ "$extras" != "$(cat "$stamp")" ] ||
   [ -n "$(find "${sources[@]}" -newer "$stamp" -print -quit)" ]; then
   names=$(paste -sd, <<<"$extras")
   echo "setup: installing Python packages${names:+ for $names} into .venv, and compiling; some minutes the first time"
+  # what the package and its extras ask for, those that an extra takes from others included
+  wanted=$("$python" - $extras <<'END'
+import re, sys, tomllib
+
+with open("pyproject.toml", "rb") as file:
+    project = tomllib.load(file)["project"]
+
+
+def asked(lines):
+    for line in lines:
+        own = re.fullmatch(re.escape(project["name"]) + r"\[(.+)\]", line)
+        for name in own[1].split(",") if own else ():
+            if name not in project["optional-dependencies"]:
+                sys.exit(f"setup: pyproject.toml has no extra {name}")
+            yield from asked(project["optional-dependencies"][name])
+        if not own:
+            yield line
+
+
+own = [f"{project['name']}[{name}]" for name in sys.argv[1:]]
+print(*dict.fromkeys(asked(project["dependencies"] + own)), sep="\n")
+END
+  )
+  mapfile -t wanted <<<"$wanted"
   # make compiles one file at a time where nobody says otherwise. Python's modules are compiled when they are first
   # used: most never are.
   export CMAKE_BUILD_PARALLEL_LEVEL="${CMAKE_BUILD_PARALLEL_LEVEL:-$(getconf _NPROCESSORS_ONLN)}"
-  .venv/bin/python -m pip install --disable-pip-version-check --progress-bar on --no-compile --editable ".${names:+[$names]}" |
-    sed -un 's/^ *\(Downloading .*\|Using cached .*\)/  \1/p; s/^ *\(Building .*\)/  \1/p; s/^\(Installing\) collected packages.*/  \1/p'
+  install() {
+    .venv/bin/python -m pip install --disable-pip-version-check --progress-bar on --no-compile "$@" |
+      sed -un 's/^ *\(Downloading .*\|Using cached .*\)/  \1/p; s/^ *\(Building .*\)/  \1/p; s/^\(Installing\) collected packages.*/  \1/p'
+  }
+  # Compiling keeps the processors busy, downloading and unpacking hardly: both at once.
+  (install --no-deps --editable .) &
+  compiling=$!
+  install "${wanted[@]}" && installed=0 || installed=$?
+  wait "$compiling"
+  [ "$installed" -eq 0 ] || exit "$installed"
   printf '%s\n' "$extras" | sed '/^$/d' >"$stamp"
 fi

@@ -56,6 +56,19 @@ def test_the_lists_name_files_that_are_there(name):
     assert [file for file in listed if not (ROOT / "tests" / file).is_file()] == []
 
 
+#: A project of which an extra takes another, with a version and a marker.
+PROJECT = """
+[project]
+name = "own"
+dependencies = ["one>=1.0,<2"]
+[project.optional-dependencies]
+view = ["two; python_version < '4'"]
+mesh = ["four"]
+dev = ["own[view]", "three"]
+complete = ["own[dev,mesh]"]
+"""
+
+
 @pytest.fixture
 def checkout(tmp_path):
     """A checkout whose ``pip`` writes down what it is asked for."""
@@ -64,8 +77,9 @@ def checkout(tmp_path):
     shutil.copy(ROOT / "scripts" / "setup.sh", root / "scripts")
     kernels = root / "colmap_inertial" / "_kernels"
     kernels.mkdir(parents=True)
-    for path in (root / "pyproject.toml", *(kernels / name for name in ("CMakeLists.txt", "a.cpp", "a.h"))):
-        path.touch()
+    for name in ("CMakeLists.txt", "a.cpp", "a.h"):
+        (kernels / name).touch()
+    (root / "pyproject.toml").write_text(PROJECT)
     python = root / ".venv" / "bin" / "python"
     python.parent.mkdir(parents=True)
     python.write_text('#!/bin/sh\nshift 2\n[ "$1" = --version ] || echo "$*" >>asked.txt\n')
@@ -79,15 +93,36 @@ def test_the_set_up_knows_which_extras_are_there(checkout):
         (checkout / "asked.txt").unlink(missing_ok=True)
         subprocess.run(["bash", "scripts/setup.sh", *extras], cwd=checkout, check=True, capture_output=True)
         path = checkout / "asked.txt"
-        return path.read_text().split()[-1] if path.exists() else None
+        if not path.exists():
+            return None
+        own, others = sorted(line.partition("--no-compile ")[2] for line in path.read_text().splitlines())
+        assert own == "--no-deps --editable ."
+        return others
 
-    assert asked() == "."  # the demo needs no extra
+    view, dev = "two; python_version < '4'", "three"
+    assert asked() == "one>=1.0,<2"  # the demo needs no extra
     assert asked() is None
-    assert asked("dev") == ".[dev]"
+    assert asked("mesh") == "one>=1.0,<2 four"
+    assert asked("dev") == f"one>=1.0,<2 {view} {dev} four"
     assert asked() is None and asked("dev") is None
-    assert asked("view") == ".[dev,view]"
+    assert asked("view") == f"one>=1.0,<2 {view} {dev} four"
     os.utime(checkout / "pyproject.toml", (2**31, 2**31))
-    assert asked("dev") == ".[dev,view]"
+    assert asked("dev") == f"one>=1.0,<2 {view} {dev} four"
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler here")
+@pytest.mark.parametrize("fails", ["--editable", "three"])
+def test_a_set_up_of_which_a_half_fails_is_done_again(checkout, fails):
+    python = checkout / ".venv" / "bin" / "python"
+    text = python.read_text()
+    python.write_text(text + f'case "$*" in *{fails}*) exit 7;; esac\n')
+    command = ["bash", "scripts/setup.sh", "dev"]
+    assert subprocess.run(command, cwd=checkout, capture_output=True).returncode == 7
+    python.write_text(text)
+    assert subprocess.run(command, cwd=checkout, capture_output=True).returncode == 0
+    assert len((checkout / "asked.txt").read_text().splitlines()) == 4
+    done = subprocess.run([*command, "nothing"], cwd=checkout, capture_output=True, text=True)
+    assert done.returncode == 1 and "no extra nothing" in done.stderr
 
 
 @pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler here")
