@@ -50,7 +50,7 @@ import imaging_metrics as metrics
 import restoration_cost
 import restoration_exposures
 from bench_imaging import BLURS_PX, SIZE, about
-from imaging_scenes import make_pairs, native_walls, photographed_walls
+from imaging_scenes import Colour, make_pairs, native_walls, photographed_walls
 from restoration.photographs import photographs
 from restoration_deblur import Ways, false_blur, quality
 from restoration_sheet import SCENES, write_sheet
@@ -59,7 +59,9 @@ from restoration_weights import checksums, use_weights
 from rich.console import Console
 
 from colmap_inertial.errors import InertialError
-from colmap_inertial.imaging import wiener
+from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.imaging.blur_path import BlurPath
+from colmap_inertial.imaging.path_filters import path_wiener
 from colmap_inertial.options import ReconstructOptions
 from colmap_inertial.restoration import Network, deepgyro, load_network
 
@@ -122,10 +124,10 @@ def run(args: argparse.Namespace) -> None:
 
     def ways() -> Ways:
         network = load_network("deepgyro", threads=args.threads)
-        found: dict[str, Any] = {"Wiener": wiener.deblur, "DeepGyro": partial(deepgyro.deblur, network=network)}
+        found: dict[str, Any] = {"Wiener": _filtered, "DeepGyro": partial(_restored, network=network)}
         if args.unet:
             unet = Network.of(args.unet.read_bytes(), "deepgyro", source=str(args.unet), threads=args.threads)
-            found["thesis's U-Net"] = partial(deepgyro.deblur, network=unet)
+            found["thesis's U-Net"] = partial(_restored, network=unet)
         return found
 
     def deepgyro_quality() -> dict[str, Any]:
@@ -188,6 +190,14 @@ def run(args: argparse.Namespace) -> None:
         write_sheet(args.sheet, shown, deblur, lsd2, size=restoration_exposures.SIZE, seed=args.seed)
     # tables are wide; a file has no width of its own
     print_report(report, Console() if sys.stdout.isatty() else Console(width=140))
+
+
+def _filtered(image: Colour, blur: BlurField) -> Colour:
+    return path_wiener(image, BlurPath.straight(blur))
+
+
+def _restored(image: Colour, blur: BlurField, *, network: Network) -> Colour:
+    return deepgyro.deblur(image, BlurPath.straight(blur), network=network)
 
 
 def reconstructions(*, quick: bool) -> dict[str, Any]:

@@ -788,6 +788,27 @@ MUTANTS = (
         ("imaging_wiener::test_the_noise_is_looked_for_along_the_blur",),
     ),
     Mutant(
+        "restoration/deepgyro.py",
+        "filtered = path_wiener(image, path, ",
+        "filtered = path_wiener(image, BlurPath.straight(path.field()), ",
+        "the network sees what a filter along the chord makes",
+        ("restoration::test_the_filter_that_the_network_sees_follows_the_curve",),
+    ),
+    Mutant(
+        "restoration/_tiles.py",
+        "mean = path.path_px.mean(axis=0)",
+        "mean = -path.path_px.mean(axis=0)",
+        "paths seem bent to the other side",
+        ("restoration::test_deepgyro_sees_the_chord_of_a_path_and_to_which_side_it_is_bent",),
+    ),
+    Mutant(
+        "restoration/_tiles.py",
+        "bend = BlurField(width=path.width, height=path.height, step_px=path.step_px, vector_px=mean)",
+        "bend = BlurField(width=path.width, height=path.height, step_px=path.step_px, vector_px=path.path_px[0])",
+        "the bend changes with the sense of time",
+        ("restoration::test_deepgyro_sees_the_chord_of_a_path_and_to_which_side_it_is_bent",),
+    ),
+    Mutant(
         "imaging/transfer.py",
         "((srgb + 0.055) / 1.055) ** 2.4",
         "((srgb + 0.055) / 1.055) ** 2.2",

@@ -81,8 +81,8 @@ def _path(image: Grey, motion: GyroCamera, camera: Projector, shutter: FrameShut
 
 
 def _deepgyro(image: Grey, motion: GyroCamera, camera: Projector, shutter: FrameShutter) -> Made:
-    blur = blur_field(motion, camera, shutter)
-    return _both(deepgyro.deblur(image, blur, network=_network()), blur)
+    path = blur_path(motion, camera, shutter)
+    return _both(deepgyro.deblur(image, path, network=_network()), path.field())
 
 
 #: ``straight`` is the filter along straight lines as it was, ``untreated, smoothed`` the frame without any filter.
@@ -179,7 +179,7 @@ def cost(take: Take, methods: Sequence[str], repeat: int = 5) -> dict[str, Any]:
             "straight": lambda image=image, field=field: deblur(image, field, _ONE),
             "wiener": lambda image=image, path=path: path_wiener(image, path, _ONE),
             "path": lambda image=image, path=path: half_quadratic(image, path, _ONE),
-            "deepgyro": lambda image=image, field=field: deepgyro.deblur(image, field, network=_network()),
+            "deepgyro": lambda image=image, path=path: deepgyro.deblur(image, path, network=_network()),
         }
         ms = {"smoothing": _least_ms(lambda image=image: smoothed(image, MOST_SMOOTHING_PX), repeat)}
         ms |= {name: _least_ms(work, repeat) for name, work in works.items() if name in ("straight", *methods)}

@@ -16,8 +16,9 @@ from imaging_metrics import extract
 from imaging_scenes import Colour, Pair
 from restoration_weights import use_weights
 
-from colmap_inertial.imaging import wiener
-from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.imaging.blur_path import BlurPath
+from colmap_inertial.imaging.path_filters import path_wiener
+from colmap_inertial.imaging.wiener import DeblurOptions
 from colmap_inertial.restoration import deepgyro, load_network
 
 THREADS = 2
@@ -26,17 +27,18 @@ THREADS = 2
 def measure(pair: Pair, weights: Sequence[Path], repeat: int) -> dict[str, Any]:
     """Least wall time of several runs, processor time of that run, and memory."""
     image, blur = pair.frame(0), pair.blur(0)
+    path = BlurPath.straight(blur)
     network = load_network("deepgyro", device="cpu", threads=THREADS)
-    options = wiener.DeblurOptions(threads=THREADS)
-    filtered = wiener.deblur(image, blur, options)
+    options = DeblurOptions(threads=THREADS)
+    filtered = path_wiener(image, path, options)
     runs: dict[str, tuple[Callable[[], object], int]] = {
-        "network": (lambda: network.restore(image, filtered, blur), repeat),
-        "DeepGyro": (lambda: deepgyro.deblur(image, blur, network=network), repeat),
-        "Wiener": (lambda: wiener.deblur(image, blur, options), 3 * repeat),
+        "network": (lambda: network.restore(image, filtered, path), repeat),
+        "DeepGyro": (lambda: deepgyro.deblur(image, path, network=network), repeat),
+        "Wiener": (lambda: path_wiener(image, path, options), 3 * repeat),
         "COLMAP's SIFT": (lambda: extract(image, -1), 1),
     }
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-        mib = pool.submit(_memory_mib, image, blur, list(weights)).result()
+        mib = pool.submit(_memory_mib, image, path, list(weights)).result()
     return {
         "size": list(image.shape[1::-1]),
         "threads": THREADS,
@@ -58,7 +60,7 @@ def least_s(run: Callable[[], object], repeat: int) -> tuple[float, float]:
     return min(times)
 
 
-def _memory_mib(image: Colour, blur: BlurField, weights: list[Path]) -> dict[str, float] | None:
+def _memory_mib(image: Colour, path: BlurPath, weights: list[Path]) -> dict[str, float] | None:
     """In a process of its own: what is in use before a frame is deblurred, and at most while it is."""
     if not Path("/proc/self/status").exists():
         return None
@@ -67,7 +69,7 @@ def _memory_mib(image: Colour, blur: BlurField, weights: list[Path]) -> dict[str
             use_weights(weights, Path(folder))
         network = load_network("deepgyro", device="cpu", threads=THREADS)
         before = _resident_mib("VmRSS")
-        deepgyro.deblur(image, blur, network=network)
+        deepgyro.deblur(image, path, network=network)
     return {"before": before, "peak": _resident_mib("VmHWM")}
 
 

@@ -3,12 +3,13 @@
 
     python scripts/train_restoration.py deepgyro --photos FOLDER --motion FOLDER --work FOLDER
 
-PHOTOS are sharp photographs (.jpg, .png; any folder will do), MOTION holds motion capture of people who carry a camera
-(*.csv in TUM-VI's layout; without it the simulator's motion alone is used). One in five photographs and the motion of
-one recording are never trained on: figures come from those.
+PHOTOS are sharp photographs (.jpg, .png; any folder will do), MOTION holds gyroscopes and motion capture of people who
+carry a camera (NAME_imu.csv.xz, NAME_gt.csv.xz as TUM-VI has them; without it the simulator's motion alone is used).
+One in five photographs and the motion of one recording are never trained on: figures come from those.
 
 Needs the extra ``train`` (PyTorch, ONNX). Uses a CUDA device where there is one. Started again with the same WORK
-folder, it goes on where it was. The defaults are what the shipped weights were made with, on two processor cores.
+folder, it goes on where it was. The defaults are for two processor cores; cards say how shipped weights were made.
+``--begin`` goes on from the weights of another network of the same kind (ONNX).
 ``thesis_unet`` is the yardstick, a U-Net as DeepGyro's own on picture and blur alone; give it --out, the package does
 not ship it. On a GPU, train longer on more:
 
@@ -25,7 +26,7 @@ from pathlib import Path
 import torch
 from restoration import samples
 from restoration.card import write_card
-from restoration.export import WEIGHTS, export
+from restoration.export import WEIGHTS, export, weights_of
 from restoration.network import RestorationNet, ThesisNet, parameters
 from restoration.pool import Sources, make_pool
 from restoration.training import TrainOptions, console, train
@@ -50,6 +51,8 @@ def main() -> None:
     parser.add_argument("--samples", type=int)
     parser.add_argument("--steps", type=int)
     parser.add_argument("--batch", type=int, default=8)
+    parser.add_argument("--rate", type=float, default=TrainOptions.rate)
+    parser.add_argument("--begin", dest="begun", type=Path, help="go on from the weights of this network (ONNX)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--width", type=int, default=64, help="of thesis_unet: channels at full size")
     parser.add_argument("--attribution", type=Path, help="text for the card: whose photographs and motion these are")
@@ -72,9 +75,14 @@ def main() -> None:
     }
     torch.set_num_threads(cores)
     torch.manual_seed(args.seed)
-    network = ThesisNet(args.width) if args.name == "thesis_unet" else RestorationNet()
+    network = (
+        ThesisNet(args.width) if args.name == "thesis_unet" else RestorationNet(samples.BLUR_CHANNELS[maker.__name__])
+    )
+    if args.begun:
+        network.load_state_dict(weights_of(args.begun, network))
     console.print(f"{args.name}: {parameters(network) / 1e6:.2f} million weights, on {args.device}")
-    options = TrainOptions(steps=args.steps or STEPS[args.name], batch=args.batch, seed=args.seed)
+    steps = args.steps or STEPS[args.name]
+    options = TrainOptions(steps=steps, batch=args.batch, rate=args.rate, warm_up=min(300, steps // 20), seed=args.seed)
     figures = train(network, pools[False], pools[True], work / "training", options, device=args.device)
     target = args.out / f"{args.name}.onnx"
     export(network, target)
@@ -84,6 +92,7 @@ def main() -> None:
             args.name,
             figures,
             samples=len(pools[False]),
+            begun=args.begun.stem if args.begun else "",
             device=args.device,
             attribution=args.attribution.read_text() if args.attribution else "Not stated.",
         )

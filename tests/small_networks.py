@@ -8,7 +8,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-SIZES = {"picture": [1, 3, "h", "w"], "aid": [1, 3, "h", "w"], "blur": [1, 3, "hh", "hw"]}
+SIZES = {"picture": [1, 3, "h", "w"], "aid": [1, 3, "h", "w"], "blur": [1, "c", "hh", "hw"]}
 #: How far `coarse` looks: the dilated filter, then the mean of a square of 16 px, of which it is at most 15 px away.
 COARSE_REACH_PX = 170 + 15
 

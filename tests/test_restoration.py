@@ -18,8 +18,9 @@ from onnx import TensorProto, helper
 
 from colmap_inertial import threads
 from colmap_inertial.errors import FormatError, InertialError, MissingExtraError
-from colmap_inertial.imaging import wiener
 from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.imaging.blur_path import BlurPath, middles
+from colmap_inertial.imaging.path_filters import path_wiener
 from colmap_inertial.restoration import (
     Network,
     _tiles,
@@ -115,7 +116,7 @@ def test_the_network_sees_length_and_double_angle_of_the_blur():
     blur = turning(90, 70, longest_px=30)
     backwards = BlurField(width=90, height=70, vector_px=-blur.vector_px)
     a = picture(70, 90, np.float32)
-    network = ready(small.seeing_blur())
+    network = ready(small.seeing_blur(), "lsd2")
     seen = 2 * network.restore(a, a, blur) - 1
     np.testing.assert_allclose(2 * network.restore(a, a, backwards) - 1, seen, atol=1e-6)
     x, y = np.moveaxis(blur.at(np.arange(70) // 2 * 2 + 0.5, np.arange(90) // 2 * 2 + 0.5), -1, 0)
@@ -124,6 +125,37 @@ def test_the_network_sees_length_and_double_angle_of_the_blur():
     np.testing.assert_allclose(seen, true, atol=1e-5)
     assert np.abs(true).max() > 0.7
     np.testing.assert_allclose(network.restore(a, a), 0.5, atol=1e-7)  # nothing is known
+
+
+def arc(width, height, bend_px, *, reverse=False):
+    """The same path everywhere: 20 px to the right, and as far up and down again as ``bend_px`` / 4."""
+    s = middles(41)
+    at = np.stack([20 * s, bend_px * s**2], axis=-1)[:: -1 if reverse else 1]
+    nodes = BlurField.nodes(width, height, 64)
+    return BlurPath(width=width, height=height, path_px=np.broadcast_to(at[:, None, None], (41, *nodes, 2)))
+
+
+def test_deepgyro_sees_the_chord_of_a_path_and_to_which_side_it_is_bent():
+    row, column = _tiles.tiles(70, 90)[0]
+    bend = 6.0
+    seen = _tiles.path_feed(arc(90, 70, bend), row, column)
+    np.testing.assert_allclose(seen[0, :3, 5, 7], [20 / 32, 0, 20 / 32], atol=1e-6)
+    # of q = v s + a s^2, a / 32, the same all over
+    np.testing.assert_allclose(seen[0, 3:], np.broadcast_to([[[0]], [[bend / 32]]], (2, 40, 48)), atol=2e-4)
+    np.testing.assert_allclose(_tiles.path_feed(arc(90, 70, bend, reverse=True), row, column), seen, atol=1e-6)
+    np.testing.assert_allclose(_tiles.path_feed(arc(90, 70, -bend), row, column)[0, 4], -seen[0, 4], atol=1e-6)
+    lines = turning(90, 70, longest_px=30)
+    straight = _tiles.path_feed(BlurPath.straight(lines), row, column)
+    np.testing.assert_allclose(straight[:, :3], _tiles.blur_feed(lines, row, column), atol=1e-5)
+    np.testing.assert_allclose(straight[:, 3:], 0, atol=1e-6)
+
+
+def test_deepgyro_is_told_of_paths_and_lsd2_of_lines():
+    a, lines = picture(32, 32), BlurField.uniform(32, 32, (5, 0))
+    with pytest.raises(ValueError, match="blur: deepgyro takes a BlurPath, not a BlurField"):
+        ready(small.mixing()).restore(a, a, lines)
+    with pytest.raises(ValueError, match="blur: lsd2 takes a BlurField, not a BlurPath"):
+        ready(small.mixing(), "lsd2").restore(a, a, BlurPath.straight(lines))
 
 
 def test_pictures_that_do_not_go_together_are_a_mistake():
@@ -135,7 +167,7 @@ def test_pictures_that_do_not_go_together_are_a_mistake():
     with pytest.raises(ValueError, match=r"image: \(H, W\) or \(H, W, 3\)"):
         network.restore(a[..., :2], a[..., :2])
     with pytest.raises(ValueError, match="blur: for 30 x 32 px, the image has 32 x 32"):
-        network.restore(a, a, BlurField.uniform(30, 32, (3, 0)))
+        network.restore(a, a, BlurPath.straight(BlurField.uniform(30, 32, (3, 0))))
 
 
 # --- parts ---------------------------------------------------------------------------------------------------------
@@ -185,7 +217,7 @@ def test_parts_do_not_show(monkeypatch, size, model):
 
 def test_blur_goes_to_its_part(monkeypatch):
     blur, a = turning(700, 500, longest_px=30), picture(500, 700, np.float32)
-    network = ready(small.seeing_blur())
+    network = ready(small.seeing_blur(), "lsd2")
     whole = network.restore(a, a, blur)
     monkeypatch.setattr(_tiles, "tiles", partial(_tiles.tiles, most_px=500**2))
     np.testing.assert_array_equal(network.restore(a, a, blur), whole)
@@ -353,8 +385,9 @@ def test_cuda_that_does_not_start_is_an_error_by_name_and_no_error_otherwise(wei
 @pytest.mark.parametrize("channels", [1, 3])
 def test_a_network_that_takes_the_filter_s_word_makes_what_the_filter_makes(dtype, channels):
     image, blur = scene(170, 230, dtype, channels), turning(230, 170)
-    filtered = wiener.deblur(image, blur)
-    made = deepgyro.deblur(image, blur, network=ready(small.mixing(1.0)))
+    path = BlurPath.straight(blur)
+    filtered = path_wiener(image, path)
+    made = deepgyro.deblur(image, path, network=ready(small.mixing(1.0)))
     assert made.dtype == dtype and made.shape == image.shape
     fully = around(np.hypot(*np.moveaxis(blur.per_pixel(), -1, 0)) > 1)
     np.testing.assert_array_equal(made[fully], filtered[fully])
@@ -365,7 +398,8 @@ def test_a_network_that_takes_the_filter_s_word_makes_what_the_filter_makes(dtyp
 def test_pixels_without_blur_stay_bit_for_bit(channels):
     image, blur = scene(170, 230, channels=channels), turning(230, 170)
     darker = ready(small.mixing(0.0, channels=(0.5, 0.5, 0.5)))
-    made, original = deepgyro.deblur(image, blur, network=darker), image.copy()
+    original = image.copy()
+    made = deepgyro.deblur(image, BlurPath.straight(blur), network=darker)
     length = np.hypot(*np.moveaxis(blur.per_pixel(), -1, 0))
     still = around(length < 0.5)
     assert still.mean() > 0.03
@@ -381,7 +415,8 @@ def test_blur_longer_than_the_network_knows_is_the_filter_s():
     rows, columns = BlurField.nodes(400, 130)
     length = np.broadcast_to(np.linspace(45, 100, columns), (rows, columns))
     blur = BlurField(width=400, height=130, vector_px=np.stack([length, 0 * length], axis=-1))
-    made, filtered = deepgyro.deblur(image, blur, network=darker), wiener.deblur(image, blur)
+    path = BlurPath.straight(blur)
+    made, filtered = deepgyro.deblur(image, path, network=darker), path_wiener(image, path)
     at = blur.per_pixel()[..., 0]
     long, short = around(at > 80), around(at < 60)
     assert long.mean() > 0.2 and short.mean() > 0.2
@@ -391,13 +426,21 @@ def test_blur_longer_than_the_network_knows_is_the_filter_s():
     share = np.clip((80 - at) / 20, 0, 1)[..., None]
     off = np.abs(made - (filtered + share * (0.5 * image - filtered)))
     assert off.max() < 8 and np.mean(off > 1.1) < 0.05
-    entirely = BlurField.uniform(400, 130, (0.0, 90.0))
-    np.testing.assert_array_equal(deepgyro.deblur(image, entirely, network=darker), wiener.deblur(image, entirely))
+    entirely = BlurPath.straight(BlurField.uniform(400, 130, (0.0, 90.0)))
+    np.testing.assert_array_equal(deepgyro.deblur(image, entirely, network=darker), path_wiener(image, entirely))
+
+
+def test_the_filter_that_the_network_sees_follows_the_curve():
+    image, curved = scene(200, 260), arc(260, 200, 24.0)
+    made = deepgyro.deblur(image, curved, network=ready(small.mixing(1.0)))
+    np.testing.assert_array_equal(made, path_wiener(image, curved))
+    straight = path_wiener(image, BlurPath.straight(curved.field()))
+    assert np.abs(made.astype(int) - straight).mean() > 1
 
 
 def test_a_sharp_picture_is_returned_as_it_is():
-    image = picture(64, 80)
-    made = deepgyro.deblur(image, BlurField.uniform(80, 64, (0.3, 0.1)), network=ready(small.mixing(0, (0, 0, 0))))
+    image, path = picture(64, 80), BlurPath.straight(BlurField.uniform(80, 64, (0.3, 0.1)))
+    made = deepgyro.deblur(image, path, network=ready(small.mixing(0, (0, 0, 0))))
     np.testing.assert_array_equal(made, image)
 
 
@@ -414,7 +457,8 @@ def test_exposures_are_fused_in_the_short_one_s_type():
 def test_one_network_is_not_taken_for_the_other():
     image = picture(32, 32)
     with pytest.raises(ValueError, match="network: deepgyro, not lsd2"):
-        deepgyro.deblur(image, BlurField.uniform(32, 32, (5, 0)), network=ready(small.mixing(), "lsd2"))
+        path = BlurPath.straight(BlurField.uniform(32, 32, (5, 0)))
+        deepgyro.deblur(image, path, network=ready(small.mixing(), "lsd2"))
     with pytest.raises(ValueError, match="network: lsd2, not deepgyro"):
         lsd2.fuse(image, image, network=ready(small.mixing()))
 
@@ -432,14 +476,16 @@ def test_the_package_has_whole_networks_of_the_right_kind(name):
     assert len(shipped.read_model(name)) < 10e6
     network = load_network(name, device="cpu")
     image = scene(200, 300)
-    restored = network.restore(image, image, BlurField.uniform(300, 200, (8, 3)))
+    lines = BlurField.uniform(300, 200, (8, 3))
+    restored = network.restore(image, image, BlurPath.straight(lines) if name == "deepgyro" else lines)
     assert restored.shape == image.shape and np.abs(restored.astype(int) - image).mean() < 20
 
 
 def test_parts_of_the_package_s_networks_do_not_show(name, monkeypatch):
     network = load_network(name, device="cpu")
-    a, blur = scene(520, 640), turning(640, 520, longest_px=25)
-    b = wiener.deblur(a, blur)
+    a, lines = scene(520, 640), turning(640, 520, longest_px=25)
+    path = BlurPath.straight(lines)
+    b, blur = path_wiener(a, path), path if name == "deepgyro" else lines
     whole = network.restore(a / np.float32(255), b, blur)
     monkeypatch.setattr(_tiles, "tiles", partial(_tiles.tiles, most_px=500**2))
     assert len(_tiles.tiles(520, 640)) == 4

@@ -3,7 +3,7 @@
 import io
 import json
 import sys
-from contextlib import contextmanager, redirect_stdout
+from contextlib import redirect_stdout
 from dataclasses import replace
 
 import cv2
@@ -19,7 +19,6 @@ from colmap_inertial.cli import main
 from colmap_inertial.drivers.capture import reconstruct
 from colmap_inertial.drivers.deblur import deblur_capture
 from colmap_inertial.errors import FormatError, MissingExtraError, NotObservableError
-from colmap_inertial.imaging import wiener
 from colmap_inertial.io.frames import read_frames
 from colmap_inertial.precalibrate import plan as imaging
 from colmap_inertial.precalibrate.plan import read_plan, write_plan
@@ -50,19 +49,10 @@ def weights(tmp_path, monkeypatch):
     return folder
 
 
-@contextmanager
-def the_network_s_filter():
-    """The filter along straight lines, which the network sees, in place of that along the path."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(DeblurStage, "_remover", lambda *_: lambda image, lines, _: wiener.deblur(image, lines))
-        yield
-
-
 @pytest.fixture(scope="module")
 def by_filter(tmp_path_factory, blurred):
     out = tmp_path_factory.mktemp("by_filter") / "out"
-    with the_network_s_filter():
-        return deblur_capture(blurred, out, progress=silent)
+    return deblur_capture(blurred, out, progress=silent)
 
 
 @pytest.fixture(scope="module")
@@ -195,8 +185,7 @@ def test_workers_share_the_network_and_make_the_same_pixels(blurred, deep_plan, 
             read_frames(loaded)[1],
         )
     )
-    with the_network_s_filter():
-        filtered = [frame.image for frame in replace(stage, method="wiener")(read_frames(loaded)[1])]
+    filtered = [frame.image for frame in replace(stage, method="wiener")(read_frames(loaded)[1])]
     np.testing.assert_array_equal(one, three)
     asked = []
     with monkeypatch.context() as context:

@@ -1,5 +1,6 @@
 """Training of the restoration networks; needs the extra ``train``."""
 
+import lzma
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -15,8 +16,8 @@ import torch
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 from restoration import samples
 from restoration.camera import jpeg, noisy, srgb
-from restoration.export import export
-from restoration.handheld import simulated
+from restoration.export import export, weights_of
+from restoration.handheld import recorded, simulated
 from restoration.network import RestorationNet
 from restoration.optics import ShotOptions, draw_shots
 from restoration.photographs import photographs
@@ -24,7 +25,8 @@ from restoration.pool import Pool, Sources, make_pool
 from restoration.training import TrainOptions, train, turned
 
 from colmap_inertial.imaging.blur_field import BlurField
-from colmap_inertial.restoration._tiles import OVERLAP_PX, Span, blur_feed
+from colmap_inertial.imaging.blur_path import BlurPath, middles
+from colmap_inertial.restoration._tiles import OVERLAP_PX, Span, path_feed
 
 
 @pytest.fixture(scope="module")
@@ -61,13 +63,54 @@ def test_a_point_smears_by_what_the_blur_field_says():
     for i in range(3):
         middle, spread = moments(smeared[i])
         place, own = moments(sharp[i])
-        x, y = (float(v) for v in shots.blur(*torch.tensor(middle, dtype=torch.float32)[:, None])[i, 0, 0])
+        there = torch.tensor(middle, dtype=torch.float32)[:, None]
+        x, y = (float(v) for v in shots.blur(*there)[i, 0, 0])
         # a segment of length L has second moments of L^2 / 12; interpolation widens points by up to a pixel
         np.testing.assert_allclose(spread - own, [x * x, y * y, x * y], atol=0.012 * (x * x + y * y) + 1)
-        np.testing.assert_allclose(middle, place, atol=0.15)
+        # where the path is bent, the smear lies to one side
+        mean = shots.path(*there, middles(64).tolist())[:, i, 0, 0].mean(dim=0).numpy()
+        np.testing.assert_allclose(middle + mean, place, atol=0.15)
     # as long as was wanted, but for what the rolling shutter makes of it
     middle = torch.tensor([64.0])
     np.testing.assert_allclose(shots.blur(middle, middle)[:, 0, 0].norm(dim=-1), [20, 14, 25], rtol=0.3)
+
+
+def test_a_point_s_light_stands_on_its_path_in_the_sharp_picture():
+    shots = drawn_shots([25.0, 18.0], 11)
+    scene = torch.zeros(2, 3, 192, 192)
+    scene[:, :, 96, 96] = 1
+    at = np.arange(128) + 0.5
+    for part in (-0.4, 0.3):
+        # the whole exposure at one part of it
+        moved = replace(shots, exposure_s=0 * shots.exposure_s, t_s=shots.t_s - part * shots.exposure_s[:, None])
+        then, middle = (s.render(scene, 1)[:, 0].numpy() for s in (moved, shots))
+        for i in range(2):
+            places = [
+                np.array([(a[i].sum(0) * at).sum(), (a[i].sum(1) * at).sum()]) / a[i].sum() for a in (then, middle)
+            ]
+            x, y = (torch.tensor([v], dtype=torch.float32) for v in places[0])
+            q = shots.path(x, y, (part,))[0, i, 0, 0].numpy()
+            assert np.hypot(*q) > 2
+            np.testing.assert_allclose(places[0] + q, places[1], atol=0.25)
+
+
+def test_recordings_turn_by_their_gyroscope_and_move_by_motion_capture(tmp_path):
+    t_ns = 10**18 + np.arange(0, 5 * 10**9, 5_000_000)
+    rate = np.stack([np.sin(np.arange(len(t_ns)) / 50), 0.3 + 0 * t_ns, -0.2 + 0 * t_ns], axis=1)
+    gt_ns = 10**18 + np.arange(0, 5 * 10**9, 8_333_333)
+    t_s = (gt_ns - gt_ns[0]) * 1e-9
+    # a body that is turned by a right angle about z, and goes along the world's x
+    pose = np.stack([0.7 * t_s, 0 * t_s, 0 * t_s, *(v + 0 * t_s for v in (0.5**0.5, 0, 0, 0.5**0.5))], axis=1)
+    for kind, ns, values in (("imu", t_ns, rate), ("gt", gt_ns, pose)):
+        with lzma.open(tmp_path / f"walk_{kind}.csv.xz", "wt") as file:
+            file.write("#timestamp\n")
+            file.writelines(
+                ",".join([str(n), *(f"{v:.9f}" for v in row)]) + "\n" for n, row in zip(ns, values, strict=True)
+            )
+    (piece,) = recorded(tmp_path, "walk")
+    found, velocity = piece.at(np.array([1.0, 2.5]))
+    np.testing.assert_allclose(found, rate[[200, 500]], atol=1e-6)
+    np.testing.assert_allclose(velocity, [[0, -0.7, 0]] * 2, atol=1e-5)
 
 
 def test_jpeg_is_that_of_the_usual_library():
@@ -106,9 +149,12 @@ def test_blur_turns_with_the_picture(photos):
     size = samples.SIDE
     rows = np.linspace(2, 9, BlurField.nodes(size, size)[0])[:, None, None] * [1.0, 0.3]
     field = BlurField(width=size, height=size, vector_px=np.broadcast_to(rows, (*BlurField.nodes(size, size), 2)))
+    bend = np.array([8.0, -3.0])
+    arc = middles(17)[:, None, None, None] * field.vector_px + middles(17)[:, None, None, None] ** 2 * bend
+    path = BlurPath(width=size, height=size, step_px=field.step_px, path_px=arc.astype(np.float32))
     picture = np.random.default_rng(0).integers(0, 256, (1, size, size, 3), dtype=np.uint8)
     whole = Span(begin=0, end=size, keep_begin=0, keep_end=size)
-    blur = blur_feed(field, whole, whole).transpose(0, 2, 3, 1).astype(np.float16)
+    blur = path_feed(path, whole, whole).transpose(0, 2, 3, 1).astype(np.float16)
     one = samples.Samples(picture=picture, aid=picture, truth=picture, blur=blur)
     v = field.per_pixel()
     ways = set()
@@ -116,16 +162,17 @@ def test_blur_turns_with_the_picture(photos):
         out = turned(one, np.random.default_rng(seed))
         grey = out.picture.sum(axis=-1)[0]
         for flip_x, flip_y, transpose in np.ndindex(2, 2, 2):
-            moved, w = picture.sum(axis=-1)[0], v
-            moved, w = (moved[:, ::-1], w[:, ::-1] * [-1, 1]) if flip_x else (moved, w)
-            moved, w = (moved[::-1], w[::-1] * [1, -1]) if flip_y else (moved, w)
-            moved, w = (moved.T, w.swapaxes(0, 1)[..., ::-1]) if transpose else (moved, w)
+            moved, w, a = picture.sum(axis=-1)[0], v, bend / 32
+            moved, w, a = (moved[:, ::-1], w[:, ::-1] * [-1, 1], a * [-1, 1]) if flip_x else (moved, w, a)
+            moved, w, a = (moved[::-1], w[::-1] * [1, -1], a * [1, -1]) if flip_y else (moved, w, a)
+            moved, w, a = (moved.T, w.swapaxes(0, 1)[..., ::-1], a[::-1]) if transpose else (moved, w, a)
             if np.array_equal(moved, grey):
                 ways.add((flip_x, flip_y, transpose))
                 x, y = w[::2, ::2].transpose(2, 0, 1)
                 length = np.hypot(x, y)
                 expected = np.stack([(x * x - y * y) / length, 2 * x * y / length, length], axis=-1) / 32
-                np.testing.assert_allclose(out.blur[0], expected, atol=0.01)
+                np.testing.assert_allclose(out.blur[0, ..., :3], expected, atol=0.01)
+                np.testing.assert_allclose(out.blur[0, ..., 3:], np.broadcast_to(a, expected[..., :2].shape), atol=2e-3)
     assert len(ways) == 8
 
 
@@ -193,11 +240,39 @@ def test_what_is_exported_computes_what_was_trained(pools, tmp_path):
     export(network, tmp_path / "some.onnx")
     session = onnxruntime.InferenceSession(str(tmp_path / "some.onnx"), providers=["CPUExecutionProvider"])
     picture, aid = torch.rand(2, 1, 3, 64, 96)
-    blur = torch.rand(1, 3, 32, 48)
+    blur = torch.rand(1, 5, 32, 48)
     inputs = {"picture": picture, "aid": aid, "blur": blur}
     (found,) = session.run(None, {name: value.numpy() for name, value in inputs.items()})
     with torch.no_grad():
         np.testing.assert_allclose(found, network(picture, aid, blur).numpy(), atol=2e-3)
+
+
+def test_training_goes_on_from_what_was_exported(tmp_path):
+    torch.manual_seed(2)
+    trained = RestorationNet(3)
+    for parameter in trained.parameters():
+        parameter.data += 0.02 * torch.randn_like(parameter)
+    export(trained, tmp_path / "some.onnx")
+    # one that is told more of the blur than that takes no notice of it at first
+    told = RestorationNet(5)
+    told.load_state_dict(weights_of(tmp_path / "some.onnx", told))
+    picture, aid = torch.rand(2, 1, 3, 64, 96)
+    blur = torch.rand(1, 5, 32, 48)
+    with torch.no_grad():
+        torch.testing.assert_close(told(picture, aid, blur), trained(picture, aid, blur[:, :3]), rtol=0, atol=2e-3)
+    with pytest.raises(SystemExit, match=r"enter\.weight has the shape"):
+        weights_of(tmp_path / "some.onnx", RestorationNet(2))
+
+
+def test_faint_texture_that_is_lost_counts_as_strong_edges_do():
+    from restoration.training import _loss
+
+    x = torch.arange(64.0).expand(64, 64)
+    wave = torch.sin(x / 2)[None, None].expand(1, 3, 64, 64)
+    grey = torch.full_like(wave, 0.5)
+    lost = {contrast: float(_loss(grey, grey + contrast * wave)) for contrast in (0.0, 0.1, 0.4)}
+    # without that term it would be four times as much
+    assert lost[0.0] < 0.003 < 0.06 < lost[0.1] and lost[0.4] < 3.5 * lost[0.1]
 
 
 def test_the_network_looks_no_further_than_its_parts_overlap(monkeypatch):
@@ -213,7 +288,7 @@ def test_the_network_looks_no_further_than_its_parts_overlap(monkeypatch):
     for which in range(2):
         pictures = [torch.ones(1, 3, 48, 832, dtype=torch.float64) for _ in range(2)]
         pictures[which].requires_grad_()
-        restored = network(*pictures, torch.ones(1, 3, 24, 416, dtype=torch.float64))
+        restored = network(*pictures, torch.ones(1, 5, 24, 416, dtype=torch.float64))
         (slope,) = torch.autograd.grad(restored[..., 16:32, begin:end].sum(), pictures[which])
         (at,) = (slope != 0).any(dim=2).flatten(0, 1).any(dim=0).nonzero(as_tuple=True)
         seen.add((begin - int(at.min()), int(at.max()) + 1 - end))
@@ -227,7 +302,8 @@ def test_both_networks_samples_are_of_one_kind(pools, photos):
         made = maker(material, 2, rng, "cpu")
         inner = samples.SIDE - 2 * samples.MARGIN
         assert made.picture.shape == made.aid.shape == made.truth.shape == (2, inner, inner, 3)
-        assert made.blur.shape == (2, inner // 2, inner // 2, 3) and np.isfinite(made.blur).all()
+        channels = samples.BLUR_CHANNELS[maker.__name__]
+        assert made.blur.shape == (2, inner // 2, inner // 2, channels) and np.isfinite(made.blur).all()
         assert made.truth.std() > 10
 
 

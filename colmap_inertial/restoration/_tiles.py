@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from colmap_inertial.imaging._bilinear import bilinear
 from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.imaging.blur_path import BlurPath
 
 #: Sides of what a network sees are multiples of this, and so are the places of parts: it halves images four times.
 MULTIPLE = 16
@@ -17,8 +18,9 @@ MULTIPLE = 16
 OVERLAP_PX = 192
 #: Pixels that a network sees at once, as in 1920 x 1080; each takes about 250 bytes.
 MOST_PX = 1920 * 1088
-#: Length of blur that networks call 1.
-UNIT_PX = 32
+#: What networks call 1: a length of blur, and a distance between the middle of a path and its mean, which is a third of
+#: how far the middle of an arc is from its chord.
+UNIT_PX, BEND_UNIT_PX = 32.0, 32.0 / 12
 
 
 @dataclass(frozen=True)
@@ -87,25 +89,42 @@ def feed(image: NDArray[Any], row: Span, column: Span) -> NDArray[np.float32]:
     return out
 
 
-def blur_feed(blur: BlurField | None, row: Span, column: Span) -> NDArray[np.float32]:
-    """(1, 3, H / 2, W / 2) the blur of a part: (L cos 2a, L sin 2a, L) / 32 for L px at angle a; zeros for none.
+def blur_feed(blur: BlurField, row: Span, column: Span) -> NDArray[np.float32]:
+    """(1, 3, H / 2, W / 2) the blur of a part: (L cos 2a, L sin 2a, L) / 32 for L px at angle a.
 
     The double angle is the same for a vector and its negative. Values hold at the centres of 2 x 2 pixels.
     """
-    out = np.zeros((1, 3, row.size // 2, column.size // 2), dtype=np.float32)
-    if blur is None:
-        return out
-    at_rows, at_columns = (
-        np.minimum(np.arange(span.begin + 0.5, span.end, 2), limit - 1) / blur.step_px
-        for span, limit in ((row, blur.height), (column, blur.width))
-    )
-    x, y = np.moveaxis(bilinear(blur.vector_px, at_rows, at_columns), -1, 0)
+    out = np.empty((1, 3, row.size // 2, column.size // 2), dtype=np.float32)
+    x, y = np.moveaxis(_at_centres(blur, row, column), -1, 0)
     cosine, sine, length = out[0]
     np.divide(np.hypot(x, y), np.float32(UNIT_PX), out=length)
     per_length = np.divide(1 / UNIT_PX**2, length, out=np.zeros_like(length), where=length > 0)
     np.multiply(x * x - y * y, per_length, out=cosine)
     np.multiply(2 * x * y, per_length, out=sine)
     return out
+
+
+def path_feed(path: BlurPath, row: Span, column: Span) -> NDArray[np.float32]:
+    """(1, 5, H / 2, W / 2) the path of a part: its chord as :func:`blur_feed` has it, and its bend.
+
+    The bend is the mean of the path, (x, y) in units of `BEND_UNIT_PX`: nothing for a line that is run through evenly,
+    and the same for a path and its reverse in time, as their blur is.
+    """
+    mean = path.path_px.mean(axis=0)
+    bend = BlurField(width=path.width, height=path.height, step_px=path.step_px, vector_px=mean)
+    out = np.empty((1, 5, row.size // 2, column.size // 2), dtype=np.float32)
+    out[:, :3] = blur_feed(path.field(), row, column)
+    out[0, 3:] = np.moveaxis(_at_centres(bend, row, column), -1, 0) / BEND_UNIT_PX
+    return out
+
+
+def _at_centres(blur: BlurField, row: Span, column: Span) -> NDArray[np.float64]:
+    """(H / 2, W / 2, 2) a field at the centres of 2 x 2 pixels."""
+    at_rows, at_columns = (
+        np.minimum(np.arange(span.begin + 0.5, span.end, 2), limit - 1) / blur.step_px
+        for span, limit in ((row, blur.height), (column, blur.width))
+    )
+    return bilinear(blur.vector_px, at_rows, at_columns)
 
 
 def put(image: NDArray[Any], restored: NDArray[np.float32], row: Span, column: Span) -> None:

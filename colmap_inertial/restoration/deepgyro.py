@@ -1,8 +1,8 @@
 """DeepGyro: motion blur that a gyroscope knows, undone by a network.
 
-After Mustaniemi et al., "Gyroscope-Aided Motion Deblurring with Deep Networks" (2019), with one more input: what the
-directional Wiener filter makes of the image. Where the blur field is right, the filter's result is sharp already;
-where it is not, the network sees both and need not believe it.
+After Mustaniemi et al., "Gyroscope-Aided Motion Deblurring with Deep Networks" (2019), with one more input: what
+Wiener's filter along the path makes of the image. Where the path is right, the filter's result is sharp already; where
+it is not, the network sees both and need not believe it.
 """
 
 from __future__ import annotations
@@ -12,10 +12,12 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.imaging import wiener
 from colmap_inertial.imaging._bilinear import bilinear
 from colmap_inertial.imaging._cells import CELL_PX, Cells
 from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.imaging.blur_path import BlurPath
+from colmap_inertial.imaging.path_filters import path_wiener
+from colmap_inertial.imaging.wiener import DeblurOptions
 from colmap_inertial.restoration.network import Network
 
 Code = TypeVar("Code", np.uint8, np.uint16)
@@ -25,38 +27,39 @@ Code = TypeVar("Code", np.uint8, np.uint16)
 LONGEST_PX = (60.0, 80.0)
 
 
-def deblur(image: NDArray[Code], blur: BlurField, *, network: Network) -> NDArray[Code]:
+def deblur(image: NDArray[Code], path: BlurPath, *, network: Network) -> NDArray[Code]:
     """Undo the motion blur of an image.
 
     Parameters
     ----------
     image
         (H, W) or (H, W, 3), uint8 or uint16, sRGB.
-    blur
-        Along which line every pixel smears; of the image's size.
+    path
+        Along which every pixel smears; of the image's size.
     network
         ``load_network("deepgyro")``.
 
     Returns
     -------
     A new image of the same shape and type. Pixels whose blur is below half a pixel are the input's, bit for bit, and
-    those whose blur is longer than the network knows (`LONGEST_PX`) the Wiener filter's.
+    those whose blur is longer than the network knows (`LONGEST_PX`) the filter's.
 
     Raises
     ------
     ValueError
-        For another network, and for what `imaging.wiener.deblur` refuses.
+        For another network, and for what `imaging.path_filters.path_wiener` refuses.
     """
     if network.name != "deepgyro":
         raise ValueError(f"network: deepgyro, not {network.name}")
-    filtered = wiener.deblur(image, blur, wiener.DeblurOptions(threads=network.threads))
-    known = _known(blur)
+    filtered = path_wiener(image, path, DeblurOptions(threads=network.threads))
+    chords = path.field()
+    known = _known(chords)
     if known.max() == 0:
         return filtered
-    restored = network.restore(image, filtered, blur)
+    restored = network.restore(image, filtered, path)
     _blend(restored, filtered, known)
-    # where there is no blur to speak of, as the Wiener filter does
-    _blend(restored, image, Cells.of(blur).fade)
+    # where there is no blur to speak of, as the filter does
+    _blend(restored, image, Cells.of(chords).fade)
     return restored
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from colmap_inertial.errors import FormatError, InertialError, MissingExtraError
 from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.imaging.blur_path import BlurPath
 from colmap_inertial.restoration import _tiles
 from colmap_inertial.restoration.shipped import NetworkName, model_file, read_model
 from colmap_inertial.threads import usable_processors
@@ -23,8 +24,9 @@ Device = Literal["auto", "cpu", "cuda"]
 Sample = TypeVar("Sample", np.uint8, np.uint16, np.float32)
 
 _CUDA, _CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
-#: What networks take; all have three channels, "blur" half the height and width.
+#: What networks take; pictures have three channels, "blur" these, and half the height and width.
 _INPUTS = ("picture", "aid", "blur")
+_BLUR_CHANNELS: dict[NetworkName, int] = {"deepgyro": 5, "lsd2": 3}
 _OUTPUT = "restored"
 _MORE_MEMORY = {
     "cuda": "if memory is short, close what else uses the GPU, or hide it (CUDA_VISIBLE_DEVICES=) to use the processor",
@@ -61,8 +63,9 @@ class Network:
         Parameters
         ----------
         model
-            The file's content. Inputs ``picture`` and ``aid`` (1, 3, H, W) and ``blur`` (1, 3, H / 2, W / 2), output
-            ``restored`` (1, 3, H, W), all float32, for any H and W that are multiples of 16.
+            The file's content. Inputs ``picture`` and ``aid`` (1, 3, H, W) and ``blur`` (1, C, H / 2, W / 2), C 5 for
+            DeepGyro and 3 for LSD2, output ``restored`` (1, 3, H, W), all float32, for any H and W that are multiples
+            of 16.
         name
             What the network does.
         source
@@ -86,10 +89,12 @@ class Network:
         on: Literal["cpu", "cuda"] = "cuda" if _CUDA in session.get_providers() else "cpu"
         network = cls(name=name, device=on, threads=threads, _session=session)
         _require_device(network, device)
-        _require_contract(session, source)
+        _require_contract(session, source, _BLUR_CHANNELS[name])
         return network
 
-    def restore(self, image: NDArray[Sample], aid: NDArray[Any], blur: BlurField | None = None) -> NDArray[Sample]:
+    def restore(
+        self, image: NDArray[Sample], aid: NDArray[Any], blur: BlurPath | BlurField | None = None
+    ) -> NDArray[Sample]:
         """Restore an image.
 
         Parameters
@@ -97,10 +102,10 @@ class Network:
         image
             (H, W) or (H, W, 3) sRGB: codes of uint8 or uint16, or float32 from 0 to 1.
         aid
-            Likewise, of the same shape: the second image of the scene, for DeepGyro the Wiener filter's result, for
+            Likewise, of the same shape: the second image of the scene, for DeepGyro the path filter's result, for
             LSD2 the long exposure.
         blur
-            Of the same size; ``None`` where nothing is known of it.
+            Of the same size, for DeepGyro a path, for LSD2 a field; ``None`` where nothing is known of it.
 
         Returns
         -------
@@ -119,12 +124,13 @@ class Network:
             Where the device fails, as for want of memory.
         """
         _require_images(image, aid, blur)
+        self._require_kind(blur)
         result = np.empty_like(image, order="C")
         for row, column in _tiles.tiles(*image.shape[:2]):
             feeds = {
                 "picture": _tiles.feed(image, row, column),
                 "aid": _tiles.feed(aid, row, column),
-                "blur": _tiles.blur_feed(blur, row, column),
+                "blur": self._blur_feed(blur, row, column),
             }
             try:
                 (restored,) = self._session.run([_OUTPUT], feeds)
@@ -135,6 +141,20 @@ class Network:
                 ) from None
             _tiles.put(result, np.asarray(restored, dtype=np.float32)[0], row, column)
         return result
+
+    def _require_kind(self, blur: BlurPath | BlurField | None) -> None:
+        wanted = BlurPath if self.name == "deepgyro" else BlurField
+        if blur is not None and not isinstance(blur, wanted):
+            raise ValueError(f"blur: {self.name} takes a {wanted.__name__}, not a {type(blur).__name__}")
+
+    def _blur_feed(
+        self, blur: BlurPath | BlurField | None, row: _tiles.Span, column: _tiles.Span
+    ) -> NDArray[np.float32]:
+        if blur is None:
+            return np.zeros((1, _BLUR_CHANNELS[self.name], row.size // 2, column.size // 2), dtype=np.float32)
+        if isinstance(blur, BlurPath):
+            return _tiles.path_feed(blur, row, column)
+        return _tiles.blur_feed(blur, row, column)
 
 
 def load_network(name: NetworkName, *, device: Device = "auto", threads: int | None = None) -> Network:
@@ -233,7 +253,7 @@ def _start(model: bytes, source: str, device: Literal["cpu", "cuda"], threads: i
         raise FormatError(source, f"onnxruntime cannot read it as a network ({_first_line(error)})") from None
 
 
-def _require_contract(session: onnxruntime.InferenceSession, source: str) -> None:
+def _require_contract(session: onnxruntime.InferenceSession, source: str, blur_channels: int) -> None:
     """Raise where a network is not of the kind that `Network.of` describes."""
     inputs = {node.name: node.type for node in session.get_inputs()}
     outputs = [node.name for node in session.get_outputs()]
@@ -245,7 +265,7 @@ def _require_contract(session: onnxruntime.InferenceSession, source: str) -> Non
         )
     for height, width in ((32, 48), (48, 32)):
         image = np.zeros((1, 3, height, width), dtype=np.float32)
-        blur = np.zeros((1, 3, height // 2, width // 2), dtype=np.float32)
+        blur = np.zeros((1, blur_channels, height // 2, width // 2), dtype=np.float32)
         try:
             (restored,) = session.run([_OUTPUT], {"picture": image, "aid": image, "blur": blur})
         except Exception as error:  # as above
@@ -259,7 +279,7 @@ def _first_line(error: Exception) -> str:
     return next(iter(str(error).strip().splitlines()), type(error).__name__)[:200]
 
 
-def _require_images(image: NDArray[Any], aid: NDArray[Any], blur: BlurField | None) -> None:
+def _require_images(image: NDArray[Any], aid: NDArray[Any], blur: BlurPath | BlurField | None) -> None:
     for name, array in (("image", image), ("aid", aid)):
         if array.dtype not in (np.uint8, np.uint16, np.float32):
             raise ValueError(f"{name}: uint8, uint16 or float32, not {array.dtype}")

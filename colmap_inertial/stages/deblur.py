@@ -9,7 +9,6 @@ from typing import Any, get_args
 import numpy as np
 
 from colmap_inertial.errors import NotObservableError
-from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath
 from colmap_inertial.imaging.gate import FrameDecision, GateOptions, RecordingVerdict, judge_frame, keep_sharp
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
@@ -36,8 +35,8 @@ SMOOTHING, MOST_SMOOTHING_PX = 0.06, 1.2
 #: A frame of which more than this share stays as it was is not smoothed.
 _MOSTLY_KEPT = 0.5
 
-#: Undoes the blur of an image: along lines, or along the path.
-_Remover = Callable[[Any, BlurField, BlurPath], Any]
+#: Undoes the blur of an image along its path.
+_Remover = Callable[[Any, BlurPath], Any]
 
 
 def smoothing_for(blur_px: float, share: float = SMOOTHING, most_px: float = MOST_SMOOTHING_PX) -> float:
@@ -126,9 +125,9 @@ class DeblurStage:
         """Undoes the blur of one frame; ``workers`` call it at once."""
         if self.method == "deepgyro":
             network = load_network("deepgyro", threads=threads_beside(workers))
-            return lambda image, lines, _: deepgyro.deblur(image, lines, network=network)
+            return lambda image, path: deepgyro.deblur(image, path, network=network)
         restore = half_quadratic if self.method == "path" else path_wiener
-        return lambda image, _, path: restore(image, path, DeblurOptions(threads=1))
+        return lambda image, path: restore(image, path, DeblurOptions(threads=1))
 
     def _treated(
         self,
@@ -166,7 +165,7 @@ class DeblurStage:
         if factor != 1.0:
             blur = blur.times(factor)
         path = blur_path(motion, camera, shutter, parallax=parallax, extent_factor=factor)
-        out, kept = keep_sharp(image, remove(image, blur, path), blur)
+        out, kept = keep_sharp(image, remove(image, path), blur)
         width_px = smoothing_for(factor * (decision.blur_px or 0.0), self.smoothing, self.most_smoothing_px)
         smoothing_px = width_px if kept < _MOSTLY_KEPT else 0.0
         return replace(said(reason, kept, factor, "deblurred"), image=out, smoothing_px=smoothing_px)

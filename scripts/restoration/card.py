@@ -12,15 +12,17 @@ from restoration.network import DOWN, UP, WIDTHS, RestorationNet, parameters
 
 _PURPOSE = {
     "deepgyro": """\
-Undoes motion blur that a gyroscope knows of, with errors. Takes the blurred picture, the result of the directional
-Wiener filter, and the blur of each pixel.""",
+Undoes motion blur that a gyroscope knows of, with errors. Takes the blurred picture, the result of Wiener's filter
+along the path, and the path of each pixel: its chord and its bend.""",
     "lsd2": """\
 Makes one clean picture of a short, noisy exposure and a long, blurred one. Takes the short one at the long one's
 brightness, the long one aligned to it, and the long one's blur where it is known.""",
 }
 
 
-def write_card(path: Path, name: str, figures: dict[str, Any], *, samples: int, device: str, attribution: str) -> None:
+def write_card(
+    path: Path, name: str, figures: dict[str, Any], *, samples: int, begun: str, device: str, attribution: str
+) -> None:
     """Write the card of a network, Markdown.
 
     Parameters
@@ -31,6 +33,8 @@ def write_card(path: Path, name: str, figures: dict[str, Any], *, samples: int, 
         What :func:`restoration.training.train` returned.
     samples
         How many it was trained on.
+    begun
+        What it went on from; empty where from nothing.
     device
         That trained it.
     attribution
@@ -39,6 +43,7 @@ def write_card(path: Path, name: str, figures: dict[str, Any], *, samples: int, 
     machine = torch.cuda.get_device_name() if device == "cuda" else _processor()
     options, minutes = figures["options"], figures["seconds"] / 60
     first, second = ("blurred", "Wiener") if name == "deepgyro" else ("short", "long")
+    begin = f" --begin {begun}.onnx" if begun else ""
     rows = "\n".join(
         f"| {step} | {psnr['picture']:.2f} | {psnr['aid']:.2f} | {psnr['restored']:.2f} |"
         for step, psnr in figures["held_out_psnr_db"].items()
@@ -55,15 +60,17 @@ def write_card(path: Path, name: str, figures: dict[str, Any], *, samples: int, 
 | channels | {", ".join(map(str, WIDTHS))} at 1/2 to 1/16; {DOWN} blocks down, {UP} up |
 | file | ONNX, weights in half precision, arithmetic in single precision |
 | trained on | {samples} pieces of 192 x 192 px, {options["steps"]} steps of {options["batch"]} |
+| begun | {f"with the weights of {begun}" if begun else "from nothing"} |
 | by | AdamW, rate {options["rate"]} down along a cosine, seed {options["seed"]}; PyTorch {torch.__version__} |
 | took | {minutes:.0f} minutes on {machine} |
 | licence | the package's; the weights contain none of the photographs |
 
-To make it again, with folders of photographs and motion capture:
+To make it again, with folders of photographs and recorded motion:
 
 ```sh
 python scripts/train_restoration.py {name} --photos PHOTOS --motion MOTION --work WORK \\
-    --samples {samples} --steps {options["steps"]} --batch {options["batch"]} --seed {options["seed"]}
+    --samples {samples} --steps {options["steps"]} --batch {options["batch"]} --rate {options["rate"]} \\
+    --seed {options["seed"]}{begin}
 ```
 
 ## Data and attribution

@@ -11,17 +11,19 @@ import numpy as np
 import onnx
 import torch
 from onnx import TensorProto, helper, numpy_helper
-from torch import nn
+from torch import Tensor
+
+from restoration.network import RestorationNet, ThesisNet
 
 #: The package's folder of weights.
 WEIGHTS = Path(__file__).parents[2] / "colmap_inertial" / "restoration" / "weights"
 _OPSET = 17
 
 
-def export(network: nn.Module, path: Path) -> None:
+def export(network: RestorationNet | ThesisNet, path: Path) -> None:
     """Write a network as ONNX: any size of picture, weights in half precision, arithmetic in single precision."""
     network = network.to("cpu").eval().to(memory_format=torch.contiguous_format)
-    picture, blur = torch.zeros(1, 3, 64, 64), torch.zeros(1, 3, 32, 32)
+    picture, blur = torch.zeros(1, 3, 64, 64), torch.zeros(1, network.blur_channels, 32, 32)
     whole, half = {2: "height", 3: "width"}, {2: "half_height", 3: "half_width"}
     path.parent.mkdir(parents=True, exist_ok=True)
     with warnings.catch_warnings():
@@ -42,6 +44,25 @@ def export(network: nn.Module, path: Path) -> None:
     onnx.checker.check_model(model)
     onnx.save(model, path)
     _note_checksum(path)
+
+
+def weights_of(path: Path, network: RestorationNet) -> dict[str, Tensor]:
+    """The weights of an exported network as the state of ``network`` to begin with.
+
+    Where that one is told more of the blur, it takes no notice of it at first.
+    """
+    stored = {w.name.removesuffix(".half"): w for w in onnx.load(path).graph.initializer}
+    state = {}
+    for name, own in network.state_dict().items():
+        if name not in stored:
+            raise SystemExit(f"{path}: holds no weights {name}")
+        found = torch.from_numpy(numpy_helper.to_array(stored[name]).astype(np.float32))
+        if name == "enter.weight" and found.shape[1] < own.shape[1]:
+            found = torch.cat([found, torch.zeros_like(own[:, found.shape[1] :])], dim=1)
+        if found.shape != own.shape:
+            raise SystemExit(f"{path}: {name} has the shape {tuple(found.shape)}, not {tuple(own.shape)}")
+        state[name] = found
+    return state
 
 
 def _halve(graph: onnx.GraphProto) -> None:

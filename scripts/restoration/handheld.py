@@ -1,18 +1,19 @@
-"""How hands move cameras: turning and moving, from motion capture or from the package's simulator."""
+"""How hands move cameras: turning and moving, from recordings or from the package's simulator."""
 
 from __future__ import annotations
 
+import lzma
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from colmap_inertial.geometry import matrix_from_quat, quat_conjugate, quat_log, quat_multiply, quat_normalize
+from colmap_inertial.geometry import matrix_from_quat, quat_normalize
 from colmap_inertial.simulate import MotionOptions, make_motion
 from colmap_inertial.types import Array
 
-#: Motion capture at 120 Hz is smoothed by this many samples: what lies above 15 Hz is its noise.
+#: Motion capture's places at 120 Hz are smoothed by this many samples: what lies above 15 Hz is its noise.
 _SMOOTHED_SAMPLES = 1.2
 _LONGEST_STEP_S, _SHORTEST_PIECE_S = 0.02, 3.0
 _SIMULATED_HZ, _SIMULATED_S = 200.0, 60.0
@@ -36,29 +37,39 @@ class Handheld:
         return out[0], out[1]
 
 
-def captured(path: Path) -> list[Handheld]:
-    """The pieces of a motion-capture file in TUM-VI's layout: t_ns, x, y, z, qw, qx, qy, qz."""
-    table = np.loadtxt(path, delimiter=",", comments="#")
-    t_s = (table[:, 0] - table[0, 0]) * 1e-9
+def recorded(folder: Path, name: str) -> list[Handheld]:
+    """A recording's pieces without a gap: turning by its gyroscope, velocity by motion capture.
+
+    TUM-VI's layout: ``NAME_imu.csv.xz`` t_ns, rate x, y, z, ... and ``NAME_gt.csv.xz`` t_ns, x, y, z, qw, qx, qy, qz.
+    """
+    imu, table = (_table(folder / f"{name}_{kind}.csv.xz") for kind in ("imu", "gt"))
+    begin_ns = imu[0, 0]
+    imu_s, t_s = (imu[:, 0] - begin_ns) * 1e-9, (table[:, 0] - begin_ns) * 1e-9
     cuts = np.flatnonzero(np.diff(t_s) > _LONGEST_STEP_S) + 1
     pieces = []
     for i in np.split(np.arange(len(t_s)), cuts):
         if t_s[i[-1]] - t_s[i[0]] < _SHORTEST_PIECE_S:
             continue
-        step_s = np.diff(t_s[i])[:, None]
         place = gaussian_filter1d(table[i, 1:4], _SMOOTHED_SAMPLES, axis=0)
         world_from_body = table[i][:, [5, 6, 7, 4]]
-        turn = quat_log(quat_multiply(quat_conjugate(world_from_body[:-1]), world_from_body[1:])) / step_s
         between = quat_normalize(world_from_body[:-1] + _same_side(world_from_body[:-1], world_from_body[1:]))
         body_from_world = np.swapaxes(matrix_from_quat(between), -1, -2)
+        velocity = np.einsum("nij,nj->ni", body_from_world, np.diff(place, axis=0) / np.diff(t_s[i])[:, None])
+        middle_s = 0.5 * (t_s[i][:-1] + t_s[i][1:])
+        inside = (imu_s >= middle_s[0]) & (imu_s <= middle_s[-1])
         pieces.append(
             Handheld(
-                t_s=0.5 * (t_s[i][:-1] + t_s[i][1:]),
-                rate_rad_s=gaussian_filter1d(turn, _SMOOTHED_SAMPLES, axis=0),
-                velocity_m_s=np.einsum("nij,nj->ni", body_from_world, np.diff(place, axis=0) / step_s),
+                t_s=imu_s[inside],
+                rate_rad_s=imu[inside, 1:4],
+                velocity_m_s=np.stack([np.interp(imu_s[inside], middle_s, v) for v in velocity.T], axis=-1),
             )
         )
     return pieces
+
+
+def _table(path: Path) -> Array:
+    with lzma.open(path, "rt") as file:
+        return np.loadtxt([line for line in file if line[0] != "#"], delimiter=",")
 
 
 def simulated(count: int, seed: int) -> list[Handheld]:

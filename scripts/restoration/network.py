@@ -1,7 +1,7 @@
 """The network that DeepGyro and LSD2 share: a small residual U-Net that works at half the picture's size.
 
 Like the thesis's networks, it sees two pictures of the same scene and the blur; unlike them, one of the two is already
-restored as well as the known blur allows (the directional Wiener filter) or free of blur (the short exposure), and the
+restored as well as the known path allows (Wiener's filter along it) or free of blur (the short exposure), and the
 network says for each pixel how much of which to take, and what to add.
 """
 
@@ -37,14 +37,15 @@ class Block(nn.Module):
 class RestorationNet(nn.Module):
     """``restored = picture + share (aid - picture) + rest``, with the share and the rest from a U-Net.
 
-    Inputs are ``picture`` and ``aid``, (N, 3, H, W) sRGB 0 to 1, and ``blur``, (N, 3, H / 2, W / 2): (L cos 2a,
-    L sin 2a, L) / 32 for a blur of L px at angle a, which is the same for a vector and its negative.
+    Inputs are ``picture`` and ``aid``, (N, 3, H, W) sRGB 0 to 1, and ``blur``, (N, C, H / 2, W / 2), as
+    ``colmap_inertial/restoration/_tiles.py`` makes it of paths (C = 5) or of lines (3).
     """
 
-    def __init__(self, share: float = 0.5) -> None:
+    def __init__(self, blur_channels: int = 5, share: float = 0.5) -> None:
         super().__init__()
         half, *_ = WIDTHS
-        self.enter = nn.Conv2d(2 * 12 + 3, half, 3, padding=1)
+        self.blur_channels = blur_channels
+        self.enter = nn.Conv2d(2 * 12 + blur_channels, half, 3, padding=1)
         self.down = nn.ModuleList(
             nn.Sequential(*(Block(w) for _ in range(n))) for w, n in zip(WIDTHS, DOWN, strict=True)
         )
@@ -84,7 +85,7 @@ class ThesisNet(nn.Module):
 
     Two convolutions at each of five sizes, the halves by the largest of four, doubled by learned interpolation, what
     was found on the way down beside what comes up. Of the original's 31 million weights at 64 channels; the same inputs
-    as :class:`RestorationNet`, of which it leaves the second picture alone.
+    as :class:`RestorationNet`, of which it leaves the second picture and the bend of paths alone.
     """
 
     def __init__(self, width: int = 64) -> None:
@@ -94,10 +95,11 @@ class ThesisNet(nn.Module):
         self.grow = nn.ModuleList(nn.ConvTranspose2d(b, a, 2, stride=2) for a, b in pairwise(widths))
         self.up = nn.ModuleList(_two(2 * a, a) for a in widths[:-1])
         self.leave = nn.Conv2d(width, 3, 1)
+        self.blur_channels = 5
 
     def forward(self, picture: Tensor, aid: Tensor, blur: Tensor) -> Tensor:
         # the exporter leaves out what nothing depends on
-        x = torch.cat([picture + 0 * aid, functional.interpolate(blur, scale_factor=2.0)], dim=1)
+        x = torch.cat([picture + 0 * aid, functional.interpolate(blur[:, :3], scale_factor=2.0)], dim=1)
         levels = []
         for i, convolve in enumerate(self.down):
             x = convolve(x if i == 0 else functional.max_pool2d(x, 2))

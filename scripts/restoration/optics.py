@@ -8,6 +8,7 @@ a radian.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +26,7 @@ _STEPS = 96
 _NODE_PX = 8
 _LEAST_STRETCH = 0.2
 #: Motion is known for so much longer before and after, s: for clocks that are wrong.
-_SPARE_S = 0.012
+_SPARE_S = 0.025
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -85,17 +86,28 @@ class Shots:
         at = self.focal_px[:, None, None, None] * seen[..., :2] / seen[..., 2:]
         return at - self.corner_px[:, None, None, :]
 
-    def blur(self, x: Tensor, y: Tensor) -> Tensor:
-        """(B, h, w, 2) the segment that pixels smear along, px."""
+    def path(self, x: Tensor, y: Tensor, parts: Sequence[float]) -> Tensor:
+        """(S, B, h, w, 2) where, in the sharp picture, that stands which pixels see at parts of their exposure; px off.
+
+        To first order in how far that is.
+        """
         middle = self.seen(x, y, 0.0)
         # how the picture at mid-exposure follows from the scene, for pixels one to the right and one below
         by_x, by_y = self.seen(x + 1, y, 0.0) - middle, self.seen(x, y + 1, 0.0) - middle
-        along = self.seen(x, y, 0.5) - self.seen(x, y, -0.5)
         # a picture that moves with the shutter would be blurred without end
         across = (by_x[..., 0] * by_y[..., 1] - by_x[..., 1] * by_y[..., 0]).clamp_min(_LEAST_STRETCH)
-        vx = (along[..., 0] * by_y[..., 1] - along[..., 1] * by_y[..., 0]) / across
-        vy = (along[..., 1] * by_x[..., 0] - along[..., 0] * by_x[..., 1]) / across
-        return torch.stack([vx, vy], dim=-1)
+        out = []
+        for part in parts:
+            along = self.seen(x, y, part) - middle
+            out_x = (along[..., 0] * by_y[..., 1] - along[..., 1] * by_y[..., 0]) / across
+            out_y = (along[..., 1] * by_x[..., 0] - along[..., 0] * by_x[..., 1]) / across
+            out.append(torch.stack([out_x, out_y], dim=-1))
+        return torch.stack(out)
+
+    def blur(self, x: Tensor, y: Tensor) -> Tensor:
+        """(B, h, w, 2) the segment that pixels smear along, px."""
+        begin, end = self.path(x, y, (-0.5, 0.5))
+        return end - begin
 
     def render(self, scene: Tensor, samples: int, shift_px: Tensor | None = None) -> Tensor:
         """(B, 3, side, side) light of the pieces: the mean over their exposure; one sample is a picture without blur.
@@ -161,7 +173,7 @@ class ShotOptions:
 
     side: int = 256
     #: Exposures, s, uniform in their logarithm.
-    exposure_s: tuple[float, float] = (2e-3, 4e-2)
+    exposure_s: tuple[float, float] = (4e-3, 6.6e-2)
     #: Sensor widths, px, whose focal lengths are 0.6 to 1.1 of them.
     widths: tuple[int, ...] = (640, 960, 1280, 1920, 2560, 3840)
     longest_readout_s: float = 0.033

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rich.progress import track
 
 from restoration.photographs import photographs
-from restoration.samples import MARGIN, SIDE, Maker, Material, Samples
+from restoration.samples import BLUR_CHANNELS, MARGIN, SIDE, Maker, Material, Samples
 
 #: Samples that are made together: they have much the same blur, and as many instants are rendered for each.
 BATCH = 16
@@ -26,7 +26,7 @@ _MAKING = ("camera", "handheld", "optics", "photographs", "samples")
 
 @dataclass(frozen=True, kw_only=True)
 class Sources:
-    """Where samples come from: folders of photographs and of motion capture, and whether those to measure with."""
+    """Where samples come from: folders of photographs and of recorded motion, and whether those to measure with."""
 
     photos: Path
     motion: Path | None
@@ -75,7 +75,9 @@ def make_pool(
         raise SystemExit(f"{folder} holds other samples ({about.read_text().strip()}): name another folder")
     if not about.exists():
         for name in _ARRAYS:
-            shape = (batches * BATCH, side // 2, side // 2, 3) if name == "blur" else (batches * BATCH, side, side, 3)
+            shape = (batches * BATCH, side, side, 3)
+            if name == "blur":
+                shape = (batches * BATCH, side // 2, side // 2, BLUR_CHANNELS[maker.__name__])
             kind = np.float16 if name == "blur" else np.uint8
             np.lib.format.open_memmap(folder / f"{name}.npy", mode="w+", dtype=kind, shape=shape).flush()
         about.write_text(json.dumps(made) + "\n")
@@ -96,7 +98,7 @@ def _recipe(sources: Sources) -> str:
     """What decides samples beside their seed: the code that makes them, and what it makes them of."""
     code = [Path(__file__).with_name(f"{name}.py") for name in _MAKING]
     used = [*photographs(sources.photos, held_out=sources.held_out)]
-    used += [] if sources.motion is None else sorted(sources.motion.glob("*.csv"))
+    used += [] if sources.motion is None else sorted(sources.motion.glob("*.csv.xz"))
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in code))
     digest.update("\n".join(f"{path.name} {path.stat().st_size}" for path in used).encode())
     return digest.hexdigest()[:16]

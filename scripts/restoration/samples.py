@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from colmap_inertial.imaging.blur_field import BlurField
-from colmap_inertial.imaging.wiener import DeblurOptions, deblur
-from colmap_inertial.restoration._tiles import Span, blur_feed
+from colmap_inertial.imaging.blur_path import BlurPath, middles, samples_for
+from colmap_inertial.imaging.path_filters import path_wiener
+from colmap_inertial.imaging.wiener import DeblurOptions
+from colmap_inertial.restoration._tiles import Span, blur_feed, path_feed
 from colmap_inertial.types import Array
 from restoration.camera import jpeg, light_of, noisy, sharpened, srgb
-from restoration.handheld import Handheld, captured, simulated
+from restoration.handheld import Handheld, recorded, simulated
 from restoration.optics import ShotOptions, Shots, draw_shots
 from restoration.photographs import Album, photographs
 
@@ -24,16 +26,23 @@ Codes = NDArray[np.uint8]
 
 #: Pieces are made so large, and lose this much at each edge, so that few see an edge as only pictures' edges are.
 SIDE, MARGIN = 256, 32
-_NODE_PX = 16
+#: Spacing of what the gyroscope says of the blur: of lines, and of paths, as the package has them.
+_NODE_PX, _PATH_NODE_PX = 16, 64
 #: Scenes reach so far beyond the pieces.
 _BEYOND_PX = 48
-#: Motion capture that is never trained on.
+_WHOLE = Span(begin=0, end=SIDE, keep_begin=0, keep_end=SIDE)
+#: Errors of usual gyroscopes (standard deviations): of clock, direction and extent; and what share of each calibrations
+#: say of themselves.
+_LATE_S, _ANGLE_RAD, _EXTENT = 3e-3, np.radians(3), 0.1
+_CALIBRATED = np.array([1 / 6, 0.1, 0.0])
+#: The recording that is never trained on.
 HELD_OUT_MOTION = "room5"
+_TRUTH = "_gt.csv.xz"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Samples:
-    """B samples, (B, S, S, 3) uint8 each, and (B, S / 2, S / 2, 3) float16 blur as the networks take it."""
+    """B samples, (B, S, S, 3) uint8 each, and (B, S / 2, S / 2, C) float16 blur as the networks take it."""
 
     picture: Codes
     aid: Codes
@@ -50,48 +59,96 @@ class Material:
 
     @classmethod
     def load(cls, photos: Path, motion: Path | None, *, held_out: bool = False) -> Material:
-        """From a folder of photographs, and of motion capture; without it, the simulator's motion alone."""
+        """From a folder of photographs, and one of recorded motion; without it, the simulator's motion alone."""
         motions = simulated(8, 1000 if held_out else 0)
         if motion is not None:
-            files = [p for p in sorted(motion.glob("*.csv")) if (HELD_OUT_MOTION in p.name) == held_out]
-            if not files:
-                raise SystemExit(f"{motion} holds no motion capture (*.csv) of this kind")
-            motions += [piece for file in files for piece in captured(file)]
+            names = [p.name.removesuffix(_TRUTH) for p in sorted(motion.glob(f"*{_TRUTH}"))]
+            names = [name for name in names if (name == HELD_OUT_MOTION) == held_out]
+            if not names:
+                raise SystemExit(f"{motion} holds no recording (NAME_imu.csv.xz, NAME{_TRUTH}) of this kind")
+            motions += [piece for name in names for piece in recorded(motion, name)]
         return cls(album=Album(photographs(photos, held_out=held_out)), motions=motions)
 
 
+#: Of each maker's samples.
+BLUR_CHANNELS = {"deepgyro_samples": 5, "lsd2_samples": 3}
 Maker = Callable[[Material, int, np.random.Generator, str], Samples]
 
 
 def deepgyro_samples(material: Material, count: int, rng: np.random.Generator, device: str) -> Samples:
-    """Blurred pieces, the Wiener filter's result by a gyroscope with errors, and that gyroscope's blur.
+    """Blurred pieces, the result of Wiener's filter along the path of a gyroscope with errors, and that path.
 
-    One in eight is sharp and has a blur that is not there; in one in eight, the gyroscope is right.
+    One in eight is sharp and has a blur that is not there; in one in eight, the gyroscope is right. The filter is told
+    how large the errors may be in half of them; in the others, of the small ones that a calibration usually has.
     """
     generator = torch.Generator(device).manual_seed(int(rng.integers(2**62)))
     longest = rng.choice([6.0, 14.0, 24.0, 40.0], p=[0.2, 0.3, 0.3, 0.2])
     blur_px = rng.uniform(0.3 * longest, longest, count)
     shots = draw_shots(material.motions, blur_px, rng, ShotOptions(side=SIDE), device)
     false = torch.tensor(rng.random(count) < 0.125, device=device)
-    told = told_blur(shots, rng)
+    paths = told_paths(shots, rng)
     shots = replace(shots, exposure_s=torch.where(false, rng.uniform(0, 0.08) * shots.exposure_s, shots.exposure_s))
     scene = _scenes(material.album, count, rng, device)
     light = shots.render(scene, max(12, int(1.2 * longest)))
     truth = srgb(shots.render(scene, 1))
     picture = _bytes(_photographed(light, rng, generator, least=0.003, most=0.02))
-    fields = _fields(told)
-    noise = DeblurOptions(threads=1)
-    aid = np.stack([deblur(np.ascontiguousarray(p), f, noise) for p, f in zip(picture, fields, strict=True)])
-    return _trimmed(picture, aid, fields, _bytes(truth))
+    one = DeblurOptions(threads=1)
+    aid = np.stack([path_wiener(np.ascontiguousarray(p), q, one) for p, q in zip(picture, paths, strict=True)])
+    return _trimmed(picture, aid, [path_feed(path, _WHOLE, _WHOLE) for path in paths], _bytes(truth))
 
 
-def told_blur(shots: Shots, rng: np.random.Generator) -> Tensor:
-    """(B, G, G, 2) blur at the nodes by a gyroscope with errors.
+def told_paths(shots: Shots, rng: np.random.Generator) -> list[BlurPath]:
+    """B paths by a gyroscope with errors, and how wrong the filter is told that they may be.
 
-    Errors are of clock (3 ms), extent (10 %), direction (3 degrees), turning (drift of 0.01 rad/s), the point about
-    which a roll turns (3 % of the focal length), and of what the camera's translation does: not known at all in one
-    of three. They are up to 1.6 times as large in some samples, and none at all in one of eight.
+    Errors are those of :func:`told_blur`.
     """
+    wrong = _wrong(shots, rng)
+    at = torch.arange(BlurField.nodes(SIDE, SIDE, _PATH_NODE_PX)[0], device=shots.t_s.device) * float(_PATH_NODE_PX)
+    at += 0.5
+    longest = float(wrong.shots.blur(at, at).norm(dim=-1).max())
+    path = wrong.turned(wrong.shots.path(at, at, middles(samples_for(longest)).tolist())).cpu().numpy()
+    # how the chord would be if the clock were a little later
+    late = replace(wrong.shots, turn_rad=wrong.shots.turned(wrong.shots.t_s + _LATE_S))
+    change = (late.blur(at, at) - wrong.shots.blur(at, at)).cpu().numpy() / _LATE_S
+    told = rng.random(len(path[0])) < 0.5
+    errors = wrong.size.cpu().numpy()[:, None, None, None]
+    out = []
+    for i, known in enumerate(told):
+        chord = path[-1, i] - path[0, i]
+        across = np.stack([-chord[..., 1], chord[..., 0]], axis=-1)
+        usual = (_LATE_S * change[i], _ANGLE_RAD * across, _EXTENT * chord)
+        shares = errors[i] * np.ones(3) if known else _CALIBRATED
+        cov = sum(
+            (share * w)[..., [0, 0, 1]] * (share * w)[..., [0, 1, 1]]
+            for share, w in zip(shares.ravel(), usual, strict=True)
+        )
+        out.append(
+            BlurPath(
+                width=SIDE, height=SIDE, step_px=_PATH_NODE_PX, path_px=path[:, i], cov_px2=np.asarray(cov, np.float32)
+            )
+        )
+    return out
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Wrong:
+    """What a gyroscope with errors takes shots for: paths and lines of ``shots``, (B,) turned and stretched.
+
+    ``size`` is that of the errors, usual ones = 1.
+    """
+
+    shots: Shots
+    angle_rad: Tensor
+    size: Tensor
+
+    def turned(self, vectors: Tensor) -> Tensor:
+        """(..., B, h, w, 2) by the angle."""
+        cos, sin = (f(self.angle_rad)[:, None, None] for f in (torch.cos, torch.sin))
+        x, y = vectors.unbind(-1)
+        return torch.stack([cos * x - sin * y, sin * x + cos * y], dim=-1)
+
+
+def _wrong(shots: Shots, rng: np.random.Generator) -> _Wrong:
     count, device = len(shots.t_s), shots.t_s.device
 
     def normal(sd: float, *shape: int) -> Tensor:
@@ -99,8 +156,7 @@ def told_blur(shots: Shots, rng: np.random.Generator) -> Tensor:
 
     drawn = rng.uniform(0, 1.6, count)
     much = torch.tensor(np.where(rng.random(count) < 0.125, 0, drawn), dtype=torch.float32, device=device)
-    at = torch.arange(SIDE // _NODE_PX + 1, device=device) * float(_NODE_PX) + 0.5
-    late = normal(3e-3) * much
+    late = normal(_LATE_S) * much
     translated = torch.tensor(rng.random(count) > 1 / 3, device=device) | (much == 0)
     drift = normal(0.01, 3) * much[:, None]
     centre = normal(0.03, 2) * (much * shots.focal_px)[:, None]
@@ -110,12 +166,21 @@ def told_blur(shots: Shots, rng: np.random.Generator) -> Tensor:
         turn_rad=turn,
         moved_m=shots.moved_m * translated[:, None, None],
         corner_px=shots.corner_px + centre,
+        exposure_s=shots.exposure_s * torch.exp(normal(_EXTENT) * much),
     )
-    vector = wrong.blur(at, at)
-    angle = normal(np.radians(3)) * much
-    factor = torch.exp(normal(0.1) * much)
-    cos, sin = (factor * torch.cos(angle))[:, None, None], (factor * torch.sin(angle))[:, None, None]
-    return torch.stack([cos * vector[..., 0] - sin * vector[..., 1], sin * vector[..., 0] + cos * vector[..., 1]], -1)
+    return _Wrong(shots=wrong, angle_rad=normal(_ANGLE_RAD) * much, size=much)
+
+
+def told_blur(shots: Shots, rng: np.random.Generator) -> Tensor:
+    """(B, G, G, 2) blur at the nodes by a gyroscope with errors.
+
+    Errors are of clock (3 ms), extent (10 %), direction (3 degrees), turning (drift of 0.01 rad/s), the point about
+    which a roll turns (3 % of the focal length), and of what the camera's translation does: not known at all in one
+    of three. They are up to 1.6 times as large in some samples, and none at all in one of eight.
+    """
+    wrong = _wrong(shots, rng)
+    at = torch.arange(SIDE // _NODE_PX + 1, device=shots.t_s.device) * float(_NODE_PX) + 0.5
+    return wrong.turned(wrong.shots.blur(at, at))
 
 
 def lsd2_samples(material: Material, count: int, rng: np.random.Generator, device: str) -> Samples:
@@ -154,7 +219,7 @@ def lsd2_samples(material: Material, count: int, rng: np.random.Generator, devic
         where = [np.s_[:edge], np.s_[-edge:], np.s_[:, :edge], np.s_[:, -edge:]][rng.integers(4)]
         aid[i][where] = picture[i][where]
     vectors = torch.where(torch.tensor(rng.random(count) < 0.5)[:, None, None, None].to(device), told, 0 * told)
-    return _trimmed(picture, aid, _fields(vectors), _bytes(truth))
+    return _trimmed(picture, aid, _line_feeds(vectors), _bytes(truth))
 
 
 def _scenes(album: Album, count: int, rng: np.random.Generator, device: str) -> Tensor:
@@ -219,15 +284,15 @@ def _bytes(code: Tensor) -> Codes:
     return (255 * code).round().clamp(0, 255).byte().permute(0, 2, 3, 1).contiguous().cpu().numpy()
 
 
-def _fields(vectors: Tensor) -> list[BlurField]:
-    return [BlurField(width=SIDE, height=SIDE, vector_px=v, step_px=_NODE_PX) for v in vectors.cpu().numpy()]
+def _line_feeds(vectors: Tensor) -> list[NDArray[np.float32]]:
+    fields = [BlurField(width=SIDE, height=SIDE, vector_px=v, step_px=_NODE_PX) for v in vectors.cpu().numpy()]
+    return [blur_feed(field, _WHOLE, _WHOLE) for field in fields]
 
 
-def _trimmed(picture: Codes, aid: Codes, fields: list[BlurField], truth: Codes) -> Samples:
+def _trimmed(picture: Codes, aid: Codes, feeds: list[NDArray[np.float32]], truth: Codes) -> Samples:
     inner = slice(MARGIN, SIDE - MARGIN)
     half = slice(MARGIN // 2, (SIDE - MARGIN) // 2)
-    whole = Span(begin=0, end=SIDE, keep_begin=0, keep_end=SIDE)
-    blur = np.concatenate([blur_feed(field, whole, whole) for field in fields]).transpose(0, 2, 3, 1)
+    blur = np.concatenate(feeds).transpose(0, 2, 3, 1)
     return Samples(
         picture=picture[:, inner, inner],
         aid=aid[:, inner, inner],
