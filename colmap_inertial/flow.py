@@ -19,7 +19,6 @@ from colmap_inertial.geometry import (
     quat_conjugate,
     quat_cumulative,
     quat_exp,
-    skew,
     so3_exp,
     so3_log,
 )
@@ -445,26 +444,30 @@ def _fit_rate(first: Array, second: Array, span_s: Array, pixel_rad: float) -> t
     reach = _INLIER_PX * pixel_rad
     draws = np.random.default_rng(0).integers(0, len(a), (_DRAWS, 2))
     rotations = _from_two(a[draws], b[draws])
-    counts = [int(np.sum(np.linalg.norm(b - a @ rotation.T, axis=1) < reach)) for rotation in rotations]
-    most = max(counts, default=-1)
-    if most < 3:
+    # of unit vectors: the cosines of all rays after all draws, as one product
+    cosines = rotations.reshape(-1, 9) @ (b[:, :, None] * a[:, None, :]).reshape(-1, 9).T
+    counts = np.sum(2 - 2 * cosines < reach**2, axis=1)
+    if counts.max(initial=-1) < 3:
         return None
-    rate, scatter = -so3_log(rotations[counts.index(most)]) / mean_s, reach
+    rate, scatter = -so3_log(rotations[np.argmax(counts)]) / mean_s, reach
+    # of a global shutter, all rays turn for as long
+    spans = span_s[:1] if np.ptp(span_s) == 0 else span_s
     for _ in range(_ROUNDS):
-        rotated = np.einsum("nij,nj->ni", so3_exp(-rate * span_s[:, None]), a)
+        turn = so3_exp(-rate * spans[:, None])
+        rotated = a @ turn[0].T if len(turn) == 1 else np.einsum("nij,nj->ni", turn, a)
         residual = b - rotated
-        # d(exp(-rate s) a) = s [rotated]x d(rate), to first order
-        jacobian = span_s[:, None, None] * skew(rotated)
         square = np.sum(residual**2, axis=1)
         near = square < (2 * reach) ** 2
         if near.sum() < 3:
             return None
         scatter = max(float(np.sqrt(np.median(square[near]))) / 1.18, _SCATTER_FLOOR_PX * pixel_rad)
         weight = 1 / (1 + square / (2.4 * scatter) ** 2) ** 2
-        information = np.einsum("n,nki,nkj->ij", weight, jacobian, jacobian)
+        # d(exp(-rate s) a) = s [rotated]x d(rate), to first order; of a unit vector, [r]x' [r]x = 1 - r r'
+        lever = weight * span_s**2
+        information = float(lever.sum()) * np.eye(3) - rotated.T @ (lever[:, None] * rotated)
         if np.linalg.cond(information) > 1e8:
             return None
-        step = np.linalg.solve(information, np.einsum("n,nki,nk->i", weight, jacobian, residual))
+        step = np.linalg.solve(information, (weight * span_s) @ cross(residual, rotated))
         rate = rate + step
         if np.linalg.norm(step) * mean_s < 1e-7:
             break

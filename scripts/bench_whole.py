@@ -1,7 +1,7 @@
 """The whole run against bare COLMAP: processor time, registered images, camera error, loops.
 
     python scripts/bench_whole.py FOLDER [--euroc DATASET] [--walk FRAMES] [--loop FRAMES] [--repeated SCENES]
-        [--drawn] [--json FILE]
+        [--drawn] [--long FRAMES ...] [--json FILE]
 
 FOLDER takes captures and reconstructions. ``--euroc``: the 100 keyframes of V1_01_easy (DATASET has ``keyframes/``,
 ``mav0/`` and ``gt/``), bare COLMAP matching every pair. ``--walk``: a simulated walk around a room back to its start
@@ -32,6 +32,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import yaml
@@ -65,8 +66,10 @@ OVERLAP = 4
 LOOP_OVERLAP = 5
 #: Matches join the same place within this; a frame is back within this and looking this way, or a loop is near it.
 SAME_M, BACK_M, BACK_DEG, BESIDE = 0.15, 0.5, 20.0, 4
-#: Synthesised features: for the loop's error, and for repeated texture.
+#: Synthesised features: for the loop's error and long walks, and for repeated texture.
 LOOP_DENSITY, REPEATED_DENSITY = 1.2, 1.5
+#: Frames of a long walk around a room of the usual size.
+LONG_FRAMES = 300
 
 
 def bare(capture: Path, out: Path, *, sequential: bool) -> None:
@@ -314,6 +317,62 @@ def loop_errors(walk: Walk, folder: Path) -> dict[str, Figures]:
     return found
 
 
+def long_walk(frames: int, folder: Path) -> dict[str, Figures]:
+    """What each mapper takes for a walk of so many frames: processor time and memory."""
+    keep_colmap_quiet()
+    walk = Walk(seed=100, frames=frames, frame_rate_hz=8.0, drawn=False, size=max(frames / LONG_FRAMES, 0.8))
+    write_walk(walk, folder)
+    recording, context = recorded(folder), RunContext(scratch=folder, num_threads=1)
+    camera, names = recording.capture.camera, recording.timing.names
+    features, database = folder / "features.db", folder / "database.db"
+    if not features.is_file():
+        write_features(walk, names, features, density=LOOP_DENSITY)
+    for left in folder.glob(f"{database.name}*"):
+        left.unlink()
+    begun_s = time.process_time()
+    record = match_capture(features, database, recording, camera, MappingOptions(pairing="sequential"), context)
+    found: dict[str, Figures] = {
+        "matching": {"processor_s": time.process_time() - begun_s, "verified": record.verified}
+    }
+    print(json.dumps(found), flush=True)
+    for mapper in ("incremental", "global"):
+        told = subprocess.run(
+            [sys.executable, __file__, "--map-by", mapper, folder], check=True, stdout=subprocess.PIPE, text=True
+        ).stdout
+        found[mapper] = json.loads(told.splitlines()[-1])
+        print(json.dumps({mapper: found[mapper]}), flush=True)
+    return found
+
+
+def peak_mib() -> float:
+    """The most memory that this process had; what ``getrusage`` says counts its parent's, too."""
+    (line,) = (line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
+    return int(line.split()[1]) / 1024
+
+
+def map_by(mapper: Literal["incremental", "global"], folder: Path) -> Figures:
+    """Map a walk that is matched: what another process of this script does."""
+    keep_colmap_quiet()
+    models, truth = folder / mapper, true_centres(folder)
+    shutil.rmtree(models, ignore_errors=True)
+    before_mib, begun_s = peak_mib(), time.process_time()
+    map_images(
+        folder / "database.db",
+        folder / "frames",
+        models,
+        MappingOptions(mapper=mapper),
+        refine_intrinsics=False,
+        num_images=len(truth),
+        context=RunContext(scratch=folder, num_threads=1),
+    )
+    processor_s = time.process_time() - begun_s
+    mib = peak_mib() - before_mib
+    each = {"ms_a_frame": 1e3 * processor_s / len(truth), "mib_a_frame": mib / len(truth)}
+    largest = max((read_model(one) for one in find_models(models).values()), key=lambda one: int(one.num_reg_images()))
+    seen = {"observations": int(largest.compute_num_observations())}
+    return {"processor_s": processor_s, "mib": mib, **each, **seen, **judged(models, truth, walk=True)}
+
+
 def verified_pairs(database: Path) -> list[tuple[str, str]]:
     """Names of all pairs whose matches COLMAP verified."""
     import pycolmap
@@ -334,12 +393,17 @@ def main() -> None:
     parser.add_argument("--repeated", type=int, default=0, help="scenes")
     parser.add_argument("--first", type=int, default=0, help="seed of the first scene")
     parser.add_argument("--drawn", action="store_true", help="find the scenes' features in drawn pictures")
+    parser.add_argument("--long", type=int, nargs="*", default=[], help="frames")
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--map-by", choices=("incremental", "global"), help=argparse.SUPPRESS)
     parser.add_argument("--bare-sequential", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--bare-exhaustive", type=Path, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.bare_sequential or args.bare_exhaustive:
         bare(args.bare_sequential or args.bare_exhaustive, args.folder, sequential=bool(args.bare_sequential))
+        return
+    if args.map_by:
+        print(json.dumps(map_by(args.map_by, args.folder)))
         return
     found: dict[str, object] = {}
     if args.euroc:
@@ -361,6 +425,10 @@ def main() -> None:
         walk = Walk(seed=seed, frames=160, frame_rate_hz=3.2, laps=1.15, scene=scene, width=wide, drawn=args.drawn)
         found[folder.name] = {"scene": scene, **false_loops(walk, folder)}
         print(json.dumps({folder.name: found[folder.name]}), flush=True)
+    for frames in args.long:
+        folder = args.folder / f"long{frames}"
+        found[folder.name] = long_walk(frames, folder)
+        print(json.dumps({folder.name: found[folder.name]}, indent=1), flush=True)
     if args.json:
         args.json.write_text(json.dumps(found, indent=1) + "\n")
 

@@ -495,8 +495,8 @@ MUTANTS = (
     ),
     Mutant(
         "model/__init__.py",
-        "[-by_cam @ skew(cam), -by_cam @ rotation]",
-        "[by_cam @ skew(cam), -by_cam @ rotation]",
+        "-cross(by_cam, cam[:, None])",
+        "cross(by_cam, cam[:, None])",
         "sign of how errors of rotation and centre go together",
         ("model",),
     ),
@@ -1551,10 +1551,31 @@ MUTANTS = (
         ("pairing",),
     ),
     Mutant(
+        "colmap/gyro_bias.py",
+        '"abc,mcd->mabd"',
+        '"abc,mdc->mabd"',
+        "matches are turned the other way round",
+        ("pairing",),
+    ),
+    Mutant(
+        "flow.py",
+        "cross(residual, rotated)",
+        "cross(rotated, residual)",
+        "steps of a rotation go uphill",
+        ("flow",),
+    ),
+    Mutant(
         "colmap/votes.py",
         "angle < _RATIO * next_angle",
         "angle < next_angle",
         "any nearest descriptor votes",
+        ("pairing",),
+    ),
+    Mutant(
+        "colmap/loops.py",
+        "beside[pair] for pair in likely if pair in voted",
+        "beside[pair] for pair in likely if pair not in voted",
+        "neighbours are looked at in place of loops",
         ("pairing",),
     ),
     Mutant(

@@ -6,6 +6,7 @@ descriptors, but for noise; so what hangs many times looks the same as it can.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from walk_scenes import Walk, motion_of, places_m, world_of
 
 from colmap_inertial.geometry import matrix_from_quat
 from colmap_inertial.model import colmap_camera
-from colmap_inertial.simulate import World
+from colmap_inertial.simulate import Quad, World
 from colmap_inertial.types import Array
 
 #: Features for each square metre of a poster, and of a wall or floor.
@@ -56,9 +57,20 @@ def seen(walk: Walk, world: World, points: Array, names: Sequence[str]) -> Itera
         xy = np.asarray(model.img_from_cam(in_cam[before]))[:, :2]
         inside = ((xy > 4) & (xy < size - 4)).all(axis=1)
         before, xy = before[inside], xy[inside]
-        met = places_m(world, np.tile(centre, (len(before), 1)), points[before] - centre)
+        met = places_m(_around(world, centre), np.tile(centre, (len(before), 1)), points[before] - centre)
         shown = np.linalg.norm(met - points[before], axis=1) < 1e-3
         yield before[shown], xy[shown]
+
+
+def _around(world: World, centre: Array) -> World:
+    """What may hide anything that is near enough to be found."""
+
+    def near(quad: Quad) -> bool:
+        across = quad.edge_u_m + quad.edge_v_m
+        away = float(np.linalg.norm(quad.corner_m + across / 2 - centre))
+        return away < FARTHEST_M + float(np.linalg.norm(across)) / 2
+
+    return dataclasses.replace(world, quads=tuple(filter(near, world.quads)))
 
 
 def write_features(walk: Walk, names: Sequence[str], database: Path, *, density: float = 1.0) -> None:

@@ -34,8 +34,8 @@ from colmap_inertial.simulate import (
 from colmap_inertial.simulate.motion import MARGIN_S
 from colmap_inertial.types import Array, CameraModel
 
-#: Half the room, and half the path, whose corners are rounded.
-HALF_M, PATH_M, HEIGHT_M = np.array([5.0, 4.0]), np.array([3.2, 2.2]), 2.6
+#: Half the room, and from the walls to the path, whose corners are rounded.
+HALF_M, AISLE_M, HEIGHT_M = np.array([5.0, 4.0]), 1.8, 2.6
 #: A corridor's length, how far its wall is from who walks along it, and how fast that is.
 LENGTH_M, AWAY_M, SPEED_M_S = 40.0, 2.2, 0.6
 #: From one copy to the next.
@@ -56,7 +56,8 @@ class Walk:
 
     ``scene``: a ``room`` in which everything is unlike; ``mixed``: in it, every other poster is one of two, of one
     size, on all walls; ``copies``: nothing but one poster at equal distances, on plaster; ``tiled``: the plaster is the
-    same from each poster to the next, too; likewise a ``corridor`` with one wall, and nobody turns round.
+    same from each poster to the next, too; likewise a ``corridor`` with one wall, and nobody turns round. ``size``: how
+    many times as long as usual the room is, each way.
     """
 
     seed: int
@@ -66,6 +67,15 @@ class Walk:
     scene: Scene = "room"
     width: int = 480
     drawn: bool = True
+    size: float = 1.0
+
+    def half_m(self) -> Array:
+        """Half the room."""
+        return self.size * HALF_M
+
+    def path_m(self) -> Array:
+        """Half the path, as far from the walls in any room."""
+        return self.half_m() - AISLE_M
 
     def camera(self) -> ShutterCamera:
         """A pinhole of 64 degrees."""
@@ -85,7 +95,7 @@ def world_of(walk: Walk) -> World:
     up = np.array([0.0, 0.0, 1.0])
     designs = [paint(textures.poster, rng, 240, 300) for _ in range(2)]
     quads = []
-    corners = HALF_M * np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]])
+    corners = walk.half_m() * np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]])
     for wall in range(4):
         start, end = (np.array([*corners[(wall + k) % 4], HEIGHT_M]) for k in (0, 1))
         along = (end - start) / np.linalg.norm(end - start)
@@ -113,9 +123,10 @@ def world_of(walk: Walk) -> World:
                     textures.poster, rng, round(300 * height), max(8, round(300 * float(np.linalg.norm(edge))))
                 )
                 quads.append(Quad(corner_m=corner, edge_u_m=edge, edge_v_m=-height * up, texture=face))
-    x, y = np.array([2 * HALF_M[0], 0, 0]), np.array([0, 2 * HALF_M[1], 0])
+    half_m = walk.half_m()
+    x, y = np.array([2 * half_m[0], 0, 0]), np.array([0, 2 * half_m[1], 0])
     floor = paint(textures.carpet, rng, 800, 1000)
-    quads.append(Quad(corner_m=np.array([-HALF_M[0], HALF_M[1], 0]), edge_u_m=x, edge_v_m=-y, texture=floor))
+    quads.append(Quad(corner_m=np.array([-half_m[0], half_m[1], 0]), edge_u_m=x, edge_v_m=-y, texture=floor))
     return World(quads=tuple(quads), board=Board(), board_corners_m=np.zeros((0, 3)))
 
 
@@ -133,7 +144,7 @@ def _copies(walk: Walk, rng: np.random.Generator, paint: Paint) -> World:
     if "corridor" in walk.scene:
         corners = np.array([[-LENGTH_M / 2, AWAY_M], [LENGTH_M / 2, AWAY_M]])
     else:
-        corners = HALF_M * np.array([[-1, 1], [1, 1], [1, -1], [-1, -1], [-1, 1]])
+        corners = walk.half_m() * np.array([[-1, 1], [1, 1], [1, -1], [-1, -1], [-1, 1]])
     tile = paint(textures.plaster, rng, 260, round(100 * PERIOD_M))
     quads = []
     for start, end in itertools.pairwise(np.column_stack([corners, np.full(len(corners), HEIGHT_M)])):
@@ -167,14 +178,14 @@ def motion_of(walk: Walk) -> Motion:
     duration_s = walk.frames / walk.frame_rate_hz
     count = int((duration_s + 2 * MARGIN_S) * RATE_HZ) + 33
     t_s = -MARGIN_S - 16 / RATE_HZ + np.arange(count) / RATE_HZ
-    phase = 2 * np.pi * walk.laps * t_s / duration_s
+    phase, path_m = 2 * np.pi * walk.laps * t_s / duration_s, walk.path_m()
     # a superellipse; the camera looks along its normal
     cosine, sine = np.cos(phase), np.sin(phase)
-    across = np.stack([np.sign(c) * np.abs(c) ** 0.5 for c in (cosine, sine)], axis=1) * PATH_M
+    across = np.stack([np.sign(c) * np.abs(c) ** 0.5 for c in (cosine, sine)], axis=1) * path_m
     smooth = np.ones(61) / 61
     across = np.stack([np.convolve(np.pad(c, 30, mode="edge"), smooth, mode="valid") for c in across.T], axis=1)
     sway = [sum(a * np.sin(2 * np.pi * f * t_s + p) for a, f, p in _tones(rng)) for _ in range(6)]
-    out = np.stack([cosine / PATH_M[0], sine / PATH_M[1], 0 * phase], axis=1)
+    out = np.stack([cosine / path_m[0], sine / path_m[1], 0 * phase], axis=1)
     if "corridor" in walk.scene:
         across = np.stack([SPEED_M_S * (t_s - duration_s / 2), 0 * t_s], axis=1)
         out = np.tile([0.3, 1.0, 0.0], (count, 1))

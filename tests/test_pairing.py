@@ -231,7 +231,7 @@ def circle(count=40):
     return 2 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
 
 
-def closing(monkeypatch, seen, votes, *, centre=None, said=None):
+def closing(monkeypatch, seen, votes, *, centre=None, said=None, also=()):
     """Close loops among 40 frames a second apart, of which ``seen`` gives rotation and coverage of verified pairs.
 
     What the matches say of where the second frame is: ``said``, or as it is on the way through ``centre``.
@@ -240,7 +240,7 @@ def closing(monkeypatch, seen, votes, *, centre=None, said=None):
     way = way_along(circle() if centre is None else centre)
     headings = headings_of(np.linspace(0, 360, 40), t_s)
     names = [f"{i:04}" for i in range(40)]
-    forgotten = []
+    forgotten, matched = [], []
 
     def compared(database, pairs):
         turned, covered = np.full((len(pairs), 3, 3), np.nan), np.zeros(len(pairs))
@@ -267,7 +267,10 @@ def closing(monkeypatch, seen, votes, *, centre=None, said=None):
     monkeypatch.setattr(loops, "compare", compared)
     monkeypatch.setattr(loops, "returns", returned)
     monkeypatch.setattr(loops, "forget", lambda database, pairs: forgotten.extend(pairs))
-    found = close_loops(None, names, headings, way, Counted(), 10, lambda pairs: None)
+    found = close_loops(
+        None, names, headings, way, Counted(), 10, doubtful=also, neighbours=[(0, 1)], match=matched.extend
+    )
+    assert matched[0] == (0, 1) and len(set(matched)) == len(matched) == found.candidates + 1
     return found, forgotten
 
 
@@ -275,6 +278,19 @@ def test_a_place_that_is_seen_again_closes_a_loop(monkeypatch):
     again = {(a, b) for a in range(3) for b in range(37, 40)}
     found, _ = closing(monkeypatch, lambda a, b: (0, 0.9) if (a, b) in again else None, lambda a, b: 20 * (b - a > 36))
     assert set(found.closed) <= again and len(found.closed) >= 6
+
+
+def test_neighbours_that_may_be_copies_stay_where_they_pass_as_loops(monkeypatch):
+    also = [(i, i + 10) for i in range(30)]
+    # what is twenty apart shows nothing, but has the most votes
+    found, forgotten = closing(
+        monkeypatch,
+        lambda a, b: (0 if a < 14 else 40, 0.9) if b - a == 10 else None,
+        lambda a, b: {20: 30, 10: 6}.get(b - a, 0) if a != 20 else 0,
+        also=also,
+    )
+    assert list(found.closed) == also[:14] and found.refused == 30 - 14 - 1
+    assert {(f"{a:04}", f"{b:04}") for a, b in also[14:] if a != 20} <= set(forgotten)
 
 
 @pytest.mark.parametrize(
@@ -466,7 +482,9 @@ def test_a_capture_too_short_for_loops_has_none(monkeypatch):
     empty = TwoViews(first_from_second=np.zeros((0, 3, 3)), covered=np.zeros(0))
     monkeypatch.setattr(loops, "compare", lambda database, pairs: empty)
     voters = Voters(descriptors=(), xy_px=())
-    found = close_loops(None, ["a", "b", "c"], headings, way_along(circle(3)), voters, 10, lambda pairs: None)
+    found = close_loops(
+        None, ["a", "b", "c"], headings, way_along(circle(3)), voters, 10, doubtful=[], neighbours=[], match=len
+    )
     assert found.compared == found.candidates == found.refused == 0 and found.closed == ()
 
 

@@ -485,6 +485,9 @@ def test_intrinsics_are_refined_where_that_is_asked_for(features, tmp_path, monk
     (options,) = asked
     assert options.ba_refine_focal_length == options.ba_refine_extra_params == refine
     assert options.mapper.abs_pose_refine_focal_length == options.mapper.abs_pose_refine_extra_params == refine
+    # unknown cameras are adjusted as often as COLMAP does
+    usual = pycolmap.IncrementalPipelineOptions().ba_global_frames_ratio
+    assert options.ba_global_frames_ratio == options.ba_global_points_ratio == (usual if refine else 1.4)
 
 
 # --- before the reconstruction ---------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.errors import NotObservableError
-from colmap_inertial.geometry import so3_exp
+from colmap_inertial.geometry import skew, so3_exp
 from colmap_inertial.threads import one_blas_thread
 from colmap_inertial.types import Array
 
@@ -32,6 +32,8 @@ _LEAST_PAIRS = 8
 _LARGEST_PX = 1.0
 #: For derivatives: a tenth of a degree in a third of a second.
 _STEP_RAD_S = 5e-3
+#: The cross product: of vectors f and g, ``einsum("abc,b,c", _CROSS, f, g)``.
+_CROSS = np.stack([skew(axis) for axis in np.eye(3)], axis=1)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -90,13 +92,18 @@ def bias_correction(pairs: RayPairs, start_from_cam: Array, bias_lever_s: Array)
     lever = bias_lever_s[pairs.second] - bias_lever_s[pairs.first]
     rays_second = pairs.rays_second @ np.swapaxes(after, 1, 2)
 
+    # a normal is linear in the products of its rays' coordinates: what all matches of a pair say is summed once
+    products = _squares((rays_first[..., :, None] * rays_second[..., None, :]).reshape(*rays_first.shape[:2], 9))
+    of_first, of_second = _squares(rays_first), _squares(rays_second)
+
     def spread(change: Array) -> Array:
-        turned = rays_second @ np.swapaxes(so3_exp(-(lever @ change)), 1, 2)
-        normal = np.cross(rays_first, turned)
+        turn = so3_exp(-(lever @ change))
+        normal_from_products = np.einsum("abc,mcd->mabd", _CROSS, turn).reshape(len(turn), 3, 9)
+        normals = normal_from_products @ products @ np.swapaxes(normal_from_products, 1, 2)
         # noise of both rays, as it shows along a translation: without it, one along the view would suit everything
-        noise = 2 * np.eye(3) - (_squares(rays_first) + _squares(turned))
+        noise = 2 * np.eye(3) - (of_first + turn @ of_second @ np.swapaxes(turn, 1, 2))
         whiten = np.linalg.inv(np.linalg.cholesky(noise))
-        return np.asarray(np.linalg.eigvalsh(whiten @ _squares(normal) @ np.swapaxes(whiten, 1, 2))[:, 0])
+        return np.asarray(np.linalg.eigvalsh(whiten @ normals @ np.swapaxes(whiten, 1, 2))[:, 0])
 
     change = np.zeros(3)
     for _ in range(4):
@@ -123,7 +130,7 @@ def bias_correction(pairs: RayPairs, start_from_cam: Array, bias_lever_s: Array)
 
 
 def _squares(vectors: Array) -> Array:
-    """(M, 3, 3) mean of the products of (M, K, 3) vectors with themselves."""
+    """(M, D, D) mean of the products of (M, K, D) vectors with themselves."""
     return np.asarray(np.swapaxes(vectors, 1, 2) @ vectors / vectors.shape[1])
 
 

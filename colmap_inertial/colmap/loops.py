@@ -8,6 +8,7 @@ the most matches behind them stay.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -92,7 +93,10 @@ def close_loops(
     way: Way,
     voters: Voters,
     nearest: int,
-    match: Callable[[Sequence[tuple[str, str]]], None],
+    *,
+    doubtful: Sequence[Pair],
+    neighbours: Sequence[Pair],
+    match: Callable[[Sequence[Pair]], None],
 ) -> Loops:
     """Match pairs that show places which the camera came back to; what is not believed leaves the database again.
 
@@ -104,6 +108,11 @@ def close_loops(
         Of these.
     nearest
         Frames fewer places apart than this are no loop.
+    doubtful
+        Pairs that are candidates, too, if they have votes enough; those beside them are not.
+    neighbours
+        Pairs that are matched and not judged; in one go with candidates, as COLMAP indexes the features of all images
+        anew each time.
     match
         Matches and verifies pairs in the database.
     """
@@ -115,14 +124,18 @@ def close_loops(
     maybe = ~_away(headings, way, i, j)
     i, j = i[maybe], j[maybe]
     chosen = candidates(voters.count(i, j), i, j)
-    first = [(int(x), int(y)) for x, y in zip(i[chosen], j[chosen], strict=True)]
-    match(_named(names, first))
+    voted = {(int(x), int(y)) for x, y in zip(i[chosen], j[chosen], strict=True)}
+    a, b = np.array(doubtful, dtype=np.intp).reshape(-1, 2).T
+    alike = ~_away(headings, way, a, b)
+    alike[alike] = voters.count(a[alike], b[alike]) >= _LEAST_VOTES
+    first = sorted(voted.union(itertools.compress(doubtful, alike)))
+    match([*neighbours, *first])
     verified, found = _judged(database, names, headings, way, first)
     likely = sorted(found)
     step = max(1, int(np.median(np.diff(keys))) // 2) if len(keys) > 1 else 1
     beside = {pair: _beside(pair, step, len(names), nearest) for pair in likely}
-    more = sorted(set().union(*beside.values()) - set(first))
-    match(_named(names, more))
+    more = sorted(set().union(*(beside[pair] for pair in likely if pair in voted)) - set(first))
+    match(more)
     verified_too, found_too = _judged(database, names, headings, way, more)
     believed = without_contradictions({**found, **found_too}, headings, way, nearest)
     closed = {pair for pair in believed & set(likely) if len(beside[pair] & believed) >= _LEAST_WITNESSES}

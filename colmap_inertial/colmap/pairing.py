@@ -32,7 +32,8 @@ _LEAST_VOTES = 4
 _CLOSE = (1, 2, 4)
 #: The way is found by images so many places apart: farther apart, some join copies of what is there many times.
 _NEXT = 2
-#: Where neighbours are matched, those within so many times the overlap are no loop.
+#: Where neighbours are matched, those within so many times the overlap are no loop; those up to as many times that are
+#: matched, and stay where they pass as one.
 _NEAR = 2
 
 
@@ -49,8 +50,8 @@ class MatchRecord:
     images, pairs
         How many there are, and pairs by the pairing.
     far
-        Pairs of neighbours far apart in time that were left out: loops are sought in their place, where the gyroscope
-        is of use.
+        Pairs of neighbours far apart in time that were left out, or matched only as candidates for loops: loops are
+        sought in their place, where the gyroscope is of use.
     apart
         Pairs that were ruled out as the gyroscope says that the camera looked elsewhere.
     unlike
@@ -128,6 +129,8 @@ def match_capture(
     i, j = _places([pair for pair in pairs if place[pair[1]] - place[pair[0]] not in _CLOSE], place)
     near = _NEAR * options.overlap
     far = np.zeros(len(i), dtype=np.bool_) if every_pair else j - i > near
+    next_to_near = far & (j - i <= _NEAR * near)
+    doubtful = list(zip(i[next_to_near].tolist(), j[next_to_near].tolist(), strict=True))
     i, j = i[~far], j[~far]
     headings: Headings | None = None
     try:
@@ -146,18 +149,23 @@ def match_capture(
             alike = (voters.count(i, j) >= _LEAST_VOTES) | ~(voters.plenty[i] & voters.plenty[j])
         i, j = i[alike], j[alike]
         kept = {"apart": int(away.sum()), "unlike": int((~alike).sum())}
-    rest = [(names[a], names[b]) for a, b in zip(i.tolist(), j.tolist(), strict=True)]
-    match_pairs(database, rest, context, done=len(pairs) - len(rest), total=len(pairs))
-    matched = len(close) + len(rest)
-    if headings is not None and not every_pair:
+    matched = len(close)
 
-        def match(more: Sequence[tuple[str, str]]) -> None:
-            match_pairs(database, more, context, done=len(pairs), total=len(pairs) + len(more))
+    def match(more: Sequence[tuple[int, int]]) -> None:
+        nonlocal matched
+        total = max(len(pairs), matched + len(more))
+        match_pairs(database, [(names[a], names[b]) for a, b in more], context, done=total - len(more), total=total)
+        matched += len(more)
 
+    rest = list(zip(i.tolist(), j.tolist(), strict=True))
+    if headings is None or every_pair:
+        match(rest)
+    else:
         next_ones = [pair for pair in close if pair[1] - pair[0] <= _NEXT]
         way = find_way(sightings_of(database, names, next_ones, headings.start_from_cam), len(names))
-        loops = close_loops(database, names, headings, way, voters, near + 1, match)
-        matched += loops.candidates
+        loops = close_loops(
+            database, names, headings, way, voters, near + 1, doubtful=doubtful, neighbours=rest, match=match
+        )
         kept |= {
             "loops_compared": loops.compared,
             "loop_candidates": loops.candidates,

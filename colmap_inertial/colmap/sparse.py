@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 #: Up to this many images every pair is matched; above it, neighbours in time.
 _EXHAUSTIVE_UP_TO = 150
 _EXTRACTION_BATCH = 16
+#: Where cameras are known, the whole model is adjusted each time it has grown so much, as COLMAP's own settings for
+#: videos have it, and at the end; unknown cameras bend a model that is adjusted so seldom.
+_GLOBAL_RATIO = 1.4
 #: Each batch indexes its images' features anew, an image as dear as a pair; the first are small, so that one sees soon
 #: how quickly it goes.
 _FIRST_MATCHING_BATCH, _MATCHING_BATCH = 100, 1600
@@ -347,6 +350,8 @@ def _incremental_options(refine: bool, num_threads: int, seed: int) -> pycolmap.
     pipeline.ba_refine_extra_params = refine
     pipeline.mapper.abs_pose_refine_focal_length = refine
     pipeline.mapper.abs_pose_refine_extra_params = refine
+    if not refine:
+        pipeline.ba_global_frames_ratio = pipeline.ba_global_points_ratio = _GLOBAL_RATIO
     return pipeline
 
 

@@ -240,5 +240,7 @@ def _plain(value: object, where: str) -> object:
             raise ValueError(f"{where}: JSON keys must be text")
         return {key: _plain(item, f"{where}.{key}") for key, item in value.items()}
     if isinstance(value, list | tuple):
+        if all(type(item) is float for item in value) and all(map(math.isfinite, value)):
+            return list(value)
         return [_plain(item, f"{where}[{i}]") for i, item in enumerate(value)]
     raise ValueError(f"{where}: {type(value).__name__} cannot be written as JSON")

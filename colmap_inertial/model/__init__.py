@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.errors import AlreadyMetricError, FormatError, OutputExistsError, TimingError
-from colmap_inertial.geometry import skew
+from colmap_inertial.geometry import cross
 from colmap_inertial.io.files import StrPath, read_json, write_json
 from colmap_inertial.io.names import check_names
 from colmap_inertial.model.binary import check_binary_model
@@ -299,7 +299,9 @@ def _pose_covariances(
     -------
     ``None`` where an image's observations do not determine its pose.
     """
-    covariances, places = [], {i: point.xyz for i, point in reconstruction.points3D.items()}
+    covariances = []
+    # to ask for each observation's point by itself would take longer than all the rest
+    place = {number: point.xyz for number, point in reconstruction.points3D.items()}
     for image in images:
         camera = reconstruction.camera(image.camera_id)
         seen = image.get_observation_points2D()
@@ -308,7 +310,7 @@ def _pose_covariances(
             return None
         pose = image.cam_from_world()
         rotation = pose.rotation.matrix()
-        world = np.array([places[point.point3D_id] for point in seen])
+        world = np.array([place[point.point3D_id] for point in seen])
         cam = world @ rotation.T + pose.translation
         error_px = camera.img_from_cam(cam) - np.array([point.xy for point in seen])
         squares = np.sum(error_px**2, axis=1)
@@ -318,8 +320,9 @@ def _pose_covariances(
         by_cam = np.zeros((len(seen), 2, 3))
         by_cam[:, 0, 0] = by_cam[:, 1, 1] = 1 / cam[:, 2]
         by_cam[:, :, 2] = -cam[:, :2] / cam[:, 2:] ** 2
-        by_pose = camera.mean_focal_length() * np.concatenate([-by_cam @ skew(cam), -by_cam @ rotation], axis=2)
-        information = np.einsum("n,nki,nkj->ij", weight, by_pose, by_pose)
+        by_turn, by_place = -cross(by_cam, cam[:, None]).reshape(-1, 3), -by_cam.reshape(-1, 3) @ rotation
+        by_pose = camera.mean_focal_length() * np.concatenate([by_turn, by_place], axis=1)
+        information = by_pose.T @ (np.repeat(weight, 2)[:, None] * by_pose)
         variance_px2 = max(level / (2 * np.log(2)), _SMALLEST_ERROR_PX**2)
         try:
             root = np.linalg.inv(np.linalg.cholesky(information))
