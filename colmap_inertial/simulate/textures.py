@@ -41,7 +41,7 @@ def _colour(rng: np.random.Generator, low: float = 0.03, high: float = 0.85) -> 
     """A random reflectance: brightness uniform in perceived lightness, some saturation."""
     lightness = rng.uniform(low**0.45, high**0.45) ** (1 / 0.45)
     tint = np.exp(rng.normal(0, 0.35, 3))
-    return np.minimum(np.maximum(lightness * tint / (np.add.reduce(tint) / 3), 0.02), 0.92).astype(np.float32)
+    return np.minimum(np.maximum(lightness * tint / tint.mean(), 0.02), 0.92).astype(np.float32)
 
 
 def _mix(a: NDArray[np.float32], b: NDArray[np.float32], weight: NDArray[np.float32]) -> Texture:
