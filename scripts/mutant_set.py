@@ -114,10 +114,17 @@ MUTANTS = (
     ),
     Mutant(
         "scale/_setup.py",
-        "        info[np.ix_(here, here)] = np.linalg.inv(gains)\n",
+        "        info[np.ix_(here, here)] = np.linalg.inv(gains_cov(imu))\n",
         "",
         "a calibrated gain stays as unknown as any",
         ("calibrate_imu::test_a_calibrated_imu_narrows_the_interval_and_keeps_the_truth_in_it",),
+    ),
+    Mutant(
+        "scale/priors.py",
+        "PRIORS.gain_per_kelvin * abs(imu.warmer_k or 0.0)",
+        "0.0",
+        "a gain is as sure however warm the sensor",
+        ("calibrate_imu::test_a_recording_warmer_than_its_calibration_is_less_sure_and_says_so",),
     ),
     Mutant(
         "rest/_fit.py",

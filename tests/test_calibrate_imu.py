@@ -197,6 +197,28 @@ def test_a_calibrated_imu_narrows_the_interval_and_keeps_the_truth_in_it():
     assert max(widths) < 0.75
 
 
+def test_a_recording_warmer_than_its_calibration_is_less_sure_and_says_so():
+    recorded = simulate_recording(RecordingOptions(imu=IMU_PRESETS["phone"]), seed=1)
+    rests = simulate_rests(RestOptions(imu=IMU_PRESETS["phone"]), seed=1, errors=recorded.truth.imu_errors)
+    cool = dataclasses.replace(rests.recording, temperature_c=21.0)
+    calibration = calibrate_imu(cool, gravity_m_s2=9.81, gravity_sigma_m_s2=5e-4).calibration
+    assert calibration.temperature_c == 21.0
+
+    def estimated(temperature_c, *, gain=1.0):
+        imu = dataclasses.replace(recorded.imu, temperature_c=temperature_c, accel_m_s2=gain * recorded.imu.accel_m_s2)
+        return estimate_scale(recorded.trajectory, imu, imu_calibration=calibration)
+
+    unknown, alike, warm = estimated(None), estimated(24.0), estimated(51.0)
+    assert not any("calibrated at" in note for note in (*unknown.notes, *alike.notes))
+    assert any("calibrated at 21 °C and was 51 °C warm here" in note for note in warm.notes)
+    assert unknown.sigma_log <= alike.sigma_log < 1.1 * unknown.sigma_log
+    assert warm.sigma_log > 1.4 * alike.sigma_log
+    assert warm.as_json()["imu_calibration"]["temperature_c"] == 21.0
+    # what 30 kelvin may do to a gain: the interval counts it
+    low, high = estimated(51.0, gain=1.006).ci95
+    assert low < recorded.truth.metres_per_unit < high
+
+
 # --- the values ------------------------------------------------------------------------------------------------------
 
 

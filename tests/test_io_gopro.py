@@ -83,6 +83,22 @@ def test_karma_s_sensors_are_each_at_their_own_rate_and_time(karma: Path) -> Non
     assert np.median(imu.accel_m_s2, axis=0) == pytest.approx([0, 0, 9.7], abs=0.3)
 
 
+def test_the_temperature_beside_the_samples_is_the_recording_s(karma: Path, max_heromode: Path) -> None:
+    for path in (karma, max_heromode):
+        content = path.read_bytes()
+        said = [content[at + 8 : at + 12] for at in range(len(content)) if content.startswith(b"TMPCf\x04\x00\x01", at)]
+        assert len(said) > 20
+        median = np.median([struct.unpack(">f", four)[0] for four in said])
+        assert read_imu(path).temperature_c == pytest.approx(median, abs=0.5)
+
+
+def test_an_impossible_temperature_is_none(tmp_path: Path, imu: ImuRecording) -> None:
+    for name, degrees, read in (("warm", 41.5, 41.5), ("none", None, None), ("odd", float("nan"), None)):
+        path = tmp_path / f"{name}.mp4"
+        imu_files.write_gopro(path, imu, imu_files.GoPro(temperature_c=degrees))
+        assert read_imu(path).temperature_c == read
+
+
 def test_karma_s_frames_have_exposures_and_no_readout(karma: Path) -> None:
     log = log_of(karma)
     np.testing.assert_array_equal(log.epoch_ns + np.rint(log.t_s * 1e9).astype(np.int64), video_stamps_ns(karma))

@@ -40,7 +40,7 @@ _SENSORS: dict[str, Quantity] = {"GYRO": "gyro", "ACCL": "accel"}
 #: Streams with one sample for each frame, the best one first.
 _OF_FRAMES = ("SHUT", "ISOE", "ISOG", "CORI", "GRAV")
 _POSITIONS = ("GPS9", "GPS5")
-_WANTED = {*_SENSORS, *_OF_FRAMES, *_POSITIONS, "GPSF", "GPSP", "IORI", "SROT"}
+_WANTED = {*_SENSORS, *_OF_FRAMES, *_POSITIONS, "GPSF", "GPSP", "IORI", "SROT", "TMPC"}
 #: Standard deviation of a position, metres, where the dilution of precision is 1.
 _UNDILUTED_M = 1.5
 #: Beyond this dilution of precision a position says nothing.
@@ -48,6 +48,8 @@ _MOST_DILUTED = 10.0
 #: Channel order by the firmware's first letters, where the stream does not say.
 _ORDER = {"HD5": "ZXY", "FS1": "yXZ"}
 _USUAL_ORDER = "YxZ"
+#: No sensor works at more, nor below its opposite (and not at what is no number).
+_HOTTEST_C = 150.0
 #: An image that is rotated by more than this against the camera was stabilised.
 _ROTATED_RAD = 0.005
 #: Samples of the last payload may be missing for so many frames at the end; they take the last one's.
@@ -84,7 +86,8 @@ def read_gopro(path: Path, units: DeclaredUnits) -> ImuRecording:
             path, "its telemetry holds no gyroscope (GYRO): HERO5 and later write one; older cameras have none"
         )
     device = _device(telemetry.movie, telemetry.streams["GYRO"])
-    return recording(found["gyro"], found.get("accel"), device=device)
+    read = recording(found["gyro"], found.get("accel"), device=device)
+    return replace(read, temperature_c=_temperature_c(telemetry.streams))
 
 
 def read_gopro_frames(path: Path) -> FrameLog:
@@ -214,6 +217,14 @@ class _Telemetry:
             if video is not None and len(video.t_ns) and stream and stream.stamps(self.payload_ns)[1] == kind:
                 return int(video.t_ns.min() - self.times_ns(key)[0])
         return 0 if gyro is None or stamps is None else int(self.payload_ns[gyro.payload[0]] - stamps[0])
+
+
+def _temperature_c(streams: dict[str, Stream]) -> float | None:
+    """What the camera says beside its sensors' readings, degrees Celsius; ``None`` where it says nothing possible."""
+    stream = streams.get("TMPC")
+    said = np.empty(0) if stream is None else stream.values[:, 0]
+    said = said[np.abs(said) < _HOTTEST_C]
+    return float(np.median(said)) if len(said) else None
 
 
 def _of_payloads(about: Stream | None, stream: Stream, default: float) -> Array:

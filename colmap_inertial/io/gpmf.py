@@ -42,7 +42,7 @@ _TYPES = {
 _FIXED_POINT = {b"q": 2.0**16, b"Q": 2.0**32}
 _NESTED, _COMPOUND = b"\0", b"?"
 #: What describes the sample after it, and is no sample: ``SCAL`` does not divide it.
-_UNSCALED = ("GPSF", "GPSP")
+_UNSCALED = ("GPSF", "GPSP", "TMPC")
 #: By the kind of stamp: payloads to either side that smooth it (milliseconds jitter by two, microseconds by 0.02,
 #: payloads without stamps by a few samples), and how much more time than usual for its samples means a loss.
 _REACH = {"STMP": 2, "TICK": 15, "track": 15}

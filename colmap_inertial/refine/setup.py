@@ -30,10 +30,9 @@ from colmap_inertial.refine.values import (
 )
 from colmap_inertial.scale._preintegration import SensorErrors, Track, Tracks, preintegrate
 from colmap_inertial.scale._setup import cut_off
-from colmap_inertial.scale.priors import PRIORS
+from colmap_inertial.scale.priors import PRIORS, gains_cov
 from colmap_inertial.types import (
     CAL,
-    IMU_CAL,
     Array,
     CameraImuCalibration,
     CameraModel,
@@ -356,9 +355,7 @@ def _information(start: Estimate, known: Known, imu: ImuRecording, timing: Frame
     info = np.diag(sigma**-2)
     if imu.calibration is not None:
         here = np.r_[at.accel_gain, at.gyro_gain]
-        there = np.r_[IMU_CAL.ACCEL_GAIN, IMU_CAL.GYRO_GAIN]
-        gains = imu.calibration.cov[np.ix_(there, there)] + PRIORS.calibrated_gain**2 * np.eye(len(there))
-        info[np.ix_(here, here)] = np.linalg.inv(gains)
+        info[np.ix_(here, here)] = np.linalg.inv(gains_cov(imu))
     return info
 
 

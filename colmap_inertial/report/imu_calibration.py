@@ -58,6 +58,8 @@ def _outcome(found: RestCalibration) -> Section:
         ("gravity, corrected", f"{found.rms_pct(found.after_m_s2):.2g} % rms off"),
         ("strength of gravity", f"{calibration.gravity_m_s2:.5f} m/s2"),
     ]
+    if calibration.temperature_c is not None:
+        values.append(("the sensors' temperature", f"{calibration.temperature_c:.0f} °C"))
     if len(turns) > 0:
         values.append(("turns miss gravity by", f"{np.sqrt(np.mean(turns**2)):.2g}° rms"))
     parts = [

@@ -132,7 +132,7 @@ def calibrate_imu(
     if apart:
         fit = of_accel
     name = imu.device if device is None else device
-    calibration = _calibration(fit, rests, gravity_m_s2, name)
+    calibration = replace(_calibration(fit, rests, gravity_m_s2, name), temperature_c=imu.temperature_c)
     verdict, reasons = _judged(calibration, fit, rests, gravity_sigma_m_s2, apart=apart)
     return RestCalibration(
         calibration=calibration,

@@ -5,14 +5,17 @@ from __future__ import annotations
 import numpy as np
 
 from colmap_inertial.sampling import PAUSE_STEPS, is_gap
+from colmap_inertial.scale.priors import PRIORS
 from colmap_inertial.types import Array, CameraImuCalibration, CameraTrajectory, ImuRecording, clock_shift_s
 
 #: Shorter pauses are not worth a sentence.
 _PAUSE_S = 0.02
+#: Nor is less than this, in which gains change by less than a calibration is sure of them.
+_WARMER_K = 10.0
 
 
 def remarks(trajectory: CameraTrajectory, imu: ImuRecording, calibration: CameraImuCalibration) -> tuple[str, ...]:
-    """Sentences on clocks far apart, pauses of the sensors, and frames without IMU.
+    """Sentences on clocks far apart, pauses of the sensors, frames without IMU, and another warmth than calibrated.
 
     Parameters
     ----------
@@ -30,6 +33,7 @@ def remarks(trajectory: CameraTrajectory, imu: ImuRecording, calibration: Camera
         _pauses("gyroscope", gyro_s, trajectory),
         _pauses("accelerometer", accel_s, trajectory),
         _uncovered(trajectory, covered),
+        _warmer(imu),
     )
     return tuple(sentence for sentence in said if sentence)
 
@@ -63,3 +67,13 @@ def _uncovered(trajectory: CameraTrajectory, covered_s: tuple[float, float]) -> 
         return ""
     count = int(np.sum((trajectory.t_s >= covered_s[0]) & (trajectory.t_s <= covered_s[1])))
     return f"the IMU runs along with {count} of {len(trajectory)} frames only; the scale rests on those"
+
+
+def _warmer(imu: ImuRecording) -> str:
+    if imu.calibration is None or imu.warmer_k is None or abs(imu.warmer_k) < _WARMER_K:
+        return ""
+    then_c, changed_pct = imu.calibration.temperature_c, 100 * PRIORS.gain_per_kelvin * abs(imu.warmer_k)
+    return (
+        f"the IMU was calibrated at {then_c:.0f} °C and was {imu.temperature_c:.0f} °C warm here: its gains may have "
+        f"changed by {changed_pct:.1f} %, which the interval counts; calibrate it as warm as you film"
+    )

@@ -14,14 +14,12 @@ from colmap_inertial.scale._grouping import find_breaks, group_frames
 from colmap_inertial.scale._noise import roughness
 from colmap_inertial.scale._parameters import Data, Estimate, Prior
 from colmap_inertial.scale._preintegration import Track, Tracks
-from colmap_inertial.scale.priors import PRIORS
+from colmap_inertial.scale.priors import PRIORS, gains_cov
 from colmap_inertial.types import (
     CAL,
-    IMU_CAL,
     Array,
     CameraImuCalibration,
     CameraTrajectory,
-    ImuCalibration,
     ImuRecording,
     clock_shift_s,
 )
@@ -137,7 +135,7 @@ def prepare(
     )
     prior = Prior(
         mean=mean,
-        info=_information(calibration, imu.calibration),
+        info=_information(calibration, imu),
         gravity_m_s2=gravity_m_s2,
         gravity_sigma_m_s2=gravity_sigma_m_s2,
         flat_m=UNKNOWN_LEVER_ARM_M[2] if _unknown_depth(calibration) else None,
@@ -160,7 +158,7 @@ def _unknown_depth(calibration: CameraImuCalibration) -> bool:
     return bool(np.isclose(calibration.cov[depth, depth], UNKNOWN_LEVER_ARM_M[2] ** 2))
 
 
-def _information(calibration: CameraImuCalibration, of_imu: ImuCalibration | None) -> Array:
+def _information(calibration: CameraImuCalibration, imu: ImuRecording) -> Array:
     """(79, 79) prior information of the globals; none for scale and gravity.
 
     The readings of a calibrated IMU are corrected already: the mean of its gains stays 0, and what is left of them is
@@ -184,11 +182,9 @@ def _information(calibration: CameraImuCalibration, of_imu: ImuCalibration | Non
     sigma[par.SHUTTER] = np.maximum(np.repeat(shutter, 9), 1e-9)
     sigma[par.COUPLING] = PRIORS.coupling_m
     info = np.diag(sigma**-2)
-    if of_imu is not None:
+    if imu.calibration is not None:
         here = np.r_[par.ACCEL_GAIN, par.GYRO_GAIN]
-        there = np.r_[IMU_CAL.ACCEL_GAIN, IMU_CAL.GYRO_GAIN]
-        gains = of_imu.cov[np.ix_(there, there)] + PRIORS.calibrated_gain**2 * np.eye(len(there))
-        info[np.ix_(here, here)] = np.linalg.inv(gains)
+        info[np.ix_(here, here)] = np.linalg.inv(gains_cov(imu))
     return info
 
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from colmap_inertial.types import ImuRecording
+import numpy as np
+
+from colmap_inertial.types import IMU_CAL, Array, ImuRecording
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +40,11 @@ class JointPriors:
     """What an accelerometer that nobody calibrated is off beside a constant gain, as a factor of the scale: with the
     lens it makes the 0.5 % that real recordings show at least."""
     calibrated_gain: float = 0.001
-    """Each gain and axis error of a calibrated sensor, beside its calibration's own covariance: age and temperature."""
+    """Each gain and axis error of a calibrated sensor, beside its calibration's own covariance: age, and the few kelvin
+    that nobody logs."""
+    gain_per_kelvin: float = 2e-4
+    """By how much a gain changes with the sensor's temperature: data sheets of phones' and cameras' IMUs give 0.005 to
+    0.03 % a kelvin."""
 
 
 PRIORS = JointPriors()
@@ -52,5 +58,29 @@ def model_scale_sigma(calibrated: bool) -> float:
 
 
 def is_calibrated(imu: ImuRecording) -> bool:
-    """Whether the accelerometer's gain was corrected by a calibration that knows it well enough."""
-    return imu.calibration is not None and imu.calibration.gain_sigma <= KNOWN_GAIN
+    """Whether the accelerometer's gain was corrected by a calibration that knows it well enough, as warm as it was."""
+    if imu.calibration is None:
+        return False
+    return math.hypot(imu.calibration.gain_sigma, _by_warmth(imu)) <= KNOWN_GAIN
+
+
+def gains_cov(imu: ImuRecording) -> Array:
+    """(18, 18) what stays unknown of a corrected recording's gains: the accelerometer's nine, then the gyroscope's.
+
+    The calibration's own covariance, and how far each may have moved since, with age and with the temperature.
+
+    Raises
+    ------
+    ValueError
+        Where no calibration corrected it.
+    """
+    if imu.calibration is None:
+        raise ValueError("the recording was not corrected by a calibration")
+    entries = np.r_[IMU_CAL.ACCEL_GAIN, IMU_CAL.GYRO_GAIN]
+    moved = math.hypot(PRIORS.calibrated_gain, _by_warmth(imu))
+    return np.asarray(imu.calibration.cov[np.ix_(entries, entries)] + moved**2 * np.eye(len(entries)))
+
+
+def _by_warmth(imu: ImuRecording) -> float:
+    """Standard deviation of what a gain changed by since the calibration; 0 where a temperature was not logged."""
+    return PRIORS.gain_per_kelvin * abs(imu.warmer_k or 0.0)

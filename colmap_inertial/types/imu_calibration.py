@@ -120,6 +120,7 @@ class ImuCalibration:
             "gyro_gain": self.gyro_gain.tolist(),
             "gain_sigma": self.gain_sigma,
             "gravity_m_s2": self.gravity_m_s2,
+            "temperature_c": self.temperature_c,
         }
 
     def corrected(self, imu: ImuRecording) -> ImuRecording:

@@ -80,6 +80,8 @@ class ImuRecording:
         The data sheet's noise, where the recording comes with one.
     calibration
         What the readings were corrected by (``ImuCalibration.corrected``); ``None`` where they are the sensor's own.
+    temperature_c
+        How warm the sensors were (median), degrees Celsius, where it was logged.
     """
 
     gyro_t_s: Array
@@ -91,6 +93,7 @@ class ImuRecording:
     device: str = ""
     noise: ImuNoise | None = None
     calibration: ImuCalibration | None = None
+    temperature_c: float | None = None
 
     def __post_init__(self) -> None:
         gyro_t_s, accel_t_s = checked_times("gyro_t_s", self.gyro_t_s), checked_times("accel_t_s", self.accel_t_s)
@@ -103,11 +106,19 @@ class ImuRecording:
         )
         if len(gyro_t_s) < 2 or len(accel_t_s) == 1:
             raise ValueError("an ImuRecording needs at least two samples of each sensor (or none of the accelerometer)")
+        if self.temperature_c is not None and not np.isfinite(self.temperature_c):
+            raise ValueError("temperature_c must be finite")
 
     @property
     def has_accel(self) -> bool:
         """Whether the accelerometer was recorded; without it there is no scale and no gravity."""
         return len(self.accel_t_s) > 0
+
+    @property
+    def warmer_k(self) -> float | None:
+        """By how much the sensors were warmer than at their calibration; ``None`` where either was not logged."""
+        then = None if self.calibration is None else self.calibration.temperature_c
+        return None if then is None or self.temperature_c is None else self.temperature_c - then
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
