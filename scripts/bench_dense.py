@@ -257,7 +257,7 @@ def cost(scene: str, work: Path, width: int) -> dict[str, float]:
         render(model, recipe, capture, folder, width)
     shutil.rmtree(folder / "stereo", ignore_errors=True)
     code = (
-        "import resource, sys, tempfile, time\n"
+        "import sys, tempfile, time\n"
         "from pathlib import Path\n"
         "from colmap_inertial.colmap.swept import SweptWorkspace\n"
         "with tempfile.TemporaryDirectory() as raw:\n"
@@ -266,8 +266,9 @@ def cost(scene: str, work: Path, width: int) -> dict[str, float]:
         "    clock, processor = time.perf_counter(), time.process_time()\n"
         "    swept.sweep(0, lambda: None)\n"
         "    spent = time.perf_counter() - clock, time.process_time() - processor\n"
-        "print(*spent, sum(v.width * v.height for v in swept.sights.views) / 1e6, "
-        "resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)\n"
+        # what getrusage says counts the parent's memory, too
+        "(peak,) = (l for l in Path('/proc/self/status').read_text().splitlines() if l.startswith('VmHWM'))\n"
+        "print(*spent, sum(v.width * v.height for v in swept.sights.views) / 1e6, peak.split()[1])\n"
     )
     done = subprocess.run([sys.executable, "-c", code, str(folder)], check=True, capture_output=True, text=True)
     clock, processor, megapixels, kib = (float(word) for word in done.stdout.split())
