@@ -120,8 +120,15 @@ MUTANTS = (
         ("calibrate_imu::test_a_calibrated_imu_narrows_the_interval_and_keeps_the_truth_in_it",),
     ),
     Mutant(
+        "io/calibration.py",
+        "UNKNOWN_LEVER_ARM_M = 0.08",
+        "UNKNOWN_LEVER_ARM_M = 0.01",
+        "every device is as flat as a phone",
+        ("scale_real::test_an_imu_behind_the_camera_is_found_there_in_short_noisy_clips",),
+    ),
+    Mutant(
         "scale/priors.py",
-        "PRIORS.gain_per_kelvin * abs(imu.warmer_k or 0.0)",
+        "PRIORS.calibrated_gain_per_k * abs(imu.warmer_k or 0.0)",
         "0.0",
         "a gain is as sure however warm the sensor",
         ("calibrate_imu::test_a_recording_warmer_than_its_calibration_is_less_sure_and_says_so",),

@@ -16,7 +16,7 @@ from colmap_inertial.types import CAL, CALIBRATION_PARAMETERS, CameraImuCalibrat
 UNKNOWN_ROTATION_RAD = np.pi
 UNKNOWN_OFFSET_S = 1e4
 UNKNOWN_GYRO_BIAS_RAD_S = 0.1
-UNKNOWN_LEVER_ARM_M = (0.08, 0.08, 0.01)  # a device is flat: along the optical axis it is centimetres thick at most
+UNKNOWN_LEVER_ARM_M = 0.08  # along each axis: a phone is flat, an action camera or a rig is not
 UNKNOWN_READOUT_S = 0.02
 #: Camera and IMU on one clock differ by pipeline delays at most.
 SHARED_CLOCK_OFFSET_S = 1.0

@@ -205,9 +205,6 @@ class Prior:
         Of the first state's bias.
     speed_sigma_m_s
         Of every velocity: holds a keyframe between two long gaps.
-    flat_m
-        Half the thickness of a device of which nothing is known, None where the lever arm is: along the optical axis
-        the IMU lies as near to the camera in phones, and farther in rigs (Cauchy's distribution).
     heavy_gains
         Whether gains of the accelerometer beyond ``LARGEST_GAIN_CHI2`` are pulled no more than there: one sensor in
         many is off by far more than the rest.
@@ -219,7 +216,6 @@ class Prior:
     gravity_sigma_m_s2: float
     gyro_bias_sigma_rad_s: float = 0.2
     speed_sigma_m_s: float = 10.0
-    flat_m: float | None = None
     heavy_gains: bool = False
 
     def at(self, x: Estimate) -> Prior:
@@ -228,8 +224,6 @@ class Prior:
         if self.heavy_gains:
             kept = min(1.0, LARGEST_GAIN_CHI2 / max(self.gain_chi2(x), 1e-9))
             info[ACCEL_GAIN, ACCEL_GAIN] -= (1 - kept) * self.gain_info
-        if self.flat_m is not None:
-            info[LEVER.stop - 1, LEVER.stop - 1] = 2 / (self.flat_m**2 + float(x.imu_in_cam_m[2]) ** 2)
         return replace(self, info=info)
 
     @property

@@ -72,7 +72,7 @@ def _uncovered(trajectory: CameraTrajectory, covered_s: tuple[float, float]) -> 
 def _warmer(imu: ImuRecording) -> str:
     if imu.calibration is None or imu.warmer_k is None or abs(imu.warmer_k) < _WARMER_K:
         return ""
-    then_c, changed_pct = imu.calibration.temperature_c, 100 * PRIORS.gain_per_kelvin * abs(imu.warmer_k)
+    then_c, changed_pct = imu.calibration.temperature_c, 100 * PRIORS.calibrated_gain_per_k * abs(imu.warmer_k)
     return (
         f"the IMU was calibrated at {then_c:.0f} °C and was {imu.temperature_c:.0f} °C warm here: its gains may have "
         f"changed by {changed_pct:.1f} %, which the interval counts; calibrate it as warm as you film"

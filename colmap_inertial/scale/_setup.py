@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.geometry import matrix_from_quat
-from colmap_inertial.io.calibration import UNKNOWN_LEVER_ARM_M
 from colmap_inertial.sampling import at_ceiling
 from colmap_inertial.scale import _parameters as par
 from colmap_inertial.scale._grouping import find_breaks, group_frames
@@ -138,7 +137,6 @@ def prepare(
         info=_information(calibration, imu),
         gravity_m_s2=gravity_m_s2,
         gravity_sigma_m_s2=gravity_sigma_m_s2,
-        flat_m=UNKNOWN_LEVER_ARM_M[2] if _unknown_depth(calibration) else None,
     )
     return data, prior
 
@@ -150,12 +148,6 @@ def cut_off(imu: ImuRecording) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         # digits that the corrections left behind would make one reading many
         gyro, accel = (np.round(values, 9) for values in imu.calibration.uncorrected(gyro, accel))
     return np.asarray(at_ceiling(gyro).any(axis=1)), np.asarray(at_ceiling(accel).any(axis=1))
-
-
-def _unknown_depth(calibration: CameraImuCalibration) -> bool:
-    """Whether nothing was said of how far the IMU lies behind the camera."""
-    depth = CAL.LEVER_ARM.stop - 1
-    return bool(np.isclose(calibration.cov[depth, depth], UNKNOWN_LEVER_ARM_M[2] ** 2))
 
 
 def _information(calibration: CameraImuCalibration, imu: ImuRecording) -> Array:

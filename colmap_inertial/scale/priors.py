@@ -15,8 +15,8 @@ class JointPriors:
     """Standard deviations of the joint estimator's priors.
 
     The lever arm, the delay between the sensors and the readout have theirs in the calibration
-    (``io.calibration.calibration_prior``: 8 cm in the sensor plane and 1 cm along the optical axis, 20 ms, 20 ms);
-    rotation, offset and gyroscope bias come from the alignment; scale and the direction of gravity have none.
+    (``io.calibration.calibration_prior``: 8 cm along each axis, 20 ms, 20 ms); rotation, offset and gyroscope bias come
+    from the alignment; scale and the direction of gravity have none.
     """
 
     gyro_gain: float = 0.01
@@ -42,7 +42,7 @@ class JointPriors:
     calibrated_gain: float = 0.001
     """Each gain and axis error of a calibrated sensor, beside its calibration's own covariance: age, and the few kelvin
     that nobody logs."""
-    gain_per_kelvin: float = 2e-4
+    calibrated_gain_per_k: float = 2e-4
     """By how much a gain changes with the sensor's temperature: data sheets of phones' and cameras' IMUs give 0.005 to
     0.03 % a kelvin."""
 
@@ -83,4 +83,4 @@ def gains_cov(imu: ImuRecording) -> Array:
 
 def _by_warmth(imu: ImuRecording) -> float:
     """Standard deviation of what a gain changed by since the calibration; 0 where a temperature was not logged."""
-    return PRIORS.gain_per_kelvin * abs(imu.warmer_k or 0.0)
+    return PRIORS.calibrated_gain_per_k * abs(imu.warmer_k or 0.0)
