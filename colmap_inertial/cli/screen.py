@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from colmap_inertial.cli.speech import Speaker
-from colmap_inertial.diagnose import Diagnosis
-from colmap_inertial.precalibrate.preflight import STOPPING
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress as Bars, TaskID
+
+    from colmap_inertial.diagnose import Diagnosis
 
 _STAGES = {
     "rendering": "Rendering",
@@ -172,6 +172,8 @@ class Screen:
             says so.
         """
         from rich.text import Text
+
+        from colmap_inertial.precalibrate.preflight import STOPPING
 
         found = [finding for finding in diagnosis.findings if finding.severity != "info"]
         stopping = next((finding for finding in found if stops and finding.code in STOPPING), None)

@@ -9,28 +9,26 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from colmap_inertial.cli.screen import SEVERITY_COLOUR, Screen
-from colmap_inertial.diagnose import Diagnosis
-from colmap_inertial.drivers.deblur import DeblurResult
-from colmap_inertial.drivers.reference import Reference
-from colmap_inertial.drivers.remembered import Remembered
-from colmap_inertial.drivers.result import ReconstructResult, shutter_note
 from colmap_inertial.errors import InertialError
-from colmap_inertial.export.whole import Exported
-from colmap_inertial.georeference import Georeference
-from colmap_inertial.model.project import Applied
-from colmap_inertial.precalibrate.plan import ImagingPlan
-from colmap_inertial.report.words import half_width_pct, length_error, not_checked
-from colmap_inertial.rest import RestCalibration
-from colmap_inertial.run.workspace import Workspace
-from colmap_inertial.scale.parts import parts_in_words
-from colmap_inertial.scale.verdict import Z95
-from colmap_inertial.stages.frame_folder import FrameRecord
-from colmap_inertial.types import CameraImuCalibration, Gap, JoinedPart, ScaleEstimate
-from colmap_inertial.validate import Validation, validation_table
-from colmap_inertial.view.guard import is_loopback
 
+# Only the annotations need these, and what a command does not load it does not wait for.
 if TYPE_CHECKING:
     from rich.text import Text
+
+    from colmap_inertial.diagnose import Diagnosis
+    from colmap_inertial.drivers.deblur import DeblurResult
+    from colmap_inertial.drivers.reference import Reference
+    from colmap_inertial.drivers.remembered import Remembered
+    from colmap_inertial.drivers.result import ReconstructResult
+    from colmap_inertial.export.whole import Exported
+    from colmap_inertial.georeference import Georeference
+    from colmap_inertial.model.project import Applied
+    from colmap_inertial.precalibrate.plan import ImagingPlan
+    from colmap_inertial.rest import RestCalibration
+    from colmap_inertial.run.workspace import Workspace
+    from colmap_inertial.stages.frame_folder import FrameRecord
+    from colmap_inertial.types import CameraImuCalibration, Gap, JoinedPart, ScaleEstimate
+    from colmap_inertial.validate import Validation
 
 #: A label and what there is to say.
 Line = tuple[str, "str | Text"]
@@ -40,6 +38,8 @@ _COLOUR = {"trusted": "green", "weak": "yellow", "refused": "red"}
 
 def headline(estimate: ScaleEstimate) -> str:
     """What a user wants to know first: how far off ten metres may be."""
+    from colmap_inertial.report.words import half_width_pct, length_error
+
     if estimate.metres_per_unit is None or estimate.ci95 is None:
         return "no metres: the recording does not tell how large things are"
     error = length_error(half_width_pct(estimate.metres_per_unit, estimate.ci95))
@@ -50,6 +50,8 @@ def headline(estimate: ScaleEstimate) -> str:
 
 def next_command(result: ReconstructResult, source: Path) -> str:
     """What to type next, by how a reconstruction ended."""
+    from colmap_inertial.validate import Validation
+
     out, best = result.workspace.root, result.models[0]
     if all(model.sparse_metric is None for model in result.models):
         return shlex.join(["colmap-inertial", "diagnose", str(source)])
@@ -65,6 +67,8 @@ def next_command(result: ReconstructResult, source: Path) -> str:
 def scale_lines(estimate: ScaleEstimate) -> list[Line]:
     """The estimate as labelled lines, the first of them what a user wants to know."""
     from rich.text import Text
+
+    from colmap_inertial.scale.parts import parts_in_words
 
     lines: list[Line] = [("Metres", Text(headline(estimate), "bold"))]
     lines.append(("Verdict", Text(estimate.verdict, f"bold {_COLOUR[estimate.verdict]}")))
@@ -218,6 +222,8 @@ def show_diagnosis(diagnosis: Diagnosis, source: Path) -> None:
 
 
 def _say_not_checked(diagnosis: Diagnosis) -> None:
+    from colmap_inertial.report.words import not_checked
+
     left = not_checked(diagnosis.checked)
     if left:
         print(f"not checked: {left}")
@@ -227,11 +233,15 @@ def show_validation(result: Validation) -> None:
     """Print a validation."""
     from rich.console import Console
 
+    from colmap_inertial.validate import validation_table
+
     Console().print(validation_table(result))
 
 
 def imaging_lines(frames: Sequence[FrameRecord], plan: ImagingPlan, rectified: Collection[str]) -> list[Line]:
     """What was done to the frames, as labelled lines."""
+    from colmap_inertial.drivers.result import shutter_note
+
     counts = {action: sum(frame.action == action for frame in frames) for action in ("deblurred", "dropped")}
     done = ", ".join(f"{count} {action}" for action, count in counts.items() if count)
     view = plan.view
@@ -249,6 +259,8 @@ def show_nothing_to_do(workspace: Workspace) -> None:
 
 def show_reference(found: Reference) -> None:
     """Print where a project's metres come from, and how good they are."""
+    from colmap_inertial.report.words import half_width_pct, length_error
+
     low, high = found.ci95
     pct = half_width_pct(found.metres_per_unit, found.ci95)
     # a small target says how long things are where it lies, and no more
@@ -293,6 +305,8 @@ def show_deblurred(result: DeblurResult) -> None:
 
 
 def _on_map(found: Georeference | InertialError) -> str:
+    from colmap_inertial.scale.verdict import Z95
+
     if isinstance(found, InertialError):
         return str(found)
     heading, place = Z95 * found.heading_sigma_deg, Z95 * found.position_sigma_m
@@ -302,6 +316,8 @@ def _on_map(found: Georeference | InertialError) -> str:
 
 def show_result(result: ReconstructResult, source: Path) -> None:
     """Print the end of a reconstruction of ``source`` on one screen; the last line is what to type next."""
+    from colmap_inertial.validate import Validation
+
     if result.unchanged and not result.waiting:
         show_nothing_to_do(result.workspace)
     frames = result.frames
@@ -407,6 +423,8 @@ def show_exported(made: Exported) -> None:
 
 def show_view(out: Path, url: str, host: str) -> None:
     """Where a model is shown, and to whom."""
+    from colmap_inertial.view.guard import is_loopback
+
     print(f"{out} is shown at {url} (Ctrl-C ends this)", flush=True)
     if not is_loopback(host):
         print(
