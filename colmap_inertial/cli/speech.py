@@ -49,9 +49,9 @@ class Speaker:
 
     def check_json(self, *inputs: Path | None) -> None:
         """Refuse, before the work, a file for the JSON that is an input or not of ours."""
-        from colmap_inertial.drivers.sources import check_output
-
         if self.json_file is not None:
+            from colmap_inertial.drivers.sources import check_output
+
             check_output(self.json_file, inputs)
 
     def tell(self, show: Callable[[], None], content: Mapping[str, Any], *, written: bool = False) -> None:
