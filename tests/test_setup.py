@@ -70,9 +70,12 @@ complete = ["own[dev,mesh]"]
 
 
 @pytest.fixture
-def checkout(tmp_path):
-    """A checkout whose ``pip`` writes down what it is asked for."""
-    root = tmp_path / "checkout"
+def checkout(tmp_path, monkeypatch):
+    """A checkout whose ``pip`` writes down what it is asked for; Python itself, not a shim that looks for it each time."""
+    root, tools = tmp_path / "checkout", tmp_path / "python"
+    tools.mkdir()
+    (tools / "python3.11").symlink_to(os.path.realpath(sys.executable))
+    monkeypatch.setenv("PATH", f"{tools}:{os.environ['PATH']}")
     (root / "scripts").mkdir(parents=True)
     shutil.copy(ROOT / "scripts" / "setup.sh", root / "scripts")
     kernels = root / "colmap_inertial" / "_kernels"
