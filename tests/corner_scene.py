@@ -81,23 +81,24 @@ class CornerScene:
 
     def _seen(self, centre, direction):
         """Light along (H, W, 3) directions, from a place for each row; in single precision, which is quicker."""
-        centre, nearest = centre.astype(np.float32), np.float32(np.inf)
-        axis, plane = (np.zeros(direction.shape[:2], np.int8) for _ in range(2))
+        centre = centre.astype(np.float32)
+        nearest, plane = np.full(direction.shape[:2], np.inf, np.float32), np.zeros(direction.shape[:2], np.int8)
         for k, (of, place) in enumerate(PLANES):
             with np.errstate(divide="ignore"):
                 along = (np.float32(place) - centre[:, None, of]) / direction[..., of]
             nearer = (along > 0) & (along < nearest)
-            nearest = np.where(nearer, along, nearest)
-            axis[nearer], plane[nearer] = of, k
+            np.copyto(nearest, along, where=nearer)
+            np.copyto(plane, np.int8(k), where=nearer)
         hit = np.isfinite(nearest)
-        nearest[~hit] = 0
+        np.copyto(nearest, np.float32(0), where=~hit)
         x, y, z = (400 * (centre[:, None, k] + nearest * direction[..., k]) for k in range(3))
-        u, v = np.where(axis == 0, y, x), np.where(axis == 2, y, z)
+        axis = np.array([of for of, _ in PLANES])
+        u, v = np.where((axis == 0)[plane], y, x), np.where((axis == 2)[plane], y, z)
         side = self.textures.shape[1]
         u, v = (at - side * np.floor(at / side) for at in (u, v))
         v += (side + 1) * plane.astype(np.float32)
         out = cv2.remap(self._atlas, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        out[~hit] = 0
+        out *= hit[..., None]
         return out
 
     def true_blur(self, i, xy):
