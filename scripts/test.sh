@@ -28,16 +28,19 @@ fi
 
 .venv/bin/ruff check .
 .venv/bin/ruff format --check .
-# Types are checked on one processor while the tests begin on the others; what was found is said at the end.
-types=$(mktemp)
-.venv/bin/mypy >"$types" 2>&1 &
+# Types, those of the docs' examples too, are checked on one processor while the tests begin on the others; what was found
+# is said at the end.
+types=$(mktemp -d)
+mkdir "$types/examples"
+.venv/bin/python scripts/doc_examples.py "$types/examples"
+.venv/bin/mypy colmap_inertial "$types/examples" >"$types/found.txt" 2>&1 &
 checking=$!
-trap 'kill "$checking" 2>/dev/null || true; rm -f "$types"' EXIT
+trap 'kill "$checking" 2>/dev/null || true; rm -rf "$types"' EXIT
 # A process for each core: one thread in each is enough. Tests of one file share what it sets up, and the slowest files
 # begin first (tests/slow.txt). Modules are compiled once, not in each of the processes that tests start.
 unset PYTHONDONTWRITEBYTECODE
 OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 .venv/bin/python -m pytest --numprocesses auto --dist loadfile \
   --no-loadscope-reorder "$@" && tested=0 || tested=$?
 wait "$checking" && typed=0 || typed=$?
-cat "$types"
+cat "$types/found.txt"
 exit $((tested ? tested : typed))

@@ -55,6 +55,10 @@ from colmap_inertial.stages.gyro_view import GyroView
 from colmap_inertial.types import CameraModel, FrameTiming, Treatment
 
 ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "scripts"))
+
+from doc_examples import write_examples  # noqa: E402
+
 DOCS = ROOT / "docs"
 PAGES = [
     ROOT / "README.md",
@@ -618,21 +622,11 @@ def test_images_are_written_out_of_a_bag(tmp_path, monkeypatch):
 
 
 def test_the_examples_pass_a_type_checker(tmp_path):
-    """As a user's editor sees them: pyright's rules, and the package as it is typed."""
+    """As a user's editor sees them: pyright's rules, and the package as it is typed. ``scripts/test.sh`` asks mypy."""
+    written = write_examples(tmp_path)
+    assert [path.name for path in written if "colmap_inertial" not in path.read_text()] == [] and len(written) == 4
     if importlib.util.find_spec("basedpyright") is None:
-        pytest.skip("basedpyright is not installed (extra dev)")
-    for page in ("python.md", "imaging.md", "exposures.md"):
-        blocks = re.findall(r"```python\n(.*?)```", (DOCS / page).read_text(), re.S)
-        (tmp_path / page.replace(".md", "_examples.py")).write_text("\n\n".join(blocks))
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.S)
-    # paths as text and plain numbers of a scale that was not refused
-    blocks.append(
-        "import colmap_inertial as ci\n"
-        "timing = ci.read_frame_times('frames.csv')\n"
-        "trajectory, _ = ci.trajectory_from_model(ci.read_model('sparse/0'), timing)\n"
-        "length_m: float = 2.0 * ci.estimate_scale(trajectory, ci.read_imu('imu.csv')).accepted.metres_per_unit\n"
-    )
-    (tmp_path / "readme_examples.py").write_text("\n\n".join(blocks))
+        pytest.skip("basedpyright is not installed (extra complete)")
     settings = {"include": ["."], "typeCheckingMode": "standard", "extraPaths": [str(ROOT)]}
     (tmp_path / "pyrightconfig.json").write_text(json.dumps(settings))
     command = [sys.executable, "-m", "basedpyright", "--level", "error", "--pythonpath", sys.executable]

@@ -71,7 +71,7 @@ complete = ["own[dev,mesh]"]
 
 @pytest.fixture
 def checkout(tmp_path, monkeypatch):
-    """A checkout whose ``pip`` writes down what it is asked for; Python itself, not a shim that looks for it each time."""
+    """A checkout whose ``pip`` writes down what it is asked for. Python is itself, not a shim that looks for it."""
     root, tools = tmp_path / "checkout", tmp_path / "python"
     tools.mkdir()
     (tools / "python3.11").symlink_to(os.path.realpath(sys.executable))
