@@ -1,6 +1,7 @@
 """Atomic files and JSON."""
 
 import json
+import os
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -73,6 +74,14 @@ def test_a_failed_write_leaves_no_trace(tmp_path: Path, monkeypatch: pytest.Monk
     with pytest.raises(OutputError, match="disk full"):
         write_text(tmp_path / "a.txt", "new")
     assert [path.read_text() for path in tmp_path.iterdir()] == ["old"]
+
+
+def test_a_file_is_on_the_disk_before_it_takes_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    done, rename = [], os.replace
+    monkeypatch.setattr(os, "fsync", lambda _: done.append("flushed"))
+    monkeypatch.setattr(os, "replace", lambda *names: (done.append("named"), rename(*names)))
+    write_text(tmp_path / "a.txt", "1")
+    assert done == ["flushed", "named"]
 
 
 @pytest.mark.parametrize(

@@ -478,6 +478,14 @@ def test_a_full_disk_is_an_error_that_says_so(project, tmp_path, monkeypatch):
     assert [p.name for p in tmp_path.iterdir()] == ["project"]
 
 
+def test_all_of_it_is_on_the_disk_before_it_takes_its_name(project, tmp_path, monkeypatch):
+    flushed = set()
+    monkeypatch.setattr(os, "fsync", lambda file: flushed.add(os.fstat(file).st_ino))
+    apply_to_project(project, tmp_path / "out", plain_factor(2))
+    written = [tmp_path / "out", *(tmp_path / "out").rglob("*")]
+    assert len(written) > 20 and [path for path in written if path.stat().st_ino not in flushed] == []
+
+
 LIMITED = """
 import resource, sys
 from colmap_inertial.cli import main
