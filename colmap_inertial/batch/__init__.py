@@ -36,8 +36,8 @@ from colmap_inertial.io.files import StrPath, locked, remove_temporaries, write_
 from colmap_inertial.options import BatchOptions, ReconstructOptions, StageNames
 from colmap_inertial.run.config import config_as_toml
 
-#: How often finished captures are collected and progress is shown.
-_POLL_S = 0.5
+#: How often progress is shown, and how often finished captures are looked for: a batch ends soon after its last one.
+_POLL_S, _DONE_S = 0.5, 0.05
 #: Captures are begun in their order: of those that wait, so many are looked at.
 _NEXT = 64
 #: After a stop, how long workers may take to notice.
@@ -233,8 +233,9 @@ class _Batch:
                 status = read_status(self._tasks[name].status)
                 if status is not None and status.state == "running":
                     self._set(status)
-            if pending:
-                time.sleep(_POLL_S)
+            until = time.monotonic() + _POLL_S
+            while pending and time.monotonic() < until and not any(one.done() for one in pending.values()):
+                time.sleep(_DONE_S)
 
     def _looked_at(self, pending: dict[str, Pending]) -> list[str]:
         """Those in work, and the next that may be: looking at thousands of files takes its time."""
