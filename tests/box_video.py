@@ -90,15 +90,15 @@ def _picture(atlas: np.ndarray, rotation: np.ndarray, centre: np.ndarray, rays: 
     looking = rotation.astype(np.float32) @ rays
     low, high = ((wall - centre).astype(np.float32) for wall in (LOW_M, HIGH_M))
     with np.errstate(divide="ignore"):
-        ways = [np.where(ray == 0, np.inf, np.where(ray > 0, high[k], low[k]) / ray) for k, ray in enumerate(looking)]
+        ways = [np.maximum(high[k] / ray, low[k] / ray) for k, ray in enumerate(looking)]
     far = np.minimum(np.minimum(ways[0], ways[1]), ways[2])
     x, y, z = ((far * ray - low[k]) / (high[k] - low[k]) for k, ray in enumerate(looking))
     at_x, at_z = ways[0] == far, ways[2] == far
     u, v = np.where(at_x, y, x), np.where(at_z, y, z)
-    axis = np.where(at_x, 0, np.where(at_z, 2, 1))
-    wall = 2 * axis + np.choose(axis, looking > 0)
-    map_x = (u * 510).astype(np.float32).reshape(HEIGHT, WIDTH)
-    map_y = (wall * 512 + np.clip(v, 0, 1) * 510).astype(np.float32).reshape(HEIGHT, WIDTH)
+    up = looking > 0
+    wall = np.where(at_x, up[0], np.where(at_z, 4 + up[2], 2 + up[1])).astype(np.float32)
+    map_x = (u * 510).reshape(HEIGHT, WIDTH)
+    map_y = (wall * 512 + np.clip(v, 0, 1) * 510).reshape(HEIGHT, WIDTH)
     return cv2.remap(atlas, map_x, map_y, cv2.INTER_LINEAR)
 
 
