@@ -1,12 +1,20 @@
 #!/usr/bin/env bash
 # Makes .venv in the checkout with colmap-inertial, and compiles its kernels. Installs missing system packages with apt
 # where it may; otherwise it says what is missing.
-#   setup.sh [EXTRA ...]    extras of pyproject.toml to install along: dev for the tests, view, ros, ... (default: none)
+#   setup.sh [--browser] [EXTRA ...]    extras of pyproject.toml to install along: dev for the tests, view, ros, ...
+#                                       (default: none); --browser installs Chromium for the tests where it is missing
 # Running it again is quick; after a change of pyproject.toml or of the C++ sources, or with another extra, it installs
 # again, those of earlier times included. What pip is told by its own variables holds (PIP_EXTRA_INDEX_URL, PIP_FIND_LINKS):
 # so torch comes without CUDA.
 set -euo pipefail
 cd "$(dirname "$0")/.."
+
+browser=()
+if [ "${1:-}" = "--browser" ]; then
+  shift
+  command -v chromium >/dev/null || browser+=("chromium")
+  command -v chromedriver >/dev/null || browser+=("chromium-driver")
+fi
 
 python=""
 for candidate in python3.11 python3.12 python3.13 python3.14 python3; do
@@ -34,16 +42,26 @@ if grep -qxE 'mesh|complete' <<<"$extras"; then
     "$python" -c "import ctypes; ctypes.CDLL('${pair%%=*}')" 2>/dev/null || missing+=("${pair#*=}")
   done
 fi
+sudo=""
+if [ "$(id -u)" -ne 0 ]; then sudo="sudo -n"; fi
+has_apt() { command -v apt-get >/dev/null && $sudo true 2>/dev/null; }
+apt_install() {
+  echo "setup: installing $* with apt"
+  $sudo apt-get update -qq &&
+    DEBIAN_FRONTEND=noninteractive $sudo apt-get install -y -qq --no-install-recommends "$@" >/dev/null
+}
 if [ ${#missing[@]} -gt 0 ]; then
-  sudo=""
-  if [ "$(id -u)" -ne 0 ]; then sudo="sudo -n"; fi
-  if ! command -v apt-get >/dev/null || ! $sudo true 2>/dev/null; then
+  if ! has_apt; then
     echo "setup: please install these packages and run this again: ${missing[*]}" >&2
     exit 2
   fi
-  echo "setup: installing ${missing[*]} with apt"
-  $sudo apt-get update -qq
-  DEBIAN_FRONTEND=noninteractive $sudo apt-get install -y -qq --no-install-recommends "${missing[@]}" >/dev/null
+  apt_install "${missing[@]}"
+fi
+# The browser comes while Python's packages do. Without one, its tests are skipped.
+if [ ${#browser[@]} -gt 0 ]; then
+  (has_apt && apt_install "${browser[@]}" ||
+    echo "setup: the report's page is not tested in a browser; please install ${browser[*]} for that" >&2) &
+  trap 'wait' EXIT
 fi
 
 if ! .venv/bin/python -m pip --version >/dev/null 2>&1; then

@@ -145,3 +145,28 @@ def test_the_set_up_installs_what_open3d_takes_from_the_system(checkout, tmp_pat
     subprocess.run(["bash", "scripts/setup.sh", extra], cwd=checkout, env=env, check=True, capture_output=True)
     asked = (tmp_path / "apt.txt").read_text() if (tmp_path / "apt.txt").exists() else ""
     assert ("libgl1" in asked.split() and "libx11-6" in asked.split()) == (extra != "dev")
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler here")
+@pytest.mark.parametrize("works", [True, False])
+def test_the_browser_comes_along_and_only_tests_of_it_need_it(checkout, tmp_path, works):
+    tools, asked = tmp_path / "tools", tmp_path / "apt.txt"
+    tools.mkdir()
+    needed = ("bash", "sh", "cat", "dirname", "find", "g++", "getconf", "grep", "id", "paste", "sed", "sort")
+    for name in needed:  # and no browser
+        (tools / name).symlink_to(shutil.which(name))
+    (tools / "python3.11").symlink_to(os.path.realpath(sys.executable))
+    for name, text in (("apt-get", f'echo "$*" >>{asked}\nexit {int(not works)}\n'), ("sudo", 'shift\nexec "$@"\n')):
+        (tools / name).write_text("#!/bin/sh\n" + text)
+        (tools / name).chmod(0o755)
+    command = ["bash", "scripts/setup.sh", "--browser", "dev"]
+    env = os.environ | {"PATH": str(tools)}
+    done = subprocess.run(command, cwd=checkout, env=env, check=True, capture_output=True, text=True)
+    assert ("not tested in a browser" in done.stderr) == (not works), done.stderr
+    assert ("chromium chromium-driver" in asked.read_text()) == works
+    assert len((checkout / "asked.txt").read_text().splitlines()) == 2
+    for name in ("chromium", "chromedriver"):
+        (tools / name).symlink_to("/bin/true")
+    asked.unlink()
+    subprocess.run(command, cwd=checkout, env=env, check=True, capture_output=True)
+    assert not asked.exists()
