@@ -550,6 +550,13 @@ MUTANTS = (
         ("model_apply",),
     ),
     Mutant(
+        "model/copying.py",
+        "os.fsync(handle)",
+        "pass",
+        "a project has its name before the disk has its files",
+        ("model_apply::test_all_of_it_is_on_the_disk_before_it_takes_its_name",),
+    ),
+    Mutant(
         "model/__init__.py",
         "copy = pycolmap.Reconstruction(reconstruction)",
         "copy = reconstruction",
@@ -667,6 +674,13 @@ MUTANTS = (
         "path.write_text(text)",
         "files are written in place",
         ("io_files",),
+    ),
+    Mutant(
+        "io/files.py",
+        "os.fsync(file.fileno())",
+        "pass",
+        "a file has its name before the disk has what is in it",
+        ("io_files::test_a_file_is_on_the_disk_before_it_takes_its_name",),
     ),
     Mutant(
         "io/units.py",
