@@ -31,6 +31,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
+from conftest import write_anew
 from fuzz_readers import READERS, Reader, mutant
 
 from colmap_inertial.errors import InertialError
@@ -59,7 +60,7 @@ def outcome(reader: Reader, folder: Path, files: list[tuple[Path, bytes]], key: 
     """Damage one of the files, read, and mend it."""
     rng = np.random.default_rng(key)
     path, whole = files[rng.integers(0, len(files))]
-    path.write_bytes(mutant(whole, rng))
+    write_anew(path, mutant(whole, rng))
     try:
         with contextlib.redirect_stderr(None):
             reader.read(folder)
@@ -73,7 +74,7 @@ def outcome(reader: Reader, folder: Path, files: list[tuple[Path, bytes]], key: 
     except Exception:
         return "foreign", f"{path.name}: {traceback.format_exc()[-900:]}"
     finally:
-        path.write_bytes(whole)
+        write_anew(path, whole)
 
 
 def whole_files(reader: Reader, folder: Path) -> list[tuple[Path, bytes]]:

@@ -113,6 +113,12 @@ def shared_data() -> Path:
     return folder
 
 
+def write_anew(path: Path, data: bytes) -> None:
+    """Put other bytes into a file's place; to empty a file and fill it again makes ext4 write to the disk at once."""
+    path.unlink(missing_ok=True)
+    path.write_bytes(data)
+
+
 @dataclass(frozen=True)
 class Project:
     """A user's files: a COLMAP model, frame times, an IMU folder; and the truth behind them."""

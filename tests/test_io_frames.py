@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from conftest import write_anew
 
 from colmap_inertial.errors import FormatError, TimingError
 from colmap_inertial.io.capture import load_capture
@@ -213,7 +214,7 @@ def test_a_flipped_bit_in_a_png_is_noticed(tmp_path: Path) -> None:
     for at in np.random.default_rng(0).integers(0, len(whole), 50).tolist():
         damaged = whole.copy()
         damaged[at] ^= 1 << (at % 8)
-        path.write_bytes(damaged)
+        write_anew(path, damaged)
         with pytest.raises(FormatError, match=r"a\.png"):
             read_image(path)
 

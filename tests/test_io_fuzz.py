@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import write_anew
 from test_io_capture import EVERYTHING
 from test_io_frames import picture
 from test_io_imu import HEADER, handheld, rows
@@ -154,7 +155,7 @@ def refusals(path: Path, read: Callable[[], object], *, key: str, count: int) ->
     found = []
     for i in range(count):
         damaged = mutated(whole, rng)
-        path.write_bytes(damaged)
+        write_anew(path, damaged)
         try:
             read()
         except InertialError as error:

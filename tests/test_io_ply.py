@@ -4,6 +4,7 @@ import zlib
 
 import numpy as np
 import pytest
+from conftest import write_anew
 from test_io_fuzz import mutated
 
 from colmap_inertial.errors import FormatError, InertialError
@@ -191,7 +192,7 @@ def test_a_file_cut_anywhere_is_refused(tmp_path, kind):
     data, _ = odd_ply(kind)
     path = tmp_path / "a.ply"
     for n in np.random.default_rng(3).integers(0, len(data) - (2 if kind == "ascii" else 0), 150):
-        path.write_bytes(data[:n])
+        write_anew(path, data[:n])
         with pytest.raises(FormatError):
             transform_ply(path, tmp_path / "b.ply", SIMILARITY)
     if kind != "ascii":
@@ -208,7 +209,7 @@ def test_only_errors_of_our_own_escape(tmp_path, kind):
     refused = 0
     for i in range(150):
         damaged = mutated(data, rng)
-        path.write_bytes(damaged)
+        write_anew(path, damaged)
         try:
             transform_ply(path, tmp_path / "b.ply", SIMILARITY)
         except InertialError as error:

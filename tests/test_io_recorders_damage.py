@@ -9,6 +9,7 @@ from pathlib import Path
 import imu_files
 import numpy as np
 import pytest
+from conftest import write_anew
 from test_io_fuzz import mutated
 from test_io_recorders import FRAME_NS, recorded
 
@@ -107,7 +108,7 @@ def test_only_errors_of_our_own_escape(tmp_path: Path, imu: ImuRecording, name: 
     refused = 0
     for i in range(MUTATIONS if "ros" not in name else MUTATIONS // 4):
         data = damaged(whole, rng, binary=binary)
-        victim.write_bytes(data)
+        write_anew(victim, data)
         failed = False
         for read in (read_imu, read_frame_log, load_capture):
             try:

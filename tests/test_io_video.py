@@ -13,6 +13,7 @@ import av
 import cv2
 import numpy as np
 import pytest
+from conftest import write_anew
 
 from colmap_inertial.errors import FormatError, TimingError
 from colmap_inertial.io.capture import load_capture
@@ -438,7 +439,7 @@ def test_most_damage_is_an_error_with_its_time(tmp_path: Path) -> None:
         damaged = bytearray(whole)
         at = draw.randrange(len(whole) // 4, len(whole) - 400)
         damaged[at : at + 200] = draw.randbytes(200)
-        video.write_bytes(damaged)
+        write_anew(video, damaged)
         try:
             images = [image for _, image in decode_video(video, stamps)]
         except FormatError as error:

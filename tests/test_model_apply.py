@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from conftest import write_anew
 from model_project import HEIGHT, NAMES, WIDTH, fuse, prior_rows, write_project
 from test_io_fuzz import refusals
 from test_io_ply import SIMILARITY
@@ -665,7 +666,7 @@ def test_a_model_file_cut_anywhere_is_refused_before_colmap_reads_it(project, na
     whole = path.read_bytes()
     check_binary_model(path.parent)
     for n in np.random.default_rng(0).integers(0, len(whole), 60):
-        path.write_bytes(whole[:n])
+        write_anew(path, whole[:n])
         with pytest.raises(FormatError, match=name):
             check_binary_model(path.parent)
     path.write_bytes(whole + b"\0")
@@ -689,7 +690,7 @@ def test_a_model_with_flipped_bits_is_read_or_refused_at_once(project, name, suf
         damaged = bytearray(whole)
         for at in rng.integers(0, len(whole), 2):
             damaged[at] ^= 1 << int(rng.integers(0, 8))
-        path.write_bytes(bytes(damaged))
+        write_anew(path, bytes(damaged))
         try:
             read_model(path.parent, suffix).transform(pycolmap.Sim3d())
         except InertialError:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import write_anew
 from test_io_fuzz import mutated, refusals
 
 from colmap_inertial.batch import read_manifest
@@ -83,6 +84,6 @@ def test_a_damaged_status_is_none_and_never_an_error(tmp_path):
     rng = np.random.default_rng(8)
     missing = 0
     for _ in range(MUTATIONS):
-        path.write_bytes(mutated(whole, rng))
+        write_anew(path, mutated(whole, rng))
         missing += read_status(path) is None
     assert missing > 0
