@@ -6,6 +6,7 @@ Every one of them is a sentence for the user: what is wrong, where, and what to 
 
 from __future__ import annotations
 
+import errno
 from pathlib import Path
 from typing import ClassVar
 
@@ -116,3 +117,18 @@ class TargetNotFoundError(InertialError):
     """The calibration target was not found in the images."""
 
     exit_code = 5
+
+
+def exhausted(error: BaseException | None) -> str | None:
+    """A sentence for an exception that means that memory or files have run out, or that one such has led to.
+
+    ``None`` for any other. pycolmap says only that it cannot be imported, and how it is installed.
+    """
+    while error is not None:
+        number = error.errno if isinstance(error, OSError) else None
+        if isinstance(error, MemoryError) or number == errno.ENOMEM or "failed to map segment" in str(error):
+            return "the memory is used up: close other programs, or allow smaller pictures or fewer processes"
+        if number in (errno.EMFILE, errno.ENFILE):
+            return "too many files are open at a time: raise the limit (ulimit -n) and start again"
+        error = error.__cause__ or error.__context__
+    return None

@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import errno
 import json
 import os
 import signal
@@ -9,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
 
@@ -373,6 +375,19 @@ def test_a_worker_that_does_not_see_the_files_says_so(tmp_path):
     status = run_capture(task)
     assert status.state == "failed"
     assert "the same files" in status.error
+
+
+def test_what_ran_out_is_said_in_a_sentence(tmp_path, monkeypatch):
+    def refused(pool, task):
+        future = Future()
+        future.set_exception(OSError(errno.EMFILE, "Too many open files"))
+        return future
+
+    monkeypatch.setattr("colmap_inertial.batch.pools._Local.submit", refused)
+    (tmp_path / "m.toml").write_text('[[capture]]\npath = "none"\n')
+    (end,) = run_batch(tmp_path / "m.toml", tmp_path / "out").captures
+    said = "no worker could finish it: too many files are open at a time: raise the limit (ulimit -n) and start again"
+    assert (end.state, end.error) == ("failed", said)
 
 
 def test_an_unreadable_manifest_is_named(tmp_path):

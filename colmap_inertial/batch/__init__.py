@@ -31,7 +31,7 @@ from colmap_inertial.batch.task import (
     read_status,
     write_status,
 )
-from colmap_inertial.errors import OutputError, OutputExistsError
+from colmap_inertial.errors import OutputError, OutputExistsError, exhausted
 from colmap_inertial.io.files import StrPath, locked, remove_temporaries, write_json, write_text
 from colmap_inertial.options import BatchOptions, ReconstructOptions, StageNames
 from colmap_inertial.run.config import config_as_toml
@@ -249,7 +249,7 @@ class _Batch:
             self._set(pending.result())
         except Exception as error:  # the worker was lost too often, or cannot run it, or the scheduler is gone
             known = read_status(task.status) or self._known[name]
-            text = f"{type(error).__name__}: {error}".partition("\n")[0]
+            text = exhausted(error) or f"{type(error).__name__}: {error}".partition("\n")[0]
             self._set(failed(known, f"no worker could finish it: {text}"))
             write_status(task.status, self._known[name])
 

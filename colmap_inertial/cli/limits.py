@@ -5,8 +5,6 @@ Libraries that are out of memory or of files end the process without one: OpenBL
 
 from __future__ import annotations
 
-import errno
-
 from colmap_inertial.errors import InertialError
 
 #: Address space to begin with, and for each thread: its stack, and what the allocator keeps for it. A reconstruction of
@@ -52,18 +50,3 @@ def require_limits(*, to_load: bool = False) -> None:
             f"only {files} files may be open at a time here, and {LEAST_FILES} are needed: raise the limit (ulimit -n "
             f"{LEAST_FILES})"
         )
-
-
-def exhausted(error: BaseException | None) -> str | None:
-    """A sentence for an exception that means that memory or files have run out, or that one such has led to.
-
-    ``None`` for any other. pycolmap says only that it cannot be imported, and how it is installed.
-    """
-    while error is not None:
-        number = error.errno if isinstance(error, OSError) else None
-        if isinstance(error, MemoryError) or number == errno.ENOMEM or "failed to map segment" in str(error):
-            return "the memory is used up: close other programs, or allow smaller pictures or fewer processes"
-        if number in (errno.EMFILE, errno.ENFILE):
-            return "too many files are open at a time: raise the limit (ulimit -n) and start again"
-        error = error.__cause__ or error.__context__
-    return None

@@ -54,8 +54,8 @@ def _writing(database: Path) -> Iterator[None]:
         if "database factory" not in str(error):
             raise
         raise OutputError(
-            f"{database}: COLMAP cannot write its database here: the disk is full, or a quota or a limit of file sizes "
-            "is reached; make room and start again, it continues"
+            f"{database}: COLMAP cannot write its database here: the disk is full, or a quota, a limit of file sizes "
+            "or of open files (ulimit -n) is reached; make room and start again, it continues"
         ) from error
 
 
