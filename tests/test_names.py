@@ -1,6 +1,7 @@
 """Names from outside never lead out of the folder that they belong to."""
 
 import json
+from types import SimpleNamespace
 
 import cv2
 import model_project
@@ -12,14 +13,16 @@ from colmap_inertial.batch import read_manifest
 from colmap_inertial.colmap.dense import _check_images
 from colmap_inertial.errors import FormatError
 from colmap_inertial.io.aperture_images import SubImages
+from colmap_inertial.io.capture import ImageFolder
 from colmap_inertial.io.exif import stamps_of_exif
 from colmap_inertial.io.names import check_names, path_in
 from colmap_inertial.model import read_model
+from colmap_inertial.precalibrate.calibrate import some_frames
 from colmap_inertial.report.markup import images
 from colmap_inertial.run.progress import silent
 from colmap_inertial.stages.frame_folder import write_frames
 from colmap_inertial.stages.rectified import write_images
-from colmap_inertial.types import Frame
+from colmap_inertial.types import Frame, FrameTiming
 from colmap_inertial.validate.views import load_views
 from colmap_inertial.view.sources import find_source
 
@@ -88,6 +91,19 @@ def test_readers_of_a_model_s_images_do_not_follow_links_out(tmp_path, model):
         _check_images(pictures, folder, read_model(folder))
     with pytest.raises(FormatError, match="a link leads out of"):
         load_views(folder, pictures)
+
+
+def test_the_first_look_at_a_capture_does_not_follow_links_out(tmp_path):
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    for path in (folder / "0.png", tmp_path / "secret.png"):
+        assert cv2.imwrite(str(path), np.zeros((4, 4), np.uint8))
+    (folder / "1.png").symlink_to(tmp_path / "secret.png")
+    capture = SimpleNamespace(frames=ImageFolder(folder=folder), camera=None)
+    timing = FrameTiming(names=("0.png", "1.png"), t_s=np.arange(2.0))
+    assert next(some_frames(capture, timing, [0])).name == "0.png"
+    with pytest.raises(FormatError, match="a link leads out of"):
+        list(some_frames(capture, timing, [1]))
 
 
 def test_tables_and_captures_do_not_lead_out(tmp_path):

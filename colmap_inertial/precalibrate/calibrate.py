@@ -90,7 +90,7 @@ def some_frames(capture: Capture, timing: FrameTiming, indices: Sequence[int]) -
         yield from read_frames(capture, only=[timing.names[i] for i in indices])[1]
         return
     for i in sorted(indices):
-        image = read_image(capture.frames.folder / timing.names[i])
+        image = read_image(path_in(capture.frames.folder, timing.names[i]))
         yield Frame(name=timing.names[i], image=image, t_s=float(timing.t_s[i]), camera=capture.camera)
 
 
