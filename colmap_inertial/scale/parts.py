@@ -32,7 +32,7 @@ CAUSES: dict[str, Cause] = {
     "accel_gain": Cause(words="the accelerometer's gain", advice="calibrate the IMU once (calibrate-imu)"),
     "lens": Cause(
         words="the lens and the model's shape",
-        advice="calibrate the lens, close loops while filming, or scale by a target of known size",
+        advice="film a target of known size, or two points whose distance is measured, and take the metres from them",
     ),
     "accel_noise": Cause(words="the accelerometer's noise", advice=_LONGER),
     "lost_readings": Cause(
