@@ -7,6 +7,7 @@ filmed a room with a rolling shutter, through a whole run.
 """
 
 import csv
+import dataclasses
 import json
 import re
 import shutil
@@ -37,7 +38,8 @@ from colmap_inertial.export.whole import _notes_on, export_model
 from colmap_inertial.geometry import matrix_from_quat
 from colmap_inertial.io.ply import read_ply_header
 from colmap_inertial.model import read_model, write_model
-from colmap_inertial.model.project import apply_to_project
+from colmap_inertial.model.nerf import EXPORT_FORMAT, transform_export
+from colmap_inertial.model.project import apply_to_project, undo_project
 from colmap_inertial.model.similarities import plain_factor
 from colmap_inertial.options import ExportProgram
 from colmap_inertial.types import Similarity
@@ -256,11 +258,52 @@ def test_cameras_of_a_rig_stay_one(tmp_path):
 def test_apply_scales_an_export_whole(exported, tmp_path, reader):
     folder, _ = exported
     applied = apply_to_project(folder, tmp_path / "made", plain_factor(2.5))
-    assert {change.path for change in applied.changes} == {"sparse/0", "sparse_pc.ply", "transforms.json"}
+    assert {change.path for change in applied.changes} == {
+        "sparse/0",
+        "sparse_pc.ply",
+        "transforms.json",
+        "export.json",
+    }
     before, after = reader(folder), reader(tmp_path / "made")
     for name, centre in before.centres().items():
         np.testing.assert_allclose(after.centres()[name], 2.5 * centre, atol=1e-9)
     np.testing.assert_allclose(after.points, 2.5 * before.points, rtol=1e-6)
+
+
+def test_what_an_export_says_of_itself_holds_after_apply_and_comes_back(exported, tmp_path):
+    folder, _ = exported
+    shutil.copytree(folder, tmp_path / "export")
+    (tmp_path / "export" / "georeference.json").write_text("{}")
+    said = json.loads((folder / "export.json").read_text())
+    assert said["unit"] == "m"
+    said |= {"up_in_world": [0.1, 0.0, 0.9], "gravity_in_world_m_s2": [1.0, 2.0, -9.5]}
+    (tmp_path / "export" / "export.json").write_text(json.dumps(said))
+    turn = np.array([np.sqrt(0.5), 0, 0, np.sqrt(0.5)])  # about x: z becomes -y
+    similarity = dataclasses.replace(plain_factor(2.5), rotation_xyzw=turn)
+    applied = apply_to_project(tmp_path / "export", tmp_path / "made", similarity)
+    assert any("1 georeference.json" in note for note in applied.notes)
+    moved = json.loads((tmp_path / "made" / "export.json").read_text())
+    assert moved["unit"] == "0.4 m"  # a length of 1 there
+    for name in ("up_in_world", "gravity_in_world_m_s2"):
+        x, y, z = said[name]
+        np.testing.assert_allclose(moved[name], [x, -z, y], atol=1e-9)
+    undo_project(tmp_path / "made", tmp_path / "again")
+    again = json.loads((tmp_path / "again" / "export.json").read_text())
+    np.testing.assert_allclose(again.pop("up_in_world"), said.pop("up_in_world"), atol=1e-12)
+    np.testing.assert_allclose(again.pop("gravity_in_world_m_s2"), said.pop("gravity_in_world_m_s2"), atol=1e-12)
+    assert again == said
+
+
+@pytest.mark.parametrize(("key", "value"), [("unit", "2m"), ("unit", "9e m"), ("up_in_world", "z")])
+def test_an_export_that_was_changed_is_copied_or_refused(tmp_path, key, value):
+    source, target = tmp_path / "export.json", tmp_path / "made.json"
+    source.write_text(json.dumps({"format": EXPORT_FORMAT, "unit": "m", key: value}))
+    if value == "2m":  # no unit of ours
+        assert transform_export(source, target, plain_factor(2.0)) == ()
+        assert json.loads(target.read_text())["unit"] == "2m"
+    else:
+        with pytest.raises(FormatError, match="--keep"):
+            transform_export(source, target, plain_factor(2.0))
 
 
 # --- lenses ----------------------------------------------------------------------------------------------------------

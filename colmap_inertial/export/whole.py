@@ -31,6 +31,7 @@ from colmap_inertial.io.frames import read_frames
 from colmap_inertial.io.trajectories import write_tum
 from colmap_inertial.model import write_files
 from colmap_inertial.model.copying import new_folder
+from colmap_inertial.model.nerf import EXPORT_FORMAT
 from colmap_inertial.options import ExportImages, ExportProgram
 from colmap_inertial.run.progress import Progress, silent
 from colmap_inertial.types import Array
@@ -331,7 +332,7 @@ class _Work:
         """The content of ``export.json``."""
         scale, gravity = self.source.found.scale, self.source.gravity_in_world_m_s2
         return {
-            "format": "colmap-inertial export",
+            "format": EXPORT_FORMAT,
             "version": __version__,
             "for": made.program,
             "command": made.command,

@@ -1,8 +1,9 @@
-"""``transforms.json`` of NeRF trainers under a similarity."""
+"""``transforms.json`` of NeRF trainers, and the ``export.json`` beside it, under a similarity."""
 
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -16,6 +17,10 @@ from colmap_inertial.model.database import PlacedModel
 from colmap_inertial.types import Array, Similarity
 
 _MATRICES = ("transform_matrix", "transform_matrix_start", "transform_matrix_end")
+#: What ``export.json`` says of itself, and of its unit: metres, or so many of them.
+EXPORT_FORMAT = "colmap-inertial export"
+_METRES = re.compile(r"(?:(\d\S*) )?m")
+_DIRECTIONS = ("up_in_world", "gravity_in_world_m_s2")
 #: Its cameras are a model's when they stand closer to them than this share of their extent.
 _SAME_FRAME = 0.01
 
@@ -92,6 +97,42 @@ def transform_transforms(source: Path, target: Path, similarity: Similarity) -> 
         values["scale"] = scale / similarity.scale
         values["offset"] = (0.5 - values["scale"] * middle).tolist()
         changed.append("box")
+    target.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
+    return tuple(dict.fromkeys(changed))
+
+
+def is_export(file: Path) -> bool:
+    """Whether a file is what an export of ours says of itself."""
+    if file.name != "export.json":
+        return False
+    try:
+        return bool(read_json(file).get("format") == EXPORT_FORMAT)
+    except FormatError:
+        return False
+
+
+def transform_export(source: Path, target: Path, similarity: Similarity) -> tuple[str, ...]:
+    """Write a copy whose unit and directions are those of the moved model.
+
+    Raises
+    ------
+    FormatError
+        For a unit or directions that are none.
+    """
+    values = read_json(source)
+    changed = []
+    metres = _METRES.fullmatch(str(values.get("unit")))
+    if metres is not None and similarity.scale != 1:
+        try:
+            length = float(metres[1] or 1) / similarity.scale
+        except ValueError:
+            raise FormatError(source, f"the unit {values['unit']!r} is no length; leave it out with --keep") from None
+        values["unit"] = "m" if abs(length - 1) < 1e-9 else f"{length:.12g} m"
+        changed.append("unit")
+    for name in _DIRECTIONS:
+        if values.get(name) is not None:
+            values[name] = (matrix_from_quat(similarity.rotation_xyzw) @ _vector(source, values[name])).tolist()
+            changed.append("directions")
     target.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
     return tuple(dict.fromkeys(changed))
 

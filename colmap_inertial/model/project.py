@@ -17,7 +17,6 @@ from typing import Any
 from colmap_inertial import __version__
 from colmap_inertial.errors import AlreadyMetricError, FormatError, InertialError, NotObservableError, OutputError
 from colmap_inertial.io.files import StrPath, read_json, write_json
-from colmap_inertial.io.ply import transform_ply
 from colmap_inertial.model import (
     TRANSFORM_FILE,
     is_metric,
@@ -28,21 +27,15 @@ from colmap_inertial.model import (
     transformed,
     write_files,
 )
-from colmap_inertial.model.artefacts import check_map, transform_depth_map, transform_obj, transform_options
 from colmap_inertial.model.binary import check_binary_model
 from colmap_inertial.model.copying import begin_writing, copy_file, list_tree, new_folder
 from colmap_inertial.model.database import SHARED_MEMORY, SIDE_FILES, is_database, transform_database
+from colmap_inertial.model.kinds import WRITERS, foreign_kind, kind_of
 from colmap_inertial.model.layout import Layout, read_layout
-from colmap_inertial.model.nerf import cameras_are_those_of, is_transforms, transform_transforms
+from colmap_inertial.model.nerf import cameras_are_those_of
 from colmap_inertial.model.similarities import ModelScale, require_not_joined, similarity_from_json, undoing
 from colmap_inertial.threads import one_blas_thread, usable_processors
 from colmap_inertial.types import Similarity
-
-#: Formats that carry length and are left as they are; the user is told.
-_FOREIGN = (
-    *(".stl", ".off", ".glb", ".gltf", ".fbx", ".dae", ".las", ".laz", ".pcd", ".xyz", ".pts", ".e57", ".splat"),
-    *(".mvs", ".nvm", ".out", ".ksplat", ".spz", ".sog"),
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -278,7 +271,7 @@ class _Work:
             databases: list[Path] = []
             jobs: list[Callable[[], Change | str]] = []
             for path in todo:
-                kind = None if self.is_kept(path) else _kind(self._project / path, path)
+                kind = None if self.is_kept(path) else kind_of(self._project / path, path)
                 if kind == "database":
                     databases.append(path)
                     continue
@@ -286,8 +279,9 @@ class _Work:
                     kind = None
                 owner = None if one is not None or kind is None else self._owner(layout, path)
                 similarity = one if owner is None else similarities[owner]
-                if kind is None and path.suffix.lower() in _FOREIGN and not self.is_kept(path):
-                    foreign[path.suffix.lower()] += 1
+                other = None if kind is not None or self.is_kept(path) else foreign_kind(path)
+                if other is not None:
+                    foreign[other] += 1
                 jobs.append(functools.partial(self._write_file, path, partial, kind, similarity, owner, link))
             done = 0
             for path in databases:
@@ -333,7 +327,7 @@ class _Work:
             if how == "copied":
                 begin_writing(target)
             return how
-        changed = _WRITERS[kind](source, target, similarity)
+        changed = WRITERS[kind](source, target, similarity)
         begin_writing(target)
         shutil.copymode(source, target)
         return Change(path=str(path), kind=kind, changed=changed, model=owner) if changed else "copied"
@@ -467,34 +461,3 @@ def _model_files(project: Path, models: Collection[Path]) -> set[Path]:
         for suffix in model_formats(project / folder)
         for path in model_files(project / folder, suffix)
     }
-
-
-def _kind(file: Path, path: Path) -> str | None:
-    """What a file is, where it carries length; damaged maps are refused here even where they would not change."""
-    suffix = path.suffix.lower()
-    stereo = path.parts[:-1]
-    if suffix == ".bin" and "depth_maps" in stereo:
-        return "depth map"
-    if suffix == ".bin" and "normal_maps" in stereo:
-        check_map(file, 3)
-        return None
-    if suffix == ".obj":
-        with open(file, "rb") as head:
-            return None if b"\0" in head.read(1024) else "obj"  # a compiler's object file has the same ending
-    if is_transforms(path):
-        return "transforms"
-    return {".ply": "ply", ".ini": "options"}.get(suffix) or ("database" if is_database(file) else None)
-
-
-def _depth_map(source: Path, target: Path, similarity: Similarity) -> tuple[str, ...]:
-    transform_depth_map(source, target, similarity)
-    return ("depths",)
-
-
-_WRITERS: dict[str, Callable[[Path, Path, Similarity], tuple[str, ...]]] = {
-    "depth map": _depth_map,
-    "ply": transform_ply,
-    "obj": transform_obj,
-    "options": transform_options,
-    "transforms": transform_transforms,
-}
