@@ -60,6 +60,8 @@ class Views:
         (N, 256, 256) costs by the codes of the reference and a view, 0 to ``MOST``; ``None`` is census.
     light
         What colours that do not add up to luminance cost in addition.
+    shown
+        (N, Hv, Wv) 1 where a view shows something; ``None``: everywhere. What is looked up elsewhere has no say.
     """
 
     reference: Codes
@@ -67,6 +69,7 @@ class Views:
     least: int = 0
     tables: Codes | None = None
     light: LightCost | None = None
+    shown: Codes | None = None
 
 
 def jump_table(views: int) -> tuple[int, NDArray[np.uint16]]:
@@ -129,6 +132,7 @@ def match_candidates(
             tables=views.tables,
             blend=None if views.light is None else views.light.blend,
             blend_table=None if views.light is None else views.light.table,
+            shown=views.shown,
             threads=threads,
         )
         total = np.empty((last - first, width, padded), dtype=np.uint16)

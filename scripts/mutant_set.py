@@ -1432,6 +1432,13 @@ MUTANTS = (
         ("sweep::test_a_candidate_leads_where_the_partner_sees_the_point",),
     ),
     Mutant(
+        "sweep/depth.py",
+        "shown[k, : canvas.height, : canvas.width] = _shown(partner.codes.shape, canvas)",
+        "shown[k, : canvas.height, : canvas.width] = 1",
+        "the blackness around a turned picture is compared",
+        ("sweep::test_beyond_the_edges_of_a_turned_picture_nothing_is_compared",),
+    ),
+    Mutant(
         "sweep/agreement.py",
         "(count > 1)",
         "(count > 0)",

@@ -57,7 +57,8 @@ def test_compiled_costs_are_the_reference_s_bit_for_bit(sides, instruction_set):
     tables = rng.integers(0, 60, (views, 256, 256), dtype=np.uint8)
     blend = rng.integers(-300, 300, views + 2).astype(np.int32)
     light = {"blend": blend, "blend_table": np.arange(256, dtype=np.uint8)}
-    for more in ({}, {"least": 9}, {"tables": tables}, light, {"tables": tables, **light}):
+    shown = {"shown": rng.integers(0, 2, others.shape, dtype=np.uint8)}
+    for more in ({}, {"least": 9}, {"tables": tables}, light, {"tables": tables, **light}, shown, {**shown, **light}):
         wanted = matching_costs_reference(reference, others, radius=radius, **where, **more)
         for threads in (1, 2, 3):
             cost = np.full(wanted.shape, 77, dtype=np.uint8)
@@ -105,6 +106,9 @@ def test_kernels_refuse_arrays_that_do_not_fit():
         _apertures.matching_costs(reference, others, cost=cost[..., :3].copy(), radius=2, **where)
     with pytest.raises(ValueError, match="instruction_set"):
         _apertures.matching_costs(reference, others, cost=cost, radius=2, instruction_set="none", **where)
+    for shown in (others[:, 1:] % 2, others % 2 + 1):
+        with pytest.raises(ValueError, match="shown"):
+            _apertures.matching_costs(reference, others, cost=cost, radius=2, shown=shown.copy(), **where)
     with pytest.raises(ValueError, match="jump"):
         jump = np.full(256, 5000, dtype=np.uint16)
         _apertures.semi_global(cost, reference, small=1, jump=jump, total=np.empty((8, 9, 32), dtype=np.uint16))

@@ -48,7 +48,8 @@ int threads_or_all(int threads) {
 void matching_costs(In<uint8_t, 2> reference, In<uint8_t, 3> views, In<int32_t, 3> columns, In<int32_t, 3> rows,
                     Of<uint8_t, 3> cost, In<int32_t, 1> share, int unseen, int radius,
                     int least, std::optional<In<uint8_t, 3>> tables, std::optional<In<int32_t, 1>> blend,
-                    std::optional<In<uint8_t, 1>> blend_table, int threads, const std::string &instruction_set) {
+                    std::optional<In<uint8_t, 1>> blend_table, std::optional<In<uint8_t, 3>> shown, int threads,
+                    const std::string &instruction_set) {
     const Sides sides{int(reference.shape(0)), int(reference.shape(1)), int(cost.shape(2)),
                       int(views.shape(0)),     int(views.shape(1)),     int(views.shape(2))};
     const int height = sides.height, width = sides.width, count = sides.views, candidates = sides.candidates;
@@ -67,6 +68,8 @@ void matching_costs(In<uint8_t, 2> reference, In<uint8_t, 3> views, In<int32_t, 
     check(blend.has_value() == blend_table.has_value(), "blend and blend_table belong together");
     check(!blend || (blend->shape(0) == size_t(count) + 2 && blend_table->shape(0) == 256),
           "blend, blend_table: of other lengths");
+    check(!shown || is(*shown, count, sides.view_height, sides.view_width), "shown: not of the views' size");
+    for (size_t i = 0; shown && i < shown->size(); ++i) check(shown->data()[i] <= 1, "shown: must be 0 or 1");
     const CostInput input{sides,
                           reference.data(),
                           views.data(),
@@ -78,7 +81,8 @@ void matching_costs(In<uint8_t, 2> reference, In<uint8_t, 3> views, In<int32_t, 
                           share.data(),
                           unseen,
                           blend ? blend->data() : nullptr,
-                          blend_table ? blend_table->data() : nullptr};
+                          blend_table ? blend_table->data() : nullptr,
+                          shown ? shown->data() : nullptr};
     const ApertureSimd &simd = simd_for(instruction_set);
     nb::gil_scoped_release release;
     matching_cost(input, simd, threads_or_all(threads), cost.data());
@@ -134,7 +138,7 @@ NB_MODULE(_apertures, m) {
     m.attr("PADDING") = PADDING;
     m.def("matching_costs", &matching_costs, "reference"_a, "views"_a, nb::kw_only(), "columns"_a, "rows"_a,
           "cost"_a.noconvert(), "share"_a, "unseen"_a, "radius"_a, "least"_a = 0, "tables"_a = nb::none(), "blend"_a = nb::none(),
-          "blend_table"_a = nb::none(), "threads"_a = 0, "instruction_set"_a = "");
+          "blend_table"_a = nb::none(), "shown"_a = nb::none(), "threads"_a = 0, "instruction_set"_a = "");
     m.def("semi_global", &semi_global_matching, "cost"_a, "guide"_a, nb::kw_only(), "small"_a, "jump"_a,
           "total"_a.noconvert(), "threads"_a = 0, "instruction_set"_a = "");
     m.def("winners", &winners_of, "total"_a, nb::kw_only(), "least"_a.noconvert(), "index"_a.noconvert(),

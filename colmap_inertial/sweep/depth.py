@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.semi_global import Views, match_candidates
+from colmap_inertial.semi_global import CENSUS_RADIUS, Views, match_candidates
 from colmap_inertial.sweep.pinhole import Pinhole
 from colmap_inertial.types import Array
 
@@ -82,7 +82,7 @@ def sweep_depth(
     -----
     Planes parallel to the picture, equally spaced in inverse depth (Collins, CVPR 1996). Once a partner is turned to
     the reference's orientation, a plane moves and shrinks its picture, so that columns and rows are looked up apart.
-    Costs (census) are summed over the partners that see a pixel, and the depths found by semi-global matching.
+    Costs (census) are summed over the partners that see all of a window, and the depths found by semi-global matching.
     """
     near, far = depths
     turned = [(canvas, p) for p in partners if (canvas := _canvas(camera, p.camera, depths)) is not None]
@@ -90,14 +90,15 @@ def sweep_depth(
         return np.zeros(codes.shape, dtype=np.float32)
     inverse = _candidates(camera, [canvas.baseline for canvas, _ in turned], near, far)
     shape = max(canvas.height for canvas, _ in turned), max(canvas.width for canvas, _ in turned)
-    others = np.zeros((len(turned), *shape), dtype=np.uint8)
+    others, shown = np.zeros((2, len(turned), *shape), dtype=np.uint8)
     columns = np.empty((len(turned), len(inverse), camera.width), dtype=np.int32)
     rows = np.empty((len(turned), len(inverse), camera.height), dtype=np.int32)
     for k, (canvas, partner) in enumerate(turned):
         others[k, : canvas.height, : canvas.width] = _turned(partner.codes, canvas)
+        shown[k, : canvas.height, : canvas.width] = _shown(partner.codes.shape, canvas)
         columns[k] = _positions(camera, canvas, inverse, 0)
         rows[k] = _positions(camera, canvas, inverse, 1)
-    views = Views(reference=codes, others=others, least=_LEAST_CODES)
+    views = Views(reference=codes, others=others, least=_LEAST_CODES, shown=shown)
     best, _ = match_candidates(views, columns, rows, threads=threads)
     known = (best > 0) & (best < len(inverse) - 1)
     found = inverse[0] + (inverse[1] - inverse[0]) * best.astype(np.float64)
@@ -172,3 +173,14 @@ def _turned(codes: Codes, canvas: _Canvas) -> Codes:
 
     size = (canvas.width, canvas.height)
     return np.asarray(cv2.warpPerspective(codes, canvas.canvas_from_view, size, flags=cv2.INTER_LINEAR))
+
+
+def _shown(shape: tuple[int, ...], canvas: _Canvas) -> Codes:
+    """Where a canvas shows the view in all of a census window: turned, the view is a quadrilateral within it."""
+    import cv2
+
+    size = (canvas.width, canvas.height)
+    inside = cv2.warpPerspective(np.ones(shape, np.uint8), canvas.canvas_from_view, size, flags=cv2.INTER_NEAREST)
+    # pixels between which a value lies are one more
+    side = 2 * (CENSUS_RADIUS + 1) + 1
+    return np.asarray(cv2.erode(inside, np.ones((side, side), np.uint8)))

@@ -59,6 +59,7 @@ def matching_costs_reference(
     tables: Codes | None = None,
     blend: NDArray[np.int32] | None = None,
     blend_table: Codes | None = None,
+    shown: Codes | None = None,
 ) -> Codes:
     """(H, W, D) what each candidate costs, summed over the views; the arguments are the compiled kernel's."""
     count, candidates = columns.shape[:2]
@@ -67,6 +68,12 @@ def matching_costs_reference(
     costs = []
     for d in range(candidates):
         warped, seen = zip(*(warped_reference(views[k], columns[k, d], rows[k, d]) for k in range(count)), strict=True)
+        if shown is not None:
+            x, y = (
+                (np.clip(at[:, d], 0, 16 * (n - 1)) + 8) // 16
+                for at, n in zip((columns, rows), views.shape[:0:-1], strict=True)
+            )
+            seen = [one & (shown[k][y[k]][:, x[k]] == 1) for k, one in enumerate(seen)]
         total = np.zeros(reference.shape, dtype=np.int64)
         for k in range(count):
             if tables is None:
