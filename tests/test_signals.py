@@ -10,6 +10,8 @@ import time
 from functools import partial
 from pathlib import Path
 
+import model_project
+import numpy as np
 import pytest
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
@@ -90,3 +92,14 @@ def test_a_simulation_that_is_ended_leaves_nothing_and_no_trace(tmp_path, number
         assert process.returncode in code
         assert "stopping" in said and "Traceback" not in said and "***" not in said and " @ " not in said
         assert list((tmp_path / "made").iterdir()) == []
+
+
+def test_who_has_read_a_model_ends_without_a_trace(tmp_path):
+    """As ``view`` and ``scale`` do; COLMAP's logging library answers by a trace of its own."""
+    model_project.sparse_model(np.random.default_rng(4)).write_binary(str(tmp_path))
+    code = "import sys, time; from colmap_inertial.model import read_model; read_model(sys.argv[1]); "
+    with started("-c", code + "print('ready', flush=True); time.sleep(60)", str(tmp_path)) as process:
+        assert process.stdout.readline() == "ready\n"
+        process.send_signal(signal.SIGTERM)
+        assert process.communicate(timeout=30) == ("", "")
+        assert process.returncode == -signal.SIGTERM

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
+import sys
+import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -209,7 +212,19 @@ def read_model(folder: StrPath, suffix: str | None = None) -> pycolmap.Reconstru
     return reconstruction
 
 
+def _load_pycolmap() -> None:
+    """Load it, and keep our answer to SIGTERM: its logging library takes it away and prints a trace in place of it."""
+    if "pycolmap" in sys.modules or threading.current_thread() is not threading.main_thread():
+        return
+    ours = signal.getsignal(signal.SIGTERM)
+    import pycolmap  # noqa: F401
+
+    if ours is not None:
+        signal.signal(signal.SIGTERM, ours)
+
+
 def _read_from(folder: Path, suffix: str) -> pycolmap.Reconstruction:
+    _load_pycolmap()
     import pycolmap
 
     reconstruction = pycolmap.Reconstruction()
