@@ -61,7 +61,8 @@ class Views:
     light
         What colours that do not add up to luminance cost in addition.
     shown
-        (N, Hv, Wv) 1 where a view shows something; ``None``: everywhere. What is looked up elsewhere has no say.
+        (N, Hv, 2) from and up to which column each row of a view shows something; ``None``: all of it. What is looked
+        up elsewhere has no say.
     """
 
     reference: Codes
@@ -69,7 +70,7 @@ class Views:
     least: int = 0
     tables: Codes | None = None
     light: LightCost | None = None
-    shown: Codes | None = None
+    shown: NDArray[np.int32] | None = None
 
 
 def jump_table(views: int) -> tuple[int, NDArray[np.uint16]]:

@@ -1433,8 +1433,8 @@ MUTANTS = (
     ),
     Mutant(
         "sweep/depth.py",
-        "shown[k, : canvas.height, : canvas.width] = _shown(partner.codes.shape, canvas)",
-        "shown[k, : canvas.height, : canvas.width] = 1",
+        "shown[k, : canvas.height] = _shown(partner.codes.shape, canvas)",
+        "shown[k, : canvas.height] = 0, canvas.width",
         "the blackness around a turned picture is compared",
         ("sweep::test_beyond_the_edges_of_a_turned_picture_nothing_is_compared",),
     ),

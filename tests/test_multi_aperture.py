@@ -57,7 +57,7 @@ def test_compiled_costs_are_the_reference_s_bit_for_bit(sides, instruction_set):
     tables = rng.integers(0, 60, (views, 256, 256), dtype=np.uint8)
     blend = rng.integers(-300, 300, views + 2).astype(np.int32)
     light = {"blend": blend, "blend_table": np.arange(256, dtype=np.uint8)}
-    shown = {"shown": rng.integers(0, 2, others.shape, dtype=np.uint8)}
+    shown = {"shown": np.sort(rng.integers(0, sizes[1] + 1, (views, sizes[0], 2), dtype=np.int32))}
     for more in ({}, {"least": 9}, {"tables": tables}, light, {"tables": tables, **light}, shown, {**shown, **light}):
         wanted = matching_costs_reference(reference, others, radius=radius, **where, **more)
         for threads in (1, 2, 3):
@@ -106,9 +106,13 @@ def test_kernels_refuse_arrays_that_do_not_fit():
         _apertures.matching_costs(reference, others, cost=cost[..., :3].copy(), radius=2, **where)
     with pytest.raises(ValueError, match="instruction_set"):
         _apertures.matching_costs(reference, others, cost=cost, radius=2, instruction_set="none", **where)
-    for shown in (others[:, 1:] % 2, others % 2 + 1):
+    for shown in (
+        np.zeros((2, 7, 2), np.int32),
+        np.array([[[3, 2]] * 8] * 2, np.int32),
+        np.full((2, 8, 2), 10, np.int32),
+    ):
         with pytest.raises(ValueError, match="shown"):
-            _apertures.matching_costs(reference, others, cost=cost, radius=2, shown=shown.copy(), **where)
+            _apertures.matching_costs(reference, others, cost=cost, radius=2, shown=shown, **where)
     with pytest.raises(ValueError, match="jump"):
         jump = np.full(256, 5000, dtype=np.uint16)
         _apertures.semi_global(cost, reference, small=1, jump=jump, total=np.empty((8, 9, 32), dtype=np.uint16))

@@ -138,31 +138,22 @@ class Band {
                 simd_.census(rows, bits_.data(), pitch_, reach_, width, mismatches_.data());
             }
             const Columns &columns = columns_[plane];
-            if (in_.shown) {
-                add_shown(k, columns, position);
-                continue;
-            }
-            simd_.add(mismatches_.data() + columns.begin, columns.end - columns.begin, sum_.data() + columns.begin,
-                      seen_.data() + columns.begin);
+            int first = columns.begin, last = columns.end;
+            if (in_.shown) narrow(k, in_.columns + plane * width, position, first, last);
+            simd_.add(mismatches_.data() + first, last - first, sum_.data() + first, seen_.data() + first);
         }
         uint8_t *costs = costs_.data() + size_t(d) * pitch_;
         simd_.divide(sum_.data(), seen_.data(), in_.share, in_.unseen, width, costs);
         if (in_.blend) add_blend(y, d, costs);
     }
 
-    // As simd_.add, of what the view shows by the nearest of its pixels.
-    void add_shown(int k, const Columns &columns, int position) {
-        const int view_height = in_.sides.view_height, view_width = in_.sides.view_width;
-        const uint8_t *shown = in_.shown + (size_t(k) * view_height + (position + 8) / 16) * view_width;
-        for (const Stretch &s : columns.stretches) {
-            const int first = std::max(s.begin, columns.begin), last = std::min(s.end, columns.end);
-            const uint8_t *at = shown + s.start + (s.part >= 8);
-            for (int x = first; x < last; ++x) {
-                const uint8_t counts = at[x - s.begin];
-                sum_[x] = uint16_t(sum_[x] + counts * mismatches_[x]);
-                seen_[x] = uint8_t(seen_[x] + counts);
-            }
-        }
+    // Which columns of the reference lie, to the nearest pixel, where a row of the view shows something. Positions of
+    // columns that the view has do not fall from left to right.
+    void narrow(int k, const int32_t *at, int position, int &begin, int &end) const {
+        const int32_t *shown = in_.shown + 2 * (size_t(k) * in_.sides.view_height + (position + 8) / 16);
+        const int first = int(std::lower_bound(at + begin, at + end, 16 * shown[0] - 8) - at);
+        end = int(std::lower_bound(at + first, at + end, 16 * shown[1] - 8) - at);
+        begin = first;
     }
 
     // The luminance cost: a weighted sum of all views that would be zero.

@@ -23,7 +23,7 @@ struct CostInput {
     int unseen;             // cost where no view does
     const int32_t *blend;   // (views + 2): weights of reference and views in 1/256, and a constant; or null
     const uint8_t *blend_table;  // (256): what a residual of the blend costs, where all views see the pixel
-    const uint8_t *shown;  // (views, view_height, view_width): 1 where a view shows something, or null: everywhere
+    const int32_t *shown;  // (views, view_height, 2): from and up to which column a row shows something, or null: all of it
 };
 
 // cost (height, width, candidates)

@@ -48,7 +48,7 @@ int threads_or_all(int threads) {
 void matching_costs(In<uint8_t, 2> reference, In<uint8_t, 3> views, In<int32_t, 3> columns, In<int32_t, 3> rows,
                     Of<uint8_t, 3> cost, In<int32_t, 1> share, int unseen, int radius,
                     int least, std::optional<In<uint8_t, 3>> tables, std::optional<In<int32_t, 1>> blend,
-                    std::optional<In<uint8_t, 1>> blend_table, std::optional<In<uint8_t, 3>> shown, int threads,
+                    std::optional<In<uint8_t, 1>> blend_table, std::optional<In<int32_t, 3>> shown, int threads,
                     const std::string &instruction_set) {
     const Sides sides{int(reference.shape(0)), int(reference.shape(1)), int(cost.shape(2)),
                       int(views.shape(0)),     int(views.shape(1)),     int(views.shape(2))};
@@ -68,8 +68,11 @@ void matching_costs(In<uint8_t, 2> reference, In<uint8_t, 3> views, In<int32_t, 
     check(blend.has_value() == blend_table.has_value(), "blend and blend_table belong together");
     check(!blend || (blend->shape(0) == size_t(count) + 2 && blend_table->shape(0) == 256),
           "blend, blend_table: of other lengths");
-    check(!shown || is(*shown, count, sides.view_height, sides.view_width), "shown: not of the views' size");
-    for (size_t i = 0; shown && i < shown->size(); ++i) check(shown->data()[i] <= 1, "shown: must be 0 or 1");
+    check(!shown || is(*shown, count, sides.view_height, 2), "shown: not a range for each row of each view");
+    for (size_t i = 0; shown && i < shown->size(); i += 2)
+        check(shown->data()[i] >= 0 && shown->data()[i] <= shown->data()[i + 1] &&
+                  shown->data()[i + 1] <= sides.view_width,
+              "shown: not a range of columns");
     const CostInput input{sides,
                           reference.data(),
                           views.data(),

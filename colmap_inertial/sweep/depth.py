@@ -90,12 +90,13 @@ def sweep_depth(
         return np.zeros(codes.shape, dtype=np.float32)
     inverse = _candidates(camera, [canvas.baseline for canvas, _ in turned], near, far)
     shape = max(canvas.height for canvas, _ in turned), max(canvas.width for canvas, _ in turned)
-    others, shown = np.zeros((2, len(turned), *shape), dtype=np.uint8)
+    others = np.zeros((len(turned), *shape), dtype=np.uint8)
+    shown = np.zeros((len(turned), shape[0], 2), dtype=np.int32)
     columns = np.empty((len(turned), len(inverse), camera.width), dtype=np.int32)
     rows = np.empty((len(turned), len(inverse), camera.height), dtype=np.int32)
     for k, (canvas, partner) in enumerate(turned):
         others[k, : canvas.height, : canvas.width] = _turned(partner.codes, canvas)
-        shown[k, : canvas.height, : canvas.width] = _shown(partner.codes.shape, canvas)
+        shown[k, : canvas.height] = _shown(partner.codes.shape, canvas)
         columns[k] = _positions(camera, canvas, inverse, 0)
         rows[k] = _positions(camera, canvas, inverse, 1)
     views = Views(reference=codes, others=others, least=_LEAST_CODES, shown=shown)
@@ -175,12 +176,17 @@ def _turned(codes: Codes, canvas: _Canvas) -> Codes:
     return np.asarray(cv2.warpPerspective(codes, canvas.canvas_from_view, size, flags=cv2.INTER_LINEAR))
 
 
-def _shown(shape: tuple[int, ...], canvas: _Canvas) -> Codes:
-    """Where a canvas shows the view in all of a census window: turned, the view is a quadrilateral within it."""
+def _shown(shape: tuple[int, ...], canvas: _Canvas) -> NDArray[np.int32]:
+    """(H, 2) from and up to which column a canvas shows the view in all of a census window.
+
+    Turned, the view is a quadrilateral in its canvas.
+    """
     import cv2
 
     size = (canvas.width, canvas.height)
     inside = cv2.warpPerspective(np.ones(shape, np.uint8), canvas.canvas_from_view, size, flags=cv2.INTER_NEAREST)
     # pixels between which a value lies are one more
     side = 2 * (CENSUS_RADIUS + 1) + 1
-    return np.asarray(cv2.erode(inside, np.ones((side, side), np.uint8)))
+    inside = cv2.erode(inside, np.ones((side, side), np.uint8))
+    begin, beyond = inside.argmax(axis=1), inside[:, ::-1].argmax(axis=1)
+    return np.stack([begin, np.where(inside.any(axis=1), canvas.width - beyond, 0)], axis=1).astype(np.int32)

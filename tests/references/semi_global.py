@@ -59,7 +59,7 @@ def matching_costs_reference(
     tables: Codes | None = None,
     blend: NDArray[np.int32] | None = None,
     blend_table: Codes | None = None,
-    shown: Codes | None = None,
+    shown: NDArray[np.int32] | None = None,
 ) -> Codes:
     """(H, W, D) what each candidate costs, summed over the views; the arguments are the compiled kernel's."""
     count, candidates = columns.shape[:2]
@@ -73,7 +73,7 @@ def matching_costs_reference(
                 (np.clip(at[:, d], 0, 16 * (n - 1)) + 8) // 16
                 for at, n in zip((columns, rows), views.shape[:0:-1], strict=True)
             )
-            seen = [one & (shown[k][y[k]][:, x[k]] == 1) for k, one in enumerate(seen)]
+            seen = [one & (x[k] >= shown[k, y[k], :1]) & (x[k] < shown[k, y[k], 1:]) for k, one in enumerate(seen)]
         total = np.zeros(reference.shape, dtype=np.int64)
         for k in range(count):
             if tables is None:
