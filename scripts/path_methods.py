@@ -107,19 +107,20 @@ def gate(takes: Sequence[Take], binned: Callable[[float], str], *, console: Cons
         blurred = [(pair, i) for pair in take.pairs for i in (0, 1)]
         known = [pair.known(i, "exact") for pair, i in blurred]
         fields = [_field(one) for one in known]
-        trusted = _verdict([pair.frame(i) for pair, i in blurred], fields)
+        trusted = _verdict([pair.frame(i) for pair, i in blurred], known)
         row: dict[str, Any] = {"verdict": trusted.reason, "trusted": trusted.trusted, "treated": {}}
-        for (pair, i), field in track(list(zip(blurred, fields, strict=True)), f"gate, {label}", console=console):
-            factor, _ = judge_frame(pair.frame(i), field, trusted, GateOptions())
+        of_each = list(zip(blurred, fields, known, strict=True))
+        for (pair, i), field, motion in track(of_each, f"gate, {label}", console=console):
+            factor, _ = judge_frame(pair.frame(i), field, trusted, GateOptions(), blur_path(*motion))
             one = row["treated"].setdefault(binned(pair.blur_px), {"frames": 0, "treated": 0})
             one["frames"] += 1
             one["treated"] += int(factor is not None)
         sharp = [pair.short(i) for pair, i in blurred]
         # as a wrong exposure time has it: alone, and among frames that bear the gyroscope out; and as it is
-        row["sharp recording"] = _kept(take.pairs, known, _verdict(sharp, fields))
+        row["sharp recording"] = _kept(take.pairs, known, _verdict(sharp, known))
         row["sharp among blurred"] = _kept(take.pairs, known, trusted)
         brief = [pair.known(i, "exact", shortened(pair.moments[i])) for pair, i in blurred]
-        row["sharp video"] = _kept(take.pairs, brief, _verdict(sharp, [_field(one) for one in brief]))
+        row["sharp video"] = _kept(take.pairs, brief, _verdict(sharp, brief))
         out[label] = row
     return out
 
@@ -128,9 +129,10 @@ def _field(known: Known) -> BlurField:
     return blur_field(*known)
 
 
-def _verdict(frames: Sequence[Grey], fields: Sequence[BlurField]) -> RecordingVerdict:
+def _verdict(frames: Sequence[Grey], known: Sequence[Known]) -> RecordingVerdict:
+    fields = [_field(one) for one in known]
     order = sorted(range(len(frames)), key=lambda i: -float(np.percentile(fields[i].extent_px(), 90)))[:_JUDGED]
-    return judge_recording(blur_evidence(frames[i], fields[i]) for i in order)
+    return judge_recording(blur_evidence(frames[i], blur_path(*known[i])) for i in order)
 
 
 def _kept(pairs: Sequence[Pair], known: Sequence[Known], verdict: RecordingVerdict) -> dict[str, Any]:
@@ -153,7 +155,7 @@ def _kept(pairs: Sequence[Pair], known: Sequence[Known], verdict: RecordingVerdi
 def _gated(image: Grey, known: Known, verdict: RecordingVerdict) -> Grey | None:
     """What features see of a frame that goes through the gate, as ``DeblurStage`` has it; ``None`` as it was."""
     field = _field(known)
-    factor, _ = judge_frame(image, field, verdict, GateOptions())
+    factor, _ = judge_frame(image, field, verdict, GateOptions(), blur_path(*known))
     # the package leaves frames with less blur alone, before any picture is asked
     if factor is None or float(np.percentile(field.extent_px(), 90)) < LEAST_PX * image.shape[1] / 1920:
         return None

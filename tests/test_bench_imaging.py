@@ -15,7 +15,7 @@ import imaging_colmap
 import imaging_metrics as metrics
 import imaging_scenes as scenes
 import imaging_shutter
-from bench_imaging import kept_share, verdict_on
+from bench_imaging import kept_share, treated, verdict_on
 
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.rolling_shutter import rectify_keypoints
@@ -78,6 +78,18 @@ def test_deblurring_helps_and_the_gate_refuses_a_wrong_axis():
     ]
     row = kept_share([pair()], [frames()], [wrong], verdict_on(frames(), wrong), [before[0]])
     assert row["kept"] >= 0.95
+
+
+@pytest.mark.parametrize(("blur_px", "sky_px"), [(6.0, 330), (10.0, 420), (20.0, 420), (30.0, 420)])
+def test_blurred_frames_are_treated_though_most_of_them_is_sky(blur_px, sky_px):
+    rng = np.random.default_rng(4)
+    walls = []
+    for wall in scenes.drawn_walls(3, 8):
+        below = wall[300:900, :1000].copy()
+        below[:sky_px] = 0.5 + 0.003 * rng.standard_normal((sky_px, 1000), dtype=np.float32)
+        walls.append(below)
+    found = treated(scenes.make_pairs(walls, blur_px, size=(800, 450), seed=3))
+    assert found["trusted"] is True and found["treated"] >= 0.9 * found["frames"] == 5.4, found
 
 
 def test_point_spread_functions_are_lines_of_the_right_length():

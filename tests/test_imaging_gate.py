@@ -11,12 +11,15 @@ from far_scene import FarScene
 from colmap_inertial.geometry import matrix_from_quat
 from colmap_inertial.gyro import GyroPath
 from colmap_inertial.imaging.blur_field import BlurField
-from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence
+from colmap_inertial.imaging.blur_path import BlurPath, middles
+from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence, shown_share
 from colmap_inertial.imaging.gate import (
+    LEAST_SHARE,
     GateOptions,
     RecordingVerdict,
     deblur_gated,
     decide,
+    judge_frame,
     judge_recording,
     keep_sharp,
 )
@@ -169,6 +172,53 @@ def test_the_image_tells_extent_and_direction(blur_px):
     assert blur_evidence(image, turned).support < 4
     flipped = replace(field, vector_px=field.vector_px * np.float32([1, -1]))
     assert blur_evidence(image, flipped).mirrored_support == pytest.approx(blur_evidence(image, field).support, rel=0.2)
+
+
+@pytest.mark.parametrize("blur_px", [6, 12, 25])
+def test_the_share_of_the_blur_that_shows_is_the_textures_and_not_the_sky_s(blur_px):
+    """Of a picture of which two thirds are a sky of noise, too."""
+    field = predicted(shot(0.98, blur_px)[0], "none")
+    shares = []
+    for image in (shot(0.98, blur_px)[1], shot(0.98, 0.2)[1]):
+        cloudless = image.copy()
+        noise = 2 * np.random.default_rng(1).standard_normal((2 * HEIGHT // 3, WIDTH, 1))
+        cloudless[: len(noise)] = np.rint(170 + noise).astype(np.uint8)
+        shares += [shown_share(image, field), shown_share(cloudless, field)]
+    blurred, blurred_below_sky, sharp, sharp_below_sky = shares
+    assert 0.5 < blurred < 1.3 and 0.5 < blurred_below_sky < 1.3
+    assert abs(sharp) < LEAST_SHARE / 2 and abs(sharp_below_sky) < LEAST_SHARE / 2
+    flat = np.full((HEIGHT, WIDTH), 90, np.uint8)
+    assert shown_share(flat, field) is None
+    noise = np.random.default_rng(0).normal(128, 6, (HEIGHT, WIDTH)).astype(np.uint8)
+    assert shown_share(noise, field) is None
+
+
+def test_curved_blur_is_compared_with_the_curve():
+    s = middles(33)
+    curve = np.stack([12 * s + 24 * s**2 - 8 * s**3, 24 * s**3 - 8 * s**2], axis=1).astype(np.float32)
+    nodes = BlurField.nodes(WIDTH, HEIGHT, 64)
+    path = BlurPath(
+        width=WIDTH, height=HEIGHT, path_px=np.broadcast_to(curve[:, None, None], (33, *nodes, 2)), step_px=64
+    )
+    sharp = shot(0.98, 0.2)[1].mean(axis=2).astype(np.float32) / 255
+    y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
+    light = np.mean([cv2.remap(sharp, x + dx, y + dy, cv2.INTER_CUBIC) for dx, dy in curve], axis=0)
+    noise = 0.01 * np.random.default_rng(2).standard_normal(light.shape)
+    image = np.rint(255 * np.clip(light + noise, 0, 1)).astype(np.uint8)
+    chord = path.field()
+    assert path.departure_px() > 3
+    assert shown_share(image, path) > 0.5 > shown_share(image, chord)
+    curved, line = blur_evidence(image, path), blur_evidence(image, chord)
+    assert curved.support > 6 and curved.extent_is_plausible and line.support < 2
+    trusted = RecordingVerdict(trusted=True, support=9.0, extent_factor=1.0, frames=9, reason="others do")
+    assert judge_frame(image, chord, trusted, GateOptions(), path)[0] == 1.0
+    assert judge_frame(image, chord, None, GateOptions(), path)[0] is not None
+    assert judge_frame(image, chord, None, GateOptions())[0] is None
+    # a picture that is sharp, or blurred along another curve, shows it no more for that
+    still = np.rint(255 * sharp).astype(np.uint8)
+    across = replace(path, path_px=path.path_px[..., ::-1])
+    for picture, other in ((still, path), (image, across)):
+        assert shown_share(picture, other) < LEAST_SHARE and blur_evidence(picture, other).support < 4
 
 
 def test_a_wrong_extent_is_corrected_and_a_right_one_left_alone():

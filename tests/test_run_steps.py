@@ -563,10 +563,10 @@ class Shown:
 @pytest.mark.parametrize(("clear", "trusted"), [(20, True), (10, None), (1, None)])
 def test_a_gyroscope_is_trusted_for_all_frames_where_nearly_all_bear_it_out(clear, trusted):
     verdict = imaging.RecordingVerdict(trusted=True, support=9.0, extent_factor=1.0, frames=20, reason="")
-    clearly, hardly = Looked(Shown(20.0), -1.5, 20.0), Looked(Shown(-1.0), -0.3, 20.0)
+    clearly, hardly = Looked(Shown(20.0), 0.8, 20.0), Looked(Shown(-1.0), 0.2, 20.0)
     assert by_frame(verdict, [clearly] * clear + [hardly] * (20 - clear)).trusted is trusted
     # a faint dip is none of a wrong gyroscope where detail lacks along the blur, and no other direction has a dip
-    faintly, elsewhere = Looked(Shown(1.0), -0.9, 20.0), Looked(Shown(1.0, other=6.0), -0.9, 20.0)
+    faintly, elsewhere = Looked(Shown(1.0), 0.5, 20.0), Looked(Shown(1.0, other=6.0), 0.5, 20.0)
     assert by_frame(verdict, [clearly] * clear + [faintly] * (20 - clear)).trusted is True
     assert by_frame(verdict, [clearly] * clear + [elsewhere] * (20 - clear)).trusted is trusted
     # short blur tells nothing

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -68,6 +68,10 @@ class BlurPath:
         return BlurField(
             width=self.width, height=self.height, step_px=self.step_px, vector_px=chord, cov_px2=self.cov_px2
         )
+
+    def times(self, factor: float) -> BlurPath:
+        """So many times as long."""
+        return replace(self, path_px=self.path_px * np.float32(factor), cov_px2=self.cov_px2 * np.float32(factor**2))
 
     def cov_at(self, rows_px: NDArray[Any], columns_px: NDArray[Any]) -> Array:
         """(R, C, 3) covariance of the chord at the crossings of rows and columns of pixels."""

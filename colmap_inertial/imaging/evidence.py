@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.imaging.blur_path import BlurPath, middles
 from colmap_inertial.types import Array
 
 #: Lags as factors of the predicted extent, and directions against the predicted one.
@@ -30,11 +31,24 @@ _SHORTEST_PX, _LEAST_CONTRAST, _MOST_CLIPPED = 2.5, 0.01, 0.1
 #: Standard deviation of the smoothing of the cepstrum, px; power (of a tile's mean square 1) below which noise rules.
 _SMOOTHING_PX, _FLOOR = 0.8, 1e-7
 _FEWEST_TILES = 12
-#: More tiles are thinned out: support grows with the square root of their number, cost with it. Few serve where the
-#: gyroscope is trusted.
+#: More tiles are thinned out: support grows with the square root of their number, cost with it. Few serve for the share
+#: of the blur that shows.
 _MOST_TILES, _FEW_TILES = 900, 200
-#: Cycles per pixel in which blur takes power from a direction before noise covers it.
-_BAND = (0.05, 0.25)
+#: Cycles per pixel in which blur takes power from a direction before noise covers it, and in which noise is alone.
+_BAND, _NOISE_BAND = (0.05, 0.25), (0.4, 0.5)
+#: The share of a tile's mean fall over all frequencies that is put down to the texture's own direction: textures differ
+#: by +-0.25 (natural logarithm of the power) along any two directions, about alike at all frequencies.
+_OWN_DIRECTION = 0.8
+#: Zeros of the transfer are no deeper than this (natural logarithm): JPEG, and blur that changes in a tile, fill them.
+_DEEPEST = -3.0
+#: Of a picture counts what stands out of the noise by twice its scatter; neighbours that are alike under the window
+#: make that half as large again.
+_SCATTER = 3.0
+#: Paths that leave their chord by more are curves; their dips are looked for at such factors of it and turns from it.
+_CURVED_PX = 0.5
+_BENT_FACTORS, _BENT_RAD = np.arange(0.7, 1.2001, 0.05), np.radians(np.arange(-30.0, 31.0, 3.0))
+#: With less, the scatter of the spectra alone (variance 1.6, neighbours alike) puts the share off by .1.
+_LEAST_INFORMATION = 400.0
 #: The extents among which the prediction may be: dips at shorter lags are the texture's own.
 _PLAUSIBLE = slice(2, 17)
 
@@ -119,7 +133,7 @@ class BlurEvidence:
         return float(self._depth(self.mirrored, self.mirrored_square)[_PLAUSIBLE].max())
 
 
-def blur_evidence(image: NDArray[np.uint8] | NDArray[np.uint16], blur: BlurField) -> BlurEvidence:
+def blur_evidence(image: NDArray[np.uint8] | NDArray[np.uint16], blur: BlurField | BlurPath) -> BlurEvidence:
     """Look for the blur that was predicted.
 
     Parameters
@@ -127,26 +141,22 @@ def blur_evidence(image: NDArray[np.uint8] | NDArray[np.uint16], blur: BlurField
     image
         (H, W) or (H, W, 3), sRGB.
     blur
-        Predicted, of the image's size.
+        Predicted, of the image's size. Where a path leaves its chord, lags are those at which its own cepstrum dips.
 
     Returns
     -------
     Evidence in units of the prediction; of no tile where blur is short, or texture missing, all over.
     """
-    from scipy.fft import irfft2
-
-    found = _spectra(image, blur, _MOST_TILES)
+    path = BlurPath.straight(blur) if isinstance(blur, BlurField) else blur
+    found = _spectra(image, path, _MOST_TILES)
     if found is None:
         return BlurEvidence.nothing()
-    logarithm, vectors = found
-    tile = logarithm.shape[1]
-    smooth = np.exp(-2 * (np.pi * _SMOOTHING_PX * np.fft.fftfreq(tile)) ** 2).astype(np.float32)
-    damped = logarithm * smooth[:, None] * smooth[: tile // 2 + 1]
-    cepstra = irfft2(damped, s=(tile, tile))
-    values = _at_lags(np.asarray(cepstra), vectors, DIRECTIONS_RAD)
+    logarithm, vectors, paths = found
+    cepstra, vectors = _cepstra(logarithm), _dips(vectors, paths, logarithm.shape[1])
+    values = _at_lags(cepstra, vectors, DIRECTIONS_RAD)
     level = np.median(values[:, :, 2:-1], axis=2, keepdims=True)
     values -= level
-    mirrored = _at_lags(np.asarray(cepstra), vectors * [1, -1], DIRECTIONS_RAD[:1]) - level
+    mirrored = _at_lags(cepstra, vectors * [1, -1], DIRECTIONS_RAD[:1]) - level
     return BlurEvidence(
         total=values.sum(axis=0),
         total_square=(values**2).sum(axis=0),
@@ -157,27 +167,42 @@ def blur_evidence(image: NDArray[np.uint8] | NDArray[np.uint16], blur: BlurField
     )
 
 
-def detail_fall(image: NDArray[np.uint8] | NDArray[np.uint16], blur: BlurField) -> float | None:
-    """How much less fine detail there is along the predicted blur than across it.
+def shown_share(image: NDArray[np.uint8] | NDArray[np.uint16], blur: BlurField | BlurPath) -> float | None:
+    """How much of the fall of detail that a blur predicts an image has: 1 where it is blurred so, 0 where it is sharp.
+
+    At one distance from the origin of a tile's spectrum, blur leaves the directions across it as they were and takes
+    power from those along it: ``log((S |K|^2 + n) / (S + n))``, with the path's own transfer K, a 1/f^2 picture S as
+    strong as the tile's directions across say, and the tile's noise n. What the tiles have is compared with that by
+    least squares. So a sky, or what is out of focus, of which noise is all that is left there, predicts no fall and
+    does not count.
 
     Returns
     -------
-    Natural logarithm of the powers' ratio: about -1 or less where an image is blurred so; about 0 where it is sharp,
-    or blurred otherwise: then textures decide, and tiles are many. ``None`` where there are too few to tell.
+    About 0 also where an image is blurred otherwise: textures decide then, and tiles are many. ``None`` where there is
+    too little to tell.
     """
-    found = _spectra(image, blur, _FEW_TILES)
-    return None if found is None else float(_fall(*found).mean())
+    path = BlurPath.straight(blur) if isinstance(blur, BlurField) else blur
+    found = _spectra(image, path, _FEW_TILES)
+    if found is None:
+        return None
+    seen, expected, seen_mean, expected_mean = _falls(*found)
+    information = float((expected - _OWN_DIRECTION * expected_mean).sum())
+    if information < _LEAST_INFORMATION:
+        return None
+    return float((seen - _OWN_DIRECTION * seen_mean).sum()) / information
 
 
 def _spectra(
-    image: NDArray[np.uint8] | NDArray[np.uint16], blur: BlurField, most_tiles: int
-) -> tuple[NDArray[np.float32], Array] | None:
-    """(N, T, T // 2 + 1) log power of tiles, and their (N, 2) blur; ``None`` where there are too few to tell."""
+    image: NDArray[np.uint8] | NDArray[np.uint16], path: BlurPath, most_tiles: int
+) -> tuple[NDArray[np.float32], Array, Array] | None:
+    """(N, T, T // 2 + 1) log power of tiles, the (N, 2) chords and the (N, S, 2) paths of their blur; ``None`` where
+    there are too few to tell."""
     import cv2
     from scipy.fft import rfft2
 
     light = _light(image)
-    lengths = blur.extent_px()
+    chords = path.field()
+    lengths = chords.extent_px()
     long_px = float(np.percentile(lengths, 90))
     reduced = 1
     while long_px / reduced > _LONGEST_PX:
@@ -198,11 +223,8 @@ def _spectra(
     step = max(3 * tile // 4, int(np.ceil(np.sqrt(height * width / most_tiles))))
     top, left = (_starts(size, tile, step) for size in (height, width))
     windows = np.lib.stride_tricks.sliding_window_view(light, (tile, tile))[top[:, None], left].reshape(-1, tile, tile)
-    rows, columns = (
-        np.minimum(np.rint((start + tile / 2) * reduced / blur.step_px), size - 1).astype(np.intp)
-        for start, size in ((top, lengths.shape[0]), (left, lengths.shape[1]))
-    )
-    vectors = blur.vector_px[rows][:, columns].reshape(-1, 2).astype(np.float64) / reduced
+    middles = [(start + tile / 2) * reduced for start in (top, left)]
+    vectors = chords.at(*middles).reshape(-1, 2) / reduced
     extent = np.hypot(vectors[:, 0], vectors[:, 1])
     usable = (extent >= _SHORTEST_PX) & (extent * FACTORS[-1] < 0.5 * tile)
     usable &= (windows > 0.97).mean(axis=(1, 2)) < _MOST_CLIPPED
@@ -214,7 +236,8 @@ def _spectra(
     window = np.hanning(tile).astype(np.float32)
     tiles = (tiles - tiles.mean(axis=(1, 2), keepdims=True)) * (window[:, None] * window)
     power = np.abs(rfft2(tiles)) ** 2
-    return np.asarray(np.log(power + _FLOOR * tile**2)), vectors[usable]
+    paths = path.at(*middles).reshape(len(vectors), -1, 2)[usable] / reduced
+    return np.asarray(np.log(power + _FLOOR * tile**2)), vectors[usable], paths
 
 
 def _light(image: NDArray[np.uint8] | NDArray[np.uint16]) -> NDArray[np.float32]:
@@ -234,26 +257,93 @@ def _starts(size: int, tile: int, step: int) -> NDArray[np.intp]:
     return np.unique(np.rint(np.linspace(0, size - tile, count)).astype(np.intp))
 
 
-def _fall(logarithm: NDArray[np.float32], vectors: Array) -> Array:
-    """(N,) mean of (N, T, T // 2 + 1) log power within 30 degrees of (N, 2) blur vectors, less that across them."""
+def _falls(logarithm: NDArray[np.float32], vectors: Array, path_px: Array) -> tuple[Array, Array, Array, Array]:
+    """(N,) sums over the frequencies of each tile: its fall times the expected one, and the expected one squared; and
+    both of the means over frequencies."""
     tile = logarithm.shape[1]
-    x, y = np.fft.rfftfreq(tile)[None, :], np.fft.fftfreq(tile)[:, None]
+    reach = int(_BAND[1] * tile) + 2
+    x, y = np.arange(reach - 1) / tile, np.arange(2 - reach, reach - 1)[:, None] / tile
     radius = np.hypot(x, y)
     band = (radius > _BAND[0]) & (radius < _BAND[1])
-    turn = np.stack([(x / np.maximum(radius, 1e-9))[band], (y / np.maximum(radius, 1e-9))[band]])
-    cosine = np.abs(vectors @ turn) / np.hypot(vectors[:, 0], vectors[:, 1])[:, None]
-    power = logarithm[:, band]
-    along, across = cosine > np.cos(np.pi / 6), cosine < np.sin(np.pi / 6)
-    return np.asarray((power * along).sum(1) / along.sum(1) - (power * across).sum(1) / across.sum(1))
+    passed = _leaked(_transfer(path_px, np.arange(-1, reach) / tile, np.arange(1 - reach, reach) / tile))[:, band]
+    power = logarithm[:, np.arange(2 - reach, reach - 1) % tile, : reach - 1][:, band].astype(np.float64)
+    every = np.hypot(np.fft.rfftfreq(tile), np.fft.fftfreq(tile)[:, None])
+    noise = np.exp(logarithm[:, (every > _NOISE_BAND[0]) & (every < _NOISE_BAND[1])].astype(np.float64)).mean(1)[
+        :, None
+    ]
+    turn = np.stack([np.broadcast_to(along, radius.shape)[band] for along in (x, y)]) / radius[band]
+    across = np.abs(vectors @ turn) < np.sin(np.pi / 6) * np.hypot(vectors[:, 0], vectors[:, 1])[:, None]
+    # the same at all frequencies of one distance from the origin
+    ring = np.rint(radius[band] * tile).astype(np.intp)
+    at_ring = np.eye(ring.max() + 1)[ring]
+    count = across @ at_ring
+    level, left = ((((values * across) @ at_ring) / np.maximum(count, 1))[:, ring] for values in (power, passed))
+    rise = radius[band] ** 2
+    above = (((np.exp(power) - noise) * rise) * across).sum(1) - _SCATTER * noise[:, 0] * np.sqrt(across @ rise**2)
+    picture = np.maximum(above / (passed * across).sum(1), 0)[:, None] / rise
+    counts = ~across & (count[:, ring] > 0)
+    expected = np.maximum(np.log((picture * passed + noise) / (picture * left + noise)), _DEEPEST) * counts
+    seen = (power - level) * counts
+    frequencies = np.maximum(counts.sum(1), 1)
+    return (
+        (seen * expected).sum(1),
+        (expected**2).sum(1),
+        seen.sum(1) * expected.sum(1) / frequencies,
+        expected.sum(1) ** 2 / frequencies,
+    )
 
 
-def _at_lags(cepstra: NDArray[np.float32], vectors: Array, directions_rad: Array) -> Array:
-    """(N, FACTORS, directions) values of (N, T, T) cepstra at the lags around (N, 2) blur vectors; bilinear."""
+def _transfer(path_px: Array, x: Array, y: Array) -> Array:
+    """(N, Y, X) power that (N, S, 2) paths leave at frequencies, cycles per pixel."""
+    wave_x, wave_y = (
+        np.exp(2j * np.pi * (path_px[:, :, i, None] * f)).astype(np.complex64) for i, f in enumerate((x, y))
+    )
+    return np.asarray(np.abs(np.swapaxes(wave_y, 1, 2) @ wave_x / path_px.shape[1]) ** 2, dtype=np.float64)
+
+
+def _leaked(power: Array) -> Array:
+    """As a tile under Hann's window has it: each frequency takes a sixth of either neighbour; without the outermost."""
+    for axis in (1, 2):
+        inner = np.moveaxis(power, axis, 0)
+        power = np.moveaxis((inner[:-2] + 4 * inner[1:-1] + inner[2:]) / 6, 0, axis)
+    return power
+
+
+def _cepstra(logarithm: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(N, T, T) of (N, T, T // 2 + 1) log power, smoothed."""
+    from scipy.fft import irfft2
+
+    tile = logarithm.shape[1]
+    smooth = np.exp(-2 * (np.pi * _SMOOTHING_PX * np.fft.fftfreq(tile)) ** 2).astype(np.float32)
+    return np.asarray(irfft2(logarithm * smooth[:, None] * smooth[: tile // 2 + 1], s=(tile, tile)))
+
+
+def _dips(vectors: Array, path_px: Array, tile: int) -> Array:
+    """(N, 2) lags at which the blur's own cepstrum is deepest: its (N, 2) chord, but of curves.
+
+    Both ends of a path make the zeros of its spectrum. Where it is curved, they bend, and the dip moves and widens.
+    """
+    bend = path_px - path_px.mean(axis=1, keepdims=True) - middles(path_px.shape[1])[:, None] * vectors[:, None]
+    curved = np.flatnonzero(np.hypot(bend[..., 0], bend[..., 1]).max(axis=1) > _CURVED_PX)
+    out = vectors.copy()
+    if len(curved):
+        power = _transfer(path_px[curved], np.asarray(np.fft.rfftfreq(tile)), np.asarray(np.fft.fftfreq(tile)))
+        cepstra = _cepstra(np.log(power + np.exp(2 * _DEEPEST)).astype(np.float32))
+        depth = _at_lags(cepstra, vectors[curved], _BENT_RAD, _BENT_FACTORS).reshape(len(curved), -1)
+        factor, turn = np.unravel_index(depth.argmin(axis=1), (len(_BENT_FACTORS), len(_BENT_RAD)))
+        cosine, sine = np.cos(_BENT_RAD[turn]), np.sin(_BENT_RAD[turn])
+        x, y = (vectors[curved] * _BENT_FACTORS[factor][:, None]).T
+        out[curved] = np.stack([x * cosine - y * sine, x * sine + y * cosine], axis=1)
+    return out
+
+
+def _at_lags(cepstra: NDArray[np.float32], vectors: Array, directions_rad: Array, factors: Array = FACTORS) -> Array:
+    """(N, factors, directions) values of (N, T, T) cepstra at the lags around (N, 2) blur vectors; bilinear."""
     tile = cepstra.shape[1]
     cosine, sine = np.cos(directions_rad), np.sin(directions_rad)
     along_x = vectors[:, 0, None] * cosine - vectors[:, 1, None] * sine
     along_y = vectors[:, 0, None] * sine + vectors[:, 1, None] * cosine
-    x, y = (FACTORS[None, :, None] * v[:, None, :] for v in (along_x, along_y))
+    x, y = (factors[None, :, None] * v[:, None, :] for v in (along_x, along_y))
     x0, y0 = np.floor(x), np.floor(y)
     part_x, part_y = (x - x0).astype(np.float32), (y - y0).astype(np.float32)
     left, top = x0.astype(np.intp) % tile, y0.astype(np.intp) % tile

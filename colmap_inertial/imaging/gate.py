@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath
-from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence, detail_fall
+from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence, shown_share
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.imaging.path_filters import path_wiener
 from colmap_inertial.imaging.psf import PredictedBlur
@@ -216,8 +216,9 @@ MUST_SHOW_PX = 8.0
 #: A blur that is known no better than this, as a share of its length, is left alone: a filter along a line that is off
 #: by a third or 20 degrees loses what it wins.
 MOST_UNSURE = 0.25
-#: Blur takes at least this from the logarithm of the power along it; sharp images are at 0 +- 0.2.
-_LEAST_FALL = -0.35
+#: A frame that shows less of the fall that its blur predicts is not blurred so. Blurred ones show .7 of it, the fewest
+#: .2 (textures with a direction of their own), sharp ones .05 +- .1.
+LEAST_SHARE = 0.25
 #: Standard deviations by which all frames together must show short blur: of wrong gyroscopes, none reached three.
 _TOGETHER_SUPPORT = 4.5
 #: From so many on, a frame has a vote whether it is rather the gyroscope's direction, or the mirrored one.
@@ -311,23 +312,31 @@ def _support(evidence: BlurEvidence) -> float:
 
 
 def judge_frame(
-    image: NDArray[Code], blur: BlurField, recording: RecordingVerdict | None, options: GateOptions
+    image: NDArray[Code],
+    blur: BlurField,
+    recording: RecordingVerdict | None,
+    options: GateOptions,
+    path: BlurPath | None = None,
 ) -> tuple[float | None, str]:
-    """The factor for the extents, or ``None`` for a frame to leave alone; and why. Arguments as of `deblur_gated`."""
+    """The factor for the extents, or ``None`` for a frame to leave alone; and why.
+
+    Arguments as of `deblur_gated`; ``path`` is the curve of which ``blur`` is the chord, where it is known.
+    """
     if recording is not None and recording.trusted is False:
         return None, recording.reason
     unsure = blur.unsure_share()
     if unsure > MOST_UNSURE:
         return None, f"noise and calibration of the gyroscope leave {unsure:.0%} of the blur's length uncertain"
+    curve = BlurPath.straight(blur) if path is None else path
     if recording is not None and recording.trusted:
-        fall = detail_fall(image, blur)
-        if fall is not None and fall > _LEAST_FALL:
+        share = shown_share(image, curve.times(recording.extent_factor))
+        if share is not None and share < LEAST_SHARE:
             return (
                 None,
                 "the image has as much detail along the predicted blur as across it, though other frames lack it",
             )
         return recording.extent_factor, recording.reason
-    evidence = blur_evidence(image, blur)
+    evidence = blur_evidence(image, curve)
     own = _support(evidence) if evidence.enough else 0.0
     if not evidence.enough:
         return None, "too little texture or blur to check the gyroscope's prediction against"

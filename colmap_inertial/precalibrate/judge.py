@@ -7,10 +7,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence, detail_fall
-from colmap_inertial.imaging.gate import MUST_SHOW_PX, FrameDecision, GateOptions, RecordingVerdict, judge_recording
+from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence, shown_share
+from colmap_inertial.imaging.gate import (
+    LEAST_SHARE,
+    MUST_SHOW_PX,
+    FrameDecision,
+    GateOptions,
+    RecordingVerdict,
+    judge_recording,
+)
 from colmap_inertial.imaging.parallax import Parallax
-from colmap_inertial.imaging.psf import blur_field
+from colmap_inertial.imaging.psf import blur_path
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.precalibrate.calibrate import some_frames
@@ -19,9 +26,9 @@ from colmap_inertial.stages.gyro_view import GyroView
 
 #: A gyroscope that is borne out by this share of them is trusted for all frames.
 _MOST_OF_THEM = 0.95
-#: A frame whose dip is faint bears the gyroscope out, too, where it has so much less detail along the blur than across
-#: it (logarithm of the power), and no other direction shows a dip this deep.
-_CLEAR_FALL, _OTHER_SUPPORT = -0.6, 4.0
+#: A frame whose dip is faint bears the gyroscope out, too, where detail falls along the blur as it would have it, and
+#: no other direction shows a dip this deep.
+_OTHER_SUPPORT = 4.0
 #: Where the pictures do not bear the gyroscope out, exposure times may be wrong by a common factor; these are tried.
 #: Twice the blur shows a dip, too, where the right one shows a deeper one.
 _EXPOSURE_FACTORS, _EXPOSURE_SUPPORT = (0.5, 2.0), 10.0
@@ -65,10 +72,10 @@ def judge_frames(
 
 @dataclass(frozen=True, eq=False)
 class Looked:
-    """What one picture says: its dips, how much less detail it has along the blur, and the blur that was predicted."""
+    """What one picture says: its dips, the share that it shows of the predicted fall of detail, and that blur."""
 
     evidence: BlurEvidence
-    fall: float | None
+    share: float | None
     blur_px: float
 
     @property
@@ -78,7 +85,7 @@ class Looked:
         if not one.extent_is_plausible:
             return False
         other = float(one.sigmas[:, 2:-1].max())
-        faint = self.fall is not None and self.fall <= _CLEAR_FALL and other < _OTHER_SUPPORT
+        faint = self.share is not None and self.share >= LEAST_SHARE and other < _OTHER_SUPPORT
         return one.support >= GateOptions().min_support or faint
 
 
@@ -96,11 +103,10 @@ def _look(
     looked: list[Looked] = []
     for frame in some_frames(capture, view.timing, [index[d.name] for d in chosen]):
         progress("blur", len(looked), len(chosen))
-        blur = blur_field(motion, camera, view.shutter(index[frame.name]), parallax=parallaxes.get(frame.name))
-        if factor != 1.0:
-            blur = blur.times(factor)
-        fall = detail_fall(frame.image, blur)
-        looked.append(Looked(blur_evidence(frame.image, blur), fall, blur_px[frame.name]))
+        shutter, parallax = view.shutter(index[frame.name]), parallaxes.get(frame.name)
+        path = blur_path(motion, camera, shutter, parallax=parallax, extent_factor=factor)
+        evidence, share = blur_evidence(frame.image, path), shown_share(frame.image, path)
+        looked.append(Looked(evidence, share, blur_px[frame.name]))
     progress("blur", len(chosen), len(chosen))
     return looked
 

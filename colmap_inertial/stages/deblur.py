@@ -159,12 +159,13 @@ class DeblurStage:
         if float(np.abs(blur.vector_px).max()) * 1.5 > LONGEST_PX:
             return said(f"{decision.blur_px:.0f} px of blur are too long to be undone")
         image: Any = frame.image  # either of two types of pixel, which the checker would keep apart
-        factor, reason = judge_frame(image, blur, self.verdict, self.gate)
+        path = blur_path(motion, camera, shutter, parallax=parallax)
+        factor, reason = judge_frame(image, blur, self.verdict, self.gate, path)
         if factor is None:
             return said(reason)
         if factor != 1.0:
             blur = blur.times(factor)
-        path = blur_path(motion, camera, shutter, parallax=parallax, extent_factor=factor)
+            path = blur_path(motion, camera, shutter, parallax=parallax, extent_factor=factor)
         out, kept = keep_sharp(image, remove(image, path), blur)
         width_px = smoothing_for(factor * (decision.blur_px or 0.0), self.smoothing, self.most_smoothing_px)
         smoothing_px = width_px if kept < _MOSTLY_KEPT else 0.0
