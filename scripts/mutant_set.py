@@ -851,6 +851,20 @@ MUTANTS = (
         ("imaging_doubt",),
     ),
     Mutant(
+        "imaging/evidence.py",
+        "_SCATTER * noise[:, 0]",
+        "0 * noise[:, 0]",
+        "a sky of noise counts as a picture",
+        ("imaging_gate",),
+    ),
+    Mutant(
+        "imaging/gate.py",
+        "curve = BlurPath.straight(blur) if path is None else path",
+        "curve = BlurPath.straight(blur)",
+        "curved blur is compared with its chord",
+        ("imaging_gate::test_curved_blur_is_compared_with_the_curve",),
+    ),
+    Mutant(
         "imaging/gyro_camera.py",
         "noise = 2 * self.path.noise_rad_s_rthz**2 * exposure_s",
         "noise = 2 * self.path.noise_rad_s_rthz**2 * exposure_s**2",
