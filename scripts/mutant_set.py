@@ -887,8 +887,8 @@ MUTANTS = (
     ),
     Mutant(
         "imaging/gate.py",
-        "if blur < options.skip_below_px * scale:",
-        "if blur < options.skip_below_px:",
+        "if blur < max(options.skip_below_px * scale, options.skip_below_own_px):",
+        "if blur < max(options.skip_below_px, options.skip_below_own_px):",
         "small pictures are judged by the thresholds of large ones",
         ("imaging_gate",),
     ),

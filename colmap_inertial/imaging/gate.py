@@ -35,6 +35,9 @@ class GateOptions:
     skip_below_px: float = 3.0
     """Less blur than this is left alone."""
 
+    skip_below_own_px: float = 2.0
+    """So is less than this in the picture as it is, however small: below, a filter may lose more than it gains."""
+
     drop_above_px: float = 45.0
     """Frames with more blur are left out, unless they bridge a gap."""
 
@@ -51,6 +54,8 @@ class GateOptions:
     """Standard deviations by which the median frame must show it, for the gyroscope to be trusted in all."""
 
     def __post_init__(self) -> None:
+        if self.skip_below_own_px < 0:
+            raise ValueError("skip_below_own_px must not be negative")
         if not 0 <= self.skip_below_px < self.drop_above_px:
             raise ValueError("skip_below_px must be from 0 to below drop_above_px")
         if not (self.bridge_s > 0 and self.bridge_deg > 0):
@@ -114,7 +119,7 @@ def decide(
             continue
         action: Action = "deblur"
         why = f"{blur:.1f} px of blur"
-        if blur < options.skip_below_px * scale:
+        if blur < max(options.skip_below_px * scale, options.skip_below_own_px):
             action, why = "keep", f"{blur:.1f} px of blur are too few to matter"
         elif drop:
             action, why = "drop", f"{blur:.0f} px of blur are too many, and the frames around it are better"
