@@ -224,6 +224,8 @@ MOST_UNSURE = 0.25
 #: A frame that shows less of the fall that its blur predicts is not blurred so. Blurred ones show .7 of it, the fewest
 #: .2 (textures with a direction of their own), sharp ones .05 +- .1.
 LEAST_SHARE = 0.25
+#: Sharp textures with a direction of their own show up to this, but no dip: in doubt, longer blur must show one.
+_CLEAR_SHARE = 0.5
 #: Standard deviations by which all frames together must show short blur: of wrong gyroscopes, none reached three.
 _TOGETHER_SUPPORT = 4.5
 #: From so many on, a frame has a vote whether it is rather the gyroscope's direction, or the mirrored one.
@@ -335,7 +337,7 @@ def judge_frame(
     curve = BlurPath.straight(blur) if path is None else path
     if recording is not None and recording.trusted:
         share = shown_share(image, curve.times(recording.extent_factor))
-        if share is not None and share < LEAST_SHARE:
+        if share is not None and (share < LEAST_SHARE or (share < _CLEAR_SHARE and _no_dip(image, curve, options))):
             return (
                 None,
                 "the image has as much detail along the predicted blur as across it, though other frames lack it",
@@ -351,6 +353,14 @@ def judge_frame(
             f"{options.min_support:g} are wanted)"
         )
     return _mended(evidence), f"the image bears out the gyroscope's blur ({own:.0f} standard deviations)"
+
+
+def _no_dip(image: NDArray[Code], curve: BlurPath, options: GateOptions) -> bool:
+    """Whether blur that is long enough to show a dip shows none."""
+    if float(np.percentile(curve.field().extent_px(), 90)) < MUST_SHOW_PX:
+        return False
+    evidence = blur_evidence(image, curve)
+    return evidence.enough and _support(evidence) < options.min_recording_support
 
 
 #: Side of the blocks that keep or give up their pixels together; a step smeared over L rises by no more than a quarter
