@@ -68,8 +68,8 @@ LOOP_OVERLAP = 5
 SAME_M, BACK_M, BACK_DEG, BESIDE = 0.15, 0.5, 20.0, 4
 #: Synthesised features: for the loop's error and long walks, and for repeated texture.
 LOOP_DENSITY, REPEATED_DENSITY = 1.2, 1.5
-#: Frames of a long walk around a room of the usual size.
-LONG_FRAMES = 300
+#: Of long walks.
+PACE_M_S = 0.8
 
 
 def bare(capture: Path, out: Path, *, sequential: bool) -> None:
@@ -320,7 +320,7 @@ def loop_errors(walk: Walk, folder: Path) -> dict[str, Figures]:
 def long_walk(frames: int, folder: Path) -> dict[str, Figures]:
     """What each mapper takes for a walk of so many frames: processor time and memory."""
     keep_colmap_quiet()
-    walk = Walk(seed=100, frames=frames, frame_rate_hz=8.0, drawn=False, size=max(frames / LONG_FRAMES, 0.8))
+    walk = Walk(seed=100, frames=frames, frame_rate_hz=8.0, drawn=False, pace_m_s=PACE_M_S)
     write_walk(walk, folder)
     recording, context = recorded(folder), RunContext(scratch=folder, num_threads=1)
     camera, names = recording.capture.camera, recording.timing.names

@@ -38,6 +38,8 @@ from colmap_inertial.types import Array, CameraModel
 HALF_M, AISLE_M, HEIGHT_M = np.array([5.0, 4.0]), 1.8, 2.6
 #: A corridor's length, how far its wall is from who walks along it, and how fast that is.
 LENGTH_M, AWAY_M, SPEED_M_S = 40.0, 2.2, 0.6
+#: Corners of a path that is walked at one pace.
+CORNER_M = 1.2
 #: From one copy to the next.
 PERIOD_M = 1.25
 #: Knots of the path.
@@ -56,8 +58,10 @@ class Walk:
 
     ``scene``: a ``room`` in which everything is unlike; ``mixed``: in it, every other poster is one of two, of one
     size, on all walls; ``copies``: nothing but one poster at equal distances, on plaster; ``tiled``: the plaster is the
-    same from each poster to the next, too; likewise a ``corridor`` with one wall, and nobody turns round. ``size``: how
-    many times as long as usual the room is, each way.
+    same from each poster to the next, too; likewise a ``corridor`` with one wall, and nobody turns round.
+
+    ``pace_m_s``: the room is as large as the walk, at this pace, is long. Without one, it is of the usual size; who walks
+    is slow in corners, and in the middle of walls the quicker the longer these are.
     """
 
     seed: int
@@ -67,11 +71,15 @@ class Walk:
     scene: Scene = "room"
     width: int = 480
     drawn: bool = True
-    size: float = 1.0
+    pace_m_s: float | None = None
 
     def half_m(self) -> Array:
         """Half the room."""
-        return self.size * HALF_M
+        if self.pace_m_s is None:
+            return HALF_M
+        lap_m = self.pace_m_s * self.frames / self.frame_rate_hz / self.laps
+        # a lap is as long as the room's walls less what the aisle and the corners take
+        return (lap_m + 8 * AISLE_M + (8 - 2 * np.pi) * CORNER_M) / (4 * HALF_M.sum()) * HALF_M
 
     def path_m(self) -> Array:
         """Half the path, as far from the walls in any room."""
@@ -182,10 +190,13 @@ def motion_of(walk: Walk) -> Motion:
     # a superellipse; the camera looks along its normal
     cosine, sine = np.cos(phase), np.sin(phase)
     across = np.stack([np.sign(c) * np.abs(c) ** 0.5 for c in (cosine, sine)], axis=1) * path_m
-    smooth = np.ones(61) / 61
-    across = np.stack([np.convolve(np.pad(c, 30, mode="edge"), smooth, mode="valid") for c in across.T], axis=1)
+    out = np.stack([cosine / path_m[0], sine / path_m[1]], axis=1)
+    if walk.pace_m_s is not None:
+        across, out = _at_one_pace(path_m, walk.laps * t_s / duration_s)
+        out = _smooth(out)
+    across = _smooth(across)
     sway = [sum(a * np.sin(2 * np.pi * f * t_s + p) for a, f, p in _tones(rng)) for _ in range(6)]
-    out = np.stack([cosine / path_m[0], sine / path_m[1], 0 * phase], axis=1)
+    out = np.column_stack([out, 0 * phase])
     if "corridor" in walk.scene:
         across = np.stack([SPEED_M_S * (t_s - duration_s / 2), 0 * t_s], axis=1)
         out = np.tile([0.3, 1.0, 0.0], (count, 1))
@@ -200,6 +211,24 @@ def motion_of(walk: Walk) -> Motion:
         cam_in_world_m=position,
         world_from_cam_xyzw=quat_multiply(looking, hand),
     )
+
+
+def _smooth(values: Array) -> Array:
+    """Means of a second."""
+    second = np.ones(61) / 61
+    return np.stack([np.convolve(np.pad(c, 30, mode="edge"), second, mode="valid") for c in values.T], axis=1)
+
+
+def _at_one_pace(half_m: Array, laps: Array) -> tuple[Array, Array]:
+    """(N, 2) places on a rectangle with round corners, after so many laps (N,), and directions (N, 2) out of it."""
+    x, y = half_m - CORNER_M
+    turn = np.pi / 2 * CORNER_M
+    way_m = np.cumsum([0, y, turn, 2 * x, turn, 2 * y, turn, 2 * x, turn, y])
+    middle = np.array([(x, 0), (x, y), (x, y), (-x, y), (-x, y), (-x, -y), (-x, -y), (x, -y), (x, -y), (x, 0)])
+    at_m = laps % 1 * way_m[-1]
+    angle = np.interp(at_m, way_m, np.pi / 2 * np.array([0, 0, 1, 1, 2, 2, 3, 3, 4, 4]))
+    out = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return np.stack([np.interp(at_m, way_m, c) for c in middle.T], axis=1) + CORNER_M * out, out
 
 
 def _tones(rng: np.random.Generator) -> list[tuple[float, float, float]]:
