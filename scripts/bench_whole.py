@@ -308,6 +308,7 @@ def loop_errors(walk: Walk, folder: Path) -> dict[str, Figures]:
             refine_intrinsics=False,
             num_images=len(names),
             context=context,
+            in_time=names,
         )
         told |= {"matching_s": matched_s - begun_s, "mapping_s": time.process_time() - matched_s}
         told["peak_mib"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
@@ -364,6 +365,7 @@ def map_by(mapper: Literal["incremental", "global"], folder: Path) -> Figures:
         refine_intrinsics=False,
         num_images=len(truth),
         context=RunContext(scratch=folder, num_threads=1),
+        in_time=list(truth),
     )
     processor_s = time.process_time() - begun_s
     mib = peak_mib() - before_mib

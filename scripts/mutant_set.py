@@ -1418,6 +1418,27 @@ MUTANTS = (
         ("run_steps::test_intrinsics_are_refined_where_that_is_asked_for",),
     ),
     Mutant(
+        "colmap/closing.py",
+        "_make_one(reconstruction, torn)",
+        "_make_one(reconstruction, torn[:0])",
+        "ends of a model that met are not joined",
+        ("closing::test_ends_that_met_are_joined_and_what_drifted_on_the_way_goes",),
+    ),
+    Mutant(
+        "colmap/closing.py",
+        "joined = stays >= _STAYS and",
+        "joined = stays >= 0 and",
+        "ends that do not belong together are joined",
+        ("closing::test_ends_whose_matches_join_what_is_not_the_same_are_not_joined",),
+    ),
+    Mutant(
+        "colmap/closing.py",
+        "if nearest is None or apart <= nearest:",
+        "if True:",
+        "ends are joined by pairs that may join copies",
+        ("closing::test_ends_are_not_joined_by_pairs_of_which_nobody_knows_whether_they_join_copies",),
+    ),
+    Mutant(
         "colmap/steps.py",
         "records if record.used}",
         "records}",

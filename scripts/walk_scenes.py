@@ -60,8 +60,8 @@ class Walk:
     size, on all walls; ``copies``: nothing but one poster at equal distances, on plaster; ``tiled``: the plaster is the
     same from each poster to the next, too; likewise a ``corridor`` with one wall, and nobody turns round.
 
-    ``pace_m_s``: the room is as large as the walk, at this pace, is long. Without one, it is of the usual size; who walks
-    is slow in corners, and in the middle of walls the quicker the longer these are.
+    ``pace_m_s``: the room is as large as the walk, at this pace, is long. Without one, it is of the usual size; who
+    walks is slow in corners, and quick in the middle of walls.
     """
 
     seed: int

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from colmap_inertial.colmap.closing import close_gaps
 from colmap_inertial.errors import FormatError, InertialError, MappingError, OutputError
 from colmap_inertial.model import colmap_camera, find_models
 from colmap_inertial.model.binary import check_binary_model
@@ -32,6 +33,8 @@ _EXTRACTION_BATCH = 16
 #: Where cameras are known, the whole model is adjusted each time it has grown so much, as COLMAP's own settings for
 #: videos have it, and at the end; unknown cameras bend a model that is adjusted so seldom.
 _GLOBAL_RATIO = 1.4
+#: Images within so many times the overlap are neighbours in time.
+_NEIGHBOURS = 2
 #: Each batch indexes its images' features anew, an image as dear as a pair; the first are small, so that one sees soon
 #: how quickly it goes.
 _FIRST_MATCHING_BATCH, _MATCHING_BATCH = 100, 1600
@@ -290,8 +293,14 @@ def map_images(
     refine_intrinsics: bool,
     num_images: int,
     context: RunContext,
+    in_time: Sequence[str] = (),
 ) -> None:
     """Run COLMAP's mapper; models are written to ``sparse/0``, ``sparse/1``, ...
+
+    Parameters
+    ----------
+    in_time
+        The images in order of time, where they are of one recording: ends of a model that met are joined then.
 
     Raises
     ------
@@ -305,13 +314,19 @@ def map_images(
     require_room(sparse, database.stat().st_size)
     context.progress("mapping", 0, num_images)
     if options.mapper == "incremental":
+        pipeline = _incremental_options(refine_intrinsics, context.num_threads, context.seed)
         models = pycolmap.incremental_mapping(
             str(database),
             str(images),
             str(sparse),
-            options=_incremental_options(refine_intrinsics, context.num_threads, context.seed),
+            options=pipeline,
             next_image_callback=_counter(context.progress, num_images),
         )
+        # of every pair of images, nobody looked whether those far apart in time join copies
+        nearest = _NEIGHBOURS * options.overlap if matches_every_pair(num_images, options) else None
+        for number, model in models.items() if in_time else ():
+            if close_gaps(database, model, pipeline, in_time, nearest=nearest):
+                model.write_binary(str(sparse / str(number)))
     else:
         models = pycolmap.global_mapping(
             str(database),

@@ -87,6 +87,7 @@ def run_colmap(
             refine_intrinsics=any(camera is None for camera in cameras.values()) if refine is None else refine,
             num_images=len(cameras),
             context=context,
+            in_time=recording.timing.names,
         )
 
     runner.run("matches", pairing, outputs, matches, after=["frames"])

@@ -1,0 +1,192 @@
+"""Ends of a model that met and were not joined.
+
+COLMAP's incremental mapper grows both ways around a long loop. Where its ends meet they are off by what has drifted;
+and where that is more than a few pixels, nothing that both show becomes one point: each end keeps its own, and the model
+stays torn there, however often it is adjusted. The matches are in the database. So what both ends hold twice is made
+one, and the model is adjusted and its points completed, as COLMAP does at the end.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import pycolmap
+
+log = logging.getLogger(__name__)
+
+Ids = NDArray[np.int64]
+
+#: Two images hang together by so many points in common: as many matches as COLMAP asks of two views.
+_LINKED = 15
+#: A pair is torn that has so many matches between points, of which hardly any, this share, are one point. COLMAP asks
+#: 30 to place an image.
+_LEAST_MATCHES, _SAME_SHARE = 30, 0.05
+#: Images that hang together over no more others than this lie as the model has them, and what contradicts that joins
+#: copies; farther on, the model may have drifted. More than neighbours in time that are matched lie apart.
+_HOPS = 10
+#: Ends that meet see each other in so many pairs at least.
+_LEAST_PAIRS = 3
+#: What was made one stays one in this share of the matches, or the ends do not belong together.
+_STAYS = 0.5
+#: To move ends that are far apart takes more rounds than COLMAP's 50; a walk of 500 frames, off by a metre, took 60.
+_ROUNDS = 200
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Torn:
+    """A pair of images that shows the same, and of which each has points of its own.
+
+    Attributes
+    ----------
+    first, second
+        The images' numbers.
+    features
+        (K, 2) matches that are points in both.
+    points
+        (K, 2) these points.
+    """
+
+    first: int
+    second: int
+    features: Ids
+    points: Ids
+
+
+def close_gaps(
+    database: Path,
+    reconstruction: pycolmap.Reconstruction,
+    pipeline: pycolmap.IncrementalPipelineOptions,
+    names: Sequence[str],
+    *,
+    nearest: int | None,
+) -> bool:
+    """Join the ends of a model that met; whether there were any, and they belong together.
+
+    Parameters
+    ----------
+    database
+        With the matches that the model was made from.
+    reconstruction
+        Is changed; where this says False it may be of no further use.
+    pipeline
+        What the model was made with.
+    names
+        Of images, in order of time.
+    nearest
+        Pairs farther apart in time may join copies, and are not looked at; ``None`` where all may be believed.
+    """
+    import pycolmap
+
+    cached = pycolmap.DatabaseCacheOptions()
+    cached.min_num_matches = pipeline.min_num_matches
+    with pycolmap.Database.open(str(database)) as opened:
+        torn = _torn(opened, reconstruction, names, nearest)
+        if len(torn) < _LEAST_PAIRS:
+            return False
+        cache = pycolmap.DatabaseCache.create(opened, cached)
+    images = reconstruction.num_reg_images()
+    _make_one(reconstruction, torn)
+    options = pipeline.get_global_bundle_adjustment()
+    options.print_summary = False
+    options.ceres.solver_options.max_num_iterations = _ROUNDS
+    pycolmap.bundle_adjustment(reconstruction, options)
+    mapper = pycolmap.IncrementalMapper(cache)
+    mapper.begin_reconstruction(reconstruction)
+    mapper.iterative_global_refinement(
+        pipeline.ba_global_max_refinements,
+        pipeline.ba_global_max_refinement_change,
+        pipeline.get_mapper(),
+        pipeline.get_global_bundle_adjustment(),
+        pipeline.get_triangulation(),
+    )
+    mapper.end_reconstruction(False)
+    point = {number: _point_of(reconstruction, number) for pair in torn for number in (pair.first, pair.second)}
+    of_first = np.concatenate([point[pair.first][pair.features[:, 0]] for pair in torn])
+    of_second = np.concatenate([point[pair.second][pair.features[:, 1]] for pair in torn])
+    stays = float(np.mean((of_first == of_second) & (of_first >= 0)))
+    joined = stays >= _STAYS and reconstruction.num_reg_images() == images
+    said = "joined" if joined else "left as they are: they do not fit"
+    log.info("a model's ends, seen in %d pairs of images, %s (%.0f %% agree)", len(torn), said, 100 * stays)
+    return joined
+
+
+def _point_of(reconstruction: pycolmap.Reconstruction, number: int) -> Ids:
+    """Of an image's features, the numbers of their points; -1 without one."""
+    image = reconstruction.image(number)
+    points = np.full(image.num_points2D(), -1, dtype=np.int64)
+    seen = np.array(image.get_observation_point2D_idxs(), dtype=np.intp)
+    points[seen] = [point.point3D_id for point in image.get_observation_points2D()]
+    return points
+
+
+def _torn(
+    opened: pycolmap.Database, reconstruction: pycolmap.Reconstruction, names: Sequence[str], nearest: int | None
+) -> list[_Torn]:
+    """Pairs that show the same, and hang together by nothing but a long way round."""
+    import pycolmap
+
+    place = {name: at for at, name in enumerate(names)}
+    when = {number: place.get(reconstruction.image(number).name) for number in reconstruction.reg_image_ids()}
+    point = {number: _point_of(reconstruction, number) for number, at in when.items() if at is not None}
+    linked: list[tuple[int, int]] = []
+    suspects: list[_Torn] = []
+    for pair, count in zip(*opened.read_two_view_geometry_num_inliers(), strict=True):
+        first, second = pycolmap.pair_id_to_image_pair(pair)
+        if count < _LINKED or first not in point or second not in point:
+            continue
+        matches = np.array(opened.read_two_view_geometry(first, second).inlier_matches, dtype=np.int64)
+        points = np.stack([point[first][matches[:, 0]], point[second][matches[:, 1]]], axis=1)
+        both = (points >= 0).all(axis=1)
+        same = int((both & (points[:, 0] == points[:, 1])).sum())
+        if same >= _LINKED:
+            linked.append((first, second))
+        elif both.sum() >= _LEAST_MATCHES and same <= _SAME_SHARE * both.sum():
+            apart = abs(place[reconstruction.image(first).name] - place[reconstruction.image(second).name])
+            if nearest is None or apart <= nearest:
+                suspects.append(_Torn(first=first, second=second, features=matches[both], points=points[both]))
+    hops = _hops(sorted(point), linked, [(pair.first, pair.second) for pair in suspects])
+    return [pair for pair, over in zip(suspects, hops, strict=True) if over > _HOPS]
+
+
+def _hops(numbers: Sequence[int], linked: Sequence[tuple[int, int]], asked: Sequence[tuple[int, int]]) -> list[float]:
+    """Over how many pairs that are linked one comes from one image to the other."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import dijkstra
+
+    if not asked:
+        return []
+    at = {number: index for index, number in enumerate(numbers)}
+    ends = np.array([(at[a], at[b]) for a, b in linked], dtype=np.intp).reshape(-1, 2)
+    graph = coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(len(at), len(at))).tocsr()
+    begin, row = np.unique([at[a] for a, _ in asked], return_inverse=True)
+    away = dijkstra(graph, directed=False, unweighted=True, indices=begin)
+    return [float(away[k, at[b]]) for k, (_, b) in zip(row.tolist(), asked, strict=True)]
+
+
+def _make_one(reconstruction: pycolmap.Reconstruction, torn: Sequence[_Torn]) -> None:
+    """Merge points that matches say are one, unless an image then saw it twice."""
+    now: dict[int, int] = {}
+    for pair in sorted(torn, key=lambda pair: (-len(pair.points), pair.first, pair.second)):
+        for couple in pair.points.tolist():
+            first, second = (_latest(now, number) for number in couple)
+            if first != second and not _images(reconstruction, first) & _images(reconstruction, second):
+                now[first] = now[second] = reconstruction.merge_points3D(first, second)
+
+
+def _latest(now: Mapping[int, int], number: int) -> int:
+    """What became of a point; the new one never has the number of an old one."""
+    while number in now:
+        number = now[number]
+    return number
+
+
+def _images(reconstruction: pycolmap.Reconstruction, number: int) -> set[int]:
+    return {element.image_id for element in reconstruction.point3D(number).track.elements}

@@ -1,0 +1,152 @@
+"""Ends of a model that met: joined where they show the same, left alone where they do not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from colmap_inertial.colmap.closing import close_gaps
+
+#: A camera turns once around in the middle of a round room, looking outwards.
+FRAMES, RING_M, ROOM_M = 48, 3.0, 5.0
+FOCAL_PX, SIZE_PX = 300.0, (480, 360)
+#: A lap is mapped as so much more than one.
+DRIFT = 1.03
+NAMES = [f"{k:03d}.jpg" for k in range(FRAMES)]
+
+
+@dataclass
+class Ring:
+    """A model of a lap around a room, its ends off by what has drifted, and the matches it was made from."""
+
+    database: Path
+    model: object
+    options: object
+
+    def error_m(self) -> float:
+        """Of centres, after a similarity, rms."""
+        found = np.array([self.model.image(k + 1).projection_center() for k in range(FRAMES)])
+        true = centres_m(1.0)
+        a, b = found - found.mean(axis=0), true - true.mean(axis=0)
+        u, s, vt = np.linalg.svd(b.T @ a)
+        sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
+        scale = np.sum(s * np.diag(sign)) / np.sum(a**2)
+        return float(np.sqrt(np.mean(np.sum((scale * a @ (u @ sign @ vt).T - b) ** 2, axis=1))))
+
+
+def angles(stretched: float) -> np.ndarray:
+    return 2 * np.pi / FRAMES * stretched * np.arange(FRAMES)
+
+
+def centres_m(stretched: float) -> np.ndarray:
+    angle = angles(stretched)
+    return RING_M * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+
+
+def cam_from_world(angle: float) -> np.ndarray:
+    """Rows: right, down, out of the ring."""
+    out = np.array([np.cos(angle), np.sin(angle), 0])
+    return np.array([[out[1], -out[0], 0], [0, 0, -1], out])
+
+
+def make(folder: Path, *, drift: float = DRIFT, shuffled: bool = False) -> Ring:
+    """``shuffled``: matches between both ends join what is not the same."""
+    import pycolmap
+
+    rng = np.random.default_rng(5)
+    angle, height = rng.uniform(0, 2 * np.pi, 1500), rng.uniform(-1, 1, 1500)
+    points = np.stack([ROOM_M * np.cos(angle), ROOM_M * np.sin(angle), height], axis=1)
+    seen, xy = [], []
+    for k, at in enumerate(angles(1.0)):
+        in_cam = (points - centres_m(1.0)[k]) @ cam_from_world(at).T
+        px = FOCAL_PX * in_cam[:, :2] / in_cam[:, 2:] + np.array(SIZE_PX) / 2
+        shown = np.flatnonzero((in_cam[:, 2] > 0.5) & (px > 0).all(axis=1) & (px < SIZE_PX).all(axis=1))
+        seen.append(shown)
+        xy.append(px[shown] + 0.3 * rng.standard_normal((len(shown), 2)))
+    camera = pycolmap.Camera(camera_id=1, model="PINHOLE", width=480, height=360, params=[FOCAL_PX, FOCAL_PX, 240, 180])
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(camera)
+    for k, at in enumerate(angles(drift)):
+        turn = cam_from_world(at)
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(turn), -turn @ centres_m(drift)[k])
+        model.add_image_with_trivial_frame(
+            pycolmap.Image(name=NAMES[k], keypoints=xy[k], camera_id=1, image_id=k + 1), pose
+        )
+    _add_points(model, seen, angle, height, drift)
+    path = folder / "database.db"
+    with pycolmap.Database.open(str(path)) as opened:
+        opened.write_camera(camera, use_camera_id=True)
+        opened.write_rig(model.rig(1), use_rig_id=True)
+        for k in range(FRAMES):
+            image = pycolmap.Image(name=NAMES[k], camera_id=1, image_id=k + 1, frame_id=k + 1)
+            opened.write_frame(model.frame(k + 1), use_frame_id=True)
+            opened.write_image(image, use_image_id=True)
+            opened.write_keypoints(k + 1, np.column_stack([xy[k], np.ones((len(xy[k]), 4))]).astype(np.float32))
+        for i in range(FRAMES):
+            for j in (i + 1, i + 2):
+                _, mine, other = np.intersect1d(seen[i], seen[j % FRAMES], return_indices=True)
+                if shuffled and j >= FRAMES:
+                    other = rng.permutation(other)
+                first, second = sorted([(i + 1, mine), (j % FRAMES + 1, other)], key=lambda one: one[0])
+                geometry = pycolmap.TwoViewGeometry()
+                geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+                geometry.inlier_matches = np.stack([first[1], second[1]], axis=1).astype(np.uint32)
+                opened.write_matches(first[0], second[0], geometry.inlier_matches)
+                opened.write_two_view_geometry(first[0], second[0], geometry)
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads, options.random_seed = 1, 0
+    options.ba_refine_focal_length = options.ba_refine_extra_params = False
+    return Ring(database=path, model=model, options=options)
+
+
+def _add_points(model, seen: list[np.ndarray], angle: np.ndarray, height: np.ndarray, drift: float) -> None:
+    """Where the drifted cameras see them; what the first and the last see, twice."""
+    import pycolmap
+
+    for point in range(len(angle)):
+        views = [(k, int(np.searchsorted(seen[k], point))) for k in range(FRAMES) if point in seen[k]]
+        late = [view for view in views if view[0] >= FRAMES // 2]
+        early = [view for view in views if view[0] < FRAMES // 2]
+        apart = bool(early) and bool(late) and late[-1][0] - early[0][0] > FRAMES // 2 and drift > 1
+        for group in (early, late) if apart else (views,):
+            if len(group) < 2:
+                continue
+            # a lap further on where the last ones see it from
+            turns = angle[point] + (2 * np.pi if group is late and angle[point] < np.pi else 0)
+            turns -= 2 * np.pi if group is early and apart and angle[point] > np.pi else 0
+            at = np.array([ROOM_M * np.cos(drift * turns), ROOM_M * np.sin(drift * turns), height[point]])
+            elements = [pycolmap.TrackElement(k + 1, feature) for k, feature in group]
+            model.add_point3D(at, pycolmap.Track(elements=elements), np.zeros(3, dtype=np.uint8))
+
+
+def test_ends_that_met_are_joined_and_what_drifted_on_the_way_goes(tmp_path):
+    ring = make(tmp_path)
+    before = ring.error_m()
+    assert before > 0.05
+    assert close_gaps(ring.database, ring.model, ring.options, NAMES, nearest=None)
+    assert ring.error_m() < before / 10
+    first, last = ({p.point3D_id for p in ring.model.image(k).get_observation_points2D()} for k in (1, FRAMES))
+    assert len(first & last) > 30
+
+
+def test_a_model_that_is_whole_stays_as_it_is(tmp_path):
+    ring = make(tmp_path, drift=1.0)
+    before = [ring.model.image(k + 1).projection_center() for k in range(FRAMES)]
+    assert not close_gaps(ring.database, ring.model, ring.options, NAMES, nearest=None)
+    np.testing.assert_array_equal([ring.model.image(k + 1).projection_center() for k in range(FRAMES)], before)
+
+
+def test_ends_whose_matches_join_what_is_not_the_same_are_not_joined(tmp_path):
+    ring = make(tmp_path, shuffled=True)
+    assert not close_gaps(ring.database, ring.model, ring.options, NAMES, nearest=None)
+
+
+@pytest.mark.parametrize("names", [NAMES, []], ids=["far apart in time", "not in the recording"])
+def test_ends_are_not_joined_by_pairs_of_which_nobody_knows_whether_they_join_copies(tmp_path, names):
+    ring = make(tmp_path)
+    before = ring.error_m()
+    assert not close_gaps(ring.database, ring.model, ring.options, names, nearest=8)
+    assert ring.error_m() == before
