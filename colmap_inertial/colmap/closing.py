@@ -1,9 +1,9 @@
 """Ends of a model that met and were not joined.
 
 COLMAP's incremental mapper grows both ways around a long loop. Where its ends meet they are off by what has drifted;
-and where that is more than a few pixels, nothing that both show becomes one point: each end keeps its own, and the model
-stays torn there, however often it is adjusted. The matches are in the database. So what both ends hold twice is made
-one, and the model is adjusted and its points completed, as COLMAP does at the end.
+and where that is more than a few pixels, nothing that both show becomes one point: each end keeps its own, and the
+model stays torn there, however often it is adjusted. The matches are in the database. So what both ends hold twice is
+made one, and the model is adjusted and its points completed, as COLMAP does at the end.
 """
 
 from __future__ import annotations
