@@ -1747,6 +1747,20 @@ MUTANTS = (
         ("refine_stage::test_what_cannot_be_refined_is_said",),
     ),
     Mutant(
+        "stages/refine.py",
+        "    if len({camera.camera_id for camera in cameras}) <= max(1, len(images) // 2):",
+        "    if True:",
+        "two devices are refined as one where each image has a camera of its own",
+        ("refine_stage::test_what_cannot_be_refined_is_said",),
+    ),
+    Mutant(
+        "stages/refine.py",
+        "turn[i, k, j], turn[i, j, k] = 0.5, -0.5",
+        "turn[i, k, j], turn[i, j, k] = -0.5, 0.5",
+        "a sensor's own axes are as uncertain as the IMU's, and more",
+        ("refine_stage::test_derivatives_of_a_sensor_s_axes_are_those_of_finite_differences",),
+    ),
+    Mutant(
         "refine/judge.py",
         "np.flatnonzero(np.isfinite(t_s) & moved)",
         "np.flatnonzero(np.isfinite(t_s))",

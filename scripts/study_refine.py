@@ -1,6 +1,7 @@
 """What the tight refinement does to simulated walks: camera centres, drift of scale, and the calibration.
 
-    python scripts/study_refine.py [--metres 100] [--readout-ms 0] [--undeclared] [--seeds 1 2] [--spoil late] [--out F]
+    python scripts/study_refine.py [--metres 100] [--readout-ms 0] [--undeclared] [--expected] [--seeds 1 2]
+        [--spoil late] [--out F]
     python scripts/study_refine.py --loop [--seeds 1 2]
 
 Points beside the way are tracked as features are (no pictures are rendered), and COLMAP's own bundle adjustment makes
@@ -11,7 +12,8 @@ through the readout's stage first, as in a run. ``--undeclared``: nobody says so
 Errors are those of the camera centres after one similarity, in millimetres; drift is the scale of the last third of the
 path over that of the first, in per cent; of the calibration, error and normalised error (over its standard deviation).
 Seconds are the processor's (one), memory is the most until then. ``--spoil`` falsifies the IMU: another recording's, 30
-ms late, an axis of the accelerometer flipped, or 5 % more of it.
+ms late, an axis of the accelerometer flipped, or 5 % more of it. ``--expected``: a device whose axes and gains are as
+far off as the refinement's priors have it, and not as a phone's: what tells whether the rotation's covariance is right.
 """
 
 import argparse
@@ -29,6 +31,7 @@ from check_euroc import similarity
 from colmap_inertial.geometry import matrix_from_quat, quat_exp, quat_multiply, so3_log
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.model import Model
+from colmap_inertial.scale.priors import PRIORS
 from colmap_inertial.simulate.motion import MotionOptions
 from colmap_inertial.simulate.tracks import TrackOptions, Tracks, simulate_tracks
 from colmap_inertial.stages.gyro_view import GyroView
@@ -158,13 +161,13 @@ def studied(options: TrackOptions, seed: int, spoil: str, *, declared: bool = Tr
 
 def axes_deg(
     found: CameraImuCalibration, gain: list[list[float]], true: CameraImuCalibration, matrix: np.ndarray
-) -> float:
-    """Angle between a sensor's own axes in the camera, as found and as they are: nearest rotations of skew ones."""
+) -> np.ndarray:
+    """(3,) from a sensor's own axes in the camera, as found, to where they are: nearest rotations of skew ones."""
     turns = []
     for calibration, errors in ((found, np.eye(3) + np.array(gain)), (true, np.linalg.inv(np.eye(3) + matrix))):
         u, _, vt = np.linalg.svd(matrix_from_quat(calibration.cam_from_imu_xyzw) @ errors)
         turns.append(u @ vt)
-    return float(np.degrees(np.linalg.norm(so3_log(turns[0] @ turns[1].T))))
+    return np.degrees(so3_log(turns[1] @ turns[0].T))
 
 
 def judged_calibration(model: Model, tracks: Tracks) -> dict[str, Any]:
@@ -180,12 +183,13 @@ def judged_calibration(model: Model, tracks: Tracks) -> dict[str, Any]:
     cov = found.cov
     accel_sigma = np.sqrt(cov[4, 4] + cov[3, 3] - 2 * cov[3, 4])
     lever = found.imu_in_cam_m - true.imu_in_cam_m
+    axes = {
+        sensor: axes_deg(found, values[f"{sensor}_gain"], true, getattr(tracks.errors, f"{sensor}_matrix"))
+        for sensor in ("gyro", "accel")
+    }
     out = {
         "rotation_deg": np.degrees(turn).tolist(),
-        "axes_deg": {
-            sensor: axes_deg(found, values[f"{sensor}_gain"], true, getattr(tracks.errors, f"{sensor}_matrix"))
-            for sensor in ("gyro", "accel")
-        },
+        "axes_deg": {sensor: float(np.linalg.norm(angle)) for sensor, angle in axes.items()},
         "lever_mm": (1e3 * lever).tolist(),
         "offset_ms": 1e3 * offset,
         "accel_delay_ms": 1e3 * accel,
@@ -196,11 +200,28 @@ def judged_calibration(model: Model, tracks: Tracks) -> dict[str, Any]:
             "accel_delay": accel / accel_sigma,
         },
     }
+    for sensor, angle in axes.items():
+        out["normalised"][f"{sensor}_axes"] = (angle / values[f"{sensor}_axes_sigma_deg"]).tolist()
     if true.readout_s and "readout_s" in values:
         error = values["readout_s"] - true.readout_s
         out["readout_pct"] = 100 * error / true.readout_s
         out["normalised"]["readout"] = error / values["readout_sigma_s"]
     return out
+
+
+def expected(options: TrackOptions) -> TrackOptions:
+    """The same with a device that is as far off as it is expected to be."""
+    names = {"gyro_scale_sd": PRIORS.gyro_gain, "gyro_misalignment_sd": PRIORS.gyro_gain}
+    names |= {"accel_scale_sd": PRIORS.accel_gain, "accel_misalignment_sd": PRIORS.accel_gain}
+    return replace(options, imu=replace(options.imu, **names))
+
+
+def told_normalised(results: list[dict[str, Any]]) -> None:
+    """Root mean squares of the normalised errors, all seeds and axes together."""
+    judged = [one["calibration"]["normalised"] for one in results if one["accepted"]]
+    for name in judged[0] if judged else ():
+        errors = np.concatenate([np.atleast_1d(one[name]) for one in judged])
+        print(f"normalised errors of {name}: {np.sqrt(np.mean(errors**2)):.2f} rms of {len(errors)}")
 
 
 def main() -> None:
@@ -211,10 +232,12 @@ def main() -> None:
     parser.add_argument("--loop", action="store_true")
     parser.add_argument("--undeclared", action="store_true")
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--expected", action="store_true")
     parser.add_argument("--spoil", choices=("", "other", "late", "flipped", "gain"), default="")
     parser.add_argument("--out", type=Path)
     asked = parser.parse_args()
     options, results = ring() if asked.loop else walk(asked.metres, asked.readout_ms * 1e-3), []
+    options = expected(options) if asked.expected else options
     for seed in asked.seeds:
         one = studied(options, seed, asked.spoil, declared=not asked.undeclared)
         results.append(one)
@@ -233,6 +256,7 @@ def main() -> None:
     print(f"median of COLMAP's error over the refined one's: {np.median(ratios):.2f}, least {min(ratios):.2f}")
     drifts = [abs(one["after"]["drift_pct"]) / max(abs(one["colmap"]["drift_pct"]), 1e-9) for one in results]
     print(f"median of the drift that is left: {np.median(drifts):.2f}")
+    told_normalised(results)
 
 
 if __name__ == "__main__":

@@ -7,12 +7,13 @@ from types import SimpleNamespace
 import numpy as np
 import pycolmap
 import pytest
-from refine_walk import tracks_of, walk
+from refine_walk import problem_of, tracks_of, walk
 
 from colmap_inertial import read_model, reconstruct_project
 from colmap_inertial.drivers import frames
 from colmap_inertial.drivers.capture import default_model_stages
 from colmap_inertial.drivers.frames import as_refined
+from colmap_inertial.geometry import matrix_from_quat, so3_log
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.records import read_record
@@ -21,12 +22,16 @@ from colmap_inertial.model import Model
 from colmap_inertial.options import ProjectOptions, ReconstructOptions
 from colmap_inertial.refine import judge
 from colmap_inertial.refine.solve import held_out, solve
+from colmap_inertial.refine.values import ROTATION
 from colmap_inertial.run.context import Recording
+from colmap_inertial.run.runner import canonical
+from colmap_inertial.scale.priors import PRIORS
+from colmap_inertial.simulate.tracks import TrackOptions
 from colmap_inertial.stages.gyro_view import GyroView
 from colmap_inertial.stages.join import JoinStage
 from colmap_inertial.stages.metric import MetricStage
 from colmap_inertial.stages.readout import ReadoutStage
-from colmap_inertial.stages.refine import RefineStage
+from colmap_inertial.stages.refine import RefineStage, axes_by
 from colmap_inertial.stages.rolling_shutter import RollingShutterStage
 from colmap_inertial.types import CameraMotion
 
@@ -82,6 +87,27 @@ def two_cameras(model, second):
     for point in model.points3D.values():
         built.add_point3D(point.xyz, point.track)
     return built
+
+
+def focused(times):
+    """The walks' camera with another focal length."""
+    return {"params": np.array(TrackOptions().camera.params) * np.array([times, times, 1, 1, 1, 1, 1, 1])}
+
+
+def camera_for_each(model, camera_of, name_of):
+    """A model in which each image has a camera of its own, and its timing; by the images' places in time."""
+    old, built, names = model.reconstruction, pycolmap.Reconstruction(), {}
+    for i, image_id in enumerate(sorted(old.reg_image_ids())):
+        image = old.image(image_id)
+        numbers = {**old.camera(1).todict(), **camera_of(i), "camera_id": i + 1}
+        built.add_camera_with_trivial_rig(pycolmap.Camera(**numbers))
+        keypoints = np.array([point.xy for point in image.points2D])
+        names[image.name] = name_of(i)
+        one = pycolmap.Image(name=names[image.name], keypoints=keypoints, camera_id=i + 1, image_id=image_id)
+        built.add_image_with_trivial_frame(one, image.cam_from_world())
+    for point in old.points3D.values():
+        built.add_point3D(point.xyz, point.track)
+    return built, replace(model.timing, names=tuple(names.get(name, name) for name in model.timing.names))
 
 
 @pytest.fixture(scope="module")
@@ -150,6 +176,54 @@ def test_the_calibration_is_the_refined_one(walked):
         found.sigma(f"imu_in_cam_{axis}_m") for axis in "xyz"
     )
     assert made.scale.metres_per_unit == model.scale.metres_per_unit
+
+
+def test_a_sensor_s_own_axes_are_surer_than_the_imu_s(walked):
+    tracks, model = walked
+    _, said = refined_by(tracks.imu, model)
+    rotation, gyro, accel = (np.array(said.values[f"{n}_sigma_deg"]) for n in ("rotation", "gyro_axes", "accel_axes"))
+    # axis errors that both sensors share turn the IMU: their priors, of both sensors together
+    shared_deg = np.degrees((2 / PRIORS.gyro_gain**2 + 2 / PRIORS.accel_gain**2) ** -0.5)
+    assert rotation == pytest.approx(np.full(3, shared_deg), rel=0.1)
+    assert np.all(gyro < 0.1 * rotation) and np.all(gyro < accel) and np.all(accel < 0.5 * rotation)
+    gains = [np.array(said.values[f"{sensor}_gain"]) for sensor in ("gyro", "accel")]
+    true = tracks.calibration
+    found = refined_by(tracks.imu, model)[0].scale.calibration
+    for gain, matrix, sigma_deg in (
+        (gains[0], tracks.errors.gyro_matrix, gyro),
+        (gains[1], tracks.errors.accel_matrix, accel),
+    ):
+        turns = []
+        for calibration, errors in ((found, np.eye(3) + gain), (true, np.linalg.inv(np.eye(3) + matrix))):
+            u, _, vt = np.linalg.svd(matrix_from_quat(calibration.cam_from_imu_xyzw) @ errors)
+            turns.append(u @ vt)
+        assert np.all(np.abs(np.degrees(so3_log(turns[0] @ turns[1].T))) < 4 * sigma_deg)
+
+
+def test_derivatives_of_a_sensor_s_axes_are_those_of_finite_differences(walked):
+    tracks, _ = walked
+    x = problem_of(tracks, walk(25.0, points_per_m=80.0))[1]
+    rng = np.random.default_rng(5)
+    for sensor in ("gyro_gain", "accel_gain"):
+        columns = getattr(x.columns, sensor)
+        step = np.zeros(x.columns.count)
+        step[ROTATION], step[columns] = 1e-5 * rng.standard_normal(3), 1e-5 * rng.standard_normal(9)
+        ends = []
+        for sign in (1, -1):
+            moved = x.moved(np.zeros((len(x.velocity_m_s), 15)), sign * step, np.zeros_like(x.points_m))
+            u, _, vt = np.linalg.svd(moved.cam_from_imu @ (np.eye(3) + getattr(moved, sensor)))
+            ends.append(u @ vt)
+        turned = 0.5 * so3_log(ends[0] @ ends[1].T)
+        assert axes_by(x, columns) @ step == pytest.approx(turned, rel=1e-6, abs=1e-12)
+
+
+def test_a_run_goes_on_from_no_older_layout(walked):
+    tracks, _ = walked
+    stage = RefineStage(imu=tracks.imu, calibration=UNKNOWN, refine_intrinsics=False)
+    assert canonical(replace(stage)) == canonical(stage)
+    older = replace(stage)
+    object.__setattr__(older, "_writes", stage._writes - 1)
+    assert canonical(older) != canonical(stage)
 
 
 def test_a_rolling_shutter_is_part_of_it(rolled):
@@ -366,6 +440,18 @@ def test_what_cannot_be_refined_is_said(walked):
     ):
         stage = RefineStage(imu=tracks.imu, calibration=UNKNOWN, refine_intrinsics=False)
         said = stage._why_not(replace(model, reconstruction=two_cameras(model.reconstruction, second)))
+        assert why in said and bool(said) == bool(why)
+    # where each image has a camera of its own, devices differ by folder, size or focus, and one that zooms is one
+    for camera_of, name_of, why in (
+        (lambda i: focused(1.0 + 0.5 * (i % 2)), str, "several cameras"),
+        (lambda i: {"width": 1280 + i % 2}, str, "several cameras"),
+        (lambda i: {}, lambda i: f"{'ab'[i % 2]}/{i}", "several cameras"),
+        (lambda i: focused(1.0 + 0.01 * i), str, ""),
+        (lambda i: focused(1.0 + 0.5 * (i == 30)), str, ""),
+    ):
+        stage = RefineStage(imu=tracks.imu, calibration=UNKNOWN, refine_intrinsics=False)
+        each, timing = camera_for_each(model, camera_of, name_of)
+        said = stage._why_not(replace(model, reconstruction=each, timing=timing))
         assert why in said and bool(said) == bool(why)
     empty = pycolmap.Reconstruction(model.reconstruction)
     for point_id in list(empty.point3D_ids()):

@@ -43,7 +43,7 @@ class ScaledModel:
     sparse, sparse_metric
         COLMAP's model in ``colmap/sparse/`` or in the project, and the same in metres, in ``sparse/``.
     trajectory
-        The camera's smoothed path.
+        The camera's path, smoothed by the IMU or refined.
     treatments
         What the stages said.
     parts

@@ -23,7 +23,7 @@ _METHODS = {"joint": "all measurements in one fit", "spectral": "spectra of both
 _WRITTEN = {
     "sparse": "COLMAP's own model",
     "sparse_metric": "the model in metres",
-    "trajectory": "the camera's smoothed path in metres",
+    "trajectory": "the camera's path in metres, smoothed by the IMU or refined",
     "project_metric": "the whole project in metres",
 }
 

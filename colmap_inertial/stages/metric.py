@@ -171,7 +171,7 @@ def _write_covariance(target: Path, t_s: Array, cov: Array) -> None:
 
 
 def motion_file(trajectory: Path) -> Path:
-    """Where the motion during each frame (``types.CameraMotion``) lies beside a smoothed path."""
+    """Where the motion during each frame (``types.CameraMotion``) lies beside a path."""
     return trajectory.with_name(f"{trajectory.stem}_motion.json")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Hashable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -37,9 +38,14 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+#: What is written of a refined model, as a number: raised with its layout, so that a run goes on from no older one.
+#: 2: ``trajectory*_cov.npz`` has positions and velocities, not positions alone.
+_WRITES = 2
 _FEWEST_IMAGES, _FEWEST_POINTS = 10, 50
 #: One camera comes back to settings that it had before in fewer of its images than this.
 _MOST_RETURNS = 0.1
+#: Where each image has a camera of its own: between focal lengths of two devices, no other lies within this share.
+_FOCAL_GAP = 0.1
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -69,6 +75,7 @@ class RefineStage:
     options: ScaleOptions = field(default_factory=ScaleOptions)
     refine_intrinsics: bool
     shutter: RollingShutterStage | None = None
+    _writes: int = field(default=_WRITES, init=False, repr=False)
 
     def __call__(self, model: Model, /) -> Model:
         """Refine the model."""
@@ -170,13 +177,29 @@ def _alternate(model: Model) -> bool:
     """Whether cameras take turns: two devices, or a rig that nobody declared; not one that zoomed, and back."""
     t_of = dict(zip(model.timing.names, model.timing.pose_t_s().tolist(), strict=True))
     images = [model.reconstruction.image(image_id) for image_id in model.reconstruction.reg_image_ids()]
-    used = [one.camera_id for one in sorted((i for i in images if i.name in t_of), key=lambda i: t_of[i.name])]
+    timed = sorted((image for image in images if image.name in t_of), key=lambda image: t_of[image.name])
+    used = _devices(model.reconstruction, timed)
     met = set(used[:1])
     returns = 0
-    for before, camera_id in pairwise(used):
-        returns += camera_id != before and camera_id in met
-        met.add(camera_id)
+    for before, device in pairwise(used):
+        returns += device != before and device in met
+        met.add(device)
     return returns > _MOST_RETURNS * len(used)
+
+
+def _devices(reconstruction: pycolmap.Reconstruction, images: Sequence[pycolmap.Image]) -> list[Hashable]:
+    """What took each image: its camera; where nearly each has one of its own, those alike by folder, size and focus."""
+    cameras = [reconstruction.camera(image.camera_id) for image in images]
+    if len({camera.camera_id for camera in cameras}) <= max(1, len(images) // 2):
+        return [camera.camera_id for camera in cameras]
+    focal = np.log([max(camera.mean_focal_length(), 1e-9) for camera in cameras])
+    order = np.argsort(focal, kind="stable")
+    group = np.empty(len(focal), dtype=np.int64)
+    group[order] = np.cumsum(np.diff(focal[order], prepend=focal[order[:1]]) > np.log1p(_FOCAL_GAP))
+    return [
+        (image.name.rpartition("/")[0], camera.width, camera.height, number)
+        for image, camera, number in zip(images, cameras, group.tolist(), strict=True)
+    ]
 
 
 def _said(model: Model, reason: str, *, action: str = "", **values: object) -> Model:
@@ -213,10 +236,36 @@ def _calibration_figures(judged: Judged) -> dict[str, object]:
         "readout_sigma_s": float(sigma[READOUT]),
         "imu_in_cam_m": x.imu_in_cam_m.tolist(),
         "imu_in_cam_sigma_m": sigma[LEVER].tolist(),
+        "rotation_sigma_deg": np.degrees(sigma[ROTATION]).tolist(),
+        "gyro_axes_sigma_deg": _axes_sigma_deg(judged, x.columns.gyro_gain),
+        "accel_axes_sigma_deg": _axes_sigma_deg(judged, x.columns.accel_gain),
         "intrinsics": x.intrinsics.tolist(),
         "gyro_gain": x.gyro_gain.tolist(),
         "accel_gain": x.accel_gain.tolist(),
     }
+
+
+def axes_by(x: Estimate, gain: slice) -> Array:
+    """(3, Q) derivatives of how a sensor's own axes lie in the camera, by what is shared; its errors are at ``gain``.
+
+    They lie as the rotation nearest to ``cam_from_imu`` times one plus the errors. Errors of axes that both sensors
+    share are a rotation of the IMU, and nothing in a recording tells them apart: ``cam_from_imu`` is as uncertain as
+    the priors of these errors are. In a sensor's own axes they cancel.
+    """
+    by = np.zeros((3, x.columns.count))
+    by[:, ROTATION] = np.eye(3)
+    # of a matrix near one, the nearest rotation is that of its antisymmetric part
+    turn = np.zeros((3, 3, 3))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        turn[i, k, j], turn[i, j, k] = 0.5, -0.5
+    by[:, gain] = x.cam_from_imu @ turn.reshape(3, 9)
+    return by
+
+
+def _axes_sigma_deg(judged: Judged, gain: slice) -> list[float]:
+    by, cov = axes_by(judged.estimate, gain), judged.shared_cov
+    assert cov is not None
+    return [float(sigma) for sigma in np.degrees(np.sqrt(np.einsum("ij,jk,ik->i", by, cov, by)))]
 
 
 def _refined_calibration(before: CameraImuCalibration, problem: Problem, judged: Judged) -> CameraImuCalibration:
