@@ -191,13 +191,13 @@ def judged_calibration(model: Model, tracks: Tracks) -> dict[str, Any]:
         "rotation_deg": np.degrees(turn).tolist(),
         "axes_deg": {sensor: float(np.linalg.norm(angle)) for sensor, angle in axes.items()},
         "lever_mm": (1e3 * lever).tolist(),
-        "offset_ms": 1e3 * offset,
-        "accel_delay_ms": 1e3 * accel,
+        "offset_ms": 1e3 * float(offset),
+        "accel_delay_ms": 1e3 * float(accel),
         "normalised": {
             "rotation": (turn / sigma[CAL.ROTATION]).tolist(),
             "lever": (lever / sigma[CAL.LEVER_ARM]).tolist(),
-            "offset": offset / sigma[CAL.GYRO_TIME_OFFSET],
-            "accel_delay": accel / accel_sigma,
+            "offset": float(offset / sigma[CAL.GYRO_TIME_OFFSET]),
+            "accel_delay": float(accel / accel_sigma),
         },
     }
     for sensor, angle in axes.items():

@@ -742,3 +742,27 @@ def test_a_long_path_is_said_to_bend_and_a_refined_one_how_much_it_did():
     ):
         model = {"treatments": treatments, "sparse_metric": "sparse/0", "scene": {"path_length": length}}
         assert _path_in_words(model) == said
+
+
+def test_drift_before_and_after_a_refinement_is_drawn_with_its_intervals(full, tmp_path):
+    out = copy_of(full, tmp_path)
+    result = json.loads((out / "result.json").read_text(encoding="utf-8"))
+    model = result["models"][0]
+    assert "refined" not in report_of_changed(out, result)[1].anchors()
+    drift = [
+        {"begin_s": 3.0, "end_s": 13.0, "percent": -0.3, "sigma_percent": 0.1, "end_sigma_m": [0.01] * 3},
+        {"begin_s": 13.0, "end_s": 23.0, "percent": 0.1, "sigma_percent": 0.2, "end_sigma_m": [0.01] * 3},
+    ]
+    done = {"stage": "refine", "reason": "refined", "action": "refined", "values": {"drift": drift}}
+    model["treatments"] = [*model.get("treatments", []), done]
+    _, page = report_of_changed(out, result)
+    assert "refined" in page.anchors()
+    assert "1 of 2 parts had drifted by more than chance explains" in page.text
+    before, after = figures.refined({"signals": {"first_frame_s": 3.0}}, drift)["data"]
+    assert before["x"] == after["x"] == [5.0, 15.0]
+    # what was stretched was too small before
+    assert before["y"] == pytest.approx([0.3009, -0.0999], abs=1e-4) and after["y"] == [0.0, 0.0]
+    assert before["error_y"]["array"] == after["error_y"]["array"] == pytest.approx([0.196, 0.392], rel=1e-3)
+    # one that was left as it was has nothing to draw
+    done["action"] = ""
+    assert "refined" not in report_of_changed(out, result)[1].anchors()

@@ -111,11 +111,18 @@ def _path_in_words(model: Content) -> list[str]:
         if model.get("sparse_metric") is None or length is None or length < _LONG_PATH_M:
             return []
         return [f"Its path is {length:.0f} m long: --refine inertial fits the IMU to it, too, against bends and drift."]
-    percent = [part["percent"] for part in done[-1]["values"].get("drift", [])]
-    if not done[-1]["action"] or not percent:
+    percent = [part["percent"] for part in refined_parts(model)]
+    if not percent:
         return []
     low, high = (f"{value:+.2f}" for value in (min(percent), max(percent)))
     return [f"The IMU took drift out of its path: parts of it were stretched by {low} to {high} %."]
+
+
+def refined_parts(model: Content) -> list[Content]:
+    """By how much the refinement stretched the parts of a model's path; empty where it left the model as it was."""
+    done = [one for one in model.get("treatments", []) if one["stage"] == "refine" and one["action"]]
+    parts: list[Content] = done[-1]["values"].get("drift", []) if done else []
+    return parts
 
 
 def _joined(model: Content, gaps: list[Content]) -> str:

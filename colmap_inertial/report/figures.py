@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from colmap_inertial.report.words import digits
-from colmap_inertial.scale.verdict import WEAK_HALF_WIDTH, half_width
+from colmap_inertial.scale.verdict import WEAK_HALF_WIDTH, Z95, half_width
 
 Figure = dict[str, Any]
 Lines = Sequence[dict[str, list[float | None]]]
@@ -253,6 +253,36 @@ def drift(model: dict[str, Any]) -> Figure:
         },
     ]
     return {"data": data, "layout": layout}
+
+
+def refined(model: dict[str, Any], parts: Sequence[dict[str, Any]]) -> Figure:
+    """Sizes of the parts of a path against the whole before and after a refinement, in per cent, each with 95 %."""
+    start = model["signals"].get("first_frame_s", parts[0]["begin_s"])
+    middle = [0.5 * (p["begin_s"] + p["end_s"]) - start for p in parts]
+    half = [0.5 * (p["end_s"] - p["begin_s"]) for p in parts]
+    reach = [Z95 * p["sigma_percent"] for p in parts]
+    before = [100 / (1 + p["percent"] / 100) - 100 for p in parts]
+    layout = _layout(300)
+    layout["showlegend"] = True
+    layout["xaxis"] = _axis(_TIME, zeroline=False)
+    layout["yaxis"] = _axis("off the whole (%)", zeroline=True)
+    return {
+        "data": [
+            {
+                "type": "scatter",
+                "mode": "markers",
+                "name": f"{name} the refinement, 95 %",
+                "x": middle,
+                "y": off,
+                "error_y": {"type": "data", "array": reach, "thickness": 1.5, "color": color},
+                "error_x": {"type": "data", "array": half, "thickness": 3, "width": 0, "color": color},
+                "marker": {"color": color, "size": 9},
+                "hovertemplate": "%{y:+.2f} %<extra></extra>",
+            }
+            for name, off, color in (("before", before, CAMERA), ("after", [0.0] * len(parts), GOOD))
+        ],
+        "layout": layout,
+    }
 
 
 def blur(frames: Sequence[dict[str, Any]]) -> Figure:

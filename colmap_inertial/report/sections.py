@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from colmap_inertial.report import figures
+from colmap_inertial.report.content import refined_parts
 from colmap_inertial.report.figure_3d import scene_figure
 from colmap_inertial.report.markup import bars, facts, gauge, images, listing, prose, scale_text, sentence, table
 from colmap_inertial.report.parts import Plot, Section
@@ -162,6 +163,9 @@ def _of_model(model: Content, name: str, mark: str, left_out: _LeftOut, out: Pat
             yield _spectra(signals, name, mark)
     if left_out.has(f"{name}Scale along the recording", model["drift"]):
         yield _drift(model, name, mark)
+    refined = refined_parts(model)
+    if refined:
+        yield _refined(model, refined, name, mark)
     if left_out.has(f"{name}Target", model["validation"]):
         yield _target(model["validation"], name, mark, out)
 
@@ -288,6 +292,22 @@ def _drift(model: Content, name: str, mark: str) -> Section:
     if telling:
         parts.append(Plot(figure=figures.drift(model), label="Scale of parts of the recording"))
     return Section(anchor=f"drift{mark}", short="" if name else "Scale over time", parts=parts)
+
+
+def _refined(model: Content, parts: list[Content], name: str, mark: str) -> Section:
+    off = [abs(part["percent"]) > Z95 * part["sigma_percent"] for part in parts]
+    said = (
+        "How much too large or too small each part of the path was against the whole, by what the IMU says of it, and "
+        f"how well that is known now. {sum(off)} of {len(parts)} parts had drifted by more than chance explains."
+    )
+    return Section(
+        anchor=f"refined{mark}",
+        short="" if name else "Drift",
+        parts=(
+            f"<h2>{escape(name)}Drift before and after the refinement</h2><p>{said}</p>",
+            Plot(figure=figures.refined(model, parts), label="Size of parts of the path before and after"),
+        ),
+    )
 
 
 def _target(found: Content, name: str, mark: str, out: Path) -> Section:

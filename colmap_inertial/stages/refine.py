@@ -26,7 +26,7 @@ from colmap_inertial.refine.setup import (
     read_seen,
     written_back,
 )
-from colmap_inertial.refine.values import LEVER, OFFSET, READOUT, ROTATION, Estimate, Problem
+from colmap_inertial.refine.values import FIRST_INTRINSIC, LEVER, OFFSET, READOUT, ROTATION, Estimate, Problem
 from colmap_inertial.scale import strength_of_gravity
 from colmap_inertial.stages.metric import gravity_in_model
 from colmap_inertial.stages.rolling_shutter import RollingShutterStage
@@ -240,8 +240,11 @@ def _calibration_figures(judged: Judged) -> dict[str, object]:
         "gyro_axes_sigma_deg": _axes_sigma_deg(judged, x.columns.gyro_gain),
         "accel_axes_sigma_deg": _axes_sigma_deg(judged, x.columns.accel_gain),
         "intrinsics": x.intrinsics.tolist(),
+        "intrinsics_sigma": sigma[FIRST_INTRINSIC : x.columns.seen.stop].tolist(),
         "gyro_gain": x.gyro_gain.tolist(),
+        "gyro_gain_sigma": sigma[x.columns.gyro_gain].reshape(3, 3).tolist(),
         "accel_gain": x.accel_gain.tolist(),
+        "accel_gain_sigma": sigma[x.columns.accel_gain].reshape(3, 3).tolist(),
     }
 
 
