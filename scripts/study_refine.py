@@ -41,6 +41,9 @@ from colmap_inertial.stages.refine import RefineStage
 from colmap_inertial.stages.rolling_shutter import RollingShutterStage
 from colmap_inertial.types import CAL, CameraImuCalibration, ImuRecording
 
+#: Of an IMU that is late.
+LATE_S = 0.03
+
 
 def adjusted(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     """COLMAP's bundle adjustment of all that there is."""
@@ -66,7 +69,7 @@ def spoiled(imu: ImuRecording, tracks: Tracks, how: str, options: TrackOptions, 
         shift_s = float(imu.gyro_t_s[0] - other.gyro_t_s[0])
         return replace(other, gyro_t_s=other.gyro_t_s + shift_s, accel_t_s=other.accel_t_s + shift_s)
     if how == "late":
-        return replace(imu, gyro_t_s=imu.gyro_t_s + 0.03, accel_t_s=imu.accel_t_s + 0.03)
+        return replace(imu, gyro_t_s=imu.gyro_t_s + LATE_S, accel_t_s=imu.accel_t_s + LATE_S)
     if how == "flipped":
         return replace(imu, accel_m_s2=imu.accel_m_s2 * np.array([1.0, -1.0, 1.0]))
     if how == "gain":
@@ -155,7 +158,7 @@ def studied(options: TrackOptions, seed: int, spoil: str, *, declared: bool = Tr
     if "readout_s" in said.values:
         out["readout"] = [1e3 * said.values[name] for name in ("readout_s", "readout_sigma_s")]
     if out["accepted"]:
-        out["calibration"] = judged_calibration(model, tracks)
+        out["calibration"] = judged_calibration(model, tracks, LATE_S if spoil == "late" else 0.0)
     return out
 
 
@@ -170,13 +173,13 @@ def axes_deg(
     return np.degrees(so3_log(turns[1] @ turns[0].T))
 
 
-def judged_calibration(model: Model, tracks: Tracks) -> dict[str, Any]:
-    """Errors of the refined calibration, and over their standard deviations."""
+def judged_calibration(model: Model, tracks: Tracks, late_s: float) -> dict[str, Any]:
+    """Errors of the refined calibration, and over their standard deviations; of an IMU whose stamps are late."""
     found, true, values = model.scale.calibration, tracks.calibration, model.treatments[-1].values
     turn = so3_log(matrix_from_quat(true.cam_from_imu_xyzw) @ matrix_from_quat(found.cam_from_imu_xyzw).T)
     # the truth's offsets hold in the middle of the recording
     at_s = tracks.errors.middle_s
-    offset = found.gyro_time_offset_s + float(found.drift_s(np.array(at_s))) - true.gyro_time_offset_s
+    offset = found.gyro_time_offset_s + float(found.drift_s(np.array(at_s))) - true.gyro_time_offset_s + late_s
     accel = found.accel_time_offset_s - found.gyro_time_offset_s
     accel -= true.accel_time_offset_s - true.gyro_time_offset_s
     sigma = np.sqrt(np.diagonal(found.cov))

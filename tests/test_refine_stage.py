@@ -180,15 +180,14 @@ def test_the_calibration_is_the_refined_one(walked):
 
 def test_a_sensor_s_own_axes_are_surer_than_the_imu_s(walked):
     tracks, model = walked
-    _, said = refined_by(tracks.imu, model)
+    made, said = refined_by(tracks.imu, model)
     rotation, gyro, accel = (np.array(said.values[f"{n}_sigma_deg"]) for n in ("rotation", "gyro_axes", "accel_axes"))
     # axis errors that both sensors share turn the IMU: their priors, of both sensors together
     shared_deg = np.degrees((2 / PRIORS.gyro_gain**2 + 2 / PRIORS.accel_gain**2) ** -0.5)
     assert rotation == pytest.approx(np.full(3, shared_deg), rel=0.1)
     assert np.all(gyro < 0.1 * rotation) and np.all(gyro < accel) and np.all(accel < 0.5 * rotation)
     gains = [np.array(said.values[f"{sensor}_gain"]) for sensor in ("gyro", "accel")]
-    true = tracks.calibration
-    found = refined_by(tracks.imu, model)[0].scale.calibration
+    found, true = made.scale.calibration, tracks.calibration
     for gain, matrix, sigma_deg in (
         (gains[0], tracks.errors.gyro_matrix, gyro),
         (gains[1], tracks.errors.accel_matrix, accel),
