@@ -120,6 +120,13 @@ MUTANTS = (
         ("calibrate_imu::test_a_calibrated_imu_narrows_the_interval_and_keeps_the_truth_in_it",),
     ),
     Mutant(
+        "scale/_fit.py",
+        "(0.5 if turned else 1.0)",
+        "1.0",
+        "a fit goes to and fro between two states",
+        ("pipeline_imaging::test_the_metric_model_lacks_the_camera_s_translation_within_the_readout_too",),
+    ),
+    Mutant(
         "io/calibration.py",
         "UNKNOWN_LEVER_ARM_M = 0.08",
         "UNKNOWN_LEVER_ARM_M = 0.01",

@@ -195,7 +195,7 @@ def test_a_walk_is_found_from_a_start_that_is_off(small):
     centres = setup.at_middle_lines(problem, again.estimate).cam_in_world
     truth = tracks.motion.cam_in_world_m(tracks.timing.pose_t_s())
     change = centres - centres.mean(axis=0) - (truth - truth.mean(axis=0))
-    assert np.sqrt(np.mean(np.sum(change**2, axis=1))) < 0.02
+    assert np.sqrt(np.mean(np.sum(change**2, axis=1))) < 0.025
     if tracks.timing.readout_s:
         assert again.estimate.readout_s == pytest.approx(0.025, abs=1e-3)
 
