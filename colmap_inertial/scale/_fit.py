@@ -21,7 +21,8 @@ _SETTLED, _FEWEST_ITERATIONS = 0.1, 4
 _HARDLY = 0.35
 #: Fewer of the gains than this are never said to be determined: no surprise is made of nothing.
 _LEAST_DETERMINED = 0.3
-#: A step that takes back more than this share of the one before goes half the way: two states in turn have their middle.
+#: With levels at rest, a step that takes back more than this share of the one before goes half the way: two states
+#: in turn have their middle.
 _TURNS_BACK = 0.7
 #: The scale changes by at most this factor (in the logarithm) in one iteration.
 _LARGEST_STEP = 0.3
@@ -114,7 +115,7 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
         system, rhs, rhs_z = fac.normal_equations(list(groups.values()), local, x)
         inverse = system.inverted()
         states, z = inverse.solve(rhs, rhs_z)
-        turned = iteration > _FEWEST_ITERATIONS and float(z[par.SCALE, 0]) * signed < -_TURNS_BACK * signed**2
+        turned = search.at_rest and float(z[par.SCALE, 0]) * signed < -_TURNS_BACK * signed**2
         signed = float(z[par.SCALE, 0])
         step = abs(signed)
         shrink = min(1.0, _LARGEST_STEP / max(step, 1e-12)) * (0.5 if turned else 1.0)
