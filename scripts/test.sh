@@ -18,11 +18,12 @@ esac
 # Types, those of the docs' examples too, are checked on one processor while the tests begin on the others; what was found
 # is said at the end.
 types=$(mktemp -d)
+checking=""
+trap '[ -z "$checking" ] || kill "$checking" 2>/dev/null || true; rm -rf "$types"' EXIT
 mkdir "$types/examples"
 .venv/bin/python scripts/doc_examples.py "$types/examples"
 .venv/bin/mypy colmap_inertial "$types/examples" >"$types/found.txt" 2>&1 &
 checking=$!
-trap 'kill "$checking" 2>/dev/null || true; rm -rf "$types"' EXIT
 # A process for each core: one thread in each is enough. Tests of one file share what it sets up, and the slowest files
 # begin first (tests/slow.txt). Modules are compiled once, not in each of the processes that tests start.
 unset PYTHONDONTWRITEBYTECODE

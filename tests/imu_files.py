@@ -145,6 +145,7 @@ class GoPro:
     late_s: float = 0.0
     readout_ms: float | None = None
     temperature_c: float | None = None
+    temperature_as: tuple[bytes, int] = (b"f", 4)
 
 
 HERO5 = GoPro(
@@ -259,7 +260,7 @@ def _gopro_stream(key: bytes, t_s: float, values: np.ndarray, unit: bytes, total
         parts.append(klv(b"MTRX", b"f", 36, matrix.astype(">f4").tobytes()))
         parts += [klv(b"ORIN", b"c", 3, style.order.encode()), text(b"ORIO", b"ZXY")]
     if style.temperature_c is not None:
-        parts.append(klv(b"TMPC", b"f", 4, struct.pack(">f", style.temperature_c)))
+        parts.append(klv(b"TMPC", *style.temperature_as, struct.pack(">f", style.temperature_c)))
     parts.append(klv(b"SIUN", b"c", len(unit), unit))
     parts.append(klv(b"SCAL", b"s", 2, struct.pack(">h", style.gyro_scale if gyro else style.accel_scale)))
     return nest(b"STRM", *parts, klv(key, b"s", 6, values.astype(">i2").tobytes()))

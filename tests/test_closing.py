@@ -153,3 +153,43 @@ def test_ends_are_not_joined_by_pairs_of_which_nobody_knows_whether_they_join_co
     before = ring.error_m()
     assert not close_gaps(ring.database, ring.model, ring.options, names, nearest=8)
     assert ring.error_m() == before
+
+
+@pytest.mark.parametrize(("given", "joins"), [(True, True), (True, False), (False, True)])
+def test_the_mapper_s_model_is_the_joined_one_where_the_order_in_time_is_known(tmp_path, monkeypatch, given, joins):
+    import pycolmap
+
+    from colmap_inertial.colmap import sparse
+    from colmap_inertial.options import MappingOptions
+    from colmap_inertial.run.context import RunContext
+
+    ring = make(tmp_path)
+    asked = []
+
+    def mapping(database, images, out, **_):
+        (Path(out) / "0").mkdir(parents=True)
+        ring.model.write_binary(str(Path(out) / "0"))
+        return {0: ring.model}
+
+    def closing(database, model, pipeline, names, *, nearest):
+        asked.append((list(names), nearest))
+        model.deregister_frame(1)  # a mark
+        return joins
+
+    monkeypatch.setattr(pycolmap, "incremental_mapping", mapping)
+    monkeypatch.setattr(sparse, "close_gaps", closing)
+    options = MappingOptions(overlap=3)
+    assert sparse.matches_every_pair(FRAMES, options)
+    sparse.map_images(
+        ring.database,
+        tmp_path,
+        tmp_path / "sparse",
+        options,
+        refine_intrinsics=False,
+        num_images=FRAMES,
+        context=RunContext(scratch=tmp_path),
+        in_time=NAMES if given else (),
+    )
+    assert asked == ([(NAMES, 2 * options.overlap)] if given else [])
+    written = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
+    assert written.num_reg_images() == FRAMES - (given and joins)

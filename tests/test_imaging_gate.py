@@ -160,6 +160,17 @@ def test_a_sharp_frame_stays_as_it_is_among_blurred_ones(blur_px):
         assert deblur_gated(image, predicted(shutter, "none"), recording=trusted).deblurred
 
 
+def test_a_sharp_frame_of_white_texture_stays_as_it_is_among_blurred_ones():
+    """Gravel or grain has as much beyond all frequencies that blur takes: no fall is expected of it."""
+    trusted = RecordingVerdict(trusted=True, support=9.0, extent_factor=1.0, frames=9, reason="others do")
+    image = np.clip(128 + 40 * np.random.default_rng(0).standard_normal((720, 1280)), 0, 255).astype(np.uint8)
+    vectors = np.broadcast_to(np.float32([12.0, 0.0]), (*BlurField.nodes(1280, 720, 16), 2))
+    flat = BlurField(width=1280, height=720, vector_px=vectors)
+    assert shown_share(image, flat) is None
+    gated = deblur_gated(image, flat, recording=trusted)
+    assert gated.image is image and "does not show the blur" in gated.reason
+
+
 @pytest.mark.parametrize("blur_px", [10, 25])
 def test_the_image_tells_extent_and_direction(blur_px):
     shutter, image = shot(0.98, blur_px)

@@ -99,6 +99,14 @@ def test_an_impossible_temperature_is_none(tmp_path: Path, imu: ImuRecording) ->
         assert read_imu(path).temperature_c == read
 
 
+@pytest.mark.parametrize("kind", [b"c", b"F", b"?"])
+def test_a_temperature_that_is_no_number_spoils_no_recording(tmp_path: Path, imu: ImuRecording, kind: bytes) -> None:
+    path = tmp_path / "text.mp4"
+    imu_files.write_gopro(path, imu, imu_files.GoPro(temperature_c=41.5, temperature_as=(kind, 4)))
+    found = read_imu(path)
+    assert found.temperature_c is None and len(found.gyro_t_s) == len(imu.gyro_t_s)
+
+
 def test_karma_s_frames_have_exposures_and_no_readout(karma: Path) -> None:
     log = log_of(karma)
     np.testing.assert_array_equal(log.epoch_ns + np.rint(log.t_s * 1e9).astype(np.int64), video_stamps_ns(karma))

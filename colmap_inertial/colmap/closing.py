@@ -100,13 +100,7 @@ def close_gaps(
     pycolmap.bundle_adjustment(reconstruction, options)
     mapper = pycolmap.IncrementalMapper(cache)
     mapper.begin_reconstruction(reconstruction)
-    mapper.iterative_global_refinement(
-        pipeline.ba_global_max_refinements,
-        pipeline.ba_global_max_refinement_change,
-        pipeline.get_mapper(),
-        pipeline.get_global_bundle_adjustment(),
-        pipeline.get_triangulation(),
-    )
+    _refine(mapper, reconstruction, pipeline)
     mapper.end_reconstruction(False)
     point = {number: _point_of(reconstruction, number) for pair in torn for number in (pair.first, pair.second)}
     of_first = np.concatenate([point[pair.first][pair.features[:, 0]] for pair in torn])
@@ -116,6 +110,29 @@ def close_gaps(
     said = "joined" if joined else "left as they are: they do not fit"
     log.info("a model's ends, seen in %d pairs of images, %s (%.0f %% agree)", len(torn), said, 100 * stays)
     return joined
+
+
+def _refine(
+    mapper: pycolmap.IncrementalMapper,
+    reconstruction: pycolmap.Reconstruction,
+    pipeline: pycolmap.IncrementalPipelineOptions,
+) -> None:
+    """Adjust the model and complete its points in turn; COLMAP's own loop would answer no signal until its end."""
+    import pycolmap
+
+    adjustment = pipeline.get_global_bundle_adjustment()
+    adjustment.print_summary = False
+    mapper.complete_and_merge_tracks(pipeline.get_triangulation())
+    mapper.retriangulate(pipeline.get_triangulation())
+    for _ in range(pipeline.ba_global_max_refinements):
+        observations = reconstruction.compute_num_observations()
+        pycolmap.bundle_adjustment(reconstruction, adjustment)
+        changed = mapper.complete_and_merge_tracks(pipeline.get_triangulation())
+        changed += mapper.filter_points(pipeline.get_mapper())
+        if changed < pipeline.ba_global_max_refinement_change * observations:
+            break
+    reconstruction.normalize()
+    mapper.filter_frames(pipeline.get_mapper())
 
 
 def _point_of(reconstruction: pycolmap.Reconstruction, number: int) -> Ids:

@@ -324,8 +324,7 @@ class _Work:
         if self.source.up_in_world is None:
             notes.append("the direction of gravity is not known: up is only taken for z")
         elif float(self.up_in_world @ _Z_UP) < 0.9:
-            up = ", ".join(f"{value:+.2f}" for value in self.up_in_world)
-            notes.append(f"up is ({up}) in this model, while viewers of most trainers take z for up")
+            notes.append("up is not z in this model (up_in_world says what it is), while most trainers' viewers take z")
         return notes
 
     def record(self, made: Exported, kind: ExportImages) -> dict[str, object]:

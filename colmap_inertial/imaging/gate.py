@@ -337,11 +337,14 @@ def judge_frame(
     curve = BlurPath.straight(blur) if path is None else path
     if recording is not None and recording.trusted:
         share = shown_share(image, curve.times(recording.extent_factor))
-        if share is not None and (share < LEAST_SHARE or (share < _CLEAR_SHARE and _no_dip(image, curve, options))):
+        if share is not None and share < LEAST_SHARE:
             return (
                 None,
                 "the image has as much detail along the predicted blur as across it, though other frames lack it",
             )
+        # a flat spectrum predicts no fall, and so tells none
+        if (share is None or share < _CLEAR_SHARE) and _no_dip(image, curve, options):
+            return None, "the image does not show the blur that the gyroscope predicts, though other frames do"
         return recording.extent_factor, recording.reason
     evidence = blur_evidence(image, curve)
     own = _support(evidence) if evidence.enough else 0.0

@@ -222,7 +222,7 @@ class _Telemetry:
 def _temperature_c(streams: dict[str, Stream]) -> float | None:
     """What the camera says beside its sensors' readings, degrees Celsius; ``None`` where it says nothing possible."""
     stream = streams.get("TMPC")
-    said = np.empty(0) if stream is None else stream.values[:, 0]
+    said = np.empty(0) if stream is None or not stream.data else stream.values[:, 0]
     said = said[np.abs(said) < _HOTTEST_C]
     return float(np.median(said)) if len(said) else None
 

@@ -210,8 +210,8 @@ def _read_device(device: Entry, index: int, found: dict[tuple[str, str, str], St
 
 
 def _append(stream: Stream, index: int, data: Entry, inside: dict[str, Entry]) -> None:
-    if data.count == 0:
-        return
+    if data.count == 0 or (data.key == "TMPC" and (data.type, data.size) != (b"f", 4)):
+        return  # a temperature that is none of the usual spoils no recording
     values = data.numbers(inside["TYPE"].text() if "TYPE" in inside else "")
     if "SCAL" in inside and data.key not in _UNSCALED:
         scale = inside["SCAL"].numbers().ravel()

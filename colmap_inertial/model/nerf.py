@@ -131,8 +131,11 @@ def transform_export(source: Path, target: Path, similarity: Similarity) -> tupl
         changed.append("unit")
     for name in _DIRECTIONS:
         if values.get(name) is not None:
-            values[name] = (matrix_from_quat(similarity.rotation_xyzw) @ _vector(source, values[name])).tolist()
-            changed.append("directions")
+            before = _vector(source, values[name])
+            after = matrix_from_quat(similarity.rotation_xyzw) @ before
+            if not np.allclose(after, before, rtol=0, atol=1e-12):
+                values[name] = after.tolist()
+                changed.append("directions")
     target.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
     return tuple(dict.fromkeys(changed))
 
