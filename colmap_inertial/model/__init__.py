@@ -240,6 +240,7 @@ def colmap_camera(camera: CameraModel, camera_id: int = 1) -> pycolmap.Camera:
     ValueError
         When the model's name or the number of parameters is not COLMAP's.
     """
+    _load_pycolmap()
     import pycolmap
 
     try:

@@ -237,8 +237,8 @@ def _calibration_figures(judged: Judged) -> dict[str, object]:
         "imu_in_cam_m": x.imu_in_cam_m.tolist(),
         "imu_in_cam_sigma_m": sigma[LEVER].tolist(),
         "rotation_sigma_deg": np.degrees(sigma[ROTATION]).tolist(),
-        "gyro_axes_sigma_deg": _axes_sigma_deg(judged, x.columns.gyro_gain),
-        "accel_axes_sigma_deg": _axes_sigma_deg(judged, x.columns.accel_gain),
+        "gyro_axes_sigma_deg": _axes_sigma_deg(x, cov, x.columns.gyro_gain),
+        "accel_axes_sigma_deg": _axes_sigma_deg(x, cov, x.columns.accel_gain),
         "intrinsics": x.intrinsics.tolist(),
         "intrinsics_sigma": sigma[FIRST_INTRINSIC : x.columns.seen.stop].tolist(),
         "gyro_gain": x.gyro_gain.tolist(),
@@ -265,9 +265,8 @@ def axes_by(x: Estimate, gain: slice) -> Array:
     return by
 
 
-def _axes_sigma_deg(judged: Judged, gain: slice) -> list[float]:
-    by, cov = axes_by(judged.estimate, gain), judged.shared_cov
-    assert cov is not None
+def _axes_sigma_deg(estimate: Estimate, cov: Array, gain: slice) -> list[float]:
+    by = axes_by(estimate, gain)
     return [float(sigma) for sigma in np.degrees(np.sqrt(np.einsum("ij,jk,ik->i", by, cov, by)))]
 
 
