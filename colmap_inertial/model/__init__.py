@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import signal
-import sys
-import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,6 +17,7 @@ from colmap_inertial.geometry import cross
 from colmap_inertial.io.files import StrPath, read_json, write_json
 from colmap_inertial.io.names import check_names
 from colmap_inertial.model.binary import check_binary_model
+from colmap_inertial.model.loading import load_pycolmap
 from colmap_inertial.model.soundness import check_values
 from colmap_inertial.types import (
     Array,
@@ -212,19 +210,8 @@ def read_model(folder: StrPath, suffix: str | None = None) -> pycolmap.Reconstru
     return reconstruction
 
 
-def _load_pycolmap() -> None:
-    """Load it, and keep our answer to SIGTERM: its logging library takes it away and prints a trace in place of it."""
-    if "pycolmap" in sys.modules or threading.current_thread() is not threading.main_thread():
-        return
-    ours = signal.getsignal(signal.SIGTERM)
-    import pycolmap  # noqa: F401
-
-    if ours is not None:
-        signal.signal(signal.SIGTERM, ours)
-
-
 def _read_from(folder: Path, suffix: str) -> pycolmap.Reconstruction:
-    _load_pycolmap()
+    load_pycolmap()
     import pycolmap
 
     reconstruction = pycolmap.Reconstruction()
@@ -240,7 +227,7 @@ def colmap_camera(camera: CameraModel, camera_id: int = 1) -> pycolmap.Camera:
     ValueError
         When the model's name or the number of parameters is not COLMAP's.
     """
-    _load_pycolmap()
+    load_pycolmap()
     import pycolmap
 
     try:

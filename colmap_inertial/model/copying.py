@@ -15,6 +15,7 @@ from types import FrameType
 
 from colmap_inertial.errors import FormatError, OutputError, OutputExistsError
 from colmap_inertial.io.files import advise, locked
+from colmap_inertial.model.loading import load_pycolmap
 
 #: Linux: share the blocks of another file (Btrfs, XFS, bcachefs, ...).
 _FICLONE = 0x40049409
@@ -121,8 +122,7 @@ def _as_output_error(target: Path) -> Iterator[None]:
 @contextlib.contextmanager
 def _ending_by_signal() -> Iterator[None]:
     """Turn SIGTERM and SIGHUP into an exception inside the block, and end by the signal after it."""
-    import pycolmap  # noqa: F401 (installs handlers of its own when it is loaded)
-
+    load_pycolmap()  # now: within the block it would take the signal away
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import signal
-import threading
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +12,7 @@ from typing import Literal
 from colmap_inertial import __version__
 from colmap_inertial.errors import InertialError
 from colmap_inertial.io.files import as_plain, read_json, remove_temporaries, write_json, write_text
+from colmap_inertial.model.loading import load_pycolmap
 from colmap_inertial.run.config import config_as_toml
 from colmap_inertial.run.context import RunContext
 from colmap_inertial.run.progress import Progress
@@ -144,11 +143,7 @@ def logging_to(path: Path) -> Iterator[None]:
 
 def keep_colmap_quiet() -> None:
     """Keep COLMAP's chatter off the terminal, from now on."""
+    load_pycolmap()
     import pycolmap
 
-    # its logging library takes this signal away from us, and answers it with a trace of its own
-    if threading.current_thread() is threading.main_thread():
-        ours = signal.getsignal(signal.SIGTERM)
-        if ours is not None:
-            signal.signal(signal.SIGTERM, ours)
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
