@@ -9,7 +9,9 @@ FOLDER takes captures and reconstructions. ``--euroc``: the 100 keyframes of V1_
 defaults), in processes of their own, one thread each; processor time is that of the whole process.
 
 Camera error: rms distance of the camera centres from the truth after a similarity. Loop error: of frames at the end,
-how far they lie from the frame at the start that is truly nearest, against the truth.
+how far they lie from the frame at the start that is truly nearest, against the truth (rms). The loop's offset is the
+part of it that these frames have in common, by which the ends do not meet; what is left are the single frames' own
+errors, as large between one frame and the next (neighbours' error) and beyond what closing a loop can mend.
 
 ``--loop``: the loop's error of a walk around a room, with its loops closed, and of the same features matched
 sequentially with a linear overlap (``quadratic_overlap`` off, no loops), both mapped alike; features are synthesised
@@ -144,6 +146,9 @@ def judged(models: Path, truth: dict[str, Array], *, walk: bool) -> Figures:
         nearest = [int(np.argmin(np.linalg.norm(true[:few] - at, axis=1))) for at in true[-few:]]
         off = (placed[-few:] - placed[nearest]) - (true[-few:] - true[nearest])
         figures["loop_error_m"] = float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
+        figures["loop_offset_m"] = float(np.linalg.norm(off.mean(axis=0)))
+        steps = np.diff(placed, axis=0) - np.diff(true, axis=0)
+        figures["neighbours_error_m"] = float(np.sqrt(np.mean(np.sum(steps**2, axis=1))))
     return figures
 
 
@@ -314,7 +319,9 @@ def loop_errors(walk: Walk, folder: Path) -> dict[str, Figures]:
         told["peak_mib"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         found[kind] = told | judged(models, truth, walk=True)
         print(json.dumps({kind: found[kind]}), flush=True)
-    found["closed"]["of_open"] = found["closed"]["loop_error_m"] / found["open"]["loop_error_m"]
+    for measure in ("error", "offset"):
+        name = f"loop_{measure}_m"
+        found["closed"][f"{measure}_of_open"] = found["closed"][name] / found["open"][name]
     return found
 
 
