@@ -42,7 +42,7 @@ from colmap_inertial.model.nerf import EXPORT_FORMAT, transform_export
 from colmap_inertial.model.project import apply_to_project, undo_project
 from colmap_inertial.model.similarities import plain_factor
 from colmap_inertial.options import ExportProgram
-from colmap_inertial.types import Similarity
+from colmap_inertial.types import ScaleEstimate, Similarity
 from colmap_inertial.view.sources import ScaleFacts, ViewSource
 
 METRIC = Similarity(
@@ -292,6 +292,30 @@ def test_what_an_export_says_of_itself_holds_after_apply_and_comes_back(exported
     np.testing.assert_allclose(again.pop("up_in_world"), said.pop("up_in_world"), atol=1e-12)
     np.testing.assert_allclose(again.pop("gravity_in_world_m_s2"), said.pop("gravity_in_world_m_s2"), atol=1e-12)
     assert again == said
+
+
+@pytest.mark.parametrize(("world", "up"), [("z-up", [0, 0, 1]), ("y-down", [0, -1, 0]), (None, None)])
+def test_an_export_without_a_scale_is_in_metres_once_one_was_applied(known, tmp_path, world, up):
+    out = tmp_path / "out"
+    (out / "sparse" / "0").mkdir(parents=True)
+    known.model.write_binary(str(out / "sparse" / "0"))
+    export_model(out, tmp_path / "export", image_folder=known.out / "images", unscaled=True)
+    said = json.loads((tmp_path / "export" / "export.json").read_text())
+    assert len(said["notes"]) == 2
+    estimate = ScaleEstimate(
+        metres_per_unit=2.5, sigma_log=0.01, ci95=(2.45, 2.55), verdict="trusted", method="joint",
+        gravity_in_world_m_s2=np.array([3.0, -9.0, 2.0]), cov=np.diag([1e-4, *[1e-3] * 6]),
+    )  # fmt: skip
+    given = plain_factor(2.5) if world is None else Similarity.from_scale(estimate, world=world, provenance="by IMU")
+    apply_to_project(tmp_path / "export", tmp_path / "made", given)
+    made = json.loads((tmp_path / "made" / "export.json").read_text())
+    assert (made["unit"], made["up_in_world"], made["scale"]["metres_per_unit"]) == ("m", up, 2.5)
+    # a factor says nothing of gravity
+    assert made["notes"] == ([] if world else said["notes"][1:]) and "gravity" in said["notes"][1]
+    if world:
+        np.testing.assert_allclose(made["scale"]["relative_ci95"], [np.exp(-0.0196), np.exp(0.0196)], rtol=1e-4)
+    undo_project(tmp_path / "made", tmp_path / "again")
+    assert json.loads((tmp_path / "again" / "export.json").read_text()) == said
 
 
 @pytest.mark.parametrize(("key", "value"), [("unit", "2m"), ("unit", "9e m"), ("up_in_world", "z")])

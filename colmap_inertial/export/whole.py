@@ -31,7 +31,7 @@ from colmap_inertial.io.frames import read_frames
 from colmap_inertial.io.trajectories import write_tum
 from colmap_inertial.model import write_files
 from colmap_inertial.model.copying import new_folder
-from colmap_inertial.model.nerf import EXPORT_FORMAT
+from colmap_inertial.model.nerf import EXPORT_FORMAT, NO_SCALE, NO_UP, NOT_METRES
 from colmap_inertial.options import ExportImages, ExportProgram
 from colmap_inertial.run.progress import Progress, silent
 from colmap_inertial.types import Array
@@ -320,9 +320,9 @@ class _Work:
         """What the user should know of the model."""
         notes = []
         if self.source.found.scale.unit != "m":
-            notes.append("the scale was refused: units are not metres, and nothing here says how large anything is")
+            notes.append(NO_SCALE)
         if self.source.up_in_world is None:
-            notes.append("the direction of gravity is not known: up is only taken for z")
+            notes.append(NO_UP)
         elif float(self.up_in_world @ _Z_UP) < 0.9:
             notes.append("up is not z in this model (up_in_world says what it is), while most trainers' viewers take z")
         return notes
@@ -336,7 +336,7 @@ class _Work:
             "for": made.program,
             "command": made.command,
             "keeps_metres_and_up": made.says,
-            "unit": "m" if scale.unit == "m" else "unknown: not metres",
+            "unit": "m" if scale.unit == "m" else NOT_METRES,
             "up_in_world": None if self.source.up_in_world is None else self.up_in_world.tolist(),
             "gravity_in_world_m_s2": None if gravity is None else gravity.tolist(),
             "scale": {

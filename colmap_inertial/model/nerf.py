@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
@@ -14,12 +15,18 @@ from colmap_inertial.errors import FormatError
 from colmap_inertial.geometry import matrix_from_quat
 from colmap_inertial.io.files import read_json
 from colmap_inertial.model.database import PlacedModel
-from colmap_inertial.types import Array, Similarity
+from colmap_inertial.scale.verdict import Z95
+from colmap_inertial.types import DOWN_IN_WORLD, UNDOES, Array, Similarity
 
 _MATRICES = ("transform_matrix", "transform_matrix_start", "transform_matrix_end")
 #: What ``export.json`` says of itself, and of its unit: metres, or so many of them.
 EXPORT_FORMAT = "colmap-inertial export"
 _METRES = re.compile(r"(?:(\d\S*) )?m")
+#: What it says where there is no scale, and no gravity, until a similarity brings them.
+NOT_METRES = "unknown: not metres"
+NO_SCALE = "the scale was refused: units are not metres, and nothing here says how large anything is"
+NO_UP = "the direction of gravity is not known: up is only taken for z"
+_BEFORE = "before_apply"
 _DIRECTIONS = ("up_in_world", "gravity_in_world_m_s2")
 #: Its cameras are a model's when they stand closer to them than this share of their extent.
 _SAME_FRAME = 0.01
@@ -114,6 +121,9 @@ def is_export(file: Path) -> bool:
 def transform_export(source: Path, target: Path, similarity: Similarity) -> tuple[str, ...]:
     """Write a copy whose unit and directions are those of the moved model.
 
+    Where the unit was unknown, the similarity is what makes it metres: the copy says so, and keeps what it said before
+    for when that is undone.
+
     Raises
     ------
     FormatError
@@ -121,14 +131,6 @@ def transform_export(source: Path, target: Path, similarity: Similarity) -> tupl
     """
     values = read_json(source)
     changed = []
-    metres = _METRES.fullmatch(str(values.get("unit")))
-    if metres is not None and similarity.scale != 1:
-        try:
-            length = float(metres[1] or 1) / similarity.scale
-        except ValueError:
-            raise FormatError(source, f"the unit {values['unit']!r} is no length; leave it out with --keep") from None
-        values["unit"] = "m" if abs(length - 1) < 1e-9 else f"{length:.12g} m"
-        changed.append("unit")
     for name in _DIRECTIONS:
         if values.get(name) is not None:
             before = _vector(source, values[name])
@@ -136,8 +138,53 @@ def transform_export(source: Path, target: Path, similarity: Similarity) -> tupl
             if not np.allclose(after, before, rtol=0, atol=1e-12):
                 values[name] = after.tolist()
                 changed.append("directions")
+    metres = _METRES.fullmatch(str(values.get("unit")))
+    if isinstance(values.get(_BEFORE), dict) and similarity.provenance.startswith(UNDOES):
+        values |= values.pop(_BEFORE)
+        changed.append("unit")
+    elif values.get("unit") == NOT_METRES:
+        values |= _in_metres(values, similarity)
+        changed.append("unit")
+    elif metres is not None and similarity.scale != 1:
+        try:
+            length = float(metres[1] or 1) / similarity.scale
+        except ValueError:
+            raise FormatError(source, f"the unit {values['unit']!r} is no length; leave it out with --keep") from None
+        values["unit"] = "m" if abs(length - 1) < 1e-9 else f"{length:.12g} m"
+        changed.append("unit")
     target.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
     return tuple(dict.fromkeys(changed))
+
+
+def _in_metres(values: Mapping[str, Any], similarity: Similarity) -> dict[str, Any]:
+    """What an export of unknown unit says once a similarity made it metric."""
+    up = values.get("up_in_world")
+    up = _up(similarity) if up is None else up
+    sigma = math.sqrt(similarity.cov[0, 0])
+    factor = math.exp(Z95 * sigma)
+    said = [note for note in values.get("notes", []) if note != NO_SCALE and (up is None or note != NO_UP)]
+    return {
+        "unit": "m",
+        "up_in_world": up,
+        "scale": {
+            "verdict": None,
+            "reasons": [similarity.provenance],
+            "metres_per_unit": similarity.scale,
+            "relative_ci95": [1 / factor, factor] if sigma > 0 else None,
+        },
+        "notes": said,
+        _BEFORE: {name: values[name] for name in ("unit", "up_in_world", "scale", "notes") if name in values},
+    }
+
+
+def _up(similarity: Similarity) -> list[float] | None:
+    """Up after a similarity that turned gravity onto an axis: the one about which its turn is certain."""
+    variance = np.diag(similarity.cov)[1:4]
+    for down in DOWN_IN_WORLD.values():
+        certain = np.abs(down) > 0
+        if variance[certain].max() <= 1e-9 * variance.max() and variance[~certain].min() > 0:
+            return [float(x) for x in -down]
+    return None
 
 
 def _frames(path: Path) -> dict[str, Any] | None:

@@ -15,7 +15,7 @@ from colmap_inertial.geometry import matrix_from_quat, quat_conjugate
 from colmap_inertial.io.files import StrPath, read_json
 from colmap_inertial.model import similarity_as_json
 from colmap_inertial.options import WorldAxes
-from colmap_inertial.types import ScaleEstimate, Similarity
+from colmap_inertial.types import UNDOES, ScaleEstimate, Similarity
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -121,7 +121,7 @@ def undoing(similarity: Similarity) -> Similarity:
         rotation_xyzw=quat_conjugate(similarity.rotation_xyzw),
         translation_m=-(rotation.T @ similarity.translation_m) / similarity.scale,
         cov=np.zeros((7, 7)),
-        provenance=f"undoes: {similarity.provenance}",
+        provenance=f"{UNDOES}{similarity.provenance}",
     )
 
 

@@ -28,6 +28,9 @@ Verdict = Literal["trusted", "weak", "refused"]
 #: The direction of gravity in a metric world with these axes: ``y-down`` is COLMAP's and computer vision's habit.
 DOWN_IN_WORLD = {"z-up": np.array([0.0, 0.0, -1.0]), "y-down": np.array([0.0, 1.0, 0.0])}
 
+#: What the provenance of a similarity begins with that takes another one back.
+UNDOES = "undoes: "
+
 #: Order of the parameters in ``CameraImuCalibration.cov``. The rotation error is in the camera frame, on the left:
 #: true = exp(error) * estimate.
 CALIBRATION_PARAMETERS = (
