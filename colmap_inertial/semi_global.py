@@ -61,8 +61,8 @@ class Views:
     light
         What colours that do not add up to luminance cost in addition.
     shown
-        (N, Hv, 2) from and up to which column each row of a view shows something; ``None``: all of it. What is looked
-        up elsewhere has no say.
+        (N, Hv, 2) from and up to which column each row of a view shows something; ``None``: all of it. A window of
+        which anything is looked up elsewhere has no say.
     """
 
     reference: Codes

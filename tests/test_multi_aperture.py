@@ -57,8 +57,11 @@ def test_compiled_costs_are_the_reference_s_bit_for_bit(sides, instruction_set):
     tables = rng.integers(0, 60, (views, 256, 256), dtype=np.uint8)
     blend = rng.integers(-300, 300, views + 2).astype(np.int32)
     light = {"blend": blend, "blend_table": np.arange(256, dtype=np.uint8)}
-    shown = {"shown": np.sort(rng.integers(0, sizes[1] + 1, (views, sizes[0], 2), dtype=np.int32))}
-    for more in ({}, {"least": 9}, {"tables": tables}, light, {"tables": tables, **light}, shown, {**shown, **light}):
+    ends = rng.integers(0, sizes[1] // 4 + 1, (views, sizes[0], 2), dtype=np.int32)
+    shown = {"shown": np.stack([ends[..., 0], sizes[1] - ends[..., 1]], axis=-1).astype(np.int32)}
+    nothing = {"shown": np.repeat(ends[..., :1], 2, axis=-1)}
+    ways = ({}, {"least": 9}, {"tables": tables}, light, {"tables": tables, **light})
+    for more in (*ways, shown, {**shown, **light}, {**shown, "tables": tables}, nothing):
         wanted = matching_costs_reference(reference, others, radius=radius, **where, **more)
         for threads in (1, 2, 3):
             cost = np.full(wanted.shape, 77, dtype=np.uint8)

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from sweep_scenes import camera, depth_of, depth_view, partner, picture_of, rays, sights_of
 
+from colmap_inertial._kernels import _apertures
+from colmap_inertial.semi_global import shares
 from colmap_inertial.sweep import (
     DepthView,
     Sights,
@@ -130,8 +132,9 @@ def test_beyond_the_edges_of_a_turned_picture_nothing_is_compared():
     inside = np.minimum(at, [rolled.width - 1, rolled.height - 1] - at).min(axis=-1)
     assert 0.2 < shown.mean() < 0.8
     inner = np.s_[4:-4, 4:-4]  # what goes on beyond the canvas is not looked up
-    assert inside[inner][shown[inner]].min() > 2.4  # a census window of 5 x 5, and what lies between its pixels
-    assert inside[inner][~shown[inner]].max() < 6
+    # the pixels that a value lies between are all there; OpenCV places them to 1/32
+    assert inside[inner][shown[inner]].min() > -1 / 32
+    assert inside[inner][~shown[inner]].max() < 1.5
     truth, _ = depth_of(REFERENCE)
     near, far = 0.7 * truth.min(), 1.3 * truth.max()
     found = sweep_depth(picture_of(REFERENCE), REFERENCE, [partner(view) for view in others], (near, far), threads=1)
@@ -139,6 +142,40 @@ def test_beyond_the_edges_of_a_turned_picture_nothing_is_compared():
     border = np.ones(truth.shape, dtype=bool)
     border[10:-10, 10:-10] = False
     assert np.mean(right[border]) > 0.885  # 0.85 where the blackness around the turned picture is compared
+
+
+@pytest.mark.parametrize("ahead", [1.2, 0.0, -0.8])
+def test_a_window_counts_where_the_partner_shows_all_of_it(ahead):
+    """Nearer than the reference, a partner shows the same window over more pixels; farther, over fewer."""
+    rolled = camera((0.15, -0.4 + ahead, 0.3), (0, 0, 30))
+    depths = (2.0, 2.6)
+    canvas = _canvas(REFERENCE, rolled, depths)
+    inverse = np.linspace(1 / depths[1], 1 / depths[0], 3)
+    columns, rows = (_positions(REFERENCE, canvas, inverse, axis)[None] for axis in (0, 1))
+    # a cost of 255 says that no view shows the window
+    y, x = np.indices((90, 120))
+    reference = (np.abs(x % 8 - 4) + np.abs(y % 8 - 4)).astype(np.uint8) * 20
+    blank = np.zeros((1, canvas.height, canvas.width), np.uint8)
+    cost = np.empty((90, 120, 3), dtype=np.uint8)
+    shown = _shown((rolled.height, rolled.width), canvas)[None]
+    _apertures.matching_costs(
+        reference, blank, columns=columns, rows=rows, cost=cost, share=shares(1), unseen=255, radius=2, shown=shown,
+        least=0,
+    )  # fmt: skip
+    used, compared = cost != 255, 0
+    matrix, offset = rolled.seen_from(REFERENCE)
+    corners = np.array([(i, j) for i in (-2, 2) for j in (-2, 2)])
+    for d, q in enumerate(inverse):
+        at = np.stack([x, y], axis=-1)[2:-2, 2:-2, None] + corners
+        seen = np.concatenate([at, np.ones((*at.shape[:-1], 1))], axis=-1) @ matrix.T / q + offset
+        px = seen[..., :2] / seen[..., 2:]
+        room = np.minimum(px, [rolled.width - 1, rolled.height - 1] - px).min(axis=(-1, -2))
+        mine = used[2:-2, 2:-2, d]
+        assert not mine[room < -0.1].any()
+        # the pixels between which a value lies are to be there, too: one more on each side of the turned picture
+        assert mine[room > 2.0].all()
+        compared += int((np.abs(room) < 4).sum())
+    assert compared > 500
 
 
 def test_what_lies_outside_of_the_range_is_not_known():

@@ -30,9 +30,9 @@ def matching_costs(
     `columns` (N, D, W) and `rows` (N, D, H): where the reference's columns and rows lie in a view, in 1/16 px. Census
     counts comparisons that differ by `least` codes or more in the reference. `tables` (N, 256, 256): costs by codes of
     reference and view in place of census. `blend` (N + 2): weights of reference and views in 1/256 and a constant,
-    whose sum costs what `blend_table` (256) says. `shown` (N, Hv, 2): from and up to which column
-    each row of a view shows something; what is looked up elsewhere has no say. Positions then must not fall from left
-    to right.
+    whose sum costs what `blend_table` (256) says. `shown` (N, Hv, 2): from and up to which column each row of a view
+    shows something; a window of which anything is looked up elsewhere has no say. Positions then must not fall from
+    left to right.
     """
 
 def semi_global(

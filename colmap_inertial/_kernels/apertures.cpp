@@ -139,7 +139,7 @@ class Band {
             }
             const Columns &columns = columns_[plane];
             int first = columns.begin, last = columns.end;
-            if (in_.shown) narrow(k, in_.columns + plane * width, position, first, last);
+            if (in_.shown) narrow(k, plane, y, first, last);
             simd_.add(mismatches_.data() + first, last - first, sum_.data() + first, seen_.data() + first);
         }
         uint8_t *costs = costs_.data() + size_t(d) * pitch_;
@@ -147,13 +147,30 @@ class Band {
         if (in_.blend) add_blend(y, d, costs);
     }
 
-    // Which columns of the reference lie, to the nearest pixel, where a row of the view shows something. Positions of
-    // columns that the view has do not fall from left to right.
-    void narrow(int k, const int32_t *at, int position, int &begin, int &end) const {
-        const int32_t *shown = in_.shown + 2 * (size_t(k) * in_.sides.view_height + (position + 8) / 16);
-        const int first = int(std::lower_bound(at + begin, at + end, 16 * shown[0] - 8) - at);
-        end = int(std::lower_bound(at + first, at + end, 16 * shown[1] - 8) - at);
-        begin = first;
+    // Of which columns of the reference all of the window lies where the view shows something, with the pixels that its
+    // values lie between. Positions of columns that the view has do not fall from left to right.
+    void narrow(int k, size_t plane, int y, int &begin, int &end) const {
+        const auto [height, width, candidates, views, view_height, view_width] = in_.sides;
+        const int32_t *at = in_.columns + plane * width, *shown = in_.shown + 2 * size_t(k) * view_height;
+        int left = 0, right = view_width;
+        for (int r = clamped(y - reach_, height); r <= clamped(y + reach_, height); ++r) {
+            const int position = std::clamp(in_.rows[plane * height + r], 0, 16 * (view_height - 1));
+            for (int row : {position / 16, (position + 15) / 16}) {
+                left = std::max(left, shown[2 * row]);
+                right = std::min(right, shown[2 * row + 1]);
+            }
+        }
+        if (left >= right) {
+            end = begin;
+            return;
+        }
+        const int first = int(std::lower_bound(at + begin, at + end, 16 * left) - at);
+        const int last = int(std::upper_bound(at + first, at + end, 16 * (right - 1)) - at);
+        // what lies beyond the view is its outermost column, what lies beyond the reference its own
+        const bool cut_left = first > begin || (begin > 0 && left > 0);
+        const bool cut_right = last < end || (end < width && right < view_width);
+        begin = first + (cut_left ? reach_ : 0);
+        end = std::max(begin, last - (cut_right ? reach_ : 0));
     }
 
     // The luminance cost: a weighted sum of all views that would be zero.

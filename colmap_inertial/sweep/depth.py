@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.semi_global import CENSUS_RADIUS, Views, match_candidates
+from colmap_inertial.semi_global import Views, match_candidates
 from colmap_inertial.sweep.pinhole import Pinhole
 from colmap_inertial.types import Array
 
@@ -161,12 +161,12 @@ def _canvas(camera: Pinhole, view: Pinhole, depths: tuple[float, float]) -> _Can
 
 
 def _positions(camera: Pinhole, canvas: _Canvas, inverse: Array, axis: int) -> NDArray[np.int32]:
-    """(D, n) columns or rows of the canvas in 1/16 px, -1 where it has none."""
+    """(D, n) columns or rows of the canvas in 1/16 px, outside of it where it has none."""
     start, size = ((canvas.left, canvas.width), (canvas.top, canvas.height))[axis]
     place, shrinks = _place(camera, canvas.baseline, inverse, axis)
-    place = place - start
-    usable = (place >= 0) & (place <= size - 1) & (shrinks >= _CLOSEST)
-    return np.where(usable, np.rint(16 * place), -1).astype(np.int32)
+    # what a window reaches beyond the canvas is on its own side
+    sixteenths = np.rint(16 * np.clip(place - start, -1, size))
+    return np.where(shrinks >= _CLOSEST, sixteenths, -1).astype(np.int32)
 
 
 def _turned(codes: Codes, canvas: _Canvas) -> Codes:
@@ -177,16 +177,12 @@ def _turned(codes: Codes, canvas: _Canvas) -> Codes:
 
 
 def _shown(shape: tuple[int, ...], canvas: _Canvas) -> NDArray[np.int32]:
-    """(H, 2) from and up to which column a canvas shows the view in all of a census window.
-
-    Turned, the view is a quadrilateral in its canvas.
-    """
+    """(H, 2) from and up to which column a canvas shows the view: turned, it is a quadrilateral there."""
     import cv2
 
     size = (canvas.width, canvas.height)
-    inside = cv2.warpPerspective(np.ones(shape, np.uint8), canvas.canvas_from_view, size, flags=cv2.INTER_NEAREST)
-    # pixels between which a value lies are one more
-    side = 2 * (CENSUS_RADIUS + 1) + 1
-    inside = cv2.erode(inside, np.ones((side, side), np.uint8))
+    # whole where all pixels count that a value lies between
+    inside = cv2.warpPerspective(np.full(shape, 255, np.uint8), canvas.canvas_from_view, size, flags=cv2.INTER_LINEAR)
+    inside = inside == 255
     begin, beyond = inside.argmax(axis=1), inside[:, ::-1].argmax(axis=1)
     return np.stack([begin, np.where(inside.any(axis=1), canvas.width - beyond, 0)], axis=1).astype(np.int32)

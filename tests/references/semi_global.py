@@ -69,11 +69,11 @@ def matching_costs_reference(
     for d in range(candidates):
         warped, seen = zip(*(warped_reference(views[k], columns[k, d], rows[k, d]) for k in range(count)), strict=True)
         if shown is not None:
-            x, y = (
-                (np.clip(at[:, d], 0, 16 * (n - 1)) + 8) // 16
-                for at, n in zip((columns, rows), views.shape[:0:-1], strict=True)
-            )
-            seen = [one & (x[k] >= shown[k, y[k], :1]) & (x[k] < shown[k, y[k], 1:]) for k, one in enumerate(seen)]
+            reach = radius if tables is None else 0
+            seen = [
+                one & _window_shown(columns[k, d], rows[k, d], shown[k], views.shape[1:], reach)
+                for k, one in enumerate(seen)
+            ]
         total = np.zeros(reference.shape, dtype=np.int64)
         for k in range(count):
             if tables is None:
@@ -91,6 +91,20 @@ def matching_costs_reference(
             cost = np.where(by == count, np.minimum(255, cost + extra), cost)
         costs.append(cost.astype(np.uint8))
     return np.stack(costs, axis=-1)
+
+
+def _window_shown(
+    columns: NDArray[np.int32], rows: NDArray[np.int32], shown: NDArray[np.int32], shape: tuple[int, ...], reach: int
+) -> NDArray[np.bool_]:
+    """(H, W) whether all that a window's values are made of lies where a view shows something."""
+    x, y = (np.clip(at, 0, 16 * (n - 1)) for at, n in ((columns, shape[1]), (rows, shape[0])))
+    whole = np.ones((len(y), len(x)), dtype=bool)
+    for row in (y // 16, (y + 15) // 16):
+        for column in (x // 16, (x + 15) // 16):
+            whole &= (column >= shown[row, :1]) & (column < shown[row, 1:])
+    around = np.pad(whole, reach, mode="edge")
+    size = 2 * reach + 1
+    return np.all([around[i : i + len(y), j : j + len(x)] for i in range(size) for j in range(size)], axis=0)
 
 
 def semi_global_reference(cost: Codes, guide: Codes, *, small: int, jump: NDArray[np.uint16]) -> NDArray[np.uint16]:
