@@ -6,12 +6,16 @@ Both are taken from the recording: every pair of sizes and every length of time 
 likelihood (H. D. Patterson and R. Thompson, "Recovery of inter-block information when block sizes are unequal",
 Biometrika 1971) times a prior, and the result is the mean over all of them. So a short path does not pass for sure
 because its errors all point one way.
+
+A receiver's positions are those of a moment before. By how much they lag is one more number that the mean is taken
+over, with a prior: where the path turns or changes its pace it is found; on a straight walk its prior is part of the
+place's uncertainty.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,6 +37,14 @@ _ALIKE_S = (30.0, 100.0, 300.0)
 #: Prior of the slow errors: log-normal about what the receiver states, or about this, by this factor.
 _USUAL_SLOW_M = 2.0
 _SLOW_FACTOR = 2.5
+#: Prior of the time by which positions lag: what flight controllers take for receivers from their logs (.11 to .22 s:
+#: ArduPilot's u-blox driver, PX4's EKF2_GPS_DELAY), and .49 s measured of a GoPro (Race Technology); phones, which
+#: smooth, up to a second.
+_USUAL_DELAY_S, _DELAY_SIGMA_S = 0.3, 0.3
+#: Delays tried first, in standard deviations of the prior, and how many; then more closely where they are, so far to
+#: each side in their own standard deviations.
+_DELAY_SPAN, _DELAYS = (-3.0, 5.0), 33
+_CLOSER, _CLOSER_DELAYS = 5.0, 17
 #: How much larger errors of heights are.
 _VERTICAL = 1.5
 #: More positions than these are thinned out evenly: their errors are alike anyway.
@@ -80,6 +92,9 @@ class Georeference:
         Sizes of the positions' errors from one to the next, and of those that are alike over ``alike_s``.
     length_ratio, length_ratio_sigma
         Lengths by the positions over lengths of the model: a check, never a correction.
+    delay_s, delay_sigma_s
+        By how much positions lag, and its standard deviation, at most that of the prior; ``None`` where there is no
+        path to compare with beside the instants of the positions.
     notes
         What the user should know.
     """
@@ -100,6 +115,8 @@ class Georeference:
     alike_s: float
     length_ratio: float
     length_ratio_sigma: float
+    delay_s: float | None = None
+    delay_sigma_s: float | None = None
     source: str = ""
     notes: tuple[str, ...] = ()
 
@@ -166,6 +183,9 @@ class Georeference:
             "positions": {"used": self.used, "left_out": self.left_out, "source": self.source},
             "residual_rms_m": self.residual_rms_m,
             "errors": {"white_m": self.white_m, "slow_m": self.slow_m, "alike_s": self.alike_s},
+            "delay": None
+            if self.delay_s is None or self.delay_sigma_s is None
+            else {"seconds": self.delay_s, "ci95_s": Z95 * self.delay_sigma_s},
             "length_ratio": self.length_ratio,
             "length_ratio_sigma": self.length_ratio_sigma,
             "notes": list(self.notes),
@@ -175,6 +195,7 @@ class Georeference:
 def georeference_of_json(values: Mapping[str, Any]) -> Georeference:
     """The value that :meth:`Georeference.as_json` came from; a missing or wrong entry raises as Python has it."""
     origin, positions, errors = values["origin"], values["positions"], values["errors"]
+    delay = values.get("delay")  # version 0.1 has none
     return Georeference(
         latitude_deg=float(origin["latitude_deg"]),
         longitude_deg=float(origin["longitude_deg"]),
@@ -193,6 +214,8 @@ def georeference_of_json(values: Mapping[str, Any]) -> Georeference:
         alike_s=float(errors["alike_s"]),
         length_ratio=float(values["length_ratio"]),
         length_ratio_sigma=float(values["length_ratio_sigma"]),
+        delay_s=None if delay is None else float(delay["seconds"]),
+        delay_sigma_s=None if delay is None else float(delay["ci95_s"]) / Z95,
         notes=tuple(map(str, values["notes"])),
     )
 
@@ -213,7 +236,14 @@ def ecef_from_enu(latitude_deg: float, longitude_deg: float) -> Array:
     return np.array([[-t, -s * k, c * k], [k, -s * t, c * t], [0.0, c, s]])
 
 
-def georeference(fixes: PositionFixes, cam_in_world_m: Array, t_s: Array, up_in_world: Array) -> Georeference:
+def georeference(
+    fixes: PositionFixes,
+    cam_in_world_m: Array,
+    t_s: Array,
+    up_in_world: Array,
+    *,
+    path_at: Callable[[Array], Array] | None = None,
+) -> Georeference:
     """Turn and shift that bring a metric path to positions of a satellite receiver.
 
     Parameters
@@ -226,6 +256,8 @@ def georeference(fixes: PositionFixes, cam_in_world_m: Array, t_s: Array, up_in_
         (N,) when, on any clock: errors are alike for a time.
     up_in_world
         (3,) unit vector against gravity.
+    path_at
+        Where the camera was at other instants (T,) of that clock, (T, 3): positions may then lag. Without, they do not.
 
     Raises
     ------
@@ -243,11 +275,22 @@ def georeference(fixes: PositionFixes, cam_in_world_m: Array, t_s: Array, up_in_
     place[~heights, 2] = origin[2]
     enu = (ecef_of_geodetic(place) - ecef_of_geodetic(origin[None])[0]) @ ecef_from_enu(origin[0], origin[1])
     level_from_world = _level(up_in_world)
-    level = path_m @ level_from_world.T
-    flat, target = level[:, 0] + 1j * level[:, 1], enu[:, 0] + 1j * enu[:, 1]
-    good = np.ones(len(flat), dtype=bool)
+    target = enu[:, 0] + 1j * enu[:, 1]
+
+    def level_at(delay_s: float) -> Array:
+        return np.asarray((path_m if path_at is None else path_at(t_s - delay_s)) @ level_from_world.T)
+
+    good = np.ones(len(target), dtype=bool)
     for _ in range(_ROUNDS):
-        fit = _fit(flat[good], target[good], t_s[good], fixes.sigma_m[good])
+        kept = good
+
+        def paths(delays_s: Array, kept: Array = kept) -> Array:
+            levels = [level_at(delay_s)[kept] for delay_s in delays_s]
+            return np.array([level[:, 0] + 1j * level[:, 1] for level in levels])
+
+        fit = _fit_delay(paths, target[good], t_s[good], fixes.sigma_m[good], lags=path_at is not None)
+        level = level_at(fit.delay_s)
+        flat = level[:, 0] + 1j * level[:, 1]
         off = np.abs(target - np.exp(1j * fit.turn) * (flat - fit.middle) - fit.at)
         keep = off < max(_OUTLIER * float(np.median(off)), _OUTLIER_M)
         if (keep == good).all() or keep.sum() < _FEWEST:
@@ -304,6 +347,8 @@ def georeference(fixes: PositionFixes, cam_in_world_m: Array, t_s: Array, up_in_
         alike_s=fit.alike_s,
         length_ratio=fit.ratio,
         length_ratio_sigma=fit.ratio_sigma,
+        delay_s=None if path_at is None else fit.delay_s,
+        delay_sigma_s=None if path_at is None else fit.delay_sigma_s,
         source=fixes.source,
         notes=tuple(notes),
     )
@@ -319,7 +364,7 @@ def _level(up_in_world: Array) -> Array:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Fit:
-    """Turn about the vertical, where the path's ``middle`` is (``at``), their covariance (3, 3), the errors' sizes."""
+    """Turn about the vertical, where the point ``middle`` is (``at``), their covariance, errors' sizes, the delay."""
 
     turn: float
     middle: complex
@@ -330,66 +375,79 @@ class _Fit:
     alike_s: float
     ratio: float
     ratio_sigma: float
+    delay_s: float
+    delay_sigma_s: float
 
 
-def _fit(path: Array, target: Array, t_s: Array, stated_m: Array) -> _Fit:
-    """The mean over all sizes of errors; plane points as complex numbers."""
+def _fit_delay(paths: Callable[[Array], Array], target: Array, t_s: Array, stated_m: Array, *, lags: bool) -> _Fit:
+    """The mean over sizes of errors and delays; ``paths`` gives the path (T, N) by each of T delays."""
+    if not lags:
+        return _fit(paths(np.zeros(1)), np.zeros(1), target, t_s, stated_m)
+    delays_s = _USUAL_DELAY_S + _DELAY_SIGMA_S * np.linspace(*_DELAY_SPAN, _DELAYS)
+    for _ in range(_ROUNDS):
+        fit = _fit(paths(delays_s), delays_s, target, t_s, stated_m)
+        step_s = float(delays_s[1] - delays_s[0])
+        if fit.delay_sigma_s >= step_s:
+            break
+        half_s = max(_CLOSER * fit.delay_sigma_s, step_s)
+        delays_s = np.linspace(fit.delay_s - half_s, fit.delay_s + half_s, _CLOSER_DELAYS)
+    return fit
+
+
+def _fit(paths: Array, delays_s: Array, target: Array, t_s: Array, stated_m: Array) -> _Fit:
+    """The mean over all sizes of errors and the delays given; plane points as complex numbers."""
     stated = stated_m[np.isfinite(stated_m) & (stated_m > 0)]
     usual_m = float(np.median(stated)) if len(stated) else _USUAL_SLOW_M
     # a receiver that is less sure of some positions than of others is right about that
     relative = np.where(np.isfinite(stated_m) & (stated_m > 0), stated_m / usual_m, 1.0)
     apart_s = np.abs(t_s[:, None] - t_s[None, :])
-    middle, n = complex(path.mean()), len(path)
-    ones, about = np.ones(n), path - middle
-    found = []
+    middle = complex(paths.mean())
+    about, logs_of_delay = paths - middle, -0.5 * ((delays_s - _USUAL_DELAY_S) / _DELAY_SIGMA_S) ** 2
+    sizes, found = [], []
     for alike_s in _ALIKE_S:
         # in units of each position's own error, and in axes in which all sizes are independent
         values, axes = np.linalg.eigh(np.exp(-apart_s / alike_s))
-        one, p, z = (axes.T @ (row / relative) for row in (ones, about, target))
+        one, z = axes.T @ (1 / relative), axes.T @ (target / relative)
+        p = (about / relative) @ axes
         for white_m in _WHITE_M:
             for slow_m in _SLOW_M:
                 var = white_m**2 + slow_m**2 * np.maximum(values, 0.0)
                 weight = 1 / var
                 total = float(np.sum(weight * one**2))
-                shift_p, shift_z = np.sum(weight * one * p) / total, np.sum(weight * one * z) / total
-                q, y = p - shift_p * one, z - shift_z * one
-                length = float(np.sum(weight * np.abs(q) ** 2))
-                along = complex(np.sum(weight * np.conj(q) * y))
-                turn = along / abs(along) if abs(along) > 0 else 1.0 + 0j
-                left = float(np.sum(weight * np.abs(y - turn * q) ** 2))
-                log = -float(np.sum(np.log(var))) - 0.5 * left - math.log(total) - 0.5 * math.log(max(length, 1e-12))
+                shift_p, shift_z = p @ (weight * one) / total, complex(np.sum(weight * one * z)) / total
+                q, y = p - shift_p[:, None] * one, z - shift_z * one
+                length = np.maximum(np.abs(q) ** 2 @ weight, 1e-12)
+                along = np.conj(q) @ (weight * y)
+                turn = np.where(np.abs(along) > 0, along / np.maximum(np.abs(along), 1e-300), 1.0)
+                left = float(np.sum(weight * np.abs(y) ** 2)) + length - 2 * np.abs(along)
+                log = -float(np.sum(np.log(var))) - 0.5 * left - math.log(total) - 0.5 * np.log(length) + logs_of_delay
                 log -= 0.5 * (math.log(slow_m / usual_m) / math.log(_SLOW_FACTOR)) ** 2
                 # where the path's middle is; its error and the turn's are not independent
-                at = shift_z - turn * shift_p
-                off = -turn * shift_p
-                cov = np.diag([1 / length, 1 / total, 1 / total])
-                arm = np.array([1.0, (1j * off).real, (1j * off).imag]) / math.sqrt(length)
-                cov += np.outer(arm, arm) - np.diag([1 / length, 0, 0])
-                found.append((log, turn, at, cov, white_m, slow_m, alike_s, abs(along) / length, 1 / length))
-    logs = np.array([f[0] for f in found])
+                at, arm = shift_z - turn * shift_p, -1j * turn * shift_p / np.sqrt(length)
+                sizes.append((white_m, slow_m, alike_s))
+                found.append((log, turn, at, arm, length, np.full(len(log), total), np.abs(along) / length))
+    logs = np.array([one[0] for one in found])
     share = np.exp(logs - logs.max())
     share /= share.sum()
-    turns, ats = np.array([f[1] for f in found]), np.array([f[2] for f in found])
-    mean_turn = float(np.angle(np.sum(share * turns)))
-    mean_at = complex(np.sum(share * ats))
-    apart = np.stack([np.angle(turns * np.exp(-1j * mean_turn)), (ats - mean_at).real, (ats - mean_at).imag], axis=1)
-    cov = np.einsum("k,kij->ij", share, np.array([f[3] for f in found]))
-    cov += np.einsum("k,ki,kj->ij", share, apart, apart)
-
-    def mean(index: int) -> float:
-        return float(np.sum(share * np.array([f[index] for f in found])))
-
-    ratio = mean(7)
-    spread = math.sqrt(mean(8) + float(np.sum(share * (np.array([f[7] for f in found]) - ratio) ** 2)))
-    best = found[int(np.argmax(logs))]
+    turns, ats, arms, lengths, totals, ratios = (np.array([one[k] for one in found]) for k in range(1, 7))
+    mean_turn, mean_at = float(np.angle(np.sum(share * turns))), complex(np.sum(share * ats))
+    apart = np.stack([np.angle(turns * np.exp(-1j * mean_turn)), (ats - mean_at).real, (ats - mean_at).imag])
+    arm3 = np.stack([1 / np.sqrt(lengths), arms.real, arms.imag])
+    cov = np.einsum("kt,ikt,jkt->ij", share, arm3, arm3) + np.einsum("kt,ikt,jkt->ij", share, apart, apart)
+    cov += np.diag([0.0, 1.0, 1.0]) * float(np.sum(share / totals))
+    delay_s = float(np.sum(share * delays_s))
+    ratio = float(np.sum(share * ratios))
+    best = sizes[int(np.argmax(logs.max(axis=1)))]
     return _Fit(
         turn=mean_turn,
         middle=middle,
         at=mean_at,
         cov=0.5 * (cov + cov.T),
-        white_m=best[4],
-        slow_m=best[5],
-        alike_s=best[6],
+        white_m=best[0],
+        slow_m=best[1],
+        alike_s=best[2],
         ratio=ratio,
-        ratio_sigma=spread,
+        ratio_sigma=math.sqrt(float(np.sum(share * (1 / lengths + (ratios - ratio) ** 2)))),
+        delay_s=delay_s,
+        delay_sigma_s=math.sqrt(float(np.sum(share * (delays_s - delay_s) ** 2))),
     )

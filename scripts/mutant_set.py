@@ -1600,6 +1600,20 @@ MUTANTS = (
         ("georeference::test_coordinates_are_those_of_proj",),
     ),
     Mutant(
+        "georeference.py",
+        "path_at(t_s - delay_s)",
+        "path_at(t_s + delay_s)",
+        "positions that lag are taken for early ones",
+        ("georeference::test_exact_positions_tell_their_delay_exactly",),
+    ),
+    Mutant(
+        "georeference.py",
+        "logs_of_delay = paths - middle, -0.5 * ((delays_s - _USUAL_DELAY_S) / _DELAY_SIGMA_S) ** 2",
+        "logs_of_delay = paths - middle, -50 * ((delays_s - _USUAL_DELAY_S) / _DELAY_SIGMA_S) ** 2",
+        "a delay that nothing tells is taken for known",
+        ("georeference::test_positions_that_lag_are_known_to",),
+    ),
+    Mutant(
         "io/gopro.py",
         "inside & (fix >= 2)",
         "inside & (fix >= 0)",

@@ -12,7 +12,7 @@ import pytest
 from box_project import shared_box
 from test_io_recorders import recorded
 
-from colmap_inertial.drivers.georeference import located, read_georeference
+from colmap_inertial.drivers.georeference import located, path_at, read_georeference
 from colmap_inertial.drivers.project import reconstruct_project
 from colmap_inertial.errors import FormatError, NotObservableError
 from colmap_inertial.export.whole import export_model
@@ -132,6 +132,85 @@ def test_heading_and_place_lie_within_their_intervals(errors):
         assert np.median(sigma) < 2
 
 
+def late(seed, *, pace_m_s, turning, delay_s, seconds=90, rate_hz=1.0, white_m=3.0):
+    """A path of small steps, and positions that are those of a moment before: a walk and its path at any instant."""
+    rng = np.random.default_rng(seed)
+    fine_s = np.arange(-5.0, seconds + 5.0, 0.05)
+    # turns and changes of pace that last some seconds, as of a person
+    swings = [
+        rng.normal(0, 1, (2, 1)) * np.sin(2 * np.pi * (fine_s / rng.uniform(8, 40) + rng.random())) for _ in "abcd"
+    ]
+    course = turning * sum(one[0] for one in swings) + rng.uniform(-np.pi, np.pi)
+    pace = pace_m_s * (1 + 0.3 * turning * np.tanh(sum(one[1] for one in swings)))
+    step = pace * np.stack([np.cos(course), np.sin(course), np.zeros_like(course)]) * 0.05
+    path = np.cumsum(step, axis=1).T
+    t_s = np.arange(0.0, seconds, 1 / rate_hz)
+
+    def at(when_s):
+        return np.stack([np.interp(when_s, fine_s, path[:, k]) for k in range(3)], axis=1)
+
+    heading, origin = rng.uniform(-np.pi, np.pi), (rng.uniform(-70, 70), rng.uniform(-179, 179), 50.0)
+    shown = at(t_s - delay_s) @ turn(heading).T + white_m * rng.standard_normal((len(t_s), 3))
+    place = geodetic_of_enu(shown, origin)
+    fixes = PositionFixes(
+        latitude_deg=place[:, 0],
+        longitude_deg=place[:, 1],
+        height_m=place[:, 2],
+        sigma_m=np.full(len(t_s), np.nan),
+        t_ns=(t_s * 1e9).astype(np.int64),
+        height_above="ellipsoid",
+    )
+    one = Walk(path_m=at(t_s), t_s=t_s, heading_rad=heading, origin=origin, fixes=fixes)
+    return one, georeference(fixes, one.path_m, t_s, UP, path_at=at)
+
+
+@pytest.mark.parametrize(
+    ("pace_m_s", "turning", "most_sigma_s"),
+    [(1.4, 1.0, 0.27), (5.0, 1.0, 0.13), (5.0, 0.0, 0.31)],
+    ids=["walking", "cycling", "straight"],
+)
+def test_positions_that_lag_are_known_to(pace_m_s, turning, most_sigma_s):
+    walks, found = zip(
+        *(late(seed, pace_m_s=pace_m_s, turning=turning, delay_s=0.5) for seed in range(40)), strict=True
+    )
+    heading = np.array([one.heading_error_deg(f) for one, f in zip(walks, found, strict=True)])
+    assert np.mean(np.abs(heading) < 1.96 * np.array([f.heading_sigma_deg for f in found])) >= 0.9
+    delay, sigma = (np.array([getattr(f, name) for f in found]) for name in ("delay_s", "delay_sigma_s"))
+    assert np.mean(np.abs(delay - 0.5) < 1.96 * sigma) >= 0.9
+    assert np.median(sigma) < most_sigma_s
+    assert np.median([f.residual_rms_m for f in found]) == pytest.approx(3.0, rel=0.1)
+    place = np.array([one.place_error_m(f)[:2] for one, f in zip(walks, found, strict=True)])
+    # 95 % of two coordinates
+    inside = [p @ np.linalg.solve(f.cov[1:3, 1:3], p) < 5.99 for p, f in zip(place, found, strict=True)]
+    assert np.mean(inside) >= 0.9
+    if not turning:
+        # nothing tells: what is known beforehand, and its part of the place along the path
+        assert np.median(sigma) > 0.29
+        along = [np.sqrt(np.linalg.eigvalsh(f.cov[1:3, 1:3])[1]) for f in found]
+        assert np.median(along) > 0.29 * pace_m_s
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.25, 1.1])
+def test_exact_positions_tell_their_delay_exactly(delay_s):
+    one, found = late(3, pace_m_s=5.0, turning=1.0, delay_s=delay_s, white_m=0.02, rate_hz=5.0)
+    assert found.delay_sigma_s < 0.01
+    assert abs(found.delay_s - delay_s) < 3 * found.delay_sigma_s
+    assert np.linalg.norm(one.place_error_m(found)[:2]) < 4 * found.position_sigma_m
+    assert found.residual_rms_m == pytest.approx(0.02, rel=0.2)
+    assert found.length_ratio == pytest.approx(1.0, abs=4 * found.length_ratio_sigma)
+
+
+def test_the_path_goes_straight_on_between_and_beyond_its_images():
+    path = CameraTrajectory(
+        names=("a", "b", "c"),
+        t_s=np.array([0.0, 1.0, 3.0]),
+        cam_from_world_xyzw=np.tile([0.0, 0, 0, 1], (3, 1)),
+        cam_in_world=np.array([[0.0, 0, 0], [1, 2, 3], [1, 2, 7]]),
+    )
+    at = path_at(path)(np.array([-0.5, 0.5, 2.0, 4.0]))
+    np.testing.assert_allclose(at, [[-0.5, -1, -1.5], [0.5, 1, 1.5], [1, 2, 5], [1, 2, 9]])
+
+
 def test_the_scale_is_never_touched_and_a_wrong_one_is_named():
     one = walk(3, white_m=0.5, length=1.3)
     found = one.fitted()
@@ -180,8 +259,9 @@ def test_a_path_too_short_for_a_heading_is_refused_and_too_few_positions():
 
 def test_it_comes_back_from_its_json():
     found = walk(7).fitted()
-    again = georeference_of_json(json.loads(json.dumps(found.as_json())))
-    assert again.as_json() == found.as_json()
+    for one in (found, replace(found, delay_s=0.4, delay_sigma_s=0.1)):
+        again = georeference_of_json(json.loads(json.dumps(one.as_json())))
+        assert again.as_json() == one.as_json()
 
 
 @pytest.mark.parametrize(
@@ -387,3 +467,4 @@ def test_the_report_says_where_it_is(placed):
     page = (root / "told" / "report.html").read_text()
     assert f"{found.latitude_deg:.6f}°, {found.longitude_deg:.6f}°" in page
     assert f"{found.used} positions" in page
+    assert "they lag by" in page and found.delay_sigma_s < 0.31

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -28,6 +28,8 @@ log = logging.getLogger(__name__)
 
 #: A position between two images that are farther apart than this has no place on the path.
 _FARTHEST_S = 2.0
+#: By images so far apart the pace before the first and after the last one is known: nearer, noise makes much of it.
+_PACE_S = 0.3
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -98,10 +100,34 @@ def located(fixes: PositionFixes, path: CameraTrajectory) -> tuple[PositionFixes
     return fixes.select(here), centres, t_s
 
 
-def on_earth(fixes: PositionFixes, path: CameraTrajectory, up_in_world: Array) -> Georeference:
-    """How a metric path stands on Earth; raises :class:`NotObservableError` where the positions leave it open."""
+def on_earth(fixes: PositionFixes, path: CameraTrajectory, up_in_world: Array, *, timed: bool = True) -> Georeference:
+    """How a metric path stands on Earth; raises :class:`NotObservableError` where the positions leave it open.
+
+    ``timed``: whether the path's times are true; without, nothing tells where the camera was a moment before.
+    """
     here, centres, t_s = located(fixes, path)
-    return georeference(here, centres, t_s, up_in_world)
+    return georeference(here, centres, t_s, up_in_world, path_at=path_at(path) if timed else None)
+
+
+def path_at(path: CameraTrajectory) -> Callable[[Array], Array]:
+    """Where a camera was at any instants (T,), (T, 3): straight on between its images, and before and after them."""
+
+    def at(t_s: Array) -> Array:
+        within = np.clip(t_s, path.t_s[0], path.t_s[-1])
+        centres = np.stack([np.interp(within, path.t_s, path.cam_in_world[:, k]) for k in range(3)], axis=1)
+        for end, inner in ((0, _after(path, 0)), (-1, _after(path, -1))):
+            pace = (path.cam_in_world[inner] - path.cam_in_world[end]) / (path.t_s[inner] - path.t_s[end])
+            beyond_s = np.maximum(t_s - within, 0) if end else np.minimum(t_s - within, 0)
+            centres += beyond_s[:, None] * pace
+        return centres
+
+    return at
+
+
+def _after(path: CameraTrajectory, end: int) -> int:
+    """The image nearest to an end of the path that is so far from it that the two tell the pace there."""
+    far = np.abs(path.t_s - path.t_s[end]) >= min(_PACE_S, path.t_s[-1] - path.t_s[0])
+    return int(np.flatnonzero(far)[0 if end == 0 else -1])
 
 
 def read_georeference(path: Path, index: int) -> Georeference | None:

@@ -190,15 +190,13 @@ def placed_on_earth(out: Path, source: ExportSource, capture: Capture | None) ->
         raise FormatError(source.found.folder, "its pictures are not beside it: give --capture or --image-folder")
     if fixes.names is None and source.motion is None:
         raise FormatError(source.found.folder, "the run kept no times of its images, which positions in a video go by")
-    return on_earth(fixes, path, source.up_in_world)
+    return on_earth(fixes, path, source.up_in_world, timed=bool(_times(source)))
 
 
 def _path(source: ExportSource) -> CameraTrajectory:
     """The images in order of time; where their times were not kept, in order of their names, a second apart."""
     images = {image.name: image for image in map(source.model.image, source.model.reg_image_ids())}
-    motion = source.motion
-    timed = [] if motion is None else [(t, name) for t, name in zip(motion.t_s, motion.names, strict=True)]
-    rows = [(t, name) for t, name in timed if name in images] or list(enumerate(sorted(images)))
+    motion, rows = source.motion, _times(source) or list(enumerate(sorted(images)))
     poses = [images[name].cam_from_world() for _, name in rows]
     return CameraTrajectory(
         names=tuple(name for _, name in rows),
@@ -207,6 +205,14 @@ def _path(source: ExportSource) -> CameraTrajectory:
         cam_from_world_xyzw=np.array([pose.rotation.quat for pose in poses]),
         cam_in_world=np.array([images[name].projection_center() for _, name in rows]),
     )
+
+
+def _times(source: ExportSource) -> list[tuple[float, str]]:
+    """When the images were taken, and their names; empty where that was not kept."""
+    if source.motion is None:
+        return []
+    names = {source.model.image(i).name for i in source.model.reg_image_ids()}
+    return [(t, name) for t, name in zip(source.motion.t_s.tolist(), source.motion.names, strict=True) if name in names]
 
 
 def _up(found: ViewSource, model: pycolmap.Reconstruction) -> Array | None:

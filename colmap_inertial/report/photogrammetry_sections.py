@@ -78,8 +78,16 @@ def _on_map(place: Content | None) -> list[tuple[str, str]]:
         ("on the map", f"{origin['latitude_deg']:.6f}°, {origin['longitude_deg']:.6f}°"),
         ("heading, place", f"±{digits(place['heading_ci95_deg'], 2)}°, ±{digits(place['position_ci95_m'], 2)} m"),
         ("by", f"{positions['used']} positions ({positions['left_out']} left out): {positions['source']}"),
+        *_lag(place.get("delay")),
         *(("note", note) for note in place["notes"]),
     ]
+
+
+def _lag(delay: Content | None) -> list[tuple[str, str]]:
+    """By how much positions lag, where that was asked."""
+    if delay is None:
+        return []
+    return [("they lag by", f"{digits(delay['seconds'], 2)} ±{digits(delay['ci95_s'], 2)} s")]
 
 
 def residual_section(survey: Content, name: str, mark: str) -> Section:
