@@ -1481,6 +1481,20 @@ MUTANTS = (
         ("sweep::test_beyond_the_edges_of_a_turned_picture_nothing_is_compared",),
     ),
     Mutant(
+        "sweep/depth.py",
+        "centre_px=(camera.centre_px + 0.5) * by - 0.5,",
+        "centre_px=camera.centre_px * by,",
+        "a picture at half its size is a quarter of a pixel aside",
+        ("sweep::test_half_a_picture_is_taken_by_half_the_camera",),
+    ),
+    Mutant(
+        "sweep/tiles.py",
+        "first, last = int(np.floor(low)) - _BEYOND, int(np.ceil(high)) + _BEYOND + 1",
+        "first, last = int(np.floor(low)), int(np.ceil(high)) + 1",
+        "depths at half the size are taken for exact",
+        ("sweep::test_tiles_hold_each_pixel_once_and_the_candidates_that_are_there",),
+    ),
+    Mutant(
         "sweep/agreement.py",
         "(count > 1)",
         "(count > 0)",
@@ -1598,6 +1612,13 @@ MUTANTS = (
         "[[-t, -s * k, c * k], [k, s * t, c * t], [0.0, c, s]]",
         "north points elsewhere away from Greenwich",
         ("georeference::test_coordinates_are_those_of_proj",),
+    ),
+    Mutant(
+        "model/nerf.py",
+        "note != NO_SCALE and (up is None or note != NO_UP)",
+        "up is None or note != NO_UP",
+        "an export in metres still says that the scale was refused",
+        ("export::test_an_export_without_a_scale_is_in_metres_once_one_was_applied",),
     ),
     Mutant(
         "georeference.py",

@@ -12,6 +12,7 @@ from colmap_inertial.sweep import (
     agreed_depth,
     agreement,
     chosen_partners,
+    depth,
     depth_range,
     normals,
     normals_of,
@@ -19,6 +20,7 @@ from colmap_inertial.sweep import (
     sweep_depth,
 )
 from colmap_inertial.sweep.depth import _canvas, _positions, _shown
+from colmap_inertial.sweep.tiles import tiles_of
 
 REFERENCE = camera((0.1, -0.4, 0.3))
 #: On different sides; turned, also about their own axis; nearer and farther; another lens.
@@ -142,6 +144,79 @@ def test_beyond_the_edges_of_a_turned_picture_nothing_is_compared():
     border = np.ones(truth.shape, dtype=bool)
     border[10:-10, 10:-10] = False
     assert np.mean(right[border]) > 0.885  # 0.85 where the blackness around the turned picture is compared
+
+
+#: As the views around, three times as many pixels to a side.
+WIDE = {"width": 360, "height": 270, "focal": (300.0, 306.0)}
+WIDE_REFERENCE = camera((0.1, -0.4, 0.3), **WIDE)
+WIDE_AROUND = (
+    camera((0.5, -0.4, 0.3), (0, 4, 0), **WIDE),
+    camera((-0.3, -0.5, 0.35), (3, -5, 12), **WIDE),
+    camera((0.15, -0.4, 0.65), (-4, 0, -25), **WIDE),
+    camera((0.0, -0.0, 0.0), (2, 2, 3), **WIDE),
+)
+
+
+def test_coarse_to_fine_finds_what_all_candidates_find_with_less_work(monkeypatch):
+    truth, _ = depth_of(WIDE_REFERENCE)
+    depths = (0.35 * truth.min(), 1.5 * truth.max())
+    pictures = [partner(view) for view in WIDE_AROUND]
+    codes, work, matched = picture_of(WIDE_REFERENCE), [], depth.match_candidates
+
+    def counted(views, columns, rows, *, threads):
+        work.append(views.reference.size * columns.shape[1])
+        return matched(views, columns, rows, threads=threads)
+
+    monkeypatch.setattr(depth, "match_candidates", counted)
+    whole = depth._Sweep.of(codes, WIDE_REFERENCE, pictures, depths)
+    full, all_of_it = whole.depth(1), work.pop()
+    assert len(whole.inverse) > 100
+    found = sweep_depth(codes, WIDE_REFERENCE, pictures, depths, threads=1)
+    assert sum(work) < 0.6 * all_of_it
+    share = {}
+    for name, one in (("full", full), ("found", found)):
+        error = np.abs(one - truth) / truth
+        share[name] = np.array([np.mean(error < limit) for limit in (0.005, 0.01, 0.02)])
+    assert share["full"][1] > 0.95
+    assert (share["found"] > share["full"] - 0.003).all()
+    assert np.mean(np.abs(found - full) < 0.01 * truth) > 0.98
+    # threads change nothing
+    assert np.array_equal(sweep_depth(codes, WIDE_REFERENCE, pictures, depths, threads=3), found)
+
+
+def test_half_a_picture_is_taken_by_half_the_camera():
+    odd = camera((0, 0, 0), width=121, height=91)
+    codes = np.zeros((91, 121), np.uint8)
+    codes[38:44, 70:76] = 255  # about (72.5, 40.5)
+    small, by = depth._half(codes), depth._half_of(odd)
+    assert small.shape == (by.height, by.width) == (45, 60)
+    y, x = (np.average(np.indices(small.shape)[k], weights=small) for k in (0, 1))
+    rays = (np.array([x, y]) - by.centre_px) / by.focal_px
+    np.testing.assert_allclose(rays * odd.focal_px + odd.centre_px, [72.5, 40.5], atol=0.05)
+
+
+def test_tiles_hold_each_pixel_once_and_the_candidates_that_are_there():
+    rng = np.random.default_rng(4)
+    y, x = np.indices((200, 310))
+    true = 40 + 30 * np.sin(x / 60) + 50 * (y > 140) + rng.uniform(-2, 2, (200, 310))
+    coarse = true.reshape(100, 2, 155, 2).mean(axis=(1, 3))
+    coarse[:, 116:] = np.nan
+    times, sizes = np.zeros((200, 310), int), []
+    for tile in tiles_of(coarse, (200, 310), 160):
+        times[tile.inner_rows, tile.inner_columns] += 1
+        inside = true[tile.inner_rows, tile.inner_columns]
+        assert tile.candidates.start < inside.min() and inside.max() < tile.candidates.stop - 1
+        assert np.array_equal(true[tile.rows, tile.columns][tile.kept], inside)
+        sizes.append(tile.candidates.stop - tile.candidates.start)
+        if tile.columns.stop == 310:
+            assert tile.candidates == slice(0, 160)
+    assert (times == 1).all()
+    assert min(sizes) >= 16 and np.mean(sizes) < 120
+    # at either end
+    for value in (0.0, 159.0):
+        for tile in tiles_of(np.full((50, 50), value), (100, 100), 160):
+            assert 16 <= tile.candidates.stop - tile.candidates.start < 30
+            assert 0 <= tile.candidates.start <= value < tile.candidates.stop <= 160
 
 
 @pytest.mark.parametrize("ahead", [1.2, 0.0, -0.8])

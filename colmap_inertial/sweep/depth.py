@@ -1,15 +1,20 @@
-"""Depth of one picture: partners are turned to its orientation, where a plane's depth moves and shrinks them."""
+"""Depth of one picture: partners are turned to its orientation, where a plane's depth moves and shrinks them.
+
+Coarse to fine: depths at half the size say which candidates each part of the picture needs.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.semi_global import Views, match_candidates
 from colmap_inertial.sweep.pinhole import Pinhole
+from colmap_inertial.sweep.tiles import Tile, tiles_of
+from colmap_inertial.threads import in_order, usable_processors
 from colmap_inertial.types import Array
 
 Codes = NDArray[np.uint8]
@@ -24,6 +29,8 @@ _LEAST_CODES = 2
 _LARGEST = 1.6
 #: A partner that stands this close to a plane, as a share of its depth, does not see it well.
 _CLOSEST = 0.2
+#: With fewer candidates than these, to look at half the size first saves nothing.
+_MANY_CANDIDATES = 64
 #: Points of a side of the grid by which the part of a view that is needed is found.
 _GRID = 33
 
@@ -83,27 +90,99 @@ def sweep_depth(
     Planes parallel to the picture, equally spaced in inverse depth (Collins, CVPR 1996). Once a partner is turned to
     the reference's orientation, a plane moves and shrinks its picture, so that columns and rows are looked up apart.
     Costs (census) are summed over the partners that see all of a window, and the depths found by semi-global matching.
+    Of many candidates, each tile of the picture is matched with those that its depths at half the size leave.
     """
-    near, far = depths
-    turned = [(canvas, p) for p in partners if (canvas := _canvas(camera, p.camera, depths)) is not None]
-    if not turned:
+    sweep = _Sweep.of(codes, camera, partners, depths)
+    if sweep is None:
         return np.zeros(codes.shape, dtype=np.float32)
-    inverse = _candidates(camera, [canvas.baseline for canvas, _ in turned], near, far)
-    shape = max(canvas.height for canvas, _ in turned), max(canvas.width for canvas, _ in turned)
-    others = np.zeros((len(turned), *shape), dtype=np.uint8)
-    shown = np.zeros((len(turned), shape[0], 2), dtype=np.int32)
-    columns = np.empty((len(turned), len(inverse), camera.width), dtype=np.int32)
-    rows = np.empty((len(turned), len(inverse), camera.height), dtype=np.int32)
-    for k, (canvas, partner) in enumerate(turned):
-        others[k, : canvas.height, : canvas.width] = _turned(partner.codes, canvas)
-        shown[k, : canvas.height] = _shown(partner.codes.shape, canvas)
-        columns[k] = _positions(camera, canvas, inverse, 0)
-        rows[k] = _positions(camera, canvas, inverse, 1)
-    views = Views(reference=codes, others=others, least=_LEAST_CODES, shown=shown)
-    best, _ = match_candidates(views, columns, rows, threads=threads)
-    known = (best > 0) & (best < len(inverse) - 1)
-    found = inverse[0] + (inverse[1] - inverse[0]) * best.astype(np.float64)
-    return np.where(known, 1 / found, 0).astype(np.float32)
+    if len(sweep.inverse) < _MANY_CANDIDATES:
+        return sweep.depth(threads)
+    halves = [Partner(codes=_half(p.codes), camera=_half_of(p.camera)) for p in partners]
+    half = _Sweep.of(_half(codes), _half_of(camera), halves, depths)
+    if half is None:
+        return sweep.depth(threads)
+    coarse = half.depth(threads)
+    with np.errstate(divide="ignore"):
+        place = (1 / coarse.astype(np.float64) - sweep.inverse[0]) / (sweep.inverse[1] - sweep.inverse[0])
+    tiles = list(tiles_of(np.where(coarse > 0, place, np.nan), (camera.height, camera.width), len(sweep.inverse)))
+    found = np.empty(codes.shape, dtype=np.float32)
+    parts = in_order(sweep.of_tile, tiles, workers=threads or usable_processors())
+    for tile, part in zip(tiles, parts, strict=True):
+        found[tile.inner_rows, tile.inner_columns] = part[tile.kept]
+    return found
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Sweep:
+    """All that is compared: views, and where the reference's columns and rows lie in them for each candidate."""
+
+    views: Views
+    inverse: Array
+    columns: NDArray[np.int32]
+    rows: NDArray[np.int32]
+
+    @classmethod
+    def of(
+        cls, codes: Codes, camera: Pinhole, partners: Sequence[Partner], depths: tuple[float, float]
+    ) -> _Sweep | None:
+        """``None`` where no partner shows anything of it."""
+        near, far = depths
+        turned = [(canvas, p) for p in partners if (canvas := _canvas(camera, p.camera, depths)) is not None]
+        if not turned:
+            return None
+        inverse = _candidates(camera, [canvas.baseline for canvas, _ in turned], near, far)
+        shape = max(canvas.height for canvas, _ in turned), max(canvas.width for canvas, _ in turned)
+        others = np.zeros((len(turned), *shape), dtype=np.uint8)
+        shown = np.zeros((len(turned), shape[0], 2), dtype=np.int32)
+        columns = np.empty((len(turned), len(inverse), camera.width), dtype=np.int32)
+        rows = np.empty((len(turned), len(inverse), camera.height), dtype=np.int32)
+        for k, (canvas, partner) in enumerate(turned):
+            others[k, : canvas.height, : canvas.width] = _turned(partner.codes, canvas)
+            shown[k, : canvas.height] = _shown(partner.codes.shape, canvas)
+            columns[k] = _positions(camera, canvas, inverse, 0)
+            rows[k] = _positions(camera, canvas, inverse, 1)
+        views = Views(reference=codes, others=others, least=_LEAST_CODES, shown=shown)
+        return cls(views=views, inverse=inverse, columns=columns, rows=rows)
+
+    def depth(self, threads: int) -> Real:
+        """(H, W) of all candidates."""
+        best, _ = match_candidates(self.views, self.columns, self.rows, threads=threads)
+        return self._of(best, slice(0, len(self.inverse)))
+
+    def of_tile(self, tile: Tile) -> Real:
+        """Of a tile and what it shares with its neighbours, by its own candidates."""
+        part = np.ascontiguousarray(self.views.reference[tile.rows, tile.columns])
+        columns = np.ascontiguousarray(self.columns[:, tile.candidates, tile.columns])
+        rows = np.ascontiguousarray(self.rows[:, tile.candidates, tile.rows])
+        best, _ = match_candidates(replace(self.views, reference=part), columns, rows, threads=1)
+        return self._of(best, tile.candidates)
+
+    def _of(self, best: Real, candidates: slice) -> Real:
+        """Depths of candidates, counted from the first of some; the best one at an end may lie beyond."""
+        known = (best > 0) & (best < candidates.stop - candidates.start - 1)
+        step = self.inverse[1] - self.inverse[0]
+        found = self.inverse[0] + step * (best.astype(np.float64) + candidates.start)
+        return np.where(known, 1 / found, 0).astype(np.float32)
+
+
+def _half(codes: Codes) -> Codes:
+    """A picture at half its size."""
+    import cv2
+
+    height, width = codes.shape
+    return np.asarray(cv2.resize(codes, (width // 2, height // 2), interpolation=cv2.INTER_AREA))
+
+
+def _half_of(camera: Pinhole) -> Pinhole:
+    """What would have taken it."""
+    by = np.array([(camera.width // 2) / camera.width, (camera.height // 2) / camera.height])
+    return replace(
+        camera,
+        width=camera.width // 2,
+        height=camera.height // 2,
+        focal_px=camera.focal_px * by,
+        centre_px=(camera.centre_px + 0.5) * by - 0.5,
+    )
 
 
 def _candidates(camera: Pinhole, baselines: Sequence[Array], near: float, far: float) -> Array:
