@@ -175,7 +175,7 @@ def run_georeference(
     def work(partial: Sequence[Path]) -> None:
         outcomes, written = [], []
         for index, folder in metric.items():
-            path, _ = trajectory_from_model(read_model(folder), timing)
+            path, _ = trajectory_from_model(read_model(folder), timing, covariances=False)
             try:
                 found = on_earth(fixes, path, -DOWN_IN_WORLD[world])
             except NotObservableError as error:

@@ -289,7 +289,8 @@ def _placed(session: Session, recording: Recording, one: ScaledModel, model: Mod
         similarity = replace(similarity, provenance=f"{similarity.provenance}; {scale.verdict}: {scale.reasons[0]}")
     model = replace(model, scale=scale, similarity=similarity)
     one = replace(one, scale=scale, treatments=model.treatments, parts=model.parts)
-    poses, _ = trajectory_from_model(model.reconstruction, model.timing)
+    # the smoother weighs by them; of a model whose motion a stage solved for, nothing is smoothed
+    poses, _ = trajectory_from_model(model.reconstruction, model.timing, covariances=model.motion is None)
     if model.similarity is not None:
         target = workspace.sparse / str(one.index)
         suffix = model_format(workspace.root / one.sparse) or ".bin"

@@ -242,7 +242,7 @@ def colmap_camera(camera: CameraModel, camera_id: int = 1) -> pycolmap.Camera:
 
 
 def trajectory_from_model(
-    reconstruction: pycolmap.Reconstruction, timing: FrameTiming
+    reconstruction: pycolmap.Reconstruction, timing: FrameTiming, *, covariances: bool = True
 ) -> tuple[CameraTrajectory, tuple[str, ...]]:
     """Camera poses of a model in the order of time.
 
@@ -252,6 +252,8 @@ def trajectory_from_model(
         A COLMAP model.
     timing
         Frame times; joined with the images by name.
+    covariances
+        Whether the poses' covariances are of use: they take longer than all the rest.
 
     Returns
     -------
@@ -285,7 +287,7 @@ def trajectory_from_model(
         cam_from_world_xyzw=np.array([pose.rotation.quat for pose in poses]),
         cam_in_world=np.array([image.projection_center() for image in timed]),
         epoch_ns=timing.epoch_ns,
-        pose_cov=_pose_covariances(reconstruction, timed),
+        pose_cov=_pose_covariances(reconstruction, timed) if covariances else None,
     )
     return trajectory, notes
 

@@ -295,7 +295,7 @@ def _by_model(
         try:
             for i in range(rounds):
                 models = _small_models(capture, images, names, work / str(i), view, context.reporting(step))
-                trajectory, _ = trajectory_from_model(models[0], timing)
+                trajectory, _ = trajectory_from_model(models[0], timing, covariances=False)
                 view = _aligned(trajectory, recording, _camera_of(models[0]), "model")
         except (MappingError, FormatError) as error:
             return view or NotObservableError("camera-IMU calibration", str(error)), ()
