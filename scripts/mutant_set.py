@@ -1488,6 +1488,13 @@ MUTANTS = (
         ("sweep::test_half_a_picture_is_taken_by_half_the_camera",),
     ),
     Mutant(
+        "colmap/sparse.py",
+        "        opened.clear_two_view_geometries()",
+        "        opened.read_all_images()",
+        "matches of keypoints that moved are believed without a look",
+        ("pairing::test_matches_of_moved_keypoints_are_those_of_features_found_anew",),
+    ),
+    Mutant(
         "sweep/tiles.py",
         "first, last = int(np.floor(low)) - _BEYOND, int(np.ceil(high)) + _BEYOND + 1",
         "first, last = int(np.floor(low)), int(np.ceil(high)) + 1",

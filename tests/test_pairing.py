@@ -1,6 +1,7 @@
 """Which pairs of images are matched: headings by the gyroscope, its bias by matches, votes, loops."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -568,3 +569,45 @@ def test_once_some_are_matched_batches_are_large(database, tmp_path, monkeypatch
     sparse.match_pairs(database, pairs, context, total=1400)
     sparse.match_pairs(database, pairs, context, done=700, total=1400)
     assert told == [0, 100, 300, 700, 700, 1400]
+
+
+# --- the same matches, verified anew ---------------------------------------------------------------------------------
+
+
+def test_matches_of_moved_keypoints_are_those_of_features_found_anew(tmp_path):
+    desk = sorted((Path(__file__).parents[1] / "example_scenes" / "desk" / "frames").iterdir())[:3]
+    names = [path.name for path in desk]
+    options = MappingOptions(max_num_features=1500, first_octave=0, max_image_size=480)
+    context, cameras = RunContext(scratch=tmp_path, num_threads=1), dict.fromkeys(names)
+    pairs = sparse.image_pairs(names, options)
+
+    def stage(keypoints):
+        """Shifts a third of the features of one picture far away."""
+        xy_px = keypoints.xy_px.copy()
+        if keypoints.name == names[1]:
+            xy_px[::3, 1] += 150
+        return replace(keypoints, xy_px=xy_px)
+
+    def found(stages, kind):
+        features, database = tmp_path / f"{kind}_features.db", tmp_path / f"{kind}.db"
+        sparse.extract_features(desk[0].parent, cameras, features, options, keypoint_stages=stages, context=context)
+        sparse.match_features(features, database, pairs, context)
+        return database
+
+    def read(database):
+        with pycolmap.Database.open(str(database)) as opened:
+            images = {image.name: image.image_id for image in opened.read_all_images()}
+            views = [opened.read_two_view_geometry(images[a], images[b]) for a, b in pairs]
+            return [np.array(opened.read_keypoints(images[name])) for name in names], [
+                np.array(view.inlier_matches) for view in views
+            ]
+
+    plain, anew = found([], "plain"), found([stage], "anew")
+    again = tmp_path / "again.db"
+    sparse.verify_again(plain, again, pairs, [stage], context)
+    for one, other in zip(read(again)[0], read(anew)[0], strict=True):
+        assert np.array_equal(one, other)
+    for one, other in zip(read(again)[1], read(anew)[1], strict=True):
+        assert np.array_equal(one, other) and len(one) > 30
+    # what moved is no longer believed
+    assert len(read(again)[1][0]) < len(read(plain)[1][0])

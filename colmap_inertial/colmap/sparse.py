@@ -251,6 +251,23 @@ def match_features(
     match_pairs(database, pairs, context)
 
 
+def verify_again(
+    matched: Path,
+    database: Path,
+    pairs: Sequence[tuple[str, str]],
+    keypoint_stages: Sequence[KeypointStage],
+    context: RunContext,
+) -> None:
+    """The same matches of keypoints that stages move, verified anew: descriptors tell what they told before."""
+    import pycolmap
+
+    shutil.copyfile(matched, database)
+    _through_stages(database, keypoint_stages)
+    with _writing(database), pycolmap.Database.open(str(database)) as opened:
+        opened.clear_two_view_geometries()
+    match_pairs(database, pairs, context)
+
+
 def match_pairs(
     database: Path, pairs: Sequence[tuple[str, str]], context: RunContext, *, done: int = 0, total: int | None = None
 ) -> None:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from colmap_inertial.align import AlignOptions, align_clocks
-from colmap_inertial.colmap.sparse import extract_features, image_pairs, map_images, match_features
+from colmap_inertial.colmap.sparse import extract_features, image_pairs, map_images, match_features, verify_again
 from colmap_inertial.errors import FormatError, MappingError, NotObservableError
 from colmap_inertial.flow import FlowOptions, VisualRotation, check_motion, find_stabilisation, measure_rotation
 from colmap_inertial.io.capture import Capture, ImageFolder
@@ -294,7 +294,8 @@ def _by_model(
         view: GyroView | None = None
         try:
             for i in range(rounds):
-                models = _small_models(capture, images, names, work / str(i), view, context.reporting(step))
+                matched = work / str(i - 1) if i else None
+                models = _small_models(capture, images, names, work / str(i), view, context.reporting(step), matched)
                 trajectory, _ = trajectory_from_model(models[0], timing, covariances=False)
                 view = _aligned(trajectory, recording, _camera_of(models[0]), "model")
         except (MappingError, FormatError) as error:
@@ -332,15 +333,22 @@ def _small_models(
     work: Path,
     view: GyroView | None,
     context: RunContext,
+    matched: Path | None = None,
 ) -> tuple[pycolmap.Reconstruction, ...]:
-    """COLMAP's models of some frames, the largest first; with a view, of rectified keypoints."""
+    """COLMAP's models of some frames, the largest first; with a view, of rectified keypoints.
+
+    ``matched``: where models of the same frames were made before, of keypoints as they are.
+    """
     work.mkdir()
     features, database, sparse = work / "features.db", work / "database.db", work / "sparse"
     cameras = {name: capture.camera for name in names}
     stages = [] if view is None else [RollingShutterStage(view=view)]
-    extract_features(images, cameras, features, _SMALL, keypoint_stages=stages, context=context)
     pairs = image_pairs(names, _SMALL)
-    match_features(features, database, pairs, context)
+    if matched is None:
+        extract_features(images, cameras, features, _SMALL, keypoint_stages=stages, context=context)
+        match_features(features, database, pairs, context)
+    else:
+        verify_again(matched / "database.db", database, pairs, stages, context)
     map_images(
         database,
         images,
