@@ -1495,6 +1495,13 @@ MUTANTS = (
         ("pairing::test_matches_of_moved_keypoints_are_those_of_features_found_anew",),
     ),
     Mutant(
+        "precalibrate/plan.py",
+        'margin_s = _SURE_SIGMAS * prior.sigma("gyro_time_offset_s")',
+        'margin_s = 0.0 * prior.sigma("gyro_time_offset_s")',
+        "clocks that are hardly known are taken for known",
+        ("run_steps::test_a_quick_turn_counts_where_a_frame_may_have_been_taken",),
+    ),
+    Mutant(
         "sweep/tiles.py",
         "first, last = int(np.floor(low)) - _BEYOND, int(np.ceil(high)) + _BEYOND + 1",
         "first, last = int(np.floor(low)), int(np.ceil(high)) + 1",

@@ -53,7 +53,7 @@ from colmap_inertial.stages.frame_folder import FrameRecord, write_frames
 from colmap_inertial.stages.gyro_view import GyroView
 from colmap_inertial.stages.rectified import write_images
 from colmap_inertial.threads import in_order
-from colmap_inertial.types import CameraModel, FrameTiming, ImuRecording, Treatment
+from colmap_inertial.types import CALIBRATION_PARAMETERS, CameraModel, FrameTiming, ImuRecording, Treatment
 
 NAMES = tuple(f"{i}.jpg" for i in range(6))
 TIMING = FrameTiming(names=NAMES, t_s=np.arange(6.0), exposure_s=[0.01, 0.02, 0.03, 0.04, 0.05, 0.06])
@@ -508,6 +508,37 @@ def test_the_longest_exposure_tells_whether_anything_may_be_blurred(tmp_path, mo
     # 3 rad/s and 60 px of focal length: 0.2 px in 1 ms, and 9 px in 50 ms
     assert "no frame has more than" in note([0.001] * 6)
     assert "looked at" in note([0.001] * 5 + [0.05])
+
+
+@pytest.mark.parametrize(
+    ("offset_sigma_s", "turned_at_s", "looked_at"),
+    [(0.001, 0.95, False), (0.1, 0.95, True), (0.001, 1.005, True), (0.001, 1.03, True), (None, 0.95, True)],
+    ids=["between frames", "clocks are not known so well", "while exposed", "while read out", "clocks are not known"],
+)
+def test_a_quick_turn_counts_where_a_frame_may_have_been_taken(
+    tmp_path, monkeypatch, offset_sigma_s, turned_at_s, looked_at
+):
+    def none(recording, context):
+        raise NotObservableError("the pixels' motion", "looked at")
+
+    monkeypatch.setattr(imaging, "precalibrate", none)
+    t_s = np.arange(-1.0, 8.0, 0.005)
+    rate = np.zeros((len(t_s), 3))
+    rate[np.abs(t_s - turned_at_s) < 0.006] = [0, 9.0, 0]
+    # stamps that are 300 s off, in another epoch
+    imu = replace(
+        IMU, gyro_t_s=t_s + 2 - 300.0, gyro_rad_s=rate, accel_t_s=t_s, accel_m_s2=np.ones((len(t_s), 3)),
+        epoch_ns=TIMING.epoch_ns - 2_000_000_000,
+    )  # fmt: skip
+    known = calibration_prior(Declared(gyro_time_offset_s=300.0) if offset_sigma_s else None)
+    cov = np.array(known.cov)
+    at = CALIBRATION_PARAMETERS.index("gyro_time_offset_s")
+    if offset_sigma_s:
+        cov[at, at] = offset_sigma_s**2
+    timing = replace(TIMING, t_s=np.arange(6.0), exposure_s=np.full(6, 0.01), readout_s=None)
+    filmed = Recording.of(replace(recording().capture, camera=CAMERA), imu, timing, replace(known, cov=cov))
+    note = plan_imaging(filmed, RunContext(scratch=tmp_path), replace(OFF, deblur=None)).deblur_note
+    assert ("looked at" in note) == looked_at and ("no frame has more than" in note) != looked_at
 
 
 @pytest.mark.parametrize("exposure_s", [None, TIMING.exposure_s], ids=["unknown", "known"])

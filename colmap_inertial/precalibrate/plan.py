@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 
 from colmap_inertial.errors import InertialError, NotObservableError
+from colmap_inertial.gyro import on_camera_rate
 from colmap_inertial.imaging.gate import (
     FrameDecision,
     GateOptions,
@@ -35,7 +36,7 @@ from colmap_inertial.run.workspace import a_record_of_ours
 from colmap_inertial.stages.deblur import SMOOTHING, DeblurStage
 from colmap_inertial.stages.gyro_view import GyroView
 from colmap_inertial.stages.rolling_shutter import RollingShutterStage
-from colmap_inertial.types import CameraImuCalibration, CameraModel, FrameTiming, ImuRecording
+from colmap_inertial.types import Array, CameraImuCalibration, CameraModel, FrameTiming, ImuRecording
 
 if TYPE_CHECKING:
     import pycolmap
@@ -50,6 +51,9 @@ _CLEAR_SUPPORT: dict[BlurRemover, float] = {"wiener": 7.0, "path": 7.0, "deepgyr
 _SAID_OF = {"deepgyro": "; the network DeepGyro undoes it", "path": "; the half-quadratic filter undoes it"}
 #: How often small models are made, at most, for more of the blurred frames.
 _SURVEYS = 4
+#: While a frame may have been taken: by how many standard deviations of the clocks' offset sooner or later, and how
+#: long a readout is at most that nobody declared.
+_SURE_SIGMAS, _LONGEST_READOUT_S = 4.0, 0.04
 #: Frames by which the gyroscope is judged.
 _JUDGED_FRAMES = 14
 
@@ -299,8 +303,7 @@ def _no_deblurring(recording: Recording, asked: Treatments, progress: Progress) 
             "capture.toml, or a column of it in the frame times"
         )
     camera = guessed_camera(recording.capture, timing)
-    rate = float(np.linalg.norm(recording.imu.gyro_rad_s, axis=1).max())
-    most_px = rate * float(timing.exposure_s.max()) * 1.2 * colmap_camera(camera).mean_focal_length()
+    most_px = _most_turned_rad(recording, timing.exposure_s) * 1.2 * colmap_camera(camera).mean_focal_length()
     limit_px = _limit_px(camera)
     if most_px >= limit_px:
         return ""
@@ -310,6 +313,24 @@ def _no_deblurring(recording: Recording, asked: Treatments, progress: Progress) 
     if any(sliding_parts(recording, camera, survey_parts(timing), limit_px, progress)):
         return ""
     return f"{why_not}, and by how far pixels move from frame to frame"
+
+
+def _most_turned_rad(recording: Recording, exposure_s: Array) -> float:
+    """By how much the camera turned during an exposure at the most: as quickly as ever while it may have been taken."""
+    timing, prior = recording.timing, recording.prior
+    imu = on_camera_rate(recording.imu, prior, camera_epoch_ns=timing.epoch_ns)
+    rate_rad_s = np.linalg.norm(imu.gyro_rad_s, axis=1)
+    stamps_s = imu.gyro_t_s + prior.gyro_time_offset_s + (imu.epoch_ns - timing.epoch_ns) * 1e-9
+    margin_s = _SURE_SIGMAS * prior.sigma("gyro_time_offset_s")
+    longest_s = _LONGEST_READOUT_S if timing.readout_s is None else timing.readout_s
+    # a sample more on each side
+    first = np.searchsorted(stamps_s, timing.t_s - margin_s) - 1
+    last = np.searchsorted(stamps_s, timing.t_s + longest_s + exposure_s + margin_s, side="right") + 1
+    within = [
+        rate_rad_s[a:b].max() if a >= 0 and b <= len(rate_rad_s) else rate_rad_s.max()
+        for a, b in zip(first.tolist(), last.tolist(), strict=True)
+    ]
+    return float(np.max(np.array(within) * exposure_s))
 
 
 def _no_gyro_for_pairs(recording: Recording) -> str:
