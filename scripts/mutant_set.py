@@ -1349,8 +1349,8 @@ MUTANTS = (
     ),
     Mutant(
         "precalibrate/plan.py",
-        "rate * float(timing.exposure_s.max()) * 1.2",
-        "rate * float(timing.exposure_s.min()) * 1.2",
+        "np.max(np.array(within) * exposure_s)",
+        "np.min(np.array(within) * exposure_s)",
         "the shortest exposure says that no frame is blurred",
         ("run_steps::test_the_longest_exposure_tells_whether_anything_may_be_blurred",),
     ),
