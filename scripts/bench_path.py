@@ -22,6 +22,12 @@ filters are told what a usual calibration says of itself (0.5 ms, 0.3 degrees), 
 bin, and which share of their matches remains of frames that are sharp while the gyroscope says that they are blurred
 (``false``), and of sharp video.
 
+``sky``: whether recordings at 6 and 10 px of which 70 and 90 % is sky are trusted, and how many of their frames are
+treated, with a right gyroscope and with wrong ones.
+
+``false``: wrong gyroscopes at 10 and 20 px, those played backwards and with the wrong sign among them: which share of
+the correct matches the gate leaves, with each of the package's methods.
+
 ``cost``: processor time of a grey 1080p frame at 10, 20 and 40 px, as a ratio to the straight filter's in the same run.
 
 ``--colmap``: whole reconstructions of simulated scenes at 10 and 20 px by ``--deblur`` methods, each with the default
@@ -33,8 +39,9 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import cv2
 import imaging_metrics as metrics
@@ -42,12 +49,15 @@ import numpy as np
 import path_reconstructions
 import path_scenes
 from bench_imaging import about
+from path_false import false_gyroscopes, mostly_sky, recording
 from path_methods import METHODS, cost, gate
 from path_tables import print_report
 from rich.console import Console
 from rich.progress import track
 
-SECTIONS = ("quality", "gate", "cost")
+from colmap_inertial.options import BlurRemover
+
+SECTIONS = ("quality", "gate", "sky", "false", "cost")
 #: Lower ends of the bins of blur, px.
 BINS_PX = (3.0, 8.0, 15.0, 25.0)
 console = Console(stderr=True)
@@ -60,6 +70,7 @@ def main() -> None:
     parser.add_argument("--exposures", type=float, nargs="+", default=(0.016, 0.033, 0.066), help="s")
     parser.add_argument("--every", type=float, default=1.2, help="s between the beginnings of two pairs; 0.2 takes all")
     parser.add_argument("--most", type=int, default=10**6, help="pairs of each exposure at most")
+    parser.add_argument("--recorded", type=int, default=7, help="pairs of each recording for ``sky`` and ``false``")
     parser.add_argument("--most-px", type=float, default=50.0, help="frames with more blur are left out")
     parser.add_argument("--size", type=int, nargs=2, default=(1280, 720))
     parser.add_argument("--methods", nargs="+", choices=tuple(METHODS), default=tuple(METHODS))
@@ -86,8 +97,20 @@ def main() -> None:
             args.json.write_text(json.dumps(report, indent=2) + "\n")
 
     if args.colmap:
-        path_reconstructions.measure(report, args.methods, args.scenes, args.widths, console=console, keep=keep)
+        path_reconstructions.measure(
+            report, args.methods, args.scenes, args.widths, motion=args.motion, console=console, keep=keep
+        )
     else:
+        removers = [name for name in args.methods if name in get_args(BlurRemover)]
+        make = partial(
+            recording,
+            args.photos,
+            args.motion,
+            count=args.recorded,
+            size=tuple(args.size),
+            seed=args.seed,
+            cache=args.cache,
+        )
         takes = path_scenes.takes(
             args.photos,
             args.motion,
@@ -103,6 +126,8 @@ def main() -> None:
         sections: dict[str, Callable[[], Any]] = {
             "quality": lambda: quality(takes, args, report, keep),
             "gate": lambda: gate(takes, binned, console=console),
+            "sky": lambda: mostly_sky(make, console=console),
+            "false": lambda: false_gyroscopes(make, removers, console=console),
             "cost": lambda: cost(takes[0], args.methods),
         }
         report["pairs_beyond"] = {f"{1e3 * t.exposure_s:g} ms": t.beyond for t in takes}

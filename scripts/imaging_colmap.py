@@ -102,7 +102,8 @@ def reconstructed(
     recipe = with_blur(recipe, blur_px)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        capture = write_capture(recipe, folder / "capture", workers=2)
+        # in this process: the recipe's motion may be another than the package's (`recorded_orbits`)
+        capture = write_capture(recipe, folder / "capture")
         truth = read_truth(folder / "capture" / "truth.json").trajectory
         # the same options with another smoothing go on from the same plan
         out = {way: folder / str([*ways.values()].index(options)) for way, options in ways.items()}

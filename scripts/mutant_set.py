@@ -866,6 +866,13 @@ MUTANTS = (
     ),
     Mutant(
         "imaging/gate.py",
+        "below = _judged(standing, options)",
+        "below = verdict",
+        "a sky hides what stands below it",
+        ("imaging_gate::test_a_recording_that_is_mostly_sky_bears_its_gyroscope_out_and_no_other",),
+    ),
+    Mutant(
+        "imaging/gate.py",
         "curve = BlurPath.straight(blur) if path is None else path",
         "curve = BlurPath.straight(blur)",
         "curved blur is compared with its chord",

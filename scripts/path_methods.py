@@ -107,7 +107,7 @@ def gate(takes: Sequence[Take], binned: Callable[[float], str], *, console: Cons
         blurred = [(pair, i) for pair in take.pairs for i in (0, 1)]
         known = [pair.known(i, "exact") for pair, i in blurred]
         fields = [_field(one) for one in known]
-        trusted = _verdict([pair.frame(i) for pair, i in blurred], known)
+        trusted = verdict_on([pair.frame(i) for pair, i in blurred], known)
         row: dict[str, Any] = {"verdict": trusted.reason, "trusted": trusted.trusted, "treated": {}}
         of_each = list(zip(blurred, fields, known, strict=True))
         for (pair, i), field, motion in track(of_each, f"gate, {label}", console=console):
@@ -117,10 +117,10 @@ def gate(takes: Sequence[Take], binned: Callable[[float], str], *, console: Cons
             one["treated"] += int(factor is not None)
         sharp = [pair.short(i) for pair, i in blurred]
         # as a wrong exposure time has it: alone, and among frames that bear the gyroscope out; and as it is
-        row["sharp recording"] = _kept(take.pairs, known, _verdict(sharp, known))
+        row["sharp recording"] = _kept(take.pairs, known, verdict_on(sharp, known))
         row["sharp among blurred"] = _kept(take.pairs, known, trusted)
         brief = [pair.known(i, "exact", shortened(pair.moments[i])) for pair, i in blurred]
-        row["sharp video"] = _kept(take.pairs, brief, _verdict(sharp, brief))
+        row["sharp video"] = _kept(take.pairs, brief, verdict_on(sharp, brief))
         out[label] = row
     return out
 
@@ -129,7 +129,7 @@ def _field(known: Known) -> BlurField:
     return blur_field(*known)
 
 
-def _verdict(frames: Sequence[Grey], known: Sequence[Known]) -> RecordingVerdict:
+def verdict_on(frames: Sequence[Grey], known: Sequence[Known]) -> RecordingVerdict:
     fields = [_field(one) for one in known]
     order = sorted(range(len(frames)), key=lambda i: -float(np.percentile(fields[i].extent_px(), 90)))[:_JUDGED]
     return judge_recording(blur_evidence(frames[i], blur_path(*known[i])) for i in order)
@@ -172,7 +172,7 @@ def cost(take: Take, methods: Sequence[str], repeat: int = 5) -> dict[str, Any]:
     camera = replace(take.pairs[0].camera, size=COST_SIZE, focal_px=1.5 * take.pairs[0].camera.focal_px)
     out: dict[str, Any] = {}
     for wanted_px in COSTS_PX:
-        moment = _with_blur(camera, take.pairs[0].moments[0], wanted_px)
+        moment = with_blur(camera, take.pairs[0].moments[0], wanted_px)
         facing = replace(camera, wall_from_world=camera.facing(moment))
         pair = Pair(camera=facing, moments=(moment, moment), blur_px=wanted_px, seed=1, cache=None)
         image, known = pair.frame(0), pair.known(0, "exact")
@@ -194,7 +194,7 @@ def cost(take: Take, methods: Sequence[str], repeat: int = 5) -> dict[str, Any]:
     return out
 
 
-def _with_blur(camera: TurningCamera, moment: Moment, wanted_px: float) -> Moment:
+def with_blur(camera: TurningCamera, moment: Moment, wanted_px: float) -> Moment:
     """The exposure, around the same instant, that blurs so much."""
     middle_s = moment.t_s + 0.5 * moment.exposure_s
     for _ in range(6):

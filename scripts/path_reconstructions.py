@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
 from typing import Any, get_args
+from unittest.mock import patch
 
 import imaging_colmap
 import numpy as np
+from recorded_orbits import hands, orbit
 from rich.console import Console
 
 from colmap_inertial.options import DeblurMethod, ReconstructOptions
-from colmap_inertial.simulate import SceneRecipe
+from colmap_inertial.simulate import SceneRecipe, capture
 
+HELD_OUT = "room5"
 BLURS_PX = (10.0, 20.0)
 _FIRST_SEED = 20
 
@@ -26,12 +32,22 @@ def scenes(count: int) -> dict[str, tuple[SceneRecipe, float]]:
     return out
 
 
+def held_by(motion: Path | None, recipe: SceneRecipe) -> AbstractContextManager[object]:
+    """While it lasts, the recipe's camera is in the hand of a recording, another stretch for each seed."""
+    if motion is None:
+        return nullcontext()
+    found = hands(motion, HELD_OUT, recipe.motion.duration_s)
+    hand = found[(recipe.seed - _FIRST_SEED) % len(found)]
+    return patch.object(capture, "make_motion", partial(orbit, hand=hand))
+
+
 def measure(
     report: dict[str, Any],
     methods: Sequence[str],
     count: int,
     widths_px: Sequence[float],
     *,
+    motion: Path | None = None,
     console: Console,
     keep: Callable[[], None],
 ) -> None:
@@ -54,7 +70,8 @@ def measure(
                 figures = ", ".join(f"{key} {value}" for key, value in one.items() if key != "deblurring")
                 console.print(f"{name}, {way}: {figures}", highlight=False, soft_wrap=True)
 
-            found[name] = imaging_colmap.reconstructed(recipe, blur_px, ways, widths, said)
+            with held_by(motion, recipe):
+                found[name] = imaging_colmap.reconstructed(recipe, blur_px, ways, widths, said)
         report["colmap"]["wanted"] = [line for way in (*known, *others) for line in wanted(found, way)]
         keep()
 

@@ -32,6 +32,10 @@ def print_report(report: dict[str, Any], console: Console) -> None:
         _quality(report["quality"], console)
     if "gate" in report:
         _gate(report["gate"], console)
+    if "sky" in report:
+        _sky(report["sky"], console)
+    if "false" in report:
+        _false(report["false"], console)
     if "cost" in report:
         _cost(report["cost"], console)
     if "colmap" in report:
@@ -97,6 +101,39 @@ def _gate(found: dict[str, Any], console: Console) -> None:
             one = row[key]
             cells.append(_verdict(one["kept"], KEPT, f"{one['kept']:.3f} ({one['treated']} treated)"))
         table.add_row(name, *cells, str(row["trusted"]))
+    console.print(table)
+
+
+def _sky(rows: list[dict[str, Any]], console: Console) -> None:
+    table = table_of("Mostly sky", "gyroscope", "blur px", "sky", "trusted", "sigmas", "treated")
+    for row in rows:
+        share = row["treated"] / row["frames"]
+        right = row["gyroscope"] == "right"
+        table.add_row(
+            row["gyroscope"],
+            f"{row['blur_px']:g}",
+            f"{row['sky']:.0%}",
+            str(row["trusted"]),
+            f"{row['support']:.1f}",
+            _verdict(share, TREATED if right else None, f"{row['treated']}/{row['frames']}"),
+        )
+    console.print(table)
+
+
+def _false(rows: list[dict[str, Any]], console: Console) -> None:
+    table = table_of(
+        "Wrong gyroscopes: correct matches against doing nothing",
+        *("gyroscope", "blur px", "method", "trusted", "kept", "treated"),
+    )
+    for row in rows:
+        table.add_row(
+            row["gyroscope"],
+            f"{row['blur_px']:g}",
+            row["method"],
+            str(row["trusted"]),
+            _verdict(row["kept"], KEPT, f"{row['kept']:.3f}"),
+            f"{row['treated']}/{row['frames']}",
+        )
     console.print(table)
 
 

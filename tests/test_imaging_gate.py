@@ -12,7 +12,7 @@ from colmap_inertial.geometry import matrix_from_quat
 from colmap_inertial.gyro import GyroPath
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath, middles
-from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence, shown_share
+from colmap_inertial.imaging.evidence import BlurEvidence, _weights, blur_evidence, shown_share
 from colmap_inertial.imaging.gate import (
     LEAST_SHARE,
     GateOptions,
@@ -202,6 +202,41 @@ def test_the_share_of_the_blur_that_shows_is_the_textures_and_not_the_sky_s(blur
     assert shown_share(flat, field) is None
     noise = np.random.default_rng(0).normal(128, 6, (HEIGHT, WIDTH)).astype(np.uint8)
     assert shown_share(noise, field) is None
+
+
+def below_sky(image, seed):
+    """The picture in its own shadow below a bright sky that takes most of it, with noise and JPEG."""
+    rng = np.random.default_rng([seed, 7])
+    light = 0.6 * (image.mean(axis=2) / 255) ** 2.2
+    sky = round(0.6 * HEIGHT)
+    light[:sky] = np.linspace(0.5, 0.7, sky)[:, None] + 0.02 * np.sin(np.arange(WIDTH) / 60)
+    light += 0.01 * np.sqrt(0.5 + light) * rng.standard_normal(light.shape)
+    codes = np.rint(255 * np.clip(light, 0, 1) ** (1 / 2.2)).astype(np.uint8)
+    return cv2.imdecode(cv2.imencode(".jpg", codes, [cv2.IMWRITE_JPEG_QUALITY, 90])[1], cv2.IMREAD_GRAYSCALE)
+
+
+def test_a_recording_that_is_mostly_sky_bears_its_gyroscope_out_and_no_other():
+    found = {"none": [], "flipped axis": [], "sharp": []}
+    for k, t_s in enumerate((0.98, 1.14, 3.58, 3.74, 2.3, 4.6)):
+        shutter, image = shot(t_s, 8)
+        for error in ("none", "flipped axis"):
+            found[error].append(blur_evidence(below_sky(image, k), predicted(shutter, error)))
+        found["sharp"].append(blur_evidence(below_sky(shot(t_s, 0.2)[1], k), predicted(shutter, "none")))
+    trusted = {error: judge_recording(evidence).trusted for error, evidence in found.items()}
+    assert trusted == {"none": True, "flipped axis": False, "sharp": False}
+    # all tiles alike, it is not: the sky hides the rest
+    alike = judge_recording([replace(one, standing=None) for one in found["none"]])
+    assert alike.trusted is False
+
+
+def test_tiles_weigh_by_what_stands_out_and_all_alike_where_nothing_does():
+    rng = np.random.default_rng(0)
+    noise = rng.standard_normal((60, 64, 33)).astype(np.float32)
+    weights = _weights(noise)
+    assert weights.sum() == pytest.approx((weights**2).sum()) and weights.sum() > 55
+    noise[:15] += np.log(50)
+    weights = _weights(noise)
+    assert 15 < weights.sum() < 22 and weights[15:].max() < 0.1 < 0.9 < weights[:15].min()
 
 
 def test_curved_blur_is_compared_with_the_curve():

@@ -9,7 +9,7 @@ two-dimensional functions" (IEEE Trans. Information Theory, 1975).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -34,6 +34,10 @@ _FEWEST_TILES = 12
 #: More tiles are thinned out: support grows with the square root of their number, cost with it. Few serve for the share
 #: of the blur that shows.
 _MOST_TILES, _FEW_TILES = 900, 200
+#: The share of a picture's tiles that are its quiet ones; the power above theirs at which a tile has half of its
+#: weight, as noise varies by so much with light and JPEG; and how steeply weights rise there: weak textures of common
+#: pictures, of tenfold power, weigh nearly all.
+_QUIET, _ABOVE_QUIET, _STEEP = 0.05, 3.0, 3
 #: Cycles per pixel in which blur takes power from a direction before noise covers it, and in which noise is alone.
 _BAND, _NOISE_BAND = (0.05, 0.25), (0.4, 0.5)
 #: The share of a tile's mean fall over all frequencies that is put down to the texture's own direction: textures differ
@@ -65,17 +69,20 @@ class BlurEvidence:
     mirrored, mirrored_square
         (FACTORS, 1) the same in the direction that a gyroscope with one axis flipped would predict.
     tiles
-        How many were summed.
+        How many were summed; weighted ones count as so many of equal weight as tell as much.
     extent_px
         Sum of the lengths of their predicted blur.
+    standing
+        The same, tiles weighted by how far they stand out of the quiet ones of their image (:func:`_weights`).
     """
 
     total: Array
     total_square: Array
     mirrored: Array
     mirrored_square: Array
-    tiles: int
+    tiles: float
     extent_px: float = 0.0
+    standing: BlurEvidence | None = None
 
     @classmethod
     def nothing(cls) -> BlurEvidence:
@@ -84,7 +91,9 @@ class BlurEvidence:
         return cls(total=zero, total_square=zero, mirrored=zero[:, :1], mirrored_square=zero[:, :1], tiles=0)
 
     def __add__(self, other: BlurEvidence) -> BlurEvidence:
-        return BlurEvidence(**{f.name: getattr(self, f.name) + getattr(other, f.name) for f in fields(self)})
+        summed = {f.name: getattr(self, f.name) + getattr(other, f.name) for f in fields(self) if f.name != "standing"}
+        parts = [one.standing for one in (self, other) if one.standing is not None]
+        return BlurEvidence(**summed, standing=parts[0] + parts[1] if len(parts) == 2 else next(iter(parts), None))
 
     @property
     def enough(self) -> bool:
@@ -157,13 +166,21 @@ def blur_evidence(image: NDArray[np.uint8] | NDArray[np.uint16], blur: BlurField
     level = np.median(values[:, :, 2:-1], axis=2, keepdims=True)
     values -= level
     mirrored = _at_lags(cepstra, vectors * [1, -1], DIRECTIONS_RAD[:1]) - level
+    lengths = np.hypot(vectors[:, 0], vectors[:, 1])
+    standing = _summed(values, mirrored, lengths, _weights(logarithm))
+    return replace(_summed(values, mirrored, lengths, np.ones(len(values))), standing=standing)
+
+
+def _summed(values: Array, mirrored: Array, lengths_px: Array, weight: Array) -> BlurEvidence:
+    """Of tiles' depths, (N, FACTORS, DIRECTIONS_RAD) and (N, FACTORS, 1)."""
+    values, mirrored = (weight[:, None, None] * depths for depths in (values, mirrored))
     return BlurEvidence(
         total=values.sum(axis=0),
         total_square=(values**2).sum(axis=0),
         mirrored=mirrored.sum(axis=0),
         mirrored_square=(mirrored**2).sum(axis=0),
-        tiles=len(values),
-        extent_px=float(np.hypot(vectors[:, 0], vectors[:, 1]).sum()),
+        tiles=float(weight.sum()),
+        extent_px=float(weight @ lengths_px),
     )
 
 
@@ -185,7 +202,8 @@ def shown_share(image: NDArray[np.uint8] | NDArray[np.uint16], blur: BlurField |
     found = _spectra(image, path, _FEW_TILES)
     if found is None:
         return None
-    seen, expected, seen_mean, expected_mean = _falls(*found)
+    weight = _weights(found[0])
+    seen, expected, seen_mean, expected_mean = (weight * fall for fall in _falls(*found))
     information = float((expected - _OWN_DIRECTION * expected_mean).sum())
     if information < _LEAST_INFORMATION:
         return None
@@ -238,6 +256,21 @@ def _spectra(
     power = np.abs(rfft2(tiles)) ** 2
     paths = path.at(*middles).reshape(len(vectors), -1, 2)[usable] / reduced
     return np.asarray(np.log(power + _FLOOR * tile**2)), vectors[usable], paths
+
+
+def _weights(logarithm: NDArray[np.float32]) -> Array:
+    """(N,) weights of tiles by how far they stand out of the quiet ones of their picture.
+
+    A sky holds noise alone, and would hide in the mean what the ground below it shows. Noise cannot be told from weak
+    texture by itself (JPEG takes its high frequencies), but where all tiles are alike, all weigh alike. The weights add
+    up to the number of equal ones that would tell as much: to the same as their squares.
+    """
+    tile = logarithm.shape[1]
+    radius = np.hypot(np.fft.rfftfreq(tile), np.fft.fftfreq(tile)[:, None])
+    power = logarithm[:, (radius > _BAND[0]) & (radius < _BAND[1])].mean(axis=1, dtype=np.float64)
+    above = np.exp(np.minimum(power - np.quantile(power, _QUIET), 50.0))
+    weight = above**_STEEP / (above**_STEEP + _ABOVE_QUIET**_STEEP)
+    return np.asarray(weight * (weight.sum() / (weight @ weight)))
 
 
 def _light(image: NDArray[np.uint8] | NDArray[np.uint16]) -> NDArray[np.float32]:

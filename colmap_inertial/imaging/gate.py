@@ -262,7 +262,8 @@ def judge_recording(evidence: Iterable[BlurEvidence], options: GateOptions | Non
     """Judge gyroscope, axes, clock offset and exposure by several frames at once.
 
     The median decides: a wrong axis still fits the frames in which it hardly rotates. Where single frames say too
-    little, as short blurs do, all together decide, against what they say of a flipped axis.
+    little, as short blurs do, all together decide, against what they say of a flipped axis. Where they do not bear the
+    gyroscope out, what stands out of their quiet parts is asked again, each and all together.
 
     Parameters
     ----------
@@ -272,6 +273,18 @@ def judge_recording(evidence: Iterable[BlurEvidence], options: GateOptions | Non
         Thresholds.
     """
     options = options or GateOptions()
+    evidence = list(evidence)
+    verdict = _judged(evidence, options)
+    if verdict.trusted is False:
+        # a sky hides what stands below it
+        standing = [one.standing for one in evidence if one.standing is not None]
+        below = _judged(standing, options)
+        if below.trusted and sum(standing, BlurEvidence.nothing()).support >= options.min_recording_support:
+            return below
+    return verdict
+
+
+def _judged(evidence: Sequence[BlurEvidence], options: GateOptions) -> RecordingVerdict:
     telling = [one for one in evidence if one.enough]
     supports = [_support(one) for one in telling]
     median = float(np.median(supports)) if supports else 0.0
