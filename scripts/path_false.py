@@ -24,12 +24,12 @@ from rich.progress import track
 from turning_world import Light, Moment, Turning, TurningCamera
 
 from colmap_inertial.imaging.blur_field import BlurField
-from colmap_inertial.imaging.evidence import blur_evidence, shown_share
-from colmap_inertial.imaging.gate import GateOptions, RecordingVerdict, judge_frame, judge_recording, keep_sharp
+from colmap_inertial.imaging.evidence import blur_evidence, shown_shares
+from colmap_inertial.imaging.gate import GateOptions, RecordingVerdict, judge_frame, keep_sharp
 from colmap_inertial.imaging.path_filters import smoothed
 from colmap_inertial.imaging.psf import blur_field, blur_path
 from colmap_inertial.precalibrate import plan
-from colmap_inertial.precalibrate.judge import Looked, by_frame
+from colmap_inertial.precalibrate.judge import Looked, judged
 from colmap_inertial.stages.deblur import smoothing_for
 
 #: Shares of the picture that are sky, blurs, and the blurs at which gyroscopes are wrong, px.
@@ -120,19 +120,24 @@ def known_by(pair: Pair, index: int, wrong: Callable[[Turning], Turning] | None 
     return replace(pair, camera=camera).known(index, "exact")
 
 
-def judged(frames: Sequence[Grey], known: Sequence[Known]) -> RecordingVerdict:
-    """What the pipeline says of a recording: all frames together, and whether nearly each of them agrees."""
+def judgement(frames: Sequence[Grey], known: Sequence[Known]) -> RecordingVerdict:
+    """What the pipeline says of a recording."""
     looked = []
     for frame, one in zip(frames, known, strict=True):
         path = blur_path(*one)
-        looked.append(Looked(blur_evidence(frame, path), shown_share(frame, path), _length_px(path.field())))
-    return by_frame(judge_recording([one.evidence for one in looked]), looked)
+        share, mirrored = shown_shares(frame, path)
+        looked.append(Looked(blur_evidence(frame, path), share, _length_px(path.field()), mirrored))
+    return judged(looked)
+
+
+def options_for(verdict: RecordingVerdict, method: str) -> GateOptions:
+    """The pipeline's: where a recording is not trusted in all, each frame must be clear by itself."""
+    return GateOptions() if verdict.trusted else GateOptions(min_support=plan._CLEAR_SUPPORT[method])
 
 
 def gated(image: Grey, known: Known, verdict: RecordingVerdict, method: str) -> Grey | None:
     """What features see of a frame that goes through the gate, as ``DeblurStage`` has it; ``None`` as it was."""
-    options = GateOptions() if verdict.trusted else GateOptions(min_support=plan._CLEAR_SUPPORT[method])
-    factor, _ = judge_frame(image, blur_field(*known), verdict, options, blur_path(*known))
+    factor, _ = judge_frame(image, blur_field(*known), verdict, options_for(verdict, method), blur_path(*known))
     if factor is None:
         return None
     motion, camera, shutter = known
@@ -161,9 +166,10 @@ def mostly_sky(make: Callable[..., list[Pair]], *, console: Console) -> list[dic
         short = [pair.short(i) for pair, i in places]
         ways = {"right": (frames, right), "sharp": (short, right), **{name: (frames, k) for name, k in wrong.items()}}
         for name, (images, known) in track(list(ways.items()), f"{blur:g} px, sky {sky:.0%}", console=console):
-            verdict = judged(images, known)
+            verdict = judgement(images, known)
             treated = sum(
-                judge_frame(image, blur_field(*one), verdict, GateOptions(), blur_path(*one))[0] is not None
+                judge_frame(image, blur_field(*one), verdict, options_for(verdict, "wiener"), blur_path(*one))[0]
+                is not None
                 for image, one in zip(images, known, strict=True)
             )
             rows.append(
@@ -196,7 +202,7 @@ def false_gyroscopes(
         for name in track(("right", "sharp", *WRONG), f"{blur:g} px", console=console):
             shot = "sharp" if name == "sharp" else "as filmed"
             known = [[known_by(pair, i, WRONG.get(name)) for i in (0, 1)] for pair in pairs]
-            verdict = judged([image for two in frames[shot] for image in two], [one for two in known for one in two])
+            verdict = judgement([image for two in frames[shot] for image in two], [one for two in known for one in two])
             for method in methods:
                 after = treated = 0
                 for pair, images, two, alone in zip(pairs, frames[shot], known, before[shot], strict=True):

@@ -338,13 +338,15 @@ class Filter {
 
 std::vector<float> twiddles_of(int side) {
     std::vector<float> out;
-    for (int n = side; n >= 4; n /= 4)
-        for (int p = 0; p < n / 4; ++p)
-            for (int power = 1; power <= 3; ++power) {
+    for (int n = side, radix = 0; n >= 4; n /= radix) {
+        radix = n >= 16 ? 16 : 4;
+        for (int p = 0; p < n / radix; ++p)
+            for (int power = 1; power < radix; ++power) {
                 const double angle = -2 * PI * double(p) * power / n;
                 out.push_back(float(std::cos(angle)));
                 out.push_back(float(std::sin(angle)));
             }
+    }
     return out;
 }
 

@@ -71,6 +71,58 @@ void four_at_once(const Rows &from, const Rows &to, int n, int s, const float *t
     }
 }
 
+// a, b, c, d become their own transform.
+inline void transform_four(Complex &a, Complex &b, Complex &c, Complex &d) {
+    const Complex sum{a.re + c.re, a.im + c.im}, less{a.re - c.re, a.im - c.im}, other{b.re + d.re, b.im + d.im},
+        turn{d.im - b.im, b.re - d.re};  // i (b - d)
+    a = {sum.re + other.re, sum.im + other.im};
+    b = {less.re - turn.re, less.im - turn.im};
+    c = {sum.re - other.re, sum.im - other.im};
+    d = {less.re + turn.re, less.im + turn.im};
+}
+
+inline Complex turned(const Complex &v, float c, float s) { return {c * v.re - s * v.im, c * v.im + s * v.re}; }
+
+// As `four_at_once`, but half as many passes through memory.
+template <bool TURNED>
+void sixteen_at_once(const Rows &from, const Rows &to, int n, int s, const float *twiddles) {
+    constexpr float C = 0.92387953f, S = 0.38268343f, H = 0.70710678f;
+    const int m = n / 16;
+    for (int p = 0; p < m; ++p) {
+        const float *w = twiddles + 30 * p;
+        for (int q = 0; q < s; ++q) {
+            Complex v[16];
+#pragma GCC unroll 16
+            for (int j = 0; j < 16; ++j) v[j] = from.get(q + s * (p + m * j));
+#pragma GCC unroll 4
+            for (int j = 0; j < 4; ++j) transform_four(v[j], v[j + 4], v[j + 8], v[j + 12]);
+            v[5] = turned(v[5], C, -S);
+            v[9] = turned(v[9], H, -H);
+            v[13] = turned(v[13], S, -C);
+            v[6] = turned(v[6], H, -H);
+            v[10] = {v[10].im, -v[10].re};
+            v[14] = turned(v[14], -H, -H);
+            v[7] = turned(v[7], S, -C);
+            v[11] = turned(v[11], -H, -H);
+            v[15] = turned(v[15], -C, S);
+            const int at = q + s * 16 * p;
+#pragma GCC unroll 4
+            for (int r = 0; r < 4; ++r) {
+                Complex *y = v + 4 * r;
+                transform_four(y[0], y[1], y[2], y[3]);
+#pragma GCC unroll 4
+                for (int k = 0; k < 4; ++k) {
+                    const int place = r + 4 * k;
+                    if (TURNED && place)
+                        put_turned(to, at + s * place, y[k].re, y[k].im, w + 2 * (place - 1));
+                    else
+                        to.set(at + s * place, y[k].re, y[k].im);
+                }
+            }
+        }
+    }
+}
+
 void two_at_once(const Rows &from, const Rows &to, int s) {
     for (int q = 0; q < s; ++q) {
         const Complex a = from.get(q), b = from.get(q + s);
@@ -84,22 +136,24 @@ void two_at_once(const Rows &from, const Rows &to, int s) {
 void transform(int side, const float *twiddles, Rows from, Rows to, float *room) {
     const ptrdiff_t size = ptrdiff_t(side) * LANES + APART;
     int passes = 0;
-    for (int n = side; n > 1; n /= 4) ++passes;
+    for (int n = side; n > 1; n /= n >= 16 ? 16 : n >= 4 ? 4 : 2) ++passes;
     const Rows rooms[2] = {{room, room + size, LANES},
                            passes % 2 ? Rows{room + 2 * size, room + 3 * size, LANES} : to};
     int n = side, s = 1, next = 0;
     while (n > 1) {
-        const bool last = n == 4 || n == 2;
-        const Rows target = last ? to : rooms[next];
-        if (n == 2) {
+        const int radix = n >= 16 ? 16 : n >= 4 ? 4 : 2;
+        const Rows target = n == radix ? to : rooms[next];
+        if (radix == 2)
             two_at_once(from, target, s);
-            n = 1;
-        } else {
+        else if (radix == 4)
             four_at_once(from, target, n, s, twiddles);
-            twiddles += 6 * (n / 4);
-            n /= 4;
-            s *= 4;
-        }
+        else if (n == 16)
+            sixteen_at_once<false>(from, target, n, s, twiddles);
+        else
+            sixteen_at_once<true>(from, target, n, s, twiddles);
+        twiddles += 2 * (radix - 1) * (n / radix);
+        n /= radix;
+        s *= radix;
         from = target;
         next = 1 - next;
     }

@@ -198,12 +198,25 @@ def shown_share(image: NDArray[np.uint8] | NDArray[np.uint16], blur: BlurField |
     About 0 also where an image is blurred otherwise: textures decide then, and tiles are many. ``None`` where there is
     too little to tell.
     """
+    return shown_shares(image, blur)[0]
+
+
+def shown_shares(
+    image: NDArray[np.uint8] | NDArray[np.uint16], blur: BlurField | BlurPath
+) -> tuple[float | None, float | None]:
+    """As `shown_share`, and that of the blur that a gyroscope with one axis flipped would predict."""
     path = BlurPath.straight(blur) if isinstance(blur, BlurField) else blur
     found = _spectra(image, path, _FEW_TILES)
     if found is None:
-        return None
-    weight = _weights(found[0])
-    seen, expected, seen_mean, expected_mean = (weight * fall for fall in _falls(*found))
+        return None, None
+    logarithm, vectors, paths = found
+    return _share(*found), _share(logarithm, vectors * [1, -1], paths * [1, -1])
+
+
+def _share(logarithm: NDArray[np.float32], vectors: Array, path_px: Array) -> float | None:
+    weight = _weights(logarithm)
+    falls = _falls(logarithm, vectors, path_px)
+    seen, expected, seen_mean, expected_mean = (weight * fall for fall in falls)
     information = float((expected - _OWN_DIRECTION * expected_mean).sum())
     if information < _LEAST_INFORMATION:
         return None

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence, shown_share
+from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence, shown_shares
 from colmap_inertial.imaging.gate import (
     LEAST_SHARE,
     MUST_SHOW_PX,
@@ -29,6 +29,13 @@ _MOST_OF_THEM = 0.95
 #: A frame whose dip is faint bears the gyroscope out, too, where detail falls along the blur as it would have it, and
 #: no other direction shows a dip this deep.
 _OTHER_SUPPORT = 4.0
+#: Pictures whose tiles tell no more than this share of them would if all were alike are mostly sky. Common ones with
+#: short blur are at .8; 70 % of sky leaves .6.
+_STANDING = 0.7
+#: So many frames that are mostly sky bear the gyroscope out where so large a share of them shows the fall of detail, and
+#: they rather show it than the mirrored one by so many standard deviations of the mean. Right gyroscopes have .7 to 1
+#: and 3.8 to 5.6, wrong ones .45 and 3.2 at most, not both at once.
+_SKY_FRAMES, _SKY_SHARE, _SKY_SIGMAS = 5, 0.65, 3.0
 #: Where the pictures do not bear the gyroscope out, exposure times may be wrong by a common factor; these are tried.
 #: Twice the blur shows a dip, too, where the right one shows a deeper one.
 _EXPOSURE_FACTORS, _EXPOSURE_SUPPORT = (0.5, 2.0), 10.0
@@ -62,7 +69,7 @@ def judge_frames(
     for exposure times that are wrong by one factor, that is corrected, and said.
     """
     looked = _look(view, capture, chosen, parallaxes, progress)
-    verdict = by_frame(judge_recording([one.evidence for one in looked]), looked)
+    verdict = judged(looked)
     factors: tuple[float, ...] = _EXPOSURE_FACTORS
     if verdict.trusted is True:
         long_blur = np.median([one.blur_px for one in looked]) >= 2 * MUST_SHOW_PX
@@ -72,21 +79,36 @@ def judge_frames(
 
 @dataclass(frozen=True, eq=False)
 class Looked:
-    """What one picture says: its dips, the share that it shows of the predicted fall of detail, and that blur."""
+    """What one picture says: its dips, the share that it shows of the predicted fall of detail, that blur, and the
+    share that it shows of what a flipped axis would predict."""
 
     evidence: BlurEvidence
     share: float | None
     blur_px: float
+    mirrored_share: float | None = None
 
     @property
     def shows(self) -> bool:
         """Whether it bears the gyroscope out."""
         one = self.evidence
+        if self.is_mostly_sky and self.gain >= LEAST_SHARE and (self.share or 0.0) >= LEAST_SHARE:
+            return True
         if not one.extent_is_plausible:
             return False
         other = float(one.sigmas[:, 2:-1].max())
         faint = self.share is not None and self.share >= LEAST_SHARE and other < _OTHER_SUPPORT
         return one.support >= GateOptions().min_support or faint
+
+    @property
+    def gain(self) -> float:
+        """By how much it rather shows the gyroscope's direction than the mirrored one."""
+        return np.nan if self.share is None or self.mirrored_share is None else self.share - self.mirrored_share
+
+    @property
+    def is_mostly_sky(self) -> bool:
+        """Whether the few parts that stand out of it would go down among the quiet ones."""
+        standing = self.evidence.standing
+        return standing is not None and standing.tiles < _STANDING * self.evidence.tiles
 
 
 def _look(
@@ -105,8 +127,8 @@ def _look(
         progress("blur", len(looked), len(chosen))
         shutter, parallax = view.shutter(index[frame.name]), parallaxes.get(frame.name)
         path = blur_path(motion, camera, shutter, parallax=parallax, extent_factor=factor)
-        evidence, share = blur_evidence(frame.image, path), shown_share(frame.image, path)
-        looked.append(Looked(evidence, share, blur_px[frame.name]))
+        share, mirrored = shown_shares(frame.image, path)
+        looked.append(Looked(blur_evidence(frame.image, path), share, blur_px[frame.name], mirrored))
     progress("blur", len(chosen), len(chosen))
     return looked
 
@@ -126,7 +148,7 @@ def _with_other_exposures(
     for factor in factors:
         others = _look(view, capture, chosen, parallaxes, progress, factor)
         evidence = [one.evidence for one in others]
-        found, support = by_frame(judge_recording(evidence), others), _together(evidence)
+        found, support = judged(others), _together(evidence)
         if found.trusted is True and support >= _EXPOSURE_SUPPORT and support > deepest:
             whole = factor * found.extent_factor
             reason = (
@@ -139,6 +161,24 @@ def _with_other_exposures(
 
 def _together(evidence: Sequence[BlurEvidence]) -> float:
     return sum(evidence, BlurEvidence.nothing()).support
+
+
+def judged(looked: Sequence[Looked]) -> RecordingVerdict:
+    """What frames say together, and whether nearly each of them does."""
+    return by_frame(below_sky(judge_recording([one.evidence for one in looked]), looked), looked)
+
+
+def below_sky(verdict: RecordingVerdict, looked: Sequence[Looked]) -> RecordingVerdict:
+    """The verdict; or trust, where the frames are mostly sky and what stands below it falls off as it should."""
+    gains = np.array([one.gain for one in looked if one.is_mostly_sky and np.isfinite(one.gain)])
+    if verdict.trusted is not False or len(gains) < max(_SKY_FRAMES, len(looked) / 2):
+        return verdict
+    shown = sum(one.is_mostly_sky and one.shows for one in looked)
+    sigmas = float(gains.mean() / max(gains.std(ddof=1) / np.sqrt(len(gains)), 1e-9))
+    if shown < _SKY_SHARE * len(gains) or sigmas < _SKY_SIGMAS:
+        return verdict
+    reason = f"what stands below the sky bears out the gyroscope's blur ({sigmas:.0f} standard deviations)"
+    return replace(verdict, trusted=True, support=sigmas, extent_factor=1.0, reason=reason)
 
 
 def by_frame(verdict: RecordingVerdict, looked: Sequence[Looked]) -> RecordingVerdict:
