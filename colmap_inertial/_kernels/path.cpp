@@ -59,6 +59,7 @@ struct Common {
 // Memory of one thread.
 struct Room {
     Floats tile, other, power, doubt, scratch, real[8], cos_x, sin_x, cos_y, sin_y;
+    std::unique_ptr<double[]> angles;
     Spectrum spectrum, transfer, data, lean;
 
     Room(const Common &common, int samples) {
@@ -73,6 +74,7 @@ struct Room {
         transfer = {real[2].get(), real[3].get()};
         data = {real[4].get(), real[5].get()};
         lean = {real[6].get(), real[7].get()};
+        angles.reset(new double[4 * size_t(samples)]);
         cos_x = floats((side / 2 + 1) * size_t(samples));
         sin_x = floats((side / 2 + 1) * size_t(samples));
         cos_y = floats(size_t(common.square.half) * size_t(samples));
@@ -84,12 +86,14 @@ class Filter {
   public:
     Filter(const Light &light, const Tiles &tiles, const PathSimd &simd, int threads)
         : light_(light), tiles_(tiles), simd_(simd), threads_(threads), common_(tiles) {
-        height_ = (tiles.rows - 1) * tiles.hop + tiles.side;
         width_ = (tiles.columns - 1) * tiles.hop + tiles.side;
         // of the result, only columns that count are transformed back
         begin_ = 0, end_ = tiles.side;
         while (begin_ < end_ && tiles.window_out[begin_] == 0) ++begin_;
         while (end_ > begin_ && tiles.window_out[end_ - 1] == 0) --end_;
+        // where the image, mirrored about its borders, has what the tiles' columns show
+        columns_of_.resize(size_t(width_));
+        for (int x = 0; x < width_; ++x) columns_of_[x] = mirrored(x - tiles.before, light.width) * light.channels;
         first_ = begin_ / MOST_LANES * MOST_LANES;
         columns_ = (end_ - first_ + 2 * MOST_LANES - 1) / (2 * MOST_LANES) * MOST_LANES;
         first_ = std::min(first_, tiles.side - 2 * columns_);
@@ -121,7 +125,6 @@ class Filter {
             },
             1);
         std::fill(result, result + size_t(light_.height) * light_.width * light_.channels, 0.0f);
-        extend();
         // Tiles that do not touch go together. So every pixel is added up in the same order, whatever the threads.
         for (const int phase : {0, 1, 2, 3}) {
             const int top = phase / 2, left = phase % 2;
@@ -140,7 +143,6 @@ class Filter {
                 return x * x + y * y > double(above) * above ? times : 0.0;
             },
             0);
-        extend();
         const int rows = (tiles_.rows + every - 1) / every, columns = (tiles_.columns + every - 1) / every;
         std::vector<float> found(size_t(light_.channels) * rows * columns * 3);
         in_parallel(rows * columns, threads_, [&](int i) {
@@ -162,21 +164,6 @@ class Filter {
     }
 
   private:
-    // The image in planes, mirrored about its borders as far as the tiles go.
-    void extend() {
-        planes_ = unset(size_t(light_.channels) * height_ * width_);
-        std::vector<int> columns(size_t(width_), 0);
-        for (int x = 0; x < width_; ++x) columns[x] = mirrored(x - tiles_.before, light_.width) * light_.channels;
-        in_parallel(height_, threads_, [&](int y) {
-            const float *row = light_.values +
-                               size_t(mirrored(y - tiles_.before, light_.height)) * light_.width * light_.channels;
-            for (int channel = 0; channel < light_.channels; ++channel) {
-                float *out = planes_.get() + (size_t(channel) * height_ + y) * width_;
-                for (int x = 0; x < width_; ++x) out[x] = row[columns[x] + channel];
-            }
-        });
-    }
-
     // Rooms are used again: to make one takes as long as to filter a tile.
     std::unique_ptr<Room> take() {
         {
@@ -196,14 +183,10 @@ class Filter {
     }
 
     void find_transfer(int row, int column, Room &room) const {
-        const int samples = tiles_.samples, half = common_.square.half, side = tiles_.side;
+        const int samples = tiles_.samples;
         const float *path = tiles_.paths + (size_t(row) * tiles_.columns + column) * samples * 2;
-        for (int k = 0; k < samples; ++k) {
-            turns(2 * PI * double(path[2 * k]) / side, side / 2 + 1, room.cos_x.get() + k, room.sin_x.get() + k,
-                  samples);
-            turns(2 * PI * double(path[2 * k + 1]) / side, side / 2 + 1, room.cos_y.get() + size_t(k) * half,
-                  room.sin_y.get() + size_t(k) * half, 1);
-        }
+        simd_.turns(common_.square, samples, path, room.angles.get(), room.cos_x.get(), room.sin_x.get(),
+                    room.cos_y.get(), room.sin_y.get());
         simd_.transfer(common_.square, samples, room.cos_x.get(), room.sin_x.get(), room.cos_y.get(), room.sin_y.get(),
                        room.transfer);
     }
@@ -230,36 +213,27 @@ class Filter {
         return true;
     }
 
-    // Cosines and sines of the multiples of an angle.
-    static void turns(double angle, int count, float *cosines, float *sines, ptrdiff_t step) {
-        const double c = std::cos(angle), s = std::sin(angle);
-        double re = 1, im = 0;
-        for (int i = 0; i < count; ++i) {
-            cosines[i * step] = float(re);
-            sines[i * step] = float(im);
-            const double next = re * c - im * s;
-            im = re * s + im * c;
-            re = next;
-        }
-    }
-
     // Transforms a tile, without its mean and windowed; returns the mean.
     float load_tile(int row, int column, int channel, Room &room) const {
         const int side = tiles_.side, pitch = common_.square.pitch;
-        const float *from = planes_.get() + (size_t(channel) * height_ + row * tiles_.hop) * width_ +
-                            column * tiles_.hop;
-        // columns side by side: a sum along a row would wait for itself
-        float *sums = room.scratch.get();
+        const int first_y = row * tiles_.hop - tiles_.before, first_x = column * tiles_.hop - tiles_.before;
+        const bool inside = light_.channels == 1 && first_x >= 0 && first_x + side <= light_.width;
+        const int *columns = columns_of_.data() + column * tiles_.hop;
+        float *sums = room.scratch.get(), *line = sums + side;
         std::fill_n(sums, side, 0.0f);
-        for (int y = 0; y < side; ++y)
-            for (int x = 0; x < side; ++x) sums[x] += from[size_t(y) * width_ + x];
-        const float mean = float(std::accumulate(sums, sums + side, 0.0) / (double(side) * side));
         for (int y = 0; y < side; ++y) {
-            const float *line = from + size_t(y) * width_;
-            float *out = room.tile.get() + size_t(y) * pitch;
-            const float weight = tiles_.window_in[y];
-            for (int x = 0; x < side; ++x) out[x] = (line[x] - mean) * (weight * tiles_.window_in[x]);
+            const float *from =
+                light_.values + size_t(mirrored(first_y + y, light_.height)) * light_.width * light_.channels;
+            if (inside)
+                from += first_x;
+            else {
+                for (int x = 0; x < side; ++x) line[x] = from[columns[x] + channel];
+                from = line;
+            }
+            simd_.take(side, from, room.tile.get() + size_t(y) * pitch, sums);
         }
+        const float mean = float(std::accumulate(sums, sums + side, 0.0) / (double(side) * side));
+        simd_.fade(common_.square, mean, tiles_.window_in, room.tile.get());
         simd_.forward(common_.square, common_.twiddles.data(), room.tile.get(), room.spectrum, room.scratch.get());
         return mean;
     }
@@ -318,18 +292,20 @@ class Filter {
             const float weight = down[y];
             const float *from = room.tile.get() + size_t(y) * common_.square.pitch;
             float *out = result + (size_t(first_y + y) * light_.width + first_x) * light_.channels + channel;
-            for (int x = from_x; x < to_x; ++x)
-                out[x * light_.channels] += weight * along[x] * (from[x] + mean);
+            if (light_.channels == 1)
+                simd_.add(to_x - from_x, weight, mean, along + from_x, from + from_x, out + from_x);
+            else
+                for (int x = from_x; x < to_x; ++x) out[x * light_.channels] += weight * along[x] * (from[x] + mean);
         }
     }
 
     Light light_;
     Tiles tiles_;
     const PathSimd &simd_;
-    int threads_, height_, width_, begin_, end_, first_, columns_;
+    int threads_, width_, begin_, end_, first_, columns_;
     std::vector<float> shares_[4];
+    std::vector<int> columns_of_;
     Common common_;
-    Floats planes_;
     std::mutex lock_;
     std::vector<std::unique_ptr<Room>> rooms_;
 };

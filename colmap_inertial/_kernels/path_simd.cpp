@@ -260,6 +260,79 @@ void inverse(const Square &square, const float *twiddles, Spectrum in, int first
     }
 }
 
+void take(int count, const float *from, float *to, float *sums) {
+    for (int x = 0; x < count; x += LANES) {
+        const Vector v = load(from + x);
+        store(to + x, v);
+        store(sums + x, load(sums + x) + v);
+    }
+}
+
+void fade(const Square &square, float mean, const float *window, float *tile) {
+    for (int y = 0; y < square.side; ++y) {
+        float *row = tile + y * ptrdiff_t(square.pitch);
+        const float weight = window[y];
+        for (int x = 0; x < square.side; x += LANES)
+            store(row + x, (load(row + x) - mean) * (weight * load(window + x)));
+    }
+}
+
+void add(int count, float weight, float mean, const float *share, const float *value, float *out) {
+    int x = 0;
+    for (; x + LANES <= count; x += LANES)
+        store(out + x, load(out + x) + weight * load(share + x) * (load(value + x) + mean));
+    for (; x < count; ++x) out[x] += weight * share[x] * (value[x] + mean);
+}
+
+// Each by turning the one before, in double precision: along x all samples side by side, along y the first ones of a
+// sample, then all of these at once.
+void turns(const Square &square, int samples, const float *path, double *room, float *cos_x, float *sin_x, float *cos_y,
+           float *sin_y) {
+    const double turn = 6.283185307179586476925 / square.side;
+    double *c = room, *s = c + samples, *re = s + samples, *im = re + samples;
+    for (int k = 0; k < samples; ++k) {
+        c[k] = __builtin_cos(turn * double(path[2 * k]));
+        s[k] = __builtin_sin(turn * double(path[2 * k]));
+        re[k] = 1;
+        im[k] = 0;
+    }
+    for (int i = 0; i <= square.side / 2; ++i) {
+        float *cosines = cos_x + i * ptrdiff_t(samples), *sines = sin_x + i * ptrdiff_t(samples);
+#pragma GCC ivdep
+        for (int k = 0; k < samples; ++k) {
+            cosines[k] = float(re[k]);
+            sines[k] = float(im[k]);
+            const double next = re[k] * c[k] - im[k] * s[k];
+            im[k] = re[k] * s[k] + im[k] * c[k];
+            re[k] = next;
+        }
+    }
+    for (int k = 0; k < samples; ++k) {
+        const double angle = turn * double(path[2 * k + 1]), one_c = __builtin_cos(angle), one_s = __builtin_sin(angle);
+        float first_c[LANES], first_s[LANES];
+        double x = 1, y = 0;
+        for (int i = 0; i < LANES; ++i) {
+            first_c[i] = float(x);
+            first_s[i] = float(y);
+            const double next = x * one_c - y * one_s;
+            y = x * one_s + y * one_c;
+            x = next;
+        }
+        const Vector base_c = load(first_c), base_s = load(first_s);
+        const double all_c = x, all_s = y;
+        x = 1, y = 0;
+        float *cosines = cos_y + k * ptrdiff_t(square.half), *sines = sin_y + k * ptrdiff_t(square.half);
+        for (int i = 0; i <= square.side / 2; i += LANES) {
+            const float a = float(x), b = float(y);
+            store(cosines + i, a * base_c - b * base_s);
+            store(sines + i, a * base_s + b * base_c);
+            const double next = x * all_c - y * all_s;
+            y = x * all_s + y * all_c;
+            x = next;
+        }
+    }
+}
+
 // Rows x and -x share their sums of products. The highest frequencies have no sign: of a curve, their two halves would not
 // agree. They are left out, as is what does not count.
 void transfer(const Square &square, int samples, const float *cos_x, const float *sin_x, const float *cos_y,
@@ -462,5 +535,5 @@ void shrink(const Square &square, const float *tile, float splitting, float thre
 
 }  // namespace
 
-extern const PathSimd JOIN(path_simd_, SIMD) = {TEXT(SIMD), forward,   inverse, transfer, doubt, fit,
-                                                restore,    correlate, weigh,   quiet,    blend, shrink};
+extern const PathSimd JOIN(path_simd_, SIMD) = {TEXT(SIMD), forward,   inverse, take,  fade,  add,    turns, transfer,
+                                                doubt,      fit,       restore, correlate, weigh, quiet, blend, shrink};

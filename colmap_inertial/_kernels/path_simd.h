@@ -30,6 +30,16 @@ struct PathSimd {
     // the side), multiples of MOST_LANES
     void (*inverse)(const Square &square, const float *twiddles, Spectrum in, int first, int count, float *tile,
                     float *room);
+    // a row of a tile, added to its columns' sums, too
+    void (*take)(int count, const float *from, float *to, float *sums);
+    // a tile without its mean, times the window along both sides
+    void (*fade)(const Square &square, float mean, const float *window, float *tile);
+    // out += weight share (value + mean)
+    void (*add)(int count, float weight, float mean, const float *share, const float *value, float *out);
+    // cosines and sines of the multiples of a path's angles, as `transfer` takes them; path: `samples` pairs of px;
+    // room: four times `samples` doubles
+    void (*turns)(const Square &square, int samples, const float *path, double *room, float *cos_x, float *sin_x,
+                  float *cos_y, float *sin_y);
     // transfer = mean over k of exp(i (x ax_k + y ay_k)), from (side / 2 + 1) x samples cosines and sines along x and
     // samples rows of `half` cosines and sines along y
     void (*transfer)(const Square &square, int samples, const float *cos_x, const float *sin_x, const float *cos_y,
