@@ -1,8 +1,8 @@
 """Recordings that are mostly sky, and gyroscopes that are wrong: what the gate trusts, and what is left of the matches.
 
-For ``bench_path.py --only sky false``. Exposures are as long as the blur takes, along the recording's own turns. Above
-a horizon there may be a sky: bright, with a gradient and soft clouds, noise and JPEG as everywhere; what stands below
-it lies in its own shadow.
+For ``bench_path.py --only sky false short``. Exposures are as long as the blur takes, along the recording's own turns.
+Above a horizon there may be a sky: bright, with a gradient and soft clouds, noise and JPEG as everywhere; what stands
+below it lies in its own shadow.
 """
 
 from __future__ import annotations
@@ -34,6 +34,8 @@ from colmap_inertial.stages.deblur import smoothing_for
 
 #: Shares of the picture that are sky, blurs, and the blurs at which gyroscopes are wrong, px.
 SKIES, SKY_PX, FALSE_PX = (0.7, 0.9), (6.0, 10.0), (10.0, 20.0)
+#: Little blur, px, of small pictures: `GateOptions.skip_below_own_px` lies among these.
+SHORT_PX, SMALL = (1.0, 1.5, 2.0, 3.0), (640, 360)
 #: Light below a sky, as a share of what it would be without.
 _SHADOW = 0.35
 #: Seconds between pairs; slower turns would take longer exposures.
@@ -227,3 +229,43 @@ def false_gyroscopes(
 
 def _features(image: Grey) -> metrics.Features:
     return metrics.extract(image, 0)
+
+
+def short_blur(make: Callable[..., list[Pair]], methods: Sequence[str], *, console: Console) -> list[dict[str, Any]]:
+    """Small pictures with little blur, treated whatever the gate would say: correct matches and PSNR, before and after.
+
+    The gyroscope is right, or wrong in the three ways of ``quality``.
+    """
+    rows = []
+    for blur in track(SHORT_PX, "little blur", console=console):
+        pairs = make(blur, size=SMALL)
+        frames = [[pair.frame(i) for i in (0, 1)] for pair in pairs]
+        sharp = [[pair.sharp(i) for i in (0, 1)] for pair in pairs]
+        before = _matches(pairs, frames)
+        before_db = _psnr_db(frames, sharp)
+        for gyro in ("exact", "errors"):
+            for method in methods:
+                made = [
+                    [METHODS[method](image, *pair.known(i, gyro)) for i, image in enumerate(two)]
+                    for pair, two in zip(pairs, frames, strict=True)
+                ]
+                rows.append(
+                    {
+                        "blur_px": blur,
+                        "gyroscope": gyro,
+                        "method": method,
+                        "untreated": before,
+                        "ratio": _matches(pairs, [[m.for_features for m in two] for two in made]) / max(before, 1),
+                        "gained_db": _psnr_db([[m.for_people for m in two] for two in made], sharp) - before_db,
+                    }
+                )
+    return rows
+
+
+def _matches(pairs: Sequence[Pair], frames: Sequence[Sequence[Grey]]) -> int:
+    return sum(pair.correct_matches(*map(_features, two))[0] for pair, two in zip(pairs, frames, strict=True))
+
+
+def _psnr_db(frames: Sequence[Sequence[Grey]], sharp: Sequence[Sequence[Grey]]) -> float:
+    each = [metrics.psnr_db(a, b) for two in zip(frames, sharp, strict=True) for a, b in zip(*two, strict=True)]
+    return float(np.mean(each))

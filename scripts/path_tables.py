@@ -36,6 +36,8 @@ def print_report(report: dict[str, Any], console: Console) -> None:
         _sky(report["sky"], console)
     if "false" in report:
         _false(report["false"], console)
+    if "short" in report:
+        _short(report["short"], console)
     if "cost" in report:
         _cost(report["cost"], console)
     if "colmap" in report:
@@ -133,6 +135,23 @@ def _false(rows: list[dict[str, Any]], console: Console) -> None:
             str(row["trusted"]),
             _verdict(row["kept"], KEPT, f"{row['kept']:.3f}"),
             f"{row['treated']}/{row['frames']}",
+        )
+    console.print(table)
+
+
+def _short(rows: list[dict[str, Any]], console: Console) -> None:
+    table = table_of(
+        "Little blur in pictures of 640 px, treated against untreated",
+        *("gyroscope", "blur px", "method", "untreated matches", "times", "PSNR gained dB"),
+    )
+    for row in rows:
+        table.add_row(
+            row["gyroscope"],
+            f"{row['blur_px']:g}",
+            row["method"],
+            str(row["untreated"]),
+            f"{row['ratio']:.3f}",
+            f"{row['gained_db']:+.2f}",
         )
     console.print(table)
 

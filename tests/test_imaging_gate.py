@@ -66,12 +66,20 @@ def flipped_gyro():
     return replace(gyro, path=GyroPath(gyro.path.t_s, rate, np.zeros(3)))
 
 
+def reversed_gyro(sign):
+    """As if the recording had been played backwards."""
+    gyro = scene().gyro()
+    return replace(gyro, path=GyroPath(gyro.path.t_s, sign * gyro.path.rate_rad_s[::-1], np.zeros(3)))
+
+
 def predicted(shutter, error):
     """The blur field as a gyroscope with an error says."""
     camera = colmap_camera(LENS)
     gyro = {
         "flipped axis": flipped_gyro,
         "noise": lambda: scene().gyro(noise_rad_s=0.2, seed=int(1e3 * shutter.t_s)),
+        "backwards": lambda: reversed_gyro(1.0),
+        "backwards, sign": lambda: reversed_gyro(-1.0),
         "10 ms late": lambda: scene().gyro(late_s=0.01),
     }.get(error, scene().gyro)()
     field = blur_field(gyro, camera, shutter)
@@ -134,7 +142,9 @@ def test_what_is_blurred_is_deblurred(blur_px):
     assert ratio(blur_px, "none") > {6: 1.15, 12: 1.4}[blur_px]
 
 
-@pytest.mark.parametrize("error", ["flipped axis", "noise", "20 % long", "20 % short", "10 ms late"])
+@pytest.mark.parametrize(
+    "error", ["flipped axis", "noise", "20 % long", "20 % short", "10 ms late", "backwards", "backwards, sign"]
+)
 def test_a_wrong_gyroscope_loses_no_matches(error):
     assert ratio(12, error) >= 0.95
 

@@ -37,7 +37,7 @@ from colmap_inertial.model import TRANSFORM_FILE
 from colmap_inertial.model.similarities import ModelScale, plain_factor
 from colmap_inertial.options import ExposureOptions, MappingOptions, ProjectOptions, ReconstructOptions
 from colmap_inertial.precalibrate import calibrate, plan as imaging
-from colmap_inertial.precalibrate.judge import Looked, by_frame
+from colmap_inertial.precalibrate.judge import Looked, below_sky, by_frame
 from colmap_inertial.precalibrate.pairs import exposure_stage
 from colmap_inertial.precalibrate.plan import Treatments, plan_imaging
 from colmap_inertial.precalibrate.preflight import stop_or_doubt
@@ -585,9 +585,11 @@ class Shown:
     """What a frame says of the gyroscope's blur."""
 
     enough = extent_is_plausible = True
+    tiles = 100.0
 
-    def __init__(self, support, other=0.0):
+    def __init__(self, support, other=0.0, standing=90.0):
         self.support = support
+        self.standing = SimpleNamespace(tiles=standing)
         self.sigmas = np.full((19, 12), other)
 
 
@@ -600,8 +602,27 @@ def test_a_gyroscope_is_trusted_for_all_frames_where_nearly_all_bear_it_out(clea
     faintly, elsewhere = Looked(Shown(1.0), 0.5, 20.0), Looked(Shown(1.0, other=6.0), 0.5, 20.0)
     assert by_frame(verdict, [clearly] * clear + [faintly] * (20 - clear)).trusted is True
     assert by_frame(verdict, [clearly] * clear + [elsewhere] * (20 - clear)).trusted is trusted
+    # of a sky, what stands below it must show the gyroscope's direction rather than the mirrored one, in most frames
+    below, neither = (Looked(Shown(1.0, other=6.0, standing=40.0), 0.5, 20.0, mirrored) for mirrored in (0.1, 0.4))
+    assert by_frame(verdict, [clearly] * clear + [below] * (20 - clear)).trusted is True
+    assert by_frame(verdict, [clearly] * clear + [neither] * (20 - clear)).trusted is trusted
     # short blur tells nothing
     assert by_frame(verdict, [clearly] * clear + [replace(hardly, blur_px=5.0)] * (20 - clear)).trusted is True
+
+
+def test_a_gyroscope_that_few_dips_show_is_borne_out_by_what_stands_below_the_sky():
+    refused = imaging.RecordingVerdict(trusted=False, support=1.0, extent_factor=1.0, frames=10, reason="")
+    rng = np.random.default_rng(0)
+
+    def looked(share, mirrored, standing=40.0, count=10):
+        draws = rng.normal([share, mirrored], 0.1, (count, 2))
+        return [Looked(Shown(1.0, standing=standing), a, 6.0, b) for a, b in draws]
+
+    assert below_sky(refused, looked(0.6, 0.0)).trusted is True
+    wrong = [looked(0.0, 0.6), looked(0.0, 0.0), looked(0.6, 0.6), looked(0.6, 0.0, standing=90.0)]
+    for one in (*wrong, looked(0.6, 0.0, count=4), looked(0.6, 0.0)[:5] + looked(-0.6, 0.0)[:5]):
+        assert below_sky(refused, one) is refused
+    assert below_sky(replace(refused, trusted=None), looked(0.6, 0.0)).trusted is None
 
 
 def test_the_middle_of_a_recording_stands_for_it():

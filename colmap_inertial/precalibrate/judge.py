@@ -26,15 +26,17 @@ from colmap_inertial.stages.gyro_view import GyroView
 
 #: A gyroscope that is borne out by this share of them is trusted for all frames.
 _MOST_OF_THEM = 0.95
+#: Of frames that are mostly sky, this share: of the little that stands below it, the fall of detail scatters by .2.
+_MOST_OF_SKIES = 0.85
 #: A frame whose dip is faint bears the gyroscope out, too, where detail falls along the blur as it would have it, and
 #: no other direction shows a dip this deep.
 _OTHER_SUPPORT = 4.0
 #: Pictures whose tiles tell no more than this share of them would if all were alike are mostly sky. Common ones with
 #: short blur are at .8; 70 % of sky leaves .6.
 _STANDING = 0.7
-#: So many frames that are mostly sky bear the gyroscope out where so large a share of them shows the fall of detail, and
-#: they rather show it than the mirrored one by so many standard deviations of the mean. Right gyroscopes have .7 to 1
-#: and 3.8 to 5.6, wrong ones .45 and 3.2 at most, not both at once.
+#: So many frames that are mostly sky bear the gyroscope out where so large a share of them shows the fall of detail,
+#: and they rather show it than the mirrored one by so many standard deviations of the mean. Right gyroscopes have .7 to
+#: 1 and 3.8 to 5.6, wrong ones .45 and 3.2 at most, not both at once.
 _SKY_FRAMES, _SKY_SHARE, _SKY_SIGMAS = 5, 0.65, 3.0
 #: Where the pictures do not bear the gyroscope out, exposure times may be wrong by a common factor; these are tried.
 #: Twice the blur shows a dip, too, where the right one shows a deeper one.
@@ -188,7 +190,8 @@ def by_frame(verdict: RecordingVerdict, looked: Sequence[Looked]) -> RecordingVe
     """
     telling = [one for one in looked if one.evidence.enough and one.blur_px >= MUST_SHOW_PX]
     shown = sum(one.shows for one in telling)
-    if verdict.trusted is not True or shown >= _MOST_OF_THEM * len(telling):
+    skies = 2 * sum(one.is_mostly_sky for one in telling) > len(telling)
+    if verdict.trusted is not True or shown >= (_MOST_OF_SKIES if skies else _MOST_OF_THEM) * len(telling):
         return verdict
     reason = (
         f"{shown} of {len(telling)} frames that were looked at bear out the gyroscope's blur, so each frame must do so "
