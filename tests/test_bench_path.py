@@ -11,15 +11,19 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 import bench_path
+import path_false
 import path_methods
 import path_reconstructions
 import path_scenes
 import path_tables
+import recorded_orbits
 from imaging_scenes import drawn_walls
+from restoration.handheld import Handheld
 from rich.console import Console
 from turning_world import Moment, Turning, TurningCamera
 
 from colmap_inertial.imaging.psf import blur_path
+from colmap_inertial.simulate import MotionOptions, make_motion
 
 SIZE = (480, 270)
 
@@ -187,3 +191,43 @@ def test_reconstructions_are_compared_by_medians():
     assert values["wiener: camera error / rectified"] == pytest.approx(0.6)
     assert values["wiener: points / rectified"] == pytest.approx(1.6)
     assert values["wiener: least share of images registered"] == 1.0
+
+
+def test_wrong_gyroscopes_are_wrong_in_their_own_way_and_skies_take_their_share():
+    one = pair()
+    middle_s = one.moments[0].t_s + 0.5 * one.moments[0].exposure_s
+    steps = turning().rate_rad_s
+    for name, wrong in path_false.WRONG.items():
+        other = wrong(turning())
+        assert len(other.t_s) == len(steps) and (np.diff(other.t_s) > 0).all(), name
+        rates = [np.array([np.interp(middle_s, t.t_s, v) for v in t.rate_rad_s.T]) for t in (turning(), other)]
+        assert np.linalg.norm(rates[1] - rates[0]) > 0.03 * np.linalg.norm(rates[0]), name
+    twice = path_false.WRONG["backwards"](path_false.WRONG["backwards"](turning()))
+    np.testing.assert_allclose(twice.rate_rad_s, steps)
+    # all axes negative: the same line, and the curve about its middle turned by half a turn
+    right, mirrored = (blur_path(*path_false.known_by(one, 0, wrong)) for wrong in (None, path_false.WRONG["sign"]))
+    ends = [path.path_px[-1] - path.path_px[0] for path in (right, mirrored)]
+    np.testing.assert_allclose(ends[1], -ends[0], atol=0.1 * np.abs(ends[0]).max())
+    wall = drawn_walls(1, 2)[0]
+    below = path_false.below_sky(wall, 270, 0.7, seed=1)
+    top = (len(wall) - 270) // 2
+    same = np.abs(below - 0.35 * wall).max(axis=1)[top : top + 270] < 1e-6
+    assert same.mean() == pytest.approx(0.3, abs=0.01) and not same[:180].any()
+
+
+def test_a_recorded_hand_swings_about_the_simulator_s_orbit():
+    t_s = np.arange(0.0, 9.0, 0.005)
+    tilt = 0.05 * np.sin(2 * np.pi * 2.0 * t_s)
+    rate = np.outer(np.gradient(tilt, t_s), [0.0, 1.0, 0.0]) @ recorded_orbits.BODY_FROM_CAM.T
+    hand = Handheld(t_s=t_s, rate_rad_s=rate, velocity_m_s=np.zeros((len(t_s), 3)))
+    turn, shift_m = recorded_orbits.swings(hand, np.arange(0.0, 9.0, 1 / 60))
+    expected = np.interp(np.arange(0.0, 9.0, 1 / 60), t_s, tilt)
+    np.testing.assert_allclose(turn[60:-60, 1], expected[60:-60], atol=0.006)
+    assert np.abs(turn[60:-60, [0, 2]]).max() < 0.003 and np.abs(shift_m).max() < 1e-9
+    options = MotionOptions(kind="orbit", duration_s=2.0, vigour=0.8)
+    still = make_motion(replace(options, vigour=0.0), np.random.default_rng(1))
+    held = recorded_orbits.orbit(options, np.random.default_rng(1), hand)
+    at = np.linspace(-2.0, 4.0, 50)
+    np.testing.assert_allclose(held.cam_in_world_m(at), still.cam_in_world_m(at), atol=1e-3)
+    cosine = np.abs((held.world_from_cam_xyzw(at) * still.world_from_cam_xyzw(at)).sum(axis=1))
+    assert 0.03 < 2 * np.arccos(np.clip(cosine, 0, 1)).max() < 0.07
