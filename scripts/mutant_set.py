@@ -1349,8 +1349,8 @@ MUTANTS = (
     ),
     Mutant(
         "precalibrate/judge.py",
-        "if verdict.trusted is not True or shown >= _MOST_OF_THEM * len(telling):",
-        "if verdict.trusted is not True or shown >= (1 - _MOST_OF_THEM) * len(telling):",
+        "if verdict.trusted is not True or shown >= most * len(telling):",
+        "if verdict.trusted is not True or shown >= (1 - most) * len(telling):",
         "a gyroscope that few frames bear out is trusted for all",
         ("run_steps::test_a_gyroscope_is_trusted_for_all_frames_where_nearly_all_bear_it_out",),
     ),

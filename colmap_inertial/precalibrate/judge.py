@@ -191,7 +191,8 @@ def by_frame(verdict: RecordingVerdict, looked: Sequence[Looked]) -> RecordingVe
     telling = [one for one in looked if one.evidence.enough and one.blur_px >= MUST_SHOW_PX]
     shown = sum(one.shows for one in telling)
     skies = 2 * sum(one.is_mostly_sky for one in telling) > len(telling)
-    if verdict.trusted is not True or shown >= (_MOST_OF_SKIES if skies else _MOST_OF_THEM) * len(telling):
+    most = _MOST_OF_SKIES if skies else _MOST_OF_THEM
+    if verdict.trusted is not True or shown >= most * len(telling):
         return verdict
     reason = (
         f"{shown} of {len(telling)} frames that were looked at bear out the gyroscope's blur, so each frame must do so "
