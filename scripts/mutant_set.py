@@ -1775,6 +1775,16 @@ MUTANTS = (
         ("refine::test_derivatives_of_the_imu_are_those_of_finite_differences",),
     ),
     Mutant(
+        "refine/levels.py",
+        "right = max(count - explained, 0.01 * count)",
+        "right = count",
+        "what the fit explains of the accelerometer's residuals counts as quiet",
+        (
+            "refine_levels::test_the_noise_is_the_simulator_s_whatever_was_thought_of_it",
+            "refine_levels::test_the_level_is_that_of_the_greatest_likelihood",
+        ),
+    ),
+    Mutant(
         "refine/judge.py",
         "if change >= -spread:",
         "if False:",

@@ -1,7 +1,7 @@
 """What the tight refinement does to simulated walks: camera centres, drift of scale, and the calibration.
 
     python scripts/study_refine.py [--metres 100] [--readout-ms 0] [--undeclared] [--expected] [--seeds 1 2]
-        [--spoil late] [--out F]
+        [--chance] [--spoil late] [--out F]
     python scripts/study_refine.py --loop [--seeds 1 2]
 
 Points beside the way are tracked as features are (no pictures are rendered), and COLMAP's own bundle adjustment makes
@@ -14,6 +14,11 @@ path over that of the first, in per cent; of the calibration, error and normalis
 Seconds are the processor's (one), memory is the most until then. ``--spoil`` falsifies the IMU: another recording's, 30
 ms late, an axis of the accelerometer flipped, or 5 % more of it. ``--expected``: a device whose axes and gains are as
 far off as the refinement's priors have it, and not as a phone's: what tells whether the rotation's covariance is right.
+
+``--chance`` prints what the refinement's covariance says of its camera centres after one similarity: the error that is
+to be expected, of it and of pictures alone, in millimetres; the normalised error of the path's shape (rms over its 12
+weakest ways to bend, 1 where the covariance is right); and how often the refined centres of such a walk lie more than
+1.1 times as far off as COLMAP's by chance: COLMAP's error is the refinement's and one that is independent of it.
 """
 
 import argparse
@@ -31,6 +36,10 @@ from check_euroc import similarity
 from colmap_inertial.geometry import matrix_from_quat, quat_exp, quat_multiply, so3_log
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.model import Model
+from colmap_inertial.refine.motion import moving
+from colmap_inertial.refine.setup import at_middle_lines, make_problem, pictures_alone, read_seen
+from colmap_inertial.refine.solve import factored, solve
+from colmap_inertial.refine.values import Estimate, Problem
 from colmap_inertial.scale.priors import PRIORS
 from colmap_inertial.simulate.motion import MotionOptions
 from colmap_inertial.simulate.tracks import TrackOptions, Tracks, simulate_tracks
@@ -43,6 +52,8 @@ from colmap_inertial.types import CAL, CameraImuCalibration, ImuRecording
 
 #: Of an IMU that is late.
 LATE_S = 0.03
+#: Of what is to be expected: frames whose centres are looked at, ways to bend, draws.
+CENTRES, WAYS, DRAWS = 200, 12, 2000
 
 
 def adjusted(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
@@ -108,7 +119,54 @@ def ring() -> TrackOptions:
     return TrackOptions(motion=motion, vibration_m_s2=0.3, frame_rate_hz=3.0, points_per_m=8.0, life_s=1e3)
 
 
-def studied(options: TrackOptions, seed: int, spoil: str, *, declared: bool = True) -> dict[str, Any]:
+def centres_cov(problem: Problem, x: Estimate, some: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """(3 K, 3 K) covariance of K camera centres but for one similarity."""
+    cov = factored(problem, x).centres_cov(some, moving(problem, x))
+    away, count = truth - truth.mean(axis=0), len(some)
+    free = np.zeros((count, 3, 7))
+    free[:, :, :3], free[:, :, 3] = np.eye(3), away
+    free[:, :, 4:] = np.cross(np.eye(3)[None], away[:, None]).transpose(0, 2, 1)
+    basis, _ = np.linalg.qr(free.reshape(3 * count, 7))
+    left = np.eye(3 * count) - basis @ basis.T
+    return left @ cov @ left
+
+
+def by_chance(stage: RefineStage, before: Model, after: Model, truth: np.ndarray, seed: int) -> dict[str, float]:
+    """What is to be expected of a refined walk, and whether it came so."""
+    seen = read_seen(before.reconstruction, before.timing)
+    values = after.treatments[-1].values
+    known = stage._known(before)
+    known = replace(known, noise=replace(known.noise, accel_density_m_s2_rthz=values["accel_noise_m_s2_rthz"]))
+    problem, start = make_problem(seen, before.timing, stage.imu, known, stage._exposed_px(before, seen))
+    alone = pictures_alone(problem, seen.observations.xy_px)
+    problem, alone = (replace(one, sigma_px=values["sigma_px"]) for one in (problem, alone))
+    x = solve(problem, start).estimate
+    some = np.linspace(0, len(truth) - 1, min(len(truth), CENTRES)).astype(int)
+    centres, true = at_middle_lines(problem, x).cam_in_world[some], truth[some]
+    scale, rotation, shift = similarity(centres, true)
+    # the error in the world of the solution
+    error = (scale * centres @ rotation.T + shift - true) @ rotation
+    covs = [centres_cov(one, x, some, (true - shift) @ rotation) for one in (problem, alone)]
+    weights, ways = np.linalg.eigh(covs[0])
+    told = np.argsort(weights)[-WAYS:]
+    normalised = ways[:, told].T @ error.ravel() / np.sqrt(weights[told])
+    rng = np.random.default_rng(seed)
+    own, beyond = (_drawn(cov, rng) for cov in (covs[0], covs[1] - covs[0]))
+    worse = np.linalg.norm(own, axis=1) > 1.1 * np.linalg.norm(own + beyond, axis=1)
+    expected_mm, colmap_mm = (1e3 * float(np.sqrt(np.trace(cov) / len(some))) for cov in covs)
+    shape = float(np.sqrt(np.mean(normalised**2)))
+    return {"expected_mm": expected_mm, "colmap_mm": colmap_mm, "shape": shape, "worse": float(worse.mean())}
+
+
+def _drawn(cov: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """(DRAWS, n) normal errors; directions that rounding left without variance have none."""
+    weights, ways = np.linalg.eigh(cov)
+    return rng.standard_normal((DRAWS, len(cov))) * np.sqrt(np.maximum(weights, 0)) @ ways.T
+
+
+def studied(
+    options: TrackOptions, seed: int, spoil: str, *, declared: bool = True, chance: bool = False
+) -> dict[str, Any]:
     """One walk through the stages."""
     tracks = simulate_tracks(options, seed=seed)
     readout_s = options.readout_s if declared else 0.0
@@ -149,12 +207,15 @@ def studied(options: TrackOptions, seed: int, spoil: str, *, declared: bool = Tr
     out["before"] = compared(centres_of(model.reconstruction), truth)
     seconds["scale"] = time.process_time() - begin_s
     begin_s = time.process_time()
-    model = RefineStage(imu=imu, calibration=prior, refine_intrinsics=True, shutter=shutter)(model)
+    stage, metric = RefineStage(imu=imu, calibration=prior, refine_intrinsics=True, shutter=shutter), model
+    model = stage(metric)
     seconds["refine"] = time.process_time() - begin_s
     said = model.treatments[-1]
     out |= {"after": compared(centres_of(model.reconstruction), truth), "said": said.reason, "values": said.values}
     out["accepted"], out["seconds"] = said.action == "refined", seconds
     out["gb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024e-9
+    if chance and out["accepted"]:
+        out["chance"] = by_chance(stage, metric, model, truth, seed)
     if "readout_s" in said.values:
         out["readout"] = [1e3 * said.values[name] for name in ("readout_s", "readout_sigma_s")]
     if out["accepted"]:
@@ -236,21 +297,23 @@ def main() -> None:
     parser.add_argument("--undeclared", action="store_true")
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--expected", action="store_true")
+    parser.add_argument("--chance", action="store_true")
     parser.add_argument("--spoil", choices=("", "other", "late", "flipped", "gain"), default="")
     parser.add_argument("--out", type=Path)
     asked = parser.parse_args()
     options, results = ring() if asked.loop else walk(asked.metres, asked.readout_ms * 1e-3), []
     options = expected(options) if asked.expected else options
     for seed in asked.seeds:
-        one = studied(options, seed, asked.spoil, declared=not asked.undeclared)
+        one = studied(options, seed, asked.spoil, declared=not asked.undeclared, chance=asked.chance)
         results.append(one)
         colmap, before, after = (one[k] for k in ("colmap", "before", "after"))
         print(
             f"seed {seed}: COLMAP {colmap['rms_mm']:.1f} before {before['rms_mm']:.1f} after {after['rms_mm']:.1f} mm; "
             f"drift {colmap['drift_pct']:+.2f} {before['drift_pct']:+.2f} -> {after['drift_pct']:+.2f} %; "
             f"{one['scale']['verdict']}; {one['said']}; seconds {one['seconds']}; readout {one.get('readout', '')} ms; "
+            f"accelerometer's noise {1e3 * one['values'].get('accel_noise_m_s2_rthz', 0):.2f} mm/s2/rtHz; "
             f"{one['frames']} frames, {one['observations']} observations, {one['gb']:.1f} GB; "
-            f"{one.get('calibration', '')}",
+            f"{one.get('chance', '')}; {one.get('calibration', '')}",
             flush=True,
         )
         if asked.out is not None:
@@ -260,6 +323,14 @@ def main() -> None:
     drifts = [abs(one["after"]["drift_pct"]) / max(abs(one["colmap"]["drift_pct"]), 1e-9) for one in results]
     print(f"median of the drift that is left: {np.median(drifts):.2f}")
     told_normalised(results)
+    chances = [one["chance"] for one in results if "chance" in one]
+    if chances:
+        shape = np.sqrt(np.mean([one["shape"] ** 2 for one in chances]))
+        worse = sum(one["colmap"]["rms_mm"] < one["after"]["rms_mm"] / 1.1 for one in results if "chance" in one)
+        print(
+            f"normalised errors of shape: {shape:.2f} rms; more than 1.1 times as far off: {worse} of {len(chances)}, "
+            f"by chance {sum(one['worse'] for one in chances):.1f}"
+        )
 
 
 if __name__ == "__main__":

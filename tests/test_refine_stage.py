@@ -372,8 +372,9 @@ def test_what_takes_too_much_memory_is_left_as_it_is(walked, monkeypatch):
 
 def test_what_does_not_come_to_rest_is_not_believed(walked, monkeypatch):
     tracks, model = walked
-    for restless, why in ((0, "pictures alone"), (1, "the refinement does not"), (2, "with all observations")):
-        count = iter(range(3))
+    whys = ("pictures alone", "the refinement does not", "the refinement does not", "with all observations")
+    for restless, why in enumerate(whys):
+        count = iter(range(len(whys)))
 
         def solved(problem, start, restless=restless, count=count):
             one = solve(problem, start)

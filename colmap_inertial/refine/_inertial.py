@@ -34,12 +34,16 @@ class Rows:
         (N, r, 15) derivatives by the states ``0 .. N`` and by the ones after them.
     by_shared
         (N, r, Q), or ``None`` where it is zero.
+    share
+        (N, r, r) part of the residuals' covariance that is the accelerometer's white noise; ``None`` where there is
+        none.
     """
 
     residual: Array
     here: Array
     after: Array | None = None
     by_shared: Array | None = None
+    share: Array | None = None
 
 
 def as_joint(x: Estimate, down: Array) -> par.Estimate:
@@ -104,11 +108,13 @@ def imu_rows(problem: Problem, x: Estimate) -> Rows:
     for mine, theirs in ((at.gyro_gain, par.GYRO_GAIN), (at.accel_gain, par.ACCEL_GAIN)):
         by_shared[:, :, mine] = by[:, :, theirs.start - start : theirs.stop - start]
     counts = inertial.linked.astype(np.float64)[:, None]
+    assert group.share is not None
     return Rows(
         residual=group.residual * counts,
         here=group.here[:, :, :N_STATE] * counts[:, :, None],
         after=group.after[:, :, :N_STATE] * counts[:, :, None],
         by_shared=by_shared * counts[:, :, None],
+        share=group.share * counts[:, :, None],
     )
 
 

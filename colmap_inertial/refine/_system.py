@@ -223,6 +223,15 @@ class Factored:
         states, _ = self.solve(rhs, np.zeros((len(self.corner[0]), count)))
         return np.sqrt(np.einsum("nk,nk->k", rhs, states))
 
+    def centres_cov(self, frames: Index, by: Moving) -> Array:
+        """(3 K, 3 K) covariance of the camera's centres in K frames, all together."""
+        count, place = len(frames), self.order.place
+        sides = np.zeros((count, 3, len(place), N_STATE))
+        sides[np.arange(count)[:, None], np.arange(3), place[frames][:, None]] = by.by_state[frames, :3]
+        rhs, rhs_shared = sides.reshape(3 * count, -1).T, by.by_shared[frames, :3].reshape(3 * count, -1).T
+        states, shared = self.solve(rhs, rhs_shared)
+        return np.asarray(rhs.T @ states + rhs_shared.T @ shared)
+
     def motion_covs(self, frames: Index, by: Moving) -> Array:
         """(K, 6, 6) covariances of K frames' positions against the first frame's, and velocities."""
         out, place = [], self.order.place

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from colmap_inertial.errors import NotObservableError
 from colmap_inertial.refine._system import Factored, Order
+from colmap_inertial.refine.levels import with_measured_noise
 from colmap_inertial.refine.motion import Moving, moving
 from colmap_inertial.refine.setup import at_middle_lines, measured_sigma_px, pictures_alone
 from colmap_inertial.refine.solve import Solution, factored, held_out, solve
@@ -73,6 +74,8 @@ class Judged:
         What the IMU adds to the sum of squares (its own squares at least), over its degrees of freedom.
     sigma_px
         Standard deviation of an observation.
+    accel_noise_m_s2_rthz
+        White noise of the accelerometer, as the refinement found it; as it was known where it did not come so far.
     shared_cov
         (Q, Q) covariance of what is shared; ``None`` where it is not believed.
     drift
@@ -98,6 +101,7 @@ class Judged:
     change_sigma: float
     chi2: float
     sigma_px: float
+    accel_noise_m_s2_rthz: float
     shared_cov: Array | None
     drift: tuple[Stretched, ...]
     velocity_m_s: Array
@@ -138,17 +142,24 @@ def refine(
     problem, alone = (replace(one, sigma_px=sigma_px, robust_px=robust_px) for one in (problem, alone))
     kept = ~_chosen(problem.observations)
     seen_alone, seen = solve(_part(alone, kept), start), solve(_part(problem, kept), start)
+    # pictures alone may fit worse than with a rolling shutter: the IMU's own squares are the least that it costs
+    freedom = _freedom(problem)
+    chi2 = max(2 * (seen.cost - seen_alone.cost), seen.squares["imu"]) / freedom
+    steps = seen_alone.steps + seen.steps
+    if seen.converged and chi2 <= _LARGEST_CHI2:
+        # a false IMU would find itself noisy: it is judged by what was known before
+        problem = _measured(problem, kept, seen.estimate)
+        seen = solve(_part(problem, kept), seen.estimate)
+        steps += seen.steps
     before = held_out(alone, seen_alone.estimate, alone.observations.select(~kept))
     after = held_out(problem, seen.estimate, problem.observations.select(~kept))
     change, count = after - before, len(before)
     mean = float(change.mean()) if count else 0.0
     spread = float(change.std(ddof=1) / count**0.5) if count > 1 else np.inf
-    # pictures alone may fit worse than with a rolling shutter: the IMU's own squares are the least that it costs
-    freedom = _freedom(problem)
-    chi2 = max(2 * (seen.cost - seen_alone.cost), seen.squares["imu"]) / freedom
     readout = None if readout_declared or not seen.converged else _readout(_part(problem, kept), seen.estimate)
     reason = _rolling(readout) or _doubt(seen_alone, seen, chi2, mean, spread) or _too_late(problem, seen.estimate)
-    steps, final = seen_alone.steps + seen.steps, start
+    assert problem.inertial is not None
+    final = start
     cov: Array | None = None
     drift: tuple[Stretched, ...] = ()
     velocity_m_s = np.full_like(start.velocity_m_s, np.nan)
@@ -166,7 +177,6 @@ def refine(
             final, cov = whole.estimate, solved.shared_cov()
             by = moving(problem, final)
             drift = drift_map(problem, start, final, t_s, solved, by)
-            assert problem.inertial is not None
             # where the IMU says nothing, the covariance of a velocity is a prior's
             moved = problem.inertial.touched
             told = np.flatnonzero(np.isfinite(t_s) & moved)
@@ -184,6 +194,7 @@ def refine(
         change_sigma=spread,
         chi2=chi2,
         sigma_px=sigma_px,
+        accel_noise_m_s2_rthz=problem.inertial.noise.accel_density_m_s2_rthz,
         shared_cov=cov,
         drift=drift,
         velocity_m_s=velocity_m_s,
@@ -204,6 +215,14 @@ def _chosen(observations: Observations) -> NDArray[np.bool_]:
 
 def _part(problem: Problem, keep: NDArray[np.bool_]) -> Problem:
     return replace(problem, observations=problem.observations.select(keep))
+
+
+def _measured(problem: Problem, kept: NDArray[np.bool_], x: Estimate) -> Problem:
+    """The problem with its accelerometer's noise as what it was solved without a tenth for says."""
+    try:
+        return replace(problem, inertial=with_measured_noise(_part(problem, kept), x).inertial)
+    except np.linalg.LinAlgError:  # the solution says why not
+        return problem
 
 
 def _freedom(problem: Problem) -> float:

@@ -183,6 +183,40 @@ def factored(problem: Problem, x: Estimate) -> Factored:
     return _built(problem, order, at, by, residual, 0.0).factored()
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Linearised:
+    """Observations at an estimate: what is solved for again and again with other noise of the IMU."""
+
+    order: Order
+    projected: Projected
+    by: Derivatives
+    residual: Array
+    estimate: Estimate
+
+    def solved(self, problem: Problem) -> tuple[Factored, Array, Array]:
+        """The information, and the steps (F, 15) and (Q,) to the solution with a problem's noise."""
+        x, observations = self.estimate, problem.observations
+        at = _Point(
+            estimate=x,
+            projected=self.projected,
+            rows=all_rows(problem, x),
+            offset=prior_offset(problem, x),
+            cost=np.nan,
+        )
+        system = _built(problem, self.order, at, self.by, self.residual, 0.0)
+        solved = system.factored()
+        states, shared, _ = solved.step(system, observations, self.by)
+        return solved, states, shared
+
+
+def linearised(problem: Problem, x: Estimate) -> Linearised:
+    """The observations at an estimate."""
+    at = _evaluate(problem, x, problem.observations)
+    by, residual = _weighted(problem, at)
+    order = Order.of(problem.observations, len(x.velocity_m_s))
+    return Linearised(order=order, projected=at.projected, by=by, residual=residual, estimate=x)
+
+
 def held_out(problem: Problem, x: Estimate, observations: Observations) -> Array:
     """(M,) robust costs of observations that were not used."""
     at = project(replace(problem, observations=observations), x, observations)

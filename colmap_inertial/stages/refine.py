@@ -122,6 +122,7 @@ class RefineStage:
             name: getattr(judged, name)
             for name in ("accepted", "held_out", "before_px", "after_px", "change", "change_sigma", "chi2", "sigma_px")
         }
+        figures["accel_noise_m_s2_rthz"] = judged.accel_noise_m_s2_rthz
         if judged.readout is not None:
             figures |= dict(zip(("readout_s", "readout_sigma_s"), judged.readout, strict=True))
         heard = (

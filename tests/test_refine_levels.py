@@ -1,0 +1,65 @@
+"""How noisy the refinement finds the accelerometer."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from refine_walk import problem_of, tracks_of, walk
+
+from colmap_inertial.refine import levels
+from colmap_inertial.refine._inertial import imu_rows
+from colmap_inertial.refine.levels import with_measured_noise
+from colmap_inertial.refine.solve import factored, solve
+
+TRUE = 2e-3
+
+
+def at_level(problem, density):
+    inertial = problem.inertial
+    return replace(problem, inertial=replace(inertial, noise=replace(inertial.noise, accel_density_m_s2_rthz=density)))
+
+
+def found(problem, x):
+    return with_measured_noise(problem, x).inertial.noise.accel_density_m_s2_rthz
+
+
+@pytest.fixture(scope="module")
+def solved():
+    # pictures that tell the path much better than the accelerometer does
+    options = walk(12.0, points_per_m=80.0, noise_px=0.05)
+    problem, start, _ = problem_of(tracks_of(options), options)
+    assert problem.inertial.noise.accel_density_m_s2_rthz == TRUE
+    return problem, start
+
+
+@pytest.mark.parametrize("times", [0.25, 1.0, 8.0])
+def test_the_noise_is_the_simulator_s_whatever_was_thought_of_it(solved, times):
+    problem, start = solved
+    thought = at_level(problem, times * TRUE)
+    x = solve(thought, start).estimate
+    measured = with_measured_noise(thought, x)
+    assert measured.inertial.noise.accel_density_m_s2_rthz == pytest.approx(TRUE, rel=0.25)
+    kept = vars(replace(measured.inertial.noise, accel_density_m_s2_rthz=times * TRUE))
+    assert kept == vars(thought.inertial.noise)
+    assert found(thought, x) == measured.inertial.noise.accel_density_m_s2_rthz
+
+
+def test_the_level_is_that_of_the_greatest_likelihood(solved, monkeypatch):
+    problem, start = solved
+    linked = np.arange(len(problem.inertial.linked)) % 5 > 0
+    problem = at_level(replace(problem, inertial=replace(problem.inertial, linked=linked)), 2 * TRUE)
+    x = solve(problem, start).estimate
+    # nothing was known of it before
+    monkeypatch.setattr(levels, "_SPREAD", 100.0)
+    best = found(problem, x)
+    share = imu_rows(at_level(problem, best), x).share
+
+    def likelihood(times):
+        now = at_level(problem, times * best)
+        information = factored(now, x)
+        halves = np.log(information.lower[0]).sum() + np.log(np.diagonal(information.corner[0])).sum()
+        noise = np.linalg.slogdet(np.eye(9) + (times**2 - 1) * share)[1].sum()
+        return -solve(now, x).cost - float(halves) - 0.5 * float(noise)
+
+    values = [likelihood(times) for times in (0.6, 1.0, 1.6)]
+    assert values[1] > max(values[0], values[2]) + 1
