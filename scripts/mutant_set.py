@@ -1775,6 +1775,27 @@ MUTANTS = (
         ("refine::test_derivatives_of_the_imu_are_those_of_finite_differences",),
     ),
     Mutant(
+        "join/judge.py",
+        "        if not trial.contradiction:\n            return replace(trial, matched=inside)",
+        "        if True:\n            return replace(trial, matched=inside)",
+        "matches that contradict the IMU keep parts from each other",
+        ("join_matched::test_matches_that_contradict_the_imu_are_left_out",),
+    ),
+    Mutant(
+        "stages/across.py",
+        "    if {e.image_id for e in tracks[0]} & {e.image_id for e in tracks[1]}:\n        return False",
+        "    return False",
+        "points that both models have stay two",
+        ("join_matched::test_points_that_both_saw_are_one_in_the_joined_model",),
+    ),
+    Mutant(
+        "join/values.py",
+        "return (self.world_from_cam, self.cam_in_world) if k == self.other",
+        "return (self.world_from_cam, self.cam_in_world) if k != self.other",
+        "an image that was found in another model is taken for one of it",
+        ("join_matched::test_matches_place_a_part_better_than_the_imu_alone",),
+    ),
+    Mutant(
         "refine/levels.py",
         "right = max(count - explained, 0.01 * count)",
         "right = count",

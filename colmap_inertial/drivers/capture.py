@@ -52,9 +52,13 @@ _GRAVITY_ROTATION_RAD = 0.2
 
 
 def default_model_stages(
-    recording: Recording, options: ReconstructOptions, keypoint_stages: Sequence[KeypointStage] = ()
+    recording: Recording,
+    options: ReconstructOptions,
+    keypoint_stages: Sequence[KeypointStage] = (),
+    *,
+    database: Path | None = None,
 ) -> list[ModelStage]:
-    """What stands for ``...`` in ``model_stages``, after these keypoint stages."""
+    """What stands for ``...`` in ``model_stages``, after these keypoint stages, of models of a database of COLMAP."""
     scale = dataclasses.replace(options.scale, max_offset_s=recording.max_offset_s)
     asked = options.mapping.refine_intrinsics
     refine_intrinsics = recording.capture.camera is None if asked is None else asked
@@ -70,7 +74,14 @@ def default_model_stages(
     if options.join == "inertial":
         limits = options.join_options
         joining = [
-            JoinStage(imu=recording.imu, calibration=recording.prior, options=scale, limits=limits, world=options.world)
+            JoinStage(
+                imu=recording.imu,
+                calibration=recording.prior,
+                options=scale,
+                limits=limits,
+                world=options.world,
+                database=database,
+            )
         ]
     if options.refine == "off":
         return [readout, metric, *joining]
@@ -214,7 +225,10 @@ def _reconstruct(
         plain_imu = corrected_imu(loaded, raw.imu, None)
         seen = Recording.of(loaded, plain_imu, used_timing, prior_calibration(loaded, None))
         keypoints, matching = run_colmap(session, seen, records, of_keypoints, gravity, options)
-        of_models = with_defaults(model_stages, default_model_stages(recording, options, of_keypoints))
+        of_models = with_defaults(
+            model_stages,
+            default_model_stages(recording, options, of_keypoints, database=workspace.colmap_database),
+        )
         # images agree with the model as it is in the end
         refining = any(isinstance(stage, RefineStage) and stage.shutter is not None for stage in of_models)
         if not refining:

@@ -136,12 +136,13 @@ def add_shared(problem: Problem, at: At, images: SharedImages, equations: Equati
     root = images.weight**0.5
     variances = np.zeros(2)
     turned, centres, arms = [], [], []
-    for k, places in ((images.first, images.in_first), (images.second, images.in_second)):
+    for k in (images.first, images.second):
         part, known = problem.parts[k], problem.known[k]
+        world_from_cam, places = images.poses(problem.parts, k)
         variances += part.path.seen_variances
-        turned.append(at.rotation[k] @ part.world_from_cam[places])
+        turned.append(at.rotation[k] @ world_from_cam)
         scale = known.metres_per_unit * float(np.exp(at.y[problem.own(k) + post.LOG_SCALE]))
-        arm = scale * (part.trajectory.cam_in_world[places] - part.path.origin) @ at.rotation[k].T
+        arm = scale * (places - part.path.origin) @ at.rotation[k].T
         arms.append(arm)
         centres.append(arm + at.translation_m[k])
     info = root / np.sqrt(variances)

@@ -12,9 +12,9 @@ import numpy as np
 from colmap_inertial.geometry import skew, so3_log
 from colmap_inertial.join._problem import Ties
 from colmap_inertial.join.doubts import at_most, clocks_differ, most, plainly_apart, times_counted, unlike
-from colmap_inertial.join.links import find_links, find_shared
+from colmap_inertial.join.links import find_links, find_matched, find_shared
 from colmap_inertial.join.solve import Placed, place
-from colmap_inertial.join.values import Link, Part, SharedImages, pair_of
+from colmap_inertial.join.values import Found, Link, MatchedImages, Part, SharedImages, pair_of
 from colmap_inertial.options import JoinOptions
 from colmap_inertial.types import Array, Gap, ImuRecording
 
@@ -43,11 +43,14 @@ class Together:
         Where they come to lie, in this order.
     shared
         Images whose poses agree, by places within ``parts``.
+    matched
+        COLMAP's numbers of pairs of parts whose matches helped to place them, the larger part first.
     """
 
     parts: tuple[int, ...]
     placed: Placed
     shared: tuple[SharedImages, ...]
+    matched: frozenset[tuple[int, int]] = frozenset()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -66,7 +69,7 @@ class Joined:
     gaps: tuple[Gap, ...]
 
 
-def join_parts(parts: Sequence[Part], imu: ImuRecording, limits: JoinOptions) -> Joined:
+def join_parts(parts: Sequence[Part], imu: ImuRecording, limits: JoinOptions, found: Sequence[Found] = ()) -> Joined:
     """Join what can be joined surely enough.
 
     Two by two first; then the surest pairs bring their groups together, one after the other, where all that ties the
@@ -80,10 +83,13 @@ def join_parts(parts: Sequence[Part], imu: ImuRecording, limits: JoinOptions) ->
         The recording that ran along, as it was read.
     limits
         Up to where gaps are closed.
+    found
+        Images of one part that matches place in another. They count beside the IMU, and where they agree with it: what
+        looks the same may be a copy.
     """
     if len(parts) < 2:
         return Joined(groups=(), gaps=())
-    links, shared = find_links(parts), find_shared(parts)
+    links, shared, matched = find_links(parts), find_shared(parts), find_matched(parts, found)
     apart = plainly_apart(parts, shared)
     pairs = sorted({pair_of(one) for one in links} | {pair_of(one) for one in shared} | apart.keys())
     # readings that a part's own fit has already do not count again where images say where the other one lies
@@ -101,13 +107,17 @@ def join_parts(parts: Sequence[Part], imu: ImuRecording, limits: JoinOptions) ->
         if pair not in both and not _of(usable, pair):
             gaps[pair] = replace(gap, reason=_why_unlinked(parts, imu, _of(links, pair)))
             continue
-        trial = _tried(parts, imu, pair, usable, shared)
-        trials[pair] = trial
+        trial = trials[pair] = _with_matches(parts, imu, pair, usable, shared, matched)
+        gap = replace(gap, matched_images=sum(len(one.in_first) for one in trial.matched))
         gap = _with_sigmas(replace(gap, chi2=trial.chi2, dof=trial.dof), trial, pair)
         if trial.contradiction:
             against.add(pair)
         reason = trial.contradiction or _unsure(gap, limits)
-        gaps[pair] = replace(gap, joined=not reason, reason=reason or _said(gap))
+        if _of(matched, pair) and not trial.matched:
+            reason = f"{reason or _said(gap)} (matches between the two contradict it, and are left out)"
+            gaps[pair] = replace(gap, joined=not (trial.contradiction or _unsure(gap, limits)), reason=reason)
+        else:
+            gaps[pair] = replace(gap, joined=not reason, reason=reason or _said(gap))
     for pair in sorted((pair for pair, gap in gaps.items() if gap.joined), key=lambda pair: gaps[pair].sigma_m or 0.0):
         one, other = (groups[k] for k in pair)
         if one == other:
@@ -116,7 +126,7 @@ def join_parts(parts: Sequence[Part], imu: ImuRecording, limits: JoinOptions) ->
         reason = _quarrel(parts, members, against)
         if not reason:
             if members not in trials:
-                trials[members] = _tried(parts, imu, members, usable, shared)
+                trials[members] = _with_matches(parts, imu, members, usable, shared, matched)
             reason = trials[members].contradiction
             if not reason:
                 inside = (
@@ -133,8 +143,9 @@ def join_parts(parts: Sequence[Part], imu: ImuRecording, limits: JoinOptions) ->
         trial = trials[members]
         assert trial.placed is not None
         place_of = {k: i for i, k in enumerate(members)}
-        images = tuple(_renumbered(one, place_of) for one in shared if pair_of(one) in _in(members))
-        together.append(Together(parts=members, placed=trial.placed, shared=images))
+        images = tuple(one.among(place_of) for one in shared if pair_of(one) in _in(members))
+        used = frozenset((parts[a].number, parts[b].number) for a, b in map(pair_of, trial.matched))
+        together.append(Together(parts=members, placed=trial.placed, shared=images, matched=used))
         for pair in _in(members) & gaps.keys():
             gap = gaps[pair]
             others = "in one model by way of others" if not gap.joined else gap.reason
@@ -158,10 +169,6 @@ def _quarrel(parts: Sequence[Part], members: Sequence[int], against: set[tuple[i
         return ""
     numbers = " and ".join(str(parts[k].number) for k in found[0])
     return f"it would bring together models {numbers}, which contradict each other"
-
-
-def _renumbered(one: Tie, place_of: Mapping[int, int]) -> Tie:
-    return replace(one, first=place_of[one.first], second=place_of[one.second])
 
 
 def silent_s(parts: Sequence[Part], imu: ImuRecording, link: Link) -> float:
@@ -233,6 +240,8 @@ class Trial:
         By pairs of places: standard deviations (m, rad) across the worst tie.
     contradiction
         Why the parts cannot be one model; empty where they can.
+    matched
+        What of the matches was used, by places of all parts.
     """
 
     placed: Placed | None
@@ -240,6 +249,24 @@ class Trial:
     dof: int | None
     sigmas: Mapping[tuple[int, int], tuple[float, float]]
     contradiction: str
+    matched: tuple[MatchedImages, ...] = ()
+
+
+def _with_matches(
+    parts: Sequence[Part],
+    imu: ImuRecording,
+    members: Sequence[int],
+    links: Sequence[Link],
+    shared: Sequence[SharedImages],
+    matched: Sequence[MatchedImages],
+) -> Trial:
+    """Place some parts by all that ties them and by matches; without these where that contradicts itself."""
+    inside = tuple(one for one in matched if pair_of(one) in _in(members))
+    if inside:
+        trial = _tried(parts, imu, members, links, [*shared, *inside])
+        if not trial.contradiction:
+            return replace(trial, matched=inside)
+    return _tried(parts, imu, members, links, shared)
 
 
 def _tried(
@@ -253,8 +280,8 @@ def _tried(
     nothing = Trial(placed=None, chi2=None, dof=None, sigmas={}, contradiction="")
     one_of = [parts[k] for k in members]
     place_of = {k: i for i, k in enumerate(members)}
-    inside = [_renumbered(one, place_of) for one in links if pair_of(one) in _in(members)]
-    images = [_renumbered(one, place_of) for one in shared if pair_of(one) in _in(members)]
+    inside = [one.among(place_of) for one in links if pair_of(one) in _in(members)]
+    images = [one.among(place_of) for one in shared if pair_of(one) in _in(members)]
     every: list[Link | SharedImages] = [*inside, *images]
     why = next(filter(None, (unlike(one_of[i], one_of[j]) for i, j in {pair_of(one) for one in every})), "")
     why = why or (_OF_THE_IMU if any(clocks_differ(one_of, one) for one in inside) else "")
@@ -308,9 +335,10 @@ def _alone_dof(count: int, links: Sequence[Link]) -> int:
 def _apart(parts: Sequence[Part], placed: Placed, images: SharedImages) -> Array:
     """(6,) by how much poses of shared images differ as the parts lie: rotation and position, medians."""
     turns, centres = [], []
-    for k, places in ((images.first, images.in_first), (images.second, images.in_second)):
-        turns.append(placed.placements[k].rotation @ parts[k].world_from_cam[places])
-        centres.append(placed.placements[k].points(parts[k].trajectory.cam_in_world[places]))
+    for k in (images.first, images.second):
+        world_from_cam, places = images.poses(parts, k)
+        turns.append(placed.placements[k].rotation @ world_from_cam)
+        centres.append(placed.placements[k].points(places))
     twists = so3_log(turns[1] @ turns[0].transpose(0, 2, 1))
     return np.concatenate([np.median(twists, axis=0), np.median(centres[1] - centres[0], axis=0)])
 
@@ -331,8 +359,9 @@ def _why_unlinked(parts: Sequence[Part], imu: ImuRecording, links: Sequence[Link
 
 
 def _said(gap: Gap) -> str:
-    by = "by the IMU" if not gap.shared_images else f"by {gap.shared_images} images that both have, and the IMU"
-    return f"joined {by}"
+    by = [f"{gap.shared_images} images that both have"] if gap.shared_images else []
+    by += [f"{gap.matched_images} images of one that match the other"] if gap.matched_images else []
+    return f"joined by {', '.join(by)}, and the IMU" if by else "joined by the IMU"
 
 
 def _unsure(gap: Gap, limits: JoinOptions) -> str:

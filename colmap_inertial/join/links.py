@@ -6,10 +6,12 @@ from collections.abc import Sequence
 from itertools import combinations, pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from colmap_inertial.geometry import so3_log
-from colmap_inertial.join.values import Link, Part, SharedImages
+from colmap_inertial.join.values import Found, Link, MatchedImages, Part, SharedImages
 from colmap_inertial.scale._parameters import DRIFT_S
+from colmap_inertial.types import Array
 
 #: Links between the same two parts: the shortest ones; more say little beyond.
 _MOST_LINKS = 4
@@ -46,23 +48,72 @@ def find_shared(parts: Sequence[Part]) -> list[SharedImages]:
         if len(both) < FEWEST_SHARED:
             continue
         mine, theirs = np.array(both, dtype=np.int64).T
-        turns = one.world_from_cam[mine] @ other.world_from_cam[theirs].transpose(0, 2, 1)
-        middle = turns[int(np.argmin([_median_angle(turns, turn) for turn in turns]))]
-        angles = np.linalg.norm(so3_log(middle.T @ turns), axis=1)
-        away = one.trajectory.cam_in_world[mine] - other.trajectory.cam_in_world[theirs] @ middle.T
-        offsets = np.linalg.norm(away - np.median(away, axis=0), axis=1)
-        agree = (angles < _AGREE * max(float(np.median(angles)), _LEAST_RAD)) & (
-            offsets < _AGREE * max(float(np.median(offsets)), _LEAST_M)
+        agree = _agreeing(
+            one.world_from_cam[mine],
+            other.world_from_cam[theirs],
+            one.trajectory.cam_in_world[mine],
+            other.trajectory.cam_in_world[theirs],
         )
         if agree.sum() < max(FEWEST_SHARED, len(both) / 2 + 1e-9):
             continue
         mine, theirs = mine[agree], theirs[agree]
-        span_s = float(np.ptp(one.trajectory.t_s[mine]))
-        independent = min(len(mine), 1 + span_s / DRIFT_S)
+        weight = _independent(one.trajectory.t_s[mine])
+        out.append(SharedImages(first=a, second=b, in_first=mine, in_second=theirs, weight=weight))
+    return out
+
+
+def find_matched(parts: Sequence[Part], found: Sequence[Found]) -> list[MatchedImages]:
+    """Images of one part that matches place in another, without those that contradict most of the others."""
+    place_of, out = {part.number: k for k, part in enumerate(parts)}, []
+    for one in found:
+        if one.first not in place_of or one.second not in place_of:
+            continue
+        k, own = place_of[one.first], place_of[one.second]
+        places = [{name: i for i, name in enumerate(parts[i].trajectory.names)} for i in (k, own)]
+        there = [i for i, name in enumerate(one.names) if name in places[1] and one.beside[i] in places[0]]
+        if len(there) < FEWEST_SHARED:
+            continue
+        theirs = np.array([places[0][one.beside[i]] for i in there], dtype=np.int64)
+        mine = np.array([places[1][one.names[i]] for i in there], dtype=np.int64)
+        world_from_cam, centres = one.world_from_cam[there], one.cam_in_world[there]
+        agree = _agreeing(
+            world_from_cam, parts[own].world_from_cam[mine], centres, parts[own].trajectory.cam_in_world[mine]
+        )
+        if agree.sum() < max(FEWEST_SHARED, len(there) / 2 + 1e-9):
+            continue
+        theirs, mine = theirs[agree], mine[agree]
+        first, second = sorted((k, own))
         out.append(
-            SharedImages(first=a, second=b, in_first=mine, in_second=theirs, weight=float(independent / len(mine)))
+            MatchedImages(
+                first=first,
+                second=second,
+                in_first=theirs if k == first else mine,
+                in_second=mine if k == first else theirs,
+                weight=_independent(parts[own].trajectory.t_s[mine]),
+                other=k,
+                world_from_cam=world_from_cam[agree],
+                cam_in_world=centres[agree],
+            )
         )
     return out
+
+
+def _agreeing(turned: Array, own: Array, centres: Array, own_centres: Array) -> NDArray[np.bool_]:
+    """(n,) which of n images lie in two parts as most of them do; rotations world_from_cam and centres in either."""
+    turns = turned @ own.transpose(0, 2, 1)
+    middle = turns[int(np.argmin([_median_angle(turns, turn) for turn in turns]))]
+    angles = np.linalg.norm(so3_log(middle.T @ turns), axis=1)
+    away = centres - own_centres @ middle.T
+    offsets = np.linalg.norm(away - np.median(away, axis=0), axis=1)
+    return np.asarray(
+        (angles < _AGREE * max(float(np.median(angles)), _LEAST_RAD))
+        & (offsets < _AGREE * max(float(np.median(offsets)), _LEAST_M))
+    )
+
+
+def _independent(t_s: Array) -> float:
+    """How much each of some images counts: errors of those a fraction of a second apart are alike."""
+    return float(min(len(t_s), 1 + float(np.ptp(t_s)) / DRIFT_S) / len(t_s))
 
 
 def _median_angle(turns: np.ndarray, turn: np.ndarray) -> float:

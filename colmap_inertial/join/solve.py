@@ -237,14 +237,12 @@ def _by_link(problem: Problem, at: At, link: Link, new: int) -> tuple[Array, Arr
 def _by_images(problem: Problem, at: At, images: SharedImages, new: int) -> tuple[Array, Array]:
     """Rotation and translation of one part by the poses of images that it shares with one that has its place."""
     there = images.first if new == images.second else images.second
-    places = {images.first: images.in_first, images.second: images.in_second}
-    mine, theirs = (problem.parts[k].world_from_cam[places[k]] for k in (new, there))
+    (mine, own), (theirs, others) = (images.poses(problem.parts, k) for k in (new, there))
     turns = at.rotation[there] @ theirs @ mine.transpose(0, 2, 1)
     rotation = turns[0] @ so3_exp(np.median(so3_log(turns[0].T @ turns), axis=0))
     centres = [
-        problem.known[k].metres_per_unit
-        * (problem.parts[k].trajectory.cam_in_world[places[k]] - problem.parts[k].path.origin)
-        for k in (new, there)
+        problem.known[k].metres_per_unit * (places - problem.parts[k].path.origin)
+        for k, places in ((new, own), (there, others))
     ]
     away = centres[1] @ at.rotation[there].T + at.translation_m[there] - centres[0] @ rotation.T
     return rotation, np.median(away, axis=0)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,6 +64,10 @@ class Link:
     from_node: int
     to_node: int
 
+    def among(self, place_of: Mapping[int, int]) -> Self:
+        """The same between parts that have other places."""
+        return replace(self, first=place_of[self.first], second=place_of[self.second])
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SharedImages:
@@ -82,6 +88,69 @@ class SharedImages:
     in_first: Index
     in_second: Index
     weight: float
+
+    def among(self, place_of: Mapping[int, int]) -> Self:
+        """The same between parts that have other places."""
+        return replace(self, first=place_of[self.first], second=place_of[self.second])
+
+    def poses(self, parts: Sequence[Part], k: int) -> tuple[Array, Array]:
+        """(n, 3, 3) world_from_cam and (n, 3) centres of the images in one of the two parts, in its own world."""
+        part, places = parts[k], self.in_first if k == self.first else self.in_second
+        return part.world_from_cam[places], part.trajectory.cam_in_world[places]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MatchedImages(SharedImages):
+    """Images of one part that matches place in the other one.
+
+    Of the other part, ``in_first`` or ``in_second`` are its images that each of them matches best.
+
+    Attributes
+    ----------
+    other
+        Place of the part in which they were found.
+    world_from_cam, cam_in_world
+        (n, 3, 3), (n, 3) their poses there.
+    """
+
+    other: int
+    world_from_cam: Array
+    cam_in_world: Array
+
+    def among(self, place_of: Mapping[int, int]) -> Self:
+        """As :meth:`SharedImages.among`."""
+        return replace(super().among(place_of), other=place_of[self.other])
+
+    def poses(self, parts: Sequence[Part], k: int) -> tuple[Array, Array]:
+        """As :meth:`SharedImages.poses`."""
+        return (self.world_from_cam, self.cam_in_world) if k == self.other else super().poses(parts, k)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Found:
+    """Images of one model that matches place in another one, as that one lies.
+
+    Attributes
+    ----------
+    first, second
+        COLMAP's number of the model in which they were found, and of their own.
+    names
+        Of the images.
+    beside
+        The other model's images that each of them matches best.
+    world_from_cam, cam_in_world
+        (n, 3, 3), (n, 3) poses in the other model.
+    matches
+        (m, 2) pairs of points that these matches say are one, by their numbers in the two models.
+    """
+
+    first: int
+    second: int
+    names: tuple[str, ...]
+    beside: tuple[str, ...]
+    world_from_cam: Array
+    cam_in_world: Array
+    matches: Index
 
 
 def pair_of(tie: Link | SharedImages) -> tuple[int, int]:

@@ -7,6 +7,7 @@ frames take seconds.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -126,6 +127,49 @@ class Tracks:
                 track.add_element(int(self.frame[o]) + 1, int(place[o]))
             built.add_point3D(xyz, track)
         return built
+
+    def write_database(self, path: Path, xy_px: Array | None = None, *, fewest: int = 15) -> None:
+        """COLMAP's database of what was seen: all pairs of frames that see enough of the same, every match true.
+
+        Numbers of images and keypoints are those of :meth:`reconstruction`.
+        """
+        import pycolmap
+
+        xy_px = self.xy_px if xy_px is None else xy_px
+        path.unlink(missing_ok=True)
+        order = np.argsort(self.frame, kind="stable")
+        of_frame = np.split(order, np.searchsorted(self.frame[order], np.arange(1, len(self.timing.names))))
+        with pycolmap.Database.open(str(path)) as opened:
+            camera = opened.write_camera(colmap_camera(self.camera))
+            rig = pycolmap.Rig()
+            rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera))
+            rig_id = opened.write_rig(rig)
+            for number, (name, mine) in enumerate(zip(self.timing.names, of_frame, strict=True), start=1):
+                image = opened.write_image(pycolmap.Image(name=name, camera_id=camera))
+                frame = pycolmap.Frame(frame_id=number, rig_id=rig_id)
+                frame.add_data_id(pycolmap.data_t(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera), image))
+                opened.write_frame(frame)
+                keypoints = np.zeros((len(mine), 6), dtype=np.float32)
+                keypoints[:, :2], keypoints[:, 2], keypoints[:, 5] = xy_px[mine], 1.0, 1.0
+                opened.write_keypoints(image, keypoints)
+            for first, second in np.argwhere(np.triu(self._in_common(), 1) >= fewest).tolist():
+                _, one, other = np.intersect1d(
+                    self.point[of_frame[first]], self.point[of_frame[second]], return_indices=True
+                )
+                matches = np.stack([one, other], axis=1).astype(np.uint32)
+                opened.write_matches(first + 1, second + 1, matches)
+                geometry = pycolmap.TwoViewGeometry(
+                    config=pycolmap.TwoViewGeometryConfiguration.CALIBRATED, inlier_matches=matches
+                )
+                opened.write_two_view_geometry(first + 1, second + 1, geometry)
+
+    def _in_common(self) -> NDArray[np.int64]:
+        """(F, F) how many points two frames both see."""
+        from scipy.sparse import coo_array, csr_array
+
+        shape = (len(self.timing.names), len(self.point_m))
+        sees = csr_array(coo_array((np.ones(len(self.frame), dtype=np.int64), (self.frame, self.point)), shape=shape))
+        return np.asarray((sees @ sees.T).toarray())
 
 
 def simulate_tracks(options: TrackOptions, *, seed: int) -> Tracks:

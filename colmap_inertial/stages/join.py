@@ -6,6 +6,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,12 +22,13 @@ from colmap_inertial.geometry import (
 )
 from colmap_inertial.join.judge import Together, join_parts, relative_cov, worst
 from colmap_inertial.join.solve import Placed
-from colmap_inertial.join.values import Part, Placement
+from colmap_inertial.join.values import Found, Part, Placement
 from colmap_inertial.model import Model, has_rigs, trajectory_from_model, transformed
 from colmap_inertial.model.merging import merged
 from colmap_inertial.options import JoinOptions, ScaleOptions, WorldAxes
 from colmap_inertial.scale.posterior import FittedPath
 from colmap_inertial.scale.verdict import TRUSTED_HALF_WIDTH, half_width, verdict_of
+from colmap_inertial.stages.across import images_in_others, one_points
 from colmap_inertial.stages.metric import metric_trajectory, of_model
 from colmap_inertial.threads import one_blas_thread
 from colmap_inertial.types import (
@@ -66,6 +68,8 @@ class JoinStage:
         Up to where gaps are closed.
     world
         Where gravity points in the metric model.
+    database
+        COLMAP's, of the models: matches between images of two of them tie these, too.
     """
 
     imu: ImuRecording
@@ -73,6 +77,8 @@ class JoinStage:
     options: ScaleOptions = field(default_factory=ScaleOptions)
     limits: JoinOptions = field(default_factory=JoinOptions)
     world: WorldAxes = "z-up"
+    #: a run with other matches has other models
+    database: Path | None = field(default=None, compare=False)
 
     def __call__(self, model: Model, /) -> Model:
         """One model by itself: it stays as it is."""
@@ -99,8 +105,9 @@ class JoinStage:
                 why_not[model.colmap_index] = hint
             else:
                 of_part.append(model)
+        found = self._found(of_part)
         with one_blas_thread():
-            joined = join_parts(parts, self.imu, self.limits)
+            joined = join_parts(parts, self.imu, self.limits, found)
         spans = _spans(models)
         ends_s = {number: end_s for _, end_s, number in spans}
         gaps = sorted([*joined.gaps, *_beside(spans, why_not)], key=lambda gap: ends_s[gap.first])
@@ -110,7 +117,7 @@ class JoinStage:
         gone: set[int] = set()
         for group in joined.groups:
             members = [of_part[k] for k in group.parts]
-            whole = self._whole(members, [parts[k] for k in group.parts], group)
+            whole = self._whole(members, [parts[k] for k in group.parts], group, found)
             made[whole.colmap_index] = whole
             gone |= {model.colmap_index for model in members[1:]}
         kept = [made.get(m.colmap_index, m) for m in models if m.colmap_index not in gone]
@@ -135,7 +142,14 @@ class JoinStage:
         path = FittedPath.of(trajectory, self.imu, of_model(self.calibration, model), self.options)
         return Part(number=model.colmap_index, trajectory=trajectory, path=path, cameras=_cameras(reconstruction))
 
-    def _whole(self, members: Sequence[Model], parts: Sequence[Part], group: Together) -> Model:
+    def _found(self, models: Sequence[Model]) -> list[Found]:
+        """Images of one model that matches place in another."""
+        if self.database is None or not self.database.is_file():
+            return []
+        numbers = [model.colmap_index for model in models]
+        return images_in_others(self.database, [model.reconstruction for model in models], numbers)
+
+    def _whole(self, members: Sequence[Model], parts: Sequence[Part], group: Together, found: Sequence[Found]) -> Model:
         """One model of several, in the world of the first."""
         first, placed = members[0], group.placed
         assert first.scale is not None and first.similarity is not None
@@ -171,9 +185,13 @@ class JoinStage:
         down = float(np.linalg.norm(placed.gravity_m_s2)) * DOWN_IN_WORLD[self.world]
         scale = _scale_of(members, about, down)
         done = Treatment(stage="join", reason=reason, action="joined", values={"parts": len(members)})
+        reconstruction = merged(pieces, _agreeing(parts, group))
+        before = {model.colmap_index: model.reconstruction for model in members}
+        one = one_points(reconstruction, before, [each for each in found if _used(each, group)])
+        log.info("%s: %d points of two models are one", reason, one)
         return replace(
             first,
-            reconstruction=merged(pieces, _agreeing(parts, group)),
+            reconstruction=reconstruction,
             scale=replace(scale, notes=(*scale.notes, f"the model was {reason}")),
             similarity=replace(placements[0], provenance=f"{first.similarity.provenance}; {reason}"),
             treatments=(*first.treatments, done),
@@ -189,6 +207,11 @@ def _cameras(reconstruction: pycolmap.Reconstruction) -> frozenset[str]:
     if len(numbers) > max(1, len(images) // 2):
         return frozenset(image.name.rpartition("/")[0] + "/" for image in images)
     return frozenset(map(str, numbers))
+
+
+def _used(found: Found, group: Together) -> bool:
+    """Whether a pair's matches helped to place it."""
+    return bool({(found.first, found.second), (found.second, found.first)} & group.matched)
 
 
 def _agreeing(parts: Sequence[Part], group: Together) -> dict[tuple[int, int], frozenset[str]]:

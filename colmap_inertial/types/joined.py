@@ -20,6 +20,8 @@ class Gap:
         From the last image before it to the first one after it; below zero where the two overlap in time.
     shared_images
         How many images of both say where one lies in the other.
+    matched_images
+        How many images of one matches place in the other, in agreement with the IMU.
     sigma_m, sigma_deg
         Standard deviations of position and direction of the first image after it as seen from the last one before it,
         along the direction that is known worst; ``None`` where they were not found.
@@ -34,6 +36,7 @@ class Gap:
     second: int
     seconds: float
     shared_images: int = 0
+    matched_images: int = 0
     sigma_m: float | None = None
     sigma_deg: float | None = None
     chi2: float | None = None

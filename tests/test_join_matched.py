@@ -1,0 +1,145 @@
+"""Sub-models that see the same places: matches across a gap place them beside the IMU."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_join import UNKNOWN, across, cut
+
+from colmap_inertial.join.judge import join_parts
+from colmap_inertial.join.links import find_links, find_matched
+from colmap_inertial.model import Model
+from colmap_inertial.options import JoinOptions
+from colmap_inertial.simulate.motion import MotionOptions
+from colmap_inertial.simulate.tracks import TrackOptions, simulate_tracks
+from colmap_inertial.stages.across import images_in_others
+from colmap_inertial.stages.join import JoinStage
+from colmap_inertial.stages.metric import MetricStage
+
+LIMITS = JoinOptions()
+
+
+@pytest.fixture(scope="module")
+def returned(tmp_path_factory):
+    """Around a third of a ring and back past the same: two metric models, four seconds apart, and the database."""
+    motion = MotionOptions(kind="orbit", duration_s=24.0, vigour=0.6, radius_m=4.0, arc_deg=120.0, sweep_s=12.0)
+    tracks = simulate_tracks(
+        TrackOptions(motion=motion, vibration_m_s2=0.2, frame_rate_hz=3.0, points_per_m=20.0, life_s=1e3), seed=4
+    )
+    metric = MetricStage(imu=tracks.imu, calibration=UNKNOWN)
+    models = [
+        metric(Model(reconstruction=model, colmap_index=i, timing=tracks.timing))
+        for i, model in enumerate(cut(tracks, [(0.0, 10.0), (14.0, 24.0)]))
+    ]
+    database = tmp_path_factory.mktemp("matched") / "database.db"
+    tracks.write_database(database)
+    return tracks, models, database
+
+
+@pytest.fixture(scope="module")
+def stage(returned):
+    tracks, _, database = returned
+    return JoinStage(imu=tracks.imu, calibration=UNKNOWN, database=database)
+
+
+@pytest.fixture(scope="module")
+def parts(returned, stage):
+    return [stage.part(model) for model in returned[1]]
+
+
+@pytest.fixture(scope="module")
+def found(returned, stage):
+    return stage._found(returned[1])
+
+
+def error_m(tracks, parts, placed):
+    return float(np.linalg.norm(across(tracks, parts, placed, find_links(parts)[0])[0][3:]))
+
+
+def test_images_of_one_model_lie_in_the_other_as_in_truth(returned, found):
+    tracks, models, _ = returned
+    assert {(one.first, one.second) for one in found} == {(0, 1), (1, 0)}
+    t_of = dict(zip(tracks.timing.names, tracks.timing.pose_t_s().tolist(), strict=True))
+    for one in found:
+        # the true places in the model's own world, by its own images
+        images = [models[one.first].reconstruction.image(i) for i in models[one.first].reconstruction.reg_image_ids()]
+        lie = np.array([image.projection_center() for image in images])
+        true = tracks.motion.cam_in_world_m(np.array([t_of[image.name] for image in images]))
+        expected = _similarity(true, lie)(tracks.motion.cam_in_world_m(np.array([t_of[name] for name in one.names])))
+        assert np.median(np.linalg.norm(one.cam_in_world - expected, axis=1)) < 0.02
+        assert len(one.names) > 10 and set(one.names).isdisjoint({image.name for image in images})
+
+
+def _similarity(source, target):
+    """A similarity by least squares (Umeyama)."""
+    a, b = source - source.mean(0), target - target.mean(0)
+    u, d, vt = np.linalg.svd(b.T @ a)
+    sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
+    scale = np.trace(np.diag(d) @ sign) / np.sum(a**2)
+    return lambda points: scale * (points - source.mean(0)) @ (u @ sign @ vt).T + target.mean(0)
+
+
+def test_matches_place_a_part_better_than_the_imu_alone(returned, parts, found):
+    tracks, _, _ = returned
+    alone, both = (join_parts(parts, tracks.imu, LIMITS, one) for one in ((), found))
+    assert alone.gaps[0].matched_images == 0 and alone.gaps[0].joined
+    (gap,), (group,) = both.gaps, both.groups
+    assert gap.joined and gap.matched_images > 10 and gap.shared_images == 0
+    assert "match the other, and the IMU" in gap.reason
+    assert gap.sigma_m < 0.6 * alone.gaps[0].sigma_m
+    assert group.matched == {(0, 1)} and alone.groups[0].matched == frozenset()
+    placed = error_m(tracks, parts, group.placed)
+    assert placed < 0.02 and placed < error_m(tracks, parts, alone.groups[0].placed)
+    error, cov = across(tracks, parts, group.placed, find_links(parts)[0])
+    assert error[3:] @ np.linalg.solve(cov[3:, 3:], error[3:]) < 11.3
+
+
+def test_matches_that_contradict_the_imu_are_left_out(returned, parts, found):
+    tracks, _, _ = returned
+    # copies of what the first part saw, a metre farther on: the poses agree with each other
+    false = [
+        replace(one, cam_in_world=one.cam_in_world + (1.0 if one.first == 0 else -1.0) * np.array([1.0, 0.0, 0.0]))
+        for one in found
+    ]
+    assert all(len(one.in_first) > 10 for one in find_matched(parts, false))
+    joined, alone = (join_parts(parts, tracks.imu, LIMITS, one) for one in (false, ()))
+    assert joined.gaps[0].joined and joined.gaps[0].matched_images == 0
+    assert "contradict it, and are left out" in joined.gaps[0].reason
+    assert joined.gaps[0].sigma_m == pytest.approx(alone.gaps[0].sigma_m)
+    assert joined.groups[0].matched == frozenset()
+
+
+def test_a_gap_that_the_imu_leaves_too_wide_is_closed_by_matches(returned, parts, found):
+    tracks, _, _ = returned
+    alone, both = (join_parts(parts, tracks.imu, LIMITS, one).gaps[0] for one in ((), found))
+    limits = JoinOptions(sigma_m=0.5 * (alone.sigma_m + both.sigma_m))
+    assert not join_parts(parts, tracks.imu, limits).gaps[0].joined
+    assert join_parts(parts, tracks.imu, limits, found).gaps[0].joined
+
+
+def test_points_that_both_saw_are_one_in_the_joined_model(returned, stage):
+    tracks, models, _ = returned
+    (whole,), _ = stage.join_models(models)
+    (apart,), _ = replace(stage, database=None).join_models(models)
+    fewer = apart.reconstruction.num_points3D() - whole.reconstruction.num_points3D()
+    assert fewer > 50
+    assert whole.reconstruction.compute_num_observations() == apart.reconstruction.compute_num_observations()
+    # what became one is one point of the walk: its keypoints' own numbers say so
+    true, mixed = {}, 0
+    for i in range(len(tracks.timing.names)):
+        for place, point in enumerate(tracks.point[tracks.frame == i].tolist()):
+            true[i + 1, place] = point
+    for point in whole.reconstruction.points3D.values():
+        mixed += len({true[e.image_id, e.point2D_idx] for e in point.track.elements}) > 1
+    assert mixed == 0
+    assert whole.reconstruction.compute_mean_reprojection_error() < 2.0
+
+
+def test_without_matches_nothing_is_found(returned, tmp_path):
+    tracks, models, _ = returned
+    empty = tmp_path / "database.db"
+    tracks.write_database(empty, fewest=10**9)
+    reconstructions = [model.reconstruction for model in models]
+    assert images_in_others(empty, reconstructions, [0, 1]) == []
+    # models of one database that share images need no matches between these
+    assert images_in_others(returned[2], [reconstructions[0], reconstructions[0]], [0, 1]) == []
