@@ -37,7 +37,14 @@ from colmap_inertial.geometry import matrix_from_quat, quat_exp, quat_multiply, 
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.model import Model
 from colmap_inertial.refine.motion import moving
-from colmap_inertial.refine.setup import at_middle_lines, make_problem, pictures_alone, read_seen
+from colmap_inertial.refine.setup import (
+    at_middle_lines,
+    make_problem,
+    measured_noise,
+    pictures_alone,
+    read_seen,
+    with_noise,
+)
 from colmap_inertial.refine.solve import factored, solve
 from colmap_inertial.refine.values import Estimate, Problem
 from colmap_inertial.scale.priors import PRIORS
@@ -139,7 +146,8 @@ def by_chance(stage: RefineStage, before: Model, after: Model, truth: np.ndarray
     known = replace(known, noise=replace(known.noise, accel_density_m_s2_rthz=values["accel_noise_m_s2_rthz"]))
     problem, start = make_problem(seen, before.timing, stage.imu, known, stage._exposed_px(before, seen))
     alone = pictures_alone(problem, seen.observations.xy_px)
-    problem, alone = (replace(one, sigma_px=values["sigma_px"]) for one in (problem, alone))
+    noise = measured_noise(alone, start)
+    problem, alone = (with_noise(one, noise) for one in (problem, alone))
     x = solve(problem, start).estimate
     some = np.linspace(0, len(truth) - 1, min(len(truth), CENTRES)).astype(int)
     centres, true = at_middle_lines(problem, x).cam_in_world[some], truth[some]

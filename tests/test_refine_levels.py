@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from refine_walk import problem_of, tracks_of, walk
 
-from colmap_inertial.refine import levels
+from colmap_inertial.refine import levels, setup
 from colmap_inertial.refine._inertial import imu_rows
+from colmap_inertial.refine._seen import project
 from colmap_inertial.refine.levels import with_measured_noise
 from colmap_inertial.refine.solve import factored, solve
 
@@ -63,3 +64,33 @@ def test_the_level_is_that_of_the_greatest_likelihood(solved, monkeypatch):
 
     values = [likelihood(times) for times in (0.6, 1.0, 1.6)]
     assert values[1] > max(values[0], values[2]) + 1
+
+
+@pytest.mark.parametrize("times", [0.2, 1.0, 2.0])
+def test_observations_weigh_as_much_as_they_tell(solved, times):
+    from scipy.special import exp1
+
+    problem, start = solved
+    alone = setup.pictures_alone(problem, problem.observations.xy_px)
+    x = solve(alone, start).estimate
+    # of normal errors and a loss of scale k standard deviations, half the squares over the scale's are exponential
+    sigma_px = times * 0.5
+    scaled = replace(
+        alone, observations=replace(alone.observations, xy_px=_with_noise(alone, x, sigma_px)), robust_px=1.0
+    )
+    noise = setup.measured_noise(scaled, x)
+    k = 0.5 * (noise.robust_px / noise.sigma_px) ** 2
+    weight = k * np.exp(k) * exp1(k)
+    slope = k * (1 - weight)
+    variance = k * (weight - slope)
+    left = 1 - (3 * len(x.points_m) + 6 * len(x.velocity_m_s)) / (2 * len(alone.observations.frame))
+    assert noise.sigma_px * left**0.5 == pytest.approx(sigma_px, rel=0.03)
+    assert noise.robust_px == pytest.approx(max(1.0, 2 * noise.sigma_px))
+    assert noise.weighed_px / noise.sigma_px == pytest.approx((variance / slope) ** 0.5, rel=0.03)
+    assert noise.informs == pytest.approx(slope / weight, rel=0.03)
+
+
+def _with_noise(problem, x, sigma_px):
+    """Where the points would be seen, and noise."""
+    exact = problem.observations.xy_px + project(problem, x, problem.observations).residual
+    return exact + sigma_px * np.random.default_rng(5).standard_normal(exact.shape)

@@ -12,7 +12,7 @@ from colmap_inertial.errors import NotObservableError
 from colmap_inertial.refine._system import Factored, Order
 from colmap_inertial.refine.levels import with_measured_noise
 from colmap_inertial.refine.motion import Moving, moving
-from colmap_inertial.refine.setup import at_middle_lines, measured_sigma_px, pictures_alone
+from colmap_inertial.refine.setup import at_middle_lines, measured_noise, pictures_alone, with_noise
 from colmap_inertial.refine.solve import Solution, factored, held_out, solve
 from colmap_inertial.refine.values import READOUT, Estimate, Observations, Problem
 from colmap_inertial.types import Array
@@ -136,10 +136,8 @@ def refine(
         why = f"frames far apart see the same points, and solving for all at once takes {1e-9 * needed:.1f} GB"
         raise NotObservableError("refinement", why)
     alone = pictures_alone(problem, at_once_px)
-    sigma_px = measured_sigma_px(alone, start)
-    # noise alone shall not lose its weight
-    robust_px = max(problem.robust_px, 2 * sigma_px)
-    problem, alone = (replace(one, sigma_px=sigma_px, robust_px=robust_px) for one in (problem, alone))
+    noise = measured_noise(alone, start)
+    problem, alone = (with_noise(one, noise) for one in (problem, alone))
     kept = ~_chosen(problem.observations)
     seen_alone, seen = solve(_part(alone, kept), start), solve(_part(problem, kept), start)
     # pictures alone may fit worse than with a rolling shutter: the IMU's own squares are the least that it costs
@@ -188,12 +186,12 @@ def refine(
         accepted=not reason,
         reason=reason,
         held_out=count,
-        before_px=_as_px(before, sigma_px),
-        after_px=_as_px(after, sigma_px),
+        before_px=_as_px(before, problem.sigma_px),
+        after_px=_as_px(after, problem.sigma_px),
         change=mean,
         change_sigma=spread,
         chi2=chi2,
-        sigma_px=sigma_px,
+        sigma_px=noise.sigma_px,
         accel_noise_m_s2_rthz=problem.inertial.noise.accel_density_m_s2_rthz,
         shared_cov=cov,
         drift=drift,

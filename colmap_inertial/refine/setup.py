@@ -366,14 +366,55 @@ def pictures_alone(problem: Problem, xy_px: Array) -> Problem:
     return replace(problem, observations=at_once, inertial=None)
 
 
-def measured_sigma_px(problem: Problem, x: Estimate) -> float:
-    """Standard deviation of observations, by the residuals' median and the numbers that were fitted to them."""
+@dataclass(frozen=True, kw_only=True)
+class PictureNoise:
+    """How observations err, and what the robust loss makes of them.
+
+    Attributes
+    ----------
+    sigma_px
+        Standard deviation, each coordinate, by the residuals' median.
+    robust_px
+        Scale of the loss.
+    weighed_px
+        What errors are divided by, so that they weigh as much as they tell: the loss takes weight off errors that are
+        only large, not false, and leaves less of their noise than of their slope (Huber 1964). With twice the noise as
+        its scale, observations would weigh 0.6 of what they should beside the IMU.
+    informs
+        What they tell over what their weights say: the weights are those of steps, steeper than the loss is curved.
+    """
+
+    sigma_px: float
+    robust_px: float
+    weighed_px: float
+    informs: float
+
+
+def measured_noise(problem: Problem, x: Estimate) -> PictureNoise:
+    """How observations err, by the residuals of a fit and how many numbers were fitted to them."""
     observations = problem.observations
     at = project(problem, x, observations)
     squares = np.sum(at.residual[at.seen] ** 2, axis=1)
     used = 3 * len(x.points_m) + 6 * len(x.velocity_m_s)
-    left = max(0.2, 1 - used / (2 * len(observations.frame)))
-    return max(_LEAST_PX, float(np.sqrt(np.median(squares) / _MEDIAN_OF_SQUARES / left)))
+    squares = squares / max(0.2, 1 - used / (2 * len(observations.frame)))
+    sigma_px = max(_LEAST_PX, float(np.sqrt(np.median(squares) / _MEDIAN_OF_SQUARES)))
+    # noise alone shall not lose its weight
+    robust_px = max(problem.robust_px, 2 * sigma_px)
+    weight = 1 / (1 + squares / robust_px**2)
+    # of what the loss pulls with: its mean slope by the error, and its variance, in two coordinates
+    slope = float(np.mean(weight**2))
+    variance = float(np.mean(squares * weight**2)) / (2 * sigma_px**2)
+    return PictureNoise(
+        sigma_px=sigma_px,
+        robust_px=robust_px,
+        weighed_px=max(_LEAST_PX, sigma_px * float(np.sqrt(variance / slope))),
+        informs=slope / float(np.mean(weight)),
+    )
+
+
+def with_noise(problem: Problem, noise: PictureNoise) -> Problem:
+    """The problem with its observations weighed so."""
+    return replace(problem, sigma_px=noise.weighed_px, robust_px=noise.robust_px, informs=noise.informs)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

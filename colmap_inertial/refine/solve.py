@@ -85,6 +85,15 @@ def _weighted(problem: Problem, at: _Point) -> tuple[Derivatives, Array]:
     return by, at.projected.residual * root[:, None]
 
 
+def _informing(problem: Problem, at: _Point) -> tuple[Derivatives, Array]:
+    """The same as much as observations tell; what they pull with stays."""
+    by, residual = _weighted(problem, at)
+    root = problem.informs**0.5
+    for values in (by.by_frame, by.by_shared, by.by_point):
+        values *= root
+    return by, residual / root
+
+
 def _built(problem: Problem, order: Order, at: _Point, by: Derivatives, residual: Array, damping: float) -> System:
     info = problem.prior.info
     return System.build(order, problem.observations, by, residual, at.rows, (info, -info @ at.offset), damping=damping)
@@ -179,8 +188,7 @@ def factored(problem: Problem, x: Estimate) -> Factored:
     """The information at an estimate, for covariances."""
     order = Order.of(problem.observations, len(x.velocity_m_s))
     at = _evaluate(problem, x, problem.observations)
-    by, residual = _weighted(problem, at)
-    return _built(problem, order, at, by, residual, 0.0).factored()
+    return _built(problem, order, at, *_informing(problem, at), 0.0).factored()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -212,7 +220,7 @@ class Linearised:
 def linearised(problem: Problem, x: Estimate) -> Linearised:
     """The observations at an estimate."""
     at = _evaluate(problem, x, problem.observations)
-    by, residual = _weighted(problem, at)
+    by, residual = _informing(problem, at)
     order = Order.of(problem.observations, len(x.velocity_m_s))
     return Linearised(order=order, projected=at.projected, by=by, residual=residual, estimate=x)
 

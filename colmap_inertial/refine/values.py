@@ -288,9 +288,11 @@ class Problem:
     prior
         What is known beforehand.
     sigma_px
-        Standard deviation of an observation, each coordinate.
+        What an observation's errors are divided by, each coordinate.
     robust_px
         Scale of Cauchy's loss: of an error this long half the weight is left.
+    informs
+        What observations tell, over what their weights in the loss say that they do: for covariances.
     """
 
     observations: Observations
@@ -300,3 +302,4 @@ class Problem:
     prior: Prior
     sigma_px: float
     robust_px: float = 1.0
+    informs: float = 1.0
