@@ -1,7 +1,7 @@
 """What the tight refinement does to simulated walks: camera centres, drift of scale, and the calibration.
 
     python scripts/study_refine.py [--metres 100] [--readout-ms 0] [--undeclared] [--expected] [--seeds 1 2]
-        [--chance] [--spoil late] [--out F]
+        [--chance] [--spoil late] [--points-per-m 250] [--mapper] [--out F]
     python scripts/study_refine.py --loop [--seeds 1 2]
 
 Points beside the way are tracked as features are (no pictures are rendered), and COLMAP's own bundle adjustment makes
@@ -11,9 +11,11 @@ through the readout's stage first, as in a run. ``--undeclared``: nobody says so
 
 Errors are those of the camera centres after one similarity, in millimetres; drift is the scale of the last third of the
 path over that of the first, in per cent; of the calibration, error and normalised error (over its standard deviation).
-Seconds are the processor's (one), memory is the most until then. ``--spoil`` falsifies the IMU: another recording's, 30
-ms late, an axis of the accelerometer flipped, or 5 % more of it. ``--expected``: a device whose axes and gains are as
-far off as the refinement's priors have it, and not as a phone's: what tells whether the rotation's covariance is right.
+Seconds are the processor's (one), memory is the most until then. ``--mapper``: COLMAP's incremental mapper makes the
+model, from true matches of all frames that see the same, with the options that ``reconstruct`` gives it. ``--spoil``
+falsifies the IMU: another recording's, 30 ms late, an axis of the accelerometer flipped, or 5 % more of it.
+``--expected``: a device whose axes and gains are as far off as the refinement's priors have it, and not as a phone's:
+what tells whether the rotation's covariance is right.
 
 ``--chance`` prints what the refinement's covariance says of its camera centres after one similarity: the error that is
 to be expected, of it and of pictures alone, in millimetres; the normalised error of the path's shape (rms over its 12
@@ -24,6 +26,7 @@ weakest ways to bend, 1 where the covariance is right); and how often the refine
 import argparse
 import json
 import resource
+import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -33,9 +36,11 @@ import numpy as np
 import pycolmap
 from check_euroc import similarity
 
+from colmap_inertial.colmap.sparse import map_images
 from colmap_inertial.geometry import matrix_from_quat, quat_exp, quat_multiply, so3_log
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.model import Model
+from colmap_inertial.options import MappingOptions
 from colmap_inertial.refine.motion import moving
 from colmap_inertial.refine.setup import (
     at_middle_lines,
@@ -47,6 +52,7 @@ from colmap_inertial.refine.setup import (
 )
 from colmap_inertial.refine.solve import factored, solve
 from colmap_inertial.refine.values import Estimate, Problem
+from colmap_inertial.run.context import RunContext
 from colmap_inertial.scale.priors import PRIORS
 from colmap_inertial.simulate.motion import MotionOptions
 from colmap_inertial.simulate.tracks import TrackOptions, Tracks, simulate_tracks
@@ -78,6 +84,26 @@ def adjusted(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     pycolmap.create_default_bundle_adjuster(options, config, model).solve()
     model.update_point_3d_errors()
     return model
+
+
+def by_mapper(tracks: Tracks, xy_px: np.ndarray) -> pycolmap.Reconstruction:
+    """The largest model that COLMAP's mapper makes, the camera known."""
+    with tempfile.TemporaryDirectory() as folder:
+        database, sparse = Path(folder) / "database.db", Path(folder) / "sparse"
+        tracks.write_database(database, xy_px)
+        context = RunContext(scratch=Path(folder), num_threads=1)
+        count = len(tracks.timing.names)
+        map_images(
+            database,
+            Path(folder),
+            sparse,
+            MappingOptions(),
+            refine_intrinsics=False,
+            num_images=count,
+            context=context,
+        )
+        models = [pycolmap.Reconstruction(str(one)) for one in sorted(sparse.iterdir())]
+    return max(models, key=lambda model: int(model.num_reg_images()))
 
 
 def spoiled(imu: ImuRecording, tracks: Tracks, how: str, options: TrackOptions, seed: int) -> ImuRecording:
@@ -173,7 +199,7 @@ def _drawn(cov: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def studied(
-    options: TrackOptions, seed: int, spoil: str, *, declared: bool = True, chance: bool = False
+    options: TrackOptions, seed: int, spoil: str, *, declared: bool = True, chance: bool = False, mapper: bool = False
 ) -> dict[str, Any]:
     """One walk through the stages."""
     tracks = simulate_tracks(options, seed=seed)
@@ -198,14 +224,17 @@ def studied(
             if shutter.covers(name):
                 xy_px[mine] = shutter.moved(name, xy_px[mine])
     begin_s = time.process_time()
-    mapped = adjusted(tracks.reconstruction(xy_px))
-    seconds = {"bundle_adjustment": time.process_time() - begin_s}
-    truth = tracks.motion.cam_in_world_m(tracks.timing.pose_t_s())
+    mapped = by_mapper(tracks, xy_px) if mapper else adjusted(tracks.reconstruction(xy_px))
+    seconds = {"mapper" if mapper else "bundle_adjustment": time.process_time() - begin_s}
+    seen_s = dict(zip(timing.names, timing.pose_t_s().tolist(), strict=True))
+    names = sorted(mapped.image(i).name for i in mapped.reg_image_ids())
+    truth = tracks.motion.cam_in_world_m(np.array([seen_s[name] for name in names]))
     model = Model(reconstruction=mapped, colmap_index=0, timing=timing, rectified=shutter is not None)
     out: dict[str, Any] = {
         "seed": seed,
-        "frames": len(tracks.timing.names),
-        "observations": len(tracks.frame),
+        "frames": len(names),
+        "points": mapped.num_points3D(),
+        "observations": mapped.compute_num_observations(),
         "colmap": compared(centres_of(mapped), truth),
     }
     begin_s = time.process_time()
@@ -305,14 +334,19 @@ def main() -> None:
     parser.add_argument("--undeclared", action="store_true")
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--expected", action="store_true")
+    parser.add_argument("--points-per-m", type=float, default=TrackOptions.points_per_m)
+    parser.add_argument("--mapper", action="store_true")
     parser.add_argument("--chance", action="store_true")
     parser.add_argument("--spoil", choices=("", "other", "late", "flipped", "gain"), default="")
     parser.add_argument("--out", type=Path)
     asked = parser.parse_args()
     options, results = ring() if asked.loop else walk(asked.metres, asked.readout_ms * 1e-3), []
     options = expected(options) if asked.expected else options
+    options = options if asked.loop else replace(options, points_per_m=asked.points_per_m)
     for seed in asked.seeds:
-        one = studied(options, seed, asked.spoil, declared=not asked.undeclared, chance=asked.chance)
+        one = studied(
+            options, seed, asked.spoil, declared=not asked.undeclared, chance=asked.chance, mapper=asked.mapper
+        )
         results.append(one)
         colmap, before, after = (one[k] for k in ("colmap", "before", "after"))
         print(
@@ -320,7 +354,7 @@ def main() -> None:
             f"drift {colmap['drift_pct']:+.2f} {before['drift_pct']:+.2f} -> {after['drift_pct']:+.2f} %; "
             f"{one['scale']['verdict']}; {one['said']}; seconds {one['seconds']}; readout {one.get('readout', '')} ms; "
             f"accelerometer's noise {1e3 * one['values'].get('accel_noise_m_s2_rthz', 0):.2f} mm/s2/rtHz; "
-            f"{one['frames']} frames, {one['observations']} observations, {one['gb']:.1f} GB; "
+            f"{one['frames']} frames, {one['points']} points, {one['observations']} observations, {one['gb']:.1f} GB; "
             f"{one.get('chance', '')}; {one.get('calibration', '')}",
             flush=True,
         )

@@ -58,7 +58,7 @@ def test_the_level_is_that_of_the_greatest_likelihood(solved, monkeypatch):
     def likelihood(times):
         now = at_level(problem, times * best)
         information = factored(now, x)
-        halves = np.log(information.lower[0]).sum() + np.log(np.diagonal(information.corner[0])).sum()
+        halves = 0.5 * information.states.log_determinant() + np.log(np.diagonal(information.corner[0])).sum()
         noise = np.linalg.slogdet(np.eye(9) + (times**2 - 1) * share)[1].sum()
         return -solve(now, x).cost - float(halves) - 0.5 * float(noise)
 
@@ -83,11 +83,19 @@ def test_observations_weigh_as_much_as_they_tell(solved, times):
     weight = k * np.exp(k) * exp1(k)
     slope = k * (1 - weight)
     variance = k * (weight - slope)
+    # nothing was fitted to these
     left = 1 - (3 * len(x.points_m) + 6 * len(x.velocity_m_s)) / (2 * len(alone.observations.frame))
     assert noise.sigma_px * left**0.5 == pytest.approx(sigma_px, rel=0.03)
     assert noise.robust_px == pytest.approx(max(1.0, 2 * noise.sigma_px))
     assert noise.weighed_px / noise.sigma_px == pytest.approx((variance / slope) ** 0.5, rel=0.03)
     assert noise.informs == pytest.approx(slope / weight, rel=0.03)
+
+
+def test_noise_is_measured_beside_what_was_fitted_to_it():
+    options = walk(6.0, points_per_m=80.0)
+    problem, start, _ = problem_of(tracks_of(options), options)
+    alone = setup.pictures_alone(problem, problem.observations.xy_px)
+    assert setup.measured_noise(alone, solve(alone, start).estimate).sigma_px == pytest.approx(0.5, rel=0.03)
 
 
 def _with_noise(problem, x, sigma_px):

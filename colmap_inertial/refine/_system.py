@@ -9,13 +9,11 @@ import numpy as np
 
 from colmap_inertial._kernels import _inertial
 from colmap_inertial.geometry import Array
+from colmap_inertial.refine._banded import BandFactor
 from colmap_inertial.refine._inertial import Rows
 from colmap_inertial.refine._seen import Derivatives
 from colmap_inertial.refine.motion import Moving
 from colmap_inertial.refine.values import N_SEEN, N_STATE, POSITION, Index, Observations
-
-#: Frames whose covariance is solved for at once.
-_AT_ONCE = 20
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -179,12 +177,12 @@ class System:
         numpy.linalg.LinAlgError
             Where it is not positive definite.
         """
-        from scipy.linalg import cho_factor, cho_solve_banded, cholesky_banded
+        from scipy.linalg import cho_factor
 
-        lower: Any = cholesky_banded(self.band.T, lower=True, overwrite_ab=True, check_finite=False)
-        solved = np.asarray(cho_solve_banded((lower, True), self.border, check_finite=False))
+        states = BandFactor.of(self.band, N_STATE)
+        solved = states.solve(self.border)
         corner: Any = cho_factor(self.corner - self.border.T @ solved, lower=True, check_finite=False)
-        return Factored(order=self.order, lower=lower, border=self.border, solved=solved, corner=corner)
+        return Factored(order=self.order, states=states, border=self.border, solved=solved, corner=corner)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -192,18 +190,17 @@ class Factored:
     """A system that was factored; its matrix was used up."""
 
     order: Order
-    lower: Any
+    states: BandFactor
     border: Array
     solved: Array
     corner: Any
 
     def solve(self, rhs: Array, rhs_shared: Array) -> tuple[Array, Array]:
         """States (15 F, k) in the band's order and shared numbers (Q, k) for k right-hand sides."""
-        from scipy.linalg import cho_solve, cho_solve_banded
+        from scipy.linalg import cho_solve
 
         shared = np.asarray(cho_solve(self.corner, rhs_shared - self.solved.T @ rhs, check_finite=False))
-        states = np.asarray(cho_solve_banded((self.lower, True), rhs, check_finite=False)) - self.solved @ shared
-        return states, shared
+        return self.states.solve(rhs) - self.solved @ shared, shared
 
     def step(self, system: System, observations: Observations, by: Derivatives) -> tuple[Array, Array, Array]:
         """The step of the states (F, 15), of what is shared (Q,), and of the points (P, 3)."""
@@ -234,21 +231,30 @@ class Factored:
 
     def motion_covs(self, frames: Index, by: Moving) -> Array:
         """(K, 6, 6) covariances of K frames' positions against the first frame's, and velocities."""
-        out, place = [], self.order.place
-        for some in np.array_split(frames, -(-len(frames) // _AT_ONCE)):
-            count = len(some)
-            sides = np.zeros((count, 6, len(place), N_STATE))
-            sides[np.arange(count)[:, None], np.arange(6), place[some][:, None]] = by.by_state[some]
-            sides[:, :3, place[0]] -= by.by_state[0, :3]
-            sides_shared = by.by_shared[some]
-            sides_shared[:, :3] -= by.by_shared[0, :3]
-            rhs, rhs_shared = sides.reshape(6 * count, -1).T, sides_shared.reshape(6 * count, -1).T
-            cov = np.zeros((count, 6, 6))
-            for side, solved in zip((rhs, rhs_shared), self.solve(rhs, rhs_shared), strict=True):
-                left, right = (one.reshape(-1, count, 6) for one in (side, solved))
-                cov += np.einsum("nki,nkj->kij", left, right)
-            out.append(0.5 * (cov + cov.transpose(0, 2, 1)))
-        return np.concatenate(out)
+        from scipy.linalg import cho_solve
+
+        place, shared = self.order.place, len(self.corner[0])
+        at, first = place[frames], N_STATE * place[0]
+        unit = np.zeros((len(self.solved), N_STATE))
+        unit[first : first + N_STATE] = np.eye(N_STATE)
+        beside = self.states.solve(unit).reshape(-1, N_STATE, N_STATE)
+        here, start = by.by_state[frames], by.by_state[0, :3]
+        cov = here @ self.states.marginals(N_STATE)[at] @ here.transpose(0, 2, 1)
+        across = here @ beside[at] @ start.T
+        cov[:, :, :3] -= across
+        cov[:, :3] -= across.transpose(0, 2, 1)
+        cov[:, :3, :3] += start @ beside[place[0]] @ start.T
+        followed = self.solved.reshape(-1, N_STATE, shared)
+        left = by.by_shared[frames] - here @ followed[at]
+        left[:, :3] -= by.by_shared[0, :3] - start @ followed[place[0]]
+        flat = left.reshape(-1, shared)
+        cov += left @ np.asarray(cho_solve(self.corner, flat.T, check_finite=False)).T.reshape(left.shape).transpose(
+            0, 2, 1
+        )
+        # against itself, the first one is sure, and not but for rounding
+        cov[frames == 0, :3] = 0.0
+        cov[frames == 0, :, :3] = 0.0
+        return np.asarray(0.5 * (cov + cov.transpose(0, 2, 1)))
 
     def shared_cov(self) -> Array:
         """(Q, Q) covariance of what is shared."""
