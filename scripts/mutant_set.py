@@ -1796,6 +1796,20 @@ MUTANTS = (
         ("join_matched::test_matches_place_a_part_better_than_the_imu_alone",),
     ),
     Mutant(
+        "refine/_banded.py",
+        "                inverse += along.T @ after @ along",
+        "                inverse += along.T @ along",
+        "a frame's covariance does not know of later frames",
+        ("refine_banded::test_solutions_and_marginals_are_those_of_the_dense_inverse",),
+    ),
+    Mutant(
+        "refine/setup.py",
+        "weighed_px=max(_LEAST_PX, sigma_px * float(np.sqrt(variance / slope))),",
+        "weighed_px=sigma_px,",
+        "observations weigh less than they tell",
+        ("refine_levels::test_observations_weigh_as_much_as_they_tell",),
+    ),
+    Mutant(
         "refine/levels.py",
         "right = max(count - explained, 0.01 * count)",
         "right = count",

@@ -241,6 +241,8 @@ def studied(
     model = ReadoutStage(imu=imu, calibration=prior, refine_intrinsics=True, num_threads=1)(model)
     model = MetricStage(imu=imu, calibration=prior)(model)
     out["scale"] = {"verdict": model.scale.verdict, "reasons": list(model.scale.reasons)}
+    noise = model.scale.noise
+    out["scale"]["accel_noise"] = 0.0 if noise is None else noise.accel_density_m_s2_rthz
     out["before"] = compared(centres_of(model.reconstruction), truth)
     seconds["scale"] = time.process_time() - begin_s
     begin_s = time.process_time()
@@ -353,7 +355,8 @@ def main() -> None:
             f"seed {seed}: COLMAP {colmap['rms_mm']:.1f} before {before['rms_mm']:.1f} after {after['rms_mm']:.1f} mm; "
             f"drift {colmap['drift_pct']:+.2f} {before['drift_pct']:+.2f} -> {after['drift_pct']:+.2f} %; "
             f"{one['scale']['verdict']}; {one['said']}; seconds {one['seconds']}; readout {one.get('readout', '')} ms; "
-            f"accelerometer's noise {1e3 * one['values'].get('accel_noise_m_s2_rthz', 0):.2f} mm/s2/rtHz; "
+            f"accelerometer's noise {1e3 * one['scale']['accel_noise']:.2f} -> "
+            f"{1e3 * one['values'].get('accel_noise_m_s2_rthz', 0):.2f} mm/s2/rtHz; "
             f"{one['frames']} frames, {one['points']} points, {one['observations']} observations, {one['gb']:.1f} GB; "
             f"{one.get('chance', '')}; {one.get('calibration', '')}",
             flush=True,

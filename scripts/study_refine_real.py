@@ -1,17 +1,17 @@
 """What the tight refinement does to real recordings.
 
     python scripts/study_refine_real.py --euroc DATASET FOLDER
-    python scripts/study_refine_real.py --recordings FOLDER [--noise-px .5]
+    python scripts/study_refine_real.py --recordings FOLDER [--noise-px 10]
 
 ``--euroc``: the 100 keyframes of V1_01_easy (DATASET has ``keyframes/``, ``mav0/`` and ``gt/``), matched and mapped by
 ``reconstruct`` with and without ``--refine inertial``, in FOLDER. Both metric models against motion capture, as
 ``check_euroc.py`` compares them: the camera centres' error and that of the scale, and what the refinement said.
 
 ``--recordings`` (a folder of InertialScale, as ``bench_scale.py`` takes it) has poses and no images: made points are
-seen from every eighth pose with ``--noise-px``, as a camera in these places would see them, which holds each pose as
-pictures would, and the model goes through scale and refinement as any other. The error of the scale before and after,
-what the refinement itself would make of it (the stage keeps the scale's), and how far the refined centres lie from the
-poses after one similarity.
+seen from every eighth pose with ``--noise-px``, as a camera in these places would see them, which holds each pose to a
+milliradian and some millimetres, as surely as such poses are known, and the model goes through scale and refinement as
+any other. The error of the scale before and after, what the refinement itself would make of it (the stage keeps the
+scale's), and how far the refined centres lie from the poses after one similarity.
 """
 
 import argparse
@@ -131,7 +131,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--euroc", type=Path, nargs=2, metavar=("DATASET", "FOLDER"))
     parser.add_argument("--recordings", type=Path)
-    parser.add_argument("--noise-px", type=float, default=0.5)
+    parser.add_argument("--noise-px", type=float, default=10.0)
     asked = parser.parse_args()
     if asked.euroc:
         euroc(*asked.euroc)
