@@ -1,6 +1,7 @@
 """Walks cut into two or three models by seconds without texture: how well the IMU brings them together again.
 
     python scripts/study_join.py [--parts 2] [--gaps 1 2 4] [--seeds 1 2] [--spoil thrown] [--sigma-m .1] [--out F]
+    python scripts/study_join.py --back [--gaps 2 4] [--seeds 1 2]
     python scripts/study_join.py --recordings FOLDER [--begins 6 25]
 
 Points beside the way are tracked as features are (no pictures are rendered), and nothing is seen for some seconds.
@@ -13,13 +14,17 @@ falsifies what cannot be joined: another recording's IMU within the gap, an IMU 
 a later part that moved elsewhere in between (the device thrown, or a part of another recording), a clock that loses a
 fifth of a second within the gap.
 
+``--back``: a third of the way around a ring and back past the same walls, cut in two. What both parts saw is matched in
+COLMAP's database, and each gap is told twice: by the IMU alone, and by matches, too.
+
 ``--recordings`` cuts real ones instead (a folder of InertialScale, as ``bench_scale.py`` takes it): two parts from so
 many seconds on, each fitted by itself; the truth is the path of the whole recording in its true scale.
 """
 
 import argparse
 import json
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -35,12 +40,13 @@ from colmap_inertial.io.trajectories import read_inertial_scale
 from colmap_inertial.join.judge import Ends, ends_of, join_parts
 from colmap_inertial.join.links import find_links
 from colmap_inertial.join.solve import Placed
-from colmap_inertial.join.values import Part
+from colmap_inertial.join.values import Found, Part
 from colmap_inertial.model import Model
 from colmap_inertial.options import JoinOptions, ScaleOptions
 from colmap_inertial.scale.posterior import FittedPath
 from colmap_inertial.simulate.motion import MotionOptions
 from colmap_inertial.simulate.tracks import TrackOptions, Tracks, simulate_tracks
+from colmap_inertial.stages.across import images_in_others
 from colmap_inertial.stages.join import JoinStage
 from colmap_inertial.stages.metric import MetricStage
 from colmap_inertial.types import ImuRecording
@@ -118,9 +124,10 @@ def judged(
     imu: ImuRecording,
     limits: JoinOptions,
     truth: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
+    found: Sequence[Found] = (),
 ) -> list[dict[str, Any]]:
     """The gaps between parts, and errors across them; the truth is (N, 3, 3) world_from_cam and (N, 3) by times."""
-    joined = join_parts(fitted, imu, limits)
+    joined = join_parts(fitted, imu, limits, found)
     out: list[dict[str, Any]] = []
     for gap in joined.gaps:
         one: dict[str, Any] = {"joined": gap.joined, "reason": gap.reason}
@@ -180,6 +187,41 @@ def cut_recording(folder: Path, begin_s: float, gap_s: float, limits: JoinOption
     return out
 
 
+def ring(seconds: float) -> TrackOptions:
+    """A third of the way around a ring of 25 m, and back; each point is known again."""
+    motion = MotionOptions(
+        kind="orbit", duration_s=seconds, vigour=0.6, radius_m=4.0, arc_deg=120.0, sweep_s=0.5 * seconds
+    )
+    return TrackOptions(motion=motion, vibration_m_s2=0.3, points_per_m=15.0, life_s=1e3)
+
+
+def come_back(gap_s: float, seed: int, limits: JoinOptions) -> list[dict[str, Any]]:
+    """A way there and back in two parts: by the IMU alone, and by matches, too."""
+    spans = [(0.0, PART_S), (PART_S + gap_s, 2 * PART_S + gap_s)]
+    tracks, rng = simulate_tracks(ring(spans[-1][1] + 0.3), seed=seed), np.random.default_rng(seed)
+    metric = MetricStage(imu=tracks.imu, calibration=calibration_prior())
+    models = []
+    for k, span in enumerate(spans):
+        model = part_of(tracks, *span, rng)
+        models.append(metric(Model(reconstruction=model, colmap_index=k, timing=tracks.timing)))
+    with tempfile.TemporaryDirectory() as folder:
+        database = Path(folder) / "database.db"
+        tracks.write_database(database)
+        found = images_in_others(database, [model.reconstruction for model in models], [0, 1])
+    stage = JoinStage(imu=tracks.imu, calibration=calibration_prior(), limits=limits)
+    fitted = [stage.part(model) for model in models]
+
+    def truth(t_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        state = tracks.motion.at(t_s)
+        return matrix_from_quat(state.world_from_cam_xyzw), state.cam_in_world_m
+
+    out = []
+    for matches in ((), found):
+        for one in judged(fitted, tracks.imu, limits, truth, matches):
+            out.append(one | {"seed": f"{seed}{', matched' if matches else ''}", "gap_s": gap_s})
+    return out
+
+
 def studied(parts: int, gap_s: float, seed: int, spoil: str, limits: JoinOptions) -> list[dict[str, Any]]:
     """One walk, its gaps."""
     spans = [(k * (PART_S + gap_s), k * (PART_S + gap_s) + PART_S) for k in range(parts)]
@@ -217,13 +259,16 @@ def main() -> None:
     parser.add_argument("--spoil", choices=("", "other", "silent", "thrown", "clock"), default="")
     parser.add_argument("--sigma-m", type=float, default=JoinOptions.sigma_m)
     parser.add_argument("--sigma-deg", type=float, default=JoinOptions.sigma_deg)
+    parser.add_argument("--back", action="store_true")
     parser.add_argument("--recordings", type=Path)
     parser.add_argument("--begins", type=float, nargs="+", default=[6.0, 25.0])
     parser.add_argument("--out", type=Path)
     asked = parser.parse_args()
     limits, results = JoinOptions(sigma_m=asked.sigma_m, sigma_deg=asked.sigma_deg), []
     for gap_s in asked.gaps:
-        if asked.recordings is None:
+        if asked.back:
+            walks = (come_back(gap_s, seed, limits) for seed in asked.seeds)
+        elif asked.recordings is None:
             walks = (studied(asked.parts, gap_s, seed, asked.spoil, limits) for seed in asked.seeds)
         else:
             folders = recordings_in(asked.recordings)
@@ -243,16 +288,24 @@ def main() -> None:
                 if asked.out is not None:
                     asked.out.write_text(json.dumps(results, indent=1))
         of_gap = [one for one in results if one["gap_s"] == gap_s]
-        told = [one for one in of_gap if "error_m" in one]
-        line = f"{gap_s:g} s: {sum(one['joined'] for one in of_gap)} of {len(of_gap)} joined"
-        if told:
-            median = [float(np.median([one[name] for one in told])) for name in ("error_m", "error_deg")]
-            inside = [sum(one[name] for one in told) for name in ("inside_m", "inside_deg")]
-            line += (
-                f"; median error {100 * median[0]:.1f} cm {median[1]:.2f} deg; within the 95 % region {inside[0]} and "
-                f"{inside[1]} of {len(told)}"
-            )
-        print(line, flush=True)
+        matched = [one for one in of_gap if str(one["seed"]).endswith("matched")]
+        told_of(f"{gap_s:g} s", [one for one in of_gap if one not in matched])
+        if matched:
+            told_of(f"{gap_s:g} s, matched", matched)
+
+
+def told_of(what: str, gaps: list[dict[str, Any]]) -> None:
+    """How many were joined, and how well."""
+    told = [one for one in gaps if "error_m" in one]
+    line = f"{what}: {sum(one['joined'] for one in gaps)} of {len(gaps)} joined"
+    if told:
+        median = [float(np.median([one[name] for one in told])) for name in ("error_m", "error_deg")]
+        inside = [sum(one[name] for one in told) for name in ("inside_m", "inside_deg")]
+        line += (
+            f"; median error {100 * median[0]:.1f} cm {median[1]:.2f} deg; within the 95 % region {inside[0]} and "
+            f"{inside[1]} of {len(told)}"
+        )
+    print(line, flush=True)
 
 
 if __name__ == "__main__":

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import combinations, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.geometry import so3_log
-from colmap_inertial.join.values import Found, Link, MatchedImages, Part, SharedImages
+from colmap_inertial.join.values import Found, Link, MatchedImages, Part, SharedImages, pair_of
 from colmap_inertial.scale._parameters import DRIFT_S
 from colmap_inertial.types import Array
 
@@ -17,6 +19,9 @@ from colmap_inertial.types import Array
 _MOST_LINKS = 4
 #: So many shared images are believed, of which more than half agree to so many times their median error.
 FEWEST_SHARED, _AGREE = 3, 5.0
+#: Images that matches place far from where the parts meet have the bends of both models between, which last for
+#: seconds: as far apart as shared images may be, one bend would count dozens of times.
+_MATCHED_ALIKE_S = 4.0
 #: Errors that pictures hardly fall below (rad, m): what agrees to less agrees.
 _LEAST_RAD, _LEAST_M = 1e-3, 5e-3
 
@@ -89,13 +94,15 @@ def find_matched(parts: Sequence[Part], found: Sequence[Found]) -> list[MatchedI
                 second=second,
                 in_first=theirs if k == first else mine,
                 in_second=mine if k == first else theirs,
-                weight=_independent(parts[own].trajectory.t_s[mine]),
+                weight=_independent(parts[own].trajectory.t_s[mine], _MATCHED_ALIKE_S),
                 other=k,
                 world_from_cam=world_from_cam[agree],
                 cam_in_world=centres[agree],
             )
         )
-    return out
+    # one's images in the other and the other's in it are the same matches, read twice
+    times = Counter(pair_of(one) for one in out)
+    return [replace(one, weight=one.weight / times[pair_of(one)]) for one in out]
 
 
 def _agreeing(turned: Array, own: Array, centres: Array, own_centres: Array) -> NDArray[np.bool_]:
@@ -111,9 +118,9 @@ def _agreeing(turned: Array, own: Array, centres: Array, own_centres: Array) -> 
     )
 
 
-def _independent(t_s: Array) -> float:
-    """How much each of some images counts: errors of those a fraction of a second apart are alike."""
-    return float(min(len(t_s), 1 + float(np.ptp(t_s)) / DRIFT_S) / len(t_s))
+def _independent(t_s: Array, alike_s: float = DRIFT_S) -> float:
+    """How much each of some images counts: errors of those so near in time are alike."""
+    return float(min(len(t_s), 1 + float(np.ptp(t_s)) / alike_s) / len(t_s))
 
 
 def _median_angle(turns: np.ndarray, turn: np.ndarray) -> float:
