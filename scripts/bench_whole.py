@@ -1,7 +1,7 @@
 """The whole run against bare COLMAP: processor time, registered images, camera error, loops.
 
     python scripts/bench_whole.py FOLDER [--euroc DATASET] [--walk FRAMES] [--loop FRAMES] [--repeated SCENES]
-        [--drawn] [--long FRAMES ...] [--json FILE]
+        [--drawn] [--long FRAMES ...] [--mappers {incremental,global,bare} ...] [--json FILE]
 
 FOLDER takes captures and reconstructions. ``--euroc``: the 100 keyframes of V1_01_easy (DATASET has ``keyframes/``,
 ``mav0/`` and ``gt/``), bare COLMAP matching every pair. ``--walk``: a simulated walk around a room back to its start
@@ -21,6 +21,10 @@ sequentially with a linear overlap (``quadratic_overlap`` off, no loops), both m
 closes a loop is false where less than half of its matches join what is the same place in truth (within 15 cm). A frame
 that comes back to where an earlier one was (half a metre, 20 degrees) is missed where no true loop is within four
 frames of it. Features are synthesised, so that copies look the same as they can; ``--drawn``: found in drawn pictures.
+
+``--long``: what mapping a walk of so many frames around a room takes, which is as large as the walk is long: processor
+time, memory beyond that of what is loaded, error. ``incremental`` is ours, in parts where it is long; ``global``
+COLMAP's; ``bare`` COLMAP's incremental one with its own settings, in one go. Features are synthesised.
 """
 
 from __future__ import annotations
@@ -34,7 +38,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 import yaml
@@ -55,6 +59,9 @@ from colmap_inertial.run.context import Recording, RunContext
 from colmap_inertial.run.session import keep_colmap_quiet
 from colmap_inertial.types import Array
 
+if TYPE_CHECKING:
+    import pycolmap
+
 Figures = dict[str, float]
 #: Of a walk, frames at the start and at the end between which the loop's error is measured.
 ENDS = 0.06
@@ -72,6 +79,8 @@ SAME_M, BACK_M, BACK_DEG, BESIDE = 0.15, 0.5, 20.0, 4
 LOOP_DENSITY, REPEATED_DENSITY = 1.2, 1.5
 #: Of long walks.
 PACE_M_S = 0.8
+#: Ours, COLMAP's global one as we call it, and COLMAP's incremental one with its own settings.
+MAPPERS = ("incremental", "global", "bare")
 
 
 def bare(capture: Path, out: Path, *, sequential: bool) -> None:
@@ -96,11 +105,18 @@ def bare(capture: Path, out: Path, *, sequential: bool) -> None:
     verification.ransac.random_seed = 0
     match = pycolmap.match_sequential if sequential else pycolmap.match_exhaustive
     match(database, matching_options=matching, verification_options=verification, device=pycolmap.Device.cpu)
+    pycolmap.incremental_mapping(database, str(images), str(out / "sparse"), options=bare_pipeline())
+
+
+def bare_pipeline() -> pycolmap.IncrementalPipelineOptions:
+    """COLMAP's own settings, one thread, the camera known."""
+    import pycolmap
+
     pipeline = pycolmap.IncrementalPipelineOptions()
     pipeline.num_threads, pipeline.random_seed = 1, 0
     pipeline.ba_refine_focal_length = pipeline.ba_refine_extra_params = False
     pipeline.mapper.abs_pose_refine_focal_length = pipeline.mapper.abs_pose_refine_extra_params = False
-    pycolmap.incremental_mapping(database, str(images), str(out / "sparse"), options=pipeline)
+    return pipeline
 
 
 def processor_s(command: list[object]) -> float:
@@ -325,7 +341,7 @@ def loop_errors(walk: Walk, folder: Path) -> dict[str, Figures]:
     return found
 
 
-def long_walk(frames: int, folder: Path) -> dict[str, Figures]:
+def long_walk(frames: int, folder: Path, mappers: Sequence[str]) -> dict[str, Figures]:
     """What each mapper takes for a walk of so many frames: processor time and memory."""
     keep_colmap_quiet()
     walk = Walk(seed=100, frames=frames, frame_rate_hz=8.0, drawn=False, pace_m_s=PACE_M_S)
@@ -343,7 +359,7 @@ def long_walk(frames: int, folder: Path) -> dict[str, Figures]:
         "matching": {"processor_s": time.process_time() - begun_s, "verified": record.verified}
     }
     print(json.dumps(found), flush=True)
-    for mapper in ("incremental", "global"):
+    for mapper in mappers:
         told = subprocess.run(
             [sys.executable, __file__, "--map-by", mapper, folder], check=True, stdout=subprocess.PIPE, text=True
         ).stdout
@@ -358,28 +374,38 @@ def peak_mib() -> float:
     return int(line.split()[1]) / 1024
 
 
-def map_by(mapper: Literal["incremental", "global"], folder: Path) -> Figures:
+def map_by(mapper: str, folder: Path) -> Figures:
     """Map a walk that is matched: what another process of this script does."""
+    import pycolmap
+
     keep_colmap_quiet()
     models, truth = folder / mapper, true_centres(folder)
     shutil.rmtree(models, ignore_errors=True)
     before_mib, begun_s = peak_mib(), time.process_time()
-    map_images(
-        folder / "database.db",
-        folder / "frames",
-        models,
-        MappingOptions(mapper=mapper),
-        refine_intrinsics=False,
-        num_images=len(truth),
-        context=RunContext(scratch=folder, num_threads=1),
-        in_time=list(truth),
-    )
+    told: Figures = {}
+    if mapper == "bare":
+        models.mkdir()
+        pycolmap.incremental_mapping(
+            str(folder / "database.db"), str(folder / "frames"), str(models), options=bare_pipeline()
+        )
+    else:
+        record = map_images(
+            folder / "database.db",
+            folder / "frames",
+            models,
+            MappingOptions(mapper="global" if mapper == "global" else "incremental"),
+            refine_intrinsics=False,
+            num_images=len(truth),
+            context=RunContext(scratch=folder, num_threads=1),
+            in_time=list(truth),
+        )
+        told = {"parts": record.parts, "ends_joined": sum(met.joined for met in record.ends)}
     processor_s = time.process_time() - begun_s
     mib = peak_mib() - before_mib
     each = {"ms_a_frame": 1e3 * processor_s / len(truth), "mib_a_frame": mib / len(truth)}
     largest = max((read_model(one) for one in find_models(models).values()), key=lambda one: int(one.num_reg_images()))
-    seen = {"observations": int(largest.compute_num_observations())}
-    return {"processor_s": processor_s, "mib": mib, **each, **seen, **judged(models, truth, walk=True)}
+    told |= {"observations": int(largest.compute_num_observations())}
+    return {"processor_s": processor_s, "mib": mib, **each, **told, **judged(models, truth, walk=True)}
 
 
 def verified_pairs(database: Path) -> list[tuple[str, str]]:
@@ -404,7 +430,8 @@ def main() -> None:
     parser.add_argument("--drawn", action="store_true", help="find the scenes' features in drawn pictures")
     parser.add_argument("--long", type=int, nargs="*", default=[], help="frames")
     parser.add_argument("--json", type=Path)
-    parser.add_argument("--map-by", choices=("incremental", "global"), help=argparse.SUPPRESS)
+    parser.add_argument("--mappers", nargs="*", choices=MAPPERS, default=MAPPERS[:2], help="of long walks")
+    parser.add_argument("--map-by", choices=MAPPERS, help=argparse.SUPPRESS)
     parser.add_argument("--bare-sequential", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--bare-exhaustive", type=Path, help=argparse.SUPPRESS)
     args = parser.parse_args()
@@ -436,7 +463,7 @@ def main() -> None:
         print(json.dumps({folder.name: found[folder.name]}), flush=True)
     for frames in args.long:
         folder = args.folder / f"long{frames}"
-        found[folder.name] = long_walk(frames, folder)
+        found[folder.name] = long_walk(frames, folder, args.mappers)
         print(json.dumps({folder.name: found[folder.name]}, indent=1), flush=True)
     if args.json:
         args.json.write_text(json.dumps(found, indent=1) + "\n")

@@ -82,7 +82,9 @@ def write_features(walk: Walk, names: Sequence[str], database: Path, *, density:
     points, descriptors = points_of(world, rng, density)
     database.unlink(missing_ok=True)
     with pycolmap.Database.open(str(database)) as opened:
-        camera = opened.write_camera(colmap_camera(walk.camera().model))
+        known = colmap_camera(walk.camera().model)
+        known.has_prior_focal_length = True  # as COLMAP notes where it is told a camera; else it changes it
+        camera = opened.write_camera(known)
         rig = pycolmap.Rig()
         rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera))
         rig_id = opened.write_rig(rig)

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from colmap_inertial.colmap.closing import close_gaps
+from colmap_inertial.colmap.closing import EndsMet, close_gaps
+from colmap_inertial.io.records import read_record, write_record
 
 #: A camera turns once around in the middle of a round room, looking outwards.
 FRAMES, RING_M, ROOM_M = 48, 3.0, 5.0
@@ -54,7 +55,14 @@ def cam_from_world(angle: float) -> np.ndarray:
     return np.array([[out[1], -out[0], 0], [0, 0, -1], out])
 
 
-def make(folder: Path, *, drift: float = DRIFT, shuffled: bool = False) -> Ring:
+def make(
+    folder: Path,
+    *,
+    drift: float = DRIFT,
+    wider: float = WIDER,
+    shuffled: bool = False,
+    true_focal_px: float = FOCAL_PX,
+) -> Ring:
     """``shuffled``: matches between both ends join what is not the same."""
     import pycolmap
 
@@ -64,12 +72,13 @@ def make(folder: Path, *, drift: float = DRIFT, shuffled: bool = False) -> Ring:
     seen, xy = [], []
     for k, at in enumerate(angles(1.0)):
         in_cam = (points - centres_m(1.0)[k]) @ cam_from_world(at).T
-        px = FOCAL_PX * in_cam[:, :2] / in_cam[:, 2:] + np.array(SIZE_PX) / 2
+        px = true_focal_px * in_cam[:, :2] / in_cam[:, 2:] + np.array(SIZE_PX) / 2
         shown = np.flatnonzero((in_cam[:, 2] > 0.5) & (px > 0).all(axis=1) & (px < SIZE_PX).all(axis=1))
         seen.append(shown)
         xy.append(px[shown] + 0.3 * rng.standard_normal((len(shown), 2)))
-    focal_px = FOCAL_PX / WIDER
+    focal_px = true_focal_px / wider
     camera = pycolmap.Camera(camera_id=1, model="PINHOLE", width=480, height=360, params=[focal_px, focal_px, 240, 180])
+    camera.has_prior_focal_length = True
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(camera)
     for k, at in enumerate(angles(drift)):
@@ -129,7 +138,10 @@ def test_ends_that_met_are_joined_and_what_drifted_on_the_way_goes(tmp_path):
     ring = make(tmp_path)
     before = ring.error_m()
     assert before > 0.05
-    assert close_gaps(ring.database, ring.model, ring.options, NAMES, nearest=None)
+    met = close_gaps(ring.database, ring.model, ring.options, NAMES, nearest=None)
+    # frames 0 and 1 are matched with the last two
+    assert met.joined and met.pairs == 3 and met.agree > 0.9
+    assert met.images[0] in NAMES[:2] and met.images[1] in NAMES[-2:]
     assert ring.error_m() < before / 10
     first, last = ({p.point3D_id for p in ring.model.image(k).get_observation_points2D()} for k in (1, FRAMES))
     assert len(first & last) > 30
@@ -138,20 +150,21 @@ def test_ends_that_met_are_joined_and_what_drifted_on_the_way_goes(tmp_path):
 def test_a_model_that_is_whole_stays_as_it_is(tmp_path):
     ring = make(tmp_path, drift=1.0)
     before = [ring.model.image(k + 1).projection_center() for k in range(FRAMES)]
-    assert not close_gaps(ring.database, ring.model, ring.options, NAMES, nearest=None)
+    assert close_gaps(ring.database, ring.model, ring.options, NAMES, nearest=None) is None
     np.testing.assert_array_equal([ring.model.image(k + 1).projection_center() for k in range(FRAMES)], before)
 
 
 def test_ends_whose_matches_join_what_is_not_the_same_are_not_joined(tmp_path):
     ring = make(tmp_path, shuffled=True)
-    assert not close_gaps(ring.database, ring.model, ring.options, NAMES, nearest=None)
+    met = close_gaps(ring.database, ring.model, ring.options, NAMES, nearest=None)
+    assert not met.joined and met.agree < 0.5
 
 
 @pytest.mark.parametrize("names", [NAMES, []], ids=["far apart in time", "not in the recording"])
 def test_ends_are_not_joined_by_pairs_of_which_nobody_knows_whether_they_join_copies(tmp_path, names):
     ring = make(tmp_path)
     before = ring.error_m()
-    assert not close_gaps(ring.database, ring.model, ring.options, names, nearest=8)
+    assert close_gaps(ring.database, ring.model, ring.options, names, nearest=8) is None
     assert ring.error_m() == before
 
 
@@ -174,13 +187,13 @@ def test_the_mapper_s_model_is_the_joined_one_where_the_order_in_time_is_known(t
     def closing(database, model, pipeline, names, *, nearest):
         asked.append((list(names), nearest))
         model.deregister_frame(1)  # a mark
-        return joins
+        return EndsMet(pairs=4, images=(NAMES[0], NAMES[-1]), agree=0.7, joined=joins)
 
     monkeypatch.setattr(pycolmap, "incremental_mapping", mapping)
     monkeypatch.setattr(sparse, "close_gaps", closing)
     options = MappingOptions(overlap=3)
     assert sparse.matches_every_pair(FRAMES, options)
-    sparse.map_images(
+    record = sparse.map_images(
         ring.database,
         tmp_path,
         tmp_path / "sparse",
@@ -193,3 +206,7 @@ def test_the_mapper_s_model_is_the_joined_one_where_the_order_in_time_is_known(t
     assert asked == ([(NAMES, 2 * options.overlap)] if given else [])
     written = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
     assert written.num_reg_images() == FRAMES - (given and joins)
+    said = sparse.ModelEnds(model=0, pairs=4, images=(NAMES[0], NAMES[-1]), agree=0.7, joined=joins)
+    assert record == sparse.MapRecord(mapper="incremental", models=1, ends=(said,) if given else ())
+    write_record(tmp_path / "record.json", record)
+    assert read_record(tmp_path / "record.json", sparse.MapRecord) == record

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Collection, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -316,8 +317,10 @@ def _on_map(found: Georeference | InertialError) -> str:
 
 def show_result(result: ReconstructResult, source: Path) -> None:
     """Print the end of a reconstruction of ``source`` on one screen; the last line is what to type next."""
+    from colmap_inertial.report.words import mapped_in_words
     from colmap_inertial.validate import Validation
 
+    mapping = None if result.mapping is None else asdict(result.mapping)
     if result.unchanged and not result.waiting:
         show_nothing_to_do(result.workspace)
     frames = result.frames
@@ -331,6 +334,8 @@ def show_result(result: ReconstructResult, source: Path) -> None:
             ("Points", f"{summary['points']}, mean reprojection error {summary['mean_reprojection_error_px']:.2f} px"),
             *(imaging_lines(frames, result.imaging, result.keypoints.rectified()) if frames else []),
         ]
+        if said := mapped_in_words(mapping, model.colmap_index):
+            lines.append(("Mapping", " ".join(said)))
         if model.parts:
             lines.append(("Joined", _joined(model.parts, result.gaps)))
         if isinstance(model.validation, Validation) and model.validation.ci95_pct is not None:

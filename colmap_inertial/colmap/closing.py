@@ -38,6 +38,9 @@ _LEAST_PAIRS = 3
 _STAYS = 0.5
 #: To move ends that are far apart takes more rounds than COLMAP's 50; a walk of 500 frames, off by a metre, took 60.
 _ROUNDS = 200
+#: COLMAP solves models of more than 1000 images by conjugate gradients, which along a chain of images come nowhere near
+#: the answer; a chain's equations are few off the diagonal, and quickly solved as they are.
+_SOLVED_DIRECTLY = 1_000_000
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -60,6 +63,28 @@ class _Torn:
     points: Ids
 
 
+@dataclass(frozen=True, kw_only=True)
+class EndsMet:
+    """Ends of a model that met, and whether they belong together.
+
+    Attributes
+    ----------
+    pairs
+        Of images, in which they see each other.
+    images
+        The two that have most matches, by name, the earlier one first.
+    agree
+        Share of their matches that are one point, once they were made one and the model was adjusted.
+    joined
+        Whether the model has them as one; else it is as it was.
+    """
+
+    pairs: int
+    images: tuple[str, str]
+    agree: float
+    joined: bool
+
+
 def close_gaps(
     database: Path,
     reconstruction: pycolmap.Reconstruction,
@@ -67,15 +92,15 @@ def close_gaps(
     names: Sequence[str],
     *,
     nearest: int | None,
-) -> bool:
-    """Join the ends of a model that met; whether there were any, and they belong together.
+) -> EndsMet | None:
+    """Join the ends of a model that met; ``None`` where there are none.
 
     Parameters
     ----------
     database
         With the matches that the model was made from.
     reconstruction
-        Is changed; where this says False it may be of no further use.
+        Is changed; where they were not joined it may be of no further use.
     pipeline
         What the model was made with.
     names
@@ -90,26 +115,38 @@ def close_gaps(
     with pycolmap.Database.open(str(database)) as opened:
         torn = _torn(opened, reconstruction, names, nearest)
         if len(torn) < _LEAST_PAIRS:
-            return False
+            return None
         cache = pycolmap.DatabaseCache.create(opened, cached)
     images = reconstruction.num_reg_images()
     _make_one(reconstruction, torn)
-    options = pipeline.get_global_bundle_adjustment()
-    options.print_summary = False
+    options = _adjustment(pipeline)
     options.ceres.solver_options.max_num_iterations = _ROUNDS
     pycolmap.bundle_adjustment(reconstruction, options)
     mapper = pycolmap.IncrementalMapper(cache)
     mapper.begin_reconstruction(reconstruction)
     _refine(mapper, reconstruction, pipeline)
     mapper.end_reconstruction(False)
-    point = {number: _point_of(reconstruction, number) for pair in torn for number in (pair.first, pair.second)}
+    point = {
+        number: points_of_features(reconstruction, number) for pair in torn for number in (pair.first, pair.second)
+    }
     of_first = np.concatenate([point[pair.first][pair.features[:, 0]] for pair in torn])
     of_second = np.concatenate([point[pair.second][pair.features[:, 1]] for pair in torn])
     stays = float(np.mean((of_first == of_second) & (of_first >= 0)))
     joined = stays >= _STAYS and reconstruction.num_reg_images() == images
     said = "joined" if joined else "left as they are: they do not fit"
     log.info("a model's ends, seen in %d pairs of images, %s (%.0f %% agree)", len(torn), said, 100 * stays)
-    return joined
+    place = {name: at for at, name in enumerate(names)}
+    most = max(torn, key=lambda pair: len(pair.points))
+    first, second = sorted((reconstruction.image(k).name for k in (most.first, most.second)), key=place.__getitem__)
+    return EndsMet(pairs=len(torn), images=(first, second), agree=stays, joined=joined)
+
+
+def _adjustment(pipeline: pycolmap.IncrementalPipelineOptions) -> pycolmap.BundleAdjustmentOptions:
+    """Of a whole model; solved directly, however many images it has."""
+    adjustment = pipeline.get_global_bundle_adjustment()
+    adjustment.print_summary = False
+    adjustment.ceres.max_num_images_direct_sparse_cpu_solver = _SOLVED_DIRECTLY
+    return adjustment
 
 
 def _refine(
@@ -120,8 +157,7 @@ def _refine(
     """Adjust the model and complete its points in turn; COLMAP's own loop would answer no signal until its end."""
     import pycolmap
 
-    adjustment = pipeline.get_global_bundle_adjustment()
-    adjustment.print_summary = False
+    adjustment = _adjustment(pipeline)
     mapper.complete_and_merge_tracks(pipeline.get_triangulation())
     mapper.retriangulate(pipeline.get_triangulation())
     for _ in range(pipeline.ba_global_max_refinements):
@@ -135,7 +171,7 @@ def _refine(
     mapper.filter_frames(pipeline.get_mapper())
 
 
-def _point_of(reconstruction: pycolmap.Reconstruction, number: int) -> Ids:
+def points_of_features(reconstruction: pycolmap.Reconstruction, number: int) -> Ids:
     """Of an image's features, the numbers of their points; -1 without one."""
     image = reconstruction.image(number)
     points = np.full(image.num_points2D(), -1, dtype=np.int64)
@@ -152,7 +188,7 @@ def _torn(
 
     place = {name: at for at, name in enumerate(names)}
     when = {number: place.get(reconstruction.image(number).name) for number in reconstruction.reg_image_ids()}
-    point = {number: _point_of(reconstruction, number) for number, at in when.items() if at is not None}
+    point = {number: points_of_features(reconstruction, number) for number, at in when.items() if at is not None}
     linked: list[tuple[int, int]] = []
     suspects: list[_Torn] = []
     for pair, count in zip(*opened.read_two_view_geometry_num_inliers(), strict=True):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import logging
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -13,7 +14,8 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from colmap_inertial.colmap.closing import close_gaps
+from colmap_inertial.colmap.closing import EndsMet, close_gaps
+from colmap_inertial.colmap.submaps import LONGEST, map_in_parts, runs
 from colmap_inertial.errors import FormatError, InertialError, MappingError, OutputError
 from colmap_inertial.model import colmap_camera, find_models
 from colmap_inertial.model.binary import check_binary_model
@@ -26,6 +28,8 @@ from colmap_inertial.types import Array, CameraModel, Keypoints, Treatment
 
 if TYPE_CHECKING:
     import pycolmap
+
+log = logging.getLogger(__name__)
 
 #: Up to this many images every pair is matched; above it, neighbours in time.
 _EXHAUSTIVE_UP_TO = 150
@@ -301,6 +305,35 @@ def match_pairs(
     context.progress("matches", done, total)
 
 
+@dataclass(frozen=True, kw_only=True)
+class ModelEnds(EndsMet):
+    """The same, of one of several models; ``model`` is its number."""
+
+    model: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapRecord:
+    """How models were made.
+
+    Attributes
+    ----------
+    mapper
+        COLMAP's: ``"incremental"`` or ``"global"``.
+    models
+        How many.
+    parts
+        Runs of images that were mapped by themselves; 1 where all were mapped in one go.
+    ends
+        Of models that were mapped in one go: their ends that met.
+    """
+
+    mapper: str
+    models: int
+    parts: int = 1
+    ends: tuple[ModelEnds, ...] = ()
+
+
 def map_images(
     database: Path,
     images: Path,
@@ -311,13 +344,17 @@ def map_images(
     num_images: int,
     context: RunContext,
     in_time: Sequence[str] = (),
-) -> None:
+    judged: bool = True,
+) -> MapRecord:
     """Run COLMAP's mapper; models are written to ``sparse/0``, ``sparse/1``, ...
 
     Parameters
     ----------
     in_time
-        The images in order of time, where they are of one recording: ends of a model that met are joined then.
+        The images in order of time, where they are of one recording: ends of a model that met are joined then, and what
+        is too long for one go is mapped in parts.
+    judged
+        Whether somebody looked which pairs far apart in time join copies. Nobody does where every pair is matched.
 
     Raises
     ------
@@ -330,20 +367,14 @@ def map_images(
     sparse.mkdir(parents=True)
     require_room(sparse, database.stat().st_size)
     context.progress("mapping", 0, num_images)
+    every_pair = matches_every_pair(num_images, options)
+    nearest = None if judged and not every_pair else _NEIGHBOURS * options.overlap
     if options.mapper == "incremental":
         pipeline = _incremental_options(refine_intrinsics, context.num_threads, context.seed)
-        models = pycolmap.incremental_mapping(
-            str(database),
-            str(images),
-            str(sparse),
-            options=pipeline,
-            next_image_callback=_counter(context.progress, num_images),
-        )
-        # of every pair of images, nobody looked whether those far apart in time join copies
-        nearest = _NEIGHBOURS * options.overlap if matches_every_pair(num_images, options) else None
-        for number, model in models.items() if in_time else ():
-            if close_gaps(database, model, pipeline, in_time, nearest=nearest):
-                model.write_binary(str(sparse / str(number)))
+        if len(in_time) > LONGEST and not every_pair:
+            record = _map_in_parts(database, images, sparse, pipeline, in_time, nearest, context)
+        else:
+            record = _map_in_one_go(database, images, sparse, pipeline, in_time, nearest, num_images, context)
     else:
         models = pycolmap.global_mapping(
             str(database),
@@ -351,23 +382,78 @@ def map_images(
             str(sparse),
             options=_global_options(options, refine_intrinsics, context.num_threads, context.seed),
         )
+        record = MapRecord(mapper="global", models=len(models))
     context.progress("mapping", num_images, num_images)
     for folder in sparse.iterdir():
         # COLMAP does not say when it could not write one whole
         find_models(folder)
         check_binary_model(folder)
-    if not models:
+    if not record.models:
         raise MappingError(
             "COLMAP found no model: too few matches between the frames. Film with more overlap, more texture or less "
             "blur, or try --mapping.pairing exhaustive"
         )
+    log.info("mapping: %s", record)
+    return record
 
 
-def _counter(progress: Progress, total: int) -> Callable[[], None]:
+def _map_in_one_go(
+    database: Path,
+    images: Path,
+    sparse: Path,
+    pipeline: pycolmap.IncrementalPipelineOptions,
+    in_time: Sequence[str],
+    nearest: int | None,
+    num_images: int,
+    context: RunContext,
+) -> MapRecord:
+    import pycolmap
+
+    models = pycolmap.incremental_mapping(
+        str(database),
+        str(images),
+        str(sparse),
+        options=pipeline,
+        next_image_callback=_counter(context.progress, num_images),
+    )
+    ends = []
+    for number, model in models.items() if in_time else ():
+        met = close_gaps(database, model, pipeline, in_time, nearest=nearest)
+        if met is not None:
+            ends.append(ModelEnds(model=number, **vars(met)))
+            if met.joined:
+                model.write_binary(str(sparse / str(number)))
+    return MapRecord(mapper="incremental", models=len(models), ends=tuple(ends))
+
+
+def _map_in_parts(
+    database: Path,
+    images: Path,
+    sparse: Path,
+    pipeline: pycolmap.IncrementalPipelineOptions,
+    in_time: Sequence[str],
+    nearest: int | None,
+    context: RunContext,
+) -> MapRecord:
+    # neighbouring parts have some images both
+    parts = runs(len(in_time))
+    counted = _counter(context.progress, len(in_time), of=sum(end - begin for begin, end in parts))
+    models = map_in_parts(
+        database, images, context.scratch, pipeline, in_time, parts, nearest=nearest, registered=counted
+    )
+    for number, model in enumerate(models):
+        model.extract_colors_for_all_images(str(images))
+        (sparse / str(number)).mkdir()
+        model.write_binary(str(sparse / str(number)))
+    return MapRecord(mapper="incremental", models=len(models), parts=len(parts))
+
+
+def _counter(progress: Progress, total: int, *, of: int | None = None) -> Callable[[], None]:
+    """Counts up to ``total``; where some images come several times, ``of`` so many calls."""
     count = itertools.count(1)
 
     def registered() -> None:
-        progress("mapping", min(next(count), total), total)
+        progress("mapping", min(next(count) * total // (of or total), total), total)
 
     return registered
 

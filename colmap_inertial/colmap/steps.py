@@ -7,7 +7,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from colmap_inertial.colmap.pairing import MatchRecord, match_capture
-from colmap_inertial.colmap.sparse import KeypointRecords, extract_features, map_images, write_gravity_priors
+from colmap_inertial.colmap.sparse import (
+    KeypointRecords,
+    MapRecord,
+    extract_features,
+    map_images,
+    write_gravity_priors,
+)
 from colmap_inertial.io.records import read_record, write_record
 from colmap_inertial.options import ReconstructOptions
 from colmap_inertial.run.context import Recording
@@ -24,7 +30,7 @@ def run_colmap(
     stages: Sequence[KeypointStage],
     gravity: Mapping[str, Array],
     options: ReconstructOptions,
-) -> tuple[KeypointRecords, MatchRecord]:
+) -> tuple[KeypointRecords, MatchRecord, MapRecord]:
     """Make COLMAP's models of the frames that are used.
 
     Parameters
@@ -42,7 +48,7 @@ def run_colmap(
 
     Returns
     -------
-    What the stages did to keypoints, and which pairs were matched.
+    What the stages did to keypoints, which pairs were matched, and how models were made.
 
     Raises
     ------
@@ -79,7 +85,7 @@ def run_colmap(
 
     def models(partial: Sequence[Path]) -> None:
         refine = mapping.refine_intrinsics
-        map_images(
+        record = map_images(
             workspace.colmap_database,
             workspace.colmap_images,
             partial[0],
@@ -89,7 +95,12 @@ def run_colmap(
             context=context,
             in_time=recording.timing.names,
         )
+        write_record(partial[1], record)
 
     runner.run("matches", pairing, outputs, matches, after=["frames"])
-    runner.run("mapping", {"mapping": mapping}, [workspace.colmap_sparse], models, after=["matches"])
-    return read_record(workspace.keypoints, KeypointRecords), read_record(workspace.matches, MatchRecord)
+    runner.run("mapping", {"mapping": mapping}, [workspace.colmap_sparse, workspace.mapped], models, after=["matches"])
+    return (
+        read_record(workspace.keypoints, KeypointRecords),
+        read_record(workspace.matches, MatchRecord),
+        read_record(workspace.mapped, MapRecord),
+    )

@@ -224,7 +224,7 @@ def _reconstruct(
         # pairs are chosen by what the capture itself holds: a calibration that is given later maps nothing again
         plain_imu = corrected_imu(loaded, raw.imu, None)
         seen = Recording.of(loaded, plain_imu, used_timing, prior_calibration(loaded, None))
-        keypoints, matching = run_colmap(session, seen, records, of_keypoints, gravity, options)
+        keypoints, matching, mapping = run_colmap(session, seen, records, of_keypoints, gravity, options)
         of_models = with_defaults(
             model_stages,
             default_model_stages(recording, options, of_keypoints, database=workspace.colmap_database),
@@ -250,6 +250,7 @@ def _reconstruct(
             frames=records,
             keypoints=keypoints,
             matching=matching,
+            mapping=mapping,
             imaging=plan,
             selection=selection,
             seconds=session.runner.seconds,

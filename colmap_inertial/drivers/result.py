@@ -11,7 +11,7 @@ import numpy as np
 from colmap_inertial import __version__
 from colmap_inertial.colmap.dense import DenseResult
 from colmap_inertial.colmap.pairing import MatchRecord
-from colmap_inertial.colmap.sparse import KeypointRecords
+from colmap_inertial.colmap.sparse import KeypointRecords, MapRecord
 from colmap_inertial.errors import InertialError, NotObservableError
 from colmap_inertial.geometry import quat_conjugate, quat_log, quat_multiply
 from colmap_inertial.georeference import Georeference
@@ -122,6 +122,8 @@ class ReconstructResult:
         What happened to each frame, and to the keypoints of each image.
     matching
         Which pairs of images were matched, and why not the rest; ``None`` for an existing project.
+    mapping
+        In how many parts COLMAP's models were made, and which of their ends met; ``None`` for an existing project.
     seconds
         By step.
     imaging
@@ -144,6 +146,7 @@ class ReconstructResult:
     frames: tuple[FrameRecord, ...] = ()
     keypoints: KeypointRecords = field(default_factory=KeypointRecords)
     matching: MatchRecord | None = None
+    mapping: MapRecord | None = None
     seconds: dict[str, float]
     imaging: ImagingPlan = field(default_factory=ImagingPlan)
     selection: Selection | None = None
@@ -275,6 +278,7 @@ def result_as_json(result: ReconstructResult, capture: Capture) -> dict[str, obj
         "selection": result.selection and result.selection.as_json(),
         "imaging": imaging_as_json(plan, rectified),
         "matching": result.matching and asdict(result.matching),
+        "mapping": result.mapping and asdict(result.mapping),
         "frames": [frame_as_json(record, plan, rectified) for record in result.frames],
         "seconds": result.seconds,
     }

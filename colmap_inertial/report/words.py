@@ -68,6 +68,20 @@ def not_checked(checked: Collection[str]) -> str:
     return "; ".join(said)
 
 
+def mapped_in_words(mapping: dict[str, Any] | None, colmap_index: int | None) -> list[str]:
+    """What there is to say of how a model was made: its parts, and its ends that met; by ``mapping`` of the result."""
+    if mapping is None:
+        return []
+    said = [] if mapping["parts"] == 1 else [f"COLMAP mapped the recording in {mapping['parts']} parts."]
+    for met in mapping["ends"]:
+        if met["model"] == colmap_index:
+            where = f"ends that met ({' and '.join(met['images'])}, {met['pairs']} pairs of images)"
+            agree = f"{100 * met['agree']:.0f} %"
+            done = "were joined" if met["joined"] else f"do not fit and stay apart ({agree} of their matches agree)"
+            said.append(f"Its {where} {done}.")
+    return said
+
+
 def outcome_of_model(model: dict[str, Any]) -> dict[str, Any]:
     """Headline, summary and advice for one model of ``result.json``, with ``signals`` where they were kept.
 

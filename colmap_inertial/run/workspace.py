@@ -100,6 +100,11 @@ class Workspace:
         return self.stamps / "matches_made.json"
 
     @property
+    def mapped(self) -> Path:
+        """How models were made."""
+        return self.stamps / "models_made.json"
+
+    @property
     def validation(self) -> Path:
         """Pictures of the target in the frames."""
         return self.root / "validation"

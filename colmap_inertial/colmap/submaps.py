@@ -1,0 +1,334 @@
+"""Captures too long for one go: mapped in parts that overlap, which then become one model.
+
+COLMAP adjusts the whole model again and again while it grows, and from 1000 images on by conjugate gradients, which
+along a chain of images come nowhere near the answer. Parts take as long for each image in a capture of any length.
+What they have in common, images and matches between them, says how each lies in the next: together, and with the loops
+that matching closed, that places all of them. Then their points are made one, and the whole is adjusted once.
+"""
+
+from __future__ import annotations
+
+import copy
+import itertools
+import logging
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.colmap.closing import close_gaps, points_of_features
+from colmap_inertial.geometry import so3_exp
+from colmap_inertial.model.merging import merged
+from colmap_inertial.types import Array
+
+if TYPE_CHECKING:
+    import pycolmap
+
+log = logging.getLogger(__name__)
+
+Ids = NDArray[np.int64]
+
+#: COLMAP's own limit, beyond which it solves adjustments by conjugate gradients.
+LONGEST = 1000
+#: Images of a part at most, and of these, how many the next one has, too.
+PART, SHARED = 400, 40
+#: Parts lie beside each other where so many points are known to be the same: as many matches as COLMAP asks of views.
+LEAST_SAME = 15
+#: Places of a point in two parts differ by this share of how far away it is from the camera, or it is not the same.
+_SAME_SHARE = 0.1
+#: Of a pair of parts, so many points are plenty to place them by.
+_PLENTY = 500
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Part:
+    """A model of some of the images.
+
+    Attributes
+    ----------
+    model
+        COLMAP's.
+    begin, end
+        The images that it was made from, by their places in time: the first one, and the first one beyond.
+    """
+
+    model: pycolmap.Reconstruction
+    begin: int
+    end: int
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Tie:
+    """Points that two parts have both.
+
+    Attributes
+    ----------
+    first, second
+        Places of the parts.
+    in_first, in_second
+        (K, 3) the points, in the parts' own units.
+    away
+        (K,) how far from the cameras they are, in the first one's units.
+    similar
+        From the second one to the first one.
+    """
+
+    first: int
+    second: int
+    in_first: Array
+    in_second: Array
+    away: Array
+    similar: Placed
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Placed:
+    """A similarity: ``scale * rotation @ x + translation``."""
+
+    scale: float
+    rotation: Array
+    translation: Array
+
+    @classmethod
+    def nowhere(cls) -> Placed:
+        """What leaves everything where it is."""
+        return cls(scale=1.0, rotation=np.eye(3), translation=np.zeros(3))
+
+    def of(self, points: Array) -> Array:
+        """(N, 3) points, moved."""
+        return np.asarray(self.scale * points @ self.rotation.T + self.translation)
+
+    def after(self, first: Placed) -> Placed:
+        """What both do, the other one first."""
+        return Placed(
+            scale=self.scale * first.scale,
+            rotation=self.rotation @ first.rotation,
+            translation=self.of(first.translation[None])[0],
+        )
+
+    def inverse(self) -> Placed:
+        """What undoes it."""
+        back = self.rotation.T / self.scale
+        return Placed(scale=1 / self.scale, rotation=self.rotation.T, translation=-back @ self.translation)
+
+    def moved(self, step: Array) -> Placed:
+        """By (7,) logarithm of the scale, rotation vector, translation, all small."""
+        return Placed(
+            scale=self.scale * float(np.exp(step[0])),
+            rotation=so3_exp(step[1:4]) @ self.rotation,
+            translation=self.translation + step[4:],
+        )
+
+
+def runs(count: int, *, longest: int = PART, shared: int = SHARED) -> list[tuple[int, int]]:
+    """Begins and ends of few runs, about equally long, that hold so many images; neighbours share some."""
+    parts = max(1, -(-(count - shared) // (longest - shared)))
+    begins = np.round(np.arange(parts + 1) * (count - shared) / parts).astype(int).tolist()
+    return [(begin, min(count, end + shared)) for begin, end in itertools.pairwise(begins)]
+
+
+def map_in_parts(
+    database: Path,
+    images: Path,
+    scratch: Path,
+    pipeline: pycolmap.IncrementalPipelineOptions,
+    names: Sequence[str],
+    parts: Sequence[tuple[int, int]],
+    *,
+    nearest: int | None,
+    registered: Callable[[], None],
+) -> list[pycolmap.Reconstruction]:
+    """Run COLMAP's incremental mapper on runs of the images, and join what comes out; the largest model first.
+
+    Parameters
+    ----------
+    names
+        In order of time.
+    parts
+        Begins and ends, as :func:`runs` has them.
+    nearest
+        Pairs farther apart in time may join copies, and are not looked at; ``None`` where all may be believed.
+    registered
+        Is called for each image that a part places.
+    """
+    import pycolmap
+
+    made = []
+    own = copy.copy(pipeline)
+    own.extract_colors = False
+    for begin, end in parts:
+        own.image_names = list(names[begin:end])
+        with tempfile.TemporaryDirectory(dir=scratch) as folder:
+            models = pycolmap.incremental_mapping(
+                str(database), str(images), folder, options=own, next_image_callback=registered
+            )
+        made += [Part(model=model, begin=begin, end=end) for _, model in sorted(models.items())]
+    joined = join_parts(database, made, pipeline, names, nearest=nearest)
+    return sorted(joined, key=lambda model: -int(model.num_reg_images()))
+
+
+def join_parts(
+    database: Path,
+    parts: Sequence[Part],
+    pipeline: pycolmap.IncrementalPipelineOptions,
+    names: Sequence[str],
+    *,
+    nearest: int | None,
+) -> list[pycolmap.Reconstruction]:
+    """Of parts that lie beside each other, one model; those that turn out not to fit stay as they are."""
+    ties = find_ties(database, parts, names, nearest=nearest)
+    joined: list[pycolmap.Reconstruction] = []
+    for members in _groups(len(parts), ties):
+        group = [parts[k] for k in members]
+        if len(group) > 1:
+            whole = _whole(group, place_parts(members, [tie for tie in ties if tie.first in members]), names)
+            met = close_gaps(database, whole, pipeline, names, nearest=nearest)
+            if met is not None and met.joined:
+                joined.append(whole)
+                continue
+            log.info("%d parts are left as they are: they do not fit", len(group))
+        joined += [part.model for part in group]
+    return joined
+
+
+def find_ties(database: Path, parts: Sequence[Part], names: Sequence[str], *, nearest: int | None) -> list[Tie]:
+    """What parts have in common: points of images that both have, or else of images that are matched."""
+    import pycolmap
+
+    place = {name: at for at, name in enumerate(names)}
+    points = [
+        {number: points_of_features(part.model, number) for number in part.model.reg_image_ids()} for part in parts
+    ]
+    having: dict[int, list[int]] = {}
+    for k, of_images in enumerate(points):
+        for number in of_images:
+            having.setdefault(number, []).append(k)
+    same: dict[tuple[int, int], list[tuple[int, Ids]]] = {}
+
+    def add(a: int, b: int, image: int, of_a: Ids, of_b: Ids) -> None:
+        both = (of_a >= 0) & (of_b >= 0)
+        same.setdefault((a, b), []).append((image, np.stack([of_a[both], of_b[both]], axis=1)))
+
+    for number, holders in sorted(having.items()):
+        for a, b in itertools.combinations(holders, 2):
+            add(a, b, number, points[a][number], points[b][number])
+    beside = set(same)
+    with pycolmap.Database.open(str(database)) as opened:
+        for pair, count in zip(*opened.read_two_view_geometry_num_inliers(), strict=True):
+            i, j = pycolmap.pair_id_to_image_pair(pair)
+            if count < LEAST_SAME or i not in having or j not in having:
+                continue
+            across = [(a, b) for a in having[i] for b in having[j] if a != b and tuple(sorted((a, b))) not in beside]
+            apart = abs(place[parts[having[i][0]].model.image(i).name] - place[parts[having[j][0]].model.image(j).name])
+            if not across or (nearest is not None and apart > nearest):
+                continue
+            matches = np.array(opened.read_two_view_geometry(i, j).inlier_matches, dtype=np.int64)
+            for a, b in across:
+                if a < b:
+                    add(a, b, i, points[a][i][matches[:, 0]], points[b][j][matches[:, 1]])
+                else:
+                    add(b, a, j, points[b][j][matches[:, 1]], points[a][i][matches[:, 0]])
+    found = (_tie(parts, a, b, seen) for (a, b), seen in sorted(same.items()))
+    return [tie for tie in found if tie is not None]
+
+
+def _tie(parts: Sequence[Part], a: int, b: int, seen: Sequence[tuple[int, Ids]]) -> Tie | None:
+    """Points that two parts have both, without those that contradict the others; None where these are too few."""
+    import pycolmap
+
+    first, second = parts[a].model, parts[b].model
+    pairs = np.concatenate([pairs for _, pairs in seen])
+    images = np.repeat([image for image, _ in seen], [len(pairs) for _, pairs in seen])
+    pairs, at = np.unique(pairs, axis=0, return_index=True)
+    if len(pairs) < LEAST_SAME:
+        return None
+    centres = {int(image): first.image(image).projection_center() for image in np.unique(images[at])}
+    in_first = np.array([first.point3D(number).xyz for number in pairs[:, 0].tolist()])
+    in_second = np.array([second.point3D(number).xyz for number in pairs[:, 1].tolist()])
+    away = np.linalg.norm(in_first - np.array([centres[image] for image in images[at].tolist()]), axis=1)
+    ransac = pycolmap.RANSACOptions()
+    ransac.random_seed = 0
+    ransac.max_error = _SAME_SHARE * float(np.median(away))
+    estimated: Any = pycolmap.estimate_sim3d_robust(in_second, in_first, ransac)  # a dict, whatever it is said to be
+    if estimated is None:
+        return None
+    similar = estimated["tgt_from_src"]
+    found = Placed(scale=similar.scale, rotation=similar.rotation.matrix(), translation=similar.translation)
+    agree = np.flatnonzero(np.linalg.norm(in_first - found.of(in_second), axis=1) < _SAME_SHARE * away)
+    if len(agree) < max(LEAST_SAME, len(pairs) / 2):
+        return None
+    log.info("parts %d and %d: %d of %d points agree", a, b, len(agree), len(pairs))
+    some = agree[np.linspace(0, len(agree) - 1, min(_PLENTY, len(agree))).astype(int)]
+    return Tie(first=a, second=b, in_first=in_first[some], in_second=in_second[some], away=away[some], similar=found)
+
+
+def _groups(count: int, ties: Sequence[Tie]) -> list[list[int]]:
+    """Parts that hang together, by their places."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    ends = np.array([(tie.first, tie.second) for tie in ties], dtype=np.intp).reshape(-1, 2)
+    graph = coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
+    number, of_part = connected_components(graph, directed=False)
+    return [np.flatnonzero(of_part == k).tolist() for k in range(number)]
+
+
+def place_parts(members: Sequence[int], ties: Sequence[Tie]) -> list[Placed]:
+    """Where parts that hang together lie in the first one's world, by all ties at once."""
+    from scipy.optimize import least_squares
+
+    known = {members[0]: Placed.nowhere()}
+    for tie in itertools.chain.from_iterable(itertools.repeat(sorted(ties, key=lambda t: -len(t.away)), len(members))):
+        if tie.first in known and tie.second not in known:
+            known[tie.second] = known[tie.first].after(tie.similar)
+        elif tie.second in known and tie.first not in known:
+            known[tie.first] = known[tie.second].after(tie.similar.inverse())
+    if len(ties) < len(members):
+        return [known[k] for k in members]
+    place = {k: at for at, k in enumerate(members)}
+    start = [known[k] for k in members]
+
+    def moved(x: Array) -> list[Placed]:
+        steps = np.vstack([np.zeros(7), x.reshape(-1, 7)])
+        return [one.moved(step) for one, step in zip(start, steps, strict=True)]
+
+    def off(x: Array) -> Array:
+        at = moved(x)
+        out = []
+        for tie in ties:
+            second_in_first = at[place[tie.first]].inverse().after(at[place[tie.second]])
+            out.append((tie.in_first - second_in_first.of(tie.in_second)) / tie.away[:, None])
+        return np.concatenate(out).ravel()
+
+    return moved(least_squares(off, np.zeros(7 * (len(members) - 1)), x_scale="jac").x)
+
+
+def _whole(group: Sequence[Part], placed: Sequence[Placed], names: Sequence[str]) -> pycolmap.Reconstruction:
+    """One model of parts; an image that several have is of the one that has most images on both sides of it."""
+    import pycolmap
+
+    place = {name: at for at, name in enumerate(names)}
+    largest = max(group, key=lambda part: int(part.model.compute_num_observations())).model
+    owner: dict[str, tuple[int, int]] = {}
+    for k, part in enumerate(group):
+        for number in part.model.reg_image_ids():
+            name = part.model.image(number).name
+            inside = min(place[name] - part.begin, part.end - 1 - place[name])
+            if name not in owner or inside > owner[name][0]:
+                owner[name] = (inside, k)
+    models = []
+    for k, (part, at) in enumerate(zip(group, placed, strict=True)):
+        model = pycolmap.Reconstruction(part.model)
+        for number in sorted(model.reg_image_ids()):
+            if owner[model.image(number).name][1] != k:
+                model.deregister_frame(model.image(number).frame_id)
+        for camera_id in set(model.cameras) & set(largest.cameras):
+            # each part refined its own, where they are refined
+            model.camera(camera_id).params = list(largest.camera(camera_id).params)
+        model.transform(pycolmap.Sim3d(at.scale, pycolmap.Rotation3d(at.rotation), at.translation))
+        models.append(model)
+    return merged(models, {})

@@ -1,0 +1,193 @@
+"""Captures that are mapped in parts: where these lie, and that what comes out is one model of all."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_closing import FRAMES, NAMES, make
+
+from colmap_inertial.colmap import sparse, submaps
+from colmap_inertial.colmap.submaps import PART, SHARED, Part, Placed, Tie, join_parts, place_parts, runs
+from colmap_inertial.geometry import so3_exp
+from colmap_inertial.options import MappingOptions
+from colmap_inertial.run.context import RunContext
+
+#: Runs of the ring's images.
+PARTS = [(0, 18), (12, 30), (24, 42), (36, 48)]
+
+
+@pytest.mark.parametrize("count", [1001, 1040, 2000, 3601, 12345])
+def test_runs_hold_every_image_and_share_some_with_the_next(count):
+    found = runs(count)
+    assert found[0][0] == 0 and found[-1][1] == count
+    lengths = [end - begin for begin, end in found]
+    assert max(lengths) <= PART + 1 and max(lengths) - min(lengths) <= 1 + 1
+    for (_, end), (begin, _) in itertools.pairwise(found):
+        assert end - begin == SHARED
+    # one fewer would not do
+    assert (len(found) - 1) * (PART - SHARED) + SHARED < count
+
+
+def random_placed(rng, scale=0.3) -> Placed:
+    return Placed(
+        scale=float(np.exp(scale * rng.standard_normal())),
+        rotation=so3_exp(rng.standard_normal(3)),
+        translation=5 * rng.standard_normal(3),
+    )
+
+
+def as_matrix(placed: Placed) -> np.ndarray:
+    return np.block([[placed.scale * placed.rotation, placed.translation[:, None]], [np.eye(4)[3:]]])
+
+
+def test_similarities_go_together_as_matrices_do():
+    rng = np.random.default_rng(1)
+    a, b = random_placed(rng), random_placed(rng)
+    np.testing.assert_allclose(as_matrix(a.after(b)), as_matrix(a) @ as_matrix(b), atol=1e-12)
+    np.testing.assert_allclose(as_matrix(a.inverse()) @ as_matrix(a), np.eye(4), atol=1e-12)
+    points = rng.standard_normal((7, 3))
+    np.testing.assert_allclose(np.c_[a.of(points), np.ones(7)], np.c_[points, np.ones(7)] @ as_matrix(a).T, atol=1e-12)
+
+
+def tie(rng, world: list[Placed], first: int, second: int, off: Placed | None = None) -> Tie:
+    """Points of two parts whose places are known; ``off``: how the second one lies wrongly in the first one."""
+    points = world[first].of(10 * rng.random((200, 3)))
+    in_first, in_second = (world[k].inverse().of(points) for k in (first, second))
+    in_first = in_first if off is None else off.of(in_first)
+    similar = world[first].inverse().after(world[second])
+    similar = similar if off is None else off.after(similar)
+    away = np.full(200, 4 / world[first].scale)
+    return Tie(first=first, second=second, in_first=in_first, in_second=in_second, away=away, similar=similar)
+
+
+def test_parts_are_placed_where_they_are_and_a_loop_takes_drift_out():
+    rng = np.random.default_rng(2)
+    world = [Placed.nowhere(), *(random_placed(rng) for _ in range(5))]
+    exact = [tie(rng, world, k, k + 1) for k in range(5)]
+    for found, true in zip(place_parts(range(6), exact), world, strict=True):
+        np.testing.assert_allclose(as_matrix(found), as_matrix(true), atol=1e-9)
+    # each tie turns, stretches and moves a little more
+    drift = Placed(scale=1.01, rotation=so3_exp(np.array([0.0, 0.01, 0.005])), translation=np.array([0.02, 0.0, 0.01]))
+    drifted = [tie(rng, world, k, k + 1, drift) for k in range(5)]
+
+    def off(ties):
+        found = place_parts(range(6), ties)
+        probe = rng.standard_normal((20, 3))
+        return max(
+            float(np.linalg.norm(one.of(true.inverse().of(probe)) - probe, axis=1).max())
+            for one, true in zip(found, world, strict=True)
+        )
+
+    chained = off(drifted)
+    # what lies half a lap away is as far off as half of it drifts
+    assert chained > 0.3 and off([*drifted, tie(rng, world, 0, 5)]) < 0.6 * chained
+
+
+@pytest.fixture(scope="module")
+def ring(tmp_path_factory):
+    """The matches of a lap, and COLMAP's models of runs of its images, each in its own units and axes."""
+    import pycolmap
+
+    made = make(tmp_path_factory.mktemp("ring"), drift=1.0, wider=1.0, true_focal_px=200.0)
+    parts = []
+    for begin, end in PARTS:
+        made.options.image_names = NAMES[begin:end]
+        out = tmp_path_factory.mktemp("part")
+        pycolmap.set_random_seed(0)
+        (model,) = pycolmap.incremental_mapping(str(made.database), str(out), str(out), options=made.options).values()
+        assert model.num_reg_images() == end - begin
+        parts.append(Part(model=model, begin=begin, end=end))
+    made.options.image_names = []
+    return made, parts
+
+
+def error_m(ring, model) -> float:
+    return replace(ring, model=model).error_m()
+
+
+def test_parts_become_one_model_that_is_as_good_as_one_made_in_one_go(ring):
+    ring, parts = ring
+    (whole,) = join_parts(ring.database, parts, ring.options, NAMES, nearest=None)
+    assert sorted(whole.image(i).name for i in whole.reg_image_ids()) == NAMES
+    assert [whole.image(i).name for i in whole.reg_image_ids()] == [NAMES[i - 1] for i in whole.reg_image_ids()]
+    assert error_m(ring, whole) < 0.008
+    # there are 1500 points, and each is one, whichever parts saw it
+    assert 1490 <= whole.num_points3D() <= 1500
+
+
+def test_ends_of_a_lap_are_placed_by_their_matches_where_these_may_be_believed(ring):
+    ring, parts = ring
+    far = {(tie.first, tie.second) for tie in submaps.find_ties(ring.database, parts, NAMES, nearest=None)}
+    near = {(tie.first, tie.second) for tie in submaps.find_ties(ring.database, parts, NAMES, nearest=4)}
+    assert near == {(0, 1), (1, 2), (2, 3)} and far == near | {(0, 3)}
+
+
+def test_parts_that_have_nothing_in_common_stay_apart(ring):
+    ring, parts = ring
+    short = [parts[2], parts[0]]
+    found = join_parts(ring.database, short, ring.options, NAMES, nearest=4)
+    assert [model.num_reg_images() for model in found] == [18, 18]
+    assert all(model is part.model for model, part in zip(found, short, strict=True))
+
+
+def test_parts_that_do_not_fit_stay_as_they_are(ring, monkeypatch):
+    ring, parts = ring
+    monkeypatch.setattr(submaps, "close_gaps", lambda *_, **__: None)
+    found = join_parts(ring.database, parts, ring.options, NAMES, nearest=None)
+    assert all(model is part.model for model, part in zip(found, parts, strict=True))
+
+
+def test_the_largest_part_s_camera_is_that_of_all(ring, monkeypatch):
+    import pycolmap
+
+    ring, parts = ring
+    asked = []
+    monkeypatch.setattr(submaps, "close_gaps", lambda database, whole, *_, **__: asked.append(whole))
+    bent = []
+    for k, part in enumerate(parts):
+        model = pycolmap.Reconstruction(part.model)
+        model.camera(1).params = [300.0 + k, 300.0 + k, 240, 180]
+        bent.append(replace(part, model=model))
+    most = max(range(len(parts)), key=lambda k: parts[k].model.compute_num_observations())
+    join_parts(ring.database, bent, ring.options, NAMES, nearest=None)
+    (whole,) = asked
+    assert [list(camera.params) for camera in whole.cameras.values()] == [[300.0 + most, 300.0 + most, 240, 180]]
+
+
+@pytest.mark.parametrize(
+    ("longest", "pairing", "in_parts"),
+    [(FRAMES - 1, "sequential", True), (FRAMES, "sequential", False), (FRAMES - 1, "exhaustive", False)],
+)
+def test_what_is_too_long_for_one_go_is_mapped_in_parts(tmp_path, monkeypatch, longest, pairing, in_parts):
+    import pycolmap
+
+    ring = make(tmp_path, drift=1.0, wider=1.0, true_focal_px=200.0)
+    monkeypatch.setattr(sparse, "LONGEST", longest)
+    monkeypatch.setattr(sparse, "runs", lambda count: PARTS)
+    asked, told, incremental = [], [], pycolmap.incremental_mapping
+
+    def mapping(*args, options, **more):
+        asked.append(list(options.image_names))
+        return incremental(*args, options=options, **more)
+
+    monkeypatch.setattr(pycolmap, "incremental_mapping", mapping)
+    record = sparse.map_images(
+        ring.database,
+        tmp_path,
+        tmp_path / "sparse",
+        MappingOptions(overlap=3, pairing=pairing),
+        refine_intrinsics=False,
+        num_images=FRAMES,
+        context=RunContext(scratch=tmp_path, num_threads=1, progress=lambda *step: told.append(step)),
+        in_time=NAMES,
+    )
+    assert asked == ([NAMES[begin:end] for begin, end in PARTS] if in_parts else [[]])
+    assert record == sparse.MapRecord(mapper="incremental", models=1, parts=len(PARTS) if in_parts else 1)
+    model = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
+    assert model.num_reg_images() == FRAMES and error_m(ring, model) < 0.008
+    done = [count for _, count, total in told if total == FRAMES]
+    assert done == sorted(done) and done[-1] == FRAMES and len(set(done)) > FRAMES / 2
+    assert not [path for path in tmp_path.iterdir() if path.is_dir() and path.name != "sparse"]
