@@ -3,7 +3,7 @@
 import json
 import os
 import shutil
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ from test_pipeline_parts import session_in
 from colmap_inertial.cli.terminal import show_result
 from colmap_inertial.colmap import dense as dense_room
 from colmap_inertial.colmap.depth_maps import MadeFrom
+from colmap_inertial.colmap.sparse import MapRecord, ModelEnds
 from colmap_inertial.drivers import deblur
 from colmap_inertial.drivers.frames import run_images
 from colmap_inertial.drivers.placed import place_project, placed_paths, remove_placed, require_free_names
@@ -31,6 +32,7 @@ from colmap_inertial.model.project import apply_to_project, undo_project
 from colmap_inertial.model.similarities import ModelScale, plain_factor
 from colmap_inertial.options import ProjectOptions
 from colmap_inertial.precalibrate.plan import ImagingPlan
+from colmap_inertial.report.words import mapped_in_words
 from colmap_inertial.run.workspace import Workspace, places_of
 from colmap_inertial.stages.frame_folder import FrameRecord
 from colmap_inertial.types import ScaleEstimate
@@ -435,3 +437,28 @@ def test_the_screen_says_the_layout_in_a_line(workspace, capsys):
         Path("capture"),
     )
     assert capsys.readouterr().out.splitlines()[-2] == f"{workspace.root} is the whole project in metres"
+
+
+def test_the_screen_and_the_report_say_how_a_model_was_made(workspace, capsys):
+    summary = {"registered_images": 3, "points": 1, "observations": 3, "mean_reprojection_error_px": 0.5}
+    refused = ScaleEstimate.refused("joint", "the camera stood still")
+    of = {"scale": refused, "summary": summary, "sparse": workspace.colmap_sparse / "0"}
+    model = ModelResult(index=0, colmap_index=1, **of)
+    joined = ModelEnds(model=1, pairs=12, images=("a.jpg", "b.jpg"), agree=0.97, joined=True)
+    apart = ModelEnds(model=1, pairs=9, images=("c.jpg", "d.jpg"), agree=0.31, joined=False)
+    other = ModelEnds(model=0, pairs=5, images=("e.jpg", "f.jpg"), agree=0.9, joined=True)
+    said = {
+        (joined, other): "Its ends that met (a.jpg and b.jpg, 12 pairs of images) were joined.",
+        (apart,): "Its ends that met (c.jpg and d.jpg, 9 pairs of images) do not fit and stay apart (31 % of their "
+        "matches agree).",
+        (): "",
+    }
+    for ends, expected in said.items():
+        record = MapRecord(mapper="incremental", models=2, ends=ends)
+        assert " ".join(mapped_in_words(asdict(record), 1)) == expected
+        show_result(ReconstructResult(workspace=workspace, models=(model,), seconds={}, mapping=record), Path("here"))
+        shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+        assert ("Mapping" in shown) == bool(expected) and expected in shown
+    in_parts = MapRecord(mapper="incremental", models=1, parts=6)
+    assert mapped_in_words(asdict(in_parts), 0) == ["COLMAP mapped the recording in 6 parts."]
+    assert mapped_in_words(None, 0) == []

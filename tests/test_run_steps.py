@@ -18,6 +18,7 @@ from colmap_inertial.colmap import steps
 from colmap_inertial.colmap.pairing import MatchRecord
 from colmap_inertial.colmap.sparse import (
     KeypointRecords,
+    MapRecord,
     extract_features,
     image_pairs,
     map_images,
@@ -358,6 +359,7 @@ def colmap(workspace, monkeypatch):
 
     def map_them(database, images, target, options, **more):
         target.mkdir()
+        return MapRecord(mapper="incremental", models=1)
 
     monkeypatch.setattr(steps, "extract_features", extract)
     monkeypatch.setattr(steps, "match_capture", match)

@@ -10,6 +10,7 @@ import pytest
 from test_closing import FRAMES, NAMES, make
 
 from colmap_inertial.colmap import sparse, submaps
+from colmap_inertial.colmap.closing import points_of_features
 from colmap_inertial.colmap.submaps import PART, SHARED, Part, Placed, Tie, join_parts, place_parts, runs
 from colmap_inertial.geometry import so3_exp
 from colmap_inertial.options import MappingOptions
@@ -125,6 +126,39 @@ def test_ends_of_a_lap_are_placed_by_their_matches_where_these_may_be_believed(r
     assert near == {(0, 1), (1, 2), (2, 3)} and far == near | {(0, 3)}
 
 
+def test_points_that_contradict_most_others_do_not_place_parts(ring):
+    ring, (first, second, *_) = ring
+    rng = np.random.default_rng(3)
+    shared = [k + 1 for k in range(second.begin, first.end)]
+    seen = []
+    for number in shared:
+        of_first, of_second = (points_of_features(part.model, number) for part in (first, second))
+        both = (of_first >= 0) & (of_second >= 0)
+        pairs = np.stack([of_first[both], of_second[both]], axis=1)
+        pairs[::10, 1] = rng.permutation(pairs[::10, 1])
+        seen.append((number, pairs))
+    good = submaps._tie([first, second], 0, 1, seen)
+    off = np.linalg.norm(good.in_first - good.similar.of(good.in_second), axis=1)
+    assert len(good.away) > 100 and np.all(off < 0.1 * good.away)
+    # the shared images lie where both parts have them
+    for number in shared:
+        here, there = (part.model.image(number).projection_center() for part in (first, second))
+        assert np.linalg.norm(good.similar.of(there[None])[0] - here) < 0.03 * np.median(good.away)
+    for _, pairs in seen:
+        pairs[:, 1] = rng.permutation(pairs[:, 1])
+    assert submaps._tie([first, second], 0, 1, seen) is None
+
+
+def test_an_image_that_two_parts_share_is_of_the_one_that_knows_more_on_both_sides(ring):
+    ring, parts = ring
+    placed = [replace(Placed.nowhere(), translation=np.array([1000.0 * k, 0, 0])) for k in range(2)]
+    whole = submaps._whole(ring.database, parts[:2], placed, ring.options, NAMES)
+    centres = {whole.image(k).name: whole.image(k).projection_center() for k in whole.reg_image_ids()}
+    far = {name for name, centre in centres.items() if centre[0] > 500}
+    assert set(centres) == set(NAMES[:30])
+    assert far == set(NAMES[15:30])
+
+
 def test_parts_that_have_nothing_in_common_stay_apart(ring):
     ring, parts = ring
     short = [parts[2], parts[0]]
@@ -191,3 +225,42 @@ def test_what_is_too_long_for_one_go_is_mapped_in_parts(tmp_path, monkeypatch, l
     done = [count for _, count, total in told if total == FRAMES]
     assert done == sorted(done) and done[-1] == FRAMES and len(set(done)) > FRAMES / 2
     assert not [path for path in tmp_path.iterdir() if path.is_dir() and path.name != "sparse"]
+
+
+def test_parts_may_have_cameras_that_others_lack(tmp_path):
+    """The second half of the lap has a camera of its own, and rigs are numbered otherwise than cameras."""
+    import pycolmap
+
+    ring = make(tmp_path, drift=1.0, wider=1.0, true_focal_px=200.0)
+    path = tmp_path / "two_cameras.db"
+    with pycolmap.Database.open(str(ring.database)) as old, pycolmap.Database.open(str(path)) as new:
+        (camera,) = old.read_all_cameras()
+        rig_of = {}
+        for number in (1, 2):
+            camera.camera_id = number
+            new.write_camera(camera, use_camera_id=True)
+        for number in (2, 1):
+            rig = pycolmap.Rig()
+            rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, number))
+            rig_of[number] = new.write_rig(rig)
+        for k, name in enumerate(NAMES, 1):
+            camera_id = 1 if k <= FRAMES / 2 else 2
+            sensor = pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id)
+            frame = pycolmap.Frame(frame_id=k, rig_id=rig_of[camera_id])
+            frame.add_data_id(pycolmap.data_t(sensor, k))
+            new.write_frame(frame, use_frame_id=True)
+            new.write_image(pycolmap.Image(name=name, camera_id=camera_id, image_id=k, frame_id=k), use_image_id=True)
+            new.write_keypoints(k, old.read_keypoints(k))
+        for pair in old.read_two_view_geometry_num_inliers()[0]:
+            both = pycolmap.pair_id_to_image_pair(pair)
+            geometry = old.read_two_view_geometry(*both)
+            new.write_matches(*both, geometry.inlier_matches)
+            new.write_two_view_geometry(*both, geometry)
+    assert rig_of == {2: 1, 1: 2}
+    parts = [(0, 20), (14, 34), (28, 48)]
+    (whole,) = submaps.map_in_parts(
+        path, tmp_path, tmp_path, ring.options, NAMES, parts, nearest=None, registered=lambda: None
+    )
+    assert whole.num_reg_images() == FRAMES and error_m(ring, whole) < 0.008
+    assert {whole.image(k).camera_id for k in range(1, FRAMES // 2 + 1)} == {1}
+    assert {whole.image(k).camera_id for k in range(FRAMES // 2 + 1, FRAMES + 1)} == {2}

@@ -38,9 +38,10 @@ _LEAST_PAIRS = 3
 _STAYS = 0.5
 #: To move ends that are far apart takes more rounds than COLMAP's 50; a walk of 500 frames, off by a metre, took 60.
 _ROUNDS = 200
-#: COLMAP solves models of more than 1000 images by conjugate gradients, which along a chain of images come nowhere near
-#: the answer; a chain's equations are few off the diagonal, and quickly solved as they are.
-_SOLVED_DIRECTLY = 1_000_000
+#: COLMAP solves models of more images by conjugate gradients, which along a chain of images hardly move. A chain's
+#: equations are few off the diagonal, and are solved as they are. COLMAP's rounds end by the gradient alone, which
+#: grows with the model; of such models, they end where one takes less than this share of what is left.
+_DIRECTLY_UP_TO, _LEAST_GAIN = 1000, 1e-7
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -119,7 +120,7 @@ def close_gaps(
         cache = pycolmap.DatabaseCache.create(opened, cached)
     images = reconstruction.num_reg_images()
     _make_one(reconstruction, torn)
-    options = _adjustment(pipeline)
+    options = _adjustment(pipeline, reconstruction)
     options.ceres.solver_options.max_num_iterations = _ROUNDS
     pycolmap.bundle_adjustment(reconstruction, options)
     mapper = pycolmap.IncrementalMapper(cache)
@@ -141,11 +142,15 @@ def close_gaps(
     return EndsMet(pairs=len(torn), images=(first, second), agree=stays, joined=joined)
 
 
-def _adjustment(pipeline: pycolmap.IncrementalPipelineOptions) -> pycolmap.BundleAdjustmentOptions:
+def _adjustment(
+    pipeline: pycolmap.IncrementalPipelineOptions, reconstruction: pycolmap.Reconstruction
+) -> pycolmap.BundleAdjustmentOptions:
     """Of a whole model; solved directly, however many images it has."""
     adjustment = pipeline.get_global_bundle_adjustment()
     adjustment.print_summary = False
-    adjustment.ceres.max_num_images_direct_sparse_cpu_solver = _SOLVED_DIRECTLY
+    if reconstruction.num_reg_images() > _DIRECTLY_UP_TO:
+        adjustment.ceres.max_num_images_direct_sparse_cpu_solver = reconstruction.num_reg_images()
+        adjustment.ceres.solver_options.function_tolerance = _LEAST_GAIN
     return adjustment
 
 
@@ -157,7 +162,7 @@ def _refine(
     """Adjust the model and complete its points in turn; COLMAP's own loop would answer no signal until its end."""
     import pycolmap
 
-    adjustment = _adjustment(pipeline)
+    adjustment = _adjustment(pipeline, reconstruction)
     mapper.complete_and_merge_tracks(pipeline.get_triangulation())
     mapper.retriangulate(pipeline.get_triangulation())
     for _ in range(pipeline.ba_global_max_refinements):

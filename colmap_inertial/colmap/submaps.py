@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from colmap_inertial.colmap.closing import close_gaps, points_of_features
 from colmap_inertial.geometry import so3_exp
-from colmap_inertial.model.merging import merged
 from colmap_inertial.types import Array
 
 if TYPE_CHECKING:
@@ -167,7 +166,7 @@ def map_in_parts(
                 str(database), str(images), folder, options=own, next_image_callback=registered
             )
         made += [Part(model=model, begin=begin, end=end) for _, model in sorted(models.items())]
-    joined = join_parts(database, made, pipeline, names, nearest=nearest)
+    joined = join_parts(database, made, pipeline, names, nearest=nearest) if made else []
     return sorted(joined, key=lambda model: -int(model.num_reg_images()))
 
 
@@ -185,7 +184,8 @@ def join_parts(
     for members in _groups(len(parts), ties):
         group = [parts[k] for k in members]
         if len(group) > 1:
-            whole = _whole(group, place_parts(members, [tie for tie in ties if tie.first in members]), names)
+            placed = place_parts(members, [tie for tie in ties if tie.first in members])
+            whole = _whole(database, group, placed, pipeline, names)
             met = close_gaps(database, whole, pipeline, names, nearest=nearest)
             if met is not None and met.joined:
                 joined.append(whole)
@@ -307,28 +307,43 @@ def place_parts(members: Sequence[int], ties: Sequence[Tie]) -> list[Placed]:
     return moved(least_squares(off, np.zeros(7 * (len(members) - 1)), x_scale="jac").x)
 
 
-def _whole(group: Sequence[Part], placed: Sequence[Placed], names: Sequence[str]) -> pycolmap.Reconstruction:
+def _whole(
+    database: Path,
+    group: Sequence[Part],
+    placed: Sequence[Placed],
+    pipeline: pycolmap.IncrementalPipelineOptions,
+    names: Sequence[str],
+) -> pycolmap.Reconstruction:
     """One model of parts; an image that several have is of the one that has most images on both sides of it."""
     import pycolmap
 
     place = {name: at for at, name in enumerate(names)}
-    largest = max(group, key=lambda part: int(part.model.compute_num_observations())).model
-    owner: dict[str, tuple[int, int]] = {}
+    owner: dict[int, tuple[int, int]] = {}
     for k, part in enumerate(group):
         for number in part.model.reg_image_ids():
-            name = part.model.image(number).name
-            inside = min(place[name] - part.begin, part.end - 1 - place[name])
-            if name not in owner or inside > owner[name][0]:
-                owner[name] = (inside, k)
-    models = []
-    for k, (part, at) in enumerate(zip(group, placed, strict=True)):
+            at = place[part.model.image(number).name]
+            inside = min(at - part.begin, part.end - 1 - at)
+            if number not in owner or inside > owner[number][0]:
+                owner[number] = (inside, k)
+    cached = pycolmap.DatabaseCacheOptions()
+    cached.min_num_matches = pipeline.min_num_matches
+    whole = pycolmap.Reconstruction()
+    with pycolmap.Database.open(str(database)) as opened:
+        whole.load(pycolmap.DatabaseCache.create(opened, cached))
+    # each part refined its own cameras, where they are refined
+    for part in sorted(group, key=lambda part: int(part.model.compute_num_observations())):
+        for camera_id, camera in part.model.cameras.items():
+            whole.camera(camera_id).params = list(camera.params)
+    for k, (part, similar) in enumerate(zip(group, placed, strict=True)):
         model = pycolmap.Reconstruction(part.model)
-        for number in sorted(model.reg_image_ids()):
-            if owner[model.image(number).name][1] != k:
-                model.deregister_frame(model.image(number).frame_id)
-        for camera_id in set(model.cameras) & set(largest.cameras):
-            # each part refined its own, where they are refined
-            model.camera(camera_id).params = list(largest.camera(camera_id).params)
-        model.transform(pycolmap.Sim3d(at.scale, pycolmap.Rotation3d(at.rotation), at.translation))
-        models.append(model)
-    return merged(models, {})
+        model.transform(pycolmap.Sim3d(similar.scale, pycolmap.Rotation3d(similar.rotation), similar.translation))
+        own = {number for number in model.reg_image_ids() if owner[number][1] == k}
+        for number in sorted(own):
+            image = model.image(number)
+            whole.frame(image.frame_id).set_cam_from_world(image.camera_id, image.cam_from_world())
+            whole.register_frame(image.frame_id)
+        for _, point in sorted(model.points3D.items()):
+            elements = [element for element in point.track.elements if element.image_id in own]
+            if len(elements) > 1:
+                whole.add_point3D(point.xyz, pycolmap.Track(elements), point.color)
+    return whole
