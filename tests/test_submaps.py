@@ -10,7 +10,7 @@ import pytest
 from test_closing import FRAMES, NAMES, make
 
 from colmap_inertial.colmap import sparse, submaps
-from colmap_inertial.colmap.closing import points_of_features
+from colmap_inertial.colmap.closing import EndsMet, points_of_features
 from colmap_inertial.colmap.submaps import PART, SHARED, Part, Placed, Tie, join_parts, place_parts, runs
 from colmap_inertial.geometry import so3_exp
 from colmap_inertial.options import MappingOptions
@@ -111,7 +111,7 @@ def error_m(ring, model) -> float:
 
 def test_parts_become_one_model_that_is_as_good_as_one_made_in_one_go(ring):
     ring, parts = ring
-    (whole,) = join_parts(ring.database, parts, ring.options, NAMES, nearest=None)
+    (whole,) = join_parts(ring.database, parts, ring.options, NAMES, near=4, loops=True)
     assert sorted(whole.image(i).name for i in whole.reg_image_ids()) == NAMES
     assert [whole.image(i).name for i in whole.reg_image_ids()] == [NAMES[i - 1] for i in whole.reg_image_ids()]
     assert error_m(ring, whole) < 0.008
@@ -162,7 +162,7 @@ def test_an_image_that_two_parts_share_is_of_the_one_that_knows_more_on_both_sid
 def test_parts_that_have_nothing_in_common_stay_apart(ring):
     ring, parts = ring
     short = [parts[2], parts[0]]
-    found = join_parts(ring.database, short, ring.options, NAMES, nearest=4)
+    found = join_parts(ring.database, short, ring.options, NAMES, near=4, loops=False)
     assert [model.num_reg_images() for model in found] == [18, 18]
     assert all(model is part.model for model, part in zip(found, short, strict=True))
 
@@ -170,8 +170,27 @@ def test_parts_that_have_nothing_in_common_stay_apart(ring):
 def test_parts_that_do_not_fit_stay_as_they_are(ring, monkeypatch):
     ring, parts = ring
     monkeypatch.setattr(submaps, "close_gaps", lambda *_, **__: None)
-    found = join_parts(ring.database, parts, ring.options, NAMES, nearest=None)
+    found = join_parts(ring.database, parts, ring.options, NAMES, near=4, loops=True)
     assert all(model is part.model for model, part in zip(found, parts, strict=True))
+
+
+def test_parts_that_do_not_fit_with_loops_are_joined_without(ring, monkeypatch):
+    ring, parts = ring
+    asked, placed = [], []
+
+    def close(database, whole, pipeline, names, *, nearest, least_kept):
+        asked.append(nearest)
+        return EndsMet(pairs=9, images=(NAMES[0], NAMES[1]), agree=1.0, joined=nearest is not None)
+
+    def place(members, ties):
+        placed.append({(tie.first, tie.second) for tie in ties})
+        return place_parts(members, ties)
+
+    monkeypatch.setattr(submaps, "close_gaps", close)
+    monkeypatch.setattr(submaps, "place_parts", place)
+    (whole,) = join_parts(ring.database, parts, ring.options, NAMES, near=4, loops=True)
+    assert asked == [None, 4] and placed[0] - placed[1] == {(0, 3)}
+    assert whole.num_reg_images() == FRAMES
 
 
 def test_the_largest_part_s_camera_is_that_of_all(ring, monkeypatch):
@@ -186,7 +205,7 @@ def test_the_largest_part_s_camera_is_that_of_all(ring, monkeypatch):
         model.camera(1).params = [300.0 + k, 300.0 + k, 240, 180]
         bent.append(replace(part, model=model))
     most = max(range(len(parts)), key=lambda k: parts[k].model.compute_num_observations())
-    join_parts(ring.database, bent, ring.options, NAMES, nearest=None)
+    join_parts(ring.database, bent, ring.options, NAMES, near=4, loops=False)
     (whole,) = asked
     assert [list(camera.params) for camera in whole.cameras.values()] == [[300.0 + most, 300.0 + most, 240, 180]]
 
@@ -259,7 +278,7 @@ def test_parts_may_have_cameras_that_others_lack(tmp_path):
     assert rig_of == {2: 1, 1: 2}
     parts = [(0, 20), (14, 34), (28, 48)]
     (whole,) = submaps.map_in_parts(
-        path, tmp_path, tmp_path, ring.options, NAMES, parts, nearest=None, registered=lambda: None
+        path, tmp_path, tmp_path, ring.options, NAMES, parts, near=4, loops=True, registered=lambda: None
     )
     assert whole.num_reg_images() == FRAMES and error_m(ring, whole) < 0.008
     assert {whole.image(k).camera_id for k in range(1, FRAMES // 2 + 1)} == {1}

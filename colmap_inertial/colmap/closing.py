@@ -93,6 +93,7 @@ def close_gaps(
     names: Sequence[str],
     *,
     nearest: int | None,
+    least_kept: float = 1.0,
 ) -> EndsMet | None:
     """Join the ends of a model that met; ``None`` where there are none.
 
@@ -108,6 +109,8 @@ def close_gaps(
         Of images, in order of time.
     nearest
         Pairs farther apart in time may join copies, and are not looked at; ``None`` where all may be believed.
+    least_kept
+        Where a smaller share of the images is left, they do not belong together.
     """
     import pycolmap
 
@@ -133,7 +136,7 @@ def close_gaps(
     of_first = np.concatenate([point[pair.first][pair.features[:, 0]] for pair in torn])
     of_second = np.concatenate([point[pair.second][pair.features[:, 1]] for pair in torn])
     stays = float(np.mean((of_first == of_second) & (of_first >= 0)))
-    joined = stays >= _STAYS and reconstruction.num_reg_images() == images
+    joined = stays >= _STAYS and reconstruction.num_reg_images() >= least_kept * images
     said = "joined" if joined else "left as they are: they do not fit"
     log.info("a model's ends, seen in %d pairs of images, %s (%.0f %% agree)", len(torn), said, 100 * stays)
     place = {name: at for at, name in enumerate(names)}

@@ -372,7 +372,8 @@ def map_images(
     if options.mapper == "incremental":
         pipeline = _incremental_options(refine_intrinsics, context.num_threads, context.seed)
         if len(in_time) > LONGEST and not every_pair:
-            record = _map_in_parts(database, images, sparse, pipeline, in_time, nearest, context)
+            near = _NEIGHBOURS * options.overlap
+            record = _map_in_parts(database, images, sparse, pipeline, in_time, near, judged, context)
         else:
             record = _map_in_one_go(database, images, sparse, pipeline, in_time, nearest, num_images, context)
     else:
@@ -432,14 +433,15 @@ def _map_in_parts(
     sparse: Path,
     pipeline: pycolmap.IncrementalPipelineOptions,
     in_time: Sequence[str],
-    nearest: int | None,
+    near: int,
+    loops: bool,
     context: RunContext,
 ) -> MapRecord:
     # neighbouring parts have some images both
     parts = runs(len(in_time))
     counted = _counter(context.progress, len(in_time), of=sum(end - begin for begin, end in parts))
     models = map_in_parts(
-        database, images, context.scratch, pipeline, in_time, parts, nearest=nearest, registered=counted
+        database, images, context.scratch, pipeline, in_time, parts, near=near, loops=loops, registered=counted
     )
     for number, model in enumerate(models):
         model.extract_colors_for_all_images(str(images))

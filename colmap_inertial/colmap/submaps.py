@@ -1,7 +1,7 @@
 """Captures too long for one go: mapped in parts that overlap, which then become one model.
 
 COLMAP adjusts the whole model again and again while it grows, and from 1000 images on by conjugate gradients, which
-along a chain of images come nowhere near the answer. Parts take as long for each image in a capture of any length.
+along a chain of images hardly move. Parts take as long for each image in a capture of any length.
 What they have in common, images and matches between them, says how each lies in the next: together, and with the loops
 that matching closed, that places all of them. Then their points are made one, and the whole is adjusted once.
 """
@@ -39,6 +39,8 @@ PART, SHARED = 400, 40
 LEAST_SAME = 15
 #: Places of a point in two parts differ by this share of how far away it is from the camera, or it is not the same.
 _SAME_SHARE = 0.1
+#: So many of the images are in what parts become, or they stay apart: what only its part's seam held may go.
+_LEAST_KEPT = 0.99
 #: Of a pair of parts, so many points are plenty to place them by.
 _PLENTY = 500
 
@@ -138,7 +140,8 @@ def map_in_parts(
     names: Sequence[str],
     parts: Sequence[tuple[int, int]],
     *,
-    nearest: int | None,
+    near: int,
+    loops: bool,
     registered: Callable[[], None],
 ) -> list[pycolmap.Reconstruction]:
     """Run COLMAP's incremental mapper on runs of the images, and join what comes out; the largest model first.
@@ -149,8 +152,10 @@ def map_in_parts(
         In order of time.
     parts
         Begins and ends, as :func:`runs` has them.
-    nearest
-        Pairs farther apart in time may join copies, and are not looked at; ``None`` where all may be believed.
+    near
+        Images no farther apart in time are neighbours.
+    loops
+        Whether matches of others may be believed; else they may join copies, and are not looked at.
     registered
         Is called for each image that a part places.
     """
@@ -166,7 +171,7 @@ def map_in_parts(
                 str(database), str(images), folder, options=own, next_image_callback=registered
             )
         made += [Part(model=model, begin=begin, end=end) for _, model in sorted(models.items())]
-    joined = join_parts(database, made, pipeline, names, nearest=nearest) if made else []
+    joined = join_parts(database, made, pipeline, names, near=near, loops=loops) if made else []
     return sorted(joined, key=lambda model: -int(model.num_reg_images()))
 
 
@@ -176,9 +181,11 @@ def join_parts(
     pipeline: pycolmap.IncrementalPipelineOptions,
     names: Sequence[str],
     *,
-    nearest: int | None,
+    near: int,
+    loops: bool,
 ) -> list[pycolmap.Reconstruction]:
-    """Of parts that lie beside each other, one model; those that turn out not to fit stay as they are."""
+    """Of parts that lie beside each other, one model; those that do not fit without loops either stay as they are."""
+    nearest = None if loops else near
     ties = find_ties(database, parts, names, nearest=nearest)
     joined: list[pycolmap.Reconstruction] = []
     for members in _groups(len(parts), ties):
@@ -186,12 +193,15 @@ def join_parts(
         if len(group) > 1:
             placed = place_parts(members, [tie for tie in ties if tie.first in members])
             whole = _whole(database, group, placed, pipeline, names)
-            met = close_gaps(database, whole, pipeline, names, nearest=nearest)
+            met = close_gaps(database, whole, pipeline, names, nearest=nearest, least_kept=_LEAST_KEPT)
             if met is not None and met.joined:
                 joined.append(whole)
                 continue
-            log.info("%d parts are left as they are: they do not fit", len(group))
-        joined += [part.model for part in group]
+            log.info("%d parts do not fit%s", len(group), " with loops" if loops else "")
+        if len(group) > 1 and loops:
+            joined += join_parts(database, group, pipeline, names, near=near, loops=False)
+        else:
+            joined += [part.model for part in group]
     return joined
 
 
