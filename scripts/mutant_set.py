@@ -1468,8 +1468,8 @@ MUTANTS = (
     ),
     Mutant(
         "colmap/submaps.py",
-        "if name not in owner or inside > owner[name][0]:",
-        "if name not in owner:",
+        "if number not in owner or inside > owner[number][0]:",
+        "if number not in owner:",
         "images that two parts share are of the first one",
         ("submaps::test_an_image_that_two_parts_share_is_of_the_one_that_knows_more_on_both_sides",),
     ),
