@@ -382,7 +382,8 @@ def map_by(mapper: str, folder: Path) -> Figures:
     models, truth = folder / mapper, true_centres(folder)
     shutil.rmtree(models, ignore_errors=True)
     before_mib, begun_s = peak_mib(), time.process_time()
-    told: Figures = {}
+    path_m = np.linalg.norm(np.diff(list(truth.values()), axis=0), axis=1).sum()
+    told: Figures = {"path_m": float(path_m)}
     if mapper == "bare":
         models.mkdir()
         pycolmap.incremental_mapping(
@@ -399,7 +400,7 @@ def map_by(mapper: str, folder: Path) -> Figures:
             context=RunContext(scratch=folder, num_threads=1),
             in_time=list(truth),
         )
-        told = {"parts": record.parts, "ends_joined": sum(met.joined for met in record.ends)}
+        told |= {"parts": record.parts, "ends_joined": sum(met.joined for met in record.ends)}
     processor_s = time.process_time() - begun_s
     mib = peak_mib() - before_mib
     each = {"ms_a_frame": 1e3 * processor_s / len(truth), "mib_a_frame": mib / len(truth)}

@@ -210,3 +210,31 @@ def test_the_mapper_s_model_is_the_joined_one_where_the_order_in_time_is_known(t
     assert record == sparse.MapRecord(mapper="incremental", models=1, ends=(said,) if given else ())
     write_record(tmp_path / "record.json", record)
     assert read_record(tmp_path / "record.json", sparse.MapRecord) == record
+
+
+@pytest.mark.parametrize(
+    ("pairing", "judged", "nearest"), [("sequential", True, None), ("sequential", False, 6), ("exhaustive", True, 6)]
+)
+def test_pairs_far_apart_in_time_are_believed_where_somebody_looked(tmp_path, monkeypatch, pairing, judged, nearest):
+    import pycolmap
+
+    from colmap_inertial.colmap import sparse
+    from colmap_inertial.options import MappingOptions
+    from colmap_inertial.run.context import RunContext
+
+    ring = make(tmp_path)
+    asked = []
+    monkeypatch.setattr(pycolmap, "incremental_mapping", lambda *_, **__: {0: ring.model})
+    monkeypatch.setattr(sparse, "close_gaps", lambda *_, nearest: asked.append(nearest))
+    sparse.map_images(
+        ring.database,
+        tmp_path,
+        tmp_path / "sparse",
+        MappingOptions(overlap=3, pairing=pairing),
+        refine_intrinsics=False,
+        num_images=FRAMES,
+        context=RunContext(scratch=tmp_path),
+        in_time=NAMES,
+        judged=judged,
+    )
+    assert asked == [nearest]

@@ -97,8 +97,10 @@ def pictures(tmp_path, project, monkeypatch):
         cv2.imwrite(str(folder / f"{i}.png"), np.full((8, 8), i, np.uint8))
     mapped = []
 
-    def map_images(database, images, sparse, *_, **__):
+    def map_images(database, images, sparse, *_, in_time, judged, **__):
         mapped.append(sorted(path.name for path in images.iterdir()))
+        # no gyroscope said which pairs far apart in time join copies
+        assert in_time == mapped[-1] and not judged
         for number in "01":
             shutil.copytree(project.model, sparse / number)
 
