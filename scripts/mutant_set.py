@@ -92,6 +92,13 @@ MUTANTS = (
         ("scale_suspects::test_what_was_undone_is_suspected_no_more",),
     ),
     Mutant(
+        "scale/_suspects.py",
+        'one.name != "rate" or abs(float(one.value[0])) > least_rate',
+        "True",
+        "a long recording has a clock of the accelerometer's own for a part in a million",
+        ("scale_suspects::test_stamps_that_part_by_less_than_a_sample_are_of_one_clock",),
+    ),
+    Mutant(
         "scale/_setup.py",
         "imu.gyro_rad_s, gyro_cut)",
         "imu.gyro_rad_s)",

@@ -12,7 +12,7 @@ from colmap_inertial.scale import _parameters as par, estimate_scale, first_seco
 from colmap_inertial.scale._fit import fit_jointly
 from colmap_inertial.scale._preintegration import Track, Tracks, gap_cov
 from colmap_inertial.scale._setup import cut_off, prepare
-from colmap_inertial.scale._suspects import Faults, worst
+from colmap_inertial.scale._suspects import Faults, Suspicion, worst
 from colmap_inertial.scale.parts import CAUSES, parts_in_words
 from colmap_inertial.simulate.motion import MotionOptions
 from colmap_inertial.simulate.recording import RecordingOptions, simulate_recording
@@ -160,11 +160,25 @@ def prepared(recording):
 def test_what_was_undone_is_suspected_no_more(recording):
     altered = replace(recording, imu=one_axis_late(recording.imu, 0.012))
     data, prior = prepared(altered)
-    found = worst(fit_jointly(data, prior, None).suspicions)
+    found = worst(fit_jointly(data, prior, None).suspicions, data.tracks.accel)
     assert found.name == "axes" and found.chi2 > 100
     undone = Faults(values={}).with_found(found).undone(data)
     again = {one.name: one.chi2 for one in fit_jointly(undone, prior, None).suspicions}
     assert again["axes"] < 0.1 * found.chi2
+
+
+def test_stamps_that_part_by_less_than_a_sample_are_of_one_clock():
+    t_s = np.linspace(0, 2000, 400_001)
+    accel = Track.of(t_s, np.zeros((len(t_s), 3)))
+
+    def rate(ppm):
+        cov = np.array([[(0.1e-6) ** 2]])
+        return Suspicion(name="rate", value=np.array([1e-6 * ppm]), cov=cov, by_scale=np.zeros(1))
+
+    # 5 ms in 2000 s
+    assert [worst([rate(ppm)], accel) is not None for ppm in (-3, -2, 2, 3)] == [True, False, False, True]
+    # what is left of a rate that was found is undone to the last
+    assert worst([rate(1)], accel, {"rate"}) is not None
 
 
 def test_the_parts_of_the_variance_are_those_of_the_covariance(recording):

@@ -129,14 +129,21 @@ def suspicions(
     return out
 
 
-def worst(found: list[Suspicion], known: Collection[str] = ()) -> Suspicion | None:
+def worst(found: list[Suspicion], accel: Track, known: Collection[str] = ()) -> Suspicion | None:
     """The strongest suspicion that is more than chance, None where there is none.
 
-    Of what is ``known`` to be wrong already, more than half a standard deviation that is left counts. The camera's path
-    is suspected last: what else is wrong with an accelerometer may look like it.
+    Of what is ``known`` to be wrong already, more than half a standard deviation that is left counts. Stamps that part
+    by less than a sample from end to end are of one clock: along half an hour even a part in a million would show. The
+    camera's path is suspected last: what else is wrong with an accelerometer may look like it.
     """
-    counts = [one for one in found if one.chi2 > (_LEFT_CHI2 * len(one.value) if one.name in known else _LARGEST_CHI2)]
-    return max(counts, key=lambda one: (not _is_of_path(one), one.chi2), default=None)
+    least_rate = float(np.median(np.diff(accel.t_s)) / np.ptp(accel.t_s))
+
+    def counts(one: Suspicion) -> bool:
+        if one.name in known:
+            return one.chi2 > _LEFT_CHI2 * len(one.value)
+        return one.chi2 > _LARGEST_CHI2 and (one.name != "rate" or abs(float(one.value[0])) > least_rate)
+
+    return max(filter(counts, found), key=lambda one: (not _is_of_path(one), one.chi2), default=None)
 
 
 def _is_of_path(suspicion: Suspicion) -> bool:

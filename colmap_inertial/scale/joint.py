@@ -152,7 +152,7 @@ def _fit_soundly(data: Data, prior: Prior, sheet: ImuNoise | None) -> tuple[Fit,
             # not from the start: on its way a fit passes gains that it would not find back from
             prior = replace(prior, heavy_gains=True)
             fit = fit_jointly(sound, faults.loosened(prior), sheet)
-        found = worst(fit.suspicions, faults.values)
+        found = worst(fit.suspicions, data.tracks.accel, faults.values)
         # a fit of what does not belong together explains nothing
         if found is None or _refusals(fit, data.t_s):
             break
