@@ -46,8 +46,9 @@ from check_euroc import similarity
 from walk_features import write_features
 from walk_scenes import Scene, Walk, places_m, world_of, write_walk
 
+from colmap_inertial.colmap.mapping import map_images
 from colmap_inertial.colmap.pairing import match_capture
-from colmap_inertial.colmap.sparse import extract_features, map_images
+from colmap_inertial.colmap.sparse import extract_features
 from colmap_inertial.geometry import matrix_from_quat, quat_rotate, slerp
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.files import read_json

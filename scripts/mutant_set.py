@@ -1432,7 +1432,7 @@ MUTANTS = (
         ("run_steps::test_every_image_of_a_long_recording_is_matched_with_its_neighbours",),
     ),
     Mutant(
-        "colmap/sparse.py",
+        "colmap/mapping.py",
         "pipeline.ba_refine_focal_length = refine\n",
         "pipeline.ba_refine_focal_length = not refine\n",
         "intrinsics that are to be kept are refined",
@@ -1488,7 +1488,7 @@ MUTANTS = (
         ("submaps::test_ends_of_a_lap_are_placed_by_their_matches_where_these_may_be_believed",),
     ),
     Mutant(
-        "colmap/sparse.py",
+        "colmap/mapping.py",
         "if len(in_time) > LONGEST and not every_pair:",
         "if len(in_time) >= LONGEST and not every_pair:",
         "what is short enough for one go is mapped in parts",

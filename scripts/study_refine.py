@@ -36,7 +36,7 @@ import numpy as np
 import pycolmap
 from check_euroc import similarity
 
-from colmap_inertial.colmap.sparse import map_images
+from colmap_inertial.colmap.mapping import map_images
 from colmap_inertial.geometry import matrix_from_quat, quat_exp, quat_multiply, so3_log
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.model import Model

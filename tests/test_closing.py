@@ -172,14 +172,14 @@ def test_ends_are_not_joined_by_pairs_of_which_nobody_knows_whether_they_join_co
 def test_the_mapper_s_model_is_the_joined_one_where_the_order_in_time_is_known(tmp_path, monkeypatch, given, joins):
     import pycolmap
 
-    from colmap_inertial.colmap import sparse
+    from colmap_inertial.colmap import mapping
     from colmap_inertial.options import MappingOptions
     from colmap_inertial.run.context import RunContext
 
     ring = make(tmp_path)
     asked = []
 
-    def mapping(database, images, out, **_):
+    def made(database, images, out, **_):
         (Path(out) / "0").mkdir(parents=True)
         ring.model.write_binary(str(Path(out) / "0"))
         return {0: ring.model}
@@ -189,11 +189,11 @@ def test_the_mapper_s_model_is_the_joined_one_where_the_order_in_time_is_known(t
         model.deregister_frame(1)  # a mark
         return EndsMet(pairs=4, images=(NAMES[0], NAMES[-1]), agree=0.7, joined=joins)
 
-    monkeypatch.setattr(pycolmap, "incremental_mapping", mapping)
-    monkeypatch.setattr(sparse, "close_gaps", closing)
+    monkeypatch.setattr(pycolmap, "incremental_mapping", made)
+    monkeypatch.setattr(mapping, "close_gaps", closing)
     options = MappingOptions(overlap=3)
-    assert sparse.matches_every_pair(FRAMES, options)
-    record = sparse.map_images(
+    assert mapping.matches_every_pair(FRAMES, options)
+    record = mapping.map_images(
         ring.database,
         tmp_path,
         tmp_path / "sparse",
@@ -206,10 +206,10 @@ def test_the_mapper_s_model_is_the_joined_one_where_the_order_in_time_is_known(t
     assert asked == ([(NAMES, 2 * options.overlap)] if given else [])
     written = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
     assert written.num_reg_images() == FRAMES - (given and joins)
-    said = sparse.ModelEnds(model=0, pairs=4, images=(NAMES[0], NAMES[-1]), agree=0.7, joined=joins)
-    assert record == sparse.MapRecord(mapper="incremental", models=1, ends=(said,) if given else ())
+    said = mapping.ModelEnds(model=0, pairs=4, images=(NAMES[0], NAMES[-1]), agree=0.7, joined=joins)
+    assert record == mapping.MapRecord(mapper="incremental", models=1, ends=(said,) if given else ())
     write_record(tmp_path / "record.json", record)
-    assert read_record(tmp_path / "record.json", sparse.MapRecord) == record
+    assert read_record(tmp_path / "record.json", mapping.MapRecord) == record
 
 
 @pytest.mark.parametrize(
@@ -218,15 +218,15 @@ def test_the_mapper_s_model_is_the_joined_one_where_the_order_in_time_is_known(t
 def test_pairs_far_apart_in_time_are_believed_where_somebody_looked(tmp_path, monkeypatch, pairing, judged, nearest):
     import pycolmap
 
-    from colmap_inertial.colmap import sparse
+    from colmap_inertial.colmap import mapping
     from colmap_inertial.options import MappingOptions
     from colmap_inertial.run.context import RunContext
 
     ring = make(tmp_path)
     asked = []
     monkeypatch.setattr(pycolmap, "incremental_mapping", lambda *_, **__: {0: ring.model})
-    monkeypatch.setattr(sparse, "close_gaps", lambda *_, nearest: asked.append(nearest))
-    sparse.map_images(
+    monkeypatch.setattr(mapping, "close_gaps", lambda *_, nearest: asked.append(nearest))
+    mapping.map_images(
         ring.database,
         tmp_path,
         tmp_path / "sparse",

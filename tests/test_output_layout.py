@@ -17,7 +17,7 @@ from test_pipeline_parts import session_in
 from colmap_inertial.cli.terminal import show_result
 from colmap_inertial.colmap import dense as dense_room
 from colmap_inertial.colmap.depth_maps import MadeFrom
-from colmap_inertial.colmap.sparse import MapRecord, ModelEnds
+from colmap_inertial.colmap.mapping import MapRecord, ModelEnds
 from colmap_inertial.drivers import deblur
 from colmap_inertial.drivers.frames import run_images
 from colmap_inertial.drivers.placed import place_project, placed_paths, remove_placed, require_free_names

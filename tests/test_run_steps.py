@@ -15,15 +15,9 @@ import pytest
 from test_pipeline_parts import frames_of, recording_of, session_in
 
 from colmap_inertial.colmap import steps
+from colmap_inertial.colmap.mapping import MapRecord, map_images
 from colmap_inertial.colmap.pairing import MatchRecord
-from colmap_inertial.colmap.sparse import (
-    KeypointRecords,
-    MapRecord,
-    extract_features,
-    image_pairs,
-    map_images,
-    write_gravity_priors,
-)
+from colmap_inertial.colmap.sparse import KeypointRecords, extract_features, image_pairs, write_gravity_priors
 from colmap_inertial.diagnose import Recorded, diagnose
 from colmap_inertial.drivers import frames as framing, placed, project as existing
 from colmap_inertial.drivers.frames import run_frames, run_images, run_plan

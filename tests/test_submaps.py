@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from test_closing import FRAMES, NAMES, make
 
-from colmap_inertial.colmap import sparse, submaps
+from colmap_inertial.colmap import mapping, submaps
 from colmap_inertial.colmap.closing import EndsMet, points_of_features
 from colmap_inertial.colmap.submaps import PART, SHARED, Part, Placed, Tie, join_parts, place_parts, runs
 from colmap_inertial.geometry import so3_exp
@@ -218,16 +218,16 @@ def test_what_is_too_long_for_one_go_is_mapped_in_parts(tmp_path, monkeypatch, l
     import pycolmap
 
     ring = make(tmp_path, drift=1.0, wider=1.0, true_focal_px=200.0)
-    monkeypatch.setattr(sparse, "LONGEST", longest)
-    monkeypatch.setattr(sparse, "runs", lambda count: PARTS)
+    monkeypatch.setattr(mapping, "LONGEST", longest)
+    monkeypatch.setattr(mapping, "runs", lambda count: PARTS)
     asked, told, incremental = [], [], pycolmap.incremental_mapping
 
-    def mapping(*args, options, **more):
+    def made(*args, options, **more):
         asked.append(list(options.image_names))
         return incremental(*args, options=options, **more)
 
-    monkeypatch.setattr(pycolmap, "incremental_mapping", mapping)
-    record = sparse.map_images(
+    monkeypatch.setattr(pycolmap, "incremental_mapping", made)
+    record = mapping.map_images(
         ring.database,
         tmp_path,
         tmp_path / "sparse",
@@ -238,7 +238,7 @@ def test_what_is_too_long_for_one_go_is_mapped_in_parts(tmp_path, monkeypatch, l
         in_time=NAMES,
     )
     assert asked == ([NAMES[begin:end] for begin, end in PARTS] if in_parts else [[]])
-    assert record == sparse.MapRecord(mapper="incremental", models=1, parts=len(PARTS) if in_parts else 1)
+    assert record == mapping.MapRecord(mapper="incremental", models=1, parts=len(PARTS) if in_parts else 1)
     model = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
     assert model.num_reg_images() == FRAMES and error_m(ring, model) < 0.008
     done = [count for _, count, total in told if total == FRAMES]

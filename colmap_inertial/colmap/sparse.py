@@ -1,44 +1,32 @@
-"""COLMAP's own stages: features, matches, mapping, with progress and nothing left half-written."""
+"""COLMAP's own stages before its mapper: features and matches, with progress and nothing left half-written."""
 
 from __future__ import annotations
 
 import contextlib
 import itertools
-import logging
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from colmap_inertial.colmap.closing import EndsMet, close_gaps
-from colmap_inertial.colmap.submaps import LONGEST, map_in_parts, runs
 from colmap_inertial.errors import FormatError, InertialError, MappingError, OutputError
-from colmap_inertial.model import colmap_camera, find_models
-from colmap_inertial.model.binary import check_binary_model
+from colmap_inertial.model import colmap_camera
 from colmap_inertial.options import MappingOptions
 from colmap_inertial.run.context import RunContext
-from colmap_inertial.run.progress import Progress
 from colmap_inertial.run.workspace import require_room
 from colmap_inertial.stages.protocols import KeypointStage
 from colmap_inertial.types import Array, CameraModel, Keypoints, Treatment
 
 if TYPE_CHECKING:
-    import pycolmap
-
-log = logging.getLogger(__name__)
+    pass
 
 #: Up to this many images every pair is matched; above it, neighbours in time.
 _EXHAUSTIVE_UP_TO = 150
 _EXTRACTION_BATCH = 16
-#: Where cameras are known, the whole model is adjusted each time it has grown so much, as COLMAP's own settings for
-#: videos have it, and at the end; unknown cameras bend a model that is adjusted so seldom.
-_GLOBAL_RATIO = 1.4
-#: Images within so many times the overlap are neighbours in time.
-_NEIGHBOURS = 2
 #: Each batch indexes its images' features anew, an image as dear as a pair; the first are small, so that one sees soon
 #: how quickly it goes.
 _FIRST_MATCHING_BATCH, _MATCHING_BATCH = 100, 1600
@@ -303,190 +291,6 @@ def match_pairs(
                 )
             done += len(batch)
     context.progress("matches", done, total)
-
-
-@dataclass(frozen=True, kw_only=True)
-class ModelEnds(EndsMet):
-    """The same, of one of several models; ``model`` is its number."""
-
-    model: int
-
-
-@dataclass(frozen=True, kw_only=True)
-class MapRecord:
-    """How models were made.
-
-    Attributes
-    ----------
-    mapper
-        COLMAP's: ``"incremental"`` or ``"global"``.
-    models
-        How many.
-    parts
-        Runs of images that were mapped by themselves; 1 where all were mapped in one go.
-    ends
-        Of models that were mapped in one go: their ends that met.
-    """
-
-    mapper: str
-    models: int
-    parts: int = 1
-    ends: tuple[ModelEnds, ...] = ()
-
-
-def map_images(
-    database: Path,
-    images: Path,
-    sparse: Path,
-    options: MappingOptions,
-    *,
-    refine_intrinsics: bool,
-    num_images: int,
-    context: RunContext,
-    in_time: Sequence[str] = (),
-    judged: bool = True,
-) -> MapRecord:
-    """Run COLMAP's mapper; models are written to ``sparse/0``, ``sparse/1``, ...
-
-    Parameters
-    ----------
-    in_time
-        The images in order of time, where they are of one recording: ends of a model that met are joined then, and what
-        is too long for one go is mapped in parts.
-    judged
-        Whether somebody looked which pairs far apart in time join copies. Nobody does where every pair is matched.
-
-    Raises
-    ------
-    MappingError
-        When no model comes out.
-    """
-    import pycolmap
-
-    pycolmap.set_random_seed(context.seed)
-    sparse.mkdir(parents=True)
-    require_room(sparse, database.stat().st_size)
-    context.progress("mapping", 0, num_images)
-    every_pair = matches_every_pair(num_images, options)
-    nearest = None if judged and not every_pair else _NEIGHBOURS * options.overlap
-    if options.mapper == "incremental":
-        pipeline = _incremental_options(refine_intrinsics, context.num_threads, context.seed)
-        if len(in_time) > LONGEST and not every_pair:
-            near = _NEIGHBOURS * options.overlap
-            record = _map_in_parts(database, images, sparse, pipeline, in_time, near, judged, context)
-        else:
-            record = _map_in_one_go(database, images, sparse, pipeline, in_time, nearest, num_images, context)
-    else:
-        models = pycolmap.global_mapping(
-            str(database),
-            str(images),
-            str(sparse),
-            options=_global_options(options, refine_intrinsics, context.num_threads, context.seed),
-        )
-        record = MapRecord(mapper="global", models=len(models))
-    context.progress("mapping", num_images, num_images)
-    for folder in sparse.iterdir():
-        # COLMAP does not say when it could not write one whole
-        find_models(folder)
-        check_binary_model(folder)
-    if not record.models:
-        raise MappingError(
-            "COLMAP found no model: too few matches between the frames. Film with more overlap, more texture or less "
-            "blur, or try --mapping.pairing exhaustive"
-        )
-    log.info("mapping: %s", record)
-    return record
-
-
-def _map_in_one_go(
-    database: Path,
-    images: Path,
-    sparse: Path,
-    pipeline: pycolmap.IncrementalPipelineOptions,
-    in_time: Sequence[str],
-    nearest: int | None,
-    num_images: int,
-    context: RunContext,
-) -> MapRecord:
-    import pycolmap
-
-    models = pycolmap.incremental_mapping(
-        str(database),
-        str(images),
-        str(sparse),
-        options=pipeline,
-        next_image_callback=_counter(context.progress, num_images),
-    )
-    ends = []
-    for number, model in models.items() if in_time else ():
-        met = close_gaps(database, model, pipeline, in_time, nearest=nearest)
-        if met is not None:
-            ends.append(ModelEnds(model=number, **vars(met)))
-            if met.joined:
-                model.write_binary(str(sparse / str(number)))
-    return MapRecord(mapper="incremental", models=len(models), ends=tuple(ends))
-
-
-def _map_in_parts(
-    database: Path,
-    images: Path,
-    sparse: Path,
-    pipeline: pycolmap.IncrementalPipelineOptions,
-    in_time: Sequence[str],
-    near: int,
-    loops: bool,
-    context: RunContext,
-) -> MapRecord:
-    # neighbouring parts have some images both
-    parts = runs(len(in_time))
-    counted = _counter(context.progress, len(in_time), of=sum(end - begin for begin, end in parts))
-    models = map_in_parts(
-        database, images, context.scratch, pipeline, in_time, parts, near=near, loops=loops, registered=counted
-    )
-    for number, model in enumerate(models):
-        model.extract_colors_for_all_images(str(images))
-        (sparse / str(number)).mkdir()
-        model.write_binary(str(sparse / str(number)))
-    return MapRecord(mapper="incremental", models=len(models), parts=len(parts))
-
-
-def _counter(progress: Progress, total: int, *, of: int | None = None) -> Callable[[], None]:
-    """Counts up to ``total``; where some images come several times, ``of`` so many calls."""
-    count = itertools.count(1)
-
-    def registered() -> None:
-        progress("mapping", min(next(count) * total // (of or total), total), total)
-
-    return registered
-
-
-def _incremental_options(refine: bool, num_threads: int, seed: int) -> pycolmap.IncrementalPipelineOptions:
-    import pycolmap
-
-    pipeline = pycolmap.IncrementalPipelineOptions()
-    pipeline.num_threads = num_threads
-    pipeline.random_seed = seed
-    pipeline.ba_refine_focal_length = refine
-    pipeline.ba_refine_extra_params = refine
-    pipeline.mapper.abs_pose_refine_focal_length = refine
-    pipeline.mapper.abs_pose_refine_extra_params = refine
-    if not refine:
-        pipeline.ba_global_frames_ratio = pipeline.ba_global_points_ratio = _GLOBAL_RATIO
-    return pipeline
-
-
-def _global_options(
-    options: MappingOptions, refine: bool, num_threads: int, seed: int
-) -> pycolmap.GlobalPipelineOptions:
-    import pycolmap
-
-    pipeline = pycolmap.GlobalPipelineOptions()
-    pipeline.num_threads = num_threads
-    pipeline.random_seed = seed
-    pipeline.mapper.bundle_adjustment.refine_focal_length = refine
-    pipeline.mapper.bundle_adjustment.refine_extra_params = refine
-    pipeline.mapper.rotation_averaging.use_gravity = options.gravity_priors
-    return pipeline
 
 
 def write_gravity_priors(database: Path, gravity_in_cam: Mapping[str, Array]) -> None:

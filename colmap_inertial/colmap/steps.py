@@ -6,14 +6,9 @@ import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from colmap_inertial.colmap.mapping import MapRecord, map_images
 from colmap_inertial.colmap.pairing import MatchRecord, match_capture
-from colmap_inertial.colmap.sparse import (
-    KeypointRecords,
-    MapRecord,
-    extract_features,
-    map_images,
-    write_gravity_priors,
-)
+from colmap_inertial.colmap.sparse import KeypointRecords, extract_features, write_gravity_priors
 from colmap_inertial.io.records import read_record, write_record
 from colmap_inertial.options import ReconstructOptions
 from colmap_inertial.run.context import Recording

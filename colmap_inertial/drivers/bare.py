@@ -10,11 +10,11 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
+from colmap_inertial.colmap.mapping import map_images
 from colmap_inertial.colmap.sparse import (
     check_pair_names,
     extract_features,
     image_pairs,
-    map_images,
     mapping_device,
     match_features,
 )

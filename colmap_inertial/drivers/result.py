@@ -10,8 +10,9 @@ import numpy as np
 
 from colmap_inertial import __version__
 from colmap_inertial.colmap.dense import DenseResult
+from colmap_inertial.colmap.mapping import MapRecord
 from colmap_inertial.colmap.pairing import MatchRecord
-from colmap_inertial.colmap.sparse import KeypointRecords, MapRecord
+from colmap_inertial.colmap.sparse import KeypointRecords
 from colmap_inertial.errors import InertialError, NotObservableError
 from colmap_inertial.geometry import quat_conjugate, quat_log, quat_multiply
 from colmap_inertial.georeference import Georeference

@@ -19,7 +19,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from colmap_inertial.align import AlignOptions, align_clocks
-from colmap_inertial.colmap.sparse import extract_features, image_pairs, map_images, match_features, verify_again
+from colmap_inertial.colmap.mapping import map_images
+from colmap_inertial.colmap.sparse import extract_features, image_pairs, match_features, verify_again
 from colmap_inertial.errors import FormatError, MappingError, NotObservableError
 from colmap_inertial.flow import FlowOptions, VisualRotation, check_motion, find_stabilisation, measure_rotation
 from colmap_inertial.io.capture import Capture, ImageFolder
