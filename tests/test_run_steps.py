@@ -230,6 +230,19 @@ def test_a_step_without_files_that_was_interrupted_is_not_finished(workspace):
     assert made == [1, 2, 1], "what the second one began may have replaced what the first one made"
 
 
+def test_a_step_that_writes_something_more_makes_again_what_follows(workspace):
+    """As after an update: what follows would be of what was there before."""
+
+    def made(*names):
+        runner = StepRunner(workspace)
+        outputs = [workspace.root / name for name in names]
+        runner.run("first", {}, outputs, lambda partial: [path.write_text("") for path in partial])
+        runner.run("second", {}, [], lambda partial: None, after=["first"])
+        return runner.worked
+
+    assert [made("a"), made("a"), made("a", "b")] == [["first", "second"], [], ["first", "second"]]
+
+
 def test_a_session_is_alone_in_its_folder_and_another_configuration_undoes_the_result(tmp_path):
     def session(seed=0):
         options = replace(ReconstructOptions(), seed=seed)

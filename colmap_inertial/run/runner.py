@@ -132,9 +132,9 @@ def _digest(path: Path, size: int, _mtime_ns: int, _ctime_ns: int) -> str:
 class StepRunner:
     """Runs steps in order and skips those whose inputs and options are those of an earlier, finished run.
 
-    A step's key hashes its options, its inputs and the keys of the steps that it takes the output of, so that a change
-    anywhere makes again what depends on it, and nothing else. A folder's existence proves nothing: only a stamp with
-    the right key does.
+    A step's key hashes its options, its inputs, what it writes and the keys of the steps that it takes the output of,
+    so that a change anywhere makes again what depends on it, and nothing else. A folder's existence proves nothing:
+    only a stamp with the right key does.
 
     Attributes
     ----------
@@ -185,7 +185,8 @@ class StepRunner:
             Steps whose output it takes.
         """
         upstream = [self._keys[step] for step in after]
-        text = json.dumps([name, __version__, upstream, canonical(depends)], sort_keys=True)
+        written = [path.name for path in outputs]
+        text = json.dumps([name, __version__, upstream, canonical(depends), written], sort_keys=True)
         key = self._keys[name] = hashlib.sha256(text.encode()).hexdigest()
         stamp = self._workspace.stamps / f"{name}.json"
         done = _read_stamp(stamp)
