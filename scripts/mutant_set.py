@@ -1678,6 +1678,13 @@ MUTANTS = (
     ),
     Mutant(
         "model/nerf.py",
+        "similarity.provenance == f\"{UNDOES}{before_apply.get(_BY, '')}\"",
+        "similarity.provenance.startswith(UNDOES)",
+        "undoing a second similarity takes from an export the metres that the first one brought",
+        ("export::test_of_two_similarities_undone_in_turn_the_first_one_made_an_export_metres",),
+    ),
+    Mutant(
+        "model/nerf.py",
         "note != NO_SCALE and (up is None or note != NO_UP)",
         "up is None or note != NO_UP",
         "an export in metres still says that the scale was refused",

@@ -38,9 +38,9 @@ from colmap_inertial.export.whole import _notes_on, export_model
 from colmap_inertial.geometry import matrix_from_quat
 from colmap_inertial.io.ply import read_ply_header
 from colmap_inertial.model import read_model, write_model
-from colmap_inertial.model.nerf import EXPORT_FORMAT, transform_export
+from colmap_inertial.model.nerf import EXPORT_FORMAT, NOT_METRES, transform_export
 from colmap_inertial.model.project import apply_to_project, undo_project
-from colmap_inertial.model.similarities import plain_factor
+from colmap_inertial.model.similarities import plain_factor, undoing
 from colmap_inertial.options import ExportProgram
 from colmap_inertial.types import ScaleEstimate, Similarity
 from colmap_inertial.view.sources import ScaleFacts, ViewSource
@@ -316,6 +316,18 @@ def test_an_export_without_a_scale_is_in_metres_once_one_was_applied(known, tmp_
         np.testing.assert_allclose(made["scale"]["relative_ci95"], [np.exp(-0.0196), np.exp(0.0196)], rtol=1e-4)
     undo_project(tmp_path / "made", tmp_path / "again")
     assert json.loads((tmp_path / "again" / "export.json").read_text()) == said
+
+
+def test_of_two_similarities_undone_in_turn_the_first_one_made_an_export_metres(tmp_path):
+    said = {"format": EXPORT_FORMAT, "unit": NOT_METRES, "up_in_world": None, "scale": {"verdict": "refused"}}
+    first, second = plain_factor(2.0), plain_factor(2.5)
+    (tmp_path / "0.json").write_text(json.dumps(said | {"notes": ["a"]}))
+    units = []
+    for i, one in enumerate([first, second, undoing(second), undoing(first), undoing(first)]):
+        transform_export(tmp_path / f"{i}.json", tmp_path / f"{i + 1}.json", one)
+        units.append(json.loads((tmp_path / f"{i + 1}.json").read_text())["unit"])
+    assert units == ["m", "0.4 m", "m", NOT_METRES, NOT_METRES]
+    assert json.loads((tmp_path / "5.json").read_text()) == said | {"notes": ["a"]}
 
 
 @pytest.mark.parametrize(("key", "value"), [("unit", "2m"), ("unit", "9e m"), ("up_in_world", "z")])

@@ -26,7 +26,8 @@ _METRES = re.compile(r"(?:(\d\S*) )?m")
 NOT_METRES = "unknown: not metres"
 NO_SCALE = "the scale was refused: units are not metres, and nothing here says how large anything is"
 NO_UP = "the direction of gravity is not known: up is only taken for z"
-_BEFORE = "before_apply"
+#: What it said before a similarity made it metres, and in that the provenance of this one.
+_BEFORE, _BY = "before_apply", "provenance"
 _DIRECTIONS = ("up_in_world", "gravity_in_world_m_s2")
 #: Its cameras are a model's when they stand closer to them than this share of their extent.
 _SAME_FRAME = 0.01
@@ -122,7 +123,7 @@ def transform_export(source: Path, target: Path, similarity: Similarity) -> tupl
     """Write a copy whose unit and directions are those of the moved model.
 
     Where the unit was unknown, the similarity is what makes it metres: the copy says so, and keeps what it said before
-    for when that is undone.
+    for when that very one is undone. Undoing another one makes nothing metres.
 
     Raises
     ------
@@ -139,10 +140,12 @@ def transform_export(source: Path, target: Path, similarity: Similarity) -> tupl
                 values[name] = after.tolist()
                 changed.append("directions")
     metres = _METRES.fullmatch(str(values.get("unit")))
-    if isinstance(values.get(_BEFORE), dict) and similarity.provenance.startswith(UNDOES):
-        values |= values.pop(_BEFORE)
+    before_apply = values.get(_BEFORE)
+    if isinstance(before_apply, dict) and similarity.provenance == f"{UNDOES}{before_apply.get(_BY, '')}":
+        del values[_BEFORE]
+        values |= {name: value for name, value in before_apply.items() if name != _BY}
         changed.append("unit")
-    elif values.get("unit") == NOT_METRES:
+    elif values.get("unit") == NOT_METRES and not similarity.provenance.startswith(UNDOES):
         values |= _in_metres(values, similarity)
         changed.append("unit")
     elif metres is not None and similarity.scale != 1:
@@ -173,7 +176,10 @@ def _in_metres(values: Mapping[str, Any], similarity: Similarity) -> dict[str, A
             "relative_ci95": [1 / factor, factor] if sigma > 0 else None,
         },
         "notes": said,
-        _BEFORE: {name: values[name] for name in ("unit", "up_in_world", "scale", "notes") if name in values},
+        _BEFORE: {
+            _BY: similarity.provenance,
+            **{name: values[name] for name in ("unit", "up_in_world", "scale", "notes") if name in values},
+        },
     }
 
 
