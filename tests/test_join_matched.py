@@ -109,6 +109,16 @@ def test_matches_that_contradict_the_imu_are_left_out(returned, parts, found):
     assert joined.groups[0].matched == frozenset()
 
 
+def test_where_the_imu_contradicts_itself_matches_are_not_blamed(returned, parts, found):
+    imu = returned[0].imu
+    forces = imu.accel_m_s2.copy()
+    forces[np.abs(imu.accel_t_s - imu.accel_t_s.mean()) < 0.5] += [3.0, 0.0, 0.0]
+    false = replace(imu, accel_m_s2=forces)
+    alone, both = (join_parts(parts, false, LIMITS, one).gaps[0] for one in ((), found))
+    assert not alone.joined and not both.joined
+    assert both.reason == alone.reason and "left out" not in both.reason
+
+
 def test_a_gap_that_the_imu_leaves_too_wide_is_closed_by_matches(returned, parts, found):
     tracks, _, _ = returned
     alone, both = (join_parts(parts, tracks.imu, LIMITS, one).gaps[0] for one in ((), found))

@@ -108,16 +108,16 @@ def join_parts(parts: Sequence[Part], imu: ImuRecording, limits: JoinOptions, fo
             gaps[pair] = replace(gap, reason=_why_unlinked(parts, imu, _of(links, pair)))
             continue
         trial = trials[pair] = _with_matches(parts, imu, pair, usable, shared, matched)
-        gap = replace(gap, matched_images=sum(len(one.in_first) for one in trial.matched))
+        gap = replace(gap, matched_images=_count(trial.matched, pair))
         gap = _with_sigmas(replace(gap, chi2=trial.chi2, dof=trial.dof), trial, pair)
         if trial.contradiction:
+            # with matches and without: these have no part in it
             against.add(pair)
-        reason = trial.contradiction or _unsure(gap, limits)
-        if _of(matched, pair) and not trial.matched:
-            reason = f"{reason or _said(gap)} (matches between the two contradict it, and are left out)"
-            gaps[pair] = replace(gap, joined=not (trial.contradiction or _unsure(gap, limits)), reason=reason)
-        else:
-            gaps[pair] = replace(gap, joined=not reason, reason=reason or _said(gap))
+            gaps[pair] = replace(gap, reason=trial.contradiction)
+            continue
+        unsure = _unsure(gap, limits)
+        left_out = bool(_of(matched, pair)) and not trial.matched
+        gaps[pair] = replace(gap, joined=not unsure, reason=_with_left_out(unsure or _said(gap), left_out))
     for pair in sorted((pair for pair, gap in gaps.items() if gap.joined), key=lambda pair: gaps[pair].sigma_m or 0.0):
         one, other = (groups[k] for k in pair)
         if one == other:
@@ -362,6 +362,15 @@ def _said(gap: Gap) -> str:
     by = [f"{gap.shared_images} images that both have"] if gap.shared_images else []
     by += [f"{gap.matched_images} images of one that match the other"] if gap.matched_images else []
     return f"joined by {', '.join(by)}, and the IMU" if by else "joined by the IMU"
+
+
+def _with_left_out(reason: str, left_out: bool) -> str:
+    return f"{reason} (matches between the two contradict it, and are left out)" if left_out else reason
+
+
+def _count(matched: Sequence[MatchedImages], pair: tuple[int, int]) -> int:
+    """How many images of a pair matches placed."""
+    return sum(len(one.in_first) for one in _of(matched, pair))
 
 
 def _unsure(gap: Gap, limits: JoinOptions) -> str:
