@@ -1825,10 +1825,17 @@ MUTANTS = (
     ),
     Mutant(
         "join/judge.py",
-        "        if not trial.contradiction:\n            return replace(trial, matched=inside)",
-        "        if True:\n            return replace(trial, matched=inside)",
+        "    if not trial.contradiction:\n        return replace(trial, matched=inside)",
+        "    if True:\n        return replace(trial, matched=inside)",
         "matches that contradict the IMU keep parts from each other",
         ("join_matched::test_matches_that_contradict_the_imu_are_left_out",),
+    ),
+    Mutant(
+        "join/judge.py",
+        "if len(pairs) > 1 and not best.contradiction:",
+        "if False:",
+        "one false pair takes all matches from a group",
+        ("join_matched::test_of_a_group_s_matches_those_of_one_pair_are_left_out",),
     ),
     Mutant(
         "stages/across.py",

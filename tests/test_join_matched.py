@@ -4,10 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refine_walk import walk
 from test_join import UNKNOWN, across, cut
+from test_join_doubt import T_S, part_of
 
+from colmap_inertial.geometry import matrix_from_quat
+from colmap_inertial.join import judge
 from colmap_inertial.join.judge import join_parts
 from colmap_inertial.join.links import find_links, find_matched
+from colmap_inertial.join.values import Found, MatchedImages
 from colmap_inertial.model import Model
 from colmap_inertial.options import JoinOptions
 from colmap_inertial.simulate.motion import MotionOptions
@@ -117,6 +122,65 @@ def test_where_the_imu_contradicts_itself_matches_are_not_blamed(returned, parts
     alone, both = (join_parts(parts, false, LIMITS, one).gaps[0] for one in ((), found))
     assert not alone.joined and not both.joined
     assert both.reason == alone.reason and "left out" not in both.reason
+
+
+@pytest.fixture(scope="module")
+def three():
+    """Three parts of a walk, a second between each two; who recorded the IMU, and who is found where."""
+    tracks = simulate_tracks(walk(30.0, points_per_m=2.0, vibration_m_s2=0.2), seed=3)
+    parts = [part_of(tracks, T_S[np.abs(T_S - 4.5 - 10 * k) < 4.5], k) for k in range(3)]
+
+    def found(first, second, shift_m=0.0):
+        """Every fourth image of one part in another one, as it lies there."""
+        there, own = parts[first], parts[second].trajectory
+        state = tracks.motion.at(there.trajectory.t_s)
+        turn = there.world_from_cam[0] @ matrix_from_quat(state.world_from_cam_xyzw)[0].T
+        shift = (there.trajectory.cam_in_world - state.cam_in_world_m @ turn.T).mean(axis=0)
+        shift[0] += shift_m
+        state = tracks.motion.at(own.t_s[::4])
+        return Found(
+            first=first,
+            second=second,
+            names=own.names[::4],
+            beside=there.trajectory.names[: len(own.names[::4])],
+            world_from_cam=turn @ matrix_from_quat(state.world_from_cam_xyzw),
+            cam_in_world=state.cam_in_world_m @ turn.T + shift,
+            matches=np.zeros((0, 2), dtype=np.int64),
+        )
+
+    return parts, tracks.imu, found
+
+
+def said_of(joined):
+    """By pairs whose gaps were judged: whether matches count, and whether they are said to be left out."""
+    return {(gap.first, gap.second): (gap.matched_images > 0, "left out" in gap.reason) for gap in joined.gaps}
+
+
+def test_of_a_group_s_matches_those_of_one_pair_are_left_out(three):
+    parts, imu, found = three
+    true = [found(0, 1), found(2, 1)]
+    # no link is between the first and the last part: nobody tried them by themselves
+    for false, matched in ((0.0, {(0, 1), (0, 2), (1, 2)}), (1.0, {(0, 1), (1, 2)})):
+        joined = join_parts(parts, imu, LIMITS, [found(0, 2, false), *true])
+        (group,) = joined.groups
+        assert group.parts == (0, 1, 2) and group.matched == matched
+        assert said_of(joined) == {(0, 1): (True, False), (1, 2): (True, False)}
+
+
+def test_what_is_said_of_matches_is_what_became_of_them_in_the_group(three, monkeypatch):
+    parts, imu, found = three
+
+    def tried(parts, imu, members, links, shared):
+        trial = judge_tried(parts, imu, members, links, shared)
+        of_pair = any(isinstance(one, MatchedImages) and (one.first, one.second) == (1, 2) for one in shared)
+        return replace(trial, contradiction="it is so") if of_pair and len(members) == 3 else trial
+
+    judge_tried = judge._tried
+    every = [found(0, 1), found(2, 1)]
+    monkeypatch.setattr(judge, "_tried", tried)
+    joined = join_parts(parts, imu, LIMITS, every)
+    assert joined.groups[0].matched == {(0, 1)}
+    assert said_of(joined) == {(0, 1): (True, False), (1, 2): (False, True)}
 
 
 def test_a_gap_that_the_imu_leaves_too_wide_is_closed_by_matches(returned, parts, found):

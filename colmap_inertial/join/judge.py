@@ -18,7 +18,7 @@ from colmap_inertial.join.values import Found, Link, MatchedImages, Part, Shared
 from colmap_inertial.options import JoinOptions
 from colmap_inertial.types import Array, Gap, ImuRecording
 
-Tie = TypeVar("Tie", Link, SharedImages)
+Tie = TypeVar("Tie", Link, MatchedImages, SharedImages)
 
 #: Gaps longer than this are not looked at: the IMU alone says nothing of where one is after them.
 _LONGEST_S = 60.0
@@ -98,7 +98,7 @@ def join_parts(parts: Sequence[Part], imu: ImuRecording, limits: JoinOptions, fo
     gaps: dict[tuple[int, int], Gap] = {}
     groups: dict[int, tuple[int, ...]] = {k: (k,) for k in range(len(parts))}
     trials: dict[tuple[int, ...], Trial] = {}
-    against = set(apart)
+    against, left_out = set(apart), set[tuple[int, int]]()
     for pair in pairs:
         gap = _gap(parts, pair, [one for one in links if pair_of(one) == pair], _of(shared, pair))
         if pair in apart:
@@ -115,9 +115,9 @@ def join_parts(parts: Sequence[Part], imu: ImuRecording, limits: JoinOptions, fo
             against.add(pair)
             gaps[pair] = replace(gap, reason=trial.contradiction)
             continue
+        left_out |= trial.left_out
         unsure = _unsure(gap, limits)
-        left_out = bool(_of(matched, pair)) and not trial.matched
-        gaps[pair] = replace(gap, joined=not unsure, reason=_with_left_out(unsure or _said(gap), left_out))
+        gaps[pair] = replace(gap, joined=not unsure, reason=_with_left_out(unsure or _said(gap), trial, pair))
     for pair in sorted((pair for pair, gap in gaps.items() if gap.joined), key=lambda pair: gaps[pair].sigma_m or 0.0):
         one, other = (groups[k] for k in pair)
         if one == other:
@@ -126,7 +126,9 @@ def join_parts(parts: Sequence[Part], imu: ImuRecording, limits: JoinOptions, fo
         reason = _quarrel(parts, members, against)
         if not reason:
             if members not in trials:
-                trials[members] = _with_matches(parts, imu, members, usable, shared, matched)
+                # what contradicts fewer parts contradicts more of them
+                kept = [one for one in matched if pair_of(one) not in left_out]
+                trials[members] = _with_matches(parts, imu, members, usable, shared, kept)
             reason = trials[members].contradiction
             if not reason:
                 inside = (
@@ -138,6 +140,8 @@ def join_parts(parts: Sequence[Part], imu: ImuRecording, limits: JoinOptions, fo
             gaps[pair] = replace(gaps[pair], joined=False, reason=reason)
         else:
             groups |= dict.fromkeys(members, members)
+            left_out |= trials[members].left_out
+            trials[members] = replace(trials[members], left_out=frozenset(left_out & _in(members)))
     together = []
     for members in dict.fromkeys(group for group in groups.values() if len(group) > 1):
         trial = trials[members]
@@ -147,9 +151,9 @@ def join_parts(parts: Sequence[Part], imu: ImuRecording, limits: JoinOptions, fo
         used = frozenset((parts[a].number, parts[b].number) for a, b in map(pair_of, trial.matched))
         together.append(Together(parts=members, placed=trial.placed, shared=images, matched=used))
         for pair in _in(members) & gaps.keys():
-            gap = gaps[pair]
-            others = "in one model by way of others" if not gap.joined else gap.reason
-            gaps[pair] = replace(_with_sigmas(gap, trial, pair), joined=True, reason=others)
+            gap = replace(gaps[pair], matched_images=_count(trial.matched, pair))
+            reason = _with_left_out(_said(gap), trial, pair) if gap.joined else "in one model by way of others"
+            gaps[pair] = replace(_with_sigmas(gap, trial, pair), joined=True, reason=reason)
     return Joined(groups=tuple(together), gaps=tuple(gaps.values()))
 
 
@@ -242,6 +246,8 @@ class Trial:
         Why the parts cannot be one model; empty where they can.
     matched
         What of the matches was used, by places of all parts.
+    left_out
+        Pairs of places whose matches contradict the rest.
     """
 
     placed: Placed | None
@@ -250,6 +256,7 @@ class Trial:
     sigmas: Mapping[tuple[int, int], tuple[float, float]]
     contradiction: str
     matched: tuple[MatchedImages, ...] = ()
+    left_out: frozenset[tuple[int, int]] = frozenset()
 
 
 def _with_matches(
@@ -260,13 +267,24 @@ def _with_matches(
     shared: Sequence[SharedImages],
     matched: Sequence[MatchedImages],
 ) -> Trial:
-    """Place some parts by all that ties them and by matches; without these where that contradicts itself."""
+    """Place some parts by all that ties them and by matches; without those of pairs that contradict the rest."""
     inside = tuple(one for one in matched if pair_of(one) in _in(members))
-    if inside:
-        trial = _tried(parts, imu, members, links, [*shared, *inside])
-        if not trial.contradiction:
-            return replace(trial, matched=inside)
-    return _tried(parts, imu, members, links, shared)
+    if not inside:
+        return _tried(parts, imu, members, links, shared)
+    trial = _tried(parts, imu, members, links, [*shared, *inside])
+    if not trial.contradiction:
+        return replace(trial, matched=inside)
+    best = _tried(parts, imu, members, links, shared)
+    tied = {pair_of(one) for one in links} | {pair_of(one) for one in shared}
+    pairs = {pair_of(one) for one in inside}
+    if len(pairs) > 1 and not best.contradiction:
+        # pairs that were tried by themselves agree with what ties them: they come first, then what shows most
+        for pair in sorted(pairs, key=lambda pair: (pair not in tied, -_count(inside, pair), pair)):
+            more = (*best.matched, *_of(inside, pair))
+            trial = _tried(parts, imu, members, links, [*shared, *more])
+            if not trial.contradiction:
+                best = replace(trial, matched=more)
+    return replace(best, left_out=frozenset(pairs - {pair_of(one) for one in best.matched}))
 
 
 def _tried(
@@ -364,8 +382,8 @@ def _said(gap: Gap) -> str:
     return f"joined by {', '.join(by)}, and the IMU" if by else "joined by the IMU"
 
 
-def _with_left_out(reason: str, left_out: bool) -> str:
-    return f"{reason} (matches between the two contradict it, and are left out)" if left_out else reason
+def _with_left_out(reason: str, trial: Trial, pair: tuple[int, int]) -> str:
+    return f"{reason} (matches between the two contradict it, and are left out)" if pair in trial.left_out else reason
 
 
 def _count(matched: Sequence[MatchedImages], pair: tuple[int, int]) -> int:
