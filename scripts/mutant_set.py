@@ -1831,6 +1831,13 @@ MUTANTS = (
         ("join_matched::test_matches_that_contradict_the_imu_are_left_out",),
     ),
     Mutant(
+        "stages/join.py",
+        "        if self._lacks_database():\n",
+        "        if False:\n",
+        "models are joined without their matches and nobody says so",
+        ("join_matched::test_a_database_that_is_gone_is_said",),
+    ),
+    Mutant(
         "join/judge.py",
         "if len(pairs) > 1 and not best.contradiction:",
         "if False:",

@@ -8,6 +8,7 @@ from refine_walk import walk
 from test_join import UNKNOWN, across, cut
 from test_join_doubt import T_S, part_of
 
+from colmap_inertial.errors import FormatError
 from colmap_inertial.geometry import matrix_from_quat
 from colmap_inertial.join import judge
 from colmap_inertial.join.judge import join_parts
@@ -217,3 +218,22 @@ def test_without_matches_nothing_is_found(returned, tmp_path):
     assert images_in_others(empty, reconstructions, [0, 1]) == []
     # models of one database that share images need no matches between these
     assert images_in_others(returned[2], [reconstructions[0], reconstructions[0]], [0, 1]) == []
+
+
+def test_a_database_that_is_gone_is_said(returned, stage, tmp_path, caplog):
+    _, models, _ = returned
+    (whole,), (gap,) = replace(stage, database=tmp_path / "none.db").join_models(models)
+    _, (asked,) = replace(stage, database=None).join_models(models)
+    assert whole.parts and gap.reason == f"{asked.reason} (without matches between the two: COLMAP's database is gone)"
+    assert "none.db is gone" in caplog.text
+    assert not (tmp_path / "none.db").exists()
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.5])
+def test_a_database_that_cannot_be_read_is_said_in_a_sentence(returned, stage, tmp_path, kept):
+    _, models, database = returned
+    data = database.read_bytes()
+    broken = tmp_path / "database.db"
+    broken.write_bytes(data[: int(kept * len(data))] or b"no database" * 99)
+    with pytest.raises(FormatError, match="put it back as it was"):
+        replace(stage, database=broken).join_models(models)

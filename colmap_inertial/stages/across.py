@@ -8,7 +8,8 @@ places any image.
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from itertools import permutations
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_inertial.errors import FormatError
 from colmap_inertial.join.values import Found
 
 if TYPE_CHECKING:
@@ -27,6 +29,8 @@ Ids = NDArray[np.int64]
 _LEAST_MATCHES, _LEAST_PLACED = 15, 30
 #: Of these, so many must agree with one pose, to so many pixels, as COLMAP asks where it places images.
 _LEAST_SHARE, _OFF_PX = 0.25, 12.0
+#: What COLMAP's complaints about a database have in them: where it cannot be opened, and where it ends too early.
+_OF_DATABASE = ("database factory", "SQLite")
 #: Two points become one where every image sees it so close, as COLMAP filters points.
 _ONE_PX = 4.0
 
@@ -40,10 +44,15 @@ def images_in_others(database: Path, models: Sequence[pycolmap.Reconstruction], 
         COLMAP's.
     models, numbers
         The models, each as it lies, and COLMAP's numbers of them.
+
+    Raises
+    ------
+    FormatError
+        Where the database is none, or damaged.
     """
     import pycolmap
 
-    with pycolmap.Database.open(str(database)) as opened:
+    with _opened(database) as opened:
         named = {image.image_id: image.name for image in opened.read_all_images()}
         ids: dict[tuple[str, str], tuple[int, int]] = {}
         for pair, count in zip(*opened.read_two_view_geometry_num_inliers(), strict=True):
@@ -73,6 +82,22 @@ def images_in_others(database: Path, models: Sequence[pycolmap.Reconstruction], 
                     )
                 )
     return found
+
+
+@contextmanager
+def _opened(database: Path) -> Iterator[pycolmap.Database]:
+    """A database of COLMAP, of which what COLMAP cannot read is said in a sentence."""
+    import pycolmap
+
+    try:
+        with pycolmap.Database.open(str(database)) as opened:
+            yield opened
+    except RuntimeError as error:
+        if not any(of_database in str(error) for of_database in _OF_DATABASE):
+            raise
+        raise FormatError(
+            database, "COLMAP cannot read its database; put it back as it was, or begin anew in another folder"
+        ) from error
 
 
 class _Held:

@@ -48,6 +48,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+_NO_MATCHES = "without matches between the two: COLMAP's database is gone"
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class JoinStage:
@@ -91,6 +93,11 @@ class JoinStage:
         ----------
         models
             The largest one first, each through the stages before.
+
+        Raises
+        ------
+        FormatError
+            Where the database cannot be read.
         """
         if len(models) < 2:
             return tuple(models), ()
@@ -108,9 +115,14 @@ class JoinStage:
         found = self._found(of_part)
         with one_blas_thread():
             joined = join_parts(parts, self.imu, self.limits, found)
+        between = joined.gaps
+        if self._lacks_database():
+            # the same stage with its matches would have joined otherwise: the result has to say so
+            log.warning("%s is gone: matches between models do not count", self.database)
+            between = tuple(replace(gap, reason=f"{gap.reason} ({_NO_MATCHES})") for gap in between)
         spans = _spans(models)
         ends_s = {number: end_s for _, end_s, number in spans}
-        gaps = sorted([*joined.gaps, *_beside(spans, why_not)], key=lambda gap: ends_s[gap.first])
+        gaps = sorted([*between, *_beside(spans, why_not)], key=lambda gap: ends_s[gap.first])
         for gap in gaps:
             log.info("models %d and %d, %.2f s: %s", gap.first, gap.second, gap.seconds, gap.reason)
         made: dict[int, Model] = {}
@@ -142,9 +154,12 @@ class JoinStage:
         path = FittedPath.of(trajectory, self.imu, of_model(self.calibration, model), self.options)
         return Part(number=model.colmap_index, trajectory=trajectory, path=path, cameras=_cameras(reconstruction))
 
+    def _lacks_database(self) -> bool:
+        return self.database is not None and not self.database.is_file()
+
     def _found(self, models: Sequence[Model]) -> list[Found]:
         """Images of one model that matches place in another."""
-        if self.database is None or not self.database.is_file():
+        if self.database is None or self._lacks_database():
             return []
         numbers = [model.colmap_index for model in models]
         return images_in_others(self.database, [model.reconstruction for model in models], numbers)
