@@ -10,9 +10,10 @@ from far_scene import FarScene
 
 from colmap_inertial.geometry import matrix_from_quat
 from colmap_inertial.gyro import GyroPath
+from colmap_inertial.imaging import evidence
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath, middles
-from colmap_inertial.imaging.evidence import BlurEvidence, _weights, blur_evidence, shown_share
+from colmap_inertial.imaging.evidence import BlurEvidence, _weights, blur_evidence, shown_share, shown_shares
 from colmap_inertial.imaging.gate import (
     LEAST_SHARE,
     GateOptions,
@@ -193,6 +194,19 @@ def test_the_image_tells_extent_and_direction(blur_px):
     assert blur_evidence(image, turned).support < 4
     flipped = replace(field, vector_px=field.vector_px * np.float32([1, -1]))
     assert blur_evidence(image, flipped).mirrored_support == pytest.approx(blur_evidence(image, field).support, rel=0.2)
+
+
+def test_tiles_are_weighed_once_for_the_blur_and_its_mirror_image(monkeypatch):
+    weighed = []
+    monkeypatch.setattr(evidence, "_weights", lambda spectra: weighed.append(1) or _weights(spectra))
+    shutter, image = shot(0.98, 12)
+    field = predicted(shutter, "none")
+    shown, mirrored = shown_shares(image, field)
+    assert len(weighed) == 1
+    monkeypatch.undo()
+    flipped = replace(field, vector_px=field.vector_px * np.float32([1, -1]))
+    assert shown == shown_share(image, field)
+    assert mirrored == pytest.approx(shown_share(image, flipped), rel=1e-6)
 
 
 @pytest.mark.parametrize("blur_px", [6, 12, 25])

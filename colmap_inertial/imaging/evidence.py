@@ -210,11 +210,11 @@ def shown_shares(
     if found is None:
         return None, None
     logarithm, vectors, paths = found
-    return _share(*found), _share(logarithm, vectors * [1, -1], paths * [1, -1])
-
-
-def _share(logarithm: NDArray[np.float32], vectors: Array, path_px: Array) -> float | None:
     weight = _weights(logarithm)
+    return _share(*found, weight), _share(logarithm, vectors * [1, -1], paths * [1, -1], weight)
+
+
+def _share(logarithm: NDArray[np.float32], vectors: Array, path_px: Array, weight: Array) -> float | None:
     falls = _falls(logarithm, vectors, path_px)
     seen, expected, seen_mean, expected_mean = (weight * fall for fall in falls)
     information = float((expected - _OWN_DIRECTION * expected_mean).sum())

@@ -295,7 +295,7 @@ def _by_model(
         view: GyroView | None = None
         try:
             for i in range(rounds):
-                matched = work / str(i - 1) if i else None
+                matched = work / "0" if i else None
                 models = _small_models(capture, images, names, work / str(i), view, context.reporting(step), matched)
                 trajectory, _ = trajectory_from_model(models[0], timing, covariances=False)
                 view = _aligned(trajectory, recording, _camera_of(models[0]), "model")
@@ -338,7 +338,8 @@ def _small_models(
 ) -> tuple[pycolmap.Reconstruction, ...]:
     """COLMAP's models of some frames, the largest first; with a view, of rectified keypoints.
 
-    ``matched``: where models of the same frames were made before, of keypoints as they are.
+    ``matched``: where models of the same frames were made before, of keypoints as they are: what has been moved already
+    would be moved twice.
     """
     work.mkdir()
     features, database, sparse = work / "features.db", work / "database.db", work / "sparse"
