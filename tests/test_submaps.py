@@ -10,7 +10,7 @@ import pytest
 from test_closing import FRAMES, NAMES, make
 
 from colmap_inertial.colmap import mapping, submaps
-from colmap_inertial.colmap.closing import EndsMet, points_of_features
+from colmap_inertial.colmap.closing import EndsMet, close_gaps, points_of_features
 from colmap_inertial.colmap.submaps import PART, SHARED, Part, Placed, Tie, join_parts, place_parts, runs
 from colmap_inertial.geometry import so3_exp
 from colmap_inertial.options import MappingOptions
@@ -283,3 +283,18 @@ def test_parts_may_have_cameras_that_others_lack(tmp_path):
     assert whole.num_reg_images() == FRAMES and error_m(ring, whole) < 0.008
     assert {whole.image(k).camera_id for k in range(1, FRAMES // 2 + 1)} == {1}
     assert {whole.image(k).camera_id for k in range(FRAMES // 2 + 1, FRAMES + 1)} == {2}
+
+
+@pytest.mark.parametrize(
+    ("turn_rad", "scale", "translation"),
+    [((3.1, 0, 0), 0.3, (0, 40, 0)), ((0, 1.2, 0), 1.0, (3, 1, 2))],
+    ids=["images go", "COLMAP's own check fails"],
+)
+def test_a_misplaced_part_does_not_fit_whatever_comes_of_the_adjustment(ring, turn_rad, scale, translation):
+    ring, parts = ring
+    placed = place_parts(range(4), submaps.find_ties(ring.database, parts, NAMES, nearest=None))
+    bad = Placed(scale=scale, rotation=so3_exp(np.array(turn_rad)), translation=np.array(translation, dtype=float))
+    placed[3] = bad.after(placed[3])
+    whole = submaps._whole(ring.database, parts, placed, ring.options, NAMES)
+    met = close_gaps(ring.database, whole, ring.options, NAMES, nearest=None, least_kept=0.99)
+    assert not met.joined and met.pairs == 12 and set(met.images) <= set(NAMES)

@@ -122,7 +122,30 @@ def close_gaps(
             return None
         cache = pycolmap.DatabaseCache.create(opened, cached)
     images = reconstruction.num_reg_images()
+    place = {name: at for at, name in enumerate(names)}
+    most = max(torn, key=lambda pair: len(pair.points))
+    first, second = sorted((reconstruction.image(k).name for k in (most.first, most.second)), key=place.__getitem__)
     _make_one(reconstruction, torn)
+    try:
+        _adjust(reconstruction, cache, pipeline)
+        stays = _agree(reconstruction, torn)
+    except (ValueError, RuntimeError) as error:  # COLMAP's own checks fail where hardly anything fits
+        log.info("COLMAP cannot adjust a model whose ends were made one: %s", error)
+        stays = 0.0
+    joined = stays >= _STAYS and reconstruction.num_reg_images() >= least_kept * images
+    said = "joined" if joined else "left as they are: they do not fit"
+    log.info("a model's ends, seen in %d pairs of images, %s (%.0f %% agree)", len(torn), said, 100 * stays)
+    return EndsMet(pairs=len(torn), images=(first, second), agree=stays, joined=joined)
+
+
+def _adjust(
+    reconstruction: pycolmap.Reconstruction,
+    cache: pycolmap.DatabaseCache,
+    pipeline: pycolmap.IncrementalPipelineOptions,
+) -> None:
+    """Move what was made one together, and finish the model as COLMAP does."""
+    import pycolmap
+
     options = _adjustment(pipeline, reconstruction)
     options.ceres.solver_options.max_num_iterations = _ROUNDS
     pycolmap.bundle_adjustment(reconstruction, options)
@@ -130,19 +153,23 @@ def close_gaps(
     mapper.begin_reconstruction(reconstruction)
     _refine(mapper, reconstruction, pipeline)
     mapper.end_reconstruction(False)
+
+
+def _agree(reconstruction: pycolmap.Reconstruction, torn: Sequence[_Torn]) -> float:
+    """Share of the matches that are one point; of an image that the model no longer has, none is."""
     point = {
-        number: points_of_features(reconstruction, number) for pair in torn for number in (pair.first, pair.second)
+        number: points_of_features(reconstruction, number)
+        for pair in torn
+        for number in (pair.first, pair.second)
+        if reconstruction.exists_image(number)
     }
-    of_first = np.concatenate([point[pair.first][pair.features[:, 0]] for pair in torn])
-    of_second = np.concatenate([point[pair.second][pair.features[:, 1]] for pair in torn])
-    stays = float(np.mean((of_first == of_second) & (of_first >= 0)))
-    joined = stays >= _STAYS and reconstruction.num_reg_images() >= least_kept * images
-    said = "joined" if joined else "left as they are: they do not fit"
-    log.info("a model's ends, seen in %d pairs of images, %s (%.0f %% agree)", len(torn), said, 100 * stays)
-    place = {name: at for at, name in enumerate(names)}
-    most = max(torn, key=lambda pair: len(pair.points))
-    first, second = sorted((reconstruction.image(k).name for k in (most.first, most.second)), key=place.__getitem__)
-    return EndsMet(pairs=len(torn), images=(first, second), agree=stays, joined=joined)
+    one = [
+        (of_first[pair.features[:, 0]] == of_second[pair.features[:, 1]]) & (of_first[pair.features[:, 0]] >= 0)
+        if (of_first := point.get(pair.first)) is not None and (of_second := point.get(pair.second)) is not None
+        else np.zeros(len(pair.features), dtype=np.bool_)
+        for pair in torn
+    ]
+    return float(np.mean(np.concatenate(one)))
 
 
 def _adjustment(
