@@ -3,7 +3,7 @@
 import json
 import os
 import shutil
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,7 @@ from test_pipeline_parts import session_in
 
 from colmap_inertial.cli.terminal import show_result
 from colmap_inertial.colmap import dense as dense_room
+from colmap_inertial.colmap.closing import EndsMet
 from colmap_inertial.colmap.depth_maps import MadeFrom
 from colmap_inertial.colmap.mapping import MapRecord, ModelEnds
 from colmap_inertial.drivers import deblur
@@ -32,7 +33,7 @@ from colmap_inertial.model.project import apply_to_project, undo_project
 from colmap_inertial.model.similarities import ModelScale, plain_factor
 from colmap_inertial.options import ProjectOptions
 from colmap_inertial.precalibrate.plan import ImagingPlan
-from colmap_inertial.report.words import mapped_in_words
+from colmap_inertial.report.words import mapped_in_words, parts_mapped_in_words
 from colmap_inertial.run.workspace import Workspace, places_of
 from colmap_inertial.stages.frame_folder import FrameRecord
 from colmap_inertial.types import ScaleEstimate
@@ -460,5 +461,15 @@ def test_the_screen_and_the_report_say_how_a_model_was_made(workspace, capsys):
         shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
         assert ("Mapping" in shown) == bool(expected) and expected in shown
     in_parts = MapRecord(mapper="incremental", models=1, parts=6)
-    assert mapped_in_words(asdict(in_parts), 0) == ["COLMAP mapped the recording in 6 parts."]
+    assert parts_mapped_in_words(asdict(in_parts)) == ["COLMAP mapped the recording in 6 parts."]
+    assert parts_mapped_in_words(asdict(record)) == parts_mapped_in_words(None) == []
+    fits = EndsMet(pairs=40, images=("a.jpg", "b.jpg"), agree=0.99, joined=True)
+    bad = EndsMet(pairs=7, images=("c.jpg", "d.jpg"), agree=0.2, joined=False)
+    torn = MapRecord(mapper="incremental", models=2, parts=6, seams=(fits, bad))
+    models = (model, replace(model, index=1, colmap_index=0))
+    show_result(ReconstructResult(workspace=workspace, models=models, seconds={}, mapping=torn), Path("here"))
+    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    # of all models together, and once
+    assert shown.count("in 6 parts.") == 1 and shown.count("(20 % of the matches agree).") == 1
+    assert "c.jpg and d.jpg, 7 pairs" in shown and "a.jpg" not in shown
     assert mapped_in_words(None, 0) == []

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from test_closing import FRAMES, NAMES, make
 
 from colmap_inertial.colmap import mapping, submaps
-from colmap_inertial.colmap.closing import EndsMet, close_gaps, points_of_features
-from colmap_inertial.colmap.submaps import PART, SHARED, Part, Placed, Tie, join_parts, place_parts, runs
+from colmap_inertial.colmap.closing import EndsMet, SeamsMet, close_seams, points_of_features
+from colmap_inertial.colmap.submaps import PART, SHARED, MappedRun, Placed, Tie, join_runs, place_parts, runs
 from colmap_inertial.geometry import so3_exp
 from colmap_inertial.options import MappingOptions
 from colmap_inertial.run.context import RunContext
@@ -100,7 +101,7 @@ def ring(tmp_path_factory):
         pycolmap.set_random_seed(0)
         (model,) = pycolmap.incremental_mapping(str(made.database), str(out), str(out), options=made.options).values()
         assert model.num_reg_images() == end - begin
-        parts.append(Part(model=model, begin=begin, end=end))
+        parts.append(MappedRun(model=model, begin=begin, end=end))
     made.options.image_names = []
     return made, parts
 
@@ -111,7 +112,8 @@ def error_m(ring, model) -> float:
 
 def test_parts_become_one_model_that_is_as_good_as_one_made_in_one_go(ring):
     ring, parts = ring
-    (whole,) = join_parts(ring.database, parts, ring.options, NAMES, near=4, loops=True)
+    (whole,), seams = join_runs(ring.database, parts, ring.options, NAMES, near=4, loops=True)
+    assert len(seams) == 4 and all(seam.joined and seam.agree > 0.9 for seam in seams)
     assert sorted(whole.image(i).name for i in whole.reg_image_ids()) == NAMES
     assert [whole.image(i).name for i in whole.reg_image_ids()] == [NAMES[i - 1] for i in whole.reg_image_ids()]
     assert error_m(ring, whole) < 0.008
@@ -152,45 +154,97 @@ def test_points_that_contradict_most_others_do_not_place_parts(ring):
 def test_an_image_that_two_parts_share_is_of_the_one_that_knows_more_on_both_sides(ring):
     ring, parts = ring
     placed = [replace(Placed.nowhere(), translation=np.array([1000.0 * k, 0, 0])) for k in range(2)]
-    whole = submaps._whole(ring.database, parts[:2], placed, ring.options, NAMES)
+    whole, part_of = submaps._whole(ring.database, parts[:2], placed, ring.options, NAMES)
     centres = {whole.image(k).name: whole.image(k).projection_center() for k in whole.reg_image_ids()}
     far = {name for name, centre in centres.items() if centre[0] > 500}
     assert set(centres) == set(NAMES[:30])
     assert far == set(NAMES[15:30])
+    assert {NAMES[number - 1] for number, k in part_of.items() if k} == far
 
 
 def test_parts_that_have_nothing_in_common_stay_apart(ring):
     ring, parts = ring
     short = [parts[2], parts[0]]
-    found = join_parts(ring.database, short, ring.options, NAMES, near=4, loops=False)
-    assert [model.num_reg_images() for model in found] == [18, 18]
+    found, seams = join_runs(ring.database, short, ring.options, NAMES, near=4, loops=False)
+    assert [model.num_reg_images() for model in found] == [18, 18] and not seams
     assert all(model is part.model for model, part in zip(found, short, strict=True))
 
 
-def test_parts_that_do_not_fit_stay_as_they_are(ring, monkeypatch):
+def fits(agree: dict[tuple[int, int], float], nearest, farthest: int = 40) -> SeamsMet:
+    """What comes of an adjustment after which each seam agrees so well."""
+    asked = {seam: share for seam, share in agree.items() if seam in nearest}
+    seams = {s: EndsMet(pairs=9, images=(NAMES[0], NAMES[s[1]]), agree=a, joined=a >= 0.5) for s, a in asked.items()}
+    return SeamsMet(seams=seams, farthest=dict.fromkeys(seams, farthest), kept=1.0)
+
+
+def test_parts_of_which_no_seam_fits_stay_as_they_are(ring, monkeypatch):
     ring, parts = ring
-    monkeypatch.setattr(submaps, "close_gaps", lambda *_, **__: None)
-    found = join_parts(ring.database, parts, ring.options, NAMES, near=4, loops=True)
-    assert all(model is part.model for model, part in zip(found, parts, strict=True))
+    asked = []
+
+    def close(*_, nearest, **__):
+        asked.append(set(nearest))
+        return fits({(0, 1): 0.3, (1, 2): 0.2, (2, 3): 0.1, (0, 3): 0.0}, nearest, 2)
+
+    monkeypatch.setattr(submaps, "close_seams", close)
+    found, seams = join_runs(ring.database, parts, ring.options, NAMES, near=4, loops=True)
+    assert [model.num_reg_images() for model in found] == [18, 18, 18, 12]
+    assert all(any(model is part.model for part in parts) for model in found)
+    # the worst of all that are left each time
+    assert len(asked) == 4 and [seam.agree for seam in seams] == [0.0, 0.1, 0.2, 0.3]
 
 
-def test_parts_that_do_not_fit_with_loops_are_joined_without(ring, monkeypatch):
+def test_a_loop_that_does_not_fit_is_forgotten_and_all_else_is_joined(ring, monkeypatch):
     ring, parts = ring
     asked, placed = [], []
 
-    def close(database, whole, pipeline, names, *, nearest, least_kept):
-        asked.append(nearest)
-        return EndsMet(pairs=9, images=(NAMES[0], NAMES[1]), agree=1.0, joined=nearest is not None)
+    def close(*_, nearest, **__):
+        asked.append(dict(nearest))
+        return (
+            fits({(0, 1): 1.0, (1, 2): 0.4, (2, 3): 1.0, (0, 3): 0.3}, nearest)
+            if len(asked) == 1
+            else fits({(0, 1): 1.0, (1, 2): 0.9, (2, 3): 1.0, (0, 3): 0.0}, nearest)
+        )
 
     def place(members, ties):
         placed.append({(tie.first, tie.second) for tie in ties})
         return place_parts(members, ties)
 
-    monkeypatch.setattr(submaps, "close_gaps", close)
+    monkeypatch.setattr(submaps, "close_seams", close)
     monkeypatch.setattr(submaps, "place_parts", place)
-    (whole,) = join_parts(ring.database, parts, ring.options, NAMES, near=4, loops=True)
-    assert asked == [None, 4] and placed[0] - placed[1] == {(0, 3)}
+    (whole,), seams = join_runs(ring.database, parts, ring.options, NAMES, near=4, loops=True)
+    assert placed[0] - placed[1] == {(0, 3)} and len(asked) == 2 and (0, 3) not in asked[1]
     assert whole.num_reg_images() == FRAMES
+    assert [seam.joined for seam in seams] == [False, True, True, True]
+
+
+def test_of_neighbours_that_do_not_fit_first_pairs_far_apart_in_time_are_not_believed(ring, monkeypatch):
+    ring, parts = ring
+    asked = []
+
+    def close(*_, nearest, **__):
+        asked.append(nearest.get((0, 1), "left out"))
+        return fits({(0, 1): 0.2, (1, 2): 1.0, (2, 3): 1.0, (0, 3): 1.0}, nearest, 40 if len(asked) == 1 else 4)
+
+    monkeypatch.setattr(submaps, "close_seams", close)
+    (whole,), _ = join_runs(ring.database, parts, ring.options, NAMES, near=4, loops=True)
+    assert asked == [None, 4, "left out"] and whole.num_reg_images() == FRAMES
+
+
+@pytest.mark.parametrize(("turn_rad", "models", "not_joined"), [(1.2, [48], 1), (1.57, [12, 42], 2)])
+def test_a_part_that_lies_wrong_is_not_averaged_away(ring, monkeypatch, turn_rad, models, not_joined):
+    """However often it is placed, the last part is turned; where no adjustment mends that, it stays by itself."""
+    ring, parts = ring
+    bad = Placed(scale=1.0, rotation=so3_exp(np.array([0, turn_rad, 0])), translation=np.array([3.0, 1, 2]))
+
+    def place(members, ties):
+        placed = place_parts(members, ties)
+        return [*placed[:-1], bad.after(placed[-1])] if members[-1] == 3 else placed
+
+    monkeypatch.setattr(submaps, "place_parts", place)
+    found, seams = join_runs(ring.database, parts, ring.options, NAMES, near=4, loops=True)
+    assert sorted(model.num_reg_images() for model in found) == models
+    assert all(error_m(ring, model) < 0.008 for model in found if model.num_reg_images() == FRAMES)
+    assert sum(not seam.joined for seam in seams) == not_joined
 
 
 def test_the_largest_part_s_camera_is_that_of_all(ring, monkeypatch):
@@ -198,14 +252,19 @@ def test_the_largest_part_s_camera_is_that_of_all(ring, monkeypatch):
 
     ring, parts = ring
     asked = []
-    monkeypatch.setattr(submaps, "close_gaps", lambda database, whole, *_, **__: asked.append(whole))
+
+    def close(database, whole, *_, nearest, **__):
+        asked.append(whole)
+        return fits(dict.fromkeys(nearest, 1.0), nearest)
+
+    monkeypatch.setattr(submaps, "close_seams", close)
     bent = []
     for k, part in enumerate(parts):
         model = pycolmap.Reconstruction(part.model)
         model.camera(1).params = [300.0 + k, 300.0 + k, 240, 180]
         bent.append(replace(part, model=model))
     most = max(range(len(parts)), key=lambda k: parts[k].model.compute_num_observations())
-    join_parts(ring.database, bent, ring.options, NAMES, near=4, loops=False)
+    join_runs(ring.database, bent, ring.options, NAMES, near=4, loops=False)
     (whole,) = asked
     assert [list(camera.params) for camera in whole.cameras.values()] == [[300.0 + most, 300.0 + most, 240, 180]]
 
@@ -224,6 +283,8 @@ def test_what_is_too_long_for_one_go_is_mapped_in_parts(tmp_path, monkeypatch, l
 
     def made(*args, options, **more):
         asked.append(list(options.image_names))
+        # what a kill leaves goes with the folder
+        assert not in_parts or Path(args[2]).parent == tmp_path / "sparse"
         return incremental(*args, options=options, **more)
 
     monkeypatch.setattr(pycolmap, "incremental_mapping", made)
@@ -238,7 +299,9 @@ def test_what_is_too_long_for_one_go_is_mapped_in_parts(tmp_path, monkeypatch, l
         in_time=NAMES,
     )
     assert asked == ([NAMES[begin:end] for begin, end in PARTS] if in_parts else [[]])
-    assert record == mapping.MapRecord(mapper="incremental", models=1, parts=len(PARTS) if in_parts else 1)
+    assert len(record.seams) == (4 if in_parts else 0) and all(seam.joined for seam in record.seams)
+    made = mapping.MapRecord(mapper="incremental", models=1, parts=len(PARTS) if in_parts else 1, seams=record.seams)
+    assert record == made
     model = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
     assert model.num_reg_images() == FRAMES and error_m(ring, model) < 0.008
     done = [count for _, count, total in told if total == FRAMES]
@@ -277,7 +340,7 @@ def test_parts_may_have_cameras_that_others_lack(tmp_path):
             new.write_two_view_geometry(*both, geometry)
     assert rig_of == {2: 1, 1: 2}
     parts = [(0, 20), (14, 34), (28, 48)]
-    (whole,) = submaps.map_in_parts(
+    (whole,), _ = submaps.map_in_parts(
         path, tmp_path, tmp_path, ring.options, NAMES, parts, near=4, loops=True, registered=lambda: None
     )
     assert whole.num_reg_images() == FRAMES and error_m(ring, whole) < 0.008
@@ -295,6 +358,8 @@ def test_a_misplaced_part_does_not_fit_whatever_comes_of_the_adjustment(ring, tu
     placed = place_parts(range(4), submaps.find_ties(ring.database, parts, NAMES, nearest=None))
     bad = Placed(scale=scale, rotation=so3_exp(np.array(turn_rad)), translation=np.array(translation, dtype=float))
     placed[3] = bad.after(placed[3])
-    whole = submaps._whole(ring.database, parts, placed, ring.options, NAMES)
-    met = close_gaps(ring.database, whole, ring.options, NAMES, nearest=None, least_kept=0.99)
-    assert not met.joined and met.pairs == 12 and set(met.images) <= set(NAMES)
+    whole, part_of = submaps._whole(ring.database, parts, placed, ring.options, NAMES)
+    nearest = dict.fromkeys([(0, 1), (1, 2), (2, 3), (0, 3)])
+    met = close_seams(ring.database, whole, ring.options, NAMES, part_of=part_of, nearest=nearest)
+    assert met.seams.keys() == nearest.keys() and all(set(one.images) <= set(NAMES) for one in met.seams.values())
+    assert met.kept < 0.99 and not all(one.joined for one in met.seams.values())

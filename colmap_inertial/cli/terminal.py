@@ -317,7 +317,7 @@ def _on_map(found: Georeference | InertialError) -> str:
 
 def show_result(result: ReconstructResult, source: Path) -> None:
     """Print the end of a reconstruction of ``source`` on one screen; the last line is what to type next."""
-    from colmap_inertial.report.words import mapped_in_words
+    from colmap_inertial.report.words import mapped_in_words, parts_mapped_in_words
     from colmap_inertial.validate import Validation
 
     mapping = None if result.mapping is None else asdict(result.mapping)
@@ -334,7 +334,8 @@ def show_result(result: ReconstructResult, source: Path) -> None:
             ("Points", f"{summary['points']}, mean reprojection error {summary['mean_reprojection_error_px']:.2f} px"),
             *(imaging_lines(frames, result.imaging, result.keypoints.rectified()) if frames else []),
         ]
-        if said := mapped_in_words(mapping, model.colmap_index):
+        said = parts_mapped_in_words(mapping) if model is result.models[0] else []
+        if said := said + mapped_in_words(mapping, model.colmap_index):
             lines.append(("Mapping", " ".join(said)))
         if model.parts:
             lines.append(("Joined", _joined(model.parts, result.gaps)))

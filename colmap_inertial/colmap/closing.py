@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -66,7 +66,7 @@ class _Torn:
 
 @dataclass(frozen=True, kw_only=True)
 class EndsMet:
-    """Ends of a model that met, and whether they belong together.
+    """Ends of a model, or two parts of one, that met, and whether they belong together.
 
     Attributes
     ----------
@@ -86,6 +86,25 @@ class EndsMet:
     joined: bool
 
 
+@dataclass(frozen=True, kw_only=True)
+class SeamsMet:
+    """Seams of a model that were made one, each by the numbers of the two parts that it is between.
+
+    Attributes
+    ----------
+    seams
+        Each, and whether it fits.
+    farthest
+        Of each, how far its images are apart in time at most.
+    kept
+        Share of the images that the model still has; 0 where it could not be adjusted.
+    """
+
+    seams: dict[tuple[int, int], EndsMet]
+    farthest: dict[tuple[int, int], int]
+    kept: float
+
+
 def close_gaps(
     database: Path,
     reconstruction: pycolmap.Reconstruction,
@@ -93,7 +112,6 @@ def close_gaps(
     names: Sequence[str],
     *,
     nearest: int | None,
-    least_kept: float = 1.0,
 ) -> EndsMet | None:
     """Join the ends of a model that met; ``None`` where there are none.
 
@@ -109,33 +127,75 @@ def close_gaps(
         Of images, in order of time.
     nearest
         Pairs farther apart in time may join copies, and are not looked at; ``None`` where all may be believed.
-    least_kept
-        Where a smaller share of the images is left, they do not belong together.
+    """
+    part_of = dict.fromkeys(reconstruction.reg_image_ids(), 0)
+    met = close_seams(database, reconstruction, pipeline, names, part_of=part_of, nearest={(0, 0): nearest})
+    if not met.seams:
+        return None
+    ends = met.seams[0, 0]
+    joined = ends.joined and met.kept == 1
+    said = "joined" if joined else "left as they are: they do not fit"
+    log.info("a model's ends, seen in %d pairs of images, %s (%.0f %% agree)", ends.pairs, said, 100 * ends.agree)
+    return replace(ends, joined=joined)
+
+
+def close_seams(
+    database: Path,
+    reconstruction: pycolmap.Reconstruction,
+    pipeline: pycolmap.IncrementalPipelineOptions,
+    names: Sequence[str],
+    *,
+    part_of: Mapping[int, int],
+    nearest: Mapping[tuple[int, int], int | None],
+) -> SeamsMet:
+    """Make one what a model holds twice, and tell of each seam whether it fits then.
+
+    Parameters
+    ----------
+    database, reconstruction, pipeline, names
+        As for :func:`close_gaps`.
+    part_of
+        Of images by number, the parts that they are of.
+    nearest
+        By the parts of a seam, the smaller number first: pairs farther apart in time are not looked at. Nor is any
+        pair of parts that are not named.
     """
     import pycolmap
 
     cached = pycolmap.DatabaseCacheOptions()
     cached.min_num_matches = pipeline.min_num_matches
+    place = {name: at for at, name in enumerate(names)}
+    of_seam: dict[tuple[int, int], list[_Torn]] = {}
     with pycolmap.Database.open(str(database)) as opened:
-        torn = _torn(opened, reconstruction, names, nearest)
-        if len(torn) < _LEAST_PAIRS:
-            return None
+        for pair in _torn(opened, reconstruction, place, part_of, nearest):
+            of_seam.setdefault(_seam(part_of, pair.first, pair.second), []).append(pair)
+        of_seam = {seam: pairs for seam, pairs in of_seam.items() if len(pairs) >= _LEAST_PAIRS}
+        if not of_seam:
+            return SeamsMet(seams={}, farthest={}, kept=1.0)
         cache = pycolmap.DatabaseCache.create(opened, cached)
     images = reconstruction.num_reg_images()
-    place = {name: at for at, name in enumerate(names)}
-    most = max(torn, key=lambda pair: len(pair.points))
-    first, second = sorted((reconstruction.image(k).name for k in (most.first, most.second)), key=place.__getitem__)
-    _make_one(reconstruction, torn)
+    name = {number: reconstruction.image(number).name for number in reconstruction.reg_image_ids()}
+    _make_one(reconstruction, [pair for pairs in of_seam.values() for pair in pairs])
     try:
         _adjust(reconstruction, cache, pipeline)
-        stays = _agree(reconstruction, torn)
+        agree = {seam: _agree(reconstruction, pairs) for seam, pairs in of_seam.items()}
+        kept = reconstruction.num_reg_images() / images
     except (ValueError, RuntimeError) as error:  # COLMAP's own checks fail where hardly anything fits
         log.info("COLMAP cannot adjust a model whose ends were made one: %s", error)
-        stays = 0.0
-    joined = stays >= _STAYS and reconstruction.num_reg_images() >= least_kept * images
-    said = "joined" if joined else "left as they are: they do not fit"
-    log.info("a model's ends, seen in %d pairs of images, %s (%.0f %% agree)", len(torn), said, 100 * stays)
-    return EndsMet(pairs=len(torn), images=(first, second), agree=stays, joined=joined)
+        agree, kept = dict.fromkeys(of_seam, 0.0), 0.0
+    seams, farthest = {}, {}
+    for seam, pairs in of_seam.items():
+        most = max(pairs, key=lambda pair: len(pair.points))
+        first, second = sorted((name[most.first], name[most.second]), key=place.__getitem__)
+        joined = agree[seam] >= _STAYS
+        seams[seam] = EndsMet(pairs=len(pairs), images=(first, second), agree=agree[seam], joined=joined)
+        farthest[seam] = max(abs(place[name[pair.first]] - place[name[pair.second]]) for pair in pairs)
+    return SeamsMet(seams=seams, farthest=farthest, kept=kept)
+
+
+def _seam(part_of: Mapping[int, int], first: int, second: int) -> tuple[int, int]:
+    a, b = part_of[first], part_of[second]
+    return min(a, b), max(a, b)
 
 
 def _adjust(
@@ -216,12 +276,15 @@ def points_of_features(reconstruction: pycolmap.Reconstruction, number: int) -> 
 
 
 def _torn(
-    opened: pycolmap.Database, reconstruction: pycolmap.Reconstruction, names: Sequence[str], nearest: int | None
+    opened: pycolmap.Database,
+    reconstruction: pycolmap.Reconstruction,
+    place: Mapping[str, int],
+    part_of: Mapping[int, int],
+    nearest: Mapping[tuple[int, int], int | None],
 ) -> list[_Torn]:
     """Pairs that show the same, and hang together by nothing but a long way round."""
     import pycolmap
 
-    place = {name: at for at, name in enumerate(names)}
     when = {number: place.get(reconstruction.image(number).name) for number in reconstruction.reg_image_ids()}
     point = {number: points_of_features(reconstruction, number) for number, at in when.items() if at is not None}
     linked: list[tuple[int, int]] = []
@@ -238,7 +301,8 @@ def _torn(
             linked.append((first, second))
         elif both.sum() >= _LEAST_MATCHES and same <= _SAME_SHARE * both.sum():
             apart = abs(place[reconstruction.image(first).name] - place[reconstruction.image(second).name])
-            if nearest is None or apart <= nearest:
+            seam = _seam(part_of, first, second)
+            if seam in nearest and ((limit := nearest[seam]) is None or apart <= limit):
                 suspects.append(_Torn(first=first, second=second, features=matches[both], points=points[both]))
     hops = _hops(sorted(point), linked, [(pair.first, pair.second) for pair in suspects])
     return [pair for pair, over in zip(suspects, hops, strict=True) if over > _HOPS]

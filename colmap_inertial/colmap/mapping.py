@@ -53,12 +53,15 @@ class MapRecord:
         Runs of images that were mapped by themselves; 1 where all were mapped in one go.
     ends
         Of models that were mapped in one go: their ends that met.
+    seams
+        Of parts: where they met, also where they do not fit and these matches were left out.
     """
 
     mapper: str
     models: int
     parts: int = 1
     ends: tuple[ModelEnds, ...] = ()
+    seams: tuple[EndsMet, ...] = ()
 
 
 def map_images(
@@ -167,14 +170,14 @@ def _map_in_parts(
     # neighbouring parts have some images both
     parts = runs(len(in_time))
     counted = _counter(context.progress, len(in_time), of=sum(end - begin for begin, end in parts))
-    models = map_in_parts(
-        database, images, context.scratch, pipeline, in_time, parts, near=near, loops=loops, registered=counted
+    models, seams = map_in_parts(
+        database, images, sparse, pipeline, in_time, parts, near=near, loops=loops, registered=counted
     )
     for number, model in enumerate(models):
         model.extract_colors_for_all_images(str(images))
         (sparse / str(number)).mkdir()
         model.write_binary(str(sparse / str(number)))
-    return MapRecord(mapper="incremental", models=len(models), parts=len(parts))
+    return MapRecord(mapper="incremental", models=len(models), parts=len(parts), seams=tuple(seams))
 
 
 def _counter(progress: Progress, total: int, *, of: int | None = None) -> Callable[[], None]:

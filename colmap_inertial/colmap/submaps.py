@@ -3,7 +3,8 @@
 COLMAP adjusts the whole model again and again while it grows, and from 1000 images on by conjugate gradients, which
 along a chain of images hardly move. Parts take as long for each image in a capture of any length.
 What they have in common, images and matches between them, says how each lies in the next: together, and with the loops
-that matching closed, that places all of them. Then their points are made one, and the whole is adjusted once.
+that matching closed, that places all of them. Then their points are made one, and the whole is adjusted. What does not
+fit then is forgotten, the worst first, and the rest is placed and adjusted again.
 """
 
 from __future__ import annotations
@@ -12,15 +13,15 @@ import copy
 import itertools
 import logging
 import tempfile
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.colmap.closing import close_gaps, points_of_features
+from colmap_inertial.colmap.closing import EndsMet, SeamsMet, close_seams, points_of_features
 from colmap_inertial.geometry import so3_exp
 from colmap_inertial.types import Array
 
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 Ids = NDArray[np.int64]
+#: Two parts that meet, or one that meets itself: their places, the smaller one first.
+Seam = tuple[int, int]
 
 #: COLMAP's own limit, beyond which it solves adjustments by conjugate gradients.
 LONGEST = 1000
@@ -46,8 +49,8 @@ _PLENTY = 500
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Part:
-    """A model of some of the images.
+class MappedRun:
+    """A model of a run of the images, or of some of it; a part of the whole.
 
     Attributes
     ----------
@@ -135,7 +138,7 @@ def runs(count: int, *, longest: int = PART, shared: int = SHARED) -> list[tuple
 def map_in_parts(
     database: Path,
     images: Path,
-    scratch: Path,
+    sparse: Path,
     pipeline: pycolmap.IncrementalPipelineOptions,
     names: Sequence[str],
     parts: Sequence[tuple[int, int]],
@@ -143,11 +146,13 @@ def map_in_parts(
     near: int,
     loops: bool,
     registered: Callable[[], None],
-) -> list[pycolmap.Reconstruction]:
+) -> tuple[list[pycolmap.Reconstruction], list[EndsMet]]:
     """Run COLMAP's incremental mapper on runs of the images, and join what comes out; the largest model first.
 
     Parameters
     ----------
+    sparse
+        Where models go; the parts' own are for a while in folders inside.
     names
         In order of time.
     parts
@@ -158,6 +163,10 @@ def map_in_parts(
         Whether matches of others may be believed; else they may join copies, and are not looked at.
     registered
         Is called for each image that a part places.
+
+    Returns
+    -------
+    The models, and where parts met.
     """
     import pycolmap
 
@@ -166,46 +175,86 @@ def map_in_parts(
     own.extract_colors = False
     for begin, end in parts:
         own.image_names = list(names[begin:end])
-        with tempfile.TemporaryDirectory(dir=scratch) as folder:
+        with tempfile.TemporaryDirectory(dir=sparse) as folder:
             models = pycolmap.incremental_mapping(
                 str(database), str(images), folder, options=own, next_image_callback=registered
             )
-        made += [Part(model=model, begin=begin, end=end) for _, model in sorted(models.items())]
-    joined = join_parts(database, made, pipeline, names, near=near, loops=loops) if made else []
-    return sorted(joined, key=lambda model: -int(model.num_reg_images()))
+        made += [MappedRun(model=model, begin=begin, end=end) for _, model in sorted(models.items())]
+    joined, seams = join_runs(database, made, pipeline, names, near=near, loops=loops) if made else ([], [])
+    return sorted(joined, key=lambda model: -int(model.num_reg_images())), seams
 
 
-def join_parts(
+def join_runs(
     database: Path,
-    parts: Sequence[Part],
+    parts: Sequence[MappedRun],
     pipeline: pycolmap.IncrementalPipelineOptions,
     names: Sequence[str],
     *,
     near: int,
     loops: bool,
-) -> list[pycolmap.Reconstruction]:
-    """Of parts that lie beside each other, one model; those that do not fit without loops either stay as they are."""
-    nearest = None if loops else near
-    ties = find_ties(database, parts, names, nearest=nearest)
+) -> tuple[list[pycolmap.Reconstruction], list[EndsMet]]:
+    """Of parts that lie beside each other, one model, and the seams between them, those that did not fit, too.
+
+    Of a seam that does not fit, first loops are not believed, then nothing is: its tie places no part, and its matches
+    make no points one. Each time one seam is less, so that it ends; at worst, parts stay as they are.
+    """
+    ties = {(tie.first, tie.second): tie for tie in find_ties(database, parts, names, nearest=None if loops else near)}
+    nearby: dict[Seam, Tie] | None = None
+    nearest: dict[Seam, int | None] = dict.fromkeys(ties, None if loops else near)
+    nearest |= {(k, k): None if loops else near for k in range(len(parts))}
     joined: list[pycolmap.Reconstruction] = []
-    for members in _groups(len(parts), ties):
-        group = [parts[k] for k in members]
-        if len(group) > 1:
-            placed = place_parts(members, [tie for tie in ties if tie.first in members])
-            whole = _whole(database, group, placed, pipeline, names)
-            met = close_gaps(database, whole, pipeline, names, nearest=nearest, least_kept=_LEAST_KEPT)
-            if met is not None and met.joined:
-                joined.append(whole)
-                continue
-            log.info("%d parts do not fit%s", len(group), " with loops" if loops else "")
-        if len(group) > 1 and loops:
-            joined += join_parts(database, group, pipeline, names, near=near, loops=False)
-        else:
-            joined += [part.model for part in group]
-    return joined
+    seams: list[EndsMet] = []
+    waiting = _groups(range(len(parts)), ties)
+    while waiting:
+        members = waiting.pop(0)
+        if len(members) == 1:
+            joined.append(parts[members[0]].model)
+            continue
+        own = [tie for seam, tie in ties.items() if seam[0] in members]
+        placed = place_parts(members, own)
+        whole, part_of = _whole(database, [parts[k] for k in members], placed, pipeline, names)
+        of_group = {number: members[k] for number, k in part_of.items()}
+        met = close_seams(database, whole, pipeline, names, part_of=of_group, nearest=nearest)
+        hold = [seam for seam, one in met.seams.items() if one.joined]
+        whole_again = len(_groups(members, hold)) == 1
+        if len(hold) == len(met.seams) and whole_again and met.kept >= _LEAST_KEPT:
+            joined.append(whole)
+            seams += met.seams.values()
+            continue
+        worst = _worst(met, own, dict(zip(members, placed, strict=True)))
+        said = met.seams.get(worst)
+        if said is not None:
+            seams.append(replace(said, joined=False))
+        log.info("parts %d and %d do not fit (%.0f %% agree)", *worst, 100 * (said.agree if said else 0))
+        ties.pop(worst, None)
+        limit = nearest.pop(worst)
+        if limit is None and met.farthest.get(worst, 0) > near:
+            if nearby is None:
+                nearby = {(tie.first, tie.second): tie for tie in find_ties(database, parts, names, nearest=near)}
+            if worst in nearby:
+                ties[worst] = nearby[worst]
+            if worst in nearby or worst[0] == worst[1]:
+                nearest[worst] = near
+        waiting = _groups(members, ties) + waiting
+    return joined, seams
 
 
-def find_ties(database: Path, parts: Sequence[Part], names: Sequence[str], *, nearest: int | None) -> list[Tie]:
+def _worst(met: SeamsMet, ties: Sequence[Tie], placed: Mapping[int, Placed]) -> Seam:
+    """The seam that fits least once all was adjusted; where that does not tell, the tie that parts lie by least."""
+
+    def fits(tie: Tie) -> tuple[float, int]:
+        second_in_first = placed[tie.first].inverse().after(placed[tie.second])
+        off = np.linalg.norm(tie.in_first - second_in_first.of(tie.in_second), axis=1)
+        return float(np.mean(off < _SAME_SHARE * tie.away)), len(tie.away)
+
+    fit = {(tie.first, tie.second): fits(tie) for tie in ties}
+    if all(one.joined for one in met.seams.values()) and (unseen := fit.keys() - met.seams.keys()):
+        return min(unseen, key=lambda seam: (fit[seam], seam))
+    # points are no fewer than so many of a seam inside of a part, which nothing places
+    return min(met.seams, key=lambda seam: (met.seams[seam].agree, fit.get(seam, (1.0, _PLENTY)), seam))
+
+
+def find_ties(database: Path, parts: Sequence[MappedRun], names: Sequence[str], *, nearest: int | None) -> list[Tie]:
     """What parts have in common: points of images that both have, or else of images that are matched."""
     import pycolmap
 
@@ -246,7 +295,7 @@ def find_ties(database: Path, parts: Sequence[Part], names: Sequence[str], *, ne
     return [tie for tie in found if tie is not None]
 
 
-def _tie(parts: Sequence[Part], a: int, b: int, seen: Sequence[tuple[int, Ids]]) -> Tie | None:
+def _tie(parts: Sequence[MappedRun], a: int, b: int, seen: Sequence[tuple[int, Ids]]) -> Tie | None:
     """Points that two parts have both, without those that contradict the others; None where these are too few."""
     import pycolmap
 
@@ -276,15 +325,16 @@ def _tie(parts: Sequence[Part], a: int, b: int, seen: Sequence[tuple[int, Ids]])
     return Tie(first=a, second=b, in_first=in_first[some], in_second=in_second[some], away=away[some], similar=found)
 
 
-def _groups(count: int, ties: Sequence[Tie]) -> list[list[int]]:
-    """Parts that hang together, by their places."""
+def _groups(members: Sequence[int], seams: Iterable[Seam]) -> list[list[int]]:
+    """Parts that hang together."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    ends = np.array([(tie.first, tie.second) for tie in ties], dtype=np.intp).reshape(-1, 2)
-    graph = coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
+    place = {k: at for at, k in enumerate(members)}
+    ends = np.array([(place[a], place[b]) for a, b in seams if a in place], dtype=np.intp).reshape(-1, 2)
+    graph = coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(len(place), len(place)))
     number, of_part = connected_components(graph, directed=False)
-    return [np.flatnonzero(of_part == k).tolist() for k in range(number)]
+    return [[members[at] for at in np.flatnonzero(of_part == k).tolist()] for k in range(number)]
 
 
 def place_parts(members: Sequence[int], ties: Sequence[Tie]) -> list[Placed]:
@@ -319,12 +369,12 @@ def place_parts(members: Sequence[int], ties: Sequence[Tie]) -> list[Placed]:
 
 def _whole(
     database: Path,
-    group: Sequence[Part],
+    group: Sequence[MappedRun],
     placed: Sequence[Placed],
     pipeline: pycolmap.IncrementalPipelineOptions,
     names: Sequence[str],
-) -> pycolmap.Reconstruction:
-    """One model of parts; an image that several have is of the one that has most images on both sides of it."""
+) -> tuple[pycolmap.Reconstruction, dict[int, int]]:
+    """One model of parts, and by number of an image whose it is: of several, that has most images on both sides."""
     import pycolmap
 
     place = {name: at for at, name in enumerate(names)}
@@ -356,4 +406,4 @@ def _whole(
             elements = [element for element in point.track.elements if element.image_id in own]
             if len(elements) > 1:
                 whole.add_point3D(point.xyz, pycolmap.Track(elements), point.color)
-    return whole
+    return whole, {number: k for number, (_, k) in owner.items()}

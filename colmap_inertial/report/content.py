@@ -12,7 +12,13 @@ import numpy as np
 from colmap_inertial import __version__
 from colmap_inertial.io.files import read_json, read_text
 from colmap_inertial.report.series import strided
-from colmap_inertial.report.words import half_width_pct, mapped_in_words, outcome_of_model, outcome_of_stop
+from colmap_inertial.report.words import (
+    half_width_pct,
+    mapped_in_words,
+    outcome_of_model,
+    outcome_of_stop,
+    parts_mapped_in_words,
+)
 
 VERSION = 1
 #: What the pipeline keeps for the report alone, in an output folder.
@@ -76,7 +82,8 @@ def gather(
     if shown and shown[0]["joined_of"]:
         outcome = {**outcome, "summary": [*outcome["summary"], _joined(shown[0], gaps)]}
     if shown:
-        made = mapped_in_words(done.get("mapping"), shown[0].get("colmap_index"))
+        made = parts_mapped_in_words(done.get("mapping"))
+        made += mapped_in_words(done.get("mapping"), shown[0].get("colmap_index"))
         outcome = {**outcome, "summary": [*outcome["summary"], *made, *_path_in_words(shown[0])]}
     if len(shown) > 1:
         said = f"There are {len(shown)} separate models. This is model {shown[0]['index']}; the others follow below."

@@ -68,11 +68,25 @@ def not_checked(checked: Collection[str]) -> str:
     return "; ".join(said)
 
 
+def parts_mapped_in_words(mapping: dict[str, Any] | None) -> list[str]:
+    """In how many parts a recording was mapped, and which of them do not fit; by ``mapping`` of the result."""
+    if mapping is None or mapping["parts"] == 1:
+        return []
+    said = [f"COLMAP mapped the recording in {mapping['parts']} parts."]
+    for met in mapping.get("seams", ()):
+        if not met["joined"]:
+            said.append(
+                f"What two of them both show ({' and '.join(met['images'])}, {met['pairs']} pairs of images) does not "
+                f"fit and was left out ({100 * met['agree']:.0f} % of the matches agree)."
+            )
+    return said
+
+
 def mapped_in_words(mapping: dict[str, Any] | None, colmap_index: int | None) -> list[str]:
-    """What there is to say of how a model was made: its parts, and its ends that met; by ``mapping`` of the result."""
+    """What there is to say of how one model was made: its ends that met; by ``mapping`` of the result."""
     if mapping is None:
         return []
-    said = [] if mapping["parts"] == 1 else [f"COLMAP mapped the recording in {mapping['parts']} parts."]
+    said = []
     for met in mapping["ends"]:
         if met["model"] == colmap_index:
             where = f"ends that met ({' and '.join(met['images'])}, {met['pairs']} pairs of images)"
