@@ -8,11 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import optimize
 from test_closing import FRAMES, NAMES, make
 
 from colmap_inertial.colmap import mapping, submaps
 from colmap_inertial.colmap.closing import EndsMet, SeamsMet, close_seams, points_of_features
-from colmap_inertial.colmap.submaps import PART, SHARED, MappedRun, Placed, Tie, join_runs, place_parts, runs
+from colmap_inertial.colmap.submaps import PART, SHARED, MappedRun, Tie, join_runs, place_parts, runs
 from colmap_inertial.geometry import so3_exp
 from colmap_inertial.options import MappingOptions
 from colmap_inertial.run.context import RunContext
@@ -33,53 +34,89 @@ def test_runs_hold_every_image_and_share_some_with_the_next(count):
     assert (len(found) - 1) * (PART - SHARED) + SHARED < count
 
 
-def random_placed(rng, scale=0.3) -> Placed:
-    return Placed(
-        scale=float(np.exp(scale * rng.standard_normal())),
-        rotation=so3_exp(rng.standard_normal(3)),
-        translation=5 * rng.standard_normal(3),
-    )
+def similarity(scale=1.0, turn_rad=(0.0, 0, 0), translation=(0.0, 0, 0)):
+    import pycolmap
+
+    return pycolmap.Sim3d(scale, pycolmap.Rotation3d(so3_exp(np.array(turn_rad))), np.array(translation, dtype=float))
 
 
-def as_matrix(placed: Placed) -> np.ndarray:
-    return np.block([[placed.scale * placed.rotation, placed.translation[:, None]], [np.eye(4)[3:]]])
+def random_similarity(rng, scale=0.3):
+    return similarity(float(np.exp(scale * rng.standard_normal())), rng.standard_normal(3), 5 * rng.standard_normal(3))
 
 
-def test_similarities_go_together_as_matrices_do():
+def test_a_similarity_is_moved_by_a_step():
     rng = np.random.default_rng(1)
-    a, b = random_placed(rng), random_placed(rng)
-    np.testing.assert_allclose(as_matrix(a.after(b)), as_matrix(a) @ as_matrix(b), atol=1e-12)
-    np.testing.assert_allclose(as_matrix(a.inverse()) @ as_matrix(a), np.eye(4), atol=1e-12)
-    points = rng.standard_normal((7, 3))
-    np.testing.assert_allclose(np.c_[a.of(points), np.ones(7)], np.c_[points, np.ones(7)] @ as_matrix(a).T, atol=1e-12)
+    start, points = random_similarity(rng), rng.standard_normal((7, 3))
+    turn = so3_exp(np.array([0.1, 0, 0.2]))
+    expected = 1.5 * (start * points - start.translation) @ turn.T + start.translation + [1, 2, 3]
+    found = submaps.moved(start, np.array([np.log(1.5), 0.1, 0, 0.2, 1, 2, 3])) * points
+    np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
-def tie(rng, world: list[Placed], first: int, second: int, off: Placed | None = None) -> Tie:
+def tie(rng, world, first: int, second: int, off=None, noise: float = 0.0, count: int = 200) -> Tie:
     """Points of two parts whose places are known; ``off``: how the second one lies wrongly in the first one."""
-    points = world[first].of(10 * rng.random((200, 3)))
-    in_first, in_second = (world[k].inverse().of(points) for k in (first, second))
-    in_first = in_first if off is None else off.of(in_first)
-    similar = world[first].inverse().after(world[second])
-    similar = similar if off is None else off.after(similar)
-    away = np.full(200, 4 / world[first].scale)
+    points = world[first] * (10 * rng.random((count, 3)))
+    in_first, in_second = (
+        world[k].inverse() * points + noise * rng.standard_normal((count, 3)) for k in (first, second)
+    )
+    in_first = in_first if off is None else off * in_first
+    similar = world[first].inverse() * world[second]
+    similar = similar if off is None else off * similar
+    away = (3 + 2 * rng.random(count)) / world[first].scale
     return Tie(first=first, second=second, in_first=in_first, in_second=in_second, away=away, similar=similar)
+
+
+def test_points_of_a_tie_say_no_less_in_few_rows():
+    rng = np.random.default_rng(4)
+    world = [similarity(), random_similarity(rng)]
+    one = tie(rng, world, 0, 1, noise=0.01)
+    design, target = submaps._shortened(one)
+    assert design.shape == (4, 4) and target.shape == (4, 3)
+
+    def both(similar):
+        left = (one.in_first - similar * one.in_second) / one.away[:, None]
+        return np.sum(left**2), np.sum((target - design @ similar.matrix().T) ** 2)
+
+    costs = np.array([both(submaps.moved(world[1], 0.3 * rng.standard_normal(7))) for _ in range(9)])
+    rest = costs[:, 0] - costs[:, 1]
+    np.testing.assert_allclose(rest, rest[0], rtol=1e-9 * costs.max() / rest[0])
+    assert 0 < rest[0] < costs[:, 0].min()
+
+
+def test_many_parts_and_loops_are_placed_by_few_rows(monkeypatch):
+    rng = np.random.default_rng(5)
+    world = [similarity(), *(random_similarity(rng, 0.1) for _ in range(11))]
+    pairs = [(k, k + 1) for k in range(11)] + [(a, b) for a in range(12) for b in range(a + 2, 12) if (a + b) % 2]
+    ties = [tie(rng, world, a, b, noise=0.01, count=500) for a, b in pairs]
+    rows, solve = [], optimize.least_squares
+
+    def solved(residuals, start, **more):
+        rows.append(len(residuals(start)))
+        return solve(residuals, start, **more)
+
+    monkeypatch.setattr(optimize, "least_squares", solved)
+    found = place_parts(range(12), ties)
+    for one, true in zip(found, world, strict=True):
+        np.testing.assert_allclose(one.matrix(), true.matrix(), atol=0.02)
+    # 1500 for each tie, were there one for each coordinate of a point
+    assert len(ties) > 30 and rows == [12 * len(ties)]
 
 
 def test_parts_are_placed_where_they_are_and_a_loop_takes_drift_out():
     rng = np.random.default_rng(2)
-    world = [Placed.nowhere(), *(random_placed(rng) for _ in range(5))]
+    world = [similarity(), *(random_similarity(rng) for _ in range(5))]
     exact = [tie(rng, world, k, k + 1) for k in range(5)]
     for found, true in zip(place_parts(range(6), exact), world, strict=True):
-        np.testing.assert_allclose(as_matrix(found), as_matrix(true), atol=1e-9)
+        np.testing.assert_allclose(found.matrix(), true.matrix(), atol=1e-9)
     # each tie turns, stretches and moves a little more
-    drift = Placed(scale=1.01, rotation=so3_exp(np.array([0.0, 0.01, 0.005])), translation=np.array([0.02, 0.0, 0.01]))
+    drift = similarity(1.01, (0.0, 0.01, 0.005), (0.02, 0.0, 0.01))
     drifted = [tie(rng, world, k, k + 1, drift) for k in range(5)]
 
     def off(ties):
         found = place_parts(range(6), ties)
         probe = rng.standard_normal((20, 3))
         return max(
-            float(np.linalg.norm(one.of(true.inverse().of(probe)) - probe, axis=1).max())
+            float(np.linalg.norm(one * (true.inverse() * probe) - probe, axis=1).max())
             for one, true in zip(found, world, strict=True)
         )
 
@@ -140,12 +177,12 @@ def test_points_that_contradict_most_others_do_not_place_parts(ring):
         pairs[::10, 1] = rng.permutation(pairs[::10, 1])
         seen.append((number, pairs))
     good = submaps._tie([first, second], 0, 1, seen)
-    off = np.linalg.norm(good.in_first - good.similar.of(good.in_second), axis=1)
+    off = np.linalg.norm(good.in_first - good.similar * good.in_second, axis=1)
     assert len(good.away) > 100 and np.all(off < 0.1 * good.away)
     # the shared images lie where both parts have them
     for number in shared:
         here, there = (part.model.image(number).projection_center() for part in (first, second))
-        assert np.linalg.norm(good.similar.of(there[None])[0] - here) < 0.03 * np.median(good.away)
+        assert np.linalg.norm(good.similar * there - here) < 0.03 * np.median(good.away)
     for _, pairs in seen:
         pairs[:, 1] = rng.permutation(pairs[:, 1])
     assert submaps._tie([first, second], 0, 1, seen) is None
@@ -153,7 +190,7 @@ def test_points_that_contradict_most_others_do_not_place_parts(ring):
 
 def test_an_image_that_two_parts_share_is_of_the_one_that_knows_more_on_both_sides(ring):
     ring, parts = ring
-    placed = [replace(Placed.nowhere(), translation=np.array([1000.0 * k, 0, 0])) for k in range(2)]
+    placed = [similarity(translation=(1000.0 * k, 0, 0)) for k in range(2)]
     whole, part_of = submaps._whole(ring.database, parts[:2], placed, ring.options, NAMES)
     centres = {whole.image(k).name: whole.image(k).projection_center() for k in whole.reg_image_ids()}
     far = {name for name, centre in centres.items() if centre[0] > 500}
@@ -234,11 +271,11 @@ def test_of_neighbours_that_do_not_fit_first_pairs_far_apart_in_time_are_not_bel
 def test_a_part_that_lies_wrong_is_not_averaged_away(ring, monkeypatch, turn_rad, models, not_joined):
     """However often it is placed, the last part is turned; where no adjustment mends that, it stays by itself."""
     ring, parts = ring
-    bad = Placed(scale=1.0, rotation=so3_exp(np.array([0, turn_rad, 0])), translation=np.array([3.0, 1, 2]))
+    bad = similarity(1.0, (0, turn_rad, 0), (3, 1, 2))
 
     def place(members, ties):
         placed = place_parts(members, ties)
-        return [*placed[:-1], bad.after(placed[-1])] if members[-1] == 3 else placed
+        return [*placed[:-1], bad * placed[-1]] if members[-1] == 3 else placed
 
     monkeypatch.setattr(submaps, "place_parts", place)
     found, seams = join_runs(ring.database, parts, ring.options, NAMES, near=4, loops=True)
@@ -356,8 +393,8 @@ def test_parts_may_have_cameras_that_others_lack(tmp_path):
 def test_a_misplaced_part_does_not_fit_whatever_comes_of_the_adjustment(ring, turn_rad, scale, translation):
     ring, parts = ring
     placed = place_parts(range(4), submaps.find_ties(ring.database, parts, NAMES, nearest=None))
-    bad = Placed(scale=scale, rotation=so3_exp(np.array(turn_rad)), translation=np.array(translation, dtype=float))
-    placed[3] = bad.after(placed[3])
+    bad = similarity(scale, turn_rad, translation)
+    placed[3] = bad * placed[3]
     whole, part_of = submaps._whole(ring.database, parts, placed, ring.options, NAMES)
     nearest = dict.fromkeys([(0, 1), (1, 2), (2, 3), (0, 3)])
     met = close_seams(ring.database, whole, ring.options, NAMES, part_of=part_of, nearest=nearest)

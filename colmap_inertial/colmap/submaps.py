@@ -86,46 +86,18 @@ class Tie:
     in_first: Array
     in_second: Array
     away: Array
-    similar: Placed
+    similar: pycolmap.Sim3d
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Placed:
-    """A similarity: ``scale * rotation @ x + translation``."""
+def moved(similar: pycolmap.Sim3d, step: Array) -> pycolmap.Sim3d:
+    """By (7,) logarithm of the scale, rotation vector, translation, all small."""
+    import pycolmap
 
-    scale: float
-    rotation: Array
-    translation: Array
-
-    @classmethod
-    def nowhere(cls) -> Placed:
-        """What leaves everything where it is."""
-        return cls(scale=1.0, rotation=np.eye(3), translation=np.zeros(3))
-
-    def of(self, points: Array) -> Array:
-        """(N, 3) points, moved."""
-        return np.asarray(self.scale * points @ self.rotation.T + self.translation)
-
-    def after(self, first: Placed) -> Placed:
-        """What both do, the other one first."""
-        return Placed(
-            scale=self.scale * first.scale,
-            rotation=self.rotation @ first.rotation,
-            translation=self.of(first.translation[None])[0],
-        )
-
-    def inverse(self) -> Placed:
-        """What undoes it."""
-        back = self.rotation.T / self.scale
-        return Placed(scale=1 / self.scale, rotation=self.rotation.T, translation=-back @ self.translation)
-
-    def moved(self, step: Array) -> Placed:
-        """By (7,) logarithm of the scale, rotation vector, translation, all small."""
-        return Placed(
-            scale=self.scale * float(np.exp(step[0])),
-            rotation=so3_exp(step[1:4]) @ self.rotation,
-            translation=self.translation + step[4:],
-        )
+    return pycolmap.Sim3d(
+        similar.scale * float(np.exp(step[0])),
+        pycolmap.Rotation3d(so3_exp(step[1:4]) @ similar.rotation.matrix()),
+        similar.translation + step[4:],
+    )
 
 
 def runs(count: int, *, longest: int = PART, shared: int = SHARED) -> list[tuple[int, int]]:
@@ -239,12 +211,12 @@ def join_runs(
     return joined, seams
 
 
-def _worst(met: SeamsMet, ties: Sequence[Tie], placed: Mapping[int, Placed]) -> Seam:
+def _worst(met: SeamsMet, ties: Sequence[Tie], placed: Mapping[int, pycolmap.Sim3d]) -> Seam:
     """The seam that fits least once all was adjusted; where that does not tell, the tie that parts lie by least."""
 
     def fits(tie: Tie) -> tuple[float, int]:
-        second_in_first = placed[tie.first].inverse().after(placed[tie.second])
-        off = np.linalg.norm(tie.in_first - second_in_first.of(tie.in_second), axis=1)
+        second_in_first = placed[tie.first].inverse() * placed[tie.second]
+        off = np.linalg.norm(tie.in_first - second_in_first * tie.in_second, axis=1)
         return float(np.mean(off < _SAME_SHARE * tie.away)), len(tie.away)
 
     fit = {(tie.first, tie.second): fits(tie) for tie in ties}
@@ -312,17 +284,16 @@ def _tie(parts: Sequence[MappedRun], a: int, b: int, seen: Sequence[tuple[int, I
     ransac = pycolmap.RANSACOptions()
     ransac.random_seed = 0
     ransac.max_error = _SAME_SHARE * float(np.median(away))
-    estimated: Any = pycolmap.estimate_sim3d_robust(in_second, in_first, ransac)  # a dict, whatever it is said to be
-    if estimated is None:
+    found: Any = pycolmap.estimate_sim3d_robust(in_second, in_first, ransac)  # a dict, whatever it is said to be
+    if found is None:
         return None
-    similar = estimated["tgt_from_src"]
-    found = Placed(scale=similar.scale, rotation=similar.rotation.matrix(), translation=similar.translation)
-    agree = np.flatnonzero(np.linalg.norm(in_first - found.of(in_second), axis=1) < _SAME_SHARE * away)
+    similar: pycolmap.Sim3d = found["tgt_from_src"]
+    agree = np.flatnonzero(np.linalg.norm(in_first - similar * in_second, axis=1) < _SAME_SHARE * away)
     if len(agree) < max(LEAST_SAME, len(pairs) / 2):
         return None
     log.info("parts %d and %d: %d of %d points agree", a, b, len(agree), len(pairs))
     some = agree[np.linspace(0, len(agree) - 1, min(_PLENTY, len(agree))).astype(int)]
-    return Tie(first=a, second=b, in_first=in_first[some], in_second=in_second[some], away=away[some], similar=found)
+    return Tie(first=a, second=b, in_first=in_first[some], in_second=in_second[some], away=away[some], similar=similar)
 
 
 def _groups(members: Sequence[int], seams: Iterable[Seam]) -> list[list[int]]:
@@ -337,40 +308,53 @@ def _groups(members: Sequence[int], seams: Iterable[Seam]) -> list[list[int]]:
     return [[members[at] for at in np.flatnonzero(of_part == k).tolist()] for k in range(number)]
 
 
-def place_parts(members: Sequence[int], ties: Sequence[Tie]) -> list[Placed]:
+def place_parts(members: Sequence[int], ties: Sequence[Tie]) -> list[pycolmap.Sim3d]:
     """Where parts that hang together lie in the first one's world, by all ties at once."""
+    import pycolmap
     from scipy.optimize import least_squares
 
-    known = {members[0]: Placed.nowhere()}
+    known = {members[0]: pycolmap.Sim3d()}
     for tie in itertools.chain.from_iterable(itertools.repeat(sorted(ties, key=lambda t: -len(t.away)), len(members))):
         if tie.first in known and tie.second not in known:
-            known[tie.second] = known[tie.first].after(tie.similar)
+            known[tie.second] = known[tie.first] * tie.similar
         elif tie.second in known and tie.first not in known:
-            known[tie.first] = known[tie.second].after(tie.similar.inverse())
+            known[tie.first] = known[tie.second] * tie.similar.inverse()
     if len(ties) < len(members):
         return [known[k] for k in members]
     place = {k: at for at, k in enumerate(members)}
     start = [known[k] for k in members]
+    short = [_shortened(tie) for tie in ties]
 
-    def moved(x: Array) -> list[Placed]:
+    def at(x: Array) -> list[pycolmap.Sim3d]:
         steps = np.vstack([np.zeros(7), x.reshape(-1, 7)])
-        return [one.moved(step) for one, step in zip(start, steps, strict=True)]
+        return [moved(one, step) for one, step in zip(start, steps, strict=True)]
 
     def off(x: Array) -> Array:
-        at = moved(x)
+        lie = at(x)
         out = []
-        for tie in ties:
-            second_in_first = at[place[tie.first]].inverse().after(at[place[tie.second]])
-            out.append((tie.in_first - second_in_first.of(tie.in_second)) / tie.away[:, None])
+        for tie, (design, target) in zip(ties, short, strict=True):
+            second_in_first = lie[place[tie.first]].inverse() * lie[place[tie.second]]
+            out.append(target - design @ second_in_first.matrix().T)
         return np.concatenate(out).ravel()
 
-    return moved(least_squares(off, np.zeros(7 * (len(members) - 1)), x_scale="jac").x)
+    return at(least_squares(off, np.zeros(7 * (len(members) - 1)), x_scale="jac").x)
+
+
+def _shortened(tie: Tie) -> tuple[Array, Array]:
+    """(4, 4) and (4, 3): what is left of all of a tie's points, but for a sum of squares that nothing changes.
+
+    Over their distances, places in the first part less those in the second, moved, are linear in the twelve numbers
+    that move them. So as many rows as these have for each coordinate say as much as all points.
+    """
+    design = np.c_[tie.in_second, np.ones(len(tie.away))]
+    _, upper = np.linalg.qr(np.c_[design, tie.in_first] / tie.away[:, None])
+    return np.asarray(upper[:4, :4]), np.asarray(upper[:4, 4:])
 
 
 def _whole(
     database: Path,
     group: Sequence[MappedRun],
-    placed: Sequence[Placed],
+    placed: Sequence[pycolmap.Sim3d],
     pipeline: pycolmap.IncrementalPipelineOptions,
     names: Sequence[str],
 ) -> tuple[pycolmap.Reconstruction, dict[int, int]]:
@@ -396,7 +380,7 @@ def _whole(
             whole.camera(camera_id).params = list(camera.params)
     for k, (part, similar) in enumerate(zip(group, placed, strict=True)):
         model = pycolmap.Reconstruction(part.model)
-        model.transform(pycolmap.Sim3d(similar.scale, pycolmap.Rotation3d(similar.rotation), similar.translation))
+        model.transform(similar)
         own = {number for number in model.reg_image_ids() if owner[number][1] == k}
         for number in sorted(own):
             image = model.image(number)
