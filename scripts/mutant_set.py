@@ -1488,6 +1488,13 @@ MUTANTS = (
         ("submaps::test_a_part_that_lies_wrong_is_not_averaged_away",),
     ),
     Mutant(
+        "colmap/closing.py",
+        "if _work(reconstruction) <= _work_of(LONGEST):",
+        "if True:",
+        "a large model of which all images see the same is solved directly",
+        ("closing::test_a_large_model_is_solved_directly_unless_all_images_see_the_same",),
+    ),
+    Mutant(
         "colmap/submaps.py",
         "if not across or (nearest is not None and apart > nearest):",
         "if not across:",

@@ -12,9 +12,10 @@ from scipy import optimize
 from test_closing import FRAMES, NAMES, make
 
 from colmap_inertial.colmap import mapping, submaps
-from colmap_inertial.colmap.closing import EndsMet, SeamsMet, close_seams, points_of_features
+from colmap_inertial.colmap.closing import LONGEST, EndsMet, SeamsMet, close_seams
 from colmap_inertial.colmap.submaps import PART, SHARED, MappedRun, Tie, join_runs, place_parts, runs
 from colmap_inertial.geometry import so3_exp
+from colmap_inertial.model.observed import points_of_features
 from colmap_inertial.options import MappingOptions
 from colmap_inertial.run.context import RunContext
 
@@ -125,6 +126,12 @@ def test_parts_are_placed_where_they_are_and_a_loop_takes_drift_out():
     assert chained > 0.3 and off([*drifted, tie(rng, world, 0, 5)]) < 0.6 * chained
 
 
+def test_the_limit_of_one_go_is_colmap_s_own():
+    import pycolmap
+
+    assert pycolmap.BundleAdjustmentOptions().ceres.max_num_images_direct_sparse_cpu_solver == LONGEST
+
+
 @pytest.fixture(scope="module")
 def ring(tmp_path_factory):
     """The matches of a lap, and COLMAP's models of runs of its images, each in its own units and axes."""
@@ -171,7 +178,7 @@ def test_points_that_contradict_most_others_do_not_place_parts(ring):
     shared = [k + 1 for k in range(second.begin, first.end)]
     seen = []
     for number in shared:
-        of_first, of_second = (points_of_features(part.model, number) for part in (first, second))
+        of_first, of_second = (points_of_features(part.model.image(number)) for part in (first, second))
         both = (of_first >= 0) & (of_second >= 0)
         pairs = np.stack([of_first[both], of_second[both]], axis=1)
         pairs[::10, 1] = rng.permutation(pairs[::10, 1])

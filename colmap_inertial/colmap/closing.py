@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_inertial.model.observed import points_of_features
+
 if TYPE_CHECKING:
     import pycolmap
 
@@ -38,10 +40,11 @@ _LEAST_PAIRS = 3
 _STAYS = 0.5
 #: To move ends that are far apart takes more rounds than COLMAP's 50; a walk of 500 frames, off by a metre, took 60.
 _ROUNDS = 200
-#: COLMAP solves models of more images by conjugate gradients, which along a chain of images hardly move. A chain's
-#: equations are few off the diagonal, and are solved as they are. COLMAP's rounds end by the gradient alone, which
-#: grows with the model; of such models, they end where one takes less than this share of what is left.
-_DIRECTLY_UP_TO, _LEAST_GAIN = 1000, 1e-7
+#: COLMAP's own limit: it solves models of more images by conjugate gradients, which along a chain hardly move.
+LONGEST = 1000
+#: COLMAP's rounds end by the gradient alone, which grows with the model; of models beyond that limit, they end where
+#: one takes less than this share of what is left.
+_LEAST_GAIN = 1e-7
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -218,7 +221,7 @@ def _adjust(
 def _agree(reconstruction: pycolmap.Reconstruction, torn: Sequence[_Torn]) -> float:
     """Share of the matches that are one point; of an image that the model no longer has, none is."""
     point = {
-        number: points_of_features(reconstruction, number)
+        number: points_of_features(reconstruction.image(number))
         for pair in torn
         for number in (pair.first, pair.second)
         if reconstruction.exists_image(number)
@@ -235,13 +238,49 @@ def _agree(reconstruction: pycolmap.Reconstruction, torn: Sequence[_Torn]) -> fl
 def _adjustment(
     pipeline: pycolmap.IncrementalPipelineOptions, reconstruction: pycolmap.Reconstruction
 ) -> pycolmap.BundleAdjustmentOptions:
-    """Of a whole model; solved directly, however many images it has."""
+    """Of a whole model; solved directly, however many images it has, where few see the same, as along a chain."""
     adjustment = pipeline.get_global_bundle_adjustment()
     adjustment.print_summary = False
-    if reconstruction.num_reg_images() > _DIRECTLY_UP_TO:
-        adjustment.ceres.max_num_images_direct_sparse_cpu_solver = reconstruction.num_reg_images()
+    images = reconstruction.num_reg_images()
+    if images > LONGEST:
         adjustment.ceres.solver_options.function_tolerance = _LEAST_GAIN
+        # no more work than COLMAP takes on itself, where as many images as its limit is all see the same
+        if _work(reconstruction) <= _work_of(LONGEST):
+            adjustment.ceres.max_num_images_direct_sparse_cpu_solver = images
     return adjustment
+
+
+def _work(reconstruction: pycolmap.Reconstruction) -> float:
+    """Of solving an adjustment directly: the sum of squared rows of its factor, in images; no less than it takes.
+
+    Two images have an entry in common where they see the same point. In an order in which such images lie close
+    together, the factor has none before the first entry of each row.
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+    at = {number: place for place, number in enumerate(sorted(reconstruction.reg_image_ids()))}
+    lengths: list[int] = []
+    rows: list[int] = []
+    for point in reconstruction.points3D.values():
+        seen = {at[element.image_id] for element in point.track.elements}
+        lengths.append(len(seen))
+        rows += sorted(seen)
+    columns = np.repeat(np.arange(len(lengths)), lengths)
+    sees = coo_matrix(
+        (np.ones(len(rows), dtype=np.float32), (np.array(rows, dtype=np.intp), columns)), shape=(len(at), len(lengths))
+    ).tocsr()
+    both = (sees @ sees.T).tocsr()
+    place = np.argsort(reverse_cuthill_mckee(both, symmetric_mode=True))
+    row, column = (place[numbers] for numbers in both.nonzero())
+    first = np.arange(len(at))
+    np.minimum.at(first, row, column)
+    return float(np.sum((np.arange(len(at)) - first + 1.0) ** 2))
+
+
+def _work_of(images: int) -> float:
+    """The same, where so many images all see the same."""
+    return float(np.sum(np.arange(1.0, images + 1) ** 2))
 
 
 def _refine(
@@ -266,15 +305,6 @@ def _refine(
     mapper.filter_frames(pipeline.get_mapper())
 
 
-def points_of_features(reconstruction: pycolmap.Reconstruction, number: int) -> Ids:
-    """Of an image's features, the numbers of their points; -1 without one."""
-    image = reconstruction.image(number)
-    points = np.full(image.num_points2D(), -1, dtype=np.int64)
-    seen = np.array(image.get_observation_point2D_idxs(), dtype=np.intp)
-    points[seen] = [point.point3D_id for point in image.get_observation_points2D()]
-    return points
-
-
 def _torn(
     opened: pycolmap.Database,
     reconstruction: pycolmap.Reconstruction,
@@ -286,7 +316,7 @@ def _torn(
     import pycolmap
 
     when = {number: place.get(reconstruction.image(number).name) for number in reconstruction.reg_image_ids()}
-    point = {number: points_of_features(reconstruction, number) for number, at in when.items() if at is not None}
+    point = {number: points_of_features(reconstruction.image(number)) for number, at in when.items() if at is not None}
     linked: list[tuple[int, int]] = []
     suspects: list[_Torn] = []
     for pair, count in zip(*opened.read_two_view_geometry_num_inliers(), strict=True):

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from colmap_inertial.colmap.closing import EndsMet, close_gaps
+from colmap_inertial.colmap.closing import LONGEST, EndsMet, close_gaps
 from colmap_inertial.colmap.sparse import matches_every_pair
-from colmap_inertial.colmap.submaps import LONGEST, map_in_parts, runs
+from colmap_inertial.colmap.submaps import map_in_parts, runs
 from colmap_inertial.errors import MappingError
 from colmap_inertial.model import find_models
 from colmap_inertial.model.binary import check_binary_model

@@ -21,8 +21,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.colmap.closing import EndsMet, SeamsMet, close_seams, points_of_features
+from colmap_inertial.colmap.closing import EndsMet, SeamsMet, close_seams
 from colmap_inertial.geometry import so3_exp
+from colmap_inertial.model.observed import points_of_features
 from colmap_inertial.types import Array
 
 if TYPE_CHECKING:
@@ -34,8 +35,6 @@ Ids = NDArray[np.int64]
 #: Two parts that meet, or one that meets itself: their places, the smaller one first.
 Seam = tuple[int, int]
 
-#: COLMAP's own limit, beyond which it solves adjustments by conjugate gradients.
-LONGEST = 1000
 #: Images of a part at most, and of these, how many the next one has, too.
 PART, SHARED = 400, 40
 #: Parts lie beside each other where so many points are known to be the same: as many matches as COLMAP asks of views.
@@ -232,7 +231,8 @@ def find_ties(database: Path, parts: Sequence[MappedRun], names: Sequence[str], 
 
     place = {name: at for at, name in enumerate(names)}
     points = [
-        {number: points_of_features(part.model, number) for number in part.model.reg_image_ids()} for part in parts
+        {number: points_of_features(part.model.image(number)) for number in part.model.reg_image_ids()}
+        for part in parts
     ]
     having: dict[int, list[int]] = {}
     for k, of_images in enumerate(points):

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from colmap_inertial.errors import FormatError
 from colmap_inertial.join.values import Found
+from colmap_inertial.model.observed import points_of_features
 
 if TYPE_CHECKING:
     import pycolmap
@@ -111,8 +112,7 @@ class _Held:
     def points(self, name: str) -> Ids:
         """Of an image's keypoints, the numbers of their points; -1 without one."""
         if name not in self._points:
-            of_image = self.images[name].points2D
-            self._points[name] = np.array([p.point3D_id if p.has_point3D() else -1 for p in of_image], dtype=np.int64)
+            self._points[name] = points_of_features(self.images[name])
         return self._points[name]
 
 
