@@ -1,18 +1,12 @@
-from .align import AlignOptions as AlignOptions, align_camera_imu as align_camera_imu
-from .align.conventions import LikelyConvention as LikelyConvention, likely_convention as likely_convention
-from .batch import (
-    BatchCapture as BatchCapture,
-    BatchResult as BatchResult,
-    CaptureStatus as CaptureStatus,
-    read_manifest as read_manifest,
-    run_batch as run_batch,
+from .checks.report import write_report as write_report
+from .checks.validate import (
+    Target as Target,
+    Validation as Validation,
+    parse_target as parse_target,
+    validate_model as validate_model,
 )
 from .colmap.sparse import KeypointRecord as KeypointRecord
-from .drivers.capture import reconstruct as reconstruct
-from .drivers.deblur import DeblurResult as DeblurResult, deblur_capture as deblur_capture
-from .drivers.project import reconstruct_project as reconstruct_project
-from .drivers.result import Fragment as Fragment, ModelResult as ModelResult, ReconstructResult as ReconstructResult
-from .errors import (
+from .core.errors import (
     AlreadyMetricError as AlreadyMetricError,
     FormatError as FormatError,
     InertialError as InertialError,
@@ -24,11 +18,41 @@ from .errors import (
     TargetNotFoundError as TargetNotFoundError,
     TimingError as TimingError,
 )
-from .export.whole import Exported as Exported, export_model as export_model
+from .core.options import (
+    BatchOptions as BatchOptions,
+    MappingOptions as MappingOptions,
+    ProjectOptions as ProjectOptions,
+    ReadLimits as ReadLimits,
+    ReconstructOptions as ReconstructOptions,
+    ScaleOptions as ScaleOptions,
+    StageNames as StageNames,
+    ValidateOptions as ValidateOptions,
+)
+from .core.types import (
+    AcceptedScale as AcceptedScale,
+    CameraImuCalibration as CameraImuCalibration,
+    CameraModel as CameraModel,
+    CameraTrajectory as CameraTrajectory,
+    Frame as Frame,
+    FrameLog as FrameLog,
+    FrameTiming as FrameTiming,
+    Gap as Gap,
+    ImuCalibration as ImuCalibration,
+    ImuNoise as ImuNoise,
+    ImuRecording as ImuRecording,
+    JoinedPart as JoinedPart,
+    Keypoints as Keypoints,
+    ScaleEstimate as ScaleEstimate,
+    Similarity as Similarity,
+    SmoothedTrajectory as SmoothedTrajectory,
+    Treatment as Treatment,
+)
 from .imaging.blur_field import BlurField as BlurField
 from .imaging.gyro_camera import FrameShutter as FrameShutter, GyroCamera as GyroCamera
 from .imaging.psf import blur_field as blur_field, frame_blur as frame_blur
 from .imaging.wiener import DeblurOptions as DeblurOptions, deblur as deblur
+from .inertial.rest import RestCalibration as RestCalibration, calibrate_imu as calibrate_imu
+from .inertial.scale import estimate_scale as estimate_scale, gravity_at_latitude_m_s2 as gravity_at_latitude_m_s2
 from .io.calibration import read_calibration as read_calibration, write_calibration as write_calibration
 from .io.capture import Capture as Capture, load_capture as load_capture
 from .io.frames import read_frame_times as read_frame_times, read_frames as read_frames
@@ -50,56 +74,40 @@ from .model import (
 )
 from .model.project import apply_to_project as apply_to_project, undo_project as undo_project
 from .model.similarities import ModelScale as ModelScale, read_scales as read_scales, read_similarity as read_similarity
-from .options import (
-    BatchOptions as BatchOptions,
-    MappingOptions as MappingOptions,
-    ProjectOptions as ProjectOptions,
-    ReadLimits as ReadLimits,
-    ReconstructOptions as ReconstructOptions,
-    ScaleOptions as ScaleOptions,
-    StageNames as StageNames,
-    ValidateOptions as ValidateOptions,
+from .motion.align import AlignOptions as AlignOptions, align_camera_imu as align_camera_imu
+from .motion.align.conventions import LikelyConvention as LikelyConvention, likely_convention as likely_convention
+from .motion.smooth import smooth_trajectory as smooth_trajectory
+from .pipeline.run.config import read_config as read_config
+from .pipeline.run.progress import Progress as Progress
+from .pipeline.stages.apertures import ApertureStage as ApertureStage
+from .pipeline.stages.deblur import DeblurStage as DeblurStage
+from .pipeline.stages.exposures import ExposureStage as ExposureStage
+from .pipeline.stages.frame_folder import FrameRecord as FrameRecord
+from .pipeline.stages.join import JoinStage as JoinStage
+from .pipeline.stages.metric import MetricStage as MetricStage
+from .pipeline.stages.protocols import (
+    FrameStage as FrameStage,
+    KeypointStage as KeypointStage,
+    ModelStage as ModelStage,
 )
-from .report import write_report as write_report
-from .rest import RestCalibration as RestCalibration, calibrate_imu as calibrate_imu
-from .run.config import read_config as read_config
-from .run.progress import Progress as Progress
-from .scale import estimate_scale as estimate_scale, gravity_at_latitude_m_s2 as gravity_at_latitude_m_s2
-from .smooth import smooth_trajectory as smooth_trajectory
-from .stages.apertures import ApertureStage as ApertureStage
-from .stages.deblur import DeblurStage as DeblurStage
-from .stages.exposures import ExposureStage as ExposureStage
-from .stages.frame_folder import FrameRecord as FrameRecord
-from .stages.join import JoinStage as JoinStage
-from .stages.metric import MetricStage as MetricStage
-from .stages.protocols import FrameStage as FrameStage, KeypointStage as KeypointStage, ModelStage as ModelStage
-from .stages.readout import ReadoutStage as ReadoutStage
-from .stages.refine import RefineStage as RefineStage
-from .stages.rolling_shutter import RollingShutterStage as RollingShutterStage
-from .types import (
-    AcceptedScale as AcceptedScale,
-    CameraImuCalibration as CameraImuCalibration,
-    CameraModel as CameraModel,
-    CameraTrajectory as CameraTrajectory,
-    Frame as Frame,
-    FrameLog as FrameLog,
-    FrameTiming as FrameTiming,
-    Gap as Gap,
-    ImuCalibration as ImuCalibration,
-    ImuNoise as ImuNoise,
-    ImuRecording as ImuRecording,
-    JoinedPart as JoinedPart,
-    Keypoints as Keypoints,
-    ScaleEstimate as ScaleEstimate,
-    Similarity as Similarity,
-    SmoothedTrajectory as SmoothedTrajectory,
-    Treatment as Treatment,
+from .pipeline.stages.readout import ReadoutStage as ReadoutStage
+from .pipeline.stages.refine import RefineStage as RefineStage
+from .pipeline.stages.rolling_shutter import RollingShutterStage as RollingShutterStage
+from .reconstruction.drivers.capture import reconstruct as reconstruct
+from .reconstruction.drivers.deblur import DeblurResult as DeblurResult, deblur_capture as deblur_capture
+from .reconstruction.drivers.project import reconstruct_project as reconstruct_project
+from .reconstruction.drivers.result import (
+    Fragment as Fragment,
+    ModelResult as ModelResult,
+    ReconstructResult as ReconstructResult,
 )
-from .validate import (
-    Target as Target,
-    Validation as Validation,
-    parse_target as parse_target,
-    validate_model as validate_model,
+from .tools.batch import (
+    BatchCapture as BatchCapture,
+    BatchResult as BatchResult,
+    CaptureStatus as CaptureStatus,
+    read_manifest as read_manifest,
+    run_batch as run_batch,
 )
+from .tools.export.whole import Exported as Exported, export_model as export_model
 
 __version__: str

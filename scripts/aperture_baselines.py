@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
+from colmap_inertial.core.options import ApertureOptions
+from colmap_inertial.core.types import Aperture, ApertureRig
+from colmap_inertial.imaging.multi_aperture import Disparity, Rectified, fuse_apertures, rectify
+from colmap_inertial.imaging.multi_aperture.disparity import background
+from colmap_inertial.imaging.multi_aperture.fusion import COLOURS, with_luminance
 from colmap_inertial.model import colmap_camera
-from colmap_inertial.multi_aperture import Disparity, Rectified, fuse_apertures, rectify
-from colmap_inertial.multi_aperture.disparity import background
-from colmap_inertial.multi_aperture.fusion import COLOURS, with_luminance
-from colmap_inertial.options import ApertureOptions
-from colmap_inertial.types import Aperture, ApertureRig
 
 Planes = list[NDArray[np.uint8]]
 

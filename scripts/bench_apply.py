@@ -25,7 +25,7 @@ from pathlib import Path
 
 import numpy as np
 
-from colmap_inertial.geometry import quat_exp
+from colmap_inertial.core.geometry import quat_exp
 
 WIDTH, HEIGHT = 2000, 1500
 CLOUD = [*((n, "<f4") for n in ("x", "y", "z", "nx", "ny", "nz")), *((n, "u1") for n in ("red", "green", "blue"))]

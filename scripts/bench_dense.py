@@ -34,12 +34,13 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from colmap_inertial.geometry import matrix_from_quat
+from colmap_inertial.core.geometry import matrix_from_quat
+from colmap_inertial.core.types import Array, CameraModel
 from colmap_inertial.io.files import read_json
 from colmap_inertial.model import read_model
 from colmap_inertial.model.depth_maps import read_map
-from colmap_inertial.run.workspace import Workspace
-from colmap_inertial.simulate import (
+from colmap_inertial.pipeline.run.workspace import Workspace
+from colmap_inertial.tools.simulate import (
     Scene,
     SceneRecipe,
     ShutterCamera,
@@ -49,8 +50,7 @@ from colmap_inertial.simulate import (
     read_truth,
     write_capture,
 )
-from colmap_inertial.simulate.truth import true_metres_per_unit
-from colmap_inertial.types import Array, CameraModel
+from colmap_inertial.tools.simulate.truth import true_metres_per_unit
 
 EXAMPLE = Path(__file__).resolve().parents[1] / "example_scenes" / "desk"
 SCENES = ("desk", "seed12", "seed13")

@@ -30,9 +30,9 @@ from rich.table import Table
 from simulated_exposures import Codes, Pair, pairs
 from turning_world import Turning
 
-from colmap_inertial.errors import NotObservableError
-from colmap_inertial.exposure_pairs import better_alone, bring_together
-from colmap_inertial.restoration import Network, load_network, lsd2
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.imaging.exposure_pairs import better_alone, bring_together
+from colmap_inertial.imaging.restoration import Network, load_network, lsd2
 
 ROOMS = ("room1", "room3", "room5")
 console = Console(stderr=True)

@@ -20,8 +20,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 import imu_files
 
+from colmap_inertial.core.types import ImuRecording
 from colmap_inertial.io.imu import read_imu
-from colmap_inertial.types import ImuRecording
 
 MINUTES, RATE_HZ = 10.0, 200.0
 

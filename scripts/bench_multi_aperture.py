@@ -56,14 +56,20 @@ from aperture_baselines import (
 )
 from numpy.typing import NDArray
 
-from colmap_inertial import semi_global
-from colmap_inertial.drivers.fuse_apertures import fuse_captured
-from colmap_inertial.multi_aperture import _volume as volume, estimate_disparity, fuse_apertures, fuse_with, plane_of
-from colmap_inertial.multi_aperture.disparity import Disparity
-from colmap_inertial.options import ApertureOptions, FuseAperturesOptions
-from colmap_inertial.simulate import MotionOptions, SceneRecipe, ShutterCamera, make_scene
-from colmap_inertial.simulate.aperture_array import write_aperture_capture
-from colmap_inertial.types import Aperture, ApertureRig, CameraModel
+from colmap_inertial.core.options import ApertureOptions, FuseAperturesOptions
+from colmap_inertial.core.types import Aperture, ApertureRig, CameraModel
+from colmap_inertial.imaging import semi_global
+from colmap_inertial.imaging.multi_aperture import (
+    _volume as volume,
+    estimate_disparity,
+    fuse_apertures,
+    fuse_with,
+    plane_of,
+)
+from colmap_inertial.imaging.multi_aperture.disparity import Disparity
+from colmap_inertial.reconstruction.drivers.fuse_apertures import fuse_captured
+from colmap_inertial.tools.simulate import MotionOptions, SceneRecipe, ShutterCamera, make_scene
+from colmap_inertial.tools.simulate.aperture_array import write_aperture_capture
 
 SECTIONS = ("antinous", "graph_cuts", "cones", "simulated", "cost")
 FLAT = np.array([0.0, 0.0, 0.0, 1.0])

@@ -57,7 +57,7 @@ from path_tables import print_report
 from rich.console import Console
 from rich.progress import track
 
-from colmap_inertial.options import BlurRemover
+from colmap_inertial.core.options import BlurRemover
 
 SECTIONS = ("quality", "gate", "sky", "false", "short", "cost")
 #: Lower ends of the bins of blur, px.

@@ -58,12 +58,12 @@ from restoration_tables import print_report
 from restoration_weights import checksums, use_weights
 from rich.console import Console
 
-from colmap_inertial.errors import InertialError
+from colmap_inertial.core.errors import InertialError
+from colmap_inertial.core.options import ReconstructOptions
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath
 from colmap_inertial.imaging.path_filters import path_wiener
-from colmap_inertial.options import ReconstructOptions
-from colmap_inertial.restoration import Network, deepgyro, load_network
+from colmap_inertial.imaging.restoration import Network, deepgyro, load_network
 
 FALSE_BLURS_PX = (10.0, 20.0)
 #: Frames so large where all has to go fast.

@@ -38,12 +38,12 @@ from linear_scale import estimate_linear
 from rich.console import Console
 from rich.progress import track
 
-from colmap_inertial.align import align_camera_imu
-from colmap_inertial.errors import NotObservableError
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.options import ScaleOptions
+from colmap_inertial.core.types import Array, CameraTrajectory, ImuRecording
+from colmap_inertial.inertial.scale import estimate_scale
 from colmap_inertial.io.trajectories import read_inertial_scale
-from colmap_inertial.options import ScaleOptions
-from colmap_inertial.scale import estimate_scale
-from colmap_inertial.types import Array, CameraTrajectory, ImuRecording
+from colmap_inertial.motion.align import align_camera_imu
 
 METHODS = ("joint", "spectral", "linear")
 SECONDS = (60.0, 30.0, 20.0, 10.0, 5.0)

@@ -38,7 +38,7 @@ from colmap_inertial.model import find_models, read_model, trajectory_from_model
 if TYPE_CHECKING:
     import pycolmap
 
-    from colmap_inertial.types import Array
+    from colmap_inertial.core.types import Array
 
 EVERY_S = 0.04
 #: Shares of points that two pictures must both show, and from how far apart in direction.

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from colmap_inertial.geometry import quat_rotate, slerp
+from colmap_inertial.core.geometry import quat_rotate, slerp
 from colmap_inertial.io.imu import read_imu
 from colmap_inertial.model import TRANSFORM_FILE, read_model
 

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import welch
 
-from colmap_inertial.geometry import quat_conjugate, quat_exp, quat_log, quat_multiply, slerp
-from colmap_inertial.simulate import MotionOptions, make_motion
+from colmap_inertial.core.geometry import quat_conjugate, quat_exp, quat_log, quat_multiply, slerp
+from colmap_inertial.tools.simulate import MotionOptions, make_motion
 
 RATE_HZ = 120.0
 MIN_PIECE_S = 8.6

@@ -14,7 +14,7 @@ import numpy as np
 
 from colmap_inertial.io.files import read_json
 from colmap_inertial.model import read_model
-from colmap_inertial.simulate.truth import read_truth, true_metres_per_unit
+from colmap_inertial.tools.simulate.truth import read_truth, true_metres_per_unit
 
 LARGEST_ERROR_PCT = 2.0
 

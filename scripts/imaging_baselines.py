@@ -16,9 +16,9 @@ from imaging_scenes import Grey, Light
 from numpy.typing import NDArray
 from scipy.signal import fftconvolve
 
+from colmap_inertial.core.types import Array
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.transfer import decode_table, srgb_from_linear
-from colmap_inertial.types import Array
 
 BLOCK_PX = 64
 #: Blocks of the iterative method, and what surrounds a block when it is transformed.

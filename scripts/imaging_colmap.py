@@ -14,18 +14,18 @@ from unittest.mock import patch
 import numpy as np
 from rich.console import Console
 
-from colmap_inertial.drivers.capture import reconstruct
-from colmap_inertial.errors import MappingError
-from colmap_inertial.geometry import matrix_from_quat
-from colmap_inertial.gyro import GyroPath
+from colmap_inertial.core.errors import MappingError
+from colmap_inertial.core.geometry import matrix_from_quat
+from colmap_inertial.core.gyro import GyroPath
+from colmap_inertial.core.options import ReconstructOptions
+from colmap_inertial.core.types import Array, CameraTrajectory, FrameTiming
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.imaging.psf import predicted_blur_px
 from colmap_inertial.model import colmap_camera, read_model
-from colmap_inertial.options import ReconstructOptions
-from colmap_inertial.precalibrate import plan
-from colmap_inertial.simulate import MotionOptions, SceneRecipe, make_scene, read_truth, write_capture
-from colmap_inertial.stages.deblur import MOST_SMOOTHING_PX, SMOOTHING, DeblurStage
-from colmap_inertial.types import Array, CameraTrajectory, FrameTiming
+from colmap_inertial.pipeline.stages.deblur import MOST_SMOOTHING_PX, SMOOTHING, DeblurStage
+from colmap_inertial.reconstruction.drivers.capture import reconstruct
+from colmap_inertial.reconstruction.precalibrate import plan
+from colmap_inertial.tools.simulate import MotionOptions, SceneRecipe, make_scene, read_truth, write_capture
 
 #: Share of the blur at which any blur is smoothed alike.
 _OF_ANY_BLUR = 1e9

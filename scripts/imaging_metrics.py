@@ -21,7 +21,7 @@ from imaging_scenes import Colour, Grey, Pair
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from colmap_inertial.types import Array
+from colmap_inertial.core.types import Array
 
 CORRECT_PX = 3.0
 STRONGEST = 1000

@@ -15,17 +15,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.geometry import matrix_from_quat, quat_exp
-from colmap_inertial.gyro import GyroPath
+from colmap_inertial.core.geometry import matrix_from_quat, quat_exp
+from colmap_inertial.core.gyro import GyroPath
+from colmap_inertial.core.types import Array, CameraModel, FrameTiming
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.psf import blur_field, predicted_blur_px
 from colmap_inertial.imaging.rolling_shutter import spread_nodes
 from colmap_inertial.imaging.transfer import linear_from_srgb, srgb_from_linear
-from colmap_inertial.simulate import Motion, MotionOptions, make_motion
-from colmap_inertial.simulate.render import colmap_camera
-from colmap_inertial.simulate.textures import MATERIALS
-from colmap_inertial.types import Array, CameraModel, FrameTiming
+from colmap_inertial.tools.simulate import Motion, MotionOptions, make_motion
+from colmap_inertial.tools.simulate.render import colmap_camera
+from colmap_inertial.tools.simulate.textures import MATERIALS
 
 Grey = NDArray[np.uint8]
 #: Codes of three channels, RGB.

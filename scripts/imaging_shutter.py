@@ -8,13 +8,13 @@ import numpy as np
 import pycolmap
 from imaging_scenes import CAM_FROM_IMU, GYRO_HZ, GYRO_NOISE_RAD_S, lens
 
-from colmap_inertial.geometry import matrix_from_quat
-from colmap_inertial.gyro import GyroPath
+from colmap_inertial.core.geometry import matrix_from_quat
+from colmap_inertial.core.gyro import GyroPath
+from colmap_inertial.core.types import Array
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.rolling_shutter import rectify_keypoints
-from colmap_inertial.simulate import Motion, MotionOptions, make_motion
-from colmap_inertial.simulate.render import colmap_camera
-from colmap_inertial.types import Array
+from colmap_inertial.tools.simulate import Motion, MotionOptions, make_motion
+from colmap_inertial.tools.simulate.render import colmap_camera
 
 READOUT_S, RATE_RAD_S, DURATION_S = 0.025, 1.0, 30.0
 #: Points that both frames see, their depths, and how well they are located.

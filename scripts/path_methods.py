@@ -15,16 +15,16 @@ from rich.console import Console
 from rich.progress import track
 from turning_world import TurningCamera
 
+from colmap_inertial.core.types import Projector
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.evidence import blur_evidence
 from colmap_inertial.imaging.gate import GateOptions, RecordingVerdict, judge_frame, judge_recording, keep_sharp
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.path_filters import half_quadratic, path_wiener, smoothed
 from colmap_inertial.imaging.psf import blur_field, blur_path
+from colmap_inertial.imaging.restoration import Network, deepgyro, load_network
 from colmap_inertial.imaging.wiener import DeblurOptions, deblur
-from colmap_inertial.restoration import Network, deepgyro, load_network
-from colmap_inertial.stages.deblur import MOST_SMOOTHING_PX, smoothing_for
-from colmap_inertial.types import Projector
+from colmap_inertial.pipeline.stages.deblur import MOST_SMOOTHING_PX, smoothing_for
 
 #: Costs are measured at these blurs, px, of a frame of this size.
 COSTS_PX, COST_SIZE = (10.0, 20.0, 40.0), (1920, 1080)

@@ -15,8 +15,8 @@ import numpy as np
 from recorded_orbits import hands, orbit
 from rich.console import Console
 
-from colmap_inertial.options import DeblurMethod, ReconstructOptions
-from colmap_inertial.simulate import SceneRecipe, capture
+from colmap_inertial.core.options import DeblurMethod, ReconstructOptions
+from colmap_inertial.tools.simulate import SceneRecipe, capture
 
 HELD_OUT = "room5"
 BLURS_PX = (10.0, 20.0)

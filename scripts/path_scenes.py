@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from restoration.photographs import photographs
 from turning_world import Array, Light, Moment, Turning, TurningCamera
 
-from colmap_inertial.geometry import quat_exp
-from colmap_inertial.gyro import GyroPath
+from colmap_inertial.core.geometry import quat_exp
+from colmap_inertial.core.gyro import GyroPath
+from colmap_inertial.core.types import CameraModel, Projector
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera, MotionErrors
 from colmap_inertial.imaging.transfer import srgb_from_linear
 from colmap_inertial.model import colmap_camera
-from colmap_inertial.types import CameraModel, Projector
 
 Grey = NDArray[np.uint8]
 #: What the package knows of a frame's motion: gyroscope, camera, shutter.

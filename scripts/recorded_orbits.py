@@ -10,8 +10,8 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 from turning_world import BODY_FROM_CAM, Array, Turning
 
-from colmap_inertial.simulate import Motion, MotionOptions, make_motion
-from colmap_inertial.simulate.motion import MARGIN_S
+from colmap_inertial.tools.simulate import Motion, MotionOptions, make_motion
+from colmap_inertial.tools.simulate.motion import MARGIN_S
 
 #: Slower than this a hand follows its subject, which the orbit does already; the simulator's begins there, too.
 _HAND_FROM_HZ = 0.5

@@ -20,7 +20,9 @@ from restoration_deblur import PERFECT, usual_errors
 from rich.console import Console
 from rich.progress import track
 
-from colmap_inertial.exposure_pairs import (
+from colmap_inertial.imaging import wiener
+from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.imaging.exposure_pairs import (
     ExposurePair,
     PairGyro,
     blur_seen_from_short,
@@ -29,14 +31,12 @@ from colmap_inertial.exposure_pairs import (
     fuse_mertens,
     gyro_shift,
 )
-from colmap_inertial.imaging import wiener
-from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.gyro_camera import FrameShutter
 from colmap_inertial.imaging.psf import blur_field
+from colmap_inertial.imaging.restoration import Network
+from colmap_inertial.imaging.restoration.lsd2 import fuse
 from colmap_inertial.imaging.transfer import srgb_from_linear
-from colmap_inertial.restoration import Network
-from colmap_inertial.restoration.lsd2 import fuse
-from colmap_inertial.simulate.render import colmap_camera
+from colmap_inertial.tools.simulate.render import colmap_camera
 
 SIZE = (960, 720)
 LONG_S = 0.06

@@ -14,8 +14,8 @@ from restoration_exposures import codes, expose
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath
 from colmap_inertial.imaging.path_filters import path_wiener
-from colmap_inertial.restoration import Network
-from colmap_inertial.restoration.lsd2 import fuse
+from colmap_inertial.imaging.restoration import Network
+from colmap_inertial.imaging.restoration.lsd2 import fuse
 
 CROP_PX, GAP_PX, TITLE_PX = 320, 6, 26
 BLURS_PX = (8.0, 14.0, 22.0, 30.0)

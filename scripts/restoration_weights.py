@@ -7,7 +7,7 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from colmap_inertial.restoration import shipped
+from colmap_inertial.imaging.restoration import shipped
 
 _NAMES = ("deepgyro", "lsd2")
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from colmap_inertial.simulate import SimulatedRecording
-from colmap_inertial.types import Array, ImuRecording
+from colmap_inertial.core.types import Array, ImuRecording
+from colmap_inertial.tools.simulate import SimulatedRecording
 
 Generator = np.random.Generator
 Fault = Callable[[SimulatedRecording, Generator], SimulatedRecording]

@@ -26,12 +26,12 @@ import bench_scale
 import numpy as np
 from bench_scale import Window
 
-from colmap_inertial.align import align_camera_imu
-from colmap_inertial.errors import NotObservableError
-from colmap_inertial.scale import _factors, _noise, _parameters, _setup, joint, priors
-from colmap_inertial.scale.priors import PRIORS
-from colmap_inertial.threads import one_blas_thread
-from colmap_inertial.types import Array, CameraImuCalibration
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.threads import one_blas_thread
+from colmap_inertial.core.types import Array, CameraImuCalibration
+from colmap_inertial.inertial.scale import _factors, _noise, _parameters, _setup, joint, priors
+from colmap_inertial.inertial.scale.priors import PRIORS
+from colmap_inertial.motion.align import align_camera_imu
 
 #: Windows by the name of their column: the first minute, and its twelfth parts.
 SCOPES = ("60 s", "parts")

@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 from turning_world import Array, Light, Moment, Turning, TurningCamera
 
-from colmap_inertial.exposure_pairs import PairGyro
-from colmap_inertial.gyro import GyroPath
+from colmap_inertial.core.gyro import GyroPath
+from colmap_inertial.core.types import CameraModel
+from colmap_inertial.imaging.exposure_pairs import PairGyro
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.transfer import linear_from_srgb, srgb_from_linear
 from colmap_inertial.model import colmap_camera
-from colmap_inertial.types import CameraModel
 
 Codes = NDArray[np.uint8]
 

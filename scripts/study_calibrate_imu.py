@@ -16,11 +16,11 @@ from pathlib import Path
 
 import numpy as np
 
-from colmap_inertial.errors import NotObservableError
-from colmap_inertial.rest import RestCalibration, calibrate_imu
-from colmap_inertial.scale.priors import PRIORS
-from colmap_inertial.simulate import RestOptions, SimulatedRests, simulate_rests
-from colmap_inertial.types import IMU_CAL, ImuRecording
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.types import IMU_CAL, ImuRecording
+from colmap_inertial.inertial.rest import RestCalibration, calibrate_imu
+from colmap_inertial.inertial.scale.priors import PRIORS
+from colmap_inertial.tools.simulate import RestOptions, SimulatedRests, simulate_rests
 
 DIAGONAL = np.array([0, 4, 8])
 BESIDE = np.array([1, 2, 3, 5, 6, 7])

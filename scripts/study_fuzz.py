@@ -34,7 +34,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from conftest import write_anew
 from fuzz_readers import READERS, Reader, mutant
 
-from colmap_inertial.errors import InertialError
+from colmap_inertial.core.errors import InertialError
 
 OUTCOMES = ("read", "refused", "foreign", "hung", "large", "died")
 #: Address space beside that of a process that has read a whole file, and processor time for one mutant.

@@ -34,22 +34,22 @@ import pycolmap
 from bench_scale import recordings_in
 from study_refine import adjusted
 
-from colmap_inertial.geometry import matrix_from_quat, quat_exp, so3_log
+from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, so3_log
+from colmap_inertial.core.options import JoinOptions, ScaleOptions
+from colmap_inertial.core.types import ImuRecording
+from colmap_inertial.inertial.join.judge import Ends, ends_of, join_parts
+from colmap_inertial.inertial.join.links import find_links
+from colmap_inertial.inertial.join.solve import Placed
+from colmap_inertial.inertial.join.values import Found, Part
+from colmap_inertial.inertial.scale.posterior import FittedPath
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.io.trajectories import read_inertial_scale
-from colmap_inertial.join.judge import Ends, ends_of, join_parts
-from colmap_inertial.join.links import find_links
-from colmap_inertial.join.solve import Placed
-from colmap_inertial.join.values import Found, Part
 from colmap_inertial.model import Model
-from colmap_inertial.options import JoinOptions, ScaleOptions
-from colmap_inertial.scale.posterior import FittedPath
-from colmap_inertial.simulate.motion import MotionOptions
-from colmap_inertial.simulate.tracks import TrackOptions, Tracks, simulate_tracks
-from colmap_inertial.stages.across import images_in_others
-from colmap_inertial.stages.join import JoinStage
-from colmap_inertial.stages.metric import MetricStage
-from colmap_inertial.types import ImuRecording
+from colmap_inertial.pipeline.stages.across import images_in_others
+from colmap_inertial.pipeline.stages.join import JoinStage
+from colmap_inertial.pipeline.stages.metric import MetricStage
+from colmap_inertial.tools.simulate.motion import MotionOptions
+from colmap_inertial.tools.simulate.tracks import TrackOptions, Tracks, simulate_tracks
 
 #: Seconds of each part; 95 % quantile of chi-square with three degrees of freedom.
 PART_S, CHI2_95 = 12.0, 7.815

@@ -18,15 +18,15 @@ from typing import get_args
 
 import numpy as np
 
-from colmap_inertial.errors import NotObservableError
-from colmap_inertial.flow import Tracks, VisualRotation
-from colmap_inertial.geometry import matrix_from_quat, quat_exp, quat_multiply
-from colmap_inertial.gyro import GyroPath
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, quat_multiply
+from colmap_inertial.core.gyro import GyroPath
+from colmap_inertial.core.types import Array, ReadoutDirection
 from colmap_inertial.imaging.gyro_camera import GyroCamera
-from colmap_inertial.shutter import ReadoutEstimate, estimate_readout
-from colmap_inertial.simulate import Motion, MotionOptions, make_motion
-from colmap_inertial.simulate.motion import MotionKind
-from colmap_inertial.types import Array, ReadoutDirection
+from colmap_inertial.motion.flow import Tracks, VisualRotation
+from colmap_inertial.motion.shutter import ReadoutEstimate, estimate_readout
+from colmap_inertial.tools.simulate import Motion, MotionOptions, make_motion
+from colmap_inertial.tools.simulate.motion import MotionKind
 
 #: Focal length as a share of the width, height as one; corners of a pair, and how well they are seen.
 FOCAL, ASPECT, CORNERS, CORNER_PX, LONG_SIDE_PX, WRONG, WRONG_PX = 0.8, 0.75, 60, 0.2, 640, 0.05, 5.0

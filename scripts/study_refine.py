@@ -37,12 +37,11 @@ import pycolmap
 from check_euroc import similarity
 
 from colmap_inertial.colmap.mapping import map_images
-from colmap_inertial.geometry import matrix_from_quat, quat_exp, quat_multiply, so3_log
-from colmap_inertial.io.calibration import Declared, calibration_prior
-from colmap_inertial.model import Model
-from colmap_inertial.options import MappingOptions
-from colmap_inertial.refine.motion import moving
-from colmap_inertial.refine.setup import (
+from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, quat_multiply, so3_log
+from colmap_inertial.core.options import MappingOptions
+from colmap_inertial.core.types import CAL, CameraImuCalibration, ImuRecording
+from colmap_inertial.inertial.refine.motion import moving
+from colmap_inertial.inertial.refine.setup import (
     at_middle_lines,
     make_problem,
     measured_noise,
@@ -50,18 +49,19 @@ from colmap_inertial.refine.setup import (
     read_seen,
     with_noise,
 )
-from colmap_inertial.refine.solve import factored, solve
-from colmap_inertial.refine.values import Estimate, Problem
-from colmap_inertial.run.context import RunContext
-from colmap_inertial.scale.priors import PRIORS
-from colmap_inertial.simulate.motion import MotionOptions
-from colmap_inertial.simulate.tracks import TrackOptions, Tracks, simulate_tracks
-from colmap_inertial.stages.gyro_view import GyroView
-from colmap_inertial.stages.metric import MetricStage
-from colmap_inertial.stages.readout import ReadoutStage
-from colmap_inertial.stages.refine import RefineStage
-from colmap_inertial.stages.rolling_shutter import RollingShutterStage
-from colmap_inertial.types import CAL, CameraImuCalibration, ImuRecording
+from colmap_inertial.inertial.refine.solve import factored, solve
+from colmap_inertial.inertial.refine.values import Estimate, Problem
+from colmap_inertial.inertial.scale.priors import PRIORS
+from colmap_inertial.io.calibration import Declared, calibration_prior
+from colmap_inertial.model import Model
+from colmap_inertial.pipeline.run.context import RunContext
+from colmap_inertial.pipeline.stages.gyro_view import GyroView
+from colmap_inertial.pipeline.stages.metric import MetricStage
+from colmap_inertial.pipeline.stages.readout import ReadoutStage
+from colmap_inertial.pipeline.stages.refine import RefineStage
+from colmap_inertial.pipeline.stages.rolling_shutter import RollingShutterStage
+from colmap_inertial.tools.simulate.motion import MotionOptions
+from colmap_inertial.tools.simulate.tracks import TrackOptions, Tracks, simulate_tracks
 
 #: Of an IMU that is late.
 LATE_S = 0.03

@@ -44,13 +44,15 @@ import numpy as np
 from scale_bound import BoundPriors, bound_of
 from scale_faults import FAULTS
 
-from colmap_inertial.geometry import quat_conjugate, quat_exp, quat_multiply, quat_normalize
+from colmap_inertial.core.geometry import quat_conjugate, quat_exp, quat_multiply, quat_normalize
+from colmap_inertial.core.threads import one_blas_thread
+from colmap_inertial.core.types import CameraTrajectory
+from colmap_inertial.inertial.scale import estimate_scale
+from colmap_inertial.inertial.scale._noise import TYPICAL
+from colmap_inertial.inertial.scale.priors import PRIORS, model_scale_sigma
+from colmap_inertial.inertial.scale.verdict import WEAK_HALF_WIDTH, half_width
 from colmap_inertial.io.calibration import ACCEL_MINUS_GYRO_OFFSET_S
-from colmap_inertial.scale import estimate_scale
-from colmap_inertial.scale._noise import TYPICAL
-from colmap_inertial.scale.priors import PRIORS, model_scale_sigma
-from colmap_inertial.scale.verdict import WEAK_HALF_WIDTH, half_width
-from colmap_inertial.simulate import (
+from colmap_inertial.tools.simulate import (
     IMU_PRESETS,
     MotionOptions,
     RecordingOptions,
@@ -58,8 +60,6 @@ from colmap_inertial.simulate import (
     SimulatedRecording,
     simulate_recording,
 )
-from colmap_inertial.threads import one_blas_thread
-from colmap_inertial.types import CameraTrajectory
 
 PARTS = ("handheld", "short", "stressed", "unobservable", "faulty")
 #: Those whose scale could be known.

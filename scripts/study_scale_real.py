@@ -25,10 +25,10 @@ import numpy as np
 from capture_gains import calibration_by
 from real_imu import HANDHELD, RECORDINGS, Window, recorded, windows
 
-from colmap_inertial.scale import estimate_scale
-from colmap_inertial.scale.verdict import Z95
-from colmap_inertial.threads import one_blas_thread
-from colmap_inertial.types import ImuCalibration
+from colmap_inertial.core.quantiles import Z95
+from colmap_inertial.core.threads import one_blas_thread
+from colmap_inertial.core.types import ImuCalibration
+from colmap_inertial.inertial.scale import estimate_scale
 
 LENGTHS_S = (np.inf, 20.0, 10.0, 5.0, 3.0)
 NOISES_M = (0.0, 0.0005, 0.002, 0.005)

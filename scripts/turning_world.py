@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from colmap_inertial.simulate import MotionOptions, make_motion
+from colmap_inertial.tools.simulate import MotionOptions, make_motion
 
 Array = NDArray[np.float64]
 Light = NDArray[np.float32]

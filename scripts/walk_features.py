@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 from walk_scenes import Walk, motion_of, places_m, world_of
 
-from colmap_inertial.geometry import matrix_from_quat
+from colmap_inertial.core.geometry import matrix_from_quat
+from colmap_inertial.core.types import Array
 from colmap_inertial.model import colmap_camera
-from colmap_inertial.simulate import Quad, World
-from colmap_inertial.types import Array
+from colmap_inertial.tools.simulate import Quad, World
 
 #: Features for each square metre of a poster, and of a wall or floor.
 POSTER_PER_M2, WALL_PER_M2 = 90.0, 25.0

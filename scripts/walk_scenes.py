@@ -15,9 +15,10 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from colmap_inertial.geometry import quat_exp, quat_from_matrix, quat_multiply
+from colmap_inertial.core.geometry import quat_exp, quat_from_matrix, quat_multiply
+from colmap_inertial.core.types import Array, CameraModel
 from colmap_inertial.io.files import write_json, write_text
-from colmap_inertial.simulate import (
+from colmap_inertial.tools.simulate import (
     IMU_PRESETS,
     Board,
     Motion,
@@ -31,8 +32,7 @@ from colmap_inertial.simulate import (
     sample_imu,
     textures,
 )
-from colmap_inertial.simulate.motion import MARGIN_S
-from colmap_inertial.types import Array, CameraModel
+from colmap_inertial.tools.simulate.motion import MARGIN_S
 
 #: Half the room, and from the walls to the path, whose corners are rounded.
 HALF_M, AISLE_M, HEIGHT_M = np.array([5.0, 4.0]), 1.8, 2.6

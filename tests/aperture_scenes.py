@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from colmap_inertial.core.types import Aperture, ApertureRig, CameraModel
 from colmap_inertial.model import colmap_camera
-from colmap_inertial.types import Aperture, ApertureRig, CameraModel
 
 FLAT = np.array([0.0, 0.0, 0.0, 1.0])
 ROLES = ("green", "red", "blue", "luminance")

@@ -13,8 +13,8 @@ import numpy as np
 import pycolmap
 from conftest import write_project
 
-from colmap_inertial.geometry import matrix_from_quat, quat_rotate
-from colmap_inertial.simulate import (
+from colmap_inertial.core.geometry import matrix_from_quat, quat_rotate
+from colmap_inertial.tools.simulate import (
     MotionOptions,
     RecordingOptions,
     SfmOptions,

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from colmap_inertial.simulate import MotionOptions, RecordingOptions, SimulatedRecording, simulate_recording
-from colmap_inertial.threads import one_blas_thread
+from colmap_inertial.core.threads import one_blas_thread
+from colmap_inertial.tools.simulate import MotionOptions, RecordingOptions, SimulatedRecording, simulate_recording
 
 #: Files of the quick tier: each takes a few seconds at most.
 QUICK = Path(__file__).with_name("quick.txt").read_text().split()
@@ -90,7 +90,7 @@ class _Errors(logging.Handler):
 def report_failures():
     """What went wrong with reports, which a run survives; a test that means it to happen empties the list."""
     handler = _Errors()
-    logger = logging.getLogger("colmap_inertial.drivers.reporting")
+    logger = logging.getLogger("colmap_inertial.reconstruction.drivers.reporting")
     logger.addHandler(handler)
     yield handler.messages
     logger.removeHandler(handler)

@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 from far_scene import CAM_FROM_IMU, rays_of, srgb
 
-from colmap_inertial.geometry import matrix_from_quat
+from colmap_inertial.core.geometry import matrix_from_quat
+from colmap_inertial.core.types import CameraModel
 from colmap_inertial.imaging.gyro_camera import FrameShutter
-from colmap_inertial.simulate import Motion, MotionOptions, make_motion
-from colmap_inertial.simulate.render import colmap_camera
-from colmap_inertial.simulate.textures import poster
-from colmap_inertial.types import CameraModel
+from colmap_inertial.tools.simulate import Motion, MotionOptions, make_motion
+from colmap_inertial.tools.simulate.render import colmap_camera
+from colmap_inertial.tools.simulate.textures import poster
 
 LENS = CameraModel(model="PINHOLE", width=400, height=300, params=(340, 340, 200, 150))
 #: Planes as the axis that they stand on and where; the IMU's clock against the camera's.

@@ -11,14 +11,14 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from colmap_inertial.geometry import matrix_from_quat, quat_exp
-from colmap_inertial.gyro import GyroPath
+from colmap_inertial.core.geometry import matrix_from_quat, quat_exp
+from colmap_inertial.core.gyro import GyroPath
+from colmap_inertial.core.types import CameraModel
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.rolling_shutter import spread_nodes
 from colmap_inertial.imaging.transfer import srgb_from_linear
 from colmap_inertial.model import colmap_camera
-from colmap_inertial.simulate import Motion, MotionOptions, make_motion
-from colmap_inertial.types import CameraModel
+from colmap_inertial.tools.simulate import Motion, MotionOptions, make_motion
 
 CAM_FROM_IMU = quat_exp(np.array([0.3, -2.1, 0.8]))
 SHORT_S, LONG_S, READOUT_S, DELAY_S = 0.004, 0.06, 0.02, 0.045

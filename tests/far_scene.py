@@ -6,12 +6,12 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from colmap_inertial.geometry import matrix_from_quat, quat_exp
-from colmap_inertial.gyro import GyroPath
+from colmap_inertial.core.geometry import matrix_from_quat, quat_exp
+from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
-from colmap_inertial.simulate import Motion, MotionOptions, make_motion
-from colmap_inertial.simulate.render import colmap_camera
-from colmap_inertial.simulate.textures import poster
+from colmap_inertial.tools.simulate import Motion, MotionOptions, make_motion
+from colmap_inertial.tools.simulate.render import colmap_camera
+from colmap_inertial.tools.simulate.textures import poster
 
 CAM_FROM_IMU = quat_exp(np.array([0.3, -2.1, 0.8]))
 

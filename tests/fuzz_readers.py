@@ -17,8 +17,9 @@ import test_io_fuzz
 from test_io_recorders import FRAME_NS, LAYOUTS, at_one_clock, recorded
 from test_multi_aperture_io import kalibr_text
 
-from colmap_inertial.batch.manifest import read_manifest
-from colmap_inertial.errors import InertialError
+from colmap_inertial.checks.report import write_report
+from colmap_inertial.core.errors import InertialError
+from colmap_inertial.core.options import ReconstructOptions
 from colmap_inertial.io.calibration import read_calibration
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.exif import stamps_of_exif
@@ -31,14 +32,13 @@ from colmap_inertial.io.trajectories import read_inertial_scale
 from colmap_inertial.model import read_model
 from colmap_inertial.model.project import apply_to_project, undo_project
 from colmap_inertial.model.similarities import plain_factor, read_scales, read_similarity
-from colmap_inertial.options import ReconstructOptions
-from colmap_inertial.report import write_report
-from colmap_inertial.run.config import read_config
-from colmap_inertial.simulate.recipe import load_recipe, recipe_text
-from colmap_inertial.simulate.truth import read_truth
-from colmap_inertial.view.clouds import dense_cloud, read_mesh
-from colmap_inertial.view.images import read_preview
-from colmap_inertial.view.scene import load_scene
+from colmap_inertial.pipeline.run.config import read_config
+from colmap_inertial.tools.batch.manifest import read_manifest
+from colmap_inertial.tools.simulate.recipe import load_recipe, recipe_text
+from colmap_inertial.tools.simulate.truth import read_truth
+from colmap_inertial.tools.view.clouds import dense_cloud, read_mesh
+from colmap_inertial.tools.view.images import read_preview
+from colmap_inertial.tools.view.scene import load_scene
 
 SCENE = Path(__file__).resolve().parents[1] / "example_scenes" / "desk"
 #: What a size, count, offset or measure may say instead.
@@ -211,7 +211,7 @@ def _read_jsons(folder: Path) -> None:
 
 
 def _tomls(folder: Path) -> list[Path]:
-    from colmap_inertial.run.config import config_as_toml
+    from colmap_inertial.pipeline.run.config import config_as_toml
 
     (folder / "config.toml").write_text(config_as_toml(ReconstructOptions()))
     (folder / "manifest.toml").write_text(

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from colmap_inertial.types import ImuRecording
+from colmap_inertial.core.types import ImuRecording
 
 GRAVITY_M_S2 = 9.80665
 

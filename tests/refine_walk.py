@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from colmap_inertial.core.types import CameraModel, ImuNoise
+from colmap_inertial.inertial.refine.setup import Known, Seen, make_problem, read_seen
+from colmap_inertial.inertial.refine.values import Estimate, Problem
 from colmap_inertial.io.calibration import calibration_prior
-from colmap_inertial.refine.setup import Known, Seen, make_problem, read_seen
-from colmap_inertial.refine.values import Estimate, Problem
-from colmap_inertial.simulate.motion import MotionOptions
-from colmap_inertial.simulate.tracks import TrackOptions, Tracks, simulate_tracks
-from colmap_inertial.types import CameraModel, ImuNoise
+from colmap_inertial.tools.simulate.motion import MotionOptions
+from colmap_inertial.tools.simulate.tracks import TrackOptions, Tracks, simulate_tracks
 
 PINHOLE = CameraModel(model="PINHOLE", width=1280, height=960, params=(1000.0, 990.0, 640.0, 480.0))
 

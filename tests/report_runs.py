@@ -9,15 +9,15 @@ import cv2
 import numpy as np
 import pycolmap
 
-from colmap_inertial.geometry import quat_rotate
+from colmap_inertial.checks.report.content import CROPS_FOLDER, DATA_FOLDER
+from colmap_inertial.checks.report.photogrammetry import photogrammetry_record
+from colmap_inertial.checks.report.scene import scene_record
+from colmap_inertial.checks.report.signals import signal_record
+from colmap_inertial.core.geometry import quat_rotate
+from colmap_inertial.core.types import Similarity
+from colmap_inertial.inertial.scale import estimate_scale
 from colmap_inertial.io.files import write_json
-from colmap_inertial.report.content import CROPS_FOLDER, DATA_FOLDER
-from colmap_inertial.report.photogrammetry import photogrammetry_record
-from colmap_inertial.report.scene import scene_record
-from colmap_inertial.report.signals import signal_record
-from colmap_inertial.scale import estimate_scale
-from colmap_inertial.simulate import MotionOptions, RecordingOptions, simulate_recording
-from colmap_inertial.types import Similarity
+from colmap_inertial.tools.simulate import MotionOptions, RecordingOptions, simulate_recording
 
 #: What a user may call things, and what a page must not run.
 HOSTILE = '<script>alert("x")</script><img src=x onerror=alert(1)> "quotes" & \'more\' 蜂🐝'
@@ -53,7 +53,7 @@ def recorded(*, kind: str = "orbit", duration_s: float = 20.0, seed: int = 3):
 
 
 def _turned(trajectory, similarity):
-    from colmap_inertial.geometry import quat_conjugate, quat_multiply
+    from colmap_inertial.core.geometry import quat_conjugate, quat_multiply
 
     return quat_multiply(trajectory.cam_from_world_xyzw, quat_conjugate(similarity.rotation_xyzw))
 

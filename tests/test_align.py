@@ -6,9 +6,8 @@ import numpy as np
 import pycolmap
 import pytest
 
-from colmap_inertial.align import AlignOptions, _fit as fit, align_camera_imu, align_clocks
-from colmap_inertial.errors import NotObservableError
-from colmap_inertial.geometry import (
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.geometry import (
     matrix_from_quat,
     quat_conjugate,
     quat_cumulative,
@@ -18,12 +17,13 @@ from colmap_inertial.geometry import (
     quat_multiply,
     quat_normalize,
 )
-from colmap_inertial.gyro import GyroPath, on_camera_rate
+from colmap_inertial.core.gyro import GyroPath, on_camera_rate
+from colmap_inertial.core.types import CameraTrajectory, ImuRecording, clock_shift_s
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.io.imu import read_imu
 from colmap_inertial.io.trajectories import read_inertial_scale
-from colmap_inertial.simulate import ImuOptions, MotionOptions, RecordingOptions, SfmOptions, simulate_recording
-from colmap_inertial.types import CameraTrajectory, ImuRecording, clock_shift_s
+from colmap_inertial.motion.align import AlignOptions, _fit as fit, align_camera_imu, align_clocks
+from colmap_inertial.tools.simulate import ImuOptions, MotionOptions, RecordingOptions, SfmOptions, simulate_recording
 
 RECORDINGS = ("D1", "D3", "D5", "D7", "D9", "D11", "D13", "D15")
 #: Errors as wide as the estimator states them: gain 1 %, axes 0.5 %.

@@ -18,14 +18,14 @@ import pycolmap
 import pytest
 from batch_captures import TINY, model_bytes, tiny_capture
 
-from colmap_inertial.batch import BatchCapture, needs_gpu, read_manifest, run_batch
-from colmap_inertial.batch.pools import available_memory, shares_of_this_machine
-from colmap_inertial.batch.task import CaptureStatus, read_status
 from colmap_inertial.cli import main, parse
-from colmap_inertial.drivers.capture import reconstruct
-from colmap_inertial.errors import FormatError, InertialError, MissingExtraError, OutputExistsError
-from colmap_inertial.options import BatchOptions, ReconstructOptions
-from colmap_inertial.run.config import config_as_toml
+from colmap_inertial.core.errors import FormatError, InertialError, MissingExtraError, OutputExistsError
+from colmap_inertial.core.options import BatchOptions, ReconstructOptions
+from colmap_inertial.pipeline.run.config import config_as_toml
+from colmap_inertial.reconstruction.drivers.capture import reconstruct
+from colmap_inertial.tools.batch import BatchCapture, needs_gpu, read_manifest, run_batch
+from colmap_inertial.tools.batch.pools import available_memory, shares_of_this_machine
+from colmap_inertial.tools.batch.task import CaptureStatus, read_status
 
 
 def table(out: Path) -> dict[str, dict[str, str]]:
@@ -41,7 +41,7 @@ def processes_of(out: Path) -> list[int]:
             command = (folder / "cmdline").read_bytes()
         except (OSError, ValueError):
             continue
-        if folder.name.isdigit() and b"colmap_inertial.batch.process" in command and str(out).encode() in command:
+        if folder.name.isdigit() and b"colmap_inertial.tools.batch.process" in command and str(out).encode() in command:
             found.append(int(folder.name))
     return found
 
@@ -158,14 +158,14 @@ def test_impossible_values_are_refused(capsys, tmp_path, flags):
 
 def test_workers_share_the_processors(monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(8)))
-    monkeypatch.setattr("colmap_inertial.batch.pools.available_memory", lambda: 64 * 2**30)
+    monkeypatch.setattr("colmap_inertial.tools.batch.pools.available_memory", lambda: 64 * 2**30)
     assert shares_of_this_machine(3) == [[0, 3, 6], [1, 4, 7], [2, 5]]
     assert shares_of_this_machine(100) == [[i] for i in range(8)]
     assert len(shares_of_this_machine(100, 2)) == 2
     assert shares_of_this_machine(100, 10)[8:] == [[0], [1]]
-    monkeypatch.setattr("colmap_inertial.batch.pools.available_memory", lambda: 7 * 2**30)
+    monkeypatch.setattr("colmap_inertial.tools.batch.pools.available_memory", lambda: 7 * 2**30)
     assert shares_of_this_machine(100) == [[0], [1]]
-    monkeypatch.setattr("colmap_inertial.batch.pools.available_memory", lambda: 0)
+    monkeypatch.setattr("colmap_inertial.tools.batch.pools.available_memory", lambda: 0)
     assert shares_of_this_machine(100) == [[0]]
 
 
@@ -366,7 +366,7 @@ def test_a_scheduler_that_does_not_answer_is_said(monkeypatch, manifest, tmp_pat
 
 
 def test_a_worker_that_does_not_see_the_files_says_so(tmp_path):
-    from colmap_inertial.batch.task import CaptureTask, run_capture
+    from colmap_inertial.tools.batch.task import CaptureTask, run_capture
 
     gone = tmp_path / "gone"
     task = CaptureTask(
@@ -383,7 +383,7 @@ def test_what_ran_out_is_said_in_a_sentence(tmp_path, monkeypatch):
         future.set_exception(OSError(errno.EMFILE, "Too many open files"))
         return future
 
-    monkeypatch.setattr("colmap_inertial.batch.pools._Local.submit", refused)
+    monkeypatch.setattr("colmap_inertial.tools.batch.pools._Local.submit", refused)
     (tmp_path / "m.toml").write_text('[[capture]]\npath = "none"\n')
     (end,) = run_batch(tmp_path / "m.toml", tmp_path / "out").captures
     said = "no worker could finish it: too many files are open at a time: raise the limit (ulimit -n) and start again"

@@ -9,19 +9,19 @@ from pathlib import Path
 import pytest
 from batch_captures import FRAMES, TINY, model_bytes, tiny_capture
 
-from colmap_inertial.batch import BatchCapture, read_manifest, run_batch
-from colmap_inertial.batch.task import CaptureStatus
 from colmap_inertial.cli import main
-from colmap_inertial.errors import FormatError, InertialError
-from colmap_inertial.options import StageNames
-from colmap_inertial.run.config import config_as_toml
-from colmap_inertial.stages.named import load_stages
+from colmap_inertial.core.errors import FormatError, InertialError
+from colmap_inertial.core.options import StageNames
+from colmap_inertial.pipeline.run.config import config_as_toml
+from colmap_inertial.pipeline.stages.named import load_stages
+from colmap_inertial.tools.batch import BatchCapture, read_manifest, run_batch
+from colmap_inertial.tools.batch.task import CaptureStatus
 
 MODULE = '''
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
-from colmap_inertial.types import Treatment
+from colmap_inertial.core.types import Treatment
 
 number = 3
 

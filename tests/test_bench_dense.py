@@ -10,12 +10,12 @@ import pytest
 
 from colmap_inertial.colmap.fusion import fuse_maps
 from colmap_inertial.colmap.swept import SweptWorkspace
-from colmap_inertial.geometry import matrix_from_quat, so3_exp
+from colmap_inertial.core.geometry import matrix_from_quat, so3_exp
+from colmap_inertial.core.types import CameraModel
 from colmap_inertial.io.files import write_json
 from colmap_inertial.model.depth_maps import write_map
-from colmap_inertial.simulate import MotionOptions, SceneRecipe, ShutterCamera, develop, make_scene
-from colmap_inertial.simulate.capture import _truth
-from colmap_inertial.types import CameraModel
+from colmap_inertial.tools.simulate import MotionOptions, SceneRecipe, ShutterCamera, develop, make_scene
+from colmap_inertial.tools.simulate.capture import _truth
 
 SCRIPTS = str(Path(__file__).parents[1] / "scripts")
 sys.path.insert(0, SCRIPTS)

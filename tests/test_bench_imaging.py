@@ -20,8 +20,8 @@ from bench_imaging import kept_share, treated, verdict_on
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.rolling_shutter import rectify_keypoints
 from colmap_inertial.imaging.wiener import deblur
-from colmap_inertial.simulate import SceneRecipe
-from colmap_inertial.simulate.render import colmap_camera
+from colmap_inertial.tools.simulate import SceneRecipe
+from colmap_inertial.tools.simulate.render import colmap_camera
 
 SIZE = (640, 360)
 

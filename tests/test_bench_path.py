@@ -23,7 +23,7 @@ from rich.console import Console
 from turning_world import Moment, Turning, TurningCamera
 
 from colmap_inertial.imaging.psf import blur_path
-from colmap_inertial.simulate import MotionOptions, make_motion
+from colmap_inertial.tools.simulate import MotionOptions, make_motion
 
 SIZE = (480, 270)
 

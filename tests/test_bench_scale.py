@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from colmap_inertial.align import align_camera_imu
-from colmap_inertial.errors import NotObservableError
-from colmap_inertial.scale import first_seconds
-from colmap_inertial.simulate import ImuOptions, MotionOptions, RecordingOptions, SfmOptions, simulate_recording
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.inertial.scale import first_seconds
+from colmap_inertial.motion.align import align_camera_imu
+from colmap_inertial.tools.simulate import ImuOptions, MotionOptions, RecordingOptions, SfmOptions, simulate_recording
 
 SCRIPTS = Path(__file__).parents[1] / "scripts"
 STILL = {
@@ -127,7 +127,7 @@ def test_the_table_holds_all_methods_beside_the_published_figures(shared_data, t
 def test_every_constant_whose_sensitivity_is_studied_acts_on_the_estimate():
     from scale_sensitivity import Setting, applied, changed_calibration, constants
 
-    from colmap_inertial.scale.joint import estimate_joint
+    from colmap_inertial.inertial.scale.joint import estimate_joint
 
     sfm = SfmOptions(rotation_correlated_rad=0.004, correlation_s=1.5)
     s = simulate_recording(RecordingOptions(motion=MotionOptions(duration_s=8.0), sfm=sfm), seed=5)

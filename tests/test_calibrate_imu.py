@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from colmap_inertial import calibrate_imu, estimate_scale, gravity_at_latitude_m_s2
-from colmap_inertial.errors import NotObservableError
-from colmap_inertial.rest._rests import candidate_rests
-from colmap_inertial.simulate import RecordingOptions, RestOptions, simulate_recording, simulate_rests
-from colmap_inertial.simulate.sensors import IMU_PRESETS
-from colmap_inertial.types import IMU_CAL, IMU_CALIBRATION_PARAMETERS, ImuCalibration, ImuRecording
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.types import IMU_CAL, IMU_CALIBRATION_PARAMETERS, ImuCalibration, ImuRecording
+from colmap_inertial.inertial.rest._rests import candidate_rests
+from colmap_inertial.tools.simulate import RecordingOptions, RestOptions, simulate_recording, simulate_rests
+from colmap_inertial.tools.simulate.sensors import IMU_PRESETS
 
 ROOT = Path(__file__).parents[1]
 GAINS, BESIDE = np.array([0, 4, 8]), np.array([3, 6, 7])

@@ -202,7 +202,7 @@ def test_align_writes_a_calibration_that_scale_takes_as_a_prior(capsys, project,
 def test_a_refusal_writes_its_reasons_and_exits_3(capsys, project, tmp_path):
     from conftest import write_project
 
-    from colmap_inertial.simulate import MotionOptions, RecordingOptions, simulate_recording
+    from colmap_inertial.tools.simulate import MotionOptions, RecordingOptions, simulate_recording
 
     still = simulate_recording(RecordingOptions(motion=MotionOptions(kind="static", duration_s=20)), seed=2)
     files = write_project(tmp_path / "still", still)
@@ -221,7 +221,7 @@ def test_a_refusal_writes_its_reasons_and_exits_3(capsys, project, tmp_path):
 def test_the_imu_of_another_recording_is_refused(capsys, project, tmp_path):
     from conftest import write_project
 
-    from colmap_inertial.simulate import RecordingOptions, simulate_recording
+    from colmap_inertial.tools.simulate import RecordingOptions, simulate_recording
 
     other = write_project(tmp_path / "other", simulate_recording(RecordingOptions(), seed=77))
     target = tmp_path / "scale.json"

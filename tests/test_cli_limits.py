@@ -8,7 +8,7 @@ import pytest
 
 from colmap_inertial.cli import limits, main
 from colmap_inertial.cli.models import Scale
-from colmap_inertial.threads import usable_processors
+from colmap_inertial.core.threads import usable_processors
 
 LIMITED = """
 import resource, sys

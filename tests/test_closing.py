@@ -174,8 +174,8 @@ def test_the_mapper_s_model_is_the_joined_one_where_the_order_in_time_is_known(t
     import pycolmap
 
     from colmap_inertial.colmap import mapping
-    from colmap_inertial.options import MappingOptions
-    from colmap_inertial.run.context import RunContext
+    from colmap_inertial.core.options import MappingOptions
+    from colmap_inertial.pipeline.run.context import RunContext
 
     ring = make(tmp_path)
     asked = []
@@ -220,8 +220,8 @@ def test_pairs_far_apart_in_time_are_believed_where_somebody_looked(tmp_path, mo
     import pycolmap
 
     from colmap_inertial.colmap import mapping
-    from colmap_inertial.options import MappingOptions
-    from colmap_inertial.run.context import RunContext
+    from colmap_inertial.core.options import MappingOptions
+    from colmap_inertial.pipeline.run.context import RunContext
 
     ring = make(tmp_path)
     asked = []

@@ -10,12 +10,12 @@ import pytest
 
 from colmap_inertial import PoseConvention, likely_convention
 from colmap_inertial.cli import main
-from colmap_inertial.geometry import quat_conjugate, quat_rotate, so3_exp
+from colmap_inertial.core.geometry import quat_conjugate, quat_rotate, so3_exp
+from colmap_inertial.core.types import ImuRecording
 from colmap_inertial.io.pose_convention import COLMAP, TUM, reread
 from colmap_inertial.io.trajectories import read_inertial_scale, read_tum, write_tum
-from colmap_inertial.simulate.motion import MotionKind, MotionOptions
-from colmap_inertial.simulate.recording import RecordingOptions, SimulatedRecording, simulate_recording
-from colmap_inertial.types import ImuRecording
+from colmap_inertial.tools.simulate.motion import MotionKind, MotionOptions
+from colmap_inertial.tools.simulate.recording import RecordingOptions, SimulatedRecording, simulate_recording
 
 RECORDINGS = ("D1", "D3", "D5", "D7", "D9", "D11", "D13", "D15")
 EVERY = (TUM, *TUM.others())

@@ -13,11 +13,11 @@ import pytest
 from conftest import Project
 from far_scene import CAM_FROM_IMU, FarScene
 
+from colmap_inertial.checks.diagnose import Diagnosis, FramesInVideo, Recorded, diagnose
 from colmap_inertial.cli import main
-from colmap_inertial.diagnose import Diagnosis, FramesInVideo, Recorded, diagnose
-from colmap_inertial.errors import NotObservableError
-from colmap_inertial.flow import measure_rotation
-from colmap_inertial.geometry import quat_conjugate, quat_exp, quat_multiply, quat_rotate, so3_exp
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.geometry import quat_conjugate, quat_exp, quat_multiply, quat_rotate, so3_exp
+from colmap_inertial.core.types import CameraModel, CameraTrajectory, Frame, FrameLog, FrameTiming, ImuRecording
 from colmap_inertial.imaging.gyro_camera import FrameShutter
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.io.capture import load_capture
@@ -25,12 +25,12 @@ from colmap_inertial.io.frames import read_frame_times
 from colmap_inertial.io.imu import read_capture_imu, read_imu
 from colmap_inertial.io.trajectories import read_inertial_scale
 from colmap_inertial.model import Model, read_model
-from colmap_inertial.precalibrate.preflight import stop_or_doubt
-from colmap_inertial.simulate.motion import MotionKind, MotionOptions
-from colmap_inertial.simulate.recording import RecordingOptions, SimulatedRecording, simulate_recording
-from colmap_inertial.simulate.render import colmap_camera
-from colmap_inertial.stages.metric import MetricStage
-from colmap_inertial.types import CameraModel, CameraTrajectory, Frame, FrameLog, FrameTiming, ImuRecording
+from colmap_inertial.motion.flow import measure_rotation
+from colmap_inertial.pipeline.stages.metric import MetricStage
+from colmap_inertial.reconstruction.precalibrate.preflight import stop_or_doubt
+from colmap_inertial.tools.simulate.motion import MotionKind, MotionOptions
+from colmap_inertial.tools.simulate.recording import RecordingOptions, SimulatedRecording, simulate_recording
+from colmap_inertial.tools.simulate.render import colmap_camera
 
 HANDHELD = [f"D{i}" for i in (1, 3, 5, 7, 9, 11, 13, 15)]
 #: Those whose camera is altered, and how much of them.

@@ -23,18 +23,12 @@ from report_runs import write_run
 from test_pipeline import copy_scene
 
 import colmap_inertial
-from colmap_inertial.batch import read_manifest
+from colmap_inertial.checks.report import write_report
 from colmap_inertial.cli import main, parse
 from colmap_inertial.colmap.dense import DenseResult
-from colmap_inertial.drivers.capture import reconstruct
-from colmap_inertial.drivers.result import (
-    Fragment,
-    ModelResult,
-    ReconstructResult,
-    frame_as_json,
-    imaging_as_json,
-)
-from colmap_inertial.errors import MappingError
+from colmap_inertial.core.errors import MappingError
+from colmap_inertial.core.options import ReconstructOptions
+from colmap_inertial.core.types import CameraModel, FrameTiming, Treatment
 from colmap_inertial.imaging.gate import RecordingVerdict
 from colmap_inertial.imaging.parallax import Parallax
 from colmap_inertial.imaging.selection import Chosen
@@ -45,14 +39,20 @@ from colmap_inertial.io.files import write_json
 from colmap_inertial.io.frames import read_frame_times
 from colmap_inertial.io.imu import read_capture_imu
 from colmap_inertial.io.imu_formats import imu_formats
-from colmap_inertial.options import ReconstructOptions
-from colmap_inertial.precalibrate.plan import ImagingPlan
-from colmap_inertial.precalibrate.selection import Selection
-from colmap_inertial.report import write_report
-from colmap_inertial.run.config import config_as_toml
-from colmap_inertial.stages.frame_folder import FrameRecord
-from colmap_inertial.stages.gyro_view import GyroView
-from colmap_inertial.types import CameraModel, FrameTiming, Treatment
+from colmap_inertial.pipeline.run.config import config_as_toml
+from colmap_inertial.pipeline.stages.frame_folder import FrameRecord
+from colmap_inertial.pipeline.stages.gyro_view import GyroView
+from colmap_inertial.reconstruction.drivers.capture import reconstruct
+from colmap_inertial.reconstruction.drivers.result import (
+    Fragment,
+    ModelResult,
+    ReconstructResult,
+    frame_as_json,
+    imaging_as_json,
+)
+from colmap_inertial.reconstruction.precalibrate.plan import ImagingPlan
+from colmap_inertial.reconstruction.precalibrate.selection import Selection
+from colmap_inertial.tools.batch import read_manifest
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "scripts"))
@@ -425,7 +425,7 @@ def test_every_reason_in_the_text_is_one_that_is_printed():
     table = page[page.index("| reason (in part)") :].split("\n\n")[0]
     texts = [
         text
-        for folder in ("scale", "align", "run", "stages", "colmap", "precalibrate", "drivers")
+        for folder in ("inertial", "motion", "pipeline", "colmap", "reconstruction")
         for text in said(ROOT / "colmap_inertial" / folder)
     ]
     phrases = [

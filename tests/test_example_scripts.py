@@ -9,7 +9,7 @@ import pytest
 from batch_captures import TINY, tiny_capture
 
 from colmap_inertial.model import read_model
-from colmap_inertial.run.config import config_as_toml
+from colmap_inertial.pipeline.run.config import config_as_toml
 
 SCRIPTS = Path(__file__).parents[1] / "scripts"
 

@@ -25,25 +25,31 @@ import pytest
 from trainer_readers import READERS, deblur_fork, inria, nerfstudio_data, ply
 
 from colmap_inertial.cli import main, parse
-from colmap_inertial.errors import FormatError, MissingExtraError, NotObservableError, OutputError, OutputExistsError
-from colmap_inertial.export.names import flat_names
-from colmap_inertial.export.pictures import _is_plain
-from colmap_inertial.export.pinhole_model import needed_cameras, pinhole_model
-from colmap_inertial.export.points import write_las
-from colmap_inertial.export.programs import PROGRAMS
-from colmap_inertial.export.source import ExportSource, Picture
-from colmap_inertial.export.transforms import Exposure, with_velocities
-from colmap_inertial.export.undistort import Undistortion
-from colmap_inertial.export.whole import _notes_on, export_model
-from colmap_inertial.geometry import matrix_from_quat
+from colmap_inertial.core.errors import (
+    FormatError,
+    MissingExtraError,
+    NotObservableError,
+    OutputError,
+    OutputExistsError,
+)
+from colmap_inertial.core.geometry import matrix_from_quat
+from colmap_inertial.core.options import ExportProgram
+from colmap_inertial.core.types import ScaleEstimate, Similarity
 from colmap_inertial.io.ply import read_ply_header
 from colmap_inertial.model import read_model, write_model
 from colmap_inertial.model.nerf import EXPORT_FORMAT, NOT_METRES, transform_export
 from colmap_inertial.model.project import apply_to_project, undo_project
 from colmap_inertial.model.similarities import plain_factor, undoing
-from colmap_inertial.options import ExportProgram
-from colmap_inertial.types import ScaleEstimate, Similarity
-from colmap_inertial.view.sources import ScaleFacts, ViewSource
+from colmap_inertial.tools.export.names import flat_names
+from colmap_inertial.tools.export.pictures import _is_plain
+from colmap_inertial.tools.export.pinhole_model import needed_cameras, pinhole_model
+from colmap_inertial.tools.export.points import write_las
+from colmap_inertial.tools.export.programs import PROGRAMS
+from colmap_inertial.tools.export.source import ExportSource, Picture
+from colmap_inertial.tools.export.transforms import Exposure, with_velocities
+from colmap_inertial.tools.export.undistort import Undistortion
+from colmap_inertial.tools.export.whole import _notes_on, export_model
+from colmap_inertial.tools.view.sources import ScaleFacts, ViewSource
 
 METRIC = Similarity(
     scale=1.0,
@@ -552,8 +558,8 @@ def rolling(tmp_path_factory):
     """A hand that films a room's corner with 30 ms of readout, through a whole run: (scene, out)."""
     from corner_scene import CALIBRATED, CornerScene
 
-    from colmap_inertial.drivers.capture import reconstruct
-    from colmap_inertial.options import MappingOptions, ReconstructOptions
+    from colmap_inertial.core.options import MappingOptions, ReconstructOptions
+    from colmap_inertial.reconstruction.drivers.capture import reconstruct
 
     root = tmp_path_factory.mktemp("rolling")
     scene = CornerScene.make(exposure_s=0.004, readout_s=0.03)

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from exposure_scenes import COLOURS, GAIN, STEP_PX, codes, make_scene, psnr_db
 
-from colmap_inertial.errors import NotObservableError
-from colmap_inertial.exposure_pairs import (
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.imaging.exposure_pairs import (
     PairGyro,
     blur_seen_from_short,
     brightened,
@@ -17,7 +18,6 @@ from colmap_inertial.exposure_pairs import (
     gyro_shift,
     match_brightness,
 )
-from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.psf import blur_field
 from colmap_inertial.imaging.transfer import linear_from_srgb
 from colmap_inertial.model import colmap_camera

@@ -16,11 +16,7 @@ from jsonschema import Draft202012Validator
 from test_pipeline import contents
 
 from colmap_inertial.cli import main
-from colmap_inertial.drivers import capture as driver, fuse_exposures
-from colmap_inertial.drivers.capture import reconstruct
-from colmap_inertial.drivers.deblur import deblur_capture
-from colmap_inertial.drivers.fuse_exposures import fuse_exposures_captured
-from colmap_inertial.errors import (
+from colmap_inertial.core.errors import (
     FormatError,
     InertialError,
     MissingExtraError,
@@ -29,15 +25,19 @@ from colmap_inertial.errors import (
     OutputExistsError,
     TimingError,
 )
+from colmap_inertial.core.options import ExposureOptions, ReconstructOptions
+from colmap_inertial.imaging.restoration import shipped
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.frames import read_frame_timing, read_frames
-from colmap_inertial.options import ExposureOptions, ReconstructOptions
-from colmap_inertial.precalibrate import plan
-from colmap_inertial.restoration import shipped
-from colmap_inertial.run.progress import silent
-from colmap_inertial.run.workspace import Workspace
-from colmap_inertial.stages import frame_folder
-from colmap_inertial.stages.exposures import ExposureStage, Fuser
+from colmap_inertial.pipeline.run.progress import silent
+from colmap_inertial.pipeline.run.workspace import Workspace
+from colmap_inertial.pipeline.stages import frame_folder
+from colmap_inertial.pipeline.stages.exposures import ExposureStage, Fuser
+from colmap_inertial.reconstruction.drivers import capture as driver, fuse_exposures
+from colmap_inertial.reconstruction.drivers.capture import reconstruct
+from colmap_inertial.reconstruction.drivers.deblur import deblur_capture
+from colmap_inertial.reconstruction.drivers.fuse_exposures import fuse_exposures_captured
+from colmap_inertial.reconstruction.precalibrate import plan
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -478,7 +478,7 @@ def test_a_missing_partner_or_network_is_said_before_the_work(capture, tmp_path,
     def missing(*args, **options):
         raise MissingExtraError("restore", "networks run in onnxruntime")
 
-    monkeypatch.setattr("colmap_inertial.stages.exposures.load_network", missing)
+    monkeypatch.setattr("colmap_inertial.pipeline.stages.exposures.load_network", missing)
     for command in ("reconstruct", "fuse-exposures"):
         with pytest.raises(SystemExit) as end:
             main([command, str(capture), str(tmp_path / "out")])

@@ -15,8 +15,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 from simulated_exposures import TEXTURES, pairs
 from turning_world import Turning
 
-from colmap_inertial.exposure_pairs import better_alone, bring_together, first_brightness
-from colmap_inertial.restoration import load_network, lsd2
+from colmap_inertial.imaging.exposure_pairs import better_alone, bring_together, first_brightness
+from colmap_inertial.imaging.restoration import load_network, lsd2
 
 SEED, WIDTH = 3, 240
 

@@ -60,7 +60,7 @@ def test_a_fault_leaves_no_half_result_and_is_told_in_a_sentence(whole, tmp_path
 HELD = """
 import mmap, os, resource, sys
 from colmap_inertial.cli import limits, main
-from colmap_inertial.threads import usable_processors
+from colmap_inertial.core.threads import usable_processors
 
 kind, left = sys.argv[1], int(sys.argv[2])
 if kind == "files":

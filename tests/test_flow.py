@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from far_scene import FarScene
 
-from colmap_inertial.align import AlignOptions, align_camera_imu
-from colmap_inertial.errors import NotObservableError
-from colmap_inertial.flow import FlowOptions, check_motion, find_stabilisation, measure_rotation
-from colmap_inertial.geometry import matrix_from_quat, quat_conjugate, quat_log, quat_multiply
-from colmap_inertial.gyro import GyroPath
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_log, quat_multiply
+from colmap_inertial.core.gyro import GyroPath
+from colmap_inertial.core.types import CameraModel, Frame, FrameTiming, ImuRecording
 from colmap_inertial.imaging.gyro_camera import FrameShutter
-from colmap_inertial.shutter import estimate_readout
-from colmap_inertial.simulate.render import colmap_camera
-from colmap_inertial.types import CameraModel, Frame, FrameTiming, ImuRecording
+from colmap_inertial.motion.align import AlignOptions, align_camera_imu
+from colmap_inertial.motion.flow import FlowOptions, check_motion, find_stabilisation, measure_rotation
+from colmap_inertial.motion.shutter import estimate_readout
+from colmap_inertial.tools.simulate.render import colmap_camera
 
 LENS = CameraModel(model="OPENCV", width=320, height=240, params=(250, 252, 161, 119, 0.12, -0.2, 0.001, -0.0005))
 FISHEYE = CameraModel(model="OPENCV_FISHEYE", width=320, height=240, params=(140, 140, 161, 119, 0.02, -0.01, 0, 0))

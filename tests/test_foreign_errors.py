@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from report_runs import write_run
 
-from colmap_inertial.batch import read_manifest
+from colmap_inertial.checks.report import write_report
 from colmap_inertial.cli import main
-from colmap_inertial.errors import FormatError
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.options import ReconstructOptions
 from colmap_inertial.io.ply import transform_ply
 from colmap_inertial.model.database import transform_database
 from colmap_inertial.model.similarities import plain_factor
-from colmap_inertial.options import ReconstructOptions
-from colmap_inertial.report import write_report
-from colmap_inertial.run.config import read_config
+from colmap_inertial.pipeline.run.config import read_config
+from colmap_inertial.tools.batch import read_manifest
 
 
 @pytest.mark.parametrize("count", ["1e999", "inf", "-inf", "nan", "1e300", "-1", "300", "1_0"])
@@ -121,9 +121,9 @@ LIMITED = """
 import resource, sys
 from pathlib import Path
 from colmap_inertial.colmap.sparse import extract_features
-from colmap_inertial.errors import OutputError
-from colmap_inertial.options import MappingOptions
-from colmap_inertial.run.context import RunContext
+from colmap_inertial.core.errors import OutputError
+from colmap_inertial.core.options import MappingOptions
+from colmap_inertial.pipeline.run.context import RunContext
 folder = Path(sys.argv[1])
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), resource.RLIM_INFINITY))
 context = RunContext(scratch=folder, num_threads=1)

@@ -10,7 +10,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
 from study_fuzz import outcome, whole_files
 
-from colmap_inertial.errors import FormatError
+from colmap_inertial.core.errors import FormatError
 
 MUTANTS = 12
 

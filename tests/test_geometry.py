@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from colmap_inertial import geometry as g
+from colmap_inertial.core import geometry as g
 
 RNG = np.random.default_rng(1)
 VECTORS = np.concatenate([RNG.normal(size=(200, 3)), 1e-10 * RNG.normal(size=(5, 3)), np.zeros((1, 3))])

@@ -12,11 +12,10 @@ import pytest
 from box_project import shared_box
 from test_io_recorders import recorded
 
-from colmap_inertial.drivers.georeference import located, path_at, read_georeference
-from colmap_inertial.drivers.project import reconstruct_project
-from colmap_inertial.errors import FormatError, NotObservableError
-from colmap_inertial.export.whole import export_model
-from colmap_inertial.georeference import (
+from colmap_inertial.core.errors import FormatError, NotObservableError
+from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
+from colmap_inertial.core.types import CameraTrajectory, PositionFixes
+from colmap_inertial.inertial.georeference import (
     Georeference,
     ecef_from_enu,
     ecef_of_geodetic,
@@ -25,8 +24,9 @@ from colmap_inertial.georeference import (
 )
 from colmap_inertial.io.positions import positions_in_pictures, positions_in_video
 from colmap_inertial.model import read_model
-from colmap_inertial.options import ProjectOptions, ReconstructOptions
-from colmap_inertial.types import CameraTrajectory, PositionFixes
+from colmap_inertial.reconstruction.drivers.georeference import located, path_at, read_georeference
+from colmap_inertial.reconstruction.drivers.project import reconstruct_project
+from colmap_inertial.tools.export.whole import export_model
 
 UP = np.array([0.0, 0.0, 1.0])
 

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from colmap_inertial.errors import NotObservableError
-from colmap_inertial.geometry import quat_rotate
-from colmap_inertial.gravity import gravity_in_cam, up_in_imu
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.geometry import quat_rotate
+from colmap_inertial.core.gravity import gravity_in_cam, up_in_imu
+from colmap_inertial.core.types import FrameTiming, ImuRecording
 from colmap_inertial.io.calibration import calibration_prior
-from colmap_inertial.simulate import RecordingOptions, simulate_recording
-from colmap_inertial.types import FrameTiming, ImuRecording
+from colmap_inertial.tools.simulate import RecordingOptions, simulate_recording
 
 
 def true_down_in_cam(recording):

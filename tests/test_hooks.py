@@ -10,7 +10,7 @@ import pytest
 from test_pipeline import DETERMINISTIC, contents, copy_scene
 
 from colmap_inertial import Frame, Keypoints, Model, ReconstructOptions, Treatment, reconstruct, write_calibration
-from colmap_inertial.stages.protocols import with_defaults
+from colmap_inertial.pipeline.stages.protocols import with_defaults
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +118,7 @@ def test_what_a_visitor_s_keypoint_stage_did_is_what_the_result_says(capture, tm
 
 
 def test_doubts_are_enforced_after_the_stages_whoever_wrote_them(capture, bare, tmp_path, monkeypatch):
-    from colmap_inertial.drivers import capture as driver
+    from colmap_inertial.reconstruction.drivers import capture as driver
 
     monkeypatch.setattr(driver, "stop_or_doubt", lambda diagnosis, force: ("the video was stabilised",))
     _, plain, _ = bare

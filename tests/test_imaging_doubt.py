@@ -8,8 +8,8 @@ from far_scene import FarScene
 from references.path_filters import Frequencies, doubt_of, transfer_of
 from test_imaging_psf import CAM_FROM_IMU, PINHOLE, turning
 
-from colmap_inertial.geometry import quat_exp, quat_multiply
-from colmap_inertial.gyro import GyroPath
+from colmap_inertial.core.geometry import quat_exp, quat_multiply
+from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath, middles
 from colmap_inertial.imaging.gate import MOST_UNSURE, RecordingVerdict, deblur_gated
@@ -18,7 +18,7 @@ from colmap_inertial.imaging.path_filters import path_wiener
 from colmap_inertial.imaging.psf import blur_field, blur_path
 from colmap_inertial.imaging.transfer import srgb_from_linear
 from colmap_inertial.io.calibration import Declared, calibration_prior
-from colmap_inertial.simulate.render import colmap_camera
+from colmap_inertial.tools.simulate.render import colmap_camera
 
 CAMERA = colmap_camera(PINHOLE)
 SHUTTER = FrameShutter(width=640, height=480, t_s=2.4, exposure_s=0.03, readout_s=0.0)

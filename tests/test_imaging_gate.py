@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from far_scene import FarScene
 
-from colmap_inertial.geometry import matrix_from_quat
-from colmap_inertial.gyro import GyroPath
+from colmap_inertial.core.geometry import matrix_from_quat
+from colmap_inertial.core.gyro import GyroPath
+from colmap_inertial.core.types import CameraModel
 from colmap_inertial.imaging import evidence
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath, middles
@@ -27,8 +28,7 @@ from colmap_inertial.imaging.gate import (
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.psf import PredictedBlur, blur_field
 from colmap_inertial.imaging.rolling_shutter import rectify_keypoints
-from colmap_inertial.simulate.render import colmap_camera
-from colmap_inertial.types import CameraModel
+from colmap_inertial.tools.simulate.render import colmap_camera
 
 WIDTH, HEIGHT = 800, 450
 LENS = CameraModel(

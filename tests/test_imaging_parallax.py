@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from test_imaging_psf import LENS, PINHOLE, STEPS, room, shutter_of, turning
 
-from colmap_inertial.geometry import matrix_from_quat
-from colmap_inertial.gyro import GyroPath
+from colmap_inertial.core.geometry import matrix_from_quat
+from colmap_inertial.core.gyro import GyroPath
+from colmap_inertial.core.types import FrameTiming
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.parallax import Parallax, parallax_from_points
 from colmap_inertial.imaging.psf import blur_field, predicted_blur_px
-from colmap_inertial.simulate import MotionOptions, make_motion
-from colmap_inertial.simulate.render import ShutterCamera, colmap_camera
-from colmap_inertial.types import FrameTiming
+from colmap_inertial.tools.simulate import MotionOptions, make_motion
+from colmap_inertial.tools.simulate.render import ShutterCamera, colmap_camera
 
 VELOCITY = np.array([0.3, -0.1, 0.4])
 

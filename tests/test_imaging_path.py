@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from test_imaging_psf import LENS, handheld, room, shutter_of
 
-from colmap_inertial.errors import NotObservableError
-from colmap_inertial.gyro import GyroPath
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath
 from colmap_inertial.imaging.parallax import Parallax
@@ -17,7 +17,7 @@ from colmap_inertial.imaging.path_filters import half_quadratic, path_wiener
 from colmap_inertial.imaging.psf import blur_field, blur_path
 from colmap_inertial.imaging.rolling_shutter import rays, seen_by_lines
 from colmap_inertial.imaging.transfer import srgb_from_linear
-from colmap_inertial.simulate.render import ShutterCamera, colmap_camera
+from colmap_inertial.tools.simulate.render import ShutterCamera, colmap_camera
 
 MODEL = replace(LENS, width=320, height=240, params=(300, 302, 161, 119, 0.12, -0.2, 0.001, -0.0005))
 #: When the hand of this seed turns in a bend.

@@ -7,15 +7,15 @@ import cv2
 import numpy as np
 import pytest
 
-from colmap_inertial.errors import NotObservableError
-from colmap_inertial.geometry import matrix_from_quat, quat_exp
-from colmap_inertial.gyro import GyroPath
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.geometry import matrix_from_quat, quat_exp
+from colmap_inertial.core.gyro import GyroPath
+from colmap_inertial.core.types import CameraModel, FrameTiming, ImuRecording
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.psf import blur_field, predicted_blur_px
 from colmap_inertial.io.calibration import Declared, calibration_prior
-from colmap_inertial.simulate import MotionOptions, make_motion, make_world
-from colmap_inertial.simulate.render import Renderer, ShutterCamera, colmap_camera
-from colmap_inertial.types import CameraModel, FrameTiming, ImuRecording
+from colmap_inertial.tools.simulate import MotionOptions, make_motion, make_world
+from colmap_inertial.tools.simulate.render import Renderer, ShutterCamera, colmap_camera
 
 PINHOLE = CameraModel(model="PINHOLE", width=640, height=480, params=(500.0, 510.0, 330.0, 235.0))
 LENS = CameraModel(model="OPENCV", width=640, height=480, params=(500, 504, 322, 237, 0.12, -0.2, 0.001, -0.0005))

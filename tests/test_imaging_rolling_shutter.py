@@ -8,12 +8,12 @@ import pytest
 from test_imaging_psf import FISHEYE, LENS, PINHOLE, handheld, room, shutter_of, turning
 from versions import version_of
 
-from colmap_inertial.errors import NotObservableError
-from colmap_inertial.geometry import matrix_from_quat
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.geometry import matrix_from_quat
+from colmap_inertial.core.types import FrameTiming
 from colmap_inertial.imaging.gyro_camera import FrameShutter
 from colmap_inertial.imaging.rolling_shutter import rectify_image, rectify_keypoints
-from colmap_inertial.simulate.render import ShutterCamera, colmap_camera, develop
-from colmap_inertial.types import FrameTiming
+from colmap_inertial.tools.simulate.render import ShutterCamera, colmap_camera, develop
 
 POINTS = np.random.default_rng(1).uniform([5, 5], [635, 475], (300, 2))
 

@@ -9,20 +9,20 @@ import pytest
 from corner_scene import CALIBRATED, LENS, PLANES, CornerScene
 from test_imaging_psf import PINHOLE, turning
 
-from colmap_inertial.drivers.deblur import deblur_capture
-from colmap_inertial.geometry import quat_exp, quat_from_matrix, quat_multiply
+from colmap_inertial.core.geometry import quat_exp, quat_from_matrix, quat_multiply
+from colmap_inertial.core.types import Frame, FrameTiming
 from colmap_inertial.imaging.gyro_camera import FrameShutter
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.frames import read_frames
 from colmap_inertial.io.imu import read_capture_imu
 from colmap_inertial.model import colmap_camera
-from colmap_inertial.precalibrate import plan as imaging, sliding as looked_at
-from colmap_inertial.precalibrate.plan import Treatments, plan_imaging
-from colmap_inertial.run.context import Recording, RunContext, prior_calibration
-from colmap_inertial.run.progress import silent
-from colmap_inertial.simulate.motion import MARGIN_S, Motion
-from colmap_inertial.slide import FollowedPair, follow_pairs
-from colmap_inertial.types import Frame, FrameTiming
+from colmap_inertial.motion.slide import FollowedPair, follow_pairs
+from colmap_inertial.pipeline.run.context import Recording, RunContext, prior_calibration
+from colmap_inertial.pipeline.run.progress import silent
+from colmap_inertial.reconstruction.drivers.deblur import deblur_capture
+from colmap_inertial.reconstruction.precalibrate import plan as imaging, sliding as looked_at
+from colmap_inertial.reconstruction.precalibrate.plan import Treatments, plan_imaging
+from colmap_inertial.tools.simulate.motion import MARGIN_S, Motion
 
 FRAMES, EXPOSURE_S = 18, 0.025
 #: From the wall, and to and fro along it: a metre a second at the quickest.

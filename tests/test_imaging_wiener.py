@@ -22,7 +22,7 @@ from colmap_inertial.imaging._taps import Prior, TapTable, optimal_taps
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.transfer import linear_from_srgb, srgb_from_linear
 from colmap_inertial.imaging.wiener import DeblurOptions, deblur, estimate_noise
-from colmap_inertial.simulate.textures import poster
+from colmap_inertial.tools.simulate.textures import poster
 
 HEIGHT, WIDTH = 240, 336
 INSTRUCTION_SETS = _wiener.instruction_sets()

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from colmap_inertial.errors import FormatError
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.types import CALIBRATION_PARAMETERS, CameraImuCalibration
 from colmap_inertial.io.calibration import (
     Declared,
     calibration_prior,
@@ -16,7 +17,6 @@ from colmap_inertial.io.calibration import (
     read_calibration,
     write_calibration,
 )
-from colmap_inertial.types import CALIBRATION_PARAMETERS, CameraImuCalibration
 
 
 def known() -> CameraImuCalibration:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from test_io_imu import HEADER, handheld, rows, write_csv
 
-from colmap_inertial.errors import FormatError
+from colmap_inertial.core.errors import FormatError
 from colmap_inertial.io.calibration import Declared, calibration_prior, write_calibration
 from colmap_inertial.io.capture import ImageFolder, Video, load_capture
 from colmap_inertial.io.capture_tables import CAMERA_MODELS, ImuPath, ImuTables

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from colmap_inertial.errors import FormatError, OutputError, OutputExistsError
+from colmap_inertial.core.errors import FormatError, OutputError, OutputExistsError
 from colmap_inertial.io.files import locked, read_json, write_json, write_text
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from conftest import write_anew
 
-from colmap_inertial.errors import FormatError, TimingError
+from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.frames import frame_source, read_frame_times, read_frame_timing, read_frames
 from colmap_inertial.io.images import SUFFIXES, read_image

@@ -13,7 +13,7 @@ from test_io_frames import picture
 from test_io_imu import HEADER, handheld, rows
 from test_io_video import write_video
 
-from colmap_inertial.errors import InertialError
+from colmap_inertial.core.errors import InertialError
 from colmap_inertial.io.calibration import Declared, calibration_prior, read_calibration, write_calibration
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.frames import read_frame_times, read_frames

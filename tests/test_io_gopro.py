@@ -10,13 +10,13 @@ import pytest
 from test_io_recorders import recorded
 from test_io_video import write_video
 
-from colmap_inertial.errors import FormatError
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.types import FrameLog, ImuRecording
 from colmap_inertial.io.frames import read_frame_timing
 from colmap_inertial.io.gpmf import entries, spread
 from colmap_inertial.io.imu import read_frame_log, read_imu
 from colmap_inertial.io.mp4 import read_movie
 from colmap_inertial.io.video import video_stamps_ns
-from colmap_inertial.types import FrameLog, ImuRecording
 
 
 @pytest.fixture(scope="module")
@@ -135,8 +135,8 @@ def test_max_says_readout_exposure_and_stabilisation(max_heromode: Path) -> None
 
 
 def test_max_s_gravity_and_orientation_are_in_the_axes_of_its_imu(max_heromode: Path) -> None:
-    from colmap_inertial.geometry import quat_conjugate, quat_log, quat_multiply
-    from colmap_inertial.gyro import GyroPath
+    from colmap_inertial.core.geometry import quat_conjugate, quat_log, quat_multiply
+    from colmap_inertial.core.gyro import GyroPath
 
     imu, log = read_imu(max_heromode), log_of(max_heromode)
     assert log.up_in_imu is not None and log.start_from_imu_xyzw is not None
@@ -157,10 +157,10 @@ def test_max_s_gravity_and_orientation_are_in_the_axes_of_its_imu(max_heromode: 
 def test_karma_turns_as_its_gyroscope_says(karma: Path) -> None:
     import pycolmap
 
-    from colmap_inertial.flow import measure_rotation
-    from colmap_inertial.geometry import quat_conjugate, quat_log, quat_multiply
-    from colmap_inertial.gyro import GyroPath
+    from colmap_inertial.core.geometry import quat_conjugate, quat_log, quat_multiply
+    from colmap_inertial.core.gyro import GyroPath
     from colmap_inertial.io.frames import read_frames
+    from colmap_inertial.motion.flow import measure_rotation
 
     timing, frames = read_frames(karma)
     # the drone hovers until the last second, and turns in it

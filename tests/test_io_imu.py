@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from colmap_inertial.errors import FormatError, TimingError
+from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.io.imu import read_imu
 
 HEADER = "#timestamp [ns],w_x [rad s^-1],w_y [rad s^-1],w_z [rad s^-1],a_x [m s^-2],a_y [m s^-2],a_z [m s^-2]"

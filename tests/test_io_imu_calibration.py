@@ -12,9 +12,9 @@ from jsonschema import Draft202012Validator
 
 from colmap_inertial import calibrate_imu
 from colmap_inertial.cli import main, parse
-from colmap_inertial.drivers import remembered
-from colmap_inertial.drivers.remembered import configuration_folder, remember, remembered_of
-from colmap_inertial.errors import FormatError, OutputError
+from colmap_inertial.core.errors import FormatError, OutputError
+from colmap_inertial.core.options import ReconstructOptions
+from colmap_inertial.core.types import ImuCalibration, ImuRecording
 from colmap_inertial.io.calibration import calibration_prior, read_calibration, write_calibration
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.imu import read_imu
@@ -24,11 +24,11 @@ from colmap_inertial.io.imu_calibration import (
     read_imu_calibration,
     write_imu_calibration,
 )
-from colmap_inertial.options import ReconstructOptions
-from colmap_inertial.run.config import config_as_toml, read_config
-from colmap_inertial.run.context import corrected_imu, prior_calibration
-from colmap_inertial.simulate import RestOptions, simulate_rests
-from colmap_inertial.types import ImuCalibration, ImuRecording
+from colmap_inertial.pipeline.run.config import config_as_toml, read_config
+from colmap_inertial.pipeline.run.context import corrected_imu, prior_calibration
+from colmap_inertial.reconstruction.drivers import remembered
+from colmap_inertial.reconstruction.drivers.remembered import configuration_folder, remember, remembered_of
+from colmap_inertial.tools.simulate import RestOptions, simulate_rests
 
 ROOT = Path(__file__).parents[1]
 

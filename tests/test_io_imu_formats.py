@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from test_io_imu import handheld
 
-from colmap_inertial.errors import FormatError, TimingError
+from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.io import imu_formats as formats
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.imu import read_imu
@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from colmap_inertial.io.imu_formats import ImuFormat
-from colmap_inertial.types import ImuRecording
+from colmap_inertial.core.types import ImuRecording
 
 
 def read(path: Path, units) -> ImuRecording:
@@ -162,7 +162,9 @@ def test_what_a_format_of_another_package_does_wrong_is_an_error_that_names_it(s
 
 
 def test_errors_of_ours_pass(site: Path, log: Path) -> None:
-    module = MODULE.replace("raise RuntimeError", "from colmap_inertial.errors import TimingError; raise TimingError")
+    module = MODULE.replace(
+        "raise RuntimeError", "from colmap_inertial.core.errors import TimingError; raise TimingError"
+    )
     install(site, "my_imu_logs:FAILING", module=module)
     with pytest.raises(TimingError, match=r"^out of coffee"):
         read_imu(log, format="failing")

@@ -15,8 +15,9 @@ import pytest
 from test_pipeline import copy_scene
 
 from colmap_inertial.cli import _COMMANDS, main
-from colmap_inertial.drivers.capture import reconstruct
-from colmap_inertial.errors import FormatError, InertialError
+from colmap_inertial.core.errors import FormatError, InertialError
+from colmap_inertial.core.options import ReadLimits, ReconstructOptions
+from colmap_inertial.core.threads import in_order
 from colmap_inertial.io.files import first_line, read_bytes, read_json, read_yaml
 from colmap_inertial.io.frame_times import stamps_of_csv
 from colmap_inertial.io.images import _stated_size, read_image
@@ -24,10 +25,9 @@ from colmap_inertial.io.imu import read_imu
 from colmap_inertial.io.limits import read_limits, reading_within
 from colmap_inertial.io.tables import read_table
 from colmap_inertial.io.video import video_stamps_ns
-from colmap_inertial.options import ReadLimits, ReconstructOptions
-from colmap_inertial.run.config import read_config
-from colmap_inertial.threads import in_order
-from colmap_inertial.view.images import read_preview
+from colmap_inertial.pipeline.run.config import read_config
+from colmap_inertial.reconstruction.drivers.capture import reconstruct
+from colmap_inertial.tools.view.images import read_preview
 
 
 def png(width, height):
@@ -130,7 +130,7 @@ def test_a_capture_that_names_them(tmp_path):
     code = (
         "import sys, resource\nresource.setrlimit(resource.RLIMIT_AS, (4 << 30, 4 << 30))\n"
         "from colmap_inertial.io.frames import read_frames\n"
-        "from colmap_inertial.errors import FormatError\n"
+        "from colmap_inertial.core.errors import FormatError\n"
         "try: read_frames(sys.argv[1])\nexcept FormatError as error: sys.exit(str(error))"
     )
     for times in ("/dev/zero", "pipe"):

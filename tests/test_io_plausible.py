@@ -9,14 +9,14 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from colmap_inertial.errors import FormatError
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.types import ImuRecording
 from colmap_inertial.io.imu import read_imu
 from colmap_inertial.io.plausible import check_consistent, check_plausible, check_rates
 from colmap_inertial.io.units import Axes
-from colmap_inertial.simulate.motion import MotionKind, MotionOptions
-from colmap_inertial.simulate.recording import RecordingOptions, simulate_recording
-from colmap_inertial.simulate.sensors import IMU_PRESETS
-from colmap_inertial.types import ImuRecording
+from colmap_inertial.tools.simulate.motion import MotionKind, MotionOptions
+from colmap_inertial.tools.simulate.recording import RecordingOptions, simulate_recording
+from colmap_inertial.tools.simulate.sensors import IMU_PRESETS
 
 RECORDINGS = [*(f"inertial_scale/D{i}" for i in (1, 3, 5, 7, 9, 11, 13, 15)), "euroc_v101"]
 

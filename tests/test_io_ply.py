@@ -7,11 +7,11 @@ import pytest
 from conftest import write_anew
 from test_io_fuzz import mutated
 
-from colmap_inertial.errors import FormatError, InertialError
-from colmap_inertial.geometry import matrix_from_quat, quat_exp
+from colmap_inertial.core.errors import FormatError, InertialError
+from colmap_inertial.core.geometry import matrix_from_quat, quat_exp
+from colmap_inertial.core.types import Similarity
 from colmap_inertial.io import ply
 from colmap_inertial.io.ply import transform_ply
-from colmap_inertial.types import Similarity
 
 SIMILARITY = Similarity(
     scale=0.3721,

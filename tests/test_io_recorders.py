@@ -9,16 +9,16 @@ import imu_files
 import numpy as np
 import pytest
 
-from colmap_inertial.errors import FormatError, MissingExtraError, TimingError
+from colmap_inertial.core.errors import FormatError, MissingExtraError, TimingError
+from colmap_inertial.core.types import FrameLog, ImuRecording
+from colmap_inertial.inertial.scale import estimate_scale
 from colmap_inertial.io.capture import ImuPath, Video, load_capture
 from colmap_inertial.io.frames import read_frame_timing, read_frames
 from colmap_inertial.io.imu import read_capture_imu, read_frame_log, read_imu
 from colmap_inertial.io.imu_formats import imu_formats
-from colmap_inertial.scale import estimate_scale
-from colmap_inertial.simulate import RecordingOptions, SimulatedRecording, simulate_recording
-from colmap_inertial.simulate.motion import MotionOptions
-from colmap_inertial.simulate.sensors import ImuOptions
-from colmap_inertial.types import FrameLog, ImuRecording
+from colmap_inertial.tools.simulate import RecordingOptions, SimulatedRecording, simulate_recording
+from colmap_inertial.tools.simulate.motion import MotionOptions
+from colmap_inertial.tools.simulate.sensors import ImuOptions
 
 EPOCH_NS = 1_700_000_000_123_456_789
 #: Frames of the simulated recorders: 30 a second, from half a second after the first sample.

@@ -13,11 +13,11 @@ from conftest import write_anew
 from test_io_fuzz import mutated
 from test_io_recorders import FRAME_NS, recorded
 
-from colmap_inertial.errors import FormatError, InertialError
+from colmap_inertial.core.errors import FormatError, InertialError
+from colmap_inertial.core.types import ImuRecording
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.imu import read_frame_log, read_imu
 from colmap_inertial.io.zipped import text_of
-from colmap_inertial.types import ImuRecording
 
 MUTATIONS = 200
 #: Sizes that a damaged box or entry may state.

@@ -7,10 +7,10 @@ import pytest
 from imu_files import INSTA360S, RUNCAMS, write_insta360, write_runcam
 from test_io_imu import handheld
 
-from colmap_inertial.errors import FormatError, MissingExtraError
+from colmap_inertial.core.errors import FormatError, MissingExtraError
+from colmap_inertial.core.types import ImuRecording
 from colmap_inertial.io.imu import read_frame_log, read_imu
 from colmap_inertial.io.imu_formats import find_imu_format
-from colmap_inertial.types import ImuRecording
 
 
 def assert_read(path, imu, *, gyro_rad_s, accel_m_s2):

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from colmap_inertial.errors import FormatError, InertialError, TimingError
+from colmap_inertial.core.errors import FormatError, InertialError, TimingError
+from colmap_inertial.core.types import CameraTrajectory
 from colmap_inertial.io.trajectories import read_inertial_scale, read_inertial_scale_poses, read_tum, write_tum
-from colmap_inertial.types import CameraTrajectory
 
 EPOCH_NS = 1403715273262142976
 

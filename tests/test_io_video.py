@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 from conftest import write_anew
 
-from colmap_inertial.errors import FormatError, TimingError
+from colmap_inertial.core.errors import FormatError, TimingError
+from colmap_inertial.core.types import FrameLog
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.frames import frame_source, read_frame_timing, read_frames, read_reduced, thin
 from colmap_inertial.io.video import decode_grey, decode_reduced, decode_video, video_stamps_ns
-from colmap_inertial.types import FrameLog
 
 VARIABLE_MS = (100, 133, 167, 250, 283, 400, 417, 450, 600, 633, 667, 700)
 

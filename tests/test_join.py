@@ -13,22 +13,22 @@ from refine_walk import walk
 
 from colmap_inertial import export_model, read_model, reconstruct_project
 from colmap_inertial.cli.terminal import show_result
-from colmap_inertial.geometry import matrix_from_quat, quat_exp, quat_rotate, so3_exp, so3_log
+from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, quat_rotate, so3_exp, so3_log
+from colmap_inertial.core.options import JoinOptions, ProjectOptions, ReconstructOptions, ScaleOptions
+from colmap_inertial.inertial.join import solve
+from colmap_inertial.inertial.join._problem import At, Problem, Ties
+from colmap_inertial.inertial.join.judge import ends_of, join_parts, worst
+from colmap_inertial.inertial.join.links import find_links, find_shared
+from colmap_inertial.inertial.join.values import Link, Part
+from colmap_inertial.inertial.scale.posterior import CLOCK_RATE, DELAY, FittedPath
 from colmap_inertial.io.calibration import calibration_prior
-from colmap_inertial.join import solve
-from colmap_inertial.join._problem import At, Problem, Ties
-from colmap_inertial.join.judge import ends_of, join_parts, worst
-from colmap_inertial.join.links import find_links, find_shared
-from colmap_inertial.join.values import Link, Part
 from colmap_inertial.model import Model, trajectory_from_model, transformed
 from colmap_inertial.model.merging import merged
-from colmap_inertial.options import JoinOptions, ProjectOptions, ReconstructOptions, ScaleOptions
-from colmap_inertial.scale.posterior import CLOCK_RATE, DELAY, FittedPath
-from colmap_inertial.simulate.tracks import simulate_tracks
-from colmap_inertial.stages.join import JoinStage
-from colmap_inertial.stages.metric import MetricStage
-from colmap_inertial.stages.refine import RefineStage
-from colmap_inertial.view.sources import find_source
+from colmap_inertial.pipeline.stages.join import JoinStage
+from colmap_inertial.pipeline.stages.metric import MetricStage
+from colmap_inertial.pipeline.stages.refine import RefineStage
+from colmap_inertial.tools.simulate.tracks import simulate_tracks
+from colmap_inertial.tools.view.sources import find_source
 
 UNKNOWN = calibration_prior()
 SCHEMAS = Path(__file__).parents[1] / "docs" / "schemas"

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from refine_walk import walk
 
-from colmap_inertial.geometry import matrix_from_quat, quat_conjugate, quat_exp, quat_multiply, quat_rotate
+from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_exp, quat_multiply, quat_rotate
+from colmap_inertial.core.options import JoinOptions, ScaleOptions
+from colmap_inertial.core.types import CameraTrajectory
+from colmap_inertial.inertial.join.judge import ends_of, join_parts, worst
+from colmap_inertial.inertial.join.links import find_links
+from colmap_inertial.inertial.join.values import Part
+from colmap_inertial.inertial.scale.posterior import FittedPath
 from colmap_inertial.io.calibration import calibration_prior
-from colmap_inertial.join.judge import ends_of, join_parts, worst
-from colmap_inertial.join.links import find_links
-from colmap_inertial.join.values import Part
-from colmap_inertial.options import JoinOptions, ScaleOptions
-from colmap_inertial.scale.posterior import FittedPath
-from colmap_inertial.simulate.tracks import simulate_tracks
-from colmap_inertial.stages.join import _cameras, _sigma_log
-from colmap_inertial.types import CameraTrajectory
+from colmap_inertial.pipeline.stages.join import _cameras, _sigma_log
+from colmap_inertial.tools.simulate.tracks import simulate_tracks
 
 LIMITS = JoinOptions()
 T_S = 0.3 + np.arange(29 * 15) / 15

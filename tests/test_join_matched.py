@@ -8,19 +8,19 @@ from refine_walk import walk
 from test_join import UNKNOWN, across, cut
 from test_join_doubt import T_S, part_of
 
-from colmap_inertial.errors import FormatError
-from colmap_inertial.geometry import matrix_from_quat
-from colmap_inertial.join import judge
-from colmap_inertial.join.judge import join_parts
-from colmap_inertial.join.links import find_links, find_matched
-from colmap_inertial.join.values import Found, MatchedImages
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.geometry import matrix_from_quat
+from colmap_inertial.core.options import JoinOptions
+from colmap_inertial.inertial.join import judge
+from colmap_inertial.inertial.join.judge import join_parts
+from colmap_inertial.inertial.join.links import find_links, find_matched
+from colmap_inertial.inertial.join.values import Found, MatchedImages
 from colmap_inertial.model import Model
-from colmap_inertial.options import JoinOptions
-from colmap_inertial.simulate.motion import MotionOptions
-from colmap_inertial.simulate.tracks import TrackOptions, simulate_tracks
-from colmap_inertial.stages.across import images_in_others
-from colmap_inertial.stages.join import JoinStage
-from colmap_inertial.stages.metric import MetricStage
+from colmap_inertial.pipeline.stages.across import images_in_others
+from colmap_inertial.pipeline.stages.join import JoinStage
+from colmap_inertial.pipeline.stages.metric import MetricStage
+from colmap_inertial.tools.simulate.motion import MotionOptions
+from colmap_inertial.tools.simulate.tracks import TrackOptions, simulate_tracks
 
 LIMITS = JoinOptions()
 

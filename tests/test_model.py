@@ -7,8 +7,9 @@ import pycolmap
 import pytest
 from versions import version_of
 
-from colmap_inertial.errors import AlreadyMetricError, FormatError, OutputExistsError, TimingError
-from colmap_inertial.geometry import matrix_from_quat, quat_exp, so3_log
+from colmap_inertial.core.errors import AlreadyMetricError, FormatError, OutputExistsError, TimingError
+from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, so3_log
+from colmap_inertial.core.types import CameraModel, FrameTiming, Similarity
 from colmap_inertial.model import (
     apply_similarity,
     colmap_camera,
@@ -17,7 +18,6 @@ from colmap_inertial.model import (
     read_model,
     trajectory_from_model,
 )
-from colmap_inertial.types import CameraModel, FrameTiming, Similarity
 
 SIMILARITY = Similarity(
     scale=0.3721,

@@ -20,8 +20,8 @@ from test_io_fuzz import refusals
 from test_io_ply import SIMILARITY
 
 from colmap_inertial.cli import main
-from colmap_inertial.errors import AlreadyMetricError, FormatError, InertialError, NotObservableError, OutputError
-from colmap_inertial.geometry import matrix_from_quat
+from colmap_inertial.core.errors import AlreadyMetricError, FormatError, InertialError, NotObservableError, OutputError
+from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.model import copying, mean_reprojection_error_px, read_model, similarity_as_json
 from colmap_inertial.model.artefacts import transform_depth_map, transform_obj, transform_options
 from colmap_inertial.model.binary import check_binary_model

@@ -6,10 +6,10 @@ import pycolmap
 import pytest
 
 from colmap_inertial.cli import main
-from colmap_inertial.errors import FormatError
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.types import CameraModel
 from colmap_inertial.model import colmap_camera, read_model
-from colmap_inertial.types import CameraModel
-from colmap_inertial.view import load_scene
+from colmap_inertial.tools.view import load_scene
 
 BAD = [float("nan"), float("inf"), 1e300, -1e300]
 

@@ -6,11 +6,13 @@ import pytest
 from aperture_scenes import FLAT, four_apertures, plane_views, projectors, psnr_db, read_pfm, texture
 from references.semi_global import matching_costs_reference, semi_global_reference
 
-from colmap_inertial import semi_global
 from colmap_inertial._kernels import _apertures
-from colmap_inertial.errors import InertialError
-from colmap_inertial.geometry import quat_exp, quat_rotate
-from colmap_inertial.multi_aperture import (
+from colmap_inertial.core.errors import InertialError
+from colmap_inertial.core.geometry import quat_exp, quat_rotate
+from colmap_inertial.core.options import ApertureOptions
+from colmap_inertial.core.types import Aperture, ApertureRig, CameraModel
+from colmap_inertial.imaging import semi_global
+from colmap_inertial.imaging.multi_aperture import (
     _volume as volume,
     estimate_disparity,
     fuse_apertures,
@@ -18,14 +20,12 @@ from colmap_inertial.multi_aperture import (
     rectify,
     refocus,
 )
-from colmap_inertial.multi_aperture._fill import fill_hidden
-from colmap_inertial.multi_aperture._geometry import transfer, trifocal_tensor
-from colmap_inertial.multi_aperture._information import cost_tables
-from colmap_inertial.multi_aperture._light import adds_up, light_cost
-from colmap_inertial.multi_aperture._noise import noise_of, smoothing
-from colmap_inertial.multi_aperture.disparity import background
-from colmap_inertial.options import ApertureOptions
-from colmap_inertial.types import Aperture, ApertureRig, CameraModel
+from colmap_inertial.imaging.multi_aperture._fill import fill_hidden
+from colmap_inertial.imaging.multi_aperture._geometry import transfer, trifocal_tensor
+from colmap_inertial.imaging.multi_aperture._information import cost_tables
+from colmap_inertial.imaging.multi_aperture._light import adds_up, light_cost
+from colmap_inertial.imaging.multi_aperture._noise import noise_of, smoothing
+from colmap_inertial.imaging.multi_aperture.disparity import background
 
 INSTRUCTION_SETS = _apertures.instruction_sets()
 #: Height, width, candidates, views, radius of the census window.

@@ -10,19 +10,19 @@ import pycolmap
 import pytest
 from aperture_scenes import plane_views, psnr_db
 
-from colmap_inertial.drivers.capture import reconstruct
-from colmap_inertial.drivers.fuse_apertures import fuse_captured
-from colmap_inertial.errors import FormatError, InertialError, OutputExistsError
-from colmap_inertial.geometry import so3_exp
+from colmap_inertial.core.errors import FormatError, InertialError, OutputExistsError
+from colmap_inertial.core.geometry import so3_exp
+from colmap_inertial.core.options import ApertureOptions, FuseAperturesOptions, ReconstructOptions
+from colmap_inertial.core.types import CameraModel
 from colmap_inertial.io.aperture_images import SubImages
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.frames import read_frames
 from colmap_inertial.io.rig_calibration import read_rig_calibration
-from colmap_inertial.options import ApertureOptions, FuseAperturesOptions, ReconstructOptions
-from colmap_inertial.simulate import MotionOptions, SceneRecipe, ShutterCamera
-from colmap_inertial.simulate.aperture_array import write_aperture_capture
-from colmap_inertial.stages.apertures import ApertureStage
-from colmap_inertial.types import CameraModel
+from colmap_inertial.pipeline.stages.apertures import ApertureStage
+from colmap_inertial.reconstruction.drivers.capture import reconstruct
+from colmap_inertial.reconstruction.drivers.fuse_apertures import fuse_captured
+from colmap_inertial.tools.simulate import MotionOptions, SceneRecipe, ShutterCamera
+from colmap_inertial.tools.simulate.aperture_array import write_aperture_capture
 
 ROTATION = so3_exp(np.array([0.02, -0.03, 0.01]))
 SHIFT = np.array([-0.01, 0.001, 0.0005])

@@ -8,14 +8,14 @@ import pytest
 from conftest import write_anew
 from test_io_fuzz import mutated, refusals
 
-from colmap_inertial.batch import read_manifest
-from colmap_inertial.batch.task import CaptureStatus, read_status, with_result, write_status
+from colmap_inertial.core.options import ReconstructOptions
+from colmap_inertial.core.types import CameraModel, Treatment
 from colmap_inertial.io.files import write_json
 from colmap_inertial.model.similarities import read_scales, read_similarity
-from colmap_inertial.options import ReconstructOptions
-from colmap_inertial.run.config import config_as_toml, read_config
-from colmap_inertial.stages.frame_folder import FrameRecord, read_frame_records
-from colmap_inertial.types import CameraModel, Treatment
+from colmap_inertial.pipeline.run.config import config_as_toml, read_config
+from colmap_inertial.pipeline.stages.frame_folder import FrameRecord, read_frame_records
+from colmap_inertial.tools.batch import read_manifest
+from colmap_inertial.tools.batch.task import CaptureStatus, read_status, with_result, write_status
 
 MUTATIONS = 60
 MODEL = {

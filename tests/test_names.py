@@ -9,22 +9,22 @@ import numpy as np
 import pycolmap
 import pytest
 
-from colmap_inertial.batch import read_manifest
+from colmap_inertial.checks.report.markup import images
+from colmap_inertial.checks.validate.views import load_views
 from colmap_inertial.colmap.dense import _check_images
-from colmap_inertial.errors import FormatError
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.types import Frame, FrameTiming
 from colmap_inertial.io.aperture_images import SubImages
 from colmap_inertial.io.capture import ImageFolder
 from colmap_inertial.io.exif import stamps_of_exif
 from colmap_inertial.io.names import check_names, path_in
 from colmap_inertial.model import read_model
-from colmap_inertial.precalibrate.calibrate import some_frames
-from colmap_inertial.report.markup import images
-from colmap_inertial.run.progress import silent
-from colmap_inertial.stages.frame_folder import write_frames
-from colmap_inertial.stages.rectified import write_images
-from colmap_inertial.types import Frame, FrameTiming
-from colmap_inertial.validate.views import load_views
-from colmap_inertial.view.sources import find_source
+from colmap_inertial.pipeline.run.progress import silent
+from colmap_inertial.pipeline.stages.frame_folder import write_frames
+from colmap_inertial.pipeline.stages.rectified import write_images
+from colmap_inertial.reconstruction.precalibrate.calibrate import some_frames
+from colmap_inertial.tools.batch import read_manifest
+from colmap_inertial.tools.view.sources import find_source
 
 BAD = ["", ".", "/etc/passwd", "../a.png", "a/../../b.png", "a\\..\\b.png", "a\0.png", "x" * 256, "a/" + "\udfff" * 90]
 

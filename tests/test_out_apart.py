@@ -4,12 +4,12 @@ import pytest
 from batch_captures import TINY, tiny_capture
 
 from colmap_inertial.cli import main
-from colmap_inertial.drivers.capture import reconstruct
-from colmap_inertial.errors import FormatError, OutputError
+from colmap_inertial.core.errors import FormatError, OutputError
 from colmap_inertial.io.capture import ImageFolder, load_capture
 from colmap_inertial.io.frames import image_names, picture_folders
-from colmap_inertial.run.progress import silent
-from colmap_inertial.run.session import open_session
+from colmap_inertial.pipeline.run.progress import silent
+from colmap_inertial.pipeline.run.session import open_session
+from colmap_inertial.reconstruction.drivers.capture import reconstruct
 
 
 @pytest.fixture(scope="module")

@@ -14,29 +14,29 @@ from test_io_ply import SIMILARITY
 from test_pipeline import copy_scene
 from test_pipeline_parts import session_in
 
+from colmap_inertial.checks.report.words import mapped_in_words, parts_mapped_in_words
 from colmap_inertial.cli.terminal import show_result
 from colmap_inertial.colmap import dense as dense_room
 from colmap_inertial.colmap.closing import EndsMet
 from colmap_inertial.colmap.depth_maps import MadeFrom
 from colmap_inertial.colmap.mapping import MapRecord, ModelEnds
-from colmap_inertial.drivers import deblur
-from colmap_inertial.drivers.frames import run_images
-from colmap_inertial.drivers.placed import place_project, placed_paths, remove_placed, require_free_names
-from colmap_inertial.drivers.reporting import reporting_stops
-from colmap_inertial.drivers.result import ModelResult, ReconstructResult
-from colmap_inertial.drivers.standing import settle_dense
-from colmap_inertial.errors import AlreadyMetricError, FormatError, MappingError, OutputError, OutputExistsError
+from colmap_inertial.core.errors import AlreadyMetricError, FormatError, MappingError, OutputError, OutputExistsError
+from colmap_inertial.core.options import ProjectOptions
+from colmap_inertial.core.types import ScaleEstimate
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.model import read_model, transformed, write_model
 from colmap_inertial.model.project import apply_to_project, undo_project
 from colmap_inertial.model.similarities import ModelScale, plain_factor
-from colmap_inertial.options import ProjectOptions
-from colmap_inertial.precalibrate.plan import ImagingPlan
-from colmap_inertial.report.words import mapped_in_words, parts_mapped_in_words
-from colmap_inertial.run.workspace import Workspace, places_of
-from colmap_inertial.stages.frame_folder import FrameRecord
-from colmap_inertial.types import ScaleEstimate
+from colmap_inertial.pipeline.run.workspace import Workspace, places_of
+from colmap_inertial.pipeline.stages.frame_folder import FrameRecord
+from colmap_inertial.reconstruction.drivers import deblur
+from colmap_inertial.reconstruction.drivers.frames import run_images
+from colmap_inertial.reconstruction.drivers.placed import place_project, placed_paths, remove_placed, require_free_names
+from colmap_inertial.reconstruction.drivers.reporting import reporting_stops
+from colmap_inertial.reconstruction.drivers.result import ModelResult, ReconstructResult
+from colmap_inertial.reconstruction.drivers.standing import settle_dense
+from colmap_inertial.reconstruction.precalibrate.plan import ImagingPlan
 
 SCALE = ModelScale(similarity=SIMILARITY, verdict="trusted")
 REFUSED = ModelScale(similarity=None, verdict="refused", reasons=("the camera stood still",))

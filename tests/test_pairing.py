@@ -24,12 +24,12 @@ from colmap_inertial.colmap.two_views import (
 )
 from colmap_inertial.colmap.votes import Voters
 from colmap_inertial.colmap.way import Sightings, Way, find_way, joined
-from colmap_inertial.errors import InertialError, NotObservableError
-from colmap_inertial.geometry import quat_from_matrix, so3_exp
+from colmap_inertial.core.errors import InertialError, NotObservableError
+from colmap_inertial.core.geometry import quat_from_matrix, so3_exp
+from colmap_inertial.core.options import MappingOptions
+from colmap_inertial.core.types import CAL, CameraModel, FrameTiming, ImuRecording
 from colmap_inertial.io.calibration import Declared, calibration_prior
-from colmap_inertial.options import MappingOptions
-from colmap_inertial.run.context import RunContext
-from colmap_inertial.types import CAL, CameraModel, FrameTiming, ImuRecording
+from colmap_inertial.pipeline.run.context import RunContext
 
 CAMERA = CameraModel(model="PINHOLE", width=480, height=360, params=(400.0, 400.0, 240.0, 180.0))
 BIAS = np.array([0.004, -0.01, 0.02])

@@ -12,13 +12,13 @@ import pycolmap
 import pytest
 
 from colmap_inertial.cli import main
-from colmap_inertial.drivers.capture import reconstruct
-from colmap_inertial.errors import FormatError, InertialError, NotObservableError, OutputExistsError
-from colmap_inertial.geometry import matrix_from_quat, quat_conjugate
+from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError, OutputExistsError
+from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate
+from colmap_inertial.core.options import MappingOptions, ReconstructOptions
 from colmap_inertial.io.trajectories import read_tum
 from colmap_inertial.model import read_model
-from colmap_inertial.options import MappingOptions, ReconstructOptions
-from colmap_inertial.simulate.truth import read_truth, true_metres_per_unit
+from colmap_inertial.reconstruction.drivers.capture import reconstruct
+from colmap_inertial.tools.simulate.truth import read_truth, true_metres_per_unit
 
 SCENE = Path(__file__).parents[1] / "example_scenes" / "desk"
 #: Enough for an accurate model of this scene, and many times faster than COLMAP's defaults.
@@ -247,7 +247,7 @@ sys.path.insert(0, sys.argv[3])
 from pathlib import Path
 import cv2, pycolmap, scipy.optimize
 from test_pipeline import DETERMINISTIC
-from colmap_inertial.drivers.capture import reconstruct
+from colmap_inertial.reconstruction.drivers.capture import reconstruct
 
 def run(at):
     def progress(stage, done, total):
@@ -300,7 +300,7 @@ def test_hooks_see_every_frame_keypoint_and_model(tmp_path):
         return dataclasses.replace(keypoints, xy_px=seen[keypoints.name])
 
     def refuse(model):
-        from colmap_inertial.types import ScaleEstimate
+        from colmap_inertial.core.types import ScaleEstimate
 
         models.append((model.colmap_index, model.reconstruction.num_reg_images()))
         estimate = ScaleEstimate(

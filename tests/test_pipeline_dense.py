@@ -16,13 +16,13 @@ from test_pipeline_existing import contents, run
 
 from colmap_inertial.colmap import dense as dense_stage, depth_maps
 from colmap_inertial.colmap.tsdf import require_mesh_maker, tsdf_mesh
-from colmap_inertial.drivers.project import reconstruct_project
-from colmap_inertial.errors import InertialError
-from colmap_inertial.geometry import matrix_from_quat
+from colmap_inertial.core.errors import InertialError
+from colmap_inertial.core.geometry import matrix_from_quat
+from colmap_inertial.core.options import DenseOptions, ProjectOptions, ReconstructOptions
 from colmap_inertial.io.ply import read_ply_header
 from colmap_inertial.model import read_model
 from colmap_inertial.model.depth_maps import read_map, write_map
-from colmap_inertial.options import DenseOptions, ProjectOptions, ReconstructOptions
+from colmap_inertial.reconstruction.drivers.project import reconstruct_project
 
 QUICK = ReconstructOptions(dense=True, dense_options=DenseOptions(max_image_size=96), deterministic=True)
 FLAGS = ["--dense", "--dense-options.max-image-size", "96", "--deterministic"]

@@ -8,8 +8,8 @@ from collections import namedtuple
 import pytest
 from batch_captures import TINY, model_bytes, tiny_capture
 
-from colmap_inertial.drivers.capture import reconstruct
-from colmap_inertial.errors import OutputError
+from colmap_inertial.core.errors import OutputError
+from colmap_inertial.reconstruction.drivers.capture import reconstruct
 
 LIMITED = """
 import resource, sys

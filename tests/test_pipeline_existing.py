@@ -12,9 +12,9 @@ import pytest
 from box_project import pictures, shared_box, with_exif, write_model, write_video
 
 from colmap_inertial.cli import main
-from colmap_inertial.drivers.project import is_project, reconstruct_project
-from colmap_inertial.errors import InertialError, TimingError
-from colmap_inertial.geometry import matrix_from_quat
+from colmap_inertial.core.errors import InertialError, TimingError
+from colmap_inertial.core.geometry import matrix_from_quat
+from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
 from colmap_inertial.io import sensor_yaml, video_match
 from colmap_inertial.io.exif import stamps_of_exif
 from colmap_inertial.io.frame_times import stamps_of_pattern
@@ -24,8 +24,8 @@ from colmap_inertial.io.video_match import match_to_video
 from colmap_inertial.model import read_model
 from colmap_inertial.model.project import apply_to_project
 from colmap_inertial.model.similarities import read_similarity
-from colmap_inertial.options import ProjectOptions, ReconstructOptions
-from colmap_inertial.view import load_scene
+from colmap_inertial.reconstruction.drivers.project import is_project, reconstruct_project
+from colmap_inertial.tools.view import load_scene
 
 
 @pytest.fixture(scope="module")
@@ -476,7 +476,7 @@ def test_euroc_keyframes_mapped_by_colmap(shared_data, tmp_path, capsys):
 
 
 def test_options_that_are_left_alone_pass():
-    from colmap_inertial.drivers.project import _check_options
+    from colmap_inertial.reconstruction.drivers.project import _check_options
 
     _check_options(ReconstructOptions(deblur="off", rolling_shutter="off", seed=4, deterministic=True))
     with pytest.raises(InertialError, match=r"--mapping\.first-octave, --deblur"):

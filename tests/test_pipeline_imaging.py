@@ -13,23 +13,29 @@ from corner_scene import CALIBRATED, LENS, CornerScene
 from test_pipeline import contents
 
 from colmap_inertial.cli import main
-from colmap_inertial.drivers.capture import reconstruct
-from colmap_inertial.drivers.deblur import deblur_capture
-from colmap_inertial.errors import InertialError, NotObservableError
+from colmap_inertial.core.errors import InertialError, NotObservableError
+from colmap_inertial.core.options import MappingOptions, ReconstructOptions
 from colmap_inertial.imaging.psf import blur_field
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.frames import read_frames
 from colmap_inertial.io.image_metadata import carry_metadata, stated_exposures_s
 from colmap_inertial.io.imu import read_capture_imu
 from colmap_inertial.model import colmap_camera, read_model
-from colmap_inertial.options import MappingOptions, ReconstructOptions
-from colmap_inertial.precalibrate import calibrate as first_look, plan as imaging
-from colmap_inertial.precalibrate.plan import Treatments, plan_imaging, read_plan, with_stated_exposures, write_plan
-from colmap_inertial.precalibrate.selection import part_of
-from colmap_inertial.precalibrate.translation import find_parallaxes
-from colmap_inertial.run.context import Recording, RunContext, prior_calibration
-from colmap_inertial.run.progress import silent
-from colmap_inertial.simulate import MotionOptions, make_motion
+from colmap_inertial.pipeline.run.context import Recording, RunContext, prior_calibration
+from colmap_inertial.pipeline.run.progress import silent
+from colmap_inertial.reconstruction.drivers.capture import reconstruct
+from colmap_inertial.reconstruction.drivers.deblur import deblur_capture
+from colmap_inertial.reconstruction.precalibrate import calibrate as first_look, plan as imaging
+from colmap_inertial.reconstruction.precalibrate.plan import (
+    Treatments,
+    plan_imaging,
+    read_plan,
+    with_stated_exposures,
+    write_plan,
+)
+from colmap_inertial.reconstruction.precalibrate.selection import part_of
+from colmap_inertial.reconstruction.precalibrate.translation import find_parallaxes
+from colmap_inertial.tools.simulate import MotionOptions, make_motion
 
 QUICK = ReconstructOptions(mapping=MappingOptions(max_num_features=1000, first_octave=0), deterministic=True)
 OFF = replace(QUICK, deblur="off", rolling_shutter="off")

@@ -14,26 +14,26 @@ import pytest
 
 from colmap_inertial.cli.terminal import show_applied
 from colmap_inertial.colmap.sparse import check_pair_names, image_pairs
-from colmap_inertial.drivers.models import run_models
-from colmap_inertial.drivers.reporting import report_result
-from colmap_inertial.drivers.result import ReconstructResult
-from colmap_inertial.errors import FormatError, InertialError, NotObservableError, OutputExistsError, TimingError
+from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError, OutputExistsError, TimingError
+from colmap_inertial.core.options import MappingOptions, ReconstructOptions
+from colmap_inertial.core.types import CameraModel, Frame, FrameTiming
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.frames import read_frame_times
 from colmap_inertial.io.imu import read_imu
 from colmap_inertial.model import read_model
 from colmap_inertial.model.project import Applied
-from colmap_inertial.options import MappingOptions, ReconstructOptions
-from colmap_inertial.run.config import config_as_toml, read_config
-from colmap_inertial.run.context import Recording, RunContext
-from colmap_inertial.run.progress import silent
-from colmap_inertial.run.runner import StepRunner, canonical
-from colmap_inertial.run.session import Session
-from colmap_inertial.run.workspace import Workspace
-from colmap_inertial.stages.frame_folder import read_frame_records, write_frames
-from colmap_inertial.stages.metric import MetricStage
-from colmap_inertial.types import CameraModel, Frame, FrameTiming
+from colmap_inertial.pipeline.run.config import config_as_toml, read_config
+from colmap_inertial.pipeline.run.context import Recording, RunContext
+from colmap_inertial.pipeline.run.progress import silent
+from colmap_inertial.pipeline.run.runner import StepRunner, canonical
+from colmap_inertial.pipeline.run.session import Session
+from colmap_inertial.pipeline.run.workspace import Workspace
+from colmap_inertial.pipeline.stages.frame_folder import read_frame_records, write_frames
+from colmap_inertial.pipeline.stages.metric import MetricStage
+from colmap_inertial.reconstruction.drivers.models import run_models
+from colmap_inertial.reconstruction.drivers.reporting import report_result
+from colmap_inertial.reconstruction.drivers.result import ReconstructResult
 
 
 def test_a_stage_runs_once_and_again_when_anything_before_it_changes(tmp_path):

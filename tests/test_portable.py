@@ -9,7 +9,7 @@ from pathlib import Path
 from batch_captures import FRAMES, TINY
 from test_pipeline import SCENE, copy_scene
 
-from colmap_inertial.run.config import config_as_toml
+from colmap_inertial.pipeline.run.config import config_as_toml
 
 #: Takes it away, then runs the commands of a JSON list and prints their exit codes.
 ELSEWHERE = """
@@ -27,9 +27,9 @@ for name in (
 del signal.SIGHUP, signal.SIGKILL
 warnings.filterwarnings("ignore", "only soft file lock is available")
 
-from colmap_inertial.batch import shares_of_this_machine
+from colmap_inertial.tools.batch import shares_of_this_machine
 from colmap_inertial.cli import main
-from colmap_inertial.threads import usable_cores, usable_processors
+from colmap_inertial.core.threads import usable_cores, usable_processors
 
 codes = []
 for args in json.loads(sys.argv[1]):

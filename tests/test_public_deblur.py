@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 
 from colmap_inertial import CameraModel, FrameTiming, ImuRecording, deblur
-from colmap_inertial.errors import NotObservableError
-from colmap_inertial.geometry import matrix_from_quat, quat_exp, so3_exp
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, so3_exp
 from colmap_inertial.imaging.psf import frame_blur
 from colmap_inertial.imaging.transfer import srgb_from_linear
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.model import colmap_camera
-from colmap_inertial.simulate.textures import poster
+from colmap_inertial.tools.simulate.textures import poster
 
 CAMERA = CameraModel(model="PINHOLE", width=320, height=240, params=(400.0, 400.0, 160.0, 120.0))
 #: The camera pans and tilts steadily while the frame is exposed: 12 px to the side, 5 px down.

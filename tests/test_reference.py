@@ -12,12 +12,12 @@ import pytest
 from test_cli import run
 from test_validate_lengths import validated
 
+from colmap_inertial.checks.validate.lengths import LengthCheck
 from colmap_inertial.cli.terminal import show_reference
-from colmap_inertial.drivers import bare as bare_rooms, reference as rooms
-from colmap_inertial.drivers.reference import Reference, scale_project_by
-from colmap_inertial.errors import InertialError, NotObservableError, TargetNotFoundError
-from colmap_inertial.options import ReferenceOptions
-from colmap_inertial.validate.lengths import LengthCheck
+from colmap_inertial.core.errors import InertialError, NotObservableError, TargetNotFoundError
+from colmap_inertial.core.options import ReferenceOptions
+from colmap_inertial.reconstruction.drivers import bare as bare_rooms, reference as rooms
+from colmap_inertial.reconstruction.drivers.reference import Reference, scale_project_by
 
 
 @pytest.fixture

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from refine_walk import PINHOLE, known_of, nudged, problem_of, tracks_of, walk
 
-from colmap_inertial.errors import NotObservableError
-from colmap_inertial.refine import _inertial, _seen, judge, setup, solve as solver
-from colmap_inertial.refine._system import Order, System
-from colmap_inertial.refine.motion import moving
-from colmap_inertial.refine.solve import _evaluate, _plausible, _weighted, factored, held_out, solve
-from colmap_inertial.refine.values import FreeCamera
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.inertial.refine import _inertial, _seen, judge, setup, solve as solver
+from colmap_inertial.inertial.refine._system import Order, System
+from colmap_inertial.inertial.refine.motion import moving
+from colmap_inertial.inertial.refine.solve import _evaluate, _plausible, _weighted, factored, held_out, solve
+from colmap_inertial.inertial.refine.values import FreeCamera
 
 
 def steps_of(x, kind, column):

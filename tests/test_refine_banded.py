@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from refine_walk import problem_of, tracks_of, walk
 
-from colmap_inertial.refine import _banded
-from colmap_inertial.refine._banded import BandFactor
-from colmap_inertial.refine.motion import moving
-from colmap_inertial.refine.solve import factored
+from colmap_inertial.inertial.refine import _banded
+from colmap_inertial.inertial.refine._banded import BandFactor
+from colmap_inertial.inertial.refine.motion import moving
+from colmap_inertial.inertial.refine.solve import factored
 
 
 @pytest.mark.parametrize(("states", "reach"), [(1, 1), (7, 2), (23, 4), (24, 24), (60, 9)])

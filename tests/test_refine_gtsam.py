@@ -6,11 +6,11 @@ import pytest
 from gtsam.symbol_shorthand import B, L, V, X
 from refine_walk import PINHOLE, nudged, problem_of, tracks_of, walk
 
-from colmap_inertial.geometry import so3_exp, so3_log
-from colmap_inertial.refine._inertial import imu_rows
-from colmap_inertial.refine.solve import factored, solve
-from colmap_inertial.refine.values import N_STATE
-from colmap_inertial.scale._preintegration import SensorErrors, preintegrate
+from colmap_inertial.core.geometry import so3_exp, so3_log
+from colmap_inertial.inertial.refine._inertial import imu_rows
+from colmap_inertial.inertial.refine.solve import factored, solve
+from colmap_inertial.inertial.refine.values import N_STATE
+from colmap_inertial.inertial.scale._preintegration import SensorErrors, preintegrate
 
 #: Seconds of GTSAM's integration steps.
 STEP_S = 0.001
@@ -26,7 +26,7 @@ def solved():
     count = start.columns.count
     problem = replace(problem, prior=replace(problem.prior, mean=start, info=1e14 * np.eye(count)))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("colmap_inertial.refine.solve._SETTLED", 1e-6)
+        patch.setattr("colmap_inertial.inertial.refine.solve._SETTLED", 1e-6)
         solution = solve(problem, nudged_states(start))
     return problem, solution.estimate
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from refine_walk import problem_of, tracks_of, walk
 
-from colmap_inertial.refine import levels, setup
-from colmap_inertial.refine._inertial import imu_rows
-from colmap_inertial.refine._seen import project
-from colmap_inertial.refine.levels import with_measured_noise
-from colmap_inertial.refine.solve import factored, solve
+from colmap_inertial.inertial.refine import levels, setup
+from colmap_inertial.inertial.refine._inertial import imu_rows
+from colmap_inertial.inertial.refine._seen import project
+from colmap_inertial.inertial.refine.levels import with_measured_noise
+from colmap_inertial.inertial.refine.solve import factored, solve
 
 TRUE = 2e-3
 

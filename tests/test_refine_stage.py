@@ -10,30 +10,30 @@ import pytest
 from refine_walk import problem_of, tracks_of, walk
 
 from colmap_inertial import read_model, reconstruct_project
-from colmap_inertial.drivers import frames
-from colmap_inertial.drivers.capture import default_model_stages
-from colmap_inertial.drivers.frames import as_refined
-from colmap_inertial.geometry import matrix_from_quat, so3_log
+from colmap_inertial.core.geometry import matrix_from_quat, so3_log
+from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
+from colmap_inertial.core.types import CameraMotion
+from colmap_inertial.inertial.refine import judge
+from colmap_inertial.inertial.refine.solve import held_out, solve
+from colmap_inertial.inertial.refine.values import ROTATION
+from colmap_inertial.inertial.scale.priors import PRIORS
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.records import read_record
 from colmap_inertial.io.trajectories import read_tum
 from colmap_inertial.model import Model
-from colmap_inertial.options import ProjectOptions, ReconstructOptions
-from colmap_inertial.refine import judge
-from colmap_inertial.refine.solve import held_out, solve
-from colmap_inertial.refine.values import ROTATION
-from colmap_inertial.run.context import Recording
-from colmap_inertial.run.runner import canonical
-from colmap_inertial.scale.priors import PRIORS
-from colmap_inertial.simulate.tracks import TrackOptions
-from colmap_inertial.stages.gyro_view import GyroView
-from colmap_inertial.stages.join import JoinStage
-from colmap_inertial.stages.metric import MetricStage
-from colmap_inertial.stages.readout import ReadoutStage
-from colmap_inertial.stages.refine import RefineStage, axes_by
-from colmap_inertial.stages.rolling_shutter import RollingShutterStage
-from colmap_inertial.types import CameraMotion
+from colmap_inertial.pipeline.run.context import Recording
+from colmap_inertial.pipeline.run.runner import canonical
+from colmap_inertial.pipeline.stages.gyro_view import GyroView
+from colmap_inertial.pipeline.stages.join import JoinStage
+from colmap_inertial.pipeline.stages.metric import MetricStage
+from colmap_inertial.pipeline.stages.readout import ReadoutStage
+from colmap_inertial.pipeline.stages.refine import RefineStage, axes_by
+from colmap_inertial.pipeline.stages.rolling_shutter import RollingShutterStage
+from colmap_inertial.reconstruction.drivers import frames
+from colmap_inertial.reconstruction.drivers.capture import default_model_stages
+from colmap_inertial.reconstruction.drivers.frames import as_refined
+from colmap_inertial.tools.simulate.tracks import TrackOptions
 
 UNKNOWN = calibration_prior()
 

@@ -18,32 +18,39 @@ import pytest
 from report_runs import HOSTILE, cloud, recorded, write_run
 from test_pipeline import DETERMINISTIC, SCENE, copy_scene
 
+from colmap_inertial.checks.report import figures, signals, write_report
+from colmap_inertial.checks.report.content import _path_in_words
+from colmap_inertial.checks.report.figure_3d import nice_length, scene_figure
+from colmap_inertial.checks.report.scene import scene_record
+from colmap_inertial.checks.report.series import MOST_POINTS, rounded, strided, thinned
+from colmap_inertial.checks.report.signals import signal_record
+from colmap_inertial.checks.report.words import outcome_of_model
 from colmap_inertial.cli import main
-from colmap_inertial.drivers.capture import reconstruct
-from colmap_inertial.drivers.project import reconstruct_project
-from colmap_inertial.drivers.reporting import reporting_stops, write_recording
-from colmap_inertial.errors import FormatError, InertialError, MappingError
-from colmap_inertial.geometry import quat_exp, quat_rotate
+from colmap_inertial.core.errors import FormatError, InertialError, MappingError
+from colmap_inertial.core.geometry import quat_exp, quat_rotate
+from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
+from colmap_inertial.core.types import (
+    CameraModel,
+    CameraTrajectory,
+    FrameTiming,
+    ImuRecording,
+    ScaleDrift,
+    ScaleEstimate,
+)
+from colmap_inertial.inertial.scale import estimate_scale
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import write_json
 from colmap_inertial.model import trajectory_from_model
-from colmap_inertial.options import ProjectOptions, ReconstructOptions
-from colmap_inertial.report import figures, signals, write_report
-from colmap_inertial.report.content import _path_in_words
-from colmap_inertial.report.figure_3d import nice_length, scene_figure
-from colmap_inertial.report.scene import scene_record
-from colmap_inertial.report.series import MOST_POINTS, rounded, strided, thinned
-from colmap_inertial.report.signals import signal_record
-from colmap_inertial.report.words import outcome_of_model
-from colmap_inertial.run.context import Recording, RunContext
-from colmap_inertial.run.runner import StepRunner
-from colmap_inertial.run.session import Session
-from colmap_inertial.run.workspace import Workspace
-from colmap_inertial.scale import estimate_scale
-from colmap_inertial.stages.gyro_view import GyroView
-from colmap_inertial.stages.rolling_shutter import RollingShutterStage
-from colmap_inertial.types import CameraModel, CameraTrajectory, FrameTiming, ImuRecording, ScaleDrift, ScaleEstimate
+from colmap_inertial.pipeline.run.context import Recording, RunContext
+from colmap_inertial.pipeline.run.runner import StepRunner
+from colmap_inertial.pipeline.run.session import Session
+from colmap_inertial.pipeline.run.workspace import Workspace
+from colmap_inertial.pipeline.stages.gyro_view import GyroView
+from colmap_inertial.pipeline.stages.rolling_shutter import RollingShutterStage
+from colmap_inertial.reconstruction.drivers.capture import reconstruct
+from colmap_inertial.reconstruction.drivers.project import reconstruct_project
+from colmap_inertial.reconstruction.drivers.reporting import reporting_stops, write_recording
 
 
 class Page(html.parser.HTMLParser):
@@ -658,7 +665,7 @@ def test_a_failing_report_of_a_stop_hides_no_reason(tmp_path, monkeypatch, repor
     with pytest.raises(MappingError, match="nothing matches") as stopped, reporting_stops(workspace, capture):
         raise MappingError("nothing matches")
     assert stopped.value.__notes__ == [f"what was found, and what to do: {tmp_path / 'report.html'}"]
-    monkeypatch.setattr("colmap_inertial.drivers.reporting.write_report", broken)
+    monkeypatch.setattr("colmap_inertial.reconstruction.drivers.reporting.write_report", broken)
     with pytest.raises(MappingError, match="nothing matches"), reporting_stops(workspace, capture):
         raise MappingError("nothing matches")
     assert len(report_failures) == 1

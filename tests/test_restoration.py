@@ -16,12 +16,13 @@ import pytest
 import small_networks as small
 from onnx import TensorProto, helper
 
-from colmap_inertial import threads
-from colmap_inertial.errors import FormatError, InertialError, MissingExtraError
+from colmap_inertial.core import threads
+from colmap_inertial.core.errors import FormatError, InertialError, MissingExtraError
+from colmap_inertial.core.threads import usable_processors
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath, middles
 from colmap_inertial.imaging.path_filters import path_wiener
-from colmap_inertial.restoration import (
+from colmap_inertial.imaging.restoration import (
     Network,
     _tiles,
     deepgyro,
@@ -31,7 +32,6 @@ from colmap_inertial.restoration import (
     require_network,
     shipped,
 )
-from colmap_inertial.threads import usable_processors
 
 ROOT = Path(__file__).parents[1]
 SIZES = [(1, 1), (1, 40), (5, 7), (15, 17), (16, 16), (33, 200), (120, 75)]
@@ -495,7 +495,7 @@ def test_parts_of_the_package_s_networks_do_not_show(name, monkeypatch):
 
 def test_the_example_in_the_documentation_runs(name):
     blocks = re.findall(r"^```python\n(.*?)^```$", (ROOT / "docs" / "imaging.md").read_text(), re.M | re.S)
-    (code,) = (block for block in blocks if "colmap_inertial.restoration" in block)
+    (code,) = (block for block in blocks if "colmap_inertial.imaging.restoration" in block)
     values: dict[str, object] = {}
     exec(compile(ast.parse(code), "imaging.md", "exec"), values)
     for made, flat in ((values["sharp"], 90), (values["clean"], 0.4)):

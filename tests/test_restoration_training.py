@@ -26,7 +26,7 @@ from restoration.training import TrainOptions, train, turned
 
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath, middles
-from colmap_inertial.restoration._tiles import OVERLAP_PX, Span, path_feed
+from colmap_inertial.imaging.restoration._tiles import OVERLAP_PX, Span, path_feed
 
 
 @pytest.fixture(scope="module")

@@ -5,11 +5,11 @@ import time
 
 import pytest
 
-from colmap_inertial.drivers.capture import reconstruct
-from colmap_inertial.drivers.project import reconstruct_project
-from colmap_inertial.errors import FormatError
-from colmap_inertial.options import ProjectOptions, ReconstructOptions
-from colmap_inertial.run import installed
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
+from colmap_inertial.pipeline.run import installed
+from colmap_inertial.reconstruction.drivers.capture import reconstruct
+from colmap_inertial.reconstruction.drivers.project import reconstruct_project
 
 
 @pytest.fixture

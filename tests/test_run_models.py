@@ -9,33 +9,11 @@ import pytest
 from conftest import write_project
 from test_pipeline_parts import recording_of, session_in
 
-from colmap_inertial.drivers import models
-from colmap_inertial.drivers.models import run_models, run_validation
-from colmap_inertial.drivers.project import _scales
-from colmap_inertial.drivers.result import ModelResult, ReconstructResult, result_as_json
-from colmap_inertial.errors import FormatError, TimingError
-from colmap_inertial.geometry import quat_exp, quat_multiply, quat_rotate
-from colmap_inertial.imaging.gate import FrameDecision, RecordingVerdict
-from colmap_inertial.io.calibration import Declared, calibration_prior
-from colmap_inertial.io.capture import Capture
-from colmap_inertial.io.frames import read_frame_times
-from colmap_inertial.io.trajectories import read_tum
-from colmap_inertial.model import Model, num_registered, read_model
-from colmap_inertial.model.project import apply_to_project, undo_project
-from colmap_inertial.model.readout import Settled
-from colmap_inertial.model.similarities import ModelScale, plain_factor, read_similarity
-from colmap_inertial.precalibrate.plan import ImagingPlan
-from colmap_inertial.report import content
-from colmap_inertial.run.workspace import Workspace
-from colmap_inertial.simulate import ImuOptions, MotionOptions, RecordingOptions, SfmOptions, simulate_recording
-from colmap_inertial.stages import readout
-from colmap_inertial.stages.deblur import MOST_SMOOTHING_PX, DeblurStage, smoothing_for
-from colmap_inertial.stages.gyro_view import GyroView
-from colmap_inertial.stages.join import JoinStage
-from colmap_inertial.stages.metric import MetricStage, gravity_in_model, of_model
-from colmap_inertial.stages.readout import ReadoutStage
-from colmap_inertial.stages.rolling_shutter import RollingShutterStage, for_rectified
-from colmap_inertial.types import (
+from colmap_inertial.checks.report import content
+from colmap_inertial.checks.validate import Validation, parse_target
+from colmap_inertial.core.errors import FormatError, TimingError
+from colmap_inertial.core.geometry import quat_exp, quat_multiply, quat_rotate
+from colmap_inertial.core.types import (
     CameraModel,
     Frame,
     FrameTiming,
@@ -45,7 +23,29 @@ from colmap_inertial.types import (
     ScaleEstimate,
     Similarity,
 )
-from colmap_inertial.validate import Validation, parse_target
+from colmap_inertial.imaging.gate import FrameDecision, RecordingVerdict
+from colmap_inertial.io.calibration import Declared, calibration_prior
+from colmap_inertial.io.capture import Capture
+from colmap_inertial.io.frames import read_frame_times
+from colmap_inertial.io.trajectories import read_tum
+from colmap_inertial.model import Model, num_registered, read_model
+from colmap_inertial.model.project import apply_to_project, undo_project
+from colmap_inertial.model.readout import Settled
+from colmap_inertial.model.similarities import ModelScale, plain_factor, read_similarity
+from colmap_inertial.pipeline.run.workspace import Workspace
+from colmap_inertial.pipeline.stages import readout
+from colmap_inertial.pipeline.stages.deblur import MOST_SMOOTHING_PX, DeblurStage, smoothing_for
+from colmap_inertial.pipeline.stages.gyro_view import GyroView
+from colmap_inertial.pipeline.stages.join import JoinStage
+from colmap_inertial.pipeline.stages.metric import MetricStage, gravity_in_model, of_model
+from colmap_inertial.pipeline.stages.readout import ReadoutStage
+from colmap_inertial.pipeline.stages.rolling_shutter import RollingShutterStage, for_rectified
+from colmap_inertial.reconstruction.drivers import models
+from colmap_inertial.reconstruction.drivers.models import run_models, run_validation
+from colmap_inertial.reconstruction.drivers.project import _scales
+from colmap_inertial.reconstruction.drivers.result import ModelResult, ReconstructResult, result_as_json
+from colmap_inertial.reconstruction.precalibrate.plan import ImagingPlan
+from colmap_inertial.tools.simulate import ImuOptions, MotionOptions, RecordingOptions, SfmOptions, simulate_recording
 
 CAMERA = CameraModel(model="PINHOLE", width=640, height=480, params=(500.0, 500.0, 320.0, 240.0))
 

@@ -14,15 +14,15 @@ import pycolmap
 import pytest
 from test_pipeline_parts import frames_of, recording_of, session_in
 
+from colmap_inertial.checks.diagnose import Recorded, diagnose
 from colmap_inertial.colmap import steps
 from colmap_inertial.colmap.mapping import MapRecord, map_images
 from colmap_inertial.colmap.pairing import MatchRecord
 from colmap_inertial.colmap.sparse import KeypointRecords, extract_features, image_pairs, write_gravity_priors
-from colmap_inertial.diagnose import Recorded, diagnose
-from colmap_inertial.drivers import frames as framing, placed, project as existing
-from colmap_inertial.drivers.frames import run_frames, run_images, run_plan
-from colmap_inertial.drivers.sources import check_output
-from colmap_inertial.errors import NotObservableError, OutputExistsError
+from colmap_inertial.core.errors import NotObservableError, OutputExistsError
+from colmap_inertial.core.options import ExposureOptions, MappingOptions, ProjectOptions, ReconstructOptions
+from colmap_inertial.core.threads import in_order
+from colmap_inertial.core.types import CALIBRATION_PARAMETERS, CameraModel, FrameTiming, ImuRecording, Treatment
 from colmap_inertial.io.calibration import Declared, calibration_prior, write_calibration
 from colmap_inertial.io.capture import Capture, ImageFolder
 from colmap_inertial.io.exposures import LongExposures, SubImages
@@ -30,25 +30,25 @@ from colmap_inertial.io.files import write_json
 from colmap_inertial.io.video_match import VideoMatch
 from colmap_inertial.model import TRANSFORM_FILE
 from colmap_inertial.model.similarities import ModelScale, plain_factor
-from colmap_inertial.options import ExposureOptions, MappingOptions, ProjectOptions, ReconstructOptions
-from colmap_inertial.precalibrate import calibrate, plan as imaging
-from colmap_inertial.precalibrate.judge import Looked, below_sky, by_frame
-from colmap_inertial.precalibrate.pairs import exposure_stage
-from colmap_inertial.precalibrate.plan import Treatments, plan_imaging
-from colmap_inertial.precalibrate.preflight import stop_or_doubt
-from colmap_inertial.precalibrate.selection import part_of
-from colmap_inertial.run.context import Recording, RunContext, prior_calibration
-from colmap_inertial.run.progress import silent
-from colmap_inertial.run.runner import StepRunner, fingerprint
-from colmap_inertial.run.session import Session, open_session
-from colmap_inertial.run.workspace import Workspace
-from colmap_inertial.simulate import MotionOptions, RecordingOptions, simulate_recording
-from colmap_inertial.stages.exposures import Fuser
-from colmap_inertial.stages.frame_folder import FrameRecord, write_frames
-from colmap_inertial.stages.gyro_view import GyroView
-from colmap_inertial.stages.rectified import write_images
-from colmap_inertial.threads import in_order
-from colmap_inertial.types import CALIBRATION_PARAMETERS, CameraModel, FrameTiming, ImuRecording, Treatment
+from colmap_inertial.pipeline.run.context import Recording, RunContext, prior_calibration
+from colmap_inertial.pipeline.run.progress import silent
+from colmap_inertial.pipeline.run.runner import StepRunner, fingerprint
+from colmap_inertial.pipeline.run.session import Session, open_session
+from colmap_inertial.pipeline.run.workspace import Workspace
+from colmap_inertial.pipeline.stages.exposures import Fuser
+from colmap_inertial.pipeline.stages.frame_folder import FrameRecord, write_frames
+from colmap_inertial.pipeline.stages.gyro_view import GyroView
+from colmap_inertial.pipeline.stages.rectified import write_images
+from colmap_inertial.reconstruction.drivers import frames as framing, placed, project as existing
+from colmap_inertial.reconstruction.drivers.frames import run_frames, run_images, run_plan
+from colmap_inertial.reconstruction.drivers.sources import check_output
+from colmap_inertial.reconstruction.precalibrate import calibrate, plan as imaging
+from colmap_inertial.reconstruction.precalibrate.judge import Looked, below_sky, by_frame
+from colmap_inertial.reconstruction.precalibrate.pairs import exposure_stage
+from colmap_inertial.reconstruction.precalibrate.plan import Treatments, plan_imaging
+from colmap_inertial.reconstruction.precalibrate.preflight import stop_or_doubt
+from colmap_inertial.reconstruction.precalibrate.selection import part_of
+from colmap_inertial.tools.simulate import MotionOptions, RecordingOptions, simulate_recording
 
 NAMES = tuple(f"{i}.jpg" for i in range(6))
 TIMING = FrameTiming(names=NAMES, t_s=np.arange(6.0), exposure_s=[0.01, 0.02, 0.03, 0.04, 0.05, 0.06])

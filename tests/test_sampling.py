@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from colmap_inertial.sampling import Coverage, integral_at, is_gap, without_running_mean
+from colmap_inertial.core.sampling import Coverage, integral_at, is_gap, without_running_mean
 
 
 def test_a_gap_is_longer_than_asked_in_seconds_and_in_usual_steps():

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from colmap_inertial.options import ScaleOptions
-from colmap_inertial.scale import check_units, estimate_scale, first_seconds, gravity_at_latitude_m_s2
-from colmap_inertial.scale.verdict import half_width, verdict_of
-from colmap_inertial.simulate.recording import RecordingOptions, simulate_recording
+from colmap_inertial.core.options import ScaleOptions
+from colmap_inertial.inertial.scale import check_units, estimate_scale, first_seconds, gravity_at_latitude_m_s2
+from colmap_inertial.inertial.scale.verdict import half_width, verdict_of
+from colmap_inertial.tools.simulate.recording import RecordingOptions, simulate_recording
 
 
 def test_the_interval_is_symmetric_in_the_logarithm_and_covers_95_percent():

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from colmap_inertial.cli import main
-from colmap_inertial.geometry import so3_exp
+from colmap_inertial.core.geometry import so3_exp
 
 NAME, SECONDS, OTHER = "D11", 30.0, "D5"
 GYRO, ACCEL, POSES = "gyroscope", "accelerometer", "poses"

@@ -7,22 +7,22 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from colmap_inertial.align import align_camera_imu
-from colmap_inertial.geometry import matrix_from_quat, quat_from_matrix, so3_exp, so3_log
+from colmap_inertial.core.geometry import matrix_from_quat, quat_from_matrix, so3_exp, so3_log
+from colmap_inertial.core.options import ScaleOptions
+from colmap_inertial.core.types import CAL, CameraTrajectory, ImuNoise, ImuRecording
+from colmap_inertial.inertial.scale import _factors as fac, _parameters as par, _setup, estimate_scale, first_seconds
+from colmap_inertial.inertial.scale._grouping import first_of_groups, group_frames
+from colmap_inertial.inertial.scale._noise import GROUP_OF, TYPICAL, Expected, roughness
+from colmap_inertial.inertial.scale._preintegration import SensorErrors, Track, Tracks, preintegrate
+from colmap_inertial.inertial.scale._setup import prepare
+from colmap_inertial.inertial.scale._solver import ArrowSystem
+from colmap_inertial.inertial.scale.joint import JointOptions, estimate_joint, fit_path, scale_of
+from colmap_inertial.inertial.scale.priors import PRIORS
 from colmap_inertial.io.calibration import Declared, calibration_prior
-from colmap_inertial.options import ScaleOptions
-from colmap_inertial.scale import _factors as fac, _parameters as par, _setup, estimate_scale, first_seconds
-from colmap_inertial.scale._grouping import first_of_groups, group_frames
-from colmap_inertial.scale._noise import GROUP_OF, TYPICAL, Expected, roughness
-from colmap_inertial.scale._preintegration import SensorErrors, Track, Tracks, preintegrate
-from colmap_inertial.scale._setup import prepare
-from colmap_inertial.scale._solver import ArrowSystem
-from colmap_inertial.scale.joint import JointOptions, estimate_joint, fit_path, scale_of
-from colmap_inertial.scale.priors import PRIORS
-from colmap_inertial.simulate import IMU_PRESETS
-from colmap_inertial.simulate.motion import MotionOptions
-from colmap_inertial.simulate.recording import RecordingOptions, SfmOptions, simulate_recording
-from colmap_inertial.types import CAL, CameraTrajectory, ImuNoise, ImuRecording
+from colmap_inertial.motion.align import align_camera_imu
+from colmap_inertial.tools.simulate import IMU_PRESETS
+from colmap_inertial.tools.simulate.motion import MotionOptions
+from colmap_inertial.tools.simulate.recording import RecordingOptions, SfmOptions, simulate_recording
 
 
 @pytest.fixture(scope="module")

@@ -10,10 +10,10 @@ from scipy.optimize import minimize
 from scipy.special import chdtrc
 
 from colmap_inertial._kernels import _inertial
-from colmap_inertial.align import _fit as align_fit
-from colmap_inertial.scale._drift import chi2_tail
-from colmap_inertial.scale._preintegration import Preintegrated, SensorErrors, Track, Tracks, preintegrate
-from colmap_inertial.scale._solver import ArrowSystem
+from colmap_inertial.inertial.scale._drift import chi2_tail
+from colmap_inertial.inertial.scale._preintegration import Preintegrated, SensorErrors, Track, Tracks, preintegrate
+from colmap_inertial.inertial.scale._solver import ArrowSystem
+from colmap_inertial.motion.align import _fit as align_fit
 
 SIZES = [(1, 21, 79, 1), (2, 21, 79, 5), (3, 21, 79, 5), (3, 5, 4, 2), (2, 7, 0, 3), (40, 1, 1, 9), (480, 21, 79, 5)]
 

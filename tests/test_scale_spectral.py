@@ -6,14 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from colmap_inertial.align import align_camera_imu
-from colmap_inertial.geometry import quat_exp, quat_multiply, so3_exp
+from colmap_inertial.core.geometry import quat_exp, quat_multiply, so3_exp
+from colmap_inertial.inertial.scale import _spectral_fit as spectral_fit
+from colmap_inertial.inertial.scale._spectra import Signals
+from colmap_inertial.inertial.scale.spectral import SpectralOptions, estimate_spectral
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.io.trajectories import read_inertial_scale
-from colmap_inertial.scale import _spectral_fit as spectral_fit
-from colmap_inertial.scale._spectra import Signals
-from colmap_inertial.scale.spectral import SpectralOptions, estimate_spectral
-from colmap_inertial.simulate import (
+from colmap_inertial.motion.align import align_camera_imu
+from colmap_inertial.tools.simulate import (
     IMU_PRESETS,
     MotionOptions,
     RecordingOptions,

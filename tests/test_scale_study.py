@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from colmap_inertial.simulate import (
+from colmap_inertial.tools.simulate import (
     ImuOptions,
     Motion,
     MotionOptions,

@@ -6,17 +6,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from colmap_inertial.align import align_camera_imu
-from colmap_inertial.options import ScaleOptions
-from colmap_inertial.scale import _parameters as par, estimate_scale, first_seconds, gravity_at_latitude_m_s2
-from colmap_inertial.scale._fit import fit_jointly
-from colmap_inertial.scale._preintegration import Track, Tracks, gap_cov
-from colmap_inertial.scale._setup import cut_off, prepare
-from colmap_inertial.scale._suspects import Faults, Suspicion, worst
-from colmap_inertial.scale.parts import CAUSES, parts_in_words
-from colmap_inertial.simulate.motion import MotionOptions
-from colmap_inertial.simulate.recording import RecordingOptions, simulate_recording
-from colmap_inertial.types import CAL, IMU_CAL, ImuCalibration
+from colmap_inertial.core.options import ScaleOptions
+from colmap_inertial.core.types import CAL, IMU_CAL, ImuCalibration
+from colmap_inertial.inertial.scale import _parameters as par, estimate_scale, first_seconds, gravity_at_latitude_m_s2
+from colmap_inertial.inertial.scale._fit import fit_jointly
+from colmap_inertial.inertial.scale._preintegration import Track, Tracks, gap_cov
+from colmap_inertial.inertial.scale._setup import cut_off, prepare
+from colmap_inertial.inertial.scale._suspects import Faults, Suspicion, worst
+from colmap_inertial.inertial.scale.parts import CAUSES, parts_in_words
+from colmap_inertial.motion.align import align_camera_imu
+from colmap_inertial.tools.simulate.motion import MotionOptions
+from colmap_inertial.tools.simulate.recording import RecordingOptions, simulate_recording
 
 
 @pytest.fixture(scope="module")

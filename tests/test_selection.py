@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from box_video import BoxVideo, film
 
-from colmap_inertial.drivers.capture import reconstruct
-from colmap_inertial.flow import VisualRotation
-from colmap_inertial.geometry import quat_conjugate, quat_log, quat_multiply
-from colmap_inertial.gyro import GyroPath
+from colmap_inertial.core.geometry import quat_conjugate, quat_log, quat_multiply
+from colmap_inertial.core.gyro import GyroPath
+from colmap_inertial.core.options import FrameOptions, MappingOptions, ReconstructOptions
+from colmap_inertial.core.types import CameraModel, FrameTiming
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.imaging.psf import predicted_blur_px
 from colmap_inertial.imaging.selection import Ranked, WindowLimits, choose_frames
@@ -23,9 +23,14 @@ from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.frames import read_frame_timing, read_frames
 from colmap_inertial.io.imu import read_capture_imu
 from colmap_inertial.model import colmap_camera
-from colmap_inertial.options import FrameOptions, MappingOptions, ReconstructOptions
-from colmap_inertial.precalibrate import selection as choosing
-from colmap_inertial.precalibrate.selection import (
+from colmap_inertial.motion.flow import VisualRotation
+from colmap_inertial.pipeline.run.context import Recording, RunContext
+from colmap_inertial.pipeline.run.runner import StepRunner
+from colmap_inertial.pipeline.run.session import Session
+from colmap_inertial.pipeline.run.workspace import Workspace
+from colmap_inertial.reconstruction.drivers.capture import reconstruct
+from colmap_inertial.reconstruction.precalibrate import selection as choosing
+from colmap_inertial.reconstruction.precalibrate.selection import (
     Selection,
     _Clocks,
     everything,
@@ -36,15 +41,10 @@ from colmap_inertial.precalibrate.selection import (
     use_all,
     write_selection,
 )
-from colmap_inertial.run.context import Recording, RunContext
-from colmap_inertial.run.runner import StepRunner
-from colmap_inertial.run.session import Session
-from colmap_inertial.run.workspace import Workspace
-from colmap_inertial.simulate import MotionOptions
-from colmap_inertial.simulate.capture import make_scene
-from colmap_inertial.simulate.recipe import SceneRecipe
-from colmap_inertial.simulate.sensors import IMU_PRESETS
-from colmap_inertial.types import CameraModel, FrameTiming
+from colmap_inertial.tools.simulate import MotionOptions
+from colmap_inertial.tools.simulate.capture import make_scene
+from colmap_inertial.tools.simulate.recipe import SceneRecipe
+from colmap_inertial.tools.simulate.sensors import IMU_PRESETS
 
 
 def silent(*_: object) -> None:
@@ -373,7 +373,7 @@ def test_folders_and_thinned_videos_are_used_as_they_are(turning, tmp_path):
 
 def test_a_quick_camera_s_frames_are_ranked_before_they_are_decoded():
     """At 240 frames a second, the least blurred of each thirtieth is looked at."""
-    from colmap_inertial.precalibrate.selection import _slots
+    from colmap_inertial.reconstruction.precalibrate.selection import _slots
 
     t_s = np.arange(480) / 240
     blur = np.random.default_rng(0).uniform(1, 9, 480)

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from colmap_inertial.errors import NotObservableError
-from colmap_inertial.shutter import estimate_readout
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.motion.shutter import estimate_readout
 
 sys.path.append(str(Path(__file__).parents[1] / "scripts"))
 

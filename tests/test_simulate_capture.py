@@ -6,17 +6,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from colmap_inertial.errors import FormatError, OutputExistsError
-from colmap_inertial.geometry import matrix_from_quat, quat_conjugate, quat_exp, quat_log, quat_multiply, quat_rotate
+from colmap_inertial.core.errors import FormatError, OutputExistsError
+from colmap_inertial.core.geometry import (
+    matrix_from_quat,
+    quat_conjugate,
+    quat_exp,
+    quat_log,
+    quat_multiply,
+    quat_rotate,
+)
+from colmap_inertial.core.types import CameraModel
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.frames import read_frames
 from colmap_inertial.io.imu import read_imu
-from colmap_inertial.simulate import MotionOptions
-from colmap_inertial.simulate.capture import make_scene, write_capture
-from colmap_inertial.simulate.recipe import SceneRecipe, load_recipe, recipe_text
-from colmap_inertial.simulate.render import ShutterCamera, colmap_camera
-from colmap_inertial.simulate.truth import read_truth, true_metres_per_unit
-from colmap_inertial.types import CameraModel
+from colmap_inertial.tools.simulate import MotionOptions
+from colmap_inertial.tools.simulate.capture import make_scene, write_capture
+from colmap_inertial.tools.simulate.recipe import SceneRecipe, load_recipe, recipe_text
+from colmap_inertial.tools.simulate.render import ShutterCamera, colmap_camera
+from colmap_inertial.tools.simulate.truth import read_truth, true_metres_per_unit
 
 SCENES = Path(__file__).resolve().parents[1] / "example_scenes"
 CAMERA = ShutterCamera(

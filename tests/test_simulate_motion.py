@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from colmap_inertial.geometry import quat_conjugate, quat_exp, quat_log, quat_multiply, quat_rotate
-from colmap_inertial.simulate import Motion, MotionOptions, make_motion
+from colmap_inertial.core.geometry import quat_conjugate, quat_exp, quat_log, quat_multiply, quat_rotate
+from colmap_inertial.tools.simulate import Motion, MotionOptions, make_motion
 
 KINDS = ("orbit", "walk", "roam", "constant_velocity", "pure_rotation", "static")
 

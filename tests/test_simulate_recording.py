@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from colmap_inertial.geometry import (
+from colmap_inertial.core.geometry import (
     matrix_from_quat,
     quat_conjugate,
     quat_exp,
@@ -13,7 +13,7 @@ from colmap_inertial.geometry import (
     quat_multiply,
     quat_rotate,
 )
-from colmap_inertial.simulate import (
+from colmap_inertial.tools.simulate import (
     IMU_PRESETS,
     ImuOptions,
     MotionOptions,
@@ -21,7 +21,7 @@ from colmap_inertial.simulate import (
     SfmOptions,
     simulate_recording,
 )
-from colmap_inertial.simulate.recording import rolling_shutter_bias_s
+from colmap_inertial.tools.simulate.recording import rolling_shutter_bias_s
 
 NO_ERRORS = ImuOptions(
     gyro_density_rad_s_rthz=0.0,

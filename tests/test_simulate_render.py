@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from colmap_inertial.geometry import matrix_from_quat, quat_exp, quat_from_matrix
-from colmap_inertial.simulate import Motion, MotionOptions, make_motion
-from colmap_inertial.simulate.render import Renderer, ShutterCamera, colmap_camera, develop
-from colmap_inertial.simulate.textures import poster
-from colmap_inertial.simulate.world import Board, Quad, World, make_world
-from colmap_inertial.types import CameraModel
+from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, quat_from_matrix
+from colmap_inertial.core.types import CameraModel
+from colmap_inertial.tools.simulate import Motion, MotionOptions, make_motion
+from colmap_inertial.tools.simulate.render import Renderer, ShutterCamera, colmap_camera, develop
+from colmap_inertial.tools.simulate.textures import poster
+from colmap_inertial.tools.simulate.world import Board, Quad, World, make_world
 
 WIDE = CameraModel(model="OPENCV", width=96, height=64, params=(80, 82, 47, 33, 0.08, -0.1, 0.001, -0.0005))
 #: A small part of a picture of 640 x 480.

@@ -6,9 +6,8 @@ import numpy as np
 import pycolmap
 import pytest
 
-from colmap_inertial.align import align_camera_imu
-from colmap_inertial.errors import NotObservableError
-from colmap_inertial.geometry import (
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.geometry import (
     matrix_from_quat,
     quat_conjugate,
     quat_from_matrix,
@@ -17,19 +16,20 @@ from colmap_inertial.geometry import (
     quat_rotate,
     slerp,
 )
+from colmap_inertial.core.types import CameraTrajectory
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.io.imu import read_imu
-from colmap_inertial.simulate import ImuOptions, MotionOptions, RecordingOptions, SfmOptions, simulate_recording
-from colmap_inertial.smooth import (
+from colmap_inertial.motion.align import align_camera_imu
+from colmap_inertial.motion.smooth import (
     SmoothOptions,
     WorldAcceleration,
     smooth_attitude,
     smooth_positions,
     smooth_trajectory,
 )
-from colmap_inertial.smooth._chain import Chain
-from colmap_inertial.smooth._models import constant_acceleration, white_jerk
-from colmap_inertial.types import CameraTrajectory
+from colmap_inertial.motion.smooth._chain import Chain
+from colmap_inertial.motion.smooth._models import constant_acceleration, white_jerk
+from colmap_inertial.tools.simulate import ImuOptions, MotionOptions, RecordingOptions, SfmOptions, simulate_recording
 
 #: Gains and misalignments are not part of the smoother's model (they are priced in roughly): left out for exact tests.
 IDEAL_GAINS = replace(

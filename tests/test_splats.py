@@ -12,8 +12,8 @@ import pytest
 from model_project import NAMES, sparse_model
 from test_io_ply import SIMILARITY
 
-from colmap_inertial.errors import FormatError
-from colmap_inertial.geometry import matrix_from_quat
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.io.files import write_json
 from colmap_inertial.io.ply import transform_ply
 from colmap_inertial.io.splats import sh_basis, sh_rotation

@@ -14,10 +14,10 @@ from test_closing import FRAMES, NAMES, make
 from colmap_inertial.colmap import mapping, submaps
 from colmap_inertial.colmap.closing import LONGEST, EndsMet, SeamsMet, close_seams
 from colmap_inertial.colmap.submaps import PART, SHARED, MappedRun, Tie, join_runs, place_parts, runs
-from colmap_inertial.geometry import so3_exp
+from colmap_inertial.core.geometry import so3_exp
+from colmap_inertial.core.options import MappingOptions
 from colmap_inertial.model.observed import points_of_features
-from colmap_inertial.options import MappingOptions
-from colmap_inertial.run.context import RunContext
+from colmap_inertial.pipeline.run.context import RunContext
 
 #: Runs of the ring's images.
 PARTS = [(0, 18), (12, 30), (24, 42), (36, 48)]

@@ -12,7 +12,7 @@ from colmap_inertial.colmap import swept
 from colmap_inertial.colmap.depth_maps import MadeFrom, coverage, found_maps, map_file, settle_maker
 from colmap_inertial.colmap.fusion import fuse_maps
 from colmap_inertial.colmap.swept import SweptWorkspace
-from colmap_inertial.errors import FormatError
+from colmap_inertial.core.errors import FormatError
 from colmap_inertial.model.depth_maps import read_map, write_map
 
 VIEWS = [camera((x, -0.6 + z, 0.3 + z), (5 * z, -6 * x, 20 * x)) for x in (-0.5, -0.2, 0.2, 0.5) for z in (-0.15, 0.15)]

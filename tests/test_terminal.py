@@ -11,12 +11,12 @@ from conftest import write_project
 from rich.console import Console
 from rich.progress import Progress as Bars
 
+from colmap_inertial.checks.diagnose import Diagnosis, Finding
 from colmap_inertial.cli import main
 from colmap_inertial.cli.screen import Screen, Stage
 from colmap_inertial.cli.terminal import show_scale
-from colmap_inertial.diagnose import Diagnosis, Finding
-from colmap_inertial.simulate import MotionOptions, RecordingOptions, simulate_recording
-from colmap_inertial.types import ScaleEstimate
+from colmap_inertial.core.types import ScaleEstimate
+from colmap_inertial.tools.simulate import MotionOptions, RecordingOptions, simulate_recording
 
 GLIDES = Finding(
     code="no-acceleration",
@@ -214,8 +214,8 @@ def test_a_scale_says_apart_what_its_recording_has(project, tmp_path, capsys):
 
 
 def test_a_batch_says_what_was_found_in_each_capture_once(capsys):
-    from colmap_inertial.batch.task import CaptureStatus
-    from colmap_inertial.batch.terminal import live_batch
+    from colmap_inertial.tools.batch.task import CaptureStatus
+    from colmap_inertial.tools.batch.terminal import live_batch
 
     found = "error: it hardly moves [at 3 s]; swing it (no-motion)"
     with live_batch() as watch:

@@ -11,13 +11,13 @@ import pytest
 from far_scene import FarScene
 from test_diagnose import imu_of, run
 
-from colmap_inertial.diagnose import Recorded, diagnose
-from colmap_inertial.flow import FlowOptions
-from colmap_inertial.geometry import so3_exp, so3_log
+from colmap_inertial.checks.diagnose import Recorded, diagnose
+from colmap_inertial.core.geometry import so3_exp, so3_log
+from colmap_inertial.core.types import CameraModel, Frame, FrameTiming
 from colmap_inertial.imaging.gyro_camera import FrameShutter
-from colmap_inertial.simulate.render import colmap_camera
-from colmap_inertial.turns import _rotation, _Seen, measure_turns
-from colmap_inertial.types import CameraModel, Frame, FrameTiming
+from colmap_inertial.motion.flow import FlowOptions
+from colmap_inertial.motion.turns import _rotation, _Seen, measure_turns
+from colmap_inertial.tools.simulate.render import colmap_camera
 
 LENS = CameraModel(model="PINHOLE", width=320, height=240, params=(250.0, 250.0, 160.0, 120.0))
 SECONDS, STEP_S = 12.0, 0.4

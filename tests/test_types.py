@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from colmap_inertial.errors import NotObservableError
-from colmap_inertial.geometry import matrix_from_quat, quat_rotate
-from colmap_inertial.types import (
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.geometry import matrix_from_quat, quat_rotate
+from colmap_inertial.core.types import (
     CAL,
     CALIBRATION_PARAMETERS,
     CameraImuCalibration,

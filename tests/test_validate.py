@@ -24,18 +24,18 @@ from validate_scenes import (
     write_images,
 )
 
-from colmap_inertial.errors import FormatError, NotObservableError, TargetNotFoundError
-from colmap_inertial.geometry import colmap_px_from_opencv
-from colmap_inertial.options import ValidateOptions
-from colmap_inertial.validate import (
+from colmap_inertial.checks.validate import (
     parse_target,
     search as search_module,
     validate_model,
     validation_table,
     write_overlays,
 )
-from colmap_inertial.validate.detect import Detection, detect
-from colmap_inertial.validate.views import sight
+from colmap_inertial.checks.validate.detect import Detection, detect
+from colmap_inertial.checks.validate.views import sight
+from colmap_inertial.core.errors import FormatError, NotObservableError, TargetNotFoundError
+from colmap_inertial.core.geometry import colmap_px_from_opencv
+from colmap_inertial.core.options import ValidateOptions
 
 TARGET = parse_target("checkerboard:9x6:0.03")
 CAMERA = default_camera()

@@ -18,8 +18,8 @@ from validate_scenes import (
 )
 from versions import version_of
 
-from colmap_inertial.validate import parse_target
-from colmap_inertial.validate.detect import detect, other_checkerboard
+from colmap_inertial.checks.validate import parse_target
+from colmap_inertial.checks.validate.detect import detect, other_checkerboard
 
 CAMERA = default_camera()
 

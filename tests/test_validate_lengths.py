@@ -5,11 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from colmap_inertial.drivers.sources import validate_source
-from colmap_inertial.errors import FormatError, InertialError, NotObservableError
-from colmap_inertial.geometry import quat_exp, quat_rotate
-from colmap_inertial.options import ValidateOptions
-from colmap_inertial.validate import (
+from colmap_inertial.checks.validate import (
     Corner,
     Distance,
     TargetSpecError,
@@ -18,8 +14,12 @@ from colmap_inertial.validate import (
     with_bars,
     with_other_target,
 )
-from colmap_inertial.validate.lengths import check_lengths, model_diagonal
-from colmap_inertial.validate.markers import distance_between, with_check_points
+from colmap_inertial.checks.validate.lengths import check_lengths, model_diagonal
+from colmap_inertial.checks.validate.markers import distance_between, with_check_points
+from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError
+from colmap_inertial.core.geometry import quat_exp, quat_rotate
+from colmap_inertial.core.options import ValidateOptions
+from colmap_inertial.reconstruction.drivers.sources import validate_source
 
 SIDE_M = 0.1
 PLACES = {0: (0, 0, 0), 1: (2, 0, 0), 2: (0, 3, 0.5), 3: (2, 3, 1), 7: (1, 1, 2)}

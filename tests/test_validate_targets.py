@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from colmap_inertial.validate import TargetSpecError, parse_target
+from colmap_inertial.checks.validate import TargetSpecError, parse_target
 
 
 def distance(target, a, b):

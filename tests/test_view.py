@@ -20,19 +20,19 @@ from markdown_it import MarkdownIt
 from report_runs import HOSTILE
 
 from colmap_inertial.cli import main
-from colmap_inertial.errors import FormatError, MissingExtraError, OutputError
-from colmap_inertial.geometry import quat_exp, quat_rotate
+from colmap_inertial.core.errors import FormatError, MissingExtraError, OutputError
+from colmap_inertial.core.geometry import quat_exp, quat_rotate
+from colmap_inertial.core.types import ScaleEstimate, Similarity
 from colmap_inertial.model import apply_similarity
 from colmap_inertial.model.project import apply_to_project
 from colmap_inertial.model.similarities import plain_factor
-from colmap_inertial.types import ScaleEstimate, Similarity
-from colmap_inertial.view import load_scene, measured, nearest_to_ray, round_length
-from colmap_inertial.view.clouds import dense_cloud, read_mesh
-from colmap_inertial.view.drawing import AMBER, BLUE, path_colours
-from colmap_inertial.view.measure import ball_at_ray, length_text
-from colmap_inertial.view.panel import camera_text, contents_text, measured_text, scale_text, target_text
-from colmap_inertial.view.scene import START_FOV_RAD
-from colmap_inertial.view.sources import TargetFacts
+from colmap_inertial.tools.view import load_scene, measured, nearest_to_ray, round_length
+from colmap_inertial.tools.view.clouds import dense_cloud, read_mesh
+from colmap_inertial.tools.view.drawing import AMBER, BLUE, path_colours
+from colmap_inertial.tools.view.measure import ball_at_ray, length_text
+from colmap_inertial.tools.view.panel import camera_text, contents_text, measured_text, scale_text, target_text
+from colmap_inertial.tools.view.scene import START_FOV_RAD
+from colmap_inertial.tools.view.sources import TargetFacts
 
 METRES_PER_UNIT = 0.25
 #: Gravity in the model's own world: neither along an axis nor of length 1.
@@ -469,7 +469,7 @@ def test_without_viser_the_extra_is_named(monkeypatch, out, capsys):
 
 
 def test_an_address_of_another_machine_is_an_error_and_a_taken_port_makes_way(out):
-    from colmap_inertial.view.server import Viewer
+    from colmap_inertial.tools.view.server import Viewer
 
     scene = load_scene(out[0])
     with pytest.raises(OutputError, match=r"cannot listen at 192\.0\.2\.1"):

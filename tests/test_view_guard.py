@@ -13,10 +13,10 @@ from test_view import ESTIMATE, write_result
 from websockets.exceptions import InvalidStatus, WebSocketException
 from websockets.sync.client import connect
 
-from colmap_inertial.errors import OutputError
-from colmap_inertial.view import load_scene
-from colmap_inertial.view.guard import MOST_CONNECTIONS, MOST_VIEWERS, Guard, allowed, guarding, is_loopback
-from colmap_inertial.view.server import Viewer
+from colmap_inertial.core.errors import OutputError
+from colmap_inertial.tools.view import load_scene
+from colmap_inertial.tools.view.guard import MOST_CONNECTIONS, MOST_VIEWERS, Guard, allowed, guarding, is_loopback
+from colmap_inertial.tools.view.server import Viewer
 
 _ENDED = (WebSocketException, OSError)
 

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.types import Array
+from colmap_inertial.core.types import Array
 
 PADDING: int
 

@@ -1,9 +1,9 @@
-"""Linear algebra and integration of `colmap_inertial.scale`, `.align` and `.refine`. Results are written in place."""
+"""Linear algebra and integration of the inertial estimators. Results are written in place."""
 
 from numpy import int64
 from numpy.typing import NDArray
 
-from colmap_inertial.types import Array
+from colmap_inertial.core.types import Array
 
 class ArrowFactor:
     """Cholesky factor of a chain of states, its rows and columns scaled by `unit`."""

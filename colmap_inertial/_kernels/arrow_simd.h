@@ -1,4 +1,4 @@
-// A chain of states with a few globals, as `ArrowSystem` in scale/_solver.py has it: what depends on the instruction
+// A chain of states with a few globals, as `ArrowSystem` in inertial/scale/_solver.py has it: what depends on the instruction
 // set. Rows of all matrices here are padded to multiples of PAD columns.
 #pragma once
 

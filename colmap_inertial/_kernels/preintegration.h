@@ -1,4 +1,4 @@
-// Inertial increments over intervals, as `Preintegrated` in scale/_preintegration.py has them.
+// Inertial increments over intervals, as `Preintegrated` in inertial/scale/_preintegration.py has them.
 #pragma once
 
 #include <cstddef>

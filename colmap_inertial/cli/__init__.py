@@ -22,8 +22,8 @@ from colmap_inertial.cli.limits import require_limits
 from colmap_inertial.cli.models import Align, Apply, CalibrateImu, Diagnose, Export, Scale, Validate, View
 from colmap_inertial.cli.signals import INTERRUPTED, TERMINATED, Terminated, answering_signals
 from colmap_inertial.cli.speech import Speaker, log_on_terminal, print_json
-from colmap_inertial.errors import InertialError, exhausted
-from colmap_inertial.options import ProjectOptions, ReconstructOptions, ReferenceOptions
+from colmap_inertial.core.errors import InertialError, exhausted
+from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, ReferenceOptions
 
 DESCRIPTION = """Metric, gravity-aligned COLMAP models from the gyroscope and accelerometer that filmed along.
 
@@ -202,7 +202,7 @@ def _calibrations_last(args: Sequence[str]) -> list[str]:
 
 def _default_from_config(cls: type[Command], args: Sequence[str]) -> Command | None:
     """The command with its options from ``--config``, so that flags go before the file and the file before defaults."""
-    from colmap_inertial.run.config import read_config
+    from colmap_inertial.pipeline.run.config import read_config
 
     path = None
     for i, text in enumerate(args):

@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from colmap_inertial.cli.speech import Reader, Speaker
-from colmap_inertial.options import (
+from colmap_inertial.core.options import (
     ApertureOptions,
     BatchOptions,
     BlurRemover,
@@ -64,14 +64,14 @@ class Reconstruct(Speaker):
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
+        from colmap_inertial.checks.diagnose import Diagnosis
         from colmap_inertial.cli.screen import live_progress
         from colmap_inertial.cli.terminal import show_remembered, show_result
-        from colmap_inertial.diagnose import Diagnosis
-        from colmap_inertial.drivers.capture import reconstruct
-        from colmap_inertial.drivers.project import is_project, reconstruct_project
-        from colmap_inertial.drivers.remembered import remembered_of
-        from colmap_inertial.errors import InertialError
+        from colmap_inertial.core.errors import InertialError
         from colmap_inertial.io.files import read_json
+        from colmap_inertial.reconstruction.drivers.capture import reconstruct
+        from colmap_inertial.reconstruction.drivers.project import is_project, reconstruct_project
+        from colmap_inertial.reconstruction.drivers.remembered import remembered_of
 
         self.check_json(self.capture, self.project.imu, self.project.frame_times)
         if self.reference.scale_from != "imu":
@@ -114,9 +114,9 @@ class Reconstruct(Speaker):
     def _by_reference(self) -> int:
         from colmap_inertial.cli.screen import live_progress
         from colmap_inertial.cli.terminal import show_reference
-        from colmap_inertial.drivers.bare import reconstruct_by
-        from colmap_inertial.drivers.project import is_project
-        from colmap_inertial.drivers.reference import scale_project_by
+        from colmap_inertial.reconstruction.drivers.bare import reconstruct_by
+        from colmap_inertial.reconstruction.drivers.project import is_project
+        from colmap_inertial.reconstruction.drivers.reference import scale_project_by
 
         with live_progress(self) as screen:
             if is_project(self.capture):
@@ -157,8 +157,8 @@ class Deblur(Reader):
         """Run the command; returns the exit code."""
         from colmap_inertial.cli.screen import live_progress
         from colmap_inertial.cli.terminal import show_deblurred
-        from colmap_inertial.drivers.deblur import deblur_capture
         from colmap_inertial.io.files import read_json
+        from colmap_inertial.reconstruction.drivers.deblur import deblur_capture
 
         self.check_json(self.capture)
         with live_progress(self) as progress:
@@ -200,9 +200,9 @@ class FuseApertures(Reader):
         """Run the command; returns the exit code."""
         from colmap_inertial.cli.screen import live_progress
         from colmap_inertial.cli.terminal import show_fused
-        from colmap_inertial.drivers.fuse_apertures import fuse_captured
         from colmap_inertial.io.files import read_json
-        from colmap_inertial.run.workspace import Workspace
+        from colmap_inertial.pipeline.run.workspace import Workspace
+        from colmap_inertial.reconstruction.drivers.fuse_apertures import fuse_captured
 
         options = FuseAperturesOptions(fusion=self.fusion, refocus=self.refocus, lens_width=self.lens_width)
         self.check_json(self.capture)
@@ -239,9 +239,9 @@ class FuseExposures(Reader):
         """Run the command; returns the exit code."""
         from colmap_inertial.cli.screen import live_progress
         from colmap_inertial.cli.terminal import show_fused
-        from colmap_inertial.drivers.fuse_exposures import fuse_exposures_captured
         from colmap_inertial.io.files import read_json
-        from colmap_inertial.run.workspace import Workspace
+        from colmap_inertial.pipeline.run.workspace import Workspace
+        from colmap_inertial.reconstruction.drivers.fuse_exposures import fuse_exposures_captured
 
         options = ExposureOptions(fusion=self.fusion, device=self.device)
         self.check_json(self.capture)
@@ -288,9 +288,9 @@ class Batch(Speaker):
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.batch import run_batch
-        from colmap_inertial.batch.terminal import live_batch, show_batch
         from colmap_inertial.io.files import read_json
+        from colmap_inertial.tools.batch import run_batch
+        from colmap_inertial.tools.batch.terminal import live_batch, show_batch
 
         self.check_json(self.manifest)
         with live_batch(quiet=self.quiet) as watch:
@@ -324,8 +324,8 @@ class Simulate(Reader):
     def run(self) -> int:
         """Run the command; returns the exit code."""
         from colmap_inertial.cli.screen import live_progress
-        from colmap_inertial.simulate.capture import write_capture
-        from colmap_inertial.simulate.recipe import load_recipe
+        from colmap_inertial.tools.simulate.capture import write_capture
+        from colmap_inertial.tools.simulate.recipe import load_recipe
 
         self.check_json(self.recipe)
         recipe = load_recipe(self.recipe)

@@ -5,7 +5,7 @@ Libraries that are out of memory or of files end the process without one: OpenBL
 
 from __future__ import annotations
 
-from colmap_inertial.errors import InertialError
+from colmap_inertial.core.errors import InertialError
 
 #: Address space to begin with, and for each thread: its stack, and what the allocator keeps for it. A reconstruction of
 #: small pictures takes 1.3 GB on two processors.
@@ -33,7 +33,7 @@ def require_limits(*, to_load: bool = False) -> None:
         import resource
     except ImportError:  # Windows has none
         return
-    from colmap_inertial.threads import usable_processors
+    from colmap_inertial.core.threads import usable_processors
 
     least = LEAST_BYTES + THREAD_BYTES * usable_processors()
     loaded = LOADING_BYTES + THREAD_BYTES * usable_processors()

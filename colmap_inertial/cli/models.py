@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import Positional, arg
 
 from colmap_inertial.cli.speech import Reader
-from colmap_inertial.options import (
+from colmap_inertial.core.options import (
     ExportImages,
     ExportProgram,
     GravityOptions,
@@ -59,8 +59,8 @@ class Scale(Reader):
     def run(self) -> int:
         """Run the command; returns the exit code."""
         from colmap_inertial.cli.terminal import show_remembered, show_scale
-        from colmap_inertial.drivers.remembered import remembered_of
-        from colmap_inertial.drivers.sources import ScaleSource, scale_as_json, scale_source
+        from colmap_inertial.reconstruction.drivers.remembered import remembered_of
+        from colmap_inertial.reconstruction.drivers.sources import ScaleSource, scale_as_json, scale_source
 
         calibration = self.calibration
         if self.remembered:
@@ -205,9 +205,9 @@ class Align(Reader):
     def run(self) -> int:
         """Run the command; returns the exit code."""
         from colmap_inertial.cli.terminal import show_calibration
-        from colmap_inertial.drivers.remembered import remember
-        from colmap_inertial.drivers.sources import ScaleSource, align_source
         from colmap_inertial.io.files import read_json
+        from colmap_inertial.reconstruction.drivers.remembered import remember
+        from colmap_inertial.reconstruction.drivers.sources import ScaleSource, align_source
 
         source = ScaleSource(
             source=self.source, imu=self.imu, frame_times=self.frame_times, calibration=self.calibration
@@ -248,9 +248,9 @@ class CalibrateImu(Reader):
     def run(self) -> int:
         """Run the command; returns the exit code."""
         from colmap_inertial.cli.terminal import show_imu_calibration
-        from colmap_inertial.drivers.imu_calibration import calibrate_source
-        from colmap_inertial.drivers.remembered import remember
         from colmap_inertial.io.files import read_json
+        from colmap_inertial.reconstruction.drivers.imu_calibration import calibrate_source
+        from colmap_inertial.reconstruction.drivers.remembered import remember
 
         self.check_json(self.recording, self.out)
         found = calibrate_source(self.recording, self.out, self.gravity, device=self.remember)
@@ -283,8 +283,8 @@ class Diagnose(Reader):
         """Run the command; returns the exit code."""
         from colmap_inertial.cli.screen import live_progress
         from colmap_inertial.cli.terminal import show_diagnosis
-        from colmap_inertial.drivers.diagnosis import diagnose_source
-        from colmap_inertial.drivers.sources import ScaleSource
+        from colmap_inertial.reconstruction.drivers.diagnosis import diagnose_source
+        from colmap_inertial.reconstruction.drivers.sources import ScaleSource
 
         source = ScaleSource(
             source=self.source, imu=self.imu, frame_times=self.frame_times, calibration=self.calibration
@@ -335,7 +335,7 @@ class Validate(Reader):
     def run(self) -> int:
         """Run the command; returns the exit code."""
         from colmap_inertial.cli.terminal import show_validation
-        from colmap_inertial.drivers.sources import validate_source
+        from colmap_inertial.reconstruction.drivers.sources import validate_source
 
         result = validate_source(
             self.model,
@@ -397,8 +397,8 @@ class Export(Reader):
         """Run the command; returns the exit code."""
         from colmap_inertial.cli.screen import live_progress
         from colmap_inertial.cli.terminal import show_exported
-        from colmap_inertial.export.whole import export_model
         from colmap_inertial.io.files import read_json
+        from colmap_inertial.tools.export.whole import export_model
 
         self.check_json(self.out, self.dir)
         with live_progress(self) as progress:
@@ -450,8 +450,8 @@ class View(Reader):
     def run(self) -> int:
         """Run the command; returns the exit code."""
         from colmap_inertial.cli.terminal import show_view
-        from colmap_inertial.view.scene import load_scene
-        from colmap_inertial.view.server import require_viser, serve
+        from colmap_inertial.tools.view.scene import load_scene
+        from colmap_inertial.tools.view.server import require_viser, serve
 
         require_viser()
         scene = load_scene(self.out, model=self.model, images=self.images, max_points=self.max_points)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress as Bars, TaskID
 
-    from colmap_inertial.diagnose import Diagnosis
+    from colmap_inertial.checks.diagnose import Diagnosis
 
 _STAGES = {
     "rendering": "Rendering",
@@ -173,7 +173,7 @@ class Screen:
         """
         from rich.text import Text
 
-        from colmap_inertial.precalibrate.preflight import STOPPING
+        from colmap_inertial.reconstruction.precalibrate.preflight import STOPPING
 
         found = [finding for finding in diagnosis.findings if finding.severity != "info"]
         stopping = next((finding for finding in found if stops and finding.code in STOPPING), None)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from colmap_inertial.options import ReadLimits
+from colmap_inertial.core.options import ReadLimits
 
 #: ``--json -``.
 _STANDARD_OUTPUT = Path("-")
@@ -50,7 +50,7 @@ class Speaker:
     def check_json(self, *inputs: Path | None) -> None:
         """Refuse, before the work, a file for the JSON that is an input or not of ours."""
         if self.json_file is not None:
-            from colmap_inertial.drivers.sources import check_output
+            from colmap_inertial.reconstruction.drivers.sources import check_output
 
             check_output(self.json_file, inputs)
 

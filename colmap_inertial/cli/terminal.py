@@ -10,26 +10,26 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from colmap_inertial.cli.screen import SEVERITY_COLOUR, Screen
-from colmap_inertial.errors import InertialError
+from colmap_inertial.core.errors import InertialError
 
 # Only the annotations need these, and what a command does not load it does not wait for.
 if TYPE_CHECKING:
     from rich.text import Text
 
-    from colmap_inertial.diagnose import Diagnosis
-    from colmap_inertial.drivers.deblur import DeblurResult
-    from colmap_inertial.drivers.reference import Reference
-    from colmap_inertial.drivers.remembered import Remembered
-    from colmap_inertial.drivers.result import ReconstructResult
-    from colmap_inertial.export.whole import Exported
-    from colmap_inertial.georeference import Georeference
+    from colmap_inertial.checks.diagnose import Diagnosis
+    from colmap_inertial.checks.validate import Validation
+    from colmap_inertial.core.types import CameraImuCalibration, Gap, JoinedPart, ScaleEstimate
+    from colmap_inertial.inertial.georeference import Georeference
+    from colmap_inertial.inertial.rest import RestCalibration
     from colmap_inertial.model.project import Applied
-    from colmap_inertial.precalibrate.plan import ImagingPlan
-    from colmap_inertial.rest import RestCalibration
-    from colmap_inertial.run.workspace import Workspace
-    from colmap_inertial.stages.frame_folder import FrameRecord
-    from colmap_inertial.types import CameraImuCalibration, Gap, JoinedPart, ScaleEstimate
-    from colmap_inertial.validate import Validation
+    from colmap_inertial.pipeline.run.workspace import Workspace
+    from colmap_inertial.pipeline.stages.frame_folder import FrameRecord
+    from colmap_inertial.reconstruction.drivers.deblur import DeblurResult
+    from colmap_inertial.reconstruction.drivers.reference import Reference
+    from colmap_inertial.reconstruction.drivers.remembered import Remembered
+    from colmap_inertial.reconstruction.drivers.result import ReconstructResult
+    from colmap_inertial.reconstruction.precalibrate.plan import ImagingPlan
+    from colmap_inertial.tools.export.whole import Exported
 
 #: A label and what there is to say.
 Line = tuple[str, "str | Text"]
@@ -39,7 +39,7 @@ _COLOUR = {"trusted": "green", "weak": "yellow", "refused": "red"}
 
 def headline(estimate: ScaleEstimate) -> str:
     """What a user wants to know first: how far off ten metres may be."""
-    from colmap_inertial.report.words import half_width_pct, length_error
+    from colmap_inertial.checks.report.words import half_width_pct, length_error
 
     if estimate.metres_per_unit is None or estimate.ci95 is None:
         return "no metres: the recording does not tell how large things are"
@@ -51,7 +51,7 @@ def headline(estimate: ScaleEstimate) -> str:
 
 def next_command(result: ReconstructResult, source: Path) -> str:
     """What to type next, by how a reconstruction ended."""
-    from colmap_inertial.validate import Validation
+    from colmap_inertial.checks.validate import Validation
 
     out, best = result.workspace.root, result.models[0]
     if all(model.sparse_metric is None for model in result.models):
@@ -69,7 +69,7 @@ def scale_lines(estimate: ScaleEstimate) -> list[Line]:
     """The estimate as labelled lines, the first of them what a user wants to know."""
     from rich.text import Text
 
-    from colmap_inertial.scale.parts import parts_in_words
+    from colmap_inertial.inertial.scale.parts import parts_in_words
 
     lines: list[Line] = [("Metres", Text(headline(estimate), "bold"))]
     lines.append(("Verdict", Text(estimate.verdict, f"bold {_COLOUR[estimate.verdict]}")))
@@ -155,7 +155,7 @@ def show_imu_calibration(found: RestCalibration, source: Path, out: Path, kept: 
     """Print what the rests say of an IMU, with 95 % intervals."""
     from rich.text import Text
 
-    from colmap_inertial.report.imu_calibration import gain_effect
+    from colmap_inertial.checks.report.imu_calibration import gain_effect
 
     calibration = found.calibration
     colour = {"good": "green", "weak": "yellow"}[found.verdict]
@@ -223,7 +223,7 @@ def show_diagnosis(diagnosis: Diagnosis, source: Path) -> None:
 
 
 def _say_not_checked(diagnosis: Diagnosis) -> None:
-    from colmap_inertial.report.words import not_checked
+    from colmap_inertial.checks.report.words import not_checked
 
     left = not_checked(diagnosis.checked)
     if left:
@@ -234,14 +234,14 @@ def show_validation(result: Validation) -> None:
     """Print a validation."""
     from rich.console import Console
 
-    from colmap_inertial.validate import validation_table
+    from colmap_inertial.checks.validate import validation_table
 
     Console().print(validation_table(result))
 
 
 def imaging_lines(frames: Sequence[FrameRecord], plan: ImagingPlan, rectified: Collection[str]) -> list[Line]:
     """What was done to the frames, as labelled lines."""
-    from colmap_inertial.drivers.result import shutter_note
+    from colmap_inertial.reconstruction.drivers.result import shutter_note
 
     counts = {action: sum(frame.action == action for frame in frames) for action in ("deblurred", "dropped")}
     done = ", ".join(f"{count} {action}" for action, count in counts.items() if count)
@@ -260,7 +260,7 @@ def show_nothing_to_do(workspace: Workspace) -> None:
 
 def show_reference(found: Reference) -> None:
     """Print where a project's metres come from, and how good they are."""
-    from colmap_inertial.report.words import half_width_pct, length_error
+    from colmap_inertial.checks.report.words import half_width_pct, length_error
 
     low, high = found.ci95
     pct = half_width_pct(found.metres_per_unit, found.ci95)
@@ -306,7 +306,7 @@ def show_deblurred(result: DeblurResult) -> None:
 
 
 def _on_map(found: Georeference | InertialError) -> str:
-    from colmap_inertial.scale.verdict import Z95
+    from colmap_inertial.core.quantiles import Z95
 
     if isinstance(found, InertialError):
         return str(found)
@@ -317,8 +317,8 @@ def _on_map(found: Georeference | InertialError) -> str:
 
 def show_result(result: ReconstructResult, source: Path) -> None:
     """Print the end of a reconstruction of ``source`` on one screen; the last line is what to type next."""
-    from colmap_inertial.report.words import mapped_in_words, parts_mapped_in_words
-    from colmap_inertial.validate import Validation
+    from colmap_inertial.checks.report.words import mapped_in_words, parts_mapped_in_words
+    from colmap_inertial.checks.validate import Validation
 
     mapping = None if result.mapping is None else asdict(result.mapping)
     if result.unchanged and not result.waiting:
@@ -429,7 +429,7 @@ def show_exported(made: Exported) -> None:
 
 def show_view(out: Path, url: str, host: str) -> None:
     """Where a model is shown, and to whom."""
-    from colmap_inertial.view.guard import is_loopback
+    from colmap_inertial.tools.view.guard import is_loopback
 
     print(f"{out} is shown at {url} (Ctrl-C ends this)", flush=True)
     if not is_loopback(host):

@@ -29,16 +29,16 @@ from colmap_inertial.colmap.depth_maps import (
 from colmap_inertial.colmap.fusion import fuse_maps
 from colmap_inertial.colmap.swept import SweptWorkspace
 from colmap_inertial.colmap.tsdf import tsdf_mesh
-from colmap_inertial.errors import FormatError, OutputError
+from colmap_inertial.core.errors import FormatError, OutputError
+from colmap_inertial.core.options import DenseOptions
 from colmap_inertial.io.files import read_json, write_json
 from colmap_inertial.io.images import read_image
 from colmap_inertial.io.names import path_in
 from colmap_inertial.io.ply import read_ply_header
 from colmap_inertial.model import TRANSFORM_FILE, read_model
-from colmap_inertial.options import DenseOptions
-from colmap_inertial.run.runner import fingerprint, remove
-from colmap_inertial.run.session import Session
-from colmap_inertial.run.workspace import a_record_of_ours
+from colmap_inertial.pipeline.run.runner import fingerprint, remove
+from colmap_inertial.pipeline.run.session import Session
+from colmap_inertial.pipeline.run.workspace import a_record_of_ours
 
 if TYPE_CHECKING:
     import pycolmap

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.errors import NotObservableError
-from colmap_inertial.geometry import skew, so3_exp
-from colmap_inertial.threads import one_blas_thread
-from colmap_inertial.types import Array
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.geometry import skew, so3_exp
+from colmap_inertial.core.threads import one_blas_thread
+from colmap_inertial.core.types import Array
 
 Int = NDArray[np.intp]
 

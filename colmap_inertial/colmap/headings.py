@@ -8,16 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.align import AlignOptions, align_clocks
 from colmap_inertial.colmap.gyro_bias import RayPairs, bias_correction
-from colmap_inertial.flow import VisualRotation
-from colmap_inertial.geometry import so3_log
-from colmap_inertial.gyro import on_camera_rate
-from colmap_inertial.imaging.gyro_camera import GyroCamera
-from colmap_inertial.model import colmap_camera
-from colmap_inertial.run.context import Recording
-from colmap_inertial.sampling import is_gap
-from colmap_inertial.types import (
+from colmap_inertial.core.geometry import so3_log
+from colmap_inertial.core.gyro import on_camera_rate
+from colmap_inertial.core.sampling import is_gap
+from colmap_inertial.core.types import (
     CAL,
     JOINT_GYRO_WALK_RAD_S_RTS,
     TYPICAL_NOISE,
@@ -27,6 +22,11 @@ from colmap_inertial.types import (
     FrameTiming,
     ImuRecording,
 )
+from colmap_inertial.imaging.gyro_camera import GyroCamera
+from colmap_inertial.model import colmap_camera
+from colmap_inertial.motion.align import AlignOptions, align_clocks
+from colmap_inertial.motion.flow import VisualRotation
+from colmap_inertial.pipeline.run.context import Recording
 
 Int = NDArray[np.intp]
 Bool = NDArray[np.bool_]

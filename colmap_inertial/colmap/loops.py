@@ -20,7 +20,7 @@ from colmap_inertial.colmap.headings import Headings
 from colmap_inertial.colmap.two_views import Return, compare, forget, returns
 from colmap_inertial.colmap.votes import Voters
 from colmap_inertial.colmap.way import DRIFT, Way
-from colmap_inertial.types import Array
+from colmap_inertial.core.types import Array
 
 Int = NDArray[np.intp]
 Bool = NDArray[np.bool_]

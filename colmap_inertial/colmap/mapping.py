@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING
 from colmap_inertial.colmap.closing import LONGEST, EndsMet, close_gaps
 from colmap_inertial.colmap.sparse import matches_every_pair
 from colmap_inertial.colmap.submaps import map_in_parts, runs
-from colmap_inertial.errors import MappingError
+from colmap_inertial.core.errors import MappingError
+from colmap_inertial.core.options import MappingOptions
 from colmap_inertial.model import find_models
 from colmap_inertial.model.binary import check_binary_model
-from colmap_inertial.options import MappingOptions
-from colmap_inertial.run.context import RunContext
-from colmap_inertial.run.progress import Progress
-from colmap_inertial.run.workspace import require_room
+from colmap_inertial.pipeline.run.context import RunContext
+from colmap_inertial.pipeline.run.progress import Progress
+from colmap_inertial.pipeline.run.workspace import require_room
 
 if TYPE_CHECKING:
     import pycolmap

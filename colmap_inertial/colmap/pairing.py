@@ -17,10 +17,10 @@ from colmap_inertial.colmap.sparse import image_pairs, match_pairs, matches_ever
 from colmap_inertial.colmap.two_views import count_verified, ray_pairs, sightings_of, turns_rad
 from colmap_inertial.colmap.votes import Voters
 from colmap_inertial.colmap.way import find_way
-from colmap_inertial.errors import NotObservableError
-from colmap_inertial.options import MappingOptions
-from colmap_inertial.run.context import Recording, RunContext
-from colmap_inertial.types import CameraModel
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.options import MappingOptions
+from colmap_inertial.core.types import CameraModel
+from colmap_inertial.pipeline.run.context import Recording, RunContext
 
 log = logging.getLogger(__name__)
 

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from colmap_inertial.errors import FormatError, InertialError, MappingError, OutputError
+from colmap_inertial.core.errors import FormatError, InertialError, MappingError, OutputError
+from colmap_inertial.core.options import MappingOptions
+from colmap_inertial.core.types import Array, CameraModel, Keypoints, Treatment
 from colmap_inertial.model import colmap_camera
-from colmap_inertial.options import MappingOptions
-from colmap_inertial.run.context import RunContext
-from colmap_inertial.run.workspace import require_room
-from colmap_inertial.stages.protocols import KeypointStage
-from colmap_inertial.types import Array, CameraModel, Keypoints, Treatment
+from colmap_inertial.pipeline.run.context import RunContext
+from colmap_inertial.pipeline.run.workspace import require_room
+from colmap_inertial.pipeline.stages.protocols import KeypointStage
 
 if TYPE_CHECKING:
     pass
@@ -191,7 +191,7 @@ def growing_batches(pairs: Sequence[str], *, first: int = _FIRST_MATCHING_BATCH)
 
 @dataclass(frozen=True, kw_only=True)
 class KeypointRecord:
-    """What the keypoint stages did to one image's keypoints; see :class:`~colmap_inertial.types.Keypoints`."""
+    """What the keypoint stages did to one image's keypoints; see :class:`~colmap_inertial.core.types.Keypoints`."""
 
     name: str
     rectified: bool = False

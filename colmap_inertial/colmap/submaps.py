@@ -22,9 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.colmap.closing import EndsMet, SeamsMet, close_seams
-from colmap_inertial.geometry import so3_exp
+from colmap_inertial.core.geometry import so3_exp
+from colmap_inertial.core.types import Array
 from colmap_inertial.model.observed import points_of_features
-from colmap_inertial.types import Array
 
 if TYPE_CHECKING:
     import pycolmap

@@ -15,14 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.colmap.depth_maps import map_file
-from colmap_inertial.geometry import opencv_px_from_colmap
-from colmap_inertial.io.files import as_plain, read_json, write_json
-from colmap_inertial.io.images import read_image
-from colmap_inertial.io.names import path_in
-from colmap_inertial.model import read_model
-from colmap_inertial.model.depth_maps import read_map, write_map
-from colmap_inertial.run.runner import remove
-from colmap_inertial.sweep import (
+from colmap_inertial.core.geometry import opencv_px_from_colmap
+from colmap_inertial.core.threads import frames_at_once, in_order
+from colmap_inertial.imaging.sweep import (
     DepthView,
     Partner,
     Pinhole,
@@ -34,7 +29,12 @@ from colmap_inertial.sweep import (
     partner_scores,
     sweep_depth,
 )
-from colmap_inertial.threads import frames_at_once, in_order
+from colmap_inertial.io.files import as_plain, read_json, write_json
+from colmap_inertial.io.images import read_image
+from colmap_inertial.io.names import path_in
+from colmap_inertial.model import read_model
+from colmap_inertial.model.depth_maps import read_map, write_map
+from colmap_inertial.pipeline.run.runner import remove
 
 #: Partners to match with (fewer measure less, more cost time), and views to ask for agreement.
 PARTNERS, WITNESSES = 4, 8

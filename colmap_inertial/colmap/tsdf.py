@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from colmap_inertial.colmap.depth_maps import Maker, map_file
-from colmap_inertial.errors import InertialError, MissingExtraError, OutputError
+from colmap_inertial.core.errors import InertialError, MissingExtraError, OutputError
+from colmap_inertial.core.options import ReconstructOptions
+from colmap_inertial.core.types import Array
 from colmap_inertial.io.images import read_image
 from colmap_inertial.io.names import path_in
 from colmap_inertial.model import read_model
 from colmap_inertial.model.depth_maps import Real, read_map
-from colmap_inertial.options import ReconstructOptions
-from colmap_inertial.types import Array
 
 if TYPE_CHECKING:
     import pycolmap

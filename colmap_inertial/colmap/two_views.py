@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from colmap_inertial.colmap.gyro_bias import RayPairs
 from colmap_inertial.colmap.way import Sightings, Way, joined
-from colmap_inertial.geometry import matrix_from_quat, so3_log
-from colmap_inertial.types import Array
+from colmap_inertial.core.geometry import matrix_from_quat, so3_log
+from colmap_inertial.core.types import Array
 
 if TYPE_CHECKING:
     import pycolmap

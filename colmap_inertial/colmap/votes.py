@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.threads import one_blas_thread
-from colmap_inertial.types import Array
+from colmap_inertial.core.threads import one_blas_thread
+from colmap_inertial.core.types import Array
 
 Int = NDArray[np.intp]
 

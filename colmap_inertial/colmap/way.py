@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.threads import one_blas_thread
-from colmap_inertial.types import Array
+from colmap_inertial.core.threads import one_blas_thread
+from colmap_inertial.core.types import Array
 
 Int = NDArray[np.intp]
 Bool = NDArray[np.bool_]

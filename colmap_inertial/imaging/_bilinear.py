@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.types import Array
+from colmap_inertial.core.types import Array
 
 
 def bilinear(grid: NDArray[Any], rows: Array, columns: Array) -> NDArray[Any]:

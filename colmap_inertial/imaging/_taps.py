@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.types import Array
+from colmap_inertial.core.types import Array
 
 #: The table of taps holds one filter for every quarter of a pixel of blur; between them it is interpolated.
 STEPS_PER_PX = 4

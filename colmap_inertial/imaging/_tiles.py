@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_inertial.core.types import Array
 from colmap_inertial.imaging._bilinear import bilinear
 from colmap_inertial.imaging.blur_path import BlurPath
-from colmap_inertial.types import Array
 
 #: Parts of a tile's side: a margin that is left out, since the filter has less than all of the blur there, and a ramp
 #: over which neighbours are blended. What is left of the side between the ramps is flat.

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_inertial.core.types import Array
 from colmap_inertial.imaging._bilinear import bilinear
-from colmap_inertial.types import Array
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_inertial.core.types import Array
 from colmap_inertial.imaging._bilinear import bilinear
 from colmap_inertial.imaging.blur_field import BlurField, spread_cov
-from colmap_inertial.types import Array
 
 #: Samples of the exposure; of longer blur, one for each so many pixels.
 SAMPLES, SAMPLE_PX = 17, 2.0

@@ -15,9 +15,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_inertial.core.types import Array
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath, middles
-from colmap_inertial.types import Array
 
 #: Lags as factors of the predicted extent, and directions against the predicted one.
 FACTORS = np.arange(0.6, 1.5001, 0.05)

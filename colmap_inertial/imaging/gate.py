@@ -15,13 +15,13 @@ from typing import Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_inertial.core.types import Array
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath
 from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence, shown_share
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.imaging.path_filters import path_wiener
 from colmap_inertial.imaging.psf import PredictedBlur
-from colmap_inertial.types import Array
 
 Code = TypeVar("Code", np.uint8, np.uint16)
 Light = NDArray[np.float32]

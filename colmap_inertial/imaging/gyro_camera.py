@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.geometry import matrix_from_quat, quat_conjugate, quat_multiply, quat_rotate, skew, so3_log
-from colmap_inertial.gyro import GyroPath
-from colmap_inertial.types import (
+from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_multiply, quat_rotate, skew, so3_log
+from colmap_inertial.core.gyro import GyroPath
+from colmap_inertial.core.types import (
     CAL,
     Array,
     CameraImuCalibration,

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from colmap_inertial.core.types import Array, Projector
 from colmap_inertial.imaging._bilinear import between_nodes
 from colmap_inertial.imaging.blur_field import BlurField
-from colmap_inertial.types import Array, Projector
 
 #: Spacing of the nodes, as a share of the longer side: depths between a few hundred points tell no more.
 _STEP_SHARE = 1 / 24

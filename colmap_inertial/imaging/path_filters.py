@@ -14,12 +14,12 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_inertial.core.types import Array
 from colmap_inertial.imaging._cells import Cells
 from colmap_inertial.imaging._tiles import SHORTEST_SIDE, Tiling
 from colmap_inertial.imaging.blur_path import BlurPath
 from colmap_inertial.imaging.transfer import ENCODE_STEPS, decode_table, encode_table, srgb_from_linear
 from colmap_inertial.imaging.wiener import LONGEST_PX, DeblurOptions, saturated_code
-from colmap_inertial.types import Array
 
 Code = TypeVar("Code", np.uint8, np.uint16)
 

@@ -8,14 +8,14 @@ from typing import Protocol
 
 import numpy as np
 
-from colmap_inertial.errors import NotObservableError
-from colmap_inertial.gyro import on_camera_rate
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.gyro import on_camera_rate
+from colmap_inertial.core.types import Array, CameraImuCalibration, FrameTiming, ImuRecording, Projector
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath, middles, samples_for
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.parallax import Parallax
 from colmap_inertial.imaging.rolling_shutter import rays
-from colmap_inertial.types import Array, CameraImuCalibration, FrameTiming, ImuRecording, Projector
 
 #: Nodes at which the blur of a frame is predicted, and frames predicted together.
 _PREDICTED_COLUMNS, _PREDICTED_ROWS, _CHUNK = 7, 5, 512
@@ -53,7 +53,7 @@ def frame_blur(
     timing
         Of all frames, with exposure times; a readout that is unknown counts as none.
     camera
-        Intrinsics (``model.colmap_camera`` makes them of a :class:`~colmap_inertial.types.CameraModel`).
+        Intrinsics (``model.colmap_camera`` makes them of a :class:`~colmap_inertial.core.types.CameraModel`).
 
     Raises
     ------

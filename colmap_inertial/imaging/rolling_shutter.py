@@ -7,11 +7,11 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.errors import NotObservableError
-from colmap_inertial.geometry import colmap_px_from_opencv
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.geometry import colmap_px_from_opencv
+from colmap_inertial.core.types import Array, Projector
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
-from colmap_inertial.types import Array, Projector
 
 Pixel = TypeVar("Pixel", np.uint8, np.uint16)
 

@@ -15,8 +15,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.geometry import skew, so3_exp
-from colmap_inertial.types import Array, Projector
+from colmap_inertial.core.geometry import skew, so3_exp
+from colmap_inertial.core.types import Array, Projector
 
 Grey = NDArray[np.uint8]
 #: Why a window was closed. start: the first frames; still: it lasted, and nothing moved; end: the last frames.

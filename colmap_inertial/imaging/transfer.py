@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.types import Array
+from colmap_inertial.core.types import Array
 
 #: Resolution of the tables back to codes. sRGB is steepest in the dark, 12.92: there one 8-bit code spans five entries.
 ENCODE_STEPS = 16384

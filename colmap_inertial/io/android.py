@@ -18,7 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from colmap_inertial.errors import FormatError
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.types import Array, FrameLog, ImuRecording
 from colmap_inertial.io.columns import split_unit
 from colmap_inertial.io.files import first_line
 from colmap_inertial.io.frame_times import frame_log, stamps_of_log
@@ -26,7 +27,6 @@ from colmap_inertial.io.imu_text import ordered, read_csv, recording
 from colmap_inertial.io.samples import Samples, nearest
 from colmap_inertial.io.tables import Table, read_table
 from colmap_inertial.io.units import SENSOR_NAMES, TIME_UNITS_NS, DeclaredUnits, Quantity, unit_of
-from colmap_inertial.types import Array, FrameLog, ImuRecording
 
 _MARS_TABLES = ("gyro_accel.csv", "raw_accel_gyro.csv")
 #: Frames that the sensor took within this of a frame's rounded time are that frame.

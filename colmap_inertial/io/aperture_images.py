@@ -30,13 +30,13 @@ from typing import get_args
 
 import numpy as np
 
-from colmap_inertial.errors import FormatError
-from colmap_inertial.geometry import quat_from_matrix
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.geometry import quat_from_matrix
+from colmap_inertial.core.types import Aperture, ApertureRig, CameraModel, SpectralRole
 from colmap_inertial.io.images import SUFFIXES, read_image
 from colmap_inertial.io.names import path_in
 from colmap_inertial.io.rig_calibration import Metres, MountedCamera, read_rig_calibration
 from colmap_inertial.io.toml_section import Section
-from colmap_inertial.types import Aperture, ApertureRig, CameraModel, SpectralRole
 
 
 @dataclass(frozen=True, kw_only=True)

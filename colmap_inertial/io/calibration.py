@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from colmap_inertial.errors import FormatError
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.types import CAL, CALIBRATION_PARAMETERS, CameraImuCalibration
 from colmap_inertial.io.files import StrPath, read_json, write_json
-from colmap_inertial.types import CAL, CALIBRATION_PARAMETERS, CameraImuCalibration
 
 #: Standard deviations of what nobody knows. A rotation: any. Offsets: clock origins are arbitrary.
 UNKNOWN_ROTATION_RAD = np.pi

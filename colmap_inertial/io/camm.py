@@ -14,13 +14,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.errors import FormatError
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.types import Array, FrameLog, ImuRecording, PositionFixes
 from colmap_inertial.io.frame_times import frame_log
 from colmap_inertial.io.imu_text import recording
 from colmap_inertial.io.mp4 import Movie, Track, has_track, read_movie
 from colmap_inertial.io.samples import Samples, nearest, order_samples
 from colmap_inertial.io.units import DeclaredUnits, Quantity
-from colmap_inertial.types import Array, FrameLog, ImuRecording, PositionFixes
 
 _EXPOSURE, _GYRO, _ACCEL, _PLACE, _FIX = 1, 2, 3, 5, 6
 _FIX_ROW = np.dtype(

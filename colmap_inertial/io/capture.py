@@ -12,8 +12,9 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from colmap_inertial.errors import FormatError
-from colmap_inertial.geometry import quat_from_matrix
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.geometry import quat_from_matrix
+from colmap_inertial.core.types import CameraImuCalibration, CameraModel, FrameLog, ImuCalibration, ReadoutDirection
 from colmap_inertial.io import sensor_yaml
 from colmap_inertial.io.aperture_images import ApertureImages, read_apertures_table
 from colmap_inertial.io.calibration import Declared, calibration_prior
@@ -34,7 +35,6 @@ from colmap_inertial.io.readouts import readout_of_video
 from colmap_inertial.io.recorders import Recording, find_recording
 from colmap_inertial.io.toml_section import Section, read_toml
 from colmap_inertial.io.units import TIME_UNITS_NS
-from colmap_inertial.types import CameraImuCalibration, CameraModel, FrameLog, ImuCalibration, ReadoutDirection
 
 
 @dataclass(frozen=True, kw_only=True)

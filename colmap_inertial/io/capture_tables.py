@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.geometry import colmap_px_from_opencv, quat_from_matrix
+from colmap_inertial.core.geometry import colmap_px_from_opencv, quat_from_matrix
+from colmap_inertial.core.types import CameraModel, ImuNoise
 from colmap_inertial.io import sensor_yaml
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.io.imu_calibration import Calibrations, holds_imu_alone, read_for_another
 from colmap_inertial.io.imu_text import SensorTable
 from colmap_inertial.io.toml_section import Section
 from colmap_inertial.io.units import SENSOR_UNITS, TIME_UNITS_NS, Axes, DeclaredUnits, Quantity
-from colmap_inertial.types import CameraModel, ImuNoise
 
 #: COLMAP's camera models: parameters, and where the principal point stands among them.
 CAMERA_MODELS = {

@@ -15,9 +15,9 @@ from math import pi
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.geometry import matrix_from_quat, quat_exp, quat_multiply
-from colmap_inertial.sampling import Coverage, integral_at
-from colmap_inertial.types import Array, ImuRecording
+from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, quat_multiply
+from colmap_inertial.core.sampling import Coverage, integral_at
+from colmap_inertial.core.types import Array, ImuRecording
 
 #: Windows, the steps in which the gyroscope is integrated, and the means that are compared in a window.
 WINDOW_S, STEP_S, MEAN_S = 4.0, 0.1, 1.0

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from colmap_inertial.errors import FormatError, TimingError
+from colmap_inertial.core.errors import FormatError, TimingError
+from colmap_inertial.core.types import HeightDatum
 from colmap_inertial.io.files import read_bytes
 from colmap_inertial.io.frame_times import FrameStamps, stamps_in_order
 from colmap_inertial.io.names import path_in
-from colmap_inertial.types import HeightDatum
 
 PNG = b"\x89PNG\r\n\x1a\n"
 _EXIF_HEADER = b"Exif\0\0"

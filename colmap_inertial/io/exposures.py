@@ -26,7 +26,8 @@ from pathlib import Path
 
 import numpy as np
 
-from colmap_inertial.errors import FormatError, TimingError
+from colmap_inertial.core.errors import FormatError, TimingError
+from colmap_inertial.core.types import Array, FrameTiming
 from colmap_inertial.io.aperture_images import SubImages, read_rename
 from colmap_inertial.io.exif import HEAD_BYTES, exposure_of
 from colmap_inertial.io.files import read_bytes
@@ -34,7 +35,6 @@ from colmap_inertial.io.frame_times import stamps_of_csv
 from colmap_inertial.io.images import SUFFIXES
 from colmap_inertial.io.toml_section import Section
 from colmap_inertial.io.units import TIME_UNITS_NS, seconds
-from colmap_inertial.types import Array, FrameTiming
 
 #: A long exposure that starts farther from its short one is that of another, or timed by another clock.
 _FARTHEST_S = 10.0

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from colmap_inertial.errors import FormatError, OutputError, OutputExistsError
+from colmap_inertial.core.errors import FormatError, OutputError, OutputExistsError
 from colmap_inertial.io.limits import read_limits
 
 _TEMPORARY = re.compile(r"\..+\.\d+-[0-9a-f]{8}\.tmp")

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.errors import FormatError, TimingError
+from colmap_inertial.core.errors import FormatError, TimingError
+from colmap_inertial.core.types import Array, FrameLog, FrameTiming
 from colmap_inertial.io.columns import recognise, split_unit
 from colmap_inertial.io.tables import Table, read_table
 from colmap_inertial.io.units import TIME_UNITS_NS, seconds, stamps_ns, unit_of
-from colmap_inertial.types import Array, FrameLog, FrameTiming
 
 _NAME_COLUMNS = {"name", "filename", "file", "image", "imagename", "frame"}
 _EXPOSURE_COLUMNS = {"exposure", "exposuretime"}

@@ -27,14 +27,14 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.errors import FormatError
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.types import Array, FrameLog, HeightDatum, ImuRecording, PositionFixes
 from colmap_inertial.io.frame_times import frame_log
 from colmap_inertial.io.gpmf import Entry, Stream, entries, read_streams
 from colmap_inertial.io.imu_text import recording
 from colmap_inertial.io.mp4 import Movie, has_track, read_movie
 from colmap_inertial.io.samples import Samples, nearest, order_samples
 from colmap_inertial.io.units import SENSOR_UNITS, Axes, DeclaredUnits, Quantity, unit_of
-from colmap_inertial.types import Array, FrameLog, HeightDatum, ImuRecording, PositionFixes
 
 _SENSORS: dict[str, Quantity] = {"GYRO": "gyro", "ACCL": "accel"}
 #: Streams with one sample for each frame, the best one first.

@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.errors import FormatError
-from colmap_inertial.types import Array
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.types import Array
 
 _ENTRY = struct.Struct(">4scBH")
 #: numpy's name of each type letter.

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from colmap_inertial.errors import FormatError
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.types import Array
 from colmap_inertial.io.plausible import GRAVITY_BOUNDS_M_S2, LARGEST_MEDIAN_RATE_RAD_S, STEADY_SHARE
 from colmap_inertial.io.tables import Table
 from colmap_inertial.io.units import STANDARD_GRAVITY_M_S2, TIME_UNITS_NS
-from colmap_inertial.types import Array
 
 #: Steps between readings of an IMU, in seconds; rows that are looked at.
 _STEP_S, _ROWS = (2.5e-4, 0.2), 2000

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from colmap_inertial.core.types import Array
 from colmap_inertial.io.exif import HEAD_BYTES, PNG, exposure_of, jpeg_segments, png_chunks
 from colmap_inertial.io.files import read_bytes
-from colmap_inertial.types import Array
 
 #: Chunks of a PNG that say something about its pixels or where they come from.
 _PNG_CARRIED = (b"eXIf", b"iCCP", b"sRGB", b"gAMA", b"cHRM", b"pHYs", b"tIME", b"tEXt", b"zTXt", b"iTXt")

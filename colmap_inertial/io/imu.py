@@ -8,7 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from colmap_inertial.errors import FormatError
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.types import FrameLog, ImuRecording
 from colmap_inertial.io import imu_text
 from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.capture_tables import ImuPath
@@ -16,7 +17,6 @@ from colmap_inertial.io.files import StrPath
 from colmap_inertial.io.imu_formats import find_imu_format
 from colmap_inertial.io.plausible import check_plausible
 from colmap_inertial.io.units import Axes, DeclaredUnits
-from colmap_inertial.types import FrameLog, ImuRecording
 
 
 def read_imu(path: StrPath, *, format: str = "auto") -> ImuRecording:

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
-from colmap_inertial.errors import FormatError
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.types import IMU_CALIBRATION_PARAMETERS, CameraImuCalibration, ImuCalibration
 from colmap_inertial.io.calibration import CAMERA_IMU, for_another_recording, is_numeric, read_calibration
 from colmap_inertial.io.files import StrPath, read_json, write_json
-from colmap_inertial.types import IMU_CALIBRATION_PARAMETERS, CameraImuCalibration, ImuCalibration
 
 #: No file, one, or several of one device.
 CalibrationFiles = StrPath | Sequence[StrPath] | None

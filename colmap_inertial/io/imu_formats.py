@@ -21,7 +21,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from colmap_inertial.errors import FormatError, InertialError
+from colmap_inertial.core.errors import FormatError, InertialError
+from colmap_inertial.core.types import FrameLog, ImuRecording
 from colmap_inertial.io import (
     android,
     camm,
@@ -38,7 +39,6 @@ from colmap_inertial.io import (
 from colmap_inertial.io.files import read_bytes, require_regular
 from colmap_inertial.io.mp4 import is_mp4, read_movie
 from colmap_inertial.io.units import DeclaredUnits
-from colmap_inertial.types import FrameLog, ImuRecording
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.errors import FormatError
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.types import Array, ImuNoise, ImuRecording
 from colmap_inertial.io.columns import recognise
 from colmap_inertial.io.files import first_line
 from colmap_inertial.io.guess import how_to_describe
@@ -16,7 +17,6 @@ from colmap_inertial.io.samples import Samples, order_samples
 from colmap_inertial.io.sensor_yaml import read_imu_noise
 from colmap_inertial.io.tables import Table, read_table
 from colmap_inertial.io.units import SENSOR_NAMES, SENSOR_UNITS, DeclaredUnits, Quantity, seconds
-from colmap_inertial.types import Array, ImuNoise, ImuRecording
 
 
 @dataclass(frozen=True, kw_only=True)

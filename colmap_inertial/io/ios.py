@@ -22,8 +22,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.errors import FormatError
-from colmap_inertial.geometry import colmap_px_from_opencv
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.geometry import colmap_px_from_opencv
+from colmap_inertial.core.types import CameraModel, FrameLog, ImuRecording
 from colmap_inertial.io.files import first_line
 from colmap_inertial.io.frame_times import frame_log
 from colmap_inertial.io.imu_text import ordered, recording
@@ -32,7 +33,6 @@ from colmap_inertial.io.samples import Samples
 from colmap_inertial.io.tables import Table, parse_table, read_table
 from colmap_inertial.io.units import DeclaredUnits, seconds
 from colmap_inertial.io.zipped import head_of, members_of, text_of
-from colmap_inertial.types import CameraModel, FrameLog, ImuRecording
 
 #: A median length up to this is g, above it m/s2: gravity gives 1 or 9.8.
 _G_BELOW = 3.0

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 
-from colmap_inertial.options import ReadLimits
+from colmap_inertial.core.options import ReadLimits
 
 _USUAL = ReadLimits()
 _LIMITS: ContextVar[ReadLimits] = ContextVar("limits", default=_USUAL)

@@ -17,7 +17,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.errors import FormatError
+from colmap_inertial.core.errors import FormatError
 from colmap_inertial.io.files import require_regular
 
 Int = NDArray[np.int64]

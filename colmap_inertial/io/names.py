@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from colmap_inertial.errors import FormatError
+from colmap_inertial.core.errors import FormatError
 
 #: Of a folder or file, in bytes; common file systems hold no longer ones.
 _LONGEST = 255

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from colmap_inertial.errors import FormatError
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.types import Array, ImuRecording
 from colmap_inertial.io.consistency import better_readings
 from colmap_inertial.io.units import SENSOR_NAMES, STANDARD_GRAVITY_M_S2, Axes, Quantity
-from colmap_inertial.types import Array, ImuRecording
 
 #: The median of |accelerometer| of a device that is carried or flown stays near gravity: sensors are off by up to 5 %,
 #: and shaking raises it. Measured on the recordings this was tried on: 9.36 to 9.81, and 10.4 in strong shaking.

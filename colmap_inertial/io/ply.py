@@ -15,11 +15,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.errors import FormatError
-from colmap_inertial.geometry import matrix_from_quat
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.geometry import matrix_from_quat
+from colmap_inertial.core.types import Similarity
 from colmap_inertial.io.files import advise
 from colmap_inertial.io.splats import SplatMover, fault_of_splats, moved_fields
-from colmap_inertial.types import Similarity
 
 _CHUNK_BYTES = 512 << 10
 _LONGEST_HEADER = 1 << 20

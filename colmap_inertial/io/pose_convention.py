@@ -7,8 +7,8 @@ from typing import Literal
 
 import numpy as np
 
-from colmap_inertial.geometry import quat_conjugate, quat_rotate
-from colmap_inertial.types import CameraTrajectory
+from colmap_inertial.core.geometry import quat_conjugate, quat_rotate
+from colmap_inertial.core.types import CameraTrajectory
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from colmap_inertial.core.types import FrameLog
 from colmap_inertial.io.imu_formats import imu_formats
-from colmap_inertial.types import FrameLog
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

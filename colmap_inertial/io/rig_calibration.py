@@ -12,12 +12,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.errors import FormatError
-from colmap_inertial.geometry import colmap_px_from_opencv, matrix_from_quat
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.geometry import colmap_px_from_opencv, matrix_from_quat
+from colmap_inertial.core.types import LengthUnit
 from colmap_inertial.io.capture_tables import CAMERA_MODELS
 from colmap_inertial.io.files import read_bytes, read_text, read_yaml
 from colmap_inertial.io.sensor_yaml import Sheet, is_rotation
-from colmap_inertial.types import LengthUnit
 
 Matrix = NDArray[np.float64]
 Metres = Literal["m", "mm"]

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.errors import FormatError, MissingExtraError
+from colmap_inertial.core.errors import FormatError, MissingExtraError
+from colmap_inertial.core.types import Array, ImuRecording
 from colmap_inertial.io.imu_text import recording
 from colmap_inertial.io.samples import Samples, order_samples
 from colmap_inertial.io.units import SENSOR_NAMES, DeclaredUnits, Quantity
-from colmap_inertial.types import Array, ImuRecording
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.errors import FormatError, TimingError
+from colmap_inertial.core.errors import FormatError, TimingError
+from colmap_inertial.core.types import Array
 from colmap_inertial.io.units import SENSOR_NAMES, Quantity, to_si
-from colmap_inertial.types import Array
 
 #: A sample this far behind the newest one before it means that the clock was set back, not that rows changed places.
 LATEST_ARRIVAL_NS = 500_000_000

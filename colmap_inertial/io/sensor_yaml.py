@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.errors import FormatError
-from colmap_inertial.geometry import colmap_px_from_opencv
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.geometry import colmap_px_from_opencv
+from colmap_inertial.core.types import CameraModel, ImuNoise
 from colmap_inertial.io.files import read_yaml
-from colmap_inertial.types import CameraModel, ImuNoise
 
 _NOISE_KEYS = {
     "gyro_density_rad_s_rthz": "gyroscope_noise_density",

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.errors import FormatError
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.types import Array
 from colmap_inertial.io.files import read_text
 from colmap_inertial.io.limits import read_limits
 from colmap_inertial.io.units import stamps_ns
-from colmap_inertial.types import Array
 
 _BLANK_OR_COMMENT = re.compile(r"\n\s*(\n|#|\Z)")
 

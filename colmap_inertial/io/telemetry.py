@@ -15,12 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from colmap_inertial.errors import FormatError, MissingExtraError
+from colmap_inertial.core.errors import FormatError, MissingExtraError
+from colmap_inertial.core.types import Array, FrameLog, ImuRecording
 from colmap_inertial.io.files import first_line
 from colmap_inertial.io.imu_text import recording
 from colmap_inertial.io.samples import Samples, order_samples
 from colmap_inertial.io.units import SENSOR_NAMES, Axes, DeclaredUnits, Quantity
-from colmap_inertial.types import Array, FrameLog, ImuRecording
 
 #: Names of logs of counts, and the columns with which they begin; the columns that tell Mobius by itself.
 _NAMES = re.compile(r"(RC_GyroData|gyroDat[ae]|Thumb).*\.csv", re.IGNORECASE)

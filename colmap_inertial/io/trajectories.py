@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.errors import FormatError, TimingError
-from colmap_inertial.geometry import quat_conjugate, quat_normalize
+from colmap_inertial.core.errors import FormatError, TimingError
+from colmap_inertial.core.geometry import quat_conjugate, quat_normalize
+from colmap_inertial.core.types import Array, CameraTrajectory, ImuRecording, SmoothedTrajectory
 from colmap_inertial.io.files import write_text
 from colmap_inertial.io.imu import read_imu
 from colmap_inertial.io.tables import Table, read_table
 from colmap_inertial.io.units import seconds
-from colmap_inertial.types import Array, CameraTrajectory, ImuRecording, SmoothedTrajectory
 
 
 def read_tum(path: Path) -> CameraTrajectory:

@@ -13,8 +13,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.errors import FormatError, TimingError
-from colmap_inertial.types import Array
+from colmap_inertial.core.errors import FormatError, TimingError
+from colmap_inertial.core.types import Array
 
 Quantity = Literal["gyro", "accel"]
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.errors import FormatError, TimingError
+from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.io.files import require_regular
 from colmap_inertial.io.mp4 import is_mp4, read_movie
 

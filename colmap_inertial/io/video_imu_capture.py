@@ -18,13 +18,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.errors import FormatError
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.types import Array, FrameLog, ImuRecording
 from colmap_inertial.io.files import read_bytes
 from colmap_inertial.io.frame_times import frame_log
 from colmap_inertial.io.imu_text import recording
 from colmap_inertial.io.samples import Samples, order_samples
 from colmap_inertial.io.units import DeclaredUnits, Quantity
-from colmap_inertial.types import Array, FrameLog, ImuRecording
 
 _FILE = "video_meta.pb3"
 #: Two's complement of 64-bit numbers.

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.errors import FormatError
+from colmap_inertial.core.errors import FormatError
 from colmap_inertial.io.images import grey_8bit, read_image
 from colmap_inertial.io.names import path_in
 from colmap_inertial.io.video import decode_grey

@@ -6,7 +6,7 @@ import zipfile
 import zlib
 from pathlib import Path, PurePosixPath
 
-from colmap_inertial.errors import FormatError
+from colmap_inertial.core.errors import FormatError
 from colmap_inertial.io.files import first_line, read_text
 
 #: An unpacked table larger than this is no recording.

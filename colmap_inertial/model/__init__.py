@@ -12,14 +12,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.errors import AlreadyMetricError, FormatError, OutputExistsError, TimingError
-from colmap_inertial.geometry import cross
-from colmap_inertial.io.files import StrPath, read_json, write_json
-from colmap_inertial.io.names import check_names
-from colmap_inertial.model.binary import check_binary_model
-from colmap_inertial.model.loading import load_pycolmap
-from colmap_inertial.model.soundness import check_values
-from colmap_inertial.types import (
+from colmap_inertial.core.errors import AlreadyMetricError, FormatError, OutputExistsError, TimingError
+from colmap_inertial.core.geometry import cross
+from colmap_inertial.core.types import (
     Array,
     CameraModel,
     CameraTrajectory,
@@ -30,6 +25,11 @@ from colmap_inertial.types import (
     SolvedMotion,
     Treatment,
 )
+from colmap_inertial.io.files import StrPath, read_json, write_json
+from colmap_inertial.io.names import check_names
+from colmap_inertial.model.binary import check_binary_model
+from colmap_inertial.model.loading import load_pycolmap
+from colmap_inertial.model.soundness import check_values
 
 if TYPE_CHECKING:
     import pycolmap

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from colmap_inertial.errors import FormatError
-from colmap_inertial.geometry import matrix_from_quat
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.geometry import matrix_from_quat
+from colmap_inertial.core.types import Similarity
 from colmap_inertial.io.files import advise
-from colmap_inertial.types import Similarity
 
 _CHUNK_BYTES = 1 << 20
 _LONGEST_LINE = 1 << 20

@@ -11,7 +11,7 @@ import struct
 from collections.abc import Callable
 from pathlib import Path
 
-from colmap_inertial.errors import FormatError
+from colmap_inertial.core.errors import FormatError
 
 #: Number of parameters of COLMAP's camera models, by id.
 _CAMERA_PARAMETERS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2)

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
 
-from colmap_inertial.errors import FormatError, OutputError, OutputExistsError
+from colmap_inertial.core.errors import FormatError, OutputError, OutputExistsError
 from colmap_inertial.io.files import advise, locked
 from colmap_inertial.model.loading import load_pycolmap
 

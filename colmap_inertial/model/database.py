@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.errors import FormatError
-from colmap_inertial.geometry import matrix_from_quat
-from colmap_inertial.types import Similarity
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.geometry import matrix_from_quat
+from colmap_inertial.core.types import Similarity
 
 SIDE_FILES = ("-wal", "-journal")
 #: Rebuilt by SQLite; a copy must not have it.

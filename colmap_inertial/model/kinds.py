@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from colmap_inertial.core.types import Similarity
 from colmap_inertial.io.ply import transform_ply
 from colmap_inertial.model.artefacts import check_map, transform_depth_map, transform_obj, transform_options
 from colmap_inertial.model.database import is_database
 from colmap_inertial.model.nerf import is_export, is_transforms, transform_export, transform_transforms
-from colmap_inertial.types import Similarity
 
 #: Formats that carry length and are left as they are; the user is told.
 _SUFFIXES = (

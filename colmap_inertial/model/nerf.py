@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from colmap_inertial.errors import FormatError
-from colmap_inertial.geometry import matrix_from_quat
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.geometry import matrix_from_quat
+from colmap_inertial.core.quantiles import Z95
+from colmap_inertial.core.types import DOWN_IN_WORLD, UNDOES, Array, Similarity
 from colmap_inertial.io.files import read_json
 from colmap_inertial.model.database import PlacedModel
-from colmap_inertial.scale.verdict import Z95
-from colmap_inertial.types import DOWN_IN_WORLD, UNDOES, Array, Similarity
 
 _MATRICES = ("transform_matrix", "transform_matrix_start", "transform_matrix_end")
 #: What ``export.json`` says of itself, and of its unit: metres, or so many of them.

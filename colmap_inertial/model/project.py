@@ -15,7 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from colmap_inertial import __version__
-from colmap_inertial.errors import AlreadyMetricError, FormatError, InertialError, NotObservableError, OutputError
+from colmap_inertial.core.errors import AlreadyMetricError, FormatError, InertialError, NotObservableError, OutputError
+from colmap_inertial.core.threads import one_blas_thread, usable_processors
+from colmap_inertial.core.types import Similarity
 from colmap_inertial.io.files import StrPath, read_json, write_json
 from colmap_inertial.model import (
     TRANSFORM_FILE,
@@ -34,8 +36,6 @@ from colmap_inertial.model.kinds import WRITERS, foreign_kind, kind_of
 from colmap_inertial.model.layout import Layout, read_layout
 from colmap_inertial.model.nerf import cameras_are_those_of
 from colmap_inertial.model.similarities import ModelScale, require_not_joined, similarity_from_json, undoing
-from colmap_inertial.threads import one_blas_thread, usable_processors
-from colmap_inertial.types import Similarity
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from colmap_inertial.core.types import Array
 from colmap_inertial.imaging.gyro_camera import FrameShutter
-from colmap_inertial.types import Array
 
 if TYPE_CHECKING:
     import pycolmap

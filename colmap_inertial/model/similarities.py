@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from colmap_inertial.errors import FormatError, InertialError, NotObservableError
-from colmap_inertial.geometry import matrix_from_quat, quat_conjugate
+from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError
+from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate
+from colmap_inertial.core.options import WorldAxes
+from colmap_inertial.core.types import UNDOES, ScaleEstimate, Similarity
 from colmap_inertial.io.files import StrPath, read_json
 from colmap_inertial.model import similarity_as_json
-from colmap_inertial.options import WorldAxes
-from colmap_inertial.types import UNDOES, ScaleEstimate, Similarity
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from colmap_inertial.errors import FormatError
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.types import Array
 from colmap_inertial.model.binary import LARGEST
-from colmap_inertial.types import Array
 
 if TYPE_CHECKING:
     import pycolmap

@@ -16,7 +16,7 @@ from torch import Tensor
 from restoration.network import RestorationNet, ThesisNet
 
 #: The package's folder of weights.
-WEIGHTS = Path(__file__).parents[2] / "colmap_inertial" / "restoration" / "weights"
+WEIGHTS = Path(__file__).parents[2] / "colmap_inertial" / "imaging" / "restoration" / "weights"
 _OPSET = 17
 
 

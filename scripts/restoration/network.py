@@ -38,7 +38,7 @@ class RestorationNet(nn.Module):
     """``restored = picture + share (aid - picture) + rest``, with the share and the rest from a U-Net.
 
     Inputs are ``picture`` and ``aid``, (N, 3, H, W) sRGB 0 to 1, and ``blur``, (N, C, H / 2, W / 2), as
-    ``colmap_inertial/restoration/_tiles.py`` makes it of paths (C = 5) or of lines (3).
+    ``colmap_inertial/imaging/restoration/_tiles.py`` makes it of paths (C = 5) or of lines (3).
     """
 
     def __init__(self, blur_channels: int = 5, share: float = 0.5) -> None:

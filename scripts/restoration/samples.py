@@ -11,12 +11,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from colmap_inertial.core.types import Array
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath, middles, samples_for
 from colmap_inertial.imaging.path_filters import path_wiener
+from colmap_inertial.imaging.restoration._tiles import Span, blur_feed, path_feed
 from colmap_inertial.imaging.wiener import DeblurOptions
-from colmap_inertial.restoration._tiles import Span, blur_feed, path_feed
-from colmap_inertial.types import Array
 from restoration.camera import jpeg, light_of, noisy, sharpened, srgb
 from restoration.handheld import Handheld, recorded, simulated
 from restoration.optics import ShotOptions, Shots, draw_shots

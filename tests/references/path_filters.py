@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_inertial.core.types import Array
 from colmap_inertial.imaging._tiles import Tiling
 from colmap_inertial.imaging.path_filters import (
     DATA_WEIGHT,
@@ -21,7 +22,6 @@ from colmap_inertial.imaging.path_filters import (
     NOISE_SHARE,
     Noise,
 )
-from colmap_inertial.types import Array
 
 
 def filter_reference(

@@ -3,8 +3,16 @@
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
-from colmap_inertial.geometry import matrix_from_quat, quat_conjugate, quat_cumulative, quat_exp, quat_multiply, skew
-from colmap_inertial.scale._preintegration import (
+from colmap_inertial.core.geometry import (
+    matrix_from_quat,
+    quat_conjugate,
+    quat_cumulative,
+    quat_exp,
+    quat_multiply,
+    skew,
+)
+from colmap_inertial.core.types import Array
+from colmap_inertial.inertial.scale._preintegration import (
     DELAY_STEP_S,
     Preintegrated,
     SensorErrors,
@@ -13,8 +21,7 @@ from colmap_inertial.scale._preintegration import (
     gap_cov,
     integration_steps,
 )
-from colmap_inertial.scale._solver import ArrowSystem
-from colmap_inertial.types import Array
+from colmap_inertial.inertial.scale._solver import ArrowSystem
 
 
 def preintegrate_reference(nodes_s: Array, tracks: Tracks, errors: SensorErrors) -> Preintegrated:

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_inertial.core.types import Array
 from colmap_inertial.imaging import wiener
 from colmap_inertial.imaging._cells import CELL_PX, Cells
 from colmap_inertial.imaging._taps import Prior, TapTable, blur_spectrum
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.transfer import decode_table, srgb_from_linear
-from colmap_inertial.types import Array
 
 #: Spacing of the points at which the influence of lost light is worked out; between them it is bilinear.
 NODE_PX = 4

@@ -1,0 +1,1 @@
+"""Diagnosis, validation, report."""

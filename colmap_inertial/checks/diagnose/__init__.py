@@ -1,0 +1,94 @@
+"""What a capture can and cannot give, before any reconstruction: findings, each with a code, evidence and advice.
+
+A check is a function of what was recorded (:class:`Recorded`) that yields :class:`Finding` values; it opens no file.
+``CHECKS`` lists all of them. ``pipeline.preflight`` reads captures for them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+from colmap_inertial.checks.diagnose import camera, frames, imu, motion
+from colmap_inertial.checks.diagnose.findings import SEVERITIES, Diagnosis, Finding, FramesInVideo, Recorded, Severity
+from colmap_inertial.core.errors import FormatError, InertialError, TimingError
+from colmap_inertial.core.threads import one_blas_thread
+
+Check = Callable[[Recorded], Iterable[Finding]]
+
+#: Every check, in the order in which findings of one severity are shown.
+CHECKS: tuple[Check, ...] = (
+    imu.check_plausibility,
+    imu.check_accelerometer,
+    imu.check_repairs,
+    imu.check_rate,
+    imu.check_pauses,
+    imu.check_together,
+    imu.check_cut_off,
+    imu.check_resolution,
+    imu.check_scatter,
+    imu.check_delay,
+    camera.check_stabilisation,
+    camera.check_pose_convention,
+    camera.check_belonging,
+    camera.check_clock_rate,
+    camera.check_coverage,
+    camera.check_declared_rotation,
+    camera.check_even_times,
+    camera.check_focal_length,
+    camera.check_accelerometer_sign,
+    motion.check_motion_content,
+    frames.check_cut_from_video,
+    frames.check_dropped,
+    frames.check_repeated,
+    frames.check_exposure,
+    frames.check_readout,
+)
+
+
+@one_blas_thread()
+def diagnose(recorded: Recorded) -> Diagnosis:
+    """Look for everything that is known to go wrong.
+
+    Parameters
+    ----------
+    recorded
+        What there is; what could not be read is a finding, too, and the rest is checked all the same.
+    """
+    findings = [unreadable(error) for error in recorded.refused]
+    for check in CHECKS:
+        findings += check(recorded)
+    findings.sort(key=lambda finding: -SEVERITIES.index(finding.severity))
+    parts = {
+        "gyroscope": recorded.imu is not None,
+        "accelerometer": recorded.imu is not None and recorded.imu.has_accel,
+        "frame times": recorded.timing is not None,
+        "pictures": recorded.is_dense,
+        "pictures far apart": not recorded.is_dense and recorded.turning is not None and recorded.trajectory is None,
+        "poses": recorded.trajectory is not None,
+        "source video": recorded.in_video is not None,
+    }
+    return Diagnosis(findings=tuple(findings), checked=tuple(name for name, there in parts.items() if there))
+
+
+def unreadable(error: InertialError) -> Finding:
+    """What a reader refused, as a finding."""
+    code = error.code if isinstance(error, FormatError | TimingError) else "unreadable"
+    return Finding(
+        code=code,
+        severity="error",
+        evidence=str(error),
+        advice="correct this and diagnose again: what needs it was not checked",
+    )
+
+
+__all__ = [
+    "CHECKS",
+    "Check",
+    "Diagnosis",
+    "Finding",
+    "FramesInVideo",
+    "Recorded",
+    "Severity",
+    "diagnose",
+    "unreadable",
+]

@@ -1,0 +1,250 @@
+"""The values of a diagnosis: what was recorded, what was found in it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError
+from colmap_inertial.core.types import (
+    CameraImuCalibration,
+    CameraModel,
+    CameraTrajectory,
+    FrameLog,
+    FrameTiming,
+    ImuRecording,
+)
+from colmap_inertial.io.plausible import find_implausible
+from colmap_inertial.io.pose_convention import ARRAYS, PoseConvention
+from colmap_inertial.io.units import Axes
+from colmap_inertial.motion.align import Alignment, AlignOptions, align_clocks
+from colmap_inertial.motion.align.conventions import LikelyConvention, likely_convention
+from colmap_inertial.motion.flow import Stabilisation, VisualRotation, find_stabilisation
+
+Severity = Literal["info", "warning", "error"]
+SEVERITIES: tuple[Severity, ...] = ("info", "warning", "error")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """One thing that a recording has.
+
+    Attributes
+    ----------
+    code
+        Stable name of what was found.
+    severity
+        ``"error"`` makes a scale wrong or impossible, ``"warning"`` makes it worse, ``"info"`` is worth knowing.
+    evidence
+        What was seen, in a sentence.
+    numbers
+        The same in numbers; units are in the names.
+    advice
+        What to do.
+    """
+
+    code: str
+    severity: Severity
+    evidence: str
+    advice: str
+    numbers: Mapping[str, float] = field(default_factory=dict)
+
+    def as_json(self) -> dict[str, object]:
+        return {
+            "code": self.code,
+            "severity": self.severity,
+            "evidence": self.evidence,
+            "numbers": dict(self.numbers),
+            "advice": self.advice,
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Diagnosis:
+    """Everything that was found, worst first.
+
+    Attributes
+    ----------
+    findings
+        Empty where nothing is wrong.
+    checked
+        What there was to check.
+    """
+
+    findings: tuple[Finding, ...]
+    checked: tuple[str, ...] = ()
+
+    @property
+    def worst(self) -> Severity | None:
+        return self.findings[0].severity if self.findings else None
+
+    @property
+    def codes(self) -> frozenset[str]:
+        return frozenset(finding.code for finding in self.findings)
+
+    def as_json(self) -> dict[str, object]:
+        """Plain values; ``version`` counts changes of this layout."""
+        return {
+            "version": 1,
+            "worst": self.worst,
+            "checked": list(self.checked),
+            "findings": [finding.as_json() for finding in self.findings],
+        }
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FramesInVideo:
+    """Where pictures were found in the video that they were taken from.
+
+    Attributes
+    ----------
+    stated_ns, found_ns
+        (K,) times that the pictures have, and presentation stamps of the video's frames that they are.
+    video_start_ns
+        Presentation stamp of the video's first frame.
+    quarter_turns
+        How often the pictures are turned by 90 degrees against the frames as stored.
+    container_turn_deg
+        The turn that the video's container asks players for.
+    doubtful
+        Pictures that could not be found, or are of several frames.
+    """
+
+    stated_ns: NDArray[np.int64]
+    found_ns: NDArray[np.int64]
+    video_start_ns: int
+    quarter_turns: int
+    container_turn_deg: int
+    doubtful: int
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Recorded:
+    """What there is of a recording; every check looks at what it needs and says nothing where that is missing.
+
+    Attributes
+    ----------
+    refused
+        What could not be read, and why.
+    imu
+        Before any check of plausibility.
+    gyro_axes, accel_axes
+        Mappings of axes that a capture.toml applied.
+    timing, log
+        Of the frames.
+    is_capture
+        Whether the frames are those of a capture, which can be described better; poses alone cannot.
+    rotation
+        Between consecutive frames, by their pixels.
+    trajectory, read_as
+        Poses of a reconstruction; the convention that they were read by.
+    camera
+        Intrinsics, as declared.
+    calibration, max_offset_s
+        What is known of camera and IMU, and the largest offset between their clocks.
+    in_video
+        Where pictures were found in the video they were taken from.
+    """
+
+    refused: Sequence[InertialError] = ()
+    imu: ImuRecording | None = None
+    gyro_axes: Axes | None = None
+    accel_axes: Axes | None = None
+    timing: FrameTiming | None = None
+    log: FrameLog | None = None
+    is_capture: bool = False
+    rotation: VisualRotation | None = None
+    trajectory: CameraTrajectory | None = None
+    read_as: PoseConvention = ARRAYS
+    camera: CameraModel | None = None
+    calibration: CameraImuCalibration | None = None
+    max_offset_s: float | None = None
+    in_video: FramesInVideo | None = None
+
+    @cached_property
+    def implausible(self) -> tuple[FormatError, ...]:
+        """What a reader would refuse the inertial samples for."""
+        if self.imu is None:
+            return ()
+        found = find_implausible(self.imu, Path("IMU"), gyro_axes=self.gyro_axes, accel_axes=self.accel_axes)
+        return tuple(found)
+
+    @property
+    def is_dense(self) -> bool:
+        """Whether pictures were followed closely enough that what is quick shows in them."""
+        return self.rotation is not None and len(self.rotation.t_s) > 1 and self.rotation.step_s <= FOLLOWED_S
+
+    @cached_property
+    def turning(self) -> CameraTrajectory | None:
+        """The camera's rotation: of the reconstruction, else of the pixels."""
+        if self.trajectory is not None or self.rotation is None:
+            return self.trajectory
+        try:
+            return self.rotation.trajectory()
+        except NotObservableError:
+            return None
+
+    @cached_property
+    def aligned(self) -> Alignment | NotObservableError | None:
+        """Camera and IMU brought together; ``None`` where one of them is missing."""
+        return None if self.imu is None else self.align(self.imu)
+
+    @cached_property
+    def stabilisation(self) -> Stabilisation | None:
+        """What the pictures tell of stabilisation; ``None`` without them."""
+        if self.rotation is None or self.imu is None:
+            return None
+        return find_stabilisation(self.rotation, self.imu, offset_s=self.offset_s(self.rotation.epoch_ns))
+
+    @cached_property
+    def wrong_unit(self) -> str | None:
+        """The code of the unit in which the gyroscope would turn as the camera does; ``None`` where none is needed."""
+        if self.imu is None or not isinstance(self.aligned, NotObservableError):
+            return None
+        for code, factor in UNIT_FACTORS.items():
+            if isinstance(self.align(replace(self.imu, gyro_rad_s=factor * self.imu.gyro_rad_s)), Alignment):
+                return code
+        return None
+
+    @cached_property
+    def likely_convention(self) -> LikelyConvention | None:
+        """By which other convention the poses fit the IMU; ``None`` where they fit as read, or by none."""
+        if self.imu is None or self.trajectory is None:
+            return None
+        options = AlignOptions(max_offset_s=self.max_offset_s)
+        return likely_convention(
+            self.trajectory, self.imu, read_as=self.read_as, prior=self.calibration, options=options
+        )
+
+    def offset_s(self, camera_epoch_ns: int) -> float | None:
+        """Camera time since that epoch = gyroscope time since its own + this; ``None`` where it was not found."""
+        if self.imu is None or not isinstance(self.aligned, Alignment):
+            return None
+        return self.aligned.calibration.gyro_time_offset_s + (self.imu.epoch_ns - camera_epoch_ns) * 1e-9
+
+    def align(self, imu: ImuRecording, *, any_offset: bool = False) -> Alignment | NotObservableError | None:
+        """The same with another reading of the gyroscope, or at any offset of the clocks."""
+        if self.turning is None:
+            return None
+        options = AlignOptions(max_offset_s=None if any_offset else self.max_offset_s)
+        if self.trajectory is None:
+            # the camera's translation is in the pixels' motion, and no gyroscope explains it
+            options = replace(options, min_explained=PIXELS_EXPLAINED)
+        try:
+            return align_clocks(self.turning, imu, prior=self.calibration, options=options)
+        except NotObservableError as error:
+            return error
+
+
+#: What a gyroscope must explain of the rotation that pixels show, where no reconstruction tells it from translation.
+PIXELS_EXPLAINED = 0.5
+#: Numbers of a gyroscope times this are rad/s, where they were in the other unit than they were declared in.
+UNIT_FACTORS = {"gyro-in-deg": np.pi / 180, "gyro-not-in-deg": 180 / np.pi}
+#: Pictures closer together than this (median) are followed; those further apart are compared two by two.
+FOLLOWED_S = 0.15

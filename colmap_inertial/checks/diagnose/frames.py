@@ -1,0 +1,207 @@
+"""The frames by themselves: their times, repeats, exposures, readout, and the video they were cut from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from colmap_inertial.checks.diagnose.findings import Finding, Recorded, Severity
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.gyro import on_camera_rate
+from colmap_inertial.imaging.gyro_camera import GyroCamera
+from colmap_inertial.motion.align import Alignment
+from colmap_inertial.motion.shutter import ReadoutEstimate, estimate_readout
+
+#: Frames come evenly where this share of their intervals is the usual one to within this; keyframes do not.
+_EVEN_SHARE, _EVEN = 0.8, 0.1
+#: A single frame now and then is lost in most recordings.
+_DROPPED, _DROPPED_SHARE = 2, 0.002
+#: A pair of frames turned by less than this is one frame twice; more of them than the share shift the times.
+_SAME_RAD, _REPEATED, _REPEATED_SHARE = 1e-7, 2, 0.05
+#: Blur, as a share of the picture's long side, beyond which features suffer; and the frames that may have it.
+_BLUR_SHARE, _BLURRED_FRAMES = 0.004, 0.5
+#: COLMAP's guess of a focal length in long sides, where none is declared.
+_GUESSED_FOCAL = 1.2
+#: Times of cut frames against the video's own: below the first is rounding; and how near a video's start is meant.
+_WANDER_S, _START_S = 0.003, 0.002
+
+
+def check_dropped(recorded: Recorded) -> Iterator[Finding]:
+    """Intervals of twice the usual length and more."""
+    frames = recorded.timing or recorded.trajectory
+    if frames is None or len(frames.t_s) < 20:
+        return
+    step_s = np.diff(frames.t_s)
+    usual_s = float(np.median(step_s))
+    if np.mean(np.abs(step_s / usual_s - 1) < _EVEN) < _EVEN_SHARE:
+        return
+    lost = int(np.sum(np.round(step_s / usual_s) - 1))
+    if lost > max(_DROPPED, _DROPPED_SHARE * len(step_s)):
+        yield Finding(
+            code="frames-dropped",
+            severity="warning",
+            evidence=f"{lost} frames are missing between {len(frames.t_s)} that come every {1e3 * usual_s:.1f} ms; "
+            f"the longest pause is {step_s.max():.2f} s",
+            advice="nothing, where the times are right; record to a faster card or at a smaller size",
+            numbers={"lost": float(lost), "longest_s": float(step_s.max())},
+        )
+
+
+def check_repeated(recorded: Recorded) -> Iterator[Finding]:
+    """Frames that are the one before, at a time of their own."""
+    if recorded.rotation is not None:
+        turn = recorded.rotation.turn_rad
+        same = np.linalg.norm(turn[np.isfinite(turn).all(axis=1)], axis=1) < _SAME_RAD
+    elif recorded.trajectory is not None:
+        poses = recorded.trajectory
+        same = (np.diff(poses.cam_in_world, axis=0) == 0).all(axis=1)
+        same &= (np.diff(poses.cam_from_world_xyzw, axis=0) == 0).all(axis=1)
+    else:
+        return
+    count = int(np.sum(same))
+    if count > _REPEATED:
+        severity: Severity = "error" if count > _REPEATED_SHARE * len(same) else "warning"
+        yield Finding(
+            code="frames-repeated",
+            severity=severity,
+            evidence=f"{count} of {len(same)} frames repeat the one before them",
+            advice="cut frames without filling up to a constant rate (ffmpeg -fps_mode passthrough)",
+            numbers={"repeated": float(count), "looked_at": float(len(same))},
+        )
+
+
+def check_exposure(recorded: Recorded) -> Iterator[Finding]:
+    """Exposures in which the gyroscope says that the picture smeared."""
+    timing, imu = recorded.timing, recorded.imu
+    if timing is None or timing.exposure_s is None or imu is None:
+        return
+    rate = np.linalg.norm(imu.gyro_rad_s - np.median(imu.gyro_rad_s, axis=0), axis=1)
+    shift_s = recorded.offset_s(timing.epoch_ns)
+    if shift_s is not None:
+        turning = np.interp(timing.t_s, imu.gyro_t_s + shift_s, rate)
+    else:
+        turning = np.full(len(timing.t_s), np.median(rate))
+    focal = _GUESSED_FOCAL
+    if recorded.camera is not None:
+        focal = recorded.camera.params[0] / max(recorded.camera.width, recorded.camera.height)
+    # two of three axes smear the middle of the picture
+    blur = focal * turning * timing.exposure_s * (2 / 3) ** 0.5
+    share = float(np.mean(blur > _BLUR_SHARE))
+    if share > _BLURRED_FRAMES:
+        yield Finding(
+            code="exposure-too-long",
+            severity="warning",
+            evidence=f"{100 * share:.0f} % of the frames are blurred by more than {100 * _BLUR_SHARE:g} % of the "
+            f"picture's long side (median {100 * np.median(blur):.2f} %, exposure "
+            f"{1e3 * np.median(timing.exposure_s):.1f} ms)",
+            advice="film with a shorter exposure (1/200 s or less) and more light; what is blurred is deblurred",
+            numbers={"share": share, "median_blur_of_long_side": float(np.median(blur))},
+        )
+
+
+def check_readout(recorded: Recorded) -> Iterator[Finding]:
+    """A capture that does not say how its shutter runs; where the pictures show it, how long it takes."""
+    if not recorded.is_capture or recorded.timing is None or recorded.timing.readout_s is not None:
+        return
+    evidence = "nothing says whether the camera has a rolling shutter, as nearly all phones do"
+    try:
+        found = _readout(recorded)
+    except NotObservableError as error:
+        yield Finding(
+            code="readout-unknown",
+            severity="warning",
+            evidence=f"{evidence}; {error.hint}",
+            advice="give readout_s under [timing] in capture.toml (0 for a global shutter), so that it is undone",
+        )
+        return
+    lines = f"readout_s = {found.readout_s:.4f}"
+    if found.direction != "down":
+        lines += f' and readout_direction = "{found.direction}"'
+    yield Finding(
+        code="readout-unknown",
+        severity="warning",
+        evidence=f"{evidence}; by the pictures and the gyroscope, reading a frame takes {found}"
+        + ("" if found.readout_s else ", as a global shutter"),
+        advice=f"write {lines} under [timing] in capture.toml, so that it is undone",
+        numbers={"readout_s": found.readout_s, "readout_sigma_s": found.sigma_s, "pairs": float(found.pairs)},
+    )
+
+
+def _readout(recorded: Recorded) -> ReadoutEstimate:
+    """By what was followed from frame to frame, and the gyroscope as it was aligned."""
+    rotation, aligned, imu = recorded.rotation, recorded.aligned, recorded.imu
+    if rotation is not None and not recorded.is_dense:
+        raise NotObservableError("readout", "pictures that are this far apart in time do not tell it; a video does")
+    if rotation is None or imu is None or not isinstance(aligned, Alignment):
+        raise NotObservableError("readout", "a video and its gyroscope would tell, where they fit each other")
+    if recorded.stabilisation is not None and recorded.stabilisation.stabilised:
+        raise NotObservableError("readout", "a stabilised video tells nothing of it")
+    settled = aligned.settled()
+    kept = on_camera_rate(imu, settled, camera_epoch_ns=rotation.epoch_ns)
+    return estimate_readout(rotation, GyroCamera.of(kept, settled, camera_epoch_ns=rotation.epoch_ns))
+
+
+def check_cut_from_video(recorded: Recorded) -> Iterator[Finding]:
+    """Times and orientation of pictures against the video that they were cut from."""
+    cut = recorded.in_video
+    if cut is None:
+        return
+    if cut.doubtful:
+        yield Finding(
+            code="frames-not-in-video",
+            severity="info",
+            evidence=f"{cut.doubtful} of {cut.doubtful + len(cut.found_ns)} pictures look like no frame of the video, "
+            "or like several",
+            advice="name the video that the pictures were cut from",
+            numbers={"pictures": float(cut.doubtful)},
+        )
+    if cut.quarter_turns:
+        yield Finding(
+            code="frames-turned",
+            severity="error" if _refers_to_rows(recorded) else "info",
+            evidence=f"the pictures are turned by {90 * cut.quarter_turns} deg against the sensor's rows",
+            advice="where readout, intrinsics or a calibration are declared, cut the pictures without turning them "
+            "upright (ffmpeg -noautorotate): these refer to the sensor's rows",
+            numbers={"angle_deg": 90.0 * cut.quarter_turns},
+        )
+    elif cut.container_turn_deg % 360:
+        yield Finding(
+            code="rotation-ignored",
+            severity="info",
+            evidence=f"the video asks players to turn it by {cut.container_turn_deg} deg; the pictures are as the "
+            "sensor saw them",
+            advice="nothing: readout, calibration and the IMU's axes refer to the sensor's rows; intrinsics must, too",
+            numbers={"angle_deg": float(cut.container_turn_deg)},
+        )
+    if len(cut.found_ns) < 3:
+        return
+    off_s = (cut.stated_ns - cut.found_ns) * 1e-9
+    middle_s = float(np.median(off_s))
+    wander_s = float(np.ptp(off_s))
+    start_s = cut.video_start_ns * 1e-9
+    if wander_s > _WANDER_S:
+        yield Finding(
+            code="frame-times-counted",
+            severity="error",
+            evidence=f"the pictures' times wander by {1e3 * wander_s:.0f} ms against the presentation stamps of the "
+            "video's frames that they are, as times counted from a frame rate do",
+            advice="give the presentation stamps of the frames, or the video itself as [video]",
+            numbers={"wander_s": wander_s},
+        )
+    elif abs(start_s) > _START_S and abs(middle_s + start_s) < _START_S:
+        yield Finding(
+            code="container-start-ignored",
+            severity="error",
+            evidence=f"the pictures' times lack the {1e3 * start_s:+.0f} ms at which the video's container starts",
+            advice="add the container's start to the times, or give the video itself as [video]",
+            numbers={"start_s": start_s},
+        )
+
+
+def _refers_to_rows(recorded: Recorded) -> bool:
+    """Whether anything is declared that pictures in another orientation would belie."""
+    readout_s = None if recorded.timing is None else recorded.timing.readout_s
+    prior = recorded.calibration
+    calibrated = prior is not None and prior.rotation_sigma_rad < 1
+    return bool(readout_s) or calibrated or recorded.camera is not None

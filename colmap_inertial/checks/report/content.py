@@ -1,0 +1,276 @@
+"""What a report says, gathered from the files of an output folder: nothing is computed again."""
+
+from __future__ import annotations
+
+import tomllib
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from colmap_inertial import __version__
+from colmap_inertial.checks.report.series import strided
+from colmap_inertial.checks.report.words import (
+    half_width_pct,
+    mapped_in_words,
+    outcome_of_model,
+    outcome_of_stop,
+    parts_mapped_in_words,
+)
+from colmap_inertial.io.files import read_json, read_text
+
+VERSION = 1
+#: What the pipeline keeps for the report alone, in an output folder.
+DATA_FOLDER, CROPS_FOLDER = "report_data", "crops"
+#: Paths longer than this bend and drift enough to say so (m).
+_LONG_PATH_M = 30.0
+#: Of a model in ``result.json``, what the page shows otherwise or not.
+_NOT_SHOWN = ("drift", "validation", "cov", "dense")
+#: Models that are shown in full, the largest ones; frames in the plot of blur; images of the target.
+_MOST_MODELS, _MOST_FRAMES, _MOST_IMAGES = 3, 3000, 4
+
+Content = dict[str, Any]
+
+
+def recording_file(out: Path) -> Path:
+    """What is kept of the recording."""
+    return out / DATA_FOLDER / "recording.json"
+
+
+def model_file(out: Path, index: int) -> Path:
+    """What is kept of one model."""
+    return out / DATA_FOLDER / f"model_{index}.json"
+
+
+def gather(
+    out: Path, *, result: Content | None = None, stopped: str | None = None, capture: str | None = None
+) -> Content:
+    """The content of a report; its layout is that of ``colmap_inertial.checks.report``.
+
+    Parameters
+    ----------
+    out
+        Folder of a run.
+    result
+        Content of ``result.json``, where it is not written yet.
+    stopped
+        Why the run ended without a result.
+    capture
+        What was run, where there is no result to say so.
+
+    Raises
+    ------
+    FormatError
+        For files that were damaged since they were written.
+    """
+    if result is None and stopped is None:
+        result = read_json(out / "result.json")
+    recording = read_json(recording_file(out)) if recording_file(out).is_file() else None
+    nothing: Content = {"models": [], "frames": [], "seconds": {}, "versions": {"colmap_inertial": __version__}}
+    done = nothing if result is None else result
+    models = sorted(done["models"], key=lambda m: (m["metres_per_unit"] is None, -m["registered_images"], m["index"]))
+    full = {model["index"] for model in models[:_MOST_MODELS]}
+    project = done.get("project") is not None
+    shown = [_model(out, model, in_full=model["index"] in full, project=project) for model in models]
+    findings = _findings(out)
+    if shown:
+        outcome = shown[0]["outcome"]
+    else:
+        outcome = outcome_of_stop(stopped or "COLMAP made no model.", findings=bool(findings.get("findings")))
+    gaps = done.get("gaps", [])
+    if shown and shown[0]["joined_of"]:
+        outcome = {**outcome, "summary": [*outcome["summary"], _joined(shown[0], gaps)]}
+    if shown:
+        made = parts_mapped_in_words(done.get("mapping"))
+        made += mapped_in_words(done.get("mapping"), shown[0].get("colmap_index"))
+        outcome = {**outcome, "summary": [*outcome["summary"], *made, *_path_in_words(shown[0])]}
+    if len(shown) > 1:
+        said = f"There are {len(shown)} separate models. This is model {shown[0]['index']}; the others follow below."
+        outcome = {**outcome, "summary": [*outcome["summary"], said]}
+    source = done.get("capture", capture) or str(out)
+    return {
+        "format": "colmap-inertial report",
+        "version": VERSION,
+        "title": _title(source),
+        "capture": source,
+        "outcome": outcome,
+        "models": shown,
+        "gaps": gaps,
+        "findings": findings,
+        "selection": _selection(done),
+        "recording": None if recording is None else _of_recording(recording),
+        "made": None if recording is None else recording.get("made"),
+        "blur": _blur(done, recording, project=project),
+        "crops": _crops(out, done),
+        "rolling_shutter": _rolling_shutter(done, recording),
+        "project_metric": done.get("project_metric"),
+        "seconds": done["seconds"],
+        "configuration": _configuration(out),
+        "versions": done["versions"],
+    }
+
+
+def _path_in_words(model: Content) -> list[str]:
+    """What the refinement did to a model's path, in a sentence; or that it could."""
+    done = [one for one in model.get("treatments", []) if one["stage"] == "refine"]
+    if not done:
+        length = model.get("scene", {}).get("path_length")
+        if model.get("sparse_metric") is None or length is None or length < _LONG_PATH_M:
+            return []
+        return [f"Its path is {length:.0f} m long: --refine inertial fits the IMU to it, too, against bends and drift."]
+    percent = [part["percent"] for part in refined_parts(model)]
+    if not percent:
+        return []
+    low, high = (f"{value:+.2f}" for value in (min(percent), max(percent)))
+    return [f"The IMU took drift out of its path: parts of it were stretched by {low} to {high} %."]
+
+
+def refined_parts(model: Content) -> list[Content]:
+    """By how much the refinement stretched the parts of a model's path; empty where it left the model as it was."""
+    done = [one for one in model.get("treatments", []) if one["stage"] == "refine" and one["action"]]
+    parts: list[Content] = done[-1]["values"].get("drift", []) if done else []
+    return parts
+
+
+def _joined(model: Content, gaps: list[Content]) -> str:
+    """What a model was joined of, in a sentence."""
+    inside = {part["colmap_index"] for part in model["joined_of"]}
+    across = [
+        gap for gap in gaps if gap["joined"] and gap["sigma_m"] is not None and {gap["first"], gap["second"]} <= inside
+    ]
+    if not across:  # a stage of somebody's own need not say how well it knows them
+        return f"COLMAP made {len(inside)} models of it, which were joined into one."
+    worst = max(across, key=lambda gap: gap["sigma_m"])
+    return (
+        f"COLMAP made {len(inside)} models of it, which what the IMU felt between them made one; the gap that is known "
+        f"worst, of {worst['seconds']:.1f} s, to {100 * worst['sigma_m']:.1f} cm and {worst['sigma_deg']:.2f} degrees "
+        "(1 sigma)."
+    )
+
+
+def _selection(done: Content) -> Content | None:
+    found = done.get("selection")
+    return None if found is None else {key: found[key] for key in ("frames", "used", "note")}
+
+
+def _missing(why: str) -> Content:
+    return {"missing": why}
+
+
+def _title(source: str) -> str:
+    path = Path(source)
+    return (path.parent.name if path.name == "capture.toml" else path.name) or source
+
+
+def _model(out: Path, model: Content, *, in_full: bool, project: bool) -> Content:
+    scale, ci95 = model["metres_per_unit"], model["ci95"]
+    kept = {key: value for key, value in model.items() if key not in _NOT_SHOWN}
+    kept.setdefault("joined_of", [])
+    kept.setdefault("notes", [])  # earlier runs had all of it among the reasons
+    kept["half_width_pct"] = None if scale is None else half_width_pct(scale, ci95)
+    if scale is None:
+        kept["drift"] = _missing("There is no scale whose parts could be compared.")
+    else:
+        unknown = _missing("This method does not tell the scale of parts of the recording.")
+        kept["drift"] = model.get("drift") or unknown
+    kept["validation"] = _validation(out, model, project=project)
+    file = model_file(out, model["index"])
+    if in_full and file.is_file():
+        kept |= read_json(file)
+    else:
+        failed = "What it is drawn from was not kept; where that failed, log.txt says why."
+        why = failed if in_full else f"Only the {_MOST_MODELS} largest models are shown in full."
+        kept["scene"], kept["signals"] = _missing(why), _missing(why)
+    kept.setdefault("photogrammetry", _missing("It was not kept: an earlier version made this run."))
+    kept["outcome"] = outcome_of_model({**model, "signals": kept["signals"]})
+    return kept
+
+
+def _validation(out: Path, model: Content, *, project: bool) -> Content:
+    found = model.get("validation")
+    if found is None:
+        if model["metres_per_unit"] is None:
+            return _missing("Without a scale there is nothing to measure a target with.")
+        if project:
+            return _missing("No target was named, or the project's images are not at hand (then the notes say so).")
+        return _missing("The capture names no target of known size ([target] in capture.toml).")
+    if "error" in found:
+        return _missing(f"The target could not be measured: {found['error']}.")
+    folder = out / "validation" / str(model["index"])
+    images = sorted(folder.glob("*.jpg")) if folder.is_dir() else []
+    chosen = [str(images[i].relative_to(out)) for i in strided(len(images), _MOST_IMAGES)]
+    return {**found, "pictures": chosen}
+
+
+def _findings(out: Path) -> Content:
+    file = out / "diagnosis.json"
+    if not file.is_file():
+        return _missing("The recording was not looked at beforehand, or what was found was not kept.")
+    found = read_json(file)
+    return {"checked": found["checked"], "findings": found["findings"]}
+
+
+def _of_recording(recording: Content) -> Content:
+    frames = {key: value for key, value in recording["frames"].items() if key not in ("names", "t_s", "exposure_s")}
+    exposures = [value for value in recording["frames"]["exposure_s"] or [] if value is not None]
+    frames["median_exposure_s"] = float(np.median(exposures)) if exposures else None
+    return {"imu": recording["imu"], "frames": frames}
+
+
+def _blur(done: Content, recording: Content | None, *, project: bool) -> Content:
+    if project:
+        return _missing("The images of an existing project are left as they are.")
+    note = done.get("imaging", {}).get("deblur") or "the run did not get that far"
+    known = [frame for frame in done["frames"] if frame["blur_px"] is not None]
+    if not known or recording is None:
+        return _missing(f"No blur to show: {note}.")
+    time_of = dict(zip(recording["frames"]["names"], recording["frames"]["t_s"], strict=True))
+    blur_px = np.array([frame["blur_px"] for frame in known])
+    some = strided(len(known), _MOST_FRAMES)
+    worst = np.argsort(-blur_px, kind="stable")[: _MOST_FRAMES // 10] if len(some) < len(known) else some[:0]
+    return {
+        "note": note,
+        "counts": dict(Counter(frame["action"] for frame in done["frames"])),
+        "median_px": float(np.median(blur_px)),
+        "largest_px": float(blur_px.max()),
+        "frames": [
+            {"t_s": time_of.get(known[i]["name"]), **{k: known[i][k] for k in ("name", "action", "blur_px", "reason")}}
+            for i in np.union1d(some, worst).tolist()
+        ],
+    }
+
+
+def _crops(out: Path, done: Content) -> Content:
+    file = out / DATA_FOLDER / CROPS_FOLDER / "crops.json"
+    crops = read_json(file)["crops"] if file.is_file() else []
+    if not crops:
+        if any(frame["action"] == "deblurred" for frame in done["frames"]):
+            return _missing("Of the frames that were looked at before and after, none differs.")
+        return _missing("No frame was deblurred, so there is nothing to show before and after.")
+    reason = {frame["name"]: frame["reason"] for frame in done["frames"]}
+    folder = f"{DATA_FOLDER}/{CROPS_FOLDER}/"
+    return {
+        "pairs": [
+            {**crop, "reason": reason.get(crop["name"], ""), **{s: folder + crop[s] for s in ("before", "after")}}
+            for crop in crops
+        ]
+    }
+
+
+def _rolling_shutter(done: Content, recording: Content | None) -> Content:
+    movement = None if recording is None else recording["rolling_shutter"]
+    if movement is None:
+        note = done.get("imaging", {}).get("rolling_shutter")
+        return _missing(f"Nothing was done about a rolling shutter{f': {note}' if note else ''}.")
+    assert recording is not None
+    note = done.get("imaging", {}).get("rolling_shutter", "")
+    return {"note": note, "readout_s": recording["frames"]["readout_s"], **movement}
+
+
+def _configuration(out: Path) -> Content:
+    file = out / "config.toml"
+    if not file.is_file():
+        return _missing("The run ended before its configuration was written.")
+    text = read_text(file)
+    return {"toml": text, "values": tomllib.loads(text)}

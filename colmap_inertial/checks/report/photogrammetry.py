@@ -1,0 +1,201 @@
+"""What photogrammetrists look for first: cameras, residuals, tracks, overlap, ground sampling distance, extent."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.checks.report.series import rounded, strided
+from colmap_inertial.core.geometry import quat_rotate
+from colmap_inertial.core.types import Array
+from colmap_inertial.model.intrinsics import intrinsics_sigma
+
+if TYPE_CHECKING:
+    import pycolmap
+
+#: Images whose residuals are computed; cells across the longer side of the sensor, and of the ground; cameras shown.
+_MOST_IMAGES, _SENSOR_CELLS, _GROUND_CELLS, _MOST_CAMERAS = 300, 16, 40, 4
+#: Lengths of tracks are counted one by one up to here. Share of the points that extent and ground leave out each side.
+_LONGEST_TRACK, _OUTSIDE_PCT = 12, 1.5
+#: Points across an image at which its distortion is drawn.
+_ACROSS = 15
+
+
+def photogrammetry_record(
+    reconstruction: pycolmap.Reconstruction, display_from_model_xyzw: Array, *, unit: str
+) -> dict[str, Any]:
+    """What a model says about itself, its images and cameras; lengths are in ``unit``.
+
+    Parameters
+    ----------
+    reconstruction
+        The model.
+    display_from_model_xyzw
+        (4,) rotation that puts it upright, for what is seen from above.
+    unit
+        ``"m"`` or ``"model"``.
+
+    Returns
+    -------
+    ``photogrammetry`` as :mod:`colmap_inertial.checks.report` describes it.
+    """
+    image_ids = sorted(reconstruction.reg_image_ids())
+    images = [reconstruction.image(i) for i in image_ids]
+    points = dict(sorted(reconstruction.points3D.items()))
+    xyz = np.array([point.xyz for point in points.values()]).reshape(-1, 3)
+    place = dict(zip(points, xyz, strict=True))
+    tracks = [point.track for point in points.values()]
+    lengths = np.array([track.length() for track in tracks], dtype=np.intp)
+    upright = quat_rotate(display_from_model_xyzw, xyz) if len(xyz) else xyz
+    seen = [
+        _seen(reconstruction.camera(images[i].camera_id), images[i], place) for i in strided(len(images), _MOST_IMAGES)
+    ]
+    sigma = intrinsics_sigma(reconstruction)
+    return {
+        "unit": unit,
+        "cameras": [_camera(reconstruction, i, image_ids, sigma.get(i)) for i in _most_used(reconstruction, image_ids)],
+        "images": [
+            {"name": s.name, "observations": len(s.residual_px), "rms_px": _rms(s.residual_px), "gsd": s.gsd}
+            for s in seen
+        ],
+        "sensor": _sensor(seen),
+        "tracks": {
+            "mean": float(lengths.mean()) if len(lengths) else 0.0,
+            "counts": np.bincount(np.minimum(lengths, _LONGEST_TRACK), minlength=_LONGEST_TRACK + 1)[2:].tolist(),
+        },
+        "extent": _span(upright),
+        "ground": _ground(upright, tracks),
+    }
+
+
+class _Seen:
+    """What one image sees: where, how far from where the model has it, and how fine."""
+
+    def __init__(self, name: str, size: tuple[int, int], xy_px: Array, residual_px: Array, gsd: float | None) -> None:
+        self.name, self.size, self.xy_px, self.residual_px, self.gsd = name, size, xy_px, residual_px, gsd
+
+
+def _seen(camera: pycolmap.Camera, image: pycolmap.Image, place: Mapping[int, Array]) -> _Seen:
+    """``place``: (3,) by a point's number."""
+    observed = image.get_observation_points2D()
+    xy_px = np.array([p.xy for p in observed], dtype=np.float64).reshape(-1, 2)
+    xyz = np.array([place[p.point3D_id] for p in observed]).reshape(-1, 3)
+    pose = image.cam_from_world()
+    in_cam = xyz @ pose.rotation.matrix().T + pose.translation
+    ahead = in_cam[:, 2] > 0
+    residual = xy_px[ahead] - np.array(camera.img_from_cam(in_cam[ahead])).reshape(-1, 2)
+    finite = np.isfinite(residual).all(axis=1)
+    focal = camera.mean_focal_length()
+    gsd = float(np.median(in_cam[ahead, 2]) / focal) if ahead.any() and focal > 0 else None
+    return _Seen(image.name, (camera.width, camera.height), xy_px[ahead][finite], residual[finite], gsd)
+
+
+def _rms(residual_px: Array) -> float | None:
+    return float(np.sqrt(np.mean(np.sum(residual_px**2, axis=1)))) if len(residual_px) else None
+
+
+def _most_used(reconstruction: pycolmap.Reconstruction, image_ids: list[int]) -> list[int]:
+    used = [reconstruction.image(i).camera_id for i in image_ids]
+    return sorted(set(used), key=lambda i: (-used.count(i), i))[:_MOST_CAMERAS]
+
+
+def _camera(
+    reconstruction: pycolmap.Reconstruction, camera_id: int, image_ids: list[int], sigma: Array | None
+) -> dict[str, Any]:
+    """Intrinsics, field of view, and by how much the lens moves points from where a pinhole would have them."""
+    camera = reconstruction.camera(camera_id)
+    names = [name.strip() for name in camera.params_info.split(",")]
+    x = (np.arange(_ACROSS) + 0.5) * camera.width / _ACROSS
+    y = (np.arange(_ACROSS) + 0.5) * camera.height / _ACROSS
+    at = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    rays = np.array(camera.cam_from_img(at)).reshape(-1, 2)
+    matrix = np.array(camera.calibration_matrix())
+    pinhole = rays @ matrix[:2, :2].T + matrix[:2, 2]
+    good = np.isfinite(pinhole).all(axis=1)
+    focal = camera.mean_focal_length()
+    field = [float(np.degrees(2 * np.arctan(0.5 * side / focal))) for side in (camera.width, camera.height)]
+    return {
+        "camera_id": camera_id,
+        "model": camera.model.name,
+        "width": camera.width,
+        "height": camera.height,
+        "images": sum(reconstruction.image(i).camera_id == camera_id for i in image_ids),
+        "params": dict(zip(names, (float(p) for p in camera.params), strict=True)),
+        "sigma": {}
+        if sigma is None
+        else {name: float(s) for name, s in zip(names, sigma, strict=True) if np.isfinite(s)},
+        "field_of_view_deg": rounded(np.array(field), 2),
+        "distortion": {
+            "at_px": np.round(at[good], 1).tolist(),
+            "shift_px": np.round((at - pinhole)[good], 3).tolist(),
+        },
+    }
+
+
+def _sensor(seen: list[_Seen]) -> dict[str, Any] | None:
+    """Mean residual over the sensor, of the images of the commonest size."""
+    sizes = [s.size for s in seen if len(s.xy_px)]
+    if not sizes:
+        return None
+    width, height = max(sorted(set(sizes)), key=sizes.count)
+    those = [s for s in seen if s.size == (width, height)]
+    xy, residual = np.concatenate([s.xy_px for s in those]), np.concatenate([s.residual_px for s in those])
+    step = max(width, height) / _SENSOR_CELLS
+    columns, rows = int(np.ceil(width / step)), int(np.ceil(height / step))
+    column, row = (np.clip((xy[:, k] / step).astype(np.intp), 0, n - 1) for k, n in ((0, columns), (1, rows)))
+    cell, cells = row * columns + column, rows * columns
+    count = np.bincount(cell, minlength=cells)
+    sums = [np.bincount(cell, weights=w, minlength=cells) for w in (*residual.T, np.sum(residual**2, axis=1))]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        x, y, rms = sums[0] / count, sums[1] / count, np.sqrt(sums[2] / count)
+    return {
+        "width": width,
+        "height": height,
+        "columns": columns,
+        "rows": rows,
+        "count": count.tolist(),
+        "mean_x_px": _known(x),
+        "mean_y_px": _known(y),
+        "rms_px": _known(rms),
+    }
+
+
+def _known(values: Array) -> list[float | None]:
+    return [round(float(v), 3) if np.isfinite(v) else None for v in values]
+
+
+def _span(upright: Array) -> list[float] | None:
+    """(3,) how far nearly all points reach, along x, y and up."""
+    if not len(upright):
+        return None
+    low, high = np.percentile(upright, [_OUTSIDE_PCT, 100 - _OUTSIDE_PCT], axis=0)
+    return [round(float(v), 4) for v in high - low]
+
+
+def _ground(upright: Array, tracks: list[Any]) -> dict[str, Any] | None:
+    """Images that see each square of the ground, from above."""
+    if len(upright) < 2:
+        return None
+    low, high = (np.percentile(upright[:, :2], pct, axis=0) for pct in (_OUTSIDE_PCT, 100 - _OUTSIDE_PCT))
+    step = float((high - low).max()) / _GROUND_CELLS
+    if not step > 0:
+        return None
+    columns, rows = (int(n) for n in np.ceil((high - low) / step).astype(np.intp).clip(1))
+    place = ((upright[:, :2] - low) / step).astype(np.intp)
+    inside = np.flatnonzero(np.all((upright[:, :2] >= low) & (upright[:, :2] <= high), axis=1))
+    seen: dict[tuple[int, int], set[int]] = {}
+    for i in inside[strided(len(inside), 60_000)].tolist():
+        key = (min(int(place[i, 1]), rows - 1), min(int(place[i, 0]), columns - 1))
+        seen.setdefault(key, set()).update(element.image_id for element in tracks[i].elements)
+    counts: NDArray[np.intp] = np.zeros((rows, columns), dtype=np.intp)
+    for key, by in seen.items():
+        counts[key] = len(by)
+    return {
+        "x0": round(float(low[0]), 4),
+        "y0": round(float(low[1]), 4),
+        "step": step,
+        "images": counts.tolist(),
+    }

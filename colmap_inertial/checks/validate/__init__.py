@@ -1,0 +1,34 @@
+"""Is a reconstruction the right size? Checked with a target of known size in its images."""
+
+from colmap_inertial.checks.validate.markers import distance_between, with_bars, with_check_points, with_other_target
+from colmap_inertial.checks.validate.measure import validate_model
+from colmap_inertial.checks.validate.overlays import write_overlays
+from colmap_inertial.checks.validate.result import (
+    Corner,
+    Distance,
+    RejectedView,
+    SetScale,
+    Validation,
+    ViewResiduals,
+    validation_table,
+)
+from colmap_inertial.checks.validate.targets import Target, TargetSpecError, parse_target
+
+__all__ = [
+    "Corner",
+    "Distance",
+    "RejectedView",
+    "SetScale",
+    "Target",
+    "TargetSpecError",
+    "Validation",
+    "ViewResiduals",
+    "distance_between",
+    "parse_target",
+    "validate_model",
+    "validation_table",
+    "with_bars",
+    "with_check_points",
+    "with_other_target",
+    "write_overlays",
+]

@@ -1,0 +1,313 @@
+"""Finds calibration targets in images: corners with their numbers, in COLMAP's pixel coordinates.
+
+Corners where black fields meet diagonally (checkerboard, ChArUco, AprilGrid) are refined to the point from which all
+grey-value gradients around look sideways (Foerstner & Guelch 1987, as OpenCV's ``cornerSubPix``): blur and gamma shift
+both edges alike there, and the point stays. On sharp rendered boards this is several times closer to the truth than
+the sector-based detector's own corners, which serve to find and number them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.checks.validate.edges import refine_marker
+from colmap_inertial.checks.validate.targets import Target
+from colmap_inertial.core.geometry import colmap_px_from_opencv
+from colmap_inertial.core.types import Array
+
+Grey = NDArray[np.uint8]
+Index = NDArray[np.intp]
+
+#: Checkerboards are searched in images of at most this many pixels along the longer side, and refined in the original.
+_SEARCH_SIZE_PX = 1600
+_MOST_BOARDS = 3
+_SMALLEST_MARKER_PX = 12.0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Detection:
+    """One target, or a part of one, found in an image.
+
+    Attributes
+    ----------
+    part
+        The rigid part (see :class:`~colmap_inertial.checks.validate.targets.Target`).
+    corner
+        (n,) numbers of the corners that were found, no number twice.
+    xy_px
+        (n, 2) where, COLMAP's pixel coordinates.
+    """
+
+    part: int
+    corner: Index
+    xy_px: Array
+
+
+def detect(image: Grey, target: Target, *, thorough: bool = False) -> list[Detection]:
+    """Find a target in an image.
+
+    Parameters
+    ----------
+    image
+        (H, W) grey values.
+    target
+        What to look for.
+    thorough
+        For checkerboards: when the quick search finds nothing, search exhaustively and then with OpenCV's classic
+        detector; when it finds one, look for further boards. Slow where there is no board.
+
+    Returns
+    -------
+    Every board or marker that was found. A checkerboard's numbering may start at the corner that
+    ``Target.relabelings`` lists instead of the true one; two detections may show the same object only in a target of
+    single markers or where the image holds several copies of a board.
+    """
+    if target.kind == "checkerboard":
+        return list(_checkerboards(image, target, thorough))
+    if target.kind == "charuco":
+        return _charuco(image, target)
+    if target.kind == "aprilgrid":
+        return _aprilgrid(image, target)
+    return _markers(image, target)
+
+
+def other_checkerboard(image: Grey) -> tuple[int, int] | None:
+    """Inner corners (columns, rows) of whatever checkerboard an image shows, to help with a wrong description."""
+    import cv2
+
+    small, _ = _shrunk(image)
+    found, _, meta = cv2.findChessboardCornersSBWithMeta(small, (3, 3), cv2.CALIB_CB_LARGER)
+    return (int(meta.shape[1]), int(meta.shape[0])) if found and meta is not None else None
+
+
+def _checkerboards(image: Grey, target: Target, thorough: bool) -> Iterator[Detection]:
+    import cv2
+
+    small, factor = _shrunk(image)
+    small = small.copy()
+    for number in range(_MOST_BOARDS if thorough else 1):
+        corners = _find_checkerboard(small, target, fallback=thorough and number == 0)
+        if corners is None:
+            return
+        xy = (corners.astype(np.float64) + 0.5) / factor - 0.5
+        grid = xy.reshape(target.rows, target.columns, 2)
+        refined, good = _refine(image, xy, 0.4 * _spacing_px(grid).ravel(), allowed_px=1.0 / factor)
+        if good.sum() >= 6:
+            yield _detection(np.arange(len(xy)), refined, good)
+        # paint over what was found, squares outside the inner corners included, and look again
+        hull = cv2.convexHull(corners.reshape(-1, 1, 2)).reshape(-1, 2)
+        centre = hull.mean(axis=0)
+        grown = centre + (hull - centre) * (1 + 2.5 / (min(target.columns, target.rows) - 1))
+        cv2.fillConvexPoly(small, np.round(grown).astype(np.int32), float(np.median(small)))
+
+
+def _detection(corner: Index, xy: Array, good: NDArray[np.bool_]) -> Detection:
+    return Detection(part=0, corner=corner[good], xy_px=colmap_px_from_opencv(xy[good]))
+
+
+def _shrunk(image: Grey) -> tuple[Grey, float]:
+    import cv2
+
+    factor = min(1.0, _SEARCH_SIZE_PX / max(image.shape))
+    if factor == 1.0:
+        return image, 1.0
+    size = (round(image.shape[1] * factor), round(image.shape[0] * factor))
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA), size[0] / image.shape[1]
+
+
+def _find_checkerboard(image: Grey, target: Target, *, fallback: bool) -> NDArray[np.float32] | None:
+    """(N, 2) corners in OpenCV's pixels, row by row; ``None`` when there is no board."""
+    import cv2
+
+    size = (target.columns, target.rows)
+    if min(image.shape) < 2 * min(size):
+        return None
+    found, corners = cv2.findChessboardCornersSB(image, size, flags=0)
+    if not found and fallback:
+        flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
+        found, corners = cv2.findChessboardCornersSB(image, size, flags=flags)
+    if not found and fallback:
+        flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
+        found, corners = cv2.findChessboardCorners(image, size, flags=flags)
+    # OpenCV 4 gives (N, 1, 2), OpenCV 5 (N, 2)
+    return np.asarray(corners, dtype=np.float32).reshape(-1, 2) if found else None
+
+
+def _spacing_px(grid: Array) -> Array:
+    """Distance of each corner of a grid (R, C, 2) to its nearest neighbour along the lines; nan where missing."""
+    out = np.full(grid.shape[:2], np.inf)
+    for view, steps in ((out, grid), (out.T, grid.swapaxes(0, 1))):
+        step = np.nan_to_num(np.linalg.norm(np.diff(steps, axis=0), axis=2), nan=np.inf, posinf=np.inf)
+        for side in (view[:-1], view[1:]):
+            np.minimum(side, step, out=side)
+    return out
+
+
+def _refine(image: Grey, xy: Array, half_px: Array, *, allowed_px: float) -> tuple[Array, NDArray[np.bool_]]:
+    """Corners (n, 2) in OpenCV's pixels refined within windows of these half sizes, and which of them are good.
+
+    Good are those that stay within ``allowed_px`` of the first guess, and within their window.
+    """
+    import cv2
+
+    half = np.clip(np.nan_to_num(half_px, posinf=4.0), 2, 12).astype(int)
+    # a corner on which the search gives up is put back to exactly where it began: begin beside every fixed point
+    start = xy.astype(np.float32) + np.float32(1 / 32)
+    out = start.copy()
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 1e-4)
+    height, width = image.shape
+    inside = ((xy > half[:, None] + 1) & (xy < np.array([width, height]) - half[:, None] - 2)).all(axis=1)
+    for size in np.unique(half[inside]):
+        pick = inside & (half == size)
+        done = cv2.cornerSubPix(image, start[pick].reshape(-1, 1, 2), (int(size), int(size)), (-1, -1), criteria)
+        out[pick] = np.asarray(done).reshape(-1, 2)
+    moved = np.abs(out - start).max(axis=1)
+    return out.astype(np.float64), inside & (moved > 0) & (moved <= np.minimum(allowed_px, half))
+
+
+def _detector(target: Target, border_bits: int, image: Grey) -> Any:
+    import cv2
+
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.markerBorderBits = border_bits
+    # OpenCV's limit is a share of the image's size; markers of a dozen pixels can be read in large images too
+    rate = 4 * _SMALLEST_MARKER_PX / max(image.shape)
+    parameters.minMarkerPerimeterRate = min(parameters.minMarkerPerimeterRate, rate)
+    return cv2.aruco.ArucoDetector(_dictionary(target), parameters)
+
+
+def _dictionary(target: Target) -> Any:
+    import cv2
+
+    # OpenCV writes the families of AprilTags and of MIP with a small h
+    name = target.dictionary.replace("36H", "36h").replace("25H", "25h").replace("16H", "16h")
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name}"))
+
+
+def _find_markers(image: Grey, target: Target, border_bits: int, count: int) -> tuple[Array, Index]:
+    """Corners (n, 4, 2) in OpenCV's pixels and numbers (n,) of the markers below ``count``."""
+    found, numbers, _ = _detector(target, border_bits, image).detectMarkers(image)
+    if numbers is None or len(numbers) == 0:
+        return np.zeros((0, 4, 2)), np.zeros(0, dtype=np.intp)
+    corners, number = np.array(found, dtype=np.float64).reshape(-1, 4, 2), np.asarray(numbers).ravel().astype(np.intp)
+    keep = (number < count) & (_side_px(corners) >= _SMALLEST_MARKER_PX)
+    return corners[keep], number[keep]
+
+
+def _side_px(corners: Array) -> Array:
+    """(n,) shortest sides of quadrilaterals (n, 4, 2)."""
+    return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).min(axis=1)
+
+
+def _copies(corners: Array, number: Index, layout_m: Array) -> list[Index]:
+    """Indices of the markers of each copy of a board, when several are in view.
+
+    Markers are gathered by growing from one to its neighbours on the board: the homography of those gathered says
+    where the next should be.
+
+    Parameters
+    ----------
+    corners
+        (n, 4, 2) markers in the image.
+    number
+        (n,) their numbers; without repetition all belong to one board.
+    layout_m
+        (K, 4, 2) corners of each marker on the board.
+    """
+    import cv2
+
+    if len(np.unique(number)) == len(number):
+        return [np.arange(len(number))] if len(number) else []
+    centre_m = layout_m.mean(axis=1)
+    reach = 3 * np.median(np.linalg.norm(layout_m[:, 1] - layout_m[:, 0], axis=1))
+    left, out = set(range(len(number))), []
+    while left:
+        group = [min(left)]
+        left -= set(group)
+        while True:
+            source, image = layout_m[number[group]].reshape(-1, 2), corners[group].reshape(-1, 2)
+            homography = cv2.findHomography(source, image)[0]
+            best: tuple[float, int] | None = None
+            for i in left:
+                near = np.linalg.norm(centre_m[number[group]] - centre_m[number[i]], axis=1).min()
+                if homography is None or number[i] in number[group] or near > reach:
+                    continue
+                expected = cv2.perspectiveTransform(layout_m[number[i]][None], homography)[0]
+                miss = float(np.abs(expected - corners[i]).max()) / _side_px(corners[i : i + 1])[0]
+                if miss < 0.5 and (best is None or near * (1 + miss) < best[0]):
+                    best = (near * (1 + miss), i)
+            if best is None:
+                break
+            group.append(best[1])
+            left.discard(best[1])
+        out.append(np.array(group))
+    return out
+
+
+def _aprilgrid(image: Grey, target: Target) -> list[Detection]:
+    corners, number = _find_markers(image, target, 2, target.columns * target.rows)
+    # OpenCV numbers a tag's corners clockwise from its upper left, and reads Kalibr's tags turned by 90 degrees
+    corners = corners[:, [1, 0, 3, 2]]
+    layout_m = target.corners_m[:, :2].reshape(-1, 4, 2)
+    out = []
+    for pick in _copies(corners, number, layout_m):
+        # the nearest other corners: the tag's code (two of its ten cells away) and the far side of the black square
+        half = np.repeat(0.9 * min(0.2, target.gap) * _side_px(corners[pick]), 4)
+        xy, good = _refine(image, corners[pick].reshape(-1, 2), half, allowed_px=np.inf)
+        which = (4 * number[pick][:, None] + np.arange(4)).ravel()
+        if good.sum() >= 4:
+            out.append(_detection(which, xy, good))
+    return out
+
+
+def _charuco(image: Grey, target: Target) -> list[Detection]:
+    import cv2
+
+    markers = target.columns * target.rows // 2
+    corners, number = _find_markers(image, target, 1, markers)
+    out = []
+    for legacy in (False, True):
+        board = cv2.aruco.CharucoBoard(
+            (target.columns, target.rows), target.length_m, target.marker_m, _dictionary(target)
+        )
+        # boards with an even number of rows made before OpenCV 4.6 begin with a white square
+        board.setLegacyPattern(legacy)
+        detector = cv2.aruco.CharucoDetector(board)
+        layout_m = np.array(board.getObjPoints(), dtype=np.float64)[:, :, :2]
+        for pick in _copies(corners, number, layout_m):
+            quads = [corners[i].astype(np.float32).reshape(1, 4, 2) for i in pick]
+            xy, found, _, _ = detector.detectBoard(
+                image, markerCorners=quads, markerIds=number[pick].astype(np.int32).reshape(-1, 1)
+            )
+            if found is None or len(found) < 4:
+                continue
+            which = np.asarray(found).ravel().astype(np.intp)
+            start = np.asarray(xy, dtype=np.float64).reshape(-1, 2)
+            grid = np.full((target.rows - 1, target.columns - 1, 2), np.nan)
+            grid.reshape(-1, 2)[which] = start
+            spacing = _spacing_px(grid).ravel()[which]
+            # the window must stay clear of the markers inside the white squares
+            half = spacing * min(0.4, 0.45 * (1 - target.marker_m / target.length_m))
+            refined, good = _refine(image, start, half, allowed_px=2.0)
+            if good.sum() >= 4:
+                out.append(_detection(which, refined, good))
+        if out or target.rows % 2:
+            break
+    return out
+
+
+def _markers(image: Grey, target: Target) -> list[Detection]:
+    corners, number = _find_markers(image, target, 1, len(target.part) // 4)
+    dictionary = _dictionary(target)
+    out = []
+    for quad, one in zip(corners, number.tolist(), strict=True):
+        bits = dictionary.generateImageMarker(one, dictionary.markerSize + 2) > 127
+        refined = refine_marker(image, quad, bits)
+        if refined is not None:
+            out.append(Detection(part=one, corner=4 * one + np.arange(4), xy_px=colmap_px_from_opencv(refined)))
+    return out

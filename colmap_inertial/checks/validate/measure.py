@@ -1,0 +1,432 @@
+"""Measures a target of known size in a COLMAP model: the check that a reconstruction has the right size."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.checks.validate.fit import ScaleFit, fit_scale
+from colmap_inertial.checks.validate.lengths import check_lengths, model_diagonal
+from colmap_inertial.checks.validate.observations import Observations, Placement, triangulate
+from colmap_inertial.checks.validate.place import PartPlacement, median_residual_px, observe
+from colmap_inertial.checks.validate.result import (
+    Corner,
+    Distance,
+    DistanceSet,
+    RejectedView,
+    SetScale,
+    Validation,
+    ViewResiduals,
+)
+from colmap_inertial.checks.validate.search import Progress, Search, why_not_placed
+from colmap_inertial.checks.validate.targets import Target
+from colmap_inertial.checks.validate.views import Sighting, load_views
+from colmap_inertial.core.errors import NotObservableError, TargetNotFoundError
+from colmap_inertial.core.options import ValidateOptions
+from colmap_inertial.core.quantiles import Z95
+from colmap_inertial.core.threads import one_blas_thread
+from colmap_inertial.core.types import Array
+from colmap_inertial.io.files import StrPath
+from colmap_inertial.model import read_model
+
+if TYPE_CHECKING:
+    import pycolmap
+
+_NOT_FOUND = "target not found"
+_DISAGREES = "does not agree with the other views: a false detection, another target, or a wrong pose"
+_ENOUGH_VIEWS = 10
+_MOST_THOROUGH = 60
+_LEAST_CORNERS = 4
+_OUTLIER_SIGMA = 5.0
+_OUTLIER_VIEW = 4.0
+_WIDEST_LOG = float(np.log(1.3))
+_OUTLYING_PART = 0.05
+
+
+#: Smallest part of the images with sightings that must agree. Two boards in view leave half of them.
+_SMALLEST_AGREEMENT = 0.2
+
+
+@one_blas_thread()
+def validate_model(
+    model: Path | pycolmap.Reconstruction,
+    images: StrPath,
+    target: Target,
+    options: ValidateOptions | None = None,
+    *,
+    progress: Progress | None = None,
+) -> Validation:
+    """Find a target in a model's images, triangulate it with the model's own cameras, and compare sizes.
+
+    Parameters
+    ----------
+    model
+        Folder of a COLMAP model, or one in memory.
+    images
+        Folder that the images' names are relative to. Where keypoints were rectified for the rolling shutter, the
+        rectified images.
+    target
+        What to look for (:func:`~colmap_inertial.checks.validate.targets.parse_target`).
+    options
+        See :class:`ValidateOptions`.
+    progress
+        Called with the number of images searched and to search.
+
+    Returns
+    -------
+    The scale with a 95 % interval (noise model and method: :mod:`~colmap_inertial.checks.validate.fit`) and all
+    residuals.
+    The interval covers detection noise and errors of the model's poses that differ from view to view; it cannot cover
+    an error of the target itself, or a bend of the model that all views share.
+
+    Raises
+    ------
+    FormatError
+        When model or images cannot be read, do not belong together, or the images are mirrored.
+    TargetNotFoundError
+        When the target is in no image, or no two images agree on where it is.
+    NotObservableError
+        When it is in one image only, or all views of it lie along one line.
+    """
+    images = Path(images)
+    options = ValidateOptions() if options is None else options
+    views, missing = load_views(model, images)
+    search = Search(views, target, options, progress)
+    search.run(images)
+    placed = search.place()
+    if sum(len(p.chosen) for p in placed.values()) < _ENOUGH_VIEWS and target.kind == "checkerboard":
+        seen = {s.view for s in search.sightings}
+        search.look_closer([v for v in search.searched if v not in seen][:_MOST_THOROUGH])
+        placed = search.place()
+    if not placed:
+        raise why_not_placed(search, images)
+    used = {search.parts[p][i].view for p, part in placed.items() for i in part.chosen}
+    outside = [v for v in sorted({s.view for s in search.sightings}) if v not in used]
+    if outside and target.kind == "checkerboard":  # perhaps the detector took another board there
+        search.look_closer(outside)
+        placed = search.place()
+    _require_agreement(search, placed)
+    return _measure(search, placed, missing, _diagonal(model))
+
+
+def _require_agreement(search: Search, placed: dict[int, PartPlacement]) -> None:
+    """Refuse a place on which a few of many sightings agree: chance does that, a wrong board size above all.
+
+    Raises
+    ------
+    TargetNotFoundError
+    """
+    used = {search.parts[p][i].view for p, part in placed.items() for i in part.chosen}
+    seen = {s.view for s in search.sightings}
+    if len(used) < _SMALLEST_AGREEMENT * len(seen):
+        raise TargetNotFoundError(
+            f"something like {search.target.spec} was found in {len(seen)} images, but only {len(used)} of them agree "
+            "on where it is in the model: check the number of columns and rows (inner corners of a checkerboard), and "
+            "that the target did not move"
+        )
+
+
+def _reject_outliers(search: Search, placed: dict[int, PartPlacement]) -> tuple[dict[int, PartPlacement], list[str]]:
+    """Single markers whose size differs from the others' by more than 5 % are not what the description says."""
+    logs = {p: part.placement.log_scale for p, part in placed.items()}
+    order = sorted(logs, key=lambda p: logs[p])
+    running = np.cumsum([len(placed[p].chosen) for p in order])
+    middle = logs[order[int(np.searchsorted(running, 0.5 * running[-1]))]]
+    outlying = [p for p in placed if abs(logs[p] - middle) > _OUTLYING_PART]
+    reasons = [
+        f"{search.target.part_name(p)} is left out: {100 * (np.exp(logs[p] - middle) - 1):+.1f} % against the others; "
+        "does it have another size?"
+        for p in outlying
+    ]
+    return {p: part for p, part in placed.items() if p not in outlying}, reasons
+
+
+def _diagonal(model: Path | pycolmap.Reconstruction) -> float | None:
+    found = read_model(model) if isinstance(model, Path) else model
+    return model_diagonal(np.array([point.xyz for point in found.points3D.values()]).reshape(-1, 3))
+
+
+def _measure(
+    search: Search, placed: dict[int, PartPlacement], missing: dict[str, str], diagonal: float | None
+) -> Validation:
+    target, views, options = search.target, search.views, search.options
+    placed, reasons = _reject_outliers(search, placed)
+    index = {p: i for i, p in enumerate(sorted(placed))}
+    sightings = [(search.parts[p][i], n, index[p]) for p in index for i, n in _zip(placed[p])]
+    obs = observe(
+        [s for s, _, _ in sightings], [n for _, n, _ in sightings], [i for _, _, i in sightings], target, views
+    )
+    start = Placement(
+        log_scale=float(np.median([placed[p].placement.log_scale for p in index])),
+        rotation=np.concatenate([placed[p].placement.rotation for p in index]),
+        centre=np.concatenate([placed[p].placement.centre for p in index]),
+    )
+    everything = obs
+    obs, fit, dropped = fit_without_outliers(obs, start)
+    half = fit.half_width_log()
+    of_target = 0.0 if target.sigma_m is None else Z95 * target.sigma_m / target.length_m
+    if not half < _WIDEST_LOG:
+        raise NotObservableError(
+            "scale",
+            f"{len(np.unique(obs.view))} views of the target lie too close together or agree too badly; "
+            "more views from different sides are needed",
+            sigma=min(fit.sigma_log, 9.99),
+        )
+    if of_target:
+        half = float(np.hypot(half, of_target))
+    log_scale = fit.placement.log_scale
+    error, ci = _per_cent(log_scale), (_per_cent(log_scale - half), _per_cent(log_scale + half))
+    seen = np.zeros(len(target.part), dtype=bool)
+    seen[obs.corner] = True
+    control_corner = target.control(seen)
+    control_fit = _fit_set(obs, fit, control_corner[obs.corner])
+    check_fit = _fit_set(obs, fit, ~control_corner[obs.corner])
+    check_error, check_ci = None, None
+    if control_fit is not None and check_fit is not None:
+        difference = check_fit[0].placement.log_scale - control_fit[0].placement.log_scale
+        # the two share the poses' errors, which this counts twice
+        both = float(np.hypot(check_fit[0].half_width_log(), control_fit[0].half_width_log()))
+        check_error, check_ci = _per_cent(difference), (_per_cent(difference - both), _per_cent(difference + both))
+    else:
+        reasons.append("too few corners to keep a control and a check set apart")
+    control, check = _set_scale(control_fit, of_target), _set_scale(check_fit, of_target)
+    to_metres = 1.0
+    if options.unscaled:
+        to_metres = float(np.exp(-log_scale)) if control is None else control.metres_per_unit
+    rejected = _rejected_views(search, placed, obs, dropped, missing)
+    view_results = _view_results(search, sightings, obs, fit, everything)
+    pose_px = fit.residual_px - fit.corner_residual_px
+    position = _positions(target, obs, fit)
+    distances = _distances(target, position, control_corner, to_metres)
+    corners = tuple(
+        Corner(name=target.label(i), in_model=position[i] + views[0].origin_in_model)
+        for i in np.flatnonzero(np.isfinite(position[:, 0])).tolist()
+    )
+    return Validation(
+        target=target,
+        unscaled=options.unscaled,
+        tolerance_pct=options.tolerance_pct,
+        scale_error_pct=None if options.unscaled else error,
+        ci95_pct=None if options.unscaled else ci,
+        metres_per_unit=float(np.exp(-log_scale)),
+        metres_per_unit_ci95=(float(np.exp(-log_scale - half)), float(np.exp(-log_scale + half))),
+        views_used=len(view_results),
+        views_searched=len(search.searched),
+        corners_used=len(obs),
+        corners_rejected=sum(len(v.rejected_px) for v in view_results),
+        rms_px=_rms(fit.residual_px),
+        corner_noise_px=fit.noise.corner_px,
+        pose_noise_px=_rms(pose_px),
+        distances=distances,
+        corners=corners,
+        views=view_results,
+        views_rejected=rejected,
+        control=control,
+        check=check,
+        check_error_pct=check_error,
+        check_ci95_pct=check_ci,
+        reasons=tuple(reasons + _remarks(search, obs, fit, view_results)),
+        lengths=check_lengths(distances, corners, diagonal, to_metres),
+    )
+
+
+def _zip(part: PartPlacement) -> list[tuple[int, int]]:
+    return list(zip(part.chosen, part.numbering, strict=True))
+
+
+def _per_cent(log: float) -> float:
+    return 100 * float(np.expm1(log))
+
+
+def _rms(vectors: Array) -> float:
+    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
+
+
+def fit_without_outliers(obs: Observations, start: Placement) -> tuple[Observations, ScaleFit, dict[int, str]]:
+    """Fit, leave out views and corners that do not belong, and fit again until none is left."""
+    dropped: dict[int, str] = {}
+    while True:
+        fit = fit_scale(obs, start)
+        start = fit.placement
+        keep = np.ones(len(obs), dtype=bool)
+        noise = np.abs(fit.corner_residual_px)
+        typical = 1.4826 * float(np.median(noise))
+        rms = {}
+        for v in np.unique(obs.view):
+            mine = obs.view == v
+            rms[int(v)] = float(np.sqrt(np.mean(np.sum(fit.residual_px[mine] ** 2, axis=1))))
+            sigma = max(typical, 1.4826 * float(np.median(noise[mine])), 1e-6)
+            keep[mine] = np.linalg.norm(fit.corner_residual_px[mine], axis=1) < _OUTLIER_SIGMA * sigma
+            if keep[mine].sum() < _LEAST_CORNERS:
+                keep[mine] = False
+                dropped[int(v)] = "fewer than four of its corners agree with the other views"
+        if keep.all():  # corners first: a few wrong ones can make a good view look bad
+            limit = _OUTLIER_VIEW * float(np.median(list(rms.values())))
+            for v, value in rms.items():
+                if value > limit and len(rms) > 2:
+                    keep[obs.view == v] = False
+                    dropped[v] = "its corners are more than four times as far off as those of the other views"
+        if keep.all():
+            return obs, fit, dropped
+        obs = obs.select(keep)
+        if len(np.unique(obs.view)) < 2:
+            raise TargetNotFoundError("the views of the target do not agree with each other in the model")
+        obs, start = _compact(obs, start)
+
+
+def _compact(obs: Observations, at: Placement) -> tuple[Observations, Placement]:
+    """Renumber the parts that are left from 0 without gaps."""
+    parts, part = np.unique(obs.part, return_inverse=True)
+    if len(parts) == len(at.rotation):
+        return obs, at
+    return replace(obs, part=part), replace(at, rotation=at.rotation[parts], centre=at.centre[parts])
+
+
+def _fit_set(obs: Observations, fit: ScaleFit, pick: NDArray[np.bool_]) -> tuple[ScaleFit, int] | None:
+    """The scale from some of the corners, weighed as all of them were; ``None`` when they cannot give one."""
+    part, start = _compact(obs.select(pick), fit.placement)
+    views, count = np.unique(part.view, return_counts=True)
+    good = np.isin(part.view, views[count >= 2])
+    part, start = _compact(part.select(good), start)
+    if len(np.unique(part.view)) < 2 or len(np.unique(part.corner)) < 2:
+        return None
+    try:
+        out = fit_scale(part, start, noise=fit.noise)
+    except NotObservableError:
+        return None
+    return (out, len(part)) if out.half_width_log() < _WIDEST_LOG else None
+
+
+def _set_scale(of: tuple[ScaleFit, int] | None, of_target: float) -> SetScale | None:
+    if of is None:
+        return None
+    fit, corners = of
+    log, half = fit.placement.log_scale, fit.half_width_log()
+    half = float(np.hypot(half, of_target)) if of_target else half
+    return SetScale(
+        metres_per_unit=float(np.exp(-log)),
+        ci95=(float(np.exp(-log - half)), float(np.exp(-log + half))),
+        corners=corners,
+    )
+
+
+def _positions(target: Target, obs: Observations, fit: ScaleFit) -> Array:
+    """(N, 3) each corner triangulated on its own; not a number where its views do not determine it."""
+    corner, in_world, determined = triangulate(obs, fit.placement)
+    position = np.full((len(target.part), 3), np.nan)
+    position[corner[determined]] = in_world[determined]
+    return position
+
+
+def _distances(target: Target, position: Array, control: NDArray[np.bool_], to_metres: float) -> tuple[Distance, ...]:
+    out = []
+    for a, b in target.pairs(np.isfinite(position[:, 0])).tolist():
+        known = float(np.linalg.norm(target.corners_m[a] - target.corners_m[b]))
+        measured = float(np.linalg.norm(position[a] - position[b]))
+        belongs: DistanceSet = "mixed"
+        if control[a] == control[b]:
+            belongs = "control" if control[a] else "check"
+        out.append(
+            Distance(
+                pair=(target.label(a), target.label(b)),
+                known_m=known,
+                measured=measured,
+                residual_m=measured * to_metres - known,
+                set=belongs,
+            )
+        )
+    return tuple(out)
+
+
+def _view_results(
+    search: Search,
+    sightings: list[tuple[Sighting, int, int]],
+    obs: Observations,
+    fit: ScaleFit,
+    everything: Observations,
+) -> tuple[ViewResiduals, ...]:
+    """Residuals of each view that was used, with the pixel coordinates of its corners."""
+    out = []
+    for v in np.unique(obs.view):
+        mine = obs.view == v
+        residual = fit.residual_px[mine]
+        seen: dict[int, Array] = {}
+        for s, numbering, _ in sightings:
+            if s.view == v:
+                seen.update(zip(search.target.relabelings[numbering][s.corner].tolist(), s.xy_px, strict=True))
+        observed = np.array([seen[c] for c in obs.corner[mine].tolist()])
+        left = [seen[c] for c in everything.corner[everything.view == v].tolist() if c not in obs.corner[mine]]
+        out.append(
+            ViewResiduals(
+                name=search.views[int(v)].name,
+                corner=obs.corner[mine],
+                observed_px=observed,
+                projected_px=observed - residual,
+                rejected_px=np.array(left).reshape(-1, 2),
+                rms_px=_rms(residual),
+            )
+        )
+    return tuple(out)
+
+
+def _rejected_views(
+    search: Search,
+    placed: dict[int, PartPlacement],
+    obs: Observations,
+    dropped: dict[int, str],
+    missing: dict[str, str],
+) -> tuple[RejectedView, ...]:
+    used = set(obs.view.tolist())
+    reason = dict(missing)
+    residual_px: dict[str, float | None] = {}
+    for v in search.searched:
+        if v in used:
+            continue
+        name = search.views[v].name
+        mine = [s for s in search.sightings if s.view == v]
+        if v in search.unreadable:
+            reason[name] = search.unreadable[v]
+        elif v in dropped:
+            reason[name] = dropped[v]
+        elif not mine:
+            reason[name] = _NOT_FOUND
+        else:
+            off = [
+                median_residual_px(s, placed[s.part].placement, search.target, search.views)
+                for s in mine
+                if s.part in placed
+            ]
+            reason[name] = _DISAGREES if off else "shows only markers that no other view confirms"
+            residual_px[name] = min(off, default=None)
+    return tuple(
+        RejectedView(name=name, reason=reason[name], residual_px=residual_px.get(name)) for name in sorted(reason)
+    )
+
+
+def _remarks(search: Search, obs: Observations, fit: ScaleFit, views: tuple[ViewResiduals, ...]) -> list[str]:
+    out = []
+    if len(views) < 5:
+        out.append(f"only {len(views)} views: the interval is wide because errors of the poses are hard to judge")
+    copies = Counter((s.view, s.part) for s in search.sightings)
+    several = len({view for (view, _), count in copies.items() if count > 1})
+    if several:
+        out.append(f"{several} images show more than one such target; the one that most views agree on was measured")
+    if fit.noise.pose_ratio.any():
+        shared = _rms(fit.residual_px - fit.corner_residual_px)
+        out.append(f"errors of the model's poses move the target by {shared:.2f} px; the interval allows for them")
+    sigma_m, length_m = search.target.sigma_m, search.target.length_m
+    if sigma_m is None:
+        out.append(
+            "the interval does not hold errors of the target itself: measure the print, and say how well you know it "
+            "(+- in the description)"
+        )
+    else:
+        out.append(f"the interval holds that the target is known to {100 * sigma_m / length_m:.2g} %")
+    if len(search.searched) < len(search.views):
+        out.append(f"{len(search.views) - len(search.searched)} images were not searched: enough views were found")
+    return out

@@ -1,0 +1,391 @@
+"""What a validation found, as values, JSON and a table."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, fields, is_dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.checks.validate.lengths import LengthCheck
+from colmap_inertial.checks.validate.targets import Target
+from colmap_inertial.core.types import Array
+
+if TYPE_CHECKING:
+    from rich.console import Group
+
+DistanceSet = Literal["control", "check", "mixed"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Distance:
+    """A known distance, measured in the model.
+
+    Attributes
+    ----------
+    pair
+        Names of the two corners.
+    known_m
+        What the target's description says.
+    measured
+        Between the two corners, each triangulated on its own; model units.
+    residual_m
+        Measured minus known. Of a model without a unit, after scaling it by the control distances.
+    set
+        ``control`` or ``check`` where both corners belong to that set, else ``mixed``.
+    """
+
+    pair: tuple[str, str]
+    known_m: float
+    measured: float
+    residual_m: float
+    set: DistanceSet
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Corner:
+    """A corner of the target, triangulated on its own.
+
+    Attributes
+    ----------
+    name
+        As in :class:`Distance`.
+    in_model
+        (3,) its position; model units.
+    """
+
+    name: str
+    in_model: Array
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ViewResiduals:
+    """The target in one image.
+
+    Attributes
+    ----------
+    name
+        The image's name in the model.
+    corner
+        (n,) numbers of the corners that were used.
+    observed_px, projected_px
+        (n, 2) where they were seen and where the model's camera sees the fitted target; COLMAP's pixel coordinates.
+    rejected_px
+        (m, 2) corners that were seen and not used.
+    rms_px
+        Root mean square distance between the two.
+    """
+
+    name: str
+    corner: NDArray[np.intp]
+    observed_px: Array
+    projected_px: Array
+    rejected_px: Array
+    rms_px: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class RejectedView:
+    """An image that was looked at and not used.
+
+    Attributes
+    ----------
+    name, reason
+        Which, and why.
+    residual_px
+        Median distance of its corners from where they should be; ``None`` where none were found.
+    """
+
+    name: str
+    reason: str
+    residual_px: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class SetScale:
+    """The scale from one of the two disjoint sets of corners.
+
+    Attributes
+    ----------
+    metres_per_unit, ci95
+        Known length divided by the length in the model, and its 95 % interval.
+    corners
+        Number of corner observations.
+    """
+
+    metres_per_unit: float
+    ci95: tuple[float, float]
+    corners: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScaleBar:
+    """A known distance between the centres of two markers.
+
+    Attributes
+    ----------
+    markers
+        Their numbers.
+    known_m, sigma_m
+        The length, and how well it is known (standard deviation), where that was said.
+    measured
+        In the model; model units.
+    residual_m
+        Measured minus known, as of :class:`Distance`.
+    """
+
+    markers: tuple[int, int]
+    known_m: float
+    sigma_m: float | None
+    measured: float
+    residual_m: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class TargetDistance:
+    """A known distance between the middles of two targets in one scene.
+
+    Attributes
+    ----------
+    other
+        The second target's specification.
+    known_m, sigma_m, measured, residual_m
+        As of :class:`ScaleBar`.
+    """
+
+    other: str
+    known_m: float
+    sigma_m: float | None
+    measured: float
+    residual_m: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CheckPoint:
+    """A marker whose coordinates are known: its number, and (3,) model minus known, along the known axes."""
+
+    marker: int
+    residual_m: Array
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CheckPoints:
+    """Markers with known coordinates, onto which the model was moved and turned.
+
+    Attributes
+    ----------
+    points
+        Each of them.
+    rmse_m
+        (3,) root mean square error along each axis.
+    rmse_horizontal_m, rmse_vertical_m
+        Over x and y, and along z, with the points' own accuracy in it where it is known (ASPRS 2023).
+    sigma_m
+        The points' own accuracy: standard deviation of a coordinate.
+    """
+
+    points: tuple[CheckPoint, ...]
+    rmse_m: Array
+    rmse_horizontal_m: float
+    rmse_vertical_m: float
+    sigma_m: float | None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Validation:
+    """Size of a reconstruction against a target of known size.
+
+    Attributes
+    ----------
+    target
+        The target.
+    unscaled
+        Whether the model claims no unit.
+    tolerance_pct
+        The largest ``scale_error_pct`` that passes.
+    scale_error_pct, ci95_pct
+        100 (length in the model / known length - 1), and its 95 % interval; ``None`` for a model without a unit.
+    metres_per_unit, metres_per_unit_ci95
+        Known length divided by the length in the model. For a model without a unit, the factor that makes it metric.
+    views_used, views_searched
+        Number of images that the result rests on, and that were looked at.
+    corners_used, corners_rejected
+        Number of corner observations that the result rests on, and of those left out within these images.
+    rms_px
+        Root mean square distance of corners from the fitted target, with the model's own poses.
+    corner_noise_px
+        The part of it that is independent from corner to corner: standard deviation of one coordinate.
+    pose_noise_px
+        The part that all corners of a view share: root mean square movement of corners by each view's pose error.
+    distances
+        Known distances, measured.
+    corners
+        The ends of these distances.
+    views
+        Residuals by view.
+    views_rejected
+        Images that were looked at and not used.
+    control, check
+        The scale from two disjoint sets of corners: ``control`` to scale a model by, ``check`` to judge the result.
+        ``None`` where a set is too small.
+    check_error_pct, check_ci95_pct
+        Scale error that the check corners show after scaling by the control corners.
+    reasons
+        What limits the result, in words.
+    lengths
+        Errors of the known distances, how long they are and what they prove.
+    bars, check_points, apart
+        Distances between markers, coordinates of markers and the distance to another target, where those were given.
+    """
+
+    target: Target
+    unscaled: bool
+    tolerance_pct: float
+    scale_error_pct: float | None
+    ci95_pct: tuple[float, float] | None
+    metres_per_unit: float
+    metres_per_unit_ci95: tuple[float, float]
+    views_used: int
+    views_searched: int
+    corners_used: int
+    corners_rejected: int
+    rms_px: float
+    corner_noise_px: float
+    pose_noise_px: float
+    control: SetScale | None
+    check: SetScale | None
+    check_error_pct: float | None
+    check_ci95_pct: tuple[float, float] | None
+    distances: tuple[Distance, ...]
+    corners: tuple[Corner, ...]
+    views: tuple[ViewResiduals, ...]
+    views_rejected: tuple[RejectedView, ...]
+    reasons: tuple[str, ...]
+    lengths: LengthCheck | None = None
+    bars: tuple[ScaleBar, ...] = ()
+    check_points: CheckPoints | None = None
+    apart: TargetDistance | None = None
+
+    @property
+    def within_tolerance(self) -> bool:
+        """Whether the scale error is at most the tolerance; a model without a unit always passes."""
+        return self.scale_error_pct is None or abs(self.scale_error_pct) <= self.tolerance_pct
+
+    def as_json(self) -> dict[str, Any]:
+        """Everything but pixel coordinates, ready for ``json.dump``."""
+
+        kept = {field.name: getattr(self, field.name) for field in fields(self)}
+        kept["target"] = self.target.spec
+        kept["views"] = [{"name": v.name, "corners": len(v.corner), "rms_px": v.rms_px} for v in self.views]
+        found: dict[str, Any] = {}
+        for name, value in kept.items():
+            found[name] = _plain(value)
+            if name == "tolerance_pct":
+                found["within_tolerance"] = self.within_tolerance
+        return found
+
+
+def _plain(value: Any) -> Any:
+    """JSON's types: tuples become lists, arrays their numbers, and values of ours objects."""
+    if is_dataclass(value):
+        return {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return [_plain(one) for one in value] if isinstance(value, (tuple, list)) else value
+
+
+def validation_table(result: Validation) -> Group:
+    """The result for a terminal: figures, distances by length, views left out by reason, remarks."""
+    from rich.console import Group
+    from rich.table import Table
+    from rich.text import Text
+
+    figures = Table(title=f"Size against {result.target.spec}", show_header=False, title_justify="left")
+    figures.add_column(justify="right")
+    figures.add_column()
+    if result.scale_error_pct is not None and result.ci95_pct is not None:
+        passed = result.within_tolerance
+        verdict = f"within {result.tolerance_pct:g} %" if passed else f"outside {result.tolerance_pct:g} %"
+        figures.add_row(
+            "scale error",
+            Text.assemble(
+                (f"{result.scale_error_pct:+.3f} %", "bold green" if passed else "bold red"),
+                f"  (95 %: {result.ci95_pct[0]:+.3f} to {result.ci95_pct[1]:+.3f}), {verdict}",
+            ),
+        )
+    low, high = result.metres_per_unit_ci95
+    figures.add_row("metres per unit", f"{result.metres_per_unit:.6g}  (95 %: {low:.6g} to {high:.6g})")
+    if result.unscaled and result.check_error_pct is not None and result.check_ci95_pct is not None:
+        low, high = result.check_ci95_pct
+        figures.add_row("control against check", f"{result.check_error_pct:+.3f} %  (95 %: {low:+.3f} to {high:+.3f})")
+    if result.lengths is not None:
+        lengths = result.lengths
+        figures.add_row(
+            "length errors",
+            f"rms {1000 * lengths.rms_m:.3g} mm, largest {1000 * lengths.largest_m:+.3g} mm of {lengths.count}",
+        )
+        share = (
+            "" if lengths.longest_share is None else f", {100 * lengths.longest_share:.2g} % of the model's diagonal"
+        )
+        figures.add_row("longest length", f"{lengths.longest_m:.3g} m{share}; {lengths.directions} directions")
+    figures.add_row("images", f"{result.views_used} used of {result.views_searched} searched")
+    figures.add_row("corner observations", f"{result.corners_used} used, {result.corners_rejected} rejected")
+    figures.add_row(
+        "residuals",
+        f"{result.rms_px:.3f} px rms; corner noise {result.corner_noise_px:.3f} px per coordinate, "
+        f"pose errors {result.pose_noise_px:.3f} px",
+    )
+    for bar in result.bars:
+        figures.add_row(
+            f"bar {bar.markers[0]} to {bar.markers[1]}",
+            f"{bar.known_m:.6g} m, off by {1000 * bar.residual_m:+.3g} mm",
+        )
+    if result.apart is not None:
+        apart = result.apart
+        figures.add_row(f"to {apart.other}", f"{apart.known_m:.6g} m, off by {1000 * apart.residual_m:+.3g} mm")
+    if result.check_points is not None:
+        points = result.check_points
+        figures.add_row(
+            f"{len(points.points)} check points",
+            f"RMSE {1000 * points.rmse_horizontal_m:.3g} mm level, {1000 * points.rmse_vertical_m:.3g} mm upwards",
+        )
+    parts: list[Table | Text] = [figures]
+    if result.distances:
+        parts.append(_distance_table(result))
+    if result.views_rejected:
+        rejected = Table(title="Images not used", title_justify="left")
+        rejected.add_column("images", justify="right")
+        rejected.add_column("reason")
+        for reason, count in Counter(view.reason for view in result.views_rejected).most_common():
+            rejected.add_row(str(count), reason)
+        parts.append(rejected)
+    said = (
+        result.reasons
+        if result.lengths is None
+        else (f"the check proves that {result.lengths.proves}", *result.reasons)
+    )
+    parts += [Text(f"- {reason}") for reason in said]
+    return Group(*parts)
+
+
+def _distance_table(result: Validation) -> Any:
+    from rich.table import Table
+
+    table = Table(title="Known distances, each corner triangulated on its own", title_justify="left")
+    for name in ("known, mm", "count", "mean residual, mm", "rms, mm", "largest, mm"):
+        table.add_column(name, justify="right")
+    by_length: dict[int, list[float]] = {}
+    for distance in result.distances:
+        by_length.setdefault(round(distance.known_m * 1e5), []).append(1000 * distance.residual_m)
+    for length, residuals in sorted(by_length.items()):
+        values = np.array(residuals)
+        table.add_row(
+            f"{length / 100:.2f}",
+            str(len(values)),
+            f"{values.mean():+.3f}",
+            f"{np.sqrt(np.mean(values**2)):.3f}",
+            f"{values[np.argmax(np.abs(values))]:+.3f}",
+        )
+    return table

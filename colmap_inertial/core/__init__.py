@@ -1,0 +1,1 @@
+"""Values, geometry, errors, options: what everything stands on."""

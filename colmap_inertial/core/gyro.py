@@ -1,0 +1,164 @@
+"""The gyroscope integrated to orientations that can be read at any instant, and brought to the camera's rate."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.core.geometry import (
+    cross,
+    matrix_from_quat,
+    quat_conjugate,
+    quat_cumulative,
+    quat_exp,
+    quat_log,
+    quat_multiply,
+)
+from colmap_inertial.core.sampling import Coverage
+from colmap_inertial.core.types import Array, CameraImuCalibration, ImuRecording
+
+#: Order of the differences by which noise is told from motion; what the median of a normal distribution's sizes is.
+_DIFFERENCES, _NORMAL_MEDIAN = 5, 0.6745
+
+
+class GyroPath:
+    """Orientation of the IMU along a recording, against its orientation at the first sample.
+
+    This is how the package integrates a gyroscope. Between samples the rate is linear; the rotation follows from
+    Magnus' series up to its second term (without which coning motion looks like a bias): the error of the integration
+    itself is of the fourth order in the step between samples, that of interpolating a rate linearly of the second.
+    ``scale._preintegration`` does the same, compiled, on a finer interpolation, with its derivatives; only
+    ``scale._grouping``, over a sixteenth of a second, and ``io.consistency``, which looks for degrees, make do with
+    the midpoint rule of order two.
+
+    Parameters
+    ----------
+    t_s
+        (N,) stamps.
+    rate_rad_s
+        (N, 3) readings, IMU frame.
+    bias_rad_s
+        (3,) subtracted from the readings.
+    """
+
+    def __init__(self, t_s: Array, rate_rad_s: Array, bias_rad_s: Array) -> None:
+        self.t_s = t_s
+        self.rate_rad_s = rate_rad_s - bias_rad_s
+        self._step_s = np.diff(t_s)
+        self.start_from_imu_xyzw = quat_cumulative(_turn(self.rate_rad_s[:-1], self.rate_rad_s[1:], self._step_s))
+        self._coverage = Coverage(t_s)
+
+    def covers(self, begin_s: Array, end_s: Array) -> NDArray[np.bool_]:
+        """Which of the intervals lie inside the recording and contain no gap."""
+        return self._coverage.covers(begin_s, end_s)
+
+    def at(self, query_s: Array) -> tuple[Array, Array]:
+        """``start_from_imu`` quaternions (M, 4) and rates (M, 3) in rad/s at ``query_s``; the ends are continued."""
+        i, since_s, rate = self._locate(query_s)
+        return quat_multiply(self.start_from_imu_xyzw[i], _turn(self.rate_rad_s[i], rate, since_s)), rate
+
+    @cached_property
+    def noise_rad_s_rthz(self) -> float:
+        """Density of white noise, at most: what each reading has of its own.
+
+        Of differences of the fifth order, which leave little of any motion that is slow against the readings.
+        """
+        if len(self.rate_rad_s) <= _DIFFERENCES:
+            return 0.0
+        own = np.abs(np.diff(self.rate_rad_s, n=_DIFFERENCES, axis=0))
+        of_each = float(np.median(own)) / (_NORMAL_MEDIAN * np.sqrt(math.comb(2 * _DIFFERENCES, _DIFFERENCES)))
+        return float(of_each * np.sqrt(np.median(self._step_s)))
+
+    def turn_rad(self, begin_s: Array, end_s: Array) -> Array:
+        """(M, 3) rotation vectors ``begin_from_end`` of intervals, IMU frame."""
+        return quat_log(quat_multiply(quat_conjugate(self.at(begin_s)[0]), self.at(end_s)[0]))
+
+    def bias_lever(self, query_s: Array) -> Array:
+        """(M, 3, 3) integrals of ``start_from_imu`` from the first sample to ``query_s``, in seconds.
+
+        A change ``db`` of the bias turns the interval from i to j, seen in the IMU frame at j, by
+        ``-R_j' (A_j - A_i) db`` with A these integrals.
+        """
+        i, since_s, _ = self._locate(query_s)
+        here = matrix_from_quat(self.at(query_s)[0])
+        return np.asarray(self._levers[i] + 0.5 * (self._rotation[i] + here) * since_s[:, None, None])
+
+    def gain_lever(self, query_s: Array) -> Array:
+        """(M, 3, 6) integrals of ``start_from_imu S rate`` for symmetric ``S`` with a one in xx, yy, zz, yz, xz, xy.
+
+        A gain error S (the true rate is ``(I + S) rate``) turns the interval from i to j by ``R_j' (G_j - G_i) S``.
+        """
+        i, since_s, rate = self._locate(query_s)
+        here = matrix_from_quat(self.at(query_s)[0]) @ _by_symmetric(rate)
+        before = self._rotation[i] @ _by_symmetric(self.rate_rad_s[i])
+        return np.asarray(self._gain_levers[i] + 0.5 * (before + here) * since_s[:, None, None])
+
+    @cached_property
+    def _rotation(self) -> Array:
+        return matrix_from_quat(self.start_from_imu_xyzw)
+
+    @cached_property
+    def _levers(self) -> Array:
+        return self._integral(self._rotation)
+
+    @cached_property
+    def _gain_levers(self) -> Array:
+        return self._integral(self._rotation @ _by_symmetric(self.rate_rad_s))
+
+    def _integral(self, values: Array) -> Array:
+        steps = 0.5 * (values[1:] + values[:-1]) * self._step_s[:, None, None]
+        return np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(steps, axis=0)])
+
+    def _locate(self, query_s: Array) -> tuple[NDArray[np.intp], Array, Array]:
+        i = np.clip(np.searchsorted(self.t_s, query_s, side="right") - 1, 0, len(self.t_s) - 2)
+        since_s = query_s - self.t_s[i]
+        # outside the recording the rate stays at the end's instead of running away
+        fraction = np.clip(since_s / self._step_s[i], 0.0, 1.0)[:, None]
+        return i, since_s, self.rate_rad_s[i] + fraction * (self.rate_rad_s[i + 1] - self.rate_rad_s[i])
+
+
+def _turn(rate_before: Array, rate_after: Array, step_s: Array) -> Array:
+    """Rotations (K, 4) over steps in which the rate goes linearly from one value to the other (Magnus, two terms)."""
+    step = step_s[:, None]
+    return quat_exp(0.5 * step * (rate_before + rate_after) + step**2 / 12 * cross(rate_before, rate_after))
+
+
+def _by_symmetric(rate: Array) -> Array:
+    """(K, 3, 6) derivatives of ``S rate`` by the entries xx, yy, zz, yz, xz, xy of a symmetric matrix S."""
+    out = np.zeros((len(rate), 3, 6))
+    for axis in range(3):
+        out[:, axis, axis] = rate[:, axis]
+    for entry, (i, j) in enumerate(((1, 2), (0, 2), (0, 1)), start=3):
+        out[:, i, entry], out[:, j, entry] = rate[:, j], rate[:, i]
+    return out
+
+
+def on_camera_rate(imu: ImuRecording, calibration: CameraImuCalibration, *, camera_epoch_ns: int) -> ImuRecording:
+    """A recording with stamps that keep step with the camera: the calibration's time offsets then hold throughout.
+
+    Parameters
+    ----------
+    imu
+        The recording as it was read. One whose clock keeps step is returned as it is.
+    calibration
+        Its clock rate, and when its offsets hold.
+    camera_epoch_ns
+        Epoch of the frame times that ``calibration.clock_middle_s`` is counted from.
+    """
+    rate = calibration.clock_rate
+    if rate == 0:
+        return imu
+    offset_s = calibration.gyro_time_offset_s + (imu.epoch_ns - camera_epoch_ns) * 1e-9
+    fixed_s = calibration.clock_middle_s - offset_s
+
+    def stretched(t_s: Array) -> Array:
+        return np.asarray(fixed_s + (t_s - fixed_s) / (1 - rate))
+
+    note = f"the IMU's clock is {1e6 * rate:+.0f} ppm off the camera's: its stamps were stretched to keep step"
+    return replace(
+        imu, gyro_t_s=stretched(imu.gyro_t_s), accel_t_s=stretched(imu.accel_t_s), repairs=(*imu.repairs, note)
+    )

@@ -1,0 +1,88 @@
+"""The values that move through the package: frozen, checked when built, numpy only.
+
+Conventions. Times are seconds on the clock that the name says, counted from the value's ``epoch_ns`` (so that
+nanosecond stamps of the size 1e18 keep their precision). Transforms are ``target_from_source``, quaternions xyzw.
+IMU frame: whatever the reader delivers, right-handed, the same for gyroscope and accelerometer. Accelerations are
+specific force: at rest the accelerometer reads +9.8 m/s2 away from the ground.
+"""
+
+from __future__ import annotations
+
+from colmap_inertial.core.types._checks import Array
+from colmap_inertial.core.types.apertures import Aperture, ApertureRig, SpectralRole
+from colmap_inertial.core.types.estimated import (
+    CAL,
+    CALIBRATION_PARAMETERS,
+    DOWN_IN_WORLD,
+    UNDOES,
+    AcceptedScale,
+    CameraImuCalibration,
+    ScaleDrift,
+    ScaleEstimate,
+    Similarity,
+    SmoothedTrajectory,
+    Verdict,
+)
+from colmap_inertial.core.types.imu_calibration import IMU_CAL, IMU_CALIBRATION_PARAMETERS, ImuCalibration
+from colmap_inertial.core.types.joined import Gap, JoinedPart
+from colmap_inertial.core.types.motion import CameraMotion, SolvedMotion
+from colmap_inertial.core.types.positions import HeightDatum, PositionFixes
+from colmap_inertial.core.types.recorded import (
+    JOINT_GYRO_WALK_RAD_S_RTS,
+    TYPICAL_NOISE,
+    CameraModel,
+    CameraTrajectory,
+    Frame,
+    FrameLog,
+    FrameTiming,
+    ImuNoise,
+    ImuRecording,
+    Keypoints,
+    LengthUnit,
+    Projector,
+    ReadoutDirection,
+    Treatment,
+    clock_shift_s,
+)
+
+__all__ = [
+    "CAL",
+    "CALIBRATION_PARAMETERS",
+    "DOWN_IN_WORLD",
+    "UNDOES",
+    "IMU_CAL",
+    "IMU_CALIBRATION_PARAMETERS",
+    "JOINT_GYRO_WALK_RAD_S_RTS",
+    "TYPICAL_NOISE",
+    "AcceptedScale",
+    "Aperture",
+    "ApertureRig",
+    "Array",
+    "CameraImuCalibration",
+    "CameraModel",
+    "CameraMotion",
+    "CameraTrajectory",
+    "Frame",
+    "FrameLog",
+    "FrameTiming",
+    "Gap",
+    "HeightDatum",
+    "ImuCalibration",
+    "ImuNoise",
+    "ImuRecording",
+    "JoinedPart",
+    "Keypoints",
+    "LengthUnit",
+    "PositionFixes",
+    "Projector",
+    "ReadoutDirection",
+    "ScaleDrift",
+    "ScaleEstimate",
+    "Similarity",
+    "SmoothedTrajectory",
+    "SolvedMotion",
+    "SpectralRole",
+    "Treatment",
+    "Verdict",
+    "clock_shift_s",
+]

@@ -1,0 +1,432 @@
+"""What is estimated, each with its covariance: calibration, smoothed trajectory, scale, similarity."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.geometry import matrix_from_quat, rotation_between, skew
+from colmap_inertial.core.options import WorldAxes
+from colmap_inertial.core.types._checks import (
+    Array,
+    checked_array,
+    checked_covariance,
+    checked_quaternions,
+    checked_times,
+    set_fields,
+)
+from colmap_inertial.core.types.imu_calibration import ImuCalibration
+from colmap_inertial.core.types.recorded import ImuNoise, LengthUnit
+
+Verdict = Literal["trusted", "weak", "refused"]
+
+#: The direction of gravity in a metric world with these axes: ``y-down`` is COLMAP's and computer vision's habit.
+DOWN_IN_WORLD = {"z-up": np.array([0.0, 0.0, -1.0]), "y-down": np.array([0.0, 1.0, 0.0])}
+
+#: What the provenance of a similarity begins with that takes another one back.
+UNDOES = "undoes: "
+
+#: Order of the parameters in ``CameraImuCalibration.cov``. The rotation error is in the camera frame, on the left:
+#: true = exp(error) * estimate.
+CALIBRATION_PARAMETERS = (
+    *("rotation_x_rad", "rotation_y_rad", "rotation_z_rad"),
+    *("gyro_time_offset_s", "accel_time_offset_s"),
+    *("gyro_bias_x_rad_s", "gyro_bias_y_rad_s", "gyro_bias_z_rad_s"),
+    *("imu_in_cam_x_m", "imu_in_cam_y_m", "imu_in_cam_z_m"),
+    "readout_s",
+)
+
+
+class CAL:
+    """Where they stand: indices of the numbers, slices of the vectors of ``CALIBRATION_PARAMETERS``."""
+
+    ROTATION = slice(0, 3)
+    GYRO_TIME_OFFSET, ACCEL_TIME_OFFSET = 3, 4
+    TIME_OFFSETS = slice(3, 5)
+    GYRO_BIAS = slice(5, 8)
+    LEVER_ARM = slice(8, 11)
+    READOUT = 11
+    COUNT = 12
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CameraImuCalibration:
+    """How the camera and the IMU of one device relate.
+
+    Attributes
+    ----------
+    cam_from_imu_xyzw
+        (4,) rotation.
+    gyro_time_offset_s, accel_time_offset_s
+        ``t_cam = t_stamp + offset`` between raw stamps (each clock's reading in seconds, epoch included).
+    gyro_bias_rad_s
+        (3,) IMU frame; the true rate is the reading minus this.
+    imu_in_cam_m
+        (3,) lever arm: the IMU's position in the camera frame.
+    readout_s
+        Rolling-shutter readout; 0 for a global shutter.
+    cov
+        (12, 12) in the order of ``CALIBRATION_PARAMETERS``. Wide where nothing is known.
+    clock_rate, clock_middle_s
+        Growth of the time offsets per second of the camera's clock (0 where the clocks keep step), and the camera
+        time, since the epoch of the frame times, at which the offsets hold. ``gyro.on_camera_rate`` makes of a
+        recording one for which they hold throughout.
+    """
+
+    cam_from_imu_xyzw: Array
+    gyro_time_offset_s: float
+    accel_time_offset_s: float
+    gyro_bias_rad_s: Array
+    imu_in_cam_m: Array
+    readout_s: float
+    cov: Array
+    clock_rate: float = 0.0
+    clock_middle_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        set_fields(
+            self,
+            cam_from_imu_xyzw=checked_quaternions("cam_from_imu_xyzw", self.cam_from_imu_xyzw, (4,)),
+            gyro_bias_rad_s=checked_array("gyro_bias_rad_s", self.gyro_bias_rad_s, (3,)),
+            imu_in_cam_m=checked_array("imu_in_cam_m", self.imu_in_cam_m, (3,)),
+            cov=checked_covariance("cov", self.cov, (CAL.COUNT, CAL.COUNT)),
+        )
+        if not (abs(self.clock_rate) < 1 and math.isfinite(self.clock_middle_s)):
+            raise ValueError("clock_rate must lie between -1 and 1, clock_middle_s must be finite")
+
+    def sigma(self, parameter: str) -> float:
+        """Standard deviation of one of ``CALIBRATION_PARAMETERS``."""
+        i = CALIBRATION_PARAMETERS.index(parameter)
+        return float(np.sqrt(self.cov[i, i]))
+
+    @property
+    def rotation_sigma_rad(self) -> float:
+        """Standard deviation of the rotation about the camera axis about which it is known worst."""
+        return float(np.sqrt(np.diagonal(self.cov)[CAL.ROTATION].max()))
+
+    def drift_s(self, t_cam_s: Array) -> Array:
+        """How much the time offsets have grown since ``clock_middle_s``, at camera times of any shape."""
+        return np.asarray(self.clock_rate * (t_cam_s - self.clock_middle_s))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SmoothedTrajectory:
+    """Positions, velocities and accelerations with their covariance.
+
+    Attributes
+    ----------
+    t_s
+        (T,) camera clock, seconds since ``epoch_ns``.
+    cam_in_world, velocity_in_world, accel_in_world
+        (T, 3) in ``length_unit``, per second, per second squared; without gravity.
+    cam_from_world_xyzw
+        (T, 4) rotations.
+    cov
+        (T, 9, 9) of position, velocity, acceleration.
+    """
+
+    t_s: Array
+    cam_in_world: Array
+    velocity_in_world: Array
+    accel_in_world: Array
+    cam_from_world_xyzw: Array
+    cov: Array
+    length_unit: LengthUnit = "model"
+    epoch_ns: int = 0
+
+    def __post_init__(self) -> None:
+        t_s = checked_times("t_s", self.t_s)
+        n = len(t_s)
+        set_fields(
+            self,
+            t_s=t_s,
+            cam_in_world=checked_array("cam_in_world", self.cam_in_world, (n, 3)),
+            velocity_in_world=checked_array("velocity_in_world", self.velocity_in_world, (n, 3)),
+            accel_in_world=checked_array("accel_in_world", self.accel_in_world, (n, 3)),
+            cam_from_world_xyzw=checked_quaternions("cam_from_world_xyzw", self.cam_from_world_xyzw, (n, 4)),
+            cov=checked_covariance("cov", self.cov, (n, 9, 9)),
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScaleDrift:
+    """Scales of parts of a recording against the scale of the whole, and whether they are the same.
+
+    Attributes
+    ----------
+    begin_s, end_s
+        (W,) the parts, camera clock, seconds since the trajectory's epoch.
+    log_ratio
+        (W,) logarithm of the part's scale over the whole one's.
+    sigma_log
+        (W,) its standard deviation.
+    chi2, dof, p_value
+        Test of equal scales, small differences tolerated: how probable it would be to see as much by chance.
+    trend_log_per_s, trend_sigma_log_per_s
+        Steady growth of the logarithm of the scale, and its standard deviation.
+    """
+
+    begin_s: Array
+    end_s: Array
+    log_ratio: Array
+    sigma_log: Array
+    chi2: float
+    dof: int
+    p_value: float
+    trend_log_per_s: float
+    trend_sigma_log_per_s: float
+
+    def __post_init__(self) -> None:
+        n = len(checked_times("begin_s", self.begin_s))
+        for name in ("begin_s", "end_s", "log_ratio", "sigma_log"):
+            set_fields(self, **{name: checked_array(name, getattr(self, name), (n,))})
+
+    def as_json(self, metres_per_unit: float | None) -> dict[str, object]:
+        """The fields in JSON types; scales of the parts where the whole one is given."""
+        parts = []
+        for begin_s, end_s, log_ratio, sigma in zip(
+            self.begin_s.tolist(), self.end_s.tolist(), self.log_ratio.tolist(), self.sigma_log.tolist(), strict=True
+        ):
+            # clipped: of a part that tells nothing, it may be anything
+            scale = None if metres_per_unit is None else metres_per_unit * math.exp(min(max(log_ratio, -600.0), 600.0))
+            parts.append({"begin_s": begin_s, "end_s": end_s, "metres_per_unit": scale, "sigma_log": sigma})
+        return {
+            "parts": parts,
+            "chi2": self.chi2,
+            "dof": self.dof,
+            "p_value": self.p_value,
+            "trend_log_per_s": self.trend_log_per_s,
+            "trend_sigma_log_per_s": self.trend_sigma_log_per_s,
+        }
+
+
+#: What a scale's JSON says of the calibration, in this order, and where there is none.
+_CALIBRATED: dict[str, float | None] = {
+    "gyro_bias_rad_s": None,
+    "cam_from_imu_xyzw": None,
+    "imu_in_cam_m": None,
+    "gyro_time_offset_s": None,
+    "accel_time_offset_s": None,
+    "clock_rate": 0.0,
+    "clock_middle_s": 0.0,
+    "readout_s": None,
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class AcceptedScale:
+    """The numbers of a scale that was not refused.
+
+    Attributes
+    ----------
+    metres_per_unit
+        Metres per model unit.
+    sigma_log
+        Standard deviation of its logarithm.
+    ci95
+        Its 95 % interval.
+    """
+
+    metres_per_unit: float
+    sigma_log: float
+    ci95: tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScaleEstimate:
+    """Metres per model unit, with its uncertainty and a verdict.
+
+    Attributes
+    ----------
+    metres_per_unit
+        ``None`` when refused.
+    sigma_log
+        Standard deviation of the logarithm of the scale; ``None`` when refused.
+    ci95
+        95 % interval of ``metres_per_unit``; ``None`` when refused.
+    verdict, reasons
+        What to make of it, and what decided that, in words for the user.
+    notes
+        What else the user should know: repairs, pauses, clocks; none of it decided the verdict.
+    gravity_in_world_m_s2
+        (3,) points down, in the source model's frame; ``None`` where it could not be estimated.
+    accel_bias_m_s2
+        (3,) IMU frame; the true specific force is the reading minus this.
+    calibration
+        The camera-IMU calibration that the estimate refined.
+    imu_calibration
+        The IMU's own, by which the readings were corrected; ``None`` where they are as the sensor read.
+    cov
+        (7, 7) of log scale, gravity (m/s2, world frame), accelerometer bias (m/s2).
+    chi2, dof
+        Of the fit, against the noise it assumed.
+    excitation_m_s2
+        Standard deviation of the camera's acceleration: what the scale rests on.
+    drift
+        Whether the scale stays the same along the recording; ``None`` where the method does not tell.
+    parts
+        What makes the interval as wide as it is: by cause (``scale.parts.CAUSES``), the standard deviation of the
+        logarithm that it alone would leave. Their squares add up to that of ``sigma_log``. ``None`` where the method
+        does not tell.
+    noise
+        Of the IMU, as the fit found it in the recording; ``None`` where the method does not tell.
+    method
+        ``"spectral"`` or ``"joint"``; ``"none"`` where nothing could be estimated.
+    """
+
+    metres_per_unit: float | None
+    sigma_log: float | None
+    ci95: tuple[float, float] | None
+    verdict: Verdict
+    method: str
+    reasons: tuple[str, ...] = ()
+    gravity_in_world_m_s2: Array | None = None
+    accel_bias_m_s2: Array | None = None
+    calibration: CameraImuCalibration | None = None
+    imu_calibration: ImuCalibration | None = None
+    cov: Array | None = None
+    chi2: float | None = None
+    dof: int | None = None
+    excitation_m_s2: float | None = None
+    drift: ScaleDrift | None = None
+    parts: Mapping[str, float] | None = None
+    noise: ImuNoise | None = None
+    runtime_s: float = 0.0
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        numbers = (self.metres_per_unit, self.sigma_log, self.ci95)
+        if (self.verdict == "refused") != (self.metres_per_unit is None) or len({n is None for n in numbers}) > 1:
+            raise ValueError("a refused scale has no number, and no other scale lacks one")
+        if self.verdict == "refused" and not self.reasons:
+            raise ValueError("a refusal needs a reason")
+        if self.metres_per_unit is not None and not self.metres_per_unit > 0:
+            raise ValueError("metres_per_unit must be positive")
+        for name, shape in (("gravity_in_world_m_s2", (3,)), ("accel_bias_m_s2", (3,))):
+            if getattr(self, name) is not None:
+                set_fields(self, **{name: checked_array(name, getattr(self, name), shape)})
+        if self.cov is not None:
+            set_fields(self, cov=checked_covariance("cov", self.cov, (7, 7)))
+
+    @classmethod
+    def refused(cls, method: str, *reasons: str, calibration: CameraImuCalibration | None = None) -> ScaleEstimate:
+        """No scale, for these reasons."""
+        return cls(
+            metres_per_unit=None,
+            sigma_log=None,
+            ci95=None,
+            verdict="refused",
+            method=method,
+            reasons=reasons,
+            calibration=calibration,
+        )
+
+    @property
+    def accepted(self) -> AcceptedScale:
+        """The numbers, which a scale that was not refused has.
+
+        Raises
+        ------
+        NotObservableError
+            When it was refused.
+        """
+        if self.metres_per_unit is None or self.sigma_log is None or self.ci95 is None:
+            raise NotObservableError("scale", "; ".join(self.reasons))
+        return AcceptedScale(metres_per_unit=self.metres_per_unit, sigma_log=self.sigma_log, ci95=self.ci95)
+
+    def as_json(self) -> dict[str, object]:
+        """The estimate in JSON types; ``None`` where a refusal has no number."""
+
+        def plain(value: object) -> object:
+            return value.tolist() if isinstance(value, np.ndarray) else value
+
+        return {
+            "metres_per_unit": self.metres_per_unit,
+            "ci95": None if self.ci95 is None else list(self.ci95),
+            "sigma_log": self.sigma_log,
+            "verdict": self.verdict,
+            "reasons": list(self.reasons),
+            "notes": list(self.notes),
+            "gravity_in_world_m_s2": plain(self.gravity_in_world_m_s2),
+            "accel_bias_m_s2": plain(self.accel_bias_m_s2),
+            # where camera and IMU could not be brought together, these are unknown
+            **{name: plain(getattr(self.calibration, name, unknown)) for name, unknown in _CALIBRATED.items()},
+            "imu_calibration": None if self.imu_calibration is None else self.imu_calibration.summary(),
+            "cov": plain(self.cov),
+            "chi2": self.chi2,
+            "dof": self.dof,
+            "excitation_m_s2": self.excitation_m_s2,
+            "drift": None if self.drift is None else self.drift.as_json(self.metres_per_unit),
+            "parts": None if self.parts is None else dict(self.parts),
+            "method": self.method,
+            "runtime_s": self.runtime_s,
+        }
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Similarity:
+    """``x_target = scale * R x_source + translation``.
+
+    Attributes
+    ----------
+    scale
+        Target units (metres) per source unit.
+    rotation_xyzw
+        (4,) ``target_from_source``.
+    translation_m
+        (3,).
+    cov
+        (7, 7) of log scale, rotation (rad, target frame, left), translation (m).
+    provenance
+        Where it comes from, in words.
+    """
+
+    scale: float
+    rotation_xyzw: Array
+    translation_m: Array
+    cov: Array
+    provenance: str = ""
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.scale) and self.scale > 0):
+            raise ValueError("scale must be positive")
+        set_fields(
+            self,
+            rotation_xyzw=checked_quaternions("rotation_xyzw", self.rotation_xyzw, (4,)),
+            translation_m=checked_array("translation_m", self.translation_m, (3,)),
+            cov=checked_covariance("cov", self.cov, (7, 7)),
+        )
+
+    @classmethod
+    def from_scale(cls, estimate: ScaleEstimate, *, world: WorldAxes = "z-up", provenance: str = "") -> Similarity:
+        """The similarity that makes a model metric with gravity along the chosen axis; origin kept.
+
+        Raises
+        ------
+        NotObservableError
+            When the scale was refused.
+        """
+        if estimate.metres_per_unit is None or estimate.gravity_in_world_m_s2 is None:
+            raise NotObservableError("scale", "; ".join(estimate.reasons))
+        down = DOWN_IN_WORLD[world]
+        gravity = estimate.gravity_in_world_m_s2
+        rotation = rotation_between(gravity, down)
+        cov = np.zeros((7, 7))
+        if estimate.cov is not None:
+            # A change of gravity dg turns the target frame by -R (g x dg) / |g|^2; heading is free and carries none.
+            jacobian = np.zeros((4, 4))
+            jacobian[0, 0] = 1.0
+            jacobian[1:, 1:] = -matrix_from_quat(rotation) @ skew(gravity) / (gravity @ gravity)
+            cov[:4, :4] = jacobian @ estimate.cov[:4, :4] @ jacobian.T
+        return cls(
+            scale=estimate.metres_per_unit,
+            rotation_xyzw=rotation,
+            translation_m=np.zeros(3),
+            cov=0.5 * (cov + cov.T),
+            provenance=provenance,
+        )

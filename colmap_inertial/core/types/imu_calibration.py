@@ -1,0 +1,160 @@
+"""How an IMU reads what is true: gains, misalignments and biases of one device, with their covariance."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from colmap_inertial.core.types._checks import Array, checked_array, checked_covariance, set_fields
+
+if TYPE_CHECKING:
+    from colmap_inertial.core.types.estimated import CameraImuCalibration
+    from colmap_inertial.core.types.recorded import ImuRecording
+
+_ENTRIES = tuple(f"{row}{column}" for row in "xyz" for column in "xyz")
+
+#: Order of the parameters in ``ImuCalibration.cov``; matrices row by row.
+IMU_CALIBRATION_PARAMETERS = (
+    *(f"accel_gain_{entry}" for entry in _ENTRIES),
+    *(f"accel_bias_{axis}_m_s2" for axis in "xyz"),
+    *(f"gyro_gain_{entry}" for entry in _ENTRIES),
+    *(f"gyro_bias_{axis}_rad_s" for axis in "xyz"),
+)
+
+
+class IMU_CAL:
+    """Where they stand: slices of ``IMU_CALIBRATION_PARAMETERS``."""
+
+    ACCEL_GAIN, ACCEL_BIAS = slice(0, 9), slice(9, 12)
+    GYRO_GAIN, GYRO_BIAS = slice(12, 21), slice(21, 24)
+    COUNT = 24
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ImuCalibration:
+    """What the readings of an IMU have to be corrected by, found where it lay still in several attitudes.
+
+    The true specific force is ``(I + accel_gain) reading - accel_bias_m_s2``, the true rate
+    ``(I + gyro_gain) reading - gyro_bias_rad_s``, both in one frame: x along the accelerometer's x axis, y in the plane
+    of its x and y axes. ``accel_gain`` has three gains and three misalignments (nothing above its diagonal), and
+    ``gyro_gain`` three gains, and six entries that say how its axes stand in that frame.
+
+    Attributes
+    ----------
+    accel_gain, gyro_gain
+        (3, 3) errors of gain and alignment.
+    accel_bias_m_s2, gyro_bias_rad_s
+        (3,) what is left to subtract. Biases change from one day to the next; gains hardly do.
+    cov
+        (24, 24) in the order of ``IMU_CALIBRATION_PARAMETERS``. What was not determined keeps its prior.
+    gravity_m_s2
+        The strength of gravity that the gains refer to.
+    temperature_c
+        Of the sensor, where it was logged.
+    device
+        What was calibrated; empty where unknown.
+    attitudes
+        In how many it lay still.
+    """
+
+    accel_gain: Array
+    accel_bias_m_s2: Array
+    gyro_gain: Array
+    gyro_bias_rad_s: Array
+    cov: Array
+    gravity_m_s2: float
+    temperature_c: float | None = None
+    device: str = ""
+    attitudes: int
+
+    def __post_init__(self) -> None:
+        set_fields(
+            self,
+            accel_gain=checked_array("accel_gain", self.accel_gain, (3, 3)),
+            accel_bias_m_s2=checked_array("accel_bias_m_s2", self.accel_bias_m_s2, (3,)),
+            gyro_gain=checked_array("gyro_gain", self.gyro_gain, (3, 3)),
+            gyro_bias_rad_s=checked_array("gyro_bias_rad_s", self.gyro_bias_rad_s, (3,)),
+            cov=checked_covariance("cov", self.cov, (IMU_CAL.COUNT, IMU_CAL.COUNT)),
+        )
+        for name in ("accel_gain", "gyro_gain"):
+            if np.abs(getattr(self, name)).max() > 0.5:
+                raise ValueError(f"{name}: its entries are errors, a few per cent at most; these are no errors of gain")
+        if not (math.isfinite(self.gravity_m_s2) and self.gravity_m_s2 > 0):
+            raise ValueError("gravity_m_s2 must be positive and finite")
+        if self.temperature_c is not None and not math.isfinite(self.temperature_c):
+            raise ValueError("temperature_c must be finite")
+        if self.attitudes < 0:
+            raise ValueError("attitudes must not be negative")
+
+    def sigma(self, parameter: str) -> float:
+        """Standard deviation of one of ``IMU_CALIBRATION_PARAMETERS``."""
+        i = IMU_CALIBRATION_PARAMETERS.index(parameter)
+        return float(np.sqrt(self.cov[i, i]))
+
+    @property
+    def gain_sigma(self) -> float:
+        """Standard deviation of the accelerometer's gain along the direction in which it is known worst."""
+        along = np.einsum("ni,nj->nij", _DIRECTIONS, _DIRECTIONS).reshape(-1, 9)
+        block = self.cov[IMU_CAL.ACCEL_GAIN, IMU_CAL.ACCEL_GAIN]
+        return float(np.sqrt(np.einsum("ni,ij,nj->n", along, block, along).max()))
+
+    def loosened(self, calibration: CameraImuCalibration) -> CameraImuCalibration:
+        """What is known of camera and IMU, its rotation as open as the gyroscope stands askew in the accelerometer.
+
+        It may have been found with readings that were not corrected, whose axes are the gyroscope's own.
+        """
+        askew = 0.5 * (self.gyro_gain - self.gyro_gain.T)
+        cov = calibration.cov.copy()
+        cov[:3, :3] += 0.5 * float(np.sum(askew**2)) * np.eye(3)
+        return replace(calibration, cov=cov)
+
+    def summary(self) -> dict[str, object]:
+        """What a result says of it, in JSON types."""
+        return {
+            "device": self.device,
+            "attitudes": self.attitudes,
+            "accel_gain": self.accel_gain.tolist(),
+            "gyro_gain": self.gyro_gain.tolist(),
+            "gain_sigma": self.gain_sigma,
+            "gravity_m_s2": self.gravity_m_s2,
+            "temperature_c": self.temperature_c,
+        }
+
+    def corrected(self, imu: ImuRecording) -> ImuRecording:
+        """A recording of the same device with true readings, as far as they are known; it carries this calibration.
+
+        Raises
+        ------
+        ValueError
+            Where it was corrected before.
+        """
+        if imu.calibration is not None:
+            raise ValueError("the recording was corrected by a calibration before")
+        attitudes = f" in {self.attitudes} attitudes" if self.attitudes else ""
+        return replace(
+            imu,
+            gyro_rad_s=imu.gyro_rad_s @ (np.eye(3) + self.gyro_gain).T - self.gyro_bias_rad_s,
+            accel_m_s2=imu.accel_m_s2 @ (np.eye(3) + self.accel_gain).T - self.accel_bias_m_s2,
+            calibration=self,
+            repairs=(*imu.repairs, f"the IMU's readings were corrected by its calibration{attitudes}"),
+        )
+
+    def uncorrected(self, gyro_rad_s: Array, accel_m_s2: Array) -> tuple[Array, Array]:
+        """(N, 3), (M, 3) what the sensors read where these are the true values."""
+        undo_gyro, undo_accel = (np.linalg.inv(np.eye(3) + gain).T for gain in (self.gyro_gain, self.accel_gain))
+        gyro, accel = gyro_rad_s + self.gyro_bias_rad_s, accel_m_s2 + self.accel_bias_m_s2
+        return np.asarray(gyro @ undo_gyro), np.asarray(accel @ undo_accel)
+
+
+def _directions(count: int) -> Array:
+    """(count, 3) unit vectors evenly over half the sphere (Fibonacci's spiral)."""
+    up = (np.arange(count) + 0.5) / count
+    around = np.pi * (1 + 5**0.5) * np.arange(count)
+    level = np.sqrt(1 - up**2)
+    return np.stack([level * np.cos(around), level * np.sin(around), up], axis=1)
+
+
+_DIRECTIONS = _directions(400)

@@ -1,0 +1,417 @@
+"""What was recorded or reconstructed: IMU samples, frames and their times, cameras, trajectories."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.core.geometry import quat_conjugate, quat_log, quat_multiply
+from colmap_inertial.core.types._checks import (
+    Array,
+    checked_array,
+    checked_covariance,
+    checked_quaternions,
+    checked_times,
+    set_fields,
+)
+from colmap_inertial.core.types.imu_calibration import ImuCalibration
+
+LengthUnit = Literal["model", "m"]
+ReadoutDirection = Literal["down", "up", "right", "left"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ImuNoise:
+    """White-noise densities and bias walks of an IMU, as data sheets give them.
+
+    Attributes
+    ----------
+    gyro_density_rad_s_rthz, accel_density_m_s2_rthz
+        White noise, per square root of hertz.
+    gyro_walk_rad_s2_rthz, accel_walk_m_s3_rthz
+        Random walk of the biases.
+    """
+
+    gyro_density_rad_s_rthz: float
+    accel_density_m_s2_rthz: float
+    gyro_walk_rad_s2_rthz: float
+    accel_walk_m_s3_rthz: float
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not (np.isfinite(value) and value >= 0):
+                raise ValueError(f"{name}: must be finite and not negative")
+
+
+#: A phone's IMU where no data sheet is at hand: gyroscopes have 1e-4 to 1e-3 rad/s/sqrt(Hz). The accelerometer's white
+#: noise is ten times the data sheets' of consumer MEMS, as sensors in use show (vibration, bandwidth, jitter).
+TYPICAL_NOISE = ImuNoise(
+    gyro_density_rad_s_rthz=3e-4, accel_density_m_s2_rthz=5e-3, gyro_walk_rad_s2_rthz=3e-4, accel_walk_m_s3_rthz=3e-4
+)
+#: Walk of the gyroscope's bias where its gains and axis errors are estimated along, as the joint fit does: without what
+#: those errors add to it as the device turns.
+JOINT_GYRO_WALK_RAD_S_RTS = 1e-4
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ImuRecording:
+    """Gyroscope and accelerometer samples of one recording.
+
+    Attributes
+    ----------
+    gyro_t_s, accel_t_s
+        (N,), (M,) stamps in seconds since ``epoch_ns`` on the IMU's clock, strictly increasing. Two time bases: a
+        gyroscope sample never belongs to an accelerometer sample by index.
+    gyro_rad_s
+        (N, 3) angular velocity in the IMU frame.
+    accel_m_s2
+        (M, 3) specific force in the IMU frame, gravity included. A gyroscope alone has no samples here (M = 0).
+    epoch_ns
+        The clock's reading, in nanoseconds, where both time bases are zero.
+    repairs
+        What the reader had to sort, merge or drop, in words.
+    device
+        What recorded it, where known.
+    noise
+        The data sheet's noise, where the recording comes with one.
+    calibration
+        What the readings were corrected by (``ImuCalibration.corrected``); ``None`` where they are the sensor's own.
+    temperature_c
+        How warm the sensors were (median), degrees Celsius, where it was logged.
+    """
+
+    gyro_t_s: Array
+    gyro_rad_s: Array
+    accel_t_s: Array
+    accel_m_s2: Array
+    epoch_ns: int = 0
+    repairs: tuple[str, ...] = ()
+    device: str = ""
+    noise: ImuNoise | None = None
+    calibration: ImuCalibration | None = None
+    temperature_c: float | None = None
+
+    def __post_init__(self) -> None:
+        gyro_t_s, accel_t_s = checked_times("gyro_t_s", self.gyro_t_s), checked_times("accel_t_s", self.accel_t_s)
+        set_fields(
+            self,
+            gyro_t_s=gyro_t_s,
+            accel_t_s=accel_t_s,
+            gyro_rad_s=checked_array("gyro_rad_s", self.gyro_rad_s, (len(gyro_t_s), 3)),
+            accel_m_s2=checked_array("accel_m_s2", self.accel_m_s2, (len(accel_t_s), 3)),
+        )
+        if len(gyro_t_s) < 2 or len(accel_t_s) == 1:
+            raise ValueError("an ImuRecording needs at least two samples of each sensor (or none of the accelerometer)")
+        if self.temperature_c is not None and not np.isfinite(self.temperature_c):
+            raise ValueError("temperature_c must be finite")
+
+    @property
+    def has_accel(self) -> bool:
+        """Whether the accelerometer was recorded; without it there is no scale and no gravity."""
+        return len(self.accel_t_s) > 0
+
+    @property
+    def warmer_k(self) -> float | None:
+        """By how much the sensors were warmer than at their calibration; ``None`` where either was not logged."""
+        then = None if self.calibration is None else self.calibration.temperature_c
+        return None if then is None or self.temperature_c is None else self.temperature_c - then
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CameraModel:
+    """Intrinsics in COLMAP's terms: model name, image size, parameters; the top-left pixel's centre is (0.5, 0.5)."""
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if self.width <= 0 or self.height <= 0:
+            raise ValueError(f"image size {self.width}x{self.height} must be positive")
+        params = tuple(float(p) for p in self.params)
+        if not np.isfinite(params).all():
+            raise ValueError("camera parameters must be finite")
+        set_fields(self, params=params)
+
+
+class Projector(Protocol):
+    """Maps between pixels and normalised image coordinates; ``pycolmap.Camera`` is one."""
+
+    def cam_from_img(self, image_points: Array, /) -> Array: ...
+
+    def img_from_cam(self, cam_points: Array, /) -> Array: ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Treatment:
+    """What a stage decided about a frame, its keypoints or a model, and why; it travels with what it is about.
+
+    Attributes
+    ----------
+    stage
+        Which stage, in a word.
+    reason
+        In words.
+    action
+        What became of it, in a word (``"deblurred"``); empty where nothing was changed.
+    values
+        Figures, in JSON types.
+    """
+
+    stage: str
+    reason: str
+    action: str = ""
+    values: Mapping[str, object] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Frame:
+    """One decoded frame on its way to feature extraction.
+
+    Attributes
+    ----------
+    name
+        File name that COLMAP will see; the frame's identity from here on.
+    image
+        (H, W) or (H, W, 3) pixels, RGB order, uint8 or uint16, read-only. A stage returns a new frame
+        (``dataclasses.replace``) with a new array; one that leaves the array alone has the original file passed on.
+    t_s
+        Start of exposure of row 0, camera clock, seconds since the timing's ``epoch_ns``.
+    exposure_s
+        ``None`` where unknown.
+    readout_s
+        From the first row to one past the last; 0 is a global shutter; ``None`` where unknown.
+    camera
+        ``None`` lets COLMAP calibrate.
+    smoothing_px
+        Standard deviation of the Gaussian by which COLMAP sees the image smoothed, in linear light; everybody else has
+        the image as it is. 0 does nothing.
+    dropped
+        Whether COLMAP shall not see it. A stage that yields a dropped frame can say why; one that is simply not
+        yielded is dropped without a reason.
+    treatments
+        What the stages before did, in order.
+    """
+
+    name: str
+    image: NDArray[np.uint8] | NDArray[np.uint16]
+    t_s: float
+    exposure_s: float | None = None
+    readout_s: float | None = None
+    camera: CameraModel | None = None
+    smoothing_px: float = 0.0
+    dropped: bool = False
+    treatments: tuple[Treatment, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.smoothing_px < 100:
+            raise ValueError(f"{self.name}: smoothing_px must be from 0 to below 100, not {self.smoothing_px:g}")
+        if self.image.ndim not in (2, 3) or self.image.dtype not in (np.uint8, np.uint16):
+            raise ValueError(f"{self.name}: an image is (H, W) or (H, W, 3), uint8 or uint16")
+        view = self.image.view()
+        view.setflags(write=False)
+        set_fields(self, image=view)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Keypoints:
+    """Where the features of one image are, on their way to matching.
+
+    Attributes
+    ----------
+    name
+        The image's.
+    xy_px
+        (N, 2) COLMAP's pixel coordinates. A stage may move them, and keeps their number and order.
+    rectified
+        Whether they are where a global shutter would have seen them.
+    treatments
+        What the stages before did, in order.
+    """
+
+    name: str
+    xy_px: Array
+    rectified: bool = False
+    treatments: tuple[Treatment, ...] = ()
+
+    def __post_init__(self) -> None:
+        set_fields(self, xy_px=checked_array("xy_px", self.xy_px, (None, 2)))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FrameTiming:
+    """When each frame was exposed, on the camera's clock.
+
+    Attributes
+    ----------
+    names
+        (F,) file names, in order of time.
+    t_s
+        (F,) start of exposure of row 0, seconds since ``epoch_ns``, strictly increasing.
+    exposure_s
+        (F,) exposure times, or ``None`` where unknown.
+    readout_s
+        From the first row to one past the last; 0 is a global shutter; ``None`` where unknown.
+    readout_direction
+        Where the rows' exposure moves in the stored image.
+    """
+
+    names: tuple[str, ...]
+    t_s: Array
+    exposure_s: Array | None = None
+    readout_s: float | None = None
+    readout_direction: ReadoutDirection = "down"
+    epoch_ns: int = 0
+
+    def __post_init__(self) -> None:
+        t_s = checked_times("t_s", self.t_s)
+        if len(self.names) != len(t_s) or len(set(self.names)) != len(t_s):
+            raise ValueError("frame names must be unique, one for each time")
+        set_fields(self, names=tuple(self.names), t_s=t_s)
+        if self.exposure_s is not None:
+            set_fields(self, exposure_s=checked_array("exposure_s", self.exposure_s, (len(t_s),)))
+        if self.readout_s is not None and not 0 <= self.readout_s < 1:
+            raise ValueError("readout_s must be from 0 to 1 second")
+
+    def pose_t_s(self) -> Array:
+        """(F,) the instants that whole-image poses hold: mid-exposure of the middle row."""
+        exposure = 0.0 if self.exposure_s is None else self.exposure_s
+        return np.asarray(self.t_s + 0.5 * exposure + 0.5 * (self.readout_s or 0.0))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FrameLog:
+    """What a recorder noted about the frames of its video, beside the inertial samples.
+
+    Attributes
+    ----------
+    t_s
+        (F,) start of exposure of row 0 (or the recorder's own stamp) of each frame of the video, in seconds since
+        ``epoch_ns``; empty where the recorder noted no times.
+    epoch_ns
+        The clock's reading, in nanoseconds, where ``t_s`` is zero.
+    in_video_time
+        Whether ``t_s`` are the video's presentation stamps, which the IMU's stamps were brought to; otherwise they are
+        the recorder's own times of the frames.
+    shared_clock
+        Whether ``t_s`` and the IMU's stamps come from one clock.
+    exposure_s, iso, focal_px
+        (F,) of each frame, or ``None`` where unknown.
+    readout_s, readout_direction
+        As in :class:`FrameTiming`.
+    stabilised
+        Whether the picture was stabilised (electronically, or by moving the lens), so that it does not turn with the
+        IMU; ``None`` where the recorder did not say.
+    stabilisation
+        In the recorder's words.
+    camera
+        Intrinsics of the video's pictures.
+    up_in_imu
+        (F, 3) unit vectors away from the ground, IMU frame, as the recorder's own filter saw them.
+    start_from_imu_xyzw
+        (F, 4) orientations of the device against the first frame's, by the recorder's own filter.
+    """
+
+    t_s: Array
+    epoch_ns: int = 0
+    in_video_time: bool = False
+    shared_clock: bool = False
+    exposure_s: Array | None = None
+    iso: Array | None = None
+    focal_px: Array | None = None
+    readout_s: float | None = None
+    readout_direction: ReadoutDirection = "down"
+    stabilised: bool | None = None
+    stabilisation: str = ""
+    camera: CameraModel | None = None
+    up_in_imu: Array | None = None
+    start_from_imu_xyzw: Array | None = None
+
+    def __post_init__(self) -> None:
+        t_s = checked_times("t_s", self.t_s)
+        set_fields(self, t_s=t_s)
+        for name in ("exposure_s", "iso", "focal_px"):
+            if getattr(self, name) is not None:
+                set_fields(self, **{name: checked_array(name, getattr(self, name), (len(t_s),))})
+        if self.start_from_imu_xyzw is not None:
+            checked = checked_quaternions("start_from_imu_xyzw", self.start_from_imu_xyzw, (len(t_s), 4))
+            set_fields(self, start_from_imu_xyzw=checked)
+        if self.up_in_imu is not None:
+            set_fields(self, up_in_imu=checked_array("up_in_imu", self.up_in_imu, (len(t_s), 3)))
+        if self.readout_s is not None and not 0 <= self.readout_s < 1:
+            raise ValueError("readout_s must be from 0 to 1 second")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CameraTrajectory:
+    """Camera poses of a reconstruction with their times.
+
+    Attributes
+    ----------
+    names
+        (F,) image names (or the index as text, where there are no images).
+    t_s
+        (F,) the instant each pose holds, camera clock, seconds since ``epoch_ns``, strictly increasing.
+    cam_from_world_xyzw
+        (F, 4) rotations.
+    cam_in_world
+        (F, 3) camera centres, in ``length_unit``.
+    pose_cov
+        (F, 6, 6) optional covariance: rotation error (rad, camera frame, left), camera centre (``length_unit``, world).
+    """
+
+    names: tuple[str, ...]
+    t_s: Array
+    cam_from_world_xyzw: Array
+    cam_in_world: Array
+    length_unit: LengthUnit = "model"
+    epoch_ns: int = 0
+    pose_cov: Array | None = None
+
+    def __post_init__(self) -> None:
+        t_s = checked_times("t_s", self.t_s)
+        n = len(t_s)
+        if len(self.names) != n:
+            raise ValueError("one name for each pose")
+        set_fields(
+            self,
+            names=tuple(self.names),
+            t_s=t_s,
+            cam_from_world_xyzw=checked_quaternions("cam_from_world_xyzw", self.cam_from_world_xyzw, (n, 4)),
+            cam_in_world=checked_array("cam_in_world", self.cam_in_world, (n, 3)),
+        )
+        if self.pose_cov is not None:
+            set_fields(self, pose_cov=checked_covariance("pose_cov", self.pose_cov, (n, 6, 6)))
+
+    def __len__(self) -> int:
+        return len(self.t_s)
+
+    def turn_rad(self) -> Array:
+        """(F-1, 3) rotation vectors ``before_from_after`` of consecutive frames, camera frame."""
+        pose = self.cam_from_world_xyzw
+        return quat_log(quat_multiply(pose[:-1], quat_conjugate(pose[1:])))
+
+    def select(self, keep: NDArray[np.bool_] | NDArray[np.intp] | slice) -> CameraTrajectory:
+        """The poses that ``keep`` (mask, increasing indices or slice) picks."""
+        index = np.arange(len(self))[keep]
+        return replace(
+            self,
+            names=tuple(self.names[i] for i in index),
+            t_s=self.t_s[index],
+            cam_from_world_xyzw=self.cam_from_world_xyzw[index],
+            cam_in_world=self.cam_in_world[index],
+            pose_cov=None if self.pose_cov is None else self.pose_cov[index],
+        )
+
+
+def clock_shift_s(trajectory: CameraTrajectory, imu: ImuRecording) -> float:
+    """What to add to an offset between raw stamps to get the offset between ``t_s`` values.
+
+    With ``t_cam = t_stamp + offset`` on raw stamps, ``trajectory`` time = ``imu`` time + offset + this.
+    """
+    return (imu.epoch_ns - trajectory.epoch_ns) * 1e-9

@@ -1,0 +1,321 @@
+"""Registration of a blurred image to a noisy one, by their pixels: reduced, without their finest and coarsest detail.
+
+Noise is as fine as a pixel, blur takes the fine detail of one image alone, and light falls off towards the corners;
+what lies between is the same in both. It is compared by its correlation, maximised over homographies by OpenCV's ECC
+(G. Evangelidis, E. Psarakis, Parametric image alignment using enhanced correlation coefficient maximization, 2008).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.core.types import Array
+from colmap_inertial.imaging._bilinear import between_nodes
+from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.imaging.exposure_pairs._search import OTHER_TURNS_DEG, USUAL_TURNS_DEG, places
+from colmap_inertial.imaging.rolling_shutter import grid_nodes, sampling_maps
+
+Light = NDArray[np.float32]
+
+#: Longer sides of the reduced images, px; the last one also judges.
+_SIDES_PX = (120, 240, 480)
+#: Detail that is compared lies between these standard deviations, px of the reduced image.
+_FINE_PX, _COARSE_PX = 1.5, 16.0
+#: Of the first size: there nearly all counts, which tells repetitions of a pattern apart.
+_COARSEST_PX = 60.0
+#: Of ECC.
+_ROUNDS, _STOP = 60, 1e-5
+#: The correlation must rise by this for a more general mapping: less also comes of fitting noise.
+_WORTH = 0.003
+#: For leaving the gyroscope, by this: a blur that is not even through time has its centre beside mid-exposure, and
+#: drew pixels away from a true shift by 0.6 px for up to 0.007.
+_WORTH_FROM_GYRO = 0.01
+#: For leaving it altogether: where it makes the images alike, and where it does not.
+_WORTH_AGAINST_GYRO = {True: 0.15, False: 0.0}
+#: A wall without texture has less detail than this (standard deviation): in the long image, and in the noisy short one.
+_FLAT = (0.003, 0.015)
+#: OpenCV's MOTION_TRANSLATION.
+_SHIFT = 0
+#: Farthest that the pixels may move an image's middle, in its longer side, and its corners beyond that; any part of it
+#: from where the gyroscope has it.
+_FARTHEST, _FARTHEST_BY_TURNING, _FARTHEST_FROM_GYRO = 0.35, 0.5, 0.03
+#: So many places are looked at more closely; none where what is found is this good already.
+_CLOSER_LOOKS, _NEVER_BETTER = 2, 0.95
+#: Where the share of the long image that tells is below the first, all of it has to; a pixel tells above the second.
+_LEAST_TELLING, _TELLS = 0.1, 0.5
+#: Images show one view where the correlations of their parts, so many along the longer side, are so high in the mean,
+#: and so many of its standard deviations above 0. Of 62 simulated pairs, true ones reach .45 and 8.6 at least, wrong
+#: ones .21 and 6.4 at most.
+_PARTS_ALONG, _ALIKE, _ALIKE_SIGMAS = 10, 0.3, 7.0
+#: A part counts where so much of it tells; with fewer of them, all together must agree so well.
+_TELLING_PART, _LEAST_PARTS, _ALIKE_AS_A_WHOLE = 0.3, 8, 0.6
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Registered:
+    """Where the long exposure shows what the short one does.
+
+    Attributes
+    ----------
+    shift_px
+        (Gy, Gx, 2) what to add to a pixel of the short exposure, at the nodes of a :class:`BlurField`.
+    by_gyro, by_pixels
+        What it rests on; nothing where both are false.
+    agreement
+        Correlation of the images' detail.
+    untouched
+        What it would be without any shift.
+    alike
+        Whether the images show one view, or nothing at all.
+    """
+
+    shift_px: Array
+    by_gyro: bool
+    by_pixels: bool
+    agreement: float
+    untouched: float
+    alike: bool = True
+
+
+def register(
+    short: Light, long: Light, clipped: NDArray[np.bool_], *, start_px: Array | None = None, step_px: int = 16
+) -> Registered:
+    """Find the shift between two images of about the same brightness.
+
+    Looked for near the gyroscope's shift, near none, and wherever the reduced images correlate best.
+
+    Parameters
+    ----------
+    short, long
+        (H, W) float32, sRGB 0 to 1.
+    clipped
+        (H, W) pixels of ``long`` that tell nothing.
+    start_px
+        (Gy, Gx, 2) the shift by the gyroscope, where there is one.
+    step_px
+        Distance of the nodes.
+    """
+    height, width = short.shape
+    zero = np.zeros((*BlurField.nodes(width, height, step_px), 2))
+    levels = [_Level.of(short, long, clipped, side) for side in _SIDES_PX if side <= 1.5 * max(width, height)]
+    levels = levels or [_Level.of(short, long, clipped, max(width, height))]
+    judge = levels[-1]
+    none = Registered(
+        shift_px=zero, by_gyro=False, by_pixels=False, agreement=judge.agreement(zero, step_px), untouched=0.0
+    )
+    none = replace(none, untouched=none.agreement)
+    found = none
+    if start_px is not None:
+        gyro = np.where(np.isfinite(start_px), start_px, 0.0)
+        # the gyroscope is believed unless the images clearly say otherwise
+        found = replace(none, shift_px=gyro, by_gyro=True, agreement=judge.agreement(gyro, step_px))
+        better = found if judge.flat() else _refined(found, np.eye(3), levels, step_px)
+        if better.agreement >= found.agreement + _WORTH_FROM_GYRO:
+            found = better
+    if judge.flat():
+        return found
+    alike = judge.alike(found.shift_px, step_px)
+    worth = 0.0 if start_px is None else _WORTH_AGAINST_GYRO[alike]
+    least = judge.score(found, step_px) + worth
+    for turns_deg in (USUAL_TURNS_DEG, OTHER_TURNS_DEG):
+        if least >= _NEVER_BETTER or (alike and turns_deg is OTHER_TURNS_DEG):
+            break
+        guesses = _guesses(none, levels, step_px, turns_deg)
+        refined = [none, *(_refined(none, guess, levels, step_px) for guess in guesses)]
+        # repeated detail agrees in many places; what is coarser tells them apart
+        best = max(refined, key=lambda one: judge.score(one, step_px) + _coarse_score(levels[0], one, step_px))
+        if (score := judge.score(best, step_px)) > least:
+            found, least = best, score
+            alike = judge.alike(found.shift_px, step_px)
+    return replace(found, alike=alike)
+
+
+@dataclass(frozen=True, eq=False)
+class _Level:
+    """Both images at one size: their detail, and how much of it tells (0 to 1)."""
+
+    short: Light
+    long: Light
+    tells: Light
+    scale: float
+
+    @classmethod
+    def of(cls, short: Light, long: Light, clipped: NDArray[np.bool_], side_px: int) -> _Level:
+        import cv2
+
+        height, width = short.shape
+        scale = min(1.0, side_px / max(width, height))
+        size = (max(16, round(scale * width)), max(16, round(scale * height)))
+        small = [cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (short, long)]
+        lost = cv2.resize(clipped.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+        # what is clipped spoils as much around it as the detail is fine, by its share: a glint is no window
+        tells = np.clip(1 - 2 * cv2.GaussianBlur(lost, (0, 0), _FINE_PX), 0, 1)
+        if tells.mean() < _LEAST_TELLING:
+            # then the edges of what clips are all that there is to see
+            tells = np.ones_like(tells)
+        sigmas = _FINE_PX, _COARSEST_PX if side_px == _SIDES_PX[0] else _COARSE_PX
+        fine, coarse = ([cv2.GaussianBlur(image, (0, 0), sigma) for image in small] for sigma in sigmas)
+        short_detail, long_detail = (np.asarray(f - c, dtype=np.float32) for f, c in zip(fine, coarse, strict=True))
+        return cls(short_detail, long_detail, np.asarray(tells, dtype=np.float32), size[0] / width)
+
+    def moved(self, shift_px: Array, step_px: int) -> tuple[Light, Light]:
+        """The long image's detail shifted, and how much it tells."""
+        import cv2
+
+        height, width = self.short.shape
+        map_x, map_y = sampling_maps(self.scale * shift_px, width, height, step_px * self.scale)
+        moved = cv2.remap(self.long, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        tells = cv2.remap(self.tells, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        return np.asarray(moved, dtype=np.float32), np.asarray(tells, dtype=np.float32)
+
+    def agreement(self, shift_px: Array, step_px: int) -> float:
+        """Correlation of the details where the long image's tells."""
+        moved, tells = self.moved(shift_px, step_px)
+        return _correlation(self.short, moved, tells)
+
+    def score(self, found: Registered, step_px: int) -> float:
+        """The agreement times the root of what tells in common: of little, chance agrees more."""
+        _, tells = self.moved(found.shift_px, step_px)
+        return found.agreement * float(np.sqrt(tells.mean() / max(float(self.tells.mean()), 1e-6)))
+
+    def flat(self) -> bool:
+        """Whether there is nothing to align, so that nothing contradicts either."""
+        return float(self.long.std()) < _FLAT[0] and float(self.short.std()) < _FLAT[1]
+
+    def alike(self, shift_px: Array, step_px: int) -> bool:
+        """Whether the details agree all over, and not by chance: in most parts of the image, each for itself."""
+        found = self._of_parts(shift_px, step_px)
+        if len(found) < _LEAST_PARTS:
+            return self.agreement(shift_px, step_px) >= _ALIKE_AS_A_WHOLE
+        mean, spread = float(found.mean()), float(found.std()) / np.sqrt(len(found))
+        return bool(mean >= _ALIKE and mean >= _ALIKE_SIGMAS * spread)
+
+    def _of_parts(self, shift_px: Array, step_px: int) -> Array:
+        """Correlations in squares where enough tells."""
+        moved, tells = self.moved(shift_px, step_px)
+        height, width = self.short.shape
+        side = max(16, max(height, width) // _PARTS_ALONG)
+        found = []
+        for top in range(0, height - side + 1, side):
+            for left in range(0, width - side + 1, side):
+                part = (slice(top, top + side), slice(left, left + side))
+                if tells[part].mean() >= _TELLING_PART:
+                    found.append(_correlation(self.short[part], moved[part], tells[part]))
+        return np.array(found)
+
+
+def _correlation(a: Light, b: Light, weights: Light) -> float:
+    """Weighted; 0 where nothing varies."""
+    total = float(weights.sum())
+    if total <= 0:
+        return 0.0
+    x, y = (image - float((weights * image).sum()) / total for image in (a, b))
+    norm = float(np.sqrt((weights * x * x).sum(dtype=np.float64) * (weights * y * y).sum(dtype=np.float64)))
+    return float((weights * x * y).sum(dtype=np.float64)) / norm if norm > 0 else 0.0
+
+
+def _guesses(start: Registered, levels: list[_Level], step_px: int, turns_deg: Sequence[float]) -> list[Array]:
+    """(3, 3) mappings, px of the full images, from the short one to where the long one may lie: the best few."""
+    coarse, finer = levels[0], levels[min(1, len(levels) - 1)]
+    scale = _centred_scale(coarse.scale)
+    found = places(
+        coarse.short, np.ones_like(coarse.tells), coarse.long, coarse.tells, farthest=_FARTHEST, turns_deg=turns_deg
+    )
+    ranked = []
+    for guess in (np.eye(3), *(np.linalg.inv(scale) @ place.mapping @ scale for place in found)):
+        mapping: Array | None = guess
+        for level in (coarse, finer):
+            mapping = None if mapping is None else _maximised(level, start, mapping, _SHIFT, step_px)
+        for one in (guess, mapping):
+            shift = None if one is None else _shift_of(one, start, step_px)
+            if one is not None and shift is not None:
+                moved = replace(start, shift_px=shift, agreement=finer.agreement(shift, step_px))
+                ranked.append((finer.score(moved, step_px) + _coarse_score(coarse, moved, step_px), one))
+    ranked.sort(key=lambda pair: -pair[0])
+    return [one for _, one in ranked[:_CLOSER_LOOKS]]
+
+
+def _coarse_score(coarse: _Level, found: Registered, step_px: int) -> float:
+    return coarse.score(replace(found, agreement=coarse.agreement(found.shift_px, step_px)), step_px)
+
+
+def _shift_of(mapping: Array, start: Registered, step_px: int) -> Array | None:
+    """(Gy, Gx, 2) the start's shift after a mapping; ``None`` where that leads too far."""
+    rows, columns = start.shift_px.shape[:2]
+    nodes = step_px * grid_nodes(rows, columns)
+    moved = np.concatenate([nodes, np.ones((rows, columns, 1))], axis=-1) @ mapping.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        target = moved[..., :2] / moved[..., 2:]
+    if not np.isfinite(target).all() or (moved[..., 2] <= 0).any():
+        return None
+    step = target - nodes
+    side = step_px * max(rows, columns)
+    middle = np.linalg.norm(step[rows // 2, columns // 2])
+    reach = np.hypot(step[..., 0], step[..., 1]).max()
+    if start.by_gyro and reach > _FARTHEST_FROM_GYRO * side:
+        return None
+    # a turn takes corners farther than the middle
+    if middle > _FARTHEST * side or reach > (_FARTHEST + _FARTHEST_BY_TURNING) * side:
+        return None
+    return np.asarray(step + between_nodes(start.shift_px, target / step_px))
+
+
+def _refined(start: Registered, guess: Array, levels: list[_Level], step_px: int) -> Registered:
+    """The best of ever more general mappings, from coarse to fine; the start, where none is better."""
+    best = start
+    for mapping in _mappings(start, guess, levels, step_px):
+        shift = _shift_of(mapping, start, step_px)
+        if shift is None:
+            continue
+        agreement = levels[-1].agreement(shift, step_px)
+        # a more general mapping must be worth it
+        if agreement >= best.agreement + _WORTH:
+            best = replace(start, shift_px=shift, by_pixels=True, agreement=agreement)
+    return best
+
+
+def _mappings(start: Registered, guess: Array, levels: list[_Level], step_px: int) -> Iterator[Array]:
+    """(3, 3) from pixels of the short image to those of the shifted long one: shift, turn, homography."""
+    import cv2
+
+    mapping = guess
+    # the simplest at every size, from coarse to fine; what is more general only where it can be told
+    steps = [(level, _SHIFT) for level in levels]
+    steps += [(levels[-1], kind) for kind in (cv2.MOTION_EUCLIDEAN, cv2.MOTION_HOMOGRAPHY)]
+    for level, kind in steps:
+        found = _maximised(level, start, mapping, kind, step_px)
+        if found is None:
+            break
+        mapping = found
+        if level is levels[-1]:
+            yield mapping
+
+
+def _maximised(level: _Level, start: Registered, mapping: Array, kind: int, step_px: int) -> Array | None:
+    """ECC from a mapping, both in px of the full image; ``None`` where it does not converge."""
+    import cv2
+
+    moved, weights = level.moved(start.shift_px, step_px)
+    tells = (weights > _TELLS).astype(np.uint8)
+    scale = _centred_scale(level.scale)
+    small = scale @ mapping @ np.linalg.inv(scale)
+    size = 3 if kind == cv2.MOTION_HOMOGRAPHY else 2
+    warp = np.ascontiguousarray((small / small[2, 2])[:size], dtype=np.float32)
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _ROUNDS, _STOP)
+    try:
+        _, warp = cv2.findTransformECC(level.short, moved, warp, kind, criteria, tells, 1)
+    except cv2.error:
+        return None
+    full = np.eye(3)
+    full[:size] = warp
+    return np.asarray(np.linalg.inv(scale) @ full @ scale)
+
+
+def _centred_scale(scale: float) -> Array:
+    """From OpenCV's pixels of an image to those of one reduced by area: corners stay, not centres of pixels."""
+    offset = 0.5 * scale - 0.5
+    return np.array([[scale, 0, offset], [0, scale, offset], [0, 0, 1.0]])

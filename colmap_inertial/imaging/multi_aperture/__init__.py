@@ -1,0 +1,29 @@
+"""Cameras of several small apertures, each with its own colour filter: one RGB image without parallax.
+
+:func:`rectify` prepares a rig once; :func:`fuse_apertures` fuses an exposure, :func:`estimate_disparity` and
+:func:`fuse_with` are its two halves; :func:`refocus` blurs what lies off a plane.
+"""
+
+from colmap_inertial.imaging.multi_aperture._geometry import Rectified, rectify
+from colmap_inertial.imaging.multi_aperture.disparity import Disparity, estimate_disparity
+from colmap_inertial.imaging.multi_aperture.fusion import (
+    Fused,
+    fuse_apertures,
+    fuse_with,
+    plane_of,
+    require_colours,
+)
+from colmap_inertial.imaging.multi_aperture.refocus import refocus
+
+__all__ = [
+    "Disparity",
+    "Fused",
+    "Rectified",
+    "estimate_disparity",
+    "fuse_apertures",
+    "fuse_with",
+    "plane_of",
+    "rectify",
+    "refocus",
+    "require_colours",
+]

@@ -1,0 +1,223 @@
+"""One disparity map from all apertures at once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.core.options import ApertureOptions
+from colmap_inertial.core.types import SpectralRole
+from colmap_inertial.imaging.multi_aperture._geometry import Rectified
+from colmap_inertial.imaging.multi_aperture._information import cost_tables
+from colmap_inertial.imaging.multi_aperture._light import adds_up, light_cost
+from colmap_inertial.imaging.multi_aperture._noise import noise_of, smoothing
+from colmap_inertial.imaging.multi_aperture._sampling import codes_of, on_canvas, shrunk
+from colmap_inertial.imaging.multi_aperture._volume import candidates, match
+from colmap_inertial.imaging.semi_global import MOST, Views
+
+Codes = NDArray[np.uint8]
+Real = NDArray[np.float32]
+
+#: Disparities that differ by no more are of one surface.
+SAME_PX = 0.75
+#: The image is matched this many times smaller to find the range of its disparities,
+_LOOK_SHRINK = 4
+#: between these shares of its width,
+_LOOK_SHARES = (-1 / 32, 1 / 8)
+#: leaving out the shares of its pixels that are likeliest to be wrong, and adding so much to each end.
+_LOOK_OUTLIERS, _LOOK_MARGIN_PX = 0.002, 2.0
+#: How much smaller the image is at first for mutual information, and its narrowest side there.
+_FIRST_SHRINK, _NARROWEST_PX = 16, 24
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Disparity:
+    """Shifts between the reference and its partner, on the canvas.
+
+    Attributes
+    ----------
+    disparity_px
+        (H, W), nearer things have more. No gaps: what no other aperture sees continues the surface behind.
+    measured
+        (H, W) whether another aperture sees the pixel and agrees on its disparity.
+    visible
+        (N - 1, H, W) whether each other aperture sees it: nothing nearer is in the way.
+    """
+
+    disparity_px: Real
+    measured: NDArray[np.bool_]
+    visible: NDArray[np.bool_]
+
+
+def estimate_disparity(
+    planes: Sequence[NDArray[Any]],
+    canvas: Rectified,
+    options: ApertureOptions | None = None,
+    *,
+    roles: Sequence[SpectralRole] = (),
+) -> Disparity:
+    """Match all apertures at once.
+
+    Parameters
+    ----------
+    planes
+        (H, W) images of the apertures, uint8 or uint16, in the rig's order.
+    canvas
+        From :func:`rectify`.
+    options
+        Defaults serve.
+    roles
+        Of the apertures; needed for the luminance cost.
+
+    Notes
+    -----
+    Every candidate disparity of a pixel of the reference is taken to the other views by trifocal tensors, and the
+    costs of all of them are summed (Mustaniemi, Kannala, Heikkilae, Parallax correction via disparity estimation in a
+    multi-aperture camera, Machine Vision and Applications 27, 2016): Census (Zabih, Woodfill, ECCV 1994) or mutual
+    information, by which views of different colour can be compared. Semi-global matching (Hirschmueller, PAMI 30(2),
+    2008) then finds the disparities. Where two pixels of the reference fall on one pixel of a view, the one that
+    matches better keeps it; a pixel that keeps none was not measured, and takes the disparity of what lies behind,
+    the second least of its neighbours in four directions. Noisy images are smoothed, and census passes over
+    comparisons that noise decides.
+    """
+    options = options or ApertureOptions()
+    threads = options.threads or 0  # 0: all processors
+    codes, least = _codes(planes, canvas)
+    reference, others = codes[0], codes[1:]
+    low, high = options.disparity_px or _range_px(reference, others, canvas, threads)
+    tables = None
+    if options.cost == "mutual-information":
+        tables = _tables(reference, others, canvas, low, high, threads)
+    light = None
+    if options.luminance_cost and adds_up(roles):
+        rough = _rough(reference, others, canvas, low, high, threads)
+        light = light_cost(codes, canvas, rough, roles, MOST)
+    views = Views(reference=reference, others=others, tables=tables, least=least, light=light)
+    found, total = match(views, canvas, candidates(low, high, options.step_px), threads=threads)
+    return _settled(found, total, canvas, threads, even=bool(np.ptp(reference) == 0))
+
+
+def _codes(planes: Sequence[NDArray[Any]], canvas: Rectified) -> tuple[Codes, int]:
+    """(N, H, W) codes to compare, on the canvas, and the least difference of them that tells."""
+    import cv2
+
+    codes, least = [], 0
+    for i, plane in enumerate(planes):
+        of_plane = codes_of(plane)
+        width_px, telling = smoothing(of_plane, noise_of(of_plane))
+        least = telling if i == 0 else least
+        if width_px > 0:
+            of_plane = np.asarray(cv2.GaussianBlur(of_plane, (0, 0), width_px))
+        codes.append(on_canvas(of_plane, canvas, i))
+    return np.stack(codes), least
+
+
+def _settled(found: Real, least: NDArray[np.uint16], canvas: Rectified, threads: int, *, even: bool) -> Disparity:
+    """The disparities without what is wrong, and what the views see of them."""
+    import cv2
+
+    bits = _seen(found, least, canvas, threads)
+    measured = (bits == 3).any(axis=0)
+    filled = background(found, measured)
+    smooth = np.asarray(cv2.medianBlur(filled, 3))
+    visible = (_seen(smooth, least, canvas, threads) & 1).astype(bool)
+    return Disparity(disparity_px=smooth, measured=measured & (not even), visible=visible)
+
+
+def _seen(disparity_px: Real, least: NDArray[np.uint16], canvas: Rectified, threads: int) -> NDArray[np.uint8]:
+    from colmap_inertial._kernels import _apertures
+
+    ratios = canvas.ratios
+    bits = np.empty((len(ratios), *disparity_px.shape), dtype=np.uint8)
+    cx, cy = canvas.centre_px.tolist()
+    _apertures.visibility(
+        disparity_px, least, ratios=ratios, cx=cx, cy=cy, tolerance=SAME_PX, bits=bits, threads=threads
+    )
+    return bits
+
+
+def background(disparity_px: Real, known: NDArray[np.bool_]) -> Real:
+    """Disparities with gaps filled from behind: by the second least of the next known ones in four directions.
+
+    Hirschmueller (2008), section 2.5.3, who takes eight; the least itself may be an outlier.
+    """
+    if known.all() or not known.any():
+        return disparity_px
+    near = []
+    for axis in (0, 1):
+        at = np.arange(known.shape[axis])
+        place = at[:, None] if axis == 0 else at[None]
+        for flip in (slice(None), slice(None, None, -1)):
+            turn = (flip, slice(None)) if axis == 0 else (slice(None), flip)
+            order = place[turn] if flip.step is None else place
+            last = np.maximum.accumulate(np.where(known[turn], order, -1), axis=axis)
+            values = np.take_along_axis(disparity_px[turn], np.maximum(last, 0), axis=axis)
+            near.append(np.where(last >= 0, values, np.inf)[turn])
+    first, second = np.sort(np.stack(near), axis=0)[:2]
+    behind = np.where(np.isfinite(second), second, first)
+    return np.where(known | ~np.isfinite(behind), disparity_px, behind).astype(np.float32)
+
+
+def _range_px(reference: Codes, others: Codes, canvas: Rectified, threads: int) -> tuple[float, float]:
+    """Limits of the disparities, by matching smaller images over a wide range."""
+    by = _look_shrink(reference)
+    small = canvas.shrunk(by)
+    low, high = (share * canvas.width / by for share in _LOOK_SHARES)
+    found, least = match(_shrunk_views(reference, others, by), small, candidates(low, high, 0.5), threads=threads)
+    measured = (_seen(found, least, small, threads) == 3).any(axis=0)
+    used = found[measured] if measured.any() else found
+    limits = by * np.quantile(used, (_LOOK_OUTLIERS, 1 - _LOOK_OUTLIERS))
+    return float(limits[0] - _LOOK_MARGIN_PX), float(limits[1] + _LOOK_MARGIN_PX)
+
+
+def _look_shrink(reference: Codes) -> int:
+    return max(1, min(_LOOK_SHRINK, min(reference.shape) // _NARROWEST_PX))
+
+
+def _shrunk_views(reference: Codes, others: Codes, by: int) -> Views:
+    return Views(reference=shrunk(reference, by), others=np.stack([shrunk(view, by) for view in others]))
+
+
+def _rough(reference: Codes, others: Codes, canvas: Rectified, low_px: float, high_px: float, threads: int) -> Real:
+    """Disparities by matching smaller images."""
+    import cv2
+
+    by = _look_shrink(reference)
+    spaced = candidates(low_px / by, high_px / by, 0.5)
+    found, _ = match(_shrunk_views(reference, others, by), canvas.shrunk(by), spaced, threads=threads)
+    return np.asarray(by * cv2.resize(found, reference.shape[::-1], interpolation=cv2.INTER_LINEAR))
+
+
+def _tables(
+    reference: Codes, others: Codes, canvas: Rectified, low_px: float, high_px: float, threads: int
+) -> NDArray[np.uint8]:
+    """Cost tables by mutual information, from small images to large ones (Hirschmueller 2008, section 2.1).
+
+    The first disparities are drawn at random, and the first size is gone through three times.
+    """
+    import cv2
+
+    levels = [by for by in (16, 8, 4, 2) if by <= _FIRST_SHRINK and min(reference.shape) // by >= _NARROWEST_PX]
+    disparity: Real | None = None
+    for by in [*levels[:1], *levels[:1], *levels]:
+        small = canvas.shrunk(by)
+        views = _shrunk_views(reference, others, by)
+        shape = views.reference.shape
+        if disparity is None:
+            drawn = np.random.default_rng(0).uniform(low_px, high_px, shape)
+            disparity = np.asarray(drawn / by, dtype=np.float32)
+        elif disparity.shape != shape:
+            disparity = 2 * cv2.resize(disparity, shape[::-1], interpolation=cv2.INTER_LINEAR)
+        tables = cost_tables(views.reference, views.others, small, disparity, MOST)
+        disparity, _ = match(
+            replace(views, tables=tables), small, candidates(low_px / by, high_px / by, 0.5), threads=threads
+        )
+    if disparity is None:
+        disparity = np.full(reference.shape, 0.5 * (low_px + high_px), dtype=np.float32)
+    else:
+        disparity = 2 * cv2.resize(disparity, reference.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    return cost_tables(reference, others, canvas, np.asarray(disparity), MOST)

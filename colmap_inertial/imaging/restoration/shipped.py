@@ -1,0 +1,64 @@
+"""The files of the networks that come with the package, and whether they are whole."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from importlib.resources import files
+from importlib.resources.abc import Traversable
+from typing import Literal
+
+from colmap_inertial.core.errors import FormatError
+
+NetworkName = Literal["deepgyro", "lsd2"]
+
+_AGAIN = "install colmap-inertial again"
+
+
+def folder() -> Traversable:
+    """Where the files are, with ``checksums.json``."""
+    return files("colmap_inertial.imaging.restoration").joinpath("weights")
+
+
+def model_file(name: NetworkName) -> Traversable:
+    """The ONNX file of a network."""
+    return folder().joinpath(f"{name}.onnx")
+
+
+def checksum(name: NetworkName) -> str:
+    """SHA-256 that the file of a network must have.
+
+    Raises
+    ------
+    FormatError
+        Where it is not known.
+    """
+    file = folder().joinpath("checksums.json")
+    try:
+        expected = json.loads(file.read_bytes())[f"{name}.onnx"]
+    except FileNotFoundError:
+        raise FormatError(str(file), f"is missing, and with it the network {name}; {_AGAIN}") from None
+    except (ValueError, LookupError, TypeError):
+        raise FormatError(str(file), f"does not name the network {name}; {_AGAIN}") from None
+    if not isinstance(expected, str):
+        raise FormatError(str(file), f"does not name the network {name}; {_AGAIN}")
+    return expected
+
+
+def read_model(name: NetworkName) -> bytes:
+    """What the ONNX file of a network holds.
+
+    Raises
+    ------
+    FormatError
+        Where it is missing or damaged.
+    """
+    expected = checksum(name)
+    file = model_file(name)
+    try:
+        model = file.read_bytes()
+    except FileNotFoundError:
+        raise FormatError(str(file), f"is missing; {_AGAIN}") from None
+    if hashlib.sha256(model).hexdigest() != expected:
+        raise FormatError(str(file), f"is damaged ({len(model)} bytes, not those of its checksum); {_AGAIN}")
+    return model

@@ -1,0 +1,267 @@
+"""Depth of one picture: partners are turned to its orientation, where a plane's depth moves and shrinks them.
+
+Coarse to fine: depths at half the size say which candidates each part of the picture needs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.core.threads import in_order, usable_processors
+from colmap_inertial.core.types import Array
+from colmap_inertial.imaging.semi_global import Views, match_candidates
+from colmap_inertial.imaging.sweep.pinhole import Pinhole
+from colmap_inertial.imaging.sweep.tiles import Tile, tiles_of
+
+Codes = NDArray[np.uint8]
+Real = NDArray[np.float32]
+
+#: Between two candidates a thing moves by this much in the partner where it moves most.
+_STEP_PX = 1.0
+_LEAST_CANDIDATES, _MOST_CANDIDATES = 16, 512
+#: Census passes over comparisons of codes that differ by less: noise and JPEG decide them.
+_LEAST_CODES = 2
+#: A turned view is at most so much larger than the reference: beyond, it is stretched more than it shows.
+_LARGEST = 1.6
+#: A partner that stands this close to a plane, as a share of its depth, does not see it well.
+_CLOSEST = 0.2
+#: With fewer candidates than these, to look at half the size first saves nothing.
+_MANY_CANDIDATES = 64
+#: Points of a side of the grid by which the part of a view that is needed is found.
+_GRID = 33
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Partner:
+    """Another picture that sees some of the same.
+
+    Attributes
+    ----------
+    codes
+        (H, W) grey values.
+    camera
+        What took it.
+    """
+
+    codes: Codes
+    camera: Pinhole
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Canvas:
+    """A partner's view turned to the reference's orientation: pixel (u, v) of it is (u + left, v + top) there."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+    canvas_from_view: Array
+    baseline: Array
+
+
+def sweep_depth(
+    codes: Codes, camera: Pinhole, partners: Sequence[Partner], depths: tuple[float, float], *, threads: int
+) -> Real:
+    """Find what depth each pixel has.
+
+    Parameters
+    ----------
+    codes
+        (H, W) grey values of the reference.
+    camera
+        What took it.
+    partners
+        Pictures to compare with, at least one.
+    depths
+        Nearest and farthest, in the model's unit.
+    threads
+        0 takes all processors.
+
+    Returns
+    -------
+    (H, W) depths; 0 where the best candidate is one of the ends: it may lie beyond.
+
+    Notes
+    -----
+    Planes parallel to the picture, equally spaced in inverse depth (Collins, CVPR 1996). Once a partner is turned to
+    the reference's orientation, a plane moves and shrinks its picture, so that columns and rows are looked up apart.
+    Costs (census) are summed over the partners that see all of a window, and the depths found by semi-global matching.
+    Of many candidates, each tile of the picture is matched with those that its depths at half the size leave.
+    """
+    sweep = _Sweep.of(codes, camera, partners, depths)
+    if sweep is None:
+        return np.zeros(codes.shape, dtype=np.float32)
+    if len(sweep.inverse) < _MANY_CANDIDATES:
+        return sweep.depth(threads)
+    halves = [Partner(codes=_half(p.codes), camera=_half_of(p.camera)) for p in partners]
+    half = _Sweep.of(_half(codes), _half_of(camera), halves, depths)
+    if half is None:
+        return sweep.depth(threads)
+    coarse = half.depth(threads)
+    with np.errstate(divide="ignore"):
+        place = (1 / coarse.astype(np.float64) - sweep.inverse[0]) / (sweep.inverse[1] - sweep.inverse[0])
+    tiles = list(tiles_of(np.where(coarse > 0, place, np.nan), (camera.height, camera.width), len(sweep.inverse)))
+    found = np.empty(codes.shape, dtype=np.float32)
+    parts = in_order(sweep.of_tile, tiles, workers=threads or usable_processors())
+    for tile, part in zip(tiles, parts, strict=True):
+        found[tile.inner_rows, tile.inner_columns] = part[tile.kept]
+    return found
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Sweep:
+    """All that is compared: views, and where the reference's columns and rows lie in them for each candidate."""
+
+    views: Views
+    inverse: Array
+    columns: NDArray[np.int32]
+    rows: NDArray[np.int32]
+
+    @classmethod
+    def of(
+        cls, codes: Codes, camera: Pinhole, partners: Sequence[Partner], depths: tuple[float, float]
+    ) -> _Sweep | None:
+        """``None`` where no partner shows anything of it."""
+        near, far = depths
+        turned = [(canvas, p) for p in partners if (canvas := _canvas(camera, p.camera, depths)) is not None]
+        if not turned:
+            return None
+        inverse = _candidates(camera, [canvas.baseline for canvas, _ in turned], near, far)
+        shape = max(canvas.height for canvas, _ in turned), max(canvas.width for canvas, _ in turned)
+        others = np.zeros((len(turned), *shape), dtype=np.uint8)
+        shown = np.zeros((len(turned), shape[0], 2), dtype=np.int32)
+        columns = np.empty((len(turned), len(inverse), camera.width), dtype=np.int32)
+        rows = np.empty((len(turned), len(inverse), camera.height), dtype=np.int32)
+        for k, (canvas, partner) in enumerate(turned):
+            others[k, : canvas.height, : canvas.width] = _turned(partner.codes, canvas)
+            shown[k, : canvas.height] = _shown(partner.codes.shape, canvas)
+            columns[k] = _positions(camera, canvas, inverse, 0)
+            rows[k] = _positions(camera, canvas, inverse, 1)
+        views = Views(reference=codes, others=others, least=_LEAST_CODES, shown=shown)
+        return cls(views=views, inverse=inverse, columns=columns, rows=rows)
+
+    def depth(self, threads: int) -> Real:
+        """(H, W) of all candidates."""
+        best, _ = match_candidates(self.views, self.columns, self.rows, threads=threads)
+        return self._of(best, slice(0, len(self.inverse)))
+
+    def of_tile(self, tile: Tile) -> Real:
+        """Of a tile and what it shares with its neighbours, by its own candidates."""
+        part = np.ascontiguousarray(self.views.reference[tile.rows, tile.columns])
+        columns = np.ascontiguousarray(self.columns[:, tile.candidates, tile.columns])
+        rows = np.ascontiguousarray(self.rows[:, tile.candidates, tile.rows])
+        best, _ = match_candidates(replace(self.views, reference=part), columns, rows, threads=1)
+        return self._of(best, tile.candidates)
+
+    def _of(self, best: Real, candidates: slice) -> Real:
+        """Depths of candidates, counted from the first of some; the best one at an end may lie beyond."""
+        known = (best > 0) & (best < candidates.stop - candidates.start - 1)
+        step = self.inverse[1] - self.inverse[0]
+        found = self.inverse[0] + step * (best.astype(np.float64) + candidates.start)
+        return np.where(known, 1 / found, 0).astype(np.float32)
+
+
+def _half(codes: Codes) -> Codes:
+    """A picture at half its size."""
+    import cv2
+
+    height, width = codes.shape
+    return np.asarray(cv2.resize(codes, (width // 2, height // 2), interpolation=cv2.INTER_AREA))
+
+
+def _half_of(camera: Pinhole) -> Pinhole:
+    """What would have taken it."""
+    by = np.array([(camera.width // 2) / camera.width, (camera.height // 2) / camera.height])
+    return replace(
+        camera,
+        width=camera.width // 2,
+        height=camera.height // 2,
+        focal_px=camera.focal_px * by,
+        centre_px=(camera.centre_px + 0.5) * by - 0.5,
+    )
+
+
+def _candidates(camera: Pinhole, baselines: Sequence[Array], near: float, far: float) -> Array:
+    """(D,) inverse depths, the farthest first."""
+    moves = [np.hypot(b[0], b[1]) + 0.5 * abs(b[2]) for b in baselines]
+    count = float(camera.focal_px.max()) * max(moves) * (1 / near - 1 / far) / _STEP_PX + 1
+    return np.linspace(1 / far, 1 / near, int(np.clip(np.ceil(count), _LEAST_CANDIDATES, _MOST_CANDIDATES)))
+
+
+def _place(camera: Pinhole, baseline: Array, inverse: Array, axis: int) -> tuple[Array, Array]:
+    """(D, n) where columns (axis 0) or rows (1) of the reference lie in a turned view; (D, 1) how they shrink."""
+    at = np.arange((camera.width, camera.height)[axis], dtype=np.float64)
+    focal, centre = camera.focal_px[axis], camera.centre_px[axis]
+    shrinks = 1 - inverse[:, None] * baseline[2]
+    moved = at - centre - focal * inverse[:, None] * baseline[axis]
+    return moved / np.maximum(shrinks, _CLOSEST) + centre, shrinks
+
+
+def _canvas(camera: Pinhole, view: Pinhole, depths: tuple[float, float]) -> _Canvas | None:
+    """What a view shows of what the reference sees between two depths; ``None`` where it shows nothing of it."""
+    baseline = camera.cam_from_world @ (view.cam_in_world - camera.cam_in_world)
+    turn = camera.cam_from_world @ view.cam_from_world.T
+    canvas_from_view = camera.matrix @ turn @ np.linalg.inv(view.matrix)
+    inverse = np.linspace(1 / depths[1], 1 / depths[0], 9)
+    ranges = []
+    for axis in (0, 1):
+        place, shrinks = _place(camera, baseline, inverse, axis)
+        place = place[shrinks[:, 0] >= _CLOSEST]
+        if not place.size:
+            return None
+        ranges.append(np.linspace(place.min(), place.max(), _GRID))
+    # which of that the view has
+    grid = np.stack([*np.meshgrid(*ranges), np.ones((_GRID, _GRID))], axis=-1) @ np.linalg.inv(canvas_from_view).T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x, y = grid[..., 0] / grid[..., 2], grid[..., 1] / grid[..., 2]
+    inside = (grid[..., 2] > 0) & (x >= 0) & (x <= view.width - 1) & (y >= 0) & (y <= view.height - 1)
+    limits = []
+    for axis, most in ((0, camera.width), (1, camera.height)):
+        hit = np.flatnonzero(inside.any(axis=axis))
+        if not len(hit):
+            return None
+        # a cell more on each side, as the border lies somewhere within
+        low, high = ranges[axis][max(0, hit[0] - 1)], ranges[axis][min(_GRID - 1, hit[-1] + 1)]
+        excess = max(0.0, high - low - _LARGEST * most) / 2
+        limits.append((int(np.floor(low + excess)), int(np.ceil(high - excess))))
+    (left, right), (top, bottom) = limits
+    return _Canvas(
+        left=left,
+        top=top,
+        width=right - left + 1,
+        height=bottom - top + 1,
+        canvas_from_view=np.array([[1.0, 0, -left], [0, 1, -top], [0, 0, 1]]) @ canvas_from_view,
+        baseline=baseline,
+    )
+
+
+def _positions(camera: Pinhole, canvas: _Canvas, inverse: Array, axis: int) -> NDArray[np.int32]:
+    """(D, n) columns or rows of the canvas in 1/16 px, outside of it where it has none."""
+    start, size = ((canvas.left, canvas.width), (canvas.top, canvas.height))[axis]
+    place, shrinks = _place(camera, canvas.baseline, inverse, axis)
+    # what a window reaches beyond the canvas is on its own side
+    sixteenths = np.rint(16 * np.clip(place - start, -1, size))
+    return np.where(shrinks >= _CLOSEST, sixteenths, -1).astype(np.int32)
+
+
+def _turned(codes: Codes, canvas: _Canvas) -> Codes:
+    import cv2
+
+    size = (canvas.width, canvas.height)
+    return np.asarray(cv2.warpPerspective(codes, canvas.canvas_from_view, size, flags=cv2.INTER_LINEAR))
+
+
+def _shown(shape: tuple[int, ...], canvas: _Canvas) -> NDArray[np.int32]:
+    """(H, 2) from and up to which column a canvas shows the view: turned, it is a quadrilateral there."""
+    import cv2
+
+    size = (canvas.width, canvas.height)
+    # whole where all pixels count that a value lies between
+    inside = cv2.warpPerspective(np.full(shape, 255, np.uint8), canvas.canvas_from_view, size, flags=cv2.INTER_LINEAR)
+    inside = inside == 255
+    begin, beyond = inside.argmax(axis=1), inside[:, ::-1].argmax(axis=1)
+    return np.stack([begin, np.where(inside.any(axis=1), canvas.width - beyond, 0)], axis=1).astype(np.int32)

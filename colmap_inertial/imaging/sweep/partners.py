@@ -1,0 +1,114 @@
+"""Which pictures are compared with which, and between which depths: by the sparse points that they share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.core.types import Array
+from colmap_inertial.imaging.sweep.pinhole import Pinhole
+
+#: The best angle between two rays to a point; below and above it, a point counts less by these widths. Small angles
+#: measure no depth, at large ones things look different and hide each other.
+_BEST_DEG, _BELOW_DEG, _ABOVE_DEG = 8.0, 4.0, 8.0
+#: What pictures must at least have in common, and how far apart their optical axes may be.
+_LEAST_SHARED, _MOST_TURN_DEG = 20, 50.0
+#: The range of depths: shares of the points at each end that are likeliest to be wrong, and what is added.
+_NEAR_SHARE, _FAR_SHARE = 0.005, 0.995
+_NEARER, _FARTHER = 0.75, 1.3
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Sights:
+    """Which view observes which sparse points.
+
+    Attributes
+    ----------
+    views
+        All pictures' cameras.
+    points
+        (P, 3) in the world.
+    of_view
+        For each view its points' numbers, each once.
+    of_point
+        (M,) views that observe point 0, then those of point 1, and so on;
+    first
+        (P + 1,) where each point's begin.
+    """
+
+    views: tuple[Pinhole, ...]
+    points: Array
+    of_view: tuple[NDArray[np.int64], ...]
+    of_point: NDArray[np.int64]
+    first: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, views: Sequence[Pinhole], points: Array, observed: Sequence[NDArray[np.int64]]) -> Sights:
+        """Of views and the numbers of the points that each of them observes."""
+        each = tuple(np.unique(numbers) for numbers in observed)
+        number = np.concatenate([np.zeros(0, dtype=np.int64), *each])
+        view = np.repeat(np.arange(len(each)), [len(numbers) for numbers in each])
+        first = np.searchsorted(np.sort(number), np.arange(len(points) + 1))
+        by_point = view[np.argsort(number, kind="stable")]
+        return cls(views=tuple(views), points=points, of_view=each, of_point=by_point, first=first)
+
+
+def depth_range(sights: Sights, view: int) -> tuple[float, float] | None:
+    """Nearest and farthest depth to try, by the points that a view observes; ``None`` where it has none before it."""
+    camera = sights.views[view]
+    rays = sights.points[sights.of_view[view]] - camera.cam_in_world
+    depths = rays @ camera.cam_from_world[2]
+    depths = depths[depths > 0]
+    if not len(depths):
+        return None
+    low, high = np.quantile(depths, (_NEAR_SHARE, _FAR_SHARE))
+    return float(_NEARER * low), float(_FARTHER * high)
+
+
+def partner_scores(sights: Sights, view: int) -> Array:
+    """(V,) how well each view is placed to measure what ``view`` sees; 0 where it is not.
+
+    The sum over shared points of a weight of the angle under which the two see the point, as MVSNet weighs
+    (Yao et al., ECCV 2018); it falls more slowly above the best angle than below.
+    """
+    camera, count = sights.views[view], len(sights.views)
+    numbers = sights.of_view[view]
+    lengths = sights.first[numbers + 1] - sights.first[numbers]
+    # each shared point with each view that observes it
+    point = np.repeat(numbers, lengths)
+    start = np.repeat(sights.first[numbers] - np.concatenate([[0], np.cumsum(lengths)[:-1]]), lengths)
+    other = sights.of_point[start + np.arange(len(point))]
+    centres = np.array([v.cam_in_world for v in sights.views])
+    here, there = camera.cam_in_world - sights.points[point], centres[other] - sights.points[point]
+    across = np.linalg.norm(np.cross(here, there), axis=1)
+    angle_deg = np.degrees(np.arctan2(across, np.sum(here * there, axis=1)))
+    width = np.where(angle_deg < _BEST_DEG, _BELOW_DEG, _ABOVE_DEG)
+    weight = np.exp(-0.5 * ((angle_deg - _BEST_DEG) / width) ** 2)
+    score = np.bincount(other, weight, count)
+    shared = np.bincount(other, minlength=count)
+    axes = np.array([v.cam_from_world[2] for v in sights.views])
+    near = axes @ camera.cam_from_world[2] >= np.cos(np.radians(_MOST_TURN_DEG))
+    apart = np.linalg.norm(centres - camera.cam_in_world, axis=1) > 0
+    return np.where((shared >= _LEAST_SHARED) & near & apart, score, 0.0)
+
+
+def chosen_partners(sights: Sights, view: int, scores: Array, count: int) -> tuple[int, ...]:
+    """The views to compare with: well placed, and on different sides.
+
+    One after the other, the best; a view in the direction of a chosen one counts less, by half where it is the same.
+    """
+    centres = np.array([v.cam_in_world for v in sights.views])
+    direction = centres - sights.views[view].cam_in_world
+    length = np.linalg.norm(direction, axis=1, keepdims=True)
+    direction = np.divide(direction, length, out=np.zeros_like(direction), where=length > 0)
+    left = scores.copy()
+    chosen: list[int] = []
+    while len(chosen) < count and left.max(initial=0.0) > 0:
+        best = int(np.argmax(left))
+        chosen.append(best)
+        left[best] = 0
+        left = left * (1 - 0.5 * (direction @ direction[best]) ** 2)
+    return tuple(chosen)

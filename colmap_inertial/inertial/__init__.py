@@ -1,0 +1,1 @@
+"""Estimators that use the accelerometer: scale, refinement, joining, calibration at rest."""

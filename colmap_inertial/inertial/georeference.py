@@ -1,0 +1,453 @@
+"""Where on Earth a metric model stands, by positions of a satellite receiver: heading and place, never the scale.
+
+A path in metres with gravity along an axis fits to positions by four numbers: a turn about the vertical and a shift.
+Errors of such positions are white in part, and in part alike over minutes; how much of each is not known beforehand.
+Both are taken from the recording: every pair of sizes and every length of time on a grid counts with its restricted
+likelihood (H. D. Patterson and R. Thompson, "Recovery of inter-block information when block sizes are unequal",
+Biometrika 1971) times a prior, and the result is the mean over all of them. So a short path does not pass for sure
+because its errors all point one way.
+
+A receiver's positions are those of a moment before. By how much they lag is one more number that the mean is taken
+over, with a prior: where the path turns or changes its pace it is found; on a straight walk its prior is part of the
+place's uncertainty.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.geometry import matrix_from_quat, rotation_between
+from colmap_inertial.core.quantiles import Z95
+from colmap_inertial.core.types import Array, HeightDatum, PositionFixes
+from colmap_inertial.core.types._checks import checked_array
+
+#: WGS84: semi-major axis and flattening.
+SEMI_MAJOR_M, FLATTENING = 6378137.0, 1 / 298.257223563
+_ECCENTRICITY2 = FLATTENING * (2 - FLATTENING)
+#: Sizes of the errors on the grid (standard deviation of each horizontal coordinate), and how long they are alike.
+_WHITE_M = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0)
+_SLOW_M = (0.02, 0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
+_ALIKE_S = (30.0, 100.0, 300.0)
+#: Prior of the slow errors: log-normal about what the receiver states, or about this, by this factor.
+_USUAL_SLOW_M = 2.0
+_SLOW_FACTOR = 2.5
+#: Prior of the time by which positions lag: what flight controllers take for receivers from their logs (.11 to .22 s:
+#: ArduPilot's u-blox driver, PX4's EKF2_GPS_DELAY), and .49 s measured of a GoPro (Race Technology); phones, which
+#: smooth, up to a second.
+_USUAL_DELAY_S, _DELAY_SIGMA_S = 0.3, 0.3
+#: Delays tried first, in standard deviations of the prior, and how many; then more closely where they are, so far to
+#: each side in their own standard deviations.
+_DELAY_SPAN, _DELAYS = (-3.0, 5.0), 33
+_CLOSER, _CLOSER_DELAYS = 5.0, 17
+#: How much larger errors of heights are.
+_VERTICAL = 1.5
+#: More positions than these are thinned out evenly: their errors are alike anyway.
+_MOST = 240
+#: Positions farther off than so many times the usual distance, and than so many metres, are left out.
+_OUTLIER_M = 3.0
+_OUTLIER, _ROUNDS = 5.0, 4
+#: A heading less certain than this says nothing.
+_LEAST_CERTAIN_DEG = 30.0
+#: Lengths of path and positions differ where their ratio is off by so many standard deviations, and by so much.
+_RATIO_SIGMAS, _LEAST_RATIO = 3.0, 0.03
+#: By so much, and the positions are of another path, or stood still.
+_LARGEST_RATIO = 0.5
+_FEWEST = 4
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Georeference:
+    """How a metric model stands on Earth.
+
+    East, north and up count from a point at ``latitude_deg``, ``longitude_deg``, ``height_m`` in its tangential plane:
+    ``enu = enu_from_world (3, 3) @ world + shift_m``.
+
+    Attributes
+    ----------
+    latitude_deg, longitude_deg, height_m
+        The point that east, north and up count from, WGS84.
+    height_above
+        What heights count from, as the positions have it; ``None`` where they hold no heights, and up then counts from
+        the model's own origin.
+    enu_from_world
+        (3, 3) rotation.
+    shift_m
+        (3,) east, north, up of the model's origin.
+    middle_in_world_m
+        (3,) the point of the model that ``cov`` holds for: the middle of the positions used.
+    cov
+        (4, 4) of the turn about the vertical (radians, anticlockwise from above) and of east, north and up (metres) of
+        ``middle_in_world_m``.
+    used, left_out
+        How many positions it rests on, and how many disagree with the rest.
+    residual_rms_m
+        Root mean square of each horizontal coordinate's residual.
+    white_m, slow_m
+        Sizes of the positions' errors from one to the next, and of those that are alike over ``alike_s``.
+    length_ratio, length_ratio_sigma
+        Lengths by the positions over lengths of the model: a check, never a correction.
+    delay_s, delay_sigma_s
+        By how much positions lag, and its standard deviation, at most that of the prior; ``None`` where there is no
+        path to compare with beside the instants of the positions.
+    notes
+        What the user should know.
+    """
+
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
+    height_above: HeightDatum | None
+    enu_from_world: Array
+    shift_m: Array
+    middle_in_world_m: Array
+    cov: Array
+    used: int
+    left_out: int
+    residual_rms_m: float
+    white_m: float
+    slow_m: float
+    alike_s: float
+    length_ratio: float
+    length_ratio_sigma: float
+    delay_s: float | None = None
+    delay_sigma_s: float | None = None
+    source: str = ""
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        at = (self.latitude_deg, self.longitude_deg, self.height_m)
+        if not (np.isfinite(at).all() and abs(at[0]) <= 90 and abs(at[1]) <= 360):
+            raise ValueError(f"latitude, longitude and height of {at} are no place on Earth")
+
+    @property
+    def heading_sigma_deg(self) -> float:
+        """Standard deviation of the turn about the vertical."""
+        return float(np.degrees(np.sqrt(self.cov[0, 0])))
+
+    @property
+    def position_sigma_m(self) -> float:
+        """Standard deviation of each horizontal coordinate of the middle."""
+        return float(np.sqrt(0.5 * (self.cov[1, 1] + self.cov[2, 2])))
+
+    def enu_m(self, world_m: Array) -> Array:
+        """(N, 3) east, north and up of points of the model."""
+        return np.asarray(world_m @ self.enu_from_world.T + self.shift_m)
+
+    def geodetic(self, world_m: Array) -> Array:
+        """(N, 3) latitude and longitude in degrees, and height in metres, of points of the model."""
+        return self.geodetic_of_ecef(self.ecef_m(world_m))
+
+    def ecef_m(self, world_m: Array) -> Array:
+        """(N, 3) earth-centred coordinates of points of the model."""
+        at = np.array([self.latitude_deg, self.longitude_deg, self.height_m])
+        return np.asarray(self.enu_m(world_m) @ ecef_from_enu(at[0], at[1]).T + ecef_of_geodetic(at[None])[0])
+
+    @staticmethod
+    def geodetic_of_ecef(ecef_m: Array) -> Array:
+        """(N, 3) latitude, longitude, height of earth-centred coordinates (Bowring's iteration)."""
+        x, y, z = ecef_m.T
+        across = np.hypot(x, y)
+        latitude = np.arctan2(z, across * (1 - _ECCENTRICITY2))
+        for _ in range(6):
+            sine = np.sin(latitude)
+            vertical = SEMI_MAJOR_M / np.sqrt(1 - _ECCENTRICITY2 * sine**2)
+            latitude = np.arctan2(z + _ECCENTRICITY2 * vertical * sine, across)
+        sine, cosine = np.sin(latitude), np.cos(latitude)
+        vertical = SEMI_MAJOR_M / np.sqrt(1 - _ECCENTRICITY2 * sine**2)
+        # along the normal of the ellipsoid, good at the poles, too
+        height = across * cosine + z * sine - SEMI_MAJOR_M**2 / vertical
+        return np.stack([np.degrees(latitude), np.degrees(np.arctan2(y, x)), height], axis=1)
+
+    def as_json(self) -> dict[str, object]:
+        """Plain values, for ``result.json`` and ``georeference.json``."""
+        return {
+            "crs": "east, north, up in metres in the tangential plane of WGS84 (EPSG:4979) at the origin",
+            "origin": {
+                "latitude_deg": self.latitude_deg,
+                "longitude_deg": self.longitude_deg,
+                "height_m": self.height_m,
+                "height_above": self.height_above,
+            },
+            "enu_from_world": self.enu_from_world.tolist(),
+            "shift_m": self.shift_m.tolist(),
+            "middle_in_world_m": self.middle_in_world_m.tolist(),
+            "cov": self.cov.tolist(),
+            "heading_ci95_deg": Z95 * self.heading_sigma_deg,
+            "position_ci95_m": Z95 * self.position_sigma_m,
+            "positions": {"used": self.used, "left_out": self.left_out, "source": self.source},
+            "residual_rms_m": self.residual_rms_m,
+            "errors": {"white_m": self.white_m, "slow_m": self.slow_m, "alike_s": self.alike_s},
+            "delay": None
+            if self.delay_s is None or self.delay_sigma_s is None
+            else {"seconds": self.delay_s, "ci95_s": Z95 * self.delay_sigma_s},
+            "length_ratio": self.length_ratio,
+            "length_ratio_sigma": self.length_ratio_sigma,
+            "notes": list(self.notes),
+        }
+
+
+def georeference_of_json(values: Mapping[str, Any]) -> Georeference:
+    """The value that :meth:`Georeference.as_json` came from; a missing or wrong entry raises as Python has it."""
+    origin, positions, errors = values["origin"], values["positions"], values["errors"]
+    delay = values.get("delay")  # version 0.1 has none
+    return Georeference(
+        latitude_deg=float(origin["latitude_deg"]),
+        longitude_deg=float(origin["longitude_deg"]),
+        height_m=float(origin["height_m"]),
+        height_above=origin["height_above"],
+        enu_from_world=checked_array("enu_from_world", values["enu_from_world"], (3, 3)),
+        shift_m=checked_array("shift_m", values["shift_m"], (3,)),
+        middle_in_world_m=checked_array("middle_in_world_m", values["middle_in_world_m"], (3,)),
+        cov=checked_array("cov", values["cov"], (4, 4)),
+        used=int(positions["used"]),
+        left_out=int(positions["left_out"]),
+        source=str(positions["source"]),
+        residual_rms_m=float(values["residual_rms_m"]),
+        white_m=float(errors["white_m"]),
+        slow_m=float(errors["slow_m"]),
+        alike_s=float(errors["alike_s"]),
+        length_ratio=float(values["length_ratio"]),
+        length_ratio_sigma=float(values["length_ratio_sigma"]),
+        delay_s=None if delay is None else float(delay["seconds"]),
+        delay_sigma_s=None if delay is None else float(delay["ci95_s"]) / Z95,
+        notes=tuple(map(str, values["notes"])),
+    )
+
+
+def ecef_of_geodetic(geodetic: Array) -> Array:
+    """(N, 3) earth-centred metres of latitude and longitude (degrees) and height above WGS84's ellipsoid (N, 3)."""
+    latitude, longitude = np.radians(geodetic[:, 0]), np.radians(geodetic[:, 1])
+    vertical = SEMI_MAJOR_M / np.sqrt(1 - _ECCENTRICITY2 * np.sin(latitude) ** 2)
+    across = (vertical + geodetic[:, 2]) * np.cos(latitude)
+    up = (vertical * (1 - _ECCENTRICITY2) + geodetic[:, 2]) * np.sin(latitude)
+    return np.stack([across * np.cos(longitude), across * np.sin(longitude), up], axis=1)
+
+
+def ecef_from_enu(latitude_deg: float, longitude_deg: float) -> Array:
+    """(3, 3) whose columns are east, north and up in earth-centred axes."""
+    s, c = math.sin(math.radians(latitude_deg)), math.cos(math.radians(latitude_deg))
+    t, k = math.sin(math.radians(longitude_deg)), math.cos(math.radians(longitude_deg))
+    return np.array([[-t, -s * k, c * k], [k, -s * t, c * t], [0.0, c, s]])
+
+
+def georeference(
+    fixes: PositionFixes,
+    cam_in_world_m: Array,
+    t_s: Array,
+    up_in_world: Array,
+    *,
+    path_at: Callable[[Array], Array] | None = None,
+) -> Georeference:
+    """Turn and shift that bring a metric path to positions of a satellite receiver.
+
+    Parameters
+    ----------
+    fixes
+        N positions.
+    cam_in_world_m
+        (N, 3) where the camera was at each of them, in the world of the metric model.
+    t_s
+        (N,) when, on any clock: errors are alike for a time.
+    up_in_world
+        (3,) unit vector against gravity.
+    path_at
+        Where the camera was at other instants (T,) of that clock, (T, 3): positions may then lag. Without, they do not.
+
+    Raises
+    ------
+    NotObservableError
+        Where the positions are too few, or leave the heading open.
+    """
+    if len(fixes.latitude_deg) < _FEWEST:
+        raise NotObservableError("heading", f"{len(fixes.latitude_deg)} positions are too few: {_FEWEST} are needed")
+    chosen = np.argsort(t_s, kind="stable")
+    chosen = chosen[np.unique(np.linspace(0, len(chosen) - 1, _MOST).round().astype(np.intp))]
+    fixes, path_m, t_s = fixes.select(chosen), np.asarray(cam_in_world_m)[chosen], np.asarray(t_s)[chosen]
+    heights = np.isfinite(fixes.height_m)
+    place = np.stack([fixes.latitude_deg, fixes.longitude_deg, np.where(heights, fixes.height_m, 0.0)], axis=1)
+    origin = np.array([np.median(place[:, 0]), place[0, 1], np.median(place[heights, 2]) if heights.any() else 0.0])
+    place[~heights, 2] = origin[2]
+    enu = (ecef_of_geodetic(place) - ecef_of_geodetic(origin[None])[0]) @ ecef_from_enu(origin[0], origin[1])
+    level_from_world = _level(up_in_world)
+    target = enu[:, 0] + 1j * enu[:, 1]
+
+    def level_at(delay_s: float) -> Array:
+        return np.asarray((path_m if path_at is None else path_at(t_s - delay_s)) @ level_from_world.T)
+
+    good = np.ones(len(target), dtype=bool)
+    for _ in range(_ROUNDS):
+        kept = good
+
+        def paths(delays_s: Array, kept: Array = kept) -> Array:
+            levels = [level_at(delay_s)[kept] for delay_s in delays_s]
+            return np.array([level[:, 0] + 1j * level[:, 1] for level in levels])
+
+        fit = _fit_delay(paths, target[good], t_s[good], fixes.sigma_m[good], lags=path_at is not None)
+        level = level_at(fit.delay_s)
+        flat = level[:, 0] + 1j * level[:, 1]
+        off = np.abs(target - np.exp(1j * fit.turn) * (flat - fit.middle) - fit.at)
+        keep = off < max(_OUTLIER * float(np.median(off)), _OUTLIER_M)
+        if (keep == good).all() or keep.sum() < _FEWEST:
+            break
+        good = keep
+    sigma = math.sqrt(fit.cov[0, 0])
+    reach_m = float(np.sqrt(np.mean(np.abs(flat[good] - flat[good].mean()) ** 2)))
+    if np.degrees(sigma) > _LEAST_CERTAIN_DEG:
+        raise NotObservableError(
+            "heading",
+            f"+-{np.degrees(Z95 * min(sigma, np.pi)):.0f} degrees: the path reaches {reach_m:.1f} m to either side, "
+            f"and the positions err by {math.hypot(fit.white_m, fit.slow_m):.1f} m; walk farther",
+        )
+    off_by = abs(fit.ratio - 1) if abs(fit.ratio - 1) > _RATIO_SIGMAS * fit.ratio_sigma else 0.0
+    if off_by > _LARGEST_RATIO:
+        raise NotObservableError(
+            "heading",
+            f"the positions are {fit.ratio:.2f} times as far apart as the model says: they are of another path, or the "
+            "receiver stood still while the camera moved",
+        )
+    cov = np.zeros((4, 4))
+    cov[:3, :3] = fit.cov
+    middle_level = np.array([fit.middle.real, fit.middle.imag, float(level[good, 2].mean())])
+    counted = good & heights
+    up_m = float(np.mean(enu[counted, 2] - level[counted, 2])) if counted.any() else 0.0
+    cov[3, 3] = (_VERTICAL**2) * max(fit.cov[1, 1], fit.cov[2, 2]) if counted.any() else 0.0
+    turned = np.array([[np.cos(fit.turn), -np.sin(fit.turn), 0], [np.sin(fit.turn), np.cos(fit.turn), 0], [0, 0, 1.0]])
+    at = np.array([fit.at.real, fit.at.imag, middle_level[2] + up_m])
+    enu_from_world = turned @ level_from_world
+    left = target[good] - np.exp(1j * fit.turn) * (flat[good] - fit.middle) - fit.at
+    notes = []
+    if off_by > _LEAST_RATIO:
+        notes.append(
+            f"the positions are {fit.ratio:.3f} times as far apart as the model says (+-{Z95 * fit.ratio_sigma:.3f}): "
+            "one of them is wrong; the model's scale was left as it is"
+        )
+    if counted.any() and fixes.height_above != "ellipsoid":
+        what = "the sea" if fixes.height_above == "sea" else "what the receiver took for zero"
+        notes.append(f"heights count from {what}, not from the ellipsoid; the two differ by up to 100 m")
+    return Georeference(
+        latitude_deg=float(origin[0]),
+        longitude_deg=float(origin[1]),
+        height_m=float(origin[2]),
+        height_above=fixes.height_above if counted.any() else None,
+        enu_from_world=enu_from_world,
+        shift_m=at - turned @ middle_level,
+        middle_in_world_m=level_from_world.T @ middle_level,
+        cov=cov,
+        used=int(good.sum()),
+        left_out=int((~good).sum()),
+        residual_rms_m=float(np.sqrt(np.mean(np.abs(left) ** 2) / 2)),
+        white_m=fit.white_m,
+        slow_m=fit.slow_m,
+        alike_s=fit.alike_s,
+        length_ratio=fit.ratio,
+        length_ratio_sigma=fit.ratio_sigma,
+        delay_s=None if path_at is None else fit.delay_s,
+        delay_sigma_s=None if path_at is None else fit.delay_sigma_s,
+        source=fixes.source,
+        notes=tuple(notes),
+    )
+
+
+# --- the pieces ------------------------------------------------------------------------------------------------------
+
+
+def _level(up_in_world: Array) -> Array:
+    """(3, 3) the shortest turn that brings up to z."""
+    return np.asarray(matrix_from_quat(rotation_between(up_in_world, np.array([0.0, 0.0, 1.0]))))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Fit:
+    """Turn about the vertical, where the point ``middle`` is (``at``), their covariance, errors' sizes, the delay."""
+
+    turn: float
+    middle: complex
+    at: complex
+    cov: Array
+    white_m: float
+    slow_m: float
+    alike_s: float
+    ratio: float
+    ratio_sigma: float
+    delay_s: float
+    delay_sigma_s: float
+
+
+def _fit_delay(paths: Callable[[Array], Array], target: Array, t_s: Array, stated_m: Array, *, lags: bool) -> _Fit:
+    """The mean over sizes of errors and delays; ``paths`` gives the path (T, N) by each of T delays."""
+    if not lags:
+        return _fit(paths(np.zeros(1)), np.zeros(1), target, t_s, stated_m)
+    delays_s = _USUAL_DELAY_S + _DELAY_SIGMA_S * np.linspace(*_DELAY_SPAN, _DELAYS)
+    for _ in range(_ROUNDS):
+        fit = _fit(paths(delays_s), delays_s, target, t_s, stated_m)
+        step_s = float(delays_s[1] - delays_s[0])
+        if fit.delay_sigma_s >= step_s:
+            break
+        half_s = max(_CLOSER * fit.delay_sigma_s, step_s)
+        delays_s = np.linspace(fit.delay_s - half_s, fit.delay_s + half_s, _CLOSER_DELAYS)
+    return fit
+
+
+def _fit(paths: Array, delays_s: Array, target: Array, t_s: Array, stated_m: Array) -> _Fit:
+    """The mean over all sizes of errors and the delays given; plane points as complex numbers."""
+    stated = stated_m[np.isfinite(stated_m) & (stated_m > 0)]
+    usual_m = float(np.median(stated)) if len(stated) else _USUAL_SLOW_M
+    # a receiver that is less sure of some positions than of others is right about that
+    relative = np.where(np.isfinite(stated_m) & (stated_m > 0), stated_m / usual_m, 1.0)
+    apart_s = np.abs(t_s[:, None] - t_s[None, :])
+    middle = complex(paths.mean())
+    about, logs_of_delay = paths - middle, -0.5 * ((delays_s - _USUAL_DELAY_S) / _DELAY_SIGMA_S) ** 2
+    sizes, found = [], []
+    for alike_s in _ALIKE_S:
+        # in units of each position's own error, and in axes in which all sizes are independent
+        values, axes = np.linalg.eigh(np.exp(-apart_s / alike_s))
+        one, z = axes.T @ (1 / relative), axes.T @ (target / relative)
+        p = (about / relative) @ axes
+        for white_m in _WHITE_M:
+            for slow_m in _SLOW_M:
+                var = white_m**2 + slow_m**2 * np.maximum(values, 0.0)
+                weight = 1 / var
+                total = float(np.sum(weight * one**2))
+                shift_p, shift_z = p @ (weight * one) / total, complex(np.sum(weight * one * z)) / total
+                q, y = p - shift_p[:, None] * one, z - shift_z * one
+                length = np.maximum(np.abs(q) ** 2 @ weight, 1e-12)
+                along = np.conj(q) @ (weight * y)
+                turn = np.where(np.abs(along) > 0, along / np.maximum(np.abs(along), 1e-300), 1.0)
+                left = float(np.sum(weight * np.abs(y) ** 2)) + length - 2 * np.abs(along)
+                log = -float(np.sum(np.log(var))) - 0.5 * left - math.log(total) - 0.5 * np.log(length) + logs_of_delay
+                log -= 0.5 * (math.log(slow_m / usual_m) / math.log(_SLOW_FACTOR)) ** 2
+                # where the path's middle is; its error and the turn's are not independent
+                at, arm = shift_z - turn * shift_p, -1j * turn * shift_p / np.sqrt(length)
+                sizes.append((white_m, slow_m, alike_s))
+                found.append((log, turn, at, arm, length, np.full(len(log), total), np.abs(along) / length))
+    logs = np.array([one[0] for one in found])
+    share = np.exp(logs - logs.max())
+    share /= share.sum()
+    turns, ats, arms, lengths, totals, ratios = (np.array([one[k] for one in found]) for k in range(1, 7))
+    mean_turn, mean_at = float(np.angle(np.sum(share * turns))), complex(np.sum(share * ats))
+    apart = np.stack([np.angle(turns * np.exp(-1j * mean_turn)), (ats - mean_at).real, (ats - mean_at).imag])
+    arm3 = np.stack([1 / np.sqrt(lengths), arms.real, arms.imag])
+    cov = np.einsum("kt,ikt,jkt->ij", share, arm3, arm3) + np.einsum("kt,ikt,jkt->ij", share, apart, apart)
+    cov += np.diag([0.0, 1.0, 1.0]) * float(np.sum(share / totals))
+    delay_s = float(np.sum(share * delays_s))
+    ratio = float(np.sum(share * ratios))
+    best = sizes[int(np.argmax(logs.max(axis=1)))]
+    return _Fit(
+        turn=mean_turn,
+        middle=middle,
+        at=mean_at,
+        cov=0.5 * (cov + cov.T),
+        white_m=best[0],
+        slow_m=best[1],
+        alike_s=best[2],
+        ratio=ratio,
+        ratio_sigma=math.sqrt(float(np.sum(share * (1 / lengths + (ratios - ratio) ** 2)))),
+        delay_s=delay_s,
+        delay_sigma_s=math.sqrt(float(np.sum(share * (delays_s - delay_s) ** 2))),
+    )

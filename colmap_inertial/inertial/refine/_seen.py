@@ -1,0 +1,263 @@
+"""Residuals of observations, each at its own line's instant, with their derivatives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.core.geometry import Array, cross, skew, so3_exp
+from colmap_inertial.core.gyro import GyroPath
+from colmap_inertial.core.types import CameraModel
+from colmap_inertial.inertial.refine.values import (
+    CLOCK_RATE,
+    FIRST_INTRINSIC,
+    LEVER,
+    N_SEEN,
+    OFFSET,
+    POSITION,
+    READOUT,
+    ROTATION,
+    THETA,
+    VELOCITY,
+    Estimate,
+    FreeCamera,
+    Index,
+    Observations,
+    Problem,
+    Turning,
+)
+from colmap_inertial.inertial.scale._preintegration import Tracks
+from colmap_inertial.model import colmap_camera
+
+#: Steps of the differences that the camera models are differentiated by, relative to the depth and to a number.
+_STEP = 1e-6
+#: Where the readings' rotation is looked up around a node, in half spans.
+_KNOTS = np.array([-1.0, -0.6, -0.2, 0.2, 0.6, 1.0])
+
+
+def turning_around(nodes_s: Array, tracks: Tracks, half_span_s: float) -> Turning:
+    """The readings' rotation and force within ``half_span_s`` of each node."""
+    path = GyroPath(tracks.gyro.t_s, tracks.gyro.value, np.zeros(3))
+    since_s = half_span_s * _KNOTS
+    times_s = nodes_s[:, None] + since_s
+    count = len(nodes_s)
+    turn = path.turn_rad(np.repeat(nodes_s, len(since_s)), times_s.ravel()).reshape(count, len(since_s), 3)
+    # five powers through six knots: the middle of the polynomial is zero by itself
+    powers = np.linalg.pinv(_KNOTS[:, None] ** np.arange(1, 6)) @ turn
+    powers = powers / half_span_s ** np.arange(1, 6)[:, None]
+    force = tracks.accel.at(times_s.ravel())[0].reshape(count, len(since_s), 3).mean(axis=1)
+    return Turning(powers=powers, force_m_s2=force, half_span_s=half_span_s)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Poses:
+    """Where the IMU was when each of M lines was exposed."""
+
+    since_s: Array  # (M,) after the frame's node
+    reading: Array  # (M, 3) rotation vector since then, by the readings
+    vector: Array  # (M, 3) the same less their errors
+    turn: Array  # (M, 3, 3) and as a matrix
+    rate: Array  # (M, 3) at that instant, body frame
+    world_from_imu: Array  # (M, 3, 3)
+    imu_in_world_m: Array  # (M, 3)
+    velocity_m_s: Array  # (M, 3)
+    force: Array  # (M, 3) body frame at the node
+
+    def of(self, index: Index) -> Poses:
+        """Those of other observations, by number."""
+        return Poses(**{one.name: getattr(self, one.name)[index] for one in fields(self)})
+
+
+def poses_at(problem: Problem, x: Estimate, frame: Index, line: Array) -> Poses:
+    """The IMU's poses at lines of frames: from the frame's state by the readings around it."""
+    world_from_imu, position, velocity = x.world_from_imu[frame], x.imu_in_world_m[frame], x.velocity_m_s[frame]
+    if problem.inertial is None:
+        still = np.zeros((len(frame), 3))
+        eye = np.broadcast_to(np.eye(3), world_from_imu.shape)
+        return Poses(
+            since_s=np.zeros(len(frame)),
+            reading=still,
+            vector=still,
+            turn=eye,
+            rate=still,
+            world_from_imu=world_from_imu,
+            imu_in_world_m=position,
+            velocity_m_s=still,
+            force=still,
+        )
+    turning = problem.inertial.turning
+    since_s = line * x.readout_s - x.offset_s - x.clock_rate * since_middle_s(problem, frame)
+    powers, t = turning.powers[frame], since_s[:, None]
+    reading, rate = np.zeros((len(frame), 3)), np.zeros((len(frame), 3))
+    for k in range(4, -1, -1):
+        rate = rate * t + (k + 1) * powers[:, k]
+        reading = (reading + powers[:, k]) * t
+    gain = np.eye(3) + x.gyro_gain
+    bias = x.gyro_bias_rad_s[frame]
+    vector = reading @ gain.T - bias * t
+    rate = rate @ gain.T - bias
+    # the derivative of a rotation vector, seen in the body: Jr, to the second order of an angle of a few degrees
+    turned = cross(vector, rate)
+    rate = rate - 0.5 * turned + cross(vector, turned) / 6
+    turn = so3_exp(vector)
+    force = turning.force_m_s2[frame] @ (np.eye(3) + x.accel_gain).T - x.accel_bias_m_s2[frame]
+    accel = np.einsum("nij,nj->ni", world_from_imu, force) + x.gravity_m_s2 * problem.inertial.down
+    return Poses(
+        since_s=since_s,
+        reading=reading,
+        vector=vector,
+        turn=turn,
+        rate=rate,
+        world_from_imu=world_from_imu @ turn,
+        imu_in_world_m=position + velocity * t + 0.5 * accel * t**2,
+        velocity_m_s=velocity + accel * t,
+        force=force,
+    )
+
+
+def since_middle_s(problem: Problem, frame: Index) -> Array:
+    """(M,) of frames' nodes, for the clock rate."""
+    if problem.inertial is None:
+        return np.zeros(len(frame))
+    return problem.inertial.nodes_s[frame] - problem.inertial.middle_s
+
+
+def camera_of(free: FreeCamera, numbers: Array) -> CameraModel:
+    """The camera with other values of its free numbers."""
+    params = np.array(free.model.params)
+    params[list(free.free)] = numbers
+    return replace(free.model, params=tuple(params))
+
+
+def cameras_of(problem: Problem, x: Estimate) -> list[CameraModel]:
+    """The cameras at an estimate."""
+    first = np.cumsum([0, *(len(free.free) for free in problem.cameras)])
+    return [camera_of(free, x.intrinsics[first[i] : first[i + 1]]) for i, free in enumerate(problem.cameras)]
+
+
+def _by_camera(problem: Problem, observations: Observations) -> list[NDArray[np.intp]]:
+    """Which observations each camera made."""
+    if len(problem.cameras) == 1:
+        return [np.arange(len(observations.frame))]
+    of = problem.camera_of[observations.frame]
+    return [np.flatnonzero(of == i) for i in range(len(problem.cameras))]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Projected:
+    """M observations at an estimate, in px.
+
+    Attributes
+    ----------
+    residual
+        (M, 2) predicted less measured; zero where a point cannot be seen.
+    seen
+        (M,) whether it can be.
+    """
+
+    residual: Array
+    seen: NDArray[np.bool_]
+    in_imu: Array
+    in_cam: Array
+    poses: Poses
+
+
+def project(problem: Problem, x: Estimate, observations: Observations) -> Projected:
+    """Where the points are predicted."""
+    if np.any(observations.line != 0):
+        poses = poses_at(problem, x, observations.frame, observations.line)
+    else:
+        frames = np.arange(len(x.velocity_m_s))
+        poses = poses_at(problem, x, frames, np.zeros(len(frames))).of(observations.frame)
+    away = x.points_m[observations.point] - poses.imu_in_world_m
+    in_imu = np.einsum("nji,nj->ni", poses.world_from_imu, away)
+    in_cam = in_imu @ x.cam_from_imu.T + x.imu_in_cam_m
+    predicted = np.empty((len(away), 2))
+    for model, mine in zip(cameras_of(problem, x), _by_camera(problem, observations), strict=True):
+        predicted[mine] = colmap_camera(model).img_from_cam(in_cam[mine])
+    seen: NDArray[np.bool_] = np.all(np.isfinite(predicted), axis=1)
+    residual = np.where(seen[:, None], predicted - observations.xy_px, 0.0)
+    return Projected(residual=residual, seen=seen, in_imu=in_imu, in_cam=in_cam, poses=poses)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Derivatives:
+    """(M, 2, ...) of observations by nine numbers of the frame's state, by what is shared, and by the point."""
+
+    by_frame: Array
+    by_shared: Array
+    by_point: Array
+
+
+def derivatives(problem: Problem, x: Estimate, observations: Observations, at: Projected) -> Derivatives:
+    """Derivatives of :func:`project`, px.
+
+    What biases and the accelerometer's gains do within a readout is left out: a thousandth of a pixel.
+    """
+    count, poses = len(observations.frame), at.poses
+    by_cam, by_intrinsics = np.zeros((count, 2, 3)), np.zeros((count, 2, len(x.intrinsics)))
+    place = 0
+    for free, model, mine in zip(
+        problem.cameras, cameras_of(problem, x), _by_camera(problem, observations), strict=True
+    ):
+        in_cam = at.in_cam[mine]
+        by_cam[mine] = _by_direction(model, in_cam)
+        for k in range(len(free.free)):
+            by_intrinsics[mine, :, place + k] = _by_number(model, free.free[k], in_cam)
+        place += len(free.free)
+    # beside the camera, a step of the difference may see nothing
+    lost = ~at.seen | ~np.isfinite(by_cam).all(axis=(1, 2)) | ~np.isfinite(by_intrinsics).all(axis=(1, 2))
+    by_cam[lost], by_intrinsics[lost] = 0.0, 0.0
+    by_imu = by_cam @ x.cam_from_imu
+    by_point = np.einsum("nri,nji->nrj", by_imu, poses.world_from_imu)
+    t = poses.since_s[:, None, None]
+    by_frame = np.empty((count, 2, N_SEEN))
+    # X_imu = turn' Exp(-theta) R' (X - p): by theta turn' [R' (X - p)]x, and what turns the force
+    before = np.einsum("nij,nj->ni", poses.turn, at.in_imu) + 0.5 * poses.since_s[:, None] ** 2 * poses.force
+    by_frame[:, :, THETA] = np.einsum("nri,nji->nrj", by_imu, poses.turn) @ skew(before)
+    by_frame[:, :, POSITION] = -by_point
+    by_frame[:, :, VELOCITY] = -t * by_point
+    moving = -cross(poses.rate, at.in_imu) - np.einsum("nji,nj->ni", poses.world_from_imu, poses.velocity_m_s)
+    by_time = np.einsum("nri,ni->nr", by_imu, moving)
+    rolling = bool(np.any(observations.line != 0))
+    by_shared = np.zeros((count, 2, x.columns.gyro_gain.stop if rolling else x.columns.seen.stop))
+    by_shared[:, :, ROTATION] = -by_cam @ skew(at.in_cam - x.imu_in_cam_m)
+    by_shared[:, :, LEVER] = by_cam
+    by_shared[:, :, OFFSET] = -by_time
+    by_shared[:, :, CLOCK_RATE] = -since_middle_s(problem, observations.frame)[:, None] * by_time
+    by_shared[:, :, READOUT] = observations.line[:, None] * by_time
+    by_shared[:, :, FIRST_INTRINSIC : x.columns.seen.stop] = by_intrinsics
+    if rolling:
+        # Jr, to the second order of an angle of a few degrees
+        turned = skew(poses.vector)
+        right = np.eye(3) - 0.5 * turned + turned @ turned / 6
+        by_vector = by_imu @ (skew(at.in_imu) @ right)
+        by_gain = by_vector[:, :, :, None] * poses.reading[:, None, None, :]
+        by_shared[:, :, x.columns.gyro_gain] = by_gain.reshape(count, 2, 9)
+    return Derivatives(by_frame=by_frame, by_shared=by_shared, by_point=by_point)
+
+
+def _by_direction(model: CameraModel, in_cam: Array) -> Array:
+    """(M, 2, 3) of pixels by points in the camera frame; along the ray nothing changes."""
+    camera, depth = colmap_camera(model), in_cam[:, 2:]
+    out = np.empty((len(in_cam), 2, 3))
+    for axis in range(2):
+        step = np.zeros((len(in_cam), 3))
+        step[:, axis] = _STEP * depth[:, 0]
+        ahead, behind = (np.asarray(camera.img_from_cam(in_cam + sign * step)) for sign in (1, -1))
+        out[:, :, axis] = (ahead - behind) / (2 * _STEP * depth)
+    out[:, :, 2] = -(out[:, :, 0] * in_cam[:, :1] + out[:, :, 1] * in_cam[:, 1:2]) / depth
+    return out
+
+
+def _by_number(model: CameraModel, place: int, in_cam: Array) -> Array:
+    """(M, 2) of pixels by one of the camera's numbers."""
+    step = _STEP * max(abs(model.params[place]), 1.0)
+    ends = []
+    for sign in (1, -1):
+        params = list(model.params)
+        params[place] += sign * step
+        ends.append(np.asarray(colmap_camera(replace(model, params=tuple(params))).img_from_cam(in_cam)))
+    return (ends[0] - ends[1]) / (2 * step)

@@ -1,0 +1,263 @@
+"""Normal equations of the refinement: points taken out, frames in a band, what is shared as its border."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from colmap_inertial._kernels import _inertial
+from colmap_inertial.core.geometry import Array
+from colmap_inertial.inertial.refine._banded import BandFactor
+from colmap_inertial.inertial.refine._inertial import Rows
+from colmap_inertial.inertial.refine._seen import Derivatives
+from colmap_inertial.inertial.refine.motion import Moving
+from colmap_inertial.inertial.refine.values import N_SEEN, N_STATE, POSITION, Index, Observations
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Order:
+    """In which order the frames stand in the band, and how wide it is.
+
+    Attributes
+    ----------
+    place
+        (F,) of each frame.
+    width
+        Numbers below the diagonal.
+    """
+
+    place: Index
+    width: int
+
+    @classmethod
+    def of(cls, observations: Observations, frames: int) -> Order:
+        """In order of time, or by Cuthill and McKee's rule where that is narrower, as it is where loops close."""
+        from scipy.sparse import coo_array, csr_array
+        from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+        ones = np.ones(len(observations.frame), dtype=np.int32)
+        shape = (frames, int(observations.point[-1]) + 1)
+        sees = csr_array(coo_array((ones, (observations.frame, observations.point)), shape=shape))
+        following = np.arange(frames - 1)
+        chain = coo_array((np.ones(frames - 1, dtype=np.int32), (following, following + 1)), shape=(frames, frames))
+        together = csr_array(sees @ sees.T + chain + chain.T)
+        row, column = together.nonzero()
+        time = np.arange(frames)
+        other = np.empty(frames, dtype=np.int64)
+        other[reverse_cuthill_mckee(together, symmetric_mode=True)] = time
+        reach, other_reach = (int(np.max(np.abs(place[row] - place[column]))) for place in (time, other))
+        place, reach = (other, other_reach) if other_reach < 0.8 * reach else (time, reach)
+        return cls(place=place.astype(np.int64), width=min((reach + 1) * N_STATE, frames * N_STATE) - 1)
+
+    @property
+    def size_bytes(self) -> int:
+        """Memory of the band."""
+        return 8 * N_STATE * len(self.place) * (self.width + 1)
+
+
+@dataclass(eq=False, kw_only=True)
+class System:
+    """``H step = rhs`` without the points.
+
+    Attributes
+    ----------
+    order
+        Of the frames.
+    band
+        (15 F, width + 1) lower triangle of the states' part, column by column.
+    border
+        (15 F, Q) states against what is shared.
+    corner
+        (Q, Q).
+    rhs, rhs_shared
+        (15 F,), (Q,) minus the gradient.
+    inverse, pull
+        (P, 3, 3) inverses of the points' own blocks, (P, 3) their right-hand sides.
+    """
+
+    order: Order
+    band: Array
+    border: Array
+    corner: Array
+    rhs: Array
+    rhs_shared: Array
+    inverse: Array
+    pull: Array
+
+    @classmethod
+    def build(
+        cls,
+        order: Order,
+        observations: Observations,
+        by: Derivatives,
+        residual: Array,
+        rows: dict[str, Rows],
+        prior: tuple[Array, Array],
+        *,
+        damping: float,
+    ) -> System:
+        """Of weighted observations, of all other residuals, and of the prior's information and right-hand side."""
+        frames, points, shared = len(order.place), len(observations.first) - 1, len(prior[1])
+        n, seen = frames * N_STATE, by.by_shared.shape[2]
+        band, border = np.zeros((n, order.width + 1)), np.zeros((n, seen))
+        corner, rhs, rhs_shared = np.zeros((seen, seen)), np.zeros(n), np.zeros(seen)
+        inverse, pull = np.empty((points, 3, 3)), np.empty((points, 3))
+        inside = _inertial.reduce_points(
+            first=observations.first,
+            column=N_STATE * order.place[observations.frame],
+            by_frame=by.by_frame,
+            by_shared=by.by_shared,
+            by_point=by.by_point,
+            residual=residual,
+            damping=damping,
+            band=band,
+            border=border,
+            corner=corner,
+            rhs=rhs,
+            rhs_shared=rhs_shared,
+            inverse=inverse,
+            pull=pull,
+        )
+        if not inside:
+            raise ValueError("two frames see one point, and the order of frames does not know it")
+        system = cls(
+            order=order,
+            band=band,
+            border=np.concatenate([border, np.zeros((n, shared - seen))], axis=1),
+            corner=prior[0].copy(),
+            rhs=rhs,
+            rhs_shared=prior[1].copy(),
+            inverse=inverse,
+            pull=pull,
+        )
+        system.corner[:seen, :seen] += corner
+        system.rhs_shared[:seen] += rhs_shared
+        for one in rows.values():
+            system._add(one)
+        band[:, 0] *= 1 + damping
+        system.corner[np.diag_indices(shared)] *= 1 + damping
+        return system
+
+    def _add(self, rows: Rows) -> None:
+        count, at = len(rows.residual), N_STATE * self.order.place
+        self._add_block(at[:count], at[:count], rows.here.transpose(0, 2, 1) @ rows.here)
+        self._pull(at[:count], rows.here, rows)
+        if rows.after is not None:
+            self._add_block(at[1:], at[1:], rows.after.transpose(0, 2, 1) @ rows.after)
+            self._add_block(at[1:], at[:count], rows.after.transpose(0, 2, 1) @ rows.here)
+            self._pull(at[1:], rows.after, rows)
+        if rows.by_shared is not None:
+            flat = rows.by_shared.reshape(-1, rows.by_shared.shape[2])
+            self.corner += flat.T @ flat
+            self.rhs_shared -= flat.T @ rows.residual.ravel()
+
+    def _pull(self, at: Index, derivative: Array, rows: Rows) -> None:
+        """Add right-hand side and border of states at (N,) columns; no column comes twice."""
+        columns = at[:, None] + np.arange(N_STATE)
+        self.rhs[columns] -= np.einsum("nri,nr->ni", derivative, rows.residual)
+        if rows.by_shared is not None:
+            self.border[columns] += derivative.transpose(0, 2, 1) @ rows.by_shared
+
+    def _add_block(self, row: Index, column: Index, block: Array) -> None:
+        """Add (N, 15, 15) at (N,) rows and columns, either triangle of the matrix."""
+        i = (row[:, None, None] + np.arange(N_STATE)[:, None]) + np.zeros((1, 1, N_STATE), dtype=np.int64)
+        j = (column[:, None, None] + np.arange(N_STATE)) + np.zeros((1, N_STATE, 1), dtype=np.int64)
+        same = (row == column)[:, None, None]
+        keep = np.broadcast_to(~same, i.shape) | (i >= j)
+        low, high = np.minimum(i, j)[keep], np.maximum(i, j)[keep]
+        self.band[low, high - low] += block[keep]
+
+    def factored(self) -> Factored:
+        """The system solved for.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            Where it is not positive definite.
+        """
+        from scipy.linalg import cho_factor
+
+        states = BandFactor.of(self.band, N_STATE)
+        solved = states.solve(self.border)
+        corner: Any = cho_factor(self.corner - self.border.T @ solved, lower=True, check_finite=False)
+        return Factored(order=self.order, states=states, border=self.border, solved=solved, corner=corner)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Factored:
+    """A system that was factored; its matrix was used up."""
+
+    order: Order
+    states: BandFactor
+    border: Array
+    solved: Array
+    corner: Any
+
+    def solve(self, rhs: Array, rhs_shared: Array) -> tuple[Array, Array]:
+        """States (15 F, k) in the band's order and shared numbers (Q, k) for k right-hand sides."""
+        from scipy.linalg import cho_solve
+
+        shared = np.asarray(cho_solve(self.corner, rhs_shared - self.solved.T @ rhs, check_finite=False))
+        return self.states.solve(rhs) - self.solved @ shared, shared
+
+    def step(self, system: System, observations: Observations, by: Derivatives) -> tuple[Array, Array, Array]:
+        """The step of the states (F, 15), of what is shared (Q,), and of the points (P, 3)."""
+        states, shared = self.solve(system.rhs[:, None], system.rhs_shared[:, None])
+        moved = states[:, 0].reshape(-1, N_STATE)[self.order.place]
+        along = np.einsum("nri,ni->nr", by.by_frame, moved[observations.frame, :N_SEEN])
+        along += by.by_shared @ shared[: by.by_shared.shape[2], 0]
+        pulled = np.add.reduceat(np.einsum("nri,nr->ni", by.by_point, along), observations.first[:-1], axis=0)
+        return moved, shared[:, 0], np.einsum("pij,pj->pi", system.inverse, system.pull - pulled)
+
+    def position_sigmas(self, by_position: Array) -> Array:
+        """(k,) standard deviations of numbers with derivatives (k, F, 3) by the frames' positions."""
+        count, frames, _ = by_position.shape
+        sides = np.zeros((count, frames, N_STATE))
+        sides[:, self.order.place, POSITION] = by_position
+        rhs = sides.reshape(count, -1).T
+        states, _ = self.solve(rhs, np.zeros((len(self.corner[0]), count)))
+        return np.sqrt(np.einsum("nk,nk->k", rhs, states))
+
+    def centres_cov(self, frames: Index, by: Moving) -> Array:
+        """(3 K, 3 K) covariance of the camera's centres in K frames, all together."""
+        count, place = len(frames), self.order.place
+        sides = np.zeros((count, 3, len(place), N_STATE))
+        sides[np.arange(count)[:, None], np.arange(3), place[frames][:, None]] = by.by_state[frames, :3]
+        rhs, rhs_shared = sides.reshape(3 * count, -1).T, by.by_shared[frames, :3].reshape(3 * count, -1).T
+        states, shared = self.solve(rhs, rhs_shared)
+        return np.asarray(rhs.T @ states + rhs_shared.T @ shared)
+
+    def motion_covs(self, frames: Index, by: Moving) -> Array:
+        """(K, 6, 6) covariances of K frames' positions against the first frame's, and velocities."""
+        from scipy.linalg import cho_solve
+
+        place, shared = self.order.place, len(self.corner[0])
+        at, first = place[frames], N_STATE * place[0]
+        unit = np.zeros((len(self.solved), N_STATE))
+        unit[first : first + N_STATE] = np.eye(N_STATE)
+        beside = self.states.solve(unit).reshape(-1, N_STATE, N_STATE)
+        here, start = by.by_state[frames], by.by_state[0, :3]
+        cov = here @ self.states.marginals(N_STATE)[at] @ here.transpose(0, 2, 1)
+        across = here @ beside[at] @ start.T
+        cov[:, :, :3] -= across
+        cov[:, :3] -= across.transpose(0, 2, 1)
+        cov[:, :3, :3] += start @ beside[place[0]] @ start.T
+        followed = self.solved.reshape(-1, N_STATE, shared)
+        left = by.by_shared[frames] - here @ followed[at]
+        left[:, :3] -= by.by_shared[0, :3] - start @ followed[place[0]]
+        flat = left.reshape(-1, shared)
+        cov += left @ np.asarray(cho_solve(self.corner, flat.T, check_finite=False)).T.reshape(left.shape).transpose(
+            0, 2, 1
+        )
+        # against itself, the first one is sure, and not but for rounding
+        cov[frames == 0, :3] = 0.0
+        cov[frames == 0, :, :3] = 0.0
+        return np.asarray(0.5 * (cov + cov.transpose(0, 2, 1)))
+
+    def shared_cov(self) -> Array:
+        """(Q, Q) covariance of what is shared."""
+        from scipy.linalg import cho_solve
+
+        return np.asarray(cho_solve(self.corner, np.eye(len(self.corner[0])), check_finite=False))

@@ -1,0 +1,339 @@
+"""The refinement of a model, and whether it is believed: by observations that it has not seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.types import Array
+from colmap_inertial.inertial.refine._system import Factored, Order
+from colmap_inertial.inertial.refine.levels import with_measured_noise
+from colmap_inertial.inertial.refine.motion import Moving, moving
+from colmap_inertial.inertial.refine.setup import at_middle_lines, measured_noise, pictures_alone, with_noise
+from colmap_inertial.inertial.refine.solve import Solution, factored, held_out, solve
+from colmap_inertial.inertial.refine.values import READOUT, Estimate, Observations, Problem
+
+#: Every so many observations of points with at least so many is held out.
+_EVERY, _FEWEST = 10, 4
+#: A readout that was not declared is one where it is longer, and so many standard deviations long.
+_LEAST_READOUT_S, _SURE_SIGMA = 1e-3, 3.0
+#: Frames whose covariance is told.
+_MOST_COVS = 400
+#: Length of a part of the path whose drift is told.
+_PART_S = 10.0
+#: Of the normal equations; more would take hours, too.
+_MOST_BYTES = 2_000_000_000
+#: What the IMU costs, over what chance makes of it.
+_LARGEST_CHI2 = 3.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stretched:
+    """By how much a part of the path was stretched against the whole.
+
+    Attributes
+    ----------
+    begin_s, end_s
+        Of the part, camera clock.
+    percent
+        Its size in the refined model over that before, less one; both models of one overall size.
+    sigma_percent
+        Standard deviation of what is left of its drift.
+    end_sigma_m
+        Of the position at its end against the first one's, along the world's axes.
+    """
+
+    begin_s: float
+    end_s: float
+    percent: float
+    sigma_percent: float
+    end_sigma_m: tuple[float, ...]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Judged:
+    """What a refinement came to.
+
+    Attributes
+    ----------
+    estimate
+        The refined poses, points and calibration, of all observations; of the start where it is not believed.
+    accepted, reason
+        Whether it is believed, and why not, in words.
+    held_out
+        How many observations.
+    before_px, after_px
+        Their robust error: root of the mean square, of a model of pictures alone and of the refined one.
+    change, change_sigma
+        Mean change of their robust costs (in half squares over variances), and its standard deviation.
+    chi2
+        What the IMU adds to the sum of squares (its own squares at least), over its degrees of freedom.
+    sigma_px
+        Standard deviation of an observation.
+    accel_noise_m_s2_rthz
+        White noise of the accelerometer, as the refinement found it; as it was known where it did not come so far.
+    shared_cov
+        (Q, Q) covariance of what is shared; ``None`` where it is not believed.
+    drift
+        How the scale changed along the path; empty where it is not believed.
+    velocity_m_s
+        (F, 3) of the camera's centre in the world; nan where the IMU says nothing of it, and where it is not believed.
+    motion_covs
+        (6, 6) covariances of position against the first frame's and of velocity, by frames: all, or evenly chosen
+        ones.
+    readout
+        One that was not declared (s), and its standard deviation; ``None`` where it was, or nothing was found.
+    steps
+        Of all solutions.
+    """
+
+    estimate: Estimate
+    accepted: bool
+    reason: str
+    held_out: int
+    before_px: float
+    after_px: float
+    change: float
+    change_sigma: float
+    chi2: float
+    sigma_px: float
+    accel_noise_m_s2_rthz: float
+    shared_cov: Array | None
+    drift: tuple[Stretched, ...]
+    velocity_m_s: Array
+    motion_covs: dict[int, Array]
+    readout: tuple[float, float] | None
+    steps: int
+
+
+def refine(
+    problem: Problem, start: Estimate, at_once_px: Array, t_s: Array, *, readout_declared: bool = True
+) -> Judged:
+    """Refine, without a tenth of the observations first; with all of them where that predicts the tenth.
+
+    Parameters
+    ----------
+    problem, start
+        Of the model; the observations' standard deviation is measured.
+    at_once_px
+        (M, 2) observations as COLMAP's model has them: what pictures alone are judged by.
+    t_s
+        (F,) times of the frames; nan without one.
+    readout_declared
+        Otherwise the images were not rectified: where they turn out to have one, the model stays as it is.
+
+    Raises
+    ------
+    NotObservableError
+        Where it would take too much memory.
+    """
+    needed = Order.of(problem.observations, len(t_s)).size_bytes
+    if needed > _MOST_BYTES:
+        why = f"frames far apart see the same points, and solving for all at once takes {1e-9 * needed:.1f} GB"
+        raise NotObservableError("refinement", why)
+    alone = pictures_alone(problem, at_once_px)
+    noise = measured_noise(alone, start)
+    problem, alone = (with_noise(one, noise) for one in (problem, alone))
+    kept = ~_chosen(problem.observations)
+    seen_alone, seen = solve(_part(alone, kept), start), solve(_part(problem, kept), start)
+    # pictures alone may fit worse than with a rolling shutter: the IMU's own squares are the least that it costs
+    freedom = _freedom(problem)
+    chi2 = max(2 * (seen.cost - seen_alone.cost), seen.squares["imu"]) / freedom
+    steps = seen_alone.steps + seen.steps
+    if seen.converged and chi2 <= _LARGEST_CHI2:
+        # a false IMU would find itself noisy: it is judged by what was known before
+        problem = _measured(problem, kept, seen.estimate)
+        seen = solve(_part(problem, kept), seen.estimate)
+        steps += seen.steps
+    before = held_out(alone, seen_alone.estimate, alone.observations.select(~kept))
+    after = held_out(problem, seen.estimate, problem.observations.select(~kept))
+    change, count = after - before, len(before)
+    mean = float(change.mean()) if count else 0.0
+    spread = float(change.std(ddof=1) / count**0.5) if count > 1 else np.inf
+    readout = None if readout_declared or not seen.converged else _readout(_part(problem, kept), seen.estimate)
+    reason = _rolling(readout) or _doubt(seen_alone, seen, chi2, mean, spread) or _too_late(problem, seen.estimate)
+    assert problem.inertial is not None
+    final = start
+    cov: Array | None = None
+    drift: tuple[Stretched, ...] = ()
+    velocity_m_s = np.full_like(start.velocity_m_s, np.nan)
+    motion_covs: dict[int, Array] = {}
+    if not reason:
+        whole = solve(problem, seen.estimate)
+        steps += whole.steps
+        reason = "" if whole.converged else "with all observations, the refinement does not come to rest"
+    if not reason:
+        try:
+            solved = factored(problem, whole.estimate)
+        except np.linalg.LinAlgError:
+            reason = "nothing says how sure it would be"
+        else:
+            final, cov = whole.estimate, solved.shared_cov()
+            by = moving(problem, final)
+            drift = drift_map(problem, start, final, t_s, solved, by)
+            # where the IMU says nothing, the covariance of a velocity is a prior's
+            moved = problem.inertial.touched
+            told = np.flatnonzero(np.isfinite(t_s) & moved)
+            some = told[:: -(-len(told) // _MOST_COVS) or 1]
+            motion_covs = dict(zip(some.tolist(), solved.motion_covs(some, by), strict=True))
+            velocity_m_s = np.where(moved[:, None], by.velocity_m_s, np.nan)
+    return Judged(
+        estimate=final,
+        accepted=not reason,
+        reason=reason,
+        held_out=count,
+        before_px=_as_px(before, problem.sigma_px),
+        after_px=_as_px(after, problem.sigma_px),
+        change=mean,
+        change_sigma=spread,
+        chi2=chi2,
+        sigma_px=noise.sigma_px,
+        accel_noise_m_s2_rthz=problem.inertial.noise.accel_density_m_s2_rthz,
+        shared_cov=cov,
+        drift=drift,
+        velocity_m_s=velocity_m_s,
+        motion_covs=motion_covs,
+        readout=readout,
+        steps=steps,
+    )
+
+
+def _chosen(observations: Observations) -> NDArray[np.bool_]:
+    """(M,) what is held out: every tenth observation of points that keep three or more."""
+    lengths = np.diff(observations.first)
+    often = np.flatnonzero(lengths[observations.point] >= _FEWEST)
+    out = np.zeros(len(observations.frame), dtype=np.bool_)
+    out[often[_EVERY // 2 :: _EVERY]] = True
+    return out
+
+
+def _part(problem: Problem, keep: NDArray[np.bool_]) -> Problem:
+    return replace(problem, observations=problem.observations.select(keep))
+
+
+def _measured(problem: Problem, kept: NDArray[np.bool_], x: Estimate) -> Problem:
+    """The problem with its accelerometer's noise as what it was solved without a tenth for says."""
+    try:
+        return replace(problem, inertial=with_measured_noise(_part(problem, kept), x).inertial)
+    except np.linalg.LinAlgError:  # the solution says why not
+        return problem
+
+
+def _freedom(problem: Problem) -> float:
+    """How many more residuals than unknowns the IMU brings: rows and priors, less velocities, biases and the rest."""
+    assert problem.inertial is not None
+    # biases walk, or are known beforehand: as many residuals as unknowns
+    return float(max(1, 9 * int(problem.inertial.linked.sum()) - 3 * int(problem.inertial.touched.sum())))
+
+
+def _readout(problem: Problem, x: Estimate) -> tuple[float, float] | None:
+    """What the readout came to and its standard deviation, in seconds; None where nothing says how sure that is."""
+    try:
+        cov = factored(problem, x).shared_cov()
+    except np.linalg.LinAlgError:
+        return None
+    return x.readout_s, float(cov[READOUT, READOUT]) ** 0.5
+
+
+def _rolling(readout: tuple[float, float] | None) -> str:
+    """Why a model stays as it is whose images turn out to have a rolling shutter; empty where they have none."""
+    if readout is None or abs(readout[0]) < max(_LEAST_READOUT_S, _SURE_SIGMA * readout[1]):
+        return ""
+    upwards = "" if readout[0] > 0 else ", from the last line to the first"
+    return (
+        "its images have a rolling shutter, and would not agree with the refined poses: declare the readout, which is "
+        f"{1e3 * abs(readout[0]):.1f} +- {1e3 * readout[1]:.1f} ms{upwards}"
+    )
+
+
+def _doubt(alone: Solution, seen: Solution, chi2: float, change: float, spread: float) -> str:
+    """Why a refinement is not believed; empty where it is."""
+    if not alone.converged:
+        return "pictures alone, which it is compared with, do not come to rest"
+    if not seen.converged:
+        return "the refinement does not come to rest"
+    if chi2 > _LARGEST_CHI2:
+        return (
+            f"the IMU contradicts the pictures ({chi2:.1f} times the squares that its noise explains): check that both "
+            "recordings belong together, and the IMU's axes and gains"
+        )
+    if change >= -spread:
+        return "observations that were held out are predicted no better with the IMU than without"
+    return ""
+
+
+def _too_late(problem: Problem, x: Estimate) -> str:
+    """Why clocks are too far apart, or a readout too long; empty where the readings around each frame reach as far."""
+    assert problem.inertial is not None
+    inertial = problem.inertial
+    times_s = inertial.nodes_s[inertial.touched] - inertial.middle_s
+    shift_s = float(np.abs(x.offset_s + x.clock_rate * times_s).max())
+    if shift_s + 0.5 * abs(x.readout_s) <= inertial.turning.half_span_s:
+        return ""
+    return (
+        f"the time offset would move by {1e3 * shift_s:.0f} ms, with a readout of {1e3 * abs(x.readout_s):.0f} ms, "
+        "farther than readings were looked up: declare them"
+    )
+
+
+def _as_px(costs: Array, sigma_px: float) -> float:
+    return float(sigma_px * np.sqrt(np.mean(costs))) if len(costs) else 0.0
+
+
+def drift_map(
+    problem: Problem, start: Estimate, x: Estimate, t_s: Array, solved: Factored, by: Moving
+) -> tuple[Stretched, ...]:
+    """How the refinement changed the scale along a path, and how sure it is of it.
+
+    Parameters
+    ----------
+    problem, start, x
+        The refinement, from where to where.
+    t_s
+        (F,) times of the frames; nan without one.
+    solved, by
+        The information at ``x``, and the camera's motion there.
+    """
+    before, after = (at_middle_lines(problem, one).cam_in_world for one in (start, x))
+    timed = np.isfinite(t_s)
+    first_s, last_s = float(t_s[timed].min()), float(t_s[timed].max())
+    edges = np.linspace(first_s, last_s, max(1, round((last_s - first_s) / _PART_S)) + 1).tolist()
+    with np.errstate(invalid="ignore"):
+        parts = [np.flatnonzero((t_s >= begin_s) & (t_s <= end_s)) for begin_s, end_s in pairwise(edges)]
+    whole = size_of(before[timed]) / size_of(after[timed])
+    by_log = np.stack([_by_log_size(after, np.flatnonzero(timed)), *(_by_log_size(after, part) for part in parts)])
+    sigma = solved.position_sigmas(by_log[1:] - by_log[0])
+    last = np.array([part[-1] if len(part) else 0 for part in parts])
+    end_sigma_m = np.sqrt(np.diagonal(solved.motion_covs(last, by), axis1=1, axis2=2)[:, :3])
+    out = []
+    for i, (part, (begin_s, end_s)) in enumerate(zip(parts, pairwise(edges), strict=True)):
+        sizes = [size_of(centres[part]) if len(part) > 1 else 0.0 for centres in (before, after)]
+        if min(sizes) > 0:
+            out.append(
+                Stretched(
+                    begin_s=begin_s,
+                    end_s=end_s,
+                    percent=100 * (whole * sizes[1] / sizes[0] - 1),
+                    sigma_percent=100 * float(sigma[i]),
+                    end_sigma_m=tuple(end_sigma_m[i].tolist()),
+                )
+            )
+    return tuple(out)
+
+
+def _by_log_size(centres: Array, part: NDArray[np.intp]) -> Array:
+    """(F, 3) derivative of the logarithm of a part's size by its centres."""
+    out = np.zeros_like(centres)
+    if len(part) > 1:
+        away = centres[part] - centres[part].mean(axis=0)
+        out[part] = away / max(float(np.sum(away**2)), 1e-12)
+    return out
+
+
+def size_of(centres: Array) -> float:
+    """Root of the mean square distance of (F, 3) points from their middle."""
+    return float(np.sqrt(np.mean(np.sum((centres - centres.mean(axis=0)) ** 2, axis=1))))

@@ -1,0 +1,488 @@
+"""From a metric COLMAP model and a recording to the problem, and from its solution back to a model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.geometry import matrix_from_quat
+from colmap_inertial.core.gyro import GyroPath, on_camera_rate
+from colmap_inertial.core.types import (
+    CAL,
+    Array,
+    CameraImuCalibration,
+    CameraModel,
+    FrameTiming,
+    ImuNoise,
+    ImuRecording,
+)
+from colmap_inertial.imaging.gyro_camera import FrameShutter
+from colmap_inertial.inertial.refine._seen import cameras_of, poses_at, project, turning_around
+from colmap_inertial.inertial.refine.values import (
+    CLOCK_RATE,
+    FIRST_INTRINSIC,
+    LEVER,
+    OFFSET,
+    READOUT,
+    ROTATION,
+    Estimate,
+    FreeCamera,
+    Index,
+    Inertial,
+    Observations,
+    Prior,
+    Problem,
+)
+from colmap_inertial.inertial.scale._preintegration import SensorErrors, Track, Tracks, preintegrate
+from colmap_inertial.inertial.scale._setup import cut_off
+from colmap_inertial.inertial.scale.priors import PRIORS, gains_cov
+
+if TYPE_CHECKING:
+    import pycolmap
+
+#: Standard deviations of what the first guess leaves of the rotation, the offset and a camera's numbers: wide.
+_ROTATION_RAD, _OFFSET_S, _INTRINSIC_SHARE = 0.05, 0.02, 0.1
+#: Of a readout that is none.
+_NO_READOUT_S = 1e-9
+#: Readings are looked up as far beyond the readout around a node; one that is not declared is hardly longer than this.
+_MARGIN_S, _LONGEST_READOUT_S = 0.01, 0.04
+_LEAST_PX = 0.05
+#: Noise is measured by this quantile of the squares of both coordinates, which for normal errors is that of chi-square
+#: with two degrees: a robust fit follows the quieter observations, and the median is a tenth too small.
+_QUANTILE = 0.75
+#: Cameras more than this are not estimated: each picture has its own.
+_MOST_FREE_CAMERAS = 4
+#: Frames farther apart say nothing of each other through the IMU.
+_LONGEST_STEP_S = 10.0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Seen:
+    """What a COLMAP model says, in arrays.
+
+    Attributes
+    ----------
+    image_ids
+        (F,) in order of time, those without a time last.
+    names
+        Of the images.
+    t_s
+        (F,) when the middle line was exposed; nan without a time.
+    cam_from_world, cam_in_world
+        (F, 3, 3), (F, 3).
+    point_ids, points
+        (P,), (P, 3) with two observations or more, in order of the first one's time.
+    observations
+        Where COLMAP has them.
+    place
+        (M,) of each observation among its image's keypoints.
+    cameras, camera_ids, camera_of
+        The cameras, their numbers, and (F,) that of each frame.
+    """
+
+    image_ids: tuple[int, ...]
+    names: tuple[str, ...]
+    t_s: Array
+    cam_from_world: Array
+    cam_in_world: Array
+    point_ids: tuple[int, ...]
+    points: Array
+    observations: Observations
+    place: Index
+    cameras: tuple[CameraModel, ...]
+    camera_ids: tuple[int, ...]
+    camera_of: Index
+
+
+def read_seen(reconstruction: pycolmap.Reconstruction, timing: FrameTiming) -> Seen:
+    """What a model says; its observations at the middle line."""
+    t_of = dict(zip(timing.names, timing.pose_t_s().tolist(), strict=True))
+    images = [reconstruction.image(i) for i in reconstruction.reg_image_ids()]
+    images.sort(key=lambda image: (t_of.get(image.name, np.inf), image.name))
+    number = {image.image_id: i for i, image in enumerate(images)}
+    keypoints = [np.array([p.xy for p in image.points2D]).reshape(-1, 2) for image in images]
+    frame: list[int] = []
+    point: list[int] = []
+    place: list[int] = []
+    ids: list[int] = []
+    xyz: list[Array] = []
+    tracks = []
+    for point_id, one in reconstruction.points3D.items():
+        elements = sorted((number[e.image_id], e.point2D_idx) for e in one.track.elements if e.image_id in number)
+        if len(elements) > 1:
+            tracks.append((elements[0][0], int(point_id), elements, one.xyz))
+    # by time: what is worked on one after the other then lies side by side in memory
+    for _, point_id, elements, point_m in sorted(tracks, key=lambda track: track[:2]):
+        frame += [e[0] for e in elements]
+        place += [e[1] for e in elements]
+        point += [len(ids)] * len(elements)
+        ids.append(point_id)
+        xyz.append(point_m)
+    frames, places = np.array(frame, dtype=np.int64), np.array(place, dtype=np.int64)
+    first = np.cumsum([0, *(len(k) for k in keypoints)])
+    every = np.concatenate(keypoints)
+    camera_ids = tuple(sorted({image.camera_id for image in images}))
+    cameras = [reconstruction.camera(i) for i in camera_ids]
+    poses = [image.cam_from_world() for image in images]
+    return Seen(
+        image_ids=tuple(image.image_id for image in images),
+        names=tuple(image.name for image in images),
+        t_s=np.array([t_of.get(image.name, np.nan) for image in images]),
+        cam_from_world=np.array([pose.rotation.matrix() for pose in poses]),
+        cam_in_world=np.array([image.projection_center() for image in images]),
+        point_ids=tuple(ids),
+        points=np.array(xyz).reshape(-1, 3),
+        observations=Observations(
+            frame=frames,
+            point=np.array(point, dtype=np.int64),
+            xy_px=every[first[frames] + places],
+            line=np.zeros(len(frames)),
+        ),
+        place=places,
+        cameras=tuple(
+            CameraModel(model=c.model.name, width=c.width, height=c.height, params=tuple(c.params)) for c in cameras
+        ),
+        camera_ids=camera_ids,
+        camera_of=np.array([camera_ids.index(image.camera_id) for image in images], dtype=np.int64),
+    )
+
+
+def lines_of(seen: Seen, timing: FrameTiming, xy_px: Array) -> Array:
+    """(M,) how much later than the middle line each observation was exposed, in readouts."""
+    out = np.zeros(len(xy_px))
+    if timing.readout_s == 0:
+        return out
+    index = {name: i for i, name in enumerate(timing.names)}
+    one = replace(timing, readout_s=0.5)  # of any length: shares are asked for
+    for i, camera in enumerate(seen.cameras):
+        mine = seen.camera_of[seen.observations.frame] == i
+        shutter = FrameShutter.of(one, next(iter(index.values())), width=camera.width, height=camera.height)
+        out[mine] = (shutter.middle_s(xy_px[mine]) - shutter.reference_s()) / 0.5
+    return out
+
+
+def keypoints_of(seen: Seen, keypoints_px: Mapping[str, Array]) -> Array:
+    """(M, 2) observations by image names' keypoints (N, 2); as the model has them where there are none."""
+    out = seen.observations.xy_px.copy()
+    for name, mine in zip(seen.names, _by_frame(seen), strict=True):
+        if name in keypoints_px:
+            out[mine] = keypoints_px[name][seen.place[mine]]
+    return out
+
+
+def _by_frame(seen: Seen) -> list[Index]:
+    """Which observations each frame has."""
+    frames = seen.observations.frame
+    order = np.argsort(frames, kind="stable")
+    return np.split(order, np.searchsorted(frames[order], np.arange(1, len(seen.names))))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Known:
+    """What was known or estimated before.
+
+    Attributes
+    ----------
+    calibration
+        The camera-IMU calibration that the scale estimate refined: the start.
+    prior
+        What was declared of it.
+    noise
+        Of the IMU, as the scale estimate found it.
+    accel_bias_m_s2
+        (3,) start.
+    down
+        (3,) unit vector of gravity in the model's world.
+    gravity_m_s2, gravity_sigma_m_s2
+        Its strength.
+    refine_intrinsics
+        Whether the cameras' numbers are estimated.
+    """
+
+    calibration: CameraImuCalibration
+    prior: CameraImuCalibration
+    noise: ImuNoise
+    accel_bias_m_s2: Array
+    down: Array
+    gravity_m_s2: float
+    gravity_sigma_m_s2: float
+    refine_intrinsics: bool
+
+
+def make_problem(
+    seen: Seen, timing: FrameTiming, imu: ImuRecording, known: Known, raw_px: Array
+) -> tuple[Problem, Estimate]:
+    """The problem, and where to start.
+
+    Raises
+    ------
+    NotObservableError
+        Where the IMU recorded hardly any of the frames, or these see nothing.
+    """
+    calibration = known.calibration
+    imu = on_camera_rate(imu, calibration, camera_epoch_ns=timing.epoch_ns)
+    shift_s = (imu.epoch_ns - timing.epoch_ns) * 1e-9 + calibration.gyro_time_offset_s
+    gyro_cut, accel_cut = cut_off(imu)
+    # the accelerometer's own delay is part of the estimate
+    delay_s = calibration.accel_time_offset_s - calibration.gyro_time_offset_s
+    tracks = Tracks(
+        gyro=Track.of(imu.gyro_t_s + shift_s, imu.gyro_rad_s, gyro_cut),
+        accel=Track.of(imu.accel_t_s + shift_s + delay_s, imu.accel_m_s2, accel_cut),
+    )
+    if not len(seen.observations.frame):
+        raise NotObservableError("refinement", "no two of its images see the same point")
+    timed = np.isfinite(seen.t_s)
+    begin_s = max(tracks.gyro.t_s[0], tracks.accel.t_s[0])
+    end_s = min(tracks.gyro.t_s[-1], tracks.accel.t_s[-1])
+    half_s = 0.5 * (_LONGEST_READOUT_S if timing.readout_s is None else timing.readout_s) + _MARGIN_S
+    with np.errstate(invalid="ignore"):
+        inside = timed & (seen.t_s > begin_s + half_s) & (seen.t_s < end_s - half_s)
+    nodes_s = np.where(timed, seen.t_s, 0.0)
+    path = GyroPath(tracks.gyro.t_s, tracks.gyro.value, np.zeros(3))
+    inside &= path.covers(nodes_s - half_s, nodes_s + half_s)
+    untimed = np.flatnonzero(~timed)
+    nodes_s[untimed] = nodes_s[timed].max() + 1.0 + np.arange(len(untimed))
+    linked = inside[:-1] & inside[1:] & (np.diff(nodes_s) < _LONGEST_STEP_S) & path.covers(nodes_s[:-1], nodes_s[1:])
+    if linked.sum() < max(5, 0.5 * (len(nodes_s) - 1)):
+        raise NotObservableError("refinement", "the IMU recorded less than half of what lies between the images")
+    inertial = Inertial(
+        nodes_s=nodes_s,
+        linked=linked,
+        tracks=tracks,
+        noise=known.noise,
+        turning=turning_around(np.where(inside, nodes_s, nodes_s[inside][0]), tracks, half_s),
+        down=known.down,
+    )
+    lines = lines_of(seen, timing, raw_px)
+    observations = replace(seen.observations, xy_px=raw_px, line=np.where(inside[seen.observations.frame], lines, 0.0))
+    free = known.refine_intrinsics and len(seen.cameras) <= _MOST_FREE_CAMERAS
+    cameras = tuple(FreeCamera(model=c, free=_free_numbers(c) if free else ()) for c in seen.cameras)
+    start = _start(seen, cameras, inertial, known, timing)
+    problem = Problem(
+        observations=observations,
+        cameras=cameras,
+        camera_of=seen.camera_of,
+        inertial=inertial,
+        prior=Prior(
+            mean=_expected(start, known),
+            info=_information(start, known, imu, timing),
+            gyro_bias_sigma_rad_s=0.1,
+            accel_bias_sigma_m_s2=PRIORS.accel_bias_m_s2,
+        ),
+        sigma_px=1.0,
+    )
+    return problem, start
+
+
+def _expected(start: Estimate, known: Known) -> Estimate:
+    """The start, with what was declared beforehand in place of what was estimated since."""
+    declared, refined = known.prior, known.calibration
+    declared_s = declared.accel_time_offset_s - declared.gyro_time_offset_s
+    refined_s = refined.accel_time_offset_s - refined.gyro_time_offset_s
+    return replace(start, imu_in_cam_m=declared.imu_in_cam_m, accel_delay_s=declared_s - refined_s)
+
+
+def _free_numbers(camera: CameraModel) -> tuple[int, ...]:
+    """Focal lengths and the lens's numbers; the principal point stays, as COLMAP's own bundle adjustment has it."""
+    from colmap_inertial.model import colmap_camera
+
+    built = colmap_camera(camera)
+    return (*built.focal_length_idxs(), *built.extra_params_idxs())
+
+
+def _start(
+    seen: Seen, cameras: tuple[FreeCamera, ...], inertial: Inertial, known: Known, timing: FrameTiming
+) -> Estimate:
+    calibration = known.calibration
+    cam_from_imu = matrix_from_quat(calibration.cam_from_imu_xyzw)
+    world_from_cam = seen.cam_from_world.transpose(0, 2, 1)
+    world_from_imu = world_from_cam @ cam_from_imu
+    position = seen.cam_in_world + world_from_cam @ calibration.imu_in_cam_m
+    count = len(position)
+    gyro_bias = np.tile(calibration.gyro_bias_rad_s, (count, 1))
+    accel_bias = np.tile(known.accel_bias_m_s2, (count, 1))
+    none = np.zeros((3, 3))
+    errors = SensorErrors(
+        gyro_bias_rad_s=gyro_bias[1:], accel_bias_m_s2=accel_bias[1:], gyro_gain=none, accel_gain=none
+    )
+    pre = preintegrate(inertial.nodes_s, inertial.tracks, errors)
+    dt = pre.dt_s[:, None]
+    gravity = known.gravity_m_s2 * known.down
+    carried = np.einsum("nij,nj->ni", world_from_imu[:-1], pre.position)
+    velocity = np.zeros((count, 3))
+    velocity[:-1] = np.diff(position, axis=0) / dt - 0.5 * gravity * dt - carried / dt
+    velocity[:-1][~inertial.linked] = 0.0
+    ends = np.flatnonzero(np.append(~inertial.linked, True) & np.append(False, inertial.linked))
+    gained = np.einsum("nij,nj->ni", world_from_imu[ends - 1], pre.velocity[ends - 1])
+    velocity[ends] = velocity[ends - 1] + gravity * dt[ends - 1] + gained
+    return Estimate(
+        world_from_imu=world_from_imu,
+        imu_in_world_m=position,
+        velocity_m_s=velocity,
+        gyro_bias_rad_s=gyro_bias,
+        accel_bias_m_s2=accel_bias,
+        points_m=seen.points,
+        cam_from_imu=cam_from_imu,
+        imu_in_cam_m=calibration.imu_in_cam_m,
+        offset_s=0.0,
+        clock_rate=0.0,
+        readout_s=timing.readout_s or 0.0,
+        intrinsics=np.array([camera.model.params[i] for camera in cameras for i in camera.free]),
+        accel_delay_s=0.0,
+        gyro_gain=none,
+        accel_gain=none,
+        gravity_m_s2=known.gravity_m_s2,
+    )
+
+
+def _information(start: Estimate, known: Known, imu: ImuRecording, timing: FrameTiming) -> Array:
+    """Prior information of the shared numbers: as the joint estimator has it."""
+    cov = known.prior.cov
+    variance, at = np.diagonal(cov), start.columns
+    gyro, accel = CAL.GYRO_TIME_OFFSET, CAL.ACCEL_TIME_OFFSET
+    sigma = np.empty(at.count)
+    sigma[ROTATION], sigma[OFFSET] = _ROTATION_RAD, _OFFSET_S
+    sigma[LEVER] = np.maximum(np.sqrt(variance[CAL.LEVER_ARM]), 1e-6)
+    sigma[CLOCK_RATE] = PRIORS.clock_rate
+    sigma[READOUT] = np.sqrt(variance[CAL.READOUT]) if timing.readout_s != 0 else _NO_READOUT_S
+    sigma[FIRST_INTRINSIC : at.seen.stop] = _INTRINSIC_SHARE * np.maximum(np.abs(start.intrinsics), 1.0)
+    sigma[at.accel_delay] = np.sqrt(max(variance[gyro] + variance[accel] - 2 * cov[gyro, accel], 1e-8))
+    sigma[at.gyro_gain], sigma[at.accel_gain] = PRIORS.gyro_gain, PRIORS.accel_gain
+    sigma[at.gravity] = known.gravity_sigma_m_s2
+    info = np.diag(sigma**-2)
+    if imu.calibration is not None:
+        here = np.r_[at.accel_gain, at.gyro_gain]
+        info[np.ix_(here, here)] = np.linalg.inv(gains_cov(imu))
+    return info
+
+
+def pictures_alone(problem: Problem, xy_px: Array) -> Problem:
+    """The problem without the IMU, of observations that a global shutter would have made."""
+    observations = problem.observations
+    at_once = replace(observations, xy_px=xy_px, line=np.zeros(len(xy_px)))
+    return replace(problem, observations=at_once, inertial=None)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PictureNoise:
+    """How observations err, and what the robust loss makes of them.
+
+    Attributes
+    ----------
+    sigma_px
+        Standard deviation, each coordinate, by a quantile of the residuals.
+    robust_px
+        Scale of the loss.
+    weighed_px
+        What errors are divided by, so that they weigh as much as they tell: the loss takes weight off errors that are
+        only large, not false, and leaves less of their noise than of their slope (Huber 1964). With twice the noise as
+        its scale, observations would weigh 0.6 of what they should beside the IMU.
+    informs
+        What they tell over what their weights say: the weights are those of steps, steeper than the loss is curved.
+    """
+
+    sigma_px: float
+    robust_px: float
+    weighed_px: float
+    informs: float
+
+
+def measured_noise(problem: Problem, x: Estimate) -> PictureNoise:
+    """How observations err, by the residuals of a fit and how many numbers were fitted to them."""
+    observations = problem.observations
+    at = project(problem, x, observations)
+    squares = np.sum(at.residual[at.seen] ** 2, axis=1)
+    used = 3 * len(x.points_m) + 6 * len(x.velocity_m_s)
+    squares = squares / max(0.2, 1 - used / (2 * len(observations.frame)))
+    sigma_px = max(_LEAST_PX, float(np.sqrt(np.quantile(squares, _QUANTILE) / (-2 * np.log(1 - _QUANTILE)))))
+    # noise alone shall not lose its weight
+    robust_px = max(problem.robust_px, 2 * sigma_px)
+    weight = 1 / (1 + squares / robust_px**2)
+    # of what the loss pulls with: its mean slope by the error, and its variance, in two coordinates
+    slope = float(np.mean(weight**2))
+    variance = float(np.mean(squares * weight**2)) / (2 * sigma_px**2)
+    return PictureNoise(
+        sigma_px=sigma_px,
+        robust_px=robust_px,
+        weighed_px=max(_LEAST_PX, sigma_px * float(np.sqrt(variance / slope))),
+        informs=slope / float(np.mean(weight)),
+    )
+
+
+def with_noise(problem: Problem, noise: PictureNoise) -> Problem:
+    """The problem with its observations weighed so."""
+    return replace(problem, sigma_px=noise.weighed_px, robust_px=noise.robust_px, informs=noise.informs)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Written:
+    """A solution in COLMAP's terms, all lines exposed at once.
+
+    Attributes
+    ----------
+    cam_from_world, cam_in_world
+        (F, 3, 3), (F, 3) when the middle line was exposed.
+    xy_px
+        (M, 2) where each observation would have been.
+    """
+
+    cam_from_world: Array
+    cam_in_world: Array
+    xy_px: Array
+
+
+def at_middle_lines(problem: Problem, x: Estimate) -> Written:
+    """What a camera without a rolling shutter would have seen."""
+    frames = np.arange(len(x.velocity_m_s))
+    poses = poses_at(problem, x, frames, np.zeros(len(frames)))
+    cam_from_world = x.cam_from_imu @ poses.world_from_imu.transpose(0, 2, 1)
+    centre = poses.imu_in_world_m - np.einsum("nji,j->ni", cam_from_world, x.imu_in_cam_m)
+    observations = problem.observations
+    moved = observations.xy_px
+    if np.any(observations.line != 0):
+        at_once = replace(observations, line=np.zeros(len(moved)))
+        here, there = project(problem, x, observations), project(problem, x, at_once)
+        both = (here.seen & there.seen)[:, None]
+        # residuals are predicted less measured
+        moved = moved + np.where(both, there.residual - here.residual, 0.0)
+    return Written(cam_from_world=cam_from_world, cam_in_world=centre, xy_px=moved)
+
+
+def written_back(
+    reconstruction: pycolmap.Reconstruction,
+    seen: Seen,
+    problem: Problem,
+    x: Estimate,
+    *,
+    about: Array,
+    scale: float = 1.0,
+) -> pycolmap.Reconstruction:
+    """A copy of a model with the poses, points, observations and cameras of a solution, stretched about a point.
+
+    Points that fewer than two of its images see were no part of it, and go.
+    """
+    import pycolmap
+
+    written = at_middle_lines(problem, x)
+    copy = pycolmap.Reconstruction(reconstruction)
+    centres = about + scale * (written.cam_in_world - about)
+    for i, (image_id, mine) in enumerate(zip(seen.image_ids, _by_frame(seen), strict=True)):
+        rotation = written.cam_from_world[i]
+        image = copy.image(image_id)
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ centres[i])
+        copy.frame(image.frame_id).set_cam_from_world(image.camera_id, pose)
+        points2D = image.points2D
+        for o in mine:
+            points2D[int(seen.place[o])].xy = written.xy_px[o]
+    for point_id in set(copy.point3D_ids()) - set(seen.point_ids):
+        copy.delete_point3D(point_id)
+    for point_id, xyz in zip(seen.point_ids, about + scale * (x.points_m - about), strict=True):
+        copy.points3D[point_id].xyz = xyz
+    for camera_id, camera in zip(seen.camera_ids, cameras_of(problem, x), strict=True):
+        copy.camera(camera_id).params = camera.params
+    copy.update_point_3d_errors()
+    return copy

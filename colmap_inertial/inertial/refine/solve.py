@@ -1,0 +1,232 @@
+"""The most probable poses, points and calibration, by Levenberg and Marquardt's method."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from colmap_inertial.core.geometry import Array
+from colmap_inertial.inertial.refine._inertial import Rows, all_rows, prior_offset
+from colmap_inertial.inertial.refine._seen import Derivatives, Projected, derivatives, project
+from colmap_inertial.inertial.refine._system import Factored, Order, System
+from colmap_inertial.inertial.refine.values import Estimate, Observations, Problem
+
+_MAX_STEPS = 40
+#: Where a step promises less of the squares' sum (in variances), it is at rest.
+_SETTLED = 0.1
+_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-9, 1e8
+#: A step to cameras whose numbers differ by more than this share (or as much of 1) is not tried.
+_LARGEST_CHANGE = 0.5
+#: With more damping, every step promises little: what seems to rest then is pushed once more with less.
+_REST_DAMPING = 1e-3
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Solution:
+    """What a solve came to.
+
+    Attributes
+    ----------
+    estimate
+        The most probable one.
+    cost
+        Half the sum of squares over variances, of observations by the robust loss.
+    squares
+        Their sum for each kind of residual but observations, over variances.
+    steps
+        That were taken.
+    converged
+        Whether it came to rest.
+    """
+
+    estimate: Estimate
+    cost: float
+    squares: dict[str, float]
+    steps: int
+    converged: bool
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Point:
+    """All residuals at an estimate."""
+
+    estimate: Estimate
+    projected: Projected
+    rows: dict[str, Rows]
+    offset: Array
+    cost: float
+
+
+def robust_cost(residual_px: Array, sigma_px: float, robust_px: float) -> Array:
+    """(M,) Cauchy's loss of (M, 2) residuals, in half squares over variances."""
+    squares = np.sum(residual_px**2, axis=1)
+    return np.asarray(0.5 * (robust_px / sigma_px) ** 2 * np.log1p(squares / robust_px**2))
+
+
+def _evaluate(problem: Problem, x: Estimate, observations: Observations) -> _Point:
+    projected = project(problem, x, observations)
+    rows, offset = all_rows(problem, x), prior_offset(problem, x)
+    cost = float(np.sum(robust_cost(projected.residual, problem.sigma_px, problem.robust_px)))
+    cost += 0.5 * sum(float(np.sum(one.residual**2)) for one in rows.values())
+    # a point that a step brings behind the camera must not look like a gain
+    cost += float(np.sum(~projected.seen)) * (problem.robust_px / problem.sigma_px) ** 2 * 5
+    cost += 0.5 * float(offset @ problem.prior.info @ offset)
+    return _Point(estimate=x, projected=projected, rows=rows, offset=offset, cost=cost)
+
+
+def _weighted(problem: Problem, at: _Point) -> tuple[Derivatives, Array]:
+    """Derivatives and residuals over their standard deviations, times the roots of their robust weights."""
+    squares = np.sum(at.projected.residual**2, axis=1)
+    root = 1 / (problem.sigma_px * np.sqrt(1 + squares / problem.robust_px**2))
+    by = derivatives(problem, at.estimate, problem.observations, at.projected)
+    for values in (by.by_frame, by.by_shared, by.by_point):
+        values *= root[:, None, None]
+    return by, at.projected.residual * root[:, None]
+
+
+def _informing(problem: Problem, at: _Point) -> tuple[Derivatives, Array]:
+    """The same as much as observations tell; what they pull with stays."""
+    by, residual = _weighted(problem, at)
+    root = problem.informs**0.5
+    for values in (by.by_frame, by.by_shared, by.by_point):
+        values *= root
+    return by, residual / root
+
+
+def _built(problem: Problem, order: Order, at: _Point, by: Derivatives, residual: Array, damping: float) -> System:
+    info = problem.prior.info
+    return System.build(order, problem.observations, by, residual, at.rows, (info, -info @ at.offset), damping=damping)
+
+
+def solve(problem: Problem, start: Estimate) -> Solution:
+    """Refine an estimate."""
+    observations = problem.observations
+    order = Order.of(observations, len(start.velocity_m_s))
+    at, damping, growth = _evaluate(problem, start, observations), _FIRST_DAMPING, 2.0
+    converged, steps = False, 0
+    for steps in range(1, _MAX_STEPS + 1):
+        by, residual = _weighted(problem, at)
+        gained = pushed = False
+        while not gained and damping < _MOST_DAMPING:
+            system = _built(problem, order, at, by, residual, damping)
+            step = _step(system, observations, by)
+            if step is None:
+                damping, growth = damping * growth, 2 * growth
+                continue
+            moved = at.estimate.moved(*step)
+            if not _plausible(start, moved):
+                damping, growth = damping * growth, 2 * growth
+                continue
+            promised = _promised(problem, at, by, residual, step, observations)
+            if promised < _SETTLED:
+                if damping <= _REST_DAMPING or pushed:
+                    return _solution(at, steps, converged=damping <= _REST_DAMPING)
+                damping, growth, pushed = _REST_DAMPING, 2.0, True
+                continue
+            tried = _evaluate(problem, moved, observations)
+            ratio = (at.cost - tried.cost) / promised
+            gained = ratio > 1e-4
+            if gained:
+                at = tried
+                damping = max(damping * max(0.1, 1 - (2 * ratio - 1) ** 3), _LEAST_DAMPING)
+                growth = 2.0
+            else:
+                damping, growth = damping * growth, 2 * growth
+        if not gained:
+            break
+    return _solution(at, steps, converged=converged)
+
+
+def _step(system: System, observations: Observations, by: Derivatives) -> tuple[Array, Array, Array] | None:
+    """What the system asks for; ``None`` where it needs more damping to be solved."""
+    try:
+        step = system.factored().step(system, observations, by)
+    except np.linalg.LinAlgError:
+        return None
+    return step if all(np.isfinite(part).all() for part in step) else None
+
+
+def _plausible(start: Estimate, moved: Estimate) -> bool:
+    """Whether a step leaves a camera that can be one: a focal length keeps its sign and size."""
+    away = np.abs(moved.intrinsics - start.intrinsics)
+    return bool(np.all(away <= _LARGEST_CHANGE * np.maximum(np.abs(start.intrinsics), 1.0)))
+
+
+def _promised(
+    problem: Problem,
+    at: _Point,
+    by: Derivatives,
+    residual: Array,
+    step: tuple[Array, Array, Array],
+    observations: Observations,
+) -> float:
+    """How much of the cost a step takes away if all were linear."""
+    states, shared, points = step
+    change = np.einsum("nri,ni->nr", by.by_frame, states[observations.frame, : by.by_frame.shape[2]])
+    change += by.by_shared @ shared[: by.by_shared.shape[2]]
+    change += np.einsum("nri,ni->nr", by.by_point, points[observations.point])
+    total = -float(np.sum(change * residual)) - 0.5 * float(np.sum(change**2))
+    for one in at.rows.values():
+        count = len(one.residual)
+        moved = np.einsum("nri,ni->nr", one.here, states[:count])
+        if one.after is not None:
+            moved += np.einsum("nri,ni->nr", one.after, states[1:])
+        if one.by_shared is not None:
+            moved += one.by_shared @ shared
+        total -= float(np.sum(moved * one.residual)) + 0.5 * float(np.sum(moved**2))
+    info = problem.prior.info
+    return total - float(shared @ info @ (at.offset + 0.5 * shared))
+
+
+def _solution(at: _Point, steps: int, *, converged: bool) -> Solution:
+    squares = {name: float(np.sum(one.residual**2)) for name, one in at.rows.items()}
+    return Solution(estimate=at.estimate, cost=at.cost, squares=squares, steps=steps, converged=converged)
+
+
+def factored(problem: Problem, x: Estimate) -> Factored:
+    """The information at an estimate, for covariances."""
+    order = Order.of(problem.observations, len(x.velocity_m_s))
+    at = _evaluate(problem, x, problem.observations)
+    return _built(problem, order, at, *_informing(problem, at), 0.0).factored()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Linearised:
+    """Observations at an estimate: what is solved for again and again with other noise of the IMU."""
+
+    order: Order
+    projected: Projected
+    by: Derivatives
+    residual: Array
+    estimate: Estimate
+
+    def solved(self, problem: Problem) -> tuple[Factored, Array, Array]:
+        """The information, and the steps (F, 15) and (Q,) to the solution with a problem's noise."""
+        x, observations = self.estimate, problem.observations
+        at = _Point(
+            estimate=x,
+            projected=self.projected,
+            rows=all_rows(problem, x),
+            offset=prior_offset(problem, x),
+            cost=np.nan,
+        )
+        system = _built(problem, self.order, at, self.by, self.residual, 0.0)
+        solved = system.factored()
+        states, shared, _ = solved.step(system, observations, self.by)
+        return solved, states, shared
+
+
+def linearised(problem: Problem, x: Estimate) -> Linearised:
+    """The observations at an estimate."""
+    at = _evaluate(problem, x, problem.observations)
+    by, residual = _informing(problem, at)
+    order = Order.of(problem.observations, len(x.velocity_m_s))
+    return Linearised(order=order, projected=at.projected, by=by, residual=residual, estimate=x)
+
+
+def held_out(problem: Problem, x: Estimate, observations: Observations) -> Array:
+    """(M,) robust costs of observations that were not used."""
+    at = project(replace(problem, observations=observations), x, observations)
+    cost = robust_cost(at.residual, problem.sigma_px, problem.robust_px)
+    return np.where(at.seen, cost, 5 * (problem.robust_px / problem.sigma_px) ** 2)

@@ -1,0 +1,305 @@
+"""What the refinement measures, assumes and estimates, and in which columns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.core.geometry import so3_exp
+from colmap_inertial.core.types import Array, CameraModel, ImuNoise
+from colmap_inertial.inertial.scale._preintegration import Tracks
+
+Index = NDArray[np.int64]
+
+# Columns of a frame's state. The first nine are what its observations depend on.
+THETA, POSITION, VELOCITY, GYRO_BIAS, ACCEL_BIAS = (slice(3 * i, 3 * i + 3) for i in range(5))
+N_SEEN, N_STATE = 9, 15
+
+# Columns of what all frames share; the free numbers of the cameras stand between what observations see and the rest.
+ROTATION, LEVER, OFFSET, CLOCK_RATE, READOUT = slice(0, 3), slice(3, 6), 6, 7, 8
+FIRST_INTRINSIC = 9
+
+
+@dataclass(frozen=True, kw_only=True)
+class Columns:
+    """Where the shared numbers stand that follow those of the cameras."""
+
+    intrinsics: int
+
+    @property
+    def seen(self) -> slice:
+        """What observations depend on where all lines are exposed at once."""
+        return slice(0, FIRST_INTRINSIC + self.intrinsics)
+
+    @property
+    def gyro_gain(self) -> slice:
+        """Nine gains and axis errors of the gyroscope, row by row; observations of a rolling shutter see them, too."""
+        return slice(self.seen.stop, self.seen.stop + 9)
+
+    @property
+    def accel_gain(self) -> slice:
+        """The same of the accelerometer."""
+        return slice(self.gyro_gain.stop, self.gyro_gain.stop + 9)
+
+    @property
+    def accel_delay(self) -> int:
+        """The accelerometer's delay beyond the gyroscope's."""
+        return self.accel_gain.stop
+
+    @property
+    def gravity(self) -> int:
+        """The strength of gravity."""
+        return self.accel_delay + 1
+
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        return self.gravity + 1
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Observations:
+    """Where points are seen, point by point.
+
+    Attributes
+    ----------
+    frame, point
+        (M,) which frame sees which point; the points' numbers rise by at most one from one to the next.
+    xy_px
+        (M, 2) in the picture as it was exposed.
+    line
+        (M,) how much later than the middle line its own was exposed, in readouts: from -.5 to .5.
+    """
+
+    frame: Index
+    point: Index
+    xy_px: Array
+    line: Array
+
+    @cached_property
+    def first(self) -> Index:
+        """(P + 1,) the first observation of each point."""
+        return np.searchsorted(self.point, np.arange(self.point[-1] + 2)).astype(np.int64)
+
+    def select(self, keep: NDArray[np.bool_]) -> Observations:
+        """Those of a mask; the points keep their numbers."""
+        return replace(
+            self, frame=self.frame[keep], point=self.point[keep], xy_px=self.xy_px[keep], line=self.line[keep]
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Turning:
+    """How each frame's IMU turns and is pushed around the instant of its state.
+
+    Attributes
+    ----------
+    powers
+        (F, 5, 3) of the reading's rotation vector, by the powers 1 to 5 of the seconds since then.
+    force_m_s2
+        (F, 3) mean reading of the accelerometer.
+    half_span_s
+        How long before and after these instants.
+    """
+
+    powers: Array
+    force_m_s2: Array
+    half_span_s: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Inertial:
+    """What the IMU says of F frames, in order of time.
+
+    Attributes
+    ----------
+    nodes_s
+        (F,) the states' instants on the clock of ``tracks``.
+    linked
+        (F - 1,) whether the IMU recorded what lies between a frame and the next.
+    tracks
+        The readings.
+    noise
+        Densities and walks.
+    turning
+        What happens around the instants.
+    down
+        (3,) unit vector of gravity in the world.
+    """
+
+    nodes_s: Array
+    linked: NDArray[np.bool_]
+    tracks: Tracks
+    noise: ImuNoise
+    turning: Turning
+    down: Array
+
+    @property
+    def touched(self) -> NDArray[np.bool_]:
+        """(F,) which frames it links to another."""
+        return np.append(self.linked, False) | np.append(False, self.linked)
+
+    @property
+    def middle_s(self) -> float:
+        """Where the clock rate is anchored."""
+        return 0.5 * float(self.nodes_s[0] + self.nodes_s[-1])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FreeCamera:
+    """A camera's intrinsics, and which of them are estimated.
+
+    Attributes
+    ----------
+    model
+        Where they start.
+    free
+        Places of those that are estimated.
+    """
+
+    model: CameraModel
+    free: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Estimate:
+    """A point of the parameter space: F states, P points, and what all share.
+
+    Attributes
+    ----------
+    world_from_imu, imu_in_world_m, velocity_m_s, gyro_bias_rad_s, accel_bias_m_s2
+        (F, 3, 3), (F, 3) ... at the frames' nodes.
+    points_m
+        (P, 3).
+    cam_from_imu, imu_in_cam_m
+        (3, 3), (3,).
+    offset_s
+        Of the IMU's stamps beyond the first guess: a node is that much later on the camera's clock.
+    clock_rate
+        Growth of that offset per second, about ``Inertial.middle_s``.
+    readout_s
+        Of the rolling shutter.
+    intrinsics
+        (n,) free numbers of the cameras, one camera after the other.
+    accel_delay_s
+        Added to the accelerometer's times.
+    gyro_gain, accel_gain
+        (3, 3) errors E: ``rate = (I + E) reading - bias``.
+    gravity_m_s2
+        Its strength.
+    """
+
+    world_from_imu: Array
+    imu_in_world_m: Array
+    velocity_m_s: Array
+    gyro_bias_rad_s: Array
+    accel_bias_m_s2: Array
+    points_m: Array
+    cam_from_imu: Array
+    imu_in_cam_m: Array
+    offset_s: float
+    clock_rate: float
+    readout_s: float
+    intrinsics: Array
+    accel_delay_s: float
+    gyro_gain: Array
+    accel_gain: Array
+    gravity_m_s2: float
+
+    @property
+    def columns(self) -> Columns:
+        """Of what is shared."""
+        return Columns(intrinsics=len(self.intrinsics))
+
+    def moved(self, states: Array, shared: Array, points: Array) -> Estimate:
+        """After a step of the states (F, 15), the shared numbers and the points (P, 3).
+
+        Rotations of states change on the right (body frame), that of the camera on the left (camera frame).
+        """
+        at = self.columns
+        return replace(
+            self,
+            world_from_imu=self.world_from_imu @ so3_exp(states[:, THETA]),
+            imu_in_world_m=self.imu_in_world_m + states[:, POSITION],
+            velocity_m_s=self.velocity_m_s + states[:, VELOCITY],
+            gyro_bias_rad_s=self.gyro_bias_rad_s + states[:, GYRO_BIAS],
+            accel_bias_m_s2=self.accel_bias_m_s2 + states[:, ACCEL_BIAS],
+            points_m=self.points_m + points,
+            cam_from_imu=so3_exp(shared[ROTATION]) @ self.cam_from_imu,
+            imu_in_cam_m=self.imu_in_cam_m + shared[LEVER],
+            offset_s=self.offset_s + float(shared[OFFSET]),
+            clock_rate=self.clock_rate + float(shared[CLOCK_RATE]),
+            readout_s=self.readout_s + float(shared[READOUT]),
+            intrinsics=self.intrinsics + shared[FIRST_INTRINSIC : at.seen.stop],
+            accel_delay_s=self.accel_delay_s + float(shared[at.accel_delay]),
+            gyro_gain=self.gyro_gain + shared[at.gyro_gain].reshape(3, 3),
+            accel_gain=self.accel_gain + shared[at.accel_gain].reshape(3, 3),
+            gravity_m_s2=self.gravity_m_s2 + float(shared[at.gravity]),
+        )
+
+    def shared_numbers(self) -> Array:
+        """Those that are added to, in their columns; zero where the rotation stands."""
+        at = self.columns
+        out = np.zeros(at.count)
+        out[LEVER], out[OFFSET], out[CLOCK_RATE] = self.imu_in_cam_m, self.offset_s, self.clock_rate
+        out[READOUT] = self.readout_s
+        out[FIRST_INTRINSIC : at.seen.stop] = self.intrinsics
+        out[at.accel_delay], out[at.gravity] = self.accel_delay_s, self.gravity_m_s2
+        out[at.gyro_gain], out[at.accel_gain] = self.gyro_gain.ravel(), self.accel_gain.ravel()
+        return out
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Prior:
+    """What is known beforehand, normal.
+
+    Attributes
+    ----------
+    mean
+        Where the shared numbers are expected; of the states, the first biases, the first pose, which is held, and the
+        other poses, which nearly nothing holds.
+    info
+        (Q, Q) information of the shared numbers.
+    gyro_bias_sigma_rad_s, accel_bias_sigma_m_s2
+        Of the first state's.
+    """
+
+    mean: Estimate
+    info: Array
+    gyro_bias_sigma_rad_s: float
+    accel_bias_sigma_m_s2: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Problem:
+    """All that the refinement is given.
+
+    Attributes
+    ----------
+    observations
+        Of the points.
+    cameras, camera_of
+        The cameras, and (F,) that of each frame.
+    inertial
+        What the IMU says; ``None`` where pictures alone shall tell (all lines exposed at once).
+    prior
+        What is known beforehand.
+    sigma_px
+        What an observation's errors are divided by, each coordinate.
+    robust_px
+        Scale of Cauchy's loss: of an error this long half the weight is left.
+    informs
+        What observations tell, over what their weights in the loss say that they do: for covariances.
+    """
+
+    observations: Observations
+    cameras: tuple[FreeCamera, ...]
+    camera_of: Index
+    inertial: Inertial | None
+    prior: Prior
+    sigma_px: float
+    robust_px: float = 1.0
+    informs: float = 1.0

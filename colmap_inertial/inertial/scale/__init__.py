@@ -1,0 +1,197 @@
+"""Metres per model unit from inertial data."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.gyro import on_camera_rate
+from colmap_inertial.core.options import GravityOptions, ScaleOptions
+from colmap_inertial.core.threads import one_blas_thread
+from colmap_inertial.core.types import (
+    CameraImuCalibration,
+    CameraTrajectory,
+    ImuCalibration,
+    ImuRecording,
+    ScaleEstimate,
+)
+from colmap_inertial.inertial.scale._remarks import remarks
+from colmap_inertial.inertial.scale.priors import PRIORS
+from colmap_inertial.inertial.scale.verdict import verdict_of
+from colmap_inertial.io.plausible import GRAVITY_BOUNDS_M_S2, LARGEST_MEDIAN_RATE_RAD_S
+from colmap_inertial.io.units import STANDARD_GRAVITY_M_S2
+from colmap_inertial.motion.align import AlignOptions, align_clocks
+
+
+def gravity_at_latitude_m_s2(latitude_deg: float, height_m: float = 0.0) -> float:
+    """Normal gravity of the WGS 84 ellipsoid, on it and above it (NIMA TR8350.2, sections 4.1 and 4.3).
+
+    Somigliana's closed formula, and its continuation upwards to the second order in the height, whose own error stays
+    below 1e-6 m/s2 up to 10 km. What lies under the ground is not in it: gravity differs from it by 0.0003 m/s2 (rms)
+    and by up to 0.003 m/s2 near high mountains and deep trenches, that is by 0.003 % to 0.03 %.
+
+    Parameters
+    ----------
+    latitude_deg
+        Geodetic, from -90 to 90.
+    height_m
+        Above the ellipsoid; that above the sea differs by 100 m at most, which is 0.0003 m/s2.
+    """
+    if not -90 <= latitude_deg <= 90:
+        raise ValueError(f"latitude_deg must be from -90 to 90, not {latitude_deg}")
+    if not -1000 <= height_m <= 10000:
+        raise ValueError(f"height_m must be from -1000 to 10000, not {height_m}")
+    sine_squared = np.sin(np.radians(latitude_deg)) ** 2
+    numerator = 9.7803253359 * (1 + 0.00193185265241 * sine_squared)
+    on_ellipsoid = float(numerator / np.sqrt(1 - 0.00669437999014 * sine_squared))
+    # semi-major axis, flattening, and the ratio m of centrifugal force to gravity at the equator
+    a, f, m = 6378137.0, 1 / 298.257223563, 0.00344978650684
+    h = height_m / a
+    return float(on_ellipsoid * (1 - 2 * (1 + f + m - 2 * f * sine_squared) * h + 3 * h**2))
+
+
+def strength_of_gravity(options: GravityOptions) -> tuple[float, float]:
+    """Gravity and its standard deviation, m/s2, by what is known of the place.
+
+    Standard gravity, or a number of two decimals (9.81), says nothing of the place.
+    """
+    given = options.gravity_m_s2
+    if given is not None and given != STANDARD_GRAVITY_M_S2:
+        return given, PRIORS.gravity_m_s2 if round(given, 2) == given else PRIORS.known_gravity_m_s2
+    if options.latitude_deg is not None:
+        return gravity_at_latitude_m_s2(options.latitude_deg, options.height_m or 0.0), PRIORS.known_gravity_m_s2
+    return STANDARD_GRAVITY_M_S2, PRIORS.gravity_m_s2
+
+
+def first_seconds(trajectory: CameraTrajectory, seconds: float, *, start_s: float | None = None) -> CameraTrajectory:
+    """The frames of the first ``seconds`` of a recording; nothing of later ones remains.
+
+    Parameters
+    ----------
+    start_s
+        When the recording began, on the trajectory's clock; without it, at the first pose.
+    """
+    begin_s = trajectory.t_s[0] if start_s is None else start_s
+    return trajectory.select(trajectory.t_s <= begin_s + seconds)
+
+
+def check_units(imu: ImuRecording) -> list[str]:
+    """What makes an IMU recording's numbers implausible as rad/s and m/s2; empty where nothing does.
+
+    Readers of files raise their own errors before; this guards arrays that come from elsewhere.
+    """
+    out = []
+    accel = float(np.median(np.linalg.norm(imu.accel_m_s2, axis=1))) if imu.has_accel else np.nan
+    low, high = GRAVITY_BOUNDS_M_S2
+    if imu.has_accel and not low <= accel <= high:
+        hint = "gravity was removed: record the raw accelerometer"
+        if low <= STANDARD_GRAVITY_M_S2 * accel <= high:
+            hint = "it is in g: multiply it by 9.80665"
+        elif accel > 500:
+            hint = "it is in mg or raw counts: convert it to m/s2"
+        out.append(f"the accelerometer's median length is {accel:.3g} m/s2 instead of about 9.8; {hint}")
+    gyro = float(np.median(np.linalg.norm(imu.gyro_rad_s, axis=1)))
+    if gyro > LARGEST_MEDIAN_RATE_RAD_S:
+        out.append(f"the gyroscope's median rate is {gyro:.3g} rad/s; it is in deg/s: multiply it by pi / 180")
+    return out
+
+
+def estimate_scale(
+    trajectory: CameraTrajectory,
+    imu: ImuRecording,
+    *,
+    calibration: CameraImuCalibration | None = None,
+    imu_calibration: ImuCalibration | None = None,
+    options: ScaleOptions | None = None,
+) -> ScaleEstimate:
+    """Metres per unit of a camera trajectory, from the IMU that was recorded along.
+
+    Parameters
+    ----------
+    trajectory
+        Poses of a reconstruction with their times.
+    imu
+        Recording of the same device; its clock may differ by any offset.
+    calibration
+        What is known of the device (``io.calibration.calibration_prior``); unknown entries wide.
+    imu_calibration
+        The IMU's own, by which its readings are corrected. A recording that was corrected before brings its own.
+    options
+        Method, gravity, range of clock offsets.
+
+    Returns
+    -------
+    The estimate with a verdict. Data that cannot give a scale give the verdict ``"refused"`` with reasons, not an
+    exception.
+    """
+    options = options or ScaleOptions()
+    begin_s = time.perf_counter()
+    if imu_calibration is not None:
+        imu = imu_calibration.corrected(imu)
+        calibration = None if calibration is None else imu_calibration.loosened(calibration)
+    with one_blas_thread():
+        estimate = _estimate_or_refuse(trajectory, imu, calibration, options)
+    return replace(estimate, imu_calibration=imu.calibration, runtime_s=time.perf_counter() - begin_s)
+
+
+def _estimate_or_refuse(
+    trajectory: CameraTrajectory, imu: ImuRecording, calibration: CameraImuCalibration | None, options: ScaleOptions
+) -> ScaleEstimate:
+    if not imu.has_accel:
+        return ScaleEstimate.refused(
+            options.method,
+            "the recording has no accelerometer, without which metres are unknown; record it too",
+        )
+    problems = check_units(imu)
+    if problems:
+        return ScaleEstimate.refused(options.method, *problems)
+    try:
+        in_step, aligned = in_step_with(trajectory, imu, calibration, options)
+        said = in_step.repairs[len(imu.repairs) :]
+        estimate = _estimate(trajectory, in_step, aligned, options)
+        return replace(
+            estimate,
+            # also where there is no scale: it says what was found of camera and IMU
+            calibration=aligned if estimate.calibration is None else estimate.calibration,
+            notes=(*estimate.notes, *said, *remarks(trajectory, in_step, aligned)),
+        )
+    except NotObservableError as error:
+        return ScaleEstimate.refused(options.method, f"{error.quantity}: {error.hint}")
+
+
+def in_step_with(
+    trajectory: CameraTrajectory, imu: ImuRecording, calibration: CameraImuCalibration | None, options: ScaleOptions
+) -> tuple[ImuRecording, CameraImuCalibration]:
+    """A recording on the camera's rate, and how camera and IMU relate, from a calibration that may be wide."""
+    alignment = align_clocks(
+        trajectory, imu, prior=calibration, options=AlignOptions(max_offset_s=options.max_offset_s)
+    )
+    aligned = alignment.settled()
+    return on_camera_rate(imu, aligned, camera_epoch_ns=trajectory.epoch_ns), aligned
+
+
+def _estimate(
+    trajectory: CameraTrajectory, imu: ImuRecording, calibration: CameraImuCalibration, options: ScaleOptions
+) -> ScaleEstimate:
+    gravity_m_s2, sigma_m_s2 = strength_of_gravity(options)
+    if options.method == "spectral":
+        from colmap_inertial.inertial.scale.spectral import SpectralOptions, estimate_spectral
+
+        return estimate_spectral(trajectory, imu, calibration, SpectralOptions(gravity_m_s2=gravity_m_s2))
+    from colmap_inertial.inertial.scale.joint import JointOptions, estimate_joint
+
+    known = JointOptions(gravity_m_s2=gravity_m_s2, gravity_sigma_m_s2=sigma_m_s2)
+    return estimate_joint(trajectory, imu, calibration, known)
+
+
+__all__ = [
+    "check_units",
+    "estimate_scale",
+    "first_seconds",
+    "gravity_at_latitude_m_s2",
+    "strength_of_gravity",
+    "verdict_of",
+]

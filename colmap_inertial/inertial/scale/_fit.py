@@ -1,0 +1,313 @@
+"""The joint fit: from a recording to the most probable parameters, their covariance and the noise levels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from colmap_inertial.core.types import Array, ImuNoise, ScaleDrift
+from colmap_inertial.inertial.scale import _factors as fac, _noise as levels, _parameters as par, _suspects as sus
+from colmap_inertial.inertial.scale._drift import scale_drift
+from colmap_inertial.inertial.scale._noise import Expected, LevelSearch
+from colmap_inertial.inertial.scale._parameters import Data, Estimate, Noise, Prior
+from colmap_inertial.inertial.scale._solver import ArrowSystem
+from colmap_inertial.inertial.scale.priors import model_scale_sigma
+
+_MAX_ITERATIONS, _MAX_ROTATION_ITERATIONS = 40, 4
+#: At rest: what the scale would still move by, in its standard deviations.
+_SETTLED, _FEWEST_ITERATIONS = 0.1, 4
+#: A robust weight below this: five times as far off as errors usually are.
+_HARDLY = 0.35
+#: Fewer of the gains than this are never said to be determined: no surprise is made of nothing.
+_LEAST_DETERMINED = 0.3
+#: With levels at rest, a step that takes back more than this share of the one before goes half the way: two states
+#: in turn have their middle.
+_TURNS_BACK = 0.7
+#: The scale changes by at most this factor (in the logarithm) in one iteration.
+_LARGEST_STEP = 0.3
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Fit:
+    """Result of the joint fit.
+
+    Attributes
+    ----------
+    estimate, noise
+        Parameters and levels.
+    cov
+        (79, 79) of the globals; the scale's entry is that of its logarithm (of ``u``: its sign is turned).
+    gyro_bias_cov, gyro_bias_with_globals
+        (3, 3) covariance of the mean gyroscope bias and (79, 3) covariance with the globals.
+    sums
+        Sum of squares and expectation for each noise level.
+    level_variance, freedom
+        Variance of the logarithm of the scale that comes from the noise levels' own uncertainty, and degrees of freedom
+        that its variance rests on.
+    expected_accel_m_s2_rthz
+        The accelerometer's noise as its own stream and its data sheet have it.
+    converged
+        Whether the scale came to rest.
+    drift
+        Scales of parts of the recording.
+    excitation_m_s2
+        Standard deviation of the camera's acceleration between nodes.
+    jumped
+        How many of the states' poses hardly count or lie behind a break of the path.
+    gain_chi2
+        Squared deviation of the accelerometer's nine gains and axis errors from their prior.
+    gain_surprise
+        The same against the prior as it was used in the end, over what chance makes of it: one standard deviation more
+        than is to be expected. At least 1.
+    variance_parts
+        What the variance of the logarithm of the scale comes from, by the keys of ``parts.CAUSES``.
+    suspicions
+        What an accelerometer with faults that the model does not have would explain.
+    system, rate_rad_s, prior_info
+        The normal equations at the end, (K, 3) angular velocities at the nodes, and (79, 79) what of the globals'
+        information is the prior's.
+    """
+
+    estimate: Estimate
+    noise: Noise
+    cov: Array
+    gyro_bias_cov: Array
+    gyro_bias_with_globals: Array
+    sums: dict[str, tuple[float, float]]
+    level_variance: float
+    freedom: float
+    expected_accel_m_s2_rthz: float
+    converged: bool
+    drift: ScaleDrift
+    excitation_m_s2: float
+    jumped: int
+    gain_chi2: float
+    gain_surprise: float
+    variance_parts: dict[str, float]
+    suspicions: list[sus.Suspicion]
+    system: ArrowSystem
+    rate_rad_s: Array
+    prior_info: Array
+
+
+def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
+    """Gauss-Newton on all states and globals, with noise levels from the residuals.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        When the data leave the system singular.
+    """
+    search = LevelSearch(expected=Expected.of(data, sheet))
+    x = _rotations_first(data, search.noise, prior)
+    scale = _moment_scale(data, x)
+    x = replace(x, metres_per_unit=scale, imu_in_world_m=data.groups.centre * scale)
+    converged = settled = False
+    signed = 0.0
+    integrated, there = fac.integrate(data, x), x
+    for iteration in range(_MAX_ITERATIONS):
+        if settled or not fac.still_near(there, x, data.t_s, tolerance=4.0 if iteration <= _FEWEST_ITERATIONS else 1.0):
+            integrated, there = fac.integrate(data, x), x
+        pre = fac.corrected(integrated, there, x)
+        local = prior.at(x)
+        groups = fac.all_groups(data, search.noise, local, x, pre, robust=iteration > 2)
+        system, rhs, rhs_z = fac.normal_equations(list(groups.values()), local, x)
+        inverse = system.inverted()
+        states, z = inverse.solve(rhs, rhs_z)
+        turned = search.at_rest and float(z[par.SCALE, 0]) * signed < -_TURNS_BACK * signed**2
+        signed = float(z[par.SCALE, 0])
+        step = abs(signed)
+        shrink = min(1.0, _LARGEST_STEP / max(step, 1e-12)) * (0.5 if turned else 1.0)
+        x = x.moved(states[:, :, 0] * shrink, z[:, 0] * shrink, pre.rate_rad_s, data.t_s)
+        cov = inverse.cov
+        sigma = float(cov[par.SCALE, par.SCALE]) ** 0.5
+        converged = step < 0.2 * sigma
+        search.update(groups, inverse, states, z, moving=not settled)
+        if settled:
+            break
+        moves = max(step, search.scale_moves())
+        settled = iteration >= _FEWEST_ITERATIONS and moves < _SETTLED * sigma and search.at_rest
+    noise, sums = search.noise, search.sums
+
+    # Once more: the mean gyroscope bias, the scale's variance, suspicions, and scales of the parts
+    k = len(data.t_s)
+    imu = groups["imu"]
+    assert isinstance(imu, fac.Group)
+    where, own = sus.columns(data, x, imu)
+    residual = (imu.residual[:, :, None] + imu.apply(states, z))[:, :, 0]
+    ends, ends_z = np.zeros((k, par.N_STATE, 4 + own.shape[2])), np.zeros((par.N_GLOBALS, 4 + own.shape[2]))
+    ends[:, par.GYRO_BIAS, :3] = np.eye(3) / k
+    ends_z[par.SCALE, 3] = 1.0
+    imu.pull_back(own, ends[:, :, 4:], ends_z[:, 4:])
+    states, z = inverse.solve(ends, ends_z)
+    suspicions = sus.suspicions(where, own, imu.apply(states[:, :, 4:], z[:, 4:]), residual, z[par.SCALE, 4:])
+    variance_parts = _variance_parts(groups, local, x, pre.cov_gaps, states[:, :, 3:4], z[:, 3])
+    level_variance, freedom = search.scale_variance(groups, states[:, :, 3:4], z[:, 3:4])
+    states, z = states[:, :, :3], z[:, :3]
+    inflation = max(1.0, *(squares / expected for squares, expected in sums.values()))
+    drift = scale_drift(
+        data,
+        x,
+        noise,
+        groups["centre"],
+        (inverse, rhs, rhs_z),
+        inflation=inflation,
+        tolerated_log=model_scale_sigma(calibrated=False),
+    )
+    return Fit(
+        estimate=x,
+        noise=noise,
+        cov=cov,
+        gyro_bias_cov=np.mean(states[:, par.GYRO_BIAS], axis=0),
+        gyro_bias_with_globals=z,
+        sums=sums,
+        level_variance=level_variance,
+        freedom=freedom,
+        expected_accel_m_s2_rthz=search.expected.noise.accel_m_s2_rthz,
+        converged=converged,
+        drift=drift,
+        excitation_m_s2=_excitation_m_s2(data, x),
+        jumped=int(np.sum(data.broken)) + _jumped(groups["rotation"], groups["centre"]),
+        gain_chi2=prior.gain_chi2(x),
+        gain_surprise=_gain_surprise(local, x, cov),
+        variance_parts=variance_parts,
+        suspicions=suspicions,
+        system=system,
+        rate_rad_s=pre.rate_rad_s,
+        prior_info=local.info,
+    )
+
+
+#: Which part of the scale's variance residuals and priors belong to.
+_PART_OF_GROUP = {
+    "imu": "gyro",
+    "gyro_walk": "gyro",
+    "gyro_bias": "gyro",
+    "accel_walk": "accel_bias",
+    "accel_slow": "accel_noise",
+    "accel_slow_zero": "accel_noise",
+    "accel_zero": "accel_bias",
+    "rotation": "camera_path",
+    "centre": "camera_path",
+    "drift": "camera_path",
+    "drift_zero": "camera_path",
+    "speed": "camera_path",
+}
+_PART_OF_GLOBALS = {
+    "accel_gain": [par.ACCEL_GAIN],
+    "accel_bias": [par.ACCEL_BIAS],
+    "gyro": [par.GYRO_GAIN],
+    "camera_path": [par.SHUTTER, par.COUPLING],
+    "camera_imu": [
+        par.ROTATION,
+        par.LEVER,
+        slice(par.DELAY, par.CLOCK_RATE + 1),
+        slice(par.ACCEL_DELAY, par.ACCEL_DELAY + 1),
+    ],
+}
+
+
+def _gain_surprise(prior: Prior, x: Estimate, cov: Array) -> float:
+    """How much farther from their prior the gains are than chance has it; see :class:`Fit`.
+
+    What of the gains the data do not determine stays at the prior's mean: ``9 - trace(information covariance)`` of them
+    are determined.
+    """
+    info = prior.gain_info
+    determined = max(_LEAST_DETERMINED, len(info) - float(np.sum(info * cov[par.ACCEL_GAIN, par.ACCEL_GAIN])))
+    return max(1.0, prior.gain_chi2(x) / (determined + (2 * determined) ** 0.5))
+
+
+def _variance_parts(
+    groups: dict[str, fac.Group | fac.Direct], prior: Prior, x: Estimate, cov_gaps: Array, states: Array, z: Array
+) -> dict[str, float]:
+    """The scale's variance, by the errors it comes from.
+
+    With the information ``A = sum J^T J``, the covariance's column ``c`` of the scale has ``c^T A c`` as its entry for
+    the scale: each residual's part of the variance is its change along ``c``, squared.
+
+    Parameters
+    ----------
+    cov_gaps
+        (K, 9, 9) part of the covariance of the inertial increments that stands for missing readings.
+    states, z
+        (K, m, 1), (n,) that column.
+    """
+    others = ("lost_readings", "gravity")
+    parts = dict.fromkeys((*_PART_OF_GROUP.values(), *_PART_OF_GLOBALS, *others), 0.0)
+    for name, group in groups.items():
+        values = group.apply(states, z[:, None])
+        parts[_PART_OF_GROUP[name]] += float(np.sum(values**2))
+    imu = groups["imu"]
+    along = imu.apply(states, z[:, None])
+    white = float(np.sum(along * levels.by_level(imu, along)))
+    parts["accel_noise"] += white
+    assert isinstance(imu, fac.Group) and imu.root is not None
+    unwhitened = imu.root.transpose(0, 2, 1) @ along
+    parts["lost_readings"] = float(np.sum(unwhitened * (cov_gaps @ unwhitened)))
+    parts["gyro"] -= white + parts["lost_readings"]
+    by_prior = z * (prior.info @ z)
+    for part, places in _PART_OF_GLOBALS.items():
+        parts[part] += sum(float(by_prior[place].sum()) for place in places)
+    up = x.gravity_m_s2 / float(np.linalg.norm(x.gravity_m_s2))
+    parts["gravity"] = float(up @ z[par.GRAVITY] / prior.gravity_sigma_m_s2) ** 2
+    # what errors of two sensors have in common counts for either, and may take from one
+    left = {name: max(variance, 0.0) for name, variance in parts.items()}
+    return {name: variance * float(z[par.SCALE]) / sum(left.values()) for name, variance in left.items()}
+
+
+def _rotations_first(data: Data, noise: Noise, prior: Prior) -> Estimate:
+    """Rotations, gyroscope bias and time offset from gyroscope and visual rotations alone."""
+    x = prior.mean
+    for _ in range(_MAX_ROTATION_ITERATIONS):
+        pre = fac.integrate(data, x)
+        groups = fac.rotation_groups(data, noise, prior, x, pre)
+        system, rhs, rhs_z = fac.normal_equations(list(groups.values()), prior, x)
+        held = np.arange(par.GRAVITY.stop)
+        system.corner[held, held] += 1.0
+        rhs_z[held] = 0.0
+        states, z, _ = system.solve(rhs, rhs_z)
+        z[held] = 0.0
+        moved = x.moved(states[:, :, 0], z[:, 0], pre.rate_rad_s, data.t_s)
+        settled, x = fac.still_near(x, moved, data.t_s), moved
+        if settled:
+            break
+    return x
+
+
+def _moment_scale(data: Data, x: Estimate) -> float:
+    """Metres per unit at which visual and inertial second differences, less gravity and bias, are equally large."""
+    pre = fac.integrate(data, x)
+    dt = pre.dt_s[:, None]
+    per_s = 2 / (dt[1:] + dt[:-1])
+    visual = np.diff(np.diff(data.groups.centre, axis=0) / dt, axis=0) * per_s
+
+    def second_difference(velocity: Array, position: Array) -> Array:
+        along = x.world_from_imu[:-1] @ position / dt[:, :, None]
+        return (along[1:] - along[:-1] + x.world_from_imu[:-2] @ velocity[:-1]) * per_s[:, :, None]
+
+    inertial = second_difference(pre.velocity[:, :, None], pre.position[:, :, None])
+    bias = second_difference(pre.by_accel_bias[:, 3:6], pre.by_accel_bias[:, 6:])
+    gravity = np.tile(np.eye(3), (len(per_s), 1, 1))
+    nuisance = np.concatenate([gravity, bias], axis=2).reshape(-1, 6)
+    both = np.stack([visual, inertial[:, :, 0]], axis=-1).reshape(-1, 2)
+    rest = both - nuisance @ np.linalg.lstsq(nuisance, both, rcond=None)[0]
+    visual_size, inertial_size = np.linalg.norm(rest, axis=0)
+    if not (visual_size > 0 and inertial_size > 0):
+        raise np.linalg.LinAlgError("no motion")
+    return float(inertial_size / visual_size)
+
+
+def _jumped(*groups: fac.Group | fac.Direct) -> int:
+    """How many states have a pose that a robust weight all but switches off."""
+    weights = [group.weight for group in groups if group.weight is not None]
+    return int(np.sum(np.min(weights, axis=0) < _HARDLY)) if weights else 0
+
+
+def _excitation_m_s2(data: Data, x: Estimate) -> float:
+    """Standard deviation of the camera's acceleration; on its lever arm the IMU swings even where the camera stays."""
+    path = x.imu_in_world_m - x.world_from_imu @ (x.cam_from_imu.T @ x.imu_in_cam_m)
+    dt_s = np.diff(data.t_s)[:, None]
+    accel = np.diff(np.diff(path, axis=0) / dt_s, axis=0) / (0.5 * (dt_s[1:] + dt_s[:-1]))
+    return float(np.sqrt(np.sum(np.var(accel, axis=0))))

@@ -1,0 +1,321 @@
+"""Noise levels: what sensors and reconstructions typically have, and what a recording says about its own.
+
+Levels are those of the greatest restricted likelihood (REML), given a prior: what the streams of the sensors show, and
+what is typical. Steps are Newton's with the average information matrix (Gilmour, Thompson and Cullis, Biometrics 1995).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from colmap_inertial.core.types import JOINT_GYRO_WALK_RAD_S_RTS, TYPICAL_NOISE, Array, ImuNoise
+from colmap_inertial.inertial.scale._factors import Direct, Group
+from colmap_inertial.inertial.scale._parameters import Data, Noise
+from colmap_inertial.inertial.scale._solver import Inverse
+
+Groups = Mapping[str, Group | Direct]
+
+#: Visual errors: video of about a megapixel of a scene a few metres away. A drift that starts lower may never be found:
+#: the fit then rests where the accelerometer's noise stands for it.
+TYPICAL = Noise(
+    gyro_rad_s_rthz=TYPICAL_NOISE.gyro_density_rad_s_rthz,
+    gyro_walk_rad_s_rts=JOINT_GYRO_WALK_RAD_S_RTS,
+    accel_m_s2_rthz=TYPICAL_NOISE.accel_density_m_s2_rthz,
+    accel_walk_m_s2_rts=TYPICAL_NOISE.accel_walk_m_s3_rthz,
+    rotation_rad=2e-3,
+    centre_m=1e-3,
+    drift_m_rts=4e-3,
+    accel_slow_m_s2_rts=1e-3,
+)
+#: No estimate may fall below these: pixels and samples are not finer.
+_FLOOR = {
+    "accel_m_s2_rthz": 3e-4,
+    "rotation_rad": 5e-5,
+    "centre_m": 5e-5,
+    "drift_m_rts": 1e-5,
+    "accel_slow_m_s2_rts": 1e-4,
+}
+#: Which residuals speak for which level. The gyroscope's is not among them: a slow error of the visual rotations looks
+#: just like a noisy gyroscope, and real SfM has the one while real gyroscopes are not the other.
+GROUP_OF = {
+    "accel_m_s2_rthz": "imu",
+    "rotation_rad": "rotation",
+    "centre_m": "centre",
+    "drift_m_rts": "drift",
+    "accel_slow_m_s2_rts": "accel_slow",
+}
+_LEVELS = tuple(GROUP_OF)
+#: Standard deviations of the logarithm of a level before anything is known of the recording: of a device in a hand,
+#: with no slow errors of its accelerometer to speak of, and of one that vibrates, where they are what there is.
+_SPREAD = {"accel_m_s2_rthz": 0.2, "rotation_rad": 2.0, "centre_m": 2.0, "drift_m_rts": 2.0, "accel_slow_m_s2_rts": 0.5}
+_SHAKEN = {**_SPREAD, "accel_m_s2_rthz": 0.7, "accel_slow_m_s2_rts": 2.0}
+#: What vibration does to an accelerometer: its most probable value where there is any; and where a search starts, with
+#: little white noise, that asks whether it is this.
+_SHAKEN_SLOW, _SLOW_START, _QUIET_START = 1e-2, 6e-2, 3e-3
+#: White noise of a gyroscope and an accelerometer, rad/s and m/s2 per root of a hertz: least and most of the first,
+#: most of the second. Streams that are rougher record motion or vibration.
+_LEAST_GYRO, _MOST_GYRO, _LEAST_ACCEL, _MOST_ACCEL = 1e-4, 3e-4, 5e-4, 4e-3
+#: Ten times the noise of the noisiest sensor: rotors and engines, not hands (.034 at most in what was recorded).
+_VIBRATES = 0.04
+#: Largest correlation between errors of neighbouring rotations that is believed.
+_LARGEST_CORRELATION = 0.8
+#: Part of a level's residuals that is left to it at least. In a hand a hundredth: where camera and IMU do not belong
+#: together, noise of the one would otherwise grow to metres and explain the other away. Where a device vibrates, that
+#: much would take noise for none that explains all but a little.
+_LEAST_LEFT, _LEAST_LEFT_SHAKEN = 1e-2, 1e-6
+#: First steps go by sums of squares, of the slow share of an error by its whole logarithm; then Newton's, damped
+#: (Levenberg): so much at first, and by these factors more where a step leads no nearer, less where it does.
+_BY_SQUARES, _DAMPED, _MORE, _LESS = 3, 0.3, 3.0, 0.4
+_LEAST_DAMPING, _MOST_DAMPING = 0.03, 10.0
+#: Largest changes of a variance's logarithm in a step: at first, and then.
+_LARGEST_FIRST, _LARGEST_CHANGE = 3.0, 1.8
+#: Where levels that explain the same do not come to rest in so many steps, that shrinks by the factor with each more.
+_PATIENCE, _TIRING = 25, 0.6
+#: At rest: the likelihood has no more than this to gain, as standard deviations of the levels (Newton's decrement).
+_AT_REST = 0.5
+
+
+def roughness(t_s: Array, values: Array) -> float:
+    """Density of the white noise that would make samples as rough as they are; more than the noise where they move.
+
+    From third differences, which leave little of a motion that is slow against the samples: 20 times the variance of
+    white noise.
+
+    Parameters
+    ----------
+    t_s, values
+        (N,), (N, 3) samples.
+    """
+    if len(t_s) < 4:
+        return 0.0
+    return float(np.sqrt(np.mean(np.diff(values, 3, axis=0) ** 2) / 20 * np.median(np.diff(t_s))))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Expected:
+    """What is known of the levels beforehand.
+
+    Attributes
+    ----------
+    noise
+        The most probable values.
+    floor
+        The least that is possible.
+    spread
+        Standard deviations of the logarithms.
+    start
+        Where the search for the greatest likelihood begins.
+    least_left
+        What part of the residuals of a level counts as left to it at least.
+    """
+
+    noise: Noise
+    floor: Mapping[str, float]
+    spread: Mapping[str, float]
+    start: Noise
+    least_left: float
+
+    @classmethod
+    def of(cls, data: Data, sheet: ImuNoise | None) -> Expected:
+        """From the streams of the sensors; a data sheet raises it, never lowers it.
+
+        The white noise of a sensor is in its stream, and so is all that is quicker than the states: motion, and above
+        all vibration, of which only a part harms. Up to what sensors have, an accelerometer's stream counts as its
+        noise; what is rougher, as the geometric mean of both. Where it vibrates, the white noise is still the sensor's,
+        and what harms is an error that stays for a while (it changes with the load on the rotors), which the search
+        finds if it begins there; from white noise it may not. Flights without any visual noise show it; with a few
+        millimetres of that, poses say nothing of what is quicker than a second, and a white noise that is believed too
+        large lowers the scale.
+        """
+        gyro = float(np.clip(data.gyro_roughness_rad_s_rthz, _LEAST_GYRO, _MOST_GYRO))
+        rough = max(data.accel_roughness_m_s2_rthz, _LEAST_ACCEL)
+        noise = replace(TYPICAL, gyro_rad_s_rthz=gyro, accel_m_s2_rthz=rough)
+        floor, spread = _FLOOR, _SPREAD
+        if rough > _MOST_ACCEL:
+            noise = replace(noise, accel_m_s2_rthz=float(np.sqrt(rough * _MOST_ACCEL)))
+        if rough > _VIBRATES:
+            noise = replace(noise, accel_m_s2_rthz=_MOST_ACCEL, accel_slow_m_s2_rts=_SHAKEN_SLOW)
+            spread = _SHAKEN
+        if sheet is not None:
+            noise = replace(
+                noise,
+                gyro_rad_s_rthz=max(noise.gyro_rad_s_rthz, sheet.gyro_density_rad_s_rthz),
+                gyro_walk_rad_s_rts=max(noise.gyro_walk_rad_s_rts, sheet.gyro_walk_rad_s2_rthz),
+                accel_m_s2_rthz=max(noise.accel_m_s2_rthz, sheet.accel_density_m_s2_rthz),
+                accel_walk_m_s2_rts=max(noise.accel_walk_m_s2_rts, sheet.accel_walk_m_s3_rthz),
+            )
+            least = max(_FLOOR["accel_m_s2_rthz"], sheet.accel_density_m_s2_rthz)
+            floor = {**_FLOOR, "accel_m_s2_rthz": least}
+        start = replace(noise, accel_slow_m_s2_rts=TYPICAL.accel_slow_m_s2_rts)
+        if spread is _SHAKEN:
+            quiet = max(floor["accel_m_s2_rthz"], min(noise.accel_m_s2_rthz, _QUIET_START))
+            start = replace(noise, accel_m_s2_rthz=quiet, accel_slow_m_s2_rts=_SLOW_START)
+        left = _LEAST_LEFT if spread is _SPREAD else _LEAST_LEFT_SHAKEN
+        return cls(noise=noise, floor=floor, spread=spread, start=start, least_left=left)
+
+
+def correlation_factor(group: Group | Direct, states: Array, z: Array) -> float:
+    """``Noise.rotation_excess`` from the correlation of consecutive residuals after a step."""
+    residual = group.residual + group.apply(states, z)[:, :, 0]
+    squares = float(np.sum(residual**2))
+    correlation = float(np.sum(residual[1:] * residual[:-1])) / squares if squares > 0 else 0.0
+    correlation = float(np.clip(correlation, 0.0, _LARGEST_CORRELATION))
+    return float(np.sqrt((1 + correlation) / (1 - correlation)))
+
+
+def by_level(group: Group | Direct, values: Array) -> Array:
+    """(N, r, q) whitened values times the derivative of the whitened covariance by the logarithm of the variance."""
+    return values if group.share is None else np.asarray(group.share @ values)
+
+
+@dataclass(eq=False, kw_only=True)
+class LevelSearch:
+    """The noise levels on their way to the greatest likelihood.
+
+    Attributes
+    ----------
+    expected
+        Prior.
+    noise
+        Where it stands.
+    sums
+        For each level: the sum of squares of its residuals, and what it would be at the right level.
+    information
+        (L, L) of the logarithms of the variances, prior included.
+    by_scale
+        (L,) change of the logarithm of ``u`` with the logarithm of each variance.
+    wanted
+        (L,) changes of the logarithms of the variances that lead to the greatest likelihood, to first order.
+    decrement
+        What is left to gain: the length of that step in standard deviations of the levels.
+    """
+
+    expected: Expected
+    noise: Noise = field(init=False)
+    sums: dict[str, tuple[float, float]] = field(default_factory=dict)
+    information: Array = field(default_factory=lambda: np.eye(len(_LEVELS)))
+    by_scale: Array = field(default_factory=lambda: np.zeros(len(_LEVELS)))
+    wanted: Array = field(default_factory=lambda: np.ones(len(_LEVELS)))
+    decrement: float = np.inf
+    _damping: float = _DAMPED
+    _before: float = np.inf
+    _steps: int = 0
+
+    def __post_init__(self) -> None:
+        self.noise = self.expected.start
+
+    def update(self, groups: Groups, inverse: Inverse, states: Array, z: Array, *, moving: bool) -> None:
+        """What a step (K, m, 1), (n, 1) of all else and the inverse of its equations say; levels go along if moving."""
+        squares, right, counts = np.zeros((3, len(_LEVELS)))
+        own = []
+        rhs, rhs_z = np.zeros((*states.shape[:2], len(_LEVELS))), np.zeros((len(z), len(_LEVELS)))
+        for i, level in enumerate(_LEVELS):
+            group = groups[GROUP_OF[level]]
+            moved = group.residual[:, :, None] + group.apply(states, z)
+            own.append(by_level(group, moved))
+            squares[i] = float(np.sum(moved * own[i]))
+            if level == "rotation_rad":
+                squares[i] *= self.noise.rotation_excess**2
+            count = group.residual.shape[1] * (
+                len(group.residual) if group.weight is None else float(group.weight.sum())
+            )
+            if group.share is not None:
+                count = float(np.trace(group.share, axis1=1, axis2=2).sum())
+            counts[i], right[i] = count, max(count - group.explained(inverse), self.expected.least_left * count)
+            group.pull_back(own[i], rhs[:, :, i : i + 1], rhs_z[:, i : i + 1])
+        # a hundredth of the residuals, or they tell nothing of how much larger than expected they are
+        told = np.maximum(right, 0.01 * counts)
+        self.sums = {level: (float(squares[i]), float(told[i])) for i, level in enumerate(_LEVELS)}
+        followed, followed_z = inverse.solve(rhs, rhs_z)
+        self.by_scale = followed_z[0]
+        average = np.zeros((len(_LEVELS), len(_LEVELS)))
+        for i, level in enumerate(_LEVELS):
+            change = groups[GROUP_OF[level]].apply(followed, followed_z)
+            average[i] = -0.5 * np.einsum("kri,krj->j", own[i], change)
+            average[i, i] += 0.5 * float(np.sum(own[i] ** 2))
+        noise = self._next(0.5 * (average + average.T), squares, right)
+        if moving:
+            self.noise = replace(noise, rotation_excess=correlation_factor(groups["rotation"], states, z))
+
+    def _next(self, average: Array, squares: Array, right: Array) -> Noise:
+        # Rotations hardly depend on the other levels; their correlation changes along with their level
+        at = _LEVELS.index("rotation_rad")
+        others = np.arange(len(_LEVELS)) != at
+        average[at, :] = average[:, at] = 0.0
+        average[at, at] = 0.5 * max(squares[at], right[at])
+        now = 2 * np.log([getattr(self.noise, level) for level in _LEVELS])
+        mean = 2 * np.log([getattr(self.expected.noise, level) for level in _LEVELS])
+        floor = 2 * np.log([self.expected.floor[level] for level in _LEVELS])
+        prior = 1 / (2 * np.array([self.expected.spread[level] for level in _LEVELS])) ** 2
+        self.information = average + np.diag(prior)
+        gradient = 0.5 * (squares - right) - prior * (now - mean)
+        free = ~((now <= floor + 1e-6) & (gradient < 0))
+
+        def newton(damping: float) -> Array:
+            step = np.zeros(len(_LEVELS))
+            stiff = np.diag(np.where(others, damping * 0.5 * np.maximum(np.maximum(right, squares), 1.0), 0.0))
+            step[free] = np.linalg.solve((self.information + stiff)[np.ix_(free, free)], gradient[free])
+            return step
+
+        self.wanted = newton(0.0)
+        self.decrement = float(max(gradient[free & others] @ self.wanted[free & others], 0.0)) ** 0.5
+        self._steps += 1
+        if self._steps <= _BY_SQUARES:
+            # an accelerometer's noise is known beforehand better than the rest
+            part = np.where(np.array(_LEVELS) == "accel_m_s2_rthz", 0.5, 1.0)
+            step = np.clip(
+                part * np.log(np.maximum(squares, 1e-9) / np.maximum(right, 1e-9)), -_LARGEST_FIRST, _LARGEST_FIRST
+            )
+        else:
+            if self.decrement > self._before:
+                self._damping = min(max(_MORE * self._damping, _LEAST_DAMPING), _MOST_DAMPING)
+            elif np.isfinite(self._before):
+                self._damping = _LESS * self._damping if self._damping > 1e-3 else 0.0
+            self._before = self.decrement
+            most = _LARGEST_CHANGE * self._left
+            step = np.clip(newton(self._damping), -most, most)
+        new = np.exp(0.5 * np.maximum(now + step, floor))
+        return replace(self.noise, **dict(zip(_LEVELS, map(float, new), strict=True)))
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the likelihood has hardly more to gain."""
+        return self.decrement * self._left < _AT_REST
+
+    def scale_moves(self) -> float:
+        """How much the logarithm of the scale would change with the step that the levels want to make."""
+        most = _LARGEST_FIRST * self._left
+        return abs(float(self.by_scale @ np.clip(self.wanted, -most, most)))
+
+    @property
+    def _left(self) -> float:
+        """What is left of the largest change."""
+        return float(_TIRING ** max(0, self._steps - _PATIENCE))
+
+    def scale_variance(self, groups: Groups, states: Array, z: Array) -> tuple[float, float]:
+        """What the levels' own uncertainty means for the scale.
+
+        Parameters
+        ----------
+        states, z
+            (K, m, 1), (n, 1) solution for the scale alone as right-hand side.
+
+        Returns
+        -------
+        Variance of the logarithm of the scale from the levels, and how many degrees of freedom the scale's own variance
+        rests on: ``2 / var(log variance)``, as a variance from that many residuals would have (Satterthwaite 1946).
+        """
+        cov = np.linalg.inv(self.information)
+        shares = []
+        for level in _LEVELS:
+            group = groups[GROUP_OF[level]]
+            values = group.apply(states, z)
+            shares.append(float(np.sum(values * by_level(group, values))))
+        by_level_of_log = np.array(shares) / float(z[0, 0])
+        return (
+            float(self.by_scale @ cov @ self.by_scale),
+            2 / max(float(by_level_of_log @ cov @ by_level_of_log), 1e-12),
+        )

@@ -1,0 +1,355 @@
+"""Scale from one fit of everything that the camera and the IMU measured; positions are never differentiated.
+
+The most probable motion, calibration and scale given gyroscope, accelerometer and visual poses. States an eighth of a
+second apart (at every frame where frames are sparser; fewer in recordings of many minutes): rotation, position,
+velocity, gyroscope bias, and random walks of the accelerometer's bias and of the visual centres' error. Globals: scale,
+gravity, accelerometer bias, gains and axis errors of both sensors, camera-IMU rotation, lever arm, time offsets of both
+sensors and the rate between the clocks, what a rolling shutter does to rotations and centres, and how errors of the
+centres go with errors of the rotations.
+The IMU enters through preintegration (Forster et al., "On-manifold preintegration", 2017). The noise sits on the visual
+centres, not on the inertial path that explains them: regression the other way round attenuates the scale. Noise levels
+of the accelerometer and of the poses are estimated along (REML).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.geometry import quat_from_matrix
+from colmap_inertial.core.sampling import MUCH_CUT
+from colmap_inertial.core.types import (
+    CAL,
+    Array,
+    CameraImuCalibration,
+    CameraTrajectory,
+    ImuNoise,
+    ImuRecording,
+    ScaleEstimate,
+)
+from colmap_inertial.inertial.scale import _parameters as par
+from colmap_inertial.inertial.scale._fit import Fit, fit_jointly
+from colmap_inertial.inertial.scale._parameters import Data, Prior
+from colmap_inertial.inertial.scale._setup import prepare
+from colmap_inertial.inertial.scale._suspects import Faults, worst
+from colmap_inertial.inertial.scale.priors import PRIORS, is_calibrated
+from colmap_inertial.inertial.scale.verdict import scale_drifts, student_factor, verdict_of
+
+_LARGEST_BIAS_M_S2 = 2.0
+#: Gains and sines of angles between axes.
+_LARGEST_GAIN = 0.2
+#: The accelerometer's noise between states over the motion's acceleration: 0.02 to 0.1 in good recordings, 0.4 and more
+#: where an axis is mirrored.
+_LARGEST_UNEXPLAINED = 0.25
+#: So many times at most is something wrong with the accelerometer looked for, undone, and the rest fitted again.
+_MOST_FAULTS = 6
+#: Shorter clips say too little about their own noise for a number to be trusted.
+_SHORTEST_TRUSTED_S = 6.0
+#: Real visual errors are not those of the model (alike over .1 to 1 s and longer), which counts the more the shorter a
+#: clip is: standard deviations grow by this over its length. Measured on handheld and flown recordings with motion
+#: capture, cut to 3 to 20 s.
+_UNMODELLED_S = 1.5
+#: Standard deviation of what lies anywhere between none and all.
+_UNIFORM = 12**-0.5
+_RECORD_INSTEAD = (
+    "move the camera itself back and forth by 20 cm or more, in several directions and briskly, for 10 s or longer, "
+    "while it sees texture; panning, walking straight at one speed and a tripod cannot give a scale"
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointOptions:
+    """How the joint estimator works."""
+
+    gravity_m_s2: float = 9.80665
+    """Magnitude of gravity where the recording was made (``gravity_at_latitude_m_s2``)."""
+
+    gravity_sigma_m_s2: float = PRIORS.gravity_m_s2
+    """Its standard deviation; the default spans 9.78 at the equator to 9.83 at the poles."""
+
+    states_hz: float = 8.0
+    """Poses of a video are averaged to this many a second."""
+
+    def __post_init__(self) -> None:
+        if not (self.gravity_m_s2 > 0 and self.gravity_sigma_m_s2 > 0 and self.states_hz > 0):
+            raise ValueError("gravity, its standard deviation and the rate of states must be positive")
+
+
+def estimate_joint(
+    trajectory: CameraTrajectory,
+    imu: ImuRecording,
+    calibration: CameraImuCalibration,
+    options: JointOptions | None = None,
+) -> ScaleEstimate:
+    """Metres per model unit, gravity and accelerometer bias, with a refined calibration.
+
+    Parameters
+    ----------
+    trajectory
+        Camera poses, dense or sparse. ``pose_cov``, where given, weighs frames against each other.
+    imu
+        Recording of the same device.
+    calibration
+        From ``align_camera_imu``. Its rotation, gyroscope bias and time offset are starting points with five times
+        their standard deviations; lever arm, readout and the offset between the sensors are priors as they stand.
+    options
+        See ``JointOptions``.
+
+    Returns
+    -------
+    ``method="joint"``. ``sigma_log`` combines the posterior standard deviation, inflated by chi-square where the fit is
+    worse than its noise and widened as Student's distribution is where few residuals tell the noise, with the floor
+    (``priors.model_scale_sigma``), what noise in the fitted path may take from the scale, and how uncertain it is what
+    was undone of the accelerometer's faults. ``verdict`` is ``"refused"`` where the data cannot give a scale, with the
+    reason.
+    """
+    options = options or JointOptions()
+    try:
+        data, fit, faults = fit_path(trajectory, imu, calibration, options)
+    except NotObservableError as error:
+        return ScaleEstimate.refused("joint", error.hint)
+    except np.linalg.LinAlgError:
+        return ScaleEstimate.refused("joint", f"camera and IMU do not determine a scale together: {_RECORD_INSTEAD}")
+    left_open = sum(one.scale_variance for one in fit.suspicions if one.name in faults.values)
+    fit = replace(fit, variance_parts={**fit.variance_parts, "accel_faults": left_open})
+    wrong = [*faults.sentences(), *_cut_off(data)]
+    # what was taken from a path nobody can put back: its scale is too large by more than any interval says
+    return _judged(fit, data.t_s, calibration, is_calibrated(imu), wrong, worthless=faults.path_is_smoothed)
+
+
+def fit_path(
+    trajectory: CameraTrajectory, imu: ImuRecording, calibration: CameraImuCalibration, options: JointOptions
+) -> tuple[Data, Fit, Faults]:
+    """The measurements as they came, their fit, and what was wrong with the accelerometer.
+
+    Raises
+    ------
+    NotObservableError
+        When too few frames lie inside the IMU recording.
+    numpy.linalg.LinAlgError
+        When the data leave the system singular.
+    """
+    data, prior = prepare(
+        trajectory,
+        imu,
+        calibration,
+        gravity_m_s2=options.gravity_m_s2,
+        gravity_sigma_m_s2=options.gravity_sigma_m_s2,
+        states_hz=options.states_hz,
+    )
+    return data, *_fit_soundly(data, prior, imu.noise)
+
+
+def _fit_soundly(data: Data, prior: Prior, sheet: ImuNoise | None) -> tuple[Fit, Faults]:
+    """The fit, with what shows to be wrong with the accelerometer undone, and what that was."""
+    faults, sound = Faults(values={}), data
+    fit = fit_jointly(data, prior, sheet)
+    for _ in range(_MOST_FAULTS):
+        if fit.gain_chi2 > par.LARGEST_GAIN_CHI2 and not prior.heavy_gains:
+            # not from the start: on its way a fit passes gains that it would not find back from
+            prior = replace(prior, heavy_gains=True)
+            fit = fit_jointly(sound, faults.loosened(prior), sheet)
+        found = worst(fit.suspicions, data.tracks.accel, faults.values)
+        # a fit of what does not belong together explains nothing
+        if found is None or _refusals(fit, data.t_s):
+            break
+        faults = faults.with_found(found)
+        if faults.path_is_smoothed:
+            break
+        sound = faults.undone(data)
+        fit = fit_jointly(sound, faults.loosened(prior), sheet)
+    return fit, faults
+
+
+def _cut_off(data: Data) -> list[str]:
+    out = []
+    for sensor, share in (("gyroscope", data.gyro_cut_share), ("accelerometer", data.accel_cut_share)):
+        if share > MUCH_CUT:
+            out.append(
+                f"{100 * share:.2g} % of the {sensor}'s readings stand at the end of its range; they count as missing: "
+                "move less violently, or give the sensor a wider range"
+            )
+    return out
+
+
+def _judged(
+    fit: Fit, t_s: Array, calibration: CameraImuCalibration, calibrated: bool, wrong: Sequence[str], *, worthless: bool
+) -> ScaleEstimate:
+    x = fit.estimate
+    squares = sum(s for s, _ in fit.sums.values())
+    expected = sum(e for _, e in fit.sums.values())
+    found = scale_of(fit, t_s, calibrated)
+    metres_per_unit, sigma_log = found.metres_per_unit, found.sigma_log
+    refusals = [*_refusals(fit, t_s), *(wrong if worthless else ())]
+    verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, refusals=refusals)
+    if verdict == "refused":
+        reasons = (*reasons, *(() if worthless else wrong))
+    else:
+        verdict, ci95, reasons = verdict_of(metres_per_unit, sigma_log, [*wrong, *_checks(fit, t_s)])
+    notes: tuple[str, ...] = ()
+    if fit.jumped:
+        places = "one place" if fit.jumped == 1 else f"{fit.jumped} places"
+        notes = (f"poses jump at {places}, which hardly counts",)
+    refused = verdict == "refused"
+    keep = [par.SCALE, *range(par.GRAVITY.start, par.ACCEL_BIAS.stop)]
+    signs = np.array([-1.0, *[1.0] * 6])
+    cov = fit.cov[np.ix_(keep, keep)] * signs[:, None] * signs
+    cov[0, 0] = sigma_log**2
+    return ScaleEstimate(
+        metres_per_unit=None if refused else metres_per_unit,
+        sigma_log=None if refused else sigma_log,
+        ci95=None if refused else ci95,
+        verdict=verdict,
+        method="joint",
+        reasons=reasons,
+        notes=notes,
+        gravity_in_world_m_s2=x.gravity_m_s2,
+        accel_bias_m_s2=x.accel_bias_m_s2,
+        calibration=_refined(fit, calibration),
+        cov=cov,
+        chi2=squares,
+        dof=max(1, round(expected)),
+        excitation_m_s2=fit.excitation_m_s2,
+        drift=fit.drift,
+        parts=None if refused else found.parts,
+        noise=ImuNoise(
+            gyro_density_rad_s_rthz=fit.noise.gyro_rad_s_rthz,
+            accel_density_m_s2_rthz=fit.noise.accel_density_m_s2_rthz,
+            gyro_walk_rad_s2_rthz=fit.noise.gyro_walk_rad_s_rts,
+            accel_walk_m_s3_rthz=fit.noise.accel_walk_m_s2_rts,
+        ),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class FoundScale:
+    """What a fit says of the scale.
+
+    Attributes
+    ----------
+    metres_per_unit, sigma_log, parts
+        As :class:`ScaleEstimate` has them.
+    widened
+        Factor on variances of the fit: squares beyond their expectation, few degrees of freedom, what no model has.
+    """
+
+    metres_per_unit: float
+    sigma_log: float
+    parts: dict[str, float]
+    widened: float
+
+
+def scale_of(fit: Fit, t_s: Array, calibrated: bool) -> FoundScale:
+    """The scale and the standard deviation of its logarithm, with what the fit takes for granted put right.
+
+    The scale makes residuals orthogonal to the fitted path. That path follows the visual noise with as many degrees of
+    freedom as the states take from the centres; where the accelerometer is less noisy than the fit says, it follows
+    too willingly, which lowers the scale by ``share * (1 - true variance / fitted variance)``. Part of the fitted noise
+    is no white noise at all, but slow (rotors), and the rest is in the accelerometer's own stream or data sheet.
+    """
+    worst = max(s / e for s, e in fit.sums.values())
+    bare = float(fit.cov[par.SCALE, par.SCALE])
+    taken = 3 * len(t_s) - fit.sums["centre_m"][1] - fit.sums["drift_m_rts"][1]
+    # A gain follows the noise the other way, so that what both have in common stays where it is
+    gains = fit.cov[par.SCALE, par.ACCEL_GAIN].reshape(3, 3)
+    share = max(0.0, bare + float(np.trace(gains)) / 3) * max(0.0, taken)
+    overstated = max(0.0, 1 - (fit.expected_accel_m_s2_rthz / fit.noise.accel_m_s2_rthz) ** 2)
+    # To first order only: not by more than what the recording leaves open
+    shift = min(overstated * share, (bare * max(1.0, worst)) ** 0.5)
+    student = student_factor(fit.freedom)
+    widened = max(1.0, worst) * (student * (1 + _UNMODELLED_S / float(t_s[-1] - t_s[0]))) ** 2
+    variances = {name: widened * variance for name, variance in fit.variance_parts.items()}
+    variances["accel_gain"] *= fit.gain_surprise
+    variances["noise_levels"] = (student * _UNIFORM * share) ** 2 + fit.level_variance
+    variances["accel_gain"] += 0.0 if calibrated else PRIORS.accel_model**2
+    variances["lens"] = PRIORS.lens**2
+    return FoundScale(
+        metres_per_unit=fit.estimate.metres_per_unit * float(np.exp(shift)),
+        sigma_log=sum(variances.values()) ** 0.5,
+        parts={name: variance**0.5 for name, variance in variances.items()},
+        widened=widened,
+    )
+
+
+def _refusals(fit: Fit, t_s: Array) -> list[str]:
+    """Findings that make the number worthless, in the user's words."""
+    out = []
+    x = fit.estimate
+    if not fit.converged and float(fit.cov[par.SCALE, par.SCALE]) < 0.15**2:
+        out.append(f"the fit of camera and IMU does not come to rest: {_RECORD_INSTEAD}")
+    bias = float(np.linalg.norm(x.accel_bias_m_s2))
+    if bias > _LARGEST_BIAS_M_S2:
+        out.append(
+            f"the accelerometer would have to be off by {bias:.1f} m/s2, more than any working sensor is: check its "
+            "unit (m/s2), its sign (at rest it reads +9.8 away from the ground) and its axes"
+        )
+    gain = float(np.abs(x.accel_gain).max())
+    if gain > _LARGEST_GAIN:
+        out.append(
+            f"the accelerometer's gains or axes would have to be off by {100 * gain:.0f} %, more than those of any "
+            "working sensor are: check its unit (m/s2), its sign (at rest it reads +9.8 away from the ground) and its "
+            "axes"
+        )
+    # Noise of the accelerometer averaged between states, against the acceleration that it should measure
+    unexplained = fit.noise.accel_m_s2(float(np.median(np.diff(t_s))))
+    if unexplained > _LARGEST_UNEXPLAINED * fit.excitation_m_s2:
+        out.append(
+            f"the accelerometer and the camera's motion disagree by {unexplained:.2f} m/s2, where the motion itself is "
+            f"{fit.excitation_m_s2:.2f} m/s2: check the accelerometer's sign and axes and that both recordings belong "
+            f"together, or {_RECORD_INSTEAD}"
+        )
+    return out
+
+
+def _checks(fit: Fit, t_s: Array) -> list[str]:
+    """Findings that make the number doubtful, in the user's words."""
+    out = []
+    span_s = float(t_s[-1] - t_s[0])
+    if span_s < _SHORTEST_TRUSTED_S:
+        out.append(
+            f"the clip is short ({span_s:.1f} s): it says little about its own noise; "
+            f"record {_SHORTEST_TRUSTED_S:.0f} s or more"
+        )
+    if fit.gain_chi2 > par.LARGEST_GAIN_CHI2:
+        gains = ", ".join(f"{-100 * g:+.1f}" for g in np.diagonal(fit.estimate.accel_gain))
+        out.append(
+            f"the accelerometer seems to be off in gain by {gains} % on its axes, more than such sensors are, which "
+            "is allowed for: check its unit and the strength of gravity, or calibrate it (calibrate-imu)"
+        )
+    drift = fit.drift
+    if scale_drifts(drift.p_value, drift.trend_log_per_s, drift.trend_sigma_log_per_s):
+        low, high = np.expm1(drift.log_ratio.min()), np.expm1(drift.log_ratio.max())
+        out.append(
+            f"the reconstruction's scale is not the same throughout: from {100 * low:+.1f} to {100 * high:+.1f} % in "
+            f"parts of {drift.end_s[0] - drift.begin_s[0]:.0f} s (see drift in the JSON); it drifts, or a part of it "
+            "is wrong: close loops while recording, or scale its parts apart"
+        )
+    return out
+
+
+def _refined(fit: Fit, calibration: CameraImuCalibration) -> CameraImuCalibration:
+    x = fit.estimate
+    # Rows of CALIBRATION_PARAMETERS from the globals and the mean gyroscope bias
+    jacobian = np.zeros((CAL.COUNT, par.N_GLOBALS))
+    jacobian[CAL.ROTATION, par.ROTATION] = np.eye(3)
+    jacobian[CAL.TIME_OFFSETS, par.DELAY] = 1.0
+    jacobian[CAL.ACCEL_TIME_OFFSET, par.ACCEL_DELAY] = 1.0
+    jacobian[CAL.LEVER_ARM, par.LEVER] = np.eye(3)
+    cov = jacobian @ fit.cov @ jacobian.T
+    with_bias = jacobian @ fit.gyro_bias_with_globals
+    cov[:, CAL.GYRO_BIAS] += with_bias
+    cov[CAL.GYRO_BIAS, :] += with_bias.T
+    cov[CAL.GYRO_BIAS, CAL.GYRO_BIAS] = fit.gyro_bias_cov
+    cov[CAL.READOUT, CAL.READOUT] = calibration.cov[CAL.READOUT, CAL.READOUT]
+    return replace(
+        calibration,
+        cam_from_imu_xyzw=quat_from_matrix(x.cam_from_imu),
+        gyro_time_offset_s=calibration.gyro_time_offset_s + x.delay_s,
+        accel_time_offset_s=calibration.accel_time_offset_s + x.delay_s + x.accel_delay_s,
+        gyro_bias_rad_s=x.gyro_bias_rad_s.mean(axis=0),
+        imu_in_cam_m=x.imu_in_cam_m,
+        cov=0.5 * (cov + cov.T),
+    )

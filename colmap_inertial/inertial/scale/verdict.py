@@ -1,0 +1,102 @@
+"""From a scale and its standard deviation to an interval and a verdict; one rule for every estimator."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from colmap_inertial.core.quantiles import Z95
+from colmap_inertial.core.types import Verdict
+
+#: Half-widths of the 95 % interval, relative to the scale, up to which a scale is trusted, and given at all.
+TRUSTED_HALF_WIDTH = 0.03
+WEAK_HALF_WIDTH = 0.30
+#: A drift of the scale is reported where chance would show as much once in a thousand recordings.
+_DRIFT_PROBABILITY, _DRIFT_SIGMAS = 1e-3, 3.29
+#: Two-sided 95 % quantile of the normal distribution.
+
+
+def half_width(sigma_log: float) -> float:
+    """Half-width of the log-symmetric 95 % interval relative to the scale: ``(hi - lo) / (2 scale)``."""
+    exponent = Z95 * sigma_log
+    return math.sinh(exponent) if exponent < 700 else math.inf
+
+
+def student_factor(freedom: float) -> float:
+    """Two-sided 95 % quantile of Student's distribution over that of the normal one, for any degrees of freedom.
+
+    The expansion by Hill (Communications of the ACM 1970), within 1 % from three degrees of freedom on; fewer count as
+    three.
+    """
+    n = max(freedom, 3.0)
+    z = Z95
+    terms = (
+        (z**2 + 1) / 4,
+        (5 * z**4 + 16 * z**2 + 3) / 96,
+        (3 * z**6 + 19 * z**4 + 17 * z**2 - 15) / 384,
+    )
+    return 1 + sum(term / n**power for power, term in enumerate(terms, start=1))
+
+
+def scale_drifts(p_value: float, trend_log_per_s: float, trend_sigma_log_per_s: float) -> bool:
+    """Whether the scales of parts of a recording differ by more than chance, or steadily grow or shrink.
+
+    Parameters
+    ----------
+    p_value, trend_log_per_s, trend_sigma_log_per_s
+        Of a ``ScaleDrift``.
+    """
+    return p_value < _DRIFT_PROBABILITY or abs(trend_log_per_s) > _DRIFT_SIGMAS * trend_sigma_log_per_s
+
+
+def verdict_of(
+    metres_per_unit: float,
+    sigma_log: float,
+    checks: Sequence[str] = (),
+    *,
+    refusals: Sequence[str] = (),
+) -> tuple[Verdict, tuple[float, float], tuple[str, ...]]:
+    """Judge a scale estimate.
+
+    Parameters
+    ----------
+    metres_per_unit
+        The estimate.
+    sigma_log
+        Standard deviation of its logarithm.
+    checks
+        A sentence for each check that failed. Any of them keeps the verdict from being ``"trusted"``.
+    refusals
+        A sentence for each finding that makes the number worthless whatever its width.
+
+    Returns
+    -------
+    verdict
+        ``"trusted"`` up to a half-width of 3 %, ``"weak"`` up to 30 %, else ``"refused"``.
+    ci95
+        (low, high), symmetric in the logarithm of the scale.
+    reasons
+        ``refusals``, ``checks``, and a sentence on the width where it decided.
+    """
+    if not (math.isfinite(metres_per_unit) and metres_per_unit > 0):
+        raise ValueError(f"metres_per_unit must be positive and finite, not {metres_per_unit}")
+    if not sigma_log >= 0:
+        raise ValueError(f"sigma_log must not be negative, not {sigma_log}")
+    width = half_width(sigma_log)
+    factor = math.exp(min(Z95 * sigma_log, 700.0))
+    ci95 = (metres_per_unit / factor, metres_per_unit * factor)
+    reasons = [*refusals, *checks]
+    verdict: Verdict = "weak" if checks else "trusted"
+    if width > TRUSTED_HALF_WIDTH:
+        verdict = "weak"
+    if width > WEAK_HALF_WIDTH:
+        known = f"known to no better than +-{100 * width:.0f} %" if width < 10 else "not known at all"
+        reasons.append(
+            f"the scale is {known}: record a clip in which the camera itself speeds up and slows down "
+            "(swing it back and forth by 20 cm or more, for 10 s or longer) while it sees texture"
+        )
+    elif width > TRUSTED_HALF_WIDTH:
+        reasons.append(f"the 95 % interval is +-{100 * width:.1f} %: more or livelier motion would narrow it")
+    if width > WEAK_HALF_WIDTH or refusals:
+        verdict = "refused"
+    return verdict, ci95, tuple(reasons)

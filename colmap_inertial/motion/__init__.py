@@ -1,0 +1,1 @@
+"""How the camera turned and where its clock stands: pixels, gyroscope, alignment, smoothing."""

@@ -1,0 +1,251 @@
+"""Camera-IMU alignment: rotation, time offset and gyroscope bias from the gyroscope against visual rotation.
+
+Step 1 of Mustaniemi et al., "Inertial-based scale estimation for structure from motion on mobile devices" (IROS 2017),
+with three changes. Every offset at which the two recordings could coincide is searched, because clock origins are
+arbitrary, and clocks may run at different rates. Rotations over intervals between frames are compared instead of
+differentiated orientations, so that video and sparse keyframes are treated in the same way. And a result is refused
+where no offset is clearly better than the rest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.gyro import GyroPath
+from colmap_inertial.core.threads import one_blas_thread
+from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuRecording, clock_shift_s
+from colmap_inertial.io.calibration import calibration_prior
+from colmap_inertial.motion.align._clock_search import (
+    ClockFit,
+    explained_at,
+    intervals_of,
+    search_offsets,
+    spaced_frames,
+)
+from colmap_inertial.motion.align._fit import OFFSET_UNKNOWN_FROM_S, Alignment, middle_of_overlap, refine_alignment
+
+#: Frames closer together than the first have turned by less than the noise of their poses; over the second, the noise
+#: of poses is small against the rotation that is to be explained.
+_SPACING_S, _CHECK_SPACING_S = 0.1, 0.3
+#: Below this there is no interval long enough to tell one offset from another.
+_SHORTEST_S = 1.0
+#: Where the clocks drift apart too far for one offset, parts of this length still have one; how many of them are
+#: tried; the largest drift (action cameras: 1 %), and how far the parts may lie off a steady drift.
+_PART_S, _PARTS, _FASTEST_DRIFT, _UNSTEADY_S = 15.0, 8, 0.02, 0.2
+
+#: Rotation within a second, rms, below which the camera counts as still: what noise of poses looks like.
+_STILL_RAD_RTS = 0.015
+
+
+@dataclass(frozen=True, kw_only=True)
+class AlignOptions:
+    """How the clocks of camera and IMU are brought together."""
+
+    max_offset_s: float | None = None
+    """Largest offset between raw stamps to consider; 1 for a shared clock. Without it, every offset is searched."""
+
+    min_overlap: float = 0.25
+    """Smallest part of the shorter recording that the other one must cover for an offset to be considered."""
+
+    min_log_likelihood: float = 12.0
+    """How much likelier, in nats, the offset must be than the next best one and than no relation at all.
+
+    Where two recordings have nothing in common, the gap between the best offset and the next is distributed roughly
+    as an exponential of mean one, so that 12 would be exceeded 6 times in a million.
+    """
+
+    min_explained: float = 0.75
+    """Smallest part of the camera's rotation over 0.3 s that the gyroscope must explain."""
+
+
+def align_camera_imu(
+    trajectory: CameraTrajectory,
+    imu: ImuRecording,
+    *,
+    prior: CameraImuCalibration | None = None,
+    options: AlignOptions | None = None,
+) -> CameraImuCalibration:
+    """Rotation, time offset and gyroscope bias between a camera and an IMU.
+
+    As :func:`align_clocks`, without the clock rate: for clocks that keep step, which all but action cameras' do.
+    """
+    found = align_clocks(trajectory, imu, prior=prior, options=options).calibration
+    return replace(found, clock_rate=0.0, clock_middle_s=0.0)
+
+
+@one_blas_thread()
+def align_clocks(
+    trajectory: CameraTrajectory,
+    imu: ImuRecording,
+    *,
+    prior: CameraImuCalibration | None = None,
+    options: AlignOptions | None = None,
+) -> Alignment:
+    """Rotation, time offset, clock rate and gyroscope bias between a camera and an IMU.
+
+    Parameters
+    ----------
+    trajectory
+        At least five poses; only their rotations are used. Video and keyframes seconds apart both serve.
+    imu
+        Only the gyroscope is used.
+    prior
+        What is known beforehand (``io.calibration.calibration_prior`` builds one). Its lever arm, readout and
+        accelerometer delay pass through; a time offset with a standard deviation below ``OFFSET_UNKNOWN_FROM_S``
+        narrows the search to two standard deviations (and 0.05 s). Where the search cannot find the rotation by
+        itself, a known rotation is held.
+    options
+        Search range and thresholds.
+
+    Returns
+    -------
+    The calibration has a covariance in the order of ``CALIBRATION_PARAMETERS``. It is that of generalised least
+    squares with pose noise (white, per frame) and gyroscope noise (random walk) estimated from the residuals, and
+    with gyroscope gain, misalignment, rolling shutter and clock rate as nuisance parameters; then widened per
+    parameter to what the scatter between twelve parts of the recording shows. It describes the very rotations that
+    were used here: as a prior of a second estimate from the same recording it would count them twice.
+
+    Raises
+    ------
+    NotObservableError
+        Where no offset is clearly better than the rest (another recording's IMU, no rotation, rotation that repeats
+        itself), where the recordings cannot overlap, or where turning about one axis only leaves the rotation open.
+    """
+    search = _search(trajectory, imu, prior, options)
+    prior = search.prior
+    rate = 0.0
+    start = search.whole(trajectory)
+    if isinstance(start, NotObservableError):
+        drifting = search.parts(trajectory)
+        if drifting is None:
+            raise start
+        start, rate = drifting
+    keep = spaced_frames(trajectory.t_s, _SPACING_S)
+    return refine_alignment(trajectory.select(keep), imu, start, prior, clock_rate=rate)
+
+
+def coarse_fit(
+    trajectory: CameraTrajectory,
+    imu: ImuRecording,
+    *,
+    prior: CameraImuCalibration | None = None,
+    options: AlignOptions | None = None,
+) -> ClockFit | NotObservableError:
+    """What :func:`align_clocks` starts from where the clocks keep step, with its evidence; or why there is nothing."""
+    try:
+        return _search(trajectory, imu, prior, options).whole(trajectory)
+    except NotObservableError as error:
+        return error
+
+
+def _search(
+    trajectory: CameraTrajectory,
+    imu: ImuRecording,
+    prior: CameraImuCalibration | None,
+    options: AlignOptions | None,
+) -> _Search:
+    options = options or AlignOptions()
+    prior = prior or calibration_prior()
+    if len(trajectory) < 5:
+        raise NotObservableError("time offset", f"{len(trajectory)} poses are too few to compare with the gyroscope")
+    span_s = float(trajectory.t_s[-1] - trajectory.t_s[0])
+    if span_s < _SHORTEST_S:
+        hint = f"{span_s:.2f} s of poses are too short to compare with the gyroscope: record ten seconds or more"
+        raise NotObservableError("time offset", hint)
+    return _Search(
+        path=GyroPath(imu.gyro_t_s, imu.gyro_rad_s, np.zeros(3)),
+        offsets_s=_range(trajectory, imu, prior, options),
+        prior=prior,
+        options=options,
+    )
+
+
+def _range(
+    trajectory: CameraTrajectory, imu: ImuRecording, prior: CameraImuCalibration, options: AlignOptions
+) -> tuple[float, float]:
+    """Lowest and highest offset between times since the two epochs."""
+    shift_s = clock_shift_s(trajectory, imu)
+    lowest_s, highest_s = -np.inf, np.inf
+    if options.max_offset_s is not None:
+        lowest_s, highest_s = shift_s - options.max_offset_s, shift_s + options.max_offset_s
+    sigma_s = prior.sigma("gyro_time_offset_s")
+    if sigma_s < OFFSET_UNKNOWN_FROM_S:
+        centre_s, reach_s = prior.gyro_time_offset_s + shift_s, 2 * sigma_s + 0.05
+        lowest_s, highest_s = max(lowest_s, centre_s - reach_s), min(highest_s, centre_s + reach_s)
+    return lowest_s, highest_s
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Search:
+    """What the offset is sought by: the gyroscope, lowest and highest offset, what is known, thresholds."""
+
+    path: GyroPath
+    offsets_s: tuple[float, float]
+    prior: CameraImuCalibration
+    options: AlignOptions
+
+    def whole(self, trajectory: CameraTrajectory) -> ClockFit | NotObservableError:
+        """The coarse fit, or the reason why there is none."""
+        intervals = intervals_of(trajectory, _SPACING_S)
+        rotation_known, options = self.prior.rotation_sigma_rad < 0.2, self.options
+        for held in (None, self.prior.cam_from_imu_xyzw) if rotation_known else (None,):
+            fits = search_offsets(
+                intervals, self.path, self.offsets_s, min_overlap=options.min_overlap, cam_from_imu_xyzw=held
+            )
+            if not fits:
+                return NotObservableError(
+                    "time offset",
+                    "camera and IMU do not overlap at any offset that is allowed: check that the recordings belong "
+                    "together and that their clocks are what was declared",
+                )
+            best = fits[0]
+            rival = max([0.0, *(fit.log_likelihood for fit in fits[1:])])
+            explained = explained_at(intervals_of(trajectory, _CHECK_SPACING_S), self.path, best.offset_s, held)
+            if best.log_likelihood - rival >= options.min_log_likelihood and explained >= options.min_explained:
+                return best
+        seconds = intervals_of(trajectory, _SHORTEST_S)
+        if np.sqrt(np.mean(np.sum(seconds.turn_rad**2, axis=1) / seconds.dt_s)) < _STILL_RAD_RTS:
+            hint = "the camera hardly rotates: turn it about all three axes while recording"
+            return NotObservableError("camera-IMU rotation", hint)
+        hint = "the rotations fit almost as well at another offset"
+        hint += ": record longer, with rotation that does not repeat itself"
+        if explained < options.min_explained:
+            hint = (
+                "at no offset does the gyroscope fit the camera's rotations clearly better than at the rest (it "
+                f"explains {100 * max(explained, 0):.0f} % of them): check that this IMU recording belongs to these "
+                "images and that the gyroscope's columns, axes and unit are right, or record longer with rotation "
+                "about all three axes"
+            )
+        return NotObservableError("time offset", hint)
+
+    def parts(self, trajectory: CameraTrajectory) -> tuple[ClockFit, float] | None:
+        """Offset in the middle and clock rate from short parts, if at least two of them agree on a steady drift."""
+        t_s = trajectory.t_s
+        if t_s[-1] - t_s[0] < 2 * _PART_S:
+            return None
+        found: list[tuple[float, ClockFit]] = []
+        for begin_s in np.linspace(t_s[0], t_s[-1] - _PART_S, _PARTS):
+            part = trajectory.select((t_s >= begin_s) & (t_s <= begin_s + _PART_S))
+            if len(part) >= 5:
+                fit = self.whole(part)
+                if isinstance(fit, ClockFit):
+                    found.append((begin_s + 0.5 * _PART_S, fit))
+        best: tuple[int, float, float] | None = None
+        for i, (time_i, fit_i) in enumerate(found):
+            for time_j, fit_j in found[i + 1 :]:
+                rate = (fit_j.offset_s - fit_i.offset_s) / (time_j - time_i)
+                at_zero_s = fit_i.offset_s - rate * time_i
+                agreeing = sum(abs(fit.offset_s - at_zero_s - rate * time) < _UNSTEADY_S for time, fit in found)
+                if abs(rate) <= _FASTEST_DRIFT and (best is None or agreeing > best[0]):
+                    best = (agreeing, rate, at_zero_s)
+        if best is None or best[0] < max(2, (len(found) + 1) // 2):
+            return None
+        _, rate, at_zero_s = best
+        middle_s = middle_of_overlap(trajectory, self.path.t_s, at_zero_s + rate * 0.5 * float(t_s[0] + t_s[-1]))
+        return replace(found[0][1], offset_s=at_zero_s + rate * middle_s), rate
+
+
+__all__ = ["OFFSET_UNKNOWN_FROM_S", "AlignOptions", "Alignment", "align_camera_imu", "align_clocks", "coarse_fit"]

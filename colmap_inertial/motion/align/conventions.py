@@ -1,0 +1,238 @@
+"""Poses written by another convention than they were read by: recognised by trying all, named, never applied.
+
+The gyroscope tells which way the rotations turn, and no more: reading a quaternion's four numbers in the other order is
+the same as inverting it, up to a constant rotation of the world and one of the camera (both are reflections of the
+sphere of quaternions). The accelerometer tells the rest: turned into the world by the right rotations, gravity is
+steady and what is quick is the acceleration of the right centres. Both kinds of evidence are log-likelihoods, and a
+convention is named only where it beats the one that was read as clearly as an alignment must beat its rivals.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from colmap_inertial.core.threads import one_blas_thread
+from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuRecording, clock_shift_s
+from colmap_inertial.io.calibration import calibration_prior
+from colmap_inertial.io.pose_convention import ARRAYS, PoseConvention, reread
+from colmap_inertial.motion.align import AlignOptions, coarse_fit
+from colmap_inertial.motion.align._acceleration import ACCELERATION_S, QuickAccelerations, quick_accelerations
+from colmap_inertial.motion.align._clock_search import ClockFit
+
+#: Standard deviation of the IMU's distance from the camera along each axis: what it adds is no sign of other poses.
+_ARM_M = 0.1
+#: Gravity is less steady in the world where rotations are wrong, or the accelerometer's axes.
+_STEADY = 0.975
+#: Share of the quick acceleration that the right centres explain at least. Measured: 0.26 and more; wrong ones 0.11.
+_EXPLAINED = 0.15
+#: Poses that explain this share as they were read need not be compared with others.
+_BEYOND_DOUBT = 0.4
+#: Keeps a path of no length from being divided by.
+_NOTHING = 1e-9
+
+
+@dataclass(frozen=True, kw_only=True)
+class LikelyConvention:
+    """What a table of poses most likely holds, other than it was read.
+
+    Attributes
+    ----------
+    read_as
+        What it was read as.
+    written_as
+        What fits instead; several where nothing tells them apart.
+    log_likelihood
+        How much likelier, in nats, than what was read; infinite where that does not fit at all.
+    """
+
+    read_as: PoseConvention
+    written_as: tuple[PoseConvention, ...]
+    log_likelihood: float
+
+    @property
+    def found(self) -> str:
+        """What fits."""
+        fits = "the IMU fits the camera's motion if"
+        if len(self.written_as) > 1:
+            fits = "the gyroscope fits the camera's rotations if"
+        return f"{fits} {', or '.join(_difference(self.read_as, one) for one in self.written_as)}"
+
+    @property
+    def advice(self) -> str:
+        """What to do."""
+        return f"write each pose as {self.read_as}"
+
+    @property
+    def sentence(self) -> str:
+        """What fits and what to do."""
+        return f"{self.found}: {self.advice}"
+
+
+def _difference(read_as: PoseConvention, written_as: PoseConvention) -> str:
+    """What is different in the table from what is read."""
+    said = []
+    if written_as.rotation != read_as.rotation:
+        said.append(f"the quaternions are inverted ({written_as.rotation}, not {read_as.rotation})")
+    if written_as.order != read_as.order:
+        said.append(f"the quaternions are in the order {' '.join(written_as.order)}, not {' '.join(read_as.order)}")
+    if written_as.position != read_as.position:
+        centre, translation = "the camera's centre", "the translation of camera_from_world"
+        what = (translation, centre) if written_as.position == "translation" else (centre, translation)
+        said.append(f"the positions are {what[0]}, not {what[1]} (centre = -R' translation)")
+    return " and ".join(said)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Candidate:
+    """One convention with its evidence: of the rotations; of acceleration by centres and lever arm, and by this alone.
+
+    It ``fits`` where the centres explain the acceleration beyond doubt, and not its opposite.
+    """
+
+    convention: PoseConvention
+    rotation: float
+    acceleration: float = 0.0
+    still: float = 0.0
+    steadiness: float = 1.0
+    fits: bool = False
+
+    @property
+    def evidence(self) -> float:
+        return self.rotation + self.acceleration
+
+
+@one_blas_thread()
+def likely_convention(
+    trajectory: CameraTrajectory,
+    imu: ImuRecording,
+    *,
+    read_as: PoseConvention = ARRAYS,
+    prior: CameraImuCalibration | None = None,
+    options: AlignOptions | None = None,
+) -> LikelyConvention | None:
+    """Whether poses fit the IMU if their table was written by another convention than it was read by.
+
+    Parameters
+    ----------
+    trajectory
+        Poses as they were read.
+    imu
+        The gyroscope tells inverted quaternions; with dense frames and an accelerometer, their order and what the
+        positions are, too.
+    read_as
+        Convention of the table that they were read from.
+    prior, options
+        As of ``align_clocks``.
+
+    Returns
+    -------
+    ``None`` where they fit as they were read, where no other convention fits clearly better, or where the
+    gyroscope fits as well when it is mirrored, which is then more likely.
+    """
+    options = options or AlignOptions()
+    prior = prior or calibration_prior()
+    margin = options.min_log_likelihood
+
+    def fit(read: CameraTrajectory, by: ImuRecording) -> ClockFit | None:
+        found = coarse_fit(read, by, prior=prior, options=options)
+        return found if isinstance(found, ClockFit) else None
+
+    fits: dict[tuple[str, str], ClockFit | None] = {}
+    candidates = []
+    for convention in (read_as, *read_as.others()):
+        read = reread(trajectory, read_as, convention)
+        rotation = (convention.rotation, convention.order)
+        if rotation not in fits:
+            fits[rotation] = fit(read, imu)
+        found = fits[rotation]
+        if found is not None:
+            candidates.append(_judged(convention, read, imu, found, prior, as_read=convention == read_as))
+            if convention == read_as and candidates[0].fits:
+                return None
+    if not candidates:
+        return None
+    best = max(candidates, key=lambda one: one.evidence)
+    as_read = next((one for one in candidates if one.convention == read_as), None)
+    ahead = np.inf if as_read is None else best.evidence - as_read.evidence
+    explains = best.acceleration - best.still >= margin
+    if ahead < margin or best.steadiness < _STEADY:
+        return None
+    if _inverts(read_as, best.convention):
+        mirrored = fit(trajectory, replace(imu, gyro_rad_s=-imu.gyro_rad_s))
+        lead = np.inf if mirrored is None else best.rotation - mirrored.log_likelihood
+        if lead < -margin or (lead < margin and not explains):
+            return None
+    equal = tuple(one.convention for one in candidates if best.evidence - one.evidence < margin)
+    as_positions = tuple(one for one in equal if one.position == read_as.position)
+    return LikelyConvention(read_as=read_as, written_as=as_positions or equal, log_likelihood=float(ahead))
+
+
+def _inverts(read_as: PoseConvention, written_as: PoseConvention) -> bool:
+    """Whether the rotations of a table, read by one instead of the other, turn the wrong way to a gyroscope."""
+    return (read_as.rotation != written_as.rotation) != (read_as.order != written_as.order)
+
+
+def _judged(
+    convention: PoseConvention,
+    read: CameraTrajectory,
+    imu: ImuRecording,
+    fit: ClockFit,
+    prior: CameraImuCalibration,
+    *,
+    as_read: bool,
+) -> _Candidate:
+    quick = None
+    if imu.has_accel:
+        offset_s = fit.offset_s - clock_shift_s(read, imu)
+        calibration = replace(
+            prior,
+            cam_from_imu_xyzw=fit.cam_from_imu_xyzw,
+            gyro_time_offset_s=offset_s,
+            accel_time_offset_s=offset_s,
+            gyro_bias_rad_s=fit.gyro_bias_rad_s,
+        )
+        quick = quick_accelerations(read, imu, calibration)
+    if quick is None:
+        return _Candidate(convention=convention, rotation=fit.log_likelihood)
+    # one independent vector in each window
+    components = 3 * quick.seconds / ACCELERATION_S
+    still, moving, positive = _left(quick)
+    explains = moving < (1 - _EXPLAINED) * still
+    # the accelerometer may be flipped; other poses than those that were read must not rest on that
+    if not as_read and not (positive and explains):
+        moving = still
+    return _Candidate(
+        convention=convention,
+        rotation=fit.log_likelihood,
+        acceleration=-0.5 * components * float(np.log(moving)),
+        still=-0.5 * components * float(np.log(still)),
+        steadiness=quick.steadiness,
+        fits=positive and moving < (1 - _BEYOND_DOUBT) * still and quick.steadiness >= _STEADY,
+    )
+
+
+def _left(quick: QuickAccelerations) -> tuple[float, float, bool]:
+    """Mean square acceleration (m2/s4) that a lever arm leaves, and that it leaves along with the visual acceleration.
+
+    Also whether the factor of the latter is positive.
+    """
+    y = quick.inertial_m_s2.ravel()
+    repeated = ACCELERATION_S / quick.seconds * len(y) / 3
+    arm = quick.arm_per_s2.reshape(-1, 3)
+    visual = quick.visual.reshape(-1, 1)
+    visual = visual / max(float(np.sqrt(np.mean(visual**2))), _NOTHING)
+    left = []
+    for columns in (arm, np.concatenate([arm, visual], axis=1)):
+        variance = float(np.mean(y**2))
+        precision = np.zeros(columns.shape[1])
+        for _ in range(4):
+            precision[:3] = variance * repeated / _ARM_M**2
+            normal = columns.T @ columns + np.diag(precision)
+            solution = np.linalg.lstsq(normal, columns.T @ y, rcond=None)[0]
+            rest = y - columns @ solution
+            variance = float((np.sum(rest**2) + np.sum(precision * solution**2)) / len(y))
+        left.append(variance)
+    still, moving = left
+    return still, min(moving, still), bool(solution[-1] > 0)

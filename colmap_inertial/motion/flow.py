@@ -1,0 +1,499 @@
+"""How a camera turns from frame to frame, from its pixels: before any reconstruction exists.
+
+Corners are tracked from each frame to the next on a reduced picture; frames too far apart for tracking are matched by
+features. One angular velocity is fitted to the rays of each pair, robustly, each ray at the time of its own line, so
+that a rolling shutter does not bend the result. Chained, the rotations are what ``align_camera_imu`` needs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.geometry import (
+    cross,
+    quat_conjugate,
+    quat_cumulative,
+    quat_exp,
+    so3_exp,
+    so3_log,
+)
+from colmap_inertial.core.gyro import GyroPath
+from colmap_inertial.core.sampling import without_running_mean
+from colmap_inertial.core.types import Array, CameraTrajectory, Frame, FrameTiming, ImuRecording, Projector
+from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
+
+Grey = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FlowOptions:
+    """How rotations between frames are measured."""
+
+    long_side_px: int = 640
+    """Pictures are reduced to this size before corners are tracked."""
+
+    corners: int = 400
+    """Corners tracked from each frame to the next."""
+
+    min_support: int = 25
+    """Fewest tracks that must agree on a rotation; below, the pair is left out."""
+
+    def __post_init__(self) -> None:
+        if self.long_side_px < 64 or self.min_support < 8 or self.corners < self.min_support:
+            raise ValueError("long_side_px must be 64 or more, min_support 8 or more, corners at least min_support")
+
+
+#: Corners of a pair of frames that are kept.
+_MOST_TRACKS = 80
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Tracks:
+    """Some of the corners that were seen in two frames: 80 at most, strong and weak ones alike.
+
+    Attributes
+    ----------
+    place
+        (N, 2, 2) where in the first and the second picture: down and across, as shares of the picture from its middle.
+    rays
+        (N, 2, 2) their rays, z = 1.
+    """
+
+    place: Array
+    rays: Array
+
+
+#: What a pair of frames shows that shares too little.
+_NO_TRACKS = Tracks(place=np.zeros((0, 2, 2)), rays=np.zeros((0, 2, 2)))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class VisualRotation:
+    """Rotations between consecutive frames.
+
+    Attributes
+    ----------
+    names
+        (F,) of the frames.
+    t_s
+        (F,) the instants between which the rotations are: mid-exposure of the middle line, camera clock.
+    turn_rad
+        (F - 1, 3) rotation vectors of ``earlier_from_later``, camera frame; NaN where a pair told nothing.
+    sigma_rad
+        (F - 1,) standard deviation of each by the scatter of its tracks; the camera's translation adds to it.
+    support
+        (F - 1,) tracks that agree.
+    tracks
+        (F - 1) what was followed in each pair; empty where pictures were not followed.
+    """
+
+    names: tuple[str, ...]
+    t_s: Array
+    turn_rad: Array
+    sigma_rad: Array
+    support: NDArray[np.intp]
+    tracks: tuple[Tracks, ...] = ()
+    epoch_ns: int = 0
+
+    @property
+    def step_s(self) -> float:
+        """The usual time between frames."""
+        return float(np.median(np.diff(self.t_s)))
+
+    def trajectory(self) -> CameraTrajectory:
+        """The longest unbroken run of frames, as orientations chained from its first frame; positions are zero.
+
+        Raises
+        ------
+        NotObservableError
+            Where no five frames hang together.
+        """
+        known = np.isfinite(self.turn_rad).all(axis=1)
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(np.int8)))
+        runs = edges.reshape(-1, 2)
+        longest = runs[np.argmax(runs[:, 1] - runs[:, 0])] if len(runs) else np.zeros(2, dtype=np.intp)
+        begin, end = int(longest[0]), int(longest[1])
+        if end - begin < 4:
+            raise NotObservableError(
+                "camera rotation",
+                "consecutive frames share too few corners to follow the camera's rotation: film at a higher frame "
+                "rate, or where there is more texture",
+            )
+        first_from_cam = quat_cumulative(quat_exp(self.turn_rad[begin:end]))
+        return CameraTrajectory(
+            names=self.names[begin : end + 1],
+            t_s=self.t_s[begin : end + 1],
+            cam_from_world_xyzw=quat_conjugate(first_from_cam),
+            cam_in_world=np.zeros((end - begin + 1, 3)),
+            epoch_ns=self.epoch_ns,
+        )
+
+
+def measure_rotation(
+    frames: Iterable[Frame], camera: Projector, timing: FrameTiming, options: FlowOptions | None = None
+) -> VisualRotation:
+    """Rotations of the camera between consecutive frames.
+
+    Parameters
+    ----------
+    frames
+        In order of time, all of one size; two are held at a time.
+    camera
+        Intrinsics with distortion, COLMAP's pixel coordinates. Without a calibration, a guess serves to find the clock
+        offset and the axes: a wrong focal length scales all rotations equally.
+    timing
+        Holds every frame; its readout, where known, gives each line a time of its own.
+    options
+        Size, number of corners.
+    """
+    options = options or FlowOptions()
+    index = {name: i for i, name in enumerate(timing.names)}
+    pose_t_s = timing.pose_t_s()
+    names: list[str] = []
+    turns: list[Array] = []
+    sigmas: list[float] = []
+    support: list[int] = []
+    tracks: list[Tracks] = []
+    before: tuple[Grey, FrameShutter] | None = None
+    for frame in frames:
+        height, width = frame.image.shape[:2]
+        shutter = FrameShutter.of(timing, index[frame.name], width=width, height=height)
+        now = (reduced(frame.image, options), shutter)
+        if before is not None:
+            pair = _pair_rotation(before, now, camera, options)
+            turns.append(np.full(3, np.nan) if pair is None else pair[0])
+            sigmas.append(np.nan if pair is None else pair[1])
+            support.append(0 if pair is None else pair[2])
+            tracks.append(_NO_TRACKS if pair is None else pair[3])
+        names.append(frame.name)
+        before = now
+    return VisualRotation(
+        names=tuple(names),
+        t_s=pose_t_s[[index[name] for name in names]],
+        turn_rad=np.array(turns).reshape(-1, 3),
+        sigma_rad=np.array(sigmas),
+        support=np.array(support, dtype=np.intp),
+        tracks=tuple(tracks),
+        epoch_ns=timing.epoch_ns,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stabilisation:
+    """Whether the picture turns as the gyroscope says.
+
+    Attributes
+    ----------
+    share
+        Quick rotation in the picture as a share of the gyroscope's (root mean square above about 1 Hz): about one
+        where the picture is as filmed, far less where it was stabilised. ``None`` where the hand was too still to say.
+    stabilised
+        ``None`` where that cannot be told.
+    reason
+        In words.
+    """
+
+    share: float | None
+    stabilised: bool | None
+    reason: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionCheck:
+    """Whether the camera turned as its gyroscope and calibration say.
+
+    Attributes
+    ----------
+    explained
+        Share of the rotation in the pictures that the gyroscope explains: one is all of it, below zero is worse than
+        no gyroscope. ``None`` where too few frames, or too little rotation, could be compared.
+    gain
+        (3,) rotation in the pictures per rotation measured, about each camera axis; negative means a flipped axis, NaN
+        one about which the camera hardly turned. A common factor above or below one points at the focal length.
+    agrees
+        ``None`` where that cannot be told.
+    reason
+        In words.
+    """
+
+    explained: float | None
+    gain: tuple[float, float, float]
+    agrees: bool | None
+    reason: str
+
+
+#: The gyroscope must explain so much; an axis counts where it rotated by more than this many times the noise.
+_LEAST_EXPLAINED, _ROTATED_SIGMAS = 0.5, 3.0
+
+
+def check_motion(rotation: VisualRotation, motion: GyroCamera) -> MotionCheck:
+    """Compare the rotation between frames with the gyroscope's, axis by axis.
+
+    Blur looks the same whichever way the camera turned; the way from frame to frame does not. So this tells a wrong
+    sign, exchanged axes and a wrong clock offset from the right ones.
+
+    Parameters
+    ----------
+    rotation
+        From :func:`measure_rotation`.
+    motion
+        The gyroscope with the calibration to check, on the same clock.
+    """
+    unknown = (float("nan"),) * 3
+    known = np.isfinite(rotation.turn_rad).all(axis=1) & motion.covers(rotation.t_s[:-1], rotation.t_s[1:])
+    if known.sum() < 3:
+        return MotionCheck(
+            explained=None, gain=unknown, agrees=None, reason="too few pairs of frames to compare with the gyroscope"
+        )
+    inertial = motion.turn_rad(rotation.t_s)[known]
+    visual, sigma = rotation.turn_rad[known], float(np.median(rotation.sigma_rad[known]))
+    size = np.sqrt(np.mean(visual**2))
+    if size < _ROTATED_SIGMAS * sigma:
+        return MotionCheck(explained=None, gain=unknown, agrees=None, reason="the camera hardly turned between frames")
+    # the median copes with pairs that were measured wrongly
+    left, all_of_it = (float(np.median(np.sum(v**2, axis=1))) for v in (visual - inertial, visual))
+    explained = 1 - left / max(all_of_it, 1e-12)
+    gain = []
+    for axis in range(3):
+        x, y = inertial[:, axis], visual[:, axis]
+        gain.append(float(y @ x / (x @ x)) if np.sqrt(np.mean(x**2)) > _ROTATED_SIGMAS * sigma else float("nan"))
+    flipped = ["xyz"[axis] for axis in range(3) if gain[axis] < -0.3]
+    reason = f"the gyroscope explains {100 * max(explained, 0):.0f} % of the rotation between frames"
+    if flipped:
+        reason += f"; the camera's {' and '.join(flipped)} axis turns the other way: check the axes"
+    agrees = explained >= _LEAST_EXPLAINED and not flipped
+    return MotionCheck(explained=explained, gain=(gain[0], gain[1], gain[2]), agrees=agrees, reason=reason)
+
+
+#: Rotation slower than this is what a stabiliser lets pass.
+_QUICK_S = 0.4
+#: A stabiliser leaves less than this share of quick rotation; quick rotation must exceed the noise of pictures by this.
+_STABILISED_SHARE, _CLEAR = 0.6, 3.0
+
+
+def find_stabilisation(rotation: VisualRotation, imu: ImuRecording, *, offset_s: float | None = None) -> Stabilisation:
+    """Tell electronic (or strong optical) stabilisation: the gyroscope turned, the picture did not follow.
+
+    What a stabiliser removes is quick; so rotations over frame intervals are compared without their running mean over
+    0.4 s, by their size alone, which needs neither axes nor, over a whole recording, the clock offset.
+
+    Parameters
+    ----------
+    rotation
+        From :func:`measure_rotation`.
+    imu
+        Gyroscope of the same recording.
+    offset_s
+        Camera time = gyroscope time + this (both since their epochs), where known; otherwise the whole gyroscope
+        recording is compared.
+    """
+    known = np.isfinite(rotation.turn_rad).all(axis=1)
+    dt_s = np.diff(rotation.t_s)
+    step_s = float(np.median(dt_s)) if len(dt_s) else np.inf
+    if known.sum() < 20 or step_s > _QUICK_S / 3:
+        return Stabilisation(share=None, stabilised=None, reason="too few frames close in time to tell stabilisation")
+    path = GyroPath(imu.gyro_t_s, imu.gyro_rad_s, np.median(imu.gyro_rad_s, axis=0))
+    if offset_s is None:
+        begin_s = np.arange(imu.gyro_t_s[0], imu.gyro_t_s[-1] - step_s, step_s)
+        end_s = begin_s + step_s
+    else:
+        begin_s, end_s = rotation.t_s[:-1][known] - offset_s, rotation.t_s[1:][known] - offset_s
+    inside = path.covers(begin_s, end_s)
+    if inside.sum() < 20:
+        return Stabilisation(share=None, stabilised=None, reason="the gyroscope does not run along with the frames")
+    inertial = path.turn_rad(begin_s[inside], end_s[inside]) / (end_s - begin_s)[inside, None]
+    visual = rotation.turn_rad[known] / dt_s[known, None]
+    noise = float(np.median(rotation.sigma_rad[known])) / step_s
+    width = max(3, round(_QUICK_S / step_s))
+    quick_inertial, quick_visual = _quick(inertial, width), _quick(visual, width)
+    if quick_inertial < _CLEAR * noise or quick_inertial < 0.02:
+        return Stabilisation(
+            share=None, stabilised=None, reason="the camera was held too still to tell whether the video is stabilised"
+        )
+    share = quick_visual / quick_inertial
+    if share < _STABILISED_SHARE:
+        return Stabilisation(
+            share=share,
+            stabilised=True,
+            reason=f"the pictures hold {100 * share:.0f} % of the quick rotation that the gyroscope measured: the "
+            "video was stabilised in the camera, so its gyroscope does not belong to its pixels; switch stabilisation "
+            "off and record again",
+        )
+    return Stabilisation(
+        share=share, stabilised=False, reason=f"the pictures hold {100 * share:.0f} % of the gyroscope's quick rotation"
+    )
+
+
+def _quick(rate: Array, width: int) -> float:
+    """Robust size of what changes faster than the running mean over ``width`` samples."""
+    quick = np.linalg.norm(without_running_mean(rate, width), axis=1)
+    return float(np.sqrt(np.mean(np.sort(quick**2)[: max(1, int(0.98 * len(quick)))])))
+
+
+# --- one pair of frames ----------------------------------------------------------------------------------------------
+
+#: Tracks must come back to where they began within this, in pixels of the reduced picture.
+_ROUND_TRIP_PX = 0.7
+#: A track agrees with a rotation within this (pixels of the reduced picture); so much translation may show.
+_INLIER_PX, _SCATTER_FLOOR_PX = 3.0, 0.05
+_DRAWS, _ROUNDS = 100, 15
+
+
+def reduced(image: NDArray[np.uint8] | NDArray[np.uint16], options: FlowOptions) -> Grey:
+    import cv2
+
+    grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    scale = options.long_side_px / max(grey.shape)
+    if scale < 1:
+        size = (max(1, round(grey.shape[1] * scale)), max(1, round(grey.shape[0] * scale)))
+        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    return np.asarray(grey if grey.dtype == np.uint8 else grey >> 8, dtype=np.uint8)
+
+
+def _pair_rotation(
+    before: tuple[Grey, FrameShutter], now: tuple[Grey, FrameShutter], camera: Projector, options: FlowOptions
+) -> tuple[Array, float, int, Tracks] | None:
+    """Rotation vector of ``before_from_now``, its standard deviation, how many tracks agree, and all of them."""
+    shutters = before[1], now[1]
+    dt_s = shutters[1].reference_s() - shutters[0].reference_s()
+    size = np.array([shutters[1].width, shutters[1].height])
+    for points in followed_points(before[0], now[0], shutters[1], options):
+        rays = [np.asarray(camera.cam_from_img(p))[:, :2] for p in points]
+        ok = np.isfinite(rays[0]).all(axis=1) & np.isfinite(rays[1]).all(axis=1)
+        if ok.sum() < options.min_support:
+            continue
+        first, second = (np.concatenate([r[ok], np.ones((ok.sum(), 1))], axis=1) for r in rays)
+        span_s = shutters[1].middle_s(points[1][ok]) - shutters[0].middle_s(points[0][ok])
+        # one pixel of the reduced picture as an angle, in the middle of the picture
+        centre = 0.5 * size[None]
+        beside = np.asarray(camera.cam_from_img(np.concatenate([centre, centre + size / now[0].shape[::-1]])))[:, :2]
+        pixel_rad = float(np.linalg.norm(np.diff(beside, axis=0))) / np.sqrt(2)
+        found = _fit_rate(first, second, span_s, pixel_rad)
+        if found is not None and found[2] >= options.min_support:
+            rate, sigma_rad_s, count = found
+            place = np.stack([(p[ok] / size - 0.5)[:, ::-1] for p in points], axis=1)
+            some = np.unique(np.linspace(0, len(place) - 1, min(len(place), _MOST_TRACKS)).astype(np.intp))
+            tracks = Tracks(place=place[some], rays=np.stack([first[some, :2], second[some, :2]], axis=1))
+            return rate * dt_s, sigma_rad_s * abs(dt_s), count, tracks
+    return None
+
+
+def followed_points(
+    before: Grey, now: Grey, shutter: FrameShutter, options: FlowOptions
+) -> Iterator[tuple[Array, Array]]:
+    """(N, 2) points that were followed from one reduced picture to the other, px of the picture as it is.
+
+    Corners that were tracked come first, then features that were matched; ways that tell too little are left out.
+    """
+    to_full = np.array([shutter.width, shutter.height]) / now.shape[::-1]
+    for matched in (_tracked, _matched):
+        first, second = ((p.astype(np.float64) + 0.5) * to_full for p in matched(before, now, options))
+        if len(first) >= options.min_support:
+            yield first, second
+
+
+def _tracked(before: Grey, now: Grey, options: FlowOptions) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Corners followed by pyramidal Lucas-Kanade, and back again; spread over the picture."""
+    import cv2
+
+    distance = max(4.0, 0.5 * np.sqrt(before.size / options.corners))
+    corners = cv2.goodFeaturesToTrack(before, options.corners, 0.01, distance)
+    if corners is None or len(corners) < options.min_support:
+        return np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32)
+    there, ok_there, _ = cv2.calcOpticalFlowPyrLK(before, now, corners, None, winSize=(21, 21), maxLevel=4)
+    back, ok_back, _ = cv2.calcOpticalFlowPyrLK(now, before, there, None, winSize=(21, 21), maxLevel=4)
+    off = np.linalg.norm((back - corners).reshape(-1, 2), axis=1)
+    good = (ok_there.ravel() == 1) & (ok_back.ravel() == 1) & (off < _ROUND_TRIP_PX)
+    return corners.reshape(-1, 2)[good], there.reshape(-1, 2)[good]
+
+
+def _matched(before: Grey, now: Grey, options: FlowOptions) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Features that are each other's best match: for frames too far apart to be tracked."""
+    import cv2
+
+    detector = cv2.SIFT.create(4 * options.corners)
+    (points_a, a), (points_b, b) = (detector.detectAndCompute(image, None) for image in (before, now))
+    if a is None or b is None or min(len(a), len(b)) < options.min_support:
+        return np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32)
+    matches = cv2.BFMatcher(cv2.NORM_L2, crossCheck=True).match(a, b)
+    return (
+        np.array([points_a[m.queryIdx].pt for m in matches], dtype=np.float32),
+        np.array([points_b[m.trainIdx].pt for m in matches], dtype=np.float32),
+    )
+
+
+def _fit_rate(first: Array, second: Array, span_s: Array, pixel_rad: float) -> tuple[Array, float, int] | None:
+    """One angular velocity (rad/s, camera frame) that turns the rays of one frame into those of the next.
+
+    A ray seen at one time is seen ``span_s`` later rotated by ``exp(-rate span_s)``. Draws of two rays, then
+    iteratively reweighted least squares with the weights of Geman and McClure; what translation moves counts as noise.
+
+    Returns
+    -------
+    The rate, its standard deviation (per axis, the worst), and the rays within reach of it.
+    """
+    a, b = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (first, second))
+    mean_s = float(np.mean(span_s))
+    if mean_s <= 0:
+        return None
+    reach = _INLIER_PX * pixel_rad
+    draws = np.random.default_rng(0).integers(0, len(a), (_DRAWS, 2))
+    rotations = _from_two(a[draws], b[draws])
+    # of unit vectors: the cosines of all rays after all draws, as one product
+    cosines = rotations.reshape(-1, 9) @ (b[:, :, None] * a[:, None, :]).reshape(-1, 9).T
+    counts = np.sum(2 - 2 * cosines < reach**2, axis=1)
+    if counts.max(initial=-1) < 3:
+        return None
+    rate, scatter = -so3_log(rotations[np.argmax(counts)]) / mean_s, reach
+    # of a global shutter, all rays turn for as long
+    spans = span_s[:1] if np.ptp(span_s) == 0 else span_s
+    for _ in range(_ROUNDS):
+        turn = so3_exp(-rate * spans[:, None])
+        rotated = a @ turn[0].T if len(turn) == 1 else np.einsum("nij,nj->ni", turn, a)
+        residual = b - rotated
+        square = np.sum(residual**2, axis=1)
+        near = square < (2 * reach) ** 2
+        if near.sum() < 3:
+            return None
+        scatter = max(float(np.sqrt(np.median(square[near]))) / 1.18, _SCATTER_FLOOR_PX * pixel_rad)
+        weight = 1 / (1 + square / (2.4 * scatter) ** 2) ** 2
+        # d(exp(-rate s) a) = s [rotated]x d(rate), to first order; of a unit vector, [r]x' [r]x = 1 - r r'
+        lever = weight * span_s**2
+        information = float(lever.sum()) * np.eye(3) - rotated.T @ (lever[:, None] * rotated)
+        if np.linalg.cond(information) > 1e8:
+            return None
+        step = np.linalg.solve(information, (weight * span_s) @ cross(residual, rotated))
+        rate = rate + step
+        if np.linalg.norm(step) * mean_s < 1e-7:
+            break
+    sigma = scatter * float(np.sqrt(np.linalg.eigvalsh(np.linalg.inv(information))[-1]))
+    return rate, sigma, int(np.sum(square < reach**2))
+
+
+def _from_two(a: Array, b: Array) -> Array:
+    """Rotations that take two directions to two others, as well as can be; draws of nearly the same are left out.
+
+    Parameters
+    ----------
+    a, b
+        (N, 2, 3) draws of two directions.
+
+    Returns
+    -------
+    (M, 3, 3) of M draws, in their order.
+    """
+    normals = [cross(pair[:, 0], pair[:, 1]) for pair in (a, b)]
+    lengths = [np.linalg.norm(normal, axis=1, keepdims=True) for normal in normals]
+    apart = np.all([length[:, 0] >= 0.02 for length in lengths], axis=0)
+    frames = []
+    for pair, normal, length in zip((a, b), normals, lengths, strict=True):
+        middle = pair[apart, 0] + pair[apart, 1]
+        middle = middle / np.linalg.norm(middle, axis=1, keepdims=True)
+        up = normal[apart] / length[apart]
+        frames.append(np.stack([middle, up, cross(middle, up)], axis=2))
+    return np.asarray(frames[1] @ np.swapaxes(frames[0], 1, 2))

@@ -1,0 +1,298 @@
+"""How long a camera reads a frame, by its own pictures and the gyroscope: for cameras that nobody has measured.
+
+A corner is seen in two frames, each time when its own line is exposed. How far the camera turned between these two
+instants depends on the readout where the turning changes from frame to frame. All corners of all pairs are fitted at
+once: the time that lines take down and across the picture, what is uncertain in the gyroscope's calibration, and for
+each pair a translation. Of a corner whose depth is unknown, only what lies across the translation's flow counts.
+The line delay has been calibrated so with targets (Oth et al., "Rolling Shutter Camera Calibration", CVPR 2013) and
+without (Karpenko et al., "Digital Video Stabilization and Rolling Shutter Correction using Gyroscopes", 2011).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.geometry import cross
+from colmap_inertial.core.types import Array, ReadoutDirection
+from colmap_inertial.imaging.gyro_camera import GyroCamera
+from colmap_inertial.motion.flow import VisualRotation
+
+#: Pairs and corners, at least; parts of the recording whose scatter widens the result, and pairs in each, at least.
+_LEAST_PAIRS, _LEAST_CORNERS, _PARTS, _PAIRS_OF_PART = 24, 1500, 12, 3
+#: What is known beforehand (standard deviations): readout along and across, clock offset, axes, bias, focal length, and
+#: the translation of a pair in mean depths. Each is far wider than what it says, so that the pictures decide.
+_READOUT_S, _OFFSET_S, _AXES_RAD, _BIAS_RAD_S, _FOCAL, _TRANSLATION = 0.1, 0.05, 0.05, 0.02, 0.2, 1.0
+#: Inverse depths scatter by so many times their mean; the least scatter of a corner, as an angle.
+_DEPTHS, _LEAST_SCATTER_RAD = 3.0, 2e-5
+#: The rate must change from frame to frame by so much (root mean square), and by so many standard deviations of a
+#: reading.
+_LEAST_CHANGE_RAD_S, _CHANGE_BY_NOISE = 0.03, 8.0
+_ROUNDS, _SETTLED_S = 25, 1e-5
+#: More pairs tell nothing that these do not.
+_MOST_PAIRS = 150
+#: A readout is told where it is known to this and clear of nothing by so many standard deviations; one that is seen the
+#: other way, too, must be clear and this share of it.
+_SIGMA_S, _CLEAR, _BESIDE = 0.002, 3.0, 0.2
+#: Added to what scatter shows (``scripts/study_readout.py``): seconds, and the share of a readout by which it comes
+#: out too short where depths are of all sizes.
+_FLOOR_S, _FLOOR_SHARE = 2e-4, 0.02
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadoutEstimate:
+    """The readout of a rolling shutter.
+
+    Attributes
+    ----------
+    readout_s
+        From the first line to one past the last; 0 where none is seen.
+    sigma_s
+        Its standard deviation.
+    direction
+        Where the exposed line moves in the stored picture.
+    pairs
+        Of frames that were compared.
+    """
+
+    readout_s: float
+    sigma_s: float
+    direction: ReadoutDirection
+    pairs: int
+
+    def __str__(self) -> str:
+        return f"{1e3 * self.readout_s:.1f} +- {1e3 * self.sigma_s:.1f} ms"
+
+
+def estimate_readout(rotation: VisualRotation, motion: GyroCamera) -> ReadoutEstimate:
+    """The readout of a camera, from corners that were followed from frame to frame.
+
+    Parameters
+    ----------
+    rotation
+        With its tracks, measured without any readout.
+    motion
+        The gyroscope on the camera's clock; its rotation and offset may be off by what an alignment leaves.
+
+    Raises
+    ------
+    NotObservableError
+        Where too little was seen, the camera turned too evenly, or what was seen is no shutter of lines.
+    """
+    seen = _seen(rotation, motion)
+    _require_change(seen, motion)
+    fit = _fitted(seen, motion)
+    sigma = np.sqrt(np.diagonal(fit.cov)[:2] + _FLOOR_S**2 + (_FLOOR_SHARE * fit.params[:2]) ** 2)
+    along, beside = (0, 1) if abs(fit.params[0]) >= abs(fit.params[1]) else (1, 0)
+    readout_s, sigma_s = float(fit.params[along]), float(sigma[along])
+    if abs(readout_s) < _CLEAR * sigma_s:
+        # of a shutter that is not seen nobody knows how its lines run
+        readout_s, sigma_s, along, beside = 0.0, float(sigma.max()), 0, 1
+    if not sigma_s < _SIGMA_S:
+        raise NotObservableError(
+            "readout",
+            f"the pictures tell the readout to +-{1e3 * sigma_s:.1f} ms only: turn the camera quickly to and fro for "
+            "some seconds",
+        )
+    if abs(fit.params[beside]) > max(_CLEAR * sigma[beside], _BESIDE * abs(readout_s)):
+        raise NotObservableError(
+            "readout",
+            "what bends the pictures runs neither along nor across their lines: they were warped, turned or stabilised",
+        )
+    directions: tuple[tuple[ReadoutDirection, ReadoutDirection], ...] = (("down", "up"), ("right", "left"))
+    return ReadoutEstimate(
+        readout_s=abs(readout_s),
+        sigma_s=sigma_s,
+        direction=directions[along][int(readout_s < 0)],
+        pairs=len(seen.begins),
+    )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Seen:
+    """Corners of all pairs, one pair after another.
+
+    Attributes
+    ----------
+    begins
+        (K,) where each pair begins.
+    pair
+        (N,) of each corner.
+    t_s
+        (N, 2) instants of the two frames, camera clock.
+    place
+        (N, 2, 2) in the two pictures, down and across, from -0.5 to 0.5.
+    rays
+        (N, 2, 2) of the two pictures, z = 1.
+    dt_s
+        (K,) between the frames.
+    """
+
+    begins: NDArray[np.intp]
+    pair: NDArray[np.intp]
+    t_s: Array
+    place: Array
+    rays: Array
+    dt_s: Array
+
+    def sums(self, values: Array) -> Array:
+        """Sums over the corners of each pair."""
+        return np.add.reduceat(values, self.begins, axis=0)
+
+
+def _seen(rotation: VisualRotation, motion: GyroCamera) -> _Seen:
+    slack_s = 0.05
+    inside = motion.covers(rotation.t_s[:-1] - slack_s, rotation.t_s[1:] + slack_s)
+    used = [i for i, tracks in enumerate(rotation.tracks) if inside[i] and len(tracks.rays)]
+    first = max(0, (len(used) - _MOST_PAIRS) // 2)
+    used = used[first : first + _MOST_PAIRS]
+    counts = [len(rotation.tracks[i].rays) for i in used]
+    if len(used) < _LEAST_PAIRS or sum(counts) < _LEAST_CORNERS:
+        raise NotObservableError(
+            "readout",
+            f"{sum(counts)} corners in {len(used)} pairs of frames are too few: film two seconds or more of texture",
+        )
+    pair = np.repeat(np.arange(len(used)), counts)
+    ends_s = np.column_stack([rotation.t_s[:-1][used], rotation.t_s[1:][used]])
+    return _Seen(
+        begins=np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.intp),
+        pair=pair,
+        t_s=ends_s[pair],
+        place=np.concatenate([rotation.tracks[i].place for i in used]),
+        rays=np.concatenate([rotation.tracks[i].rays for i in used]),
+        dt_s=ends_s[:, 1] - ends_s[:, 0],
+    )
+
+
+def _require_change(seen: _Seen, motion: GyroCamera) -> None:
+    """Refuse a camera whose rate hardly changes from frame to frame: noise in the change makes readouts too short."""
+    ends = np.array([motion.rate_in_cam_rad_s(seen.t_s[seen.begins, k]) for k in range(2)])
+    change = float(np.sqrt(np.mean(np.sum((ends[1] - ends[0]) ** 2, axis=1))))
+    noise = motion.path.noise_rad_s_rthz / float(np.sqrt(np.median(np.diff(motion.path.t_s))))
+    if change < max(_LEAST_CHANGE_RAD_S, _CHANGE_BY_NOISE * noise):
+        raise NotObservableError(
+            "readout",
+            f"the camera's rate changes by {change:.2g} rad/s from frame to frame, which is too little to tell it: "
+            "turn the camera quickly to and fro for some seconds",
+        )
+
+
+class _Fit(NamedTuple):
+    """Readout down and across, clock offset, axes, bias, focal length (as a logarithm), and their covariance."""
+
+    params: Array
+    cov: Array
+
+
+def _fitted(seen: _Seen, motion: GyroCamera) -> _Fit:
+    sigmas = np.array([_READOUT_S, _READOUT_S, _OFFSET_S, *(3 * [_AXES_RAD]), *(3 * [_BIAS_RAD_S]), _FOCAL])
+    prior = np.diag(sigmas**-2.0)
+    params = np.zeros(len(sigmas))
+    moved = np.zeros((len(seen.begins), 3))
+    for _ in range(_ROUNDS):
+        off, by_params, by_moved = _residuals(seen, motion, params, moved)
+        weight = _weights(off, by_moved, moved, seen)
+        # what a corner's depth is, as far as it shows: the flow of a pair's translation is that much stronger
+        flow = np.einsum("nij,nj->ni", by_moved, moved[seen.pair])
+        depth = np.clip(1 + _DEPTHS**2 * np.einsum("ni,nij,nj->n", flow, weight.inverse, off), 0, 1 + _DEPTHS)
+        slope = depth[:, None, None] * by_moved
+        weighed = weight.robust[:, None, None] * weight.inverse
+        square = seen.sums(np.swapaxes(slope, 1, 2) @ weighed @ slope) + _TRANSLATION**-2 * np.eye(3)
+        mixed = seen.sums(np.swapaxes(slope, 1, 2) @ weighed @ by_params)
+        own = seen.sums(np.einsum("nij,nik,nk->nj", slope, weighed, off)) - _TRANSLATION**-2 * moved
+        shared = seen.sums(np.einsum("nij,nik,nk->nj", by_params, weighed, off))
+        shared_square = np.einsum("nij,nik,nkl->jl", by_params, weighed, by_params)
+        gain = np.swapaxes(np.linalg.solve(square, mixed), 1, 2)
+        information = shared_square - np.einsum("kij,kjl->il", gain, mixed) + prior
+        scores = shared - np.einsum("kij,kj->ki", gain, own)
+        step = np.linalg.solve(information, scores.sum(axis=0) - prior @ params)
+        moved = moved + np.linalg.solve(square, (own - mixed @ step)[..., None])[..., 0]
+        params = params + step
+        if np.abs(step[:2]).max() < _SETTLED_S:
+            break
+    cov = np.linalg.inv(information)
+    parts = min(_PARTS, len(scores) // _PAIRS_OF_PART)
+    sums = np.array([part.sum(axis=0) for part in np.array_split(scores, parts)])
+    scatter = cov @ (sums.T @ sums) @ cov * parts / (parts - 1)
+    return _Fit(params, np.maximum(np.diagonal(cov), np.diagonal(scatter)) * np.eye(len(cov)))
+
+
+def _residuals(seen: _Seen, motion: GyroCamera, params: Array, moved: Array) -> tuple[Array, Array, Array]:
+    """(N, 2) what the second ray is off, its change with the parameters (N, 2, 10) and the translation (N, 2, 3)."""
+    lines, offset_s, axes, bias, focal = params[:2], params[2], params[3:6], params[6:9], np.exp(params[9])
+    since_s = seen.place @ lines
+    at_s = seen.t_s + since_s - offset_s
+    looking = motion.start_from_cam(at_s)
+    now_from_before = np.swapaxes(looking[:, 1], 1, 2) @ looking[:, 0]
+    rate = motion.rate_in_cam_rad_s(at_s.ravel()).reshape(*at_s.shape, 3)
+    span_s = np.diff(at_s, axis=1)
+    middle_rate = rate.mean(axis=1)
+    rays = seen.rays * focal
+    ahead = np.concatenate([rays[:, 0], np.ones((len(rays), 1))], axis=1)
+    turned = np.einsum("nij,nj->ni", now_from_before, ahead)
+    # a little of axes and bias turns it further
+    turned = turned + cross(span_s * (bias - cross(np.broadcast_to(axes, middle_rate.shape), middle_rate)), turned)
+    seen_at = turned[:, :2] / turned[:, 2:]
+    now, before = rate[:, 1], np.einsum("nij,nj->ni", now_from_before, rate[:, 0])
+    turns = np.zeros((len(rays), 3, 9))
+    for k in range(2):
+        turns[:, :, k] = -(seen.place[:, 1, k, None] * now - seen.place[:, 0, k, None] * before)
+    turns[:, :, 2] = now - before
+    for k in range(3):
+        axis = np.broadcast_to(np.eye(3)[k], now.shape)
+        turns[:, :, 3 + k] = -span_s * cross(axis, middle_rate)
+        turns[:, :, 6 + k] = span_s * axis
+    swept = np.stack([cross(turns[:, :, k], turned) for k in range(9)], axis=2)
+    by_focal = np.einsum("nij,nj->ni", now_from_before[:, :, :2], rays[:, 0])
+    shown = _shown(turned, np.concatenate([swept, by_focal[:, :, None]], axis=2))
+    # all of it in the picture's own unit: with the focal length it would shrink
+    shown[:, :, 9] -= seen_at
+    shown /= focal
+    flow = np.zeros((len(rays), 2, 3))
+    flow[:, 0, 0] = flow[:, 1, 1] = 1 / focal
+    flow[:, :, 2] = -seen_at / focal
+    # lines that are read later saw a translation that had changed
+    changed = _change(seen, moved)[seen.pair]
+    by_line = np.einsum("nij,nj->ni", flow, changed)
+    shown[:, :, :2] += by_line[:, :, None] * seen.place[:, None, 1]
+    translation = moved[seen.pair] + since_s[:, 1, None] * changed
+    off = seen.rays[:, 1] - seen_at / focal - np.einsum("nij,nj->ni", flow, translation)
+    return off, shown, flow
+
+
+def _change(seen: _Seen, moved: Array) -> Array:
+    """(K, 3) by how much a pair's translation grows a second later."""
+    speed = moved / seen.dt_s[:, None]
+    at = 0.5 * (speed[1:] + speed[:-1])
+    ends = np.concatenate([speed[:1], at, speed[-1:]])
+    return np.diff(ends, axis=0)
+
+
+def _shown(point: Array, change: Array) -> Array:
+    """(N, 2, P) how changes (N, 3, P) of points show in the picture at z = 1."""
+    return np.asarray((change[:, :2] - (point[:, :2] / point[:, 2:])[:, :, None] * change[:, 2:]) / point[:, 2:, None])
+
+
+class _Weights(NamedTuple):
+    """(N, 2, 2) inverse covariances, with unknown depths; (N,) how far each corner is believed."""
+
+    inverse: Array
+    robust: Array
+
+
+def _weights(off: Array, flow_of: Array, moved: Array, seen: _Seen) -> _Weights:
+    flow = np.einsum("nij,nj->ni", flow_of, moved[seen.pair])
+    length = np.linalg.norm(flow, axis=1)
+    along = flow / np.maximum(length, 1e-12)[:, None]
+    across = np.abs(off[:, 0] * -along[:, 1] + off[:, 1] * along[:, 0])
+    across = np.where(length > 1e-12, across, np.abs(off[:, 1]))
+    usual = np.array([float(np.median(part)) for part in np.split(across, seen.begins[1:])])
+    sigma = np.maximum(usual / 0.6745, _LEAST_SCATTER_RAD)[seen.pair]
+    share = _DEPTHS**2 / (sigma**2 + _DEPTHS**2 * length**2)
+    inverse = (np.eye(2) - share[:, None, None] * flow[:, :, None] * flow[:, None]) / sigma[:, None, None] ** 2
+    square = np.einsum("ni,nij,nj->n", off, inverse, off)
+    return _Weights(inverse, 1 / (1 + square / 2.4**2) ** 2)

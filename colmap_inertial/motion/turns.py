@@ -1,0 +1,153 @@
+"""How a camera turned between pictures that lie seconds apart: photographs, keyframes, frames cut once a second.
+
+There the camera has moved, too, and the pixels' motion is no rotation. Features are matched, the geometry of two views
+with unknown translation is fitted (the five-point method of Nister, 2004, and RANSAC), and a rotation is kept only
+where it agrees with those to the picture after: around a triangle of three pictures rotations must close.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.core.geometry import so3_log
+from colmap_inertial.core.types import Array, Frame, FrameTiming, Projector
+from colmap_inertial.motion.flow import FlowOptions, VisualRotation, reduced
+
+#: Features of a picture; matches of two pictures that must agree; how far a match may lie off, px of the reduced one.
+_FEATURES, _LEAST_MATCHES, _OFF_PX = 1000, 40, 1.5
+#: Matches that one rotation explains to within this (px of the reduced picture) are of a camera that did not move.
+_TURNED_PX, _TURNED_SHARE = 3.0, 0.8
+#: A match is clear where the second best is this much further away.
+_RATIO = 0.8
+#: Three rotations around a triangle close to within this.
+_CLOSED_RAD = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """The features of one picture: pixels, rays (z = 1), descriptors."""
+
+    rays: Array
+    descriptors: NDArray[np.float32]
+    pixel_rad: float
+
+
+def measure_turns(
+    frames: Iterable[Frame], camera: Projector, timing: FrameTiming, options: FlowOptions | None = None
+) -> VisualRotation:
+    """Rotations of the camera between pictures that follow each other.
+
+    Parameters
+    ----------
+    frames
+        In order of time, all of one size; the features of three are held at a time.
+    camera
+        Intrinsics with distortion; a guess of the focal length serves to tell whether a gyroscope belongs to them.
+    timing
+        Holds every frame.
+    options
+        Size to which pictures are reduced.
+
+    Returns
+    -------
+    As of ``flow.measure_rotation``, NaN where no triangle of pictures closes.
+    """
+    options = options or FlowOptions()
+    index = {name: i for i, name in enumerate(timing.names)}
+    names: list[str] = []
+    seen: list[_Seen] = []
+    next_one: list[tuple[Array, int] | None] = []
+    after_next: list[tuple[Array, int] | None] = []
+    for frame in frames:
+        seen.append(_features(frame, camera, options))
+        names.append(frame.name)
+        if len(seen) > 1:
+            next_one.append(_rotation(seen[-2], seen[-1]))
+        if len(seen) > 2:
+            after_next.append(_rotation(seen[-3], seen[-1]))
+            del seen[0]
+    turns = np.full((max(len(names) - 1, 0), 3), np.nan)
+    off = np.full(len(turns), np.inf)
+    support = np.zeros(len(turns), dtype=np.intp)
+    for i, across in enumerate(after_next):
+        first, second = next_one[i], next_one[i + 1]
+        if across is None or first is None or second is None:
+            continue
+        open_rad = float(np.linalg.norm(so3_log(first[0] @ second[0] @ across[0].T)))
+        for k, (rotation, count) in ((i, first), (i + 1, second)):
+            if open_rad < min(_CLOSED_RAD, off[k]):
+                turns[k], off[k], support[k] = so3_log(rotation), open_rad, count
+    return VisualRotation(
+        names=tuple(names),
+        t_s=timing.pose_t_s()[[index[name] for name in names]],
+        turn_rad=turns,
+        sigma_rad=np.where(np.isfinite(off), np.maximum(off, 1e-3), np.nan),
+        support=support,
+        epoch_ns=timing.epoch_ns,
+    )
+
+
+def _features(frame: Frame, camera: Projector, options: FlowOptions) -> _Seen:
+    import cv2
+
+    grey = reduced(frame.image, options)
+    points, descriptors = cv2.SIFT.create(_FEATURES).detectAndCompute(grey, None)
+    to_full = np.array([frame.image.shape[1] / grey.shape[1], frame.image.shape[0] / grey.shape[0]])
+    centre = np.array([[frame.image.shape[1] / 2, frame.image.shape[0] / 2]])
+    xy_px = (np.array([point.pt for point in points], dtype=np.float64).reshape(-1, 2) + 0.5) * to_full
+    rays = np.asarray(camera.cam_from_img(np.concatenate([xy_px, centre, centre + to_full])))[:, :2]
+    ok = np.isfinite(rays[:-2]).all(axis=1)
+    known = np.zeros((0, 128), np.float32) if descriptors is None else descriptors
+    return _Seen(
+        rays=rays[:-2][ok],
+        descriptors=known[ok],
+        pixel_rad=float(np.linalg.norm(rays[-1] - rays[-2])) / 2**0.5,
+    )
+
+
+def _rotation(first: _Seen, second: _Seen) -> tuple[Array, int] | None:
+    """(3, 3) ``first_from_second`` and the matches that agree; ``None`` where too few do."""
+    import cv2
+
+    if min(len(first.rays), len(second.rays)) < _LEAST_MATCHES:
+        return None
+    found: Any = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first.descriptors, second.descriptors, k=2)
+    pairs = np.array([(m.queryIdx, m.trainIdx) for m, other in found if m.distance < _RATIO * other.distance])
+    if len(pairs) < _LEAST_MATCHES:
+        return None
+    a, b = first.rays[pairs[:, 0]], second.rays[pairs[:, 1]]
+    reach = _OFF_PX * first.pixel_rad
+    essential, inside = cv2.findEssentialMat(
+        a, b, np.eye(3), method=cv2.USAC_FAST, prob=0.999, threshold=reach, maxIters=1000
+    )
+    if essential is None or essential.shape != (3, 3):
+        return None
+    kept = inside.ravel() > 0
+    if kept.sum() < _LEAST_MATCHES:
+        return None
+    a, b = a[kept], b[kept]
+    turned, share = _turn_alone(a, b, _TURNED_PX * first.pixel_rad)
+    if share > _TURNED_SHARE:
+        return turned, int(share * len(a))
+    count, second_from_first, _, _ = cv2.recoverPose(essential, a, b, np.eye(3))
+    if count < _LEAST_MATCHES:
+        return None
+    return np.asarray(second_from_first, dtype=np.float64).T, int(count)
+
+
+def _turn_alone(a: Array, b: Array, reach: float) -> tuple[Array, float]:
+    """The rotation ``a_from_b`` that turns most rays into each other, and the share that it explains."""
+    a, b = (np.column_stack([rays, np.ones(len(rays))]) for rays in (a, b))
+    a, b = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (a, b))
+    weight = np.ones(len(a))
+    for _ in range(10):
+        u, _, vt = np.linalg.svd((a * weight[:, None]).T @ b)
+        rotation = u @ np.diag([1.0, 1.0, float(np.linalg.det(u @ vt))]) @ vt
+        off = np.linalg.norm(a - b @ rotation.T, axis=1)
+        weight = 1 / (1 + (off / reach) ** 2) ** 2
+    return rotation, float(np.mean(off < reach))

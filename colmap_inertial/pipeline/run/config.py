@@ -1,0 +1,163 @@
+"""Options as TOML: read from ``--config``, and written back in full beside every result."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import tomllib
+import types
+import typing
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.io.files import StrPath, require_regular
+
+Options = TypeVar("Options")
+
+
+def config_as_toml(options: object) -> str:
+    """Every option with its value; those that are ``None`` (TOML has none) are left out."""
+    import tomli_w
+
+    return tomli_w.dumps(_plain(options))
+
+
+def _plain(options: Any) -> dict[str, Any]:
+    plain: dict[str, Any] = {}
+    for f in dataclasses.fields(options):
+        value = getattr(options, f.name)
+        if dataclasses.is_dataclass(value):
+            plain[f.name] = _plain(value)
+        elif isinstance(value, Path):
+            plain[f.name] = str(value.resolve())
+        elif value is not None:
+            plain[f.name] = [_plain_item(item) for item in value] if isinstance(value, tuple) else value
+    return plain
+
+
+def _plain_item(item: object) -> object:
+    return str(item.resolve()) if isinstance(item, Path) else item
+
+
+def read_config(path: StrPath, cls: type[Options]) -> Options:
+    """Options of type ``cls`` from a TOML file; what it does not name keeps its default.
+
+    Raises
+    ------
+    FormatError
+        For a file that is no TOML, an unknown key (the nearest known one is named), or a value of the wrong type.
+    """
+    path = Path(path)
+    return _build(path, cls, read_values(path), "")
+
+
+def read_values(path: Path) -> dict[str, Any]:
+    """What a TOML file says, unchecked; a :class:`FormatError` for a file that is none."""
+    try:
+        require_regular(path)
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise FormatError(path, f"cannot be read: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:  # also no UTF-8, and a NUL in the path
+        raise FormatError(path, f"is not valid TOML: {error}") from error
+
+
+def with_values(options: Options, values: Mapping[str, Any], path: Path) -> Options:
+    """``options``, where ``values`` (nested as in TOML) go before its own.
+
+    Parameters
+    ----------
+    path
+        The file that the values come from: named by errors, and its folder is where relative paths count from.
+
+    Raises
+    ------
+    FormatError
+        As :func:`read_config`.
+    """
+    stated = _build(path, type(options), values, "")  # by themselves first: a wrong one is named as it was written
+    plain = _merged(_plain(options), _with_absolute_paths(stated, values, path.parent))
+    return _build(path, type(options), plain, "")
+
+
+def _with_absolute_paths(stated: Any, values: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    absolute: dict[str, Any] = {}
+    for key, value in values.items():
+        built = getattr(stated, key)
+        if dataclasses.is_dataclass(built):
+            absolute[key] = _with_absolute_paths(built, value, folder)
+        else:
+            absolute[key] = _absolute(built, value, folder)
+    return absolute
+
+
+def _absolute(built: object, value: object, folder: Path) -> object:
+    if isinstance(built, tuple):
+        return [_absolute(item, item, folder) for item in built]
+    return str((folder / built).resolve()) if isinstance(built, Path) else value
+
+
+def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    merged = dict(below)
+    for key, value in above.items():
+        deeper = isinstance(value, Mapping) and isinstance(merged.get(key), Mapping)
+        merged[key] = _merged(merged[key], value) if deeper else value
+    return merged
+
+
+def _build(path: Path, cls: type[Options], values: Mapping[str, Any], prefix: str) -> Options:
+    hints = typing.get_type_hints(cls)
+    known = [f.name for f in dataclasses.fields(cls)]  # type: ignore[arg-type]
+    built: dict[str, Any] = {}
+    for key, value in values.items():
+        if key not in known:
+            near = difflib.get_close_matches(key, known, n=1)
+            hint = f"; did you mean {prefix}{near[0]}?" if near else f"; known here: {', '.join(known)}"
+            raise FormatError(path, f"unknown option {prefix}{key}{hint}")
+        hint_type = hints[key]
+        if dataclasses.is_dataclass(hint_type):
+            if not isinstance(value, Mapping):
+                raise FormatError(path, f"{prefix}{key} is a table of options")
+            built[key] = _build(path, typing.cast(type, hint_type), value, f"{prefix}{key}.")
+        else:
+            built[key] = _checked(path, f"{prefix}{key}", value, hint_type)
+    try:
+        return cls(**built)
+    except ValueError as error:
+        raise FormatError(path, str(error)) from error
+
+
+def _checked(path: Path, name: str, value: Any, hint: Any) -> Any:
+    alternatives = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+    for kind in alternatives:
+        if typing.get_origin(kind) is typing.Literal:
+            if value in typing.get_args(kind):
+                return value
+        elif kind is Path and isinstance(value, str):
+            if "\0" in value:
+                raise FormatError(path, f"{name}: holds a NUL character")
+            return Path(value)
+        elif typing.get_origin(kind) is tuple:
+            of_paths = typing.get_args(kind)[0] is Path
+            items = [value] if of_paths and isinstance(value, str) else value
+            if isinstance(items, list) and all(isinstance(item, str) for item in items):
+                return tuple(_checked(path, name, item, Path) for item in items) if of_paths else tuple(items)
+        elif kind is float and isinstance(value, (int, float)) and not isinstance(value, bool):
+            return float(value)
+        elif isinstance(kind, type) and type(value) is kind:
+            return value
+    raise FormatError(path, f"{name}: {value!r} is not {_describe(alternatives)}")
+
+
+def _describe(kinds: tuple[Any, ...]) -> str:
+    words = []
+    for kind in kinds:
+        if typing.get_origin(kind) is typing.Literal:
+            words.append("one of " + ", ".join(map(repr, typing.get_args(kind))))
+        elif typing.get_origin(kind) is tuple:
+            words.append("a list of texts")
+        elif kind is not type(None):
+            words.append(f"a {getattr(kind, '__name__', kind)}")
+    return " or ".join(words)

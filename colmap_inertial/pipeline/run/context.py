@@ -1,0 +1,132 @@
+"""What goes through a run together: what was recorded, and how the work is done."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+from colmap_inertial.core.types import CameraImuCalibration, FrameTiming, ImuRecording
+from colmap_inertial.io.calibration import largest_offset_s
+from colmap_inertial.io.capture import Capture, Video
+from colmap_inertial.io.frames import frame_source
+from colmap_inertial.io.imu_calibration import CalibrationFiles, read_calibrations, read_for_another
+from colmap_inertial.io.names import path_in
+from colmap_inertial.pipeline.run.progress import Progress, silent
+from colmap_inertial.pipeline.run.runner import fingerprint
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Recording:
+    """One recording: its frames' times, the IMU that ran along, and what is known of both.
+
+    Attributes
+    ----------
+    capture
+        What describes it, and where its files are.
+    imu
+        Gyroscope and accelerometer.
+    timing
+        Of the frames to use.
+    prior
+        Camera and IMU, as far as they are known beforehand.
+    doubts
+        What was found wrong with it; with any of them, no scale is trusted.
+    every
+        Of all frames of the video that ``timing``'s were chosen from; ``timing`` itself where all are used.
+    max_offset_s
+        Largest offset between the clocks; ``None`` where it may be any.
+    """
+
+    capture: Capture
+    imu: ImuRecording
+    timing: FrameTiming
+    prior: CameraImuCalibration
+    doubts: tuple[str, ...] = ()
+    every: FrameTiming
+    max_offset_s: float | None = None
+
+    @classmethod
+    def of(
+        cls,
+        capture: Capture,
+        imu: ImuRecording,
+        timing: FrameTiming,
+        prior: CameraImuCalibration,
+        *,
+        max_offset_s: float | None = None,
+    ) -> Recording:
+        """A recording of which all frames are used; without a largest offset, that of a shared clock counts."""
+        limit_s = largest_offset_s(capture.shared_clock, max_offset_s)
+        return cls(capture=capture, imu=imu, timing=timing, prior=prior, every=timing, max_offset_s=limit_s)
+
+    def using(self, timing: FrameTiming) -> Recording:
+        """With some of its frames."""
+        return replace(self, timing=timing)
+
+    def identity(self) -> dict[str, object]:
+        """All that decides what is made of it."""
+        names = ("imu", "timing", "every", "prior", "max_offset_s")
+        return {
+            **{name: getattr(self, name) for name in names},
+            "capture": replace(self.capture, target=None),
+            "inputs": self.inputs(),
+        }
+
+    def inputs(self) -> list[object]:
+        """What identifies the files that frames are read from."""
+        capture, source = self.capture, frame_source(self.capture)
+        paths = [] if source is None else [path_in(source, name) for name in self.timing.names]
+        if isinstance(capture.frames, Video):
+            paths = [capture.frames.file]
+        if capture.apertures is not None:
+            paths += capture.apertures.files(self.timing.names)
+        if capture.exposures is not None:
+            paths += [*capture.exposures.files(self.timing.names), *filter(None, [capture.exposures.times])]
+        return [fingerprint(path) for path in paths]
+
+
+def prior_calibration(capture: Capture, given: CalibrationFiles) -> CameraImuCalibration:
+    """What is known of camera and IMU beforehand: from a calibration file where one is given, else from the capture."""
+    files = read_for_another(given, shared_clock=capture.shared_clock)
+    calibration, of_imu = files.camera_imu or capture.calibration, files.imu or capture.imu_calibration
+    return calibration if of_imu is None else of_imu.loosened(calibration)
+
+
+def corrected_imu(capture: Capture, imu: ImuRecording, given: CalibrationFiles) -> ImuRecording:
+    """The recording as its IMU's own calibration corrects it, from a file or from the capture; else as it is."""
+    calibration = read_calibrations(given).imu or capture.imu_calibration
+    return imu if calibration is None else calibration.corrected(imu)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RunContext:
+    """How the work is done.
+
+    Attributes
+    ----------
+    scratch
+        A folder for temporary files.
+    num_threads
+        Of COLMAP; -1 uses all.
+    seed
+        Of COLMAP.
+    device
+        What COLMAP finds and matches features on.
+    progress
+        Hears how far it is.
+    """
+
+    scratch: Path
+    num_threads: int = -1
+    seed: int = 0
+    device: Literal["cpu", "cuda"] = "cpu"
+    progress: Progress = silent
+
+    def reporting(self, progress: Progress) -> RunContext:
+        """The same, heard by somebody else."""
+        return replace(self, progress=progress)
+
+    def identity(self) -> dict[str, object]:
+        """What decides a result: not who listens, nor where."""
+        return {"num_threads": self.num_threads, "seed": self.seed, "device": self.device}

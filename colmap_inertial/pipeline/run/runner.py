@@ -1,0 +1,240 @@
+"""Steps in order, those that are done already skipped, each output whole or absent."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import functools
+import hashlib
+import json
+import logging
+import os
+import shutil
+import time
+import types
+import uuid
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from colmap_inertial import __version__
+from colmap_inertial.core.errors import FormatError, InertialError
+from colmap_inertial.io.files import read_json, write_json
+from colmap_inertial.pipeline.run.progress import HearsSteps, Progress, silent
+from colmap_inertial.pipeline.run.workspace import Workspace
+
+log = logging.getLogger(__name__)
+
+
+def canonical(value: object) -> object:
+    """A value in JSON types, for hashing: dataclasses by field, paths as text, functions by name, body and closure.
+
+    A field that is declared with ``compare=False`` decides nothing and is left out.
+    """
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = {f.name: canonical(getattr(value, f.name)) for f in dataclasses.fields(value) if f.compare}
+        kind = type(value)
+        return {"type": f"{kind.__module__}.{kind.__qualname__}", "methods": _methods(kind), **fields}
+    if isinstance(value, Mapping):
+        return {str(k): canonical(v) for k, v in value.items()}
+    if isinstance(value, enum.Enum):
+        return value.value
+    if isinstance(value, np.ndarray):
+        return hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, (list, tuple)):
+        return [canonical(v) for v in value]
+    if isinstance(value, (set, frozenset)):
+        return sorted((canonical(v) for v in value), key=repr)
+    if isinstance(value, Path):
+        return str(value)
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    if isinstance(value, functools.partial):
+        return ["partial", canonical(value.func), canonical(value.args), canonical(value.keywords)]
+    if isinstance(value, types.FunctionType):
+        cells = [canonical(cell.cell_contents) for cell in value.__closure__ or ()]
+        defaults = canonical([value.__defaults__, value.__kwdefaults__])
+        return [f"{value.__module__}.{value.__qualname__}", _code(value.__code__), cells, defaults]
+    if isinstance(value, types.MethodType):
+        return [canonical(value.__func__), canonical(value.__self__)]
+    # Anything else may hide what decides its result: a key of its own, so that nothing made with it is ever kept.
+    return f"{type(value).__module__}.{type(value).__qualname__} {uuid.uuid4()}"
+
+
+def _code(code: types.CodeType) -> list[object]:
+    """A function's body, without names of files and numbers of lines."""
+    constants = [_code(c) if isinstance(c, types.CodeType) else _constant(c) for c in code.co_consts]
+    return [code.co_code.hex(), list(code.co_names), constants]
+
+
+def _constant(value: object) -> object:
+    """A constant of a function, the same in every process: the order of a set is not."""
+    if isinstance(value, tuple | frozenset):
+        parts = [_constant(part) for part in value]
+        return parts if isinstance(value, tuple) else sorted(parts, key=repr)
+    return repr(value)
+
+
+def _methods(kind: type) -> dict[str, object]:
+    """The code of a visitor's class; our own is known by our version."""
+    if kind.__module__.split(".")[0] == __package__.split(".")[0]:
+        return {}
+    own = {name: value for name, value in vars(kind).items() if name == "__call__" or not name.startswith("__")}
+    return {name: canonical(value) for name, value in own.items() if isinstance(value, types.FunctionType)}
+
+
+#: Of a file this much is read to tell it from another one: all of it, or as many bytes in pieces of this size.
+_READ_BYTES, _PIECE_BYTES = 4 << 20, 1 << 16
+
+
+def fingerprint(path: Path) -> list[object]:
+    """What identifies an input: names, sizes, modification times and what is in it.
+
+    Tools that edit metadata or copy with the old times leave size and time as they were, so the content counts, too: of
+    files up to 4 MiB, as most pictures and tables are, each byte; of larger ones 64 pieces over their whole length. Not
+    the time of the last change of the inode, which tells of an edit as well, but also of a hard link, which
+    ``reconstruct PROJECT OUT --link`` makes itself, and of another owner.
+    """
+    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    try:
+        stats = [(file, file.stat()) for file in files]
+    except FileNotFoundError as error:
+        raise FormatError(error.filename, "no such file") from None
+    return [[str(file.resolve()), stat.st_size, stat.st_mtime_ns, _content(file, stat)] for file, stat in stats]
+
+
+def _content(path: Path, stat: os.stat_result) -> str:
+    return _digest(path, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns)
+
+
+@functools.lru_cache(maxsize=100_000)
+def _digest(path: Path, size: int, _mtime_ns: int, _ctime_ns: int) -> str:
+    """Of a file's content; once in a run, as several steps ask for the same inputs."""
+    digest = hashlib.blake2b(digest_size=16)
+    try:
+        with open(path, "rb") as file:
+            if size <= _READ_BYTES:
+                digest.update(file.read(_READ_BYTES))
+            else:
+                pieces = _READ_BYTES // _PIECE_BYTES
+                for i in range(pieces):
+                    file.seek(i * (size - _PIECE_BYTES) // (pieces - 1))
+                    digest.update(file.read(_PIECE_BYTES))
+    except OSError as error:
+        raise FormatError(path, f"cannot be read: {error.strerror or error}") from None
+    return digest.hexdigest()
+
+
+class StepRunner:
+    """Runs steps in order and skips those whose inputs and options are those of an earlier, finished run.
+
+    A step's key hashes its options, its inputs, what it writes and the keys of the steps that it takes the output of,
+    so that a change anywhere makes again what depends on it, and nothing else. A folder's existence proves nothing:
+    only a stamp with the right key does.
+
+    Attributes
+    ----------
+    seconds
+        By step, also of those that an earlier run did.
+    worked
+        The steps that this run did, in order.
+    """
+
+    def __init__(self, workspace: Workspace, heard_by: Progress = silent) -> None:
+        self._workspace = workspace
+        self._heard_by = heard_by if isinstance(heard_by, HearsSteps) else None
+        self._keys: dict[str, str] = {}
+        self.seconds: dict[str, float] = {}
+        self.worked: list[str] = []
+
+    def of(self, *steps: str) -> list[str]:
+        """Those of the steps that belong to this run."""
+        return [step for step in steps if step in self._keys]
+
+    def forget(self, name: str) -> None:
+        """Have a step made again: what it made is gone."""
+        (self._workspace.stamps / f"{name}.json").unlink(missing_ok=True)
+
+    def run(
+        self,
+        name: str,
+        depends: Mapping[str, object],
+        outputs: Sequence[Path],
+        work: Callable[[list[Path]], None],
+        *,
+        after: Sequence[str] = (),
+    ) -> None:
+        """Run ``work`` unless its stamp holds.
+
+        Parameters
+        ----------
+        name
+            The step.
+        depends
+            Everything that decides its output beside the steps before it.
+        outputs
+            What it writes. ``work`` gets temporary paths in their places, which are renamed when it returns.
+        work
+            Writes every temporary path; parent folders exist, the paths themselves do not. It may run a step of its
+            own, whose time is not counted twice.
+        after
+            Steps whose output it takes.
+        """
+        upstream = [self._keys[step] for step in after]
+        written = [path.name for path in outputs]
+        text = json.dumps([name, __version__, upstream, canonical(depends), written], sort_keys=True)
+        key = self._keys[name] = hashlib.sha256(text.encode()).hexdigest()
+        stamp = self._workspace.stamps / f"{name}.json"
+        done = _read_stamp(stamp)
+        if done is not None and done["key"] == key and all(path.exists() for path in outputs):
+            self.seconds |= {**done.get("inner", {}), name: done["seconds"]}
+            log.info("%s: finished in an earlier run, kept", name)
+            if self._heard_by is not None:
+                self._heard_by.kept(name)
+            return
+        self._workspace.unfinish()
+        self.worked.append(name)
+        stamp.unlink(missing_ok=True)
+        for path in outputs:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        partial = [path.with_name(f"{path.stem}.partial{path.suffix}") for path in outputs]
+        for path in (*outputs, *partial):
+            remove(path)
+        log.info("%s: started", name)
+        if self._heard_by is not None:
+            self._heard_by.began(name, partial)
+        start, begun = time.perf_counter(), len(self.worked)
+        try:
+            work(partial)
+        except (InertialError, OSError):
+            for path in partial:
+                remove(path)
+            raise
+        for source, target in zip(partial, outputs, strict=True):
+            os.replace(source, target)
+        inner = {step: self.seconds[step] for step in self.worked[begun:]}
+        self.seconds[name] = time.perf_counter() - start - sum(inner.values())
+        write_json(stamp, {"key": key, "seconds": self.seconds[name], "inner": inner})
+        log.info("%s: finished in %.1f s", name, self.seconds[name])
+
+
+def _read_stamp(stamp: Path) -> dict[str, Any] | None:
+    if not stamp.is_file():
+        return None
+    try:
+        return read_json(stamp)
+    except FormatError:
+        return None
+
+
+def remove(path: Path) -> None:
+    """Remove a file or folder of our own, if it is there, with the side files of an SQLite database."""
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        for suffix in ("", "-journal", "-wal", "-shm"):
+            path.with_name(path.name + suffix).unlink(missing_ok=True)

@@ -1,0 +1,149 @@
+"""A run from its lock to its log: what every driver does around its own steps."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from colmap_inertial import __version__
+from colmap_inertial.core.errors import InertialError
+from colmap_inertial.io.files import as_plain, read_json, remove_temporaries, write_json, write_text
+from colmap_inertial.model.loading import load_pycolmap
+from colmap_inertial.pipeline.run.config import config_as_toml
+from colmap_inertial.pipeline.run.context import RunContext
+from colmap_inertial.pipeline.run.progress import Progress
+from colmap_inertial.pipeline.run.runner import StepRunner
+from colmap_inertial.pipeline.run.workspace import Workspace, require_apart
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Session:
+    """A run at work in its folder, which is its own until the end.
+
+    Attributes
+    ----------
+    workspace
+        The folder.
+    runner
+        Does the steps, or keeps them from an earlier run.
+    context
+        How the work is done.
+    """
+
+    workspace: Workspace
+    runner: StepRunner
+    context: RunContext
+
+    @property
+    def progress(self) -> Progress:
+        """Who hears how far it is."""
+        return self.context.progress
+
+    def stands(self, content: Mapping[str, object]) -> bool:
+        """Whether an earlier run's ``result.json`` says this already, and nothing had to be made again."""
+        if self.runner.worked or not self.workspace.result.is_file():
+            return False
+        known = read_json(self.workspace.result)
+        return {**known, "seconds": {}} == as_plain({**content, "seconds": {}})
+
+    def finish(self, content: Mapping[str, object]) -> bool:
+        """Write ``result.json``, whose presence says that the run is finished; returns whether it stood already."""
+        unchanged = self.stands(content)
+        if not unchanged:
+            write_json(self.workspace.result, content)
+        log.info("nothing to do" if unchanged else "finished")
+        return unchanged
+
+
+@contextlib.contextmanager
+def open_session(
+    out: Path,
+    source: Path,
+    options: object,
+    *,
+    pictures: Sequence[Path],
+    command: str = "reconstruct",
+    deterministic: bool = False,
+    seed: int = 0,
+    device: Literal["cpu", "cuda"] = "cpu",
+    progress: Progress,
+) -> Iterator[Session]:
+    """A session in ``out``: locked, its options written down, its log kept.
+
+    Parameters
+    ----------
+    out
+        A folder that does not exist, or holds a run on the same source, which is then gone on with.
+    source
+        The capture or project.
+    options
+        All that decides the result; a dataclass.
+    pictures
+        Folders that pictures are read from; ``out`` may not lie in one.
+    command
+        What is done; one folder is for one command.
+    deterministic
+        Whether one thread does it all.
+    seed, device, progress
+        As of :class:`RunContext`.
+
+    Raises
+    ------
+    OutputExistsError
+        When ``out`` holds something else, or another run is at work in it.
+    OutputError
+        Where it cannot be written, as on a full disk, or lies among the pictures.
+    """
+    require_apart(out, pictures)
+    workspace = Workspace(out)
+    workspace.prepare(source, command)
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(workspace.locked())
+        workspace.open(source, command)
+        remove_temporaries(workspace.root, workspace.stamps, workspace.report_data)
+        stack.enter_context(logging_to(workspace.log))
+        log.info("colmap-inertial %s: %s -> %s", __version__, source, out)
+        config = config_as_toml(options)
+        if not workspace.config.is_file() or workspace.config.read_text(encoding="utf-8") != config:
+            workspace.unfinish()
+            write_text(workspace.config, config)
+        runner = StepRunner(workspace, progress)
+        threads = 1 if deterministic else -1
+        context = RunContext(scratch=workspace.stamps, num_threads=threads, seed=seed, device=device, progress=progress)
+        session = Session(workspace=workspace, runner=runner, context=context)
+        yield session
+
+
+@contextlib.contextmanager
+def logging_to(path: Path) -> Iterator[None]:
+    """Send this package's log to a file, and keep COLMAP's chatter off the terminal."""
+    keep_colmap_quiet()
+    logger = logging.getLogger("colmap_inertial")
+    handler = logging.FileHandler(path, encoding="utf-8")
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    level = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    try:
+        yield
+    except InertialError as error:
+        log.error("%s", error)
+        raise
+    finally:
+        logger.setLevel(level)
+        logger.removeHandler(handler)
+        handler.close()
+
+
+def keep_colmap_quiet() -> None:
+    """Keep COLMAP's chatter off the terminal, from now on."""
+    load_pycolmap()
+    import pycolmap
+
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value

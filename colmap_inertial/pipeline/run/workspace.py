@@ -1,0 +1,355 @@
+"""The output folder: where everything lies, what is finished, and how a step's output appears whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fnmatch
+import logging
+import re
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from colmap_inertial.checks.report.content import CROPS_FOLDER, DATA_FOLDER
+from colmap_inertial.core.errors import FormatError, OutputError, OutputExistsError
+from colmap_inertial.io.files import locked, read_json, write_json
+
+log = logging.getLogger(__name__)
+
+#: Counts changes of the layout: 2 since the folder itself is a project in metres.
+_LAYOUT = 2
+_TRAJECTORY = re.compile(r"trajectory(_\d+)?(\.tum|_cov(\.partial)?\.npz|_motion\.json)")
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """Every path of an output folder, derived from its root."""
+
+    root: Path
+
+    @property
+    def images(self) -> Path:
+        """The images that agree with the metric models, and whatever else is made from them."""
+        return self.root / "images"
+
+    @property
+    def sparse(self) -> Path:
+        """The models in metres; none where no scale is accepted."""
+        return self.root / "sparse"
+
+    @property
+    def dense(self) -> Path:
+        """Dense reconstructions of the metric models."""
+        return self.root / "dense"
+
+    @property
+    def earlier(self) -> Path:
+        """Dense reconstructions with depth maps whose model is no longer there."""
+        return self.root / "earlier"
+
+    @property
+    def colmap(self) -> Path:
+        """COLMAP's own project: what it saw and made, untouched, in its arbitrary units."""
+        return self.root / "colmap"
+
+    @property
+    def colmap_images(self) -> Path:
+        """The frames that COLMAP sees."""
+        return self.colmap / "images"
+
+    @property
+    def colmap_database(self) -> Path:
+        """COLMAP's database."""
+        return self.colmap / "database.db"
+
+    @property
+    def colmap_features(self) -> Path:
+        """The database before matching; removed at the end of a run."""
+        return self.colmap / "features.db"
+
+    @property
+    def colmap_sparse(self) -> Path:
+        """COLMAP's models."""
+        return self.colmap / "sparse"
+
+    @property
+    def selection(self) -> Path:
+        """Which frames of a video are used, and why."""
+        return self.root / "selection.json"
+
+    @property
+    def imaging(self) -> Path:
+        """Calibration from before the reconstruction, and what it means for each frame."""
+        return self.root / "imaging.json"
+
+    @property
+    def frames(self) -> Path:
+        """Names, times and treatment of the frames."""
+        return self.root / "frames.json"
+
+    @property
+    def keypoints(self) -> Path:
+        """What the keypoint stages did."""
+        return self.root / "keypoints.json"
+
+    @property
+    def matches(self) -> Path:
+        """Which pairs of images were matched, and why not the rest."""
+        return self.stamps / "matches_made.json"
+
+    @property
+    def mapped(self) -> Path:
+        """How models were made."""
+        return self.stamps / "models_made.json"
+
+    @property
+    def validation(self) -> Path:
+        """Pictures of the target in the frames."""
+        return self.root / "validation"
+
+    @property
+    def georeference(self) -> Path:
+        """Where on Earth the metric models and their images stand."""
+        return self.root / "georeference.json"
+
+    @property
+    def diagnosis(self) -> Path:
+        """What was found wrong with the recording before the reconstruction."""
+        return self.root / "diagnosis.json"
+
+    @property
+    def apertures(self) -> Path:
+        """Disparities and depths of a multi-aperture camera's frames, where they were asked for."""
+        return self.root / "apertures"
+
+    @property
+    def report(self) -> Path:
+        """For reading: everything in one page."""
+        return self.root / "report.html"
+
+    @property
+    def report_data(self) -> Path:
+        """What the report shows beside the results; with it, the report can be made again."""
+        return self.root / DATA_FOLDER
+
+    @property
+    def crops(self) -> Path:
+        """Parts of some frames before and after the frame stages."""
+        return self.report_data / CROPS_FOLDER
+
+    @property
+    def result(self) -> Path:
+        """Written last: its presence means that the run is finished."""
+        return self.root / "result.json"
+
+    @property
+    def config(self) -> Path:
+        """The resolved configuration, in the form that ``--config`` reads."""
+        return self.root / "config.toml"
+
+    @property
+    def log(self) -> Path:
+        """The run's log."""
+        return self.root / "log.txt"
+
+    @property
+    def stamps(self) -> Path:
+        """One JSON for each finished step."""
+        return self.root / ".stages"
+
+    @property
+    def stage_names(self) -> Path:
+        """Which stages it is made with, where a batch named them."""
+        return self.stamps / "stage_names.toml"
+
+    @property
+    def lock(self) -> Path:
+        """Held by the run that is at work in the folder."""
+        return self.stamps / "lock"
+
+    def trajectory(self, index: int, *, first: bool) -> Path:
+        """The smoothed metric trajectory of a model; the first one has the plain name."""
+        return self.root / ("trajectory.tum" if first else f"trajectory_{index}.tum")
+
+    def trajectories(self) -> list[Path]:
+        """The trajectories of all models, with their covariances."""
+        return [path for path in self.root.glob("trajectory*") if _TRAJECTORY.fullmatch(path.name)]
+
+    @property
+    def own_names(self) -> tuple[str, ...]:
+        """Names that are the run's own where the folder is an existing project in metres; patterns, as in a shell."""
+        report = (self.report, self.report.with_suffix(".json"), self.report_data)
+        files = (self.result, self.config, self.log, self.diagnosis, self.georeference, self.frames, *report)
+        names = (path.name for path in (*files, self.validation, self.earlier, self.stamps))
+        return (*names, "trajectory*.tum", "trajectory*_cov.npz", "trajectory*_motion.json")
+
+    def is_own(self, name: str) -> bool:
+        """Whether a name is among them."""
+        return any(fnmatch.fnmatchcase(name, pattern) for pattern in self.own_names)
+
+    @property
+    def unsmoothed(self) -> Path:
+        """Frames as they are, of which COLMAP sees smoothed ones."""
+        return self.stamps / "unsmoothed"
+
+    @property
+    def placed(self) -> Path:
+        """What came into the folder from an existing project."""
+        return self.stamps / "placed.json"
+
+    @property
+    def owner(self) -> Path:
+        """Which command on which capture or project the folder is for."""
+        return self.stamps / "capture.json"
+
+    def open(self, source: Path, command: str = "reconstruct") -> None:
+        """Create the folder, or take up a run of the same command on the same capture or project, finished or not.
+
+        Raises
+        ------
+        OutputExistsError
+            When the folder holds another run, or something that is not ours.
+        """
+        identity = self.prepare(source, command)
+        if not self.owner.is_file():
+            write_json(self.owner, identity)
+
+    def prepare(self, source: Path, command: str) -> dict[str, str | int]:
+        """Make room for the lock, in a folder that is new or ours; nothing else is written before it is held.
+
+        Returns
+        -------
+        dict
+            What the owner's record holds, or is to hold.
+
+        Raises
+        ------
+        OutputExistsError
+            As :meth:`open`.
+        """
+        if self.root.exists() and not self.root.is_dir():
+            raise OutputExistsError(f"{self.root} is a file; choose another output folder")
+        identity: dict[str, str | int] = {"capture": str(source.resolve()), "command": command, "layout": _LAYOUT}
+        if self.owner.is_file():
+            known = read_json(self.owner)
+            if known.get("layout") != _LAYOUT:
+                raise OutputExistsError(
+                    f"{self.root} holds a run of another version, which laid its folders out otherwise: choose another "
+                    "folder, or remove this one (view and write_report still read it)"
+                )
+            for what in ("capture", "command"):
+                if known.get(what) != identity[what]:
+                    raise OutputExistsError(
+                        f"{self.root} holds a run of another {what} ({known.get(what)}); choose another folder or "
+                        "remove it"
+                    )
+        elif self.root.is_dir() and any(p.name != self.stamps.name for p in self.root.iterdir()):
+            raise OutputExistsError(f"{self.root} is not empty; choose another output folder")
+        try:
+            self.stamps.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"{self.root} cannot be made: {error.strerror or error}") from error
+        return identity
+
+    def unfinish(self) -> None:
+        """Something is made again: what the result says no longer stands."""
+        self.result.unlink(missing_ok=True)
+
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep other runs out of the folder.
+
+        Raises
+        ------
+        OutputExistsError
+            While another run is at work in it.
+        OutputError
+            Where the disk is full.
+        """
+        busy = f"another run is at work in {self.root}; wait for it or choose another folder"
+        with full_disk_is_an_error(self.root), locked(self.lock, busy):
+            yield
+
+
+@dataclass(frozen=True, kw_only=True)
+class Places:
+    """Where a finished folder may hold what others go on with, the best first; not each of them is there.
+
+    Attributes
+    ----------
+    images, sparse, dense
+        Images that agree with the metric models, those models, dense reconstructions of them.
+    seen
+        The images that COLMAP saw, with their rolling shutter.
+    rectified
+        Those without it, where it was undone.
+    """
+
+    images: tuple[Path, ...]
+    sparse: tuple[Path, ...]
+    dense: tuple[Path, ...]
+    seen: Path
+    rectified: Path
+
+
+def places_of(root: Path) -> Places:
+    """The places of a finished folder, also of one that 0.2 or a version before it made."""
+    now, before = Workspace(root), root / "images_rectified"
+    return Places(
+        images=(before, now.images, root / "project_metric" / "images"),
+        sparse=(root / "sparse_metric", now.sparse),
+        dense=(now.dense, root / "dense_metric"),
+        # colmap/ may have been removed, and then images/ is still what it was; a stranger's project may have its own
+        seen=now.colmap_images if now.colmap_images.is_dir() and now.stamps.is_dir() else now.images,
+        rectified=before if before.is_dir() else now.images,
+    )
+
+
+_MAKE_ROOM = "make room and start again, it continues"
+
+
+@contextlib.contextmanager
+def full_disk_is_an_error(root: Path, advice: str = _MAKE_ROOM) -> Iterator[None]:
+    """Turn the system's complaint about a full disk (or a quota, or a limit of file sizes) into one of ours."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+            raise
+        raise OutputError(f"the disk of {root} is full ({error.strerror}); {advice}") from error
+
+
+@contextlib.contextmanager
+def a_record_of_ours(path: Path) -> Iterator[None]:
+    """While a record of an earlier run is taken apart: what does not fit means that it was changed since."""
+    try:
+        yield
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        raise FormatError(path, f"was damaged since it was written ({error}); remove it and start again") from None
+
+
+def require_apart(out: Path, pictures: Sequence[Path]) -> None:
+    """Raise :class:`OutputError` where an output would lie among the pictures that it is made from.
+
+    They would be taken for pictures of the capture when the command is given again.
+    """
+    for folder in pictures:
+        if out.resolve().is_relative_to(folder.resolve()):
+            raise OutputError(
+                f"{out} lies in {folder}, the folder of the capture's pictures; choose a folder outside of it"
+            )
+
+
+def require_room(folder: Path, num_bytes: int) -> None:
+    """Raise :class:`OutputError` where the disk of ``folder`` has less room left than ``num_bytes``.
+
+    For what COLMAP writes: its threads end the process when a database cannot grow, and its models end early.
+    """
+    free = shutil.disk_usage(folder).free
+    if free < num_bytes:
+        raise OutputError(
+            f"the disk of {folder} is nearly full: {free / 1e6:.0f} MB are left, COLMAP's next step may need "
+            f"{num_bytes / 1e6:.0f} MB; {_MAKE_ROOM}"
+        )

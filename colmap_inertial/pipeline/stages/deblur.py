@@ -1,0 +1,172 @@
+"""The default frame stage that treats frames by the gyroscope: motion blur undone, or frames left out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, get_args
+
+import numpy as np
+
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.options import BlurRemover, DeblurMethod
+from colmap_inertial.core.threads import frames_at_once, in_order, threads_beside
+from colmap_inertial.core.types import (
+    Frame,
+    Projector,
+    Treatment,
+)
+from colmap_inertial.imaging.blur_path import BlurPath
+from colmap_inertial.imaging.gate import FrameDecision, GateOptions, RecordingVerdict, judge_frame, keep_sharp
+from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
+from colmap_inertial.imaging.parallax import Parallax
+from colmap_inertial.imaging.path_filters import half_quadratic, path_wiener
+from colmap_inertial.imaging.psf import blur_field, blur_path
+from colmap_inertial.imaging.restoration import deepgyro, load_network, require_network
+from colmap_inertial.imaging.restoration.shipped import checksum
+from colmap_inertial.imaging.wiener import LONGEST_PX, DeblurOptions
+from colmap_inertial.model import colmap_camera
+from colmap_inertial.pipeline.stages.gyro_view import GyroView
+
+#: Standard deviation of the Gaussian, in linear light, by which COLMAP sees a deblurred frame smoothed, as a share of
+#: its blur's length, and at most, px: what a filter leaves of noise and ringing grows with the blur, and moves cameras;
+#: of short blur, it leaves detail that gives more points than smoothing does.
+SMOOTHING, MOST_SMOOTHING_PX = 0.06, 1.2
+#: A frame of which more than this share stays as it was is not smoothed.
+_MOSTLY_KEPT = 0.5
+
+#: Undoes the blur of an image along its path.
+_Remover = Callable[[Any, BlurPath], Any]
+
+
+def smoothing_for(blur_px: float, share: float = SMOOTHING, most_px: float = MOST_SMOOTHING_PX) -> float:
+    """Standard deviation (px) of the Gaussian by which COLMAP sees a frame smoothed that had so much blur."""
+    return min(share * blur_px, most_px)
+
+
+def require_method(method: DeblurMethod | None) -> None:
+    """Say before any work where frames cannot be deblurred as they shall be.
+
+    Raises
+    ------
+    MissingExtraError, FormatError
+        Where a network is asked for, and what it runs in or its file is missing.
+    """
+    if method == "deepgyro":
+        require_network("deepgyro")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DeblurStage:
+    """The frame stage that undoes motion blur where gyroscope and image agree on it, and drops what is beyond help.
+
+    Frames that it does not change pass as they are. Two or more are worked on at once; the order stays, and memory
+    does not grow with their number.
+
+    Attributes
+    ----------
+    view
+        Gyroscope, camera and times.
+    decisions
+        What to do with each frame, by the gyroscope alone (``imaging.gate.decide``).
+    verdict
+        What some of the frames say about the gyroscope together (``imaging.gate.judge_recording``).
+    parallaxes
+        By frame name, where the camera's translation is known to blur.
+    gate
+        Thresholds.
+    drop
+        Whether frames that are too blurred are left out.
+    method
+        How blur is undone: along its path by a Wiener filter, or a half-quadratic one, or by the network DeepGyro.
+    smoothing, most_smoothing_px
+        Standard deviation of the Gaussian by which COLMAP sees deblurred frames smoothed, as a share of the blur's
+        length, and at most.
+    weights
+        Checksum of the network; empty where there is none. It decides the frames as the options do.
+    workers
+        Frames in work at once; as many as the process has processors, up to four, where absent.
+    """
+
+    view: GyroView
+    decisions: tuple[FrameDecision, ...]
+    verdict: RecordingVerdict
+    parallaxes: Mapping[str, Parallax] = field(default_factory=dict)
+    gate: GateOptions = field(default_factory=GateOptions)
+    drop: bool = True
+    method: BlurRemover = "wiener"
+    smoothing: float = SMOOTHING
+    most_smoothing_px: float = MOST_SMOOTHING_PX
+    weights: str = field(default="", init=False)
+    workers: int | None = field(default=None, compare=False)
+
+    def __post_init__(self) -> None:
+        if self.method not in get_args(BlurRemover):
+            raise ValueError(f"method: {', '.join(get_args(BlurRemover))}, not {self.method}")
+        if self.method == "deepgyro":
+            object.__setattr__(self, "weights", checksum("deepgyro"))
+
+    def __call__(self, frames: Iterator[Frame], /) -> Iterator[Frame]:
+        """Deblur the frames, in order."""
+        workers = self.workers or frames_at_once()
+        remove = self._remover(workers)
+        motion, camera, index = self.view.motion(), colmap_camera(self.view.camera), self.view.index()
+        decision_of = {decision.name: decision for decision in self.decisions}
+
+        def treat(frame: Frame) -> Frame:
+            decision = decision_of.get(frame.name)
+            if decision is None or frame.dropped:
+                return frame
+            return self._treated(frame, decision, motion, camera, self.view.shutter(index[frame.name]), remove)
+
+        yield from in_order(treat, frames, workers=workers)
+
+    def _remover(self, workers: int) -> _Remover:
+        """Undoes the blur of one frame; ``workers`` call it at once."""
+        if self.method == "deepgyro":
+            network = load_network("deepgyro", threads=threads_beside(workers))
+            return lambda image, path: deepgyro.deblur(image, path, network=network)
+        restore = half_quadratic if self.method == "path" else path_wiener
+        return lambda image, path: restore(image, path, DeblurOptions(threads=1))
+
+    def _treated(
+        self,
+        frame: Frame,
+        decision: FrameDecision,
+        motion: GyroCamera,
+        camera: Projector,
+        shutter: FrameShutter,
+        remove: _Remover,
+    ) -> Frame:
+        """The frame to go on with, and what was decided about it."""
+
+        def said(reason: str, kept_share: float = 1.0, extent_factor: float = 1.0, action: str = "") -> Frame:
+            values = {"blur_px": decision.blur_px, "kept_share": kept_share, "extent_factor": extent_factor}
+            done = Treatment(stage="deblur", reason=reason, action=action, values=values)
+            return replace(frame, treatments=(*frame.treatments, done))
+
+        if decision.action == "keep":
+            return said(decision.reason)
+        if self.verdict.trusted is False:
+            return said(self.verdict.reason)
+        if decision.action == "drop":
+            return replace(said(decision.reason), dropped=bool(self.drop and self.verdict.trusted))
+        parallax = self.parallaxes.get(frame.name)
+        try:
+            blur = blur_field(motion, camera, shutter, parallax=parallax)
+        except NotObservableError as error:
+            return said(error.hint)
+        if float(np.abs(blur.vector_px).max()) * 1.5 > LONGEST_PX:
+            return said(f"{decision.blur_px:.0f} px of blur are too long to be undone")
+        image: Any = frame.image  # either of two types of pixel, which the checker would keep apart
+        path = blur_path(motion, camera, shutter, parallax=parallax)
+        factor, reason = judge_frame(image, blur, self.verdict, self.gate, path)
+        if factor is None:
+            return said(reason)
+        if factor != 1.0:
+            blur = blur.times(factor)
+            path = blur_path(motion, camera, shutter, parallax=parallax, extent_factor=factor)
+        out, kept = keep_sharp(image, remove(image, path), blur)
+        width_px = smoothing_for(factor * (decision.blur_px or 0.0), self.smoothing, self.most_smoothing_px)
+        smoothing_px = width_px if kept < _MOSTLY_KEPT else 0.0
+        return replace(said(reason, kept, factor, "deblurred"), image=out, smoothing_px=smoothing_px)

@@ -1,0 +1,301 @@
+"""Frames of short and long exposures: each pair becomes the one picture that COLMAP sees."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.core.errors import FormatError, NotObservableError
+from colmap_inertial.core.options import ExposureOptions
+from colmap_inertial.core.threads import frames_at_once, in_order, threads_beside
+from colmap_inertial.core.types import Frame, Projector, Treatment
+from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.imaging.exposure_pairs import (
+    Brightness,
+    ExposurePair,
+    PairGyro,
+    better_alone,
+    brightened,
+    bring_together,
+    fuse_mertens,
+)
+from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
+from colmap_inertial.imaging.restoration import load_network, lsd2, shipped
+from colmap_inertial.io.exposures import LongExposures, LongTiming
+from colmap_inertial.io.images import read_image
+from colmap_inertial.io.names import path_in
+from colmap_inertial.model import colmap_camera
+from colmap_inertial.pipeline.stages.gyro_view import GyroView
+
+Light = NDArray[np.float32]
+#: Makes one picture of a short exposure as bright as the long one, the long one in its geometry, and the long one's
+#: blur: all float32 sRGB 0 to 1, of one shape.
+Fuse = Callable[[Light, Light, BlurField | None], Light]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Fuser:
+    """What makes one picture of two.
+
+    Attributes
+    ----------
+    fuse
+        Does it, in any number of threads at once.
+    identity
+        What decides its result: pairs are fused again where it changes.
+    """
+
+    fuse: Fuse = field(compare=False)
+    identity: str
+
+
+def lsd2_fuser(options: ExposureOptions | None = None) -> Fuser:
+    """The network that comes with the package.
+
+    Raises
+    ------
+    MissingExtraError, FormatError, InertialError
+        As ``restoration.load_network``.
+    """
+    options = options or ExposureOptions()
+    network = load_network("lsd2", device=options.device, threads=threads_beside(frames_at_once()))
+
+    def fuse(short: Light, long: Light, blur: BlurField | None) -> Light:
+        return lsd2.fuse(short, long, blur=blur, network=network)
+
+    return Fuser(fuse=fuse, identity=f"lsd2 {shipped.checksum('lsd2')}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FusedPair:
+    """What was done with one pair.
+
+    Attributes
+    ----------
+    name, long
+        Of the frame, and the file of its long exposure.
+    fused
+        Whether one picture was made of them.
+    used
+        ``both``, or the better one of the two: the short one, brightened, or the long one as it is.
+    reason
+        In words.
+    gain, colours
+        By what the short one's light was multiplied, and what each channel's gain is of it.
+    gain_measured, gain_stated
+        By the pixels, and by exposure times and sensitivities; ``None`` where unknown.
+    by_gyro, by_pixels
+        What the alignment rests on.
+    agreement, agreement_before
+        Correlation of the pictures' detail, and what it was without alignment.
+    shift_px
+        Median length of the shift between them.
+    blur_px
+        90th percentile of the long one's blur that the gyroscope predicts; ``None`` where unknown.
+    covered_share, clipped_share
+        Of the picture: what the long one covers, and where it may have clipped.
+    """
+
+    name: str
+    long: str
+    fused: bool
+    used: Literal["both", "short", "long"]
+    reason: str
+    gain: float | None = None
+    colours: tuple[float, ...] | None = None
+    gain_measured: float | None = None
+    gain_stated: float | None = None
+    by_gyro: bool | None = None
+    by_pixels: bool | None = None
+    agreement: float | None = None
+    agreement_before: float | None = None
+    shift_px: float | None = None
+    blur_px: float | None = None
+    covered_share: float | None = None
+    clipped_share: float | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ExposureStage:
+    """The frame stage that fuses pairs of exposures.
+
+    Takes the short ones, reads the long ones beside them, and yields pictures with the short ones' names, times,
+    geometry and depth, as bright as the long ones. Two or more are worked on at once; the order stays, and memory does
+    not grow with their number.
+
+    Attributes
+    ----------
+    pictures
+        Where the long ones are.
+    folder
+        Of the short ones.
+    fuser
+        What makes one picture of two.
+    fusion
+        Whether the result is blended with the short exposure.
+    view
+        Gyroscope, camera and times of the short ones; ``None`` aligns by the pixels alone.
+    long
+        Times of the long ones; ``None`` where unknown, then, too, the pixels alone align.
+    workers
+        Pairs in work at once; as many as the process has processors, up to four, where absent.
+    """
+
+    pictures: LongExposures
+    folder: Path
+    fuser: Fuser
+    fusion: Literal["none", "mertens"] = "none"
+    view: GyroView | None = None
+    long: LongTiming | None = None
+    workers: int | None = field(default=None, compare=False)
+
+    def __call__(self, frames: Iterator[Frame], /) -> Iterator[Frame]:
+        """Fuse the pairs, in order."""
+        exposures_s = {} if self.long is None else dict(zip(self.long.names, self.long.exposure_s, strict=True))
+        work = partial(self._fused, gyro=self._gyro(), long_exposures_s=exposures_s)
+        for frame, done in in_order(work, frames, workers=self.workers or frames_at_once()):
+            if done is None:
+                yield frame
+                continue
+            said = Treatment(stage="exposures", reason=done.reason, values={"pair": asdict(done)})
+            yield replace(frame, treatments=(*frame.treatments, said))
+
+    def _gyro(self) -> Callable[[str], PairGyro | None]:
+        """The gyroscope's part for each name."""
+        if self.view is None or self.long is None:
+            return lambda name: None
+        view, long = self.view, self.long
+        motion: GyroCamera = view.motion()
+        camera: Projector = colmap_camera(view.camera)
+        index, place = view.index(), {name: i for i, name in enumerate(long.names)}
+
+        def of(name: str) -> PairGyro | None:
+            if name not in index or name not in place:
+                return None
+            short, i = view.shutter(index[name]), place[name]
+            later = replace(short, t_s=float(long.t_s[i]), exposure_s=float(long.exposure_s[i]))
+            return PairGyro(motion=motion, camera=camera, short=short, long=later)
+
+        return of
+
+    def _fused(
+        self, frame: Frame, *, gyro: Callable[[str], PairGyro | None], long_exposures_s: Mapping[str, float]
+    ) -> tuple[Frame, FusedPair | None]:
+        if frame.dropped:
+            return frame, None
+        path = self.pictures.path(frame.name)
+        long = read_image(path)
+        _require_alike(frame, path, long)
+        times = gyro(frame.name)
+        if times is not None:
+            _require_size(path_in(self.folder, frame.name), frame, times.short)
+        stated = self.pictures.stated_gain(
+            path_in(self.folder, frame.name),
+            path,
+            short_exposure_s=frame.exposure_s,
+            long_exposure_s=long_exposures_s.get(frame.name),
+        )
+        done = FusedPair(name=frame.name, long=str(path), fused=False, used="short", reason="")
+        try:
+            pair = bring_together(frame.image, long, gyro=times, stated_gain=stated)
+        except NotObservableError as error:
+            return _alone(frame, long, None, done, error.hint)
+        done = _described(done, pair)
+        if not pair.registered.alike:
+            why = f"{path.name} does not show the same (correlation {done.agreement:.2f})"
+            return _alone(frame, long, pair.brightness, done, why)
+        light = self.fuser.fuse(pair.short, pair.long, pair.blur)
+        if self.fusion == "mertens":
+            dark = brightened(frame.image, replace(pair.brightness, gain=1.0))
+            light = fuse_mertens([dark, light])
+        done = replace(done, fused=True, used="both", reason=_in_words(pair, path))
+        return _with_light(frame, light), done
+
+
+def _alone(
+    frame: Frame, long: NDArray[Any], brightness: Brightness | None, done: FusedPair, why: str
+) -> tuple[Frame, FusedPair]:
+    """The better one of the two, never a dark one."""
+    alone = better_alone(frame.image, long, brightness)
+    what = (
+        "the long exposure as it is"
+        if alone.used == "long"
+        else f"the short exposure, {alone.gain:.3g} times as bright"
+    )
+    said = replace(done, used=alone.used, reason=f"is {what}, and not fused: {why}")
+    if alone.used == "short":
+        said = replace(said, gain=alone.gain)
+    return _with_light(frame, alone.image), said
+
+
+def _with_light(frame: Frame, light: Light) -> Frame:
+    top = np.iinfo(frame.image.dtype).max
+    image: Any = np.rint(top * np.clip(light, 0, 1)).astype(frame.image.dtype)  # either of two types of pixel
+    return replace(frame, image=image)
+
+
+def _require_alike(frame: Frame, path: Path, long: NDArray[Any]) -> None:
+    height, width = frame.image.shape[:2]
+    if long.shape[:2] != (height, width):
+        raise FormatError(
+            path, f"is {long.shape[1]}x{long.shape[0]}, but its short exposure {frame.name} is {width}x{height}"
+        )
+    if long.shape != frame.image.shape:
+        kinds = ["grey" if image.ndim == 2 else "in colour" for image in (long, frame.image)]
+        raise FormatError(path, f"is {kinds[0]}, but its short exposure {frame.name} is {kinds[1]}; write both alike")
+    if long.dtype != frame.image.dtype:
+        raise FormatError(
+            path,
+            f"holds {long.dtype} pixels, its short exposure {frame.name} {frame.image.dtype}; write both with the same "
+            "depth",
+        )
+
+
+def _require_size(path: Path, frame: Frame, shutter: FrameShutter) -> None:
+    height, width = frame.image.shape[:2]
+    if (width, height) != (shutter.width, shutter.height):
+        raise FormatError(
+            path,
+            f"is {width}x{height}, but the camera is {shutter.width}x{shutter.height}; all pictures of a capture must "
+            "have the camera's size",
+        )
+
+
+def _described(done: FusedPair, pair: ExposurePair) -> FusedPair:
+    bright, registered = pair.brightness, pair.registered
+    return replace(
+        done,
+        gain=bright.gain,
+        colours=bright.colours,
+        gain_measured=bright.measured,
+        gain_stated=bright.stated,
+        by_gyro=registered.by_gyro,
+        by_pixels=registered.by_pixels,
+        agreement=registered.agreement,
+        agreement_before=registered.untouched,
+        shift_px=float(np.median(np.hypot(registered.shift_px[..., 0], registered.shift_px[..., 1]))),
+        blur_px=None if pair.blur is None else float(np.percentile(pair.blur.extent_px(), 90)),
+        covered_share=float(pair.covered.mean()),
+        clipped_share=float(pair.clipped.mean()),
+    )
+
+
+def _in_words(pair: ExposurePair, path: Path) -> str:
+    by = [
+        name
+        for name, used in (("the gyroscope", pair.registered.by_gyro), ("the pixels", pair.registered.by_pixels))
+        if used
+    ]
+    aligned = f"aligned by {' and '.join(by)}" if by else "not aligned: no shift makes them agree better"
+    said = f"fused with {path.name}, which has {pair.brightness.gain:.3g} times the light; {aligned}"
+    if pair.gyro_note and pair.gyro_note != "no gyroscope":
+        said += f" ({pair.gyro_note})"
+    if pair.brightness.contradicts:
+        said += f"; exposure times and sensitivities say {pair.brightness.stated:.3g} times, which the pixels do not"
+    return said

@@ -1,0 +1,212 @@
+"""Frames through the frame stages into the folder that COLMAP reads, with a record of what was done to each."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.core.errors import FormatError, InertialError
+from colmap_inertial.core.types import CameraModel, Frame, Treatment
+from colmap_inertial.imaging.path_filters import smoothed
+from colmap_inertial.io.image_metadata import carry_metadata
+from colmap_inertial.io.names import path_in
+from colmap_inertial.io.records import read_record, write_record
+from colmap_inertial.pipeline.run.progress import Progress
+from colmap_inertial.pipeline.stages.protocols import FrameStage
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameRecord:
+    """What happened to one frame.
+
+    Attributes
+    ----------
+    name
+        Image name.
+    action
+        ``"passed"``: the original file or pixels; ``"dropped"``: by a frame stage; ``"changed"``: by a frame stage, or
+        the word that the stage itself has for it, such as ``"deblurred"``.
+    camera
+        Intrinsics that COLMAP starts from; ``None`` where COLMAP guesses.
+    treatments
+        What the stages said.
+    """
+
+    name: str
+    action: str
+    camera: CameraModel | None = None
+    treatments: tuple[Treatment, ...] = ()
+
+    @property
+    def used(self) -> bool:
+        """Whether COLMAP sees it."""
+        return self.action != "dropped"
+
+    @property
+    def reason(self) -> str | None:
+        """Why, in the words of the last stage that said something; ``None`` where none did."""
+        return self.treatments[-1].reason if self.treatments else None
+
+    def value(self, key: str) -> Any:
+        """A figure that a stage gave; ``None`` where none did."""
+        return next((t.values[key] for t in reversed(self.treatments) if key in t.values), None)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameRecords:
+    """What happened to the frames of a capture, in order of time."""
+
+    frames: tuple[FrameRecord, ...]
+
+
+class _Originals:
+    """Remembers the decoded array of each frame in flight, to tell whether a stage has changed it."""
+
+    def __init__(self) -> None:
+        self._arrays: dict[str, NDArray[Any]] = {}
+
+    def tap(self, frames: Iterator[Frame]) -> Iterator[Frame]:
+        for frame in frames:
+            self._arrays[frame.name] = frame.image
+            yield frame
+
+    def pop_through(self, name: str) -> NDArray[Any] | None:
+        """The original of ``name``; forgets it and, as order is kept, every frame before it."""
+        found = None
+        for known in list(self._arrays):
+            array = self._arrays.pop(known)
+            if known == name:
+                found = array
+                break
+        return found
+
+
+def write_frames(
+    frames: Iterator[Frame],
+    names: Sequence[str],
+    stages: Sequence[FrameStage],
+    *,
+    source_folder: Path | None,
+    images: Path,
+    records: Path,
+    progress: Progress,
+    least: int = 3,
+    unsmoothed: Path | None = None,
+) -> None:
+    """Run the frames through the stages and write them.
+
+    Parameters
+    ----------
+    frames
+        Decoded frames in order of time.
+    names
+        Of all these frames, in order.
+    source_folder
+        Where the original files lie, for image folders: a frame that no stage changed is copied, byte for byte.
+    images
+        Written: the folder for COLMAP.
+    unsmoothed
+        Written: the folder for frames as they are, of which COLMAP is to see smoothed ones. Without it, those are
+        nowhere.
+    records
+        Written: a JSON with one :class:`FrameRecord` for each frame of the capture.
+
+    Raises
+    ------
+    InertialError
+        When fewer than ``least`` frames are left: three, where they are to become a model.
+    """
+    originals = _Originals()
+    stream = originals.tap(frames)
+    for stage in stages:
+        stream = iter(stage(stream))
+    seen: dict[str, FrameRecord] = {}
+    images.mkdir(parents=True)
+    if unsmoothed is not None:
+        unsmoothed.mkdir(parents=True)
+    known = set(names)
+    for frame in stream:
+        if frame.name not in known or frame.name in seen:
+            raise ValueError(f"a frame stage yielded {frame.name!r}, which is no frame of the capture or came twice")
+        original = originals.pop_through(frame.name)
+        action = "dropped" if frame.dropped else _write(frame, original, source_folder, images, unsmoothed)
+        seen[frame.name] = FrameRecord(
+            name=frame.name,
+            action=action,
+            camera=None if frame.dropped else frame.camera,
+            treatments=frame.treatments,
+        )
+        progress("frames", len(seen), len(names))
+    require_frames(sum(record.used for record in seen.values()), of=len(names), least=least)
+    every = tuple(seen.get(name) or FrameRecord(name=name, action="dropped") for name in names)
+    write_record(records, FrameRecords(frames=every))
+
+
+def _write(
+    frame: Frame, original: NDArray[Any] | None, source_folder: Path | None, images: Path, unsmoothed: Path | None
+) -> str:
+    """Write the picture of a frame; returns what happened to it."""
+    source = None if source_folder is None else path_in(source_folder, frame.name)
+    target = path_in(images, frame.name)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    passed = original is not None and _same_memory(original, frame.image)
+    if frame.smoothing_px > 0 and unsmoothed is not None:
+        itself = path_in(unsmoothed, frame.name)
+        itself.parent.mkdir(parents=True, exist_ok=True)
+        encode_image(itself, frame.image, source)
+    if frame.smoothing_px > 0:
+        encode_image(target, seen_by_colmap(frame), source)
+    elif passed and source is not None:
+        shutil.copyfile(source, target)
+    else:
+        encode_image(target, frame.image, source)
+    said = [treatment.action for treatment in frame.treatments if treatment.action]
+    return "passed" if passed else (said or ["changed"])[-1]
+
+
+def seen_by_colmap(frame: Frame) -> NDArray[Any]:
+    """The picture of a frame that features are extracted from."""
+    image: Any = frame.image  # either of two types of pixel
+    return smoothed(image, frame.smoothing_px) if frame.smoothing_px > 0 else image
+
+
+def require_frames(count: int, *, of: int, least: int = 3) -> None:
+    """Raise ``InertialError`` where there are too few frames for a model."""
+    if count < least:
+        raise InertialError(f"{count} frames are left of {of}; a model needs at least three")
+
+
+def _same_memory(a: NDArray[Any], b: NDArray[Any]) -> bool:
+    """Whether two arrays show the same bytes of the same buffer (``is`` fails: a Frame holds a read-only view)."""
+    return a.__array_interface__ == b.__array_interface__
+
+
+def encode_image(target: Path, image: NDArray[Any], original: Path | None = None) -> None:
+    """Write an image in the format of its file name, with the metadata of the file that it was made from.
+
+    Raises
+    ------
+    FormatError
+        Where the format cannot hold such pixels.
+    """
+    import cv2
+
+    bgr = image if image.ndim == 2 else cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2BGR)
+    options = [cv2.IMWRITE_JPEG_QUALITY, 98] if target.suffix.lower() in (".jpg", ".jpeg") else []
+    # Through memory: cv2.imwrite reports a full disk as success.
+    ok, data = cv2.imencode(target.suffix, bgr, options)
+    if not ok:
+        raise FormatError(target, f"OpenCV cannot write {image.dtype} images as {target.suffix}")
+    encoded = data.tobytes()
+    target.write_bytes(encoded if original is None else carry_metadata(original.read_bytes(), encoded))
+
+
+def read_frame_records(path: Path) -> tuple[FrameRecord, ...]:
+    """The records that :func:`write_frames` wrote."""
+    return read_record(path, FrameRecords).frames

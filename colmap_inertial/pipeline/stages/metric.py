@@ -1,0 +1,206 @@
+"""The default model stage: scale and gravity from the IMU; and the smoothed trajectory of what it made."""
+
+from __future__ import annotations
+
+import logging
+import os
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from colmap_inertial.core.geometry import quat_rotate, so3_log
+from colmap_inertial.core.gyro import on_camera_rate
+from colmap_inertial.core.options import ScaleOptions, WorldAxes
+from colmap_inertial.core.types import (
+    Array,
+    CameraImuCalibration,
+    CameraMotion,
+    CameraTrajectory,
+    ImuRecording,
+    ScaleEstimate,
+    Similarity,
+    SmoothedTrajectory,
+)
+from colmap_inertial.imaging.gyro_camera import GyroCamera
+from colmap_inertial.inertial.scale import estimate_scale
+from colmap_inertial.io.records import write_record
+from colmap_inertial.io.trajectories import write_tum
+from colmap_inertial.model import Model, doubted, trajectory_from_model
+from colmap_inertial.motion.smooth import smooth_trajectory
+from colmap_inertial.pipeline.stages.rolling_shutter import for_rectified
+
+log = logging.getLogger(__name__)
+
+#: An angular velocity is the mean over this time, and over so many samples of the gyroscope, on each side of the
+#: instant: one reading has all of its noise, and a hand turns otherwise a few hundredths of a second later.
+_RATE_HALF_S, _LEAST_SAMPLES = 7e-3, 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class MetricStage:
+    """Scale, gravity and accelerometer bias from the IMU; a refused scale leaves the model as it is.
+
+    Attributes
+    ----------
+    imu
+        The recording that ran along.
+    calibration
+        What is known of the camera and the IMU beforehand.
+    options
+        Of the scale estimate.
+    world
+        Where gravity points in the metric model.
+    """
+
+    imu: ImuRecording
+    calibration: CameraImuCalibration | None
+    options: ScaleOptions = field(default_factory=ScaleOptions)
+    world: WorldAxes = "z-up"
+
+    def __call__(self, model: Model, /) -> Model:
+        """Estimate and apply the scale."""
+        trajectory, notes = trajectory_from_model(model.reconstruction, model.timing)
+        estimate = estimate_scale(
+            trajectory, self.imu, calibration=of_model(self.calibration, model), options=self.options
+        )
+        estimate = replace(estimate, notes=(*estimate.notes, *self.imu.repairs, *notes))
+        estimate = doubted(estimate, model.doubts)
+        if estimate.verdict == "refused":
+            return model.scaled(estimate, None)
+        similarity = Similarity.from_scale(estimate, world=self.world, provenance=provenance(estimate))
+        return model.scaled(estimate, similarity)
+
+
+def provenance(estimate: ScaleEstimate) -> str:
+    """Where an inertial scale comes from, in words."""
+    return f"inertial scale, method {estimate.method}, {estimate.verdict}"
+
+
+def of_model(calibration: CameraImuCalibration | None, model: Model) -> CameraImuCalibration | None:
+    """What is known of the camera that a model was mapped for: of rectified keypoints, hardly any readout is left."""
+    return for_rectified(calibration) if model.rectified and calibration is not None else calibration
+
+
+def smoothed_path(
+    trajectory: CameraTrajectory,
+    imu: ImuRecording,
+    estimate: ScaleEstimate,
+    gravity_in_world_m_s2: Array,
+    *,
+    also_at_s: Array | None = None,
+) -> SmoothedTrajectory:
+    """Smooth a metric path with what the scale estimate says of the IMU; gravity in the path's world.
+
+    ``also_at_s``: instants without a pose, as in :func:`~colmap_inertial.motion.smooth.smooth_trajectory`.
+    """
+    if estimate.calibration is None:
+        raise ValueError("a refused scale says nothing of the IMU")
+    return smooth_trajectory(
+        trajectory,
+        imu,
+        estimate.calibration,
+        gravity_in_world_m_s2=gravity_in_world_m_s2,
+        accel_bias_m_s2=estimate.accel_bias_m_s2,
+        also_at_s=also_at_s,
+    )
+
+
+def metric_trajectory(trajectory: CameraTrajectory) -> CameraTrajectory:
+    """The trajectory of a model that is in metres, said to be so."""
+    return replace(trajectory, length_unit="m")
+
+
+def gravity_in_model(model: Model) -> Array | None:
+    """(3,) gravity in the world of a model as it came out of the model stages; ``None`` where unknown."""
+    gravity = None if model.scale is None else model.scale.gravity_in_world_m_s2
+    if gravity is None or model.similarity is None:
+        return gravity
+    return quat_rotate(model.similarity.rotation_xyzw, gravity)
+
+
+def write_trajectory(path: Path, model: Model, trajectory: CameraTrajectory, imu: ImuRecording) -> None:
+    """Write the metric camera path of a model as TUM text, its covariance and motion beside it.
+
+    It is smoothed by the IMU; where a stage solved for the motion already, it is what that stage found.
+
+    Parameters
+    ----------
+    path
+        ``trajectory*.tum``; the covariance goes to ``trajectory*_cov.npz`` with ``t_s`` (T,) and ``cov`` (T, 9, 9) of
+        position, velocity and acceleration; of a refined model (K, 6, 6) of position against the first one's and of
+        velocity, at 400 of them at most; none of a joined one that was not refined. Velocities by frame go to
+        :func:`motion_file`.
+    model
+        A model that a stage made metric.
+    trajectory
+        Its poses, in metres.
+    imu
+        The recording that ran along.
+    """
+    estimate, gravity = model.scale, gravity_in_model(model)
+    if estimate is None or model.similarity is None or estimate.calibration is None or gravity is None:
+        raise ValueError("only a metric model has a metric trajectory")
+    target = path.with_name(f"{path.stem}_cov.npz")
+    if model.motion is not None:
+        # the IMU made these poses already: smoothed by it once more, they would be worse, and seem far surer
+        solved = model.motion.of(trajectory.names, trajectory.cam_in_world)
+        write_tum(path, trajectory)
+        told = [i for i, name in enumerate(trajectory.names) if name in solved.cov]
+        covs = np.array([solved.cov[trajectory.names[i]] for i in told]).reshape(-1, 6, 6)
+        _write_covariance(target, trajectory.t_s[told] + trajectory.epoch_ns * 1e-9, covs)
+        unknown = np.full(3, np.nan)
+        velocity = np.array([solved.velocity_in_world.get(name, unknown) for name in trajectory.names])
+    else:
+        smoothed = smoothed_path(trajectory, imu, estimate, gravity)
+        write_tum(path, smoothed)
+        velocity = smoothed.velocity_in_world
+        if model.parts:
+            # smoothing knows nothing of how surely each part was placed
+            log.info("%s: no covariance of a joined path is written; result.json has that of each part", path.name)
+            target.unlink(missing_ok=True)
+        else:
+            _write_covariance(target, smoothed.t_s + smoothed.epoch_ns * 1e-9, smoothed.cov)
+    write_record(motion_file(path), _motion(model, trajectory, velocity, imu, estimate.calibration))
+
+
+def _write_covariance(target: Path, t_s: Array, cov: Array) -> None:
+    partial = target.with_name(f"{target.stem}.partial.npz")
+    np.savez_compressed(partial, t_s=t_s, cov=cov)
+    os.replace(partial, target)
+
+
+def motion_file(trajectory: Path) -> Path:
+    """Where the motion during each frame (``types.CameraMotion``) lies beside a path."""
+    return trajectory.with_name(f"{trajectory.stem}_motion.json")
+
+
+def _motion(
+    model: Model,
+    trajectory: CameraTrajectory,
+    velocity_in_world: Array,
+    imu: ImuRecording,
+    calibration: CameraImuCalibration,
+) -> CameraMotion:
+    """Velocities of a model's frames, but those during which the gyroscope was silent, and those that are nan."""
+    timing, solved = model.timing, model.motion
+    gyro = on_camera_rate(imu, calibration, camera_epoch_ns=timing.epoch_ns)
+    camera = GyroCamera.of(gyro, calibration, camera_epoch_ns=timing.epoch_ns)
+    place = {name: i for i, name in enumerate(timing.names)}
+    index = np.array([place[name] for name in trajectory.names])
+    exposure_s = None if timing.exposure_s is None else timing.exposure_s[index]
+    half_s = max(_RATE_HALF_S, _LEAST_SAMPLES * float(np.median(np.diff(gyro.gyro_t_s))))
+    begin_s, end_s = trajectory.t_s - half_s, trajectory.t_s + half_s
+    seen = camera.covers(begin_s, end_s) & np.isfinite(velocity_in_world).all(axis=1)
+    before, after = (camera.start_from_cam(t_s[seen]) for t_s in (begin_s, end_s))
+    rate = so3_log(np.swapaxes(before, 1, 2) @ after) / (2 * half_s)
+    return CameraMotion(
+        names=tuple(name for name, kept in zip(trajectory.names, seen, strict=True) if kept),
+        t_s=trajectory.t_s[seen],
+        velocity_in_world_m_s=velocity_in_world[seen],
+        angular_velocity_in_cam_rad_s=rate,
+        exposure_s=None if exposure_s is None else exposure_s[seen],
+        readout_s=timing.readout_s if solved is None or solved.readout_s is None else solved.readout_s,
+        readout_direction=timing.readout_direction,
+        epoch_ns=trajectory.epoch_ns,
+    )

@@ -1,0 +1,107 @@
+"""The model stage that finishes what rectified keypoints begin: translation within the readout of a rolling shutter."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import asdict, dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.options import ScaleOptions
+from colmap_inertial.core.types import Array, CameraImuCalibration, ImuRecording, Treatment
+from colmap_inertial.imaging.gyro_camera import FrameShutter
+from colmap_inertial.inertial.scale import estimate_scale
+from colmap_inertial.model import Model, trajectory_from_model
+from colmap_inertial.model.readout import settle_readout
+from colmap_inertial.pipeline.stages.metric import of_model, smoothed_path
+
+if TYPE_CHECKING:
+    import pycolmap
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadoutStage:
+    """Moves observations to where they would be without the camera's translation within the readout.
+
+    The gyroscope undoes the camera's turning before mapping. Its translation shows in things that are near, and takes
+    a model to tell: depths are the model's, velocities those of the path smoothed with the accelerometer. The model
+    is changed only where this brings it closer to its observations, and left alone where the scale is refused or the
+    keypoints were not rectified.
+
+    Attributes
+    ----------
+    imu
+        The recording that ran along.
+    calibration
+        What is known of the camera and the IMU beforehand.
+    options
+        Of the scale estimate.
+    refine_intrinsics
+        Whether the cameras may change.
+    num_threads
+        Of bundle adjustment; all where negative.
+    """
+
+    imu: ImuRecording
+    calibration: CameraImuCalibration | None
+    options: ScaleOptions = field(default_factory=ScaleOptions)
+    refine_intrinsics: bool
+    num_threads: int = -1
+
+    def __call__(self, model: Model, /) -> Model:
+        """Adjust the model."""
+        if not model.rectified:
+            return model
+        reconstruction = model.reconstruction
+        trajectory, _ = trajectory_from_model(reconstruction, model.timing)
+        calibration = of_model(self.calibration, model)
+        estimate = estimate_scale(trajectory, self.imu, calibration=calibration, options=self.options)
+        if estimate.metres_per_unit is None or estimate.gravity_in_world_m_s2 is None:
+            return model
+        metric = replace(
+            trajectory,
+            cam_in_world=trajectory.cam_in_world * estimate.metres_per_unit,
+            length_unit="m",
+            pose_cov=None,
+        )
+        try:
+            path = smoothed_path(metric, self.imu, estimate, estimate.gravity_in_world_m_s2)
+        except NotObservableError as error:
+            log.info("model %d: readout left as it is: %s", model.colmap_index, error)
+            return model
+        velocity = dict(zip(trajectory.names, path.velocity_in_world / estimate.metres_per_unit, strict=True))
+        place = {name: i for i, name in enumerate(model.timing.names)}
+        shutters = {}
+        for name in velocity:
+            image = reconstruction.find_image_with_name(name)
+            camera = reconstruction.camera(image.camera_id)
+            shutters[name] = FrameShutter.of(model.timing, place[name], width=camera.width, height=camera.height)
+        settled, what = settle_readout(
+            reconstruction,
+            shutters,
+            velocity,
+            refine_intrinsics=self.refine_intrinsics,
+            num_threads=self.num_threads,
+        )
+        said = (
+            f"translation within the readout moves points by {what.shift_px:.2f} px; reprojection error "
+            f"{what.before_px:.3f} -> {what.after_px:.3f} px{'' if what.accepted else ': left as it is'}"
+        )
+        log.info("model %d: %s", model.colmap_index, said)
+        done = Treatment(stage="readout", reason=said, action="adjusted" if what.accepted else "", values=asdict(what))
+        return replace(
+            model,
+            reconstruction=settled if what.accepted else reconstruction,
+            treatments=(*model.treatments, done),
+            observed_px=_keypoints_of(reconstruction) if what.accepted else {},
+        )
+
+
+def _keypoints_of(reconstruction: pycolmap.Reconstruction) -> dict[str, Array]:
+    """By image name, (N, 2) where a model has its keypoints."""
+    images = (reconstruction.image(i) for i in reconstruction.reg_image_ids())
+    return {image.name: np.array([point.xy for point in image.points2D]).reshape(-1, 2) for image in images}

@@ -1,0 +1,302 @@
+"""The model stage that fits pictures, rolling shutter and IMU together: a metric model's shape, without its drift."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Hashable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.geometry import quat_from_matrix
+from colmap_inertial.core.options import ScaleOptions
+from colmap_inertial.core.threads import one_blas_thread
+from colmap_inertial.core.types import CAL, Array, CameraImuCalibration, ImuRecording, SolvedMotion, Treatment
+from colmap_inertial.inertial.refine.judge import Judged, refine, size_of
+from colmap_inertial.inertial.refine.setup import (
+    Known,
+    Seen,
+    at_middle_lines,
+    keypoints_of,
+    make_problem,
+    read_seen,
+    written_back,
+)
+from colmap_inertial.inertial.refine.values import FIRST_INTRINSIC, LEVER, OFFSET, READOUT, ROTATION, Estimate, Problem
+from colmap_inertial.inertial.scale import strength_of_gravity
+from colmap_inertial.io.calibration import calibration_prior
+from colmap_inertial.model import Model, has_rigs
+from colmap_inertial.pipeline.stages.metric import gravity_in_model
+from colmap_inertial.pipeline.stages.rolling_shutter import RollingShutterStage
+
+if TYPE_CHECKING:
+    import pycolmap
+
+log = logging.getLogger(__name__)
+
+#: What is written of a refined model, as a number: raised with its layout, so that a run goes on from no older one.
+#: 2: ``trajectory*_cov.npz`` has positions and velocities, not positions alone.
+_WRITES = 2
+_FEWEST_IMAGES, _FEWEST_POINTS = 10, 50
+#: One camera comes back to settings that it had before in fewer of its images than this.
+_MOST_RETURNS = 0.1
+#: Where each image has a camera of its own: between focal lengths of two devices, no other lies within this share.
+_FOCAL_GAP = 0.1
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RefineStage:
+    """Refines a metric model by all of its observations, each at its own line's instant, and the IMU between frames.
+
+    Comes after the scale. The overall size and the direction of gravity stay what the scale estimate made them; the
+    shape changes: paths bend less, and their scale drifts less. The model stays as it is where the refined one
+    predicts observations that were held out no better, or where the IMU contradicts the pictures.
+
+    Attributes
+    ----------
+    imu
+        The recording that ran along.
+    calibration
+        What is known of the camera and the IMU beforehand.
+    options
+        Of the scale estimate: strength of gravity.
+    refine_intrinsics
+        Whether the cameras may change.
+    shutter
+        What rectified the keypoints, where something did.
+    """
+
+    imu: ImuRecording
+    calibration: CameraImuCalibration | None
+    options: ScaleOptions = field(default_factory=ScaleOptions)
+    refine_intrinsics: bool
+    shutter: RollingShutterStage | None = None
+    _writes: int = field(default=_WRITES, init=False, repr=False)
+
+    def __call__(self, model: Model, /) -> Model:
+        """Refine the model."""
+        begin_s = time.perf_counter()
+        why_not = self._why_not(model)
+        if why_not:
+            return _said(model, f"left as it is: {why_not}")
+        try:
+            with one_blas_thread():
+                refined = self._refined(model)
+        except (NotObservableError, np.linalg.LinAlgError) as error:
+            hint = error.hint if isinstance(error, NotObservableError) else "camera and IMU do not determine its shape"
+            return _said(model, f"left as it is: {hint}")
+        log.info("model %d: refined in %.1f s", model.colmap_index, time.perf_counter() - begin_s)
+        return refined
+
+    def _why_not(self, model: Model) -> str:
+        """Why a model cannot be refined; empty where it can."""
+        estimate, reconstruction = model.scale, model.reconstruction
+        if model.similarity is None or estimate is None or estimate.calibration is None:
+            return "it has no scale"
+        if estimate.noise is None or estimate.accel_bias_m_s2 is None or gravity_in_model(model) is None:
+            return "its scale says nothing of the IMU's noise; the joint method does"
+        if reconstruction.num_reg_images() < _FEWEST_IMAGES:
+            return f"it has fewer than {_FEWEST_IMAGES} images"
+        if reconstruction.num_points3D() < _FEWEST_POINTS:
+            return f"it has fewer than {_FEWEST_POINTS} points"
+        if has_rigs(reconstruction) or _alternate(model):
+            return "several cameras took its images, and each has its own place beside the IMU"
+        if model.timing.readout_s and not model.rectified:
+            return "its images still have the rolling shutter, and would not agree with the refined poses"
+        if estimate.parts is not None and estimate.parts.get("accel_faults"):
+            return "the accelerometer has faults, which its scale undid and the refinement would not"
+        if model.rectified and self.shutter is None:
+            return "its keypoints were moved by a stage that cannot say from where"
+        return ""
+
+    def _refined(self, model: Model) -> Model:
+        seen = read_seen(model.reconstruction, model.timing)
+        problem, start = make_problem(seen, model.timing, self.imu, self._known(model), self._exposed_px(model, seen))
+        declared = model.timing.readout_s is not None
+        judged = refine(problem, start, seen.observations.xy_px, seen.t_s, readout_declared=declared)
+        figures = {
+            name: getattr(judged, name)
+            for name in ("accepted", "held_out", "before_px", "after_px", "change", "change_sigma", "chi2", "sigma_px")
+        }
+        figures["accel_noise_m_s2_rthz"] = judged.accel_noise_m_s2_rthz
+        if judged.readout is not None:
+            figures |= dict(zip(("readout_s", "readout_sigma_s"), judged.readout, strict=True))
+        heard = (
+            f"{judged.held_out} observations that were held out: {judged.before_px:.4f} -> {judged.after_px:.4f} px; "
+            f"the IMU costs {judged.chi2:.2f} of what its noise explains"
+        )
+        if not judged.accepted:
+            return _said(model, f"left as it is: {judged.reason} ({heard})", **figures)
+        x = judged.estimate
+        after = at_middle_lines(problem, x).cam_in_world
+        about, scale = after.mean(axis=0), size_of(seen.cam_in_world) / size_of(after)
+        figures |= {"size_before": scale, "drift": [asdict(part) for part in judged.drift]}
+        figures |= _calibration_figures(judged)
+        reconstruction = written_back(model.reconstruction, seen, problem, x, about=about, scale=scale)
+        assert model.scale is not None and model.scale.calibration is not None
+        calibration = _refined_calibration(model.scale.calibration, problem, judged)
+        refined = replace(model.scale, calibration=calibration, accel_bias_m_s2=x.accel_bias_m_s2.mean(axis=0))
+        readout_s = x.readout_s if model.timing.readout_s else None
+        motion = _motion(reconstruction, seen, judged, scale, readout_s=readout_s)
+        done = replace(model, reconstruction=reconstruction, scale=refined, observed_px={}, motion=motion)
+        return _said(done, f"refined by the IMU ({heard})", action="refined", **figures)
+
+    def _exposed_px(self, model: Model, seen: Seen) -> Array:
+        """(M, 2) observations in the pictures as they were exposed."""
+        if not model.rectified or self.shutter is None:
+            return seen.observations.xy_px
+        keypoints = {}
+        for image_id, name in zip(seen.image_ids, seen.names, strict=True):
+            points = model.reconstruction.image(image_id).points2D
+            mapped = model.observed_px.get(name)
+            xy_px = np.array([p.xy for p in points]).reshape(-1, 2) if mapped is None else mapped
+            keypoints[name] = self.shutter.as_exposed(name, xy_px)
+        return keypoints_of(seen, keypoints)
+
+    def _known(self, model: Model) -> Known:
+        estimate, gravity = model.scale, gravity_in_model(model)
+        assert estimate is not None and estimate.calibration is not None and estimate.noise is not None
+        assert estimate.accel_bias_m_s2 is not None and gravity is not None
+        strength, sigma = strength_of_gravity(self.options)
+        return Known(
+            calibration=estimate.calibration,
+            prior=calibration_prior() if self.calibration is None else self.calibration,
+            noise=estimate.noise,
+            accel_bias_m_s2=estimate.accel_bias_m_s2,
+            down=gravity / np.linalg.norm(gravity),
+            gravity_m_s2=strength,
+            gravity_sigma_m_s2=sigma,
+            refine_intrinsics=self.refine_intrinsics,
+        )
+
+
+def _alternate(model: Model) -> bool:
+    """Whether cameras take turns: two devices, or a rig that nobody declared; not one that zoomed, and back."""
+    t_of = dict(zip(model.timing.names, model.timing.pose_t_s().tolist(), strict=True))
+    images = [model.reconstruction.image(image_id) for image_id in model.reconstruction.reg_image_ids()]
+    timed = sorted((image for image in images if image.name in t_of), key=lambda image: t_of[image.name])
+    used = _devices(model.reconstruction, timed)
+    met = set(used[:1])
+    returns = 0
+    for before, device in pairwise(used):
+        returns += device != before and device in met
+        met.add(device)
+    return returns > _MOST_RETURNS * len(used)
+
+
+def _devices(reconstruction: pycolmap.Reconstruction, images: Sequence[pycolmap.Image]) -> list[Hashable]:
+    """What took each image: its camera; where nearly each has one of its own, those alike by folder, size and focus."""
+    cameras = [reconstruction.camera(image.camera_id) for image in images]
+    if len({camera.camera_id for camera in cameras}) <= max(1, len(images) // 2):
+        return [camera.camera_id for camera in cameras]
+    focal = np.log([max(camera.mean_focal_length(), 1e-9) for camera in cameras])
+    order = np.argsort(focal, kind="stable")
+    group = np.empty(len(focal), dtype=np.int64)
+    group[order] = np.cumsum(np.diff(focal[order], prepend=focal[order[:1]]) > np.log1p(_FOCAL_GAP))
+    return [
+        (image.name.rpartition("/")[0], camera.width, camera.height, number)
+        for image, camera, number in zip(images, cameras, group.tolist(), strict=True)
+    ]
+
+
+def _said(model: Model, reason: str, *, action: str = "", **values: object) -> Model:
+    """The model with what was decided; a note beside its scale says it on the terminal and in the report."""
+    log.info("model %d: %s", model.colmap_index, reason)
+    done = Treatment(stage="refine", reason=reason, action=action, values=values)
+    scale = model.scale
+    if scale is not None and model.similarity is not None:
+        scale = replace(scale, notes=(*scale.notes, f"the model was {reason}"))
+    return replace(model, treatments=(*model.treatments, done), scale=scale)
+
+
+def _motion(
+    written: pycolmap.Reconstruction, seen: Seen, judged: Judged, scale: float, *, readout_s: float | None
+) -> SolvedMotion:
+    """The camera's motion in the model that is written, which is stretched."""
+    velocity = scale * judged.velocity_m_s
+    images = (written.image(image_id) for image_id in seen.image_ids)
+    return SolvedMotion(
+        cam_in_world={image.name: image.projection_center() for image in images},
+        velocity_in_world={seen.names[i]: velocity[i] for i in np.flatnonzero(np.isfinite(velocity).all(axis=1))},
+        cov={seen.names[i]: scale**2 * cov for i, cov in judged.motion_covs.items()},
+        readout_s=readout_s,
+    )
+
+
+def _calibration_figures(judged: Judged) -> dict[str, object]:
+    """What was estimated of the device, with standard deviations."""
+    x, cov = judged.estimate, judged.shared_cov
+    assert cov is not None
+    sigma = np.sqrt(np.diagonal(cov))
+    return {
+        "readout_s": x.readout_s,
+        "readout_sigma_s": float(sigma[READOUT]),
+        "imu_in_cam_m": x.imu_in_cam_m.tolist(),
+        "imu_in_cam_sigma_m": sigma[LEVER].tolist(),
+        "rotation_sigma_deg": np.degrees(sigma[ROTATION]).tolist(),
+        "gyro_axes_sigma_deg": _axes_sigma_deg(x, cov, x.columns.gyro_gain),
+        "accel_axes_sigma_deg": _axes_sigma_deg(x, cov, x.columns.accel_gain),
+        "intrinsics": x.intrinsics.tolist(),
+        "intrinsics_sigma": sigma[FIRST_INTRINSIC : x.columns.seen.stop].tolist(),
+        "gyro_gain": x.gyro_gain.tolist(),
+        "gyro_gain_sigma": sigma[x.columns.gyro_gain].reshape(3, 3).tolist(),
+        "accel_gain": x.accel_gain.tolist(),
+        "accel_gain_sigma": sigma[x.columns.accel_gain].reshape(3, 3).tolist(),
+    }
+
+
+def axes_by(x: Estimate, gain: slice) -> Array:
+    """(3, Q) derivatives of how a sensor's own axes lie in the camera, by what is shared; its errors are at ``gain``.
+
+    They lie as the rotation nearest to ``cam_from_imu`` times one plus the errors. Errors of axes that both sensors
+    share are a rotation of the IMU, and nothing in a recording tells them apart: ``cam_from_imu`` is as uncertain as
+    the priors of these errors are. In a sensor's own axes they cancel.
+    """
+    by = np.zeros((3, x.columns.count))
+    by[:, ROTATION] = np.eye(3)
+    # of a matrix near one, the nearest rotation is that of its antisymmetric part
+    turn = np.zeros((3, 3, 3))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        turn[i, k, j], turn[i, j, k] = 0.5, -0.5
+    by[:, gain] = x.cam_from_imu @ turn.reshape(3, 9)
+    return by
+
+
+def _axes_sigma_deg(estimate: Estimate, cov: Array, gain: slice) -> list[float]:
+    by = axes_by(estimate, gain)
+    return [float(sigma) for sigma in np.degrees(np.sqrt(np.einsum("ij,jk,ik->i", by, cov, by)))]
+
+
+def _refined_calibration(before: CameraImuCalibration, problem: Problem, judged: Judged) -> CameraImuCalibration:
+    """The calibration with what the refinement says of it, and its covariance."""
+    x, shared, inertial = judged.estimate, judged.shared_cov, problem.inertial
+    assert shared is not None and inertial is not None
+    at = x.columns
+    jacobian = np.zeros((CAL.COUNT, at.count))
+    jacobian[CAL.ROTATION, ROTATION] = np.eye(3)
+    jacobian[CAL.TIME_OFFSETS, OFFSET] = 1.0
+    jacobian[CAL.ACCEL_TIME_OFFSET, at.accel_delay] = 1.0
+    jacobian[CAL.LEVER_ARM, LEVER] = np.eye(3)
+    cov = jacobian @ shared @ jacobian.T
+    for part in (CAL.GYRO_BIAS, slice(CAL.READOUT, CAL.READOUT + 1)):
+        cov[part, part] = before.cov[part, part]
+    later_s = before.clock_rate * (inertial.middle_s - before.clock_middle_s) + x.offset_s
+    return replace(
+        before,
+        cam_from_imu_xyzw=quat_from_matrix(x.cam_from_imu),
+        gyro_time_offset_s=before.gyro_time_offset_s + later_s,
+        accel_time_offset_s=before.accel_time_offset_s + later_s + x.accel_delay_s,
+        gyro_bias_rad_s=_mean_bias(x),
+        imu_in_cam_m=x.imu_in_cam_m,
+        cov=0.5 * (cov + cov.T),
+        clock_rate=before.clock_rate + x.clock_rate,
+        clock_middle_s=inertial.middle_s,
+    )
+
+
+def _mean_bias(x: Estimate) -> Array:
+    return np.asarray(x.gyro_bias_rad_s.mean(axis=0))

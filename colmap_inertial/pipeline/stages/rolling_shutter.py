@@ -1,0 +1,107 @@
+"""The default keypoint stage: keypoints without the rolling shutter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from colmap_inertial.core.types import (
+    CAL,
+    Array,
+    CameraImuCalibration,
+    CameraModel,
+    Keypoints,
+    Projector,
+    Treatment,
+)
+from colmap_inertial.imaging.gyro_camera import GyroCamera
+from colmap_inertial.imaging.rolling_shutter import rays, rectify_image, rectify_keypoints, seen_by_lines
+from colmap_inertial.io.calibration import SMALLEST_READOUT_S
+from colmap_inertial.model import colmap_camera
+from colmap_inertial.pipeline.stages.gyro_view import GyroView
+
+#: Share of the readout that acts on poses after rectification.
+_LEFT_SHARE = 0.1
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RollingShutterStage:
+    """The keypoint stage that moves keypoints to where a global shutter would have seen them.
+
+    The instant is the one that poses hold, mid-exposure of the middle row. Keypoints of frames that the gyroscope does
+    not cover stay in place.
+
+    Attributes
+    ----------
+    view
+        Gyroscope, camera and times.
+    """
+
+    view: GyroView
+    _ready: dict[str, tuple[GyroCamera, Projector, dict[str, int]]] = field(
+        default_factory=dict, init=False, compare=False, repr=False
+    )
+
+    def __call__(self, keypoints: Keypoints, /) -> Keypoints:
+        """Move the keypoints of one image."""
+        name = keypoints.name
+        if not self.covers(name):
+            said = Treatment(stage="rolling_shutter", reason="the gyroscope does not cover the whole readout")
+            return replace(keypoints, treatments=(*keypoints.treatments, said))
+        said = Treatment(stage="rolling_shutter", reason="undone by the gyroscope", action="rectified")
+        return replace(
+            keypoints,
+            xy_px=self.moved(name, keypoints.xy_px),
+            rectified=True,
+            treatments=(*keypoints.treatments, said),
+        )
+
+    def moved(self, name: str, xy_px: Array) -> Array:
+        """(N, 2) where a global shutter would have seen points of an image that the gyroscope covers."""
+        motion, camera, index = self._parts()
+        return np.asarray(rectify_keypoints(xy_px, motion, camera, self.view.shutter(index[name])), dtype=np.float64)
+
+    def as_exposed(self, name: str, xy_px: Array) -> Array:
+        """The inverse of :meth:`moved`: where the shutter had points (N, 2); as they are where it did not move them."""
+        motion, camera, index = self._parts()
+        if name not in index or not self.covers(name):
+            return xy_px
+        shutter = self.view.shutter(index[name])
+        reference = motion.start_from_cam(np.array(shutter.reference_s()))
+        found = seen_by_lines(rays(camera, xy_px) @ reference.T, xy_px, motion, camera, shutter)
+        return np.where(np.isfinite(found), found, xy_px)
+
+    def move_image(self, name: str, image: Any, /) -> Any:
+        """The pixels of one image as a global shutter would have taken them."""
+        if not self.covers(name):
+            return image
+        motion, camera, index = self._parts()
+        return rectify_image(image, motion, camera, self.view.shutter(index[name]))[0]
+
+    def covers(self, name: str) -> bool:
+        """Whether the gyroscope recorded the whole readout of a frame."""
+        motion, _, index = self._parts()
+        return self.view.shutter(index[name]).covered_by(motion, reference=True)
+
+    def refined(self, calibration: CameraImuCalibration, readout_s: float, camera: CameraModel) -> RollingShutterStage:
+        """The stage with another calibration, readout and camera."""
+        timing = replace(self.view.timing, readout_s=readout_s)
+        return RollingShutterStage(view=replace(self.view, calibration=calibration, timing=timing, camera=camera))
+
+    def _parts(self) -> tuple[GyroCamera, Projector, dict[str, int]]:
+        if "parts" not in self._ready:
+            self._ready["parts"] = self.view.motion(), colmap_camera(self.view.camera), self.view.index()
+        return self._ready["parts"]
+
+
+def for_rectified(calibration: CameraImuCalibration) -> CameraImuCalibration:
+    """The calibration of a camera whose keypoints were rectified: hardly any readout is left.
+
+    Its standard deviation stands for what the camera's translation does within the readout, which stays.
+    """
+    cov = calibration.cov.copy()
+    cov[CAL.READOUT, :] = cov[:, CAL.READOUT] = 0.0
+    cov[CAL.READOUT, CAL.READOUT] = max(SMALLEST_READOUT_S, _LEFT_SHARE * calibration.readout_s) ** 2
+    return replace(calibration, readout_s=0.0, cov=cov)

@@ -1,0 +1,171 @@
+"""Parts of the most blurred frames before and after deblurring, side by side, with the blur that was undone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.core.errors import OutputError
+from colmap_inertial.core.types import Frame
+from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.imaging.psf import blur_field
+from colmap_inertial.io.capture import Capture
+from colmap_inertial.io.files import write_json
+from colmap_inertial.io.images import read_image
+from colmap_inertial.io.names import path_in
+from colmap_inertial.model import colmap_camera
+from colmap_inertial.pipeline.stages.frame_folder import encode_image
+from colmap_inertial.reconstruction.precalibrate.calibrate import some_frames
+from colmap_inertial.reconstruction.precalibrate.plan import ImagingPlan
+
+_FRAMES, _WIDTH, _HEIGHT, _GAP, _LABEL = 8, 420, 280, 6, 22
+#: Frames that are looked at for the report, and how many of them it shows.
+_CANDIDATES, _SHOWN = 16, 4
+#: Top, left, height and width.
+Part = tuple[int, int, int, int]
+#: Distance of the arrows, px of the crop.
+_ARROWS_PX = 70
+
+
+def write_contact_sheet(path: Path, capture: Capture, plan: ImagingPlan, images: Path, names: Sequence[str]) -> None:
+    """Write a PNG: one row for each of the first frames named; before on the left, after on the right with the
+    method that undid the blur.
+
+    Parameters
+    ----------
+    path
+        Of the PNG.
+    capture
+        The recording.
+    plan
+        By which it was deblurred.
+    images
+        Folder of the deblurred images.
+    names
+        Of deblurred frames, the most blurred first.
+    """
+    import cv2
+
+    view = plan.view
+    if view is None:
+        raise ValueError("nothing was deblurred without a view")
+    index = view.index()
+    motion, camera = view.motion(), colmap_camera(view.camera)
+    rows: dict[str, NDArray[np.uint8]] = {}
+    for frame in some_frames(capture, view.timing, [index[name] for name in names[:_FRAMES]]):
+        parallax = plan.parallaxes.get(frame.name)
+        field = blur_field(motion, camera, view.shutter(index[frame.name]), parallax=parallax)
+        before, after = _eight_bit(frame.image), _eight_bit(read_image(path_in(images, frame.name)))
+        top, left, height, width = _busiest(before)
+        cut = [picture[top : top + height, left : left + width].copy() for picture in (before, after)]
+        _draw(cut[0], field, top, left)
+        length = float(np.percentile(field.extent_px(), 90))
+        gap = np.full((height, _GAP, 3), 255, np.uint8)
+        label = np.full((_LABEL, 2 * width + _GAP, 3), 255, np.uint8)
+        text = f"{frame.name}   {length:.1f} px   before | {plan.method}"
+        cv2.putText(label, text, (4, _LABEL - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
+        rows[frame.name] = np.concatenate([label, np.concatenate([cut[0], gap, cut[1]], axis=1)])
+    sheet = np.concatenate([rows[name] for name in names[:_FRAMES]])
+    data = cv2.imencode(".png", cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))[1]
+    try:
+        path.write_bytes(data.tobytes())
+    except OSError as error:
+        raise OutputError(f"{path} cannot be written: {error.strerror or error}") from error
+
+
+@dataclass(eq=False)
+class CropKeeper:
+    """Keeps parts of some frames as they pass before and after the frame stages, a few however many there are.
+
+    Attributes
+    ----------
+    blur_px
+        By name, the blur of the frames to look at.
+    """
+
+    blur_px: Mapping[str, float]
+    _seen: dict[str, tuple[Part, NDArray[np.uint8]]] = field(default_factory=dict, init=False)
+    _pairs: dict[str, tuple[NDArray[np.uint8], NDArray[np.uint8]]] = field(default_factory=dict, init=False)
+
+    @classmethod
+    def of(cls, plan: ImagingPlan) -> CropKeeper:
+        """For a plan: frames that are to be deblurred, evenly from the most to the least blurred."""
+        blurred = () if plan.deblur is None else plan.deblur[0]
+        by_blur = sorted((d for d in blurred if d.action == "deblur"), key=lambda d: (-(d.blur_px or 0.0), d.name))
+        some = by_blur[:: -(-len(by_blur) // _CANDIDATES) or 1]
+        return cls(blur_px={decision.name: decision.blur_px or 0.0 for decision in some})
+
+    def before(self, frames: Iterator[Frame], /) -> Iterator[Frame]:
+        """The first stage."""
+        for frame in frames:
+            if frame.name in self.blur_px:
+                picture = _eight_bit(frame.image)
+                part = _busiest(picture)
+                self._seen[frame.name] = part, _cut(picture, part)
+            yield frame
+
+    def after(self, frames: Iterator[Frame], /) -> Iterator[Frame]:
+        """The last stage."""
+        for frame in frames:
+            seen = self._seen.pop(frame.name, None)
+            if seen is not None:
+                part, before = seen
+                after = _cut(_eight_bit(frame.image), part)
+                if before.shape == after.shape and not np.array_equal(before, after):
+                    self._pairs[frame.name] = before, after
+            yield frame
+
+    def write(self, folder: Path) -> None:
+        """Write the most blurred of the frames that were changed: JPEGs, and ``crops.json`` with their names."""
+        folder.mkdir(parents=True)
+        listed = []
+        for number, name in enumerate(sorted(self._pairs, key=lambda name: -self.blur_px[name])[:_SHOWN]):
+            entry: dict[str, object] = {"name": name, "blur_px": self.blur_px[name]}
+            for side, picture in zip(("before", "after"), self._pairs[name], strict=True):
+                entry[side] = f"{number}_{side}.jpg"
+                encode_image(folder / f"{number}_{side}.jpg", picture)
+            listed.append(entry)
+        write_json(folder / "crops.json", {"crops": listed})
+
+
+def _cut(picture: NDArray[np.uint8], part: Part) -> NDArray[np.uint8]:
+    top, left, height, width = part
+    return picture[top : top + height, left : left + width].copy()
+
+
+def _eight_bit(image: NDArray[Any]) -> NDArray[np.uint8]:
+    """(H, W, 3) with 8 bit."""
+    codes = np.asarray(image if image.dtype == np.uint8 else image >> 8, dtype=np.uint8)
+    return np.repeat(codes[..., None], 3, axis=2) if codes.ndim == 2 else codes
+
+
+def _busiest(image: NDArray[np.uint8]) -> Part:
+    """Top, left, height and width of the part with the most texture."""
+    import cv2
+
+    height, width = min(_HEIGHT, image.shape[0]), min(_WIDTH, image.shape[1])
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    texture = np.abs(cv2.Laplacian(cv2.GaussianBlur(grey, (0, 0), 2), cv2.CV_32F))
+    sums = cv2.integral(np.minimum(texture, np.percentile(texture, 99)))
+    inside = sums[height:, width:] - sums[:-height, width:] - sums[height:, :-width] + sums[:-height, :-width]
+    top, left = np.unravel_index(int(np.argmax(inside)), inside.shape)
+    return int(top), int(left), height, width
+
+
+def _draw(crop: NDArray[np.uint8], field: BlurField, top: int, left: int) -> None:
+    """The segments along which pixels were smeared."""
+    import cv2
+
+    height, width = crop.shape[:2]
+    for y in range(_ARROWS_PX // 2, height, _ARROWS_PX):
+        for x in range(_ARROWS_PX // 2, width, _ARROWS_PX):
+            row, column = (round((at + offset) / field.step_px) for at, offset in ((y, top), (x, left)))
+            row, column = min(row, field.vector_px.shape[0] - 1), min(column, field.vector_px.shape[1] - 1)
+            dx, dy = 0.5 * field.vector_px[row, column]
+            ends = [(round(float(x + sign * dx)), round(float(y + sign * dy))) for sign in (-1, 1)]
+            cv2.line(crop, ends[0], ends[1], (255, 60, 0), 2, cv2.LINE_AA)

@@ -1,0 +1,215 @@
+"""What ``diagnose`` looks at, read from captures, sources of ``scale`` and IMU files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from colmap_inertial.checks.diagnose import Diagnosis, FramesInVideo, Recorded, diagnose, unreadable
+from colmap_inertial.core.errors import FormatError, InertialError, TimingError
+from colmap_inertial.core.types import CameraTrajectory, FrameTiming
+from colmap_inertial.io.calibration import largest_offset_s
+from colmap_inertial.io.capture import Capture, ImageFolder, load_capture
+from colmap_inertial.io.files import write_json
+from colmap_inertial.io.frames import read_frame_times, read_frame_timing
+from colmap_inertial.io.imu import RawImu, is_capture, read_raw_capture_imu, read_raw_imu
+from colmap_inertial.io.imu_calibration import CalibrationFiles, read_for_another
+from colmap_inertial.io.imu_text import is_inertial_scale
+from colmap_inertial.io.pose_convention import ARRAYS, COLMAP, INERTIAL_SCALE, TUM, PoseConvention
+from colmap_inertial.io.recorders import find_recording
+from colmap_inertial.io.trajectories import read_inertial_scale_poses, read_tum
+from colmap_inertial.io.video import decode_grey, video_stamps_ns
+from colmap_inertial.io.video_match import match_to_video
+from colmap_inertial.model import read_model, trajectory_from_model
+from colmap_inertial.pipeline.run.progress import Progress
+from colmap_inertial.reconstruction.drivers.sources import ScaleSource, check_output, only_model
+from colmap_inertial.reconstruction.precalibrate.plan import with_stated_exposures
+from colmap_inertial.reconstruction.precalibrate.preflight import _followed, compared
+
+T = TypeVar("T")
+
+
+_MANY, _MANY_SPACING_S = 400, 0.03
+
+
+#: Pictures that are looked for in the video they were cut from.
+_CUT = 60
+
+
+def diagnose_source(
+    source: ScaleSource, *, json: Path | None = None, progress: Progress = lambda *_: None
+) -> Diagnosis:
+    """Diagnose whatever there is.
+
+    Parameters
+    ----------
+    source
+        A capture, a source of ``scale``, or an IMU recording alone.
+    json
+        Where to write the findings.
+    progress
+        Called with ``"motion"`` and ``"video"``.
+
+    Raises
+    ------
+    FormatError, TimingError
+        Where nothing can be read at all.
+    """
+    if json is not None:
+        check_output(json, [source.source, source.imu, source.frame_times])
+    found = diagnose(collect(source, progress))
+    if json is not None:
+        write_json(json, found.as_json())
+    return found
+
+
+def collect(source: ScaleSource, progress: Progress) -> Recorded:
+    """Read what there is of a source; what cannot be read is kept with its reason, and the rest is read all the same.
+
+    Raises
+    ------
+    FormatError, TimingError
+        Where that leaves nothing.
+    """
+    path = source.source
+    if not path.exists():
+        raise FormatError(path, "no such file or folder")
+    inertial_scale = path.is_dir() and is_inertial_scale(path)
+    if source.imu is None and not inertial_scale:
+        if _describes_frames(path):
+            return _of_capture(load_capture(path), source.calibration, progress)
+        return _recorded(_Reading(), imu=lambda: read_raw_imu(path))
+    reading = _Reading()
+    timing: FrameTiming | None = None
+    trajectory: CameraTrajectory | None = None
+    read_as = TUM
+    times = source.frame_times
+    if (
+        times is None
+        and source.imu is not None
+        and is_capture(source.imu)
+        and load_capture(source.imu).frames is not None
+    ):
+        times = source.imu
+    if times is not None:
+        timing = reading.attempt(lambda: read_frame_times(times))
+    if inertial_scale:
+        trajectory = reading.attempt(lambda: read_inertial_scale_poses(path))
+        read_as = INERTIAL_SCALE
+    elif path.is_dir():
+        read_as = COLMAP
+        only_model(path)
+        if times is None:
+            raise FormatError(path, "a COLMAP model has no frame times: give --frame-times, a CSV with name,t_s")
+        if timing is not None:
+            known = timing
+            model = only_model(path)
+            trajectory = reading.attempt(lambda: trajectory_from_model(read_model(model), known)[0])
+    else:
+        trajectory = reading.attempt(lambda: read_tum(path))
+    captures = [load_capture(p) for p in (source.imu, source.frame_times, path) if p is not None and is_capture(p)]
+    shared = any(capture.shared_clock for capture in captures)
+    calibration = captures[0].calibration if captures else None
+    calibration = read_for_another(source.calibration, shared_clock=shared).camera_imu or calibration
+    return _recorded(
+        reading,
+        imu=lambda: read_raw_imu(path if source.imu is None else source.imu),
+        timing=timing,
+        trajectory=trajectory,
+        read_as=read_as,
+        calibration=calibration,
+        max_offset_s=largest_offset_s(shared),
+    )
+
+
+def _describes_frames(path: Path) -> bool:
+    """Whether a path is a capture rather than an inertial recording alone."""
+    if is_capture(path) or find_recording(path) is not None:
+        return True
+    return any((base / "cam0" / "data.csv").is_file() for base in (path, path / "mav0"))
+
+
+class _Reading:
+    """Reads what can be read, and remembers what could not."""
+
+    def __init__(self) -> None:
+        self.refused: list[InertialError] = []
+
+    def attempt(self, read: Callable[[], T]) -> T | None:
+        try:
+            return read()
+        except (FormatError, TimingError) as error:
+            self.refused.append(error)
+            return None
+
+
+def _recorded(
+    reading: _Reading, *, imu: Callable[[], RawImu] | None, read_as: PoseConvention = ARRAYS, **known: Any
+) -> Recorded:
+    raw = None if imu is None else reading.attempt(imu)
+    if raw is None and all(value is None for value in known.values()):
+        error = reading.refused[0]
+        # a file of no known kind is bad input; one that is known and damaged is a finding
+        if unreadable(error).code in ("unreadable", "untimed"):
+            raise error
+    return Recorded(
+        refused=tuple(reading.refused),
+        imu=None if raw is None else raw.imu,
+        gyro_axes=None if raw is None else raw.gyro_axes,
+        accel_axes=None if raw is None else raw.accel_axes,
+        read_as=read_as,
+        **known,
+    )
+
+
+def _of_capture(capture: Capture, calibration: CalibrationFiles, progress: Progress) -> Recorded:
+    reading = _Reading()
+    timing = rotation = in_video = None
+    if capture.frames is not None:
+        timing = reading.attempt(lambda: with_stated_exposures(capture, read_frame_timing(capture)))
+    if timing is not None:
+        known = timing
+        rotation = reading.attempt(
+            lambda: _followed(capture, known, _MANY, _MANY_SPACING_S, progress) or compared(capture, known, progress)
+        )
+        in_video = reading.attempt(lambda: _find_in_video(capture, known, progress))
+    # the readings stay the sensor's own: that is what the checks are about
+    prior = read_for_another(calibration, shared_clock=capture.shared_clock).camera_imu or capture.calibration
+    return _recorded(
+        reading,
+        imu=None if capture.imu is None else lambda: read_raw_capture_imu(capture),
+        timing=timing,
+        log=capture.frame_log,
+        is_capture=True,
+        rotation=rotation,
+        camera=capture.camera,
+        calibration=prior,
+        max_offset_s=largest_offset_s(capture.shared_clock),
+        in_video=in_video,
+    )
+
+
+def _find_in_video(capture: Capture, timing: FrameTiming, progress: Progress) -> FramesInVideo | None:
+    """Some of a capture's pictures in the video that they were cut from."""
+    if not isinstance(capture.frames, ImageFolder) or capture.frames.video is None:
+        return None
+    video = capture.frames.video
+    stamps_ns = video_stamps_ns(video)
+    index = np.unique(np.linspace(0, len(timing.names) - 1, _CUT).astype(np.intp))
+    names = [timing.names[i] for i in index]
+    match = match_to_video(
+        video, capture.frames.folder, names, progress=lambda seen: progress("video", seen, len(stamps_ns))
+    )
+    stated_ns = {timing.names[i]: timing.epoch_ns + round(float(timing.t_s[i]) * 1e9) for i in index}
+    found = [name for name in names if name in match.t_ns]
+    return FramesInVideo(
+        stated_ns=np.array([stated_ns[name] for name in found], dtype=np.int64),
+        found_ns=np.array([match.t_ns[name] for name in found], dtype=np.int64),
+        video_start_ns=int(stamps_ns[0]),
+        quarter_turns=match.quarter_turns,
+        container_turn_deg=next(decode_grey(video))[1],
+        doubtful=len(match.doubtful),
+    )

@@ -1,0 +1,164 @@
+"""The frames of a capture on their way to COLMAP: what is to be done, done, and written down."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from colmap_inertial.core.options import ApertureOptions, ReconstructOptions
+from colmap_inertial.core.types import CameraModel, Frame
+from colmap_inertial.imaging.restoration.shipped import checksum
+from colmap_inertial.io.capture import Capture
+from colmap_inertial.io.frames import frame_source
+from colmap_inertial.model import read_model
+from colmap_inertial.pipeline.run.context import Recording
+from colmap_inertial.pipeline.run.runner import remove
+from colmap_inertial.pipeline.run.session import Session
+from colmap_inertial.pipeline.run.workspace import Workspace
+from colmap_inertial.pipeline.stages.apertures import ApertureStage
+from colmap_inertial.pipeline.stages.frame_folder import FrameRecord, read_frame_records, write_frames
+from colmap_inertial.pipeline.stages.protocols import FrameStage, KeypointStage
+from colmap_inertial.pipeline.stages.rectified import image_movers, write_images
+from colmap_inertial.pipeline.stages.rolling_shutter import RollingShutterStage
+from colmap_inertial.reconstruction.drivers.contact_sheet import CropKeeper
+from colmap_inertial.reconstruction.drivers.result import ModelResult
+from colmap_inertial.reconstruction.precalibrate.plan import (
+    ImagingPlan,
+    Treatments,
+    plan_imaging,
+    read_plan,
+    write_plan,
+)
+
+log = logging.getLogger(__name__)
+
+
+def ask_for_plan(
+    options: ReconstructOptions, frame_stages: Sequence[object], keypoint_stages: Sequence[object], *, pairs: bool
+) -> Treatments:
+    """What the options ask for, as far as the default stages are to do it."""
+    return Treatments(
+        deblur=options.deblur,
+        rolling_shutter=options.rolling_shutter,
+        pairs=pairs,
+        frames_by_others=... not in frame_stages,
+        keypoints_by_others=... not in keypoint_stages,
+    )
+
+
+def run_plan(session: Session, recording: Recording, asked: Treatments) -> ImagingPlan:
+    """What to do to frames and keypoints; where nothing is asked for, nothing is looked at."""
+
+    def work(partial: Sequence[Path]) -> None:
+        write_plan(partial[0], plan_imaging(recording, session.context, asked))
+
+    depends = {
+        **recording.identity(),
+        **session.context.identity(),
+        "asked": asked,
+        "weights": checksum("deepgyro") if asked.deblur == "deepgyro" else "",
+    }
+    imaging = session.workspace.imaging
+    session.runner.run("imaging", depends, [imaging], work)
+    plan = read_plan(imaging, recording.imu, recording.timing)
+    log.info("deblurring: %s", plan.deblur_note)
+    log.info("rolling shutter: %s", plan.rolling_shutter_note)
+    return plan
+
+
+def run_frames(
+    session: Session,
+    recording: Recording,
+    frames: Iterator[Frame],
+    stages: Sequence[FrameStage],
+    images: Path,
+    plan: ImagingPlan | None = None,
+) -> tuple[FrameRecord, ...]:
+    """The frames through the stages into the folder ``images``; with a plan, parts of some are kept for the report."""
+    source, workspace = frame_source(recording.capture), session.workspace
+    kept = None if plan is None else CropKeeper.of(plan)
+
+    def work(partial: Sequence[Path]) -> None:
+        written, records, unsmoothed = partial[:3]
+        through = stages if kept is None else (kept.before, *stages, kept.after)
+        names = recording.timing.names
+        write_frames(
+            frames,
+            names,
+            through,
+            source_folder=source,
+            images=written,
+            records=records,
+            progress=session.progress,
+            unsmoothed=unsmoothed,
+        )
+        if kept is not None:
+            kept.write(partial[3])
+
+    depends = {
+        "capture": replace(recording.capture, target=None),
+        "timing": recording.timing,
+        "inputs": recording.inputs(),
+        "stages": stages,
+        "kept": {} if kept is None else kept.blur_px,
+        "images": images.relative_to(workspace.root),
+    }
+    crops = [] if kept is None else [workspace.crops]
+    session.runner.run("frames", depends, [images, workspace.frames, workspace.unsmoothed, *crops], work)
+    return read_frame_records(workspace.frames)
+
+
+def fusing(capture: Capture, workspace: Workspace, options: ApertureOptions) -> list[ApertureStage]:
+    """The stage that makes frames of a multi-aperture camera's sub-images; none for other cameras."""
+    if capture.apertures is None:
+        return []
+    keep = workspace.apertures if options.depth else None
+    if keep is None:
+        remove(workspace.apertures)
+    return [ApertureStage(pictures=capture.apertures, options=options, keep=keep)]
+
+
+def as_refined(stages: Sequence[KeypointStage], models: Sequence[ModelResult]) -> list[KeypointStage]:
+    """The stages with clocks, readout and camera as the largest model that was refined has them."""
+    for model in models:
+        said = next((one for one in model.treatments if one.stage == "refine" and one.action), None)
+        if said is None or model.sparse_metric is None or model.scale.calibration is None:
+            continue
+        readout_s = said.values["readout_s"]
+        assert isinstance(readout_s, float)
+        cameras = read_model(model.sparse_metric).cameras
+        camera = cameras[min(cameras)]
+        intrinsics = CameraModel(
+            model=camera.model.name, width=camera.width, height=camera.height, params=tuple(camera.params)
+        )
+        return [
+            stage.refined(model.scale.calibration, readout_s, intrinsics)
+            if isinstance(stage, RollingShutterStage)
+            else stage
+            for stage in stages
+        ]
+    return list(stages)
+
+
+def run_images(
+    session: Session,
+    records: Sequence[FrameRecord],
+    rectified: Collection[str],
+    stages: Sequence[KeypointStage],
+) -> Path:
+    """Images that agree with the keypoints, for whoever goes on from the model; returns their folder."""
+    workspace = session.workspace
+    movers = image_movers(stages)
+    if rectified and not movers:
+        log.warning("keypoints of %d images are rectified by a stage that moves no pixels", len(rectified))
+    moved = frozenset(rectified) if movers else frozenset()
+    names = [record.name for record in records if record.used]
+
+    def work(partial: Sequence[Path]) -> None:
+        write_images(movers, names, moved, workspace.colmap_images, partial[0], session.progress, workspace.unsmoothed)
+
+    depends = {"stages": stages if moved else (), "rectified": sorted(moved)}
+    session.runner.run("images", depends, [workspace.images], work, after=["frames"])
+    return workspace.images

@@ -1,0 +1,399 @@
+"""COLMAP's models through the model stages, to their final places; measured and made dense where that is asked for."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
+
+from colmap_inertial.checks.validate import Target, Validation, validate_model, write_overlays
+from colmap_inertial.colmap.dense import run_dense
+from colmap_inertial.core.errors import FormatError, NotObservableError, TargetNotFoundError, TimingError
+from colmap_inertial.core.options import DenseOptions
+from colmap_inertial.core.types import Gap, JoinedPart, ScaleEstimate
+from colmap_inertial.io.records import read_record, write_record
+from colmap_inertial.model import (
+    Model,
+    doubted,
+    find_models,
+    model_format,
+    num_registered,
+    read_model,
+    summarize,
+    trajectory_from_model,
+    transformed,
+    write_model,
+)
+from colmap_inertial.model.similarities import undoing
+from colmap_inertial.pipeline.run.context import Recording
+from colmap_inertial.pipeline.run.runner import fingerprint, remove
+from colmap_inertial.pipeline.run.session import Session
+from colmap_inertial.pipeline.stages.metric import gravity_in_model, metric_trajectory, motion_file, write_trajectory
+from colmap_inertial.pipeline.stages.protocols import JoiningStage, ModelStage
+from colmap_inertial.reconstruction.drivers.reporting import write_model_record
+from colmap_inertial.reconstruction.drivers.result import Fragment, ModelResult, ScaledModel
+from colmap_inertial.reconstruction.drivers.standing import settle_dense
+
+if TYPE_CHECKING:
+    import pycolmap
+
+log = logging.getLogger(__name__)
+
+#: COLMAP's models of fewer images, or of a smaller share of those of its largest one, are fragments.
+_FEWEST_IMAGES, _LEAST_SHARE = 5, 0.01
+
+
+#: A model that went through the first stages, ``None`` where it was refused before, and what is known of it.
+_Begun: TypeAlias = "tuple[ScaledModel, Model | None]"
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Made:
+    """What the model stages made of all models; the folders of parts of joined ones are ``beside`` theirs."""
+
+    models: tuple[ScaledModel, ...]
+    fragments: tuple[Fragment, ...]
+    gaps: tuple[Gap, ...] = ()
+    beside: tuple[Path, ...] = ()
+
+
+def run_models(
+    session: Session,
+    recording: Recording,
+    stages: Sequence[ModelStage],
+    *,
+    rectified: bool = False,
+    found: Mapping[int, Path] | None = None,
+    fragments: bool = False,
+    numbered: bool = False,
+    after: Sequence[str] = ("mapping",),
+    read: Callable[[Path], pycolmap.Reconstruction] = read_model,
+) -> tuple[tuple[ModelResult, ...], tuple[Fragment, ...], tuple[Gap, ...]]:
+    """Every sub-model through the model stages, then to its final place: the largest first, fragments left out.
+
+    One with fewer than two timed images is refused, and the others go on. A stage that joins models takes all of them
+    at once; any other one after the other. Beside models and fragments come the gaps between models that it found.
+
+    Parameters
+    ----------
+    session, recording, stages
+        Of the run.
+    rectified
+        Whether the models were mapped from keypoints without the rolling shutter.
+    found
+        The sub-models by COLMAP's number, where they are not those of ``colmap/sparse/``.
+    fragments
+        Treat fragments as models.
+    numbered
+        Keep COLMAP's numbers, as an existing project's other parts go by them.
+    after
+        The step that made the sub-models, where one did.
+    read
+        Reads a sub-model.
+
+    Raises
+    ------
+    TimingError
+        Where no sub-model has two timed images.
+    """
+    workspace = session.workspace
+    found = find_models(workspace.colmap_sparse) if found is None else found
+    record = workspace.stamps / "models.json"
+
+    def work(partial: Sequence[Path]) -> None:
+        for path in (workspace.sparse, *workspace.trajectories()):
+            remove(path)
+        for path in workspace.report_data.glob("model_*.json"):
+            remove(path)
+        kept, left_out = _without_fragments(found, keep=fragments)
+        read_in = (
+            Model(
+                reconstruction=read(found[number]),
+                colmap_index=number,
+                timing=recording.timing,
+                rectified=rectified,
+                doubts=recording.doubts,
+            )
+            for number in kept
+        )
+        place_of = {number: number if numbered else place for place, number in enumerate(kept)}
+        made, gaps = _through_stages(session, recording, stages, read_in, place_of, found, numbered=numbered)
+        small = [replace(one, sparse=_within(workspace.root, one.sparse)) for one in left_out]
+        beside = tuple(
+            _within(workspace.root, workspace.sparse / str(part.colmap_index))
+            for one in made
+            if numbered
+            for part in _others(one)
+        )
+        write_record(partial[0], _Made(models=tuple(made), fragments=tuple(small), gaps=gaps, beside=beside))
+
+    depends = {
+        "recording": {name: getattr(recording, name) for name in ("imu", "timing", "doubts")},
+        "stages": stages,
+        "rectified": rectified,
+        "fragments": fragments,
+        "numbered": numbered,
+        "found": [fingerprint(folder) for folder in found.values()] if not after else [],
+    }
+    _forget_where_gone(record, workspace.root)
+    session.runner.run("metric", depends, [record], work, after=after)
+    said = read_record(record, _Made)
+    models = tuple(
+        ModelResult(**{f.name: getattr(one, f.name) for f in fields(one)}).within(workspace.root) for one in said.models
+    )
+    settle_dense(workspace, {one.index: one.sparse_metric for one in models if one.sparse_metric is not None})
+    return models, tuple(replace(one, sparse=workspace.root / one.sparse) for one in said.fragments), said.gaps
+
+
+def _forget_where_gone(record: Path, root: Path) -> None:
+    """A record of models of which something is no longer there counts for nothing."""
+    if not record.is_file():
+        return
+    try:
+        said = read_record(record, _Made)
+    except FormatError:
+        said = _Made(models=(), fragments=())
+    models, paths = said.models, list(said.beside)
+    paths += [path for one in models for path in (one.sparse_metric, one.trajectory) if path is not None]
+    paths += [motion_file(one.trajectory) for one in models if one.trajectory is not None]
+    if not models or not all((root / path).exists() for path in paths):
+        remove(record)
+
+
+def _without_fragments(found: Mapping[int, Path], *, keep: bool) -> tuple[list[int], list[Fragment]]:
+    """COLMAP's numbers of the models to go on with, the largest first; and what is too small."""
+    sizes = {number: num_registered(folder) for number, folder in found.items()}
+    order = sorted(found, key=lambda number: (-sizes[number], number))
+    least = 0.0 if keep else max(_FEWEST_IMAGES, _LEAST_SHARE * sizes[order[0]])
+    kept = [number for number in order if number == order[0] or sizes[number] >= least]
+    left_out = [Fragment(colmap_index=n, registered_images=sizes[n], sparse=found[n]) for n in order if n not in kept]
+    for fragment in left_out:
+        log.info("COLMAP's model %d is a fragment of %d images", fragment.colmap_index, fragment.registered_images)
+    return kept, left_out
+
+
+def _through_stages(
+    session: Session,
+    recording: Recording,
+    stages: Sequence[ModelStage],
+    models: Iterator[Model],
+    place_of: Mapping[int, int],
+    found: Mapping[int, Path],
+    *,
+    numbered: bool,
+) -> tuple[list[ScaledModel], tuple[Gap, ...]]:
+    """What the stages make of COLMAP's models; without one that joins them, one is in memory at a time.
+
+    Raises
+    ------
+    TimingError
+        Where no model has two timed images.
+    """
+    several = len(place_of) > 1
+    at = next((i for i, stage in enumerate(stages) if several and isinstance(stage, JoiningStage)), len(stages))
+    untimed: list[TimingError] = []
+
+    def begun() -> Iterator[_Begun]:
+        for done, model in enumerate(models):
+            session.progress("metric", done, len(place_of))
+            # COLMAP's own counts, whatever the stages make of the model
+            one = ScaledModel(
+                index=place_of[model.colmap_index],
+                colmap_index=model.colmap_index,
+                scale=_refused("not looked at"),
+                summary=summarize(model.reconstruction),
+                sparse=_within(session.workspace.root, found[model.colmap_index]),
+            )
+            reason = _too_few_timed(model)
+            if reason is None:
+                yield one, _after(stages[:at], model)
+            else:
+                untimed.append(reason)
+                yield replace(one, scale=_refused(str(reason))), None
+
+    going: Iterable[_Begun] = begun()
+    gaps: tuple[Gap, ...] = ()
+    staged: dict[int, Model] = {}
+    if at < len(stages):
+        joining = stages[at]
+        assert isinstance(joining, JoiningStage)
+        going = list(going)
+        if numbered:
+            staged = {model.colmap_index: model for _, model in going if model is not None}
+        going, gaps = _joined(joining, going, numbered=numbered)
+    made: list[ScaledModel] = []
+    for one, model in going:
+        if model is None:
+            log.info("model %d: refused %s", one.index, "; ".join(one.scale.reasons))
+            made.append(one)
+            continue
+        made.append(_placed(session, recording, one, _after(stages[at + 1 :], model)))
+        if numbered:
+            _write_parts(session, model, staged, found)
+    if len(untimed) == len(place_of):
+        raise untimed[0]
+    session.progress("metric", len(place_of), len(place_of))
+    return made, gaps
+
+
+def _joined(joining: JoiningStage, begun: Sequence[_Begun], *, numbered: bool) -> tuple[list[_Begun], tuple[Gap, ...]]:
+    """What a stage makes of all models at once, the largest first; what was joined into one leaves its numbers free."""
+    of_number = {one.colmap_index: one for one, _ in begun}
+    models, gaps = joining.join_models([model for _, model in begun if model is not None])
+    left: list[_Begun] = [(one, None) for one, model in begun if model is None]
+    for model in models:
+        one = of_number[model.colmap_index]
+        left.append((replace(one, summary=summarize(model.reconstruction)) if model.parts else one, model))
+    left.sort(key=lambda each: (-each[0].summary["registered_images"], each[0].colmap_index))
+    return [(one if numbered else replace(one, index=i), model) for i, (one, model) in enumerate(left)], gaps
+
+
+def _write_parts(session: Session, model: Model, staged: Mapping[int, Model], found: Mapping[int, Path]) -> None:
+    """The other parts of a joined model by themselves, in its world: what a project made from them goes by them.
+
+    As the stages before the joining left them.
+    """
+    for part in _others(model):
+        before = staged[part.colmap_index]
+        own = before.reconstruction
+        if before.similarity is not None:
+            own = transformed(own, undoing(before.similarity))
+        target = session.workspace.sparse / str(part.colmap_index)
+        moved = transformed(own, part.similarity)
+        write_model(moved, target, part.similarity, suffix=model_format(found[part.colmap_index]))
+
+
+def _others(model: Model | ScaledModel) -> list[JoinedPart]:
+    """The parts of a joined model but the first, whose number it has."""
+    return [part for part in model.parts if part.colmap_index != model.colmap_index]
+
+
+def _after(stages: Sequence[ModelStage], model: Model) -> Model:
+    """What stages make of a model, one after the other."""
+    for stage in stages:
+        model = stage(model)
+    return model
+
+
+def _placed(session: Session, recording: Recording, one: ScaledModel, model: Model) -> ScaledModel:
+    """A model that went through the stages, written to where it stays, with its path."""
+    workspace = session.workspace
+    if model.scale is None:
+        raise ValueError("the model stages must include one that estimates the scale, such as ... or MetricStage")
+    scale, similarity = doubted(model.scale, recording.doubts), model.similarity
+    if similarity is not None and scale.verdict == "refused":
+        raise ValueError("the model stages made a model metric whose scale they refused")
+    if similarity is not None and scale.verdict != model.scale.verdict:
+        similarity = replace(similarity, provenance=f"{similarity.provenance}; {scale.verdict}: {scale.reasons[0]}")
+    model = replace(model, scale=scale, similarity=similarity)
+    one = replace(one, scale=scale, treatments=model.treatments, parts=model.parts)
+    # the smoother weighs by them; of a model whose motion a stage solved for, nothing is smoothed
+    poses, _ = trajectory_from_model(model.reconstruction, model.timing, covariances=model.motion is None)
+    if model.similarity is not None:
+        target = workspace.sparse / str(one.index)
+        suffix = model_format(workspace.root / one.sparse) or ".bin"
+        write_model(model.reconstruction, target, model.similarity, suffix=suffix)
+        poses = metric_trajectory(poses)
+        one = replace(one, sparse_metric=_within(workspace.root, target))
+        if scale.calibration is not None and gravity_in_model(model) is not None:
+            trajectory = workspace.trajectory(one.index, first=not any(workspace.root.glob("trajectory*.tum")))
+            write_trajectory(trajectory, model, poses, recording.imu)
+            one = replace(one, trajectory=_within(workspace.root, trajectory))
+    write_model_record(workspace, one.index, model, poses, recording.imu)
+    log.info("model %d: %s %s", one.index, scale.verdict, "; ".join(scale.reasons))
+    return one
+
+
+def _within(root: Path, path: Path) -> Path:
+    """A path as it counts from ``root``; one elsewhere as it counts from anywhere."""
+    return path.relative_to(root) if path.is_relative_to(root) else path.resolve()
+
+
+def _too_few_timed(model: Model) -> TimingError | None:
+    names, reconstruction = set(model.timing.names), model.reconstruction
+    if sum(reconstruction.image(i).name in names for i in reconstruction.reg_image_ids()) >= 2:
+        return None
+    try:
+        trajectory_from_model(reconstruction, model.timing)
+    except TimingError as error:
+        return error
+    return None
+
+
+def _refused(reason: str) -> ScaleEstimate:
+    return ScaleEstimate(
+        metres_per_unit=None, sigma_log=None, ci95=None, verdict="refused", method="none", reasons=(reason,)
+    )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Checked:
+    """What came of measuring the target in a model; an error in its parts."""
+
+    found: Validation | None = None
+    unobservable: str | None = None
+    error: str = ""
+
+    def outcome(self) -> Validation | TargetNotFoundError | NotObservableError:
+        if self.found is not None:
+            return self.found
+        if self.unobservable is not None:
+            return NotObservableError(self.unobservable, self.error)
+        return TargetNotFoundError(self.error)
+
+
+def run_validation(
+    session: Session, models: Sequence[ModelResult], target: Target | None, images: Path | None
+) -> tuple[ModelResult, ...]:
+    """Measure the target in the metric models; one that cannot be measured does not undo its model."""
+    if target is None or images is None:
+        remove(session.workspace.validation)
+        return tuple(models)
+    checked = []
+    for stale in session.workspace.validation.glob("[0-9]*"):
+        if stale.name not in {str(model.index) for model in models}:
+            remove(stale)
+    for model in models:
+        pictures = session.workspace.validation / str(model.index)
+        if model.sparse_metric is None:
+            remove(pictures)
+            checked.append(model)
+            continue
+        metric = model.sparse_metric
+
+        def work(partial: Sequence[Path], metric: Path = metric, pictures: Path = pictures) -> None:
+            remove(pictures)
+            try:
+                found = validate_model(
+                    metric, images, target, progress=lambda done, total: session.progress("validation", done, total)
+                )
+            except TargetNotFoundError as error:
+                write_record(partial[0], _Checked(error=str(error)))
+            except NotObservableError as error:
+                write_record(partial[0], _Checked(unobservable=error.quantity, error=error.hint))
+            else:
+                write_overlays(found, images, pictures)
+                write_record(partial[0], _Checked(found=found))
+
+        record = session.workspace.stamps / f"validated_{model.index}.json"
+        if record.is_file() and not pictures.is_dir() and read_record(record, _Checked).found is not None:
+            remove(record)  # the pictures went while there was no such model or target
+        after = ["metric", *session.runner.of("frames", "images")]
+        depends = {"target": target.spec, "images": [] if len(after) > 1 else fingerprint(images)}
+        session.runner.run(f"validation_{model.index}", depends, [record], work, after=after)
+        check = read_record(record, _Checked).outcome()
+        said = f"scale error {check.scale_error_pct:+.3f} %" if isinstance(check, Validation) else str(check)
+        log.info("model %d: %s against %s", model.index, said, target.spec)
+        checked.append(replace(model, validation=check))
+    return tuple(checked)
+
+
+def run_dense_models(
+    session: Session, models: Sequence[ModelResult], images: Path, options: DenseOptions
+) -> tuple[ModelResult, ...]:
+    """The models with their dense reconstructions, where they are metric."""
+    metric = [model.index for model in models if model.sparse_metric is not None]
+    dense = run_dense(session, metric, images, options)
+    return tuple(replace(model, dense=dense.get(model.index)) for model in models)

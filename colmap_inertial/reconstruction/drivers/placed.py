@@ -1,0 +1,170 @@
+"""An existing project in metres, in the output folder itself, beside the result and the report."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from colmap_inertial.core.errors import OutputError, OutputExistsError
+from colmap_inertial.core.options import ProjectOptions
+from colmap_inertial.io.files import read_json, write_json
+from colmap_inertial.io.names import check_names, path_in
+from colmap_inertial.io.records import read_record, write_record
+from colmap_inertial.model import TRANSFORM_FILE, model_files, model_format, model_formats, read_model, write_files
+from colmap_inertial.model.project import apply_to_project
+from colmap_inertial.model.similarities import ModelScale
+from colmap_inertial.pipeline.run.runner import fingerprint, remove
+from colmap_inertial.pipeline.run.session import Session
+from colmap_inertial.pipeline.run.workspace import Workspace
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Placed:
+    """Paths in the output folder that came from the project."""
+
+    paths: tuple[str, ...]
+
+
+def require_free_names(project: Path, workspace: Workspace, *, dense: bool) -> None:
+    """Raise :class:`OutputError` where something of a project would lie where the run writes, too."""
+    for path in sorted(project.iterdir()):
+        if workspace.is_own(path.name):
+            raise OutputError(
+                f"{path} has a name that the output folder needs for itself: rename it, or go in two steps, scale and "
+                "apply"
+            )
+    if dense and (project / workspace.dense.name).exists():
+        raise OutputError(
+            f"{project / workspace.dense.name} comes along in metres: leave out --dense, or rename it to have another "
+            "one made"
+        )
+
+
+def place_project(
+    session: Session,
+    project: Path,
+    source: ProjectOptions,
+    submodels: Mapping[int, Path],
+    scales: Mapping[int | None, ModelScale],
+) -> Path | None:
+    """The whole project in metres around the metric models, which are there; ``None`` where every scale was refused.
+
+    Everything keeps its path in the project, but the sub-models lie in ``sparse/`` by COLMAP's numbers. What has a
+    refused scale is left out, with all that was made from it.
+
+    Raises
+    ------
+    OutputExistsError
+        Where something of the run's own stands in the way.
+    """
+    workspace = session.workspace
+    scratch = workspace.stamps / "project"
+    remove(scratch)  # of a run that was killed
+    if all(scale.similarity is None for scale in scales.values()):
+        remove_placed(workspace)
+        return None
+
+    def work(_: object) -> None:
+        applied = apply_to_project(
+            project,
+            scratch,
+            scales,
+            link=source.link,
+            keep=source.keep,
+            follow_links=source.follow_links,
+            only_metric=True,
+            progress=lambda done, total: session.progress("apply", done, total),
+        )
+        for note in applied.notes:
+            log.info("%s", note)
+        folders = {index: submodels[index].relative_to(project) for index in applied.models}
+        _correct_record(scratch / TRANSFORM_FILE, workspace, folders)
+        moves = _moves(workspace, scratch, folders)
+        remove_placed(workspace)
+        for target in moves:
+            if os.path.lexists(target):
+                raise OutputExistsError(f"{target} stands where the project's is to come; rename or remove it")
+        paths = [target.relative_to(workspace.root).as_posix() for target in moves]
+        write_record(workspace.placed, _Placed(paths=tuple(paths)))
+        for target, moved in moves.items():
+            target.parent.mkdir(parents=True, exist_ok=True)
+            os.replace(moved, target)
+        remove(scratch)
+
+    depends = {
+        "scales": {str(index): scale.similarity for index, scale in scales.items()},
+        "project": fingerprint(project),
+        "source": source,
+    }
+    if not workspace.placed.is_file() or not all(os.path.lexists(path) for path in placed_paths(workspace)):
+        session.runner.forget("apply")
+    session.runner.run("apply", depends, [], work)
+    return workspace.root
+
+
+def placed_paths(workspace: Workspace) -> list[Path]:
+    """What came from the project into the folder; a killed run may have left part of it."""
+    if not workspace.placed.is_file():
+        return []
+    names = read_record(workspace.placed, _Placed).paths
+    check_names(names, workspace.placed)
+    for folder in {PurePosixPath(name).parent.as_posix() for name in names} - {"."}:
+        path_in(workspace.root, folder, workspace.placed)
+    return [workspace.root / name for name in names]
+
+
+def remove_placed(workspace: Workspace) -> None:
+    """Take away what came from the project."""
+    for path in placed_paths(workspace):
+        if path.is_symlink():
+            path.unlink()
+        else:
+            remove(path)
+    workspace.placed.unlink(missing_ok=True)
+
+
+def _correct_record(path: Path, workspace: Workspace, folders: Mapping[int, Path]) -> None:
+    """Have the project's record say where the sub-models lie here, and what in the folder is not of the project."""
+    record = read_json(path)
+    here = {str(folder): f"{workspace.sparse.name}/{index}" for index, folder in folders.items()}
+    for model in record["models"]:
+        model["folder"] = here[model["folder"]]
+    for change in record["files"]:
+        if change["kind"].startswith("model"):
+            change["path"] = here.get(change["path"], change["path"])
+    write_json(path, {**record, "beside": list(workspace.own_names)})
+
+
+def _moves(workspace: Workspace, scratch: Path, folders: Mapping[int, Path]) -> dict[Path, Path]:
+    """Where each part of the transformed project goes: all but what the metric models are.
+
+    A model that is there in the other format, too, is written again: a model stage may have changed it.
+    """
+    moves: dict[Path, Path] = {}
+    done = {scratch / folder for folder in folders.values()}
+    for index, folder in folders.items():
+        place, inside = workspace.sparse / str(index), scratch / folder
+        own, others = model_format(place), model_formats(inside)
+        for suffix in others:
+            if suffix == own:
+                for file in model_files(inside, suffix):
+                    remove(file)
+            else:
+                write_files(read_model(place), inside, suffix)
+                if inside == scratch:
+                    moves |= {place / file.name: file for file in model_files(inside, suffix)}
+        if inside != scratch:
+            moves |= {place / path.name: path for path in inside.iterdir() if path.name != TRANSFORM_FILE}
+    for path in scratch.iterdir():
+        if path in done or path in moves.values():
+            continue
+        if path.name == workspace.sparse.name:
+            moves |= {workspace.sparse / inner.name: inner for inner in path.iterdir() if inner not in done}
+        else:
+            moves[workspace.root / path.name] = path
+    return moves

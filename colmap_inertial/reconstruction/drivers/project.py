@@ -1,0 +1,474 @@
+"""``reconstruct`` on a project that COLMAP has made already: no mapping, everything else."""
+
+from __future__ import annotations
+
+import dataclasses
+import fnmatch
+import functools
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import EllipsisType
+from typing import TYPE_CHECKING, Literal, get_args
+
+from colmap_inertial.checks.diagnose import Diagnosis
+from colmap_inertial.checks.report import require_plotly
+from colmap_inertial.checks.validate import parse_target
+from colmap_inertial.colmap.tsdf import require_mesh_maker
+from colmap_inertial.core.errors import AlreadyMetricError, FormatError, InertialError, OutputError, TimingError
+from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
+from colmap_inertial.core.types import CameraTrajectory, FrameTiming, ReadoutDirection
+from colmap_inertial.io.calibration import calibration_prior
+from colmap_inertial.io.capture import Capture, Video, load_capture
+from colmap_inertial.io.exif import stamps_of_exif
+from colmap_inertial.io.files import StrPath, write_json
+from colmap_inertial.io.frame_times import FrameStamps, stamps_of_pattern
+from colmap_inertial.io.frames import read_frame_times, read_frame_timing
+from colmap_inertial.io.image_metadata import stated_exposures_s
+from colmap_inertial.io.imu import RawImu, is_capture, read_raw_capture_imu, read_raw_imu
+from colmap_inertial.io.imu_calibration import used_files
+from colmap_inertial.io.limits import reading_within
+from colmap_inertial.io.names import path_in
+from colmap_inertial.io.recorders import find_recording
+from colmap_inertial.io.records import read_record, write_record
+from colmap_inertial.io.video import video_stamps_ns
+from colmap_inertial.io.video_match import match_to_video
+from colmap_inertial.model import (
+    TRANSFORM_FILE,
+    is_metric,
+    model_format,
+    num_registered,
+    read_model,
+    trajectory_from_model,
+)
+from colmap_inertial.model.copying import list_tree
+from colmap_inertial.model.layout import read_layout
+from colmap_inertial.model.similarities import ModelScale, read_similarity
+from colmap_inertial.pipeline.run.context import Recording, corrected_imu, prior_calibration
+from colmap_inertial.pipeline.run.installed import warn_of_conflicts
+from colmap_inertial.pipeline.run.progress import Progress, silent
+from colmap_inertial.pipeline.run.runner import fingerprint
+from colmap_inertial.pipeline.run.session import Session, open_session
+from colmap_inertial.pipeline.run.workspace import Workspace
+from colmap_inertial.pipeline.stages.protocols import ModelStage, with_defaults
+from colmap_inertial.reconstruction.drivers.capture import default_model_stages
+from colmap_inertial.reconstruction.drivers.georeference import positions_of, run_georeference
+from colmap_inertial.reconstruction.drivers.models import run_dense_models, run_models, run_validation
+from colmap_inertial.reconstruction.drivers.placed import place_project, require_free_names
+from colmap_inertial.reconstruction.drivers.reporting import report_result, reporting_stops, write_recording
+from colmap_inertial.reconstruction.drivers.result import Fragment, ModelResult, ReconstructResult
+from colmap_inertial.reconstruction.precalibrate.preflight import checked_imu, preflight, stop_or_doubt
+
+if TYPE_CHECKING:
+    import pycolmap
+
+log = logging.getLogger(__name__)
+
+#: With fewer of the images found in the video, it is not theirs.
+_LEAST_SHARE = 0.5
+#: Digits of EXIF's fraction of a second that are as good as milliseconds.
+_FINE_DIGITS = 3
+_HOW_TIMES = (
+    "give --frame-times (a CSV with name,t_s), --name-times (times in the file names), --exif-times, or --video (the "
+    "one that the images were taken from)"
+)
+
+
+def is_project(path: Path) -> bool:
+    """Whether ``path`` holds a COLMAP model where a project has it, and is no capture by itself."""
+    if not _has_model(path):
+        return False
+    try:
+        load_capture(path)
+    except FormatError:
+        return not is_capture(path)
+    return False
+
+
+def _has_model(path: Path) -> bool:
+    places = (path, path / "sparse")
+    return any(
+        model_format(folder) is not None
+        or (folder.is_dir() and any(p.name.isdigit() and model_format(p) is not None for p in folder.iterdir()))
+        for folder in places
+    )
+
+
+def reconstruct_project(
+    project: StrPath,
+    out: StrPath,
+    source: ProjectOptions,
+    options: ReconstructOptions = ReconstructOptions(),
+    *,
+    model_stages: Sequence[ModelStage | EllipsisType] = (...,),
+    progress: Progress = silent,
+    findings: Callable[[Diagnosis], None] = lambda _: None,
+) -> ReconstructResult:
+    """Make an existing COLMAP project metric, gravity along an axis, with everything that was made from it.
+
+    Parameters
+    ----------
+    project
+        A folder with a COLMAP model; it is only read.
+    out
+        A folder that does not exist, or holds a run on the same project, which is then gone on with. It becomes the
+        whole project in metres, with ``trajectory.tum``, ``result.json`` and the report of :func:`reconstruct`.
+    source
+        The recording that ran along, and when the images were taken.
+    options
+        Those of mapping and of pixels must be left alone: the model is what it is.
+    model_stages
+        As of :func:`reconstruct`.
+    progress
+        Called with stage, steps done and steps in all.
+    findings
+        Called with what the check beforehand found, before the work and before a refusal that it leads to.
+
+    Raises
+    ------
+    FormatError, TimingError
+        For what is missing or cannot be read, naming the flag to give.
+    AlreadyMetricError
+        When the project carries a similarity of ours.
+    OutputError, OutputExistsError
+        When ``out`` holds something else, or lies in the project, or something in the project has a name that the run
+        needs.
+    NotObservableError
+        When the recording cannot give metres (``options.force`` goes on).
+    """
+    with reading_within(options.limits):
+        return _reconstruct(Path(project), Path(out), source, options, model_stages, progress, findings)
+
+
+def _reconstruct(
+    project: Path,
+    out: Path,
+    source: ProjectOptions,
+    options: ReconstructOptions,
+    model_stages: Sequence[ModelStage | EllipsisType],
+    progress: Progress,
+    findings: Callable[[Diagnosis], None],
+) -> ReconstructResult:
+    warn_of_conflicts()
+    if not _has_model(project):
+        raise FormatError(
+            project,
+            "holds no COLMAP model (sparse/ or a model folder), and --imu and the like belong to one: leave them out "
+            "for a capture, which describes itself",
+        )
+    require_plotly()
+    require_mesh_maker(options)
+    _check_options(options)
+    given = _given(project, source, options)
+    capture = given.capture
+    raw = checked_imu(given.raw, force=options.force)
+    used = used_files(options.calibration)
+    prior = prior_calibration(capture, options.calibration)
+    imu = corrected_imu(capture, raw.imu, options.calibration)
+    target = None if capture.target is None else parse_target(capture.target)
+    models = _models(project, out, source.keep, follow_links=source.follow_links)
+    require_free_names(project, Workspace(out), dense=options.dense)
+    pictures = options.dense or source.exif_times or source.video is not None
+    filmed = isinstance(capture.frames, Video)
+    images = _images(project, source, needed=pictures or (options.georeference and not filmed))
+    read = functools.cache(read_model)
+    with (
+        open_session(
+            out,
+            project,
+            options,
+            pictures=() if images is None else (images,),
+            deterministic=options.deterministic,
+            seed=options.seed,
+            progress=progress,
+        ) as session,
+        reporting_stops(session.workspace, capture),
+    ):
+        workspace = session.workspace
+        timing, notes = _run_times(session, given, models, images, read)
+        fixes = positions_of(capture, _registered(models, read), images) if options.georeference else None
+        recording = Recording.of(capture, imu, timing, prior, max_offset_s=options.scale.max_offset_s)
+        largest = read(models[max(models, key=lambda n: (num_registered(models[n]), -n))])
+        diagnosis = preflight(recording, raw, progress, model=_trajectory(largest, timing))
+        write_json(workspace.diagnosis, diagnosis.as_json())
+        findings(diagnosis)
+        recording = dataclasses.replace(recording, doubts=stop_or_doubt(diagnosis, force=options.force))
+        stages = with_defaults(model_stages, default_model_stages(recording, _as_mapped(options)))
+        results, fragments, gaps = run_models(
+            session, recording, stages, found=models, fragments=options.fragments, numbered=True, after=(), read=read
+        )
+        read.cache_clear()
+        if target is not None and images is None:
+            notes = (*notes, "the target was not measured: the project has no images/; give --images DIR")
+        results = tuple(_noted(result, notes) for result in results)
+        results = run_validation(session, results, target, images)
+        results = run_georeference(session, results, fixes, timing, options.world)
+        metric = place_project(session, project, source, models, _scales(results, fragments))
+        if options.dense and images is not None:
+            results = run_dense_models(session, results, images, options.dense_options)
+        result = ReconstructResult(
+            workspace=workspace,
+            models=results,
+            fragments=fragments,
+            gaps=gaps,
+            seconds=session.runner.seconds,
+            project_metric=metric,
+        )
+        write_recording(session, recording)
+        result = report_result(session, result, capture, used, project=source)
+    return result
+
+
+def _trajectory(model: pycolmap.Reconstruction, timing: FrameTiming) -> CameraTrajectory | Literal["untimed"]:
+    """The poses of a model, where enough of its images have times."""
+    try:
+        return trajectory_from_model(model, timing)[0]
+    except TimingError:
+        return "untimed"
+
+
+def _as_mapped(options: ReconstructOptions) -> ReconstructOptions:
+    """The options, with a project's cameras held where a refinement is not asked to change them, too."""
+    if options.refine == "off" or options.mapping.refine_intrinsics is not None:
+        return options
+    return dataclasses.replace(options, mapping=dataclasses.replace(options.mapping, refine_intrinsics=False))
+
+
+def _check_options(options: ReconstructOptions) -> None:
+    """Refuse what has no meaning without mapping."""
+    default = ReconstructOptions()
+    named = [
+        f"--{group}.{f.name}"
+        for group in ("mapping", "apertures", "exposures")
+        for f in dataclasses.fields(getattr(default, group))
+        if getattr(getattr(options, group), f.name) != getattr(getattr(default, group), f.name)
+        and not (f.name == "refine_intrinsics" and options.refine != "off")
+    ]
+    named += ["--deblur"] if options.deblur not in (None, "off") else []
+    named += ["--rolling-shutter"] if options.rolling_shutter not in (None, "off") else []
+    if named:
+        flags = ", ".join(flag.replace("_", "-") for flag in named)
+        raise InertialError(f"{flags}: an existing model is not mapped again, nor its images changed; leave it out")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Given:
+    """What the user gave beside the project.
+
+    Attributes
+    ----------
+    capture
+        What is known of the recording, in a capture's terms; its frames are those of a capture that was given.
+    """
+
+    source: ProjectOptions
+    capture: Capture
+    raw: RawImu
+
+
+def _given(project: Path, source: ProjectOptions, options: ReconstructOptions) -> _Given:
+    if source.imu is None:
+        stated = (source.frame_times, source.name_times, source.video, source.exif_times or None)
+        when = "" if any(way is not None for way in stated) else f"; and when its images were taken: {_HOW_TIMES}"
+        raise FormatError(project, f"is a COLMAP project and needs the recording that ran along: give --imu PATH{when}")
+    times = source.frame_times
+    if times is not None and not times.exists():
+        raise FormatError(times, "no such file or folder")
+    described = [p for p in (source.imu, times) if p is not None and (is_capture(p) or find_recording(p) is not None)]
+    captures = [load_capture(path) for path in described]
+    raw = read_raw_capture_imu(captures[0]) if described[:1] == [source.imu] else read_raw_imu(source.imu)
+    capture = captures[0] if captures else Capture(path=project, calibration=calibration_prior())
+    frames = next((c.frames for c in captures if c.frames is not None), None)
+    own_clock = source.exif_times or (source.video is not None and not isinstance(frames, Video))
+    shared = any(c.shared_clock for c in captures) and not own_clock
+    capture = dataclasses.replace(capture, path=project, frames=frames, shared_clock=shared)
+    if source.video is not None:
+        capture = _with_video(capture, source.video, None if times in described else times)
+    elif times is None and source.name_times is None and not source.exif_times and frames is None:
+        raise TimingError(f"{project}: nothing says when its images were taken: {_HOW_TIMES}")
+    return _Given(source=source, capture=capture, raw=raw)
+
+
+def _with_video(capture: Capture, video: Path, times: Path | None) -> Capture:
+    """The capture with all frames of a video; what the recorder noted about them counts where it is the recorder's."""
+    frames = Video(file=video) if not isinstance(capture.frames, Video) else capture.frames
+    if not isinstance(capture.frames, Video) and (recording := find_recording(video)) is not None:
+        log_ = recording.log
+        capture = dataclasses.replace(capture, frame_log=log_)
+        if log_ is not None and capture.readout_s is None:
+            capture = dataclasses.replace(capture, readout_s=log_.readout_s, readout_direction=log_.readout_direction)
+    frames = dataclasses.replace(frames, file=video, frames_per_s=None)
+    return dataclasses.replace(
+        capture, frames=frames if times is None else dataclasses.replace(frames, frame_times=times)
+    )
+
+
+def _models(project: Path, out: Path, keep: Sequence[str], *, follow_links: bool) -> dict[int, Path]:
+    """COLMAP's sub-models by number; what would stop ``apply`` at the end is said at once."""
+    inner, outer = out.resolve(), project.resolve()
+    if inner.is_relative_to(outer) or outer.is_relative_to(inner):
+        raise OutputError(f"{out} and {project} lie within each other; choose a folder elsewhere")
+    folders = [
+        folder
+        for folder in list_tree(project, follow_links=follow_links)[0]
+        if not any(fnmatch.fnmatch(str(p), pattern) for p in (folder, *folder.parents[:-1]) for pattern in keep)
+    ]
+    for folder in (Path(), *folders):
+        if is_metric(project / folder):
+            raise AlreadyMetricError(
+                f"{project / folder} already holds a metric scale; give COLMAP's own project, or leave the folder "
+                "as it is with --keep"
+            )
+    layout = read_layout(project, folders, one_for_all=False)
+    return {index: project / folder for index, folder in layout.submodels.items()}
+
+
+def _images(project: Path, source: ProjectOptions, *, needed: bool) -> Path | None:
+    folder = project / "images" if source.images is None else source.images
+    if folder.is_dir():
+        return folder
+    if source.images is not None or needed:
+        raise FormatError(folder, "no such folder of pictures; give the project's images with --images DIR")
+    return None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Times:
+    """When the images were taken, and what the user should know about that."""
+
+    timing: FrameTiming
+    notes: tuple[str, ...]
+
+
+def _run_times(
+    session: Session,
+    given: _Given,
+    models: dict[int, Path],
+    images: Path | None,
+    read: Callable[[Path], pycolmap.Reconstruction],
+) -> tuple[FrameTiming, tuple[str, ...]]:
+    """When the images were taken, and what the user should know about that."""
+
+    def work(partial: Sequence[Path]) -> None:
+        timing, notes = _times(given, _registered(models, read), images, session.progress)
+        write_record(partial[0], _Times(timing=timing, notes=notes))
+
+    frames = given.capture.frames
+    stated = frames.frame_times if isinstance(frames, Video) else None if frames is None else frames.times
+    inputs = [given.source.frame_times, given.source.video, images, stated if isinstance(stated, Path) else None]
+    depends = {
+        "source": dataclasses.replace(given.source, keep=(), link=False),
+        "capture": dataclasses.replace(given.capture, target=None),
+        "models": [fingerprint(folder) for folder in models.values()],
+        "inputs": [fingerprint(path) for path in inputs if path is not None],
+    }
+    session.runner.run("times", depends, [session.workspace.frames], work)
+    found = read_record(session.workspace.frames, _Times)
+    return found.timing, found.notes
+
+
+def _registered(models: dict[int, Path], read: Callable[[Path], pycolmap.Reconstruction]) -> list[str]:
+    """Names of all images of the models."""
+    found = [read(folder) for folder in models.values()]
+    return sorted({model.image(i).name for model in found for i in model.reg_image_ids()})
+
+
+def _times(
+    given: _Given, names: Sequence[str], images: Path | None, progress: Progress
+) -> tuple[FrameTiming, tuple[str, ...]]:
+    source, capture = given.source, given.capture
+    notes: tuple[str, ...] = ()
+    if source.video is not None:
+        assert images is not None
+        timing, notes = _video_times(capture, source.video, images, names, progress)
+    elif source.exif_times:
+        assert images is not None
+        stamps, digits = stamps_of_exif(images, names)
+        timing = _timing(capture, stamps)
+        if digits < _FINE_DIGITS:
+            notes = (f"EXIF gives the frames' times to 1/{10**digits} s only",)
+    elif source.name_times is not None:
+        timing = _timing(capture, stamps_of_pattern(images or Path(), names, source.name_times))
+    elif source.frame_times is not None:
+        timing = read_frame_times(source.frame_times)
+        if timing.readout_s is None:
+            timing = dataclasses.replace(
+                timing, readout_s=capture.readout_s, readout_direction=capture.readout_direction
+            )
+    else:
+        timing = read_frame_timing(capture)
+    # an exposure that the pictures state belongs to the frames; one that they do not is no reason to stop
+    if timing.exposure_s is None and images is not None:
+        paths = [path_in(images, name) for name in timing.names]
+        if all(path.is_file() for path in paths):
+            timing = dataclasses.replace(timing, exposure_s=stated_exposures_s(paths))
+    return timing, notes
+
+
+def _timing(capture: Capture, stamps: FrameStamps) -> FrameTiming:
+    timing = stamps.timing(exposure_s=capture.exposure_s, readout_s=capture.readout_s)
+    return dataclasses.replace(timing, readout_direction=capture.readout_direction)
+
+
+def _video_times(
+    capture: Capture, video: Path, images: Path, names: Sequence[str], progress: Progress
+) -> tuple[FrameTiming, tuple[str, ...]]:
+    stamps_ns = video_stamps_ns(video)
+    every = read_frame_timing(capture)
+    match = match_to_video(video, images, names, progress=lambda done: progress("video", done, len(stamps_ns)))
+    if len(match.t_ns) < max(2, _LEAST_SHARE * len(names)):
+        example = next(iter(match.doubtful.items()), ("", ""))
+        raise TimingError(
+            f"{video}: {len(match.t_ns)} of {len(names)} images are one of its frames beyond doubt ({example[0]} "
+            f"{example[1]}): give the video that the images were taken from, or --frame-times"
+        )
+    name_of = {t_ns: name for name, t_ns in match.t_ns.items()}
+    kept = [i for i, t_ns in enumerate(stamps_ns.tolist()) if t_ns in name_of]
+    # counterclockwise, as the pictures were turned against the frames
+    directions: tuple[ReadoutDirection, ...] = ("down", "right", "up", "left")
+    assert set(directions) == set(get_args(ReadoutDirection))
+    turned = (directions.index(every.readout_direction) + match.quarter_turns) % 4
+    timing = FrameTiming(
+        names=tuple(name_of[int(stamps_ns[i])] for i in kept),
+        t_s=every.t_s[kept],
+        exposure_s=None if every.exposure_s is None else every.exposure_s[kept],
+        readout_s=every.readout_s,
+        readout_direction=directions[turned],
+        epoch_ns=every.epoch_ns,
+    )
+    notes = []
+    for why in sorted(set(match.doubtful.values())):
+        those = [name for name, reason in match.doubtful.items() if reason == why]
+        notes.append(f"{len(those)} of {len(names)} images have no time: each {why} (first: {those[0]})")
+    return timing, tuple(notes)
+
+
+def _noted(result: ModelResult, notes: Sequence[str]) -> ModelResult:
+    scale = result.scale
+    return dataclasses.replace(result, scale=dataclasses.replace(scale, notes=(*scale.notes, *notes)))
+
+
+def _scales(results: Sequence[ModelResult], fragments: Sequence[Fragment]) -> dict[int | None, ModelScale]:
+    """What is applied to each sub-model of the project, by COLMAP's number."""
+    small = "a fragment of {} images: too small to be made metric (--fragments does it all the same)"
+    scales: dict[int | None, ModelScale] = {
+        one.colmap_index: ModelScale(similarity=None, verdict="refused", reasons=(small.format(one.registered_images),))
+        for one in fragments
+    }
+    for result in results:
+        similarity = None
+        if result.sparse_metric is not None:
+            similarity = read_similarity(result.sparse_metric / TRANSFORM_FILE)
+        scales[result.colmap_index] = ModelScale(
+            similarity=similarity,
+            verdict=result.scale.verdict,
+            reasons=result.scale.reasons,
+            joined_of=tuple(part.colmap_index for part in result.parts),
+        )
+        for part in result.parts:
+            if part.colmap_index != result.colmap_index:
+                scales[part.colmap_index] = ModelScale(
+                    similarity=part.similarity, verdict=part.verdict, reasons=result.scale.reasons
+                )
+    return scales

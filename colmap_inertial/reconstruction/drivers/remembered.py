@@ -1,0 +1,126 @@
+"""Calibrations that the command line keeps for a user's devices. Nothing but the command line looks here."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from colmap_inertial.core.errors import FormatError, InertialError, OutputError
+from colmap_inertial.io.calibration import CAMERA_IMU
+from colmap_inertial.io.capture import Capture, load_capture
+from colmap_inertial.io.files import read_text, write_text
+from colmap_inertial.io.imu import read_raw_capture_imu, read_raw_imu
+from colmap_inertial.io.imu_calibration import IMU, calibration_kind
+
+#: A camera-IMU rotation that is known better than this was stated by the capture.
+_STATED_RAD = 1.0
+_LONGEST = 60
+
+
+@dataclass(frozen=True, kw_only=True)
+class Remembered:
+    """Calibration files that are kept for a device.
+
+    Attributes
+    ----------
+    device
+        Its name; empty where unknown.
+    files
+        Path and kind of each.
+    """
+
+    device: str = ""
+    files: tuple[tuple[Path, str], ...] = ()
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """The paths alone."""
+        return tuple(path for path, _ in self.files)
+
+
+def configuration_folder() -> Path:
+    """Where this system keeps a user's configuration of this program."""
+    home = Path.home()
+    if sys.platform == "win32":
+        base = Path(os.environ.get("APPDATA") or home / "AppData" / "Roaming")
+    elif sys.platform == "darwin":
+        base = home / "Library" / "Application Support"
+    else:
+        stated = os.environ.get("XDG_CONFIG_HOME", "")
+        base = Path(stated) if os.path.isabs(stated) else home / ".config"
+    return base / "colmap-inertial"
+
+
+def remember(device: str, calibration: Path) -> Path:
+    """Keep a calibration file under the name of its device, in place of an earlier one of the same kind.
+
+    Returns
+    -------
+    Where it is kept.
+
+    Raises
+    ------
+    OutputError
+        Where it cannot be written.
+    """
+    folder = _folder(device)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder} cannot be created: {error.strerror or error}") from error
+    target = folder / f"{calibration_kind(calibration)}.json"
+    write_text(target, read_text(calibration))
+    return target
+
+
+def remembered_of(source: Path, given: tuple[Path, ...], *, device: str | None = None) -> Remembered:
+    """What is kept for the device of a recording, of the kinds that were not given.
+
+    Parameters
+    ----------
+    source
+        A capture, or an IMU recording.
+    given
+        Calibration files that go before it. What a capture.toml says goes before it, too.
+    device
+        Name of the device; without it, what the recording says.
+    """
+    if not (configuration_folder() / "devices").is_dir():
+        return Remembered()
+    kinds = {calibration_kind(path) for path in given}
+    try:
+        capture = _capture_of(source)
+        if device is None:
+            imu = read_raw_imu(source).imu if capture is None else read_raw_capture_imu(capture).imu
+            device = imu.device
+    except InertialError:
+        return Remembered()  # whoever reads it next says what is wrong
+    if capture is not None and capture.imu_calibration is not None:
+        kinds.add(IMU)
+    if capture is not None and capture.calibration.rotation_sigma_rad < _STATED_RAD:
+        kinds.add(CAMERA_IMU)
+    if not device:
+        return Remembered()
+    files = ((_folder(device) / f"{kind}.json", kind) for kind in (CAMERA_IMU, IMU) if kind not in kinds)
+    return Remembered(device=device, files=tuple((path, kind) for path, kind in files if path.is_file()))
+
+
+def _capture_of(source: Path) -> Capture | None:
+    try:
+        return load_capture(source)
+    except FormatError:
+        return None
+
+
+def _folder(device: str) -> Path:
+    """A device's folder: its name as far as a file may have it, and a mark that tells like ones apart."""
+    name = " ".join(device.split())
+    if not name:
+        raise OutputError("a device needs a name to be remembered by")
+    readable = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")[:_LONGEST]
+    mark = hashlib.sha256(name.lower().encode("utf-8", "surrogatepass")).hexdigest()[:8]
+    return configuration_folder() / "devices" / f"{readable}-{mark}".lstrip("-")

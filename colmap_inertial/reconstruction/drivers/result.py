@@ -1,0 +1,285 @@
+"""What a reconstruction made, and ``result.json``, which says the same."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
+
+import numpy as np
+
+from colmap_inertial import __version__
+from colmap_inertial.checks.validate import Validation
+from colmap_inertial.colmap.dense import DenseResult
+from colmap_inertial.colmap.mapping import MapRecord
+from colmap_inertial.colmap.pairing import MatchRecord
+from colmap_inertial.colmap.sparse import KeypointRecords
+from colmap_inertial.core.errors import InertialError, NotObservableError
+from colmap_inertial.core.geometry import quat_conjugate, quat_log, quat_multiply
+from colmap_inertial.core.types import CameraImuCalibration, Gap, JoinedPart, ScaleEstimate, Treatment
+from colmap_inertial.inertial.georeference import Georeference
+from colmap_inertial.io.capture import Capture
+from colmap_inertial.model import similarity_as_json
+from colmap_inertial.pipeline.run.workspace import Workspace
+from colmap_inertial.pipeline.stages.frame_folder import FrameRecord
+from colmap_inertial.reconstruction.precalibrate.plan import ImagingPlan
+from colmap_inertial.reconstruction.precalibrate.selection import Selection
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScaledModel:
+    """What the model stages made of one of COLMAP's models; paths are ``None`` where the scale was refused.
+
+    Attributes
+    ----------
+    index
+        Its number in ``sparse/``: the models count from the one with the most images; those of an existing project
+        keep COLMAP's numbers.
+    colmap_index
+        COLMAP's number, that of its folder in ``colmap/sparse/`` or in the project.
+    scale
+        Metres per unit, interval and verdict.
+    summary
+        ``registered_images``, ``points``, ``observations``, ``mean_reprojection_error_px``.
+    sparse, sparse_metric
+        COLMAP's model in ``colmap/sparse/`` or in the project, and the same in metres, in ``sparse/``.
+    trajectory
+        The camera's path, smoothed by the IMU or refined.
+    treatments
+        What the stages said.
+    parts
+        What it was joined of; empty where it is one of COLMAP's models.
+    """
+
+    index: int
+    colmap_index: int
+    scale: ScaleEstimate
+    summary: dict[str, int | float]
+    sparse: Path
+    sparse_metric: Path | None = None
+    trajectory: Path | None = None
+    treatments: tuple[Treatment, ...] = ()
+    parts: tuple[JoinedPart, ...] = ()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ModelResult(ScaledModel):
+    """What became of one of COLMAP's models.
+
+    Attributes
+    ----------
+    validation
+        Against the capture's target, where it names one; an error says why the target could not be measured.
+    georeference
+        Where on Earth it stands, where that was asked for; an error says why that stays open.
+    dense
+        Where it was asked for.
+    """
+
+    validation: Validation | InertialError | None = None
+    georeference: Georeference | InertialError | None = None
+    dense: DenseResult | None = None
+
+    def within(self, root: Path) -> ModelResult:
+        """The same with paths that count from ``root`` made whole."""
+        paths = {name: getattr(self, name) for name in ("sparse", "sparse_metric", "trajectory")}
+        return replace(self, **{name: root / path for name, path in paths.items() if path is not None})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fragment:
+    """A model of COLMAP's that is too small to be made metric.
+
+    Attributes
+    ----------
+    colmap_index
+        COLMAP's number.
+    registered_images
+        How many images it holds.
+    sparse
+        Its folder.
+    """
+
+    colmap_index: int
+    registered_images: int
+    sparse: Path
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ReconstructResult:
+    """What ``reconstruct`` made; the same as ``result.json``.
+
+    Attributes
+    ----------
+    workspace
+        The output folder.
+    models
+        The one with the most images first.
+    fragments
+        What was left out.
+    gaps
+        What lies between COLMAP's models, and whether they were joined across it.
+    frames, keypoints
+        What happened to each frame, and to the keypoints of each image.
+    matching
+        Which pairs of images were matched, and why not the rest; ``None`` for an existing project.
+    mapping
+        In how many parts COLMAP's models were made, and which of their ends met; ``None`` for an existing project.
+    seconds
+        By step.
+    imaging
+        What was decided beforehand about frames and keypoints, and why.
+    selection
+        Which frames were used, and why; ``None`` for an existing project.
+    project_metric
+        The whole project in metres, which is the output folder itself, where an existing one was given and not every
+        scale was refused.
+    report
+        The page for reading; ``None`` where it failed, for which ``log.txt`` has the reason.
+    unchanged
+        Whether there was nothing to do: the folder held this result already.
+    """
+
+    workspace: Workspace
+    models: tuple[ModelResult, ...]
+    fragments: tuple[Fragment, ...] = ()
+    gaps: tuple[Gap, ...] = ()
+    frames: tuple[FrameRecord, ...] = ()
+    keypoints: KeypointRecords = field(default_factory=KeypointRecords)
+    matching: MatchRecord | None = None
+    mapping: MapRecord | None = None
+    seconds: dict[str, float]
+    imaging: ImagingPlan = field(default_factory=ImagingPlan)
+    selection: Selection | None = None
+    project_metric: Path | None = None
+    report: Path | None = None
+    unchanged: bool = False
+
+    @property
+    def waiting(self) -> tuple[str, ...]:
+        """What the user has to do for the dense reconstructions to go on; empty where nothing is left to do."""
+        return tuple(model.dense.waiting for model in self.models if model.dense is not None and model.dense.waiting)
+
+    def exit_code(self) -> int:
+        """0; 1 where a validation is outside its tolerance; its error's code where the target could not be measured.
+
+        Raises
+        ------
+        NotObservableError
+            When every model's scale was refused.
+        InertialError
+            When a dense reconstruction was asked for and waits for depth maps.
+        """
+        if all(model.sparse_metric is None for model in self.models):
+            reasons = {model.index: "; ".join(model.scale.reasons) for model in self.models}
+            raise NotObservableError(
+                "scale",
+                next(iter(reasons.values()))
+                if len(reasons) == 1
+                else "; ".join(f"model {i}: {text}" for i, text in reasons.items()),
+            )
+        if self.waiting:
+            raise InertialError("; ".join(self.waiting))
+        checked = [model.validation for model in self.models if model.validation is not None]
+        failures = [check.exit_code for check in checked if isinstance(check, InertialError)]
+        outside = any(not check.within_tolerance for check in checked if isinstance(check, Validation))
+        if outside:
+            return 1
+        return failures[0] if len(failures) == len(checked) > 0 else 0
+
+
+def imaging_as_json(plan: ImagingPlan, rectified: Collection[str]) -> dict[str, object]:
+    """What was decided beforehand and why, without what concerns single frames; and whether any was rectified."""
+    values = {key: value for key, value in plan.as_json().items() if key not in ("decisions", "parallaxes")}
+    values |= {"rectify": bool(rectified), "rolling_shutter": shutter_note(plan, rectified)}
+    return {**values, "frames_with_translation": len(plan.parallaxes)}
+
+
+def shutter_note(plan: ImagingPlan, rectified: Collection[str]) -> str:
+    """What was done about a rolling shutter, in words, by the images whose keypoints were rectified."""
+    if rectified and not plan.rectify:
+        return f"{plan.rolling_shutter_note}, which rectified keypoints of {len(rectified)} images"
+    if plan.rectify and not rectified:
+        return "no keypoints are rectified: the gyroscope covers the whole readout of no image"
+    return plan.rolling_shutter_note
+
+
+def frame_as_json(record: FrameRecord, plan: ImagingPlan, rectified: Collection[str]) -> dict[str, object]:
+    """What happened to one frame."""
+    return {
+        "name": record.name,
+        "action": record.action,
+        "reason": record.reason or (plan.deblur_note if record.action == "passed" else f"{record.action} by a stage"),
+        **{key: record.value(key) for key in ("blur_px", "kept_share", "extent_factor")},
+        "rectified": record.name in rectified,
+    }
+
+
+def _change(first: CameraImuCalibration, refined: CameraImuCalibration | None) -> dict[str, object] | None:
+    """How far the scale estimate moved the calibration that the frames were treated with."""
+    if refined is None:
+        return None
+    turn = quat_log(quat_multiply(refined.cam_from_imu_xyzw, quat_conjugate(first.cam_from_imu_xyzw)))
+    return {
+        "rotation_deg": float(np.degrees(np.linalg.norm(turn))),
+        "gyro_time_offset_s": refined.gyro_time_offset_s - first.gyro_time_offset_s,
+        "gyro_bias_rad_s": (refined.gyro_bias_rad_s - first.gyro_bias_rad_s).tolist(),
+    }
+
+
+def _measured_as_json(found: Validation | Georeference | InertialError | None) -> object:
+    return {"error": str(found)} if isinstance(found, InertialError) else found and found.as_json()
+
+
+def _part_as_json(part: JoinedPart) -> dict[str, object]:
+    values = {f.name: getattr(part, f.name) for f in fields(part)}
+    return {**values, "similarity": similarity_as_json(part.similarity)}
+
+
+def result_as_json(result: ReconstructResult, capture: Capture) -> dict[str, object]:
+    """The content of ``result.json``."""
+    import pycolmap
+
+    root, plan, rectified = result.workspace.root, result.imaging, result.keypoints.rectified()
+
+    def relative(path: Path | None) -> str | None:
+        if path is None:
+            return None
+        # elsewhere, as an existing project's model: whatever folder one looks from
+        return str(path.relative_to(root) if path.is_relative_to(root) else path.resolve())
+
+    return {
+        "versions": {"colmap_inertial": __version__, "pycolmap": pycolmap.__version__},
+        "capture": str(capture.path.resolve()),
+        "models": [
+            {
+                "index": model.index,
+                "colmap_index": model.colmap_index,
+                **model.summary,
+                "sparse": relative(model.sparse),
+                "sparse_metric": relative(model.sparse_metric),
+                "trajectory": relative(model.trajectory),
+                **model.scale.as_json(),
+                "calibration_change": None
+                if plan.view is None
+                else _change(plan.view.calibration, model.scale.calibration),
+                "validation": _measured_as_json(model.validation),
+                "georeference": _measured_as_json(model.georeference),
+                "readout_translation": next((t.values for t in model.treatments if t.stage == "readout"), None),
+                "joined_of": [_part_as_json(part) for part in model.parts],
+                "treatments": [asdict(treatment) for treatment in model.treatments],
+                "dense": model.dense and model.dense.as_json(root),
+            }
+            for model in result.models
+        ],
+        "fragments": [{**asdict(fragment), "sparse": relative(fragment.sparse)} for fragment in result.fragments],
+        "gaps": [asdict(gap) for gap in result.gaps],
+        "project_metric": relative(result.project_metric),
+        "waiting": bool(result.waiting),
+        "selection": result.selection and result.selection.as_json(),
+        "imaging": imaging_as_json(plan, rectified),
+        "matching": result.matching and asdict(result.matching),
+        "mapping": result.mapping and asdict(result.mapping),
+        "frames": [frame_as_json(record, plan, rectified) for record in result.frames],
+        "seconds": result.seconds,
+    }

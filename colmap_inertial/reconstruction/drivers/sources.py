@@ -1,0 +1,365 @@
+"""``scale`` and ``align`` without mapping: what the user has, turned into a trajectory and an IMU recording."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from colmap_inertial.checks.validate import (
+    Validation,
+    parse_target,
+    validate_model,
+    with_bars,
+    with_check_points,
+    with_other_target,
+    write_overlays,
+)
+from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError, OutputError, OutputExistsError
+from colmap_inertial.core.options import ScaleOptions, ValidateOptions
+from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuRecording, ScaleEstimate, Similarity
+from colmap_inertial.inertial.scale import estimate_scale, first_seconds
+from colmap_inertial.io.calibration import largest_offset_s, write_calibration
+from colmap_inertial.io.capture import load_capture
+from colmap_inertial.io.files import read_json, write_json
+from colmap_inertial.io.frames import read_frame_times
+from colmap_inertial.io.imu import is_capture, read_imu
+from colmap_inertial.io.imu_calibration import CalibrationFiles, as_paths, read_for_another, used_files
+from colmap_inertial.io.imu_text import is_inertial_scale
+from colmap_inertial.io.pose_convention import COLMAP, INERTIAL_SCALE, TUM, PoseConvention
+from colmap_inertial.io.trajectories import read_inertial_scale, read_tum
+from colmap_inertial.model import apply_similarity, find_models, is_metric, read_model, trajectory_from_model
+from colmap_inertial.motion.align import AlignOptions, align_camera_imu
+from colmap_inertial.motion.align.conventions import LikelyConvention, likely_convention
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScaleSource:
+    """Where a trajectory and its IMU recording come from.
+
+    Attributes
+    ----------
+    source
+        COLMAP model folder, TUM trajectory, or InertialScale folder.
+    imu
+        What ``read_imu`` accepts; an InertialScale folder has its own.
+    frame_times
+        For a COLMAP model: CSV or capture.toml; where ``imu`` is a capture.toml, its frame times serve.
+    calibration
+        Calibration files; where ``imu`` is a capture.toml, its calibration serves.
+    """
+
+    source: Path
+    imu: Path | None = None
+    frame_times: Path | None = None
+    calibration: CalibrationFiles = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TimedPoses:
+    """A trajectory with its IMU recording; ``start_s`` is when the camera began, where frame times tell.
+
+    ``read_as`` is the convention that the poses were read by.
+    """
+
+    trajectory: CameraTrajectory
+    read_as: PoseConvention
+    imu: ImuRecording
+    calibration: CameraImuCalibration | None
+    shared_clock: bool
+    start_s: float | None = None
+    notes: Sequence[str] = ()
+
+
+def load_source(source: ScaleSource) -> TimedPoses:
+    """Read a trajectory and the IMU recording that ran along.
+
+    Raises
+    ------
+    FormatError, TimingError
+        For what is missing or cannot be read, naming the flag to give.
+    """
+    path = source.source
+    if not path.exists():
+        raise FormatError(path, "no such file or folder")
+    inertial_scale = path.is_dir() and is_inertial_scale(path)
+    if not inertial_scale:
+        _require_all(source)
+    notes: Sequence[str] = ()
+    start_s = None
+    read_as = TUM
+    if inertial_scale:
+        trajectory, imu = read_inertial_scale(path)
+        read_as = INERTIAL_SCALE
+    elif path.is_dir():
+        times = source.frame_times or source.imu
+        assert times is not None
+        timing = read_frame_times(times)
+        folder = only_model(path)
+        trajectory, notes = trajectory_from_model(read_model(folder), timing)
+        read_as = COLMAP
+        start_s = float(timing.pose_t_s()[0])
+        if is_metric(folder):
+            notes = (*notes, "this model is metric already: a scale of 1 says that it is right")
+    else:
+        trajectory = read_tum(path)
+    if source.imu is not None:
+        imu = read_imu(source.imu)
+    captures = [load_capture(p) for p in (source.imu, source.frame_times, path) if p is not None and is_capture(p)]
+    shared = any(capture.shared_clock for capture in captures)
+    calibration = captures[0].calibration if captures else None
+    of_imu = captures[0].imu_calibration if captures else None
+    files = read_for_another(source.calibration, shared_clock=shared)
+    calibration, of_imu = files.camera_imu or calibration, files.imu or of_imu
+    if of_imu is not None:
+        imu = of_imu.corrected(imu)
+        calibration = None if calibration is None else of_imu.loosened(calibration)
+    return TimedPoses(
+        trajectory=trajectory,
+        read_as=read_as,
+        imu=imu,
+        calibration=calibration,
+        shared_clock=shared,
+        start_s=start_s,
+        notes=notes,
+    )
+
+
+def _require_all(source: ScaleSource) -> None:
+    """Refuse a model or trajectory without its recording or times, naming all that is missing at once."""
+    path, missing = source.source, []
+    if path.is_dir():
+        only_model(path)
+    if source.imu is None:
+        missing.append("the recording that ran along: give --imu PATH")
+    if path.is_dir() and source.frame_times is None and not (source.imu is not None and is_capture(source.imu)):
+        missing.append("the times of its images: give --frame-times, a CSV with name,t_s")
+    if missing:
+        raise FormatError(path, f"needs {'; and '.join(missing)}")
+
+
+def only_model(path: Path) -> Path:
+    """The one model in a folder.
+
+    Raises
+    ------
+    FormatError
+        Where there are several, or none; of a project, with the place of its models.
+    """
+    try:
+        models = find_models(path)
+    except FormatError:
+        if not (path / "sparse").is_dir():
+            raise
+        inside = next(iter(find_models(path / "sparse").values()))
+        raise FormatError(path, f"is a whole project: give one of its models, {inside}") from None
+    if len(models) > 1:
+        raise FormatError(
+            path, f"holds {len(models)} models; give one of them, for example {next(iter(models.values()))}"
+        )
+    return next(iter(models.values()))
+
+
+#: One of these is in every JSON file that a command writes.
+_OURS = frozenset({"metres_per_unit", "cam_from_imu_xyzw", "accel_gain", "findings", "out", "exit_code"})
+
+
+def check_output(path: Path, inputs: Sequence[Path | None]) -> None:
+    """Refuse, before any work, an output that would replace anything but an earlier result of ours.
+
+    Raises
+    ------
+    OutputError
+    """
+    if not path.parent.is_dir():
+        raise OutputError(f"{path.parent} is no folder; create it first")
+    if path.is_dir():
+        raise OutputError(f"{path} is a folder; name a file in it")
+    target = path.resolve()
+    for known in inputs:
+        if known is not None and target == known.resolve():
+            raise OutputExistsError(f"{path} is an input; choose another name for the result")
+    if path.exists():
+        try:
+            keys = set(read_json(path))
+        except FormatError:
+            keys = set()
+        if not keys & _OURS:
+            raise OutputExistsError(f"{path} exists and is no earlier result; choose another name or remove it")
+
+
+def align_source(source: ScaleSource, out: Path) -> CameraImuCalibration:
+    """Align camera and IMU of an existing model or trajectory, and write the calibration.
+
+    Raises
+    ------
+    NotObservableError
+        Where no offset between the clocks is better than the rest, or the camera hardly turned. Poses that fit by
+        another convention are named, also where their rotations alone would do.
+    """
+    check_output(out, [source.source, source.imu, source.frame_times])
+    recording = load_source(source)
+    options = AlignOptions(max_offset_s=largest_offset_s(recording.shared_clock))
+    try:
+        found = align_camera_imu(recording.trajectory, recording.imu, prior=recording.calibration, options=options)
+    except NotObservableError as error:
+        _refuse_another_convention(recording, options, error.quantity)
+        raise
+    _refuse_another_convention(recording, options, "rotation")
+    write_calibration(out, found)
+    return found
+
+
+def _refuse_another_convention(recording: TimedPoses, options: AlignOptions, quantity: str) -> None:
+    likely = _likely_convention(recording, recording.trajectory, options)
+    if likely is not None:
+        raise NotObservableError(quantity, likely.sentence)
+
+
+def _likely_convention(
+    recording: TimedPoses, trajectory: CameraTrajectory, options: AlignOptions
+) -> LikelyConvention | None:
+    return likely_convention(
+        trajectory, recording.imu, read_as=recording.read_as, prior=recording.calibration, options=options
+    )
+
+
+def scale_source(
+    source: ScaleSource,
+    options: ScaleOptions,
+    *,
+    json: Path | None = None,
+    first_s: float | None = None,
+) -> ScaleEstimate:
+    """Estimate the scale of an existing model or trajectory.
+
+    Parameters
+    ----------
+    source
+        Where the data lie.
+    options
+        Of the estimate.
+    json
+        Where to write it, also when the scale is refused.
+    first_s
+        Use only the first seconds of the camera's recording, for the alignment too.
+    """
+    if json is not None:
+        check_output(json, [source.source, source.imu, source.frame_times, *as_paths(source.calibration)])
+    recording = load_source(source)
+    trajectory = recording.trajectory
+    if first_s is not None:
+        trajectory = first_seconds(trajectory, first_s, start_s=recording.start_s)
+    limit_s = largest_offset_s(recording.shared_clock, options.max_offset_s)
+    options = dataclasses.replace(options, max_offset_s=limit_s)
+    estimate = estimate_scale(trajectory, recording.imu, calibration=recording.calibration, options=options)
+    if estimate.verdict == "refused":
+        likely = _likely_convention(recording, trajectory, AlignOptions(max_offset_s=limit_s))
+        if likely is not None:
+            estimate = dataclasses.replace(estimate, reasons=(likely.sentence, *estimate.reasons))
+    notes = (*estimate.notes, *recording.imu.repairs, *recording.notes)
+    estimate = dataclasses.replace(estimate, notes=notes)
+    if json is not None:
+        write_json(json, scale_as_json(estimate, source.calibration))
+    return estimate
+
+
+def scale_as_json(estimate: ScaleEstimate, calibration: CalibrationFiles = None) -> dict[str, object]:
+    """What ``scale --json`` writes: the estimate, and the calibration files that it used."""
+    return {**estimate.as_json(), "calibration_files": used_files(calibration)}
+
+
+def validate_source(
+    model: Path,
+    images: Path,
+    target: str,
+    options: ValidateOptions,
+    *,
+    json: Path | None = None,
+    pictures: Path | None = None,
+    apply: Path | None = None,
+    bars: Path | None = None,
+    check_points: Path | None = None,
+    other: tuple[str, str] | None = None,
+) -> Validation:
+    """Measure a target in a model and write what was found.
+
+    Parameters
+    ----------
+    model, images, target
+        COLMAP model folder, folder of its images, specification of the target.
+    options
+        Of the validation.
+    json, pictures
+        Where to write the result, and frames with the corners drawn in.
+    apply
+        Where to write the model in metres, scaled by the control distances; for a model without a unit only.
+    bars, check_points
+        Tables of distances between markers, and of their coordinates.
+    other
+        Specification of a second target in the scene, and the metres between the middles of both, as ``4.03`` or
+        ``4.03+-0.002`` with how well they are known.
+
+    Raises
+    ------
+    InertialError
+        When ``apply`` is asked for and cannot be done; see also :func:`validate_model`.
+    """
+    parsed = parse_target(target)
+    if json is not None:
+        check_output(json, [model])
+    if pictures is not None and pictures.exists() and not (pictures.is_dir() and not any(pictures.iterdir())):
+        raise OutputExistsError(f"{pictures} exists; name a new folder for the pictures")
+    if apply is not None and apply.exists():
+        raise OutputExistsError(f"{apply} exists; name a new folder for the metric model")
+    if apply is not None and not options.unscaled:
+        raise InertialError("--apply scales a model that claims no unit: add --unscaled")
+    folder = only_model(model)
+    if (bars is not None or check_points is not None) and parsed.kind != "aruco":
+        raise InertialError("--bars and --check-points name markers: give a target of markers, as aruco:DICT:SIDE_M")
+    second = None if other is None else (parse_target(other[0]), *_metres_apart(other[1]))
+    if second is not None and "aruco" in (parsed.kind, second[0].kind):
+        raise InertialError("--other-target is for two boards; distances between single markers go into --bars")
+    if second is not None and second[0].spec == parsed.spec:
+        raise InertialError("--other-target must be another board than --target: nobody could tell them apart")
+    result = validate_model(folder, images, parsed, options)
+    if second is not None:
+        result = with_other_target(result, validate_model(folder, images, second[0], options), second[1], second[2])
+    if bars is not None:
+        result = with_bars(result, bars)
+    if check_points is not None:
+        result = with_check_points(result, check_points)
+    if apply is not None:
+        if result.control is None:
+            raise InertialError("too few corners to keep control and check distances apart; --apply needs more views")
+        low, high = result.control.ci95
+        cov = np.zeros((7, 7))
+        cov[0, 0] = (np.log(high / low) / (2 * 1.96)) ** 2
+        similarity = Similarity(
+            scale=result.control.metres_per_unit,
+            rotation_xyzw=np.array([0.0, 0.0, 0.0, 1.0]),
+            translation_m=np.zeros(3),
+            cov=cov,
+            provenance=f"control distances of {parsed.spec}",
+        )
+        apply_similarity(folder, apply, similarity)
+    if json is not None:
+        write_json(json, result.as_json())
+    if pictures is not None:
+        write_overlays(result, images, pictures)
+    return result
+
+
+def _metres_apart(text: str) -> tuple[float, float | None]:
+    """A length, and its standard deviation where that is said."""
+    length, said, sigma = text.partition("+-")
+    try:
+        metres, sigma_m = float(length), float(sigma) if said else None
+    except ValueError:
+        metres, sigma_m = float("nan"), None
+    if not 0 < metres < float("inf") or (sigma_m is not None and not 0 < sigma_m < metres):
+        raise InertialError(f'--other-target ... "{text}": write metres between the two middles, as in 4.03+-0.002')
+    return metres, sigma_m

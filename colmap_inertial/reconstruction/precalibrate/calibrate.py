@@ -1,0 +1,370 @@
+"""Camera and IMU brought together before the reconstruction: what deblurring and the rolling shutter need.
+
+The rotation between frames comes from a small model that COLMAP makes of some of the frames at reduced size; it tells
+rotation from translation, which pixels followed from frame to frame cannot. Where there is no such model (a camera
+that only turns), the followed pixels serve; in a video they also tell whether it was stabilised.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import math
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from colmap_inertial.colmap.mapping import map_images
+from colmap_inertial.colmap.sparse import extract_features, image_pairs, match_features, verify_again
+from colmap_inertial.core.errors import FormatError, MappingError, NotObservableError
+from colmap_inertial.core.options import MappingOptions
+from colmap_inertial.core.threads import one_blas_thread
+from colmap_inertial.core.types import (
+    CameraImuCalibration,
+    CameraModel,
+    CameraTrajectory,
+    Frame,
+    FrameTiming,
+)
+from colmap_inertial.io.capture import Capture, ImageFolder
+from colmap_inertial.io.frames import frame_source, read_frames
+from colmap_inertial.io.images import read_image
+from colmap_inertial.io.names import path_in
+from colmap_inertial.model import colmap_camera, find_models, read_model, trajectory_from_model
+from colmap_inertial.motion.align import AlignOptions, align_clocks
+from colmap_inertial.motion.flow import FlowOptions, VisualRotation, check_motion, find_stabilisation, measure_rotation
+from colmap_inertial.pipeline.run.context import Recording, RunContext
+from colmap_inertial.pipeline.run.progress import Progress
+from colmap_inertial.pipeline.stages.frame_folder import encode_image, seen_by_colmap
+from colmap_inertial.pipeline.stages.gyro_view import GyroView
+from colmap_inertial.pipeline.stages.protocols import FrameStage
+from colmap_inertial.pipeline.stages.rolling_shutter import RollingShutterStage
+
+if TYPE_CHECKING:
+    import pycolmap
+
+log = logging.getLogger(__name__)
+
+#: Frames of the small model: at most so many, at least so far apart; and how COLMAP makes it.
+_MODEL_FRAMES, _MODEL_SPACING_S = 60, 0.24
+#: Frames of one small model, where they are to cover a recording: the cost stays linear in its length.
+_MOST_IN_PART = 240
+_SMALL = MappingOptions(
+    pairing="sequential", overlap=6, max_num_features=1500, first_octave=0, max_image_size=800, refine_intrinsics=None
+)
+#: Frames that are followed by their pixels: at most so many, not closer than this; a video has them closer than that.
+_FLOW_FRAMES, _FLOW_SPACING_S, _VIDEO_STEP_S = 300, 0.06, 0.13
+#: Where a quick look begins at the latest.
+_BEGIN_S = 5.0
+#: A declared calibration that is as good as this needs no search.
+_GOOD_ROTATION_RAD, _GOOD_OFFSET_S = 0.03, 0.005
+#: What is found must be as good as this.
+_USABLE_ROTATION_RAD, _USABLE_OFFSET_S = 0.1, 0.01
+#: COLMAP's guess of a focal length, in longer sides of the image.
+_GUESSED_FOCAL = 1.2
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Precalibration:
+    """What there is before the reconstruction.
+
+    Attributes
+    ----------
+    view
+        Gyroscope, camera and times, brought together.
+    models
+        COLMAP's models of frames all along the recording, of keypoints without the rolling shutter; empty where none
+        were needed.
+    """
+
+    view: GyroView
+    models: tuple[pycolmap.Reconstruction, ...] = ()
+
+
+def some_frames(capture: Capture, timing: FrameTiming, indices: Sequence[int]) -> Iterator[Frame]:
+    """Some frames of a capture, in order of time; of a folder, no other is opened."""
+    if not isinstance(capture.frames, ImageFolder):
+        yield from read_frames(capture, only=[timing.names[i] for i in indices])[1]
+        return
+    for i in sorted(indices):
+        image = read_image(path_in(capture.frames.folder, timing.names[i]))
+        yield Frame(name=timing.names[i], image=image, t_s=float(timing.t_s[i]), camera=capture.camera)
+
+
+def guessed_camera(capture: Capture, timing: FrameTiming) -> CameraModel:
+    """The declared intrinsics, or what COLMAP starts from without any."""
+    if capture.camera is not None:
+        return capture.camera
+    height, width = next(some_frames(capture, timing, [0])).image.shape[:2]
+    params = (_GUESSED_FOCAL * max(width, height), width / 2, height / 2)
+    return CameraModel(model="SIMPLE_PINHOLE", width=width, height=height, params=params)
+
+
+def precalibrate(recording: Recording, context: RunContext) -> Precalibration:
+    """Find the calibration that the treatment of frames needs.
+
+    Parameters
+    ----------
+    recording
+        What is known beforehand is used as it stands where that is enough. Pixels are followed through all frames of a
+        video.
+    context
+        ``progress`` is called with ``"motion"`` and ``"calibration"``.
+
+    Raises
+    ------
+    NotObservableError
+        Where the frames do not turn as the gyroscope does, or were stabilised.
+    """
+    capture, timing, every, progress = recording.capture, recording.timing, recording.every, context.progress
+    camera = guessed_camera(capture, timing)
+    is_video = len(every.t_s) > 1 and float(np.median(np.diff(every.t_s))) <= _VIDEO_STEP_S
+    rotation_rad, offset_s = _sigmas(recording.prior)
+    declared = rotation_rad <= _GOOD_ROTATION_RAD and offset_s <= _GOOD_OFFSET_S
+    along = _middle(every, _FLOW_SPACING_S, _FLOW_FRAMES)
+    rotation = followed(capture, every, camera, along, progress) if is_video else None
+    found: GyroView | NotObservableError
+    models: tuple[pycolmap.Reconstruction, ...] = ()
+    if declared:
+        notes = () if capture.camera is not None else (f"the focal length was guessed: {camera.params[0]:.0f} px",)
+        found = GyroView(
+            imu=recording.imu, timing=timing, calibration=recording.prior, camera=camera, source="capture", notes=notes
+        )
+    else:
+        found, models = _by_model(recording, context)
+        if isinstance(found, NotObservableError):
+            rotation = rotation or followed(capture, every, camera, along, progress)
+            found = _by_pixels(rotation, recording, camera, found)
+    if rotation is not None:
+        known_s = None if isinstance(found, NotObservableError) else found.motion().offset_s
+        stabilised = find_stabilisation(rotation, recording.imu, offset_s=known_s)
+        if stabilised.stabilised:
+            raise NotObservableError("the pixels' motion", stabilised.reason)
+        if not isinstance(found, NotObservableError):
+            agreement = check_motion(rotation, found.motion())
+            if agreement.agrees is False:
+                raise NotObservableError("the pixels' motion", agreement.reason)
+    if isinstance(found, NotObservableError):
+        raise found
+    return Precalibration(view=found, models=models)
+
+
+def survey_parts(timing: FrameTiming) -> list[list[str]]:
+    """Frames all along a recording, not too close together, in parts for small models of their own."""
+    names = [timing.names[i] for i in _spaced(timing, _MODEL_SPACING_S)]
+    return [part.tolist() for part in np.array_split(np.array(names, dtype=object), -(-len(names) // _MOST_IN_PART))]
+
+
+def survey(
+    capture: Capture, view: GyroView, names: Sequence[str], stages: Sequence[FrameStage], context: RunContext
+) -> tuple[pycolmap.Reconstruction, ...]:
+    """COLMAP's small models of some frames; empty where it makes none.
+
+    Parameters
+    ----------
+    capture
+        The recording.
+    view
+        By which keypoints are rectified.
+    names
+        Of the frames, as :func:`survey_parts` has them.
+    stages
+        That they go through.
+    context
+        ``progress`` is called with ``"survey"``.
+    """
+    steps = itertools.count()
+
+    def step(stage: str, done: int, total: int, /) -> None:
+        context.progress("survey", min(next(steps), 10 * len(names)), 10 * len(names))
+
+    with tempfile.TemporaryDirectory(dir=context.scratch) as folder:
+        work = Path(folder)
+        images = _image_folder(capture, view.timing, names, work, stages)
+        try:
+            found = _small_models(capture, images, names, work / "0", view, context.reporting(step))
+        except (MappingError, FormatError) as error:
+            log.info("no survey: %s", error)
+            found = ()
+    context.progress("survey", 1, 1)
+    return found
+
+
+def _sigmas(calibration: CameraImuCalibration) -> tuple[float, float]:
+    """Standard deviations of rotation (rad) and of the gyroscope's time offset (s)."""
+    rotation = calibration.rotation_sigma_rad
+    return rotation, calibration.sigma("gyro_time_offset_s")
+
+
+def _middle(timing: FrameTiming, spacing_s: float, most: int) -> list[int]:
+    """Frames from the middle of a recording, not closer together than asked for."""
+    kept = _spaced(timing, spacing_s)
+    first = max(0, (len(kept) - most) // 2)
+    return kept[first : first + most]
+
+
+def _spaced(timing: FrameTiming, spacing_s: float) -> list[int]:
+    kept = [0]
+    for i, t_s in enumerate(timing.t_s.tolist()):
+        if t_s - timing.t_s[kept[-1]] >= spacing_s:
+            kept.append(i)
+    return kept
+
+
+def near_the_beginning(timing: FrameTiming, spacing_s: float, most: int) -> list[int]:
+    """Frames of a video about so far apart, from a few seconds in at the latest: what lies before is decoded, too."""
+    usual_s = float(np.median(np.diff(timing.t_s))) if len(timing.t_s) > 1 else 0.0
+    kept = _spaced(timing, spacing_s - 0.25 * usual_s)
+    early = int(np.searchsorted(timing.t_s[kept], timing.t_s[0] + _BEGIN_S))
+    first = min(max(0, (len(kept) - most) // 2), early)
+    return kept[first : first + most]
+
+
+def followed(
+    capture: Capture,
+    timing: FrameTiming,
+    camera: CameraModel,
+    indices: Sequence[int],
+    progress: Progress,
+    *,
+    stage: str = "motion",
+) -> VisualRotation:
+    """The rotation between some frames, by their pixels; progress under the name of ``stage``."""
+
+    def counted() -> Iterator[Frame]:
+        for done, frame in enumerate(some_frames(capture, timing, indices)):
+            progress(stage, done, len(indices))
+            yield frame
+        progress(stage, len(indices), len(indices))
+
+    with one_blas_thread():
+        return measure_rotation(counted(), colmap_camera(camera), timing, FlowOptions())
+
+
+def _by_pixels(
+    rotation: VisualRotation, recording: Recording, camera: CameraModel, instead_of: NotObservableError
+) -> GyroView | NotObservableError:
+    try:
+        view = _aligned(rotation.trajectory(), recording, camera, "pixels")
+    except NotObservableError as error:
+        return NotObservableError(error.quantity, f"{error.hint} (nor by a small model: {instead_of})")
+    # what translation does to pixels looks like a bias of the gyroscope
+    return replace(view, calibration=replace(view.calibration, gyro_bias_rad_s=recording.prior.gyro_bias_rad_s))
+
+
+def _aligned(trajectory: CameraTrajectory, recording: Recording, camera: CameraModel, source: str) -> GyroView:
+    options = AlignOptions(max_offset_s=recording.max_offset_s)
+    found = align_clocks(trajectory, recording.imu, prior=recording.prior, options=options)
+    rotation_rad, offset_s = _sigmas(found.calibration)
+    if rotation_rad > _USABLE_ROTATION_RAD or offset_s > _USABLE_OFFSET_S:
+        raise NotObservableError(
+            "camera-IMU calibration",
+            f"before the reconstruction it is known to {math.degrees(rotation_rad):.1f} deg and "
+            f"{1e3 * offset_s:.0f} ms, which is too little: give [calibration] in capture.toml",
+        )
+    return GyroView(
+        imu=recording.imu, timing=recording.timing, calibration=found.settled(), camera=camera, source=source
+    )
+
+
+def _by_model(
+    recording: Recording, context: RunContext
+) -> tuple[GyroView | NotObservableError, tuple[pycolmap.Reconstruction, ...]]:
+    """The calibration by a small model; with a rolling shutter, by a second one of rectified keypoints.
+
+    Also the models, where they are of all the recording.
+    """
+    capture, timing = recording.capture, recording.timing
+    indices = _middle(timing, _MODEL_SPACING_S, _MODEL_FRAMES)
+    whole = len(indices) == len(_spaced(timing, _MODEL_SPACING_S))
+    names = [timing.names[i] for i in indices]
+    rounds = 2 if timing.readout_s else 1
+    steps = itertools.count()
+
+    def step(stage: str, done: int, total: int, /) -> None:
+        context.progress("calibration", min(next(steps), 10 * len(names) * rounds), 10 * len(names) * rounds)
+
+    models: tuple[pycolmap.Reconstruction, ...] = ()
+    with tempfile.TemporaryDirectory(dir=context.scratch) as folder:
+        work = Path(folder)
+        images = _image_folder(capture, timing, names, work)
+        view: GyroView | None = None
+        try:
+            for i in range(rounds):
+                matched = work / "0" if i else None
+                models = _small_models(capture, images, names, work / str(i), view, context.reporting(step), matched)
+                trajectory, _ = trajectory_from_model(models[0], timing, covariances=False)
+                view = _aligned(trajectory, recording, _camera_of(models[0]), "model")
+        except (MappingError, FormatError) as error:
+            return view or NotObservableError("camera-IMU calibration", str(error)), ()
+        except NotObservableError as error:
+            return view or error, ()
+    assert view is not None
+    context.progress("calibration", 1, 1)
+    return view, models if whole else ()
+
+
+def _image_folder(
+    capture: Capture, timing: FrameTiming, names: Sequence[str], work: Path, stages: Sequence[FrameStage] = ()
+) -> Path:
+    """Where some frames are as pictures: with the capture, or written to a folder of work."""
+    images = frame_source(capture)
+    if images is not None and not stages:
+        return images
+    images = work / "images"
+    place = {name: i for i, name in enumerate(timing.names)}
+    frames = some_frames(capture, timing, [place[name] for name in names])
+    for stage in stages:
+        frames = stage(frames)
+    for frame in frames:
+        target = path_in(images, frame.name)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        encode_image(target, seen_by_colmap(frame))
+    return images
+
+
+def _small_models(
+    capture: Capture,
+    images: Path,
+    names: Sequence[str],
+    work: Path,
+    view: GyroView | None,
+    context: RunContext,
+    matched: Path | None = None,
+) -> tuple[pycolmap.Reconstruction, ...]:
+    """COLMAP's models of some frames, the largest first; with a view, of rectified keypoints.
+
+    ``matched``: where models of the same frames were made before, of keypoints as they are: what has been moved already
+    would be moved twice.
+    """
+    work.mkdir()
+    features, database, sparse = work / "features.db", work / "database.db", work / "sparse"
+    cameras = {name: capture.camera for name in names}
+    stages = [] if view is None else [RollingShutterStage(view=view)]
+    pairs = image_pairs(names, _SMALL)
+    if matched is None:
+        extract_features(images, cameras, features, _SMALL, keypoint_stages=stages, context=context)
+        match_features(features, database, pairs, context)
+    else:
+        verify_again(matched / "database.db", database, pairs, stages, context)
+    map_images(
+        database,
+        images,
+        sparse,
+        _SMALL,
+        refine_intrinsics=capture.camera is None,
+        num_images=len(names),
+        context=context,
+    )
+    models = [read_model(folder) for folder in find_models(sparse).values()]
+    return tuple(sorted(models, key=lambda model: -int(model.num_reg_images())))
+
+
+def _camera_of(model: pycolmap.Reconstruction) -> CameraModel:
+    used = next(iter(model.cameras.values()))
+    params = tuple(float(value) for value in used.params)
+    return CameraModel(model=used.model.name, width=used.width, height=used.height, params=params)

@@ -1,0 +1,201 @@
+"""What some of the frames say of the gyroscope, before any is treated."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence, shown_shares
+from colmap_inertial.imaging.gate import (
+    LEAST_SHARE,
+    MUST_SHOW_PX,
+    FrameDecision,
+    GateOptions,
+    RecordingVerdict,
+    judge_recording,
+)
+from colmap_inertial.imaging.parallax import Parallax
+from colmap_inertial.imaging.psf import blur_path
+from colmap_inertial.io.capture import Capture
+from colmap_inertial.model import colmap_camera
+from colmap_inertial.pipeline.run.progress import Progress
+from colmap_inertial.pipeline.stages.gyro_view import GyroView
+from colmap_inertial.reconstruction.precalibrate.calibrate import some_frames
+
+#: A gyroscope that is borne out by this share of them is trusted for all frames.
+_MOST_OF_THEM = 0.95
+#: Of frames that are mostly sky, this share: of the little that stands below it, the fall of detail scatters by .2.
+_MOST_OF_SKIES = 0.85
+#: A frame whose dip is faint bears the gyroscope out, too, where detail falls along the blur as it would have it, and
+#: no other direction shows a dip this deep.
+_OTHER_SUPPORT = 4.0
+#: Pictures whose tiles tell no more than this share of them would if all were alike are mostly sky. Common ones with
+#: short blur are at .8; 70 % of sky leaves .6.
+_STANDING = 0.7
+#: So many frames that are mostly sky bear the gyroscope out where so large a share of them shows the fall of detail,
+#: and they rather show it than the mirrored one by so many standard deviations of the mean. Right gyroscopes have .7 to
+#: 1 and 3.8 to 5.6, wrong ones .45 and 3.2 at most, not both at once.
+_SKY_FRAMES, _SKY_SHARE, _SKY_SIGMAS = 5, 0.65, 3.0
+#: Where the pictures do not bear the gyroscope out, exposure times may be wrong by a common factor; these are tried.
+#: Twice the blur shows a dip, too, where the right one shows a deeper one.
+_EXPOSURE_FACTORS, _EXPOSURE_SUPPORT = (0.5, 2.0), 10.0
+
+
+def judge_frames(
+    view: GyroView,
+    capture: Capture,
+    chosen: Sequence[FrameDecision],
+    parallaxes: Mapping[str, Parallax],
+    progress: Progress,
+) -> RecordingVerdict:
+    """Judge the gyroscope by some frames.
+
+    Parameters
+    ----------
+    view
+        Gyroscope, camera and times.
+    capture
+        Where the frames are.
+    chosen
+        The frames to look at, blurred ones.
+    parallaxes
+        By frame name, where the camera's translation is known to blur.
+    progress
+        Called with ``"blur"``.
+
+    Returns
+    -------
+    Whether it is trusted for all frames, or every frame must bear it out by itself. Where the pictures bear it out but
+    for exposure times that are wrong by one factor, that is corrected, and said.
+    """
+    looked = _look(view, capture, chosen, parallaxes, progress)
+    verdict = judged(looked)
+    factors: tuple[float, ...] = _EXPOSURE_FACTORS
+    if verdict.trusted is True:
+        long_blur = np.median([one.blur_px for one in looked]) >= 2 * MUST_SHOW_PX
+        factors = tuple(factor for factor in factors if factor < 1 and long_blur)
+    return _with_other_exposures(verdict, factors, view, capture, chosen, parallaxes, looked, progress)
+
+
+@dataclass(frozen=True, eq=False)
+class Looked:
+    """What one picture says: its dips, the share that it shows of the predicted fall of detail, that blur, and the
+    share that it shows of what a flipped axis would predict."""
+
+    evidence: BlurEvidence
+    share: float | None
+    blur_px: float
+    mirrored_share: float | None = None
+
+    @property
+    def shows(self) -> bool:
+        """Whether it bears the gyroscope out."""
+        one = self.evidence
+        if self.is_mostly_sky and self.gain >= LEAST_SHARE and (self.share or 0.0) >= LEAST_SHARE:
+            return True
+        if not one.extent_is_plausible:
+            return False
+        other = float(one.sigmas[:, 2:-1].max())
+        faint = self.share is not None and self.share >= LEAST_SHARE and other < _OTHER_SUPPORT
+        return one.support >= GateOptions().min_support or faint
+
+    @property
+    def gain(self) -> float:
+        """By how much it rather shows the gyroscope's direction than the mirrored one."""
+        return np.nan if self.share is None or self.mirrored_share is None else self.share - self.mirrored_share
+
+    @property
+    def is_mostly_sky(self) -> bool:
+        """Whether the few parts that stand out of it would go down among the quiet ones."""
+        standing = self.evidence.standing
+        return standing is not None and standing.tiles < _STANDING * self.evidence.tiles
+
+
+def _look(
+    view: GyroView,
+    capture: Capture,
+    chosen: Sequence[FrameDecision],
+    parallaxes: Mapping[str, Parallax],
+    progress: Progress,
+    factor: float = 1.0,
+) -> list[Looked]:
+    """What some frames say of the blur that is predicted, or of so many times as much."""
+    motion, camera, index = view.motion(), colmap_camera(view.camera), view.index()
+    blur_px = {decision.name: factor * (decision.blur_px or 0.0) for decision in chosen}
+    looked: list[Looked] = []
+    for frame in some_frames(capture, view.timing, [index[d.name] for d in chosen]):
+        progress("blur", len(looked), len(chosen))
+        shutter, parallax = view.shutter(index[frame.name]), parallaxes.get(frame.name)
+        path = blur_path(motion, camera, shutter, parallax=parallax, extent_factor=factor)
+        share, mirrored = shown_shares(frame.image, path)
+        looked.append(Looked(blur_evidence(frame.image, path), share, blur_px[frame.name], mirrored))
+    progress("blur", len(chosen), len(chosen))
+    return looked
+
+
+def _with_other_exposures(
+    verdict: RecordingVerdict,
+    factors: Sequence[float],
+    view: GyroView,
+    capture: Capture,
+    chosen: Sequence[FrameDecision],
+    parallaxes: Mapping[str, Parallax],
+    looked: Sequence[Looked],
+    progress: Progress,
+) -> RecordingVerdict:
+    """The verdict, or where all exposure times are wrong by one factor, that of the pictures with it corrected."""
+    best, deepest = verdict, _together([one.evidence for one in looked])
+    for factor in factors:
+        others = _look(view, capture, chosen, parallaxes, progress, factor)
+        evidence = [one.evidence for one in others]
+        found, support = judged(others), _together(evidence)
+        if found.trusted is True and support >= _EXPOSURE_SUPPORT and support > deepest:
+            whole = factor * found.extent_factor
+            reason = (
+                f"the images bear out the gyroscope's blur ({support:.0f} standard deviations), but for its extent, "
+                f"which is multiplied by {whole:.2f}: the exposure times are wrong by this factor"
+            )
+            best, deepest = replace(found, extent_factor=whole, reason=reason), support
+    return best
+
+
+def _together(evidence: Sequence[BlurEvidence]) -> float:
+    return sum(evidence, BlurEvidence.nothing()).support
+
+
+def judged(looked: Sequence[Looked]) -> RecordingVerdict:
+    """What frames say together, and whether nearly each of them does."""
+    return by_frame(below_sky(judge_recording([one.evidence for one in looked]), looked), looked)
+
+
+def below_sky(verdict: RecordingVerdict, looked: Sequence[Looked]) -> RecordingVerdict:
+    """The verdict; or trust, where the frames are mostly sky and what stands below it falls off as it should."""
+    gains = np.array([one.gain for one in looked if one.is_mostly_sky and np.isfinite(one.gain)])
+    if verdict.trusted is not False or len(gains) < max(_SKY_FRAMES, len(looked) / 2):
+        return verdict
+    shown = sum(one.is_mostly_sky and one.shows for one in looked)
+    sigmas = float(gains.mean() / max(gains.std(ddof=1) / np.sqrt(len(gains)), 1e-9))
+    if shown < _SKY_SHARE * len(gains) or sigmas < _SKY_SIGMAS:
+        return verdict
+    reason = f"what stands below the sky bears out the gyroscope's blur ({sigmas:.0f} standard deviations)"
+    return replace(verdict, trusted=True, support=sigmas, extent_factor=1.0, reason=reason)
+
+
+def by_frame(verdict: RecordingVerdict, looked: Sequence[Looked]) -> RecordingVerdict:
+    """The verdict, unless only some of the frames bear it out: then every frame must do so by itself.
+
+    So it is where the camera moves close to things: they blur by translation, too, which no gyroscope feels.
+    """
+    telling = [one for one in looked if one.evidence.enough and one.blur_px >= MUST_SHOW_PX]
+    shown = sum(one.shows for one in telling)
+    skies = 2 * sum(one.is_mostly_sky for one in telling) > len(telling)
+    most = _MOST_OF_SKIES if skies else _MOST_OF_THEM
+    if verdict.trusted is not True or shown >= most * len(telling):
+        return verdict
+    reason = (
+        f"{shown} of {len(telling)} frames that were looked at bear out the gyroscope's blur, so each frame must do so "
+        "by itself (close to things, the camera's translation blurs, too)"
+    )
+    return replace(verdict, trusted=None, reason=reason)

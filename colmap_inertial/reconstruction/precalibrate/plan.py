@@ -1,0 +1,472 @@
+"""What is done to the frames of a capture before COLMAP sees them, decided once and written down."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_args
+
+import numpy as np
+
+from colmap_inertial.core.errors import InertialError, NotObservableError
+from colmap_inertial.core.gyro import on_camera_rate
+from colmap_inertial.core.options import BlurRemover, DeblurMethod, RollingShutterMethod
+from colmap_inertial.core.types import Array, CameraImuCalibration, CameraModel, FrameTiming, ImuRecording
+from colmap_inertial.imaging.gate import (
+    FrameDecision,
+    GateOptions,
+    RecordingVerdict,
+    decide,
+)
+from colmap_inertial.imaging.parallax import Parallax
+from colmap_inertial.imaging.psf import predicted_blur_px
+from colmap_inertial.io.capture import Capture
+from colmap_inertial.io.files import read_json, write_json
+from colmap_inertial.io.frames import frame_source
+from colmap_inertial.io.image_metadata import stated_exposures_s
+from colmap_inertial.io.names import path_in
+from colmap_inertial.model import colmap_camera
+from colmap_inertial.pipeline.run.context import Recording, RunContext
+from colmap_inertial.pipeline.run.progress import Progress
+from colmap_inertial.pipeline.run.workspace import a_record_of_ours
+from colmap_inertial.pipeline.stages.deblur import SMOOTHING, DeblurStage
+from colmap_inertial.pipeline.stages.gyro_view import GyroView
+from colmap_inertial.pipeline.stages.rolling_shutter import RollingShutterStage
+from colmap_inertial.reconstruction.precalibrate.calibrate import guessed_camera, precalibrate, survey, survey_parts
+from colmap_inertial.reconstruction.precalibrate.judge import judge_frames
+from colmap_inertial.reconstruction.precalibrate.sliding import most_by_sliding_px, sliding_parts
+from colmap_inertial.reconstruction.precalibrate.translation import find_parallaxes
+
+if TYPE_CHECKING:
+    import pycolmap
+
+
+#: Blur below this cannot be told from the texture: where no frame has more, nothing is deblurred.
+_TELLING_PX = 4.0
+#: Standard deviations by which a frame must bear it out by itself, where others do not. With 4, the filter made some
+#: worse; the network, which sees whether the filter's result can be true, is worth using unless a frame speaks against.
+_CLEAR_SUPPORT: dict[BlurRemover, float] = {"wiener": 7.0, "path": 7.0, "deepgyro": 0.0}
+#: What the note says of methods other than the default.
+_SAID_OF = {"deepgyro": "; the network DeepGyro undoes it", "path": "; the half-quadratic filter undoes it"}
+#: How often small models are made, at most, for more of the blurred frames.
+_SURVEYS = 4
+#: While a frame may have been taken: by how many standard deviations of the clocks' offset sooner or later, and how
+#: long a readout is at most that nobody declared.
+_SURE_SIGMAS, _LONGEST_READOUT_S = 4.0, 0.04
+#: Frames by which the gyroscope is judged.
+_JUDGED_FRAMES = 14
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ImagingPlan:
+    """What is to be done to frames and keypoints, and why.
+
+    Where frames must bear out the gyroscope by themselves, they must do so clearly for the filter; for the network it
+    is enough that they do not speak against it.
+
+    Attributes
+    ----------
+    view
+        Gyroscope, camera and times; ``None`` where nothing is to be done.
+    deblur
+        Decisions and verdict for :class:`DeblurStage`; ``None`` where no frame is to be deblurred.
+    method
+        How blur is undone.
+    parallaxes
+        By frame name, where the camera's translation is known to blur.
+    rectify
+        Whether the rolling shutter is undone.
+    deblur_note, rolling_shutter_note
+        What is done, or why not, in words.
+    """
+
+    view: GyroView | None = None
+    deblur: tuple[tuple[FrameDecision, ...], RecordingVerdict] | None = None
+    method: BlurRemover = "wiener"
+    parallaxes: Mapping[str, Parallax] = field(default_factory=dict)
+    rectify: bool = False
+    deblur_note: str = ""
+    rolling_shutter_note: str = ""
+
+    def frame_stages(self, *, drop: bool = True, smoothing: bool = True) -> list[DeblurStage]:
+        """The default frame stages; they need not drop what is too blurred, nor have COLMAP see it smoothed."""
+        if self.view is None or self.deblur is None:
+            return []
+        decisions, verdict = self.deblur
+        gate = GateOptions() if verdict.trusted else GateOptions(min_support=_CLEAR_SUPPORT[self.method])
+        stage = DeblurStage(
+            view=self.view,
+            decisions=decisions,
+            verdict=verdict,
+            parallaxes=self.parallaxes,
+            gate=gate,
+            drop=drop,
+            method=self.method,
+            smoothing=SMOOTHING if smoothing else 0.0,
+        )
+        return [stage]
+
+    def keypoint_stages(self) -> list[RollingShutterStage]:
+        """The default keypoint stages."""
+        return [RollingShutterStage(view=self.view)] if self.view is not None and self.rectify else []
+
+    def as_json(self) -> dict[str, object]:
+        """In JSON types, without the recording."""
+        view = self.view
+        return {
+            "deblur": self.deblur_note,
+            "deblur_method": None if self.deblur is None else self.method,
+            "rolling_shutter": self.rolling_shutter_note,
+            "rectify": self.rectify,
+            "calibration": None
+            if view is None
+            else {
+                **asdict(view.calibration),
+                "source": view.source,
+                "notes": list(view.notes),
+            },
+            "camera": None if view is None else asdict(view.camera),
+            "verdict": None if self.deblur is None else asdict(self.deblur[1]),
+            "decisions": None if self.deblur is None else [asdict(decision) for decision in self.deblur[0]],
+            "parallaxes": {name: parallax.as_json() for name, parallax in self.parallaxes.items()},
+        }
+
+
+def write_plan(path: Path, plan: ImagingPlan) -> None:
+    """Write a plan for :func:`read_plan`."""
+    write_json(path, plan.as_json(), indent=None)
+
+
+def read_plan(path: Path, imu: ImuRecording, timing: FrameTiming) -> ImagingPlan:
+    """The plan that :func:`write_plan` wrote for the same recording."""
+    values: dict[str, Any] = read_json(path)
+    with a_record_of_ours(path):
+        view = None
+        if values["calibration"] is not None:
+            found = dict(values["calibration"])
+            camera = values["camera"]
+            view = GyroView(
+                imu=imu,
+                timing=timing,
+                source=found.pop("source"),
+                notes=tuple(found.pop("notes")),
+                calibration=CameraImuCalibration(**found),
+                camera=CameraModel(**{**camera, "params": tuple(camera["params"])}),
+            )
+        deblur = None
+        if values["decisions"] is not None:
+            decisions = tuple(FrameDecision(**decision) for decision in values["decisions"])
+            deblur = decisions, RecordingVerdict(**values["verdict"])
+        return ImagingPlan(
+            view=view,
+            deblur=deblur,
+            method=values["deblur_method"] or "wiener",
+            parallaxes={name: Parallax.from_json(parallax) for name, parallax in values["parallaxes"].items()},
+            rectify=values["rectify"],
+            deblur_note=values["deblur"],
+            rolling_shutter_note=values["rolling_shutter"],
+        )
+
+
+def with_stated_exposures(capture: Capture, timing: FrameTiming) -> FrameTiming:
+    """The timing with exposure times from the pictures' EXIF, where nothing else gives them."""
+    source = frame_source(capture)
+    if timing.exposure_s is not None or source is None:
+        return timing
+    stated = stated_exposures_s([path_in(source, name) for name in timing.names])
+    return timing if stated is None else replace(timing, exposure_s=stated)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Treatments:
+    """What is to be done to frames and keypoints.
+
+    Attributes
+    ----------
+    deblur, rolling_shutter
+        ``None`` does what the recording allows; what is asked for by name and not possible is an error.
+    pairs
+        Whether frames are fused of short and long exposures, and not deblurred.
+    frames_by_others, keypoints_by_others
+        Whether the default frame or keypoint stages do not run, so that nothing is to be decided for them.
+    """
+
+    deblur: DeblurMethod | None = None
+    rolling_shutter: RollingShutterMethod | None = None
+    pairs: bool = False
+    frames_by_others: bool = False
+    keypoints_by_others: bool = False
+
+
+def plan_imaging(recording: Recording, context: RunContext, asked: Treatments) -> ImagingPlan:
+    """Decide what is done to frames and keypoints.
+
+    Parameters
+    ----------
+    recording
+        See :func:`with_stated_exposures`.
+    context
+        ``progress`` is called with ``"motion"``, ``"calibration"``, ``"survey"`` and ``"blur"``.
+    asked
+        What is to be done.
+
+    Raises
+    ------
+    NotObservableError
+        Where deblurring or rectifying was asked for by name, and the gyroscope does not belong to the pixels.
+    InertialError
+        Where rectifying was asked for and the readout is unknown.
+    """
+    capture, timing = recording.capture, recording.timing
+    if asked.rolling_shutter == "rectify" and timing.readout_s is None:
+        raise InertialError(
+            f"{capture.path}: undoing the rolling shutter needs readout_s under [timing], the time from the first row "
+            "to the last"
+        )
+    why_not = _no_deblurring(recording, asked, context.progress)
+    no_rectifying = _no_rectifying(timing, asked)
+    source = f" ({capture.readout_source})" if capture.readout_source else ""
+    rectifying = f"keypoints are rectified, readout {1e3 * (timing.readout_s or 0):.1f} ms{source}"
+    plan = ImagingPlan(
+        method="wiener" if asked.deblur is None or asked.deblur == "off" else asked.deblur,
+        rectify=not no_rectifying,
+        deblur_note=why_not,
+        rolling_shutter_note=no_rectifying or rectifying,
+    )
+    if why_not and not plan.rectify and not asked.pairs:
+        return plan
+    no_gyro = _no_gyro_for_pairs(recording) if asked.pairs else ""
+    if not plan.rectify and no_gyro:
+        return replace(plan, deblur_note=_aligned_note(no_gyro))
+    try:
+        found = precalibrate(recording, context)
+    except NotObservableError as error:
+        by_name = [
+            asked.deblur in get_args(BlurRemover) and not why_not,
+            asked.rolling_shutter == "rectify" and plan.rectify,
+        ]
+        if any(by_name):
+            raise
+        untreated = f"frames stay as they were filmed: {error}"
+        return ImagingPlan(
+            deblur_note=_aligned_note(str(error)) if asked.pairs else why_not or untreated,
+            rolling_shutter_note=untreated if plan.rectify else plan.rolling_shutter_note,
+        )
+    plan = replace(plan, view=found.view)
+    if asked.pairs:
+        return replace(plan, deblur_note=_aligned_note(no_gyro))
+    if why_not:
+        return plan
+
+    def models(names: Sequence[str], plan: ImagingPlan | None) -> tuple[pycolmap.Reconstruction, ...]:
+        if plan is None and found.models:
+            return found.models
+        stages = [] if plan is None else plan.frame_stages(drop=False)
+        return survey(capture, found.view, names, stages, context)
+
+    def sliding(parts: Sequence[Sequence[str]]) -> list[bool]:
+        camera = found.view.camera
+        return sliding_parts(recording, camera, parts, _limit_px(camera), context.progress, motion=found.view.motion())
+
+    return _deblurring(plan, found.view, capture, models, sliding, context.progress)
+
+
+def _no_rectifying(timing: FrameTiming, asked: Treatments) -> str:
+    """Why keypoints are not rectified; empty where they are."""
+    if asked.keypoints_by_others:
+        return "left to the keypoint stages that were given"
+    if asked.rolling_shutter == "off":
+        return "not asked for"
+    if timing.readout_s is None:
+        return (
+            "the readout is unknown: give readout_s under [timing] in capture.toml (docs/devices says where to find it)"
+        )
+    return "" if timing.readout_s else "global shutter"
+
+
+def _limit_px(camera: CameraModel) -> float:
+    """Blur of which a frame must have more to be looked at and treated, px of the picture as it is."""
+    return max(_TELLING_PX, GateOptions().skip_below_px * max(camera.width, camera.height) / 1920)
+
+
+def _no_deblurring(recording: Recording, asked: Treatments, progress: Progress) -> str:
+    """Why no frame of a recording can be deblurred; empty where some may be."""
+    timing = recording.timing
+    if asked.frames_by_others:
+        return "left to the frame stages that were given"
+    if asked.deblur == "off" or asked.pairs:
+        return "not asked for"
+    if timing.exposure_s is None:
+        return (
+            "frames stay as they were filmed: the exposure time is unknown; give exposure_s under [timing] in "
+            "capture.toml, or a column of it in the frame times"
+        )
+    camera = guessed_camera(recording.capture, timing)
+    most_px = _most_turned_rad(recording, timing.exposure_s) * 1.2 * colmap_camera(camera).mean_focal_length()
+    limit_px = _limit_px(camera)
+    if most_px >= limit_px:
+        return ""
+    why_not = f"no frame has more than {most_px:.1f} px of blur, by the quickest turn that the gyroscope felt"
+    if most_by_sliding_px(timing, camera) < limit_px:
+        return why_not
+    if any(sliding_parts(recording, camera, survey_parts(timing), limit_px, progress)):
+        return ""
+    return f"{why_not}, and by how far pixels move from frame to frame"
+
+
+def _most_turned_rad(recording: Recording, exposure_s: Array) -> float:
+    """By how much the camera turned during an exposure at the most: as quickly as ever while it may have been taken."""
+    timing, prior = recording.timing, recording.prior
+    imu = on_camera_rate(recording.imu, prior, camera_epoch_ns=timing.epoch_ns)
+    rate_rad_s = np.linalg.norm(imu.gyro_rad_s, axis=1)
+    stamps_s = imu.gyro_t_s + prior.gyro_time_offset_s + (imu.epoch_ns - timing.epoch_ns) * 1e-9
+    margin_s = _SURE_SIGMAS * prior.sigma("gyro_time_offset_s")
+    longest_s = _LONGEST_READOUT_S if timing.readout_s is None else timing.readout_s
+    # a sample more on each side
+    first = np.searchsorted(stamps_s, timing.t_s - margin_s) - 1
+    last = np.searchsorted(stamps_s, timing.t_s + longest_s + exposure_s + margin_s, side="right") + 1
+    within = [
+        rate_rad_s[a:b].max() if a >= 0 and b <= len(rate_rad_s) else rate_rad_s.max()
+        for a, b in zip(first.tolist(), last.tolist(), strict=True)
+    ]
+    return float(np.max(np.array(within) * exposure_s))
+
+
+def _no_gyro_for_pairs(recording: Recording) -> str:
+    """Why a gyroscope cannot align pairs of exposures; empty where it may."""
+    exposures, timing = recording.capture.exposures, recording.timing
+    if timing.exposure_s is None:
+        return (
+            "the short ones' exposure time is unknown; give exposure_s under [timing] in capture.toml, or a column of "
+            "it in the frame times"
+        )
+    if exposures is None or exposures.timing(timing) is None:
+        return (
+            "start or length of the long exposures is unknown; give times with a column exposure_s, or long_delay_s "
+            "and long_exposure_s, under [exposures] in capture.toml"
+        )
+    return ""
+
+
+def _aligned_note(no_gyro: str) -> str:
+    return "short and long exposures are fused, aligned by the " + (
+        f"pixels alone: {no_gyro}" if no_gyro else "gyroscope and the pixels"
+    )
+
+
+def _deblurring(
+    plan: ImagingPlan,
+    view: GyroView,
+    capture: Capture,
+    models: Callable[[Sequence[str], ImagingPlan | None], tuple[pycolmap.Reconstruction, ...]],
+    sliding: Callable[[Sequence[Sequence[str]]], Sequence[bool]],
+    progress: Progress,
+) -> ImagingPlan:
+    """The plan with what is to be deblurred, by the gyroscope and by what small models tell of the translation.
+
+    ``models`` makes them of some frames as filmed, or as a plan has them. Where frames were too blurred for a model,
+    those around them, and the IMU beyond, tell how to deblur them for the next one. ``sliding`` says in which of some
+    parts frames are blurred although the camera does not turn: of these small models are made, too.
+    """
+    decisions = _decisions(view, {})
+    parts, place = survey_parts(view.timing), view.index()
+    begins_s = view.timing.t_s[[place[names[0]] for names in parts]]
+
+    def by_part(names: set[str]) -> dict[int, set[str]]:
+        out: dict[int, set[str]] = {}
+        for name in names:
+            part = int(np.searchsorted(begins_s, view.timing.t_s[place[name]], side="right")) - 1
+            out.setdefault(part, set()).add(name)
+        return out
+
+    lost = by_part(_to_deblur(decisions)) if _blurred(decisions) else {}
+    others = [i for i in range(len(parts)) if i not in lost]
+    lost |= {i: set() for i, slides in zip(others, sliding([parts[i] for i in others]), strict=True) if slides}
+    if not lost:
+        return _decided(plan, view, capture, {}, progress)
+    found: dict[int, _Surveyed] = {}
+    treated = None
+    for _ in range(_SURVEYS):
+        better = False
+        for i in sorted(lost):
+            new = _Surveyed.of(models(parts[i], treated), view)
+            if i not in found or len(new.registered) > len(found[i].registered):
+                found[i], better = new, True
+        if not better:
+            break
+        # of two parts that tell about a frame, its own goes first
+        parallaxes = {name: one for part in found.values() for name, one in part.parallaxes.items()}
+        own = by_part(set(parallaxes))
+        parallaxes |= {n: found[i].parallaxes[n] for i in found for n in own.get(i, ()) if n in found[i].parallaxes}
+        decisions = _decisions(view, parallaxes)
+        treated = _decided(plan, view, capture, parallaxes, progress)
+        registered = {name for part in found.values() for name in part.registered}
+        known = {i: names & set(parts[i]) - registered for i, names in by_part(_to_deblur(decisions)).items()}
+        lost = {i: names for i, names in known.items() if names}
+        if not parallaxes or not lost or not treated.frame_stages():
+            break
+    assert treated is not None
+    return treated
+
+
+@dataclass(frozen=True, eq=False)
+class _Surveyed:
+    """What the small models of a part of a recording tell."""
+
+    parallaxes: Mapping[str, Parallax]
+    registered: frozenset[str]
+
+    @classmethod
+    def of(cls, models: Sequence[pycolmap.Reconstruction], view: GyroView) -> _Surveyed:
+        registered = frozenset(model.image(i).name for model in models for i in model.reg_image_ids())
+        return cls(parallaxes=find_parallaxes(models, view), registered=registered)
+
+
+def _to_deblur(decisions: Sequence[FrameDecision]) -> set[str]:
+    return {decision.name for decision in decisions if decision.action == "deblur"}
+
+
+def _decisions(view: GyroView, parallaxes: Mapping[str, Parallax]) -> tuple[FrameDecision, ...]:
+    """What to do with each frame, before any is looked at."""
+    width, height = view.camera.width, view.camera.height
+    motion, camera = view.motion(), colmap_camera(view.camera)
+    predicted = predicted_blur_px(motion, camera, view.timing, width=width, height=height, parallaxes=parallaxes)
+    return _keeping_ends(decide(predicted, view.timing.t_s, width=width, height=height, motion=motion))
+
+
+def _blurred(decisions: Sequence[FrameDecision]) -> list[FrameDecision]:
+    """The frames by which to judge, the most blurred first."""
+    telling = [d for d in decisions if d.action == "deblur" and (d.blur_px or 0) >= _TELLING_PX]
+    return sorted(telling, key=lambda d: -(d.blur_px or 0))[:_JUDGED_FRAMES]
+
+
+def _decided(
+    plan: ImagingPlan, view: GyroView, capture: Capture, parallaxes: Mapping[str, Parallax], progress: Progress
+) -> ImagingPlan:
+    decisions = _decisions(view, parallaxes)
+    chosen = _blurred(decisions)
+    if not chosen:
+        known = [d.blur_px for d in decisions if d.blur_px is not None]
+        most = f"{max(known):.1f} px" if known else "nothing"
+        return replace(plan, deblur_note=f"frames stay as they were filmed: the gyroscope predicts {most} of blur")
+    verdict = judge_frames(view, capture, chosen, parallaxes, progress)
+    note = f"{sum(d.action == 'deblur' for d in decisions)} of {len(decisions)} frames are blurred; {verdict.reason}"
+    used = {name: parallaxes[name] for name in _to_deblur(decisions) if name in parallaxes}
+    if used:
+        note += f"; the camera's translation is counted in for {len(used)} frames"
+    if plan.method in _SAID_OF and verdict.trusted is not False:
+        note += _SAID_OF[plan.method]
+    return replace(plan, deblur=(decisions, verdict), parallaxes=used, deblur_note=note)
+
+
+def _keeping_ends(decisions: tuple[FrameDecision, ...]) -> tuple[FrameDecision, ...]:
+    """No frame is dropped before the first or after the last one that stays: nothing would bridge the gap."""
+    stay = [i for i, decision in enumerate(decisions) if decision.action != "drop"]
+    first, last = (stay[0], stay[-1]) if stay else (len(decisions), -1)
+    return tuple(
+        replace(d, action="deblur", reason=f"{d.blur_px:.0f} px of blur are too many, but no frame is beyond it")
+        if d.action == "drop" and not first < i < last
+        else d
+        for i, d in enumerate(decisions)
+    )

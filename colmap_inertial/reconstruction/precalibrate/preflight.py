@@ -1,0 +1,155 @@
+"""What ``diagnose`` looks at, read from captures, sources of ``scale`` and IMU files; and the stop before mapping."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from typing import Literal
+
+import numpy as np
+
+from colmap_inertial.checks.diagnose import Diagnosis, Recorded, diagnose
+from colmap_inertial.core.errors import FormatError, NotObservableError
+from colmap_inertial.core.threads import one_blas_thread
+from colmap_inertial.core.types import CameraTrajectory, Frame, FrameTiming
+from colmap_inertial.io.capture import Capture
+from colmap_inertial.io.imu import RawImu
+from colmap_inertial.io.pose_convention import COLMAP
+from colmap_inertial.model import colmap_camera
+from colmap_inertial.motion.flow import VisualRotation
+from colmap_inertial.motion.turns import measure_turns
+from colmap_inertial.pipeline.run.context import Recording
+from colmap_inertial.pipeline.run.progress import Progress
+from colmap_inertial.reconstruction.precalibrate.calibrate import (
+    followed,
+    guessed_camera,
+    near_the_beginning,
+    some_frames,
+)
+
+log = logging.getLogger(__name__)
+
+
+#: Frames that are followed by their pixels come at least so often; how many are, before a reconstruction and when
+#: asked to diagnose, and how far apart at least.
+_VIDEO_STEP_S = 0.13
+_FEW, _FEW_SPACING_S = 90, 0.09
+#: Pictures further apart that are compared two by two.
+_COMPARED = 60
+
+#: What makes a reconstruction in metres meaningless.
+STOPPING = frozenset(
+    {
+        "stabilised",
+        "gravity-removed",
+        "pose-convention",
+        "imu-does-not-fit",
+        "gyro-mirrored",
+        "gyro-in-deg",
+        "gyro-not-in-deg",
+        "frame-rate",
+        "clock-offset",
+    }
+)
+
+
+def checked_imu(raw: RawImu, *, force: bool) -> RawImu:
+    """An inertial recording, refused where its numbers are implausible.
+
+    Parameters
+    ----------
+    force
+        Take one without gravity, too: its scale will be refused, its gyroscope still serves.
+
+    Raises
+    ------
+    FormatError
+        As ``RawImu.check``.
+    NotObservableError
+        Where gravity was taken out.
+    """
+    try:
+        raw.check()
+    except FormatError as error:
+        if error.code != "gravity-removed":
+            raise
+        if not force:
+            raise NotObservableError("scale", f"{error} (--force goes on)") from None
+    return raw
+
+
+def preflight(
+    recording: Recording,
+    raw: RawImu,
+    progress: Progress,
+    *,
+    model: CameraTrajectory | Literal["untimed"] | None = None,
+) -> Diagnosis:
+    """The checks before a reconstruction, or of a ``model`` by its trajectory: all but what needs many images."""
+    capture, timing = recording.capture, recording.timing
+    rotation = None
+    if model is None and (capture.frame_log is None or not capture.frame_log.stabilised):
+        rotation = _followed(capture, timing, _FEW, _FEW_SPACING_S, progress)
+    return diagnose(
+        Recorded(
+            imu=raw.imu,
+            gyro_axes=raw.gyro_axes,
+            accel_axes=raw.accel_axes,
+            timing=timing,
+            log=capture.frame_log,
+            is_capture=model is None,
+            rotation=rotation,
+            camera=capture.camera,
+            calibration=recording.prior,
+            trajectory=None if isinstance(model, str) else model,
+            read_as=COLMAP,
+            max_offset_s=recording.max_offset_s,
+        )
+    )
+
+
+def stop_or_doubt(diagnosis: Diagnosis, *, force: bool) -> tuple[str, ...]:
+    """Stop where the recording cannot give metres; when forced to go on, the reasons not to trust them.
+
+    Raises
+    ------
+    NotObservableError
+        With the finding's words.
+    """
+    for finding in diagnosis.findings:
+        log.info("%s: %s: %s", finding.severity, finding.code, finding.evidence)
+    stopping = [finding for finding in diagnosis.findings if finding.code in STOPPING and finding.severity == "error"]
+    if stopping and not force:
+        first = stopping[0]
+        raise NotObservableError("scale", f"{first.evidence}; {first.advice} (--force goes on)")
+    for finding in stopping:
+        log.warning("forced to go on: %s", finding.evidence)
+    return tuple(f"{finding.evidence}; forced to go on" for finding in stopping)
+
+
+def _followed(
+    capture: Capture, timing: FrameTiming, most: int, spacing_s: float, progress: Progress
+) -> VisualRotation | None:
+    """The rotation between frames from the beginning of a video; ``None`` for pictures further apart."""
+    if len(timing.t_s) < 2 or float(np.median(np.diff(timing.t_s))) > _VIDEO_STEP_S:
+        return None
+    indices = near_the_beginning(timing, spacing_s, most)
+    return followed(capture, timing, guessed_camera(capture, timing), indices, progress)
+
+
+def compared(capture: Capture, timing: FrameTiming, progress: Progress) -> VisualRotation | None:
+    """The rotation between pictures that are too far apart in time to be followed; ``None`` for fewer than five."""
+    if len(timing.t_s) < 5:
+        return None
+    first = max(0, (len(timing.t_s) - _COMPARED) // 2)
+    indices = range(first, min(first + _COMPARED, len(timing.t_s)))
+
+    def counted() -> Iterator[Frame]:
+        for done, frame in enumerate(some_frames(capture, timing, indices)):
+            progress("motion", done, len(indices))
+            yield frame
+        progress("motion", len(indices), len(indices))
+
+    camera = colmap_camera(guessed_camera(capture, timing))
+    with one_blas_thread():
+        return measure_turns(counted(), camera, timing)

@@ -1,0 +1,369 @@
+"""Which frames of a capture the reconstruction uses, decided once and written down.
+
+The gyroscope ranks frames before any is decoded, where its clock is known against the camera's: from the capture, or by
+following the pixels of some frames. Otherwise their sharpness decides.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.gyro import on_camera_rate
+from colmap_inertial.core.options import FrameOptions
+from colmap_inertial.core.threads import one_blas_thread
+from colmap_inertial.core.types import Array, CameraModel, FrameTiming
+from colmap_inertial.imaging.gyro_camera import GyroCamera
+from colmap_inertial.imaging.psf import predicted_blur_px
+from colmap_inertial.imaging.selection import Chosen, Ranked, Ranking, WindowLimits, choose_frames
+from colmap_inertial.io.capture import Capture, Video
+from colmap_inertial.io.files import read_json, write_json
+from colmap_inertial.io.frames import read_reduced
+from colmap_inertial.model import colmap_camera
+from colmap_inertial.motion.align import AlignOptions, align_clocks
+from colmap_inertial.motion.flow import check_motion
+from colmap_inertial.pipeline.run.context import Recording
+from colmap_inertial.pipeline.run.progress import Progress
+from colmap_inertial.pipeline.run.runner import remove
+from colmap_inertial.pipeline.run.session import Session
+from colmap_inertial.pipeline.run.workspace import a_record_of_ours
+from colmap_inertial.reconstruction.precalibrate.calibrate import followed, guessed_camera, near_the_beginning
+
+log = logging.getLogger(__name__)
+
+Int = NDArray[np.intp]
+
+#: Of several frames within so much time, the least blurred one is looked at; pictures are looked at in this size.
+_SLOT_S, _LOOKED_PX = 1 / 30, 960
+#: Frames that are followed to find the offset between the clocks: how many, how far apart.
+_FOLLOWED, _FOLLOWED_SPACING_S = 300, 0.06
+#: A rotation and an offset as good as these serve.
+_ROTATION_RAD, _OFFSET_S = 0.1, 0.01
+#: Blur below this, for a picture of 1920 px, cannot be seen.
+_SHARP_PX = 1.0
+#: Exposure is at most this where it is unknown; angular speed is looked at in so many instants of it.
+_USUAL_EXPOSURE_S, _INSTANTS = 1 / 60, 5
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Selection:
+    """Frames to use, and why.
+
+    Attributes
+    ----------
+    names
+        In order of time.
+    frames
+        How many the capture has.
+    note
+        How they were chosen, in words.
+    windows
+        For each chosen frame; empty where all are used. Places count the capture's frames.
+    offset_s, offset_sigma_s, offset_from
+        Camera time = gyroscope stamp + offset, as used for ranking; ``offset_from`` is ``"capture"``, ``"pixels"`` or
+        ``None``. From pixels, it holds in the middle of the frames that were followed; elsewhere the difference between
+        the clocks' rates, which ``note`` states, adds to it.
+    """
+
+    names: tuple[str, ...]
+    frames: int
+    note: str
+    windows: tuple[Chosen, ...] = ()
+    offset_s: float | None = None
+    offset_sigma_s: float | None = None
+    offset_from: str | None = None
+
+    def timing(self, every: FrameTiming) -> FrameTiming:
+        """The timing of the frames to use."""
+        return part_of(every, self.names)
+
+    def as_json(self) -> dict[str, object]:
+        """In JSON types: one list for each property of the windows, and the frames left out as ranges."""
+        kept = [window.place for window in self.windows] if self.windows else list(range(self.frames))
+        edges = [-1, *kept, self.frames]
+        return {
+            "frames": self.frames,
+            "used": len(self.names),
+            "note": self.note,
+            "offset_s": self.offset_s,
+            "offset_sigma_s": self.offset_sigma_s,
+            "offset_from": self.offset_from,
+            "windows": {
+                key: [_plain(getattr(window, key)) for window in self.windows]
+                for key in ("place", "first", "last", "closed_by", "ranked_by", "blur", "baseline", "motion")
+            },
+            "left_out": [[a + 1, b - 1] for a, b in itertools.pairwise(edges) if b - a > 1],
+        }
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, float):
+        return None if np.isnan(value) else round(value, 4)
+    return value
+
+
+def part_of(timing: FrameTiming, names: Collection[str]) -> FrameTiming:
+    """The timing of some frames."""
+    wanted = set(names)
+    keep = np.array([name in wanted for name in timing.names])
+    return replace(
+        timing,
+        names=tuple(name for name in timing.names if name in wanted),
+        t_s=timing.t_s[keep],
+        exposure_s=None if timing.exposure_s is None else timing.exposure_s[keep],
+    )
+
+
+def everything(timing: FrameTiming, note: str) -> Selection:
+    """All frames."""
+    return Selection(names=timing.names, frames=len(timing.names), note=note)
+
+
+def use_all(capture: Capture, options: FrameOptions) -> str:
+    """Why all frames of a capture are used; empty where they are to be selected."""
+    if options.use == "all":
+        return "all frames, as asked for"
+    if options.use is None and not isinstance(capture.frames, Video):
+        return "all pictures of the folder"
+    if options.use is None and isinstance(capture.frames, Video) and capture.frames.frames_per_s is not None:
+        return "as frames_per_s in capture.toml has it"
+    return ""
+
+
+def write_selection(path: Path, selection: Selection) -> None:
+    """Write a selection for :func:`read_selection`."""
+    windows = [{key: _or_none(value) for key, value in asdict(window).items()} for window in selection.windows]
+    write_json(path, {**asdict(selection), "windows": windows})
+
+
+def _or_none(value: object) -> object:
+    return None if isinstance(value, float) and np.isnan(value) else value
+
+
+def _chosen(window: dict[str, Any]) -> Chosen:
+    known: dict[str, Any] = {key: np.nan if value is None else value for key, value in window.items()}
+    return Chosen(**known)
+
+
+def read_selection(path: Path) -> Selection:
+    """The selection that :func:`write_selection` wrote."""
+    values: dict[str, Any] = read_json(path)
+    with a_record_of_ours(path):
+        windows = tuple(_chosen(window) for window in values.pop("windows"))
+        return Selection(**{**values, "names": tuple(values["names"])}, windows=windows)
+
+
+def run_selection(session: Session, recording: Recording, options: FrameOptions) -> Selection:
+    """The frames to use, by :func:`select_frames` or all of them."""
+    selection_file = session.workspace.selection
+    why_all = use_all(recording.capture, options)
+    if why_all:
+        remove(selection_file)
+        return everything(recording.timing, why_all)
+
+    def work(partial: Sequence[Path]) -> None:
+        write_selection(partial[0], select_frames(recording, options, session.progress))
+
+    session.runner.run("selection", {**recording.identity(), "frames": options}, [selection_file], work)
+    selection = read_selection(selection_file)
+    log.info("frames: %s", selection.note)
+    return selection
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Clocks:
+    """What is known of gyroscope and camera before a reconstruction.
+
+    ``motion`` is ``None`` where the offset is unknown; its orientation counts only where ``oriented``. The offset is as
+    good as ``offset_sigma_s`` at ``middle_s``, camera clock, and worse the farther from there.
+    """
+
+    motion: GyroCamera | None
+    oriented: bool
+    camera: CameraModel
+    note: str
+    offset_s: float | None = None
+    offset_sigma_s: float | None = None
+    offset_from: str | None = None
+    rate_sigma: float = 0.0
+    middle_s: float = 0.0
+
+    def usable(self, t_s: Array) -> NDArray[np.bool_]:
+        """(N,) at which times the offset is good enough."""
+        sigma_s = 0.0 if self.offset_sigma_s is None else self.offset_sigma_s
+        return np.asarray(np.hypot(sigma_s, self.rate_sigma * (t_s - self.middle_s)) <= _OFFSET_S)
+
+
+def select_frames(recording: Recording, options: FrameOptions, progress: Progress) -> Selection:
+    """Choose the frames to use: about ``min_fps`` to ``max_fps`` a second, each the least blurred of its window.
+
+    Parameters
+    ----------
+    recording
+        With the timing of all its frames.
+    options
+        How many.
+    progress
+        Called with ``"clocks"`` and ``"selection"``.
+
+    Raises
+    ------
+    FormatError
+        For a frame that cannot be decoded.
+    """
+    capture, timing = recording.capture, recording.timing
+    with one_blas_thread():
+        clocks = _clocks(recording, progress)
+        blur, ranking = _predicted(clocks, timing)
+        looked = _slots(timing.t_s, blur)
+        pose_t_s = timing.pose_t_s()[looked]
+        turning = np.full((len(looked), 3, 3), np.nan)
+        if clocks.motion is not None and clocks.oriented:
+            turning = clocks.motion.start_from_cam(pose_t_s)
+            turning[~(clocks.motion.covers(pose_t_s, pose_t_s) & clocks.usable(pose_t_s))] = np.nan
+        ranked = Ranked(
+            t_s=timing.t_s[looked],
+            blur=blur[looked],
+            ranking=ranking,
+            sharp_below=_SHARP_PX * max(clocks.camera.width, clocks.camera.height) / 1920 if ranking == "blur" else 0.0,
+            start_from_cam=turning,
+        )
+        names = [timing.names[i] for i in looked]
+
+        def pictures() -> Iterator[NDArray[np.uint8]]:
+            for done, (_, picture) in enumerate(read_reduced(capture, names, _LOOKED_PX)):
+                progress("selection", done, len(names))
+                yield picture
+            progress("selection", len(names), len(names))
+
+        chosen = choose_frames(
+            pictures(),
+            ranked,
+            WindowLimits(shortest_s=1 / options.max_fps, longest_s=1 / options.min_fps),
+            colmap_camera(clocks.camera),
+            width=clocks.camera.width,
+            height=clocks.camera.height,
+        )
+        windows = tuple(
+            replace(w, place=int(looked[w.place]), first=int(looked[w.first]), last=int(looked[w.last])) for w in chosen
+        )
+    ways = {window.ranked_by for window in windows}
+    how = {"blur": "predicted blur", "speed": "angular speed", "sharpness": "sharpness of the pictures"}
+    return Selection(
+        names=tuple(timing.names[window.place] for window in windows),
+        frames=len(timing.names),
+        note=f"{len(windows)} of {len(timing.names)} frames, by {' and '.join(how[way] for way in sorted(ways))}; "
+        + clocks.note,
+        windows=windows,
+        offset_s=clocks.offset_s,
+        offset_sigma_s=clocks.offset_sigma_s,
+        offset_from=clocks.offset_from,
+    )
+
+
+def _slots(t_s: Array, blur: Array) -> Int:
+    """The frames to look at: every one of a usual video, of a quicker one the least blurred in each slot."""
+    slot = np.floor((t_s - t_s[0]) / _SLOT_S + 0.5).astype(np.int64)
+    if len(t_s) < 2 or float(np.median(np.diff(t_s))) > 0.9 * _SLOT_S:
+        return np.arange(len(t_s))
+    order = np.lexsort((np.arange(len(t_s)), np.where(np.isnan(blur), np.inf, blur), slot))
+    first = np.concatenate([[True], np.diff(slot[order]) > 0])
+    return np.sort(order[first])
+
+
+def _predicted(clocks: _Clocks, timing: FrameTiming) -> tuple[Array, Ranking]:
+    """What ranks every frame, NaN where the gyroscope says nothing, and what it is."""
+    motion = clocks.motion
+    if motion is None:
+        return np.full(len(timing.t_s), np.nan), "speed"
+    if clocks.oriented and timing.exposure_s is not None:
+        width, height = clocks.camera.width, clocks.camera.height
+        blur = predicted_blur_px(motion, colmap_camera(clocks.camera), timing, width=width, height=height).px
+        return np.where(clocks.usable(timing.t_s), blur, np.nan), "blur"
+    exposure_s = timing.exposure_s
+    if exposure_s is None:
+        step_s = float(np.median(np.diff(timing.t_s))) if len(timing.t_s) > 1 else np.inf
+        exposure_s = np.full(len(timing.t_s), min(_USUAL_EXPOSURE_S, 0.5 * step_s))
+    span_s = exposure_s + (timing.readout_s or 0.0)
+    at_s = timing.t_s[:, None] + span_s[:, None] * (np.arange(_INSTANTS) + 0.5) / _INSTANTS
+    speed = np.linalg.norm(motion.rate_in_cam_rad_s(at_s.ravel()), axis=1).reshape(at_s.shape).mean(axis=1)
+    loss = speed if timing.exposure_s is None else speed * exposure_s
+    known = motion.covers(timing.t_s, timing.t_s + span_s) & clocks.usable(timing.t_s)
+    return np.where(known, loss, np.nan), "speed"
+
+
+def _clocks(recording: Recording, progress: Progress) -> _Clocks:
+    capture, imu, timing, prior = recording.capture, recording.imu, recording.timing, recording.prior
+    camera = guessed_camera(capture, timing)
+    rotation_rad = prior.rotation_sigma_rad
+    offset_sigma_s = prior.sigma("gyro_time_offset_s")
+    known = _Clocks(
+        motion=GyroCamera.of(imu, prior, camera_epoch_ns=timing.epoch_ns),
+        oriented=rotation_rad <= _ROTATION_RAD,
+        camera=camera,
+        note=f"the clocks' offset is the capture's, to {1e3 * offset_sigma_s:.0f} ms",
+        offset_s=prior.gyro_time_offset_s,
+        offset_sigma_s=offset_sigma_s,
+        offset_from="capture",
+    )
+    if offset_sigma_s <= _OFFSET_S and known.oriented:
+        return known
+    log_of = capture.frame_log
+    if log_of is not None and log_of.in_video_time and capture.shared_clock and offset_sigma_s > _OFFSET_S:
+        # the recorder stamped frames and samples by one clock; measured on such files: some milliseconds
+        offset_sigma_s = _OFFSET_S
+        note = "the recorder stamped frames and gyroscope by one clock"
+        known = replace(known, oriented=False, note=note, offset_sigma_s=offset_sigma_s)
+    try:
+        indices = near_the_beginning(timing, _FOLLOWED_SPACING_S, _FOLLOWED)
+        rotation = followed(capture, timing, camera, indices, progress, stage="clocks")
+        options = AlignOptions(max_offset_s=recording.max_offset_s)
+        aligned = align_clocks(rotation.trajectory(), imu, prior=prior, options=options)
+        found, on_rate, rates, rate_sigma = aligned.calibration, imu, "", 0.0
+        if aligned.drifts() or not (capture.shared_clock or offset_sigma_s <= _OFFSET_S):
+            # what one clock stamped has one rate; another is corrected even where it may be zero: what is left of it is
+            # then as small as its deviation says
+            rate_sigma = aligned.clock_rate_sigma
+            on_rate = on_camera_rate(imu, found, camera_epoch_ns=timing.epoch_ns)
+            rates = f", with rates {1e6 * found.clock_rate:+.0f} ppm apart, to {1e6 * rate_sigma:.0f} ppm"
+        sigma_s = found.sigma("gyro_time_offset_s")
+        turned = found.rotation_sigma_rad
+        # what translation does to pixels looks like a bias of the gyroscope
+        found = replace(found, gyro_bias_rad_s=prior.gyro_bias_rad_s)
+        motion = GyroCamera.of(on_rate, found, camera_epoch_ns=timing.epoch_ns)
+        agreement = check_motion(rotation, motion)
+        if turned > _ROTATION_RAD or sigma_s > _OFFSET_S or agreement.agrees is not True:
+            raise NotObservableError("clock offset", agreement.reason)
+    except NotObservableError as error:
+        if offset_sigma_s <= _OFFSET_S:
+            return replace(known, oriented=False)
+        return _Clocks(
+            motion=None, oriented=False, camera=camera, note=f"the clocks' offset is not known beforehand: {error}"
+        )
+    return _Clocks(
+        motion=motion,
+        oriented=True,
+        camera=camera if capture.camera is not None else _with_focal(camera, agreement.gain),
+        note=f"the clocks' offset was found by following pixels, to {1e3 * sigma_s:.1f} ms{rates}",
+        offset_s=found.gyro_time_offset_s,
+        offset_sigma_s=sigma_s,
+        offset_from="pixels",
+        rate_sigma=rate_sigma,
+        middle_s=found.clock_middle_s,
+    )
+
+
+def _with_focal(camera: CameraModel, gain: tuple[float, float, float]) -> CameraModel:
+    """A guessed camera, with the focal length for which pixels turn as far as the gyroscope felt."""
+    known = [g for g in gain[:2] if np.isfinite(g)]
+    if not known or not 0.4 < min(known) <= max(known) < 2.5:
+        return camera
+    return replace(camera, params=(camera.params[0] * float(np.mean(known)), *camera.params[1:]))

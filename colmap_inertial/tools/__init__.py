@@ -1,0 +1,1 @@
+"""Batch, viewer, export, simulator."""

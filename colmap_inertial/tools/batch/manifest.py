@@ -1,0 +1,178 @@
+"""Which captures a batch is made of: a TOML file, or a folder of captures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, StageNames
+from colmap_inertial.io.files import StrPath
+from colmap_inertial.io.names import check_names
+from colmap_inertial.io.toml_section import Section, read_toml
+from colmap_inertial.pipeline.run.config import read_values, with_values
+
+#: What the batch itself writes into its output folder.
+_RESERVED = ("status", "summary.csv", "summary.json")
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchCapture:
+    """One capture of a batch.
+
+    Attributes
+    ----------
+    name
+        Its folder in the output; unique.
+    path
+        What ``reconstruct`` takes.
+    options
+        How it is reconstructed.
+    project
+        For an existing COLMAP project: the recording that ran along, and when its images were taken.
+    stages
+        Its hooks; ``None`` for those of all captures.
+    """
+
+    name: str
+    path: Path
+    options: ReconstructOptions = field(default_factory=ReconstructOptions)
+    project: ProjectOptions = field(default_factory=ProjectOptions)
+    stages: StageNames | None = None
+
+    def __post_init__(self) -> None:
+        if not self.name.isprintable() or "/" in self.name or self.name.startswith(".") or not self.name.strip():
+            raise ValueError(f"a capture's name is that of its folder: {self.name!r} cannot be one")
+        try:
+            check_names((f"{self.name}.json",), "a capture's name")
+        except FormatError as error:
+            raise ValueError(str(error)) from None
+        if self.name in _RESERVED:
+            raise ValueError(f"{self.name!r} is what the batch itself writes; choose another name")
+
+
+def read_manifest(
+    path: StrPath, options: ReconstructOptions = ReconstructOptions(), *, allow_stages: bool = False
+) -> list[BatchCapture]:
+    """The captures of a batch.
+
+    Parameters
+    ----------
+    path
+        A TOML file with a ``[[capture]]`` table for each capture::
+
+            [[capture]]
+            path = "captures/hall"      # relative paths count from the manifest's folder
+
+            [[capture]]
+            name = "yard-2"             # its folder in the output; the last part of the path where left out
+            path = "captures/yard/second.mp4"
+            config = "yard.toml"        # options of this capture, as OUT/config.toml has them
+            options.world = "y-down"    # and one by one
+            stages.frame = ["masks:people", "..."]  # hooks, as StageNames has them: code that is run
+
+            [[capture]]
+            path = "old/bridge"         # an existing COLMAP project: with the flags that reconstruct takes for one
+            project.imu = "old/bridge_imu.csv"
+            project.frame_times = "old/bridge_frames.csv"
+
+        Or a folder: every folder in it is a capture.
+    options
+        Those of all captures; what the manifest states of one goes before them, ``options`` before ``config``.
+    allow_stages
+        Take a manifest that names stages: they are code that its author chose, and that the batch runs.
+
+    Raises
+    ------
+    FormatError
+        For a file that is not such a manifest, two captures of one name, a wrong option, or stages without
+        ``allow_stages``.
+    """
+    path = Path(path)
+    captures = _of_folder(path, options) if path.is_dir() else _of_file(path, options)
+    if not allow_stages:
+        _refuse_stages(captures, path)
+    if not captures:
+        raise FormatError(
+            path, "holds no folder with a capture" if path.is_dir() else "names no capture: write [[capture]] tables"
+        )
+    check_unique(captures, path)
+    return captures
+
+
+def check_unique(captures: Sequence[BatchCapture], path: Path) -> None:
+    """Raise :class:`FormatError` where two captures have one name (some file systems do not tell A from a)."""
+    seen: dict[str, BatchCapture] = {}
+    for capture in captures:
+        other = seen.setdefault(capture.name.casefold(), capture)
+        if other is not capture:
+            raise FormatError(
+                path, f"two captures are called {capture.name} ({other.path}, {capture.path}): give one another name"
+            )
+
+
+def _refuse_stages(captures: Sequence[BatchCapture], path: Path) -> None:
+    for i, capture in enumerate(captures, start=1):
+        if capture.stages is not None and capture.stages.code:
+            raise FormatError(
+                path,
+                f"[capture, number {i}] stages: names code that this batch would run ({', '.join(capture.stages.code)})"
+                "; look at it first, then allow it with --allow-stages (allow_stages=True)",
+            )
+
+
+def _of_folder(folder: Path, options: ReconstructOptions) -> list[BatchCapture]:
+    found = sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
+    return [BatchCapture(name=path.name, path=path, options=options) for path in found]
+
+
+def _of_file(path: Path, options: ReconstructOptions) -> list[BatchCapture]:
+    root = read_toml(path)
+    tables = root.raw("capture")
+    root.finish()
+    if tables is None:
+        return []
+    if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
+        root.fail("capture", "write [[capture]], with two brackets, before each capture")
+    text = path.read_text(encoding="utf-8-sig", errors="replace")
+    return [
+        _capture(path, Section(path, f"capture, number {i}", table, text), options)
+        for i, table in enumerate(tables, start=1)
+    ]
+
+
+def _capture(manifest: Path, table: Section, options: ReconstructOptions) -> BatchCapture:
+    source: Path = table.require("path", table.file("path"))
+    name = table.text("name")
+    config = table.file("config")
+    values = _table(table, "options")
+    project = with_values(ProjectOptions(), _table(table, "project"), manifest)
+    stages = _stages(table)
+    table.finish()
+    if config is not None:
+        options = with_values(options, read_values(config), config)
+    options = with_values(options, values, manifest)
+    if name is None:
+        resolved = source.resolve()
+        name = resolved.parent.name if resolved.name == "capture.toml" else resolved.stem
+    try:
+        return BatchCapture(name=name, path=source, options=options, project=project, stages=stages)
+    except ValueError as error:
+        table.fail("name", str(error))
+
+
+def _stages(table: Section) -> StageNames | None:
+    values = _table(table, "stages")
+    try:
+        return with_values(StageNames(), values, table.path) if "stages" in table else None
+    except FormatError as error:
+        table.fail("stages", error.reason)
+
+
+def _table(table: Section, key: str) -> dict[str, Any]:
+    values = table.raw(key)
+    if values is not None and not isinstance(values, dict):
+        table.fail(key, f"is a table, such as {key}.name = value")
+    return values or {}

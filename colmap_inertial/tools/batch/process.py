@@ -1,0 +1,143 @@
+"""One capture of a batch, in a process: ``python -m colmap_inertial.tools.batch.process TASK CORES``."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from colmap_inertial.checks.diagnose import Diagnosis
+from colmap_inertial.core.errors import InertialError, OutputExistsError
+from colmap_inertial.core.options import ProjectOptions, StageNames
+from colmap_inertial.io.files import locked, write_text
+from colmap_inertial.io.limits import reading_within
+from colmap_inertial.pipeline.run.config import config_as_toml, read_config
+from colmap_inertial.pipeline.run.progress import Progress
+from colmap_inertial.pipeline.run.workspace import Workspace
+from colmap_inertial.pipeline.stages.named import load_stages
+from colmap_inertial.reconstruction.drivers.capture import reconstruct
+from colmap_inertial.reconstruction.drivers.project import is_project, reconstruct_project
+from colmap_inertial.tools.batch.task import (
+    CaptureTask,
+    Job,
+    failed,
+    kill_with_children,
+    read_status,
+    with_result,
+    write_status,
+)
+
+#: The task's paths, which JSON carries as text.
+_PATHS = ("capture", "out", "config", "status", "log", "run_file")
+#: Progress is written no more often than this.
+_PROGRESS_S = 1.0
+#: A worker that was lost may still be letting go of the folder for this long.
+_LOCK_S = 60.0
+
+
+def main() -> None:
+    """Reconstruct, and keep the status file up to date."""
+    values: dict[str, Any] = json.loads(sys.argv[1])
+    cores = [int(core) for core in sys.argv[2].split(",") if core]
+    task = CaptureTask(**{**values, **{key: Path(values[key]) for key in _PATHS}})
+    threading.Thread(target=_end_with_the_parent, daemon=True).start()
+    if cores and hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, cores)
+    known = read_status(task.status)
+    if known is None:
+        raise SystemExit(f"{task.status} cannot be read")
+    status = known
+    last = 0.0
+
+    def progress(stage: str, done: int, total: int, /) -> None:
+        nonlocal last
+        now = time.monotonic()
+        if now - last >= _PROGRESS_S:
+            last = now
+            write_status(task.status, dataclasses.replace(status, stage=stage, steps_done=done, steps=total))
+
+    def findings(diagnosis: Diagnosis) -> None:
+        nonlocal status
+        said = (f for f in diagnosis.findings if f.severity != "info")
+        status = dataclasses.replace(
+            status, findings=tuple(f"{f.severity}: {f.evidence}; {f.advice} ({f.code})" for f in said)
+        )
+        write_status(task.status, status)
+
+    try:
+        _reconstruct(task, progress, findings)
+        end = with_result(status, Workspace(task.out).result)
+    except InertialError as error:
+        print(f"error: {error}", file=sys.stderr)
+        end = failed(status, str(error), error.exit_code)
+    except Exception as error:
+        traceback.print_exc()
+        end = failed(status, f"{type(error).__name__}: {error} (see {task.log})")
+    write_status(task.status, end)
+
+
+def _reconstruct(task: CaptureTask, progress: Progress, findings: Callable[[Diagnosis], None]) -> None:
+    job = read_config(task.config, Job)
+    with reading_within(job.options.limits):
+        existing = job.project != ProjectOptions() or is_project(task.capture)
+    if existing and job.stages != StageNames(model=job.stages.model):
+        raise InertialError(
+            "stages.frame and stages.keypoint: an existing model is not mapped again, nor its images changed; give "
+            "this capture stages of its own without them"
+        )
+    stages = load_stages(job.stages)
+    _begin(Workspace(task.out), job.stages)
+    if existing:
+        reconstruct_project(
+            task.capture,
+            task.out,
+            job.project,
+            job.options,
+            model_stages=stages.model,
+            progress=progress,
+            findings=findings,
+        )
+    else:
+        reconstruct(
+            task.capture,
+            task.out,
+            job.options,
+            frame_stages=stages.frame,
+            keypoint_stages=stages.keypoint,
+            model_stages=stages.model,
+            progress=progress,
+            findings=findings,
+        )
+
+
+def _end_with_the_parent() -> None:
+    """The pipe from the parent closes when the parent ends, whatever ended it."""
+    os.read(sys.stdin.fileno(), 1)  # not through its buffer, whose lock would keep this process from ending in peace
+    kill_with_children(os.getpid())
+
+
+def _begin(workspace: Workspace, stages: StageNames) -> None:
+    """Wait until nobody else is at work in the folder, and write down which stages are from now on.
+
+    Before the work, for a process may be killed at any time. Whoever stays in the folder, or whatever else it holds,
+    ``reconstruct`` complains about.
+    """
+    root = workspace.root
+    vacant = not root.exists() or (root.is_dir() and not any(root.iterdir()))
+    if workspace.stamps.is_dir() or (vacant and stages != StageNames()):
+        with contextlib.suppress(OutputExistsError, OSError):
+            workspace.stamps.mkdir(parents=True, exist_ok=True)
+            with locked(workspace.lock, "", wait_s=_LOCK_S):
+                write_text(workspace.stage_names, config_as_toml(stages))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,332 @@
+"""One capture of a batch, on whatever machine: a process of its own, watched, started again when it was killed.
+
+A task carries paths and nothing else. What becomes of it stands in its status file, which the process at work keeps up
+to date, so that progress shows wherever the files are seen.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from colmap_inertial.core.errors import FormatError, InertialError, OutputError, TargetNotFoundError
+from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, StageNames
+from colmap_inertial.io.files import read_json, write_json
+from colmap_inertial.pipeline.run.config import read_config
+from colmap_inertial.pipeline.run.workspace import Workspace
+
+State = Literal["waiting", "running", "done", "failed", "interrupted"]
+
+#: How often a process at work is looked at.
+_POLL_S = 0.25
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """How a capture is to be reconstructed, as its task's configuration file has it.
+
+    Attributes
+    ----------
+    options
+        As for ``reconstruct``.
+    project
+        For an existing COLMAP project: the recording that ran along, and when its images were taken.
+    stages
+        The hooks.
+    """
+
+    options: ReconstructOptions = field(default_factory=ReconstructOptions)
+    project: ProjectOptions = field(default_factory=ProjectOptions)
+    stages: StageNames = field(default_factory=StageNames)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureTask:
+    """What a worker needs to know; every path is absolute and the same on all machines.
+
+    Attributes
+    ----------
+    name
+        The capture's.
+    capture, out
+        What ``reconstruct`` takes.
+    config
+        A :class:`Job`, as TOML.
+    status, log
+        Where to write what becomes of it, and what its process says.
+    run_file, run
+        A file that holds ``run`` as long as this run of the batch goes on.
+    attempts
+        How often to start it in all, where its process or worker is killed.
+    gpu
+        Whether it is to have a GPU to itself.
+    """
+
+    name: str
+    capture: Path
+    out: Path
+    config: Path
+    status: Path
+    log: Path
+    run_file: Path
+    run: str
+    attempts: int
+    gpu: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureStatus:
+    """What became of one capture; the same as its status file.
+
+    Attributes
+    ----------
+    name
+        The capture's.
+    state
+        ``"done"``: its exit code is 0. ``"failed"``: any other end. ``"interrupted"``: stopped with the batch.
+    exit_code
+        That of ``reconstruct``: 0 done, 1 target outside its tolerance or an error in the program, 2 bad input,
+        3 scale refused, 4 mapping failed, 5 target not found.
+    error
+        One sentence, where it failed.
+    attempts
+        How often its process was started in this run.
+    seconds
+        From the first of these starts to the end.
+    stage, steps_done, steps
+        What it is at, while it runs.
+    host
+        Where.
+    models
+        From ``result.json``: for each model its number, verdict, metres per unit with interval, images and checks.
+    frames
+        Frames of the capture.
+    findings
+        Errors and warnings of the check beforehand, in words.
+    run
+        Which run of the batch wrote this.
+    """
+
+    name: str
+    state: State = "waiting"
+    exit_code: int | None = None
+    error: str | None = None
+    attempts: int = 0
+    seconds: float = 0.0
+    stage: str = ""
+    steps_done: int = 0
+    steps: int = 0
+    host: str = ""
+    models: tuple[Mapping[str, Any], ...] = ()
+    frames: int | None = None
+    findings: tuple[str, ...] = ()
+    run: str = field(default="", compare=False)
+
+    @property
+    def finished(self) -> bool:
+        """Whether it ended by itself."""
+        return self.state in ("done", "failed")
+
+
+def read_status(path: Path) -> CaptureStatus | None:
+    """The status in a file; ``None`` where there is none."""
+    try:
+        values = read_json(path)
+        lists = {key: tuple(values.get(key, ())) for key in ("models", "findings")}
+        return CaptureStatus(**{**values, **lists})
+    except (FormatError, TypeError):
+        return None
+
+
+def write_status(path: Path, status: CaptureStatus) -> None:
+    """Write it, if that is possible: a full disk shall not hide what is to be said."""
+    with contextlib.suppress(OutputError):
+        write_json(path, status)
+
+
+def failed(status: CaptureStatus, error: str, exit_code: int = 1) -> CaptureStatus:
+    """The status of a capture that ended with an error."""
+    return dataclasses.replace(status, state="failed", exit_code=exit_code, error=error, stage="")
+
+
+def finished_earlier(task: CaptureTask) -> CaptureStatus | None:
+    """The end of a capture that has one already; ``None`` where there is work to do.
+
+    A result that was made from another capture, with other options or with other stages is an error, not this
+    capture's result.
+    """
+    workspace, known = Workspace(task.out), read_status(task.status)
+    if not workspace.result.exists():
+        return None
+    status = CaptureStatus(name=task.name) if known is None else known
+    try:
+        result, job = read_json(workspace.result), read_config(task.config, Job)
+        if result.get("waiting"):
+            return None
+        made_from = Path(str(read_json(workspace.stamps / "capture.json").get("capture")))
+        other = None if made_from == task.capture or task.capture in made_from.parents else "capture"
+        project = result.get("project", _plain(ProjectOptions()))
+        if read_config(workspace.config, ReconstructOptions) != job.options or project != _plain(job.project):
+            other = other or "set of options"
+        if made_with(workspace) != job.stages:
+            other = other or "set of stages"
+        if other is not None:
+            text = f"{task.out} holds the result of another {other}; remove it or choose another folder"
+            return failed(status, text, FormatError.exit_code)
+        return with_result(status, workspace.result)
+    except FormatError as error:
+        return failed(status, str(error), error.exit_code)
+
+
+def made_with(workspace: Workspace) -> StageNames:
+    """The stages that a folder is made with, as the process at work wrote them down."""
+    return read_config(workspace.stage_names, StageNames) if workspace.stage_names.is_file() else StageNames()
+
+
+def _plain(project: ProjectOptions) -> object:
+    return json.loads(json.dumps(dataclasses.asdict(project), default=str))
+
+
+def with_result(status: CaptureStatus, result: Path) -> CaptureStatus:
+    """The status of a capture whose ``result.json`` is there, by the rules of ``ReconstructResult.exit_code``."""
+    values = read_json(result)
+    try:
+        models = tuple(_model(model) for model in values["models"])
+        frames = len(values["frames"]) or None  # an existing project counts none
+    except (KeyError, TypeError, AttributeError):
+        raise FormatError(result, "is not the result of a reconstruction") from None
+    code, error = _verdict(models)
+    state: State = "failed" if code else "done"
+    return dataclasses.replace(
+        status, state=state, exit_code=code, error=error, models=models, frames=frames, stage="", steps_done=0, steps=0
+    )
+
+
+def _model(values: Mapping[str, Any]) -> dict[str, Any]:
+    kept = ("index", "verdict", "metres_per_unit", "ci95", "reasons", "registered_images", "points", "sparse_metric")
+    check = values["validation"]
+    return {
+        **{key: values[key] for key in kept},
+        "waiting": (values.get("dense") or {}).get("waiting"),
+        "scale_error_pct": None if check is None else check.get("scale_error_pct"),
+        "within_tolerance": None if check is None else check.get("within_tolerance"),
+        "validation_error": None if check is None else check.get("error"),
+    }
+
+
+def _verdict(models: Sequence[Mapping[str, Any]]) -> tuple[int, str | None]:
+    if all(model["sparse_metric"] is None for model in models):
+        return 3, "scale refused: " + "; ".join(reason for model in models for reason in model["reasons"])
+    waiting = [model["waiting"] for model in models if model["waiting"]]
+    if waiting:
+        return InertialError.exit_code, "; ".join(waiting)
+    outside = [model for model in models if model["within_tolerance"] is False]
+    if outside:
+        return 1, f"the target is outside its tolerance: scale error {outside[0]['scale_error_pct']:+.2f} %"
+    checked = [model for model in models if model["within_tolerance"] is not None or model["validation_error"]]
+    errors = [model["validation_error"] for model in checked if model["validation_error"]]
+    if checked and len(errors) == len(checked):
+        return TargetNotFoundError.exit_code, errors[0]
+    return 0, None
+
+
+def run_capture(task: CaptureTask, cores: Sequence[int] = ()) -> CaptureStatus:
+    """Reconstruct one capture in a process of its own; also what a worker of a cluster calls.
+
+    Never raises for what goes wrong in the capture. The process ends with this one, however that ends.
+
+    Parameters
+    ----------
+    task
+        The capture.
+    cores
+        Processors that the process may use; all that this process may use, where empty.
+    """
+    host = socket.gethostname()
+    status = CaptureStatus(name=task.name, host=host, run=task.run)
+    if not task.config.is_file():
+        return failed(status, f"{host} does not see {task.config}: workers need the same files under the same paths", 2)
+    earlier = finished_earlier(task)
+    if earlier is not None:
+        write_status(task.status, earlier)
+        return earlier
+    known = read_status(task.status)
+    if known is not None and known.run == task.run:
+        status = dataclasses.replace(known, host=host)  # another worker had it and was lost
+    start = time.monotonic() - status.seconds
+    while True:
+        if status.attempts >= task.attempts:
+            status = failed(status, f"its process or worker was killed {status.attempts} times; see {task.log}")
+            break
+        status = dataclasses.replace(status, state="running", attempts=status.attempts + 1, stage="")
+        write_status(task.status, status)
+        code = _attend(task, cores)
+        known = read_status(task.status)
+        if known is not None and known.run == task.run:
+            status = known
+        status = dataclasses.replace(status, seconds=time.monotonic() - start)
+        if code is None:
+            status = dataclasses.replace(status, state="interrupted", stage="")
+            break
+        if status.finished:
+            break
+        if code >= 0:
+            status = failed(status, f"its process ended with code {code}; see {task.log}")
+            break
+    write_status(task.status, status)
+    return status
+
+
+def goes_on(task: CaptureTask) -> bool:
+    """Whether this run of the batch still wants the capture."""
+    try:
+        return task.run_file.read_text(encoding="utf-8") == task.run
+    except OSError:
+        return False
+
+
+def kill_with_children(pid: int) -> None:
+    """Kill a process that :func:`run_capture` started and all that it started; where there are no groups, it alone."""
+    if hasattr(os, "killpg"):
+        os.killpg(pid, signal.SIGKILL)
+    else:
+        os.kill(pid, signal.SIGTERM)
+
+
+def _attend(task: CaptureTask, cores: Sequence[int]) -> int | None:
+    """Start the process and wait for it: its return code, or ``None`` where the batch was stopped meanwhile."""
+    values = {f.name: getattr(task, f.name) for f in dataclasses.fields(task)}
+    argument = json.dumps({key: str(value) if isinstance(value, Path) else value for key, value in values.items()})
+    environment = dict(os.environ)
+    if cores:
+        environment |= {"OMP_NUM_THREADS": str(len(cores)), "OPENBLAS_NUM_THREADS": str(len(cores))}
+    command = [sys.executable, "-m", "colmap_inertial.tools.batch.process", argument, ",".join(map(str, cores))]
+    with open(task.log, "ab") as log:
+        # A session of its own keeps the terminal's Ctrl-C away from it; the open pipe tells it that we are alive.
+        process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=log, stderr=log, env=environment, start_new_session=True
+        )
+    try:
+        while True:
+            try:
+                return process.wait(timeout=_POLL_S)
+            except subprocess.TimeoutExpired:
+                if not goes_on(task):
+                    return None
+    finally:
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            kill_with_children(process.pid)
+        process.wait()
+        if process.stdin is not None:
+            process.stdin.close()

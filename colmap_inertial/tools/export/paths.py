@@ -1,0 +1,214 @@
+"""The camera's path as TUM text, CSV and glTF."""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.core.errors import FormatError, MissingExtraError
+from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_from_matrix, rotation_between
+from colmap_inertial.core.types import Array, CameraMotion, CameraTrajectory
+from colmap_inertial.io.files import write_text
+from colmap_inertial.io.trajectories import read_tum
+from colmap_inertial.tools.export.transforms import OPENGL_FROM_CAM, View
+
+if TYPE_CHECKING:
+    from pygltflib import GLTF2
+
+    from colmap_inertial.inertial.georeference import Georeference
+
+_COLUMNS = (
+    *("name", "t_s", "x", "y", "z", "qx", "qy", "qz", "qw"),
+    *("vx_m_s", "vy_m_s", "vz_m_s", "wx_rad_s", "wy_rad_s", "wz_rad_s"),
+)
+_PLACE = ("latitude_deg", "longitude_deg", "height_m")
+_GLTF_UP = np.array([0.0, 1.0, 0.0])
+#: Where a drawn camera begins to see, metres.
+_NEAR_M = 0.01
+
+
+def smoothed_path(trajectory: Path | None, model: Path) -> CameraTrajectory:
+    """The smoothed path of a model.
+
+    Raises
+    ------
+    FormatError
+        Where there is none.
+    """
+    if trajectory is None or not trajectory.is_file():
+        raise FormatError(
+            model, "has no smoothed path: only a run of reconstruct with a scale makes one; csv needs none"
+        )
+    return read_tum(trajectory)
+
+
+def write_cameras(
+    path: Path,
+    views: list[View],
+    motion: CameraMotion | None,
+    originals: dict[str, str],
+    on_map: Georeference | None = None,
+) -> None:
+    """Write a row for each image: its time, pose and velocities, where they are known.
+
+    Columns: image name; seconds on the camera's clock; camera centre; rotation world_from_camera (x right, y down, z
+    forward); velocity in the world; angular velocity in the camera's axes; with ``on_map`` latitude, longitude and
+    height (WGS84).
+    """
+    place = {} if motion is None else {name: i for i, name in enumerate(motion.names)}
+    text = io.StringIO()
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow(_COLUMNS if on_map is None else (*_COLUMNS, *_PLACE))
+    for view in views:
+        name = originals[view.name]
+        pose = (*view.cam_in_world, *quat_conjugate(view.cam_from_world_xyzw))
+        index = place.get(name)
+        time, moving = "", [""] * 6
+        if motion is not None and index is not None:
+            total_ns = motion.epoch_ns + round(float(motion.t_s[index]) * 1e9)
+            time = f"{'-' if total_ns < 0 else ''}{abs(total_ns) // 10**9}.{abs(total_ns) % 10**9:09d}"
+            both = (*motion.velocity_in_world_m_s[index], *motion.angular_velocity_in_cam_rad_s[index])
+            moving = [f"{value:.9g}" for value in both]
+        place_on_map = [] if on_map is None else on_map.geodetic(view.cam_in_world[None])[0].tolist()
+        rows.writerow([name, time, *(f"{value:.12g}" for value in pose), *moving, *(f"{v:.12g}" for v in place_on_map)])
+    write_text(path, text.getvalue())
+
+
+def require_pygltflib() -> None:
+    """Raise :class:`MissingExtraError` where pygltflib is not installed."""
+    try:
+        import pygltflib  # noqa: F401
+    except ImportError:
+        raise MissingExtraError("gltf", "glTF files are written by pygltflib") from None
+
+
+def write_gltf(
+    path: Path,
+    views: list[View],
+    trajectory: CameraTrajectory | None,
+    xyz: Array,
+    rgb: NDArray[np.uint8],
+    up_in_world: Array,
+) -> None:
+    """Write cameras, points, the path as a line and as an animated camera: glTF 2.0, binary, metres, y up.
+
+    Parameters
+    ----------
+    views
+        A camera each.
+    trajectory
+        The smoothed path; ``None`` where there is none.
+    xyz, rgb
+        (N, 3) points and colours.
+    up_in_world
+        (3,) becomes +y by the node that all others hang from.
+
+    Raises
+    ------
+    MissingExtraError
+        Without pygltflib.
+    """
+    require_pygltflib()
+    import pygltflib as gl
+
+    made = _Gltf(gl)
+    children = [made.node(name="points", mesh=made.points(xyz, rgb))] if len(xyz) else []
+    centres = np.array([view.cam_in_world for view in views]) if trajectory is None else trajectory.cam_in_world
+    if len(centres) > 1:
+        children.append(made.node(name="path", mesh=made.line(centres)))
+    seen: dict[tuple[object, ...], int] = {}
+    for view in views:
+        camera = view.camera
+        key = (camera.width, camera.height, camera.params)
+        if key not in seen:
+            seen[key] = made.camera(camera.width / camera.params[0], camera.height / camera.params[1])
+        pose = {
+            "translation": view.cam_in_world.tolist(),
+            "rotation": _opengl(view.cam_from_world_xyzw[None])[0].tolist(),
+        }
+        children.append(made.node(name=view.name.rpartition(".")[0], camera=seen[key], **pose))
+    if trajectory is not None:
+        moving = made.node(name="moving camera", camera=next(iter(seen.values())))
+        made.animate(moving, trajectory.t_s, trajectory.cam_in_world, _opengl(trajectory.cam_from_world_xyzw))
+        children.append(moving)
+    root = made.node(name="world", rotation=rotation_between(up_in_world, _GLTF_UP).tolist(), children=children)
+    made.write(path, root)
+
+
+def _opengl(cam_from_world_xyzw: Array) -> Array:
+    """(N, 4) world from camera with the axes that glTF's cameras have."""
+    return quat_from_matrix(matrix_from_quat(quat_conjugate(cam_from_world_xyzw)) @ OPENGL_FROM_CAM)
+
+
+class _Gltf:
+    """A glTF with one buffer, part by part."""
+
+    def __init__(self, gl: Any) -> None:
+        self._gl = gl
+        self._gltf: GLTF2 = gl.GLTF2(asset=gl.Asset(version="2.0", generator="colmap-inertial"))
+        self._data = bytearray()
+
+    def node(self, **fields: Any) -> int:
+        self._gltf.nodes.append(self._gl.Node(**fields))
+        return len(self._gltf.nodes) - 1
+
+    def camera(self, width: float, height: float) -> int:
+        """One that sees so far to both sides together, at a distance of 1."""
+        lens = self._gl.Perspective(
+            yfov=float(2 * np.arctan(0.5 * height)), aspectRatio=float(width / height), znear=_NEAR_M
+        )
+        self._gltf.cameras.append(self._gl.Camera(type="perspective", perspective=lens))
+        return len(self._gltf.cameras) - 1
+
+    def points(self, xyz: Array, rgb: NDArray[np.uint8]) -> int:
+        colours = np.concatenate([rgb, np.full((len(rgb), 1), 255, np.uint8)], axis=1)
+        attributes = self._gl.Attributes(
+            POSITION=self._accessor(xyz, "VEC3", bounds=True), COLOR_0=self._accessor(colours, "VEC4")
+        )
+        return self._mesh(attributes, self._gl.POINTS)
+
+    def line(self, xyz: Array) -> int:
+        return self._mesh(self._gl.Attributes(POSITION=self._accessor(xyz, "VEC3", bounds=True)), self._gl.LINE_STRIP)
+
+    def animate(self, node: int, t_s: Array, places: Array, rotations: Array) -> None:
+        gl, since = self._gl, self._accessor((t_s - t_s[0])[:, None], "SCALAR", bounds=True)
+        animation = gl.Animation(name="camera path", samplers=[], channels=[])
+        for what, values, kind in (("translation", places, "VEC3"), ("rotation", rotations, "VEC4")):
+            animation.samplers.append(gl.AnimationSampler(input=since, output=self._accessor(values, kind)))
+            target = gl.AnimationChannelTarget(node=node, path=what)
+            animation.channels.append(gl.AnimationChannel(sampler=len(animation.samplers) - 1, target=target))
+        self._gltf.animations.append(animation)
+
+    def write(self, path: Path, root: int) -> None:
+        self._gltf.scenes, self._gltf.scene = [self._gl.Scene(nodes=[root])], 0
+        self._gltf.buffers = [self._gl.Buffer(byteLength=len(self._data))]
+        self._gltf.set_binary_blob(bytes(self._data))
+        path.write_bytes(b"".join(self._gltf.save_to_bytes()))
+
+    def _mesh(self, attributes: Any, mode: int) -> int:
+        self._gltf.meshes.append(self._gl.Mesh(primitives=[self._gl.Primitive(attributes=attributes, mode=mode)]))
+        return len(self._gltf.meshes) - 1
+
+    def _accessor(self, values: NDArray[Any], kind: str, *, bounds: bool = False) -> int:
+        """Values (N, K) into the buffer: bytes as they are (normalised), all else as float."""
+        gl, is_bytes = self._gl, values.dtype == np.uint8
+        stored = values if is_bytes else values.astype("<f4")
+        self._gltf.bufferViews.append(gl.BufferView(buffer=0, byteOffset=len(self._data), byteLength=stored.nbytes))
+        self._data += stored.tobytes()
+        self._gltf.accessors.append(
+            gl.Accessor(
+                bufferView=len(self._gltf.bufferViews) - 1,
+                componentType=gl.UNSIGNED_BYTE if is_bytes else gl.FLOAT,
+                normalized=is_bytes,
+                count=len(stored),
+                type=kind,
+                min=stored.min(axis=0).tolist() if bounds else None,
+                max=stored.max(axis=0).tolist() if bounds else None,
+            )
+        )
+        return len(self._gltf.accessors) - 1

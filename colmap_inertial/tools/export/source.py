@@ -1,0 +1,234 @@
+"""What there is to export: the model, its unit and up, its pictures, and how the camera moved."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from colmap_inertial.core.errors import FormatError, NotObservableError
+from colmap_inertial.core.options import ExportImages
+from colmap_inertial.core.types import DOWN_IN_WORLD, Array, CameraMotion, CameraTrajectory
+from colmap_inertial.inertial.georeference import Georeference
+from colmap_inertial.io.capture import Capture
+from colmap_inertial.io.files import read_json
+from colmap_inertial.io.frames import read_frame_timing
+from colmap_inertial.io.names import path_in
+from colmap_inertial.io.positions import positions_in_pictures
+from colmap_inertial.io.records import read_record
+from colmap_inertial.model import read_model
+from colmap_inertial.pipeline.run.workspace import Workspace, a_record_of_ours, places_of
+from colmap_inertial.pipeline.stages.metric import motion_file
+from colmap_inertial.reconstruction.drivers.georeference import on_earth, positions_of, read_georeference
+from colmap_inertial.tools.view.sources import ViewSource, find_source
+
+if TYPE_CHECKING:
+    import pycolmap
+
+
+@dataclass(frozen=True, kw_only=True)
+class Picture:
+    """An image of the model, and the file that is exported for it.
+
+    Attributes
+    ----------
+    path
+        Of the file; of one that comes out of the capture, the capture.
+    rectified
+        Whether the rolling shutter was undone in it.
+    sharpened
+        Whether its blur was undone in it.
+    filmed
+        Whether it comes out of the capture.
+    agrees
+        Whether it shows things where the model has them; a picture with its rolling shutter does not, where the model
+        was made without.
+    """
+
+    path: Path
+    rectified: bool = False
+    sharpened: bool = False
+    filmed: bool = False
+    agrees: bool = True
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ExportSource:
+    """A model to export.
+
+    Attributes
+    ----------
+    found
+        Where the model is; unit, verdict, places of pictures.
+    model
+        The model itself.
+    up_in_world
+        (3,) unit vector, ``None`` where unknown.
+    gravity_in_world_m_s2
+        (3,) points down; ``None`` where unknown.
+    motion
+        During each frame; ``None`` where it was not kept.
+    treated
+        By image name, what a run did to its frames: action and whether keypoints were rectified.
+    """
+
+    found: ViewSource
+    model: pycolmap.Reconstruction
+    up_in_world: Array | None
+    gravity_in_world_m_s2: Array | None
+    motion: CameraMotion | None
+    treated: Mapping[str, tuple[str, bool]]
+
+    def pictures(
+        self, out: Path, names: list[str], kind: ExportImages, capture: Capture | None = None
+    ) -> dict[str, Picture]:
+        """The file of each image; of those that a run changed, the picture of the capture where one is given.
+
+        Raises
+        ------
+        FormatError
+            Where one is missing.
+        """
+        places = places_of(out)
+        folders = self.found.images if kind == "rectified" else (places.seen, *self.found.images)
+        changed = [name for name in names if self.treated.get(name, ("passed", False))[0] != "passed"]
+        filmed = {}
+        if capture is not None:
+            if capture.apertures is not None or capture.exposures is not None:
+                raise FormatError(capture.path, "its frames are made of several pictures each: there is no original")
+            known = set(read_frame_timing(capture).names) if capture.frames is not None else set()
+            lost = next((name for name in changed if name not in known), None)
+            if lost is not None:
+                raise FormatError(
+                    capture.path, f"has no frame {lost!r}: it is not the capture that the run was made of"
+                )
+            for name in changed:
+                bent = self.treated[name][1]
+                filmed[name] = Picture(path=capture.path, filmed=True, agrees=not bent)
+        return {name: filmed.get(name) or self._picture(places.rectified, folders, name) for name in names}
+
+    def _picture(self, rectified: Path, folders: tuple[Path, ...], name: str) -> Picture:
+        paths = (path_in(folder, name, self.found.folder) for folder in folders if folder.is_dir())
+        path = next((path for path in paths if path.is_file()), None)
+        if path is None:
+            looked = ", ".join(str(folder) for folder in folders if folder.is_dir()) or "no folder of images"
+            raise FormatError(
+                self.found.folder,
+                f"the picture of its image {name!r} is missing (in {looked}); say where: --image-folder",
+            )
+        action, was_rectified = self.treated.get(name, ("passed", False))
+        moved = was_rectified and path.resolve().is_relative_to(rectified.resolve())
+        return Picture(path=path, rectified=moved, sharpened=action == "deblurred", agrees=moved or not was_rectified)
+
+
+def read_source(
+    out: Path, *, model: int | None = None, image_folder: Path | None = None, unscaled: bool = False
+) -> ExportSource:
+    """What a finished run, or a project, has to export.
+
+    Parameters
+    ----------
+    out
+        What ``reconstruct`` or ``apply`` wrote, or a folder with a COLMAP model.
+    model
+        Its number; ``None`` takes the largest.
+    image_folder
+        Where its pictures are, where they are not beside it.
+    unscaled
+        Whether a model without a scale will do.
+
+    Raises
+    ------
+    FormatError
+        Where there is no such model, or the run is not finished.
+    NotObservableError
+        Where the model has no scale.
+    """
+    found = find_source(out, model, images=image_folder)
+    if found.scale.unit != "m" and not unscaled:
+        why = "; ".join(found.scale.reasons) or "this model was never given one"
+        raise NotObservableError("scale", f"{why}; --unscaled exports it in its own units")
+    reconstruction = read_model(found.folder)
+    down, motion = found.down_in_world, None
+    if found.scale.unit == "m" and found.trajectory is not None and motion_file(found.trajectory).is_file():
+        motion = read_record(motion_file(found.trajectory), CameraMotion)
+    return ExportSource(
+        found=found,
+        model=reconstruction,
+        up_in_world=_up(found, reconstruction),
+        gravity_in_world_m_s2=down,
+        motion=motion,
+        treated=_treated(Workspace(out)),
+    )
+
+
+def placed_on_earth(out: Path, source: ExportSource, capture: Capture | None) -> Georeference:
+    """Where on Earth a model stands: as its run found it, else by the positions of the capture or of its pictures.
+
+    Raises
+    ------
+    FormatError
+        Where there are no positions.
+    NotObservableError
+        Where they leave the heading open, or the model is not metric.
+    """
+    if source.found.scale.unit != "m" or source.up_in_world is None:
+        raise NotObservableError("heading", "only a model in metres, with gravity known, stands anywhere on Earth")
+    known = read_georeference(Workspace(out).georeference, source.found.index)
+    if known is not None:
+        return known
+    path = _path(source)
+    folder = next((folder for folder in source.found.images if folder.is_dir()), None)
+    if capture is not None:
+        fixes = positions_of(capture, path.names)
+    elif folder is not None:
+        fixes = positions_in_pictures(folder, path.names)
+    else:
+        raise FormatError(source.found.folder, "its pictures are not beside it: give --capture or --image-folder")
+    if fixes.names is None and source.motion is None:
+        raise FormatError(source.found.folder, "the run kept no times of its images, which positions in a video go by")
+    return on_earth(fixes, path, source.up_in_world, timed=bool(_times(source)))
+
+
+def _path(source: ExportSource) -> CameraTrajectory:
+    """The images in order of time; where their times were not kept, in order of their names, a second apart."""
+    images = {image.name: image for image in map(source.model.image, source.model.reg_image_ids())}
+    motion, rows = source.motion, _times(source) or list(enumerate(sorted(images)))
+    poses = [images[name].cam_from_world() for _, name in rows]
+    return CameraTrajectory(
+        names=tuple(name for _, name in rows),
+        t_s=np.array([t for t, _ in rows], dtype=np.float64),
+        epoch_ns=0 if motion is None else motion.epoch_ns,
+        cam_from_world_xyzw=np.array([pose.rotation.quat for pose in poses]),
+        cam_in_world=np.array([images[name].projection_center() for _, name in rows]),
+    )
+
+
+def _times(source: ExportSource) -> list[tuple[float, str]]:
+    """When the images were taken, and their names; empty where that was not kept."""
+    if source.motion is None:
+        return []
+    names = {source.model.image(i).name for i in source.model.reg_image_ids()}
+    return [(t, name) for t, name in zip(source.motion.t_s.tolist(), source.motion.names, strict=True) if name in names]
+
+
+def _up(found: ViewSource, model: pycolmap.Reconstruction) -> Array | None:
+    """Against gravity; of an axis that gravity lies on, the one that the pictures' upper edges point along."""
+    if found.down_in_world is not None:
+        return -found.down_in_world / np.linalg.norm(found.down_in_world)
+    if not found.gravity_on_axis:
+        return None
+    rotations = [model.image(i).cam_from_world().rotation.matrix() for i in model.reg_image_ids()]
+    edges = -np.mean(rotations, axis=0)[1]
+    return max((-down for down in DOWN_IN_WORLD.values()), key=lambda up: float(up @ edges))
+
+
+def _treated(workspace: Workspace) -> dict[str, tuple[str, bool]]:
+    if not workspace.result.is_file():
+        return {}
+    with a_record_of_ours(workspace.result):
+        frames = read_json(workspace.result).get("frames", [])
+        return {str(f["name"]): (str(f["action"]), bool(f["rectified"])) for f in frames}

@@ -1,0 +1,174 @@
+"""Pinhole cameras with the principal point in the middle, and pictures as they would have taken them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.geometry import colmap_px_from_opencv
+from colmap_inertial.core.types import Array, CameraModel
+from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.imaging.rolling_shutter import grid_nodes, sampling_maps
+
+if TYPE_CHECKING:
+    import pycolmap
+
+#: A side of the new picture is at most this many times the old one's: beyond it a wide lens shows hardly any detail.
+_LARGEST = 1.6
+#: Points of the border that tell how far a picture reaches; how well distorting must undo undistorting there, px.
+_BORDER, _UNDONE_PX = 200, 0.05
+#: Where the new picture shows what the old one does not have, it shrinks by this share, so often.
+_SHRINK, _ROUNDS = 0.01, 90
+#: Distance of the nodes between which the resampling is interpolated, px.
+_STEP_PX = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Undistortion:
+    """A camera, and the pinhole camera that takes its place.
+
+    Attributes
+    ----------
+    camera
+        COLMAP's, with any lens.
+    pinhole
+        ``PINHOLE`` of fx, fy, and cx, cy in the middle.
+    """
+
+    camera: pycolmap.Camera
+    pinhole: CameraModel
+
+    @classmethod
+    def of(cls, camera: pycolmap.Camera, where: Path, *, square: bool = False) -> Undistortion:
+        """The largest pinhole camera of the same focal lengths that sees nothing the camera does not see.
+
+        The picture of a camera whose principal point is off the middle loses a strip on the far side; the optical axis,
+        poses and points stay what they are.
+
+        Parameters
+        ----------
+        camera
+            Of the model.
+        where
+            The model's folder, for messages.
+        square
+            Make pixels square, of the focal length in between.
+
+        Raises
+        ------
+        FormatError
+            For a camera that sees all around.
+        """
+        named = f"camera {camera.camera_id} ({camera.model_name})"
+        if camera.is_spherical():
+            raise FormatError(where, f"{named} sees all around; no pinhole does")
+        fx, fy = float(camera.focal_length_x), float(camera.focal_length_y)
+        if square:
+            fx = fy = 0.5 * (fx + fy)
+        half = _half_extent(camera)
+        for _ in range(_ROUNDS):
+            # what is left of a whole pixel by rounding counts as one
+            width, height = (
+                int(min(2 * extent * focal + 1e-6, _LARGEST * side))
+                for extent, focal, side in zip(half, (fx, fy), (camera.width, camera.height), strict=True)
+            )
+            if width < 1 or height < 1:
+                break
+            pinhole = CameraModel(
+                model="PINHOLE", width=width, height=height, params=(fx, fy, 0.5 * width, 0.5 * height)
+            )
+            found = cls(camera, pinhole)
+            if found.is_inside():
+                return found
+            half = half * (1 - _SHRINK)
+        raise FormatError(where, f"{named}: its lens cannot be undistorted")
+
+    def is_inside(self) -> bool:
+        """Whether all of the new picture comes from the old one."""
+        width, height = self.pinhole.width, self.pinhole.height
+        x, y = np.linspace(0, width, _BORDER // 4), np.linspace(0, height, _BORDER // 4)
+        grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        source = self.source_px(grid)
+        size = np.array([self.camera.width, self.camera.height])
+        return bool(np.isfinite(source).all() and (source >= -0.01).all() and (source <= size + 0.01).all())
+
+    def source_px(self, xy_px: Array) -> Array:
+        """(N, 2) where (N, 2) points of the new picture are in the old one; nan where nowhere."""
+        fx, fy, cx, cy = self.pinhole.params
+        rays = np.stack([(xy_px[:, 0] - cx) / fx, (xy_px[:, 1] - cy) / fy, np.ones(len(xy_px))], axis=1)
+        return np.asarray(self.camera.img_from_cam(rays), dtype=np.float64)
+
+    def moved_px(self, xy_px: Array) -> Array:
+        """(N, 2) where (N, 2) points of the old picture are in the new one; nan where they have no ray."""
+        fx, fy, cx, cy = self.pinhole.params
+        return np.asarray(_normalised(self.camera, xy_px) * [fx, fy] + [cx, cy])
+
+    def is_same(self) -> bool:
+        """Whether the camera is that pinhole already."""
+        size = (self.camera.width, self.camera.height) == (self.pinhole.width, self.pinhole.height)
+        corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]]) * [self.pinhole.width, self.pinhole.height]
+        return size and bool(np.abs(self.source_px(corners) - corners).max() < 1e-6)
+
+    def resampled(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """(h, w, C) the picture (H, W, C) as the pinhole camera would have taken it, by bicubic interpolation."""
+        import cv2
+
+        if self.is_same():
+            return image
+        width, height = self.pinhole.width, self.pinhole.height
+        nodes = _STEP_PX * grid_nodes(*BlurField.nodes(width, height, _STEP_PX))
+        target = colmap_px_from_opencv(nodes.reshape(-1, 2))
+        # a shift between pixels is the same whichever corner they are counted from
+        shift = (self.source_px(target) - target).reshape(nodes.shape)
+        maps = sampling_maps(_continued(shift), width, height, _STEP_PX)
+        out = cv2.remap(image, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(out, dtype=np.uint8)
+
+
+def _continued(shift: Array) -> Array:
+    """Shifts at nodes beyond the picture's edge, which a lens may not reach, as those within go on."""
+    for axis in (0, 1):
+        along = np.moveaxis(shift, axis, 0)
+        for i in range(2, len(along)):
+            lost = ~np.isfinite(along[i])
+            along[i][lost] = (2 * along[i - 1] - along[i - 2])[lost]
+    return shift
+
+
+def _normalised(camera: pycolmap.Camera, xy_px: Array) -> Array:
+    """(N, 2) rays at z = 1 of (N, 2) pixels; nan where the lens model does not lead there and back."""
+    if len(xy_px) == 0:
+        return np.zeros((0, 2))
+    rays = np.asarray(camera.cam_from_img(xy_px), dtype=np.float64)[:, :2].copy()
+    ahead = np.concatenate([rays, np.ones((len(rays), 1))], axis=1)
+    ahead[~np.isfinite(rays).all(axis=1)] = [0.0, 0.0, 1.0]
+    back = np.asarray(camera.img_from_cam(ahead), dtype=np.float64)
+    lost = ~(np.abs(back - xy_px).max(axis=1) < _UNDONE_PX)
+    rays[lost] = np.nan
+    return rays
+
+
+def _half_extent(camera: pycolmap.Camera) -> Array:
+    """(2,) how far the picture reaches at z = 1, to the nearer side of each two."""
+    width, height = camera.width, camera.height
+    x, y = np.linspace(0, width, _BORDER), np.linspace(0, height, _BORDER)
+    sides = {
+        (0, -1.0): np.stack([np.zeros_like(y), y], axis=1),
+        (0, 1.0): np.stack([np.full_like(y, width), y], axis=1),
+        (1, -1.0): np.stack([x, np.zeros_like(x)], axis=1),
+        (1, 1.0): np.stack([x, np.full_like(x, height)], axis=1),
+    }
+    # where no ray leads to the border, the lens sees further than a pinhole may
+    size = np.array([width, height])
+    reach = 0.5 * _LARGEST * size / [camera.focal_length_x, camera.focal_length_y]
+    for (axis, sign), border in sides.items():
+        rays = sign * _normalised(camera, border)[:, axis]
+        rays = rays[np.isfinite(rays) & (rays > 0)]
+        if len(rays):
+            reach[axis] = min(reach[axis], float(rays.min()))
+    return reach

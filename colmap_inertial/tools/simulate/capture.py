@@ -1,0 +1,327 @@
+"""Write a simulated capture: frames or video, IMU, ``capture.toml``, and the truth beside them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from fractions import Fraction
+from functools import lru_cache, partial
+from multiprocessing import get_context, parent_process
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.core.errors import OutputExistsError
+from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_multiply, quat_normalize
+from colmap_inertial.io.files import write_json, write_text
+from colmap_inertial.io.video import frame_name
+from colmap_inertial.model.copying import new_folder
+from colmap_inertial.tools.simulate.motion import Motion, make_motion
+from colmap_inertial.tools.simulate.recipe import SceneRecipe, recipe_text
+from colmap_inertial.tools.simulate.render import Renderer, ShutterCamera, develop
+from colmap_inertial.tools.simulate.sensors import (
+    STANDARD_GRAVITY_M_S2,
+    ImuErrors,
+    SampledImu,
+    draw_imu_errors,
+    sample_imu,
+)
+from colmap_inertial.tools.simulate.world import Board, World, WorldKind, make_world
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+#: Camera (end of its files' names), frame, folder for the depth map.
+_Job = tuple[str, int, Path | None]
+
+#: Ticks of a video's clock in a second: 30, 25, 24 frames per second are whole numbers of them.
+_TICKS_HZ = 90000
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Scene:
+    """A recipe carried out, but for the pictures.
+
+    Attributes
+    ----------
+    motion
+        The body's path: poses at any time.
+    errors, imu
+        The device and its samples.
+    trigger_s
+        (F,) when the main camera starts exposing each frame's first line, camera clock.
+    names
+        (F,) file names of the frames.
+    """
+
+    recipe: SceneRecipe
+    motion: Motion
+    errors: ImuErrors
+    imu: SampledImu
+    trigger_s: Array
+    names: tuple[str, ...]
+
+    def world(self) -> World:
+        """The world that is filmed."""
+        return self.renderer().world
+
+    def renderer(self) -> Renderer:
+        """Renders that world; takes seconds to build, and is kept until one of another world is asked for."""
+        return _renderer(self.recipe.world, self.recipe.seed, self.recipe.board)
+
+    def camera_pose(self, camera: ShutterCamera, t_s: Array) -> tuple[Array, Array]:
+        """(N, 4) cam_from_world_xyzw and (N, 3) camera centres in metres of a camera of the rig at (N,) times."""
+        world_from_body = self.motion.world_from_cam_xyzw(t_s)
+        centre = self.motion.cam_in_world_m(t_s) + matrix_from_quat(world_from_body) @ np.array(camera.cam_in_body_m)
+        world_from_cam = quat_multiply(world_from_body, np.array(camera.body_from_cam_xyzw))
+        return quat_normalize(quat_conjugate(world_from_cam)), centre
+
+
+def make_scene(recipe: SceneRecipe) -> Scene:
+    """Draw the motion, the device and its samples; the camera's clock starts at 0 with the first frame."""
+    streams = [np.random.default_rng(s) for s in np.random.SeedSequence(recipe.seed).spawn(2)]
+    duration_s = recipe.motion.duration_s
+    motion = make_motion(recipe.motion, streams[0])
+    errors = draw_imu_errors(recipe.imu, duration_s, streams[1])
+    imu = sample_imu(motion, errors, recipe.imu, duration_s=duration_s, rng=streams[1])
+    count = int(duration_s * recipe.frame_rate_hz)
+    ticks = np.rint(np.arange(count) * (_TICKS_HZ / recipe.frame_rate_hz)).astype(np.int64)
+    if recipe.format == "h264":
+        names = tuple(frame_name(int(t), 0) for t in np.rint(ticks * (1e9 / _TICKS_HZ)))
+    else:
+        names = tuple(f"{i:06d}.{'jpg' if recipe.format == 'jpeg' else 'png'}" for i in range(count))
+    return Scene(recipe=recipe, motion=motion, errors=errors, imu=imu, trigger_s=ticks / _TICKS_HZ, names=names)
+
+
+def write_capture(
+    recipe: SceneRecipe, folder: Path, *, workers: int = 1, progress: Callable[[int, int], None] | None = None
+) -> Path:
+    """Make the capture that a recipe describes.
+
+    Writes ``frames/`` and ``frames.csv``, or ``clip.mp4``; ``gyro.csv``, ``accel.csv``, ``capture.toml``,
+    ``truth.json``, ``recipe.toml``; ``depth/`` where the recipe wants it; ``frames_NAME/`` or ``clip_NAME.mp4`` for the
+    rig's other cameras.
+
+    Parameters
+    ----------
+    folder
+        Must not exist, or be empty; it appears whole or not at all.
+    workers
+        Processes that render.
+    progress
+        Called with frames done and frames in all.
+
+    Returns
+    -------
+    The path of ``capture.toml``.
+
+    Raises
+    ------
+    OutputExistsError
+        Where the folder holds something already.
+    """
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise OutputExistsError(f"{folder} exists already; name a new folder")
+    with new_folder(folder, into_empty=True) as partial_folder:
+        _write_capture(recipe, partial_folder, workers, progress)
+    return folder / "capture.toml"
+
+
+def _write_capture(
+    recipe: SceneRecipe, folder: Path, workers: int, progress: Callable[[int, int], None] | None
+) -> None:
+    scene = make_scene(recipe)
+    cameras = _cameras(recipe)
+    total, done = len(cameras) * len(scene.names), 0
+    write = _write_video if recipe.format == "h264" else _write_images
+    with _processes(recipe, workers) as pool:
+        for suffix in cameras:
+            depth = folder / f"depth{suffix}" if recipe.depth_maps else None
+            if depth is not None:
+                depth.mkdir()
+            jobs = [(suffix, i, depth) for i in range(len(scene.names))]
+            images = map(partial(_render, scene), jobs) if pool is None else pool.map(_render_job, jobs)
+            for _ in write(scene, images, folder, suffix):
+                done += 1
+                if progress is not None:
+                    progress(done, total)
+    for name, t_s, values in (
+        ("gyro", scene.imu.recording.gyro_t_s, scene.imu.recording.gyro_rad_s),
+        ("accel", scene.imu.recording.accel_t_s, scene.imu.recording.accel_m_s2),
+    ):
+        rows = [f"{t:.7f},{x:.6f},{y:.6f},{z:.6f}" for t, (x, y, z) in zip(t_s, values, strict=True)]
+        write_text(folder / f"{name}.csv", "\n".join(["t,x,y,z", *rows]) + "\n")
+    if recipe.format != "h264":
+        rows = [f"{name},{t:.9f}" for name, t in zip(scene.names, scene.trigger_s, strict=True)]
+        write_text(folder / "frames.csv", "\n".join(["name,t_s", *rows]) + "\n")
+    write_text(folder / "recipe.toml", recipe_text(recipe))
+    write_json(folder / "truth.json", _truth(scene))
+    write_text(folder / "capture.toml", _capture_toml(recipe))
+
+
+# --- rendering, in this process or in several ---------------------------------------------------------------------
+
+
+@lru_cache(maxsize=1)
+def _renderer(world: WorldKind, seed: int, board: Board) -> Renderer:
+    return Renderer(make_world(world, seed, board))
+
+
+def _cameras(recipe: SceneRecipe) -> dict[str, ShutterCamera]:
+    """The main camera and those of the rig, by what their files' names end with."""
+    return {"": recipe.camera, **{f"_{name}": camera for name, camera in recipe.rig.items()}}
+
+
+def _render(scene: Scene, job: _Job) -> Image:
+    suffix, index, depth = job
+    recipe = scene.recipe
+    camera = _cameras(recipe)[suffix]
+    renderer = scene.renderer()
+    t_s = float(scene.trigger_s[index])
+    if depth is not None:
+        depth_m = renderer.depth_m(camera, scene.motion, camera.middle_s(t_s))
+        np.save(depth / f"{Path(scene.names[index]).stem}.npy", depth_m.astype(np.float32))
+    linear = renderer.linear(camera, scene.motion, t_s)
+    # a stream for each frame and camera, so that the noise does not depend on who rendered the one before
+    stream = [recipe.seed, index, *suffix.encode()]
+    return develop(linear, camera, np.random.default_rng(stream))
+
+
+#: The scene of a rendering process.
+_SCENE: list[Scene] = []
+
+
+def _begin(recipe: SceneRecipe) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that waits for this one ends it
+    threading.Thread(target=_end_with_the_parent, daemon=True).start()
+    _SCENE.append(make_scene(recipe))
+
+
+def _end_with_the_parent() -> None:
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _render_job(job: _Job) -> Image:
+    return _render(_SCENE[-1], job)
+
+
+@contextmanager
+def _processes(recipe: SceneRecipe, workers: int) -> Iterator[ProcessPoolExecutor | None]:
+    if workers <= 1:
+        yield None
+        return
+    with ProcessPoolExecutor(workers, get_context("spawn"), initializer=_begin, initargs=(recipe,)) as pool:
+        try:
+            yield pool
+        except BaseException:
+            pool.shutdown(cancel_futures=True)  # the frames that are in work take a second or two
+            raise
+
+
+def _write_images(scene: Scene, images: Iterator[Image], folder: Path, suffix: str) -> Iterator[None]:
+    import cv2
+
+    target = folder / f"frames{suffix}"
+    target.mkdir()
+    options = [cv2.IMWRITE_JPEG_QUALITY, scene.recipe.quality] if scene.recipe.format == "jpeg" else []
+    for name, image in zip(scene.names, images, strict=True):
+        if not cv2.imwrite(str(target / name), image[..., ::-1], options):
+            raise OSError(f"{target / name} could not be written")
+        yield
+
+
+def _write_video(scene: Scene, images: Iterator[Image], folder: Path, suffix: str) -> Iterator[None]:
+    import av
+
+    camera = scene.recipe.camera.model
+    with av.open(str(folder / f"clip{suffix}.mp4"), "w") as container:
+        rate = Fraction(scene.recipe.frame_rate_hz).limit_denominator(1001)
+        stream = container.add_stream("libx264", rate=rate)
+        stream.width, stream.height = camera.width, camera.height
+        stream.pix_fmt = "yuv420p"
+        # one thread: more of them make the result depend on the machine's load
+        stream.codec_context.thread_count = 1
+        stream.options = {"crf": str(scene.recipe.crf), "threads": "1"}
+        stream.codec_context.time_base = stream.time_base = Fraction(1, _TICKS_HZ)
+        for t_s, image in zip(scene.trigger_s, images, strict=True):
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
+            frame.pts, frame.time_base = round(t_s * _TICKS_HZ), Fraction(1, _TICKS_HZ)
+            container.mux(stream.encode(frame))
+            yield
+        container.mux(stream.encode())
+
+
+# --- what stands beside the pictures ------------------------------------------------------------------------------
+
+
+def _poses(scene: Scene, camera: ShutterCamera) -> list[dict[str, object]]:
+    middle_s = np.array([camera.middle_s(float(t)) for t in scene.trigger_s])
+    rotation, centre = scene.camera_pose(camera, middle_s)
+    return [
+        {"name": n, "t_s": t + camera.delay_s, "t_middle_s": m, "cam_from_world_xyzw": q, "cam_in_world_m": c}
+        for n, t, m, q, c in zip(scene.names, scene.trigger_s, middle_s, rotation, centre, strict=True)
+    ]
+
+
+def _truth(scene: Scene) -> dict[str, object]:
+    recipe, errors = scene.recipe, scene.errors
+    # the motion is the body's; the calibration that estimators seek is the main camera's
+    camera = recipe.camera
+    cam_from_body = quat_conjugate(np.array(camera.body_from_cam_xyzw))
+    imu_in_cam = matrix_from_quat(cam_from_body) @ (errors.imu_in_cam_m - np.array(camera.cam_in_body_m))
+    return {
+        "about": "Truth of a simulated capture: metres, seconds, radians; world z up; poses hold at t_middle_s "
+        "(mid-exposure of the middle line) on the camera's clock. recipe.toml gives poses at any other time.",
+        "gravity_in_world_m_s2": [0.0, 0.0, -STANDARD_GRAVITY_M_S2],
+        "target": {
+            "spec": recipe.board.spec(),
+            "corners_in_world_m": scene.world().board_corners_m,
+        },
+        "calibration": {
+            "cam_from_imu_xyzw": quat_normalize(quat_multiply(cam_from_body, errors.cam_from_imu_xyzw)),
+            "gyro_time_offset_s": errors.gyro_time_offset_s,
+            "accel_time_offset_s": errors.accel_time_offset_s,
+            "gyro_bias_rad_s": scene.imu.gyro_bias_rad_s.mean(axis=0),
+            "imu_in_cam_m": imu_in_cam,
+            "readout_s": camera.readout_s,
+        },
+        "accel_bias_m_s2": scene.imu.accel_bias_m_s2.mean(axis=0),
+        "gyro_error_matrix": errors.gyro_matrix,
+        "accel_error_matrix": errors.accel_matrix,
+        "imu_clock_rate": errors.clock_rate,
+        "exposure_s": camera.exposure_s,
+        "camera": camera.model,
+        "frames": _poses(scene, camera),
+        "rig": {
+            name: {"camera": other.model, "exposure_s": other.exposure_s, "frames": _poses(scene, other)}
+            for name, other in recipe.rig.items()
+        },
+    }
+
+
+def _capture_toml(recipe: SceneRecipe) -> str:
+    camera = recipe.camera
+    if recipe.format == "h264":
+        lines = ["[video]", 'file = "clip.mp4"']
+    else:
+        lines = ["[images]", 'folder = "frames"', 'times = "frames.csv"']
+    lines += ["", "[timing]", f"exposure_s = {camera.exposure_s!r}", f"readout_s = {camera.readout_s!r}"]
+    lines += [f'readout_direction = "{camera.readout_direction}"']
+    if recipe.camera_known:
+        model = camera.model
+        lines += ["", "[camera]", f'model = "{model.model}"', f"width = {model.width}", f"height = {model.height}"]
+        lines += [f"params = {list(model.params)!r}", 'pixel_origin = "corner"']
+    for sensor, unit in (("gyro", "rad/s"), ("accel", "m/s2")):
+        lines += ["", f"[imu.{sensor}]", f'file = "{sensor}.csv"', 'time = "t"', 'time_unit = "s"']
+        lines += ['columns = ["x", "y", "z"]', f'unit = "{unit}"']
+    lines += ["", "[imu.noise]", *(f"{name} = {value!r}" for name, value in asdict(recipe.imu.noise()).items())]
+    lines += ["", "[target]", f'spec = "{recipe.board.spec()}"']
+    return "\n".join(["# A simulated recording; recipe.toml made it, truth.json is its truth.", *lines]) + "\n"

@@ -1,0 +1,185 @@
+"""Points and meshes as arrays, thinned: from COLMAP's models and from the PLY files of its dense reconstructions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_inertial.checks.report.series import strided
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.types import Array
+from colmap_inertial.io.ply import Element, read_ply_header
+
+if TYPE_CHECKING:
+    import pycolmap
+
+Colours = NDArray[np.uint8]
+
+#: Points seen by so few images, or this badly, are left out where enough others remain.
+_FEWEST_VIEWS, _WORST_PX, _ENOUGH = 3, 2.0, 0.3
+_GREY = 150
+#: What float32, the graphics card's numbers, can hold.
+_LARGEST = float(np.finfo(np.float32).max)
+#: The scene reaches as far as this share of its points, and of its cameras.
+_MOST_PER_CENT, _NEARLY_ALL_PER_CENT = 65, 95
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Cloud:
+    """Some of a model's points.
+
+    Attributes
+    ----------
+    xyz
+        (N, 3) float32, in the units of the model.
+    rgb
+        (N, 3) colours.
+    total
+        Number of points that the model or file has.
+    dense
+        Whether they come from depth maps.
+    """
+
+    xyz: NDArray[np.float32]
+    rgb: Colours
+    total: int
+    dense: bool
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Mesh:
+    """A mesh: vertices (V, 3), faces (F, 3), colours (V, 3) where it has them."""
+
+    vertices: NDArray[np.float32]
+    faces: NDArray[np.uint32]
+    rgb: Colours | None
+
+
+def sparse_cloud(reconstruction: pycolmap.Reconstruction, most: int) -> Cloud:
+    """At most ``most`` points of a model, the same each time: those that at least three images see well."""
+    ids = np.array(sorted(reconstruction.point3D_ids()), dtype=np.uint64)
+    points = reconstruction.points3D
+    # a first choice bounds the work for models of millions of points
+    chosen = [points[i] for i in ids[strided(len(ids), 2 * most)].tolist()]
+    chosen = [p for p in chosen if np.abs(p.xyz).max() < _LARGEST]
+    good = [p for p in chosen if p.track.length() >= _FEWEST_VIEWS and not p.error > _WORST_PX]
+    if len(good) >= _ENOUGH * len(chosen):
+        chosen = good
+    chosen = [chosen[i] for i in strided(len(chosen), most).tolist()]
+    rgb = np.array([p.color for p in chosen], dtype=np.uint8).reshape(-1, 3)
+    if not rgb.any():  # a model without colours
+        rgb = np.full_like(rgb, _GREY)
+    xyz = np.array([p.xyz for p in chosen], dtype=np.float32).reshape(-1, 3)
+    return Cloud(xyz=xyz, rgb=rgb, total=len(ids), dense=False)
+
+
+def dense_cloud(path: Path, most: int) -> Cloud:
+    """At most ``most`` points of a PLY file, evenly chosen; only these are read, and shown where they are finite.
+
+    Raises
+    ------
+    FormatError
+        For what is no binary PLY file with points.
+    """
+    table, _ = _vertices(path)
+    some = np.asarray(table[strided(len(table), most)])
+    xyz = _positions(some)
+    known = np.isfinite(xyz).all(axis=1)
+    some, xyz = some[known], xyz[known]
+    rgb = _colours(some)
+    return Cloud(
+        xyz=xyz,
+        rgb=np.full((len(some), 3), _GREY, np.uint8) if rgb is None else rgb,
+        total=len(table),
+        dense=True,
+    )
+
+
+def read_mesh(path: Path, most_faces: int) -> Mesh | None:
+    """A PLY file of triangles; ``None`` where it has more than ``most_faces``, or none. Without what is not finite.
+
+    Raises
+    ------
+    FormatError
+        For what is no binary PLY mesh of triangles.
+    """
+    table, rest = _vertices(path)
+    if rest is None:
+        raise FormatError(path, "a mesh without faces")
+    element, offset, order = rest
+    if not 0 < element.rows <= most_faces:
+        return None
+    lists = [p for p in element.properties if p.count is not None]
+    if len(lists) != 1:
+        raise FormatError(path, "the faces of this mesh are not a list of vertices alone")
+    fields: list[Any] = []
+    for p in element.properties:
+        if p.count is None:
+            fields.append((p.name, order + p.kind))
+        else:
+            fields += [("count", order + p.count), ("index", order + p.kind, (3,))]
+    dtype = np.dtype(fields)
+    if path.stat().st_size < offset + element.rows * dtype.itemsize:
+        raise FormatError(path, "truncated, or a mesh of other faces than triangles")
+    faces = np.memmap(path, dtype, "r", offset, (element.rows,))
+    if not (faces["count"] == 3).all() or faces["index"].max() >= len(table):
+        raise FormatError(path, "a mesh of other faces than triangles")
+    vertices, index, rgb = _positions(table), faces["index"].astype(np.uint32), _colours(table)
+    known = np.asarray(np.isfinite(vertices).all(axis=1))
+    if not known.all():
+        renumbered = (np.cumsum(known) - 1).astype(np.uint32)
+        index = renumbered[index[np.all(known[index], axis=1)]]
+        vertices, rgb = vertices[known], None if rgb is None else rgb[known]
+    return Mesh(vertices=vertices, faces=index, rgb=rgb) if len(index) else None
+
+
+def _vertices(path: Path) -> tuple[Any, tuple[Element, int, str] | None]:
+    """The table of vertices, mapped from the file; and the faces' element, where in the file it begins, byte order."""
+    try:
+        with open(path, "rb") as file:
+            header = read_ply_header(path, file)
+            offset = file.tell()
+    except OSError as error:
+        raise FormatError(path, f"cannot be read: {error.strerror or error}") from None
+    order, elements = header.order, header.elements
+    if order is None or not elements or elements[0].name != "vertex" or elements[0].has_list:
+        raise FormatError(path, "only binary PLY files that begin with vertices can be shown")
+    first = elements[0]
+    dtype = first.dtype(order)
+    if not {"x", "y", "z"} <= set(dtype.names or ()) or first.rows == 0:
+        raise FormatError(path, "holds no points")
+    end = offset + first.rows * dtype.itemsize
+    if path.stat().st_size < end:
+        raise FormatError(path, "truncated")
+    table = np.memmap(path, dtype, "r", offset, (first.rows,))
+    faces = elements[1] if len(elements) > 1 and elements[1].name == "face" else None
+    return table, None if faces is None else (faces, end, order)
+
+
+def _positions(table: Any) -> NDArray[np.float32]:
+    with np.errstate(over="ignore"):  # what float32 cannot hold is not finite, and left out like the rest of it
+        return np.stack([table[name] for name in "xyz"], axis=1).astype(np.float32)
+
+
+def _colours(table: Any) -> Colours | None:
+    names = ("red", "green", "blue")
+    if not set(names) <= set(table.dtype.names):
+        return None
+    return np.stack([table[name] for name in names], axis=1).astype(np.uint8)
+
+
+def centre_and_reach(xyz: Array, cameras: Array) -> tuple[Array, float]:
+    """The middle of what was filmed, and how far around it most points and nearly all cameras are.
+
+    Far points, which a model of an open place always has, count for little.
+    """
+    every = np.concatenate([xyz, cameras]) if len(xyz) else cameras
+    middle = np.median(xyz, axis=0) if len(xyz) else np.median(cameras, axis=0)
+    points = np.percentile(np.linalg.norm(xyz - middle, axis=1), _MOST_PER_CENT) if len(xyz) else 0.0
+    poses = np.percentile(np.linalg.norm(cameras - middle, axis=1), _NEARLY_ALL_PER_CENT)
+    reach = max(float(points), float(poses), 1e-6 * float(np.abs(every).max()), 1e-9)
+    return middle, reach

@@ -1,0 +1,328 @@
+"""What a folder holds that can be shown: which model, in which unit, how sure its scale is, and what lies beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.geometry import quat_rotate
+from colmap_inertial.core.quantiles import Z95
+from colmap_inertial.core.types import Array
+from colmap_inertial.core.types.recorded import LengthUnit
+from colmap_inertial.io.files import read_json
+from colmap_inertial.io.names import path_in
+from colmap_inertial.model import TRANSFORM_FILE, find_models, is_metric, model_format
+from colmap_inertial.model.similarities import similarity_from_json
+from colmap_inertial.pipeline.run.workspace import Workspace, a_record_of_ours, places_of
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScaleFacts:
+    """What is known of a model's scale.
+
+    Attributes
+    ----------
+    unit
+        Of the model that is shown.
+    verdict, reasons
+        Of the estimate; ``None`` and empty where there was none.
+    metres_per_unit
+        What the original model was multiplied by; ``None`` where refused or unknown.
+    relative_ci95
+        The scale's 95 % interval divided by the scale; ``None`` where unknown.
+    """
+
+    unit: LengthUnit
+    verdict: str | None = None
+    reasons: tuple[str, ...] = ()
+    metres_per_unit: float | None = None
+    relative_ci95: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class KnownDistance:
+    """A known distance of a target, and what it measures in the model: metres."""
+
+    pair: tuple[str, str]
+    known_m: float
+    measured_m: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TargetFacts:
+    """A target of known size, as the validation of a metric model found it.
+
+    Attributes
+    ----------
+    spec
+        The target's description.
+    error_pct, ci95_pct
+        How much larger than it should be the target is in the model, per cent, and the 95 % interval.
+    within_tolerance
+        Whether that passes.
+    distances
+        Known distances, measured.
+    corners
+        (3,) position of each corner by name, in the model; empty where the validation did not keep them.
+    """
+
+    spec: str
+    error_pct: float
+    ci95_pct: tuple[float, float]
+    within_tolerance: bool
+    distances: tuple[KnownDistance, ...]
+    corners: Mapping[str, Array]
+
+
+@dataclass(frozen=True, kw_only=True)
+class StretchedPart:
+    """By how many per cent the refinement stretched a part of the path against the whole; times, camera clock."""
+
+    begin_s: float
+    end_s: float
+    percent: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ViewSource:
+    """A model to show.
+
+    Attributes
+    ----------
+    folder
+        The COLMAP model.
+    index
+        Its number.
+    others
+        Numbers of all models beside it, its own among them.
+    scale
+        What is known of its scale.
+    down_in_world
+        (3,) gravity's direction in the model; ``None`` where unknown.
+    gravity_on_axis
+        The model was turned so that gravity is along z or y, and it is not recorded which.
+    images
+        Folders that may have its images, best first.
+    fused, mesh, trajectory
+        Files made from it; ``None`` where there are none.
+    target
+        Where it was validated.
+    stretched
+        The drift that a refinement took out of it, part by part.
+    """
+
+    folder: Path
+    index: int
+    others: tuple[int, ...]
+    scale: ScaleFacts
+    down_in_world: Array | None = None
+    gravity_on_axis: bool = False
+    images: tuple[Path, ...] = ()
+    fused: Path | None = None
+    mesh: Path | None = None
+    trajectory: Path | None = None
+    target: TargetFacts | None = None
+    stretched: tuple[StretchedPart, ...] = ()
+
+
+def find_source(out: Path, index: int | None = None, *, images: Path | None = None) -> ViewSource:
+    """Find the model to show.
+
+    Parameters
+    ----------
+    out
+        What ``reconstruct`` or ``apply`` wrote, or any folder with a COLMAP model.
+    index
+        Number of the model; ``None`` takes the largest.
+    images
+        Folder with the model's images, where they are not beside it. What a result says of such a folder is not
+        followed: the result may be a stranger's, and the folder one's own.
+
+    Raises
+    ------
+    FormatError
+        Where there is no such model, or the run that makes it is not finished.
+    """
+    if not out.is_dir():
+        raise FormatError(out, "no such folder; give what reconstruct or apply wrote, or a COLMAP model")
+    if images is not None and not images.is_dir():
+        raise FormatError(images, "no such folder of images")
+    given = () if images is None else (images,)
+    workspace = Workspace(out)
+    if workspace.result.is_file() and model_format(out) is None:
+        return _of_reconstruction(workspace, index, given)
+    if workspace.stamps.is_dir():
+        raise FormatError(
+            out, "the run that writes this folder is not finished; start it again with the same arguments, it continues"
+        )
+    return _of_project(out, index, given)
+
+
+def _of_reconstruction(workspace: Workspace, index: int | None, given: tuple[Path, ...]) -> ViewSource:
+    root = workspace.root
+    record = read_json(workspace.result)
+    with a_record_of_ours(workspace.result):
+        models = {int(m["index"]): m for m in record.get("models", [])}
+        if not models:
+            raise FormatError(root, "its result holds no model to show")
+        sizes = {i: int(m["registered_images"]) for i, m in models.items()}
+        chosen = _choose(root, sizes, index)
+        fields = models[chosen]
+        metric = fields["sparse_metric"] is not None
+        place = str(fields["sparse_metric"] if metric else fields["sparse"])
+        # of an existing project, COLMAP's own model lies where the user's project is; it is only read
+        elsewhere = not metric and record.get("project") is not None and Path(place).is_absolute()
+        folder = Path(place) if elsewhere else path_in(root, place, workspace.result)
+        scale = _estimated(fields, "m" if metric else "model")
+        gravity = fields["gravity_in_world_m_s2"]
+        down = None if gravity is None else np.array(gravity, dtype=np.float64).reshape(3)
+        if down is not None and metric:
+            path = folder / TRANSFORM_FILE
+            down = quat_rotate(similarity_from_json(path, read_json(path)).rotation_xyzw, down)
+        dense = fields.get("dense") or {}
+        validation = fields.get("validation")
+        target = _target(validation) if metric and validation and "error" not in validation else None
+        fused, mesh, path_file = dense.get("fused"), dense.get("mesh"), fields.get("trajectory")
+        return ViewSource(
+            folder=folder,
+            index=chosen,
+            others=tuple(models),
+            scale=scale,
+            down_in_world=down,
+            images=(
+                *given,
+                *places_of(root).images,
+                *_image_folders(folder),
+            ),
+            fused=path_in(root, fused, workspace.result) if fused else None,
+            mesh=path_in(root, mesh, workspace.result) if mesh else None,
+            trajectory=path_in(root, path_file, workspace.result) if path_file else None,
+            target=target,
+            stretched=_stretched(fields),
+        )
+
+
+def _stretched(fields: Mapping[str, Any]) -> tuple[StretchedPart, ...]:
+    done = [one for one in fields.get("treatments", []) if one["stage"] == "refine" and one["action"]]
+    parts = done[-1]["values"].get("drift", []) if done else []
+    return tuple(
+        StretchedPart(**{name: float(part[name]) for name in ("begin_s", "end_s", "percent")}) for part in parts
+    )
+
+
+def _of_project(out: Path, index: int | None, given: tuple[Path, ...]) -> ViewSource:
+    """A COLMAP model, or a project with models where COLMAP has them, as they are or as ``apply`` wrote them."""
+    for place in (out, *places_of(out).sparse):
+        try:
+            models = find_models(place)
+            break
+        except FormatError:
+            continue
+    else:
+        raise FormatError(out, "no result of ours and no COLMAP model here (cameras, images, points3D, .bin or .txt)")
+    sizes = {i: _num_images(folder) for i, folder in models.items()}
+    chosen = _choose(out, sizes, index)
+    folder = models[chosen]
+    scale, on_axis = ScaleFacts(unit="model", **_verdict_of_apply(out, folder)), False
+    if is_metric(folder):
+        path = folder / TRANSFORM_FILE
+        similarity = similarity_from_json(path, read_json(path))
+        sigma = float(np.sqrt(max(similarity.cov[0, 0], 0.0)))
+        factor = float(np.exp(Z95 * sigma))
+        scale = ScaleFacts(
+            unit="m",
+            metres_per_unit=similarity.scale,
+            relative_ci95=(1 / factor, factor) if sigma > 0 else None,
+            **_verdict_of_apply(out, folder),
+        )
+        on_axis = bool(similarity.cov[1:4, 1:4].any())
+    single = len(models) == 1
+    return ViewSource(
+        folder=folder,
+        index=chosen,
+        others=tuple(models),
+        scale=scale,
+        gravity_on_axis=on_axis,
+        images=(*given, *_image_folders(folder)),
+        fused=_beside(out, chosen, single, "fused.ply"),
+        mesh=_beside(out, chosen, single, "meshed-tsdf.ply") or _beside(out, chosen, single, "meshed-poisson.ply"),
+    )
+
+
+def _choose(out: Path, sizes: Mapping[int, int], index: int | None) -> int:
+    if index is None:
+        return max(sizes, key=lambda i: (sizes[i], -i))
+    if index not in sizes:
+        there = ", ".join(map(str, sorted(sizes)))
+        raise FormatError(out, f"no model {index} here; --model takes one of {there}")
+    return index
+
+
+def _num_images(folder: Path) -> int:
+    """A measure of the number of registered images, without reading the model."""
+    suffix = model_format(folder)
+    return (folder / f"images{suffix}").stat().st_size
+
+
+def _estimated(fields: Mapping[str, Any], unit: LengthUnit) -> ScaleFacts:
+    scale, ci95 = fields["metres_per_unit"], fields["ci95"]
+    relative = None if scale is None or ci95 is None else (float(ci95[0]) / scale, float(ci95[1]) / scale)
+    return ScaleFacts(
+        unit=unit,
+        verdict=str(fields["verdict"]),
+        reasons=tuple(map(str, fields["reasons"])),
+        metres_per_unit=scale,
+        relative_ci95=relative,
+    )
+
+
+def _verdict_of_apply(out: Path, folder: Path) -> dict[str, Any]:
+    """Verdict and reasons that ``apply`` wrote into the project's record, where there is one."""
+    path = out / TRANSFORM_FILE
+    if not path.is_file():
+        return {}
+    with a_record_of_ours(path):
+        for model in read_json(path).get("models", []):
+            if out / model["folder"] == folder:
+                return {"verdict": model["verdict"], "reasons": tuple(map(str, model["reasons"]))}
+    return {}
+
+
+def _target(fields: Mapping[str, Any]) -> TargetFacts | None:
+    if fields["scale_error_pct"] is None or fields["ci95_pct"] is None:
+        return None
+    low, high = map(float, fields["ci95_pct"])
+    return TargetFacts(
+        spec=str(fields["target"]),
+        error_pct=float(fields["scale_error_pct"]),
+        ci95_pct=(low, high),
+        within_tolerance=bool(fields["within_tolerance"]),
+        distances=tuple(
+            KnownDistance(
+                pair=(str(d["pair"][0]), str(d["pair"][1])),
+                known_m=float(d["known_m"]),
+                measured_m=float(d["measured"]),
+            )
+            for d in fields["distances"]
+        ),
+        corners={
+            str(c["name"]): np.array(c["in_model"], dtype=np.float64).reshape(3) for c in fields.get("corners", [])
+        },
+    )
+
+
+def _image_folders(folder: Path) -> list[Path]:
+    """Where COLMAP's projects have the images of a model."""
+    return [place / "images" for place in (folder, *folder.absolute().parents[:3])]
+
+
+def _beside(out: Path, index: int, single: bool, name: str) -> Path | None:
+    """A dense result of a project's model, in the places where COLMAP's commands put it."""
+    dense = places_of(out).dense
+    places = [*(place / str(index) for place in dense), *([*dense, out] if single else [])]
+    return next((place / name for place in places if (place / name).is_file()), None)

@@ -1,6 +1,0 @@
-"""A reconstruction in the browser: what is shown (``scene``), how one measures in it (``measure``), and the server."""
-
-from colmap_inertial.view.measure import Measured, measured, nearest_to_ray, round_length
-from colmap_inertial.view.scene import Scene, load_scene
-
-__all__ = ["Measured", "Scene", "load_scene", "measured", "nearest_to_ray", "round_length"]
