@@ -259,7 +259,7 @@ def cost(scene: str, work: Path, width: int) -> dict[str, float]:
     code = (
         "import sys, tempfile, time\n"
         "from pathlib import Path\n"
-        "from colmap_inertial.colmap.swept import SweptWorkspace\n"
+        "from colmap_inertial.colmap.sweep_stereo import SweptWorkspace\n"
         "with tempfile.TemporaryDirectory() as raw:\n"
         "    swept = SweptWorkspace(Path(sys.argv[1]), Path(raw) / 'raw')\n"
         "    swept.begin(None)\n"

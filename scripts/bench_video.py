@@ -25,7 +25,7 @@ from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.io.capture import Capture, Video
 from colmap_inertial.io.frames import read_frame_timing, read_frames
 from colmap_inertial.pipeline.run.context import Recording
-from colmap_inertial.reconstruction.precalibrate.selection import part_of, select_frames
+from colmap_inertial.reconstruction.preparation.selection import part_of, select_frames
 
 WIDTH, HEIGHT, FPS, FOCAL_PX = 1920, 1080, 30, 1500.0
 #: Of the texture's path, px and rad/s; both repeat after a minute.

@@ -24,7 +24,7 @@ from colmap_inertial.imaging.psf import predicted_blur_px
 from colmap_inertial.model import colmap_camera, read_model
 from colmap_inertial.pipeline.stages.deblur import MOST_SMOOTHING_PX, SMOOTHING, DeblurStage
 from colmap_inertial.reconstruction.drivers.capture import reconstruct
-from colmap_inertial.reconstruction.precalibrate import plan
+from colmap_inertial.reconstruction.preparation import plan
 from colmap_inertial.tools.simulate import MotionOptions, SceneRecipe, make_scene, read_truth, write_capture
 
 #: Share of the blur at which any blur is smoothed alike.

@@ -29,8 +29,8 @@ from colmap_inertial.imaging.gate import GateOptions, RecordingVerdict, judge_fr
 from colmap_inertial.imaging.path_filters import smoothed
 from colmap_inertial.imaging.psf import blur_field, blur_path
 from colmap_inertial.pipeline.stages.deblur import smoothing_for
-from colmap_inertial.reconstruction.precalibrate import plan
-from colmap_inertial.reconstruction.precalibrate.judge import Looked, judged
+from colmap_inertial.reconstruction.preparation import plan
+from colmap_inertial.reconstruction.preparation.judge import Looked, judged
 
 #: Shares of the picture that are sky, blurs, and the blurs at which gyroscopes are wrong, px.
 SKIES, SKY_PX, FALSE_PX = (0.7, 0.9), (6.0, 10.0), (10.0, 20.0)

@@ -4,7 +4,7 @@ import numpy as np
 from box_project import HIGH, LOW, cast
 
 from colmap_inertial.core.geometry import so3_exp
-from colmap_inertial.imaging.sweep import DepthView, Partner, Pinhole, Sights
+from colmap_inertial.imaging.plane_sweep import DepthView, Partner, Pinhole, Sights
 
 _GRAIN_M = 0.06
 _VOLUME = np.random.default_rng(3).uniform(0, 255, (64, 64, 64)).astype("f4")

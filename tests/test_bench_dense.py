@@ -9,7 +9,7 @@ import pycolmap
 import pytest
 
 from colmap_inertial.colmap.fusion import fuse_maps
-from colmap_inertial.colmap.swept import SweptWorkspace
+from colmap_inertial.colmap.sweep_stereo import SweptWorkspace
 from colmap_inertial.core.geometry import matrix_from_quat, so3_exp
 from colmap_inertial.core.types import CameraModel
 from colmap_inertial.io.files import write_json

@@ -11,7 +11,7 @@ import pytest
 from colmap_inertial import calibrate_imu, estimate_scale, gravity_at_latitude_m_s2
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.types import IMU_CAL, IMU_CALIBRATION_PARAMETERS, ImuCalibration, ImuRecording
-from colmap_inertial.inertial.rest._rests import candidate_rests
+from colmap_inertial.inertial.static_calibration._rests import candidate_rests
 from colmap_inertial.tools.simulate import RecordingOptions, RestOptions, simulate_recording, simulate_rests
 from colmap_inertial.tools.simulate.sensors import IMU_PRESETS
 

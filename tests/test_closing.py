@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from colmap_inertial.colmap import closing
-from colmap_inertial.colmap.closing import EndsMet, close_gaps
+from colmap_inertial.colmap import loop_closure
+from colmap_inertial.colmap.loop_closure import LoopClosure, close_gaps
 from colmap_inertial.io.records import read_record, write_record
 
 #: A camera turns once around in the middle of a round room, looking outwards.
@@ -188,7 +188,7 @@ def test_the_mapper_s_model_is_the_joined_one_where_the_order_in_time_is_known(t
     def close(database, model, pipeline, names, *, nearest):
         asked.append((list(names), nearest))
         model.deregister_frame(1)  # a mark
-        return EndsMet(pairs=4, images=(NAMES[0], NAMES[-1]), agree=0.7, joined=joins)
+        return LoopClosure(pairs=4, images=(NAMES[0], NAMES[-1]), agree=0.7, joined=joins)
 
     monkeypatch.setattr(pycolmap, "incremental_mapping", made)
     monkeypatch.setattr(mapping, "close_gaps", close)
@@ -252,12 +252,12 @@ def test_a_large_model_is_solved_directly_unless_all_images_see_the_same(tmp_pat
             if ring.model.image(element.image_id).point2D(0).has_point3D():
                 ring.model.delete_observation(element.image_id, 0)
         ring.model.add_point3D(np.zeros(3), pycolmap.Track(elements), np.zeros(3, dtype=np.uint8))
-    assert (closing._work(ring.model) == closing._work_of(FRAMES)) == all_see_it
+    assert (loop_closure._work(ring.model) == loop_closure._work_of(FRAMES)) == all_see_it
     as_it_is = pycolmap.BundleAdjustmentOptions().ceres.max_num_images_direct_sparse_cpu_solver
-    adjustment = closing._adjustment(ring.options, ring.model)
+    adjustment = loop_closure._adjustment(ring.options, ring.model)
     # what is small is as COLMAP has it
     assert adjustment.ceres.max_num_images_direct_sparse_cpu_solver == as_it_is
-    monkeypatch.setattr(closing, "LONGEST", FRAMES - 8)
-    adjustment = closing._adjustment(ring.options, ring.model)
+    monkeypatch.setattr(loop_closure, "LONGEST", FRAMES - 8)
+    adjustment = loop_closure._adjustment(ring.options, ring.model)
     assert adjustment.ceres.max_num_images_direct_sparse_cpu_solver == (FRAMES if directly else as_it_is)
     assert adjustment.ceres.solver_options.function_tolerance > 0

@@ -27,7 +27,7 @@ from colmap_inertial.io.trajectories import read_inertial_scale
 from colmap_inertial.model import Model, read_model
 from colmap_inertial.motion.flow import measure_rotation
 from colmap_inertial.pipeline.stages.metric import MetricStage
-from colmap_inertial.reconstruction.precalibrate.preflight import stop_or_doubt
+from colmap_inertial.reconstruction.preparation.preflight import stop_or_doubt
 from colmap_inertial.tools.simulate.motion import MotionKind, MotionOptions
 from colmap_inertial.tools.simulate.recording import RecordingOptions, SimulatedRecording, simulate_recording
 from colmap_inertial.tools.simulate.render import colmap_camera

@@ -50,8 +50,8 @@ from colmap_inertial.reconstruction.drivers.result import (
     frame_as_json,
     imaging_as_json,
 )
-from colmap_inertial.reconstruction.precalibrate.plan import ImagingPlan
-from colmap_inertial.reconstruction.precalibrate.selection import Selection
+from colmap_inertial.reconstruction.preparation.plan import ImagingPlan
+from colmap_inertial.reconstruction.preparation.selection import Selection
 from colmap_inertial.tools.batch import read_manifest
 
 ROOT = Path(__file__).parents[1]

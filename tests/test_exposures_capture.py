@@ -37,7 +37,7 @@ from colmap_inertial.reconstruction.drivers import capture as driver, fuse_expos
 from colmap_inertial.reconstruction.drivers.capture import reconstruct
 from colmap_inertial.reconstruction.drivers.deblur import deblur_capture
 from colmap_inertial.reconstruction.drivers.fuse_exposures import fuse_exposures_captured
-from colmap_inertial.reconstruction.precalibrate import plan
+from colmap_inertial.reconstruction.preparation import plan
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -279,7 +279,7 @@ def test_colmap_is_quiet_while_it_looks_for_the_calibration(capture, tmp_path, m
         levels.append(pycolmap.logging.minloglevel)
         raise NotObservableError("calibration", "so")
 
-    monkeypatch.setattr(plan, "precalibrate", look)
+    monkeypatch.setattr(plan, "estimate_preliminary_calibration", look)
     pycolmap.logging.minloglevel = 0
     try:
         fuse_exposures_captured(capture, tmp_path / "out", fuser=AVERAGE, progress=silent)

@@ -16,12 +16,12 @@ from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.frames import read_frames
 from colmap_inertial.io.imu import read_capture_imu
 from colmap_inertial.model import colmap_camera
-from colmap_inertial.motion.slide import FollowedPair, follow_pairs
+from colmap_inertial.motion.lateral_flow import FollowedPair, follow_pairs
 from colmap_inertial.pipeline.run.context import Recording, RunContext, prior_calibration
 from colmap_inertial.pipeline.run.progress import silent
 from colmap_inertial.reconstruction.drivers.deblur import deblur_capture
-from colmap_inertial.reconstruction.precalibrate import plan as imaging, sliding as looked_at
-from colmap_inertial.reconstruction.precalibrate.plan import Treatments, plan_imaging
+from colmap_inertial.reconstruction.preparation import plan as imaging, translating as looked_at
+from colmap_inertial.reconstruction.preparation.plan import Treatments, plan_imaging
 from colmap_inertial.tools.simulate.motion import MARGIN_S, Motion
 
 FRAMES, EXPOSURE_S = 18, 0.025

@@ -26,8 +26,8 @@ from colmap_inertial.io.imu_calibration import (
 )
 from colmap_inertial.pipeline.run.config import config_as_toml, read_config
 from colmap_inertial.pipeline.run.context import corrected_imu, prior_calibration
-from colmap_inertial.reconstruction.drivers import remembered
-from colmap_inertial.reconstruction.drivers.remembered import configuration_folder, remember, remembered_of
+from colmap_inertial.reconstruction.drivers import device_store
+from colmap_inertial.reconstruction.drivers.device_store import configuration_folder, remember, remembered_of
 from colmap_inertial.tools.simulate import RestOptions, simulate_rests
 
 ROOT = Path(__file__).parents[1]
@@ -363,4 +363,4 @@ def test_any_name_of_a_device_stays_in_the_folder(both, home, name) -> None:
     kept = remember(name, both[1])
     assert kept.parent.parent == configuration_folder() / "devices"
     assert kept != remember(name + "2", both[1])
-    assert remembered._folder(name) == kept.parent
+    assert device_store._folder(name) == kept.parent

@@ -22,7 +22,7 @@ from colmap_inertial.model import read_model
 from colmap_inertial.pipeline.run.progress import silent
 from colmap_inertial.pipeline.stages.frame_folder import write_frames
 from colmap_inertial.pipeline.stages.rectified import write_images
-from colmap_inertial.reconstruction.precalibrate.calibrate import some_frames
+from colmap_inertial.reconstruction.preparation.calibrate import some_frames
 from colmap_inertial.tools.batch import read_manifest
 from colmap_inertial.tools.view.sources import find_source
 

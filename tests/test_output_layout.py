@@ -17,8 +17,8 @@ from test_pipeline_parts import session_in
 from colmap_inertial.checks.report.words import mapped_in_words, parts_mapped_in_words
 from colmap_inertial.cli.terminal import show_result
 from colmap_inertial.colmap import dense as dense_room
-from colmap_inertial.colmap.closing import EndsMet
 from colmap_inertial.colmap.depth_maps import MadeFrom
+from colmap_inertial.colmap.loop_closure import LoopClosure
 from colmap_inertial.colmap.mapping import MapRecord, ModelEnds
 from colmap_inertial.core.errors import AlreadyMetricError, FormatError, MappingError, OutputError, OutputExistsError
 from colmap_inertial.core.options import ProjectOptions
@@ -32,11 +32,16 @@ from colmap_inertial.pipeline.run.workspace import Workspace, places_of
 from colmap_inertial.pipeline.stages.frame_folder import FrameRecord
 from colmap_inertial.reconstruction.drivers import deblur
 from colmap_inertial.reconstruction.drivers.frames import run_images
-from colmap_inertial.reconstruction.drivers.placed import place_project, placed_paths, remove_placed, require_free_names
+from colmap_inertial.reconstruction.drivers.project_output import (
+    place_project,
+    placed_paths,
+    remove_placed,
+    require_free_names,
+)
 from colmap_inertial.reconstruction.drivers.reporting import reporting_stops
 from colmap_inertial.reconstruction.drivers.result import ModelResult, ReconstructResult
-from colmap_inertial.reconstruction.drivers.standing import settle_dense
-from colmap_inertial.reconstruction.precalibrate.plan import ImagingPlan
+from colmap_inertial.reconstruction.drivers.stale_outputs import remove_stale_dense
+from colmap_inertial.reconstruction.preparation.plan import ImagingPlan
 
 SCALE = ModelScale(similarity=SIMILARITY, verdict="trusted")
 REFUSED = ModelScale(similarity=None, verdict="refused", reasons=("the camera stood still",))
@@ -172,13 +177,13 @@ def test_a_dense_reconstruction_goes_with_its_model(workspace, colmap_project):
     mine = workspace.dense / "1"
     mine.mkdir()
     (mine / "fused.ply").write_text("by somebody else")
-    settle_dense(workspace, models)
+    remove_stale_dense(workspace, models)
     assert (folder / "fused.ply").is_file()
-    settle_dense(workspace, models | metric_model(workspace, colmap_project, 3.0))
+    remove_stale_dense(workspace, models | metric_model(workspace, colmap_project, 3.0))
     assert not folder.exists() and not workspace.earlier.exists()
     assert not list(workspace.stamps.glob("dense_*"))  # what is gone is made again
     assert contents(mine) == {"fused.ply": b"by somebody else"}
-    settle_dense(workspace, {})
+    remove_stale_dense(workspace, {})
     assert contents(workspace.dense) == {"1/fused.ply": b"by somebody else"}
 
 
@@ -187,14 +192,14 @@ def test_depth_maps_are_set_aside_and_come_back_with_their_model(workspace, colm
     (folder / "stereo" / "depth_maps" / "a.geometric.bin").write_text("hours")
     before = contents(folder)
     other = metric_model(workspace, colmap_project, 3.0)
-    settle_dense(workspace, other)
+    remove_stale_dense(workspace, other)
     assert not workspace.dense.exists()
     assert contents(workspace.earlier / "dense" / "0") == before | {".stages/dense_0_fused.json": b"{}"}
     assert not list(workspace.stamps.glob("dense_*"))  # another one is made whole
     dense_of(workspace, 0, maps=True)
-    settle_dense(workspace, {})  # refused
+    remove_stale_dense(workspace, {})  # refused
     assert sorted(path.name for path in (workspace.earlier / "dense").iterdir()) == ["0", "0-2"]
-    settle_dense(workspace, metric_model(workspace, colmap_project, 2.0))
+    remove_stale_dense(workspace, metric_model(workspace, colmap_project, 2.0))
     assert contents(folder) == before
     assert [path.name for path in workspace.stamps.glob("dense_*")] == ["dense_0_fused.json"]  # and is not made again
     assert [path.name for path in (workspace.earlier / "dense").iterdir()] == ["0-2"]
@@ -213,10 +218,10 @@ def test_a_dense_reconstruction_that_was_cut_off_early_goes_with_its_model(works
     prepared = dense_room._Prepared(names=(), made_from=made_from, has_maps=False)
     with pytest.raises(KeyboardInterrupt):
         dense_room._undistort(session, 0, workspace.images, prepared)
-    settle_dense(workspace, models)
+    remove_stale_dense(workspace, models)
     assert (workspace.dense / "0").is_dir()
     (workspace.stamps / "sweep_0").mkdir()
-    settle_dense(workspace, {})
+    remove_stale_dense(workspace, {})
     assert not workspace.dense.exists() and not (workspace.stamps / "sweep_0").exists()
 
 
@@ -411,7 +416,7 @@ def test_what_is_not_of_the_project_is_not_written_over(placing):
 def test_a_project_s_own_dense_folder_goes_with_the_project(placing):
     placing()
     (placing.workspace.dense / "made_from.json").write_text('{"model": "another"}')
-    settle_dense(placing.workspace, {})
+    remove_stale_dense(placing.workspace, {})
     assert (placing.workspace.dense / "fused.ply").is_file()
 
 
@@ -463,8 +468,8 @@ def test_the_screen_and_the_report_say_how_a_model_was_made(workspace, capsys):
     in_parts = MapRecord(mapper="incremental", models=1, parts=6)
     assert parts_mapped_in_words(asdict(in_parts)) == ["COLMAP mapped the recording in 6 parts."]
     assert parts_mapped_in_words(asdict(record)) == parts_mapped_in_words(None) == []
-    fits = EndsMet(pairs=40, images=("a.jpg", "b.jpg"), agree=0.99, joined=True)
-    bad = EndsMet(pairs=7, images=("c.jpg", "d.jpg"), agree=0.2, joined=False)
+    fits = LoopClosure(pairs=40, images=("a.jpg", "b.jpg"), agree=0.99, joined=True)
+    bad = LoopClosure(pairs=7, images=("c.jpg", "d.jpg"), agree=0.2, joined=False)
     torn = MapRecord(mapper="incremental", models=2, parts=6, seams=(fits, bad))
     models = (model, replace(model, index=1, colmap_index=0))
     show_result(ReconstructResult(workspace=workspace, models=models, seconds={}, mapping=torn), Path("here"))

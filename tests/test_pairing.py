@@ -7,11 +7,13 @@ import numpy as np
 import pycolmap
 import pytest
 
-from colmap_inertial.colmap import loops, pairing, sparse, way as way_module
+from colmap_inertial.colmap import loops, pairing, relative_track, sparse
+from colmap_inertial.colmap.covisibility import Covisibility
 from colmap_inertial.colmap.gyro_bias import RayPairs, bias_correction
-from colmap_inertial.colmap.headings import Headings, find_headings
+from colmap_inertial.colmap.gyro_orientations import GyroOrientations, estimate_gyro_orientations
 from colmap_inertial.colmap.loops import candidates, close_loops, key_frames, without_contradictions
 from colmap_inertial.colmap.pairing import match_capture
+from colmap_inertial.colmap.relative_track import RelativeTrack, Sightings, estimate_relative_track, joined
 from colmap_inertial.colmap.sparse import mapping_device
 from colmap_inertial.colmap.two_views import (
     Return,
@@ -22,8 +24,6 @@ from colmap_inertial.colmap.two_views import (
     returns,
     sightings_of,
 )
-from colmap_inertial.colmap.votes import Voters
-from colmap_inertial.colmap.way import Sightings, Way, find_way, joined
 from colmap_inertial.core.errors import InertialError, NotObservableError
 from colmap_inertial.core.geometry import quat_from_matrix, so3_exp
 from colmap_inertial.core.options import MappingOptions
@@ -58,7 +58,7 @@ def headings_of(angle_deg, t_s, bias_sigma=1e-3, bias=BIAS):
     rate[:, 1] = np.gradient(angle, fine_s)
     timing = FrameTiming(names=tuple(f"{i:04}" for i in range(len(t_s))), t_s=t_s, readout_s=0.0)
     calibration = replace(calibration_of(bias_sigma), gyro_bias_rad_s=bias)
-    return Headings.of(imu_of(fine_s, rate), calibration, timing, CAMERA)
+    return GyroOrientations.of(imu_of(fine_s, rate), calibration, timing, CAMERA)
 
 
 def pair(i, j):
@@ -109,9 +109,9 @@ def test_a_wide_lens_sees_more_in_common():
     wide = CameraModel(model="PINHOLE", width=800, height=600, params=(200.0, 200.0, 400.0, 300.0))
     timing = FrameTiming(names=("a", "b"), t_s=t_s, readout_s=0.0)
     imu = imu_of(np.arange(-1, 7, 0.01), np.zeros((800, 3)))
-    assert Headings.of(imu, calibration_of(), timing, wide).apart_rad == pytest.approx(2 * np.arctan(2))
-    assert Headings.of(imu, calibration_of(), timing, CAMERA).apart_rad == pytest.approx(np.pi / 2)
-    assert Headings.of(imu, calibration_of(), timing, None).apart_rad == pytest.approx(np.pi / 2)
+    assert GyroOrientations.of(imu, calibration_of(), timing, wide).apart_rad == pytest.approx(2 * np.arctan(2))
+    assert GyroOrientations.of(imu, calibration_of(), timing, CAMERA).apart_rad == pytest.approx(np.pi / 2)
+    assert GyroOrientations.of(imu, calibration_of(), timing, None).apart_rad == pytest.approx(np.pi / 2)
 
 
 # --- the gyroscope's bias --------------------------------------------------------------------------------------------
@@ -194,14 +194,14 @@ def database(tmp_path):
 
 
 def test_images_that_share_features_have_votes(database):
-    voters = Voters.of(database, ["a", "b", "c"])
+    voters = Covisibility.of(database, ["a", "b", "c"])
     votes = voters.count(np.array([0, 0]), np.array([1, 2]))
     assert voters.plenty.all() and len(voters.descriptors[0]) == 500
     assert votes[0] > 400 and votes[1] < 4
 
 
 def test_few_features_do_not_rule_a_pair_out(database):
-    voters = Voters.of(database, ["a", "b"])
+    voters = Covisibility.of(database, ["a", "b"])
     few = replace(voters, descriptors=(voters.descriptors[0], voters.descriptors[1][:30]))
     assert few.plenty.tolist() == [True, False]
 
@@ -223,7 +223,9 @@ def way_along(centre):
     """A way through centres (N, 3), with one point before each frame."""
     none = np.zeros(0, dtype=np.intp)
     sightings = Sightings(frame=none, point=none, feature=none, rays=np.zeros((0, 3)))
-    return Way(part=np.zeros(len(centre), dtype=np.intp), centre=centre, points=np.zeros((0, 3)), sightings=sightings)
+    return RelativeTrack(
+        part=np.zeros(len(centre), dtype=np.intp), centre=centre, points=np.zeros((0, 3)), sightings=sightings
+    )
 
 
 def circle(count=40):
@@ -361,7 +363,7 @@ def test_the_way_is_found_up_to_its_length_and_is_as_sure_as_it_says():
     count = 60
     centre = circle(count)
     headings = headings_of(np.linspace(0, 360, count), 0.5 * np.arange(count))
-    way = find_way(sightings_along(centre, headings.start_from_cam, np.random.default_rng(3)), count)
+    way = estimate_relative_track(sightings_along(centre, headings.start_from_cam, np.random.default_rng(3)), count)
     assert (way.part == 0).all()
     scale = np.linalg.norm(way.centre[10] - way.centre[0]) / np.linalg.norm(centre[10] - centre[0])
     i, j = np.zeros(5, dtype=np.intp), np.array([10, 20, 30, 45, 59])
@@ -371,7 +373,9 @@ def test_the_way_is_found_up_to_its_length_and_is_as_sure_as_it_says():
     assert (np.sum(off * np.linalg.solve(covariance, off[..., None])[..., 0], axis=1) < 16.3).all()
     # all of the way was left at its first frame
     rest = way.centre[20] - way.centre[:21]
-    assert way.covariance(i[:1], np.array([20]), np.zeros(1))[0] == pytest.approx(way_module.DRIFT**2 * rest.T @ rest)
+    assert way.covariance(i[:1], np.array([20]), np.zeros(1))[0] == pytest.approx(
+        relative_track.DRIFT**2 * rest.T @ rest
+    )
 
 
 def test_a_way_that_nothing_leads_across_has_two_parts():
@@ -379,7 +383,7 @@ def test_a_way_that_nothing_leads_across_has_two_parts():
     headings = headings_of(np.linspace(0, 180, count), 0.5 * np.arange(count))
     found = sightings_along(circle(count), headings.start_from_cam, np.random.default_rng(0))
     split = replace(found, point=np.where(found.frame < 15, found.point, found.point + 1500))
-    way = find_way(split, count)
+    way = estimate_relative_track(split, count)
     assert way.known(np.array([0, 20]), np.array([10, 29])).all()
     assert not way.known(np.array([10]), np.array([20]))[0]
 
@@ -405,7 +409,7 @@ def test_pairs_without_a_gyroscope_are_those_of_before(database, tmp_path, monke
     def refused(*_):
         raise NotObservableError("time offset", "no")
 
-    monkeypatch.setattr(pairing, "find_headings", refused)
+    monkeypatch.setattr(pairing, "estimate_gyro_orientations", refused)
     timing = FrameTiming(names=("a", "b", "c"), t_s=np.arange(3.0))
     recording = type("Recording", (), {"timing": timing})()
     record = match_capture(
@@ -473,7 +477,7 @@ def test_headings_are_found_by_the_turns_of_the_pictures():
     recording = type(
         "Recording", (), {"timing": timing, "imu": imu_of(fine_s, rate), "prior": prior, "max_offset_s": 1.0}
     )()
-    found = find_headings(recording, turn, ray_pairs_of(true, np.random.default_rng(0)), CAMERA)
+    found = estimate_gyro_orientations(recording, turn, ray_pairs_of(true, np.random.default_rng(0)), CAMERA)
     assert found.calibration.gyro_bias_rad_s == pytest.approx(BIAS, abs=3e-3)
 
 
@@ -482,7 +486,7 @@ def test_a_capture_too_short_for_loops_has_none(monkeypatch):
     monkeypatch.setattr(loops, "forget", lambda database, pairs: None)
     empty = TwoViews(first_from_second=np.zeros((0, 3, 3)), covered=np.zeros(0))
     monkeypatch.setattr(loops, "compare", lambda database, pairs: empty)
-    voters = Voters(descriptors=(), xy_px=())
+    voters = Covisibility(descriptors=(), xy_px=())
     found = close_loops(
         None, ["a", "b", "c"], headings, way_along(circle(3)), voters, 10, doubtful=[], neighbours=[], match=len
     )
@@ -538,7 +542,7 @@ def test_a_frame_is_placed_by_points_that_another_one_knew(tmp_path):
         feature=np.tile(np.arange(60), 2),
         rays=np.zeros((120, 3)),
     )
-    way = Way(
+    way = RelativeTrack(
         part=np.zeros(2, dtype=np.intp),
         centre=np.array([[0, 0, 0], [7.0, 7, 7]]),
         points=np.concatenate([points, half]),

@@ -25,16 +25,16 @@ from colmap_inertial.pipeline.run.context import Recording, RunContext, prior_ca
 from colmap_inertial.pipeline.run.progress import silent
 from colmap_inertial.reconstruction.drivers.capture import reconstruct
 from colmap_inertial.reconstruction.drivers.deblur import deblur_capture
-from colmap_inertial.reconstruction.precalibrate import calibrate as first_look, plan as imaging
-from colmap_inertial.reconstruction.precalibrate.plan import (
+from colmap_inertial.reconstruction.preparation import calibrate as first_look, plan as imaging
+from colmap_inertial.reconstruction.preparation.plan import (
     Treatments,
     plan_imaging,
     read_plan,
     with_stated_exposures,
     write_plan,
 )
-from colmap_inertial.reconstruction.precalibrate.selection import part_of
-from colmap_inertial.reconstruction.precalibrate.translation import find_parallaxes
+from colmap_inertial.reconstruction.preparation.selection import part_of
+from colmap_inertial.reconstruction.preparation.translation import find_parallaxes
 from colmap_inertial.tools.simulate import MotionOptions, make_motion
 
 QUICK = ReconstructOptions(mapping=MappingOptions(max_num_features=1000, first_octave=0), deterministic=True)

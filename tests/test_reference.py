@@ -16,7 +16,7 @@ from colmap_inertial.checks.validate.lengths import LengthCheck
 from colmap_inertial.cli.terminal import show_reference
 from colmap_inertial.core.errors import InertialError, NotObservableError, TargetNotFoundError
 from colmap_inertial.core.options import ReferenceOptions
-from colmap_inertial.reconstruction.drivers import bare as bare_rooms, reference as rooms
+from colmap_inertial.reconstruction.drivers import no_imu as bare_rooms, reference as rooms
 from colmap_inertial.reconstruction.drivers.reference import Reference, scale_project_by
 
 

@@ -27,8 +27,8 @@ from colmap_inertial.pipeline.stages.deblur import DeblurStage
 from colmap_inertial.pipeline.stages.frame_folder import read_frame_records
 from colmap_inertial.reconstruction.drivers.capture import reconstruct
 from colmap_inertial.reconstruction.drivers.deblur import deblur_capture
-from colmap_inertial.reconstruction.precalibrate import plan as imaging
-from colmap_inertial.reconstruction.precalibrate.plan import read_plan, write_plan
+from colmap_inertial.reconstruction.preparation import plan as imaging
+from colmap_inertial.reconstruction.preparation.plan import read_plan, write_plan
 
 DEEP = replace(QUICK, deblur="deepgyro")
 
@@ -227,7 +227,7 @@ def test_asked_for_by_name_it_is_an_error_where_gyroscope_and_pixels_do_not_agre
     def fails(*args, **kwargs):
         raise NotObservableError("time offset", "so")
 
-    monkeypatch.setattr(imaging, "precalibrate", fails)
+    monkeypatch.setattr(imaging, "estimate_preliminary_calibration", fails)
     with pytest.raises(NotObservableError):
         planned(parts(blurred), tmp_path, deblur=method)
     plan = planned(parts(blurred), tmp_path)

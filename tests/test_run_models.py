@@ -44,7 +44,7 @@ from colmap_inertial.reconstruction.drivers import models
 from colmap_inertial.reconstruction.drivers.models import run_models, run_validation
 from colmap_inertial.reconstruction.drivers.project import _scales
 from colmap_inertial.reconstruction.drivers.result import ModelResult, ReconstructResult, result_as_json
-from colmap_inertial.reconstruction.precalibrate.plan import ImagingPlan
+from colmap_inertial.reconstruction.preparation.plan import ImagingPlan
 from colmap_inertial.tools.simulate import ImuOptions, MotionOptions, RecordingOptions, SfmOptions, simulate_recording
 
 CAMERA = CameraModel(model="PINHOLE", width=640, height=480, params=(500.0, 500.0, 320.0, 240.0))
@@ -285,8 +285,8 @@ def test_doubts_make_any_stage_s_scale_weak_and_make_the_models_again(run):
     sure, _ = run({0: 40})
     assert sure[0].scale.verdict == "trusted"
     doubts = ("the video was stabilised",)
-    doubted, _ = run({0: 40}, doubts=doubts)
-    assert doubted[0].scale.verdict == "weak" and doubted[0].scale.reasons[:1] == doubts
+    downgraded, _ = run({0: 40}, doubts=doubts)
+    assert downgraded[0].scale.verdict == "weak" and downgraded[0].scale.reasons[:1] == doubts
     assert run.session.runner.worked == ["metric"]
     run({0: 40}, doubts=doubts)
     assert run.session.runner.worked == []

@@ -11,7 +11,7 @@ import pytest
 
 from colmap_inertial import AlreadyMetricError, Model, OutputExistsError, ScaleEstimate, Similarity, reconstruct
 from colmap_inertial.core.errors import FormatError
-from colmap_inertial.model import doubted, read_model
+from colmap_inertial.model import downgraded, read_model
 from colmap_inertial.model.similarities import read_scales
 from colmap_inertial.pipeline.run.context import RunContext
 from colmap_inertial.pipeline.run.runner import StepRunner, canonical
@@ -47,11 +47,11 @@ def test_scales_of_a_result_belong_to_colmap_s_numbers(tmp_path):
 
 def test_doubts_lower_a_verdict_that_was_raised_again():
     doubts = ("the video was stabilised",)
-    once = doubted(ESTIMATE, doubts)
+    once = downgraded(ESTIMATE, doubts)
     raised = dataclasses.replace(once, verdict="trusted")
-    assert once.verdict == doubted(raised, doubts).verdict == "weak"
-    assert doubted(raised, doubts).reasons == once.reasons == doubts
-    assert doubted(ESTIMATE, ()) is ESTIMATE
+    assert once.verdict == downgraded(raised, doubts).verdict == "weak"
+    assert downgraded(raised, doubts).reasons == once.reasons == doubts
+    assert downgraded(ESTIMATE, ()) is ESTIMATE
 
 
 def test_a_model_is_scaled_once(project):

@@ -39,15 +39,15 @@ from colmap_inertial.pipeline.stages.exposures import Fuser
 from colmap_inertial.pipeline.stages.frame_folder import FrameRecord, write_frames
 from colmap_inertial.pipeline.stages.gyro_view import GyroView
 from colmap_inertial.pipeline.stages.rectified import write_images
-from colmap_inertial.reconstruction.drivers import frames as framing, placed, project as existing
+from colmap_inertial.reconstruction.drivers import frames as framing, project as existing, project_output
 from colmap_inertial.reconstruction.drivers.frames import run_frames, run_images, run_plan
 from colmap_inertial.reconstruction.drivers.sources import check_output
-from colmap_inertial.reconstruction.precalibrate import calibrate, plan as imaging
-from colmap_inertial.reconstruction.precalibrate.judge import Looked, below_sky, by_frame
-from colmap_inertial.reconstruction.precalibrate.pairs import exposure_stage
-from colmap_inertial.reconstruction.precalibrate.plan import Treatments, plan_imaging
-from colmap_inertial.reconstruction.precalibrate.preflight import stop_or_doubt
-from colmap_inertial.reconstruction.precalibrate.selection import part_of
+from colmap_inertial.reconstruction.preparation import calibrate, plan as imaging
+from colmap_inertial.reconstruction.preparation.judge import Looked, below_sky, by_frame
+from colmap_inertial.reconstruction.preparation.pairs import exposure_stage
+from colmap_inertial.reconstruction.preparation.plan import Treatments, plan_imaging
+from colmap_inertial.reconstruction.preparation.preflight import stop_or_doubt
+from colmap_inertial.reconstruction.preparation.selection import part_of
 from colmap_inertial.tools.simulate import MotionOptions, RecordingOptions, simulate_recording
 
 NAMES = tuple(f"{i}.jpg" for i in range(6))
@@ -506,7 +506,7 @@ def test_the_longest_exposure_tells_whether_anything_may_be_blurred(tmp_path, mo
     def none(recording, context):
         raise NotObservableError("the pixels' motion", "looked at")
 
-    monkeypatch.setattr(imaging, "precalibrate", none)
+    monkeypatch.setattr(imaging, "estimate_preliminary_calibration", none)
     capture = replace(recording().capture, camera=CAMERA)
 
     def note(exposure_s):
@@ -530,7 +530,7 @@ def test_a_quick_turn_counts_where_a_frame_may_have_been_taken(
     def none(recording, context):
         raise NotObservableError("the pixels' motion", "looked at")
 
-    monkeypatch.setattr(imaging, "precalibrate", none)
+    monkeypatch.setattr(imaging, "estimate_preliminary_calibration", none)
     t_s = np.arange(-1.0, 8.0, 0.005)
     rate = np.zeros((len(t_s), 3))
     rate[np.abs(t_s - turned_at_s) < 0.006] = [0, 9.0, 0]
@@ -691,12 +691,12 @@ def test_another_scale_makes_the_project_again(workspace, tmp_path, monkeypatch)
         write_json(out / TRANSFORM_FILE, {"models": [], "files": []})
         return Done
 
-    monkeypatch.setattr(placed, "apply_to_project", apply)
+    monkeypatch.setattr(project_output, "apply_to_project", apply)
 
     def made(scale):
         session = session_in(workspace)
         scales = {0: ModelScale(similarity=scale and plain_factor(scale))}
-        found = placed.place_project(session, project, ProjectOptions(), {0: project}, scales)
+        found = project_output.place_project(session, project, ProjectOptions(), {0: project}, scales)
         return session.runner.worked, found and (found / "scale").read_text()
 
     assert made(2.0) == (["apply"], "2.0")

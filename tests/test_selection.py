@@ -29,8 +29,8 @@ from colmap_inertial.pipeline.run.runner import StepRunner
 from colmap_inertial.pipeline.run.session import Session
 from colmap_inertial.pipeline.run.workspace import Workspace
 from colmap_inertial.reconstruction.drivers.capture import reconstruct
-from colmap_inertial.reconstruction.precalibrate import selection as choosing
-from colmap_inertial.reconstruction.precalibrate.selection import (
+from colmap_inertial.reconstruction.preparation import selection as choosing
+from colmap_inertial.reconstruction.preparation.selection import (
     Selection,
     _Clocks,
     everything,
@@ -373,7 +373,7 @@ def test_folders_and_thinned_videos_are_used_as_they_are(turning, tmp_path):
 
 def test_a_quick_camera_s_frames_are_ranked_before_they_are_decoded():
     """At 240 frames a second, the least blurred of each thirtieth is looked at."""
-    from colmap_inertial.reconstruction.precalibrate.selection import _slots
+    from colmap_inertial.reconstruction.preparation.selection import _slots
 
     t_s = np.arange(480) / 240
     blur = np.random.default_rng(0).uniform(1, 9, 480)

@@ -12,7 +12,7 @@ from scipy import optimize
 from test_closing import FRAMES, NAMES, make
 
 from colmap_inertial.colmap import mapping, submaps
-from colmap_inertial.colmap.closing import LONGEST, EndsMet, SeamsMet, close_seams
+from colmap_inertial.colmap.loop_closure import LONGEST, LoopClosure, SubmapOverlap, merge_overlaps
 from colmap_inertial.colmap.submaps import PART, SHARED, MappedRun, Tie, join_runs, place_parts, runs
 from colmap_inertial.core.geometry import so3_exp
 from colmap_inertial.core.options import MappingOptions
@@ -214,11 +214,13 @@ def test_parts_that_have_nothing_in_common_stay_apart(ring):
     assert all(model is part.model for model, part in zip(found, short, strict=True))
 
 
-def fits(agree: dict[tuple[int, int], float], nearest, farthest: int = 40) -> SeamsMet:
+def fits(agree: dict[tuple[int, int], float], nearest, farthest: int = 40) -> SubmapOverlap:
     """What comes of an adjustment after which each seam agrees so well."""
     asked = {seam: share for seam, share in agree.items() if seam in nearest}
-    seams = {s: EndsMet(pairs=9, images=(NAMES[0], NAMES[s[1]]), agree=a, joined=a >= 0.5) for s, a in asked.items()}
-    return SeamsMet(seams=seams, farthest=dict.fromkeys(seams, farthest), kept=1.0)
+    seams = {
+        s: LoopClosure(pairs=9, images=(NAMES[0], NAMES[s[1]]), agree=a, joined=a >= 0.5) for s, a in asked.items()
+    }
+    return SubmapOverlap(seams=seams, farthest=dict.fromkeys(seams, farthest), kept=1.0)
 
 
 def test_parts_of_which_no_seam_fits_stay_as_they_are(ring, monkeypatch):
@@ -229,7 +231,7 @@ def test_parts_of_which_no_seam_fits_stay_as_they_are(ring, monkeypatch):
         asked.append(set(nearest))
         return fits({(0, 1): 0.3, (1, 2): 0.2, (2, 3): 0.1, (0, 3): 0.0}, nearest, 2)
 
-    monkeypatch.setattr(submaps, "close_seams", close)
+    monkeypatch.setattr(submaps, "merge_overlaps", close)
     found, seams = join_runs(ring.database, parts, ring.options, NAMES, near=4, loops=True)
     assert [model.num_reg_images() for model in found] == [18, 18, 18, 12]
     assert all(any(model is part.model for part in parts) for model in found)
@@ -253,7 +255,7 @@ def test_a_loop_that_does_not_fit_is_forgotten_and_all_else_is_joined(ring, monk
         placed.append({(tie.first, tie.second) for tie in ties})
         return place_parts(members, ties)
 
-    monkeypatch.setattr(submaps, "close_seams", close)
+    monkeypatch.setattr(submaps, "merge_overlaps", close)
     monkeypatch.setattr(submaps, "place_parts", place)
     (whole,), seams = join_runs(ring.database, parts, ring.options, NAMES, near=4, loops=True)
     assert placed[0] - placed[1] == {(0, 3)} and len(asked) == 2 and (0, 3) not in asked[1]
@@ -269,7 +271,7 @@ def test_of_neighbours_that_do_not_fit_first_pairs_far_apart_in_time_are_not_bel
         asked.append(nearest.get((0, 1), "left out"))
         return fits({(0, 1): 0.2, (1, 2): 1.0, (2, 3): 1.0, (0, 3): 1.0}, nearest, 40 if len(asked) == 1 else 4)
 
-    monkeypatch.setattr(submaps, "close_seams", close)
+    monkeypatch.setattr(submaps, "merge_overlaps", close)
     (whole,), _ = join_runs(ring.database, parts, ring.options, NAMES, near=4, loops=True)
     assert asked == [None, 4, "left out"] and whole.num_reg_images() == FRAMES
 
@@ -301,7 +303,7 @@ def test_the_largest_part_s_camera_is_that_of_all(ring, monkeypatch):
         asked.append(whole)
         return fits(dict.fromkeys(nearest, 1.0), nearest)
 
-    monkeypatch.setattr(submaps, "close_seams", close)
+    monkeypatch.setattr(submaps, "merge_overlaps", close)
     bent = []
     for k, part in enumerate(parts):
         model = pycolmap.Reconstruction(part.model)
@@ -404,6 +406,6 @@ def test_a_misplaced_part_does_not_fit_whatever_comes_of_the_adjustment(ring, tu
     placed[3] = bad * placed[3]
     whole, part_of = submaps._whole(ring.database, parts, placed, ring.options, NAMES)
     nearest = dict.fromkeys([(0, 1), (1, 2), (2, 3), (0, 3)])
-    met = close_seams(ring.database, whole, ring.options, NAMES, part_of=part_of, nearest=nearest)
+    met = merge_overlaps(ring.database, whole, ring.options, NAMES, part_of=part_of, nearest=nearest)
     assert met.seams.keys() == nearest.keys() and all(set(one.images) <= set(NAMES) for one in met.seams.values())
     assert met.kept < 0.99 and not all(one.joined for one in met.seams.values())

@@ -5,8 +5,7 @@ import pytest
 from sweep_scenes import camera, depth_of, depth_view, partner, picture_of, rays, sights_of
 
 from colmap_inertial._kernels import _apertures
-from colmap_inertial.imaging.semi_global import shares
-from colmap_inertial.imaging.sweep import (
+from colmap_inertial.imaging.plane_sweep import (
     DepthView,
     Sights,
     agreed_depth,
@@ -19,8 +18,9 @@ from colmap_inertial.imaging.sweep import (
     partner_scores,
     sweep_depth,
 )
-from colmap_inertial.imaging.sweep.depth import _canvas, _positions, _shown
-from colmap_inertial.imaging.sweep.tiles import tiles_of
+from colmap_inertial.imaging.plane_sweep.depth import _canvas, _positions, _shown
+from colmap_inertial.imaging.plane_sweep.tiles import tiles_of
+from colmap_inertial.imaging.semi_global import shares
 
 REFERENCE = camera((0.1, -0.4, 0.3))
 #: On different sides; turned, also about their own axis; nearer and farther; another lens.

@@ -8,10 +8,10 @@ from box_project import off_the_walls
 from sweep_scenes import camera, depth_of, picture_of, sights_of
 from test_pipeline_dense import vertices
 
-from colmap_inertial.colmap import swept
+from colmap_inertial.colmap import sweep_stereo
 from colmap_inertial.colmap.depth_maps import MadeFrom, coverage, found_maps, map_file, settle_maker
 from colmap_inertial.colmap.fusion import fuse_maps
-from colmap_inertial.colmap.swept import SweptWorkspace
+from colmap_inertial.colmap.sweep_stereo import SweptWorkspace
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.model.depth_maps import read_map, write_map
 
@@ -126,8 +126,8 @@ def test_exact_depths_of_pixel_centres_are_fused_exactly(workspace, tmp_path):
 
 
 def test_a_sweep_that_was_cut_off_goes_on(workspace, tmp_path, monkeypatch):
-    raw, calls, matched = tmp_path / "raw", [], swept.sweep_depth
-    monkeypatch.setattr(swept, "sweep_depth", lambda *a, **k: calls.append(1) or matched(*a, **k))
+    raw, calls, matched = tmp_path / "raw", [], sweep_stereo.sweep_depth
+    monkeypatch.setattr(sweep_stereo, "sweep_depth", lambda *a, **k: calls.append(1) or matched(*a, **k))
 
     class Killed(BaseException):
         pass

@@ -70,8 +70,8 @@ class Reconstruct(Speaker):
         from colmap_inertial.core.errors import InertialError
         from colmap_inertial.io.files import read_json
         from colmap_inertial.reconstruction.drivers.capture import reconstruct
+        from colmap_inertial.reconstruction.drivers.device_store import remembered_of
         from colmap_inertial.reconstruction.drivers.project import is_project, reconstruct_project
-        from colmap_inertial.reconstruction.drivers.remembered import remembered_of
 
         self.check_json(self.capture, self.project.imu, self.project.frame_times)
         if self.reference.scale_from != "imu":
@@ -114,7 +114,7 @@ class Reconstruct(Speaker):
     def _by_reference(self) -> int:
         from colmap_inertial.cli.screen import live_progress
         from colmap_inertial.cli.terminal import show_reference
-        from colmap_inertial.reconstruction.drivers.bare import reconstruct_by
+        from colmap_inertial.reconstruction.drivers.no_imu import reconstruct_by
         from colmap_inertial.reconstruction.drivers.project import is_project
         from colmap_inertial.reconstruction.drivers.reference import scale_project_by
 

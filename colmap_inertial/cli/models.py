@@ -59,7 +59,7 @@ class Scale(Reader):
     def run(self) -> int:
         """Run the command; returns the exit code."""
         from colmap_inertial.cli.terminal import show_remembered, show_scale
-        from colmap_inertial.reconstruction.drivers.remembered import remembered_of
+        from colmap_inertial.reconstruction.drivers.device_store import remembered_of
         from colmap_inertial.reconstruction.drivers.sources import ScaleSource, scale_as_json, scale_source
 
         calibration = self.calibration
@@ -206,7 +206,7 @@ class Align(Reader):
         """Run the command; returns the exit code."""
         from colmap_inertial.cli.terminal import show_calibration
         from colmap_inertial.io.files import read_json
-        from colmap_inertial.reconstruction.drivers.remembered import remember
+        from colmap_inertial.reconstruction.drivers.device_store import remember
         from colmap_inertial.reconstruction.drivers.sources import ScaleSource, align_source
 
         source = ScaleSource(
@@ -249,8 +249,8 @@ class CalibrateImu(Reader):
         """Run the command; returns the exit code."""
         from colmap_inertial.cli.terminal import show_imu_calibration
         from colmap_inertial.io.files import read_json
+        from colmap_inertial.reconstruction.drivers.device_store import remember
         from colmap_inertial.reconstruction.drivers.imu_calibration import calibrate_source
-        from colmap_inertial.reconstruction.drivers.remembered import remember
 
         self.check_json(self.recording, self.out)
         found = calibrate_source(self.recording, self.out, self.gravity, device=self.remember)

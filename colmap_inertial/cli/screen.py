@@ -173,7 +173,7 @@ class Screen:
         """
         from rich.text import Text
 
-        from colmap_inertial.reconstruction.precalibrate.preflight import STOPPING
+        from colmap_inertial.reconstruction.preparation.preflight import STOPPING
 
         found = [finding for finding in diagnosis.findings if finding.severity != "info"]
         stopping = next((finding for finding in found if stops and finding.code in STOPPING), None)

@@ -20,15 +20,15 @@ if TYPE_CHECKING:
     from colmap_inertial.checks.validate import Validation
     from colmap_inertial.core.types import CameraImuCalibration, Gap, JoinedPart, ScaleEstimate
     from colmap_inertial.inertial.georeference import Georeference
-    from colmap_inertial.inertial.rest import RestCalibration
+    from colmap_inertial.inertial.static_calibration import RestCalibration
     from colmap_inertial.model.project import Applied
     from colmap_inertial.pipeline.run.workspace import Workspace
     from colmap_inertial.pipeline.stages.frame_folder import FrameRecord
     from colmap_inertial.reconstruction.drivers.deblur import DeblurResult
+    from colmap_inertial.reconstruction.drivers.device_store import Remembered
     from colmap_inertial.reconstruction.drivers.reference import Reference
-    from colmap_inertial.reconstruction.drivers.remembered import Remembered
     from colmap_inertial.reconstruction.drivers.result import ReconstructResult
-    from colmap_inertial.reconstruction.precalibrate.plan import ImagingPlan
+    from colmap_inertial.reconstruction.preparation.plan import ImagingPlan
     from colmap_inertial.tools.export.whole import Exported
 
 #: A label and what there is to say.

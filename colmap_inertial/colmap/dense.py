@@ -27,7 +27,7 @@ from colmap_inertial.colmap.depth_maps import (
     settle_maker,
 )
 from colmap_inertial.colmap.fusion import fuse_maps
-from colmap_inertial.colmap.swept import SweptWorkspace
+from colmap_inertial.colmap.sweep_stereo import SweptWorkspace
 from colmap_inertial.colmap.tsdf import tsdf_mesh
 from colmap_inertial.core.errors import FormatError, OutputError
 from colmap_inertial.core.options import DenseOptions

@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.colmap.headings import Headings
+from colmap_inertial.colmap.covisibility import Covisibility
+from colmap_inertial.colmap.gyro_orientations import GyroOrientations
+from colmap_inertial.colmap.relative_track import DRIFT, RelativeTrack
 from colmap_inertial.colmap.two_views import Return, compare, forget, returns
-from colmap_inertial.colmap.votes import Voters
-from colmap_inertial.colmap.way import DRIFT, Way
 from colmap_inertial.core.types import Array
 
 Int = NDArray[np.intp]
@@ -89,9 +89,9 @@ def candidates(votes: Int, i: Int, j: Int) -> Bool:
 def close_loops(
     database: Path,
     names: Sequence[str],
-    headings: Headings,
-    way: Way,
-    voters: Voters,
+    headings: GyroOrientations,
+    way: RelativeTrack,
+    voters: Covisibility,
     nearest: int,
     *,
     doubtful: Sequence[Pair],
@@ -149,7 +149,9 @@ def close_loops(
     )
 
 
-def without_contradictions(found: dict[Pair, Return], headings: Headings, way: Way, nearest: int) -> set[Pair]:
+def without_contradictions(
+    found: dict[Pair, Return], headings: GyroOrientations, way: RelativeTrack, nearest: int
+) -> set[Pair]:
     """Of loops, those that no other contradicts, or none with half as many matches behind it.
 
     A loop says where one of its frames is, seen from the other. The way from there to the frames of another loop nearby
@@ -182,7 +184,7 @@ def without_contradictions(found: dict[Pair, Return], headings: Headings, way: W
     return {pair for pair, kept in zip(pairs, (behind >= _BY_FAR * rival).tolist(), strict=True) if kept}
 
 
-def _between(way: Way, headings: Headings, i: Int, j: Int) -> tuple[Array, Array]:
+def _between(way: RelativeTrack, headings: GyroOrientations, i: Int, j: Int) -> tuple[Array, Array]:
     """(M, 3) the ways from frames i to frames j, in any order, and (M, 3, 3) their covariances."""
     first, last = np.minimum(i, j), np.maximum(i, j)
     return way.centre[j] - way.centre[i], way.covariance(first, last, headings.sigma_rad(first, last))
@@ -193,14 +195,14 @@ def _squared(off: Array, covariance: Array) -> Array:
     return np.asarray(np.sum(off * np.linalg.solve(covariance, off[..., None])[..., 0], axis=1))
 
 
-def _away(headings: Headings, way: Way, i: Int, j: Int) -> Bool:
+def _away(headings: GyroOrientations, way: RelativeTrack, i: Int, j: Int) -> Bool:
     """(M,) whether frames i and j surely show nothing in common; a part at a time: there may be half a million."""
     depth = np.array([way.depth(k) for k in range(len(way.part))])
     parts = np.array_split(np.arange(len(i)), max(1, len(i) // 50_000))
     return np.concatenate([_away_part(headings, way, depth, i[part], j[part]) for part in parts])
 
 
-def _away_part(headings: Headings, way: Way, depth: Array, i: Int, j: Int) -> Bool:
+def _away_part(headings: GyroOrientations, way: RelativeTrack, depth: Array, i: Int, j: Int) -> Bool:
     away = headings.see_nothing_in_common(i, j)
     known = np.flatnonzero(~away & way.known(i, j) & np.isfinite(depth[i]))
     passed, covariance = _between(way, headings, i[known], j[known])
@@ -210,7 +212,7 @@ def _away_part(headings: Headings, way: Way, depth: Array, i: Int, j: Int) -> Bo
 
 
 def _judged(
-    database: Path, names: Sequence[str], headings: Headings, way: Way, pairs: Sequence[Pair]
+    database: Path, names: Sequence[str], headings: GyroOrientations, way: RelativeTrack, pairs: Sequence[Pair]
 ) -> tuple[set[Pair], dict[Pair, Return]]:
     """Pairs with matches that are verified; and of these, pairs that may close a loop, with what they say.
 

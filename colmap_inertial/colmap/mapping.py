@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from colmap_inertial.colmap.closing import LONGEST, EndsMet, close_gaps
+from colmap_inertial.colmap.loop_closure import LONGEST, LoopClosure, close_gaps
 from colmap_inertial.colmap.sparse import matches_every_pair
 from colmap_inertial.colmap.submaps import map_in_parts, runs
 from colmap_inertial.core.errors import MappingError
@@ -33,7 +33,7 @@ _NEIGHBOURS = 2
 
 
 @dataclass(frozen=True, kw_only=True)
-class ModelEnds(EndsMet):
+class ModelEnds(LoopClosure):
     """The same, of one of several models; ``model`` is its number."""
 
     model: int
@@ -61,7 +61,7 @@ class MapRecord:
     models: int
     parts: int = 1
     ends: tuple[ModelEnds, ...] = ()
-    seams: tuple[EndsMet, ...] = ()
+    seams: tuple[LoopClosure, ...] = ()
 
 
 def map_images(

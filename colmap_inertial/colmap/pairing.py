@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.colmap.headings import Headings, find_headings
+from colmap_inertial.colmap.covisibility import Covisibility
+from colmap_inertial.colmap.gyro_orientations import GyroOrientations, estimate_gyro_orientations
 from colmap_inertial.colmap.loops import close_loops
+from colmap_inertial.colmap.relative_track import estimate_relative_track
 from colmap_inertial.colmap.sparse import image_pairs, match_pairs, matches_every_pair
 from colmap_inertial.colmap.two_views import count_verified, ray_pairs, sightings_of, turns_rad
-from colmap_inertial.colmap.votes import Voters
-from colmap_inertial.colmap.way import find_way
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.options import MappingOptions
 from colmap_inertial.core.types import CameraModel
@@ -132,10 +132,10 @@ def match_capture(
     next_to_near = far & (j - i <= _NEAR * near)
     doubtful = list(zip(i[next_to_near].tolist(), j[next_to_near].tolist(), strict=True))
     i, j = i[~far], j[~far]
-    headings: Headings | None = None
+    headings: GyroOrientations | None = None
     try:
         turn_rad = turns_rad(database, names)
-        headings = find_headings(recording, turn_rad, ray_pairs(database, names, close), camera)
+        headings = estimate_gyro_orientations(recording, turn_rad, ray_pairs(database, names, close), camera)
     except NotObservableError as error:
         note = f"not used: {error}"
     else:
@@ -143,7 +143,7 @@ def match_capture(
         sigma_deg = _widest_deg(headings)
         away = headings.see_nothing_in_common(i, j)
         i, j = i[~away], j[~away]
-        voters = Voters.of(database, names)
+        voters = Covisibility.of(database, names)
         alike = np.ones(len(i), dtype=np.bool_)
         if every_pair:
             alike = (voters.count(i, j) >= _LEAST_VOTES) | ~(voters.plenty[i] & voters.plenty[j])
@@ -162,7 +162,7 @@ def match_capture(
         match(rest)
     else:
         next_ones = [pair for pair in close if pair[1] - pair[0] <= _NEXT]
-        way = find_way(sightings_of(database, names, next_ones, headings.start_from_cam), len(names))
+        way = estimate_relative_track(sightings_of(database, names, next_ones, headings.start_from_cam), len(names))
         loops = close_loops(
             database, names, headings, way, voters, near + 1, doubtful=doubtful, neighbours=rest, match=match
         )
@@ -193,7 +193,7 @@ def _places(pairs: Sequence[tuple[str, str]], place: dict[str, int]) -> tuple[In
     return found[:, 0], found[:, 1]
 
 
-def _widest_deg(headings: Headings) -> float:
+def _widest_deg(headings: GyroOrientations) -> float:
     """How unsure the heading is from the middle of what the gyroscope recorded to any other frame."""
     recorded = np.flatnonzero(headings.part >= 0)
     middle = np.full(len(recorded), recorded[len(recorded) // 2])

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.colmap.closing import EndsMet, SeamsMet, close_seams
+from colmap_inertial.colmap.loop_closure import LoopClosure, SubmapOverlap, merge_overlaps
 from colmap_inertial.core.geometry import so3_exp
 from colmap_inertial.core.types import Array
 from colmap_inertial.model.observed import points_of_features
@@ -117,7 +117,7 @@ def map_in_parts(
     near: int,
     loops: bool,
     registered: Callable[[], None],
-) -> tuple[list[pycolmap.Reconstruction], list[EndsMet]]:
+) -> tuple[list[pycolmap.Reconstruction], list[LoopClosure]]:
     """Run COLMAP's incremental mapper on runs of the images, and join what comes out; the largest model first.
 
     Parameters
@@ -163,7 +163,7 @@ def join_runs(
     *,
     near: int,
     loops: bool,
-) -> tuple[list[pycolmap.Reconstruction], list[EndsMet]]:
+) -> tuple[list[pycolmap.Reconstruction], list[LoopClosure]]:
     """Of parts that lie beside each other, one model, and the seams between them, those that did not fit, too.
 
     Of a seam that does not fit, first loops are not believed, then nothing is: its tie places no part, and its matches
@@ -174,7 +174,7 @@ def join_runs(
     nearest: dict[Seam, int | None] = dict.fromkeys(ties, None if loops else near)
     nearest |= {(k, k): None if loops else near for k in range(len(parts))}
     joined: list[pycolmap.Reconstruction] = []
-    seams: list[EndsMet] = []
+    seams: list[LoopClosure] = []
     waiting = _groups(range(len(parts)), ties)
     while waiting:
         members = waiting.pop(0)
@@ -185,7 +185,7 @@ def join_runs(
         placed = place_parts(members, own)
         whole, part_of = _whole(database, [parts[k] for k in members], placed, pipeline, names)
         of_group = {number: members[k] for number, k in part_of.items()}
-        met = close_seams(database, whole, pipeline, names, part_of=of_group, nearest=nearest)
+        met = merge_overlaps(database, whole, pipeline, names, part_of=of_group, nearest=nearest)
         hold = [seam for seam, one in met.seams.items() if one.joined]
         whole_again = len(_groups(members, hold)) == 1
         if len(hold) == len(met.seams) and whole_again and met.kept >= _LEAST_KEPT:
@@ -210,7 +210,7 @@ def join_runs(
     return joined, seams
 
 
-def _worst(met: SeamsMet, ties: Sequence[Tie], placed: Mapping[int, pycolmap.Sim3d]) -> Seam:
+def _worst(met: SubmapOverlap, ties: Sequence[Tie], placed: Mapping[int, pycolmap.Sim3d]) -> Seam:
     """The seam that fits least once all was adjusted; where that does not tell, the tie that parts lie by least."""
 
     def fits(tie: Tie) -> tuple[float, int]:

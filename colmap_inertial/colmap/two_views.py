@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.colmap.gyro_bias import RayPairs
-from colmap_inertial.colmap.way import Sightings, Way, joined
+from colmap_inertial.colmap.relative_track import RelativeTrack, Sightings, joined
 from colmap_inertial.core.geometry import matrix_from_quat, so3_log
 from colmap_inertial.core.types import Array
 
@@ -202,7 +202,9 @@ class Return:
     matches: int
 
 
-def returns(database: Path, names: Sequence[str], pairs: Sequence[tuple[int, int]], way: Way) -> list[Return | None]:
+def returns(
+    database: Path, names: Sequence[str], pairs: Sequence[tuple[int, int]], way: RelativeTrack
+) -> list[Return | None]:
     """What the verified matches of pairs say; ``None`` where too few of them are points of the way that fit."""
     import pycolmap
 

@@ -105,12 +105,12 @@ class Model:
         return replace(
             self,
             reconstruction=reconstruction,
-            scale=doubted(estimate, self.doubts),
+            scale=downgraded(estimate, self.doubts),
             similarity=similarity,
         )
 
 
-def doubted(estimate: ScaleEstimate, doubts: Sequence[str]) -> ScaleEstimate:
+def downgraded(estimate: ScaleEstimate, doubts: Sequence[str]) -> ScaleEstimate:
     """An estimate from a recording with doubts: they are among its reasons, and it is not trusted."""
     if not doubts:
         return estimate

@@ -26,7 +26,7 @@ from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.inertial.scale import estimate_scale
 from colmap_inertial.io.records import write_record
 from colmap_inertial.io.trajectories import write_tum
-from colmap_inertial.model import Model, doubted, trajectory_from_model
+from colmap_inertial.model import Model, downgraded, trajectory_from_model
 from colmap_inertial.motion.smooth import smooth_trajectory
 from colmap_inertial.pipeline.stages.rolling_shutter import for_rectified
 
@@ -65,7 +65,7 @@ class MetricStage:
             trajectory, self.imu, calibration=of_model(self.calibration, model), options=self.options
         )
         estimate = replace(estimate, notes=(*estimate.notes, *self.imu.repairs, *notes))
-        estimate = doubted(estimate, model.doubts)
+        estimate = downgraded(estimate, model.doubts)
         if estimate.verdict == "refused":
             return model.scaled(estimate, None)
         similarity = Similarity.from_scale(estimate, world=self.world, provenance=provenance(estimate))

@@ -49,10 +49,10 @@ from colmap_inertial.reconstruction.drivers.georeference import positions_of, ru
 from colmap_inertial.reconstruction.drivers.models import run_dense_models, run_models, run_validation
 from colmap_inertial.reconstruction.drivers.reporting import report_result, reporting_stops, write_recording
 from colmap_inertial.reconstruction.drivers.result import ReconstructResult
-from colmap_inertial.reconstruction.precalibrate.pairs import exposure_stage, fuses_pairs
-from colmap_inertial.reconstruction.precalibrate.plan import with_stated_exposures
-from colmap_inertial.reconstruction.precalibrate.preflight import checked_imu, preflight, stop_or_doubt
-from colmap_inertial.reconstruction.precalibrate.selection import part_of, run_selection
+from colmap_inertial.reconstruction.preparation.pairs import exposure_stage, fuses_pairs
+from colmap_inertial.reconstruction.preparation.plan import with_stated_exposures
+from colmap_inertial.reconstruction.preparation.preflight import checked_imu, preflight, stop_or_doubt
+from colmap_inertial.reconstruction.preparation.selection import part_of, run_selection
 
 #: A camera-IMU rotation less certain than this is no basis for gravity directions.
 _GRAVITY_ROTATION_RAD = 0.2

@@ -26,7 +26,7 @@ from colmap_inertial.pipeline.stages.protocols import FrameStage
 from colmap_inertial.reconstruction.drivers.contact_sheet import write_contact_sheet
 from colmap_inertial.reconstruction.drivers.frames import fusing, run_frames, run_images, run_plan
 from colmap_inertial.reconstruction.drivers.result import frame_as_json, imaging_as_json
-from colmap_inertial.reconstruction.precalibrate.plan import ImagingPlan, Treatments, with_stated_exposures
+from colmap_inertial.reconstruction.preparation.plan import ImagingPlan, Treatments, with_stated_exposures
 
 _SHEET = "sheet.json"
 

@@ -26,8 +26,8 @@ from colmap_inertial.io.video_match import match_to_video
 from colmap_inertial.model import read_model, trajectory_from_model
 from colmap_inertial.pipeline.run.progress import Progress
 from colmap_inertial.reconstruction.drivers.sources import ScaleSource, check_output, only_model
-from colmap_inertial.reconstruction.precalibrate.plan import with_stated_exposures
-from colmap_inertial.reconstruction.precalibrate.preflight import _followed, compared
+from colmap_inertial.reconstruction.preparation.plan import with_stated_exposures
+from colmap_inertial.reconstruction.preparation.preflight import _followed, compared
 
 T = TypeVar("T")
 

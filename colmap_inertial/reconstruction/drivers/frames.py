@@ -24,7 +24,7 @@ from colmap_inertial.pipeline.stages.rectified import image_movers, write_images
 from colmap_inertial.pipeline.stages.rolling_shutter import RollingShutterStage
 from colmap_inertial.reconstruction.drivers.contact_sheet import CropKeeper
 from colmap_inertial.reconstruction.drivers.result import ModelResult
-from colmap_inertial.reconstruction.precalibrate.plan import (
+from colmap_inertial.reconstruction.preparation.plan import (
     ImagingPlan,
     Treatments,
     plan_imaging,

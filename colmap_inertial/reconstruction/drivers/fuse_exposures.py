@@ -25,8 +25,8 @@ from colmap_inertial.pipeline.run.session import open_session
 from colmap_inertial.pipeline.stages.exposures import FusedPair, Fuser, lsd2_fuser
 from colmap_inertial.pipeline.stages.frame_folder import read_frame_records, write_frames
 from colmap_inertial.reconstruction.drivers.frames import run_plan
-from colmap_inertial.reconstruction.precalibrate.pairs import pair_stage
-from colmap_inertial.reconstruction.precalibrate.plan import ImagingPlan, Treatments, with_stated_exposures
+from colmap_inertial.reconstruction.preparation.pairs import pair_stage
+from colmap_inertial.reconstruction.preparation.plan import ImagingPlan, Treatments, with_stated_exposures
 
 
 def fuse_exposures_captured(

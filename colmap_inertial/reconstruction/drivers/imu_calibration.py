@@ -8,8 +8,8 @@ from colmap_inertial.checks.report import require_plotly
 from colmap_inertial.checks.report.imu_calibration import calibration_page
 from colmap_inertial.core.errors import FormatError, OutputError, OutputExistsError
 from colmap_inertial.core.options import GravityOptions
-from colmap_inertial.inertial.rest import RestCalibration, calibrate_imu
 from colmap_inertial.inertial.scale import check_units, strength_of_gravity
+from colmap_inertial.inertial.static_calibration import RestCalibration, calibrate_imu
 from colmap_inertial.io.files import write_text
 from colmap_inertial.io.imu import read_raw_imu
 from colmap_inertial.io.imu_calibration import write_imu_calibration

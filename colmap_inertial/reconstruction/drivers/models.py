@@ -16,7 +16,7 @@ from colmap_inertial.core.types import Gap, JoinedPart, ScaleEstimate
 from colmap_inertial.io.records import read_record, write_record
 from colmap_inertial.model import (
     Model,
-    doubted,
+    downgraded,
     find_models,
     model_format,
     num_registered,
@@ -34,7 +34,7 @@ from colmap_inertial.pipeline.stages.metric import gravity_in_model, metric_traj
 from colmap_inertial.pipeline.stages.protocols import JoiningStage, ModelStage
 from colmap_inertial.reconstruction.drivers.reporting import write_model_record
 from colmap_inertial.reconstruction.drivers.result import Fragment, ModelResult, ScaledModel
-from colmap_inertial.reconstruction.drivers.standing import settle_dense
+from colmap_inertial.reconstruction.drivers.stale_outputs import remove_stale_dense
 
 if TYPE_CHECKING:
     import pycolmap
@@ -143,7 +143,7 @@ def run_models(
     models = tuple(
         ModelResult(**{f.name: getattr(one, f.name) for f in fields(one)}).within(workspace.root) for one in said.models
     )
-    settle_dense(workspace, {one.index: one.sparse_metric for one in models if one.sparse_metric is not None})
+    remove_stale_dense(workspace, {one.index: one.sparse_metric for one in models if one.sparse_metric is not None})
     return models, tuple(replace(one, sparse=workspace.root / one.sparse) for one in said.fragments), said.gaps
 
 
@@ -282,7 +282,7 @@ def _placed(session: Session, recording: Recording, one: ScaledModel, model: Mod
     workspace = session.workspace
     if model.scale is None:
         raise ValueError("the model stages must include one that estimates the scale, such as ... or MetricStage")
-    scale, similarity = doubted(model.scale, recording.doubts), model.similarity
+    scale, similarity = downgraded(model.scale, recording.doubts), model.similarity
     if similarity is not None and scale.verdict == "refused":
         raise ValueError("the model stages made a model metric whose scale they refused")
     if similarity is not None and scale.verdict != model.scale.verdict:

@@ -55,10 +55,10 @@ from colmap_inertial.pipeline.stages.protocols import ModelStage, with_defaults
 from colmap_inertial.reconstruction.drivers.capture import default_model_stages
 from colmap_inertial.reconstruction.drivers.georeference import positions_of, run_georeference
 from colmap_inertial.reconstruction.drivers.models import run_dense_models, run_models, run_validation
-from colmap_inertial.reconstruction.drivers.placed import place_project, require_free_names
+from colmap_inertial.reconstruction.drivers.project_output import place_project, require_free_names
 from colmap_inertial.reconstruction.drivers.reporting import report_result, reporting_stops, write_recording
 from colmap_inertial.reconstruction.drivers.result import Fragment, ModelResult, ReconstructResult
-from colmap_inertial.reconstruction.precalibrate.preflight import checked_imu, preflight, stop_or_doubt
+from colmap_inertial.reconstruction.preparation.preflight import checked_imu, preflight, stop_or_doubt
 
 if TYPE_CHECKING:
     import pycolmap

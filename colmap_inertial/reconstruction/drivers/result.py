@@ -22,8 +22,8 @@ from colmap_inertial.io.capture import Capture
 from colmap_inertial.model import similarity_as_json
 from colmap_inertial.pipeline.run.workspace import Workspace
 from colmap_inertial.pipeline.stages.frame_folder import FrameRecord
-from colmap_inertial.reconstruction.precalibrate.plan import ImagingPlan
-from colmap_inertial.reconstruction.precalibrate.selection import Selection
+from colmap_inertial.reconstruction.preparation.plan import ImagingPlan
+from colmap_inertial.reconstruction.preparation.selection import Selection
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

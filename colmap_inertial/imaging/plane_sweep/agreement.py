@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.imaging.sweep.pinhole import ROWS_AT_ONCE, Pinhole
+from colmap_inertial.imaging.plane_sweep.pinhole import ROWS_AT_ONCE, Pinhole
 
 Real = NDArray[np.float32]
 #: Matrix and offset from a pixel and its depth to another view.

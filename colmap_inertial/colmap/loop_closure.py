@@ -68,7 +68,7 @@ class _Torn:
 
 
 @dataclass(frozen=True, kw_only=True)
-class EndsMet:
+class LoopClosure:
     """Ends of a model, or two parts of one, that met, and whether they belong together.
 
     Attributes
@@ -90,7 +90,7 @@ class EndsMet:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SeamsMet:
+class SubmapOverlap:
     """Seams of a model that were made one, each by the numbers of the two parts that it is between.
 
     Attributes
@@ -103,7 +103,7 @@ class SeamsMet:
         Share of the images that the model still has; 0 where it could not be adjusted.
     """
 
-    seams: dict[tuple[int, int], EndsMet]
+    seams: dict[tuple[int, int], LoopClosure]
     farthest: dict[tuple[int, int], int]
     kept: float
 
@@ -115,7 +115,7 @@ def close_gaps(
     names: Sequence[str],
     *,
     nearest: int | None,
-) -> EndsMet | None:
+) -> LoopClosure | None:
     """Join the ends of a model that met; ``None`` where there are none.
 
     Parameters
@@ -132,7 +132,7 @@ def close_gaps(
         Pairs farther apart in time may join copies, and are not looked at; ``None`` where all may be believed.
     """
     part_of = dict.fromkeys(reconstruction.reg_image_ids(), 0)
-    met = close_seams(database, reconstruction, pipeline, names, part_of=part_of, nearest={(0, 0): nearest})
+    met = merge_overlaps(database, reconstruction, pipeline, names, part_of=part_of, nearest={(0, 0): nearest})
     if not met.seams:
         return None
     ends = met.seams[0, 0]
@@ -142,7 +142,7 @@ def close_gaps(
     return replace(ends, joined=joined)
 
 
-def close_seams(
+def merge_overlaps(
     database: Path,
     reconstruction: pycolmap.Reconstruction,
     pipeline: pycolmap.IncrementalPipelineOptions,
@@ -150,7 +150,7 @@ def close_seams(
     *,
     part_of: Mapping[int, int],
     nearest: Mapping[tuple[int, int], int | None],
-) -> SeamsMet:
+) -> SubmapOverlap:
     """Make one what a model holds twice, and tell of each seam whether it fits then.
 
     Parameters
@@ -174,7 +174,7 @@ def close_seams(
             of_seam.setdefault(_seam(part_of, pair.first, pair.second), []).append(pair)
         of_seam = {seam: pairs for seam, pairs in of_seam.items() if len(pairs) >= _LEAST_PAIRS}
         if not of_seam:
-            return SeamsMet(seams={}, farthest={}, kept=1.0)
+            return SubmapOverlap(seams={}, farthest={}, kept=1.0)
         cache = pycolmap.DatabaseCache.create(opened, cached)
     images = reconstruction.num_reg_images()
     name = {number: reconstruction.image(number).name for number in reconstruction.reg_image_ids()}
@@ -191,9 +191,9 @@ def close_seams(
         most = max(pairs, key=lambda pair: len(pair.points))
         first, second = sorted((name[most.first], name[most.second]), key=place.__getitem__)
         joined = agree[seam] >= _STAYS
-        seams[seam] = EndsMet(pairs=len(pairs), images=(first, second), agree=agree[seam], joined=joined)
+        seams[seam] = LoopClosure(pairs=len(pairs), images=(first, second), agree=agree[seam], joined=joined)
         farthest[seam] = max(abs(place[name[pair.first]] - place[name[pair.second]]) for pair in pairs)
-    return SeamsMet(seams=seams, farthest=farthest, kept=kept)
+    return SubmapOverlap(seams=seams, farthest=farthest, kept=kept)
 
 
 def _seam(part_of: Mapping[int, int], first: int, second: int) -> tuple[int, int]:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.core.types import Array
-from colmap_inertial.imaging.sweep.pinhole import Pinhole
+from colmap_inertial.imaging.plane_sweep.pinhole import Pinhole
 
 #: The best angle between two rays to a point; below and above it, a point counts less by these widths. Small angles
 #: measure no depth, at large ones things look different and hide each other.

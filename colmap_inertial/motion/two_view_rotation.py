@@ -37,7 +37,7 @@ class _Seen:
     pixel_rad: float
 
 
-def measure_turns(
+def measure_two_view_rotations(
     frames: Iterable[Frame], camera: Projector, timing: FrameTiming, options: FlowOptions | None = None
 ) -> VisualRotation:
     """Rotations of the camera between pictures that follow each other.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.imaging.sweep.pinhole import ROWS_AT_ONCE, Pinhole
+from colmap_inertial.imaging.plane_sweep.pinhole import ROWS_AT_ONCE, Pinhole
 
 Real = NDArray[np.float32]
 

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from colmap_inertial.core.threads import in_order, usable_processors
 from colmap_inertial.core.types import Array
+from colmap_inertial.imaging.plane_sweep.pinhole import Pinhole
+from colmap_inertial.imaging.plane_sweep.tiles import Tile, tiles_of
 from colmap_inertial.imaging.semi_global import Views, match_candidates
-from colmap_inertial.imaging.sweep.pinhole import Pinhole
-from colmap_inertial.imaging.sweep.tiles import Tile, tiles_of
 
 Codes = NDArray[np.uint8]
 Real = NDArray[np.float32]

@@ -3,11 +3,11 @@
 Views are pinhole cameras whose pixel centres are whole numbers. Depth is along the optical axis; 0 is unknown.
 """
 
-from colmap_inertial.imaging.sweep.agreement import DepthView, agreed_depth
-from colmap_inertial.imaging.sweep.depth import Partner, sweep_depth
-from colmap_inertial.imaging.sweep.normals import normals_of
-from colmap_inertial.imaging.sweep.partners import Sights, chosen_partners, depth_range, partner_scores
-from colmap_inertial.imaging.sweep.pinhole import Pinhole
+from colmap_inertial.imaging.plane_sweep.agreement import DepthView, agreed_depth
+from colmap_inertial.imaging.plane_sweep.depth import Partner, sweep_depth
+from colmap_inertial.imaging.plane_sweep.normals import normals_of
+from colmap_inertial.imaging.plane_sweep.partners import Sights, chosen_partners, depth_range, partner_scores
+from colmap_inertial.imaging.plane_sweep.pinhole import Pinhole
 
 __all__ = [
     "DepthView",

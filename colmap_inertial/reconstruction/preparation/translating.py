@@ -14,10 +14,10 @@ from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import CameraModel, Frame, FrameTiming
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.model import colmap_camera
-from colmap_inertial.motion.slide import follow_pairs
+from colmap_inertial.motion.lateral_flow import follow_pairs
 from colmap_inertial.pipeline.run.context import Recording
 from colmap_inertial.pipeline.run.progress import Progress
-from colmap_inertial.reconstruction.precalibrate.calibrate import some_frames
+from colmap_inertial.reconstruction.preparation.calibrate import some_frames
 
 #: Pairs that are followed in each part of a recording; in a part that slides, so many of them show enough blur.
 _PAIRS, _ENOUGH = 12, 2
@@ -33,7 +33,7 @@ def most_by_sliding_px(timing: FrameTiming, camera: CameraModel) -> float:
     return _MOST_PER_S * longest_s * colmap_camera(camera).mean_focal_length()
 
 
-def sliding_parts(
+def translating_segments(
     recording: Recording,
     camera: CameraModel,
     parts: Sequence[Sequence[str]],

@@ -22,7 +22,7 @@ from colmap_inertial.io.capture import Capture
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.pipeline.run.progress import Progress
 from colmap_inertial.pipeline.stages.gyro_view import GyroView
-from colmap_inertial.reconstruction.precalibrate.calibrate import some_frames
+from colmap_inertial.reconstruction.preparation.calibrate import some_frames
 
 #: A gyroscope that is borne out by this share of them is trusted for all frames.
 _MOST_OF_THEM = 0.95

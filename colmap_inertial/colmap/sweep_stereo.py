@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from colmap_inertial.colmap.depth_maps import map_file
 from colmap_inertial.core.geometry import opencv_px_from_colmap
 from colmap_inertial.core.threads import frames_at_once, in_order
-from colmap_inertial.imaging.sweep import (
+from colmap_inertial.imaging.plane_sweep import (
     DepthView,
     Partner,
     Pinhole,

@@ -42,7 +42,7 @@ _TWO_VIEWS_RAD = math.radians(1.5)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Headings:
+class GyroOrientations:
     """Orientations of frames by the gyroscope, with all that makes two of them unsure against each other.
 
     Attributes
@@ -83,7 +83,7 @@ class Headings:
         calibration: CameraImuCalibration,
         timing: FrameTiming,
         camera: CameraModel | None,
-    ) -> Headings:
+    ) -> GyroOrientations:
         """Of the frames of ``timing``, by a calibration that fits the recording."""
         steady = on_camera_rate(imu, calibration, camera_epoch_ns=timing.epoch_ns)
         motion = GyroCamera.of(steady, calibration, camera_epoch_ns=timing.epoch_ns)
@@ -157,7 +157,9 @@ def _view_rad(camera: CameraModel) -> float:
     return float(np.arctan(np.linalg.norm(rays, axis=1)).sum()) if np.isfinite(rays).all() else math.pi
 
 
-def find_headings(recording: Recording, turn_rad: Array, pairs: RayPairs, camera: CameraModel | None) -> Headings:
+def estimate_gyro_orientations(
+    recording: Recording, turn_rad: Array, pairs: RayPairs, camera: CameraModel | None
+) -> GyroOrientations:
     """Headings of a recording's frames, by a calibration that makes the gyroscope turn as the pictures do.
 
     Parameters
@@ -197,4 +199,4 @@ def find_headings(recording: Recording, turn_rad: Array, pairs: RayPairs, camera
     cov[CAL.GYRO_BIAS] = cov[:, CAL.GYRO_BIAS] = 0
     cov[CAL.GYRO_BIAS, CAL.GYRO_BIAS] = covariance
     better = replace(found, gyro_bias_rad_s=found.gyro_bias_rad_s + change, cov=cov)
-    return Headings.of(recording.imu, better, timing, camera)
+    return GyroOrientations.of(recording.imu, better, timing, camera)

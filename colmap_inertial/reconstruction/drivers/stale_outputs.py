@@ -11,7 +11,7 @@ from colmap_inertial.colmap.dense import digest
 from colmap_inertial.colmap.depth_maps import has_depth_maps, model_of
 from colmap_inertial.pipeline.run.runner import remove
 from colmap_inertial.pipeline.run.workspace import Workspace
-from colmap_inertial.reconstruction.drivers.placed import placed_paths, remove_placed
+from colmap_inertial.reconstruction.drivers.project_output import placed_paths, remove_placed
 
 log = logging.getLogger(__name__)
 
@@ -21,13 +21,13 @@ _STEPS = ".stages"
 
 def withdraw(workspace: Workspace) -> None:
     """Take away everything metric: there is no accepted scale, or none any more."""
-    settle_dense(workspace, {})
+    remove_stale_dense(workspace, {})
     remove_placed(workspace)
     for path in (workspace.sparse, *workspace.trajectories()):
         remove(path)
 
 
-def settle_dense(workspace: Workspace, models: Mapping[int, Path]) -> None:
+def remove_stale_dense(workspace: Workspace, models: Mapping[int, Path]) -> None:
     """Leave no dense reconstruction beside a model that it was not made from.
 
     One with depth maps, which may have taken hours, is kept in ``earlier/``, and comes back when its model does (as

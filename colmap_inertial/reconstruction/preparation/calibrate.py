@@ -69,7 +69,7 @@ _GUESSED_FOCAL = 1.2
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Precalibration:
+class PreliminaryCalibration:
     """What there is before the reconstruction.
 
     Attributes
@@ -104,7 +104,7 @@ def guessed_camera(capture: Capture, timing: FrameTiming) -> CameraModel:
     return CameraModel(model="SIMPLE_PINHOLE", width=width, height=height, params=params)
 
 
-def precalibrate(recording: Recording, context: RunContext) -> Precalibration:
+def estimate_preliminary_calibration(recording: Recording, context: RunContext) -> PreliminaryCalibration:
     """Find the calibration that the treatment of frames needs.
 
     Parameters
@@ -150,7 +150,7 @@ def precalibrate(recording: Recording, context: RunContext) -> Precalibration:
                 raise NotObservableError("the pixels' motion", agreement.reason)
     if isinstance(found, NotObservableError):
         raise found
-    return Precalibration(view=found, models=models)
+    return PreliminaryCalibration(view=found, models=models)
 
 
 def survey_parts(timing: FrameTiming) -> list[list[str]]:

@@ -55,7 +55,7 @@ class Sightings:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Way:
+class RelativeTrack:
     """Where frames were, up to a length, and the points by which they were placed.
 
     Attributes
@@ -148,7 +148,7 @@ def joined(features: Sequence[int], matches: Sequence[tuple[int, int, Int]]) -> 
 
 
 @one_blas_thread()
-def find_way(sightings: Sightings, frames: int) -> Way:
+def estimate_relative_track(sightings: Sightings, frames: int) -> RelativeTrack:
     """Place frames one after another; where too little hangs together, a new part begins.
 
     Parameters
@@ -203,7 +203,7 @@ def find_way(sightings: Sightings, frames: int) -> Way:
                 add(k, trusted)
             k += 1
         begun, now = max(k, begun + 1), now + 1
-    return Way(part=part, centre=centre, points=points, sightings=sightings)
+    return RelativeTrack(part=part, centre=centre, points=points, sightings=sightings)
 
 
 def _beginning(sightings: Sightings, bounds: Int, i: int) -> tuple[int, Array] | None:

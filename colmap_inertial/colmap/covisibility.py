@@ -23,7 +23,7 @@ _LENGTH = 512.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Voters:
+class Covisibility:
     """The largest features of each image.
 
     Attributes
@@ -38,7 +38,7 @@ class Voters:
     xy_px: tuple[Array, ...]
 
     @classmethod
-    def of(cls, database: Path, names: Sequence[str]) -> Voters:
+    def of(cls, database: Path, names: Sequence[str]) -> Covisibility:
         """Of images, from a database that holds their features."""
         import pycolmap
 

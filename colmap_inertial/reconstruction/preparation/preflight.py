@@ -17,10 +17,10 @@ from colmap_inertial.io.imu import RawImu
 from colmap_inertial.io.pose_convention import COLMAP
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.motion.flow import VisualRotation
-from colmap_inertial.motion.turns import measure_turns
+from colmap_inertial.motion.two_view_rotation import measure_two_view_rotations
 from colmap_inertial.pipeline.run.context import Recording
 from colmap_inertial.pipeline.run.progress import Progress
-from colmap_inertial.reconstruction.precalibrate.calibrate import (
+from colmap_inertial.reconstruction.preparation.calibrate import (
     followed,
     guessed_camera,
     near_the_beginning,
@@ -152,4 +152,4 @@ def compared(capture: Capture, timing: FrameTiming, progress: Progress) -> Visua
 
     camera = colmap_camera(guessed_camera(capture, timing))
     with one_blas_thread():
-        return measure_turns(counted(), camera, timing)
+        return measure_two_view_rotations(counted(), camera, timing)

@@ -11,7 +11,7 @@ from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.sampling import Coverage
 from colmap_inertial.core.types import IMU_CAL, Array, ImuRecording
-from colmap_inertial.inertial.rest._rests import Rests
+from colmap_inertial.inertial.static_calibration._rests import Rests
 
 #: Entries of the accelerometer's matrix that are fitted, row by row: the frame takes the others.
 _LOWER = np.array([0, 3, 4, 6, 7, 8])

@@ -35,7 +35,7 @@ from colmap_inertial.pipeline.run.progress import Progress
 from colmap_inertial.pipeline.run.runner import remove
 from colmap_inertial.pipeline.run.session import Session
 from colmap_inertial.pipeline.run.workspace import a_record_of_ours
-from colmap_inertial.reconstruction.precalibrate.calibrate import followed, guessed_camera, near_the_beginning
+from colmap_inertial.reconstruction.preparation.calibrate import followed, guessed_camera, near_the_beginning
 
 log = logging.getLogger(__name__)
 

@@ -33,10 +33,15 @@ from colmap_inertial.pipeline.run.workspace import a_record_of_ours
 from colmap_inertial.pipeline.stages.deblur import SMOOTHING, DeblurStage
 from colmap_inertial.pipeline.stages.gyro_view import GyroView
 from colmap_inertial.pipeline.stages.rolling_shutter import RollingShutterStage
-from colmap_inertial.reconstruction.precalibrate.calibrate import guessed_camera, precalibrate, survey, survey_parts
-from colmap_inertial.reconstruction.precalibrate.judge import judge_frames
-from colmap_inertial.reconstruction.precalibrate.sliding import most_by_sliding_px, sliding_parts
-from colmap_inertial.reconstruction.precalibrate.translation import find_parallaxes
+from colmap_inertial.reconstruction.preparation.calibrate import (
+    estimate_preliminary_calibration,
+    guessed_camera,
+    survey,
+    survey_parts,
+)
+from colmap_inertial.reconstruction.preparation.judge import judge_frames
+from colmap_inertial.reconstruction.preparation.translating import most_by_sliding_px, translating_segments
+from colmap_inertial.reconstruction.preparation.translation import find_parallaxes
 
 if TYPE_CHECKING:
     import pycolmap
@@ -240,7 +245,7 @@ def plan_imaging(recording: Recording, context: RunContext, asked: Treatments) -
     if not plan.rectify and no_gyro:
         return replace(plan, deblur_note=_aligned_note(no_gyro))
     try:
-        found = precalibrate(recording, context)
+        found = estimate_preliminary_calibration(recording, context)
     except NotObservableError as error:
         by_name = [
             asked.deblur in get_args(BlurRemover) and not why_not,
@@ -267,7 +272,9 @@ def plan_imaging(recording: Recording, context: RunContext, asked: Treatments) -
 
     def sliding(parts: Sequence[Sequence[str]]) -> list[bool]:
         camera = found.view.camera
-        return sliding_parts(recording, camera, parts, _limit_px(camera), context.progress, motion=found.view.motion())
+        return translating_segments(
+            recording, camera, parts, _limit_px(camera), context.progress, motion=found.view.motion()
+        )
 
     return _deblurring(plan, found.view, capture, models, sliding, context.progress)
 
@@ -310,7 +317,7 @@ def _no_deblurring(recording: Recording, asked: Treatments, progress: Progress) 
     why_not = f"no frame has more than {most_px:.1f} px of blur, by the quickest turn that the gyroscope felt"
     if most_by_sliding_px(timing, camera) < limit_px:
         return why_not
-    if any(sliding_parts(recording, camera, survey_parts(timing), limit_px, progress)):
+    if any(translating_segments(recording, camera, survey_parts(timing), limit_px, progress)):
         return ""
     return f"{why_not}, and by how far pixels move from frame to frame"
 
