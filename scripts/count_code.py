@@ -21,6 +21,8 @@ ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = "colmap_inertial"
 _NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
 
+Function = ast.FunctionDef | ast.AsyncFunctionDef
+
 
 def git(*words: str) -> str:
     """What git prints."""
@@ -49,14 +51,52 @@ def _docstring_lines(text: str) -> set[int]:
     return lines
 
 
+def parameter_count(function: Function) -> int:
+    """Parameters of a function or method; ``self`` and ``cls`` do not count."""
+    every = [*function.args.posonlyargs, *function.args.args, *function.args.kwonlyargs]
+    return len([parameter for parameter in every if parameter.arg not in ("self", "cls")])
+
+
+def lines_without_docstring(function: Function) -> int:
+    """Lines from ``def`` to the end."""
+    first = function.body[0]
+    docstring = 0 if ast.get_docstring(function) is None else (first.end_lineno or 0) - first.lineno + 1
+    return (function.end_lineno or 0) - function.lineno + 1 - docstring
+
+
+def complexity(function: Function) -> int:
+    """Cyclomatic complexity as radon 6 counts it: functions inside of this one are counted by themselves."""
+    return 1 + sum(map(_decisions, function.body))
+
+
+def _decisions(node: ast.AST) -> int:
+    match node:
+        case ast.FunctionDef() | ast.AsyncFunctionDef() | ast.ClassDef():
+            return 0
+        case ast.Assert():
+            return 1
+        case ast.If() | ast.IfExp():
+            own = 1
+        case ast.For() | ast.AsyncFor() | ast.While():
+            own = 1 + bool(node.orelse)
+        case ast.Try():
+            own = len(node.handlers) + bool(node.orelse)
+        case ast.BoolOp():
+            own = len(node.values) - 1
+        case ast.comprehension():
+            own = 1 + len(node.ifs)
+        case ast.Match():
+            own = len(node.cases) - any(getattr(case.pattern, "pattern", node) is None for case in node.cases)
+        case _:
+            own = 0
+    return own + sum(map(_decisions, ast.iter_child_nodes(node)))
+
+
 def with_many_parameters(text: str, least: int) -> Iterator[tuple[str, int]]:
-    """Functions and methods with so many parameters or more; ``self`` and ``cls`` do not count."""
+    """Functions and methods with so many parameters or more."""
     for node in ast.walk(ast.parse(text)):
-        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
-            every = [a.arg for a in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)]
-            count = len([name for name in every if name not in ("self", "cls")])
-            if count >= least:
-                yield node.name, count
+        if isinstance(node, Function) and parameter_count(node) >= least:
+            yield node.name, parameter_count(node)
 
 
 def modules(commit: str | None) -> dict[str, str]:
