@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
+from colmap_inertial.core.arrays import AnyArray, Array, BoolArray, Float32Array, Int64Array, UInt8Array, UInt16Array
 from colmap_inertial.core.options import ApertureOptions
 from colmap_inertial.core.types import Aperture, ApertureRig
 from colmap_inertial.imaging.multi_aperture import Disparity, Rectified, fuse_apertures, rectify
@@ -18,7 +17,7 @@ from colmap_inertial.imaging.multi_aperture.disparity import background
 from colmap_inertial.imaging.multi_aperture.fusion import COLOURS, with_luminance
 from colmap_inertial.model import colmap_camera
 
-Planes = list[NDArray[np.uint8]]
+Planes = list[UInt8Array]
 
 
 def canvas_of(rig: ApertureRig) -> Rectified:
@@ -26,20 +25,18 @@ def canvas_of(rig: ApertureRig) -> Rectified:
     return rectify(rig, [colmap_camera(aperture.camera) for aperture in rig.apertures])
 
 
-def direct(planes: Planes, rig: ApertureRig) -> NDArray[np.uint8]:
+def direct(planes: Planes, rig: ApertureRig) -> UInt8Array:
     """The colours on each other as they are."""
     roles = [aperture.role for aperture in rig.apertures]
     return np.stack([planes[roles.index(role)] for role in COLOURS], axis=-1)
 
 
-def pairwise(
-    planes: Planes, rig: ApertureRig, options: ApertureOptions
-) -> tuple[NDArray[np.uint8], list[NDArray[np.float32]]]:
+def pairwise(planes: Planes, rig: ApertureRig, options: ApertureOptions) -> tuple[UInt8Array, list[Float32Array]]:
     """Each view matched with the reference alone, and warped by what that gives; all else as in the package.
 
     Also the disparities of each pair, in pixels between the reference and its partner.
     """
-    found: dict[str, NDArray[np.float32]] = {rig.reference.role: planes[0].astype(np.float32) / 255}
+    found: dict[str, Float32Array] = {rig.reference.role: planes[0].astype(np.float32) / 255}
     maps = []
     partner = rig.apertures[1].cam_in_rig - rig.reference.cam_in_rig
     for plane, aperture in zip(planes[1:], rig.apertures[1:], strict=True):
@@ -66,9 +63,7 @@ def pairwise(
     return np.clip(np.rint(255 * colours), 0, 255).astype(np.uint8), maps
 
 
-def opencv_disparity(
-    left: NDArray[np.uint8], right: NDArray[np.uint8], low_px: float, high_px: float
-) -> NDArray[np.float32]:
+def opencv_disparity(left: UInt8Array, right: UInt8Array, low_px: float, high_px: float) -> Float32Array:
     """StereoSGBM with eight paths, at the parameters of OpenCV's own sample; gaps as the package fills them."""
     first = int(np.floor(low_px)) - 1
     count = 16 * int(np.ceil((high_px + 2 - first) / 16))
@@ -92,15 +87,15 @@ def opencv_disparity(
     return background(found, found >= first)
 
 
-def as_disparity(disparity_px: NDArray[np.float32], views: int) -> Disparity:
+def as_disparity(disparity_px: Float32Array, views: int) -> Disparity:
     """Somebody else's disparities, everywhere visible."""
     everywhere = np.ones(disparity_px.shape, dtype=bool)
     return Disparity(disparity_px=disparity_px, measured=everywhere, visible=np.repeat(everywhere[None], views, axis=0))
 
 
 def expansion_moves(
-    cost: NDArray[np.uint8], guide: NDArray[np.uint8], *, small: int, jump: NDArray[np.uint16], cycles: int = 2
-) -> NDArray[np.int64]:
+    cost: UInt8Array, guide: UInt8Array, *, small: int, jump: UInt16Array, cycles: int = 2
+) -> Int64Array:
     """Labels by alpha-expansion (Boykov, Veksler, Zabih, PAMI 23(11), 2001) with scipy's maximum flow.
 
     The energy is that of semi-global matching, on the four neighbours: ``small`` for labels that differ by one,
@@ -115,7 +110,7 @@ def expansion_moves(
     limit = 2 * jump[np.abs(codes[p] - codes[q])].astype(np.int64)
     data = cost.reshape(-1, labels).astype(np.int64)
 
-    def pair(a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.int64]:
+    def pair(a: Int64Array, b: Int64Array) -> Int64Array:
         d = np.abs(a - b)
         return np.where(d == 0, 0, np.where(d == 1, 2 * small, np.maximum(limit, 2 * small)))
 
@@ -149,12 +144,12 @@ def expansion_moves(
     return labelling.reshape(height, width)
 
 
-def psnr_db(a: NDArray[Any], b: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> float:
+def psnr_db(a: AnyArray, b: AnyArray, mask: BoolArray | None = None) -> float:
     error = (a.astype(float) - b.astype(float)) ** 2
     return float(10 * np.log10(255**2 / (error if mask is None else error[mask]).mean()))
 
 
-def read_pfm(path: Path) -> NDArray[np.float64]:
+def read_pfm(path: Path) -> Array:
     with open(path, "rb") as file:
         if file.readline().strip() != b"Pf":
             raise ValueError(f"{path}: no grey PFM")
@@ -163,7 +158,7 @@ def read_pfm(path: Path) -> NDArray[np.float64]:
         return np.fromfile(file, f"{order}f4").reshape(height, width)[::-1].astype(np.float64)
 
 
-def seen_by(disparity: NDArray[np.float64], dy: float, dx: float, tolerance: float) -> NDArray[np.bool_]:
+def seen_by(disparity: Array, dy: float, dx: float, tolerance: float) -> BoolArray:
     """Which pixels the view at (dx, dy) baselines sees, by the true disparity."""
     height, width = disparity.shape
     y, x = np.mgrid[:height, :width]

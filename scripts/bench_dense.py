@@ -31,11 +31,11 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.geometry import matrix_from_quat
-from colmap_inertial.core.types import Array, CameraModel
+from colmap_inertial.core.types import CameraModel
 from colmap_inertial.io.files import read_json
 from colmap_inertial.model import read_model
 from colmap_inertial.model.depth_maps import read_map
@@ -159,7 +159,7 @@ def _on_the_table(points: Array) -> Array:
     return points[((points >= LOW_M) & (points <= HIGH_M)).all(axis=1)]
 
 
-def _cells(points: Array) -> NDArray[np.int64]:
+def _cells(points: Array) -> Int64Array:
     """One number for each cell of a grid."""
     cell = np.floor((points - LOW_M) / SPACING_M).astype(np.int64)
     return (cell[:, 0] * 4096 + cell[:, 1]) * 4096 + cell[:, 2]

@@ -22,14 +22,14 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from restoration.photographs import photographs
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
-from simulated_exposures import Codes, Pair, pairs
+from simulated_exposures import Pair, pairs
 from turning_world import Turning
 
+from colmap_inertial.core.arrays import AnyArray, UInt8Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.imaging.exposure_pairs import better_alone, bring_together
 from colmap_inertial.imaging.restoration import Network, load_network, lsd2
@@ -106,7 +106,7 @@ def _row(pair: Pair, i: int, network: Network) -> dict[str, Any]:
     return row
 
 
-def psnr_db(image: NDArray[Any], truth: Codes) -> float:
+def psnr_db(image: AnyArray, truth: UInt8Array) -> float:
     """Of 0 to 1 against codes."""
     return float(-10 * np.log10(np.mean((np.clip(image, 0, 1) - truth / 255) ** 2)))
 

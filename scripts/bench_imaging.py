@@ -40,21 +40,12 @@ import imaging_metrics as metrics
 import imaging_shutter
 import numpy as np
 from imaging_metrics import Features, correct_matches, extract, psnr_db, repeatability, ssim
-from imaging_scenes import (
-    Colour,
-    Grey,
-    Light,
-    Pair,
-    drawn_walls,
-    make_pairs,
-    native_walls,
-    photographed_walls,
-    photographs,
-)
+from imaging_scenes import Pair, drawn_walls, make_pairs, native_walls, photographed_walls, photographs
 from imaging_tables import print_report
 from rich.console import Console
 from rich.progress import track
 
+from colmap_inertial.core.arrays import Float32Array, UInt8Array
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath
 from colmap_inertial.imaging.evidence import blur_evidence
@@ -73,7 +64,7 @@ SECTIONS = ("quality", "treated", "other_ways_20_px", "cost", "false_blur_10_px"
 console = Console(stderr=True)
 T = TypeVar("T")
 #: The package's filters, by the names that ``--deblur`` gives them.
-FILTERS: dict[str, Callable[[Grey, BlurField], Grey]] = {
+FILTERS: dict[str, Callable[[UInt8Array, BlurField], UInt8Array]] = {
     "wiener": lambda image, blur: path_wiener(image, BlurPath.straight(blur)),
     "path": lambda image, blur: half_quadratic(image, BlurPath.straight(blur)),
 }
@@ -107,7 +98,7 @@ def main() -> None:
     scenes, compared = (2, 1) if args.quick else (args.scenes, min(args.compared, args.scenes))
     blurs = (10.0, 20.0) if args.quick else BLURS_PX
     walls = drawn_walls(scenes, args.seed)
-    kinds: dict[str, tuple[list[Light], tuple[int, int] | None]] = {"drawn": (walls, SIZE)}
+    kinds: dict[str, tuple[list[Float32Array], tuple[int, int] | None]] = {"drawn": (walls, SIZE)}
     if args.photos is not None:
         pictures = photographs(args.photos)
         walls = photographed_walls(pictures, scenes, args.seed)
@@ -165,19 +156,19 @@ def flat(pairs: Sequence[Sequence[T]]) -> list[T]:
     return [one for pair in pairs for one in pair]
 
 
-def features_of(images: Sequence[Grey | Colour]) -> list[Features]:
+def features_of(images: Sequence[UInt8Array]) -> list[Features]:
     """Of a few images, two at a time."""
     with ThreadPoolExecutor(2) as pool:
         return list(pool.map(extract, images))
 
 
-def verdict_on(frames: Sequence[Grey | Colour], blurs: Sequence[BlurField]) -> RecordingVerdict:
+def verdict_on(frames: Sequence[UInt8Array], blurs: Sequence[BlurField]) -> RecordingVerdict:
     """What the most blurred frames of a recording say of its gyroscope."""
     order = sorted(range(len(frames)), key=lambda i: -float(np.percentile(blurs[i].extent_px(), 90)))[:JUDGED]
     return judge_recording(blur_evidence(frames[i], blurs[i]) for i in order)
 
 
-def measured(pair: Pair, images: Sequence[Grey | Colour], sharp: Sequence[Grey | Colour]) -> dict[str, float]:
+def measured(pair: Pair, images: Sequence[UInt8Array], sharp: Sequence[UInt8Array]) -> dict[str, float]:
     """Every figure of one pair of frames."""
     features = features_of(images)
     correct, found = correct_matches(pair, *features)
@@ -199,7 +190,7 @@ def summed(rows: Sequence[dict[str, float]]) -> dict[str, float]:
 
 
 def quality(
-    walls: Sequence[Light], size: tuple[int, int] | None, blur_px: float, seed: int, kind: str
+    walls: Sequence[Float32Array], size: tuple[int, int] | None, blur_px: float, seed: int, kind: str
 ) -> dict[str, Any]:
     """Nothing against the gated default, at one blur."""
     pairs = make_pairs(walls, blur_px, size=size, seed=seed)
@@ -254,7 +245,7 @@ def other_ways(pairs: Sequence[Pair]) -> dict[str, Any]:
     frames = [[pair.frame(i) for i in (0, 1)] for pair in pairs]
     blurs = [[pair.blur(i) for i in (0, 1)] for pair in pairs]
     verdict = verdict_on(flat(frames), flat(blurs))
-    ways: dict[str, Callable[[Grey, BlurField], Grey]] = {
+    ways: dict[str, Callable[[UInt8Array, BlurField], UInt8Array]] = {
         "nothing": lambda image, _: image,
         "gated": lambda image, blur: deblur_gated(image, blur, recording=verdict).image,
         "ungated": deblur,
@@ -294,7 +285,7 @@ def false_blur(pairs: Sequence[Pair]) -> dict[str, Any]:
 
 def by_filter(
     pairs: Sequence[Pair],
-    frames: Sequence[Sequence[Grey]],
+    frames: Sequence[Sequence[UInt8Array]],
     fields: Sequence[Sequence[BlurField]],
     verdict: RecordingVerdict,
     before: Sequence[int],
@@ -313,11 +304,11 @@ def with_short_exposure(pair: Pair) -> Pair:
 
 def kept_share(
     pairs: Sequence[Pair],
-    frames: Sequence[Sequence[Grey]],
+    frames: Sequence[Sequence[UInt8Array]],
     fields: Sequence[Sequence[BlurField]],
     verdict: RecordingVerdict,
     before: Sequence[int],
-    way: Callable[[Grey, BlurField], Grey] | None = None,
+    way: Callable[[UInt8Array, BlurField], UInt8Array] | None = None,
 ) -> dict[str, Any]:
     """Correct matches through the gate against those of doing nothing."""
     after, deblurred = 0, 0

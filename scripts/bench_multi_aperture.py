@@ -54,8 +54,8 @@ from aperture_baselines import (
     read_pfm,
     seen_by,
 )
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import AnyArray, Array, BoolArray, Float32Array, UInt8Array
 from colmap_inertial.core.options import ApertureOptions, FuseAperturesOptions
 from colmap_inertial.core.types import Aperture, ApertureRig, CameraModel
 from colmap_inertial.imaging import semi_global
@@ -100,7 +100,7 @@ def rig_of(
 
 def light_field(
     folder: Path, step: int, roles: str, noise: float, seed: int = 0
-) -> tuple[list[NDArray[np.uint8]], ApertureRig, NDArray[np.uint8], NDArray[np.float64], NDArray[np.bool_]]:
+) -> tuple[list[UInt8Array], ApertureRig, UInt8Array, Array, BoolArray]:
     """Planes, rig, the reference's colours, its disparity to the partner, and which pixels all views see."""
     names = {"R": "red", "G": "green", "B": "blue", "L": "luminance"}
     places = ((0, 0), (1, 0), (0, 1), (1, 1))
@@ -137,7 +137,7 @@ def antinous_case(folder: Path, step: int, roles: str, noise: float) -> list[dic
     limits = (float(truth.min()) - MARGIN_PX, float(truth.max()) + MARGIN_PX)
     rows = []
 
-    def row(way: str, image: NDArray[Any], disparities: list[NDArray[Any]] | None, seconds: float | None) -> None:
+    def row(way: str, image: AnyArray, disparities: list[AnyArray] | None, seconds: float | None) -> None:
         wrong = None
         if disparities is not None:
             far = [100 * float((np.abs(d - truth)[seen] * 2 / step > 1).mean()) for d in disparities]
@@ -248,7 +248,7 @@ def bench_cones(folder: Path) -> list[dict[str, Any]]:
     seen = known & (there >= 0) & (back > 0) & (np.abs(back - truth) <= 1)
     rows: list[dict[str, Any]] = []
 
-    def row(way: str, found: NDArray[Any], measured: NDArray[np.bool_] | None = None) -> None:
+    def row(way: str, found: AnyArray, measured: BoolArray | None = None) -> None:
         wrong = np.abs(found - truth) > 1
         both = seen if measured is None else seen & measured
         rows.append(
@@ -265,9 +265,7 @@ def bench_cones(folder: Path) -> list[dict[str, Any]]:
     grey = [cv2.cvtColor(p, cv2.COLOR_RGB2GRAY) for p in (left, right)]
     row("StereoSGBM, grey", opencv_disparity(grey[0], grey[1], *limits))
 
-    def ours(
-        first: NDArray[np.uint8], second: NDArray[np.uint8], cost: str
-    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    def ours(first: UInt8Array, second: UInt8Array, cost: str) -> tuple[Float32Array, BoolArray]:
         rig = rig_of(("other", "other"), ((0, 0), (1, 0)), width, height)
         options = ApertureOptions(cost=cost, disparity_px=limits)  # type: ignore[arg-type]
         found = estimate_disparity([first, second], canvas_of(rig), options)

@@ -50,7 +50,7 @@ import imaging_metrics as metrics
 import restoration_cost
 import restoration_exposures
 from bench_imaging import BLURS_PX, SIZE, about
-from imaging_scenes import Colour, make_pairs, native_walls, photographed_walls
+from imaging_scenes import make_pairs, native_walls, photographed_walls
 from restoration.photographs import photographs
 from restoration_deblur import Ways, false_blur, quality
 from restoration_sheet import SCENES, write_sheet
@@ -58,6 +58,7 @@ from restoration_tables import print_report
 from restoration_weights import checksums, use_weights
 from rich.console import Console
 
+from colmap_inertial.core.arrays import UInt8Array
 from colmap_inertial.core.errors import InertialError
 from colmap_inertial.core.options import ReconstructOptions
 from colmap_inertial.imaging.blur_field import BlurField
@@ -192,11 +193,11 @@ def run(args: argparse.Namespace) -> None:
     print_report(report, Console() if sys.stdout.isatty() else Console(width=140))
 
 
-def _filtered(image: Colour, blur: BlurField) -> Colour:
+def _filtered(image: UInt8Array, blur: BlurField) -> UInt8Array:
     return path_wiener(image, BlurPath.straight(blur))
 
 
-def _restored(image: Colour, blur: BlurField, *, network: Network) -> Colour:
+def _restored(image: UInt8Array, blur: BlurField, *, network: Network) -> UInt8Array:
     return deepgyro.deblur(image, BlurPath.straight(blur), network=network)
 
 

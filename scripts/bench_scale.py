@@ -38,9 +38,10 @@ from linear_scale import estimate_linear
 from rich.console import Console
 from rich.progress import track
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.options import ScaleOptions
-from colmap_inertial.core.types import Array, CameraTrajectory, ImuRecording
+from colmap_inertial.core.types import CameraTrajectory, ImuRecording
 from colmap_inertial.inertial.scale import estimate_scale
 from colmap_inertial.io.trajectories import read_inertial_scale
 from colmap_inertial.motion.align import align_camera_imu

@@ -30,6 +30,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.files import read_json
 from colmap_inertial.io.frames import read_frames
@@ -38,7 +39,6 @@ from colmap_inertial.model import find_models, read_model, trajectory_from_model
 if TYPE_CHECKING:
     import pycolmap
 
-    from colmap_inertial.core.types import Array
 
 EVERY_S = 0.04
 #: Shares of points that two pictures must both show, and from how far apart in direction.

@@ -49,9 +49,9 @@ from walk_scenes import Scene, Walk, places_m, world_of, write_walk
 from colmap_inertial.colmap.mapping import map_images
 from colmap_inertial.colmap.pairing import match_capture
 from colmap_inertial.colmap.sparse import extract_features
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import matrix_from_quat, quat_rotate, slerp
 from colmap_inertial.core.options import MappingOptions
-from colmap_inertial.core.types import Array
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.files import read_json
 from colmap_inertial.io.frames import read_frames

@@ -13,7 +13,8 @@ import numpy as np
 from real_imu import RECORDINGS, Motion, read
 from scipy.spatial.transform import Rotation, Slerp
 
-from colmap_inertial.core.types import IMU_CALIBRATION_PARAMETERS, Array, ImuCalibration
+from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.types import IMU_CALIBRATION_PARAMETERS, ImuCalibration
 
 #: Length of a bump, of a bias, and the strength of gravity in Munich (latitude 48.26 degrees, 480 m).
 BUMP_S, BIAS_S, GRAVITY_M_S2 = 1.0, 10.0, 9.8073

@@ -12,11 +12,10 @@ from functools import lru_cache
 import cv2
 import numpy as np
 import scipy.fft
-from imaging_scenes import Grey, Light
 from numpy.typing import NDArray
 from scipy.signal import fftconvolve
 
-from colmap_inertial.core.types import Array
+from colmap_inertial.core.arrays import Array, Float32Array, UInt8Array
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.transfer import decode_table, srgb_from_linear
 
@@ -34,18 +33,18 @@ STEEPEST = 2.0
 _TO_CODE = np.round(255 * srgb_from_linear(np.arange(16385) / 16384)).astype(np.uint8)
 
 
-def light_of(image: Grey) -> Light:
+def light_of(image: UInt8Array) -> Float32Array:
     """Linear light of 8-bit codes."""
     return np.asarray(cv2.LUT(image, decode_table(np.dtype(np.uint8))))
 
 
-def encoded(light: Light) -> Grey:
+def encoded(light: Float32Array) -> UInt8Array:
     """8-bit codes, through a table of 14 bits."""
     index = cv2.multiply(np.clip(light, 0, 1), 16384.0).astype(np.uint16)
     return np.asarray(_TO_CODE[index])
 
 
-def line(vector_px: tuple[float, float]) -> Light:
+def line(vector_px: tuple[float, float]) -> Float32Array:
     """The point spread function on whole pixels, of odd size."""
     radius = int(np.ceil(np.hypot(*vector_px) / 2)) + 1
     y, x = np.mgrid[-radius : radius + 1, -radius : radius + 1]
@@ -55,7 +54,7 @@ def line(vector_px: tuple[float, float]) -> Light:
 
 
 @lru_cache(maxsize=4096)
-def wiener_kernel(vector_px: tuple[float, float]) -> Light:
+def wiener_kernel(vector_px: tuple[float, float]) -> Float32Array:
     """The 2-D Wiener filter of the published schemes, cut by a window to three times the point spread function."""
     spread = line(vector_px)
     n, reach = scipy.fft.next_fast_len(8 * spread.shape[0]) | 1, 3 * spread.shape[0] // 2
@@ -79,7 +78,7 @@ def block_vectors(blur: BlurField, block_px: int) -> list[tuple[int, int, tuple[
     return found
 
 
-def spatial_wiener(image: Grey, blur: BlurField) -> Grey:
+def spatial_wiener(image: UInt8Array, blur: BlurField) -> UInt8Array:
     """Blocks filtered by 2-D kernels in space, with a validation by gradients.
 
     A block keeps its pixels where its brightness, smoothed against noise, changes from pixel to pixel along the blur by
@@ -113,7 +112,7 @@ def transfer(vector_px: tuple[float, float], size: int) -> NDArray[np.complex64]
     return np.asarray(scipy.fft.rfft2(np.roll(whole, [-(s // 2) for s in spread.shape], axis=(0, 1))))
 
 
-def fourier_wiener(image: Grey, blur: BlurField) -> Grey:
+def fourier_wiener(image: UInt8Array, blur: BlurField) -> UInt8Array:
     """Blocks filtered in the frequency domain, each with its surroundings."""
     light = light_of(image)
     size = BLOCK_PX + 2 * AROUND_PX
@@ -127,7 +126,7 @@ def fourier_wiener(image: Grey, blur: BlurField) -> Grey:
     return encoded(result[: light.shape[0], : light.shape[1]])
 
 
-def richardson_lucy_blocks(image: Grey, blur: BlurField) -> Grey:
+def richardson_lucy_blocks(image: UInt8Array, blur: BlurField) -> UInt8Array:
     """Richardson-Lucy with a point spread function for each block, from a flat start."""
     light = light_of(image)
     size = LARGE_BLOCK_PX + 2 * AROUND_PX
@@ -145,7 +144,7 @@ def richardson_lucy_blocks(image: Grey, blur: BlurField) -> Grey:
     return encoded(result[: light.shape[0], : light.shape[1]])
 
 
-def richardson_lucy(image: Grey, spread: Light) -> Grey:
+def richardson_lucy(image: UInt8Array, spread: Float32Array) -> UInt8Array:
     """The whole frame with one point spread function, operation for operation as scikit-image has it."""
     light = light_of(image)
     estimate = np.full_like(light, 0.5)
@@ -156,14 +155,14 @@ def richardson_lucy(image: Grey, spread: Light) -> Grey:
     return encoded(estimate)
 
 
-def _surrounded(light: Light, block_px: int) -> Light:
+def _surrounded(light: Float32Array, block_px: int) -> Float32Array:
     """The frame, filled up to whole blocks, with what surrounds them."""
     height, width = light.shape
     below, right = -height % block_px + AROUND_PX, -width % block_px + AROUND_PX
     return np.asarray(cv2.copyMakeBorder(light, AROUND_PX, below, AROUND_PX, right, cv2.BORDER_REFLECT_101))
 
 
-def _put(result: Light, top: int, left: int, window: Array | Light, block_px: int) -> None:
+def _put(result: Float32Array, top: int, left: int, window: Array | Float32Array, block_px: int) -> None:
     inside = slice(AROUND_PX, AROUND_PX + block_px)
     part = window[inside, inside]
     target = result[top : top + block_px, left : left + block_px]

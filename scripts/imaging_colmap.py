@@ -14,11 +14,12 @@ from unittest.mock import patch
 import numpy as np
 from rich.console import Console
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import MappingError
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.options import ReconstructOptions
-from colmap_inertial.core.types import Array, CameraTrajectory, FrameTiming
+from colmap_inertial.core.types import CameraTrajectory, FrameTiming
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.imaging.psf import predicted_blur_px
 from colmap_inertial.model import colmap_camera, read_model

@@ -9,10 +9,10 @@ from typing import Any
 import imaging_baselines as baselines
 import numpy as np
 from imaging_metrics import extract
-from imaging_scenes import Grey, Pair
-from numpy.typing import NDArray
+from imaging_scenes import Pair
 
 from colmap_inertial._kernels import _wiener
+from colmap_inertial.core.arrays import AnyArray, UInt8Array
 from colmap_inertial.imaging import wiener
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.evidence import blur_evidence
@@ -70,7 +70,7 @@ def least_cpu_s(run: Callable[[], object], repeat: int) -> float:
     return min(times)
 
 
-def roofline(image: Grey, blur: BlurField, name: str, repeat: int) -> dict[str, float]:
+def roofline(image: UInt8Array, blur: BlurField, name: str, repeat: int) -> dict[str, float]:
     """Times of the stages, ms, and the multiply-adds a second as a share of the processor's peak.
 
     The filter is timed on light that needs no decoding, less the time of the same pass with a single tap: what is left
@@ -87,7 +87,7 @@ def roofline(image: Grey, blur: BlurField, name: str, repeat: int) -> dict[str, 
     # Two multiply-adds a tap and pixel (two rows, or columns, are interpolated), one in the middle.
     count = float(np.mean(2 * taps - 1)) * cells.extent_px.size * 256
 
-    def seconds(what: NDArray[Any], with_taps: wiener.TapTable) -> Any:
+    def seconds(what: AnyArray, with_taps: wiener.TapTable) -> Any:
         runs = [wiener._compiled(what, cells, with_taps, threads=1, instruction_set=name)[1] for _ in range(repeat)]
         return np.min(runs, axis=0)
 

@@ -17,11 +17,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from imaging_scenes import Colour, Grey, Pair
-from numpy.typing import NDArray
+from imaging_scenes import Pair
 from scipy.spatial import cKDTree
 
-from colmap_inertial.core.types import Array
+from colmap_inertial.core.arrays import Array, BoolArray, Float32Array, IndexArray, UInt8Array
 
 CORRECT_PX = 3.0
 STRONGEST = 1000
@@ -35,7 +34,7 @@ class Features:
 
     points_px: Array
     scale_px: Array
-    descriptors: NDArray[np.float32]
+    descriptors: Float32Array
 
 
 _first_octave = -1
@@ -63,7 +62,7 @@ def _extractor(first_octave: int) -> Any:
         return pycolmap.Sift(options, pycolmap.Device.cpu)
 
 
-def extract(image: Grey | Colour, first_octave: int | None = None) -> Features:
+def extract(image: UInt8Array, first_octave: int | None = None) -> Features:
     """COLMAP's SIFT at its defaults, but for the first octave (`set_first_octave`); of pictures in colour, of grey."""
     if image.ndim == 3:
         image = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
@@ -74,7 +73,7 @@ def extract(image: Grey | Colour, first_octave: int | None = None) -> Features:
     return Features(points[inside], np.asarray(keypoints[inside, 2]), np.asarray(descriptors[inside], np.float32))
 
 
-def match(a: Features, b: Features) -> NDArray[np.intp]:
+def match(a: Features, b: Features) -> IndexArray:
     """(M, 2) mutual nearest neighbours that pass the ratio test, as COLMAP does by default (0.8, at most 0.7 rad)."""
     if min(len(a.points_px), len(b.points_px)) < 2:
         return np.zeros((0, 2), dtype=np.intp)
@@ -83,7 +82,7 @@ def match(a: Features, b: Features) -> NDArray[np.intp]:
     return np.stack([index, there[index]], axis=1)
 
 
-def _nearest(a: NDArray[np.float32], b: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+def _nearest(a: Float32Array, b: Float32Array) -> tuple[IndexArray, BoolArray]:
     """(N,) the nearest of ``b`` for each of ``a``, and whether it passes the ratio test."""
     best, cosine = np.empty(len(a), dtype=np.intp), np.empty((2, len(a)), dtype=np.float32)
     for i in range(0, len(a), 256):  # few enough to stay in the cache
@@ -125,17 +124,17 @@ def repeatability(pair: Pair, a: Features, b: Features) -> tuple[float, float]:
     return float(share), float(distance[repeated].mean()) if repeated.any() else float("nan")
 
 
-def psnr_db(image: Grey | Colour, truth: Grey | Colour, margin: int = 30) -> float:
+def psnr_db(image: UInt8Array, truth: UInt8Array, margin: int = 30) -> float:
     """Peak signal to noise ratio, without a margin."""
     inside = (slice(margin, -margin),) * 2
     return float(10 * np.log10(255**2 / np.mean((image[inside].astype(np.float32) - truth[inside]) ** 2)))
 
 
-def ssim(image: Grey | Colour, truth: Grey | Colour, margin: int = 30) -> float:
+def ssim(image: UInt8Array, truth: UInt8Array, margin: int = 30) -> float:
     """Structural similarity (Wang et al. 2004): Gaussian window of 1.5 px, K1 = 0.01, K2 = 0.03."""
     a, b = (i[margin:-margin, margin:-margin].astype(np.float32) / 255 for i in (image, truth))
 
-    def mean(x: NDArray[np.float32]) -> NDArray[np.float32]:
+    def mean(x: Float32Array) -> Float32Array:
         return np.asarray(cv2.GaussianBlur(x, (11, 11), 1.5))
 
     mean_a, mean_b = mean(a), mean(b)

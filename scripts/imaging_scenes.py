@@ -13,11 +13,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, Float32Array, UInt8Array
 from colmap_inertial.core.geometry import matrix_from_quat, quat_exp
 from colmap_inertial.core.gyro import GyroPath
-from colmap_inertial.core.types import Array, CameraModel, FrameTiming
+from colmap_inertial.core.types import CameraModel, FrameTiming
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.psf import blur_field, predicted_blur_px
@@ -26,12 +26,6 @@ from colmap_inertial.imaging.transfer import linear_from_srgb, srgb_from_linear
 from colmap_inertial.tools.simulate import Motion, MotionOptions, make_motion
 from colmap_inertial.tools.simulate.render import colmap_camera
 from colmap_inertial.tools.simulate.textures import MATERIALS
-
-Grey = NDArray[np.uint8]
-#: Codes of three channels, RGB.
-Colour = NDArray[np.uint8]
-#: (H, W) or (H, W, 3)
-Light = NDArray[np.float32]
 
 DURATION_S = 60.0
 #: Of the camera, and of a phone's gyroscope (white, each sample).
@@ -95,7 +89,7 @@ NAMED_ERRORS = {
 class Pair:
     """Two frames of one recording that see much the same part of a wall."""
 
-    wall: Light
+    wall: Float32Array
     wall_from_world: Array
     model: CameraModel
     motion: Motion
@@ -106,20 +100,20 @@ class Pair:
         """(N, 3, 3) wall_from_cam at (N,) times."""
         return np.asarray(self.wall_from_world @ matrix_from_quat(self.motion.world_from_cam_xyzw(t_s)))
 
-    def frame(self, index: int, *, noise: float = NOISE, exposure_s: float | None = None) -> Grey:
+    def frame(self, index: int, *, noise: float = NOISE, exposure_s: float | None = None) -> UInt8Array:
         """A frame as filmed; with ``exposure_s``, around the same instants of mid-exposure."""
         shutter = self.shutters[index] if exposure_s is None else _shortened(self.shutters[index], exposure_s)
         light = self.light(shutter)
         light += noise * np.random.default_rng([self.seed, index]).standard_normal(light.shape, dtype=np.float32)
         return np.asarray(np.rint(255 * srgb_from_linear(light)), dtype=np.uint8)
 
-    def light(self, shutter: FrameShutter) -> Light:
+    def light(self, shutter: FrameShutter) -> Float32Array:
         """What a frame of this shutter gathers, without noise and clipping; the wall's own light where it is still."""
         length = float(np.percentile(blur_field(self.gyro(), colmap_camera(self.model), shutter).extent_px(), 99))
         samples = 1 if shutter.exposure_s == 0 else max(32, int(np.ceil(2 * length)))
         return _render(self, shutter, samples)
 
-    def sharp(self, index: int) -> Grey:
+    def sharp(self, index: int) -> UInt8Array:
         """The frame without blur or noise."""
         return self.frame(index, noise=0.0, exposure_s=0.0)
 
@@ -173,7 +167,7 @@ def _shortened(shutter: FrameShutter, exposure_s: float) -> FrameShutter:
     return replace(shutter, exposure_s=exposure_s, t_s=shutter.t_s + 0.5 * (shutter.exposure_s - exposure_s))
 
 
-def _render(pair: Pair, shutter: FrameShutter, samples: int) -> Light:
+def _render(pair: Pair, shutter: FrameShutter, samples: int) -> Float32Array:
     """(H, W) or (H, W, 3) light of a frame."""
     model, wall = pair.model, pair.wall
     rows, columns = BlurField.nodes(model.width, model.height, NODE_PX)
@@ -196,7 +190,7 @@ def _render(pair: Pair, shutter: FrameShutter, samples: int) -> Light:
 
 
 def make_pairs(
-    walls: Sequence[Light],
+    walls: Sequence[Float32Array],
     blur_px: float,
     *,
     size: tuple[int, int] | None,
@@ -290,7 +284,7 @@ def _instants(
     return float(t[good[a]]), float(t[good[b]])
 
 
-def drawn_walls(count: int, seed: int) -> list[Light]:
+def drawn_walls(count: int, seed: int) -> list[Float32Array]:
     """Walls of the simulator's materials, six patches each."""
     walls = []
     for i in range(count):
@@ -308,7 +302,7 @@ def photographs(folder: Path) -> list[Path]:
     return found
 
 
-def photographed_walls(paths: Sequence[Path], count: int, seed: int, *, colour: bool = False) -> list[Light]:
+def photographed_walls(paths: Sequence[Path], count: int, seed: int, *, colour: bool = False) -> list[Float32Array]:
     """Walls hung with photographs at their own size, 15 each, none twice while there are enough."""
     side = 500
     order = np.random.default_rng(seed).permutation(len(paths))
@@ -320,7 +314,7 @@ def photographed_walls(paths: Sequence[Path], count: int, seed: int, *, colour: 
     return walls
 
 
-def native_walls(paths: Sequence[Path], count: int, seed: int, *, colour: bool = False) -> list[Light]:
+def native_walls(paths: Sequence[Path], count: int, seed: int, *, colour: bool = False) -> list[Float32Array]:
     """Whole photographs, the larger ones first."""
     sizes = {path: cv2.imread(str(path), cv2.IMREAD_GRAYSCALE).size for path in paths}
     large = sorted(paths, key=lambda path: (-sizes[path], path.name))[: 3 * count]
@@ -328,7 +322,7 @@ def native_walls(paths: Sequence[Path], count: int, seed: int, *, colour: bool =
     return [_light(large[k], None, colour) for k in chosen]
 
 
-def _light(path: Path, size: tuple[int, int] | None, colour: bool) -> Light:
+def _light(path: Path, size: tuple[int, int] | None, colour: bool) -> Float32Array:
     picture = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB if colour else cv2.IMREAD_GRAYSCALE)
     if picture is None:
         raise SystemExit(f"bench_imaging: cannot read {path}")

@@ -8,9 +8,9 @@ import numpy as np
 import pycolmap
 from imaging_scenes import CAM_FROM_IMU, GYRO_HZ, GYRO_NOISE_RAD_S, lens
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.gyro import GyroPath
-from colmap_inertial.core.types import Array
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.rolling_shutter import rectify_keypoints
 from colmap_inertial.tools.simulate import Motion, MotionOptions, make_motion

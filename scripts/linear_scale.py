@@ -24,10 +24,11 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 from scipy.signal import butter, sosfiltfilt
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import matrix_from_quat, quat_rotate, slerp
 from colmap_inertial.core.threads import one_blas_thread
-from colmap_inertial.core.types import Array, CameraImuCalibration, CameraTrajectory, ImuRecording, clock_shift_s
+from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuRecording, clock_shift_s
 
 LOW_PASS_HZ, LOW_PASS_ORDER = 1.2, 4
 GRID_HZ = 100.0

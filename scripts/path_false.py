@@ -17,12 +17,13 @@ import imaging_metrics as metrics
 import numpy as np
 from imaging_scenes import photographed_walls
 from path_methods import LEAST_PX, METHODS, MOSTLY_KEPT, with_blur
-from path_scenes import FOCAL, HELD_OUT, INTERVAL_S, READOUT_S, Grey, Known, Pair, blur_px
+from path_scenes import FOCAL, HELD_OUT, INTERVAL_S, READOUT_S, Known, Pair, blur_px
 from restoration.photographs import photographs
 from rich.console import Console
 from rich.progress import track
-from turning_world import Light, Moment, Turning, TurningCamera
+from turning_world import Moment, Turning, TurningCamera
 
+from colmap_inertial.core.arrays import Float32Array, UInt8Array
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.evidence import blur_evidence, shown_shares
 from colmap_inertial.imaging.gate import GateOptions, RecordingVerdict, judge_frame, keep_sharp
@@ -71,7 +72,7 @@ WRONG: Mapping[str, Callable[[Turning], Turning]] = {
 }
 
 
-def below_sky(wall: Light, height: int, share: float, seed: int) -> Light:
+def below_sky(wall: Float32Array, height: int, share: float, seed: int) -> Float32Array:
     """The wall with a horizon so high that this share of a frame of this height is sky."""
     horizon = round(0.5 * wall.shape[0] + (share - 0.5) * height)
     clouds = np.random.default_rng([seed, 31]).standard_normal((6, 9)).astype(np.float32)
@@ -122,7 +123,7 @@ def known_by(pair: Pair, index: int, wrong: Callable[[Turning], Turning] | None 
     return replace(pair, camera=camera).known(index, "exact")
 
 
-def judgement(frames: Sequence[Grey], known: Sequence[Known]) -> RecordingVerdict:
+def judgement(frames: Sequence[UInt8Array], known: Sequence[Known]) -> RecordingVerdict:
     """What the pipeline says of a recording."""
     looked = []
     for frame, one in zip(frames, known, strict=True):
@@ -137,7 +138,7 @@ def options_for(verdict: RecordingVerdict, method: str) -> GateOptions:
     return GateOptions() if verdict.trusted else GateOptions(min_support=plan._CLEAR_SUPPORT[method])
 
 
-def gated(image: Grey, known: Known, verdict: RecordingVerdict, method: str) -> Grey | None:
+def gated(image: UInt8Array, known: Known, verdict: RecordingVerdict, method: str) -> UInt8Array | None:
     """What features see of a frame that goes through the gate, as ``DeblurStage`` has it; ``None`` as it was."""
     factor, _ = judge_frame(image, blur_field(*known), verdict, options_for(verdict, method), blur_path(*known))
     if factor is None:
@@ -227,7 +228,7 @@ def false_gyroscopes(
     return rows
 
 
-def _features(image: Grey) -> metrics.Features:
+def _features(image: UInt8Array) -> metrics.Features:
     return metrics.extract(image, 0)
 
 
@@ -262,10 +263,10 @@ def short_blur(make: Callable[..., list[Pair]], methods: Sequence[str], *, conso
     return rows
 
 
-def _matches(pairs: Sequence[Pair], frames: Sequence[Sequence[Grey]]) -> int:
+def _matches(pairs: Sequence[Pair], frames: Sequence[Sequence[UInt8Array]]) -> int:
     return sum(pair.correct_matches(*map(_features, two))[0] for pair, two in zip(pairs, frames, strict=True))
 
 
-def _psnr_db(frames: Sequence[Sequence[Grey]], sharp: Sequence[Sequence[Grey]]) -> float:
+def _psnr_db(frames: Sequence[Sequence[UInt8Array]], sharp: Sequence[Sequence[UInt8Array]]) -> float:
     each = [metrics.psnr_db(a, b) for two in zip(frames, sharp, strict=True) for a, b in zip(*two, strict=True)]
     return float(np.mean(each))

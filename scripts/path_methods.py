@@ -10,11 +10,12 @@ from typing import Any
 
 import imaging_metrics as metrics
 import numpy as np
-from path_scenes import Grey, Known, Moment, Pair, Take, blur_px, shortened
+from path_scenes import Known, Moment, Pair, Take, blur_px, shortened
 from rich.console import Console
 from rich.progress import track
 from turning_world import TurningCamera
 
+from colmap_inertial.core.arrays import UInt8Array
 from colmap_inertial.core.types import Projector
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.evidence import blur_evidence
@@ -39,11 +40,11 @@ _ONE = DeblurOptions(threads=1)
 class Made:
     """A frame as features see it, and as people do."""
 
-    for_features: Grey
-    for_people: Grey
+    for_features: UInt8Array
+    for_people: UInt8Array
 
 
-def _both(image: Grey, blur: BlurField) -> Made:
+def _both(image: UInt8Array, blur: BlurField) -> Made:
     return Made(for_features=smoothed(image, _width_px(blur)), for_people=image)
 
 
@@ -56,31 +57,31 @@ def _network() -> Network:
     return load_network("deepgyro", device="cpu", threads=1)
 
 
-def _smoothed_alone(image: Grey, motion: GyroCamera, camera: Projector, shutter: FrameShutter) -> Made:
+def _smoothed_alone(image: UInt8Array, motion: GyroCamera, camera: Projector, shutter: FrameShutter) -> Made:
     return _both(image, blur_field(motion, camera, shutter))
 
 
-def _straight(image: Grey, motion: GyroCamera, camera: Projector, shutter: FrameShutter) -> Made:
+def _straight(image: UInt8Array, motion: GyroCamera, camera: Projector, shutter: FrameShutter) -> Made:
     out = deblur(image, blur_field(motion, camera, shutter), _ONE)
     return Made(for_features=out, for_people=out)
 
 
-def _straight_smoothed(image: Grey, motion: GyroCamera, camera: Projector, shutter: FrameShutter) -> Made:
+def _straight_smoothed(image: UInt8Array, motion: GyroCamera, camera: Projector, shutter: FrameShutter) -> Made:
     blur = blur_field(motion, camera, shutter)
     return _both(deblur(image, blur, _ONE), blur)
 
 
-def _wiener(image: Grey, motion: GyroCamera, camera: Projector, shutter: FrameShutter) -> Made:
+def _wiener(image: UInt8Array, motion: GyroCamera, camera: Projector, shutter: FrameShutter) -> Made:
     path = blur_path(motion, camera, shutter)
     return _both(path_wiener(image, path, _ONE), path.field())
 
 
-def _path(image: Grey, motion: GyroCamera, camera: Projector, shutter: FrameShutter) -> Made:
+def _path(image: UInt8Array, motion: GyroCamera, camera: Projector, shutter: FrameShutter) -> Made:
     path = blur_path(motion, camera, shutter)
     return _both(half_quadratic(image, path, _ONE), path.field())
 
 
-def _deepgyro(image: Grey, motion: GyroCamera, camera: Projector, shutter: FrameShutter) -> Made:
+def _deepgyro(image: UInt8Array, motion: GyroCamera, camera: Projector, shutter: FrameShutter) -> Made:
     path = blur_path(motion, camera, shutter)
     return _both(deepgyro.deblur(image, path, network=_network()), path.field())
 
@@ -129,7 +130,7 @@ def _field(known: Known) -> BlurField:
     return blur_field(*known)
 
 
-def verdict_on(frames: Sequence[Grey], known: Sequence[Known]) -> RecordingVerdict:
+def verdict_on(frames: Sequence[UInt8Array], known: Sequence[Known]) -> RecordingVerdict:
     fields = [_field(one) for one in known]
     order = sorted(range(len(frames)), key=lambda i: -float(np.percentile(fields[i].extent_px(), 90)))[:_JUDGED]
     return judge_recording(blur_evidence(frames[i], blur_path(*known[i])) for i in order)
@@ -152,7 +153,7 @@ def _kept(pairs: Sequence[Pair], known: Sequence[Known], verdict: RecordingVerdi
     return {"kept": after / max(before, 1), "treated": treated, "frames": 2 * len(pairs), "trusted": verdict.trusted}
 
 
-def _gated(image: Grey, known: Known, verdict: RecordingVerdict) -> Grey | None:
+def _gated(image: UInt8Array, known: Known, verdict: RecordingVerdict) -> UInt8Array | None:
     """What features see of a frame that goes through the gate, as ``DeblurStage`` has it; ``None`` as it was."""
     field = _field(known)
     factor, _ = judge_frame(image, field, verdict, GateOptions(), blur_path(*known))

@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 from imaging_metrics import CORRECT_PX, Features, match
 from imaging_scenes import photographed_walls
-from numpy.typing import NDArray
 from restoration.photographs import photographs
-from turning_world import Array, Light, Moment, Turning, TurningCamera
+from turning_world import Moment, Turning, TurningCamera
 
+from colmap_inertial.core.arrays import Array, Float32Array, UInt8Array
 from colmap_inertial.core.geometry import quat_exp
 from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.types import CameraModel, Projector
@@ -22,7 +22,6 @@ from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera, Motion
 from colmap_inertial.imaging.transfer import srgb_from_linear
 from colmap_inertial.model import colmap_camera
 
-Grey = NDArray[np.uint8]
 #: What the package knows of a frame's motion: gyroscope, camera, shutter.
 Known = tuple[GyroCamera, Projector, FrameShutter]
 
@@ -58,15 +57,15 @@ class Pair:
     seed: int
     cache: Path | None
 
-    def frame(self, index: int) -> Grey:
+    def frame(self, index: int) -> UInt8Array:
         """As filmed."""
         return self._kept(f"frame{index}", lambda: _filmed(self._light(self.moments[index]), self.seed + index))
 
-    def sharp(self, index: int) -> Grey:
+    def sharp(self, index: int) -> UInt8Array:
         """Without blur, noise and JPEG."""
         return self._kept(f"sharp{index}", lambda: _codes(self.camera.frame(self.moments[index], 1)))
 
-    def short(self, index: int) -> Grey:
+    def short(self, index: int) -> UInt8Array:
         """As filmed with so short an exposure, around the same instant, that nothing blurs."""
         brief = shortened(self.moments[index])
         return self._kept(f"short{index}", lambda: _filmed(self.camera.frame(brief, 3), self.seed + 7 + index))
@@ -88,10 +87,10 @@ class Pair:
             right = np.linalg.norm(there - b.points_px[found[:, 1]], axis=1) < CORRECT_PX
         return int(right.sum()), len(found)
 
-    def _light(self, moment: Moment) -> Light:
+    def _light(self, moment: Moment) -> Float32Array:
         return self.camera.frame(moment, max(SAMPLES, int(np.ceil(self.blur_px / SAMPLE_PX))))
 
-    def _kept(self, name: str, make: Any) -> Grey:
+    def _kept(self, name: str, make: Any) -> UInt8Array:
         if self.cache is None:
             return np.asarray(make())
         width, height = self.camera.size
@@ -212,7 +211,7 @@ def _known(camera: TurningCamera, moment: Moment, wrong: Array, errors: MotionEr
     return motion, colmap_camera(model), shutter
 
 
-def _filmed(light: Light, seed: int) -> Grey:
+def _filmed(light: Float32Array, seed: int) -> UInt8Array:
     """With noise of photons and of reading, alike at half of full scale, and JPEG."""
     rng = np.random.default_rng([seed, 3])
     sigma = NOISE * np.sqrt(0.5 + np.clip(light, 0, 1))
@@ -221,5 +220,5 @@ def _filmed(light: Light, seed: int) -> Grey:
     return np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE))
 
 
-def _codes(light: Light) -> Grey:
+def _codes(light: Float32Array) -> UInt8Array:
     return np.asarray(np.rint(255 * srgb_from_linear(np.clip(light, 0, 1))), dtype=np.uint8)

@@ -13,8 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import matrix_from_quat, quat_from_matrix, so3_exp
-from colmap_inertial.core.types import Array, CameraTrajectory, ImuRecording
+from colmap_inertial.core.types import CameraTrajectory, ImuRecording
 
 #: Camera in the body (the IMU) of the two rigs: rotation, position in metres.
 HANDHELD = (

@@ -8,8 +8,9 @@ import numpy as np
 from restoration.handheld import Handheld, recorded
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
-from turning_world import BODY_FROM_CAM, Array, Turning
+from turning_world import BODY_FROM_CAM, Turning
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.tools.simulate import Motion, MotionOptions, make_motion
 from colmap_inertial.tools.simulate.motion import MARGIN_S
 

@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 from imaging_metrics import extract
-from imaging_scenes import Colour, Pair
+from imaging_scenes import Pair
 from restoration_weights import use_weights
 
+from colmap_inertial.core.arrays import UInt8Array
 from colmap_inertial.imaging.blur_path import BlurPath
 from colmap_inertial.imaging.path_filters import path_wiener
 from colmap_inertial.imaging.restoration import deepgyro, load_network
@@ -60,7 +61,7 @@ def least_s(run: Callable[[], object], repeat: int) -> tuple[float, float]:
     return min(times)
 
 
-def _memory_mib(image: Colour, path: BlurPath, weights: list[Path]) -> dict[str, float] | None:
+def _memory_mib(image: UInt8Array, path: BlurPath, weights: list[Path]) -> dict[str, float] | None:
     """In a process of its own: what is in use before a frame is deblurred, and at most while it is."""
     if not Path("/proc/self/status").exists():
         return None

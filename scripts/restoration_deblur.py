@@ -9,15 +9,16 @@ from typing import Any
 import numpy as np
 from bench_imaging import features_of, flat, measured, summed, verdict_on, with_short_exposure
 from imaging_metrics import correct_matches
-from imaging_scenes import Colour, GyroErrors, Pair
+from imaging_scenes import GyroErrors, Pair
 from rich.console import Console
 from rich.progress import track
 
+from colmap_inertial.core.arrays import UInt8Array
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.gate import GatedFrame, RecordingVerdict, deblur_gated
 
 #: By name; each undoes the blur of a frame.
-Ways = Mapping[str, Callable[[Colour, BlurField], Colour]]
+Ways = Mapping[str, Callable[[UInt8Array, BlurField], UInt8Array]]
 
 #: A gyroscope without any error, and standard deviations of those of a usual one.
 PERFECT = GyroErrors(noise_rad_s=0.0)
@@ -83,15 +84,15 @@ def quality(pairs: Sequence[Pair], ways: Ways, *, label: str, console: Console) 
 
 
 def gated_again(
-    images: Sequence[Colour],
+    images: Sequence[UInt8Array],
     fields: Sequence[BlurField],
-    plain: Sequence[Colour],
-    deblur: Callable[[Colour, BlurField], Colour],
+    plain: Sequence[UInt8Array],
+    deblur: Callable[[UInt8Array, BlurField], UInt8Array],
     verdict: RecordingVerdict,
 ) -> list[GatedFrame]:
     """Frames through the gate, of which it is known what ``deblur`` makes of them by the fields as they are."""
 
-    def known(image: Colour, blur: BlurField, *, of: BlurField, result: Colour) -> Colour:
+    def known(image: UInt8Array, blur: BlurField, *, of: BlurField, result: UInt8Array) -> UInt8Array:
         return result if blur is of else deblur(image, blur)
 
     return [
@@ -133,6 +134,6 @@ def false_blur(pairs: Sequence[Pair], ways: Ways, *, label: str, console: Consol
     }
 
 
-def _all_same(a: Sequence[Colour], b: Sequence[Colour]) -> bool:
+def _all_same(a: Sequence[UInt8Array], b: Sequence[UInt8Array]) -> bool:
     """Whether these are the very same arrays."""
     return all(x is y for x, y in zip(a, b, strict=True))

@@ -14,12 +14,12 @@ from typing import Any
 import cv2
 import numpy as np
 from imaging_metrics import correct_matches, extract, psnr_db, ssim
-from imaging_scenes import Colour, GyroErrors, Light, Pair, erred, make_pairs
-from numpy.typing import NDArray
+from imaging_scenes import GyroErrors, Pair, erred, make_pairs
 from restoration_deblur import PERFECT, usual_errors
 from rich.console import Console
 from rich.progress import track
 
+from colmap_inertial.core.arrays import AnyArray, Float32Array, UInt8Array
 from colmap_inertial.imaging import wiener
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.exposure_pairs import (
@@ -79,10 +79,10 @@ class Exposures:
 
     pair: Pair
     long_shutter: FrameShutter
-    short: Colour
-    long: Colour
-    truth: Colour
-    view: Colour
+    short: UInt8Array
+    long: UInt8Array
+    truth: UInt8Array
+    view: UInt8Array
     errors: GyroErrors
     ratio: float
 
@@ -108,7 +108,7 @@ class Exposures:
 
 
 def expose(
-    wall: Light,
+    wall: Float32Array,
     blur_px: float,
     ratio: float,
     noise: float,
@@ -132,7 +132,7 @@ def expose(
     read = noise * np.sqrt(READ_SHARE)
     by_light = noise**2 * (1 - READ_SHARE) / 0.5
 
-    def filmed(light: Light, gathered: float) -> Colour:
+    def filmed(light: Float32Array, gathered: float) -> UInt8Array:
         """Codes of light of which the sensor gathered a share, as bright as that leaves it."""
         variance = read**2 / ratio**2 + by_light / ratio * np.clip(gathered * light, 0, None)
         grain = np.sqrt(variance) * rng.standard_normal(light.shape, dtype=np.float32)
@@ -151,20 +151,20 @@ def expose(
     )
 
 
-def codes(srgb: NDArray[Any]) -> Colour:
+def codes(srgb: AnyArray) -> UInt8Array:
     """8 bits of 0 to 1."""
     return np.asarray(np.rint(255 * np.clip(srgb, 0, 1)), dtype=np.uint8)
 
 
-def denoised(image: Colour, strength: float) -> Colour:
+def denoised(image: UInt8Array, strength: float) -> UInt8Array:
     """Non-local means as OpenCV has it, of brightness and colours alike."""
     return np.asarray(cv2.fastNlMeansDenoisingColored(image, None, strength, strength, 7, 21))
 
 
-def best_strength(pictures: Sequence[Colour], truth: Sequence[Colour]) -> float:
+def best_strength(pictures: Sequence[UInt8Array], truth: Sequence[UInt8Array]) -> float:
     """Of non-local means, by the PSNR of the middle of all pictures: the truth chooses, in their favour."""
 
-    def middle(image: Colour) -> Colour:
+    def middle(image: UInt8Array) -> UInt8Array:
         top, left = ((n - m) // 2 if n > m else 0 for n, m in zip(image.shape, _NLM_CROP, strict=False))
         return np.ascontiguousarray(image[top : top + _NLM_CROP[0], left : left + _NLM_CROP[1]])
 
@@ -177,7 +177,7 @@ def best_strength(pictures: Sequence[Colour], truth: Sequence[Colour]) -> float:
 
 
 def measure(
-    walls: Sequence[Light],
+    walls: Sequence[Float32Array],
     network: Network,
     *,
     noises: Sequence[float],
@@ -190,7 +190,7 @@ def measure(
 
 
 def _of_noise(
-    walls: Sequence[Light], network: Network, noise: float, size: tuple[int, int], seed: int, console: Console
+    walls: Sequence[Float32Array], network: Network, noise: float, size: tuple[int, int], seed: int, console: Console
 ) -> dict[str, Any]:
     scenes = [
         expose(wall, BLURS_PX[i % 3], RATIOS[i // 3 % 3], noise, errors, size=size, seed=seed + i)
@@ -230,16 +230,18 @@ def _of_noise(
     }
 
 
-def ways(scene: Exposures, pair: ExposurePair, network: Network, strength: float) -> dict[str, Callable[[], Colour]]:
+def ways(
+    scene: Exposures, pair: ExposurePair, network: Network, strength: float
+) -> dict[str, Callable[[], UInt8Array]]:
     """What can be made of a pair; the last one has a brightness of its own."""
     short, long = codes(pair.short), codes(pair.long)
     fused = fuse(pair.short, pair.long, blur=pair.blur, network=network)
 
-    def without_gyro() -> Colour:
+    def without_gyro() -> UInt8Array:
         other = scene.together(gyro=False)
         return codes(fuse(other.short, other.long, network=network))
 
-    def mertens() -> Colour:
+    def mertens() -> UInt8Array:
         dark = brightened(scene.short, replace(pair.brightness, gain=1.0))
         return codes(fuse_mertens([dark, fused]))
 

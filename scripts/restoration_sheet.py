@@ -7,10 +7,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from imaging_scenes import Colour, Light, make_pairs
+from imaging_scenes import make_pairs
 from restoration_deblur import usual_errors
 from restoration_exposures import codes, expose
 
+from colmap_inertial.core.arrays import Float32Array, UInt8Array
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath
 from colmap_inertial.imaging.path_filters import path_wiener
@@ -27,15 +28,15 @@ SCENES = len(BLURS_PX) + len(PAIRS)
 
 def write_sheet(
     file: Path,
-    walls: Sequence[Light],
-    deblur: Callable[[Colour, BlurField], Colour] | None,
+    walls: Sequence[Float32Array],
+    deblur: Callable[[UInt8Array, BlurField], UInt8Array] | None,
     lsd2: Network | None,
     *,
     size: tuple[int, int],
     seed: int,
 ) -> None:
     """A row for each scene; gyroscopes have the usual errors. What there is no network for is left out."""
-    rows: list[tuple[list[str], list[Colour]]] = []
+    rows: list[tuple[list[str], list[UInt8Array]]] = []
     errors = usual_errors(SCENES, seed)
     for i, blur_px in enumerate(BLURS_PX if deblur else ()):
         pair = make_pairs([walls[i % len(walls)]], blur_px, size=size, seed=seed + 100 + i)[0]
@@ -57,7 +58,7 @@ def write_sheet(
         raise SystemExit(f"--sheet: cannot write {file}")
 
 
-def _crops(pictures: Sequence[Colour], blur: BlurField) -> list[Colour]:
+def _crops(pictures: Sequence[UInt8Array], blur: BlurField) -> list[UInt8Array]:
     """The same part of all, where there is most detail (by the last one) and blur."""
     truth, length = pictures[-1], blur.per_pixel()
     detail = np.abs(cv2.Laplacian(cv2.cvtColor(truth, cv2.COLOR_RGB2GRAY), cv2.CV_32F))
@@ -68,7 +69,7 @@ def _crops(pictures: Sequence[Colour], blur: BlurField) -> list[Colour]:
     return [np.ascontiguousarray(p[top : top + CROP_PX, left : left + CROP_PX]) for p in pictures]
 
 
-def _row(titles: Sequence[str], crops: Sequence[Colour]) -> Colour:
+def _row(titles: Sequence[str], crops: Sequence[UInt8Array]) -> UInt8Array:
     tiles = []
     for title, crop in zip(titles, crops, strict=True):
         tile = np.full((CROP_PX + TITLE_PX + GAP_PX, CROP_PX + GAP_PX, 3), 255, dtype=np.uint8)

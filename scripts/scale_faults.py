@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from colmap_inertial.core.types import Array, ImuRecording
+from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.types import ImuRecording
 from colmap_inertial.tools.simulate import SimulatedRecording
 
 Generator = np.random.Generator

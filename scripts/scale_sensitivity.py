@@ -26,9 +26,10 @@ import bench_scale
 import numpy as np
 from bench_scale import Window
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.threads import one_blas_thread
-from colmap_inertial.core.types import Array, CameraImuCalibration
+from colmap_inertial.core.types import CameraImuCalibration
 from colmap_inertial.inertial.scale import _factors, _noise, _parameters, _setup, joint, priors
 from colmap_inertial.inertial.scale.priors import PRIORS
 from colmap_inertial.motion.align import align_camera_imu

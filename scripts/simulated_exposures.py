@@ -13,17 +13,15 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
-from turning_world import Array, Light, Moment, Turning, TurningCamera
+from turning_world import Moment, Turning, TurningCamera
 
+from colmap_inertial.core.arrays import Array, Float32Array, UInt8Array
 from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.types import CameraModel
 from colmap_inertial.imaging.exposure_pairs import PairGyro
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.transfer import linear_from_srgb, srgb_from_linear
 from colmap_inertial.model import colmap_camera
-
-Codes = NDArray[np.uint8]
 
 TEXTURES = ("photographs", "one photograph", "low texture", "repeated", "clipping", "speckled", "dark")
 #: Of the picture's width: how far the camera turned between the exposures, from and to.
@@ -56,16 +54,16 @@ class Pair:
     """
 
     kind: str
-    short: Codes
-    long: Codes
-    truth: Codes
+    short: UInt8Array
+    long: UInt8Array
+    truth: UInt8Array
     gyro: PairGyro | None
     gain: float
     good: bool
     shift_px: Array
 
 
-def codes(light: Light) -> Codes:
+def codes(light: Float32Array) -> UInt8Array:
     """8 bit sRGB of linear light."""
     return np.asarray(np.rint(255 * srgb_from_linear(np.clip(light, 0, 1))), dtype=np.uint8)
 
@@ -125,7 +123,7 @@ def _pair(turnings: Sequence[Turning], photos: Sequence[Path], i: int, seed: int
     )
 
 
-def _filmed(light: Light, gathered: float, noise: float, gain: float, rng: np.random.Generator) -> Codes:
+def _filmed(light: Float32Array, gathered: float, noise: float, gain: float, rng: np.random.Generator) -> UInt8Array:
     """Of one sensor: at half of full scale of the brightened short exposure, the noise is ``noise``."""
     variance = 0.5 * noise**2 * (1 / gain**2 + np.clip(gathered * light, 0, 1) / (0.5 * gain))
     grain = np.sqrt(variance) * rng.standard_normal(light.shape, dtype=np.float32)
@@ -201,7 +199,7 @@ def _shift(camera: TurningCamera, short: Moment, long: Moment) -> Array:
 # --- scenes -----------------------------------------------------------------------------------------------------------
 
 
-def _wall(texture: str, photos: Sequence[Path], rng: np.random.Generator, size: tuple[int, int]) -> Light:
+def _wall(texture: str, photos: Sequence[Path], rng: np.random.Generator, size: tuple[int, int]) -> Float32Array:
     """(H, W, 3) linear light."""
     width, height = size
     side = max(size) // 4
@@ -234,7 +232,7 @@ def _wall(texture: str, photos: Sequence[Path], rng: np.random.Generator, size: 
     return np.ascontiguousarray(np.maximum(wall, 0), dtype=np.float32)
 
 
-def _smooth(rng: np.random.Generator, size: tuple[int, int], sigma: float) -> Light:
+def _smooth(rng: np.random.Generator, size: tuple[int, int], sigma: float) -> Float32Array:
     """Noise of unit deviation, smooth at so many pixels."""
     step = max(1, int(sigma / 3))
     small = rng.standard_normal((size[1] // step + 2, size[0] // step + 2)).astype(np.float32)
@@ -243,7 +241,7 @@ def _smooth(rng: np.random.Generator, size: tuple[int, int], sigma: float) -> Li
     return np.asarray(out, dtype=np.float32)
 
 
-def _piece(photos: Sequence[Path], rng: np.random.Generator, size: tuple[int, int]) -> Light:
+def _piece(photos: Sequence[Path], rng: np.random.Generator, size: tuple[int, int]) -> Float32Array:
     width, height = size
     if not photos:
         layers = [sum(s**0.9 * _smooth(rng, size, s) for s in (1.2, 3.0, 8.0, 20.0)) for _ in range(3)]

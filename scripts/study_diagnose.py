@@ -22,8 +22,9 @@ import numpy as np
 from real_imu import read
 
 from colmap_inertial.checks.diagnose import Diagnosis, Recorded, diagnose
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import quat_conjugate, quat_from_matrix, so3_exp
-from colmap_inertial.core.types import Array, CameraModel, CameraTrajectory, FrameTiming, ImuRecording
+from colmap_inertial.core.types import CameraModel, CameraTrajectory, FrameTiming, ImuRecording
 from colmap_inertial.io.pose_convention import ARRAYS, PoseConvention, reread
 from colmap_inertial.io.trajectories import read_inertial_scale, write_tum
 from colmap_inertial.io.units import STANDARD_GRAVITY_M_S2

@@ -18,10 +18,11 @@ from typing import get_args
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, quat_multiply
 from colmap_inertial.core.gyro import GyroPath
-from colmap_inertial.core.types import Array, ReadoutDirection
+from colmap_inertial.core.types import ReadoutDirection
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.motion.flow import Tracks, VisualRotation
 from colmap_inertial.motion.shutter import ReadoutEstimate, estimate_readout

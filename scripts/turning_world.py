@@ -16,13 +16,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from colmap_inertial.core.arrays import Array, Float32Array
 from colmap_inertial.tools.simulate import MotionOptions, make_motion
-
-Array = NDArray[np.float64]
-Light = NDArray[np.float32]
 
 #: Camera in the body of the hand-held recordings (TUM-VI), whose motion the benchmarks use.
 BODY_FROM_CAM = np.array([[-0.99953, 0.02962, -0.00852], [0.00750, -0.03440, -0.99938], [-0.02989, -0.99897, 0.03416]])
@@ -98,7 +95,7 @@ class TurningCamera:
     """A pinhole of (width, height) before a wall of linear light, (H, W) or (H, W, 3), one of its pixels to one of
     the camera's where it looks straight at it."""
 
-    wall: Light
+    wall: Float32Array
     wall_from_world: Array
     turning: Turning
     size: tuple[int, int]
@@ -117,7 +114,7 @@ class TurningCamera:
 
     def frame(
         self, moment: Moment, samples: int, *, moved: Callable[[Array, Array], tuple[Array, Array]] | None = None
-    ) -> Light:
+    ) -> Float32Array:
         """The light that a frame gathers; the same instant for all of a line's exposure where ``samples`` is 1.
 
         Parameters
@@ -173,7 +170,7 @@ class TurningCamera:
         return x + 0.5 * (width - 1), y + 0.5 * (height - 1)
 
 
-def _between_nodes(count: int, nodes: int) -> Light:
+def _between_nodes(count: int, nodes: int) -> Float32Array:
     """(count, nodes) weights that bring values at nodes to every pixel, linearly."""
     distance = np.abs(np.arange(count)[:, None] / _NODE_PX - np.arange(nodes))
     return np.maximum(1 - distance, 0).astype(np.float32)

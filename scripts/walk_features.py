@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from walk_scenes import Walk, motion_of, places_m, world_of
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import matrix_from_quat
-from colmap_inertial.core.types import Array
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.tools.simulate import Quad, World
 

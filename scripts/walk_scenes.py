@@ -15,8 +15,9 @@ from typing import Literal
 import cv2
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import quat_exp, quat_from_matrix, quat_multiply
-from colmap_inertial.core.types import Array, CameraModel
+from colmap_inertial.core.types import CameraModel
 from colmap_inertial.io.files import write_json, write_text
 from colmap_inertial.tools.simulate import (
     IMU_PRESETS,

@@ -1,27 +1,24 @@
 """Matching of several apertures' pictures. Results are written in place; threads = 0 takes all processors."""
 
-import numpy as np
-from numpy.typing import NDArray
-
-from colmap_inertial.core.types import Array
+from colmap_inertial.core.arrays import Array, Float32Array, Int32Array, UInt8Array, UInt16Array
 
 PADDING: int
 
 def matching_costs(
-    reference: NDArray[np.uint8],
-    views: NDArray[np.uint8],
+    reference: UInt8Array,
+    views: UInt8Array,
     *,
-    columns: NDArray[np.int32],
-    rows: NDArray[np.int32],
-    cost: NDArray[np.uint8],
-    share: NDArray[np.int32],
+    columns: Int32Array,
+    rows: Int32Array,
+    cost: UInt8Array,
+    share: Int32Array,
     unseen: int,
     radius: int,
     least: int = 0,
-    tables: NDArray[np.uint8] | None = None,
-    blend: NDArray[np.int32] | None = None,
-    blend_table: NDArray[np.uint8] | None = None,
-    shown: NDArray[np.int32] | None = None,
+    tables: UInt8Array | None = None,
+    blend: Int32Array | None = None,
+    blend_table: UInt8Array | None = None,
+    shown: Int32Array | None = None,
     threads: int = 0,
     instruction_set: str = "",
 ) -> None:
@@ -36,37 +33,37 @@ def matching_costs(
     """
 
 def semi_global(
-    cost: NDArray[np.uint8],
-    guide: NDArray[np.uint8],
+    cost: UInt8Array,
+    guide: UInt8Array,
     *,
     small: int,
-    jump: NDArray[np.uint16],
-    total: NDArray[np.uint16],
+    jump: UInt16Array,
+    total: UInt16Array,
     threads: int = 0,
     instruction_set: str = "",
 ) -> None:
     """Write the sums of `cost` along eight paths into `total` (H, W, D padded to a multiple of `PADDING`)."""
 
 def winners(
-    total: NDArray[np.uint16],
+    total: UInt16Array,
     *,
-    least: NDArray[np.uint16],
-    index: NDArray[np.uint16],
-    aside: NDArray[np.float32],
+    least: UInt16Array,
+    index: UInt16Array,
+    aside: Float32Array,
     candidates: int,
     threads: int = 0,
 ) -> None:
     """Write the least total, its candidate, and how far aside a parabola has its least value, -1/2 to 1/2."""
 
 def visibility(
-    disparity: NDArray[np.float32],
-    least: NDArray[np.uint16],
+    disparity: Float32Array,
+    least: UInt16Array,
     *,
     ratios: Array,
     cx: float,
     cy: float,
     tolerance: float,
-    bits: NDArray[np.uint8],
+    bits: UInt8Array,
     threads: int = 0,
 ) -> None:
     """Write into `bits` (N, H, W) how the views see what the reference sees with these disparities.

@@ -1,9 +1,6 @@
 """Linear algebra and integration of the inertial estimators. Results are written in place."""
 
-from numpy import int64
-from numpy.typing import NDArray
-
-from colmap_inertial.core.types import Array
+from colmap_inertial.core.arrays import Array, Int64Array
 
 class ArrowFactor:
     """Cholesky factor of a chain of states, its rows and columns scaled by `unit`."""
@@ -51,7 +48,7 @@ def add_information(
 def preintegrate(
     *,
     nodes_s: Array,
-    steps: NDArray[int64],
+    steps: Int64Array,
     gyro_t_s: Array,
     gyro: Array,
     gyro_slope: Array,
@@ -85,8 +82,8 @@ def whiten_tridiagonal(diagonal: Array, below: Array, sides: Array) -> float:
 
 def reduce_points(
     *,
-    first: NDArray[int64],
-    column: NDArray[int64],
+    first: Int64Array,
+    column: Int64Array,
     by_frame: Array,
     by_shared: Array,
     by_point: Array,

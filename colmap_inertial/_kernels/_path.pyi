@@ -1,19 +1,18 @@
 """Filters along curved paths of blur, in tiles. The arguments are those of `colmap_inertial.imaging.path_filters`."""
 
-import numpy as np
-from numpy.typing import NDArray
+from colmap_inertial.core.arrays import Float32Array
 
 def filter(
-    light: NDArray[np.float32],
-    result: NDArray[np.float32],
+    light: Float32Array,
+    result: Float32Array,
     *,
-    paths: NDArray[np.float32],
-    spread: NDArray[np.float32],
-    window_in: NDArray[np.float32],
-    window_out: NDArray[np.float32],
+    paths: Float32Array,
+    spread: Float32Array,
+    window_in: Float32Array,
+    window_out: Float32Array,
     hop: int,
     before: int,
-    noise: NDArray[np.float32],
+    noise: Float32Array,
     least_noise: float,
     noise_factor: float,
     flat_below: float,
@@ -21,17 +20,17 @@ def filter(
     fitted_to: float,
     least_signal: float,
     data_weight: float,
-    splitting: NDArray[np.float32],
+    splitting: Float32Array,
     threads: int = 0,
     instruction_set: str = "",
 ) -> None:
     """Write the (H, W, C) light without blur into `result`; no splitting is Wiener's filter."""
 
 def noise(
-    light: NDArray[np.float32],
+    light: Float32Array,
     *,
-    paths: NDArray[np.float32],
-    window_in: NDArray[np.float32],
+    paths: Float32Array,
+    window_in: Float32Array,
     hop: int,
     before: int,
     above: float,
@@ -42,9 +41,7 @@ def noise(
 ) -> list[float]:
     """Of each channel and each of the tiles looked at: mean light, variance of the noise, frequencies that show it."""
 
-def transform(
-    tile: NDArray[np.float32], spectrum: NDArray[np.float32], back: NDArray[np.float32], instruction_set: str = ""
-) -> None:
+def transform(tile: Float32Array, spectrum: Float32Array, back: Float32Array, instruction_set: str = "") -> None:
     """Write the real transform of a (T, T) tile, (T, T // 2 + 1, 2), and what comes back, times T^2. For tests."""
 
 def instruction_sets() -> list[str]:

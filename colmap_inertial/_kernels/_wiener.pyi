@@ -5,23 +5,25 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import BoolArray, Float32Array, Int32Array
+
 Code = TypeVar("Code", np.uint8, np.uint16, np.float32)
 
 def deblur(
     image: NDArray[Code],
     result: NDArray[Code],
     *,
-    extent_px: NDArray[np.float32],
-    slope: NDArray[np.float32],
-    along_y: NDArray[np.bool_],
-    fade: NDArray[np.float32],
-    weights: NDArray[np.float32],
-    reach: NDArray[np.int32],
+    extent_px: Float32Array,
+    slope: Float32Array,
+    along_y: BoolArray,
+    fade: Float32Array,
+    weights: Float32Array,
+    reach: Int32Array,
     first: float,
     steps: float,
-    smoothing: NDArray[np.float32],
-    decode: NDArray[np.float32],
-    encode: NDArray[np.float32],
+    smoothing: Float32Array,
+    decode: Float32Array,
+    encode: Float32Array,
     saturated: int,
     threads: int = 0,
     instruction_set: str = "",
@@ -30,15 +32,15 @@ def deblur(
 
 def blend(
     image: NDArray[Code],
-    light: NDArray[np.float32],
+    light: Float32Array,
     result: NDArray[Code],
     *,
-    extent_px: NDArray[np.float32],
-    slope: NDArray[np.float32],
-    along_y: NDArray[np.bool_],
-    fade: NDArray[np.float32],
-    decode: NDArray[np.float32],
-    encode: NDArray[np.float32],
+    extent_px: Float32Array,
+    slope: Float32Array,
+    along_y: BoolArray,
+    fade: Float32Array,
+    decode: Float32Array,
+    encode: Float32Array,
     saturated: int,
     threads: int = 0,
     instruction_set: str = "",

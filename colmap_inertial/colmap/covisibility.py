@@ -7,12 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, BoolArray, IndexArray, UInt8Array
 from colmap_inertial.core.threads import one_blas_thread
-from colmap_inertial.core.types import Array
-
-Int = NDArray[np.intp]
 
 #: Features of each image that vote.
 _VOTERS = 500
@@ -34,7 +31,7 @@ class Covisibility:
         Of each image (K, 2).
     """
 
-    descriptors: tuple[NDArray[np.uint8], ...]
+    descriptors: tuple[UInt8Array, ...]
     xy_px: tuple[Array, ...]
 
     @classmethod
@@ -55,11 +52,11 @@ class Covisibility:
         return cls(descriptors=tuple(descriptors), xy_px=tuple(places))
 
     @property
-    def plenty(self) -> NDArray[np.bool_]:
+    def plenty(self) -> BoolArray:
         """(N,) which images have features enough for few votes to mean something."""
         return np.array([len(own) == _VOTERS for own in self.descriptors], dtype=np.bool_)
 
-    def count(self, i: Int, j: Int) -> Int:
+    def count(self, i: IndexArray, j: IndexArray) -> IndexArray:
         """(M,) votes that images i and j, (M,) each, show the same."""
         counted = np.zeros(len(i), dtype=np.intp)
         with one_blas_thread():
@@ -68,7 +65,7 @@ class Covisibility:
         return counted
 
 
-def _votes(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> int:
+def _votes(first: UInt8Array, second: UInt8Array) -> int:
     """Mutually nearest descriptors that are clearly nearer than the next."""
     if len(first) < 2 or len(second) < 2:
         return 0

@@ -12,14 +12,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import skew, so3_exp
 from colmap_inertial.core.threads import one_blas_thread
-from colmap_inertial.core.types import Array
-
-Int = NDArray[np.intp]
 
 #: Pairs are left out whose planes meet worse than so many times the usual pair's.
 _OUTLIER = 3.0
@@ -50,13 +47,13 @@ class RayPairs:
         (M, K, 3) unit rays, in each camera's frame.
     """
 
-    first: Int
-    second: Int
+    first: IndexArray
+    second: IndexArray
     pixel_rad: float
     rays_first: Array
     rays_second: Array
 
-    def only(self, which: NDArray[np.bool_]) -> RayPairs:
+    def only(self, which: BoolArray) -> RayPairs:
         """Some of the pairs."""
         return RayPairs(
             first=self.first[which],

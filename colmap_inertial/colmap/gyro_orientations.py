@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_inertial.colmap.gyro_bias import RayPairs, bias_correction
+from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
 from colmap_inertial.core.geometry import so3_log
 from colmap_inertial.core.gyro import on_camera_rate
 from colmap_inertial.core.sampling import is_gap
@@ -16,7 +16,6 @@ from colmap_inertial.core.types import (
     CAL,
     JOINT_GYRO_WALK_RAD_S_RTS,
     TYPICAL_NOISE,
-    Array,
     CameraImuCalibration,
     CameraModel,
     FrameTiming,
@@ -27,9 +26,6 @@ from colmap_inertial.model import colmap_camera
 from colmap_inertial.motion.align import AlignOptions, align_clocks
 from colmap_inertial.motion.flow import VisualRotation
 from colmap_inertial.pipeline.run.context import Recording
-
-Int = NDArray[np.intp]
-Bool = NDArray[np.bool_]
 
 #: Optical axes farther apart than this share next to nothing, or than the field of view, where that is wider.
 APART_DEG = 90.0
@@ -67,7 +63,7 @@ class GyroOrientations:
 
     t_s: Array
     start_from_cam: Array
-    part: Int
+    part: IndexArray
     bias_lever_s: Array
     gain_lever_rad: Array
     rate_rad_s: Array
@@ -106,11 +102,11 @@ class GyroOrientations:
             apart_rad=max(math.radians(APART_DEG), 0.0 if camera is None else _view_rad(camera)),
         )
 
-    def known(self, i: Int, j: Int) -> Bool:
+    def known(self, i: IndexArray, j: IndexArray) -> BoolArray:
         """(M,) whether the gyroscope tells of the rotation between frames i and j, (M,) each."""
         return np.asarray((self.part[i] == self.part[j]) & (self.part[i] >= 0))
 
-    def covariance(self, i: Int, j: Int) -> Array:
+    def covariance(self, i: IndexArray, j: IndexArray) -> Array:
         """(M, 3, 3) of the rotation vectors between frames i and j, in the frame that all orientations are in."""
         bias = self.bias_lever_s[j] - self.bias_lever_s[i]
         gain = (self.gain_lever_rad[j] - self.gain_lever_rad[i]) * np.array([*[_GAIN_SIGMA] * 3, *[_AXIS_SIGMA] * 3])
@@ -122,7 +118,7 @@ class GyroOrientations:
         of_bias = bias @ self.calibration.cov[CAL.GYRO_BIAS, CAL.GYRO_BIAS] @ np.swapaxes(bias, 1, 2)
         return np.asarray(of_bias + gain @ np.swapaxes(gain, 1, 2) + noise[:, None, None] * np.eye(3))
 
-    def see_nothing_in_common(self, i: Int, j: Int) -> Bool:
+    def see_nothing_in_common(self, i: IndexArray, j: IndexArray) -> BoolArray:
         """(M,) whether the optical axes of frames i and j are surely too far apart; never where it is not known."""
         axis_i, axis_j = self.start_from_cam[i, :, 2], self.start_from_cam[j, :, 2]
         across = np.cross(axis_i, axis_j)
@@ -135,7 +131,7 @@ class GyroOrientations:
         variance = np.where(sine < 0.1, np.trace(covariance, axis1=1, axis2=2), variance)
         return np.asarray(self.known(i, j) & (angle - _SURE_SIGMAS * np.sqrt(variance) > self.apart_rad))
 
-    def agree(self, i: Int, j: Int, first_from_second: Array) -> Bool:
+    def agree(self, i: IndexArray, j: IndexArray, first_from_second: Array) -> BoolArray:
         """(M,) whether rotations (M, 3, 3) of camera i from j may be true; so where the gyroscope tells nothing."""
         turned = self.start_from_cam[i] @ first_from_second @ np.swapaxes(self.start_from_cam[j], 1, 2)
         off = so3_log(turned)
@@ -144,7 +140,7 @@ class GyroOrientations:
         # three numbers: their squares add up to 3 on average, and to this once in a thousand times
         return np.asarray(~self.known(i, j) | (squared < 16.3))
 
-    def sigma_rad(self, i: Int, j: Int) -> Array:
+    def sigma_rad(self, i: IndexArray, j: IndexArray) -> Array:
         """(M,) standard deviation of the rotation between frames i and j, about an axis on average."""
         return np.asarray(np.sqrt(np.trace(self.covariance(i, j), axis1=1, axis2=2) / 3))
 

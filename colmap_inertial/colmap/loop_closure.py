@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Int64Array
 from colmap_inertial.model.observed import points_of_features
 
 if TYPE_CHECKING:
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-Ids = NDArray[np.int64]
 
 #: Two images hang together by so many points in common: as many matches as COLMAP asks of two views.
 _LINKED = 15
@@ -63,8 +62,8 @@ class _Torn:
 
     first: int
     second: int
-    features: Ids
-    points: Ids
+    features: Int64Array
+    points: Int64Array
 
 
 @dataclass(frozen=True, kw_only=True)

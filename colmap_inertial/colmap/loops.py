@@ -14,16 +14,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_inertial.colmap.covisibility import Covisibility
 from colmap_inertial.colmap.gyro_orientations import GyroOrientations
 from colmap_inertial.colmap.relative_track import DRIFT, RelativeTrack
 from colmap_inertial.colmap.two_views import Return, compare, forget, returns
-from colmap_inertial.core.types import Array
+from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
 
-Int = NDArray[np.intp]
-Bool = NDArray[np.bool_]
 Pair = tuple[int, int]
 
 #: Frames among which loops are sought are about so far apart, and so many at most.
@@ -66,7 +63,7 @@ class Loops:
     closed: tuple[Pair, ...]
 
 
-def key_frames(t_s: Array) -> Int:
+def key_frames(t_s: Array) -> IndexArray:
     """Frames about a second apart, or farther in a capture that is very long."""
     spacing_s = max(_SPACING_S, float(t_s[-1] - t_s[0]) / _MOST_FRAMES)
     kept = [0]
@@ -76,7 +73,7 @@ def key_frames(t_s: Array) -> Int:
     return np.array(kept, dtype=np.intp)
 
 
-def candidates(votes: Int, i: Int, j: Int) -> Bool:
+def candidates(votes: IndexArray, i: IndexArray, j: IndexArray) -> BoolArray:
     """(M,) which pairs of frames i, j, (M,) each, have votes enough and are among the best of one of their frames."""
     chosen = np.zeros(len(votes), dtype=np.bool_)
     for frame in np.unique(np.concatenate([i, j])):
@@ -184,7 +181,7 @@ def without_contradictions(
     return {pair for pair, kept in zip(pairs, (behind >= _BY_FAR * rival).tolist(), strict=True) if kept}
 
 
-def _between(way: RelativeTrack, headings: GyroOrientations, i: Int, j: Int) -> tuple[Array, Array]:
+def _between(way: RelativeTrack, headings: GyroOrientations, i: IndexArray, j: IndexArray) -> tuple[Array, Array]:
     """(M, 3) the ways from frames i to frames j, in any order, and (M, 3, 3) their covariances."""
     first, last = np.minimum(i, j), np.maximum(i, j)
     return way.centre[j] - way.centre[i], way.covariance(first, last, headings.sigma_rad(first, last))
@@ -195,14 +192,14 @@ def _squared(off: Array, covariance: Array) -> Array:
     return np.asarray(np.sum(off * np.linalg.solve(covariance, off[..., None])[..., 0], axis=1))
 
 
-def _away(headings: GyroOrientations, way: RelativeTrack, i: Int, j: Int) -> Bool:
+def _away(headings: GyroOrientations, way: RelativeTrack, i: IndexArray, j: IndexArray) -> BoolArray:
     """(M,) whether frames i and j surely show nothing in common; a part at a time: there may be half a million."""
     depth = np.array([way.depth(k) for k in range(len(way.part))])
     parts = np.array_split(np.arange(len(i)), max(1, len(i) // 50_000))
     return np.concatenate([_away_part(headings, way, depth, i[part], j[part]) for part in parts])
 
 
-def _away_part(headings: GyroOrientations, way: RelativeTrack, depth: Array, i: Int, j: Int) -> Bool:
+def _away_part(headings: GyroOrientations, way: RelativeTrack, depth: Array, i: IndexArray, j: IndexArray) -> BoolArray:
     away = headings.see_nothing_in_common(i, j)
     known = np.flatnonzero(~away & way.known(i, j) & np.isfinite(depth[i]))
     passed, covariance = _between(way, headings, i[known], j[known])

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_inertial.colmap.covisibility import Covisibility
 from colmap_inertial.colmap.gyro_orientations import GyroOrientations, estimate_gyro_orientations
@@ -17,6 +16,7 @@ from colmap_inertial.colmap.loops import close_loops
 from colmap_inertial.colmap.relative_track import estimate_relative_track
 from colmap_inertial.colmap.sparse import image_pairs, match_pairs, matches_every_pair
 from colmap_inertial.colmap.two_views import count_verified, ray_pairs, sightings_of, turns_rad
+from colmap_inertial.core.arrays import IndexArray
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.options import MappingOptions
 from colmap_inertial.core.types import CameraModel
@@ -24,7 +24,6 @@ from colmap_inertial.pipeline.run.context import Recording, RunContext
 
 log = logging.getLogger(__name__)
 
-Int = NDArray[np.intp]
 
 #: Pairs with fewer votes are not worth matching: of V1_01, they hold .7 % of the inliers.
 _LEAST_VOTES = 4
@@ -188,7 +187,7 @@ def match_capture(
     return record
 
 
-def _places(pairs: Sequence[tuple[str, str]], place: dict[str, int]) -> tuple[Int, Int]:
+def _places(pairs: Sequence[tuple[str, str]], place: dict[str, int]) -> tuple[IndexArray, IndexArray]:
     found = np.array([(place[a], place[b]) for a, b in pairs], dtype=np.intp).reshape(-1, 2)
     return found[:, 0], found[:, 1]
 

@@ -12,13 +12,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
 from colmap_inertial.core.threads import one_blas_thread
-from colmap_inertial.core.types import Array
-
-Int = NDArray[np.intp]
-Bool = NDArray[np.bool_]
 
 #: A point is known once rays to it are so far apart.
 _PARALLAX_RAD = 0.02
@@ -48,9 +44,9 @@ class Sightings:
         (M, 3) unit vectors to it, in the frame that all orientations are in.
     """
 
-    frame: Int
-    point: Int
-    feature: Int
+    frame: IndexArray
+    point: IndexArray
+    feature: IndexArray
     rays: Array
 
 
@@ -70,16 +66,16 @@ class RelativeTrack:
         Of these.
     """
 
-    part: Int
+    part: IndexArray
     centre: Array
     points: Array
     sightings: Sightings
 
-    def known(self, i: Int, j: Int) -> Bool:
+    def known(self, i: IndexArray, j: IndexArray) -> BoolArray:
         """(M,) whether there is a way from frames i to frames j, (M,) each."""
         return np.asarray((self.part[i] == self.part[j]) & (self.part[i] >= 0))
 
-    def covariance(self, i: Int, j: Int, heading_rad: Array) -> Array:
+    def covariance(self, i: IndexArray, j: IndexArray, heading_rad: Array) -> Array:
         """(M, 3, 3) of the ways from frames i to frames j >= i, (M,) each.
 
         Each step's length is off by a factor that walks; headings are off by ``heading_rad`` (M,) at the end.
@@ -103,7 +99,7 @@ class RelativeTrack:
         at = self.seen(frame)[1]
         return float(np.median(np.linalg.norm(at - self.centre[frame], axis=1))) if len(at) else float("nan")
 
-    def seen(self, frame: int) -> tuple[Int, Array]:
+    def seen(self, frame: int) -> tuple[IndexArray, Array]:
         """Features (K,) of a frame whose points are known, and these (K, 3)."""
         mine = slice(*np.searchsorted(self.sightings.frame, [frame, frame + 1]))
         feature, at = self.sightings.feature[mine], self.points[self.sightings.point[mine]]
@@ -111,7 +107,9 @@ class RelativeTrack:
         return feature[known], at[known]
 
 
-def joined(features: Sequence[int], matches: Sequence[tuple[int, int, Int]]) -> tuple[Int, Int, Int]:
+def joined(
+    features: Sequence[int], matches: Sequence[tuple[int, int, IndexArray]]
+) -> tuple[IndexArray, IndexArray, IndexArray]:
     """Points that matches of pairs of frames are of: frame, feature and point (M,) of all sightings, frame by frame.
 
     Of very many points, some are enough.
@@ -163,7 +161,7 @@ def estimate_relative_track(sightings: Sightings, frames: int) -> RelativeTrack:
     first, wide = np.full((count, 3), np.nan), np.zeros(count)
     bounds = np.searchsorted(sightings.frame, np.arange(frames + 1))
 
-    def add(k: int, trusted: Bool) -> None:
+    def add(k: int, trusted: BoolArray) -> None:
         """Let a placed frame's rays tell of points."""
         mine = np.arange(bounds[k], bounds[k + 1])[trusted]
         which, rays = sightings.point[mine], sightings.rays[mine]
@@ -206,7 +204,7 @@ def estimate_relative_track(sightings: Sightings, frames: int) -> RelativeTrack:
     return RelativeTrack(part=part, centre=centre, points=points, sightings=sightings)
 
 
-def _beginning(sightings: Sightings, bounds: Int, i: int) -> tuple[int, Array] | None:
+def _beginning(sightings: Sightings, bounds: IndexArray, i: int) -> tuple[int, Array] | None:
     """A frame soon after frame i from which much looks different, and the direction to it; ``None`` without one."""
     for j in range(i + 1, min(i + 9, len(bounds) - 1)):
         a, b = slice(bounds[i], bounds[i + 1]), slice(bounds[j], bounds[j + 1])
@@ -232,7 +230,7 @@ def _across(rays: Array) -> Array:
     return np.asarray(np.eye(3) - rays[:, :, None] * rays[:, None, :])
 
 
-def _placed(points: Array, rays: Array, guess: Array, step: Array) -> tuple[Array, Bool] | None:
+def _placed(points: Array, rays: Array, guess: Array, step: Array) -> tuple[Array, BoolArray] | None:
     """(3,) where a frame is by the points it sees, and (K,) which of its rays may tell of points.
 
     It is sought near the guess: what hangs twice may have more points that agree on a place elsewhere.

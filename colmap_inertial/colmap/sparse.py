@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, InertialError, MappingError, OutputError
 from colmap_inertial.core.options import MappingOptions
-from colmap_inertial.core.types import Array, CameraModel, Keypoints, Treatment
+from colmap_inertial.core.types import CameraModel, Keypoints, Treatment
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.pipeline.run.context import RunContext
 from colmap_inertial.pipeline.run.workspace import require_room

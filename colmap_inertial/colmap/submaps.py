@@ -19,11 +19,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_inertial.colmap.loop_closure import LoopClosure, SubmapOverlap, merge_overlaps
+from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.geometry import so3_exp
-from colmap_inertial.core.types import Array
 from colmap_inertial.model.observed import points_of_features
 
 if TYPE_CHECKING:
@@ -31,7 +30,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-Ids = NDArray[np.int64]
 #: Two parts that meet, or one that meets itself: their places, the smaller one first.
 Seam = tuple[int, int]
 
@@ -238,9 +236,9 @@ def find_ties(database: Path, parts: Sequence[MappedRun], names: Sequence[str], 
     for k, of_images in enumerate(points):
         for number in of_images:
             having.setdefault(number, []).append(k)
-    same: dict[tuple[int, int], list[tuple[int, Ids]]] = {}
+    same: dict[tuple[int, int], list[tuple[int, Int64Array]]] = {}
 
-    def add(a: int, b: int, image: int, of_a: Ids, of_b: Ids) -> None:
+    def add(a: int, b: int, image: int, of_a: Int64Array, of_b: Int64Array) -> None:
         both = (of_a >= 0) & (of_b >= 0)
         same.setdefault((a, b), []).append((image, np.stack([of_a[both], of_b[both]], axis=1)))
 
@@ -267,7 +265,7 @@ def find_ties(database: Path, parts: Sequence[MappedRun], names: Sequence[str], 
     return [tie for tie in found if tie is not None]
 
 
-def _tie(parts: Sequence[MappedRun], a: int, b: int, seen: Sequence[tuple[int, Ids]]) -> Tie | None:
+def _tie(parts: Sequence[MappedRun], a: int, b: int, seen: Sequence[tuple[int, Int64Array]]) -> Tie | None:
     """Points that two parts have both, without those that contradict the others; None where these are too few."""
     import pycolmap
 

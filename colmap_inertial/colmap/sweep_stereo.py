@@ -12,9 +12,9 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_inertial.colmap.depth_maps import map_file
+from colmap_inertial.core.arrays import UInt8Array
 from colmap_inertial.core.geometry import opencv_px_from_colmap
 from colmap_inertial.core.threads import frames_at_once, in_order
 from colmap_inertial.imaging.plane_sweep import (
@@ -137,7 +137,7 @@ class SweptWorkspace:
     def _depth_view(self, view: int) -> DepthView:
         return DepthView(depth=read_map(self._raw_file(view)), camera=self.sights.views[view])
 
-    def _grey(self, view: int) -> NDArray[np.uint8]:
+    def _grey(self, view: int) -> UInt8Array:
         import cv2
 
         picture = read_image(path_in(self.folder / "images", self.names[view]))

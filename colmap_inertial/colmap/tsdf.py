@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from colmap_inertial.colmap.depth_maps import Maker, map_file
+from colmap_inertial.core.arrays import Array, Float32Array
 from colmap_inertial.core.errors import InertialError, MissingExtraError, OutputError
 from colmap_inertial.core.options import ReconstructOptions
-from colmap_inertial.core.types import Array
 from colmap_inertial.io.images import read_image
 from colmap_inertial.io.names import path_in
 from colmap_inertial.model import read_model
-from colmap_inertial.model.depth_maps import Real, read_map
+from colmap_inertial.model.depth_maps import read_map
 
 if TYPE_CHECKING:
     import pycolmap
@@ -162,7 +162,7 @@ def _in_order(o3d: ModuleType, mesh: Any) -> Any:
     return out
 
 
-def _typical(depth: Real, camera: pycolmap.Camera) -> tuple[float, float]:
+def _typical(depth: Float32Array, camera: pycolmap.Camera) -> tuple[float, float]:
     """What is near in a map, and what a pixel covers there."""
     known = depth[depth > 0]
     near = float(np.quantile(known, _NEAR)) if len(known) else 0.0
@@ -176,7 +176,7 @@ def _matrix(params: Array, maker: Maker) -> Array:
     return np.array([[fx, 0, cx + aside], [0, fy, cy + aside], [0, 0, 1]])
 
 
-def _colours(path: Path) -> Real:
+def _colours(path: Path) -> Float32Array:
     picture = read_image(path)
     shares = picture.astype(np.float32) / np.float32(np.iinfo(picture.dtype).max)
     return shares if shares.ndim == 3 else np.stack([shares] * 3, axis=2)

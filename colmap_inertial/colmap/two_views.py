@@ -13,13 +13,12 @@ from numpy.typing import NDArray
 
 from colmap_inertial.colmap.gyro_bias import RayPairs
 from colmap_inertial.colmap.relative_track import RelativeTrack, Sightings, joined
+from colmap_inertial.core.arrays import Array, BoolArray
 from colmap_inertial.core.geometry import matrix_from_quat, so3_log
-from colmap_inertial.core.types import Array
 
 if TYPE_CHECKING:
     import pycolmap
 
-Bool = NDArray[np.bool_]
 
 #: A rotation of fewer matches is not believed.
 _LEAST_MATCHES = 30
@@ -92,7 +91,7 @@ def _covered(
     return int((asked & (again > 0)).sum()) / max(int(asked.sum()), 1)
 
 
-def _shown(xy_px: Array, camera: pycolmap.Camera, other: pycolmap.Camera, other_from_this: Array) -> Bool:
+def _shown(xy_px: Array, camera: pycolmap.Camera, other: pycolmap.Camera, other_from_this: Array) -> BoolArray:
     """(N,) which points of a picture, infinitely far away, the other one shows."""
     rays = np.asarray(camera.cam_from_img(xy_px))[:, :2]
     there = np.column_stack([rays, np.ones(len(rays))]) @ other_from_this.T

@@ -6,9 +6,8 @@ A rotation ``a_from_b`` takes coordinates in frame b to coordinates in frame a; 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from colmap_inertial.core.arrays import Array
 
 
 def cross(a: Array, b: Array) -> Array:

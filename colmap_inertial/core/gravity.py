@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import AnyArray, Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import quat_conjugate, quat_rotate
 from colmap_inertial.core.gyro import GyroPath
-from colmap_inertial.core.types import Array, CameraImuCalibration, FrameTiming, ImuRecording
+from colmap_inertial.core.types import CameraImuCalibration, FrameTiming, ImuRecording
 
 #: Hand and walking accelerations average out over this time; the gyro carries the attitude meanwhile.
 _AVERAGING_S = 3.0
@@ -64,7 +62,7 @@ def up_in_imu(imu: ImuRecording, gyro_bias_rad_s: Array, query_s: Array, accel_d
     return up / np.linalg.norm(up, axis=1, keepdims=True)
 
 
-def _convolve_same(signal: NDArray[Any], window: Array) -> Array:
+def _convolve_same(signal: AnyArray, window: Array) -> Array:
     """Convolution of the signal's length, whichever of the two is longer."""
     half = len(window) // 2
     return np.convolve(signal, window)[half : half + len(signal)]

@@ -7,8 +7,8 @@ from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
 from colmap_inertial.core.geometry import (
     cross,
     matrix_from_quat,
@@ -19,7 +19,7 @@ from colmap_inertial.core.geometry import (
     quat_multiply,
 )
 from colmap_inertial.core.sampling import Coverage
-from colmap_inertial.core.types import Array, CameraImuCalibration, ImuRecording
+from colmap_inertial.core.types import CameraImuCalibration, ImuRecording
 
 #: Order of the differences by which noise is told from motion; what the median of a normal distribution's sizes is.
 _DIFFERENCES, _NORMAL_MEDIAN = 5, 0.6745
@@ -52,7 +52,7 @@ class GyroPath:
         self.start_from_imu_xyzw = quat_cumulative(_turn(self.rate_rad_s[:-1], self.rate_rad_s[1:], self._step_s))
         self._coverage = Coverage(t_s)
 
-    def covers(self, begin_s: Array, end_s: Array) -> NDArray[np.bool_]:
+    def covers(self, begin_s: Array, end_s: Array) -> BoolArray:
         """Which of the intervals lie inside the recording and contain no gap."""
         return self._coverage.covers(begin_s, end_s)
 
@@ -113,7 +113,7 @@ class GyroPath:
         steps = 0.5 * (values[1:] + values[:-1]) * self._step_s[:, None, None]
         return np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(steps, axis=0)])
 
-    def _locate(self, query_s: Array) -> tuple[NDArray[np.intp], Array, Array]:
+    def _locate(self, query_s: Array) -> tuple[IndexArray, Array, Array]:
         i = np.clip(np.searchsorted(self.t_s, query_s, side="right") - 1, 0, len(self.t_s) - 2)
         since_s = query_s - self.t_s[i]
         # outside the recording the rate stays at the end's instead of running away

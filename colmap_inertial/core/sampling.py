@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from colmap_inertial.core.arrays import Array, BoolArray
 
 #: A longer pause between samples of an IMU is a gap: nothing is known about the motion in it.
 GAP_S = 0.1
@@ -18,7 +17,7 @@ _CUT_SAMPLES, _CUT_TIMES, _CUT_NEAR = 6, 3, 0.1
 MUCH_CUT = 0.001
 
 
-def is_gap(t_s: Array, longer_than_s: float = GAP_S, *, steps: float = 0.0) -> NDArray[np.bool_]:
+def is_gap(t_s: Array, longer_than_s: float = GAP_S, *, steps: float = 0.0) -> BoolArray:
     """(N-1,) which steps between samples at (N,) times are gaps.
 
     Parameters
@@ -32,7 +31,7 @@ def is_gap(t_s: Array, longer_than_s: float = GAP_S, *, steps: float = 0.0) -> N
     return np.asarray(step_s > max(longer_than_s, steps * float(np.median(step_s)) if steps else 0.0))
 
 
-def at_ceiling(values: Array) -> NDArray[np.bool_]:
+def at_ceiling(values: Array) -> BoolArray:
     """(N, k) which samples (N, k) stand at their column's largest or smallest value, where these are far too many.
 
     An end of a natural distribution is rare; one that is cut off is a common reading.
@@ -40,7 +39,7 @@ def at_ceiling(values: Array) -> NDArray[np.bool_]:
     return np.stack([_column_at_ceiling(column) for column in values.T], axis=1)
 
 
-def _column_at_ceiling(values: Array) -> NDArray[np.bool_]:
+def _column_at_ceiling(values: Array) -> BoolArray:
     out = np.zeros(len(values), dtype=bool)
     levels, counts = np.unique(values, return_counts=True)
     if len(levels) < 3:
@@ -64,7 +63,7 @@ class Coverage:
         self._t_s = t_s
         self._gaps = np.concatenate([[0], np.cumsum(is_gap(t_s))])
 
-    def covers(self, begin_s: Array, end_s: Array) -> NDArray[np.bool_]:
+    def covers(self, begin_s: Array, end_s: Array) -> BoolArray:
         """Which of the intervals lie inside the recording and contain no gap."""
         top = len(self._t_s) - 1
         first = np.searchsorted(self._t_s, begin_s, side="right") - 1

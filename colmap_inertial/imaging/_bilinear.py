@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
-from colmap_inertial.core.types import Array
+from colmap_inertial.core.arrays import AnyArray, Array
 
 
-def bilinear(grid: NDArray[Any], rows: Array, columns: Array) -> NDArray[Any]:
+def bilinear(grid: AnyArray, rows: Array, columns: Array) -> AnyArray:
     """(R, C, ...) a (Gy, Gx, ...) grid at the crossings of rows and columns, given in distances between nodes.
 
     In the grid's precision. What lies beyond the last node has its value; nothing may lie before the first.
@@ -25,7 +22,7 @@ def bilinear(grid: NDArray[Any], rows: Array, columns: Array) -> NDArray[Any]:
     return grid
 
 
-def between_nodes(nodes: NDArray[Any], at: Array) -> Array:
+def between_nodes(nodes: AnyArray, at: Array) -> Array:
     """Bilinear values at (..., 2) fractional columns and rows of a (Gy, Gx, C) grid; beyond it, the edge's."""
     rows, columns = nodes.shape[:2]
     x, y = np.clip(at[..., 0], 0, columns - 1), np.clip(at[..., 1], 0, rows - 1)

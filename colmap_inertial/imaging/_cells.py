@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import BoolArray, Float32Array
 from colmap_inertial.imaging.blur_field import BlurField
 
 #: Side of a cell. The vector of its centre holds for all its pixels.
@@ -31,10 +31,10 @@ class Cells:
         (Ny + 1, Nx + 1) float32 share of the filter's result at the corners of the cells, 0 to 1.
     """
 
-    extent_px: NDArray[np.float32]
-    slope: NDArray[np.float32]
-    along_y: NDArray[np.bool_]
-    fade: NDArray[np.float32]
+    extent_px: Float32Array
+    slope: Float32Array
+    along_y: BoolArray
+    fade: Float32Array
 
     @property
     def typical_px(self) -> float:

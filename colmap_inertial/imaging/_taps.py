@@ -6,9 +6,8 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
-from colmap_inertial.core.types import Array
+from colmap_inertial.core.arrays import Array, Float32Array, IndexArray, Int32Array
 
 #: The table of taps holds one filter for every quarter of a pixel of blur; between them it is interpolated.
 STEPS_PER_PX = 4
@@ -31,7 +30,7 @@ def smoothing_px(sigma: float, extent_px: float) -> float:
     return float(min(SMOOTHING_PX * (sigma / 0.01 * extent_px / 10) ** 0.5, LARGEST_SMOOTHING_PX))
 
 
-def gaussian_weights(sigma_px: float) -> NDArray[np.float32]:
+def gaussian_weights(sigma_px: float) -> Float32Array:
     """(R + 1,) weights of a Gaussian at the distances 0, 1, ... px, up to three standard deviations."""
     at = np.arange(int(np.ceil(3 * sigma_px)) + 1)
     weights = np.exp(-0.5 * (at / max(sigma_px, 1e-3)) ** 2)
@@ -113,9 +112,9 @@ class TapTable:
     """
 
     first: int
-    weights: NDArray[np.float32]
-    reach: NDArray[np.int32]
-    smoothing: NDArray[np.float32] = field(default_factory=lambda: np.ones(1, dtype=np.float32))
+    weights: Float32Array
+    reach: Int32Array
+    smoothing: Float32Array = field(default_factory=lambda: np.ones(1, dtype=np.float32))
 
     @classmethod
     def covering(cls, shortest_px: float, longest_px: float, prior: Prior, smoothing_px: float = 0.0) -> TapTable:
@@ -128,7 +127,7 @@ class TapTable:
         reach = np.array([len(taps) - 1 for taps in filters], dtype=np.int32)
         return cls(first=first, weights=weights, reach=reach, smoothing=gaussian_weights(smoothing_px))
 
-    def at(self, extent_px: Array) -> tuple[NDArray[np.intp], Array]:
+    def at(self, extent_px: Array) -> tuple[IndexArray, Array]:
         """Row below each blur length and the fraction of the way to the next row."""
         position = np.asarray(extent_px, dtype=np.float64) * STEPS_PER_PX - self.first
         row = np.clip(np.floor(position), 0, len(self.weights) - 2).astype(np.intp)

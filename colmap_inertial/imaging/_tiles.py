@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from colmap_inertial.core.types import Array
+from colmap_inertial.core.arrays import Array, Float32Array, Int32Array
 from colmap_inertial.imaging._bilinear import bilinear
 from colmap_inertial.imaging.blur_path import BlurPath
 
@@ -70,11 +69,11 @@ class Tiling:
         rows, columns = (max(1, -(-(n - self.ramp) // self.hop)) for n in (self.height, self.width))
         return rows, columns
 
-    def paths(self, path: BlurPath) -> NDArray[np.float32]:
+    def paths(self, path: BlurPath) -> Float32Array:
         """(Ty, Tx, S, 2) the path in the middle of each tile, or at the image's border where that lies beyond."""
         return np.ascontiguousarray(path.at(*self._middles()), dtype=np.float32)
 
-    def spreads(self, path: BlurPath) -> NDArray[np.float32]:
+    def spreads(self, path: BlurPath) -> Float32Array:
         """(Ty, Tx, 3) covariance of the chords there: how uncertain they are, and how they change within the tile.
 
         To a filter with one path for all of a tile, the latter is no other than the former. A chord that changes
@@ -100,12 +99,12 @@ class Tiling:
         )
         return rows, columns
 
-    def window_in(self) -> NDArray[np.float32]:
+    def window_in(self) -> Float32Array:
         """(side,) by which rows and columns of a tile are multiplied before it is transformed."""
         rise = np.sin(0.5 * np.pi * (np.arange(self.margin) + 0.5) / self.margin) ** 2
         return self._mirrored(np.concatenate([rise, np.ones(self.side // 2 - self.margin)]))
 
-    def window_out(self) -> NDArray[np.float32]:
+    def window_out(self) -> Float32Array:
         """(side,) shares of a tile in the result; those of neighbours add up to one.
 
         Of the first tile the half before its middle counts in full, of the last one that behind it (:meth:`shares`).
@@ -114,7 +113,7 @@ class Tiling:
         flat = np.ones(self.side // 2 - self.margin - self.ramp)
         return self._mirrored(np.concatenate([np.zeros(self.margin), rise, flat]))
 
-    def shares(self, place: int, count: int) -> NDArray[np.float32]:
+    def shares(self, place: int, count: int) -> Float32Array:
         """(side,) shares of one of several tiles in a row: beyond both ends there is nothing to blend with."""
         out = self.window_out()
         if place == 0:
@@ -123,7 +122,7 @@ class Tiling:
             out[self.side // 2 :] = 1
         return out
 
-    def sources(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    def sources(self) -> tuple[Int32Array, Int32Array]:
         """Rows and columns of the image that those of the tiled area show: mirrored about its border pixels."""
         out = []
         for n, size in zip(self.count, (self.height, self.width), strict=True):
@@ -134,5 +133,5 @@ class Tiling:
         return out[0], out[1]
 
     @staticmethod
-    def _mirrored(half: Array) -> NDArray[np.float32]:
+    def _mirrored(half: Array) -> Float32Array:
         return np.concatenate([half, half[::-1]]).astype(np.float32)

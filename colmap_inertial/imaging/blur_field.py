@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from colmap_inertial.core.types import Array
+from colmap_inertial.core.arrays import AnyArray, Array, Float32Array
 from colmap_inertial.imaging._bilinear import bilinear
 
 
@@ -34,7 +32,7 @@ class BlurField:
     height: int
     vector_px: np.ndarray[tuple[int, int, int], np.dtype[np.float32]]
     step_px: int = 16
-    cov_px2: NDArray[np.float32] = field(default_factory=lambda: np.zeros(3, np.float32))
+    cov_px2: Float32Array = field(default_factory=lambda: np.zeros(3, np.float32))
 
     def __post_init__(self) -> None:
         if self.width <= 0 or self.height <= 0 or self.step_px <= 0:
@@ -60,7 +58,7 @@ class BlurField:
         grid = np.broadcast_to(np.asarray(vector_px, dtype=np.float32), (*cls.nodes(width, height, step_px), 2))
         return cls(width=width, height=height, vector_px=grid, step_px=step_px)
 
-    def at(self, rows_px: NDArray[Any], columns_px: NDArray[Any]) -> Array:
+    def at(self, rows_px: AnyArray, columns_px: AnyArray) -> Array:
         """(R, C, 2) the field at the crossings of rows and columns of pixels, between them, too."""
         nodes = self.vector_px.astype(np.float64)
         return bilinear(nodes, np.asarray(rows_px) / self.step_px, np.asarray(columns_px) / self.step_px)
@@ -85,7 +83,7 @@ class BlurField:
         return (off / whole) ** 0.5 if whole > 0 else 0.0
 
 
-def spread_cov(cov_px2: NDArray[np.float32], nodes: tuple[int, int]) -> NDArray[np.float32]:
+def spread_cov(cov_px2: Float32Array, nodes: tuple[int, int]) -> Float32Array:
     """(Gy, Gx, 3) checked, not to be written to."""
     cov = np.broadcast_to(np.asarray(cov_px2, dtype=np.float32), (*nodes, 3)).copy()
     if not (np.isfinite(cov).all() and (cov[..., ::2] >= 0).all()):

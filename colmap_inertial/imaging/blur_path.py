@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from colmap_inertial.core.types import Array
+from colmap_inertial.core.arrays import AnyArray, Array, Float32Array
 from colmap_inertial.imaging._bilinear import bilinear
 from colmap_inertial.imaging.blur_field import BlurField, spread_cov
 
@@ -39,7 +37,7 @@ class BlurPath:
     height: int
     path_px: np.ndarray[tuple[int, int, int, int], np.dtype[np.float32]]
     step_px: int = 64
-    cov_px2: NDArray[np.float32] = field(default_factory=lambda: np.zeros(3, np.float32))
+    cov_px2: Float32Array = field(default_factory=lambda: np.zeros(3, np.float32))
 
     def __post_init__(self) -> None:
         if self.width <= 0 or self.height <= 0 or self.step_px <= 0:
@@ -73,7 +71,7 @@ class BlurPath:
         """So many times as long."""
         return replace(self, path_px=self.path_px * np.float32(factor), cov_px2=self.cov_px2 * np.float32(factor**2))
 
-    def cov_at(self, rows_px: NDArray[Any], columns_px: NDArray[Any]) -> Array:
+    def cov_at(self, rows_px: AnyArray, columns_px: AnyArray) -> Array:
         """(R, C, 3) covariance of the chord at the crossings of rows and columns of pixels."""
         nodes = self.cov_px2.astype(np.float64)
         return bilinear(nodes, np.asarray(rows_px) / self.step_px, np.asarray(columns_px) / self.step_px)
@@ -91,7 +89,7 @@ class BlurPath:
         span = np.ptp(self.path_px, axis=0) * samples / (samples - 1)
         return float(np.hypot(span[..., 0], span[..., 1]).max())
 
-    def at(self, rows_px: NDArray[Any], columns_px: NDArray[Any]) -> Array:
+    def at(self, rows_px: AnyArray, columns_px: AnyArray) -> Array:
         """(R, C, S, 2) the path at the crossings of rows and columns of pixels, between them, too."""
         nodes = np.moveaxis(self.path_px, 0, 2).astype(np.float64)
         return bilinear(nodes, np.asarray(rows_px) / self.step_px, np.asarray(columns_px) / self.step_px)

@@ -13,9 +13,8 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from colmap_inertial.core.types import Array
+from colmap_inertial.core.arrays import Array, Float32Array, IndexArray, UInt8Array, UInt16Array
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath, middles
 
@@ -142,7 +141,7 @@ class BlurEvidence:
         return float(self._depth(self.mirrored, self.mirrored_square)[_PLAUSIBLE].max())
 
 
-def blur_evidence(image: NDArray[np.uint8] | NDArray[np.uint16], blur: BlurField | BlurPath) -> BlurEvidence:
+def blur_evidence(image: UInt8Array | UInt16Array, blur: BlurField | BlurPath) -> BlurEvidence:
     """Look for the blur that was predicted.
 
     Parameters
@@ -184,7 +183,7 @@ def _summed(values: Array, mirrored: Array, lengths_px: Array, weight: Array) ->
     )
 
 
-def shown_share(image: NDArray[np.uint8] | NDArray[np.uint16], blur: BlurField | BlurPath) -> float | None:
+def shown_share(image: UInt8Array | UInt16Array, blur: BlurField | BlurPath) -> float | None:
     """How much of the fall of detail that a blur predicts an image has: 1 where it is blurred so, 0 where it is sharp.
 
     At one distance from the origin of a tile's spectrum, blur leaves the directions across it as they were and takes
@@ -201,9 +200,7 @@ def shown_share(image: NDArray[np.uint8] | NDArray[np.uint16], blur: BlurField |
     return shown_shares(image, blur)[0]
 
 
-def shown_shares(
-    image: NDArray[np.uint8] | NDArray[np.uint16], blur: BlurField | BlurPath
-) -> tuple[float | None, float | None]:
+def shown_shares(image: UInt8Array | UInt16Array, blur: BlurField | BlurPath) -> tuple[float | None, float | None]:
     """As `shown_share`, and that of the blur that a gyroscope with one axis flipped would predict."""
     path = BlurPath.straight(blur) if isinstance(blur, BlurField) else blur
     found = _spectra(image, path, _FEW_TILES)
@@ -214,7 +211,7 @@ def shown_shares(
     return _share(*found, weight), _share(logarithm, vectors * [1, -1], paths * [1, -1], weight)
 
 
-def _share(logarithm: NDArray[np.float32], vectors: Array, path_px: Array, weight: Array) -> float | None:
+def _share(logarithm: Float32Array, vectors: Array, path_px: Array, weight: Array) -> float | None:
     falls = _falls(logarithm, vectors, path_px)
     seen, expected, seen_mean, expected_mean = (weight * fall for fall in falls)
     information = float((expected - _OWN_DIRECTION * expected_mean).sum())
@@ -224,8 +221,8 @@ def _share(logarithm: NDArray[np.float32], vectors: Array, path_px: Array, weigh
 
 
 def _spectra(
-    image: NDArray[np.uint8] | NDArray[np.uint16], path: BlurPath, most_tiles: int
-) -> tuple[NDArray[np.float32], Array, Array] | None:
+    image: UInt8Array | UInt16Array, path: BlurPath, most_tiles: int
+) -> tuple[Float32Array, Array, Array] | None:
     """(N, T, T // 2 + 1) log power of tiles, the (N, 2) chords and the (N, S, 2) paths of their blur; ``None`` where
     there are too few to tell."""
     import cv2
@@ -271,7 +268,7 @@ def _spectra(
     return np.asarray(np.log(power + _FLOOR * tile**2)), vectors[usable], paths
 
 
-def _weights(logarithm: NDArray[np.float32]) -> Array:
+def _weights(logarithm: Float32Array) -> Array:
     """(N,) weights of tiles by how far they stand out of the quiet ones of their picture.
 
     A sky holds noise alone, and would hide in the mean what the ground below it shows. Noise cannot be told from weak
@@ -286,7 +283,7 @@ def _weights(logarithm: NDArray[np.float32]) -> Array:
     return np.asarray(weight * (weight.sum() / (weight @ weight)))
 
 
-def _light(image: NDArray[np.uint8] | NDArray[np.uint16]) -> NDArray[np.float32]:
+def _light(image: UInt8Array | UInt16Array) -> Float32Array:
     """(H, W) roughly linear light, 0 to 1."""
     import cv2
 
@@ -297,13 +294,13 @@ def _light(image: NDArray[np.uint8] | NDArray[np.uint16]) -> NDArray[np.float32]
     return np.asarray((grey.astype(np.float32) / np.float32(codes)) ** np.float32(2.2))
 
 
-def _starts(size: int, tile: int, step: int) -> NDArray[np.intp]:
+def _starts(size: int, tile: int, step: int) -> IndexArray:
     """Tiles that cover a side evenly."""
     count = max(1, -(-(size - tile) // step) + 1)
     return np.unique(np.rint(np.linspace(0, size - tile, count)).astype(np.intp))
 
 
-def _falls(logarithm: NDArray[np.float32], vectors: Array, path_px: Array) -> tuple[Array, Array, Array, Array]:
+def _falls(logarithm: Float32Array, vectors: Array, path_px: Array) -> tuple[Array, Array, Array, Array]:
     """(N,) sums over the frequencies of each tile: its fall times the expected one, and the expected one squared; and
     both of the means over frequencies."""
     tile = logarithm.shape[1]
@@ -355,7 +352,7 @@ def _leaked(power: Array) -> Array:
     return power
 
 
-def _cepstra(logarithm: NDArray[np.float32]) -> NDArray[np.float32]:
+def _cepstra(logarithm: Float32Array) -> Float32Array:
     """(N, T, T) of (N, T, T // 2 + 1) log power, smoothed."""
     from scipy.fft import irfft2
 
@@ -383,7 +380,7 @@ def _dips(vectors: Array, path_px: Array, tile: int) -> Array:
     return out
 
 
-def _at_lags(cepstra: NDArray[np.float32], vectors: Array, directions_rad: Array, factors: Array = FACTORS) -> Array:
+def _at_lags(cepstra: Float32Array, vectors: Array, directions_rad: Array, factors: Array = FACTORS) -> Array:
     """(N, factors, directions) values of (N, T, T) cepstra at the lags around (N, 2) blur vectors; bilinear."""
     tile = cepstra.shape[1]
     cosine, sine = np.cos(directions_rad), np.sin(directions_rad)

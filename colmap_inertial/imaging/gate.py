@@ -15,7 +15,7 @@ from typing import Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.core.types import Array
+from colmap_inertial.core.arrays import Array, BoolArray, Float32Array, UInt8Array, UInt16Array
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath
 from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence, shown_share
@@ -24,7 +24,6 @@ from colmap_inertial.imaging.path_filters import path_wiener
 from colmap_inertial.imaging.psf import PredictedBlur
 
 Code = TypeVar("Code", np.uint8, np.uint16)
-Light = NDArray[np.float32]
 Action = Literal["keep", "deblur", "drop"]
 
 
@@ -130,8 +129,8 @@ def decide(
 
 
 def _droppable(
-    candidate: NDArray[np.bool_], px: Array, t_s: Array, motion: GyroCamera | None, options: GateOptions
-) -> NDArray[np.bool_]:
+    candidate: BoolArray, px: Array, t_s: Array, motion: GyroCamera | None, options: GateOptions
+) -> BoolArray:
     """Which candidates can go, the most blurred first, without opening too wide a gap between those that stay."""
     looking = None if motion is None else motion.start_from_cam(t_s)
     stays = np.ones(len(px), dtype=np.bool_)
@@ -171,7 +170,7 @@ class GatedFrame:
         In words.
     """
 
-    image: NDArray[np.uint8] | NDArray[np.uint16]
+    image: UInt8Array | UInt16Array
     deblurred: bool
     kept_share: float
     extent_factor: float
@@ -405,7 +404,7 @@ def keep_sharp(image: NDArray[Code], deblurred: NDArray[Code], blur: BlurField) 
     size = (max(1, width // 2), max(1, height // 2))
     codes = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     small = cv2.resize(codes, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-    grey: Light = np.asarray(cv2.GaussianBlur(small, (0, 0), 0.5) / np.float32(np.iinfo(image.dtype).max))
+    grey: Float32Array = np.asarray(cv2.GaussianBlur(small, (0, 0), 0.5) / np.float32(np.iinfo(image.dtype).max))
     nearest = [
         np.minimum(np.rint(np.arange(n) * 2 / blur.step_px).astype(np.intp), nodes - 1)
         for n, nodes in zip(size[::-1], blur.vector_px.shape, strict=False)
@@ -420,7 +419,7 @@ def keep_sharp(image: NDArray[Code], deblurred: NDArray[Code], blur: BlurField) 
     change = np.asarray(np.abs(ends[0] - ends[1]), dtype=np.float32)
     side = _BLOCK_PX // 2
 
-    def blocks(values: Light, pick: Callable[..., Light]) -> Light:
+    def blocks(values: Float32Array, pick: Callable[..., Float32Array]) -> Float32Array:
         padded = cv2.copyMakeBorder(values, 0, rows * side - size[1], 0, columns * side - size[0], cv2.BORDER_REPLICATE)
         # lines first: whole rows at a time
         return pick(pick(padded.reshape(rows, side, -1), axis=1).reshape(rows, columns, side), axis=2)

@@ -5,18 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, BoolArray
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_multiply, quat_rotate, skew, so3_log
 from colmap_inertial.core.gyro import GyroPath
-from colmap_inertial.core.types import (
-    CAL,
-    Array,
-    CameraImuCalibration,
-    FrameTiming,
-    ImuRecording,
-    ReadoutDirection,
-)
+from colmap_inertial.core.types import CAL, CameraImuCalibration, FrameTiming, ImuRecording, ReadoutDirection
 
 #: Standard deviation of what is known of blur's length: exposure times are nominal, as are focal lengths.
 EXTENT_SIGMA = 0.03
@@ -99,7 +92,7 @@ class GyroCamera:
             errors=MotionErrors.of(calibration),
         )
 
-    def covers(self, begin_s: Array, end_s: Array) -> NDArray[np.bool_]:
+    def covers(self, begin_s: Array, end_s: Array) -> BoolArray:
         """(N,) which of the intervals the gyroscope recorded without a gap."""
         return self.path.covers(np.asarray(begin_s) - self.offset_s, np.asarray(end_s) - self.offset_s)
 

@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from colmap_inertial.core.types import Array, Projector
+from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.types import Projector
 from colmap_inertial.imaging._bilinear import between_nodes
 from colmap_inertial.imaging.blur_field import BlurField
 

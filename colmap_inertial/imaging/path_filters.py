@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.core.types import Array
+from colmap_inertial.core.arrays import AnyArray, Array, Float32Array
 from colmap_inertial.imaging._cells import Cells
 from colmap_inertial.imaging._tiles import SHORTEST_SIDE, Tiling
 from colmap_inertial.imaging.blur_path import BlurPath
@@ -115,9 +115,7 @@ class Noise:
         return cls(dark, by_light)
 
 
-def noise_along(
-    light: NDArray[np.float32], tiling: Tiling, paths: NDArray[np.float32], threads: int = 0
-) -> tuple[Noise, ...]:
+def noise_along(light: Float32Array, tiling: Tiling, paths: Float32Array, threads: int = 0) -> tuple[Noise, ...]:
     """Of each channel of (H, W, C) linear light: what shows at frequencies that the blur leaves nothing of.
 
     So the errors of compression count, and those of the path.
@@ -140,16 +138,16 @@ def noise_along(
 
 
 def filter_along(
-    light: NDArray[np.float32],
+    light: Float32Array,
     tiling: Tiling,
-    paths: NDArray[np.float32],
-    spreads: NDArray[np.float32],
+    paths: Float32Array,
+    spreads: Float32Array,
     noise: Sequence[Noise],
     splitting: Sequence[float],
     *,
     threads: int = 0,
     instruction_set: str = "",
-) -> NDArray[np.float32]:
+) -> Float32Array:
     """(H, W, C) linear light without blur; without splitting, by Wiener's filter."""
     from colmap_inertial._kernels import _path
 
@@ -178,7 +176,7 @@ def filter_along(
     return result
 
 
-def _light(image: NDArray[Any]) -> NDArray[np.float32]:
+def _light(image: AnyArray) -> Float32Array:
     """Linear light of codes."""
     if image.dtype == np.uint8:
         import cv2

@@ -8,9 +8,10 @@ from typing import Protocol
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.gyro import on_camera_rate
-from colmap_inertial.core.types import Array, CameraImuCalibration, FrameTiming, ImuRecording, Projector
+from colmap_inertial.core.types import CameraImuCalibration, FrameTiming, ImuRecording, Projector
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath, middles, samples_for
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera

@@ -7,9 +7,10 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, BoolArray, Float32Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import colmap_px_from_opencv
-from colmap_inertial.core.types import Array, Projector
+from colmap_inertial.core.types import Projector
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 
@@ -66,7 +67,7 @@ def rectify_keypoints(
 
 def rectify_image(
     image: NDArray[Pixel], motion: GyroCamera, camera: Projector, shutter: FrameShutter, *, step_px: int = 16
-) -> tuple[NDArray[Pixel], NDArray[np.bool_]]:
+) -> tuple[NDArray[Pixel], BoolArray]:
     """The image as a global shutter would have taken it at ``shutter.reference_s()``.
 
     Where a pixel came from is found by fixed-point iteration on a grid, and interpolated between its nodes; colours by
@@ -157,19 +158,17 @@ def grid_nodes(rows: int, columns: int) -> Array:
     return np.stack(np.meshgrid(np.arange(float(columns)), np.arange(float(rows))), axis=-1)
 
 
-def sampling_maps(
-    shift_px: Array, width: int, height: int, step_px: float
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def sampling_maps(shift_px: Array, width: int, height: int, step_px: float) -> tuple[Float32Array, Float32Array]:
     """(H, W) columns and rows for ``cv2.remap``: each pixel's own and the shift there, given at (Gy, Gx, 2) nodes."""
     x, y = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)[:, None]
     spread_x, spread_y = (spread_nodes(shift_px[..., i], width, height, step_px) for i in (0, 1))
     return spread_x + x, spread_y + y
 
 
-def spread_nodes(nodes: Array, width: int, height: int, step_px: float) -> NDArray[np.float32]:
+def spread_nodes(nodes: Array, width: int, height: int, step_px: float) -> Float32Array:
     """(H, W) bilinear values between (Gy, Gx) nodes, as two products with weights."""
 
-    def weights(size: int, count: int) -> NDArray[np.float32]:
+    def weights(size: int, count: int) -> Float32Array:
         distance = np.abs(np.arange(size)[:, None] / step_px - np.arange(count))
         return np.maximum(1 - distance, 0).astype(np.float32)
 

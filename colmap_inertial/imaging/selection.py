@@ -13,12 +13,11 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, Int64Array, UInt8Array
 from colmap_inertial.core.geometry import skew, so3_exp
-from colmap_inertial.core.types import Array, Projector
+from colmap_inertial.core.types import Projector
 
-Grey = NDArray[np.uint8]
 #: Why a window was closed. start: the first frames; still: it lasted, and nothing moved; end: the last frames.
 Closing = Literal["start", "baseline", "motion", "interval", "still", "end"]
 #: By what the frames of a window were ranked: the blur or angular speed that the gyroscope predicts, or the image.
@@ -114,13 +113,13 @@ class _Seen:
     """An image that was looked at: its corners by number, in shares of the longer side, and its sharpness."""
 
     place: int
-    ids: NDArray[np.int64]
+    ids: Int64Array
     xy: Array
     sharpness: float
 
 
 def choose_frames(
-    images: Iterable[Grey], ranked: Ranked, limits: WindowLimits, camera: Projector, *, width: int, height: int
+    images: Iterable[UInt8Array], ranked: Ranked, limits: WindowLimits, camera: Projector, *, width: int, height: int
 ) -> Iterator[Chosen]:
     """Choose frames while looking at them; memory holds one window.
 
@@ -213,12 +212,12 @@ class _Follower:
     """Follows corners from image to image by pyramidal Lucas-Kanade, and adds new ones where they got few."""
 
     def __init__(self) -> None:
-        self._before: Grey | None = None
+        self._before: UInt8Array | None = None
         self._xy = np.zeros((0, 2), np.float32)
         self._ids = np.zeros(0, np.int64)
         self._next = 0
 
-    def step(self, place: int, image: Grey) -> _Seen:
+    def step(self, place: int, image: UInt8Array) -> _Seen:
         import cv2
 
         sharpness = float(np.mean(np.square(cv2.Laplacian(image, cv2.CV_32F))))
@@ -237,7 +236,7 @@ class _Follower:
         xy = (self._xy.astype(np.float64) + 0.5) / max(now.shape)
         return _Seen(place, self._ids.copy(), xy, sharpness)
 
-    def _follow(self, before: Grey, now: Grey) -> None:
+    def _follow(self, before: UInt8Array, now: UInt8Array) -> None:
         import cv2
 
         points = self._xy.reshape(-1, 1, 2)
@@ -249,7 +248,7 @@ class _Follower:
         good = (ok_there.ravel() == 1) & (ok_back.ravel() == 1) & (off < _ROUND_TRIP_PX) & inside
         self._xy, self._ids = np.asarray(xy[good], np.float32), self._ids[good]
 
-    def _refill(self, now: Grey) -> None:
+    def _refill(self, now: UInt8Array) -> None:
         import cv2
 
         distance = max(4.0, 0.5 * float(np.sqrt(now.size / _CORNERS)))

@@ -6,10 +6,8 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Codes = NDArray[np.uint8]
-Real = NDArray[np.float32]
+from colmap_inertial.core.arrays import Float32Array, Int32Array, UInt8Array, UInt16Array
 
 #: Pixels from the centre of the census window to its sides: 5 x 5 pixels, 24 comparisons.
 CENSUS_RADIUS = 2
@@ -40,8 +38,8 @@ class LightCost:
         (256,) costs of what the sum is instead, in codes.
     """
 
-    blend: NDArray[np.int32]
-    table: Codes
+    blend: Int32Array
+    table: UInt8Array
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -65,15 +63,15 @@ class Views:
         which anything is looked up elsewhere has no say.
     """
 
-    reference: Codes
-    others: Codes
+    reference: UInt8Array
+    others: UInt8Array
     least: int = 0
-    tables: Codes | None = None
+    tables: UInt8Array | None = None
     light: LightCost | None = None
-    shown: NDArray[np.int32] | None = None
+    shown: Int32Array | None = None
 
 
-def jump_table(views: int) -> tuple[int, NDArray[np.uint16]]:
+def jump_table(views: int) -> tuple[int, UInt16Array]:
     """The small penalty, and (256,) that of a jump by the change of the reference's code."""
     most = MOST * _counted(views)
     small = round(_SMALL * most)
@@ -81,7 +79,7 @@ def jump_table(views: int) -> tuple[int, NDArray[np.uint16]]:
     return small, np.maximum(small + 1, np.floor(jump)).astype(np.uint16)
 
 
-def shares(views: int) -> NDArray[np.int32]:
+def shares(views: int) -> Int32Array:
     """(views + 1,) factors in 1/256: a cost counts as if all views saw the pixel, and stays below 256."""
     by = np.maximum(1, np.arange(views + 1))
     return np.asarray(np.rint(256 * _counted(views) / by), dtype=np.int32)
@@ -93,8 +91,8 @@ def _counted(views: int) -> int:
 
 
 def match_candidates(
-    views: Views, columns: NDArray[np.int32], rows: NDArray[np.int32], *, threads: int
-) -> tuple[Real, NDArray[np.uint16]]:
+    views: Views, columns: Int32Array, rows: Int32Array, *, threads: int
+) -> tuple[Float32Array, UInt16Array]:
     """Semi-global matching of all views at once (Hirschmueller, PAMI 30(2), 2008).
 
     Parameters

@@ -6,9 +6,8 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from colmap_inertial.core.types import Array
+from colmap_inertial.core.arrays import Array, Float32Array
 
 #: Resolution of the tables back to codes. sRGB is steepest in the dark, 12.92: there one 8-bit code spans five entries.
 ENCODE_STEPS = 16384
@@ -26,7 +25,7 @@ def srgb_from_linear(linear: Array) -> Array:
 
 
 @lru_cache(maxsize=4)
-def decode_table(dtype: np.dtype[Any]) -> NDArray[np.float32]:
+def decode_table(dtype: np.dtype[Any]) -> Float32Array:
     """Linear light of every code of an image type."""
     top = int(np.iinfo(dtype).max)
     table = linear_from_srgb(np.arange(top + 1) / top).astype(np.float32)
@@ -35,7 +34,7 @@ def decode_table(dtype: np.dtype[Any]) -> NDArray[np.float32]:
 
 
 @lru_cache(maxsize=4)
-def encode_table(dtype: np.dtype[Any]) -> NDArray[np.float32]:
+def encode_table(dtype: np.dtype[Any]) -> Float32Array:
     """(ENCODE_STEPS + 2,) codes, not yet rounded, of evenly spaced linear light; the last entry repeats."""
     light = np.minimum(np.arange(ENCODE_STEPS + 2) / ENCODE_STEPS, 1)
     table = (np.iinfo(dtype).max * srgb_from_linear(light)).astype(np.float32)

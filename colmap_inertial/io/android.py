@@ -18,8 +18,9 @@ from pathlib import Path
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
-from colmap_inertial.core.types import Array, FrameLog, ImuRecording
+from colmap_inertial.core.types import FrameLog, ImuRecording
 from colmap_inertial.io.columns import split_unit
 from colmap_inertial.io.files import first_line
 from colmap_inertial.io.frame_times import frame_log, stamps_of_log

@@ -12,10 +12,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, Int64Array, UInt8Array
 from colmap_inertial.core.errors import FormatError
-from colmap_inertial.core.types import Array, FrameLog, ImuRecording, PositionFixes
+from colmap_inertial.core.types import FrameLog, ImuRecording, PositionFixes
 from colmap_inertial.io.frame_times import frame_log
 from colmap_inertial.io.imu_text import recording
 from colmap_inertial.io.mp4 import Movie, Track, has_track, read_movie
@@ -128,14 +128,14 @@ def _open(path: Path) -> tuple[Movie, Track]:
     return movie, movie.telemetry("camm", "camera motion metadata")
 
 
-def _packets(movie: Movie, track: Track) -> dict[int, tuple[NDArray[np.int64], NDArray[np.uint8]]]:
+def _packets(movie: Movie, track: Track) -> dict[int, tuple[Int64Array, UInt8Array]]:
     """Times (N,) and data (N, bytes) of the packets of the types that are used."""
     raw, begin = movie.contents(track)
     data = np.frombuffer(raw, np.uint8)
     at, end, t_ns = begin, begin + track.size, track.t_ns
     lengths = np.full(65536, -1)
     lengths[list(_LENGTHS)] = list(_LENGTHS.values())
-    parts: dict[int, list[tuple[NDArray[np.int64], NDArray[np.uint8]]]] = {
+    parts: dict[int, list[tuple[Int64Array, UInt8Array]]] = {
         kind: [] for kind in (_EXPOSURE, _GYRO, _ACCEL, _PLACE, _FIX)
     }
     while len(at):

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import colmap_px_from_opencv, quat_from_matrix
 from colmap_inertial.core.types import CameraModel, ImuNoise
 from colmap_inertial.io import sensor_yaml
@@ -74,7 +74,7 @@ class ImuTables:
     noise: ImuNoise | None = None
 
 
-def read_camera(table: Section | None) -> tuple[CameraModel | None, NDArray[np.float64] | None]:
+def read_camera(table: Section | None) -> tuple[CameraModel | None, Array | None]:
     """The ``[camera]`` table: the model, and (4, 4) body_from_cam where a sensor.yaml gives it."""
     if table is None:
         return None, None
@@ -140,7 +140,7 @@ def read_imu_table(table: Section | None) -> ImuPath | ImuTables | None:
 def read_calibration_table(
     table: Section,
     *,
-    body_from_cam: NDArray[np.float64] | None,
+    body_from_cam: Array | None,
     imu: ImuPath | ImuTables | None,
     readout_s: float | None,
     shared_clock: bool,
@@ -189,7 +189,7 @@ def read_calibration_table(
     return replace(found, camera_imu=calibration_prior(declared, shared_clock=shared_clock))
 
 
-def body_from_imu(imu: ImuPath) -> NDArray[np.float64]:
+def body_from_imu(imu: ImuPath) -> Array:
     """(4, 4) body_from_imu: the T_BS of the sensor.yaml beside the IMU's data, or the identity where there is none."""
     folder = imu.path.parent if imu.path.is_file() else imu.path
     sheets = [folder / part / "sensor.yaml" for part in ("mav0/imu0", "imu0")]
@@ -201,7 +201,7 @@ def body_from_imu(imu: ImuPath) -> NDArray[np.float64]:
     return sensor_yaml.read_body_from_sensor(sheet)
 
 
-def _transform(table: Section, rows: list[list[float]]) -> NDArray[np.float64]:
+def _transform(table: Section, rows: list[list[float]]) -> Array:
     shape = (len(rows), len(rows[0]) if rows else 0)
     if shape not in ((3, 3), (4, 4)):
         table.fail("cam_from_imu", f"must be a 3x3 or 4x4 matrix, found {shape[0]}x{shape[1]}")

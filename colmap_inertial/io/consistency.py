@@ -13,11 +13,11 @@ from itertools import permutations, product
 from math import pi
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, quat_multiply
 from colmap_inertial.core.sampling import Coverage, integral_at
-from colmap_inertial.core.types import Array, ImuRecording
+from colmap_inertial.core.types import ImuRecording
 
 #: Windows, the steps in which the gyroscope is integrated, and the means that are compared in a window.
 WINDOW_S, STEP_S, MEAN_S = 4.0, 0.1, 1.0
@@ -44,7 +44,7 @@ class Reading:
         1, pi/180 or 180/pi.
     """
 
-    matrix: NDArray[np.float64]
+    matrix: Array
     factor: float = 1.0
 
 

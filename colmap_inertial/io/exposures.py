@@ -26,8 +26,9 @@ from pathlib import Path
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, TimingError
-from colmap_inertial.core.types import Array, FrameTiming
+from colmap_inertial.core.types import FrameTiming
 from colmap_inertial.io.aperture_images import SubImages, read_rename
 from colmap_inertial.io.exif import HEAD_BYTES, exposure_of
 from colmap_inertial.io.files import read_bytes

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import FormatError, TimingError
-from colmap_inertial.core.types import Array, FrameLog, FrameTiming
+from colmap_inertial.core.types import FrameLog, FrameTiming
 from colmap_inertial.io.columns import recognise, split_unit
 from colmap_inertial.io.tables import Table, read_table
 from colmap_inertial.io.units import TIME_UNITS_NS, seconds, stamps_ns, unit_of
@@ -39,7 +39,7 @@ class FrameStamps:
     """
 
     names: tuple[str, ...]
-    t_ns: NDArray[np.int64]
+    t_ns: Int64Array
     exposure_s: Array | None = None
 
     def timing(self, *, exposure_s: float | None = None, readout_s: float | None = None) -> FrameTiming:
@@ -155,7 +155,7 @@ def _date_ns(path: Path, pattern: str) -> int:
     return since // datetime.timedelta(microseconds=1) * 1000
 
 
-def stamps_of_log(path: Path, time_unit: str | None = None) -> NDArray[np.int64]:
+def stamps_of_log(path: Path, time_unit: str | None = None) -> Int64Array:
     """Read a recorder's frame times, one row for each frame of its video, in order.
 
     A header names the time column and its unit; without one the file must have one column, in ``time_unit``.
@@ -168,7 +168,7 @@ def stamps_of_log(path: Path, time_unit: str | None = None) -> NDArray[np.int64]
     return table.stamps_ns(0, _required_unit(path, None, time_unit))
 
 
-def frame_log(path: Path, frame_ns: NDArray[np.int64], **noted: Any) -> FrameLog:
+def frame_log(path: Path, frame_ns: Int64Array, **noted: Any) -> FrameLog:
     """The log of frames with these times, on the IMU's clock; ``noted`` are its other fields.
 
     Raises
@@ -183,7 +183,7 @@ def frame_log(path: Path, frame_ns: NDArray[np.int64], **noted: Any) -> FrameLog
     return FrameLog(t_s=seconds(frame_ns, epoch_ns), epoch_ns=epoch_ns, shared_clock=True, **noted)
 
 
-def _time_column(table: Table, declared: str | None) -> NDArray[np.int64]:
+def _time_column(table: Table, declared: str | None) -> Int64Array:
     assert table.header is not None
     try:
         columns = [recognise(cell) for cell in table.header]
@@ -224,8 +224,8 @@ def _exposures(table: Table, column: int) -> Array:
 def stamps_in_order(
     path: Path,
     names: list[str],
-    t_ns: NDArray[np.int64],
-    line_numbers: NDArray[np.int64] | None = None,
+    t_ns: Int64Array,
+    line_numbers: Int64Array | None = None,
     exposure_s: Array | None = None,
 ) -> FrameStamps:
     """Stamps sorted by time; a name or time that comes twice is an error of ``path``."""

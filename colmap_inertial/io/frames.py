@@ -7,8 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import IndexArray, Int64Array, UInt8Array, UInt16Array
 from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.core.types import Frame, FrameLog, FrameTiming
 from colmap_inertial.io.capture import Capture, ImageFolder, Video, load_capture
@@ -56,9 +56,7 @@ def read_frames(
     return timing, _decode_images(capture, timing, _places(timing, only))
 
 
-def read_reduced(
-    capture: Capture, names: Collection[str], long_side_px: int
-) -> Iterator[tuple[str, NDArray[np.uint8]]]:
+def read_reduced(capture: Capture, names: Collection[str], long_side_px: int) -> Iterator[tuple[str, UInt8Array]]:
     """Some frames of a capture to look at: grey, 8 bit, not larger than ``long_side_px``, in order of time.
 
     Raises
@@ -77,7 +75,7 @@ def read_reduced(
         yield name_of[t_ns], grey
 
 
-def _places(timing: FrameTiming, only: Collection[str] | None) -> NDArray[np.intp]:
+def _places(timing: FrameTiming, only: Collection[str] | None) -> IndexArray:
     """Indices of the frames to decode."""
     if only is None:
         return np.arange(len(timing.names))
@@ -171,14 +169,14 @@ def image_names(source: ImageFolder) -> list[str]:
     return sorted(path.relative_to(source.folder).as_posix() for path in paths)
 
 
-def _decode_images(capture: Capture, timing: FrameTiming, places: NDArray[np.intp]) -> Iterator[Frame]:
+def _decode_images(capture: Capture, timing: FrameTiming, places: IndexArray) -> Iterator[Frame]:
     assert isinstance(capture.frames, ImageFolder)
     for i in places.tolist():
         path = path_in(capture.frames.folder, timing.names[i])
         yield _frame(capture, timing, i, path, read_image(path))
 
 
-def _video_frames(source: Video, log: FrameLog | None) -> tuple[FrameStamps, NDArray[np.int64]]:
+def _video_frames(source: Video, log: FrameLog | None) -> tuple[FrameStamps, Int64Array]:
     """Stamps of the frames to use, and the presentation stamps by which to find them in the video."""
     source_ns = video_stamps_ns(source.file)
     names = tuple(frame_name(int(t_ns), int(source_ns[0])) for t_ns in source_ns)
@@ -206,7 +204,7 @@ def _video_frames(source: Video, log: FrameLog | None) -> tuple[FrameStamps, NDA
     return FrameStamps(names=tuple(names[i] for i in keep), t_ns=t_ns[keep], exposure_s=exposure_s), source_ns[keep]
 
 
-def thin(t_ns: NDArray[np.int64], frames_per_s: float) -> NDArray[np.intp]:
+def thin(t_ns: Int64Array, frames_per_s: float) -> IndexArray:
     """Indices of about ``frames_per_s`` frames a second: for each tick of that clock the frame nearest to it."""
     since_s = (t_ns - t_ns[0]) / 1e9
     ticks = np.arange(int(since_s[-1] * frames_per_s) + 1) / frames_per_s
@@ -218,16 +216,14 @@ def thin(t_ns: NDArray[np.int64], frames_per_s: float) -> NDArray[np.intp]:
 
 
 def _decode_video(
-    capture: Capture, source: Video, timing: FrameTiming, source_ns: NDArray[np.int64], places: NDArray[np.intp]
+    capture: Capture, source: Video, timing: FrameTiming, source_ns: Int64Array, places: IndexArray
 ) -> Iterator[Frame]:
     place = {int(source_ns[i]): i for i in places.tolist()}
     for t_ns, image in decode_video(source.file, source_ns[places]):
         yield _frame(capture, timing, place[t_ns], source.file, image)
 
 
-def _frame(
-    capture: Capture, timing: FrameTiming, i: int, path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]
-) -> Frame:
+def _frame(capture: Capture, timing: FrameTiming, i: int, path: Path, image: UInt8Array | UInt16Array) -> Frame:
     camera = capture.camera
     if camera is not None and image.shape[:2] != (camera.height, camera.width):
         height, width = image.shape[:2]

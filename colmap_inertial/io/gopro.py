@@ -25,10 +25,10 @@ from pathlib import Path
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import FormatError
-from colmap_inertial.core.types import Array, FrameLog, HeightDatum, ImuRecording, PositionFixes
+from colmap_inertial.core.types import FrameLog, HeightDatum, ImuRecording, PositionFixes
 from colmap_inertial.io.frame_times import frame_log
 from colmap_inertial.io.gpmf import Entry, Stream, entries, read_streams
 from colmap_inertial.io.imu_text import recording
@@ -187,7 +187,7 @@ class _Telemetry:
 
     movie: Movie
     streams: dict[str, Stream]
-    payload_ns: NDArray[np.int64]
+    payload_ns: Int64Array
     shift_ns: int = 0
 
     @classmethod
@@ -200,7 +200,7 @@ class _Telemetry:
         plain = cls(movie=movie, streams=own, payload_ns=track.t_ns)
         return replace(plain, shift_ns=plain._video_minus_stamp_ns())
 
-    def times_ns(self, key: str) -> NDArray[np.int64]:
+    def times_ns(self, key: str) -> Int64Array:
         """(N,) when a stream's samples were taken, on the video's clock."""
         try:
             return self.streams[key].sample_times_ns(self.payload_ns) + self.shift_ns
@@ -327,7 +327,7 @@ def _stabilisation(settings: dict[str, Entry], image: Array | None) -> tuple[boo
     return (False if flag == "N" else None), words
 
 
-def _nearest(t_ns: NDArray[np.int64], values: Array, frame_ns: NDArray[np.int64]) -> Array | None:
+def _nearest(t_ns: Int64Array, values: Array, frame_ns: Int64Array) -> Array | None:
     """The sample nearest to each frame; ``None`` where frames lie outside the samples."""
     step_ns = float(np.median(np.diff(t_ns)))
     if frame_ns[0] < t_ns[0] - _MISSING_FRAMES * step_ns or frame_ns[-1] > t_ns[-1] + _MISSING_FRAMES * step_ns:

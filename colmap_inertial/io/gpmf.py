@@ -18,10 +18,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import FormatError
-from colmap_inertial.core.types import Array
 
 _ENTRY = struct.Struct(">4scBH")
 #: numpy's name of each type letter.
@@ -112,7 +111,7 @@ class Stream:
         return np.concatenate(self.data)
 
     @property
-    def count(self) -> NDArray[np.int64]:
+    def count(self) -> Int64Array:
         """(P,) samples in each payload."""
         return np.array([len(part) for part in self.data], dtype=np.int64)
 
@@ -120,7 +119,7 @@ class Stream:
         """A describing text, empty where there is none."""
         return self.about[key].text() if key in self.about else ""
 
-    def stamps(self, track_ns: NDArray[np.int64]) -> tuple[NDArray[np.int64], str]:
+    def stamps(self, track_ns: Int64Array) -> tuple[Int64Array, str]:
         """(P,) when each payload's first sample was taken, by the best clock there is; and which.
 
         Parameters
@@ -135,7 +134,7 @@ class Stream:
                 return np.array(found, dtype=np.int64), kind
         return track_ns[self.payload], "track"
 
-    def sample_times_ns(self, track_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    def sample_times_ns(self, track_ns: Int64Array) -> Int64Array:
         """(N,) when each sample was taken, by the clock of :meth:`stamps`; see :func:`spread`."""
         stamps, kind = self.stamps(track_ns)
         late_ns = 0
@@ -234,7 +233,7 @@ def _stamp(inside: dict[str, Entry], key: str) -> int | None:
     return int.from_bytes(entry.data[: entry.size], "big")
 
 
-def spread(stamp_ns: NDArray[np.int64], count: NDArray[np.int64], reach: int, lost_share: float) -> NDArray[np.int64]:
+def spread(stamp_ns: Int64Array, count: Int64Array, reach: int, lost_share: float) -> Int64Array:
     """When each sample was taken, from the stamps of the first sample of each payload.
 
     Samples are even within a payload, stamps jitter by what the camera was busy with. So a line is fitted to the stamps

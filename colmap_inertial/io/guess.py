@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
-from colmap_inertial.core.types import Array
 from colmap_inertial.io.plausible import GRAVITY_BOUNDS_M_S2, LARGEST_MEDIAN_RATE_RAD_S, STEADY_SHARE
 from colmap_inertial.io.tables import Table
 from colmap_inertial.io.units import STANDARD_GRAVITY_M_S2, TIME_UNITS_NS

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from colmap_inertial.core.types import Array
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.io.exif import HEAD_BYTES, PNG, exposure_of, jpeg_segments, png_chunks
 from colmap_inertial.io.files import read_bytes
 

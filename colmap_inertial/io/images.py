@@ -8,8 +8,8 @@ import zlib
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import UInt8Array, UInt16Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.io.files import read_bytes
 from colmap_inertial.io.limits import read_limits
@@ -21,7 +21,7 @@ SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".pgm", ".ppm")
 _SILENT = 0
 
 
-def read_image(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
+def read_image(path: Path) -> UInt8Array | UInt16Array:
     """Decode a picture: (H, W) or (H, W, 3) RGB, in the file's own depth, rows as stored.
 
     The orientation that EXIF may state is not applied, as COLMAP does not apply it either (pycolmap 4.2's
@@ -120,7 +120,7 @@ def _tiff_size(data: bytes) -> tuple[int, int] | None:
     return (found[256], found[257]) if len(found) == 2 else None
 
 
-def grey_8bit(image: NDArray[np.uint8] | NDArray[np.uint16]) -> NDArray[np.uint8]:
+def grey_8bit(image: UInt8Array | UInt16Array) -> UInt8Array:
     """(H, W) brightness of an image in 8 bit."""
     import cv2
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import FormatError
-from colmap_inertial.core.types import Array, ImuNoise, ImuRecording
+from colmap_inertial.core.types import ImuNoise, ImuRecording
 from colmap_inertial.io.columns import recognise
 from colmap_inertial.io.files import first_line
 from colmap_inertial.io.guess import how_to_describe
@@ -186,7 +186,7 @@ def column_index(table: Table, column: str | int) -> int:
     return table.header.index(column)
 
 
-def ordered(table: Table, quantity: Quantity, unit: str, t_ns: NDArray[np.int64], values: Array) -> Samples:
+def ordered(table: Table, quantity: Quantity, unit: str, t_ns: Int64Array, values: Array) -> Samples:
     """:func:`order_samples` of a table's rows."""
     samples = order_samples(table.path, quantity, unit, t_ns, values, table.line_numbers)
     return replace(samples, repairs=table.repairs + samples.repairs)

@@ -20,8 +20,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.geometry import colmap_px_from_opencv
 from colmap_inertial.core.types import CameraModel, FrameLog, ImuRecording
@@ -167,7 +167,7 @@ def _platform(path: Path, members: dict[str, str]) -> tuple[bool, bool]:
     )
 
 
-def _sensor(path: Path, members: dict[str, str], name: str) -> tuple[Table, NDArray[np.int64], NDArray[np.float64]]:
+def _sensor(path: Path, members: dict[str, str], name: str) -> tuple[Table, Int64Array, Array]:
     table = parse_table(path / name if path.is_dir() else path, text_of(path, members[name]))
     values = table.numbers([_column(table, axis) for axis in "xyz"])
     return table, table.stamps_ns(_column(table, "time"), "ns"), values

@@ -15,12 +15,10 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Int64Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.io.files import require_regular
-
-Int = NDArray[np.int64]
 
 #: Four letters at the start of a file of this family.
 _FIRST_BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
@@ -48,10 +46,10 @@ class Track:
 
     handler: str
     entry: str
-    offset: Int
-    size: Int
-    t_ns: Int
-    duration_ns: Int
+    offset: Int64Array
+    size: Int64Array
+    t_ns: Int64Array
+    duration_ns: Int64Array
     width_px: int = 0
     height_px: int = 0
 
@@ -78,7 +76,7 @@ class Movie:
             raise FormatError(self.path, f"holds no {what} (a track of format {entry})")
         return track
 
-    def frame_times_ns(self) -> Int:
+    def frame_times_ns(self) -> Int64Array:
         """(F,) presentation times of the video's frames, in order.
 
         Raises
@@ -100,12 +98,12 @@ class Movie:
         ends = begin + track.size
         return [data[b:e] for b, e in zip(begin.tolist(), ends.tolist(), strict=True)]
 
-    def beyond(self, track: Track) -> Int:
+    def beyond(self, track: Track) -> Int64Array:
         """Which of a track's samples do not lie inside the file."""
         length = self.path.stat().st_size
         return np.flatnonzero((track.offset < 0) | (track.size < 0) | (track.offset + track.size > length))
 
-    def contents(self, track: Track) -> tuple[bytes, Int]:
+    def contents(self, track: Track) -> tuple[bytes, Int64Array]:
         """A track's samples one after the other, and (N,) where each begins; neighbours in the file are read at once.
 
         Raises
@@ -251,7 +249,7 @@ class _Boxes:
             raise self.fail(begin, "a timescale of 0")
         return scale
 
-    def table(self, place: tuple[int, int] | None, name: str, kind: str, columns: int, head: int = 8) -> Int:
+    def table(self, place: tuple[int, int] | None, name: str, kind: str, columns: int, head: int = 8) -> Int64Array:
         """(N, columns) of a table whose number of rows stands just before the rows."""
         if place is None:
             return np.zeros((0, columns), dtype=np.int64)
@@ -314,7 +312,7 @@ def _entry(reader: _Boxes, place: tuple[int, int] | None, kind: str) -> tuple[st
     return entry, int(width), int(height)
 
 
-def _sizes(reader: _Boxes, place: tuple[int, int] | None) -> Int:
+def _sizes(reader: _Boxes, place: tuple[int, int] | None) -> Int64Array:
     if place is None:
         return np.zeros(0, dtype=np.int64)
     begin, end = place
@@ -327,7 +325,7 @@ def _sizes(reader: _Boxes, place: tuple[int, int] | None) -> Int:
     return np.full(count, common, dtype=np.int64)
 
 
-def _runs(reader: _Boxes, rows: Int, count: int, what: str) -> Int:
+def _runs(reader: _Boxes, rows: Int64Array, count: int, what: str) -> Int64Array:
     """(count,) values of a table of (how many, value)."""
     if int(rows[:, 0].sum()) != count or (rows[:, 0] < 0).any():
         raise FormatError(
@@ -336,7 +334,7 @@ def _runs(reader: _Boxes, rows: Int, count: int, what: str) -> Int:
     return np.repeat(rows[:, 1], rows[:, 0])
 
 
-def _offsets(reader: _Boxes, boxes: dict[bytes, tuple[int, int]], size: Int) -> Int:
+def _offsets(reader: _Boxes, boxes: dict[bytes, tuple[int, int]], size: Int64Array) -> Int64Array:
     """Where each sample begins: samples follow each other inside their chunk."""
     if b"co64" in boxes:
         chunks = reader.table(boxes[b"co64"], "co64", ">i8", 1)[:, 0]
@@ -380,7 +378,7 @@ def _edit_ns(reader: _Boxes, place: tuple[int, int] | None, scale: int, movie_sc
     return delay_ns
 
 
-def _ns(ticks: Int, scale: int) -> Int:
+def _ns(ticks: Int64Array, scale: int) -> Int64Array:
     """Nanoseconds of ticks, rounded once; whole seconds apart, so that nothing overflows."""
     whole, rest = np.divmod(ticks, scale)
     return np.asarray(whole * 1_000_000_000 + (2 * rest * 1_000_000_000 + scale) // (2 * scale), dtype=np.int64)

@@ -10,9 +10,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.types import ImuRecording
 from colmap_inertial.io.imu_text import ordered, recording
@@ -83,7 +81,7 @@ def _samples(path: Path, member: str, name: str, quantity: str, pattern: str, un
         text = text.replace(",", ".")
     table = parse_table(path / name if path.is_dir() else path, text)
     columns = [_column(table, pattern.format(axis)) for axis in "xyz"]
-    values: NDArray[np.float64] = table.numbers(columns)
+    values: Array = table.numbers(columns)
     t_ns = table.stamps_ns(_column(table, r"time \(s\)"), "s")
     return ordered(table, "gyro" if quantity == "gyro" else "accel", unit, t_ns, values)
 

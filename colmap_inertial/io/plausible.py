@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
-from colmap_inertial.core.types import Array, ImuRecording
+from colmap_inertial.core.types import ImuRecording
 from colmap_inertial.io.consistency import better_readings
 from colmap_inertial.io.units import SENSOR_NAMES, STANDARD_GRAVITY_M_S2, Axes, Quantity
 

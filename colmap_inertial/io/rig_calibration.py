@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.geometry import colmap_px_from_opencv, matrix_from_quat
 from colmap_inertial.core.types import LengthUnit
@@ -19,7 +19,6 @@ from colmap_inertial.io.capture_tables import CAMERA_MODELS
 from colmap_inertial.io.files import read_bytes, read_text, read_yaml
 from colmap_inertial.io.sensor_yaml import Sheet, is_rotation
 
-Matrix = NDArray[np.float64]
 Metres = Literal["m", "mm"]
 
 
@@ -40,7 +39,7 @@ class MountedCamera:
     model: str
     params: tuple[float, ...]
     size: tuple[int, int] | None
-    cam_from_rig: Matrix
+    cam_from_rig: Array
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -235,7 +234,7 @@ def _from_model(path: Path, unit: Metres | None) -> RigCalibration:
             found[number] = models[model], (width, height), take(f"<{CAMERA_MODELS[models[model]][0]}d")
         return found
 
-    def read_rigs(take: Callable[[str], tuple[Any, ...]]) -> list[dict[int, Matrix]]:
+    def read_rigs(take: Callable[[str], tuple[Any, ...]]) -> list[dict[int, Array]]:
         found = []
         for _ in range(take("<Q")[0]):
             _, count = take("<II")

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import FormatError, MissingExtraError
-from colmap_inertial.core.types import Array, ImuRecording
+from colmap_inertial.core.types import ImuRecording
 from colmap_inertial.io.imu_text import recording
 from colmap_inertial.io.samples import Samples, order_samples
 from colmap_inertial.io.units import SENSOR_NAMES, DeclaredUnits, Quantity
@@ -83,7 +83,7 @@ def read_rosbag(path: Path, units: DeclaredUnits) -> ImuRecording:
     return recording(found["gyro"], found.get("accel"))
 
 
-_Series = tuple[NDArray[np.int64], Array]
+_Series = tuple[Int64Array, Array]
 
 
 def _topics(reader: AnyReader) -> dict[str, dict[str, _Series]]:

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, IndexArray, Int64Array
 from colmap_inertial.core.errors import FormatError, TimingError
-from colmap_inertial.core.types import Array
 from colmap_inertial.io.units import SENSOR_NAMES, Quantity, to_si
 
 #: A sample this far behind the newest one before it means that the clock was set back, not that rows changed places.
@@ -49,7 +49,7 @@ class Samples:
         What was sorted, merged or dropped.
     """
 
-    t_ns: NDArray[np.int64]
+    t_ns: Int64Array
     values: Array
     repairs: tuple[str, ...]
 
@@ -58,9 +58,9 @@ def order_samples(
     path: Path,
     quantity: Quantity,
     unit: str,
-    t_ns: NDArray[np.int64],
+    t_ns: Int64Array,
     values: Array,
-    line_numbers: NDArray[np.int64] | None = None,
+    line_numbers: Int64Array | None = None,
 ) -> Samples:
     """Samples in SI units; sort, merge and drop what is harmless.
 
@@ -99,8 +99,8 @@ class _Rows:
     path: Path
     what: str
     counted: str
-    numbers: NDArray[np.int64]
-    t_ns: NDArray[np.int64]
+    numbers: Int64Array
+    t_ns: Int64Array
     values: Array
     repairs: tuple[Repair, ...] = ()
 
@@ -189,13 +189,13 @@ def _merged(rows: _Rows) -> _Rows:
     return rows
 
 
-def nearest(t_ns: NDArray[np.int64], at_ns: NDArray[np.int64]) -> NDArray[np.intp]:
+def nearest(t_ns: Int64Array, at_ns: Int64Array) -> IndexArray:
     """(M,) which of the increasing times (N,) is nearest to each of (M,) others."""
     after = np.clip(np.searchsorted(t_ns, at_ns), 1, len(t_ns) - 1)
     return np.where(at_ns - t_ns[after - 1] < t_ns[after] - at_ns, after - 1, after)
 
 
-def check_rate(path: Path, what: str, t_ns: NDArray[np.int64]) -> None:
+def check_rate(path: Path, what: str, t_ns: Int64Array) -> None:
     """Refuse stamps that cannot be in the unit they were read with.
 
     Raises

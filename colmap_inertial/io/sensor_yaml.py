@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.geometry import colmap_px_from_opencv
 from colmap_inertial.core.types import CameraModel, ImuNoise
@@ -57,7 +57,7 @@ class Sheet:
             raise self.fault(f"{key} must hold {count} numbers, found {len(numbers)}")
         return numbers
 
-    def pose(self, key: str, what: str) -> NDArray[np.float64]:
+    def pose(self, key: str, what: str) -> Array:
         """A (4, 4) matrix that moves and rotates."""
         matrix = np.array(self.numbers(key, 16)).reshape(4, 4)
         if not is_rotation(matrix[:3, :3]):
@@ -83,7 +83,7 @@ class Sheet:
         return _COLMAP_MODELS[distortion], params, (int(width), int(height))
 
 
-def is_rotation(matrix: NDArray[np.float64]) -> bool:
+def is_rotation(matrix: Array) -> bool:
     """Whether a (3, 3) matrix is a rotation, to the precision that people write."""
     return bool(np.abs(matrix @ matrix.T - np.eye(3)).max() <= 1e-3 and np.linalg.det(matrix) > 0)
 
@@ -119,7 +119,7 @@ def read_camera(path: Path) -> CameraModel:
         raise FormatError(path, f"resolution: {error}") from None
 
 
-def read_body_from_sensor(path: Path) -> NDArray[np.float64]:
+def read_body_from_sensor(path: Path) -> Array:
     """(4, 4) ``T_BS``: body frame from sensor frame, metres."""
     entry = _read(path).values.get("T_BS")
     if not isinstance(entry, dict):

@@ -12,8 +12,9 @@ import re
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import matrix_from_quat, quat_multiply
-from colmap_inertial.core.types import Array, Similarity
+from colmap_inertial.core.types import Similarity
 
 _POSITION, _NORMAL, _ROTATION = ("x", "y", "z"), ("nx", "ny", "nz"), tuple(f"rot_{i}" for i in range(4))
 #: Fields by which a vertex is a splat; lengths that some programs add.

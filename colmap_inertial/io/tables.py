@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import FormatError
-from colmap_inertial.core.types import Array
 from colmap_inertial.io.files import read_text
 from colmap_inertial.io.limits import read_limits
 from colmap_inertial.io.units import stamps_ns
@@ -43,7 +42,7 @@ class Table:
     header: tuple[str, ...] | None
     header_text: str
     lines: tuple[str, ...]
-    line_numbers: NDArray[np.int64]
+    line_numbers: Int64Array
     delimiter: str | None
     width: int
     repairs: tuple[str, ...] = ()
@@ -78,7 +77,7 @@ class Table:
         except ValueError:
             return self._numbers_cell_by_cell(columns)
 
-    def stamps_ns(self, column: int, unit: str) -> NDArray[np.int64]:
+    def stamps_ns(self, column: int, unit: str) -> Int64Array:
         """(N,) exact nanoseconds of a zero-based column of time stamps in ``unit``."""
         return stamps_ns(self.path, self.text(column), unit, self.line_numbers)
 

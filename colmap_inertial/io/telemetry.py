@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, MissingExtraError
-from colmap_inertial.core.types import Array, FrameLog, ImuRecording
+from colmap_inertial.core.types import FrameLog, ImuRecording
 from colmap_inertial.io.files import first_line
 from colmap_inertial.io.imu_text import recording
 from colmap_inertial.io.samples import Samples, order_samples

@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.core.geometry import quat_conjugate, quat_normalize
-from colmap_inertial.core.types import Array, CameraTrajectory, ImuRecording, SmoothedTrajectory
+from colmap_inertial.core.types import CameraTrajectory, ImuRecording, SmoothedTrajectory
 from colmap_inertial.io.files import write_text
 from colmap_inertial.io.imu import read_imu
 from colmap_inertial.io.tables import Table, read_table
@@ -109,7 +109,7 @@ def _finite(table: Table, columns: list[int]) -> Array:
     return numbers
 
 
-def _increasing(table: Table, t_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+def _increasing(table: Table, t_ns: Int64Array) -> Int64Array:
     bad = np.flatnonzero(np.diff(t_ns) <= 0)
     if len(bad):
         line = int(table.line_numbers[bad[0] + 1])

@@ -11,10 +11,9 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import FormatError, TimingError
-from colmap_inertial.core.types import Array
 
 Quantity = Literal["gyro", "accel"]
 
@@ -63,7 +62,7 @@ def to_si(values: Array, quantity: Quantity, unit: str) -> Array:
     return values if factor == 1.0 else values * factor
 
 
-def seconds(t_ns: NDArray[np.int64], epoch_ns: int) -> Array:
+def seconds(t_ns: Int64Array, epoch_ns: int) -> Array:
     """Seconds since ``epoch_ns``: the difference is taken in whole nanoseconds, so nothing is lost."""
     return np.asarray((t_ns - epoch_ns) / 1e9, dtype=np.float64)
 
@@ -78,7 +77,7 @@ class Axes:
         (3, 3) signed permutation: ``v_imu = matrix @ v_file``.
     """
 
-    matrix: NDArray[np.float64]
+    matrix: Array
 
     @classmethod
     def parse(cls, text: str) -> Axes:
@@ -121,8 +120,8 @@ class Axes:
 
 
 def stamps_ns(
-    path: Path, tokens: Sequence[str], unit: str, line_numbers: Sequence[int] | NDArray[np.int64] | None = None
-) -> NDArray[np.int64]:
+    path: Path, tokens: Sequence[str], unit: str, line_numbers: Sequence[int] | Int64Array | None = None
+) -> Int64Array:
     """Exact integer nanoseconds of time stamps written as text.
 
     Parameters

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Int64Array, UInt8Array, UInt16Array
 from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.io.files import require_regular
 from colmap_inertial.io.mp4 import is_mp4, read_movie
@@ -31,7 +31,7 @@ T = TypeVar("T")
 _UNSTATED, _HD_ROWS = 2, 720
 
 
-def video_stamps_ns(path: Path) -> NDArray[np.int64]:
+def video_stamps_ns(path: Path) -> Int64Array:
     """(F,) presentation time of every frame, without decoding: nanoseconds on the container's clock, its start offset
     included, in order. Frames that an edit list cuts away have none.
 
@@ -87,9 +87,7 @@ def frame_name(t_ns: int, first_ns: int) -> str:
     return f"frame_{(t_ns - min(0, first_ns) + 500) // 1000:012d}.png"
 
 
-def decode_video(
-    path: Path, wanted_ns: NDArray[np.int64]
-) -> Iterator[tuple[int, NDArray[np.uint8] | NDArray[np.uint16]]]:
+def decode_video(path: Path, wanted_ns: Int64Array) -> Iterator[tuple[int, UInt8Array | UInt16Array]]:
     """Decode the frames with the wanted presentation stamps, in order.
 
     Rotation that the container states is not applied: rows stay the sensor's rows, which the rolling shutter, the
@@ -104,15 +102,13 @@ def decode_video(
         yield t_ns, _pixels(frame)
 
 
-def decode_reduced(
-    path: Path, wanted_ns: NDArray[np.int64], long_side_px: int
-) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+def decode_reduced(path: Path, wanted_ns: Int64Array, long_side_px: int) -> Iterator[tuple[int, UInt8Array]]:
     """As :func:`decode_video`, but 8 bit of brightness, as coded, not larger than ``long_side_px``: to look at."""
     for t_ns, frame in _wanted(path, wanted_ns):
         yield t_ns, reduced(_brightness(frame), long_side_px)
 
 
-def reduced(grey: NDArray[np.uint8], long_side_px: int) -> NDArray[np.uint8]:
+def reduced(grey: UInt8Array, long_side_px: int) -> UInt8Array:
     """A grey picture, shrunk by area where its longer side is longer than this."""
     import cv2
 
@@ -123,7 +119,7 @@ def reduced(grey: NDArray[np.uint8], long_side_px: int) -> NDArray[np.uint8]:
     return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
-def decode_grey(path: Path) -> Iterator[tuple[int, int, NDArray[np.uint8]]]:
+def decode_grey(path: Path) -> Iterator[tuple[int, int, UInt8Array]]:
     """Every frame's presentation stamp in nanoseconds, the turn that the container wants (degrees), and (H, W) grey.
 
     The grey is in the sensor's orientation, as :func:`decode_video` has it.
@@ -138,7 +134,7 @@ def decode_grey(path: Path) -> Iterator[tuple[int, int, NDArray[np.uint8]]]:
                 yield t_ns, turn, np.asarray(frame.to_ndarray(format="gray"), dtype=np.uint8)
 
 
-def _wanted(path: Path, wanted_ns: NDArray[np.int64]) -> Iterator[tuple[int, av.VideoFrame]]:
+def _wanted(path: Path, wanted_ns: Int64Array) -> Iterator[tuple[int, av.VideoFrame]]:
     """The frames with the wanted stamps, each of them whole, and all of one size."""
     if len(wanted_ns) == 0:
         return
@@ -176,7 +172,7 @@ def _ns(pts: int, numerator: int, denominator: int) -> int:
     return (2 * pts * numerator * 1_000_000_000 + denominator) // (2 * denominator)
 
 
-def _pixels(frame: av.VideoFrame) -> NDArray[np.uint8] | NDArray[np.uint16]:
+def _pixels(frame: av.VideoFrame) -> UInt8Array | UInt16Array:
     grey = frame.format.name.startswith("gray")
     deep = max(component.bits for component in frame.format.components) > 8
     layout = ("gray16le" if deep else "gray") if grey else ("rgb48le" if deep else "rgb24")
@@ -185,7 +181,7 @@ def _pixels(frame: av.VideoFrame) -> NDArray[np.uint8] | NDArray[np.uint16]:
     return np.asarray(pixels, dtype=np.uint16) if deep else np.asarray(pixels, dtype=np.uint8)
 
 
-def _brightness(frame: av.VideoFrame) -> NDArray[np.uint8]:
+def _brightness(frame: av.VideoFrame) -> UInt8Array:
     """The plane of brightness, as it is coded, in 8 bit; FFmpeg's grey is ten times as slow."""
     name, bits = frame.format.name, frame.format.components[0].bits
     if not name.startswith(("yuv", "nv12", "gray")) or name.endswith("be"):

@@ -16,10 +16,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import FormatError
-from colmap_inertial.core.types import Array, FrameLog, ImuRecording
+from colmap_inertial.core.types import FrameLog, ImuRecording
 from colmap_inertial.io.files import read_bytes
 from colmap_inertial.io.frame_times import frame_log
 from colmap_inertial.io.imu_text import recording
@@ -123,7 +123,7 @@ def _stabilisation(file: Path, data: bytes, lens_moves: bool) -> tuple[bool | No
     return (True, "optical") if lens_moves else (None, "")
 
 
-def _samples(file: Path, t_ns: NDArray[np.int64], rows: list[bytes], quantity: Quantity, unit: str) -> Samples | None:
+def _samples(file: Path, t_ns: Int64Array, rows: list[bytes], quantity: Quantity, unit: str) -> Samples | None:
     """Samples of one sensor; messages without it are passed over."""
     has = np.array([len(row) > 0 for row in rows], dtype=bool)
     if not has.any():

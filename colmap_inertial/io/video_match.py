@@ -8,14 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Float32Array, UInt8Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.io.images import grey_8bit, read_image
 from colmap_inertial.io.names import path_in
 from colmap_inertial.io.video import decode_grey
-
-Floats = NDArray[np.float32]
 
 #: Sides of the thumbnails: the small one chooses which frames are compared closely, the large one decides.
 _SMALL, _LARGE = 40, 128
@@ -52,7 +50,7 @@ class VideoMatch:
 class _Candidates:
     """The two frames that look most like each picture so far."""
 
-    def __init__(self, images: NDArray[np.uint8]) -> None:
+    def __init__(self, images: UInt8Array) -> None:
         self._small = np.array([_normalised(_smaller(image)) for image in images])
         self._large = np.ascontiguousarray(images)
         self._correlation = np.full((len(images), _CANDIDATES), _LEAST, dtype=np.float32)
@@ -60,7 +58,7 @@ class _Candidates:
         self._frames = np.zeros((len(images), 2, *images.shape[1:]), dtype=np.uint8)
         self.t_ns = np.zeros((len(images), 2), dtype=np.int64)
 
-    def offer(self, t_ns: int, grey: NDArray[np.uint8]) -> None:
+    def offer(self, t_ns: int, grey: UInt8Array) -> None:
         """Compare a frame with all pictures."""
         thumbnail = _thumbnail(grey, _LARGE)
         correlation = self._small @ _normalised(_smaller(thumbnail))
@@ -146,7 +144,7 @@ def _decided(candidates: _Candidates, names: Sequence[str]) -> tuple[dict[str, i
     return found, doubtful
 
 
-def _thumbnail(grey: NDArray[np.uint8], side: int) -> NDArray[np.uint8]:
+def _thumbnail(grey: UInt8Array, side: int) -> UInt8Array:
     """(side, side) 8 bit, whatever the aspect; blurred a little, as resizing filters differ."""
     import cv2
 
@@ -154,13 +152,13 @@ def _thumbnail(grey: NDArray[np.uint8], side: int) -> NDArray[np.uint8]:
     return np.asarray(cv2.GaussianBlur(shrunk, (0, 0), 1.0), dtype=np.uint8)
 
 
-def _smaller(thumbnail: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def _smaller(thumbnail: UInt8Array) -> UInt8Array:
     import cv2
 
     return np.asarray(cv2.resize(thumbnail, (_SMALL, _SMALL), interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
-def _normalised(thumbnail: NDArray[np.uint8]) -> Floats:
+def _normalised(thumbnail: UInt8Array) -> Float32Array:
     """(N,) zero mean, unit length; zero for a flat picture, which looks like nothing."""
     values = thumbnail.astype(np.float32).ravel()
     values -= values.mean()
@@ -168,6 +166,6 @@ def _normalised(thumbnail: NDArray[np.uint8]) -> Floats:
     return np.asarray(values / length if length > values.size**0.5 else values * 0)
 
 
-def _distance(a: Floats, b: Floats) -> float:
+def _distance(a: Float32Array, b: Float32Array) -> float:
     """Root of one minus the correlation."""
     return float(np.sqrt(max(0.0, 1 - float(a @ b))))

@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import AlreadyMetricError, FormatError, OutputExistsError, TimingError
 from colmap_inertial.core.geometry import cross
 from colmap_inertial.core.types import (
-    Array,
     CameraModel,
     CameraTrajectory,
     FrameTiming,
@@ -292,9 +291,7 @@ def trajectory_from_model(
     return trajectory, notes
 
 
-def _pose_covariances(
-    reconstruction: pycolmap.Reconstruction, images: Sequence[pycolmap.Image]
-) -> NDArray[np.float64] | None:
+def _pose_covariances(reconstruction: pycolmap.Reconstruction, images: Sequence[pycolmap.Image]) -> Array | None:
     """(F, 6, 6) covariances of the poses given the points, in the terms of ``CameraTrajectory.pose_cov``.
 
     What an image's own observations say about its pose: the error that a pose does not share with its neighbours,

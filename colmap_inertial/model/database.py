@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.types import Similarity
@@ -46,8 +46,8 @@ class PlacedModel:
     """
 
     index: int
-    centres: Mapping[str, NDArray[np.float64]]
-    sensors: Mapping[tuple[int, int], NDArray[np.float64]]
+    centres: Mapping[str, Array]
+    sensors: Mapping[tuple[int, int], Array]
 
     def extent(self) -> float:
         """Diagonal of the box around the cameras."""
@@ -201,8 +201,8 @@ def _transform(
 class _Prior:
     rowid: int
     name: str
-    position: NDArray[np.float64]
-    covariance: NDArray[np.float64] | None
+    position: Array
+    covariance: Array | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,10 +210,10 @@ class _Rig:
     rowid: int
     kind: int
     sensor: int
-    pose: NDArray[np.float64]
+    pose: Array
 
 
-def _doubles(path: Path, what: str, blob: object, count: int) -> NDArray[np.float64] | None:
+def _doubles(path: Path, what: str, blob: object, count: int) -> Array | None:
     if blob is None:
         return None
     if not isinstance(blob, bytes) or len(blob) != 8 * count:

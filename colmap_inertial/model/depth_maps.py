@@ -6,15 +6,13 @@ import os
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Float32Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.model.artefacts import check_map
 
-Real = NDArray[np.float32]
 
-
-def read_map(path: Path, channels: int = 1) -> Real:
+def read_map(path: Path, channels: int = 1) -> Float32Array:
     """Read a map.
 
     Returns
@@ -36,7 +34,7 @@ def read_map(path: Path, channels: int = 1) -> Real:
     return np.asarray(planes[0] if channels == 1 else np.moveaxis(planes, 0, -1), dtype=np.float32)
 
 
-def write_map(path: Path, values: Real) -> None:
+def write_map(path: Path, values: Float32Array) -> None:
     """Write (H, W) depths or (H, W, 3) normals; the file appears whole or not at all, its folders are made."""
     planes = values[None] if values.ndim == 2 else np.moveaxis(values, -1, 0)
     channels, height, width = planes.shape

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+
+from colmap_inertial.core.arrays import Array
 
 if TYPE_CHECKING:
     import pycolmap
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
 _MOST_IMAGES = 400
 
 
-def intrinsics_sigma(reconstruction: pycolmap.Reconstruction) -> dict[int, NDArray[np.float64]]:
+def intrinsics_sigma(reconstruction: pycolmap.Reconstruction) -> dict[int, Array]:
     """Standard deviations of the cameras' parameters, by a camera's number.
 
     Parameters

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.model import model_format, read_model
 from colmap_inertial.model.database import PlacedModel
@@ -114,7 +114,7 @@ def _submodels(root: Path, models: list[Path], dense: list[Path], *, one_for_all
 def _placed(folder: Path, index: int) -> PlacedModel:
     model = read_model(folder)
     images = [model.image(i) for i in model.reg_image_ids()]
-    sensors: dict[tuple[int, int], NDArray[np.float64]] = {}
+    sensors: dict[tuple[int, int], Array] = {}
     for rig in model.rigs.values():
         for sensor, pose in rig.non_ref_sensors.items():
             if pose is not None:

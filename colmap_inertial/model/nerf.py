@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.quantiles import Z95
-from colmap_inertial.core.types import DOWN_IN_WORLD, UNDOES, Array, Similarity
+from colmap_inertial.core.types import DOWN_IN_WORLD, UNDOES, Similarity
 from colmap_inertial.io.files import read_json
 from colmap_inertial.model.database import PlacedModel
 

@@ -5,15 +5,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+
+from colmap_inertial.core.arrays import Int64Array
 
 if TYPE_CHECKING:
     import pycolmap
 
-Ids = NDArray[np.int64]
 
-
-def points_of_features(image: pycolmap.Image) -> Ids:
+def points_of_features(image: pycolmap.Image) -> Int64Array:
     """Of an image's features, the numbers of their points; -1 without one."""
     points = np.full(image.num_points2D(), -1, dtype=np.int64)
     seen = np.array(image.get_observation_point2D_idxs(), dtype=np.intp)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from colmap_inertial.core.types import Array
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.imaging.gyro_camera import FrameShutter
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
-from colmap_inertial.core.types import Array
 from colmap_inertial.model.binary import LARGEST
 
 if TYPE_CHECKING:

@@ -11,8 +11,8 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, Float32Array, IndexArray, UInt8Array, UInt16Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import (
     cross,
@@ -24,10 +24,8 @@ from colmap_inertial.core.geometry import (
 )
 from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.sampling import without_running_mean
-from colmap_inertial.core.types import Array, CameraTrajectory, Frame, FrameTiming, ImuRecording, Projector
+from colmap_inertial.core.types import CameraTrajectory, Frame, FrameTiming, ImuRecording, Projector
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
-
-Grey = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,7 +94,7 @@ class VisualRotation:
     t_s: Array
     turn_rad: Array
     sigma_rad: Array
-    support: NDArray[np.intp]
+    support: IndexArray
     tracks: tuple[Tracks, ...] = ()
     epoch_ns: int = 0
 
@@ -159,7 +157,7 @@ def measure_rotation(
     sigmas: list[float] = []
     support: list[int] = []
     tracks: list[Tracks] = []
-    before: tuple[Grey, FrameShutter] | None = None
+    before: tuple[UInt8Array, FrameShutter] | None = None
     for frame in frames:
         height, width = frame.image.shape[:2]
         shutter = FrameShutter.of(timing, index[frame.name], width=width, height=height)
@@ -344,7 +342,7 @@ _INLIER_PX, _SCATTER_FLOOR_PX = 3.0, 0.05
 _DRAWS, _ROUNDS = 100, 15
 
 
-def reduced(image: NDArray[np.uint8] | NDArray[np.uint16], options: FlowOptions) -> Grey:
+def reduced(image: UInt8Array | UInt16Array, options: FlowOptions) -> UInt8Array:
     import cv2
 
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
@@ -356,7 +354,10 @@ def reduced(image: NDArray[np.uint8] | NDArray[np.uint16], options: FlowOptions)
 
 
 def _pair_rotation(
-    before: tuple[Grey, FrameShutter], now: tuple[Grey, FrameShutter], camera: Projector, options: FlowOptions
+    before: tuple[UInt8Array, FrameShutter],
+    now: tuple[UInt8Array, FrameShutter],
+    camera: Projector,
+    options: FlowOptions,
 ) -> tuple[Array, float, int, Tracks] | None:
     """Rotation vector of ``before_from_now``, its standard deviation, how many tracks agree, and all of them."""
     shutters = before[1], now[1]
@@ -384,7 +385,7 @@ def _pair_rotation(
 
 
 def followed_points(
-    before: Grey, now: Grey, shutter: FrameShutter, options: FlowOptions
+    before: UInt8Array, now: UInt8Array, shutter: FrameShutter, options: FlowOptions
 ) -> Iterator[tuple[Array, Array]]:
     """(N, 2) points that were followed from one reduced picture to the other, px of the picture as it is.
 
@@ -397,7 +398,7 @@ def followed_points(
             yield first, second
 
 
-def _tracked(before: Grey, now: Grey, options: FlowOptions) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _tracked(before: UInt8Array, now: UInt8Array, options: FlowOptions) -> tuple[Float32Array, Float32Array]:
     """Corners followed by pyramidal Lucas-Kanade, and back again; spread over the picture."""
     import cv2
 
@@ -412,7 +413,7 @@ def _tracked(before: Grey, now: Grey, options: FlowOptions) -> tuple[NDArray[np.
     return corners.reshape(-1, 2)[good], there.reshape(-1, 2)[good]
 
 
-def _matched(before: Grey, now: Grey, options: FlowOptions) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _matched(before: UInt8Array, now: UInt8Array, options: FlowOptions) -> tuple[Float32Array, Float32Array]:
     """Features that are each other's best match: for frames too far apart to be tracked."""
     import cv2
 

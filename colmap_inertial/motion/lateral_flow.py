@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from colmap_inertial.core.types import Array, Frame, FrameTiming, Projector
+from colmap_inertial.core.arrays import Array, UInt8Array
+from colmap_inertial.core.types import Frame, FrameTiming, Projector
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
-from colmap_inertial.motion.flow import FlowOptions, Grey, followed_points, reduced
+from colmap_inertial.motion.flow import FlowOptions, followed_points, reduced
 
 #: Share of the points that are slower: as of a frame's blur, which is the 90th percentile over the picture.
 _PERCENTILE = 90
@@ -71,7 +72,7 @@ def follow_pairs(
     """
     options = options or FlowOptions()
     index = {name: i for i, name in enumerate(timing.names)}
-    before: tuple[str, Grey, FrameShutter] | None = None
+    before: tuple[str, UInt8Array, FrameShutter] | None = None
     for frame in frames:
         height, width = frame.image.shape[:2]
         shutter = FrameShutter.of(timing, index[frame.name], width=width, height=height)

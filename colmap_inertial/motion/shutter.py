@@ -14,11 +14,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, IndexArray
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import cross
-from colmap_inertial.core.types import Array, ReadoutDirection
+from colmap_inertial.core.types import ReadoutDirection
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.motion.flow import VisualRotation
 
@@ -132,8 +132,8 @@ class _Seen:
         (K,) between the frames.
     """
 
-    begins: NDArray[np.intp]
-    pair: NDArray[np.intp]
+    begins: IndexArray
+    pair: IndexArray
     t_s: Array
     place: Array
     rays: Array

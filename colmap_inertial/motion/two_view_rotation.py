@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, Float32Array
 from colmap_inertial.core.geometry import so3_log
-from colmap_inertial.core.types import Array, Frame, FrameTiming, Projector
+from colmap_inertial.core.types import Frame, FrameTiming, Projector
 from colmap_inertial.motion.flow import FlowOptions, VisualRotation, reduced
 
 #: Features of a picture; matches of two pictures that must agree; how far a match may lie off, px of the reduced one.
@@ -33,7 +33,7 @@ class _Seen:
     """The features of one picture: pixels, rays (z = 1), descriptors."""
 
     rays: Array
-    descriptors: NDArray[np.float32]
+    descriptors: Float32Array
     pixel_rad: float
 
 

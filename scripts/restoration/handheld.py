@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import matrix_from_quat, quat_normalize
-from colmap_inertial.core.types import Array
 from colmap_inertial.tools.simulate import MotionOptions, make_motion
 
 #: Motion capture's places at 120 Hz are smoothed by this many samples: what lies above 15 Hz is its noise.

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import matrix_from_quat
-from colmap_inertial.core.types import Array
 from restoration.handheld import Handheld
 
 #: Instants, evenly over an exposure and the readout of a piece, between which turning and moving are interpolated.

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Float32Array
 from colmap_inertial.imaging.transfer import decode_table
 
 #: Every so many-th photograph is never trained on.
@@ -37,7 +37,7 @@ class Album:
     def __init__(self, paths: list[Path]) -> None:
         self.pictures = [np.asarray(cv2.imread(str(p), cv2.IMREAD_COLOR_RGB)) for p in paths]
 
-    def piece(self, side: int, rng: np.random.Generator) -> NDArray[np.float32]:
+    def piece(self, side: int, rng: np.random.Generator) -> Float32Array:
         """(side, side, 3) linear light: any part of any photograph, turned by right angles, at 1/2 to full size."""
         picture = self.pictures[rng.integers(len(self.pictures))]
         height, width = picture.shape[:2]

@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from rich.progress import track
 
+from colmap_inertial.core.arrays import IndexArray
 from restoration.photographs import photographs
 from restoration.samples import BLUR_CHANNELS, MARGIN, SIDE, Maker, Material, Samples
 
@@ -44,7 +45,7 @@ class Pool:
     def __len__(self) -> int:
         return len(self.arrays["picture"])
 
-    def batch(self, which: Sequence[int] | NDArray[np.intp]) -> Samples:
+    def batch(self, which: Sequence[int] | IndexArray) -> Samples:
         """Some of them."""
         order = np.sort(np.asarray(which))
         return Samples(**{name: np.asarray(array[order]) for name, array in self.arrays.items()})

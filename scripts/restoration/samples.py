@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from colmap_inertial.core.types import Array
+from colmap_inertial.core.arrays import Array, Float32Array, UInt8Array
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath, middles, samples_for
 from colmap_inertial.imaging.path_filters import path_wiener
@@ -21,8 +21,6 @@ from restoration.camera import jpeg, light_of, noisy, sharpened, srgb
 from restoration.handheld import Handheld, recorded, simulated
 from restoration.optics import ShotOptions, Shots, draw_shots
 from restoration.photographs import Album, photographs
-
-Codes = NDArray[np.uint8]
 
 #: Pieces are made so large, and lose this much at each edge, so that few see an edge as only pictures' edges are.
 SIDE, MARGIN = 256, 32
@@ -44,10 +42,10 @@ _TRUTH = "_gt.csv.xz"
 class Samples:
     """B samples, (B, S, S, 3) uint8 each, and (B, S / 2, S / 2, C) float16 blur as the networks take it."""
 
-    picture: Codes
-    aid: Codes
+    picture: UInt8Array
+    aid: UInt8Array
     blur: NDArray[np.float16]
-    truth: Codes
+    truth: UInt8Array
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -279,17 +277,17 @@ def _colourless(light: Tensor) -> Tensor:
     return (light == light[:, :1]).flatten(1).all(dim=1)[:, None, None, None]
 
 
-def _bytes(code: Tensor) -> Codes:
+def _bytes(code: Tensor) -> UInt8Array:
     """(B, S, S, 3) of (B, 3, S, S) codes 0 to 1."""
     return (255 * code).round().clamp(0, 255).byte().permute(0, 2, 3, 1).contiguous().cpu().numpy()
 
 
-def _line_feeds(vectors: Tensor) -> list[NDArray[np.float32]]:
+def _line_feeds(vectors: Tensor) -> list[Float32Array]:
     fields = [BlurField(width=SIDE, height=SIDE, vector_px=v, step_px=_NODE_PX) for v in vectors.cpu().numpy()]
     return [blur_feed(field, _WHOLE, _WHOLE) for field in fields]
 
 
-def _trimmed(picture: Codes, aid: Codes, feeds: list[NDArray[np.float32]], truth: Codes) -> Samples:
+def _trimmed(picture: UInt8Array, aid: UInt8Array, feeds: list[Float32Array], truth: UInt8Array) -> Samples:
     inner = slice(MARGIN, SIDE - MARGIN)
     half = slice(MARGIN // 2, (SIDE - MARGIN) // 2)
     blur = np.concatenate(feeds).transpose(0, 2, 3, 1)

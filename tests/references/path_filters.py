@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from colmap_inertial.core.types import Array
+from colmap_inertial.core.arrays import AnyArray, Array, BoolArray, ComplexArray, Float32Array
 from colmap_inertial.imaging._tiles import Tiling
 from colmap_inertial.imaging.path_filters import (
     DATA_WEIGHT,
@@ -25,10 +24,10 @@ from colmap_inertial.imaging.path_filters import (
 
 
 def filter_reference(
-    light: NDArray[np.float32],
+    light: Float32Array,
     tiling: Tiling,
-    paths: NDArray[np.float32],
-    spreads: NDArray[np.float32],
+    paths: Float32Array,
+    spreads: Float32Array,
     noise: Noise,
     splitting: tuple[float, ...],
 ) -> Array:
@@ -45,7 +44,7 @@ def filter_reference(
     return total[begin : begin + tiling.height, begin : begin + tiling.width]
 
 
-def noise_reference(light: NDArray[np.float32], tiling: Tiling, paths: NDArray[np.float32]) -> Array:
+def noise_reference(light: Float32Array, tiling: Tiling, paths: Float32Array) -> Array:
     """(N, 3) mean light of each tile, the variance of its noise, and how many frequencies show it."""
     found = []
     for tile, mean, path, frequencies, window, _ in tiles(light, tiling, paths):
@@ -57,7 +56,7 @@ def noise_reference(light: NDArray[np.float32], tiling: Tiling, paths: NDArray[n
     return np.array(found)
 
 
-def tiles(light: NDArray[np.float32], tiling: Tiling, paths: NDArray[np.float32]) -> Iterator[tuple[Any, ...]]:
+def tiles(light: Float32Array, tiling: Tiling, paths: Float32Array) -> Iterator[tuple[Any, ...]]:
     """Each tile without its mean and windowed, the mean, the path, what is the same for all, and its place."""
     rows, columns = tiling.sources()
     window = np.outer(tiling.window_in(), tiling.window_in()).astype(np.float64)
@@ -92,7 +91,7 @@ class Frequencies:
     y: Array
     square: Array
     gradient: Array
-    fitted: NDArray[np.bool_]
+    fitted: BoolArray
     times: Array
 
     @classmethod
@@ -108,8 +107,8 @@ class Frequencies:
 
 def filter_tile(
     tile: Array,
-    path: NDArray[Any],
-    spread: NDArray[Any],
+    path: AnyArray,
+    spread: AnyArray,
     frequencies: Frequencies,
     window: Array,
     noise: float,
@@ -141,7 +140,7 @@ def filter_tile(
     return sharp
 
 
-def transfer_of(path: NDArray[Any], frequencies: Frequencies) -> NDArray[np.complex128]:
+def transfer_of(path: AnyArray, frequencies: Frequencies) -> ComplexArray:
     """(T, T // 2 + 1) by what blur along an (S, 2) path multiplies each frequency: mean of ``exp(2 pi i f q)``.
 
     Zero at the highest frequencies, which have no sign.
@@ -153,7 +152,7 @@ def transfer_of(path: NDArray[Any], frequencies: Frequencies) -> NDArray[np.comp
     return along_y @ along_x.T / len(path)
 
 
-def doubt_of(path: NDArray[Any], spread: NDArray[Any], frequencies: Frequencies) -> Array:
+def doubt_of(path: AnyArray, spread: AnyArray, frequencies: Frequencies) -> Array:
     """(T, T // 2 + 1) variance of the transfer of a path whose chord has the covariance xx, xy, yy, px^2.
 
     An error w of the chord moves the path by ``s w``, s from -1/2 to 1/2 over the exposure, and the transfer by

@@ -3,6 +3,7 @@
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import (
     matrix_from_quat,
     quat_conjugate,
@@ -11,7 +12,6 @@ from colmap_inertial.core.geometry import (
     quat_multiply,
     skew,
 )
-from colmap_inertial.core.types import Array
 from colmap_inertial.inertial.scale._preintegration import (
     DELAY_STEP_S,
     Preintegrated,

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Codes = NDArray[np.uint8]
+from colmap_inertial.core.arrays import BoolArray, Int32Array, Int64Array, UInt8Array, UInt16Array
 
 
-def warped_reference(
-    view: Codes, columns: NDArray[np.int32], rows: NDArray[np.int32]
-) -> tuple[Codes, NDArray[np.bool_]]:
+def warped_reference(view: UInt8Array, columns: Int32Array, rows: Int32Array) -> tuple[UInt8Array, BoolArray]:
     """A view as the reference's pixels see it, bilinear, and where the view has them.
 
     Parameters
@@ -31,12 +28,12 @@ def warped_reference(
     return (((16 - part_x) * blended[:, x] + part_x * blended[:, right] + 128) // 256).astype(np.uint8), seen
 
 
-def census_reference(image: Codes, radius: int) -> NDArray[np.bool_]:
+def census_reference(image: UInt8Array, radius: int) -> BoolArray:
     """(neighbours, H, W) whether each neighbour in a square window is darker than the pixel (Zabih, Woodfill 1994)."""
     return _neighbours(image, radius) < image
 
 
-def _neighbours(image: Codes, radius: int) -> Codes:
+def _neighbours(image: UInt8Array, radius: int) -> UInt8Array:
     """(neighbours, H, W); beyond the border the image goes on as its border pixels."""
     height, width = image.shape
     padded = np.pad(image, radius, mode="edge")
@@ -47,20 +44,20 @@ def _neighbours(image: Codes, radius: int) -> Codes:
 
 
 def matching_costs_reference(
-    reference: Codes,
-    views: Codes,
+    reference: UInt8Array,
+    views: UInt8Array,
     *,
-    columns: NDArray[np.int32],
-    rows: NDArray[np.int32],
-    share: NDArray[np.int32],
+    columns: Int32Array,
+    rows: Int32Array,
+    share: Int32Array,
     unseen: int,
     radius: int,
     least: int = 0,
-    tables: Codes | None = None,
-    blend: NDArray[np.int32] | None = None,
-    blend_table: Codes | None = None,
-    shown: NDArray[np.int32] | None = None,
-) -> Codes:
+    tables: UInt8Array | None = None,
+    blend: Int32Array | None = None,
+    blend_table: UInt8Array | None = None,
+    shown: Int32Array | None = None,
+) -> UInt8Array:
     """(H, W, D) what each candidate costs, summed over the views; the arguments are the compiled kernel's."""
     count, candidates = columns.shape[:2]
     bits = census_reference(reference, radius)
@@ -94,8 +91,8 @@ def matching_costs_reference(
 
 
 def _window_shown(
-    columns: NDArray[np.int32], rows: NDArray[np.int32], shown: NDArray[np.int32], shape: tuple[int, ...], reach: int
-) -> NDArray[np.bool_]:
+    columns: Int32Array, rows: Int32Array, shown: Int32Array, shape: tuple[int, ...], reach: int
+) -> BoolArray:
     """(H, W) whether all that a window's values are made of lies where a view shows something."""
     x, y = (np.clip(at, 0, 16 * (n - 1)) for at, n in ((columns, shape[1]), (rows, shape[0])))
     whole = np.ones((len(y), len(x)), dtype=bool)
@@ -107,7 +104,7 @@ def _window_shown(
     return np.all([around[i : i + len(y), j : j + len(x)] for i in range(size) for j in range(size)], axis=0)
 
 
-def semi_global_reference(cost: Codes, guide: Codes, *, small: int, jump: NDArray[np.uint16]) -> NDArray[np.uint16]:
+def semi_global_reference(cost: UInt8Array, guide: UInt8Array, *, small: int, jump: UInt16Array) -> UInt16Array:
     """(H, W, D) costs summed along eight paths (Hirschmueller 2008, equations 12 to 14).
 
     Along a path ``L(p, d) = C(p, d) - min L(q) + min(L(q, d), L(q, d - 1) + small, L(q, d + 1) + small, min L(q) + j)``
@@ -132,7 +129,7 @@ def semi_global_reference(cost: Codes, guide: Codes, *, small: int, jump: NDArra
     return total.astype(np.uint16)
 
 
-def _path(cost: Codes, guide: Codes, dy: int, dx: int, small: int, jump: NDArray[np.uint16]) -> NDArray[np.int64]:
+def _path(cost: UInt8Array, guide: UInt8Array, dy: int, dx: int, small: int, jump: UInt16Array) -> Int64Array:
     height, width, candidates = cost.shape
     if dy == 0:  # a row is a column of the transposed image
         turned = _path(cost.swapaxes(0, 1), guide.T, 1, 0, small, jump)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.core.types import Array
+from colmap_inertial.core.arrays import AnyArray, Array, BoolArray, IndexArray
 from colmap_inertial.imaging import wiener
 from colmap_inertial.imaging._cells import CELL_PX, Cells
 from colmap_inertial.imaging._taps import Prior, TapTable, blur_spectrum
@@ -24,7 +22,7 @@ LOST_LIGHT_REACH = (2.0, 2.5)
 STEEPEST = 2.0
 
 
-def deblur_reference(image: NDArray[Any], blur: BlurField, options: wiener.DeblurOptions | None = None) -> NDArray[Any]:
+def deblur_reference(image: AnyArray, blur: BlurField, options: wiener.DeblurOptions | None = None) -> AnyArray:
     """`deblur` in plain numpy; hundreds of times slower."""
     planes, cells, noise = wiener._prepare(image, blur, options or wiener.DeblurOptions())
     table = wiener._table(cells, noise)
@@ -95,7 +93,7 @@ def smoothed_reference(light: Array, weights: NDArray[np.floating]) -> Array:
     return light
 
 
-def mirrored(index: NDArray[np.intp], size: int) -> NDArray[np.intp]:
+def mirrored(index: IndexArray, size: int) -> IndexArray:
     """Indices reflected into ``0 .. size - 1`` about the first and last element, as often as needed."""
     if size == 1:
         return np.zeros_like(index)
@@ -103,7 +101,7 @@ def mirrored(index: NDArray[np.intp], size: int) -> NDArray[np.intp]:
     return np.minimum(index, 2 * size - 2 - index)
 
 
-def lost_light_reference(light: Array, saturated: NDArray[np.bool_], cells: Cells) -> NDArray[np.bool_]:
+def lost_light_reference(light: Array, saturated: BoolArray, cells: Cells) -> BoolArray:
     """(H, W) where one channel is saturated by far more light than the sensor can hold.
 
     A blur of length L is the mean over L, so that a scene within the sensor's range changes by at most 1/L from pixel
@@ -122,7 +120,7 @@ def lost_light_reference(light: Array, saturated: NDArray[np.bool_], cells: Cell
     return saturated & ((light - darkest) * extent > STEEPEST * major)
 
 
-def share_reference(lost: NDArray[np.bool_], cells: Cells) -> Array:
+def share_reference(lost: BoolArray, cells: Cells) -> Array:
     """(H, W) share of the filter's result at every pixel, 0 to 1; the rest is the input.
 
     Short blurs fade out. So does the result near lost light.

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Int64Array
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError
 from colmap_inertial.core.types import (
     CameraImuCalibration,
@@ -116,8 +116,8 @@ class FramesInVideo:
         Pictures that could not be found, or are of several frames.
     """
 
-    stated_ns: NDArray[np.int64]
-    found_ns: NDArray[np.int64]
+    stated_ns: Int64Array
+    found_ns: Int64Array
     video_start_ns: int
     quarter_turns: int
     container_turn_deg: int

@@ -8,9 +8,10 @@ import numpy as np
 
 from colmap_inertial.checks.diagnose.findings import Finding, Recorded, Severity
 from colmap_inertial.checks.diagnose.motion import acceleration_rms_m_s2
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.sampling import MUCH_CUT, PAUSE_STEPS, at_ceiling, integral_at, is_gap
-from colmap_inertial.core.types import Array, ImuRecording
+from colmap_inertial.core.types import ImuRecording
 from colmap_inertial.motion.align import Alignment
 
 #: Pauses longer than this are findings (shorter ones cost nothing); over the second, much can happen in them.

@@ -9,7 +9,7 @@ import numpy as np
 
 from colmap_inertial.checks.report.figures import CAMERA, GOOD, IMU, QUIET, Figure
 from colmap_inertial.checks.report.words import digits
-from colmap_inertial.core.types import Array
+from colmap_inertial.core.arrays import Array
 
 #: Share of the points that the box leaves out on each side; cells across the grid.
 _OUTSIDE_PCT, _CELLS = 1.5, 9

@@ -6,11 +6,10 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_inertial.checks.report.series import rounded, strided
+from colmap_inertial.core.arrays import Array, IndexArray
 from colmap_inertial.core.geometry import quat_rotate
-from colmap_inertial.core.types import Array
 from colmap_inertial.model.intrinsics import intrinsics_sigma
 
 if TYPE_CHECKING:
@@ -190,7 +189,7 @@ def _ground(upright: Array, tracks: list[Any]) -> dict[str, Any] | None:
     for i in inside[strided(len(inside), 60_000)].tolist():
         key = (min(int(place[i, 1]), rows - 1), min(int(place[i, 0]), columns - 1))
         seen.setdefault(key, set()).update(element.image_id for element in tracks[i].elements)
-    counts: NDArray[np.intp] = np.zeros((rows, columns), dtype=np.intp)
+    counts: IndexArray = np.zeros((rows, columns), dtype=np.intp)
     for key, by in seen.items():
         counts[key] = len(by)
     return {

@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_inertial.checks.report.series import strided
+from colmap_inertial.core.arrays import Array, UInt8Array
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_rotate, rotation_between
-from colmap_inertial.core.types import Array, CameraTrajectory
+from colmap_inertial.core.types import CameraTrajectory
 
 if TYPE_CHECKING:
     import pycolmap
@@ -91,7 +91,7 @@ def _half_sides(reconstruction: pycolmap.Reconstruction) -> tuple[float, float]:
     return 0.5 * camera.width / focal, 0.5 * camera.height / focal
 
 
-def _points(reconstruction: pycolmap.Reconstruction, centres: Array) -> tuple[Array, NDArray[np.uint8]]:
+def _points(reconstruction: pycolmap.Reconstruction, centres: Array) -> tuple[Array, UInt8Array]:
     """(N, 3) positions and colours of some points, chosen by their numbers: the same each time."""
     chosen = []
     ids = sorted(reconstruction.point3D_ids())

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from colmap_inertial.core.types import Array
+from colmap_inertial.core.arrays import Array, IndexArray
 
 #: Points of a line in the report: more than a screen has columns.
 MOST_POINTS = 1200
@@ -40,7 +39,7 @@ def thinned(t_s: Array, values: Array, most: int = MOST_POINTS) -> dict[str, lis
     return {"t_s": times, "values": rounded(np.asarray(values)[keep])}
 
 
-def _extremes(values: Array, parts: int) -> NDArray[np.intp]:
+def _extremes(values: Array, parts: int) -> IndexArray:
     edges = np.linspace(0, len(values), parts + 1).astype(np.intp)[:-1]
     part = np.repeat(np.arange(parts), np.diff(np.append(edges, len(values))))
     kept = []
@@ -51,7 +50,7 @@ def _extremes(values: Array, parts: int) -> NDArray[np.intp]:
     return np.unique(np.concatenate(kept))
 
 
-def strided(count: int, most: int) -> NDArray[np.intp]:
+def strided(count: int, most: int) -> IndexArray:
     """At most ``most`` of ``count`` indices, evenly, first and last among them."""
     if count <= most:
         return np.arange(count)

@@ -9,14 +9,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_inertial.checks.report.series import rounded, thinned
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import quat_conjugate, quat_rotate, rotation_between, so3_log
 from colmap_inertial.core.gyro import GyroPath, on_camera_rate
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import (
-    Array,
     CameraImuCalibration,
     CameraTrajectory,
     ImuRecording,
@@ -296,7 +295,7 @@ def _spectrum(t_s: Array, values: Array) -> Record | None:
     step_s = float(np.median(steps))
     if np.mean(np.abs(steps - step_s) < 0.2 * step_s) < _EVEN:
         return None
-    total: NDArray[np.float64] | float = 0.0
+    total: Array | float = 0.0
     count = min(round(_PART_S / step_s), int(np.ptp(t_s) / step_s))
     hz = np.zeros(0)
     weights = 0

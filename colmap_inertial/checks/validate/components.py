@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from colmap_inertial.checks.validate.observations import Observations, Placement, linearise
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import skew
-from colmap_inertial.core.types import Array
 
 #: Kinds of pose error: turn of the camera across the line of sight and about it, shift along the line of sight, turn
 #: about the target (the kind that bundle adjustment leaves, where place and aim err together), shift across the line of

@@ -13,15 +13,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_inertial.checks.validate.edges import refine_marker
 from colmap_inertial.checks.validate.targets import Target
+from colmap_inertial.core.arrays import Array, BoolArray, Float32Array, IndexArray, UInt8Array
 from colmap_inertial.core.geometry import colmap_px_from_opencv
-from colmap_inertial.core.types import Array
-
-Grey = NDArray[np.uint8]
-Index = NDArray[np.intp]
 
 #: Checkerboards are searched in images of at most this many pixels along the longer side, and refined in the original.
 _SEARCH_SIZE_PX = 1600
@@ -44,11 +40,11 @@ class Detection:
     """
 
     part: int
-    corner: Index
+    corner: IndexArray
     xy_px: Array
 
 
-def detect(image: Grey, target: Target, *, thorough: bool = False) -> list[Detection]:
+def detect(image: UInt8Array, target: Target, *, thorough: bool = False) -> list[Detection]:
     """Find a target in an image.
 
     Parameters
@@ -76,7 +72,7 @@ def detect(image: Grey, target: Target, *, thorough: bool = False) -> list[Detec
     return _markers(image, target)
 
 
-def other_checkerboard(image: Grey) -> tuple[int, int] | None:
+def other_checkerboard(image: UInt8Array) -> tuple[int, int] | None:
     """Inner corners (columns, rows) of whatever checkerboard an image shows, to help with a wrong description."""
     import cv2
 
@@ -85,7 +81,7 @@ def other_checkerboard(image: Grey) -> tuple[int, int] | None:
     return (int(meta.shape[1]), int(meta.shape[0])) if found and meta is not None else None
 
 
-def _checkerboards(image: Grey, target: Target, thorough: bool) -> Iterator[Detection]:
+def _checkerboards(image: UInt8Array, target: Target, thorough: bool) -> Iterator[Detection]:
     import cv2
 
     small, factor = _shrunk(image)
@@ -106,11 +102,11 @@ def _checkerboards(image: Grey, target: Target, thorough: bool) -> Iterator[Dete
         cv2.fillConvexPoly(small, np.round(grown).astype(np.int32), float(np.median(small)))
 
 
-def _detection(corner: Index, xy: Array, good: NDArray[np.bool_]) -> Detection:
+def _detection(corner: IndexArray, xy: Array, good: BoolArray) -> Detection:
     return Detection(part=0, corner=corner[good], xy_px=colmap_px_from_opencv(xy[good]))
 
 
-def _shrunk(image: Grey) -> tuple[Grey, float]:
+def _shrunk(image: UInt8Array) -> tuple[UInt8Array, float]:
     import cv2
 
     factor = min(1.0, _SEARCH_SIZE_PX / max(image.shape))
@@ -120,7 +116,7 @@ def _shrunk(image: Grey) -> tuple[Grey, float]:
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA), size[0] / image.shape[1]
 
 
-def _find_checkerboard(image: Grey, target: Target, *, fallback: bool) -> NDArray[np.float32] | None:
+def _find_checkerboard(image: UInt8Array, target: Target, *, fallback: bool) -> Float32Array | None:
     """(N, 2) corners in OpenCV's pixels, row by row; ``None`` when there is no board."""
     import cv2
 
@@ -148,7 +144,7 @@ def _spacing_px(grid: Array) -> Array:
     return out
 
 
-def _refine(image: Grey, xy: Array, half_px: Array, *, allowed_px: float) -> tuple[Array, NDArray[np.bool_]]:
+def _refine(image: UInt8Array, xy: Array, half_px: Array, *, allowed_px: float) -> tuple[Array, BoolArray]:
     """Corners (n, 2) in OpenCV's pixels refined within windows of these half sizes, and which of them are good.
 
     Good are those that stay within ``allowed_px`` of the first guess, and within their window.
@@ -170,7 +166,7 @@ def _refine(image: Grey, xy: Array, half_px: Array, *, allowed_px: float) -> tup
     return out.astype(np.float64), inside & (moved > 0) & (moved <= np.minimum(allowed_px, half))
 
 
-def _detector(target: Target, border_bits: int, image: Grey) -> Any:
+def _detector(target: Target, border_bits: int, image: UInt8Array) -> Any:
     import cv2
 
     parameters = cv2.aruco.DetectorParameters()
@@ -189,7 +185,7 @@ def _dictionary(target: Target) -> Any:
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name}"))
 
 
-def _find_markers(image: Grey, target: Target, border_bits: int, count: int) -> tuple[Array, Index]:
+def _find_markers(image: UInt8Array, target: Target, border_bits: int, count: int) -> tuple[Array, IndexArray]:
     """Corners (n, 4, 2) in OpenCV's pixels and numbers (n,) of the markers below ``count``."""
     found, numbers, _ = _detector(target, border_bits, image).detectMarkers(image)
     if numbers is None or len(numbers) == 0:
@@ -204,7 +200,7 @@ def _side_px(corners: Array) -> Array:
     return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).min(axis=1)
 
 
-def _copies(corners: Array, number: Index, layout_m: Array) -> list[Index]:
+def _copies(corners: Array, number: IndexArray, layout_m: Array) -> list[IndexArray]:
     """Indices of the markers of each copy of a board, when several are in view.
 
     Markers are gathered by growing from one to its neighbours on the board: the homography of those gathered says
@@ -249,7 +245,7 @@ def _copies(corners: Array, number: Index, layout_m: Array) -> list[Index]:
     return out
 
 
-def _aprilgrid(image: Grey, target: Target) -> list[Detection]:
+def _aprilgrid(image: UInt8Array, target: Target) -> list[Detection]:
     corners, number = _find_markers(image, target, 2, target.columns * target.rows)
     # OpenCV numbers a tag's corners clockwise from its upper left, and reads Kalibr's tags turned by 90 degrees
     corners = corners[:, [1, 0, 3, 2]]
@@ -265,7 +261,7 @@ def _aprilgrid(image: Grey, target: Target) -> list[Detection]:
     return out
 
 
-def _charuco(image: Grey, target: Target) -> list[Detection]:
+def _charuco(image: UInt8Array, target: Target) -> list[Detection]:
     import cv2
 
     markers = target.columns * target.rows // 2
@@ -301,7 +297,7 @@ def _charuco(image: Grey, target: Target) -> list[Detection]:
     return out
 
 
-def _markers(image: Grey, target: Target) -> list[Detection]:
+def _markers(image: UInt8Array, target: Target) -> list[Detection]:
     corners, number = _find_markers(image, target, 1, len(target.part) // 4)
     dictionary = _dictionary(target)
     out = []

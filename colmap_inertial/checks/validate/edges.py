@@ -9,9 +9,8 @@ apart. One homography and one common shift of all edges towards white are fitted
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from colmap_inertial.core.types import Array
+from colmap_inertial.core.arrays import Array, BoolArray, Float32Array, UInt8Array
 
 _ALONG = np.array([0.2, 0.35, 0.5, 0.65, 0.8])
 _STEP_PX = 0.25
@@ -20,7 +19,7 @@ _ITERATIONS = 4
 _LEAST_CONTRAST = 8.0
 
 
-def refine_marker(image: NDArray[np.uint8], corners_px: Array, bits: NDArray[np.bool_]) -> Array | None:
+def refine_marker(image: UInt8Array, corners_px: Array, bits: BoolArray) -> Array | None:
     """The four outer corners of a marker.
 
     Parameters
@@ -72,7 +71,7 @@ def _project(homography: Array, xy: Array) -> Array:
     return p[:, :2] / p[:, 2:]
 
 
-def _cell_edges(bits: NDArray[np.bool_]) -> tuple[Array, Array]:
+def _cell_edges(bits: BoolArray) -> tuple[Array, Array]:
     """Sample points (m, 2) on the borders between unlike cells, and unit directions (m, 2) towards white."""
     padded = np.pad(bits, 1, constant_values=True).astype(int)
     points, towards = [], []
@@ -86,7 +85,7 @@ def _cell_edges(bits: NDArray[np.bool_]) -> tuple[Array, Array]:
     return np.array(points, dtype=np.float64), np.array(towards)
 
 
-def _edge_offsets(image: NDArray[np.float32], at: Array, normal: Array, reach: float) -> tuple[Array, Array]:
+def _edge_offsets(image: Float32Array, at: Array, normal: Array, reach: float) -> tuple[Array, Array]:
     """Distance (m,) from each point along its normal to the centre of the brightening there, and its height (m,)."""
     import cv2
 
@@ -105,7 +104,7 @@ def _edge_offsets(image: NDArray[np.float32], at: Array, normal: Array, reach: f
     return (rise @ middle) / np.maximum(height, 1e-9), height
 
 
-def _fit(homography: Array, xy: Array, normal: Array, offset: Array, good: NDArray[np.bool_]) -> Array | None:
+def _fit(homography: Array, xy: Array, normal: Array, offset: Array, good: BoolArray) -> Array | None:
     """Change (3, 3) of the homography that takes the edges to where they were seen, up to one common shift."""
     p = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
     q = p @ homography.T

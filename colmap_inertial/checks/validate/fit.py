@@ -24,9 +24,9 @@ from colmap_inertial.checks.validate.components import (
     weighted,
 )
 from colmap_inertial.checks.validate.observations import Observations, Placement, linearise
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import so3_exp
-from colmap_inertial.core.types import Array
 
 _ITERATIONS = 50
 #: The fit has settled when a step would lower the cost by less than this share of the noise variance (a ten-thousandth

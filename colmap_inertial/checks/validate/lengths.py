@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from colmap_inertial.core.types import Array
+from colmap_inertial.core.arrays import Array
 
 if TYPE_CHECKING:
     from colmap_inertial.checks.validate.result import Corner, Distance

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from colmap_inertial.checks.validate.result import CheckPoint, CheckPoints, ScaleBar, TargetDistance, Validation
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, NotObservableError
-from colmap_inertial.core.types import Array
 from colmap_inertial.io.files import read_text
 
 #: Points that a rigid motion needs, with one to spare.

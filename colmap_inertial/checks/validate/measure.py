@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_inertial.checks.validate.fit import ScaleFit, fit_scale
 from colmap_inertial.checks.validate.lengths import check_lengths, model_diagonal
@@ -26,11 +25,11 @@ from colmap_inertial.checks.validate.result import (
 from colmap_inertial.checks.validate.search import Progress, Search, why_not_placed
 from colmap_inertial.checks.validate.targets import Target
 from colmap_inertial.checks.validate.views import Sighting, load_views
+from colmap_inertial.core.arrays import Array, BoolArray
 from colmap_inertial.core.errors import NotObservableError, TargetNotFoundError
 from colmap_inertial.core.options import ValidateOptions
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.threads import one_blas_thread
-from colmap_inertial.core.types import Array
 from colmap_inertial.io.files import StrPath
 from colmap_inertial.model import read_model
 
@@ -287,7 +286,7 @@ def _compact(obs: Observations, at: Placement) -> tuple[Observations, Placement]
     return replace(obs, part=part), replace(at, rotation=at.rotation[parts], centre=at.centre[parts])
 
 
-def _fit_set(obs: Observations, fit: ScaleFit, pick: NDArray[np.bool_]) -> tuple[ScaleFit, int] | None:
+def _fit_set(obs: Observations, fit: ScaleFit, pick: BoolArray) -> tuple[ScaleFit, int] | None:
     """The scale from some of the corners, weighed as all of them were; ``None`` when they cannot give one."""
     part, start = _compact(obs.select(pick), fit.placement)
     views, count = np.unique(part.view, return_counts=True)
@@ -323,7 +322,7 @@ def _positions(target: Target, obs: Observations, fit: ScaleFit) -> Array:
     return position
 
 
-def _distances(target: Target, position: Array, control: NDArray[np.bool_], to_metres: float) -> tuple[Distance, ...]:
+def _distances(target: Target, position: Array, control: BoolArray, to_metres: float) -> tuple[Distance, ...]:
     out = []
     for a, b in target.pairs(np.isfinite(position[:, 0])).tolist():
         known = float(np.linalg.norm(target.corners_m[a] - target.corners_m[b]))

@@ -9,11 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from colmap_inertial.core.types import Array
-
-Index = NDArray[np.intp]
+from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -40,9 +37,9 @@ class Observations:
         (V, 3) translations, model units.
     """
 
-    view: Index
-    corner: Index
-    part: Index
+    view: IndexArray
+    corner: IndexArray
+    part: IndexArray
     target_m: Array
     ray: Array
     px_from_tangent: Array
@@ -52,7 +49,7 @@ class Observations:
     def __len__(self) -> int:
         return len(self.view)
 
-    def select(self, keep: NDArray[np.bool_]) -> Observations:
+    def select(self, keep: BoolArray) -> Observations:
         """The observations that ``keep`` (M,) picks; cameras and parts keep their numbers."""
         return replace(
             self,
@@ -111,14 +108,14 @@ def linearise(obs: Observations, at: Placement) -> tuple[Array, Array, Array]:
 def tangent_residual(obs: Observations, in_cam: Array) -> tuple[Array, Array, Array]:
     """As :func:`linearise`, for corners (M, 3) at any place in the camera frames."""
     depth = np.einsum("mi,mi->m", obs.ray, in_cam)
-    behind: NDArray[np.bool_] = np.asarray(depth <= 0)
+    behind: BoolArray = np.asarray(depth <= 0)
     depth = np.where(behind, 1.0, depth)
     projected = np.einsum("mij,mj->mi", obs.px_from_tangent, in_cam) / depth[:, None]
     jacobian = (obs.px_from_tangent - projected[:, :, None] * obs.ray[:, None, :]) / depth[:, None, None]
     return np.where(behind[:, None], np.inf, -projected), in_cam, jacobian
 
 
-def triangulate(obs: Observations, at: Placement) -> tuple[Index, Array, NDArray[np.bool_]]:
+def triangulate(obs: Observations, at: Placement) -> tuple[IndexArray, Array, BoolArray]:
     """Corners one by one, from the model's cameras alone; the target's known shape only starts the search.
 
     Parameters
@@ -146,7 +143,7 @@ def triangulate(obs: Observations, at: Placement) -> tuple[Index, Array, NDArray
     for _ in range(5):
         in_cam = np.einsum("mij,mj->mi", rotation, in_world[which]) + obs.cam_from_world_t[obs.view]
         residual, _, jac = tangent_residual(obs, in_cam)
-        seen: NDArray[np.bool_] = np.asarray(np.isfinite(residual).all(axis=1))
+        seen: BoolArray = np.asarray(np.isfinite(residual).all(axis=1))
         jac = np.where(seen[:, None, None], jac @ rotation, 0.0)
         residual = np.where(seen[:, None], residual, 0.0)
         matrix, rhs = np.zeros((len(corner), 3, 3)), np.zeros((len(corner), 3))

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from colmap_inertial.checks.validate.result import Validation, ViewResiduals
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.geometry import opencv_px_from_colmap
-from colmap_inertial.core.types import Array
 
 #: Residuals are drawn this many times longer than they are.
 MAGNIFIED = 30

@@ -16,8 +16,8 @@ from colmap_inertial.checks.validate.fit import settle
 from colmap_inertial.checks.validate.observations import Observations, Placement, linearise
 from colmap_inertial.checks.validate.targets import Target
 from colmap_inertial.checks.validate.views import Sighting, View
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
-from colmap_inertial.core.types import Array
 
 _MOST_PAIRS = 80
 _LEAST_CORNERS = 4

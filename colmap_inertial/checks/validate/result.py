@@ -7,11 +7,10 @@ from dataclasses import dataclass, fields, is_dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_inertial.checks.validate.lengths import LengthCheck
 from colmap_inertial.checks.validate.targets import Target
-from colmap_inertial.core.types import Array
+from colmap_inertial.core.arrays import Array, IndexArray
 
 if TYPE_CHECKING:
     from rich.console import Group
@@ -79,7 +78,7 @@ class ViewResiduals:
     """
 
     name: str
-    corner: NDArray[np.intp]
+    corner: IndexArray
     observed_px: Array
     projected_px: Array
     rejected_px: Array

@@ -14,11 +14,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
 from colmap_inertial.core.errors import InertialError
-from colmap_inertial.core.types import Array
 
 Kind = Literal["checkerboard", "charuco", "aprilgrid", "aruco"]
-Index = NDArray[np.intp]
 
 #: OpenCV's predefined marker dictionaries and how many markers each holds.
 DICTIONARIES = {
@@ -111,10 +110,10 @@ class Target:
     dictionary: str = ""
     sigma_m: float | None = None
     corners_m: Array
-    part: Index
-    row: Index
-    column: Index
-    relabelings: Index
+    part: IndexArray
+    row: IndexArray
+    column: IndexArray
+    relabelings: IndexArray
 
     def label(self, corner: int) -> str:
         """A corner's name: ``r2c5`` (row, column), ``tag7.0`` or ``marker3.2`` (corner of a tag or marker)."""
@@ -128,7 +127,7 @@ class Target:
         """What to call a rigid part in a sentence."""
         return f"marker {part}" if self.kind == "aruco" else self.kind
 
-    def control(self, seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def control(self, seen: BoolArray) -> BoolArray:
         """Which corners may set a scale; the rest are kept to check it.
 
         The two sets share no corner, so no corner's detection error is in both. Boards are split by every second
@@ -157,7 +156,7 @@ class Target:
         line = self.column if np.ptp(self.column) >= np.ptp(self.row) else self.row
         return line % 2 == 0
 
-    def pairs(self, seen: NDArray[np.bool_]) -> Index:
+    def pairs(self, seen: BoolArray) -> IndexArray:
         """Pairs of seen corners whose distances are reported.
 
         Every two corners of a row or of a column, and the two diagonals of the whole; of single markers the four

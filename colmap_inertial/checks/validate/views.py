@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_inertial.checks.validate.detect import Detection
+from colmap_inertial.core.arrays import Array, IndexArray, UInt8Array
 from colmap_inertial.core.errors import FormatError
-from colmap_inertial.core.types import Array
 from colmap_inertial.io.files import read_bytes
 from colmap_inertial.io.images import require_modest
 from colmap_inertial.io.names import path_in
@@ -20,7 +19,6 @@ from colmap_inertial.model import model_format, read_model
 if TYPE_CHECKING:
     import pycolmap
 
-Index = NDArray[np.intp]
 
 #: Half step of the numeric derivative of the projection, as an angle.
 _STEP_RAD = 1e-4
@@ -54,7 +52,7 @@ class View:
     cam_from_world_t: Array
     origin_in_model: Array = field(default_factory=lambda: np.zeros(3))
 
-    def read(self, *, flip: int | None = None) -> NDArray[np.uint8] | str:
+    def read(self, *, flip: int | None = None) -> UInt8Array | str:
         """The image (H, W) in grey as COLMAP sees it (orientation tags ignored), or why it cannot be used.
 
         Parameters
@@ -104,7 +102,7 @@ class Sighting:
 
     view: int
     part: int
-    corner: Index
+    corner: IndexArray
     xy_px: Array
     ray: Array
     px_from_tangent: Array

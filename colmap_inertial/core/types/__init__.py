@@ -8,7 +8,6 @@ specific force: at rest the accelerometer reads +9.8 m/s2 away from the ground.
 
 from __future__ import annotations
 
-from colmap_inertial.core.types._checks import Array
 from colmap_inertial.core.types.apertures import Aperture, ApertureRig, SpectralRole
 from colmap_inertial.core.types.estimated import (
     CAL,
@@ -57,7 +56,6 @@ __all__ = [
     "AcceptedScale",
     "Aperture",
     "ApertureRig",
-    "Array",
     "CameraImuCalibration",
     "CameraModel",
     "CameraMotion",

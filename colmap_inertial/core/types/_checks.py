@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from colmap_inertial.core.arrays import Array
 
 
 def checked_array(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Array:

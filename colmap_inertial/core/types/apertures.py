@@ -7,7 +7,8 @@ from typing import Literal
 
 import numpy as np
 
-from colmap_inertial.core.types._checks import Array, checked_array, checked_quaternions, set_fields
+from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.types._checks import checked_array, checked_quaternions, set_fields
 from colmap_inertial.core.types.recorded import CameraModel, LengthUnit
 
 #: What an aperture's filter passes; ``other`` (near infrared, say) takes part in matching and in no colour.

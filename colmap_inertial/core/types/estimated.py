@@ -9,11 +9,11 @@ from typing import Literal
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import matrix_from_quat, rotation_between, skew
 from colmap_inertial.core.options import WorldAxes
 from colmap_inertial.core.types._checks import (
-    Array,
     checked_array,
     checked_covariance,
     checked_quaternions,

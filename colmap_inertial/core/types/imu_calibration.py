@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from colmap_inertial.core.types._checks import Array, checked_array, checked_covariance, set_fields
+from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.types._checks import checked_array, checked_covariance, set_fields
 
 if TYPE_CHECKING:
     from colmap_inertial.core.types.estimated import CameraImuCalibration

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from colmap_inertial.core.types._checks import Array, checked_array, checked_covariance, checked_times, set_fields
+from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.types._checks import checked_array, checked_covariance, checked_times, set_fields
 from colmap_inertial.core.types.recorded import ReadoutDirection
 
 #: An image stands where it stood within this part of its distance from the origin, and of one unit.

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from colmap_inertial.core.types._checks import Array, checked_array, set_fields
+from colmap_inertial.core.arrays import Array, BoolArray, IndexArray, Int64Array
+from colmap_inertial.core.types._checks import checked_array, set_fields
 
 #: What heights count from: WGS84's ellipsoid, the sea, or what nobody said.
 HeightDatum = Literal["ellipsoid", "sea", "unknown"]
@@ -40,7 +40,7 @@ class PositionFixes:
     longitude_deg: Array
     height_m: Array
     sigma_m: Array
-    t_ns: NDArray[np.int64] | None = None
+    t_ns: Int64Array | None = None
     names: tuple[str, ...] | None = None
     height_above: HeightDatum = "unknown"
     source: str = ""
@@ -65,7 +65,7 @@ class PositionFixes:
         if self.t_ns is not None:
             set_fields(self, t_ns=np.asarray(self.t_ns, dtype=np.int64))
 
-    def select(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> PositionFixes:
+    def select(self, index: IndexArray | BoolArray) -> PositionFixes:
         """Some of them."""
         names = None if self.names is None else tuple(np.array(self.names, dtype=object)[index])
         return PositionFixes(

@@ -7,11 +7,10 @@ from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, BoolArray, IndexArray, UInt8Array, UInt16Array
 from colmap_inertial.core.geometry import quat_conjugate, quat_log, quat_multiply
 from colmap_inertial.core.types._checks import (
-    Array,
     checked_array,
     checked_covariance,
     checked_quaternions,
@@ -199,7 +198,7 @@ class Frame:
     """
 
     name: str
-    image: NDArray[np.uint8] | NDArray[np.uint16]
+    image: UInt8Array | UInt16Array
     t_s: float
     exposure_s: float | None = None
     readout_s: float | None = None
@@ -396,7 +395,7 @@ class CameraTrajectory:
         pose = self.cam_from_world_xyzw
         return quat_log(quat_multiply(pose[:-1], quat_conjugate(pose[1:])))
 
-    def select(self, keep: NDArray[np.bool_] | NDArray[np.intp] | slice) -> CameraTrajectory:
+    def select(self, keep: BoolArray | IndexArray | slice) -> CameraTrajectory:
         """The poses that ``keep`` (mask, increasing indices or slice) picks."""
         index = np.arange(len(self))[keep]
         return replace(

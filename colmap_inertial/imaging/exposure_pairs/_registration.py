@@ -11,15 +11,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from colmap_inertial.core.types import Array
+from colmap_inertial.core.arrays import Array, BoolArray, Float32Array
 from colmap_inertial.imaging._bilinear import between_nodes
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.exposure_pairs._search import OTHER_TURNS_DEG, USUAL_TURNS_DEG, places
 from colmap_inertial.imaging.rolling_shutter import grid_nodes, sampling_maps
-
-Light = NDArray[np.float32]
 
 #: Longer sides of the reduced images, px; the last one also judges.
 _SIDES_PX = (120, 240, 480)
@@ -82,7 +79,7 @@ class Registered:
 
 
 def register(
-    short: Light, long: Light, clipped: NDArray[np.bool_], *, start_px: Array | None = None, step_px: int = 16
+    short: Float32Array, long: Float32Array, clipped: BoolArray, *, start_px: Array | None = None, step_px: int = 16
 ) -> Registered:
     """Find the shift between two images of about the same brightness.
 
@@ -138,13 +135,13 @@ def register(
 class _Level:
     """Both images at one size: their detail, and how much of it tells (0 to 1)."""
 
-    short: Light
-    long: Light
-    tells: Light
+    short: Float32Array
+    long: Float32Array
+    tells: Float32Array
     scale: float
 
     @classmethod
-    def of(cls, short: Light, long: Light, clipped: NDArray[np.bool_], side_px: int) -> _Level:
+    def of(cls, short: Float32Array, long: Float32Array, clipped: BoolArray, side_px: int) -> _Level:
         import cv2
 
         height, width = short.shape
@@ -162,7 +159,7 @@ class _Level:
         short_detail, long_detail = (np.asarray(f - c, dtype=np.float32) for f, c in zip(fine, coarse, strict=True))
         return cls(short_detail, long_detail, np.asarray(tells, dtype=np.float32), size[0] / width)
 
-    def moved(self, shift_px: Array, step_px: int) -> tuple[Light, Light]:
+    def moved(self, shift_px: Array, step_px: int) -> tuple[Float32Array, Float32Array]:
         """The long image's detail shifted, and how much it tells."""
         import cv2
 
@@ -208,7 +205,7 @@ class _Level:
         return np.array(found)
 
 
-def _correlation(a: Light, b: Light, weights: Light) -> float:
+def _correlation(a: Float32Array, b: Float32Array, weights: Float32Array) -> float:
     """Weighted; 0 where nothing varies."""
     total = float(weights.sum())
     if total <= 0:

@@ -11,11 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from colmap_inertial.core.types import Array
-
-Light = NDArray[np.float32]
+from colmap_inertial.core.arrays import Array, ComplexArray, Float32Array
 
 #: The images must share so much of their area: with less, chance correlates, too.
 _LEAST_SHARED = 0.3
@@ -46,10 +43,10 @@ class Place:
 
 
 def places(
-    first: Light,
-    first_tells: Light,
-    second: Light,
-    second_tells: Light,
+    first: Float32Array,
+    first_tells: Float32Array,
+    second: Float32Array,
+    second_tells: Float32Array,
     *,
     farthest: float,
     turns_deg: Sequence[float],
@@ -101,13 +98,13 @@ def places(
 
 
 def _all_shifts(
-    first: Light, first_tells: Light, second: Light, second_tells: Light
+    first: Float32Array, first_tells: Float32Array, second: Float32Array, second_tells: Float32Array
 ) -> tuple[Array, tuple[Array, Array]]:
     """Scores at all shifts (what to add to a pixel of the first), and the shifts of their rows and columns."""
     height, width = first.shape
     size = (2 * height, 2 * width)
 
-    def transformed(image: Array) -> NDArray[np.complex128]:
+    def transformed(image: Array) -> ComplexArray:
         return np.asarray(np.fft.rfft2(image, size))
 
     a, b = np.asarray(first_tells, dtype=np.float64), np.asarray(second_tells, dtype=np.float64)

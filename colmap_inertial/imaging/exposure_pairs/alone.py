@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from colmap_inertial.core.types import Array
+from colmap_inertial.core.arrays import AnyArray, Array, Float32Array
 from colmap_inertial.imaging.exposure_pairs.pair import CLIPPED, MOST_GAIN, Brightness, brightened
 from colmap_inertial.imaging.transfer import decode_table
-
-Codes = NDArray[Any]
-Light = NDArray[np.float32]
 
 #: Detail is compared in bands, of octaves from this standard deviation on, px.
 _FINEST_PX, _BANDS = 0.7, 5
@@ -43,11 +39,11 @@ class Alone:
     """
 
     used: Literal["short", "long"]
-    image: Light
+    image: Float32Array
     gain: float
 
 
-def better_alone(short: Codes, long: Codes, brightness: Brightness | None) -> Alone:
+def better_alone(short: AnyArray, long: AnyArray, brightness: Brightness | None) -> Alone:
     """The short exposure, brightened, or the long one, as it is: by which has the smaller error as far as it shows.
 
     The short one's error is its noise; the long one's is the detail that the short one has beyond its noise, and the
@@ -78,7 +74,7 @@ def better_alone(short: Codes, long: Codes, brightness: Brightness | None) -> Al
     return Alone(used="short", image=bright, gain=brightness.gain)
 
 
-def _errors(short: Light, long: Light) -> tuple[float, float]:
+def _errors(short: Float32Array, long: Float32Array) -> tuple[float, float]:
     """Mean squares: noise of the short one, and what blur makes of detail in the long one."""
     noise = _noise_variance(short)
     blurred = 0.0
@@ -88,7 +84,7 @@ def _errors(short: Light, long: Light) -> tuple[float, float]:
     return noise, blurred
 
 
-def _bands(image: Light) -> list[tuple[float, float]]:
+def _bands(image: Float32Array) -> list[tuple[float, float]]:
     """Variance of each band of detail, and the share of white noise's that the band lets through."""
     import cv2
 
@@ -103,7 +99,7 @@ def _bands(image: Light) -> list[tuple[float, float]]:
     return found
 
 
-def _noise_variance(image: Light) -> float:
+def _noise_variance(image: Float32Array) -> float:
     """Of white noise: by a second difference that planes and straight edges do not pass, in most squares (J.
     Immerkaer, Fast noise variance estimation, 1996)."""
     import cv2
@@ -115,5 +111,5 @@ def _noise_variance(image: Light) -> float:
     return float(np.median(cells)) / float((mask**2).sum())
 
 
-def _grey(image: Light) -> Light:
+def _grey(image: Float32Array) -> Float32Array:
     return image if image.ndim == 2 else np.asarray(image.mean(axis=2), dtype=np.float32)

@@ -9,12 +9,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-Light = NDArray[np.float32]
+from colmap_inertial.core.arrays import Float32Array
 
 
-def fuse_mertens(images: Sequence[Light]) -> Light:
+def fuse_mertens(images: Sequence[Float32Array]) -> Float32Array:
     """Blend images of the same view.
 
     Parameters

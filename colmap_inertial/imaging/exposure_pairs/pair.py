@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import contextlib
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import AnyArray, Array, BoolArray, Float32Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import colmap_px_from_opencv
-from colmap_inertial.core.types import Array, Projector
+from colmap_inertial.core.types import Projector
 from colmap_inertial.imaging._bilinear import between_nodes
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.exposure_pairs._registration import Registered, register
@@ -23,9 +22,6 @@ from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.psf import blur_field
 from colmap_inertial.imaging.rolling_shutter import grid_nodes, rays, sampling_maps, seen_by_lines
 from colmap_inertial.imaging.transfer import decode_table, srgb_from_linear
-
-Codes = NDArray[Any]
-Light = NDArray[np.float32]
 
 #: Pixels as bright as this share of the largest code may have been clipped.
 CLIPPED = 250 / 255
@@ -76,7 +72,7 @@ class Brightness:
         return abs(np.log(self.measured / self.stated)) > np.log(_AGREE)
 
 
-def match_brightness(short: Codes, long: Codes, *, stated: float | None = None) -> Brightness:
+def match_brightness(short: AnyArray, long: AnyArray, *, stated: float | None = None) -> Brightness:
     """The gain between two exposures, in linear light.
 
     The images are compared in squares: the median over those that neither clip nor sink into black, weighted by their
@@ -124,7 +120,7 @@ def match_brightness(short: Codes, long: Codes, *, stated: float | None = None) 
     )
 
 
-def first_brightness(short: Codes, long: Codes, *, stated: float | None = None) -> Brightness:
+def first_brightness(short: AnyArray, long: AnyArray, *, stated: float | None = None) -> Brightness:
     """The gain between two exposures that may lie far from each other.
 
     Not what lies in one place is compared, but what is equally bright among all squares of each image. What is stated
@@ -150,7 +146,7 @@ def first_brightness(short: Codes, long: Codes, *, stated: float | None = None) 
     )
 
 
-def brightened(short: Codes, brightness: Brightness) -> Light:
+def brightened(short: AnyArray, brightness: Brightness) -> Float32Array:
     """The short exposure as bright as the long one: float32 sRGB 0 to 1, clipped, of the same shape."""
     light = decode_table(short.dtype).astype(np.float64)
     planes = short.reshape(*short.shape[:2], -1)
@@ -265,10 +261,10 @@ class ExposurePair:
         Why the gyroscope had no part in it; empty where it had.
     """
 
-    short: Light
-    long: Light
-    covered: NDArray[np.bool_]
-    clipped: NDArray[np.bool_]
+    short: Float32Array
+    long: Float32Array
+    covered: BoolArray
+    clipped: BoolArray
     blur: BlurField | None
     brightness: Brightness
     registered: Registered
@@ -276,7 +272,7 @@ class ExposurePair:
 
 
 def bring_together(
-    short: Codes, long: Codes, *, gyro: PairGyro | None = None, stated_gain: float | None = None
+    short: AnyArray, long: AnyArray, *, gyro: PairGyro | None = None, stated_gain: float | None = None
 ) -> ExposurePair:
     """Match the brightness of a short exposure to the long one's, and the long one's geometry to the short one's.
 
@@ -346,7 +342,7 @@ def bring_together(
     )
 
 
-def _channel_gain(short: Codes, long: Codes, cell: int) -> float | None:
+def _channel_gain(short: AnyArray, long: AnyArray, cell: int) -> float | None:
     """Weighted median over squares of one channel; ``None`` where too few tell."""
     (dark, *of_short), (bright, *of_long) = _squares(short, cell), _squares(long, cell)
     clipped, black = zip(of_short, of_long, strict=True)
@@ -360,7 +356,7 @@ def _channel_gain(short: Codes, long: Codes, cell: int) -> float | None:
     return float(np.exp(_weighted_median(np.log(bright[good] / dark[good]), np.sqrt(bright[good] * dark[good]))))
 
 
-def _ranked_gain(short: Codes, long: Codes, cell: int) -> float | None:
+def _ranked_gain(short: AnyArray, long: AnyArray, cell: int) -> float | None:
     """Likewise of squares of the same rank in brightness, between those that are black and those that clip."""
     (dark, *of_short), (bright, *of_long) = _squares(short, cell), _squares(long, cell)
     clipped, black = (
@@ -377,7 +373,7 @@ def _ranked_gain(short: Codes, long: Codes, cell: int) -> float | None:
     return float(np.exp(_weighted_median(np.log(b[good] / a[good]), np.sqrt(a[good] * b[good]))))
 
 
-def _squares(image: Codes, cell: int) -> tuple[Array, Array, Array]:
+def _squares(image: AnyArray, cell: int) -> tuple[Array, Array, Array]:
     """Mean light of one channel's squares, and which share of them clips and is black."""
     import cv2
 
@@ -385,7 +381,7 @@ def _squares(image: Codes, cell: int) -> tuple[Array, Array, Array]:
     size = (max(1, width // cell), max(1, height // cell))
     top = np.iinfo(image.dtype).max
 
-    def mean(values: NDArray[Any]) -> Array:
+    def mean(values: AnyArray) -> Array:
         return np.asarray(cv2.resize(values.astype(np.float32), size, interpolation=cv2.INTER_AREA), dtype=np.float64)
 
     # codes below the first of 8 bits: what noise takes below black is lost, and what is left is too bright
@@ -402,9 +398,9 @@ def _weighted_median(values: Array, weights: Array) -> float:
     return float(values[order][np.searchsorted(below, 0.5 * below[-1])])
 
 
-def _grey(image: Light) -> Light:
+def _grey(image: Float32Array) -> Float32Array:
     return image if image.ndim == 2 else np.asarray(image.mean(axis=2), dtype=np.float32)
 
 
-def _like(mask: NDArray[np.bool_], image: NDArray[Any]) -> NDArray[np.bool_]:
+def _like(mask: BoolArray, image: AnyArray) -> BoolArray:
     return mask if image.ndim == 2 else mask[..., None]

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Real = NDArray[np.float32]
+from colmap_inertial.core.arrays import BoolArray, Float32Array, IndexArray
 
 #: Neighbours on a square grid: this many steps to each side, first as wide as the first spacing, then wider ones for
 #: pixels that have found too few.
@@ -19,7 +18,7 @@ _ENOUGH, _FLAT = 0.5, 3e-4
 _CHUNK = 1 << 16
 
 
-def fill_hidden(values: Real, seen: NDArray[np.bool_], guide: Real, disparity_px: Real) -> Real:
+def fill_hidden(values: Float32Array, seen: BoolArray, guide: Float32Array, disparity_px: Float32Array) -> Float32Array:
     """A colour's values where it was not seen, from how it goes with the reference's colour nearby.
 
     A line through (guide, value) of neighbours that are seen, of like brightness in the guide and of the same depth, by
@@ -62,14 +61,14 @@ def fill_hidden(values: Real, seen: NDArray[np.bool_], guide: Real, disparity_px
 
 
 def _from_neighbours(
-    values: Real,
-    seen: NDArray[np.bool_],
-    guide: Real,
-    disparity_px: Real,
-    y: NDArray[np.intp],
-    x: NDArray[np.intp],
+    values: Float32Array,
+    seen: BoolArray,
+    guide: Float32Array,
+    disparity_px: Float32Array,
+    y: IndexArray,
+    x: IndexArray,
     spacing: int,
-) -> tuple[Real, Real]:
+) -> tuple[Float32Array, Float32Array]:
     """(n,) values and (n,) sums of weights."""
     height, width = values.shape
     side = spacing * np.arange(-_STEPS, _STEPS + 1)
@@ -93,7 +92,7 @@ def _from_neighbours(
     return np.clip(found, 0, 1).astype(np.float32), total.astype(np.float32)
 
 
-def _line(values: Real, guide: Real) -> tuple[float, float]:
+def _line(values: Float32Array, guide: Float32Array) -> tuple[float, float]:
     """Slope and offset of values over the guide, for what has no neighbours."""
     mean_guide, mean_value = float(guide.mean()), float(values.mean())
     slope = float(np.mean((guide - mean_guide) * (values - mean_value))) / (float(guide.var()) + _FLAT)

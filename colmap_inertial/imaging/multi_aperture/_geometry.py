@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, Float32Array, Int32Array
 from colmap_inertial.core.geometry import (
     colmap_px_from_opencv,
     matrix_from_quat,
@@ -21,10 +21,8 @@ from colmap_inertial.core.geometry import (
     quat_rotate,
     rotation_between,
 )
-from colmap_inertial.core.types import ApertureRig, Array, Projector
+from colmap_inertial.core.types import ApertureRig, Projector
 from colmap_inertial.imaging.rolling_shutter import rays
-
-Map = NDArray[np.float32]
 
 #: The canvas is at most this much larger than the reference's image: strong fisheyes lose their rim.
 _LARGEST = 1.4
@@ -81,9 +79,9 @@ class Rectified:
     rect_from_reference: Array
     baselines: Array
     direction: Array
-    image_from_canvas: tuple[Map | None, ...]
-    canvas_from_reference: Map | None
-    depth_factor: Map | None
+    image_from_canvas: tuple[Float32Array | None, ...]
+    canvas_from_reference: Float32Array | None
+    depth_factor: Float32Array | None
     covered: tuple[tuple[int, int, int, int], ...]
 
     @property
@@ -145,7 +143,7 @@ class Rectified:
         moved = np.stack(placed)  # (N - 1, corner, D, 2)
         return moved[:, 1, :, 0] - moved[:, 0, :, 0], moved[:, 0]
 
-    def sample_positions(self, disparities_px: Array) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    def sample_positions(self, disparities_px: Array) -> tuple[Int32Array, Int32Array]:
         """(N - 1, D, W) columns and (N - 1, D, H) rows in sixteenths of a pixel; negative where a view ends."""
         sizes, offsets = self.transfers(disparities_px)
         out = []
@@ -200,7 +198,7 @@ def rectify(rig: ApertureRig, projectors: Sequence[Projector]) -> Rectified:
 
     x, y = np.meshgrid(np.arange(width), np.arange(height))
     directions = np.stack([(x - centre[0]) / focal, (y - centre[1]) / focal, np.ones_like(x, dtype=float)], axis=-1)
-    maps: list[Map | None] = []
+    maps: list[Float32Array | None] = []
     covered = []
     for aperture, projector, rotation in zip(apertures, projectors, rotations, strict=True):
         in_cam = directions.reshape(-1, 3) @ (rotation @ rect_from_rig.T).T

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from colmap_inertial.core.types import Array
+from colmap_inertial.core.arrays import Array, Float32Array, UInt8Array
 from colmap_inertial.imaging.multi_aperture._geometry import Rectified
 from colmap_inertial.imaging.multi_aperture._sampling import seen_by
-
-Codes = NDArray[np.uint8]
 
 #: Standard deviation of the Gaussian that stands for the unknown noise of codes (Parzen estimate, 7 x 7 codes).
 _SPREAD_CODES = 1.0
 
 
 def cost_tables(
-    reference: Codes, others: Codes, canvas: Rectified, disparity_px: NDArray[np.float32], most: int
-) -> Codes:
+    reference: UInt8Array, others: UInt8Array, canvas: Rectified, disparity_px: Float32Array, most: int
+) -> UInt8Array:
     """(N - 1, 256, 256) costs by the codes of the reference and of each view, from 0 to ``most``.
 
     ``-mi(i, k)`` with ``mi = h_1(i) + h_2(k) - h_12(i, k)`` and ``h = -1/n log(P * g) * g``, ``P`` the codes that lie
@@ -40,7 +37,7 @@ def cost_tables(
     return np.stack(tables)
 
 
-def _table(joint: Array, most: int) -> Codes:
+def _table(joint: Array, most: int) -> UInt8Array:
     def information(probability: Array) -> Array:
         """``-log(P * g) * g``: per correspondence, but for the constant 1/n."""
         smooth = _smoothed(probability)

@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Float32Array, UInt8Array
 from colmap_inertial.core.types import SpectralRole
 from colmap_inertial.imaging.multi_aperture._geometry import Rectified
 from colmap_inertial.imaging.multi_aperture._sampling import seen_by
 from colmap_inertial.imaging.semi_global import LightCost
-
-Codes = NDArray[np.uint8]
 
 #: A residual of this many times the usual one costs 63 % of the most.
 _WIDE = 3.0
@@ -31,7 +29,7 @@ def adds_up(roles: Sequence[SpectralRole]) -> bool:
 
 
 def light_cost(
-    codes: Codes, canvas: Rectified, disparity_px: NDArray[np.float32], roles: Sequence[SpectralRole], most: int
+    codes: UInt8Array, canvas: Rectified, disparity_px: Float32Array, roles: Sequence[SpectralRole], most: int
 ) -> LightCost | None:
     """How luminance follows from the colours, by images that are roughly aligned already.
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
+
+from colmap_inertial.core.arrays import AnyArray, Array, Float32Array, UInt8Array
 
 _BLOCK_PX = 16
 #: Blocks of this share are even enough to show nothing but noise.
@@ -19,7 +18,7 @@ _STANDS_OUT = 1.5
 _TELLING = 1.5
 
 
-def noise_of(plane: NDArray[Any]) -> float:
+def noise_of(plane: AnyArray) -> float:
     """Standard deviation of the noise of an image, in its own codes.
 
     By what is left of it after the Laplacian's square (Immerkaer, Fast noise variance estimation, CVIU 64(2), 1996), in
@@ -35,7 +34,7 @@ def noise_of(plane: NDArray[Any]) -> float:
     kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)
     residual = np.abs(cv2.filter2D(image, -1, kernel))
 
-    def blocks(values: NDArray[np.float32]) -> NDArray[np.float64]:
+    def blocks(values: Float32Array) -> Array:
         cut = values[: height * _BLOCK_PX, : width * _BLOCK_PX]
         return cut.reshape(height, _BLOCK_PX, width, _BLOCK_PX).mean(axis=(1, 3), dtype=np.float64)
 
@@ -44,7 +43,7 @@ def noise_of(plane: NDArray[Any]) -> float:
     return float(np.quantile(level, _EVEN) * np.sqrt(np.pi / 2) / 6) if level.size else 0.0
 
 
-def smoothing(codes: NDArray[np.uint8], noise_codes: float) -> tuple[float, int]:
+def smoothing(codes: UInt8Array, noise_codes: float) -> tuple[float, int]:
     """Over how many pixels (standard deviation) to smooth before comparing, and the least difference that tells.
 
     Nothing is smoothed where at least half of the image has texture that stands out of the noise: there it would cost

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import AnyArray, BoolArray, Float32Array, UInt8Array
 from colmap_inertial.imaging.multi_aperture._geometry import Rectified
 
-Codes = NDArray[np.uint8]
-Real = NDArray[np.float32]
 
-
-def codes_of(image: NDArray[Any]) -> Codes:
+def codes_of(image: AnyArray) -> UInt8Array:
     """(H, W) codes of 8 bit, brighter for brighter; 16 bit go over the square root of what is in use."""
     if image.dtype == np.uint8:
         return image
@@ -21,7 +16,7 @@ def codes_of(image: NDArray[Any]) -> Codes:
     return np.asarray(np.clip(np.rint(255 * np.sqrt(image / np.float32(top))), 0, 255), dtype=np.uint8)
 
 
-def on_canvas(codes: Codes, canvas: Rectified, index: int) -> Codes:
+def on_canvas(codes: UInt8Array, canvas: Rectified, index: int) -> UInt8Array:
     """An aperture's codes on the canvas; beyond the image its border goes on."""
     import cv2
 
@@ -31,7 +26,7 @@ def on_canvas(codes: Codes, canvas: Rectified, index: int) -> Codes:
     return np.asarray(cv2.remap(codes, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
-def shrunk(codes: Codes, by: int) -> Codes:
+def shrunk(codes: UInt8Array, by: int) -> UInt8Array:
     """Means of squares of ``by`` pixels, for ``Rectified.shrunk``."""
     import cv2
 
@@ -41,7 +36,9 @@ def shrunk(codes: Codes, by: int) -> Codes:
     return np.asarray(cv2.resize(codes[: height * by, : width * by], (width, height), interpolation=cv2.INTER_AREA))
 
 
-def places(canvas: Rectified, index: int, disparity_px: Real, x: Real, y: Real) -> tuple[Real, Real]:
+def places(
+    canvas: Rectified, index: int, disparity_px: Float32Array, x: Float32Array, y: Float32Array
+) -> tuple[Float32Array, Float32Array]:
     """Where points (x, y) of the canvas with these disparities lie on the canvas as another aperture sees it."""
     r = canvas.ratios[index - 1]
     cx, cy = (np.float32(c) for c in canvas.centre_px)
@@ -52,8 +49,8 @@ def places(canvas: Rectified, index: int, disparity_px: Real, x: Real, y: Real) 
 
 
 def seen_by(
-    view: NDArray[Any], canvas: Rectified, index: int, disparity_px: Real, every: int = 1
-) -> tuple[Real, NDArray[np.bool_]]:
+    view: AnyArray, canvas: Rectified, index: int, disparity_px: Float32Array, every: int = 1
+) -> tuple[Float32Array, BoolArray]:
     """What the reference sees on the canvas in another aperture's view, itself on the canvas; and whether it is there.
 
     Parameters

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from colmap_inertial.core.types import Array
+from colmap_inertial.core.arrays import Array, Float32Array, UInt16Array
 from colmap_inertial.imaging.multi_aperture._geometry import Rectified
 from colmap_inertial.imaging.semi_global import Views, match_candidates
-
-Real = NDArray[np.float32]
 
 
 def candidates(low_px: float, high_px: float, step_px: float) -> Array:
@@ -18,7 +15,7 @@ def candidates(low_px: float, high_px: float, step_px: float) -> Array:
     return np.asarray(step_px * np.arange(first, last + 1))
 
 
-def match(views: Views, canvas: Rectified, disparities_px: Array, *, threads: int) -> tuple[Real, NDArray[np.uint16]]:
+def match(views: Views, canvas: Rectified, disparities_px: Array, *, threads: int) -> tuple[Float32Array, UInt16Array]:
     """Match all views at once.
 
     Parameters

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import AnyArray, BoolArray, Float32Array, UInt8Array, UInt16Array
 from colmap_inertial.core.options import ApertureOptions
 from colmap_inertial.core.types import SpectralRole
 from colmap_inertial.imaging.multi_aperture._geometry import Rectified
@@ -18,9 +17,6 @@ from colmap_inertial.imaging.multi_aperture._noise import noise_of, smoothing
 from colmap_inertial.imaging.multi_aperture._sampling import codes_of, on_canvas, shrunk
 from colmap_inertial.imaging.multi_aperture._volume import candidates, match
 from colmap_inertial.imaging.semi_global import MOST, Views
-
-Codes = NDArray[np.uint8]
-Real = NDArray[np.float32]
 
 #: Disparities that differ by no more are of one surface.
 SAME_PX = 0.75
@@ -48,13 +44,13 @@ class Disparity:
         (N - 1, H, W) whether each other aperture sees it: nothing nearer is in the way.
     """
 
-    disparity_px: Real
-    measured: NDArray[np.bool_]
-    visible: NDArray[np.bool_]
+    disparity_px: Float32Array
+    measured: BoolArray
+    visible: BoolArray
 
 
 def estimate_disparity(
-    planes: Sequence[NDArray[Any]],
+    planes: Sequence[AnyArray],
     canvas: Rectified,
     options: ApertureOptions | None = None,
     *,
@@ -101,7 +97,7 @@ def estimate_disparity(
     return _settled(found, total, canvas, threads, even=bool(np.ptp(reference) == 0))
 
 
-def _codes(planes: Sequence[NDArray[Any]], canvas: Rectified) -> tuple[Codes, int]:
+def _codes(planes: Sequence[AnyArray], canvas: Rectified) -> tuple[UInt8Array, int]:
     """(N, H, W) codes to compare, on the canvas, and the least difference of them that tells."""
     import cv2
 
@@ -116,7 +112,7 @@ def _codes(planes: Sequence[NDArray[Any]], canvas: Rectified) -> tuple[Codes, in
     return np.stack(codes), least
 
 
-def _settled(found: Real, least: NDArray[np.uint16], canvas: Rectified, threads: int, *, even: bool) -> Disparity:
+def _settled(found: Float32Array, least: UInt16Array, canvas: Rectified, threads: int, *, even: bool) -> Disparity:
     """The disparities without what is wrong, and what the views see of them."""
     import cv2
 
@@ -128,7 +124,7 @@ def _settled(found: Real, least: NDArray[np.uint16], canvas: Rectified, threads:
     return Disparity(disparity_px=smooth, measured=measured & (not even), visible=visible)
 
 
-def _seen(disparity_px: Real, least: NDArray[np.uint16], canvas: Rectified, threads: int) -> NDArray[np.uint8]:
+def _seen(disparity_px: Float32Array, least: UInt16Array, canvas: Rectified, threads: int) -> UInt8Array:
     from colmap_inertial._kernels import _apertures
 
     ratios = canvas.ratios
@@ -140,7 +136,7 @@ def _seen(disparity_px: Real, least: NDArray[np.uint16], canvas: Rectified, thre
     return bits
 
 
-def background(disparity_px: Real, known: NDArray[np.bool_]) -> Real:
+def background(disparity_px: Float32Array, known: BoolArray) -> Float32Array:
     """Disparities with gaps filled from behind: by the second least of the next known ones in four directions.
 
     Hirschmueller (2008), section 2.5.3, who takes eight; the least itself may be an outlier.
@@ -162,7 +158,7 @@ def background(disparity_px: Real, known: NDArray[np.bool_]) -> Real:
     return np.where(known | ~np.isfinite(behind), disparity_px, behind).astype(np.float32)
 
 
-def _range_px(reference: Codes, others: Codes, canvas: Rectified, threads: int) -> tuple[float, float]:
+def _range_px(reference: UInt8Array, others: UInt8Array, canvas: Rectified, threads: int) -> tuple[float, float]:
     """Limits of the disparities, by matching smaller images over a wide range."""
     by = _look_shrink(reference)
     small = canvas.shrunk(by)
@@ -174,15 +170,17 @@ def _range_px(reference: Codes, others: Codes, canvas: Rectified, threads: int) 
     return float(limits[0] - _LOOK_MARGIN_PX), float(limits[1] + _LOOK_MARGIN_PX)
 
 
-def _look_shrink(reference: Codes) -> int:
+def _look_shrink(reference: UInt8Array) -> int:
     return max(1, min(_LOOK_SHRINK, min(reference.shape) // _NARROWEST_PX))
 
 
-def _shrunk_views(reference: Codes, others: Codes, by: int) -> Views:
+def _shrunk_views(reference: UInt8Array, others: UInt8Array, by: int) -> Views:
     return Views(reference=shrunk(reference, by), others=np.stack([shrunk(view, by) for view in others]))
 
 
-def _rough(reference: Codes, others: Codes, canvas: Rectified, low_px: float, high_px: float, threads: int) -> Real:
+def _rough(
+    reference: UInt8Array, others: UInt8Array, canvas: Rectified, low_px: float, high_px: float, threads: int
+) -> Float32Array:
     """Disparities by matching smaller images."""
     import cv2
 
@@ -193,8 +191,8 @@ def _rough(reference: Codes, others: Codes, canvas: Rectified, low_px: float, hi
 
 
 def _tables(
-    reference: Codes, others: Codes, canvas: Rectified, low_px: float, high_px: float, threads: int
-) -> NDArray[np.uint8]:
+    reference: UInt8Array, others: UInt8Array, canvas: Rectified, low_px: float, high_px: float, threads: int
+) -> UInt8Array:
     """Cost tables by mutual information, from small images to large ones (Hirschmueller 2008, section 2.1).
 
     The first disparities are drawn at random, and the first size is gone through three times.
@@ -202,7 +200,7 @@ def _tables(
     import cv2
 
     levels = [by for by in (16, 8, 4, 2) if by <= _FIRST_SHRINK and min(reference.shape) // by >= _NARROWEST_PX]
-    disparity: Real | None = None
+    disparity: Float32Array | None = None
     for by in [*levels[:1], *levels[:1], *levels]:
         small = canvas.shrunk(by)
         views = _shrunk_views(reference, others, by)

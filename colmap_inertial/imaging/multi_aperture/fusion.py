@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import AnyArray, BoolArray, Float32Array
 from colmap_inertial.core.errors import InertialError
 from colmap_inertial.core.options import ApertureOptions
 from colmap_inertial.core.types import ApertureRig, SpectralRole
@@ -17,8 +16,6 @@ from colmap_inertial.imaging.multi_aperture._geometry import Rectified
 from colmap_inertial.imaging.multi_aperture._noise import noise_of
 from colmap_inertial.imaging.multi_aperture._sampling import places
 from colmap_inertial.imaging.multi_aperture.disparity import Disparity, estimate_disparity
-
-Real = NDArray[np.float32]
 
 COLOURS: tuple[SpectralRole, ...] = ("red", "green", "blue")
 #: Side of the windows in which colours go with luminance.
@@ -46,14 +43,14 @@ class Fused:
         (H, W) whether a colour was seen by none of its apertures, and taken from its neighbourhood.
     """
 
-    image: NDArray[Any]
-    disparity_px: Real
-    depth: Real
-    measured: NDArray[np.bool_]
-    hidden: NDArray[np.bool_]
+    image: AnyArray
+    disparity_px: Float32Array
+    depth: Float32Array
+    measured: BoolArray
+    hidden: BoolArray
 
 
-def plane_of(image: NDArray[Any], role: SpectralRole) -> NDArray[Any]:
+def plane_of(image: AnyArray, role: SpectralRole) -> AnyArray:
     """What an aperture recorded, (H, W), from a file of one or three channels.
 
     A colour is taken from its own channel of an RGB image, luminance (and ``other``) from ITU-R BT.601's sum.
@@ -78,7 +75,7 @@ def require_colours(rig: ApertureRig) -> None:
 
 
 def fuse_apertures(
-    planes: Sequence[NDArray[Any]], rig: ApertureRig, canvas: Rectified, options: ApertureOptions | None = None
+    planes: Sequence[AnyArray], rig: ApertureRig, canvas: Rectified, options: ApertureOptions | None = None
 ) -> Fused:
     """One RGB image, as the reference sees it, from one exposure of all apertures.
 
@@ -102,7 +99,7 @@ def fuse_apertures(
     return fuse_with(planes, rig, canvas, estimate_disparity(planes, canvas, options, roles=roles), options)
 
 
-def check_planes(planes: Sequence[NDArray[Any]], rig: ApertureRig) -> None:
+def check_planes(planes: Sequence[AnyArray], rig: ApertureRig) -> None:
     """Raise ``ValueError`` where images do not belong to a rig."""
     if len(planes) != len(rig.apertures):
         raise ValueError(f"{len(planes)} pictures for {len(rig.apertures)} apertures")
@@ -115,7 +112,7 @@ def check_planes(planes: Sequence[NDArray[Any]], rig: ApertureRig) -> None:
 
 
 def fuse_with(
-    planes: Sequence[NDArray[Any]],
+    planes: Sequence[AnyArray],
     rig: ApertureRig,
     canvas: Rectified,
     found: Disparity,
@@ -138,7 +135,7 @@ def fuse_with(
     grid = _Grid(canvas, shape, found)
     guide = planes[0].astype(np.float32) / top
     hidden = np.zeros(shape, dtype=bool)
-    roles: dict[SpectralRole, Real] = {}
+    roles: dict[SpectralRole, Float32Array] = {}
     wanted = [*COLOURS, "luminance"] if options.use_luminance else [*COLOURS]
     for role in wanted:
         total, count = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
@@ -181,17 +178,17 @@ class _Grid:
         else:
             x, y = np.moveaxis(canvas.canvas_from_reference, -1, 0)
         self.x, self.y = x, y
-        self.disparity_px: Real = self._nearest(found.disparity_px)
-        self.measured: NDArray[np.bool_] = self._nearest(found.measured)
+        self.disparity_px: Float32Array = self._nearest(found.disparity_px)
+        self.measured: BoolArray = self._nearest(found.measured)
 
-    def _nearest(self, values: NDArray[Any]) -> NDArray[Any]:
+    def _nearest(self, values: AnyArray) -> AnyArray:
         if self.canvas.canvas_from_reference is None:
             return values
         row = np.clip(np.rint(self.y), 0, self.canvas.height - 1).astype(np.intp)
         column = np.clip(np.rint(self.x), 0, self.canvas.width - 1).astype(np.intp)
         return np.asarray(values[row, column])
 
-    def depth(self) -> Real:
+    def depth(self) -> Float32Array:
         d = self.disparity_px
         scale = np.float32(self.canvas.focal_px * self.canvas.baseline)
         depth = np.where(d > 0, scale / np.maximum(d, np.float32(1e-6)), np.float32(np.inf))
@@ -199,7 +196,7 @@ class _Grid:
             depth = depth * self.canvas.depth_factor
         return np.where(self.measured, depth, np.float32(np.nan)).astype(np.float32)
 
-    def warped(self, plane: NDArray[Any], index: int, top: np.float32) -> tuple[Real, NDArray[np.bool_]]:
+    def warped(self, plane: AnyArray, index: int, top: np.float32) -> tuple[Float32Array, BoolArray]:
         """An aperture's image as the reference sees it, full scale 1, and where it sees it."""
         import cv2
 
@@ -214,11 +211,11 @@ class _Grid:
         return np.clip(values, 0, 1), inside & self._nearest(self.found.visible[index - 1])
 
 
-def with_luminance(colours: Real, luminance: Real) -> Real:
+def with_luminance(colours: Float32Array, luminance: Float32Array) -> Float32Array:
     """Colours with the noise of luminance instead of their own, as far as they go with it."""
     import cv2
 
-    def mean(values: Real) -> Real:
+    def mean(values: Float32Array) -> Float32Array:
         size = (_WINDOW_PX, _WINDOW_PX)
         return np.asarray(cv2.blur(values, size, borderType=cv2.BORDER_REFLECT_101))
 

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import AnyArray, Float32Array
 from colmap_inertial.imaging.transfer import decode_table, srgb_from_linear
-
-Real = NDArray[np.float32]
 
 #: Layers of disparity that are blurred one by one; more make no visible difference.
 _MOST_LAYERS = 48
@@ -18,8 +14,8 @@ _LAYER_PX = 0.5
 
 
 def refocus(
-    image: NDArray[Any], disparity_px: Real, focus_px: float, *, strength: float = 1.0, largest_px: float = 60.0
-) -> NDArray[Any]:
+    image: AnyArray, disparity_px: Float32Array, focus_px: float, *, strength: float = 1.0, largest_px: float = 60.0
+) -> AnyArray:
     """Blur what does not have the disparity in focus, as a lens as wide as the baseline would.
 
     A thing whose disparity differs by ``d`` from the one in focus becomes a disc ``d`` pixels wide: that is what the
@@ -64,7 +60,7 @@ def refocus(
     return np.asarray(np.rint(top * srgb_from_linear(np.clip(result, 0, 1))), dtype=image.dtype)
 
 
-def _disc(width_px: float) -> Real:
+def _disc(width_px: float) -> Float32Array:
     """A disc that adds up to one, its rim in shares of pixels."""
     reach = int(np.ceil(width_px / 2))
     y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]

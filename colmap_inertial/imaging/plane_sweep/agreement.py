@@ -6,13 +6,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, Float32Array
 from colmap_inertial.imaging.plane_sweep.pinhole import ROWS_AT_ONCE, Pinhole
 
-Real = NDArray[np.float32]
 #: Matrix and offset from a pixel and its depth to another view.
-Transfer = tuple[NDArray[np.float64], NDArray[np.float64]]
+Transfer = tuple[Array, Array]
 
 #: How far from itself a pixel may come back, and by which share its depth may have changed.
 _WITHIN_PX, _WITHIN_SHARE = 1.0, 0.02
@@ -22,11 +21,11 @@ _WITHIN_PX, _WITHIN_SHARE = 1.0, 0.02
 class DepthView:
     """A picture's depths, (H, W), and the camera that took it."""
 
-    depth: Real
+    depth: Float32Array
     camera: Pinhole
 
 
-def agreed_depth(reference: DepthView, others: Iterable[DepthView]) -> Real:
+def agreed_depth(reference: DepthView, others: Iterable[DepthView]) -> Float32Array:
     """Keep the depths that at least one other view agrees with.
 
     A pixel is taken to the other view by its depth, and back by the depth that was found there.
@@ -55,7 +54,9 @@ def agreed_depth(reference: DepthView, others: Iterable[DepthView]) -> Real:
     return np.where((count > 1) & (depth > 0), total / count, 0).astype(np.float32)
 
 
-def _there_and_back(depth: Real, begin: int, other: Real, there: Transfer, back: Transfer) -> Real:
+def _there_and_back(
+    depth: Float32Array, begin: int, other: Float32Array, there: Transfer, back: Transfer
+) -> Float32Array:
     """The depths that rows ``begin ...`` come back with, by another view's depths; nan where they do not."""
     rows, columns = np.indices(depth.shape)
     y, x = (np.asarray(axis, dtype=np.float32) for axis in (rows + begin, columns))
@@ -71,8 +72,8 @@ def _there_and_back(depth: Real, begin: int, other: Real, there: Transfer, back:
 
 
 def _carried(
-    matrix: NDArray[np.float64], offset: NDArray[np.float64], x: Real, y: Real, depth: Real
-) -> tuple[Real, Real, Real]:
+    matrix: Array, offset: Array, x: Float32Array, y: Float32Array, depth: Float32Array
+) -> tuple[Float32Array, Float32Array, Float32Array]:
     """Pixels and depths in another view, (H, W) each; not finite where they lie in the plane of its centre."""
     m, b = matrix.astype(np.float32), offset.astype(np.float32)
     u, v, w = ((m[i, 0] * x + m[i, 1] * y + m[i, 2]) * depth + b[i] for i in range(3))

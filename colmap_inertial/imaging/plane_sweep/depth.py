@@ -9,16 +9,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, Float32Array, Int32Array, UInt8Array
 from colmap_inertial.core.threads import in_order, usable_processors
-from colmap_inertial.core.types import Array
 from colmap_inertial.imaging.plane_sweep.pinhole import Pinhole
 from colmap_inertial.imaging.plane_sweep.tiles import Tile, tiles_of
 from colmap_inertial.imaging.semi_global import Views, match_candidates
-
-Codes = NDArray[np.uint8]
-Real = NDArray[np.float32]
 
 #: Between two candidates a thing moves by this much in the partner where it moves most.
 _STEP_PX = 1.0
@@ -47,7 +43,7 @@ class Partner:
         What took it.
     """
 
-    codes: Codes
+    codes: UInt8Array
     camera: Pinhole
 
 
@@ -64,8 +60,8 @@ class _Canvas:
 
 
 def sweep_depth(
-    codes: Codes, camera: Pinhole, partners: Sequence[Partner], depths: tuple[float, float], *, threads: int
-) -> Real:
+    codes: UInt8Array, camera: Pinhole, partners: Sequence[Partner], depths: tuple[float, float], *, threads: int
+) -> Float32Array:
     """Find what depth each pixel has.
 
     Parameters
@@ -118,12 +114,12 @@ class _Sweep:
 
     views: Views
     inverse: Array
-    columns: NDArray[np.int32]
-    rows: NDArray[np.int32]
+    columns: Int32Array
+    rows: Int32Array
 
     @classmethod
     def of(
-        cls, codes: Codes, camera: Pinhole, partners: Sequence[Partner], depths: tuple[float, float]
+        cls, codes: UInt8Array, camera: Pinhole, partners: Sequence[Partner], depths: tuple[float, float]
     ) -> _Sweep | None:
         """``None`` where no partner shows anything of it."""
         near, far = depths
@@ -144,12 +140,12 @@ class _Sweep:
         views = Views(reference=codes, others=others, least=_LEAST_CODES, shown=shown)
         return cls(views=views, inverse=inverse, columns=columns, rows=rows)
 
-    def depth(self, threads: int) -> Real:
+    def depth(self, threads: int) -> Float32Array:
         """(H, W) of all candidates."""
         best, _ = match_candidates(self.views, self.columns, self.rows, threads=threads)
         return self._of(best, slice(0, len(self.inverse)))
 
-    def of_tile(self, tile: Tile) -> Real:
+    def of_tile(self, tile: Tile) -> Float32Array:
         """Of a tile and what it shares with its neighbours, by its own candidates."""
         part = np.ascontiguousarray(self.views.reference[tile.rows, tile.columns])
         columns = np.ascontiguousarray(self.columns[:, tile.candidates, tile.columns])
@@ -157,7 +153,7 @@ class _Sweep:
         best, _ = match_candidates(replace(self.views, reference=part), columns, rows, threads=1)
         return self._of(best, tile.candidates)
 
-    def _of(self, best: Real, candidates: slice) -> Real:
+    def _of(self, best: Float32Array, candidates: slice) -> Float32Array:
         """Depths of candidates, counted from the first of some; the best one at an end may lie beyond."""
         known = (best > 0) & (best < candidates.stop - candidates.start - 1)
         step = self.inverse[1] - self.inverse[0]
@@ -165,7 +161,7 @@ class _Sweep:
         return np.where(known, 1 / found, 0).astype(np.float32)
 
 
-def _half(codes: Codes) -> Codes:
+def _half(codes: UInt8Array) -> UInt8Array:
     """A picture at half its size."""
     import cv2
 
@@ -239,7 +235,7 @@ def _canvas(camera: Pinhole, view: Pinhole, depths: tuple[float, float]) -> _Can
     )
 
 
-def _positions(camera: Pinhole, canvas: _Canvas, inverse: Array, axis: int) -> NDArray[np.int32]:
+def _positions(camera: Pinhole, canvas: _Canvas, inverse: Array, axis: int) -> Int32Array:
     """(D, n) columns or rows of the canvas in 1/16 px, outside of it where it has none."""
     start, size = ((canvas.left, canvas.width), (canvas.top, canvas.height))[axis]
     place, shrinks = _place(camera, canvas.baseline, inverse, axis)
@@ -248,14 +244,14 @@ def _positions(camera: Pinhole, canvas: _Canvas, inverse: Array, axis: int) -> N
     return np.where(shrinks >= _CLOSEST, sixteenths, -1).astype(np.int32)
 
 
-def _turned(codes: Codes, canvas: _Canvas) -> Codes:
+def _turned(codes: UInt8Array, canvas: _Canvas) -> UInt8Array:
     import cv2
 
     size = (canvas.width, canvas.height)
     return np.asarray(cv2.warpPerspective(codes, canvas.canvas_from_view, size, flags=cv2.INTER_LINEAR))
 
 
-def _shown(shape: tuple[int, ...], canvas: _Canvas) -> NDArray[np.int32]:
+def _shown(shape: tuple[int, ...], canvas: _Canvas) -> Int32Array:
     """(H, 2) from and up to which column a canvas shows the view: turned, it is a quadrilateral there."""
     import cv2
 

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import BoolArray, Float32Array
 from colmap_inertial.imaging.plane_sweep.pinhole import ROWS_AT_ONCE, Pinhole
-
-Real = NDArray[np.float32]
 
 #: Pixels from the centre of the window that a plane is fitted to.
 _RADIUS = 3
@@ -17,7 +15,7 @@ _SAME_SHARE = 0.03
 _LEAST = 6
 
 
-def normals_of(depth: Real, camera: Pinhole) -> Real:
+def normals_of(depth: Float32Array, camera: Pinhole) -> Float32Array:
     """Fit a plane around each pixel.
 
     On a plane ``n X = d``, inverse depth ``1/z = n (x, y, 1) / d`` is linear in the pixel's coordinates: least squares
@@ -51,7 +49,7 @@ def normals_of(depth: Real, camera: Pinhole) -> Real:
     return out
 
 
-def _of_rows(known: NDArray[np.bool_], middle: Real, room: Real, begin: int, camera: Pinhole) -> Real:
+def _of_rows(known: BoolArray, middle: Float32Array, room: Float32Array, begin: int, camera: Pinhole) -> Float32Array:
     """Of rows ``begin ...``; ``room`` is their inverse depth with the neighbours around."""
     height, width = known.shape
     tolerance = _SAME_SHARE * middle

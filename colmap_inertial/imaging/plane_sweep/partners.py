@@ -6,9 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from colmap_inertial.core.types import Array
+from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.imaging.plane_sweep.pinhole import Pinhole
 
 #: The best angle between two rays to a point; below and above it, a point counts less by these widths. Small angles
@@ -41,12 +40,12 @@ class Sights:
 
     views: tuple[Pinhole, ...]
     points: Array
-    of_view: tuple[NDArray[np.int64], ...]
-    of_point: NDArray[np.int64]
-    first: NDArray[np.int64]
+    of_view: tuple[Int64Array, ...]
+    of_point: Int64Array
+    first: Int64Array
 
     @classmethod
-    def of(cls, views: Sequence[Pinhole], points: Array, observed: Sequence[NDArray[np.int64]]) -> Sights:
+    def of(cls, views: Sequence[Pinhole], points: Array, observed: Sequence[Int64Array]) -> Sights:
         """Of views and the numbers of the points that each of them observes."""
         each = tuple(np.unique(numbers) for numbers in observed)
         number = np.concatenate([np.zeros(0, dtype=np.int64), *each])

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from colmap_inertial.core.types import Array
+from colmap_inertial.core.arrays import Array
 
 #: Rows of a picture that are worked on at once: what is made of them stays in the cache, and little memory is held.
 ROWS_AT_ONCE = 64

@@ -7,7 +7,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+
+from colmap_inertial.core.arrays import Array
 
 #: Sides of the tiles that have candidates of their own, and what they share with their neighbours on each side:
 #: smaller tiles need fewer candidates, but share more (2.2 times less work than all candidates; 1.8 with 128 and 16).
@@ -37,7 +38,7 @@ class Tile:
         return _within(self.inner_rows, self.rows), _within(self.inner_columns, self.columns)
 
 
-def tiles_of(coarse: NDArray[np.float64], shape: tuple[int, int], count: int) -> Iterator[Tile]:
+def tiles_of(coarse: Array, shape: tuple[int, int], count: int) -> Iterator[Tile]:
     """Cut a picture into tiles with the candidates that each needs.
 
     Parameters

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import AnyArray, Array, Float32Array
 from colmap_inertial.imaging._bilinear import bilinear
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath
@@ -69,7 +68,7 @@ def tiles(height: int, width: int, most_px: int = MOST_PX) -> list[tuple[Span, S
     return [(row, column) for row in rows for column in columns]
 
 
-def feed(image: NDArray[Any], row: Span, column: Span) -> NDArray[np.float32]:
+def feed(image: AnyArray, row: Span, column: Span) -> Float32Array:
     """(1, 3, H, W) a part of an image, mirrored beyond its edges, full scale = 1; grey is three times the same.
 
     Parameters
@@ -89,7 +88,7 @@ def feed(image: NDArray[Any], row: Span, column: Span) -> NDArray[np.float32]:
     return out
 
 
-def blur_feed(blur: BlurField, row: Span, column: Span) -> NDArray[np.float32]:
+def blur_feed(blur: BlurField, row: Span, column: Span) -> Float32Array:
     """(1, 3, H / 2, W / 2) the blur of a part: (L cos 2a, L sin 2a, L) / 32 for L px at angle a.
 
     The double angle is the same for a vector and its negative. Values hold at the centres of 2 x 2 pixels.
@@ -104,7 +103,7 @@ def blur_feed(blur: BlurField, row: Span, column: Span) -> NDArray[np.float32]:
     return out
 
 
-def path_feed(path: BlurPath, row: Span, column: Span) -> NDArray[np.float32]:
+def path_feed(path: BlurPath, row: Span, column: Span) -> Float32Array:
     """(1, 5, H / 2, W / 2) the path of a part: its chord as :func:`blur_feed` has it, and its bend.
 
     The bend is the mean of the path, (x, y) in units of `BEND_UNIT_PX`: nothing for a line that is run through evenly,
@@ -118,7 +117,7 @@ def path_feed(path: BlurPath, row: Span, column: Span) -> NDArray[np.float32]:
     return out
 
 
-def _at_centres(blur: BlurField, row: Span, column: Span) -> NDArray[np.float64]:
+def _at_centres(blur: BlurField, row: Span, column: Span) -> Array:
     """(H / 2, W / 2, 2) a field at the centres of 2 x 2 pixels."""
     at_rows, at_columns = (
         np.minimum(np.arange(span.begin + 0.5, span.end, 2), limit - 1) / blur.step_px
@@ -127,7 +126,7 @@ def _at_centres(blur: BlurField, row: Span, column: Span) -> NDArray[np.float64]
     return bilinear(blur.vector_px, at_rows, at_columns)
 
 
-def put(image: NDArray[Any], restored: NDArray[np.float32], row: Span, column: Span) -> None:
+def put(image: AnyArray, restored: Float32Array, row: Span, column: Span) -> None:
     """Put what is kept of (3, H, W) into an image of any type that :func:`feed` takes; grey gets the mean."""
     to_row, from_row = row.kept(image.shape[0])
     to_column, from_column = column.kept(image.shape[1])

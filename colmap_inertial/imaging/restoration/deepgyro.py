@@ -12,6 +12,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Float32Array
 from colmap_inertial.imaging._bilinear import bilinear
 from colmap_inertial.imaging._cells import CELL_PX, Cells
 from colmap_inertial.imaging.blur_field import BlurField
@@ -63,7 +64,7 @@ def deblur(image: NDArray[Code], path: BlurPath, *, network: Network) -> NDArray
     return restored
 
 
-def _known(blur: BlurField) -> NDArray[np.float32]:
+def _known(blur: BlurField) -> Float32Array:
     """(Ny + 1, Nx + 1) share of the network's result at the corners of the cells, by the length of blur."""
     rows, columns = (np.minimum(np.arange(0, n + CELL_PX, CELL_PX), n - 1) for n in (blur.height, blur.width))
     x, y = np.moveaxis(blur.at(rows, columns), -1, 0)
@@ -71,7 +72,7 @@ def _known(blur: BlurField) -> NDArray[np.float32]:
     return np.asarray(np.clip((high - np.hypot(x, y)) / (high - low), 0, 1), dtype=np.float32)
 
 
-def _blend(restored: NDArray[Code], other: NDArray[Code], share: NDArray[np.float32]) -> None:
+def _blend(restored: NDArray[Code], other: NDArray[Code], share: Float32Array) -> None:
     """Put another image's pixels for what is not the share of the restored one, given at the corners of cells."""
     if share.min() == 1:
         return

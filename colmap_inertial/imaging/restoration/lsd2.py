@@ -6,20 +6,19 @@ Neural Networks" (2018).
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import AnyArray
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.restoration.network import Network
 
 Sample = TypeVar("Sample", np.uint8, np.uint16, np.float32)
 
 
-def fuse(
-    short: NDArray[Sample], long: NDArray[Any], *, blur: BlurField | None = None, network: Network
-) -> NDArray[Sample]:
+def fuse(short: NDArray[Sample], long: AnyArray, *, blur: BlurField | None = None, network: Network) -> NDArray[Sample]:
     """Make one image of two exposures.
 
     Parameters

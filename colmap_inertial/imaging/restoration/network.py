@@ -10,6 +10,7 @@ from weakref import WeakValueDictionary
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import AnyArray, Float32Array
 from colmap_inertial.core.errors import FormatError, InertialError, MissingExtraError
 from colmap_inertial.core.threads import usable_processors
 from colmap_inertial.imaging.blur_field import BlurField
@@ -93,7 +94,7 @@ class Network:
         return network
 
     def restore(
-        self, image: NDArray[Sample], aid: NDArray[Any], blur: BlurPath | BlurField | None = None
+        self, image: NDArray[Sample], aid: AnyArray, blur: BlurPath | BlurField | None = None
     ) -> NDArray[Sample]:
         """Restore an image.
 
@@ -147,9 +148,7 @@ class Network:
         if blur is not None and not isinstance(blur, wanted):
             raise ValueError(f"blur: {self.name} takes a {wanted.__name__}, not a {type(blur).__name__}")
 
-    def _blur_feed(
-        self, blur: BlurPath | BlurField | None, row: _tiles.Span, column: _tiles.Span
-    ) -> NDArray[np.float32]:
+    def _blur_feed(self, blur: BlurPath | BlurField | None, row: _tiles.Span, column: _tiles.Span) -> Float32Array:
         if blur is None:
             return np.zeros((1, _BLUR_CHANNELS[self.name], row.size // 2, column.size // 2), dtype=np.float32)
         if isinstance(blur, BlurPath):
@@ -279,7 +278,7 @@ def _first_line(error: Exception) -> str:
     return next(iter(str(error).strip().splitlines()), type(error).__name__)[:200]
 
 
-def _require_images(image: NDArray[Any], aid: NDArray[Any], blur: BlurPath | BlurField | None) -> None:
+def _require_images(image: AnyArray, aid: AnyArray, blur: BlurPath | BlurField | None) -> None:
     for name, array in (("image", image), ("aid", aid)):
         if array.dtype not in (np.uint8, np.uint16, np.float32):
             raise ValueError(f"{name}: uint8, uint16 or float32, not {array.dtype}")

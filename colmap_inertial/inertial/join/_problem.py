@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.geometry import so3_exp, so3_log
-from colmap_inertial.core.types import Array, ImuRecording
+from colmap_inertial.core.types import ImuRecording
 from colmap_inertial.inertial.join.values import Link, Part, SharedImages
 from colmap_inertial.inertial.scale import _parameters as par, posterior as post
 from colmap_inertial.inertial.scale._preintegration import Preintegrated, SensorErrors, Track, Tracks, preintegrate
@@ -95,20 +95,20 @@ class Equations:
     gradient: Array
     squares: float = 0.0
 
-    def add(self, residual: Array, columns: NDArray[np.int64], by: Array) -> None:
+    def add(self, residual: Array, columns: Int64Array, by: Array) -> None:
         """Residuals over their standard deviations, with derivatives by some columns."""
         self.matrix[np.ix_(columns, columns)] += by.T @ by
         self.gradient[columns] += by.T @ residual
         self.squares += float(residual @ residual)
 
-    def add_normal(self, away: Array, columns: NDArray[np.int64], info: Array, sign: float = 1.0) -> None:
+    def add_normal(self, away: Array, columns: Int64Array, info: Array, sign: float = 1.0) -> None:
         """A normal distribution over some columns; with a sign of -1, one that is in there twice."""
         self.matrix[np.ix_(columns, columns)] += sign * info
         self.gradient[columns] += sign * (info @ away)
         self.squares += sign * float(away @ info @ away)
 
 
-def columns_of(columns: slice) -> NDArray[np.int64]:
+def columns_of(columns: slice) -> Int64Array:
     return np.arange(columns.start, columns.stop)
 
 

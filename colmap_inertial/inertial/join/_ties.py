@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import skew, so3_log
-from colmap_inertial.core.types import Array
 from colmap_inertial.inertial.join._problem import (
     At,
     End,

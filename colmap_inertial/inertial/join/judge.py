@@ -9,9 +9,10 @@ from typing import TypeVar
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import skew, so3_log
 from colmap_inertial.core.options import JoinOptions
-from colmap_inertial.core.types import Array, Gap, ImuRecording
+from colmap_inertial.core.types import Gap, ImuRecording
 from colmap_inertial.inertial.join._problem import Ties
 from colmap_inertial.inertial.join.doubts import at_most, clocks_differ, most, plainly_apart, times_counted, unlike
 from colmap_inertial.inertial.join.links import find_links, find_matched, find_shared

@@ -8,10 +8,9 @@ from dataclasses import replace
 from itertools import combinations, pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, BoolArray
 from colmap_inertial.core.geometry import so3_log
-from colmap_inertial.core.types import Array
 from colmap_inertial.inertial.join.values import Found, Link, MatchedImages, Part, SharedImages, pair_of
 from colmap_inertial.inertial.scale._parameters import DRIFT_S
 
@@ -105,7 +104,7 @@ def find_matched(parts: Sequence[Part], found: Sequence[Found]) -> list[MatchedI
     return [replace(one, weight=one.weight / times[pair_of(one)]) for one in out]
 
 
-def _agreeing(turned: Array, own: Array, centres: Array, own_centres: Array) -> NDArray[np.bool_]:
+def _agreeing(turned: Array, own: Array, centres: Array, own_centres: Array) -> BoolArray:
     """(n,) which of n images lie in two parts as most of them do; rotations world_from_cam and centres in either."""
     turns = turned @ own.transpose(0, 2, 1)
     middle = turns[int(np.argmin([_median_angle(turns, turn) for turn in turns]))]

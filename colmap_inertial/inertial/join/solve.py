@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import matrix_from_quat, rotation_between, so3_exp, so3_log
-from colmap_inertial.core.types import Array
 from colmap_inertial.inertial.join._problem import (
     At,
     End,

@@ -7,13 +7,11 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.geometry import matrix_from_quat
-from colmap_inertial.core.types import Array, CameraTrajectory
+from colmap_inertial.core.types import CameraTrajectory
 from colmap_inertial.inertial.scale.posterior import FittedPath
-
-Index = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -85,8 +83,8 @@ class SharedImages:
 
     first: int
     second: int
-    in_first: Index
-    in_second: Index
+    in_first: Int64Array
+    in_second: Int64Array
     weight: float
 
     def among(self, place_of: Mapping[int, int]) -> Self:
@@ -150,7 +148,7 @@ class Found:
     beside: tuple[str, ...]
     world_from_cam: Array
     cam_in_world: Array
-    matches: Index
+    matches: Int64Array
 
 
 def pair_of(tie: Link | SharedImages) -> tuple[int, int]:

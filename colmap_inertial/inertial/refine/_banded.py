@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from colmap_inertial.core.geometry import Array
+from colmap_inertial.core.arrays import Array
 
 #: A block has so many numbers at least, or Python takes longer than the products; of whole states.
 _LEAST = 240

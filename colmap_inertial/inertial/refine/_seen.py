@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from colmap_inertial.core.geometry import Array, cross, skew, so3_exp
+from colmap_inertial.core.arrays import Array, BoolArray, IndexArray, Int64Array
+from colmap_inertial.core.geometry import cross, skew, so3_exp
 from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.types import CameraModel
 from colmap_inertial.inertial.refine.values import (
@@ -23,7 +23,6 @@ from colmap_inertial.inertial.refine.values import (
     VELOCITY,
     Estimate,
     FreeCamera,
-    Index,
     Observations,
     Problem,
     Turning,
@@ -65,12 +64,12 @@ class Poses:
     velocity_m_s: Array  # (M, 3)
     force: Array  # (M, 3) body frame at the node
 
-    def of(self, index: Index) -> Poses:
+    def of(self, index: Int64Array) -> Poses:
         """Those of other observations, by number."""
         return Poses(**{one.name: getattr(self, one.name)[index] for one in fields(self)})
 
 
-def poses_at(problem: Problem, x: Estimate, frame: Index, line: Array) -> Poses:
+def poses_at(problem: Problem, x: Estimate, frame: Int64Array, line: Array) -> Poses:
     """The IMU's poses at lines of frames: from the frame's state by the readings around it."""
     world_from_imu, position, velocity = x.world_from_imu[frame], x.imu_in_world_m[frame], x.velocity_m_s[frame]
     if problem.inertial is None:
@@ -117,7 +116,7 @@ def poses_at(problem: Problem, x: Estimate, frame: Index, line: Array) -> Poses:
     )
 
 
-def since_middle_s(problem: Problem, frame: Index) -> Array:
+def since_middle_s(problem: Problem, frame: Int64Array) -> Array:
     """(M,) of frames' nodes, for the clock rate."""
     if problem.inertial is None:
         return np.zeros(len(frame))
@@ -137,7 +136,7 @@ def cameras_of(problem: Problem, x: Estimate) -> list[CameraModel]:
     return [camera_of(free, x.intrinsics[first[i] : first[i + 1]]) for i, free in enumerate(problem.cameras)]
 
 
-def _by_camera(problem: Problem, observations: Observations) -> list[NDArray[np.intp]]:
+def _by_camera(problem: Problem, observations: Observations) -> list[IndexArray]:
     """Which observations each camera made."""
     if len(problem.cameras) == 1:
         return [np.arange(len(observations.frame))]
@@ -158,7 +157,7 @@ class Projected:
     """
 
     residual: Array
-    seen: NDArray[np.bool_]
+    seen: BoolArray
     in_imu: Array
     in_cam: Array
     poses: Poses
@@ -177,7 +176,7 @@ def project(problem: Problem, x: Estimate, observations: Observations) -> Projec
     predicted = np.empty((len(away), 2))
     for model, mine in zip(cameras_of(problem, x), _by_camera(problem, observations), strict=True):
         predicted[mine] = colmap_camera(model).img_from_cam(in_cam[mine])
-    seen: NDArray[np.bool_] = np.all(np.isfinite(predicted), axis=1)
+    seen: BoolArray = np.all(np.isfinite(predicted), axis=1)
     residual = np.where(seen[:, None], predicted - observations.xy_px, 0.0)
     return Projected(residual=residual, seen=seen, in_imu=in_imu, in_cam=in_cam, poses=poses)
 

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from colmap_inertial._kernels import _inertial
-from colmap_inertial.core.geometry import Array
+from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.inertial.refine._banded import BandFactor
 from colmap_inertial.inertial.refine._inertial import Rows
 from colmap_inertial.inertial.refine._seen import Derivatives
 from colmap_inertial.inertial.refine.motion import Moving
-from colmap_inertial.inertial.refine.values import N_SEEN, N_STATE, POSITION, Index, Observations
+from colmap_inertial.inertial.refine.values import N_SEEN, N_STATE, POSITION, Observations
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -28,7 +28,7 @@ class Order:
         Numbers below the diagonal.
     """
 
-    place: Index
+    place: Int64Array
     width: int
 
     @classmethod
@@ -153,14 +153,14 @@ class System:
             self.corner += flat.T @ flat
             self.rhs_shared -= flat.T @ rows.residual.ravel()
 
-    def _pull(self, at: Index, derivative: Array, rows: Rows) -> None:
+    def _pull(self, at: Int64Array, derivative: Array, rows: Rows) -> None:
         """Add right-hand side and border of states at (N,) columns; no column comes twice."""
         columns = at[:, None] + np.arange(N_STATE)
         self.rhs[columns] -= np.einsum("nri,nr->ni", derivative, rows.residual)
         if rows.by_shared is not None:
             self.border[columns] += derivative.transpose(0, 2, 1) @ rows.by_shared
 
-    def _add_block(self, row: Index, column: Index, block: Array) -> None:
+    def _add_block(self, row: Int64Array, column: Int64Array, block: Array) -> None:
         """Add (N, 15, 15) at (N,) rows and columns, either triangle of the matrix."""
         i = (row[:, None, None] + np.arange(N_STATE)[:, None]) + np.zeros((1, 1, N_STATE), dtype=np.int64)
         j = (column[:, None, None] + np.arange(N_STATE)) + np.zeros((1, N_STATE, 1), dtype=np.int64)
@@ -220,7 +220,7 @@ class Factored:
         states, _ = self.solve(rhs, np.zeros((len(self.corner[0]), count)))
         return np.sqrt(np.einsum("nk,nk->k", rhs, states))
 
-    def centres_cov(self, frames: Index, by: Moving) -> Array:
+    def centres_cov(self, frames: Int64Array, by: Moving) -> Array:
         """(3 K, 3 K) covariance of the camera's centres in K frames, all together."""
         count, place = len(frames), self.order.place
         sides = np.zeros((count, 3, len(place), N_STATE))
@@ -229,7 +229,7 @@ class Factored:
         states, shared = self.solve(rhs, rhs_shared)
         return np.asarray(rhs.T @ states + rhs_shared.T @ shared)
 
-    def motion_covs(self, frames: Index, by: Moving) -> Array:
+    def motion_covs(self, frames: Int64Array, by: Moving) -> Array:
         """(K, 6, 6) covariances of K frames' positions against the first frame's, and velocities."""
         from scipy.linalg import cho_solve
 

@@ -6,10 +6,9 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
 from colmap_inertial.core.errors import NotObservableError
-from colmap_inertial.core.types import Array
 from colmap_inertial.inertial.refine._system import Factored, Order
 from colmap_inertial.inertial.refine.levels import with_measured_noise
 from colmap_inertial.inertial.refine.motion import Moving, moving
@@ -202,7 +201,7 @@ def refine(
     )
 
 
-def _chosen(observations: Observations) -> NDArray[np.bool_]:
+def _chosen(observations: Observations) -> BoolArray:
     """(M,) what is held out: every tenth observation of points that keep three or more."""
     lengths = np.diff(observations.first)
     often = np.flatnonzero(lengths[observations.point] >= _FEWEST)
@@ -211,11 +210,11 @@ def _chosen(observations: Observations) -> NDArray[np.bool_]:
     return out
 
 
-def _part(problem: Problem, keep: NDArray[np.bool_]) -> Problem:
+def _part(problem: Problem, keep: BoolArray) -> Problem:
     return replace(problem, observations=problem.observations.select(keep))
 
 
-def _measured(problem: Problem, kept: NDArray[np.bool_], x: Estimate) -> Problem:
+def _measured(problem: Problem, kept: BoolArray, x: Estimate) -> Problem:
     """The problem with its accelerometer's noise as what it was solved without a tenth for says."""
     try:
         return replace(problem, inertial=with_measured_noise(_part(problem, kept), x).inertial)
@@ -325,7 +324,7 @@ def drift_map(
     return tuple(out)
 
 
-def _by_log_size(centres: Array, part: NDArray[np.intp]) -> Array:
+def _by_log_size(centres: Array, part: IndexArray) -> Array:
     """(F, 3) derivative of the logarithm of a part's size by its centres."""
     out = np.zeros_like(centres)
     if len(part) > 1:

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from colmap_inertial.core.geometry import Array
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.inertial.refine._inertial import Rows, imu_rows
 from colmap_inertial.inertial.refine._system import Factored
 from colmap_inertial.inertial.refine.solve import Linearised, linearised

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import cross, skew
-from colmap_inertial.core.types import Array
 from colmap_inertial.inertial.refine._seen import poses_at, since_middle_s
 from colmap_inertial.inertial.refine.values import (
     ACCEL_BIAS,

@@ -8,18 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.gyro import GyroPath, on_camera_rate
-from colmap_inertial.core.types import (
-    CAL,
-    Array,
-    CameraImuCalibration,
-    CameraModel,
-    FrameTiming,
-    ImuNoise,
-    ImuRecording,
-)
+from colmap_inertial.core.types import CAL, CameraImuCalibration, CameraModel, FrameTiming, ImuNoise, ImuRecording
 from colmap_inertial.imaging.gyro_camera import FrameShutter
 from colmap_inertial.inertial.refine._seen import cameras_of, poses_at, project, turning_around
 from colmap_inertial.inertial.refine.values import (
@@ -31,7 +24,6 @@ from colmap_inertial.inertial.refine.values import (
     ROTATION,
     Estimate,
     FreeCamera,
-    Index,
     Inertial,
     Observations,
     Prior,
@@ -92,10 +84,10 @@ class Seen:
     point_ids: tuple[int, ...]
     points: Array
     observations: Observations
-    place: Index
+    place: Int64Array
     cameras: tuple[CameraModel, ...]
     camera_ids: tuple[int, ...]
-    camera_of: Index
+    camera_of: Int64Array
 
 
 def read_seen(reconstruction: pycolmap.Reconstruction, timing: FrameTiming) -> Seen:
@@ -174,7 +166,7 @@ def keypoints_of(seen: Seen, keypoints_px: Mapping[str, Array]) -> Array:
     return out
 
 
-def _by_frame(seen: Seen) -> list[Index]:
+def _by_frame(seen: Seen) -> list[Int64Array]:
     """Which observations each frame has."""
     frames = seen.observations.frame
     order = np.argsort(frames, kind="stable")

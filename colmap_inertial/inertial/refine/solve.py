@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from colmap_inertial.core.geometry import Array
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.inertial.refine._inertial import Rows, all_rows, prior_offset
 from colmap_inertial.inertial.refine._seen import Derivatives, Projected, derivatives, project
 from colmap_inertial.inertial.refine._system import Factored, Order, System

@@ -6,13 +6,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, BoolArray, Int64Array
 from colmap_inertial.core.geometry import so3_exp
-from colmap_inertial.core.types import Array, CameraModel, ImuNoise
+from colmap_inertial.core.types import CameraModel, ImuNoise
 from colmap_inertial.inertial.scale._preintegration import Tracks
-
-Index = NDArray[np.int64]
 
 # Columns of a frame's state. The first nine are what its observations depend on.
 THETA, POSITION, VELOCITY, GYRO_BIAS, ACCEL_BIAS = (slice(3 * i, 3 * i + 3) for i in range(5))
@@ -74,17 +72,17 @@ class Observations:
         (M,) how much later than the middle line its own was exposed, in readouts: from -.5 to .5.
     """
 
-    frame: Index
-    point: Index
+    frame: Int64Array
+    point: Int64Array
     xy_px: Array
     line: Array
 
     @cached_property
-    def first(self) -> Index:
+    def first(self) -> Int64Array:
         """(P + 1,) the first observation of each point."""
         return np.searchsorted(self.point, np.arange(self.point[-1] + 2)).astype(np.int64)
 
-    def select(self, keep: NDArray[np.bool_]) -> Observations:
+    def select(self, keep: BoolArray) -> Observations:
         """Those of a mask; the points keep their numbers."""
         return replace(
             self, frame=self.frame[keep], point=self.point[keep], xy_px=self.xy_px[keep], line=self.line[keep]
@@ -131,14 +129,14 @@ class Inertial:
     """
 
     nodes_s: Array
-    linked: NDArray[np.bool_]
+    linked: BoolArray
     tracks: Tracks
     noise: ImuNoise
     turning: Turning
     down: Array
 
     @property
-    def touched(self) -> NDArray[np.bool_]:
+    def touched(self) -> BoolArray:
         """(F,) which frames it links to another."""
         return np.append(self.linked, False) | np.append(False, self.linked)
 
@@ -297,7 +295,7 @@ class Problem:
 
     observations: Observations
     cameras: tuple[FreeCamera, ...]
-    camera_of: Index
+    camera_of: Int64Array
     inertial: Inertial | None
     prior: Prior
     sigma_px: float

@@ -10,7 +10,8 @@ import math
 
 import numpy as np
 
-from colmap_inertial.core.types import Array, ScaleDrift
+from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.types import ScaleDrift
 from colmap_inertial.inertial.scale import _parameters as par
 from colmap_inertial.inertial.scale._factors import Direct, Group
 from colmap_inertial.inertial.scale._parameters import Data, Estimate, Noise

@@ -10,10 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, BoolArray
 from colmap_inertial.core.geometry import skew, so3_exp, so3_log
-from colmap_inertial.core.types import Array
 from colmap_inertial.inertial.scale import _parameters as par
 from colmap_inertial.inertial.scale._parameters import Data, Estimate, Noise, Prior
 from colmap_inertial.inertial.scale._preintegration import Preintegrated, SensorErrors, preintegrate
@@ -397,7 +396,7 @@ def walk_group(values: Array, columns: slice, sigma: float, dt_s: Array) -> Dire
 
 
 def lasting_group(
-    values: Array, columns: slice, sigma: float, lasting_s: float, dt_s: Array, broken: NDArray[np.bool_]
+    values: Array, columns: slice, sigma: float, lasting_s: float, dt_s: Array, broken: BoolArray
 ) -> Direct:
     """An error that is alike over ``lasting_s``, and anything where it is ``broken``.
 

@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from colmap_inertial.core.types import Array, ImuNoise, ScaleDrift
+from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.types import ImuNoise, ScaleDrift
 from colmap_inertial.inertial.scale import _factors as fac, _noise as levels, _parameters as par, _suspects as sus
 from colmap_inertial.inertial.scale._drift import scale_drift
 from colmap_inertial.inertial.scale._noise import Expected, LevelSearch

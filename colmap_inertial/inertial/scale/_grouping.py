@@ -10,10 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
 from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, quat_multiply, so3_exp, so3_log
-from colmap_inertial.core.types import Array
 from colmap_inertial.inertial.scale._preintegration import Tracks
 
 #: Longest step of the integration from a group's mean instant to a frame.
@@ -49,8 +48,8 @@ class Groups:
         (K, 3) mean readings of the gyroscope, body frame.
     """
 
-    first: NDArray[np.intp]
-    count: NDArray[np.intp]
+    first: IndexArray
+    count: IndexArray
     t_s: Array
     world_from_cam: Array
     centre: Array
@@ -60,7 +59,7 @@ class Groups:
     rate_rad_s: Array
 
 
-def first_of_groups(t_s: Array, rate_hz: float, pauses: Array) -> NDArray[np.intp]:
+def first_of_groups(t_s: Array, rate_hz: float, pauses: Array) -> IndexArray:
     """Indices where a new group begins: ``1 / rate_hz`` after the last beginning, and after a pause of the IMU.
 
     Parameters
@@ -84,7 +83,7 @@ def first_of_groups(t_s: Array, rate_hz: float, pauses: Array) -> NDArray[np.int
     return np.array(begins, dtype=np.intp)
 
 
-def find_breaks(t_s: Array, centre: Array) -> NDArray[np.bool_]:
+def find_breaks(t_s: Array, centre: Array) -> BoolArray:
     """Between which of K states (K,), (K, 3) the path jumps, as where a reconstruction lost and found its way again.
 
     A displacement is compared with the median velocity of its neighbours. Of eight recordings no step is more than six

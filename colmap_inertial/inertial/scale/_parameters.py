@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, BoolArray
 from colmap_inertial.core.geometry import so3_exp, so3_log
-from colmap_inertial.core.types import Array
 from colmap_inertial.inertial.scale._grouping import Groups
 from colmap_inertial.inertial.scale._preintegration import Tracks
 
@@ -95,7 +94,7 @@ class Data:
     rotation_shape: Array
     centre_shape: Array
     coupling: Array
-    broken: NDArray[np.bool_]
+    broken: BoolArray
     tracks: Tracks
     gyro_roughness_rad_s_rthz: float
     accel_roughness_m_s2_rthz: float

@@ -18,11 +18,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_inertial._kernels import _inertial
+from colmap_inertial.core.arrays import Array, BoolArray, Int64Array
 from colmap_inertial.core.sampling import is_gap
-from colmap_inertial.core.types import Array
 
 #: Integration steps: as the samples come, within these. Steps of 5 instead of 2.5 ms change the scale by 0.003 %.
 _SHORTEST_STEP_S, _LONGEST_STEP_S = 0.0025, 0.005
@@ -53,7 +52,7 @@ class Track:
         return np.asarray(ends)
 
     @classmethod
-    def of(cls, t_s: Array, value: Array, lost: NDArray[np.bool_] | None = None) -> Track:
+    def of(cls, t_s: Array, value: Array, lost: BoolArray | None = None) -> Track:
         """A track through samples ``value`` (N, 3) at times ``t_s`` (N,).
 
         ``lost`` are samples that say nothing: what they cover is a gap, however short.
@@ -199,7 +198,7 @@ def preintegrate(nodes_s: Array, tracks: Tracks, errors: SensorErrors) -> Preint
     )
 
 
-def integration_steps(nodes_s: Array, tracks: Tracks) -> NDArray[np.int64]:
+def integration_steps(nodes_s: Array, tracks: Tracks) -> Int64Array:
     """In how many steps each interval is integrated."""
     spacing = min(float(np.median(np.diff(track.t_s))) for track in (tracks.gyro, tracks.accel))
     step_s = float(np.clip(spacing, _SHORTEST_STEP_S, _LONGEST_STEP_S))

@@ -3,19 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, BoolArray
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.sampling import at_ceiling
-from colmap_inertial.core.types import (
-    CAL,
-    Array,
-    CameraImuCalibration,
-    CameraTrajectory,
-    ImuRecording,
-    clock_shift_s,
-)
+from colmap_inertial.core.types import CAL, CameraImuCalibration, CameraTrajectory, ImuRecording, clock_shift_s
 from colmap_inertial.inertial.scale import _parameters as par
 from colmap_inertial.inertial.scale._grouping import find_breaks, group_frames
 from colmap_inertial.inertial.scale._noise import roughness
@@ -141,7 +134,7 @@ def prepare(
     return data, prior
 
 
-def cut_off(imu: ImuRecording) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def cut_off(imu: ImuRecording) -> tuple[BoolArray, BoolArray]:
     """(N,), (M,) which samples of gyroscope and accelerometer stand at the end of the sensor's range on any axis."""
     gyro, accel = imu.gyro_rad_s, imu.accel_m_s2
     if imu.calibration is not None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from colmap_inertial._kernels import _inertial
-from colmap_inertial.core.types import Array
+from colmap_inertial.core.arrays import Array
 
 
 @dataclass(eq=False, kw_only=True)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, BoolArray, ComplexArray
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate
-from colmap_inertial.core.types import Array, CameraImuCalibration, CameraTrajectory, ImuRecording, clock_shift_s
+from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuRecording, clock_shift_s
 from colmap_inertial.motion.smooth import PositionSmoother, WorldAcceleration, smooth_attitude
 
 #: Frames further apart than this sample motion of 1.2 Hz too thinly to differentiate it twice.
@@ -44,11 +44,11 @@ class Spectra:
     """
 
     frequency_hz: Array
-    visual: NDArray[np.complex128]
-    inertial: NDArray[np.complex128]
-    lever_by: NDArray[np.complex128]
-    bias_by: NDArray[np.complex128]
-    gravity_by: NDArray[np.complex128]
+    visual: ComplexArray
+    inertial: ComplexArray
+    lever_by: ComplexArray
+    bias_by: ComplexArray
+    gravity_by: ComplexArray
     visual_noise: Array
 
 
@@ -169,7 +169,7 @@ class Signals:
         )
 
 
-def _stretches(t_s: Array, covered: NDArray[np.bool_]) -> list[tuple[float, float]]:
+def _stretches(t_s: Array, covered: BoolArray) -> list[tuple[float, float]]:
     """First and last time of each stretch without a pause."""
     broken = np.flatnonzero(~covered | (np.diff(t_s) > _PAUSE_S))
     first = np.concatenate([[0], broken + 1])

@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, ComplexArray
 from colmap_inertial.core.errors import NotObservableError
-from colmap_inertial.core.types import CAL, Array, CameraImuCalibration
+from colmap_inertial.core.types import CAL, CameraImuCalibration
 from colmap_inertial.inertial.scale._spectra import Spectra
-
-Complex = NDArray[np.complex128]
 
 #: Standard deviation of the accelerometer's bias before anything is known (m/s2).
 _BIAS_SIGMA_M_S2 = 1.0
@@ -152,7 +150,7 @@ def _tangent(gravity: Array) -> Array:
     return np.stack([np.linalg.norm(gravity) * across, np.cross(gravity, across)], axis=1)
 
 
-def _sides(data: Spectra, state: _State) -> tuple[Complex, Complex]:
+def _sides(data: Spectra, state: _State) -> tuple[ComplexArray, ComplexArray]:
     """(F, 3), (F, 3): the IMU's acceleration according to the camera, and according to the accelerometer."""
     visual = state.scale * data.visual + data.lever_by @ state.lever
     inertial = data.inertial - data.bias_by @ state.bias + data.gravity_by @ state.gravity

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from colmap_inertial.core.types import Array
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.inertial.scale import _factors as fac, _parameters as par
 from colmap_inertial.inertial.scale._parameters import Data, Estimate, Prior
 from colmap_inertial.inertial.scale._preintegration import Preintegrated, SensorErrors, Track, Tracks, preintegrate

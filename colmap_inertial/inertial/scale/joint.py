@@ -18,12 +18,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import quat_from_matrix
 from colmap_inertial.core.sampling import MUCH_CUT
 from colmap_inertial.core.types import (
     CAL,
-    Array,
     CameraImuCalibration,
     CameraTrajectory,
     ImuNoise,

@@ -10,19 +10,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.options import ScaleOptions
 from colmap_inertial.core.threads import one_blas_thread
-from colmap_inertial.core.types import Array, CameraImuCalibration, CameraTrajectory, ImuRecording
+from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuRecording
 from colmap_inertial.inertial.scale import _parameters as par, in_step_with, strength_of_gravity
 from colmap_inertial.inertial.scale._fit import Fit
 from colmap_inertial.inertial.scale._parameters import Data, Noise
 from colmap_inertial.inertial.scale.joint import JointOptions, fit_path, scale_of
 from colmap_inertial.inertial.scale.priors import is_calibrated, model_scale_sigma
-
-Index = NDArray[np.int64]
 
 # Columns of a node: rotation (right, body frame), position, velocity, biases of gyroscope and accelerometer.
 NODE = 15
@@ -192,14 +190,14 @@ class FittedPath:
         groups = self._data.groups
         return groups.world_from_cam[node], groups.centre[node] + self.origin
 
-    def stamps_s(self, nodes: Index) -> Array:
+    def stamps_s(self, nodes: Int64Array) -> Array:
         """(n,) the IMU's stamps, as they were recorded, at n of the nodes."""
         x, t_s = self._fit.estimate, self._data.t_s
         instant_s = t_s[nodes] - x.delay_s - x.clock_rate * (t_s[nodes] - par.middle_s(t_s))
         (first_s, first), (last_s, last) = self._stamps_s
         return np.asarray(first + (instant_s - first_s) * (last - first) / (last_s - first_s))
 
-    def at(self, nodes: Index) -> Posterior:
+    def at(self, nodes: Int64Array) -> Posterior:
         """The posterior of n of the nodes and of what is global."""
         fit, x, t_s = self._fit, self._fit.estimate, self._data.t_s
         n, k, middle_s = len(nodes), len(t_s), par.middle_s(t_s)

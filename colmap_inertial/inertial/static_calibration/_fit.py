@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, IndexArray
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.sampling import Coverage
-from colmap_inertial.core.types import IMU_CAL, Array, ImuRecording
+from colmap_inertial.core.types import IMU_CAL, ImuRecording
 from colmap_inertial.inertial.static_calibration._rests import Rests
 
 #: Entries of the accelerometer's matrix that are fitted, row by row: the frame takes the others.
@@ -89,9 +89,9 @@ class _Turns:
         (T,) standard deviation of the direction that is carried along.
     """
 
-    before: NDArray[np.intp]
-    first: NDArray[np.intp]
-    last: NDArray[np.intp]
+    before: IndexArray
+    first: IndexArray
+    last: IndexArray
     t_s: Array
     rate_rad_s: Array
     sigma_rad: Array
@@ -313,7 +313,7 @@ def _result(
 ) -> RestFit:
     widening = _student(freedom)
     full = np.zeros((IMU_CAL.COUNT, IMU_CAL.COUNT))
-    columns: NDArray[np.intp] = np.concatenate([np.arange(9), np.arange(10, 19)])
+    columns: IndexArray = np.concatenate([np.arange(9), np.arange(10, 19)])
     target = np.concatenate([_LOWER, np.arange(9, 12), np.arange(12, 21)])
     scale = np.concatenate([np.full(9, widening[0]), np.full(9, widening[1])])
     full[np.ix_(target, target)] = cov[np.ix_(columns, columns)] * np.outer(scale, scale)

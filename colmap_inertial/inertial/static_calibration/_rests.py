@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
 from colmap_inertial.core.sampling import Coverage
-from colmap_inertial.core.types import Array, ImuRecording
+from colmap_inertial.core.types import ImuRecording
 
 #: Readings vary over windows of this length; a device that lies lies for longer than the shortest rest, beside that.
 _WINDOW_S, _SHORTEST_REST_S = 1.0, 1.0
@@ -50,7 +50,7 @@ class Rests:
     gyro_sigma_rad_s: Array
     accel_deviation_m_s2: float
     gyro_deviation_rad_s: float
-    attitude: NDArray[np.intp]
+    attitude: IndexArray
 
     def __len__(self) -> int:
         return len(self.begin_s)
@@ -104,7 +104,7 @@ def _window_variance(t_s: Array, values: Array) -> tuple[Array, Array] | None:
     return t_s[first : first + len(variance)], variance
 
 
-def _spans(t_s: Array, still: NDArray[np.bool_]) -> Array:
+def _spans(t_s: Array, still: BoolArray) -> Array:
     """(K, 2) begin and end of what is still for long enough; the window around it reaches half its length further."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
     spans = np.stack([t_s[edges[::2]], t_s[edges[1::2] - 1]], axis=1)
@@ -148,7 +148,7 @@ def _means(t_s: Array, values: Array, spans: Array) -> tuple[Array, Array, float
     return np.array(means), sigma, float(np.sqrt(squares / max(singles, 1)))
 
 
-def _attitudes(accel: Array) -> NDArray[np.intp]:
+def _attitudes(accel: Array) -> IndexArray:
     """The number of each rest's attitude: that of the first one that is near."""
     up = accel / np.linalg.norm(accel, axis=1, keepdims=True)
     known: list[Array] = []

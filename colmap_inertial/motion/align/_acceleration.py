@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_multiply, quat_rotate
 from colmap_inertial.core.sampling import without_running_mean
-from colmap_inertial.core.types import Array, CameraImuCalibration, CameraTrajectory, ImuRecording
+from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuRecording
 
 #: Window of the quadratics whose second derivative is the visual acceleration.
 ACCELERATION_S = 0.5
@@ -76,5 +76,5 @@ def quick_accelerations(
     )
 
 
-def _filtered(values: Array, kernel: NDArray[np.float64]) -> Array:
+def _filtered(values: Array, kernel: Array) -> Array:
     return np.stack([np.convolve(column, kernel, "valid") for column in values.T], axis=1)

@@ -12,11 +12,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, BoolArray, ComplexArray, IndexArray
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_from_matrix, quat_log, quat_multiply
 from colmap_inertial.core.gyro import GyroPath
-from colmap_inertial.core.types import Array, CameraTrajectory
+from colmap_inertial.core.types import CameraTrajectory
 
 #: Frames this close together sample the rotation densely enough to be correlated on a grid.
 DENSE_S = 0.25
@@ -54,7 +54,7 @@ class Intervals:
     def __len__(self) -> int:
         return len(self.begin_s)
 
-    def select(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Intervals:
+    def select(self, index: IndexArray | BoolArray) -> Intervals:
         return Intervals(begin_s=self.begin_s[index], end_s=self.end_s[index], turn_rad=self.turn_rad[index])
 
 
@@ -81,7 +81,7 @@ class ClockFit:
     gyro_bias_rad_s: Array
 
 
-def spaced_frames(t_s: Array, spacing_s: float) -> NDArray[np.intp]:
+def spaced_frames(t_s: Array, spacing_s: float) -> IndexArray:
     """Indices of frames at least ``spacing_s`` apart (to within half a frame interval); sparse frames all stay."""
     if len(t_s) < 2:
         return np.arange(len(t_s))
@@ -154,7 +154,7 @@ def explained_at(intervals: Intervals, path: GyroPath, offset_s: float, cam_from
     return _closest(_without_jumps(intervals, path), path, np.array([offset_s]), 1.0, rotation).explained
 
 
-def _evenly(count: int, wanted: int) -> NDArray[np.intp]:
+def _evenly(count: int, wanted: int) -> IndexArray:
     if count <= wanted:
         return np.arange(count)
     return np.unique(np.linspace(0, count - 1, wanted).astype(np.intp))
@@ -193,10 +193,10 @@ def _correlate(
     inertial, inertial_ok, imu_begin_s = _on_grid(path.t_s[:-1], path.t_s[1:], swept)
     size = _fft_length(len(visual) + len(inertial))
 
-    def spectrum(x: Array) -> NDArray[np.complex128]:
+    def spectrum(x: Array) -> ComplexArray:
         return np.asarray(np.fft.rfft(x, size, axis=0), dtype=np.complex128)
 
-    def correlate(a: NDArray[np.complex128], b: NDArray[np.complex128]) -> Array:
+    def correlate(a: ComplexArray, b: ComplexArray) -> Array:
         return np.asarray(np.fft.irfft(np.conj(a) * b, size, axis=0), dtype=np.float64)
 
     v, g = spectrum(visual), spectrum(inertial)
@@ -227,7 +227,7 @@ def _fft_length(at_least: int) -> int:
     return 1 << max(at_least - 1, 1).bit_length()
 
 
-def _on_grid(begin_s: Array, end_s: Array, turn_rad: Array) -> tuple[Array, NDArray[np.bool_], float]:
+def _on_grid(begin_s: Array, end_s: Array, turn_rad: Array) -> tuple[Array, BoolArray, float]:
     """Mean rates in the cells of a grid, which cells are covered by intervals without gaps, and the grid's start."""
     start_s = float(begin_s[0])
     edges = start_s + _GRID_S * np.arange(max(int((end_s[-1] - start_s) / _GRID_S), 1) + 1)
@@ -307,7 +307,7 @@ def _effective_intervals(intervals: Intervals) -> float:
 
 
 def _moments(
-    intervals: Intervals, inertial_rad: Array, inside: NDArray[np.bool_]
+    intervals: Intervals, inertial_rad: Array, inside: BoolArray
 ) -> tuple[Array, Array, Array, tuple[Array, Array]]:
     """Cross moments (L, 3, 3) and energies (L,), (L,) of the interval rotations after a common rate is taken out.
 

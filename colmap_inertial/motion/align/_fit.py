@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from colmap_inertial._kernels import _inertial
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import (
     matrix_from_quat,
@@ -20,7 +21,6 @@ from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.types import (
     CAL,
     TYPICAL_NOISE,
-    Array,
     CameraImuCalibration,
     CameraTrajectory,
     ImuRecording,

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, BoolArray
 from colmap_inertial.core.geometry import quat_rotate
 from colmap_inertial.core.sampling import Coverage
-from colmap_inertial.core.types import Array, CameraImuCalibration, CameraTrajectory, ImuRecording, clock_shift_s
+from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuRecording, clock_shift_s
 from colmap_inertial.motion.smooth._attitude import Attitude
 
 
@@ -73,11 +73,11 @@ class WorldAcceleration:
         # median of the square of a normal variable: 0.455; a second difference has six times the variance
         return float(np.median(bend**2)) / 0.455 / 6
 
-    def covers(self, t_s: Array) -> NDArray[np.bool_]:
+    def covers(self, t_s: Array) -> BoolArray:
         """(T-1,) which intervals between these times have samples throughout."""
         return Coverage(self.t_s).covers(t_s[:-1], t_s[1:])
 
-    def at(self, t_s: Array) -> tuple[Array, NDArray[np.bool_]]:
+    def at(self, t_s: Array) -> tuple[Array, BoolArray]:
         """Acceleration (T, 3), zero where there are no samples, and whether there are."""
         here = self.covers(np.append(t_s, t_s[-1]) if len(t_s) == 1 else t_s)
         sampled = np.append(here, False) | np.append(False, here)

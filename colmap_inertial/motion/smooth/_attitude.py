@@ -5,14 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
 from colmap_inertial.core.geometry import quat_conjugate, quat_exp, quat_log, quat_multiply, quat_normalize, slerp
 from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.types import (
     CAL,
     TYPICAL_NOISE,
-    Array,
     CameraImuCalibration,
     CameraTrajectory,
     ImuRecording,
@@ -120,12 +119,12 @@ class _Model:
 
     t_s: Array
     curve: Array
-    silent: NDArray[np.bool_]
-    left_out: NDArray[np.bool_]
+    silent: BoolArray
+    left_out: BoolArray
     density: float
     walk: float
 
-    def select(self, index: NDArray[np.intp]) -> _Model:
+    def select(self, index: IndexArray) -> _Model:
         silent = np.concatenate([[0], np.cumsum(self.silent)])[index]
         return replace(
             self,

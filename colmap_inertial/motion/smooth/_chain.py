@@ -12,7 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
-from colmap_inertial.core.types import Array
+from colmap_inertial.core.arrays import Array
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

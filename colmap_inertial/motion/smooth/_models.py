@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
-from colmap_inertial.core.types import Array
+from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
 from colmap_inertial.motion.smooth._chain import Chain
 
 
@@ -38,9 +37,7 @@ def white_acceleration(dt_s: Array) -> Array:
     return out
 
 
-def worst_outliers(
-    t: Array, wrong: Array, jumped: Array, *, limit: float, reach: float
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def worst_outliers(t: Array, wrong: Array, jumped: Array, *, limit: float, reach: float) -> tuple[BoolArray, BoolArray]:
     """Which measurements (T,) to leave out and which transitions (T-1,) to free, after one look.
 
     Whatever exceeds ``limit`` competes; the worst wins, and silences everything within ``reach`` of its time, because
@@ -57,7 +54,7 @@ def worst_outliers(
     return chosen[:count], chosen[count:]
 
 
-def runs_of(count: int, *, longest: int = 600, runs: int = 3) -> NDArray[np.intp]:
+def runs_of(count: int, *, longest: int = 600, runs: int = 3) -> IndexArray:
     """Frames to estimate noise from: all of a short recording, else three runs of consecutive ones."""
     if count <= longest:
         return np.arange(count)

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, BoolArray
 from colmap_inertial.core.errors import NotObservableError
-from colmap_inertial.core.types import Array, CameraTrajectory, SmoothedTrajectory
+from colmap_inertial.core.types import CameraTrajectory, SmoothedTrajectory
 from colmap_inertial.motion.smooth._chain import Chain
 from colmap_inertial.motion.smooth._models import constant_acceleration, white_jerk, worst_outliers
 
@@ -144,8 +144,8 @@ class _Model:
     t: Array
     measured: Array
     relative_var: Array
-    left_out: NDArray[np.bool_]
-    jumps: NDArray[np.bool_]
+    left_out: BoolArray
+    jumps: BoolArray
 
     def chain(self, time_constant: float, var: float) -> Chain:
         """The time constant is where the noise of positions (``var``) and motion meet: white jerk has the density

@@ -5,15 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import quat_conjugate, quat_multiply, quat_normalize, quat_rotate
 from colmap_inertial.core.gyro import on_camera_rate
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import (
     TYPICAL_NOISE,
-    Array,
     CameraImuCalibration,
     CameraTrajectory,
     ImuRecording,
@@ -188,13 +187,13 @@ class _Model:
     t_s: Array
     measured: Array
     gained: Array
-    silent: NDArray[np.bool_]
-    left_out: NDArray[np.bool_]
-    jumps: NDArray[np.bool_]
+    silent: BoolArray
+    left_out: BoolArray
+    jumps: BoolArray
     motion_density: float
 
-    def select(self, index: NDArray[np.intp]) -> _Model:
-        def any_between(flags: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def select(self, index: IndexArray) -> _Model:
+        def any_between(flags: BoolArray) -> BoolArray:
             return np.diff(np.concatenate([[0], np.cumsum(flags)])[index]) > 0
 
         return replace(

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Int64Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.inertial.join.values import Found
 from colmap_inertial.model.observed import points_of_features
@@ -24,7 +24,6 @@ from colmap_inertial.model.observed import points_of_features
 if TYPE_CHECKING:
     import pycolmap
 
-Ids = NDArray[np.int64]
 
 #: Matches that a pair of images has at least, and an image to points of another model: as many as COLMAP asks for.
 _LEAST_MATCHES, _LEAST_PLACED = 15, 30
@@ -107,9 +106,9 @@ class _Held:
     def __init__(self, model: pycolmap.Reconstruction) -> None:
         self.model = model
         self.images = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
-        self._points: dict[str, Ids] = {}
+        self._points: dict[str, Int64Array] = {}
 
-    def points(self, name: str) -> Ids:
+    def points(self, name: str) -> Int64Array:
         """Of an image's keypoints, the numbers of their points; -1 without one."""
         if name not in self._points:
             self._points[name] = points_of_features(self.images[name])
@@ -123,8 +122,8 @@ def _between(names: tuple[str, str], held: _Held, other: _Held) -> bool:
 
 
 def _placed(
-    there: _Held, own: _Held, between: Mapping[tuple[str, str], Ids]
-) -> dict[str, tuple[str, pycolmap.Rigid3d, Ids]]:
+    there: _Held, own: _Held, between: Mapping[tuple[str, str], Int64Array]
+) -> dict[str, tuple[str, pycolmap.Rigid3d, Int64Array]]:
     """By name of images of ``own``: the image that it matches best, its pose, and points (there, own) that are one."""
     seen: dict[str, dict[tuple[int, int], None]] = defaultdict(dict)
     best: dict[str, Counter[str]] = defaultdict(Counter)
@@ -152,7 +151,7 @@ def _placed(
     return out
 
 
-def _pose(there: _Held, own: _Held, name: str, couples: Ids) -> tuple[pycolmap.Rigid3d | None, Ids]:
+def _pose(there: _Held, own: _Held, name: str, couples: Int64Array) -> tuple[pycolmap.Rigid3d | None, Int64Array]:
     """The pose of an image by (K, 2) keypoints and points of another model, and those that agree; none where few do."""
     import pycolmap
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import AnyArray
 from colmap_inertial.core.errors import FormatError, InertialError
 from colmap_inertial.core.options import ApertureOptions
 from colmap_inertial.core.types import Frame, Treatment
@@ -76,7 +75,7 @@ class ApertureStage:
                 raise InertialError(f"the apertures do not fit together: {error}") from None
         return self._canvas[0]
 
-    def fused(self, name: str, reference: NDArray[Any]) -> Fused:
+    def fused(self, name: str, reference: AnyArray) -> Fused:
         """One exposure, by the name and the pixels of the reference's picture."""
         rig = self.pictures.rig
         paths = [source.path(name) for source in self.pictures.sources]

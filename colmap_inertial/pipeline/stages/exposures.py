@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import AnyArray, Float32Array
 from colmap_inertial.core.errors import FormatError, NotObservableError
 from colmap_inertial.core.options import ExposureOptions
 from colmap_inertial.core.threads import frames_at_once, in_order, threads_beside
@@ -33,10 +33,9 @@ from colmap_inertial.io.names import path_in
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.pipeline.stages.gyro_view import GyroView
 
-Light = NDArray[np.float32]
 #: Makes one picture of a short exposure as bright as the long one, the long one in its geometry, and the long one's
 #: blur: all float32 sRGB 0 to 1, of one shape.
-Fuse = Callable[[Light, Light, BlurField | None], Light]
+Fuse = Callable[[Float32Array, Float32Array, BlurField | None], Float32Array]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -66,7 +65,7 @@ def lsd2_fuser(options: ExposureOptions | None = None) -> Fuser:
     options = options or ExposureOptions()
     network = load_network("lsd2", device=options.device, threads=threads_beside(frames_at_once()))
 
-    def fuse(short: Light, long: Light, blur: BlurField | None) -> Light:
+    def fuse(short: Float32Array, long: Float32Array, blur: BlurField | None) -> Float32Array:
         return lsd2.fuse(short, long, blur=blur, network=network)
 
     return Fuser(fuse=fuse, identity=f"lsd2 {shipped.checksum('lsd2')}")
@@ -219,7 +218,7 @@ class ExposureStage:
 
 
 def _alone(
-    frame: Frame, long: NDArray[Any], brightness: Brightness | None, done: FusedPair, why: str
+    frame: Frame, long: AnyArray, brightness: Brightness | None, done: FusedPair, why: str
 ) -> tuple[Frame, FusedPair]:
     """The better one of the two, never a dark one."""
     alone = better_alone(frame.image, long, brightness)
@@ -234,13 +233,13 @@ def _alone(
     return _with_light(frame, alone.image), said
 
 
-def _with_light(frame: Frame, light: Light) -> Frame:
+def _with_light(frame: Frame, light: Float32Array) -> Frame:
     top = np.iinfo(frame.image.dtype).max
     image: Any = np.rint(top * np.clip(light, 0, 1)).astype(frame.image.dtype)  # either of two types of pixel
     return replace(frame, image=image)
 
 
-def _require_alike(frame: Frame, path: Path, long: NDArray[Any]) -> None:
+def _require_alike(frame: Frame, path: Path, long: AnyArray) -> None:
     height, width = frame.image.shape[:2]
     if long.shape[:2] != (height, width):
         raise FormatError(

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import AnyArray
 from colmap_inertial.core.errors import FormatError, InertialError
 from colmap_inertial.core.types import CameraModel, Frame, Treatment
 from colmap_inertial.imaging.path_filters import smoothed
@@ -69,14 +69,14 @@ class _Originals:
     """Remembers the decoded array of each frame in flight, to tell whether a stage has changed it."""
 
     def __init__(self) -> None:
-        self._arrays: dict[str, NDArray[Any]] = {}
+        self._arrays: dict[str, AnyArray] = {}
 
     def tap(self, frames: Iterator[Frame]) -> Iterator[Frame]:
         for frame in frames:
             self._arrays[frame.name] = frame.image
             yield frame
 
-    def pop_through(self, name: str) -> NDArray[Any] | None:
+    def pop_through(self, name: str) -> AnyArray | None:
         """The original of ``name``; forgets it and, as order is kept, every frame before it."""
         found = None
         for known in list(self._arrays):
@@ -149,7 +149,7 @@ def write_frames(
 
 
 def _write(
-    frame: Frame, original: NDArray[Any] | None, source_folder: Path | None, images: Path, unsmoothed: Path | None
+    frame: Frame, original: AnyArray | None, source_folder: Path | None, images: Path, unsmoothed: Path | None
 ) -> str:
     """Write the picture of a frame; returns what happened to it."""
     source = None if source_folder is None else path_in(source_folder, frame.name)
@@ -170,7 +170,7 @@ def _write(
     return "passed" if passed else (said or ["changed"])[-1]
 
 
-def seen_by_colmap(frame: Frame) -> NDArray[Any]:
+def seen_by_colmap(frame: Frame) -> AnyArray:
     """The picture of a frame that features are extracted from."""
     image: Any = frame.image  # either of two types of pixel
     return smoothed(image, frame.smoothing_px) if frame.smoothing_px > 0 else image
@@ -182,12 +182,12 @@ def require_frames(count: int, *, of: int, least: int = 3) -> None:
         raise InertialError(f"{count} frames are left of {of}; a model needs at least three")
 
 
-def _same_memory(a: NDArray[Any], b: NDArray[Any]) -> bool:
+def _same_memory(a: AnyArray, b: AnyArray) -> bool:
     """Whether two arrays show the same bytes of the same buffer (``is`` fails: a Frame holds a read-only view)."""
     return a.__array_interface__ == b.__array_interface__
 
 
-def encode_image(target: Path, image: NDArray[Any], original: Path | None = None) -> None:
+def encode_image(target: Path, image: AnyArray, original: Path | None = None) -> None:
     """Write an image in the format of its file name, with the metadata of the file that it was made from.
 
     Raises

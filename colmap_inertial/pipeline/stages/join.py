@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError, TimingError
 from colmap_inertial.core.geometry import (
     matrix_from_quat,
@@ -24,7 +25,6 @@ from colmap_inertial.core.options import JoinOptions, ScaleOptions, WorldAxes
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import (
     DOWN_IN_WORLD,
-    Array,
     CameraImuCalibration,
     Gap,
     ImuRecording,

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import quat_rotate, so3_log
 from colmap_inertial.core.gyro import on_camera_rate
 from colmap_inertial.core.options import ScaleOptions, WorldAxes
 from colmap_inertial.core.types import (
-    Array,
     CameraImuCalibration,
     CameraMotion,
     CameraTrajectory,

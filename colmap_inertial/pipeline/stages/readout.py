@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.options import ScaleOptions
-from colmap_inertial.core.types import Array, CameraImuCalibration, ImuRecording, Treatment
+from colmap_inertial.core.types import CameraImuCalibration, ImuRecording, Treatment
 from colmap_inertial.imaging.gyro_camera import FrameShutter
 from colmap_inertial.inertial.scale import estimate_scale
 from colmap_inertial.model import Model, trajectory_from_model

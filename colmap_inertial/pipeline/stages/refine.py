@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import quat_from_matrix
 from colmap_inertial.core.options import ScaleOptions
 from colmap_inertial.core.threads import one_blas_thread
-from colmap_inertial.core.types import CAL, Array, CameraImuCalibration, ImuRecording, SolvedMotion, Treatment
+from colmap_inertial.core.types import CAL, CameraImuCalibration, ImuRecording, SolvedMotion, Treatment
 from colmap_inertial.inertial.refine.judge import Judged, refine, size_of
 from colmap_inertial.inertial.refine.setup import (
     Known,

@@ -7,15 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from colmap_inertial.core.types import (
-    CAL,
-    Array,
-    CameraImuCalibration,
-    CameraModel,
-    Keypoints,
-    Projector,
-    Treatment,
-)
+from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.types import CAL, CameraImuCalibration, CameraModel, Keypoints, Projector, Treatment
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.imaging.rolling_shutter import rays, rectify_image, rectify_keypoints, seen_by_lines
 from colmap_inertial.io.calibration import SMALLEST_READOUT_S

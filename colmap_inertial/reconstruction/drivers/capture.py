@@ -13,10 +13,10 @@ from colmap_inertial.checks.validate import parse_target
 from colmap_inertial.colmap.sparse import check_pair_names, mapping_device
 from colmap_inertial.colmap.steps import run_colmap
 from colmap_inertial.colmap.tsdf import require_mesh_maker
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, InertialError
 from colmap_inertial.core.gravity import gravity_in_cam
 from colmap_inertial.core.options import ReconstructOptions
-from colmap_inertial.core.types import Array
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.files import StrPath, write_json
 from colmap_inertial.io.frames import picture_folders, read_frames

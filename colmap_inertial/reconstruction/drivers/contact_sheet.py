@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import AnyArray, UInt8Array
 from colmap_inertial.core.errors import OutputError
 from colmap_inertial.core.types import Frame
 from colmap_inertial.imaging.blur_field import BlurField
@@ -56,7 +55,7 @@ def write_contact_sheet(path: Path, capture: Capture, plan: ImagingPlan, images:
         raise ValueError("nothing was deblurred without a view")
     index = view.index()
     motion, camera = view.motion(), colmap_camera(view.camera)
-    rows: dict[str, NDArray[np.uint8]] = {}
+    rows: dict[str, UInt8Array] = {}
     for frame in some_frames(capture, view.timing, [index[name] for name in names[:_FRAMES]]):
         parallax = plan.parallaxes.get(frame.name)
         field = blur_field(motion, camera, view.shutter(index[frame.name]), parallax=parallax)
@@ -89,8 +88,8 @@ class CropKeeper:
     """
 
     blur_px: Mapping[str, float]
-    _seen: dict[str, tuple[Part, NDArray[np.uint8]]] = field(default_factory=dict, init=False)
-    _pairs: dict[str, tuple[NDArray[np.uint8], NDArray[np.uint8]]] = field(default_factory=dict, init=False)
+    _seen: dict[str, tuple[Part, UInt8Array]] = field(default_factory=dict, init=False)
+    _pairs: dict[str, tuple[UInt8Array, UInt8Array]] = field(default_factory=dict, init=False)
 
     @classmethod
     def of(cls, plan: ImagingPlan) -> CropKeeper:
@@ -133,18 +132,18 @@ class CropKeeper:
         write_json(folder / "crops.json", {"crops": listed})
 
 
-def _cut(picture: NDArray[np.uint8], part: Part) -> NDArray[np.uint8]:
+def _cut(picture: UInt8Array, part: Part) -> UInt8Array:
     top, left, height, width = part
     return picture[top : top + height, left : left + width].copy()
 
 
-def _eight_bit(image: NDArray[Any]) -> NDArray[np.uint8]:
+def _eight_bit(image: AnyArray) -> UInt8Array:
     """(H, W, 3) with 8 bit."""
     codes = np.asarray(image if image.dtype == np.uint8 else image >> 8, dtype=np.uint8)
     return np.repeat(codes[..., None], 3, axis=2) if codes.ndim == 2 else codes
 
 
-def _busiest(image: NDArray[np.uint8]) -> Part:
+def _busiest(image: UInt8Array) -> Part:
     """Top, left, height and width of the part with the most texture."""
     import cv2
 
@@ -157,7 +156,7 @@ def _busiest(image: NDArray[np.uint8]) -> Part:
     return int(top), int(left), height, width
 
 
-def _draw(crop: NDArray[np.uint8], field: BlurField, top: int, left: int) -> None:
+def _draw(crop: UInt8Array, field: BlurField, top: int, left: int) -> None:
     """The segments along which pixels were smeared."""
     import cv2
 

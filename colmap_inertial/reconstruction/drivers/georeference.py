@@ -9,10 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, NotObservableError
 from colmap_inertial.core.options import WorldAxes
 from colmap_inertial.core.quantiles import Z95
-from colmap_inertial.core.types import DOWN_IN_WORLD, Array, CameraTrajectory, FrameTiming, PositionFixes
+from colmap_inertial.core.types import DOWN_IN_WORLD, CameraTrajectory, FrameTiming, PositionFixes
 from colmap_inertial.inertial.georeference import Georeference, georeference, georeference_of_json
 from colmap_inertial.io.capture import Capture, ImageFolder, Video
 from colmap_inertial.io.files import read_json, write_json

@@ -11,10 +11,11 @@ import numpy as np
 
 from colmap_inertial.checks.validate import Validation, parse_target, validate_model
 from colmap_inertial.checks.validate.markers import marker_centres
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError
 from colmap_inertial.core.options import ProjectOptions, ReferenceOptions, ValidateOptions
 from colmap_inertial.core.quantiles import Z95
-from colmap_inertial.core.types import Array, Similarity
+from colmap_inertial.core.types import Similarity
 from colmap_inertial.io.files import StrPath, write_json
 from colmap_inertial.model.project import apply_to_project
 from colmap_inertial.pipeline.run.progress import Progress, silent

@@ -22,10 +22,11 @@ from colmap_inertial.checks.report.photogrammetry import photogrammetry_record
 from colmap_inertial.checks.report.scene import scene_record
 from colmap_inertial.checks.report.series import rounded, strided
 from colmap_inertial.checks.report.signals import signal_record
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import MappingError, NotObservableError
 from colmap_inertial.core.options import ProjectOptions
 from colmap_inertial.core.threads import usable_processors
-from colmap_inertial.core.types import Array, CameraTrajectory, ImuRecording, Keypoints
+from colmap_inertial.core.types import CameraTrajectory, ImuRecording, Keypoints
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import write_json
 from colmap_inertial.model import Model

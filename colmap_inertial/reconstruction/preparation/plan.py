@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import InertialError, NotObservableError
 from colmap_inertial.core.gyro import on_camera_rate
 from colmap_inertial.core.options import BlurRemover, DeblurMethod, RollingShutterMethod
-from colmap_inertial.core.types import Array, CameraImuCalibration, CameraModel, FrameTiming, ImuRecording
+from colmap_inertial.core.types import CameraImuCalibration, CameraModel, FrameTiming, ImuRecording
 from colmap_inertial.imaging.gate import (
     FrameDecision,
     GateOptions,

@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, BoolArray, IndexArray, UInt8Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.gyro import on_camera_rate
 from colmap_inertial.core.options import FrameOptions
 from colmap_inertial.core.threads import one_blas_thread
-from colmap_inertial.core.types import Array, CameraModel, FrameTiming
+from colmap_inertial.core.types import CameraModel, FrameTiming
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.imaging.psf import predicted_blur_px
 from colmap_inertial.imaging.selection import Chosen, Ranked, Ranking, WindowLimits, choose_frames
@@ -39,7 +39,6 @@ from colmap_inertial.reconstruction.preparation.calibrate import followed, guess
 
 log = logging.getLogger(__name__)
 
-Int = NDArray[np.intp]
 
 #: Of several frames within so much time, the least blurred one is looked at; pictures are looked at in this size.
 _SLOT_S, _LOOKED_PX = 1 / 30, 960
@@ -196,7 +195,7 @@ class _Clocks:
     rate_sigma: float = 0.0
     middle_s: float = 0.0
 
-    def usable(self, t_s: Array) -> NDArray[np.bool_]:
+    def usable(self, t_s: Array) -> BoolArray:
         """(N,) at which times the offset is good enough."""
         sigma_s = 0.0 if self.offset_sigma_s is None else self.offset_sigma_s
         return np.asarray(np.hypot(sigma_s, self.rate_sigma * (t_s - self.middle_s)) <= _OFFSET_S)
@@ -238,7 +237,7 @@ def select_frames(recording: Recording, options: FrameOptions, progress: Progres
         )
         names = [timing.names[i] for i in looked]
 
-        def pictures() -> Iterator[NDArray[np.uint8]]:
+        def pictures() -> Iterator[UInt8Array]:
             for done, (_, picture) in enumerate(read_reduced(capture, names, _LOOKED_PX)):
                 progress("selection", done, len(names))
                 yield picture
@@ -269,7 +268,7 @@ def select_frames(recording: Recording, options: FrameOptions, progress: Progres
     )
 
 
-def _slots(t_s: Array, blur: Array) -> Int:
+def _slots(t_s: Array, blur: Array) -> IndexArray:
     """The frames to look at: every one of a usual video, of a quicker one the least blurred in each slot."""
     slot = np.floor((t_s - t_s[0]) / _SLOT_S + 0.5).astype(np.int64)
     if len(t_s) < 2 or float(np.median(np.diff(t_s))) > 0.9 * _SLOT_S:

@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.options import ScaleOptions
-from colmap_inertial.core.types import Array, CameraTrajectory
+from colmap_inertial.core.types import CameraTrajectory
 from colmap_inertial.imaging.parallax import Parallax, parallax_from_points
 from colmap_inertial.inertial.scale import estimate_scale
 from colmap_inertial.model import colmap_camera, trajectory_from_model

@@ -8,8 +8,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate
-from colmap_inertial.core.types import Array
 from colmap_inertial.io.files import write_text
 from colmap_inertial.tools.export.transforms import OPENGL_FROM_CAM, View
 

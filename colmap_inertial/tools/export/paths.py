@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import AnyArray, Array, UInt8Array
 from colmap_inertial.core.errors import FormatError, MissingExtraError
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_from_matrix, rotation_between
-from colmap_inertial.core.types import Array, CameraMotion, CameraTrajectory
+from colmap_inertial.core.types import CameraMotion, CameraTrajectory
 from colmap_inertial.io.files import write_text
 from colmap_inertial.io.trajectories import read_tum
 from colmap_inertial.tools.export.transforms import OPENGL_FROM_CAM, View
@@ -92,7 +92,7 @@ def write_gltf(
     views: list[View],
     trajectory: CameraTrajectory | None,
     xyz: Array,
-    rgb: NDArray[np.uint8],
+    rgb: UInt8Array,
     up_in_world: Array,
 ) -> None:
     """Write cameras, points, the path as a line and as an animated camera: glTF 2.0, binary, metres, y up.
@@ -165,7 +165,7 @@ class _Gltf:
         self._gltf.cameras.append(self._gl.Camera(type="perspective", perspective=lens))
         return len(self._gltf.cameras) - 1
 
-    def points(self, xyz: Array, rgb: NDArray[np.uint8]) -> int:
+    def points(self, xyz: Array, rgb: UInt8Array) -> int:
         colours = np.concatenate([rgb, np.full((len(rgb), 1), 255, np.uint8)], axis=1)
         attributes = self._gl.Attributes(
             POSITION=self._accessor(xyz, "VEC3", bounds=True), COLOR_0=self._accessor(colours, "VEC4")
@@ -194,7 +194,7 @@ class _Gltf:
         self._gltf.meshes.append(self._gl.Mesh(primitives=[self._gl.Primitive(attributes=attributes, mode=mode)]))
         return len(self._gltf.meshes) - 1
 
-    def _accessor(self, values: NDArray[Any], kind: str, *, bounds: bool = False) -> int:
+    def _accessor(self, values: AnyArray, kind: str, *, bounds: bool = False) -> int:
         """Values (N, K) into the buffer: bytes as they are (normalised), all else as float."""
         gl, is_bytes = self._gl, values.dtype == np.uint8
         stored = values if is_bytes else values.astype("<f4")

@@ -6,11 +6,10 @@ import shutil
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import AnyArray, UInt8Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.threads import frames_at_once, in_order
 from colmap_inertial.io.images import read_image
@@ -38,11 +37,11 @@ class Job:
     target: Path
     source: Path
     undistortion: Undistortion
-    pixels: NDArray[Any] | None = None
+    pixels: AnyArray | None = None
 
     def write(self) -> None:
         """Write it."""
-        image: NDArray[Any] = read_image(self.source) if self.pixels is None else self.pixels
+        image: AnyArray = read_image(self.source) if self.pixels is None else self.pixels
         camera = self.undistortion.camera
         if image.shape[:2] != (camera.height, camera.width):
             raise FormatError(
@@ -76,13 +75,13 @@ def write_pictures(jobs: Iterable[Job], count: int, progress: Progress) -> None:
         progress("export", done, count)
 
 
-def three_channels(image: NDArray[Any]) -> NDArray[np.uint8]:
+def three_channels(image: AnyArray) -> UInt8Array:
     """(H, W, 3) the picture in 8 bit and three channels: trainers read nothing else."""
     shown = np.asarray(image // 257 if image.dtype == np.uint16 else image, dtype=np.uint8)
     return np.repeat(shown[:, :, None], 3, axis=2) if shown.ndim == 2 else shown
 
 
-def _is_plain(source: Path, target: Path, image: NDArray[Any]) -> bool:
+def _is_plain(source: Path, target: Path, image: AnyArray) -> bool:
     """Whether a file is what trainers read, as it is; an orientation in its metadata some of them would heed."""
     suffix = {".jpeg": ".jpg"}.get(source.suffix.lower(), source.suffix.lower())
     plain = image.ndim == 3 and image.dtype == np.uint8 and suffix == target.suffix

@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, UInt8Array
 from colmap_inertial.core.errors import MissingExtraError
-from colmap_inertial.core.types import Array
 
 if TYPE_CHECKING:
     import pycolmap
@@ -20,14 +19,14 @@ if TYPE_CHECKING:
 _LAS_STEP, _LAS_RANGE = 1e-6, 2**31 - 1
 
 
-def sparse_points(model: pycolmap.Reconstruction) -> tuple[Array, NDArray[np.uint8]]:
+def sparse_points(model: pycolmap.Reconstruction) -> tuple[Array, UInt8Array]:
     """(N, 3) positions and (N, 3) colours of a model's points, in the order of their numbers."""
     points = [model.points3D[i] for i in sorted(model.points3D)]
     xyz = np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3)
     return xyz, np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
 
 
-def write_ply(path: Path, xyz: Array, rgb: NDArray[np.uint8], comments: tuple[str, ...] = ()) -> None:
+def write_ply(path: Path, xyz: Array, rgb: UInt8Array, comments: tuple[str, ...] = ()) -> None:
     """Write points as PLY: binary, little-endian, float positions, 8-bit colours."""
     rows = np.zeros(
         len(xyz), [(name, "<f4") for name in ("x", "y", "z")] + [(name, "u1") for name in ("red", "green", "blue")]
@@ -61,7 +60,7 @@ def utm_epsg(latitude_deg: float, longitude_deg: float) -> int:
     return (32600 if latitude_deg >= 0 else 32700) + zone
 
 
-def write_las(path: Path, xyz: Array, rgb: NDArray[np.uint8], on_map: Georeference | None = None) -> None:
+def write_las(path: Path, xyz: Array, rgb: UInt8Array, on_map: Georeference | None = None) -> None:
     """Write points as LAS 1.2, point format 2: coordinates to a micrometre where they allow it, 16-bit colours.
 
     With ``on_map`` in UTM (WGS84) of the zone that the model lies in, and the file says so; else in the model's world.

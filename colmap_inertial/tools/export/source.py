@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, NotObservableError
 from colmap_inertial.core.options import ExportImages
-from colmap_inertial.core.types import DOWN_IN_WORLD, Array, CameraMotion, CameraTrajectory
+from colmap_inertial.core.types import DOWN_IN_WORLD, CameraMotion, CameraTrajectory
 from colmap_inertial.inertial.georeference import Georeference
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import read_json

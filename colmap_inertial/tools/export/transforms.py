@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, so3_exp
-from colmap_inertial.core.types import Array, CameraModel
+from colmap_inertial.core.types import CameraModel
 
 #: From COLMAP's camera axes to OpenGL's, and back.
 OPENGL_FROM_CAM = np.diag([1.0, -1.0, -1.0])

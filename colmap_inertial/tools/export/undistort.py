@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, UInt8Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.geometry import colmap_px_from_opencv
-from colmap_inertial.core.types import Array, CameraModel
+from colmap_inertial.core.types import CameraModel
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.rolling_shutter import grid_nodes, sampling_maps
 
@@ -114,7 +114,7 @@ class Undistortion:
         corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]]) * [self.pinhole.width, self.pinhole.height]
         return size and bool(np.abs(self.source_px(corners) - corners).max() < 1e-6)
 
-    def resampled(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def resampled(self, image: UInt8Array) -> UInt8Array:
         """(h, w, C) the picture (H, W, C) as the pinhole camera would have taken it, by bicubic interpolation."""
         import cv2
 

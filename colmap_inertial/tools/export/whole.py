@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_inertial import __version__
+from colmap_inertial.core.arrays import Array, UInt8Array
 from colmap_inertial.core.errors import OutputError
 from colmap_inertial.core.options import ExportImages, ExportProgram
-from colmap_inertial.core.types import Array
 from colmap_inertial.inertial.georeference import Georeference
 from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.files import StrPath, write_json
@@ -226,7 +225,7 @@ class _Work:
         where = self.source.found.folder
         return {i: Undistortion.of(self.model.camera(i), where, square=square) for i in needed_cameras(self.model)}
 
-    def _write_format(self, partial: Path, views: list[View], xyz: Array, rgb: NDArray[np.uint8]) -> None:
+    def _write_format(self, partial: Path, views: list[View], xyz: Array, rgb: UInt8Array) -> None:
         """What needs no pictures."""
         found = self.source.found
         if self.program == "ply":

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import UInt8Array, UInt16Array
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.types import SpectralRole
 from colmap_inertial.imaging.transfer import decode_table, srgb_from_linear
@@ -92,7 +92,7 @@ def _moved(camera: ShutterCamera, by_m: tuple[float, float, float]) -> tuple[flo
     return float(x), float(y), float(z)
 
 
-def _filtered(image: NDArray[np.uint8] | NDArray[np.uint16], role: SpectralRole) -> NDArray[np.uint8]:
+def _filtered(image: UInt8Array | UInt16Array, role: SpectralRole) -> UInt8Array:
     """What an aperture lets through of a colour picture."""
     if role in ("red", "green", "blue"):
         return np.asarray(image[..., ("red", "green", "blue").index(role)], dtype=np.uint8)

@@ -15,8 +15,8 @@ from multiprocessing import get_context, parent_process
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, UInt8Array
 from colmap_inertial.core.errors import OutputExistsError
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_multiply, quat_normalize
 from colmap_inertial.io.files import write_json, write_text
@@ -34,8 +34,6 @@ from colmap_inertial.tools.simulate.sensors import (
 )
 from colmap_inertial.tools.simulate.world import Board, World, WorldKind, make_world
 
-Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
 #: Camera (end of its files' names), frame, folder for the depth map.
 _Job = tuple[str, int, Path | None]
 
@@ -177,7 +175,7 @@ def _cameras(recipe: SceneRecipe) -> dict[str, ShutterCamera]:
     return {"": recipe.camera, **{f"_{name}": camera for name, camera in recipe.rig.items()}}
 
 
-def _render(scene: Scene, job: _Job) -> Image:
+def _render(scene: Scene, job: _Job) -> UInt8Array:
     suffix, index, depth = job
     recipe = scene.recipe
     camera = _cameras(recipe)[suffix]
@@ -209,7 +207,7 @@ def _end_with_the_parent() -> None:
         os._exit(1)
 
 
-def _render_job(job: _Job) -> Image:
+def _render_job(job: _Job) -> UInt8Array:
     return _render(_SCENE[-1], job)
 
 
@@ -226,7 +224,7 @@ def _processes(recipe: SceneRecipe, workers: int) -> Iterator[ProcessPoolExecuto
             raise
 
 
-def _write_images(scene: Scene, images: Iterator[Image], folder: Path, suffix: str) -> Iterator[None]:
+def _write_images(scene: Scene, images: Iterator[UInt8Array], folder: Path, suffix: str) -> Iterator[None]:
     import cv2
 
     target = folder / f"frames{suffix}"
@@ -238,7 +236,7 @@ def _write_images(scene: Scene, images: Iterator[Image], folder: Path, suffix: s
         yield
 
 
-def _write_video(scene: Scene, images: Iterator[Image], folder: Path, suffix: str) -> Iterator[None]:
+def _write_video(scene: Scene, images: Iterator[UInt8Array], folder: Path, suffix: str) -> Iterator[None]:
     import av
 
     camera = scene.recipe.camera.model

@@ -12,11 +12,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, IndexArray
 from colmap_inertial.core.geometry import quat_exp, quat_from_matrix, quat_multiply, quat_normalize
 
-Array = NDArray[np.float64]
 MotionKind = Literal["orbit", "walk", "roam", "constant_velocity", "pure_rotation", "static"]
 
 #: One-sided power spectral densities of handheld motion, mean of the motion-capture ground truth of TUM-VI room1,
@@ -145,7 +144,7 @@ class Motion:
         self._first_s = start_s + 2 * step_s
         self.start_s, self.end_s = self._first_s, self._first_s + len(windows) * step_s
 
-    def _locate(self, t_s: Array) -> tuple[NDArray[np.intp], Array]:
+    def _locate(self, t_s: Array) -> tuple[IndexArray, Array]:
         t = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
         if t.ndim != 1:
             raise ValueError("times must be a scalar or one-dimensional")
@@ -155,7 +154,7 @@ class Motion:
         index = np.clip(np.floor(u).astype(np.intp), 0, self._position.shape[1] - 1)
         return index, u - index
 
-    def _evaluate(self, polynomials: Array, index: NDArray[np.intp], fraction: Array, order: int) -> Array:
+    def _evaluate(self, polynomials: Array, index: IndexArray, fraction: Array, order: int) -> Array:
         """The ``order``-th derivative of the piecewise polynomials."""
         f = fraction[:, None]
         factors = [float(np.prod(np.arange(p - order + 1, p + 1))) for p in range(6)]

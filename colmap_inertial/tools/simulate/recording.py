@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import (
     matrix_from_quat,
     quat_conjugate,
@@ -26,8 +26,6 @@ from colmap_inertial.tools.simulate.sensors import (
     draw_imu_errors,
     sample_imu,
 )
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,14 +15,12 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, BoolArray, Float32Array, IndexArray, Int64Array, UInt8Array
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.types import CameraModel, ReadoutDirection
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.tools.simulate.motion import Motion
 from colmap_inertial.tools.simulate.world import World
-
-Array = NDArray[np.float64]
-FloatImage = NDArray[np.float32]
 
 _NEAR_M = 0.02
 #: Samples of a pixel: so many, and so many more for each pixel of blur. Against 256 samples the error is then about one
@@ -98,13 +96,13 @@ class _Atlas:
         lengths = [np.linalg.norm(q.edge_u_m) / q.texture.shape[1] for q in world.quads]
         self.texel_m = np.array(lengths, dtype=np.float32)
 
-    def look_up(self, quad: NDArray[np.intp], s: FloatImage, t: FloatImage, footprint_m: FloatImage) -> FloatImage:
+    def look_up(self, quad: IndexArray, s: Float32Array, t: Float32Array, footprint_m: Float32Array) -> Float32Array:
         """(N, 3) colours at fractions (s, t) of the edges, averaged over about ``footprint_m``."""
         detail = 2 * np.log2(np.maximum(footprint_m / self.texel_m[quad], np.float32(1)))
         level = np.minimum(np.rint(detail).astype(np.int64), self.levels - 1)
         return self._bilinear(quad * self.levels + level, s, t)
 
-    def _bilinear(self, index: NDArray[np.int64], s: FloatImage, t: FloatImage) -> FloatImage:
+    def _bilinear(self, index: Int64Array, s: Float32Array, t: Float32Array) -> Float32Array:
         width, height = self.width[index], self.height[index]
         u = np.clip(s * width - np.float32(0.5), 0, width - 1).astype(np.float32)
         v = np.clip(t * height - np.float32(0.5), 0, height - 1).astype(np.float32)
@@ -120,7 +118,7 @@ class _Atlas:
         return np.asarray(upper)
 
 
-def _pyramid_shapes(texture: FloatImage, levels: int) -> list[tuple[int, int]]:
+def _pyramid_shapes(texture: Float32Array, levels: int) -> list[tuple[int, int]]:
     """(height, width) of each level: of the second by the square root of two, of each other by two from two before."""
     shapes = [(texture.shape[0], texture.shape[1])]
     for level in range(1, levels):
@@ -170,7 +168,7 @@ class Renderer:
         self._v = np.stack([q.edge_v_m for q in quads]) / self._size[:, 1:]
         self._rays: dict[CameraModel, tuple[Array, Array]] = {}
 
-    def linear(self, camera: ShutterCamera, motion: Motion, t_s: float) -> FloatImage:
+    def linear(self, camera: ShutterCamera, motion: Motion, t_s: float) -> Float32Array:
         """(H, W, 3) light that falls on each pixel during a frame triggered at ``t_s``, before noise."""
         starts = camera.line_start_s(t_s)
         samples = self._samples_needed(camera, motion, t_s)
@@ -227,7 +225,7 @@ class Renderer:
 
     def _sample(
         self, camera: ShutterCamera, motion: Motion, instants: Array, offset: Array, samples: int
-    ) -> FloatImage:
+    ) -> Float32Array:
         rays, slope = self._rays_of(camera.model)
         shifted = rays + slope @ offset
         lines = instants if camera.readout_s > 0 else instants[:1]
@@ -252,7 +250,7 @@ class Renderer:
 
     def _trace(
         self, camera: ShutterCamera, motion: Motion, instants: Array, x: NDArray[np.floating], y: NDArray[np.floating]
-    ) -> tuple[NDArray[np.intp], NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]:
+    ) -> tuple[IndexArray, NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]:
         """What rays (x, y, 1) meet: the piece (-1 is none), its (U, V) / depth in metres, 1 / depth.
 
         ``instants`` holds one time for all rays, or one for each row or column.
@@ -319,13 +317,13 @@ class Renderer:
         return list(zip(rows, columns, strict=True))
 
 
-def _spans(inside: NDArray[np.bool_]) -> list[slice]:
+def _spans(inside: BoolArray) -> list[slice]:
     """For each row of (Q, N), from the first to the last that is true."""
     first, last = inside.argmax(axis=1), inside.shape[1] - inside[:, ::-1].argmax(axis=1)
     return [slice(a, b) for a, b in zip(first.tolist(), np.where(inside.any(axis=1), last, 0).tolist(), strict=True)]
 
 
-def develop(linear: FloatImage, camera: ShutterCamera, rng: np.random.Generator | None) -> NDArray[np.uint8]:
+def develop(linear: Float32Array, camera: ShutterCamera, rng: np.random.Generator | None) -> UInt8Array:
     """(H, W, 3) 8-bit sRGB picture of linear light, with shot and read noise (none with ``rng`` None)."""
     light: NDArray[np.floating] = np.asarray(linear, dtype=np.float32)
     if rng is not None:

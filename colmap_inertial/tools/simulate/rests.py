@@ -6,12 +6,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, quat_log, quat_multiply, rotation_between
 from colmap_inertial.core.types import ImuRecording
 from colmap_inertial.tools.simulate.sensors import (
     IMU_PRESETS,
     STANDARD_GRAVITY_M_S2,
-    Array,
     ImuErrors,
     ImuOptions,
     draw_imu_errors,

@@ -14,13 +14,11 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, quat_multiply, quat_normalize
 from colmap_inertial.core.types import ImuNoise, ImuRecording
 from colmap_inertial.tools.simulate.motion import MARGIN_S, Motion
-
-Array = NDArray[np.float64]
 
 STANDARD_GRAVITY_M_S2 = 9.80665
 #: cam_from_imu of a phone filming in landscape with its rear camera: the IMU's x right, y up, z out of the screen.

@@ -9,14 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
-Texture = NDArray[np.float32]
+from colmap_inertial.core.arrays import Float32Array
 
 
 def clouds(
     rng: np.random.Generator, height: int, width: int, *, coarsest_px: float, octaves: int, stretch: float = 1.0
-) -> NDArray[np.float32]:
+) -> Float32Array:
     """(height, width) sum of smooth random fields of halving size, zero mean, unit standard deviation.
 
     Parameters
@@ -37,21 +36,21 @@ def clouds(
     return (out - out.mean()) / max(float(out.std()), 1e-6)
 
 
-def _colour(rng: np.random.Generator, low: float = 0.03, high: float = 0.85) -> NDArray[np.float32]:
+def _colour(rng: np.random.Generator, low: float = 0.03, high: float = 0.85) -> Float32Array:
     """A random reflectance: brightness uniform in perceived lightness, some saturation."""
     lightness = rng.uniform(low**0.45, high**0.45) ** (1 / 0.45)
     tint = np.exp(rng.normal(0, 0.35, 3))
     return np.minimum(np.maximum(lightness * tint / tint.mean(), 0.02), 0.92).astype(np.float32)
 
 
-def _mix(a: NDArray[np.float32], b: NDArray[np.float32], weight: NDArray[np.float32]) -> Texture:
+def _mix(a: Float32Array, b: Float32Array, weight: Float32Array) -> Float32Array:
     w = np.clip(weight, 0, 1)[..., None]
     out = a * (1 - w)
     out += b * w
     return np.asarray(out, dtype=np.float32)
 
 
-def _shapes(rng: np.random.Generator, image: Texture, count: int, smallest_px: float, largest_px: float) -> None:
+def _shapes(rng: np.random.Generator, image: Float32Array, count: int, smallest_px: float, largest_px: float) -> None:
     """Draw random polygons, ellipses and strokes, sizes uniform in their logarithm, large ones first."""
     import cv2
 
@@ -77,7 +76,7 @@ def _shapes(rng: np.random.Generator, image: Texture, count: int, smallest_px: f
             cv2.line(image, (int(a[0]), int(a[1])), (int(b[0]), int(b[1])), colour, max(1, int(size / 6)))
 
 
-def _writing(rng: np.random.Generator, image: Texture, size_px: float) -> None:
+def _writing(rng: np.random.Generator, image: Float32Array, size_px: float) -> None:
     """A line of made-up letters: a few strokes each, between the points of a 3 x 4 grid."""
     import cv2
 
@@ -91,7 +90,7 @@ def _writing(rng: np.random.Generator, image: Texture, size_px: float) -> None:
         at = at + np.array([0.75 * size_px, 0.0])
 
 
-def poster(rng: np.random.Generator, height: int, width: int) -> Texture:
+def poster(rng: np.random.Generator, height: int, width: int) -> Float32Array:
     """Printed paper: shapes of all sizes and lines of letters."""
     image = _mix(
         _colour(rng, 0.2), _colour(rng, 0.2), 0.5 + 0.3 * clouds(rng, height, width, coarsest_px=width / 2, octaves=3)
@@ -102,7 +101,7 @@ def poster(rng: np.random.Generator, height: int, width: int) -> Texture:
     return image
 
 
-def terrazzo(rng: np.random.Generator, height: int, width: int) -> Texture:
+def terrazzo(rng: np.random.Generator, height: int, width: int) -> Float32Array:
     """Stone chips in cement."""
     base = _colour(rng, 0.15, 0.6)
     image = _mix(
@@ -112,7 +111,7 @@ def terrazzo(rng: np.random.Generator, height: int, width: int) -> Texture:
     return image
 
 
-def wood(rng: np.random.Generator, height: int, width: int) -> Texture:
+def wood(rng: np.random.Generator, height: int, width: int) -> Float32Array:
     """Grain along the rows, with rings, knots, scratches and stains."""
     dark = np.array([0.13, 0.06, 0.03], dtype=np.float32) * np.float32(rng.uniform(0.7, 1.6))
     light = np.array([0.50, 0.30, 0.16], dtype=np.float32) * np.float32(rng.uniform(0.8, 1.3))
@@ -125,10 +124,10 @@ def wood(rng: np.random.Generator, height: int, width: int) -> Texture:
     return np.clip(image, 0.02, 0.92)
 
 
-def fabric(rng: np.random.Generator, height: int, width: int) -> Texture:
+def fabric(rng: np.random.Generator, height: int, width: int) -> Float32Array:
     """A tartan of threads of random widths, worn and stained."""
 
-    def threads(n: int) -> NDArray[np.float32]:
+    def threads(n: int) -> Float32Array:
         widths = rng.integers(2, 24, n)
         colours = np.stack([_colour(rng) for _ in range(n)])
         return np.repeat(colours, widths, axis=0)[:n].astype(np.float32)
@@ -138,7 +137,7 @@ def fabric(rng: np.random.Generator, height: int, width: int) -> Texture:
     return np.clip(image, 0.02, 0.92).astype(np.float32)
 
 
-def marble(rng: np.random.Generator, height: int, width: int) -> Texture:
+def marble(rng: np.random.Generator, height: int, width: int) -> Float32Array:
     """Veins through a warped field."""
     warp = clouds(rng, height, width, coarsest_px=max(height, width) / 4, octaves=7)
     veins = np.exp(-6 * np.abs(np.sin(2.5 * warp + clouds(rng, height, width, coarsest_px=80, octaves=5))))
@@ -147,7 +146,7 @@ def marble(rng: np.random.Generator, height: int, width: int) -> Texture:
     return np.clip(image, 0.02, 0.92).astype(np.float32)
 
 
-def plaster(rng: np.random.Generator, height: int, width: int) -> Texture:
+def plaster(rng: np.random.Generator, height: int, width: int) -> Float32Array:
     """A wall: faint blotches at all scales, specks, a few cracks."""
     image = np.ones((height, width, 3), dtype=np.float32) * _colour(rng, 0.3, 0.7)
     image *= np.exp(0.18 * clouds(rng, height, width, coarsest_px=200, octaves=8))[..., None]
@@ -155,7 +154,7 @@ def plaster(rng: np.random.Generator, height: int, width: int) -> Texture:
     return np.clip(image, 0.02, 0.92)
 
 
-def carpet(rng: np.random.Generator, height: int, width: int) -> Texture:
+def carpet(rng: np.random.Generator, height: int, width: int) -> Float32Array:
     """Blotches of a few colours with a fine pile."""
     image = np.broadcast_to(_colour(rng, 0.08, 0.3), (height, width, 3)).astype(np.float32)
     for _ in range(4):
@@ -164,7 +163,7 @@ def carpet(rng: np.random.Generator, height: int, width: int) -> Texture:
     return np.clip(image, 0.02, 0.92)
 
 
-def checkerboard(columns: int, rows: int, square_px: int, margin_px: int) -> Texture:
+def checkerboard(columns: int, rows: int, square_px: int, margin_px: int) -> Float32Array:
     """A board of ``columns`` x ``rows`` inner corners with a white margin; its edges lie between texels."""
     v, u = np.indices(((rows + 1) * square_px, (columns + 1) * square_px)) // square_px
     board = np.where((u + v) % 2 == 0, 0.07, 0.8)
@@ -172,7 +171,7 @@ def checkerboard(columns: int, rows: int, square_px: int, margin_px: int) -> Tex
     return np.repeat(image[..., None], 3, axis=2).astype(np.float32)
 
 
-MATERIALS: tuple[Callable[[np.random.Generator, int, int], Texture], ...] = (
+MATERIALS: tuple[Callable[[np.random.Generator, int, int], Float32Array], ...] = (
     poster,
     terrazzo,
     wood,

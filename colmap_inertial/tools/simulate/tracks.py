@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.types import CAL, CameraImuCalibration, CameraModel, FrameTiming, ImuRecording
 from colmap_inertial.imaging.gyro_camera import FrameShutter
@@ -30,7 +30,6 @@ from colmap_inertial.tools.simulate.sensors import (
 if TYPE_CHECKING:
     import pycolmap
 
-Array = NDArray[np.float64]
 
 #: Rounds until a point's line and the instant of that line agree.
 _ROUNDS = 6
@@ -95,8 +94,8 @@ class Tracks:
     timing: FrameTiming
     camera: CameraModel
     point_m: Array
-    frame: NDArray[np.int64]
-    point: NDArray[np.int64]
+    frame: Int64Array
+    point: Int64Array
     xy_px: Array
     imu: ImuRecording
     motion: Motion
@@ -163,7 +162,7 @@ class Tracks:
                 )
                 opened.write_two_view_geometry(first + 1, second + 1, geometry)
 
-    def _in_common(self) -> NDArray[np.int64]:
+    def _in_common(self) -> Int64Array:
         """(F, F) how many points two frames both see."""
         from scipy.sparse import coo_array, csr_array
 
@@ -248,7 +247,7 @@ def _points(motion: Motion, timing: FrameTiming, options: TrackOptions, rng: np.
 
 def _seen(
     motion: Motion, timing: FrameTiming, points: Array, options: TrackOptions, rng: np.random.Generator
-) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+) -> tuple[Int64Array, Int64Array, Array]:
     """Which frame sees which point and where, each line at its own instant; points by at least three frames."""
     camera, pose_s = colmap_camera(options.camera), timing.pose_t_s()
     width, height = options.camera.width, options.camera.height

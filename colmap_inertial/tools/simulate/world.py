@@ -8,14 +8,12 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array, Float32Array
 from colmap_inertial.tools.simulate import textures
-from colmap_inertial.tools.simulate.textures import Texture
 
-Array = NDArray[np.float64]
 WorldKind = Literal["desk", "room"]
-_Material = Callable[[np.random.Generator, int, int], Texture]
+_Material = Callable[[np.random.Generator, int, int], Float32Array]
 
 #: Direction to the lamp, and how much light comes from everywhere.
 _TO_LAMP = np.array([0.35, -0.25, 0.9]) / np.linalg.norm([0.35, -0.25, 0.9])
@@ -40,7 +38,7 @@ class Quad:
     corner_m: Array
     edge_u_m: Array
     edge_v_m: Array
-    texture: Texture
+    texture: Float32Array
 
     @cached_property
     def normal(self) -> Array:
@@ -94,7 +92,9 @@ class _Builder:
     def material(self) -> _Material:
         return textures.MATERIALS[self.rng.integers(len(textures.MATERIALS))]
 
-    def quad(self, corner: Array, u: Array, v: Array, material: _Material | Texture, texel_m: float = 0.001) -> None:
+    def quad(
+        self, corner: Array, u: Array, v: Array, material: _Material | Float32Array, texel_m: float = 0.001
+    ) -> None:
         """Add a rectangle, lit by the lamp; ``u`` right and ``v`` down as seen."""
         if callable(material):
             height, width = (max(8, round(float(np.linalg.norm(edge)) / texel_m)) for edge in (v, u))
@@ -168,7 +168,7 @@ class _Builder:
             self.quad(corner, along * width, -height * _UP, textures.poster, texel_m)
 
 
-def _shadow(texture: Texture, footprints: list[Array], texel_m: float) -> Texture:
+def _shadow(texture: Float32Array, footprints: list[Array], texel_m: float) -> Float32Array:
     """Darken a table top softly where things stand; footprints are polygons in metres from its upper left."""
     import cv2
 

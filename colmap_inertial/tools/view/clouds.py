@@ -10,14 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_inertial.checks.report.series import strided
+from colmap_inertial.core.arrays import Array, Float32Array, UInt8Array
 from colmap_inertial.core.errors import FormatError
-from colmap_inertial.core.types import Array
 from colmap_inertial.io.ply import Element, read_ply_header
 
 if TYPE_CHECKING:
     import pycolmap
 
-Colours = NDArray[np.uint8]
 
 #: Points seen by so few images, or this badly, are left out where enough others remain.
 _FEWEST_VIEWS, _WORST_PX, _ENOUGH = 3, 2.0, 0.3
@@ -44,8 +43,8 @@ class Cloud:
         Whether they come from depth maps.
     """
 
-    xyz: NDArray[np.float32]
-    rgb: Colours
+    xyz: Float32Array
+    rgb: UInt8Array
     total: int
     dense: bool
 
@@ -54,9 +53,9 @@ class Cloud:
 class Mesh:
     """A mesh: vertices (V, 3), faces (F, 3), colours (V, 3) where it has them."""
 
-    vertices: NDArray[np.float32]
+    vertices: Float32Array
     faces: NDArray[np.uint32]
-    rgb: Colours | None
+    rgb: UInt8Array | None
 
 
 def sparse_cloud(reconstruction: pycolmap.Reconstruction, most: int) -> Cloud:
@@ -160,12 +159,12 @@ def _vertices(path: Path) -> tuple[Any, tuple[Element, int, str] | None]:
     return table, None if faces is None else (faces, end, order)
 
 
-def _positions(table: Any) -> NDArray[np.float32]:
+def _positions(table: Any) -> Float32Array:
     with np.errstate(over="ignore"):  # what float32 cannot hold is not finite, and left out like the rest of it
         return np.stack([table[name] for name in "xyz"], axis=1).astype(np.float32)
 
 
-def _colours(table: Any) -> Colours | None:
+def _colours(table: Any) -> UInt8Array | None:
     names = ("red", "green", "blue")
     if not set(names) <= set(table.dtype.names):
         return None

@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import AnyArray, Array, UInt8Array
 from colmap_inertial.core.geometry import quat_rotate
-from colmap_inertial.core.types import Array
 from colmap_inertial.tools.view import panel
 from colmap_inertial.tools.view.measure import length_text
 from colmap_inertial.tools.view.scene import Scene
@@ -173,13 +172,13 @@ class Drawing:
             drawn.append(label)
         return drawn
 
-    def points(self, name: str, xyz: NDArray[Any], colours: Any, size: float, **more: Any) -> Any:
+    def points(self, name: str, xyz: AnyArray, colours: Any, size: float, **more: Any) -> Any:
         """Add points (N, 3) of one or (N, 3) colours, so large in the scene's units."""
         return self._api.add_point_cloud(
             name, xyz, colours, point_size=size, point_shape="circle", precision="float32", **more
         )
 
-    def lines(self, name: str, pieces: Array, colour: tuple[int, int, int] | NDArray[np.uint8], width_px: float) -> Any:
+    def lines(self, name: str, pieces: Array, colour: tuple[int, int, int] | UInt8Array, width_px: float) -> Any:
         """Add straight lines (N, 2, 3), as wide on the screen from everywhere; of one colour, or of their ends'."""
         return self._api.add_line_segments(name, pieces, colour, thickness=width_px, thickness_units="screen")
 
@@ -187,7 +186,7 @@ class Drawing:
         """Add a text, as large on the screen from everywhere."""
         return self._api.add_label(name, text, position=position, anchor=anchor, font_screen_scale=size)
 
-    def frustum(self, name: str, camera: int, image: NDArray[np.uint8] | None, *, through: bool = False) -> Any:
+    def frustum(self, name: str, camera: int, image: UInt8Array | None, *, through: bool = False) -> Any:
         """Add a camera with its image; larger than the others, so that it is seen; one looks ``through`` its image."""
         cameras = self.scene.cameras
         half_height, aspect = np.tan(0.5 * cameras.vertical_fov_rad[camera]), float(cameras.aspect[camera])
@@ -211,13 +210,13 @@ class Drawing:
         )
 
 
-def path_colours(percent: Array | None) -> tuple[int, int, int] | NDArray[np.uint8]:
+def path_colours(percent: Array | None) -> tuple[int, int, int] | UInt8Array:
     """Of a path: amber; towards red where it was stretched and towards blue where it was shortened, (S, 2, 3)."""
     if percent is None:
         return AMBER
     share = percent / max(float(np.abs(percent).max(initial=0.0)), 1e-9)
     towards = np.where(share[..., None] > 0, RED, BLUE)
-    colours: NDArray[np.uint8] = np.rint(AMBER + np.abs(share[..., None]) * (towards - AMBER)).astype(np.uint8)
+    colours: UInt8Array = np.rint(AMBER + np.abs(share[..., None]) * (towards - AMBER)).astype(np.uint8)
     return colours
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import UInt8Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.io.images import read_image
 
 
-def read_preview(path: Path | None, width_px: int) -> tuple[NDArray[np.uint8] | None, str]:
+def read_preview(path: Path | None, width_px: int) -> tuple[UInt8Array | None, str]:
     """An image (H, W, 3) that is no wider than this, or ``None`` and why there is none."""
     import cv2
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from colmap_inertial.core.types import Array
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.types.recorded import LengthUnit
 
 #: A click means a point within this angle of it, rad; of several closer than the smaller angle, the one in front.

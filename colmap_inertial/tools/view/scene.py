@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import quat_conjugate, quat_rotate
-from colmap_inertial.core.types import DOWN_IN_WORLD, Array
+from colmap_inertial.core.types import DOWN_IN_WORLD
 from colmap_inertial.io.names import path_in
 from colmap_inertial.io.trajectories import read_tum
 from colmap_inertial.model import read_model
@@ -146,7 +146,7 @@ class Scene:
         paths = (path_in(folder, name, self.source.folder) for folder in self.source.images if folder.is_dir())
         return next((path for path in paths if path.is_file()), None)
 
-    def pickable(self) -> NDArray[np.float64]:
+    def pickable(self) -> Array:
         """(N, 3) points that one can measure between: the cloud's, and the target's corners."""
         corners = list(self.target.corners.values()) if self.target is not None else []
         return np.concatenate([self.cloud.xyz.astype(np.float64), np.array(corners).reshape(-1, 3)])

@@ -12,12 +12,11 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_inertial.checks.report.series import strided
+from colmap_inertial.core.arrays import Array, UInt8Array
 from colmap_inertial.core.errors import MissingExtraError, OutputError
 from colmap_inertial.core.geometry import quat_rotate
-from colmap_inertial.core.types import Array
 from colmap_inertial.tools.view import panel
 from colmap_inertial.tools.view.drawing import RED, Drawing
 from colmap_inertial.tools.view.guard import Guard, guarding
@@ -197,7 +196,7 @@ class Viewer:
                 if image is not None:
                     self._temporary["thumbnails"].append(self._drawing.frustum(f"/thumbnails/{camera}", camera, image))
 
-    def _read_image(self, camera: int, width_px: int) -> tuple[NDArray[np.uint8] | None, str]:
+    def _read_image(self, camera: int, width_px: int) -> tuple[UInt8Array | None, str]:
         return read_preview(self.scene.image_of(camera), width_px)
 
     def _switch_measuring(self) -> None:

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.geometry import quat_rotate
 from colmap_inertial.core.quantiles import Z95
-from colmap_inertial.core.types import Array
 from colmap_inertial.core.types.recorded import LengthUnit
 from colmap_inertial.io.files import read_json
 from colmap_inertial.io.names import path_in
