@@ -23,10 +23,12 @@ import re
 import shutil
 import subprocess
 import sys
+import sysconfig
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -65,6 +67,12 @@ class Trial:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         shutil.copytree(ROOT / PACKAGE, folder / PACKAGE)
+        # An editable install keeps the compiled kernels with the installed packages, and is found before any folder.
+        for kernel in Path(sysconfig.get_path("platlib"), PACKAGE).rglob("*.so"):
+            shutil.copy2(kernel, folder / PACKAGE / kernel.relative_to(Path(sysconfig.get_path("platlib"), PACKAGE)))
+        (folder / "sitecustomize.py").write_text(
+            'import sys\nsys.meta_path[:] = [f for f in sys.meta_path if "ScikitBuild" not in type(f).__name__]\n'
+        )
         self._environment = {
             **os.environ,
             "PYTHONPATH": str(folder),
@@ -75,54 +83,74 @@ class Trial:
         code = f"import {PACKAGE}; print({PACKAGE}.__file__)"
         found = self._run([sys.executable, "-c", code]).stdout.strip()
         if not Path(found).is_relative_to(folder):
-            raise SystemExit(
-                f"tests would use {found} instead of the copy: run this where the package is not installed"
-            )
+            raise SystemExit(f"tests would use {found} instead of the copy")
 
     def outcome(self, mutant: Mutant) -> Outcome:
         """Make the fault, run its tests, and take it back."""
-        target = self._folder / PACKAGE / mutant.file
-        text = mutated(target.read_text(encoding="utf-8"), mutant)
+        text = mutated((ROOT / PACKAGE / mutant.file).read_text(encoding="utf-8"), mutant)
         if text is None:
             return Outcome(mutant=mutant, state="stale")
-        target.write_text(text, encoding="utf-8")
         begun = time.perf_counter()
-        try:
-            state, by = self._tested(mutant.test_files())
-        finally:
-            shutil.copy2(ROOT / PACKAGE / mutant.file, target)
-        seconds = time.perf_counter() - begun
-        if state == "caught" and "::" in by and not self._passes(by):
-            state, by = "broken", f"{by} fails without the fault"
-        return Outcome(mutant=mutant, state=state, by=by, seconds=seconds)
+        with self.module(mutant.file, text):
+            state, by = self.tested(mutant.test_files())
+        return Outcome(mutant=mutant, state=state, by=by, seconds=time.perf_counter() - begun)
 
-    def _tested(self, tests: Sequence[str]) -> tuple[str, str]:
-        """``caught`` and the test that failed first, ``survived``, or ``broken`` and what pytest said."""
+    @contextmanager
+    def module(self, file: str, text: str) -> Iterator[None]:
+        """While the context lasts, a module of the copy has this text."""
+        target = self._folder / PACKAGE / file
+        target.write_text(text, encoding="utf-8")
+        try:
+            yield
+        finally:
+            shutil.copy2(ROOT / PACKAGE / file, target)
+
+    def tested(self, tests: Sequence[str]) -> tuple[str, str]:
+        """``caught`` and the test that failed first, ``survived``, or ``broken`` and what pytest said.
+
+        A test that fails without the fault as well counts for nothing (``broken``).
+        """
         try:
             done = self._pytest(tests)
         except subprocess.TimeoutExpired:
             return "caught", f"tests run for more than {_LONGEST_S} s"
         failed = re.search(r"^(?:FAILED|ERROR) \S*?(tests/.+?)(?: - .*)?$", done.stdout, re.MULTILINE)
         if failed is not None:
-            return "caught", failed[1]
+            sound = "::" not in failed[1] or self._passes(failed[1])
+            return ("caught", failed[1]) if sound else ("broken", f"{failed[1]} fails without the fault")
         if done.returncode < 0:
             return "caught", f"tests end by signal {-done.returncode}"
-        said = (done.stdout + done.stderr).strip().splitlines()
-        return ("survived", "") if done.returncode == _PASSED else ("broken", said[-1] if said else "pytest failed")
+        printed = (done.stdout + done.stderr).strip().splitlines()
+        return (
+            ("survived", "") if done.returncode == _PASSED else ("broken", printed[-1] if printed else "pytest failed")
+        )
 
     @functools.cache  # noqa: B019 (a trial lives as long as the script)
     def _passes(self, test: str) -> bool:
-        """Whether a test passes without any fault."""
-        return self._pytest([test]).returncode == _PASSED
+        """Whether a test passes in the installed package, without any fault."""
+        return self._pytest([test], where=ROOT, environment={**os.environ}).returncode == _PASSED
 
-    def _pytest(self, tests: Sequence[str]) -> subprocess.CompletedProcess[str]:
+    def _pytest(
+        self, tests: Sequence[str], where: Path | None = None, environment: dict[str, str] | None = None
+    ) -> subprocess.CompletedProcess[str]:
         words = [sys.executable, "-m", "pytest", "-x", "-q", "--tb=no", "-p", "no:cacheprovider", f"--rootdir={ROOT}"]
-        return self._run([*words, *(str(ROOT / test) for test in tests)], timeout=_LONGEST_S)
+        return self._run([*words, *(str(ROOT / test) for test in tests)], where, environment, timeout=_LONGEST_S)
 
-    def _run(self, words: Sequence[str], timeout: float | None = None) -> subprocess.CompletedProcess[str]:
+    def _run(
+        self,
+        words: Sequence[str],
+        where: Path | None = None,
+        environment: dict[str, str] | None = None,
+        timeout: float | None = None,
+    ) -> subprocess.CompletedProcess[str]:
         # in the copy's folder: Python finds modules where it is started before it looks elsewhere
         return subprocess.run(
-            words, cwd=self._folder, env=self._environment, capture_output=True, text=True, timeout=timeout
+            words,
+            cwd=where or self._folder,
+            env=environment or self._environment,
+            capture_output=True,
+            text=True,
+            timeout=timeout,
         )
 
 
