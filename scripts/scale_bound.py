@@ -19,7 +19,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import matrix_from_quat, skew
-from colmap_inertial.inertial.scale.priors import PRIORS, model_scale_sigma
+from colmap_inertial.inertial.core.priors import PRIORS, model_scale_sigma
 from colmap_inertial.tools.simulate import ImuErrors, Motion, RecordingOptions, SimulatedRecording
 from colmap_inertial.tools.simulate.sensors import true_rate_rad_s, true_specific_force_m_s2
 

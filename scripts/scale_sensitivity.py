@@ -29,9 +29,10 @@ from bench_scale import Window
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.threads import one_blas_thread
-from colmap_inertial.core.types import CameraImuCalibration
-from colmap_inertial.inertial.scale import _factors, _noise, _parameters, _setup, joint, priors
-from colmap_inertial.inertial.scale.priors import PRIORS
+from colmap_inertial.core.types import Array, CameraImuCalibration
+from colmap_inertial.inertial.core import parameters, priors
+from colmap_inertial.inertial.core.priors import PRIORS
+from colmap_inertial.inertial.scale import _noise, _residuals, _setup, joint
 from colmap_inertial.motion.align import align_camera_imu
 
 #: Windows by the name of their column: the first minute, and its twelfth parts.
@@ -43,9 +44,9 @@ _PRIVATE = {
     "_setup._NEAR_M": _setup,
     "_setup._FAR_M": _setup,
     "joint._UNMODELLED_S": joint,
-    "_parameters.DRIFT_S": _parameters,
+    "parameters.DRIFT_S": parameters,
     "_noise._LARGEST_CORRELATION": _noise,
-    "_factors.ROBUST_SIGMAS": _factors,
+    "_residuals.ROBUST_SIGMAS": _residuals,
 }
 _UPPER_BOUNDS = {"_noise._LARGEST_CORRELATION": 1.0}
 
@@ -77,7 +78,7 @@ def constants() -> dict[str, float | None]:
     known = [f.name for f in dataclasses.fields(PRIORS) if not f.name.startswith(("calibrated", "known"))]
     out: dict[str, float | None] = {f"PRIORS.{name}": getattr(PRIORS, name) for name in known}
     levels = dataclasses.fields(_noise.TYPICAL)
-    from_stream = ("rotation_excess", "gyro_rad_s_rthz", "accel_m_s2_rthz")
+    from_stream = ("rotation_excess", "gyro_density_rad_s_rthz", "accel_density_m_s2_rthz")
     out |= {f"TYPICAL.{f.name}": getattr(_noise.TYPICAL, f.name) for f in levels if f.name not in from_stream}
     out["JointOptions.states_hz"] = joint.JointOptions().states_hz
     out |= {name: getattr(module, name.partition(".")[2]) for name, module in _PRIVATE.items()}

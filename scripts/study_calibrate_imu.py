@@ -18,7 +18,7 @@ import numpy as np
 
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.types import IMU_CAL, ImuRecording
-from colmap_inertial.inertial.scale.priors import PRIORS
+from colmap_inertial.inertial.core.priors import PRIORS
 from colmap_inertial.inertial.static_calibration import RestCalibration, calibrate_imu
 from colmap_inertial.tools.simulate import RestOptions, SimulatedRests, simulate_rests
 

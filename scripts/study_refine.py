@@ -40,6 +40,7 @@ from colmap_inertial.colmap.mapping import map_images
 from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, quat_multiply, so3_log
 from colmap_inertial.core.options import MappingOptions
 from colmap_inertial.core.types import CAL, CameraImuCalibration, ImuRecording
+from colmap_inertial.inertial.core.priors import PRIORS
 from colmap_inertial.inertial.refine.motion import moving
 from colmap_inertial.inertial.refine.setup import (
     at_middle_lines,
@@ -51,7 +52,6 @@ from colmap_inertial.inertial.refine.setup import (
 )
 from colmap_inertial.inertial.refine.solve import factored, solve
 from colmap_inertial.inertial.refine.values import Estimate, Problem
-from colmap_inertial.inertial.scale.priors import PRIORS
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.model import Model
 from colmap_inertial.pipeline.run.context import RunContext

@@ -47,9 +47,9 @@ from scale_faults import FAULTS
 from colmap_inertial.core.geometry import quat_conjugate, quat_exp, quat_multiply, quat_normalize
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import CameraTrajectory
+from colmap_inertial.inertial.core.priors import PRIORS, model_scale_sigma
 from colmap_inertial.inertial.scale import estimate_scale
 from colmap_inertial.inertial.scale._noise import TYPICAL
-from colmap_inertial.inertial.scale.priors import PRIORS, model_scale_sigma
 from colmap_inertial.inertial.scale.verdict import WEAK_HALF_WIDTH, half_width
 from colmap_inertial.io.calibration import ACCEL_MINUS_GYRO_OFFSET_S
 from colmap_inertial.tools.simulate import (
@@ -121,7 +121,7 @@ def drawn(seed: int) -> tuple[RecordingOptions, str, str]:
     gravity_m_s2 = float(rng.normal(9.80665, PRIORS.gravity_m_s2))
     speed_m_s = 0.8
     if part == "stressed":
-        assumed = max(imu.accel_density_m_s2_rthz, TYPICAL.accel_m_s2_rthz)
+        assumed = max(imu.accel_density_m_s2_rthz, TYPICAL.accel_density_m_s2_rthz)
         imu, drift_m_rts = replace(imu, accel_density_m_s2_rthz=2 * assumed), 0.01
     if part == "faulty":
         louder = float(np.exp(rng.uniform(-np.log(3), np.log(3))))

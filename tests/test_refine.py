@@ -313,7 +313,7 @@ def test_a_gap_of_the_gyroscope_links_nothing():
     keep = (since_s < 3.0) | (since_s > 4.0)
     gappy = replace(tracks, imu=replace(imu, gyro_t_s=imu.gyro_t_s[keep], gyro_rad_s=imu.gyro_rad_s[keep]))
     whole, gap = (problem_of(one, options)[0] for one in (tracks, gappy))
-    t_s = gap.inertial.tracks.gyro.t_s
+    t_s = gap.inertial.streams.gyro.t_s
     begin_s, end_s = t_s[int(np.argmax(np.diff(t_s))) + np.arange(2)]
     nodes_s = gap.inertial.nodes_s
     across = (nodes_s[1:] > begin_s) & (nodes_s[:-1] < end_s)

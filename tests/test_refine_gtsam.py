@@ -7,10 +7,10 @@ from gtsam.symbol_shorthand import B, L, V, X
 from refine_walk import PINHOLE, nudged, problem_of, tracks_of, walk
 
 from colmap_inertial.core.geometry import so3_exp, so3_log
+from colmap_inertial.inertial.core.preintegration import SensorErrors, preintegrate
 from colmap_inertial.inertial.refine._inertial import imu_rows
 from colmap_inertial.inertial.refine.solve import factored, solve
 from colmap_inertial.inertial.refine.values import N_STATE
-from colmap_inertial.inertial.scale._preintegration import SensorErrors, preintegrate
 
 #: Seconds of GTSAM's integration steps.
 STEP_S = 0.001
@@ -61,7 +61,7 @@ def increments(problem, x, i):
     steps = round((end_s - begin_s) / STEP_S)
     dt = (end_s - begin_s) / steps
     middle_s = begin_s + dt * (np.arange(steps) + 0.5)
-    rate, force = inertial.tracks.gyro.at(middle_s)[0], inertial.tracks.accel.at(middle_s)[0]
+    rate, force = inertial.streams.gyro.at(middle_s)[0], inertial.streams.accel.at(middle_s)[0]
     # GTSAM takes a step's force in the frame where the step begins
     turned = so3_exp(0.5 * dt * (rate - x.gyro_bias_rad_s[i]))
     force = np.einsum("nij,nj->ni", turned, force - x.accel_bias_m_s2[i]) + x.accel_bias_m_s2[i]
@@ -131,7 +131,7 @@ def test_increments_and_their_derivatives_are_gtsam_s(solved):
         gyro_gain=np.zeros((3, 3)),
         accel_gain=np.zeros((3, 3)),
     )
-    ours = preintegrate(problem.inertial.nodes_s, problem.inertial.tracks, errors)
+    ours = preintegrate(problem.inertial.nodes_s, problem.inertial.streams, errors)
     for i in (0, 7):
         theirs = increments(problem, x, i)
         assert np.abs(so3_log(ours.rotation[i].T @ theirs.deltaRij().matrix())).max() < 1e-5

@@ -13,10 +13,10 @@ from colmap_inertial import read_model, reconstruct_project
 from colmap_inertial.core.geometry import matrix_from_quat, so3_log
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
 from colmap_inertial.core.types import CameraMotion
+from colmap_inertial.inertial.core.priors import PRIORS
 from colmap_inertial.inertial.refine import judge
 from colmap_inertial.inertial.refine.solve import held_out, solve
 from colmap_inertial.inertial.refine.values import ROTATION
-from colmap_inertial.inertial.scale.priors import PRIORS
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.records import read_record

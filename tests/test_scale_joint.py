@@ -10,14 +10,15 @@ import pytest
 from colmap_inertial.core.geometry import matrix_from_quat, quat_from_matrix, so3_exp, so3_log
 from colmap_inertial.core.options import ScaleOptions
 from colmap_inertial.core.types import CAL, CameraTrajectory, ImuNoise, ImuRecording
-from colmap_inertial.inertial.scale import _factors as fac, _parameters as par, _setup, estimate_scale, first_seconds
+from colmap_inertial.inertial.core import factors as fac, parameters as par
+from colmap_inertial.inertial.core.arrow import ArrowSystem
+from colmap_inertial.inertial.core.preintegration import SensorErrors, SensorStream, SensorStreams, preintegrate
+from colmap_inertial.inertial.core.priors import PRIORS
+from colmap_inertial.inertial.scale import _residuals as res, _setup, estimate_scale, first_seconds
 from colmap_inertial.inertial.scale._grouping import first_of_groups, group_frames
 from colmap_inertial.inertial.scale._noise import GROUP_OF, TYPICAL, Expected, roughness
-from colmap_inertial.inertial.scale._preintegration import SensorErrors, Track, Tracks, preintegrate
 from colmap_inertial.inertial.scale._setup import prepare
-from colmap_inertial.inertial.scale._solver import ArrowSystem
 from colmap_inertial.inertial.scale.joint import JointOptions, estimate_joint, fit_path, scale_of
-from colmap_inertial.inertial.scale.priors import PRIORS
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.motion.align import align_camera_imu
 from colmap_inertial.tools.simulate import IMU_PRESETS
@@ -47,7 +48,7 @@ def run_through(nodes_s, gyro, accel, **changed):
     arguments = {
         "gyro_bias_rad_s": zero, "accel_bias_m_s2": zero, "gyro_gain": np.zeros((3, 3)), "accel_gain": np.zeros((3, 3))
     }  # fmt: skip
-    return preintegrate(nodes_s, Tracks(gyro=gyro, accel=accel), SensorErrors(**{**arguments, **changed}))
+    return preintegrate(nodes_s, SensorStreams(gyro=gyro, accel=accel), SensorErrors(**{**arguments, **changed}))
 
 
 def test_preintegration_agrees_with_fine_steps_of_the_motion():
@@ -56,7 +57,7 @@ def test_preintegration_agrees_with_fine_steps_of_the_motion():
     gyro, accel = smooth_tracks(rng, t_s)
     rng = np.random.default_rng(1)
     nodes_s = np.array([0.503, 0.7, 1.9])
-    pre = run_through(nodes_s, Track.of(t_s, gyro), Track.of(t_s, accel))
+    pre = run_through(nodes_s, SensorStream.from_samples(t_s, gyro), SensorStream.from_samples(t_s, accel))
     for k in range(2):
         n = 20000
         fine_s = np.linspace(nodes_s[k], nodes_s[k + 1], n + 1)
@@ -75,7 +76,7 @@ def test_preintegration_agrees_with_fine_steps_of_the_motion():
 
 def test_derivatives_of_the_preintegration_are_those_of_finite_differences():
     t_s = np.arange(0, 3, 0.01)
-    gyro, accel = (Track.of(t_s, values) for values in smooth_tracks(np.random.default_rng(2), t_s))
+    gyro, accel = (SensorStream.from_samples(t_s, values) for values in smooth_tracks(np.random.default_rng(2), t_s))
     nodes_s = np.array([0.5, 0.7, 1.9])
     base = run_through(nodes_s, gyro, accel)
 
@@ -104,12 +105,12 @@ def test_the_preintegrated_covariance_is_that_of_noisy_samples():
     t_s = np.arange(0, 1.5, 0.01)
     gyro, accel = smooth_tracks(np.random.default_rng(4), t_s)
     nodes_s = np.array([0.2, 1.2])
-    base = run_through(nodes_s, Track.of(t_s, gyro), Track.of(t_s, accel))
+    base = run_through(nodes_s, SensorStream.from_samples(t_s, gyro), SensorStream.from_samples(t_s, accel))
     density_g, density_a, runs = 2e-3, 2e-2, 600
     errors = np.empty((runs, 9))
     for i in range(runs):
         noisy = [
-            Track.of(t_s, values + density / np.sqrt(0.01) * rng.standard_normal(values.shape))
+            SensorStream.from_samples(t_s, values + density / np.sqrt(0.01) * rng.standard_normal(values.shape))
             for values, density in ((gyro, density_g), (accel, density_a))
         ]
         pre = run_through(nodes_s, *noisy)
@@ -169,12 +170,12 @@ def test_derivatives_of_all_residuals_are_those_of_finite_differences(recording,
 
     def residuals(moved):
         # The IMU's instants stay where they are: the derivative by the delay is that of the pictures
-        pre = fac.integrate(data, replace(moved, delay_s=0.0, clock_rate=0.0))
+        pre = res.integrate(data, replace(moved, delay_s=0.0, clock_rate=0.0))
         pre = replace(pre, rate_rad_s=rate)
-        return pre, fac.all_groups(data, TYPICAL, prior, moved, pre, robust=False)
+        return pre, res.all_groups(data, TYPICAL, prior, moved, pre, robust=False)
 
     # Left out of the derivatives, as of second order: changes of rates and frames in the terms of shutter and coupling
-    rate = fac.integrate(data, x).rate_rad_s
+    rate = res.integrate(data, x).rate_rad_s
     _, groups = residuals(x)
     step = 1e-6
     still = np.zeros_like(rate)
@@ -214,19 +215,19 @@ def test_readings_of_both_sensors_are_found_at_the_camera_times_at_which_they_we
         accel_m_s2=np.tile(t_s[:, None], 3),
     )
     data, _ = prepare(recording.trajectory, clocks, apart, gravity_m_s2=9.8, gravity_sigma_m_s2=0.02, states_hz=5.0)
-    for track in (data.tracks.gyro, data.tracks.accel):
+    for track in (data.streams.gyro, data.streams.accel):
         assert np.allclose(track.at(data.t_s)[0], data.t_s[:, None], atol=1e-9)
 
 
 def test_a_gap_counts_in_the_interval_in_which_readings_are_missing():
     t_s = np.arange(0, 4, 0.01)
-    gyro = Track.of(t_s, np.zeros((len(t_s), 3)))
+    gyro = SensorStream.from_samples(t_s, np.zeros((len(t_s), 3)))
     pulse = np.where((t_s > 1.0) & (t_s < 1.3), 50.0, 0.0)[:, None] * np.ones(3)
     kept = (t_s <= 1.0) | (t_s >= 1.3)
     nodes_s = np.array([0.7, 1.35, 1.45, 1.95, 2.6])
     # the accelerometer's stamps are half a second early: what it stamps 1.0 to 1.3 happens from 1.5 to 1.8
-    whole = run_through(nodes_s, gyro, Track.of(t_s, pulse), accel_delay_s=0.5)
-    gapped = run_through(nodes_s, gyro, Track.of(t_s[kept], pulse[kept]), accel_delay_s=0.5)
+    whole = run_through(nodes_s, gyro, SensorStream.from_samples(t_s, pulse), accel_delay_s=0.5)
+    gapped = run_through(nodes_s, gyro, SensorStream.from_samples(t_s[kept], pulse[kept]), accel_delay_s=0.5)
     lost = np.linalg.norm(whole.velocity - gapped.velocity, axis=1) > 1e-6
     assert lost.tolist() == [False, False, True, False]
     assert (gapped.cov_gaps[:, 3, 3] > 0).tolist() == lost.tolist() and not whole.cov_gaps.any()
@@ -257,9 +258,9 @@ def test_a_group_tells_the_motion_at_its_mean_instant():
         world_from_imu @ cam_from_imu.T,
         np.outer(t_s, [1.0, 0, 0]),
         rate_hz=5.0,
-        tracks=Tracks(
-            gyro=Track.of(samples_s, np.tile(rate + 0.01, (len(samples_s), 1))),
-            accel=Track.of(samples_s, force_in_body),
+        streams=SensorStreams(
+            gyro=SensorStream.from_samples(samples_s, np.tile(rate + 0.01, (len(samples_s), 1))),
+            accel=SensorStream.from_samples(samples_s, force_in_body),
         ),
         gyro_bias_rad_s=np.full(3, 0.01),
         cam_from_imu=cam_from_imu,
@@ -282,9 +283,9 @@ def test_a_force_acts_on_a_group_s_frames_from_when_it_begins():
         np.tile(np.eye(3), (4, 1, 1)),
         np.zeros((4, 3)),
         rate_hz=5.0,
-        tracks=Tracks(
-            gyro=Track.of(samples_s, np.zeros((len(samples_s), 3))),
-            accel=Track.of(samples_s, push + growth * samples_s[:, None]),
+        streams=SensorStreams(
+            gyro=SensorStream.from_samples(samples_s, np.zeros((len(samples_s), 3))),
+            accel=SensorStream.from_samples(samples_s, push + growth * samples_s[:, None]),
         ),
         gyro_bias_rad_s=np.zeros(3),
         cam_from_imu=np.eye(3),
@@ -301,13 +302,13 @@ def test_frames_are_turned_to_their_mean_instant_also_where_the_turn_speeds_up()
     def turned(t_s):
         return so3_exp(np.outer(0.8 * t_s + 2.5 * t_s**2, axis))
 
-    gyro = Track.of(samples_s, np.outer(0.8 + 5.0 * samples_s, axis))
+    gyro = SensorStream.from_samples(samples_s, np.outer(0.8 + 5.0 * samples_s, axis))
     groups = group_frames(
         t_s,
         turned(t_s) @ cam_from_imu.T,
         np.zeros((4, 3)),
         rate_hz=5.0,
-        tracks=Tracks(gyro=gyro, accel=gyro),
+        streams=SensorStreams(gyro=gyro, accel=gyro),
         gyro_bias_rad_s=np.zeros(3),
         cam_from_imu=cam_from_imu,
     )
@@ -342,11 +343,11 @@ def test_a_later_picture_shows_what_the_motion_brings(recording):
         imu_in_cam_m=lever,
         **states(data.t_s),
     )
-    before = fac.visual_groups(data, TYPICAL, x, rate_rad_s, robust=False)
+    before = res.visual_groups(data, TYPICAL, x, rate_rad_s, robust=False)
     for column, late_s in ((par.DELAY, 1e-4), (par.CLOCK_RATE, 1e-4 * (data.t_s - par.middle_s(data.t_s)))):
         # where the camera was when the picture was really taken, so much earlier by the IMU's clock
         moved = replace(x, **states(data.t_s - late_s))
-        after = fac.visual_groups(data, TYPICAL, moved, rate_rad_s, robust=False)
+        after = res.visual_groups(data, TYPICAL, moved, rate_rad_s, robust=False)
         z = np.zeros((par.N_GLOBALS, 1))
         z[column] = 1e-4
         for old, new in zip(before, after, strict=True):
@@ -383,7 +384,7 @@ def rough_data(gyro: float, accel: float) -> SimpleNamespace:
 
 
 def test_a_data_sheet_raises_the_noise_and_never_lowers_it():
-    levels = ("gyro_rad_s_rthz", "gyro_walk_rad_s_rts", "accel_m_s2_rthz", "accel_walk_m_s2_rts")
+    levels = ("gyro_density_rad_s_rthz", "gyro_walk_rad_s2_rthz", "accel_density_m_s2_rthz", "accel_walk_m_s3_rthz")
     stream = rough_data(2e-4, 2e-3)
     bare = Expected.of(stream, None).noise
 
@@ -395,20 +396,20 @@ def test_a_data_sheet_raises_the_noise_and_never_lowers_it():
     for level in levels:
         assert getattr(expected(0.1).noise, level) == getattr(bare, level)
         assert getattr(expected(10.0).noise, level) == pytest.approx(10 * getattr(bare, level))
-    assert expected(10.0).floor["accel_m_s2_rthz"] == pytest.approx(10 * bare.accel_m_s2_rthz)
+    assert expected(10.0).floor["accel_density_m_s2_rthz"] == pytest.approx(10 * bare.accel_density_m_s2_rthz)
 
 
 def test_the_streams_tell_the_noise_of_quiet_sensors_and_bound_that_of_rough_ones():
     quiet = Expected.of(rough_data(1.5e-4, 1.5e-3), None).noise
-    assert (quiet.gyro_rad_s_rthz, quiet.accel_m_s2_rthz) == (1.5e-4, 1.5e-3)
+    assert (quiet.gyro_density_rad_s_rthz, quiet.accel_density_m_s2_rthz) == (1.5e-4, 1.5e-3)
     moving = Expected.of(rough_data(3e-3, 0.02), None).noise
-    assert 1e-4 < moving.gyro_rad_s_rthz < 1e-3
-    assert 0.004 < moving.accel_m_s2_rthz < 0.02
+    assert 1e-4 < moving.gyro_density_rad_s_rthz < 1e-3
+    assert 0.004 < moving.accel_density_m_s2_rthz < 0.02
     # rotors leave slow errors; the white noise stays what sensors have, and is less sure
     vibrating, hand = (Expected.of(rough_data(3e-3, rough), None) for rough in (0.09, 2e-3))
-    assert vibrating.noise.accel_m_s2_rthz == pytest.approx(0.004)
+    assert vibrating.noise.accel_density_m_s2_rthz == pytest.approx(0.004)
     assert vibrating.noise.accel_slow_m_s2_rts > 5 * hand.noise.accel_slow_m_s2_rts
-    assert vibrating.spread["accel_m_s2_rthz"] > 3 * hand.spread["accel_m_s2_rthz"]
+    assert vibrating.spread["accel_density_m_s2_rthz"] > 3 * hand.spread["accel_density_m_s2_rthz"]
 
 
 @pytest.mark.parametrize("rate_hz", [100.0, 400.0])
@@ -587,7 +588,7 @@ def test_noise_of_the_accelerometer_does_not_look_like_a_smaller_gain():
         recording, imu, calibration = shaken(seed, 0.1, 0.0)
         with mock.patch.object(_setup, "PRIORS", replace(PRIORS, accel_gain=0.03)):
             _, fit, _ = fit_path(recording.trajectory, imu, calibration, JointOptions())
-        assert fit.noise.accel_m_s2_rthz == pytest.approx(0.1, rel=0.2)
+        assert fit.noise.accel_density_m_s2_rthz == pytest.approx(0.1, rel=0.2)
         gains.append(np.trace(fit.estimate.accel_gain) / 3)
     # noise is a hundredth of the motion's variance, which a regression on the readings takes from the gain
     assert abs(np.mean(gains)) < 0.006
@@ -598,7 +599,7 @@ def test_errors_of_a_shaken_accelerometer_that_stay_for_a_while_are_told_from_wh
         recording, imu, calibration = shaken(seed, 0.0, 0.06)
         data, fit, _ = fit_path(recording.trajectory, imu, calibration, JointOptions())
         assert fit.noise.accel_slow_m_s2_rts == pytest.approx(0.06, rel=0.35)
-        assert fit.noise.accel_m_s2_rthz < 0.015
+        assert fit.noise.accel_density_m_s2_rthz < 0.015
         found = scale_of(fit, data.t_s, False)
         error = np.log(found.metres_per_unit / recording.truth.metres_per_unit)
         assert abs(error) < 1.96 * found.sigma_log
@@ -611,7 +612,7 @@ def test_what_residuals_lose_to_the_fit_is_the_trace_of_a_dense_inverse(recordin
     )  # fmt: skip
     k, m, n = len(data.t_s), par.N_STATE, par.N_GLOBALS
     x = replace(prior.mean, velocity_m_s=0.3 * np.random.default_rng(1).standard_normal((k, 3)))
-    groups = fac.all_groups(data, TYPICAL, prior, x, fac.integrate(data, x), robust=True)
+    groups = res.all_groups(data, TYPICAL, prior, x, res.integrate(data, x), robust=True)
     system, _, _ = fac.normal_equations(list(groups.values()), prior, x)
     inverse = system.inverted()
     dense = np.zeros((k * m + n, k * m + n))

@@ -10,9 +10,15 @@ from scipy.optimize import minimize
 from scipy.special import chdtrc
 
 from colmap_inertial._kernels import _inertial
+from colmap_inertial.inertial.core.arrow import ArrowSystem
+from colmap_inertial.inertial.core.preintegration import (
+    Preintegrated,
+    SensorErrors,
+    SensorStream,
+    SensorStreams,
+    preintegrate,
+)
 from colmap_inertial.inertial.scale._drift import chi2_tail
-from colmap_inertial.inertial.scale._preintegration import Preintegrated, SensorErrors, Track, Tracks, preintegrate
-from colmap_inertial.inertial.scale._solver import ArrowSystem
 from colmap_inertial.motion.align import _fit as align_fit
 
 SIZES = [(1, 21, 79, 1), (2, 21, 79, 5), (3, 21, 79, 5), (3, 5, 4, 2), (2, 7, 0, 3), (40, 1, 1, 9), (480, 21, 79, 5)]
@@ -151,10 +157,10 @@ def test_arrays_of_the_wrong_size_are_rejected():
             _inertial.eliminate(**arguments)
 
 
-def tracks(rng, t_s):
+def streams(rng, t_s):
     gyro = np.cumsum(rng.standard_normal((len(t_s), 3)), axis=0) * 0.1
     accel = rng.standard_normal((len(t_s), 3)) + np.array([0, 0, 9.8])
-    return Track.of(t_s, gyro), Track.of(t_s + 0.0013, accel)
+    return SensorStream.from_samples(t_s, gyro), SensorStream.from_samples(t_s + 0.0013, accel)
 
 
 @pytest.mark.parametrize("case", ["real size", "one interval", "beyond the samples", "gaps", "slow", "at rest"])
@@ -170,7 +176,7 @@ def test_intervals_are_integrated_as_by_numpy(case):
         nodes_s = nodes_s[100:102]
     if case == "beyond the samples":
         nodes_s = np.linspace(-1, 62, 500)
-    gyro, accel = tracks(rng, t_s)
+    gyro, accel = streams(rng, t_s)
     k = len(nodes_s) - 1
     arguments = {
         "gyro_bias_rad_s": 0.02 * rng.standard_normal((k, 3)),
@@ -180,9 +186,9 @@ def test_intervals_are_integrated_as_by_numpy(case):
         "accel_delay_s": 0.013,
     }
     if case == "at rest":
-        gyro = Track.of(t_s, np.zeros((len(t_s), 3)))
+        gyro = SensorStream.from_samples(t_s, np.zeros((len(t_s), 3)))
         arguments["gyro_bias_rad_s"][:] = 0
-    both, errors = Tracks(gyro=gyro, accel=accel), SensorErrors(**arguments)
+    both, errors = SensorStreams(gyro=gyro, accel=accel), SensorErrors(**arguments)
     fast, truth = preintegrate(nodes_s, both, errors), preintegrate_reference(nodes_s, both, errors)
     assert (np.max(truth.cov_gaps) > 0) == (case in ("gaps", "real size", "slow") and np.max(np.diff(t_s)) > 0.06)
     for field in fields(Preintegrated):

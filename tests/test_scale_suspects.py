@@ -8,10 +8,11 @@ import pytest
 
 from colmap_inertial.core.options import ScaleOptions
 from colmap_inertial.core.types import CAL, IMU_CAL, ImuCalibration
-from colmap_inertial.inertial.scale import _parameters as par, estimate_scale, first_seconds, gravity_at_latitude_m_s2
+from colmap_inertial.inertial.core import parameters as par
+from colmap_inertial.inertial.core.preintegration import SensorStream, SensorStreams, find_saturated, gap_cov
+from colmap_inertial.inertial.scale import estimate_scale, first_seconds, gravity_at_latitude_m_s2
 from colmap_inertial.inertial.scale._fit import fit_jointly
-from colmap_inertial.inertial.scale._preintegration import Track, Tracks, gap_cov
-from colmap_inertial.inertial.scale._setup import cut_off, prepare
+from colmap_inertial.inertial.scale._setup import prepare
 from colmap_inertial.inertial.scale._suspects import Faults, Suspicion, worst
 from colmap_inertial.inertial.scale.parts import CAUSES, parts_in_words
 from colmap_inertial.motion.align import align_camera_imu
@@ -160,7 +161,7 @@ def prepared(recording):
 def test_what_was_undone_is_suspected_no_more(recording):
     altered = replace(recording, imu=one_axis_late(recording.imu, 0.012))
     data, prior = prepared(altered)
-    found = worst(fit_jointly(data, prior, None).suspicions, data.tracks.accel)
+    found = worst(fit_jointly(data, prior, None).suspicions, data.streams.accel)
     assert found.name == "axes" and found.chi2 > 100
     undone = Faults(values={}).with_found(found).undone(data)
     again = {one.name: one.chi2 for one in fit_jointly(undone, prior, None).suspicions}
@@ -169,7 +170,7 @@ def test_what_was_undone_is_suspected_no_more(recording):
 
 def test_stamps_that_part_by_less_than_a_sample_are_of_one_clock():
     t_s = np.linspace(0, 2000, 400_001)
-    accel = Track.of(t_s, np.zeros((len(t_s), 3)))
+    accel = SensorStream.from_samples(t_s, np.zeros((len(t_s), 3)))
 
     def rate(ppm):
         cov = np.array([[(0.1e-6) ** 2]])
@@ -235,9 +236,9 @@ def test_cut_off_readings_are_found_behind_a_calibration(recording):
         gravity_m_s2=9.80665,
         attitudes=12,
     )
-    gyro, accel = cut_off(calibration.corrected(raw))
+    gyro, accel = find_saturated(calibration.corrected(raw))
     assert not gyro.any()
-    np.testing.assert_array_equal(accel, cut_off(raw)[1])
+    np.testing.assert_array_equal(accel, find_saturated(raw)[1])
     assert accel.mean() == pytest.approx(0.03, abs=0.002)
 
 
@@ -247,7 +248,7 @@ def test_the_gyroscope_s_cut_off_readings_are_a_gap(recording):
     altered = replace(imu, gyro_rad_s=np.clip(imu.gyro_rad_s, -limit, limit))
     data, _ = prepared(replace(recording, imu=altered))
     assert data.gyro_cut_share > 0.01
-    assert data.tracks.gyro.paused_s[-1] == pytest.approx(data.gyro_cut_share * np.ptp(imu.gyro_t_s), rel=0.5)
+    assert data.streams.gyro.paused_s[-1] == pytest.approx(data.gyro_cut_share * np.ptp(imu.gyro_t_s), rel=0.5)
     estimate = estimate_scale(recording.trajectory, altered)
     assert estimate.verdict == "weak" and any("of the gyroscope's readings" in reason for reason in estimate.reasons)
     assert estimate.ci95[0] < recording.truth.metres_per_unit < estimate.ci95[1]
@@ -258,9 +259,11 @@ def test_lost_samples_are_a_gap_of_their_own_sensor_however_short():
     values = np.random.default_rng(0).standard_normal((len(t_s), 3))
     lost = np.zeros(len(t_s), dtype=bool)
     lost[50:53] = True
-    tracks = Tracks(gyro=Track.of(t_s, values), accel=Track.of(t_s, values, lost))
+    streams = SensorStreams(
+        gyro=SensorStream.from_samples(t_s, values), accel=SensorStream.from_samples(t_s, values, lost)
+    )
     nodes_s = np.array([0.1, 0.3, 0.7, 1.0])
-    gyro_s, accel_s = tracks.gap_s(nodes_s)
+    gyro_s, accel_s = streams.gap_s(nodes_s)
     np.testing.assert_allclose(gyro_s, 0)
     np.testing.assert_allclose(accel_s, [0, 0.04, 0])
     hidden = np.diagonal(gap_cov(nodes_s, gyro_s, accel_s)[1])

@@ -31,9 +31,9 @@ class GyroPath:
     This is how the package integrates a gyroscope. Between samples the rate is linear; the rotation follows from
     Magnus' series up to its second term (without which coning motion looks like a bias): the error of the integration
     itself is of the fourth order in the step between samples, that of interpolating a rate linearly of the second.
-    ``scale._preintegration`` does the same, compiled, on a finer interpolation, with its derivatives; only
-    ``scale._grouping``, over a sixteenth of a second, and ``io.consistency``, which looks for degrees, make do with
-    the midpoint rule of order two.
+    ``inertial.core.preintegration`` does the same, compiled, on a finer interpolation, with its derivatives; only
+    ``inertial.scale._grouping``, over a sixteenth of a second, and ``io.consistency``, which looks for degrees, make do
+    with the midpoint rule of order two.
 
     Parameters
     ----------

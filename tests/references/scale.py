@@ -12,21 +12,22 @@ from colmap_inertial.core.geometry import (
     quat_multiply,
     skew,
 )
-from colmap_inertial.inertial.scale._preintegration import (
+from colmap_inertial.core.types import Array
+from colmap_inertial.inertial.core.arrow import ArrowSystem
+from colmap_inertial.inertial.core.preintegration import (
     DELAY_STEP_S,
     Preintegrated,
     SensorErrors,
-    Tracks,
+    SensorStreams,
     accel_noise_cov,
     gap_cov,
     integration_steps,
 )
-from colmap_inertial.inertial.scale._solver import ArrowSystem
 
 
-def preintegrate_reference(nodes_s: Array, tracks: Tracks, errors: SensorErrors) -> Preintegrated:
+def preintegrate_reference(nodes_s: Array, streams: SensorStreams, errors: SensorErrors) -> Preintegrated:
     """As ``preintegrate``, in numpy."""
-    steps = integration_steps(nodes_s, tracks)
+    steps = integration_steps(nodes_s, streams)
     dt = np.diff(nodes_s)
     points = steps + 1
     first = np.concatenate([[0], np.cumsum(points)[:-1]])
@@ -40,16 +41,16 @@ def preintegrate_reference(nodes_s: Array, tracks: Tracks, errors: SensorErrors)
     weight[first] *= 0.5
     h_step = np.where(is_last, 0.0, h)[:-1, None]
 
-    reading, _ = tracks.gyro.at(t)
+    reading, _ = streams.gyro.at(t)
     rate = reading @ (np.eye(3) + errors.gyro_gain).T - errors.gyro_bias_rad_s[interval]
     # Second-order Magnus expansion for a rate that changes linearly within the step
     turn = h_step * (0.5 * (rate[:-1] + rate[1:])) + h_step**2 / 12 * np.cross(rate[:-1], rate[1:])
     product = quat_cumulative(quat_exp(turn))
     rotation = matrix_from_quat(quat_multiply(quat_conjugate(product[first])[interval], product))
 
-    reading_a, _ = tracks.accel.at(t - errors.accel_delay_s)
-    later, _ = tracks.accel.at(t - errors.accel_delay_s + DELAY_STEP_S)
-    earlier, _ = tracks.accel.at(t - errors.accel_delay_s - DELAY_STEP_S)
+    reading_a, _ = streams.accel.at(t - errors.accel_delay_s)
+    later, _ = streams.accel.at(t - errors.accel_delay_s + DELAY_STEP_S)
+    earlier, _ = streams.accel.at(t - errors.accel_delay_s - DELAY_STEP_S)
     slope_a = (later - earlier) / (2 * DELAY_STEP_S)
     in_body = reading_a @ (np.eye(3) + errors.accel_gain).T - errors.accel_bias_m_s2[interval]
     force = np.einsum("nij,nj->ni", rotation, in_body)
@@ -92,7 +93,7 @@ def preintegrate_reference(nodes_s: Array, tracks: Tracks, errors: SensorErrors)
         position=position[end],
         cov_gyro=total(g @ g.transpose(0, 2, 1)),
         cov_accel=accel_noise_cov(dt),
-        cov_gaps=gap_cov(nodes_s, *tracks.gap_s(nodes_s, errors.accel_delay_s)),
+        cov_gaps=gap_cov(nodes_s, *streams.gap_s(nodes_s, errors.accel_delay_s)),
         by_gyro_bias=-total(g_body),
         by_accel_bias=by_accel_bias,
         by_gyro_gain=total((g_body[:, :, :, None] * reading[:, None, None, :]).reshape(-1, 9, 9)),

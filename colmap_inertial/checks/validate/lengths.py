@@ -9,14 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Literal
 
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
 
-if TYPE_CHECKING:
-    from colmap_inertial.checks.validate.result import Corner, Distance
+DistanceSet = Literal["control", "check", "mixed"]
 
 #: Shares of the model's diagonal below which a length says little of the whole, and above which it says much.
 _SHORT, _LONG = 0.2, 0.66
@@ -24,6 +23,47 @@ _SHORT, _LONG = 0.2, 0.66
 _OUTSIDE_PCT = 1.5
 #: Least spread of the directions of the lengths along an axis, of the largest, to count as one of its own.
 _OWN_DIRECTION = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Distance:
+    """A known distance, measured in the model.
+
+    Attributes
+    ----------
+    pair
+        Names of the two corners.
+    known_m
+        What the target's description says.
+    measured
+        Between the two corners, each triangulated on its own; model units.
+    residual_m
+        Measured minus known. Of a model without a unit, after scaling it by the control distances.
+    set
+        ``control`` or ``check`` where both corners belong to that set, else ``mixed``.
+    """
+
+    pair: tuple[str, str]
+    known_m: float
+    measured: float
+    residual_m: float
+    set: DistanceSet
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Corner:
+    """A corner of the target, triangulated on its own.
+
+    Attributes
+    ----------
+    name
+        As in :class:`Distance`.
+    in_model
+        (3,) its position; model units.
+    """
+
+    name: str
+    in_model: Array
 
 
 @dataclass(frozen=True, kw_only=True)

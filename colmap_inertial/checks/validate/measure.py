@@ -10,13 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from colmap_inertial.checks.validate.fit import ScaleFit, fit_scale
-from colmap_inertial.checks.validate.lengths import check_lengths, model_diagonal
+from colmap_inertial.checks.validate.lengths import Corner, Distance, DistanceSet, check_lengths, model_diagonal
 from colmap_inertial.checks.validate.observations import Observations, Placement, triangulate
 from colmap_inertial.checks.validate.place import PartPlacement, median_residual_px, observe
 from colmap_inertial.checks.validate.result import (
-    Corner,
-    Distance,
-    DistanceSet,
     RejectedView,
     SetScale,
     Validation,

@@ -4,59 +4,16 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, fields, is_dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from colmap_inertial.checks.validate.lengths import LengthCheck
+from colmap_inertial.checks.validate.lengths import Corner, Distance, LengthCheck
 from colmap_inertial.checks.validate.targets import Target
 from colmap_inertial.core.arrays import Array, IndexArray
 
 if TYPE_CHECKING:
     from rich.console import Group
-
-DistanceSet = Literal["control", "check", "mixed"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Distance:
-    """A known distance, measured in the model.
-
-    Attributes
-    ----------
-    pair
-        Names of the two corners.
-    known_m
-        What the target's description says.
-    measured
-        Between the two corners, each triangulated on its own; model units.
-    residual_m
-        Measured minus known. Of a model without a unit, after scaling it by the control distances.
-    set
-        ``control`` or ``check`` where both corners belong to that set, else ``mixed``.
-    """
-
-    pair: tuple[str, str]
-    known_m: float
-    measured: float
-    residual_m: float
-    set: DistanceSet
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Corner:
-    """A corner of the target, triangulated on its own.
-
-    Attributes
-    ----------
-    name
-        As in :class:`Distance`.
-    in_model
-        (3,) its position; model units.
-    """
-
-    name: str
-    in_model: Array
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

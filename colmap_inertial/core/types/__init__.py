@@ -8,34 +8,37 @@ specific force: at rest the accelerometer reads +9.8 m/s2 away from the ground.
 
 from __future__ import annotations
 
+from colmap_inertial.core.types._checks import Array, checked_array
 from colmap_inertial.core.types.apertures import Aperture, ApertureRig, SpectralRole
+from colmap_inertial.core.types.camera_imu import CAL, CALIBRATION_PARAMETERS, CameraImuCalibration
 from colmap_inertial.core.types.estimated import (
-    CAL,
-    CALIBRATION_PARAMETERS,
     DOWN_IN_WORLD,
     UNDOES,
     AcceptedScale,
-    CameraImuCalibration,
     ScaleDrift,
     ScaleEstimate,
     Similarity,
     SmoothedTrajectory,
     Verdict,
 )
-from colmap_inertial.core.types.imu_calibration import IMU_CAL, IMU_CALIBRATION_PARAMETERS, ImuCalibration
+from colmap_inertial.core.types.imu import (
+    IMU_CAL,
+    IMU_CALIBRATION_PARAMETERS,
+    JOINT_GYRO_WALK_RAD_S_RTS,
+    TYPICAL_NOISE,
+    ImuCalibration,
+    ImuNoise,
+    ImuRecording,
+)
 from colmap_inertial.core.types.joined import Gap, JoinedPart
 from colmap_inertial.core.types.motion import CameraMotion, SolvedMotion
 from colmap_inertial.core.types.positions import HeightDatum, PositionFixes
 from colmap_inertial.core.types.recorded import (
-    JOINT_GYRO_WALK_RAD_S_RTS,
-    TYPICAL_NOISE,
     CameraModel,
     CameraTrajectory,
     Frame,
     FrameLog,
     FrameTiming,
-    ImuNoise,
-    ImuRecording,
     Keypoints,
     LengthUnit,
     Projector,
@@ -82,5 +85,6 @@ __all__ = [
     "SpectralRole",
     "Treatment",
     "Verdict",
+    "checked_array",
     "clock_shift_s",
 ]

@@ -1,4 +1,4 @@
-"""What was recorded or reconstructed: IMU samples, frames and their times, cameras, trajectories."""
+"""What was recorded or reconstructed: frames and their times, cameras, trajectories."""
 
 from __future__ import annotations
 
@@ -17,107 +17,10 @@ from colmap_inertial.core.types._checks import (
     checked_times,
     set_fields,
 )
-from colmap_inertial.core.types.imu_calibration import ImuCalibration
+from colmap_inertial.core.types.imu import ImuRecording
 
 LengthUnit = Literal["model", "m"]
 ReadoutDirection = Literal["down", "up", "right", "left"]
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class ImuNoise:
-    """White-noise densities and bias walks of an IMU, as data sheets give them.
-
-    Attributes
-    ----------
-    gyro_density_rad_s_rthz, accel_density_m_s2_rthz
-        White noise, per square root of hertz.
-    gyro_walk_rad_s2_rthz, accel_walk_m_s3_rthz
-        Random walk of the biases.
-    """
-
-    gyro_density_rad_s_rthz: float
-    accel_density_m_s2_rthz: float
-    gyro_walk_rad_s2_rthz: float
-    accel_walk_m_s3_rthz: float
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not (np.isfinite(value) and value >= 0):
-                raise ValueError(f"{name}: must be finite and not negative")
-
-
-#: A phone's IMU where no data sheet is at hand: gyroscopes have 1e-4 to 1e-3 rad/s/sqrt(Hz). The accelerometer's white
-#: noise is ten times the data sheets' of consumer MEMS, as sensors in use show (vibration, bandwidth, jitter).
-TYPICAL_NOISE = ImuNoise(
-    gyro_density_rad_s_rthz=3e-4, accel_density_m_s2_rthz=5e-3, gyro_walk_rad_s2_rthz=3e-4, accel_walk_m_s3_rthz=3e-4
-)
-#: Walk of the gyroscope's bias where its gains and axis errors are estimated along, as the joint fit does: without what
-#: those errors add to it as the device turns.
-JOINT_GYRO_WALK_RAD_S_RTS = 1e-4
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class ImuRecording:
-    """Gyroscope and accelerometer samples of one recording.
-
-    Attributes
-    ----------
-    gyro_t_s, accel_t_s
-        (N,), (M,) stamps in seconds since ``epoch_ns`` on the IMU's clock, strictly increasing. Two time bases: a
-        gyroscope sample never belongs to an accelerometer sample by index.
-    gyro_rad_s
-        (N, 3) angular velocity in the IMU frame.
-    accel_m_s2
-        (M, 3) specific force in the IMU frame, gravity included. A gyroscope alone has no samples here (M = 0).
-    epoch_ns
-        The clock's reading, in nanoseconds, where both time bases are zero.
-    repairs
-        What the reader had to sort, merge or drop, in words.
-    device
-        What recorded it, where known.
-    noise
-        The data sheet's noise, where the recording comes with one.
-    calibration
-        What the readings were corrected by (``ImuCalibration.corrected``); ``None`` where they are the sensor's own.
-    temperature_c
-        How warm the sensors were (median), degrees Celsius, where it was logged.
-    """
-
-    gyro_t_s: Array
-    gyro_rad_s: Array
-    accel_t_s: Array
-    accel_m_s2: Array
-    epoch_ns: int = 0
-    repairs: tuple[str, ...] = ()
-    device: str = ""
-    noise: ImuNoise | None = None
-    calibration: ImuCalibration | None = None
-    temperature_c: float | None = None
-
-    def __post_init__(self) -> None:
-        gyro_t_s, accel_t_s = checked_times("gyro_t_s", self.gyro_t_s), checked_times("accel_t_s", self.accel_t_s)
-        set_fields(
-            self,
-            gyro_t_s=gyro_t_s,
-            accel_t_s=accel_t_s,
-            gyro_rad_s=checked_array("gyro_rad_s", self.gyro_rad_s, (len(gyro_t_s), 3)),
-            accel_m_s2=checked_array("accel_m_s2", self.accel_m_s2, (len(accel_t_s), 3)),
-        )
-        if len(gyro_t_s) < 2 or len(accel_t_s) == 1:
-            raise ValueError("an ImuRecording needs at least two samples of each sensor (or none of the accelerometer)")
-        if self.temperature_c is not None and not np.isfinite(self.temperature_c):
-            raise ValueError("temperature_c must be finite")
-
-    @property
-    def has_accel(self) -> bool:
-        """Whether the accelerometer was recorded; without it there is no scale and no gravity."""
-        return len(self.accel_t_s) > 0
-
-    @property
-    def warmer_k(self) -> float | None:
-        """By how much the sensors were warmer than at their calibration; ``None`` where either was not logged."""
-        then = None if self.calibration is None else self.calibration.temperature_c
-        return None if then is None or self.temperature_c is None else self.temperature_c - then
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -9,11 +9,16 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.geometry import so3_exp, so3_log
-from colmap_inertial.core.types import ImuRecording
+from colmap_inertial.core.types import Array, ImuRecording
+from colmap_inertial.inertial.core import parameters as par
+from colmap_inertial.inertial.core.preintegration import (
+    Preintegrated,
+    SensorErrors,
+    SensorStreams,
+    preintegrate,
+)
 from colmap_inertial.inertial.join.values import Link, Part, SharedImages
-from colmap_inertial.inertial.scale import _parameters as par, posterior as post
-from colmap_inertial.inertial.scale._preintegration import Preintegrated, SensorErrors, Track, Tracks, preintegrate
-from colmap_inertial.inertial.scale._setup import cut_off
+from colmap_inertial.inertial.scale import posterior as post
 from colmap_inertial.inertial.scale.posterior import Posterior
 
 
@@ -25,23 +30,19 @@ class Ties:
     ----------
     links, shared
         Between which nodes and images.
-    tracks
+    streams
         Readings by the stamps of the gyroscope, the accelerometer's own delay left to the parts.
     """
 
     links: tuple[Link, ...]
     shared: tuple[SharedImages, ...]
-    tracks: Tracks
+    streams: SensorStreams
 
     @classmethod
     def of(cls, imu: ImuRecording, links: Sequence[Link], shared: Sequence[SharedImages]) -> Ties:
         """Of a recording as it was read."""
-        gyro_cut, accel_cut = cut_off(imu)
-        tracks = Tracks(
-            gyro=Track.of(imu.gyro_t_s, imu.gyro_rad_s, gyro_cut),
-            accel=Track.of(imu.accel_t_s, imu.accel_m_s2, accel_cut),
-        )
-        return cls(links=tuple(links), shared=tuple(shared), tracks=tracks)
+        streams = SensorStreams.from_recording(imu, imu.gyro_t_s, imu.accel_t_s)
+        return cls(links=tuple(links), shared=tuple(shared), streams=streams)
 
 
 class Problem:
@@ -178,30 +179,15 @@ def felt_between(problem: Problem, at: At, begin: End, end: End) -> Preintegrate
         accel_gain=accel_gain_of(problem, at),
         accel_delay_s=reference.accel_delay_s + float(y[post.ACCEL_DELAY]),
     )
-    return preintegrate(np.array([begin.stamp_s, end.stamp_s]), problem.ties.tracks, errors)
+    return preintegrate(np.array([begin.stamp_s, end.stamp_s]), problem.ties.streams, errors)
 
 
-def joint_terms(problem: Problem, at: At, begin: End, end: End) -> par.Estimate:
-    """Two nodes in the joint estimator's terms."""
-    zeros, none = np.zeros((2, 3)), np.zeros((3, 3))
-    return par.Estimate(
-        metres_per_unit=1.0,
+def inertial_states(problem: Problem, at: At, begin: End, end: End) -> par.InertialStates:
+    """Two nodes as the factor of the IMU between them takes them."""
+    return par.InertialStates(
         world_from_imu=np.stack([begin.world_from_imu, end.world_from_imu]),
         imu_in_world_m=np.stack([begin.imu_in_world_m, end.imu_in_world_m]),
         velocity_m_s=np.stack([begin.velocity_m_s, end.velocity_m_s]),
-        gyro_bias_rad_s=np.stack([begin.gyro_bias_rad_s, end.gyro_bias_rad_s]),
-        accel_walk_m_s2=np.stack([begin.accel_bias_m_s2, end.accel_bias_m_s2]),
-        drift_m=zeros,
-        accel_slow_m_s2=zeros,
         gravity_m_s2=gravity_of(problem, at, problem.held),
-        accel_bias_m_s2=np.zeros(3),
-        accel_delay_s=0.0,
-        gyro_gain=none,
         accel_gain=accel_gain_of(problem, at),
-        cam_from_imu=np.eye(3),
-        imu_in_cam_m=np.zeros(3),
-        delay_s=0.0,
-        clock_rate=0.0,
-        shutter=np.zeros((4, 3, 3)),
-        coupling_m=none,
     )

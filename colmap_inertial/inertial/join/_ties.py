@@ -8,6 +8,10 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import skew, so3_log
+from colmap_inertial.core.types import Array, ImuNoise
+from colmap_inertial.inertial.core import parameters as par
+from colmap_inertial.inertial.core.factors import imu_group
+from colmap_inertial.inertial.core.priors import PRIORS
 from colmap_inertial.inertial.join._problem import (
     At,
     End,
@@ -16,13 +20,11 @@ from colmap_inertial.inertial.join._problem import (
     columns_of,
     felt_between,
     gravity_of,
-    joint_terms,
+    inertial_states,
 )
 from colmap_inertial.inertial.join.doubts import LEAST_STAMP_S
 from colmap_inertial.inertial.join.values import Link, SharedImages
-from colmap_inertial.inertial.scale import _parameters as par, posterior as post
-from colmap_inertial.inertial.scale._factors import imu_group
-from colmap_inertial.inertial.scale.priors import PRIORS
+from colmap_inertial.inertial.scale import posterior as post
 
 #: Directions and strengths of gravity of two parts are one (m/s2).
 _ONE_GRAVITY_M_S2 = 1e-4
@@ -30,16 +32,10 @@ _ONE_GRAVITY_M_S2 = 1e-4
 _STAMP_STEP_S = 2e-3
 
 
-def _link_noise(problem: Problem, link: Link) -> par.Noise:
+def _link_noise(problem: Problem, link: Link) -> ImuNoise:
     """Of the IMU between two parts: the louder one's."""
-    one, other = (problem.parts[k].path.noise for k in (link.first, link.second))
-    return replace(
-        one,
-        gyro_rad_s_rthz=max(one.gyro_rad_s_rthz, other.gyro_rad_s_rthz),
-        gyro_walk_rad_s_rts=max(one.gyro_walk_rad_s_rts, other.gyro_walk_rad_s_rts),
-        accel_m_s2_rthz=max(one.accel_density_m_s2_rthz, other.accel_density_m_s2_rthz),
-        accel_walk_m_s2_rts=max(one.accel_walk_m_s2_rts, other.accel_walk_m_s2_rts),
-    )
+    one, other = (vars(problem.parts[k].path.noise.imu_over_seconds()) for k in (link.first, link.second))
+    return ImuNoise(**{name: max(one[name], other[name]) for name in one})
 
 
 def add_gravity(problem: Problem, at: At, k: int, equations: Equations) -> None:
@@ -61,8 +57,8 @@ def add_link(problem: Problem, at: At, link: Link, equations: Equations, *, by_i
     noise = _link_noise(problem, link)
     dt_s = problem.known[link.second].t_s[j] - problem.known[link.first].t_s[i]
     for columns, change, sigma in (
-        (post.GYRO_BIAS, end.gyro_bias_rad_s - begin.gyro_bias_rad_s, noise.gyro_walk_rad_s_rts),
-        (post.ACCEL_BIAS, end.accel_bias_m_s2 - begin.accel_bias_m_s2, noise.accel_walk_m_s2_rts),
+        (post.GYRO_BIAS, end.gyro_bias_rad_s - begin.gyro_bias_rad_s, noise.gyro_walk_rad_s2_rthz),
+        (post.ACCEL_BIAS, end.accel_bias_m_s2 - begin.accel_bias_m_s2, noise.accel_walk_m_s3_rthz),
     ):
         info = 1 / (sigma * dt_s**0.5)
         at_columns = np.r_[first + columns_of(columns), second + columns_of(columns)]
@@ -71,7 +67,7 @@ def add_link(problem: Problem, at: At, link: Link, equations: Equations, *, by_i
     if not by_imu:
         return
     pre = felt_between(problem, at, begin, end)
-    group = imu_group(noise, joint_terms(problem, at, begin, end), pre)
+    group = imu_group(noise, inertial_states(problem, at, begin, end), pre)
     assert group.after is not None and group.by_globals is not None and group.root is not None
     by = np.zeros((9, problem.size))
     for k, column, world_from_imu, place, derivative in (

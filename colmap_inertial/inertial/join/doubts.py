@@ -8,10 +8,10 @@ from itertools import combinations
 import numpy as np
 
 from colmap_inertial.core.geometry import so3_log
+from colmap_inertial.inertial.core.priors import PRIORS
 from colmap_inertial.inertial.join.links import FEWEST_SHARED
 from colmap_inertial.inertial.join.values import Link, Part, SharedImages, pair_of
 from colmap_inertial.inertial.scale import posterior as post
-from colmap_inertial.inertial.scale.priors import PRIORS
 
 #: Parts contradict each other where chance makes what they differ by no oftener than so many standard deviations ...
 _SURE_SIGMA = 4.0

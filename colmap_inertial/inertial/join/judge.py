@@ -178,9 +178,9 @@ def _quarrel(parts: Sequence[Part], members: Sequence[int], against: set[tuple[i
 
 def silent_s(parts: Sequence[Part], imu: ImuRecording, link: Link) -> float:
     """How long the IMU was silent between two nodes."""
-    tracks = Ties.of(imu, (), ()).tracks
+    streams = Ties.of(imu, (), ()).streams
     ends = [parts[k].path.stamps_s(np.array([node]))[0] for k, node in _ends(link)]
-    gyro_s, accel_s = tracks.gap_s(np.array(ends))
+    gyro_s, accel_s = streams.gap_s(np.array(ends))
     return float(max(gyro_s[0], accel_s[0]))
 
 

@@ -11,8 +11,9 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, BoolArray
 from colmap_inertial.core.geometry import so3_log
+from colmap_inertial.core.types import Array
+from colmap_inertial.inertial.core.parameters import DRIFT_S
 from colmap_inertial.inertial.join.values import Found, Link, MatchedImages, Part, SharedImages, pair_of
-from colmap_inertial.inertial.scale._parameters import DRIFT_S
 
 #: Links between the same two parts: the shortest ones; more say little beyond.
 _MOST_LINKS = 4

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from colmap_inertial.core.arrays import Array
-from colmap_inertial.core.geometry import skew, so3_log
-from colmap_inertial.core.types import ImuNoise
+from colmap_inertial.core.geometry import Array, skew, so3_log
+from colmap_inertial.inertial.core import parameters as par
+from colmap_inertial.inertial.core.factors import imu_group
+from colmap_inertial.inertial.core.preintegration import SensorErrors, preintegrate
 from colmap_inertial.inertial.refine.values import (
     ACCEL_BIAS,
     GYRO_BIAS,
@@ -19,10 +20,6 @@ from colmap_inertial.inertial.refine.values import (
     Estimate,
     Problem,
 )
-from colmap_inertial.inertial.scale import _parameters as par
-from colmap_inertial.inertial.scale._factors import imu_group
-from colmap_inertial.inertial.scale._noise import TYPICAL
-from colmap_inertial.inertial.scale._preintegration import SensorErrors, preintegrate
 
 #: Standard deviations of the first position and heading, which nothing else determines.
 _HELD_M, _HELD_RAD = 1e-5, 1e-6
@@ -56,46 +53,6 @@ class Rows:
     share: Array | None = None
 
 
-def as_joint(x: Estimate, down: Array) -> par.Estimate:
-    """The joint estimator's terms of an estimate, in metres and without errors of a visual path."""
-    zeros = np.zeros_like(x.velocity_m_s)
-    return par.Estimate(
-        metres_per_unit=1.0,
-        world_from_imu=x.world_from_imu,
-        imu_in_world_m=x.imu_in_world_m,
-        velocity_m_s=x.velocity_m_s,
-        gyro_bias_rad_s=x.gyro_bias_rad_s,
-        accel_walk_m_s2=x.accel_bias_m_s2,
-        drift_m=zeros,
-        accel_slow_m_s2=zeros,
-        gravity_m_s2=x.gravity_m_s2 * down,
-        accel_bias_m_s2=np.zeros(3),
-        accel_delay_s=x.accel_delay_s,
-        gyro_gain=x.gyro_gain,
-        accel_gain=x.accel_gain,
-        cam_from_imu=x.cam_from_imu,
-        imu_in_cam_m=x.imu_in_cam_m,
-        delay_s=0.0,
-        clock_rate=0.0,
-        shutter=np.zeros((4, 3, 3)),
-        coupling_m=np.zeros((3, 3)),
-    )
-
-
-def joint_noise(noise: ImuNoise) -> par.Noise:
-    """The joint estimator's terms of an IMU's noise."""
-    return par.Noise(
-        gyro_rad_s_rthz=noise.gyro_density_rad_s_rthz,
-        gyro_walk_rad_s_rts=noise.gyro_walk_rad_s2_rthz,
-        accel_m_s2_rthz=noise.accel_density_m_s2_rthz,
-        accel_walk_m_s2_rts=noise.accel_walk_m_s3_rthz,
-        rotation_rad=TYPICAL.rotation_rad,
-        centre_m=TYPICAL.centre_m,
-        drift_m_rts=TYPICAL.drift_m_rts,
-        accel_slow_m_s2_rts=TYPICAL.accel_slow_m_s2_rts,
-    )
-
-
 def imu_rows(problem: Problem, x: Estimate) -> Rows:
     """Rotation, velocity, position between consecutive frames."""
     inertial = problem.inertial
@@ -107,8 +64,15 @@ def imu_rows(problem: Problem, x: Estimate) -> Rows:
         accel_gain=x.accel_gain,
         accel_delay_s=x.accel_delay_s,
     )
-    pre = preintegrate(inertial.nodes_s, inertial.tracks, errors)
-    group = imu_group(joint_noise(inertial.noise), as_joint(x, inertial.down), pre)
+    pre = preintegrate(inertial.nodes_s, inertial.streams, errors)
+    states = par.InertialStates(
+        world_from_imu=x.world_from_imu,
+        imu_in_world_m=x.imu_in_world_m,
+        velocity_m_s=x.velocity_m_s,
+        gravity_m_s2=x.gravity_m_s2 * inertial.down,
+        accel_gain=x.accel_gain,
+    )
+    group = imu_group(inertial.noise, states, pre)
     assert group.after is not None and group.by_globals is not None
     at, start = x.columns, par.IMU_GLOBALS.start
     by = group.by_globals

@@ -10,6 +10,7 @@ from colmap_inertial.core.arrays import Array, BoolArray, IndexArray, Int64Array
 from colmap_inertial.core.geometry import cross, skew, so3_exp
 from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.types import CameraModel
+from colmap_inertial.inertial.core.preintegration import SensorStreams
 from colmap_inertial.inertial.refine.values import (
     CLOCK_RATE,
     FIRST_INTRINSIC,
@@ -27,7 +28,6 @@ from colmap_inertial.inertial.refine.values import (
     Problem,
     Turning,
 )
-from colmap_inertial.inertial.scale._preintegration import Tracks
 from colmap_inertial.model import colmap_camera
 
 #: Steps of the differences that the camera models are differentiated by, relative to the depth and to a number.
@@ -36,9 +36,9 @@ _STEP = 1e-6
 _KNOTS = np.array([-1.0, -0.6, -0.2, 0.2, 0.6, 1.0])
 
 
-def turning_around(nodes_s: Array, tracks: Tracks, half_span_s: float) -> Turning:
+def turning_around(nodes_s: Array, streams: SensorStreams, half_span_s: float) -> Turning:
     """The readings' rotation and force within ``half_span_s`` of each node."""
-    path = GyroPath(tracks.gyro.t_s, tracks.gyro.value, np.zeros(3))
+    path = GyroPath(streams.gyro.t_s, streams.gyro.value, np.zeros(3))
     since_s = half_span_s * _KNOTS
     times_s = nodes_s[:, None] + since_s
     count = len(nodes_s)
@@ -46,7 +46,7 @@ def turning_around(nodes_s: Array, tracks: Tracks, half_span_s: float) -> Turnin
     # five powers through six knots: the middle of the polynomial is zero by itself
     powers = np.linalg.pinv(_KNOTS[:, None] ** np.arange(1, 6)) @ turn
     powers = powers / half_span_s ** np.arange(1, 6)[:, None]
-    force = tracks.accel.at(times_s.ravel())[0].reshape(count, len(since_s), 3).mean(axis=1)
+    force = streams.accel.at(times_s.ravel())[0].reshape(count, len(since_s), 3).mean(axis=1)
     return Turning(powers=powers, force_m_s2=force, half_span_s=half_span_s)
 
 

@@ -14,6 +14,8 @@ from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.gyro import GyroPath, on_camera_rate
 from colmap_inertial.core.types import CAL, CameraImuCalibration, CameraModel, FrameTiming, ImuNoise, ImuRecording
 from colmap_inertial.imaging.gyro_camera import FrameShutter
+from colmap_inertial.inertial.core.preintegration import SensorErrors, SensorStreams, preintegrate
+from colmap_inertial.inertial.core.priors import PRIORS, gains_cov
 from colmap_inertial.inertial.refine._seen import cameras_of, poses_at, project, turning_around
 from colmap_inertial.inertial.refine.values import (
     CLOCK_RATE,
@@ -29,9 +31,6 @@ from colmap_inertial.inertial.refine.values import (
     Prior,
     Problem,
 )
-from colmap_inertial.inertial.scale._preintegration import SensorErrors, Track, Tracks, preintegrate
-from colmap_inertial.inertial.scale._setup import cut_off
-from colmap_inertial.inertial.scale.priors import PRIORS, gains_cov
 
 if TYPE_CHECKING:
     import pycolmap
@@ -218,23 +217,19 @@ def make_problem(
     calibration = known.calibration
     imu = on_camera_rate(imu, calibration, camera_epoch_ns=timing.epoch_ns)
     shift_s = (imu.epoch_ns - timing.epoch_ns) * 1e-9 + calibration.gyro_time_offset_s
-    gyro_cut, accel_cut = cut_off(imu)
     # the accelerometer's own delay is part of the estimate
     delay_s = calibration.accel_time_offset_s - calibration.gyro_time_offset_s
-    tracks = Tracks(
-        gyro=Track.of(imu.gyro_t_s + shift_s, imu.gyro_rad_s, gyro_cut),
-        accel=Track.of(imu.accel_t_s + shift_s + delay_s, imu.accel_m_s2, accel_cut),
-    )
+    streams = SensorStreams.from_recording(imu, imu.gyro_t_s + shift_s, imu.accel_t_s + shift_s + delay_s)
     if not len(seen.observations.frame):
         raise NotObservableError("refinement", "no two of its images see the same point")
     timed = np.isfinite(seen.t_s)
-    begin_s = max(tracks.gyro.t_s[0], tracks.accel.t_s[0])
-    end_s = min(tracks.gyro.t_s[-1], tracks.accel.t_s[-1])
+    begin_s = max(streams.gyro.t_s[0], streams.accel.t_s[0])
+    end_s = min(streams.gyro.t_s[-1], streams.accel.t_s[-1])
     half_s = 0.5 * (_LONGEST_READOUT_S if timing.readout_s is None else timing.readout_s) + _MARGIN_S
     with np.errstate(invalid="ignore"):
         inside = timed & (seen.t_s > begin_s + half_s) & (seen.t_s < end_s - half_s)
     nodes_s = np.where(timed, seen.t_s, 0.0)
-    path = GyroPath(tracks.gyro.t_s, tracks.gyro.value, np.zeros(3))
+    path = GyroPath(streams.gyro.t_s, streams.gyro.value, np.zeros(3))
     inside &= path.covers(nodes_s - half_s, nodes_s + half_s)
     untimed = np.flatnonzero(~timed)
     nodes_s[untimed] = nodes_s[timed].max() + 1.0 + np.arange(len(untimed))
@@ -244,9 +239,9 @@ def make_problem(
     inertial = Inertial(
         nodes_s=nodes_s,
         linked=linked,
-        tracks=tracks,
+        streams=streams,
         noise=known.noise,
-        turning=turning_around(np.where(inside, nodes_s, nodes_s[inside][0]), tracks, half_s),
+        turning=turning_around(np.where(inside, nodes_s, nodes_s[inside][0]), streams, half_s),
         down=known.down,
     )
     lines = lines_of(seen, timing, raw_px)
@@ -301,7 +296,7 @@ def _start(
     errors = SensorErrors(
         gyro_bias_rad_s=gyro_bias[1:], accel_bias_m_s2=accel_bias[1:], gyro_gain=none, accel_gain=none
     )
-    pre = preintegrate(inertial.nodes_s, inertial.tracks, errors)
+    pre = preintegrate(inertial.nodes_s, inertial.streams, errors)
     dt = pre.dt_s[:, None]
     gravity = known.gravity_m_s2 * known.down
     carried = np.einsum("nij,nj->ni", world_from_imu[:-1], pre.position)

@@ -9,8 +9,8 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, BoolArray, Int64Array
 from colmap_inertial.core.geometry import so3_exp
-from colmap_inertial.core.types import CameraModel, ImuNoise
-from colmap_inertial.inertial.scale._preintegration import Tracks
+from colmap_inertial.core.types import Array, CameraModel, ImuNoise
+from colmap_inertial.inertial.core.preintegration import SensorStreams
 
 # Columns of a frame's state. The first nine are what its observations depend on.
 THETA, POSITION, VELOCITY, GYRO_BIAS, ACCEL_BIAS = (slice(3 * i, 3 * i + 3) for i in range(5))
@@ -115,10 +115,10 @@ class Inertial:
     Attributes
     ----------
     nodes_s
-        (F,) the states' instants on the clock of ``tracks``.
+        (F,) the states' instants on the clock of ``streams``.
     linked
         (F - 1,) whether the IMU recorded what lies between a frame and the next.
-    tracks
+    streams
         The readings.
     noise
         Densities and walks.
@@ -129,8 +129,8 @@ class Inertial:
     """
 
     nodes_s: Array
-    linked: BoolArray
-    tracks: Tracks
+    linked: NDArray[np.bool_]
+    streams: SensorStreams
     noise: ImuNoise
     turning: Turning
     down: Array

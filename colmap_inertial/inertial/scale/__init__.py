@@ -18,8 +18,8 @@ from colmap_inertial.core.types import (
     ImuRecording,
     ScaleEstimate,
 )
+from colmap_inertial.inertial.core.priors import PRIORS
 from colmap_inertial.inertial.scale._remarks import remarks
-from colmap_inertial.inertial.scale.priors import PRIORS
 from colmap_inertial.inertial.scale.verdict import verdict_of
 from colmap_inertial.io.plausible import GRAVITY_BOUNDS_M_S2, LARGEST_MEDIAN_RATE_RAD_S
 from colmap_inertial.io.units import STANDARD_GRAVITY_M_S2

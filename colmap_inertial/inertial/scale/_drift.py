@@ -10,12 +10,12 @@ import math
 
 import numpy as np
 
-from colmap_inertial.core.arrays import Array
-from colmap_inertial.core.types import ScaleDrift
-from colmap_inertial.inertial.scale import _parameters as par
-from colmap_inertial.inertial.scale._factors import Direct, Group
-from colmap_inertial.inertial.scale._parameters import Data, Estimate, Noise
-from colmap_inertial.inertial.scale._solver import Inverse
+from colmap_inertial.core.types import Array, ScaleDrift
+from colmap_inertial.inertial.core import parameters as par
+from colmap_inertial.inertial.core.arrow import Inverse
+from colmap_inertial.inertial.core.factors import Direct, Group
+from colmap_inertial.inertial.core.parameters import Estimate, Noise
+from colmap_inertial.inertial.scale._grouping import Data
 
 #: Length of a part, and how many there are at most.
 _PART_S, _MOST_PARTS = 10.0, 12

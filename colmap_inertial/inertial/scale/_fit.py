@@ -6,14 +6,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from colmap_inertial.core.arrays import Array
-from colmap_inertial.core.types import ImuNoise, ScaleDrift
-from colmap_inertial.inertial.scale import _factors as fac, _noise as levels, _parameters as par, _suspects as sus
+from colmap_inertial.core.types import Array, ImuNoise, ScaleDrift
+from colmap_inertial.inertial.core import factors as fac, parameters as par
+from colmap_inertial.inertial.core.arrow import ArrowSystem
+from colmap_inertial.inertial.core.parameters import Estimate, Noise, Prior
+from colmap_inertial.inertial.core.priors import model_scale_sigma
+from colmap_inertial.inertial.scale import _noise as levels, _residuals as res, _suspects as sus
 from colmap_inertial.inertial.scale._drift import scale_drift
+from colmap_inertial.inertial.scale._grouping import Data
 from colmap_inertial.inertial.scale._noise import Expected, LevelSearch
-from colmap_inertial.inertial.scale._parameters import Data, Estimate, Noise, Prior
-from colmap_inertial.inertial.scale._solver import ArrowSystem
-from colmap_inertial.inertial.scale.priors import model_scale_sigma
 
 _MAX_ITERATIONS, _MAX_ROTATION_ITERATIONS = 40, 4
 #: At rest: what the scale would still move by, in its standard deviations.
@@ -106,13 +107,13 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
     x = replace(x, metres_per_unit=scale, imu_in_world_m=data.groups.centre * scale)
     converged = settled = False
     signed = 0.0
-    integrated, there = fac.integrate(data, x), x
+    integrated, there = res.integrate(data, x), x
     for iteration in range(_MAX_ITERATIONS):
         if settled or not fac.still_near(there, x, data.t_s, tolerance=4.0 if iteration <= _FEWEST_ITERATIONS else 1.0):
-            integrated, there = fac.integrate(data, x), x
+            integrated, there = res.integrate(data, x), x
         pre = fac.corrected(integrated, there, x)
         local = prior.at(x)
-        groups = fac.all_groups(data, search.noise, local, x, pre, robust=iteration > 2)
+        groups = res.all_groups(data, search.noise, local, x, pre, robust=iteration > 2)
         system, rhs, rhs_z = fac.normal_equations(list(groups.values()), local, x)
         inverse = system.inverted()
         states, z = inverse.solve(rhs, rhs_z)
@@ -165,7 +166,7 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
         sums=sums,
         level_variance=level_variance,
         freedom=freedom,
-        expected_accel_m_s2_rthz=search.expected.noise.accel_m_s2_rthz,
+        expected_accel_m_s2_rthz=search.expected.noise.accel_density_m_s2_rthz,
         converged=converged,
         drift=drift,
         excitation_m_s2=_excitation_m_s2(data, x),
@@ -180,22 +181,8 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
     )
 
 
-#: Which part of the scale's variance residuals and priors belong to.
-_PART_OF_GROUP = {
-    "imu": "gyro",
-    "gyro_walk": "gyro",
-    "gyro_bias": "gyro",
-    "accel_walk": "accel_bias",
-    "accel_slow": "accel_noise",
-    "accel_slow_zero": "accel_noise",
-    "accel_zero": "accel_bias",
-    "rotation": "camera_path",
-    "centre": "camera_path",
-    "drift": "camera_path",
-    "drift_zero": "camera_path",
-    "speed": "camera_path",
-}
-_PART_OF_GLOBALS = {
+#: Which part of the scale's variance priors of the globals belong to.
+_CAUSE_OF_GLOBALS = {
     "accel_gain": [par.ACCEL_GAIN],
     "accel_bias": [par.ACCEL_BIAS],
     "gyro": [par.GYRO_GAIN],
@@ -236,10 +223,10 @@ def _variance_parts(
         (K, m, 1), (n,) that column.
     """
     others = ("lost_readings", "gravity")
-    parts = dict.fromkeys((*_PART_OF_GROUP.values(), *_PART_OF_GLOBALS, *others), 0.0)
+    parts = dict.fromkeys((*res.CAUSE_OF_GROUP.values(), *_CAUSE_OF_GLOBALS, *others), 0.0)
     for name, group in groups.items():
         values = group.apply(states, z[:, None])
-        parts[_PART_OF_GROUP[name]] += float(np.sum(values**2))
+        parts[res.CAUSE_OF_GROUP[name]] += float(np.sum(values**2))
     imu = groups["imu"]
     along = imu.apply(states, z[:, None])
     white = float(np.sum(along * levels.by_level(imu, along)))
@@ -249,7 +236,7 @@ def _variance_parts(
     parts["lost_readings"] = float(np.sum(unwhitened * (cov_gaps @ unwhitened)))
     parts["gyro"] -= white + parts["lost_readings"]
     by_prior = z * (prior.info @ z)
-    for part, places in _PART_OF_GLOBALS.items():
+    for part, places in _CAUSE_OF_GLOBALS.items():
         parts[part] += sum(float(by_prior[place].sum()) for place in places)
     up = x.gravity_m_s2 / float(np.linalg.norm(x.gravity_m_s2))
     parts["gravity"] = float(up @ z[par.GRAVITY] / prior.gravity_sigma_m_s2) ** 2
@@ -262,8 +249,8 @@ def _rotations_first(data: Data, noise: Noise, prior: Prior) -> Estimate:
     """Rotations, gyroscope bias and time offset from gyroscope and visual rotations alone."""
     x = prior.mean
     for _ in range(_MAX_ROTATION_ITERATIONS):
-        pre = fac.integrate(data, x)
-        groups = fac.rotation_groups(data, noise, prior, x, pre)
+        pre = res.integrate(data, x)
+        groups = res.rotation_groups(data, noise, prior, x, pre)
         system, rhs, rhs_z = fac.normal_equations(list(groups.values()), prior, x)
         held = np.arange(par.GRAVITY.stop)
         system.corner[held, held] += 1.0
@@ -279,7 +266,7 @@ def _rotations_first(data: Data, noise: Noise, prior: Prior) -> Estimate:
 
 def _moment_scale(data: Data, x: Estimate) -> float:
     """Metres per unit at which visual and inertial second differences, less gravity and bias, are equally large."""
-    pre = fac.integrate(data, x)
+    pre = res.integrate(data, x)
     dt = pre.dt_s[:, None]
     per_s = 2 / (dt[1:] + dt[:-1])
     visual = np.diff(np.diff(data.groups.centre, axis=0) / dt, axis=0) * per_s

@@ -13,7 +13,8 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
 from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, quat_multiply, so3_exp, so3_log
-from colmap_inertial.inertial.scale._preintegration import Tracks
+from colmap_inertial.core.types import Array
+from colmap_inertial.inertial.core.preintegration import SensorStreams
 
 #: Longest step of the integration from a group's mean instant to a frame.
 _STEP_S = 0.01
@@ -59,7 +60,51 @@ class Groups:
     rate_rad_s: Array
 
 
-def first_of_groups(t_s: Array, rate_hz: float, pauses: Array) -> IndexArray:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Data:
+    """Measurements at K nodes, each the mean of a few frames of the camera.
+
+    Attributes
+    ----------
+    groups
+        Visual rotations and centres in model units, about their mean.
+    origin
+        (3,) that mean, in the model's world.
+    rotation_shape, centre_shape
+        (K, 3, 3) square roots of the information of the visual rotation (camera frame) and of the centre (world frame)
+        given the rotation, for a noise level of one.
+    coupling
+        (K, 3, 3) model units per radian: the error of the centre (camera frame) that comes with an error of the
+        rotation, as far as the covariances of the poses tell.
+    broken
+        (K - 1,) where the model's parts may be shifted against each other.
+    streams
+        Readings over camera time, by the first guess of the offsets.
+    gyro_roughness_rad_s_rthz, accel_roughness_m_s2_rthz
+        Densities of white noise that would make the streams as rough as they are (``_noise.roughness``).
+    gyro_cut_share, accel_cut_share
+        Parts of the readings that stand at the end of the sensor's range; they count as gaps.
+    """
+
+    groups: Groups
+    origin: Array
+    rotation_shape: Array
+    centre_shape: Array
+    coupling: Array
+    broken: NDArray[np.bool_]
+    streams: SensorStreams
+    gyro_roughness_rad_s_rthz: float
+    accel_roughness_m_s2_rthz: float
+    gyro_cut_share: float
+    accel_cut_share: float
+
+    @property
+    def t_s(self) -> Array:
+        """(K,) camera time."""
+        return self.groups.t_s
+
+
+def first_of_groups(t_s: Array, rate_hz: float, pauses: Array) -> NDArray[np.intp]:
     """Indices where a new group begins: ``1 / rate_hz`` after the last beginning, and after a pause of the IMU.
 
     Parameters
@@ -110,7 +155,7 @@ def group_frames(
     centre: Array,
     *,
     rate_hz: float,
-    tracks: Tracks,
+    streams: SensorStreams,
     gyro_bias_rad_s: Array,
     cam_from_imu: Array,
 ) -> Groups:
@@ -118,14 +163,14 @@ def group_frames(
 
     Parameters
     ----------
-    tracks
+    streams
         Readings over camera time; the frames lie inside.
     gyro_bias_rad_s
         (3,) subtracted from the readings.
     cam_from_imu
         (3, 3) from the alignment: its error matters little over the small rotations within a group.
     """
-    first = first_of_groups(t_s, rate_hz, np.add(*tracks.gap_s(t_s)))
+    first = first_of_groups(t_s, rate_hz, np.add(*streams.gap_s(t_s)))
     count = np.diff(first, append=len(t_s))
     group = np.repeat(np.arange(len(first)), count)
 
@@ -145,9 +190,9 @@ def group_frames(
     displacement = np.zeros((len(t_s), 3))
     for i in range(steps):
         middle_s = mean_s[group] + (i + 0.5) * step_s
-        half = quat_exp((tracks.gyro.at(middle_s)[0] - gyro_bias_rad_s) * (0.5 * step_s)[:, None])
+        half = quat_exp((streams.gyro.at(middle_s)[0] - gyro_bias_rad_s) * (0.5 * step_s)[:, None])
         rotated = quat_multiply(rotated, half)
-        force = (matrix_from_quat(rotated) @ tracks.accel.at(middle_s)[0][:, :, None])[:, :, 0]
+        force = (matrix_from_quat(rotated) @ streams.accel.at(middle_s)[0][:, :, None])[:, :, 0]
         displacement += force * (step_s * (steps - i - 0.5) * step_s)[:, None]
         rotated = quat_multiply(rotated, half)
     turns = matrix_from_quat(rotated)
@@ -163,5 +208,5 @@ def group_frames(
         spread_s2=mean(since_s**2),
         rotation_since=mean(turns),
         displacement_m=mean(displacement),
-        rate_rad_s=mean(tracks.gyro.at(t_s)[0]),
+        rate_rad_s=mean(streams.gyro.at(t_s)[0]),
     )

@@ -11,21 +11,21 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from colmap_inertial.core.arrays import Array
-from colmap_inertial.core.types import JOINT_GYRO_WALK_RAD_S_RTS, TYPICAL_NOISE, ImuNoise
-from colmap_inertial.inertial.scale._factors import Direct, Group
-from colmap_inertial.inertial.scale._parameters import Data, Noise
-from colmap_inertial.inertial.scale._solver import Inverse
+from colmap_inertial.core.types import JOINT_GYRO_WALK_RAD_S_RTS, TYPICAL_NOISE, Array, ImuNoise
+from colmap_inertial.inertial.core.arrow import Inverse
+from colmap_inertial.inertial.core.factors import Direct, Group
+from colmap_inertial.inertial.core.parameters import Noise
+from colmap_inertial.inertial.scale._grouping import Data
 
 Groups = Mapping[str, Group | Direct]
 
 #: Visual errors: video of about a megapixel of a scene a few metres away. A drift that starts lower may never be found:
 #: the fit then rests where the accelerometer's noise stands for it.
 TYPICAL = Noise(
-    gyro_rad_s_rthz=TYPICAL_NOISE.gyro_density_rad_s_rthz,
-    gyro_walk_rad_s_rts=JOINT_GYRO_WALK_RAD_S_RTS,
-    accel_m_s2_rthz=TYPICAL_NOISE.accel_density_m_s2_rthz,
-    accel_walk_m_s2_rts=TYPICAL_NOISE.accel_walk_m_s3_rthz,
+    gyro_density_rad_s_rthz=TYPICAL_NOISE.gyro_density_rad_s_rthz,
+    gyro_walk_rad_s2_rthz=JOINT_GYRO_WALK_RAD_S_RTS,
+    accel_density_m_s2_rthz=TYPICAL_NOISE.accel_density_m_s2_rthz,
+    accel_walk_m_s3_rthz=TYPICAL_NOISE.accel_walk_m_s3_rthz,
     rotation_rad=2e-3,
     centre_m=1e-3,
     drift_m_rts=4e-3,
@@ -33,7 +33,7 @@ TYPICAL = Noise(
 )
 #: No estimate may fall below these: pixels and samples are not finer.
 _FLOOR = {
-    "accel_m_s2_rthz": 3e-4,
+    "accel_density_m_s2_rthz": 3e-4,
     "rotation_rad": 5e-5,
     "centre_m": 5e-5,
     "drift_m_rts": 1e-5,
@@ -42,7 +42,7 @@ _FLOOR = {
 #: Which residuals speak for which level. The gyroscope's is not among them: a slow error of the visual rotations looks
 #: just like a noisy gyroscope, and real SfM has the one while real gyroscopes are not the other.
 GROUP_OF = {
-    "accel_m_s2_rthz": "imu",
+    "accel_density_m_s2_rthz": "imu",
     "rotation_rad": "rotation",
     "centre_m": "centre",
     "drift_m_rts": "drift",
@@ -51,8 +51,14 @@ GROUP_OF = {
 _LEVELS = tuple(GROUP_OF)
 #: Standard deviations of the logarithm of a level before anything is known of the recording: of a device in a hand,
 #: with no slow errors of its accelerometer to speak of, and of one that vibrates, where they are what there is.
-_SPREAD = {"accel_m_s2_rthz": 0.2, "rotation_rad": 2.0, "centre_m": 2.0, "drift_m_rts": 2.0, "accel_slow_m_s2_rts": 0.5}
-_SHAKEN = {**_SPREAD, "accel_m_s2_rthz": 0.7, "accel_slow_m_s2_rts": 2.0}
+_SPREAD = {
+    "accel_density_m_s2_rthz": 0.2,
+    "rotation_rad": 2.0,
+    "centre_m": 2.0,
+    "drift_m_rts": 2.0,
+    "accel_slow_m_s2_rts": 0.5,
+}
+_SHAKEN = {**_SPREAD, "accel_density_m_s2_rthz": 0.7, "accel_slow_m_s2_rts": 2.0}
 #: What vibration does to an accelerometer: its most probable value where there is any; and where a search starts, with
 #: little white noise, that asks whether it is this.
 _SHAKEN_SLOW, _SLOW_START, _QUIET_START = 1e-2, 6e-2, 3e-3
@@ -133,27 +139,27 @@ class Expected:
         """
         gyro = float(np.clip(data.gyro_roughness_rad_s_rthz, _LEAST_GYRO, _MOST_GYRO))
         rough = max(data.accel_roughness_m_s2_rthz, _LEAST_ACCEL)
-        noise = replace(TYPICAL, gyro_rad_s_rthz=gyro, accel_m_s2_rthz=rough)
+        noise = replace(TYPICAL, gyro_density_rad_s_rthz=gyro, accel_density_m_s2_rthz=rough)
         floor, spread = _FLOOR, _SPREAD
         if rough > _MOST_ACCEL:
-            noise = replace(noise, accel_m_s2_rthz=float(np.sqrt(rough * _MOST_ACCEL)))
+            noise = replace(noise, accel_density_m_s2_rthz=float(np.sqrt(rough * _MOST_ACCEL)))
         if rough > _VIBRATES:
-            noise = replace(noise, accel_m_s2_rthz=_MOST_ACCEL, accel_slow_m_s2_rts=_SHAKEN_SLOW)
+            noise = replace(noise, accel_density_m_s2_rthz=_MOST_ACCEL, accel_slow_m_s2_rts=_SHAKEN_SLOW)
             spread = _SHAKEN
         if sheet is not None:
             noise = replace(
                 noise,
-                gyro_rad_s_rthz=max(noise.gyro_rad_s_rthz, sheet.gyro_density_rad_s_rthz),
-                gyro_walk_rad_s_rts=max(noise.gyro_walk_rad_s_rts, sheet.gyro_walk_rad_s2_rthz),
-                accel_m_s2_rthz=max(noise.accel_m_s2_rthz, sheet.accel_density_m_s2_rthz),
-                accel_walk_m_s2_rts=max(noise.accel_walk_m_s2_rts, sheet.accel_walk_m_s3_rthz),
+                gyro_density_rad_s_rthz=max(noise.gyro_density_rad_s_rthz, sheet.gyro_density_rad_s_rthz),
+                gyro_walk_rad_s2_rthz=max(noise.gyro_walk_rad_s2_rthz, sheet.gyro_walk_rad_s2_rthz),
+                accel_density_m_s2_rthz=max(noise.accel_density_m_s2_rthz, sheet.accel_density_m_s2_rthz),
+                accel_walk_m_s3_rthz=max(noise.accel_walk_m_s3_rthz, sheet.accel_walk_m_s3_rthz),
             )
-            least = max(_FLOOR["accel_m_s2_rthz"], sheet.accel_density_m_s2_rthz)
-            floor = {**_FLOOR, "accel_m_s2_rthz": least}
+            least = max(_FLOOR["accel_density_m_s2_rthz"], sheet.accel_density_m_s2_rthz)
+            floor = {**_FLOOR, "accel_density_m_s2_rthz": least}
         start = replace(noise, accel_slow_m_s2_rts=TYPICAL.accel_slow_m_s2_rts)
         if spread is _SHAKEN:
-            quiet = max(floor["accel_m_s2_rthz"], min(noise.accel_m_s2_rthz, _QUIET_START))
-            start = replace(noise, accel_m_s2_rthz=quiet, accel_slow_m_s2_rts=_SLOW_START)
+            quiet = max(floor["accel_density_m_s2_rthz"], min(noise.accel_density_m_s2_rthz, _QUIET_START))
+            start = replace(noise, accel_density_m_s2_rthz=quiet, accel_slow_m_s2_rts=_SLOW_START)
         left = _LEAST_LEFT if spread is _SPREAD else _LEAST_LEFT_SHAKEN
         return cls(noise=noise, floor=floor, spread=spread, start=start, least_left=left)
 
@@ -266,7 +272,7 @@ class LevelSearch:
         self._steps += 1
         if self._steps <= _BY_SQUARES:
             # an accelerometer's noise is known beforehand better than the rest
-            part = np.where(np.array(_LEVELS) == "accel_m_s2_rthz", 0.5, 1.0)
+            part = np.where(np.array(_LEVELS) == "accel_density_m_s2_rthz", 0.5, 1.0)
             step = np.clip(
                 part * np.log(np.maximum(squares, 1e-9) / np.maximum(right, 1e-9)), -_LARGEST_FIRST, _LARGEST_FIRST
             )

@@ -7,14 +7,20 @@ import numpy as np
 from colmap_inertial.core.arrays import Array, BoolArray
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import matrix_from_quat
-from colmap_inertial.core.sampling import at_ceiling
-from colmap_inertial.core.types import CAL, CameraImuCalibration, CameraTrajectory, ImuRecording, clock_shift_s
-from colmap_inertial.inertial.scale import _parameters as par
-from colmap_inertial.inertial.scale._grouping import find_breaks, group_frames
+from colmap_inertial.core.types import (
+    CAL,
+    Array,
+    CameraImuCalibration,
+    CameraTrajectory,
+    ImuRecording,
+    clock_shift_s,
+)
+from colmap_inertial.inertial.core import parameters as par
+from colmap_inertial.inertial.core.parameters import Estimate, Prior
+from colmap_inertial.inertial.core.preintegration import SensorStreams, find_saturated
+from colmap_inertial.inertial.core.priors import PRIORS, gains_cov
+from colmap_inertial.inertial.scale._grouping import Data, find_breaks, group_frames
 from colmap_inertial.inertial.scale._noise import roughness
-from colmap_inertial.inertial.scale._parameters import Data, Estimate, Prior
-from colmap_inertial.inertial.scale._preintegration import Track, Tracks
-from colmap_inertial.inertial.scale.priors import PRIORS, gains_cov
 
 #: Standard deviation of rows' times about the middle row, in readouts (uniform over the picture).
 _ROW_SPREAD = 12**-0.5
@@ -44,7 +50,7 @@ def prepare(
         When too few frames lie inside the IMU recording.
     """
     shift_s = clock_shift_s(trajectory, imu)
-    gyro_cut, accel_cut = cut_off(imu)
+    gyro_cut, accel_cut = find_saturated(imu)
     for sensor, cut in (("gyroscope", gyro_cut), ("accelerometer", accel_cut)):
         if np.sum(~cut) < _FEWEST_READINGS:
             raise NotObservableError(
@@ -52,10 +58,13 @@ def prepare(
                 f"nearly all of the {sensor}'s readings stand at the end of its range: move less violently, or give "
                 "the sensor a wider range",
             )
-    gyro = Track.of(imu.gyro_t_s + (shift_s + calibration.gyro_time_offset_s), imu.gyro_rad_s, gyro_cut)
-    accel = Track.of(imu.accel_t_s + (shift_s + calibration.accel_time_offset_s), imu.accel_m_s2, accel_cut)
+    streams = SensorStreams.from_recording(
+        imu,
+        imu.gyro_t_s + (shift_s + calibration.gyro_time_offset_s),
+        imu.accel_t_s + (shift_s + calibration.accel_time_offset_s),
+    )
+    gyro, accel = streams.gyro, streams.accel
     margin_s = 0.02
-    tracks = Tracks(gyro=gyro, accel=accel)
     begin_s = max(gyro.t_s[0], accel.t_s[0]) + margin_s
     end_s = min(gyro.t_s[-1], accel.t_s[-1]) - margin_s
     inside = np.flatnonzero((trajectory.t_s >= begin_s) & (trajectory.t_s <= end_s))
@@ -71,7 +80,7 @@ def prepare(
             matrix_from_quat(trajectory.cam_from_world_xyzw[inside]).transpose(0, 2, 1),
             centre - centre.mean(axis=0),
             rate_hz=max(min(_MANY_STATES / span_s, states_hz), min(_FEWEST_HZ, states_hz)),
-            tracks=tracks,
+            streams=streams,
             gyro_bias_rad_s=calibration.gyro_bias_rad_s,
             cam_from_imu=cam_from_imu,
         )
@@ -94,7 +103,7 @@ def prepare(
         centre_shape=centre_shape,
         coupling=coupling,
         broken=find_breaks(groups.t_s, groups.centre),
-        tracks=tracks,
+        streams=streams,
         gyro_roughness_rad_s_rthz=roughness(imu.gyro_t_s, imu.gyro_rad_s),
         accel_roughness_m_s2_rthz=roughness(imu.accel_t_s, imu.accel_m_s2),
         gyro_cut_share=float(gyro_cut.mean()),
@@ -103,27 +112,9 @@ def prepare(
 
     world_from_imu = world_from_cam @ cam_from_imu
     mean_force = np.mean((world_from_imu @ accel.at(data.t_s)[0][:, :, None])[:, :, 0], axis=0)
-    zeros = np.zeros((k, 3))
-    mean = Estimate(
-        metres_per_unit=1.0,
-        world_from_imu=world_from_imu,
-        imu_in_world_m=zeros,
-        velocity_m_s=zeros,
-        gyro_bias_rad_s=zeros + calibration.gyro_bias_rad_s,
-        accel_walk_m_s2=zeros,
-        drift_m=zeros,
-        accel_slow_m_s2=zeros,
-        gravity_m_s2=-mean_force * gravity_m_s2 / max(float(np.linalg.norm(mean_force)), 1e-9),
-        accel_bias_m_s2=np.zeros(3),
-        accel_delay_s=0.0,
-        gyro_gain=np.zeros((3, 3)),
-        accel_gain=np.zeros((3, 3)),
-        cam_from_imu=cam_from_imu,
-        imu_in_cam_m=calibration.imu_in_cam_m,
-        delay_s=0.0,
-        clock_rate=0.0,
-        shutter=np.zeros((4, 3, 3)),
-        coupling_m=np.zeros((3, 3)),
+    gravity = -mean_force * gravity_m_s2 / max(float(np.linalg.norm(mean_force)), 1e-9)
+    mean = Estimate.at_start(
+        world_from_imu, gravity, cam_from_imu, calibration.imu_in_cam_m, calibration.gyro_bias_rad_s
     )
     prior = Prior(
         mean=mean,
@@ -132,15 +123,6 @@ def prepare(
         gravity_sigma_m_s2=gravity_sigma_m_s2,
     )
     return data, prior
-
-
-def cut_off(imu: ImuRecording) -> tuple[BoolArray, BoolArray]:
-    """(N,), (M,) which samples of gyroscope and accelerometer stand at the end of the sensor's range on any axis."""
-    gyro, accel = imu.gyro_rad_s, imu.accel_m_s2
-    if imu.calibration is not None:
-        # digits that the corrections left behind would make one reading many
-        gyro, accel = (np.round(values, 9) for values in imu.calibration.uncorrected(gyro, accel))
-    return np.asarray(at_ceiling(gyro).any(axis=1)), np.asarray(at_ceiling(accel).any(axis=1))
 
 
 def _information(calibration: CameraImuCalibration, imu: ImuRecording) -> Array:

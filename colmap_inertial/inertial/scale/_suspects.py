@@ -12,10 +12,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from colmap_inertial.core.arrays import Array
-from colmap_inertial.inertial.scale import _factors as fac, _parameters as par
-from colmap_inertial.inertial.scale._parameters import Data, Estimate, Prior
-from colmap_inertial.inertial.scale._preintegration import Preintegrated, SensorErrors, Track, Tracks, preintegrate
+from colmap_inertial.core.types import Array
+from colmap_inertial.inertial.core import factors as fac, parameters as par
+from colmap_inertial.inertial.core.parameters import Estimate, Prior
+from colmap_inertial.inertial.core.preintegration import (
+    Preintegrated,
+    SensorErrors,
+    SensorStream,
+    SensorStreams,
+    preintegrate,
+)
+from colmap_inertial.inertial.scale._grouping import Data
+from colmap_inertial.inertial.scale._residuals import node_stamps
 
 #: Squared deviation in standard deviations from which a suspicion counts. 935 clean recordings, real and simulated, had
 #: 23 at most.
@@ -63,7 +71,7 @@ class Suspicion:
         return float(self.by_scale @ self.cov @ self.by_scale)
 
 
-def perturbations(accel: Track, middle_s: float) -> dict[str, list[Array]]:
+def perturbations(accel: SensorStream, middle_s: float) -> dict[str, list[Array]]:
     """For each suspicion the changes (N, 3) of the readings by its unknowns.
 
     ``bandwidth`` (s2): to second order, and but for a delay, a low-pass filter takes from a signal what is proportional
@@ -79,7 +87,7 @@ def perturbations(accel: Track, middle_s: float) -> dict[str, list[Array]]:
 
 def columns(data: Data, x: Estimate, imu: fac.Group) -> tuple[dict[str, slice], Array]:
     """Where each suspicion's unknowns stand, and their columns (K, 9, q) of the whitened inertial residuals ``imu``."""
-    k, accel = len(data.t_s) - 1, data.tracks.accel
+    k, accel = len(data.t_s) - 1, data.streams.accel
     errors = SensorErrors(
         gyro_bias_rad_s=x.gyro_bias_rad_s[:-1],
         accel_bias_m_s2=np.zeros((k, 3)),
@@ -87,14 +95,16 @@ def columns(data: Data, x: Estimate, imu: fac.Group) -> tuple[dict[str, slice], 
         accel_gain=np.zeros((3, 3)),
         accel_delay_s=x.accel_delay_s,
     )
-    nodes_s = fac.nodes_s(data, x)
+    nodes_s = node_stamps(data, x)
     where: dict[str, slice] = {}
     found: list[Preintegrated] = []
     for name, changes in perturbations(accel, par.middle_s(data.t_s)).items():
         where[name] = slice(len(found), len(found) + len(changes))
         # increments are linear in the readings of the accelerometer
         found += [
-            preintegrate(nodes_s, Tracks(gyro=data.tracks.gyro, accel=accel.with_samples(accel.t_s, change)), errors)
+            preintegrate(
+                nodes_s, SensorStreams(gyro=data.streams.gyro, accel=accel.with_samples(accel.t_s, change)), errors
+            )
             for change in changes
         ]
     by = np.stack([np.concatenate([np.zeros((k, 3)), -pre.velocity, -pre.position], axis=1) for pre in found], axis=2)
@@ -129,7 +139,7 @@ def suspicions(
     return out
 
 
-def worst(found: list[Suspicion], accel: Track, known: Collection[str] = ()) -> Suspicion | None:
+def worst(found: list[Suspicion], accel: SensorStream, known: Collection[str] = ()) -> Suspicion | None:
     """The strongest suspicion that is more than chance, None where there is none.
 
     Of what is ``known`` to be wrong already, more than half a standard deviation that is left counts. Stamps that part
@@ -180,7 +190,7 @@ class Faults:
         A filter is taken as one of the first order, which applications' are: the reading plus its time constant times
         its derivative. The delay of such a filter is fitted along.
         """
-        accel = data.tracks.accel
+        accel = data.streams.accel
         t_s, value, rough = accel.t_s, accel.value, data.accel_roughness_m_s2_rthz
         slope = np.gradient(_smooth(t_s, value, _SMOOTH_TO_UNDO_S), t_s, axis=0)
         if "bandwidth" in self.values:
@@ -192,8 +202,8 @@ class Faults:
         if "rate" in self.values:
             middle_s = par.middle_s(data.t_s)
             t_s = middle_s + (t_s - middle_s) / (1 + float(self.values["rate"][0]))
-        tracks = replace(data.tracks, accel=accel.with_samples(t_s, value))
-        return replace(data, tracks=tracks, accel_roughness_m_s2_rthz=rough)
+        streams = replace(data.streams, accel=accel.with_samples(t_s, value))
+        return replace(data, streams=streams, accel_roughness_m_s2_rthz=rough)
 
     @property
     def _time_constant_s(self) -> float:

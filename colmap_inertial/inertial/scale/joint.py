@@ -30,12 +30,13 @@ from colmap_inertial.core.types import (
     ImuRecording,
     ScaleEstimate,
 )
-from colmap_inertial.inertial.scale import _parameters as par
+from colmap_inertial.inertial.core import parameters as par
+from colmap_inertial.inertial.core.parameters import Prior
+from colmap_inertial.inertial.core.priors import PRIORS, is_calibrated
 from colmap_inertial.inertial.scale._fit import Fit, fit_jointly
-from colmap_inertial.inertial.scale._parameters import Data, Prior
+from colmap_inertial.inertial.scale._grouping import Data
 from colmap_inertial.inertial.scale._setup import prepare
 from colmap_inertial.inertial.scale._suspects import Faults, worst
-from colmap_inertial.inertial.scale.priors import PRIORS, is_calibrated
 from colmap_inertial.inertial.scale.verdict import scale_drifts, student_factor, verdict_of
 
 _LARGEST_BIAS_M_S2 = 2.0
@@ -152,7 +153,7 @@ def _fit_soundly(data: Data, prior: Prior, sheet: ImuNoise | None) -> tuple[Fit,
             # not from the start: on its way a fit passes gains that it would not find back from
             prior = replace(prior, heavy_gains=True)
             fit = fit_jointly(sound, faults.loosened(prior), sheet)
-        found = worst(fit.suspicions, data.tracks.accel, faults.values)
+        found = worst(fit.suspicions, data.streams.accel, faults.values)
         # a fit of what does not belong together explains nothing
         if found is None or _refusals(fit, data.t_s):
             break
@@ -215,12 +216,7 @@ def _judged(
         excitation_m_s2=fit.excitation_m_s2,
         drift=fit.drift,
         parts=None if refused else found.parts,
-        noise=ImuNoise(
-            gyro_density_rad_s_rthz=fit.noise.gyro_rad_s_rthz,
-            accel_density_m_s2_rthz=fit.noise.accel_density_m_s2_rthz,
-            gyro_walk_rad_s2_rthz=fit.noise.gyro_walk_rad_s_rts,
-            accel_walk_m_s3_rthz=fit.noise.accel_walk_m_s2_rts,
-        ),
+        noise=fit.noise.imu_over_seconds(),
     )
 
 
@@ -256,7 +252,7 @@ def scale_of(fit: Fit, t_s: Array, calibrated: bool) -> FoundScale:
     # A gain follows the noise the other way, so that what both have in common stays where it is
     gains = fit.cov[par.SCALE, par.ACCEL_GAIN].reshape(3, 3)
     share = max(0.0, bare + float(np.trace(gains)) / 3) * max(0.0, taken)
-    overstated = max(0.0, 1 - (fit.expected_accel_m_s2_rthz / fit.noise.accel_m_s2_rthz) ** 2)
+    overstated = max(0.0, 1 - (fit.expected_accel_m_s2_rthz / fit.noise.accel_density_m_s2_rthz) ** 2)
     # To first order only: not by more than what the recording leaves open
     shift = min(overstated * share, (bare * max(1.0, worst)) ** 0.5)
     student = student_factor(fit.freedom)

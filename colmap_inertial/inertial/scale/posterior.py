@@ -15,12 +15,14 @@ from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.options import ScaleOptions
 from colmap_inertial.core.threads import one_blas_thread
-from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuRecording
-from colmap_inertial.inertial.scale import _parameters as par, in_step_with, strength_of_gravity
+from colmap_inertial.core.types import Array, CameraImuCalibration, CameraTrajectory, ImuRecording
+from colmap_inertial.inertial.core import parameters as par
+from colmap_inertial.inertial.core.parameters import Noise
+from colmap_inertial.inertial.core.priors import is_calibrated, model_scale_sigma
+from colmap_inertial.inertial.scale import in_step_with, strength_of_gravity
 from colmap_inertial.inertial.scale._fit import Fit
-from colmap_inertial.inertial.scale._parameters import Data, Noise
+from colmap_inertial.inertial.scale._grouping import Data
 from colmap_inertial.inertial.scale.joint import JointOptions, fit_path, scale_of
-from colmap_inertial.inertial.scale.priors import is_calibrated, model_scale_sigma
 
 # Columns of a node: rotation (right, body frame), position, velocity, biases of gyroscope and accelerometer.
 NODE = 15
@@ -168,7 +170,7 @@ class FittedPath:
         """Variances of a visual rotation (rad2) and centre (m2) at a usual node, each axis, as many of them weigh."""
         noise = self._fit.noise
         rotation = (noise.rotation_rad * noise.rotation_excess) ** 2
-        return rotation, noise.centre_m**2 + 0.5 * par.DRIFT_S * noise.drift_m_rts**2
+        return rotation, noise.centre_m**2 + noise.drift_m2
 
     def seen_cov(self, node: int) -> Array:
         """(6, 6) covariance of one visual pose at a node: rotation (left) and centre (m), along the model's axes."""
@@ -180,7 +182,7 @@ class FittedPath:
         centre = noise.centre_m**2 * _inverse_square(data.centre_shape[node]) + carried @ rotation @ carried.T
         cov = np.zeros((6, 6))
         cov[:3, :3] = camera @ rotation @ camera.T
-        cov[3:, 3:] = centre + 0.5 * par.DRIFT_S * noise.drift_m_rts**2 * np.eye(3)
+        cov[3:, 3:] = centre + noise.drift_m2 * np.eye(3)
         cov[3:, :3] = -carried @ rotation @ camera.T
         cov[:3, 3:] = cov[3:, :3].T
         return cov

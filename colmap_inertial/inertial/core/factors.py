@@ -1,4 +1,4 @@
-"""Residuals of the joint model with their derivatives, all divided by their standard deviations.
+"""Residuals of an IMU and of errors that last, with their derivatives, all divided by their standard deviations.
 
 Rotations change on the right (``R exp(d)``, body frame), cam_from_imu on the left (camera frame), the scale through
 ``u`` = assumed over true metres per unit, all else by addition.
@@ -13,13 +13,12 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, BoolArray
 from colmap_inertial.core.geometry import skew, so3_exp, so3_log
-from colmap_inertial.inertial.scale import _parameters as par
-from colmap_inertial.inertial.scale._parameters import Data, Estimate, Noise, Prior
-from colmap_inertial.inertial.scale._preintegration import Preintegrated, SensorErrors, preintegrate
-from colmap_inertial.inertial.scale._solver import ArrowSystem, Inverse
+from colmap_inertial.core.types import Array, ImuNoise
+from colmap_inertial.inertial.core import parameters as par
+from colmap_inertial.inertial.core.arrow import ArrowSystem, Inverse
+from colmap_inertial.inertial.core.parameters import Estimate, InertialStates, Prior
+from colmap_inertial.inertial.core.preintegration import Preintegrated
 
-#: Cauchy scale of the visual residuals, in standard deviations: a normal error loses 4 % of its weight on average.
-ROBUST_SIGMAS = 4.0
 #: How far a model's parts may be shifted against each other where it breaks.
 _BREAK_M = 10.0
 
@@ -173,25 +172,8 @@ class Direct:
                 system.below[self.first : self.first + n, i, i] -= squared * keep
 
 
-def _mv(matrices: Array, vectors: Array) -> Array:
+def rotate(matrices: Array, vectors: Array) -> Array:
     return np.asarray((matrices @ vectors[:, :, None])[:, :, 0])
-
-
-def integrate(data: Data, x: Estimate) -> Preintegrated:
-    """Preintegration between the nodes at the biases, gains and delays of ``x``."""
-    errors = SensorErrors(
-        gyro_bias_rad_s=x.gyro_bias_rad_s[:-1],
-        accel_bias_m_s2=x.accel_biases_m_s2[:-1],
-        gyro_gain=x.gyro_gain,
-        accel_gain=x.accel_gain,
-        accel_delay_s=x.accel_delay_s,
-    )
-    return preintegrate(nodes_s(data, x), data.tracks, errors)
-
-
-def nodes_s(data: Data, x: Estimate) -> Array:
-    """(K,) times of the nodes on the clock of the tracks."""
-    return np.asarray(data.t_s - x.delay_s - x.clock_rate * (data.t_s - par.middle_s(data.t_s)))
 
 
 def still_near(then: Estimate, x: Estimate, t_s: Array, tolerance: float = 1.0) -> bool:
@@ -214,8 +196,8 @@ def corrected(pre: Preintegrated, then: Estimate, x: Estimate) -> Preintegrated:
     gyro_bias = x.gyro_bias_rad_s - then.gyro_bias_rad_s
     accel_bias = x.accel_biases_m_s2 - then.accel_biases_m_s2
     change = (
-        _mv(pre.by_gyro_bias, gyro_bias[:-1])
-        + _mv(pre.by_accel_bias, accel_bias[:-1])
+        rotate(pre.by_gyro_bias, gyro_bias[:-1])
+        + rotate(pre.by_accel_bias, accel_bias[:-1])
         + pre.by_gyro_gain @ gyro_gain.ravel()
         + pre.by_accel_gain @ accel_gain.ravel()
         + pre.by_accel_delay * (x.accel_delay_s - then.accel_delay_s)
@@ -229,14 +211,14 @@ def corrected(pre: Preintegrated, then: Estimate, x: Estimate) -> Preintegrated:
     )
 
 
-def imu_group(noise: Noise, x: Estimate, pre: Preintegrated, *, rotation_only: bool = False) -> Group:
+def imu_group(noise: ImuNoise, x: InertialStates, pre: Preintegrated, *, rotation_only: bool = False) -> Group:
     """Rows: rotation, velocity, position between consecutive nodes."""
     k, dt = len(pre.dt_s), pre.dt_s[:, None]
     body_from_world = x.world_from_imu[:-1].transpose(0, 2, 1)
     step_velocity = x.velocity_m_s[1:] - x.velocity_m_s[:-1] - x.gravity_m_s2 * dt
     step_position = x.imu_in_world_m[1:] - x.imu_in_world_m[:-1] - x.velocity_m_s[:-1] * dt
-    velocity = _mv(body_from_world, step_velocity)
-    position = _mv(body_from_world, step_position - 0.5 * x.gravity_m_s2 * dt**2)
+    velocity = rotate(body_from_world, step_velocity)
+    position = rotate(body_from_world, step_position - 0.5 * x.gravity_m_s2 * dt**2)
     twist = so3_log(body_from_world @ x.world_from_imu[1:] @ pre.rotation.transpose(0, 2, 1))
     residual = np.concatenate([twist, velocity - pre.velocity, position - pre.position], axis=1)
 
@@ -274,119 +256,21 @@ def imu_group(noise: Noise, x: Estimate, pre: Preintegrated, *, rotation_only: b
     z = z[:, :, par.IMU_GLOBALS]
 
     rows = slice(0, 3) if rotation_only else slice(0, 9)
-    cov = noise.gyro_rad_s_rthz**2 * pre.cov_gyro + noise.accel_m_s2_rthz**2 * pre.cov_accel + pre.cov_gaps
+    cov = (
+        noise.gyro_density_rad_s_rthz**2 * pre.cov_gyro
+        + noise.accel_density_m_s2_rthz**2 * pre.cov_accel
+        + pre.cov_gaps
+    )
     root = np.linalg.inv(np.linalg.cholesky(cov[:, rows, rows]))
     return Group(
-        residual=_mv(root, residual[:, rows]),
+        residual=rotate(root, residual[:, rows]),
         here=root @ here[:, rows],
         after=root @ after[:, rows],
         by_globals=root @ z[:, rows],
         columns=par.IMU_GLOBALS,
-        share=noise.accel_m_s2_rthz**2 * root @ pre.cov_accel[:, rows, rows] @ root.transpose(0, 2, 1),
+        share=noise.accel_density_m_s2_rthz**2 * root @ pre.cov_accel[:, rows, rows] @ root.transpose(0, 2, 1),
         root=root,
     )
-
-
-def visual_groups(data: Data, noise: Noise, x: Estimate, rate_rad_s: Array, *, robust: bool) -> tuple[Group, Group]:
-    """Rotations, and centres given the rotations.
-
-    A picture determines a camera's rotation and its centre together: what turns the camera and moves it so that the
-    scene stays in place hardly changes the picture. The errors of the two are therefore strongly correlated (by 0.6
-    to 0.9 in real recordings), and the centre is much better known once the gyroscope has told the rotation. So the
-    error of the centre is modelled as coupling times error of the rotation plus a rest; the coupling is estimated.
-    """
-    k = len(data.t_s)
-    camera = x.world_from_imu @ x.cam_from_imu.T  # world_from_cam
-    cam_from_world = camera.transpose(0, 2, 1)
-    # Mean rate of the group's frames: what row times and a delay act on
-    mean_rate_rad_s = data.groups.rate_rad_s @ (np.eye(3) + x.gyro_gain).T - x.gyro_bias_rad_s
-    rate = mean_rate_rad_s @ x.cam_from_imu.T
-    velocity = _mv(cam_from_world, x.velocity_m_s)
-    rotation_by_rate, rotation_by_velocity, centre_by_rate, centre_by_velocity = x.shutter
-
-    rotation = so3_log(data.groups.world_from_cam.transpose(0, 2, 1) @ camera)
-    # The frames were moved to their mean instant with the first guess of the delay
-    rotation = rotation + (rate_rad_s @ x.cam_from_imu.T - rate) * x.delay_s
-    rotation_here = np.zeros((k, 3, par.N_STATE))
-    rotation_here[:, :, par.THETA] = x.cam_from_imu
-    since_middle = (data.t_s - par.middle_s(data.t_s))[:, None]
-    rotation_z = np.zeros((k, 3, par.N_GLOBALS))
-    rotation_z[:, :, par.ROTATION] = -np.eye(3)
-    rotation_z[:, :, par.DELAY] = -rate
-    rotation_z[:, :, par.CLOCK_RATE] = -rate * since_middle
-
-    lever_body = x.cam_from_imu.T @ x.imu_in_cam_m
-    smear = rate @ centre_by_rate.T + velocity @ centre_by_velocity.T
-    half_spread_s2 = 0.5 * data.groups.spread_s2[:, None]
-    displacement = data.groups.displacement_m - half_spread_s2 * x.accel_biases_m_s2
-    displacement = displacement - _mv(data.groups.rotation_since - np.eye(3), np.broadcast_to(lever_body, (k, 3)))
-    predicted = x.imu_in_world_m + _mv(camera, smear - x.imu_in_cam_m)
-    predicted = predicted + half_spread_s2 * x.gravity_m_s2 + _mv(x.world_from_imu, displacement)
-    camera_velocity = x.velocity_m_s - _mv(x.world_from_imu, np.cross(rate_rad_s, lever_body))
-    centre = data.groups.centre * x.metres_per_unit - predicted - x.drift_m
-    centre_here = np.zeros((k, 3, par.N_STATE))
-    centre_here[:, :, par.POSITION] = -np.eye(3)
-    centre_here[:, :, par.DRIFT] = -np.eye(3)
-    centre_here[:, :, par.THETA] = x.world_from_imu @ skew(displacement - lever_body)
-    centre_here[:, :, par.ACCEL_WALK] = centre_here[:, :, par.ACCEL_SLOW] = (
-        half_spread_s2[:, :, None] * x.world_from_imu
-    )
-    centre_here[:, :, par.VELOCITY] = -camera @ centre_by_velocity @ cam_from_world
-    centre_z = np.zeros((k, 3, par.N_GLOBALS))
-    # The noise sits on the visual centre, so a change of log u scales the prediction: total least squares
-    centre_z[:, :, par.SCALE] = -predicted
-    centre_z[:, :, par.ROTATION] = camera @ skew(x.imu_in_cam_m)
-    centre_z[:, :, par.GRAVITY] = -half_spread_s2[:, :, None] * np.eye(3)
-    centre_z[:, :, par.ACCEL_BIAS] = half_spread_s2[:, :, None] * x.world_from_imu
-    centre_z[:, :, par.LEVER] = x.world_from_imu @ data.groups.rotation_since @ x.cam_from_imu.T
-    centre_z[:, :, par.DELAY] = camera_velocity
-    centre_z[:, :, par.CLOCK_RATE] = camera_velocity * since_middle
-
-    # Before the shutter's part: that one, too, is mostly along the direction in which a picture changes little
-    carried = camera @ (x.coupling_m + x.metres_per_unit * data.coupling)
-    centre = centre - _mv(carried, rotation)
-    centre_here -= carried @ rotation_here
-    centre_z -= carried @ rotation_z
-    unsmeared = rotation
-    rotation = rotation - rate @ rotation_by_rate.T - velocity @ rotation_by_velocity.T
-    rotation_here[:, :, par.VELOCITY] = -rotation_by_velocity @ cam_from_world
-    for i in range(3):
-        # Entries of the four shutter matrices and of the coupling, row by row
-        at = [par.SHUTTER.start + 9 * j + 3 * i for j in range(4)] + [par.COUPLING.start + 3 * i]
-        rotation_z[:, i, at[0] : at[0] + 3] = -rate
-        rotation_z[:, i, at[1] : at[1] + 3] = -velocity
-        column = -camera[:, :, i, None]
-        centre_z[:, :, at[2] : at[2] + 3] = column * rate[:, None, :]
-        centre_z[:, :, at[3] : at[3] + 3] = column * velocity[:, None, :]
-        centre_z[:, :, at[4] : at[4] + 3] = column * unsmeared[:, None, :]
-
-    groups = []
-    for residual, here, z, root, columns in (
-        (
-            rotation,
-            rotation_here,
-            rotation_z,
-            data.rotation_shape / (noise.rotation_rad * noise.rotation_excess),
-            par.VISUAL_GLOBALS,
-        ),
-        (centre, centre_here, centre_z, data.centre_shape / noise.centre_m, slice(0, par.N_GLOBALS)),
-    ):
-        whitened = _mv(root, residual)
-        weight = np.ones(k)
-        if robust:
-            weight = 1 / (1 + np.sum(whitened**2, axis=1) / (3 * ROBUST_SIGMAS**2))
-        root_weight = np.sqrt(weight)[:, None, None]
-        root = root * root_weight
-        groups.append(
-            Group(
-                residual=whitened * root_weight[:, :, 0],
-                here=root @ here,
-                by_globals=root @ z[:, :, columns],
-                columns=columns,
-                weight=weight,
-            )
-        )
-    return groups[0], groups[1]
 
 
 def walk_group(values: Array, columns: slice, sigma: float, dt_s: Array) -> Direct:
@@ -417,61 +301,6 @@ def state_group(values: Array, columns: slice, sigma: float, first: int = 0) -> 
     """Values of states ``first ..`` expected to be zero."""
     info = np.full(len(values), 1 / sigma)
     return Direct(residual=values / sigma, columns=columns, info=info, first=first)
-
-
-def all_groups(
-    data: Data, noise: Noise, prior: Prior, x: Estimate, pre: Preintegrated, *, robust: bool
-) -> dict[str, Group | Direct]:
-    """Everything but the priors of the globals."""
-    rotation, centre = visual_groups(data, noise, x, pre.rate_rad_s, robust=robust)
-    middle = int(np.argmin(np.abs(data.t_s - par.middle_s(data.t_s))))
-    return {
-        "imu": imu_group(noise, x, pre),
-        "rotation": rotation,
-        "centre": centre,
-        "gyro_walk": walk_group(x.gyro_bias_rad_s, par.GYRO_BIAS, noise.gyro_walk_rad_s_rts, pre.dt_s),
-        "accel_walk": walk_group(x.accel_walk_m_s2, par.ACCEL_WALK, noise.accel_walk_m_s2_rts, pre.dt_s),
-        "drift": lasting_group(x.drift_m, par.DRIFT, noise.drift_m_rts, par.DRIFT_S, pre.dt_s, data.broken),
-        "accel_slow": lasting_group(
-            x.accel_slow_m_s2,
-            par.ACCEL_SLOW,
-            noise.accel_slow_m_s2_rts,
-            par.ACCEL_SLOW_S,
-            pre.dt_s,
-            np.zeros_like(data.broken),
-        ),
-        # Anchors of what only differences determine
-        "gyro_bias": state_group(
-            x.gyro_bias_rad_s[:1] - prior.mean.gyro_bias_rad_s[:1], par.GYRO_BIAS, prior.gyro_bias_sigma_rad_s
-        ),
-        "accel_zero": state_group(x.accel_walk_m_s2[middle : middle + 1], par.ACCEL_WALK, 1e-4, middle),
-        "drift_zero": state_group(x.drift_m[:1], par.DRIFT, noise.drift_m_rts * (0.5 * par.DRIFT_S) ** 0.5),
-        "accel_slow_zero": state_group(
-            x.accel_slow_m_s2[:1], par.ACCEL_SLOW, noise.accel_slow_m_s2_rts * (0.5 * par.ACCEL_SLOW_S) ** 0.5
-        ),
-        "speed": state_group(x.velocity_m_s, par.VELOCITY, prior.speed_sigma_m_s),
-    }
-
-
-def rotation_groups(
-    data: Data, noise: Noise, prior: Prior, x: Estimate, pre: Preintegrated
-) -> dict[str, Group | Direct]:
-    """What rotations alone say; all else is held."""
-    k = len(data.t_s)
-    rotation, _ = visual_groups(data, noise, x, pre.rate_rad_s, robust=True)
-    held = {
-        str(columns): state_group(np.zeros((k, 3)), columns, 1.0)
-        for columns in (par.POSITION, par.VELOCITY, par.ACCEL_WALK, par.DRIFT, par.ACCEL_SLOW)
-    }
-    return {
-        "imu": imu_group(noise, x, pre, rotation_only=True),
-        "rotation": rotation,
-        "gyro_walk": walk_group(x.gyro_bias_rad_s, par.GYRO_BIAS, noise.gyro_walk_rad_s_rts, pre.dt_s),
-        "gyro_bias": state_group(
-            x.gyro_bias_rad_s[:1] - prior.mean.gyro_bias_rad_s[:1], par.GYRO_BIAS, prior.gyro_bias_sigma_rad_s
-        ),
-        **held,
-    }
 
 
 def normal_equations(groups: Sequence[Group | Direct], prior: Prior, x: Estimate) -> tuple[ArrowSystem, Array, Array]:

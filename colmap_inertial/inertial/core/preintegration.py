@@ -20,8 +20,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from colmap_inertial._kernels import _inertial
-from colmap_inertial.core.arrays import Array, BoolArray, Int64Array
-from colmap_inertial.core.sampling import is_gap
+from colmap_inertial.core.sampling import at_ceiling, is_gap
+from colmap_inertial.core.types import Array, ImuRecording
 
 #: Integration steps: as the samples come, within these. Steps of 5 instead of 2.5 ms change the scale by 0.003 %.
 _SHORTEST_STEP_S, _LONGEST_STEP_S = 0.0025, 0.005
@@ -35,7 +35,7 @@ DELAY_STEP_S = 0.01
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Track:
+class SensorStream:
     """Samples of a vector over time, interpolated by cubic Hermite polynomials.
 
     Linear interpolation would lose 0.1 % of the amplitude at 2 Hz from samples at 100 Hz, and the scale with it.
@@ -52,8 +52,8 @@ class Track:
         return np.asarray(ends)
 
     @classmethod
-    def of(cls, t_s: Array, value: Array, lost: BoolArray | None = None) -> Track:
-        """A track through samples ``value`` (N, 3) at times ``t_s`` (N,).
+    def from_samples(cls, t_s: Array, value: Array, lost: NDArray[np.bool_] | None = None) -> SensorStream:
+        """A stream of samples ``value`` (N, 3) at times ``t_s`` (N,).
 
         ``lost`` are samples that say nothing: what they cover is a gap, however short.
         """
@@ -63,8 +63,8 @@ class Track:
         paused_s = np.concatenate([[0.0], np.cumsum(np.where(across | is_gap(t_s, _GAP_S), np.diff(t_s), 0.0))])
         return cls(t_s=t_s, value=value, slope=_slope(t_s, value), paused_s=paused_s)
 
-    def with_samples(self, t_s: Array, value: Array) -> Track:
-        """A track with as many other samples, and the same pauses."""
+    def with_samples(self, t_s: Array, value: Array) -> SensorStream:
+        """A stream with as many other samples, and the same pauses."""
         return replace(self, t_s=t_s, value=value, slope=_slope(t_s, value))
 
     def at(self, query_s: Array) -> tuple[Array, Array]:
@@ -86,16 +86,40 @@ def _slope(t_s: Array, value: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Tracks:
+class SensorStreams:
     """Readings of gyroscope (rad/s) and accelerometer (m/s2) over one clock."""
 
-    gyro: Track
-    accel: Track
+    gyro: SensorStream
+    accel: SensorStream
+
+    @classmethod
+    def from_recording(cls, imu: ImuRecording, gyro_t_s: Array, accel_t_s: Array) -> SensorStreams:
+        """The streams of a recording on another clock; saturated readings count as missing.
+
+        Parameters
+        ----------
+        gyro_t_s, accel_t_s
+            (N,), (M,) times of the recording's samples.
+        """
+        gyro_cut, accel_cut = find_saturated(imu)
+        return cls(
+            gyro=SensorStream.from_samples(gyro_t_s, imu.gyro_rad_s, gyro_cut),
+            accel=SensorStream.from_samples(accel_t_s, imu.accel_m_s2, accel_cut),
+        )
 
     def gap_s(self, t_s: Array, accel_delay_s: float = 0.0) -> tuple[Array, Array]:
         """(K,) seconds of gaps of gyroscope and accelerometer between K + 1 times; the delay is the accelerometer's."""
         accel_s = t_s - accel_delay_s
         return self.gyro.gap_s(t_s[:-1], t_s[1:]), self.accel.gap_s(accel_s[:-1], accel_s[1:])
+
+
+def find_saturated(imu: ImuRecording) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """(N,), (M,) which samples of gyroscope and accelerometer stand at the end of the sensor's range on any axis."""
+    gyro, accel = imu.gyro_rad_s, imu.accel_m_s2
+    if imu.calibration is not None:
+        # digits that the corrections left behind would make one reading many
+        gyro, accel = (np.round(values, 9) for values in imu.calibration.uncorrected(gyro, accel))
+    return np.asarray(at_ceiling(gyro).any(axis=1)), np.asarray(at_ceiling(accel).any(axis=1))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -160,11 +184,11 @@ class Preintegrated:
     rate_rad_s: Array
 
 
-def preintegrate(nodes_s: Array, tracks: Tracks, errors: SensorErrors) -> Preintegrated:
-    """Integrate both sensors between consecutive nodes, at (K + 1,) increasing times on the clock of the tracks."""
+def preintegrate(nodes_s: Array, streams: SensorStreams, errors: SensorErrors) -> Preintegrated:
+    """Integrate both sensors between consecutive nodes, at (K + 1,) increasing times on the clock of the streams."""
     nodes_s = np.ascontiguousarray(nodes_s)
-    gyro, accel = tracks.gyro, tracks.accel
-    k, steps = len(nodes_s) - 1, integration_steps(nodes_s, tracks)
+    gyro, accel = streams.gyro, streams.accel
+    k, steps = len(nodes_s) - 1, integration_steps(nodes_s, streams)
     shapes = {"rotation": (3, 3), "velocity": (3,), "position": (3,)}
     shapes |= {"cov_gyro": (9, 9), "by_gyro_bias": (9, 3), "by_accel_bias": (9, 3)}
     shapes |= {"by_gyro_gain": (9, 9), "by_accel_gain": (9, 9), "by_accel_delay": (9,)}
@@ -192,15 +216,15 @@ def preintegrate(nodes_s: Array, tracks: Tracks, errors: SensorErrors) -> Preint
     return Preintegrated(
         dt_s=dt_s,
         cov_accel=accel_noise_cov(dt_s),
-        cov_gaps=gap_cov(nodes_s, *tracks.gap_s(nodes_s, errors.accel_delay_s)),
+        cov_gaps=gap_cov(nodes_s, *streams.gap_s(nodes_s, errors.accel_delay_s)),
         rate_rad_s=rate_rad_s,
         **results,
     )
 
 
-def integration_steps(nodes_s: Array, tracks: Tracks) -> Int64Array:
+def integration_steps(nodes_s: Array, streams: SensorStreams) -> NDArray[np.int64]:
     """In how many steps each interval is integrated."""
-    spacing = min(float(np.median(np.diff(track.t_s))) for track in (tracks.gyro, tracks.accel))
+    spacing = min(float(np.median(np.diff(stream.t_s))) for stream in (streams.gyro, streams.accel))
     step_s = float(np.clip(spacing, _SHORTEST_STEP_S, _LONGEST_STEP_S))
     return np.maximum(np.ceil(np.diff(nodes_s) / step_s).astype(np.int64), 2)
 

@@ -1,17 +1,16 @@
-"""What the joint estimator measures, assumes and estimates, and in which columns."""
+"""What the estimators assume and estimate, and in which columns of states and globals."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 
 from colmap_inertial.core.arrays import Array, BoolArray
 from colmap_inertial.core.geometry import so3_exp, so3_log
-from colmap_inertial.inertial.scale._grouping import Groups
-from colmap_inertial.inertial.scale._preintegration import Tracks
+from colmap_inertial.core.types import Array, ImuNoise
 
 # Columns of the globals: the scale, those that the IMU factors see, those that the visual factors see.
 SCALE = 0
@@ -63,53 +62,9 @@ _ADDED_GLOBALS = dict(
 )
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Data:
-    """Measurements at K nodes, each the mean of a few frames of the camera.
-
-    Attributes
-    ----------
-    groups
-        Visual rotations and centres in model units, about their mean.
-    origin
-        (3,) that mean, in the model's world.
-    rotation_shape, centre_shape
-        (K, 3, 3) square roots of the information of the visual rotation (camera frame) and of the centre (world frame)
-        given the rotation, for a noise level of one.
-    coupling
-        (K, 3, 3) model units per radian: the error of the centre (camera frame) that comes with an error of the
-        rotation, as far as the covariances of the poses tell.
-    broken
-        (K - 1,) where the model's parts may be shifted against each other.
-    tracks
-        Readings over camera time, by the first guess of the offsets.
-    gyro_roughness_rad_s_rthz, accel_roughness_m_s2_rthz
-        Densities of white noise that would make the streams as rough as they are (``_noise.roughness``).
-    gyro_cut_share, accel_cut_share
-        Parts of the readings that stand at the end of the sensor's range; they count as gaps.
-    """
-
-    groups: Groups
-    origin: Array
-    rotation_shape: Array
-    centre_shape: Array
-    coupling: Array
-    broken: BoolArray
-    tracks: Tracks
-    gyro_roughness_rad_s_rthz: float
-    accel_roughness_m_s2_rthz: float
-    gyro_cut_share: float
-    accel_cut_share: float
-
-    @property
-    def t_s(self) -> Array:
-        """(K,) camera time."""
-        return self.groups.t_s
-
-
 @dataclass(frozen=True, kw_only=True)
-class Noise:
-    """Standard deviations: densities of the sensors, walks per root of a second, visual errors per state.
+class Noise(ImuNoise):
+    """Standard deviations: of an IMU as :class:`ImuNoise` has them, and visual and slow errors per state.
 
     ``drift_m_rts`` and ``accel_slow_m_s2_rts`` are what a Gauss-Markov process grows by in a short time.
 
@@ -117,10 +72,6 @@ class Noise:
     since those of neighbouring states are correlated: ``sqrt((1 + c) / (1 - c))`` for a correlation ``c``.
     """
 
-    gyro_rad_s_rthz: float
-    gyro_walk_rad_s_rts: float
-    accel_m_s2_rthz: float
-    accel_walk_m_s2_rts: float
     rotation_rad: float
     centre_m: float
     drift_m_rts: float
@@ -128,38 +79,91 @@ class Noise:
     rotation_excess: float = 1.0
 
     @property
-    def accel_density_m_s2_rthz(self) -> float:
-        """White noise that would do over seconds what noise and slow errors of the accelerometer do together."""
-        return math.hypot(self.accel_m_s2_rthz, self.accel_slow_m_s2_rts * ACCEL_SLOW_S)
+    def drift_m(self) -> float:
+        """Standard deviation of the drift at any one time."""
+        return self.drift_m_rts * (0.5 * DRIFT_S) ** 0.5
+
+    @property
+    def drift_m2(self) -> float:
+        """Variance of the drift at any one time."""
+        return 0.5 * DRIFT_S * self.drift_m_rts**2
+
+    @property
+    def accel_slow_m_s2(self) -> float:
+        """Standard deviation of the accelerometer's slow error at any one time."""
+        return self.accel_slow_m_s2_rts * (0.5 * ACCEL_SLOW_S) ** 0.5
 
     def accel_m_s2(self, dt_s: float) -> float:
         """Standard deviation of the accelerometer's mean over so short a time."""
-        return math.hypot(self.accel_m_s2_rthz / dt_s**0.5, self.accel_slow_m_s2_rts * (0.5 * ACCEL_SLOW_S) ** 0.5)
+        return math.hypot(self.accel_density_m_s2_rthz / dt_s**0.5, self.accel_slow_m_s2)
+
+    def imu_over_seconds(self) -> ImuNoise:
+        """The IMU's noise with white noise that does over seconds what the slow errors do beside their own."""
+        density = math.hypot(self.accel_density_m_s2_rthz, self.accel_slow_m_s2_rts * ACCEL_SLOW_S)
+        imu = {field.name: getattr(self, field.name) for field in fields(ImuNoise)}
+        return ImuNoise(**{**imu, "accel_density_m_s2_rthz": density})
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Estimate:
-    """A point of the parameter space; K states and the globals."""
+class InertialStates:
+    """What the factor between two states of an IMU acts on, beside its increments."""
 
-    metres_per_unit: float
     world_from_imu: Array  # (K, 3, 3)
     imu_in_world_m: Array  # (K, 3)
     velocity_m_s: Array  # (K, 3)
+    gravity_m_s2: Array  # (3,) world frame
+    accel_gain: Array  # (3, 3): force = (I + gain) reading - bias
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Estimate(InertialStates):
+    """A point of the parameter space; K states and the globals."""
+
+    metres_per_unit: float
     gyro_bias_rad_s: Array  # (K, 3)
     accel_walk_m_s2: Array  # (K, 3)
     drift_m: Array  # (K, 3)
     accel_slow_m_s2: Array  # (K, 3)
-    gravity_m_s2: Array  # (3,) world frame
     accel_bias_m_s2: Array  # (3,)
     accel_delay_s: float  # beyond the gyroscope's, and beyond the first guess
     gyro_gain: Array  # (3, 3): rate = (I + gain) reading - bias
-    accel_gain: Array  # (3, 3): force = (I + gain) reading - bias
     cam_from_imu: Array  # (3, 3)
     imu_in_cam_m: Array  # (3,)
     delay_s: float  # of the IMU's stamps, beyond the first guess
     clock_rate: float  # growth of that delay per second, about the middle of the recording
     shutter: Array  # (4, 3, 3): rotation by rate, rotation by velocity, centre by rate, centre by velocity
     coupling_m: Array  # (3, 3): beyond Data.coupling
+
+    @classmethod
+    def at_start(
+        cls,
+        world_from_imu: Array,
+        gravity_m_s2: Array,
+        cam_from_imu: Array,
+        imu_in_cam_m: Array,
+        gyro_bias_rad_s: Array,
+    ) -> Estimate:
+        """Where a fit begins: rotations, gravity and what the calibration says; all else is zero, the scale one."""
+        zeros, none = np.zeros((len(world_from_imu), 3)), np.zeros((3, 3))
+        return cls(
+            metres_per_unit=1.0,
+            world_from_imu=world_from_imu,
+            imu_in_world_m=zeros,
+            velocity_m_s=zeros,
+            gyro_bias_rad_s=zeros + gyro_bias_rad_s,
+            gravity_m_s2=gravity_m_s2,
+            accel_bias_m_s2=np.zeros(3),
+            accel_delay_s=0.0,
+            gyro_gain=none,
+            accel_gain=none,
+            cam_from_imu=cam_from_imu,
+            imu_in_cam_m=imu_in_cam_m,
+            delay_s=0.0,
+            clock_rate=0.0,
+            shutter=np.zeros((4, 3, 3)),
+            coupling_m=none,
+            **dict.fromkeys(("accel_walk_m_s2", "drift_m", "accel_slow_m_s2"), zeros),
+        )
 
     @property
     def accel_biases_m_s2(self) -> Array:

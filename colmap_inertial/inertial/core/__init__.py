@@ -1,0 +1,1 @@
+"""What estimators from inertial data share: preintegration, parameters, factors, priors, normal equations."""
