@@ -641,7 +641,7 @@ def broken(*_, **__):
 
 def test_a_report_that_fails_costs_no_result_and_is_told(project, tmp_path, monkeypatch, report_failures, capsys):
     source = ProjectOptions(imu=project.imu, frame_times=project.frame_times)
-    for place in ("report.page.page_of", "drivers.reporting.scene_record"):
+    for place in ("checks.report.run_page.run_page", "reconstruction.drivers.reporting.scene_record"):
         monkeypatch.setattr(f"colmap_inertial.{place}", broken)
     out = tmp_path / "out"
     arguments = ["--imu", str(project.imu), "--frame-times", str(project.frame_times)]

@@ -101,12 +101,12 @@ def write_report(
         Where it cannot be written.
     """
     out = Path(out)
-    from colmap_inertial.checks.report.page import page_of
+    from colmap_inertial.checks.report.run_page import run_page
 
     target = out / "report.html"
     try:
         content = gather(out, result=result, stopped=stopped, capture=capture)
-        page = page_of(content, out)
+        page = run_page(content, out)
     except (LookupError, TypeError, ValueError, ArithmeticError, AttributeError, RecursionError) as error:
         told = f"{type(error).__name__}: {error}"
         raise FormatError(

@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-from html import escape
-
 import numpy as np
 
 from colmap_inertial import __version__
 from colmap_inertial.checks.report.figures import BAD, IMU, QUIET, Figure
-from colmap_inertial.checks.report.markup import facts, listing, table
-from colmap_inertial.checks.report.page import document
-from colmap_inertial.checks.report.parts import Plot, Section
+from colmap_inertial.checks.report.page import render_page
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import IMU_CAL, Array
 from colmap_inertial.inertial.core.priors import KNOWN_GAIN, model_scale_sigma
 from colmap_inertial.inertial.static_calibration import RestCalibration
-
-#: How the page is coloured.
-_TONE = {"good": "trusted", "weak": "weak"}
 
 
 def calibration_page(found: RestCalibration, *, source: str) -> str:
@@ -29,12 +22,25 @@ def calibration_page(found: RestCalibration, *, source: str) -> str:
     source
         The recording's path.
     """
-    return document(
-        [_outcome(found), _residuals(found), _numbers(found)],
-        title="IMU calibration" + (f" of {found.calibration.device}" if found.calibration.device else ""),
-        verdict=_TONE[found.verdict],
+    calibration, rests = found.calibration, found.rests
+    middle_s, between_s = 0.5 * (rests.begin_s + rests.end_s), 0.5 * (rests.end_s[:-1] + rests.begin_s[1:])
+    names = [f"attitude {number + 1}" for number in rests.attitude]
+    before, after = (100 * error / calibration.gravity_m_s2 for error in (found.before_m_s2, found.after_m_s2))
+    corrected = ("corrected", IMU, middle_s, after, names)
+    turns = ("turn", BAD, between_s, np.degrees(found.turn_residual_rad), [""] * len(between_s))
+    return render_page(
+        "imu_calibration.html",
+        title="IMU calibration" + (f" of {calibration.device}" if calibration.device else ""),
+        tone={"good": "trusted", "weak": "weak"}[found.verdict],
         source=source,
         footer=f"colmap-inertial {__version__}. The calibration itself is the JSON file beside this page.",
+        verdict=found.verdict,
+        reasons=[*found.reasons, gain_effect(found)],
+        values=_values(found),
+        lengths=_dots([("as read", QUIET, middle_s, before, names), corrected], "gravity too long (%)"),
+        corrected=_dots([corrected], "gravity too long (%)"),
+        turns=_dots([turns], "gravity missed after a turn (°)"),
+        parameters=_parameters(found),
     )
 
 
@@ -50,7 +56,7 @@ def gain_effect(found: RestCalibration) -> str:
     return f"{known}; the floor of a scale's interval falls from +-{before:.1g} % to +-{after:.1g} %"
 
 
-def _outcome(found: RestCalibration) -> Section:
+def _values(found: RestCalibration) -> list[tuple[str, str]]:
     calibration = found.calibration
     turns = np.degrees(found.turn_residual_rad[np.isfinite(found.turn_residual_rad)])
     values = [
@@ -63,45 +69,7 @@ def _outcome(found: RestCalibration) -> Section:
         values.append(("the sensors' temperature", f"{calibration.temperature_c:.0f} °C"))
     if len(turns) > 0:
         values.append(("turns miss gravity by", f"{np.sqrt(np.mean(turns**2)):.2g}° rms"))
-    parts = [
-        f'<span class="verdict">{escape(found.verdict)}</span><h2>{escape(_HEADLINES[found.verdict])}</h2>',
-        listing([*found.reasons, gain_effect(found)]),
-        facts(values),
-        "<!--links-->",
-    ]
-    return Section(anchor="outcome", short="", parts=parts, classes=f"outcome {_TONE[found.verdict]}")
-
-
-_HEADLINES = {"good": "The attitudes determine the calibration", "weak": "A part stays undetermined"}
-
-
-def _residuals(found: RestCalibration) -> Section:
-    middle_s = 0.5 * (found.rests.begin_s + found.rests.end_s)
-    between_s = 0.5 * (found.rests.end_s[:-1] + found.rests.begin_s[1:])
-    gravity = found.calibration.gravity_m_s2
-    names = [f"attitude {number + 1}" for number in found.rests.attitude]
-    lengths = _dots(
-        [
-            ("as read", QUIET, middle_s, 100 * found.before_m_s2 / gravity, names),
-            ("corrected", IMU, middle_s, 100 * found.after_m_s2 / gravity, names),
-        ],
-        "gravity too long (%)",
-    )
-    left = _dots([("corrected", IMU, middle_s, 100 * found.after_m_s2 / gravity, names)], "gravity too long (%)")
-    turned = _dots(
-        [("turn", BAD, between_s, np.degrees(found.turn_residual_rad), [""] * len(between_s))],
-        "gravity missed after a turn (°)",
-    )
-    parts: list[str | Plot] = [
-        "<h2>What is left over</h2>",
-        "<p>In each rest, the length of the mean reading against the strength of gravity:</p>",
-        Plot(figure=lengths, label="Length of gravity in each rest, as read and corrected"),
-        "<p>The same, corrected, by itself. Nothing but noise should be left:</p>",
-        Plot(figure=left, label="Length of gravity in each rest, corrected"),
-        "<p>From one rest to the next, the angle by which the corrected gyroscope misses gravity:</p>",
-        Plot(figure=turned, label="Angle by which the gyroscope misses gravity after each turn"),
-    ]
-    return Section(anchor="residuals", short="Residuals", parts=parts)
+    return values
 
 
 def _dots(series: list[tuple[str, str, Array, Array, list[str]]], title: str) -> Figure:
@@ -132,7 +100,8 @@ def _dots(series: list[tuple[str, str, Array, Array, list[str]]], title: str) ->
     return {"data": data, "layout": layout}
 
 
-def _numbers(found: RestCalibration) -> Section:
+def _parameters(found: RestCalibration) -> list[tuple[str, str, str]]:
+    """Name, value and 95 % of each parameter that was estimated."""
     calibration = found.calibration
     sigma = np.sqrt(np.diagonal(calibration.cov))
     rows = []
@@ -154,9 +123,4 @@ def _numbers(found: RestCalibration) -> Section:
     ):
         for axis, value, s in zip("xyz", bias, sigma[where], strict=True):
             rows.append((f"{name} bias {axis}", f"{value:+.5f} {unit}", f"±{Z95 * s:.2g} {unit}"))
-    parts = [
-        "<h2>Parameters</h2>",
-        "<p>True = (1 + gain) reading + misalignments - bias. Intervals hold 95 %.</p>",
-        table(("parameter", "value", "95 %"), rows, numbers=(1, 2)),
-    ]
-    return Section(anchor="parameters", short="Parameters", parts=parts)
+    return rows

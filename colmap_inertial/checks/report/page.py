@@ -1,117 +1,159 @@
-"""The page: one file that needs nothing else. Text and tables stand without scripts; plots are drawn by plotly.js."""
+"""Pages: single files that need nothing else, from the templates beside this module.
+
+Templates escape whatever they are given (``autoescape``): names and messages come from strangers.
+"""
 
 from __future__ import annotations
 
 import base64
 import gzip
 import json
-from collections.abc import Iterator, Sequence
+import math
+import re
+from collections.abc import Sequence
 from functools import cache
-from html import escape
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from colmap_inertial.checks.report.figures import Figure
-from colmap_inertial.checks.report.parts import Section
-from colmap_inertial.checks.report.sections import sections_of
+from colmap_inertial.checks.report.words import digits, signed
+from colmap_inertial.inertial.scale.verdict import TRUSTED_HALF_WIDTH, WEAK_HALF_WIDTH
+from colmap_inertial.io.files import read_bytes
+from colmap_inertial.io.images import require_modest
+from colmap_inertial.io.names import path_in
 
-_HERE = Path(__file__).parent
-#: Nothing may be loaded from anywhere, whatever the page holds. (plotly.js builds some of its shaders by evaluation.)
-_POLICY = (
-    "default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; script-src 'unsafe-inline' 'unsafe-eval'; "
-    "font-src data:"
-)
-_NO_SCRIPT = "The plots need JavaScript. All text and tables are complete without them."
+if TYPE_CHECKING:
+    from jinja2 import Environment
+    from markupsafe import Markup
+
+_UNIT = re.compile(r"(\d) ((?:m|cm|mm|s|ms|px|Hz|m/s²|°/s)\b|%)")
+#: Images are embedded no wider than this, as JPEG of this quality.
+_IMAGE = {"width_px": 720, "jpeg_quality": 78}
 
 
-def page_of(content: dict[str, Any], out: Path) -> str:
-    """The report as HTML.
+def render_page(template: str, *, out: Path | None = None, **values: Any) -> str:
+    """A page as HTML.
 
     Parameters
     ----------
-    content
-        As ``colmap_inertial.checks.report`` describes it.
+    template
+        Name of its template.
     out
-        Folder that its images' paths start from.
+        Folder that paths of its images start from.
+    values
+        What the template shows; of every page ``title``, ``source``, ``footer`` and ``tone``, which colours it
+        (``"trusted"``, ``"weak"``, ``"refused"`` or ``"stopped"``).
+
+    Raises
+    ------
+    LookupError
+        Where the template names what is not in the values.
     """
-    versions = ", ".join(f"{name} {number}" for name, number in content["versions"].items())
-    made = content["made"]
-    if made is not None:
-        versions = f"{made['date']}, {versions}, {made['machine']}, {made['processors']} processors"
-    return document(
-        list(sections_of(content, out)),
-        title=content["title"],
-        verdict=content["outcome"]["verdict"],
-        source=content["capture"],
-        footer=f"{versions}. The same content for programs: report.json.",
-    )
+    from jinja2 import UndefinedError
+    from markupsafe import Markup
 
-
-def document(sections: Sequence[Section], *, title: str, verdict: str, source: str, footer: str) -> str:
-    """A whole page of sections; the texts are plain, and escaped here.
-
-    Parameters
-    ----------
-    sections
-        In order; the first one is the outcome, with a place for links.
-    title, verdict, source, footer
-        What it is about, what was found (``"trusted"``, ``"weak"``, ``"refused"`` colour the page), where it came from.
-    """
     figures: dict[str, Figure] = {}
-    body = "".join(_section(section, figures) for section in sections)
-    title, verdict = escape(title), escape(verdict)
-    links = "".join(f'<a href="#{s.anchor}">{escape(s.short)}</a>' for s in sections[1:] if s.short)
-    parts = [
-        "<!DOCTYPE html>",
-        f'<html lang="en" class="{verdict}"><head><meta charset="utf-8">',
-        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">',
-        '<meta name="viewport" content="width=device-width, initial-scale=1">',
-        '<link rel="icon" href="data:,">',
-        f"<title>{title}: {verdict}</title><style>{_asset('page.css')}</style></head><body>",
-        f'<header><h1>{title}</h1><p class="soft small">{escape(source)}</p></header>',
-        f'<main><p id="notice" hidden></p><noscript><p>{_NO_SCRIPT}</p></noscript>',
-        body.replace("<!--links-->", f"<nav>{links}</nav>" if links else "", 1),
-        f"</main><footer>{escape(footer)}</footer>",
-    ]
-    if figures:
-        packed = json.dumps(figures, separators=(",", ":"), allow_nan=False)
-        parts += [
-            f'<script type="application/octet-stream" id="library">{_library()}</script>',
-            f'<script type="application/octet-stream" id="figures">{_packed(packed.encode())}</script>',
-            f"<script>{_asset('page.js')}</script>",
-        ]
-    return "\n".join([*parts, "</body></html>", ""])
+    links: list[tuple[str, str]] = []
 
-
-def _section(section: Section, figures: dict[str, Figure]) -> str:
-    """A section's HTML; its figures get a place, and are kept."""
-    return (
-        f'<section id="{section.anchor}" class="{section.classes}">'
-        + "".join(_placed(section, figures))
-        + "</section>\n"
-    )
-
-
-def _placed(section: Section, figures: dict[str, Figure]) -> Iterator[str]:
-    for part in section.parts:
-        if isinstance(part, str):
-            yield part
-            continue
+    def plot(figure: Figure, label: str) -> Markup:
+        """A place for a figure; ``label`` is for those who cannot see it."""
         key = f"f{len(figures)}"
-        figures[key] = part.figure
-        height = part.figure["layout"]["height"]
-        label = escape(part.label, quote=True)
-        place = f'data-figure="{key}" style="min-height:{height}px"'
-        yield f'<div class="plot" {place} role="img" aria-label="{label}"></div>'
+        figures[key] = figure
+        place = '<div class="plot" data-figure="{}" style="min-height:{}px" role="img" aria-label="{}"></div>'
+        return Markup(place).format(key, figure["layout"]["height"], label)
+
+    def add_link(anchor: str, short: str) -> str:
+        """Note a section for the list of links, where it has a name there."""
+        if short:
+            links.append((anchor, short))
+        return ""
+
+    def embedded(paths: Sequence[str], captions: Sequence[str] | None = None) -> list[tuple[str, str]]:
+        return [] if out is None else embedded_images(out, paths, captions)
+
+    shared = {"plot": plot, "add_link": add_link, "embedded": embedded, "figures_drawn": figures, "links": links}
+    try:
+        return _environment().get_template(template).render(**values, **shared)
+    except UndefinedError as error:
+        raise LookupError(str(error)) from error
 
 
 @cache
-def _asset(name: str) -> str:
-    return (_HERE / name).read_text(encoding="utf-8")
+def _environment() -> Environment:
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("colmap_inertial.checks.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {
+        "prose": prose,
+        "sentence": sentence,
+        "digits": digits,
+        "signed": signed,
+        "degrees": math.degrees,
+        "packed_json": lambda value: _packed(json.dumps(value, separators=(",", ":"), allow_nan=False).encode()),
+    }
+    environment.globals |= {
+        "library": _plotly_library,
+        "gauge_at": _gauge_at,
+        "trusted_pct": 100 * TRUSTED_HALF_WIDTH,
+        "weak_pct": 100 * WEAK_HALF_WIDTH,
+    }
+    return environment
+
+
+def prose(text: str) -> Markup:
+    """Text for a paragraph: escaped, numbers kept on one line with their units."""
+    from markupsafe import Markup, escape
+
+    typeset = escape(text.replace("m/s2", "m/s²").replace("+-", "±"))
+    return Markup(_UNIT.sub("\\1\N{NO-BREAK SPACE}\\2", typeset))
+
+
+def sentence(text: str) -> Markup:
+    """The same, with a capital letter and a full stop."""
+    text = text.strip()
+    return prose(text[:1].upper() + text[1:] + ("" if text.endswith((".", "!", "?")) else "."))
+
+
+def _gauge_at(pct: float) -> float:
+    """Where a half-width lies on the gauge (of 10 to 490): from a tenth of a per cent to a hundred."""
+    return 10.0 + 480.0 * (min(max(math.log10(max(pct, 1e-9)), -1.0), 2.0) + 1) / 3
+
+
+def embedded_images(out: Path, paths: Sequence[str], captions: Sequence[str] | None = None) -> list[tuple[str, str]]:
+    """Caption (by default the file's name) and data URL of each image; those that are gone are left out."""
+    named = zip(captions or [Path(path).stem for path in paths], paths, strict=True)
+    found = ((caption, _data_url(path_in(out, path))) for caption, path in named)
+    return [(caption, url) for caption, url in found if url is not None]
+
+
+def _data_url(path: Path) -> str | None:
+    import cv2
+
+    if not path.is_file():
+        return None
+    data = read_bytes(path)
+    require_modest(path, data)
+    image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR) if data else None
+    if image is None:
+        return None
+    height, width = image.shape[:2]
+    widest = _IMAGE["width_px"]
+    if width > widest:
+        image = cv2.resize(image, (widest, round(height * widest / width)), interpolation=cv2.INTER_AREA)
+        data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _IMAGE["jpeg_quality"]])[1].tobytes()
+    return f"data:image/jpeg;base64,{base64.b64encode(data).decode('ascii')}"
 
 
 @cache
-def _library() -> str:
+def _plotly_library() -> str:
     """plotly.js, packed: it is five megabytes long."""
     from plotly.offline import get_plotlyjs
 

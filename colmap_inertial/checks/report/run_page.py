@@ -1,0 +1,242 @@
+"""The page of a run: what its template takes beside the content, as labelled values and rows of tables."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from colmap_inertial.checks.report import figures, photogrammetry_figures
+from colmap_inertial.checks.report.content import refined_parts
+from colmap_inertial.checks.report.figure_3d import scene_figure
+from colmap_inertial.checks.report.page import render_page
+from colmap_inertial.checks.report.words import digits, not_checked, signed
+from colmap_inertial.core.quantiles import Z95
+from colmap_inertial.inertial.scale.verdict import scale_drifts
+
+Content = dict[str, Any]
+Rows = list[tuple[str, ...]]
+
+_METHODS = {"joint": "all measurements in one fit", "spectral": "spectra of both sensors"}
+#: What the paths of a result are.
+_WRITTEN = {
+    "sparse": "COLMAP's own model",
+    "sparse_metric": "the model in metres",
+    "trajectory": "the camera's path in metres, smoothed by the IMU or refined",
+    "project_metric": "the whole project in metres",
+}
+#: What COLMAP calls the parameters of its cameras; the others are distortion.
+_PARAMETERS = {
+    "f": "focal length",
+    "fx": "focal length, across",
+    "fy": "focal length, down",
+    "cx": "principal point, across",
+    "cy": "principal point, down",
+}
+#: Of intrinsics, so that a row fits the narrowest page.
+_MOST_DECIMALS = 6
+
+
+def run_page(content: Content, out: Path) -> str:
+    """The report as HTML.
+
+    Parameters
+    ----------
+    content
+        As ``colmap_inertial.checks.report`` describes it.
+    out
+        Folder that its images' paths start from.
+    """
+    made, left_out = content["made"], Rows()
+    versions = ", ".join(f"{name} {number}" for name, number in content["versions"].items())
+    if made is not None:
+        versions = f"{made['date']}, {versions}, {made['machine']}, {made['processors']} processors"
+
+    def has_data(title: str, record: Content) -> bool:
+        """Whether there is data for a section; noted where not."""
+        if "missing" in record:
+            left_out.append((title, record["missing"]))
+        return "missing" not in record
+
+    helpers: Sequence[Callable[..., Any]] = (
+        *(run_facts, survey_facts, target_facts, intrinsics_rows, readout_rows, written_rows, model_rows, gap_rows),
+        *(drifted_parts, refined_parts, not_checked, scale_drifts, scene_figure),
+    )
+    return render_page(
+        "report.html",
+        out=out,
+        content=content,
+        title=content["title"],
+        tone=content["outcome"]["verdict"],
+        source=content["capture"],
+        footer=f"{versions}. The same content for programs: report.json.",
+        left_out=left_out,
+        has_data=has_data,
+        figures=figures,
+        survey_figures=photogrammetry_figures,
+        rms_of=_rms_of_images,
+        z95=Z95,
+        **{helper.__name__: helper for helper in helpers},
+    )
+
+
+def run_facts(content: Content) -> Iterator[tuple[str, str]]:
+    """The numbers below the outcome: of the first model, and of the recording."""
+    recording, selection = content["recording"], content["selection"]
+    for model in content["models"][:1]:
+        count = recording["frames"]["count"] if recording else None
+        yield "images in the model", f"{model['registered_images']}{f' of {count}' if count else ''}"
+        yield "points", f"{model['points']:,}".replace(",", " ")
+        yield "reprojection error", f"{model['mean_reprojection_error_px']:.2f} px"
+        path = model["scene"].get("path_length")
+        if path is not None:
+            yield "camera path", f"{digits(path, 3)} {_unit(model['scene'])}"
+        if model["excitation_m_s2"] is not None and model["metres_per_unit"] is not None:
+            yield "camera acceleration", f"{digits(model['excitation_m_s2'], 2)} m/s²"
+        yield "how the scale was found", _METHODS.get(model["method"]) or str(model["method"])
+        if model["gyro_time_offset_s"] is not None:
+            yield "camera clock − IMU clock", f"{signed(model['gyro_time_offset_s'], 4)} s"
+    if selection is not None:
+        yield "frames used", f"{selection['used']} of {selection['frames']}: {selection['note']}"
+    if recording is not None:
+        frames, imu = recording["frames"], recording["imu"]
+        interval = frames["interval_s"]
+        rate = f" at {digits(1 / interval, 3)} per s" if interval else ""
+        yield "frames", f"{frames['count']} in {digits(frames['duration_s'], 3)} s{rate}"
+        accel = f", accelerometer {digits(imu['accel_hz'], 3)}" if imu["accel_hz"] else ", no accelerometer"
+        yield "IMU", f"gyroscope {digits(imu['gyro_hz'], 3)}{accel} Hz"
+        if imu["device"]:
+            yield "device", imu["device"]
+
+
+def _unit(record: Content) -> str:
+    return "m" if record["unit"] == "m" else "model units"
+
+
+def survey_facts(survey: Content, scene: Content, place: Content | None) -> Iterator[tuple[str, str]]:
+    """Extent, ground sampling distance, tracks, and the model's place on Earth where it was asked for."""
+    unit, images = _unit(survey), survey["images"]
+    if survey["extent"] is not None:
+        x, y, up = (digits(v, 3) for v in survey["extent"])
+        yield "extent (nearly all points)", f"{x} × {y} {unit}, {up} {unit} high"
+    gsd = sorted(image["gsd"] for image in images if image["gsd"] is not None)
+    if gsd:
+        middle = gsd[len(gsd) // 2]
+        length = f"{digits(1000 * middle, 3)} mm" if unit == "m" else f"{digits(middle, 3)} {unit}"
+        yield "ground sampling distance", f"{length} a pixel"
+    if images:
+        yield "points an image", f"{sum(i['observations'] for i in images) / len(images):.0f}"
+    yield "mean track length", digits(survey["tracks"]["mean"], 3)
+    if scene.get("path_length") is not None:
+        yield "camera path", f"{digits(scene['path_length'], 3)} {unit}"
+    if place is not None:
+        yield from _place_facts(place)
+
+
+def _place_facts(place: Content) -> Iterator[tuple[str, str]]:
+    if "error" in place:
+        yield "on the map", place["error"]
+        return
+    origin, positions, delay = place["origin"], place["positions"], place.get("delay")
+    yield "on the map", f"{origin['latitude_deg']:.6f}°, {origin['longitude_deg']:.6f}°"
+    yield "heading, place", f"±{digits(place['heading_ci95_deg'], 2)}°, ±{digits(place['position_ci95_m'], 2)} m"
+    yield "by", f"{positions['used']} positions ({positions['left_out']} left out): {positions['source']}"
+    if delay is not None:
+        yield "they lag by", f"{digits(delay['seconds'], 2)} ±{digits(delay['ci95_s'], 2)} s"
+    yield from (("note", note) for note in place["notes"])
+
+
+def _rms_of_images(images: Sequence[Content]) -> float:
+    """Root mean square of the images' residuals (px)."""
+    known = [image["rms_px"] for image in images if image["rms_px"] is not None]
+    return math.sqrt(sum(value**2 for value in known) / len(known)) if known else 0.0
+
+
+def target_facts(target: Content) -> Iterator[tuple[str, str]]:
+    """What was measured at a target of known size."""
+    yield "target", target["target"]
+    if target["scale_error_pct"] is not None:
+        low, high = target["ci95_pct"]
+        yield "error of lengths", f"{signed(target['scale_error_pct'])} % ({signed(low)} to {signed(high)})"
+        yield "tolerance", f"{target['tolerance_pct']:g} %, {'kept' if target['within_tolerance'] else 'exceeded'}"
+    yield "images", f"{target['views_used']} used of {target['views_searched']} searched"
+    yield "corners", f"{target['corners_used']} used, {target['corners_rejected']} rejected"
+    yield "residual, rms", f"{target['rms_px']:.2f} px"
+    lengths = target.get("lengths")
+    if lengths is not None:
+        rms, largest = 1000 * lengths["rms_m"], 1000 * lengths["largest_m"]
+        yield "errors of lengths", f"rms {rms:.3g} mm, largest {largest:+.3g} mm"
+        yield "longest length", f"{digits(lengths['longest_m'], 3)} m, {lengths['directions']} directions"
+
+
+def intrinsics_rows(camera: Content) -> Rows:
+    """Name, meaning, value and standard deviation of each parameter of a camera."""
+    sigma = camera.get("sigma", {})
+    return [
+        (key, _PARAMETERS.get(key, "distortion"), *_with_sigma(value, sigma.get(key)))
+        for key, value in camera["params"].items()
+    ]
+
+
+def _with_sigma(value: float, sigma: float | None) -> tuple[str, str]:
+    """A value to the second digit of its standard deviation, and that."""
+    if sigma is None or not sigma > 0:
+        return f"{value:.6g}", ""
+    decimals = max(0, 1 - math.floor(math.log10(sigma)))
+    if decimals > _MOST_DECIMALS:
+        return f"{value:.6g}", f"{sigma:.2g}"
+    return f"{value:.{decimals}f}", f"{sigma:.{decimals}f}"
+
+
+def readout_rows(models: Sequence[Content]) -> Rows:
+    """What taking the translation within the readout out of each model changed."""
+    rows: Rows = []
+    for model in models:
+        change = model.get("readout_translation")
+        if change:
+            lengths = f"{change['shift_px']:.2f}", f"{change['before_px']:.3f}", f"{change['after_px']:.3f}"
+            rows.append(
+                (str(model["index"]), *lengths, "kept" if change["accepted"] else "not worth it, left as it was")
+            )
+    return rows
+
+
+def written_rows(content: Content) -> Rows:
+    """Each path of the result, and what lies there."""
+    paths = [(key, model[key]) for model in content["models"] for key in ("sparse", "sparse_metric", "trajectory")]
+    paths.append(("project_metric", content["project_metric"]))
+    return [("this folder" if path == "." else path, _WRITTEN[key]) for key, path in paths if path is not None]
+
+
+def model_rows(models: Sequence[Content]) -> Rows:
+    """Number, verdict, scale, images and method of each model."""
+    return [
+        (
+            str(model["index"]),
+            model["verdict"],
+            "none" if model["metres_per_unit"] is None else f"{digits(model['metres_per_unit'], 5)} m",
+            str(model["registered_images"]),
+            model["method"],
+        )
+        for model in models
+    ]
+
+
+def gap_rows(gaps: Sequence[Content]) -> Rows:
+    """The gaps between COLMAP's models: how long, how well known (1 sigma), and whether they were joined across it."""
+    return [
+        (
+            f"{gap['first']}, {gap['second']}",
+            f"{gap['seconds']:.2f}",
+            "unknown" if gap["sigma_m"] is None else digits(100 * gap["sigma_m"], 2),
+            "unknown" if gap["sigma_deg"] is None else digits(gap["sigma_deg"], 2),
+            gap["reason"] if gap["joined"] else f"apart: {gap['reason']}",
+        )
+        for gap in gaps
+    ]
+
+
+def drifted_parts(parts: Sequence[Content]) -> int:
+    """How many parts of a path had drifted by more than their 95 % interval."""
+    return sum(abs(part["percent"]) > Z95 * part["sigma_percent"] for part in parts)
