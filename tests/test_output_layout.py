@@ -14,7 +14,7 @@ from test_io_ply import SIMILARITY
 from test_pipeline import copy_scene
 from test_pipeline_parts import session_in
 
-from colmap_inertial.checks.report.words import mapped_in_words, parts_mapped_in_words
+from colmap_inertial.checks.words import mapped_in_words, parts_mapped_in_words
 from colmap_inertial.cli.terminal import show_result
 from colmap_inertial.colmap import dense as dense_room
 from colmap_inertial.colmap.depth_maps import MadeFrom

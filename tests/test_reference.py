@@ -37,7 +37,10 @@ def test_a_known_distance_of_two_points_makes_a_project_metric(bare, tmp_path, c
     args = ["--scale-from", "distance", "--between", *between, "--distance", "2.5+-0.01"]
     code, said, err = run(capsys, "reconstruct", bare, out, *args)
     assert code == 0, err
-    assert "10 m are 10 m to within 7.8 cm" in said and said.splitlines()[-1] == f"next: colmap-inertial view {out}"
+    assert (
+        "lengths of 10 m are right to within 7.8 cm" in said
+        and said.splitlines()[-1] == f"next: colmap-inertial view {out}"
+    )
     after = pycolmap.Reconstruction(str(out / "sparse" / "0"))
     a, b = (after.image(i).projection_center() for i in (images[0], images[-1]))
     assert np.linalg.norm(a - b) == pytest.approx(2.5)
@@ -128,7 +131,7 @@ def test_pictures_alone_are_mapped_and_scaled(pictures, tmp_path, monkeypatch, c
     monkeypatch.setattr(rooms, "validate_model", lambda *_, **__: validated(0.5, unscaled=True))
     code, said, err = run(capsys, *args)
     assert code == 0, err
-    assert "10 m are 10 m to within" in said
+    assert "lengths of 10 m are right to within" in said
     assert mapped == [["0.png", "1.png", "2.png", "3.png"]]  # not a second time
     assert sorted(path.name for path in out.iterdir()) == ["colmap", "images", "scale.json", "sparse", "transform.json"]
     found = json.loads((out / "scale.json").read_text())

@@ -24,7 +24,7 @@ from colmap_inertial.checks.report.figure_3d import nice_length, scene_figure
 from colmap_inertial.checks.report.scene import scene_record
 from colmap_inertial.checks.report.series import MOST_POINTS, rounded, strided, thinned
 from colmap_inertial.checks.report.signals import signal_record
-from colmap_inertial.checks.report.words import outcome_of_model
+from colmap_inertial.checks.words import outcome_of_model
 from colmap_inertial.cli import main
 from colmap_inertial.core.errors import FormatError, InertialError, MappingError
 from colmap_inertial.core.geometry import quat_exp, quat_rotate

@@ -253,7 +253,7 @@ def test_the_last_screen_begins_with_metres_and_ends_with_the_next_command(made,
     _, out, _ = run(capsys, *made)
     lines = out.splitlines()
     box = [line for line in lines if line.startswith("\u2502")]
-    assert re.match(r"\u2502 Metres +10 m are 10 m to within \d+(\.\d)? cm", box[0])
+    assert re.match(r"\u2502 Metres +lengths of 10 m are right to within \d+(\.\d)? cm", box[0])
     assert [line.split()[1] for line in box if line.split()[1] in ("Verdict", "Scale", "Images", "Written")] == [
         "Verdict", "Scale", "Images", "Written",
     ]  # fmt: skip

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,8 +18,7 @@ if TYPE_CHECKING:
 
     from colmap_inertial.checks.diagnose import Diagnosis
     from colmap_inertial.checks.validate import Validation
-    from colmap_inertial.core.types import CameraImuCalibration, Gap, JoinedPart, ScaleEstimate
-    from colmap_inertial.inertial.georeference import Georeference
+    from colmap_inertial.core.types import CameraImuCalibration, ScaleEstimate
     from colmap_inertial.inertial.static_calibration import RestCalibration
     from colmap_inertial.model.project import Applied
     from colmap_inertial.pipeline.run.workspace import Workspace
@@ -27,7 +26,7 @@ if TYPE_CHECKING:
     from colmap_inertial.reconstruction.drivers.deblur import DeblurResult
     from colmap_inertial.reconstruction.drivers.device_store import Remembered
     from colmap_inertial.reconstruction.drivers.reference import Reference
-    from colmap_inertial.reconstruction.drivers.result import ReconstructResult
+    from colmap_inertial.reconstruction.drivers.result import ModelResult, ReconstructResult
     from colmap_inertial.reconstruction.preparation.plan import ImagingPlan
     from colmap_inertial.tools.export.whole import Exported
 
@@ -35,18 +34,6 @@ if TYPE_CHECKING:
 Line = tuple[str, "str | Text"]
 
 _COLOUR = {"trusted": "green", "weak": "yellow", "refused": "red"}
-
-
-def headline(estimate: ScaleEstimate) -> str:
-    """What a user wants to know first: how far off ten metres may be."""
-    from colmap_inertial.checks.report.words import half_width_pct, length_error
-
-    if estimate.metres_per_unit is None or estimate.ci95 is None:
-        return "no metres: the recording does not tell how large things are"
-    error = length_error(half_width_pct(estimate.metres_per_unit, estimate.ci95))
-    if estimate.verdict == "trusted":
-        return f"10 m are 10 m to within {error}"
-    return f"10 m may be off by {error}, or by more for the reasons below: check a known length before you measure"
 
 
 def next_command(result: ReconstructResult, source: Path) -> str:
@@ -69,35 +56,30 @@ def scale_lines(estimate: ScaleEstimate) -> list[Line]:
     """The estimate as labelled lines, the first of them what a user wants to know."""
     from rich.text import Text
 
+    from colmap_inertial.checks.words import half_width_pct, length_in_words, scale_facts, sensor_facts
     from colmap_inertial.inertial.scale.parts import parts_in_words
 
-    lines: list[Line] = [("Metres", Text(headline(estimate), "bold"))]
-    lines.append(("Verdict", Text(estimate.verdict, f"bold {_COLOUR[estimate.verdict]}")))
+    metres = "no metres: the recording does not tell how large things are"
     if estimate.metres_per_unit is not None and estimate.ci95 is not None:
-        low, high = estimate.ci95
-        half_width = 50 * (high - low) / estimate.metres_per_unit
-        lines.append(("Scale", f"{estimate.metres_per_unit:.6g} m per unit, +-{half_width:.2g} % (95 %)"))
-        lines.append(("Interval", f"{low:.6g} to {high:.6g} m per unit"))
-    if estimate.parts is not None:
-        made_of, advice = parts_in_words(estimate.parts)
-        lines += [("Made of", made_of), ("Narrower", advice)]
-    lines += [("Reason" if i == 0 else "", text) for i, text in enumerate(estimate.reasons)]
-    lines += [("Note" if i == 0 else "", text) for i, text in enumerate(estimate.notes)]
-    calibration = estimate.calibration
-    if calibration is not None:
-        gyro, accel = calibration.gyro_time_offset_s, calibration.accel_time_offset_s
-        lines.append(
-            ("Time offset", f"gyro {gyro:+.4f} s, accelerometer {accel:+.4f} s (camera time = stamp + offset)")
-        )
-        bias = ", ".join(f"{value:+.4f}" for value in calibration.gyro_bias_rad_s)
-        lines.append(("Gyro bias", f"{bias} rad/s"))
-    if estimate.accel_bias_m_s2 is not None:
-        bias = ", ".join(f"{value:+.3f}" for value in estimate.accel_bias_m_s2)
-        lines.append(("Accel. bias", f"{bias} m/s2"))
-    return lines
+        metres = length_in_words(estimate.verdict, half_width_pct(estimate.metres_per_unit, estimate.ci95))
+    values = estimate.as_json()
+    return [
+        ("metres", Text(metres, "bold")),
+        ("verdict", Text(estimate.verdict, f"bold {_COLOUR[estimate.verdict]}")),
+        *scale_facts(values),
+        *([] if estimate.parts is None else zip(("made of", "narrower"), parts_in_words(estimate.parts), strict=True)),
+        *_listed("reason", estimate.reasons),
+        *_listed("note", estimate.notes),
+        *sensor_facts(values),
+    ]
 
 
-def _show(title: str, lines: Sequence[Line]) -> None:
+def _listed(label: str, texts: Iterable[object]) -> list[Line]:
+    """Lines of which the first one bears the label."""
+    return [("" if i else label, str(text)) for i, text in enumerate(texts)]
+
+
+def _show(title: str, lines: Iterable[Line]) -> None:
     from rich.console import Console
     from rich.panel import Panel
     from rich.table import Table
@@ -108,13 +90,13 @@ def _show(title: str, lines: Sequence[Line]) -> None:
     table.add_column(overflow="fold")
     for label, text in lines:
         # not as markup: square brackets of paths and tables are meant
-        table.add_row(label, Text(text) if isinstance(text, str) else text)
+        table.add_row(label[:1].upper() + label[1:], Text(text) if isinstance(text, str) else text)
     Console().print(Panel(table, title=Text(title), title_align="left", expand=False))
 
 
 def show_scale(estimate: ScaleEstimate, source: Path) -> None:
     """Print one scale estimate."""
-    _show(str(source), [*scale_lines(estimate), ("Method", f"{estimate.method}, {estimate.runtime_s:.2f} s")])
+    _show(str(source), [*scale_lines(estimate), ("method", f"{estimate.method}, {estimate.runtime_s:.2f} s")])
 
 
 def show_applied(applied: Applied) -> None:
@@ -134,10 +116,9 @@ def show_applied(applied: Applied) -> None:
         kinds.setdefault(change.kind, []).append(f"{change.path} ({', '.join(change.changed)})")
     for kind, paths in kinds.items():
         more = f" and {len(paths) - 1} more" if len(paths) > 1 else ""
-        lines.append((kind.capitalize(), f"{paths[0]}{more}"))
-    lines.append(("Unchanged", ", ".join(f"{n} {how}" for how, n in applied.unchanged.items()) or "nothing"))
-    lines += [("Note", note) for note in applied.notes]
-    lines.append(("Written", str(applied.out)))
+        lines.append((kind, f"{paths[0]}{more}"))
+    lines.append(("unchanged", ", ".join(f"{n} {how}" for how, n in applied.unchanged.items()) or "nothing"))
+    lines += [*_listed("note", applied.notes), ("written", str(applied.out))]
     _show("Project", lines)
 
 
@@ -148,36 +129,19 @@ def show_remembered(known: Remembered) -> None:
 
 
 def _kept(kept: Path | None) -> list[Line]:
-    return [] if kept is None else [("Remembered", f"{kept}; reconstruct and scale take it by the device's name")]
+    return [] if kept is None else [("remembered", f"{kept}; reconstruct and scale take it by the device's name")]
 
 
 def show_imu_calibration(found: RestCalibration, source: Path, out: Path, kept: Path | None) -> None:
     """Print what the rests say of an IMU, with 95 % intervals."""
     from rich.text import Text
 
-    from colmap_inertial.checks.report.imu_calibration import gain_effect
+    from colmap_inertial.checks.report.imu_calibration import calibration_facts, gain_effect
 
-    calibration = found.calibration
     colour = {"good": "green", "weak": "yellow"}[found.verdict]
-    lines: list[Line] = [("Verdict", Text(found.verdict, f"bold {colour}"))]
-    lines += [("Reason" if i == 0 else "", reason) for i, reason in enumerate(found.reasons)]
-    before, after = found.rms_pct(found.before_m_s2), found.rms_pct(found.after_m_s2)
-    lines += [
-        ("Rests", f"{len(found.rests)} in {calibration.attitudes} attitudes"),
-        ("Gravity", f"off by {before:.2g} % rms over the rests as read, by {after:.2g} % corrected"),
-    ]
-    for name, label in (("accel", "Accel. gain"), ("gyro", "Gyro gain")):
-        gains = [f"{100 * getattr(calibration, f'{name}_gain')[i, i]:+.3f}" for i in range(3)]
-        spread = 196 * max(calibration.sigma(f"{name}_gain_{axis}{axis}") for axis in "xyz")
-        lines.append((label, f"{', '.join(gains)} %, +-{spread:.2g} (95 %)"))
-    units = {"accel": ("accel_bias_m_s2", "m_s2", "m/s2"), "gyro": ("gyro_bias_rad_s", "rad_s", "rad/s")}
-    for name, (field, suffix, unit) in units.items():
-        bias = ", ".join(f"{value:+.4f}" for value in getattr(calibration, field))
-        spread = 1.96 * max(calibration.sigma(f"{name}_bias_{axis}_{suffix}") for axis in "xyz")
-        lines.append(
-            (f"{name.capitalize()}. bias" if name == "accel" else "Gyro bias", f"{bias} {unit}, +-{spread:.2g}")
-        )
-    lines += [("Scale", gain_effect(found)), ("Written", str(out)), ("", str(out.with_suffix(".html"))), *_kept(kept)]
+    lines: list[Line] = [("verdict", Text(found.verdict, f"bold {colour}")), *_listed("reason", found.reasons)]
+    lines += [*calibration_facts(found), ("scale", gain_effect(found))]
+    lines += [*_listed("written", (out, out.with_suffix(".html"))), *_kept(kept)]
     _show(str(source), lines)
 
 
@@ -188,46 +152,33 @@ def show_calibration(calibration: CameraImuCalibration, source: Path, kept: Path
     bias = ", ".join(f"{value:+.4f}" for value in calibration.gyro_bias_rad_s)
     bias_spread = max(calibration.sigma(f"gyro_bias_{axis}_rad_s") for axis in "xyz")
     offset, offset_ms = calibration.gyro_time_offset_s, 1e3 * calibration.sigma("gyro_time_offset_s")
-    _show(
-        str(source),
-        [
-            ("Rotation", f"camera from IMU, xyzw: {rotation}, +-{spread_deg:.2g} deg"),
-            ("Time offset", f"{offset:+.4f} s, +-{offset_ms:.2g} ms (camera time = stamp + offset)"),
-            ("Gyro bias", f"{bias} rad/s, +-{bias_spread:.2g}"),
-            *_kept(kept),
-        ],
-    )
+    lines: list[Line] = [
+        ("rotation", f"camera from IMU, xyzw: {rotation}, +-{spread_deg:.2g} deg"),
+        ("time offset", f"{offset:+.4f} s, +-{offset_ms:.2g} ms (camera time = stamp + offset)"),
+        ("gyro bias", f"{bias} rad/s, +-{bias_spread:.2g}"),
+    ]
+    _show(str(source), [*lines, *_kept(kept)])
 
 
 def show_diagnosis(diagnosis: Diagnosis, source: Path) -> None:
-    """Print findings, worst first."""
+    """Print findings, worst first, and what could not be checked."""
     from rich.console import Console
-    from rich.markup import escape
     from rich.table import Table
+    from rich.text import Text
 
-    checked = ", ".join(diagnosis.checked) or "nothing"
-    console = Console()
-    if not diagnosis.findings:
-        console.print(f"{escape(str(source))}: nothing found (looked at: {checked})")
-        _say_not_checked(diagnosis)
-        return
-    table = Table(title=f"{escape(str(source))} (looked at: {checked})", title_justify="left", show_lines=True)
+    from colmap_inertial.checks.words import not_checked
+
+    title = f"{source} (looked at: {', '.join(diagnosis.checked) or 'nothing'})"
+    table = Table(title=Text(title), title_justify="left", show_lines=True)
     for column in ("Severity", "Code", "Found", "What to do"):
         table.add_column(column, overflow="fold", no_wrap=column in ("Severity", "Code"))
     for finding in diagnosis.findings:
-        colour = SEVERITY_COLOUR[finding.severity]
-        severity = f"[bold {colour}]{finding.severity}[/]"
-        table.add_row(severity, finding.code, escape(finding.evidence), escape(finding.advice))
-    console.print(table)
-    _say_not_checked(diagnosis)
-
-
-def _say_not_checked(diagnosis: Diagnosis) -> None:
-    from colmap_inertial.checks.report.words import not_checked
-
-    left = not_checked(diagnosis.checked)
-    if left:
-        print(f"not checked: {left}")
+        severity = Text(finding.severity, f"bold {SEVERITY_COLOUR[finding.severity]}")
+        table.add_row(severity, finding.code, Text(finding.evidence), Text(finding.advice))
+    Console().print(table if diagnosis.findings else Text(f"{title}: nothing found"))
+    unchecked = not_checked(diagnosis.checked)
+    if unchecked:
+        print(f"not checked: {unchecked}")
 
 
 def show_validation(result: Validation) -> None:
@@ -247,8 +198,8 @@ def imaging_lines(frames: Sequence[FrameRecord], plan: ImagingPlan, rectified: C
     done = ", ".join(f"{count} {action}" for action, count in counts.items() if count)
     view = plan.view
     lines: list[Line] = [
-        ("Deblurring", f"{done} of {len(frames)} frames: {plan.deblur_note}" if done else plan.deblur_note),
-        ("Shutter", shutter_note(plan, rectified)),
+        ("deblurring", f"{done} of {len(frames)} frames: {plan.deblur_note}" if done else plan.deblur_note),
+        ("shutter", shutter_note(plan, rectified)),
     ]
     return [*lines, *(("", note) for note in (() if view is None else view.notes))]
 
@@ -260,27 +211,16 @@ def show_nothing_to_do(workspace: Workspace) -> None:
 
 def show_reference(found: Reference) -> None:
     """Print where a project's metres come from, and how good they are."""
-    from colmap_inertial.checks.report.words import half_width_pct, length_error
+    from colmap_inertial.checks.words import half_width_pct, length_in_words, scale_facts
 
-    low, high = found.ci95
-    pct = half_width_pct(found.metres_per_unit, found.ci95)
     # a small target says how long things are where it lies, and no more
     lengths = None if found.validation is None else found.validation.lengths
     small = found.scale_from == "target" and lengths is not None and lengths.is_short
-    _show(
-        "Project",
-        [
-            (
-                "Metres",
-                f"10 m are 10 m to within {length_error(pct)}{', as far as the target reaches' if small else ''}",
-            ),
-            ("From", found.made_of),
-            ("Scale", f"{found.metres_per_unit:.6g} m per unit, +-{pct:.2g} % (95 %)"),
-            ("Interval", f"{low:.6g} to {high:.6g} m per unit"),
-            *(("Note" if i == 0 else "", note) for i, note in enumerate(found.notes)),
-            ("Written", str(found.out)),
-        ],
-    )
+    metres = length_in_words("trusted", half_width_pct(found.metres_per_unit, found.ci95))
+    values = {"metres_per_unit": found.metres_per_unit, "ci95": found.ci95}
+    lines: list[Line] = [("metres", f"{metres}{', as far as the target reaches' if small else ''}")]
+    lines += [("from", found.made_of), *scale_facts(values), *_listed("note", found.notes)]
+    _show("Project", [*lines, ("written", str(found.out))])
     print(f"next: {shlex.join(['colmap-inertial', 'view', str(found.out)])}")
 
 
@@ -302,67 +242,16 @@ def show_deblurred(result: DeblurResult) -> None:
     if result.sheet is not None:
         written.append(result.sheet)
     lines = imaging_lines(result.frames, result.imaging, result.rectified)
-    _show("Images", [*lines, *(("Written" if i == 0 else "", str(path)) for i, path in enumerate(written))])
-
-
-def _on_map(found: Georeference | InertialError) -> str:
-    from colmap_inertial.core.quantiles import Z95
-
-    if isinstance(found, InertialError):
-        return str(found)
-    heading, place = Z95 * found.heading_sigma_deg, Z95 * found.position_sigma_m
-    at = f"{found.latitude_deg:.6f}, {found.longitude_deg:.6f}"
-    return f"{at}: heading +-{heading:.1f} degrees, place +-{place:.1f} m, by {found.used} positions"
+    _show("Images", [*lines, *_listed("written", written)])
 
 
 def show_result(result: ReconstructResult, source: Path) -> None:
     """Print the end of a reconstruction of ``source`` on one screen; the last line is what to type next."""
-    from colmap_inertial.checks.report.words import mapped_in_words, parts_mapped_in_words
-    from colmap_inertial.checks.validate import Validation
-
-    mapping = None if result.mapping is None else asdict(result.mapping)
     if result.unchanged and not result.waiting:
         show_nothing_to_do(result.workspace)
-    frames = result.frames
-    used = sum(record.used for record in frames)
-    registered = f" of {used} registered ({len(frames)} frames)" if frames else ""
     for model in result.models:
-        summary = model.summary
-        lines: list[Line] = [
-            *scale_lines(model.scale),
-            ("Images", f"{summary['registered_images']}{registered}"),
-            ("Points", f"{summary['points']}, mean reprojection error {summary['mean_reprojection_error_px']:.2f} px"),
-            *(imaging_lines(frames, result.imaging, result.keypoints.rectified()) if frames else []),
-        ]
-        said = parts_mapped_in_words(mapping) if model is result.models[0] else []
-        if said := said + mapped_in_words(mapping, model.colmap_index):
-            lines.append(("Mapping", " ".join(said)))
-        if model.parts:
-            lines.append(("Joined", _joined(model.parts, result.gaps)))
-        if isinstance(model.validation, Validation) and model.validation.ci95_pct is not None:
-            low, high = model.validation.ci95_pct
-            error = f"{model.validation.scale_error_pct:+.2f} % (95 %: {low:+.2f} to {high:+.2f})"
-            lines.append(("Target", f"{model.validation.target.spec}: scale error {error}"))
-        elif isinstance(model.validation, InertialError):
-            lines.append(("Target", str(model.validation)))
-        if model.georeference is not None:
-            lines.append(("On the map", _on_map(model.georeference)))
-        dense = model.dense
-        made = [] if dense is None else [dense.fused, dense.mesh]
-        if dense is not None and not dense.waiting:
-            maps = f"{dense.depth_maps} depth maps of {dense.images} images"
-            lines.append(("Dense", f"{maps}, {dense.points} points, {dense.faces} faces"))
-        paths = (model.sparse_metric, model.trajectory, *made, result.project_metric)
-        written = [path for path in paths if path is not None]
-        lines += [
-            ("Written" if i == 0 else "", str(path))
-            for i, path in enumerate([*written, result.workspace.result, *([result.report] if result.report else [])])
-        ]
-        if result.report is None:
-            lines.append(("Report", f"failed, see {result.workspace.log}"))
-        lines.append(("Time", ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in result.seconds.items())))
         number = "" if model.colmap_index == model.index else f" (COLMAP's {model.colmap_index})"
-        _show(f"Model {model.index}{number}", lines)
+        _show(f"Model {model.index}{number}", _model_lines(model, result))
     if all(model.sparse_metric is None for model in result.models) and result.workspace.colmap_sparse.is_dir():
         print(
             f"metres by hand: colmap-inertial reconstruct {shlex.quote(str(result.workspace.colmap))} NEW_FOLDER "
@@ -380,16 +269,45 @@ def show_result(result: ReconstructResult, source: Path) -> None:
     print(f"next: {next_command(result, source)}")
 
 
-def _joined(parts: Sequence[JoinedPart], gaps: Sequence[Gap]) -> str:
-    """What a model was joined of, and how sure that is."""
-    inside = {part.colmap_index for part in parts}
-    across = [
-        f"{gap.seconds:.1f} s to {100 * (gap.sigma_m or 0.0):.1f} cm, {gap.sigma_deg:.2f} degrees"
-        for gap in gaps
-        if gap.joined and {gap.first, gap.second} <= inside
-    ]
-    numbers = ", ".join(str(part.colmap_index) for part in parts)
-    return f"COLMAP's models {numbers}; 1 sigma across: {'; '.join(across)}"
+def _model_lines(model: ModelResult, result: ReconstructResult) -> Iterator[Line]:
+    """What there is to say of one model, as labelled lines."""
+    from colmap_inertial.checks.words import (
+        joined_in_words,
+        mapped_in_words,
+        model_facts,
+        parts_mapped_in_words,
+        place_facts,
+        target_facts,
+    )
+    from colmap_inertial.reconstruction.drivers.result import measured_as_json
+
+    frames, dense = result.frames, model.dense
+    mapping = None if result.mapping is None else asdict(result.mapping)
+    used = sum(record.used for record in frames)
+    yield from scale_lines(model.scale)
+    yield from model_facts(model.summary, f" of {used} registered ({len(frames)} frames)" if frames else "")
+    if frames:
+        yield from imaging_lines(frames, result.imaging, result.keypoints.rectified())
+    made = parts_mapped_in_words(mapping) if model is result.models[0] else []
+    made += mapped_in_words(mapping, model.colmap_index)
+    if made:
+        yield "mapping", " ".join(made)
+    if model.parts:
+        yield "joined", joined_in_words([part.colmap_index for part in model.parts], [asdict(g) for g in result.gaps])
+    if isinstance(model.validation, InertialError):
+        yield "target", str(model.validation)
+    elif model.validation is not None and model.validation.scale_error_pct is not None:
+        yield from list(target_facts(model.validation.as_json()))[:2]
+    yield from place_facts(measured_as_json(model.georeference))
+    if dense is not None and not dense.waiting:
+        maps = f"{dense.depth_maps} depth maps of {dense.images} images"
+        yield "dense", f"{maps}, {dense.points} points, {dense.faces} faces"
+    made_of_dense = () if dense is None else (dense.fused, dense.mesh)
+    paths = (model.sparse_metric, model.trajectory, *made_of_dense, result.project_metric)
+    yield from _listed("written", filter(None, (*paths, result.workspace.result, result.report)))
+    if result.report is None:
+        yield "report", f"failed, see {result.workspace.log}"
+    yield "time", ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in result.seconds.items())
 
 
 def _layout_in_a_line(result: ReconstructResult) -> str:
@@ -413,13 +331,13 @@ def show_exported(made: Exported) -> None:
     )
     unit = "metres" if made.unit == "m" else Text("unknown: not metres", "bold red")
     lines: list[Line] = [
-        ("Model", f"{made.model}{several}"),
-        ("Unit", unit),
-        *([("Images", str(made.images))] if made.images else []),
-        *([("Points", str(made.points))] if made.points else []),
-        *(("Note", note) for note in made.notes),
-        *([("Use", made.says)] if made.says else []),
-        ("Written", str(made.folder)),
+        ("model", f"{made.model}{several}"),
+        ("unit", unit),
+        *([("images", str(made.images))] if made.images else []),
+        *([("points", str(made.points))] if made.points else []),
+        *_listed("note", made.notes),
+        *([("use", made.says)] if made.says else []),
+        ("written", str(made.folder)),
     ]
     _show("Export" if made.program is None else f"Export for {made.program}", lines)
     if made.command:

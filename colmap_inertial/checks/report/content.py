@@ -11,8 +11,9 @@ import numpy as np
 
 from colmap_inertial import __version__
 from colmap_inertial.checks.report.series import strided
-from colmap_inertial.checks.report.words import (
+from colmap_inertial.checks.words import (
     half_width_pct,
+    joined_in_words,
     mapped_in_words,
     outcome_of_model,
     outcome_of_stop,
@@ -80,7 +81,9 @@ def gather(
         outcome = outcome_of_stop(stopped or "COLMAP made no model.", findings=bool(findings.get("findings")))
     gaps = done.get("gaps", [])
     if shown and shown[0]["joined_of"]:
-        outcome = {**outcome, "summary": [*outcome["summary"], _joined(shown[0], gaps)]}
+        models_joined = [part["colmap_index"] for part in shown[0]["joined_of"]]
+        joined = f"It was joined of {joined_in_words(models_joined, gaps)}."
+        outcome = {**outcome, "summary": [*outcome["summary"], joined]}
     if shown:
         made = parts_mapped_in_words(done.get("mapping"))
         made += mapped_in_words(done.get("mapping"), shown[0].get("colmap_index"))
@@ -131,22 +134,6 @@ def refined_parts(model: Content) -> list[Content]:
     done = [one for one in model.get("treatments", []) if one["stage"] == "refine" and one["action"]]
     parts: list[Content] = done[-1]["values"].get("drift", []) if done else []
     return parts
-
-
-def _joined(model: Content, gaps: list[Content]) -> str:
-    """What a model was joined of, in a sentence."""
-    inside = {part["colmap_index"] for part in model["joined_of"]}
-    across = [
-        gap for gap in gaps if gap["joined"] and gap["sigma_m"] is not None and {gap["first"], gap["second"]} <= inside
-    ]
-    if not across:  # a stage of somebody's own need not say how well it knows them
-        return f"COLMAP made {len(inside)} models of it, which were joined into one."
-    worst = max(across, key=lambda gap: gap["sigma_m"])
-    return (
-        f"COLMAP made {len(inside)} models of it, which what the IMU felt between them made one; the gap that is known "
-        f"worst, of {worst['seconds']:.1f} s, to {100 * worst['sigma_m']:.1f} cm and {worst['sigma_deg']:.2f} degrees "
-        "(1 sigma)."
-    )
 
 
 def _selection(done: Content) -> Content | None:

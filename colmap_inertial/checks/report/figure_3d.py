@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from colmap_inertial.checks.report.figures import CAMERA, GOOD, IMU, QUIET, Figure
-from colmap_inertial.checks.report.words import digits
+from colmap_inertial.checks.words import digits
 from colmap_inertial.core.arrays import Array
 
 #: Share of the points that the box leaves out on each side; cells across the grid.

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from colmap_inertial.checks.report.words import digits
+from colmap_inertial.checks.words import digits
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.inertial.scale.verdict import WEAK_HALF_WIDTH, half_width
 

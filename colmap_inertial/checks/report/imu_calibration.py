@@ -7,6 +7,7 @@ import numpy as np
 from colmap_inertial import __version__
 from colmap_inertial.checks.report.figures import BAD, IMU, QUIET, Figure
 from colmap_inertial.checks.report.page import render_page
+from colmap_inertial.checks.words import Fact
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import IMU_CAL, Array
@@ -36,7 +37,7 @@ def calibration_page(found: RestCalibration, *, source: str) -> str:
         footer=f"colmap-inertial {__version__}. The calibration itself is the JSON file beside this page.",
         verdict=found.verdict,
         reasons=[*found.reasons, gain_effect(found)],
-        values=_values(found),
+        values=calibration_facts(found),
         lengths=_dots([("as read", QUIET, middle_s, before, names), corrected], "gravity too long (%)"),
         corrected=_dots([corrected], "gravity too long (%)"),
         turns=_dots([turns], "gravity missed after a turn (°)"),
@@ -56,7 +57,8 @@ def gain_effect(found: RestCalibration) -> str:
     return f"{known}; the floor of a scale's interval falls from +-{before:.1g} % to +-{after:.1g} %"
 
 
-def _values(found: RestCalibration) -> list[tuple[str, str]]:
+def calibration_facts(found: RestCalibration) -> list[Fact]:
+    """Rests, gravity and the sensors' gains and biases with 95 % intervals."""
     calibration = found.calibration
     turns = np.degrees(found.turn_residual_rad[np.isfinite(found.turn_residual_rad)])
     values = [
@@ -68,7 +70,16 @@ def _values(found: RestCalibration) -> list[tuple[str, str]]:
     if calibration.temperature_c is not None:
         values.append(("the sensors' temperature", f"{calibration.temperature_c:.0f} °C"))
     if len(turns) > 0:
-        values.append(("turns miss gravity by", f"{np.sqrt(np.mean(turns**2)):.2g}° rms"))
+        values.append(("turns miss gravity by", f"{np.sqrt(np.mean(turns**2)):.2g} degrees rms"))
+    for name, label in (("accel", "accel."), ("gyro", "gyro")):
+        unit = "m/s2" if name == "accel" else "rad/s"
+        gains = [f"{100 * getattr(calibration, f'{name}_gain')[i, i]:+.3f}" for i in range(3)]
+        gain_pct = 100 * Z95 * max(calibration.sigma(f"{name}_gain_{axis}{axis}") for axis in "xyz")
+        field = f"{name}_bias_{unit.replace('/', '_')}"
+        bias = ", ".join(f"{value:+.4f}" for value in getattr(calibration, field))
+        spread = Z95 * max(calibration.sigma(f"{name}_bias_{axis}_{unit.replace('/', '_')}") for axis in "xyz")
+        values.append((f"{label} gain", f"{', '.join(gains)} %, +-{gain_pct:.2g} (95 %)"))
+        values.append((f"{label} bias", f"{bias} {unit}, +-{spread:.2g} (95 %)"))
     return values
 
 

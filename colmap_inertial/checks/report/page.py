@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from colmap_inertial.checks.report.figures import Figure
-from colmap_inertial.checks.report.words import digits, signed
+from colmap_inertial.checks.words import digits, signed
 from colmap_inertial.inertial.scale.verdict import TRUSTED_HALF_WIDTH, WEAK_HALF_WIDTH
 from colmap_inertial.io.files import read_bytes
 from colmap_inertial.io.images import require_modest
@@ -28,7 +28,8 @@ if TYPE_CHECKING:
     from jinja2 import Environment
     from markupsafe import Markup
 
-_UNIT = re.compile(r"(\d) ((?:m|cm|mm|s|ms|px|Hz|m/s²|°/s)\b|%)")
+_UNIT = re.compile(r"(\d) ((?:m|cm|mm|s|ms|px|Hz|m/s²|°/s|rad/s)\b|%)")
+_MINUS = re.compile(r"(?<![^\s(])-(?=\d+\.\d)")
 #: Images are embedded no wider than this, as JPEG of this quality.
 _IMAGE = {"width_px": 720, "jpeg_quality": 78}
 
@@ -109,10 +110,10 @@ def _environment() -> Environment:
 
 
 def prose(text: str) -> Markup:
-    """Text for a paragraph: escaped, numbers kept on one line with their units."""
+    """Text for a paragraph: escaped, signs and exponents set in type, numbers kept on one line with their units."""
     from markupsafe import Markup, escape
 
-    typeset = escape(text.replace("m/s2", "m/s²").replace("+-", "±"))
+    typeset = escape(_MINUS.sub("−", text.replace("m/s2", "m/s²").replace("+-", "±")))
     return Markup(_UNIT.sub("\\1\N{NO-BREAK SPACE}\\2", typeset))
 
 

@@ -11,7 +11,16 @@ from colmap_inertial.checks.report import figures, photogrammetry_figures
 from colmap_inertial.checks.report.content import refined_parts
 from colmap_inertial.checks.report.figure_3d import scene_figure
 from colmap_inertial.checks.report.page import render_page
-from colmap_inertial.checks.report.words import digits, not_checked, signed
+from colmap_inertial.checks.words import (
+    Fact,
+    digits,
+    model_facts,
+    not_checked,
+    place_facts,
+    scale_facts,
+    sensor_facts,
+    target_facts,
+)
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.inertial.scale.verdict import scale_drifts
 
@@ -61,7 +70,7 @@ def run_page(content: Content, out: Path) -> str:
 
     helpers: Sequence[Callable[..., Any]] = (
         *(run_facts, survey_facts, target_facts, intrinsics_rows, readout_rows, written_rows, model_rows, gap_rows),
-        *(drifted_parts, refined_parts, not_checked, scale_drifts, scene_figure),
+        *(drifted_parts, refined_parts, not_checked, scale_drifts, scale_facts, scene_figure),
     )
     return render_page(
         "report.html",
@@ -81,22 +90,19 @@ def run_page(content: Content, out: Path) -> str:
     )
 
 
-def run_facts(content: Content) -> Iterator[tuple[str, str]]:
+def run_facts(content: Content) -> Iterator[Fact]:
     """The numbers below the outcome: of the first model, and of the recording."""
     recording, selection = content["recording"], content["selection"]
     for model in content["models"][:1]:
         count = recording["frames"]["count"] if recording else None
-        yield "images in the model", f"{model['registered_images']}{f' of {count}' if count else ''}"
-        yield "points", f"{model['points']:,}".replace(",", " ")
-        yield "reprojection error", f"{model['mean_reprojection_error_px']:.2f} px"
+        yield from model_facts(model, f" of {count}" if count else "")
         path = model["scene"].get("path_length")
         if path is not None:
             yield "camera path", f"{digits(path, 3)} {_unit(model['scene'])}"
         if model["excitation_m_s2"] is not None and model["metres_per_unit"] is not None:
             yield "camera acceleration", f"{digits(model['excitation_m_s2'], 2)} m/s²"
         yield "how the scale was found", _METHODS.get(model["method"]) or str(model["method"])
-        if model["gyro_time_offset_s"] is not None:
-            yield "camera clock − IMU clock", f"{signed(model['gyro_time_offset_s'], 4)} s"
+        yield from sensor_facts(model)
     if selection is not None:
         yield "frames used", f"{selection['used']} of {selection['frames']}: {selection['note']}"
     if recording is not None:
@@ -114,7 +120,7 @@ def _unit(record: Content) -> str:
     return "m" if record["unit"] == "m" else "model units"
 
 
-def survey_facts(survey: Content, scene: Content, place: Content | None) -> Iterator[tuple[str, str]]:
+def survey_facts(survey: Content, scene: Content, place: Content | None) -> Iterator[Fact]:
     """Extent, ground sampling distance, tracks, and the model's place on Earth where it was asked for."""
     unit, images = _unit(survey), survey["images"]
     if survey["extent"] is not None:
@@ -130,44 +136,13 @@ def survey_facts(survey: Content, scene: Content, place: Content | None) -> Iter
     yield "mean track length", digits(survey["tracks"]["mean"], 3)
     if scene.get("path_length") is not None:
         yield "camera path", f"{digits(scene['path_length'], 3)} {unit}"
-    if place is not None:
-        yield from _place_facts(place)
-
-
-def _place_facts(place: Content) -> Iterator[tuple[str, str]]:
-    if "error" in place:
-        yield "on the map", place["error"]
-        return
-    origin, positions, delay = place["origin"], place["positions"], place.get("delay")
-    yield "on the map", f"{origin['latitude_deg']:.6f}°, {origin['longitude_deg']:.6f}°"
-    yield "heading, place", f"±{digits(place['heading_ci95_deg'], 2)}°, ±{digits(place['position_ci95_m'], 2)} m"
-    yield "by", f"{positions['used']} positions ({positions['left_out']} left out): {positions['source']}"
-    if delay is not None:
-        yield "they lag by", f"{digits(delay['seconds'], 2)} ±{digits(delay['ci95_s'], 2)} s"
-    yield from (("note", note) for note in place["notes"])
+    yield from place_facts(place)
 
 
 def _rms_of_images(images: Sequence[Content]) -> float:
     """Root mean square of the images' residuals (px)."""
     known = [image["rms_px"] for image in images if image["rms_px"] is not None]
     return math.sqrt(sum(value**2 for value in known) / len(known)) if known else 0.0
-
-
-def target_facts(target: Content) -> Iterator[tuple[str, str]]:
-    """What was measured at a target of known size."""
-    yield "target", target["target"]
-    if target["scale_error_pct"] is not None:
-        low, high = target["ci95_pct"]
-        yield "error of lengths", f"{signed(target['scale_error_pct'])} % ({signed(low)} to {signed(high)})"
-        yield "tolerance", f"{target['tolerance_pct']:g} %, {'kept' if target['within_tolerance'] else 'exceeded'}"
-    yield "images", f"{target['views_used']} used of {target['views_searched']} searched"
-    yield "corners", f"{target['corners_used']} used, {target['corners_rejected']} rejected"
-    yield "residual, rms", f"{target['rms_px']:.2f} px"
-    lengths = target.get("lengths")
-    if lengths is not None:
-        rms, largest = 1000 * lengths["rms_m"], 1000 * lengths["largest_m"]
-        yield "errors of lengths", f"rms {rms:.3g} mm, largest {largest:+.3g} mm"
-        yield "longest length", f"{digits(lengths['longest_m'], 3)} m, {lengths['directions']} directions"
 
 
 def intrinsics_rows(camera: Content) -> Rows:

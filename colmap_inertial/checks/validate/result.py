@@ -10,6 +10,7 @@ import numpy as np
 
 from colmap_inertial.checks.validate.lengths import Corner, Distance, LengthCheck
 from colmap_inertial.checks.validate.targets import Target
+from colmap_inertial.checks.words import target_facts
 from colmap_inertial.core.arrays import Array, IndexArray
 
 if TYPE_CHECKING:
@@ -261,52 +262,10 @@ def validation_table(result: Validation) -> Group:
     figures = Table(title=f"Size against {result.target.spec}", show_header=False, title_justify="left")
     figures.add_column(justify="right")
     figures.add_column()
-    if result.scale_error_pct is not None and result.ci95_pct is not None:
-        passed = result.within_tolerance
-        verdict = f"within {result.tolerance_pct:g} %" if passed else f"outside {result.tolerance_pct:g} %"
-        figures.add_row(
-            "scale error",
-            Text.assemble(
-                (f"{result.scale_error_pct:+.3f} %", "bold green" if passed else "bold red"),
-                f"  (95 %: {result.ci95_pct[0]:+.3f} to {result.ci95_pct[1]:+.3f}), {verdict}",
-            ),
-        )
-    low, high = result.metres_per_unit_ci95
-    figures.add_row("metres per unit", f"{result.metres_per_unit:.6g}  (95 %: {low:.6g} to {high:.6g})")
-    if result.unscaled and result.check_error_pct is not None and result.check_ci95_pct is not None:
-        low, high = result.check_ci95_pct
-        figures.add_row("control against check", f"{result.check_error_pct:+.3f} %  (95 %: {low:+.3f} to {high:+.3f})")
-    if result.lengths is not None:
-        lengths = result.lengths
-        figures.add_row(
-            "length errors",
-            f"rms {1000 * lengths.rms_m:.3g} mm, largest {1000 * lengths.largest_m:+.3g} mm of {lengths.count}",
-        )
-        share = (
-            "" if lengths.longest_share is None else f", {100 * lengths.longest_share:.2g} % of the model's diagonal"
-        )
-        figures.add_row("longest length", f"{lengths.longest_m:.3g} m{share}; {lengths.directions} directions")
-    figures.add_row("images", f"{result.views_used} used of {result.views_searched} searched")
-    figures.add_row("corner observations", f"{result.corners_used} used, {result.corners_rejected} rejected")
-    figures.add_row(
-        "residuals",
-        f"{result.rms_px:.3f} px rms; corner noise {result.corner_noise_px:.3f} px per coordinate, "
-        f"pose errors {result.pose_noise_px:.3f} px",
-    )
-    for bar in result.bars:
-        figures.add_row(
-            f"bar {bar.markers[0]} to {bar.markers[1]}",
-            f"{bar.known_m:.6g} m, off by {1000 * bar.residual_m:+.3g} mm",
-        )
-    if result.apart is not None:
-        apart = result.apart
-        figures.add_row(f"to {apart.other}", f"{apart.known_m:.6g} m, off by {1000 * apart.residual_m:+.3g} mm")
-    if result.check_points is not None:
-        points = result.check_points
-        figures.add_row(
-            f"{len(points.points)} check points",
-            f"RMSE {1000 * points.rmse_horizontal_m:.3g} mm level, {1000 * points.rmse_vertical_m:.3g} mm upwards",
-        )
+    colours = {"scale error": "bold green" if result.within_tolerance else "bold red"}
+    for label, value in target_facts(result.as_json()):
+        if label != "target":
+            figures.add_row(label, Text(value, colours.get(label, "")))
     parts: list[Table | Text] = [figures]
     if result.distances:
         parts.append(_distance_table(result))
@@ -317,12 +276,8 @@ def validation_table(result: Validation) -> Group:
         for reason, count in Counter(view.reason for view in result.views_rejected).most_common():
             rejected.add_row(str(count), reason)
         parts.append(rejected)
-    said = (
-        result.reasons
-        if result.lengths is None
-        else (f"the check proves that {result.lengths.proves}", *result.reasons)
-    )
-    parts += [Text(f"- {reason}") for reason in said]
+    proved = [] if result.lengths is None else [f"the check proves that {result.lengths.proves}"]
+    parts += [Text(f"- {text}") for text in (*proved, *result.reasons)]
     return Group(*parts)
 
 
@@ -332,16 +287,11 @@ def _distance_table(result: Validation) -> Any:
     table = Table(title="Known distances, each corner triangulated on its own", title_justify="left")
     for name in ("known, mm", "count", "mean residual, mm", "rms, mm", "largest, mm"):
         table.add_column(name, justify="right")
-    by_length: dict[int, list[float]] = {}
-    for distance in result.distances:
-        by_length.setdefault(round(distance.known_m * 1e5), []).append(1000 * distance.residual_m)
-    for length, residuals in sorted(by_length.items()):
-        values = np.array(residuals)
-        table.add_row(
-            f"{length / 100:.2f}",
-            str(len(values)),
-            f"{values.mean():+.3f}",
-            f"{np.sqrt(np.mean(values**2)):.3f}",
-            f"{values[np.argmax(np.abs(values))]:+.3f}",
-        )
+    length_10um = np.array([round(distance.known_m * 1e5) for distance in result.distances])
+    residual_mm = np.array([1000 * distance.residual_m for distance in result.distances])
+    for length in np.unique(length_10um):
+        values = residual_mm[length_10um == length]
+        largest = values[np.argmax(np.abs(values))]
+        rms = np.sqrt(np.mean(values**2))
+        table.add_row(f"{length / 100:.2f}", str(len(values)), f"{values.mean():+.3f}", f"{rms:.3f}", f"{largest:+.3f}")
     return table

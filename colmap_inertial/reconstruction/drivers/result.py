@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -227,8 +228,11 @@ def _change(first: CameraImuCalibration, refined: CameraImuCalibration | None) -
     }
 
 
-def _measured_as_json(found: Validation | Georeference | InertialError | None) -> object:
-    return {"error": str(found)} if isinstance(found, InertialError) else found and found.as_json()
+def measured_as_json(found: Validation | Georeference | InertialError | None) -> dict[str, Any] | None:
+    """What was measured in a model, or why it could not be."""
+    if found is None:
+        return None
+    return {"error": str(found)} if isinstance(found, InertialError) else found.as_json()
 
 
 def _part_as_json(part: JoinedPart) -> dict[str, object]:
@@ -263,8 +267,8 @@ def result_as_json(result: ReconstructResult, capture: Capture) -> dict[str, obj
                 "calibration_change": None
                 if plan.view is None
                 else _change(plan.view.calibration, model.scale.calibration),
-                "validation": _measured_as_json(model.validation),
-                "georeference": _measured_as_json(model.georeference),
+                "validation": measured_as_json(model.validation),
+                "georeference": measured_as_json(model.georeference),
                 "readout_translation": next((t.values for t in model.treatments if t.stage == "readout"), None),
                 "joined_of": [_part_as_json(part) for part in model.parts],
                 "treatments": [asdict(treatment) for treatment in model.treatments],

@@ -1,12 +1,18 @@
-"""The outcome in plain words: what was found, what it means, what to do."""
+"""Results in words: label and text of each value with its unit, and sentences; the same on the terminal and the page.
+
+Values come as ``result.json`` has them. Texts of facts are ASCII ("+-", "m/s2", "-"), which the page sets in type.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 from colmap_inertial.inertial.scale.parts import parts_in_words
 from colmap_inertial.inertial.scale.verdict import TRUSTED_HALF_WIDTH
+
+#: A label, and the value with its unit.
+Fact = tuple[str, str]
 
 #: Camera acceleration below which there is too little to weigh gravity against; what filming by hand usually has.
 _LITTLE_M_S2, _USUAL = 0.3, "0.5 to 2 m/s²"
@@ -49,6 +55,104 @@ def length_error(pct: float) -> str:
     if metres >= 1:
         return f"{metres:.2g} m"
     return f"{100 * metres:.2g} cm" if metres >= 0.01 else f"{1000 * metres:.2g} mm"
+
+
+def length_in_words(verdict: str, pct: float) -> str:
+    """What the half-width of a scale's interval means for a length of ten metres."""
+    if verdict == "trusted":
+        return f"lengths of 10 m are right to within {length_error(pct)}"
+    return (
+        f"lengths of 10 m may be off by {length_error(pct)}, or by more for the reasons below: check a known length "
+        "before you measure"
+    )
+
+
+def scale_facts(estimate: Mapping[str, Any]) -> Iterator[Fact]:
+    """The scale and its interval, of an estimate or any other source of metres."""
+    if estimate["metres_per_unit"] is not None and estimate["ci95"] is not None:
+        low, high = estimate["ci95"]
+        pct = half_width_pct(estimate["metres_per_unit"], (low, high))
+        yield "scale", f"{estimate['metres_per_unit']:.6g} m per unit, +-{pct:.2g} % (95 %)"
+        yield "interval", f"{low:.6g} to {high:.6g} m per unit"
+
+
+def sensor_facts(estimate: Mapping[str, Any]) -> Iterator[Fact]:
+    """Time offsets and biases that a fit of the scale found."""
+    if estimate["gyro_time_offset_s"] is not None:
+        gyro_s, accel_s = estimate["gyro_time_offset_s"], estimate["accel_time_offset_s"]
+        yield "time offset", f"gyro {gyro_s:+.4f} s, accelerometer {accel_s:+.4f} s (camera time = stamp + offset)"
+        yield "gyro bias", f"{', '.join(f'{value:+.4f}' for value in estimate['gyro_bias_rad_s'])} rad/s"
+    if estimate["accel_bias_m_s2"] is not None:
+        yield "accel. bias", f"{', '.join(f'{value:+.3f}' for value in estimate['accel_bias_m_s2'])} m/s2"
+
+
+def model_facts(model: Mapping[str, Any], available: str = "") -> Iterator[Fact]:
+    """Images and points of a model; ``available`` says of how many images."""
+    yield "images", f"{model['registered_images']}{available}"
+    yield "points", f"{model['points']}, mean reprojection error {model['mean_reprojection_error_px']:.2f} px"
+
+
+def target_facts(found: Mapping[str, Any]) -> Iterator[Fact]:
+    """What a target of known size says of a model, by ``Validation.as_json()``."""
+    yield "target", found["target"]
+    if found["scale_error_pct"] is not None:
+        low, high = found["ci95_pct"]
+        place = "within" if found["within_tolerance"] else "outside"
+        error = f"{found['scale_error_pct']:+.3f} % (95 %: {low:+.3f} to {high:+.3f})"
+        yield "scale error", f"{error}, {place} {found['tolerance_pct']:g} %"
+    low, high = found["metres_per_unit_ci95"]
+    yield "metres per unit", f"{found['metres_per_unit']:.6g} (95 %: {low:.6g} to {high:.6g})"
+    if found["unscaled"] and found["check_error_pct"] is not None:
+        low, high = found["check_ci95_pct"]
+        yield "control against check", f"{found['check_error_pct']:+.3f} % (95 %: {low:+.3f} to {high:+.3f})"
+    lengths = found.get("lengths")
+    if lengths is not None:
+        rms_mm, largest_mm = 1000 * lengths["rms_m"], 1000 * lengths["largest_m"]
+        share = lengths["longest_share"]
+        of_model = "" if share is None else f", {100 * share:.2g} % of the model's diagonal"
+        yield "length errors", f"rms {rms_mm:.3g} mm, largest {largest_mm:+.3g} mm of {lengths['count']}"
+        yield "longest length", f"{lengths['longest_m']:.3g} m{of_model}; {lengths['directions']} directions"
+    yield "images", f"{found['views_used']} used of {found['views_searched']} searched"
+    yield "corner observations", f"{found['corners_used']} used, {found['corners_rejected']} rejected"
+    noise = (
+        f"corner noise {found['corner_noise_px']:.3f} px per coordinate, pose errors {found['pose_noise_px']:.3f} px"
+    )
+    yield "residuals", f"{found['rms_px']:.3f} px rms; {noise}"
+    known = [(f"bar {' to '.join(map(str, bar['markers']))}", bar) for bar in found.get("bars") or ()]
+    known += [(f"to {apart['other']}", apart) for apart in [found.get("apart")] if apart is not None]
+    yield from ((of, f"{one['known_m']:.6g} m, off by {1000 * one['residual_m']:+.3g} mm") for of, one in known)
+    points = found.get("check_points")
+    if points is not None:
+        level_mm, up_mm = 1000 * points["rmse_horizontal_m"], 1000 * points["rmse_vertical_m"]
+        yield f"{len(points['points'])} check points", f"RMSE {level_mm:.3g} mm level, {up_mm:.3g} mm upwards"
+
+
+def place_facts(place: Mapping[str, Any] | None) -> Iterator[Fact]:
+    """A model's place on Earth, by ``Georeference.as_json()``, or why it has none."""
+    if place is None:
+        return
+    if "error" in place:
+        yield "on the map", place["error"]
+        return
+    origin, positions, delay = place["origin"], place["positions"], place.get("delay")
+    heading_deg, position_m = place["heading_ci95_deg"], place["position_ci95_m"]
+    yield "on the map", f"{origin['latitude_deg']:.6f}, {origin['longitude_deg']:.6f} degrees"
+    yield "heading, place", f"+-{digits(heading_deg, 2)} degrees, +-{digits(position_m, 2)} m (95 %)"
+    yield "by", f"{positions['used']} positions ({positions['left_out']} left out): {positions['source']}"
+    if delay is not None:
+        yield "lag of positions", f"{digits(delay['seconds'], 2)} s +-{digits(delay['ci95_s'], 2)} s"
+    yield from (("note", note) for note in place["notes"])
+
+
+def joined_in_words(models: Collection[int], gaps: Sequence[Mapping[str, Any]]) -> str:
+    """Which of COLMAP's models were joined into one, and how well each gap between them is known."""
+    across = [
+        f"{gap['seconds']:.1f} s to {100 * gap['sigma_m']:.1f} cm, {gap['sigma_deg']:.2f} degrees"
+        for gap in gaps
+        if gap["joined"] and gap["sigma_m"] is not None and {gap["first"], gap["second"]} <= set(models)
+    ]
+    known = f"; 1 sigma across: {'; '.join(across)}" if across else ""  # a user's own stage need not say it
+    return f"COLMAP's models {', '.join(map(str, models))}{known}"
 
 
 def not_checked(checked: Collection[str]) -> str:
@@ -114,14 +218,10 @@ def outcome_of_model(model: dict[str, Any]) -> dict[str, Any]:
     todo = []
     if verdict == "trusted":
         headline = "The scale can be trusted"
-        summary.append(f"In the metric model, 10 m are 10 m to within ±{length_error(pct)}, and it stands upright.")
+        summary.append(f"In the metric model, which stands upright, {length_in_words(verdict, pct)}.")
     else:
         headline = "The scale is rough"
-        summary.append(
-            f"In the metric model, 10 m may be off by {length_error(pct)} or, if what is listed below is at fault, by "
-            "more. It has the right order of size and stands upright; do not measure by it without a check against a "
-            "known length."
-        )
+        summary.append(f"In the metric model, which stands upright, {length_in_words(verdict, pct)}.")
         # livelier motion narrows the interval; it mends nothing else
         todo = [_MOVE if pct > 100 * TRUSTED_HALF_WIDTH else _CHECK]
         todo += [] if model.get("validation") else [_TARGET]
