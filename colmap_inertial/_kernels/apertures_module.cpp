@@ -2,48 +2,25 @@
 #include "apertures.h"
 #include "dispatch.h"
 
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
-#include <nanobind/stl/string.h>
-#include <nanobind/stl/vector.h>
 
 #include <optional>
-#include <stdexcept>
-#include <thread>
-
-namespace nb = nanobind;
 
 namespace {
 
-template <class T, int N>
-using Of = nb::ndarray<T, nb::ndim<N>, nb::c_contig, nb::device::cpu>;
-template <class T, int N>
-using In = Of<const T, N>;
-
-const ApertureSimd *simd_named(const std::string &name) {
+Tables<ApertureSimd> simd_tables() {
+    Tables<ApertureSimd> tables = TABLES_OF(apertures);
 #if defined(COLMAP_INERTIAL_X86_64)
     // sums of bytes and words need more of AVX-512 than its foundation
     __builtin_cpu_init();
-    const bool whole = __builtin_cpu_supports("avx512bw");
-    return named(name.c_str(), apertures_base, &apertures_avx2, whole ? &apertures_avx512 : &apertures_avx2);
-#else
-    return named<ApertureSimd>(name.c_str(), apertures_base, nullptr, nullptr);
+    if (!__builtin_cpu_supports("avx512bw")) tables.avx512 = nullptr;
 #endif
+    return tables;
 }
 
-const ApertureSimd &simd_for(const std::string &name) {
-    const ApertureSimd *simd = simd_named(name);
-    check(simd != nullptr, "instruction_set: unknown, or this processor lacks it");
-    return *simd;
-}
+const Tables<ApertureSimd> SIMD_TABLES = simd_tables();
 
 int padded(int candidates) { return (candidates + PADDING - 1) / PADDING * PADDING; }
-
-int threads_or_all(int threads) {
-    check(threads >= 0, "threads: negative");
-    return threads > 0 ? threads : int(std::max(1u, std::thread::hardware_concurrency()));
-}
 
 void matching_costs(In<uint8_t, 2> reference, In<uint8_t, 3> views, In<int32_t, 3> columns, In<int32_t, 3> rows,
                     Of<uint8_t, 3> cost, In<int32_t, 1> share, int unseen, int radius,
@@ -86,7 +63,7 @@ void matching_costs(In<uint8_t, 2> reference, In<uint8_t, 3> views, In<int32_t, 
                           blend ? blend->data() : nullptr,
                           blend_table ? blend_table->data() : nullptr,
                           shown ? shown->data() : nullptr};
-    const ApertureSimd &simd = simd_for(instruction_set);
+    const ApertureSimd &simd = SIMD_TABLES.require(instruction_set);
     nb::gil_scoped_release release;
     matching_cost(input, simd, threads_or_all(threads), cost.data());
 }
@@ -101,7 +78,7 @@ void semi_global_matching(In<uint8_t, 3> cost, In<uint8_t, 2> guide, int small, 
     check(jump.shape(0) == 256, "jump: not one penalty for each difference of codes");
     check(small >= 0 && small <= 4000, "small: must be from 0 to 4000");
     for (int i = 0; i < 256; ++i) check(jump.data()[i] <= 4000, "jump: must be at most 4000");
-    const ApertureSimd &simd = simd_for(instruction_set);
+    const ApertureSimd &simd = SIMD_TABLES.require(instruction_set);
     nb::gil_scoped_release release;
     semi_global(sides, cost.data(), guide.data(), small, jump.data(), simd, threads_or_all(threads), total.data());
 }
@@ -127,13 +104,6 @@ void visible(In<float, 2> disparity, In<uint16_t, 2> least, In<double, 2> ratios
                bits.data());
 }
 
-std::vector<std::string> instruction_sets() {
-    std::vector<std::string> names;
-    for (const char *name : {"base", "avx2", "avx512"})
-        if (simd_named(name) != nullptr && simd_named(name)->name == std::string(name)) names.emplace_back(name);
-    return names;
-}
-
 }  // namespace
 
 NB_MODULE(_apertures, m) {
@@ -148,5 +118,5 @@ NB_MODULE(_apertures, m) {
           "aside"_a.noconvert(), "candidates"_a, "threads"_a = 0);
     m.def("visibility", &visible, "disparity"_a, "least"_a, nb::kw_only(), "ratios"_a, "cx"_a, "cy"_a, "tolerance"_a,
           "bits"_a.noconvert(), "threads"_a = 0);
-    m.def("instruction_sets", &instruction_sets);
+    m.def("instruction_sets", [] { return SIMD_TABLES.names(); });
 }

@@ -1,15 +1,10 @@
-// Compiled once for each instruction set; see wiener_simd.cpp for why only C headers are here.
 #include "apertures_simd.h"
 
-#include <string.h>
+#include "each_set.h"
+
 #if defined(__SSE4_1__)
 #include <smmintrin.h>
 #endif
-
-#define JOIN_(a, b) a##b
-#define JOIN(a, b) JOIN_(a, b)
-#define TEXT_(a) #a
-#define TEXT(a) TEXT_(a)
 
 namespace {
 

@@ -1,29 +1,23 @@
-// Compiled once for each instruction set; no standard headers beyond the C ones, as in wiener_simd.cpp.
 #include "arrow_simd.h"
 
-#include <math.h>
-#include <string.h>
+#include "each_set.h"
 
-#define JOIN_(a, b) a##b
-#define JOIN(a, b) JOIN_(a, b)
-#define TEXT_(a) #a
-#define TEXT(a) TEXT_(a)
+#include <math.h>
 
 namespace {
 
 constexpr int ROWS = 6;  // of a tile of a product
 #if defined(__AVX512F__)
-constexpr int LANES = 8, VECTORS = 4;  // 24 of 32 registers add up
-#elif defined(__AVX2__)
-constexpr int LANES = 4, VECTORS = 2;  // 12 of 16
+constexpr int VECTORS = 4;  // 24 of 32 registers add up
 #else
-constexpr int LANES = 2, VECTORS = 2;
+constexpr int VECTORS = 2;  // 12 of 16
 #endif
+constexpr int LANES = VECTOR_BYTES / sizeof(double);
 static_assert(PAD % LANES == 0, "rows are whole vectors");
 
 constexpr ptrdiff_t STATES_AT_ONCE = 8;  // whose products are added up together: they stay in the cache
 
-typedef double Vector __attribute__((vector_size(8 * LANES)));
+typedef double Vector __attribute__((vector_size(VECTOR_BYTES)));
 
 inline Vector load(const double *at) {
     Vector v;

@@ -4,11 +4,7 @@
 #include "points.h"
 #include "preintegration.h"
 
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
-#include <nanobind/stl/string.h>
-#include <nanobind/stl/vector.h>
 
 #include <cmath>
 #include <cstdlib>
@@ -19,24 +15,14 @@
 #include <stdexcept>
 #include <vector>
 
-namespace nb = nanobind;
-
 namespace {
 
-template <class T, int N>
-using Of = nb::ndarray<T, nb::ndim<N>, nb::c_contig, nb::device::cpu>;
 template <int N>
-using In = Of<const double, N>;
+using Doubles = In<double, N>;
 template <int N>
-using Out = Of<double, N>;
+using Results = Of<double, N>;
 
-const ArrowSimd *arrow_named(const std::string &name) {
-#if defined(COLMAP_INERTIAL_X86_64)
-    return named(name.c_str(), arrow_base, &arrow_avx2, &arrow_avx512);
-#else
-    return named<ArrowSimd>(name.c_str(), arrow_base, nullptr, nullptr);
-#endif
-}
+const Tables<ArrowSimd> SIMD_TABLES = TABLES_OF(arrow);
 
 struct Free {
     void operator()(void *memory) const { std::free(memory); }
@@ -60,7 +46,7 @@ class ArrowFactor {
 
     Factor factor() const { return {diagonal_.get(), right_.get()}; }
 
-    void substitute(Out<3> sides) const {
+    void substitute(Results<3> sides) const {
         check(is(sides, chain_.states, chain_.size, sides.shape(2)), "sides: not one row for each number of a state");
         Chain chain = chain_;
         chain.sides = ptrdiff_t(sides.shape(2));
@@ -75,7 +61,7 @@ class ArrowFactor {
             for (ptrdiff_t j = 0; j < q; ++j) values[i * q + j] = x.get()[i * pitch + j];
     }
 
-    void selected_inverse(Out<3> diagonal, Out<3> right) const {
+    void selected_inverse(Results<3> diagonal, Results<3> right) const {
         const size_t k = size_t(chain_.states), m = size_t(chain_.size);
         check(is(diagonal, k, m, m) && is(right, k - 1, m, m), "diagonal, right: not of the size of the chain");
         double *here = diagonal.data(), *beside = right.data();
@@ -103,25 +89,24 @@ std::unique_ptr<ArrowFactor> eliminate(const Chain &chain, const ArrowSimd &simd
     return result;
 }
 
-ArrowFactor *eliminate_chain(In<3> diagonal, In<3> below, In<3> border, In<3> rhs, In<2> unit, Out<2> products,
-                             const std::string &instruction_set) {
+ArrowFactor *eliminate_chain(Doubles<3> diagonal, Doubles<3> below, Doubles<3> border, Doubles<3> rhs, Doubles<2> unit,
+                             Results<2> products, const std::string &instruction_set) {
     const size_t k = border.shape(0), m = border.shape(1), n = border.shape(2), q = rhs.shape(2);
     check(k > 0 && m > 0, "border: empty");
     check(is(diagonal, k, m, m) && is(below, k - 1, m, m) && is(rhs, k, m, q) && is(unit, k, m),
           "diagonal, below, rhs, unit: not of the size of border");
     check(is(products, n, n + q), "products: not (n, n + q)");
-    const ArrowSimd *simd = arrow_named(instruction_set);
-    check(simd != nullptr, "instruction_set: unknown, or this processor lacks it");
+    const ArrowSimd &simd = SIMD_TABLES.require(instruction_set);
     const Chain chain{ptrdiff_t(k), ptrdiff_t(m), ptrdiff_t(n), ptrdiff_t(q), diagonal.data(), below.data(),
                       border.data(), rhs.data(), unit.data()};
     double *values = products.data();
     nb::gil_scoped_release release;
-    return eliminate(chain, *simd, values).release();
+    return eliminate(chain, simd, values).release();
 }
 
-void add_information(In<3> here, std::optional<In<3>> after, std::optional<In<3>> by_globals, size_t first,
-                     size_t column, Out<3> diagonal, Out<3> below, Out<3> border, Out<2> corner,
-                     const std::string &instruction_set) {
+void add_information(Doubles<3> here, std::optional<Doubles<3>> after, std::optional<Doubles<3>> by_globals,
+                     size_t first, size_t column, Results<3> diagonal, Results<3> below, Results<3> border,
+                     Results<2> corner, const std::string &instruction_set) {
     const size_t states = here.shape(0), r = here.shape(1), m = here.shape(2);
     const size_t k = border.shape(0), n = border.shape(2), g = by_globals ? by_globals->shape(2) : 0;
     check(k > 0 && is(diagonal, k, m, m) && is(below, k - 1, m, m) && is(border, k, m, n) && is(corner, n, n),
@@ -130,24 +115,24 @@ void add_information(In<3> here, std::optional<In<3>> after, std::optional<In<3>
     check(!by_globals || is(*by_globals, states, r, g), "by_globals: not of the size of here");
     check(first <= k && states + (after ? 1 : 0) <= k - first, "first: beyond the states");
     check(column <= n && g <= n - column, "column: beyond the globals");
-    const ArrowSimd *simd = arrow_named(instruction_set);
-    check(simd != nullptr, "instruction_set: unknown, or this processor lacks it");
+    const ArrowSimd &simd = SIMD_TABLES.require(instruction_set);
     if (states == 0) return;
     const double *next = after ? after->data() : nullptr, *globals = by_globals ? by_globals->data() : nullptr;
     const Rows rows{ptrdiff_t(states), ptrdiff_t(r), ptrdiff_t(m), ptrdiff_t(g), here.data(), next, globals};
     const Sums sums{ptrdiff_t(n), diagonal.data() + first * m * m, below.data() + first * m * m,
                     border.data() + first * m * n + column, corner.data() + column * n + column};
     nb::gil_scoped_release release;
-    const Memory work = memory_for(simd->rows_work(rows));
-    simd->add_rows(rows, sums, work.get());
+    const Memory work = memory_for(simd.rows_work(rows));
+    simd.add_rows(rows, sums, work.get());
 }
 
-void preintegrate_intervals(In<1> nodes_s, Of<const int64_t, 1> steps, In<1> gyro_t_s, In<2> gyro, In<2> gyro_slope,
-                            In<1> accel_t_s, In<2> accel, In<2> accel_slope, In<2> gyro_bias, In<2> accel_bias,
-                            In<2> gyro_matrix, In<2> accel_matrix, double accel_delay_s, double delay_step_s,
-                            Out<3> rotation, Out<2> velocity, Out<2> position, Out<3> cov_gyro, Out<3> by_gyro_bias,
-                            Out<3> by_accel_bias, Out<3> by_gyro_gain, Out<3> by_accel_gain, Out<2> by_accel_delay,
-                            Out<2> rate) {
+void preintegrate_intervals(Doubles<1> nodes_s, Of<const int64_t, 1> steps, Doubles<1> gyro_t_s, Doubles<2> gyro,
+                            Doubles<2> gyro_slope, Doubles<1> accel_t_s, Doubles<2> accel, Doubles<2> accel_slope,
+                            Doubles<2> gyro_bias, Doubles<2> accel_bias, Doubles<2> gyro_matrix,
+                            Doubles<2> accel_matrix, double accel_delay_s, double delay_step_s, Results<3> rotation,
+                            Results<2> velocity, Results<2> position, Results<3> cov_gyro, Results<3> by_gyro_bias,
+                            Results<3> by_accel_bias, Results<3> by_gyro_gain, Results<3> by_accel_gain,
+                            Results<2> by_accel_delay, Results<2> rate) {
     const size_t k = steps.shape(0), n = gyro_t_s.shape(0), a = accel_t_s.shape(0);
     check(k > 0 && is(nodes_s, k + 1), "nodes_s, steps: not the ends of intervals");
     for (size_t i = 0; i < k; ++i) check(steps.data()[i] > 0, "steps: must be positive");
@@ -178,7 +163,7 @@ void preintegrate_intervals(In<1> nodes_s, Of<const int64_t, 1> steps, In<1> gyr
 }
 
 // Divides `sides` by the Cholesky factor of a tridiagonal matrix; returns half the logarithm of its determinant.
-double whiten_tridiagonal(In<1> diagonal, In<1> below, Out<2> sides) {
+double whiten_tridiagonal(Doubles<1> diagonal, Doubles<1> below, Results<2> sides) {
     const size_t n = diagonal.shape(0), columns = sides.shape(1);
     check(n > 0 && is(below, n - 1) && is(sides, n, columns), "diagonal, below, sides: not of one size");
     const double *d = diagonal.data(), *b = below.data();
@@ -199,14 +184,16 @@ double whiten_tridiagonal(In<1> diagonal, In<1> below, Out<2> sides) {
 }
 
 // Adds the normal equations of a bundle adjustment without its points; see the stub.
-bool reduce_points_of(Of<const int64_t, 1> first, Of<const int64_t, 1> column, In<3> by_frame, In<3> by_shared,
-                      In<3> by_point, In<2> residual, double damping, Out<2> band, Out<2> border, Out<2> corner,
-                      Out<1> rhs, Out<1> rhs_shared, Out<3> inverse, Out<2> pull) {
+bool reduce_points_of(Of<const int64_t, 1> first, Of<const int64_t, 1> column, Doubles<3> by_frame,
+                      Doubles<3> by_shared, Doubles<3> by_point, Doubles<2> residual, double damping, Results<2> band,
+                      Results<2> border, Results<2> corner, Results<1> rhs, Results<1> rhs_shared, Results<3> inverse,
+                      Results<2> pull) {
     const size_t m = column.shape(0), n = rhs.shape(0), q = rhs_shared.shape(0), p = pull.shape(0);
     check(is(by_frame, m, 2, FRAME) && is(by_shared, m, 2, q) && is(by_point, m, 2, 3) && is(residual, m, 2),
           "derivatives: not of one size");
-    check(is(border, n, q) && is(corner, q, q) && is(inverse, p, 3, 3) && is(first, p + 1) && is(band, n, band.shape(1)),
-          "results: not of the size of the derivatives");
+    check(
+        is(border, n, q) && is(corner, q, q) && is(inverse, p, 3, 3) && is(first, p + 1) && is(band, n, band.shape(1)),
+        "results: not of the size of the derivatives");
     check(first(0) == 0 && size_t(first(p)) == m && band.shape(1) >= size_t(STATE), "first: not up to the last one");
     for (size_t i = 0; i < p; ++i) check(first(i) <= first(i + 1), "first: must not fall");
     for (size_t i = 0; i < m; ++i) check(column(i) >= 0 && size_t(column(i) + STATE) <= n, "column: outside the band");
@@ -216,13 +203,6 @@ bool reduce_points_of(Of<const int64_t, 1> first, Of<const int64_t, 1> column, I
                       rhs.data(), rhs_shared.data(), inverse.data(), pull.data()};
     nb::gil_scoped_release release;
     return reduce_points(seen, out);
-}
-
-std::vector<std::string> instruction_sets() {
-    std::vector<std::string> names;
-    for (const char *name : {"base", "avx2", "avx512"})
-        if (arrow_named(name)) names.emplace_back(name);
-    return names;
 }
 
 }  // namespace
@@ -255,5 +235,5 @@ NB_MODULE(_inertial, module) {
                nb::arg("band").noconvert(), nb::arg("border").noconvert(), nb::arg("corner").noconvert(),
                nb::arg("rhs").noconvert(), nb::arg("rhs_shared").noconvert(), nb::arg("inverse").noconvert(),
                nb::arg("pull").noconvert());
-    module.def("instruction_sets", &instruction_sets);
+    module.def("instruction_sets", [] { return SIMD_TABLES.names(); });
 }

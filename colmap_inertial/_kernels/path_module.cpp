@@ -2,48 +2,18 @@
 #include "dispatch.h"
 #include "path.h"
 
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
-#include <nanobind/stl/string.h>
-#include <nanobind/stl/vector.h>
-
 #include <algorithm>
-#include <thread>
-
-namespace nb = nanobind;
 
 namespace {
 
-template <class T, int N>
-using Of = nb::ndarray<T, nb::ndim<N>, nb::c_contig, nb::device::cpu>;
-template <class T, int N>
-using In = Of<const T, N>;
-
-const PathSimd *simd_named(const std::string &name) {
-#if defined(COLMAP_INERTIAL_X86_64)
-    return named(name.c_str(), path_simd_base, &path_simd_avx2, &path_simd_avx512);
-#else
-    return named<PathSimd>(name.c_str(), path_simd_base, nullptr, nullptr);
-#endif
-}
-
-const PathSimd &simd_for(const std::string &name) {
-    const PathSimd *simd = simd_named(name);
-    check(simd != nullptr, "instruction_set: unknown, or this processor lacks it");
-    return *simd;
-}
-
-int threads_or_all(int threads) {
-    check(threads >= 0, "threads: negative");
-    return threads > 0 ? threads : int(std::max(1u, std::thread::hardware_concurrency()));
-}
+const Tables<PathSimd> SIMD_TABLES = TABLES_OF(path_simd);
 
 void check_side(size_t side) {
     check(side >= 32 && side <= 8192 && (side & (side - 1)) == 0, "side: must be a power of two from 32 to 8192");
 }
 
-Tiles tiles_of(const In<float, 4> &paths, const float *spread, const In<float, 1> &window_in, const In<float, 1> &window_out, int hop,
-               int before) {
+Tiles tiles_of(const In<float, 4> &paths, const float *spread, const In<float, 1> &window_in,
+               const In<float, 1> &window_out, int hop, int before) {
     check_side(window_in.shape(0));
     check(window_out.shape(0) == window_in.shape(0), "window_out: not of a tile's side");
     const int side = int(window_in.shape(0));
@@ -76,7 +46,7 @@ void filter(In<float, 3> light, Of<float, 3> result, In<float, 4> paths, In<floa
                       fitted_to,    least_signal, least_noise,
                       noise.data(), data_weight, int(splitting.shape(0)),
                       splitting.data()};
-    const PathSimd &simd = simd_for(instruction_set);
+    const PathSimd &simd = SIMD_TABLES.require(instruction_set);
     const int count = threads_or_all(threads);
     nb::gil_scoped_release release;
     filter_along(source, tiles, model, result.data(), simd, count);
@@ -91,7 +61,7 @@ std::vector<float> noise(In<float, 3> light, In<float, 4> paths, In<float, 1> wi
     Tiles placed = tiles;
     placed.hop = hop;
     check(hop > 0, "hop: positive");
-    const PathSimd &simd = simd_for(instruction_set);
+    const PathSimd &simd = SIMD_TABLES.require(instruction_set);
     const int count = threads_or_all(threads);
     nb::gil_scoped_release release;
     return noise_along(source, placed, above, share, every, simd, count);
@@ -102,7 +72,7 @@ void transform(In<float, 2> tile, Of<float, 3> spectrum, Of<float, 2> back, cons
     const int side = int(tile.shape(0));
     check_side(tile.shape(0));
     check(is(tile, side, side) && is(back, side, side) && is(spectrum, side, side / 2 + 1, 2), "not of one side");
-    const PathSimd &simd = simd_for(instruction_set);
+    const PathSimd &simd = SIMD_TABLES.require(instruction_set);
     const Square square{side, side + 16, side / 2 + 16};
     std::vector<float> pixels(size_t(side) * square.pitch), re(size_t(side) * square.half), im(re.size()),
         room(room_of(square));
@@ -121,13 +91,6 @@ void transform(In<float, 2> tile, Of<float, 3> spectrum, Of<float, 2> back, cons
         std::copy_n(pixels.begin() + ptrdiff_t(y) * square.pitch, side, back.data() + size_t(y) * side);
 }
 
-std::vector<std::string> instruction_sets() {
-    std::vector<std::string> names;
-    for (const char *name : {"base", "avx2", "avx512"})
-        if (simd_named(name)) names.emplace_back(name);
-    return names;
-}
-
 }  // namespace
 
 NB_MODULE(_path, module) {
@@ -143,5 +106,5 @@ NB_MODULE(_path, module) {
                nb::arg("every"), nb::arg("threads") = 0, nb::arg("instruction_set") = "");
     module.def("transform", &transform, nb::arg("tile").noconvert(), nb::arg("spectrum").noconvert(),
                nb::arg("back").noconvert(), nb::arg("instruction_set") = "");
-    module.def("instruction_sets", &instruction_sets);
+    module.def("instruction_sets", [] { return SIMD_TABLES.names(); });
 }

@@ -1,28 +1,16 @@
-// Compiled once for each instruction set; no standard headers beyond the C ones, as in wiener_simd.cpp.
 #include "path_simd.h"
 
-#include <stdint.h>
-#include <string.h>
+#include "each_set.h"
 
-#define JOIN_(a, b) a##b
-#define JOIN(a, b) JOIN_(a, b)
-#define TEXT_(a) #a
-#define TEXT(a) TEXT_(a)
+#include <stdint.h>
 
 namespace {
 
-#if defined(__AVX512F__)
-constexpr int LANES = 16;
-#elif defined(__AVX2__)
-constexpr int LANES = 8;
-#else
-constexpr int LANES = 4;
-#endif
+constexpr int LANES = VECTOR_BYTES / sizeof(float);
 
-typedef float Vector __attribute__((vector_size(4 * LANES)));
-typedef int32_t Integers __attribute__((vector_size(4 * LANES)));
+typedef float Vector __attribute__((vector_size(VECTOR_BYTES)));
+typedef int32_t Integers __attribute__((vector_size(VECTOR_BYTES)));
 typedef float Four __attribute__((vector_size(16)));
-typedef int32_t FourIntegers __attribute__((vector_size(16)));
 
 inline Vector load(const float *at) {
     Vector v;
@@ -168,14 +156,14 @@ void transpose(const float *from, ptrdiff_t from_pitch, int rows, int columns, f
             memcpy(&b, at + from_pitch, 16);
             memcpy(&c, at + 2 * from_pitch, 16);
             memcpy(&d, at + 3 * from_pitch, 16);
-            const Four ab = __builtin_shuffle(a, b, FourIntegers{0, 4, 1, 5}),
-                       ab2 = __builtin_shuffle(a, b, FourIntegers{2, 6, 3, 7}),
-                       cd = __builtin_shuffle(c, d, FourIntegers{0, 4, 1, 5}),
-                       cd2 = __builtin_shuffle(c, d, FourIntegers{2, 6, 3, 7});
-            const Four out[4] = {__builtin_shuffle(ab, cd, FourIntegers{0, 1, 4, 5}),
-                                 __builtin_shuffle(ab, cd, FourIntegers{2, 3, 6, 7}),
-                                 __builtin_shuffle(ab2, cd2, FourIntegers{0, 1, 4, 5}),
-                                 __builtin_shuffle(ab2, cd2, FourIntegers{2, 3, 6, 7})};
+            const Four ab = __builtin_shufflevector(a, b, 0, 4, 1, 5),
+                       ab2 = __builtin_shufflevector(a, b, 2, 6, 3, 7),
+                       cd = __builtin_shufflevector(c, d, 0, 4, 1, 5),
+                       cd2 = __builtin_shufflevector(c, d, 2, 6, 3, 7);
+            const Four out[4] = {__builtin_shufflevector(ab, cd, 0, 1, 4, 5),
+                                 __builtin_shufflevector(ab, cd, 2, 3, 6, 7),
+                                 __builtin_shufflevector(ab2, cd2, 0, 1, 4, 5),
+                                 __builtin_shufflevector(ab2, cd2, 2, 3, 6, 7)};
             for (int k = 0; k < 4; ++k) memcpy(to + (j + k) * to_pitch + i, &out[k], 16);
         }
 }
@@ -298,7 +286,7 @@ void turns(const Square &square, int samples, const float *path, double *room, f
     }
     for (int i = 0; i <= square.side / 2; ++i) {
         float *cosines = cos_x + i * ptrdiff_t(samples), *sines = sin_x + i * ptrdiff_t(samples);
-#pragma GCC ivdep
+        INDEPENDENT
         for (int k = 0; k < samples; ++k) {
             cosines[k] = float(re[k]);
             sines[k] = float(im[k]);

@@ -1,6 +1,5 @@
 #include "wiener.h"
 
-#include "dispatch.h"
 #include "wiener_light.h"
 
 #include <algorithm>
@@ -12,26 +11,6 @@
 #include <thread>
 #include <type_traits>
 #include <vector>
-
-#if defined(__linux__)
-#include <sched.h>
-#endif
-
-const Simd *simd_named(const char *name) {
-#if defined(COLMAP_INERTIAL_X86_64)
-    return named(name, simd_base, &simd_avx2, &simd_avx512);
-#else
-    return named<Simd>(name, simd_base, nullptr, nullptr);
-#endif
-}
-
-int usable_threads() {
-#if defined(__linux__)
-    cpu_set_t set;
-    if (sched_getaffinity(0, sizeof set, &set) == 0) return std::max(1, CPU_COUNT(&set));
-#endif
-    return std::max(1u, std::thread::hardware_concurrency());
-}
 
 namespace {
 
@@ -405,14 +384,14 @@ class Deblur {
 template <class Code>
 Seconds deblur(const Code *image, Code *result, Image size, const Field &field, const Table &table, const Codec &codec,
                const Simd &simd, int threads) {
-    return Deblur<Code>(image, result, size, field, table, codec, simd, threads > 0 ? threads : usable_threads()).run();
+    return Deblur<Code>(image, result, size, field, table, codec, simd, threads).run();
 }
 
 template <class Code>
 void blend(const Code *image, const float *light, Code *result, Image size, const Field &field, const Codec &codec,
            const Simd &simd, int threads) {
     const Table none{};
-    Deblur<Code>(image, result, size, field, none, codec, simd, threads > 0 ? threads : usable_threads()).blend(light);
+    Deblur<Code>(image, result, size, field, none, codec, simd, threads).blend(light);
 }
 
 template void blend(const uint8_t *, const float *, uint8_t *, Image, const Field &, const Codec &, const Simd &, int);

@@ -35,12 +35,6 @@ struct Image {
     int height, width, channels;
 };
 
-// The instruction set of that name, or the best one where the name is empty; null where the processor lacks it.
-const Simd *simd_named(const char *name);
-
-// As many as the process may run on.
-int usable_threads();
-
 // Code: uint8_t or uint16_t with a codec; float is linear light already, for which the codec is not read.
 // Returns the processor time of decoding and of filtering, of all threads of the process.
 struct Seconds {

@@ -1,46 +1,25 @@
+#include "arrays.h"
+#include "dispatch.h"
 #include "wiener.h"
 
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
 #include <nanobind/stl/pair.h>
-#include <nanobind/stl/string.h>
-#include <nanobind/stl/vector.h>
 
 #include <chrono>
-#include <stdexcept>
-
-namespace nb = nanobind;
 
 namespace {
 
-template <class T, int N>
-using In = nb::ndarray<const T, nb::ndim<N>, nb::c_contig, nb::device::cpu>;
-template <class T>
-using Out = nb::ndarray<T, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
-
-void check(bool holds, const char *message) {
-    if (!holds) throw std::invalid_argument(message);
-}
-
-const Simd &simd_for(const std::string &name) {
-    const Simd *simd = simd_named(name.c_str());
-    check(simd != nullptr, "instruction_set: unknown, or this processor lacks it");
-    return *simd;
-}
+const Tables<Simd> SIMD_TABLES = TABLES_OF(simd);
 
 template <class Code>
-std::pair<double, double> deblur_image(In<Code, 3> image, Out<Code> result, In<float, 2> extent_px, In<float, 2> slope,
-                                       In<bool, 2> along_y, In<float, 2> fade, In<float, 2> weights,
+std::pair<double, double> deblur_image(In<Code, 3> image, Of<Code, 3> result, In<float, 2> extent_px,
+                                       In<float, 2> slope, In<bool, 2> along_y, In<float, 2> fade, In<float, 2> weights,
                                        In<int32_t, 1> reach, float first, float steps, In<float, 1> smoothing,
                                        In<float, 1> decode, In<float, 1> encode, int saturated, int threads,
                                        const std::string &instruction_set) {
     const int height = int(image.shape(0)), width = int(image.shape(1));
     const int ny = (height + CELL - 1) / CELL, nx = (width + CELL - 1) / CELL;
-    auto is = [](const auto &array, size_t rows, size_t columns) {
-        return array.shape(0) == rows && array.shape(1) == columns;
-    };
     check(height > 0 && width > 0 && image.shape(2) > 0, "image: empty");
-    check(is(result, image.shape(0), image.shape(1)) && result.shape(2) == image.shape(2),
+    check(is(result, image.shape(0), image.shape(1), image.shape(2)),
           "result: not the shape of image");
     check(is(extent_px, ny, nx) && is(slope, ny, nx) && is(along_y, ny, nx),
           "extent_px, slope, along_y: not one value for each cell");
@@ -60,25 +39,23 @@ std::pair<double, double> deblur_image(In<Code, 3> image, Out<Code> result, In<f
     const Table table{int(weights.shape(0)), int(weights.shape(1)), first, steps, weights.data(), reach.data(),
                       int(smoothing.shape(0)) - 1, smoothing.data()};
     const Codec codec{decode.data(), encode.data(), int(encode.shape(0)) - 2, saturated};
-    const Simd &simd = simd_for(instruction_set);
+    const Simd &simd = SIMD_TABLES.require(instruction_set);
+    const int count = threads_or_all(threads);
     nb::gil_scoped_release release;
     const Seconds seconds = deblur(image.data(), result.data(), Image{height, width, int(image.shape(2))}, field, table,
-                                   codec, simd, threads);
+                                   codec, simd, count);
     return {seconds.decode, seconds.filter};
 }
 
 template <class Code>
-void blend_image(In<Code, 3> image, In<float, 3> light, Out<Code> result, In<float, 2> extent_px, In<float, 2> slope,
+void blend_image(In<Code, 3> image, In<float, 3> light, Of<Code, 3> result, In<float, 2> extent_px, In<float, 2> slope,
                  In<bool, 2> along_y, In<float, 2> fade, In<float, 1> decode, In<float, 1> encode, int saturated,
                  int threads, const std::string &instruction_set) {
     const int height = int(image.shape(0)), width = int(image.shape(1));
     const int ny = (height + CELL - 1) / CELL, nx = (width + CELL - 1) / CELL;
-    auto is = [](const auto &array, size_t rows, size_t columns) {
-        return array.shape(0) == rows && array.shape(1) == columns;
-    };
     check(height > 0 && width > 0 && image.shape(2) > 0, "image: empty");
-    check(is(result, image.shape(0), image.shape(1)) && result.shape(2) == image.shape(2) &&
-              is(light, image.shape(0), image.shape(1)) && light.shape(2) == image.shape(2),
+    check(is(result, image.shape(0), image.shape(1), image.shape(2)) &&
+              is(light, image.shape(0), image.shape(1), image.shape(2)),
           "light, result: not the shape of image");
     check(is(extent_px, ny, nx) && is(slope, ny, nx) && is(along_y, ny, nx),
           "extent_px, slope, along_y: not one value for each cell");
@@ -87,15 +64,16 @@ void blend_image(In<Code, 3> image, In<float, 3> light, Out<Code> result, In<flo
     check(encode.shape(0) >= 3, "encode: too short");
     const Field field{ny, nx, extent_px.data(), slope.data(), along_y.data(), fade.data()};
     const Codec codec{decode.data(), encode.data(), int(encode.shape(0)) - 2, saturated};
-    const Simd &simd = simd_for(instruction_set);
+    const Simd &simd = SIMD_TABLES.require(instruction_set);
+    const int count = threads_or_all(threads);
     nb::gil_scoped_release release;
     blend(image.data(), light.data(), result.data(), Image{height, width, int(image.shape(2))}, field, codec, simd,
-          threads);
+          count);
 }
 
 // Multiply-adds a second, lanes counted singly, that one core does on numbers in registers: the best of several runs.
 double peak_multiply_adds(const std::string &instruction_set, double seconds) {
-    const Simd &simd = simd_for(instruction_set);
+    const Simd &simd = SIMD_TABLES.require(instruction_set);
     nb::gil_scoped_release release;
     using Clock = std::chrono::steady_clock;
     volatile float sink;
@@ -112,13 +90,6 @@ double peak_multiply_adds(const std::string &instruction_set, double seconds) {
     return best;
 }
 
-std::vector<std::string> instruction_sets() {
-    std::vector<std::string> names;
-    for (const char *name : {"base", "avx2", "avx512"})
-        if (simd_named(name)) names.emplace_back(name);
-    return names;
-}
-
 template <class Code>
 void define_blend(nb::module_ &module) {
     module.def("blend", &blend_image<Code>, nb::arg("image").noconvert(), nb::arg("light").noconvert(),
@@ -129,13 +100,13 @@ void define_blend(nb::module_ &module) {
 }
 
 template <class Code>
-void define(nb::module_ &module) {
+void define(nb::module_& module) {
     module.def("deblur", &deblur_image<Code>, nb::arg("image").noconvert(), nb::arg("result").noconvert(),
                nb::kw_only(), nb::arg("extent_px").noconvert(), nb::arg("slope").noconvert(),
                nb::arg("along_y").noconvert(), nb::arg("fade").noconvert(), nb::arg("weights").noconvert(),
-               nb::arg("reach").noconvert(), nb::arg("first"), nb::arg("steps"), nb::arg("smoothing").noconvert(), nb::arg("decode").noconvert(),
-               nb::arg("encode").noconvert(), nb::arg("saturated"), nb::arg("threads") = 0,
-               nb::arg("instruction_set") = "");
+               nb::arg("reach").noconvert(), nb::arg("first"), nb::arg("steps"), nb::arg("smoothing").noconvert(),
+               nb::arg("decode").noconvert(), nb::arg("encode").noconvert(), nb::arg("saturated"),
+               nb::arg("threads") = 0, nb::arg("instruction_set") = "");
 }
 
 }  // namespace
@@ -147,5 +118,5 @@ NB_MODULE(_wiener, module) {
     define<uint16_t>(module);
     define<float>(module);
     module.def("peak_multiply_adds", &peak_multiply_adds, nb::arg("instruction_set") = "", nb::arg("seconds") = 0.2);
-    module.def("instruction_sets", &instruction_sets);
+    module.def("instruction_sets", [] { return SIMD_TABLES.names(); });
 }

@@ -1,25 +1,17 @@
-// Compiled once for each instruction set. No standard headers beyond the C ones: an inline function of theirs, compiled
-// here for AVX-512, could otherwise be the copy that the linker keeps for everybody.
 #include "wiener_simd.h"
 
-#include <string.h>
-
-#define JOIN_(a, b) a##b
-#define JOIN(a, b) JOIN_(a, b)
-#define TEXT_(a) #a
-#define TEXT(a) TEXT_(a)
+#include "each_set.h"
 
 namespace {
 
 #if defined(__AVX512F__)
-constexpr int LANES = 16, ROWS = 16, CHAINS = 24;  // 16 of 32 registers add up; 17 loads for 32 multiply-adds
-#elif defined(__AVX2__)
-constexpr int LANES = 8, ROWS = 8, CHAINS = 12;
+constexpr int ROWS = 16, CHAINS = 24;  // 16 of 32 registers add up; 17 loads for 32 multiply-adds
 #else
-constexpr int LANES = 4, ROWS = 8, CHAINS = 12;
+constexpr int ROWS = 8, CHAINS = 12;
 #endif
+constexpr int LANES = VECTOR_BYTES / sizeof(float);
 
-typedef float Vector __attribute__((vector_size(4 * LANES)));
+typedef float Vector __attribute__((vector_size(VECTOR_BYTES)));
 
 inline Vector load(const float *at) {
     Vector v;
