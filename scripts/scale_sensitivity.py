@@ -29,7 +29,7 @@ from bench_scale import Window
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.threads import one_blas_thread
-from colmap_inertial.core.types import Array, CameraImuCalibration
+from colmap_inertial.core.types import CameraImuCalibration
 from colmap_inertial.inertial.core import parameters, priors
 from colmap_inertial.inertial.core.priors import PRIORS
 from colmap_inertial.inertial.scale import _noise, _residuals, _setup, joint

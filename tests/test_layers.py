@@ -56,7 +56,7 @@ LIMITS = {
     "names": 13,
     "rows": 10,
     "circles": 2,  # goal: 0
-    "chain": 30,  # goal: 20
+    "chain": 33,  # goal: 20
     "private_rooms": 2,  # goal: 0
     "private_packages": 2,  # goal: 0
     "code": 42250,  # goal: 38000
@@ -64,7 +64,7 @@ LIMITS = {
     "complex": 30,  # goal: 5
     "wide": 16,  # goal: 2
     "numbers": 783,  # goal: 450
-    "offset": 33,  # goal: 8
+    "offset": 34,  # goal: 8
 }
 
 

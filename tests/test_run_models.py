@@ -9,8 +9,8 @@ import pytest
 from conftest import write_project
 from test_pipeline_parts import recording_of, session_in
 
-from colmap_inertial.checks.report import content
 from colmap_inertial.checks.validate import Validation, parse_target
+from colmap_inertial.checks.words import joined_in_words
 from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.core.geometry import quat_exp, quat_multiply, quat_rotate
 from colmap_inertial.core.types import (
@@ -252,12 +252,11 @@ def test_a_project_that_was_joined_is_not_taken_back(project, tmp_path):
     assert not (tmp_path / "back").exists()
 
 
-def test_the_report_says_of_a_joined_model_what_is_known():
-    model = {"joined_of": [{"colmap_index": 0}, {"colmap_index": 2}]}
+def test_a_joined_model_is_described_by_its_parts_and_its_worst_gap():
     gap = {"first": 0, "second": 2, "joined": True, "seconds": 1.0, "sigma_m": None, "sigma_deg": None}
-    for gaps in ([], [gap]):
-        assert content._joined(model, gaps) == "COLMAP made 2 models of it, which were joined into one."
-    assert "to 3.0 cm and 0.50 degrees" in content._joined(model, [gap | {"sigma_m": 0.03, "sigma_deg": 0.5}])
+    unknown = {joined_in_words([0, 2], gaps) for gaps in ([], [gap])}
+    assert len(unknown) == 1 and "2" in unknown.pop()
+    assert "3.0 cm, 0.50 degrees" in joined_in_words([0, 2], [gap | {"sigma_m": 0.03, "sigma_deg": 0.5}])
 
 
 def test_no_covariance_is_written_of_a_joined_path(run):

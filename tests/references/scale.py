@@ -12,7 +12,6 @@ from colmap_inertial.core.geometry import (
     quat_multiply,
     skew,
 )
-from colmap_inertial.core.types import Array
 from colmap_inertial.inertial.core.arrow import ArrowSystem
 from colmap_inertial.inertial.core.preintegration import (
     DELAY_STEP_S,

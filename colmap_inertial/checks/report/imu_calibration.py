@@ -10,7 +10,7 @@ from colmap_inertial.checks.report.page import render_page
 from colmap_inertial.checks.words import Fact
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.quantiles import Z95
-from colmap_inertial.core.types import IMU_CAL, Array
+from colmap_inertial.core.types import IMU_CAL
 from colmap_inertial.inertial.core.priors import KNOWN_GAIN, model_scale_sigma
 from colmap_inertial.inertial.static_calibration import RestCalibration
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.types._checks import (
-    Array,
     checked_array,
     checked_covariance,
     checked_quaternions,

@@ -7,7 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from colmap_inertial.core.types._checks import Array, checked_array, checked_covariance, checked_times, set_fields
+from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.types._checks import (
+    checked_array,
+    checked_covariance,
+    checked_times,
+    set_fields,
+)
 from colmap_inertial.core.types.camera_imu import CameraImuCalibration
 
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from colmap_inertial.core.arrays import Array, BoolArray
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import so3_exp, so3_log
-from colmap_inertial.core.types import Array, ImuNoise
+from colmap_inertial.core.types import ImuNoise
 
 # Columns of the globals: the scale, those that the IMU factors see, those that the visual factors see.
 SCALE = 0

@@ -20,8 +20,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from colmap_inertial._kernels import _inertial
+from colmap_inertial.core.arrays import Array, BoolArray, Int64Array
 from colmap_inertial.core.sampling import at_ceiling, is_gap
-from colmap_inertial.core.types import Array, ImuRecording
+from colmap_inertial.core.types import ImuRecording
 
 #: Integration steps: as the samples come, within these. Steps of 5 instead of 2.5 ms change the scale by 0.003 %.
 _SHORTEST_STEP_S, _LONGEST_STEP_S = 0.0025, 0.005
@@ -52,7 +53,7 @@ class SensorStream:
         return np.asarray(ends)
 
     @classmethod
-    def from_samples(cls, t_s: Array, value: Array, lost: NDArray[np.bool_] | None = None) -> SensorStream:
+    def from_samples(cls, t_s: Array, value: Array, lost: BoolArray | None = None) -> SensorStream:
         """A stream of samples ``value`` (N, 3) at times ``t_s`` (N,).
 
         ``lost`` are samples that say nothing: what they cover is a gap, however short.
@@ -113,7 +114,7 @@ class SensorStreams:
         return self.gyro.gap_s(t_s[:-1], t_s[1:]), self.accel.gap_s(accel_s[:-1], accel_s[1:])
 
 
-def find_saturated(imu: ImuRecording) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def find_saturated(imu: ImuRecording) -> tuple[BoolArray, BoolArray]:
     """(N,), (M,) which samples of gyroscope and accelerometer stand at the end of the sensor's range on any axis."""
     gyro, accel = imu.gyro_rad_s, imu.accel_m_s2
     if imu.calibration is not None:
@@ -222,7 +223,7 @@ def preintegrate(nodes_s: Array, streams: SensorStreams, errors: SensorErrors) -
     )
 
 
-def integration_steps(nodes_s: Array, streams: SensorStreams) -> NDArray[np.int64]:
+def integration_steps(nodes_s: Array, streams: SensorStreams) -> Int64Array:
     """In how many steps each interval is integrated."""
     spacing = min(float(np.median(np.diff(stream.t_s))) for stream in (streams.gyro, streams.accel))
     step_s = float(np.clip(spacing, _SHORTEST_STEP_S, _LONGEST_STEP_S))

@@ -9,7 +9,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.geometry import so3_exp, so3_log
-from colmap_inertial.core.types import Array, ImuRecording
+from colmap_inertial.core.types import ImuRecording
 from colmap_inertial.inertial.core import parameters as par
 from colmap_inertial.inertial.core.preintegration import (
     Preintegrated,

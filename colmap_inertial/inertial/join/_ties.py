@@ -8,7 +8,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import skew, so3_log
-from colmap_inertial.core.types import Array, ImuNoise
+from colmap_inertial.core.types import ImuNoise
 from colmap_inertial.inertial.core import parameters as par
 from colmap_inertial.inertial.core.factors import imu_group
 from colmap_inertial.inertial.core.priors import PRIORS

@@ -11,7 +11,6 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, BoolArray
 from colmap_inertial.core.geometry import so3_log
-from colmap_inertial.core.types import Array
 from colmap_inertial.inertial.core.parameters import DRIFT_S
 from colmap_inertial.inertial.join.values import Found, Link, MatchedImages, Part, SharedImages, pair_of
 

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from colmap_inertial.core.geometry import Array, skew, so3_log
+from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.geometry import skew, so3_log
 from colmap_inertial.inertial.core import parameters as par
 from colmap_inertial.inertial.core.factors import imu_group
 from colmap_inertial.inertial.core.preintegration import SensorErrors, preintegrate

@@ -9,7 +9,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, BoolArray, Int64Array
 from colmap_inertial.core.geometry import so3_exp
-from colmap_inertial.core.types import Array, CameraModel, ImuNoise
+from colmap_inertial.core.types import CameraModel, ImuNoise
 from colmap_inertial.inertial.core.preintegration import SensorStreams
 
 # Columns of a frame's state. The first nine are what its observations depend on.
@@ -129,7 +129,7 @@ class Inertial:
     """
 
     nodes_s: Array
-    linked: NDArray[np.bool_]
+    linked: BoolArray
     streams: SensorStreams
     noise: ImuNoise
     turning: Turning

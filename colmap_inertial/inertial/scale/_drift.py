@@ -10,7 +10,8 @@ import math
 
 import numpy as np
 
-from colmap_inertial.core.types import Array, ScaleDrift
+from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.types import ScaleDrift
 from colmap_inertial.inertial.core import parameters as par
 from colmap_inertial.inertial.core.arrow import Inverse
 from colmap_inertial.inertial.core.factors import Direct, Group

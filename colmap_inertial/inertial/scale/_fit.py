@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from colmap_inertial.core.types import Array, ImuNoise, ScaleDrift
+from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.types import ImuNoise, ScaleDrift
 from colmap_inertial.inertial.core import factors as fac, parameters as par
 from colmap_inertial.inertial.core.arrow import ArrowSystem
 from colmap_inertial.inertial.core.parameters import Estimate, Noise, Prior

@@ -13,7 +13,6 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
 from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, quat_multiply, so3_exp, so3_log
-from colmap_inertial.core.types import Array
 from colmap_inertial.inertial.core.preintegration import SensorStreams
 
 #: Longest step of the integration from a group's mean instant to a frame.
@@ -91,7 +90,7 @@ class Data:
     rotation_shape: Array
     centre_shape: Array
     coupling: Array
-    broken: NDArray[np.bool_]
+    broken: BoolArray
     streams: SensorStreams
     gyro_roughness_rad_s_rthz: float
     accel_roughness_m_s2_rthz: float
@@ -104,7 +103,7 @@ class Data:
         return self.groups.t_s
 
 
-def first_of_groups(t_s: Array, rate_hz: float, pauses: Array) -> NDArray[np.intp]:
+def first_of_groups(t_s: Array, rate_hz: float, pauses: Array) -> IndexArray:
     """Indices where a new group begins: ``1 / rate_hz`` after the last beginning, and after a pause of the IMU.
 
     Parameters

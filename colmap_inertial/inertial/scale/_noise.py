@@ -11,7 +11,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from colmap_inertial.core.types import JOINT_GYRO_WALK_RAD_S_RTS, TYPICAL_NOISE, Array, ImuNoise
+from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.types import JOINT_GYRO_WALK_RAD_S_RTS, TYPICAL_NOISE, ImuNoise
 from colmap_inertial.inertial.core.arrow import Inverse
 from colmap_inertial.inertial.core.factors import Direct, Group
 from colmap_inertial.inertial.core.parameters import Noise

@@ -6,7 +6,12 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.sampling import PAUSE_STEPS, is_gap
-from colmap_inertial.core.types import Array, CameraImuCalibration, CameraTrajectory, ImuRecording, clock_shift_s
+from colmap_inertial.core.types import (
+    CameraImuCalibration,
+    CameraTrajectory,
+    ImuRecording,
+    clock_shift_s,
+)
 from colmap_inertial.inertial.core.priors import PRIORS
 
 #: Shorter pauses are not worth a sentence.

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import skew, so3_log
-from colmap_inertial.core.types import Array
 from colmap_inertial.inertial.core import parameters as par
 from colmap_inertial.inertial.core.factors import (
     Direct,

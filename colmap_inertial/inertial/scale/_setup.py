@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from colmap_inertial.core.arrays import Array, BoolArray
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.types import (
     CAL,
-    Array,
     CameraImuCalibration,
     CameraTrajectory,
     ImuRecording,

@@ -15,7 +15,7 @@ from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.options import ScaleOptions
 from colmap_inertial.core.threads import one_blas_thread
-from colmap_inertial.core.types import Array, CameraImuCalibration, CameraTrajectory, ImuRecording
+from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuRecording
 from colmap_inertial.inertial.core import parameters as par
 from colmap_inertial.inertial.core.parameters import Noise
 from colmap_inertial.inertial.core.priors import is_calibrated, model_scale_sigma

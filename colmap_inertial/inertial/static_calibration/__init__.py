@@ -16,7 +16,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.threads import one_blas_thread
-from colmap_inertial.core.types import IMU_CAL, Array, ImuCalibration, ImuRecording
+from colmap_inertial.core.types import IMU_CAL, ImuCalibration, ImuRecording
 from colmap_inertial.inertial.core.priors import KNOWN_GAIN, PRIORS
 from colmap_inertial.inertial.static_calibration._fit import RestFit, RestPriors, fit_rests
 from colmap_inertial.inertial.static_calibration._rests import Rests, candidate_rests

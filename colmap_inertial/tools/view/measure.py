@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from colmap_inertial.core.types import Array, LengthUnit
+from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.types import LengthUnit
 
 #: A click means a point within this angle of it, rad; of several closer than the smaller angle, the one in front.
 _WIDEST_RAD, _SAME_RAD = 0.03, 0.004

@@ -13,7 +13,7 @@ from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.geometry import quat_rotate
 from colmap_inertial.core.quantiles import Z95
-from colmap_inertial.core.types import Array, LengthUnit
+from colmap_inertial.core.types import LengthUnit
 from colmap_inertial.io.files import read_json
 from colmap_inertial.io.names import path_in
 from colmap_inertial.model import TRANSFORM_FILE, find_models, is_metric, model_format
