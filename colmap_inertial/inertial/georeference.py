@@ -25,7 +25,8 @@ from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import matrix_from_quat, rotation_between
 from colmap_inertial.core.quantiles import Z95
-from colmap_inertial.core.types import HeightDatum, PositionFixes, checked_array
+from colmap_inertial.core.types import HeightDatum, PositionFixes
+from colmap_inertial.core.validation import checked_array
 
 #: WGS84: semi-major axis and flattening.
 SEMI_MAJOR_M, FLATTENING = 6378137.0, 1 / 298.257223563

@@ -8,7 +8,6 @@ specific force: at rest the accelerometer reads +9.8 m/s2 away from the ground.
 
 from __future__ import annotations
 
-from colmap_inertial.core.types._checks import checked_array
 from colmap_inertial.core.types.apertures import Aperture, ApertureRig, SpectralRole
 from colmap_inertial.core.types.camera_imu import CAL, CALIBRATION_PARAMETERS, CameraImuCalibration
 from colmap_inertial.core.types.estimated import (
@@ -85,6 +84,5 @@ __all__ = [
     "SpectralRole",
     "Treatment",
     "Verdict",
-    "checked_array",
     "clock_shift_s",
 ]

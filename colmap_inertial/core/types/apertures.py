@@ -8,8 +8,8 @@ from typing import Literal
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
-from colmap_inertial.core.types._checks import checked_array, checked_quaternions, set_fields
 from colmap_inertial.core.types.recorded import CameraModel, LengthUnit
+from colmap_inertial.core.validation import check_fields, set_fields
 
 #: What an aperture's filter passes; ``other`` (near infrared, say) takes part in matching and in no colour.
 SpectralRole = Literal["red", "green", "blue", "luminance", "other"]
@@ -40,11 +40,7 @@ class Aperture:
     cam_in_rig: Array
 
     def __post_init__(self) -> None:
-        set_fields(
-            self,
-            cam_from_rig_xyzw=checked_quaternions("cam_from_rig_xyzw", self.cam_from_rig_xyzw, (4,)),
-            cam_in_rig=checked_array("cam_in_rig", self.cam_in_rig, (3,)),
-        )
+        check_fields(self, cam_from_rig_xyzw=(4,), cam_in_rig=(3,))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

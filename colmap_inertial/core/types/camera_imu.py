@@ -8,12 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
-from colmap_inertial.core.types._checks import (
-    checked_array,
-    checked_covariance,
-    checked_quaternions,
-    set_fields,
-)
+from colmap_inertial.core.validation import check_fields
 
 #: Order of the parameters in ``CameraImuCalibration.cov``. The rotation error is in the camera frame, on the left:
 #: true = exp(error) * estimate.
@@ -73,13 +68,7 @@ class CameraImuCalibration:
     clock_middle_s: float = 0.0
 
     def __post_init__(self) -> None:
-        set_fields(
-            self,
-            cam_from_imu_xyzw=checked_quaternions("cam_from_imu_xyzw", self.cam_from_imu_xyzw, (4,)),
-            gyro_bias_rad_s=checked_array("gyro_bias_rad_s", self.gyro_bias_rad_s, (3,)),
-            imu_in_cam_m=checked_array("imu_in_cam_m", self.imu_in_cam_m, (3,)),
-            cov=checked_covariance("cov", self.cov, (CAL.COUNT, CAL.COUNT)),
-        )
+        check_fields(self, cam_from_imu_xyzw=(4,), gyro_bias_rad_s=(3,), imu_in_cam_m=(3,), cov=(CAL.COUNT, CAL.COUNT))
         if not (abs(self.clock_rate) < 1 and math.isfinite(self.clock_middle_s)):
             raise ValueError("clock_rate must lie between -1 and 1, clock_middle_s must be finite")
 

@@ -13,16 +13,10 @@ from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import matrix_from_quat, rotation_between, skew
 from colmap_inertial.core.options import WorldAxes
-from colmap_inertial.core.types._checks import (
-    checked_array,
-    checked_covariance,
-    checked_quaternions,
-    checked_times,
-    set_fields,
-)
 from colmap_inertial.core.types.camera_imu import CameraImuCalibration
 from colmap_inertial.core.types.imu import ImuCalibration, ImuNoise
 from colmap_inertial.core.types.recorded import LengthUnit
+from colmap_inertial.core.validation import check_fields, check_increasing
 
 Verdict = Literal["trusted", "weak", "refused"]
 
@@ -59,17 +53,8 @@ class SmoothedTrajectory:
     epoch_ns: int = 0
 
     def __post_init__(self) -> None:
-        t_s = checked_times("t_s", self.t_s)
-        n = len(t_s)
-        set_fields(
-            self,
-            t_s=t_s,
-            cam_in_world=checked_array("cam_in_world", self.cam_in_world, (n, 3)),
-            velocity_in_world=checked_array("velocity_in_world", self.velocity_in_world, (n, 3)),
-            accel_in_world=checked_array("accel_in_world", self.accel_in_world, (n, 3)),
-            cam_from_world_xyzw=checked_quaternions("cam_from_world_xyzw", self.cam_from_world_xyzw, (n, 4)),
-            cov=checked_covariance("cov", self.cov, (n, 9, 9)),
-        )
+        vectors = dict.fromkeys(("cam_in_world", "velocity_in_world", "accel_in_world"), ("T", 3))
+        check_fields(self, t_s=("T",), **vectors, cam_from_world_xyzw=("T", 4), cov=("T", 9, 9))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -101,9 +86,8 @@ class ScaleDrift:
     trend_sigma_log_per_s: float
 
     def __post_init__(self) -> None:
-        n = len(checked_times("begin_s", self.begin_s))
-        for name in ("begin_s", "end_s", "log_ratio", "sigma_log"):
-            set_fields(self, **{name: checked_array(name, getattr(self, name), (n,))})
+        check_fields(self, begin_s=("W",), end_s=("W",), log_ratio=("W",), sigma_log=("W",))
+        check_increasing("begin_s", self.begin_s)
 
     def as_json(self, metres_per_unit: float | None) -> dict[str, object]:
         """The fields in JSON types; scales of the parts where the whole one is given."""
@@ -226,11 +210,7 @@ class ScaleEstimate:
             raise ValueError("a refusal needs a reason")
         if self.metres_per_unit is not None and not self.metres_per_unit > 0:
             raise ValueError("metres_per_unit must be positive")
-        for name, shape in (("gravity_in_world_m_s2", (3,)), ("accel_bias_m_s2", (3,))):
-            if getattr(self, name) is not None:
-                set_fields(self, **{name: checked_array(name, getattr(self, name), shape)})
-        if self.cov is not None:
-            set_fields(self, cov=checked_covariance("cov", self.cov, (7, 7)))
+        check_fields(self, gravity_in_world_m_s2=(3,), accel_bias_m_s2=(3,), cov=(7, 7))
 
     @classmethod
     def refused(cls, method: str, *reasons: str, calibration: CameraImuCalibration | None = None) -> ScaleEstimate:
@@ -314,12 +294,7 @@ class Similarity:
     def __post_init__(self) -> None:
         if not (np.isfinite(self.scale) and self.scale > 0):
             raise ValueError("scale must be positive")
-        set_fields(
-            self,
-            rotation_xyzw=checked_quaternions("rotation_xyzw", self.rotation_xyzw, (4,)),
-            translation_m=checked_array("translation_m", self.translation_m, (3,)),
-            cov=checked_covariance("cov", self.cov, (7, 7)),
-        )
+        check_fields(self, rotation_xyzw=(4,), translation_m=(3,), cov=(7, 7))
 
     @classmethod
     def from_scale(cls, estimate: ScaleEstimate, *, world: WorldAxes = "z-up", provenance: str = "") -> Similarity:

@@ -8,13 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
-from colmap_inertial.core.types._checks import (
-    checked_array,
-    checked_covariance,
-    checked_times,
-    set_fields,
-)
 from colmap_inertial.core.types.camera_imu import CameraImuCalibration
+from colmap_inertial.core.validation import check_fields
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -107,14 +102,8 @@ class ImuCalibration:
     attitudes: int
 
     def __post_init__(self) -> None:
-        set_fields(
-            self,
-            accel_gain=checked_array("accel_gain", self.accel_gain, (3, 3)),
-            accel_bias_m_s2=checked_array("accel_bias_m_s2", self.accel_bias_m_s2, (3,)),
-            gyro_gain=checked_array("gyro_gain", self.gyro_gain, (3, 3)),
-            gyro_bias_rad_s=checked_array("gyro_bias_rad_s", self.gyro_bias_rad_s, (3,)),
-            cov=checked_covariance("cov", self.cov, (IMU_CAL.COUNT, IMU_CAL.COUNT)),
-        )
+        gains, biases = {"accel_gain": (3, 3), "gyro_gain": (3, 3)}, {"accel_bias_m_s2": (3,), "gyro_bias_rad_s": (3,)}
+        check_fields(self, **gains, **biases, cov=(IMU_CAL.COUNT, IMU_CAL.COUNT))
         for name in ("accel_gain", "gyro_gain"):
             if np.abs(getattr(self, name)).max() > 0.5:
                 raise ValueError(f"{name}: its entries are errors, a few per cent at most; these are no errors of gain")
@@ -224,15 +213,8 @@ class ImuRecording:
     temperature_c: float | None = None
 
     def __post_init__(self) -> None:
-        gyro_t_s, accel_t_s = checked_times("gyro_t_s", self.gyro_t_s), checked_times("accel_t_s", self.accel_t_s)
-        set_fields(
-            self,
-            gyro_t_s=gyro_t_s,
-            accel_t_s=accel_t_s,
-            gyro_rad_s=checked_array("gyro_rad_s", self.gyro_rad_s, (len(gyro_t_s), 3)),
-            accel_m_s2=checked_array("accel_m_s2", self.accel_m_s2, (len(accel_t_s), 3)),
-        )
-        if len(gyro_t_s) < 2 or len(accel_t_s) == 1:
+        check_fields(self, gyro_t_s=("N",), accel_t_s=("M",), gyro_rad_s=("N", 3), accel_m_s2=("M", 3))
+        if len(self.gyro_t_s) < 2 or len(self.accel_t_s) == 1:
             raise ValueError("an ImuRecording needs at least two samples of each sensor (or none of the accelerometer)")
         if self.temperature_c is not None and not np.isfinite(self.temperature_c):
             raise ValueError("temperature_c must be finite")

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
-from colmap_inertial.core.types._checks import checked_array, checked_covariance, checked_times, set_fields
 from colmap_inertial.core.types.recorded import ReadoutDirection
+from colmap_inertial.core.validation import check_fields, checked_field, set_fields
 
 #: An image stands where it stood within this part of its distance from the origin, and of one unit.
 _UNMOVED = 1e-6
@@ -45,16 +45,13 @@ class CameraMotion:
     epoch_ns: int = 0
 
     def __post_init__(self) -> None:
-        t_s = checked_times("t_s", self.t_s)
-        n = len(t_s)
-        if len(self.names) != n:
+        velocities = ("velocity_in_world_m_s", "angular_velocity_in_cam_rad_s")
+        # without any frame, JSON keeps no shape
+        set_fields(self, **{name: np.reshape(getattr(self, name), (-1, 3)) for name in velocities})
+        check_fields(self, t_s=("F",), **dict.fromkeys(velocities, ("F", 3)), exposure_s=("F",))
+        if len(self.names) != len(self.t_s):
             raise ValueError("one name for each instant")
-        set_fields(self, names=tuple(self.names), t_s=t_s)
-        for name in ("velocity_in_world_m_s", "angular_velocity_in_cam_rad_s"):
-            # without any frame, JSON keeps no shape
-            set_fields(self, **{name: checked_array(name, np.reshape(getattr(self, name), (-1, 3)), (n, 3))})
-        if self.exposure_s is not None:
-            set_fields(self, exposure_s=checked_array("exposure_s", self.exposure_s, (n,)))
+        set_fields(self, names=tuple(self.names))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -81,10 +78,9 @@ class SolvedMotion:
     readout_s: float | None = None
 
     def __post_init__(self) -> None:
-        centres = {name: checked_array(name, one, (3,)) for name, one in self.cam_in_world.items()}
-        velocity = {name: checked_array(name, one, (3,)) for name, one in self.velocity_in_world.items()}
-        cov = {name: checked_covariance(name, one, (6, 6)) for name, one in self.cov.items()}
-        set_fields(self, cam_in_world=centres, velocity_in_world=velocity, cov=cov)
+        for field, shape in (("cam_in_world", (3,)), ("velocity_in_world", (3,)), ("cov", (6, 6))):
+            values = {n: checked_field(f"{n}: {field}", v, shape) for n, v in getattr(self, field).items()}
+            set_fields(self, **{field: values})
 
     def of(self, names: Sequence[str], cam_in_world: Array) -> SolvedMotion:
         """What holds of these images: of those that still stand where they stood when this was solved.

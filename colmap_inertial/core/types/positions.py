@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
 from colmap_inertial.core.arrays import Array, BoolArray, IndexArray, Int64Array
-from colmap_inertial.core.types._checks import checked_array, set_fields
+from colmap_inertial.core.validation import check_fields, set_fields
 
 #: What heights count from: WGS84's ellipsoid, the sea, or what nobody said.
 HeightDatum = Literal["ellipsoid", "sea", "unknown"]
@@ -46,16 +46,14 @@ class PositionFixes:
     source: str = ""
 
     def __post_init__(self) -> None:
-        latitude = checked_array("latitude_deg", self.latitude_deg, (None,))
-        n = len(latitude)
+        check_fields(self, latitude_deg=("N",), longitude_deg=("N",))
+        n = len(self.latitude_deg)
         if (self.t_ns is None) == (self.names is None):
             raise ValueError("either times or names")
         if self.names is not None and len(self.names) != n:
             raise ValueError("one name for each position")
-        longitude = checked_array("longitude_deg", self.longitude_deg, (n,))
-        if np.abs(latitude).max(initial=0) > 90 or np.abs(longitude).max(initial=0) > 360:
+        if np.abs(self.latitude_deg).max(initial=0) > 90 or np.abs(self.longitude_deg).max(initial=0) > 360:
             raise ValueError("latitudes reach from -90 to 90 degrees, longitudes from -180 to 180")
-        set_fields(self, latitude_deg=latitude, longitude_deg=longitude)
         for name in ("height_m", "sigma_m"):
             values = np.array(getattr(self, name), dtype=np.float64)
             if values.shape != (n,) or np.isinf(values).any():
@@ -68,13 +66,6 @@ class PositionFixes:
     def select(self, index: IndexArray | BoolArray) -> PositionFixes:
         """Some of them."""
         names = None if self.names is None else tuple(np.array(self.names, dtype=object)[index])
-        return PositionFixes(
-            latitude_deg=self.latitude_deg[index],
-            longitude_deg=self.longitude_deg[index],
-            height_m=self.height_m[index],
-            sigma_m=self.sigma_m[index],
-            t_ns=None if self.t_ns is None else self.t_ns[index],
-            names=names,
-            height_above=self.height_above,
-            source=self.source,
-        )
+        arrays = ("latitude_deg", "longitude_deg", "height_m", "sigma_m")
+        t_ns = None if self.t_ns is None else self.t_ns[index]
+        return replace(self, **{name: getattr(self, name)[index] for name in arrays}, t_ns=t_ns, names=names)

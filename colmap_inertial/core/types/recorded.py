@@ -10,14 +10,8 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, BoolArray, IndexArray, UInt8Array, UInt16Array
 from colmap_inertial.core.geometry import quat_conjugate, quat_log, quat_multiply
-from colmap_inertial.core.types._checks import (
-    checked_array,
-    checked_covariance,
-    checked_quaternions,
-    checked_times,
-    set_fields,
-)
 from colmap_inertial.core.types.imu import ImuRecording
+from colmap_inertial.core.validation import check_fields, set_fields
 
 LengthUnit = Literal["model", "m"]
 ReadoutDirection = Literal["down", "up", "right", "left"]
@@ -142,7 +136,7 @@ class Keypoints:
     treatments: tuple[Treatment, ...] = ()
 
     def __post_init__(self) -> None:
-        set_fields(self, xy_px=checked_array("xy_px", self.xy_px, (None, 2)))
+        check_fields(self, xy_px=("N", 2))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -171,12 +165,10 @@ class FrameTiming:
     epoch_ns: int = 0
 
     def __post_init__(self) -> None:
-        t_s = checked_times("t_s", self.t_s)
-        if len(self.names) != len(t_s) or len(set(self.names)) != len(t_s):
+        check_fields(self, t_s=("F",), exposure_s=("F",))
+        if not len(self.names) == len(set(self.names)) == len(self.t_s):
             raise ValueError("frame names must be unique, one for each time")
-        set_fields(self, names=tuple(self.names), t_s=t_s)
-        if self.exposure_s is not None:
-            set_fields(self, exposure_s=checked_array("exposure_s", self.exposure_s, (len(t_s),)))
+        set_fields(self, names=tuple(self.names))
         if self.readout_s is not None and not 0 <= self.readout_s < 1:
             raise ValueError("readout_s must be from 0 to 1 second")
 
@@ -235,16 +227,8 @@ class FrameLog:
     start_from_imu_xyzw: Array | None = None
 
     def __post_init__(self) -> None:
-        t_s = checked_times("t_s", self.t_s)
-        set_fields(self, t_s=t_s)
-        for name in ("exposure_s", "iso", "focal_px"):
-            if getattr(self, name) is not None:
-                set_fields(self, **{name: checked_array(name, getattr(self, name), (len(t_s),))})
-        if self.start_from_imu_xyzw is not None:
-            checked = checked_quaternions("start_from_imu_xyzw", self.start_from_imu_xyzw, (len(t_s), 4))
-            set_fields(self, start_from_imu_xyzw=checked)
-        if self.up_in_imu is not None:
-            set_fields(self, up_in_imu=checked_array("up_in_imu", self.up_in_imu, (len(t_s), 3)))
+        of_frames = dict.fromkeys(("t_s", "exposure_s", "iso", "focal_px"), ("F",))
+        check_fields(self, **of_frames, start_from_imu_xyzw=("F", 4), up_in_imu=("F", 3))
         if self.readout_s is not None and not 0 <= self.readout_s < 1:
             raise ValueError("readout_s must be from 0 to 1 second")
 
@@ -276,19 +260,10 @@ class CameraTrajectory:
     pose_cov: Array | None = None
 
     def __post_init__(self) -> None:
-        t_s = checked_times("t_s", self.t_s)
-        n = len(t_s)
-        if len(self.names) != n:
+        check_fields(self, t_s=("F",), cam_from_world_xyzw=("F", 4), cam_in_world=("F", 3), pose_cov=("F", 6, 6))
+        if len(self.names) != len(self.t_s):
             raise ValueError("one name for each pose")
-        set_fields(
-            self,
-            names=tuple(self.names),
-            t_s=t_s,
-            cam_from_world_xyzw=checked_quaternions("cam_from_world_xyzw", self.cam_from_world_xyzw, (n, 4)),
-            cam_in_world=checked_array("cam_in_world", self.cam_in_world, (n, 3)),
-        )
-        if self.pose_cov is not None:
-            set_fields(self, pose_cov=checked_covariance("pose_cov", self.pose_cov, (n, 6, 6)))
+        set_fields(self, names=tuple(self.names))
 
     def __len__(self) -> int:
         return len(self.t_s)

@@ -1,0 +1,78 @@
+"""Checks that make values valid by construction; what fails here is a programmer's mistake, hence ``ValueError``."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from colmap_inertial.core.arrays import Array
+
+
+def checked_array(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Array:
+    """A read-only float64 copy of ``value``; ``None`` in ``shape`` means any length.
+
+    Raises
+    ------
+    ValueError
+        For another shape, and for values that are not finite; the message begins with ``name``.
+    """
+    out = np.array(value, dtype=np.float64)
+    if out.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, out.shape, strict=True)):
+        wanted = tuple("N" if n is None else n for n in shape)
+        raise ValueError(f"{name}: shape {out.shape}, expected {wanted}")
+    if not np.isfinite(out).all():
+        raise ValueError(f"{name}: contains values that are not finite")
+    out.setflags(write=False)
+    return out
+
+
+def checked_field(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Array:
+    """As :func:`checked_array`, and what the end of the name says of it.
+
+    Times (``t_s``) increase strictly, quaternions (``xyzw``) have unit norm and are normalised, covariances (``cov``)
+    are symmetric with a non-negative diagonal.
+    """
+    out = checked_array(name, value, shape)
+    if name.endswith("t_s"):
+        check_increasing(name, out)
+    elif name.endswith("xyzw"):
+        norm = np.linalg.norm(out, axis=-1, keepdims=True)
+        if np.any(np.abs(norm - 1) > 1e-3):
+            raise ValueError(f"{name}: quaternions must have unit norm")
+        out = out / norm
+        out.setflags(write=False)
+    elif name.endswith("cov"):
+        diagonal = np.diagonal(out, axis1=-2, axis2=-1)
+        if np.any(diagonal < 0) or not np.allclose(out, np.swapaxes(out, -1, -2), rtol=1e-6, atol=1e-30):
+            raise ValueError(f"{name}: not a covariance (must be symmetric with a non-negative diagonal)")
+    return out
+
+
+def check_increasing(name: str, t_s: Array) -> None:
+    """Raise ``ValueError`` unless times increase strictly."""
+    if np.any(np.diff(t_s) <= 0):
+        raise ValueError(f"{name}: times must increase strictly")
+
+
+def check_fields(instance: object, **shapes: tuple[int | str, ...]) -> None:
+    """Replace array fields of a frozen value by what :func:`checked_field` makes of them; an optional ``None`` stays.
+
+    Parameters
+    ----------
+    shapes
+        By field; a letter is a length that fields have in common.
+    """
+    lengths: dict[str, int] = {}
+    for name, shape in shapes.items():
+        value = getattr(instance, name)
+        if value is None and getattr(type(instance), name, ...) is None:
+            continue
+        out = checked_field(name, value, tuple(lengths.get(n) if isinstance(n, str) else n for n in shape))
+        lengths |= {letter: n for letter, n in zip(shape, out.shape, strict=True) if isinstance(letter, str)}
+        set_fields(instance, **{name: out})
+
+
+def set_fields(instance: object, **values: object) -> None:
+    """Set fields of a frozen value while it is made."""
+    for name, value in values.items():
+        object.__setattr__(instance, name, value)
