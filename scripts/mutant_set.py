@@ -135,8 +135,8 @@ MUTANTS = (
     ),
     Mutant(
         "io/calibration.py",
-        "UNKNOWN_LEVER_ARM_M = 0.08",
-        "UNKNOWN_LEVER_ARM_M = 0.01",
+        "unknown_lever_arm_m: float = 0.08",
+        "unknown_lever_arm_m: float = 0.01",
         "every device is as flat as a phone",
         ("scale_real::test_an_imu_behind_the_camera_is_found_there_in_short_noisy_clips",),
     ),
@@ -635,8 +635,8 @@ MUTANTS = (
     ),
     Mutant(
         "io/calibration.py",
-        "ACCEL_MINUS_GYRO_OFFSET_S * on_gyro, ACCEL_MINUS_GYRO_OFFSET_S * (not on_gyro)",
-        "ACCEL_MINUS_GYRO_OFFSET_S * (not on_gyro), ACCEL_MINUS_GYRO_OFFSET_S * on_gyro",
+        "delay_s * on_gyro, delay_s * (not on_gyro)",
+        "delay_s * (not on_gyro), delay_s * on_gyro",
         "of two time offsets the one that is known is the wider",
         ("io_calibration",),
     ),

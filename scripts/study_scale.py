@@ -51,7 +51,7 @@ from colmap_inertial.inertial.core.priors import PRIORS, model_scale_sigma
 from colmap_inertial.inertial.scale import estimate_scale
 from colmap_inertial.inertial.scale._noise import TYPICAL
 from colmap_inertial.inertial.scale.verdict import WEAK_HALF_WIDTH, half_width
-from colmap_inertial.io.calibration import ACCEL_MINUS_GYRO_OFFSET_S
+from colmap_inertial.io.calibration import SIGMAS
 from colmap_inertial.tools.simulate import (
     IMU_PRESETS,
     MotionOptions,
@@ -113,7 +113,7 @@ def drawn(seed: int) -> tuple[RecordingOptions, str, str]:
         accel_bias_m_s2_sd=PRIORS.accel_bias_m_s2,
         clock_rate_sd=PRIORS.clock_rate,
         lever_arm_m_sd=BoundPriors().imu_in_cam_m,
-        accel_delay_s=(0.0, ACCEL_MINUS_GYRO_OFFSET_S),
+        accel_delay_s=(0.0, SIGMAS.accel_minus_gyro_offset_s),
     )
     vigour = float(np.exp(rng.uniform(np.log(0.3), 0.0)))
     duration_s = float(rng.uniform(10.0, 30.0)) if part == "short" else 60.0

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,28 +14,55 @@ from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.types import CAL, CALIBRATION_PARAMETERS, CameraImuCalibration
 from colmap_inertial.io.files import StrPath, read_json, write_json
 
-#: Standard deviations of what nobody knows. A rotation: any. Offsets: clock origins are arbitrary.
-UNKNOWN_ROTATION_RAD = np.pi
-UNKNOWN_OFFSET_S = 1e4
-UNKNOWN_GYRO_BIAS_RAD_S = 0.1
-UNKNOWN_LEVER_ARM_M = 0.08  # along each axis: a phone is flat, an action camera or a rig is not
-UNKNOWN_READOUT_S = 0.02
-#: Camera and IMU on one clock differ by pipeline delays at most.
-SHARED_CLOCK_OFFSET_S = 1.0
-#: Within one device the accelerometer's delay differs from the gyroscope's by filters; -8 to -13 ms on a tablet.
-ACCEL_MINUS_GYRO_OFFSET_S = 0.02
-#: Standard deviations of what was declared without one.
-KNOWN_ROTATION_RAD = 0.01
-KNOWN_LEVER_ARM_M = 0.005
-KNOWN_OFFSET_S = 0.002
-KNOWN_GYRO_BIAS_RAD_S = 0.002
-KNOWN_READOUT_SHARE = 0.02
-SMALLEST_READOUT_S = 1e-4
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+T = TypeVar("T", bound="DataclassInstance")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrationSigmas:
+    """Standard deviations of a calibration before anything is estimated: of what nobody knows, and of what is stated.
+
+    Attributes
+    ----------
+    unknown_rotation_rad, unknown_offset_s, unknown_gyro_bias_rad_s
+        A rotation may be any, and the origins of clocks are arbitrary.
+    unknown_lever_arm_m
+        Along each axis: a phone is flat, an action camera or a rig is not.
+    unknown_readout_s
+        Where no readout is declared.
+    shared_clock_offset_s
+        Camera and IMU on one clock differ by pipeline delays at most.
+    accel_minus_gyro_offset_s
+        Within one device the delays of the two sensors differ by filters; -8 to -13 ms on a tablet.
+    known_rotation_rad, known_lever_arm_m, known_offset_s, known_gyro_bias_rad_s
+        What was stated without a standard deviation.
+    known_readout_share, smallest_readout_s
+        A readout that was stated, as a share of it, and at least.
+    """
+
+    unknown_rotation_rad: float = np.pi
+    unknown_offset_s: float = 1e4
+    unknown_gyro_bias_rad_s: float = 0.1
+    unknown_lever_arm_m: float = 0.08
+    unknown_readout_s: float = 0.02
+    shared_clock_offset_s: float = 1.0
+    accel_minus_gyro_offset_s: float = 0.02
+    known_rotation_rad: float = 0.01
+    known_lever_arm_m: float = 0.005
+    known_offset_s: float = 0.002
+    known_gyro_bias_rad_s: float = 0.002
+    known_readout_share: float = 0.02
+    smallest_readout_s: float = 1e-4
+
+
+SIGMAS = CalibrationSigmas()
 
 #: What a file of this module holds, under ``kind``; one without it is of this kind, too.
 CAMERA_IMU = "camera-imu"
 #: Fields that a file may lack, as those of clocks that keep step do.
-_CLOCK = {"clock_rate", "clock_middle_s"}
+_CLOCK = frozenset({"clock_rate", "clock_middle_s"})
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -55,10 +84,10 @@ class Declared:
     accel_time_offset_s: float | None = None
     gyro_bias_rad_s: ArrayLike | None = None
     readout_s: float | None = None
-    rotation_sigma_rad: float = KNOWN_ROTATION_RAD
-    imu_in_cam_sigma_m: float = KNOWN_LEVER_ARM_M
-    time_offset_sigma_s: float = KNOWN_OFFSET_S
-    gyro_bias_sigma_rad_s: float = KNOWN_GYRO_BIAS_RAD_S
+    rotation_sigma_rad: float = SIGMAS.known_rotation_rad
+    imu_in_cam_sigma_m: float = SIGMAS.known_lever_arm_m
+    time_offset_sigma_s: float = SIGMAS.known_offset_s
+    gyro_bias_sigma_rad_s: float = SIGMAS.known_gyro_bias_rad_s
 
 
 def calibration_prior(declared: Declared | None = None, *, shared_clock: bool = False) -> CameraImuCalibration:
@@ -80,12 +109,13 @@ def calibration_prior(declared: Declared | None = None, *, shared_clock: bool = 
     else:
         common_s = sigma_s if stated else _unknown_offset_s(shared_clock)
         on_gyro = bool(stated) and gyro_s is None
-        extra_s = [ACCEL_MINUS_GYRO_OFFSET_S * on_gyro, ACCEL_MINUS_GYRO_OFFSET_S * (not on_gyro)]
+        delay_s = SIGMAS.accel_minus_gyro_offset_s
+        extra_s = [delay_s * on_gyro, delay_s * (not on_gyro)]
 
     cov = np.zeros((CAL.COUNT, CAL.COUNT))
-    rotation_sd = UNKNOWN_ROTATION_RAD if known.cam_from_imu_xyzw is None else known.rotation_sigma_rad
-    bias_sd = UNKNOWN_GYRO_BIAS_RAD_S if known.gyro_bias_rad_s is None else known.gyro_bias_sigma_rad_s
-    lever_sd = UNKNOWN_LEVER_ARM_M if known.imu_in_cam_m is None else known.imu_in_cam_sigma_m
+    rotation_sd = SIGMAS.unknown_rotation_rad if known.cam_from_imu_xyzw is None else known.rotation_sigma_rad
+    bias_sd = SIGMAS.unknown_gyro_bias_rad_s if known.gyro_bias_rad_s is None else known.gyro_bias_sigma_rad_s
+    lever_sd = SIGMAS.unknown_lever_arm_m if known.imu_in_cam_m is None else known.imu_in_cam_sigma_m
     cov[CAL.ROTATION, CAL.ROTATION] = np.eye(3) * rotation_sd**2
     cov[CAL.TIME_OFFSETS, CAL.TIME_OFFSETS] = common_s**2 + np.diag(np.square(extra_s))
     cov[CAL.GYRO_BIAS, CAL.GYRO_BIAS] = np.eye(3) * bias_sd**2
@@ -105,19 +135,19 @@ def calibration_prior(declared: Declared | None = None, *, shared_clock: bool = 
 
 def _unknown_offset_s(shared_clock: bool) -> float:
     """Standard deviation of a time offset that nothing was said about."""
-    return SHARED_CLOCK_OFFSET_S if shared_clock else UNKNOWN_OFFSET_S
+    return SIGMAS.shared_clock_offset_s if shared_clock else SIGMAS.unknown_offset_s
 
 
 def readout_sigma_s(readout_s: float | None) -> float:
     """Standard deviation of a readout that was declared (or not: ``None``)."""
     if readout_s is None:
-        return UNKNOWN_READOUT_S
-    return max(SMALLEST_READOUT_S, KNOWN_READOUT_SHARE * readout_s)
+        return SIGMAS.unknown_readout_s
+    return max(SIGMAS.smallest_readout_s, SIGMAS.known_readout_share * readout_s)
 
 
 def largest_offset_s(shared_clock: bool, asked: float | None = None) -> float | None:
     """Largest offset between raw stamps to search for: what was asked for, else a shared clock's, else any."""
-    return SHARED_CLOCK_OFFSET_S if asked is None and shared_clock else asked
+    return SIGMAS.shared_clock_offset_s if asked is None and shared_clock else asked
 
 
 def for_another_recording(calibration: CameraImuCalibration, *, shared_clock: bool = False) -> CameraImuCalibration:
@@ -134,7 +164,7 @@ def for_another_recording(calibration: CameraImuCalibration, *, shared_clock: bo
     cov = to_delay @ calibration.cov @ to_delay.T
     opened = np.r_[CAL.GYRO_TIME_OFFSET, CAL.GYRO_BIAS]
     cov[opened, :] = cov[:, opened] = 0.0
-    cov[opened, opened] = np.square([_unknown_offset_s(shared_clock), *[UNKNOWN_GYRO_BIAS_RAD_S] * 3])
+    cov[opened, opened] = np.square([_unknown_offset_s(shared_clock), *[SIGMAS.unknown_gyro_bias_rad_s] * 3])
     cov = back @ cov @ back.T
     delay_s = calibration.accel_time_offset_s - calibration.gyro_time_offset_s
     gyro_offset_s = calibration.gyro_time_offset_s if shared_clock else 0.0
@@ -153,11 +183,8 @@ def write_calibration(path: StrPath, calibration: CameraImuCalibration) -> None:
 
     A clock rate and when the offsets hold are written where the clocks do not keep step.
     """
-    path = Path(path)
-    values = {field.name: getattr(calibration, field.name) for field in fields(calibration)}
-    if calibration.clock_rate == 0:
-        values = {name: value for name, value in values.items() if name not in _CLOCK}
-    write_json(path, {"kind": CAMERA_IMU, **values, "cov_parameters": list(CALIBRATION_PARAMETERS)})
+    left_out = _CLOCK if calibration.clock_rate == 0 else frozenset()
+    write_calibration_fields(Path(path), CAMERA_IMU, calibration, CALIBRATION_PARAMETERS, left_out)
 
 
 def read_calibration(path: StrPath) -> CameraImuCalibration:
@@ -169,33 +196,63 @@ def read_calibration(path: StrPath) -> CameraImuCalibration:
         Where a field is missing, unknown, of a wrong shape, or not finite.
     """
     path = Path(path)
-    values = read_json(path)
-    if values.pop("kind", CAMERA_IMU) != CAMERA_IMU:
+    # a file that states neither is of this kind and order
+    values = {"kind": CAMERA_IMU, "cov_parameters": list(CALIBRATION_PARAMETERS), **read_json(path)}
+    if values.pop("kind") != CAMERA_IMU:
         raise FormatError(path, "holds no calibration of a camera and an IMU (its kind is another)")
-    order = values.pop("cov_parameters", list(CALIBRATION_PARAMETERS))
-    if order != list(CALIBRATION_PARAMETERS):
+    return calibration_from_fields(path, values, CameraImuCalibration, CALIBRATION_PARAMETERS, _CLOCK)
+
+
+def write_calibration_fields(
+    path: Path, kind: str, calibration: DataclassInstance, parameters: Sequence[str], left_out: Set[str] = frozenset()
+) -> None:
+    """Write a calibration: its kind, its fields but those left out, and the order of ``cov``."""
+    written = {f.name: getattr(calibration, f.name) for f in fields(calibration) if f.name not in left_out}
+    write_json(path, {"kind": kind, **written, "cov_parameters": list(parameters)})
+
+
+def calibration_from_fields(
+    path: Path, values: dict[str, Any], cls: type[T], parameters: Sequence[str], optional: Set[str] = frozenset()
+) -> T:
+    """The calibration of fields that :func:`write_calibration_fields` wrote, each of the type that the class states.
+
+    Raises
+    ------
+    FormatError
+        Where a field is missing (but for ``optional`` ones), unknown, of another type, or refused by the class.
+    """
+    if values.pop("cov_parameters", None) != list(parameters):
         raise FormatError(path, "cov_parameters: the order of cov is not the one of this version")
-    names = {field.name for field in fields(CameraImuCalibration)}
-    missing, unknown = sorted(names - values.keys() - _CLOCK), sorted(values.keys() - names)
+    types = {field.name: str(field.type) for field in fields(cls)}
+    missing, unknown = sorted(types.keys() - values.keys() - optional), sorted(values.keys() - types.keys())
     if missing or unknown:
-        what = "; ".join(
-            f"{label} {', '.join(items)}" for label, items in (("missing:", missing), ("unknown:", unknown)) if items
-        )
-        raise FormatError(path, f"not a calibration file ({what})")
+        stated = (("missing:", missing), ("unknown:", unknown))
+        what = "; ".join(f"{label} {', '.join(names)}" for label, names in stated if names)
+        raise FormatError(path, f"not the fields of such a calibration ({what})")
     for name, value in values.items():
-        if not is_numeric(value):
-            raise FormatError(path, f"{name}: expected numbers")
-    scalars = ["gyro_time_offset_s", "accel_time_offset_s", "readout_s", *sorted(_CLOCK & values.keys())]
-    if any(not isinstance(values[name], int | float) for name in scalars):
-        raise FormatError(path, f"{', '.join(scalars)} must be single numbers")
+        if fault := _field_fault(value, types[name]):
+            raise FormatError(path, f"{name}{fault}")
     try:
-        return CameraImuCalibration(**values)
+        return cls(**values)
     except (ValueError, TypeError, OverflowError) as error:
         raise FormatError(path, str(error)) from None
 
 
-def is_numeric(value: object) -> bool:
-    """Whether a value of a JSON file is a number, or lists of numbers."""
+def _field_fault(value: object, kind: str) -> str | None:
+    """What is wrong with a value from JSON for a field of this annotation; ``None`` where nothing is."""
+    if kind == "str":
+        return None if isinstance(value, str) else ": expected a text"
+    if kind == "int":
+        return None if isinstance(value, int) and not isinstance(value, bool) else ": expected a whole number"
+    if value is None and kind.endswith("None"):
+        return None
+    if not _is_numeric(value):
+        return ": expected numbers"
+    return " must be a single number" if kind.startswith("float") and isinstance(value, list) else None
+
+
+def _is_numeric(value: object) -> bool:
+    """Whether a value from JSON is a number, or lists of numbers."""
     if isinstance(value, list):
-        return all(is_numeric(item) for item in value)
+        return all(map(_is_numeric, value))
     return isinstance(value, int | float) and not isinstance(value, bool)

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.types import IMU_CALIBRATION_PARAMETERS, CameraImuCalibration, ImuCalibration
-from colmap_inertial.io.calibration import CAMERA_IMU, for_another_recording, is_numeric, read_calibration
-from colmap_inertial.io.files import StrPath, read_json, write_json
+from colmap_inertial.io.calibration import (
+    CAMERA_IMU,
+    calibration_from_fields,
+    for_another_recording,
+    read_calibration,
+    write_calibration_fields,
+)
+from colmap_inertial.io.files import StrPath, read_json
 
 #: No file, one, or several of one device.
 CalibrationFiles = StrPath | Sequence[StrPath] | None
@@ -37,8 +43,7 @@ class Calibrations:
 
 def write_imu_calibration(path: StrPath, calibration: ImuCalibration) -> None:
     """Write an IMU's calibration as JSON: its kind, the fields of :class:`ImuCalibration`, and the order of ``cov``."""
-    values = {field.name: getattr(calibration, field.name) for field in fields(calibration)}
-    write_json(Path(path), {"kind": IMU, **values, "cov_parameters": list(IMU_CALIBRATION_PARAMETERS)})
+    write_calibration_fields(Path(path), IMU, calibration, IMU_CALIBRATION_PARAMETERS)
 
 
 def read_imu_calibration(path: StrPath) -> ImuCalibration:
@@ -53,29 +58,7 @@ def read_imu_calibration(path: StrPath) -> ImuCalibration:
     values = read_json(path)
     if values.pop("kind", None) != IMU:
         raise FormatError(path, "holds no calibration of an IMU (colmap-inertial calibrate-imu writes one)")
-    if values.pop("cov_parameters", None) != list(IMU_CALIBRATION_PARAMETERS):
-        raise FormatError(path, "cov_parameters: the order of cov is not the one of this version")
-    names = {field.name for field in fields(ImuCalibration)}
-    missing, unknown = sorted(names - values.keys()), sorted(values.keys() - names)
-    if missing or unknown:
-        what = "; ".join(
-            f"{label} {', '.join(items)}" for label, items in (("missing:", missing), ("unknown:", unknown)) if items
-        )
-        raise FormatError(path, f"not the calibration of an IMU ({what})")
-    if not isinstance(values["device"], str):
-        raise FormatError(path, "device: expected a text")
-    if not isinstance(values["attitudes"], int) or isinstance(values["attitudes"], bool):
-        raise FormatError(path, "attitudes: expected a whole number")
-    for name, value in values.items():
-        known = name == "device" or (name == "temperature_c" and value is None)
-        if not known and not is_numeric(value):
-            raise FormatError(path, f"{name}: expected numbers")
-        if name in ("gravity_m_s2", "temperature_c") and isinstance(value, list):
-            raise FormatError(path, f"{name} must be a single number")
-    try:
-        return ImuCalibration(**values)
-    except (ValueError, TypeError, OverflowError) as error:
-        raise FormatError(path, str(error)) from None
+    return calibration_from_fields(path, values, ImuCalibration, IMU_CALIBRATION_PARAMETERS)
 
 
 def calibration_kind(path: StrPath) -> str:

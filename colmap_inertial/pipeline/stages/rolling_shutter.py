@@ -11,7 +11,7 @@ from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.types import CAL, CameraImuCalibration, CameraModel, Keypoints, Projector, Treatment
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.imaging.rolling_shutter import rays, rectify_image, rectify_keypoints, seen_by_lines
-from colmap_inertial.io.calibration import SMALLEST_READOUT_S
+from colmap_inertial.io.calibration import SIGMAS
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.pipeline.stages.gyro_view import GyroView
 
@@ -96,5 +96,5 @@ def for_rectified(calibration: CameraImuCalibration) -> CameraImuCalibration:
     """
     cov = calibration.cov.copy()
     cov[CAL.READOUT, :] = cov[:, CAL.READOUT] = 0.0
-    cov[CAL.READOUT, CAL.READOUT] = max(SMALLEST_READOUT_S, _LEFT_SHARE * calibration.readout_s) ** 2
+    cov[CAL.READOUT, CAL.READOUT] = max(SIGMAS.smallest_readout_s, _LEFT_SHARE * calibration.readout_s) ** 2
     return replace(calibration, readout_s=0.0, cov=cov)
