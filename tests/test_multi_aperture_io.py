@@ -249,7 +249,7 @@ def test_a_capture_s_apertures_are_its_camera(tmp_path):
             "[apertures]",
             '[camera]\nmodel = "PINHOLE"\nwidth = 160\nheight = 120\nparams = [1, 1, 1, 1]\n'
             'pixel_origin = "corner"\n[apertures]',
-            "given by the calibration",
+            "gives the camera by its calibration",
         ),
     ],
 )

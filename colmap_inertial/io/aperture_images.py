@@ -95,7 +95,7 @@ def read_rename(table: Section) -> tuple[str, str] | None:
     return texts[0], texts[1]
 
 
-def read_apertures_table(table: Section | None, images: Path | None) -> ApertureImages | None:
+def read_apertures_table(table: Section, images: Path | None) -> ApertureImages:
     """The ``[apertures]`` table.
 
     Parameters
@@ -108,14 +108,13 @@ def read_apertures_table(table: Section | None, images: Path | None) -> Aperture
     FormatError
         Where the calibration cannot be read, lacks a camera, or knows no size and there is no picture.
     """
-    if table is None:
-        return None
     if images is None:
         table.fail(None, "belongs to [images], the folder of the reference's pictures, which is missing")
+    names = [key for key in table.names() if isinstance(table.raw(key), dict)]
+    table.require_known(["calibration", "unit", *names])
     calibration = table.require("calibration", table.file("calibration"))
     units: tuple[Metres, ...] = get_args(Metres)
     unit = table.choice("unit", units)
-    names = [key for key in table.names() if isinstance(table.raw(key), dict)]
     if len(names) < 2:
         table.fail(None, f"needs two or more apertures, each a table [apertures.NAME]; found {len(names)}")
     known = read_rig_calibration(calibration, unit=unit)
@@ -124,11 +123,11 @@ def read_apertures_table(table: Section | None, images: Path | None) -> Aperture
     sources: list[SubImages] = []
     for i, name in enumerate(names):
         part = table.table(name)
+        part.require_known(["role", "camera", "folder", "rename"])
         role = part.require("role", part.choice("role", roles))
         camera = known.camera(part.text("camera") or name)
         folder = part.file("folder")
         rename = read_rename(part)
-        part.finish()
         if i == 0 and (rename is not None or (folder is not None and folder != images)):
             part.fail("folder", "is that of [images] for the reference, the first aperture; leave it and rename out")
         source = SubImages(folder=folder or images, rename=rename)
@@ -136,7 +135,6 @@ def read_apertures_table(table: Section | None, images: Path | None) -> Aperture
             part.fail(None, "has the same pictures as the reference; give folder or rename")
         sources.append(source)
         apertures.append(_aperture(name, role, camera, source, names=sources[0].folder))
-    table.finish()
     try:
         rig = ApertureRig(apertures=tuple(apertures), length_unit=known.length_unit)
     except ValueError as error:

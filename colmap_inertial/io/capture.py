@@ -6,12 +6,14 @@ Paths count from the file's folder. Nothing is guessed: a unit, axis or time tha
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.geometry import quat_from_matrix
 from colmap_inertial.core.types import CameraImuCalibration, CameraModel, FrameLog, ImuCalibration, ReadoutDirection
@@ -19,14 +21,17 @@ from colmap_inertial.io import sensor_yaml
 from colmap_inertial.io.aperture_images import ApertureImages, read_apertures_table
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.io.capture_tables import (
+    CALIBRATION_KEYS,
+    CAMERA_KEYS,
+    IMU_KEYS,
     ImuPath,
     ImuTables,
     body_from_imu,
     read_calibration_table,
-    read_camera,
+    read_camera_table,
     read_imu_table,
 )
-from colmap_inertial.io.exposures import LongExposures, read_exposures_table
+from colmap_inertial.io.exposures import EXPOSURES_KEYS, LongExposures, read_exposures_table
 from colmap_inertial.io.files import StrPath
 from colmap_inertial.io.gcsv import is_gcsv, read_gcsv_frames
 from colmap_inertial.io.imu_formats import refuse_video
@@ -100,6 +105,8 @@ class Capture:
         Whether frame times and IMU stamps come from one clock.
     camera
         ``None`` lets COLMAP calibrate.
+    body_from_cam
+        (4, 4) by the camera's sensor.yaml; ``None`` where there is none.
     imu
         ``None`` where nothing inertial was recorded.
     calibration
@@ -126,6 +133,7 @@ class Capture:
     readout_direction: ReadoutDirection = "down"
     shared_clock: bool = False
     camera: CameraModel | None = None
+    body_from_cam: Array | None = None
     imu: ImuPath | ImuTables | None = None
     calibration: CameraImuCalibration
     imu_calibration: ImuCalibration | None = None
@@ -134,6 +142,11 @@ class Capture:
     frame_log: FrameLog | None = None
     apertures: ApertureImages | None = None
     exposures: LongExposures | None = None
+
+    @property
+    def image_folder(self) -> Path | None:
+        """The folder of the original file of each frame; ``None`` where frames come from a video."""
+        return self.frames.folder if isinstance(self.frames, ImageFolder) else None
 
 
 def load_capture(path: StrPath) -> Capture:
@@ -152,7 +165,6 @@ def load_capture(path: StrPath) -> Capture:
     FormatError
         For an unknown key (the nearest known one is named), a value that cannot be, or a folder of no known layout.
     """
-    path = Path(path)
     path = Path(path)
     if path.is_dir():
         if (path / "capture.toml").is_file():
@@ -173,111 +185,174 @@ def load_capture(path: StrPath) -> Capture:
     return _from_toml(path)
 
 
+# --- capture.toml -----------------------------------------------------------------------------------------------------
+
+
 def _from_toml(path: Path) -> Capture:
     root = read_toml(path)
-    images = root.section("images")
-    frames: ImageFolder | Video | None = _video_of(root)
-    if images is not None:
-        if frames is not None:
-            root.fail("video", "a capture has [images] or [video], not both")
-        frames = _images(images)
-    timing = root.table("timing")
-    directions: tuple[ReadoutDirection, ...] = get_args(ReadoutDirection)
-    exposure_s = timing.number("exposure_s", low=0, high=10)
-    readout_s = timing.number("readout_s", low=0, high=0.5)
-    readout_direction = timing.choice("readout_direction", directions)
-    shared_clock = timing.boolean("shared_clock")
-    timing.finish()
-    camera, body_from_cam = read_camera(root.section("camera"))
-    folder = frames.folder if isinstance(frames, ImageFolder) else None
-    apertures = read_apertures_table(root.section("apertures"), folder)
-    exposures = read_exposures_table(root.section("exposures"), folder)
-    if apertures is not None:
-        if camera is not None:
-            root.fail("camera", "is given by the calibration under [apertures]; leave it out")
-        camera = apertures.rig.reference.camera
-        if exposures is not None:
-            root.fail("exposures", "a capture has [apertures] or [exposures], not both")
-    imu = read_imu_table(root.section("imu"))
-    log = None
-    if isinstance(frames, Video):
-        recording = find_recording(frames.file)
-        log = None if recording is None else recording.log
-        if recording is not None and imu is None:
-            imu = ImuPath(path=recording.imu, format=recording.format)
-        if recording is None and isinstance(imu, ImuPath) and is_gcsv(imu.path):
-            log = read_gcsv_frames(imu.path)
-        if log is not None:
-            readout_s = log.readout_s if readout_s is None else readout_s
-            readout_direction = readout_direction or log.readout_direction
-            inside = isinstance(imu, ImuPath) and imu.path == frames.file
-            if shared_clock is None and inside and frames.frame_times is None:
-                shared_clock = log.shared_clock
-    shared_clock = bool(shared_clock)
-    published = readout_of_video(frames.file) if isinstance(frames, Video) and readout_s is None else None
-    if published is not None:
-        readout_s = published.readout_s
-    known = read_calibration_table(
-        root.table("calibration"), body_from_cam=body_from_cam, imu=imu, readout_s=readout_s, shared_clock=shared_clock
-    )
-    device = root.text("device")
-    target = root.section("target")
-    spec = None
-    if target is not None:
-        spec = target.require("spec", target.text("spec"))
-        target.finish()
-    root.finish()
-    if frames is None and imu is None:
+    root.require_known(["device", *(section.name for section in SECTIONS)])
+    capture = Capture(path=path, device=root.text("device") or "", calibration=calibration_prior())
+    for section in SECTIONS:
+        table = root.section(section.name, short=section.short)
+        if table is None and section.is_always_read:
+            table = root.table(section.name)
+        if table is not None:
+            if section.keys is not None:
+                table.require_known(section.keys)
+            capture = section.read(table, capture)
+    if capture.frames is None and capture.imu is None:
         raise FormatError(path, "describes neither frames ([images] or [video]) nor an IMU ([imu])")
-    return Capture(
-        path=path,
-        frames=frames,
-        exposure_s=exposure_s,
-        readout_s=readout_s,
-        readout_source="" if published is None else str(published),
-        readout_direction=readout_direction or "down",
-        shared_clock=shared_clock,
-        camera=camera,
-        imu=imu,
-        calibration=known.camera_imu or calibration_prior(shared_clock=shared_clock),
-        imu_calibration=known.imu,
-        device=device or "",
-        target=spec,
-        frame_log=log,
-        apertures=apertures,
-        exposures=exposures,
-    )
+    return capture
 
 
-def _images(table: Section) -> ImageFolder:
+def _read_images(table: Section, capture: Capture) -> Capture:
     folder = table.require("folder", table.file("folder"))
     pattern = table.text("pattern")
     times: Literal["name"] | Path | None = "name" if table.text("times") == "name" else table.file("times")
     unit = table.choice("time_unit", TIME_UNITS_NS)
-    video = table.file("video")
     if times == "name" and unit is None:
         table.fail("times", f'"name" needs time_unit, one of {", ".join(TIME_UNITS_NS)}')
     if pattern is not None and (Path(pattern).is_absolute() or ".." in Path(pattern).parts):
         table.fail("pattern", f"must stay inside folder, found {pattern!r}")
-    table.finish()
-    return ImageFolder(folder=folder, pattern=pattern, times=times, time_unit=unit, video=video)
+    frames = ImageFolder(folder=folder, pattern=pattern, times=times, time_unit=unit, video=table.file("video"))
+    return replace(capture, frames=frames)
 
 
-def _video_of(root: Section) -> Video | None:
-    """The table ``[video]``, or the video's path alone."""
-    if isinstance(root.raw("video"), str):
-        return Video(file=root.require("video", root.file("video")))
-    table = root.section("video")
-    if table is None:
-        return None
-    video = Video(
+def _read_video(table: Section, capture: Capture) -> Capture:
+    if capture.frames is not None:
+        table.fail(None, "a capture has [images] or [video], not both")
+    frames = Video(
         file=table.require("file", table.file("file")),
         frame_times=table.file("frame_times"),
         time_unit=table.choice("time_unit", TIME_UNITS_NS),
         frames_per_s=table.positive("frames_per_s"),
     )
-    table.finish()
-    return video
+    return replace(capture, frames=frames)
+
+
+def _read_imu(table: Section, capture: Capture) -> Capture:
+    return replace(capture, imu=read_imu_table(table))
+
+
+def _read_timing(table: Section, capture: Capture) -> Capture:
+    """What the user states goes before what the recorder noted, and that before what others published."""
+    capture = _add_recorder_notes(capture)
+    directions: tuple[ReadoutDirection, ...] = get_args(ReadoutDirection)
+    exposure_s, readout_s = table.number("exposure_s", low=0, high=10), table.number("readout_s", low=0, high=0.5)
+    direction, shared_clock = table.choice("readout_direction", directions), table.boolean("shared_clock")
+    readout_s, source = capture.readout_s if readout_s is None else readout_s, ""
+    if readout_s is None and isinstance(capture.frames, Video):
+        published = readout_of_video(capture.frames.file)
+        if published is not None:
+            readout_s, source = published.readout_s, str(published)
+    return replace(
+        capture,
+        exposure_s=exposure_s,
+        readout_s=readout_s,
+        readout_source=source,
+        readout_direction=direction or capture.readout_direction,
+        shared_clock=capture.shared_clock if shared_clock is None else shared_clock,
+    )
+
+
+def _add_recorder_notes(capture: Capture) -> Capture:
+    """The IMU inside a video, and what its recorder noted about the frames."""
+    if not isinstance(capture.frames, Video):
+        return capture
+    imu, video = capture.imu, capture.frames
+    recording = find_recording(video.file)
+    log = None if recording is None else recording.log
+    if recording is not None and imu is None:
+        imu = ImuPath(path=recording.imu, format=recording.format)
+    if recording is None and isinstance(imu, ImuPath) and is_gcsv(imu.path):
+        log = read_gcsv_frames(imu.path)
+    capture = replace(capture, imu=imu, frame_log=log)
+    if log is None:
+        return capture
+    inside = isinstance(imu, ImuPath) and imu.path == video.file
+    shared_clock = inside and video.frame_times is None and log.shared_clock
+    return replace(capture, readout_s=log.readout_s, readout_direction=log.readout_direction, shared_clock=shared_clock)
+
+
+def _read_camera(table: Section, capture: Capture) -> Capture:
+    camera, body_from_cam = read_camera_table(table)
+    return replace(capture, camera=camera, body_from_cam=body_from_cam)
+
+
+def _read_apertures(table: Section, capture: Capture) -> Capture:
+    if capture.camera is not None:
+        table.fail(None, "gives the camera by its calibration; leave out [camera]")
+    apertures = read_apertures_table(table, capture.image_folder)
+    return replace(capture, apertures=apertures, camera=apertures.rig.reference.camera)
+
+
+def _read_exposures(table: Section, capture: Capture) -> Capture:
+    if capture.apertures is not None:
+        table.fail(None, "a capture has [apertures] or [exposures], not both")
+    return replace(capture, exposures=read_exposures_table(table, capture.image_folder))
+
+
+def _read_calibration(table: Section, capture: Capture) -> Capture:
+    found = read_calibration_table(
+        table,
+        body_from_cam=capture.body_from_cam,
+        imu=capture.imu,
+        readout_s=capture.readout_s,
+        shared_clock=capture.shared_clock,
+    )
+    prior = found.camera_imu or calibration_prior(shared_clock=capture.shared_clock)
+    return replace(capture, calibration=prior, imu_calibration=found.imu)
+
+
+def _read_target(table: Section, capture: Capture) -> Capture:
+    return replace(capture, target=table.require("spec", table.text("spec")))
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureSection:
+    """One table of a capture.toml.
+
+    Attributes
+    ----------
+    name, keys
+        Of the table, and what it may hold; ``None`` where ``read`` says so.
+    read
+        Adds what the table says to the capture that the sections before it made.
+    short
+        The key that a text in place of the table is.
+    is_always_read
+        As an empty table where it is absent: other sections bear on what it makes.
+    """
+
+    name: str
+    keys: tuple[str, ...] | None
+    read: Callable[[Section, Capture], Capture]
+    short: str | None = None
+    is_always_read: bool = False
+
+
+#: In the order in which they are read.
+SECTIONS = (
+    CaptureSection(name="images", keys=("folder", "pattern", "times", "time_unit", "video"), read=_read_images),
+    CaptureSection(
+        name="video", keys=("file", "frame_times", "time_unit", "frames_per_s"), read=_read_video, short="file"
+    ),
+    CaptureSection(name="imu", keys=IMU_KEYS, read=_read_imu),
+    CaptureSection(
+        name="timing",
+        keys=("exposure_s", "readout_s", "readout_direction", "shared_clock"),
+        read=_read_timing,
+        is_always_read=True,
+    ),
+    CaptureSection(name="camera", keys=CAMERA_KEYS, read=_read_camera),
+    CaptureSection(name="apertures", keys=None, read=_read_apertures),
+    CaptureSection(name="exposures", keys=EXPOSURES_KEYS, read=_read_exposures),
+    CaptureSection(name="calibration", keys=CALIBRATION_KEYS, read=_read_calibration, is_always_read=True),
+    CaptureSection(name="target", keys=("spec",), read=_read_target),
+)
+
+
+# --- captures without one -------------------------------------------------------------------------------------------
 
 
 def _from_folder(path: Path) -> Capture:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import colmap_px_from_opencv, quat_from_matrix
@@ -74,26 +75,23 @@ class ImuTables:
     noise: ImuNoise | None = None
 
 
-def read_camera(table: Section | None) -> tuple[CameraModel | None, Array | None]:
+CAMERA_KEYS = ("sensor_yaml", "model", "width", "height", "params", "pixel_origin")
+
+
+def read_camera_table(table: Section) -> tuple[CameraModel, Array | None]:
     """The ``[camera]`` table: the model, and (4, 4) body_from_cam where a sensor.yaml gives it."""
-    if table is None:
-        return None, None
     sheet = table.file("sensor_yaml")
-    model = table.choice("model", CAMERA_MODELS)
-    width, height = table.integer("width"), table.integer("height")
-    params = table.numbers("params")
-    origin = table.choice("pixel_origin", ("corner", "center"))
-    table.finish()
     if sheet is not None:
-        if any(value is not None for value in (model, width, height, params, origin)):
+        if any(key in table for key in CAMERA_KEYS[1:]):
             table.fail("sensor_yaml", "gives the intrinsics; leave out model, width, height, params and pixel_origin")
         return sensor_yaml.read_camera(sheet), sensor_yaml.read_body_from_sensor(sheet)
-    for key, value in (("model", model), ("width", width), ("height", height), ("params", params)):
-        table.require(key, value)
-    assert model is not None and params is not None and width is not None and height is not None
+    model = table.require("model", table.choice("model", CAMERA_MODELS))
+    width, height = (table.require(key, table.integer(key)) for key in ("width", "height"))
+    params = table.require("params", table.numbers("params"))
     count, centre = CAMERA_MODELS[model]
     if len(params) != count:
         table.fail("params", f"{model} has {count} parameters, found {len(params)}")
+    origin = table.choice("pixel_origin", ("corner", "center"))
     if origin is None:
         table.fail(
             None,
@@ -107,19 +105,21 @@ def read_camera(table: Section | None) -> tuple[CameraModel | None, Array | None
     return CameraModel(model=model, width=width, height=height, params=tuple(values.tolist())), None
 
 
-def read_imu_table(table: Section | None) -> ImuPath | ImuTables | None:
+IMU_KEYS = ("path", "format", "gyro", "accel", "noise")
+_CORRECTION_KEYS = ("unit", "axes", "mirrored")
+_SENSOR_KEYS = ("file", "time", "time_unit", "columns", "zero", "counts_per_unit", *_CORRECTION_KEYS)
+
+
+def read_imu_table(table: Section) -> ImuPath | ImuTables:
     """The ``[imu]`` table with its sub-tables."""
-    if table is None:
-        return None
     path, fmt = table.file("path"), table.text("format")
     gyro, accel = table.section("gyro"), table.section("accel")
-    noise = _noise(table.section("noise"))
-    table.finish()
+    noise = _read_noise(table.section("noise"))
     if path is not None:
         if path.suffix.lower() == ".toml" or fmt == "capture":
             table.fail("path", "must be a recording, not another capture.toml")
-        gyro_unit, gyro_axes = _correction(gyro, "gyro")
-        accel_unit, accel_axes = _correction(accel, "accel")
+        gyro_unit, gyro_axes = _read_correction(gyro, "gyro")
+        accel_unit, accel_axes = _read_correction(accel, "accel")
         return ImuPath(
             path=path,
             format=fmt or "auto",
@@ -132,9 +132,16 @@ def read_imu_table(table: Section | None) -> ImuPath | ImuTables | None:
         table.fail("format", "belongs to path, which is missing")
     if gyro is None:
         table.fail(None, "needs path, or [imu.gyro] (and [imu.accel], for scale and gravity) that describe tables")
-    gyro_table, gyro_axes = _sensor_table(gyro, "gyro")
-    accel_table, accel_axes = (None, None) if accel is None else _sensor_table(accel, "accel")
+    gyro_table, gyro_axes = _read_sensor_table(gyro, "gyro")
+    accel_table, accel_axes = (None, None) if accel is None else _read_sensor_table(accel, "accel")
     return ImuTables(gyro=gyro_table, accel=accel_table, gyro_axes=gyro_axes, accel_axes=accel_axes, noise=noise)
+
+
+_SIGMA_KEYS = ("rotation_sigma_rad", "imu_in_cam_sigma_m", "time_offset_sigma_s", "gyro_bias_sigma_rad_s")
+CALIBRATION_KEYS = (
+    *("file", "cam_from_imu", "cam_from_imu_xyzw", "imu_in_cam_m", "gyro_time_offset_s", "accel_time_offset_s"),
+    *("gyro_bias_rad_s", *_SIGMA_KEYS),
+)
 
 
 def read_calibration_table(
@@ -147,46 +154,44 @@ def read_calibration_table(
 ) -> Calibrations:
     """The ``[calibration]`` table, completed by the sheets of camera and IMU and by ``[timing]``."""
     files = table.files("file")
-    matrix, xyzw = table.matrix("cam_from_imu"), table.numbers("cam_from_imu_xyzw", 4)
-    lever = table.numbers("imu_in_cam_m", 3)
-    gyro_offset, accel_offset = table.number("gyro_time_offset_s"), table.number("accel_time_offset_s")
-    bias = table.numbers("gyro_bias_rad_s", 3)
-    sigmas = {
-        key: table.positive(key)
-        for key in ("rotation_sigma_rad", "imu_in_cam_sigma_m", "time_offset_sigma_s", "gyro_bias_sigma_rad_s")
-    }
-    table.finish()
-    stated = (matrix, xyzw, lever, gyro_offset, accel_offset, bias, *sigmas.values())
-    if any(value is not None for value in stated) and not all(holds_imu_alone(file) for file in files):
+    if any(key in table for key in CALIBRATION_KEYS[1:]) and not all(holds_imu_alone(file) for file in files):
         table.fail("file", "gives the calibration; leave out the other keys of this table")
     found = read_for_another(files, shared_clock=shared_clock)
     if found.camera_imu is not None:
         return found
-    if matrix is not None and xyzw is not None:
-        table.fail("cam_from_imu_xyzw", "and cam_from_imu say the same; leave one out")
-    if xyzw is not None and abs(np.linalg.norm(xyzw) - 1) > 1e-3:
-        table.fail("cam_from_imu_xyzw", "must be a quaternion x, y, z, w of length 1")
-    cam_from_imu = None
-    if matrix is not None:
-        cam_from_imu = _transform(table, matrix)
-    elif xyzw is None and body_from_cam is not None:
-        cam_from_imu = np.linalg.inv(body_from_cam) @ (body_from_imu(imu) if isinstance(imu, ImuPath) else np.eye(4))
-    rotation = xyzw if cam_from_imu is None else quat_from_matrix(cam_from_imu[:3, :3])
-    has_lever = cam_from_imu is not None and (matrix is None or len(matrix) > 3)
-    if lever is not None and has_lever and matrix is not None:
-        table.fail("imu_in_cam_m", "and the last column of cam_from_imu say the same; leave one out")
-    if lever is None and has_lever and cam_from_imu is not None:
-        lever = tuple(cam_from_imu[:3, 3].tolist())
+    rotation, lever = _read_pose(table)
+    if body_from_cam is not None and rotation is None:
+        body = body_from_imu(imu) if isinstance(imu, ImuPath) else np.eye(4)
+        cam_from_imu = np.linalg.inv(body_from_cam) @ body
+        rotation = quat_from_matrix(cam_from_imu[:3, :3])
+        lever = cam_from_imu[:3, 3] if lever is None else lever
+    sigmas = {key: value for key in _SIGMA_KEYS if (value := table.positive(key)) is not None}
     declared = Declared(
         cam_from_imu_xyzw=rotation,
         imu_in_cam_m=lever,
-        gyro_time_offset_s=gyro_offset,
-        accel_time_offset_s=accel_offset,
-        gyro_bias_rad_s=bias,
+        gyro_time_offset_s=table.number("gyro_time_offset_s"),
+        accel_time_offset_s=table.number("accel_time_offset_s"),
+        gyro_bias_rad_s=table.numbers("gyro_bias_rad_s", 3),
         readout_s=readout_s,
-        **{key: sigma for key, sigma in sigmas.items() if sigma is not None},
+        **sigmas,
     )
     return replace(found, camera_imu=calibration_prior(declared, shared_clock=shared_clock))
+
+
+def _read_pose(table: Section) -> tuple[ArrayLike | None, ArrayLike | None]:
+    """Rotation (quaternion xyzw) and lever arm that a ``[calibration]`` table states; ``None`` for what it does not."""
+    matrix, xyzw = table.matrix("cam_from_imu"), table.numbers("cam_from_imu_xyzw", 4)
+    lever = table.numbers("imu_in_cam_m", 3)
+    if matrix is None:
+        if xyzw is not None and abs(np.linalg.norm(xyzw) - 1) > 1e-3:
+            table.fail("cam_from_imu_xyzw", "must be a quaternion x, y, z, w of length 1")
+        return xyzw, lever
+    if xyzw is not None:
+        table.fail("cam_from_imu_xyzw", "and cam_from_imu say the same; leave one out")
+    cam_from_imu = _check_transform(table, matrix)
+    if len(matrix) > 3 and lever is not None:
+        table.fail("imu_in_cam_m", "and the last column of cam_from_imu say the same; leave one out")
+    return quat_from_matrix(cam_from_imu[:3, :3]), cam_from_imu[:3, 3] if len(matrix) > 3 else lever
 
 
 def body_from_imu(imu: ImuPath) -> Array:
@@ -201,7 +206,7 @@ def body_from_imu(imu: ImuPath) -> Array:
     return sensor_yaml.read_body_from_sensor(sheet)
 
 
-def _transform(table: Section, rows: list[list[float]]) -> Array:
+def _check_transform(table: Section, rows: list[list[float]]) -> Array:
     shape = (len(rows), len(rows[0]) if rows else 0)
     if shape not in ((3, 3), (4, 4)):
         table.fail("cam_from_imu", f"must be a 3x3 or 4x4 matrix, found {shape[0]}x{shape[1]}")
@@ -214,50 +219,37 @@ def _transform(table: Section, rows: list[list[float]]) -> Array:
     return matrix
 
 
-def _noise(table: Section | None) -> ImuNoise | None:
+def _read_noise(table: Section | None) -> ImuNoise | None:
     if table is None:
         return None
-    values = {f.name: table.number(f.name, low=0) for f in fields(ImuNoise)}
-    table.finish()
-    return ImuNoise(**{key: table.require(key, value) for key, value in values.items()})
+    names = [f.name for f in fields(ImuNoise)]
+    table.require_known(names)
+    return ImuNoise(**{name: table.require(name, table.number(name, low=0)) for name in names})
 
 
-def _correction(table: Section | None, quantity: Quantity) -> tuple[str | None, Axes | None]:
+def _read_correction(table: Section | None, quantity: Quantity) -> tuple[str | None, Axes | None]:
     """What a sensor's table may say beside ``[imu] path``."""
     if table is None:
         return None, None
     if "file" in table:
         table.fail("file", "and [imu] path say the same; leave one out")
-    unit = table.choice("unit", SENSOR_UNITS[quantity])
-    axes = _axes(table)
-    table.finish()
-    return unit, axes
+    table.require_known(_CORRECTION_KEYS)
+    return table.choice("unit", SENSOR_UNITS[quantity]), _read_axes(table)
 
 
-def _sensor_table(table: Section, quantity: Quantity) -> tuple[SensorTable, Axes | None]:
-    file = table.file("file")
-    time = table.raw("time")
-    time_unit = table.choice("time_unit", TIME_UNITS_NS)
-    columns = table.raw("columns")
-    unit = table.choice("unit", SENSOR_UNITS[quantity])
-    zero, counts_per_unit = table.number("zero"), table.positive("counts_per_unit")
-    axes = _axes(table)
-    table.finish()
-    for key, value in (
-        ("file", file),
-        ("time", time),
-        ("time_unit", time_unit),
-        ("columns", columns),
-        ("unit", unit),
-    ):
-        table.require(key, value)
+def _read_sensor_table(table: Section, quantity: Quantity) -> tuple[SensorTable, Axes | None]:
+    table.require_known(_SENSOR_KEYS)
+    file = table.require("file", table.file("file"))
+    time = table.require("time", table.raw("time"))
+    time_unit = table.require("time_unit", table.choice("time_unit", TIME_UNITS_NS))
+    columns = table.require("columns", table.raw("columns"))
+    unit = table.require("unit", table.choice("unit", SENSOR_UNITS[quantity]))
     if not _is_column(time):
         table.fail("time", f"must be a column's name, or its number counted from 1; found {time!r}")
     if not isinstance(columns, list) or len(columns) != 3 or not all(map(_is_column, columns)):
         table.fail("columns", f"must be three names, or numbers counted from 1, of x, y and z; found {columns!r}")
     if len({time, *columns}) != 4:
         table.fail("columns", "must be three columns, and another than time")
-    assert file is not None and time_unit is not None and unit is not None
     x, y, z = columns
     described = SensorTable(
         file=file,
@@ -265,10 +257,10 @@ def _sensor_table(table: Section, quantity: Quantity) -> tuple[SensorTable, Axes
         time_unit=time_unit,
         columns=(x, y, z),
         unit=unit,
-        zero=zero or 0.0,
-        counts_per_unit=counts_per_unit or 1.0,
+        zero=table.number("zero") or 0.0,
+        counts_per_unit=table.positive("counts_per_unit") or 1.0,
     )
-    return described, axes
+    return described, _read_axes(table)
 
 
 def _is_column(value: object) -> bool:
@@ -277,7 +269,7 @@ def _is_column(value: object) -> bool:
     )
 
 
-def _axes(table: Section) -> Axes | None:
+def _read_axes(table: Section) -> Axes | None:
     text, mirrored = table.text("axes"), table.boolean("mirrored")
     if text is None:
         if mirrored is not None:

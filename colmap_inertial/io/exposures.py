@@ -177,7 +177,13 @@ class LongExposures:
         return values[1] / values[0]
 
 
-def read_exposures_table(table: Section | None, images: Path | None) -> LongExposures | None:
+EXPOSURES_KEYS = (
+    *("folder", "rename", "times", "time_unit", "long_delay_s"),
+    *("long_exposure_s", "short_iso", "long_iso"),
+)
+
+
+def read_exposures_table(table: Section, images: Path | None) -> LongExposures:
     """The ``[exposures]`` table.
 
     Parameters
@@ -190,18 +196,12 @@ def read_exposures_table(table: Section | None, images: Path | None) -> LongExpo
     FormatError
         For what is missing or contradicts itself.
     """
-    if table is None:
-        return None
     if images is None:
         table.fail(None, "belongs to [images], the folder of the short exposures, which is missing")
-    folder = table.file("folder")
-    rename = read_rename(table)
-    times, unit = table.file("times"), table.choice("time_unit", TIME_UNITS_NS)
+    times = table.file("times")
     delay_s = table.number("long_delay_s", low=-_FARTHEST_S, high=_FARTHEST_S)
     exposure_s = table.positive("long_exposure_s")
-    isos = table.positive("short_iso"), table.positive("long_iso")
-    table.finish()
-    source = SubImages(folder=folder or images, rename=rename)
+    source = SubImages(folder=table.file("folder") or images, rename=read_rename(table))
     if source == SubImages(folder=images):
         table.fail(None, "has the same pictures as [images]; give folder or rename")
     if times is not None and delay_s is not None:
@@ -211,9 +211,9 @@ def read_exposures_table(table: Section | None, images: Path | None) -> LongExpo
     return LongExposures(
         source=source,
         times=times,
-        time_unit=unit,
+        time_unit=table.choice("time_unit", TIME_UNITS_NS),
         delay_s=delay_s,
         exposure_s=exposure_s,
-        short_iso=isos[0],
-        long_iso=isos[1],
+        short_iso=table.positive("short_iso"),
+        long_iso=table.positive("long_iso"),
     )

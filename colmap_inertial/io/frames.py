@@ -112,7 +112,7 @@ def read_frame_times(path: StrPath) -> FrameTiming:
 
 def frame_source(capture: Capture) -> Path | None:
     """The folder that holds the original file of each frame name, or ``None`` where frames come from a video."""
-    return capture.frames.folder if isinstance(capture.frames, ImageFolder) else None
+    return capture.image_folder
 
 
 def picture_folders(capture: Capture) -> tuple[Path, ...]:

@@ -55,12 +55,14 @@ class Section:
         where = f"[{self.name}]" if self.name else "top level"
         raise FormatError(self.path, f"{where}{'' if key is None else ' ' + key}: {reason}", line=self._line(key))
 
-    def section(self, key: str) -> Section | None:
-        """The table under ``key``, or ``None`` where it is absent."""
+    def section(self, key: str, *, short: str | None = None) -> Section | None:
+        """The table under ``key``, or ``None`` where it is absent; a text in its place is its key ``short``."""
         value = self._take(key)
         if value is None:
             return None
         name = f"{self.name}.{key}" if self.name else key
+        if short is not None and isinstance(value, str):
+            value = {short: value}
         if not isinstance(value, dict):
             self.fail(key, f"must be a table: write [{name}] on a line of its own")
         return Section(self.path, name, value, self._text)
@@ -161,13 +163,17 @@ class Section:
             self.fail(None, f"{key} is missing")
         return value
 
+    def require_known(self, known: Sequence[str]) -> None:
+        """Complain about keys that are not among the known ones; the most similar one is named."""
+        for key in self._values:
+            if key not in known:
+                near = difflib.get_close_matches(key, known, n=1, cutoff=0.0)
+                hint = f'; did you mean "{near[0]}"?' if near else ""
+                self.fail(key, f"unknown key{hint} (known here: {', '.join(known)})")
+
     def finish(self) -> None:
         """Complain about keys that nobody asked for."""
-        for key in self._values:
-            if key not in self._known:
-                near = difflib.get_close_matches(key, self._known, n=1, cutoff=0.0)
-                hint = f'; did you mean "{near[0]}"?' if near else ""
-                self.fail(key, f"unknown key{hint} (known here: {', '.join(self._known)})")
+        self.require_known(self._known)
 
     def _take(self, key: str) -> Any:
         if key not in self._known:
@@ -188,7 +194,7 @@ class Section:
     def _line(self, key: str | None) -> int | None:
         """The line of a key (or of the table's head), found in the text; ``None`` for unusual spellings."""
         lines = self._text.splitlines()
-        return _find_line(lines, self.name, key) or (_find_line(lines, self.name, None) if key else None)
+        return _find_line(lines, self.name, key) or (_find_line(lines, "", self.name) if self.name else None)
 
 
 def _find_line(lines: Sequence[str], table: str, key: str | None) -> int | None:
