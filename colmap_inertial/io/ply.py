@@ -87,53 +87,53 @@ def read_ply_header(path: Path, file: BufferedReader) -> Header:
     raw = [file.readline(64)]
     if raw[0].strip() != b"ply":
         raise FormatError(path, "not a PLY file", line=1)
-    order: str | None = "?"
+    formats: list[str] = []
     elements: list[Element] = []
     length = 0
-    while True:
-        line = file.readline(_LONGEST_LINE)
-        raw.append(line)
-        n = len(raw)
-        length += len(line)
-        if not line.endswith(b"\n") or length > _LONGEST_HEADER:
-            raise FormatError(path, "the PLY header does not end", line=n)
-        words = line.decode("latin-1").split()
-        match words:
-            case ["end_header"]:
-                break
-            case ["comment" | "obj_info", *_]:
-                continue
-            case ["format", name, "1.0"] if name in _BYTE_ORDERS and order == "?":
-                order = _BYTE_ORDERS[name]
-            case ["element", name, rows] if rows.isascii() and rows.isdigit() and len(rows) < 16:
-                if name in {e.name for e in elements}:
-                    raise FormatError(path, f"element {name} is declared twice", line=n)
-                elements.append(Element(name, int(rows), ()))
-            case ["property", "list", count, kind, name] if elements and _TYPES.get(count, "f")[0] in "iu":
-                _add(path, n, elements, Property(name, _known(path, n, kind), _TYPES[count]))
-            case ["property", kind, name] if elements:
-                _add(path, n, elements, Property(name, _known(path, n, kind)))
-            case _:
-                raise FormatError(path, f"not a line of a PLY header: {' '.join(words)[:60]!r}", line=n)
-    if order == "?":
+    while raw[-1].split() != [b"end_header"]:
+        raw.append(file.readline(_LONGEST_LINE))
+        length += len(raw[-1])
+        if not raw[-1].endswith(b"\n") or length > _LONGEST_HEADER:
+            raise FormatError(path, "the PLY header does not end", line=len(raw))
+        fault = _read_header_line(raw[-1].decode("latin-1").split(), formats, elements)
+        if fault is not None:
+            raise FormatError(path, fault, line=len(raw))
+    if not formats:
         raise FormatError(path, "the PLY header does not say its format")
     for element in elements:
         if element.rows and not element.properties:
             raise FormatError(path, f"element {element.name} has rows but no property")
-    return Header(b"".join(raw), order, tuple(elements))
+    return Header(b"".join(raw), _BYTE_ORDERS[formats[0]], tuple(elements))
 
 
-def _known(path: Path, line: int, kind: str) -> str:
+def _read_header_line(words: list[str], formats: list[str], elements: list[Element]) -> str | None:
+    """Add what a line of the header declares to the formats and elements; what is wrong with it, if anything."""
+    count: str | None = None
+    match words:
+        case ["end_header"] | ["comment" | "obj_info", *_]:
+            return None
+        case ["format", name, "1.0"] if name in _BYTE_ORDERS and not formats:
+            formats.append(name)
+            return None
+        case ["element", name, rows] if rows.isascii() and rows.isdigit() and len(rows) < 16:
+            if name in {e.name for e in elements}:
+                return f"element {name} is declared twice"
+            elements.append(Element(name, int(rows), ()))
+            return None
+        case ["property", "list", length, kind, name] if elements and _TYPES.get(length, "f")[0] in "iu":
+            count = _TYPES[length]
+        case ["property", kind, name] if elements:
+            pass
+        case _:
+            return f"not a line of a PLY header: {' '.join(words)[:60]!r}"
     if kind not in _TYPES:
-        raise FormatError(path, f"{kind!r} is no PLY type", line=line)
-    return _TYPES[kind]
-
-
-def _add(path: Path, line: int, elements: list[Element], new: Property) -> None:
+        return f"{kind!r} is no PLY type"
     last = elements[-1]
-    if new.name in {p.name for p in last.properties}:
-        raise FormatError(path, f"property {new.name} of {last.name} is declared twice", line=line)
+    if name in {p.name for p in last.properties}:
+        return f"property {name} of {last.name} is declared twice"
+    new = Property(name, _TYPES[kind], count)
     elements[-1] = Element(last.name, last.rows, (*last.properties, new))
+    return None
 
 
 def transform_ply(source: Path, target: Path, similarity: Similarity) -> tuple[str, ...]:

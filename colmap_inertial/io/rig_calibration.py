@@ -118,48 +118,12 @@ def _kalibr(path: Path, sheet: dict[str, Any]) -> dict[str, MountedCamera]:
 
 def _opencv(path: Path, sheet: dict[str, Any], metres: float) -> dict[str, MountedCamera]:
     if "M1" in sheet and "M2" in sheet:
-        shared = {key: sheet[key] for key in ("image_width", "image_height") if key in sheet}
-        extrinsics = {key: sheet[key] for key in ("R", "T") if key in sheet}
-        if len(extrinsics) < 2:
-            raise FormatError(
-                path, "R and T of the second camera are missing: put intrinsics and extrinsics in one file"
-            )
-        pair = {
-            name: {"camera_matrix": sheet[f"M{name}"], "distortion_coefficients": sheet.get(f"D{name}"), **shared}
-            for name in ("1", "2")
-        }
-        pair["2"].update(extrinsics)
-        sheet = pair
-    cameras = {}
-    for name, entry in sheet.items():
-        if not isinstance(entry, dict) or "camera_matrix" not in entry:
-            continue
-        given = Sheet(path=path, values=entry, part=name)
-        matrix = np.array(given.numbers("camera_matrix", 9)).reshape(3, 3)
-        key = "distortion_coefficients"
-        coefficients = [] if entry.get(key) is None else given.numbers(key)
-        if any(coefficients[8:]):
-            raise given.fault("prism or tilt coefficients are not known to COLMAP's cameras")
-        coefficients = [*coefficients, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0][:8]
-        full = any(coefficients[4:])
-        size = None
-        if "image_width" in entry and "image_height" in entry:
-            size = int(given.numbers("image_width", 1)[0]), int(given.numbers("image_height", 1)[0])
-        pose = np.eye(4)
-        if ("R" in entry) != ("T" in entry):
-            raise given.fault("R and T belong together; one of them is missing")
-        if "R" in entry:
-            pose[:3, :3] = np.array(given.numbers("R", 9)).reshape(3, 3)
-            pose[:3, 3] = metres * np.array(given.numbers("T", 3))
-            if not is_rotation(pose[:3, :3]):
-                raise given.fault("R holds no rotation")
-        centre = colmap_px_from_opencv(matrix[:2, 2]).tolist()
-        cameras[name] = MountedCamera(
-            model="FULL_OPENCV" if full else "OPENCV",
-            params=(matrix[0, 0], matrix[1, 1], *centre, *coefficients[: 8 if full else 4]),
-            size=size,
-            cam_from_rig=pose,
-        )
+        sheet = _stereo_pair(path, sheet)
+    cameras = {
+        name: _opencv_camera(Sheet(path=path, values=entry, part=name), metres)
+        for name, entry in sheet.items()
+        if isinstance(entry, dict) and "camera_matrix" in entry
+    }
     if not cameras:
         raise FormatError(
             path,
@@ -167,6 +131,47 @@ def _opencv(path: Path, sheet: dict[str, Any], metres: float) -> dict[str, Mount
             "with camera_matrix, nor M1, M2",
         )
     return cameras
+
+
+def _stereo_pair(path: Path, sheet: dict[str, Any]) -> dict[str, Any]:
+    """What OpenCV's stereo sample writes, as a map for each of the cameras ``1`` and ``2``."""
+    if not {"R", "T"} <= sheet.keys():
+        raise FormatError(path, "R and T of the second camera are missing: put intrinsics and extrinsics in one file")
+    shared = {key: sheet[key] for key in ("image_width", "image_height") if key in sheet}
+    pair = {
+        name: {"camera_matrix": sheet[f"M{name}"], "distortion_coefficients": sheet.get(f"D{name}"), **shared}
+        for name in ("1", "2")
+    }
+    pair["2"] |= {"R": sheet["R"], "T": sheet["T"]}
+    return pair
+
+
+def _opencv_camera(given: Sheet, metres: float) -> MountedCamera:
+    matrix = np.array(given.numbers("camera_matrix", 9)).reshape(3, 3)
+    key = "distortion_coefficients"
+    coefficients = [] if given.values.get(key) is None else given.numbers(key)
+    if any(coefficients[8:]):
+        raise given.fault("prism or tilt coefficients are not known to COLMAP's cameras")
+    coefficients = [*coefficients, *[0.0] * 8][:8]
+    full = any(coefficients[4:])
+    size = None
+    if {"image_width", "image_height"} <= given.values.keys():
+        size = int(given.numbers("image_width", 1)[0]), int(given.numbers("image_height", 1)[0])
+    pose = np.eye(4)
+    if ("R" in given.values) != ("T" in given.values):
+        raise given.fault("R and T belong together; one of them is missing")
+    if "R" in given.values:
+        pose[:3, :3] = np.array(given.numbers("R", 9)).reshape(3, 3)
+        pose[:3, 3] = metres * np.array(given.numbers("T", 3))
+        if not is_rotation(pose[:3, :3]):
+            raise given.fault("R holds no rotation")
+    centre = colmap_px_from_opencv(matrix[:2, 2]).tolist()
+    return MountedCamera(
+        model="FULL_OPENCV" if full else "OPENCV",
+        params=(matrix[0, 0], matrix[1, 1], *centre, *coefficients[: 8 if full else 4]),
+        size=size,
+        cam_from_rig=pose,
+    )
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:

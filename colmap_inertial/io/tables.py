@@ -124,7 +124,41 @@ def read_table(path: Path) -> Table:
 def parse_table(path: Path, text: str) -> Table:
     """:func:`read_table` of a text that lies elsewhere than in a file of its own; ``path`` is for messages."""
     text = text.replace("\r\n", "\n").replace("\r", "\n")
-    body = text.rstrip("\n")
+    lines, numbers, comments, repairs = _split_lines(path, text.rstrip("\n"))
+    delimiter = _delimiter(lines[min(1, len(lines) - 1)])
+    most = read_limits().table_columns
+    if any(_width(line, delimiter, most) > most for line in lines[:2]):
+        raise too_wide(path, int(numbers[0]))
+    has_header = _is_header(lines[0], delimiter)
+    candidates = [lines[0]] if has_header else comments[::-1]
+    lines, numbers = lines[has_header:], numbers[has_header:]
+    if not lines:
+        raise FormatError(path, "holds a header and no rows")
+    width = len(lines[0].split(delimiter))
+    candidates = [line.strip() for line in candidates if _width(line, delimiter, most) <= most]
+    header_text = next((line for line in candidates if len(_header_cells(line, delimiter)) == width), None)
+    if has_header and header_text is None:
+        cells = len(_header_cells(candidates[0], delimiter))
+        reason = f"{width} cells under a header of {cells}: {candidates[0][:200]}"
+        raise FormatError(path, reason, line=int(numbers[0]))
+    if not text.endswith("\n") and len(lines) > 1 and _is_cut_off(lines[-1], lines[-2], delimiter, width):
+        repairs.append(f"{path.name}: dropped the last line ({numbers[-1]}), which is cut off")
+        lines, numbers = lines[:-1], numbers[:-1]
+    _require_one_width(path, lines, numbers, delimiter, width)
+    return Table(
+        path=path,
+        header=None if header_text is None else _header_cells(header_text, delimiter),
+        header_text=header_text or "",
+        lines=tuple(lines),
+        line_numbers=numbers,
+        delimiter=delimiter,
+        width=width,
+        repairs=tuple(repairs),
+    )
+
+
+def _split_lines(path: Path, body: str) -> tuple[list[str], Int64Array, list[str], list[str]]:
+    """Lines that hold cells, their numbers in the file, the comments before them, and what was passed over."""
     raw = body.split("\n")
     first = next((i for i, line in enumerate(raw) if line.strip() and not _is_comment(line)), None)
     if first is None:
@@ -138,49 +172,16 @@ def parse_table(path: Path, text: str) -> Table:
         if inside:
             repairs.append(f"{path.name}: passed over {inside} lines inside the data that start with #")
         lines, numbers = [line for line, kept in zip(lines, keep, strict=True) if kept], numbers[keep]
+    return lines, numbers, comments, repairs
 
-    delimiter = _delimiter(lines[min(1, len(lines) - 1)])
+
+def _require_one_width(path: Path, lines: list[str], numbers: Int64Array, delimiter: str | None, width: int) -> None:
     most = read_limits().table_columns
-    if any(_width(line, delimiter, most) > most for line in lines[:2]):
-        raise too_wide(path, int(numbers[0]))
-    header: tuple[str, ...] | None = None
-    header_text = ""
-    if _is_header(lines[0], delimiter):
-        header_text = lines[0].strip()
-        header = _header_cells(header_text, delimiter)
-        lines, numbers = lines[1:], numbers[1:]
-        if not lines:
-            raise FormatError(path, "holds a header and no rows")
-    width = len(lines[0].split(delimiter))
-    if header is None:
-        for line in reversed(comments):
-            if _width(line, delimiter, most) <= most and len(_header_cells(line, delimiter)) == width:
-                header_text, header = line.strip(), _header_cells(line, delimiter)
-                break
-    elif len(header) != width:
-        reason = f"{width} cells under a header of {len(header)}: {header_text[:200]}"
-        raise FormatError(path, reason, line=int(numbers[0]))
-    if not text.endswith("\n") and len(lines) > 1 and _is_cut_off(lines[-1], lines[-2], delimiter, width):
-        repairs.append(f"{path.name}: dropped the last line ({numbers[-1]}), which is cut off")
-        lines, numbers = lines[:-1], numbers[:-1]
-    if delimiter is None:
-        widths = [_width(line, None, most) for line in lines]
-    else:
-        widths = [line.count(delimiter) + 1 for line in lines]
+    widths = [_width(line, delimiter, most) for line in lines]
     if widths.count(width) != len(widths):
         wrong = next(i for i, found in enumerate(widths) if found != width)
         reason = f"{widths[wrong]} cells where the other lines have {width}"
         raise FormatError(path, reason, line=int(numbers[wrong]))
-    return Table(
-        path=path,
-        header=header,
-        header_text=header_text,
-        lines=tuple(lines),
-        line_numbers=numbers,
-        delimiter=delimiter,
-        width=width,
-        repairs=tuple(repairs),
-    )
 
 
 def too_wide(path: Path, line: int) -> FormatError:

@@ -13,6 +13,7 @@ import sqlite3
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -25,8 +26,8 @@ SIDE_FILES = ("-wal", "-journal")
 #: Rebuilt by SQLite; a copy must not have it.
 SHARED_MEMORY = "-shm"
 
-_WGS84 = 0
-_CAMERA = 0
+#: COLMAP's numbers of a coordinate system and of a kind of sensor.
+_WGS84 = _CAMERA = 0
 #: Priors and rigs of a database count as the model's when they differ from it by less than this share of its size.
 _SAME_FRAME = 0.1
 
@@ -153,9 +154,9 @@ def _transform(
     # The pages of the tables that matter; a check of the whole takes minutes on a large database
     tables = {row[0] for row in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
     for table in tables & {"pose_priors", "rig_sensors", "images"}:
-        told = database.execute(f"PRAGMA quick_check({table})").fetchone()[0]
-        if told != "ok":
-            raise FormatError(path, f"damaged: {told}")
+        answer = database.execute(f"PRAGMA quick_check({table})").fetchone()[0]
+        if answer != "ok":
+            raise FormatError(path, f"damaged: {answer}")
     priors = list(_priors(database, path)) if {"pose_priors", "images"} <= tables else []
     rigs = list(_rigs(database, path)) if "rig_sensors" in tables else []
     moved_priors: set[int] = set()
@@ -163,29 +164,14 @@ def _transform(
     used_priors, used_rigs = [], []
     for model in models:
         similarity = similarities[model.index]
-        mine = [p for p in priors if p.name in model.centres and p.rowid not in moved_priors]
-        in_frame = model.index in prior_models if prior_models is not None else _priors_agree(model, mine)
-        if in_frame and mine and similarity is not None:
-            rotation = matrix_from_quat(similarity.rotation_xyzw)
-            for p in mine:
-                position = similarity.scale * rotation @ p.position + similarity.translation_m
-                database.execute("UPDATE pose_priors SET position = ? WHERE rowid = ?", (position.tobytes(), p.rowid))
-                if p.covariance is not None:
-                    covariance = similarity.scale**2 * rotation @ p.covariance @ rotation.T
-                    database.execute(
-                        "UPDATE pose_priors SET position_covariance = ? WHERE rowid = ?",
-                        (covariance.tobytes(), p.rowid),
-                    )
-            moved_priors |= {p.rowid for p in mine}
+        own_priors = [p for p in priors if p.key in model.centres and p.rowid not in moved_priors]
+        if _are_in_frame(own_priors, model.centres, model.extent(), model.index, prior_models) and similarity:
+            moved_priors |= _move(database, "pose_priors", own_priors, similarity)
             used_priors.append(model.index)
-        own = [r for r in rigs if (r.kind, r.sensor) in model.sensors and r.rowid not in moved_rigs]
-        in_frame = model.index in rig_models if rig_models is not None else _rigs_agree(model, own)
-        if in_frame and own and similarity is not None:
-            database.executemany(
-                "UPDATE rig_sensors SET sensor_from_rig = ? WHERE rowid = ?",
-                [(np.append(r.pose[:4], similarity.scale * r.pose[4:]).tobytes(), r.rowid) for r in own],
-            )
-            moved_rigs |= {r.rowid for r in own}
+        own_rigs = [r for r in rigs if r.key in model.sensors and r.rowid not in moved_rigs]
+        size = max((float(np.linalg.norm(model.sensors[r.key])) for r in own_rigs), default=0.0)
+        if _are_in_frame(own_rigs, model.sensors, size, model.index, rig_models) and similarity:
+            moved_rigs |= _move(database, "rig_sensors", own_rigs, similarity)
             used_rigs.append(model.index)
     return DatabaseChange(
         priors_moved=len(moved_priors),
@@ -199,18 +185,56 @@ def _transform(
 
 @dataclass(frozen=True, eq=False)
 class _Prior:
+    """A pose prior of the image ``key``, at (3,) ``place``."""
+
     rowid: int
-    name: str
-    position: Array
+    key: str
+    place: Array
     covariance: Array | None
+
+    def moved(self, similarity: Similarity) -> dict[str, Array]:
+        """The columns that change."""
+        rotation = matrix_from_quat(similarity.rotation_xyzw)
+        columns = {"position": similarity.scale * rotation @ self.place + similarity.translation_m}
+        if self.covariance is not None:
+            columns["position_covariance"] = similarity.scale**2 * rotation @ self.covariance @ rotation.T
+        return columns
 
 
 @dataclass(frozen=True, eq=False)
 class _Rig:
+    """A sensor of a rig by type and id, at (3,) ``place`` of ``sensor_from_rig``."""
+
     rowid: int
-    kind: int
-    sensor: int
-    pose: Array
+    key: tuple[int, int]
+    rotation: Array
+    place: Array
+
+    def moved(self, similarity: Similarity) -> dict[str, Array]:
+        """The columns that change."""
+        return {"sensor_from_rig": np.append(self.rotation, similarity.scale * self.place)}
+
+
+def _move(database: sqlite3.Connection, table: str, rows: Sequence[_Prior | _Rig], similarity: Similarity) -> set[int]:
+    """Move rows of a table; their numbers."""
+    for row in rows:
+        for column, values in row.moved(similarity).items():
+            database.execute(f"UPDATE {table} SET {column} = ? WHERE rowid = ?", (values.tobytes(), row.rowid))
+    return {row.rowid for row in rows}
+
+
+def _are_in_frame(
+    rows: Sequence[_Prior | _Rig],
+    places: Mapping[Any, Array],
+    size: float,
+    model: int,
+    decided: Collection[int] | None,
+) -> bool:
+    """Whether there are rows and they are in the frame of a model of this size: as was decided, or by their places."""
+    if not rows or decided is not None:
+        return bool(rows) and decided is not None and model in decided
+    distances = [np.linalg.norm(row.place - places[row.key]) for row in rows]
+    return float(np.median(distances)) <= _SAME_FRAME * size
 
 
 def _doubles(path: Path, what: str, blob: object, count: int) -> Array | None:
@@ -246,20 +270,4 @@ def _rigs(database: sqlite3.Connection, path: Path) -> Iterator[_Rig]:
     ):
         pose = _doubles(path, "pose of a sensor in its rig", blob, 7)
         if pose is not None:
-            yield _Rig(rowid, kind, sensor, pose)
-
-
-def _priors_agree(model: PlacedModel, priors: Sequence[_Prior]) -> bool:
-    if not priors:
-        return False
-    distances = [np.linalg.norm(p.position - model.centres[p.name]) for p in priors]
-    return float(np.median(distances)) <= _SAME_FRAME * model.extent()
-
-
-def _rigs_agree(model: PlacedModel, rigs: Sequence[_Rig]) -> bool:
-    if not rigs:
-        return False
-    ours = np.array([model.sensors[r.kind, r.sensor] for r in rigs])
-    theirs = np.array([r.pose[4:] for r in rigs])
-    size = float(np.linalg.norm(ours, axis=1).max())
-    return float(np.median(np.linalg.norm(theirs - ours, axis=1))) <= _SAME_FRAME * size
+            yield _Rig(rowid, (kind, sensor), pose[:4], pose[4:])

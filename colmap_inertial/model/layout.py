@@ -92,14 +92,9 @@ def _submodels(root: Path, models: list[Path], dense: list[Path], *, one_for_all
     """COLMAP's own models: ``sparse`` or its numbered folders, else what is nearest to the root."""
     outside = [m for m in models if not any(m.is_relative_to(d) for d in dense)] or models
     top = Path("sparse")
-    if top in outside:
-        return {0: top}
-    numbered = {int(m.name): m for m in outside if m.parent == top and m.name.isdigit()}
-    if numbered:
-        return dict(sorted(numbered.items()))
-    depth = min(len(m.parts) for m in outside)
-    nearest = [m for m in outside if len(m.parts) == depth]
-    if len(nearest) == 1:
+    numbered = [m for m in outside if m.parent == top and m.name.isdigit()]
+    nearest = [top] if top in outside else numbered or _nearest_to_root(outside)
+    if len(nearest) == 1 and nearest != numbered:
         return {0: nearest[0]}
     if len({m.parent for m in nearest}) == 1 and all(m.name.isdigit() for m in nearest):
         return dict(sorted((int(m.name), m) for m in nearest))
@@ -109,6 +104,11 @@ def _submodels(root: Path, models: list[Path], dense: list[Path], *, one_for_all
     raise FormatError(
         root, f"it cannot be told which of these is COLMAP's model: {names}; leave others out with --keep"
     )
+
+
+def _nearest_to_root(folders: list[Path]) -> list[Path]:
+    depth = min(len(folder.parts) for folder in folders)
+    return [folder for folder in folders if len(folder.parts) == depth]
 
 
 def _placed(folder: Path, index: int) -> PlacedModel:

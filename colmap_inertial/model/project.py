@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Generator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -134,9 +134,10 @@ def apply_to_project(
     one = scales if isinstance(scales, Similarity) else None
     layout = read_layout(project, work.open_folders(), one_for_all=one is not None)
     by_model = _by_model(project, layout, scales)
-    left = [index for index, scale in by_model.items() if only_metric and scale.similarity is None]
-    work.leave_out(layout, left)
-    return work.run(layout, by_model, one, link=link, progress=progress, left=left)
+    left_out = [index for index, scale in by_model.items() if only_metric and scale.similarity is None]
+    work.leave_out(layout, left_out)
+    plan = _Plan(layout=layout, by_model=by_model, one_for_all=one, left_out=left_out, link=link)
+    return work.run(plan, progress)
 
 
 def undo_project(
@@ -161,7 +162,7 @@ def undo_project(
     try:
         keep = [str(pattern) for pattern in record["keep"]]
         models = [(int(m["index"]), m["similarity"]) for m in record["models"]]
-        database = {name: (list(d["prior_models"]), list(d["rig_models"])) for name, d in record["databases"].items()}
+        databases = {name: (list(d["prior_models"]), list(d["rig_models"])) for name, d in record["databases"].items()}
         beside = [str(pattern) for pattern in record.get("beside", [])]
         require_not_joined(path, {int(m["index"]): [int(i) for i in m.get("joined_of", [])] for m in record["models"]})
     except (KeyError, TypeError, ValueError, AttributeError):
@@ -175,7 +176,8 @@ def undo_project(
     layout = read_layout(project, work.open_folders(), one_for_all=one is not None)
     if layout.submodels.keys() != by_model.keys():
         raise FormatError(path, "the models of the project are not those that it records")
-    return work.run(layout, by_model, one, link=link, progress=progress, undo=True, database=database)
+    plan = _Plan(layout=layout, by_model=by_model, one_for_all=one, databases=databases, link=link, is_undo=True)
+    return work.run(plan, progress)
 
 
 def _by_model(
@@ -200,6 +202,42 @@ def _by_model(
     return {index: scales[index] for index in layout.submodels}
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Plan:
+    """What a copy of a project is made by.
+
+    Attributes
+    ----------
+    layout
+        The models of the project.
+    by_model
+        What is applied to each sub-model and what was made from it.
+    one_for_all
+        The similarity of everything, in place of these.
+    left_out
+        Sub-models that are not copied.
+    databases
+        By path, the models whose priors and rigs it holds, where that is recorded.
+    link
+        Make hard links of files that do not change.
+    is_undo
+        Whether it takes back what was applied, and leaves no record.
+    """
+
+    layout: Layout
+    by_model: Mapping[int, ModelScale]
+    one_for_all: Similarity | None
+    left_out: Collection[int] = ()
+    databases: Mapping[str, tuple[Collection[int], Collection[int]]] = field(default_factory=dict)
+    link: bool = False
+    is_undo: bool = False
+
+    @property
+    def similarities(self) -> dict[int, Similarity | None]:
+        """By sub-model."""
+        return {index: scale.similarity for index, scale in self.by_model.items()}
+
+
 class _Work:
     """One copy of a project, file by file."""
 
@@ -219,6 +257,7 @@ class _Work:
         self._changes: list[Change] = []
         self._databases: dict[str, dict[str, Any]] = {}
         self._notes: list[str] = []
+        self._foreign: Counter[str] = Counter()
 
     def is_kept(self, path: Path) -> bool:
         """Whether a path, or a folder above it, is to be copied as it is."""
@@ -240,97 +279,76 @@ class _Work:
             self._notes.append(f"{layout.submodels[index]} and what was made from it is left out: its scale is refused")
 
     @one_blas_thread()
-    def run(
-        self,
-        layout: Layout,
-        by_model: Mapping[int, ModelScale],
-        one: Similarity | None,
-        *,
-        link: bool,
-        progress: Callable[[int, int], object],
-        undo: bool = False,
-        database: Mapping[str, tuple[Collection[int], Collection[int]]] | None = None,
-        left: Collection[int] = (),
-    ) -> Applied:
-        """Write everything but the sub-models that are ``left`` out, then give it its name."""
-        similarities = {index: scale.similarity for index, scale in by_model.items()}
-        models = _model_files(self._project, layout.owners)
-        skipped = {folder / TRANSFORM_FILE for folder in (Path(), *layout.owners)} if undo else set()
+    def run(self, plan: _Plan, progress: Callable[[int, int], object]) -> Applied:
+        """Write everything but the sub-models that are left out, then give it its name."""
         unchanged: Counter[str] = Counter()
-        foreign: Counter[str] = Counter()
         with new_folder(self._out) as partial:
             for folder in self.folders:
                 (partial / folder).mkdir()
             for path in self._links:
                 (partial / path).symlink_to((self._project / path).readlink())
                 unchanged["link"] += 1
-            for folder, index in layout.owners.items():
-                if index not in left:
-                    self._write_model(folder, partial, index, one or similarities[index], record=not undo)
-            todo = [p for p in self._files if p not in models and p not in skipped and not self._is_side_file(p)]
-            databases: list[Path] = []
-            jobs: list[Callable[[], Change | str]] = []
-            for path in todo:
-                kind = None if self.is_kept(path) else kind_of(self._project / path, path)
-                if kind == "database":
-                    databases.append(path)
-                    continue
-                if kind == "transforms" and not self._is_of_a_model(layout, path):
-                    kind = None
-                owner = None if one is not None or kind is None else self._owner(layout, path)
-                similarity = one if owner is None else similarities[owner]
-                other = None if kind is not None or self.is_kept(path) else foreign_kind(path)
-                if other is not None:
-                    foreign[other] += 1
-                jobs.append(functools.partial(self._write_file, path, partial, kind, similarity, owner, link))
-            done = 0
+            for folder, index in plan.layout.owners.items():
+                if index not in plan.left_out:
+                    self._write_model(folder, partial, index, plan)
+            databases, jobs = self._sort_files(plan, partial)
+            done, total = 0, len(databases) + len(jobs)
             for path in databases:
-                if not self._write_database(path, partial, layout, similarities, database):
+                if not self._write_database(path, partial, plan):
                     unchanged["copied"] += 1
-                progress(done := done + 1, len(todo))
+                progress(done := done + 1, total)
             with contextlib.closing(_side_by_side(jobs)) as outcomes:
                 for outcome in outcomes:
                     if isinstance(outcome, Change):
                         self._changes.append(outcome)
                     else:
                         unchanged[outcome] += 1
-                    progress(done := done + 1, len(todo))
+                    progress(done := done + 1, total)
             for folder in reversed(self.folders):
                 shutil.copymode(self._project / folder, partial / folder)
-            if foreign:
-                told = ", ".join(f"{count} {suffix}" for suffix, count in sorted(foreign.items()))
-                self._notes.append(f"copied in their old units, as their formats are not transformed: {told}")
+            if self._foreign:
+                counted = ", ".join(f"{count} {suffix}" for suffix, count in sorted(self._foreign.items()))
+                self._notes.append(f"copied in their old units, as their formats are not transformed: {counted}")
+            submodels = plan.layout.submodels
             applied = Applied(
                 out=self._out,
-                models={i: (str(layout.submodels[i]), scale) for i, scale in by_model.items() if i not in left},
+                models={i: (str(submodels[i]), s) for i, s in plan.by_model.items() if i not in plan.left_out},
                 changes=tuple(self._changes),
                 unchanged=dict(unchanged),
                 notes=tuple(self._notes),
             )
-            if not undo:
-                write_json(partial / TRANSFORM_FILE, self._record(applied, one))
+            if not plan.is_undo:
+                write_json(partial / TRANSFORM_FILE, self._record(applied, plan.one_for_all))
         return applied
 
-    def _write_file(
-        self,
-        path: Path,
-        partial: Path,
-        kind: str | None,
-        similarity: Similarity | None,
-        owner: int | None,
-        link: bool,
-    ) -> Change | str:
-        """Transform or copy one file; what was changed, or how it was copied."""
-        source, target = self._project / path, partial / path
-        if kind is None or similarity is None:
-            how = copy_file(source, target, link=link)
-            if how == "copied":
-                begin_writing(target)
-            return how
-        changed = WRITERS[kind](source, target, similarity)
-        begin_writing(target)
-        shutil.copymode(source, target)
-        return Change(path=str(path), kind=kind, changed=changed, model=owner) if changed else "copied"
+    def _sort_files(self, plan: _Plan, partial: Path) -> tuple[list[Path], list[Callable[[], Change | str]]]:
+        """The databases, and the work on every other file that COLMAP does not write itself."""
+        skipped = _model_files(self._project, plan.layout.owners)
+        if plan.is_undo:
+            skipped |= {folder / TRANSFORM_FILE for folder in (Path(), *plan.layout.owners)}
+        similarities = plan.similarities
+        databases: list[Path] = []
+        jobs: list[Callable[[], Change | str]] = []
+        for path in self._files:
+            if path in skipped or self._is_side_file(path):
+                continue
+            kind = None if self.is_kept(path) else kind_of(self._project / path, path)
+            if kind == "database":
+                databases.append(path)
+                continue
+            if kind == "transforms" and not self._is_of_a_model(plan.layout, path):
+                kind = None
+            owner = None if plan.one_for_all is not None or kind is None else self._owner(plan.layout, path)
+            similarity = plan.one_for_all if owner is None else similarities[owner]
+            other = None if kind is not None or self.is_kept(path) else foreign_kind(path)
+            if other is not None:
+                self._foreign[other] += 1
+            source, target = self._project / path, partial / path
+            if kind is None or similarity is None:
+                jobs.append(functools.partial(_copy, source, target, link=plan.link))
+            else:
+                jobs.append(functools.partial(_transform, source, target, kind, similarity, (str(path), owner)))
+        return databases, jobs
 
     def _is_of_a_model(self, layout: Layout, path: Path) -> bool:
         """Whether cameras of a NeRF trainer are those of the models here; the user hears where they are not."""
@@ -357,10 +375,9 @@ class _Work:
                 return not self.is_kept(base)
         return False
 
-    def _write_model(
-        self, folder: Path, partial: Path, index: int, similarity: Similarity | None, *, record: bool
-    ) -> None:
+    def _write_model(self, folder: Path, partial: Path, index: int, plan: _Plan) -> None:
         source, target = self._project / folder, partial / folder
+        similarity = plan.one_for_all or plan.by_model[index].similarity
         for suffix in model_formats(source):
             model = read_model(source, suffix)
             if similarity is None:
@@ -384,24 +401,17 @@ class _Work:
             self._changes.append(
                 Change(path=str(folder), kind=f"model {suffix}", changed=("cameras", "points", "rigs"), model=index)
             )
-        if similarity is not None and record and folder != Path():
+        if similarity is not None and not plan.is_undo and folder != Path():
             write_json(target / TRANSFORM_FILE, similarity_as_json(similarity))
 
-    def _write_database(
-        self,
-        path: Path,
-        partial: Path,
-        layout: Layout,
-        similarities: Mapping[int, Similarity | None],
-        decided: Mapping[str, tuple[Collection[int], Collection[int]]] | None,
-    ) -> bool:
+    def _write_database(self, path: Path, partial: Path, plan: _Plan) -> bool:
         """Whether anything in it changed."""
-        priors, rigs = (None, None) if decided is None else decided.get(str(path), (None, None))
+        priors, rigs = plan.databases.get(str(path), (None, None))
         done = transform_database(
             self._project / path,
             partial / path,
-            layout.placed,
-            similarities,
+            plan.layout.placed,
+            plan.similarities,
             prior_models=priors,
             rig_models=rigs,
         )
@@ -440,6 +450,24 @@ class _Work:
             "unchanged": applied.unchanged,
             "notes": list(applied.notes),
         }
+
+
+def _copy(source: Path, target: Path, *, link: bool) -> str:
+    """How the file was copied."""
+    how = copy_file(source, target, link=link)
+    if how == "copied":
+        begin_writing(target)
+    return how
+
+
+def _transform(
+    source: Path, target: Path, kind: str, similarity: Similarity, place: tuple[str, int | None]
+) -> Change | str:
+    """Transform one file; ``place`` is its path in the project and the sub-model that owns it."""
+    changed = WRITERS[kind](source, target, similarity)
+    begin_writing(target)
+    shutil.copymode(source, target)
+    return Change(path=place[0], kind=kind, changed=changed, model=place[1]) if changed else "copied"
 
 
 def _side_by_side(jobs: Sequence[Callable[[], Change | str]]) -> Generator[Change | str, None, None]:
