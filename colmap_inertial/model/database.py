@@ -27,7 +27,7 @@ SIDE_FILES = ("-wal", "-journal")
 SHARED_MEMORY = "-shm"
 
 #: COLMAP's numbers of a coordinate system and of a kind of sensor.
-_WGS84 = _CAMERA = 0
+_WGS84, _CAMERA = 0, 0
 #: Priors and rigs of a database count as the model's when they differ from it by less than this share of its size.
 _SAME_FRAME = 0.1
 
