@@ -859,14 +859,14 @@ MUTANTS = (
     ),
     Mutant(
         "imaging/gate.py",
-        "if unsure > MOST_UNSURE:",
-        "if unsure > 4 * MOST_UNSURE:",
+        "if unsure > GATE_LIMITS.most_unsure:",
+        "if unsure > 4 * GATE_LIMITS.most_unsure:",
         "a blur that is hardly known is undone",
         ("imaging_doubt",),
     ),
     Mutant(
         "imaging/evidence.py",
-        "_SCATTER * noise[:, 0]",
+        "_LIMITS.scatter * noise[:, 0]",
         "0 * noise[:, 0]",
         "a sky of noise counts as a picture",
         ("imaging_gate",),
@@ -1566,7 +1566,7 @@ MUTANTS = (
     ),
     Mutant(
         "imaging/plane_sweep/tiles.py",
-        "first, last = int(np.floor(low)) - _BEYOND, int(np.ceil(high)) + _BEYOND + 1",
+        "first, last = int(np.floor(low)) - _LIMITS.beyond, int(np.ceil(high)) + _LIMITS.beyond + 1",
         "first, last = int(np.floor(low)), int(np.ceil(high)) + 1",
         "depths at half the size are taken for exact",
         ("sweep::test_tiles_hold_each_pixel_once_and_the_candidates_that_are_there",),
@@ -1975,7 +1975,7 @@ MUTANTS = (
     ),
     Mutant(
         "imaging/exposure_pairs/_registration.py",
-        "return bool(mean >= _ALIKE and mean >= _ALIKE_SIGMAS * spread)",
+        "return bool(mean >= _LIMITS.alike and mean >= _LIMITS.alike_sigmas * spread)",
         "return bool(mean >= -1)",
         "two scenes are blended",
         ("exposures_simulated::test_pictures_of_two_scenes_are_never_blended",),
@@ -2108,8 +2108,8 @@ MUTANTS = (
     ),
     Mutant(
         "motion/shutter.py",
-        "_DEPTHS, _LEAST_SCATTER_RAD = 3.0,",
-        "_DEPTHS, _LEAST_SCATTER_RAD = 0.01,",
+        "depth_scatter: float = 3.0",
+        "depth_scatter: float = 0.01",
         "corners of all depths move alike with the camera, and what they do not bends the readout",
         ("shutter::test_the_readout_is_found_and_as_sure_as_it_says",),
     ),

@@ -12,7 +12,7 @@ from colmap_inertial.core.geometry import quat_exp, quat_multiply
 from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath, middles
-from colmap_inertial.imaging.gate import MOST_UNSURE, RecordingVerdict, deblur_gated
+from colmap_inertial.imaging.gate import GATE_LIMITS, RecordingVerdict, deblur_gated
 from colmap_inertial.imaging.gyro_camera import MOST_BIAS_RAD_S, FrameShutter, MotionErrors
 from colmap_inertial.imaging.path_filters import path_wiener
 from colmap_inertial.imaging.psf import blur_field, blur_path
@@ -143,9 +143,13 @@ def test_a_blur_that_is_hardly_known_is_left_alone():
     image = np.random.default_rng(0).integers(0, 255, (240, 320), dtype=np.uint8)
     lines = BlurField.uniform(320, 240, (12.0, 0.0))
     trusted = RecordingVerdict(trusted=True, support=9.0, extent_factor=1.0, frames=9, reason="others do")
-    off_px2 = (12 * MOST_UNSURE) ** 2
+    off_px2 = (12 * GATE_LIMITS.most_unsure) ** 2
     unsure = replace(lines, cov_px2=(0.6 * off_px2, 0.0, 0.6 * off_px2))
-    assert unsure.unsure_share() > MOST_UNSURE > replace(lines, cov_px2=(0.9 * off_px2, 0.0, 0.0)).unsure_share()
+    assert (
+        unsure.unsure_share()
+        > GATE_LIMITS.most_unsure
+        > replace(lines, cov_px2=(0.9 * off_px2, 0.0, 0.0)).unsure_share()
+    )
     gated = deblur_gated(image, unsure, recording=trusted)
     assert gated.image is image and "uncertain" in gated.reason
     assert lines.times(2.0).unsure_share() == 0 and unsure.times(2.0).unsure_share() == unsure.unsure_share()

@@ -16,7 +16,7 @@ from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath, middles
 from colmap_inertial.imaging.evidence import BlurEvidence, _weights, blur_evidence, shown_share, shown_shares
 from colmap_inertial.imaging.gate import (
-    LEAST_SHARE,
+    GATE_LIMITS,
     GateOptions,
     RecordingVerdict,
     deblur_gated,
@@ -221,7 +221,7 @@ def test_the_share_of_the_blur_that_shows_is_the_textures_and_not_the_sky_s(blur
         shares += [shown_share(image, field), shown_share(cloudless, field)]
     blurred, blurred_below_sky, sharp, sharp_below_sky = shares
     assert 0.5 < blurred < 1.3 and 0.5 < blurred_below_sky < 1.3
-    assert abs(sharp) < LEAST_SHARE / 2 and abs(sharp_below_sky) < LEAST_SHARE / 2
+    assert abs(sharp) < GATE_LIMITS.least_share / 2 and abs(sharp_below_sky) < GATE_LIMITS.least_share / 2
     flat = np.full((HEIGHT, WIDTH), 90, np.uint8)
     assert shown_share(flat, field) is None
     noise = np.random.default_rng(0).normal(128, 6, (HEIGHT, WIDTH)).astype(np.uint8)
@@ -288,7 +288,7 @@ def test_curved_blur_is_compared_with_the_curve():
     still = np.rint(255 * sharp).astype(np.uint8)
     across = replace(path, path_px=path.path_px[..., ::-1])
     for picture, other in ((still, path), (image, across)):
-        assert shown_share(picture, other) < LEAST_SHARE and blur_evidence(picture, other).support < 4
+        assert shown_share(picture, other) < GATE_LIMITS.least_share and blur_evidence(picture, other).support < 4
 
 
 def test_a_wrong_extent_is_corrected_and_a_right_one_left_alone():

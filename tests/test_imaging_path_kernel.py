@@ -48,7 +48,7 @@ def test_a_tile_s_transform_is_numpy_s_and_comes_back(side, instruction_set):
 
 
 @pytest.mark.parametrize("instruction_set", SETS)
-@pytest.mark.parametrize("splitting", [(), path_filters.SPLITTING], ids=["wiener", "half-quadratic"])
+@pytest.mark.parametrize("splitting", [(), path_filters.FILTER_MODEL.splitting], ids=["wiener", "half-quadratic"])
 @pytest.mark.parametrize("cov_px2", [(0.0, 0.0, 0.0), (2.0, -0.5, 0.7)], ids=["certain", "doubtful"])
 def test_both_filters_are_the_plain_ones(cov_px2, splitting, instruction_set):
     width, height = 330, 210
@@ -77,8 +77,8 @@ def test_noise_is_what_the_plain_version_sees():
             window_in=tiling.window_in(),
             hop=tiling.hop,
             before=tiling.before,
-            above=path_filters.NOISE_ABOVE,
-            share=path_filters.NOISE_SHARE,
+            above=path_filters.FILTER_MODEL.noise_above_per_px,
+            share=path_filters.FILTER_MODEL.noise_share,
             every=1,
         ),
         (-1, 3),

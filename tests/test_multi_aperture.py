@@ -1,5 +1,7 @@
 """Fusion of several apertures: kernels against numpy, geometry against projection, scenes whose disparity is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pycolmap
 import pytest
@@ -312,7 +314,8 @@ def test_strips_give_what_the_whole_gives(monkeypatch):
     planes, _truth, rig = plane_views(96, 400, 4.0, (0.0, 0.005))
     canvas = rectify(rig, projectors(rig))
     whole = estimate_disparity(planes, canvas, PLANE)
-    monkeypatch.setattr(semi_global, "_MEMORY", 96 * (36 + 2 * 64) * 180)
+    limits = replace(semi_global.MATCHING, memory_bytes=96 * (36 + 2 * 64) * 180)
+    monkeypatch.setattr(semi_global, "MATCHING", limits)
     assert len(semi_global.strips(400, 96 * (36 + 2 * 64))) > 3
     in_strips = estimate_disparity(planes, canvas, PLANE)
     assert (np.abs(whole.disparity_px - in_strips.disparity_px) > 0.1).mean() < 0.01
@@ -324,7 +327,7 @@ def test_memory_is_bounded():
         parts = semi_global.strips(height, row)
         assert [p[0] for p in parts] == [0, *[p[1] for p in parts[:-1]]]
         assert parts[-1][1] == height
-        assert max(last - first for *_, first, last in parts) * row <= max(semi_global._MEMORY, 98 * row)
+        assert max(last - first for *_, first, last in parts) * row <= max(semi_global.MATCHING.memory_bytes, 98 * row)
 
 
 @pytest.mark.parametrize("shape", [(1, 40), (40, 1), (1, 1), (5, 7)])

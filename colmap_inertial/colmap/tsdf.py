@@ -8,6 +8,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
@@ -27,17 +28,30 @@ from colmap_inertial.model.depth_maps import read_map
 if TYPE_CHECKING:
     import pycolmap
 
-#: Which of the depths counts as near: what was filmed for its own sake, not what stands behind.
-_NEAR = 0.25
-#: Side of a voxel in pixels where it is near, and how far from the surface distances are kept, in voxels. On the
-#: example scene 2 to 3 px are alike; twice the truncation blunts it.
-VOXEL_PX, TRUNCATION_VOXELS = 2.5, 4.0
-#: What is so many times farther than what is near is coarser than the voxels: it would take most of the memory.
-FARTHEST = 3.0
-#: Surfaces that fewer pictures saw are left out.
-LEAST_SEEN = 3.0
-#: Voxels on a side of the blocks that memory comes in, blocks in the beginning, and the most of them: about 3 GB.
-_BLOCK, _BLOCKS, _MOST_BLOCKS = 8, 10_000, 400_000
+
+@dataclass(frozen=True, kw_only=True)
+class SurfaceLimits:
+    """The voxels of a surface."""
+
+    #: Which of the depths counts as near: what was filmed for its own sake, not what stands behind.
+    near_quantile: float = 0.25
+    #: Side of a voxel in pixels where it is near; on the example scene 2 to 3 px are alike.
+    voxel_px: float = 2.5
+    #: How far from the surface distances are kept; twice of it blunts the example scene.
+    truncation_voxels: float = 4.0
+    #: What is so many times farther than what is near is coarser than the voxels: it would take most of the memory.
+    farthest: float = 3.0
+    #: Surfaces that fewer pictures saw are left out.
+    least_seen: float = 3.0
+    #: Voxels on a side of the blocks that memory comes in,
+    block_voxels: int = 8
+    #: blocks in the beginning,
+    first_blocks: int = 10_000
+    #: and the most of them: about 3 GB.
+    most_blocks: int = 400_000
+
+
+SURFACE = SurfaceLimits()
 
 
 def require_mesh_maker(options: ReconstructOptions) -> None:
@@ -111,14 +125,14 @@ def tsdf_mesh(folder: Path, names: Sequence[str], target: Path, *, maker: Maker,
     files = {name: map_file(folder, "depth", name, kind) for name in names}
     typical = [_typical(read_map(files[name]), model.camera(images[name].camera_id)) for name in names]
     near_m, pixel_m = np.median(typical, axis=0)
-    voxel_m, far_m = VOXEL_PX * float(pixel_m), FARTHEST * float(near_m)
+    voxel_m, far_m = SURFACE.voxel_px * float(pixel_m), SURFACE.farthest * float(near_m)
     grid = o3d.t.geometry.VoxelBlockGrid(
         attr_names=("tsdf", "weight", "color"),
         attr_dtypes=(core.float32, core.uint16, core.uint16),
         attr_channels=((1), (1), (3)),
         voxel_size=voxel_m,
-        block_resolution=_BLOCK,
-        block_count=_BLOCKS,
+        block_resolution=SURFACE.block_voxels,
+        block_count=SURFACE.first_blocks,
         device=core.Device("CPU:0"),
     )
     for name in sorted(names):
@@ -131,15 +145,15 @@ def tsdf_mesh(folder: Path, names: Sequence[str], target: Path, *, maker: Maker,
         seen = o3d.t.geometry.Image(np.ascontiguousarray(depth))
         shown = o3d.t.geometry.Image(_colours(path_in(folder / "images", name)))
         matrix, pose = core.Tensor(_matrix(camera.params, maker)), core.Tensor(cam_from_world)
-        limits = (1.0, far_m, TRUNCATION_VOXELS)
+        limits = (1.0, far_m, SURFACE.truncation_voxels)
         blocks = grid.compute_unique_block_coordinates(seen, matrix, pose, *limits)
         grid.integrate(blocks, seen, shown, matrix, pose, *limits)
-        if grid.hashmap().size() > _MOST_BLOCKS:
+        if grid.hashmap().size() > SURFACE.most_blocks:
             raise InertialError(
                 f"{target}: the surface is too large for voxels of {1000 * voxel_m:.1f} mm; shrink the pictures "
                 "(--dense-options.max-image-size), or take --dense-options.mesh poisson"
             )
-    mesh = _in_order(o3d, grid.extract_triangle_mesh(weight_threshold=LEAST_SEEN))
+    mesh = _in_order(o3d, grid.extract_triangle_mesh(weight_threshold=SURFACE.least_seen))
     if not o3d.t.io.write_triangle_mesh(str(target), mesh) or not target.is_file():
         raise OutputError(f"{target}: open3d wrote no mesh; is the disk full?")
 
@@ -165,7 +179,7 @@ def _in_order(o3d: ModuleType, mesh: Any) -> Any:
 def _typical(depth: Float32Array, camera: pycolmap.Camera) -> tuple[float, float]:
     """What is near in a map, and what a pixel covers there."""
     known = depth[depth > 0]
-    near = float(np.quantile(known, _NEAR)) if len(known) else 0.0
+    near = float(np.quantile(known, SURFACE.near_quantile)) if len(known) else 0.0
     return near, near / float(camera.mean_focal_length())
 
 

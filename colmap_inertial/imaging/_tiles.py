@@ -10,15 +10,30 @@ from colmap_inertial.core.arrays import Array, Float32Array, Int32Array
 from colmap_inertial.imaging._bilinear import bilinear
 from colmap_inertial.imaging.blur_path import BlurPath
 
-#: Parts of a tile's side: a margin that is left out, since the filter has less than all of the blur there, and a ramp
-#: over which neighbours are blended. What is left of the side between the ramps is flat.
-_MARGIN, _RAMP = 48 / 256, 64 / 256
-#: With shorter blur, tiles need less of both.
-_SHORT_MARGIN, _SHORT_RAMP = 40 / 256, 48 / 256
-#: Up to so many px of blur, tiles of the shortest side are laid out for short blur; above, for long blur. A side is at
-#: least so many times as long as the blur.
-SHORT_BLUR_PX, _SIDES = 25.0, 5.0
-SHORTEST_SIDE, _LONGEST_SIDE = 256, 2048
+
+@dataclass(frozen=True, kw_only=True)
+class TilingLimits:
+    """How tiles are laid out."""
+
+    #: Part of a tile's side that is left out, since the filter has less than all of the blur there,
+    margin: float = 48 / 256
+    #: and the ramp over which neighbours are blended. What is left of the side between the ramps is flat.
+    ramp: float = 64 / 256
+    #: With shorter blur, tiles need less of the margin
+    short_margin: float = 40 / 256
+    #: and of the ramp:
+    short_ramp: float = 48 / 256
+    #: up to so many px of blur, tiles of the shortest side are laid out for short blur; above, for long blur.
+    short_blur_px: float = 25.0
+    #: A side is at least so many times as long as the blur.
+    blurs_per_side: float = 5.0
+    #: Shortest side of a tile,
+    shortest_side_px: int = 256
+    #: and longest one.
+    longest_side_px: int = 2048
+
+
+TILING = TilingLimits()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,11 +61,11 @@ class Tiling:
     @classmethod
     def covering(cls, width: int, height: int, extent_px: float) -> Tiling:
         """For an image with blur of at most this length."""
-        side = SHORTEST_SIDE
-        while side < _SIDES * extent_px and side < _LONGEST_SIDE:
+        side = TILING.shortest_side_px
+        while side < TILING.blurs_per_side * extent_px and side < TILING.longest_side_px:
             side *= 2
-        short = extent_px <= SHORT_BLUR_PX
-        margin, ramp = (_SHORT_MARGIN, _SHORT_RAMP) if short else (_MARGIN, _RAMP)
+        short = extent_px <= TILING.short_blur_px
+        margin, ramp = (TILING.short_margin, TILING.short_ramp) if short else (TILING.margin, TILING.ramp)
         return cls(width=width, height=height, side=side, margin=int(margin * side), ramp=int(ramp * side))
 
     @property

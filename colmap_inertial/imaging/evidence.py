@@ -17,41 +17,68 @@ import numpy as np
 from colmap_inertial.core.arrays import Array, Float32Array, IndexArray, UInt8Array, UInt16Array
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath, middles
+from colmap_inertial.imaging.tracking import to_grey
 
 #: Lags as factors of the predicted extent, and directions against the predicted one.
 FACTORS = np.arange(0.6, 1.5001, 0.05)
 DIRECTIONS_RAD = np.radians(np.arange(0.0, 180.0, 15.0))
-#: Tiles are at least so large, and so many times the blur's length.
-_SMALLEST_TILE_PX, _TILE_BLURS = 64, 2.9
-#: Images with longer blur are looked at in half the size, a quarter and so on.
-_LONGEST_PX = 44.0
-#: Shorter blur leaves no zero in the spectrum; flat or overexposed tiles say nothing.
-_SHORTEST_PX, _LEAST_CONTRAST, _MOST_CLIPPED = 2.5, 0.01, 0.1
-#: Standard deviation of the smoothing of the cepstrum, px; power (of a tile's mean square 1) below which noise rules.
-_SMOOTHING_PX, _FLOOR = 0.8, 1e-7
-_FEWEST_TILES = 12
-#: More tiles are thinned out: support grows with the square root of their number, cost with it. Few serve for the share
-#: of the blur that shows.
-_MOST_TILES, _FEW_TILES = 900, 200
-#: The share of a picture's tiles that are its quiet ones; the power above theirs at which a tile has half of its
-#: weight, as noise varies by so much with light and JPEG; and how steeply weights rise there: weak textures of common
-#: pictures, of tenfold power, weigh nearly all.
-_QUIET, _ABOVE_QUIET, _STEEP = 0.05, 3.0, 3
-#: Cycles per pixel in which blur takes power from a direction before noise covers it, and in which noise is alone.
-_BAND, _NOISE_BAND = (0.05, 0.25), (0.4, 0.5)
-#: The share of a tile's mean fall over all frequencies that is put down to the texture's own direction: textures differ
-#: by +-0.25 (natural logarithm of the power) along any two directions, about alike at all frequencies.
-_OWN_DIRECTION = 0.8
-#: Zeros of the transfer are no deeper than this (natural logarithm): JPEG, and blur that changes in a tile, fill them.
-_DEEPEST = -3.0
-#: Of a picture counts what stands out of the noise by twice its scatter; neighbours that are alike under the window
-#: make that half as large again.
-_SCATTER = 3.0
-#: Paths that leave their chord by more are curves; their dips are looked for at such factors of it and turns from it.
-_CURVED_PX = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvidenceLimits:
+    """What the evidence of blur is looked for in, and what it is weighed by."""
+
+    #: Side of the smallest tiles.
+    smallest_tile_px: int = 64
+    #: Tiles are at least this many blur lengths wide.
+    tile_blurs: float = 2.9
+    #: Images with longer blur are reduced to half their size, a quarter and so on.
+    longest_px: float = 44.0
+    #: Shorter blur leaves no zero in the spectrum.
+    shortest_px: float = 2.5
+    #: Tiles with a smaller standard deviation of light (full scale = 1) are flat, and tell nothing.
+    least_contrast: float = 0.01
+    #: Tiles with a larger share of clipped pixels tell nothing.
+    most_clipped: float = 0.1
+    #: Standard deviation of the smoothing of the cepstrum.
+    smoothing_px: float = 0.8
+    #: Power, of a tile's mean square 1, below which noise rules.
+    floor: float = 1e-7
+    #: Fewer tiles tell nothing.
+    fewest_tiles: int = 12
+    #: More tiles are thinned out: support grows with the square root of their number, cost with it.
+    most_tiles: int = 900
+    #: As many serve for the share of the blur that shows.
+    few_tiles: int = 200
+    #: The share of a picture's tiles that are its quiet ones.
+    quiet_share: float = 0.05
+    #: Times the power of quiet tiles at which a tile has half of its weight: noise varies by so much with light and
+    #: JPEG.
+    above_quiet: float = 3.0
+    #: How steeply weights rise there: weak textures of common pictures, of tenfold power, weigh nearly all.
+    steepness: int = 3
+    #: Cycles per pixel between which blur takes power from a direction before noise covers it.
+    band_per_px: tuple[float, float] = (0.05, 0.25)
+    #: Cycles per pixel between which noise is alone.
+    noise_band_per_px: tuple[float, float] = (0.4, 0.5)
+    #: The share of a tile's mean fall over all frequencies that is put down to the texture's own direction: textures
+    #: differ by +-0.25 (natural logarithm of the power) along any two directions, about alike at all frequencies.
+    own_direction: float = 0.8
+    #: Zeros of the transfer are no deeper than this (natural logarithm): JPEG, and blur that changes in a tile, fill
+    #: them.
+    deepest_log: float = -3.0
+    #: Of a picture counts what stands out of the noise by twice its scatter; neighbours that are alike under the window
+    #: make that half as large again.
+    scatter: float = 3.0
+    #: Paths that leave their chord by more are curves.
+    curved_px: float = 0.5
+    #: With less, the scatter of the spectra alone (variance 1.6, neighbours alike) puts the share off by .1.
+    least_information: float = 400.0
+
+
+_LIMITS = EvidenceLimits()
+
 _BENT_FACTORS, _BENT_RAD = np.arange(0.7, 1.2001, 0.05), np.radians(np.arange(-30.0, 31.0, 3.0))
-#: With less, the scatter of the spectra alone (variance 1.6, neighbours alike) puts the share off by .1.
-_LEAST_INFORMATION = 400.0
 #: The extents among which the prediction may be: dips at shorter lags are the texture's own.
 _PLAUSIBLE = slice(2, 17)
 
@@ -97,7 +124,7 @@ class BlurEvidence:
     @property
     def enough(self) -> bool:
         """Whether there are tiles enough to say anything."""
-        return self.tiles >= _FEWEST_TILES
+        return self.tiles >= _LIMITS.fewest_tiles
 
     @cached_property
     def sigmas(self) -> Array:
@@ -156,7 +183,7 @@ def blur_evidence(image: UInt8Array | UInt16Array, blur: BlurField | BlurPath) -
     Evidence in units of the prediction; of no tile where blur is short, or texture missing, all over.
     """
     path = BlurPath.straight(blur) if isinstance(blur, BlurField) else blur
-    found = _spectra(image, path, _MOST_TILES)
+    found = _spectra(image, path, _LIMITS.most_tiles)
     if found is None:
         return BlurEvidence.nothing()
     logarithm, vectors, paths = found
@@ -203,7 +230,7 @@ def shown_share(image: UInt8Array | UInt16Array, blur: BlurField | BlurPath) -> 
 def shown_shares(image: UInt8Array | UInt16Array, blur: BlurField | BlurPath) -> tuple[float | None, float | None]:
     """As `shown_share`, and that of the blur that a gyroscope with one axis flipped would predict."""
     path = BlurPath.straight(blur) if isinstance(blur, BlurField) else blur
-    found = _spectra(image, path, _FEW_TILES)
+    found = _spectra(image, path, _LIMITS.few_tiles)
     if found is None:
         return None, None
     logarithm, vectors, paths = found
@@ -214,10 +241,10 @@ def shown_shares(image: UInt8Array | UInt16Array, blur: BlurField | BlurPath) ->
 def _share(logarithm: Float32Array, vectors: Array, path_px: Array, weight: Array) -> float | None:
     falls = _falls(logarithm, vectors, path_px)
     seen, expected, seen_mean, expected_mean = (weight * fall for fall in falls)
-    information = float((expected - _OWN_DIRECTION * expected_mean).sum())
-    if information < _LEAST_INFORMATION:
+    information = float((expected - _LIMITS.own_direction * expected_mean).sum())
+    if information < _LIMITS.least_information:
         return None
-    return float((seen - _OWN_DIRECTION * seen_mean).sum()) / information
+    return float((seen - _LIMITS.own_direction * seen_mean).sum()) / information
 
 
 def _spectra(
@@ -233,7 +260,7 @@ def _spectra(
     lengths = chords.extent_px()
     long_px = float(np.percentile(lengths, 90))
     reduced = 1
-    while long_px / reduced > _LONGEST_PX:
+    while long_px / reduced > _LIMITS.longest_px:
         reduced *= 2
     if reduced > 1:
         size = (light.shape[1] // reduced, light.shape[0] // reduced)
@@ -242,8 +269,8 @@ def _spectra(
         light = np.asarray(
             cv2.resize(light[: size[1] * reduced, : size[0] * reduced], size, interpolation=cv2.INTER_AREA)
         )
-    tile = _SMALLEST_TILE_PX
-    while tile < _TILE_BLURS * long_px / reduced:
+    tile = _LIMITS.smallest_tile_px
+    while tile < _LIMITS.tile_blurs * long_px / reduced:
         tile *= 2
     height, width = light.shape
     if min(height, width) < tile:
@@ -254,18 +281,18 @@ def _spectra(
     middles = [(start + tile / 2) * reduced for start in (top, left)]
     vectors = chords.at(*middles).reshape(-1, 2) / reduced
     extent = np.hypot(vectors[:, 0], vectors[:, 1])
-    usable = (extent >= _SHORTEST_PX) & (extent * FACTORS[-1] < 0.5 * tile)
-    usable &= (windows > 0.97).mean(axis=(1, 2)) < _MOST_CLIPPED
+    usable = (extent >= _LIMITS.shortest_px) & (extent * FACTORS[-1] < 0.5 * tile)
+    usable &= (windows > 0.97).mean(axis=(1, 2)) < _LIMITS.most_clipped
     spread = windows.std(axis=(1, 2))
-    usable &= spread > _LEAST_CONTRAST
-    if usable.sum() < _FEWEST_TILES:
+    usable &= spread > _LIMITS.least_contrast
+    if usable.sum() < _LIMITS.fewest_tiles:
         return None
     tiles = windows[usable]
     window = np.hanning(tile).astype(np.float32)
     tiles = (tiles - tiles.mean(axis=(1, 2), keepdims=True)) * (window[:, None] * window)
     power = np.abs(rfft2(tiles)) ** 2
     paths = path.at(*middles).reshape(len(vectors), -1, 2)[usable] / reduced
-    return np.asarray(np.log(power + _FLOOR * tile**2)), vectors[usable], paths
+    return np.asarray(np.log(power + _LIMITS.floor * tile**2)), vectors[usable], paths
 
 
 def _weights(logarithm: Float32Array) -> Array:
@@ -277,9 +304,11 @@ def _weights(logarithm: Float32Array) -> Array:
     """
     tile = logarithm.shape[1]
     radius = np.hypot(np.fft.rfftfreq(tile), np.fft.fftfreq(tile)[:, None])
-    power = logarithm[:, (radius > _BAND[0]) & (radius < _BAND[1])].mean(axis=1, dtype=np.float64)
-    above = np.exp(np.minimum(power - np.quantile(power, _QUIET), 50.0))
-    weight = above**_STEEP / (above**_STEEP + _ABOVE_QUIET**_STEEP)
+    power = logarithm[:, (radius > _LIMITS.band_per_px[0]) & (radius < _LIMITS.band_per_px[1])].mean(
+        axis=1, dtype=np.float64
+    )
+    above = np.exp(np.minimum(power - np.quantile(power, _LIMITS.quiet_share), 50.0))
+    weight = above**_LIMITS.steepness / (above**_LIMITS.steepness + _LIMITS.above_quiet**_LIMITS.steepness)
     return np.asarray(weight * (weight.sum() / (weight @ weight)))
 
 
@@ -287,7 +316,7 @@ def _light(image: UInt8Array | UInt16Array) -> Float32Array:
     """(H, W) roughly linear light, 0 to 1."""
     import cv2
 
-    grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    grey = to_grey(image)
     codes = np.iinfo(grey.dtype).max
     if grey.dtype == np.uint8:
         return np.asarray(cv2.LUT(grey, ((np.arange(256) / 255) ** 2.2).astype(np.float32)))
@@ -304,16 +333,16 @@ def _falls(logarithm: Float32Array, vectors: Array, path_px: Array) -> tuple[Arr
     """(N,) sums over the frequencies of each tile: its fall times the expected one, and the expected one squared; and
     both of the means over frequencies."""
     tile = logarithm.shape[1]
-    reach = int(_BAND[1] * tile) + 2
+    reach = int(_LIMITS.band_per_px[1] * tile) + 2
     x, y = np.arange(reach - 1) / tile, np.arange(2 - reach, reach - 1)[:, None] / tile
     radius = np.hypot(x, y)
-    band = (radius > _BAND[0]) & (radius < _BAND[1])
+    band = (radius > _LIMITS.band_per_px[0]) & (radius < _LIMITS.band_per_px[1])
     passed = _leaked(_transfer(path_px, np.arange(-1, reach) / tile, np.arange(1 - reach, reach) / tile))[:, band]
     power = logarithm[:, np.arange(2 - reach, reach - 1) % tile, : reach - 1][:, band].astype(np.float64)
     every = np.hypot(np.fft.rfftfreq(tile), np.fft.fftfreq(tile)[:, None])
-    noise = np.exp(logarithm[:, (every > _NOISE_BAND[0]) & (every < _NOISE_BAND[1])].astype(np.float64)).mean(1)[
-        :, None
-    ]
+    noise = np.exp(
+        logarithm[:, (every > _LIMITS.noise_band_per_px[0]) & (every < _LIMITS.noise_band_per_px[1])].astype(np.float64)
+    ).mean(1)[:, None]
     turn = np.stack([np.broadcast_to(along, radius.shape)[band] for along in (x, y)]) / radius[band]
     across = np.abs(vectors @ turn) < np.sin(np.pi / 6) * np.hypot(vectors[:, 0], vectors[:, 1])[:, None]
     # the same at all frequencies of one distance from the origin
@@ -322,10 +351,12 @@ def _falls(logarithm: Float32Array, vectors: Array, path_px: Array) -> tuple[Arr
     count = across @ at_ring
     level, left = ((((values * across) @ at_ring) / np.maximum(count, 1))[:, ring] for values in (power, passed))
     rise = radius[band] ** 2
-    above = (((np.exp(power) - noise) * rise) * across).sum(1) - _SCATTER * noise[:, 0] * np.sqrt(across @ rise**2)
+    above = (((np.exp(power) - noise) * rise) * across).sum(1) - _LIMITS.scatter * noise[:, 0] * np.sqrt(
+        across @ rise**2
+    )
     picture = np.maximum(above / (passed * across).sum(1), 0)[:, None] / rise
     counts = ~across & (count[:, ring] > 0)
-    expected = np.maximum(np.log((picture * passed + noise) / (picture * left + noise)), _DEEPEST) * counts
+    expected = np.maximum(np.log((picture * passed + noise) / (picture * left + noise)), _LIMITS.deepest_log) * counts
     seen = (power - level) * counts
     frequencies = np.maximum(counts.sum(1), 1)
     return (
@@ -357,7 +388,7 @@ def _cepstra(logarithm: Float32Array) -> Float32Array:
     from scipy.fft import irfft2
 
     tile = logarithm.shape[1]
-    smooth = np.exp(-2 * (np.pi * _SMOOTHING_PX * np.fft.fftfreq(tile)) ** 2).astype(np.float32)
+    smooth = np.exp(-2 * (np.pi * _LIMITS.smoothing_px * np.fft.fftfreq(tile)) ** 2).astype(np.float32)
     return np.asarray(irfft2(logarithm * smooth[:, None] * smooth[: tile // 2 + 1], s=(tile, tile)))
 
 
@@ -367,11 +398,11 @@ def _dips(vectors: Array, path_px: Array, tile: int) -> Array:
     Both ends of a path make the zeros of its spectrum. Where it is curved, they bend, and the dip moves and widens.
     """
     bend = path_px - path_px.mean(axis=1, keepdims=True) - middles(path_px.shape[1])[:, None] * vectors[:, None]
-    curved = np.flatnonzero(np.hypot(bend[..., 0], bend[..., 1]).max(axis=1) > _CURVED_PX)
+    curved = np.flatnonzero(np.hypot(bend[..., 0], bend[..., 1]).max(axis=1) > _LIMITS.curved_px)
     out = vectors.copy()
     if len(curved):
         power = _transfer(path_px[curved], np.asarray(np.fft.rfftfreq(tile)), np.asarray(np.fft.fftfreq(tile)))
-        cepstra = _cepstra(np.log(power + np.exp(2 * _DEEPEST)).astype(np.float32))
+        cepstra = _cepstra(np.log(power + np.exp(2 * _LIMITS.deepest_log)).astype(np.float32))
         depth = _at_lags(cepstra, vectors[curved], _BENT_RAD, _BENT_FACTORS).reshape(len(curved), -1)
         factor, turn = np.unravel_index(depth.argmin(axis=1), (len(_BENT_FACTORS), len(_BENT_RAD)))
         cosine, sine = np.cos(_BENT_RAD[turn]), np.sin(_BENT_RAD[turn])

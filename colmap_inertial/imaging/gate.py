@@ -22,6 +22,7 @@ from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence, shown_
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.imaging.path_filters import path_wiener
 from colmap_inertial.imaging.psf import PredictedBlur
+from colmap_inertial.imaging.tracking import to_grey
 
 Code = TypeVar("Code", np.uint8, np.uint16)
 Action = Literal["keep", "deblur", "drop"]
@@ -212,24 +213,36 @@ def deblur_gated(
     return GatedFrame(image=out, deblurred=True, kept_share=kept, extent_factor=factor, reason=reason)
 
 
-#: An extent is corrected where it is further off than small blur lets the dip drift, as a share and in px, and where
-#: the dip is this clear.
-_CORRECTED_FROM, _DRIFT_PX, _CLEAR_SUPPORT = 0.1, 1.2, 7.0
-#: Blur this long must show in a frame with texture.
-MUST_SHOW_PX = 8.0
-#: A blur that is known no better than this, as a share of its length, is left alone: a filter along a line that is off
-#: by a third or 20 degrees loses what it wins.
-MOST_UNSURE = 0.25
-#: A frame that shows less of the fall that its blur predicts is not blurred so. Blurred ones show .7 of it, the fewest
-#: .2 (textures with a direction of their own), sharp ones .05 +- .1.
-LEAST_SHARE = 0.25
-#: Sharp textures with a direction of their own show up to this, but no dip: in doubt, longer blur must show one.
-_CLEAR_SHARE = 0.5
-#: Standard deviations by which all frames together must show short blur: of wrong gyroscopes, none reached three.
-_TOGETHER_SUPPORT = 4.5
-#: From so many on, a frame has a vote whether it is rather the gyroscope's direction, or the mirrored one.
-_VOTE = 2.5
-_FEWEST_FRAMES = 3
+@dataclass(frozen=True, kw_only=True)
+class GateLimits:
+    """What the gate decides by, beside the options."""
+
+    #: An extent is corrected where it is off by a larger share,
+    corrected_from: float = 0.1
+    #: and by more than the dip of small blur drifts,
+    drift_px: float = 1.2
+    #: and where the dip is this clear (standard deviations).
+    clear_support: float = 7.0
+    #: Blur this long must show in a frame with texture.
+    must_show_px: float = 8.0
+    #: Blur that is known no better than this, as a share of its length, is left alone: a filter along a line that is
+    #: off by a third or 20 degrees loses what it wins.
+    most_unsure: float = 0.25
+    #: A frame that shows less of the fall that its blur predicts is not blurred so. Blurred ones show .7 of it, the
+    #: fewest .2 (textures with a direction of their own), sharp ones .05 +- .1.
+    least_share: float = 0.25
+    #: Sharp textures with a direction of their own show up to this, but no dip: in doubt, longer blur must show one.
+    clear_share: float = 0.5
+    #: Standard deviations by which all frames together must show short blur: of wrong gyroscopes, none reached three.
+    together_support: float = 4.5
+    #: From so many standard deviations on, a frame has a vote whether it is rather the gyroscope's direction, or the
+    #: mirrored one.
+    vote_support: float = 2.5
+    #: Fewer frames do not tell whether the gyroscope is right.
+    fewest_frames: int = 3
+
+
+GATE_LIMITS = GateLimits()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -289,7 +302,7 @@ def _judged(evidence: Sequence[BlurEvidence], options: GateOptions) -> Recording
     median = float(np.median(supports)) if supports else 0.0
     together = sum(telling, BlurEvidence.nothing())
     factor = _mended(together)
-    if len(telling) < _FEWEST_FRAMES:
+    if len(telling) < GATE_LIMITS.fewest_frames:
         trusted, reason = None, f"{len(telling)} frames are too few to check the gyroscope against the images"
     elif median < options.min_recording_support and not _clear_together(telling, together):
         trusted = False
@@ -308,21 +321,26 @@ def _judged(evidence: Sequence[BlurEvidence], options: GateOptions) -> Recording
 
 def _clear_together(telling: Sequence[BlurEvidence], together: BlurEvidence) -> bool:
     """Whether many frames, of which none says much, bear the gyroscope out, and no flipped axis."""
-    if together.support - max(0.0, together.mirrored_support) < _TOGETHER_SUPPORT or not together.extent_is_plausible:
+    if (
+        together.support - max(0.0, together.mirrored_support) < GATE_LIMITS.together_support
+        or not together.extent_is_plausible
+    ):
         return False
     votes = [
-        one.support - one.mirrored_support for one in telling if one.support >= _VOTE or one.mirrored_support >= _VOTE
+        one.support - one.mirrored_support
+        for one in telling
+        if one.support >= GATE_LIMITS.vote_support or one.mirrored_support >= GATE_LIMITS.vote_support
     ]
     against = sum(vote < -1 for vote in votes)
-    return len(votes) - against >= max(_FEWEST_FRAMES, 3 * against)
+    return len(votes) - against >= max(GATE_LIMITS.fewest_frames, 3 * against)
 
 
 def _mended(evidence: BlurEvidence) -> float:
     """The factor that the extents need."""
     factor = evidence.extent_factor
-    clear = evidence.support >= _CLEAR_SUPPORT and evidence.extent_is_plausible
+    clear = evidence.support >= GATE_LIMITS.clear_support and evidence.extent_is_plausible
     mean_px = evidence.extent_px / max(evidence.tiles, 1)
-    drift = max(_CORRECTED_FROM, _DRIFT_PX / mean_px if mean_px > 0 else 0.0)
+    drift = max(GATE_LIMITS.corrected_from, GATE_LIMITS.drift_px / mean_px if mean_px > 0 else 0.0)
     return factor if clear and abs(factor - 1) > drift else 1.0
 
 
@@ -344,18 +362,18 @@ def judge_frame(
     if recording is not None and recording.trusted is False:
         return None, recording.reason
     unsure = blur.unsure_share()
-    if unsure > MOST_UNSURE:
+    if unsure > GATE_LIMITS.most_unsure:
         return None, f"noise and calibration of the gyroscope leave {unsure:.0%} of the blur's length uncertain"
     curve = BlurPath.straight(blur) if path is None else path
     if recording is not None and recording.trusted:
         share = shown_share(image, curve.times(recording.extent_factor))
-        if share is not None and share < LEAST_SHARE:
+        if share is not None and share < GATE_LIMITS.least_share:
             return (
                 None,
                 "the image has as much detail along the predicted blur as across it, though other frames lack it",
             )
         # a flat spectrum predicts no fall, and so tells none
-        if (share is None or share < _CLEAR_SHARE) and _no_dip(image, curve, options):
+        if (share is None or share < GATE_LIMITS.clear_share) and _no_dip(image, curve, options):
             return None, "the image does not show the blur that the gyroscope predicts, though other frames do"
         return recording.extent_factor, recording.reason
     evidence = blur_evidence(image, curve)
@@ -372,17 +390,31 @@ def judge_frame(
 
 def _no_dip(image: NDArray[Code], curve: BlurPath, options: GateOptions) -> bool:
     """Whether blur that is long enough to show a dip shows none."""
-    if float(np.percentile(curve.field().extent_px(), 90)) < MUST_SHOW_PX:
+    if float(np.percentile(curve.field().extent_px(), 90)) < GATE_LIMITS.must_show_px:
         return False
     evidence = blur_evidence(image, curve)
     return evidence.enough and _support(evidence) < options.min_recording_support
 
 
-#: Side of the blocks that keep or give up their pixels together; a step smeared over L rises by no more than a quarter
-#: of its height within L / 4: at about twice that, the original fades in.
-_BLOCK_PX, _SPAN, _FADE_FROM, _FADE_TO = 32, 0.25, 1.8, 2.6
-#: Least brightness range of a block, of full scale: below, there is nothing to lose. Shorter blur cannot be told.
-_LEAST_RANGE, _SHORTEST_PX = 0.06, 5.0
+@dataclass(frozen=True, kw_only=True)
+class SharpBlockLimits:
+    """Which blocks of a deblurred frame keep their original pixels (:func:`keep_sharp`)."""
+
+    #: Side of the blocks that keep or give up their pixels together.
+    block_px: int = 32
+    #: Share of the blur length over which brightness is compared.
+    span: float = 0.25
+    #: A step smeared over L rises by no more than a quarter of its height within L / 4: from this many times that on,
+    fade_from: float = 1.8
+    #: the original fades in, up to this many times.
+    fade_to: float = 2.6
+    #: Least brightness range of a block, of full scale: below, there is nothing to lose.
+    least_range: float = 0.06
+    #: Shorter blur cannot be told.
+    shortest_px: float = 5.0
+
+
+_SHARP = SharpBlockLimits()
 
 
 def keep_sharp(image: NDArray[Code], deblurred: NDArray[Code], blur: BlurField) -> tuple[NDArray[Code], float]:
@@ -399,11 +431,10 @@ def keep_sharp(image: NDArray[Code], deblurred: NDArray[Code], blur: BlurField) 
     import cv2
 
     height, width = image.shape[:2]
-    rows, columns = -(-height // _BLOCK_PX), -(-width // _BLOCK_PX)
+    rows, columns = -(-height // _SHARP.block_px), -(-width // _SHARP.block_px)
     # judged at half the size: a quarter of the cost, and of the noise
     size = (max(1, width // 2), max(1, height // 2))
-    codes = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    small = cv2.resize(codes, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    small = cv2.resize(to_grey(image), size, interpolation=cv2.INTER_AREA).astype(np.float32)
     grey: Float32Array = np.asarray(cv2.GaussianBlur(small, (0, 0), 0.5) / np.float32(np.iinfo(image.dtype).max))
     nearest = [
         np.minimum(np.rint(np.arange(n) * 2 / blur.step_px).astype(np.intp), nodes - 1)
@@ -411,13 +442,13 @@ def keep_sharp(image: NDArray[Code], deblurred: NDArray[Code], blur: BlurField) 
     ]
     along_x, along_y = (0.5 * blur.vector_px[..., i][nearest[0]][:, nearest[1]] for i in (0, 1))
     x, y = np.arange(size[0], dtype=np.float32), np.arange(size[1], dtype=np.float32)[:, None]
-    half = 0.5 * _SPAN
+    half = 0.5 * _SHARP.span
     ends = [
         cv2.remap(grey, x + s * along_x, y + s * along_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
         for s in (half, -half)
     ]
     change = np.asarray(np.abs(ends[0] - ends[1]), dtype=np.float32)
-    side = _BLOCK_PX // 2
+    side = _SHARP.block_px // 2
 
     def blocks(values: Float32Array, pick: Callable[..., Float32Array]) -> Float32Array:
         padded = cv2.copyMakeBorder(values, 0, rows * side - size[1], 0, columns * side - size[0], cv2.BORDER_REPLICATE)
@@ -427,17 +458,17 @@ def keep_sharp(image: NDArray[Code], deblurred: NDArray[Code], blur: BlurField) 
     around = np.ones((3, 3), np.uint8)
     span = cv2.dilate(blocks(grey, np.max), around) - cv2.erode(blocks(grey, np.min), around)
     length = 2 * np.hypot(blocks(np.abs(along_x), np.max), blocks(np.abs(along_y), np.max))
-    q = blocks(change, np.max) / (_SPAN * np.maximum(span, _LEAST_RANGE))
-    keep = np.clip((q - _FADE_FROM) / (_FADE_TO - _FADE_FROM), 0, 1)
-    keep[(span < _LEAST_RANGE) | (length < _SHORTEST_PX)] = 0
+    q = blocks(change, np.max) / (_SHARP.span * np.maximum(span, _SHARP.least_range))
+    keep = np.clip((q - _SHARP.fade_from) / (_SHARP.fade_to - _SHARP.fade_from), 0, 1)
+    keep[(span < _SHARP.least_range) | (length < _SHARP.shortest_px)] = 0
     share = float(keep.mean())
     if share == 0:
         return deblurred, 0.0
-    whole = (columns * _BLOCK_PX, rows * _BLOCK_PX)
+    whole = (columns * _SHARP.block_px, rows * _SHARP.block_px)
     weight = cv2.resize(keep.astype(np.float32), whole, interpolation=cv2.INTER_LINEAR)[:height, :width]
     out = deblurred.copy()
-    for top in range(0, height, _BLOCK_PX):
-        band = slice(top, top + _BLOCK_PX)
+    for top in range(0, height, _SHARP.block_px):
+        band = slice(top, top + _SHARP.block_px)
         if weight[band].any():
             part = weight[band] if image.ndim == 2 else weight[band, :, None]
             out[band] = np.rint(deblurred[band] + part * (image[band].astype(np.float32) - deblurred[band]))

@@ -17,14 +17,24 @@ from colmap_inertial.core.types import Projector
 from colmap_inertial.imaging._bilinear import between_nodes
 from colmap_inertial.imaging.blur_field import BlurField
 
-#: Spacing of the nodes, as a share of the longer side: depths between a few hundred points tell no more.
-_STEP_SHARE = 1 / 24
-#: Points from which the depth at a node is averaged; with fewer in all, depths are not known.
-_NEIGHBOURS, _FEWEST = 6, 12
-#: Points beyond the border count, too, up to this share of the sides.
-_BEYOND = 0.1
-#: Depths below this share of the median one are of points that the camera is about to pass, or wrong.
-_NEAREST_SHARE = 0.1
+
+@dataclass(frozen=True, kw_only=True)
+class ParallaxLimits:
+    """How depths are spread over an image."""
+
+    #: Spacing of the nodes, as a share of the longer side: depths between a few hundred points tell no more.
+    step_share: float = 1 / 24
+    #: Points from which the depth at a node is averaged;
+    neighbours: int = 6
+    #: with fewer in all, depths are not known.
+    fewest: int = 12
+    #: Points beyond the border count, too, up to this share of the sides.
+    beyond: float = 0.1
+    #: Depths below this share of the median one are of points that the camera is about to pass, or wrong.
+    nearest_share: float = 0.1
+
+
+_LIMITS = ParallaxLimits()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -108,22 +118,22 @@ def parallax_from_points(
 
     points = np.asarray(points_in_cam, dtype=np.float64)
     ahead = points[:, 2] > 0
-    if ahead.sum() < _FEWEST:
+    if ahead.sum() < _LIMITS.fewest:
         return None
     points = points[ahead]
-    points = points[points[:, 2] > _NEAREST_SHARE * np.median(points[:, 2])]
+    points = points[points[:, 2] > _LIMITS.nearest_share * np.median(points[:, 2])]
     xy = np.asarray(camera.img_from_cam(points))
-    margin = _BEYOND * np.array([width, height])
+    margin = _LIMITS.beyond * np.array([width, height])
     seen = (
         np.isfinite(xy).all(axis=1) & (xy > -margin).all(axis=1) & (xy < np.array([width, height]) + margin).all(axis=1)
     )
-    if seen.sum() < _FEWEST:
+    if seen.sum() < _LIMITS.fewest:
         return None
     xy, inverse = xy[seen], 1 / points[seen, 2]
-    step_px = max(1, round(_STEP_SHARE * max(width, height)))
+    step_px = max(1, round(_LIMITS.step_share * max(width, height)))
     rows, columns = BlurField.nodes(width, height, step_px)
     nodes = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2) * step_px + 0.5
-    found: Any = cKDTree(xy).query(nodes, k=_NEIGHBOURS)
+    found: Any = cKDTree(xy).query(nodes, k=_LIMITS.neighbours)
     away, nearest = found
     weight = 1 / (away**2 + (0.5 * step_px) ** 2)
     smooth = (weight * inverse[nearest]).sum(axis=1) / weight.sum(axis=1)

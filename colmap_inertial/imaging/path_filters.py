@@ -16,24 +16,43 @@ from numpy.typing import NDArray
 
 from colmap_inertial.core.arrays import AnyArray, Array, Float32Array
 from colmap_inertial.imaging._cells import Cells
-from colmap_inertial.imaging._tiles import SHORTEST_SIDE, Tiling
+from colmap_inertial.imaging._tiles import TILING, Tiling
 from colmap_inertial.imaging.blur_path import BlurPath
 from colmap_inertial.imaging.transfer import ENCODE_STEPS, decode_table, encode_table, srgb_from_linear
 from colmap_inertial.imaging.wiener import LONGEST_PX, DeblurOptions, saturated_code
 
 Code = TypeVar("Code", np.uint8, np.uint16)
 
-#: Noise counts so many times: for JPEG's errors, and for paths that change within a tile.
-NOISE_FACTOR = 8.0
-#: Cycles per pixel below which the spectrum of natural images, 1 / f^2, is flat, and between which it is fitted.
-FLAT_BELOW, FITTED = 0.01, (0.02, 0.3)
-#: Least share of the noise that a tile's spectrum has at one cycle per pixel, and least noise, of full scale.
-LEAST_SIGNAL, LEAST_NOISE = 0.002, 1e-3
-#: Frequencies at which a tile shows its noise: this high, and left with no more than this share by the blur. So many
-#: must do so. Of many tiles, about so many of the shortest side are looked at; of longer ones, which show more, fewer.
-NOISE_ABOVE, NOISE_SHARE, _NOISE_COUNT, _NOISE_TILES = 0.2, 0.08, 200, 20
-#: Weight of the data against gradients to the power 2/3 where noise is 1 % of full scale; those of the splitting.
-DATA_WEIGHT, SPLITTING = 1000.0, (8.0, 32.0, 128.0)
+
+@dataclass(frozen=True, kw_only=True)
+class PathFilterModel:
+    """What the filters along paths assume of pictures and their noise."""
+
+    #: Noise counts so many times: for JPEG's errors, and for paths that change within a tile.
+    noise_factor: float = 8.0
+    #: Cycles per pixel below which the spectrum of natural images, 1 / f^2, is flat,
+    flat_below_per_px: float = 0.01
+    #: and between which it is fitted.
+    fitted_per_px: tuple[float, float] = (0.02, 0.3)
+    #: Least share of the noise that a tile's spectrum has at one cycle per pixel.
+    least_signal: float = 0.002
+    #: Least noise, of full scale.
+    least_noise: float = 1e-3
+    #: A tile shows its noise at frequencies above this,
+    noise_above_per_px: float = 0.2
+    #: of which the blur leaves no more than this share;
+    noise_share: float = 0.08
+    #: so many must do so.
+    noise_count: int = 200
+    #: Of many tiles, about so many of the shortest side are looked at; of longer ones, which show more, fewer.
+    noise_tiles: int = 20
+    #: Weight of the data against gradients to the power 2/3 where noise is 1 % of full scale.
+    data_weight: float = 1000.0
+    #: Weights of the splitting, one for each round.
+    splitting: tuple[float, ...] = (8.0, 32.0, 128.0)
+
+
+FILTER_MODEL = PathFilterModel()
 
 
 def path_wiener(image: NDArray[Code], path: BlurPath, options: DeblurOptions | None = None) -> NDArray[Code]:
@@ -57,8 +76,8 @@ def path_wiener(image: NDArray[Code], path: BlurPath, options: DeblurOptions | N
     -----
     In linear light, in tiles of 256 px or more that overlap: ``W = conj(K) S / (|K|^2 S + c n)``, K the mean of
     ``exp(2 pi i f q)`` over the path q in the middle of the tile, ``S = A / (f^2 + .01^2)`` the spectrum of natural
-    images, A fitted to the tile, n the variance of the noise at the tile's light, `NOISE_FACTOR` times. Compiled;
-    other Python threads go on while it runs. The plain version is `tests/references/path_filters.py`.
+    images, A fitted to the tile, n the variance of the noise at the tile's light, c `PathFilterModel.noise_factor`.
+    Compiled; other Python threads go on while it runs. The plain version is `tests/references/path_filters.py`.
 
     Raises
     ------
@@ -73,9 +92,9 @@ def half_quadratic(image: NDArray[Code], path: BlurPath, options: DeblurOptions 
 
     Wiener's result is the first guess. In turn, what its gradients w should be is found by minimising
     ``|w|^(2/3) + b / 2 (w - gradient)^2``, and the picture that has these gradients and, blurred, is the one seen;
-    b grows (`SPLITTING`).
+    b grows (`FILTER_MODEL.splitting`).
     """
-    return _filtered(image, path, options or DeblurOptions(), SPLITTING)
+    return _filtered(image, path, options or DeblurOptions(), FILTER_MODEL.splitting)
 
 
 def smoothed(image: NDArray[Code], sigma_px: float) -> NDArray[Code]:
@@ -101,7 +120,7 @@ class Noise:
     def fitted(cls, found: Array) -> Noise:
         """To the light and the variance of (N, 2) tiles, some of which show more than noise: by least distances."""
         if not len(found):
-            return cls(LEAST_NOISE**2, 0.0)
+            return cls(FILTER_MODEL.least_noise**2, 0.0)
         light, variance = found.T
         weight = np.ones(len(found))
         dark, by_light = 0.0, 0.0
@@ -128,13 +147,19 @@ def noise_along(light: Float32Array, tiling: Tiling, paths: Float32Array, thread
         window_in=tiling.window_in(),
         hop=tiling.hop,
         before=tiling.before,
-        above=NOISE_ABOVE,
-        share=NOISE_SHARE,
-        every=max(1, round((tiling.count[0] * tiling.count[1] * tiling.side / SHORTEST_SIDE / _NOISE_TILES) ** 0.5)),
+        above=FILTER_MODEL.noise_above_per_px,
+        share=FILTER_MODEL.noise_share,
+        every=max(
+            1,
+            round(
+                (tiling.count[0] * tiling.count[1] * tiling.side / TILING.shortest_side_px / FILTER_MODEL.noise_tiles)
+                ** 0.5
+            ),
+        ),
         threads=threads,
     )
     channels = np.reshape(found, (light.shape[2], -1, 3))
-    return tuple(Noise.fitted(tiles[tiles[:, 2] >= _NOISE_COUNT, :2]) for tiles in channels)
+    return tuple(Noise.fitted(tiles[tiles[:, 2] >= FILTER_MODEL.noise_count, :2]) for tiles in channels)
 
 
 def filter_along(
@@ -162,13 +187,13 @@ def filter_along(
         hop=tiling.hop,
         before=tiling.before,
         noise=np.array([[n.dark, n.by_light] for n in noise], dtype=np.float32),
-        least_noise=LEAST_NOISE,
-        noise_factor=NOISE_FACTOR,
-        flat_below=FLAT_BELOW,
-        fitted_from=FITTED[0],
-        fitted_to=FITTED[1],
-        least_signal=LEAST_SIGNAL,
-        data_weight=DATA_WEIGHT,
+        least_noise=FILTER_MODEL.least_noise,
+        noise_factor=FILTER_MODEL.noise_factor,
+        flat_below=FILTER_MODEL.flat_below_per_px,
+        fitted_from=FILTER_MODEL.fitted_per_px[0],
+        fitted_to=FILTER_MODEL.fitted_per_px[1],
+        least_signal=FILTER_MODEL.least_signal,
+        data_weight=FILTER_MODEL.data_weight,
         splitting=np.array(splitting, dtype=np.float32),
         threads=threads,
         instruction_set=instruction_set,

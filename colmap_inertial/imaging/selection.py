@@ -17,17 +17,34 @@ import numpy as np
 from colmap_inertial.core.arrays import Array, Int64Array, UInt8Array
 from colmap_inertial.core.geometry import skew, so3_exp
 from colmap_inertial.core.types import Projector
+from colmap_inertial.imaging.rolling_shutter import with_unit_depth
+from colmap_inertial.imaging.tracking import reduce_image, track_points
 
 #: Why a window was closed. start: the first frames; still: it lasted, and nothing moved; end: the last frames.
 Closing = Literal["start", "baseline", "motion", "interval", "still", "end"]
 #: By what the frames of a window were ranked: the blur or angular speed that the gyroscope predicts, or the image.
 Ranking = Literal["blur", "speed", "sharpness"]
 
-#: Images are followed at this size; so many corners, and how far from there and back they may end, px of it.
-_FOLLOWED_PX, _CORNERS, _ROUND_TRIP_PX = 480, 200, 0.7
-#: New corners are looked for when fewer than this share are left; fewer corners than this tell nothing.
-_REFILL, _FEWEST = 0.7, 12
-_ROUNDS = 6
+
+@dataclass(frozen=True, kw_only=True)
+class FollowerLimits:
+    """How corners are followed from image to image."""
+
+    #: Images are followed at this size.
+    followed_px: int = 480
+    #: Corners that are followed;
+    corners: int = 200
+    #: how far from there and back they may end, px of the reduced image.
+    round_trip_px: float = 0.7
+    #: New corners are looked for when fewer than this share are left;
+    refill_share: float = 0.7
+    #: fewer corners than this tell nothing.
+    fewest: int = 12
+    #: Rounds of reweighted least squares for a rotation.
+    rotation_rounds: int = 6
+
+
+_LIMITS = FollowerLimits()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -221,41 +238,30 @@ class _Follower:
         import cv2
 
         sharpness = float(np.mean(np.square(cv2.Laplacian(image, cv2.CV_32F))))
-        scale = _FOLLOWED_PX / max(image.shape)
-        now = image
-        if scale < 1:
-            size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
-            now = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        now = reduce_image(image, _LIMITS.followed_px)
         if self._before is not None and self._before.shape != now.shape:
             self._xy, self._ids = self._xy[:0], self._ids[:0]
         elif self._before is not None and len(self._xy):
             self._follow(self._before, now)
-        if len(self._xy) < _REFILL * _CORNERS:
+        if len(self._xy) < _LIMITS.refill_share * _LIMITS.corners:
             self._refill(now)
         self._before = now
         xy = (self._xy.astype(np.float64) + 0.5) / max(now.shape)
         return _Seen(place, self._ids.copy(), xy, sharpness)
 
     def _follow(self, before: UInt8Array, now: UInt8Array) -> None:
-        import cv2
-
-        points = self._xy.reshape(-1, 1, 2)
-        there, ok_there, _ = cv2.calcOpticalFlowPyrLK(before, now, points, None, winSize=(15, 15), maxLevel=4)
-        back, ok_back, _ = cv2.calcOpticalFlowPyrLK(now, before, there, None, winSize=(15, 15), maxLevel=4)
-        off = np.linalg.norm((back - points).reshape(-1, 2), axis=1)
-        xy = there.reshape(-1, 2)
-        inside = ((xy >= 0) & (xy <= np.array(now.shape[::-1]) - 1)).all(axis=1)
-        good = (ok_there.ravel() == 1) & (ok_back.ravel() == 1) & (off < _ROUND_TRIP_PX) & inside
-        self._xy, self._ids = np.asarray(xy[good], np.float32), self._ids[good]
+        xy, tracked = track_points(before, now, self._xy, window_px=15, round_trip_px=_LIMITS.round_trip_px)
+        good = tracked & ((xy >= 0) & (xy <= np.array(now.shape[::-1]) - 1)).all(axis=1)
+        self._xy, self._ids = xy[good], self._ids[good]
 
     def _refill(self, now: UInt8Array) -> None:
         import cv2
 
-        distance = max(4.0, 0.5 * float(np.sqrt(now.size / _CORNERS)))
+        distance = max(4.0, 0.5 * float(np.sqrt(now.size / _LIMITS.corners)))
         free = np.full(now.shape, 255, np.uint8)
         for x, y in np.rint(self._xy).astype(int).tolist():
             cv2.circle(free, (x, y), int(distance), 0, -1)
-        wanted = _CORNERS - len(self._xy)
+        wanted = _LIMITS.corners - len(self._xy)
         corners = cv2.goodFeaturesToTrack(now, wanted, 0.01, distance, mask=free)
         if corners is None:
             return
@@ -275,20 +281,20 @@ class _Compare:
 
     def __call__(self, before: _Seen, now: _Seen) -> tuple[float, float, float]:
         """Baseline, motion (NaN where an image shows too few corners) and share of corners that stayed."""
-        if len(before.ids) < _FEWEST:
+        if len(before.ids) < _LIMITS.fewest:
             return np.nan, np.nan, 1.0
         _, i, j = np.intersect1d(before.ids, now.ids, assume_unique=True, return_indices=True)
         overlap = len(i) / len(before.ids)
-        if len(i) < _FEWEST:
+        if len(i) < _LIMITS.fewest:
             return np.nan, np.nan, overlap
         motion = float(np.median(np.linalg.norm(now.xy[j] - before.xy[i], axis=1)))
         rays = [
             np.asarray(self._camera.cam_from_img(s[k] * self._long_px))[:, :2] for s, k in ((before.xy, i), (now.xy, j))
         ]
         known = np.isfinite(rays[0]).all(axis=1) & np.isfinite(rays[1]).all(axis=1)
-        if known.sum() < _FEWEST:
+        if known.sum() < _LIMITS.fewest:
             return np.nan, motion, overlap
-        first, second = (np.concatenate([r[known], np.ones((known.sum(), 1))], axis=1) for r in rays)
+        first, second = (with_unit_depth(r[known]) for r in rays)
         now_from_before = self._start_from_cam[now.place].T @ self._start_from_cam[before.place]
         if not np.isfinite(now_from_before).all():
             now_from_before = _fitted_rotation(first, second)
@@ -300,7 +306,7 @@ def _fitted_rotation(first: Array, second: Array) -> Array:
     """(3, 3) the rotation that takes most rays (N, 3) to where they were seen next, by reweighted least squares."""
     a, b = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (first, second))
     rotation = np.eye(3)
-    for _ in range(_ROUNDS):
+    for _ in range(_LIMITS.rotation_rounds):
         rotated = a @ rotation.T
         residual = b - rotated
         square = np.sum(residual**2, axis=1)

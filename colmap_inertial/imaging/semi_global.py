@@ -13,17 +13,28 @@ from colmap_inertial.core.arrays import Float32Array, Int32Array, UInt8Array, UI
 CENSUS_RADIUS = 2
 #: What a view can cost at most, of either kind.
 MOST = (2 * CENSUS_RADIUS + 1) ** 2 - 1
-#: A pixel that no view sees costs this share of the most: more than a good match, less than a poor one.
-_UNSEEN = 0.25
-#: Penalties for disparities that change by one candidate, and by more, in shares of the most that all views can cost.
-_SMALL, _JUMP = 0.2, 2.0
-#: The jump's penalty is divided by the change of brightness over this many codes: edges of things are where they look
-#: different (Hirschmueller 2008, after equation 12).
-_EDGE_CODES = 8
-#: Bytes of costs and their sums that are held at once; larger images are matched in strips.
-_MEMORY = 512 * 2**20
-#: Rows that strips share with their neighbours on each side.
-_OVERLAP = 48
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatchingLimits:
+    """What semi-global matching weighs, and the memory that it takes."""
+
+    #: A pixel that no view sees costs this share of the most: more than a good match, less than a poor one.
+    unseen: float = 0.25
+    #: Penalty for disparities that change by one candidate, in shares of the most that all views can cost,
+    small: float = 0.2
+    #: and for those that change by more.
+    jump: float = 2.0
+    #: The jump's penalty is divided by the change of brightness over this many codes: edges of things are where they
+    #: look different (Hirschmueller 2008, after equation 12).
+    edge_codes: int = 8
+    #: Costs and their sums that are held at once; larger images are matched in strips.
+    memory_bytes: int = 512 * 2**20
+    #: Rows that strips share with their neighbours on each side.
+    overlap_rows: int = 48
+
+
+MATCHING = MatchingLimits()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -74,8 +85,8 @@ class Views:
 def jump_table(views: int) -> tuple[int, UInt16Array]:
     """The small penalty, and (256,) that of a jump by the change of the reference's code."""
     most = MOST * _counted(views)
-    small = round(_SMALL * most)
-    jump = _JUMP * most / np.maximum(1, np.arange(256) / _EDGE_CODES)
+    small = round(MATCHING.small * most)
+    jump = MATCHING.jump * most / np.maximum(1, np.arange(256) / MATCHING.edge_codes)
     return small, np.maximum(small + 1, np.floor(jump)).astype(np.uint16)
 
 
@@ -125,7 +136,7 @@ def match_candidates(
             rows=np.ascontiguousarray(rows[:, :, first:last]),
             cost=cost,
             share=shares(count),
-            unseen=round(_UNSEEN * MOST * _counted(count)),
+            unseen=round(MATCHING.unseen * MOST * _counted(count)),
             radius=CENSUS_RADIUS,
             least=views.least,
             tables=views.tables,
@@ -148,11 +159,12 @@ def match_candidates(
 
 def strips(height: int, bytes_a_row: int) -> list[tuple[int, int, int, int]]:
     """Rows of the result (begin, end) and rows to work on (first, last) for each strip that fits the memory."""
-    fits = max(1, _MEMORY // bytes_a_row - 2 * _OVERLAP)
-    if height * bytes_a_row <= _MEMORY:
+    fits = max(1, MATCHING.memory_bytes // bytes_a_row - 2 * MATCHING.overlap_rows)
+    if height * bytes_a_row <= MATCHING.memory_bytes:
         fits = height
     count = -(-height // fits)
     edges = [height * i // count for i in range(count + 1)]
     return [
-        (begin, end, max(0, begin - _OVERLAP), min(height, end + _OVERLAP)) for begin, end in itertools.pairwise(edges)
+        (begin, end, max(0, begin - MATCHING.overlap_rows), min(height, end + MATCHING.overlap_rows))
+        for begin, end in itertools.pairwise(edges)
     ]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,6 +27,8 @@ from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.sampling import without_running_mean
 from colmap_inertial.core.types import CameraTrajectory, Frame, FrameTiming, ImuRecording, Projector
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
+from colmap_inertial.imaging.rolling_shutter import with_unit_depth
+from colmap_inertial.imaging.tracking import reduce_image, to_grey, track_points
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,8 +49,35 @@ class FlowOptions:
             raise ValueError("long_side_px must be 64 or more, min_support 8 or more, corners at least min_support")
 
 
-#: Corners of a pair of frames that are kept.
-_MOST_TRACKS = 80
+@dataclass(frozen=True, kw_only=True)
+class FlowLimits:
+    """What decides on rotations from pixels, beside the options."""
+
+    #: Corners of a pair of frames that are kept.
+    most_tracks: int = 80
+    #: Share of the rotation between frames that the gyroscope must explain.
+    least_explained: float = 0.5
+    #: An axis counts where the camera rotated about it by more than this many times the noise.
+    rotated_sigmas: float = 3.0
+    #: Rotation slower than this is what a stabiliser lets pass.
+    quick_s: float = 0.4
+    #: A stabiliser leaves a smaller share of quick rotation.
+    stabilised_share: float = 0.6
+    #: Quick rotation must exceed the noise of pictures by this factor.
+    clear_sigmas: float = 3.0
+    #: Tracks must come back to where they began within this, px of the reduced picture.
+    round_trip_px: float = 0.7
+    #: A track agrees with a rotation within this, px of the reduced picture: so much translation may show.
+    inlier_px: float = 3.0
+    #: Least scatter of tracks, px of the reduced picture.
+    scatter_floor_px: float = 0.05
+    #: Draws of two rays.
+    draws: int = 100
+    #: Rounds of reweighted least squares, at most.
+    most_rounds: int = 15
+
+
+_LIMITS = FlowLimits()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -66,8 +96,17 @@ class Tracks:
     rays: Array
 
 
-#: What a pair of frames shows that shares too little.
-_NO_TRACKS = Tracks(place=np.zeros((0, 2, 2)), rays=np.zeros((0, 2, 2)))
+class _PairRotation(NamedTuple):
+    """Rotation vector of ``earlier_from_later``, its standard deviation, how many tracks agree, and all of them."""
+
+    turn_rad: Array
+    sigma_rad: float
+    support: int
+    tracks: Tracks
+
+
+#: Of a pair of frames that shares too little.
+_UNKNOWN = _PairRotation(np.full(3, np.nan), np.nan, 0, Tracks(place=np.zeros((0, 2, 2)), rays=np.zeros((0, 2, 2))))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -153,30 +192,23 @@ def measure_rotation(
     index = {name: i for i, name in enumerate(timing.names)}
     pose_t_s = timing.pose_t_s()
     names: list[str] = []
-    turns: list[Array] = []
-    sigmas: list[float] = []
-    support: list[int] = []
-    tracks: list[Tracks] = []
+    pairs: list[_PairRotation] = []
     before: tuple[UInt8Array, FrameShutter] | None = None
     for frame in frames:
         height, width = frame.image.shape[:2]
         shutter = FrameShutter.of(timing, index[frame.name], width=width, height=height)
         now = (reduced(frame.image, options), shutter)
         if before is not None:
-            pair = _pair_rotation(before, now, camera, options)
-            turns.append(np.full(3, np.nan) if pair is None else pair[0])
-            sigmas.append(np.nan if pair is None else pair[1])
-            support.append(0 if pair is None else pair[2])
-            tracks.append(_NO_TRACKS if pair is None else pair[3])
+            pairs.append(_pair_rotation(before, now, camera, options))
         names.append(frame.name)
         before = now
     return VisualRotation(
         names=tuple(names),
         t_s=pose_t_s[[index[name] for name in names]],
-        turn_rad=np.array(turns).reshape(-1, 3),
-        sigma_rad=np.array(sigmas),
-        support=np.array(support, dtype=np.intp),
-        tracks=tuple(tracks),
+        turn_rad=np.array([pair.turn_rad for pair in pairs]).reshape(-1, 3),
+        sigma_rad=np.array([pair.sigma_rad for pair in pairs]),
+        support=np.array([pair.support for pair in pairs], dtype=np.intp),
+        tracks=tuple(pair.tracks for pair in pairs),
         epoch_ns=timing.epoch_ns,
     )
 
@@ -196,8 +228,8 @@ class Stabilisation:
         In words.
     """
 
-    share: float | None
-    stabilised: bool | None
+    share: float | None = None
+    stabilised: bool | None = None
     reason: str
 
 
@@ -219,14 +251,10 @@ class MotionCheck:
         In words.
     """
 
-    explained: float | None
-    gain: tuple[float, float, float]
-    agrees: bool | None
+    explained: float | None = None
+    gain: tuple[float, float, float] = (float("nan"), float("nan"), float("nan"))
+    agrees: bool | None = None
     reason: str
-
-
-#: The gyroscope must explain so much; an axis counts where it rotated by more than this many times the noise.
-_LEAST_EXPLAINED, _ROTATED_SIGMAS = 0.5, 3.0
 
 
 def check_motion(rotation: VisualRotation, motion: GyroCamera) -> MotionCheck:
@@ -242,36 +270,27 @@ def check_motion(rotation: VisualRotation, motion: GyroCamera) -> MotionCheck:
     motion
         The gyroscope with the calibration to check, on the same clock.
     """
-    unknown = (float("nan"),) * 3
     known = np.isfinite(rotation.turn_rad).all(axis=1) & motion.covers(rotation.t_s[:-1], rotation.t_s[1:])
     if known.sum() < 3:
-        return MotionCheck(
-            explained=None, gain=unknown, agrees=None, reason="too few pairs of frames to compare with the gyroscope"
-        )
+        return MotionCheck(reason="too few pairs of frames to compare with the gyroscope")
     inertial = motion.turn_rad(rotation.t_s)[known]
     visual, sigma = rotation.turn_rad[known], float(np.median(rotation.sigma_rad[known]))
     size = np.sqrt(np.mean(visual**2))
-    if size < _ROTATED_SIGMAS * sigma:
-        return MotionCheck(explained=None, gain=unknown, agrees=None, reason="the camera hardly turned between frames")
+    if size < _LIMITS.rotated_sigmas * sigma:
+        return MotionCheck(reason="the camera hardly turned between frames")
     # the median copes with pairs that were measured wrongly
     left, all_of_it = (float(np.median(np.sum(v**2, axis=1))) for v in (visual - inertial, visual))
     explained = 1 - left / max(all_of_it, 1e-12)
     gain = []
     for axis in range(3):
         x, y = inertial[:, axis], visual[:, axis]
-        gain.append(float(y @ x / (x @ x)) if np.sqrt(np.mean(x**2)) > _ROTATED_SIGMAS * sigma else float("nan"))
+        gain.append(float(y @ x / (x @ x)) if np.sqrt(np.mean(x**2)) > _LIMITS.rotated_sigmas * sigma else float("nan"))
     flipped = ["xyz"[axis] for axis in range(3) if gain[axis] < -0.3]
     reason = f"the gyroscope explains {100 * max(explained, 0):.0f} % of the rotation between frames"
     if flipped:
         reason += f"; the camera's {' and '.join(flipped)} axis turns the other way: check the axes"
-    agrees = explained >= _LEAST_EXPLAINED and not flipped
+    agrees = explained >= _LIMITS.least_explained and not flipped
     return MotionCheck(explained=explained, gain=(gain[0], gain[1], gain[2]), agrees=agrees, reason=reason)
-
-
-#: Rotation slower than this is what a stabiliser lets pass.
-_QUICK_S = 0.4
-#: A stabiliser leaves less than this share of quick rotation; quick rotation must exceed the noise of pictures by this.
-_STABILISED_SHARE, _CLEAR = 0.6, 3.0
 
 
 def find_stabilisation(rotation: VisualRotation, imu: ImuRecording, *, offset_s: float | None = None) -> Stabilisation:
@@ -293,8 +312,8 @@ def find_stabilisation(rotation: VisualRotation, imu: ImuRecording, *, offset_s:
     known = np.isfinite(rotation.turn_rad).all(axis=1)
     dt_s = np.diff(rotation.t_s)
     step_s = float(np.median(dt_s)) if len(dt_s) else np.inf
-    if known.sum() < 20 or step_s > _QUICK_S / 3:
-        return Stabilisation(share=None, stabilised=None, reason="too few frames close in time to tell stabilisation")
+    if known.sum() < 20 or step_s > _LIMITS.quick_s / 3:
+        return Stabilisation(reason="too few frames close in time to tell stabilisation")
     path = GyroPath(imu.gyro_t_s, imu.gyro_rad_s, np.median(imu.gyro_rad_s, axis=0))
     if offset_s is None:
         begin_s = np.arange(imu.gyro_t_s[0], imu.gyro_t_s[-1] - step_s, step_s)
@@ -303,28 +322,23 @@ def find_stabilisation(rotation: VisualRotation, imu: ImuRecording, *, offset_s:
         begin_s, end_s = rotation.t_s[:-1][known] - offset_s, rotation.t_s[1:][known] - offset_s
     inside = path.covers(begin_s, end_s)
     if inside.sum() < 20:
-        return Stabilisation(share=None, stabilised=None, reason="the gyroscope does not run along with the frames")
+        return Stabilisation(reason="the gyroscope does not run along with the frames")
     inertial = path.turn_rad(begin_s[inside], end_s[inside]) / (end_s - begin_s)[inside, None]
     visual = rotation.turn_rad[known] / dt_s[known, None]
     noise = float(np.median(rotation.sigma_rad[known])) / step_s
-    width = max(3, round(_QUICK_S / step_s))
+    width = max(3, round(_LIMITS.quick_s / step_s))
     quick_inertial, quick_visual = _quick(inertial, width), _quick(visual, width)
-    if quick_inertial < _CLEAR * noise or quick_inertial < 0.02:
-        return Stabilisation(
-            share=None, stabilised=None, reason="the camera was held too still to tell whether the video is stabilised"
-        )
+    if quick_inertial < _LIMITS.clear_sigmas * noise or quick_inertial < 0.02:
+        return Stabilisation(reason="the camera was held too still to tell whether the video is stabilised")
     share = quick_visual / quick_inertial
-    if share < _STABILISED_SHARE:
-        return Stabilisation(
-            share=share,
-            stabilised=True,
-            reason=f"the pictures hold {100 * share:.0f} % of the quick rotation that the gyroscope measured: the "
-            "video was stabilised in the camera, so its gyroscope does not belong to its pixels; switch stabilisation "
-            "off and record again",
+    stabilised = share < _LIMITS.stabilised_share
+    reason = f"the pictures show {100 * share:.0f} % of the quick rotation that the gyroscope measured"
+    if stabilised:
+        reason += (
+            ": the video was stabilised in the camera, so its gyroscope does not belong to its pixels; switch "
+            "stabilisation off and record again"
         )
-    return Stabilisation(
-        share=share, stabilised=False, reason=f"the pictures hold {100 * share:.0f} % of the gyroscope's quick rotation"
-    )
+    return Stabilisation(share=share, stabilised=stabilised, reason=reason)
 
 
 def _quick(rate: Array, width: int) -> float:
@@ -335,21 +349,10 @@ def _quick(rate: Array, width: int) -> float:
 
 # --- one pair of frames ----------------------------------------------------------------------------------------------
 
-#: Tracks must come back to where they began within this, in pixels of the reduced picture.
-_ROUND_TRIP_PX = 0.7
-#: A track agrees with a rotation within this (pixels of the reduced picture); so much translation may show.
-_INLIER_PX, _SCATTER_FLOOR_PX = 3.0, 0.05
-_DRAWS, _ROUNDS = 100, 15
-
 
 def reduced(image: UInt8Array | UInt16Array, options: FlowOptions) -> UInt8Array:
-    import cv2
-
-    grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    scale = options.long_side_px / max(grey.shape)
-    if scale < 1:
-        size = (max(1, round(grey.shape[1] * scale)), max(1, round(grey.shape[0] * scale)))
-        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    """The picture in which corners are tracked: (H, W), 8 bit."""
+    grey = reduce_image(to_grey(image), options.long_side_px)
     return np.asarray(grey if grey.dtype == np.uint8 else grey >> 8, dtype=np.uint8)
 
 
@@ -358,8 +361,7 @@ def _pair_rotation(
     now: tuple[UInt8Array, FrameShutter],
     camera: Projector,
     options: FlowOptions,
-) -> tuple[Array, float, int, Tracks] | None:
-    """Rotation vector of ``before_from_now``, its standard deviation, how many tracks agree, and all of them."""
+) -> _PairRotation:
     shutters = before[1], now[1]
     dt_s = shutters[1].reference_s() - shutters[0].reference_s()
     size = np.array([shutters[1].width, shutters[1].height])
@@ -368,7 +370,7 @@ def _pair_rotation(
         ok = np.isfinite(rays[0]).all(axis=1) & np.isfinite(rays[1]).all(axis=1)
         if ok.sum() < options.min_support:
             continue
-        first, second = (np.concatenate([r[ok], np.ones((ok.sum(), 1))], axis=1) for r in rays)
+        first, second = (with_unit_depth(r[ok]) for r in rays)
         span_s = shutters[1].middle_s(points[1][ok]) - shutters[0].middle_s(points[0][ok])
         # one pixel of the reduced picture as an angle, in the middle of the picture
         centre = 0.5 * size[None]
@@ -378,10 +380,10 @@ def _pair_rotation(
         if found is not None and found[2] >= options.min_support:
             rate, sigma_rad_s, count = found
             place = np.stack([(p[ok] / size - 0.5)[:, ::-1] for p in points], axis=1)
-            some = np.unique(np.linspace(0, len(place) - 1, min(len(place), _MOST_TRACKS)).astype(np.intp))
+            some = np.unique(np.linspace(0, len(place) - 1, min(len(place), _LIMITS.most_tracks)).astype(np.intp))
             tracks = Tracks(place=place[some], rays=np.stack([first[some, :2], second[some, :2]], axis=1))
-            return rate * dt_s, sigma_rad_s * abs(dt_s), count, tracks
-    return None
+            return _PairRotation(rate * dt_s, sigma_rad_s * abs(dt_s), count, tracks)
+    return _UNKNOWN
 
 
 def followed_points(
@@ -406,11 +408,9 @@ def _tracked(before: UInt8Array, now: UInt8Array, options: FlowOptions) -> tuple
     corners = cv2.goodFeaturesToTrack(before, options.corners, 0.01, distance)
     if corners is None or len(corners) < options.min_support:
         return np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32)
-    there, ok_there, _ = cv2.calcOpticalFlowPyrLK(before, now, corners, None, winSize=(21, 21), maxLevel=4)
-    back, ok_back, _ = cv2.calcOpticalFlowPyrLK(now, before, there, None, winSize=(21, 21), maxLevel=4)
-    off = np.linalg.norm((back - corners).reshape(-1, 2), axis=1)
-    good = (ok_there.ravel() == 1) & (ok_back.ravel() == 1) & (off < _ROUND_TRIP_PX)
-    return corners.reshape(-1, 2)[good], there.reshape(-1, 2)[good]
+    points = corners.reshape(-1, 2)
+    there, good = track_points(before, now, points, window_px=21, round_trip_px=_LIMITS.round_trip_px)
+    return points[good], there[good]
 
 
 def _matched(before: UInt8Array, now: UInt8Array, options: FlowOptions) -> tuple[Float32Array, Float32Array]:
@@ -442,8 +442,8 @@ def _fit_rate(first: Array, second: Array, span_s: Array, pixel_rad: float) -> t
     mean_s = float(np.mean(span_s))
     if mean_s <= 0:
         return None
-    reach = _INLIER_PX * pixel_rad
-    draws = np.random.default_rng(0).integers(0, len(a), (_DRAWS, 2))
+    reach = _LIMITS.inlier_px * pixel_rad
+    draws = np.random.default_rng(0).integers(0, len(a), (_LIMITS.draws, 2))
     rotations = _from_two(a[draws], b[draws])
     # of unit vectors: the cosines of all rays after all draws, as one product
     cosines = rotations.reshape(-1, 9) @ (b[:, :, None] * a[:, None, :]).reshape(-1, 9).T
@@ -453,7 +453,7 @@ def _fit_rate(first: Array, second: Array, span_s: Array, pixel_rad: float) -> t
     rate, scatter = -so3_log(rotations[np.argmax(counts)]) / mean_s, reach
     # of a global shutter, all rays turn for as long
     spans = span_s[:1] if np.ptp(span_s) == 0 else span_s
-    for _ in range(_ROUNDS):
+    for _ in range(_LIMITS.most_rounds):
         turn = so3_exp(-rate * spans[:, None])
         rotated = a @ turn[0].T if len(turn) == 1 else np.einsum("nij,nj->ni", turn, a)
         residual = b - rotated
@@ -461,7 +461,7 @@ def _fit_rate(first: Array, second: Array, span_s: Array, pixel_rad: float) -> t
         near = square < (2 * reach) ** 2
         if near.sum() < 3:
             return None
-        scatter = max(float(np.sqrt(np.median(square[near]))) / 1.18, _SCATTER_FLOOR_PX * pixel_rad)
+        scatter = max(float(np.sqrt(np.median(square[near]))) / 1.18, _LIMITS.scatter_floor_px * pixel_rad)
         weight = 1 / (1 + square / (2.4 * scatter) ** 2) ** 2
         # d(exp(-rate s) a) = s [rotated]x d(rate), to first order; of a unit vector, [r]x' [r]x = 1 - r r'
         lever = weight * span_s**2

@@ -10,6 +10,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Array, UInt8Array
 from colmap_inertial.core.types import Frame, FrameTiming, Projector
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
+from colmap_inertial.imaging.rolling_shutter import rays
 from colmap_inertial.motion.flow import FlowOptions, followed_points, reduced
 
 #: Share of the points that are slower: as of a frame's blur, which is the 90th percentile over the picture.
@@ -46,9 +47,8 @@ class FollowedPair:
             begin_s, end_s = (np.array([of(np.concatenate(at_s))]) for of in (np.min, np.max))
             if not motion.covers(begin_s, end_s)[0]:
                 return float("nan")
-            rays = np.column_stack([np.asarray(camera.cam_from_img(first))[:, :2], np.ones(len(first))])
             turn = np.swapaxes(motion.start_from_cam(at_s[1]), -1, -2) @ motion.start_from_cam(at_s[0])
-            first = np.asarray(camera.img_from_cam(np.einsum("nij,nj->ni", turn, rays)))
+            first = np.asarray(camera.img_from_cam(np.einsum("nij,nj->ni", turn, rays(camera, first))))
         speeds = np.linalg.norm(second - first, axis=1) / np.maximum(at_s[1] - at_s[0], 1e-9)
         known = speeds[np.isfinite(speeds)]
         return float(np.percentile(known, _PERCENTILE)) if len(known) >= FlowOptions().min_support else float("nan")

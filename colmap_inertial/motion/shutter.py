@@ -20,27 +20,62 @@ from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import cross
 from colmap_inertial.core.types import ReadoutDirection
 from colmap_inertial.imaging.gyro_camera import GyroCamera
+from colmap_inertial.imaging.rolling_shutter import with_unit_depth
 from colmap_inertial.motion.flow import VisualRotation
 
-#: Pairs and corners, at least; parts of the recording whose scatter widens the result, and pairs in each, at least.
-_LEAST_PAIRS, _LEAST_CORNERS, _PARTS, _PAIRS_OF_PART = 24, 1500, 12, 3
-#: What is known beforehand (standard deviations): readout along and across, clock offset, axes, bias, focal length, and
-#: the translation of a pair in mean depths. Each is far wider than what it says, so that the pictures decide.
-_READOUT_S, _OFFSET_S, _AXES_RAD, _BIAS_RAD_S, _FOCAL, _TRANSLATION = 0.1, 0.05, 0.05, 0.02, 0.2, 1.0
-#: Inverse depths scatter by so many times their mean; the least scatter of a corner, as an angle.
-_DEPTHS, _LEAST_SCATTER_RAD = 3.0, 2e-5
-#: The rate must change from frame to frame by so much (root mean square), and by so many standard deviations of a
-#: reading.
-_LEAST_CHANGE_RAD_S, _CHANGE_BY_NOISE = 0.03, 8.0
-_ROUNDS, _SETTLED_S = 25, 1e-5
-#: More pairs tell nothing that these do not.
-_MOST_PAIRS = 150
-#: A readout is told where it is known to this and clear of nothing by so many standard deviations; one that is seen the
-#: other way, too, must be clear and this share of it.
-_SIGMA_S, _CLEAR, _BESIDE = 0.002, 3.0, 0.2
-#: Added to what scatter shows (``scripts/study_readout.py``): seconds, and the share of a readout by which it comes
-#: out too short where depths are of all sizes.
-_FLOOR_S, _FLOOR_SHARE = 2e-4, 0.02
+
+@dataclass(frozen=True, kw_only=True)
+class ReadoutLimits:
+    """What decides on the readout of a rolling shutter."""
+
+    #: Pairs of frames, at least.
+    least_pairs: int = 24
+    #: Corners, at least.
+    least_corners: int = 1500
+    #: More pairs tell nothing that these do not.
+    most_pairs: int = 150
+    #: Parts of the recording whose scatter widens the result,
+    parts: int = 12
+    #: and pairs in each, at least.
+    pairs_of_part: int = 3
+    #: What is known beforehand, standard deviations, each far wider than what it says, so that the pictures decide:
+    #: readout along and across,
+    readout_sigma_s: float = 0.1
+    #: clock offset,
+    offset_sigma_s: float = 0.05
+    #: axes,
+    axes_sigma_rad: float = 0.05
+    #: bias,
+    bias_sigma_rad_s: float = 0.02
+    #: focal length,
+    focal_sigma_log: float = 0.2
+    #: and the translation of a pair in mean depths.
+    translation_sigma: float = 1.0
+    #: Inverse depths scatter by so many times their mean.
+    depth_scatter: float = 3.0
+    #: Least scatter of a corner, as an angle.
+    least_scatter_rad: float = 2e-5
+    #: The rate must change from frame to frame by so much (root mean square),
+    least_change_rad_s: float = 0.03
+    #: and by so many standard deviations of a reading.
+    change_by_noise: float = 8.0
+    #: Rounds of least squares, at most.
+    most_rounds: int = 25
+    #: Change of the readout at which they end.
+    settled_s: float = 1e-5
+    #: A readout is told where it is known to this,
+    most_sigma_s: float = 0.002
+    #: and clear of nothing by so many standard deviations;
+    clear_sigmas: float = 3.0
+    #: one that is seen the other way, too, must be clear and this share of it.
+    beside_share: float = 0.2
+    #: Added to what scatter shows (``scripts/study_readout.py``): seconds,
+    floor_s: float = 2e-4
+    #: and the share of a readout by which it comes out too short where depths are of all sizes.
+    floor_share: float = 0.02
+
+
+_LIMITS = ReadoutLimits()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,19 +121,19 @@ def estimate_readout(rotation: VisualRotation, motion: GyroCamera) -> ReadoutEst
     seen = _seen(rotation, motion)
     _require_change(seen, motion)
     fit = _fitted(seen, motion)
-    sigma = np.sqrt(np.diagonal(fit.cov)[:2] + _FLOOR_S**2 + (_FLOOR_SHARE * fit.params[:2]) ** 2)
+    sigma = np.sqrt(np.diagonal(fit.cov)[:2] + _LIMITS.floor_s**2 + (_LIMITS.floor_share * fit.params[:2]) ** 2)
     along, beside = (0, 1) if abs(fit.params[0]) >= abs(fit.params[1]) else (1, 0)
     readout_s, sigma_s = float(fit.params[along]), float(sigma[along])
-    if abs(readout_s) < _CLEAR * sigma_s:
+    if abs(readout_s) < _LIMITS.clear_sigmas * sigma_s:
         # of a shutter that is not seen nobody knows how its lines run
         readout_s, sigma_s, along, beside = 0.0, float(sigma.max()), 0, 1
-    if not sigma_s < _SIGMA_S:
+    if not sigma_s < _LIMITS.most_sigma_s:
         raise NotObservableError(
             "readout",
             f"the pictures tell the readout to +-{1e3 * sigma_s:.1f} ms only: turn the camera quickly to and fro for "
             "some seconds",
         )
-    if abs(fit.params[beside]) > max(_CLEAR * sigma[beside], _BESIDE * abs(readout_s)):
+    if abs(fit.params[beside]) > max(_LIMITS.clear_sigmas * sigma[beside], _LIMITS.beside_share * abs(readout_s)):
         raise NotObservableError(
             "readout",
             "what bends the pictures runs neither along nor across their lines: they were warped, turned or stabilised",
@@ -148,10 +183,10 @@ def _seen(rotation: VisualRotation, motion: GyroCamera) -> _Seen:
     slack_s = 0.05
     inside = motion.covers(rotation.t_s[:-1] - slack_s, rotation.t_s[1:] + slack_s)
     used = [i for i, tracks in enumerate(rotation.tracks) if inside[i] and len(tracks.rays)]
-    first = max(0, (len(used) - _MOST_PAIRS) // 2)
-    used = used[first : first + _MOST_PAIRS]
+    first = max(0, (len(used) - _LIMITS.most_pairs) // 2)
+    used = used[first : first + _LIMITS.most_pairs]
     counts = [len(rotation.tracks[i].rays) for i in used]
-    if len(used) < _LEAST_PAIRS or sum(counts) < _LEAST_CORNERS:
+    if len(used) < _LIMITS.least_pairs or sum(counts) < _LIMITS.least_corners:
         raise NotObservableError(
             "readout",
             f"{sum(counts)} corners in {len(used)} pairs of frames are too few: film two seconds or more of texture",
@@ -173,7 +208,7 @@ def _require_change(seen: _Seen, motion: GyroCamera) -> None:
     ends = np.array([motion.rate_in_cam_rad_s(seen.t_s[seen.begins, k]) for k in range(2)])
     change = float(np.sqrt(np.mean(np.sum((ends[1] - ends[0]) ** 2, axis=1))))
     noise = motion.path.noise_rad_s_rthz / float(np.sqrt(np.median(np.diff(motion.path.t_s))))
-    if change < max(_LEAST_CHANGE_RAD_S, _CHANGE_BY_NOISE * noise):
+    if change < max(_LIMITS.least_change_rad_s, _LIMITS.change_by_noise * noise):
         raise NotObservableError(
             "readout",
             f"the camera's rate changes by {change:.2g} rad/s from frame to frame, which is too little to tell it: "
@@ -189,21 +224,34 @@ class _Fit(NamedTuple):
 
 
 def _fitted(seen: _Seen, motion: GyroCamera) -> _Fit:
-    sigmas = np.array([_READOUT_S, _READOUT_S, _OFFSET_S, *(3 * [_AXES_RAD]), *(3 * [_BIAS_RAD_S]), _FOCAL])
+    sigmas = np.array(
+        [
+            _LIMITS.readout_sigma_s,
+            _LIMITS.readout_sigma_s,
+            _LIMITS.offset_sigma_s,
+            *(3 * [_LIMITS.axes_sigma_rad]),
+            *(3 * [_LIMITS.bias_sigma_rad_s]),
+            _LIMITS.focal_sigma_log,
+        ]
+    )
     prior = np.diag(sigmas**-2.0)
     params = np.zeros(len(sigmas))
     moved = np.zeros((len(seen.begins), 3))
-    for _ in range(_ROUNDS):
+    for _ in range(_LIMITS.most_rounds):
         off, by_params, by_moved = _residuals(seen, motion, params, moved)
         weight = _weights(off, by_moved, moved, seen)
         # what a corner's depth is, as far as it shows: the flow of a pair's translation is that much stronger
         flow = np.einsum("nij,nj->ni", by_moved, moved[seen.pair])
-        depth = np.clip(1 + _DEPTHS**2 * np.einsum("ni,nij,nj->n", flow, weight.inverse, off), 0, 1 + _DEPTHS)
+        depth = np.clip(
+            1 + _LIMITS.depth_scatter**2 * np.einsum("ni,nij,nj->n", flow, weight.inverse, off),
+            0,
+            1 + _LIMITS.depth_scatter,
+        )
         slope = depth[:, None, None] * by_moved
         weighed = weight.robust[:, None, None] * weight.inverse
-        square = seen.sums(np.swapaxes(slope, 1, 2) @ weighed @ slope) + _TRANSLATION**-2 * np.eye(3)
+        square = seen.sums(np.swapaxes(slope, 1, 2) @ weighed @ slope) + _LIMITS.translation_sigma**-2 * np.eye(3)
         mixed = seen.sums(np.swapaxes(slope, 1, 2) @ weighed @ by_params)
-        own = seen.sums(np.einsum("nij,nik,nk->nj", slope, weighed, off)) - _TRANSLATION**-2 * moved
+        own = seen.sums(np.einsum("nij,nik,nk->nj", slope, weighed, off)) - _LIMITS.translation_sigma**-2 * moved
         shared = seen.sums(np.einsum("nij,nik,nk->nj", by_params, weighed, off))
         shared_square = np.einsum("nij,nik,nkl->jl", by_params, weighed, by_params)
         gain = np.swapaxes(np.linalg.solve(square, mixed), 1, 2)
@@ -212,10 +260,10 @@ def _fitted(seen: _Seen, motion: GyroCamera) -> _Fit:
         step = np.linalg.solve(information, scores.sum(axis=0) - prior @ params)
         moved = moved + np.linalg.solve(square, (own - mixed @ step)[..., None])[..., 0]
         params = params + step
-        if np.abs(step[:2]).max() < _SETTLED_S:
+        if np.abs(step[:2]).max() < _LIMITS.settled_s:
             break
     cov = np.linalg.inv(information)
-    parts = min(_PARTS, len(scores) // _PAIRS_OF_PART)
+    parts = min(_LIMITS.parts, len(scores) // _LIMITS.pairs_of_part)
     sums = np.array([part.sum(axis=0) for part in np.array_split(scores, parts)])
     scatter = cov @ (sums.T @ sums) @ cov * parts / (parts - 1)
     return _Fit(params, np.maximum(np.diagonal(cov), np.diagonal(scatter)) * np.eye(len(cov)))
@@ -232,7 +280,7 @@ def _residuals(seen: _Seen, motion: GyroCamera, params: Array, moved: Array) -> 
     span_s = np.diff(at_s, axis=1)
     middle_rate = rate.mean(axis=1)
     rays = seen.rays * focal
-    ahead = np.concatenate([rays[:, 0], np.ones((len(rays), 1))], axis=1)
+    ahead = with_unit_depth(rays[:, 0])
     turned = np.einsum("nij,nj->ni", now_from_before, ahead)
     # a little of axes and bias turns it further
     turned = turned + cross(span_s * (bias - cross(np.broadcast_to(axes, middle_rate.shape), middle_rate)), turned)
@@ -291,8 +339,8 @@ def _weights(off: Array, flow_of: Array, moved: Array, seen: _Seen) -> _Weights:
     across = np.abs(off[:, 0] * -along[:, 1] + off[:, 1] * along[:, 0])
     across = np.where(length > 1e-12, across, np.abs(off[:, 1]))
     usual = np.array([float(np.median(part)) for part in np.split(across, seen.begins[1:])])
-    sigma = np.maximum(usual / 0.6745, _LEAST_SCATTER_RAD)[seen.pair]
-    share = _DEPTHS**2 / (sigma**2 + _DEPTHS**2 * length**2)
+    sigma = np.maximum(usual / 0.6745, _LIMITS.least_scatter_rad)[seen.pair]
+    share = _LIMITS.depth_scatter**2 / (sigma**2 + _LIMITS.depth_scatter**2 * length**2)
     inverse = (np.eye(2) - share[:, None, None] * flow[:, :, None] * flow[:, None]) / sigma[:, None, None] ** 2
     square = np.einsum("ni,nij,nj->n", off, inverse, off)
     return _Weights(inverse, 1 / (1 + square / 2.4**2) ** 2)

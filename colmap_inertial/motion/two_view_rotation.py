@@ -16,16 +16,31 @@ import numpy as np
 from colmap_inertial.core.arrays import Array, Float32Array
 from colmap_inertial.core.geometry import so3_log
 from colmap_inertial.core.types import Frame, FrameTiming, Projector
+from colmap_inertial.imaging.rolling_shutter import with_unit_depth
 from colmap_inertial.motion.flow import FlowOptions, VisualRotation, reduced
 
-#: Features of a picture; matches of two pictures that must agree; how far a match may lie off, px of the reduced one.
-_FEATURES, _LEAST_MATCHES, _OFF_PX = 1000, 40, 1.5
-#: Matches that one rotation explains to within this (px of the reduced picture) are of a camera that did not move.
-_TURNED_PX, _TURNED_SHARE = 3.0, 0.8
-#: A match is clear where the second best is this much further away.
-_RATIO = 0.8
-#: Three rotations around a triangle close to within this.
-_CLOSED_RAD = 0.05
+
+@dataclass(frozen=True, kw_only=True)
+class TwoViewLimits:
+    """What decides on the rotation between two views."""
+
+    #: Features of a picture.
+    features: int = 1000
+    #: Matches of two pictures that must agree.
+    least_matches: int = 40
+    #: How far a match may lie off, px of the reduced picture.
+    off_px: float = 1.5
+    #: Matches that one rotation explains to within this, px of the reduced picture,
+    turned_px: float = 3.0
+    #: are of a camera that did not move, where they are more than this share.
+    turned_share: float = 0.8
+    #: A match is clear where the second best is this much further away.
+    ratio: float = 0.8
+    #: Three rotations around a triangle close to within this.
+    closed_rad: float = 0.05
+
+
+_LIMITS = TwoViewLimits()
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +95,7 @@ def measure_two_view_rotations(
             continue
         open_rad = float(np.linalg.norm(so3_log(first[0] @ second[0] @ across[0].T)))
         for k, (rotation, count) in ((i, first), (i + 1, second)):
-            if open_rad < min(_CLOSED_RAD, off[k]):
+            if open_rad < min(_LIMITS.closed_rad, off[k]):
                 turns[k], off[k], support[k] = so3_log(rotation), open_rad, count
     return VisualRotation(
         names=tuple(names),
@@ -96,7 +111,7 @@ def _features(frame: Frame, camera: Projector, options: FlowOptions) -> _Seen:
     import cv2
 
     grey = reduced(frame.image, options)
-    points, descriptors = cv2.SIFT.create(_FEATURES).detectAndCompute(grey, None)
+    points, descriptors = cv2.SIFT.create(_LIMITS.features).detectAndCompute(grey, None)
     to_full = np.array([frame.image.shape[1] / grey.shape[1], frame.image.shape[0] / grey.shape[0]])
     centre = np.array([[frame.image.shape[1] / 2, frame.image.shape[0] / 2]])
     xy_px = (np.array([point.pt for point in points], dtype=np.float64).reshape(-1, 2) + 0.5) * to_full
@@ -114,35 +129,35 @@ def _rotation(first: _Seen, second: _Seen) -> tuple[Array, int] | None:
     """(3, 3) ``first_from_second`` and the matches that agree; ``None`` where too few do."""
     import cv2
 
-    if min(len(first.rays), len(second.rays)) < _LEAST_MATCHES:
+    if min(len(first.rays), len(second.rays)) < _LIMITS.least_matches:
         return None
     found: Any = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first.descriptors, second.descriptors, k=2)
-    pairs = np.array([(m.queryIdx, m.trainIdx) for m, other in found if m.distance < _RATIO * other.distance])
-    if len(pairs) < _LEAST_MATCHES:
+    pairs = np.array([(m.queryIdx, m.trainIdx) for m, other in found if m.distance < _LIMITS.ratio * other.distance])
+    if len(pairs) < _LIMITS.least_matches:
         return None
     a, b = first.rays[pairs[:, 0]], second.rays[pairs[:, 1]]
-    reach = _OFF_PX * first.pixel_rad
+    reach = _LIMITS.off_px * first.pixel_rad
     essential, inside = cv2.findEssentialMat(
         a, b, np.eye(3), method=cv2.USAC_FAST, prob=0.999, threshold=reach, maxIters=1000
     )
     if essential is None or essential.shape != (3, 3):
         return None
     kept = inside.ravel() > 0
-    if kept.sum() < _LEAST_MATCHES:
+    if kept.sum() < _LIMITS.least_matches:
         return None
     a, b = a[kept], b[kept]
-    turned, share = _turn_alone(a, b, _TURNED_PX * first.pixel_rad)
-    if share > _TURNED_SHARE:
+    turned, share = _turn_alone(a, b, _LIMITS.turned_px * first.pixel_rad)
+    if share > _LIMITS.turned_share:
         return turned, int(share * len(a))
     count, second_from_first, _, _ = cv2.recoverPose(essential, a, b, np.eye(3))
-    if count < _LEAST_MATCHES:
+    if count < _LIMITS.least_matches:
         return None
     return np.asarray(second_from_first, dtype=np.float64).T, int(count)
 
 
 def _turn_alone(a: Array, b: Array, reach: float) -> tuple[Array, float]:
     """The rotation ``a_from_b`` that turns most rays into each other, and the share that it explains."""
-    a, b = (np.column_stack([rays, np.ones(len(rays))]) for rays in (a, b))
+    a, b = (with_unit_depth(rays) for rays in (a, b))
     a, b = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (a, b))
     weight = np.ones(len(a))
     for _ in range(10):

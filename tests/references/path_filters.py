@@ -11,14 +11,7 @@ import numpy as np
 from colmap_inertial.core.arrays import AnyArray, Array, BoolArray, ComplexArray, Float32Array
 from colmap_inertial.imaging._tiles import Tiling
 from colmap_inertial.imaging.path_filters import (
-    DATA_WEIGHT,
-    FITTED,
-    FLAT_BELOW,
-    LEAST_NOISE,
-    LEAST_SIGNAL,
-    NOISE_ABOVE,
-    NOISE_FACTOR,
-    NOISE_SHARE,
+    FILTER_MODEL,
     Noise,
 )
 
@@ -38,7 +31,7 @@ def filter_reference(
     for (tile, mean, path, frequencies, window, place), spread, share in zip(
         tiles(light, tiling, paths), spreads.reshape(-1, 3), shares, strict=True
     ):
-        variance = max(noise.dark + noise.by_light * mean, LEAST_NOISE**2)
+        variance = max(noise.dark + noise.by_light * mean, FILTER_MODEL.least_noise**2)
         total[place] += share * (filter_tile(tile, path, spread, frequencies, window, variance, splitting) + mean)
     begin = tiling.before
     return total[begin : begin + tiling.height, begin : begin + tiling.width]
@@ -48,8 +41,8 @@ def noise_reference(light: Float32Array, tiling: Tiling, paths: Float32Array) ->
     """(N, 3) mean light of each tile, the variance of its noise, and how many frequencies show it."""
     found = []
     for tile, mean, path, frequencies, window, _ in tiles(light, tiling, paths):
-        shows = frequencies.square > NOISE_ABOVE**2
-        shows &= np.abs(transfer_of(path, frequencies)) < NOISE_SHARE
+        shows = frequencies.square > FILTER_MODEL.noise_above_per_px**2
+        shows &= np.abs(transfer_of(path, frequencies)) < FILTER_MODEL.noise_share
         power = np.abs(np.fft.rfft2(tile)) ** 2 / np.sum(window**2)
         count = (frequencies.times * shows).sum()
         found.append((mean, (frequencies.times * power)[shows].sum() / max(count, 1), count))
@@ -99,7 +92,7 @@ class Frequencies:
         x, y = np.asarray(np.fft.rfftfreq(side)), np.asarray(np.fft.fftfreq(side))
         square = x**2 + y[:, None] ** 2
         gradient = 4 * (np.sin(np.pi * x) ** 2 + np.sin(np.pi * y[:, None]) ** 2)
-        low, high = FITTED
+        low, high = FILTER_MODEL.fitted_per_px
         fitted = (square > low**2) & (square < high**2)
         times = np.where(np.arange(len(x)) % (side // 2), 2.0, 1.0)
         return cls(x=x, y=y, square=square, gradient=gradient, fitted=fitted, times=times)
@@ -123,12 +116,12 @@ def filter_tile(
     doubt = doubt_of(path, spread, frequencies)
     power = np.abs(transfer) ** 2 + doubt
     signal = signal_at_one(np.abs(spectrum) ** 2 / np.sum(window**2), power, frequencies, noise)
-    prior = signal / (frequencies.square + FLAT_BELOW**2)
-    wiener = np.conj(transfer) * prior / (power * prior + NOISE_FACTOR * noise) * spectrum
+    prior = signal / (frequencies.square + FILTER_MODEL.flat_below_per_px**2)
+    wiener = np.conj(transfer) * prior / (power * prior + FILTER_MODEL.noise_factor * noise) * spectrum
     sharp = np.fft.irfft2(wiener, tile.shape)
-    weight = DATA_WEIGHT * 1e-4 / noise
+    weight = FILTER_MODEL.data_weight * 1e-4 / noise
     # what the path is not known to do to the sharp picture adds to the noise of a frequency
-    certain = NOISE_FACTOR * noise / (NOISE_FACTOR * noise + doubt * prior)
+    certain = FILTER_MODEL.noise_factor * noise / (FILTER_MODEL.noise_factor * noise + doubt * prior)
     data = weight * certain * np.conj(transfer) * spectrum
     for b in splitting:
         kept = [shrunk(np.roll(sharp, -1, axis) - sharp, b) for axis in (0, 1)]
@@ -172,7 +165,7 @@ def signal_at_one(power_seen: Array, transfer: Array, frequencies: Frequencies, 
     """Power of the sharp tile at one cycle per pixel, where it falls as ``1 / f^2``: by least squares of the excess."""
     band = frequencies.fitted * frequencies.times
     excess = (band * frequencies.square * transfer * (power_seen - noise)).sum()
-    return max(float(excess / (band * transfer**2).sum()), LEAST_SIGNAL * noise)
+    return max(float(excess / (band * transfer**2).sum()), FILTER_MODEL.least_signal * noise)
 
 
 def shrunk(gradient: Array, splitting: float) -> Array:

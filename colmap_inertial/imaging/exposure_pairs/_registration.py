@@ -18,38 +18,65 @@ from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.exposure_pairs._search import OTHER_TURNS_DEG, USUAL_TURNS_DEG, places
 from colmap_inertial.imaging.rolling_shutter import grid_nodes, sampling_maps
 
-#: Longer sides of the reduced images, px; the last one also judges.
-_SIDES_PX = (120, 240, 480)
-#: Detail that is compared lies between these standard deviations, px of the reduced image.
-_FINE_PX, _COARSE_PX = 1.5, 16.0
-#: Of the first size: there nearly all counts, which tells repetitions of a pattern apart.
-_COARSEST_PX = 60.0
-#: Of ECC.
-_ROUNDS, _STOP = 60, 1e-5
-#: The correlation must rise by this for a more general mapping: less also comes of fitting noise.
-_WORTH = 0.003
-#: For leaving the gyroscope, by this: a blur that is not even through time has its centre beside mid-exposure, and
-#: drew pixels away from a true shift by 0.6 px for up to 0.007.
-_WORTH_FROM_GYRO = 0.01
+
+@dataclass(frozen=True, kw_only=True)
+class RegistrationLimits:
+    """What two exposures are registered by, and when they show one view."""
+
+    #: Longer sides of the reduced images; the last one also judges.
+    sides_px: tuple[int, ...] = (120, 240, 480)
+    #: Detail that is compared is coarser than this standard deviation, px of the reduced image,
+    fine_px: float = 1.5
+    #: and finer than this one;
+    coarse_px: float = 16.0
+    #: of the first size, than this one: there nearly all counts, which tells repetitions of a pattern apart.
+    coarsest_px: float = 60.0
+    #: Iterations of ECC, at most.
+    ecc_rounds: int = 60
+    #: Change of its correlation at which it stops.
+    ecc_settled: float = 1e-5
+    #: The correlation must rise by this for a more general mapping: less also comes of fitting noise.
+    worth: float = 0.003
+    #: For leaving the gyroscope, by this: a blur that is not even through time has its centre beside mid-exposure, and
+    #: drew pixels away from a true shift by 0.6 px for up to 0.007.
+    worth_from_gyro: float = 0.01
+    #: Farthest that the pixels may move an image's middle, in its longer side,
+    farthest: float = 0.35
+    #: its corners beyond that,
+    farthest_by_turning: float = 0.5
+    #: and any part of it from where the gyroscope has it.
+    farthest_from_gyro: float = 0.03
+    #: So many places are looked at more closely;
+    closer_looks: int = 2
+    #: none where the correlation is this high already.
+    never_better: float = 0.95
+    #: Where a smaller share of the long image tells, all of it has to.
+    least_telling: float = 0.1
+    #: A pixel tells above this.
+    tells: float = 0.5
+    #: Images show one view where the correlations of their parts, so many along the longer side,
+    parts_along: int = 10
+    #: are so high in the mean,
+    alike: float = 0.3
+    #: and so many of its standard deviations above 0. Of 62 simulated pairs, true ones reach .45 and 8.6 at least,
+    #: wrong ones .21 and 6.4 at most.
+    alike_sigmas: float = 7.0
+    #: A part counts where so much of it tells;
+    telling_part: float = 0.3
+    #: with fewer of them,
+    least_parts: int = 8
+    #: all together must correlate so well.
+    alike_as_a_whole: float = 0.6
+
+
+_LIMITS = RegistrationLimits()
+
 #: For leaving it altogether: where it makes the images alike, and where it does not.
 _WORTH_AGAINST_GYRO = {True: 0.15, False: 0.0}
 #: A wall without texture has less detail than this (standard deviation): in the long image, and in the noisy short one.
 _FLAT = (0.003, 0.015)
 #: OpenCV's MOTION_TRANSLATION.
 _SHIFT = 0
-#: Farthest that the pixels may move an image's middle, in its longer side, and its corners beyond that; any part of it
-#: from where the gyroscope has it.
-_FARTHEST, _FARTHEST_BY_TURNING, _FARTHEST_FROM_GYRO = 0.35, 0.5, 0.03
-#: So many places are looked at more closely; none where what is found is this good already.
-_CLOSER_LOOKS, _NEVER_BETTER = 2, 0.95
-#: Where the share of the long image that tells is below the first, all of it has to; a pixel tells above the second.
-_LEAST_TELLING, _TELLS = 0.1, 0.5
-#: Images show one view where the correlations of their parts, so many along the longer side, are so high in the mean,
-#: and so many of its standard deviations above 0. Of 62 simulated pairs, true ones reach .45 and 8.6 at least, wrong
-#: ones .21 and 6.4 at most.
-_PARTS_ALONG, _ALIKE, _ALIKE_SIGMAS = 10, 0.3, 7.0
-#: A part counts where so much of it tells; with fewer of them, all together must agree so well.
-_TELLING_PART, _LEAST_PARTS, _ALIKE_AS_A_WHOLE = 0.3, 8, 0.6
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -98,7 +125,7 @@ def register(
     """
     height, width = short.shape
     zero = np.zeros((*BlurField.nodes(width, height, step_px), 2))
-    levels = [_Level.of(short, long, clipped, side) for side in _SIDES_PX if side <= 1.5 * max(width, height)]
+    levels = [_Level.of(short, long, clipped, side) for side in _LIMITS.sides_px if side <= 1.5 * max(width, height)]
     levels = levels or [_Level.of(short, long, clipped, max(width, height))]
     judge = levels[-1]
     none = Registered(
@@ -111,7 +138,7 @@ def register(
         # the gyroscope is believed unless the images clearly say otherwise
         found = replace(none, shift_px=gyro, by_gyro=True, agreement=judge.agreement(gyro, step_px))
         better = found if judge.flat() else _refined(found, np.eye(3), levels, step_px)
-        if better.agreement >= found.agreement + _WORTH_FROM_GYRO:
+        if better.agreement >= found.agreement + _LIMITS.worth_from_gyro:
             found = better
     if judge.flat():
         return found
@@ -119,7 +146,7 @@ def register(
     worth = 0.0 if start_px is None else _WORTH_AGAINST_GYRO[alike]
     least = judge.score(found, step_px) + worth
     for turns_deg in (USUAL_TURNS_DEG, OTHER_TURNS_DEG):
-        if least >= _NEVER_BETTER or (alike and turns_deg is OTHER_TURNS_DEG):
+        if least >= _LIMITS.never_better or (alike and turns_deg is OTHER_TURNS_DEG):
             break
         guesses = _guesses(none, levels, step_px, turns_deg)
         refined = [none, *(_refined(none, guess, levels, step_px) for guess in guesses)]
@@ -150,11 +177,11 @@ class _Level:
         small = [cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (short, long)]
         lost = cv2.resize(clipped.astype(np.float32), size, interpolation=cv2.INTER_AREA)
         # what is clipped spoils as much around it as the detail is fine, by its share: a glint is no window
-        tells = np.clip(1 - 2 * cv2.GaussianBlur(lost, (0, 0), _FINE_PX), 0, 1)
-        if tells.mean() < _LEAST_TELLING:
+        tells = np.clip(1 - 2 * cv2.GaussianBlur(lost, (0, 0), _LIMITS.fine_px), 0, 1)
+        if tells.mean() < _LIMITS.least_telling:
             # then the edges of what clips are all that there is to see
             tells = np.ones_like(tells)
-        sigmas = _FINE_PX, _COARSEST_PX if side_px == _SIDES_PX[0] else _COARSE_PX
+        sigmas = _LIMITS.fine_px, _LIMITS.coarsest_px if side_px == _LIMITS.sides_px[0] else _LIMITS.coarse_px
         fine, coarse = ([cv2.GaussianBlur(image, (0, 0), sigma) for image in small] for sigma in sigmas)
         short_detail, long_detail = (np.asarray(f - c, dtype=np.float32) for f, c in zip(fine, coarse, strict=True))
         return cls(short_detail, long_detail, np.asarray(tells, dtype=np.float32), size[0] / width)
@@ -186,21 +213,21 @@ class _Level:
     def alike(self, shift_px: Array, step_px: int) -> bool:
         """Whether the details agree all over, and not by chance: in most parts of the image, each for itself."""
         found = self._of_parts(shift_px, step_px)
-        if len(found) < _LEAST_PARTS:
-            return self.agreement(shift_px, step_px) >= _ALIKE_AS_A_WHOLE
+        if len(found) < _LIMITS.least_parts:
+            return self.agreement(shift_px, step_px) >= _LIMITS.alike_as_a_whole
         mean, spread = float(found.mean()), float(found.std()) / np.sqrt(len(found))
-        return bool(mean >= _ALIKE and mean >= _ALIKE_SIGMAS * spread)
+        return bool(mean >= _LIMITS.alike and mean >= _LIMITS.alike_sigmas * spread)
 
     def _of_parts(self, shift_px: Array, step_px: int) -> Array:
         """Correlations in squares where enough tells."""
         moved, tells = self.moved(shift_px, step_px)
         height, width = self.short.shape
-        side = max(16, max(height, width) // _PARTS_ALONG)
+        side = max(16, max(height, width) // _LIMITS.parts_along)
         found = []
         for top in range(0, height - side + 1, side):
             for left in range(0, width - side + 1, side):
                 part = (slice(top, top + side), slice(left, left + side))
-                if tells[part].mean() >= _TELLING_PART:
+                if tells[part].mean() >= _LIMITS.telling_part:
                     found.append(_correlation(self.short[part], moved[part], tells[part]))
         return np.array(found)
 
@@ -220,7 +247,12 @@ def _guesses(start: Registered, levels: list[_Level], step_px: int, turns_deg: S
     coarse, finer = levels[0], levels[min(1, len(levels) - 1)]
     scale = _centred_scale(coarse.scale)
     found = places(
-        coarse.short, np.ones_like(coarse.tells), coarse.long, coarse.tells, farthest=_FARTHEST, turns_deg=turns_deg
+        coarse.short,
+        np.ones_like(coarse.tells),
+        coarse.long,
+        coarse.tells,
+        farthest=_LIMITS.farthest,
+        turns_deg=turns_deg,
     )
     ranked = []
     for guess in (np.eye(3), *(np.linalg.inv(scale) @ place.mapping @ scale for place in found)):
@@ -233,7 +265,7 @@ def _guesses(start: Registered, levels: list[_Level], step_px: int, turns_deg: S
                 moved = replace(start, shift_px=shift, agreement=finer.agreement(shift, step_px))
                 ranked.append((finer.score(moved, step_px) + _coarse_score(coarse, moved, step_px), one))
     ranked.sort(key=lambda pair: -pair[0])
-    return [one for _, one in ranked[:_CLOSER_LOOKS]]
+    return [one for _, one in ranked[: _LIMITS.closer_looks]]
 
 
 def _coarse_score(coarse: _Level, found: Registered, step_px: int) -> float:
@@ -253,10 +285,10 @@ def _shift_of(mapping: Array, start: Registered, step_px: int) -> Array | None:
     side = step_px * max(rows, columns)
     middle = np.linalg.norm(step[rows // 2, columns // 2])
     reach = np.hypot(step[..., 0], step[..., 1]).max()
-    if start.by_gyro and reach > _FARTHEST_FROM_GYRO * side:
+    if start.by_gyro and reach > _LIMITS.farthest_from_gyro * side:
         return None
     # a turn takes corners farther than the middle
-    if middle > _FARTHEST * side or reach > (_FARTHEST + _FARTHEST_BY_TURNING) * side:
+    if middle > _LIMITS.farthest * side or reach > (_LIMITS.farthest + _LIMITS.farthest_by_turning) * side:
         return None
     return np.asarray(step + between_nodes(start.shift_px, target / step_px))
 
@@ -270,7 +302,7 @@ def _refined(start: Registered, guess: Array, levels: list[_Level], step_px: int
             continue
         agreement = levels[-1].agreement(shift, step_px)
         # a more general mapping must be worth it
-        if agreement >= best.agreement + _WORTH:
+        if agreement >= best.agreement + _LIMITS.worth:
             best = replace(start, shift_px=shift, by_pixels=True, agreement=agreement)
     return best
 
@@ -297,12 +329,12 @@ def _maximised(level: _Level, start: Registered, mapping: Array, kind: int, step
     import cv2
 
     moved, weights = level.moved(start.shift_px, step_px)
-    tells = (weights > _TELLS).astype(np.uint8)
+    tells = (weights > _LIMITS.tells).astype(np.uint8)
     scale = _centred_scale(level.scale)
     small = scale @ mapping @ np.linalg.inv(scale)
     size = 3 if kind == cv2.MOTION_HOMOGRAPHY else 2
     warp = np.ascontiguousarray((small / small[2, 2])[:size], dtype=np.float32)
-    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _ROUNDS, _STOP)
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _LIMITS.ecc_rounds, _LIMITS.ecc_settled)
     try:
         _, warp = cv2.findTransformECC(level.short, moved, warp, kind, criteria, tells, 1)
     except cv2.error:

@@ -14,16 +14,27 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, ComplexArray, Float32Array
 
-#: The images must share so much of their area: with less, chance correlates, too.
-_LEAST_SHARED = 0.3
+
+@dataclass(frozen=True, kw_only=True)
+class SearchLimits:
+    """Where one image is looked for on another."""
+
+    #: The images must share so much of their area: with less, chance correlates, too.
+    least_shared: float = 0.3
+    #: What a shift by the longer side takes off the score.
+    nearer: float = 0.1
+    #: So many places are worth a closer look;
+    places: int = 8
+    #: they lie so far apart, in the reduced image's px.
+    apart_px: float = 4.0
+
+
+_LIMITS = SearchLimits()
+
 #: Turns about the view's axis, degrees, of steady hands, and others: between them detail of a picture's tenth still
 #: agrees.
 USUAL_TURNS_DEG = (0.0, -5.0, 5.0, -10.0, 10.0)
 OTHER_TURNS_DEG = tuple(sign * degrees for degrees in range(15, 65, 5) for sign in (-1.0, 1.0))
-#: What a shift by the longer side takes off the score.
-_NEARER = 0.1
-#: So many places are worth a closer look; they lie so far apart, in the reduced image's px.
-_PLACES, _APART_PX = 8, 4.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -78,21 +89,21 @@ def places(
         scores, shifts = _all_shifts(first, first_tells, np.asarray(turned), np.asarray(tells))
         length = np.hypot(shifts[0][:, None], shifts[1]) / max(height, width)
         # of a pattern's repetitions, the nearest
-        scores = np.where(length <= farthest, scores - _NEARER * length, -1.0)
-        for _ in range(_PLACES):
+        scores = np.where(length <= farthest, scores - _LIMITS.nearer * length, -1.0)
+        for _ in range(_LIMITS.places):
             row, column = np.unravel_index(np.argmax(scores), scores.shape)
             dy, dx = shifts[0][row], shifts[1][column]
             shift = np.array([[1, 0, dx], [0, 1, dy], [0, 0, 1.0]])
             found.append(Place(mapping=turn @ shift, score=float(scores[row, column])))
-            near = (np.abs(shifts[0] - dy) < _APART_PX)[:, None] & (np.abs(shifts[1] - dx) < _APART_PX)
+            near = (np.abs(shifts[0] - dy) < _LIMITS.apart_px)[:, None] & (np.abs(shifts[1] - dx) < _LIMITS.apart_px)
             scores[near] = -1.0
     chosen: list[Place] = []
     middle = np.array([0.5 * width, 0.5 * height, 1.0])
     for place in sorted(found, key=lambda one: -one.score):
         there = (place.mapping @ middle)[:2]
-        if all(np.linalg.norm(there - (other.mapping @ middle)[:2]) >= _APART_PX for other in chosen):
+        if all(np.linalg.norm(there - (other.mapping @ middle)[:2]) >= _LIMITS.apart_px for other in chosen):
             chosen.append(place)
-        if len(chosen) == _PLACES:
+        if len(chosen) == _LIMITS.places:
             break
     return chosen
 
@@ -116,7 +127,7 @@ def _all_shifts(
     )
     share = shared / (height * width)
     power = np.sqrt(np.clip(power_x, 1e-12, None) * np.clip(power_y, 1e-12, None))
-    enough = share >= min(_LEAST_SHARED, 0.9 * float(share.max()))
+    enough = share >= min(_LIMITS.least_shared, 0.9 * float(share.max()))
     scores = np.where(enough, both / power * np.sqrt(np.clip(share, 0, 1)), -1.0)
     rows, columns = (np.fft.fftfreq(n, 1 / n) for n in size)
     return scores, (rows, columns)

@@ -8,20 +8,32 @@ from typing import Literal
 import numpy as np
 
 from colmap_inertial.core.arrays import AnyArray, Array, Float32Array
-from colmap_inertial.imaging.exposure_pairs.pair import CLIPPED, MOST_GAIN, Brightness, brightened
+from colmap_inertial.imaging.exposure_pairs.pair import BRIGHTNESS_LIMITS, Brightness, brightened
 from colmap_inertial.imaging.transfer import decode_table
 
-#: Detail is compared in bands, of octaves from this standard deviation on, px.
-_FINEST_PX, _BANDS = 0.7, 5
-#: What blur costs: so many times the power that detail lacks, and a share of what is left, for it lies elsewhere. By 42
-#: simulated pairs, of which the worse one is taken of 5, and is then worse by 6 dB at most.
-_MISSING, _DISPLACED = 3.0, 0.5
-#: An image with more pixels black or clipped shows nothing.
-_MOST_LOST = 0.5
-#: Where nothing tells the gain, a short exposure is made so bright that this share of its pixels lies below white.
-_BELOW_WHITE = 0.995
-#: Squares in which noise is measured, px; the median over them holds where texture fills fewer than half.
-_NOISE_CELL_PX = 24
+
+@dataclass(frozen=True, kw_only=True)
+class AloneLimits:
+    """By what the better one of two exposures is told."""
+
+    #: Detail is compared in bands: octaves from this standard deviation on,
+    finest_px: float = 0.7
+    #: so many of them.
+    bands: int = 5
+    #: What blur costs: so many times the power that detail lacks,
+    missing: float = 3.0
+    #: and this share of what is left, for it lies elsewhere. By 42 simulated pairs, of which the worse one is taken of
+    #: 5, and is then worse by 6 dB at most.
+    displaced: float = 0.5
+    #: An image with more pixels black or clipped shows nothing.
+    most_lost: float = 0.5
+    #: Where nothing tells the gain, a short exposure is made so bright that this share of its pixels lies below white.
+    below_white: float = 0.995
+    #: Squares in which noise is measured; the median over them holds where texture fills fewer than half.
+    noise_cell_px: int = 24
+
+
+_LIMITS = AloneLimits()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -58,15 +70,18 @@ def better_alone(short: AnyArray, long: AnyArray, brightness: Brightness | None)
     """
     light = decode_table(short.dtype)[short]
     if brightness is None:
-        white = float(np.quantile(light, _BELOW_WHITE))
-        gain = float(np.clip(1 / max(white, 1 / MOST_GAIN), 1.0, MOST_GAIN))
+        white = float(np.quantile(light, _LIMITS.below_white))
+        gain = float(np.clip(1 / max(white, 1 / BRIGHTNESS_LIMITS.most_gain), 1.0, BRIGHTNESS_LIMITS.most_gain))
         colours = (1.0,) * (1 if short.ndim == 2 else short.shape[2])
         brightness = Brightness(gain=gain, colours=colours, measured=None, stated=None)
     bright = brightened(short, brightness)
     top = np.iinfo(long.dtype).max
     as_it_is = np.asarray(long.astype(np.float32) / np.float32(top))
-    lost = [(short <= top // 256).mean(), max((long <= top // 256).mean(), (long >= np.ceil(CLIPPED * top)).mean())]
-    shown = [share <= _MOST_LOST for share in lost]
+    lost = [
+        (short <= top // 256).mean(),
+        max((long <= top // 256).mean(), (long >= np.ceil(BRIGHTNESS_LIMITS.clipped * top)).mean()),
+    ]
+    shown = [share <= _LIMITS.most_lost for share in lost]
     noise, blurred = _errors(_grey(bright), _grey(as_it_is))
     take_long = blurred < noise if shown[0] and shown[1] else not shown[0]
     if take_long:
@@ -80,7 +95,7 @@ def _errors(short: Float32Array, long: Float32Array) -> tuple[float, float]:
     blurred = 0.0
     for (a, share), (b, _) in zip(_bands(short), _bands(long), strict=True):
         detail = max(a - noise * share, 0.0)
-        blurred += _MISSING * max(detail - b, 0.0) + _DISPLACED * detail
+        blurred += _LIMITS.missing * max(detail - b, 0.0) + _LIMITS.displaced * detail
     return noise, blurred
 
 
@@ -91,8 +106,8 @@ def _bands(image: Float32Array) -> list[tuple[float, float]]:
     point = np.zeros((129, 129), dtype=np.float32)
     point[64, 64] = 1.0
     found, before, spread = [], image, point
-    for k in range(_BANDS):
-        sigma = _FINEST_PX * 2**k
+    for k in range(_LIMITS.bands):
+        sigma = _LIMITS.finest_px * 2**k
         after, wider = (cv2.GaussianBlur(picture, (0, 0), sigma) for picture in (image, point))
         found.append((float(np.var(before - after)), float(np.sum((spread - wider) ** 2))))
         before, spread = after, wider
@@ -106,7 +121,7 @@ def _noise_variance(image: Float32Array) -> float:
 
     mask = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)
     power: Array = np.square(cv2.filter2D(image, cv2.CV_32F, mask)[1:-1, 1:-1], dtype=np.float64)
-    size = tuple(max(1, n // _NOISE_CELL_PX) for n in power.shape[::-1])
+    size = tuple(max(1, n // _LIMITS.noise_cell_px) for n in power.shape[::-1])
     cells = cv2.resize(power, size, interpolation=cv2.INTER_AREA)
     return float(np.median(cells)) / float((mask**2).sum())
 

@@ -23,23 +23,41 @@ from colmap_inertial.imaging.psf import blur_field
 from colmap_inertial.imaging.rolling_shutter import grid_nodes, rays, sampling_maps, seen_by_lines
 from colmap_inertial.imaging.transfer import decode_table, srgb_from_linear
 
-#: Pixels as bright as this share of the largest code may have been clipped.
-CLIPPED = 250 / 255
-#: Brightness is compared in squares, large enough that blur and a shift between the images hardly count.
-_CELLS_ALONG, _LEAST_CELL_PX = 40, 12
-#: Squares with more clipped pixels, or more that are black, tell nothing; fewer of them than this tell too little.
-#: Where noise takes a tenth of the pixels below black, what is left is too bright by 4 %.
-_MOST_CLIPPED, _MOST_BLACK, _LEAST_CELLS = 0.01, 0.1, 12
-#: Where so few are left, those with the least black serve, as long as half of their pixels are not.
-_BLACKEST = 0.5
-#: Of squares that are compared by rank alone, those with more clipped pixels are the brightest.
-_CLIPPED_SQUARE = 0.2
-#: What is stated is believed while the pixels agree to this factor; before they are aligned, to the second.
-_AGREE, _AGREE_UNALIGNED = 1.25, 2.0
-#: Colours differ between exposures by no more than this factor (phones at night reach 1.5): more would be a mistake.
-_MOST_COLOUR = 2.0
-#: A gain beyond this shows nothing but noise.
-MOST_GAIN = 1000.0
+
+@dataclass(frozen=True, kw_only=True)
+class BrightnessLimits:
+    """What the gain between two exposures is measured on, and when it is believed."""
+
+    #: Pixels as bright as this share of the largest code may have been clipped.
+    clipped: float = 250 / 255
+    #: Squares along the longer side: large enough that blur and a shift between the images hardly count.
+    cells_along: int = 40
+    #: Least side of a square.
+    least_cell_px: int = 12
+    #: Squares with a larger share of clipped pixels tell nothing.
+    most_clipped: float = 0.01
+    #: Nor do those with a larger share of black ones: where noise takes a tenth of the pixels below black, what is left
+    #: is too bright by 4 %.
+    most_black: float = 0.1
+    #: Fewer squares tell too little.
+    least_cells: int = 12
+    #: Where fewer are left, those with the least black serve, as long as a larger share of their pixels is not black.
+    blackest: float = 0.5
+    #: Of squares that are compared by rank alone, those with more clipped pixels are the brightest.
+    clipped_square: float = 0.2
+    #: What is stated is believed while the pixels agree to this factor,
+    agree_factor: float = 1.25
+    #: and before they are aligned, to this one.
+    agree_unaligned_factor: float = 2.0
+    #: Colours differ between exposures by no more than this factor (phones at night reach 1.5): more would be a
+    #: mistake.
+    most_colour: float = 2.0
+    #: A gain beyond this shows nothing but noise.
+    most_gain: float = 1000.0
+
+
+BRIGHTNESS_LIMITS = BrightnessLimits()
+
 _STEP_PX = 16
 
 
@@ -69,7 +87,7 @@ class Brightness:
         """Whether the pixels disagree with what was stated."""
         if self.measured is None or self.stated is None:
             return False
-        return abs(np.log(self.measured / self.stated)) > np.log(_AGREE)
+        return abs(np.log(self.measured / self.stated)) > np.log(BRIGHTNESS_LIMITS.agree_factor)
 
 
 def match_brightness(short: AnyArray, long: AnyArray, *, stated: float | None = None) -> Brightness:
@@ -95,7 +113,7 @@ def match_brightness(short: AnyArray, long: AnyArray, *, stated: float | None = 
         raise ValueError(f"the short exposure has shape {short.shape}, the long one {long.shape}")
     if stated is not None and not stated > 0:
         raise ValueError(f"stated must be above 0, not {stated}")
-    cell = max(_LEAST_CELL_PX, max(short.shape[:2]) // _CELLS_ALONG)
+    cell = max(BRIGHTNESS_LIMITS.least_cell_px, max(short.shape[:2]) // BRIGHTNESS_LIMITS.cells_along)
     dark, bright = (image.reshape(*image.shape[:2], -1) for image in (short, long))
     found = [_channel_gain(dark[..., c], bright[..., c], cell) for c in range(dark.shape[2])]
     telling = np.array([np.log(gain) for gain in found if gain is not None])
@@ -107,13 +125,15 @@ def match_brightness(short: AnyArray, long: AnyArray, *, stated: float | None = 
             "too little of the pictures is neither black in the short nor clipped in the long one; give the exposure "
             "times and sensitivities",
         )
-    agrees = measured is None or (stated is not None and abs(np.log(measured / stated)) <= np.log(_AGREE))
+    agrees = measured is None or (
+        stated is not None and abs(np.log(measured / stated)) <= np.log(BRIGHTNESS_LIMITS.agree_factor)
+    )
     gain = stated if stated is not None and agrees else measured
     assert gain is not None
-    limit = np.log(_MOST_COLOUR)
+    limit = np.log(BRIGHTNESS_LIMITS.most_colour)
     colours = [0.0 if g is None or middle is None else np.clip(np.log(g) - middle, -limit, limit) for g in found]
     return Brightness(
-        gain=float(np.clip(gain, 1 / MOST_GAIN, MOST_GAIN)),
+        gain=float(np.clip(gain, 1 / BRIGHTNESS_LIMITS.most_gain, BRIGHTNESS_LIMITS.most_gain)),
         colours=tuple(float(np.exp(c)) for c in colours),
         measured=measured,
         stated=stated,
@@ -127,19 +147,21 @@ def first_brightness(short: AnyArray, long: AnyArray, *, stated: float | None = 
     is taken where that agrees to a factor of two or tells nothing. Parameters and errors are those of
     :func:`match_brightness`, which is exact where the images are aligned.
     """
-    cell = max(_LEAST_CELL_PX, max(short.shape[:2]) // _CELLS_ALONG)
+    cell = max(BRIGHTNESS_LIMITS.least_cell_px, max(short.shape[:2]) // BRIGHTNESS_LIMITS.cells_along)
     dark, bright = (image.reshape(*image.shape[:2], -1) for image in (short, long))
     found = [_ranked_gain(dark[..., c], bright[..., c], cell) for c in range(dark.shape[2])]
     telling = np.array([np.log(gain) for gain in found if gain is not None])
     measured = float(np.exp(np.median(telling))) if len(telling) else None
-    if stated is not None and (measured is None or abs(np.log(measured / stated)) <= np.log(_AGREE_UNALIGNED)):
+    if stated is not None and (
+        measured is None or abs(np.log(measured / stated)) <= np.log(BRIGHTNESS_LIMITS.agree_unaligned_factor)
+    ):
         gain = stated
     elif measured is not None:
         gain = measured
     else:
         return match_brightness(short, long, stated=stated)
     return Brightness(
-        gain=float(np.clip(gain, 1 / MOST_GAIN, MOST_GAIN)),
+        gain=float(np.clip(gain, 1 / BRIGHTNESS_LIMITS.most_gain, BRIGHTNESS_LIMITS.most_gain)),
         colours=(1.0,) * dark.shape[2],
         measured=measured,
         stated=stated,
@@ -307,7 +329,7 @@ def bring_together(
             note = error.hint
     height, width = short.shape[:2]
     top = np.iinfo(long.dtype).max
-    clipped = long >= np.ceil(CLIPPED * top)
+    clipped = long >= np.ceil(BRIGHTNESS_LIMITS.clipped * top)
     clipped = clipped if clipped.ndim == 2 else clipped.any(axis=2)
     bright = np.asarray(long.astype(np.float32) / np.float32(top))
     registered = register(
@@ -346,11 +368,13 @@ def _channel_gain(short: AnyArray, long: AnyArray, cell: int) -> float | None:
     """Weighted median over squares of one channel; ``None`` where too few tell."""
     (dark, *of_short), (bright, *of_long) = _squares(short, cell), _squares(long, cell)
     clipped, black = zip(of_short, of_long, strict=True)
-    good = (np.maximum(*clipped) <= _MOST_CLIPPED) & (dark > 0) & (bright > 0)
+    good = (np.maximum(*clipped) <= BRIGHTNESS_LIMITS.most_clipped) & (dark > 0) & (bright > 0)
     blackness = np.maximum(*black)
-    ranked = np.sort(blackness[good])[: 2 * _LEAST_CELLS]
-    good &= blackness <= max(_MOST_BLACK, min(ranked[-1], _BLACKEST) if len(ranked) else 0.0)
-    if np.count_nonzero(good) < _LEAST_CELLS:
+    ranked = np.sort(blackness[good])[: 2 * BRIGHTNESS_LIMITS.least_cells]
+    good &= blackness <= max(
+        BRIGHTNESS_LIMITS.most_black, min(ranked[-1], BRIGHTNESS_LIMITS.blackest) if len(ranked) else 0.0
+    )
+    if np.count_nonzero(good) < BRIGHTNESS_LIMITS.least_cells:
         return None
     # by the light of both: that of one alone would prefer squares in which a shift between them makes it the brighter
     return float(np.exp(_weighted_median(np.log(bright[good] / dark[good]), np.sqrt(bright[good] * dark[good]))))
@@ -361,14 +385,14 @@ def _ranked_gain(short: AnyArray, long: AnyArray, cell: int) -> float | None:
     (dark, *of_short), (bright, *of_long) = _squares(short, cell), _squares(long, cell)
     clipped, black = (
         max(float((of_one[k] > most).mean()) for of_one in (of_short, of_long))
-        for k, most in ((0, _CLIPPED_SQUARE), (1, _BLACKEST))
+        for k, most in ((0, BRIGHTNESS_LIMITS.clipped_square), (1, BRIGHTNESS_LIMITS.blackest))
     )
     first, end = int(np.ceil(black * dark.size)), int((1 - clipped) * dark.size)
-    if end - first < _LEAST_CELLS:
+    if end - first < BRIGHTNESS_LIMITS.least_cells:
         return None
     a, b = np.sort(dark.ravel())[first:end], np.sort(bright.ravel())[first:end]
     good = (a > 0) & (b > 0)
-    if np.count_nonzero(good) < _LEAST_CELLS:
+    if np.count_nonzero(good) < BRIGHTNESS_LIMITS.least_cells:
         return None
     return float(np.exp(_weighted_median(np.log(b[good] / a[good]), np.sqrt(a[good] * b[good]))))
 
@@ -387,7 +411,7 @@ def _squares(image: AnyArray, cell: int) -> tuple[Array, Array, Array]:
     # codes below the first of 8 bits: what noise takes below black is lost, and what is left is too bright
     return (
         mean(decode_table(image.dtype)[image]),
-        mean(image >= np.ceil(CLIPPED * top)),
+        mean(image >= np.ceil(BRIGHTNESS_LIMITS.clipped * top)),
         mean(image <= top // 256),
     )
 

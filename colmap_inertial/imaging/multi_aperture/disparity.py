@@ -20,14 +20,27 @@ from colmap_inertial.imaging.semi_global import MOST, Views
 
 #: Disparities that differ by no more are of one surface.
 SAME_PX = 0.75
-#: The image is matched this many times smaller to find the range of its disparities,
-_LOOK_SHRINK = 4
-#: between these shares of its width,
-_LOOK_SHARES = (-1 / 32, 1 / 8)
-#: leaving out the shares of its pixels that are likeliest to be wrong, and adding so much to each end.
-_LOOK_OUTLIERS, _LOOK_MARGIN_PX = 0.002, 2.0
-#: How much smaller the image is at first for mutual information, and its narrowest side there.
-_FIRST_SHRINK, _NARROWEST_PX = 16, 24
+
+
+@dataclass(frozen=True, kw_only=True)
+class RangeLimits:
+    """How the range of disparities is found, and the first ones for mutual information."""
+
+    #: The image is matched this many times smaller to find the range of its disparities,
+    shrink: int = 4
+    #: between these shares of its width,
+    shares: tuple[float, float] = (-1 / 32, 1 / 8)
+    #: leaving out the shares of its pixels that are likeliest to be wrong,
+    outliers: float = 0.002
+    #: and adding so much to each end.
+    margin_px: float = 2.0
+    #: How much smaller the image is at first for mutual information,
+    first_shrink: int = 16
+    #: and its narrowest side there.
+    narrowest_px: int = 24
+
+
+_LIMITS = RangeLimits()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -162,16 +175,16 @@ def _range_px(reference: UInt8Array, others: UInt8Array, canvas: Rectified, thre
     """Limits of the disparities, by matching smaller images over a wide range."""
     by = _look_shrink(reference)
     small = canvas.shrunk(by)
-    low, high = (share * canvas.width / by for share in _LOOK_SHARES)
+    low, high = (share * canvas.width / by for share in _LIMITS.shares)
     found, least = match(_shrunk_views(reference, others, by), small, candidates(low, high, 0.5), threads=threads)
     measured = (_seen(found, least, small, threads) == 3).any(axis=0)
     used = found[measured] if measured.any() else found
-    limits = by * np.quantile(used, (_LOOK_OUTLIERS, 1 - _LOOK_OUTLIERS))
-    return float(limits[0] - _LOOK_MARGIN_PX), float(limits[1] + _LOOK_MARGIN_PX)
+    limits = by * np.quantile(used, (_LIMITS.outliers, 1 - _LIMITS.outliers))
+    return float(limits[0] - _LIMITS.margin_px), float(limits[1] + _LIMITS.margin_px)
 
 
 def _look_shrink(reference: UInt8Array) -> int:
-    return max(1, min(_LOOK_SHRINK, min(reference.shape) // _NARROWEST_PX))
+    return max(1, min(_LIMITS.shrink, min(reference.shape) // _LIMITS.narrowest_px))
 
 
 def _shrunk_views(reference: UInt8Array, others: UInt8Array, by: int) -> Views:
@@ -199,7 +212,9 @@ def _tables(
     """
     import cv2
 
-    levels = [by for by in (16, 8, 4, 2) if by <= _FIRST_SHRINK and min(reference.shape) // by >= _NARROWEST_PX]
+    levels = [
+        by for by in (16, 8, 4, 2) if by <= _LIMITS.first_shrink and min(reference.shape) // by >= _LIMITS.narrowest_px
+    ]
     disparity: Float32Array | None = None
     for by in [*levels[:1], *levels[:1], *levels]:
         small = canvas.shrunk(by)

@@ -16,19 +16,30 @@ from colmap_inertial.imaging.plane_sweep.pinhole import Pinhole
 from colmap_inertial.imaging.plane_sweep.tiles import Tile, tiles_of
 from colmap_inertial.imaging.semi_global import Views, match_candidates
 
-#: Between two candidates a thing moves by this much in the partner where it moves most.
-_STEP_PX = 1.0
-_LEAST_CANDIDATES, _MOST_CANDIDATES = 16, 512
-#: Census passes over comparisons of codes that differ by less: noise and JPEG decide them.
-_LEAST_CODES = 2
-#: A turned view is at most so much larger than the reference: beyond, it is stretched more than it shows.
-_LARGEST = 1.6
-#: A partner that stands this close to a plane, as a share of its depth, does not see it well.
-_CLOSEST = 0.2
-#: With fewer candidates than these, to look at half the size first saves nothing.
-_MANY_CANDIDATES = 64
-#: Points of a side of the grid by which the part of a view that is needed is found.
-_GRID = 33
+
+@dataclass(frozen=True, kw_only=True)
+class SweepLimits:
+    """What candidates a plane sweep tries, and what it compares."""
+
+    #: Between two candidates a thing moves by this much in the partner where it moves most.
+    step_px: float = 1.0
+    #: Candidates, at least,
+    least_candidates: int = 16
+    #: and at most.
+    most_candidates: int = 512
+    #: Census passes over comparisons of codes that differ by less: noise and JPEG decide them.
+    least_codes: int = 2
+    #: A turned view is at most so much larger than the reference: beyond, it is stretched more than it shows.
+    largest: float = 1.6
+    #: A partner that stands this close to a plane, as a share of its depth, does not see it well.
+    closest: float = 0.2
+    #: With fewer candidates than these, to look at half the size first saves nothing.
+    many_candidates: int = 64
+    #: Points of a side of the grid by which the part of a view that is needed is found.
+    grid: int = 33
+
+
+_LIMITS = SweepLimits()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -91,7 +102,7 @@ def sweep_depth(
     sweep = _Sweep.of(codes, camera, partners, depths)
     if sweep is None:
         return np.zeros(codes.shape, dtype=np.float32)
-    if len(sweep.inverse) < _MANY_CANDIDATES:
+    if len(sweep.inverse) < _LIMITS.many_candidates:
         return sweep.depth(threads)
     halves = [Partner(codes=_half(p.codes), camera=_half_of(p.camera)) for p in partners]
     half = _Sweep.of(_half(codes), _half_of(camera), halves, depths)
@@ -137,7 +148,7 @@ class _Sweep:
             shown[k, : canvas.height] = _shown(partner.codes.shape, canvas)
             columns[k] = _positions(camera, canvas, inverse, 0)
             rows[k] = _positions(camera, canvas, inverse, 1)
-        views = Views(reference=codes, others=others, least=_LEAST_CODES, shown=shown)
+        views = Views(reference=codes, others=others, least=_LIMITS.least_codes, shown=shown)
         return cls(views=views, inverse=inverse, columns=columns, rows=rows)
 
     def depth(self, threads: int) -> Float32Array:
@@ -184,8 +195,10 @@ def _half_of(camera: Pinhole) -> Pinhole:
 def _candidates(camera: Pinhole, baselines: Sequence[Array], near: float, far: float) -> Array:
     """(D,) inverse depths, the farthest first."""
     moves = [np.hypot(b[0], b[1]) + 0.5 * abs(b[2]) for b in baselines]
-    count = float(camera.focal_px.max()) * max(moves) * (1 / near - 1 / far) / _STEP_PX + 1
-    return np.linspace(1 / far, 1 / near, int(np.clip(np.ceil(count), _LEAST_CANDIDATES, _MOST_CANDIDATES)))
+    count = float(camera.focal_px.max()) * max(moves) * (1 / near - 1 / far) / _LIMITS.step_px + 1
+    return np.linspace(
+        1 / far, 1 / near, int(np.clip(np.ceil(count), _LIMITS.least_candidates, _LIMITS.most_candidates))
+    )
 
 
 def _place(camera: Pinhole, baseline: Array, inverse: Array, axis: int) -> tuple[Array, Array]:
@@ -194,7 +207,7 @@ def _place(camera: Pinhole, baseline: Array, inverse: Array, axis: int) -> tuple
     focal, centre = camera.focal_px[axis], camera.centre_px[axis]
     shrinks = 1 - inverse[:, None] * baseline[2]
     moved = at - centre - focal * inverse[:, None] * baseline[axis]
-    return moved / np.maximum(shrinks, _CLOSEST) + centre, shrinks
+    return moved / np.maximum(shrinks, _LIMITS.closest) + centre, shrinks
 
 
 def _canvas(camera: Pinhole, view: Pinhole, depths: tuple[float, float]) -> _Canvas | None:
@@ -206,12 +219,15 @@ def _canvas(camera: Pinhole, view: Pinhole, depths: tuple[float, float]) -> _Can
     ranges = []
     for axis in (0, 1):
         place, shrinks = _place(camera, baseline, inverse, axis)
-        place = place[shrinks[:, 0] >= _CLOSEST]
+        place = place[shrinks[:, 0] >= _LIMITS.closest]
         if not place.size:
             return None
-        ranges.append(np.linspace(place.min(), place.max(), _GRID))
+        ranges.append(np.linspace(place.min(), place.max(), _LIMITS.grid))
     # which of that the view has
-    grid = np.stack([*np.meshgrid(*ranges), np.ones((_GRID, _GRID))], axis=-1) @ np.linalg.inv(canvas_from_view).T
+    grid = (
+        np.stack([*np.meshgrid(*ranges), np.ones((_LIMITS.grid, _LIMITS.grid))], axis=-1)
+        @ np.linalg.inv(canvas_from_view).T
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
         x, y = grid[..., 0] / grid[..., 2], grid[..., 1] / grid[..., 2]
     inside = (grid[..., 2] > 0) & (x >= 0) & (x <= view.width - 1) & (y >= 0) & (y <= view.height - 1)
@@ -221,8 +237,8 @@ def _canvas(camera: Pinhole, view: Pinhole, depths: tuple[float, float]) -> _Can
         if not len(hit):
             return None
         # a cell more on each side, as the border lies somewhere within
-        low, high = ranges[axis][max(0, hit[0] - 1)], ranges[axis][min(_GRID - 1, hit[-1] + 1)]
-        excess = max(0.0, high - low - _LARGEST * most) / 2
+        low, high = ranges[axis][max(0, hit[0] - 1)], ranges[axis][min(_LIMITS.grid - 1, hit[-1] + 1)]
+        excess = max(0.0, high - low - _LIMITS.largest * most) / 2
         limits.append((int(np.floor(low + excess)), int(np.ceil(high - excess))))
     (left, right), (top, bottom) = limits
     return _Canvas(
@@ -241,7 +257,7 @@ def _positions(camera: Pinhole, canvas: _Canvas, inverse: Array, axis: int) -> I
     place, shrinks = _place(camera, canvas.baseline, inverse, axis)
     # what a window reaches beyond the canvas is on its own side
     sixteenths = np.rint(16 * np.clip(place - start, -1, size))
-    return np.where(shrinks >= _CLOSEST, sixteenths, -1).astype(np.int32)
+    return np.where(shrinks >= _LIMITS.closest, sixteenths, -1).astype(np.int32)
 
 
 def _turned(codes: UInt8Array, canvas: _Canvas) -> UInt8Array:

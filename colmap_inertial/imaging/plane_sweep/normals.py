@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from colmap_inertial.core.arrays import BoolArray, Float32Array
 from colmap_inertial.imaging.plane_sweep.pinhole import ROWS_AT_ONCE, Pinhole
 
-#: Pixels from the centre of the window that a plane is fitted to.
-_RADIUS = 3
-#: Neighbours are of the same surface where their inverse depth is within this share of the middle's.
-_SAME_SHARE = 0.03
-#: Fewer neighbours than these make no plane.
-_LEAST = 6
+
+@dataclass(frozen=True, kw_only=True)
+class NormalLimits:
+    """What a plane is fitted to."""
+
+    #: Pixels from the centre of the window.
+    radius_px: int = 3
+    #: Neighbours are of the same surface where their inverse depth is within this share of the middle's.
+    same_share: float = 0.03
+    #: Fewer neighbours than these make no plane.
+    least_neighbours: int = 6
+
+
+_LIMITS = NormalLimits()
 
 
 def normals_of(depth: Float32Array, camera: Pinhole) -> Float32Array:
@@ -39,24 +49,30 @@ def normals_of(depth: Float32Array, camera: Pinhole) -> Float32Array:
     known = depth > 0
     inverse = np.where(known, 1 / np.where(known, depth, 1), 0).astype(np.float32)
     middle = np.asarray(cv2.medianBlur(inverse, 5))
-    middle = np.where(np.abs(middle - inverse) > _SAME_SHARE * inverse, inverse, middle)
-    room = np.pad(inverse, _RADIUS)
+    middle = np.where(np.abs(middle - inverse) > _LIMITS.same_share * inverse, inverse, middle)
+    room = np.pad(inverse, _LIMITS.radius_px)
     out = np.empty((height, width, 3), dtype=np.float32)
     for begin in range(0, height, ROWS_AT_ONCE):
         end = min(height, begin + ROWS_AT_ONCE)
         rows = slice(begin, end)
-        out[rows] = _of_rows(known[rows], middle[rows], room[begin : end + 2 * _RADIUS], begin, camera)
+        out[rows] = _of_rows(known[rows], middle[rows], room[begin : end + 2 * _LIMITS.radius_px], begin, camera)
     return out
 
 
 def _of_rows(known: BoolArray, middle: Float32Array, room: Float32Array, begin: int, camera: Pinhole) -> Float32Array:
     """Of rows ``begin ...``; ``room`` is their inverse depth with the neighbours around."""
     height, width = known.shape
-    tolerance = _SAME_SHARE * middle
+    tolerance = _LIMITS.same_share * middle
     count, sx, sy, sxx, sxy, syy, sq, sxq, syq = (np.zeros(known.shape, dtype=np.float32) for _ in range(9))
-    for dy in range(-_RADIUS, _RADIUS + 1):
-        for dx in range(-_RADIUS, _RADIUS + 1):
-            away = room[_RADIUS + dy : _RADIUS + dy + height, _RADIUS + dx : _RADIUS + dx + width] - middle
+    for dy in range(-_LIMITS.radius_px, _LIMITS.radius_px + 1):
+        for dx in range(-_LIMITS.radius_px, _LIMITS.radius_px + 1):
+            away = (
+                room[
+                    _LIMITS.radius_px + dy : _LIMITS.radius_px + dy + height,
+                    _LIMITS.radius_px + dx : _LIMITS.radius_px + dx + width,
+                ]
+                - middle
+            )
             same = np.abs(away) <= tolerance
             away *= same
             one = same.view(np.uint8)
@@ -73,7 +89,7 @@ def _of_rows(known: BoolArray, middle: Float32Array, room: Float32Array, begin: 
         vxq, vyq = sxq - sx * sq * share, syq - sy * sq * share
         determinant = vxx * vyy - vxy * vxy
         slope_x, slope_y = (vyy * vxq - vxy * vyq) / determinant, (vxx * vyq - vxy * vxq) / determinant
-    flat = known & (count >= _LEAST) & (determinant > 1e-3)
+    flat = known & (count >= _LIMITS.least_neighbours) & (determinant > 1e-3)
     slope_x, slope_y = np.where(flat, slope_x, 0), np.where(flat, slope_y, 0)
     level = middle + (sq - slope_x * sx - slope_y * sy) * share
     (fx, fy), (cx, cy) = camera.focal_px.astype(np.float32), camera.centre_px.astype(np.float32)

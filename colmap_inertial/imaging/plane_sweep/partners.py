@@ -10,14 +10,33 @@ import numpy as np
 from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.imaging.plane_sweep.pinhole import Pinhole
 
-#: The best angle between two rays to a point; below and above it, a point counts less by these widths. Small angles
-#: measure no depth, at large ones things look different and hide each other.
-_BEST_DEG, _BELOW_DEG, _ABOVE_DEG = 8.0, 4.0, 8.0
-#: What pictures must at least have in common, and how far apart their optical axes may be.
-_LEAST_SHARED, _MOST_TURN_DEG = 20, 50.0
-#: The range of depths: shares of the points at each end that are likeliest to be wrong, and what is added.
-_NEAR_SHARE, _FAR_SHARE = 0.005, 0.995
-_NEARER, _FARTHER = 0.75, 1.3
+
+@dataclass(frozen=True, kw_only=True)
+class PartnerLimits:
+    """Which views are compared, and over which depths."""
+
+    #: The best angle between two rays to a point: small angles measure no depth, at large ones things look different
+    #: and hide each other.
+    best_deg: float = 8.0
+    #: Below it a point counts less by this width,
+    below_deg: float = 4.0
+    #: above it by this one.
+    above_deg: float = 8.0
+    #: Points that pictures must at least have in common.
+    least_shared: int = 20
+    #: How far apart their optical axes may be.
+    most_turn_deg: float = 50.0
+    #: The range of depths leaves out this share of the points at the near end,
+    near_share: float = 0.005
+    #: and those beyond this share: they are likeliest to be wrong;
+    far_share: float = 0.995
+    #: it is widened by this factor at the near end,
+    nearer: float = 0.75
+    #: and by this one at the far end.
+    farther: float = 1.3
+
+
+_LIMITS = PartnerLimits()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -63,8 +82,8 @@ def depth_range(sights: Sights, view: int) -> tuple[float, float] | None:
     depths = depths[depths > 0]
     if not len(depths):
         return None
-    low, high = np.quantile(depths, (_NEAR_SHARE, _FAR_SHARE))
-    return float(_NEARER * low), float(_FARTHER * high)
+    low, high = np.quantile(depths, (_LIMITS.near_share, _LIMITS.far_share))
+    return float(_LIMITS.nearer * low), float(_LIMITS.farther * high)
 
 
 def partner_scores(sights: Sights, view: int) -> Array:
@@ -84,14 +103,14 @@ def partner_scores(sights: Sights, view: int) -> Array:
     here, there = camera.cam_in_world - sights.points[point], centres[other] - sights.points[point]
     across = np.linalg.norm(np.cross(here, there), axis=1)
     angle_deg = np.degrees(np.arctan2(across, np.sum(here * there, axis=1)))
-    width = np.where(angle_deg < _BEST_DEG, _BELOW_DEG, _ABOVE_DEG)
-    weight = np.exp(-0.5 * ((angle_deg - _BEST_DEG) / width) ** 2)
+    width = np.where(angle_deg < _LIMITS.best_deg, _LIMITS.below_deg, _LIMITS.above_deg)
+    weight = np.exp(-0.5 * ((angle_deg - _LIMITS.best_deg) / width) ** 2)
     score = np.bincount(other, weight, count)
     shared = np.bincount(other, minlength=count)
     axes = np.array([v.cam_from_world[2] for v in sights.views])
-    near = axes @ camera.cam_from_world[2] >= np.cos(np.radians(_MOST_TURN_DEG))
+    near = axes @ camera.cam_from_world[2] >= np.cos(np.radians(_LIMITS.most_turn_deg))
     apart = np.linalg.norm(centres - camera.cam_in_world, axis=1) > 0
-    return np.where((shared >= _LEAST_SHARED) & near & apart, score, 0.0)
+    return np.where((shared >= _LIMITS.least_shared) & near & apart, score, 0.0)
 
 
 def chosen_partners(sights: Sights, view: int, scores: Array, count: int) -> tuple[int, ...]:

@@ -10,16 +10,29 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 
-#: Sides of the tiles that have candidates of their own, and what they share with their neighbours on each side:
-#: smaller tiles need fewer candidates, but share more (2.2 times less work than all candidates; 1.8 with 128 and 16).
-_TILE_PX, _SHARED_PX = 96, 8
-#: Of a tile's depths at half the size, the shares at each end that are likeliest to be wrong, and by how many
-#: candidates it may be off beyond the rest: three of the coarse ones.
-_LOW_SHARE, _HIGH_SHARE, _BEYOND = 0.002, 0.998, 6
-#: A tile of which a smaller share is known at half the size needs all candidates.
-_LEAST_KNOWN = 0.5
-#: Fewer candidates leave nothing to smooth over.
-_FEWEST = 16
+
+@dataclass(frozen=True, kw_only=True)
+class TileLimits:
+    """How a picture is cut into tiles with candidates of their own."""
+
+    #: Side of a tile: smaller ones need fewer candidates, but share more (2.2 times less work than all candidates; 1.8
+    #: with 128 and 16).
+    tile_px: int = 96
+    #: What tiles share with their neighbours on each side.
+    shared_px: int = 8
+    #: Of a tile's depths at half the size, the share at the low end that is likeliest to be wrong,
+    low_share: float = 0.002
+    #: and up to which share they are believed;
+    high_share: float = 0.998
+    #: by how many candidates it may be off beyond the rest: three of the coarse ones.
+    beyond: int = 6
+    #: A tile of which a smaller share is known at half the size needs all candidates.
+    least_known: float = 0.5
+    #: Fewer candidates leave nothing to smooth over.
+    fewest: int = 16
+
+
+_LIMITS = TileLimits()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,12 +69,12 @@ def tiles_of(coarse: Array, shape: tuple[int, int], count: int) -> Iterator[Tile
             found = coarse[_scaled(rows, down), _scaled(columns, across)]
             known = found[np.isfinite(found)]
             candidates = slice(0, count)
-            if len(known) >= max(1.0, _LEAST_KNOWN * found.size):
-                low, high = np.quantile(known, (_LOW_SHARE, _HIGH_SHARE))
-                first, last = int(np.floor(low)) - _BEYOND, int(np.ceil(high)) + _BEYOND + 1
-                more = max(0, _FEWEST - (last - first))
-                first = min(max(0, first - more // 2), max(0, count - _FEWEST))
-                candidates = slice(first, min(count, max(last + more, first + _FEWEST)))
+            if len(known) >= max(1.0, _LIMITS.least_known * found.size):
+                low, high = np.quantile(known, (_LIMITS.low_share, _LIMITS.high_share))
+                first, last = int(np.floor(low)) - _LIMITS.beyond, int(np.ceil(high)) + _LIMITS.beyond + 1
+                more = max(0, _LIMITS.fewest - (last - first))
+                first = min(max(0, first - more // 2), max(0, count - _LIMITS.fewest))
+                candidates = slice(first, min(count, max(last + more, first + _LIMITS.fewest)))
             yield Tile(
                 rows=rows,
                 columns=columns,
@@ -73,10 +86,10 @@ def tiles_of(coarse: Array, shape: tuple[int, int], count: int) -> Iterator[Tile
 
 def _cut(length: int) -> list[tuple[slice, slice]]:
     """Tiles along a side, and the same with what they share."""
-    number = -(-length // _TILE_PX)
+    number = -(-length // _LIMITS.tile_px)
     edges = [length * i // number for i in range(number + 1)]
     return [
-        (slice(begin, end), slice(max(0, begin - _SHARED_PX), min(length, end + _SHARED_PX)))
+        (slice(begin, end), slice(max(0, begin - _LIMITS.shared_px), min(length, end + _LIMITS.shared_px)))
         for begin, end in itertools.pairwise(edges)
     ]
 

@@ -9,8 +9,7 @@ import numpy as np
 
 from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence, shown_shares
 from colmap_inertial.imaging.gate import (
-    LEAST_SHARE,
-    MUST_SHOW_PX,
+    GATE_LIMITS,
     FrameDecision,
     GateOptions,
     RecordingVerdict,
@@ -74,7 +73,7 @@ def judge_frames(
     verdict = judged(looked)
     factors: tuple[float, ...] = _EXPOSURE_FACTORS
     if verdict.trusted is True:
-        long_blur = np.median([one.blur_px for one in looked]) >= 2 * MUST_SHOW_PX
+        long_blur = np.median([one.blur_px for one in looked]) >= 2 * GATE_LIMITS.must_show_px
         factors = tuple(factor for factor in factors if factor < 1 and long_blur)
     return _with_other_exposures(verdict, factors, view, capture, chosen, parallaxes, looked, progress)
 
@@ -93,12 +92,16 @@ class Looked:
     def shows(self) -> bool:
         """Whether it bears the gyroscope out."""
         one = self.evidence
-        if self.is_mostly_sky and self.gain >= LEAST_SHARE and (self.share or 0.0) >= LEAST_SHARE:
+        if (
+            self.is_mostly_sky
+            and self.gain >= GATE_LIMITS.least_share
+            and (self.share or 0.0) >= GATE_LIMITS.least_share
+        ):
             return True
         if not one.extent_is_plausible:
             return False
         other = float(one.sigmas[:, 2:-1].max())
-        faint = self.share is not None and self.share >= LEAST_SHARE and other < _OTHER_SUPPORT
+        faint = self.share is not None and self.share >= GATE_LIMITS.least_share and other < _OTHER_SUPPORT
         return one.support >= GateOptions().min_support or faint
 
     @property
@@ -188,7 +191,7 @@ def by_frame(verdict: RecordingVerdict, looked: Sequence[Looked]) -> RecordingVe
 
     So it is where the camera moves close to things: they blur by translation, too, which no gyroscope feels.
     """
-    telling = [one for one in looked if one.evidence.enough and one.blur_px >= MUST_SHOW_PX]
+    telling = [one for one in looked if one.evidence.enough and one.blur_px >= GATE_LIMITS.must_show_px]
     shown = sum(one.shows for one in telling)
     skies = 2 * sum(one.is_mostly_sky for one in telling) > len(telling)
     most = _MOST_OF_SKIES if skies else _MOST_OF_THEM

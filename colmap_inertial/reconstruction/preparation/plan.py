@@ -15,6 +15,7 @@ from colmap_inertial.core.gyro import on_camera_rate
 from colmap_inertial.core.options import BlurRemover, DeblurMethod, RollingShutterMethod
 from colmap_inertial.core.types import CameraImuCalibration, CameraModel, FrameTiming, ImuRecording
 from colmap_inertial.imaging.gate import (
+    GATE_LIMITS,
     FrameDecision,
     GateOptions,
     RecordingVerdict,
@@ -52,7 +53,11 @@ if TYPE_CHECKING:
 _TELLING_PX = 4.0
 #: Standard deviations by which a frame must bear it out by itself, where others do not. With 4, the filter made some
 #: worse; the network, which sees whether the filter's result can be true, is worth using unless a frame speaks against.
-_CLEAR_SUPPORT: dict[BlurRemover, float] = {"wiener": 7.0, "path": 7.0, "deepgyro": 0.0}
+_CLEAR_SUPPORT: dict[BlurRemover, float] = {
+    "wiener": GATE_LIMITS.clear_support,
+    "path": GATE_LIMITS.clear_support,
+    "deepgyro": 0.0,
+}
 #: What the note says of methods other than the default.
 _SAID_OF = {"deepgyro": "; the network DeepGyro undoes it", "path": "; the half-quadratic filter undoes it"}
 #: How often small models are made, at most, for more of the blurred frames.
