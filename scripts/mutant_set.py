@@ -1989,8 +1989,8 @@ MUTANTS = (
     ),
     Mutant(
         "imaging/exposure_pairs/pair.py",
-        "np.sort(dark.ravel())[first:end], np.sort(bright.ravel())[first:end]",
-        "dark.ravel()[first:end], bright.ravel()[first:end]",
+        "np.sort(dark.ravel())[inner], np.sort(bright.ravel())[inner]",
+        "dark.ravel()[inner], bright.ravel()[inner]",
         "the first gain compares what lies in one place though nothing is aligned",
         ("exposures_simulated::test_the_first_gain_needs_no_alignment",),
     ),

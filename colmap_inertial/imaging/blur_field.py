@@ -37,15 +37,9 @@ class BlurField:
     def __post_init__(self) -> None:
         if self.width <= 0 or self.height <= 0 or self.step_px <= 0:
             raise ValueError("width, height and step_px must be positive")
-        vector = np.array(self.vector_px, dtype=np.float32)
-        expected = (*self.nodes(self.width, self.height, self.step_px), 2)
-        if vector.shape != expected:
-            raise ValueError(f"vector_px: shape {vector.shape}, expected {expected}")
-        if not np.isfinite(vector).all():
-            raise ValueError("vector_px: must be finite")
-        vector.setflags(write=False)
-        object.__setattr__(self, "vector_px", vector)
-        object.__setattr__(self, "cov_px2", spread_cov(self.cov_px2, expected[:2]))
+        nodes = self.nodes(self.width, self.height, self.step_px)
+        object.__setattr__(self, "vector_px", checked_nodes("vector_px", self.vector_px, (*nodes, 2)))
+        object.__setattr__(self, "cov_px2", spread_cov(self.cov_px2, nodes))
 
     @staticmethod
     def nodes(width: int, height: int, step_px: int = 16) -> tuple[int, int]:
@@ -81,6 +75,17 @@ class BlurField:
         """How far off the vectors may be against their length, over the image."""
         off, whole = float(self.cov_px2[..., ::2].sum()), float(np.sum(self.vector_px.astype(np.float64) ** 2))
         return (off / whole) ** 0.5 if whole > 0 else 0.0
+
+
+def checked_nodes(name: str, value: AnyArray, shape: tuple[int, ...]) -> AnyArray:
+    """A read-only float32 copy of finite values, of a shape."""
+    out = np.array(value, dtype=np.float32)
+    if out.shape != shape:
+        raise ValueError(f"{name}: shape {out.shape}, expected {shape}")
+    if not np.isfinite(out).all():
+        raise ValueError(f"{name}: must be finite")
+    out.setflags(write=False)
+    return out
 
 
 def spread_cov(cov_px2: Float32Array, nodes: tuple[int, int]) -> Float32Array:

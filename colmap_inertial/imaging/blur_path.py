@@ -8,7 +8,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import AnyArray, Array, Float32Array
 from colmap_inertial.imaging._bilinear import bilinear
-from colmap_inertial.imaging.blur_field import BlurField, spread_cov
+from colmap_inertial.imaging.blur_field import BlurField, checked_nodes, spread_cov
 
 #: Samples of the exposure; of longer blur, one for each so many pixels.
 SAMPLES, SAMPLE_PX = 17, 2.0
@@ -42,14 +42,9 @@ class BlurPath:
     def __post_init__(self) -> None:
         if self.width <= 0 or self.height <= 0 or self.step_px <= 0:
             raise ValueError("width, height and step_px must be positive")
-        path = np.array(self.path_px, dtype=np.float32)
         nodes = BlurField.nodes(self.width, self.height, self.step_px)
-        if path.ndim != 4 or len(path) < 2 or path.shape[1:] != (*nodes, 2):
-            raise ValueError(f"path_px: shape {path.shape}, expected (2 or more, {nodes[0]}, {nodes[1]}, 2)")
-        if not np.isfinite(path).all():
-            raise ValueError("path_px: must be finite")
-        path.setflags(write=False)
-        object.__setattr__(self, "path_px", path)
+        samples = max(2, len(self.path_px))
+        object.__setattr__(self, "path_px", checked_nodes("path_px", self.path_px, (samples, *nodes, 2)))
         object.__setattr__(self, "cov_px2", spread_cov(self.cov_px2, nodes))
 
     @classmethod

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
-from colmap_inertial.core.types import Projector
+from colmap_inertial.core.types import Projector, checked_array
 from colmap_inertial.imaging._bilinear import between_nodes
-from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.imaging.blur_field import BlurField, checked_nodes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,17 +60,13 @@ class Parallax:
     inverse_depth: np.ndarray[tuple[int, int], np.dtype[np.float32]]
 
     def __post_init__(self) -> None:
-        velocity = np.array(self.velocity_in_cam, dtype=np.float64)
-        inverse = np.array(self.inverse_depth, dtype=np.float32)
-        if velocity.shape != (3,) or not np.isfinite(velocity).all():
-            raise ValueError("velocity_in_cam: three finite numbers")
-        if inverse.shape != BlurField.nodes(self.width, self.height, self.step_px):
-            raise ValueError(f"inverse_depth: shape {inverse.shape} does not fit the image")
-        if not (np.isfinite(inverse).all() and (inverse >= 0).all()):
-            raise ValueError("inverse_depth: must be finite and not negative")
-        for name, value in (("velocity_in_cam", velocity), ("inverse_depth", inverse)):
-            value.setflags(write=False)
-            object.__setattr__(self, name, value)
+        velocity = checked_array("velocity_in_cam", self.velocity_in_cam, (3,))
+        nodes = BlurField.nodes(self.width, self.height, self.step_px)
+        inverse = checked_nodes("inverse_depth", self.inverse_depth, nodes)
+        if (inverse < 0).any():
+            raise ValueError("inverse_depth: must not be negative")
+        object.__setattr__(self, "velocity_in_cam", velocity)
+        object.__setattr__(self, "inverse_depth", inverse)
 
     def rate_at(self, x_px: Array, y_px: Array) -> Array:
         """(len(y), len(x), 3) velocity times inverse depth at a grid of image points (COLMAP's coordinates), 1/s."""

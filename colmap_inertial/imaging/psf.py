@@ -109,8 +109,7 @@ def blur_field(
         raise NotObservableError("motion blur", _NO_EXPOSURE)
     if not shutter.covered_by(motion):
         raise NotObservableError("motion blur", _NOT_COVERED)
-    rows, columns = BlurField.nodes(shutter.width, shutter.height, step_px)
-    x, y = step_px * np.arange(float(columns)) + 0.5, step_px * np.arange(float(rows)) + 0.5
+    x, y = _node_axes(shutter.width, shutter.height, step_px)
     rates = None if parallax is None else parallax.rate_at(x, y)[None]
     one = _Exposures(shutter, np.array([shutter.t_s]), np.array([shutter.exposure_s]))
     vectors = _vectors(motion, camera, one, x, y, rates)[0]
@@ -157,24 +156,21 @@ def blur_path(
     assert shutter.exposure_s is not None
     exposure_s = extent_factor * shutter.exposure_s
     since_s = exposure_s * middles(samples_for(float(field.extent_px().max())))
-    rows, columns = BlurField.nodes(shutter.width, shutter.height, step_px)
-    x, y = step_px * np.arange(float(columns)) + 0.5, step_px * np.arange(float(rows)) + 0.5
-    nodes = np.stack(np.meshgrid(x, y), axis=-1)
-    directions = rays(camera, nodes.reshape(-1, 2)).reshape(*nodes.shape[:2], 3)
-    by_column = shutter.readout_direction in ("right", "left")
-    middle_s = shutter.middle_s(nodes[0] if by_column else nodes[:, 0])
+    x, y = _node_axes(shutter.width, shutter.height, step_px)
+    grid = _Grid.of(camera, shutter, x, y)
+    middle_s = shutter.middle_s(grid.lines_px)
     turn = np.swapaxes(motion.start_from_cam(middle_s), -1, -2) @ motion.start_from_cam(middle_s + since_s[:, None])
-    seen = np.einsum("sxij,yxj->syxi" if by_column else "syij,yxj->syxi", turn, directions)
+    seen = grid.turned(turn)
     if parallax is not None:
         seen = seen + since_s[:, None, None, None] * parallax.rate_at(x, y)
-    path = np.asarray(camera.img_from_cam(seen.reshape(-1, 3))).reshape(*seen.shape[:3], 2) - nodes
+    path = _project(camera, seen) - grid.nodes_px
     step_s = np.array(shutter.line_step_s)
     if exposure_s > 0 and step_s.any():
         before, after = (len(since_s) - 1) // 2 - 1, len(since_s) // 2 + 1
         speed = (path[after] - path[before]) / (since_s[after] - since_s[before])
         stretch = np.maximum(1 + speed @ step_s, _LEAST_STRETCH)
         path = path - ((path @ step_s) / stretch)[..., None] * speed
-    filled = _filled(np.moveaxis(path, 0, 2).reshape(rows, columns, -1)).reshape(rows, columns, -1, 2)
+    filled = _filled(np.moveaxis(path, 0, 2).reshape(len(y), len(x), -1)).reshape(len(y), len(x), -1, 2)
     return BlurPath(
         width=shutter.width,
         height=shutter.height,
@@ -259,6 +255,50 @@ _NOT_COVERED = "the gyroscope does not cover the exposure of this frame, or paus
 
 
 @dataclass(frozen=True, eq=False)
+class _Grid:
+    """Nodes of a grid over an image, the rays through them, and the lines of the shutter that they lie on.
+
+    Attributes
+    ----------
+    nodes_px
+        (Y, X, 2) COLMAP's pixel coordinates.
+    directions
+        (Y, X, 3) rays in the camera frame, z = 1.
+    by_column
+        Whether lines are columns: what belongs to a line varies along x.
+    lines_px
+        (L, 2) a node of each line.
+    """
+
+    nodes_px: Array
+    directions: Array
+    by_column: bool
+    lines_px: Array
+
+    @classmethod
+    def of(cls, camera: Projector, shutter: FrameShutter, x: Array, y: Array) -> _Grid:
+        nodes = np.stack(np.meshgrid(x, y), axis=-1)
+        by_column = shutter.readout_direction in ("right", "left")
+        directions = rays(camera, nodes.reshape(-1, 2)).reshape(*nodes.shape[:2], 3)
+        return cls(nodes, directions, by_column, nodes[0] if by_column else nodes[:, 0])
+
+    def turned(self, turn: Array) -> Array:
+        """(F, Y, X, 3) the rays after (F, L, 3, 3) rotations of their lines."""
+        return np.asarray(np.einsum("fxij,yxj->fyxi" if self.by_column else "fyij,yxj->fyxi", turn, self.directions))
+
+
+def _project(camera: Projector, points: Array) -> Array:
+    """(..., 2) pixels of (..., 3) points in the camera frame."""
+    return np.asarray(camera.img_from_cam(points.reshape(-1, 3))).reshape(*points.shape[:-1], 2)
+
+
+def _node_axes(width: int, height: int, step_px: int) -> tuple[Array, Array]:
+    """Columns and rows of a field's nodes, COLMAP's pixel coordinates."""
+    rows, columns = BlurField.nodes(width, height, step_px)
+    return step_px * np.arange(float(columns)) + 0.5, step_px * np.arange(float(rows)) + 0.5
+
+
+@dataclass(frozen=True, eq=False)
 class _Exposures:
     """Frames that have ``shutter``'s readout: (F,) when they begin to expose, and for how long."""
 
@@ -275,23 +315,20 @@ def _vectors(
     ``rates``: (F, len(y), len(x), 3) velocity times inverse depth, 1/s.
     """
     shutter, exposure_s = frames.shutter, frames.exposure_s
-    nodes = np.stack(np.meshgrid(x, y), axis=-1)
-    directions = rays(camera, nodes.reshape(-1, 2)).reshape(*nodes.shape[:2], 3)
+    grid = _Grid.of(camera, shutter, x, y)
     step_x, step_y = shutter.line_step_s
-    by_column = shutter.readout_direction in ("right", "left")
-    lines = nodes[0] if by_column else nodes[:, 0]
     # mid-exposure of each node's line against the start of its frame
-    delay_s = shutter.middle_s(lines) - shutter.t_s - 0.5 * (shutter.exposure_s or 0.0)
+    delay_s = shutter.middle_s(grid.lines_px) - shutter.t_s - 0.5 * (shutter.exposure_s or 0.0)
     middle_s = frames.t_s[:, None] + 0.5 * exposure_s[:, None] + delay_s
     half_s = 0.5 * exposure_s[:, None]
     middle = np.swapaxes(motion.start_from_cam(middle_s), -1, -2)
     ends = []
     for sign in (-1, 1):
         turn = middle @ motion.start_from_cam(middle_s + sign * half_s)
-        seen = np.einsum("fxij,yxj->fyxi" if by_column else "fyij,yxj->fyxi", turn, directions)
+        seen = grid.turned(turn)
         if rates is not None:
             seen = seen + sign * half_s[:, None, :, None] * rates
-        ends.append(np.asarray(camera.img_from_cam(seen.reshape(-1, 3))).reshape(*seen.shape[:3], 2))
+        ends.append(_project(camera, seen))
     vector = ends[1] - ends[0]
     with np.errstate(divide="ignore", invalid="ignore"):
         per_s = vector / exposure_s[:, None, None, None]
@@ -301,17 +338,13 @@ def _vectors(
 
 def _vector_cov(motion: GyroCamera, camera: Projector, shutter: FrameShutter, x: Array, y: Array) -> Array:
     """(len(y), len(x), 3) covariance xx, xy, yy of blur vectors at the nodes of a grid, by the errors of the turn."""
-    nodes = np.stack(np.meshgrid(x, y), axis=-1)
-    directions = rays(camera, nodes.reshape(-1, 2))
-    lever = np.empty((*nodes.shape, 3))
+    grid = _Grid.of(camera, shutter, x, y)
+    lever = np.empty((*grid.nodes_px.shape, 3))
     for axis in range(3):
-        turned = directions + _SMALL_TURN_RAD * np.cross(np.eye(3)[axis], directions)
-        moved = np.asarray(camera.img_from_cam(turned)).reshape(nodes.shape) - nodes
-        lever[..., axis] = moved / _SMALL_TURN_RAD
-    by_column = shutter.readout_direction in ("right", "left")
-    middle_s = shutter.middle_s(nodes[0] if by_column else nodes[:, 0])
-    turn = motion.turn_cov_rad2(middle_s, shutter.exposure_s or 0.0)
-    cov = lever @ (turn[None] if by_column else turn[:, None]) @ np.swapaxes(lever, -1, -2)
+        turned = grid.directions + _SMALL_TURN_RAD * np.cross(np.eye(3)[axis], grid.directions)
+        lever[..., axis] = (_project(camera, turned) - grid.nodes_px) / _SMALL_TURN_RAD
+    turn = motion.turn_cov_rad2(shutter.middle_s(grid.lines_px), shutter.exposure_s or 0.0)
+    cov = lever @ (turn[None] if grid.by_column else turn[:, None]) @ np.swapaxes(lever, -1, -2)
     return np.stack([cov[..., 0, 0], cov[..., 0, 1], cov[..., 1, 1]], axis=-1)
 
 

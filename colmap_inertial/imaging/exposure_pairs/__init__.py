@@ -4,31 +4,16 @@
 (:mod:`colmap_inertial.imaging.restoration.lsd2`); :func:`fuse_mertens` blends exposures as they are.
 """
 
-from colmap_inertial.imaging.exposure_pairs.alone import Alone, better_alone
-from colmap_inertial.imaging.exposure_pairs.mertens import fuse_mertens
+from colmap_inertial.imaging.exposure_pairs.alone import Alone as Alone, better_alone as better_alone
+from colmap_inertial.imaging.exposure_pairs.mertens import fuse_mertens as fuse_mertens
 from colmap_inertial.imaging.exposure_pairs.pair import (
-    Brightness,
-    ExposurePair,
-    PairGyro,
-    blur_seen_from_short,
-    brightened,
-    bring_together,
-    first_brightness,
-    gyro_shift,
-    match_brightness,
+    Brightness as Brightness,
+    ExposurePair as ExposurePair,
+    PairGyro as PairGyro,
+    blur_seen_from_short as blur_seen_from_short,
+    brightened as brightened,
+    bring_together as bring_together,
+    first_brightness as first_brightness,
+    gyro_shift as gyro_shift,
+    match_brightness as match_brightness,
 )
-
-__all__ = [
-    "Alone",
-    "Brightness",
-    "ExposurePair",
-    "PairGyro",
-    "better_alone",
-    "blur_seen_from_short",
-    "brightened",
-    "bring_together",
-    "first_brightness",
-    "fuse_mertens",
-    "gyro_shift",
-    "match_brightness",
-]

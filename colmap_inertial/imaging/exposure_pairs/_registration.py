@@ -125,36 +125,33 @@ def register(
     """
     height, width = short.shape
     zero = np.zeros((*BlurField.nodes(width, height, step_px), 2))
-    levels = [_Level.of(short, long, clipped, side) for side in _LIMITS.sides_px if side <= 1.5 * max(width, height)]
-    levels = levels or [_Level.of(short, long, clipped, max(width, height))]
+    sides = [side for side in _LIMITS.sides_px if side <= 1.5 * max(width, height)] or [max(width, height)]
+    levels = [_Level.of(short, long, clipped, side, step_px) for side in sides]
     judge = levels[-1]
-    none = Registered(
-        shift_px=zero, by_gyro=False, by_pixels=False, agreement=judge.agreement(zero, step_px), untouched=0.0
-    )
-    none = replace(none, untouched=none.agreement)
-    found = none
+    none = Registered(shift_px=zero, by_gyro=False, by_pixels=False, agreement=judge.agreement(zero), untouched=0.0)
+    found = none = replace(none, untouched=none.agreement)
     if start_px is not None:
         gyro = np.where(np.isfinite(start_px), start_px, 0.0)
         # the gyroscope is believed unless the images clearly say otherwise
-        found = replace(none, shift_px=gyro, by_gyro=True, agreement=judge.agreement(gyro, step_px))
-        better = found if judge.flat() else _refined(found, np.eye(3), levels, step_px)
+        found = replace(none, shift_px=gyro, by_gyro=True, agreement=judge.agreement(gyro))
+        better = found if judge.flat() else _refined(found, np.eye(3), levels)
         if better.agreement >= found.agreement + _LIMITS.worth_from_gyro:
             found = better
     if judge.flat():
         return found
-    alike = judge.alike(found.shift_px, step_px)
+    alike = judge.alike(found.shift_px)
     worth = 0.0 if start_px is None else _WORTH_AGAINST_GYRO[alike]
-    least = judge.score(found, step_px) + worth
+    least = judge.score(found) + worth
     for turns_deg in (USUAL_TURNS_DEG, OTHER_TURNS_DEG):
         if least >= _LIMITS.never_better or (alike and turns_deg is OTHER_TURNS_DEG):
             break
-        guesses = _guesses(none, levels, step_px, turns_deg)
-        refined = [none, *(_refined(none, guess, levels, step_px) for guess in guesses)]
+        guesses = _guesses(none, levels, turns_deg)
+        refined = [none, *(_refined(none, guess, levels) for guess in guesses)]
         # repeated detail agrees in many places; what is coarser tells them apart
-        best = max(refined, key=lambda one: judge.score(one, step_px) + _coarse_score(levels[0], one, step_px))
-        if (score := judge.score(best, step_px)) > least:
+        best = max(refined, key=lambda one: judge.score(one) + _coarse_score(levels[0], one))
+        if (score := judge.score(best)) > least:
             found, least = best, score
-            alike = judge.alike(found.shift_px, step_px)
+            alike = judge.alike(found.shift_px)
     return replace(found, alike=alike)
 
 
@@ -166,9 +163,10 @@ class _Level:
     long: Float32Array
     tells: Float32Array
     scale: float
+    step_px: int
 
     @classmethod
-    def of(cls, short: Float32Array, long: Float32Array, clipped: BoolArray, side_px: int) -> _Level:
+    def of(cls, short: Float32Array, long: Float32Array, clipped: BoolArray, side_px: int, step_px: int) -> _Level:
         import cv2
 
         height, width = short.shape
@@ -184,43 +182,43 @@ class _Level:
         sigmas = _LIMITS.fine_px, _LIMITS.coarsest_px if side_px == _LIMITS.sides_px[0] else _LIMITS.coarse_px
         fine, coarse = ([cv2.GaussianBlur(image, (0, 0), sigma) for image in small] for sigma in sigmas)
         short_detail, long_detail = (np.asarray(f - c, dtype=np.float32) for f, c in zip(fine, coarse, strict=True))
-        return cls(short_detail, long_detail, np.asarray(tells, dtype=np.float32), size[0] / width)
+        return cls(short_detail, long_detail, np.asarray(tells, dtype=np.float32), size[0] / width, step_px)
 
-    def moved(self, shift_px: Array, step_px: int) -> tuple[Float32Array, Float32Array]:
+    def moved(self, shift_px: Array) -> tuple[Float32Array, Float32Array]:
         """The long image's detail shifted, and how much it tells."""
         import cv2
 
         height, width = self.short.shape
-        map_x, map_y = sampling_maps(self.scale * shift_px, width, height, step_px * self.scale)
+        map_x, map_y = sampling_maps(self.scale * shift_px, width, height, self.step_px * self.scale)
         moved = cv2.remap(self.long, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         tells = cv2.remap(self.tells, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
         return np.asarray(moved, dtype=np.float32), np.asarray(tells, dtype=np.float32)
 
-    def agreement(self, shift_px: Array, step_px: int) -> float:
+    def agreement(self, shift_px: Array) -> float:
         """Correlation of the details where the long image's tells."""
-        moved, tells = self.moved(shift_px, step_px)
+        moved, tells = self.moved(shift_px)
         return _correlation(self.short, moved, tells)
 
-    def score(self, found: Registered, step_px: int) -> float:
+    def score(self, found: Registered) -> float:
         """The agreement times the root of what tells in common: of little, chance agrees more."""
-        _, tells = self.moved(found.shift_px, step_px)
+        _, tells = self.moved(found.shift_px)
         return found.agreement * float(np.sqrt(tells.mean() / max(float(self.tells.mean()), 1e-6)))
 
     def flat(self) -> bool:
         """Whether there is nothing to align, so that nothing contradicts either."""
         return float(self.long.std()) < _FLAT[0] and float(self.short.std()) < _FLAT[1]
 
-    def alike(self, shift_px: Array, step_px: int) -> bool:
+    def alike(self, shift_px: Array) -> bool:
         """Whether the details agree all over, and not by chance: in most parts of the image, each for itself."""
-        found = self._of_parts(shift_px, step_px)
+        found = self._of_parts(shift_px)
         if len(found) < _LIMITS.least_parts:
-            return self.agreement(shift_px, step_px) >= _LIMITS.alike_as_a_whole
+            return self.agreement(shift_px) >= _LIMITS.alike_as_a_whole
         mean, spread = float(found.mean()), float(found.std()) / np.sqrt(len(found))
         return bool(mean >= _LIMITS.alike and mean >= _LIMITS.alike_sigmas * spread)
 
-    def _of_parts(self, shift_px: Array, step_px: int) -> Array:
+    def _of_parts(self, shift_px: Array) -> Array:
         """Correlations in squares where enough tells."""
-        moved, tells = self.moved(shift_px, step_px)
+        moved, tells = self.moved(shift_px)
         height, width = self.short.shape
         side = max(16, max(height, width) // _LIMITS.parts_along)
         found = []
@@ -242,7 +240,7 @@ def _correlation(a: Float32Array, b: Float32Array, weights: Float32Array) -> flo
     return float((weights * x * y).sum(dtype=np.float64)) / norm if norm > 0 else 0.0
 
 
-def _guesses(start: Registered, levels: list[_Level], step_px: int, turns_deg: Sequence[float]) -> list[Array]:
+def _guesses(start: Registered, levels: list[_Level], turns_deg: Sequence[float]) -> list[Array]:
     """(3, 3) mappings, px of the full images, from the short one to where the long one may lie: the best few."""
     coarse, finer = levels[0], levels[min(1, len(levels) - 1)]
     scale = _centred_scale(coarse.scale)
@@ -258,18 +256,18 @@ def _guesses(start: Registered, levels: list[_Level], step_px: int, turns_deg: S
     for guess in (np.eye(3), *(np.linalg.inv(scale) @ place.mapping @ scale for place in found)):
         mapping: Array | None = guess
         for level in (coarse, finer):
-            mapping = None if mapping is None else _maximised(level, start, mapping, _SHIFT, step_px)
+            mapping = None if mapping is None else _maximised(level, start, mapping, _SHIFT)
         for one in (guess, mapping):
-            shift = None if one is None else _shift_of(one, start, step_px)
+            shift = None if one is None else _shift_of(one, start, finer.step_px)
             if one is not None and shift is not None:
-                moved = replace(start, shift_px=shift, agreement=finer.agreement(shift, step_px))
-                ranked.append((finer.score(moved, step_px) + _coarse_score(coarse, moved, step_px), one))
+                moved = replace(start, shift_px=shift, agreement=finer.agreement(shift))
+                ranked.append((finer.score(moved) + _coarse_score(coarse, moved), one))
     ranked.sort(key=lambda pair: -pair[0])
     return [one for _, one in ranked[: _LIMITS.closer_looks]]
 
 
-def _coarse_score(coarse: _Level, found: Registered, step_px: int) -> float:
-    return coarse.score(replace(found, agreement=coarse.agreement(found.shift_px, step_px)), step_px)
+def _coarse_score(coarse: _Level, found: Registered) -> float:
+    return coarse.score(replace(found, agreement=coarse.agreement(found.shift_px)))
 
 
 def _shift_of(mapping: Array, start: Registered, step_px: int) -> Array | None:
@@ -293,21 +291,21 @@ def _shift_of(mapping: Array, start: Registered, step_px: int) -> Array | None:
     return np.asarray(step + between_nodes(start.shift_px, target / step_px))
 
 
-def _refined(start: Registered, guess: Array, levels: list[_Level], step_px: int) -> Registered:
+def _refined(start: Registered, guess: Array, levels: list[_Level]) -> Registered:
     """The best of ever more general mappings, from coarse to fine; the start, where none is better."""
     best = start
-    for mapping in _mappings(start, guess, levels, step_px):
-        shift = _shift_of(mapping, start, step_px)
+    for mapping in _mappings(start, guess, levels):
+        shift = _shift_of(mapping, start, levels[-1].step_px)
         if shift is None:
             continue
-        agreement = levels[-1].agreement(shift, step_px)
+        agreement = levels[-1].agreement(shift)
         # a more general mapping must be worth it
         if agreement >= best.agreement + _LIMITS.worth:
             best = replace(start, shift_px=shift, by_pixels=True, agreement=agreement)
     return best
 
 
-def _mappings(start: Registered, guess: Array, levels: list[_Level], step_px: int) -> Iterator[Array]:
+def _mappings(start: Registered, guess: Array, levels: list[_Level]) -> Iterator[Array]:
     """(3, 3) from pixels of the short image to those of the shifted long one: shift, turn, homography."""
     import cv2
 
@@ -316,7 +314,7 @@ def _mappings(start: Registered, guess: Array, levels: list[_Level], step_px: in
     steps = [(level, _SHIFT) for level in levels]
     steps += [(levels[-1], kind) for kind in (cv2.MOTION_EUCLIDEAN, cv2.MOTION_HOMOGRAPHY)]
     for level, kind in steps:
-        found = _maximised(level, start, mapping, kind, step_px)
+        found = _maximised(level, start, mapping, kind)
         if found is None:
             break
         mapping = found
@@ -324,11 +322,11 @@ def _mappings(start: Registered, guess: Array, levels: list[_Level], step_px: in
             yield mapping
 
 
-def _maximised(level: _Level, start: Registered, mapping: Array, kind: int, step_px: int) -> Array | None:
+def _maximised(level: _Level, start: Registered, mapping: Array, kind: int) -> Array | None:
     """ECC from a mapping, both in px of the full image; ``None`` where it does not converge."""
     import cv2
 
-    moved, weights = level.moved(start.shift_px, step_px)
+    moved, weights = level.moved(start.shift_px)
     tells = (weights > _LIMITS.tells).astype(np.uint8)
     scale = _centred_scale(level.scale)
     small = scale @ mapping @ np.linalg.inv(scale)

@@ -7,6 +7,7 @@ one brightness and in one geometry; the short one's geometry stays, because it i
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -113,30 +114,19 @@ def match_brightness(short: AnyArray, long: AnyArray, *, stated: float | None = 
         raise ValueError(f"the short exposure has shape {short.shape}, the long one {long.shape}")
     if stated is not None and not stated > 0:
         raise ValueError(f"stated must be above 0, not {stated}")
-    cell = max(BRIGHTNESS_LIMITS.least_cell_px, max(short.shape[:2]) // BRIGHTNESS_LIMITS.cells_along)
-    dark, bright = (image.reshape(*image.shape[:2], -1) for image in (short, long))
-    found = [_channel_gain(dark[..., c], bright[..., c], cell) for c in range(dark.shape[2])]
-    telling = np.array([np.log(gain) for gain in found if gain is not None])
-    middle = float(np.median(telling)) if len(telling) else None
+    gains, middle = _channel_gains(short, long, _aligned_gain)
     measured = None if middle is None else float(np.exp(middle))
-    if measured is None and stated is None:
+    gain = _believed_gain(stated, measured, BRIGHTNESS_LIMITS.agree_factor)
+    if gain is None:
         raise NotObservableError(
             "the gain between short and long exposure",
             "too little of the pictures is neither black in the short nor clipped in the long one; give the exposure "
             "times and sensitivities",
         )
-    agrees = measured is None or (
-        stated is not None and abs(np.log(measured / stated)) <= np.log(BRIGHTNESS_LIMITS.agree_factor)
-    )
-    gain = stated if stated is not None and agrees else measured
-    assert gain is not None
     limit = np.log(BRIGHTNESS_LIMITS.most_colour)
-    colours = [0.0 if g is None or middle is None else np.clip(np.log(g) - middle, -limit, limit) for g in found]
+    colours = [0.0 if g is None or middle is None else np.clip(np.log(g) - middle, -limit, limit) for g in gains]
     return Brightness(
-        gain=float(np.clip(gain, 1 / BRIGHTNESS_LIMITS.most_gain, BRIGHTNESS_LIMITS.most_gain)),
-        colours=tuple(float(np.exp(c)) for c in colours),
-        measured=measured,
-        stated=stated,
+        gain=_clipped_gain(gain), colours=tuple(float(np.exp(c)) for c in colours), measured=measured, stated=stated
     )
 
 
@@ -147,25 +137,12 @@ def first_brightness(short: AnyArray, long: AnyArray, *, stated: float | None = 
     is taken where that agrees to a factor of two or tells nothing. Parameters and errors are those of
     :func:`match_brightness`, which is exact where the images are aligned.
     """
-    cell = max(BRIGHTNESS_LIMITS.least_cell_px, max(short.shape[:2]) // BRIGHTNESS_LIMITS.cells_along)
-    dark, bright = (image.reshape(*image.shape[:2], -1) for image in (short, long))
-    found = [_ranked_gain(dark[..., c], bright[..., c], cell) for c in range(dark.shape[2])]
-    telling = np.array([np.log(gain) for gain in found if gain is not None])
-    measured = float(np.exp(np.median(telling))) if len(telling) else None
-    if stated is not None and (
-        measured is None or abs(np.log(measured / stated)) <= np.log(BRIGHTNESS_LIMITS.agree_unaligned_factor)
-    ):
-        gain = stated
-    elif measured is not None:
-        gain = measured
-    else:
+    gains, middle = _channel_gains(short, long, _ranked_gain)
+    measured = None if middle is None else float(np.exp(middle))
+    gain = _believed_gain(stated, measured, BRIGHTNESS_LIMITS.agree_unaligned_factor)
+    if gain is None:
         return match_brightness(short, long, stated=stated)
-    return Brightness(
-        gain=float(np.clip(gain, 1 / BRIGHTNESS_LIMITS.most_gain, BRIGHTNESS_LIMITS.most_gain)),
-        colours=(1.0,) * dark.shape[2],
-        measured=measured,
-        stated=stated,
-    )
+    return Brightness(gain=_clipped_gain(gain), colours=(1.0,) * len(gains), measured=measured, stated=stated)
 
 
 def brightened(short: AnyArray, brightness: Brightness) -> Float32Array:
@@ -333,7 +310,7 @@ def bring_together(
     clipped = clipped if clipped.ndim == 2 else clipped.any(axis=2)
     bright = np.asarray(long.astype(np.float32) / np.float32(top))
     registered = register(
-        _grey(brightened(short, brightness)), _grey(bright), clipped, start_px=shift, step_px=_STEP_PX
+        to_mean(brightened(short, brightness)), to_mean(bright), clipped, start_px=shift, step_px=_STEP_PX
     )
     blur = None
     if gyro is not None and shift is not None:
@@ -364,41 +341,69 @@ def bring_together(
     )
 
 
-def _channel_gain(short: AnyArray, long: AnyArray, cell: int) -> float | None:
-    """Weighted median over squares of one channel; ``None`` where too few tell."""
-    (dark, *of_short), (bright, *of_long) = _squares(short, cell), _squares(long, cell)
+def _believed_gain(stated: float | None, measured: float | None, factor: float) -> float | None:
+    """What is stated, where the pixels agree with it to a factor or tell nothing; what they tell otherwise."""
+    if stated is not None and (measured is None or abs(np.log(measured / stated)) <= np.log(factor)):
+        return stated
+    return measured
+
+
+def _clipped_gain(gain: float) -> float:
+    return float(np.clip(gain, 1 / BRIGHTNESS_LIMITS.most_gain, BRIGHTNESS_LIMITS.most_gain))
+
+
+#: Mean light of one channel's squares, and which share of them clips and is black.
+_Squares = tuple[Array, Array, Array]
+
+
+def _channel_gains(
+    short: AnyArray, long: AnyArray, gain_of: Callable[[_Squares, _Squares], float | None]
+) -> tuple[list[float | None], float | None]:
+    """The gain of each channel, ``None`` where too few squares tell, and the logarithm of their median."""
+    cell = max(BRIGHTNESS_LIMITS.least_cell_px, max(short.shape[:2]) // BRIGHTNESS_LIMITS.cells_along)
+    dark, bright = (image.reshape(*image.shape[:2], -1) for image in (short, long))
+    gains = [gain_of(_squares(dark[..., c], cell), _squares(bright[..., c], cell)) for c in range(dark.shape[2])]
+    telling = [np.log(gain) for gain in gains if gain is not None]
+    return gains, float(np.median(telling)) if telling else None
+
+
+def _aligned_gain(short: _Squares, long: _Squares) -> float | None:
+    """Weighted median over squares of one channel that neither clip nor sink into black."""
+    (dark, *of_short), (bright, *of_long) = short, long
     clipped, black = zip(of_short, of_long, strict=True)
     good = (np.maximum(*clipped) <= BRIGHTNESS_LIMITS.most_clipped) & (dark > 0) & (bright > 0)
     blackness = np.maximum(*black)
     ranked = np.sort(blackness[good])[: 2 * BRIGHTNESS_LIMITS.least_cells]
-    good &= blackness <= max(
-        BRIGHTNESS_LIMITS.most_black, min(ranked[-1], BRIGHTNESS_LIMITS.blackest) if len(ranked) else 0.0
-    )
-    if np.count_nonzero(good) < BRIGHTNESS_LIMITS.least_cells:
-        return None
-    # by the light of both: that of one alone would prefer squares in which a shift between them makes it the brighter
-    return float(np.exp(_weighted_median(np.log(bright[good] / dark[good]), np.sqrt(bright[good] * dark[good]))))
+    blackest = min(ranked[-1], BRIGHTNESS_LIMITS.blackest) if len(ranked) else 0.0
+    good &= blackness <= max(BRIGHTNESS_LIMITS.most_black, blackest)
+    return _median_gain(dark[good], bright[good])
 
 
-def _ranked_gain(short: AnyArray, long: AnyArray, cell: int) -> float | None:
+def _ranked_gain(short: _Squares, long: _Squares) -> float | None:
     """Likewise of squares of the same rank in brightness, between those that are black and those that clip."""
-    (dark, *of_short), (bright, *of_long) = _squares(short, cell), _squares(long, cell)
+    (dark, *of_short), (bright, *of_long) = short, long
     clipped, black = (
         max(float((of_one[k] > most).mean()) for of_one in (of_short, of_long))
         for k, most in ((0, BRIGHTNESS_LIMITS.clipped_square), (1, BRIGHTNESS_LIMITS.blackest))
     )
-    first, end = int(np.ceil(black * dark.size)), int((1 - clipped) * dark.size)
-    if end - first < BRIGHTNESS_LIMITS.least_cells:
-        return None
-    a, b = np.sort(dark.ravel())[first:end], np.sort(bright.ravel())[first:end]
+    inner = slice(int(np.ceil(black * dark.size)), int((1 - clipped) * dark.size))
+    a, b = np.sort(dark.ravel())[inner], np.sort(bright.ravel())[inner]
     good = (a > 0) & (b > 0)
-    if np.count_nonzero(good) < BRIGHTNESS_LIMITS.least_cells:
+    return _median_gain(a[good], b[good])
+
+
+def _median_gain(dark: Array, bright: Array) -> float | None:
+    """The median ratio, weighted by the light of both: that of one alone would prefer squares in which a shift between
+    the images makes it the brighter; ``None`` of too few squares."""
+    if len(dark) < BRIGHTNESS_LIMITS.least_cells:
         return None
-    return float(np.exp(_weighted_median(np.log(b[good] / a[good]), np.sqrt(a[good] * b[good]))))
+    ratios, weights = np.log(bright / dark), np.sqrt(bright * dark)
+    order = np.argsort(ratios)
+    below = np.cumsum(weights[order])
+    return float(np.exp(ratios[order][np.searchsorted(below, 0.5 * below[-1])]))
 
 
-def _squares(image: AnyArray, cell: int) -> tuple[Array, Array, Array]:
-    """Mean light of one channel's squares, and which share of them clips and is black."""
+def _squares(image: AnyArray, cell: int) -> _Squares:
     import cv2
 
     height, width = image.shape
@@ -416,13 +421,8 @@ def _squares(image: AnyArray, cell: int) -> tuple[Array, Array, Array]:
     )
 
 
-def _weighted_median(values: Array, weights: Array) -> float:
-    order = np.argsort(values)
-    below = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(below, 0.5 * below[-1])])
-
-
-def _grey(image: Float32Array) -> Float32Array:
+def to_mean(image: Float32Array) -> Float32Array:
+    """(H, W) mean of the channels."""
     return image if image.ndim == 2 else np.asarray(image.mean(axis=2), dtype=np.float32)
 
 

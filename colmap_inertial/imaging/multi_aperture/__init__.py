@@ -4,26 +4,16 @@
 :func:`fuse_with` are its two halves; :func:`refocus` blurs what lies off a plane.
 """
 
-from colmap_inertial.imaging.multi_aperture._geometry import Rectified, rectify
-from colmap_inertial.imaging.multi_aperture.disparity import Disparity, estimate_disparity
-from colmap_inertial.imaging.multi_aperture.fusion import (
-    Fused,
-    fuse_apertures,
-    fuse_with,
-    plane_of,
-    require_colours,
+from colmap_inertial.imaging.multi_aperture._geometry import Rectified as Rectified, rectify as rectify
+from colmap_inertial.imaging.multi_aperture.disparity import (
+    Disparity as Disparity,
+    estimate_disparity as estimate_disparity,
 )
-from colmap_inertial.imaging.multi_aperture.refocus import refocus
-
-__all__ = [
-    "Disparity",
-    "Fused",
-    "Rectified",
-    "estimate_disparity",
-    "fuse_apertures",
-    "fuse_with",
-    "plane_of",
-    "rectify",
-    "refocus",
-    "require_colours",
-]
+from colmap_inertial.imaging.multi_aperture.fusion import (
+    Fused as Fused,
+    fuse_apertures as fuse_apertures,
+    fuse_with as fuse_with,
+    plane_of as plane_of,
+    require_colours as require_colours,
+)
+from colmap_inertial.imaging.multi_aperture.refocus import refocus as refocus
