@@ -39,6 +39,7 @@ import imaging_cost
 import imaging_metrics as metrics
 import imaging_shutter
 import numpy as np
+from gated_deblur import deblur_gated
 from imaging_metrics import Features, correct_matches, extract, psnr_db, repeatability, ssim
 from imaging_scenes import Pair, drawn_walls, make_pairs, native_walls, photographed_walls, photographs
 from imaging_tables import print_report
@@ -49,7 +50,7 @@ from colmap_inertial.core.arrays import Float32Array, UInt8Array
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath
 from colmap_inertial.imaging.evidence import blur_evidence
-from colmap_inertial.imaging.gate import GateOptions, RecordingVerdict, deblur_gated, judge_frame, judge_recording
+from colmap_inertial.imaging.gate import GateOptions, RecordingVerdict, judge_frame, judge_recording
 from colmap_inertial.imaging.path_filters import half_quadratic, path_wiener
 from colmap_inertial.imaging.wiener import deblur
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import imaging_baselines as baselines
 import numpy as np
+from gated_deblur import deblur_gated
 from imaging_metrics import extract
 from imaging_scenes import Pair
 
@@ -16,7 +17,7 @@ from colmap_inertial.core.arrays import AnyArray, UInt8Array
 from colmap_inertial.imaging import wiener
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.evidence import blur_evidence
-from colmap_inertial.imaging.gate import deblur_gated, judge_recording
+from colmap_inertial.imaging.gate import judge_recording
 from colmap_inertial.imaging.transfer import decode_table
 from colmap_inertial.imaging.wiener import DeblurOptions, deblur
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from bench_imaging import features_of, flat, measured, summed, verdict_on, with_short_exposure
+from gated_deblur import GatedFrame, deblur_gated
 from imaging_metrics import correct_matches
 from imaging_scenes import GyroErrors, Pair
 from rich.console import Console
@@ -15,7 +16,7 @@ from rich.progress import track
 
 from colmap_inertial.core.arrays import UInt8Array
 from colmap_inertial.imaging.blur_field import BlurField
-from colmap_inertial.imaging.gate import GatedFrame, RecordingVerdict, deblur_gated
+from colmap_inertial.imaging.gate import RecordingVerdict
 
 #: By name; each undoes the blur of a frame.
 Ways = Mapping[str, Callable[[UInt8Array, BlurField], UInt8Array]]

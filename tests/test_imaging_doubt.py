@@ -1,6 +1,8 @@
 """How wrong the blur may be follows from what is known of the gyroscope, and the filter and the gate know it."""
 
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,13 +14,16 @@ from colmap_inertial.core.geometry import quat_exp, quat_multiply
 from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath, middles
-from colmap_inertial.imaging.gate import GATE_LIMITS, RecordingVerdict, deblur_gated
+from colmap_inertial.imaging.gate import GATE_LIMITS, RecordingVerdict
 from colmap_inertial.imaging.gyro_camera import MOST_BIAS_RAD_S, FrameShutter, MotionErrors
 from colmap_inertial.imaging.path_filters import path_wiener
 from colmap_inertial.imaging.psf import blur_field, blur_path
 from colmap_inertial.imaging.transfer import srgb_from_linear
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.tools.simulate.render import colmap_camera
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
+from gated_deblur import deblur_gated
 
 CAMERA = colmap_camera(PINHOLE)
 SHUTTER = FrameShutter(width=640, height=480, t_s=2.4, exposure_s=0.03, readout_s=0.0)

@@ -1,7 +1,9 @@
 """Nothing that is sharp gets worse, and what is blurred is still deblurred."""
 
+import sys
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -19,7 +21,6 @@ from colmap_inertial.imaging.gate import (
     GATE_LIMITS,
     GateOptions,
     RecordingVerdict,
-    deblur_gated,
     decide,
     judge_frame,
     judge_recording,
@@ -29,6 +30,9 @@ from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.psf import PredictedBlur, blur_field
 from colmap_inertial.imaging.rolling_shutter import rectify_keypoints
 from colmap_inertial.tools.simulate.render import colmap_camera
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
+from gated_deblur import deblur_gated
 
 WIDTH, HEIGHT = 800, 450
 LENS = CameraModel(

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from references.path_filters import filter_reference, noise_reference
+from references.path_filters import filter_reference, noise_reference, shares_of, sources_of
 
 from colmap_inertial._kernels import _path
 from colmap_inertial.imaging import path_filters
@@ -123,9 +123,9 @@ def test_tiles_add_up_to_one_wherever_there_is_image(extent_px):
         assert (count - 1) * tiling.hop + tiling.ramp < size or count == 1  # none too many
         total = np.zeros((count - 1) * tiling.hop + tiling.side)
         for k in range(count):
-            total[k * tiling.hop : k * tiling.hop + tiling.side] += tiling.shares(k, count)
+            total[k * tiling.hop : k * tiling.hop + tiling.side] += shares_of(tiling, k, count)
         np.testing.assert_allclose(total[tiling.before : tiling.before + size], 1, atol=1e-6)
-    rows, columns = tiling.sources()
+    rows, columns = sources_of(tiling)
     np.testing.assert_array_equal(rows[tiling.before - 2 : tiling.before + 335], [2, 1, *range(333), 331, 330])
 
 

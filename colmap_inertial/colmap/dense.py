@@ -12,6 +12,7 @@ import os
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -217,22 +218,26 @@ def _densify(
         return result
     if options.mesh == "tsdf":
         depends: dict[str, object] = {"maps": maps}
-
-        def surface(partial: Sequence[Path]) -> None:
-            tsdf_mesh(folder, mapped, partial[0], maker=maker, kind=kind)
+        make_mesh = partial(tsdf_mesh, folder, mapped, maker=maker, kind=kind)
     else:
-        poisson = pycolmap.PoissonMeshingOptions()
-        poisson.num_threads = num_threads
-        poisson.depth, poisson.trim = _octree(fused, read_model(folder / "sparse"))
-        depends = {"depth": poisson.depth, "trim": poisson.trim}
-
-        def surface(partial: Sequence[Path]) -> None:
-            pycolmap.poisson_meshing(str(fused), str(partial[0]), poisson)
-            if not partial[0].is_file():
-                raise OutputError(f"{mesh}: COLMAP wrote no mesh; is the disk full?")
-
-    runner.run(f"dense_{index}_mesh", depends, [mesh], surface, after=[f"dense_{index}_fused"])
+        depth, trim = _octree(fused, read_model(folder / "sparse"))
+        depends = {"depth": depth, "trim": trim}
+        make_mesh = partial(_poisson_mesh, fused, depth=depth, trim=trim, num_threads=num_threads)
+    runner.run(
+        f"dense_{index}_mesh", depends, [mesh], lambda outputs: make_mesh(outputs[0]), after=[f"dense_{index}_fused"]
+    )
     return replace(result, mesh=mesh, faces=_count(mesh, "face"))
+
+
+def _poisson_mesh(fused: Path, target: Path, *, depth: int, trim: float, num_threads: int) -> None:
+    """Write COLMAP's Poisson surface of a point cloud."""
+    import pycolmap
+
+    poisson = pycolmap.PoissonMeshingOptions()
+    poisson.depth, poisson.trim, poisson.num_threads = depth, trim, num_threads
+    pycolmap.poisson_meshing(str(fused), str(target), poisson)
+    if not target.is_file():
+        raise OutputError(f"{fused.parent}: COLMAP wrote no mesh; is the disk full?")
 
 
 def _prepare(session: Session, index: int, images: Path, options: DenseOptions) -> _Prepared:

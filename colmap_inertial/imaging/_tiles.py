@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from colmap_inertial.core.arrays import Array, Float32Array, Int32Array
+from colmap_inertial.core.arrays import Array, Float32Array
 from colmap_inertial.imaging._bilinear import bilinear
 from colmap_inertial.imaging.blur_path import BlurPath
 
@@ -122,30 +122,11 @@ class Tiling:
     def window_out(self) -> Float32Array:
         """(side,) shares of a tile in the result; those of neighbours add up to one.
 
-        Of the first tile the half before its middle counts in full, of the last one that behind it (:meth:`shares`).
+        Of the first tile the half before its middle counts in full, of the last one that behind it.
         """
         rise = np.sin(0.5 * np.pi * (np.arange(self.ramp) + 0.5) / self.ramp) ** 2
         flat = np.ones(self.side // 2 - self.margin - self.ramp)
         return self._mirrored(np.concatenate([np.zeros(self.margin), rise, flat]))
-
-    def shares(self, place: int, count: int) -> Float32Array:
-        """(side,) shares of one of several tiles in a row: beyond both ends there is nothing to blend with."""
-        out = self.window_out()
-        if place == 0:
-            out[: self.side // 2] = 1
-        if place == count - 1:
-            out[self.side // 2 :] = 1
-        return out
-
-    def sources(self) -> tuple[Int32Array, Int32Array]:
-        """Rows and columns of the image that those of the tiled area show: mirrored about its border pixels."""
-        out = []
-        for n, size in zip(self.count, (self.height, self.width), strict=True):
-            at = np.abs(np.arange((n - 1) * self.hop + self.side) - self.before)
-            period = max(1, 2 * (size - 1))
-            at = at % period
-            out.append(np.minimum(at, period - at).astype(np.int32) if size > 1 else np.zeros(len(at), np.int32))
-        return out[0], out[1]
 
     @staticmethod
     def _mirrored(half: Array) -> Float32Array:

@@ -15,12 +15,11 @@ from typing import Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_inertial.core.arrays import Array, BoolArray, Float32Array, UInt8Array, UInt16Array
+from colmap_inertial.core.arrays import Array, BoolArray, Float32Array
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath
 from colmap_inertial.imaging.evidence import BlurEvidence, blur_evidence, shown_share
 from colmap_inertial.imaging.gyro_camera import GyroCamera
-from colmap_inertial.imaging.path_filters import path_wiener
 from colmap_inertial.imaging.psf import PredictedBlur
 from colmap_inertial.imaging.tracking import to_grey
 
@@ -151,66 +150,6 @@ def _droppable(
         if right < len(px):
             before[right] = left
     return ~stays
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class GatedFrame:
-    """A frame that went through the gate.
-
-    Attributes
-    ----------
-    image
-        Deblurred, or the very array that came in.
-    deblurred
-        Whether any pixel was changed on purpose.
-    kept_share
-        Share of the image that keeps its pixels because it was sharp already.
-    extent_factor
-        What the predicted extents were multiplied by, to agree with the images.
-    reason
-        In words.
-    """
-
-    image: UInt8Array | UInt16Array
-    deblurred: bool
-    kept_share: float
-    extent_factor: float
-    reason: str
-
-
-def deblur_gated(
-    image: NDArray[Code],
-    blur: BlurField,
-    *,
-    recording: RecordingVerdict | None = None,
-    deblur: Callable[[NDArray[Code], BlurField], NDArray[Code]] | None = None,
-    options: GateOptions | None = None,
-) -> GatedFrame:
-    """Deblur a frame where the image bears it out, and only there.
-
-    Parameters
-    ----------
-    image
-        (H, W) or (H, W, 3), sRGB.
-    blur
-        Predicted by the gyroscope.
-    recording
-        What its frames say together (:func:`judge_recording`). Without it, only frames that show the blur clearly by
-        themselves are deblurred.
-    deblur
-        ``path_wiener`` along the field's lines by default.
-    options
-        Thresholds.
-    """
-    options = options or GateOptions()
-    factor, reason = judge_frame(image, blur, recording, options)
-    if factor is None:
-        return GatedFrame(image=image, deblurred=False, kept_share=1.0, extent_factor=1.0, reason=reason)
-    if factor != 1.0:
-        blur = blur.times(factor)
-    restored = path_wiener(image, BlurPath.straight(blur)) if deblur is None else deblur(image, blur)
-    out, kept = keep_sharp(image, restored, blur)
-    return GatedFrame(image=out, deblurred=True, kept_share=kept, extent_factor=factor, reason=reason)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -355,9 +294,25 @@ def judge_frame(
     options: GateOptions,
     path: BlurPath | None = None,
 ) -> tuple[float | None, str]:
-    """The factor for the extents, or ``None`` for a frame to leave alone; and why.
+    """Whether an image bears out its blur.
 
-    Arguments as of `deblur_gated`; ``path`` is the curve of which ``blur`` is the chord, where it is known.
+    Parameters
+    ----------
+    image
+        (H, W) or (H, W, 3), sRGB.
+    blur
+        Predicted by the gyroscope.
+    recording
+        What its frames say together (:func:`judge_recording`). Without it, only frames that show the blur clearly by
+        themselves are deblurred.
+    options
+        Thresholds.
+    path
+        The curve of which ``blur`` is the chord, where it is known.
+
+    Returns
+    -------
+    The factor for the extents, or ``None`` for a frame to leave alone; and why.
     """
     if recording is not None and recording.trusted is False:
         return None, recording.reason

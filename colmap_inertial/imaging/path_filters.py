@@ -19,7 +19,7 @@ from colmap_inertial.imaging._cells import Cells
 from colmap_inertial.imaging._tiles import TILING, Tiling
 from colmap_inertial.imaging.blur_path import BlurPath
 from colmap_inertial.imaging.transfer import ENCODE_STEPS, decode_table, encode_table, srgb_from_linear
-from colmap_inertial.imaging.wiener import LONGEST_PX, DeblurOptions, saturated_code
+from colmap_inertial.imaging.wiener import DeblurOptions, require_planes, saturated_code
 
 Code = TypeVar("Code", np.uint8, np.uint16)
 
@@ -215,18 +215,11 @@ def _filtered(
 ) -> NDArray[Code]:
     from colmap_inertial._kernels import _wiener
 
-    if image.dtype not in (np.uint8, np.uint16) or image.ndim not in (2, 3) or 0 in image.shape:
-        raise ValueError(f"image: (H, W) or (H, W, channels) of uint8 or uint16, not {image.shape} of {image.dtype}")
-    height, width = image.shape[:2]
-    if (height, width) != (path.height, path.width):
-        raise ValueError(f"path: for {path.width} x {path.height} px, the image has {width} x {height}")
     extent_px = path.extent_px()
-    if extent_px > LONGEST_PX:
-        raise ValueError(f"path: {extent_px:.0f} px long; at most {LONGEST_PX:.0f} can be undone")
+    planes = require_planes(image, path, "path", extent_px)
     threads = options.threads or 0
-    tiling = Tiling.covering(width, height, extent_px)
+    tiling = Tiling.covering(path.width, path.height, extent_px)
     paths = tiling.paths(path)
-    planes = np.ascontiguousarray(image).reshape(height, width, -1)
     light = _light(planes).reshape(planes.shape)
     channels = planes.shape[2]
     if options.noise is None:

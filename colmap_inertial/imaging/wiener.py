@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from colmap_inertial.imaging._cells import Cells
 from colmap_inertial.imaging._taps import STEPS_PER_PX, Prior, TapTable, smoothing_px
 from colmap_inertial.imaging.blur_field import BlurField
+from colmap_inertial.imaging.blur_path import BlurPath
 from colmap_inertial.imaging.transfer import decode_table, encode_table
 
 Code = TypeVar("Code", np.uint8, np.uint16)
@@ -97,18 +98,24 @@ def estimate_noise(image: NDArray[Code], axis: Literal["x", "y"]) -> float:
 
 def _prepare(image: NDArray[Code], blur: BlurField, options: DeblurOptions) -> tuple[NDArray[Code], Cells, float]:
     """The image as (H, W, channels), its cells, and its noise."""
+    cells = Cells.of(blur)
+    planes = require_planes(image, blur, "blur", float(cells.extent_px.max()))
+    noise = options.noise
+    if noise is None:
+        noise = estimate_noise(image, "y" if cells.along_y.mean() > 0.5 else "x")
+    return planes, cells, noise
+
+
+def require_planes(image: NDArray[Code], blur: BlurField | BlurPath, name: str, extent_px: float) -> NDArray[Code]:
+    """The image as (H, W, channels); ``ValueError`` where it or its blur (``name``) is not one that can be undone."""
     if image.dtype not in (np.uint8, np.uint16) or image.ndim not in (2, 3) or 0 in image.shape:
         raise ValueError(f"image: (H, W) or (H, W, channels) of uint8 or uint16, not {image.shape} of {image.dtype}")
     height, width = image.shape[:2]
     if (height, width) != (blur.height, blur.width):
-        raise ValueError(f"blur: for {blur.width} x {blur.height} px, the image has {width} x {height}")
-    cells = Cells.of(blur)
-    if cells.extent_px.max() > LONGEST_PX:
-        raise ValueError(f"blur: {cells.extent_px.max():.0f} px long; at most {LONGEST_PX:.0f} can be undone")
-    noise = options.noise
-    if noise is None:
-        noise = estimate_noise(image, "y" if cells.along_y.mean() > 0.5 else "x")
-    return np.ascontiguousarray(image).reshape(height, width, -1), cells, noise
+        raise ValueError(f"{name}: for {blur.width} x {blur.height} px, the image has {width} x {height}")
+    if extent_px > LONGEST_PX:
+        raise ValueError(f"{name}: {extent_px:.0f} px long; at most {LONGEST_PX:.0f} can be undone")
+    return np.ascontiguousarray(image).reshape(height, width, -1)
 
 
 def _table(cells: Cells, noise: float) -> TapTable:

@@ -11,7 +11,6 @@ without (Karpenko et al., "Digital Video Stabilization and Rolling Shutter Corre
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -120,10 +119,10 @@ def estimate_readout(rotation: VisualRotation, motion: GyroCamera) -> ReadoutEst
     """
     seen = _seen(rotation, motion)
     _require_change(seen, motion)
-    fit = _fitted(seen, motion)
-    sigma = np.sqrt(np.diagonal(fit.cov)[:2] + _LIMITS.floor_s**2 + (_LIMITS.floor_share * fit.params[:2]) ** 2)
-    along, beside = (0, 1) if abs(fit.params[0]) >= abs(fit.params[1]) else (1, 0)
-    readout_s, sigma_s = float(fit.params[along]), float(sigma[along])
+    params, cov = _fitted(seen, motion)
+    sigma = np.sqrt(np.diagonal(cov)[:2] + _LIMITS.floor_s**2 + (_LIMITS.floor_share * params[:2]) ** 2)
+    along, beside = (0, 1) if abs(params[0]) >= abs(params[1]) else (1, 0)
+    readout_s, sigma_s = float(params[along]), float(sigma[along])
     if abs(readout_s) < _LIMITS.clear_sigmas * sigma_s:
         # of a shutter that is not seen nobody knows how its lines run
         readout_s, sigma_s, along, beside = 0.0, float(sigma.max()), 0, 1
@@ -133,7 +132,7 @@ def estimate_readout(rotation: VisualRotation, motion: GyroCamera) -> ReadoutEst
             f"the pictures tell the readout to +-{1e3 * sigma_s:.1f} ms only: turn the camera quickly to and fro for "
             "some seconds",
         )
-    if abs(fit.params[beside]) > max(_LIMITS.clear_sigmas * sigma[beside], _LIMITS.beside_share * abs(readout_s)):
+    if abs(params[beside]) > max(_LIMITS.clear_sigmas * sigma[beside], _LIMITS.beside_share * abs(readout_s)):
         raise NotObservableError(
             "readout",
             "what bends the pictures runs neither along nor across their lines: they were warped, turned or stabilised",
@@ -216,14 +215,8 @@ def _require_change(seen: _Seen, motion: GyroCamera) -> None:
         )
 
 
-class _Fit(NamedTuple):
-    """Readout down and across, clock offset, axes, bias, focal length (as a logarithm), and their covariance."""
-
-    params: Array
-    cov: Array
-
-
-def _fitted(seen: _Seen, motion: GyroCamera) -> _Fit:
+def _fitted(seen: _Seen, motion: GyroCamera) -> tuple[Array, Array]:
+    """(10,) readout down and across, clock offset, axes, bias and logarithm of the focal length; their covariance."""
     sigmas = np.array(
         [
             _LIMITS.readout_sigma_s,
@@ -239,16 +232,16 @@ def _fitted(seen: _Seen, motion: GyroCamera) -> _Fit:
     moved = np.zeros((len(seen.begins), 3))
     for _ in range(_LIMITS.most_rounds):
         off, by_params, by_moved = _residuals(seen, motion, params, moved)
-        weight = _weights(off, by_moved, moved, seen)
+        inverse, robust = _weights(off, by_moved, moved, seen)
         # what a corner's depth is, as far as it shows: the flow of a pair's translation is that much stronger
         flow = np.einsum("nij,nj->ni", by_moved, moved[seen.pair])
         depth = np.clip(
-            1 + _LIMITS.depth_scatter**2 * np.einsum("ni,nij,nj->n", flow, weight.inverse, off),
+            1 + _LIMITS.depth_scatter**2 * np.einsum("ni,nij,nj->n", flow, inverse, off),
             0,
             1 + _LIMITS.depth_scatter,
         )
         slope = depth[:, None, None] * by_moved
-        weighed = weight.robust[:, None, None] * weight.inverse
+        weighed = robust[:, None, None] * inverse
         square = seen.sums(np.swapaxes(slope, 1, 2) @ weighed @ slope) + _LIMITS.translation_sigma**-2 * np.eye(3)
         mixed = seen.sums(np.swapaxes(slope, 1, 2) @ weighed @ by_params)
         own = seen.sums(np.einsum("nij,nik,nk->nj", slope, weighed, off)) - _LIMITS.translation_sigma**-2 * moved
@@ -266,7 +259,7 @@ def _fitted(seen: _Seen, motion: GyroCamera) -> _Fit:
     parts = min(_LIMITS.parts, len(scores) // _LIMITS.pairs_of_part)
     sums = np.array([part.sum(axis=0) for part in np.array_split(scores, parts)])
     scatter = cov @ (sums.T @ sums) @ cov * parts / (parts - 1)
-    return _Fit(params, np.maximum(np.diagonal(cov), np.diagonal(scatter)) * np.eye(len(cov)))
+    return params, np.maximum(np.diagonal(cov), np.diagonal(scatter)) * np.eye(len(cov))
 
 
 def _residuals(seen: _Seen, motion: GyroCamera, params: Array, moved: Array) -> tuple[Array, Array, Array]:
@@ -325,14 +318,8 @@ def _shown(point: Array, change: Array) -> Array:
     return np.asarray((change[:, :2] - (point[:, :2] / point[:, 2:])[:, :, None] * change[:, 2:]) / point[:, 2:, None])
 
 
-class _Weights(NamedTuple):
+def _weights(off: Array, flow_of: Array, moved: Array, seen: _Seen) -> tuple[Array, Array]:
     """(N, 2, 2) inverse covariances, with unknown depths; (N,) how far each corner is believed."""
-
-    inverse: Array
-    robust: Array
-
-
-def _weights(off: Array, flow_of: Array, moved: Array, seen: _Seen) -> _Weights:
     flow = np.einsum("nij,nj->ni", flow_of, moved[seen.pair])
     length = np.linalg.norm(flow, axis=1)
     along = flow / np.maximum(length, 1e-12)[:, None]
@@ -343,4 +330,4 @@ def _weights(off: Array, flow_of: Array, moved: Array, seen: _Seen) -> _Weights:
     share = _LIMITS.depth_scatter**2 / (sigma**2 + _LIMITS.depth_scatter**2 * length**2)
     inverse = (np.eye(2) - share[:, None, None] * flow[:, :, None] * flow[:, None]) / sigma[:, None, None] ** 2
     square = np.einsum("ni,nij,nj->n", off, inverse, off)
-    return _Weights(inverse, 1 / (1 + square / 2.4**2) ** 2)
+    return inverse, 1 / (1 + square / 2.4**2) ** 2

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from colmap_inertial.core.arrays import AnyArray, Array, BoolArray, ComplexArray, Float32Array
+from colmap_inertial.core.arrays import AnyArray, Array, BoolArray, ComplexArray, Float32Array, Int32Array
 from colmap_inertial.imaging._tiles import Tiling
 from colmap_inertial.imaging.path_filters import (
     FILTER_MODEL,
@@ -26,8 +26,10 @@ def filter_reference(
 ) -> Array:
     """(H, W) linear light without blur, each tile by itself."""
     rows, columns = tiling.count
-    shares = [np.outer(tiling.shares(i, rows), tiling.shares(j, columns)) for i in range(rows) for j in range(columns)]
-    total = np.zeros(tuple(map(len, tiling.sources())))
+    shares = [
+        np.outer(shares_of(tiling, i, rows), shares_of(tiling, j, columns)) for i in range(rows) for j in range(columns)
+    ]
+    total = np.zeros(tuple(map(len, sources_of(tiling))))
     for (tile, mean, path, frequencies, window, place), spread, share in zip(
         tiles(light, tiling, paths), spreads.reshape(-1, 3), shares, strict=True
     ):
@@ -49,9 +51,30 @@ def noise_reference(light: Float32Array, tiling: Tiling, paths: Float32Array) ->
     return np.array(found)
 
 
+def shares_of(tiling: Tiling, place: int, count: int) -> Float32Array:
+    """(side,) shares of one of several tiles in a row: beyond both ends there is nothing to blend with."""
+    out = tiling.window_out()
+    if place == 0:
+        out[: tiling.side // 2] = 1
+    if place == count - 1:
+        out[tiling.side // 2 :] = 1
+    return out
+
+
+def sources_of(tiling: Tiling) -> tuple[Int32Array, Int32Array]:
+    """Rows and columns of the image that those of the tiled area show: mirrored about its border pixels."""
+    out = []
+    for n, size in zip(tiling.count, (tiling.height, tiling.width), strict=True):
+        at = np.abs(np.arange((n - 1) * tiling.hop + tiling.side) - tiling.before)
+        period = max(1, 2 * (size - 1))
+        at = at % period
+        out.append(np.minimum(at, period - at).astype(np.int32) if size > 1 else np.zeros(len(at), np.int32))
+    return out[0], out[1]
+
+
 def tiles(light: Float32Array, tiling: Tiling, paths: Float32Array) -> Iterator[tuple[Any, ...]]:
     """Each tile without its mean and windowed, the mean, the path, what is the same for all, and its place."""
-    rows, columns = tiling.sources()
+    rows, columns = sources_of(tiling)
     window = np.outer(tiling.window_in(), tiling.window_in()).astype(np.float64)
     frequencies = Frequencies.of(tiling.side)
     for i in range(paths.shape[0]):

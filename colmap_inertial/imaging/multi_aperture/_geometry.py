@@ -21,7 +21,7 @@ from colmap_inertial.core.geometry import (
     quat_rotate,
     rotation_between,
 )
-from colmap_inertial.core.types import ApertureRig, Projector
+from colmap_inertial.core.types import ApertureRig, CameraModel, Projector
 from colmap_inertial.imaging.rolling_shutter import rays
 
 #: The canvas is at most this much larger than the reference's image: strong fisheyes lose their rim.
@@ -182,57 +182,72 @@ def rectify(rig: ApertureRig, projectors: Sequence[Projector]) -> Rectified:
 
     camera = reference.camera
     focal = _focal_px(projectors[0], camera.width, camera.height)
-    border = _border(camera.width, camera.height)
-    rays = _rays(projectors[0], border) @ rect_from_ref.T
-    sides = np.array([camera.width, camera.height])
-    seen = np.where(rays[:, 2:] > 0.05, rays[:, :2] / np.maximum(rays[:, 2:], 0.05), np.nan) * focal
-    low, high = np.nanmin(seen, axis=0), np.nanmax(seen, axis=0)
-    middle = focal * (_rays(projectors[0], opencv_px_from_colmap(sides / 2.0)[None]) @ rect_from_ref.T)[0, :2]
-    low, high = np.maximum(low, middle - _LARGEST / 2 * sides), np.minimum(high, middle + _LARGEST / 2 * sides)
-    # a canvas whose pixels are the reference's where nothing is distorted or rotated
-    axis = opencv_px_from_colmap(np.asarray(projectors[0].img_from_cam(np.array([[0.0, 0.0, 1.0]])))[0])
-    start = np.floor(low + axis + 1e-3)
-    size = np.ceil(high + axis - start + 1 - 1e-3).astype(int)
-    centre = axis - start
-    width, height = (int(n) for n in size)
-
-    x, y = np.meshgrid(np.arange(width), np.arange(height))
-    directions = np.stack([(x - centre[0]) / focal, (y - centre[1]) / focal, np.ones_like(x, dtype=float)], axis=-1)
+    width, height, centre = _canvas_extent(camera, projectors[0], rect_from_ref, focal)
+    pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
+    directions = np.concatenate([(pixels - centre) / focal, np.ones((height, width, 1))], axis=-1)
     maps: list[Float32Array | None] = []
     covered = []
     for aperture, projector, rotation in zip(apertures, projectors, rotations, strict=True):
-        in_cam = directions.reshape(-1, 3) @ (rotation @ rect_from_rig.T).T
-        at = np.asarray(projector.img_from_cam(in_cam)).reshape(height, width, 2)
-        at = opencv_px_from_colmap(np.where((in_cam[:, 2] > 0).reshape(height, width, 1), at, np.nan))
+        at = _in_image(projector, directions.reshape(-1, 3) @ (rotation @ rect_from_rig.T).T).reshape(pixels.shape)
         w, h = aperture.camera.width, aperture.camera.height
         inside = (at >= -0.5 - 1e-6).all(axis=-1) & (at[..., 0] <= w - 0.5 + 1e-6) & (at[..., 1] <= h - 0.5 + 1e-6)
         columns, rows = np.flatnonzero(inside.any(axis=0)), np.flatnonzero(inside.any(axis=1))
         if not len(columns):
             raise ValueError(f"{aperture.name} looks elsewhere than {rig.names[0]}: their pictures share nothing")
         covered.append((int(columns[0]), int(columns[-1]), int(rows[0]), int(rows[-1])))
-        still = (w, h) == (width, height) and bool(np.nanmax(np.abs(at - np.stack([x, y], axis=-1))) < _STILL_PX)
+        still = (w, h) == (width, height) and bool(np.nanmax(np.abs(at - pixels)) < _STILL_PX)
         maps.append(None if still else np.where(np.isfinite(at), at, -1e4).astype(np.float32))
     back = factor = None
     if maps[0] is not None:
-        gx, gy = np.meshgrid(np.arange(camera.width, dtype=float), np.arange(camera.height, dtype=float))
-        rays = _rays(projectors[0], np.stack([gx, gy], axis=-1).reshape(-1, 2)) @ rect_from_ref.T
-        with np.errstate(divide="ignore", invalid="ignore"):
-            at = focal * rays[:, :2] / np.where(rays[:, 2:] > 0.05, rays[:, 2:], np.nan) + centre
-        factor = (1 / np.where(rays[:, 2:] > 0.05, rays[:, 2:], np.nan)).reshape(camera.height, camera.width)
-        back = np.nan_to_num(at, nan=-1e4).reshape(camera.height, camera.width, 2).astype(np.float32)
+        back, factor = _from_reference(camera, projectors[0], rect_from_ref, focal, centre)
     return Rectified(
         width=width,
         height=height,
-        focal_px=float(focal),
+        focal_px=focal,
         centre_px=centre,
         rect_from_reference=rect_from_ref,
         baselines=baselines,
         direction=baselines[0, :2] / np.linalg.norm(baselines[0, :2]),
         image_from_canvas=tuple(maps),
         canvas_from_reference=back,
-        depth_factor=None if factor is None else factor.astype(np.float32),
+        depth_factor=factor,
         covered=tuple(covered),
     )
+
+
+def _canvas_extent(
+    camera: CameraModel, projector: Projector, rect_from_ref: Array, focal_px: float
+) -> tuple[int, int, Array]:
+    """Width, height and principal point of the canvas: its pixels are the reference's where nothing is distorted or
+    rotated."""
+    border = _rays(projector, _border(camera.width, camera.height)) @ rect_from_ref.T
+    sides = np.array([camera.width, camera.height])
+    seen = np.where(border[:, 2:] > 0.05, border[:, :2] / np.maximum(border[:, 2:], 0.05), np.nan) * focal_px
+    low, high = np.nanmin(seen, axis=0), np.nanmax(seen, axis=0)
+    middle = focal_px * (_rays(projector, opencv_px_from_colmap(sides / 2.0)[None]) @ rect_from_ref.T)[0, :2]
+    low, high = np.maximum(low, middle - _LARGEST / 2 * sides), np.minimum(high, middle + _LARGEST / 2 * sides)
+    axis = opencv_px_from_colmap(np.asarray(projector.img_from_cam(np.array([[0.0, 0.0, 1.0]])))[0])
+    start = np.floor(low + axis + 1e-3)
+    width, height = np.ceil(high + axis - start + 1 - 1e-3).astype(int).tolist()
+    return width, height, axis - start
+
+
+def _in_image(projector: Projector, in_cam: Array) -> Array:
+    """(N, 2) pixels, centres whole numbers, of (N, 3) directions; nan of those behind the camera."""
+    return opencv_px_from_colmap(np.where(in_cam[:, 2:] > 0, np.asarray(projector.img_from_cam(in_cam)), np.nan))
+
+
+def _from_reference(
+    camera: CameraModel, projector: Projector, rect_from_ref: Array, focal_px: float, centre: Array
+) -> tuple[Float32Array, Float32Array]:
+    """Where the reference's pixels lie on the canvas, and their depth there as a factor of that on the canvas."""
+    pixels = np.stack(np.meshgrid(np.arange(camera.width, dtype=float), np.arange(camera.height, dtype=float)), axis=-1)
+    seen = _rays(projector, pixels.reshape(-1, 2)) @ rect_from_ref.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ahead = np.where(seen[:, 2:] > 0.05, seen[:, 2:], np.nan)
+        at = focal_px * seen[:, :2] / ahead + centre
+    factor = (1 / ahead).reshape(camera.height, camera.width).astype(np.float32)
+    return np.nan_to_num(at, nan=-1e4).reshape(pixels.shape).astype(np.float32), factor
 
 
 def _shrunk_range(first: int, last: int, by: int, size: int) -> tuple[int, int]:
