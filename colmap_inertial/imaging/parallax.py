@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
-from colmap_inertial.core.types import Projector, checked_array
+from colmap_inertial.core.types import Projector
+from colmap_inertial.core.validation import checked_array
 from colmap_inertial.imaging._bilinear import between_nodes
 from colmap_inertial.imaging.blur_field import BlurField, checked_nodes
 
