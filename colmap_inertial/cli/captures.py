@@ -5,13 +5,17 @@ from __future__ import annotations
 import dataclasses
 import os
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from colmap_inertial.cli.screen import Screen
 from colmap_inertial.cli.speech import Reader, Speaker
+from colmap_inertial.cli.terminal import show_deblurred, show_fused, show_reference, show_remembered, show_result
+from colmap_inertial.core.errors import InertialError
 from colmap_inertial.core.options import (
     ApertureOptions,
     BatchOptions,
@@ -45,7 +49,7 @@ class Reconstruct(Speaker):
     """A capture.toml or a folder that holds one; a video or a recorder's folder with the IMU in it (GoPro, phones); an
     EuRoC/ASL dataset; or a COLMAP project. With --scale-from target or distance also pictures or a video without."""
     out: Positional[Path]
-    """A new folder for everything that is made, or that of an earlier run on the same, which is gone on with."""
+    """A new folder for everything that is made, or that of an earlier run on the same capture, which is continued."""
     project: Annotated[ProjectOptions, arg(name="")] = dataclasses.field(default_factory=ProjectOptions)
     reference: Annotated[ReferenceOptions, arg(name="")] = dataclasses.field(default_factory=ReferenceOptions)
     options: Annotated[ReconstructOptions, arg(name="")] = dataclasses.field(default_factory=ReconstructOptions)
@@ -55,7 +59,7 @@ class Reconstruct(Speaker):
     """Take what `align` and `calibrate-imu` remembered of the device, where neither --calibration nor the capture says
     it; never with --deterministic."""
     config: Path | None = None
-    """TOML file with options, as OUT/config.toml of an earlier run; flags given here go before it."""
+    """TOML file with options, as OUT/config.toml of an earlier run; options given here override it."""
 
     @property
     def limits(self) -> ReadLimits:
@@ -65,10 +69,6 @@ class Reconstruct(Speaker):
     def run(self) -> int:
         """Run the command; returns the exit code."""
         from colmap_inertial.checks.diagnose import Diagnosis
-        from colmap_inertial.cli.screen import live_progress
-        from colmap_inertial.cli.terminal import show_remembered, show_result
-        from colmap_inertial.core.errors import InertialError
-        from colmap_inertial.io.files import read_json
         from colmap_inertial.reconstruction.drivers.capture import reconstruct
         from colmap_inertial.reconstruction.drivers.device_store import remembered_of
         from colmap_inertial.reconstruction.drivers.project import is_project, reconstruct_project
@@ -82,7 +82,7 @@ class Reconstruct(Speaker):
             if self.talks:
                 show_remembered(known)
             options = dataclasses.replace(options, calibration=(*options.calibration, *known.paths))
-        with live_progress(self) as screen:
+        with self.progress() as screen:
 
             def findings(diagnosis: Diagnosis) -> None:
                 screen.findings(diagnosis, stops=not options.force)
@@ -98,32 +98,29 @@ class Reconstruct(Speaker):
             code = result.exit_code()
         except InertialError as error:
             code, stopped = error.exit_code, str(error)
-        content = {
-            **read_json(result.workspace.result),
-            "out": self.out,
-            "unchanged": result.unchanged,
-            "exit_code": code,
-            "error": stopped,
-        }
-        self.tell(lambda: show_result(result, self.capture), content)
+        self.tell(
+            lambda: show_result(result, self.capture),
+            result.workspace.result,
+            {"out": self.out, "unchanged": result.unchanged, "exit_code": code, "error": stopped},
+        )
         if stopped is not None:
-            said = "no scale is accepted, for the reasons above" if self.talks and code == 3 else stopped
-            print(f"error: {said}", file=sys.stderr)
+            shown_above = self.talks and code == 3
+            print(
+                f"error: {'no scale is accepted, for the reasons above' if shown_above else stopped}", file=sys.stderr
+            )
         return code
 
     def _by_reference(self) -> int:
-        from colmap_inertial.cli.screen import live_progress
-        from colmap_inertial.cli.terminal import show_reference
         from colmap_inertial.reconstruction.drivers.no_imu import reconstruct_by
         from colmap_inertial.reconstruction.drivers.project import is_project
         from colmap_inertial.reconstruction.drivers.reference import scale_project_by
 
-        with live_progress(self) as screen:
+        with self.progress() as screen:
             if is_project(self.capture):
                 found = scale_project_by(self.capture, self.out, self.reference, self.project, progress=screen)
             else:
                 found = reconstruct_by(self.capture, self.out, self.reference, self.options, progress=screen)
-        self.tell(lambda: show_reference(found), {**found.as_json(), "out": found.out, "exit_code": 0})
+        self.tell(lambda: show_reference(found), found.as_json(), {"out": found.out, "exit_code": 0})
         return 0
 
 
@@ -141,7 +138,7 @@ class Deblur(Reader):
     capture: Positional[Path]
     """A capture.toml, a folder that holds one, or an EuRoC/ASL dataset; it must know the exposure times."""
     out: Positional[Path]
-    """A new folder for everything that is made, or that of an earlier run on the same, which is gone on with."""
+    """A new folder for everything that is made, or that of an earlier run on the same capture, which is continued."""
     method: BlurRemover = "wiener"
     """wiener: a Wiener filter along the path of each pixel. path: along the same path, a filter that expects few and
     strong edges (slower). deepgyro: a network, which also sees what a filter makes of the picture (slower;
@@ -155,13 +152,10 @@ class Deblur(Reader):
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.cli.screen import live_progress
-        from colmap_inertial.cli.terminal import show_deblurred
-        from colmap_inertial.io.files import read_json
         from colmap_inertial.reconstruction.drivers.deblur import deblur_capture
 
         self.check_json(self.capture)
-        with live_progress(self) as progress:
+        with self.progress() as progress:
             result = deblur_capture(
                 self.capture,
                 self.out,
@@ -171,13 +165,27 @@ class Deblur(Reader):
                 sheet=self.sheet,
                 progress=progress,
             )
-        content = {**read_json(result.workspace.result), "out": self.out, "unchanged": result.unchanged}
-        self.tell(lambda: show_deblurred(result), content)
+        self.tell(
+            lambda: show_deblurred(result), result.workspace.result, {"out": self.out, "unchanged": result.unchanged}
+        )
         return 0
 
 
+class Fuser(Reader):
+    """What the commands have in common that make one picture of several."""
+
+    out: Path
+
+    def tell_fused(self, lines: Sequence[str], screen: Screen) -> None:
+        """Say what became of the pictures."""
+        from colmap_inertial.pipeline.run.workspace import Workspace
+
+        result = Workspace(self.out).result
+        self.tell(lambda: show_fused(lines, screen), result, {"out": self.out, "unchanged": screen.unchanged})
+
+
 @dataclass(frozen=True, kw_only=True)
-class FuseApertures(Reader):
+class FuseApertures(Fuser):
     """Make RGB pictures of a multi-aperture camera's sub-images, without reconstructing anything.
 
     One disparity map from all apertures takes their parallax out. Writes OUT/images, seen through the first aperture,
@@ -189,7 +197,7 @@ class FuseApertures(Reader):
     capture: Positional[Path]
     """A capture.toml with [images] and [apertures], or a folder that holds one; no IMU is needed."""
     out: Positional[Path]
-    """A new folder, or that of an earlier run on the same capture, which is gone on with."""
+    """A new folder, or that of an earlier run on the same capture, which is continued."""
     refocus: float | None = None
     """Also write pictures that are sharp at this depth only, in metres."""
     lens_width: float = 1.0
@@ -198,23 +206,18 @@ class FuseApertures(Reader):
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.cli.screen import live_progress
-        from colmap_inertial.cli.terminal import show_fused
-        from colmap_inertial.io.files import read_json
-        from colmap_inertial.pipeline.run.workspace import Workspace
         from colmap_inertial.reconstruction.drivers.fuse_apertures import fuse_captured
 
         options = FuseAperturesOptions(fusion=self.fusion, refocus=self.refocus, lens_width=self.lens_width)
         self.check_json(self.capture)
-        with live_progress(self) as screen:
+        with self.progress() as screen:
             written = fuse_captured(self.capture, self.out, options, progress=screen)
-        content = {**read_json(Workspace(self.out).result), "out": self.out, "unchanged": screen.unchanged}
-        self.tell(lambda: show_fused([f"{len(written)} pictures in {self.out / 'images'}"], screen), content)
+        self.tell_fused([f"{len(written)} pictures in {self.out / 'images'}"], screen)
         return 0
 
 
 @dataclass(frozen=True, kw_only=True)
-class FuseExposures(Reader):
+class FuseExposures(Fuser):
     """Make one clean, sharp picture of each short and long exposure, without reconstructing anything.
 
     The long one is brought to the short one's geometry, by the gyroscope where there is one and by the pixels; a
@@ -227,7 +230,7 @@ class FuseExposures(Reader):
     capture: Positional[Path]
     """A capture.toml with [images] and [exposures], or a folder that holds one; times and an IMU are welcome."""
     out: Positional[Path]
-    """A new folder, or that of an earlier run on the same capture, which is gone on with."""
+    """A new folder, or that of an earlier run on the same capture, which is continued."""
     fusion: Literal["none", "mertens"] = "none"
     """Blend the fused picture with the short exposure, which shows what clips in the long one."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -237,23 +240,17 @@ class FuseExposures(Reader):
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.cli.screen import live_progress
-        from colmap_inertial.cli.terminal import show_fused
-        from colmap_inertial.io.files import read_json
-        from colmap_inertial.pipeline.run.workspace import Workspace
         from colmap_inertial.reconstruction.drivers.fuse_exposures import fuse_exposures_captured
 
         options = ExposureOptions(fusion=self.fusion, device=self.device)
         self.check_json(self.capture)
-        with live_progress(self) as screen:
+        with self.progress() as screen:
             pairs = fuse_exposures_captured(
                 self.capture, self.out, options, calibration=self.calibration, progress=screen
             )
         fused = sum(pair.fused for pair in pairs)
-        said = [f"{fused} of {len(pairs)} pairs fused in {self.out / 'images'}"]
-        said += [f"{pair.name} {pair.reason}" for pair in pairs if not pair.fused]
-        content = {**read_json(Workspace(self.out).result), "out": self.out, "unchanged": screen.unchanged}
-        self.tell(lambda: show_fused(said, screen), content)
+        lines = [f"{fused} of {len(pairs)} pairs fused in {self.out / 'images'}"]
+        self.tell_fused([*lines, *(f"{pair.name} {pair.reason}" for pair in pairs if not pair.fused)], screen)
         return 0
 
 
@@ -279,7 +276,7 @@ class Batch(Speaker):
     """Import and run the stages that the manifest names: they are code that its author chose."""
     options: Annotated[ReconstructOptions, arg(name="")] = dataclasses.field(default_factory=ReconstructOptions)
     config: Path | None = None
-    """TOML file with options for all; flags given here go before it, and what the manifest says before both."""
+    """TOML file with options for all captures; options given here override it, the manifest's override both."""
 
     @property
     def limits(self) -> ReadLimits:
@@ -288,7 +285,6 @@ class Batch(Speaker):
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.io.files import read_json
         from colmap_inertial.tools.batch import run_batch
         from colmap_inertial.tools.batch.terminal import live_batch, show_batch
 
@@ -297,14 +293,9 @@ class Batch(Speaker):
             result = run_batch(
                 self.manifest, self.out, self.options, batch=self.batch, watch=watch, allow_stages=self.allow_stages
             )
-        content = {
-            **read_json(self.out / "summary.json"),
-            "out": self.out,
-            "unchanged": result.unchanged,
-            "exit_code": result.exit_code(),
-        }
-        self.tell(lambda: show_batch(result), content)
-        return result.exit_code()
+        code, file = result.exit_code(), self.out / "summary.json"
+        self.tell(lambda: show_batch(result), file, {"out": self.out, "unchanged": result.unchanged, "exit_code": code})
+        return code
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -323,13 +314,12 @@ class Simulate(Reader):
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.cli.screen import live_progress
         from colmap_inertial.tools.simulate.capture import write_capture
         from colmap_inertial.tools.simulate.recipe import load_recipe
 
         self.check_json(self.recipe)
         recipe = load_recipe(self.recipe)
-        with live_progress(self) as progress:
+        with self.progress() as progress:
             capture = write_capture(
                 recipe, self.out, workers=self.workers, progress=lambda done, total: progress("rendering", done, total)
             )

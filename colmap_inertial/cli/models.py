@@ -10,6 +10,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import Positional, arg
 
 from colmap_inertial.cli.speech import Reader
+from colmap_inertial.cli.terminal import (
+    show_applied,
+    show_calibration,
+    show_diagnosis,
+    show_exported,
+    show_imu_calibration,
+    show_remembered,
+    show_scale,
+    show_validation,
+    show_view,
+)
 from colmap_inertial.core.options import (
     ExportImages,
     ExportProgram,
@@ -21,17 +32,12 @@ from colmap_inertial.core.options import (
 
 if TYPE_CHECKING:
     from colmap_inertial.model.project import Applied
+    from colmap_inertial.reconstruction.drivers.sources import ScaleSource
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scale(Reader):
-    """Metres per unit of an existing model or trajectory, without mapping.
-
-    SOURCE is a COLMAP model folder (needs --imu and --frame-times), a trajectory in TUM format (needs --imu), or an
-    InertialScale folder. Exit code 3 when the recording cannot give a scale; the reasons then say why.
-
-    Example: colmap-inertial scale project/sparse/0 --imu imu.csv --frame-times frames.csv --json scale.json
-    """
+class SourceReader(Reader):
+    """What the commands have in common that read poses of a camera and the IMU that ran along."""
 
     source: Positional[Path]
     """COLMAP model folder, trajectory in TUM format (a text file of t x y z qx qy qz qw), or InertialScale folder (text
@@ -42,6 +48,25 @@ class Scale(Reader):
     """When the images were taken: a CSV with columns name,t_s, or a capture.toml."""
     calibration: tuple[Path, ...] = ()
     """Calibration files of this device: from `align --out`, from `calibrate-imu --out`, or both."""
+
+    def read_from(self, calibration: tuple[Path, ...] | None = None) -> ScaleSource:
+        """Where poses and IMU come from, with these calibrations or those that were given."""
+        from colmap_inertial.reconstruction.drivers.sources import ScaleSource
+
+        files = self.calibration if calibration is None else calibration
+        return ScaleSource(source=self.source, imu=self.imu, frame_times=self.frame_times, calibration=files)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scale(SourceReader):
+    """Metres per unit of an existing model or trajectory, without mapping.
+
+    SOURCE is a COLMAP model folder (needs --imu and --frame-times), a trajectory in TUM format (needs --imu), or an
+    InertialScale folder. Exit code 3 when the recording cannot give a scale; the reasons then say why.
+
+    Example: colmap-inertial scale project/sparse/0 --imu imu.csv --frame-times frames.csv --json scale.json
+    """
+
     first_s: float | None = None
     """Use only this many seconds from the start of the camera's recording."""
     device: str | None = None
@@ -50,7 +75,7 @@ class Scale(Reader):
     """Take what `align` and `calibrate-imu` remembered of the device, where --calibration does not say it."""
     options: Annotated[ScaleOptions, arg(name="")] = dataclasses.field(default_factory=ScaleOptions)
     config: Path | None = None
-    """TOML file as OUT/config.toml of a reconstruction: its [scale] table counts; flags given here go before it."""
+    """TOML file as OUT/config.toml of a reconstruction: its [scale] table counts; options given here override it."""
 
     def __post_init__(self) -> None:
         if self.first_s is not None and not self.first_s > 0:
@@ -58,9 +83,8 @@ class Scale(Reader):
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.cli.terminal import show_remembered, show_scale
         from colmap_inertial.reconstruction.drivers.device_store import remembered_of
-        from colmap_inertial.reconstruction.drivers.sources import ScaleSource, scale_as_json, scale_source
+        from colmap_inertial.reconstruction.drivers.sources import scale_as_json, scale_source
 
         calibration = self.calibration
         if self.remembered:
@@ -68,12 +92,7 @@ class Scale(Reader):
             if self.talks:
                 show_remembered(known)
             calibration = (*calibration, *known.paths)
-        estimate = scale_source(
-            ScaleSource(source=self.source, imu=self.imu, frame_times=self.frame_times, calibration=calibration),
-            self.options,
-            json=self.json_file,
-            first_s=self.first_s,
-        )
+        estimate = scale_source(self.read_from(calibration), self.options, json=self.json_file, first_s=self.first_s)
         self.tell(lambda: show_scale(estimate, self.source), scale_as_json(estimate, calibration), written=True)
         return 3 if estimate.verdict == "refused" else 0
 
@@ -122,14 +141,12 @@ class Apply(Reader):
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.cli.screen import live_progress
-        from colmap_inertial.cli.terminal import show_applied
         from colmap_inertial.model.project import apply_to_project, undo_project
         from colmap_inertial.model.similarities import plain_factor, read_scales, read_similarity
 
         scales: Any
         self.check_json(self.sim3)
-        with live_progress(self) as progress:
+        with self.progress() as progress:
 
             def files(done: int, total: int) -> None:
                 progress("apply", done, total)
@@ -179,7 +196,7 @@ def _applied_as_json(applied: Applied) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Align(Reader):
+class Align(SourceReader):
     """Rotation, time offset and gyro bias between the camera and the IMU of one device, from one recording.
 
     Needs no scale, only a camera that turned. The calibration file serves --calibration for later recordings of the
@@ -188,36 +205,20 @@ class Align(Reader):
     Example: colmap-inertial align project/sparse/0 --imu imu.csv --frame-times frames.csv --out phone.json
     """
 
-    source: Positional[Path]
-    """COLMAP model folder, trajectory in TUM format (a text file of t x y z qx qy qz qw), or InertialScale folder (text
-    files of camera and IMU)."""
     out: Path
     """Where to write the calibration (JSON)."""
-    imu: Path | None = None
-    """IMU recording: a file or folder of a known format, or a capture.toml."""
-    frame_times: Path | None = None
-    """When the images were taken: a CSV with columns name,t_s, or a capture.toml."""
-    calibration: tuple[Path, ...] = ()
-    """Earlier calibration files of this device: from `align --out`, from `calibrate-imu --out`, or both."""
     remember: str | None = None
     """Keep the calibration under this name of the device: `reconstruct` and `scale` then take it by themselves."""
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.cli.terminal import show_calibration
-        from colmap_inertial.io.files import read_json
         from colmap_inertial.reconstruction.drivers.device_store import remember
-        from colmap_inertial.reconstruction.drivers.sources import ScaleSource, align_source
+        from colmap_inertial.reconstruction.drivers.sources import align_source
 
-        source = ScaleSource(
-            source=self.source, imu=self.imu, frame_times=self.frame_times, calibration=self.calibration
-        )
         self.check_json(self.source, self.imu, self.frame_times, self.out)
-        found = align_source(source, self.out)
+        found = align_source(self.read_from(), self.out)
         kept = None if self.remember is None else remember(self.remember, self.out)
-        self.tell(
-            lambda: show_calibration(found, self.source, kept), {**read_json(self.out), "out": self.out, "kept": kept}
-        )
+        self.tell(lambda: show_calibration(found, self.source, kept), self.out, {"out": self.out, "kept": kept})
         return 0
 
 
@@ -247,21 +248,19 @@ class CalibrateImu(Reader):
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.cli.terminal import show_imu_calibration
-        from colmap_inertial.io.files import read_json
         from colmap_inertial.reconstruction.drivers.device_store import remember
         from colmap_inertial.reconstruction.drivers.imu_calibration import calibrate_source
 
         self.check_json(self.recording, self.out)
         found = calibrate_source(self.recording, self.out, self.gravity, device=self.remember)
         kept = None if self.remember is None else remember(self.remember, self.out)
-        content = {**read_json(self.out), "out": self.out, "kept": kept, "verdict": found.verdict}
-        self.tell(lambda: show_imu_calibration(found, self.recording, self.out, kept), content)
+        more = {"out": self.out, "kept": kept, "verdict": found.verdict}
+        self.tell(lambda: show_imu_calibration(found, self.recording, self.out, kept), self.out, more)
         return 0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Diagnose(Reader):
+class Diagnose(SourceReader):
     """What is wrong with a recording, and what to do, before any reconstruction.
 
     Exit code 1 when something makes a scale wrong or impossible, 0 when nothing is worse than a warning.
@@ -272,25 +271,13 @@ class Diagnose(Reader):
     source: Positional[Path]
     """What would be reconstructed: a capture.toml, a video or a recorder's folder. Or an IMU recording alone; or a
     COLMAP model folder, TUM trajectory or InertialScale folder."""
-    imu: Path | None = None
-    """IMU recording of a model or trajectory: a file or folder of a known format, or a capture.toml."""
-    frame_times: Path | None = None
-    """When the images were taken: a CSV with columns name,t_s, or a capture.toml."""
-    calibration: tuple[Path, ...] = ()
-    """Calibration files of this device: from `align --out`, from `calibrate-imu --out`, or both."""
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.cli.screen import live_progress
-        from colmap_inertial.cli.terminal import show_diagnosis
         from colmap_inertial.reconstruction.drivers.diagnosis import diagnose_source
-        from colmap_inertial.reconstruction.drivers.sources import ScaleSource
 
-        source = ScaleSource(
-            source=self.source, imu=self.imu, frame_times=self.frame_times, calibration=self.calibration
-        )
-        with live_progress(self) as progress:
-            found = diagnose_source(source, json=self.json_file, progress=progress)
+        with self.progress() as progress:
+            found = diagnose_source(self.read_from(), json=self.json_file, progress=progress)
         self.tell(lambda: show_diagnosis(found, self.source), found.as_json(), written=True)
         return 1 if found.worst == "error" else 0
 
@@ -334,7 +321,6 @@ class Validate(Reader):
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.cli.terminal import show_validation
         from colmap_inertial.reconstruction.drivers.sources import validate_source
 
         result = validate_source(
@@ -395,13 +381,10 @@ class Export(Reader):
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.cli.screen import live_progress
-        from colmap_inertial.cli.terminal import show_exported
-        from colmap_inertial.io.files import read_json
         from colmap_inertial.tools.export.whole import export_model
 
         self.check_json(self.out, self.dir)
-        with live_progress(self) as progress:
+        with self.progress() as progress:
             made = export_model(
                 self.out,
                 self.dir,
@@ -414,7 +397,7 @@ class Export(Reader):
                 unscaled=self.unscaled,
                 progress=progress,
             )
-        self.tell(lambda: show_exported(made), {**read_json(made.folder / "export.json"), "folder": made.folder})
+        self.tell(lambda: show_exported(made), made.folder / "export.json", {"folder": made.folder})
         return 0
 
 
@@ -449,7 +432,6 @@ class View(Reader):
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.cli.terminal import show_view
         from colmap_inertial.tools.view.scene import load_scene
         from colmap_inertial.tools.view.server import require_viser, serve
 

@@ -8,8 +8,6 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from colmap_inertial.cli.speech import Speaker
-
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress as Bars, TaskID
@@ -192,7 +190,7 @@ def _named(stage: str) -> str:
 
 
 @contextlib.contextmanager
-def live_progress(speaker: Speaker) -> Iterator[Screen]:
+def live_progress(*, quiet: bool, verbose: bool) -> Iterator[Screen]:
     """The screen of a command that takes a while."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress as Bars, ProgressColumn, SpinnerColumn, Task, TextColumn
@@ -214,7 +212,7 @@ def live_progress(speaker: Speaker) -> Iterator[Screen]:
             left = "" if task.finished else stage.ends_in(time.monotonic())
             return Text.assemble("clock ", (clock(seconds or 0.0), "progress.elapsed"), f", {left}" if left else "")
 
-    console = Console(stderr=True, quiet=speaker.quiet)
+    console = Console(stderr=True, quiet=quiet)
     columns: tuple[Any, ...] = (
         SpinnerColumn(finished_text=" "),
         TextColumn("{task.description:<13}"),
@@ -223,7 +221,7 @@ def live_progress(speaker: Speaker) -> Iterator[Screen]:
         Clock(),
     )
     # the log goes line by line beside no bars
-    shown = console.is_terminal and not speaker.quiet and not speaker.verbose
+    shown = console.is_terminal and not quiet and not verbose
     bars = Bars(*columns, console=console, disable=not shown)
     with bars if shown else contextlib.nullcontext():  # rich before 14.3 ends hidden bars with a newline
         screen = Screen(console, bars)

@@ -7,10 +7,12 @@ import json
 import logging
 import sys
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from colmap_inertial.cli.screen import Screen, live_progress
 from colmap_inertial.core.options import ReadLimits
 
 #: ``--json -``.
@@ -54,7 +56,18 @@ class Speaker:
 
             check_output(self.json_file, inputs)
 
-    def tell(self, show: Callable[[], None], content: Mapping[str, Any], *, written: bool = False) -> None:
+    def progress(self) -> AbstractContextManager[Screen]:
+        """The screen of a command that takes a while."""
+        return live_progress(quiet=self.quiet, verbose=self.verbose)
+
+    def tell(
+        self,
+        show: Callable[[], None],
+        content: Mapping[str, Any] | Path,
+        more: Mapping[str, Any] | None = None,
+        *,
+        written: bool = False,
+    ) -> None:
         """Say how it ended.
 
         Parameters
@@ -62,10 +75,17 @@ class Speaker:
         show
             Prints it for a person.
         content
-            The same for a program.
+            The same for a program, or the JSON file that has it.
+        more
+            What the program is told besides.
         written
             Whether the file that ``--json`` names has been written already.
         """
+        if isinstance(content, Path):
+            from colmap_inertial.io.files import read_json
+
+            content = read_json(content)
+        content = {**content, **(more or {})}
         if self.talks:
             show()
         if self.answers_in_json:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from colmap_inertial.checks.validate.limits import FIT
 from colmap_inertial.checks.validate.observations import Observations, Placement, linearise
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
@@ -22,14 +23,6 @@ from colmap_inertial.core.geometry import skew
 #: sight. Shifts are divided by the median distance.
 POSE_ERRORS = ("aim_rad", "roll_rad", "range_relative", "orbit_rad", "shift_relative")
 _DIMENSIONS = np.array([2.0, 1.0, 1.0, 2.0, 2.0])
-
-#: A variance component whose effect in one view is below this share of the corner noise counts as zero.
-_NEGLIGIBLE = 2e-3
-_LARGEST = 1e6
-#: Pose errors are assumed where they raise twice the log likelihood by more than this. Of data without any, one set in
-#: six passes; always assuming them would widen the intervals of such data to 97 % coverage, and a stricter test would
-#: miss small real ones.
-_EVIDENCE = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +150,7 @@ def estimate_ratio(n: Normal) -> Array:
 
     # an error of this variance, in each dimension of its kind, is as large as its uncertainty from one view's corners
     unit = len(n.bb) * _DIMENSIONS / np.einsum("kvij,vji->k", n.shapes, n.bb)
-    low, high = np.log(_NEGLIGIBLE / 4), np.log(_LARGEST)
+    low, high = np.log(FIT.negligible_ratio / 4), np.log(FIT.largest_ratio)
     none = np.zeros(len(unit))
     if np.isinf(solve(*weighted(n, none)[1:3])[1]):  # the views leave the scale free: its equations cannot be solved
         return none
@@ -170,9 +163,9 @@ def estimate_ratio(n: Normal) -> Array:
     starts = [np.full(len(unit), np.log(r)) for r in (0.3, 10.0, 300.0, 1e4)]
     start = min(starts, key=lambda x: cost(x)[0])
     found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=[(low, high)] * len(unit))
-    if restricted_likelihood(n, none)[0] - found.fun < _EVIDENCE:
+    if restricted_likelihood(n, none)[0] - found.fun < FIT.pose_error_evidence:
         return none
-    return np.where(np.exp(found.x) < _NEGLIGIBLE, 0.0, unit * np.exp(found.x))
+    return np.where(np.exp(found.x) < FIT.negligible_ratio, 0.0, unit * np.exp(found.x))
 
 
 def satterthwaite_dof(n: Normal, ratio: Array, corner_var: float, dof: float) -> float:

@@ -15,14 +15,10 @@ from typing import Any
 import numpy as np
 
 from colmap_inertial.checks.validate.edges import refine_marker
+from colmap_inertial.checks.validate.limits import DETECTION
 from colmap_inertial.checks.validate.targets import Target
 from colmap_inertial.core.arrays import Array, BoolArray, Float32Array, IndexArray, UInt8Array
 from colmap_inertial.core.geometry import colmap_px_from_opencv
-
-#: Checkerboards are searched in images of at most this many pixels along the longer side, and refined in the original.
-_SEARCH_SIZE_PX = 1600
-_MOST_BOARDS = 3
-_SMALLEST_MARKER_PX = 12.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -86,7 +82,7 @@ def _checkerboards(image: UInt8Array, target: Target, thorough: bool) -> Iterato
 
     small, factor = _shrunk(image)
     small = small.copy()
-    for number in range(_MOST_BOARDS if thorough else 1):
+    for number in range(DETECTION.most_boards if thorough else 1):
         corners = _find_checkerboard(small, target, fallback=thorough and number == 0)
         if corners is None:
             return
@@ -109,7 +105,7 @@ def _detection(corner: IndexArray, xy: Array, good: BoolArray) -> Detection:
 def _shrunk(image: UInt8Array) -> tuple[UInt8Array, float]:
     import cv2
 
-    factor = min(1.0, _SEARCH_SIZE_PX / max(image.shape))
+    factor = min(1.0, DETECTION.search_size_px / max(image.shape))
     if factor == 1.0:
         return image, 1.0
     size = (round(image.shape[1] * factor), round(image.shape[0] * factor))
@@ -172,7 +168,7 @@ def _detector(target: Target, border_bits: int, image: UInt8Array) -> Any:
     parameters = cv2.aruco.DetectorParameters()
     parameters.markerBorderBits = border_bits
     # OpenCV's limit is a share of the image's size; markers of a dozen pixels can be read in large images too
-    rate = 4 * _SMALLEST_MARKER_PX / max(image.shape)
+    rate = 4 * DETECTION.smallest_marker_px / max(image.shape)
     parameters.minMarkerPerimeterRate = min(parameters.minMarkerPerimeterRate, rate)
     return cv2.aruco.ArucoDetector(_dictionary(target), parameters)
 
@@ -191,7 +187,7 @@ def _find_markers(image: UInt8Array, target: Target, border_bits: int, count: in
     if numbers is None or len(numbers) == 0:
         return np.zeros((0, 4, 2)), np.zeros(0, dtype=np.intp)
     corners, number = np.array(found, dtype=np.float64).reshape(-1, 4, 2), np.asarray(numbers).ravel().astype(np.intp)
-    keep = (number < count) & (_side_px(corners) >= _SMALLEST_MARKER_PX)
+    keep = (number < count) & (_side_px(corners) >= DETECTION.smallest_marker_px)
     return corners[keep], number[keep]
 
 

@@ -10,13 +10,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from colmap_inertial.checks.validate.limits import DETECTION
 from colmap_inertial.core.arrays import Array, BoolArray, Float32Array, UInt8Array
 
 _ALONG = np.array([0.2, 0.35, 0.5, 0.65, 0.8])
-_STEP_PX = 0.25
-_LEAST_CELL_PX = 3.0
-_ITERATIONS = 4
-_LEAST_CONTRAST = 8.0
 
 
 def refine_marker(image: UInt8Array, corners_px: Array, bits: BoolArray) -> Array | None:
@@ -43,7 +40,7 @@ def refine_marker(image: UInt8Array, corners_px: Array, bits: BoolArray) -> Arra
     homography = cv2.getPerspectiveTransform(square.astype(np.float32), corners_px.astype(np.float32))
     homography = np.asarray(homography, dtype=np.float64)
     grey = image.astype(np.float32)
-    for _ in range(_ITERATIONS):
+    for _ in range(DETECTION.edge_iterations):
         at = _project(homography, start)
         ahead = _project(homography, start + 0.5 * white) - _project(homography, start - 0.5 * white)
         along = np.stack([white[:, 1], -white[:, 0]], axis=1)
@@ -52,11 +49,11 @@ def refine_marker(image: UInt8Array, corners_px: Array, bits: BoolArray) -> Arra
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         normal *= np.sign(np.sum(normal * ahead, axis=1, keepdims=True))
         cell_px = np.abs(np.sum(normal * ahead, axis=1))
-        if np.median(cell_px) < _LEAST_CELL_PX:
+        if np.median(cell_px) < DETECTION.least_cell_px:
             return None
         reach = float(np.clip(0.5 * np.median(cell_px), 1.5, 4.0))
         offset, contrast = _edge_offsets(grey, at, normal, reach)
-        good = contrast > max(0.3 * float(np.median(contrast)), _LEAST_CONTRAST)
+        good = contrast > max(0.3 * float(np.median(contrast)), DETECTION.least_contrast)
         if good.sum() < 8 * 5:
             return None
         step = _fit(homography, start, normal, offset, good)
@@ -89,7 +86,7 @@ def _edge_offsets(image: Float32Array, at: Array, normal: Array, reach: float) -
     """Distance (m,) from each point along its normal to the centre of the brightening there, and its height (m,)."""
     import cv2
 
-    along = np.arange(-reach, reach + 0.5 * _STEP_PX, _STEP_PX)
+    along = np.arange(-reach, reach + 0.5 * DETECTION.profile_step_px, DETECTION.profile_step_px)
     xy = at[:, None, :] + along[:, None] * normal[:, None, :]
     profile = cv2.remap(
         image,

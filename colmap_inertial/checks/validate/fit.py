@@ -23,15 +23,11 @@ from colmap_inertial.checks.validate.components import (
     solve,
     weighted,
 )
+from colmap_inertial.checks.validate.limits import FIT
 from colmap_inertial.checks.validate.observations import Observations, Placement, linearise
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import so3_exp
-
-_ITERATIONS = 50
-#: The fit has settled when a step would lower the cost by less than this share of the noise variance (a ten-thousandth
-#: of a standard deviation), or by less than the least that counts, px^2.
-_SETTLED, _LEAST_PX2 = 1e-8, 1e-14
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -138,7 +134,7 @@ def fit_scale(obs: Observations, start: Placement, *, noise: NoiseModel | None =
 
 
 def settle(
-    obs: Observations, at: Placement, *, pose_ratio: Array | None = None, most_iterations: int = _ITERATIONS
+    obs: Observations, at: Placement, *, pose_ratio: Array | None = None, most_iterations: int = FIT.most_iterations
 ) -> Placement:
     """Gauss-Newton iterations from a first placement.
 
@@ -166,7 +162,7 @@ def settle(
     for _ in range(most_iterations):
         s, rhs, now = equations
         step = solve(s, rhs)[0]
-        if rhs @ step <= _SETTLED * now / (2 * len(obs)) + _LEAST_PX2:
+        if rhs @ step <= FIT.settled_share * now / (2 * len(obs)) + FIT.settled_px2:
             return at
         size = max(abs(step[0]), float(np.abs(step[1:].reshape(-1, 6)[:, :3]).max()))
         step *= min(1.0, 0.5 / max(size, 1e-300))

@@ -13,16 +13,10 @@ from typing import Literal
 
 import numpy as np
 
+from colmap_inertial.checks.validate.limits import FIT
 from colmap_inertial.core.arrays import Array
 
 DistanceSet = Literal["control", "check", "mixed"]
-
-#: Shares of the model's diagonal below which a length says little of the whole, and above which it says much.
-_SHORT, _LONG = 0.2, 0.66
-#: Points left out on each side when the model's diagonal is taken, per cent.
-_OUTSIDE_PCT = 1.5
-#: Least spread of the directions of the lengths along an axis, of the largest, to count as one of its own.
-_OWN_DIRECTION = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +94,7 @@ class LengthCheck:
     @property
     def is_short(self) -> bool:
         """Whether the lengths say little of the whole model."""
-        return self.longest_share is not None and self.longest_share < _SHORT
+        return self.longest_share is not None and self.longest_share < FIT.short_share
 
 
 def check_lengths(
@@ -146,7 +140,7 @@ def model_diagonal(xyz: Array) -> float | None:
     """Diagonal of the box that nearly all of (N, 3) points fill; ``None`` where there are too few."""
     if len(xyz) < 2:
         return None
-    low, high = np.percentile(xyz, [_OUTSIDE_PCT, 100 - _OUTSIDE_PCT], axis=0)
+    low, high = np.percentile(xyz, [FIT.outside_pct, 100 - FIT.outside_pct], axis=0)
     return float(np.linalg.norm(high - low)) or None
 
 
@@ -158,18 +152,18 @@ def _directions(ends: Array) -> int:
     if not len(along):
         return 0
     spread = np.linalg.eigvalsh(along.T @ along / len(along))
-    return int((spread > _OWN_DIRECTION * spread[-1]).sum())
+    return int((spread > FIT.own_direction * spread[-1]).sum())
 
 
 def _proves(longest_m: float, diagonal_m: float | None, share: float | None, directions: int) -> str:
-    said = f"lengths up to {longest_m:.3g} m are right to what is said here"
+    checked = f"lengths up to {longest_m:.3g} m are right to what is said here"
     if share is None or diagonal_m is None:
-        return said
-    where = "one direction" if directions == 1 else f"{directions} directions"
-    if share >= _LONG:
-        return f"{said}, in {where} and over {100 * share:.0f} % of the model's diagonal of {diagonal_m:.3g} m"
-    what = "nothing of whether it bends or drifts" if share < _SHORT else "little of whether it bends or drifts"
+        return checked
+    checked += f", in {'one direction' if directions == 1 else f'{directions} directions'}"
+    if share >= FIT.long_share:
+        return f"{checked} and over {100 * share:.0f} % of the model's diagonal of {diagonal_m:.3g} m"
+    amount = "nothing" if share < FIT.short_share else "little"
     return (
-        f"{said}, in {where}; they are {100 * share:.2g} % of the model's diagonal of {diagonal_m:.3g} m and prove "
-        f"its scale where they lie, and {what} elsewhere"
+        f"{checked}; they span {100 * share:.2g} % of the model's diagonal of {diagonal_m:.3g} m, which says {amount} "
+        "of whether it bends or drifts elsewhere"
     )

@@ -9,13 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
+from colmap_inertial.checks.validate.limits import FIT
 from colmap_inertial.checks.validate.result import CheckPoint, CheckPoints, ScaleBar, TargetDistance, Validation
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, NotObservableError
 from colmap_inertial.io.files import read_text
-
-#: Points that a rigid motion needs, with one to spare.
-_LEAST_POINTS = 4
 
 
 def marker_centres(validation: Validation) -> dict[int, Array]:
@@ -70,9 +68,9 @@ def with_check_points(validation: Validation, path: Path) -> Validation:
         measured.append(centres[marker] * to_metres)
         if row.get("sigma_m"):
             sigmas.append(_number(row, "sigma_m", path, line))
-    if len(names) < _LEAST_POINTS:
+    if len(names) < FIT.least_points:
         raise NotObservableError(
-            "accuracy of points", f"{path} has {len(names)} check points; {_LEAST_POINTS} are needed, apart in space"
+            "accuracy of points", f"{path} has {len(names)} check points; {FIT.least_points} are needed, apart in space"
         )
     residual = _moved_onto(np.array(measured), np.array(known)) - np.array(known)
     sigma_m = float(np.sqrt(np.mean(np.square(sigmas)))) if len(sigmas) == len(names) else None
@@ -123,7 +121,7 @@ def middle_of(validation: Validation) -> Array:
     places = {target.label(corner): place for corner, place in enumerate(target.corners_m)}
     drawn = np.array([places[corner.name] for corner in validation.corners]).reshape(-1, 3)
     seen = np.array([corner.in_model for corner in validation.corners]).reshape(-1, 3)
-    if len(drawn) < _LEAST_POINTS or np.linalg.matrix_rank(drawn - drawn.mean(axis=0), tol=1e-9) < 2:
+    if len(drawn) < FIT.least_points or np.linalg.matrix_rank(drawn - drawn.mean(axis=0), tol=1e-9) < 2:
         raise NotObservableError("distance", f"too few corners of {target.spec} were measured to tell its middle")
     units = float(np.sqrt(np.sum((seen - seen.mean(axis=0)) ** 2) / np.sum((drawn - drawn.mean(axis=0)) ** 2)))
     return _moved_onto(np.vstack([drawn * units, np.zeros((1, 3))]), seen)[-1]

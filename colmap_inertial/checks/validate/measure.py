@@ -11,6 +11,7 @@ import numpy as np
 
 from colmap_inertial.checks.validate.fit import ScaleFit, fit_scale
 from colmap_inertial.checks.validate.lengths import Corner, Distance, DistanceSet, check_lengths, model_diagonal
+from colmap_inertial.checks.validate.limits import DETECTION, FIT, PLACEMENT
 from colmap_inertial.checks.validate.observations import Observations, Placement, triangulate
 from colmap_inertial.checks.validate.place import PartPlacement, median_residual_px, observe
 from colmap_inertial.checks.validate.result import (
@@ -35,17 +36,6 @@ if TYPE_CHECKING:
 
 _NOT_FOUND = "target not found"
 _DISAGREES = "does not agree with the other views: a false detection, another target, or a wrong pose"
-_ENOUGH_VIEWS = 10
-_MOST_THOROUGH = 60
-_LEAST_CORNERS = 4
-_OUTLIER_SIGMA = 5.0
-_OUTLIER_VIEW = 4.0
-_WIDEST_LOG = float(np.log(1.3))
-_OUTLYING_PART = 0.05
-
-
-#: Smallest part of the images with sightings that must agree. Two boards in view leave half of them.
-_SMALLEST_AGREEMENT = 0.2
 
 
 @one_blas_thread()
@@ -95,9 +85,9 @@ def validate_model(
     search = Search(views, target, options, progress)
     search.run(images)
     placed = search.place()
-    if sum(len(p.chosen) for p in placed.values()) < _ENOUGH_VIEWS and target.kind == "checkerboard":
+    if sum(len(p.chosen) for p in placed.values()) < PLACEMENT.enough_views and target.kind == "checkerboard":
         seen = {s.view for s in search.sightings}
-        search.look_closer([v for v in search.searched if v not in seen][:_MOST_THOROUGH])
+        search.look_closer([v for v in search.searched if v not in seen][: PLACEMENT.most_thorough_views])
         placed = search.place()
     if not placed:
         raise why_not_placed(search, images)
@@ -119,7 +109,7 @@ def _require_agreement(search: Search, placed: dict[int, PartPlacement]) -> None
     """
     used = {search.parts[p][i].view for p, part in placed.items() for i in part.chosen}
     seen = {s.view for s in search.sightings}
-    if len(used) < _SMALLEST_AGREEMENT * len(seen):
+    if len(used) < PLACEMENT.smallest_agreement * len(seen):
         raise TargetNotFoundError(
             f"something like {search.target.spec} was found in {len(seen)} images, but only {len(used)} of them agree "
             "on where it is in the model: check the number of columns and rows (inner corners of a checkerboard), and "
@@ -133,7 +123,7 @@ def _reject_outliers(search: Search, placed: dict[int, PartPlacement]) -> tuple[
     order = sorted(logs, key=lambda p: logs[p])
     running = np.cumsum([len(placed[p].chosen) for p in order])
     middle = logs[order[int(np.searchsorted(running, 0.5 * running[-1]))]]
-    outlying = [p for p in placed if abs(logs[p] - middle) > _OUTLYING_PART]
+    outlying = [p for p in placed if abs(logs[p] - middle) > FIT.outlying_marker_log]
     reasons = [
         f"{search.target.part_name(p)} is left out: {100 * (np.exp(logs[p] - middle) - 1):+.1f} % against the others; "
         "does it have another size?"
@@ -166,7 +156,7 @@ def _measure(
     obs, fit, dropped = fit_without_outliers(obs, start)
     half = fit.half_width_log()
     of_target = 0.0 if target.sigma_m is None else Z95 * target.sigma_m / target.length_m
-    if not half < _WIDEST_LOG:
+    if not half < np.log(FIT.widest_factor):
         raise NotObservableError(
             "scale",
             f"{len(np.unique(obs.view))} views of the target lie too close together or agree too badly; "
@@ -257,12 +247,12 @@ def fit_without_outliers(obs: Observations, start: Placement) -> tuple[Observati
             mine = obs.view == v
             rms[int(v)] = float(np.sqrt(np.mean(np.sum(fit.residual_px[mine] ** 2, axis=1))))
             sigma = max(typical, 1.4826 * float(np.median(noise[mine])), 1e-6)
-            keep[mine] = np.linalg.norm(fit.corner_residual_px[mine], axis=1) < _OUTLIER_SIGMA * sigma
-            if keep[mine].sum() < _LEAST_CORNERS:
+            keep[mine] = np.linalg.norm(fit.corner_residual_px[mine], axis=1) < FIT.outlier_sigma * sigma
+            if keep[mine].sum() < DETECTION.least_corners:
                 keep[mine] = False
                 dropped[int(v)] = "fewer than four of its corners agree with the other views"
         if keep.all():  # corners first: a few wrong ones can make a good view look bad
-            limit = _OUTLIER_VIEW * float(np.median(list(rms.values())))
+            limit = FIT.outlier_view_ratio * float(np.median(list(rms.values())))
             for v, value in rms.items():
                 if value > limit and len(rms) > 2:
                     keep[obs.view == v] = False
@@ -295,7 +285,7 @@ def _fit_set(obs: Observations, fit: ScaleFit, pick: BoolArray) -> tuple[ScaleFi
         out = fit_scale(part, start, noise=fit.noise)
     except NotObservableError:
         return None
-    return (out, len(part)) if out.half_width_log() < _WIDEST_LOG else None
+    return (out, len(part)) if out.half_width_log() < np.log(FIT.widest_factor) else None
 
 
 def _set_scale(of: tuple[ScaleFit, int] | None, of_target: float) -> SetScale | None:

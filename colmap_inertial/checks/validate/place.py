@@ -13,16 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from colmap_inertial.checks.validate.fit import settle
+from colmap_inertial.checks.validate.limits import DETECTION, PLACEMENT
 from colmap_inertial.checks.validate.observations import Observations, Placement, linearise
 from colmap_inertial.checks.validate.targets import Target
 from colmap_inertial.checks.validate.views import Sighting, View
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
-
-_MOST_PAIRS = 80
-_LEAST_CORNERS = 4
-_LEAST_PARALLAX_RAD = np.deg2rad(0.5)
-_REFINEMENTS = 5
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -101,7 +97,7 @@ def place_part(
     NotObservableError
         When all views lie in one direction from the target.
     """
-    usable = [i for i, s in enumerate(sightings) if len(s.corner) >= _LEAST_CORNERS]
+    usable = [i for i, s in enumerate(sightings) if len(s.corner) >= DETECTION.least_corners]
     direction = np.array([_direction(sightings[i], views) for i in usable]).reshape(-1, 3)
     view = np.array([sightings[i].view for i in usable], dtype=np.intp)
     first, second = np.triu_indices(len(usable), 1)
@@ -110,7 +106,7 @@ def place_part(
     if len(first) == 0:
         return None
     angle = np.arccos(np.clip(np.sum(direction[first] * direction[second], axis=1), -1.0, 1.0))
-    apart = angle >= _LEAST_PARALLAX_RAD
+    apart = angle >= np.deg2rad(PLACEMENT.least_parallax_deg)
     if not apart.any():
         raise NotObservableError(
             "scale",
@@ -118,9 +114,9 @@ def place_part(
             "needs views from different places",
         )
     first, second, angle = first[apart], second[apart], angle[apart]
-    if len(first) > _MOST_PAIRS:  # some of every angle from the larger half
-        order = np.argsort(-angle, kind="stable")[: max(_MOST_PAIRS, len(angle) // 2)]
-        pick = np.random.default_rng(seed).choice(order, _MOST_PAIRS, replace=False)
+    if len(first) > PLACEMENT.most_pairs:  # some of every angle from the larger half
+        order = np.argsort(-angle, kind="stable")[: max(PLACEMENT.most_pairs, len(angle) // 2)]
+        pick = np.random.default_rng(seed).choice(order, PLACEMENT.most_pairs, replace=False)
         first, second = first[pick], second[pick]
     judge = _Judge([sightings[i] for i in usable], target, views, max_residual_px)
     best: tuple[float, Placement] | None = None
@@ -135,7 +131,7 @@ def place_part(
     if best is None:
         return None
     placement = best[1]
-    for _ in range(_REFINEMENTS):
+    for _ in range(PLACEMENT.refinements):
         chosen, numbering_of = judge.choose(placement)
         if len(chosen) < 2:
             return None
@@ -221,7 +217,7 @@ class _Judge:
 def _from_pair(a: Sighting, b: Sighting, numbering: int, target: Target, views: list[View]) -> Placement | None:
     """The placement that two views give, the second numbered in this way; ``None`` when their rays do not meet."""
     _, ia, ib = np.intersect1d(a.corner, target.relabelings[numbering][b.corner], return_indices=True)
-    if len(ia) < _LEAST_CORNERS:
+    if len(ia) < DETECTION.least_corners:
         return None
     va, vb = views[a.view], views[b.view]
     da, db = a.ray[ia] @ va.cam_from_world, b.ray[ib] @ vb.cam_from_world

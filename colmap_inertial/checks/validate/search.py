@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from colmap_inertial.checks.validate.detect import detect, other_checkerboard
+from colmap_inertial.checks.validate.limits import DETECTION, PLACEMENT
 from colmap_inertial.checks.validate.place import PartPlacement, place_part
 from colmap_inertial.checks.validate.targets import Target
 from colmap_inertial.checks.validate.views import Sighting, View, sight
@@ -14,10 +15,6 @@ from colmap_inertial.core.errors import FormatError, NotObservableError, TargetN
 from colmap_inertial.core.options import ValidateOptions
 
 Progress = Callable[[int, int], None]
-
-_MIRROR_VIEWS = 20
-_HINT_VIEWS = 10
-_LEAST_CORNERS = 4
 
 
 class Search:
@@ -59,7 +56,7 @@ class Search:
             self.unreadable[v] = image
             return False
         found = [sight(v, self.views[v].camera, d) for d in detect(image, self.target, thorough=thorough)]
-        found = [s for s in found if len(s.corner) >= _LEAST_CORNERS]
+        found = [s for s in found if len(s.corner) >= DETECTION.least_corners]
         self.sightings += found
         return bool(found)
 
@@ -124,12 +121,12 @@ def _mirrored(search: Search) -> str | None:
     """How the images are mirrored against the model, if that explains them."""
     for flip, words in ((1, "left to right"), (0, "top to bottom")):
         again = Search(search.views, search.target, search.options, None)
-        for v in search.searched[:_MIRROR_VIEWS]:
+        for v in search.searched[: PLACEMENT.mirror_views]:
             image = search.views[v].read(flip=flip)
             if isinstance(image, str):
                 continue
             found = [sight(v, search.views[v].camera, d) for d in detect(image, search.target)]
-            again.sightings += [s for s in found if len(s.corner) >= _LEAST_CORNERS]
+            again.sightings += [s for s in found if len(s.corner) >= DETECTION.least_corners]
         if again.place():
             return words
     return None
@@ -139,7 +136,7 @@ def _absence_hint(search: Search) -> str:
     if search.target.kind != "checkerboard":
         return "is the description right, and is the target large and sharp enough in the images?"
     sizes: Counter[tuple[int, int]] = Counter()
-    for v in search.searched[:_HINT_VIEWS]:
+    for v in search.searched[: PLACEMENT.hint_views]:
         image = search.views[v].read()
         size = None if isinstance(image, str) else other_checkerboard(image)
         if size is not None:

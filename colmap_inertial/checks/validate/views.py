@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from colmap_inertial.checks.validate.detect import Detection
+from colmap_inertial.checks.validate.limits import DETECTION
 from colmap_inertial.core.arrays import Array, IndexArray, UInt8Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.io.files import read_bytes
@@ -18,11 +19,6 @@ from colmap_inertial.model import model_format, read_model
 
 if TYPE_CHECKING:
     import pycolmap
-
-
-#: Half step of the numeric derivative of the projection, as an angle.
-_STEP_RAD = 1e-4
-_ROUND_TRIP_PX = 0.05
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -195,15 +191,13 @@ def sight(view: int, camera: Any, detection: Detection) -> Sighting:
     def project(direction: Array) -> Array:
         return np.asarray(camera.img_from_cam(np.ascontiguousarray(direction)), dtype=np.float64)
 
-    derivative = np.stack(
-        [
-            (project(ray + _STEP_RAD * tangent[:, k]) - project(ray - _STEP_RAD * tangent[:, k])) / (2 * _STEP_RAD)
-            for k in (0, 1)
-        ],
-        axis=2,
-    )
+    step = DETECTION.derivative_step_rad
+    ends = [[project(ray + sign * step * tangent[:, k]) for sign in (1, -1)] for k in (0, 1)]
+    derivative = np.stack([(ahead - behind) / (2 * step) for ahead, behind in ends], axis=2)
     px_from_tangent = derivative @ tangent
-    good = np.isfinite(px_from_tangent).all(axis=(1, 2)) & (np.abs(project(ray) - xy).max(axis=1) < _ROUND_TRIP_PX)
+    good = np.isfinite(px_from_tangent).all(axis=(1, 2)) & (
+        np.abs(project(ray) - xy).max(axis=1) < DETECTION.round_trip_px
+    )
     return Sighting(
         view=view,
         part=detection.part,
