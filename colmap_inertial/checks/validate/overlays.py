@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -98,7 +98,7 @@ def _fixed(xy: Array, radius: int = 0) -> tuple[tuple[int, int], int]:
 
 def distance_chart(validation: Validation) -> str:
     """An SVG: measured against known distances, and their differences, in millimetres."""
-    from xml.sax.saxutils import escape
+    from jinja2 import Environment, PackageLoader, StrictUndefined
 
     known = np.array([d.known_m for d in validation.distances]) * 1000
     residual = np.array([d.residual_m for d in validation.distances]) * 1000
@@ -109,69 +109,52 @@ def distance_chart(validation: Validation) -> str:
         title += f"scale error {validation.scale_error_pct:+.3f} % (95 %: {low:+.3f} to {high:+.3f})"
     else:
         title += f"{validation.metres_per_unit:.6g} metres per unit"
-    legend = sorted(set(sets), key=list(_COLOURS).index)
-    parts = [
-        '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1000 440" font-family="sans-serif" font-size="13">',
-        '<rect width="1000" height="440" fill="white"/>',
-        f'<text x="500" y="24" font-size="15" text-anchor="middle">{escape(title)}</text>',
-    ]
-    for i, name in enumerate(legend):
-        parts.append(f'<circle cx="{70 + 100 * i}" cy="46" r="4" fill="{_COLOURS[name]}"/>')
-        parts.append(f'<text x="{80 + 100 * i}" y="50">{name}</text>')
+    panels = []
     if len(known):
         top = 1.05 * float(max(known.max(), (known + residual).max()))
-        measured = _Axes(70, (0.0, top), (0.0, top), "measured, mm")
-        parts += _panel(measured, known, known + residual, sets, end_mm=top)
         low, high = min(float(residual.min()), 0.0), max(float(residual.max()), 0.0)
         rim = 0.1 * max(high - low, 1e-6)
-        differences = _Axes(570, (0.0, top), (low - rim, high + rim), "measured - known, mm")
-        parts += _panel(differences, known, residual, sets, end_mm=0.0)
-    return "\n".join([*parts, "</svg>\n"])
+        panels = [
+            _Panel(70, top, (0.0, top), "measured, mm", top, list(zip(known, known + residual, sets, strict=True))),
+            _Panel(
+                570,
+                top,
+                (low - rim, high + rim),
+                "measured - known, mm",
+                0.0,
+                list(zip(known, residual, sets, strict=True)),
+            ),
+        ]
+    templates = PackageLoader("colmap_inertial.checks.validate")
+    environment = Environment(
+        loader=templates, autoescape=True, undefined=StrictUndefined, trim_blocks=True, keep_trailing_newline=True
+    )
+    legend = sorted(set(sets), key=list(_COLOURS).index)
+    return environment.get_template("distances.svg").render(title=title, legend=legend, colours=_COLOURS, panels=panels)
 
 
 @dataclass(frozen=True)
-class _Axes:
-    """Where a chart's left edge is, what its axes reach from and to, and the name of the upright one."""
+class _Panel:
+    """One chart: its left edge, how far its axes reach, name of the upright one, end of the line of no error, points."""
 
     left: int
-    x_range: tuple[float, float]
+    x_end: float
     y_range: tuple[float, float]
     label: str
+    line_end: float
+    points: Sequence[tuple[float, float, str]]
 
+    def x(self, value: float) -> float:
+        """Pixels from the left."""
+        return self.left + 400 * value / self.x_end
 
-def _panel(axes: _Axes, x: Array, y: Array, sets: list[Any], *, end_mm: float) -> list[str]:
-    """One chart of 400 x 300 with axes, and a line from 0 to ``end_mm`` at the right edge."""
-    left, x_range, y_range = axes.left, axes.x_range, axes.y_range
-    top, width, height = 70, 400, 300
+    def y(self, value: float) -> float:
+        """Pixels from the top."""
+        return 70 + 300 * (1 - (value - self.y_range[0]) / (self.y_range[1] - self.y_range[0]))
 
-    def px(value: float) -> float:
-        return left + width * (value - x_range[0]) / (x_range[1] - x_range[0])
-
-    def py(value: float) -> float:
-        return top + height * (1 - (value - y_range[0]) / (y_range[1] - y_range[0]))
-
-    out = [f'<rect x="{left}" y="{top}" width="{width}" height="{height}" fill="none" stroke="#444"/>']
-    for tick in _ticks(*x_range):
-        out.append(
-            f'<line x1="{px(tick):.1f}" y1="{top + height}" x2="{px(tick):.1f}" y2="{top + height + 5}" stroke="#444"/>'
-        )
-        out.append(f'<text x="{px(tick):.1f}" y="{top + height + 20}" text-anchor="middle">{tick:g}</text>')
-    for tick in _ticks(*y_range):
-        out.append(f'<line x1="{left}" y1="{py(tick):.1f}" x2="{left + width}" y2="{py(tick):.1f}" stroke="#ddd"/>')
-        out.append(f'<text x="{left - 6}" y="{py(tick) + 4:.1f}" text-anchor="end">{tick:g}</text>')
-    out.append(
-        f'<line x1="{px(x_range[0]):.1f}" y1="{py(0.0):.1f}" x2="{px(x_range[1]):.1f}" y2="{py(end_mm):.1f}" '
-        'stroke="#444" stroke-dasharray="4 3"/>'
-    )
-    for a, b, name in zip(x.tolist(), y.tolist(), sets, strict=True):
-        out.append(f'<circle cx="{px(a):.1f}" cy="{py(b):.1f}" r="2.5" fill="{_COLOURS[name]}" fill-opacity="0.6"/>')
-    out.append(f'<text x="{left + width / 2}" y="{top + height + 42}" text-anchor="middle">known, mm</text>')
-    middle = top + height / 2
-    out.append(
-        f'<text x="{left - 48}" y="{middle}" text-anchor="middle" transform="rotate(-90 {left - 48} {middle})">'
-        f"{axes.label}</text>"
-    )
-    return out
+    def ticks(self) -> tuple[list[float], list[float]]:
+        """Round numbers along both axes."""
+        return _ticks(0.0, self.x_end), _ticks(*self.y_range)
 
 
 def _ticks(low: float, high: float) -> list[float]:
