@@ -31,14 +31,12 @@ _HAND_M_S2 = 1.0
 _MOST_DISTANCES = 1500
 
 
-def _layout(height: int, **more: Any) -> Figure:
-    return {
-        "height": height,
-        "margin": {"l": 58, "r": 12, "t": 34, "b": 46},
-        "legend": {"orientation": "h", "x": 0, "y": 1.0, "yanchor": "bottom", "xanchor": "left"},
-        "hovermode": "closest",
-        **more,
-    }
+def layout(height: int, x: Figure | None = None, y: Figure | None = None, **more: Any) -> Figure:
+    """The layout of all flat figures, with these axes; ``margin`` may change some of its sides."""
+    margin = {"l": 58, "r": 12, "t": 34, "b": 46, **more.pop("margin", {})}
+    axes = {name: value for name, value in (("xaxis", x), ("yaxis", y)) if value is not None}
+    legend = {"orientation": "h", "x": 0, "y": 1.0, "yanchor": "bottom", "xanchor": "left"}
+    return {"height": height, "margin": margin, "legend": legend, "hovermode": "closest", **axes, **more}
 
 
 def _line(line: dict[str, Any], name: str, colour: str, **more: Any) -> Figure:
@@ -63,12 +61,12 @@ def _dots(name: str, points: Sequence[tuple[float, float, str]], colour: str, op
     return {**named, "x": x, "y": y, "marker": marker}
 
 
-def _axis(title: str, **more: Any) -> Figure:
+def axis(title: str, **more: Any) -> Figure:
     return {"title": {"text": title}, **more}
 
 
 def _right_axis(title: str, overlaying: str, **more: Any) -> Figure:
-    return {"overlaying": overlaying, "side": "right", "showgrid": False, **_axis(title), **more}
+    return {"overlaying": overlaying, "side": "right", "showgrid": False, **axis(title), **more}
 
 
 def _scaled(lines: Lines, factor: float) -> list[dict[str, Any]]:
@@ -84,29 +82,28 @@ def _rows(
     """Rows over one time axis; a side is name, colour, a line for each row, and its axis (``"left"``, ``"right"``)."""
     gap, count = 0.05, len(titles)
     size = (1 - gap * (count - 1)) / count
-    layout = _layout(170 * count + 60, hovermode="x unified" if not right_unit else "closest")
-    layout["xaxis"] = _axis(_TIME, anchor=f"y{count if count > 1 else ''}", zeroline=False)
+    time = axis(_TIME, anchor=f"y{count if count > 1 else ''}", zeroline=False)
+    hovermode, margin = ("closest", {"r": 58}) if right_unit else ("x unified", {})
+    rows = layout(170 * count + 60, time, hovermode=hovermode, margin=margin)
     data = []
     for row, title in enumerate(titles):
         top = 1 - row * (size + gap)
         key = "" if row == 0 else str(row + 1)
-        layout[f"yaxis{key}"] = {
+        rows[f"yaxis{key}"] = {
             "domain": [max(0.0, top - size), top],
             "title": {"text": f"{title} ({unit})", "standoff": 6},
             "zeroline": True,
         }
         for name, colour, lines, side in sides:
-            axis = f"y{key}" if side == "left" else f"y{row + 1 + count}"
+            yaxis = f"y{key}" if side == "left" else f"y{row + 1 + count}"
             tip = unit if side == "left" else right_unit
             hover = f"%{{x:.2f}} s: %{{y:.4g}} {tip}<extra>{name}</extra>"
-            data.append(_line(lines[row], name, colour, yaxis=axis, showlegend=row == 0, hovertemplate=hover))
+            data.append(_line(lines[row], name, colour, yaxis=yaxis, showlegend=row == 0, hovertemplate=hover))
         if right_unit:
             right = _right_axis(right_unit, f"y{key}", zeroline=False)
             right["title"]["standoff"] = 4
-            layout[f"yaxis{row + 1 + count}"] = right
-    if right_unit:
-        layout["margin"] = {**layout["margin"], "r": 58}
-    return {"data": data, "layout": layout}
+            rows[f"yaxis{row + 1 + count}"] = right
+    return {"data": data, "layout": rows}
 
 
 def _underlaid(figure: Figure) -> Figure:
@@ -192,15 +189,13 @@ def spectra(spectrum: dict[str, Any], *, unit: str, factor: float = 1.0) -> Figu
         trace["line"] = {"color": colour, "width": width}
         trace["opacity"] = 0.45 if width > 2 else 1.0
         data.append(trace)
-    layout = _layout(360)
-    layout["showlegend"] = True
     left = [trace["y"] for trace in data if trace["yaxis"] == "y"]
-    layout["xaxis"] = _axis("frequency (Hz)", **_decades([trace["x"] for trace in data]))
-    layout["yaxis"] = _axis(f"{unit}/√Hz", **_decades(left))
+    x = axis("frequency (Hz)", **_decades([trace["x"] for trace in data]))
+    more: Figure = {"showlegend": True}
     if other:
-        layout["yaxis2"] = _right_axis("model units/s²/√Hz", "y", **_decades([data[-1]["y"]]))
-        layout["margin"] = {**layout["margin"], "r": 58}
-    return {"data": data, "layout": layout}
+        right = _right_axis("model units/s²/√Hz", "y", **_decades([data[-1]["y"]]))
+        more |= {"yaxis2": right, "margin": {"r": 58}}
+    return {"data": data, "layout": layout(360, x, axis(f"{unit}/√Hz", **_decades(left)), **more)}
 
 
 def _decades(columns: Sequence[Sequence[float | None]]) -> Figure:
@@ -215,74 +210,70 @@ def informative_parts(parts: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return [part for part in parts if half_width(part["sigma_log"]) <= WEAK_HALF_WIDTH]
 
 
+def _intervals(
+    parts: Sequence[dict[str, Any]],
+    start_s: float,
+    off: Sequence[float],
+    reach: Sequence[float],
+    name: str,
+    colour: str,
+) -> Figure:
+    """Parts of a recording as dots, with how long they are and their 95 % intervals (per cent)."""
+    return {
+        "type": "scatter",
+        "mode": "markers",
+        "name": name,
+        "x": [0.5 * (part["begin_s"] + part["end_s"]) - start_s for part in parts],
+        "y": off,
+        "error_y": {"type": "data", "array": reach, "thickness": 1.5, "color": colour},
+        "error_x": {
+            "type": "data",
+            "array": [0.5 * (part["end_s"] - part["begin_s"]) for part in parts],
+            "thickness": 3,
+            "width": 0,
+            "color": colour,
+        },
+        "marker": {"color": colour, "size": 9},
+        "hovertemplate": "%{y:+.2f} %<extra></extra>",
+    }
+
+
 def drift(model: dict[str, Any]) -> Figure:
     """Scales of the parts of a recording that tell one against the scale of the whole, in per cent."""
     whole, width = model["metres_per_unit"], model["half_width_pct"]
     every = model["drift"]["parts"]
     parts = informative_parts(every)
-    start = model["signals"].get("first_frame_s", every[0]["begin_s"])
-    middle = [0.5 * (p["begin_s"] + p["end_s"]) - start for p in parts]
-    off = [100 * (p["metres_per_unit"] / whole - 1) for p in parts]
-    reach = [100 * half_width(p["sigma_log"]) for p in parts]
+    start_s = model["signals"].get("first_frame_s", every[0]["begin_s"])
+    off = [100 * (part["metres_per_unit"] / whole - 1) for part in parts]
+    reach = [100 * half_width(part["sigma_log"]) for part in parts]
+    dots = _intervals(parts, start_s, off, reach, "part of the recording, 95 %", CAMERA)
+    dots["text"] = [f"{digits(part['metres_per_unit'])} m per unit" for part in parts]
+    dots["hovertemplate"] = "%{y:+.2f} %, %{text}<extra></extra>"
+    key = {
+        "type": "scatter",
+        "mode": "markers",
+        "name": f"interval of the whole, ±{digits(width, 2)} %",
+        "x": [None],
+        "y": [None],
+        "marker": {"color": GOOD, "symbol": "square", "size": 12, "opacity": 0.4},
+    }
     band = {"type": "rect", "xref": "paper", "x0": 0, "x1": 1, "y0": -width, "y1": width, "line": {"width": 0}}
-    layout = _layout(300, shapes=[{**band, "fillcolor": GOOD, "opacity": 0.13, "layer": "below"}])
-    span = [min(0.0, every[0]["begin_s"] - start), every[-1]["end_s"] - start]
-    layout["xaxis"] = _axis(_TIME, range=span, zeroline=False)
+    band |= {"fillcolor": GOOD, "opacity": 0.13, "layer": "below"}
     most = 1.15 * max([1.3 * width, *(abs(o) + r for o, r in zip(off, reach, strict=True))])
-    layout["yaxis"] = _axis("off the whole (%)", zeroline=True, range=[-most, most])
-    lengths = [0.5 * (p["end_s"] - p["begin_s"]) for p in parts]
-    data = [
-        {
-            "type": "scatter",
-            "mode": "markers",
-            "name": "part of the recording, 95 %",
-            "x": middle,
-            "y": off,
-            "error_y": {"type": "data", "array": reach, "thickness": 1.5, "color": CAMERA},
-            "error_x": {"type": "data", "array": lengths, "thickness": 3, "width": 0, "color": CAMERA},
-            "marker": {"color": CAMERA, "size": 9},
-            "text": [f"{digits(p['metres_per_unit'])} m per unit" for p in parts],
-            "hovertemplate": "%{y:+.2f} %, %{text}<extra></extra>",
-        },
-        {
-            "type": "scatter",
-            "mode": "markers",
-            "name": f"interval of the whole, ±{digits(width, 2)} %",
-            "x": [None],
-            "y": [None],
-            "marker": {"color": GOOD, "symbol": "square", "size": 12, "opacity": 0.4},
-        },
-    ]
-    return {"data": data, "layout": layout}
+    x = axis(_TIME, range=[min(0.0, every[0]["begin_s"] - start_s), every[-1]["end_s"] - start_s], zeroline=False)
+    y = axis("off the whole (%)", zeroline=True, range=[-most, most])
+    return {"data": [dots, key], "layout": layout(300, x, y, shapes=[band])}
 
 
 def refined(model: dict[str, Any], parts: Sequence[dict[str, Any]]) -> Figure:
     """Sizes of the parts of a path against the whole before and after a refinement, in per cent, each with 95 %."""
-    start = model["signals"].get("first_frame_s", parts[0]["begin_s"])
-    middle = [0.5 * (p["begin_s"] + p["end_s"]) - start for p in parts]
-    half = [0.5 * (p["end_s"] - p["begin_s"]) for p in parts]
-    reach = [Z95 * p["sigma_percent"] for p in parts]
-    before = [100 / (1 + p["percent"] / 100) - 100 for p in parts]
-    layout = _layout(300)
-    layout["showlegend"] = True
-    layout["xaxis"] = _axis(_TIME, zeroline=False)
-    layout["yaxis"] = _axis("off the whole (%)", zeroline=True)
+    start_s = model["signals"].get("first_frame_s", parts[0]["begin_s"])
+    reach = [Z95 * part["sigma_percent"] for part in parts]
+    before = [100 / (1 + part["percent"] / 100) - 100 for part in parts]
+    sides = (("before", CAMERA, before), ("after", GOOD, [0.0] * len(parts)))
     return {
-        "data": [
-            {
-                "type": "scatter",
-                "mode": "markers",
-                "name": f"{name} the refinement, 95 %",
-                "x": middle,
-                "y": off,
-                "error_y": {"type": "data", "array": reach, "thickness": 1.5, "color": color},
-                "error_x": {"type": "data", "array": half, "thickness": 3, "width": 0, "color": color},
-                "marker": {"color": color, "size": 9},
-                "hovertemplate": "%{y:+.2f} %<extra></extra>",
-            }
-            for name, off, color in (("before", before, CAMERA), ("after", [0.0] * len(parts), GOOD))
-        ],
-        "layout": layout,
+        "data": [_intervals(parts, start_s, off, reach, f"{name} the refinement, 95 %", c) for name, c, off in sides],
+        "layout": layout(300, axis(_TIME, zeroline=False), axis("off the whole (%)", zeroline=True), showlegend=True),
     }
 
 
@@ -299,8 +290,7 @@ def blur(frames: Sequence[dict[str, Any]]) -> Figure:
 
 
 def _over_time(height: int, title: str) -> Figure:
-    axes = {"xaxis": _axis(_TIME, zeroline=False), "yaxis": _axis(title, rangemode="tozero")}
-    return _layout(height, **axes)
+    return layout(height, axis(_TIME, zeroline=False), axis(title, rangemode="tozero"))
 
 
 def shutter_over_time(shutter: dict[str, Any]) -> Figure:
@@ -338,14 +328,12 @@ def shutter_field(worst: dict[str, Any]) -> Figure:
             "hovertemplate": "%{text}<extra></extra>",
         },
     ]
-    layout = _layout(420)
     width, height, edge = worst["width"], worst["height"], 0.08
     outline = {"type": "rect", "x0": 0, "x1": width, "y0": 0, "y1": height, "line": {"color": QUIET, "width": 1}}
-    layout["shapes"] = [outline]
     across, down = [-edge * width, (1 + edge) * width], [(1 + edge) * height, -edge * height]
-    layout["xaxis"] = _axis("x (px)", range=across, constrain="domain", zeroline=False)
-    layout["yaxis"] = _axis("y (px)", range=down, scaleanchor="x", constrain="domain", zeroline=False)
-    return {"data": data, "layout": layout}
+    x_axis = axis("x (px)", range=across, constrain="domain", zeroline=False)
+    y_axis = axis("y (px)", range=down, scaleanchor="x", constrain="domain", zeroline=False)
+    return {"data": data, "layout": layout(420, x_axis, y_axis, shapes=[outline])}
 
 
 def target_distances(validation: dict[str, Any]) -> Figure:
@@ -362,28 +350,31 @@ def target_distances(validation: dict[str, Any]) -> Figure:
             ]
             tip = "%{text}: %{x:.1f} mm, off by %{y:+.3f} mm<extra></extra>"
             data.append(_dots(f"{kind} ({len(those)})", points, colour, 0.75, tip))
-    layout = _layout(320)
-    layout["xaxis"] = _axis("known distance (mm)", zeroline=False)
-    layout["yaxis"] = _axis("measured − known (mm)", zeroline=True)
-    return {"data": data, "layout": layout}
+    x, y = axis("known distance (mm)", zeroline=False), axis("measured − known (mm)", zeroline=True)
+    return {"data": data, "layout": layout(320, x, y)}
+
+
+def bars(x: Sequence[Any], y: Sequence[Any], texts: Sequence[str] | None = None) -> Figure:
+    """Bars that say what they are when pointed at: their text, and y as a residual."""
+    trace = {
+        "type": "bar",
+        "x": list(x),
+        "y": list(y),
+        "marker": {"color": IMU},
+        "hovertemplate": "%{y}<extra></extra>",
+    }
+    if texts is not None:
+        tip = "%{text}, %{y:.2f} px<extra></extra>"
+        trace |= {"text": [escape(text) for text in texts], "textposition": "none", "hovertemplate": tip}
+    return trace
 
 
 def target_views(validation: dict[str, Any]) -> Figure:
     """Residuals of the target's corners in each image."""
     views = validation["views"]
-    data = [
-        {
-            "type": "bar",
-            "x": list(range(1, len(views) + 1)),
-            "y": [round(view["rms_px"], 4) for view in views],
-            "text": [escape(f"{view['name']}: {view['corners']} corners") for view in views],
-            "textposition": "none",
-            "marker": {"color": IMU},
-            "hovertemplate": "%{text}, %{y:.2f} px<extra></extra>",
-        }
-    ]
-    layout = _layout(240, showlegend=False)
-    layout["margin"] = {**layout["margin"], "t": 12}
-    layout["xaxis"] = _axis("images with the target", dtick=max(1, round(len(views) / 8)), zeroline=False)
-    layout["yaxis"] = _axis("residual, rms (px)")
-    return {"data": data, "layout": layout}
+    texts = [f"{view['name']}: {view['corners']} corners" for view in views]
+    x = axis("images with the target", dtick=max(1, round(len(views) / 8)), zeroline=False)
+    return {
+        "data": [bars(range(1, len(views) + 1), [round(view["rms_px"], 4) for view in views], texts)],
+        "layout": layout(240, x, axis("residual, rms (px)"), showlegend=False, margin={"t": 12}),
+    }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from colmap_inertial import __version__
-from colmap_inertial.checks.report.figures import BAD, IMU, QUIET, Figure
+from colmap_inertial.checks.report.figures import BAD, IMU, QUIET, Figure, axis, layout
 from colmap_inertial.checks.report.page import render_page
 from colmap_inertial.checks.words import Fact
 from colmap_inertial.core.arrays import Array
@@ -99,16 +99,9 @@ def _dots(series: list[tuple[str, str, Array, Array, list[str]]], title: str) ->
                 "marker": {"color": colour, "size": 7},
             }
         )
-    layout = {
-        "height": 260,
-        "margin": {"l": 68, "r": 12, "t": 30, "b": 46},
-        "legend": {"orientation": "h", "x": 0, "y": 1.0, "yanchor": "bottom", "xanchor": "left"},
-        "showlegend": len(series) > 1,
-        "hovermode": "closest",
-        "xaxis": {"title": {"text": "time since the recording's start (s)"}},
-        "yaxis": {"title": {"text": title}, "zeroline": True},
-    }
-    return {"data": data, "layout": layout}
+    x, y = axis("time since the recording's start (s)"), axis(title, zeroline=True)
+    shape = layout(260, x, y, showlegend=len(series) > 1, margin={"l": 68, "t": 30})
+    return {"data": data, "layout": shape}
 
 
 def _parameters(found: RestCalibration) -> list[tuple[str, str, str]]:
@@ -132,6 +125,6 @@ def _parameters(found: RestCalibration) -> list[tuple[str, str, str]]:
         ("accelerometer", calibration.accel_bias_m_s2, IMU_CAL.ACCEL_BIAS, "m/s²"),
         ("gyroscope", calibration.gyro_bias_rad_s, IMU_CAL.GYRO_BIAS, "rad/s"),
     ):
-        for axis, value, s in zip("xyz", bias, sigma[where], strict=True):
-            rows.append((f"{name} bias {axis}", f"{value:+.5f} {unit}", f"±{Z95 * s:.2g} {unit}"))
+        for letter, value, s in zip("xyz", bias, sigma[where], strict=True):
+            rows.append((f"{name} bias {letter}", f"{value:+.5f} {unit}", f"±{Z95 * s:.2g} {unit}"))
     return rows

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from html import escape
+import math
 from typing import Any
 
-from colmap_inertial.checks.report.figures import CAMERA, IMU, Figure, _axis, _layout, shutter_field
+import numpy as np
+
+from colmap_inertial.checks.report.figures import CAMERA, Figure, axis, bars, layout, shutter_field
 
 #: Below so many images, a place is seen too seldom to be sure of it.
 _FEW = 3
@@ -17,24 +19,15 @@ def distortion(camera: dict[str, Any]) -> Figure:
     return {**figure, "layout": {**figure["layout"], "height": 360}}
 
 
-def residuals_by_image(images: list[dict[str, Any]], *, height: int = 240) -> Figure:
+def residuals_by_image(images: list[dict[str, Any]]) -> Figure:
     """Residuals of each image, in order of the names."""
-    data = [
-        {
-            "type": "bar",
-            "x": list(range(1, len(images) + 1)),
-            "y": [None if image["rms_px"] is None else round(image["rms_px"], 4) for image in images],
-            "text": [escape(f"{image['name']}: {image['observations']} points") for image in images],
-            "textposition": "none",
-            "marker": {"color": IMU},
-            "hovertemplate": "%{text}, %{y:.2f} px<extra></extra>",
-        }
-    ]
-    layout = _layout(height, showlegend=False)
-    layout["margin"] = {**layout["margin"], "t": 12}
-    layout["xaxis"] = _axis("images, by name", zeroline=False)
-    layout["yaxis"] = _axis("residual, rms (px)", rangemode="tozero")
-    return {"data": data, "layout": layout}
+    residuals = [None if image["rms_px"] is None else round(image["rms_px"], 4) for image in images]
+    texts = [f"{image['name']}: {image['observations']} points" for image in images]
+    x, y = axis("images, by name", zeroline=False), axis("residual, rms (px)", rangemode="tozero")
+    return {
+        "data": [bars(range(1, len(images) + 1), residuals, texts)],
+        "layout": layout(240, x, y, showlegend=False, margin={"t": 12}),
+    }
 
 
 def residuals_on_sensor(sensor: dict[str, Any]) -> Figure:
@@ -42,17 +35,16 @@ def residuals_on_sensor(sensor: dict[str, Any]) -> Figure:
     columns, rows = sensor["columns"], sensor["rows"]
     across, down = sensor["width"] / columns, sensor["height"] / rows
     x, y = [(c + 0.5) * across for c in range(columns)], [(r + 0.5) * down for r in range(rows)]
-    known = [v for v in (*sensor["mean_x_px"], *sensor["mean_y_px"]) if v is not None]
-    largest = max((abs(v) for v in known), default=0.0) or 1.0
+    mean = np.array([sensor["mean_x_px"], sensor["mean_y_px"]], dtype=np.float64)  # none where nothing is known
+    largest = float(np.nanmax(np.abs(mean), initial=0.0)) or 1.0
     times = 0.9 * min(across, down) / largest
     ends_x: list[float | None] = []
     ends_y: list[float | None] = []
-    for r in range(rows):
-        for c in range(columns):
-            dx, dy = sensor["mean_x_px"][r * columns + c], sensor["mean_y_px"][r * columns + c]
-            if dx is not None:
-                ends_x += [round(x[c], 1), round(x[c] + times * dx, 1), None]
-                ends_y += [round(y[r], 1), round(y[r] + times * dy, 1), None]
+    for i, (dx, dy) in enumerate(mean.T.tolist()):
+        if not math.isnan(dx):
+            r, c = divmod(i, columns)
+            ends_x += [round(x[c], 1), round(x[c] + times * dx, 1), None]
+            ends_y += [round(y[r], 1), round(y[r] + times * dy, 1), None]
     table = [sensor["rms_px"][r * columns : (r + 1) * columns] for r in range(rows)]
     heat = {
         "type": "heatmap",
@@ -73,13 +65,9 @@ def residuals_on_sensor(sensor: dict[str, Any]) -> Figure:
         "hoverinfo": "skip",
         "showlegend": True,
     }
-    layout = _layout(360)
-    layout["margin"] = {**layout["margin"], "r": 70}
-    layout["xaxis"] = _axis("x (px)", constrain="domain", zeroline=False, showgrid=False)
-    layout["yaxis"] = _axis(
-        "y (px)", autorange="reversed", scaleanchor="x", constrain="domain", zeroline=False, showgrid=False
-    )
-    return {"data": [heat, arrows], "layout": layout}
+    plain = {"constrain": "domain", "zeroline": False, "showgrid": False}
+    x_axis, y_axis = axis("x (px)", **plain), axis("y (px)", autorange="reversed", scaleanchor="x", **plain)
+    return {"data": [heat, arrows], "layout": layout(360, x_axis, y_axis, margin={"r": 70})}
 
 
 def track_lengths(tracks: dict[str, Any]) -> Figure:
@@ -87,12 +75,9 @@ def track_lengths(tracks: dict[str, Any]) -> Figure:
     counts = tracks["counts"]
     names = [str(n) for n in range(2, len(counts) + 2)]
     names[-1] += "+"
-    data = [{"type": "bar", "x": names, "y": counts, "marker": {"color": IMU}, "hovertemplate": "%{y}<extra></extra>"}]
-    layout = _layout(240, showlegend=False)
-    layout["margin"] = {**layout["margin"], "t": 12}
-    layout["xaxis"] = _axis("images that see a point", type="category")
-    layout["yaxis"] = _axis("points")
-    return {"data": data, "layout": layout}
+    x = axis("images that see a point", type="category")
+    shape = layout(240, x, axis("points"), showlegend=False, margin={"t": 12})
+    return {"data": [bars(names, counts)], "layout": shape}
 
 
 def overlap(ground: dict[str, Any], path: list[list[float]], unit: str) -> Figure:
@@ -121,11 +106,9 @@ def overlap(ground: dict[str, Any], path: list[list[float]], unit: str) -> Figur
         "hoverinfo": "skip",
         "showlegend": True,
     }
-    layout = _layout(420)
-    layout["margin"] = {**layout["margin"], "r": 70}
-    layout["xaxis"] = _axis(f"x ({unit})", constrain="domain", zeroline=False, showgrid=False)
-    layout["yaxis"] = _axis(f"y ({unit})", scaleanchor="x", constrain="domain", zeroline=False, showgrid=False)
-    return {"data": [heat, line], "layout": layout}
+    plain = {"constrain": "domain", "zeroline": False, "showgrid": False}
+    x, y = axis(f"x ({unit})", **plain), axis(f"y ({unit})", scaleanchor="x", **plain)
+    return {"data": [heat, line], "layout": layout(420, x, y, margin={"r": 70})}
 
 
 def seldom_seen(ground: dict[str, Any]) -> float:

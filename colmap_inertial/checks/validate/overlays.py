@@ -135,7 +135,7 @@ def distance_chart(validation: Validation) -> str:
 
 @dataclass(frozen=True)
 class _Panel:
-    """One chart: its left edge, how far its axes reach, name of the upright one, end of the line of no error, points."""
+    """One chart: left edge, reach of its axes, name of the upright one, end of the line of no error, points."""
 
     left: int
     x_end: float
