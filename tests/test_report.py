@@ -22,8 +22,9 @@ from colmap_inertial.checks.report import figures, signals, write_report
 from colmap_inertial.checks.report.content import _path_in_words
 from colmap_inertial.checks.report.figure_3d import nice_length, scene_figure
 from colmap_inertial.checks.report.scene import scene_record
-from colmap_inertial.checks.report.series import MOST_POINTS, rounded, strided, thinned
+from colmap_inertial.checks.report.series import rounded, strided, thinned
 from colmap_inertial.checks.report.signals import signal_record
+from colmap_inertial.checks.report.sizes import SIZES
 from colmap_inertial.checks.words import outcome_of_model
 from colmap_inertial.cli import main
 from colmap_inertial.core.errors import FormatError, InertialError, MappingError
@@ -372,7 +373,7 @@ def test_a_long_recording_with_several_models_stays_below_five_megabytes(tmp_pat
     assert (out / "report.html").stat().st_size < 5e6
     for model in content["models"]:
         for line in model["signals"]["rotation"]["after"]["camera"]:
-            assert len(line["t_s"]) <= MOST_POINTS
+            assert len(line["t_s"]) <= SIZES.line_points
         assert len(model["scene"]["points"]["rgb"]) <= 12000
     assert len(page.anchors()) > 20
 
@@ -386,7 +387,7 @@ def test_thinning_keeps_the_extremes_the_order_and_the_gaps():
     values[7777], values[15000] = 9.0, -9.0
     values[4000:6000] = np.nan
     line = thinned(t_s, values)
-    assert len(line["t_s"]) == len(line["values"]) <= MOST_POINTS
+    assert len(line["t_s"]) == len(line["values"]) <= SIZES.line_points
     assert line["t_s"] == sorted(line["t_s"])
     known = [value for value in line["values"] if value is not None]
     assert max(known) == 9.0 and min(known) == -9.0

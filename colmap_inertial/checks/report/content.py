@@ -11,6 +11,7 @@ import numpy as np
 
 from colmap_inertial import __version__
 from colmap_inertial.checks.report.series import strided
+from colmap_inertial.checks.report.sizes import SIZES
 from colmap_inertial.checks.words import (
     half_width_pct,
     joined_in_words,
@@ -24,12 +25,8 @@ from colmap_inertial.io.files import read_json, read_text
 VERSION = 1
 #: What the pipeline keeps for the report alone, in an output folder.
 DATA_FOLDER, CROPS_FOLDER = "report_data", "crops"
-#: Paths longer than this bend and drift enough to say so (m).
-_LONG_PATH_M = 30.0
 #: Of a model in ``result.json``, what the page shows otherwise or not.
 _NOT_SHOWN = ("drift", "validation", "cov", "dense")
-#: Models that are shown in full, the largest ones; frames in the plot of blur; images of the target.
-_MOST_MODELS, _MOST_FRAMES, _MOST_IMAGES = 3, 3000, 4
 
 Content = dict[str, Any]
 
@@ -71,7 +68,7 @@ def gather(
     nothing: Content = {"models": [], "frames": [], "seconds": {}, "versions": {"colmap_inertial": __version__}}
     done = nothing if result is None else result
     models = sorted(done["models"], key=lambda m: (m["metres_per_unit"] is None, -m["registered_images"], m["index"]))
-    full = {model["index"] for model in models[:_MOST_MODELS]}
+    full = {model["index"] for model in models[: SIZES.models]}
     project = done.get("project") is not None
     shown = [_model(out, model, in_full=model["index"] in full, project=project) for model in models]
     findings = _findings(out)
@@ -119,7 +116,7 @@ def _path_in_words(model: Content) -> list[str]:
     done = [one for one in model.get("treatments", []) if one["stage"] == "refine"]
     if not done:
         length = model.get("scene", {}).get("path_length")
-        if model.get("sparse_metric") is None or length is None or length < _LONG_PATH_M:
+        if model.get("sparse_metric") is None or length is None or length < SIZES.long_path_m:
             return []
         return [f"Its path is {length:.0f} m long: --refine inertial fits the IMU to it, too, against bends and drift."]
     percent = [part["percent"] for part in refined_parts(model)]
@@ -167,7 +164,7 @@ def _model(out: Path, model: Content, *, in_full: bool, project: bool) -> Conten
         kept |= read_json(file)
     else:
         failed = "What it is drawn from was not kept; where that failed, log.txt says why."
-        why = failed if in_full else f"Only the {_MOST_MODELS} largest models are shown in full."
+        why = failed if in_full else f"Only the {SIZES.models} largest models are shown in full."
         kept["scene"], kept["signals"] = _missing(why), _missing(why)
     kept.setdefault("photogrammetry", _missing("It was not kept: an earlier version made this run."))
     kept["outcome"] = outcome_of_model({**model, "signals": kept["signals"]})
@@ -186,7 +183,7 @@ def _validation(out: Path, model: Content, *, project: bool) -> Content:
         return _missing(f"The target could not be measured: {found['error']}.")
     folder = out / "validation" / str(model["index"])
     images = sorted(folder.glob("*.jpg")) if folder.is_dir() else []
-    chosen = [str(images[i].relative_to(out)) for i in strided(len(images), _MOST_IMAGES)]
+    chosen = [str(images[i].relative_to(out)) for i in strided(len(images), SIZES.target_images)]
     return {**found, "pictures": chosen}
 
 
@@ -214,8 +211,8 @@ def _blur(done: Content, recording: Content | None, *, project: bool) -> Content
         return _missing(f"No blur to show: {note}.")
     time_of = dict(zip(recording["frames"]["names"], recording["frames"]["t_s"], strict=True))
     blur_px = np.array([frame["blur_px"] for frame in known])
-    some = strided(len(known), _MOST_FRAMES)
-    worst = np.argsort(-blur_px, kind="stable")[: _MOST_FRAMES // 10] if len(some) < len(known) else some[:0]
+    some = strided(len(known), SIZES.blur_frames)
+    worst = np.argsort(-blur_px, kind="stable")[: SIZES.blur_frames // 10] if len(some) < len(known) else some[:0]
     return {
         "note": note,
         "counts": dict(Counter(frame["action"] for frame in done["frames"])),

@@ -8,11 +8,9 @@ from typing import Any
 import numpy as np
 
 from colmap_inertial.checks.report.figures import CAMERA, GOOD, IMU, QUIET, Figure
+from colmap_inertial.checks.report.sizes import SIZES
 from colmap_inertial.checks.words import digits
 from colmap_inertial.core.arrays import Array
-
-#: Share of the points that the box leaves out on each side; cells across the grid.
-_OUTSIDE_PCT, _CELLS = 1.5, 9
 
 
 def scene_figure(scene: dict[str, Any]) -> Figure:
@@ -22,7 +20,7 @@ def scene_figure(scene: dict[str, Any]) -> Figure:
     xyz, path = (np.array(scene[key]["xyz"], dtype=np.float64).reshape(3, -1) for key in ("points", "path"))
     low, high = _box(xyz, path)
     size = float((high - low).max())
-    step = nice_length(size / _CELLS)
+    step = nice_length(size / SIZES.grid_cells)
     inside = np.all((xyz >= low[:, None]) & (xyz <= high[:, None]), axis=0)
     data: list[Figure] = [
         {
@@ -88,7 +86,7 @@ def _box(xyz: Array, path: Array) -> tuple[Array, Array]:
     """Low and high corner (3,) of what is shown: nearly all points, and all of the path."""
     edges = [path.min(axis=1), path.max(axis=1)]
     if xyz.shape[1]:
-        edges += list(np.percentile(xyz, [_OUTSIDE_PCT, 100 - _OUTSIDE_PCT], axis=1))
+        edges += list(np.percentile(xyz, [SIZES.outside_pct, 100 - SIZES.outside_pct], axis=1))
     low, high = np.min(edges, axis=0), np.max(edges, axis=0)
     pad = 0.06 * max(float((high - low).max()), 1e-9)
     return low - pad, high + pad

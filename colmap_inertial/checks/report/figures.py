@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from colmap_inertial.checks.report.sizes import SIZES
 from colmap_inertial.checks.words import digits
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.inertial.scale.verdict import WEAK_HALF_WIDTH, half_width
@@ -25,10 +26,6 @@ _ACTIONS = {
     "dropped": ("left out", BAD),
 }
 _SETS = {"control": IMU, "check": CAMERA, "mixed": QUIET}
-#: Acceleration that filming by hand reaches, so that less looks like less.
-_HAND_M_S2 = 1.0
-#: Known distances that are drawn.
-_MOST_DISTANCES = 1500
 
 
 def layout(height: int, x: Figure | None = None, y: Figure | None = None, **more: Any) -> Figure:
@@ -157,7 +154,7 @@ def accelerations(acceleration: dict[str, Any]) -> Figure:
     # without a unit the factor between the curves is open: zero in the middle of both, and what a hand does as measure
     for row, (imu, camera) in enumerate(zip(acceleration["accelerometer"], acceleration["camera"], strict=True)):
         key = "" if row == 0 else str(row + 1)
-        most = 1.1 * max(_HAND_M_S2, _peak(imu))
+        most = 1.1 * max(SIZES.hand_m_s2, _peak(imu))
         figure["layout"][f"yaxis{key}"]["range"] = [-most, most]
         most = 1.6 * _peak(camera) or 1.0
         figure["layout"][f"yaxis{row + 4}"] |= {"range": [-most, most], "tickmode": "auto", "nticks": 5}
@@ -339,7 +336,7 @@ def shutter_field(worst: dict[str, Any]) -> Figure:
 def target_distances(validation: dict[str, Any]) -> Figure:
     """Measured minus known distances, each corner triangulated on its own."""
     distances = validation["distances"]
-    step = -(-len(distances) // _MOST_DISTANCES) or 1
+    step = -(-len(distances) // SIZES.target_distances) or 1
     data = []
     for kind, colour in _SETS.items():
         those = [distance for distance in distances[::step] if distance["set"] == kind]

@@ -8,19 +8,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from colmap_inertial.checks.report.series import rounded, strided
+from colmap_inertial.checks.report.sizes import SIZES
 from colmap_inertial.core.arrays import Array, IndexArray
 from colmap_inertial.core.geometry import quat_rotate
 from colmap_inertial.model.intrinsics import intrinsics_sigma
 
 if TYPE_CHECKING:
     import pycolmap
-
-#: Images whose residuals are computed; cells across the longer side of the sensor, and of the ground; cameras shown.
-_MOST_IMAGES, _SENSOR_CELLS, _GROUND_CELLS, _MOST_CAMERAS = 300, 16, 40, 4
-#: Lengths of tracks are counted one by one up to here. Share of the points that extent and ground leave out each side.
-_LONGEST_TRACK, _OUTSIDE_PCT = 12, 1.5
-#: Points across an image at which its distortion is drawn.
-_ACROSS = 15
 
 
 def photogrammetry_record(
@@ -50,9 +44,10 @@ def photogrammetry_record(
     lengths = np.array([track.length() for track in tracks], dtype=np.intp)
     upright = quat_rotate(display_from_model_xyzw, xyz) if len(xyz) else xyz
     seen = [
-        _seen(reconstruction.camera(images[i].camera_id), images[i], place) for i in strided(len(images), _MOST_IMAGES)
+        _seen(reconstruction.camera(images[i].camera_id), images[i], place)
+        for i in strided(len(images), SIZES.residual_images)
     ]
-    sigma = intrinsics_sigma(reconstruction)
+    sigma, longest = intrinsics_sigma(reconstruction), SIZES.longest_track
     return {
         "unit": unit,
         "cameras": [_camera(reconstruction, i, image_ids, sigma.get(i)) for i in _most_used(reconstruction, image_ids)],
@@ -63,7 +58,7 @@ def photogrammetry_record(
         "sensor": _sensor(seen),
         "tracks": {
             "mean": float(lengths.mean()) if len(lengths) else 0.0,
-            "counts": np.bincount(np.minimum(lengths, _LONGEST_TRACK), minlength=_LONGEST_TRACK + 1)[2:].tolist(),
+            "counts": np.bincount(np.minimum(lengths, longest), minlength=longest + 1)[2:].tolist(),
         },
         "extent": _span(upright),
         "ground": _ground(upright, tracks),
@@ -98,7 +93,7 @@ def _rms(residual_px: Array) -> float | None:
 
 def _most_used(reconstruction: pycolmap.Reconstruction, image_ids: list[int]) -> list[int]:
     used = [reconstruction.image(i).camera_id for i in image_ids]
-    return sorted(set(used), key=lambda i: (-used.count(i), i))[:_MOST_CAMERAS]
+    return sorted(set(used), key=lambda i: (-used.count(i), i))[: SIZES.cameras]
 
 
 def _camera(
@@ -107,8 +102,8 @@ def _camera(
     """Intrinsics, field of view, and by how much the lens moves points from where a pinhole would have them."""
     camera = reconstruction.camera(camera_id)
     names = [name.strip() for name in camera.params_info.split(",")]
-    x = (np.arange(_ACROSS) + 0.5) * camera.width / _ACROSS
-    y = (np.arange(_ACROSS) + 0.5) * camera.height / _ACROSS
+    count = SIZES.distortion_points
+    x, y = ((np.arange(count) + 0.5) * side / count for side in (camera.width, camera.height))
     at = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     rays = np.array(camera.cam_from_img(at)).reshape(-1, 2)
     matrix = np.array(camera.calibration_matrix())
@@ -123,9 +118,7 @@ def _camera(
         "height": camera.height,
         "images": sum(reconstruction.image(i).camera_id == camera_id for i in image_ids),
         "params": dict(zip(names, (float(p) for p in camera.params), strict=True)),
-        "sigma": {}
-        if sigma is None
-        else {name: float(s) for name, s in zip(names, sigma, strict=True) if np.isfinite(s)},
+        "sigma": {n: float(s) for n, s in zip(names, () if sigma is None else sigma, strict=False) if np.isfinite(s)},
         "field_of_view_deg": rounded(np.array(field), 2),
         "distortion": {
             "at_px": np.round(at[good], 1).tolist(),
@@ -142,7 +135,7 @@ def _sensor(seen: list[_Seen]) -> dict[str, Any] | None:
     width, height = max(sorted(set(sizes)), key=sizes.count)
     those = [s for s in seen if s.size == (width, height)]
     xy, residual = np.concatenate([s.xy_px for s in those]), np.concatenate([s.residual_px for s in those])
-    step = max(width, height) / _SENSOR_CELLS
+    step = max(width, height) / SIZES.sensor_cells
     columns, rows = int(np.ceil(width / step)), int(np.ceil(height / step))
     column, row = (np.clip((xy[:, k] / step).astype(np.intp), 0, n - 1) for k, n in ((0, columns), (1, rows)))
     cell, cells = row * columns + column, rows * columns
@@ -170,7 +163,7 @@ def _span(upright: Array) -> list[float] | None:
     """(3,) how far nearly all points reach, along x, y and up."""
     if not len(upright):
         return None
-    low, high = np.percentile(upright, [_OUTSIDE_PCT, 100 - _OUTSIDE_PCT], axis=0)
+    low, high = np.percentile(upright, [SIZES.outside_pct, 100 - SIZES.outside_pct], axis=0)
     return [round(float(v), 4) for v in high - low]
 
 
@@ -178,8 +171,8 @@ def _ground(upright: Array, tracks: list[Any]) -> dict[str, Any] | None:
     """Images that see each square of the ground, from above."""
     if len(upright) < 2:
         return None
-    low, high = (np.percentile(upright[:, :2], pct, axis=0) for pct in (_OUTSIDE_PCT, 100 - _OUTSIDE_PCT))
-    step = float((high - low).max()) / _GROUND_CELLS
+    low, high = (np.percentile(upright[:, :2], pct, axis=0) for pct in (SIZES.outside_pct, 100 - SIZES.outside_pct))
+    step = float((high - low).max()) / SIZES.ground_cells
     if not step > 0:
         return None
     columns, rows = (int(n) for n in np.ceil((high - low) / step).astype(np.intp).clip(1))

@@ -8,9 +8,7 @@ from typing import Any
 import numpy as np
 
 from colmap_inertial.checks.report.figures import CAMERA, Figure, axis, bars, layout, shutter_field
-
-#: Below so many images, a place is seen too seldom to be sure of it.
-_FEW = 3
+from colmap_inertial.checks.report.sizes import SIZES
 
 
 def distortion(camera: dict[str, Any]) -> Figure:
@@ -114,4 +112,4 @@ def overlap(ground: dict[str, Any], path: list[list[float]], unit: str) -> Figur
 def seldom_seen(ground: dict[str, Any]) -> float:
     """Share of the ground that fewer than three images see."""
     seen = [value for row in ground["images"] for value in row if value]
-    return sum(value < _FEW for value in seen) / max(1, len(seen))
+    return sum(value < SIZES.fewest_views for value in seen) / max(1, len(seen))

@@ -11,6 +11,7 @@ from colmap_inertial.checks.report import figures, photogrammetry_figures
 from colmap_inertial.checks.report.content import refined_parts
 from colmap_inertial.checks.report.figure_3d import scene_figure
 from colmap_inertial.checks.report.page import render_page
+from colmap_inertial.checks.report.sizes import SIZES
 from colmap_inertial.checks.words import (
     Fact,
     digits,
@@ -43,8 +44,6 @@ _PARAMETERS = {
     "cx": "principal point, across",
     "cy": "principal point, down",
 }
-#: Of intrinsics, so that a row fits the narrowest page.
-_MOST_DECIMALS = 6
 
 
 def run_page(content: Content, out: Path) -> str:
@@ -159,7 +158,7 @@ def _with_sigma(value: float, sigma: float | None) -> tuple[str, str]:
     if sigma is None or not sigma > 0:
         return f"{value:.6g}", ""
     decimals = max(0, 1 - math.floor(math.log10(sigma)))
-    if decimals > _MOST_DECIMALS:
+    if decimals > SIZES.most_decimals:
         return f"{value:.6g}", f"{sigma:.2g}"
     return f"{value:.{decimals}f}", f"{sigma:.{decimals}f}"
 

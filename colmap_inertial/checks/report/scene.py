@@ -7,18 +7,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from colmap_inertial.checks.report.series import strided
+from colmap_inertial.checks.report.sizes import SIZES
 from colmap_inertial.core.arrays import Array, UInt8Array
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_rotate, rotation_between
 from colmap_inertial.core.types import CameraTrajectory
 
 if TYPE_CHECKING:
     import pycolmap
-
-#: Points, poses of the path, and cameras drawn as pyramids.
-_MOST_POINTS, _MOST_POSES, _MOST_CAMERAS = 12000, 1200, 40
-#: Points that are seen this badly, or by so few images, tell little; far points this many path lengths off make the
-#: rest small.
-_WORST_PX, _FEWEST_VIEWS, _FAR = 2.0, 3, 8.0
 
 
 def scene_record(
@@ -54,8 +49,8 @@ def scene_record(
     centres = quat_rotate(upright, trajectory.cam_in_world)
     xyz, rgb = _points(reconstruction, trajectory.cam_in_world)
     xyz = quat_rotate(upright, xyz) if len(xyz) else xyz
-    some = strided(len(centres), _MOST_CAMERAS)
-    poses = strided(len(centres), _MOST_POSES)
+    some = strided(len(centres), SIZES.scene_cameras)
+    poses = strided(len(centres), SIZES.scene_poses)
     size = _extent(np.concatenate([xyz, centres]))
     digits = int(np.clip(4 - np.floor(np.log10(size)), 0, 9)) if size > 0 else 6
     axes = np.einsum("ij,njk->nik", matrix_from_quat(upright), matrix_from_quat(world_from_cam[some]))
@@ -96,9 +91,9 @@ def _points(reconstruction: pycolmap.Reconstruction, centres: Array) -> tuple[Ar
     chosen = []
     ids = sorted(reconstruction.point3D_ids())
     # a first choice bounds the work for models of millions of points
-    for i in np.array(ids)[strided(len(ids), 6 * _MOST_POINTS)].tolist() if ids else []:
+    for i in np.array(ids)[strided(len(ids), 6 * SIZES.scene_points)].tolist() if ids else []:
         point = reconstruction.points3D[i]
-        seen_well = point.track.length() >= _FEWEST_VIEWS and not point.error > _WORST_PX
+        seen_well = point.track.length() >= SIZES.fewest_views and not point.error > SIZES.worst_point_px
         if seen_well and np.isfinite(point.xyz).all():
             chosen.append(point)
     if not chosen:
@@ -106,8 +101,8 @@ def _points(reconstruction: pycolmap.Reconstruction, centres: Array) -> tuple[Ar
     xyz = np.array([point.xyz for point in chosen])
     middle = np.median(np.concatenate([xyz, centres]), axis=0)
     away = np.linalg.norm(xyz - middle, axis=1)
-    near = np.flatnonzero(away < _FAR * max(float(np.median(away)), 1e-12))
-    near = near[strided(len(near), _MOST_POINTS)]
+    near = np.flatnonzero(away < SIZES.farthest_medians * max(float(np.median(away)), 1e-12))
+    near = near[strided(len(near), SIZES.scene_points)]
     return xyz[near], np.array([chosen[i].color for i in near], dtype=np.uint8).reshape(-1, 3)
 
 

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from colmap_inertial.checks.report.sizes import SIZES
 from colmap_inertial.core.arrays import Array, IndexArray
-
-#: Points of a line in the report: more than a screen has columns.
-MOST_POINTS = 1200
 
 
 def rounded(values: Array, digits: int = 5) -> list[float | None]:
@@ -20,7 +18,7 @@ def rounded(values: Array, digits: int = 5) -> list[float | None]:
     return [value if known else None for value, known in zip(short.tolist(), finite.tolist(), strict=True)]
 
 
-def thinned(t_s: Array, values: Array, most: int = MOST_POINTS) -> dict[str, list[float | None]]:
+def thinned(t_s: Array, values: Array, most: int = SIZES.line_points) -> dict[str, list[float | None]]:
     """A line of at most ``most`` points: of each of equally long parts, its smallest and its largest value.
 
     Parameters

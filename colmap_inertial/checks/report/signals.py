@@ -6,6 +6,7 @@ frames; second differences of positions, of the camera's own and of the accelero
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,14 +27,25 @@ from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.inertial.scale import check_units
 from colmap_inertial.motion.smooth import WorldAcceleration, smooth_attitude
 
-#: Positions are differentiated over this long: a millimetre of noise becomes 0.06 m/s2.
-_REACH_S = 0.2
-#: A longer pause between frames is a gap in the lines, as is a rotation in one that may be one the other way round.
-_PAUSE_S, _MOST_ROTATION_RAD = 5.0, 2.5
-#: Parts that spectra are averaged over; samples less even than this have none (share within a fifth of the usual step).
-_PART_S, _EVEN = 8.0, 0.9
-#: Points of a spectrum.
-_BINS = 120
+
+@dataclass(frozen=True, kw_only=True)
+class ComparisonSettings:
+    """How camera and IMU are compared."""
+
+    #: Positions are differentiated over this long: a millimetre of noise becomes 0.06 m/s2.
+    reach_s: float = 0.2
+    #: A longer pause between frames is a gap in the lines, as is a rotation in one that may be one the other way round.
+    longest_pause_s: float = 5.0
+    largest_rotation_rad: float = 2.5
+    #: Parts that spectra are averaged over.
+    part_s: float = 8.0
+    #: Samples less even have no spectrum: share of the steps within a fifth of the usual one.
+    even_share: float = 0.9
+    #: Points of a spectrum.
+    bins: int = 120
+
+
+SETTINGS = ComparisonSettings()
 
 Record = dict[str, Any]
 
@@ -115,7 +127,10 @@ class _Rates:
     def of(cls, trajectory: CameraTrajectory) -> _Rates:
         t_s, rotation = trajectory.t_s, trajectory.turn_rad()
         rate = rotation / np.diff(t_s)[:, None]
-        rate[(np.diff(t_s) > _PAUSE_S) | (np.linalg.norm(rotation, axis=1) > _MOST_ROTATION_RAD)] = np.nan
+        rate[
+            (np.diff(t_s) > SETTINGS.longest_pause_s)
+            | (np.linalg.norm(rotation, axis=1) > SETTINGS.largest_rotation_rad)
+        ] = np.nan
         return cls(t_s[:-1], t_s[1:], rate)
 
     def by_gyroscope(self, motion: GyroCamera) -> Array:
@@ -239,13 +254,13 @@ class _Accelerations:
             return 2 * slopes / (before + after)[:, None]
 
         gaps = self._covered[2 * reach :] != self._covered[: -2 * reach]
-        broken = gaps | (np.maximum(before, after) > max(_PAUSE_S, 3 * reach * self._step_s))
+        broken = gaps | (np.maximum(before, after) > max(SETTINGS.longest_pause_s, 3 * reach * self._step_s))
         by_camera, by_imu = second_difference(self._path), second_difference(self._sums)
         by_camera[broken] = by_imu[broken] = np.nan
         return t_s[reach:-reach], by_camera, by_imu
 
     def record(self, start_s: float) -> Record:
-        reach = max(1, round(_REACH_S / self._step_s))
+        reach = max(1, round(SETTINGS.reach_s / self._step_s))
         t_s, by_camera, by_imu = self.over(reach)
         both = np.isfinite(by_camera).all(axis=1)
         if both.sum() < 3:
@@ -293,10 +308,10 @@ def _spectrum(t_s: Array, values: Array) -> Record | None:
     t_s, values = t_s[known], values[known]
     steps = np.diff(t_s)
     step_s = float(np.median(steps))
-    if np.mean(np.abs(steps - step_s) < 0.2 * step_s) < _EVEN:
+    if np.mean(np.abs(steps - step_s) < 0.2 * step_s) < SETTINGS.even_share:
         return None
     total: Array | float = 0.0
-    count = min(round(_PART_S / step_s), int(np.ptp(t_s) / step_s))
+    count = min(round(SETTINGS.part_s / step_s), int(np.ptp(t_s) / step_s))
     hz = np.zeros(0)
     weights = 0
     for part in np.split(np.arange(len(t_s)), np.flatnonzero(np.diff(t_s) > 5 * step_s) + 1):
@@ -313,7 +328,7 @@ def _spectrum(t_s: Array, values: Array) -> Record | None:
         return None
     density = np.sqrt(total / weights)[1:]
     hz = hz[1:]
-    edges = np.geomspace(hz[0], hz[-1] * 1.0001, _BINS + 1)
+    edges = np.geomspace(hz[0], hz[-1] * 1.0001, SETTINGS.bins + 1)
     place = np.searchsorted(edges, hz, side="right")
     found, index, members = np.unique(place, return_inverse=True, return_counts=True)
     mean = np.sqrt(np.bincount(index, density**2, len(found)) / members)

@@ -140,22 +140,17 @@ def _diagonal(model: Path | pycolmap.Reconstruction) -> float | None:
 def _measure(
     search: Search, placed: dict[int, PartPlacement], missing: dict[str, str], diagonal: float | None
 ) -> Validation:
-    target, views, options = search.target, search.views, search.options
+    """The size of a target that was placed; ``missing``: why images of the model are not there, by name."""
+    target, options = search.target, search.options
     placed, reasons = _reject_outliers(search, placed)
-    index = {p: i for i, p in enumerate(sorted(placed))}
-    sightings = [(search.parts[p][i], n, index[p]) for p in index for i, n in _zip(placed[p])]
-    obs = observe(
-        [s for s, _, _ in sightings], [n for _, n, _ in sightings], [i for _, _, i in sightings], target, views
-    )
-    start = Placement(
-        log_scale=float(np.median([placed[p].placement.log_scale for p in index])),
-        rotation=np.concatenate([placed[p].placement.rotation for p in index]),
-        centre=np.concatenate([placed[p].placement.centre for p in index]),
-    )
-    everything = obs
-    obs, fit, dropped = fit_without_outliers(obs, start)
+    sightings = [
+        (search.parts[part][i], numbering, index)
+        for index, part in enumerate(sorted(placed))
+        for i, numbering in zip(placed[part].chosen, placed[part].numbering, strict=True)
+    ]
+    everything, start = _observed(search, placed, sightings)
+    obs, fit, dropped = fit_without_outliers(everything, start)
     half = fit.half_width_log()
-    of_target = 0.0 if target.sigma_m is None else Z95 * target.sigma_m / target.length_m
     if not half < np.log(FIT.widest_factor):
         raise NotObservableError(
             "scale",
@@ -163,42 +158,33 @@ def _measure(
             "more views from different sides are needed",
             sigma=min(fit.sigma_log, 9.99),
         )
-    if of_target:
-        half = float(np.hypot(half, of_target))
+    of_target = 0.0 if target.sigma_m is None else Z95 * target.sigma_m / target.length_m
+    half = float(np.hypot(half, of_target)) if of_target else half
     log_scale = fit.placement.log_scale
-    error, ci = _per_cent(log_scale), (_per_cent(log_scale - half), _per_cent(log_scale + half))
     seen = np.zeros(len(target.part), dtype=bool)
     seen[obs.corner] = True
     control_corner = target.control(seen)
-    control_fit = _fit_set(obs, fit, control_corner[obs.corner])
-    check_fit = _fit_set(obs, fit, ~control_corner[obs.corner])
-    check_error, check_ci = None, None
-    if control_fit is not None and check_fit is not None:
-        difference = check_fit[0].placement.log_scale - control_fit[0].placement.log_scale
-        # the two share the poses' errors, which this counts twice
-        both = float(np.hypot(check_fit[0].half_width_log(), control_fit[0].half_width_log()))
-        check_error, check_ci = _per_cent(difference), (_per_cent(difference - both), _per_cent(difference + both))
-    else:
+    sets = [_fit_set(obs, fit, pick[obs.corner]) for pick in (control_corner, ~control_corner)]
+    control, check = (_set_scale(found, of_target) for found in sets)
+    check_error, check_ci = _set_difference(*sets)
+    if check_error is None:
         reasons.append("too few corners to keep a control and a check set apart")
-    control, check = _set_scale(control_fit, of_target), _set_scale(check_fit, of_target)
     to_metres = 1.0
     if options.unscaled:
         to_metres = float(np.exp(-log_scale)) if control is None else control.metres_per_unit
-    rejected = _rejected_views(search, placed, obs, dropped, missing)
     view_results = _view_results(search, sightings, obs, fit, everything)
-    pose_px = fit.residual_px - fit.corner_residual_px
     position = _positions(target, obs, fit)
     distances = _distances(target, position, control_corner, to_metres)
     corners = tuple(
-        Corner(name=target.label(i), in_model=position[i] + views[0].origin_in_model)
+        Corner(name=target.label(i), in_model=position[i] + search.views[0].origin_in_model)
         for i in np.flatnonzero(np.isfinite(position[:, 0])).tolist()
     )
     return Validation(
         target=target,
         unscaled=options.unscaled,
         tolerance_pct=options.tolerance_pct,
-        scale_error_pct=None if options.unscaled else error,
-        ci95_pct=None if options.unscaled else ci,
+        scale_error_pct=None if options.unscaled else _per_cent(log_scale),
+        ci95_pct=None if options.unscaled else (_per_cent(log_scale - half), _per_cent(log_scale + half)),
         metres_per_unit=float(np.exp(-log_scale)),
         metres_per_unit_ci95=(float(np.exp(-log_scale - half)), float(np.exp(-log_scale + half))),
         views_used=len(view_results),
@@ -207,11 +193,11 @@ def _measure(
         corners_rejected=sum(len(v.rejected_px) for v in view_results),
         rms_px=_rms(fit.residual_px),
         corner_noise_px=fit.noise.corner_px,
-        pose_noise_px=_rms(pose_px),
+        pose_noise_px=_rms(fit.residual_px - fit.corner_residual_px),
         distances=distances,
         corners=corners,
         views=view_results,
-        views_rejected=rejected,
+        views_rejected=_rejected_views(search, placed, obs, dropped, missing),
         control=control,
         check=check,
         check_error_pct=check_error,
@@ -221,8 +207,30 @@ def _measure(
     )
 
 
-def _zip(part: PartPlacement) -> list[tuple[int, int]]:
-    return list(zip(part.chosen, part.numbering, strict=True))
+def _observed(
+    search: Search, placed: dict[int, PartPlacement], sightings: list[tuple[Sighting, int, int]]
+) -> tuple[Observations, Placement]:
+    """The observations of all parts, and where the fit of their common scale starts."""
+    seen, numbering, parts = (list(column) for column in zip(*sightings, strict=True))
+    at = [placed[part].placement for part in sorted(placed)]
+    start = Placement(
+        log_scale=float(np.median([one.log_scale for one in at])),
+        rotation=np.concatenate([one.rotation for one in at]),
+        centre=np.concatenate([one.centre for one in at]),
+    )
+    return observe(seen, numbering, parts, search.target, search.views), start
+
+
+def _set_difference(
+    control: tuple[ScaleFit, int] | None, check: tuple[ScaleFit, int] | None
+) -> tuple[float | None, tuple[float, float] | None]:
+    """Scale error of the check corners after scaling by the control corners, per cent, and its 95 % interval."""
+    if control is None or check is None:
+        return None, None
+    difference = check[0].placement.log_scale - control[0].placement.log_scale
+    # the two share the poses' errors, which this counts twice
+    both = float(np.hypot(check[0].half_width_log(), control[0].half_width_log()))
+    return _per_cent(difference), (_per_cent(difference - both), _per_cent(difference + both))
 
 
 def _per_cent(log: float) -> float:
@@ -245,7 +253,7 @@ def fit_without_outliers(obs: Observations, start: Placement) -> tuple[Observati
         rms = {}
         for v in np.unique(obs.view):
             mine = obs.view == v
-            rms[int(v)] = float(np.sqrt(np.mean(np.sum(fit.residual_px[mine] ** 2, axis=1))))
+            rms[int(v)] = _rms(fit.residual_px[mine])
             sigma = max(typical, 1.4826 * float(np.median(noise[mine])), 1e-6)
             keep[mine] = np.linalg.norm(fit.corner_residual_px[mine], axis=1) < FIT.outlier_sigma * sigma
             if keep[mine].sum() < DETECTION.least_corners:

@@ -98,29 +98,12 @@ def place_part(
         When all views lie in one direction from the target.
     """
     usable = [i for i, s in enumerate(sightings) if len(s.corner) >= DETECTION.least_corners]
-    direction = np.array([_direction(sightings[i], views) for i in usable]).reshape(-1, 3)
-    view = np.array([sightings[i].view for i in usable], dtype=np.intp)
-    first, second = np.triu_indices(len(usable), 1)
-    pick = view[first] != view[second]
-    first, second = first[pick], second[pick]
-    if len(first) == 0:
+    pairs = _pairs([sightings[i] for i in usable], views, seed)
+    if not pairs:
         return None
-    angle = np.arccos(np.clip(np.sum(direction[first] * direction[second], axis=1), -1.0, 1.0))
-    apart = angle >= np.deg2rad(PLACEMENT.least_parallax_deg)
-    if not apart.any():
-        raise NotObservableError(
-            "scale",
-            f"all views see the target along the same line (within {np.rad2deg(angle.max()):.2f} degrees): a length "
-            "needs views from different places",
-        )
-    first, second, angle = first[apart], second[apart], angle[apart]
-    if len(first) > PLACEMENT.most_pairs:  # some of every angle from the larger half
-        order = np.argsort(-angle, kind="stable")[: max(PLACEMENT.most_pairs, len(angle) // 2)]
-        pick = np.random.default_rng(seed).choice(order, PLACEMENT.most_pairs, replace=False)
-        first, second = first[pick], second[pick]
     judge = _Judge([sightings[i] for i in usable], target, views, max_residual_px)
     best: tuple[float, Placement] | None = None
-    for a, b in zip(first.tolist(), second.tolist(), strict=True):
+    for a, b in pairs:
         for numbering in range(len(target.relabelings)):
             placement = _from_pair(judge.sightings[a], judge.sightings[b], numbering, target, views)
             if placement is None:
@@ -150,6 +133,37 @@ def place_part(
     if len(chosen) < 2:
         return None
     return PartPlacement(placement=placement, chosen=tuple(usable[i] for i in chosen), numbering=tuple(numbering_of))
+
+
+def _pairs(sightings: list[Sighting], views: list[View], seed: int) -> list[tuple[int, int]]:
+    """Pairs of sightings whose lines of sight meet at an angle; of many, some of the larger half.
+
+    Raises
+    ------
+    NotObservableError
+        When all views lie in one direction from the target.
+    """
+    direction = np.array([_direction(sighting, views) for sighting in sightings]).reshape(-1, 3)
+    view = np.array([sighting.view for sighting in sightings], dtype=np.intp)
+    first, second = np.triu_indices(len(sightings), 1)
+    pick = view[first] != view[second]
+    first, second = first[pick], second[pick]
+    if len(first) == 0:
+        return []
+    angle = np.arccos(np.clip(np.sum(direction[first] * direction[second], axis=1), -1.0, 1.0))
+    apart = angle >= np.deg2rad(PLACEMENT.least_parallax_deg)
+    if not apart.any():
+        raise NotObservableError(
+            "scale",
+            f"all views see the target along the same line (within {np.rad2deg(angle.max()):.2f} degrees): a length "
+            "needs views from different places",
+        )
+    first, second, angle = first[apart], second[apart], angle[apart]
+    if len(first) > PLACEMENT.most_pairs:
+        order = np.argsort(-angle, kind="stable")[: max(PLACEMENT.most_pairs, len(angle) // 2)]
+        pick = np.random.default_rng(seed).choice(order, PLACEMENT.most_pairs, replace=False)
+        first, second = first[pick], second[pick]
+    return list(zip(first.tolist(), second.tolist(), strict=True))
 
 
 def median_residual_px(sighting: Sighting, placement: Placement, target: Target, views: list[View]) -> float:
