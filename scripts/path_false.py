@@ -29,8 +29,8 @@ from colmap_inertial.imaging.evidence import blur_evidence, shown_shares
 from colmap_inertial.imaging.gate import GateOptions, RecordingVerdict, judge_frame, keep_sharp
 from colmap_inertial.imaging.path_filters import smoothed
 from colmap_inertial.imaging.psf import blur_field, blur_path
+from colmap_inertial.pipeline.stages import deblur
 from colmap_inertial.pipeline.stages.deblur import smoothing_for
-from colmap_inertial.reconstruction.preparation import plan
 from colmap_inertial.reconstruction.preparation.judge import Looked, judged
 
 #: Shares of the picture that are sky, blurs, and the blurs at which gyroscopes are wrong, px.
@@ -135,7 +135,7 @@ def judgement(frames: Sequence[UInt8Array], known: Sequence[Known]) -> Recording
 
 def options_for(verdict: RecordingVerdict, method: str) -> GateOptions:
     """The pipeline's: where a recording is not trusted in all, each frame must be clear by itself."""
-    return GateOptions() if verdict.trusted else GateOptions(min_support=plan._CLEAR_SUPPORT[method])
+    return GateOptions() if verdict.trusted else GateOptions(min_support=deblur._CLEAR_SUPPORT[method])
 
 
 def gated(image: UInt8Array, known: Known, verdict: RecordingVerdict, method: str) -> UInt8Array | None:

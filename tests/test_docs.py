@@ -42,6 +42,7 @@ from colmap_inertial.io.imu_formats import imu_formats
 from colmap_inertial.pipeline.run.config import config_as_toml
 from colmap_inertial.pipeline.stages.frame_folder import FrameRecord
 from colmap_inertial.pipeline.stages.gyro_view import GyroView
+from colmap_inertial.pipeline.stages.imaging_plan import ImagingPlan
 from colmap_inertial.reconstruction.drivers.capture import reconstruct
 from colmap_inertial.reconstruction.drivers.result import (
     Fragment,
@@ -50,7 +51,6 @@ from colmap_inertial.reconstruction.drivers.result import (
     frame_as_json,
     imaging_as_json,
 )
-from colmap_inertial.reconstruction.preparation.plan import ImagingPlan
 from colmap_inertial.reconstruction.preparation.selection import Selection
 from colmap_inertial.tools.batch import read_manifest
 

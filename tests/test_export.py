@@ -44,8 +44,8 @@ from colmap_inertial.tools.export.names import flat_names
 from colmap_inertial.tools.export.pictures import _is_plain
 from colmap_inertial.tools.export.pinhole_model import needed_cameras, pinhole_model
 from colmap_inertial.tools.export.points import write_las
-from colmap_inertial.tools.export.programs import PROGRAMS
 from colmap_inertial.tools.export.source import ExportSource, Picture
+from colmap_inertial.tools.export.targets import TARGETS
 from colmap_inertial.tools.export.transforms import Exposure, with_velocities
 from colmap_inertial.tools.export.undistort import Undistortion
 from colmap_inertial.tools.export.whole import _notes_on, export_model
@@ -531,8 +531,8 @@ def test_instant_ngp_needs_no_velocities(known, tmp_path):
 def test_the_page_has_the_command_lines_that_are_printed():
     page = (Path(__file__).parents[1] / "docs" / "export.md").read_text()
     named = set(re.findall(r"`([\w-]+)`", "".join(re.findall(r"^\| (`.*?) \|", page, re.MULTILINE))))
-    assert set(PROGRAMS) <= named and set(get_args(ExportProgram)) == set(PROGRAMS)
-    lines = [program.command.format(folder="DIR") for program in PROGRAMS.values() if program.command]
+    assert set(TARGETS) <= named and set(get_args(ExportProgram)) == set(TARGETS)
+    lines = [program.command.format(folder="DIR") for program in TARGETS.values() if program.command]
     assert len(lines) == 7 and [line for line in lines if f"`{line}`" not in page] == []
 
 

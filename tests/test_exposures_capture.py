@@ -32,7 +32,8 @@ from colmap_inertial.io.frames import read_frame_timing, read_frames
 from colmap_inertial.pipeline.run.progress import silent
 from colmap_inertial.pipeline.run.workspace import Workspace
 from colmap_inertial.pipeline.stages import frame_folder
-from colmap_inertial.pipeline.stages.exposures import ExposureStage, Fuser
+from colmap_inertial.pipeline.stages.exposures import ExposureStage
+from colmap_inertial.pipeline.stages.fusers import Fuser
 from colmap_inertial.reconstruction.drivers import capture as driver, fuse_exposures
 from colmap_inertial.reconstruction.drivers.capture import reconstruct
 from colmap_inertial.reconstruction.drivers.deblur import deblur_capture
@@ -478,7 +479,7 @@ def test_a_missing_partner_or_network_is_said_before_the_work(capture, tmp_path,
     def missing(*args, **options):
         raise MissingExtraError("restore", "networks run in onnxruntime")
 
-    monkeypatch.setattr("colmap_inertial.pipeline.stages.exposures.load_network", missing)
+    monkeypatch.setattr("colmap_inertial.pipeline.stages.fusers.load_network", missing)
     for command in ("reconstruct", "fuse-exposures"):
         with pytest.raises(SystemExit) as end:
             main([command, str(capture), str(tmp_path / "out")])

@@ -24,8 +24,8 @@ from colmap_inertial.inertial.georeference import (
 )
 from colmap_inertial.io.positions import positions_in_pictures, positions_in_video
 from colmap_inertial.model import read_model
-from colmap_inertial.reconstruction.drivers.georeference import located, path_at, read_georeference
 from colmap_inertial.reconstruction.drivers.project import reconstruct_project
+from colmap_inertial.reconstruction.preparation.geolocation import located, path_at, read_georeference
 from colmap_inertial.tools.export.whole import export_model
 
 UP = np.array([0.0, 0.0, 1.0])

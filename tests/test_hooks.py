@@ -9,7 +9,16 @@ import numpy as np
 import pytest
 from test_pipeline import DETERMINISTIC, contents, copy_scene
 
-from colmap_inertial import Frame, Keypoints, Model, ReconstructOptions, Treatment, reconstruct, write_calibration
+from colmap_inertial import (
+    Frame,
+    InertialError,
+    Keypoints,
+    Model,
+    ReconstructOptions,
+    Treatment,
+    reconstruct,
+    write_calibration,
+)
 from colmap_inertial.pipeline.stages.protocols import with_defaults
 
 
@@ -84,6 +93,33 @@ def test_dots_stand_for_the_defaults_once():
         with_defaults([..., ...], [7])
 
 
+class Joining:
+    """Joins nothing."""
+
+    def __call__(self, model: Model, /) -> Model:
+        return model
+
+    def join_models(self, models):
+        return tuple(models), ()
+
+
+class JoiningInstead(Joining):
+    replaces = (Joining,)
+
+
+def test_one_stage_joins_models_and_may_stand_in_for_the_default_one():
+    default, own = Joining(), JoiningInstead()
+    with pytest.raises(InertialError, match="two model stages join models"):
+        with_defaults([..., Joining()], [default])
+    assert with_defaults([..., own], [7, default]) == [7, own]
+
+
+def test_two_joining_stages_are_refused_before_any_work(capture, tmp_path):
+    with pytest.raises(InertialError, match="JoinStage and Joining"):
+        reconstruct(capture, tmp_path / "out", DETERMINISTIC, model_stages=[..., Joining()])
+    assert not (tmp_path / "out").exists()
+
+
 def test_what_a_visitor_s_keypoint_stage_did_is_what_the_result_says(capture, tmp_path):
     moved = []
 
@@ -118,9 +154,9 @@ def test_what_a_visitor_s_keypoint_stage_did_is_what_the_result_says(capture, tm
 
 
 def test_doubts_are_enforced_after_the_stages_whoever_wrote_them(capture, bare, tmp_path, monkeypatch):
-    from colmap_inertial.reconstruction.drivers import capture as driver
+    from colmap_inertial.reconstruction.preparation import preflight
 
-    monkeypatch.setattr(driver, "stop_or_doubt", lambda diagnosis, force: ("the video was stabilised",))
+    monkeypatch.setattr(preflight, "stop_or_doubt", lambda diagnosis, force: ("the video was stabilised",))
     _, plain, _ = bare
     trusted = dataclasses.replace(plain.models[0].scale, verdict="trusted")
     seen = []

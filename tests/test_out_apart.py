@@ -7,7 +7,6 @@ from colmap_inertial.cli import main
 from colmap_inertial.core.errors import FormatError, OutputError
 from colmap_inertial.io.capture import ImageFolder, load_capture
 from colmap_inertial.io.frames import image_names, picture_folders
-from colmap_inertial.pipeline.run.progress import silent
 from colmap_inertial.pipeline.run.session import open_session
 from colmap_inertial.reconstruction.drivers.capture import reconstruct
 
@@ -50,10 +49,10 @@ def test_every_folder_of_pictures_counts_and_others_do_not(tmp_path):
     folders = (tmp_path / "short", tmp_path / "long")
     with (
         pytest.raises(OutputError, match="long"),
-        open_session(tmp_path / "long" / "out", tmp_path, TINY, pictures=folders, progress=silent),
+        open_session(tmp_path / "long" / "out", tmp_path, TINY, pictures=folders),
     ):
         pass
-    with open_session(tmp_path / "longer", tmp_path, TINY, pictures=folders, progress=silent):
+    with open_session(tmp_path / "longer", tmp_path, TINY, pictures=folders):
         pass
 
 

@@ -30,6 +30,7 @@ from colmap_inertial.model.project import apply_to_project, undo_project
 from colmap_inertial.model.similarities import ModelScale, plain_factor
 from colmap_inertial.pipeline.run.workspace import Workspace, places_of
 from colmap_inertial.pipeline.stages.frame_folder import FrameRecord
+from colmap_inertial.pipeline.stages.imaging_plan import ImagingPlan
 from colmap_inertial.reconstruction.drivers import deblur
 from colmap_inertial.reconstruction.drivers.frames import run_images
 from colmap_inertial.reconstruction.drivers.project_output import (
@@ -41,7 +42,6 @@ from colmap_inertial.reconstruction.drivers.project_output import (
 from colmap_inertial.reconstruction.drivers.reporting import reporting_stops
 from colmap_inertial.reconstruction.drivers.result import ModelResult, ReconstructResult
 from colmap_inertial.reconstruction.drivers.stale_outputs import remove_stale_dense
-from colmap_inertial.reconstruction.preparation.plan import ImagingPlan
 
 SCALE = ModelScale(similarity=SIMILARITY, verdict="trusted")
 REFUSED = ModelScale(similarity=None, verdict="refused", reasons=("the camera stood still",))
@@ -115,23 +115,20 @@ def test_without_hard_links_images_are_copied(workspace, monkeypatch):
     assert contents(workspace.images) == contents(workspace.colmap_images)
 
 
-class Plan(ImagingPlan):
-    """Nothing to deblur, and a rolling shutter in one picture."""
+def one_moved(inputs):
+    """A rolling shutter in one picture."""
 
-    def frame_stages(self, **_):
-        return []
+    def mover(keypoints):
+        return keypoints
 
-    def keypoint_stages(self):
-        def mover(keypoints):
-            return keypoints
-
-        mover.covers = lambda name: name == "000000.jpg"
-        mover.move_image = lambda name, image: 255 - image
-        return [mover]
+    mover.covers = lambda name: name == "000000.jpg"
+    mover.move_image = lambda name, image: 255 - image
+    return [mover]
 
 
 def test_deblurred_images_are_rectified_where_that_is_asked_for(tmp_path, monkeypatch):
-    monkeypatch.setattr(deblur, "run_plan", lambda *_: Plan())
+    monkeypatch.setattr(deblur, "run_plan", lambda *_: ImagingPlan())
+    monkeypatch.setattr(deblur, "default_keypoint_stages", one_moved)
     capture = copy_scene(tmp_path / "capture", first=3)
     filmed = contents(capture / "frames")
 

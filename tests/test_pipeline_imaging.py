@@ -23,16 +23,12 @@ from colmap_inertial.io.imu import read_capture_imu
 from colmap_inertial.model import colmap_camera, read_model
 from colmap_inertial.pipeline.run.context import Recording, RunContext, prior_calibration
 from colmap_inertial.pipeline.run.progress import silent
+from colmap_inertial.pipeline.stages.deblur import DeblurStage
+from colmap_inertial.pipeline.stages.imaging_plan import read_plan, write_plan
 from colmap_inertial.reconstruction.drivers.capture import reconstruct
 from colmap_inertial.reconstruction.drivers.deblur import deblur_capture
 from colmap_inertial.reconstruction.preparation import calibrate as first_look, plan as imaging
-from colmap_inertial.reconstruction.preparation.plan import (
-    Treatments,
-    plan_imaging,
-    read_plan,
-    with_stated_exposures,
-    write_plan,
-)
+from colmap_inertial.reconstruction.preparation.plan import Treatments, plan_imaging, with_stated_exposures
 from colmap_inertial.reconstruction.preparation.selection import part_of
 from colmap_inertial.reconstruction.preparation.translation import find_parallaxes
 from colmap_inertial.tools.simulate import MotionOptions, make_motion
@@ -294,8 +290,7 @@ def test_the_plan_reads_back_and_the_stage_keeps_order_and_memory(tmp_path, blur
     write_plan(tmp_path / "again.json", again)
     assert (tmp_path / "again.json").read_text() == (tmp_path / "plan.json").read_text()
     assert again.deblur == plan.deblur and set(again.parallaxes) == set(plan.parallaxes)
-    (stage,) = plan.frame_stages()
-    stage = replace(stage, workers=3)
+    stage = replace(DeblurStage.of_plan(plan), workers=3)
     taken = []
 
     def frames():
@@ -365,7 +360,8 @@ def test_a_stabilised_video_is_refused_where_asked_and_left_alone_otherwise(tmp_
     with pytest.raises(NotObservableError, match="stabilised"):
         planned(recording, tmp_path, deblur="off", rolling_shutter="rectify")
     plan = planned(recording, tmp_path)
-    assert plan.frame_stages() == [] == plan.keypoint_stages()
+    assert plan.view is plan.deblur is None and not plan.rectify
+    assert DeblurStage.of_plan(plan) is None
     assert "stabilised" in plan.deblur_note and "stabilised" in plan.rolling_shutter_note
     # where a few frames were chosen from the video, all of them are followed
     few = recording.using(part_of(recording.timing, recording.timing.names[::7]))

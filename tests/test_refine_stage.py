@@ -24,15 +24,16 @@ from colmap_inertial.io.trajectories import read_tum
 from colmap_inertial.model import Model
 from colmap_inertial.pipeline.run.context import Recording
 from colmap_inertial.pipeline.run.runner import canonical
+from colmap_inertial.pipeline.stages.defaults import default_model_stages
 from colmap_inertial.pipeline.stages.gyro_view import GyroView
+from colmap_inertial.pipeline.stages.inputs import StageInputs
 from colmap_inertial.pipeline.stages.join import JoinStage
 from colmap_inertial.pipeline.stages.metric import MetricStage
 from colmap_inertial.pipeline.stages.readout import ReadoutStage
 from colmap_inertial.pipeline.stages.refine import RefineStage, axes_by
 from colmap_inertial.pipeline.stages.rolling_shutter import RollingShutterStage
 from colmap_inertial.reconstruction.drivers import frames
-from colmap_inertial.reconstruction.drivers.capture import default_model_stages
-from colmap_inertial.reconstruction.drivers.frames import as_refined
+from colmap_inertial.reconstruction.drivers.frames import stages_of_refined
 from colmap_inertial.tools.simulate.tracks import TrackOptions
 
 UNKNOWN = calibration_prior()
@@ -294,10 +295,10 @@ def test_images_are_rectified_as_the_refined_model_has_the_shutter(rolled):
     made, _ = refined_by(tracks.imu, model, calibration=known, shutter=shutter)
     result = SimpleNamespace(treatments=made.treatments, scale=made.scale, sparse_metric="of the model")
     left = SimpleNamespace(treatments=(), scale=made.scale, sparse_metric="of another")
-    assert as_refined([wrong], [left]) == [wrong]
+    assert stages_of_refined([wrong], [left]) == [wrong]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(frames, "read_model", lambda folder: made.reconstruction)
-        (refined,) = as_refined([wrong], [left, result])
+        (refined,) = stages_of_refined([wrong], [left, result])
     away = []
     for stage in (wrong, refined):
         moved = [stage.moved(tracks.timing.names[i], tracks.xy_px[tracks.frame == i]) for i in range(0, 100, 10)]
@@ -467,9 +468,9 @@ def test_without_the_option_the_model_is_what_it_was(walked):
     mapped.transform(pycolmap.Sim3d(similarity.scale, rotation, similarity.translation_m).inverse())
     model = MetricStage(imu=tracks.imu, calibration=UNKNOWN)(replace(model, reconstruction=mapped, similarity=None))
     recording = Recording.of(Capture(path="none", calibration=UNKNOWN), tracks.imu, tracks.timing, UNKNOWN)
-    stages = default_model_stages(recording, ReconstructOptions(join="off"))
+    stages = default_model_stages(StageInputs(recording=recording, options=ReconstructOptions(join="off")))
     assert [type(stage) for stage in stages] == [ReadoutStage, MetricStage]
-    joining = default_model_stages(recording, ReconstructOptions())
+    joining = default_model_stages(StageInputs(recording=recording))
     assert [type(stage) for stage in joining] == [ReadoutStage, MetricStage, JoinStage]
     made = Model(reconstruction=mapped, colmap_index=0, timing=tracks.timing)
     for stage in stages:
@@ -480,7 +481,7 @@ def test_without_the_option_the_model_is_what_it_was(walked):
     assert points.keys() == same.keys() and all(np.array_equal(points[i], same[i]) for i in points)
     assert [one.stage for one in made.treatments if one.stage == "refine"] == []
     assert made.scale.metres_per_unit == model.scale.metres_per_unit
-    stages = default_model_stages(recording, ReconstructOptions(refine="inertial"))
+    stages = default_model_stages(StageInputs(recording=recording, options=ReconstructOptions(refine="inertial")))
     assert [type(stage) for stage in stages] == [ReadoutStage, MetricStage, JoinStage, RefineStage]
 
 

@@ -25,10 +25,10 @@ from colmap_inertial.pipeline.run.runner import canonical
 from colmap_inertial.pipeline.stages import deblur as stages
 from colmap_inertial.pipeline.stages.deblur import DeblurStage
 from colmap_inertial.pipeline.stages.frame_folder import read_frame_records
+from colmap_inertial.pipeline.stages.imaging_plan import read_plan, write_plan
 from colmap_inertial.reconstruction.drivers.capture import reconstruct
 from colmap_inertial.reconstruction.drivers.deblur import deblur_capture
 from colmap_inertial.reconstruction.preparation import plan as imaging
-from colmap_inertial.reconstruction.preparation.plan import read_plan, write_plan
 
 DEEP = replace(QUICK, deblur="deepgyro")
 
@@ -144,7 +144,7 @@ def test_a_resumed_run_does_not_mix_methods_or_networks(tmp_path, blurred, weigh
 
 def test_a_stage_s_key_holds_method_and_network(blurred, deep_plan, weights, tmp_path):
     plan = deep_plan
-    (stage,) = plan.frame_stages()
+    stage = DeblurStage.of_plan(plan)
     assert isinstance(stage, DeblurStage) and stage.weights == shipped.checksum("deepgyro")
     by_filter = replace(stage, method="wiener")
     assert by_filter.weights == "" and canonical(by_filter) != canonical(stage)
@@ -156,7 +156,7 @@ def test_a_stage_s_key_holds_method_and_network(blurred, deep_plan, weights, tmp
     recording = parts(blurred)
     write_plan(tmp_path / "plan.json", plan)
     again = read_plan(tmp_path / "plan.json", recording.imu, recording.timing)
-    assert again.method == "deepgyro" and again.frame_stages()[0].method == "deepgyro"
+    assert again.method == "deepgyro" and DeblurStage.of_plan(again).method == "deepgyro"
 
 
 def test_frames_need_not_speak_for_themselves_where_a_network_treats_them(blurred, deep_plan, weights):
@@ -168,14 +168,14 @@ def test_frames_need_not_speak_for_themselves_where_a_network_treats_them(blurre
     loaded = parts(blurred).capture
     treated = {}
     for method in ("wiener", "path", "deepgyro"):
-        (stage,) = replace(plan, method=method).frame_stages(drop=False)
+        stage = DeblurStage.of_plan(replace(plan, method=method), drop=False)
         frames = list(stage(read_frames(loaded)[1]))
         treated[method] = {frame.name for frame in frames if frame.treatments[-1].action == "deblurred"}
     assert treated["wiener"] == treated["path"] < treated["deepgyro"]
 
 
 def test_workers_share_the_network_and_make_the_same_pixels(blurred, deep_plan, weights, monkeypatch):
-    (stage,) = deep_plan.frame_stages()
+    stage = DeblurStage.of_plan(deep_plan)
     loaded = parts(blurred).capture
     one, three, filmed = (
         [frame.image for frame in frames]
@@ -231,4 +231,4 @@ def test_asked_for_by_name_it_is_an_error_where_gyroscope_and_pixels_do_not_agre
     with pytest.raises(NotObservableError):
         planned(parts(blurred), tmp_path, deblur=method)
     plan = planned(parts(blurred), tmp_path)
-    assert plan.frame_stages() == [] and plan.as_json()["deblur_method"] is None
+    assert DeblurStage.of_plan(plan) is None and plan.as_json()["deblur_method"] is None

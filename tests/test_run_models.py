@@ -36,15 +36,15 @@ from colmap_inertial.pipeline.run.workspace import Workspace
 from colmap_inertial.pipeline.stages import readout
 from colmap_inertial.pipeline.stages.deblur import MOST_SMOOTHING_PX, DeblurStage, smoothing_for
 from colmap_inertial.pipeline.stages.gyro_view import GyroView
+from colmap_inertial.pipeline.stages.imaging_plan import ImagingPlan
 from colmap_inertial.pipeline.stages.join import JoinStage
-from colmap_inertial.pipeline.stages.metric import MetricStage, gravity_in_model, of_model
+from colmap_inertial.pipeline.stages.metric import MetricStage, gravity_in_model
 from colmap_inertial.pipeline.stages.readout import ReadoutStage
 from colmap_inertial.pipeline.stages.rolling_shutter import RollingShutterStage, for_rectified
 from colmap_inertial.reconstruction.drivers import models
 from colmap_inertial.reconstruction.drivers.models import run_models, run_validation
 from colmap_inertial.reconstruction.drivers.project import _scales
 from colmap_inertial.reconstruction.drivers.result import ModelResult, ReconstructResult, result_as_json
-from colmap_inertial.reconstruction.preparation.plan import ImagingPlan
 from colmap_inertial.tools.simulate import ImuOptions, MotionOptions, RecordingOptions, SfmOptions, simulate_recording
 
 CAMERA = CameraModel(model="PINHOLE", width=640, height=480, params=(500.0, 500.0, 320.0, 240.0))
@@ -330,8 +330,10 @@ def test_text_models_count_their_images(whole, tmp_path):
 def test_only_rectified_models_have_lost_their_readout(whole):
     model, _ = whole
     known = calibration_prior(Declared(readout_s=0.03))
-    assert of_model(known, model) is known and of_model(None, replace(model, rectified=True)) is None
-    left = of_model(known, replace(model, rectified=True))
+    stage = MetricStage(imu=PANNING, calibration=known)
+    assert stage.calibration_of(model) is known
+    assert replace(stage, calibration=None).calibration_of(replace(model, rectified=True)) is None
+    left = stage.calibration_of(replace(model, rectified=True))
     assert left.readout_s == 0 and 0 < left.sigma("readout_s") < 0.1 * 0.03 + 1e-9
     np.testing.assert_array_equal(left.cam_from_imu_xyzw, known.cam_from_imu_xyzw)
     assert for_rectified(known).readout_s == 0

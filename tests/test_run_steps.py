@@ -20,7 +20,7 @@ from colmap_inertial.colmap.mapping import MapRecord, map_images
 from colmap_inertial.colmap.pairing import MatchRecord
 from colmap_inertial.colmap.sparse import KeypointRecords, extract_features, image_pairs, write_gravity_priors
 from colmap_inertial.core.errors import NotObservableError, OutputExistsError
-from colmap_inertial.core.options import ExposureOptions, MappingOptions, ProjectOptions, ReconstructOptions
+from colmap_inertial.core.options import MappingOptions, ProjectOptions, ReconstructOptions
 from colmap_inertial.core.threads import in_order
 from colmap_inertial.core.types import CALIBRATION_PARAMETERS, CameraModel, FrameTiming, ImuRecording, Treatment
 from colmap_inertial.io.calibration import Declared, calibration_prior, write_calibration
@@ -35,16 +35,19 @@ from colmap_inertial.pipeline.run.progress import silent
 from colmap_inertial.pipeline.run.runner import StepRunner, fingerprint
 from colmap_inertial.pipeline.run.session import Session, open_session
 from colmap_inertial.pipeline.run.workspace import Workspace
-from colmap_inertial.pipeline.stages.exposures import Fuser
+from colmap_inertial.pipeline.stages.defaults import default_keypoint_stages
+from colmap_inertial.pipeline.stages.exposures import ExposureStage
 from colmap_inertial.pipeline.stages.frame_folder import FrameRecord, write_frames
+from colmap_inertial.pipeline.stages.fusers import Fuser
 from colmap_inertial.pipeline.stages.gyro_view import GyroView
+from colmap_inertial.pipeline.stages.inputs import StageInputs
 from colmap_inertial.pipeline.stages.rectified import write_images
+from colmap_inertial.pipeline.stages.rolling_shutter import RollingShutterStage
 from colmap_inertial.reconstruction.drivers import frames as framing, project as existing, project_output
 from colmap_inertial.reconstruction.drivers.frames import run_frames, run_images, run_plan
 from colmap_inertial.reconstruction.drivers.sources import check_output
 from colmap_inertial.reconstruction.preparation import calibrate, plan as imaging
 from colmap_inertial.reconstruction.preparation.judge import Looked, below_sky, by_frame
-from colmap_inertial.reconstruction.preparation.pairs import exposure_stage
 from colmap_inertial.reconstruction.preparation.plan import Treatments, plan_imaging
 from colmap_inertial.reconstruction.preparation.preflight import stop_or_doubt
 from colmap_inertial.reconstruction.preparation.selection import part_of
@@ -166,7 +169,7 @@ def test_nothing_is_written_into_the_folder_of_a_run_that_is_at_work(tmp_path):
         options = ReconstructOptions()
         with (
             pytest.raises(OutputExistsError, match="another run is at work"),
-            open_session(out, tmp_path / "capture.toml", options, pictures=(), progress=silent),
+            open_session(out, tmp_path / "capture.toml", options, pictures=()),
         ):
             pass
         assert sorted(out.rglob("*")) == before
@@ -174,7 +177,7 @@ def test_nothing_is_written_into_the_folder_of_a_run_that_is_at_work(tmp_path):
     workspace.open(tmp_path / "other.toml")
     with (
         pytest.raises(OutputExistsError, match="another capture"),
-        open_session(out, tmp_path / "capture.toml", options, pictures=(), progress=silent),
+        open_session(out, tmp_path / "capture.toml", options, pictures=()),
     ):
         pass
     assert not workspace.log.exists()
@@ -246,7 +249,7 @@ def test_a_step_that_writes_something_more_makes_again_what_follows(workspace):
 def test_a_session_is_alone_in_its_folder_and_another_configuration_undoes_the_result(tmp_path):
     def session(seed=0):
         options = replace(ReconstructOptions(), seed=seed)
-        return open_session(tmp_path / "out", tmp_path / "capture.toml", options, pictures=(), progress=silent)
+        return open_session(tmp_path / "out", tmp_path / "capture.toml", options, pictures=())
 
     with session() as first:
         with pytest.raises(OutputExistsError, match="another run is at work"), session():
@@ -556,7 +559,8 @@ def test_pairs_are_aligned_by_the_gyroscope_only_where_exposures_are_known(tmp_p
     capture = replace(recording().capture, frames=ImageFolder(folder=tmp_path), exposures=long)
     filmed = recording(capture=capture, timing=replace(TIMING, exposure_s=exposure_s))
     view = GyroView(imu=IMU, timing=filmed.timing, calibration=calibration_prior(), camera=CAMERA, source="capture")
-    stage = exposure_stage(filmed, ExposureOptions(), view, Fuser(fuse=lambda *pair: pair[0], identity="first"))
+    fuser = Fuser(fuse=lambda *pair: pair[0], identity="first")
+    stage = ExposureStage.for_run(StageInputs(recording=filmed, plan=imaging.ImagingPlan(view=view), fuser=fuser))
     assert stage.view is (None if exposure_s is None else view)
     np.testing.assert_allclose(stage.long.t_s, TIMING.t_s + 0.02)
 
@@ -578,7 +582,9 @@ def test_a_mirrored_gyroscope_stops_a_reconstruction():
 
 def test_what_was_not_to_be_rectified_is_not():
     plan = imaging.ImagingPlan(view=object())
-    assert plan.keypoint_stages() == []
+    assert default_keypoint_stages(StageInputs(recording=recording(), plan=plan)) == []
+    rectifying = StageInputs(recording=recording(), plan=replace(plan, rectify=True))
+    assert [type(stage) for stage in default_keypoint_stages(rectifying)] == [RollingShutterStage]
 
 
 def test_no_frame_is_dropped_where_nothing_bridges_the_gap():
@@ -735,11 +741,11 @@ def test_work_that_is_let_go_of_in_one_of_its_own_threads_ends(monkeypatch):
 def test_what_a_killed_writer_left_is_removed_and_nothing_else(tmp_path):
     out = tmp_path / "out"
     options = ReconstructOptions()
-    with open_session(out, tmp_path / "capture.toml", options, pictures=(), progress=silent) as session:
+    with open_session(out, tmp_path / "capture.toml", options, pictures=()) as session:
         stamps = session.workspace.stamps
     left = [out / ".result.json.123-0a1b2c3d.tmp", stamps / ".frames.json.9-deadbeef.tmp"]
     other = [out / ".mine.tmp", out / "a.123-0a1b2c3d.tmp"]
     for path in (*left, *other):
         path.touch()
-    with open_session(out, tmp_path / "capture.toml", options, pictures=(), progress=silent):
+    with open_session(out, tmp_path / "capture.toml", options, pictures=()):
         assert not any(path.exists() for path in left) and all(path.exists() for path in other)

@@ -171,10 +171,8 @@ class Screen:
         """
         from rich.text import Text
 
-        from colmap_inertial.reconstruction.preparation.preflight import STOPPING
-
         found = [finding for finding in diagnosis.findings if finding.severity != "info"]
-        stopping = next((finding for finding in found if stops and finding.code in STOPPING), None)
+        stopping = diagnosis.stopping[0] if stops and diagnosis.stopping else None
         for finding in found:
             if finding is stopping:
                 continue

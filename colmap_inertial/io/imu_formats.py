@@ -58,7 +58,7 @@ class ImuFormat:
     Attributes
     ----------
     name
-        What ``format =`` and ``--imu-format`` call it.
+        What ``format =`` in a capture.toml calls it.
     layout
         What such a recording looks like, for messages.
     accepts

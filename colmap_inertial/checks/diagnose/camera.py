@@ -46,6 +46,7 @@ _OPPOSITE = -0.3
 _MIRRORED = Finding(
     code="gyro-mirrored",
     severity="error",
+    stops=True,
     evidence="the gyroscope fits the camera's rotation better when it is mirrored",
     advice='give the axes of both sensors in capture.toml, for example axes = "-x,y,z" and mirrored = true under '
     "[imu.gyro] and [imu.accel]",
@@ -107,6 +108,7 @@ def check_belonging(recorded: Recorded) -> Iterator[Finding]:
     yield Finding(
         code="imu-does-not-fit",
         severity="error",
+        stops=True,
         evidence=failed.hint.split(":")[0],
         advice="check that this IMU recording belongs to these images, and the gyroscope's columns, axes and unit",
         numbers={"seconds": span_s},
@@ -134,6 +136,7 @@ def _as_it_would_fit(recorded: Recorded, imu: ImuRecording) -> Finding | None:
     return Finding(
         code="clock-offset",
         severity="error",
+        stops=True,
         evidence=f"camera and gyroscope fit where their stamps are {offset_s:+.3f} s apart, which one clock does not "
         "allow",
         advice="leave out shared_clock = true under [timing] in capture.toml, or correct the stamps; a known offset "
@@ -155,6 +158,7 @@ def _unit_finding(code: str) -> Finding:
     return Finding(
         code=code,
         severity="error",
+        stops=True,
         evidence=found,
         advice=f'set unit = "{unit}" under [imu.gyro] in capture.toml',
         numbers={"gain": 1 / factor},
@@ -168,6 +172,7 @@ def check_pose_convention(recorded: Recorded) -> Iterator[Finding]:
         yield Finding(
             code="pose-convention",
             severity="error",
+            stops=True,
             evidence=likely.found,
             advice=likely.advice,
             numbers={"log_likelihood": likely.log_likelihood} if np.isfinite(likely.log_likelihood) else {},
@@ -213,6 +218,7 @@ def _frame_rate_finding(rate: float) -> Finding:
     return Finding(
         code="frame-rate",
         severity="error",
+        stops=True,
         evidence=f"the frames fit the gyroscope if {rate:.3g} times as many come in a second as are stated: they were "
         "timed by another frame rate than they were filmed with",
         advice="give the video itself as [video], or times as the recorder stamped them",
@@ -255,6 +261,7 @@ def check_stabilisation(recorded: Recorded) -> Iterator[Finding]:
         yield Finding(
             code="stabilised",
             severity="error",
+            stops=True,
             evidence=f"the recorder says that the video was stabilised in the camera ({said})",
             advice=advice,
         )
@@ -265,6 +272,7 @@ def check_stabilisation(recorded: Recorded) -> Iterator[Finding]:
         yield Finding(
             code="stabilised",
             severity="error",
+            stops=True,
             evidence=f"the pictures hold {100 * told.share:.0f} % of the quick rotation that the gyroscope measured: "
             "the video was stabilised in the camera",
             advice=advice,

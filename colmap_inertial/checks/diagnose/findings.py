@@ -47,6 +47,8 @@ class Finding:
         The same in numbers; units are in the names.
     advice
         What to do.
+    stops
+        Whether it makes a reconstruction in metres meaningless, so that one stops before the work; an error only.
     """
 
     code: str
@@ -54,6 +56,11 @@ class Finding:
     evidence: str
     advice: str
     numbers: Mapping[str, float] = field(default_factory=dict)
+    stops: bool = False
+
+    def __post_init__(self) -> None:
+        if self.stops and self.severity != "error":
+            raise ValueError(f"{self.code}: only an error can stop a reconstruction")
 
     def as_json(self) -> dict[str, object]:
         return {
@@ -83,6 +90,11 @@ class Diagnosis:
     @property
     def worst(self) -> Severity | None:
         return self.findings[0].severity if self.findings else None
+
+    @property
+    def stopping(self) -> tuple[Finding, ...]:
+        """Those that stop a reconstruction."""
+        return tuple(finding for finding in self.findings if finding.stops)
 
     @property
     def codes(self) -> frozenset[str]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+from colmap_inertial.core.options import ReconstructOptions
 from colmap_inertial.core.types import CameraImuCalibration, FrameTiming, ImuRecording
 from colmap_inertial.io.calibration import largest_offset_s
 from colmap_inertial.io.capture import Capture, Video
@@ -14,6 +15,9 @@ from colmap_inertial.io.imu_calibration import CalibrationFiles, read_calibratio
 from colmap_inertial.io.names import path_in
 from colmap_inertial.pipeline.run.progress import Progress, silent
 from colmap_inertial.pipeline.run.runner import fingerprint
+
+#: What COLMAP finds and matches features on.
+Device = Literal["cpu", "cuda"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -106,7 +110,7 @@ class RunContext:
     Attributes
     ----------
     scratch
-        A folder for temporary files.
+        A folder for temporary files; that of a session where there is one.
     num_threads
         Of COLMAP; -1 uses all.
     seed
@@ -117,11 +121,17 @@ class RunContext:
         Hears how far it is.
     """
 
-    scratch: Path
+    scratch: Path = Path()
     num_threads: int = -1
     seed: int = 0
-    device: Literal["cpu", "cuda"] = "cpu"
+    device: Device = "cpu"
     progress: Progress = silent
+
+    @classmethod
+    def of(cls, options: ReconstructOptions, *, device: Device = "cpu", progress: Progress = silent) -> RunContext:
+        """As the options of a reconstruction ask for."""
+        num_threads = 1 if options.deterministic else -1
+        return cls(num_threads=num_threads, seed=options.seed, device=device, progress=progress)
 
     def reporting(self, progress: Progress) -> RunContext:
         """The same, heard by somebody else."""

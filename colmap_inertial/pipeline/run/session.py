@@ -5,9 +5,8 @@ from __future__ import annotations
 import contextlib
 import logging
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 from colmap_inertial import __version__
 from colmap_inertial.core.errors import InertialError
@@ -66,13 +65,10 @@ def open_session(
     out: Path,
     source: Path,
     options: object,
+    context: RunContext | None = None,
     *,
     pictures: Sequence[Path],
     command: str = "reconstruct",
-    deterministic: bool = False,
-    seed: int = 0,
-    device: Literal["cpu", "cuda"] = "cpu",
-    progress: Progress,
 ) -> Iterator[Session]:
     """A session in ``out``: locked, its options written down, its log kept.
 
@@ -84,14 +80,12 @@ def open_session(
         The capture or project.
     options
         All that decides the result; a dataclass.
+    context
+        How the work is done; defaults serve. ``scratch`` becomes a folder in ``out``.
     pictures
         Folders that pictures are read from; ``out`` may not lie in one.
     command
         What is done; one folder is for one command.
-    deterministic
-        Whether one thread does it all.
-    seed, device, progress
-        As of :class:`RunContext`.
 
     Raises
     ------
@@ -113,11 +107,9 @@ def open_session(
         if not workspace.config.is_file() or workspace.config.read_text(encoding="utf-8") != config:
             workspace.unfinish()
             write_text(workspace.config, config)
-        runner = StepRunner(workspace, progress)
-        threads = 1 if deterministic else -1
-        context = RunContext(scratch=workspace.stamps, num_threads=threads, seed=seed, device=device, progress=progress)
-        session = Session(workspace=workspace, runner=runner, context=context)
-        yield session
+        context = context or RunContext()
+        runner = StepRunner(workspace, context.progress)
+        yield Session(workspace=workspace, runner=runner, context=replace(context, scratch=workspace.stamps))
 
 
 @contextlib.contextmanager

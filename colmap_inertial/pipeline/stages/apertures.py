@@ -24,6 +24,7 @@ from colmap_inertial.io.aperture_images import ApertureImages
 from colmap_inertial.io.images import read_image
 from colmap_inertial.io.names import path_in
 from colmap_inertial.model import colmap_camera
+from colmap_inertial.pipeline.stages.inputs import StageInputs
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -47,6 +48,14 @@ class ApertureStage:
     keep: Path | None = field(default=None, compare=False)
     _canvas: list[Rectified] = field(default_factory=list, init=False, compare=False, repr=False)
 
+    @classmethod
+    def for_run(cls, inputs: StageInputs) -> ApertureStage | None:
+        """The stage of a run, for a multi-aperture camera."""
+        options, pictures = inputs.options.apertures, inputs.recording.capture.apertures
+        if pictures is None:
+            return None
+        return cls(pictures=pictures, options=options, keep=inputs.apertures if options.depth else None)
+
     def __call__(self, frames: Iterator[Frame], /) -> Iterator[Frame]:
         """Fuse the exposures, in order."""
         require_colours(self.pictures.rig)
@@ -57,12 +66,12 @@ class ApertureStage:
             fused = self.fused(frame.name, frame.image)
             if self.keep is not None:
                 write_maps(self.keep / "disparity", self.keep / "depth", frame.name, fused)
-            said = Treatment(stage="apertures", reason=f"fused of {len(self.pictures.rig.apertures)} sub-images")
+            done = Treatment(stage="apertures", reason=f"fused of {len(self.pictures.rig.apertures)} sub-images")
             yield replace(
                 frame,
                 image=fused.image,
                 camera=self.pictures.rig.reference.camera,
-                treatments=(*frame.treatments, said),
+                treatments=(*frame.treatments, done),
             )
 
     def canvas(self) -> Rectified:

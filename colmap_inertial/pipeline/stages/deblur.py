@@ -17,7 +17,14 @@ from colmap_inertial.core.types import (
     Treatment,
 )
 from colmap_inertial.imaging.blur_path import BlurPath
-from colmap_inertial.imaging.gate import FrameDecision, GateOptions, RecordingVerdict, judge_frame, keep_sharp
+from colmap_inertial.imaging.gate import (
+    GATE_LIMITS,
+    FrameDecision,
+    GateOptions,
+    RecordingVerdict,
+    judge_frame,
+    keep_sharp,
+)
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.parallax import Parallax
 from colmap_inertial.imaging.path_filters import half_quadratic, path_wiener
@@ -27,11 +34,21 @@ from colmap_inertial.imaging.restoration.shipped import checksum
 from colmap_inertial.imaging.wiener import LONGEST_PX, DeblurOptions
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.pipeline.stages.gyro_view import GyroView
+from colmap_inertial.pipeline.stages.imaging_plan import ImagingPlan
+from colmap_inertial.pipeline.stages.inputs import StageInputs
 
 #: Standard deviation of the Gaussian, in linear light, by which COLMAP sees a deblurred frame smoothed, as a share of
 #: its blur's length, and at most, px: what a filter leaves of noise and ringing grows with the blur, and moves cameras;
 #: of short blur, it leaves detail that gives more points than smoothing does.
 SMOOTHING, MOST_SMOOTHING_PX = 0.06, 1.2
+#: Standard deviations by which a frame must bear out the gyroscope by itself, where others do not. With 4, the filter
+#: made some worse; the network, which sees whether the filter's result can be true, is worth using unless a frame
+#: speaks against.
+_CLEAR_SUPPORT: dict[BlurRemover, float] = {
+    "wiener": GATE_LIMITS.clear_support,
+    "path": GATE_LIMITS.clear_support,
+    "deepgyro": 0.0,
+}
 #: A frame of which more than this share stays as it was is not smoothed.
 _MOSTLY_KEPT = 0.5
 
@@ -105,6 +122,32 @@ class DeblurStage:
             raise ValueError(f"method: {', '.join(get_args(BlurRemover))}, not {self.method}")
         if self.method == "deepgyro":
             object.__setattr__(self, "weights", checksum("deepgyro"))
+
+    @classmethod
+    def for_run(cls, inputs: StageInputs) -> DeblurStage | None:
+        """The stage of a run, where the plan says that frames are deblurred."""
+        return cls.of_plan(inputs.plan, drop=inputs.maps, smoothing=inputs.maps)
+
+    @classmethod
+    def of_plan(cls, plan: ImagingPlan, *, drop: bool = True, smoothing: bool = True) -> DeblurStage | None:
+        """What a plan says; it need not drop what is too blurred, nor have COLMAP see it smoothed.
+
+        Where frames must bear out the gyroscope by themselves, they must do so clearly for a filter; for the network
+        it is enough that they do not speak against it.
+        """
+        if plan.view is None or plan.deblur is None:
+            return None
+        decisions, verdict = plan.deblur
+        return cls(
+            view=plan.view,
+            decisions=decisions,
+            verdict=verdict,
+            parallaxes=plan.parallaxes,
+            gate=GateOptions() if verdict.trusted else GateOptions(min_support=_CLEAR_SUPPORT[plan.method]),
+            drop=drop,
+            method=plan.method,
+            smoothing=SMOOTHING if smoothing else 0.0,
+        )
 
     def __call__(self, frames: Iterator[Frame], /) -> Iterator[Frame]:
         """Deblur the frames, in order."""

@@ -11,11 +11,10 @@ from typing import Any, Literal
 import numpy as np
 
 from colmap_inertial.core.arrays import AnyArray, Float32Array
-from colmap_inertial.core.errors import FormatError, NotObservableError
+from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError
 from colmap_inertial.core.options import ExposureOptions
-from colmap_inertial.core.threads import frames_at_once, in_order, threads_beside
+from colmap_inertial.core.threads import frames_at_once, in_order
 from colmap_inertial.core.types import Frame, Projector, Treatment
-from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.exposure_pairs import (
     Brightness,
     ExposurePair,
@@ -26,49 +25,37 @@ from colmap_inertial.imaging.exposure_pairs import (
     fuse_mertens,
 )
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
-from colmap_inertial.imaging.restoration import load_network, lsd2, shipped
+from colmap_inertial.io.capture import Capture, ImageFolder
 from colmap_inertial.io.exposures import LongExposures, LongTiming
+from colmap_inertial.io.frames import image_names
 from colmap_inertial.io.images import read_image
 from colmap_inertial.io.names import path_in
 from colmap_inertial.model import colmap_camera
+from colmap_inertial.pipeline.stages.fusers import Fuser
 from colmap_inertial.pipeline.stages.gyro_view import GyroView
-
-#: Makes one picture of a short exposure as bright as the long one, the long one in its geometry, and the long one's
-#: blur: all float32 sRGB 0 to 1, of one shape.
-Fuse = Callable[[Float32Array, Float32Array, BlurField | None], Float32Array]
+from colmap_inertial.pipeline.stages.inputs import StageInputs
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Fuser:
-    """What makes one picture of two.
-
-    Attributes
-    ----------
-    fuse
-        Does it, in any number of threads at once.
-    identity
-        What decides its result: pairs are fused again where it changes.
-    """
-
-    fuse: Fuse = field(compare=False)
-    identity: str
-
-
-def lsd2_fuser(options: ExposureOptions | None = None) -> Fuser:
-    """The network that comes with the package.
+def fuses_pairs(capture: Capture, options: ExposureOptions, *, deblur: str | None) -> bool:
+    """Whether frames are made of pairs; what stands against it is said before any work.
 
     Raises
     ------
-    MissingExtraError, FormatError, InertialError
-        As ``restoration.load_network``.
+    InertialError
+        Where deblurring was asked for by name, too.
+    FormatError
+        Where a long exposure is missing.
     """
-    options = options or ExposureOptions()
-    network = load_network("lsd2", device=options.device, threads=threads_beside(frames_at_once()))
-
-    def fuse(short: Float32Array, long: Float32Array, blur: BlurField | None) -> Float32Array:
-        return lsd2.fuse(short, long, blur=blur, network=network)
-
-    return Fuser(fuse=fuse, identity=f"lsd2 {shipped.checksum('lsd2')}")
+    if capture.exposures is None or not options.fuse:
+        return False
+    if deblur not in (None, "off"):
+        raise InertialError(
+            f"--deblur {deblur}: frames of short and long exposures are fused, and not deblurred then; leave it out, "
+            "or leave out the long ones by --exposures.no-fuse"
+        )
+    assert isinstance(capture.frames, ImageFolder)
+    capture.exposures.files(image_names(capture.frames))
+    return True
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,6 +140,47 @@ class ExposureStage:
     view: GyroView | None = None
     long: LongTiming | None = None
     workers: int | None = field(default=None, compare=False)
+
+    @classmethod
+    def for_run(cls, inputs: StageInputs) -> ExposureStage | None:
+        """The stage of a run, where pairs are fused; without exposure times, the pixels alone align them.
+
+        Raises
+        ------
+        TimingError
+            As ``LongExposures.timing``.
+        """
+        capture, timing = inputs.recording.capture, inputs.recording.timing
+        if inputs.fuser is None or capture.exposures is None:
+            return None
+        return cls.of_capture(
+            capture,
+            inputs.options.exposures,
+            inputs.fuser,
+            view=None if timing.exposure_s is None else inputs.plan.view,
+            long=capture.exposures.timing(timing),
+        )
+
+    @classmethod
+    def of_capture(
+        cls,
+        capture: Capture,
+        options: ExposureOptions,
+        fuser: Fuser,
+        *,
+        view: GyroView | None = None,
+        long: LongTiming | None = None,
+    ) -> ExposureStage:
+        """The stage for a capture with pairs, of which the times may be unknown."""
+        assert capture.exposures is not None and isinstance(capture.frames, ImageFolder)
+        return cls(
+            pictures=capture.exposures,
+            folder=capture.frames.folder,
+            fuser=fuser,
+            fusion=options.fusion,
+            view=view,
+            long=long,
+        )
 
     def __call__(self, frames: Iterator[Frame], /) -> Iterator[Frame]:
         """Fuse the pairs, in order."""

@@ -21,13 +21,11 @@ from colmap_inertial.core.geometry import (
     rotation_between,
     skew,
 )
-from colmap_inertial.core.options import JoinOptions, ScaleOptions, WorldAxes
+from colmap_inertial.core.options import JoinOptions
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import (
     DOWN_IN_WORLD,
-    CameraImuCalibration,
     Gap,
-    ImuRecording,
     JoinedPart,
     ScaleEstimate,
     Similarity,
@@ -41,7 +39,9 @@ from colmap_inertial.inertial.scale.verdict import TRUSTED_HALF_WIDTH, half_widt
 from colmap_inertial.model import Model, has_rigs, trajectory_from_model, transformed
 from colmap_inertial.model.merging import merged
 from colmap_inertial.pipeline.stages.across import images_in_others, one_points
-from colmap_inertial.pipeline.stages.metric import metric_trajectory, of_model
+from colmap_inertial.pipeline.stages.inertial import InertialStage
+from colmap_inertial.pipeline.stages.inputs import StageInputs
+from colmap_inertial.pipeline.stages.metric import metric_trajectory
 
 if TYPE_CHECKING:
     import pycolmap
@@ -52,7 +52,7 @@ _NO_MATCHES = "without matches between the two: COLMAP's database is gone"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class JoinStage:
+class JoinStage(InertialStage):
     """Joins metric models of one recording; those that nothing places surely enough stay apart.
 
     Comes after the scale. It takes all models at once (:meth:`join_models`); one alone stays as it is. Each joined
@@ -60,27 +60,22 @@ class JoinStage:
 
     Attributes
     ----------
-    imu
-        The recording that ran along.
-    calibration
-        What is known of the camera and the IMU beforehand.
-    options
-        Of the scale estimate.
     limits
         Up to where gaps are closed.
-    world
-        Where gravity points in the metric model.
     database
         COLMAP's, of the models: matches between images of two of them tie these, too.
     """
 
-    imu: ImuRecording
-    calibration: CameraImuCalibration | None
-    options: ScaleOptions = field(default_factory=ScaleOptions)
     limits: JoinOptions = field(default_factory=JoinOptions)
-    world: WorldAxes = "z-up"
     #: a run with other matches has other models
     database: Path | None = field(default=None, compare=False)
+
+    @classmethod
+    def for_run(cls, inputs: StageInputs) -> JoinStage | None:
+        """The stage of a run, where models are to be joined."""
+        if inputs.options.join == "off":
+            return None
+        return cls(**cls.fields_for(inputs), limits=inputs.options.join_options, database=inputs.database)
 
     def __call__(self, model: Model, /) -> Model:
         """One model by itself: it stays as it is."""
@@ -151,7 +146,7 @@ class JoinStage:
         if has_rigs(reconstruction):
             raise NotObservableError("place", f"the cameras of model {model.colmap_index} are a rig")
         trajectory = metric_trajectory(trajectory_from_model(reconstruction, model.timing)[0])
-        path = FittedPath.of(trajectory, self.imu, of_model(self.calibration, model), self.options)
+        path = FittedPath.of(trajectory, self.imu, self.calibration_of(model), self.options)
         return Part(number=model.colmap_index, trajectory=trajectory, path=path, cameras=_cameras(reconstruction))
 
     def _lacks_database(self) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,6 @@ import numpy as np
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import quat_rotate, so3_log
 from colmap_inertial.core.gyro import on_camera_rate
-from colmap_inertial.core.options import ScaleOptions, WorldAxes
 from colmap_inertial.core.types import (
     CameraImuCalibration,
     CameraMotion,
@@ -23,12 +22,12 @@ from colmap_inertial.core.types import (
     SmoothedTrajectory,
 )
 from colmap_inertial.imaging.gyro_camera import GyroCamera
-from colmap_inertial.inertial.scale import estimate_scale
 from colmap_inertial.io.records import write_record
 from colmap_inertial.io.trajectories import write_tum
-from colmap_inertial.model import Model, downgraded, trajectory_from_model
+from colmap_inertial.model import Model, downgraded
 from colmap_inertial.motion.smooth import smooth_trajectory
-from colmap_inertial.pipeline.stages.rolling_shutter import for_rectified
+from colmap_inertial.pipeline.stages.inertial import InertialStage
+from colmap_inertial.pipeline.stages.inputs import StageInputs
 
 log = logging.getLogger(__name__)
 
@@ -38,32 +37,20 @@ _RATE_HALF_S, _LEAST_SAMPLES = 7e-3, 2
 
 
 @dataclass(frozen=True, kw_only=True)
-class MetricStage:
+class MetricStage(InertialStage):
     """Scale, gravity and accelerometer bias from the IMU; a refused scale leaves the model as it is.
 
-    Attributes
-    ----------
-    imu
-        The recording that ran along.
-    calibration
-        What is known of the camera and the IMU beforehand.
-    options
-        Of the scale estimate.
-    world
-        Where gravity points in the metric model.
+    See :class:`InertialStage` for the attributes.
     """
 
-    imu: ImuRecording
-    calibration: CameraImuCalibration | None
-    options: ScaleOptions = field(default_factory=ScaleOptions)
-    world: WorldAxes = "z-up"
+    @classmethod
+    def for_run(cls, inputs: StageInputs) -> MetricStage:
+        """The stage of a run."""
+        return cls(**cls.fields_for(inputs))
 
     def __call__(self, model: Model, /) -> Model:
         """Estimate and apply the scale."""
-        trajectory, notes = trajectory_from_model(model.reconstruction, model.timing)
-        estimate = estimate_scale(
-            trajectory, self.imu, calibration=of_model(self.calibration, model), options=self.options
-        )
+        estimate, _, notes = self.estimate_scale(model)
         estimate = replace(estimate, notes=(*estimate.notes, *self.imu.repairs, *notes))
         estimate = downgraded(estimate, model.doubts)
         if estimate.verdict == "refused":
@@ -75,11 +62,6 @@ class MetricStage:
 def provenance(estimate: ScaleEstimate) -> str:
     """Where an inertial scale comes from, in words."""
     return f"inertial scale, method {estimate.method}, {estimate.verdict}"
-
-
-def of_model(calibration: CameraImuCalibration | None, model: Model) -> CameraImuCalibration | None:
-    """What is known of the camera that a model was mapped for: of rectified keypoints, hardly any readout is left."""
-    return for_rectified(calibration) if model.rectified and calibration is not None else calibration
 
 
 def smoothed_path(

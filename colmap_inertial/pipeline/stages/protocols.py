@@ -2,15 +2,29 @@
 
 Our own stages come in by the same doors. What a stage did travels with the data (``treatments``), and results are made
 from that alone.
+
+A stage may have further attributes, by which it says what else it does. A plain function has none of them.
+
+========================================== ============================================================================
+``replaces``                               types of default stages that do not run beside it
+``move_image(name, image)``                keypoint stage: moves the pixels of an image as it moves its keypoints
+``covers(name)``                           keypoint stage: whether it moves anything in an image
+``as_exposed(name, xy_px)``                keypoint stage: its inverse, where the shutter had keypoints
+``refined(calibration, readout_s, camera)`` keypoint stage: the same with what a refinement made of these
+``join_models(models)``                    model stage: takes all models at once (:class:`JoiningStage`)
+``changes_images``                         model stage: whether images are made after it, by ``refined`` keypoint stages
+========================================== ============================================================================
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from types import EllipsisType
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Protocol, TypeGuard, TypeVar
 
-from colmap_inertial.core.types import Frame, Gap, Keypoints
+from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.errors import InertialError
+from colmap_inertial.core.types import CameraImuCalibration, CameraModel, Frame, Gap, Keypoints
 from colmap_inertial.model import Model
 
 Stage = TypeVar("Stage")
@@ -32,6 +46,14 @@ class KeypointStage(Protocol):
         ...
 
 
+class InvertibleStage(KeypointStage, Protocol):
+    """A keypoint stage that knows where the shutter had the keypoints that it moved."""
+
+    def as_exposed(self, name: str, xy_px: Array) -> Array:
+        """Return (N, 2) pixels of an image as it was exposed, of keypoints as the stage left them."""
+        ...
+
+
 class ModelStage(Protocol):
     """Between mapping and the final write: takes a model and returns the one to go on with."""
 
@@ -40,8 +62,7 @@ class ModelStage(Protocol):
         ...
 
 
-@runtime_checkable
-class JoiningStage(Protocol):
+class JoiningStage(ModelStage, Protocol):
     """A model stage that takes all models of a run at once."""
 
     def join_models(self, models: Sequence[Model], /) -> tuple[tuple[Model, ...], tuple[Gap, ...]]:
@@ -50,19 +71,57 @@ class JoiningStage(Protocol):
 
 
 def with_defaults(stages: Sequence[Stage | EllipsisType], defaults: Iterable[Stage]) -> list[Stage]:
-    """A list of stages with the defaults where ``...`` stands.
+    """A list of stages with the defaults where ``...`` stands, but those that another stage ``replaces``.
 
     Raises
     ------
     ValueError
         Where ``...`` stands twice.
+    InertialError
+        Where two stages join models: the second one would get models that are joined already.
     """
     if sum(stage is ... for stage in stages) > 1:
         raise ValueError("the default stages (...) can stand in a list of stages once")
-    found: list[Stage] = []
+    replaced = tuple(kind for stage in stages for kind in getattr(stage, "replaces", ()))
+    every: list[Stage] = []
     for stage in stages:
         if isinstance(stage, EllipsisType):
-            found += defaults
+            every += [default for default in defaults if type(default) not in replaced]
         else:
-            found.append(stage)
-    return found
+            every.append(stage)
+    joining = [type(stage).__name__ for stage in every if joins_models(stage)]
+    if len(joining) > 1:
+        raise InertialError(
+            f"two model stages join models ({' and '.join(joining[:2])}), and only one can: leave one out (--join off "
+            "leaves out the default one), or name the default one in `replaces` of yours"
+        )
+    return every
+
+
+def joins_models(stage: object) -> TypeGuard[JoiningStage]:
+    """Whether a stage takes all models at once."""
+    return hasattr(stage, "join_models")
+
+
+def changes_images(stages: Iterable[ModelStage]) -> bool:
+    """Whether images can be made only after these stages: one of them changes what the images agree with."""
+    return any(getattr(stage, "changes_images", False) for stage in stages)
+
+
+def find_inverse(stages: Sequence[KeypointStage]) -> InvertibleStage | None:
+    """The stage that knows where the shutter had all keypoints: the only one, where it can tell."""
+    return next((stage for stage in stages if len(stages) == 1 and _is_invertible(stage)), None)
+
+
+def _is_invertible(stage: object) -> TypeGuard[InvertibleStage]:
+    return hasattr(stage, "as_exposed")
+
+
+def refined_stages(
+    stages: Iterable[KeypointStage], calibration: CameraImuCalibration, readout_s: float, camera: CameraModel
+) -> list[KeypointStage]:
+    """The keypoint stages with what a refinement found, as far as they take it."""
+    return [
+        stage if (refined := getattr(stage, "refined", None)) is None else refined(calibration, readout_s, camera)
+        for stage in stages
+    ]

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
-from colmap_inertial.core.options import ScaleOptions
-from colmap_inertial.core.types import CameraImuCalibration, ImuRecording, Treatment
+from colmap_inertial.core.types import Treatment
 from colmap_inertial.imaging.gyro_camera import FrameShutter
-from colmap_inertial.inertial.scale import estimate_scale
-from colmap_inertial.model import Model, trajectory_from_model
+from colmap_inertial.model import Model
 from colmap_inertial.model.readout import settle_readout
-from colmap_inertial.pipeline.stages.metric import of_model, smoothed_path
+from colmap_inertial.pipeline.stages.inertial import InertialStage
+from colmap_inertial.pipeline.stages.inputs import StageInputs
+from colmap_inertial.pipeline.stages.metric import smoothed_path
 
 if TYPE_CHECKING:
     import pycolmap
@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReadoutStage:
+class ReadoutStage(InertialStage):
     """Moves observations to where they would be without the camera's translation within the readout.
 
     The gyroscope undoes the camera's turning before mapping. Its translation shows in things that are near, and takes
@@ -35,32 +35,30 @@ class ReadoutStage:
 
     Attributes
     ----------
-    imu
-        The recording that ran along.
-    calibration
-        What is known of the camera and the IMU beforehand.
-    options
-        Of the scale estimate.
     refine_intrinsics
         Whether the cameras may change.
     num_threads
         Of bundle adjustment; all where negative.
     """
 
-    imu: ImuRecording
-    calibration: CameraImuCalibration | None
-    options: ScaleOptions = field(default_factory=ScaleOptions)
     refine_intrinsics: bool
     num_threads: int = -1
+
+    @classmethod
+    def for_run(cls, inputs: StageInputs) -> ReadoutStage:
+        """The stage of a run."""
+        return cls(
+            **cls.fields_for(inputs),
+            refine_intrinsics=cls.refines_intrinsics(inputs),
+            num_threads=1 if inputs.options.deterministic else -1,
+        )
 
     def __call__(self, model: Model, /) -> Model:
         """Adjust the model."""
         if not model.rectified:
             return model
         reconstruction = model.reconstruction
-        trajectory, _ = trajectory_from_model(reconstruction, model.timing)
-        calibration = of_model(self.calibration, model)
-        estimate = estimate_scale(trajectory, self.imu, calibration=calibration, options=self.options)
+        estimate, trajectory, _ = self.estimate_scale(model)
         if estimate.metres_per_unit is None or estimate.gravity_in_world_m_s2 is None:
             return model
         metric = replace(
@@ -88,12 +86,14 @@ class ReadoutStage:
             refine_intrinsics=self.refine_intrinsics,
             num_threads=self.num_threads,
         )
-        said = (
+        reason = (
             f"translation within the readout moves points by {what.shift_px:.2f} px; reprojection error "
             f"{what.before_px:.3f} -> {what.after_px:.3f} px{'' if what.accepted else ': left as it is'}"
         )
-        log.info("model %d: %s", model.colmap_index, said)
-        done = Treatment(stage="readout", reason=said, action="adjusted" if what.accepted else "", values=asdict(what))
+        log.info("model %d: %s", model.colmap_index, reason)
+        done = Treatment(
+            stage="readout", reason=reason, action="adjusted" if what.accepted else "", values=asdict(what)
+        )
         return replace(
             model,
             reconstruction=settled if what.accepted else reconstruction,

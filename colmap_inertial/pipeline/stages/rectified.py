@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,17 @@ ImageMover = Callable[[str, Any], Any]
 def image_movers(stages: Sequence[KeypointStage]) -> list[ImageMover]:
     """Those of the keypoint stages that can move pixels, too: by a method ``move_image(name, image)``."""
     return [stage.move_image for stage in stages if hasattr(stage, "move_image")]
+
+
+def rectifiable(stages: Sequence[KeypointStage], names: Iterable[str]) -> frozenset[str]:
+    """Names of the images that one of the stages can move: where it has a method ``covers(name)``, what that says."""
+    movers = [stage for stage in stages if hasattr(stage, "move_image")]
+    return frozenset(name for name in names if any(_covers(stage, name) for stage in movers))
+
+
+def _covers(stage: object, name: str) -> bool:
+    covers = getattr(stage, "covers", None)
+    return covers is None or bool(covers(name))
 
 
 def write_images(

@@ -14,9 +14,8 @@ import numpy as np
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import quat_from_matrix
-from colmap_inertial.core.options import ScaleOptions
 from colmap_inertial.core.threads import one_blas_thread
-from colmap_inertial.core.types import CAL, CameraImuCalibration, ImuRecording, SolvedMotion, Treatment
+from colmap_inertial.core.types import CAL, CameraImuCalibration, SolvedMotion, Treatment
 from colmap_inertial.inertial.refine.judge import Judged, refine, size_of
 from colmap_inertial.inertial.refine.setup import (
     Known,
@@ -31,8 +30,10 @@ from colmap_inertial.inertial.refine.values import FIRST_INTRINSIC, LEVER, OFFSE
 from colmap_inertial.inertial.scale import strength_of_gravity
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.model import Model, has_rigs
+from colmap_inertial.pipeline.stages.inertial import InertialStage
+from colmap_inertial.pipeline.stages.inputs import StageInputs
 from colmap_inertial.pipeline.stages.metric import gravity_in_model
-from colmap_inertial.pipeline.stages.rolling_shutter import RollingShutterStage
+from colmap_inertial.pipeline.stages.protocols import InvertibleStage, find_inverse
 
 if TYPE_CHECKING:
     import pycolmap
@@ -50,7 +51,7 @@ _FOCAL_GAP = 0.1
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class RefineStage:
+class RefineStage(InertialStage):
     """Refines a metric model by all of its observations, each at its own line's instant, and the IMU between frames.
 
     Comes after the scale. The overall size and the direction of gravity stay what the scale estimate made them; the
@@ -59,24 +60,31 @@ class RefineStage:
 
     Attributes
     ----------
-    imu
-        The recording that ran along.
-    calibration
-        What is known of the camera and the IMU beforehand.
-    options
-        Of the scale estimate: strength of gravity.
     refine_intrinsics
         Whether the cameras may change.
     shutter
         What rectified the keypoints, where something did.
     """
 
-    imu: ImuRecording
-    calibration: CameraImuCalibration | None
-    options: ScaleOptions = field(default_factory=ScaleOptions)
     refine_intrinsics: bool
-    shutter: RollingShutterStage | None = None
+    shutter: InvertibleStage | None = None
     _writes: int = field(default=_WRITES, init=False, repr=False)
+
+    @classmethod
+    def for_run(cls, inputs: StageInputs) -> RefineStage | None:
+        """The stage of a run, where models are to be refined."""
+        if inputs.options.refine == "off":
+            return None
+        return cls(
+            **cls.fields_for(inputs),
+            refine_intrinsics=cls.refines_intrinsics(inputs),
+            shutter=find_inverse(inputs.keypoint_stages),
+        )
+
+    @property
+    def changes_images(self) -> bool:
+        """Whether images that were rectified agree with the refined model only once they are made again."""
+        return self.shutter is not None
 
     def __call__(self, model: Model, /) -> Model:
         """Refine the model."""

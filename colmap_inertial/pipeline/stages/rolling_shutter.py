@@ -14,6 +14,7 @@ from colmap_inertial.imaging.rolling_shutter import rays, rectify_image, rectify
 from colmap_inertial.io.calibration import SIGMAS
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.pipeline.stages.gyro_view import GyroView
+from colmap_inertial.pipeline.stages.inputs import StageInputs
 
 #: Share of the readout that acts on poses after rectification.
 _LEFT_SHARE = 0.1
@@ -36,6 +37,12 @@ class RollingShutterStage:
     _ready: dict[str, tuple[GyroCamera, Projector, dict[str, int]]] = field(
         default_factory=dict, init=False, compare=False, repr=False
     )
+
+    @classmethod
+    def for_run(cls, inputs: StageInputs) -> RollingShutterStage | None:
+        """The stage of a run, where the plan says that keypoints are rectified."""
+        view = inputs.plan.view
+        return cls(view=view) if view is not None and inputs.plan.rectify else None
 
     def __call__(self, keypoints: Keypoints, /) -> Keypoints:
         """Move the keypoints of one image."""

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import EllipsisType
 
 from colmap_inertial.checks.diagnose import Diagnosis
 from colmap_inertial.checks.report import require_plotly
-from colmap_inertial.checks.validate import parse_target
+from colmap_inertial.checks.validate import Target, parse_target
 from colmap_inertial.colmap.sparse import check_pair_names, mapping_device
 from colmap_inertial.colmap.steps import run_colmap
 from colmap_inertial.colmap.tsdf import require_mesh_maker
@@ -17,91 +17,54 @@ from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, InertialError
 from colmap_inertial.core.gravity import gravity_in_cam
 from colmap_inertial.core.options import ReconstructOptions
-from colmap_inertial.io.capture import load_capture
-from colmap_inertial.io.files import StrPath, write_json
+from colmap_inertial.core.types import Frame, PositionFixes
+from colmap_inertial.io.capture import Capture, load_capture
+from colmap_inertial.io.files import StrPath
 from colmap_inertial.io.frames import picture_folders, read_frames
-from colmap_inertial.io.imu import read_raw_capture_imu
+from colmap_inertial.io.imu import RawImu, read_raw_capture_imu
 from colmap_inertial.io.imu_calibration import used_files
 from colmap_inertial.io.limits import reading_within
-from colmap_inertial.pipeline.run.context import Recording, corrected_imu, prior_calibration
+from colmap_inertial.pipeline.run.context import Recording, RunContext, corrected_imu, prior_calibration
 from colmap_inertial.pipeline.run.installed import warn_of_conflicts
 from colmap_inertial.pipeline.run.progress import Progress, silent
 from colmap_inertial.pipeline.run.runner import remove
-from colmap_inertial.pipeline.run.session import open_session
+from colmap_inertial.pipeline.run.session import Session, open_session
 from colmap_inertial.pipeline.stages.deblur import require_method
-from colmap_inertial.pipeline.stages.exposures import lsd2_fuser
+from colmap_inertial.pipeline.stages.defaults import (
+    default_frame_stages,
+    default_keypoint_stages,
+    default_model_stages,
+)
+from colmap_inertial.pipeline.stages.exposures import fuses_pairs
 from colmap_inertial.pipeline.stages.frame_folder import require_frames
-from colmap_inertial.pipeline.stages.join import JoinStage
-from colmap_inertial.pipeline.stages.metric import MetricStage
-from colmap_inertial.pipeline.stages.protocols import FrameStage, KeypointStage, ModelStage, with_defaults
-from colmap_inertial.pipeline.stages.readout import ReadoutStage
-from colmap_inertial.pipeline.stages.refine import RefineStage
-from colmap_inertial.pipeline.stages.rolling_shutter import RollingShutterStage
+from colmap_inertial.pipeline.stages.fusers import Fuser, lsd2_fuser
+from colmap_inertial.pipeline.stages.inputs import StageInputs
+from colmap_inertial.pipeline.stages.named import Stages
+from colmap_inertial.pipeline.stages.protocols import (
+    FrameStage,
+    KeypointStage,
+    ModelStage,
+    changes_images,
+    with_defaults,
+)
 from colmap_inertial.reconstruction.drivers.frames import (
-    as_refined,
     ask_for_plan,
-    fusing,
     run_frames,
     run_images,
     run_plan,
+    stages_of_refined,
 )
-from colmap_inertial.reconstruction.drivers.georeference import positions_of, run_georeference
+from colmap_inertial.reconstruction.drivers.georeference import run_georeference
 from colmap_inertial.reconstruction.drivers.models import run_dense_models, run_models, run_validation
 from colmap_inertial.reconstruction.drivers.reporting import report_result, reporting_stops, write_recording
 from colmap_inertial.reconstruction.drivers.result import ReconstructResult
-from colmap_inertial.reconstruction.preparation.pairs import exposure_stage, fuses_pairs
+from colmap_inertial.reconstruction.preparation.geolocation import positions_of
 from colmap_inertial.reconstruction.preparation.plan import with_stated_exposures
-from colmap_inertial.reconstruction.preparation.preflight import checked_imu, preflight, stop_or_doubt
+from colmap_inertial.reconstruction.preparation.preflight import checked_imu, run_preflight
 from colmap_inertial.reconstruction.preparation.selection import part_of, run_selection
 
 #: A camera-IMU rotation less certain than this is no basis for gravity directions.
 _GRAVITY_ROTATION_RAD = 0.2
-
-
-def default_model_stages(
-    recording: Recording,
-    options: ReconstructOptions,
-    keypoint_stages: Sequence[KeypointStage] = (),
-    *,
-    database: Path | None = None,
-) -> list[ModelStage]:
-    """What stands for ``...`` in ``model_stages``, after these keypoint stages, of models of a database of COLMAP."""
-    scale = dataclasses.replace(options.scale, max_offset_s=recording.max_offset_s)
-    asked = options.mapping.refine_intrinsics
-    refine_intrinsics = recording.capture.camera is None if asked is None else asked
-    readout = ReadoutStage(
-        imu=recording.imu,
-        calibration=recording.prior,
-        options=scale,
-        refine_intrinsics=refine_intrinsics,
-        num_threads=1 if options.deterministic else -1,
-    )
-    metric = MetricStage(imu=recording.imu, calibration=recording.prior, options=scale, world=options.world)
-    joining: list[ModelStage] = []
-    if options.join == "inertial":
-        limits = options.join_options
-        joining = [
-            JoinStage(
-                imu=recording.imu,
-                calibration=recording.prior,
-                options=scale,
-                limits=limits,
-                world=options.world,
-                database=database,
-            )
-        ]
-    if options.refine == "off":
-        return [readout, metric, *joining]
-    # only what moved keypoints all by itself can say from where
-    shutters = [stage for stage in keypoint_stages if isinstance(stage, RollingShutterStage)]
-    refined = RefineStage(
-        imu=recording.imu,
-        calibration=recording.prior,
-        options=scale,
-        refine_intrinsics=refine_intrinsics,
-        shutter=shutters[0] if len(shutters) == len(keypoint_stages) == 1 else None,
-    )
-    return [readout, metric, *joining, refined]
 
 
 def reconstruct(
@@ -154,118 +117,165 @@ def reconstruct(
         When the recording cannot give metres, as a stabilised video (``options.force`` goes on); when deblurring or
         rectifying was asked for by name, and the gyroscope does not belong to the pixels.
     """
+    stages = Stages(frame=tuple(frame_stages), keypoint=tuple(keypoint_stages), model=tuple(model_stages))
     with reading_within(options.limits):
-        return _reconstruct(
-            Path(capture), Path(out), options, frame_stages, keypoint_stages, model_stages, progress, findings
-        )
+        return _reconstruct(Path(capture), Path(out), options, stages, progress, findings)
 
 
-def _reconstruct(
-    capture: Path,
-    out: Path,
-    options: ReconstructOptions,
-    frame_stages: Sequence[FrameStage | EllipsisType],
-    keypoint_stages: Sequence[KeypointStage | EllipsisType],
-    model_stages: Sequence[ModelStage | EllipsisType],
-    progress: Progress,
-    findings: Callable[[Diagnosis], None],
-) -> ReconstructResult:
-    for stages in (frame_stages, keypoint_stages, model_stages):
-        with_defaults(stages, [])  # a wrong list is said before the work, not after it
-    if not model_stages:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Given:
+    """A capture that was read and checked.
+
+    Attributes
+    ----------
+    capture
+        Without its long exposures where they are not fused.
+    raw
+        The IMU, before any calibration of its own.
+    recording
+        With all frames.
+    frames
+        Of the capture, in order of time.
+    fuser
+        What fuses pairs of exposures; ``None`` where none are fused.
+    target
+        To measure in the model.
+    gravity
+        By image name, where the options ask for it.
+    fixes
+        Positions of the frames, where the options ask for them.
+    """
+
+    capture: Capture
+    raw: RawImu
+    recording: Recording
+    frames: Iterator[Frame]
+    fuser: Fuser | None
+    target: Target | None
+    gravity: Mapping[str, Array]
+    fixes: PositionFixes | None
+
+
+def _read(path: Path, options: ReconstructOptions, stages: Stages) -> _Given:
+    """Read a capture; what is wrong with it, the options or the stages is said before any work."""
+    for kind in (stages.frame, stages.keypoint, stages.model):
+        with_defaults(kind, [])
+    if not stages.model:
         raise ValueError("model_stages: one must estimate the scale, such as ... or MetricStage")
     warn_of_conflicts()
     require_plotly()
     require_mesh_maker(options)
     require_method(options.deblur)
-    loaded = load_capture(capture)
-    if loaded.frames is None:
-        raise FormatError(loaded.path, "has no frames: add [images] or [video]")
-    pairs = ... in frame_stages and fuses_pairs(loaded, options.exposures, deblur=options.deblur)
+    capture = load_capture(path)
+    if capture.frames is None:
+        raise FormatError(capture.path, "has no frames: add [images] or [video]")
+    pairs = ... in stages.frame and fuses_pairs(capture, options.exposures, deblur=options.deblur)
     fuser = lsd2_fuser(options.exposures) if pairs else None
-    loaded = loaded if pairs else dataclasses.replace(loaded, exposures=None)
-    raw = checked_imu(read_raw_capture_imu(loaded), force=options.force)
-    target = None if loaded.target is None else parse_target(loaded.target)  # what is wrong is said before the work
-    timing, frames = read_frames(loaded)
-    timing = with_stated_exposures(loaded, timing)
+    capture = capture if pairs else replace(capture, exposures=None)
+    raw = checked_imu(read_raw_capture_imu(capture), force=options.force)
+    target = None if capture.target is None else parse_target(capture.target)
+    timing, frames = read_frames(capture)
+    timing = with_stated_exposures(capture, timing)
     require_frames(len(timing.names), of=len(timing.names))
-    used = used_files(options.calibration)
-    prior = prior_calibration(loaded, options.calibration)
-    imu = corrected_imu(loaded, raw.imu, options.calibration)
-    recording = Recording.of(loaded, imu, timing, prior, max_offset_s=options.scale.max_offset_s)
+    prior = prior_calibration(capture, options.calibration)
+    imu = corrected_imu(capture, raw.imu, options.calibration)
+    recording = Recording.of(capture, imu, timing, prior, max_offset_s=options.scale.max_offset_s)
+    with_defaults(stages.model, default_model_stages(StageInputs(recording=recording, options=options)))
     gravity = _gravity_priors(recording, options)
     check_pair_names(timing.names)
-    fixes = positions_of(loaded, timing.names) if options.georeference else None
+    return _Given(
+        capture=capture,
+        raw=raw,
+        recording=recording,
+        frames=frames,
+        fuser=fuser,
+        target=target,
+        gravity=gravity,
+        fixes=positions_of(capture, timing.names) if options.georeference else None,
+    )
+
+
+def _reconstruct(
+    path: Path,
+    out: Path,
+    options: ReconstructOptions,
+    stages: Stages,
+    progress: Progress,
+    findings: Callable[[Diagnosis], None],
+) -> ReconstructResult:
+    given = _read(path, options, stages)
+    capture, used_calibration = given.capture, used_files(options.calibration)
     device = mapping_device(options.mapping, deterministic=options.deterministic)
+    context = RunContext.of(options, device=device, progress=progress)
     with (
-        open_session(
-            out,
-            loaded.path,
-            options,
-            pictures=picture_folders(loaded),
-            deterministic=options.deterministic,
-            seed=options.seed,
-            device=device,
-            progress=progress,
-        ) as session,
-        reporting_stops(session.workspace, loaded),
+        open_session(out, capture.path, options, context, pictures=picture_folders(capture)) as session,
+        reporting_stops(session.workspace, capture),
     ):
-        workspace = session.workspace
-        write_recording(session, recording)  # a run that stops reports it, too
-        diagnosis = preflight(recording, raw, progress)
-        write_json(workspace.diagnosis, diagnosis.as_json())
-        findings(diagnosis)
-        doubts = stop_or_doubt(diagnosis, force=options.force)
-        recording = dataclasses.replace(recording, doubts=doubts)
-        selection = run_selection(session, recording, options.frames)
-        if len(selection.names) < len(timing.names):
-            recording = recording.using(part_of(timing, selection.names))
-            _, frames = read_frames(loaded, only=selection.names)
-        plan = run_plan(session, recording, ask_for_plan(options, frame_stages, keypoint_stages, pairs=pairs))
-        fused = [exposure_stage(recording, options.exposures, plan.view, fuser)] if fuser is not None else []
-        defaults: list[FrameStage] = [*fusing(loaded, workspace, options.apertures), *fused, *plan.frame_stages()]
-        of_frames = with_defaults(frame_stages, defaults)
-        of_keypoints = with_defaults(keypoint_stages, plan.keypoint_stages())
-        records = run_frames(session, recording, frames, of_frames, workspace.colmap_images, plan)
-        used_timing = part_of(recording.timing, [record.name for record in records if record.used])
-        # pairs are chosen by what the capture itself holds: a calibration that is given later maps nothing again
-        plain_imu = corrected_imu(loaded, raw.imu, None)
-        seen = Recording.of(loaded, plain_imu, used_timing, prior_calibration(loaded, None))
-        keypoints, matching, mapping = run_colmap(session, seen, records, of_keypoints, gravity, options)
-        of_models = with_defaults(
-            model_stages,
-            default_model_stages(recording, options, of_keypoints, database=workspace.colmap_database),
-        )
-        # images agree with the model as it is in the end
-        refining = any(isinstance(stage, RefineStage) and stage.shutter is not None for stage in of_models)
-        if not refining:
-            images = run_images(session, records, keypoints.rectified(), of_keypoints)
-        models, fragments, gaps = run_models(
-            session, recording, of_models, rectified=bool(keypoints.rectified()), fragments=options.fragments
-        )
-        if refining:
-            images = run_images(session, records, keypoints.rectified(), as_refined(of_keypoints, models))
-        models = run_validation(session, models, target, images)
-        models = run_georeference(session, models, fixes, recording.timing, options.world)
-        if options.dense:
-            models = run_dense_models(session, models, images, options.dense_options)
-        result = ReconstructResult(
-            workspace=workspace,
-            models=models,
-            fragments=fragments,
-            gaps=gaps,
-            frames=records,
-            keypoints=keypoints,
-            matching=matching,
-            mapping=mapping,
-            imaging=plan,
-            selection=selection,
-            seconds=session.runner.seconds,
-        )
-        write_recording(session, recording, of_keypoints, keypoints.rectified())
-        result = report_result(session, result, loaded, used)
-        remove(workspace.colmap_features)
+        write_recording(session, given.recording)  # a run that stops reports it, too
+        doubts = run_preflight(session, given.recording, given.raw, findings, force=options.force)
+        given = replace(given, recording=replace(given.recording, doubts=doubts))
+        result = _run(session, given, options, stages)
+        result = report_result(session, result, capture, used_calibration)
+        remove(session.workspace.colmap_features)
     return result
+
+
+def _run(session: Session, given: _Given, options: ReconstructOptions, stages: Stages) -> ReconstructResult:
+    """The steps of a run, from the choice of frames to the dense reconstruction."""
+    workspace, capture = session.workspace, given.capture
+    recording, frames, timing = given.recording, given.frames, given.recording.timing
+    selection = run_selection(session, recording, options.frames)
+    if len(selection.names) < len(timing.names):
+        recording = recording.using(part_of(timing, selection.names))
+        _, frames = read_frames(capture, only=selection.names)
+    if not options.apertures.depth:
+        remove(workspace.apertures)  # of an earlier run that kept them
+    asked = ask_for_plan(options, stages.frame, stages.keypoint, pairs=given.fuser is not None)
+    inputs = StageInputs(
+        recording=recording,
+        options=options,
+        plan=run_plan(session, recording, asked),
+        fuser=given.fuser,
+        apertures=workspace.apertures,
+        database=workspace.colmap_database,
+    )
+    of_frames = with_defaults(stages.frame, default_frame_stages(inputs))
+    of_keypoints = with_defaults(stages.keypoint, default_keypoint_stages(inputs))
+    records = run_frames(session, recording, frames, of_frames, workspace.colmap_images, inputs.plan)
+    used_timing = part_of(recording.timing, [record.name for record in records if record.used])
+    # pairs are chosen by what the capture itself holds: a calibration that is given later maps nothing again
+    plain_imu = corrected_imu(capture, given.raw.imu, None)
+    plain = Recording.of(capture, plain_imu, used_timing, prior_calibration(capture, None))
+    keypoints, matching, mapping = run_colmap(session, plain, records, of_keypoints, given.gravity, options)
+    rectified = keypoints.rectified()
+    of_models = with_defaults(stages.model, default_model_stages(replace(inputs, keypoint_stages=of_keypoints)))
+    # images agree with the model as it is in the end
+    after_models = changes_images(of_models)
+    if not after_models:
+        images = run_images(session, records, rectified, of_keypoints)
+    models, fragments, gaps = run_models(
+        session, recording, of_models, rectified=bool(rectified), fragments=options.fragments
+    )
+    if after_models:
+        images = run_images(session, records, rectified, stages_of_refined(of_keypoints, models))
+    models = run_validation(session, models, given.target, images)
+    models = run_georeference(session, models, given.fixes, recording.timing, options.world)
+    if options.dense:
+        models = run_dense_models(session, models, images, options.dense_options)
+    write_recording(session, recording, of_keypoints, rectified)
+    return ReconstructResult(
+        workspace=workspace,
+        models=models,
+        fragments=fragments,
+        gaps=gaps,
+        frames=records,
+        keypoints=keypoints,
+        matching=matching,
+        mapping=mapping,
+        imaging=inputs.plan,
+        selection=selection,
+        seconds=session.runner.seconds,
+    )
 
 
 def _gravity_priors(recording: Recording, options: ReconstructOptions) -> Mapping[str, Array]:

@@ -19,8 +19,8 @@ from colmap_inertial.io.images import read_image
 from colmap_inertial.io.names import path_in
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.pipeline.stages.frame_folder import encode_image
+from colmap_inertial.pipeline.stages.imaging_plan import ImagingPlan
 from colmap_inertial.reconstruction.preparation.calibrate import some_frames
-from colmap_inertial.reconstruction.preparation.plan import ImagingPlan
 
 _FRAMES, _WIDTH, _HEIGHT, _GAP, _LABEL = 8, 420, 280, 6, 22
 #: Frames that are looked at for the report, and how many of them it shows.

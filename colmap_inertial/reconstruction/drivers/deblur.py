@@ -15,18 +15,21 @@ from colmap_inertial.io.files import StrPath, read_json, write_json
 from colmap_inertial.io.frames import frame_source, picture_folders, read_frames
 from colmap_inertial.io.imu import read_capture_imu
 from colmap_inertial.io.imu_calibration import CalibrationFiles, as_paths
-from colmap_inertial.pipeline.run.context import Recording, corrected_imu, prior_calibration
+from colmap_inertial.pipeline.run.context import Recording, RunContext, corrected_imu, prior_calibration
 from colmap_inertial.pipeline.run.progress import Progress, silent
 from colmap_inertial.pipeline.run.runner import remove
 from colmap_inertial.pipeline.run.session import open_session
 from colmap_inertial.pipeline.run.workspace import Workspace
 from colmap_inertial.pipeline.stages.deblur import require_method
+from colmap_inertial.pipeline.stages.defaults import default_frame_stages, default_keypoint_stages
 from colmap_inertial.pipeline.stages.frame_folder import FrameRecord
-from colmap_inertial.pipeline.stages.protocols import FrameStage
+from colmap_inertial.pipeline.stages.imaging_plan import ImagingPlan
+from colmap_inertial.pipeline.stages.inputs import StageInputs
+from colmap_inertial.pipeline.stages.rectified import rectifiable
 from colmap_inertial.reconstruction.drivers.contact_sheet import write_contact_sheet
-from colmap_inertial.reconstruction.drivers.frames import fusing, run_frames, run_images, run_plan
+from colmap_inertial.reconstruction.drivers.frames import run_frames, run_images, run_plan
 from colmap_inertial.reconstruction.drivers.result import frame_as_json, imaging_as_json
-from colmap_inertial.reconstruction.preparation.plan import ImagingPlan, Treatments, with_stated_exposures
+from colmap_inertial.reconstruction.preparation.plan import Treatments, with_stated_exposures
 
 _SHEET = "sheet.json"
 
@@ -120,21 +123,18 @@ def deblur_capture(
     recording = Recording.of(loaded, imu, timing, prior_calibration(loaded, calibration))
     pictures = picture_folders(loaded)
     with open_session(
-        Path(out), loaded.path, options, pictures=pictures, command="deblur", progress=progress
+        Path(out), loaded.path, options, RunContext(progress=progress), pictures=pictures, command="deblur"
     ) as session:
         workspace = session.workspace
         plan = run_plan(session, recording, Treatments(deblur=method, rolling_shutter=options.rolling_shutter))
-        stages: list[FrameStage] = [
-            *fusing(loaded, workspace, options.apertures),
-            *plan.frame_stages(drop=False, smoothing=False),
-        ]
+        inputs = StageInputs(recording=recording, options=options, plan=plan, maps=False)
         deblurred = workspace.colmap_images if rectify else workspace.images
         if not rectify:
             remove(workspace.colmap)
             session.runner.forget("images")
-        records = run_frames(session, recording, frames, stages, deblurred)
-        movers = plan.keypoint_stages()
-        rectified = frozenset(name for name in timing.names if any(mover.covers(name) for mover in movers))
+        records = run_frames(session, recording, frames, default_frame_stages(inputs), deblurred)
+        movers = default_keypoint_stages(inputs)
+        rectified = rectifiable(movers, timing.names)
         if rectify:
             run_images(session, records, rectified, movers)
         shown = _shown(records)

@@ -27,7 +27,7 @@ from colmap_inertial.model import read_model, trajectory_from_model
 from colmap_inertial.pipeline.run.progress import Progress
 from colmap_inertial.reconstruction.drivers.sources import ScaleSource, check_output, only_model
 from colmap_inertial.reconstruction.preparation.plan import with_stated_exposures
-from colmap_inertial.reconstruction.preparation.preflight import _followed, compared
+from colmap_inertial.reconstruction.preparation.preflight import compare_pictures, follow_video
 
 T = TypeVar("T")
 
@@ -173,7 +173,10 @@ def _of_capture(capture: Capture, calibration: CalibrationFiles, progress: Progr
     if timing is not None:
         known = timing
         rotation = reading.attempt(
-            lambda: _followed(capture, known, _MANY, _MANY_SPACING_S, progress) or compared(capture, known, progress)
+            lambda: (
+                follow_video(capture, known, _MANY, _MANY_SPACING_S, progress)
+                or compare_pictures(capture, known, progress)
+            )
         )
         in_video = reading.attempt(lambda: _find_in_video(capture, known, progress))
     # the readings stay the sensor's own: that is what the checks are about

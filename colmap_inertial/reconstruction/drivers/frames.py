@@ -7,30 +7,20 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from colmap_inertial.core.options import ApertureOptions, ReconstructOptions
+from colmap_inertial.core.options import ReconstructOptions
 from colmap_inertial.core.types import CameraModel, Frame
 from colmap_inertial.imaging.restoration.shipped import checksum
-from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.frames import frame_source
 from colmap_inertial.model import read_model
 from colmap_inertial.pipeline.run.context import Recording
-from colmap_inertial.pipeline.run.runner import remove
 from colmap_inertial.pipeline.run.session import Session
-from colmap_inertial.pipeline.run.workspace import Workspace
-from colmap_inertial.pipeline.stages.apertures import ApertureStage
 from colmap_inertial.pipeline.stages.frame_folder import FrameRecord, read_frame_records, write_frames
-from colmap_inertial.pipeline.stages.protocols import FrameStage, KeypointStage
+from colmap_inertial.pipeline.stages.imaging_plan import ImagingPlan, read_plan, write_plan
+from colmap_inertial.pipeline.stages.protocols import FrameStage, KeypointStage, refined_stages
 from colmap_inertial.pipeline.stages.rectified import image_movers, write_images
-from colmap_inertial.pipeline.stages.rolling_shutter import RollingShutterStage
 from colmap_inertial.reconstruction.drivers.contact_sheet import CropKeeper
 from colmap_inertial.reconstruction.drivers.result import ModelResult
-from colmap_inertial.reconstruction.preparation.plan import (
-    ImagingPlan,
-    Treatments,
-    plan_imaging,
-    read_plan,
-    write_plan,
-)
+from colmap_inertial.reconstruction.preparation.plan import Treatments, plan_imaging
 
 log = logging.getLogger(__name__)
 
@@ -110,35 +100,20 @@ def run_frames(
     return read_frame_records(workspace.frames)
 
 
-def fusing(capture: Capture, workspace: Workspace, options: ApertureOptions) -> list[ApertureStage]:
-    """The stage that makes frames of a multi-aperture camera's sub-images; none for other cameras."""
-    if capture.apertures is None:
-        return []
-    keep = workspace.apertures if options.depth else None
-    if keep is None:
-        remove(workspace.apertures)
-    return [ApertureStage(pictures=capture.apertures, options=options, keep=keep)]
-
-
-def as_refined(stages: Sequence[KeypointStage], models: Sequence[ModelResult]) -> list[KeypointStage]:
+def stages_of_refined(stages: Sequence[KeypointStage], models: Sequence[ModelResult]) -> list[KeypointStage]:
     """The stages with clocks, readout and camera as the largest model that was refined has them."""
     for model in models:
-        said = next((one for one in model.treatments if one.stage == "refine" and one.action), None)
-        if said is None or model.sparse_metric is None or model.scale.calibration is None:
+        refined = next((one for one in model.treatments if one.action and "readout_s" in one.values), None)
+        if refined is None or model.sparse_metric is None or model.scale.calibration is None:
             continue
-        readout_s = said.values["readout_s"]
+        readout_s = refined.values["readout_s"]
         assert isinstance(readout_s, float)
         cameras = read_model(model.sparse_metric).cameras
         camera = cameras[min(cameras)]
         intrinsics = CameraModel(
             model=camera.model.name, width=camera.width, height=camera.height, params=tuple(camera.params)
         )
-        return [
-            stage.refined(model.scale.calibration, readout_s, intrinsics)
-            if isinstance(stage, RollingShutterStage)
-            else stage
-            for stage in stages
-        ]
+        return refined_stages(stages, model.scale.calibration, readout_s, intrinsics)
     return list(stages)
 
 

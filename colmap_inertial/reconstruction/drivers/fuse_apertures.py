@@ -16,6 +16,7 @@ from colmap_inertial.io.files import StrPath
 from colmap_inertial.io.frames import image_names, picture_folders
 from colmap_inertial.io.images import read_image
 from colmap_inertial.io.names import path_in
+from colmap_inertial.pipeline.run.context import RunContext
 from colmap_inertial.pipeline.run.progress import Progress, silent
 from colmap_inertial.pipeline.run.runner import fingerprint, remove
 from colmap_inertial.pipeline.run.session import open_session
@@ -65,7 +66,7 @@ def fuse_captured(
     canvas = stage.canvas()
     pictures = picture_folders(loaded)
     with open_session(
-        Path(out), loaded.path, options, pictures=pictures, command="fuse-apertures", progress=progress
+        Path(out), loaded.path, options, RunContext(progress=progress), pictures=pictures, command="fuse-apertures"
     ) as session:
         workspace = session.workspace
         root = workspace.root

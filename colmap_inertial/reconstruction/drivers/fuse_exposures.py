@@ -18,15 +18,16 @@ from colmap_inertial.io.imu import read_capture_imu
 from colmap_inertial.io.imu_calibration import CalibrationFiles
 from colmap_inertial.io.names import path_in
 from colmap_inertial.io.records import structured
-from colmap_inertial.pipeline.run.context import Recording, corrected_imu, prior_calibration
+from colmap_inertial.pipeline.run.context import Recording, RunContext, corrected_imu, prior_calibration
 from colmap_inertial.pipeline.run.progress import Progress, silent
 from colmap_inertial.pipeline.run.runner import fingerprint
 from colmap_inertial.pipeline.run.session import open_session
-from colmap_inertial.pipeline.stages.exposures import FusedPair, Fuser, lsd2_fuser
+from colmap_inertial.pipeline.stages.exposures import ExposureStage, FusedPair
 from colmap_inertial.pipeline.stages.frame_folder import read_frame_records, write_frames
+from colmap_inertial.pipeline.stages.fusers import Fuser, lsd2_fuser
+from colmap_inertial.pipeline.stages.imaging_plan import ImagingPlan
 from colmap_inertial.reconstruction.drivers.frames import run_plan
-from colmap_inertial.reconstruction.preparation.pairs import pair_stage
-from colmap_inertial.reconstruction.preparation.plan import ImagingPlan, Treatments, with_stated_exposures
+from colmap_inertial.reconstruction.preparation.plan import Treatments, with_stated_exposures
 
 
 def fuse_exposures_captured(
@@ -87,13 +88,13 @@ def fuse_exposures_captured(
         recording = Recording.of(loaded, imu, timing, prior)
     pictures = picture_folders(loaded)
     with open_session(
-        Path(out), loaded.path, options, pictures=pictures, command="fuse-exposures", progress=progress
+        Path(out), loaded.path, options, RunContext(progress=progress), pictures=pictures, command="fuse-exposures"
     ) as session:
         workspace = session.workspace
         plan = ImagingPlan(deblur_note=note)
         if recording is not None:
             plan = run_plan(session, recording, Treatments(deblur="off", rolling_shutter="off", pairs=True))
-        stage = pair_stage(
+        stage = ExposureStage.of_capture(
             loaded,
             options,
             fuser,

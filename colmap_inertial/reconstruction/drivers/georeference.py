@@ -3,34 +3,24 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
-from colmap_inertial.core.arrays import Array
-from colmap_inertial.core.errors import FormatError, NotObservableError
+from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.options import WorldAxes
 from colmap_inertial.core.quantiles import Z95
-from colmap_inertial.core.types import DOWN_IN_WORLD, CameraTrajectory, FrameTiming, PositionFixes
-from colmap_inertial.inertial.georeference import Georeference, georeference, georeference_of_json
-from colmap_inertial.io.capture import Capture, ImageFolder, Video
-from colmap_inertial.io.files import read_json, write_json
-from colmap_inertial.io.positions import positions_in_pictures, positions_in_video
+from colmap_inertial.core.types import DOWN_IN_WORLD, FrameTiming, PositionFixes
+from colmap_inertial.inertial.georeference import Georeference
+from colmap_inertial.io.files import write_json
 from colmap_inertial.io.records import read_record, write_record
 from colmap_inertial.model import read_model, trajectory_from_model
 from colmap_inertial.pipeline.run.runner import remove
 from colmap_inertial.pipeline.run.session import Session
-from colmap_inertial.pipeline.run.workspace import a_record_of_ours
 from colmap_inertial.reconstruction.drivers.result import ModelResult
+from colmap_inertial.reconstruction.preparation.geolocation import cameras_as_json, on_earth
 
 log = logging.getLogger(__name__)
-
-#: A position between two images that are farther apart than this has no place on the path.
-_FARTHEST_S = 2.0
-#: By images so far apart the pace before the first and after the last one is known: nearer, noise makes much of it.
-_PACE_S = 0.3
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -51,111 +41,6 @@ class _Outcomes:
     """Of all metric models."""
 
     models: tuple[_Outcome, ...]
-
-
-def positions_of(capture: Capture, names: Sequence[str], images: Path | None = None) -> PositionFixes:
-    """The positions that a capture carries.
-
-    Parameters
-    ----------
-    capture
-        Of the recording.
-    names
-        Of the frames.
-    images
-        Where an existing project has its pictures.
-
-    Raises
-    ------
-    FormatError
-        Where it has none, or none on its frames' clock.
-    """
-    frames = capture.frames
-    if isinstance(frames, Video):
-        if frames.frame_times is not None:
-            raise FormatError(
-                frames.frame_times, "puts the frames on another clock than the video's, which its positions are on"
-            )
-        return positions_in_video(frames.file)
-    folder = images if images is not None else frames.folder if isinstance(frames, ImageFolder) else None
-    if folder is None:
-        raise FormatError(capture.path, "has neither a video nor pictures that could hold positions")
-    return positions_in_pictures(folder, names)
-
-
-def located(fixes: PositionFixes, path: CameraTrajectory) -> tuple[PositionFixes, Array, Array]:
-    """The positions that belong to a path, where the camera was at each (N, 3), and when (N,) seconds."""
-    if fixes.names is not None:
-        place = {name: i for i, name in enumerate(path.names)}
-        here = np.array([name in place for name in fixes.names], dtype=bool)
-        fixes = fixes.select(here)
-        at = np.array([place[name] for name in fixes.names or ()], dtype=np.intp)
-        return fixes, path.cam_in_world[at], path.t_s[at]
-    assert fixes.t_ns is not None
-    t_s = (fixes.t_ns - path.epoch_ns) * 1e-9
-    after = np.clip(np.searchsorted(path.t_s, t_s), 1, len(path.t_s) - 1)
-    near = path.t_s[after] - path.t_s[after - 1] <= _FARTHEST_S
-    here = near & (t_s >= path.t_s[0]) & (t_s <= path.t_s[-1])
-    t_s = t_s[here]
-    centres = np.stack([np.interp(t_s, path.t_s, path.cam_in_world[:, k]) for k in range(3)], axis=1)
-    return fixes.select(here), centres, t_s
-
-
-def on_earth(fixes: PositionFixes, path: CameraTrajectory, up_in_world: Array, *, timed: bool = True) -> Georeference:
-    """How a metric path stands on Earth; raises :class:`NotObservableError` where the positions leave it open.
-
-    ``timed``: whether the path's times are true; without, nothing tells where the camera was a moment before.
-    """
-    here, centres, t_s = located(fixes, path)
-    return georeference(here, centres, t_s, up_in_world, path_at=path_at(path) if timed else None)
-
-
-def path_at(path: CameraTrajectory) -> Callable[[Array], Array]:
-    """Where a camera was at any instants (T,), (T, 3): straight on between its images, and before and after them."""
-
-    def at(t_s: Array) -> Array:
-        within = np.clip(t_s, path.t_s[0], path.t_s[-1])
-        centres = np.stack([np.interp(within, path.t_s, path.cam_in_world[:, k]) for k in range(3)], axis=1)
-        for end, inner in ((0, _after(path, 0)), (-1, _after(path, -1))):
-            pace = (path.cam_in_world[inner] - path.cam_in_world[end]) / (path.t_s[inner] - path.t_s[end])
-            beyond_s = np.maximum(t_s - within, 0) if end else np.minimum(t_s - within, 0)
-            centres += beyond_s[:, None] * pace
-        return centres
-
-    return at
-
-
-def _after(path: CameraTrajectory, end: int) -> int:
-    """The image nearest to an end of the path that is so far from it that the two tell the pace there."""
-    far = np.abs(path.t_s - path.t_s[end]) >= min(_PACE_S, path.t_s[-1] - path.t_s[0])
-    return int(np.flatnonzero(far)[0 if end == 0 else -1])
-
-
-def read_georeference(path: Path, index: int) -> Georeference | None:
-    """What a run found for one of its models; ``None`` where it was not asked.
-
-    Raises
-    ------
-    NotObservableError
-        Where it could not say.
-    """
-    if not path.is_file():
-        return None
-    with a_record_of_ours(path):
-        found = next((one for one in read_json(path)["models"] if one["model"] == index), None)
-        if found is None:
-            return None
-        if "error" in found:
-            raise NotObservableError("heading", str(found["error"]))
-        return georeference_of_json(found)
-
-
-def cameras_as_json(found: Georeference, names: Sequence[str], centres: Array) -> list[dict[str, object]]:
-    """Where each image was taken."""
-    return [
-        {"name": name, "latitude_deg": latitude, "longitude_deg": longitude, "height_m": height}
-        for name, (latitude, longitude, height) in zip(names, found.geodetic(centres).tolist(), strict=True)
-    ]
 
 
 def run_georeference(

@@ -31,7 +31,7 @@ from colmap_inertial.pipeline.run.context import Recording
 from colmap_inertial.pipeline.run.runner import fingerprint, remove
 from colmap_inertial.pipeline.run.session import Session
 from colmap_inertial.pipeline.stages.metric import gravity_in_model, metric_trajectory, motion_file, write_trajectory
-from colmap_inertial.pipeline.stages.protocols import JoiningStage, ModelStage
+from colmap_inertial.pipeline.stages.protocols import JoiningStage, ModelStage, joins_models
 from colmap_inertial.reconstruction.drivers.reporting import write_model_record
 from colmap_inertial.reconstruction.drivers.result import Fragment, ModelResult, ScaledModel
 from colmap_inertial.reconstruction.drivers.stale_outputs import remove_stale_dense
@@ -192,7 +192,7 @@ def _through_stages(
         Where no model has two timed images.
     """
     several = len(place_of) > 1
-    at = next((i for i, stage in enumerate(stages) if several and isinstance(stage, JoiningStage)), len(stages))
+    at, joining = next(((i, s) for i, s in enumerate(stages) if several and joins_models(s)), (len(stages), None))
     untimed: list[TimingError] = []
 
     def begun() -> Iterator[_Begun]:
@@ -216,9 +216,7 @@ def _through_stages(
     going: Iterable[_Begun] = begun()
     gaps: tuple[Gap, ...] = ()
     staged: dict[int, Model] = {}
-    if at < len(stages):
-        joining = stages[at]
-        assert isinstance(joining, JoiningStage)
+    if joining is not None:
         going = list(going)
         if numbered:
             staged = {model.colmap_index: model for _, model in going if model is not None}

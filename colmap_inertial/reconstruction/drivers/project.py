@@ -22,7 +22,7 @@ from colmap_inertial.core.types import CameraTrajectory, FrameTiming, ReadoutDir
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.io.capture import Capture, Video, load_capture
 from colmap_inertial.io.exif import stamps_of_exif
-from colmap_inertial.io.files import StrPath, write_json
+from colmap_inertial.io.files import StrPath
 from colmap_inertial.io.frame_times import FrameStamps, stamps_of_pattern
 from colmap_inertial.io.frames import read_frame_times, read_frame_timing
 from colmap_inertial.io.image_metadata import stated_exposures_s
@@ -45,20 +45,22 @@ from colmap_inertial.model import (
 from colmap_inertial.model.copying import list_tree
 from colmap_inertial.model.layout import read_layout
 from colmap_inertial.model.similarities import ModelScale, read_similarity
-from colmap_inertial.pipeline.run.context import Recording, corrected_imu, prior_calibration
+from colmap_inertial.pipeline.run.context import Recording, RunContext, corrected_imu, prior_calibration
 from colmap_inertial.pipeline.run.installed import warn_of_conflicts
 from colmap_inertial.pipeline.run.progress import Progress, silent
 from colmap_inertial.pipeline.run.runner import fingerprint
 from colmap_inertial.pipeline.run.session import Session, open_session
 from colmap_inertial.pipeline.run.workspace import Workspace
+from colmap_inertial.pipeline.stages.defaults import default_model_stages
+from colmap_inertial.pipeline.stages.inputs import StageInputs
 from colmap_inertial.pipeline.stages.protocols import ModelStage, with_defaults
-from colmap_inertial.reconstruction.drivers.capture import default_model_stages
-from colmap_inertial.reconstruction.drivers.georeference import positions_of, run_georeference
+from colmap_inertial.reconstruction.drivers.georeference import run_georeference
 from colmap_inertial.reconstruction.drivers.models import run_dense_models, run_models, run_validation
 from colmap_inertial.reconstruction.drivers.project_output import place_project, require_free_names
 from colmap_inertial.reconstruction.drivers.reporting import report_result, reporting_stops, write_recording
 from colmap_inertial.reconstruction.drivers.result import Fragment, ModelResult, ReconstructResult
-from colmap_inertial.reconstruction.preparation.preflight import checked_imu, preflight, stop_or_doubt
+from colmap_inertial.reconstruction.preparation.geolocation import positions_of
+from colmap_inertial.reconstruction.preparation.preflight import checked_imu, run_preflight
 
 if TYPE_CHECKING:
     import pycolmap
@@ -178,10 +180,8 @@ def _reconstruct(
             out,
             project,
             options,
+            RunContext.of(options, progress=progress),
             pictures=() if images is None else (images,),
-            deterministic=options.deterministic,
-            seed=options.seed,
-            progress=progress,
         ) as session,
         reporting_stops(session.workspace, capture),
     ):
@@ -190,11 +190,11 @@ def _reconstruct(
         fixes = positions_of(capture, _registered(models, read), images) if options.georeference else None
         recording = Recording.of(capture, imu, timing, prior, max_offset_s=options.scale.max_offset_s)
         largest = read(models[max(models, key=lambda n: (num_registered(models[n]), -n))])
-        diagnosis = preflight(recording, raw, progress, model=_trajectory(largest, timing))
-        write_json(workspace.diagnosis, diagnosis.as_json())
-        findings(diagnosis)
-        recording = dataclasses.replace(recording, doubts=stop_or_doubt(diagnosis, force=options.force))
-        stages = with_defaults(model_stages, default_model_stages(recording, _as_mapped(options)))
+        model = _trajectory(largest, timing)
+        doubts = run_preflight(session, recording, raw, findings, force=options.force, model=model)
+        recording = dataclasses.replace(recording, doubts=doubts)
+        inputs = StageInputs(recording=recording, options=_as_mapped(options))
+        stages = with_defaults(model_stages, default_model_stages(inputs))
         results, fragments, gaps = run_models(
             session, recording, stages, found=models, fragments=options.fragments, numbered=True, after=(), read=read
         )

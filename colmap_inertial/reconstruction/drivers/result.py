@@ -23,7 +23,7 @@ from colmap_inertial.io.capture import Capture
 from colmap_inertial.model import similarity_as_json
 from colmap_inertial.pipeline.run.workspace import Workspace
 from colmap_inertial.pipeline.stages.frame_folder import FrameRecord
-from colmap_inertial.reconstruction.preparation.plan import ImagingPlan
+from colmap_inertial.pipeline.stages.imaging_plan import ImagingPlan
 from colmap_inertial.reconstruction.preparation.selection import Selection
 
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
@@ -13,28 +12,24 @@ from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import InertialError, NotObservableError
 from colmap_inertial.core.gyro import on_camera_rate
 from colmap_inertial.core.options import BlurRemover, DeblurMethod, RollingShutterMethod
-from colmap_inertial.core.types import CameraImuCalibration, CameraModel, FrameTiming, ImuRecording
+from colmap_inertial.core.types import CameraModel, FrameTiming
 from colmap_inertial.imaging.gate import (
-    GATE_LIMITS,
     FrameDecision,
     GateOptions,
-    RecordingVerdict,
     decide,
 )
 from colmap_inertial.imaging.parallax import Parallax
 from colmap_inertial.imaging.psf import predicted_blur_px
 from colmap_inertial.io.capture import Capture
-from colmap_inertial.io.files import read_json, write_json
 from colmap_inertial.io.frames import frame_source
 from colmap_inertial.io.image_metadata import stated_exposures_s
 from colmap_inertial.io.names import path_in
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.pipeline.run.context import Recording, RunContext
 from colmap_inertial.pipeline.run.progress import Progress
-from colmap_inertial.pipeline.run.workspace import a_record_of_ours
-from colmap_inertial.pipeline.stages.deblur import SMOOTHING, DeblurStage
+from colmap_inertial.pipeline.stages.deblur import DeblurStage
 from colmap_inertial.pipeline.stages.gyro_view import GyroView
-from colmap_inertial.pipeline.stages.rolling_shutter import RollingShutterStage
+from colmap_inertial.pipeline.stages.imaging_plan import ImagingPlan
 from colmap_inertial.reconstruction.preparation.calibrate import (
     estimate_preliminary_calibration,
     guessed_camera,
@@ -51,13 +46,6 @@ if TYPE_CHECKING:
 
 #: Blur below this cannot be told from the texture: where no frame has more, nothing is deblurred.
 _TELLING_PX = 4.0
-#: Standard deviations by which a frame must bear it out by itself, where others do not. With 4, the filter made some
-#: worse; the network, which sees whether the filter's result can be true, is worth using unless a frame speaks against.
-_CLEAR_SUPPORT: dict[BlurRemover, float] = {
-    "wiener": GATE_LIMITS.clear_support,
-    "path": GATE_LIMITS.clear_support,
-    "deepgyro": 0.0,
-}
 #: What the note says of methods other than the default.
 _SAID_OF = {"deepgyro": "; the network DeepGyro undoes it", "path": "; the half-quadratic filter undoes it"}
 #: How often small models are made, at most, for more of the blurred frames.
@@ -67,117 +55,6 @@ _SURVEYS = 4
 _SURE_SIGMAS, _LONGEST_READOUT_S = 4.0, 0.04
 #: Frames by which the gyroscope is judged.
 _JUDGED_FRAMES = 14
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class ImagingPlan:
-    """What is to be done to frames and keypoints, and why.
-
-    Where frames must bear out the gyroscope by themselves, they must do so clearly for the filter; for the network it
-    is enough that they do not speak against it.
-
-    Attributes
-    ----------
-    view
-        Gyroscope, camera and times; ``None`` where nothing is to be done.
-    deblur
-        Decisions and verdict for :class:`DeblurStage`; ``None`` where no frame is to be deblurred.
-    method
-        How blur is undone.
-    parallaxes
-        By frame name, where the camera's translation is known to blur.
-    rectify
-        Whether the rolling shutter is undone.
-    deblur_note, rolling_shutter_note
-        What is done, or why not, in words.
-    """
-
-    view: GyroView | None = None
-    deblur: tuple[tuple[FrameDecision, ...], RecordingVerdict] | None = None
-    method: BlurRemover = "wiener"
-    parallaxes: Mapping[str, Parallax] = field(default_factory=dict)
-    rectify: bool = False
-    deblur_note: str = ""
-    rolling_shutter_note: str = ""
-
-    def frame_stages(self, *, drop: bool = True, smoothing: bool = True) -> list[DeblurStage]:
-        """The default frame stages; they need not drop what is too blurred, nor have COLMAP see it smoothed."""
-        if self.view is None or self.deblur is None:
-            return []
-        decisions, verdict = self.deblur
-        gate = GateOptions() if verdict.trusted else GateOptions(min_support=_CLEAR_SUPPORT[self.method])
-        stage = DeblurStage(
-            view=self.view,
-            decisions=decisions,
-            verdict=verdict,
-            parallaxes=self.parallaxes,
-            gate=gate,
-            drop=drop,
-            method=self.method,
-            smoothing=SMOOTHING if smoothing else 0.0,
-        )
-        return [stage]
-
-    def keypoint_stages(self) -> list[RollingShutterStage]:
-        """The default keypoint stages."""
-        return [RollingShutterStage(view=self.view)] if self.view is not None and self.rectify else []
-
-    def as_json(self) -> dict[str, object]:
-        """In JSON types, without the recording."""
-        view = self.view
-        return {
-            "deblur": self.deblur_note,
-            "deblur_method": None if self.deblur is None else self.method,
-            "rolling_shutter": self.rolling_shutter_note,
-            "rectify": self.rectify,
-            "calibration": None
-            if view is None
-            else {
-                **asdict(view.calibration),
-                "source": view.source,
-                "notes": list(view.notes),
-            },
-            "camera": None if view is None else asdict(view.camera),
-            "verdict": None if self.deblur is None else asdict(self.deblur[1]),
-            "decisions": None if self.deblur is None else [asdict(decision) for decision in self.deblur[0]],
-            "parallaxes": {name: parallax.as_json() for name, parallax in self.parallaxes.items()},
-        }
-
-
-def write_plan(path: Path, plan: ImagingPlan) -> None:
-    """Write a plan for :func:`read_plan`."""
-    write_json(path, plan.as_json(), indent=None)
-
-
-def read_plan(path: Path, imu: ImuRecording, timing: FrameTiming) -> ImagingPlan:
-    """The plan that :func:`write_plan` wrote for the same recording."""
-    values: dict[str, Any] = read_json(path)
-    with a_record_of_ours(path):
-        view = None
-        if values["calibration"] is not None:
-            found = dict(values["calibration"])
-            camera = values["camera"]
-            view = GyroView(
-                imu=imu,
-                timing=timing,
-                source=found.pop("source"),
-                notes=tuple(found.pop("notes")),
-                calibration=CameraImuCalibration(**found),
-                camera=CameraModel(**{**camera, "params": tuple(camera["params"])}),
-            )
-        deblur = None
-        if values["decisions"] is not None:
-            decisions = tuple(FrameDecision(**decision) for decision in values["decisions"])
-            deblur = decisions, RecordingVerdict(**values["verdict"])
-        return ImagingPlan(
-            view=view,
-            deblur=deblur,
-            method=values["deblur_method"] or "wiener",
-            parallaxes={name: Parallax.from_json(parallax) for name, parallax in values["parallaxes"].items()},
-            rectify=values["rectify"],
-            deblur_note=values["deblur"],
-            rolling_shutter_note=values["rolling_shutter"],
-        )
 
 
 def with_stated_exposures(capture: Capture, timing: FrameTiming) -> FrameTiming:
@@ -273,8 +150,8 @@ def plan_imaging(recording: Recording, context: RunContext, asked: Treatments) -
     def models(names: Sequence[str], plan: ImagingPlan | None) -> tuple[pycolmap.Reconstruction, ...]:
         if plan is None and found.models:
             return found.models
-        stages = [] if plan is None else plan.frame_stages(drop=False)
-        return survey(capture, found.view, names, stages, context)
+        stage = None if plan is None else DeblurStage.of_plan(plan, drop=False)
+        return survey(capture, found.view, names, [] if stage is None else [stage], context)
 
     def sliding(parts: Sequence[Sequence[str]]) -> list[bool]:
         camera = found.view.camera
@@ -417,7 +294,7 @@ def _deblurring(
         registered = {name for part in found.values() for name in part.registered}
         known = {i: names & set(parts[i]) - registered for i, names in by_part(_to_deblur(decisions)).items()}
         lost = {i: names for i, names in known.items() if names}
-        if not parallaxes or not lost or not treated.frame_stages():
+        if not parallaxes or not lost or treated.deblur is None:
             break
     assert treated is not None
     return treated

@@ -1,9 +1,9 @@
-"""What ``diagnose`` looks at, read from captures, sources of ``scale`` and IMU files; and the stop before mapping."""
+"""The checks before a reconstruction: what they look at, and the stop where the recording cannot give metres."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Literal
 
 import numpy as np
@@ -13,6 +13,7 @@ from colmap_inertial.core.errors import FormatError, NotObservableError
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import CameraTrajectory, Frame, FrameTiming
 from colmap_inertial.io.capture import Capture
+from colmap_inertial.io.files import write_json
 from colmap_inertial.io.imu import RawImu
 from colmap_inertial.io.pose_convention import COLMAP
 from colmap_inertial.model import colmap_camera
@@ -20,6 +21,7 @@ from colmap_inertial.motion.flow import VisualRotation
 from colmap_inertial.motion.two_view_rotation import measure_two_view_rotations
 from colmap_inertial.pipeline.run.context import Recording
 from colmap_inertial.pipeline.run.progress import Progress
+from colmap_inertial.pipeline.run.session import Session
 from colmap_inertial.reconstruction.preparation.calibrate import (
     followed,
     guessed_camera,
@@ -36,21 +38,6 @@ _VIDEO_STEP_S = 0.13
 _FEW, _FEW_SPACING_S = 90, 0.09
 #: Pictures further apart that are compared two by two.
 _COMPARED = 60
-
-#: What makes a reconstruction in metres meaningless.
-STOPPING = frozenset(
-    {
-        "stabilised",
-        "gravity-removed",
-        "pose-convention",
-        "imu-does-not-fit",
-        "gyro-mirrored",
-        "gyro-in-deg",
-        "gyro-not-in-deg",
-        "frame-rate",
-        "clock-offset",
-    }
-)
 
 
 def checked_imu(raw: RawImu, *, force: bool) -> RawImu:
@@ -89,7 +76,7 @@ def preflight(
     capture, timing = recording.capture, recording.timing
     rotation = None
     if model is None and (capture.frame_log is None or not capture.frame_log.stabilised):
-        rotation = _followed(capture, timing, _FEW, _FEW_SPACING_S, progress)
+        rotation = follow_video(capture, timing, _FEW, _FEW_SPACING_S, progress)
     return diagnose(
         Recorded(
             imu=raw.imu,
@@ -108,6 +95,28 @@ def preflight(
     )
 
 
+def run_preflight(
+    session: Session,
+    recording: Recording,
+    raw: RawImu,
+    findings: Callable[[Diagnosis], None],
+    *,
+    force: bool,
+    model: CameraTrajectory | Literal["untimed"] | None = None,
+) -> tuple[str, ...]:
+    """The checks, written down and told to ``findings``; the doubts of a run that is forced to go on.
+
+    Raises
+    ------
+    NotObservableError
+        As :func:`stop_or_doubt`.
+    """
+    diagnosis = preflight(recording, raw, session.progress, model=model)
+    write_json(session.workspace.diagnosis, diagnosis.as_json())
+    findings(diagnosis)
+    return stop_or_doubt(diagnosis, force=force)
+
+
 def stop_or_doubt(diagnosis: Diagnosis, *, force: bool) -> tuple[str, ...]:
     """Stop where the recording cannot give metres; when forced to go on, the reasons not to trust them.
 
@@ -118,7 +127,7 @@ def stop_or_doubt(diagnosis: Diagnosis, *, force: bool) -> tuple[str, ...]:
     """
     for finding in diagnosis.findings:
         log.info("%s: %s: %s", finding.severity, finding.code, finding.evidence)
-    stopping = [finding for finding in diagnosis.findings if finding.code in STOPPING and finding.severity == "error"]
+    stopping = diagnosis.stopping
     if stopping and not force:
         first = stopping[0]
         raise NotObservableError("scale", f"{first.evidence}; {first.advice} (--force goes on)")
@@ -127,17 +136,20 @@ def stop_or_doubt(diagnosis: Diagnosis, *, force: bool) -> tuple[str, ...]:
     return tuple(f"{finding.evidence}; forced to go on" for finding in stopping)
 
 
-def _followed(
+def follow_video(
     capture: Capture, timing: FrameTiming, most: int, spacing_s: float, progress: Progress
 ) -> VisualRotation | None:
-    """The rotation between frames from the beginning of a video; ``None`` for pictures further apart."""
+    """The rotation between frames from the beginning of a video; ``None`` for pictures further apart.
+
+    Of ``most`` frames, at least ``spacing_s`` apart.
+    """
     if len(timing.t_s) < 2 or float(np.median(np.diff(timing.t_s))) > _VIDEO_STEP_S:
         return None
     indices = near_the_beginning(timing, spacing_s, most)
     return followed(capture, timing, guessed_camera(capture, timing), indices, progress)
 
 
-def compared(capture: Capture, timing: FrameTiming, progress: Progress) -> VisualRotation | None:
+def compare_pictures(capture: Capture, timing: FrameTiming, progress: Progress) -> VisualRotation | None:
     """The rotation between pictures that are too far apart in time to be followed; ``None`` for fewer than five."""
     if len(timing.t_s) < 5:
         return None

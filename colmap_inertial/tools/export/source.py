@@ -23,7 +23,7 @@ from colmap_inertial.io.records import read_record
 from colmap_inertial.model import read_model
 from colmap_inertial.pipeline.run.workspace import Workspace, a_record_of_ours, places_of
 from colmap_inertial.pipeline.stages.metric import motion_file
-from colmap_inertial.reconstruction.drivers.georeference import on_earth, positions_of, read_georeference
+from colmap_inertial.reconstruction.preparation.geolocation import on_earth, positions_of, read_georeference
 from colmap_inertial.tools.view.sources import ViewSource, find_source
 
 if TYPE_CHECKING:
