@@ -1265,7 +1265,7 @@ MUTANTS = (
     ),
     Mutant(
         "reconstruction/drivers/capture.py",
-        "session, recording, of_models, rectified=bool(keypoints.rectified())",
+        "session, recording, of_models, rectified=bool(rectified)",
         "session, recording, of_models, rectified=False",
         "models of rectified keypoints are not known to be",
         ("pipeline_imaging::test_the_metric_model_lacks_the_camera_s_translation_within_the_readout_too",),

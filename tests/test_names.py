@@ -20,7 +20,7 @@ from colmap_inertial.io.exif import stamps_of_exif
 from colmap_inertial.io.names import check_names, path_in
 from colmap_inertial.model import read_model
 from colmap_inertial.pipeline.run.progress import silent
-from colmap_inertial.pipeline.stages.frame_folder import write_frames
+from colmap_inertial.pipeline.stages.frame_folder import FramePaths, write_frames
 from colmap_inertial.pipeline.stages.rectified import write_images
 from colmap_inertial.reconstruction.preparation.calibrate import some_frames
 from colmap_inertial.tools.batch import read_manifest
@@ -127,9 +127,7 @@ def test_writers_stay_in_their_folder(tmp_path, name):
 
     frames = iter([Frame(name=name, image=np.zeros((4, 4), np.uint8), t_s=0.0)])
     with pytest.raises(FormatError, match="names the file"):
-        write_frames(
-            frames, [name], [linked], source_folder=None, images=target, records=tmp_path / "r", progress=silent
-        )
+        write_frames(frames, [name], [linked], FramePaths(source=None, images=target, records=tmp_path / "r"), silent)
     (source / "out").symlink_to(tmp_path / "outside")
     with pytest.raises(FormatError, match="names the file"):
         write_images([], [name], (), source, tmp_path / "rectified", silent)

@@ -29,7 +29,7 @@ from colmap_inertial.pipeline.run.progress import silent
 from colmap_inertial.pipeline.run.runner import StepRunner, canonical
 from colmap_inertial.pipeline.run.session import Session
 from colmap_inertial.pipeline.run.workspace import Workspace
-from colmap_inertial.pipeline.stages.frame_folder import read_frame_records, write_frames
+from colmap_inertial.pipeline.stages.frame_folder import FramePaths, read_frame_records, write_frames
 from colmap_inertial.pipeline.stages.metric import MetricStage
 from colmap_inertial.reconstruction.drivers.models import run_models
 from colmap_inertial.reconstruction.drivers.reporting import report_result
@@ -184,10 +184,8 @@ def test_frames_that_no_stage_changed_are_copied_byte_for_byte(tmp_path):
         frames,
         timing.names,
         [invert_the_third_and_drop_the_fourth],
-        source_folder=tmp_path / "in",
-        images=tmp_path / "out",
-        records=tmp_path / "frames.json",
-        progress=silent,
+        FramePaths(source=tmp_path / "in", images=tmp_path / "out", records=tmp_path / "frames.json"),
+        silent,
     )
     records = read_frame_records(tmp_path / "frames.json")
     assert [r.action for r in records] == ["passed", "passed", "changed", "dropped", "changed", "passed"]
@@ -204,8 +202,8 @@ def test_frames_that_no_stage_changed_are_copied_byte_for_byte(tmp_path):
 def test_stages_cannot_rename_or_repeat_frames(tmp_path):
     def run(stage, count):
         timing, frames = frames_of(tmp_path / f"in{count}", count)
-        kwargs = dict(source_folder=None, images=tmp_path / f"out{count}", records=tmp_path / "r", progress=silent)
-        write_frames(frames, timing.names, [stage], **kwargs)
+        paths = FramePaths(source=None, images=tmp_path / f"out{count}", records=tmp_path / "r")
+        write_frames(frames, timing.names, [stage], paths, silent)
 
     with pytest.raises(ValueError, match=r"'x\.jpg', which is no frame"):
         run(lambda stream: (dataclasses.replace(f, name="x.jpg") for f in stream), 4)

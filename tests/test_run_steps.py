@@ -37,7 +37,7 @@ from colmap_inertial.pipeline.run.session import Session, open_session
 from colmap_inertial.pipeline.run.workspace import Workspace
 from colmap_inertial.pipeline.stages.defaults import default_keypoint_stages
 from colmap_inertial.pipeline.stages.exposures import ExposureStage
-from colmap_inertial.pipeline.stages.frame_folder import FrameRecord, write_frames
+from colmap_inertial.pipeline.stages.frame_folder import FramePaths, FrameRecord, write_frames
 from colmap_inertial.pipeline.stages.fusers import Fuser
 from colmap_inertial.pipeline.stages.gyro_view import GyroView
 from colmap_inertial.pipeline.stages.inputs import StageInputs
@@ -269,8 +269,8 @@ def test_dropped_frames_are_not_written_and_say_why(tmp_path):
             said = tuple(Treatment(stage=stage, reason=f"{stage} said so") for stage in ("first", "last"))
             yield replace(frame, dropped=frame.name == "1.jpg", treatments=said)
 
-    paths = {"source_folder": tmp_path / "in", "images": tmp_path / "out", "records": tmp_path / "frames.json"}
-    write_frames(frames, timing.names, [drop_the_second], **paths, progress=silent)
+    paths = FramePaths(source=tmp_path / "in", images=tmp_path / "out", records=tmp_path / "frames.json")
+    write_frames(frames, timing.names, [drop_the_second], paths, silent)
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [n for n in timing.names if n != "1.jpg"]
     records = framing.read_frame_records(tmp_path / "frames.json")
     assert [record.name for record in records if not record.used] == ["1.jpg"]
@@ -288,8 +288,8 @@ def test_colmap_sees_a_frame_smoothed_and_everybody_else_as_it_is(tmp_path):
 
     seen, kept = tmp_path / "seen", tmp_path / "kept"
     records = tmp_path / "frames.json"
-    paths = {"source_folder": tmp_path / "in", "images": seen, "records": records, "unsmoothed": kept}
-    write_frames(frames, timing.names, [restored], **paths, progress=silent)
+    paths = FramePaths(source=tmp_path / "in", images=seen, records=records, unsmoothed=kept)
+    write_frames(frames, timing.names, [restored], paths, silent)
     assert sorted(path.name for path in kept.iterdir()) == ["1.jpg", "2.jpg"]
     assert [record.action for record in framing.read_frame_records(records)].count("changed") == 2
     write_images(
@@ -610,7 +610,7 @@ class Shown:
 
 @pytest.mark.parametrize(("clear", "trusted"), [(20, True), (10, None), (1, None)])
 def test_a_gyroscope_is_trusted_for_all_frames_where_nearly_all_bear_it_out(clear, trusted):
-    verdict = imaging.RecordingVerdict(trusted=True, support=9.0, extent_factor=1.0, frames=20, reason="")
+    verdict = RecordingVerdict(trusted=True, support=9.0, extent_factor=1.0, frames=20, reason="")
     clearly, hardly = Looked(Shown(20.0), 0.8, 20.0), Looked(Shown(-1.0), 0.2, 20.0)
     assert by_frame(verdict, [clearly] * clear + [hardly] * (20 - clear)).trusted is trusted
     # a faint dip is none of a wrong gyroscope where detail lacks along the blur, and no other direction has a dip
@@ -626,7 +626,7 @@ def test_a_gyroscope_is_trusted_for_all_frames_where_nearly_all_bear_it_out(clea
 
 
 def test_a_gyroscope_that_few_dips_show_is_borne_out_by_what_stands_below_the_sky():
-    refused = imaging.RecordingVerdict(trusted=False, support=1.0, extent_factor=1.0, frames=10, reason="")
+    refused = RecordingVerdict(trusted=False, support=1.0, extent_factor=1.0, frames=10, reason="")
     rng = np.random.default_rng(0)
 
     def looked(share, mirrored, standing=40.0, count=10):

@@ -33,6 +33,20 @@ ExportProgram = Literal[
 ExportImages = Literal["rectified", "original"]
 
 
+def _check(
+    name: str, value: float | None, low: float | None = None, high: float | None = None, *, hint: str = ""
+) -> None:
+    """Raise ``ValueError`` where a number is not within limits, or not positive where none are given."""
+    if value is None:
+        return
+    if low is None and not value > 0:
+        raise ValueError(f"{name} must be positive, not {value:g}")
+    if low is not None and high is None and not value >= low:
+        raise ValueError(f"{name} must be at least {low}, not {value:g}")
+    if low is not None and high is not None and not low <= value <= high:
+        raise ValueError(f"{name} must be from {low} to {high}{hint}, not {value:g}")
+
+
 @dataclass(frozen=True, kw_only=True)
 class ReadLimits:
     """How large a file may be that is read: above any camera's and recorder's, below what takes all memory."""
@@ -46,8 +60,7 @@ class ReadLimits:
 
     def __post_init__(self) -> None:
         for f in fields(self):
-            if not getattr(self, f.name) > 0:
-                raise ValueError(f"limits.{f.name} must be positive, not {getattr(self, f.name):g}")
+            _check(f"limits.{f.name}", getattr(self, f.name))
         if self.megapixels > 1073:
             raise ValueError(f"limits.megapixels: OpenCV decodes no more than 1073, not {self.megapixels:g}")
 
@@ -76,14 +89,10 @@ class MappingOptions:
     """Let bundle adjustment change the camera. Not given: only where the capture declares none."""
 
     def __post_init__(self) -> None:
-        if self.overlap < 1:
-            raise ValueError(f"mapping.overlap must be at least 1, not {self.overlap}")
-        if self.max_image_size is not None and self.max_image_size < 64:
-            raise ValueError(f"mapping.max_image_size must be at least 64, not {self.max_image_size}")
-        if self.max_num_features < 50:
-            raise ValueError(f"mapping.max_num_features must be at least 50, not {self.max_num_features}")
-        if not -1 <= self.first_octave <= 2:
-            raise ValueError(f"mapping.first_octave must be from -1 to 2, not {self.first_octave}")
+        _check("mapping.overlap", self.overlap, 1)
+        _check("mapping.max_image_size", self.max_image_size, 64)
+        _check("mapping.max_num_features", self.max_num_features, 50)
+        _check("mapping.first_octave", self.first_octave, -1, 2)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,18 +107,13 @@ class GravityOptions:
     """Height of the place above the sea, with --latitude-deg; 1000 m are 0.03 %."""
 
     def __post_init__(self) -> None:
-        if self.gravity_m_s2 is not None and not 9.7 <= self.gravity_m_s2 <= 9.9:
-            raise ValueError(
-                f"gravity_m_s2 must be from 9.7 to 9.9 (it is 9.76 to 9.84 on Earth), not {self.gravity_m_s2:g}"
-            )
+        _check("gravity_m_s2", self.gravity_m_s2, 9.7, 9.9, hint=" (it is 9.76 to 9.84 on Earth)")
         if self.gravity_m_s2 is not None and self.latitude_deg is not None:
             raise ValueError("--gravity-m-s2 and --latitude-deg both set the strength of gravity; give one of them")
-        if self.latitude_deg is not None and not -90 <= self.latitude_deg <= 90:
-            raise ValueError(f"latitude_deg must be from -90 to 90, not {self.latitude_deg:g}")
+        _check("latitude_deg", self.latitude_deg, -90, 90)
         if self.height_m is not None and self.latitude_deg is None:
             raise ValueError("--height-m goes with --latitude-deg")
-        if self.height_m is not None and not -1000 <= self.height_m <= 10000:
-            raise ValueError(f"height_m must be from -1000 to 10000, not {self.height_m:g}")
+        _check("height_m", self.height_m, -1000, 10000)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,8 +129,7 @@ class ScaleOptions(GravityOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.max_offset_s is not None and not self.max_offset_s > 0:
-            raise ValueError(f"max_offset_s must be positive, not {self.max_offset_s:g}")
+        _check("max_offset_s", self.max_offset_s)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,8 +143,7 @@ class JoinOptions:
 
     def __post_init__(self) -> None:
         for f in fields(self):
-            if not getattr(self, f.name) > 0:
-                raise ValueError(f"join_options.{f.name} must be positive, not {getattr(self, f.name):g}")
+            _check(f"join_options.{f.name}", getattr(self, f.name))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,12 +163,9 @@ class ValidateOptions:
     """Seed of the search for views that agree."""
 
     def __post_init__(self) -> None:
-        if not self.tolerance_pct > 0:
-            raise ValueError("tolerance_pct must be positive")
-        if self.max_views < 2:
-            raise ValueError("max_views must be at least 2")
-        if not self.max_residual_px > 0:
-            raise ValueError("max_residual_px must be positive")
+        _check("tolerance_pct", self.tolerance_pct)
+        _check("max_views", self.max_views, 2)
+        _check("max_residual_px", self.max_residual_px)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,8 +180,7 @@ class DenseOptions:
     five times as fast, open where little was seen."""
 
     def __post_init__(self) -> None:
-        if self.max_image_size is not None and self.max_image_size < 64:
-            raise ValueError(f"dense_options.max_image_size must be at least 64, not {self.max_image_size}")
+        _check("dense_options.max_image_size", self.max_image_size, 64)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -284,10 +282,8 @@ class ApertureOptions:
     def __post_init__(self) -> None:
         if self.disparity_px is not None and not self.disparity_px[0] < self.disparity_px[1]:
             raise ValueError(f"disparity_px: must be a lower and a higher limit, not {self.disparity_px}")
-        if not 0.1 <= self.step_px <= 2:
-            raise ValueError(f"step_px must be from 0.1 to 2, not {self.step_px:g}")
-        if self.threads is not None and self.threads < 1:
-            raise ValueError(f"threads must be at least 1, not {self.threads}")
+        _check("step_px", self.step_px, 0.1, 2)
+        _check("threads", self.threads, 1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -354,8 +350,7 @@ class ReconstructOptions:
     """How large a file may be that is read."""
 
     def __post_init__(self) -> None:
-        if not 0 <= self.seed < 2**31:
-            raise ValueError(f"seed must be from 0 to 2147483647, not {self.seed}")
+        _check("seed", self.seed, 0, 2**31 - 1)
         given: Any = self.calibration
         if given is None or isinstance(given, str | Path):  # one file may be given by itself
             object.__setattr__(self, "calibration", () if given is None else (Path(given),))
@@ -414,12 +409,10 @@ class BatchOptions:
     """How often a capture is started in all, where its process or its worker is killed."""
 
     def __post_init__(self) -> None:
-        if self.workers is not None and self.workers < 1:
-            raise ValueError(f"workers must be at least 1, not {self.workers}")
+        _check("workers", self.workers, 1)
         if self.workers is not None and self.scheduler is not None:
             raise ValueError("--workers are those of this machine; with --scheduler, the cluster has its own")
-        if not 1 <= self.attempts <= 100:
-            raise ValueError(f"attempts must be from 1 to 100, not {self.attempts}")
+        _check("attempts", self.attempts, 1, 100)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -434,7 +427,5 @@ class FuseAperturesOptions:
     """Width of the lens that refocused pictures show, in distances between the reference and its partner."""
 
     def __post_init__(self) -> None:
-        if self.refocus is not None and not self.refocus > 0:
-            raise ValueError(f"refocus must be a depth above 0, not {self.refocus:g}")
-        if not self.lens_width > 0:
-            raise ValueError(f"lens_width must be positive, not {self.lens_width:g}")
+        _check("refocus", self.refocus)
+        _check("lens_width", self.lens_width)

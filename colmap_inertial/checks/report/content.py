@@ -24,7 +24,8 @@ from colmap_inertial.io.files import read_json, read_text
 
 VERSION = 1
 #: What the pipeline keeps for the report alone, in an output folder.
-DATA_FOLDER, CROPS_FOLDER = "report_data", "crops"
+DATA_FOLDER = "report_data"
+CROPS_FOLDER = "crops"
 #: Of a model in ``result.json``, what the page shows otherwise or not.
 _NOT_SHOWN = ("drift", "validation", "cov", "dense")
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Protocol, TypeVar, runtime_checkable
+
+Item = TypeVar("Item")
 
 
 class Progress(Protocol):
@@ -26,3 +28,11 @@ class HearsSteps(Protocol):
 
 def silent(stage: str, done: int, total: int, /) -> None:
     """A progress receiver that shows nothing."""
+
+
+def counted(items: Iterable[Item], total: int, stage: str, progress: Progress) -> Iterator[Item]:
+    """The items; ``progress`` hears of each before it goes on, and of the end."""
+    for done, item in enumerate(items):
+        progress(stage, done, total)
+        yield item
+    progress(stage, total, total)

@@ -23,151 +23,84 @@ _LAYOUT = 2
 _TRAJECTORY = re.compile(r"trajectory(_\d+)?(\.tum|_cov(\.partial)?\.npz|_motion\.json)")
 
 
+class _Inside:
+    """A path in the output folder."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __get__(self, workspace: Workspace, owner: type[Workspace]) -> Path:
+        return workspace.root / self._name
+
+
 @dataclass(frozen=True)
 class Workspace:
     """Every path of an output folder, derived from its root."""
 
     root: Path
 
-    @property
-    def images(self) -> Path:
-        """The images that agree with the metric models, and whatever else is made from them."""
-        return self.root / "images"
-
-    @property
-    def sparse(self) -> Path:
-        """The models in metres; none where no scale is accepted."""
-        return self.root / "sparse"
-
-    @property
-    def dense(self) -> Path:
-        """Dense reconstructions of the metric models."""
-        return self.root / "dense"
-
-    @property
-    def earlier(self) -> Path:
-        """Dense reconstructions with depth maps whose model is no longer there."""
-        return self.root / "earlier"
-
-    @property
-    def colmap(self) -> Path:
-        """COLMAP's own project: what it saw and made, untouched, in its arbitrary units."""
-        return self.root / "colmap"
-
-    @property
-    def colmap_images(self) -> Path:
-        """The frames that COLMAP sees."""
-        return self.colmap / "images"
-
-    @property
-    def colmap_database(self) -> Path:
-        """COLMAP's database."""
-        return self.colmap / "database.db"
-
-    @property
-    def colmap_features(self) -> Path:
-        """The database before matching; removed at the end of a run."""
-        return self.colmap / "features.db"
-
-    @property
-    def colmap_sparse(self) -> Path:
-        """COLMAP's models."""
-        return self.colmap / "sparse"
-
-    @property
-    def selection(self) -> Path:
-        """Which frames of a video are used, and why."""
-        return self.root / "selection.json"
-
-    @property
-    def imaging(self) -> Path:
-        """Calibration from before the reconstruction, and what it means for each frame."""
-        return self.root / "imaging.json"
-
-    @property
-    def frames(self) -> Path:
-        """Names, times and treatment of the frames."""
-        return self.root / "frames.json"
-
-    @property
-    def keypoints(self) -> Path:
-        """What the keypoint stages did."""
-        return self.root / "keypoints.json"
-
-    @property
-    def matches(self) -> Path:
-        """Which pairs of images were matched, and why not the rest."""
-        return self.stamps / "matches_made.json"
-
-    @property
-    def mapped(self) -> Path:
-        """How models were made."""
-        return self.stamps / "models_made.json"
-
-    @property
-    def validation(self) -> Path:
-        """Pictures of the target in the frames."""
-        return self.root / "validation"
-
-    @property
-    def georeference(self) -> Path:
-        """Where on Earth the metric models and their images stand."""
-        return self.root / "georeference.json"
-
-    @property
-    def diagnosis(self) -> Path:
-        """What was found wrong with the recording before the reconstruction."""
-        return self.root / "diagnosis.json"
-
-    @property
-    def apertures(self) -> Path:
-        """Disparities and depths of a multi-aperture camera's frames, where they were asked for."""
-        return self.root / "apertures"
-
-    @property
-    def report(self) -> Path:
-        """For reading: everything in one page."""
-        return self.root / "report.html"
-
-    @property
-    def report_data(self) -> Path:
-        """What the report shows beside the results; with it, the report can be made again."""
-        return self.root / DATA_FOLDER
-
-    @property
-    def crops(self) -> Path:
-        """Parts of some frames before and after the frame stages."""
-        return self.report_data / CROPS_FOLDER
-
-    @property
-    def result(self) -> Path:
-        """Written last: its presence means that the run is finished."""
-        return self.root / "result.json"
-
-    @property
-    def config(self) -> Path:
-        """The resolved configuration, in the form that ``--config`` reads."""
-        return self.root / "config.toml"
-
-    @property
-    def log(self) -> Path:
-        """The run's log."""
-        return self.root / "log.txt"
-
-    @property
-    def stamps(self) -> Path:
-        """One JSON for each finished step."""
-        return self.root / ".stages"
-
-    @property
-    def stage_names(self) -> Path:
-        """Which stages it is made with, where a batch named them."""
-        return self.stamps / "stage_names.toml"
-
-    @property
-    def lock(self) -> Path:
-        """Held by the run that is at work in the folder."""
-        return self.stamps / "lock"
+    images = _Inside("images")
+    """The images that agree with the metric models, and whatever else is made from them."""
+    sparse = _Inside("sparse")
+    """The models in metres; none where no scale is accepted."""
+    dense = _Inside("dense")
+    """Dense reconstructions of the metric models."""
+    earlier = _Inside("earlier")
+    """Dense reconstructions with depth maps whose model is no longer there."""
+    colmap = _Inside("colmap")
+    """COLMAP's own project: what it saw and made, untouched, in its arbitrary units."""
+    colmap_images = _Inside("colmap/images")
+    """The frames that COLMAP sees."""
+    colmap_database = _Inside("colmap/database.db")
+    """COLMAP's database."""
+    colmap_features = _Inside("colmap/features.db")
+    """The database before matching; removed at the end of a run."""
+    colmap_sparse = _Inside("colmap/sparse")
+    """COLMAP's models."""
+    selection = _Inside("selection.json")
+    """Which frames of a video are used, and why."""
+    imaging = _Inside("imaging.json")
+    """Calibration from before the reconstruction, and what it means for each frame."""
+    frames = _Inside("frames.json")
+    """Names, times and treatment of the frames."""
+    keypoints = _Inside("keypoints.json")
+    """What the keypoint stages did."""
+    matches = _Inside(".stages/matches_made.json")
+    """Which pairs of images were matched, and why not the rest."""
+    mapped = _Inside(".stages/models_made.json")
+    """How models were made."""
+    validation = _Inside("validation")
+    """Pictures of the target in the frames."""
+    georeference = _Inside("georeference.json")
+    """Where on Earth the metric models and their images stand."""
+    diagnosis = _Inside("diagnosis.json")
+    """What was found wrong with the recording before the reconstruction."""
+    apertures = _Inside("apertures")
+    """Disparities and depths of a multi-aperture camera's frames, where they were asked for."""
+    report = _Inside("report.html")
+    """For reading: everything in one page."""
+    report_data = _Inside(DATA_FOLDER)
+    """What the report shows beside the results; with it, the report can be made again."""
+    crops = _Inside(f"{DATA_FOLDER}/{CROPS_FOLDER}")
+    """Parts of some frames before and after the frame stages."""
+    result = _Inside("result.json")
+    """Written last: its presence means that the run is finished."""
+    config = _Inside("config.toml")
+    """The resolved configuration, in the form that ``--config`` reads."""
+    log = _Inside("log.txt")
+    """The run's log."""
+    stamps = _Inside(".stages")
+    """One JSON for each finished step."""
+    stage_names = _Inside(".stages/stage_names.toml")
+    """Which stages it is made with, where a batch named them."""
+    lock = _Inside(".stages/lock")
+    """Held by the run that is at work in the folder."""
+    unsmoothed = _Inside(".stages/unsmoothed")
+    """Frames as they are, of which COLMAP sees smoothed ones."""
+    placed = _Inside(".stages/placed.json")
+    """What came into the folder from an existing project."""
+    owner = _Inside(".stages/capture.json")
+    """Which command on which capture or project the folder is for."""
 
     def trajectory(self, index: int, *, first: bool) -> Path:
         """The smoothed metric trajectory of a model; the first one has the plain name."""
@@ -188,21 +121,6 @@ class Workspace:
     def is_own(self, name: str) -> bool:
         """Whether a name is among them."""
         return any(fnmatch.fnmatchcase(name, pattern) for pattern in self.own_names)
-
-    @property
-    def unsmoothed(self) -> Path:
-        """Frames as they are, of which COLMAP sees smoothed ones."""
-        return self.stamps / "unsmoothed"
-
-    @property
-    def placed(self) -> Path:
-        """What came into the folder from an existing project."""
-        return self.stamps / "placed.json"
-
-    @property
-    def owner(self) -> Path:
-        """Which command on which capture or project the folder is for."""
-        return self.stamps / "capture.json"
 
     def open(self, source: Path, command: str = "reconstruct") -> None:
         """Create the folder, or take up a run of the same command on the same capture or project, finished or not.

@@ -65,6 +65,29 @@ class FrameRecords:
     frames: tuple[FrameRecord, ...]
 
 
+@dataclass(frozen=True, kw_only=True)
+class FramePaths:
+    """Where frames come from and go to.
+
+    Attributes
+    ----------
+    source
+        Where the original files lie, for image folders: a frame that no stage changed is copied, byte for byte.
+    images
+        Written: the folder for COLMAP.
+    records
+        Written: a JSON with one :class:`FrameRecord` for each frame of the capture.
+    unsmoothed
+        Written: the folder for frames as they are, of which COLMAP is to see smoothed ones. Without it, those are
+        nowhere.
+    """
+
+    source: Path | None
+    images: Path
+    records: Path
+    unsmoothed: Path | None = None
+
+
 class _Originals:
     """Remembers the decoded array of each frame in flight, to tell whether a stage has changed it."""
 
@@ -91,13 +114,10 @@ def write_frames(
     frames: Iterator[Frame],
     names: Sequence[str],
     stages: Sequence[FrameStage],
-    *,
-    source_folder: Path | None,
-    images: Path,
-    records: Path,
+    paths: FramePaths,
     progress: Progress,
+    *,
     least: int = 3,
-    unsmoothed: Path | None = None,
 ) -> None:
     """Run the frames through the stages and write them.
 
@@ -107,15 +127,10 @@ def write_frames(
         Decoded frames in order of time.
     names
         Of all these frames, in order.
-    source_folder
-        Where the original files lie, for image folders: a frame that no stage changed is copied, byte for byte.
-    images
-        Written: the folder for COLMAP.
-    unsmoothed
-        Written: the folder for frames as they are, of which COLMAP is to see smoothed ones. Without it, those are
-        nowhere.
-    records
-        Written: a JSON with one :class:`FrameRecord` for each frame of the capture.
+    paths
+        Where they come from and go to.
+    progress
+        Called with ``"frames"``.
 
     Raises
     ------
@@ -127,15 +142,15 @@ def write_frames(
     for stage in stages:
         stream = iter(stage(stream))
     seen: dict[str, FrameRecord] = {}
-    images.mkdir(parents=True)
-    if unsmoothed is not None:
-        unsmoothed.mkdir(parents=True)
+    paths.images.mkdir(parents=True)
+    if paths.unsmoothed is not None:
+        paths.unsmoothed.mkdir(parents=True)
     known = set(names)
     for frame in stream:
         if frame.name not in known or frame.name in seen:
             raise ValueError(f"a frame stage yielded {frame.name!r}, which is no frame of the capture or came twice")
         original = originals.pop_through(frame.name)
-        action = "dropped" if frame.dropped else _write(frame, original, source_folder, images, unsmoothed)
+        action = "dropped" if frame.dropped else _write(frame, original, paths)
         seen[frame.name] = FrameRecord(
             name=frame.name,
             action=action,
@@ -145,19 +160,17 @@ def write_frames(
         progress("frames", len(seen), len(names))
     require_frames(sum(record.used for record in seen.values()), of=len(names), least=least)
     every = tuple(seen.get(name) or FrameRecord(name=name, action="dropped") for name in names)
-    write_record(records, FrameRecords(frames=every))
+    write_record(paths.records, FrameRecords(frames=every))
 
 
-def _write(
-    frame: Frame, original: AnyArray | None, source_folder: Path | None, images: Path, unsmoothed: Path | None
-) -> str:
+def _write(frame: Frame, original: AnyArray | None, paths: FramePaths) -> str:
     """Write the picture of a frame; returns what happened to it."""
-    source = None if source_folder is None else path_in(source_folder, frame.name)
-    target = path_in(images, frame.name)
+    source = None if paths.source is None else path_in(paths.source, frame.name)
+    target = path_in(paths.images, frame.name)
     target.parent.mkdir(parents=True, exist_ok=True)
     passed = original is not None and _same_memory(original, frame.image)
-    if frame.smoothing_px > 0 and unsmoothed is not None:
-        itself = path_in(unsmoothed, frame.name)
+    if frame.smoothing_px > 0 and paths.unsmoothed is not None:
+        itself = path_in(paths.unsmoothed, frame.name)
         itself.parent.mkdir(parents=True, exist_ok=True)
         encode_image(itself, frame.image, source)
     if frame.smoothing_px > 0:

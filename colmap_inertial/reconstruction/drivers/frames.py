@@ -14,7 +14,7 @@ from colmap_inertial.io.frames import frame_source
 from colmap_inertial.model import read_model
 from colmap_inertial.pipeline.run.context import Recording
 from colmap_inertial.pipeline.run.session import Session
-from colmap_inertial.pipeline.stages.frame_folder import FrameRecord, read_frame_records, write_frames
+from colmap_inertial.pipeline.stages.frame_folder import FramePaths, FrameRecord, read_frame_records, write_frames
 from colmap_inertial.pipeline.stages.imaging_plan import ImagingPlan, read_plan, write_plan
 from colmap_inertial.pipeline.stages.protocols import FrameStage, KeypointStage, refined_stages
 from colmap_inertial.pipeline.stages.rectified import image_movers, write_images
@@ -71,19 +71,9 @@ def run_frames(
     kept = None if plan is None else CropKeeper.of(plan)
 
     def work(partial: Sequence[Path]) -> None:
-        written, records, unsmoothed = partial[:3]
+        paths = FramePaths(source=source, images=partial[0], records=partial[1], unsmoothed=partial[2])
         through = stages if kept is None else (kept.before, *stages, kept.after)
-        names = recording.timing.names
-        write_frames(
-            frames,
-            names,
-            through,
-            source_folder=source,
-            images=written,
-            records=records,
-            progress=session.progress,
-            unsmoothed=unsmoothed,
-        )
+        write_frames(frames, recording.timing.names, through, paths, session.progress)
         if kept is not None:
             kept.write(partial[3])
 

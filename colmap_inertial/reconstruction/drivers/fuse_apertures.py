@@ -21,7 +21,7 @@ from colmap_inertial.pipeline.run.progress import Progress, silent
 from colmap_inertial.pipeline.run.runner import fingerprint, remove
 from colmap_inertial.pipeline.run.session import open_session
 from colmap_inertial.pipeline.stages.apertures import ApertureStage, write_maps
-from colmap_inertial.pipeline.stages.frame_folder import encode_image, read_frame_records, write_frames
+from colmap_inertial.pipeline.stages.frame_folder import FramePaths, encode_image, read_frame_records, write_frames
 
 
 def fuse_captured(
@@ -98,10 +98,8 @@ def fuse_captured(
                 (Frame(name=name, image=read_image(path_in(folder, name)), t_s=0.0) for name in names),
                 names,
                 [through],
-                source_folder=folder,
-                images=partial[0],
-                records=partial[1],
-                progress=lambda _, done, total: progress("fusing", done, total),
+                FramePaths(source=folder, images=partial[0], records=partial[1]),
+                lambda _, done, total: progress("fusing", done, total),
                 least=1,
             )
 

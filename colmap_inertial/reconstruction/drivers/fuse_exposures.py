@@ -23,7 +23,7 @@ from colmap_inertial.pipeline.run.progress import Progress, silent
 from colmap_inertial.pipeline.run.runner import fingerprint
 from colmap_inertial.pipeline.run.session import open_session
 from colmap_inertial.pipeline.stages.exposures import ExposureStage, FusedPair
-from colmap_inertial.pipeline.stages.frame_folder import read_frame_records, write_frames
+from colmap_inertial.pipeline.stages.frame_folder import FramePaths, read_frame_records, write_frames
 from colmap_inertial.pipeline.stages.fusers import Fuser, lsd2_fuser
 from colmap_inertial.pipeline.stages.imaging_plan import ImagingPlan
 from colmap_inertial.reconstruction.drivers.frames import run_plan
@@ -107,10 +107,8 @@ def fuse_exposures_captured(
                 _frames(loaded, timing, names),
                 names,
                 [stage],
-                source_folder=folder,
-                images=partial[0],
-                records=partial[1],
-                progress=lambda _, done, total: progress("fusing", done, total),
+                FramePaths(source=folder, images=partial[0], records=partial[1]),
+                lambda _, done, total: progress("fusing", done, total),
                 least=1,
             )
 

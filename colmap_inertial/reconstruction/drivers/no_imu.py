@@ -30,7 +30,7 @@ from colmap_inertial.io.names import path_in
 from colmap_inertial.model import find_models, read_model
 from colmap_inertial.model.copying import copy_file, new_folder
 from colmap_inertial.pipeline.run.context import RunContext
-from colmap_inertial.pipeline.run.progress import Progress, silent
+from colmap_inertial.pipeline.run.progress import Progress, counted, silent
 from colmap_inertial.pipeline.run.session import keep_colmap_quiet
 from colmap_inertial.pipeline.run.workspace import a_record_of_ours, require_apart
 from colmap_inertial.pipeline.stages.frame_folder import encode_image, require_frames
@@ -162,16 +162,10 @@ def _map(
     if isinstance(capture.frames, ImageFolder):
         require_apart(project, (capture.frames.folder,))
     images, sparse = project / "images", project / "sparse"
-    context = RunContext(
-        scratch=project,
-        num_threads=1 if options.deterministic else -1,
-        seed=options.seed,
-        device=mapping_device(mapping, deterministic=options.deterministic),
-        progress=progress,
-    )
-    for done, _ in enumerate(_written(capture, names, images)):
-        progress("frames", done, len(names))
-    progress("frames", len(names), len(names))
+    device = mapping_device(mapping, deterministic=options.deterministic)
+    context = dataclasses.replace(RunContext.of(options, device=device, progress=progress), scratch=project)
+    for _ in counted(_written(capture, names, images), len(names), "frames", progress):
+        pass
     features, database = project / "features.db", project / "database.db"
     extract_features(images, dict.fromkeys(names, capture.camera), features, mapping, context=context)
     match_features(features, database, image_pairs(names, mapping), context)

@@ -15,11 +15,10 @@ from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError
 from colmap_inertial.core.options import ProjectOptions, ReferenceOptions, ValidateOptions
 from colmap_inertial.core.quantiles import Z95
-from colmap_inertial.core.types import Similarity
 from colmap_inertial.io.files import StrPath, write_json
 from colmap_inertial.model.project import apply_to_project
 from colmap_inertial.pipeline.run.progress import Progress, silent
-from colmap_inertial.reconstruction.drivers.sources import only_model
+from colmap_inertial.reconstruction.drivers.sources import only_model, scaling
 
 #: What the folder keeps beside the project: where its metres come from.
 REFERENCE_FILE = "scale.json"
@@ -113,15 +112,6 @@ def scale_project_by(
     else:
         scale, sigma_log, made_of = _by_target(validation)
     half = Z95 * sigma_log
-    cov = np.zeros((7, 7))
-    cov[0, 0] = sigma_log**2
-    similarity = Similarity(
-        scale=scale,
-        rotation_xyzw=np.array([0.0, 0.0, 0.0, 1.0]),
-        translation_m=np.zeros(3),
-        cov=cov,
-        provenance=made_of,
-    )
     notes = ["which way is up is not known: no IMU was used"]
     if validation is not None:
         notes += [] if validation.lengths is None else [f"this proves that {validation.lengths.proves}"]
@@ -140,7 +130,7 @@ def scale_project_by(
     apply_to_project(
         project,
         out,
-        similarity,
+        scaling(scale, sigma_log, made_of),
         link=source.link,
         keep=source.keep,
         follow_links=source.follow_links,

@@ -336,21 +336,24 @@ def validate_source(
         if result.control is None:
             raise InertialError("too few corners to keep control and check distances apart; --apply needs more views")
         low, high = result.control.ci95
-        cov = np.zeros((7, 7))
-        cov[0, 0] = (np.log(high / low) / (2 * 1.96)) ** 2
-        similarity = Similarity(
-            scale=result.control.metres_per_unit,
-            rotation_xyzw=np.array([0.0, 0.0, 0.0, 1.0]),
-            translation_m=np.zeros(3),
-            cov=cov,
-            provenance=f"control distances of {parsed.spec}",
-        )
-        apply_similarity(folder, apply, similarity)
+        sigma_log = np.log(high / low) / (2 * 1.96)
+        provenance = f"control distances of {parsed.spec}"
+        apply_similarity(folder, apply, scaling(result.control.metres_per_unit, sigma_log, provenance))
     if json is not None:
         write_json(json, result.as_json())
     if pictures is not None:
         write_overlays(result, images, pictures)
     return result
+
+
+def scaling(metres_per_unit: float, sigma_log: float, provenance: str) -> Similarity:
+    """A similarity that only scales."""
+    cov = np.zeros((7, 7))
+    cov[0, 0] = sigma_log**2
+    rotation = np.array([0.0, 0.0, 0.0, 1.0])
+    return Similarity(
+        scale=metres_per_unit, rotation_xyzw=rotation, translation_m=np.zeros(3), cov=cov, provenance=provenance
+    )
 
 
 def _metres_apart(text: str) -> tuple[float, float | None]:

@@ -38,7 +38,7 @@ from colmap_inertial.model import colmap_camera, find_models, read_model, trajec
 from colmap_inertial.motion.align import AlignOptions, align_clocks
 from colmap_inertial.motion.flow import FlowOptions, VisualRotation, check_motion, find_stabilisation, measure_rotation
 from colmap_inertial.pipeline.run.context import Recording, RunContext
-from colmap_inertial.pipeline.run.progress import Progress
+from colmap_inertial.pipeline.run.progress import Progress, counted
 from colmap_inertial.pipeline.stages.frame_folder import encode_image, seen_by_colmap
 from colmap_inertial.pipeline.stages.gyro_view import GyroView
 from colmap_inertial.pipeline.stages.protocols import FrameStage
@@ -234,15 +234,9 @@ def followed(
     stage: str = "motion",
 ) -> VisualRotation:
     """The rotation between some frames, by their pixels; progress under the name of ``stage``."""
-
-    def counted() -> Iterator[Frame]:
-        for done, frame in enumerate(some_frames(capture, timing, indices)):
-            progress(stage, done, len(indices))
-            yield frame
-        progress(stage, len(indices), len(indices))
-
+    frames = counted(some_frames(capture, timing, indices), len(indices), stage, progress)
     with one_blas_thread():
-        return measure_rotation(counted(), colmap_camera(camera), timing, FlowOptions())
+        return measure_rotation(frames, colmap_camera(camera), timing, FlowOptions())
 
 
 def _by_pixels(

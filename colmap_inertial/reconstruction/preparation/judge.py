@@ -19,7 +19,7 @@ from colmap_inertial.imaging.parallax import Parallax
 from colmap_inertial.imaging.psf import blur_path
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.model import colmap_camera
-from colmap_inertial.pipeline.run.progress import Progress
+from colmap_inertial.pipeline.run.progress import Progress, counted
 from colmap_inertial.pipeline.stages.gyro_view import GyroView
 from colmap_inertial.reconstruction.preparation.calibrate import some_frames
 
@@ -128,13 +128,12 @@ def _look(
     motion, camera, index = view.motion(), colmap_camera(view.camera), view.index()
     blur_px = {decision.name: factor * (decision.blur_px or 0.0) for decision in chosen}
     looked: list[Looked] = []
-    for frame in some_frames(capture, view.timing, [index[d.name] for d in chosen]):
-        progress("blur", len(looked), len(chosen))
+    frames = some_frames(capture, view.timing, [index[d.name] for d in chosen])
+    for frame in counted(frames, len(chosen), "blur", progress):
         shutter, parallax = view.shutter(index[frame.name]), parallaxes.get(frame.name)
         path = blur_path(motion, camera, shutter, parallax=parallax, extent_factor=factor)
         share, mirrored = shown_shares(frame.image, path)
         looked.append(Looked(blur_evidence(frame.image, path), share, blur_px[frame.name], mirrored))
-    progress("blur", len(chosen), len(chosen))
     return looked
 
 

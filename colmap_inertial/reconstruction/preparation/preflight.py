@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from colmap_inertial.checks.diagnose import Diagnosis, Recorded, diagnose
 from colmap_inertial.core.errors import FormatError, NotObservableError
 from colmap_inertial.core.threads import one_blas_thread
-from colmap_inertial.core.types import CameraTrajectory, Frame, FrameTiming
+from colmap_inertial.core.types import CameraTrajectory, FrameTiming
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import write_json
 from colmap_inertial.io.imu import RawImu
@@ -20,7 +20,7 @@ from colmap_inertial.model import colmap_camera
 from colmap_inertial.motion.flow import VisualRotation
 from colmap_inertial.motion.two_view_rotation import measure_two_view_rotations
 from colmap_inertial.pipeline.run.context import Recording
-from colmap_inertial.pipeline.run.progress import Progress
+from colmap_inertial.pipeline.run.progress import Progress, counted
 from colmap_inertial.pipeline.run.session import Session
 from colmap_inertial.reconstruction.preparation.calibrate import (
     followed,
@@ -155,13 +155,7 @@ def compare_pictures(capture: Capture, timing: FrameTiming, progress: Progress) 
         return None
     first = max(0, (len(timing.t_s) - _COMPARED) // 2)
     indices = range(first, min(first + _COMPARED, len(timing.t_s)))
-
-    def counted() -> Iterator[Frame]:
-        for done, frame in enumerate(some_frames(capture, timing, indices)):
-            progress("motion", done, len(indices))
-            yield frame
-        progress("motion", len(indices), len(indices))
-
+    frames = counted(some_frames(capture, timing, indices), len(indices), "motion", progress)
     camera = colmap_camera(guessed_camera(capture, timing))
     with one_blas_thread():
-        return measure_two_view_rotations(counted(), camera, timing)
+        return measure_two_view_rotations(frames, camera, timing)

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from colmap_inertial.core.arrays import Array, BoolArray, IndexArray, UInt8Array
+from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.gyro import on_camera_rate
 from colmap_inertial.core.options import FrameOptions
@@ -31,7 +31,7 @@ from colmap_inertial.model import colmap_camera
 from colmap_inertial.motion.align import AlignOptions, align_clocks
 from colmap_inertial.motion.flow import check_motion
 from colmap_inertial.pipeline.run.context import Recording
-from colmap_inertial.pipeline.run.progress import Progress
+from colmap_inertial.pipeline.run.progress import Progress, counted
 from colmap_inertial.pipeline.run.runner import remove
 from colmap_inertial.pipeline.run.session import Session
 from colmap_inertial.pipeline.run.workspace import a_record_of_ours
@@ -236,15 +236,9 @@ def select_frames(recording: Recording, options: FrameOptions, progress: Progres
             start_from_cam=turning,
         )
         names = [timing.names[i] for i in looked]
-
-        def pictures() -> Iterator[UInt8Array]:
-            for done, (_, picture) in enumerate(read_reduced(capture, names, _LOOKED_PX)):
-                progress("selection", done, len(names))
-                yield picture
-            progress("selection", len(names), len(names))
-
+        pictures = counted(read_reduced(capture, names, _LOOKED_PX), len(names), "selection", progress)
         chosen = choose_frames(
-            pictures(),
+            (picture for _, picture in pictures),
             ranked,
             WindowLimits(shortest_s=1 / options.max_fps, longest_s=1 / options.min_fps),
             colmap_camera(clocks.camera),

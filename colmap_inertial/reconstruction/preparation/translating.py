@@ -6,17 +6,17 @@ felt, tells how far the same motion smears them while a frame is exposed.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from colmap_inertial.core.threads import one_blas_thread
-from colmap_inertial.core.types import CameraModel, Frame, FrameTiming
+from colmap_inertial.core.types import CameraModel, FrameTiming
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.motion.lateral_flow import follow_pairs
 from colmap_inertial.pipeline.run.context import Recording
-from colmap_inertial.pipeline.run.progress import Progress
+from colmap_inertial.pipeline.run.progress import Progress, counted
 from colmap_inertial.reconstruction.preparation.calibrate import some_frames
 
 #: Pairs that are followed in each part of a recording; in a part that slides, so many of them show enough blur.
@@ -79,17 +79,11 @@ def translating_segments(
     if not firsts:
         return [False] * len(parts)
     indices = sorted({place[name] + k for name in firsts for k in (0, 1)})
-
-    def counted() -> Iterator[Frame]:
-        for done, frame in enumerate(some_frames(recording.capture, every, indices)):
-            progress("motion", done, len(indices))
-            yield frame
-        progress("motion", len(indices), len(indices))
-
+    frames = counted(some_frames(recording.capture, every, indices), len(indices), "motion", progress)
     projector = colmap_camera(camera)
     with one_blas_thread():
         blur_px = {
             pair.name: exposure_s[pair.name] * pair.speed_px_s(projector, motion)
-            for pair in follow_pairs(counted(), every, firsts)
+            for pair in follow_pairs(frames, every, firsts)
         }
     return [sum(blur_px.get(name, 0.0) >= limit_px for name in names) >= _ENOUGH for names in chosen]
