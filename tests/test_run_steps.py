@@ -23,6 +23,7 @@ from colmap_inertial.core.errors import NotObservableError, OutputExistsError
 from colmap_inertial.core.options import MappingOptions, ProjectOptions, ReconstructOptions
 from colmap_inertial.core.threads import in_order
 from colmap_inertial.core.types import CALIBRATION_PARAMETERS, CameraModel, FrameTiming, ImuRecording, Treatment
+from colmap_inertial.imaging.gate import RecordingVerdict
 from colmap_inertial.io.calibration import Declared, calibration_prior, write_calibration
 from colmap_inertial.io.capture import Capture, ImageFolder
 from colmap_inertial.io.exposures import LongExposures, SubImages
