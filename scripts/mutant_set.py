@@ -1265,8 +1265,8 @@ MUTANTS = (
     ),
     Mutant(
         "reconstruction/drivers/capture.py",
-        "session, recording, of_models, rectified=bool(rectified)",
-        "session, recording, of_models, rectified=False",
+        "Submodels(rectified=bool(rectified))",
+        "Submodels()",
         "models of rectified keypoints are not known to be",
         ("pipeline_imaging::test_the_metric_model_lacks_the_camera_s_translation_within_the_readout_too",),
     ),

@@ -31,7 +31,7 @@ from colmap_inertial.pipeline.run.session import Session
 from colmap_inertial.pipeline.run.workspace import Workspace
 from colmap_inertial.pipeline.stages.frame_folder import FramePaths, read_frame_records, write_frames
 from colmap_inertial.pipeline.stages.metric import MetricStage
-from colmap_inertial.reconstruction.drivers.models import run_models
+from colmap_inertial.reconstruction.drivers.models import Submodels, run_models
 from colmap_inertial.reconstruction.drivers.reporting import report_result
 from colmap_inertial.reconstruction.drivers.result import ReconstructResult
 
@@ -247,7 +247,7 @@ def test_each_sub_model_gets_its_own_scale_and_verdict(project, tmp_path):
     imu = read_imu(project.imu)
     timing = read_frame_times(project.frame_times)
     results, fragments, _ = run_models(
-        session_in(workspace), recording_of(imu, timing), [MetricStage(imu=imu, calibration=None)], after=()
+        session_in(workspace), recording_of(imu, timing), [MetricStage(imu=imu, calibration=None)], Submodels(after=())
     )
 
     assert [(result.index, result.colmap_index) for result in results] == [(0, 0), (1, 1), (2, 3)]
@@ -294,7 +294,7 @@ def test_the_largest_model_comes_first_and_fragments_are_left_out_and_named(proj
     sub_models(project, workspace, {0: 3, 1: 500, 2: 60, 4: 4})
     imu, timing = read_imu(project.imu), read_frame_times(project.frame_times)
     session, recording = session_in(workspace), recording_of(imu, timing)
-    models, fragments, _ = run_models(session, recording, [MetricStage(imu=imu, calibration=None)], after=())
+    models, fragments, _ = run_models(session, recording, [MetricStage(imu=imu, calibration=None)], Submodels(after=()))
     assert [(m.index, m.colmap_index, m.summary["registered_images"]) for m in models] == [(0, 1, 500), (1, 2, 60)]
     assert models[0].sparse == workspace.colmap_sparse / "1"
     assert models[0].sparse_metric == workspace.sparse / "0"
@@ -313,10 +313,10 @@ def test_the_largest_model_comes_first_and_fragments_are_left_out_and_named(proj
     ]
     # a second look finds the same without making it again, another one with the fragments makes it again
     session = session_in(workspace)
-    again, *_ = run_models(session, recording, [MetricStage(imu=imu, calibration=None)], after=())
+    again, *_ = run_models(session, recording, [MetricStage(imu=imu, calibration=None)], Submodels(after=()))
     assert session.runner.worked == [] and [m.scale.ci95 for m in again] == [m.scale.ci95 for m in models]
     every, none, _ = run_models(
-        session_in(workspace), recording, [MetricStage(imu=imu, calibration=None)], after=(), fragments=True
+        session_in(workspace), recording, [MetricStage(imu=imu, calibration=None)], Submodels(after=()), fragments=True
     )
     assert [m.colmap_index for m in every] == [1, 2, 4, 0] and none == ()
 
@@ -327,10 +327,10 @@ def test_metric_models_that_are_gone_are_made_again(project, tmp_path):
     sub_models(project, workspace, {0: 1000})
     imu, timing = read_imu(project.imu), read_frame_times(project.frame_times)
     recording, stages = recording_of(imu, timing), [MetricStage(imu=imu, calibration=None)]
-    run_models(session_in(workspace), recording, stages, after=())
+    run_models(session_in(workspace), recording, stages, Submodels(after=()))
     shutil.rmtree(workspace.sparse)
     session = session_in(workspace)
-    run_models(session, recording, stages, after=())
+    run_models(session, recording, stages, Submodels(after=()))
     assert session.runner.worked == ["metric"] and (workspace.sparse / "0").is_dir()
 
 
@@ -348,7 +348,7 @@ def test_a_sub_model_with_one_timed_image_is_refused_and_the_others_go_on(projec
     imu, timing = read_imu(project.imu), read_frame_times(project.frame_times)
     session, recording = session_in(workspace), recording_of(imu, timing)
     stages = [MetricStage(imu=imu, calibration=None)]
-    (metric, refused), *_ = run_models(session, recording, stages, after=(), fragments=True)
+    (metric, refused), *_ = run_models(session, recording, stages, Submodels(after=()), fragments=True)
     assert metric.scale.verdict == "trusted"
     assert refused.scale.verdict == "refused" and "1 of the model's 1 images" in refused.scale.reasons[0]
     assert refused.summary["registered_images"] == 1
@@ -357,7 +357,7 @@ def test_a_sub_model_with_one_timed_image_is_refused_and_the_others_go_on(projec
     assert result.exit_code() == 0
     shutil.rmtree(workspace.colmap_sparse / "0")
     with pytest.raises(TimingError, match="1 of the model's 1 images"):
-        run_models(session_in(workspace), recording, stages, after=(), fragments=True)
+        run_models(session_in(workspace), recording, stages, Submodels(after=()), fragments=True)
 
 
 def test_the_key_of_a_hook_knows_its_parameters_and_its_body():

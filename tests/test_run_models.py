@@ -42,7 +42,7 @@ from colmap_inertial.pipeline.stages.metric import MetricStage, gravity_in_model
 from colmap_inertial.pipeline.stages.readout import ReadoutStage
 from colmap_inertial.pipeline.stages.rolling_shutter import RollingShutterStage, for_rectified
 from colmap_inertial.reconstruction.drivers import models
-from colmap_inertial.reconstruction.drivers.models import run_models, run_validation
+from colmap_inertial.reconstruction.drivers.models import Submodels, run_models, run_validation
 from colmap_inertial.reconstruction.drivers.project import _scales
 from colmap_inertial.reconstruction.drivers.result import ModelResult, ReconstructResult, result_as_json
 from colmap_inertial.tools.simulate import ImuOptions, MotionOptions, RecordingOptions, SfmOptions, simulate_recording
@@ -133,7 +133,7 @@ def run(project, whole, tmp_path):
     model, made = whole
     names = sorted(image.name for image in model.reconstruction.images.values())
 
-    def run(sizes, *, doubts=(), least=0, most=1000, then=(), **more):
+    def run(sizes, *, doubts=(), least=0, most=1000, then=(), fragments=False, **numbered):
         for number, size in sizes.items():
             folder = workspace.colmap_sparse / str(number)
             if not folder.exists():
@@ -146,8 +146,9 @@ def run(project, whole, tmp_path):
         recording = replace(recording_of(project.recording.imu, model.timing), doubts=doubts)
         found = {number: workspace.colmap_sparse / str(number) for number in sizes}
         run.session = session
+        submodels = Submodels(folders=found, after=(), **numbered)
         return run_models(
-            session, recording, [Scaled(made=made, least=least, most=most), *then], found=found, after=(), **more
+            session, recording, [Scaled(made=made, least=least, most=most), *then], submodels, fragments=fragments
         )[:2]
 
     run.workspace = workspace

@@ -55,7 +55,7 @@ from colmap_inertial.reconstruction.drivers.frames import (
     stages_of_refined,
 )
 from colmap_inertial.reconstruction.drivers.georeference import run_georeference
-from colmap_inertial.reconstruction.drivers.models import run_dense_models, run_models, run_validation
+from colmap_inertial.reconstruction.drivers.models import Submodels, run_dense_models, run_models, run_validation
 from colmap_inertial.reconstruction.drivers.reporting import report_result, reporting_stops, write_recording
 from colmap_inertial.reconstruction.drivers.result import ReconstructResult
 from colmap_inertial.reconstruction.preparation.geolocation import positions_of
@@ -254,7 +254,7 @@ def _run(session: Session, given: _Given, options: ReconstructOptions, stages: S
     if not after_models:
         images = run_images(session, records, rectified, of_keypoints)
     models, fragments, gaps = run_models(
-        session, recording, of_models, rectified=bool(rectified), fragments=options.fragments
+        session, recording, of_models, Submodels(rectified=bool(rectified)), fragments=options.fragments
     )
     if after_models:
         images = run_images(session, records, rectified, stages_of_refined(of_keypoints, models))

@@ -59,17 +59,38 @@ class _Made:
     beside: tuple[Path, ...] = ()
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Submodels:
+    """What COLMAP made of a recording.
+
+    Attributes
+    ----------
+    folders
+        By COLMAP's number, where they are not those of ``colmap/sparse/``.
+    rectified
+        Whether they were mapped from keypoints without the rolling shutter.
+    numbered
+        Keep COLMAP's numbers, as an existing project's other parts go by them.
+    after
+        The step that made them, where one did.
+    read
+        Reads one.
+    """
+
+    folders: Mapping[int, Path] | None = None
+    rectified: bool = False
+    numbered: bool = False
+    after: Sequence[str] = ("mapping",)
+    read: Callable[[Path], pycolmap.Reconstruction] = read_model
+
+
 def run_models(
     session: Session,
     recording: Recording,
     stages: Sequence[ModelStage],
+    submodels: Submodels | None = None,
     *,
-    rectified: bool = False,
-    found: Mapping[int, Path] | None = None,
     fragments: bool = False,
-    numbered: bool = False,
-    after: Sequence[str] = ("mapping",),
-    read: Callable[[Path], pycolmap.Reconstruction] = read_model,
 ) -> tuple[tuple[ModelResult, ...], tuple[Fragment, ...], tuple[Gap, ...]]:
     """Every sub-model through the model stages, then to its final place: the largest first, fragments left out.
 
@@ -80,26 +101,19 @@ def run_models(
     ----------
     session, recording, stages
         Of the run.
-    rectified
-        Whether the models were mapped from keypoints without the rolling shutter.
-    found
-        The sub-models by COLMAP's number, where they are not those of ``colmap/sparse/``.
+    submodels
+        What COLMAP made; those of ``colmap/sparse/`` by default.
     fragments
         Treat fragments as models.
-    numbered
-        Keep COLMAP's numbers, as an existing project's other parts go by them.
-    after
-        The step that made the sub-models, where one did.
-    read
-        Reads a sub-model.
 
     Raises
     ------
     TimingError
         Where no sub-model has two timed images.
     """
-    workspace = session.workspace
-    found = find_models(workspace.colmap_sparse) if found is None else found
+    workspace, submodels = session.workspace, submodels or Submodels()
+    rectified, numbered = submodels.rectified, submodels.numbered
+    found = find_models(workspace.colmap_sparse) if submodels.folders is None else submodels.folders
     record = workspace.stamps / "models.json"
 
     def work(partial: Sequence[Path]) -> None:
@@ -110,7 +124,7 @@ def run_models(
         kept, left_out = _without_fragments(found, keep=fragments)
         read_in = (
             Model(
-                reconstruction=read(found[number]),
+                reconstruction=submodels.read(found[number]),
                 colmap_index=number,
                 timing=recording.timing,
                 rectified=rectified,
@@ -135,10 +149,10 @@ def run_models(
         "rectified": rectified,
         "fragments": fragments,
         "numbered": numbered,
-        "found": [fingerprint(folder) for folder in found.values()] if not after else [],
+        "found": [] if submodels.after else [fingerprint(folder) for folder in found.values()],
     }
     _forget_where_gone(record, workspace.root)
-    session.runner.run("metric", depends, [record], work, after=after)
+    session.runner.run("metric", depends, [record], work, after=submodels.after)
     said = read_record(record, _Made)
     models = tuple(
         ModelResult(**{f.name: getattr(one, f.name) for f in fields(one)}).within(workspace.root) for one in said.models

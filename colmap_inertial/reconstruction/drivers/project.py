@@ -55,7 +55,7 @@ from colmap_inertial.pipeline.stages.defaults import default_model_stages
 from colmap_inertial.pipeline.stages.inputs import StageInputs
 from colmap_inertial.pipeline.stages.protocols import ModelStage, with_defaults
 from colmap_inertial.reconstruction.drivers.georeference import run_georeference
-from colmap_inertial.reconstruction.drivers.models import run_dense_models, run_models, run_validation
+from colmap_inertial.reconstruction.drivers.models import Submodels, run_dense_models, run_models, run_validation
 from colmap_inertial.reconstruction.drivers.project_output import place_project, require_free_names
 from colmap_inertial.reconstruction.drivers.reporting import report_result, reporting_stops, write_recording
 from colmap_inertial.reconstruction.drivers.result import Fragment, ModelResult, ReconstructResult
@@ -195,9 +195,8 @@ def _reconstruct(
         recording = dataclasses.replace(recording, doubts=doubts)
         inputs = StageInputs(recording=recording, options=_as_mapped(options))
         stages = with_defaults(model_stages, default_model_stages(inputs))
-        results, fragments, gaps = run_models(
-            session, recording, stages, found=models, fragments=options.fragments, numbered=True, after=(), read=read
-        )
+        submodels = Submodels(folders=models, numbered=True, after=(), read=read)
+        results, fragments, gaps = run_models(session, recording, stages, submodels, fragments=options.fragments)
         read.cache_clear()
         if target is not None and images is None:
             notes = (*notes, "the target was not measured: the project has no images/; give --images DIR")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -69,13 +69,17 @@ def judge_frames(
     Whether it is trusted for all frames, or every frame must bear it out by itself. Where the pictures bear it out but
     for exposure times that are wrong by one factor, that is corrected, and said.
     """
-    looked = _look(view, capture, chosen, parallaxes, progress)
+
+    def look(factor: float) -> list[Looked]:
+        return _look(view, capture, chosen, parallaxes, progress, factor)
+
+    looked = look(1.0)
     verdict = judged(looked)
     factors: tuple[float, ...] = _EXPOSURE_FACTORS
     if verdict.trusted is True:
         long_blur = np.median([one.blur_px for one in looked]) >= 2 * GATE_LIMITS.must_show_px
         factors = tuple(factor for factor in factors if factor < 1 and long_blur)
-    return _with_other_exposures(verdict, factors, view, capture, chosen, parallaxes, looked, progress)
+    return _correct_exposures(verdict, looked, factors, look)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +126,7 @@ def _look(
     chosen: Sequence[FrameDecision],
     parallaxes: Mapping[str, Parallax],
     progress: Progress,
-    factor: float = 1.0,
+    factor: float,
 ) -> list[Looked]:
     """What some frames say of the blur that is predicted, or of so many times as much."""
     motion, camera, index = view.motion(), colmap_camera(view.camera), view.index()
@@ -137,20 +141,16 @@ def _look(
     return looked
 
 
-def _with_other_exposures(
+def _correct_exposures(
     verdict: RecordingVerdict,
-    factors: Sequence[float],
-    view: GyroView,
-    capture: Capture,
-    chosen: Sequence[FrameDecision],
-    parallaxes: Mapping[str, Parallax],
     looked: Sequence[Looked],
-    progress: Progress,
+    factors: Sequence[float],
+    look: Callable[[float], Sequence[Looked]],
 ) -> RecordingVerdict:
     """The verdict, or where all exposure times are wrong by one factor, that of the pictures with it corrected."""
     best, deepest = verdict, _together([one.evidence for one in looked])
     for factor in factors:
-        others = _look(view, capture, chosen, parallaxes, progress, factor)
+        others = look(factor)
         evidence = [one.evidence for one in others]
         found, support = judged(others), _together(evidence)
         if found.trusted is True and support >= _EXPOSURE_SUPPORT and support > deepest:
