@@ -30,7 +30,7 @@ def test_there_is_one_version_and_the_changelog_has_it():
 def test_the_citation_names_what_is_followed():
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     assert citation["authors"] == [{"name": "the colmap-inertial authors"}]
-    sources = " ".join((ROOT / "docs" / "method.md").read_text().lower().split())
+    sources = " ".join((ROOT / "docs" / "dev" / "sources.md").read_text().lower().split())
     assert len(citation["references"]) == 6
     for reference in citation["references"]:
         title = reference["title"].lower().replace("lsd2 - ", "lsd2: ")
