@@ -69,10 +69,16 @@ def type_of(form: dict[str, Any]) -> str:
 
 
 def array_of(form: dict[str, Any]) -> str:
-    """An array and what it holds."""
-    length = form.get("minItems")
-    size = f"{length} " if length and length == form.get("maxItems") else ""
-    return f"array of {size}{type_of(form.get('items', {}))}"
+    """An array and what it holds: ``7 x 7 numbers``, ``array of strings``."""
+    sizes, items = [], form
+    while "array" in items.get("type", ()) and items.get("minItems") and items["minItems"] == items.get("maxItems"):
+        sizes.append(str(items["minItems"]))
+        items = items.get("items", {})
+    if not sizes:
+        items = form.get("items", {})
+    kind = type_of(items)
+    kind = f"{kind}s" if re.fullmatch(r"number|integer|string|object|boolean", kind) else kind
+    return f"{' × '.join(sizes)} {kind}" if sizes else f"array of {kind}"
 
 
 def objects(form: dict[str, Any], path: str) -> Iterator[tuple[str, dict[str, Any]]]:
