@@ -25,10 +25,11 @@ from scipy.interpolate import make_interp_spline
 from scipy.signal import butter, sosfiltfilt
 
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import matrix_from_quat, quat_rotate, slerp
 from colmap_inertial.core.threads import one_blas_thread
-from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuRecording, clock_shift_s
+from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuRecording
 
 LOW_PASS_HZ, LOW_PASS_ORDER = 1.2, 4
 GRID_HZ = 100.0
@@ -63,7 +64,7 @@ def estimate_linear(trajectory: CameraTrajectory, imu: ImuRecording, calibration
     NotObservableError
         Where less than three seconds are covered, or the scale comes out negative.
     """
-    accel_s = imu.accel_t_s + calibration.accel_time_offset_s + clock_shift_s(trajectory, imu)
+    accel_s = CameraTimedImu.from_recording(imu, calibration, trajectory.epoch_ns).accel_t_s
     begin_s, end_s = max(accel_s[0], trajectory.t_s[0]), min(accel_s[-1], trajectory.t_s[-1])
     if end_s - begin_s < SHORTEST_S or len(trajectory) < 6:
         raise NotObservableError("scale", f"camera and accelerometer share less than {SHORTEST_S:g} s: record longer")

@@ -27,6 +27,7 @@ import numpy as np
 from bench_scale import Window
 
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import CameraImuCalibration
@@ -144,7 +145,8 @@ def run(task: tuple[Window, CameraImuCalibration | None, Setting]) -> Found:
         return Found(error=None, inside=False)
     trajectory, imu, truth = window.read()
     with one_blas_thread(), applied(setting) as options:
-        estimate = joint.estimate_joint(trajectory, imu, changed_calibration(calibration, setting), options)
+        timed = CameraTimedImu.from_recording(imu, changed_calibration(calibration, setting), trajectory.epoch_ns)
+        estimate = joint.estimate_joint(trajectory, timed, options)
     if estimate.metres_per_unit is None or estimate.ci95 is None:
         return Found(error=None, inside=False)
     low, high = estimate.ci95

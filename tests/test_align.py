@@ -6,6 +6,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from colmap_inertial.core.camera_clock import CameraTimedImu, epoch_shift_s
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import (
     matrix_from_quat,
@@ -17,8 +18,8 @@ from colmap_inertial.core.geometry import (
     quat_multiply,
     quat_normalize,
 )
-from colmap_inertial.core.gyro import GyroPath, on_camera_rate
-from colmap_inertial.core.types import CameraTrajectory, ImuRecording, clock_shift_s
+from colmap_inertial.core.gyro import GyroPath
+from colmap_inertial.core.types import CameraTrajectory, ImuRecording
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.io.imu import read_imu
 from colmap_inertial.io.trajectories import read_inertial_scale
@@ -262,7 +263,7 @@ def test_the_offset_of_drifting_clocks_holds_in_the_middle_of_what_both_recorded
     keep = (imu.gyro_t_s > imu.gyro_t_s[0] + 12) & (imu.gyro_t_s < imu.gyro_t_s[-1] - 4)
     part = replace(imu, gyro_t_s=imu.gyro_t_s[keep], gyro_rad_s=imu.gyro_rad_s[keep])
     found = align_clocks(trajectory, part).calibration
-    covered_s = part.gyro_t_s + simulated.truth.calibration.gyro_time_offset_s + clock_shift_s(trajectory, imu)
+    covered_s = part.gyro_t_s + simulated.truth.calibration.gyro_time_offset_s + epoch_shift_s(imu, trajectory.epoch_ns)
     both = (trajectory.t_s > covered_s[0]) & (trajectory.t_s < covered_s[-1])
     assert not both.all()
     shared_s = trajectory.t_s[both]
@@ -296,7 +297,7 @@ def test_the_offset_is_between_raw_stamps_whatever_the_epochs():
     here = align_camera_imu(simulated.trajectory, simulated.imu)
     # 1.7e9 s leave 2.4e-7 s to a double
     assert calibration.gyro_time_offset_s - here.gyro_time_offset_s == pytest.approx(1.7e9, abs=1e-6)
-    assert clock_shift_s(there, simulated.imu) == -1.7e9
+    assert epoch_shift_s(simulated.imu, there.epoch_ns) == -1.7e9
 
 
 @pytest.mark.parametrize("rate", [-0.01, 0.002, 0.01])
@@ -306,12 +307,11 @@ def test_clocks_that_run_at_different_rates_are_followed(rate):
     drifting = replace(imu, gyro_t_s=imu.gyro_t_s * (1 + rate), accel_t_s=imu.accel_t_s * (1 + rate))
     alignment = align_clocks(simulated.trajectory, drifting)
     assert alignment.calibration.clock_rate == pytest.approx(-rate, abs=max(3 * alignment.clock_rate_sigma, 2e-5))
-    steady = on_camera_rate(drifting, alignment.calibration, camera_epoch_ns=simulated.trajectory.epoch_ns)
+    steady = CameraTimedImu.from_recording(drifting, alignment.calibration, simulated.trajectory.epoch_ns)
     # the true time of each sample on the camera's clock
     true_s = imu.gyro_t_s + simulated.truth.calibration.gyro_time_offset_s
-    found_s = steady.gyro_t_s + alignment.calibration.gyro_time_offset_s
-    assert np.abs(found_s - true_s).max() < 0.004
-    assert "ppm" in steady.repairs[-1]
+    assert np.abs(steady.gyro_t_s - true_s).max() < 0.004
+    assert "ppm" in steady.imu.repairs[-1]
     assert alignment.drifts() and alignment.settled() is alignment.calibration
 
 
@@ -325,9 +325,8 @@ def test_a_clock_rate_that_is_small_or_in_doubt_is_not_corrected():
         assert with_rate.drifts() == certain
         assert with_rate.settled().clock_rate == (rate if certain else 0.0)
         assert with_rate.settled().clock_middle_s == alignment.calibration.clock_middle_s
-    assert on_camera_rate(simulated.imu, replace(alignment.calibration, clock_rate=0.0), camera_epoch_ns=0) is (
-        simulated.imu
-    )
+    steady = replace(alignment.calibration, clock_rate=0.0)
+    assert CameraTimedImu.from_recording(simulated.imu, steady, 0).imu is simulated.imu
 
 
 def test_jumps_of_the_poses_are_outvoted():
@@ -421,7 +420,7 @@ def test_on_real_recordings_the_own_imu_is_found_and_every_other_is_refused(reco
         for part in (trajectory, window(trajectory, 0.0, 10.0)):
             calibration = align_camera_imu(part, own)
             # camera and IMU were started together, whatever their stamps say
-            assert abs(calibration.gyro_time_offset_s + clock_shift_s(trajectory, own)) < 0.1
+            assert abs(calibration.gyro_time_offset_s + epoch_shift_s(own, trajectory.epoch_ns)) < 0.1
         for i, (other, (_, imu)) in enumerate(recordings.items()):
             if other != name:
                 with pytest.raises(NotObservableError):

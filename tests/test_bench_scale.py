@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.inertial.scale import first_seconds
 from colmap_inertial.motion.align import align_camera_imu
@@ -135,7 +136,8 @@ def test_every_constant_whose_sensitivity_is_studied_acts_on_the_estimate():
 
     def estimate(setting):
         with applied(setting) as options:
-            found = estimate_joint(s.trajectory, s.imu, changed_calibration(aligned, setting), options)
+            timed = CameraTimedImu.from_recording(s.imu, changed_calibration(aligned, setting), s.trajectory.epoch_ns)
+            found = estimate_joint(s.trajectory, timed, options)
         return found.metres_per_unit, found.sigma_log
 
     default = estimate(Setting())

@@ -5,12 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import quat_rotate
 from colmap_inertial.core.gravity import gravity_in_cam, up_in_imu
 from colmap_inertial.core.types import FrameTiming, ImuRecording
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.tools.simulate import RecordingOptions, simulate_recording
+
+
+def timed(imu, calibration, timing):
+    return CameraTimedImu.from_recording(imu, calibration, timing.epoch_ns)
 
 
 def true_down_in_cam(recording):
@@ -26,7 +31,7 @@ def test_gravity_in_the_camera_is_right_but_for_the_accelerometer_s_bias(seed):
     recording = simulate_recording(RecordingOptions(), seed=seed)
     trajectory = recording.trajectory
     timing = FrameTiming(names=trajectory.names, t_s=trajectory.t_s, epoch_ns=trajectory.epoch_ns)
-    found = gravity_in_cam(recording.imu, recording.truth.calibration, timing)
+    found = gravity_in_cam(timed(recording.imu, recording.truth.calibration, timing), timing)
     assert len(found) == len(trajectory)
     down = np.array([found[name] for name in trajectory.names])
     cosine = np.sum(down * true_down_in_cam(recording), axis=1)
@@ -41,7 +46,7 @@ def test_frames_that_the_imu_does_not_cover_get_none():
     recording = simulate_recording(RecordingOptions(), seed=4)
     trajectory = recording.trajectory
     late = FrameTiming(names=trajectory.names, t_s=trajectory.t_s + 1e4, epoch_ns=trajectory.epoch_ns)
-    assert gravity_in_cam(recording.imu, recording.truth.calibration, late) == {}
+    assert gravity_in_cam(timed(recording.imu, recording.truth.calibration, late), late) == {}
 
 
 def test_a_still_device_shows_the_mean_of_its_accelerometer():
@@ -77,7 +82,7 @@ def test_sensors_with_time_offsets_of_their_own_are_brought_together(delay_s):
     calibration = replace(calibration_prior(), gyro_time_offset_s=5.0, accel_time_offset_s=5.0 + delay_s)
     asked_s = np.arange(10.0, 30.0, 0.5)
     timing = FrameTiming(names=tuple(map(str, range(len(asked_s)))), t_s=asked_s)
-    found = np.array(list(gravity_in_cam(imu, calibration, timing).values()))
+    found = np.array(list(gravity_in_cam(timed(imu, calibration, timing), timing).values()))
     np.testing.assert_allclose(found, -up(asked_s), atol=1e-3)
 
 
@@ -87,4 +92,4 @@ def test_a_gyroscope_alone_knows_no_gravity():
     with pytest.raises(NotObservableError, match="no accelerometer"):
         up_in_imu(imu, np.zeros(3), t)
     timing = FrameTiming(names=("a",), t_s=[0.5])
-    assert gravity_in_cam(imu, calibration_prior(), timing) == {}
+    assert gravity_in_cam(timed(imu, calibration_prior(), timing), timing) == {}

@@ -7,6 +7,7 @@ from unittest import mock
 import numpy as np
 import pytest
 
+from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.geometry import matrix_from_quat, quat_from_matrix, so3_exp, so3_log
 from colmap_inertial.core.options import ScaleOptions
 from colmap_inertial.core.types import CAL, CameraTrajectory, ImuNoise, ImuRecording
@@ -24,6 +25,15 @@ from colmap_inertial.motion.align import align_camera_imu
 from colmap_inertial.tools.simulate import IMU_PRESETS
 from colmap_inertial.tools.simulate.motion import MotionOptions
 from colmap_inertial.tools.simulate.recording import RecordingOptions, SfmOptions, simulate_recording
+
+
+def timed(trajectory, imu, calibration):
+    return CameraTimedImu.from_recording(imu, calibration, trajectory.epoch_ns)
+
+
+def joint(trajectory, imu, calibration, options=None):
+    """``estimate_joint`` of a recording as it was read."""
+    return estimate_joint(trajectory, timed(trajectory, imu, calibration), options)
 
 
 @pytest.fixture(scope="module")
@@ -152,7 +162,7 @@ def test_the_arrow_solver_agrees_with_a_dense_inverse():
 
 def test_derivatives_of_all_residuals_are_those_of_finite_differences(recording, calibration):
     data, prior = prepare(
-        first_seconds(recording.trajectory, 4.0), recording.imu, calibration,
+        first_seconds(recording.trajectory, 4.0), timed(recording.trajectory, recording.imu, calibration),
         gravity_m_s2=9.8, gravity_sigma_m_s2=0.02, states_hz=5.0,
     )  # fmt: skip
     rng = np.random.default_rng(6)
@@ -214,7 +224,13 @@ def test_readings_of_both_sensors_are_found_at_the_camera_times_at_which_they_we
         accel_t_s=imu.gyro_t_s - 0.25,
         accel_m_s2=np.tile(t_s[:, None], 3),
     )
-    data, _ = prepare(recording.trajectory, clocks, apart, gravity_m_s2=9.8, gravity_sigma_m_s2=0.02, states_hz=5.0)
+    data, _ = prepare(
+        recording.trajectory,
+        timed(recording.trajectory, clocks, apart),
+        gravity_m_s2=9.8,
+        gravity_sigma_m_s2=0.02,
+        states_hz=5.0,
+    )
     for track in (data.streams.gyro, data.streams.accel):
         assert np.allclose(track.at(data.t_s)[0], data.t_s[:, None], atol=1e-9)
 
@@ -320,7 +336,9 @@ def test_a_later_picture_shows_what_the_motion_brings(recording):
     """The derivatives of the pictures by the time offset and the clock rate are how the camera moves."""
     truth, trajectory = recording.truth, recording.trajectory.select(np.arange(0, 300, 15))
     known = replace(truth.calibration, cov=np.diag([1e-6] * 12))
-    data, prior = prepare(trajectory, recording.imu, known, gravity_m_s2=9.8, gravity_sigma_m_s2=0.02, states_hz=5.0)
+    data, prior = prepare(
+        trajectory, timed(trajectory, recording.imu, known), gravity_m_s2=9.8, gravity_sigma_m_s2=0.02, states_hz=5.0
+    )
     cam_from_imu, lever = matrix_from_quat(known.cam_from_imu_xyzw), np.array([0.3, -0.2, 0.1])
 
     def states(t_s):
@@ -369,7 +387,7 @@ def test_a_late_alignment_is_corrected_for_both_sensors(recording, calibration):
         gyro_time_offset_s=calibration.gyro_time_offset_s + 0.005,
         accel_time_offset_s=calibration.accel_time_offset_s + 0.005,
     )
-    found = [estimate_joint(recording.trajectory, recording.imu, one).calibration for one in (known, late)]
+    found = [joint(recording.trajectory, recording.imu, one).calibration for one in (known, late)]
     for refined in found:
         assert refined.gyro_time_offset_s == pytest.approx(found[0].gyro_time_offset_s, abs=3e-4)
         assert refined.accel_time_offset_s - refined.gyro_time_offset_s == pytest.approx(delay_s, abs=3e-4)
@@ -442,7 +460,7 @@ def test_a_lever_arm_along_the_optical_axis_is_found_where_the_device_is_no_phon
 
 
 def test_scale_gravity_bias_and_calibration_are_recovered(recording, calibration):
-    estimate = estimate_joint(recording.trajectory, recording.imu, calibration)
+    estimate = joint(recording.trajectory, recording.imu, calibration)
     truth = recording.truth
     assert estimate.verdict == "trusted"
     assert estimate.ci95[0] < truth.metres_per_unit < estimate.ci95[1]
@@ -461,7 +479,7 @@ def test_scale_and_gravity_err_together_as_the_covariance_says(recording, calibr
     """Another strength of gravity moves the scale by their covariance over the prior's variance."""
     sigma, change = 0.1, 0.02
     low, high = (
-        estimate_joint(
+        joint(
             recording.trajectory,
             recording.imu,
             calibration,
@@ -478,8 +496,8 @@ def test_scale_and_gravity_err_together_as_the_covariance_says(recording, calibr
 def test_the_scale_of_the_model_drops_out(recording, calibration):
     trajectory = recording.trajectory
     larger = replace(trajectory, cam_in_world=trajectory.cam_in_world * 1000)
-    one = estimate_joint(trajectory, recording.imu, calibration)
-    other = estimate_joint(larger, recording.imu, calibration)
+    one = joint(trajectory, recording.imu, calibration)
+    other = joint(larger, recording.imu, calibration)
     assert other.metres_per_unit * 1000 == pytest.approx(one.metres_per_unit, rel=1e-4)
 
 
@@ -488,7 +506,7 @@ def test_keyframes_seconds_apart_give_the_scale_too(calibration):
     rng = np.random.default_rng(0)
     keep = np.cumsum(rng.integers(3, 60, 200))
     sparse = recording.trajectory.select(keep[keep < len(recording.trajectory)])
-    estimate = estimate_joint(sparse, recording.imu, align_camera_imu(recording.trajectory, recording.imu))
+    estimate = joint(sparse, recording.imu, align_camera_imu(recording.trajectory, recording.imu))
     assert estimate.ci95[0] < recording.truth.metres_per_unit < estimate.ci95[1]
     assert estimate.verdict == "trusted"
 
@@ -503,8 +521,8 @@ def test_covariances_of_poses_are_used(recording, calibration):
     cov[:, 3:, 3:] = (sigma**2)[:, None, None] * np.eye(3)
     blind = replace(trajectory, cam_in_world=centre)
     told = replace(blind, pose_cov=cov)
-    without = estimate_joint(blind, recording.imu, calibration)
-    with_cov = estimate_joint(told, recording.imu, calibration)
+    without = joint(blind, recording.imu, calibration)
+    with_cov = joint(told, recording.imu, calibration)
     assert with_cov.sigma_log < without.sigma_log
     assert with_cov.ci95[0] < recording.truth.metres_per_unit < with_cov.ci95[1]
 
@@ -514,8 +532,8 @@ def test_pose_jumps_do_not_matter(recording, calibration):
     centre = trajectory.cam_in_world.copy()
     centre[100:106] += 0.1 / recording.truth.metres_per_unit
     centre[300:303] -= 0.2 / recording.truth.metres_per_unit
-    clean = estimate_joint(trajectory, recording.imu, calibration)
-    jumped = estimate_joint(replace(trajectory, cam_in_world=centre), recording.imu, calibration)
+    clean = joint(trajectory, recording.imu, calibration)
+    jumped = joint(replace(trajectory, cam_in_world=centre), recording.imu, calibration)
     assert jumped.ci95[0] < recording.truth.metres_per_unit < jumped.ci95[1]
     assert jumped.metres_per_unit == pytest.approx(clean.metres_per_unit, rel=0.01)
 
@@ -538,7 +556,7 @@ def test_a_pause_of_the_imu_is_bridged_and_named(recording, calibration):
 def test_a_break_of_the_path_does_no_harm_and_is_named(recording, calibration, shift_m):
     centre = recording.trajectory.cam_in_world.copy()
     centre[280:] += np.array([1.0, -0.5, 0.3]) * shift_m / recording.truth.metres_per_unit
-    estimate = estimate_joint(replace(recording.trajectory, cam_in_world=centre), recording.imu, calibration)
+    estimate = joint(replace(recording.trajectory, cam_in_world=centre), recording.imu, calibration)
     assert estimate.ci95[0] < recording.truth.metres_per_unit < estimate.ci95[1]
     assert shift_m < 0.1 or any("jump" in note for note in estimate.notes)
 
@@ -548,7 +566,7 @@ def test_motion_that_cannot_give_a_scale_is_refused(kind):
     recording = simulate_recording(RecordingOptions(motion=MotionOptions(kind=kind, duration_s=30.0)), seed=1)
     truth = recording.truth.calibration
     cov = np.diag(np.array([0.01] * 3 + [0.002, 0.02] + [0.01] * 3 + [0.08] * 3 + [0.02]) ** 2)
-    estimate = estimate_joint(recording.trajectory, recording.imu, replace(truth, cov=cov))
+    estimate = joint(recording.trajectory, recording.imu, replace(truth, cov=cov))
     assert estimate.verdict == "refused" and estimate.metres_per_unit is None
     assert any("back and forth" in reason for reason in estimate.reasons)
 
@@ -560,7 +578,7 @@ def test_motion_that_cannot_give_a_scale_is_refused(kind):
 )
 def test_a_wrong_accelerometer_is_never_trusted(recording, calibration, wrong):
     imu = replace(recording.imu, accel_m_s2=recording.imu.accel_m_s2 @ wrong.T)
-    estimate = estimate_joint(recording.trajectory, imu, calibration)
+    estimate = joint(recording.trajectory, imu, calibration)
     assert estimate.verdict == "refused"
 
 
@@ -587,7 +605,7 @@ def test_noise_of_the_accelerometer_does_not_look_like_a_smaller_gain():
     for seed in range(4):
         recording, imu, calibration = shaken(seed, 0.1, 0.0)
         with mock.patch.object(_setup, "PRIORS", replace(PRIORS, accel_gain=0.03)):
-            _, fit, _ = fit_path(recording.trajectory, imu, calibration, JointOptions())
+            _, fit, _ = fit_path(recording.trajectory, timed(recording.trajectory, imu, calibration), JointOptions())
         assert fit.noise.accel_density_m_s2_rthz == pytest.approx(0.1, rel=0.2)
         gains.append(np.trace(fit.estimate.accel_gain) / 3)
     # noise is a hundredth of the motion's variance, which a regression on the readings takes from the gain
@@ -597,7 +615,7 @@ def test_noise_of_the_accelerometer_does_not_look_like_a_smaller_gain():
 def test_errors_of_a_shaken_accelerometer_that_stay_for_a_while_are_told_from_white_noise():
     for seed in range(2):
         recording, imu, calibration = shaken(seed, 0.0, 0.06)
-        data, fit, _ = fit_path(recording.trajectory, imu, calibration, JointOptions())
+        data, fit, _ = fit_path(recording.trajectory, timed(recording.trajectory, imu, calibration), JointOptions())
         assert fit.noise.accel_slow_m_s2_rts == pytest.approx(0.06, rel=0.35)
         assert fit.noise.accel_density_m_s2_rthz < 0.015
         found = scale_of(fit, data.t_s, False)
@@ -607,7 +625,7 @@ def test_errors_of_a_shaken_accelerometer_that_stay_for_a_while_are_told_from_wh
 
 def test_what_residuals_lose_to_the_fit_is_the_trace_of_a_dense_inverse(recording, calibration):
     data, prior = prepare(
-        first_seconds(recording.trajectory, 3.0), recording.imu, calibration,
+        first_seconds(recording.trajectory, 3.0), timed(recording.trajectory, recording.imu, calibration),
         gravity_m_s2=9.8, gravity_sigma_m_s2=0.02, states_hz=5.0,
     )  # fmt: skip
     k, m, n = len(data.t_s), par.N_STATE, par.N_GLOBALS
@@ -639,7 +657,7 @@ def test_what_residuals_lose_to_the_fit_is_the_trace_of_a_dense_inverse(recordin
 def test_a_wrong_gain_is_named():
     recording = simulate_recording(RecordingOptions(motion=MotionOptions(kind="roam", duration_s=40.0)), seed=7)
     imu = replace(recording.imu, accel_m_s2=1.1 * recording.imu.accel_m_s2)
-    estimate = estimate_joint(recording.trajectory, imu, align_camera_imu(recording.trajectory, imu))
+    estimate = joint(recording.trajectory, imu, align_camera_imu(recording.trajectory, imu))
     assert estimate.verdict != "trusted" and any("gain" in reason for reason in estimate.reasons)
 
 
@@ -648,13 +666,13 @@ def test_a_scale_that_changes_halfway_is_noticed(recording, calibration):
     half = len(trajectory) // 2
     centre = trajectory.cam_in_world.copy()
     centre[half:] = centre[half] + 1.2 * (centre[half:] - centre[half])
-    estimate = estimate_joint(replace(trajectory, cam_in_world=centre), recording.imu, calibration)
+    estimate = joint(replace(trajectory, cam_in_world=centre), recording.imu, calibration)
     assert estimate.verdict != "trusted"
     assert any("not the same throughout" in reason for reason in estimate.reasons)
 
 
 def test_too_few_frames_are_refused(recording, calibration):
-    estimate = estimate_joint(first_seconds(recording.trajectory, 1.0), recording.imu, calibration)
+    estimate = joint(first_seconds(recording.trajectory, 1.0), recording.imu, calibration)
     assert estimate.verdict == "refused" and "longer" in estimate.reasons[0]
 
 
@@ -670,7 +688,7 @@ def test_intervals_cover_the_truth_of_simulated_recordings():
     for seed in range(30, 46):
         recording = simulate_recording(options, seed=seed)
         calibration = align_camera_imu(recording.trajectory, recording.imu)
-        estimate = estimate_joint(recording.trajectory, replace(recording.imu, noise=None), calibration)
+        estimate = joint(recording.trajectory, replace(recording.imu, noise=None), calibration)
         errors.append(np.log(estimate.metres_per_unit / recording.truth.metres_per_unit) / estimate.sigma_log)
         inside += estimate.ci95[0] < recording.truth.metres_per_unit < estimate.ci95[1]
     # Of 16, fewer than 13 fall inside a true 95 % interval once in a hundred studies

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.geometry import quat_exp, quat_multiply, so3_exp
 from colmap_inertial.inertial.scale import _spectral_fit as spectral_fit
 from colmap_inertial.inertial.scale._spectra import Signals
@@ -22,6 +23,15 @@ from colmap_inertial.tools.simulate import (
 )
 
 RECORDINGS = ("D1", "D3", "D5", "D7", "D9", "D11", "D13", "D15")
+
+
+def timed(trajectory, imu, calibration):
+    return CameraTimedImu.from_recording(imu, calibration, trajectory.epoch_ns)
+
+
+def spectral(trajectory, imu, calibration, options=None):
+    """``estimate_spectral`` of a recording as it was read."""
+    return estimate_spectral(trajectory, timed(trajectory, imu, calibration), options)
 
 
 def known(simulated, **changes):
@@ -50,7 +60,7 @@ def test_intervals_cover_the_truth_and_nothing_pulls_the_scale(device):
         options = RecordingOptions(motion=MotionOptions(duration_s=25.0), imu=IMU_PRESETS[device], sfm=sfm)
         simulated = simulate_recording(options, seed=100 + seed)
         calibration = align_camera_imu(simulated.trajectory, simulated.imu)
-        estimate = estimate_spectral(simulated.trajectory, simulated.imu, calibration)
+        estimate = spectral(simulated.trajectory, simulated.imu, calibration)
         assert estimate.verdict in ("trusted", "weak")
         errors.append(log_error(estimate, simulated))
         sigmas.append(estimate.sigma_log)
@@ -70,23 +80,23 @@ def test_intervals_cover_the_truth_and_nothing_pulls_the_scale(device):
 
 
 def test_the_unit_of_the_model_does_not_matter(handheld):
-    here = estimate_spectral(handheld.trajectory, handheld.imu, known(handheld))
+    here = spectral(handheld.trajectory, handheld.imu, known(handheld))
     centre = 1000 * handheld.trajectory.cam_in_world + np.array([5e4, 0.0, -3e4])
-    there = estimate_spectral(replace(handheld.trajectory, cam_in_world=centre), handheld.imu, known(handheld))
+    there = spectral(replace(handheld.trajectory, cam_in_world=centre), handheld.imu, known(handheld))
     assert 1000 * there.metres_per_unit == pytest.approx(here.metres_per_unit, rel=1e-4)
     assert there.sigma_log == pytest.approx(here.sigma_log, rel=0.02)
     assert there.verdict == here.verdict == "trusted"
 
 
 def test_a_turned_model_turns_gravity_and_nothing_else(handheld):
-    here = estimate_spectral(handheld.trajectory, handheld.imu, known(handheld))
+    here = spectral(handheld.trajectory, handheld.imu, known(handheld))
     turn = np.array([0.4, -1.1, 0.7])
     turned = replace(
         handheld.trajectory,
         cam_in_world=handheld.trajectory.cam_in_world @ so3_exp(turn).T,
         cam_from_world_xyzw=quat_multiply(handheld.trajectory.cam_from_world_xyzw, quat_exp(-turn)),
     )
-    there = estimate_spectral(turned, handheld.imu, known(handheld))
+    there = spectral(turned, handheld.imu, known(handheld))
     assert there.metres_per_unit == pytest.approx(here.metres_per_unit, rel=1e-5)
     assert np.allclose(there.gravity_in_world_m_s2, so3_exp(turn) @ here.gravity_in_world_m_s2, atol=1e-4)
     assert np.allclose(there.accel_bias_m_s2, here.accel_bias_m_s2, atol=1e-4)
@@ -96,7 +106,7 @@ def test_magnitudes_hardly_mind_a_wrong_time_offset(handheld):
     right = known(handheld)
     for late_s, limit in ((0.02, 0.01), (0.04, 0.03)):
         late = replace(right, accel_time_offset_s=right.accel_time_offset_s + late_s)
-        estimate = estimate_spectral(handheld.trajectory, handheld.imu, late)
+        estimate = spectral(handheld.trajectory, handheld.imu, late)
         assert abs(log_error(estimate, handheld)) < min(limit, 2 * estimate.sigma_log)
 
 
@@ -106,13 +116,13 @@ def test_noise_of_the_positions_does_not_shrink_the_scale():
         noisy = SfmOptions(position_white_m=0.01, position_correlated_m=0.0)
         options = RecordingOptions(motion=MotionOptions(duration_s=40.0), sfm=noisy)
         simulated = simulate_recording(options, seed=200 + seed)
-        estimate = estimate_spectral(simulated.trajectory, simulated.imu, known(simulated))
+        estimate = spectral(simulated.trajectory, simulated.imu, known(simulated))
         errors.append(log_error(estimate, simulated))
     assert abs(np.mean(errors)) < 0.007
 
 
 def test_gravity_s_strength_is_held_at_what_was_given(handheld):
-    estimate = estimate_spectral(handheld.trajectory, handheld.imu, known(handheld), SpectralOptions(gravity_m_s2=9.78))
+    estimate = spectral(handheld.trajectory, handheld.imu, known(handheld), SpectralOptions(gravity_m_s2=9.78))
     assert np.linalg.norm(estimate.gravity_in_world_m_s2) == pytest.approx(9.78)
 
 
@@ -123,13 +133,13 @@ def test_a_jump_of_the_poses_and_missing_frames_are_survived(handheld):
     broken = replace(trajectory, cam_in_world=centre).select(
         np.flatnonzero((trajectory.t_s < 17.0) | (trajectory.t_s > 18.5))
     )
-    estimate = estimate_spectral(broken, handheld.imu, known(handheld))
+    estimate = spectral(broken, handheld.imu, known(handheld))
     assert abs(log_error(estimate, handheld)) < 3 * estimate.sigma_log
     assert estimate.verdict in ("trusted", "weak")
 
 
 def test_derivatives_of_the_magnitudes_are_right(handheld):
-    signals = Signals.of(handheld.trajectory, handheld.imu, known(handheld))
+    signals = Signals.of(handheld.trajectory, timed(handheld.trajectory, handheld.imu, known(handheld)))
     data = signals.spectra(1.2)
     prior = spectral_fit._prior(known(handheld))
     state, noise = spectral_fit._linear_start(data, prior, 9.80665)
@@ -152,7 +162,7 @@ def test_motion_without_acceleration_gives_no_number(kind):
     for seed in range(4):
         options = RecordingOptions(motion=MotionOptions(kind=kind, duration_s=20.0))
         simulated = simulate_recording(options, seed=seed)
-        estimate = estimate_spectral(simulated.trajectory, simulated.imu, known(simulated))
+        estimate = spectral(simulated.trajectory, simulated.imu, known(simulated))
         assert estimate.verdict == "refused"
         assert estimate.metres_per_unit is None
         assert any("record" in reason or "swing" in reason for reason in estimate.reasons)
@@ -170,7 +180,7 @@ def test_motion_without_acceleration_gives_no_number(kind):
 )
 def test_a_spoilt_accelerometer_gives_no_number(handheld, spoil, reason):
     imu = replace(handheld.imu, accel_m_s2=spoil(handheld.imu.accel_m_s2))
-    estimate = estimate_spectral(handheld.trajectory, imu, known(handheld))
+    estimate = spectral(handheld.trajectory, imu, known(handheld))
     assert estimate.verdict == "refused"
     assert re.search(reason, " ".join(estimate.reasons))
 
@@ -178,13 +188,13 @@ def test_a_spoilt_accelerometer_gives_no_number(handheld, spoil, reason):
 def test_what_cannot_be_differentiated_is_refused(handheld):
     calibration = known(handheld)
     sparse = handheld.trajectory.select(slice(None, None, 10))
-    assert "joint" in estimate_spectral(sparse, handheld.imu, calibration).reasons[0]
+    assert "joint" in spectral(sparse, handheld.imu, calibration).reasons[0]
     short = handheld.trajectory.select(slice(0, 60))
-    assert "record longer" in estimate_spectral(short, handheld.imu, calibration).reasons[0]
+    assert "record longer" in spectral(short, handheld.imu, calibration).reasons[0]
     later = replace(handheld.imu, accel_t_s=handheld.imu.accel_t_s + 29.0)
-    assert estimate_spectral(handheld.trajectory, later, calibration).verdict == "refused"
+    assert spectral(handheld.trajectory, later, calibration).verdict == "refused"
     frozen = replace(handheld.trajectory, cam_in_world=np.zeros_like(handheld.trajectory.cam_in_world))
-    assert "does not move" in estimate_spectral(frozen, handheld.imu, calibration).reasons[0]
+    assert "does not move" in spectral(frozen, handheld.imu, calibration).reasons[0]
 
 
 # --- real recordings
@@ -205,7 +215,7 @@ def test_real_recordings_have_the_published_accuracy_or_better(recordings, secon
     errors, inside = [], []
     for trajectory, imu, truth in recordings:
         part = trajectory.select(trajectory.t_s < trajectory.t_s[0] + seconds)
-        estimate = estimate_spectral(part, imu, align_camera_imu(part, imu))
+        estimate = spectral(part, imu, align_camera_imu(part, imu))
         assert estimate.verdict in ("trusted", "weak")
         errors.append(100 * abs(estimate.metres_per_unit / truth - 1))
         low, high = estimate.ci95
@@ -219,5 +229,5 @@ def test_another_recording_s_accelerometer_is_not_trusted(recordings):
     trajectory, _, _ = recordings[0]
     own_trajectory, own_imu, _ = recordings[4]
     calibration = align_camera_imu(own_trajectory, own_imu)
-    estimate = estimate_spectral(trajectory, own_imu, calibration)
+    estimate = spectral(trajectory, own_imu, calibration)
     assert estimate.verdict != "trusted"

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.options import ScaleOptions
 from colmap_inertial.core.types import CAL, IMU_CAL, ImuCalibration
 from colmap_inertial.inertial.core import parameters as par
@@ -150,8 +151,9 @@ def test_a_sound_accelerometer_raises_no_suspicion(seed):
 def prepared(recording):
     return prepare(
         recording.trajectory,
-        recording.imu,
-        align_camera_imu(recording.trajectory, recording.imu),
+        CameraTimedImu.from_recording(
+            recording.imu, align_camera_imu(recording.trajectory, recording.imu), recording.trajectory.epoch_ns
+        ),
         gravity_m_s2=9.80665,
         gravity_sigma_m_s2=0.02,
         states_hz=8.0,

@@ -6,6 +6,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import (
     matrix_from_quat,
@@ -374,7 +375,9 @@ def test_orientation_follows_the_gyroscope_quickly_and_the_camera_slowly():
         gyro_bias_rad_s=truth.calibration.gyro_bias_rad_s + 0.001,
         cov=np.diag([0.0] * 5 + [0.001**2] * 3 + [0.0] * 4),
     )
-    attitude = smooth_attitude(metric(simulated), simulated.imu, biased)
+    attitude = smooth_attitude(
+        metric(simulated), CameraTimedImu.from_recording(simulated.imu, biased, simulated.trajectory.epoch_ns)
+    )
     true = quat_multiply(quat_conjugate(truth.cam_from_model_xyzw(attitude.t_s)), truth.calibration.cam_from_imu_xyzw)
     error = quat_log(quat_multiply(attitude.world_from_imu_xyzw, quat_conjugate(true)))
     # the bias alone would make 0.06 rad; a frame alone has 0.006

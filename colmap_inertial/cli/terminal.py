@@ -151,7 +151,7 @@ def show_calibration(calibration: CameraImuCalibration, source: Path, kept: Path
     spread_deg = math.degrees(calibration.rotation_sigma_rad)
     bias = ", ".join(f"{value:+.4f}" for value in calibration.gyro_bias_rad_s)
     bias_spread = max(calibration.sigma(f"gyro_bias_{axis}_rad_s") for axis in "xyz")
-    offset, offset_ms = calibration.gyro_time_offset_s, 1e3 * calibration.sigma("gyro_time_offset_s")
+    offset, offset_ms = calibration.clock_offset_s, 1e3 * calibration.clock_sigma_s
     lines: list[Line] = [
         ("rotation", f"camera from IMU, xyzw: {rotation}, +-{spread_deg:.2g} deg"),
         ("time offset", f"{offset:+.4f} s, +-{offset_ms:.2g} ms (camera time = stamp + offset)"),

@@ -9,8 +9,8 @@ import numpy as np
 
 from colmap_inertial.colmap.gyro_bias import RayPairs, bias_correction
 from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
+from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.geometry import so3_log
-from colmap_inertial.core.gyro import on_camera_rate
 from colmap_inertial.core.sampling import is_gap
 from colmap_inertial.core.types import (
     CAL,
@@ -81,8 +81,7 @@ class GyroOrientations:
         camera: CameraModel | None,
     ) -> GyroOrientations:
         """Of the frames of ``timing``, by a calibration that fits the recording."""
-        steady = on_camera_rate(imu, calibration, camera_epoch_ns=timing.epoch_ns)
-        motion = GyroCamera.of(steady, calibration, camera_epoch_ns=timing.epoch_ns)
+        motion = GyroCamera.from_timed(CameraTimedImu.from_recording(imu, calibration, timing.epoch_ns))
         t_s = timing.pose_t_s()
         on_gyro_s, path = t_s - motion.offset_s, motion.path
         inside = (on_gyro_s >= path.t_s[0]) & (on_gyro_s <= path.t_s[-1])
@@ -111,7 +110,7 @@ class GyroOrientations:
         bias = self.bias_lever_s[j] - self.bias_lever_s[i]
         gain = (self.gain_lever_rad[j] - self.gain_lever_rad[i]) * np.array([*[_GAIN_SIGMA] * 3, *[_AXIS_SIGMA] * 3])
         dt_s = np.abs(self.t_s[j] - self.t_s[i])
-        offset_rad = self.calibration.sigma("gyro_time_offset_s") * np.hypot(self.rate_rad_s[i], self.rate_rad_s[j])
+        offset_rad = self.calibration.clock_sigma_s * np.hypot(self.rate_rad_s[i], self.rate_rad_s[j])
         noise = self.density_rad_s_rthz**2 * dt_s + self.walk_rad_s_rts**2 * dt_s**3 / 3 + offset_rad**2
         # an error of the rotation between the sensors acts on both frames; at most twice where they look apart
         noise = noise + (2 * self.calibration.rotation_sigma_rad) ** 2
@@ -186,8 +185,8 @@ def estimate_gyro_orientations(
     )
     options = AlignOptions(max_offset_s=recording.max_offset_s)
     found = align_clocks(visual.trajectory(), recording.imu, prior=recording.prior, options=options).settled()
-    steady = on_camera_rate(recording.imu, found, camera_epoch_ns=timing.epoch_ns)
-    motion, t_s = GyroCamera.of(steady, found, camera_epoch_ns=timing.epoch_ns), timing.pose_t_s()
+    motion = GyroCamera.from_timed(CameraTimedImu.from_recording(recording.imu, found, timing.epoch_ns))
+    t_s = timing.pose_t_s()
     covered = motion.covers(t_s[pairs.first], t_s[pairs.second])
     lever = motion.path.bias_lever(t_s - motion.offset_s)
     change, covariance = bias_correction(pairs.only(covered), motion.start_from_cam(t_s), lever)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from colmap_inertial.core.arrays import AnyArray, Array
+from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import quat_conjugate, quat_rotate
 from colmap_inertial.core.gyro import GyroPath
-from colmap_inertial.core.types import CameraImuCalibration, FrameTiming, ImuRecording
+from colmap_inertial.core.types import FrameTiming, ImuRecording
 
 #: Hand and walking accelerations average out over this time; the gyro carries the attitude meanwhile.
 _AVERAGING_S = 3.0
@@ -68,16 +69,15 @@ def _convolve_same(signal: AnyArray, window: Array) -> Array:
     return np.convolve(signal, window)[half : half + len(signal)]
 
 
-def gravity_in_cam(imu: ImuRecording, calibration: CameraImuCalibration, timing: FrameTiming) -> dict[str, Array]:
+def gravity_in_cam(timed: CameraTimedImu, timing: FrameTiming) -> dict[str, Array]:
     """Each frame's gravity direction (down, unit vector, camera frame) by name, for frames that the IMU covers;
     none without an accelerometer."""
+    imu, calibration = timed.imu, timed.calibration
     if not imu.has_accel:
         return {}
-    shift_s = (imu.epoch_ns - timing.epoch_ns) * 1e-9
-    query_s = timing.pose_t_s() - calibration.gyro_time_offset_s - shift_s
+    query_s = timing.pose_t_s() - timed.gyro_offset_s
     covered = (query_s >= imu.gyro_t_s[0]) & (query_s <= imu.gyro_t_s[-1])
-    delay_s = calibration.accel_time_offset_s - calibration.gyro_time_offset_s
-    up = up_in_imu(imu, calibration.gyro_bias_rad_s, query_s[covered], delay_s)
+    up = up_in_imu(imu, calibration.gyro_bias_rad_s, query_s[covered], calibration.accel_delay_s)
     down_in_cam = -quat_rotate(calibration.cam_from_imu_xyzw, up)
     names = [name for name, inside in zip(timing.names, covered, strict=True) if inside]
     return dict(zip(names, down_in_cam, strict=True))

@@ -1,9 +1,8 @@
-"""The gyroscope integrated to orientations that can be read at any instant, and brought to the camera's rate."""
+"""The gyroscope integrated to orientations that can be read at any instant."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -19,7 +18,6 @@ from colmap_inertial.core.geometry import (
     quat_multiply,
 )
 from colmap_inertial.core.sampling import Coverage
-from colmap_inertial.core.types import CameraImuCalibration, ImuRecording
 
 #: Order of the differences by which noise is told from motion; what the median of a normal distribution's sizes is.
 _DIFFERENCES, _NORMAL_MEDIAN = 5, 0.6745
@@ -135,30 +133,3 @@ def _by_symmetric(rate: Array) -> Array:
     for entry, (i, j) in enumerate(((1, 2), (0, 2), (0, 1)), start=3):
         out[:, i, entry], out[:, j, entry] = rate[:, j], rate[:, i]
     return out
-
-
-def on_camera_rate(imu: ImuRecording, calibration: CameraImuCalibration, *, camera_epoch_ns: int) -> ImuRecording:
-    """A recording with stamps that keep step with the camera: the calibration's time offsets then hold throughout.
-
-    Parameters
-    ----------
-    imu
-        The recording as it was read. One whose clock keeps step is returned as it is.
-    calibration
-        Its clock rate, and when its offsets hold.
-    camera_epoch_ns
-        Epoch of the frame times that ``calibration.clock_middle_s`` is counted from.
-    """
-    rate = calibration.clock_rate
-    if rate == 0:
-        return imu
-    offset_s = calibration.gyro_time_offset_s + (imu.epoch_ns - camera_epoch_ns) * 1e-9
-    fixed_s = calibration.clock_middle_s - offset_s
-
-    def stretched(t_s: Array) -> Array:
-        return np.asarray(fixed_s + (t_s - fixed_s) / (1 - rate))
-
-    note = f"the IMU's clock is {1e6 * rate:+.0f} ppm off the camera's: its stamps were stretched to keep step"
-    return replace(
-        imu, gyro_t_s=stretched(imu.gyro_t_s), accel_t_s=stretched(imu.accel_t_s), repairs=(*imu.repairs, note)
-    )

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from colmap_inertial.core.arrays import Array, BoolArray
+from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_multiply, quat_rotate, skew, so3_log
 from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.types import CAL, CameraImuCalibration, FrameTiming, ImuRecording, ReadoutDirection
@@ -46,7 +47,7 @@ class MotionErrors:
         bias = bias * min(1.0, MOST_BIAS_RAD_S**2 / max(float(np.diagonal(bias).max()), 1e-30))
         return cls(
             rotation_cov_rad2=calibration.cov[CAL.ROTATION, CAL.ROTATION],
-            offset_sigma_s=calibration.sigma("gyro_time_offset_s"),
+            offset_sigma_s=calibration.clock_sigma_s,
             rate_cov_rad2_s2=turn @ bias @ turn.T,
         )
 
@@ -85,10 +86,16 @@ class GyroCamera:
         camera_epoch_ns
             Epoch of the frame times (``FrameTiming.epoch_ns``).
         """
+        return cls.from_timed(CameraTimedImu(imu=imu, calibration=calibration, camera_epoch_ns=camera_epoch_ns))
+
+    @classmethod
+    def from_timed(cls, timed: CameraTimedImu) -> GyroCamera:
+        """The camera of a recording on the camera's clock."""
+        imu, calibration = timed.imu, timed.calibration
         return cls(
             path=GyroPath(imu.gyro_t_s, imu.gyro_rad_s, calibration.gyro_bias_rad_s),
             cam_from_imu_xyzw=calibration.cam_from_imu_xyzw,
-            offset_s=calibration.gyro_time_offset_s + (imu.epoch_ns - camera_epoch_ns) * 1e-9,
+            offset_s=timed.gyro_offset_s,
             errors=MotionErrors.of(calibration),
         )
 

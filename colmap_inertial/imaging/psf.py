@@ -9,8 +9,8 @@ from typing import Protocol
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
-from colmap_inertial.core.gyro import on_camera_rate
 from colmap_inertial.core.types import CameraImuCalibration, FrameTiming, ImuRecording, Projector
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath, middles, samples_for
@@ -65,8 +65,7 @@ def frame_blur(
     """
     if name not in timing.names:
         raise ValueError(f"{name}: no such frame among the {len(timing.names)} of the timing")
-    imu = on_camera_rate(imu, calibration, camera_epoch_ns=timing.epoch_ns)
-    motion = GyroCamera.of(imu, calibration, camera_epoch_ns=timing.epoch_ns)
+    motion = GyroCamera.from_timed(CameraTimedImu.from_recording(imu, calibration, timing.epoch_ns))
     shutter = FrameShutter.of(timing, timing.names.index(name), width=camera.width, height=camera.height)
     return blur_field(motion, camera, shutter)
 

@@ -166,12 +166,9 @@ def for_another_recording(calibration: CameraImuCalibration, *, shared_clock: bo
     cov[opened, :] = cov[:, opened] = 0.0
     cov[opened, opened] = np.square([_unknown_offset_s(shared_clock), *[SIGMAS.unknown_gyro_bias_rad_s] * 3])
     cov = back @ cov @ back.T
-    delay_s = calibration.accel_time_offset_s - calibration.gyro_time_offset_s
     gyro_offset_s = calibration.gyro_time_offset_s if shared_clock else 0.0
     return replace(
-        calibration,
-        gyro_time_offset_s=gyro_offset_s,
-        accel_time_offset_s=gyro_offset_s + delay_s,
+        calibration.replace_clock_offset(gyro_offset_s, calibration.accel_delay_s),
         clock_rate=0.0,
         clock_middle_s=0.0,
         cov=0.5 * (cov + cov.T),

@@ -14,7 +14,7 @@ from colmap_inertial.core.sampling import without_running_mean
 from colmap_inertial.core.types import CameraTrajectory, ImuRecording
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.motion.align import Alignment
-from colmap_inertial.motion.align._acceleration import quick_accelerations
+from colmap_inertial.motion.align.acceleration import quick_accelerations
 
 #: Clock rates: phones keep within 1e-4, action cameras within 1 %; the scale is corrected for what is found.
 _RATE, _WRONG_RATE, _WRONG_FRAME_RATE = 0.003, 0.012, 0.1
@@ -132,7 +132,7 @@ def _as_it_would_fit(recorded: Recorded, imu: ImuRecording) -> Finding | None:
     found = recorded.align(imu, any_offset=True)
     if not isinstance(found, Alignment):
         return None
-    offset_s = found.calibration.gyro_time_offset_s
+    offset_s = found.calibration.clock_offset_s
     return Finding(
         code="clock-offset",
         severity="error",

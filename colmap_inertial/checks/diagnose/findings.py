@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 
 from colmap_inertial.core.arrays import Int64Array
+from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError
 from colmap_inertial.core.types import (
     CameraImuCalibration,
@@ -238,7 +239,8 @@ class Recorded:
         """Camera time since that epoch = gyroscope time since its own + this; ``None`` where it was not found."""
         if self.imu is None or not isinstance(self.aligned, Alignment):
             return None
-        return self.aligned.calibration.gyro_time_offset_s + (self.imu.epoch_ns - camera_epoch_ns) * 1e-9
+        timed = CameraTimedImu(imu=self.imu, calibration=self.aligned.calibration, camera_epoch_ns=camera_epoch_ns)
+        return timed.gyro_offset_s
 
     def align(self, imu: ImuRecording, *, any_offset: bool = False) -> Alignment | NotObservableError | None:
         """The same with another reading of the gyroscope, or at any offset of the clocks."""

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from colmap_inertial.checks.diagnose.findings import Finding, Recorded, Severity
+from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
-from colmap_inertial.core.gyro import on_camera_rate
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.motion.align import Alignment
 from colmap_inertial.motion.shutter import ReadoutEstimate, estimate_readout
@@ -137,9 +137,8 @@ def _readout(recorded: Recorded) -> ReadoutEstimate:
         raise NotObservableError("readout", "a video and its gyroscope would tell, where they fit each other")
     if recorded.stabilisation is not None and recorded.stabilisation.stabilised:
         raise NotObservableError("readout", "a stabilised video tells nothing of it")
-    settled = aligned.settled()
-    kept = on_camera_rate(imu, settled, camera_epoch_ns=rotation.epoch_ns)
-    return estimate_readout(rotation, GyroCamera.of(kept, settled, camera_epoch_ns=rotation.epoch_ns))
+    timed = CameraTimedImu.from_recording(imu, aligned.settled(), rotation.epoch_ns)
+    return estimate_readout(rotation, GyroCamera.from_timed(timed))
 
 
 def check_cut_from_video(recorded: Recorded) -> Iterator[Finding]:

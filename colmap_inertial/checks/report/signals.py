@@ -13,15 +13,14 @@ import numpy as np
 
 from colmap_inertial.checks.report.series import rounded, thinned
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.camera_clock import CameraTimedImu, epoch_shift_s
 from colmap_inertial.core.geometry import quat_conjugate, quat_rotate, rotation_between, so3_log
-from colmap_inertial.core.gyro import GyroPath, on_camera_rate
+from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import (
-    CameraImuCalibration,
     CameraTrajectory,
     ImuRecording,
     ScaleEstimate,
-    clock_shift_s,
 )
 from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.inertial.scale import check_units
@@ -90,8 +89,8 @@ def signal_record(
     rates = _Rates.of(trajectory)
     aligned = None
     if calibration is not None:
-        imu = on_camera_rate(imu, calibration, camera_epoch_ns=trajectory.epoch_ns)
-        aligned = GyroCamera.of(imu, calibration, camera_epoch_ns=trajectory.epoch_ns)
+        timed = CameraTimedImu.from_recording(imu, calibration, trajectory.epoch_ns)
+        imu, aligned = timed.imu, GyroCamera.from_timed(timed)
     record["rotation"] = _rotation(trajectory, imu, rates, aligned, start_s)
     no_accel = "The recording has no accelerometer."
     if aligned is None or calibration is None:
@@ -109,7 +108,7 @@ def signal_record(
     if not imu.has_accel:
         record["acceleration"] = record["acceleration_spectrum"] = {"missing": no_accel}
         return record
-    both = _Accelerations.of(trajectory, imu, calibration, estimate, gravity_in_world_m_s2)
+    both = _Accelerations.of(trajectory, timed, estimate, gravity_in_world_m_s2)
     record["acceleration"] = both.record(start_s)
     record["acceleration_spectrum"] = both.spectrum()
     return record
@@ -144,7 +143,7 @@ class _Rates:
 def _rotation(
     trajectory: CameraTrajectory, imu: ImuRecording, rates: _Rates, aligned: GyroCamera | None, start_s: float
 ) -> Record:
-    shift_s = clock_shift_s(trajectory, imu)
+    shift_s = epoch_shift_s(imu, trajectory.epoch_ns)
     gyro_s = imu.gyro_t_s + shift_s
     overlap = gyro_s[0] < trajectory.t_s[-1] and gyro_s[-1] > trajectory.t_s[0]
     # clocks that have nothing in common are drawn from the first sample of each
@@ -217,16 +216,13 @@ class _Accelerations:
     def of(
         cls,
         trajectory: CameraTrajectory,
-        imu: ImuRecording,
-        calibration: CameraImuCalibration,
+        timed: CameraTimedImu,
         estimate: ScaleEstimate,
         gravity: Array | None,
     ) -> _Accelerations:
-        attitude = smooth_attitude(trajectory, imu, calibration)
+        attitude = smooth_attitude(trajectory, timed)
         bias = np.zeros(3) if estimate.accel_bias_m_s2 is None else estimate.accel_bias_m_s2
-        inertial = WorldAcceleration.of(
-            trajectory, imu, calibration, attitude, bias_m_s2=bias, gravity_in_world_m_s2=np.zeros(3)
-        )
+        inertial = WorldAcceleration.of(timed, attitude, bias_m_s2=bias, gravity_in_world_m_s2=np.zeros(3))
         during = (inertial.t_s >= trajectory.t_s[0]) & (inertial.t_s <= trajectory.t_s[-1])
         weight = inertial.accel_m_s2[during].mean(axis=0) if during.any() else inertial.accel_m_s2.mean(axis=0)
         down = -weight if gravity is None else gravity
@@ -235,6 +231,7 @@ class _Accelerations:
         path = trajectory.cam_in_world
         metric = trajectory.length_unit == "m"
         if metric:
+            calibration = timed.calibration
             lever = quat_rotate(quat_conjugate(calibration.cam_from_imu_xyzw), calibration.imu_in_cam_m)
             path = path + quat_rotate(attitude.world_from_imu_xyzw, lever)
         step_s = float(np.median(np.diff(trajectory.t_s)))

@@ -43,7 +43,6 @@ from colmap_inertial.core.types.recorded import (
     Projector,
     ReadoutDirection,
     Treatment,
-    clock_shift_s,
 )
 
 __all__ = [
@@ -84,5 +83,4 @@ __all__ = [
     "SpectralRole",
     "Treatment",
     "Verdict",
-    "clock_shift_s",
 ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -53,8 +53,8 @@ class CameraImuCalibration:
         (12, 12) in the order of ``CALIBRATION_PARAMETERS``. Wide where nothing is known.
     clock_rate, clock_middle_s
         Growth of the time offsets per second of the camera's clock (0 where the clocks keep step), and the camera
-        time, since the epoch of the frame times, at which the offsets hold. ``gyro.on_camera_rate`` makes of a
-        recording one for which they hold throughout.
+        time, since the epoch of the frame times, at which the offsets hold. ``CameraTimedImu`` holds a
+        recording for which they hold throughout.
     """
 
     cam_from_imu_xyzw: Array
@@ -81,6 +81,38 @@ class CameraImuCalibration:
     def rotation_sigma_rad(self) -> float:
         """Standard deviation of the rotation about the camera axis about which it is known worst."""
         return float(np.sqrt(np.diagonal(self.cov)[CAL.ROTATION].max()))
+
+    @property
+    def clock_offset_s(self) -> float:
+        """Camera time less a stamp of the gyroscope."""
+        return self.gyro_time_offset_s
+
+    @property
+    def clock_offsets_s(self) -> tuple[float, float]:
+        """Camera time less a stamp of the gyroscope, and of the accelerometer."""
+        return self.gyro_time_offset_s, self.accel_time_offset_s
+
+    @property
+    def accel_delay_s(self) -> float:
+        """What the accelerometer's time offset is larger than the gyroscope's."""
+        return self.accel_time_offset_s - self.gyro_time_offset_s
+
+    @property
+    def clock_sigma_s(self) -> float:
+        """Standard deviation of the clock offset."""
+        return self.sigma("gyro_time_offset_s")
+
+    def replace_clock_offset(self, offset_s: float, accel_delay_s: float = 0.0) -> CameraImuCalibration:
+        """The calibration with another time offset, the accelerometer's larger by a delay; ``cov`` stays."""
+        return replace(self, gyro_time_offset_s=offset_s, accel_time_offset_s=offset_s + accel_delay_s)
+
+    def shift_clock_offsets(self, by_s: float, accel_by_s: float) -> CameraImuCalibration:
+        """The calibration with both time offsets larger, the accelerometer's by the second as well; ``cov`` stays."""
+        return replace(
+            self,
+            gyro_time_offset_s=self.gyro_time_offset_s + by_s,
+            accel_time_offset_s=self.accel_time_offset_s + by_s + accel_by_s,
+        )
 
     def drift_s(self, t_cam_s: Array) -> Array:
         """How much the time offsets have grown since ``clock_middle_s``, at camera times of any shape."""

@@ -10,7 +10,6 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, BoolArray, IndexArray, UInt8Array, UInt16Array
 from colmap_inertial.core.geometry import quat_conjugate, quat_log, quat_multiply
-from colmap_inertial.core.types.imu import ImuRecording
 from colmap_inertial.core.validation import check_fields, set_fields
 
 LengthUnit = Literal["model", "m"]
@@ -284,11 +283,3 @@ class CameraTrajectory:
             cam_in_world=self.cam_in_world[index],
             pose_cov=None if self.pose_cov is None else self.pose_cov[index],
         )
-
-
-def clock_shift_s(trajectory: CameraTrajectory, imu: ImuRecording) -> float:
-    """What to add to an offset between raw stamps to get the offset between ``t_s`` values.
-
-    With ``t_cam = t_stamp + offset`` on raw stamps, ``trajectory`` time = ``imu`` time + offset + this.
-    """
-    return (imu.epoch_ns - trajectory.epoch_ns) * 1e-9

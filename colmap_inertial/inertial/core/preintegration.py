@@ -21,6 +21,7 @@ import numpy as np
 
 from colmap_inertial._kernels import _inertial
 from colmap_inertial.core.arrays import Array, BoolArray, Int64Array
+from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.sampling import at_ceiling, is_gap
 from colmap_inertial.core.types import ImuRecording
 
@@ -107,6 +108,11 @@ class SensorStreams:
             gyro=SensorStream.from_samples(gyro_t_s, imu.gyro_rad_s, gyro_cut),
             accel=SensorStream.from_samples(accel_t_s, imu.accel_m_s2, accel_cut),
         )
+
+    @classmethod
+    def from_camera(cls, timed: CameraTimedImu) -> SensorStreams:
+        """The streams of a recording over camera time."""
+        return cls.from_recording(timed.imu, timed.gyro_t_s, timed.accel_t_s)
 
     def gap_s(self, t_s: Array, accel_delay_s: float = 0.0) -> tuple[Array, Array]:
         """(K,) seconds of gaps of gyroscope and accelerometer between K + 1 times; the delay is the accelerometer's."""

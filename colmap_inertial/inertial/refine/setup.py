@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from colmap_inertial.core.arrays import Array, Int64Array
+from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import matrix_from_quat
-from colmap_inertial.core.gyro import GyroPath, on_camera_rate
+from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.types import CAL, CameraImuCalibration, CameraModel, FrameTiming, ImuNoise, ImuRecording
 from colmap_inertial.imaging.gyro_camera import FrameShutter
 from colmap_inertial.inertial.core.preintegration import SensorErrors, SensorStreams, preintegrate
@@ -214,12 +215,8 @@ def make_problem(
     NotObservableError
         Where the IMU recorded hardly any of the frames, or these see nothing.
     """
-    calibration = known.calibration
-    imu = on_camera_rate(imu, calibration, camera_epoch_ns=timing.epoch_ns)
-    shift_s = (imu.epoch_ns - timing.epoch_ns) * 1e-9 + calibration.gyro_time_offset_s
-    # the accelerometer's own delay is part of the estimate
-    delay_s = calibration.accel_time_offset_s - calibration.gyro_time_offset_s
-    streams = SensorStreams.from_recording(imu, imu.gyro_t_s + shift_s, imu.accel_t_s + shift_s + delay_s)
+    # what is estimated of the accelerometer's delay counts from the calibration's
+    streams = SensorStreams.from_camera(CameraTimedImu.from_recording(imu, known.calibration, timing.epoch_ns))
     if not len(seen.observations.frame):
         raise NotObservableError("refinement", "no two of its images see the same point")
     timed = np.isfinite(seen.t_s)
@@ -268,9 +265,8 @@ def make_problem(
 def _expected(start: Estimate, known: Known) -> Estimate:
     """The start, with what was declared beforehand in place of what was estimated since."""
     declared, refined = known.prior, known.calibration
-    declared_s = declared.accel_time_offset_s - declared.gyro_time_offset_s
-    refined_s = refined.accel_time_offset_s - refined.gyro_time_offset_s
-    return replace(start, imu_in_cam_m=declared.imu_in_cam_m, accel_delay_s=declared_s - refined_s)
+    delay_s = declared.accel_delay_s - refined.accel_delay_s
+    return replace(start, imu_in_cam_m=declared.imu_in_cam_m, accel_delay_s=delay_s)
 
 
 def _free_numbers(camera: CameraModel) -> tuple[int, ...]:

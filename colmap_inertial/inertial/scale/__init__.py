@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
-from colmap_inertial.core.gyro import on_camera_rate
 from colmap_inertial.core.options import GravityOptions, ScaleOptions
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import (
@@ -149,42 +149,39 @@ def _estimate_or_refuse(
     if problems:
         return ScaleEstimate.refused(options.method, *problems)
     try:
-        in_step, aligned = in_step_with(trajectory, imu, calibration, options)
-        said = in_step.repairs[len(imu.repairs) :]
-        estimate = _estimate(trajectory, in_step, aligned, options)
+        timed = align_recording(trajectory, imu, calibration, options)
+        stretched = timed.imu.repairs[len(imu.repairs) :]
+        estimate = _estimate(trajectory, timed, options)
         return replace(
             estimate,
             # also where there is no scale: it says what was found of camera and IMU
-            calibration=aligned if estimate.calibration is None else estimate.calibration,
-            notes=(*estimate.notes, *said, *remarks(trajectory, in_step, aligned)),
+            calibration=timed.calibration if estimate.calibration is None else estimate.calibration,
+            notes=(*estimate.notes, *stretched, *remarks(trajectory, timed)),
         )
     except NotObservableError as error:
         return ScaleEstimate.refused(options.method, f"{error.quantity}: {error.hint}")
 
 
-def in_step_with(
+def align_recording(
     trajectory: CameraTrajectory, imu: ImuRecording, calibration: CameraImuCalibration | None, options: ScaleOptions
-) -> tuple[ImuRecording, CameraImuCalibration]:
-    """A recording on the camera's rate, and how camera and IMU relate, from a calibration that may be wide."""
+) -> CameraTimedImu:
+    """Align a recording with the camera, from a calibration that may be wide."""
     alignment = align_clocks(
         trajectory, imu, prior=calibration, options=AlignOptions(max_offset_s=options.max_offset_s)
     )
-    aligned = alignment.settled()
-    return on_camera_rate(imu, aligned, camera_epoch_ns=trajectory.epoch_ns), aligned
+    return CameraTimedImu.from_recording(imu, alignment.settled(), trajectory.epoch_ns)
 
 
-def _estimate(
-    trajectory: CameraTrajectory, imu: ImuRecording, calibration: CameraImuCalibration, options: ScaleOptions
-) -> ScaleEstimate:
+def _estimate(trajectory: CameraTrajectory, timed: CameraTimedImu, options: ScaleOptions) -> ScaleEstimate:
     gravity_m_s2, sigma_m_s2 = strength_of_gravity(options)
     if options.method == "spectral":
         from colmap_inertial.inertial.scale.spectral import SpectralOptions, estimate_spectral
 
-        return estimate_spectral(trajectory, imu, calibration, SpectralOptions(gravity_m_s2=gravity_m_s2))
+        return estimate_spectral(trajectory, timed, SpectralOptions(gravity_m_s2=gravity_m_s2))
     from colmap_inertial.inertial.scale.joint import JointOptions, estimate_joint
 
     known = JointOptions(gravity_m_s2=gravity_m_s2, gravity_sigma_m_s2=sigma_m_s2)
-    return estimate_joint(trajectory, imu, calibration, known)
+    return estimate_joint(trajectory, timed, known)
 
 
 __all__ = [

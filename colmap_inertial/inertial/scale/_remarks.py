@@ -5,13 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.camera_clock import CameraTimedImu, epoch_shift_s
 from colmap_inertial.core.sampling import PAUSE_STEPS, is_gap
-from colmap_inertial.core.types import (
-    CameraImuCalibration,
-    CameraTrajectory,
-    ImuRecording,
-    clock_shift_s,
-)
+from colmap_inertial.core.types import CameraTrajectory, ImuRecording
 from colmap_inertial.inertial.core.priors import PRIORS
 
 #: Shorter pauses are not worth a sentence.
@@ -20,38 +16,34 @@ _PAUSE_S = 0.02
 _WARMER_K = 10.0
 
 
-def remarks(trajectory: CameraTrajectory, imu: ImuRecording, calibration: CameraImuCalibration) -> tuple[str, ...]:
+def remarks(trajectory: CameraTrajectory, timed: CameraTimedImu) -> tuple[str, ...]:
     """Sentences on clocks far apart, pauses of the sensors, frames without IMU, and another warmth than calibrated.
 
     Parameters
     ----------
-    trajectory, imu
-        As they were read.
-    calibration
-        Time offsets between them.
+    trajectory, timed
+        Camera and IMU.
     """
-    shift_s = clock_shift_s(trajectory, imu)
-    gyro_s = imu.gyro_t_s + (calibration.gyro_time_offset_s + shift_s)
-    accel_s = imu.accel_t_s + (calibration.accel_time_offset_s + shift_s)
+    gyro_s, accel_s = timed.gyro_t_s, timed.accel_t_s
     covered = (max(gyro_s[0], accel_s[0]), min(gyro_s[-1], accel_s[-1]))
     said = (
-        _far_apart(trajectory, imu, calibration),
+        _far_apart(trajectory, timed),
         _pauses("gyroscope", gyro_s, trajectory),
         _pauses("accelerometer", accel_s, trajectory),
         _uncovered(trajectory, covered),
-        _warmer(imu),
+        _warmer(timed.imu),
     )
     return tuple(sentence for sentence in said if sentence)
 
 
-def _far_apart(trajectory: CameraTrajectory, imu: ImuRecording, calibration: CameraImuCalibration) -> str:
-    shift_s = clock_shift_s(trajectory, imu)
-    begin_s, end_s = imu.gyro_t_s[0] + shift_s, imu.gyro_t_s[-1] + shift_s
+def _far_apart(trajectory: CameraTrajectory, timed: CameraTimedImu) -> str:
+    shift_s = epoch_shift_s(timed.imu, trajectory.epoch_ns)
+    begin_s, end_s = timed.imu.gyro_t_s[0] + shift_s, timed.imu.gyro_t_s[-1] + shift_s
     if begin_s < trajectory.t_s[-1] and end_s > trajectory.t_s[0]:
         return ""
     return (
         "the stamps of camera and IMU have no time in common; the rotations give an offset of "
-        f"{calibration.gyro_time_offset_s:.2f} s"
+        f"{timed.calibration.clock_offset_s:.2f} s"
     )
 
 

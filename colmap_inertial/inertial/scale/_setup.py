@@ -5,15 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import matrix_from_quat
-from colmap_inertial.core.types import (
-    CAL,
-    CameraImuCalibration,
-    CameraTrajectory,
-    ImuRecording,
-    clock_shift_s,
-)
+from colmap_inertial.core.types import CAL, CameraImuCalibration, CameraTrajectory, ImuRecording
 from colmap_inertial.inertial.core import parameters as par
 from colmap_inertial.inertial.core.parameters import Estimate, Prior
 from colmap_inertial.inertial.core.preintegration import SensorStreams, find_saturated
@@ -34,8 +29,7 @@ _MANY_STATES, _FEWEST_HZ = 2400.0, 2.0
 
 def prepare(
     trajectory: CameraTrajectory,
-    imu: ImuRecording,
-    calibration: CameraImuCalibration,
+    timed: CameraTimedImu,
     *,
     gravity_m_s2: float,
     gravity_sigma_m_s2: float,
@@ -48,7 +42,7 @@ def prepare(
     NotObservableError
         When too few frames lie inside the IMU recording.
     """
-    shift_s = clock_shift_s(trajectory, imu)
+    imu, calibration = timed.imu, timed.calibration
     gyro_cut, accel_cut = find_saturated(imu)
     for sensor, cut in (("gyroscope", gyro_cut), ("accelerometer", accel_cut)):
         if np.sum(~cut) < _FEWEST_READINGS:
@@ -57,11 +51,7 @@ def prepare(
                 f"nearly all of the {sensor}'s readings stand at the end of its range: move less violently, or give "
                 "the sensor a wider range",
             )
-    streams = SensorStreams.from_recording(
-        imu,
-        imu.gyro_t_s + (shift_s + calibration.gyro_time_offset_s),
-        imu.accel_t_s + (shift_s + calibration.accel_time_offset_s),
-    )
+    streams = SensorStreams.from_camera(timed)
     gyro, accel = streams.gyro, streams.accel
     margin_s = 0.02
     begin_s = max(gyro.t_s[0], accel.t_s[0]) + margin_s

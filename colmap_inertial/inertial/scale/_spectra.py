@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from colmap_inertial.core.arrays import Array, BoolArray, ComplexArray
+from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate
-from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuRecording, clock_shift_s
+from colmap_inertial.core.types import CameraTrajectory
 from colmap_inertial.motion.smooth import PositionSmoother, WorldAcceleration, smooth_attitude
 
 #: Frames further apart than this sample motion of 1.2 Hz too thinly to differentiate it twice.
@@ -77,7 +78,7 @@ class Signals:
     smoother: PositionSmoother
 
     @classmethod
-    def of(cls, trajectory: CameraTrajectory, imu: ImuRecording, calibration: CameraImuCalibration) -> Signals:
+    def of(cls, trajectory: CameraTrajectory, timed: CameraTimedImu) -> Signals:
         """Smooth, differentiate, turn into the IMU frame.
 
         The accelerometer is integrated twice along the camera's path and goes through the very smoother that the
@@ -88,8 +89,8 @@ class Signals:
         NotObservableError
             Where frames are too sparse to differentiate, or nothing long enough is covered by both sensors.
         """
-        attitude = smooth_attitude(trajectory, imu, calibration)
-        stamps_s = imu.accel_t_s + calibration.accel_time_offset_s + clock_shift_s(trajectory, imu)
+        imu, calibration, stamps_s = timed.imu, timed.calibration, timed.accel_t_s
+        attitude = smooth_attitude(trajectory, timed)
         world_from_imu = matrix_from_quat(attitude.at(stamps_s)[0])
         force = np.einsum("kij,kj->ki", world_from_imu, imu.accel_m_s2)
         weight = force.mean(axis=0)  # taken out while integrating, for the sake of digits

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import quat_from_matrix
 from colmap_inertial.core.sampling import MUCH_CUT
@@ -27,7 +28,6 @@ from colmap_inertial.core.types import (
     CameraImuCalibration,
     CameraTrajectory,
     ImuNoise,
-    ImuRecording,
     ScaleEstimate,
 )
 from colmap_inertial.inertial.core import parameters as par
@@ -81,8 +81,7 @@ class JointOptions:
 
 def estimate_joint(
     trajectory: CameraTrajectory,
-    imu: ImuRecording,
-    calibration: CameraImuCalibration,
+    timed: CameraTimedImu,
     options: JointOptions | None = None,
 ) -> ScaleEstimate:
     """Metres per model unit, gravity and accelerometer bias, with a refined calibration.
@@ -91,11 +90,10 @@ def estimate_joint(
     ----------
     trajectory
         Camera poses, dense or sparse. ``pose_cov``, where given, weighs frames against each other.
-    imu
-        Recording of the same device.
-    calibration
-        From ``align_camera_imu``. Its rotation, gyroscope bias and time offset are starting points with five times
-        their standard deviations; lever arm, readout and the offset between the sensors are priors as they stand.
+    timed
+        Recording of the same device, aligned with the camera. Its calibration's rotation, gyroscope bias and time
+        offset are starting points with five times their standard deviations; lever arm, readout and the offset between
+        the sensors are priors as they stand.
     options
         See ``JointOptions``.
 
@@ -109,7 +107,7 @@ def estimate_joint(
     """
     options = options or JointOptions()
     try:
-        data, fit, faults = fit_path(trajectory, imu, calibration, options)
+        data, fit, faults = fit_path(trajectory, timed, options)
     except NotObservableError as error:
         return ScaleEstimate.refused("joint", error.hint)
     except np.linalg.LinAlgError:
@@ -118,12 +116,10 @@ def estimate_joint(
     fit = replace(fit, variance_parts={**fit.variance_parts, "accel_faults": left_open})
     wrong = [*faults.sentences(), *_cut_off(data)]
     # what was taken from a path nobody can put back: its scale is too large by more than any interval says
-    return _judged(fit, data.t_s, calibration, is_calibrated(imu), wrong, worthless=faults.path_is_smoothed)
+    return _judged(fit, data.t_s, timed.calibration, is_calibrated(timed.imu), wrong, worthless=faults.path_is_smoothed)
 
 
-def fit_path(
-    trajectory: CameraTrajectory, imu: ImuRecording, calibration: CameraImuCalibration, options: JointOptions
-) -> tuple[Data, Fit, Faults]:
+def fit_path(trajectory: CameraTrajectory, timed: CameraTimedImu, options: JointOptions) -> tuple[Data, Fit, Faults]:
     """The measurements as they came, their fit, and what was wrong with the accelerometer.
 
     Raises
@@ -135,13 +131,12 @@ def fit_path(
     """
     data, prior = prepare(
         trajectory,
-        imu,
-        calibration,
+        timed,
         gravity_m_s2=options.gravity_m_s2,
         gravity_sigma_m_s2=options.gravity_sigma_m_s2,
         states_hz=options.states_hz,
     )
-    return data, *_fit_soundly(data, prior, imu.noise)
+    return data, *_fit_soundly(data, prior, timed.imu.noise)
 
 
 def _fit_soundly(data: Data, prior: Prior, sheet: ImuNoise | None) -> tuple[Fit, Faults]:
@@ -341,10 +336,8 @@ def _refined(fit: Fit, calibration: CameraImuCalibration) -> CameraImuCalibratio
     cov[CAL.GYRO_BIAS, CAL.GYRO_BIAS] = fit.gyro_bias_cov
     cov[CAL.READOUT, CAL.READOUT] = calibration.cov[CAL.READOUT, CAL.READOUT]
     return replace(
-        calibration,
+        calibration.shift_clock_offsets(x.delay_s, x.accel_delay_s),
         cam_from_imu_xyzw=quat_from_matrix(x.cam_from_imu),
-        gyro_time_offset_s=calibration.gyro_time_offset_s + x.delay_s,
-        accel_time_offset_s=calibration.accel_time_offset_s + x.delay_s + x.accel_delay_s,
         gyro_bias_rad_s=x.gyro_bias_rad_s.mean(axis=0),
         imu_in_cam_m=x.imu_in_cam_m,
         cov=0.5 * (cov + cov.T),

@@ -19,7 +19,7 @@ from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, I
 from colmap_inertial.inertial.core import parameters as par
 from colmap_inertial.inertial.core.parameters import Noise
 from colmap_inertial.inertial.core.priors import is_calibrated, model_scale_sigma
-from colmap_inertial.inertial.scale import in_step_with, strength_of_gravity
+from colmap_inertial.inertial.scale import align_recording, strength_of_gravity
 from colmap_inertial.inertial.scale._fit import Fit
 from colmap_inertial.inertial.scale._grouping import Data
 from colmap_inertial.inertial.scale.joint import JointOptions, fit_path, scale_of
@@ -126,23 +126,22 @@ class FittedPath:
         strength, sigma = strength_of_gravity(options)
         known = JointOptions(gravity_m_s2=strength, gravity_sigma_m_s2=sigma)
         with one_blas_thread():
-            in_step, aligned = in_step_with(trajectory, imu, calibration, options)
+            timed = align_recording(trajectory, imu, calibration, options)
             try:
-                data, fit, faults = fit_path(trajectory, in_step, aligned, known)
+                data, fit, faults = fit_path(trajectory, timed, known)
             except np.linalg.LinAlgError as error:
                 raise NotObservableError("place", "camera and IMU do not determine its motion") from error
         if faults.values or faults.path_is_smoothed:
             raise NotObservableError("place", "the accelerometer has faults, which count from end to end of a gap")
         scale = scale_of(fit, data.t_s, is_calibrated(imu))
         ends = (0, -1)
-        shift_s = (imu.epoch_ns - trajectory.epoch_ns) * 1e-9 + aligned.gyro_time_offset_s
         return cls(
             origin=data.origin,
             floor_log=model_scale_sigma(is_calibrated(imu)),
             _data=data,
             _fit=fit,
-            _aligned=aligned,
-            _stamps_s=np.array([[in_step.gyro_t_s[i] + shift_s, imu.gyro_t_s[i]] for i in ends]),
+            _aligned=timed.calibration,
+            _stamps_s=np.array([[timed.gyro_t_s[i], imu.gyro_t_s[i]] for i in ends]),
             _widened=scale.widened,
             _shift_log=float(np.log(scale.metres_per_unit / fit.estimate.metres_per_unit)),
         )
@@ -253,7 +252,7 @@ class FittedPath:
             accel_bias_m_s2=x.accel_bias_m_s2 + x.accel_walk_m_s2[nodes] + nodes_of[:, ACCEL_BIAS],
             metres_per_unit=x.metres_per_unit * float(np.exp(self._shift_log)),
             gravity_m_s2=x.gravity_m_s2 + along[own + GRAVITY.start : own + GRAVITY.stop],
-            accel_delay_s=guess.accel_time_offset_s - guess.gyro_time_offset_s + x.accel_delay_s,
+            accel_delay_s=guess.accel_delay_s + x.accel_delay_s,
             gyro_gain=x.gyro_gain,
             accel_gain=x.accel_gain,
             cam_from_imu=x.cam_from_imu,

@@ -17,8 +17,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
-from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuRecording, ScaleEstimate
+from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ScaleEstimate
 from colmap_inertial.inertial.scale._spectra import SHORTEST_S, Signals
 from colmap_inertial.inertial.scale._spectral_fit import SpectralFit, fit_spectra
 from colmap_inertial.inertial.scale.verdict import verdict_of
@@ -42,8 +43,7 @@ class SpectralOptions:
 
 def estimate_spectral(
     trajectory: CameraTrajectory,
-    imu: ImuRecording,
-    calibration: CameraImuCalibration,
+    timed: CameraTimedImu,
     options: SpectralOptions | None = None,
 ) -> ScaleEstimate:
     """Metres per unit, gravity and accelerometer bias from acceleration spectra.
@@ -52,10 +52,8 @@ def estimate_spectral(
     ----------
     trajectory
         Dense poses (frames at most 0.2 s apart), any unit.
-    imu
-        Both sensors.
-    calibration
-        Rotation, time offsets, gyroscope bias; the lever arm with its covariance is a prior.
+    timed
+        Both sensors; rotation and gyroscope bias; the lever arm with its covariance is a prior.
     options
         Gravity and bandwidth.
 
@@ -65,9 +63,9 @@ def estimate_spectral(
     they exceed the estimated noise; the scale's variance also contains the accelerometer's gain (0.5 %) and what is
     unknown of the noise's share between the sensors. Where the data cannot give a scale, a refused estimate.
     """
-    options = options or SpectralOptions()
+    options, calibration = options or SpectralOptions(), timed.calibration
     try:
-        signals = Signals.of(trajectory, imu, calibration)
+        signals = Signals.of(trajectory, timed)
         if not signals.segments:
             needed = f"no stretch of {SHORTEST_S:g} s is covered by camera and accelerometer without a pause"
             raise NotObservableError("scale", f"{needed}: record longer")

@@ -13,10 +13,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from colmap_inertial.core.camera_clock import epoch_shift_s
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.threads import one_blas_thread
-from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuRecording, clock_shift_s
+from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuRecording
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.motion.align._clock_search import (
     ClockFit,
@@ -167,13 +168,13 @@ def _range(
     trajectory: CameraTrajectory, imu: ImuRecording, prior: CameraImuCalibration, options: AlignOptions
 ) -> tuple[float, float]:
     """Lowest and highest offset between times since the two epochs."""
-    shift_s = clock_shift_s(trajectory, imu)
+    shift_s = epoch_shift_s(imu, trajectory.epoch_ns)
     lowest_s, highest_s = -np.inf, np.inf
     if options.max_offset_s is not None:
         lowest_s, highest_s = shift_s - options.max_offset_s, shift_s + options.max_offset_s
-    sigma_s = prior.sigma("gyro_time_offset_s")
+    sigma_s = prior.clock_sigma_s
     if sigma_s < OFFSET_UNKNOWN_FROM_S:
-        centre_s, reach_s = prior.gyro_time_offset_s + shift_s, 2 * sigma_s + 0.05
+        centre_s, reach_s = prior.clock_offset_s + shift_s, 2 * sigma_s + 0.05
         lowest_s, highest_s = max(lowest_s, centre_s - reach_s), min(highest_s, centre_s + reach_s)
     return lowest_s, highest_s
 

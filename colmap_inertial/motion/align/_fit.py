@@ -8,6 +8,7 @@ import numpy as np
 
 from colmap_inertial._kernels import _inertial
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.camera_clock import epoch_shift_s
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import (
     matrix_from_quat,
@@ -24,7 +25,6 @@ from colmap_inertial.core.types import (
     CameraImuCalibration,
     CameraTrajectory,
     ImuRecording,
-    clock_shift_s,
 )
 from colmap_inertial.motion.align._clock_search import ClockFit
 
@@ -128,7 +128,7 @@ def refine_alignment(
     NotObservableError
         Where the rotation about some axis, or the offset, stays open.
     """
-    shift_s = clock_shift_s(trajectory, imu)
+    shift_s = epoch_shift_s(imu, trajectory.epoch_ns)
     (prior_rotation, prior_offset_s, prior_bias), prior_info = _prior_of_fitted(prior, start, shift_s)
     state = _State(start.cam_from_imu_xyzw, start.offset_s, start.gyro_bias_rad_s, np.zeros(_N_NUISANCE))
     state.nuisance[_RATE] = clock_rate
@@ -195,7 +195,7 @@ def _prior_of_fitted(
 ) -> tuple[tuple[Array, float, Array], Array]:
     """Mean (rotation, offset, bias) and information of what is fitted; what is unknown starts at the search's."""
     rotation_known = prior.sigma("rotation_x_rad") < 1
-    offset_known = prior.sigma("gyro_time_offset_s") < OFFSET_UNKNOWN_FROM_S
+    offset_known = prior.clock_sigma_s < OFFSET_UNKNOWN_FROM_S
     mean = (
         prior.cam_from_imu_xyzw if rotation_known else start.cam_from_imu_xyzw,
         prior.gyro_time_offset_s + shift_s if offset_known else start.offset_s,

@@ -13,13 +13,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from colmap_inertial.core.camera_clock import epoch_shift_s
 from colmap_inertial.core.threads import one_blas_thread
-from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuRecording, clock_shift_s
+from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuRecording
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.io.pose_convention import ARRAYS, PoseConvention, reread
 from colmap_inertial.motion.align import AlignOptions, coarse_fit
-from colmap_inertial.motion.align._acceleration import ACCELERATION_S, QuickAccelerations, quick_accelerations
 from colmap_inertial.motion.align._clock_search import ClockFit
+from colmap_inertial.motion.align.acceleration import ACCELERATION_S, QuickAccelerations, quick_accelerations
 
 #: Standard deviation of the IMU's distance from the camera along each axis: what it adds is no sign of other poses.
 _ARM_M = 0.1
@@ -185,12 +186,9 @@ def _judged(
 ) -> _Candidate:
     quick = None
     if imu.has_accel:
-        offset_s = fit.offset_s - clock_shift_s(read, imu)
         calibration = replace(
-            prior,
+            prior.replace_clock_offset(fit.offset_s - epoch_shift_s(imu, read.epoch_ns)),
             cam_from_imu_xyzw=fit.cam_from_imu_xyzw,
-            gyro_time_offset_s=offset_s,
-            accel_time_offset_s=offset_s,
             gyro_bias_rad_s=fit.gyro_bias_rad_s,
         )
         quick = quick_accelerations(read, imu, calibration)

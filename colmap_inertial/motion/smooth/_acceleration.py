@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from colmap_inertial.core.arrays import Array, BoolArray
+from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.geometry import quat_rotate
 from colmap_inertial.core.sampling import Coverage
-from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuRecording, clock_shift_s
 from colmap_inertial.motion.smooth._attitude import Attitude
 
 
@@ -33,18 +33,16 @@ class WorldAcceleration:
     @classmethod
     def of(
         cls,
-        trajectory: CameraTrajectory,
-        imu: ImuRecording,
-        calibration: CameraImuCalibration,
+        timed: CameraTimedImu,
         attitude: Attitude,
         *,
         bias_m_s2: Array,
         gravity_in_world_m_s2: Array,
     ) -> WorldAcceleration:
         """Turn the readings into the world, without their bias and gravity."""
-        t_s = imu.accel_t_s + calibration.accel_time_offset_s + clock_shift_s(trajectory, imu)
-        world_from_imu, _ = attitude.at(t_s)
-        return cls.integrated(t_s, quat_rotate(world_from_imu, imu.accel_m_s2 - bias_m_s2) + gravity_in_world_m_s2)
+        world_from_imu, _ = attitude.at(timed.accel_t_s)
+        accel = quat_rotate(world_from_imu, timed.imu.accel_m_s2 - bias_m_s2) + gravity_in_world_m_s2
+        return cls.integrated(timed.accel_t_s, accel)
 
     @classmethod
     def integrated(cls, t_s: Array, accel_m_s2: Array) -> WorldAcceleration:

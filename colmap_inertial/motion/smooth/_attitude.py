@@ -7,15 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
+from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.geometry import quat_conjugate, quat_exp, quat_log, quat_multiply, quat_normalize, slerp
 from colmap_inertial.core.gyro import GyroPath
 from colmap_inertial.core.types import (
     CAL,
     TYPICAL_NOISE,
-    CameraImuCalibration,
     CameraTrajectory,
-    ImuRecording,
-    clock_shift_s,
 )
 from colmap_inertial.motion.smooth._chain import Chain
 from colmap_inertial.motion.smooth._models import most_likely, runs_of, worst_outliers
@@ -57,7 +55,7 @@ class Attitude:
         return quat_normalize(quat_multiply(correction, start_from_imu)), rate
 
 
-def smooth_attitude(trajectory: CameraTrajectory, imu: ImuRecording, calibration: CameraImuCalibration) -> Attitude:
+def smooth_attitude(trajectory: CameraTrajectory, timed: CameraTimedImu) -> Attitude:
     """Fuse the orientations of the frames with the gyroscope between them.
 
     What the gyroscope's path lacks to the camera's orientations is a slow curve: white rate noise, a bias that walks,
@@ -68,12 +66,11 @@ def smooth_attitude(trajectory: CameraTrajectory, imu: ImuRecording, calibration
     ----------
     trajectory
         Its orientations are used; any length unit.
-    imu, calibration
-        Gyroscope, and its rotation, time offset and bias.
+    timed
+        Gyroscope, and its rotation and bias.
     """
-    t_s = trajectory.t_s
-    stamps_s = imu.gyro_t_s + calibration.gyro_time_offset_s + clock_shift_s(trajectory, imu)
-    path = GyroPath(stamps_s, imu.gyro_rad_s, calibration.gyro_bias_rad_s)
+    t_s, imu, calibration = trajectory.t_s, timed.imu, timed.calibration
+    path = GyroPath(timed.gyro_t_s, imu.gyro_rad_s, calibration.gyro_bias_rad_s)
     world_from_cam = quat_conjugate(trajectory.cam_from_world_xyzw)
     seen = quat_multiply(world_from_cam, calibration.cam_from_imu_xyzw)
     correction = quat_multiply(seen, quat_conjugate(path.at(t_s)[0]))

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
+from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import quat_conjugate, quat_multiply, quat_normalize, quat_rotate
-from colmap_inertial.core.gyro import on_camera_rate
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import (
     TYPICAL_NOISE,
@@ -95,13 +95,11 @@ def smooth_trajectory(
     if not imu.has_accel:
         hint = "the recording has no accelerometer; record it along with the gyroscope"
         raise NotObservableError("smooth motion", hint)
-    imu = on_camera_rate(imu, calibration, camera_epoch_ns=trajectory.epoch_ns)
-    attitude = smooth_attitude(trajectory, imu, calibration)
+    timed = CameraTimedImu.from_recording(imu, calibration, trajectory.epoch_ns)
+    attitude = smooth_attitude(trajectory, timed)
     bias = np.zeros(3) if accel_bias_m_s2 is None else np.asarray(accel_bias_m_s2, dtype=np.float64)
     gravity = np.asarray(gravity_in_world_m_s2, dtype=np.float64)
-    inertial = WorldAcceleration.of(
-        trajectory, imu, calibration, attitude, bias_m_s2=bias, gravity_in_world_m_s2=gravity
-    )
+    inertial = WorldAcceleration.of(timed, attitude, bias_m_s2=bias, gravity_in_world_m_s2=gravity)
     t_s = trajectory.t_s
     silent = ~inertial.covers(t_s)
     if silent.all():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from colmap_inertial.core.gyro import on_camera_rate
+from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.types import (
     CameraImuCalibration,
     CameraModel,
@@ -41,13 +41,13 @@ class GyroView:
     source: str
     notes: tuple[str, ...] = ()
 
-    def recording(self) -> ImuRecording:
-        """The recording on a clock that runs as the camera's does; one offset holds for all of it."""
-        return on_camera_rate(self.imu, self.calibration, camera_epoch_ns=self.timing.epoch_ns)
+    def timed(self) -> CameraTimedImu:
+        """The recording on the camera's clock."""
+        return CameraTimedImu.from_recording(self.imu, self.calibration, self.timing.epoch_ns)
 
     def motion(self) -> GyroCamera:
         """The gyroscope on the camera's clock."""
-        return GyroCamera.of(self.recording(), self.calibration, camera_epoch_ns=self.timing.epoch_ns)
+        return GyroCamera.from_timed(self.timed())
 
     def shutter(self, index: int) -> FrameShutter:
         """When the lines of one frame are exposed."""

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.geometry import quat_rotate, so3_log
-from colmap_inertial.core.gyro import on_camera_rate
 from colmap_inertial.core.types import (
     CameraImuCalibration,
     CameraMotion,
@@ -166,12 +166,12 @@ def _motion(
 ) -> CameraMotion:
     """Velocities of a model's frames, but those during which the gyroscope was silent, and those that are nan."""
     timing, solved = model.timing, model.motion
-    gyro = on_camera_rate(imu, calibration, camera_epoch_ns=timing.epoch_ns)
-    camera = GyroCamera.of(gyro, calibration, camera_epoch_ns=timing.epoch_ns)
+    timed = CameraTimedImu.from_recording(imu, calibration, timing.epoch_ns)
+    camera = GyroCamera.from_timed(timed)
     place = {name: i for i, name in enumerate(timing.names)}
     index = np.array([place[name] for name in trajectory.names])
     exposure_s = None if timing.exposure_s is None else timing.exposure_s[index]
-    half_s = max(_RATE_HALF_S, _LEAST_SAMPLES * float(np.median(np.diff(gyro.gyro_t_s))))
+    half_s = max(_RATE_HALF_S, _LEAST_SAMPLES * float(np.median(np.diff(timed.imu.gyro_t_s))))
     begin_s, end_s = trajectory.t_s - half_s, trajectory.t_s + half_s
     seen = camera.covers(begin_s, end_s) & np.isfinite(velocity_in_world).all(axis=1)
     before, after = (camera.start_from_cam(t_s[seen]) for t_s in (begin_s, end_s))

@@ -295,10 +295,8 @@ def _refined_calibration(before: CameraImuCalibration, problem: Problem, judged:
         cov[part, part] = before.cov[part, part]
     later_s = before.clock_rate * (inertial.middle_s - before.clock_middle_s) + x.offset_s
     return replace(
-        before,
+        before.shift_clock_offsets(later_s, x.accel_delay_s),
         cam_from_imu_xyzw=quat_from_matrix(x.cam_from_imu),
-        gyro_time_offset_s=before.gyro_time_offset_s + later_s,
-        accel_time_offset_s=before.accel_time_offset_s + later_s + x.accel_delay_s,
         gyro_bias_rad_s=_mean_bias(x),
         imu_in_cam_m=x.imu_in_cam_m,
         cov=0.5 * (cov + cov.T),

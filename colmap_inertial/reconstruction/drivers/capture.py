@@ -14,6 +14,7 @@ from colmap_inertial.colmap.sparse import check_pair_names, mapping_device
 from colmap_inertial.colmap.steps import run_colmap
 from colmap_inertial.colmap.tsdf import require_mesh_maker
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import FormatError, InertialError
 from colmap_inertial.core.gravity import gravity_in_cam
 from colmap_inertial.core.options import ReconstructOptions
@@ -287,9 +288,10 @@ def _gravity_priors(recording: Recording, options: ReconstructOptions) -> Mappin
             "--mapping.gravity-priors needs --mapping.mapper global: the incremental mapper ignores them"
         )
     calibration = recording.prior
-    if calibration.sigma("rotation_x_rad") > _GRAVITY_ROTATION_RAD or calibration.sigma("gyro_time_offset_s") > 1:
+    if calibration.sigma("rotation_x_rad") > _GRAVITY_ROTATION_RAD or calibration.clock_sigma_s > 1:
         raise InertialError(
             "--mapping.gravity-priors needs the rotation between camera and IMU and their time offset beforehand: give "
             "[calibration] in capture.toml or --calibration FILE, and shared_clock or a time offset"
         )
-    return gravity_in_cam(recording.imu, calibration, recording.timing)
+    timed = CameraTimedImu.from_recording(recording.imu, calibration, recording.timing.epoch_ns)
+    return gravity_in_cam(timed, recording.timing)

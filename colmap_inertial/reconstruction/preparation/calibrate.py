@@ -197,7 +197,7 @@ def survey(
 def _sigmas(calibration: CameraImuCalibration) -> tuple[float, float]:
     """Standard deviations of rotation (rad) and of the gyroscope's time offset (s)."""
     rotation = calibration.rotation_sigma_rad
-    return rotation, calibration.sigma("gyro_time_offset_s")
+    return rotation, calibration.clock_sigma_s
 
 
 def _middle(timing: FrameTiming, spacing_s: float, most: int) -> list[int]:

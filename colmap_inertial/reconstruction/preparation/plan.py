@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, get_args
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import InertialError, NotObservableError
-from colmap_inertial.core.gyro import on_camera_rate
 from colmap_inertial.core.options import BlurRemover, DeblurMethod, RollingShutterMethod
 from colmap_inertial.core.types import CameraModel, FrameTiming
 from colmap_inertial.imaging.gate import (
@@ -208,10 +208,9 @@ def _no_deblurring(recording: Recording, asked: Treatments, progress: Progress) 
 def _most_turned_rad(recording: Recording, exposure_s: Array) -> float:
     """By how much the camera turned during an exposure at the most: as quickly as ever while it may have been taken."""
     timing, prior = recording.timing, recording.prior
-    imu = on_camera_rate(recording.imu, prior, camera_epoch_ns=timing.epoch_ns)
-    rate_rad_s = np.linalg.norm(imu.gyro_rad_s, axis=1)
-    stamps_s = imu.gyro_t_s + prior.gyro_time_offset_s + (imu.epoch_ns - timing.epoch_ns) * 1e-9
-    margin_s = _SURE_SIGMAS * prior.sigma("gyro_time_offset_s")
+    timed = CameraTimedImu.from_recording(recording.imu, prior, timing.epoch_ns)
+    rate_rad_s, stamps_s = np.linalg.norm(timed.imu.gyro_rad_s, axis=1), timed.gyro_t_s
+    margin_s = _SURE_SIGMAS * prior.clock_sigma_s
     longest_s = _LONGEST_READOUT_S if timing.readout_s is None else timing.readout_s
     # a sample more on each side
     first = np.searchsorted(stamps_s, timing.t_s - margin_s) - 1

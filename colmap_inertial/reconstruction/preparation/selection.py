@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
+from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
-from colmap_inertial.core.gyro import on_camera_rate
 from colmap_inertial.core.options import FrameOptions
 from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import CameraModel, FrameTiming
@@ -297,13 +297,13 @@ def _clocks(recording: Recording, progress: Progress) -> _Clocks:
     capture, imu, timing, prior = recording.capture, recording.imu, recording.timing, recording.prior
     camera = guessed_camera(capture, timing)
     rotation_rad = prior.rotation_sigma_rad
-    offset_sigma_s = prior.sigma("gyro_time_offset_s")
+    offset_sigma_s = prior.clock_sigma_s
     known = _Clocks(
         motion=GyroCamera.of(imu, prior, camera_epoch_ns=timing.epoch_ns),
         oriented=rotation_rad <= _ROTATION_RAD,
         camera=camera,
         note=f"the clocks' offset is the capture's, to {1e3 * offset_sigma_s:.0f} ms",
-        offset_s=prior.gyro_time_offset_s,
+        offset_s=prior.clock_offset_s,
         offset_sigma_s=offset_sigma_s,
         offset_from="capture",
     )
@@ -325,9 +325,9 @@ def _clocks(recording: Recording, progress: Progress) -> _Clocks:
             # what one clock stamped has one rate; another is corrected even where it may be zero: what is left of it is
             # then as small as its deviation says
             rate_sigma = aligned.clock_rate_sigma
-            on_rate = on_camera_rate(imu, found, camera_epoch_ns=timing.epoch_ns)
+            on_rate = CameraTimedImu.from_recording(imu, found, timing.epoch_ns).imu
             rates = f", with rates {1e6 * found.clock_rate:+.0f} ppm apart, to {1e6 * rate_sigma:.0f} ppm"
-        sigma_s = found.sigma("gyro_time_offset_s")
+        sigma_s = found.clock_sigma_s
         turned = found.rotation_sigma_rad
         # what translation does to pixels looks like a bias of the gyroscope
         found = replace(found, gyro_bias_rad_s=prior.gyro_bias_rad_s)
@@ -346,7 +346,7 @@ def _clocks(recording: Recording, progress: Progress) -> _Clocks:
         oriented=True,
         camera=camera if capture.camera is not None else _with_focal(camera, agreement.gain),
         note=f"the clocks' offset was found by following pixels, to {1e3 * sigma_s:.1f} ms{rates}",
-        offset_s=found.gyro_time_offset_s,
+        offset_s=found.clock_offset_s,
         offset_sigma_s=sigma_s,
         offset_from="pixels",
         rate_sigma=rate_sigma,

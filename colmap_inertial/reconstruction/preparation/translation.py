@@ -62,7 +62,7 @@ def _of_model(model: pycolmap.Reconstruction, view: GyroView) -> Iterator[tuple[
     """Names of frames, how far in time they are from the model's nearest one, and their parallax."""
     calibration = for_rectified(view.calibration) if view.timing.readout_s else view.calibration
     trajectory, _ = trajectory_from_model(model, view.timing)
-    imu = view.recording()
+    imu = view.timed().imu
     estimate = estimate_scale(trajectory, imu, calibration=calibration, options=ScaleOptions())
     if estimate.metres_per_unit is None or estimate.gravity_in_world_m_s2 is None:
         log.info("no blur by translation: %s", "; ".join(estimate.reasons))

@@ -285,8 +285,7 @@ def _truth(scene: Scene) -> dict[str, object]:
         },
         "calibration": {
             "cam_from_imu_xyzw": quat_normalize(quat_multiply(cam_from_body, errors.cam_from_imu_xyzw)),
-            "gyro_time_offset_s": errors.gyro_time_offset_s,
-            "accel_time_offset_s": errors.accel_time_offset_s,
+            **errors.clock_offsets_s,
             "gyro_bias_rad_s": scene.imu.gyro_bias_rad_s.mean(axis=0),
             "imu_in_cam_m": imu_in_cam,
             "readout_s": camera.readout_s,

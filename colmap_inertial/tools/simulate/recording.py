@@ -16,7 +16,7 @@ from colmap_inertial.core.geometry import (
     quat_rotate,
     skew,
 )
-from colmap_inertial.core.types import CAL, CameraImuCalibration, CameraTrajectory, ImuRecording
+from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuRecording
 from colmap_inertial.tools.simulate.motion import Motion, MotionOptions, make_motion
 from colmap_inertial.tools.simulate.sensors import (
     STANDARD_GRAVITY_M_S2,
@@ -237,15 +237,7 @@ def simulate_recording(options: RecordingOptions | None = None, *, seed: int) ->
         model_from_world_xyzw=model_from_world,
         world_in_model=world_in_model,
         gravity_in_world_m_s2=quat_rotate(model_from_world, np.array([0.0, 0.0, -options.gravity_m_s2])),
-        calibration=CameraImuCalibration(
-            cam_from_imu_xyzw=errors.cam_from_imu_xyzw,
-            gyro_time_offset_s=errors.gyro_time_offset_s,
-            accel_time_offset_s=errors.accel_time_offset_s,
-            gyro_bias_rad_s=imu.gyro_bias_rad_s.mean(axis=0),
-            imu_in_cam_m=errors.imu_in_cam_m,
-            readout_s=options.sfm.readout_s,
-            cov=np.zeros((CAL.COUNT, CAL.COUNT)),
-        ),
+        calibration=errors.calibrate(imu.gyro_bias_rad_s.mean(axis=0), options.sfm.readout_s),
         accel_bias_m_s2=imu.accel_bias_m_s2.mean(axis=0),
         imu_errors=errors,
         imu=imu,

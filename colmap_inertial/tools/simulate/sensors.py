@@ -17,7 +17,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, quat_multiply, quat_normalize
-from colmap_inertial.core.types import ImuNoise, ImuRecording
+from colmap_inertial.core.types import CAL, CameraImuCalibration, ImuNoise, ImuRecording
 from colmap_inertial.tools.simulate.motion import MARGIN_S, Motion
 
 STANDARD_GRAVITY_M_S2 = 9.80665
@@ -161,6 +161,22 @@ class ImuErrors:
     accel_time_offset_s: float
     clock_rate: float
     middle_s: float
+
+    @property
+    def clock_offsets_s(self) -> dict[str, float]:
+        """The time offsets by their names."""
+        return {name: getattr(self, name) for name in ("gyro_time_offset_s", "accel_time_offset_s")}
+
+    def calibrate(self, gyro_bias_rad_s: Array, readout_s: float) -> CameraImuCalibration:
+        """The true calibration of a recording with a mean gyroscope bias and a camera's readout."""
+        return CameraImuCalibration(
+            cam_from_imu_xyzw=self.cam_from_imu_xyzw,
+            **self.clock_offsets_s,
+            gyro_bias_rad_s=gyro_bias_rad_s,
+            imu_in_cam_m=self.imu_in_cam_m,
+            readout_s=readout_s,
+            cov=np.zeros((CAL.COUNT, CAL.COUNT)),
+        )
 
     def stamp_s(self, t_cam_s: Array, offset_s: float) -> Array:
         """The IMU clock's reading at camera times, for the gyroscope's or the accelerometer's offset."""

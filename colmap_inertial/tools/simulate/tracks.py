@@ -14,7 +14,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.geometry import matrix_from_quat
-from colmap_inertial.core.types import CAL, CameraImuCalibration, CameraModel, FrameTiming, ImuRecording
+from colmap_inertial.core.types import CameraImuCalibration, CameraModel, FrameTiming, ImuRecording
 from colmap_inertial.imaging.gyro_camera import FrameShutter
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.tools.simulate.motion import Motion, MotionOptions, make_motion
@@ -208,15 +208,7 @@ def simulate_tracks(options: TrackOptions, *, seed: int) -> Tracks:
         motion=motion,
         sampled=sampled,
         errors=errors,
-        calibration=CameraImuCalibration(
-            cam_from_imu_xyzw=errors.cam_from_imu_xyzw,
-            gyro_time_offset_s=errors.gyro_time_offset_s,
-            accel_time_offset_s=errors.accel_time_offset_s,
-            gyro_bias_rad_s=sampled.gyro_bias_rad_s.mean(axis=0),
-            imu_in_cam_m=errors.imu_in_cam_m,
-            readout_s=options.readout_s,
-            cov=np.zeros((CAL.COUNT, CAL.COUNT)),
-        ),
+        calibration=errors.calibrate(sampled.gyro_bias_rad_s.mean(axis=0), options.readout_s),
     )
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_multiply, quat_rotate
 from colmap_inertial.core.sampling import without_running_mean
 from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuRecording
@@ -49,8 +50,8 @@ def quick_accelerations(
     half = round(0.5 * ACCELERATION_S / step_s)
     if half < 3 or len(poses) < 40 * half:
         return None
-    shift_s = calibration.accel_time_offset_s + (imu.epoch_ns - poses.epoch_ns) * 1e-9
-    t_s = poses.t_s - calibration.drift_s(poses.t_s) - shift_s
+    timed = CameraTimedImu(imu=imu, calibration=calibration, camera_epoch_ns=poses.epoch_ns)
+    t_s = poses.t_s - calibration.drift_s(poses.t_s) - timed.accel_offset_s
     time = step_s * np.arange(-half, half + 1)
     basis = np.stack([np.ones(len(time)), time, time**2], axis=1)
     second = 2 * np.linalg.pinv(basis)[2][::-1]
