@@ -71,7 +71,7 @@ MUTANTS = (
         ("scale_joint::test_scale_and_gravity_err_together_as_the_covariance_says",),
     ),
     Mutant(
-        "core/types/camera_imu.py",
+        "core/types/imu.py",
         "accel_time_offset_s=self.accel_time_offset_s + by_s + accel_by_s",
         "accel_time_offset_s=self.accel_time_offset_s + accel_by_s",
         "the accelerometer's refined time offset lacks the common delay",
@@ -620,7 +620,7 @@ MUTANTS = (
         ("io_trajectories",),
     ),
     Mutant(
-        "core/types/camera_imu.py",
+        "core/types/imu.py",
         "accel_time_offset_s=offset_s + accel_delay_s",
         "accel_time_offset_s=offset_s - accel_delay_s",
         "sign of the accelerometer's delay in the next recording",

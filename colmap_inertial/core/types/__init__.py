@@ -9,11 +9,12 @@ specific force: at rest the accelerometer reads +9.8 m/s2 away from the ground.
 from __future__ import annotations
 
 from colmap_inertial.core.types.apertures import Aperture, ApertureRig, SpectralRole
-from colmap_inertial.core.types.camera_imu import CAL, CALIBRATION_PARAMETERS, CameraImuCalibration
 from colmap_inertial.core.types.estimated import (
     DOWN_IN_WORLD,
     UNDOES,
     AcceptedScale,
+    Gap,
+    JoinedPart,
     ScaleDrift,
     ScaleEstimate,
     Similarity,
@@ -21,15 +22,17 @@ from colmap_inertial.core.types.estimated import (
     Verdict,
 )
 from colmap_inertial.core.types.imu import (
+    CAL,
+    CALIBRATION_PARAMETERS,
     IMU_CAL,
     IMU_CALIBRATION_PARAMETERS,
     JOINT_GYRO_WALK_RAD_S_RTS,
     TYPICAL_NOISE,
+    CameraImuCalibration,
     ImuCalibration,
     ImuNoise,
     ImuRecording,
 )
-from colmap_inertial.core.types.joined import Gap, JoinedPart
 from colmap_inertial.core.types.motion import CameraMotion, SolvedMotion
 from colmap_inertial.core.types.positions import HeightDatum, PositionFixes
 from colmap_inertial.core.types.recorded import (
