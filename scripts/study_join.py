@@ -37,15 +37,15 @@ from study_refine import adjusted
 from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, so3_log
 from colmap_inertial.core.options import JoinOptions, ScaleOptions
 from colmap_inertial.core.types import ImuRecording
-from colmap_inertial.inertial.join.judge import Ends, ends_of, join_parts
-from colmap_inertial.inertial.join.links import find_links
-from colmap_inertial.inertial.join.solve import Placed
-from colmap_inertial.inertial.join.values import Found, Part
+from colmap_inertial.inertial.join.evidence import find_links
+from colmap_inertial.inertial.join.judge import Ends, join_submodels
+from colmap_inertial.inertial.join.placement import Placed
+from colmap_inertial.inertial.join.values import FittedSubmodel
 from colmap_inertial.inertial.scale.posterior import FittedPath
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.io.trajectories import read_inertial_scale
 from colmap_inertial.model import Model
-from colmap_inertial.pipeline.stages.across import images_in_others
+from colmap_inertial.model.submodels.matches import PlacedImages, place_images
 from colmap_inertial.pipeline.stages.join import JoinStage
 from colmap_inertial.pipeline.stages.metric import MetricStage
 from colmap_inertial.tools.simulate.motion import MotionOptions
@@ -120,36 +120,39 @@ def spoiled(imu: ImuRecording, how: str, spans: list[tuple[float, float]], offse
 
 
 def judged(
-    fitted: list[Part],
+    fitted: list[FittedSubmodel],
     imu: ImuRecording,
     limits: JoinOptions,
     truth: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
-    found: Sequence[Found] = (),
+    found: Sequence[PlacedImages] = (),
 ) -> list[dict[str, Any]]:
     """The gaps between parts, and errors across them; the truth is (N, 3, 3) world_from_cam and (N, 3) by times."""
-    joined = join_parts(fitted, imu, limits, found)
+    joined = join_submodels(fitted, imu, limits, found)
     out: list[dict[str, Any]] = []
     for gap in joined.gaps:
         one: dict[str, Any] = {"joined": gap.joined, "reason": gap.reason}
         one |= {"sigma_m": gap.sigma_m, "sigma_deg": gap.sigma_deg, "chi2": gap.chi2, "dof": gap.dof}
         out.append(one)
         for group in joined.groups:
-            members = [fitted[k] for k in group.parts]
+            members = [fitted[k] for k in group.members]
             for link in find_links(members):
                 if (members[link.first].number, members[link.second].number) == (gap.first, gap.second):
-                    one |= error_across(members, group.placed, ends_of(members, link), truth)
+                    one |= error_across(members, group.placed, Ends.of(members, link), truth)
     return out
 
 
 def error_across(
-    parts: list[Part], placed: Placed, ends: Ends, truth: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+    parts: list[FittedSubmodel],
+    placed: Placed,
+    ends: Ends,
+    truth: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
 ) -> dict[str, Any]:
     """Of the first image after a gap as seen from the last one before it."""
     poses = []
     for k, image in zip(ends.pair, ends.images, strict=True):
-        place, part = placed.placements[k], parts[k]
-        at = place.points(part.trajectory.cam_in_world[image : image + 1])[0]
-        poses.append((place.rotation @ part.world_from_cam[image], at, float(part.trajectory.t_s[image])))
+        part = parts[k]
+        at = placed.points(k, part.trajectory.cam_in_world[image : image + 1])[0]
+        poses.append((placed.places.rotation[k] @ part.world_from_cam[image], at, float(part.trajectory.t_s[image])))
     true, centres = truth(np.array([pose[2] for pose in poses]))
     turn = poses[0][0].T @ poses[1][0] @ (true[0].T @ true[1]).T
     away = poses[0][0].T @ (poses[1][1] - poses[0][1]) - true[0].T @ (centres[1] - centres[0])
@@ -175,7 +178,7 @@ def cut_recording(folder: Path, begin_s: float, gap_s: float, limits: JoinOption
     for k in range(2):
         first_s = path.t_s[0] + begin_s + k * (PART_S + gap_s)
         part = path.select((path.t_s >= first_s) & (path.t_s <= first_s + PART_S))
-        fitted.append(Part(number=k, trajectory=part, path=FittedPath.of(part, imu, None, ScaleOptions())))
+        fitted.append(FittedSubmodel(number=k, trajectory=part, path=FittedPath.of(part, imu, None, ScaleOptions())))
 
     def truth(t_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         at = np.searchsorted(path.t_s, t_s - 1e-6)
@@ -207,7 +210,7 @@ def come_back(gap_s: float, seed: int, limits: JoinOptions) -> list[dict[str, An
     with tempfile.TemporaryDirectory() as folder:
         database = Path(folder) / "database.db"
         tracks.write_database(database)
-        found = images_in_others(database, [model.reconstruction for model in models], [0, 1])
+        found = place_images(database, [model.reconstruction for model in models], [0, 1])
     stage = JoinStage(imu=tracks.imu, calibration=calibration_prior(), limits=limits)
     fitted = [stage.part(model) for model in models]
 

@@ -78,7 +78,9 @@ def adjusted(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     solver.solver_options.num_threads = 1
     solver.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     # beyond 1000 images COLMAP takes conjugate gradients, which along a chain hardly move
-    solver.max_num_images_direct_sparse_cpu_solver = model.num_reg_images()
+    solver.max_num_images_direct_sparse_cpu_solver = max(
+        solver.max_num_images_direct_sparse_cpu_solver, model.num_reg_images()
+    )
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():
         config.add_image(image_id)

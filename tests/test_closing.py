@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from colmap_inertial.colmap import loop_closure
-from colmap_inertial.colmap.loop_closure import LoopClosure, close_gaps
+from colmap_inertial.colmap.loop_closure import LoopClosure, MappedCapture, close_gaps
 from colmap_inertial.io.records import read_record, write_record
 
 #: A camera turns once around in the middle of a round room, looking outwards.
@@ -29,6 +29,9 @@ class Ring:
     database: Path
     model: object
     options: object
+
+    def capture(self, names=None) -> MappedCapture:
+        return MappedCapture(database=self.database, pipeline=self.options, names=NAMES if names is None else names)
 
     def error_m(self) -> float:
         """Of centres, after a similarity, rms."""
@@ -139,7 +142,7 @@ def test_ends_that_met_are_joined_and_what_drifted_on_the_way_goes(tmp_path):
     ring = make(tmp_path)
     before = ring.error_m()
     assert before > 0.05
-    met = close_gaps(ring.database, ring.model, ring.options, NAMES, nearest=None)
+    met = close_gaps(ring.capture(), ring.model, nearest=None)
     # frames 0 and 1 are matched with the last two
     assert met.joined and met.pairs == 3 and met.agree > 0.9
     assert met.images[0] in NAMES[:2] and met.images[1] in NAMES[-2:]
@@ -151,13 +154,13 @@ def test_ends_that_met_are_joined_and_what_drifted_on_the_way_goes(tmp_path):
 def test_a_model_that_is_whole_stays_as_it_is(tmp_path):
     ring = make(tmp_path, drift=1.0)
     before = [ring.model.image(k + 1).projection_center() for k in range(FRAMES)]
-    assert close_gaps(ring.database, ring.model, ring.options, NAMES, nearest=None) is None
+    assert close_gaps(ring.capture(), ring.model, nearest=None) is None
     np.testing.assert_array_equal([ring.model.image(k + 1).projection_center() for k in range(FRAMES)], before)
 
 
 def test_ends_whose_matches_join_what_is_not_the_same_are_not_joined(tmp_path):
     ring = make(tmp_path, shuffled=True)
-    met = close_gaps(ring.database, ring.model, ring.options, NAMES, nearest=None)
+    met = close_gaps(ring.capture(), ring.model, nearest=None)
     assert not met.joined and met.agree < 0.5
 
 
@@ -165,7 +168,7 @@ def test_ends_whose_matches_join_what_is_not_the_same_are_not_joined(tmp_path):
 def test_ends_are_not_joined_by_pairs_of_which_nobody_knows_whether_they_join_copies(tmp_path, names):
     ring = make(tmp_path)
     before = ring.error_m()
-    assert close_gaps(ring.database, ring.model, ring.options, names, nearest=8) is None
+    assert close_gaps(ring.capture(names), ring.model, nearest=8) is None
     assert ring.error_m() == before
 
 
@@ -185,8 +188,8 @@ def test_the_mapper_s_model_is_the_joined_one_where_the_order_in_time_is_known(t
         ring.model.write_binary(str(Path(out) / "0"))
         return {0: ring.model}
 
-    def close(database, model, pipeline, names, *, nearest):
-        asked.append((list(names), nearest))
+    def close(capture, model, *, nearest):
+        asked.append((list(capture.names), nearest))
         model.deregister_frame(1)  # a mark
         return LoopClosure(pairs=4, images=(NAMES[0], NAMES[-1]), agree=0.7, joined=joins)
 

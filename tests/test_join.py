@@ -15,15 +15,15 @@ from colmap_inertial import export_model, read_model, reconstruct_project
 from colmap_inertial.cli.terminal import show_result
 from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, quat_rotate, so3_exp, so3_log
 from colmap_inertial.core.options import JoinOptions, ProjectOptions, ReconstructOptions, ScaleOptions
-from colmap_inertial.inertial.join import solve
-from colmap_inertial.inertial.join._problem import At, Problem, Ties
-from colmap_inertial.inertial.join.judge import ends_of, join_parts, worst
-from colmap_inertial.inertial.join.links import find_links, find_shared
-from colmap_inertial.inertial.join.values import Link, Part
+from colmap_inertial.inertial.join.evidence import Evidence, find_links, find_shared
+from colmap_inertial.inertial.join.judge import Ends, join_submodels, worst
+from colmap_inertial.inertial.join.placement import Problem, place_submodels
+from colmap_inertial.inertial.join.values import FittedSubmodel, ImuLink
 from colmap_inertial.inertial.scale.posterior import CLOCK_RATE, DELAY, FittedPath
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.model import Model, trajectory_from_model, transformed
-from colmap_inertial.model.merging import merged
+from colmap_inertial.model.submodels.graph import PLACEMENT
+from colmap_inertial.model.submodels.merging import merge_models
 from colmap_inertial.pipeline.stages.join import JoinStage
 from colmap_inertial.pipeline.stages.metric import MetricStage
 from colmap_inertial.pipeline.stages.refine import RefineStage
@@ -99,11 +99,11 @@ def halves(walked):
 
 def across(tracks, parts, placed, link):
     """Error and covariance of the first image after a gap as seen from the last one before it: rotation, position."""
-    ends, poses = ends_of(parts, link), []
+    ends, poses = Ends.of(parts, link), []
     for k, image in zip(ends.pair, ends.images, strict=True):
-        place, part = placed.placements[k], parts[k]
-        at = place.points(part.trajectory.cam_in_world[image : image + 1])[0]
-        poses.append((place.rotation @ part.world_from_cam[image], at, part.trajectory.t_s[image]))
+        part = parts[k]
+        at = placed.points(k, part.trajectory.cam_in_world[image : image + 1])[0]
+        poses.append((placed.places.rotation[k] @ part.world_from_cam[image], at, part.trajectory.t_s[image]))
     state = tracks.motion.at(np.array([t_s for _, _, t_s in poses]))
     true = matrix_from_quat(state.world_from_cam_xyzw)
     turn = poses[0][0].T @ poses[1][0] @ (true[0].T @ true[1]).T
@@ -113,10 +113,10 @@ def across(tracks, parts, placed, link):
 
 def test_the_imu_places_one_part_in_the_world_of_the_other(walked, halves):
     _, parts = halves
-    joined = join_parts(parts, walked.imu, LIMITS)
+    joined = join_submodels(parts, walked.imu, LIMITS)
     (gap,), (group,) = joined.gaps, joined.groups
     assert (gap.first, gap.second, gap.joined, gap.shared_images, gap.dof) == (0, 1, True, 0, 5)
-    assert group.parts == (0, 1)
+    assert group.members == (0, 1)
     assert gap.seconds == pytest.approx(1.25, abs=0.01)
     error, cov = across(walked, parts, group.placed, find_links(parts)[0])
     assert np.linalg.norm(error[3:]) < 0.03 and np.degrees(np.linalg.norm(error[:3])) < 0.3
@@ -126,9 +126,9 @@ def test_the_imu_places_one_part_in_the_world_of_the_other(walked, halves):
     assert worst(cov) == pytest.approx((gap.sigma_m, np.radians(gap.sigma_deg)), rel=1e-6)
     assert 0.002 < gap.sigma_m < 0.05
     # both were upright already, as well as each knew by itself
-    held, other = group.placed.placements
-    assert np.array_equal(held.rotation, np.eye(3))
-    assert np.degrees(np.arccos(other.rotation[2, 2])) < 1.5
+    held, other = group.placed.places.rotation
+    assert np.array_equal(held, np.eye(3))
+    assert np.degrees(np.arccos(other[2, 2])) < 1.5
 
 
 def test_three_parts_become_one_across_one_and_two_seconds():
@@ -137,11 +137,11 @@ def test_three_parts_become_one_across_one_and_two_seconds():
     for k, model in enumerate(cut(tracks, [(0.0, 8.2), (9.2, 17.2), (19.2, 27.0)], seed=2)):
         trajectory, _ = trajectory_from_model(model, tracks.timing)
         path = FittedPath.of(trajectory, tracks.imu, None, ScaleOptions())
-        parts.append(Part(number=k, trajectory=trajectory, path=path))
-    joined = join_parts(parts, tracks.imu, LIMITS)
+        parts.append(FittedSubmodel(number=k, trajectory=trajectory, path=path))
+    joined = join_submodels(parts, tracks.imu, LIMITS)
     assert [(gap.first, gap.second, gap.joined) for gap in joined.gaps] == [(0, 1, True), (1, 2, True)]
     (group,) = joined.groups
-    assert group.parts == (0, 1, 2)
+    assert group.members == (0, 1, 2)
     for link, most_m in zip(find_links(parts), (0.04, 0.07), strict=True):
         error, cov = across(tracks, parts, group.placed, link)
         assert np.linalg.norm(error[3:]) < most_m and np.degrees(np.linalg.norm(error[:3])) < 0.4
@@ -151,9 +151,9 @@ def test_three_parts_become_one_across_one_and_two_seconds():
 
 def test_whose_world_it_is_does_not_matter(walked, halves):
     _, parts = halves
-    ties = Ties.of(walked.imu, find_links(parts), [])
-    link = ties.links[0]
-    errors = [across(walked, parts, solve.place(parts, ties, held), link) for held in (0, 1)]
+    evidence = Evidence.of(parts, walked.imu)
+    problems = [Problem(parts, evidence.streams, evidence.links, held=held) for held in (0, 1)]
+    errors = [across(walked, parts, place_submodels(problem), evidence.links[0]) for problem in problems]
     # along the axes of either world
     for part in (slice(0, 3), slice(3, 6)):
         one, other = (float(np.linalg.norm(error[part])) for error, _ in errors)
@@ -164,20 +164,19 @@ def test_whose_world_it_is_does_not_matter(walked, halves):
 
 def test_the_equations_are_the_derivatives_of_their_squares(walked, halves):
     _, parts = halves
-    problem = Problem(parts, Ties.of(walked.imu, find_links(parts), []), 0)
-    start = solve._first_places(problem)
-    shift = np.array([[0.0, 0.0, 0.0], [0.02, -0.03, 0.01]])
-    at = At(y=np.zeros(problem.placed), rotation=start.rotation, translation_m=start.translation_m + shift)
-    equations = solve._equations(problem, at, by_imu=True)
+    evidence = Evidence.of(parts, walked.imu)
+    problem = Problem(parts, evidence.streams, evidence.links)
+    start = np.zeros(problem.size)
+    start[PLACEMENT + 1 : 2 * PLACEMENT] = 0, 0, 0, 0.02, -0.03, 0.01
+    state = replace(problem.start().moved(start), change=np.zeros(problem.size))
+    equations = problem.equations(state, by_imu=True)
     clocks = [problem.own(k) + i for k in (0, 1) for i in (DELAY, CLOCK_RATE)]
     for column in range(problem.size):
-        if column in range(*problem.place(0).indices(problem.size)):
+        if column in range(1, PLACEMENT):
             continue  # the held part stays where it is
         step = np.zeros(problem.size)
         step[column] = 0.02 / equations.matrix[column, column] ** 0.5
-        sides = [
-            solve._equations(problem, solve._moved(problem, at, sign * step), by_imu=True).squares for sign in (-1, 1)
-        ]
+        sides = [problem.equations(state.moved(sign * step), by_imu=True).squares for sign in (-1, 1)]
         slope, expected = 0.5 * (sides[1] - sides[0]), 2 * equations.gradient @ step
         # vibration makes differences by the stamps what they are
         assert expected == pytest.approx(slope, rel=0.1 if column in clocks else 0.02, abs=5e-3), column
@@ -185,7 +184,7 @@ def test_the_equations_are_the_derivatives_of_their_squares(walked, halves):
 
 @pytest.mark.parametrize("limits", [JoinOptions(sigma_m=1e-3), JoinOptions(sigma_deg=1e-3)])
 def test_what_is_not_known_to_the_limits_stays_apart(walked, halves, limits):
-    joined = join_parts(halves[1], walked.imu, limits)
+    joined = join_submodels(halves[1], walked.imu, limits)
     (gap,) = joined.gaps
     assert not joined.groups and not gap.joined
     assert "the limit is" in gap.reason and ("cm" in gap.reason) == (limits.sigma_m < 0.1)
@@ -201,7 +200,7 @@ def test_a_silent_imu_joins_nothing(walked, halves):
     imu = walked.imu
     kept = ~in_the_gap(imu, imu.gyro_t_s)
     silent = replace(imu, gyro_t_s=imu.gyro_t_s[kept], gyro_rad_s=imu.gyro_rad_s[kept])
-    (gap,) = join_parts(halves[1], silent, LIMITS).gaps
+    (gap,) = join_submodels(halves[1], silent, LIMITS).gaps
     assert not gap.joined and gap.sigma_m is None
     assert "the IMU itself recorded nothing for 0.3" in gap.reason
 
@@ -217,7 +216,7 @@ def test_motion_that_the_imu_contradicts_stays_apart(walked, halves, sensor):
         forces = imu.accel_m_s2.copy()
         forces[in_the_gap(imu, imu.accel_t_s)] += [2.0, 1.0, 0.0]
         other = replace(imu, accel_m_s2=forces)
-    (gap,) = join_parts(halves[1], other, LIMITS).gaps
+    (gap,) = join_submodels(halves[1], other, LIMITS).gaps
     assert not gap.joined
     assert "contradicts the motion before and after it" in gap.reason
     assert gap.chi2 > 100 * gap.dof
@@ -235,7 +234,7 @@ def test_a_clock_that_changes_in_the_gap_is_seen(walked, halves, lost_s):
 
     jumped = replace(imu, gyro_t_s=squeezed(imu.gyro_t_s), accel_t_s=squeezed(imu.accel_t_s))
     later = JoinStage(imu=jumped, calibration=UNKNOWN).part(models[1])
-    (gap,) = join_parts([parts[0], later], jumped, LIMITS).gaps
+    (gap,) = join_submodels([parts[0], later], jumped, LIMITS).gaps
     assert not gap.joined
     assert "about the IMU itself" in gap.reason and "clock changed" in gap.reason
 
@@ -298,7 +297,7 @@ def test_a_refused_model_stays_apart_and_so_does_one_alone(walked, halves):
 
 
 def group_of(parts, tracks):
-    (group,) = join_parts(parts, tracks.imu, LIMITS).groups
+    (group,) = join_submodels(parts, tracks.imu, LIMITS).groups
     return group.placed
 
 
@@ -312,12 +311,12 @@ def test_images_that_both_have_tie_two_models(walked):
     stage = JoinStage(imu=walked.imu, calibration=UNKNOWN)
     parts = [stage.part(model) for model in models]
     (shared,) = find_shared(parts)
-    assert len(shared.in_first) == 4 and shared.weight <= 1
+    assert len(shared.images) == 4 and shared.equations <= 6 * 4
     # one that contradicts the others is left out
     wrong = parts[1].trajectory.cam_in_world.copy()
-    wrong[shared.in_second[1]] += 3.0
+    wrong[shared.images[1, 1]] += 3.0
     spoiled = replace(parts[1], trajectory=replace(parts[1].trajectory, cam_in_world=wrong))
-    assert len(find_shared([parts[0], spoiled])[0].in_first) == 3
+    assert len(find_shared([parts[0], spoiled])[0].images) == 3
     (whole,), (gap,) = stage.join_models(models)
     # both parts' fits have the readings of the overlap: they count once
     assert group_of(parts, walked).inflation >= (10.6 + 8.4 - 0.5) / 18.0
@@ -334,8 +333,8 @@ def test_links_are_where_one_part_s_node_follows_another_s():
     # a part in a hole of another one is tied at both ends
     around, inside = part([0, 1, 2, 8, 9]), part([4, 5, 6])
     assert find_links([around, inside]) == [
-        Link(first=0, second=1, from_node=2, to_node=0),
-        Link(first=1, second=0, from_node=2, to_node=3),
+        ImuLink(first=0, second=1, from_node=2, to_node=0),
+        ImuLink(first=1, second=0, from_node=2, to_node=3),
     ]
     # of frames that take turns, only the four shortest steps
     assert len(find_links([part(np.arange(0, 10, 1)), part(np.arange(0.3, 10, 1))])) == 4
@@ -354,7 +353,7 @@ def same_images(first, second):
 def test_models_become_one_with_every_observation_once():
     first, second = small_models()
     second.camera(1).params = first.camera(1).params * 1.001
-    whole = merged([first, second], same_images(first, second))
+    whole, points = merge_models([first, second], agreeing=same_images(first, second))
     names = {one.image(i).name for one in (first, second) for i in one.reg_image_ids()}
     assert {whole.image(i).name for i in whole.reg_image_ids()} == names
     # numbers are the database's, cameras that were refined apart stay apart
@@ -367,7 +366,7 @@ def test_models_become_one_with_every_observation_once():
     assert np.array_equal(whole.camera(2).params, second.camera(1).params)
     # first's points and poses are untouched, and what is seen is seen once, both ways
     for point_id in first.point3D_ids():
-        assert np.array_equal(whole.points3D[point_id].xyz, first.points3D[point_id].xyz)
+        assert np.array_equal(whole.points3D[points[0][point_id]].xyz, first.points3D[point_id].xyz)
     assert whole.num_points3D() > first.num_points3D()
     elements = [(e.image_id, e.point2D_idx) for p in whole.points3D.values() for e in p.track.elements]
     assert len(set(elements)) == len(elements)
@@ -380,13 +379,13 @@ def test_of_an_image_whose_poses_differ_only_the_first_one_s_observations_stay()
     first, second = small_models()
     (both,) = same_images(first, second).values()
     wrong = sorted(both)[1]
-    whole = merged([first, second], {(0, 1): both - {wrong}})
-    every = merged([first, second], {(0, 1): both})
+    whole, _ = merge_models([first, second], agreeing={(0, 1): both - {wrong}})
+    every, _ = merge_models([first, second], agreeing={(0, 1): both})
     image_id = first.find_image_with_name(wrong).image_id
     assert whole.image(image_id).num_points3D == first.image(image_id).num_points3D
     assert every.image(image_id).num_points3D > first.image(image_id).num_points3D
     # a third model's owner is the one whose pose stayed
-    other = merged([first, second, second], {(0, 1): both, (1, 2): both})
+    other, _ = merge_models([first, second, second], agreeing={(0, 1): both, (1, 2): both})
     assert other.num_points3D() == every.num_points3D()
 
 
@@ -394,7 +393,7 @@ def test_numbers_that_clash_become_new_ones(tmp_path):
     first, second = small_models()
     for image_id in second.reg_image_ids():
         second.image(image_id).name = f"other-{second.image(image_id).name}"
-    whole = merged([first, second], {})
+    whole, _ = merge_models([first, second], agreeing={})
     assert whole.num_reg_images() == first.num_reg_images() + second.num_reg_images()
     assert whole.num_points3D() == first.num_points3D() + second.num_points3D()
     whole.write_binary(str(tmp_path))

@@ -10,12 +10,13 @@ from refine_walk import walk
 from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat_exp, quat_multiply, quat_rotate
 from colmap_inertial.core.options import JoinOptions, ScaleOptions
 from colmap_inertial.core.types import CameraTrajectory
-from colmap_inertial.inertial.join.judge import ends_of, join_parts, worst
-from colmap_inertial.inertial.join.links import find_links
-from colmap_inertial.inertial.join.values import Part
+from colmap_inertial.inertial.join.evidence import find_links
+from colmap_inertial.inertial.join.joined_model import _sigma_log
+from colmap_inertial.inertial.join.judge import Ends, join_submodels, worst
+from colmap_inertial.inertial.join.values import FittedSubmodel
 from colmap_inertial.inertial.scale.posterior import FittedPath
 from colmap_inertial.io.calibration import calibration_prior
-from colmap_inertial.pipeline.stages.join import _cameras, _sigma_log
+from colmap_inertial.pipeline.stages.join import _cameras
 from colmap_inertial.tools.simulate.tracks import simulate_tracks
 
 LIMITS = JoinOptions()
@@ -47,7 +48,7 @@ def part_of(tracks, t_s, number, *, shifted=None, shift_m=(0.0, 0.0, 0.0), mount
         length_unit="m",
     )
     fitted = FittedPath.of(path, tracks.imu, calibration_prior(), ScaleOptions())
-    return Part(number=number, trajectory=path, path=fitted)
+    return FittedSubmodel(number=number, trajectory=path, path=fitted)
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +61,7 @@ def inside(walked):
 def test_a_part_in_a_hole_is_held_to_the_poses_on_both_sides(walked, inside, shift_m):
     t_s = np.concatenate([T_S[T_S < 9], T_S[T_S > 19]])
     around = part_of(walked, t_s, 0, shifted=t_s > 15, shift_m=(shift_m, 0, 0))
-    joined = join_parts([around, inside], walked.imu, LIMITS)
+    joined = join_submodels([around, inside], walked.imu, LIMITS)
     (gap,) = joined.gaps
     assert 1.0 < gap.seconds < 1.2
     assert gap.joined == (shift_m == 0)
@@ -69,7 +70,7 @@ def test_a_part_in_a_hole_is_held_to_the_poses_on_both_sides(walked, inside, shi
     else:
         (group,) = joined.groups
         parts = [around, inside]
-        sigmas = [worst(ends_of(parts, link).cov(parts, group.placed))[0] for link in find_links(parts)]
+        sigmas = [worst(Ends.of(parts, link).cov(parts, group.placed))[0] for link in find_links(parts)]
         assert gap.sigma_m == pytest.approx(max(sigmas))
 
 
@@ -78,8 +79,8 @@ def test_parts_that_two_by_two_agree_are_joined_only_where_all_agree(walked, ins
     t_s = np.concatenate([T_S[(T_S > 3.5) & (T_S < 8.5)], T_S[T_S > 19]])
     last = part_of(walked, t_s, 2, shifted=t_s < 10, shift_m=(shift_m, 0, 0))
     parts = [part_of(walked, T_S[T_S < 9], 0), inside, last]
-    joined = join_parts(parts, walked.imu, LIMITS)
-    assert [group.parts for group in joined.groups] == ([(0, 1, 2)] if not shift_m else [(0, 2)])
+    joined = join_submodels(parts, walked.imu, LIMITS)
+    assert [group.members for group in joined.groups] == ([(0, 1, 2)] if not shift_m else [(0, 2)])
 
 
 def test_an_error_of_the_imu_within_the_gap_does_not_become_one_of_the_scale(walked):
@@ -89,7 +90,7 @@ def test_an_error_of_the_imu_within_the_gap_does_not_become_one_of_the_scale(wal
     for wrong in (0.3, -0.3):
         forces = walked.imu.accel_m_s2.copy()
         forces[np.abs(walked.imu.accel_t_s - middle_s) < 0.2] += [wrong, 0, 0]
-        (gap,) = join_parts(parts, replace(walked.imu, accel_m_s2=forces), LIMITS).gaps
+        (gap,) = join_submodels(parts, replace(walked.imu, accel_m_s2=forces), LIMITS).gaps
         assert not gap.joined and "contradicts the motion" in gap.reason
 
 
@@ -97,7 +98,7 @@ def test_an_error_of_the_imu_within_the_gap_does_not_become_one_of_the_scale(wal
 def test_two_cameras_are_not_one_device(walked, mounted_m):
     first = part_of(walked, T_S[T_S < 8.5], 0)
     other = part_of(walked, T_S[(T_S > 9.5) & (T_S < 17)], 1, mounted_m=(mounted_m, 0, 0))
-    (gap,) = join_parts([first, other], walked.imu, LIMITS).gaps
+    (gap,) = join_submodels([first, other], walked.imu, LIMITS).gaps
     assert gap.joined == (mounted_m == 0)
     assert gap.joined or "is mounted to the IMU otherwise" in gap.reason
 
@@ -113,7 +114,7 @@ def test_ties_that_are_off_never_widen_a_scale_beyond_its_own():
 def test_frames_by_turns_are_no_surer_than_all_of_them(walked):
     t_s = T_S[T_S < 17]
     halves = [part_of(walked, t_s[k::2], k) for k in (0, 1)]
-    joined = join_parts(halves, walked.imu, LIMITS)
+    joined = join_submodels(halves, walked.imu, LIMITS)
     (group,) = joined.groups
     placed = group.placed
     assert placed.inflation > 1.9
@@ -127,7 +128,7 @@ def test_pictures_of_two_cameras_stay_apart(walked):
     other = part_of(walked, T_S[(T_S > 9.5) & (T_S < 17)], 1)
     for cameras, joined in (((), True), (("1", "2"), True), (("2",), False)):
         parts = [replace(first, cameras=frozenset({"1"})), replace(other, cameras=frozenset(cameras))]
-        (gap,) = join_parts(parts, walked.imu, LIMITS).gaps
+        (gap,) = join_submodels(parts, walked.imu, LIMITS).gaps
         assert gap.joined == joined
         assert joined or "other cameras" in gap.reason
 
@@ -144,14 +145,14 @@ def test_images_that_lie_otherwise_in_either_part_keep_them_apart(walked):
     centres[third : 2 * third] += [0.5, 0, 0]
     moved = replace(other.trajectory, cam_from_world_xyzw=cam_from_world, cam_in_world=centres)
     other = replace(other, trajectory=moved)
-    (gap,) = join_parts([first, other], walked.imu, LIMITS).gaps
+    (gap,) = join_submodels([first, other], walked.imu, LIMITS).gaps
     assert not gap.joined
     assert gap.reason == f"the {both} images that both have lie otherwise in one than in the other"
 
 
 def test_two_models_of_one_piece_are_not_joined(walked):
     parts = [part_of(walked, T_S[T_S < 9.5], 0), part_of(walked, T_S[T_S < 8.5], 1)]
-    (gap,) = join_parts(parts, walked.imu, LIMITS).gaps
+    (gap,) = join_submodels(parts, walked.imu, LIMITS).gaps
     assert not gap.joined and "two models of one piece" in gap.reason
 
 

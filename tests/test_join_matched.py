@@ -12,11 +12,10 @@ from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.options import JoinOptions
 from colmap_inertial.inertial.join import judge
-from colmap_inertial.inertial.join.judge import join_parts
-from colmap_inertial.inertial.join.links import find_links, find_matched
-from colmap_inertial.inertial.join.values import Found, MatchedImages
+from colmap_inertial.inertial.join.evidence import find_links, find_matched
+from colmap_inertial.inertial.join.judge import join_submodels
 from colmap_inertial.model import Model
-from colmap_inertial.pipeline.stages.across import images_in_others
+from colmap_inertial.model.submodels.matches import PlacedImages, place_images
 from colmap_inertial.pipeline.stages.join import JoinStage
 from colmap_inertial.pipeline.stages.metric import MetricStage
 from colmap_inertial.tools.simulate.motion import MotionOptions
@@ -87,7 +86,7 @@ def _similarity(source, target):
 
 def test_matches_place_a_part_better_than_the_imu_alone(returned, parts, found):
     tracks, _, _ = returned
-    alone, both = (join_parts(parts, tracks.imu, LIMITS, one) for one in ((), found))
+    alone, both = (join_submodels(parts, tracks.imu, LIMITS, one) for one in ((), found))
     assert alone.gaps[0].matched_images == 0 and alone.gaps[0].joined
     (gap,), (group,) = both.gaps, both.groups
     assert gap.joined and gap.matched_images > 10 and gap.shared_images == 0
@@ -107,8 +106,8 @@ def test_matches_that_contradict_the_imu_are_left_out(returned, parts, found):
         replace(one, cam_in_world=one.cam_in_world + (1.0 if one.first == 0 else -1.0) * np.array([1.0, 0.0, 0.0]))
         for one in found
     ]
-    assert all(len(one.in_first) > 10 for one in find_matched(parts, false))
-    joined, alone = (join_parts(parts, tracks.imu, LIMITS, one) for one in (false, ()))
+    assert all(len(one.images) > 10 for one in find_matched(parts, false))
+    joined, alone = (join_submodels(parts, tracks.imu, LIMITS, one) for one in (false, ()))
     assert joined.gaps[0].joined and joined.gaps[0].matched_images == 0
     assert "contradict it, and are left out" in joined.gaps[0].reason
     assert joined.gaps[0].sigma_m == pytest.approx(alone.gaps[0].sigma_m)
@@ -120,7 +119,7 @@ def test_where_the_imu_contradicts_itself_matches_are_not_blamed(returned, parts
     forces = imu.accel_m_s2.copy()
     forces[np.abs(imu.accel_t_s - imu.accel_t_s.mean()) < 0.5] += [3.0, 0.0, 0.0]
     false = replace(imu, accel_m_s2=forces)
-    alone, both = (join_parts(parts, false, LIMITS, one).gaps[0] for one in ((), found))
+    alone, both = (join_submodels(parts, false, LIMITS, one).gaps[0] for one in ((), found))
     assert not alone.joined and not both.joined
     assert both.reason == alone.reason and "left out" not in both.reason
 
@@ -139,7 +138,7 @@ def three():
         shift = (there.trajectory.cam_in_world - state.cam_in_world_m @ turn.T).mean(axis=0)
         shift[0] += shift_m
         state = tracks.motion.at(own.t_s[::4])
-        return Found(
+        return PlacedImages(
             first=first,
             second=second,
             names=own.names[::4],
@@ -162,34 +161,34 @@ def test_of_a_group_s_matches_those_of_one_pair_are_left_out(three):
     true = [found(0, 1), found(2, 1)]
     # no link is between the first and the last part: nobody tried them by themselves
     for false, matched in ((0.0, {(0, 1), (0, 2), (1, 2)}), (1.0, {(0, 1), (1, 2)})):
-        joined = join_parts(parts, imu, LIMITS, [found(0, 2, false), *true])
+        joined = join_submodels(parts, imu, LIMITS, [found(0, 2, false), *true])
         (group,) = joined.groups
-        assert group.parts == (0, 1, 2) and group.matched == matched
+        assert group.members == (0, 1, 2) and group.matched == matched
         assert said_of(joined) == {(0, 1): (True, False), (1, 2): (True, False)}
 
 
 def test_what_is_said_of_matches_is_what_became_of_them_in_the_group(three, monkeypatch):
     parts, imu, found = three
 
-    def tried(parts, imu, members, links, shared):
-        trial = judge_tried(parts, imu, members, links, shared)
-        of_pair = any(isinstance(one, MatchedImages) and (one.first, one.second) == (1, 2) for one in shared)
+    def tried(evidence, members, matched=()):
+        trial = judge_tried(evidence, members, matched)
+        of_pair = any({one.first, one.second} == {1, 2} for one in matched)
         return replace(trial, contradiction="it is so") if of_pair and len(members) == 3 else trial
 
-    judge_tried = judge._tried
+    judge_tried = judge._try
     every = [found(0, 1), found(2, 1)]
-    monkeypatch.setattr(judge, "_tried", tried)
-    joined = join_parts(parts, imu, LIMITS, every)
+    monkeypatch.setattr(judge, "_try", tried)
+    joined = join_submodels(parts, imu, LIMITS, every)
     assert joined.groups[0].matched == {(0, 1)}
     assert said_of(joined) == {(0, 1): (True, False), (1, 2): (False, True)}
 
 
 def test_a_gap_that_the_imu_leaves_too_wide_is_closed_by_matches(returned, parts, found):
     tracks, _, _ = returned
-    alone, both = (join_parts(parts, tracks.imu, LIMITS, one).gaps[0] for one in ((), found))
+    alone, both = (join_submodels(parts, tracks.imu, LIMITS, one).gaps[0] for one in ((), found))
     limits = JoinOptions(sigma_m=0.5 * (alone.sigma_m + both.sigma_m))
-    assert not join_parts(parts, tracks.imu, limits).gaps[0].joined
-    assert join_parts(parts, tracks.imu, limits, found).gaps[0].joined
+    assert not join_submodels(parts, tracks.imu, limits).gaps[0].joined
+    assert join_submodels(parts, tracks.imu, limits, found).gaps[0].joined
 
 
 def test_points_that_both_saw_are_one_in_the_joined_model(returned, stage):
@@ -215,9 +214,9 @@ def test_without_matches_nothing_is_found(returned, tmp_path):
     empty = tmp_path / "database.db"
     tracks.write_database(empty, fewest=10**9)
     reconstructions = [model.reconstruction for model in models]
-    assert images_in_others(empty, reconstructions, [0, 1]) == []
+    assert place_images(empty, reconstructions, [0, 1]) == []
     # models of one database that share images need no matches between these
-    assert images_in_others(returned[2], [reconstructions[0], reconstructions[0]], [0, 1]) == []
+    assert place_images(returned[2], [reconstructions[0], reconstructions[0]], [0, 1]) == []
 
 
 def test_a_database_that_is_gone_is_said(returned, stage, tmp_path, caplog):

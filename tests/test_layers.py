@@ -33,6 +33,7 @@ ROWS = [
 ROWS_INSIDE = {
     "core": [("types",), ("gyro", "camera_clock"), ("gravity",)],
     "imaging": [("semi_global",), ("plane_sweep", "multi_aperture", "exposure_pairs", "restoration")],
+    "model": [("submodels",)],
     "motion": [("flow",), ("two_view_rotation", "shutter", "lateral_flow"), ("align", "smooth")],
     "inertial": [("core",), ("scale",), ("static_calibration", "georeference"), ("refine", "join")],
     "checks": [("diagnose", "validate", "report")],

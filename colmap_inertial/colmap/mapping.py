@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from colmap_inertial.colmap.loop_closure import LONGEST, LoopClosure, close_gaps
+from colmap_inertial.colmap.loop_closure import LONGEST, LoopClosure, MappedCapture, close_gaps
 from colmap_inertial.colmap.sparse import matches_every_pair
 from colmap_inertial.colmap.submaps import map_in_parts, runs
 from colmap_inertial.core.errors import MappingError
@@ -101,11 +101,12 @@ def map_images(
     nearest = None if judged and not every_pair else _NEIGHBOURS * options.overlap
     if options.mapper == "incremental":
         pipeline = _incremental_options(refine_intrinsics, context.num_threads, context.seed)
+        capture = MappedCapture(database=database, pipeline=pipeline, names=in_time)
         if len(in_time) > LONGEST and not every_pair:
             near = _NEIGHBOURS * options.overlap
-            record = _map_in_parts(database, images, sparse, pipeline, in_time, near, judged, context)
+            record = _map_in_parts(capture, images, sparse, context, near=near, loops=judged)
         else:
-            record = _map_in_one_go(database, images, sparse, pipeline, in_time, nearest, num_images, context)
+            record = _map_in_one_go(capture, images, sparse, context, nearest=nearest, num_images=num_images)
     else:
         models = pycolmap.global_mapping(
             str(database),
@@ -129,50 +130,34 @@ def map_images(
 
 
 def _map_in_one_go(
-    database: Path,
-    images: Path,
-    sparse: Path,
-    pipeline: pycolmap.IncrementalPipelineOptions,
-    in_time: Sequence[str],
-    nearest: int | None,
-    num_images: int,
-    context: RunContext,
+    capture: MappedCapture, images: Path, sparse: Path, context: RunContext, *, nearest: int | None, num_images: int
 ) -> MapRecord:
     import pycolmap
 
     models = pycolmap.incremental_mapping(
-        str(database),
+        str(capture.database),
         str(images),
         str(sparse),
-        options=pipeline,
+        options=capture.pipeline,
         next_image_callback=_counter(context.progress, num_images),
     )
     ends = []
-    for number, model in models.items() if in_time else ():
-        met = close_gaps(database, model, pipeline, in_time, nearest=nearest)
-        if met is not None:
-            ends.append(ModelEnds(model=number, **vars(met)))
-            if met.joined:
+    for number, model in models.items() if capture.names else ():
+        closure = close_gaps(capture, model, nearest=nearest)
+        if closure is not None:
+            ends.append(ModelEnds(model=number, **vars(closure)))
+            if closure.joined:
                 model.write_binary(str(sparse / str(number)))
     return MapRecord(mapper="incremental", models=len(models), ends=tuple(ends))
 
 
 def _map_in_parts(
-    database: Path,
-    images: Path,
-    sparse: Path,
-    pipeline: pycolmap.IncrementalPipelineOptions,
-    in_time: Sequence[str],
-    near: int,
-    loops: bool,
-    context: RunContext,
+    capture: MappedCapture, images: Path, sparse: Path, context: RunContext, *, near: int, loops: bool
 ) -> MapRecord:
     # neighbouring parts have some images both
-    parts = runs(len(in_time))
-    counted = _counter(context.progress, len(in_time), of=sum(end - begin for begin, end in parts))
-    models, seams = map_in_parts(
-        database, images, sparse, pipeline, in_time, parts, near=near, loops=loops, registered=counted
-    )
+    parts = runs(len(capture.names))
+    counted = _counter(context.progress, len(capture.names), of=sum(end - begin for begin, end in parts))
+    models, seams = map_in_parts(capture, images, sparse, parts, near=near, loops=loops, registered=counted)
     for number, model in enumerate(models):
         model.extract_colors_for_all_images(str(images))
         (sparse / str(number)).mkdir()

@@ -2,9 +2,9 @@
 
 COLMAP adjusts the whole model again and again while it grows, and from 1000 images on by conjugate gradients, which
 along a chain of images hardly move. Parts take as long for each image in a capture of any length.
-What they have in common, images and matches between them, says how each lies in the next: together, and with the loops
-that matching closed, that places all of them. Then their points are made one, and the whole is adjusted. What does not
-fit then is forgotten, the worst first, and the rest is placed and adjusted again.
+Points that two parts have both, in shared images and in matches between them, constrain the similarity between the two;
+together with the loops that matching closed, these place all parts. Then their points are merged, and the whole is
+adjusted. A constraint that does not fit then is left out, the worst first, and the rest is placed and adjusted again.
 """
 
 from __future__ import annotations
@@ -13,36 +13,40 @@ import copy
 import itertools
 import logging
 import tempfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from colmap_inertial.colmap.loop_closure import LoopClosure, SubmapOverlap, merge_overlaps
-from colmap_inertial.core.arrays import Array, Int64Array
-from colmap_inertial.core.geometry import so3_exp
-from colmap_inertial.model.observed import points_of_features
+from colmap_inertial.colmap.loop_closure import LoopClosure, MappedCapture, SubmapOverlap, merge_overlaps
+from colmap_inertial.model.submodels.graph import (
+    Convergence,
+    Equations,
+    Pair,
+    Placements,
+    SimilarityConstraint,
+    among,
+    chained,
+    columns_of,
+    connected,
+    minimised,
+)
+from colmap_inertial.model.submodels.matches import Submodel, constrain_by_points, matches_between, shared_features
+from colmap_inertial.model.submodels.merging import merge_models
 
 if TYPE_CHECKING:
     import pycolmap
 
 log = logging.getLogger(__name__)
 
-#: Two parts that meet, or one that meets itself: their places, the smaller one first.
-Seam = tuple[int, int]
-
 #: Images of a part at most, and of these, how many the next one has, too.
 PART, SHARED = 400, 40
-#: Parts lie beside each other where so many points are known to be the same: as many matches as COLMAP asks of views.
-LEAST_SAME = 15
-#: Places of a point in two parts differ by this share of how far away it is from the camera, or it is not the same.
-_SAME_SHARE = 0.1
-#: So many of the images are in what parts become, or they stay apart: what only its part's seam held may go.
-_LEAST_KEPT = 0.99
-#: Of a pair of parts, so many points are plenty to place them by.
-_PLENTY = 500
+#: The merged model keeps so much of the images, or parts stay apart: what only its part's seam held may go.
+LEAST_KEPT_SHARE = 0.99
+#: Squares are of shares of points' distances: the adjustment that follows corrects far more than this.
+_CONVERGENCE = Convergence(rounds=50, step=1e-7, squares=0.0, squares_share=1e-9)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -62,41 +66,6 @@ class MappedRun:
     end: int
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Tie:
-    """Points that two parts have both.
-
-    Attributes
-    ----------
-    first, second
-        Places of the parts.
-    in_first, in_second
-        (K, 3) the points, in the parts' own units.
-    away
-        (K,) how far from the cameras they are, in the first one's units.
-    similar
-        From the second one to the first one.
-    """
-
-    first: int
-    second: int
-    in_first: Array
-    in_second: Array
-    away: Array
-    similar: pycolmap.Sim3d
-
-
-def moved(similar: pycolmap.Sim3d, step: Array) -> pycolmap.Sim3d:
-    """By (7,) logarithm of the scale, rotation vector, translation, all small."""
-    import pycolmap
-
-    return pycolmap.Sim3d(
-        similar.scale * float(np.exp(step[0])),
-        pycolmap.Rotation3d(so3_exp(step[1:4]) @ similar.rotation.matrix()),
-        similar.translation + step[4:],
-    )
-
-
 def runs(count: int, *, longest: int = PART, shared: int = SHARED) -> list[tuple[int, int]]:
     """Begins and ends of few runs, about equally long, that hold so many images; neighbours share some."""
     parts = max(1, -(-(count - shared) // (longest - shared)))
@@ -105,11 +74,9 @@ def runs(count: int, *, longest: int = PART, shared: int = SHARED) -> list[tuple
 
 
 def map_in_parts(
-    database: Path,
+    capture: MappedCapture,
     images: Path,
     sparse: Path,
-    pipeline: pycolmap.IncrementalPipelineOptions,
-    names: Sequence[str],
     parts: Sequence[tuple[int, int]],
     *,
     near: int,
@@ -122,8 +89,6 @@ def map_in_parts(
     ----------
     sparse
         Where models go; the parts' own are for a while in folders inside.
-    names
-        In order of time.
     parts
         Begins and ends, as :func:`runs` has them.
     near
@@ -140,252 +105,140 @@ def map_in_parts(
     import pycolmap
 
     made = []
-    own = copy.copy(pipeline)
+    own = copy.copy(capture.pipeline)
     own.extract_colors = False
     for begin, end in parts:
-        own.image_names = list(names[begin:end])
+        own.image_names = list(capture.names[begin:end])
         with tempfile.TemporaryDirectory(dir=sparse) as folder:
             models = pycolmap.incremental_mapping(
-                str(database), str(images), folder, options=own, next_image_callback=registered
+                str(capture.database), str(images), folder, options=own, next_image_callback=registered
             )
         made += [MappedRun(model=model, begin=begin, end=end) for _, model in sorted(models.items())]
-    joined, seams = join_runs(database, made, pipeline, names, near=near, loops=loops) if made else ([], [])
+    joined, seams = join_runs(capture, made, near=near, loops=loops) if made else ([], [])
     return sorted(joined, key=lambda model: -int(model.num_reg_images())), seams
 
 
 def join_runs(
-    database: Path,
-    parts: Sequence[MappedRun],
-    pipeline: pycolmap.IncrementalPipelineOptions,
-    names: Sequence[str],
-    *,
-    near: int,
-    loops: bool,
+    capture: MappedCapture, parts: Sequence[MappedRun], *, near: int, loops: bool
 ) -> tuple[list[pycolmap.Reconstruction], list[LoopClosure]]:
     """Of parts that lie beside each other, one model, and the seams between them, those that did not fit, too.
 
-    Of a seam that does not fit, first loops are not believed, then nothing is: its tie places no part, and its matches
-    make no points one. Each time one seam is less, so that it ends; at worst, parts stay as they are.
+    Of a seam that does not fit, first loops are not believed, then nothing is: its constraint places no part, and its
+    matches merge no points. Each time one seam is less, so that it ends; at worst, parts stay as they are.
     """
-    ties = {(tie.first, tie.second): tie for tie in find_ties(database, parts, names, nearest=None if loops else near)}
-    nearby: dict[Seam, Tie] | None = None
-    nearest: dict[Seam, int | None] = dict.fromkeys(ties, None if loops else near)
-    nearest |= {(k, k): None if loops else near for k in range(len(parts))}
+    farthest = None if loops else near
+    ties = find_ties(capture, parts, nearest=farthest)
+    nearby: dict[Pair, SimilarityConstraint] | None = None
+    nearest: dict[Pair, int | None] = dict.fromkeys([*ties, *((k, k) for k in range(len(parts)))], farthest)
     joined: list[pycolmap.Reconstruction] = []
     seams: list[LoopClosure] = []
-    waiting = _groups(range(len(parts)), ties)
+    waiting = connected(range(len(parts)), ties)
     while waiting:
         members = waiting.pop(0)
         if len(members) == 1:
             joined.append(parts[members[0]].model)
             continue
-        own = [tie for seam, tie in ties.items() if seam[0] in members]
-        placed = place_parts(members, own)
-        whole, part_of = _whole(database, [parts[k] for k in members], placed, pipeline, names)
+        own = among(ties.values(), members)
+        placed = place_parts(len(members), own)
+        whole, part_of = merge_parts([parts[k] for k in members], placed, capture.names)
         of_group = {number: members[k] for number, k in part_of.items()}
-        met = merge_overlaps(database, whole, pipeline, names, part_of=of_group, nearest=nearest)
-        hold = [seam for seam, one in met.seams.items() if one.joined]
-        whole_again = len(_groups(members, hold)) == 1
-        if len(hold) == len(met.seams) and whole_again and met.kept >= _LEAST_KEPT:
+        overlap = merge_overlaps(capture, whole, part_of=of_group, nearest=nearest)
+        fitting = [pair for pair, seam in overlap.seams.items() if seam.joined]
+        all_fit = len(fitting) == len(overlap.seams) and len(connected(members, fitting)) == 1
+        if all_fit and overlap.kept >= LEAST_KEPT_SHARE:
             joined.append(whole)
-            seams += met.seams.values()
+            seams += overlap.seams.values()
             continue
-        worst = _worst(met, own, dict(zip(members, placed, strict=True)))
-        said = met.seams.get(worst)
-        if said is not None:
-            seams.append(replace(said, joined=False))
-        log.info("parts %d and %d do not fit (%.0f %% agree)", *worst, 100 * (said.agree if said else 0))
+        worst = _worst(overlap, {(members[tie.first], members[tie.second]): tie.misfit(placed) for tie in own})
+        if worst in overlap.seams:
+            seams.append(replace(overlap.seams[worst], joined=False))
+        log.info("parts %d and %d do not fit", *worst)
         ties.pop(worst, None)
-        limit = nearest.pop(worst)
-        if limit is None and met.farthest.get(worst, 0) > near:
+        if nearest.pop(worst) is None and overlap.farthest.get(worst, 0) > near:
             if nearby is None:
-                nearby = {(tie.first, tie.second): tie for tie in find_ties(database, parts, names, nearest=near)}
+                nearby = find_ties(capture, parts, nearest=near)
             if worst in nearby:
                 ties[worst] = nearby[worst]
             if worst in nearby or worst[0] == worst[1]:
                 nearest[worst] = near
-        waiting = _groups(members, ties) + waiting
+        waiting = connected(members, ties) + waiting
     return joined, seams
 
 
-def _worst(met: SubmapOverlap, ties: Sequence[Tie], placed: Mapping[int, pycolmap.Sim3d]) -> Seam:
-    """The seam that fits least once all was adjusted; where that does not tell, the tie that parts lie by least."""
-
-    def fits(tie: Tie) -> tuple[float, int]:
-        second_in_first = placed[tie.first].inverse() * placed[tie.second]
-        off = np.linalg.norm(tie.in_first - second_in_first * tie.in_second, axis=1)
-        return float(np.mean(off < _SAME_SHARE * tie.away)), len(tie.away)
-
-    fit = {(tie.first, tie.second): fits(tie) for tie in ties}
-    if all(one.joined for one in met.seams.values()) and (unseen := fit.keys() - met.seams.keys()):
-        return min(unseen, key=lambda seam: (fit[seam], seam))
-    # points are no fewer than so many of a seam inside of a part, which nothing places
-    return min(met.seams, key=lambda seam: (met.seams[seam].agree, fit.get(seam, (1.0, _PLENTY)), seam))
+def _worst(overlap: SubmapOverlap, misfit: dict[Pair, float]) -> Pair:
+    """The seam that fits least once all was adjusted; where that does not tell, the constraint that fits least."""
+    if all(seam.joined for seam in overlap.seams.values()) and (unseen := misfit.keys() - overlap.seams.keys()):
+        return max(unseen, key=lambda pair: (misfit[pair], pair))
+    return min(overlap.seams, key=lambda pair: (overlap.seams[pair].agree, -misfit.get(pair, 0.0), pair))
 
 
-def find_ties(database: Path, parts: Sequence[MappedRun], names: Sequence[str], *, nearest: int | None) -> list[Tie]:
-    """What parts have in common: points of images that both have, or else of images that are matched."""
-    import pycolmap
+def find_ties(
+    capture: MappedCapture, parts: Sequence[MappedRun], *, nearest: int | None
+) -> dict[Pair, SimilarityConstraint]:
+    """Constraints by points that parts have both: in images that both have, or else in images that are matched.
 
-    place = {name: at for at, name in enumerate(names)}
-    points = [
-        {number: points_of_features(part.model.image(number)) for number in part.model.reg_image_ids()}
-        for part in parts
-    ]
-    having: dict[int, list[int]] = {}
-    for k, of_images in enumerate(points):
-        for number in of_images:
-            having.setdefault(number, []).append(k)
-    same: dict[tuple[int, int], list[tuple[int, Int64Array]]] = {}
-
-    def add(a: int, b: int, image: int, of_a: Int64Array, of_b: Int64Array) -> None:
-        both = (of_a >= 0) & (of_b >= 0)
-        same.setdefault((a, b), []).append((image, np.stack([of_a[both], of_b[both]], axis=1)))
-
-    for number, holders in sorted(having.items()):
-        for a, b in itertools.combinations(holders, 2):
-            add(a, b, number, points[a][number], points[b][number])
-    beside = set(same)
-    with pycolmap.Database.open(str(database)) as opened:
-        for pair, count in zip(*opened.read_two_view_geometry_num_inliers(), strict=True):
-            i, j = pycolmap.pair_id_to_image_pair(pair)
-            if count < LEAST_SAME or i not in having or j not in having:
-                continue
-            across = [(a, b) for a in having[i] for b in having[j] if a != b and tuple(sorted((a, b))) not in beside]
-            apart = abs(place[parts[having[i][0]].model.image(i).name] - place[parts[having[j][0]].model.image(j).name])
-            if not across or (nearest is not None and apart > nearest):
-                continue
-            matches = np.array(opened.read_two_view_geometry(i, j).inlier_matches, dtype=np.int64)
-            for a, b in across:
-                if a < b:
-                    add(a, b, i, points[a][i][matches[:, 0]], points[b][j][matches[:, 1]])
-                else:
-                    add(b, a, j, points[b][j][matches[:, 1]], points[a][i][matches[:, 0]])
-    found = (_tie(parts, a, b, seen) for (a, b), seen in sorted(same.items()))
-    return [tie for tie in found if tie is not None]
-
-
-def _tie(parts: Sequence[MappedRun], a: int, b: int, seen: Sequence[tuple[int, Int64Array]]) -> Tie | None:
-    """Points that two parts have both, without those that contradict the others; None where these are too few."""
-    import pycolmap
-
-    first, second = parts[a].model, parts[b].model
-    pairs = np.concatenate([pairs for _, pairs in seen])
-    images = np.repeat([image for image, _ in seen], [len(pairs) for _, pairs in seen])
-    pairs, at = np.unique(pairs, axis=0, return_index=True)
-    if len(pairs) < LEAST_SAME:
-        return None
-    centres = {int(image): first.image(image).projection_center() for image in np.unique(images[at])}
-    in_first = np.array([first.point3D(number).xyz for number in pairs[:, 0].tolist()])
-    in_second = np.array([second.point3D(number).xyz for number in pairs[:, 1].tolist()])
-    away = np.linalg.norm(in_first - np.array([centres[image] for image in images[at].tolist()]), axis=1)
-    ransac = pycolmap.RANSACOptions()
-    ransac.random_seed = 0
-    ransac.max_error = _SAME_SHARE * float(np.median(away))
-    found: Any = pycolmap.estimate_sim3d_robust(in_second, in_first, ransac)  # a dict, whatever it is said to be
-    if found is None:
-        return None
-    similar: pycolmap.Sim3d = found["tgt_from_src"]
-    agree = np.flatnonzero(np.linalg.norm(in_first - similar * in_second, axis=1) < _SAME_SHARE * away)
-    if len(agree) < max(LEAST_SAME, len(pairs) / 2):
-        return None
-    log.info("parts %d and %d: %d of %d points agree", a, b, len(agree), len(pairs))
-    some = agree[np.linspace(0, len(agree) - 1, min(_PLENTY, len(agree))).astype(int)]
-    return Tie(first=a, second=b, in_first=in_first[some], in_second=in_second[some], away=away[some], similar=similar)
-
-
-def _groups(members: Sequence[int], seams: Iterable[Seam]) -> list[list[int]]:
-    """Parts that hang together."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    place = {k: at for at, k in enumerate(members)}
-    ends = np.array([(place[a], place[b]) for a, b in seams if a in place], dtype=np.intp).reshape(-1, 2)
-    graph = coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(len(place), len(place)))
-    number, of_part = connected_components(graph, directed=False)
-    return [[members[at] for at in np.flatnonzero(of_part == k).tolist()] for k in range(number)]
-
-
-def place_parts(members: Sequence[int], ties: Sequence[Tie]) -> list[pycolmap.Sim3d]:
-    """Where parts that hang together lie in the first one's world, by all ties at once."""
-    import pycolmap
-    from scipy.optimize import least_squares
-
-    known = {members[0]: pycolmap.Sim3d()}
-    for tie in itertools.chain.from_iterable(itertools.repeat(sorted(ties, key=lambda t: -len(t.away)), len(members))):
-        if tie.first in known and tie.second not in known:
-            known[tie.second] = known[tie.first] * tie.similar
-        elif tie.second in known and tie.first not in known:
-            known[tie.first] = known[tie.second] * tie.similar.inverse()
-    if len(ties) < len(members):
-        return [known[k] for k in members]
-    place = {k: at for at, k in enumerate(members)}
-    start = [known[k] for k in members]
-    short = [_shortened(tie) for tie in ties]
-
-    def at(x: Array) -> list[pycolmap.Sim3d]:
-        steps = np.vstack([np.zeros(7), x.reshape(-1, 7)])
-        return [moved(one, step) for one, step in zip(start, steps, strict=True)]
-
-    def off(x: Array) -> Array:
-        lie = at(x)
-        out = []
-        for tie, (design, target) in zip(ties, short, strict=True):
-            second_in_first = lie[place[tie.first]].inverse() * lie[place[tie.second]]
-            out.append(target - design @ second_in_first.matrix().T)
-        return np.concatenate(out).ravel()
-
-    return at(least_squares(off, np.zeros(7 * (len(members) - 1)), x_scale="jac").x)
-
-
-def _shortened(tie: Tie) -> tuple[Array, Array]:
-    """(4, 4) and (4, 3): what is left of all of a tie's points, but for a sum of squares that nothing changes.
-
-    Over their distances, places in the first part less those in the second, moved, are linear in the twelve numbers
-    that move them. So as many rows as these have for each coordinate say as much as all points.
+    Parameters
+    ----------
+    nearest
+        Matches of images farther apart in time do not count; ``None`` where all do.
     """
-    design = np.c_[tie.in_second, np.ones(len(tie.away))]
-    _, upper = np.linalg.qr(np.c_[design, tie.in_first] / tie.away[:, None])
-    return np.asarray(upper[:4, :4]), np.asarray(upper[:4, 4:])
+    place = {name: at for at, name in enumerate(capture.names)}
+    submodels = [Submodel(part.model) for part in parts]
+    shared = shared_features(submodels)
+
+    def near(first: str, second: str) -> bool:
+        return nearest is None or abs(place[first] - place[second]) <= nearest
+
+    views = matches_between(capture.database, submodels, near) | shared
+    found = {pair: constrain_by_points(submodels, pair, views[pair]) for pair in sorted(views)}
+    return {pair: tie for pair, tie in found.items() if tie is not None}
 
 
-def _whole(
-    database: Path,
-    group: Sequence[MappedRun],
-    placed: Sequence[pycolmap.Sim3d],
-    pipeline: pycolmap.IncrementalPipelineOptions,
-    names: Sequence[str],
+def place_parts(count: int, ties: Sequence[SimilarityConstraint]) -> Placements:
+    """Where parts that hang together lie in the first one's world, by all constraints at once."""
+    order = sorted(ties, key=lambda tie: -float(np.trace(tie.info)))
+    start = chained(
+        Placements.at_origin(np.ones(count)), 0, order, lambda state, tie, new: tie.attach(state, new, scaled=True)
+    )
+
+    def equations(state: Placements) -> Equations:
+        out = Equations.of_size(len(state.change))
+        for tie in ties:
+            tie.add_to(out, state)
+        out.hold(columns_of(0))
+        return out
+
+    try:
+        return minimised(start, equations, _CONVERGENCE)[0]
+    except np.linalg.LinAlgError as error:
+        log.info("parts lie one after the other: %s", error)
+        return start
+
+
+def merge_parts(
+    group: Sequence[MappedRun], placed: Placements, names: Sequence[str]
 ) -> tuple[pycolmap.Reconstruction, dict[int, int]]:
     """One model of parts, and by number of an image whose it is: of several, that has most images on both sides."""
     import pycolmap
 
     place = {name: at for at, name in enumerate(names)}
-    owner: dict[int, tuple[int, int]] = {}
-    for k, part in enumerate(group):
-        for number in part.model.reg_image_ids():
-            at = place[part.model.image(number).name]
-            inside = min(at - part.begin, part.end - 1 - at)
-            if number not in owner or inside > owner[number][0]:
-                owner[number] = (inside, k)
-    cached = pycolmap.DatabaseCacheOptions()
-    cached.min_num_matches = pipeline.min_num_matches
-    whole = pycolmap.Reconstruction()
-    with pycolmap.Database.open(str(database)) as opened:
-        whole.load(pycolmap.DatabaseCache.create(opened, cached))
-    # each part refined its own cameras, where they are refined
+    owner: dict[str, tuple[int, int]] = {}
+    # each part refined its own cameras, where they are refined: those of the part that sees most count
+    cameras: dict[int, pycolmap.Camera] = {}
     for part in sorted(group, key=lambda part: int(part.model.compute_num_observations())):
-        for camera_id, camera in part.model.cameras.items():
-            whole.camera(camera_id).params = list(camera.params)
-    for k, (part, similar) in enumerate(zip(group, placed, strict=True)):
+        cameras |= part.model.cameras
+    moved = []
+    for k, part in enumerate(group):
         model = pycolmap.Reconstruction(part.model)
-        model.transform(similar)
-        own = {number for number in model.reg_image_ids() if owner[number][1] == k}
-        for number in sorted(own):
-            image = model.image(number)
-            whole.frame(image.frame_id).set_cam_from_world(image.camera_id, image.cam_from_world())
-            whole.register_frame(image.frame_id)
-        for _, point in sorted(model.points3D.items()):
-            elements = [element for element in point.track.elements if element.image_id in own]
-            if len(elements) > 1:
-                whole.add_point3D(point.xyz, pycolmap.Track(elements), point.color)
-    return whole, {number: k for number, (_, k) in owner.items()}
+        model.transform(placed.similarity(k))
+        for number in model.cameras:
+            model.camera(number).params = list(cameras[number].params)
+        moved.append(model)
+        for number in model.reg_image_ids():
+            name = model.image(number).name
+            inside = min(place[name] - part.begin, part.end - 1 - place[name])
+            if name not in owner or inside > owner[name][0]:
+                owner[name] = (inside, k)
+    of_images = {name: k for name, (_, k) in owner.items()}
+    whole, _ = merge_models(moved, owner=of_images)
+    return whole, {number: of_images[whole.image(number).name] for number in whole.reg_image_ids()}

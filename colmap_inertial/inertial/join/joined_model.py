@@ -1,0 +1,231 @@
+"""One metric model of several that were placed together: images, points, scale, and what is known of each part."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.geometry import (
+    matrix_from_quat,
+    quat_conjugate,
+    quat_from_matrix,
+    quat_rotate,
+    rotation_between,
+    skew,
+)
+from colmap_inertial.core.options import WorldAxes
+from colmap_inertial.core.types import DOWN_IN_WORLD, JoinedPart, ScaleEstimate, Similarity, Treatment
+from colmap_inertial.inertial.join.judge import JoinedGroup, relative_cov, worst
+from colmap_inertial.inertial.join.placement import Placed
+from colmap_inertial.inertial.join.values import FittedSubmodel
+from colmap_inertial.inertial.scale.verdict import TRUSTED_HALF_WIDTH, half_width, verdict_of
+from colmap_inertial.model import Model, transformed
+from colmap_inertial.model.submodels.graph import PLACEMENT
+from colmap_inertial.model.submodels.matches import PlacedImages
+from colmap_inertial.model.submodels.merging import merge_models, merge_points
+
+log = logging.getLogger(__name__)
+
+#: Two points become one where every image sees it so close, as COLMAP filters points.
+SAME_POINT_PX = 4.0
+
+
+def join_models(
+    models: Sequence[Model],
+    submodels: Sequence[FittedSubmodel],
+    group: JoinedGroup,
+    found: Sequence[PlacedImages],
+    *,
+    world: WorldAxes,
+) -> Model:
+    """One model of a group, in the world of its first, gravity and scale as all have them together.
+
+    Parameters
+    ----------
+    models, submodels
+        All that were judged, in the order that the group's members are places of.
+    found
+        Images of one model that matches place in another.
+    world
+        Where gravity points.
+    """
+    members, fitted = [models[k] for k in group.members], [submodels[k] for k in group.members]
+    first, placed = members[0], group.placed
+    assert first.scale is not None and first.similarity is not None
+    moves = [_metric_move(placed, k, world) for k in range(len(members))]
+    after = [_after(move, model) for move, model in zip(moves, members, strict=True)]
+    # its own up and scale are as uncertain as before, at most
+    placements = [replace(after[0], cov=_with_scale(first.similarity.cov, _sigma_log(first, fitted[0], placed, 0)))]
+    for k in range(1, len(members)):
+        cov = _similarity_cov(placed, k, moves[k])
+        shared = np.zeros((4, 4))
+        shared[0, 0], shared[1:, 1:] = _unmodelled_variance(members[k], fitted[k]), placements[0].cov[1:4, 1:4]
+        by = _by_world(after[k].translation_m)
+        cov = cov + by @ shared @ by.T
+        placements.append(replace(after[k], cov=0.5 * (cov + cov.T)))
+    about = [_part_of(model, fitted, placed, k, placements[k]) for k, model in enumerate(members)]
+    numbers = ", ".join(str(model.colmap_index) for model in members)
+    reason = f"joined of COLMAP's models {numbers}, {sum(part.images for part in about)} images"
+    scale = _scale_of(members, about, float(np.linalg.norm(placed.gravity_m_s2)) * DOWN_IN_WORLD[world])
+    return replace(
+        _merged(members, moves, fitted, group, found),
+        scale=replace(scale, notes=(*scale.notes, f"the model was {reason}")),
+        similarity=replace(placements[0], provenance=f"{first.similarity.provenance}; {reason}"),
+        treatments=(
+            *first.treatments,
+            Treatment(stage="join", reason=reason, action="joined", values={"parts": len(members)}),
+        ),
+        observed_px={name: xy for model in reversed(members) for name, xy in model.observed_px.items()},
+        parts=tuple(about),
+    )
+
+
+def _metric_move(placed: Placed, k: int, world: WorldAxes) -> Similarity:
+    """From a submodel's own metric world to the joined one; the first one's origin stays where it is."""
+    up = matrix_from_quat(rotation_between(placed.gravity_m_s2, DOWN_IN_WORLD[world]))
+    scale, rotation = float(placed.places.scale[k]), up @ placed.places.rotation[k]
+    shift = up @ placed.places.translation[k] + placed.origins[0] - scale * rotation @ placed.origins[k]
+    return Similarity(scale=scale, rotation_xyzw=quat_from_matrix(rotation), translation_m=shift, cov=np.zeros((7, 7)))
+
+
+def _after(move: Similarity, model: Model) -> Similarity:
+    """From COLMAP's units of a model to the joined world."""
+    before = model.similarity
+    assert before is not None
+    rotation = matrix_from_quat(move.rotation_xyzw) @ matrix_from_quat(before.rotation_xyzw)
+    return Similarity(
+        scale=move.scale * before.scale,
+        rotation_xyzw=quat_from_matrix(rotation),
+        translation_m=move.scale * quat_rotate(move.rotation_xyzw, before.translation_m) + move.translation_m,
+        cov=np.zeros((7, 7)),
+        provenance=before.provenance,
+    )
+
+
+def _merged(
+    members: Sequence[Model],
+    moves: Sequence[Similarity],
+    fitted: Sequence[FittedSubmodel],
+    group: JoinedGroup,
+    found: Sequence[PlacedImages],
+) -> Model:
+    """The first model with all images and points of a group, those that matches say are one as one."""
+    agreeing = {
+        (one.first, one.second): {fitted[one.first].trajectory.names[i] for i in one.images[:, 0].tolist()}
+        for one in group.shared
+    }
+    pieces = [transformed(model.reconstruction, move) for model, move in zip(members, moves, strict=True)]
+    whole, points = merge_models(pieces, agreeing=agreeing)
+    number = {model.colmap_index: of_model for model, of_model in zip(members, points, strict=True)}
+    same = [
+        (number[placed.first][a], number[placed.second][b])
+        for placed in found
+        if {(placed.first, placed.second), (placed.second, placed.first)} & group.matched
+        for a, b in placed.matches.tolist()
+        if a in number[placed.first] and b in number[placed.second]
+    ]
+    log.info("%d points of two models are one", merge_points(whole, same, within_px=SAME_POINT_PX))
+    return replace(members[0], reconstruction=whole)
+
+
+def _similarity_cov(placed: Placed, k: int, move: Similarity) -> Array:
+    """(7, 7) covariance of log scale, rotation and translation, now of the world's origin, not the submodel's."""
+    rotation = matrix_from_quat(move.rotation_xyzw)
+    up, arm = rotation @ placed.places.rotation[k].T, -move.scale * rotation @ placed.origins[k]
+    by = np.zeros((PLACEMENT, PLACEMENT))
+    by[0, 0] = 1.0
+    by[1:4, 1:4] = by[4:, 4:] = up
+    by[4:, 0] = arm
+    by[4:, 1:4] = -skew(arm) @ up
+    own = slice(PLACEMENT * k, PLACEMENT * (k + 1))
+    return np.asarray(placed.inflation * by @ placed.cov[own, own] @ by.T)
+
+
+def _with_scale(cov: Array, sigma_log: float) -> Array:
+    """A similarity's covariance with another standard deviation of its scale."""
+    before = float(cov[0, 0]) ** 0.5
+    by = np.eye(7)
+    by[0, 0] = min(1.0, sigma_log / before) if before > 0 else 1.0
+    return np.asarray(by @ cov @ by.T)
+
+
+def _by_world(translation_m: Array) -> Array:
+    """(7, 4) of a similarity by the size of a metre and by a rotation of the world, both about the world's origin."""
+    by = np.zeros((PLACEMENT, 4))
+    by[0, 0], by[4:, 0] = 1.0, translation_m
+    by[1:4, 1:], by[4:, 1:] = np.eye(3), -skew(translation_m)
+    return by
+
+
+def _unmodelled_variance(model: Model, submodel: FittedSubmodel) -> float:
+    """What the fit itself does not say of a scale's variance: lens, accelerometer and more."""
+    assert model.scale is not None and model.scale.sigma_log is not None
+    return max(0.0, model.scale.sigma_log**2 - submodel.path.scale[1])
+
+
+def _sigma_log(model: Model, submodel: FittedSubmodel, placed: Placed, k: int) -> float:
+    """Of a scale once joined: what the fit left of it goes down, all the rest stays."""
+    # where the ties are off by more than noise makes them, the scale gains less by them
+    joined = placed.inflation * float(placed.cov[7 * k, 7 * k])
+    return float((min(submodel.path.scale[1], joined) + _unmodelled_variance(model, submodel)) ** 0.5)
+
+
+def _part_of(
+    model: Model, fitted: Sequence[FittedSubmodel], placed: Placed, k: int, similarity: Similarity
+) -> JoinedPart:
+    assert model.scale is not None
+    trajectory, (sigma_m, sigma_rad) = fitted[k].trajectory, (0.0, 0.0)
+    if k:
+        middles = [one.trajectory.cam_in_world.mean(axis=0) for one in (fitted[0], fitted[k])]
+        sigma_m, sigma_rad = worst(relative_cov(fitted, placed, middles, (0, k)))
+    return JoinedPart(
+        colmap_index=model.colmap_index,
+        images=model.reconstruction.num_reg_images(),
+        begin_s=float(trajectory.t_s[0]),
+        end_s=float(trajectory.t_s[-1]),
+        verdict=model.scale.verdict,
+        sigma_log=_sigma_log(model, fitted[k], placed, k),
+        similarity=similarity,
+        sigma_m=sigma_m,
+        sigma_deg=float(np.degrees(sigma_rad)),
+    )
+
+
+def _scale_of(members: Sequence[Model], parts: Sequence[JoinedPart], down: Array) -> ScaleEstimate:
+    """The scale of a joined model: that of its first part, with what the others say of it."""
+    first, similarity, sigma_log = members[0].scale, parts[0].similarity, parts[0].sigma_log
+    assert first is not None and first.gravity_in_world_m_s2 is not None and first.sigma_log is not None
+    verdict, ci95, reasons = verdict_of(similarity.scale, sigma_log, [*first.reasons, *_doubts(members[1:], parts[1:])])
+    narrower = sigma_log / first.sigma_log
+    return replace(
+        first,
+        metres_per_unit=similarity.scale,
+        sigma_log=sigma_log,
+        ci95=ci95,
+        verdict="weak" if first.verdict == "weak" else verdict,
+        reasons=tuple(dict.fromkeys(reasons)),
+        # in COLMAP's world, as the similarity turns it down
+        gravity_in_world_m_s2=quat_rotate(quat_conjugate(similarity.rotation_xyzw), down),
+        parts=None if first.parts is None else {name: narrower * sigma for name, sigma in first.parts.items()},
+    )
+
+
+def _doubts(members: Sequence[Model], parts: Sequence[JoinedPart]) -> list[str]:
+    """What keeps a joined model from being trusted, beside its first part."""
+    out = []
+    for model, part in zip(members, parts, strict=True):
+        scale = model.scale
+        assert scale is not None and scale.sigma_log is not None
+        known = half_width(part.sigma_log)
+        if known > TRUSTED_HALF_WIDTH:
+            why = f"its scale is known to +-{100 * known:.1f} % only"
+        elif scale.verdict == "weak" and half_width(scale.sigma_log) <= TRUSTED_HALF_WIDTH:
+            why = "; ".join(scale.reasons)
+        else:
+            continue
+        out.append(f"its part of {part.images} images, COLMAP's model {part.colmap_index}: {why}")
+    return out
