@@ -12,9 +12,7 @@ from typing import TYPE_CHECKING
 from colmap_inertial.core.errors import NotObservableError, TimingError
 from colmap_inertial.core.options import JoinOptions
 from colmap_inertial.core.threads import one_blas_thread
-from colmap_inertial.core.types import (
-    Gap,
-)
+from colmap_inertial.core.types import Gap
 from colmap_inertial.inertial.join.joined_model import join_models
 from colmap_inertial.inertial.join.judge import join_submodels
 from colmap_inertial.inertial.join.values import FittedSubmodel
@@ -30,8 +28,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-#: Two points become one where every image sees it so close, as COLMAP filters points.
-_SAME_PX = 4.0
 _NO_MATCHES = "without matches between the two: COLMAP's database is gone"
 
 
