@@ -15,7 +15,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.arrays import Array, Float32Array
 from colmap_inertial.core.geometry import quat_exp, quat_from_matrix, quat_multiply
 from colmap_inertial.core.types import CameraModel
 from colmap_inertial.io.files import write_json, write_text
@@ -46,8 +46,8 @@ PERIOD_M = 1.25
 #: Knots of the path.
 RATE_HZ = 60.0
 
-Kind = Callable[[np.random.Generator, int, int], textures.Texture]
-Paint = Callable[[Kind, np.random.Generator, int, int], textures.Texture]
+Kind = Callable[[np.random.Generator, int, int], Float32Array]
+Paint = Callable[[Kind, np.random.Generator, int, int], Float32Array]
 Scene = Literal["room", "mixed", "copies", "tiled", "corridor", "tiled corridor"]
 
 
@@ -139,11 +139,11 @@ def world_of(walk: Walk) -> World:
     return World(quads=tuple(quads), board=Board(), board_corners_m=np.zeros((0, 3)))
 
 
-def _drawn(kind: Kind, rng: np.random.Generator, height: int, width: int) -> textures.Texture:
+def _drawn(kind: Kind, rng: np.random.Generator, height: int, width: int) -> Float32Array:
     return kind(rng, height, width)
 
 
-def _blank(kind: Kind, rng: np.random.Generator, height: int, width: int) -> textures.Texture:
+def _blank(kind: Kind, rng: np.random.Generator, height: int, width: int) -> Float32Array:
     return np.zeros((2, 2, 3), dtype=np.float32)
 
 
