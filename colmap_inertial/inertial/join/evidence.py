@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations, pairwise
 
 import numpy as np
@@ -149,7 +149,7 @@ def find_matched(submodels: Sequence[FittedSubmodel], found: Sequence[PlacedImag
         t_s = submodels[own].trajectory.t_s[images[:, 1]]
         constraint = _constraint(submodels, (k, own), images, poses, t_s, alike_s=LIMITS.matched_alike_s)
         if constraint is not None:
-            out.append(replace(constraint, matched=True))
+            out.append(constraint)
     # one's images in the other and the other's in it are the same matches, read twice
     times = Counter(pair_of(one) for one in out)
     return [one.weighted(1 / times[pair_of(one)]) for one in out]

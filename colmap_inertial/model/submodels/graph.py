@@ -213,8 +213,6 @@ class SimilarityConstraint:
         (n, 2) the images of either submodel that it was measured by, where it was by their poses.
     equations
         How many independent equations it stands for.
-    matched
-        Whether it was measured by matches; else by images that both have.
     """
 
     first: int
@@ -227,7 +225,6 @@ class SimilarityConstraint:
     squares: float = 0.0
     images: Int64Array = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
     equations: float = 0.0
-    matched: bool = False
 
     @classmethod
     def fitted(
