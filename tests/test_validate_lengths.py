@@ -19,7 +19,7 @@ from colmap_inertial.checks.validate.markers import distance_between, with_check
 from colmap_inertial.core.errors import FormatError, InertialError, NotObservableError
 from colmap_inertial.core.geometry import quat_exp, quat_rotate
 from colmap_inertial.core.options import ValidateOptions
-from colmap_inertial.reconstruction.drivers.sources import validate_source
+from colmap_inertial.reconstruction.drivers.sources import KnownLengths, validate_source
 
 SIDE_M = 0.1
 PLACES = {0: (0, 0, 0), 1: (2, 0, 0), 2: (0, 3, 0.5), 3: (2, 3, 1), 7: (1, 1, 2)}
@@ -122,7 +122,7 @@ def test_a_second_board_that_cannot_be_used_is_refused_before_the_search(tmp_pat
     for name in ("cameras", "images", "points3D"):
         (tmp_path / f"{name}.txt").write_text("")
     with pytest.raises(InertialError, match=words):
-        validate_source(tmp_path, tmp_path, target, ValidateOptions(), other=other)
+        validate_source(tmp_path, tmp_path, target, ValidateOptions(), known=KnownLengths(other=other))
 
 
 def test_the_distance_of_two_markers():

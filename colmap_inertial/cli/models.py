@@ -321,19 +321,15 @@ class Validate(Reader):
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        from colmap_inertial.reconstruction.drivers.sources import validate_source
+        from colmap_inertial.reconstruction.drivers.sources import KnownLengths, ValidationOutputs, validate_source
 
         result = validate_source(
             self.model,
             self.images,
             self.target,
             ValidateOptions(tolerance_pct=self.tolerance, unscaled=self.unscaled),
-            json=self.json_file,
-            pictures=self.pictures,
-            apply=self.apply,
-            bars=self.bars,
-            check_points=self.check_points,
-            other=self.other_target,
+            ValidationOutputs(json=self.json_file, pictures=self.pictures, apply=self.apply),
+            KnownLengths(bars=self.bars, check_points=self.check_points, other=self.other_target),
         )
         self.tell(lambda: show_validation(result), result.as_json(), written=True)
         return 0 if result.within_tolerance else 1

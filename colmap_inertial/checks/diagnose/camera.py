@@ -82,21 +82,23 @@ def check_belonging(recorded: Recorded) -> Iterator[Finding]:
     otherwise = _as_it_would_fit(recorded, imu)
     if otherwise is not None:
         yield otherwise
-        return
-    if recorded.stabilisation is not None and recorded.stabilisation.stabilised:
-        return
+    elif recorded.stabilisation is None or not recorded.stabilisation.stabilised:
+        yield _never_fits(recorded, turning, failed)
+
+
+def _never_fits(recorded: Recorded, turning: CameraTrajectory, failed: NotObservableError) -> Finding:
+    """A gyroscope that fits the camera at no offset: it belongs to something else, where there is enough to tell."""
     span_s = float(np.ptp(turning.t_s))
     if span_s < _ENOUGH_S:
-        yield Finding(
+        return Finding(
             code="offset-undecided",
             severity="warning",
             evidence=f"in {span_s:.1f} s no time offset between camera and gyroscope is clearly better than the rest",
             advice="record ten seconds or more, with rotation about all three axes",
             numbers={"seconds": span_s},
         )
-        return
     if recorded.trajectory is None and not recorded.is_dense and len(turning) <= _ENOUGH_PAIRS:
-        yield Finding(
+        return Finding(
             code="pictures-too-few",
             severity="info",
             evidence=f"only {len(turning) - 1} pictures that follow each other share enough to be compared with the "
@@ -104,8 +106,7 @@ def check_belonging(recorded: Recorded) -> Iterator[Finding]:
             advice="take pictures closer together, or film; after a reconstruction diagnose its model",
             numbers={"pairs": len(turning) - 1.0},
         )
-        return
-    yield Finding(
+    return Finding(
         code="imu-does-not-fit",
         severity="error",
         stops=True,

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from colmap_inertial.checks.validate import (
+    Target,
     Validation,
     parse_target,
     validate_model,
@@ -272,18 +273,82 @@ def scale_as_json(estimate: ScaleEstimate, calibration: CalibrationFiles = None)
     return {**estimate.as_json(), "calibration_files": used_files(calibration)}
 
 
+@dataclass(frozen=True, kw_only=True)
+class ValidationOutputs:
+    """Where a validation is written.
+
+    Attributes
+    ----------
+    json, pictures
+        The result, and frames with the corners drawn in.
+    apply
+        The model in metres, scaled by the control distances; for a model without a unit only.
+    """
+
+    json: Path | None = None
+    pictures: Path | None = None
+    apply: Path | None = None
+
+    def check(self, model: Path, *, unscaled: bool) -> None:
+        """Refuse, before any work, what would replace something; raises :class:`InertialError`."""
+        if self.json is not None:
+            check_output(self.json, [model])
+        folder = self.pictures
+        if folder is not None and folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
+            raise OutputExistsError(f"{folder} exists; name a new folder for the pictures")
+        if self.apply is not None and self.apply.exists():
+            raise OutputExistsError(f"{self.apply} exists; name a new folder for the metric model")
+        if self.apply is not None and not unscaled:
+            raise InertialError("--apply scales a model that claims no unit: add --unscaled")
+
+
+@dataclass(frozen=True, kw_only=True)
+class KnownLengths:
+    """What is known of a scene beside the target.
+
+    Attributes
+    ----------
+    bars, check_points
+        Tables of distances between markers, and of their coordinates.
+    other
+        Specification of a second target in the scene, and the metres between the middles of both, as ``4.03`` or
+        ``4.03+-0.002`` with how well they are known.
+    """
+
+    bars: Path | None = None
+    check_points: Path | None = None
+    other: tuple[str, str] | None = None
+
+    def second_target(self, first: Target) -> tuple[Target, float, float | None] | None:
+        """The second target, metres between both, and their standard deviation; ``None`` without one.
+
+        Raises
+        ------
+        InertialError
+            Where the kinds of the targets do not go with what is known.
+        """
+        if (self.bars is not None or self.check_points is not None) and first.kind != "aruco":
+            raise InertialError(
+                "--bars and --check-points name markers: give a target of markers, as aruco:DICT:SIDE_M"
+            )
+        if self.other is None:
+            return None
+        second = parse_target(self.other[0])
+        metres, sigma_m = _metres_apart(self.other[1])
+        if "aruco" in (first.kind, second.kind):
+            raise InertialError("--other-target is for two boards; distances between single markers go into --bars")
+        if second.spec == first.spec:
+            raise InertialError("--other-target must be another board than --target: nobody could tell them apart")
+        return second, metres, sigma_m
+
+
 def validate_source(
     model: Path,
     images: Path,
     target: str,
     options: ValidateOptions,
-    *,
-    json: Path | None = None,
-    pictures: Path | None = None,
-    apply: Path | None = None,
-    bars: Path | None = None,
-    check_points: Path | None = None,
-    other: tuple[str, str] | None = None,
+    outputs: ValidationOutputs = ValidationOutputs(),
+    known: KnownLengths = KnownLengths(),
 ) -> Validation:
     """Measure a target in a model and write what was found.
 
@@ -293,15 +358,10 @@ def validate_source(
         COLMAP model folder, folder of its images, specification of the target.
     options
         Of the validation.
-    json, pictures
-        Where to write the result, and frames with the corners drawn in.
-    apply
-        Where to write the model in metres, scaled by the control distances; for a model without a unit only.
-    bars, check_points
-        Tables of distances between markers, and of their coordinates.
-    other
-        Specification of a second target in the scene, and the metres between the middles of both, as ``4.03`` or
-        ``4.03+-0.002`` with how well they are known.
+    outputs
+        Where to write it.
+    known
+        What else is known of the scene.
 
     Raises
     ------
@@ -309,40 +369,27 @@ def validate_source(
         When ``apply`` is asked for and cannot be done; see also :func:`validate_model`.
     """
     parsed = parse_target(target)
-    if json is not None:
-        check_output(json, [model])
-    if pictures is not None and pictures.exists() and not (pictures.is_dir() and not any(pictures.iterdir())):
-        raise OutputExistsError(f"{pictures} exists; name a new folder for the pictures")
-    if apply is not None and apply.exists():
-        raise OutputExistsError(f"{apply} exists; name a new folder for the metric model")
-    if apply is not None and not options.unscaled:
-        raise InertialError("--apply scales a model that claims no unit: add --unscaled")
+    outputs.check(model, unscaled=options.unscaled)
     folder = only_model(model)
-    if (bars is not None or check_points is not None) and parsed.kind != "aruco":
-        raise InertialError("--bars and --check-points name markers: give a target of markers, as aruco:DICT:SIDE_M")
-    second = None if other is None else (parse_target(other[0]), *_metres_apart(other[1]))
-    if second is not None and "aruco" in (parsed.kind, second[0].kind):
-        raise InertialError("--other-target is for two boards; distances between single markers go into --bars")
-    if second is not None and second[0].spec == parsed.spec:
-        raise InertialError("--other-target must be another board than --target: nobody could tell them apart")
+    second = known.second_target(parsed)
     result = validate_model(folder, images, parsed, options)
     if second is not None:
         result = with_other_target(result, validate_model(folder, images, second[0], options), second[1], second[2])
-    if bars is not None:
-        result = with_bars(result, bars)
-    if check_points is not None:
-        result = with_check_points(result, check_points)
-    if apply is not None:
+    if known.bars is not None:
+        result = with_bars(result, known.bars)
+    if known.check_points is not None:
+        result = with_check_points(result, known.check_points)
+    if outputs.apply is not None:
         if result.control is None:
             raise InertialError("too few corners to keep control and check distances apart; --apply needs more views")
         low, high = result.control.ci95
         sigma_log = np.log(high / low) / (2 * 1.96)
         provenance = f"control distances of {parsed.spec}"
-        apply_similarity(folder, apply, scaling(result.control.metres_per_unit, sigma_log, provenance))
-    if json is not None:
-        write_json(json, result.as_json())
-    if pictures is not None:
-        write_overlays(result, images, pictures)
+        apply_similarity(folder, outputs.apply, scaling(result.control.metres_per_unit, sigma_log, provenance))
+    if outputs.json is not None:
+        write_json(outputs.json, result.as_json())
+    if outputs.pictures is not None:
+        write_overlays(result, images, outputs.pictures)
     return result
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from colmap_inertial.core.errors import NotObservableError
+from colmap_inertial.core.types import CameraMotion
 from colmap_inertial.tools.export.source import ExportSource, Picture
 from colmap_inertial.tools.export.transforms import Exposure
 from colmap_inertial.tools.export.undistort import Undistortion
@@ -43,21 +44,8 @@ def exposures_of(
     NotObservableError
         Where no velocity is known, and where lines are read out in another direction than down.
     """
-    motion = source.motion
-    if motion is None or not motion.names:
-        raise NotObservableError(
-            "camera motion",
-            "the run kept no velocities: its model has no scale, its gyroscope was silent, or an earlier version made "
-            "it (then start reconstruct again with the same arguments, it adds them)",
-        )
+    motion = _known_motion(source.motion, pictures)
     readout_s = motion.readout_s or 0.0
-    filmed = [picture for picture in pictures.values() if not picture.rectified]
-    if filmed and readout_s > 0 and motion.readout_direction != "down":
-        raise NotObservableError(
-            "rolling shutter",
-            f"these pictures are read out {motion.readout_direction}, which the program cannot be told; export the "
-            "rectified ones, or turn the pictures",
-        )
     if motion.exposure_s is None and any(not picture.sharpened for picture in pictures.values()):
         notes.append("exposure times are not known and count as 0: blur is not modelled")
     place = {name: i for i, name in enumerate(motion.names)}
@@ -83,6 +71,24 @@ def exposures_of(
     if motion.exposure_s is not None and len({one.exposure_s for one in found.values()}) > 1:
         notes.append("exposure times differ between pictures; the program takes one for all, their median")
     return found
+
+
+def _known_motion(motion: CameraMotion | None, pictures: Mapping[str, Picture]) -> CameraMotion:
+    """The motion, where it is known and a program can be told of the pictures' readout."""
+    if motion is None or not motion.names:
+        raise NotObservableError(
+            "camera motion",
+            "the run kept no velocities: its model has no scale, its gyroscope was silent, or an earlier version made "
+            "it (then start reconstruct again with the same arguments, it adds them)",
+        )
+    as_filmed = any(not picture.rectified for picture in pictures.values())
+    if as_filmed and (motion.readout_s or 0.0) > 0 and motion.readout_direction != "down":
+        raise NotObservableError(
+            "rolling shutter",
+            f"these pictures are read out {motion.readout_direction}, which the program cannot be told; export the "
+            "rectified ones, or turn the pictures",
+        )
+    return motion
 
 
 def _rows(undistortion: Undistortion) -> tuple[float, float]:
