@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,31 +16,54 @@ from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.motion.align import Alignment
 from colmap_inertial.motion.align.acceleration import quick_accelerations
 
-#: Clock rates: phones keep within 1e-4, action cameras within 1 %; the scale is corrected for what is found.
-_RATE, _WRONG_RATE, _WRONG_FRAME_RATE = 0.003, 0.012, 0.1
-#: Intervals over which rotations are compared, and how strong the axis must be that turns the wrong way.
-_INTERVAL_S, _MIRROR_SHARE = 0.1, 0.03
-#: Rates beyond what an alignment follows, which are tried where it finds nothing; and frame rates that are taken for
-#: one another (24, 25, 30, 50, 60 and half or double of them), as the IMU's seconds per second of frames.
-_TRIED_RATES = (0.02, -0.02, 0.03, -0.03, 0.04, -0.04)
-_TRIED_FRAME_RATES = (0.8, 1.25, 5 / 6, 1.2, 0.5, 2.0, 0.6, 5 / 3)
+
+@dataclass(frozen=True, kw_only=True)
+class CameraCheckLimits:
+    """When the camera and the gyroscope do not belong together."""
+
+    #: Clock rates: phones keep within 1e-4, action cameras within 1 %; the scale is corrected for what is found.
+    rate: float = 0.003
+    wrong_rate: float = 0.012
+    wrong_frame_rate: float = 0.1
+    #: Intervals over which rotations are compared, and how strong the axis must be that turns the wrong way.
+    interval_s: float = 0.1
+    mirror_share: float = 0.03
+    #: Rates beyond what an alignment follows, which are tried where it finds nothing; and frame rates that are taken
+    #: for one another (24, 25, 30, 50, 60 and half or double of them), as the IMU's seconds per second of frames.
+    tried_rates: tuple[float, ...] = (0.02, -0.02, 0.03, -0.03, 0.04, -0.04)
+    tried_frame_rates: tuple[float, ...] = (0.8, 1.25, 5 / 6, 1.2, 0.5, 2.0, 0.6, 5 / 3)
+    #: Of pictures far apart so many pairs must have been compared for a gyroscope not to belong to them.
+    enough_pairs: int = 12
+    #: A recording that is shorter may simply not have turned enough.
+    enough_s: float = 8.0
+    #: The IMU may miss so many frames, and this share of them; below the last, too little is left.
+    slack_frames: float = 2.0
+    slack_share: float = 0.03
+    least_covered: float = 0.25
+    #: A camera-IMU rotation known better than the first, and off by more than the second, is declared wrongly.
+    known_rotation_rad: float = 0.2
+    other_rotation_rad: float = 0.35
+    #: Parts whose offsets are compared, how far they may be off, and how sharp a part's best offset must be.
+    part_s: float = 3.0
+    part_reach_s: float = 0.4
+    part_step_s: float = 0.01
+    uneven_s: float = 0.05
+    part_explained: float = 0.6
+    #: Quick rotation in the picture per rotation measured; translation is slow against it, and makes it a little less
+    #: (0.92 to 0.95 in rendered orbits about a desk, 1.00 before a far wall). A standard deviation above the third
+    #: tells nothing.
+    quick_s: float = 0.35
+    usual_gain: tuple[float, float] = (0.88, 1.08)
+    gain_sigma: float = 0.05
+    least_quick_rad_s: float = 0.03
+    #: The correlation of visual and inertial acceleration that tells its sign.
+    opposite: float = -0.3
+
+
+_LIMITS = CameraCheckLimits()
+
 #: What is wrong with a gyroscope's own numbers keeps it from fitting the camera: it is named once.
 _OF_THE_GYROSCOPE = frozenset({*UNIT_FACTORS, "sensors-exchanged", "dead-sensor", "dead-axis"})
-#: Of pictures far apart so many pairs must have been compared for a gyroscope not to belong to them.
-_ENOUGH_PAIRS = 12
-#: A recording that is shorter may simply not have turned enough.
-_ENOUGH_S = 8.0
-#: The IMU may miss so many frames, and this share of them; below the last, too little is left.
-_SLACK_FRAMES, _SLACK_SHARE, _LEAST_COVERED = 2.0, 0.03, 0.25
-#: A camera-IMU rotation known better than the first, and off by more than the second, is declared wrongly.
-_KNOWN_ROTATION_RAD, _OTHER_ROTATION_RAD = 0.2, 0.35
-#: Parts whose offsets are compared, how far they may be off, and how sharp a part's best offset must be.
-_PART_S, _PART_REACH_S, _PART_STEP_S, _UNEVEN_S, _PART_EXPLAINED = 3.0, 0.4, 0.01, 0.05, 0.6
-#: Quick rotation in the picture per rotation measured; translation is slow against it, and makes it a little less (0.92
-#: to 0.95 in rendered orbits about a desk, 1.00 before a far wall). A standard deviation above the third tells nothing.
-_QUICK_S, _USUAL_GAIN, _GAIN_SIGMA, _LEAST_QUICK_RAD_S = 0.35, (0.88, 1.08), 0.05, 0.03
-#: The correlation of visual and inertial acceleration that tells its sign.
-_OPPOSITE = -0.3
 
 
 _MIRRORED = Finding(
@@ -89,7 +112,7 @@ def check_belonging(recorded: Recorded) -> Iterator[Finding]:
 def _never_fits(recorded: Recorded, turning: CameraTrajectory, failed: NotObservableError) -> Finding:
     """A gyroscope that fits the camera at no offset: it belongs to something else, where there is enough to tell."""
     span_s = float(np.ptp(turning.t_s))
-    if span_s < _ENOUGH_S:
+    if span_s < _LIMITS.enough_s:
         return Finding(
             code="offset-undecided",
             severity="warning",
@@ -97,7 +120,7 @@ def _never_fits(recorded: Recorded, turning: CameraTrajectory, failed: NotObserv
             advice="record ten seconds or more, with rotation about all three axes",
             numbers={"seconds": span_s},
         )
-    if recorded.trajectory is None and not recorded.is_dense and len(turning) <= _ENOUGH_PAIRS:
+    if recorded.trajectory is None and not recorded.is_dense and len(turning) <= _LIMITS.enough_pairs:
         return Finding(
             code="pictures-too-few",
             severity="info",
@@ -121,13 +144,13 @@ def _as_it_would_fit(recorded: Recorded, imu: ImuRecording) -> Finding | None:
     if isinstance(recorded.align(replace(imu, gyro_rad_s=-imu.gyro_rad_s)), Alignment):
         return _MIRRORED
     begin_s = imu.gyro_t_s[0]
-    for tried in (*(1 + rate for rate in _TRIED_RATES), *_TRIED_FRAME_RATES):
+    for tried in (*(1 + rate for rate in _LIMITS.tried_rates), *_LIMITS.tried_frame_rates):
         # a frame of the same motion lasts longer, so that it turns slower
         slower = replace(imu, gyro_t_s=begin_s + (imu.gyro_t_s - begin_s) * tried, gyro_rad_s=imu.gyro_rad_s / tried)
         found = recorded.align(slower)
         if isinstance(found, Alignment):
             rate = tried * (1 + found.calibration.clock_rate)
-            return _rate_finding(rate - 1) if abs(tried - 1) < _WRONG_FRAME_RATE else _frame_rate_finding(rate)
+            return _rate_finding(rate - 1) if abs(tried - 1) < _LIMITS.wrong_frame_rate else _frame_rate_finding(rate)
     if recorded.max_offset_s is None:
         return None
     found = recorded.align(imu, any_offset=True)
@@ -183,27 +206,27 @@ def check_pose_convention(recorded: Recorded) -> Iterator[Finding]:
 def _is_mirrored(turning: CameraTrajectory, imu: ImuRecording, aligned: Alignment) -> bool:
     """Whether rates of camera and IMU are related by a mirror: where one axis hardly turns, a rotation nearly fits."""
     motion = GyroCamera.of(imu, aligned.calibration, camera_epoch_ns=turning.epoch_ns)
-    step = max(1, round(_INTERVAL_S / float(np.median(np.diff(turning.t_s)))))
+    step = max(1, round(_LIMITS.interval_s / float(np.median(np.diff(turning.t_s)))))
     poses = turning.select(slice(None, None, step))
     t_s = poses.t_s - aligned.calibration.drift_s(poses.t_s)
     visual, inertial = poses.turn_rad(), motion.turn_rad(t_s)
-    usable = motion.covers(t_s[:-1], t_s[1:]) & (np.diff(t_s) < 5 * _INTERVAL_S)
+    usable = motion.covers(t_s[:-1], t_s[1:]) & (np.diff(t_s) < 5 * _LIMITS.interval_s)
     if usable.sum() < 20:
         return False
     cross = visual[usable].T @ inertial[usable]
     singular = np.linalg.svd(cross, compute_uv=False)
-    return bool(np.linalg.det(cross) < 0 and singular[2] > _MIRROR_SHARE * singular[0])
+    return bool(np.linalg.det(cross) < 0 and singular[2] > _LIMITS.mirror_share * singular[0])
 
 
 def check_clock_rate(recorded: Recorded) -> Iterator[Finding]:
     """A camera's clock that runs faster or slower than the IMU's."""
     aligned = recorded.aligned
-    if isinstance(aligned, Alignment) and aligned.drifts(faster_than=_RATE):
+    if isinstance(aligned, Alignment) and aligned.drifts(faster_than=_LIMITS.rate):
         yield _rate_finding(aligned.calibration.clock_rate)
 
 
 def _rate_finding(rate: float) -> Finding:
-    severity: Severity = "error" if abs(rate) > _WRONG_RATE else "warning"
+    severity: Severity = "error" if abs(rate) > _LIMITS.wrong_rate else "warning"
     return Finding(
         code="clock-rate",
         severity=severity,
@@ -236,7 +259,7 @@ def check_coverage(recorded: Recorded) -> Iterator[Finding]:
     sensors = [imu.gyro_t_s, imu.accel_t_s] if imu.has_accel else [imu.gyro_t_s]
     begin_s, end_s = max(t_s[0] for t_s in sensors), min(t_s[-1] for t_s in sensors)
     span_s = float(frames.t_s[-1] - frames.t_s[0])
-    slack_s = max(_SLACK_FRAMES * float(np.median(np.diff(frames.t_s))), _SLACK_SHARE * span_s)
+    slack_s = max(_LIMITS.slack_frames * float(np.median(np.diff(frames.t_s))), _LIMITS.slack_share * span_s)
     shift_s = recorded.offset_s(frames.epoch_ns)
     if shift_s is not None:
         missed_s = max(begin_s + shift_s - frames.t_s[0], 0) + max(frames.t_s[-1] - end_s - shift_s, 0)
@@ -247,7 +270,7 @@ def check_coverage(recorded: Recorded) -> Iterator[Finding]:
     share = float(np.clip(1 - missed_s / span_s, 0, 1))
     yield Finding(
         code="imu-too-short",
-        severity="error" if share < _LEAST_COVERED else "warning",
+        severity="error" if share < _LIMITS.least_covered else "warning",
         evidence=f"the IMU runs along with {100 * share:.0f} % of {span_s:.1f} s of frames",
         advice="start the IMU before the video and stop it after; the scale rests on what both recorded",
         numbers={"share": share, "frames_s": span_s, "imu_s": float(end_s - begin_s)},
@@ -287,11 +310,11 @@ def check_declared_rotation(recorded: Recorded) -> Iterator[Finding]:
     if not isinstance(aligned, Alignment) or prior is None:
         return
     sigmas = [c.rotation_sigma_rad for c in (prior, aligned.calibration)]
-    if max(sigmas) > _KNOWN_ROTATION_RAD:
+    if max(sigmas) > _LIMITS.known_rotation_rad:
         return
     turn = quat_multiply(aligned.calibration.cam_from_imu_xyzw, quat_conjugate(prior.cam_from_imu_xyzw))
     angle = float(np.linalg.norm(quat_log(turn)))
-    if angle > _OTHER_ROTATION_RAD + 3 * max(sigmas):
+    if angle > _LIMITS.other_rotation_rad + 3 * max(sigmas):
         yield Finding(
             code="declared-rotation",
             severity="error",
@@ -307,14 +330,14 @@ def check_even_times(recorded: Recorded) -> Iterator[Finding]:
     aligned, imu, turning = recorded.aligned, recorded.imu, recorded.turning
     if not isinstance(aligned, Alignment) or imu is None or turning is None:
         return
-    if float(np.median(np.diff(turning.t_s))) > _PART_REACH_S / 2:
+    if float(np.median(np.diff(turning.t_s))) > _LIMITS.part_reach_s / 2:
         return
     motion = GyroCamera.of(imu, aligned.calibration, camera_epoch_ns=turning.epoch_ns)
     middles, offsets = [], []
-    count = int(np.ptp(turning.t_s) / _PART_S)
-    for begin_s in turning.t_s[0] + _PART_S * np.arange(count):
-        inside = np.flatnonzero((turning.t_s >= begin_s) & (turning.t_s < begin_s + _PART_S))
-        middle_s = begin_s + 0.5 * _PART_S
+    count = int(np.ptp(turning.t_s) / _LIMITS.part_s)
+    for begin_s in turning.t_s[0] + _LIMITS.part_s * np.arange(count):
+        inside = np.flatnonzero((turning.t_s >= begin_s) & (turning.t_s < begin_s + _LIMITS.part_s))
+        middle_s = begin_s + 0.5 * _LIMITS.part_s
         drift_s = float(aligned.calibration.drift_s(middle_s))
         found = _part_offset_s(turning.select(inside), motion, drift_s)
         if found is not None:
@@ -325,7 +348,7 @@ def check_even_times(recorded: Recorded) -> Iterator[Finding]:
     off = np.array(offsets)
     off -= np.median(off)
     worst = int(np.argmax(np.abs(off)))
-    if abs(off[worst]) > _UNEVEN_S:
+    if abs(off[worst]) > _LIMITS.uneven_s:
         yield Finding(
             code="frame-times-uneven",
             severity="error",
@@ -342,7 +365,7 @@ def _part_offset_s(part: CameraTrajectory, motion: GyroCamera, drift_s: float) -
     if len(part) < 8:
         return None
     visual = part.turn_rad()
-    shifts = np.arange(-_PART_REACH_S, _PART_REACH_S + 1e-9, _PART_STEP_S)
+    shifts = np.arange(-_LIMITS.part_reach_s, _LIMITS.part_reach_s + 1e-9, _LIMITS.part_step_s)
     left = np.full(len(shifts), np.inf)
     t_s = part.t_s - drift_s - shifts[:, None]
     covered = motion.covers(t_s[:, 0], t_s[:, -1])
@@ -353,7 +376,7 @@ def _part_offset_s(part: CameraTrajectory, motion: GyroCamera, drift_s: float) -
     energy = float(np.median(np.sum((visual - visual.mean(axis=0)) ** 2, axis=1)))
     if best in (0, len(left) - 1) or not np.isfinite(left[best - 1 : best + 2]).all():
         return None
-    if left[best] > (1 - _PART_EXPLAINED) * energy:
+    if left[best] > (1 - _LIMITS.part_explained) * energy:
         return None
     return float(shifts[best])
 
@@ -368,19 +391,19 @@ def check_focal_length(recorded: Recorded) -> Iterator[Finding]:
     motion = GyroCamera.of(imu, aligned.calibration, camera_epoch_ns=rotation.epoch_ns)
     known = np.isfinite(rotation.turn_rad).all(axis=1) & motion.covers(rotation.t_s[:-1], rotation.t_s[1:])
     dt_s = np.diff(rotation.t_s)
-    width = max(3, round(_QUICK_S / float(np.median(dt_s))))
+    width = max(3, round(_LIMITS.quick_s / float(np.median(dt_s))))
     if known.sum() < 10 * width:
         return
     inertial = (motion.turn_rad(rotation.t_s) / dt_s[:, None])[known]
     visual = (rotation.turn_rad / dt_s[:, None])[known]
     quick_inertial, quick_visual = (without_running_mean(turn, width)[:, :2] for turn in (inertial, visual))
     energy = float(np.sum(quick_inertial**2))
-    if np.sqrt(energy / len(quick_inertial)) < _LEAST_QUICK_RAD_S:
+    if np.sqrt(energy / len(quick_inertial)) < _LIMITS.least_quick_rad_s:
         return
     gain = float(np.sum(quick_visual * quick_inertial)) / energy
     rest = quick_visual - gain * quick_inertial
     sigma = float(np.sqrt(np.mean(rest**2) * width / energy))
-    if sigma < _GAIN_SIGMA and not _USUAL_GAIN[0] - sigma < gain < _USUAL_GAIN[1] + sigma:
+    if sigma < _LIMITS.gain_sigma and not _LIMITS.usual_gain[0] - sigma < gain < _LIMITS.usual_gain[1] + sigma:
         yield Finding(
             code="focal-length",
             severity="error",
@@ -399,7 +422,7 @@ def check_accelerometer_sign(recorded: Recorded) -> Iterator[Finding]:
     if recorded.likely_convention is not None:
         return
     correlation = acceleration_correlation(poses, imu, aligned)
-    if correlation is not None and correlation < _OPPOSITE:
+    if correlation is not None and correlation < _LIMITS.opposite:
         yield Finding(
             code="accel-flipped",
             severity="error",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,18 +14,32 @@ from colmap_inertial.imaging.gyro_camera import GyroCamera
 from colmap_inertial.motion.align import Alignment
 from colmap_inertial.motion.shutter import ReadoutEstimate, estimate_readout
 
-#: Frames come evenly where this share of their intervals is the usual one to within this; keyframes do not.
-_EVEN_SHARE, _EVEN = 0.8, 0.1
-#: A single frame now and then is lost in most recordings.
-_DROPPED, _DROPPED_SHARE = 2, 0.002
-#: A pair of frames turned by less than this is one frame twice; more of them than the share shift the times.
-_SAME_RAD, _REPEATED, _REPEATED_SHARE = 1e-7, 2, 0.05
-#: Blur, as a share of the picture's long side, beyond which features suffer; and the frames that may have it.
-_BLUR_SHARE, _BLURRED_FRAMES = 0.004, 0.5
-#: COLMAP's guess of a focal length in long sides, where none is declared.
-_GUESSED_FOCAL = 1.2
-#: Times of cut frames against the video's own: below the first is rounding; and how near a video's start is meant.
-_WANDER_S, _START_S = 0.003, 0.002
+
+@dataclass(frozen=True, kw_only=True)
+class FrameCheckLimits:
+    """When frames, their times or exposures are not good enough."""
+
+    #: Frames come evenly where this share of their intervals is the usual one to within this; keyframes do not.
+    even_share: float = 0.8
+    even: float = 0.1
+    #: A single frame now and then is lost in most recordings.
+    dropped: int = 2
+    dropped_share: float = 0.002
+    #: A pair of frames turned by less than this is one frame twice; more of them than the share shift the times.
+    same_rad: float = 1e-7
+    repeated: int = 2
+    repeated_share: float = 0.05
+    #: Blur, as a share of the picture's long side, beyond which features suffer; and the frames that may have it.
+    blur_share: float = 0.004
+    blurred_frames: float = 0.5
+    #: COLMAP's guess of a focal length in long sides, where none is declared.
+    guessed_focal: float = 1.2
+    #: Times of cut frames against the video's own: below the first is rounding; and how near a video's start is meant.
+    wander_s: float = 0.003
+    start_s: float = 0.002
+
+
+_LIMITS = FrameCheckLimits()
 
 
 def check_dropped(recorded: Recorded) -> Iterator[Finding]:
@@ -34,10 +49,10 @@ def check_dropped(recorded: Recorded) -> Iterator[Finding]:
         return
     step_s = np.diff(frames.t_s)
     usual_s = float(np.median(step_s))
-    if np.mean(np.abs(step_s / usual_s - 1) < _EVEN) < _EVEN_SHARE:
+    if np.mean(np.abs(step_s / usual_s - 1) < _LIMITS.even) < _LIMITS.even_share:
         return
     lost = int(np.sum(np.round(step_s / usual_s) - 1))
-    if lost > max(_DROPPED, _DROPPED_SHARE * len(step_s)):
+    if lost > max(_LIMITS.dropped, _LIMITS.dropped_share * len(step_s)):
         yield Finding(
             code="frames-dropped",
             severity="warning",
@@ -52,7 +67,7 @@ def check_repeated(recorded: Recorded) -> Iterator[Finding]:
     """Frames that are the one before, at a time of their own."""
     if recorded.rotation is not None:
         turn = recorded.rotation.turn_rad
-        same = np.linalg.norm(turn[np.isfinite(turn).all(axis=1)], axis=1) < _SAME_RAD
+        same = np.linalg.norm(turn[np.isfinite(turn).all(axis=1)], axis=1) < _LIMITS.same_rad
     elif recorded.trajectory is not None:
         poses = recorded.trajectory
         same = (np.diff(poses.cam_in_world, axis=0) == 0).all(axis=1)
@@ -60,8 +75,8 @@ def check_repeated(recorded: Recorded) -> Iterator[Finding]:
     else:
         return
     count = int(np.sum(same))
-    if count > _REPEATED:
-        severity: Severity = "error" if count > _REPEATED_SHARE * len(same) else "warning"
+    if count > _LIMITS.repeated:
+        severity: Severity = "error" if count > _LIMITS.repeated_share * len(same) else "warning"
         yield Finding(
             code="frames-repeated",
             severity=severity,
@@ -82,18 +97,18 @@ def check_exposure(recorded: Recorded) -> Iterator[Finding]:
         turning = np.interp(timing.t_s, imu.gyro_t_s + shift_s, rate)
     else:
         turning = np.full(len(timing.t_s), np.median(rate))
-    focal = _GUESSED_FOCAL
+    focal = _LIMITS.guessed_focal
     if recorded.camera is not None:
         focal = recorded.camera.params[0] / max(recorded.camera.width, recorded.camera.height)
     # two of three axes smear the middle of the picture
     blur = focal * turning * timing.exposure_s * (2 / 3) ** 0.5
-    share = float(np.mean(blur > _BLUR_SHARE))
-    if share > _BLURRED_FRAMES:
+    share = float(np.mean(blur > _LIMITS.blur_share))
+    if share > _LIMITS.blurred_frames:
         yield Finding(
             code="exposure-too-long",
             severity="warning",
-            evidence=f"{100 * share:.0f} % of the frames are blurred by more than {100 * _BLUR_SHARE:g} % of the "
-            f"picture's long side (median {100 * np.median(blur):.2f} %, exposure "
+            evidence=f"{100 * share:.0f} % of the frames are blurred by more than {100 * _LIMITS.blur_share:g} % of "
+            f"the picture's long side (median {100 * np.median(blur):.2f} %, exposure "
             f"{1e3 * np.median(timing.exposure_s):.1f} ms)",
             advice="film with a shorter exposure (1/200 s or less) and more light; what is blurred is deblurred",
             numbers={"share": share, "median_blur_of_long_side": float(np.median(blur))},
@@ -179,7 +194,7 @@ def check_cut_from_video(recorded: Recorded) -> Iterator[Finding]:
     middle_s = float(np.median(off_s))
     wander_s = float(np.ptp(off_s))
     start_s = cut.video_start_ns * 1e-9
-    if wander_s > _WANDER_S:
+    if wander_s > _LIMITS.wander_s:
         yield Finding(
             code="frame-times-counted",
             severity="error",
@@ -188,7 +203,7 @@ def check_cut_from_video(recorded: Recorded) -> Iterator[Finding]:
             advice="give the presentation stamps of the frames, or the video itself as [video]",
             numbers={"wander_s": wander_s},
         )
-    elif abs(start_s) > _START_S and abs(middle_s + start_s) < _START_S:
+    elif abs(start_s) > _LIMITS.start_s and abs(middle_s + start_s) < _LIMITS.start_s:
         yield Finding(
             code="container-start-ignored",
             severity="error",

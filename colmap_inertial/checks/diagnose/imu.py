@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,30 +15,47 @@ from colmap_inertial.core.sampling import MUCH_CUT, PAUSE_STEPS, at_ceiling, int
 from colmap_inertial.core.types import ImuRecording
 from colmap_inertial.motion.align import Alignment
 
-#: Pauses longer than this are findings (shorter ones cost nothing); over the second, much can happen in them.
-_PAUSE_S, _LONG_PAUSE_S = 0.03, 0.5
-#: Pauses that take up more than this share of a recording leave too little.
-_MOST_PAUSED = 0.2
+
+@dataclass(frozen=True, kw_only=True)
+class ImuCheckLimits:
+    """When inertial samples are not good enough."""
+
+    #: Pauses longer than this are findings (shorter ones cost nothing); over the second, much can happen in them.
+    pause_s: float = 0.03
+    long_pause_s: float = 0.5
+    #: Pauses that take up more than this share of a recording leave too little.
+    most_paused: float = 0.2
+    rounding_share: float = 0.1
+    #: Gyroscope and accelerometer must run together for this share of the shorter one.
+    together: float = 0.5
+    #: Search of the delay between the sensors: grid, smoothing, reach, and what counts. Measured: up to 0.04 s of bias
+    #: by the hand's accelerations in clean recordings, correlations of 0.66 to 0.90 handheld, up to 0.51 where they
+    #: tell nothing (a drone, an action camera on one).
+    grid_hz: float = 50.0
+    smooth_cells: int = 25
+    reach_s: float = 0.5
+    delay_s: float = 0.055
+    delay_correlation: float = 0.6
+    #: Hands shake up to 12 times a second. Below the first rate that is lost in part, below the second all of it.
+    slow_hz: float = 45.0
+    too_slow_hz: float = 18.0
+    #: A camera that turns (rms) by less than the first, with less scatter than the second, in rad/s: a hand's turning
+    #: divided by 57.3, and what a sensor's scatter becomes. And half of a recording faster than the third is no
+    #: filming.
+    hardly_rad_s: float = 0.05
+    silent_rad_s: float = 0.0002
+    whirling_rad_s: float = 3.0
+
+
+_LIMITS = ImuCheckLimits()
+
 #: Steps between readings, far coarser than any of today's sensors (12 bit over +-2 g: 0.01 m/s2; 16 bit over 2000
 #: deg/s: 0.001 rad/s); and the share of the signal that their rounding may take.
 _COARSE = {"gyroscope": 0.003, "accelerometer": 0.03}
-_ROUNDING_SHARE = 0.1
-#: Gyroscope and accelerometer must run together for this share of the shorter one.
-_TOGETHER = 0.5
-#: Search of the delay between the sensors: grid, smoothing, reach, and what counts. Measured: up to 0.04 s of bias by
-#: the hand's accelerations in clean recordings, correlations of 0.66 to 0.90 handheld, up to 0.51 where they tell
-#: nothing (a drone, an action camera on one).
-_GRID_HZ, _SMOOTH_CELLS, _REACH_S = 50.0, 25, 0.5
-_DELAY_S, _DELAY_CORRELATION = 0.055, 0.6
 
-#: Hands shake up to 12 times a second. Below the first rate that is lost in part, below the second all of it.
-_SLOW_HZ, _TOO_SLOW_HZ = 45.0, 18.0
 #: Sensors scatter from sample to sample (rad/s, m/s2). Measured in eleven recordings of seven devices: 0.0013 and more,
 #: 0.019 and more; low-passed at 2 Hz and at 5 Hz: 0.0003 and 0.001, 0.001 and 0.006 at most.
 _SCATTER = {"gyroscope": 0.0004, "accelerometer": 0.005}
-#: A camera that turns (rms) by less than the first, with less scatter than the second, in rad/s: a hand's turning
-#: divided by 57.3, and what a sensor's scatter becomes. And half of a recording faster than the third is no filming.
-_HARDLY_RAD_S, _SILENT_RAD_S, _WHIRLING_RAD_S = 0.05, 0.0002, 3.0
 #: Motion that leaves no doubt that readings without scatter are smoothed ones.
 _MOVING = {"gyroscope": 0.1, "accelerometer": 0.2}
 
@@ -99,17 +117,17 @@ def check_pauses(recorded: Recorded) -> Iterator[Finding]:
     for sensor, t_s, _ in _sensors(recorded.imu):
         step_s = np.diff(t_s)
         usual_s = float(np.median(step_s))
-        pauses = step_s[is_gap(t_s, _PAUSE_S, steps=PAUSE_STEPS)]
+        pauses = step_s[is_gap(t_s, _LIMITS.pause_s, steps=PAUSE_STEPS)]
         share = float(pauses.sum() / (t_s[-1] - t_s[0]))
         for code, some in (
-            ("short-gap", pauses[pauses < _LONG_PAUSE_S]),
-            ("long-gap", pauses[pauses >= _LONG_PAUSE_S]),
+            ("short-gap", pauses[pauses < _LIMITS.long_pause_s]),
+            ("long-gap", pauses[pauses >= _LIMITS.long_pause_s]),
         ):
             if len(some) == 0:
                 continue
             yield Finding(
                 code=code,
-                severity="error" if share > _MOST_PAUSED else "warning",
+                severity="error" if share > _LIMITS.most_paused else "warning",
                 evidence=f"the {sensor} pauses {len(some)} times, {some.max():.3f} s at the longest, "
                 f"{some.sum():.2f} s in all; it samples every {1e3 * usual_s:.1f} ms",
                 advice="the scale bridges it, less surely; close other apps, or log to a faster card, and record again",
@@ -121,10 +139,10 @@ def check_rate(recorded: Recorded) -> Iterator[Finding]:
     """Readings that come too seldom for a hand's motion."""
     for sensor, t_s, _ in _sensors(recorded.imu):
         rate_hz = 1 / float(np.median(np.diff(t_s)))
-        if rate_hz < _SLOW_HZ:
+        if rate_hz < _LIMITS.slow_hz:
             yield Finding(
                 code="rate-too-low",
-                severity="error" if rate_hz < _TOO_SLOW_HZ else "warning",
+                severity="error" if rate_hz < _LIMITS.too_slow_hz else "warning",
                 evidence=f"the {sensor} reads {rate_hz:.3g} times a second; a hand shakes ten times a second",
                 advice="log at 100 Hz or more, at the app's or sensor's highest rate",
                 numbers={"rate_hz": rate_hz},
@@ -140,7 +158,7 @@ def check_scatter(recorded: Recorded) -> Iterator[Finding]:
     turning, usual = float(np.sqrt(np.mean(lengths**2))), float(np.median(lengths))
     # the camera tells units better, where there is one
     alone = not isinstance(recorded.aligned, Alignment)
-    if alone and usual > _WHIRLING_RAD_S:
+    if alone and usual > _LIMITS.whirling_rad_s:
         yield Finding(
             code="gyro-in-deg",
             severity="warning",
@@ -153,7 +171,7 @@ def check_scatter(recorded: Recorded) -> Iterator[Finding]:
         scatter = scatter_of(values)
         if not 0 < scatter < _SCATTER[sensor]:
             continue
-        if alone and sensor == "gyroscope" and turning < _HARDLY_RAD_S and scatter < _SILENT_RAD_S:
+        if alone and sensor == "gyroscope" and turning < _LIMITS.hardly_rad_s and scatter < _LIMITS.silent_rad_s:
             yield Finding(
                 code="gyro-not-in-deg",
                 severity="warning",
@@ -188,7 +206,7 @@ def check_together(recorded: Recorded) -> Iterator[Finding]:
         return
     both_s = min(imu.gyro_t_s[-1], imu.accel_t_s[-1]) - max(imu.gyro_t_s[0], imu.accel_t_s[0])
     shorter_s = min(np.ptp(imu.gyro_t_s), np.ptp(imu.accel_t_s))
-    if both_s < _TOGETHER * shorter_s:
+    if both_s < _LIMITS.together * shorter_s:
         yield Finding(
             code="sensors-apart",
             severity="error",
@@ -223,7 +241,7 @@ def check_resolution(recorded: Recorded) -> Iterator[Finding]:
             continue
         changing = values - np.median(values, axis=0)
         share = float(step / 12**0.5 / max(np.sqrt(np.mean(changing**2)), 1e-12))
-        severity: Severity = "error" if share > _ROUNDING_SHARE else "warning"
+        severity: Severity = "error" if share > _LIMITS.rounding_share else "warning"
         yield Finding(
             code="coarse-resolution",
             severity=severity,
@@ -248,7 +266,7 @@ def check_delay(recorded: Recorded) -> Iterator[Finding]:
     if imu is None or not imu.has_accel or recorded.implausible:
         return
     delay_s, correlation = accel_delay_s(imu)
-    if abs(delay_s) > _DELAY_S and correlation > _DELAY_CORRELATION:
+    if abs(delay_s) > _LIMITS.delay_s and correlation > _LIMITS.delay_correlation:
         yield Finding(
             code="sensors-offset",
             severity="error",
@@ -266,17 +284,17 @@ def accel_delay_s(imu: ImuRecording) -> tuple[float, float]:
     correlate best.
     """
     begin_s, end_s = max(imu.gyro_t_s[0], imu.accel_t_s[0]), min(imu.gyro_t_s[-1], imu.accel_t_s[-1])
-    edges = np.arange(begin_s, end_s, 1 / _GRID_HZ)
-    reach = round(_REACH_S * _GRID_HZ)
-    margin = 2 * _SMOOTH_CELLS + reach
+    edges = np.arange(begin_s, end_s, 1 / _LIMITS.grid_hz)
+    reach = round(_LIMITS.reach_s * _LIMITS.grid_hz)
+    margin = 2 * _LIMITS.smooth_cells + reach
     if len(edges) < 6 * margin:
         return 0.0, 0.0
     rate, force = (
-        np.diff(integral_at(t_s, values, edges), axis=0) * _GRID_HZ
+        np.diff(integral_at(t_s, values, edges), axis=0) * _LIMITS.grid_hz
         for t_s, values in ((imu.gyro_t_s, imu.gyro_rad_s), (imu.accel_t_s, imu.accel_m_s2))
     )
     slow = _smooth(force)
-    change = np.gradient(slow, 1 / _GRID_HZ, axis=0)[margin:-margin]
+    change = np.gradient(slow, 1 / _LIMITS.grid_hz, axis=0)[margin:-margin]
     delays = np.arange(-reach, reach + 1)
     correlations = np.array(
         [_correlation(change, _smooth(np.cross(slow, np.roll(rate, k, axis=0)))[margin:-margin]) for k in delays]
@@ -286,7 +304,7 @@ def accel_delay_s(imu: ImuRecording) -> tuple[float, float]:
         return 0.0, 0.0
     before, best, after = correlations[k - 1 : k + 2]
     peak = delays[k] + 0.5 * (before - after) / (before - 2 * best + after)
-    return float(peak / _GRID_HZ), float(best)
+    return float(peak / _LIMITS.grid_hz), float(best)
 
 
 def _correlation(a: Array, b: Array) -> float:
@@ -294,7 +312,7 @@ def _correlation(a: Array, b: Array) -> float:
 
 
 def _smooth(values: Array) -> Array:
-    kernel = np.ones(_SMOOTH_CELLS) / _SMOOTH_CELLS
+    kernel = np.ones(_LIMITS.smooth_cells) / _LIMITS.smooth_cells
     kernel = np.convolve(kernel, kernel)
     return np.stack([np.convolve(column, kernel, mode="same") for column in values.T], axis=1)
 
