@@ -14,7 +14,7 @@ from colmap_inertial.core.options import ApertureOptions
 from colmap_inertial.core.types import Aperture, ApertureRig
 from colmap_inertial.imaging.multi_aperture import Disparity, Rectified, fuse_apertures, rectify
 from colmap_inertial.imaging.multi_aperture.disparity import background
-from colmap_inertial.imaging.multi_aperture.fusion import COLOURS, with_luminance
+from colmap_inertial.imaging.multi_aperture.fusion import COLOURS, denoise_by_luminance
 from colmap_inertial.model import colmap_camera
 
 Planes = list[UInt8Array]
@@ -59,7 +59,7 @@ def pairwise(planes: Planes, rig: ApertureRig, options: ApertureOptions) -> tupl
         maps.append(fused.disparity_px / ratio)
     colours = np.stack([found[role] for role in COLOURS], axis=-1)
     if options.use_luminance and "luminance" in found:
-        colours = with_luminance(colours, found["luminance"])
+        colours = denoise_by_luminance(colours, found["luminance"])
     return np.clip(np.rint(255 * colours), 0, 255).astype(np.uint8), maps
 
 
@@ -158,7 +158,7 @@ def read_pfm(path: Path) -> Array:
         return np.fromfile(file, f"{order}f4").reshape(height, width)[::-1].astype(np.float64)
 
 
-def seen_by(disparity: Array, dy: float, dx: float, tolerance: float) -> BoolArray:
+def warp_view(disparity: Array, dy: float, dx: float, tolerance: float) -> BoolArray:
     """Which pixels the view at (dx, dy) baselines sees, by the true disparity."""
     height, width = disparity.shape
     y, x = np.mgrid[:height, :width]

@@ -52,7 +52,7 @@ from aperture_baselines import (
     pairwise,
     psnr_db,
     read_pfm,
-    seen_by,
+    warp_view,
 )
 
 from colmap_inertial.core.arrays import AnyArray, Array, BoolArray, Float32Array, UInt8Array
@@ -116,7 +116,7 @@ def light_field(
             plane = plane + rng.normal(0, 255 * noise, plane.shape)
         planes.append(np.clip(np.rint(plane), 0, 255).astype(np.uint8))
     truth = step * read_pfm(folder / "gt_disp_lowres.pfm")
-    everywhere = np.all([seen_by(truth, y, x, 0.5) for x, y in places[1:]], axis=0)
+    everywhere = np.all([warp_view(truth, y, x, 0.5) for x, y in places[1:]], axis=0)
     assert colours is not None
     return planes, rig, np.ascontiguousarray(colours), truth, everywhere
 
@@ -186,7 +186,7 @@ def antinous_case(folder: Path, step: int, roles: str, noise: float) -> list[dic
     row("StereoSGBM", image, [found], time.perf_counter() - start)
     exact = truth.astype(np.float32)
     row("truth, not filled", fuse_with(planes, rig, canvas, as_disparity(exact, 3)).image, None, None)
-    visible = np.stack([seen_by(truth, y, x, 0.5) for x, y in ((1, 0), (0, 1), (1, 1))])
+    visible = np.stack([warp_view(truth, y, x, 0.5) for x, y in ((1, 0), (0, 1), (1, 1))])
     filled = Disparity(disparity_px=exact, measured=visible.any(axis=0), visible=visible)
     row("truth, filled", fuse_with(planes, rig, canvas, filled).image, None, None)
     return rows

@@ -873,7 +873,7 @@ MUTANTS = (
     ),
     Mutant(
         "imaging/gate.py",
-        "below = _judged(standing, options)",
+        "below = _judge_evidence(standing, options)",
         "below = verdict",
         "a sky hides what stands below it",
         ("imaging_gate::test_a_recording_that_is_mostly_sky_bears_its_gyroscope_out_and_no_other",),
@@ -1538,7 +1538,7 @@ MUTANTS = (
     ),
     Mutant(
         "imaging/plane_sweep/depth.py",
-        "shown[k, : canvas.height] = _shown(partner.codes.shape, canvas)",
+        "shown[k, : canvas.height] = _find_shown_columns(partner.codes.shape, canvas)",
         "shown[k, : canvas.height] = 0, canvas.width",
         "the blackness around a turned picture is compared",
         ("sweep::test_beyond_the_edges_of_a_turned_picture_nothing_is_compared",),

@@ -16,7 +16,7 @@ from colmap_inertial.core.types import CameraModel
 from colmap_inertial.imaging import evidence
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath, middles
-from colmap_inertial.imaging.evidence import BlurEvidence, _weights, blur_evidence, shown_share, shown_shares
+from colmap_inertial.imaging.evidence import BlurEvidence, _weigh_tiles, blur_evidence, shown_share, shown_shares
 from colmap_inertial.imaging.gate import (
     GATE_LIMITS,
     GateOptions,
@@ -202,7 +202,7 @@ def test_the_image_tells_extent_and_direction(blur_px):
 
 def test_tiles_are_weighed_once_for_the_blur_and_its_mirror_image(monkeypatch):
     weighed = []
-    monkeypatch.setattr(evidence, "_weights", lambda spectra: weighed.append(1) or _weights(spectra))
+    monkeypatch.setattr(evidence, "_weigh_tiles", lambda spectra: weighed.append(1) or _weigh_tiles(spectra))
     shutter, image = shot(0.98, 12)
     field = predicted(shutter, "none")
     shown, mirrored = shown_shares(image, field)
@@ -260,10 +260,10 @@ def test_a_recording_that_is_mostly_sky_bears_its_gyroscope_out_and_no_other():
 def test_tiles_weigh_by_what_stands_out_and_all_alike_where_nothing_does():
     rng = np.random.default_rng(0)
     noise = rng.standard_normal((60, 64, 33)).astype(np.float32)
-    weights = _weights(noise)
+    weights = _weigh_tiles(noise)
     assert weights.sum() == pytest.approx((weights**2).sum()) and weights.sum() > 55
     noise[:15] += np.log(50)
-    weights = _weights(noise)
+    weights = _weigh_tiles(noise)
     assert 15 < weights.sum() < 22 and weights[15:].max() < 0.1 < 0.9 < weights[:15].min()
 
 

@@ -15,7 +15,7 @@ from colmap_inertial.imaging.blur_path import BlurPath
 from colmap_inertial.imaging.parallax import Parallax
 from colmap_inertial.imaging.path_filters import half_quadratic, path_wiener
 from colmap_inertial.imaging.psf import blur_field, blur_path
-from colmap_inertial.imaging.rolling_shutter import rays, seen_by_lines
+from colmap_inertial.imaging.rolling_shutter import project_by_lines, rays
 from colmap_inertial.imaging.transfer import srgb_from_linear
 from colmap_inertial.tools.simulate.render import ShutterCamera, colmap_camera
 
@@ -96,7 +96,7 @@ def test_the_path_is_where_the_lines_see_the_content(direction):
     directions = rays(lens, nodes.reshape(-1, 2)).reshape(rows, columns, 3)
     for k, since_s in ((0, -0.03 * 8 / 17), (8, 0.0), (13, 0.03 * 5 / 17)):
         world = np.einsum("yxij,yxj->yxi", gyro.start_from_cam(shutter.middle_s(nodes) + since_s), directions)
-        seen = seen_by_lines(world.reshape(-1, 3), nodes.reshape(-1, 2), gyro, lens, shutter)
+        seen = project_by_lines(world.reshape(-1, 3), nodes.reshape(-1, 2), gyro, lens, shutter)
         np.testing.assert_allclose(path.path_px[k], seen.reshape(nodes.shape) - nodes, atol=0.02)
     chord = blur_field(gyro, lens, shutter, step_px=64).vector_px
     np.testing.assert_allclose(path.field().vector_px, chord, atol=0.15)

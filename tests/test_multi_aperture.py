@@ -26,7 +26,7 @@ from colmap_inertial.imaging.multi_aperture._fill import fill_hidden
 from colmap_inertial.imaging.multi_aperture._geometry import transfer, trifocal_tensor
 from colmap_inertial.imaging.multi_aperture._information import cost_tables
 from colmap_inertial.imaging.multi_aperture._light import adds_up, light_cost
-from colmap_inertial.imaging.multi_aperture._noise import noise_of, smoothing
+from colmap_inertial.imaging.multi_aperture._noise import measure_noise, smoothing
 from colmap_inertial.imaging.multi_aperture.disparity import background
 
 INSTRUCTION_SETS = _apertures.instruction_sets()
@@ -488,12 +488,12 @@ def test_noise_is_measured_and_clean_pictures_are_left_alone():
     clean = np.tile(np.linspace(40, 200, 256), (200, 1))
     for sigma in (2.0, 6.0):
         noisy = np.clip(clean + rng.normal(0, sigma, clean.shape), 0, 255).astype(np.uint8)
-        assert noise_of(noisy) == pytest.approx(sigma, rel=0.15)
+        assert measure_noise(noisy) == pytest.approx(sigma, rel=0.15)
     even, rich = np.full((60, 80), 90, dtype=np.uint8), texture(80, 60, seed=0).astype(np.uint8)
     assert smoothing(even, 0.3) == (0.0, 0)
     assert smoothing(even, 5.0)[0] > 1
     assert smoothing(rich, 5.0) == (0.0, 5)
-    assert noise_of(np.zeros((4, 4), dtype=np.uint8)) == 0
+    assert measure_noise(np.zeros((4, 4), dtype=np.uint8)) == 0
 
 
 def test_refocusing_leaves_what_is_in_focus_and_blurs_the_rest():

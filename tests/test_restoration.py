@@ -368,10 +368,12 @@ def test_cuda_asked_for_by_name_must_be_there(weights, monkeypatch):
 
 
 def test_cuda_that_does_not_start_is_an_error_by_name_and_no_error_otherwise(weights, monkeypatch):
-    monkeypatch.setattr(networks, "_chosen", lambda device: "cpu" if device == "cpu" else "cuda")
+    monkeypatch.setattr(networks, "_choose_device", lambda device: "cpu" if device == "cpu" else "cuda")
     monkeypatch.setattr(networks, "_CUDA", "AzureExecutionProvider")  # onnxruntime leaves out what it does not have
-    start = networks._start
-    monkeypatch.setattr(networks, "_start", lambda model, source, device, threads: start(model, source, "cpu", threads))
+    start = networks._start_session
+    monkeypatch.setattr(
+        networks, "_start_session", lambda model, source, device, threads: start(model, source, "cpu", threads)
+    )
     kept = load_network("deepgyro")
     assert kept.device == "cpu"
     with pytest.raises(InertialError, match="cannot run on CUDA"):

@@ -8,18 +8,18 @@ from colmap_inertial._kernels import _apertures
 from colmap_inertial.imaging.plane_sweep import (
     DepthView,
     Sights,
-    agreed_depth,
     agreement,
-    chosen_partners,
+    choose_partners,
+    confirm_depth,
     depth,
     depth_range,
+    estimate_normals,
     normals,
-    normals_of,
-    partner_scores,
+    score_partners,
     sweep_depth,
 )
-from colmap_inertial.imaging.plane_sweep.depth import _canvas, _positions, _shown
-from colmap_inertial.imaging.plane_sweep.tiles import tiles_of
+from colmap_inertial.imaging.plane_sweep.depth import _find_shown_columns, _make_canvas, _sample_positions
+from colmap_inertial.imaging.plane_sweep.tiles import cut_tiles
 from colmap_inertial.imaging.semi_global import shares
 
 REFERENCE = camera((0.1, -0.4, 0.3))
@@ -46,7 +46,7 @@ def test_a_point_of_one_camera_is_found_in_another():
 def test_partners_are_weighed_as_by_loops_over_points():
     views = (REFERENCE, *AROUND, camera((0.1, -0.4, 0.3), (0, 60, 0)), camera((0.1, -0.4, 0.31)))
     sights = sights_of(views)
-    scores = partner_scores(sights, 0)
+    scores = score_partners(sights, 0)
     for k in range(1, len(views)):
         shared = set(sights.of_view[0].tolist()) & set(sights.of_view[k].tolist())
         total = 0.0
@@ -65,16 +65,16 @@ def test_views_that_share_few_points_are_no_partners():
     sights = sights_of((REFERENCE, AROUND[0]), points=600)
     few = np.intersect1d(*sights.of_view)[:19]
     less = Sights.of(sights.views, sights.points, [sights.of_view[0], few])
-    assert partner_scores(sights, 0)[1] > 0 == partner_scores(less, 0)[1]
-    assert chosen_partners(less, 0, partner_scores(less, 0), 4) == ()
+    assert score_partners(sights, 0)[1] > 0 == score_partners(less, 0)[1]
+    assert choose_partners(less, 0, score_partners(less, 0), 4) == ()
 
 
 def test_partners_on_other_sides_go_before_more_of_the_same():
     views = [REFERENCE, *(camera((0.1 + x, -0.4, 0.3 + z)) for x, z in ((0.4, 0), (0.41, 0), (0.39, 0), (0, 0.4)))]
     sights = sights_of(views)
     scores = np.array([0, 10.0, 9.9, 9.8, 6.0])
-    assert chosen_partners(sights, 0, scores, 2) == (1, 4)
-    assert set(chosen_partners(sights, 0, scores, 9)) == {1, 2, 3, 4}
+    assert choose_partners(sights, 0, scores, 2) == (1, 4)
+    assert set(choose_partners(sights, 0, scores, 9)) == {1, 2, 3, 4}
 
 
 def test_the_range_of_depths_holds_what_is_seen():
@@ -88,9 +88,9 @@ def test_the_range_of_depths_holds_what_is_seen():
 @pytest.mark.parametrize("view", AROUND)
 def test_a_candidate_leads_where_the_partner_sees_the_point(view):
     depths = (0.6, 6.0)
-    canvas = _canvas(REFERENCE, view, depths)
+    canvas = _make_canvas(REFERENCE, view, depths)
     inverse = np.linspace(1 / depths[1], 1 / depths[0], 7)
-    columns, rows = (_positions(REFERENCE, canvas, inverse, axis) for axis in (0, 1))
+    columns, rows = (_sample_positions(REFERENCE, canvas, inverse, axis) for axis in (0, 1))
     matrix, offset = view.seen_from(REFERENCE)
     compared = 0
     for d, q in enumerate(inverse):
@@ -125,8 +125,8 @@ def test_depths_of_a_room_are_found():
 def test_beyond_the_edges_of_a_turned_picture_nothing_is_compared():
     rolled = camera((0.4, -0.4, 0.3), (0, 4, 45))
     others = (rolled, *(camera(centre) for centre in ((-0.2, -0.5, 0.3), (0.1, -0.1, 0.3), (0.1, -0.4, 0.1))))
-    canvas = _canvas(REFERENCE, rolled, (0.6, 6.0))
-    begin, end = _shown((rolled.height, rolled.width), canvas).T
+    canvas = _make_canvas(REFERENCE, rolled, (0.6, 6.0))
+    begin, end = _find_shown_columns((rolled.height, rolled.width), canvas).T
     y, x = np.indices((canvas.height, canvas.width))
     shown = (x >= begin[:, None]) & (x < end[:, None])
     seen = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(canvas.canvas_from_view).T
@@ -188,7 +188,7 @@ def test_half_a_picture_is_taken_by_half_the_camera():
     odd = camera((0, 0, 0), width=121, height=91)
     codes = np.zeros((91, 121), np.uint8)
     codes[38:44, 70:76] = 255  # about (72.5, 40.5)
-    small, by = depth._half(codes), depth._half_of(odd)
+    small, by = depth._halve_codes(codes), depth._halve_camera(odd)
     assert small.shape == (by.height, by.width) == (45, 60)
     y, x = (np.average(np.indices(small.shape)[k], weights=small) for k in (0, 1))
     rays = (np.array([x, y]) - by.centre_px) / by.focal_px
@@ -202,7 +202,7 @@ def test_tiles_hold_each_pixel_once_and_the_candidates_that_are_there():
     coarse = true.reshape(100, 2, 155, 2).mean(axis=(1, 3))
     coarse[:, 116:] = np.nan
     times, sizes = np.zeros((200, 310), int), []
-    for tile in tiles_of(coarse, (200, 310), 160):
+    for tile in cut_tiles(coarse, (200, 310), 160):
         times[tile.inner_rows, tile.inner_columns] += 1
         inside = true[tile.inner_rows, tile.inner_columns]
         assert tile.candidates.start < inside.min() and inside.max() < tile.candidates.stop - 1
@@ -214,7 +214,7 @@ def test_tiles_hold_each_pixel_once_and_the_candidates_that_are_there():
     assert min(sizes) >= 16 and np.mean(sizes) < 120
     # at either end
     for value in (0.0, 159.0):
-        for tile in tiles_of(np.full((50, 50), value), (100, 100), 160):
+        for tile in cut_tiles(np.full((50, 50), value), (100, 100), 160):
             assert 16 <= tile.candidates.stop - tile.candidates.start < 30
             assert 0 <= tile.candidates.start <= value < tile.candidates.stop <= 160
 
@@ -224,15 +224,15 @@ def test_a_window_counts_where_the_partner_shows_all_of_it(ahead):
     """Nearer than the reference, a partner shows the same window over more pixels; farther, over fewer."""
     rolled = camera((0.15, -0.4 + ahead, 0.3), (0, 0, 30))
     depths = (2.0, 2.6)
-    canvas = _canvas(REFERENCE, rolled, depths)
+    canvas = _make_canvas(REFERENCE, rolled, depths)
     inverse = np.linspace(1 / depths[1], 1 / depths[0], 3)
-    columns, rows = (_positions(REFERENCE, canvas, inverse, axis)[None] for axis in (0, 1))
+    columns, rows = (_sample_positions(REFERENCE, canvas, inverse, axis)[None] for axis in (0, 1))
     # a cost of 255 says that no view shows the window
     y, x = np.indices((90, 120))
     reference = (np.abs(x % 8 - 4) + np.abs(y % 8 - 4)).astype(np.uint8) * 20
     blank = np.zeros((1, canvas.height, canvas.width), np.uint8)
     cost = np.empty((90, 120, 3), dtype=np.uint8)
-    shown = _shown((rolled.height, rolled.width), canvas)[None]
+    shown = _find_shown_columns((rolled.height, rolled.width), canvas)[None]
     _apertures.matching_costs(
         reference, blank, columns=columns, rows=rows, cost=cost, share=shares(1), unseen=255, radius=2, shown=shown,
         least=0,
@@ -266,7 +266,7 @@ def test_what_lies_outside_of_the_range_is_not_known():
 def test_depths_stay_where_another_view_agrees():
     exact = depth_view(REFERENCE)
     others = [depth_view(v) for v in AROUND]
-    kept = agreed_depth(exact, others)
+    kept = confirm_depth(exact, others)
     assert np.mean(kept > 0) > 0.9
     error = np.abs(kept / exact.depth - 1)[kept > 0]
     # depths are looked up at the nearest pixel: it may be the other side of an edge
@@ -275,16 +275,16 @@ def test_depths_stay_where_another_view_agrees():
     # wrong where nobody says so
     wrong = exact.depth.copy()
     wrong[20:50, 30:70] *= 1.2
-    judged = agreed_depth(DepthView(depth=wrong, camera=REFERENCE), others)
+    judged = confirm_depth(DepthView(depth=wrong, camera=REFERENCE), others)
     assert not judged[22:48, 32:68].any()
     assert np.array_equal(judged[60:, 80:], kept[60:, 80:])
     # unknown here or there
     hole = exact.depth.copy()
     hole[:45] = 0
-    assert not agreed_depth(DepthView(depth=hole, camera=REFERENCE), others)[:45].any()
+    assert not confirm_depth(DepthView(depth=hole, camera=REFERENCE), others)[:45].any()
     blind = [DepthView(depth=np.zeros_like(other.depth), camera=other.camera) for other in others]
-    assert not agreed_depth(exact, blind).any()
-    assert not agreed_depth(exact, []).any()
+    assert not confirm_depth(exact, blind).any()
+    assert not confirm_depth(exact, []).any()
 
 
 def test_it_makes_no_difference_how_many_rows_are_worked_on_at_once(monkeypatch):
@@ -293,8 +293,8 @@ def test_it_makes_no_difference_how_many_rows_are_worked_on_at_once(monkeypatch)
     for rows in (7, 10_000):
         monkeypatch.setattr(agreement, "ROWS_AT_ONCE", rows)
         monkeypatch.setattr(normals, "ROWS_AT_ONCE", rows)
-        depth = agreed_depth(exact, others)
-        found.append((depth, normals_of(depth, REFERENCE)))
+        depth = confirm_depth(exact, others)
+        found.append((depth, estimate_normals(depth, REFERENCE)))
     for few, all_of_them in zip(*found, strict=True):
         assert np.array_equal(few, all_of_them)
 
@@ -302,14 +302,14 @@ def test_it_makes_no_difference_how_many_rows_are_worked_on_at_once(monkeypatch)
 def test_agreeing_depths_are_averaged():
     exact, other = depth_view(REFERENCE), depth_view(AROUND[0])
     off = DepthView(depth=exact.depth * np.float32(1.006), camera=REFERENCE)
-    kept = agreed_depth(off, [other])
+    kept = confirm_depth(off, [other])
     ratio = (kept / exact.depth)[kept > 0]
     assert np.median(ratio) == pytest.approx(1.003, abs=7e-4)
 
 
 def test_normals_of_a_room():
     depth, truth = depth_of(REFERENCE)
-    normals = normals_of(depth.astype("f4"), REFERENCE)
+    normals = estimate_normals(depth.astype("f4"), REFERENCE)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1, atol=1e-5)
     assert (np.sum(normals * rays(REFERENCE), axis=-1) < 0).all()
     angle = np.degrees(np.arccos(np.clip(np.sum(normals * truth, axis=-1), -1, 1)))
@@ -317,7 +317,9 @@ def test_normals_of_a_room():
     # edges of the room take part in few windows
     assert np.mean(angle < 2) > 0.9
     noisy = depth * (1 + np.random.default_rng(2).normal(0, 0.002, depth.shape))
-    angle = np.degrees(np.arccos(np.clip(np.sum(normals_of(noisy.astype("f4"), REFERENCE) * truth, axis=-1), -1, 1)))
+    angle = np.degrees(
+        np.arccos(np.clip(np.sum(estimate_normals(noisy.astype("f4"), REFERENCE) * truth, axis=-1), -1, 1))
+    )
     assert np.median(angle) < 8
 
 
@@ -326,10 +328,10 @@ def test_normals_do_not_reach_over_steps_and_gaps():
     depth = np.full((90, 120), 2.0, dtype="f4")
     depth[:, 60:] = 3.0
     depth[40:50] = 0
-    normals = normals_of(depth, flat)
+    normals = estimate_normals(depth, flat)
     np.testing.assert_allclose(normals[depth > 0], np.tile([0, 0, -1.0], (int((depth > 0).sum()), 1)), atol=1e-4)
     assert not normals[40:50].any()
     alone = np.zeros_like(depth)
     alone[5, 7] = 1.0
     ray = rays(flat)[5, 7]
-    np.testing.assert_allclose(normals_of(alone, flat)[5, 7], -ray / np.linalg.norm(ray), atol=1e-6)
+    np.testing.assert_allclose(estimate_normals(alone, flat)[5, 7], -ray / np.linalg.norm(ray), atol=1e-6)

@@ -9,7 +9,7 @@ from sweep_scenes import camera, depth_of, picture_of, sights_of
 from test_pipeline_dense import vertices
 
 from colmap_inertial.colmap import sweep_stereo
-from colmap_inertial.colmap.depth_maps import MadeFrom, coverage, found_maps, map_file, settle_maker
+from colmap_inertial.colmap.depth_maps import MadeFrom, choose_maker, coverage, find_maps, map_file
 from colmap_inertial.colmap.fusion import fuse_maps
 from colmap_inertial.colmap.sweep_stereo import SweptWorkspace
 from colmap_inertial.core.errors import FormatError
@@ -86,7 +86,7 @@ def test_a_workspace_gets_maps_that_colmap_fuses(workspace, tmp_path):
     heard = []
     made = sweep(workspace, tmp_path / "raw", progress=lambda: heard.append(1))
     assert len(heard) == 2 * len(NAMES)
-    kind, mapped = found_maps(workspace, NAMES)
+    kind, mapped = find_maps(workspace, NAMES)
     assert (kind, mapped) == ("geometric", NAMES[:-1])
     assert 0.7 < coverage(workspace, mapped, kind) <= 1
     for name, view in zip(made.names, made.sights.views, strict=True):
@@ -146,7 +146,7 @@ def test_a_sweep_that_was_cut_off_goes_on(workspace, tmp_path, monkeypatch):
         with pytest.raises(Killed):
             sweep(workspace, raw, progress=stop_after(number))
         assert len(calls) == done
-    assert 0 < len(found_maps(workspace, NAMES)[1]) < len(VIEWS)
+    assert 0 < len(find_maps(workspace, NAMES)[1]) < len(VIEWS)
     sweep(workspace, raw)
     assert len(calls) == len(VIEWS)
     whole = {name: map_file(workspace, "depth", name).read_bytes() for name in NAMES[:-1]}
@@ -159,10 +159,10 @@ def test_a_sweep_that_was_cut_off_goes_on(workspace, tmp_path, monkeypatch):
 @pytest.mark.parametrize("cuda", [False, True])
 def test_whoever_began_the_maps_goes_on(workspace, monkeypatch, cuda):
     monkeypatch.setattr(pycolmap, "has_cuda", cuda)
-    made_from, has_maps = settle_maker(workspace, "model", None)
+    made_from, has_maps = choose_maker(workspace, "model", None)
     assert (made_from.maps, made_from.max_image_size) == (("patch-match", None) if cuda else ("plane sweep", 1200))
     assert not has_maps
     write_map(map_file(workspace, "depth", NAMES[0]), np.ones((4, 4), dtype="f4"))
     made_from.write(workspace)
     monkeypatch.setattr(pycolmap, "has_cuda", not cuda)
-    assert settle_maker(workspace, "model", None) == (made_from, True)
+    assert choose_maker(workspace, "model", None) == (made_from, True)

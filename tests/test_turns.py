@@ -16,7 +16,7 @@ from colmap_inertial.core.geometry import so3_exp, so3_log
 from colmap_inertial.core.types import CameraModel, Frame, FrameTiming
 from colmap_inertial.imaging.gyro_camera import FrameShutter
 from colmap_inertial.motion.flow import FlowOptions
-from colmap_inertial.motion.two_view_rotation import _rotation, _Seen, measure_two_view_rotations
+from colmap_inertial.motion.two_view_rotation import _estimate_rotation, _Features, measure_two_view_rotations
 from colmap_inertial.tools.simulate.render import colmap_camera
 
 LENS = CameraModel(model="PINHOLE", width=320, height=240, params=(250.0, 250.0, 160.0, 120.0))
@@ -61,17 +61,17 @@ def test_the_camera_s_translation_does_not_count_as_rotation() -> None:
     turn, moved = so3_exp(np.array([0.03, -0.12, 0.05])), np.array([0.6, 0.1, 0.2])
     descriptors = rng.uniform(0, 255, (400, 128)).astype(np.float32)
 
-    def seen(in_camera: np.ndarray) -> _Seen:
+    def seen(in_camera: np.ndarray) -> _Features:
         rays = in_camera[:, :2] / in_camera[:, 2:] + rng.normal(0, 2e-4, (400, 2))
         wrong = rng.permutation(400)[:60]
         rays[wrong] = rng.uniform(-0.7, 0.7, (60, 2))
-        return _Seen(rays, descriptors, 1e-3)
+        return _Features(rays, descriptors, 1e-3)
 
     # first_from_second: x_first = turn x_second + moved
-    found = _rotation(seen(points), seen((points - moved) @ turn))
+    found = _estimate_rotation(seen(points), seen((points - moved) @ turn))
     assert found is not None
     assert np.linalg.norm(so3_log(found[0] @ turn.T)) < 0.01
-    assert _rotation(seen(points), _Seen(np.zeros((5, 2)), descriptors[:5], 1e-3)) is None
+    assert _estimate_rotation(seen(points), _Features(np.zeros((5, 2)), descriptors[:5], 1e-3)) is None
 
 
 def test_a_folder_of_pictures_is_compared_with_the_gyroscope(

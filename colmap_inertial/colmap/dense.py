@@ -21,11 +21,11 @@ import numpy as np
 from colmap_inertial.colmap.depth_maps import (
     MadeFrom,
     Maker,
+    choose_maker,
     coverage,
-    found_maps,
+    find_maps,
     map_file,
     patch_match,
-    settle_maker,
 )
 from colmap_inertial.colmap.fusion import fuse_maps
 from colmap_inertial.colmap.sweep_stereo import SweptWorkspace
@@ -127,7 +127,7 @@ def run_dense(session: Session, indices: Sequence[int], images: Path, options: D
     """
     prepared: dict[int, _Prepared] = {}
     for index in indices:
-        prepared[index] = _prepare(session, index, images, options)
+        prepared[index] = _prepare_model(session, index, images, options)
     done, total = 0, sum(model.steps for model in prepared.values())
 
     def step() -> None:
@@ -187,7 +187,7 @@ def _densify(
         size = prepared.made_from.max_image_size
         runner.run(f"dense_{index}_depth", {"maps": maker}, [], lambda _: patch_match(folder, size), after=before)
         progress()
-    kind, mapped = found_maps(folder, names)
+    kind, mapped = find_maps(folder, names)
     result = DenseResult(folder=folder, images=len(names), depth_maps=len(mapped), maps=maker)
     if not mapped:
         waiting = f"{folder} has no depth maps: no two images see enough of the same under a fit angle"
@@ -210,7 +210,7 @@ def _densify(
     progress()
     with a_record_of_ours(record):
         covered = float(read_json(record)["coverage"])
-    result = replace(result, fused=fused, points=_count(fused, "vertex"), coverage=covered)
+    result = replace(result, fused=fused, points=_count_elements(fused, "vertex"), coverage=covered)
     for other in folder.glob("meshed-*.ply"):
         if other != mesh or not result.points:
             remove(other)
@@ -220,13 +220,13 @@ def _densify(
         depends: dict[str, object] = {"maps": maps}
         make_mesh = partial(tsdf_mesh, folder, mapped, maker=maker, kind=kind)
     else:
-        depth, trim = _octree(fused, read_model(folder / "sparse"))
+        depth, trim = _choose_octree(fused, read_model(folder / "sparse"))
         depends = {"depth": depth, "trim": trim}
         make_mesh = partial(_poisson_mesh, fused, depth=depth, trim=trim, num_threads=num_threads)
     runner.run(
         f"dense_{index}_mesh", depends, [mesh], lambda outputs: make_mesh(outputs[0]), after=[f"dense_{index}_fused"]
     )
-    return replace(result, mesh=mesh, faces=_count(mesh, "face"))
+    return replace(result, mesh=mesh, faces=_count_elements(mesh, "face"))
 
 
 def _poisson_mesh(fused: Path, target: Path, *, depth: int, trim: float, num_threads: int) -> None:
@@ -240,13 +240,13 @@ def _poisson_mesh(fused: Path, target: Path, *, depth: int, trim: float, num_thr
         raise OutputError(f"{fused.parent}: COLMAP wrote no mesh; is the disk full?")
 
 
-def _prepare(session: Session, index: int, images: Path, options: DenseOptions) -> _Prepared:
+def _prepare_model(session: Session, index: int, images: Path, options: DenseOptions) -> _Prepared:
     """Look at what there is, and decide who makes the depth maps; removes old ones of our own."""
     model, folder = session.workspace.sparse / str(index), session.workspace.dense / str(index)
     reconstruction = read_model(model)
     names = tuple(sorted(reconstruction.image(i).name for i in reconstruction.reg_image_ids()))
     _check_images(images, model, reconstruction)
-    made_from, has_maps = settle_maker(folder, digest(model), options.max_image_size)
+    made_from, has_maps = choose_maker(folder, digest(model), options.max_image_size)
     return _Prepared(names=names, made_from=made_from, has_maps=has_maps)
 
 
@@ -333,7 +333,7 @@ def _check_images(images: Path, model: Path, reconstruction: pycolmap.Reconstruc
                 )
 
 
-def _octree(fused: Path, model: pycolmap.Reconstruction) -> tuple[int, float]:
+def _choose_octree(fused: Path, model: pycolmap.Reconstruction) -> tuple[int, float]:
     """Depth of the octree, so that its cells are as large as pixels on the surface, and where to trim it."""
     with open(fused, "rb") as file:
         header = read_ply_header(fused, file)
@@ -356,6 +356,6 @@ def _octree(fused: Path, model: pycolmap.Reconstruction) -> tuple[int, float]:
     return depth, float(depth - _TRIM_LEVELS)
 
 
-def _count(path: Path, element: str) -> int:
+def _count_elements(path: Path, element: str) -> int:
     with open(path, "rb") as file:
         return sum(e.rows for e in read_ply_header(path, file).elements if e.name == element)

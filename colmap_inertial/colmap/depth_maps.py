@@ -71,7 +71,7 @@ def model_of(folder: Path) -> str | None:
     return str(read_json(record).get("model")) if record.is_file() else None
 
 
-def settle_maker(folder: Path, model: str, max_image_size: int | None) -> tuple[MadeFrom, bool]:
+def choose_maker(folder: Path, model: str, max_image_size: int | None) -> tuple[MadeFrom, bool]:
     """Decide who makes a workspace's depth maps, and tell whether some are there.
 
     Whoever began goes on: maps of two makers are never mixed. Maps of patch-match may have taken hours, or came from
@@ -153,7 +153,7 @@ def patch_match(folder: Path, max_image_size: int | None) -> None:
         )
 
 
-def found_maps(folder: Path, names: Sequence[str]) -> tuple[str, list[str]]:
+def find_maps(folder: Path, names: Sequence[str]) -> tuple[str, list[str]]:
     """The kind of depth map that is there, and the images that have one and its normals, all of them checked.
 
     Raises

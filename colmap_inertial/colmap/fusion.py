@@ -60,7 +60,7 @@ def fuse_maps(
     seen = folder
     if maker == "plane sweep":
         seen = scratch
-        _show_centres(folder, names, scratch)
+        _write_corner_workspace(folder, names, scratch)
     pycolmap.stereo_fusion(str(targets[0]), str(seen), input_type=kind, options=options, output_type="PLY")
     remove(scratch)
     visible = targets[0].with_name(targets[0].name + ".vis")
@@ -69,7 +69,7 @@ def fuse_maps(
     os.replace(visible, targets[1])
 
 
-def _show_centres(folder: Path, names: Sequence[str], scratch: Path) -> None:
+def _write_corner_workspace(folder: Path, names: Sequence[str], scratch: Path) -> None:
     """A workspace of links to the pictures and maps, with cameras that see pixels' corners where centres are."""
     remove(scratch)
     (scratch / "sparse").mkdir(parents=True)

@@ -22,11 +22,11 @@ from colmap_inertial.imaging.plane_sweep import (
     Partner,
     Pinhole,
     Sights,
-    agreed_depth,
-    chosen_partners,
+    choose_partners,
+    confirm_depth,
     depth_range,
-    normals_of,
-    partner_scores,
+    estimate_normals,
+    score_partners,
     sweep_depth,
 )
 from colmap_inertial.io.files import as_plain, read_json, write_json
@@ -117,7 +117,7 @@ class SweptWorkspace:
         depths = depth_range(sights, view)
         if target.is_file() or depths is None:
             return
-        chosen = chosen_partners(sights, view, partner_scores(sights, view), PARTNERS)
+        chosen = choose_partners(sights, view, score_partners(sights, view), PARTNERS)
         if chosen:
             partners = [Partner(codes=self._grey(k), camera=sights.views[k]) for k in chosen]
             write_map(target, sweep_depth(self._grey(view), sights.views[view], partners, depths, threads=threads))
@@ -127,12 +127,12 @@ class SweptWorkspace:
         files = [map_file(self.folder, what, self.names[view]) for what in ("depth", "normal")]
         if not self._raw_file(view).is_file() or all(file.is_file() for file in files):
             return
-        scores = partner_scores(self.sights, view)
+        scores = score_partners(self.sights, view)
         best = np.argsort(-scores, kind="stable")[:WITNESSES]
         witnesses = [int(k) for k in best if scores[k] > 0 and self._raw_file(int(k)).is_file()]
-        depth = agreed_depth(self._depth_view(view), (self._depth_view(k) for k in witnesses))
+        depth = confirm_depth(self._depth_view(view), (self._depth_view(k) for k in witnesses))
         write_map(files[0], depth)
-        write_map(files[1], normals_of(depth, self.sights.views[view]))
+        write_map(files[1], estimate_normals(depth, self.sights.views[view]))
 
     def _depth_view(self, view: int) -> DepthView:
         return DepthView(depth=read_map(self._raw_file(view)), camera=self.sights.views[view])

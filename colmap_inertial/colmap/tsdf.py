@@ -68,32 +68,32 @@ def require_mesh_maker(options: ReconstructOptions) -> None:
     """
     if options.dense and options.dense_options.mesh == "tsdf":
         if find_spec("open3d") is None:
-            raise _missing()
+            raise _missing_error()
         tried = subprocess.run(
             [sys.executable, "-c", "import open3d"], capture_output=True, text=True, errors="replace"
         )
         if tried.returncode:
-            raise _unloadable((tried.stderr.strip().splitlines() or [f"exit code {tried.returncode}"])[-1])
+            raise _unloadable_error((tried.stderr.strip().splitlines() or [f"exit code {tried.returncode}"])[-1])
 
 
-def _missing() -> MissingExtraError:
+def _missing_error() -> MissingExtraError:
     return MissingExtraError("mesh", "dense_options.mesh tsdf is made by open3d")
 
 
-def _unloadable(why: str) -> InertialError:
+def _unloadable_error(why: str) -> InertialError:
     return InertialError(
         f"open3d cannot be loaded ({why}); on Debian: apt install libusb-1.0-0 libgl1 libgomp1 libx11-6, or take "
         "--dense-options.mesh poisson"
     )
 
 
-def _open3d() -> ModuleType:
+def _import_open3d() -> ModuleType:
     try:
         import open3d
     except ModuleNotFoundError:
-        raise _missing() from None
+        raise _missing_error() from None
     except (ImportError, OSError) as error:
-        raise _unloadable(str(error)) from error
+        raise _unloadable_error(str(error)) from error
     return open3d
 
 
@@ -118,12 +118,12 @@ def tsdf_mesh(folder: Path, names: Sequence[str], target: Path, *, maker: Maker,
     OutputError
         Where nothing was written.
     """
-    o3d = _open3d()
+    o3d = _import_open3d()
     core = o3d.core
     model = read_model(folder / "sparse")
     images = {image.name: image for image in (model.image(i) for i in model.reg_image_ids())}
     files = {name: map_file(folder, "depth", name, kind) for name in names}
-    typical = [_typical(read_map(files[name]), model.camera(images[name].camera_id)) for name in names]
+    typical = [_measure_typical(read_map(files[name]), model.camera(images[name].camera_id)) for name in names]
     near_m, pixel_m = np.median(typical, axis=0)
     voxel_m, far_m = SURFACE.voxel_px * float(pixel_m), SURFACE.farthest * float(near_m)
     grid = o3d.t.geometry.VoxelBlockGrid(
@@ -143,8 +143,8 @@ def tsdf_mesh(folder: Path, names: Sequence[str], target: Path, *, maker: Maker,
         camera, cam_from_world = model.camera(image.camera_id), np.eye(4)
         cam_from_world[:3] = image.cam_from_world().matrix()
         seen = o3d.t.geometry.Image(np.ascontiguousarray(depth))
-        shown = o3d.t.geometry.Image(_colours(path_in(folder / "images", name)))
-        matrix, pose = core.Tensor(_matrix(camera.params, maker)), core.Tensor(cam_from_world)
+        shown = o3d.t.geometry.Image(_read_colours(path_in(folder / "images", name)))
+        matrix, pose = core.Tensor(_open3d_matrix(camera.params, maker)), core.Tensor(cam_from_world)
         limits = (1.0, far_m, SURFACE.truncation_voxels)
         blocks = grid.compute_unique_block_coordinates(seen, matrix, pose, *limits)
         grid.integrate(blocks, seen, shown, matrix, pose, *limits)
@@ -153,12 +153,12 @@ def tsdf_mesh(folder: Path, names: Sequence[str], target: Path, *, maker: Maker,
                 f"{target}: the surface is too large for voxels of {1000 * voxel_m:.1f} mm; shrink the pictures "
                 "(--dense-options.max-image-size), or take --dense-options.mesh poisson"
             )
-    mesh = _in_order(o3d, grid.extract_triangle_mesh(weight_threshold=SURFACE.least_seen))
+    mesh = _sort_mesh(o3d, grid.extract_triangle_mesh(weight_threshold=SURFACE.least_seen))
     if not o3d.t.io.write_triangle_mesh(str(target), mesh) or not target.is_file():
         raise OutputError(f"{target}: open3d wrote no mesh; is the disk full?")
 
 
-def _in_order(o3d: ModuleType, mesh: Any) -> Any:
+def _sort_mesh(o3d: ModuleType, mesh: Any) -> Any:
     """The mesh in single precision, its vertices and faces sorted: Open3D's threads leave them in any order."""
     positions = mesh.vertex.positions.numpy().astype(np.float32)
     order = np.lexsort(positions.T[::-1])
@@ -176,21 +176,21 @@ def _in_order(o3d: ModuleType, mesh: Any) -> Any:
     return out
 
 
-def _typical(depth: Float32Array, camera: pycolmap.Camera) -> tuple[float, float]:
+def _measure_typical(depth: Float32Array, camera: pycolmap.Camera) -> tuple[float, float]:
     """What is near in a map, and what a pixel covers there."""
     known = depth[depth > 0]
     near = float(np.quantile(known, SURFACE.near_quantile)) if len(known) else 0.0
     return near, near / float(camera.mean_focal_length())
 
 
-def _matrix(params: Array, maker: Maker) -> Array:
+def _open3d_matrix(params: Array, maker: Maker) -> Array:
     """(3, 3) intrinsics. Open3D rounds down: the depth of a pixel holds for all of it, counted from its corner."""
     fx, fy, cx, cy = params
     aside = 0.0 if maker == "plane sweep" else 0.5
     return np.array([[fx, 0, cx + aside], [0, fy, cy + aside], [0, 0, 1]])
 
 
-def _colours(path: Path) -> Float32Array:
+def _read_colours(path: Path) -> Float32Array:
     picture = read_image(path)
     shares = picture.astype(np.float32) / np.float32(np.iinfo(picture.dtype).max)
     return shares if shares.ndim == 3 else np.stack([shares] * 3, axis=2)

@@ -99,7 +99,7 @@ class BlurEvidence:
     extent_px
         Sum of the lengths of their predicted blur.
     standing
-        The same, tiles weighted by how far they stand out of the quiet ones of their image (:func:`_weights`).
+        The same, tiles weighted by how far they stand out of the quiet ones of their image (:func:`_weigh_tiles`).
     """
 
     total: Array
@@ -183,21 +183,21 @@ def blur_evidence(image: UInt8Array | UInt16Array, blur: BlurField | BlurPath) -
     Evidence in units of the prediction; of no tile where blur is short, or texture missing, all over.
     """
     path = BlurPath.straight(blur) if isinstance(blur, BlurField) else blur
-    found = _spectra(image, path, _LIMITS.most_tiles)
+    found = _compute_spectra(image, path, _LIMITS.most_tiles)
     if found is None:
         return BlurEvidence.nothing()
     logarithm, vectors, paths = found
-    cepstra, vectors = _cepstra(logarithm), _dips(vectors, paths, logarithm.shape[1])
-    values = _at_lags(cepstra, vectors, DIRECTIONS_RAD)
+    cepstra, vectors = _compute_cepstra(logarithm), _find_dips(vectors, paths, logarithm.shape[1])
+    values = _sample_lags(cepstra, vectors, DIRECTIONS_RAD)
     level = np.median(values[:, :, 2:-1], axis=2, keepdims=True)
     values -= level
-    mirrored = _at_lags(cepstra, vectors * [1, -1], DIRECTIONS_RAD[:1]) - level
+    mirrored = _sample_lags(cepstra, vectors * [1, -1], DIRECTIONS_RAD[:1]) - level
     lengths = np.hypot(vectors[:, 0], vectors[:, 1])
-    standing = _summed(values, mirrored, lengths, _weights(logarithm))
-    return replace(_summed(values, mirrored, lengths, np.ones(len(values))), standing=standing)
+    standing = _sum_tiles(values, mirrored, lengths, _weigh_tiles(logarithm))
+    return replace(_sum_tiles(values, mirrored, lengths, np.ones(len(values))), standing=standing)
 
 
-def _summed(values: Array, mirrored: Array, lengths_px: Array, weight: Array) -> BlurEvidence:
+def _sum_tiles(values: Array, mirrored: Array, lengths_px: Array, weight: Array) -> BlurEvidence:
     """Of tiles' depths, (N, FACTORS, DIRECTIONS_RAD) and (N, FACTORS, 1)."""
     values, mirrored = (weight[:, None, None] * depths for depths in (values, mirrored))
     return BlurEvidence(
@@ -230,16 +230,16 @@ def shown_share(image: UInt8Array | UInt16Array, blur: BlurField | BlurPath) -> 
 def shown_shares(image: UInt8Array | UInt16Array, blur: BlurField | BlurPath) -> tuple[float | None, float | None]:
     """As `shown_share`, and that of the blur that a gyroscope with one axis flipped would predict."""
     path = BlurPath.straight(blur) if isinstance(blur, BlurField) else blur
-    found = _spectra(image, path, _LIMITS.few_tiles)
+    found = _compute_spectra(image, path, _LIMITS.few_tiles)
     if found is None:
         return None, None
     logarithm, vectors, paths = found
-    weight = _weights(logarithm)
-    return _share(*found, weight), _share(logarithm, vectors * [1, -1], paths * [1, -1], weight)
+    weight = _weigh_tiles(logarithm)
+    return _fit_share(*found, weight), _fit_share(logarithm, vectors * [1, -1], paths * [1, -1], weight)
 
 
-def _share(logarithm: Float32Array, vectors: Array, path_px: Array, weight: Array) -> float | None:
-    falls = _falls(logarithm, vectors, path_px)
+def _fit_share(logarithm: Float32Array, vectors: Array, path_px: Array, weight: Array) -> float | None:
+    falls = _measure_falls(logarithm, vectors, path_px)
     seen, expected, seen_mean, expected_mean = (weight * fall for fall in falls)
     information = float((expected - _LIMITS.own_direction * expected_mean).sum())
     if information < _LIMITS.least_information:
@@ -247,7 +247,7 @@ def _share(logarithm: Float32Array, vectors: Array, path_px: Array, weight: Arra
     return float((seen - _LIMITS.own_direction * seen_mean).sum()) / information
 
 
-def _spectra(
+def _compute_spectra(
     image: UInt8Array | UInt16Array, path: BlurPath, most_tiles: int
 ) -> tuple[Float32Array, Array, Array] | None:
     """(N, T, T // 2 + 1) log power of tiles, the (N, 2) chords and the (N, S, 2) paths of their blur; ``None`` where
@@ -255,7 +255,7 @@ def _spectra(
     import cv2
     from scipy.fft import rfft2
 
-    light = _light(image)
+    light = _to_light(image)
     chords = path.field()
     lengths = chords.extent_px()
     long_px = float(np.percentile(lengths, 90))
@@ -276,7 +276,7 @@ def _spectra(
     if min(height, width) < tile:
         return None
     step = max(3 * tile // 4, int(np.ceil(np.sqrt(height * width / most_tiles))))
-    top, left = (_starts(size, tile, step) for size in (height, width))
+    top, left = (_place_tiles(size, tile, step) for size in (height, width))
     windows = np.lib.stride_tricks.sliding_window_view(light, (tile, tile))[top[:, None], left].reshape(-1, tile, tile)
     middles = [(start + tile / 2) * reduced for start in (top, left)]
     vectors = chords.at(*middles).reshape(-1, 2) / reduced
@@ -295,7 +295,7 @@ def _spectra(
     return np.asarray(np.log(power + _LIMITS.floor * tile**2)), vectors[usable], paths
 
 
-def _weights(logarithm: Float32Array) -> Array:
+def _weigh_tiles(logarithm: Float32Array) -> Array:
     """(N,) weights of tiles by how far they stand out of the quiet ones of their picture.
 
     A sky holds noise alone, and would hide in the mean what the ground below it shows. Noise cannot be told from weak
@@ -312,7 +312,7 @@ def _weights(logarithm: Float32Array) -> Array:
     return np.asarray(weight * (weight.sum() / (weight @ weight)))
 
 
-def _light(image: UInt8Array | UInt16Array) -> Float32Array:
+def _to_light(image: UInt8Array | UInt16Array) -> Float32Array:
     """(H, W) roughly linear light, 0 to 1."""
     import cv2
 
@@ -323,13 +323,13 @@ def _light(image: UInt8Array | UInt16Array) -> Float32Array:
     return np.asarray((grey.astype(np.float32) / np.float32(codes)) ** np.float32(2.2))
 
 
-def _starts(size: int, tile: int, step: int) -> IndexArray:
+def _place_tiles(size: int, tile: int, step: int) -> IndexArray:
     """Tiles that cover a side evenly."""
     count = max(1, -(-(size - tile) // step) + 1)
     return np.unique(np.rint(np.linspace(0, size - tile, count)).astype(np.intp))
 
 
-def _falls(logarithm: Float32Array, vectors: Array, path_px: Array) -> tuple[Array, Array, Array, Array]:
+def _measure_falls(logarithm: Float32Array, vectors: Array, path_px: Array) -> tuple[Array, Array, Array, Array]:
     """(N,) sums over the frequencies of each tile: its fall times the expected one, and the expected one squared; and
     both of the means over frequencies."""
     tile = logarithm.shape[1]
@@ -337,7 +337,9 @@ def _falls(logarithm: Float32Array, vectors: Array, path_px: Array) -> tuple[Arr
     x, y = np.arange(reach - 1) / tile, np.arange(2 - reach, reach - 1)[:, None] / tile
     radius = np.hypot(x, y)
     band = (radius > _LIMITS.band_per_px[0]) & (radius < _LIMITS.band_per_px[1])
-    passed = _leaked(_transfer(path_px, np.arange(-1, reach) / tile, np.arange(1 - reach, reach) / tile))[:, band]
+    passed = _leak_window(_compute_transfer(path_px, np.arange(-1, reach) / tile, np.arange(1 - reach, reach) / tile))[
+        :, band
+    ]
     power = logarithm[:, np.arange(2 - reach, reach - 1) % tile, : reach - 1][:, band].astype(np.float64)
     every = np.hypot(np.fft.rfftfreq(tile), np.fft.fftfreq(tile)[:, None])
     noise = np.exp(
@@ -367,7 +369,7 @@ def _falls(logarithm: Float32Array, vectors: Array, path_px: Array) -> tuple[Arr
     )
 
 
-def _transfer(path_px: Array, x: Array, y: Array) -> Array:
+def _compute_transfer(path_px: Array, x: Array, y: Array) -> Array:
     """(N, Y, X) power that (N, S, 2) paths leave at frequencies, cycles per pixel."""
     wave_x, wave_y = (
         np.exp(2j * np.pi * (path_px[:, :, i, None] * f)).astype(np.complex64) for i, f in enumerate((x, y))
@@ -375,7 +377,7 @@ def _transfer(path_px: Array, x: Array, y: Array) -> Array:
     return np.asarray(np.abs(np.swapaxes(wave_y, 1, 2) @ wave_x / path_px.shape[1]) ** 2, dtype=np.float64)
 
 
-def _leaked(power: Array) -> Array:
+def _leak_window(power: Array) -> Array:
     """As a tile under Hann's window has it: each frequency takes a sixth of either neighbour; without the outermost."""
     for axis in (1, 2):
         inner = np.moveaxis(power, axis, 0)
@@ -383,7 +385,7 @@ def _leaked(power: Array) -> Array:
     return power
 
 
-def _cepstra(logarithm: Float32Array) -> Float32Array:
+def _compute_cepstra(logarithm: Float32Array) -> Float32Array:
     """(N, T, T) of (N, T, T // 2 + 1) log power, smoothed."""
     from scipy.fft import irfft2
 
@@ -392,7 +394,7 @@ def _cepstra(logarithm: Float32Array) -> Float32Array:
     return np.asarray(irfft2(logarithm * smooth[:, None] * smooth[: tile // 2 + 1], s=(tile, tile)))
 
 
-def _dips(vectors: Array, path_px: Array, tile: int) -> Array:
+def _find_dips(vectors: Array, path_px: Array, tile: int) -> Array:
     """(N, 2) lags at which the blur's own cepstrum is deepest: its (N, 2) chord, but of curves.
 
     Both ends of a path make the zeros of its spectrum. Where it is curved, they bend, and the dip moves and widens.
@@ -401,9 +403,9 @@ def _dips(vectors: Array, path_px: Array, tile: int) -> Array:
     curved = np.flatnonzero(np.hypot(bend[..., 0], bend[..., 1]).max(axis=1) > _LIMITS.curved_px)
     out = vectors.copy()
     if len(curved):
-        power = _transfer(path_px[curved], np.asarray(np.fft.rfftfreq(tile)), np.asarray(np.fft.fftfreq(tile)))
-        cepstra = _cepstra(np.log(power + np.exp(2 * _LIMITS.deepest_log)).astype(np.float32))
-        depth = _at_lags(cepstra, vectors[curved], _BENT_RAD, _BENT_FACTORS).reshape(len(curved), -1)
+        power = _compute_transfer(path_px[curved], np.asarray(np.fft.rfftfreq(tile)), np.asarray(np.fft.fftfreq(tile)))
+        cepstra = _compute_cepstra(np.log(power + np.exp(2 * _LIMITS.deepest_log)).astype(np.float32))
+        depth = _sample_lags(cepstra, vectors[curved], _BENT_RAD, _BENT_FACTORS).reshape(len(curved), -1)
         factor, turn = np.unravel_index(depth.argmin(axis=1), (len(_BENT_FACTORS), len(_BENT_RAD)))
         cosine, sine = np.cos(_BENT_RAD[turn]), np.sin(_BENT_RAD[turn])
         x, y = (vectors[curved] * _BENT_FACTORS[factor][:, None]).T
@@ -411,7 +413,7 @@ def _dips(vectors: Array, path_px: Array, tile: int) -> Array:
     return out
 
 
-def _at_lags(cepstra: Float32Array, vectors: Array, directions_rad: Array, factors: Array = FACTORS) -> Array:
+def _sample_lags(cepstra: Float32Array, vectors: Array, directions_rad: Array, factors: Array = FACTORS) -> Array:
     """(N, factors, directions) values of (N, T, T) cepstra at the lags around (N, 2) blur vectors; bilinear."""
     tile = cepstra.shape[1]
     cosine, sine = np.cos(directions_rad), np.sin(directions_rad)

@@ -110,7 +110,7 @@ def decide(
     options = options or GateOptions()
     scale = max(width, height) / 1920
     px = predicted.px
-    dropped = _droppable(px > options.drop_above_px * scale, px, t_s, motion, options)
+    dropped = _find_droppable(px > options.drop_above_px * scale, px, t_s, motion, options)
     out = []
     for name, blur, reason, drop in zip(predicted.names, px, predicted.reasons, dropped, strict=True):
         if not np.isfinite(blur):
@@ -128,7 +128,7 @@ def decide(
     return tuple(out)
 
 
-def _droppable(
+def _find_droppable(
     candidate: BoolArray, px: Array, t_s: Array, motion: GyroCamera | None, options: GateOptions
 ) -> BoolArray:
     """Which candidates can go, the most blurred first, without opening too wide a gap between those that stay."""
@@ -225,25 +225,25 @@ def judge_recording(evidence: Iterable[BlurEvidence], options: GateOptions | Non
     """
     options = options or GateOptions()
     evidence = list(evidence)
-    verdict = _judged(evidence, options)
+    verdict = _judge_evidence(evidence, options)
     if verdict.trusted is False:
         # a sky hides what stands below it
         standing = [one.standing for one in evidence if one.standing is not None]
-        below = _judged(standing, options)
+        below = _judge_evidence(standing, options)
         if below.trusted and sum(standing, BlurEvidence.nothing()).support >= options.min_recording_support:
             return below
     return verdict
 
 
-def _judged(evidence: Sequence[BlurEvidence], options: GateOptions) -> RecordingVerdict:
+def _judge_evidence(evidence: Sequence[BlurEvidence], options: GateOptions) -> RecordingVerdict:
     telling = [one for one in evidence if one.enough]
-    supports = [_support(one) for one in telling]
+    supports = [_plausible_support(one) for one in telling]
     median = float(np.median(supports)) if supports else 0.0
     together = sum(telling, BlurEvidence.nothing())
-    factor = _mended(together)
+    factor = _correct_extent(together)
     if len(telling) < GATE_LIMITS.fewest_frames:
         trusted, reason = None, f"{len(telling)} frames are too few to check the gyroscope against the images"
-    elif median < options.min_recording_support and not _clear_together(telling, together):
+    elif median < options.min_recording_support and not _is_clear_together(telling, together):
         trusted = False
         reason = (
             f"the images do not show the blur that the gyroscope predicts ({median:.1f} standard deviations in the "
@@ -258,7 +258,7 @@ def _judged(evidence: Sequence[BlurEvidence], options: GateOptions) -> Recording
     return RecordingVerdict(trusted=trusted, support=median, extent_factor=factor, frames=len(telling), reason=reason)
 
 
-def _clear_together(telling: Sequence[BlurEvidence], together: BlurEvidence) -> bool:
+def _is_clear_together(telling: Sequence[BlurEvidence], together: BlurEvidence) -> bool:
     """Whether many frames, of which none says much, bear the gyroscope out, and no flipped axis."""
     if (
         together.support - max(0.0, together.mirrored_support) < GATE_LIMITS.together_support
@@ -274,7 +274,7 @@ def _clear_together(telling: Sequence[BlurEvidence], together: BlurEvidence) -> 
     return len(votes) - against >= max(GATE_LIMITS.fewest_frames, 3 * against)
 
 
-def _mended(evidence: BlurEvidence) -> float:
+def _correct_extent(evidence: BlurEvidence) -> float:
     """The factor that the extents need."""
     factor = evidence.extent_factor
     clear = evidence.support >= GATE_LIMITS.clear_support and evidence.extent_is_plausible
@@ -283,7 +283,7 @@ def _mended(evidence: BlurEvidence) -> float:
     return factor if clear and abs(factor - 1) > drift else 1.0
 
 
-def _support(evidence: BlurEvidence) -> float:
+def _plausible_support(evidence: BlurEvidence) -> float:
     return evidence.support if evidence.extent_is_plausible else min(evidence.support, 0.0)
 
 
@@ -328,11 +328,11 @@ def judge_frame(
                 "the image has as much detail along the predicted blur as across it, though other frames lack it",
             )
         # a flat spectrum predicts no fall, and so tells none
-        if (share is None or share < GATE_LIMITS.clear_share) and _no_dip(image, curve, options):
+        if (share is None or share < GATE_LIMITS.clear_share) and _lacks_dip(image, curve, options):
             return None, "the image does not show the blur that the gyroscope predicts, though other frames do"
         return recording.extent_factor, recording.reason
     evidence = blur_evidence(image, curve)
-    own = _support(evidence) if evidence.enough else 0.0
+    own = _plausible_support(evidence) if evidence.enough else 0.0
     if not evidence.enough:
         return None, "too little texture or blur to check the gyroscope's prediction against"
     if own < options.min_support:
@@ -340,15 +340,15 @@ def judge_frame(
             f"the image does not show the blur that the gyroscope predicts ({own:.1f} standard deviations where "
             f"{options.min_support:g} are wanted)"
         )
-    return _mended(evidence), f"the image bears out the gyroscope's blur ({own:.0f} standard deviations)"
+    return _correct_extent(evidence), f"the image bears out the gyroscope's blur ({own:.0f} standard deviations)"
 
 
-def _no_dip(image: NDArray[Code], curve: BlurPath, options: GateOptions) -> bool:
+def _lacks_dip(image: NDArray[Code], curve: BlurPath, options: GateOptions) -> bool:
     """Whether blur that is long enough to show a dip shows none."""
     if float(np.percentile(curve.field().extent_px(), 90)) < GATE_LIMITS.must_show_px:
         return False
     evidence = blur_evidence(image, curve)
-    return evidence.enough and _support(evidence) < options.min_recording_support
+    return evidence.enough and _plausible_support(evidence) < options.min_recording_support
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -84,7 +84,7 @@ def path_wiener(image: NDArray[Code], path: BlurPath, options: DeblurOptions | N
     ValueError
         Where the image is of another type, the path of another size, or longer than `LONGEST_PX`.
     """
-    return _filtered(image, path, options or DeblurOptions(), ())
+    return _filter_image(image, path, options or DeblurOptions(), ())
 
 
 def half_quadratic(image: NDArray[Code], path: BlurPath, options: DeblurOptions | None = None) -> NDArray[Code]:
@@ -94,14 +94,14 @@ def half_quadratic(image: NDArray[Code], path: BlurPath, options: DeblurOptions 
     ``|w|^(2/3) + b / 2 (w - gradient)^2``, and the picture that has these gradients and, blurred, is the one seen;
     b grows (`FILTER_MODEL.splitting`).
     """
-    return _filtered(image, path, options or DeblurOptions(), FILTER_MODEL.splitting)
+    return _filter_image(image, path, options or DeblurOptions(), FILTER_MODEL.splitting)
 
 
 def smoothed(image: NDArray[Code], sigma_px: float) -> NDArray[Code]:
     """An image smoothed by a Gaussian in linear light, as feature extraction likes it after a filter."""
     import cv2
 
-    light = np.asarray(cv2.GaussianBlur(_light(image), (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT_101))
+    light = np.asarray(cv2.GaussianBlur(_to_light(image), (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT_101))
     if image.dtype == np.uint8:  # the table is fine enough for 256 codes
         codes = encode_table(image.dtype)[np.rint(light * np.float32(ENCODE_STEPS)).astype(np.intp)]
     else:
@@ -201,7 +201,7 @@ def filter_along(
     return result
 
 
-def _light(image: AnyArray) -> Float32Array:
+def _to_light(image: AnyArray) -> Float32Array:
     """Linear light of codes."""
     if image.dtype == np.uint8:
         import cv2
@@ -210,7 +210,7 @@ def _light(image: AnyArray) -> Float32Array:
     return decode_table(image.dtype)[image]
 
 
-def _filtered(
+def _filter_image(
     image: NDArray[Code], path: BlurPath, options: DeblurOptions, splitting: Sequence[float]
 ) -> NDArray[Code]:
     from colmap_inertial._kernels import _wiener
@@ -220,7 +220,7 @@ def _filtered(
     threads = options.threads or 0
     tiling = Tiling.covering(path.width, path.height, extent_px)
     paths = tiling.paths(path)
-    light = _light(planes).reshape(planes.shape)
+    light = _to_light(planes).reshape(planes.shape)
     channels = planes.shape[2]
     if options.noise is None:
         noise = noise_along(light, tiling, paths, threads)

@@ -111,13 +111,13 @@ def blur_field(
     x, y = _node_axes(shutter.width, shutter.height, step_px)
     rates = None if parallax is None else parallax.rate_at(x, y)[None]
     one = _Exposures(shutter, np.array([shutter.t_s]), np.array([shutter.exposure_s]))
-    vectors = _vectors(motion, camera, one, x, y, rates)[0]
+    vectors = _compute_vectors(motion, camera, one, x, y, rates)[0]
     return BlurField(
         width=shutter.width,
         height=shutter.height,
-        vector_px=_filled(vectors).astype(np.float32),
+        vector_px=_fill_nodes(vectors).astype(np.float32),
         step_px=step_px,
-        cov_px2=_filled(_vector_cov(motion, camera, shutter, x, y)).astype(np.float32),
+        cov_px2=_fill_nodes(_compute_vector_cov(motion, camera, shutter, x, y)).astype(np.float32),
     )
 
 
@@ -169,7 +169,7 @@ def blur_path(
         speed = (path[after] - path[before]) / (since_s[after] - since_s[before])
         stretch = np.maximum(1 + speed @ step_s, _LEAST_STRETCH)
         path = path - ((path @ step_s) / stretch)[..., None] * speed
-    filled = _filled(np.moveaxis(path, 0, 2).reshape(len(y), len(x), -1)).reshape(len(y), len(x), -1, 2)
+    filled = _fill_nodes(np.moveaxis(path, 0, 2).reshape(len(y), len(x), -1)).reshape(len(y), len(x), -1, 2)
     return BlurPath(
         width=shutter.width,
         height=shutter.height,
@@ -240,7 +240,7 @@ def predicted_blur_px(
                     if timing.names[i] in parallaxes:
                         rate[:] = parallaxes[timing.names[i]].rate_at(x, y)
                 exposures = _Exposures(shutter, timing.t_s[part], timing.exposure_s[part])
-                vectors = _vectors(motion, camera, exposures, x, y, rates)
+                vectors = _compute_vectors(motion, camera, exposures, x, y, rates)
                 lengths = np.hypot(vectors[..., 0], vectors[..., 1]).reshape(len(part), -1)
                 px[part] = np.nanpercentile(lengths, 90, axis=1)
     return PredictedBlur(names=timing.names, px=px, reasons=tuple(reasons))
@@ -306,7 +306,7 @@ class _Exposures:
     exposure_s: Array
 
 
-def _vectors(
+def _compute_vectors(
     motion: GyroCamera, camera: Projector, frames: _Exposures, x: Array, y: Array, rates: Array | None
 ) -> Array:
     """(F, len(y), len(x), 2) blur vectors of F frames, at the nodes of a grid.
@@ -335,7 +335,7 @@ def _vectors(
     return np.asarray(vector / np.maximum(stretch, _LEAST_STRETCH)[..., None])
 
 
-def _vector_cov(motion: GyroCamera, camera: Projector, shutter: FrameShutter, x: Array, y: Array) -> Array:
+def _compute_vector_cov(motion: GyroCamera, camera: Projector, shutter: FrameShutter, x: Array, y: Array) -> Array:
     """(len(y), len(x), 3) covariance xx, xy, yy of blur vectors at the nodes of a grid, by the errors of the turn."""
     grid = _Grid.of(camera, shutter, x, y)
     lever = np.empty((*grid.nodes_px.shape, 3))
@@ -347,7 +347,7 @@ def _vector_cov(motion: GyroCamera, camera: Projector, shutter: FrameShutter, x:
     return np.stack([cov[..., 0, 0], cov[..., 0, 1], cov[..., 1, 1]], axis=-1)
 
 
-def _filled(vectors: Array) -> Array:
+def _fill_nodes(vectors: Array) -> Array:
     """Nodes beyond the image's edge that no ray meets take the vector of the nearest one that some ray does."""
     bad = ~np.isfinite(vectors).all(axis=-1)
     if not bad.any():

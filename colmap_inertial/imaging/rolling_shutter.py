@@ -54,13 +54,13 @@ def rectify_keypoints(
     if len(keypoints) == 0 or shutter.readout_s == 0:
         return keypoints
     points = keypoints[:, :2].astype(np.float64)
-    moved = _to_reference(points, motion, camera, shutter)
+    moved = _move_to_reference(points, motion, camera, shutter)
     ok = np.isfinite(moved).all(axis=1)
     if keypoints.shape[1] in (4, 6):
-        beside = [_to_reference(points + step, motion, camera, shutter) for step in ([1.0, 0.0], [0.0, 1.0])]
+        beside = [_move_to_reference(points + step, motion, camera, shutter) for step in ([1.0, 0.0], [0.0, 1.0])]
         derivative = np.stack([b - moved for b in beside], axis=-1)
         ok &= np.isfinite(derivative).all(axis=(1, 2))
-        keypoints[ok, 2:] = _reshaped(keypoints[ok, 2:].astype(np.float64), derivative[ok])
+        keypoints[ok, 2:] = _transform_shapes(keypoints[ok, 2:].astype(np.float64), derivative[ok])
     keypoints[ok, :2] = moved[ok]
     return keypoints
 
@@ -99,7 +99,7 @@ def rectify_image(
     _check_covered(motion, shutter)
     if shutter.readout_s == 0:
         return image.copy(), np.ones((height, width), dtype=np.bool_)
-    shift = _from_reference(motion, camera, shutter, step_px)
+    shift = _shift_from_reference(motion, camera, shutter, step_px)
     map_x, map_y = sampling_maps(shift, width, height, step_px)
     covered = (map_x >= -0.5) & (map_x <= width - 0.5) & (map_y >= -0.5) & (map_y <= height - 0.5)
     out = cv2.remap(image, map_x, map_y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
@@ -124,7 +124,7 @@ def with_unit_depth(xy: Array) -> Array:
     return np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
 
 
-def _to_reference(points: Array, motion: GyroCamera, camera: Projector, shutter: FrameShutter) -> Array:
+def _move_to_reference(points: Array, motion: GyroCamera, camera: Projector, shutter: FrameShutter) -> Array:
     """(N, 2) where (N, 2) points of the frame are at the reference instant."""
     reference = motion.start_from_cam(np.array(shutter.reference_s()))
     seen = motion.start_from_cam(shutter.middle_s(points))
@@ -132,16 +132,16 @@ def _to_reference(points: Array, motion: GyroCamera, camera: Projector, shutter:
     return np.asarray(camera.img_from_cam(rotated))
 
 
-def _from_reference(motion: GyroCamera, camera: Projector, shutter: FrameShutter, step_px: int) -> Array:
+def _shift_from_reference(motion: GyroCamera, camera: Projector, shutter: FrameShutter, step_px: int) -> Array:
     """(Gy, Gx, 2) what to add to a pixel at the reference instant to get to the frame's, at the nodes of a grid."""
     nodes = step_px * grid_nodes(*BlurField.nodes(shutter.width, shutter.height, step_px))
     target = colmap_px_from_opencv(nodes.reshape(-1, 2))
     directions = rays(camera, target) @ motion.start_from_cam(np.array(shutter.reference_s())).T
-    source = seen_by_lines(directions, target, motion, camera, shutter)
+    source = project_by_lines(directions, target, motion, camera, shutter)
     return np.asarray(source - target).reshape(nodes.shape)
 
 
-def seen_by_lines(
+def project_by_lines(
     directions: Array, start: Array, motion: GyroCamera, camera: Projector, shutter: FrameShutter
 ) -> Array:
     """(N, 2) where a frame has (N, 3) directions that do not move, each when its own line exposes.
@@ -182,7 +182,7 @@ def spread_nodes(nodes: Array, width: int, height: int, step_px: float) -> Float
     return np.asarray(weights(height, rows) @ values @ weights(width, columns).T)
 
 
-def _reshaped(columns: Array, derivative: Array) -> Array:
+def _transform_shapes(columns: Array, derivative: Array) -> Array:
     """(N, 2) scale and orientation or (N, 4) affine shape after a mapping with (N, 2, 2) derivatives."""
     if columns.shape[1] == 4:
         return np.asarray((derivative @ columns.reshape(-1, 2, 2)).reshape(-1, 4))

@@ -126,7 +126,7 @@ class Chosen:
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
+class _FollowedImage:
     """An image that was looked at: its corners by number, in shares of the longer side, and its sharpness."""
 
     place: int
@@ -155,31 +155,33 @@ def choose_frames(
     """
     follower = _Follower()
     compare = _Compare(ranked.start_from_cam, camera, width, height)
-    seen: list[_Seen] = []
+    seen: list[_FollowedImage] = []
     anchored, checked = False, 1  # how many of ``seen`` are settled
     for place, image in enumerate(images):
         seen.append(follower.step(place, image))
         if not anchored:
             if ranked.t_s[place] - ranked.t_s[0] < limits.shortest_s - 1e-6:
                 continue
-            chosen = _best(seen, ranked, "start")
+            chosen = _choose_best(seen, ranked, "start")
             yield chosen
             seen, anchored = [s for s in seen if s.place >= chosen.place], True
         while checked < len(seen):
-            closing = _closing(seen[0], seen[checked], ranked, limits, compare)
+            closing = _find_closing(seen[0], seen[checked], ranked, limits, compare)
             checked += 1
             if closing is not None:
-                chosen = _next(seen[:checked], ranked, limits, compare, closing)
+                chosen = _choose_next(seen[:checked], ranked, limits, compare, closing)
                 yield chosen
                 # what follows the chosen frame belongs to the next window
                 seen, checked = [s for s in seen if s.place >= chosen.place], 1
     if seen and not anchored:
-        yield _best(seen, ranked, "start")
+        yield _choose_best(seen, ranked, "start")
     elif seen and ranked.t_s[seen[-1].place] - ranked.t_s[seen[0].place] >= limits.shortest_s - 1e-6:
-        yield _next(seen, ranked, limits, compare, "end")
+        yield _choose_next(seen, ranked, limits, compare, "end")
 
 
-def _closing(anchor: _Seen, now: _Seen, ranked: Ranked, limits: WindowLimits, compare: _Compare) -> Closing | None:
+def _find_closing(
+    anchor: _FollowedImage, now: _FollowedImage, ranked: Ranked, limits: WindowLimits, compare: _Compare
+) -> Closing | None:
     since_s = float(ranked.t_s[now.place] - ranked.t_s[anchor.place])
     if since_s < limits.shortest_s - 1e-6:
         return None
@@ -196,16 +198,18 @@ def _closing(anchor: _Seen, now: _Seen, ranked: Ranked, limits: WindowLimits, co
     return None
 
 
-def _next(seen: list[_Seen], ranked: Ranked, limits: WindowLimits, compare: _Compare, closing: Closing) -> Chosen:
+def _choose_next(
+    seen: list[_FollowedImage], ranked: Ranked, limits: WindowLimits, compare: _Compare, closing: Closing
+) -> Chosen:
     """The best frame of the second half of a window that begins with a chosen one."""
     begin_s, end_s = ranked.t_s[seen[0].place], ranked.t_s[seen[-1].place]
     from_s = begin_s + max(limits.shortest_s, 0.5 * (end_s - begin_s)) - 1e-6
-    chosen = _best([s for s in seen[1:] if ranked.t_s[s.place] >= from_s], ranked, closing)
+    chosen = _choose_best([s for s in seen[1:] if ranked.t_s[s.place] >= from_s], ranked, closing)
     baseline, motion, _ = compare(seen[0], next(s for s in seen if s.place == chosen.place))
     return replace(chosen, baseline=baseline, motion=motion)
 
 
-def _best(seen: list[_Seen], ranked: Ranked, closing: Closing) -> Chosen:
+def _choose_best(seen: list[_FollowedImage], ranked: Ranked, closing: Closing) -> Chosen:
     places = np.array([s.place for s in seen])
     blur = ranked.blur[places]
     known = bool(np.isfinite(blur).all())
@@ -232,9 +236,9 @@ class _Follower:
         self._before: UInt8Array | None = None
         self._xy = np.zeros((0, 2), np.float32)
         self._ids = np.zeros(0, np.int64)
-        self._next = 0
+        self._next_id = 0
 
-    def step(self, place: int, image: UInt8Array) -> _Seen:
+    def step(self, place: int, image: UInt8Array) -> _FollowedImage:
         import cv2
 
         sharpness = float(np.mean(np.square(cv2.Laplacian(image, cv2.CV_32F))))
@@ -247,7 +251,7 @@ class _Follower:
             self._refill(now)
         self._before = now
         xy = (self._xy.astype(np.float64) + 0.5) / max(now.shape)
-        return _Seen(place, self._ids.copy(), xy, sharpness)
+        return _FollowedImage(place, self._ids.copy(), xy, sharpness)
 
     def _follow(self, before: UInt8Array, now: UInt8Array) -> None:
         xy, tracked = track_points(before, now, self._xy, window_px=15, round_trip_px=_LIMITS.round_trip_px)
@@ -266,9 +270,9 @@ class _Follower:
         if corners is None:
             return
         self._xy = np.concatenate([self._xy, np.asarray(corners, np.float32).reshape(-1, 2)])
-        fresh = self._next + np.arange(len(corners), dtype=np.int64)
+        fresh = self._next_id + np.arange(len(corners), dtype=np.int64)
         self._ids = np.concatenate([self._ids, fresh])
-        self._next += len(corners)
+        self._next_id += len(corners)
 
 
 class _Compare:
@@ -279,7 +283,7 @@ class _Compare:
         self._camera = camera
         self._long_px = float(max(width, height))
 
-    def __call__(self, before: _Seen, now: _Seen) -> tuple[float, float, float]:
+    def __call__(self, before: _FollowedImage, now: _FollowedImage) -> tuple[float, float, float]:
         """Baseline, motion (NaN where an image shows too few corners) and share of corners that stayed."""
         if len(before.ids) < _LIMITS.fewest:
             return np.nan, np.nan, 1.0
@@ -297,12 +301,12 @@ class _Compare:
         first, second = (with_unit_depth(r[known]) for r in rays)
         now_from_before = self._start_from_cam[now.place].T @ self._start_from_cam[before.place]
         if not np.isfinite(now_from_before).all():
-            now_from_before = _fitted_rotation(first, second)
+            now_from_before = _fit_rotation(first, second)
         rotated = np.asarray(self._camera.img_from_cam(first @ now_from_before.T)) / self._long_px
         return float(np.nanmedian(np.linalg.norm(now.xy[j][known] - rotated, axis=1))), motion, overlap
 
 
-def _fitted_rotation(first: Array, second: Array) -> Array:
+def _fit_rotation(first: Array, second: Array) -> Array:
     """(3, 3) the rotation that takes most rays (N, 3) to where they were seen next, by reweighted least squares."""
     a, b = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (first, second))
     rotation = np.eye(3)

@@ -199,7 +199,7 @@ def measure_rotation(
         shutter = FrameShutter.of(timing, index[frame.name], width=width, height=height)
         now = (reduced(frame.image, options), shutter)
         if before is not None:
-            pairs.append(_pair_rotation(before, now, camera, options))
+            pairs.append(_estimate_pair_rotation(before, now, camera, options))
         names.append(frame.name)
         before = now
     return VisualRotation(
@@ -327,7 +327,7 @@ def find_stabilisation(rotation: VisualRotation, imu: ImuRecording, *, offset_s:
     visual = rotation.turn_rad[known] / dt_s[known, None]
     noise = float(np.median(rotation.sigma_rad[known])) / step_s
     width = max(3, round(_LIMITS.quick_s / step_s))
-    quick_inertial, quick_visual = _quick(inertial, width), _quick(visual, width)
+    quick_inertial, quick_visual = _measure_quick_rotation(inertial, width), _measure_quick_rotation(visual, width)
     if quick_inertial < _LIMITS.clear_sigmas * noise or quick_inertial < 0.02:
         return Stabilisation(reason="the camera was held too still to tell whether the video is stabilised")
     share = quick_visual / quick_inertial
@@ -341,7 +341,7 @@ def find_stabilisation(rotation: VisualRotation, imu: ImuRecording, *, offset_s:
     return Stabilisation(share=share, stabilised=stabilised, reason=reason)
 
 
-def _quick(rate: Array, width: int) -> float:
+def _measure_quick_rotation(rate: Array, width: int) -> float:
     """Robust size of what changes faster than the running mean over ``width`` samples."""
     quick = np.linalg.norm(without_running_mean(rate, width), axis=1)
     return float(np.sqrt(np.mean(np.sort(quick**2)[: max(1, int(0.98 * len(quick)))])))
@@ -356,7 +356,7 @@ def reduced(image: UInt8Array | UInt16Array, options: FlowOptions) -> UInt8Array
     return np.asarray(grey if grey.dtype == np.uint8 else grey >> 8, dtype=np.uint8)
 
 
-def _pair_rotation(
+def _estimate_pair_rotation(
     before: tuple[UInt8Array, FrameShutter],
     now: tuple[UInt8Array, FrameShutter],
     camera: Projector,
@@ -365,7 +365,7 @@ def _pair_rotation(
     shutters = before[1], now[1]
     dt_s = shutters[1].reference_s() - shutters[0].reference_s()
     size = np.array([shutters[1].width, shutters[1].height])
-    for points in followed_points(before[0], now[0], shutters[1], options):
+    for points in follow_points(before[0], now[0], shutters[1], options):
         rays = [np.asarray(camera.cam_from_img(p))[:, :2] for p in points]
         ok = np.isfinite(rays[0]).all(axis=1) & np.isfinite(rays[1]).all(axis=1)
         if ok.sum() < options.min_support:
@@ -386,7 +386,7 @@ def _pair_rotation(
     return _UNKNOWN
 
 
-def followed_points(
+def follow_points(
     before: UInt8Array, now: UInt8Array, shutter: FrameShutter, options: FlowOptions
 ) -> Iterator[tuple[Array, Array]]:
     """(N, 2) points that were followed from one reduced picture to the other, px of the picture as it is.
@@ -394,13 +394,13 @@ def followed_points(
     Corners that were tracked come first, then features that were matched; ways that tell too little are left out.
     """
     to_full = np.array([shutter.width, shutter.height]) / now.shape[::-1]
-    for matched in (_tracked, _matched):
+    for matched in (_track_corners, _match_features):
         first, second = ((p.astype(np.float64) + 0.5) * to_full for p in matched(before, now, options))
         if len(first) >= options.min_support:
             yield first, second
 
 
-def _tracked(before: UInt8Array, now: UInt8Array, options: FlowOptions) -> tuple[Float32Array, Float32Array]:
+def _track_corners(before: UInt8Array, now: UInt8Array, options: FlowOptions) -> tuple[Float32Array, Float32Array]:
     """Corners followed by pyramidal Lucas-Kanade, and back again; spread over the picture."""
     import cv2
 
@@ -413,7 +413,7 @@ def _tracked(before: UInt8Array, now: UInt8Array, options: FlowOptions) -> tuple
     return points[good], there[good]
 
 
-def _matched(before: UInt8Array, now: UInt8Array, options: FlowOptions) -> tuple[Float32Array, Float32Array]:
+def _match_features(before: UInt8Array, now: UInt8Array, options: FlowOptions) -> tuple[Float32Array, Float32Array]:
     """Features that are each other's best match: for frames too far apart to be tracked."""
     import cv2
 
@@ -444,7 +444,7 @@ def _fit_rate(first: Array, second: Array, span_s: Array, pixel_rad: float) -> t
         return None
     reach = _LIMITS.inlier_px * pixel_rad
     draws = np.random.default_rng(0).integers(0, len(a), (_LIMITS.draws, 2))
-    rotations = _from_two(a[draws], b[draws])
+    rotations = _solve_two_rays(a[draws], b[draws])
     # of unit vectors: the cosines of all rays after all draws, as one product
     cosines = rotations.reshape(-1, 9) @ (b[:, :, None] * a[:, None, :]).reshape(-1, 9).T
     counts = np.sum(2 - 2 * cosines < reach**2, axis=1)
@@ -476,7 +476,7 @@ def _fit_rate(first: Array, second: Array, span_s: Array, pixel_rad: float) -> t
     return rate, sigma, int(np.sum(square < reach**2))
 
 
-def _from_two(a: Array, b: Array) -> Array:
+def _solve_two_rays(a: Array, b: Array) -> Array:
     """Rotations that take two directions to two others, as well as can be; draws of nearly the same are left out.
 
     Parameters

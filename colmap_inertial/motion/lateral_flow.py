@@ -11,7 +11,7 @@ from colmap_inertial.core.arrays import Array, UInt8Array
 from colmap_inertial.core.types import Frame, FrameTiming, Projector
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.rolling_shutter import rays
-from colmap_inertial.motion.flow import FlowOptions, followed_points, reduced
+from colmap_inertial.motion.flow import FlowOptions, follow_points, reduced
 
 #: Share of the points that are slower: as of a frame's blur, which is the 90th percentile over the picture.
 _PERCENTILE = 90
@@ -78,7 +78,7 @@ def follow_pairs(
         shutter = FrameShutter.of(timing, index[frame.name], width=width, height=height)
         now = reduced(frame.image, options)
         if before is not None and before[0] in firsts and index[frame.name] == index[before[0]] + 1:
-            found = next(followed_points(before[1], now, shutter, options), None)
+            found = next(follow_points(before[1], now, shutter, options), None)
             if found is not None:
                 yield FollowedPair(name=before[0], shutters=(before[2], shutter), points=np.stack(found))
         before = frame.name, now, shutter

@@ -117,9 +117,9 @@ def estimate_readout(rotation: VisualRotation, motion: GyroCamera) -> ReadoutEst
     NotObservableError
         Where too little was seen, the camera turned too evenly, or what was seen is no shutter of lines.
     """
-    seen = _seen(rotation, motion)
+    seen = _collect_corners(rotation, motion)
     _require_change(seen, motion)
-    params, cov = _fitted(seen, motion)
+    params, cov = _fit_readout(seen, motion)
     sigma = np.sqrt(np.diagonal(cov)[:2] + _LIMITS.floor_s**2 + (_LIMITS.floor_share * params[:2]) ** 2)
     along, beside = (0, 1) if abs(params[0]) >= abs(params[1]) else (1, 0)
     readout_s, sigma_s = float(params[along]), float(sigma[along])
@@ -147,7 +147,7 @@ def estimate_readout(rotation: VisualRotation, motion: GyroCamera) -> ReadoutEst
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class _Seen:
+class _Corners:
     """Corners of all pairs, one pair after another.
 
     Attributes
@@ -178,7 +178,7 @@ class _Seen:
         return np.add.reduceat(values, self.begins, axis=0)
 
 
-def _seen(rotation: VisualRotation, motion: GyroCamera) -> _Seen:
+def _collect_corners(rotation: VisualRotation, motion: GyroCamera) -> _Corners:
     slack_s = 0.05
     inside = motion.covers(rotation.t_s[:-1] - slack_s, rotation.t_s[1:] + slack_s)
     used = [i for i, tracks in enumerate(rotation.tracks) if inside[i] and len(tracks.rays)]
@@ -192,7 +192,7 @@ def _seen(rotation: VisualRotation, motion: GyroCamera) -> _Seen:
         )
     pair = np.repeat(np.arange(len(used)), counts)
     ends_s = np.column_stack([rotation.t_s[:-1][used], rotation.t_s[1:][used]])
-    return _Seen(
+    return _Corners(
         begins=np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.intp),
         pair=pair,
         t_s=ends_s[pair],
@@ -202,7 +202,7 @@ def _seen(rotation: VisualRotation, motion: GyroCamera) -> _Seen:
     )
 
 
-def _require_change(seen: _Seen, motion: GyroCamera) -> None:
+def _require_change(seen: _Corners, motion: GyroCamera) -> None:
     """Refuse a camera whose rate hardly changes from frame to frame: noise in the change makes readouts too short."""
     ends = np.array([motion.rate_in_cam_rad_s(seen.t_s[seen.begins, k]) for k in range(2)])
     change = float(np.sqrt(np.mean(np.sum((ends[1] - ends[0]) ** 2, axis=1))))
@@ -215,7 +215,7 @@ def _require_change(seen: _Seen, motion: GyroCamera) -> None:
         )
 
 
-def _fitted(seen: _Seen, motion: GyroCamera) -> tuple[Array, Array]:
+def _fit_readout(seen: _Corners, motion: GyroCamera) -> tuple[Array, Array]:
     """(10,) readout down and across, clock offset, axes, bias and logarithm of the focal length; their covariance."""
     sigmas = np.array(
         [
@@ -231,8 +231,8 @@ def _fitted(seen: _Seen, motion: GyroCamera) -> tuple[Array, Array]:
     params = np.zeros(len(sigmas))
     moved = np.zeros((len(seen.begins), 3))
     for _ in range(_LIMITS.most_rounds):
-        off, by_params, by_moved = _residuals(seen, motion, params, moved)
-        inverse, robust = _weights(off, by_moved, moved, seen)
+        off, by_params, by_moved = _compute_residuals(seen, motion, params, moved)
+        inverse, robust = _weigh_corners(off, by_moved, moved, seen)
         # what a corner's depth is, as far as it shows: the flow of a pair's translation is that much stronger
         flow = np.einsum("nij,nj->ni", by_moved, moved[seen.pair])
         depth = np.clip(
@@ -262,7 +262,7 @@ def _fitted(seen: _Seen, motion: GyroCamera) -> tuple[Array, Array]:
     return params, np.maximum(np.diagonal(cov), np.diagonal(scatter)) * np.eye(len(cov))
 
 
-def _residuals(seen: _Seen, motion: GyroCamera, params: Array, moved: Array) -> tuple[Array, Array, Array]:
+def _compute_residuals(seen: _Corners, motion: GyroCamera, params: Array, moved: Array) -> tuple[Array, Array, Array]:
     """(N, 2) what the second ray is off, its change with the parameters (N, 2, 10) and the translation (N, 2, 3)."""
     lines, offset_s, axes, bias, focal = params[:2], params[2], params[3:6], params[6:9], np.exp(params[9])
     since_s = seen.place @ lines
@@ -289,7 +289,7 @@ def _residuals(seen: _Seen, motion: GyroCamera, params: Array, moved: Array) -> 
         turns[:, :, 6 + k] = span_s * axis
     swept = np.stack([cross(turns[:, :, k], turned) for k in range(9)], axis=2)
     by_focal = np.einsum("nij,nj->ni", now_from_before[:, :, :2], rays[:, 0])
-    shown = _shown(turned, np.concatenate([swept, by_focal[:, :, None]], axis=2))
+    shown = _project_changes(turned, np.concatenate([swept, by_focal[:, :, None]], axis=2))
     # all of it in the picture's own unit: with the focal length it would shrink
     shown[:, :, 9] -= seen_at
     shown /= focal
@@ -297,7 +297,7 @@ def _residuals(seen: _Seen, motion: GyroCamera, params: Array, moved: Array) -> 
     flow[:, 0, 0] = flow[:, 1, 1] = 1 / focal
     flow[:, :, 2] = -seen_at / focal
     # lines that are read later saw a translation that had changed
-    changed = _change(seen, moved)[seen.pair]
+    changed = _differentiate_translation(seen, moved)[seen.pair]
     by_line = np.einsum("nij,nj->ni", flow, changed)
     shown[:, :, :2] += by_line[:, :, None] * seen.place[:, None, 1]
     translation = moved[seen.pair] + since_s[:, 1, None] * changed
@@ -305,7 +305,7 @@ def _residuals(seen: _Seen, motion: GyroCamera, params: Array, moved: Array) -> 
     return off, shown, flow
 
 
-def _change(seen: _Seen, moved: Array) -> Array:
+def _differentiate_translation(seen: _Corners, moved: Array) -> Array:
     """(K, 3) by how much a pair's translation grows a second later."""
     speed = moved / seen.dt_s[:, None]
     at = 0.5 * (speed[1:] + speed[:-1])
@@ -313,12 +313,12 @@ def _change(seen: _Seen, moved: Array) -> Array:
     return np.diff(ends, axis=0)
 
 
-def _shown(point: Array, change: Array) -> Array:
+def _project_changes(point: Array, change: Array) -> Array:
     """(N, 2, P) how changes (N, 3, P) of points show in the picture at z = 1."""
     return np.asarray((change[:, :2] - (point[:, :2] / point[:, 2:])[:, :, None] * change[:, 2:]) / point[:, 2:, None])
 
 
-def _weights(off: Array, flow_of: Array, moved: Array, seen: _Seen) -> tuple[Array, Array]:
+def _weigh_corners(off: Array, flow_of: Array, moved: Array, seen: _Corners) -> tuple[Array, Array]:
     """(N, 2, 2) inverse covariances, with unknown depths; (N,) how far each corner is believed."""
     flow = np.einsum("nij,nj->ni", flow_of, moved[seen.pair])
     length = np.linalg.norm(flow, axis=1)

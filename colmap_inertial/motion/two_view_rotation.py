@@ -44,7 +44,7 @@ _LIMITS = TwoViewLimits()
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
+class _Features:
     """The features of one picture: pixels, rays (z = 1), descriptors."""
 
     rays: Array
@@ -75,16 +75,16 @@ def measure_two_view_rotations(
     options = options or FlowOptions()
     index = {name: i for i, name in enumerate(timing.names)}
     names: list[str] = []
-    seen: list[_Seen] = []
+    seen: list[_Features] = []
     next_one: list[tuple[Array, int] | None] = []
     after_next: list[tuple[Array, int] | None] = []
     for frame in frames:
-        seen.append(_features(frame, camera, options))
+        seen.append(_detect_features(frame, camera, options))
         names.append(frame.name)
         if len(seen) > 1:
-            next_one.append(_rotation(seen[-2], seen[-1]))
+            next_one.append(_estimate_rotation(seen[-2], seen[-1]))
         if len(seen) > 2:
-            after_next.append(_rotation(seen[-3], seen[-1]))
+            after_next.append(_estimate_rotation(seen[-3], seen[-1]))
             del seen[0]
     turns = np.full((max(len(names) - 1, 0), 3), np.nan)
     off = np.full(len(turns), np.inf)
@@ -107,7 +107,7 @@ def measure_two_view_rotations(
     )
 
 
-def _features(frame: Frame, camera: Projector, options: FlowOptions) -> _Seen:
+def _detect_features(frame: Frame, camera: Projector, options: FlowOptions) -> _Features:
     import cv2
 
     grey = reduced(frame.image, options)
@@ -118,14 +118,14 @@ def _features(frame: Frame, camera: Projector, options: FlowOptions) -> _Seen:
     rays = np.asarray(camera.cam_from_img(np.concatenate([xy_px, centre, centre + to_full])))[:, :2]
     ok = np.isfinite(rays[:-2]).all(axis=1)
     known = np.zeros((0, 128), np.float32) if descriptors is None else descriptors
-    return _Seen(
+    return _Features(
         rays=rays[:-2][ok],
         descriptors=known[ok],
         pixel_rad=float(np.linalg.norm(rays[-1] - rays[-2])) / 2**0.5,
     )
 
 
-def _rotation(first: _Seen, second: _Seen) -> tuple[Array, int] | None:
+def _estimate_rotation(first: _Features, second: _Features) -> tuple[Array, int] | None:
     """(3, 3) ``first_from_second`` and the matches that agree; ``None`` where too few do."""
     import cv2
 
@@ -146,7 +146,7 @@ def _rotation(first: _Seen, second: _Seen) -> tuple[Array, int] | None:
     if kept.sum() < _LIMITS.least_matches:
         return None
     a, b = a[kept], b[kept]
-    turned, share = _turn_alone(a, b, _LIMITS.turned_px * first.pixel_rad)
+    turned, share = _fit_pure_rotation(a, b, _LIMITS.turned_px * first.pixel_rad)
     if share > _LIMITS.turned_share:
         return turned, int(share * len(a))
     count, second_from_first, _, _ = cv2.recoverPose(essential, a, b, np.eye(3))
@@ -155,7 +155,7 @@ def _rotation(first: _Seen, second: _Seen) -> tuple[Array, int] | None:
     return np.asarray(second_from_first, dtype=np.float64).T, int(count)
 
 
-def _turn_alone(a: Array, b: Array, reach: float) -> tuple[Array, float]:
+def _fit_pure_rotation(a: Array, b: Array, reach: float) -> tuple[Array, float]:
     """The rotation ``a_from_b`` that turns most rays into each other, and the share that it explains."""
     a, b = (with_unit_depth(rays) for rays in (a, b))
     a, b = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (a, b))

@@ -134,7 +134,7 @@ def register(
         gyro = np.where(np.isfinite(start_px), start_px, 0.0)
         # the gyroscope is believed unless the images clearly say otherwise
         found = replace(none, shift_px=gyro, by_gyro=True, agreement=judge.agreement(gyro))
-        better = found if judge.flat() else _refined(found, np.eye(3), levels)
+        better = found if judge.flat() else _refine(found, np.eye(3), levels)
         if better.agreement >= found.agreement + _LIMITS.worth_from_gyro:
             found = better
     if judge.flat():
@@ -145,10 +145,10 @@ def register(
     for turns_deg in (USUAL_TURNS_DEG, OTHER_TURNS_DEG):
         if least >= _LIMITS.never_better or (alike and turns_deg is OTHER_TURNS_DEG):
             break
-        guesses = _guesses(none, levels, turns_deg)
-        refined = [none, *(_refined(none, guess, levels) for guess in guesses)]
+        guesses = _guess_mappings(none, levels, turns_deg)
+        refined = [none, *(_refine(none, guess, levels) for guess in guesses)]
         # repeated detail agrees in many places; what is coarser tells them apart
-        best = max(refined, key=lambda one: judge.score(one) + _coarse_score(levels[0], one))
+        best = max(refined, key=lambda one: judge.score(one) + _score_coarsely(levels[0], one))
         if (score := judge.score(best)) > least:
             found, least = best, score
             alike = judge.alike(found.shift_px)
@@ -197,7 +197,7 @@ class _Level:
     def agreement(self, shift_px: Array) -> float:
         """Correlation of the details where the long image's tells."""
         moved, tells = self.moved(shift_px)
-        return _correlation(self.short, moved, tells)
+        return _correlate(self.short, moved, tells)
 
     def score(self, found: Registered) -> float:
         """The agreement times the root of what tells in common: of little, chance agrees more."""
@@ -210,13 +210,13 @@ class _Level:
 
     def alike(self, shift_px: Array) -> bool:
         """Whether the details agree all over, and not by chance: in most parts of the image, each for itself."""
-        found = self._of_parts(shift_px)
+        found = self._correlate_parts(shift_px)
         if len(found) < _LIMITS.least_parts:
             return self.agreement(shift_px) >= _LIMITS.alike_as_a_whole
         mean, spread = float(found.mean()), float(found.std()) / np.sqrt(len(found))
         return bool(mean >= _LIMITS.alike and mean >= _LIMITS.alike_sigmas * spread)
 
-    def _of_parts(self, shift_px: Array) -> Array:
+    def _correlate_parts(self, shift_px: Array) -> Array:
         """Correlations in squares where enough tells."""
         moved, tells = self.moved(shift_px)
         height, width = self.short.shape
@@ -226,11 +226,11 @@ class _Level:
             for left in range(0, width - side + 1, side):
                 part = (slice(top, top + side), slice(left, left + side))
                 if tells[part].mean() >= _LIMITS.telling_part:
-                    found.append(_correlation(self.short[part], moved[part], tells[part]))
+                    found.append(_correlate(self.short[part], moved[part], tells[part]))
         return np.array(found)
 
 
-def _correlation(a: Float32Array, b: Float32Array, weights: Float32Array) -> float:
+def _correlate(a: Float32Array, b: Float32Array, weights: Float32Array) -> float:
     """Weighted; 0 where nothing varies."""
     total = float(weights.sum())
     if total <= 0:
@@ -240,7 +240,7 @@ def _correlation(a: Float32Array, b: Float32Array, weights: Float32Array) -> flo
     return float((weights * x * y).sum(dtype=np.float64)) / norm if norm > 0 else 0.0
 
 
-def _guesses(start: Registered, levels: list[_Level], turns_deg: Sequence[float]) -> list[Array]:
+def _guess_mappings(start: Registered, levels: list[_Level], turns_deg: Sequence[float]) -> list[Array]:
     """(3, 3) mappings, px of the full images, from the short one to where the long one may lie: the best few."""
     coarse, finer = levels[0], levels[min(1, len(levels) - 1)]
     scale = _centred_scale(coarse.scale)
@@ -256,21 +256,21 @@ def _guesses(start: Registered, levels: list[_Level], turns_deg: Sequence[float]
     for guess in (np.eye(3), *(np.linalg.inv(scale) @ place.mapping @ scale for place in found)):
         mapping: Array | None = guess
         for level in (coarse, finer):
-            mapping = None if mapping is None else _maximised(level, start, mapping, _SHIFT)
+            mapping = None if mapping is None else _maximise_correlation(level, start, mapping, _SHIFT)
         for one in (guess, mapping):
-            shift = None if one is None else _shift_of(one, start, finer.step_px)
+            shift = None if one is None else _apply_mapping(one, start, finer.step_px)
             if one is not None and shift is not None:
                 moved = replace(start, shift_px=shift, agreement=finer.agreement(shift))
-                ranked.append((finer.score(moved) + _coarse_score(coarse, moved), one))
+                ranked.append((finer.score(moved) + _score_coarsely(coarse, moved), one))
     ranked.sort(key=lambda pair: -pair[0])
     return [one for _, one in ranked[: _LIMITS.closer_looks]]
 
 
-def _coarse_score(coarse: _Level, found: Registered) -> float:
+def _score_coarsely(coarse: _Level, found: Registered) -> float:
     return coarse.score(replace(found, agreement=coarse.agreement(found.shift_px)))
 
 
-def _shift_of(mapping: Array, start: Registered, step_px: int) -> Array | None:
+def _apply_mapping(mapping: Array, start: Registered, step_px: int) -> Array | None:
     """(Gy, Gx, 2) the start's shift after a mapping; ``None`` where that leads too far."""
     rows, columns = start.shift_px.shape[:2]
     nodes = step_px * grid_nodes(rows, columns)
@@ -291,11 +291,11 @@ def _shift_of(mapping: Array, start: Registered, step_px: int) -> Array | None:
     return np.asarray(step + between_nodes(start.shift_px, target / step_px))
 
 
-def _refined(start: Registered, guess: Array, levels: list[_Level]) -> Registered:
+def _refine(start: Registered, guess: Array, levels: list[_Level]) -> Registered:
     """The best of ever more general mappings, from coarse to fine; the start, where none is better."""
     best = start
-    for mapping in _mappings(start, guess, levels):
-        shift = _shift_of(mapping, start, levels[-1].step_px)
+    for mapping in _generalise_mapping(start, guess, levels):
+        shift = _apply_mapping(mapping, start, levels[-1].step_px)
         if shift is None:
             continue
         agreement = levels[-1].agreement(shift)
@@ -305,7 +305,7 @@ def _refined(start: Registered, guess: Array, levels: list[_Level]) -> Registere
     return best
 
 
-def _mappings(start: Registered, guess: Array, levels: list[_Level]) -> Iterator[Array]:
+def _generalise_mapping(start: Registered, guess: Array, levels: list[_Level]) -> Iterator[Array]:
     """(3, 3) from pixels of the short image to those of the shifted long one: shift, turn, homography."""
     import cv2
 
@@ -314,7 +314,7 @@ def _mappings(start: Registered, guess: Array, levels: list[_Level]) -> Iterator
     steps = [(level, _SHIFT) for level in levels]
     steps += [(levels[-1], kind) for kind in (cv2.MOTION_EUCLIDEAN, cv2.MOTION_HOMOGRAPHY)]
     for level, kind in steps:
-        found = _maximised(level, start, mapping, kind)
+        found = _maximise_correlation(level, start, mapping, kind)
         if found is None:
             break
         mapping = found
@@ -322,7 +322,7 @@ def _mappings(start: Registered, guess: Array, levels: list[_Level]) -> Iterator
             yield mapping
 
 
-def _maximised(level: _Level, start: Registered, mapping: Array, kind: int) -> Array | None:
+def _maximise_correlation(level: _Level, start: Registered, mapping: Array, kind: int) -> Array | None:
     """ECC from a mapping, both in px of the full image; ``None`` where it does not converge."""
     import cv2
 

@@ -86,7 +86,7 @@ def places(
             cv2.warpAffine(image, turn[:2], (width, height), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
             for image in (second, np.asarray(second_tells, dtype=np.float32))
         )
-        scores, shifts = _all_shifts(first, first_tells, np.asarray(turned), np.asarray(tells))
+        scores, shifts = _correlate_shifts(first, first_tells, np.asarray(turned), np.asarray(tells))
         length = np.hypot(shifts[0][:, None], shifts[1]) / max(height, width)
         # of a pattern's repetitions, the nearest
         scores = np.where(length <= farthest, scores - _LIMITS.nearer * length, -1.0)
@@ -108,7 +108,7 @@ def places(
     return chosen
 
 
-def _all_shifts(
+def _correlate_shifts(
     first: Float32Array, first_tells: Float32Array, second: Float32Array, second_tells: Float32Array
 ) -> tuple[Array, tuple[Array, Array]]:
     """Scores at all shifts (what to add to a pixel of the first), and the shifts of their rows and columns."""

@@ -82,24 +82,24 @@ def better_alone(short: AnyArray, long: AnyArray, brightness: Brightness | None)
         max((long <= top // 256).mean(), (long >= np.ceil(BRIGHTNESS_LIMITS.clipped * top)).mean()),
     ]
     shown = [share <= _LIMITS.most_lost for share in lost]
-    noise, blurred = _errors(to_mean(bright), to_mean(as_it_is))
+    noise, blurred = _estimate_errors(to_mean(bright), to_mean(as_it_is))
     take_long = blurred < noise if shown[0] and shown[1] else not shown[0]
     if take_long:
         return Alone(used="long", image=as_it_is, gain=1.0)
     return Alone(used="short", image=bright, gain=brightness.gain)
 
 
-def _errors(short: Float32Array, long: Float32Array) -> tuple[float, float]:
+def _estimate_errors(short: Float32Array, long: Float32Array) -> tuple[float, float]:
     """Mean squares: noise of the short one, and what blur makes of detail in the long one."""
-    noise = _noise_variance(short)
+    noise = _estimate_noise_variance(short)
     blurred = 0.0
-    for (a, share), (b, _) in zip(_bands(short), _bands(long), strict=True):
+    for (a, share), (b, _) in zip(_split_bands(short), _split_bands(long), strict=True):
         detail = max(a - noise * share, 0.0)
         blurred += _LIMITS.missing * max(detail - b, 0.0) + _LIMITS.displaced * detail
     return noise, blurred
 
 
-def _bands(image: Float32Array) -> list[tuple[float, float]]:
+def _split_bands(image: Float32Array) -> list[tuple[float, float]]:
     """Variance of each band of detail, and the share of white noise's that the band lets through."""
     import cv2
 
@@ -114,7 +114,7 @@ def _bands(image: Float32Array) -> list[tuple[float, float]]:
     return found
 
 
-def _noise_variance(image: Float32Array) -> float:
+def _estimate_noise_variance(image: Float32Array) -> float:
     """Of white noise: by a second difference that planes and straight edges do not pass, in most squares (J.
     Immerkaer, Fast noise variance estimation, 1996)."""
     import cv2

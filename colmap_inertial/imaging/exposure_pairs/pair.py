@@ -21,7 +21,7 @@ from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.exposure_pairs._registration import Registered, register
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
 from colmap_inertial.imaging.psf import blur_field
-from colmap_inertial.imaging.rolling_shutter import grid_nodes, rays, sampling_maps, seen_by_lines
+from colmap_inertial.imaging.rolling_shutter import grid_nodes, project_by_lines, rays, sampling_maps
 from colmap_inertial.imaging.transfer import decode_table, srgb_from_linear
 
 
@@ -114,9 +114,9 @@ def match_brightness(short: AnyArray, long: AnyArray, *, stated: float | None = 
         raise ValueError(f"the short exposure has shape {short.shape}, the long one {long.shape}")
     if stated is not None and not stated > 0:
         raise ValueError(f"stated must be above 0, not {stated}")
-    gains, middle = _channel_gains(short, long, _aligned_gain)
+    gains, middle = _measure_channel_gains(short, long, _measure_aligned_gain)
     measured = None if middle is None else float(np.exp(middle))
-    gain = _believed_gain(stated, measured, BRIGHTNESS_LIMITS.agree_factor)
+    gain = _choose_gain(stated, measured, BRIGHTNESS_LIMITS.agree_factor)
     if gain is None:
         raise NotObservableError(
             "the gain between short and long exposure",
@@ -126,7 +126,7 @@ def match_brightness(short: AnyArray, long: AnyArray, *, stated: float | None = 
     limit = np.log(BRIGHTNESS_LIMITS.most_colour)
     colours = [0.0 if g is None or middle is None else np.clip(np.log(g) - middle, -limit, limit) for g in gains]
     return Brightness(
-        gain=_clipped_gain(gain), colours=tuple(float(np.exp(c)) for c in colours), measured=measured, stated=stated
+        gain=_clip_gain(gain), colours=tuple(float(np.exp(c)) for c in colours), measured=measured, stated=stated
     )
 
 
@@ -137,12 +137,12 @@ def first_brightness(short: AnyArray, long: AnyArray, *, stated: float | None = 
     is taken where that agrees to a factor of two or tells nothing. Parameters and errors are those of
     :func:`match_brightness`, which is exact where the images are aligned.
     """
-    gains, middle = _channel_gains(short, long, _ranked_gain)
+    gains, middle = _measure_channel_gains(short, long, _measure_ranked_gain)
     measured = None if middle is None else float(np.exp(middle))
-    gain = _believed_gain(stated, measured, BRIGHTNESS_LIMITS.agree_unaligned_factor)
+    gain = _choose_gain(stated, measured, BRIGHTNESS_LIMITS.agree_unaligned_factor)
     if gain is None:
         return match_brightness(short, long, stated=stated)
-    return Brightness(gain=_clipped_gain(gain), colours=(1.0,) * len(gains), measured=measured, stated=stated)
+    return Brightness(gain=_clip_gain(gain), colours=(1.0,) * len(gains), measured=measured, stated=stated)
 
 
 def brightened(short: AnyArray, brightness: Brightness) -> Float32Array:
@@ -194,7 +194,7 @@ def gyro_shift(
     nodes = step_px * grid_nodes(*BlurField.nodes(short.width, short.height, step_px))
     source = colmap_px_from_opencv(nodes.reshape(-1, 2))
     directions = np.einsum("nij,nj->ni", motion.start_from_cam(short.middle_s(source)), rays(camera, source))
-    target = seen_by_lines(directions, source, motion, camera, long)
+    target = project_by_lines(directions, source, motion, camera, long)
     return np.asarray(target - source).reshape(nodes.shape)
 
 
@@ -326,9 +326,9 @@ def bring_together(
     # exactly, of what they have in common, if that is enough
     if registered.alike:
         with contextlib.suppress(NotObservableError):
-            brightness = match_brightness(short, np.where(_like(covered, seen), seen, 0), stated=stated_gain)
+            brightness = match_brightness(short, np.where(_match_channels(covered, seen), seen, 0), stated=stated_gain)
     matched = brightened(short, brightness)
-    aligned = np.where(_like(covered, seen), seen.astype(np.float32) / np.float32(top), matched)
+    aligned = np.where(_match_channels(covered, seen), seen.astype(np.float32) / np.float32(top), matched)
     return ExposurePair(
         short=matched,
         long=aligned,
@@ -341,14 +341,14 @@ def bring_together(
     )
 
 
-def _believed_gain(stated: float | None, measured: float | None, factor: float) -> float | None:
+def _choose_gain(stated: float | None, measured: float | None, factor: float) -> float | None:
     """What is stated, where the pixels agree with it to a factor or tell nothing; what they tell otherwise."""
     if stated is not None and (measured is None or abs(np.log(measured / stated)) <= np.log(factor)):
         return stated
     return measured
 
 
-def _clipped_gain(gain: float) -> float:
+def _clip_gain(gain: float) -> float:
     return float(np.clip(gain, 1 / BRIGHTNESS_LIMITS.most_gain, BRIGHTNESS_LIMITS.most_gain))
 
 
@@ -356,18 +356,21 @@ def _clipped_gain(gain: float) -> float:
 _Squares = tuple[Array, Array, Array]
 
 
-def _channel_gains(
+def _measure_channel_gains(
     short: AnyArray, long: AnyArray, gain_of: Callable[[_Squares, _Squares], float | None]
 ) -> tuple[list[float | None], float | None]:
     """The gain of each channel, ``None`` where too few squares tell, and the logarithm of their median."""
     cell = max(BRIGHTNESS_LIMITS.least_cell_px, max(short.shape[:2]) // BRIGHTNESS_LIMITS.cells_along)
     dark, bright = (image.reshape(*image.shape[:2], -1) for image in (short, long))
-    gains = [gain_of(_squares(dark[..., c], cell), _squares(bright[..., c], cell)) for c in range(dark.shape[2])]
+    gains = [
+        gain_of(_measure_squares(dark[..., c], cell), _measure_squares(bright[..., c], cell))
+        for c in range(dark.shape[2])
+    ]
     telling = [np.log(gain) for gain in gains if gain is not None]
     return gains, float(np.median(telling)) if telling else None
 
 
-def _aligned_gain(short: _Squares, long: _Squares) -> float | None:
+def _measure_aligned_gain(short: _Squares, long: _Squares) -> float | None:
     """Weighted median over squares of one channel that neither clip nor sink into black."""
     (dark, *of_short), (bright, *of_long) = short, long
     clipped, black = zip(of_short, of_long, strict=True)
@@ -376,10 +379,10 @@ def _aligned_gain(short: _Squares, long: _Squares) -> float | None:
     ranked = np.sort(blackness[good])[: 2 * BRIGHTNESS_LIMITS.least_cells]
     blackest = min(ranked[-1], BRIGHTNESS_LIMITS.blackest) if len(ranked) else 0.0
     good &= blackness <= max(BRIGHTNESS_LIMITS.most_black, blackest)
-    return _median_gain(dark[good], bright[good])
+    return _weigh_median_gain(dark[good], bright[good])
 
 
-def _ranked_gain(short: _Squares, long: _Squares) -> float | None:
+def _measure_ranked_gain(short: _Squares, long: _Squares) -> float | None:
     """Likewise of squares of the same rank in brightness, between those that are black and those that clip."""
     (dark, *of_short), (bright, *of_long) = short, long
     clipped, black = (
@@ -389,10 +392,10 @@ def _ranked_gain(short: _Squares, long: _Squares) -> float | None:
     inner = slice(int(np.ceil(black * dark.size)), int((1 - clipped) * dark.size))
     a, b = np.sort(dark.ravel())[inner], np.sort(bright.ravel())[inner]
     good = (a > 0) & (b > 0)
-    return _median_gain(a[good], b[good])
+    return _weigh_median_gain(a[good], b[good])
 
 
-def _median_gain(dark: Array, bright: Array) -> float | None:
+def _weigh_median_gain(dark: Array, bright: Array) -> float | None:
     """The median ratio, weighted by the light of both: that of one alone would prefer squares in which a shift between
     the images makes it the brighter; ``None`` of too few squares."""
     if len(dark) < BRIGHTNESS_LIMITS.least_cells:
@@ -403,7 +406,7 @@ def _median_gain(dark: Array, bright: Array) -> float | None:
     return float(np.exp(ratios[order][np.searchsorted(below, 0.5 * below[-1])]))
 
 
-def _squares(image: AnyArray, cell: int) -> _Squares:
+def _measure_squares(image: AnyArray, cell: int) -> _Squares:
     import cv2
 
     height, width = image.shape
@@ -426,5 +429,5 @@ def to_mean(image: Float32Array) -> Float32Array:
     return image if image.ndim == 2 else np.asarray(image.mean(axis=2), dtype=np.float32)
 
 
-def _like(mask: BoolArray, image: AnyArray) -> BoolArray:
+def _match_channels(mask: BoolArray, image: AnyArray) -> BoolArray:
     return mask if image.ndim == 2 else mask[..., None]

@@ -57,12 +57,12 @@ def fill_hidden(values: Float32Array, seen: BoolArray, guide: Float32Array, disp
     if not seen.any():
         result[rows, columns] = guide[rows, columns]
         return result
-    slope, offset = _line(values[seen], guide[seen])
+    slope, offset = _fit_line(values[seen], guide[seen])
     for spacing in _LIMITS.spacings_px:
         kept_rows, kept_columns = [], []
         for start in range(0, len(rows), _LIMITS.chunk):
             y, x = rows[start : start + _LIMITS.chunk], columns[start : start + _LIMITS.chunk]
-            found, weight = _from_neighbours(values, seen, guide, disparity_px, y, x, spacing)
+            found, weight = _fit_neighbours(values, seen, guide, disparity_px, y, x, spacing)
             enough = weight > _LIMITS.enough_weight
             result[y[enough], x[enough]] = found[enough]
             kept_rows.append(y[~enough])
@@ -74,7 +74,7 @@ def fill_hidden(values: Float32Array, seen: BoolArray, guide: Float32Array, disp
     return result
 
 
-def _from_neighbours(
+def _fit_neighbours(
     values: Float32Array,
     seen: BoolArray,
     guide: Float32Array,
@@ -106,7 +106,7 @@ def _from_neighbours(
     return np.clip(found, 0, 1).astype(np.float32), total.astype(np.float32)
 
 
-def _line(values: Float32Array, guide: Float32Array) -> tuple[float, float]:
+def _fit_line(values: Float32Array, guide: Float32Array) -> tuple[float, float]:
     """Slope and offset of values over the guide, for what has no neighbours."""
     mean_guide, mean_value = float(guide.mean()), float(values.mean())
     slope = float(np.mean((guide - mean_guide) * (values - mean_value))) / (float(guide.var()) + _LIMITS.flat_variance)

@@ -112,7 +112,7 @@ class Rectified:
             image_from_canvas=(),
             canvas_from_reference=None,
             covered=tuple(
-                _shrunk_range(a, b, by, self.width // by) + _shrunk_range(c, d, by, self.height // by)
+                _shrink_range(a, b, by, self.width // by) + _shrink_range(c, d, by, self.height // by)
                 for a, b, c, d in self.covered
             ),
         )
@@ -181,14 +181,16 @@ def rectify(rig: ApertureRig, projectors: Sequence[Projector]) -> Rectified:
     baselines = to_others[1:] @ rect_from_ref.T
 
     camera = reference.camera
-    focal = _focal_px(projectors[0], camera.width, camera.height)
-    width, height, centre = _canvas_extent(camera, projectors[0], rect_from_ref, focal)
+    focal = _measure_focal_px(projectors[0], camera.width, camera.height)
+    width, height, centre = _find_canvas_extent(camera, projectors[0], rect_from_ref, focal)
     pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
     directions = np.concatenate([(pixels - centre) / focal, np.ones((height, width, 1))], axis=-1)
     maps: list[Float32Array | None] = []
     covered = []
     for aperture, projector, rotation in zip(apertures, projectors, rotations, strict=True):
-        at = _in_image(projector, directions.reshape(-1, 3) @ (rotation @ rect_from_rig.T).T).reshape(pixels.shape)
+        at = _project_directions(projector, directions.reshape(-1, 3) @ (rotation @ rect_from_rig.T).T).reshape(
+            pixels.shape
+        )
         w, h = aperture.camera.width, aperture.camera.height
         inside = (at >= -0.5 - 1e-6).all(axis=-1) & (at[..., 0] <= w - 0.5 + 1e-6) & (at[..., 1] <= h - 0.5 + 1e-6)
         columns, rows = np.flatnonzero(inside.any(axis=0)), np.flatnonzero(inside.any(axis=1))
@@ -199,7 +201,7 @@ def rectify(rig: ApertureRig, projectors: Sequence[Projector]) -> Rectified:
         maps.append(None if still else np.where(np.isfinite(at), at, -1e4).astype(np.float32))
     back = factor = None
     if maps[0] is not None:
-        back, factor = _from_reference(camera, projectors[0], rect_from_ref, focal, centre)
+        back, factor = _map_reference(camera, projectors[0], rect_from_ref, focal, centre)
     return Rectified(
         width=width,
         height=height,
@@ -215,16 +217,16 @@ def rectify(rig: ApertureRig, projectors: Sequence[Projector]) -> Rectified:
     )
 
 
-def _canvas_extent(
+def _find_canvas_extent(
     camera: CameraModel, projector: Projector, rect_from_ref: Array, focal_px: float
 ) -> tuple[int, int, Array]:
     """Width, height and principal point of the canvas: its pixels are the reference's where nothing is distorted or
     rotated."""
-    border = _rays(projector, _border(camera.width, camera.height)) @ rect_from_ref.T
+    border = _cast_rays(projector, _border_pixels(camera.width, camera.height)) @ rect_from_ref.T
     sides = np.array([camera.width, camera.height])
     seen = np.where(border[:, 2:] > 0.05, border[:, :2] / np.maximum(border[:, 2:], 0.05), np.nan) * focal_px
     low, high = np.nanmin(seen, axis=0), np.nanmax(seen, axis=0)
-    middle = focal_px * (_rays(projector, opencv_px_from_colmap(sides / 2.0)[None]) @ rect_from_ref.T)[0, :2]
+    middle = focal_px * (_cast_rays(projector, opencv_px_from_colmap(sides / 2.0)[None]) @ rect_from_ref.T)[0, :2]
     low, high = np.maximum(low, middle - _LARGEST / 2 * sides), np.minimum(high, middle + _LARGEST / 2 * sides)
     axis = opencv_px_from_colmap(np.asarray(projector.img_from_cam(np.array([[0.0, 0.0, 1.0]])))[0])
     start = np.floor(low + axis + 1e-3)
@@ -232,17 +234,17 @@ def _canvas_extent(
     return width, height, axis - start
 
 
-def _in_image(projector: Projector, in_cam: Array) -> Array:
+def _project_directions(projector: Projector, in_cam: Array) -> Array:
     """(N, 2) pixels, centres whole numbers, of (N, 3) directions; nan of those behind the camera."""
     return opencv_px_from_colmap(np.where(in_cam[:, 2:] > 0, np.asarray(projector.img_from_cam(in_cam)), np.nan))
 
 
-def _from_reference(
+def _map_reference(
     camera: CameraModel, projector: Projector, rect_from_ref: Array, focal_px: float, centre: Array
 ) -> tuple[Float32Array, Float32Array]:
     """Where the reference's pixels lie on the canvas, and their depth there as a factor of that on the canvas."""
     pixels = np.stack(np.meshgrid(np.arange(camera.width, dtype=float), np.arange(camera.height, dtype=float)), axis=-1)
-    seen = _rays(projector, pixels.reshape(-1, 2)) @ rect_from_ref.T
+    seen = _cast_rays(projector, pixels.reshape(-1, 2)) @ rect_from_ref.T
     with np.errstate(divide="ignore", invalid="ignore"):
         ahead = np.where(seen[:, 2:] > 0.05, seen[:, 2:], np.nan)
         at = focal_px * seen[:, :2] / ahead + centre
@@ -250,25 +252,25 @@ def _from_reference(
     return np.nan_to_num(at, nan=-1e4).reshape(pixels.shape).astype(np.float32), factor
 
 
-def _shrunk_range(first: int, last: int, by: int, size: int) -> tuple[int, int]:
+def _shrink_range(first: int, last: int, by: int, size: int) -> tuple[int, int]:
     """The pixels, ``by`` times larger, that lie whole within a range; at least one."""
     start = min(-(-first // by), size - 1)
     return start, max(start, min((last + 1) // by, size) - 1)
 
 
-def _rays(projector: Projector, xy_px: Array) -> Array:
+def _cast_rays(projector: Projector, xy_px: Array) -> Array:
     """(N, 3) directions of pixels whose centres are whole numbers."""
     return rays(projector, colmap_px_from_opencv(xy_px))
 
 
-def _border(width: int, height: int) -> Array:
+def _border_pixels(width: int, height: int) -> Array:
     """(N, 2) centres of the pixels all around."""
     x, y = np.linspace(0, width - 1, 33), np.linspace(0, height - 1, 33)
     sides = [(x, 0 * x), (x, 0 * x + height - 1), (0 * y, y), (0 * y + width - 1, y)]
     return np.concatenate([np.column_stack(side) for side in sides])
 
 
-def _focal_px(projector: Projector, width: int, height: int) -> float:
+def _measure_focal_px(projector: Projector, width: int, height: int) -> float:
     """Pixels a radian, at the middle of the image."""
     middle = np.array([[width / 2, height / 2]])
     rays = [np.asarray(projector.cam_from_img(middle + step))[0, :2] for step in ((0, 0), (1, 0), (0, 1))]

@@ -6,7 +6,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, Float32Array, UInt8Array
 from colmap_inertial.imaging.multi_aperture._geometry import Rectified
-from colmap_inertial.imaging.multi_aperture._sampling import seen_by
+from colmap_inertial.imaging.multi_aperture._sampling import warp_view
 
 #: Standard deviation of the Gaussian that stands for the unknown noise of codes (Parzen estimate, 7 x 7 codes).
 _SPREAD_CODES = 1.0
@@ -30,21 +30,21 @@ def cost_tables(
     """
     tables = []
     for k, view in enumerate(others, start=1):
-        warped, inside = seen_by(view, canvas, k, disparity_px)
+        warped, inside = warp_view(view, canvas, k, disparity_px)
         codes = np.clip(np.rint(warped[inside]), 0, 255).astype(np.intp)
         joint = np.bincount(256 * reference[inside].astype(np.intp) + codes, minlength=65536).reshape(256, 256)
-        tables.append(_table(joint / max(1, joint.sum()), most))
+        tables.append(_make_table(joint / max(1, joint.sum()), most))
     return np.stack(tables)
 
 
-def _table(joint: Array, most: int) -> UInt8Array:
+def _make_table(joint: Array, most: int) -> UInt8Array:
     def information(probability: Array) -> Array:
         """``-log(P * g) * g``: per correspondence, but for the constant 1/n."""
-        smooth = _smoothed(probability)
-        return _smoothed(-np.log(np.maximum(smooth, 1e-9)))
+        smooth = _smooth(probability)
+        return _smooth(-np.log(np.maximum(smooth, 1e-9)))
 
     mutual = information(joint.sum(axis=1))[:, None] + information(joint.sum(axis=0)) - information(joint)
-    used = _smoothed(joint) > 1e-7
+    used = _smooth(joint) > 1e-7
     low, high = np.percentile(mutual[used], (2, 98)) if used.any() else (0.0, 0.0)
     if high <= low:
         return np.zeros((256, 256), dtype=np.uint8)
@@ -52,7 +52,7 @@ def _table(joint: Array, most: int) -> UInt8Array:
     return np.asarray(np.clip(np.rint(scaled), 0, most), dtype=np.uint8)
 
 
-def _smoothed(values: Array) -> Array:
+def _smooth(values: Array) -> Array:
     """Gaussian along every axis, ends mirrored."""
     kernel = np.exp(-0.5 * (np.arange(-3, 4) / _SPREAD_CODES) ** 2)
     kernel /= kernel.sum()

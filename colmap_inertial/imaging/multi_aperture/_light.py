@@ -9,7 +9,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Float32Array, UInt8Array
 from colmap_inertial.core.types import SpectralRole
 from colmap_inertial.imaging.multi_aperture._geometry import Rectified
-from colmap_inertial.imaging.multi_aperture._sampling import seen_by
+from colmap_inertial.imaging.multi_aperture._sampling import warp_view
 from colmap_inertial.imaging.semi_global import LightCost
 
 #: A residual of this many times the usual one costs 63 % of the most.
@@ -48,7 +48,7 @@ def light_cost(
     first = codes[0][::_EVERY, ::_EVERY]
     aligned, inside = [first.astype(np.float64)], np.ones(first.shape, dtype=bool)
     for k in range(1, len(codes)):
-        warped, there = seen_by(codes[k], canvas, k, disparity_px, _EVERY)
+        warped, there = warp_view(codes[k], canvas, k, disparity_px, _EVERY)
         aligned.append(warped.astype(np.float64))
         inside &= there
     means = {role: [i for i, other in enumerate(roles) if other == role] for role in _NEEDED}

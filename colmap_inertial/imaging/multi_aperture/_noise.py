@@ -32,7 +32,7 @@ class NoiseLimits:
 _LIMITS = NoiseLimits()
 
 
-def noise_of(plane: AnyArray) -> float:
+def measure_noise(plane: AnyArray) -> float:
     """Standard deviation of the noise of an image, in its own codes.
 
     By what is left of it after the Laplacian's square (Immerkaer, Fast noise variance estimation, CVIU 64(2), 1996), in

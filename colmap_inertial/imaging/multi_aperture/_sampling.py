@@ -8,7 +8,7 @@ from colmap_inertial.core.arrays import AnyArray, BoolArray, Float32Array, UInt8
 from colmap_inertial.imaging.multi_aperture._geometry import Rectified
 
 
-def codes_of(image: AnyArray) -> UInt8Array:
+def to_codes(image: AnyArray) -> UInt8Array:
     """(H, W) codes of 8 bit, brighter for brighter; 16 bit go over the square root of what is in use."""
     if image.dtype == np.uint8:
         return image
@@ -16,7 +16,7 @@ def codes_of(image: AnyArray) -> UInt8Array:
     return np.asarray(np.clip(np.rint(255 * np.sqrt(image / np.float32(top))), 0, 255), dtype=np.uint8)
 
 
-def on_canvas(codes: UInt8Array, canvas: Rectified, index: int) -> UInt8Array:
+def warp_to_canvas(codes: UInt8Array, canvas: Rectified, index: int) -> UInt8Array:
     """An aperture's codes on the canvas; beyond the image its border goes on."""
     import cv2
 
@@ -48,7 +48,7 @@ def places(
     return np.asarray(u, dtype=np.float32), np.asarray(v, dtype=np.float32)
 
 
-def seen_by(
+def warp_view(
     view: AnyArray, canvas: Rectified, index: int, disparity_px: Float32Array, every: int = 1
 ) -> tuple[Float32Array, BoolArray]:
     """What the reference sees on the canvas in another aperture's view, itself on the canvas; and whether it is there.

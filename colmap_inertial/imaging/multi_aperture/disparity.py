@@ -13,8 +13,8 @@ from colmap_inertial.core.types import SpectralRole
 from colmap_inertial.imaging.multi_aperture._geometry import Rectified
 from colmap_inertial.imaging.multi_aperture._information import cost_tables
 from colmap_inertial.imaging.multi_aperture._light import adds_up, light_cost
-from colmap_inertial.imaging.multi_aperture._noise import noise_of, smoothing
-from colmap_inertial.imaging.multi_aperture._sampling import codes_of, on_canvas, shrunk
+from colmap_inertial.imaging.multi_aperture._noise import measure_noise, smoothing
+from colmap_inertial.imaging.multi_aperture._sampling import shrunk, to_codes, warp_to_canvas
 from colmap_inertial.imaging.multi_aperture._volume import candidates, match
 from colmap_inertial.imaging.semi_global import MOST, Views
 
@@ -95,49 +95,51 @@ def estimate_disparity(
     """
     options = options or ApertureOptions()
     threads = options.threads or 0  # 0: all processors
-    codes, least = _codes(planes, canvas)
+    codes, least = _prepare_codes(planes, canvas)
     reference, others = codes[0], codes[1:]
-    low, high = options.disparity_px or _range_px(reference, others, canvas, threads)
+    low, high = options.disparity_px or _estimate_range_px(reference, others, canvas, threads)
     tables = None
     if options.cost == "mutual-information":
-        tables = _tables(reference, others, canvas, low, high, threads)
+        tables = _make_cost_tables(reference, others, canvas, low, high, threads)
     light = None
     if options.luminance_cost and adds_up(roles):
-        rough = _rough(reference, others, canvas, low, high, threads)
+        rough = _match_roughly(reference, others, canvas, low, high, threads)
         light = light_cost(codes, canvas, rough, roles, MOST)
     views = Views(reference=reference, others=others, tables=tables, least=least, light=light)
     found, total = match(views, canvas, candidates(low, high, options.step_px), threads=threads)
-    return _settled(found, total, canvas, threads, even=bool(np.ptp(reference) == 0))
+    return _check_disparities(found, total, canvas, threads, even=bool(np.ptp(reference) == 0))
 
 
-def _codes(planes: Sequence[AnyArray], canvas: Rectified) -> tuple[UInt8Array, int]:
+def _prepare_codes(planes: Sequence[AnyArray], canvas: Rectified) -> tuple[UInt8Array, int]:
     """(N, H, W) codes to compare, on the canvas, and the least difference of them that tells."""
     import cv2
 
     codes, least = [], 0
     for i, plane in enumerate(planes):
-        of_plane = codes_of(plane)
-        width_px, telling = smoothing(of_plane, noise_of(of_plane))
+        of_plane = to_codes(plane)
+        width_px, telling = smoothing(of_plane, measure_noise(of_plane))
         least = telling if i == 0 else least
         if width_px > 0:
             of_plane = np.asarray(cv2.GaussianBlur(of_plane, (0, 0), width_px))
-        codes.append(on_canvas(of_plane, canvas, i))
+        codes.append(warp_to_canvas(of_plane, canvas, i))
     return np.stack(codes), least
 
 
-def _settled(found: Float32Array, least: UInt16Array, canvas: Rectified, threads: int, *, even: bool) -> Disparity:
+def _check_disparities(
+    found: Float32Array, least: UInt16Array, canvas: Rectified, threads: int, *, even: bool
+) -> Disparity:
     """The disparities without what is wrong, and what the views see of them."""
     import cv2
 
-    bits = _seen(found, least, canvas, threads)
+    bits = _find_visibility(found, least, canvas, threads)
     measured = (bits == 3).any(axis=0)
     filled = background(found, measured)
     smooth = np.asarray(cv2.medianBlur(filled, 3))
-    visible = (_seen(smooth, least, canvas, threads) & 1).astype(bool)
+    visible = (_find_visibility(smooth, least, canvas, threads) & 1).astype(bool)
     return Disparity(disparity_px=smooth, measured=measured & (not even), visible=visible)
 
 
-def _seen(disparity_px: Float32Array, least: UInt16Array, canvas: Rectified, threads: int) -> UInt8Array:
+def _find_visibility(disparity_px: Float32Array, least: UInt16Array, canvas: Rectified, threads: int) -> UInt8Array:
     from colmap_inertial._kernels import _apertures
 
     ratios = canvas.ratios
@@ -171,39 +173,41 @@ def background(disparity_px: Float32Array, known: BoolArray) -> Float32Array:
     return np.where(known | ~np.isfinite(behind), disparity_px, behind).astype(np.float32)
 
 
-def _range_px(reference: UInt8Array, others: UInt8Array, canvas: Rectified, threads: int) -> tuple[float, float]:
+def _estimate_range_px(
+    reference: UInt8Array, others: UInt8Array, canvas: Rectified, threads: int
+) -> tuple[float, float]:
     """Limits of the disparities, by matching smaller images over a wide range."""
-    by = _look_shrink(reference)
+    by = _choose_shrink(reference)
     small = canvas.shrunk(by)
     low, high = (share * canvas.width / by for share in _LIMITS.shares)
-    found, least = match(_shrunk_views(reference, others, by), small, candidates(low, high, 0.5), threads=threads)
-    measured = (_seen(found, least, small, threads) == 3).any(axis=0)
+    found, least = match(_shrink_views(reference, others, by), small, candidates(low, high, 0.5), threads=threads)
+    measured = (_find_visibility(found, least, small, threads) == 3).any(axis=0)
     used = found[measured] if measured.any() else found
     limits = by * np.quantile(used, (_LIMITS.outliers, 1 - _LIMITS.outliers))
     return float(limits[0] - _LIMITS.margin_px), float(limits[1] + _LIMITS.margin_px)
 
 
-def _look_shrink(reference: UInt8Array) -> int:
+def _choose_shrink(reference: UInt8Array) -> int:
     return max(1, min(_LIMITS.shrink, min(reference.shape) // _LIMITS.narrowest_px))
 
 
-def _shrunk_views(reference: UInt8Array, others: UInt8Array, by: int) -> Views:
+def _shrink_views(reference: UInt8Array, others: UInt8Array, by: int) -> Views:
     return Views(reference=shrunk(reference, by), others=np.stack([shrunk(view, by) for view in others]))
 
 
-def _rough(
+def _match_roughly(
     reference: UInt8Array, others: UInt8Array, canvas: Rectified, low_px: float, high_px: float, threads: int
 ) -> Float32Array:
     """Disparities by matching smaller images."""
     import cv2
 
-    by = _look_shrink(reference)
+    by = _choose_shrink(reference)
     spaced = candidates(low_px / by, high_px / by, 0.5)
-    found, _ = match(_shrunk_views(reference, others, by), canvas.shrunk(by), spaced, threads=threads)
+    found, _ = match(_shrink_views(reference, others, by), canvas.shrunk(by), spaced, threads=threads)
     return np.asarray(by * cv2.resize(found, reference.shape[::-1], interpolation=cv2.INTER_LINEAR))
 
 
-def _tables(
+def _make_cost_tables(
     reference: UInt8Array, others: UInt8Array, canvas: Rectified, low_px: float, high_px: float, threads: int
 ) -> UInt8Array:
     """Cost tables by mutual information, from small images to large ones (Hirschmueller 2008, section 2.1).
@@ -218,7 +222,7 @@ def _tables(
     disparity: Float32Array | None = None
     for by in [*levels[:1], *levels[:1], *levels]:
         small = canvas.shrunk(by)
-        views = _shrunk_views(reference, others, by)
+        views = _shrink_views(reference, others, by)
         shape = views.reference.shape
         if disparity is None:
             drawn = np.random.default_rng(0).uniform(low_px, high_px, shape)

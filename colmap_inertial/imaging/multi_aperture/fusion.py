@@ -13,7 +13,7 @@ from colmap_inertial.core.options import ApertureOptions
 from colmap_inertial.core.types import ApertureRig, SpectralRole
 from colmap_inertial.imaging.multi_aperture._fill import fill_hidden
 from colmap_inertial.imaging.multi_aperture._geometry import Rectified
-from colmap_inertial.imaging.multi_aperture._noise import noise_of
+from colmap_inertial.imaging.multi_aperture._noise import measure_noise
 from colmap_inertial.imaging.multi_aperture._sampling import places
 from colmap_inertial.imaging.multi_aperture.disparity import Disparity, estimate_disparity
 
@@ -156,7 +156,7 @@ def fuse_with(
             hidden |= missing
     colours = np.stack([roles[role] for role in COLOURS], axis=-1)
     if "luminance" in roles:
-        colours = with_luminance(colours, roles["luminance"])
+        colours = denoise_by_luminance(colours, roles["luminance"])
     image = np.clip(np.rint(top * colours), 0, top).astype(planes[0].dtype)
     return Fused(
         image=image,
@@ -211,7 +211,7 @@ class _Grid:
         return np.clip(values, 0, 1), inside & self._nearest(self.found.visible[index - 1])
 
 
-def with_luminance(colours: Float32Array, luminance: Float32Array) -> Float32Array:
+def denoise_by_luminance(colours: Float32Array, luminance: Float32Array) -> Float32Array:
     """Colours with the noise of luminance instead of their own, as far as they go with it."""
     import cv2
 
@@ -219,14 +219,14 @@ def with_luminance(colours: Float32Array, luminance: Float32Array) -> Float32Arr
         size = (_WINDOW_PX, _WINDOW_PX)
         return np.asarray(cv2.blur(values, size, borderType=cv2.BORDER_REFLECT_101))
 
-    noise_light = noise_of(255 * luminance) / 255
+    noise_light = measure_noise(255 * luminance) / 255
     of_light = mean(luminance)
     spread = np.maximum(mean(luminance * luminance) - of_light**2, 0)
     texture = np.maximum(spread - np.float32(noise_light**2), 0) + np.float32(_TEXTURE)
     result = np.empty_like(colours)
     for c in range(colours.shape[2]):
         colour = colours[..., c]
-        noise = noise_of(255 * colour) / 255
+        noise = measure_noise(255 * colour) / 255
         of_colour = mean(colour)
         slope = (mean(luminance * colour) - of_light * of_colour) / (texture + np.float32(noise_light**2))
         model = mean(slope) * luminance + mean(of_colour - slope * of_light)

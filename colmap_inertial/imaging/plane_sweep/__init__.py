@@ -3,13 +3,13 @@
 Views are pinhole cameras whose pixel centres are whole numbers. Depth is along the optical axis; 0 is unknown.
 """
 
-from colmap_inertial.imaging.plane_sweep.agreement import DepthView as DepthView, agreed_depth as agreed_depth
+from colmap_inertial.imaging.plane_sweep.agreement import DepthView as DepthView, confirm_depth as confirm_depth
 from colmap_inertial.imaging.plane_sweep.depth import Partner as Partner, sweep_depth as sweep_depth
-from colmap_inertial.imaging.plane_sweep.normals import normals_of as normals_of
+from colmap_inertial.imaging.plane_sweep.normals import estimate_normals as estimate_normals
 from colmap_inertial.imaging.plane_sweep.partners import (
     Sights as Sights,
-    chosen_partners as chosen_partners,
+    choose_partners as choose_partners,
     depth_range as depth_range,
-    partner_scores as partner_scores,
+    score_partners as score_partners,
 )
 from colmap_inertial.imaging.plane_sweep.pinhole import Pinhole as Pinhole

@@ -25,7 +25,7 @@ class DepthView:
     camera: Pinhole
 
 
-def agreed_depth(reference: DepthView, others: Iterable[DepthView]) -> Float32Array:
+def confirm_depth(reference: DepthView, others: Iterable[DepthView]) -> Float32Array:
     """Keep the depths that at least one other view agrees with.
 
     A pixel is taken to the other view by its depth, and back by the depth that was found there.
@@ -47,31 +47,31 @@ def agreed_depth(reference: DepthView, others: Iterable[DepthView]) -> Float32Ar
         there, back = other.camera.seen_from(reference.camera), reference.camera.seen_from(other.camera)
         for begin in range(0, len(depth), ROWS_AT_ONCE):
             rows = slice(begin, begin + ROWS_AT_ONCE)
-            depth_back = _there_and_back(depth[rows], begin, other.depth, there, back)
+            depth_back = _transfer_there_and_back(depth[rows], begin, other.depth, there, back)
             agrees = np.abs(depth_back - depth[rows]) <= _WITHIN_SHARE * depth[rows]
             total[rows] += np.where(agrees, depth_back, 0)
             count[rows] += agrees
     return np.where((count > 1) & (depth > 0), total / count, 0).astype(np.float32)
 
 
-def _there_and_back(
+def _transfer_there_and_back(
     depth: Float32Array, begin: int, other: Float32Array, there: Transfer, back: Transfer
 ) -> Float32Array:
     """The depths that rows ``begin ...`` come back with, by another view's depths; nan where they do not."""
     rows, columns = np.indices(depth.shape)
     y, x = (np.asarray(axis, dtype=np.float32) for axis in (rows + begin, columns))
-    u, v, w = _carried(*there, x, y, depth)
+    u, v, w = _transfer_pixels(*there, x, y, depth)
     high, wide = other.shape
     column, row = np.rint(u), np.rint(v)
     inside = (depth > 0) & (w > 0) & (column >= 0) & (row >= 0) & (column < wide) & (row < high)
     at = np.where(inside, row, 0).astype(np.intp) * wide + np.where(inside, column, 0).astype(np.intp)
     found = other.ravel()[at]
-    x_back, y_back, depth_back = _carried(*back, np.where(inside, u, 0), np.where(inside, v, 0), found)
+    x_back, y_back, depth_back = _transfer_pixels(*back, np.where(inside, u, 0), np.where(inside, v, 0), found)
     near = (x_back - x) ** 2 + (y_back - y) ** 2 <= _WITHIN_PX**2
     return np.where(inside & (found > 0) & near, depth_back, np.float32(np.nan))
 
 
-def _carried(
+def _transfer_pixels(
     matrix: Array, offset: Array, x: Float32Array, y: Float32Array, depth: Float32Array
 ) -> tuple[Float32Array, Float32Array, Float32Array]:
     """Pixels and depths in another view, (H, W) each; not finite where they lie in the plane of its centre."""

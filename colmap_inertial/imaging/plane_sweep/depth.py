@@ -13,7 +13,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Array, Float32Array, Int32Array, UInt8Array
 from colmap_inertial.core.threads import in_order, usable_processors
 from colmap_inertial.imaging.plane_sweep.pinhole import Pinhole
-from colmap_inertial.imaging.plane_sweep.tiles import Tile, tiles_of
+from colmap_inertial.imaging.plane_sweep.tiles import Tile, cut_tiles
 from colmap_inertial.imaging.semi_global import Views, match_candidates
 
 
@@ -104,14 +104,14 @@ def sweep_depth(
         return np.zeros(codes.shape, dtype=np.float32)
     if len(sweep.inverse) < _LIMITS.many_candidates:
         return sweep.depth(threads)
-    halves = [Partner(codes=_half(p.codes), camera=_half_of(p.camera)) for p in partners]
-    half = _Sweep.of(_half(codes), _half_of(camera), halves, depths)
+    halves = [Partner(codes=_halve_codes(p.codes), camera=_halve_camera(p.camera)) for p in partners]
+    half = _Sweep.of(_halve_codes(codes), _halve_camera(camera), halves, depths)
     if half is None:
         return sweep.depth(threads)
     coarse = half.depth(threads)
     with np.errstate(divide="ignore"):
         place = (1 / coarse.astype(np.float64) - sweep.inverse[0]) / (sweep.inverse[1] - sweep.inverse[0])
-    tiles = list(tiles_of(np.where(coarse > 0, place, np.nan), (camera.height, camera.width), len(sweep.inverse)))
+    tiles = list(cut_tiles(np.where(coarse > 0, place, np.nan), (camera.height, camera.width), len(sweep.inverse)))
     found = np.empty(codes.shape, dtype=np.float32)
     parts = in_order(sweep.of_tile, tiles, workers=threads or usable_processors())
     for tile, part in zip(tiles, parts, strict=True):
@@ -134,20 +134,20 @@ class _Sweep:
     ) -> _Sweep | None:
         """``None`` where no partner shows anything of it."""
         near, far = depths
-        turned = [(canvas, p) for p in partners if (canvas := _canvas(camera, p.camera, depths)) is not None]
+        turned = [(canvas, p) for p in partners if (canvas := _make_canvas(camera, p.camera, depths)) is not None]
         if not turned:
             return None
-        inverse = _candidates(camera, [canvas.baseline for canvas, _ in turned], near, far)
+        inverse = _choose_candidates(camera, [canvas.baseline for canvas, _ in turned], near, far)
         shape = max(canvas.height for canvas, _ in turned), max(canvas.width for canvas, _ in turned)
         others = np.zeros((len(turned), *shape), dtype=np.uint8)
         shown = np.zeros((len(turned), shape[0], 2), dtype=np.int32)
         columns = np.empty((len(turned), len(inverse), camera.width), dtype=np.int32)
         rows = np.empty((len(turned), len(inverse), camera.height), dtype=np.int32)
         for k, (canvas, partner) in enumerate(turned):
-            others[k, : canvas.height, : canvas.width] = _turned(partner.codes, canvas)
-            shown[k, : canvas.height] = _shown(partner.codes.shape, canvas)
-            columns[k] = _positions(camera, canvas, inverse, 0)
-            rows[k] = _positions(camera, canvas, inverse, 1)
+            others[k, : canvas.height, : canvas.width] = _turn_view(partner.codes, canvas)
+            shown[k, : canvas.height] = _find_shown_columns(partner.codes.shape, canvas)
+            columns[k] = _sample_positions(camera, canvas, inverse, 0)
+            rows[k] = _sample_positions(camera, canvas, inverse, 1)
         views = Views(reference=codes, others=others, least=_LIMITS.least_codes, shown=shown)
         return cls(views=views, inverse=inverse, columns=columns, rows=rows)
 
@@ -172,7 +172,7 @@ class _Sweep:
         return np.where(known, 1 / found, 0).astype(np.float32)
 
 
-def _half(codes: UInt8Array) -> UInt8Array:
+def _halve_codes(codes: UInt8Array) -> UInt8Array:
     """A picture at half its size."""
     import cv2
 
@@ -180,7 +180,7 @@ def _half(codes: UInt8Array) -> UInt8Array:
     return np.asarray(cv2.resize(codes, (width // 2, height // 2), interpolation=cv2.INTER_AREA))
 
 
-def _half_of(camera: Pinhole) -> Pinhole:
+def _halve_camera(camera: Pinhole) -> Pinhole:
     """What would have taken it."""
     by = np.array([(camera.width // 2) / camera.width, (camera.height // 2) / camera.height])
     return replace(
@@ -192,7 +192,7 @@ def _half_of(camera: Pinhole) -> Pinhole:
     )
 
 
-def _candidates(camera: Pinhole, baselines: Sequence[Array], near: float, far: float) -> Array:
+def _choose_candidates(camera: Pinhole, baselines: Sequence[Array], near: float, far: float) -> Array:
     """(D,) inverse depths, the farthest first."""
     moves = [np.hypot(b[0], b[1]) + 0.5 * abs(b[2]) for b in baselines]
     count = float(camera.focal_px.max()) * max(moves) * (1 / near - 1 / far) / _LIMITS.step_px + 1
@@ -201,7 +201,7 @@ def _candidates(camera: Pinhole, baselines: Sequence[Array], near: float, far: f
     )
 
 
-def _place(camera: Pinhole, baseline: Array, inverse: Array, axis: int) -> tuple[Array, Array]:
+def _place_planes(camera: Pinhole, baseline: Array, inverse: Array, axis: int) -> tuple[Array, Array]:
     """(D, n) where columns (axis 0) or rows (1) of the reference lie in a turned view; (D, 1) how they shrink."""
     at = np.arange((camera.width, camera.height)[axis], dtype=np.float64)
     focal, centre = camera.focal_px[axis], camera.centre_px[axis]
@@ -210,7 +210,7 @@ def _place(camera: Pinhole, baseline: Array, inverse: Array, axis: int) -> tuple
     return moved / np.maximum(shrinks, _LIMITS.closest) + centre, shrinks
 
 
-def _canvas(camera: Pinhole, view: Pinhole, depths: tuple[float, float]) -> _Canvas | None:
+def _make_canvas(camera: Pinhole, view: Pinhole, depths: tuple[float, float]) -> _Canvas | None:
     """What a view shows of what the reference sees between two depths; ``None`` where it shows nothing of it."""
     baseline = camera.cam_from_world @ (view.cam_in_world - camera.cam_in_world)
     turn = camera.cam_from_world @ view.cam_from_world.T
@@ -218,7 +218,7 @@ def _canvas(camera: Pinhole, view: Pinhole, depths: tuple[float, float]) -> _Can
     inverse = np.linspace(1 / depths[1], 1 / depths[0], 9)
     ranges = []
     for axis in (0, 1):
-        place, shrinks = _place(camera, baseline, inverse, axis)
+        place, shrinks = _place_planes(camera, baseline, inverse, axis)
         place = place[shrinks[:, 0] >= _LIMITS.closest]
         if not place.size:
             return None
@@ -251,23 +251,23 @@ def _canvas(camera: Pinhole, view: Pinhole, depths: tuple[float, float]) -> _Can
     )
 
 
-def _positions(camera: Pinhole, canvas: _Canvas, inverse: Array, axis: int) -> Int32Array:
+def _sample_positions(camera: Pinhole, canvas: _Canvas, inverse: Array, axis: int) -> Int32Array:
     """(D, n) columns or rows of the canvas in 1/16 px, outside of it where it has none."""
     start, size = ((canvas.left, canvas.width), (canvas.top, canvas.height))[axis]
-    place, shrinks = _place(camera, canvas.baseline, inverse, axis)
+    place, shrinks = _place_planes(camera, canvas.baseline, inverse, axis)
     # what a window reaches beyond the canvas is on its own side
     sixteenths = np.rint(16 * np.clip(place - start, -1, size))
     return np.where(shrinks >= _LIMITS.closest, sixteenths, -1).astype(np.int32)
 
 
-def _turned(codes: UInt8Array, canvas: _Canvas) -> UInt8Array:
+def _turn_view(codes: UInt8Array, canvas: _Canvas) -> UInt8Array:
     import cv2
 
     size = (canvas.width, canvas.height)
     return np.asarray(cv2.warpPerspective(codes, canvas.canvas_from_view, size, flags=cv2.INTER_LINEAR))
 
 
-def _shown(shape: tuple[int, ...], canvas: _Canvas) -> Int32Array:
+def _find_shown_columns(shape: tuple[int, ...], canvas: _Canvas) -> Int32Array:
     """(H, 2) from and up to which column a canvas shows the view: turned, it is a quadrilateral there."""
     import cv2
 

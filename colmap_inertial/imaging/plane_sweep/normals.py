@@ -25,7 +25,7 @@ class NormalLimits:
 _LIMITS = NormalLimits()
 
 
-def normals_of(depth: Float32Array, camera: Pinhole) -> Float32Array:
+def estimate_normals(depth: Float32Array, camera: Pinhole) -> Float32Array:
     """Fit a plane around each pixel.
 
     On a plane ``n X = d``, inverse depth ``1/z = n (x, y, 1) / d`` is linear in the pixel's coordinates: least squares
@@ -55,11 +55,11 @@ def normals_of(depth: Float32Array, camera: Pinhole) -> Float32Array:
     for begin in range(0, height, ROWS_AT_ONCE):
         end = min(height, begin + ROWS_AT_ONCE)
         rows = slice(begin, end)
-        out[rows] = _of_rows(known[rows], middle[rows], room[begin : end + 2 * _LIMITS.radius_px], begin, camera)
+        out[rows] = _fit_rows(known[rows], middle[rows], room[begin : end + 2 * _LIMITS.radius_px], begin, camera)
     return out
 
 
-def _of_rows(known: BoolArray, middle: Float32Array, room: Float32Array, begin: int, camera: Pinhole) -> Float32Array:
+def _fit_rows(known: BoolArray, middle: Float32Array, room: Float32Array, begin: int, camera: Pinhole) -> Float32Array:
     """Of rows ``begin ...``; ``room`` is their inverse depth with the neighbours around."""
     height, width = known.shape
     tolerance = _LIMITS.same_share * middle

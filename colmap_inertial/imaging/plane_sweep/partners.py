@@ -86,7 +86,7 @@ def depth_range(sights: Sights, view: int) -> tuple[float, float] | None:
     return float(_LIMITS.nearer * low), float(_LIMITS.farther * high)
 
 
-def partner_scores(sights: Sights, view: int) -> Array:
+def score_partners(sights: Sights, view: int) -> Array:
     """(V,) how well each view is placed to measure what ``view`` sees; 0 where it is not.
 
     The sum over shared points of a weight of the angle under which the two see the point, as MVSNet weighs
@@ -113,7 +113,7 @@ def partner_scores(sights: Sights, view: int) -> Array:
     return np.where((shared >= _LIMITS.least_shared) & near & apart, score, 0.0)
 
 
-def chosen_partners(sights: Sights, view: int, scores: Array, count: int) -> tuple[int, ...]:
+def choose_partners(sights: Sights, view: int, scores: Array, count: int) -> tuple[int, ...]:
     """The views to compare with: well placed, and on different sides.
 
     One after the other, the best; a view in the direction of a chosen one counts less, by half where it is the same.

@@ -48,10 +48,10 @@ class Tile:
     @property
     def kept(self) -> tuple[slice, slice]:
         """Of what is worked on, what is of the tile."""
-        return _within(self.inner_rows, self.rows), _within(self.inner_columns, self.columns)
+        return _make_relative(self.inner_rows, self.rows), _make_relative(self.inner_columns, self.columns)
 
 
-def tiles_of(coarse: Array, shape: tuple[int, int], count: int) -> Iterator[Tile]:
+def cut_tiles(coarse: Array, shape: tuple[int, int], count: int) -> Iterator[Tile]:
     """Cut a picture into tiles with the candidates that each needs.
 
     Parameters
@@ -64,9 +64,9 @@ def tiles_of(coarse: Array, shape: tuple[int, int], count: int) -> Iterator[Tile
         How many candidates there are.
     """
     down, across = (small / whole for small, whole in zip(coarse.shape, shape, strict=True))
-    for inner_rows, rows in _cut(shape[0]):
-        for inner_columns, columns in _cut(shape[1]):
-            found = coarse[_scaled(rows, down), _scaled(columns, across)]
+    for inner_rows, rows in _cut_side(shape[0]):
+        for inner_columns, columns in _cut_side(shape[1]):
+            found = coarse[_scale_slice(rows, down), _scale_slice(columns, across)]
             known = found[np.isfinite(found)]
             candidates = slice(0, count)
             if len(known) >= max(1.0, _LIMITS.least_known * found.size):
@@ -84,7 +84,7 @@ def tiles_of(coarse: Array, shape: tuple[int, int], count: int) -> Iterator[Tile
             )
 
 
-def _cut(length: int) -> list[tuple[slice, slice]]:
+def _cut_side(length: int) -> list[tuple[slice, slice]]:
     """Tiles along a side, and the same with what they share."""
     number = -(-length // _LIMITS.tile_px)
     edges = [length * i // number for i in range(number + 1)]
@@ -94,9 +94,9 @@ def _cut(length: int) -> list[tuple[slice, slice]]:
     ]
 
 
-def _scaled(part: slice, by: float) -> slice:
+def _scale_slice(part: slice, by: float) -> slice:
     return slice(int(np.floor(part.start * by)), int(np.ceil(part.stop * by)))
 
 
-def _within(inner: slice, outer: slice) -> slice:
+def _make_relative(inner: slice, outer: slice) -> slice:
     return slice(inner.start - outer.start, inner.stop - outer.start)

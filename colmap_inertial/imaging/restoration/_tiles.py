@@ -56,13 +56,13 @@ def tiles(height: int, width: int, most_px: int = MOST_PX) -> list[tuple[Span, S
     Of the grids whose parts have ``most_px`` pixels at most, the one with the fewest in all. (Parts of one grid cell
     of 16 px and its overlap are as small as they get.)
     """
-    rows, columns = _spans(height, -1), _spans(width, -1)
+    rows, columns = _cut_spans(height, -1), _cut_spans(width, -1)
     for i in range(1, -(-height // MULTIPLE) + 1):
-        some_rows = _spans(height, i)
+        some_rows = _cut_spans(height, i)
         for j in range(1, -(-width // MULTIPLE) + 1):
-            some_columns = _spans(width, j)
-            if _largest(some_rows) * _largest(some_columns) <= most_px:
-                if _total(some_rows) * _total(some_columns) < _total(rows) * _total(columns):
+            some_columns = _cut_spans(width, j)
+            if _largest_size(some_rows) * _largest_size(some_columns) <= most_px:
+                if _total_size(some_rows) * _total_size(some_columns) < _total_size(rows) * _total_size(columns):
                     rows, columns = some_rows, some_columns
                 break
     return [(row, column) for row in rows for column in columns]
@@ -94,7 +94,7 @@ def blur_feed(blur: BlurField, row: Span, column: Span) -> Float32Array:
     The double angle is the same for a vector and its negative. Values hold at the centres of 2 x 2 pixels.
     """
     out = np.empty((1, 3, row.size // 2, column.size // 2), dtype=np.float32)
-    x, y = np.moveaxis(_at_centres(blur, row, column), -1, 0)
+    x, y = np.moveaxis(_sample_centres(blur, row, column), -1, 0)
     cosine, sine, length = out[0]
     np.divide(np.hypot(x, y), np.float32(UNIT_PX), out=length)
     per_length = np.divide(1 / UNIT_PX**2, length, out=np.zeros_like(length), where=length > 0)
@@ -113,11 +113,11 @@ def path_feed(path: BlurPath, row: Span, column: Span) -> Float32Array:
     bend = BlurField(width=path.width, height=path.height, step_px=path.step_px, vector_px=mean)
     out = np.empty((1, 5, row.size // 2, column.size // 2), dtype=np.float32)
     out[:, :3] = blur_feed(path.field(), row, column)
-    out[0, 3:] = np.moveaxis(_at_centres(bend, row, column), -1, 0) / BEND_UNIT_PX
+    out[0, 3:] = np.moveaxis(_sample_centres(bend, row, column), -1, 0) / BEND_UNIT_PX
     return out
 
 
-def _at_centres(blur: BlurField, row: Span, column: Span) -> Array:
+def _sample_centres(blur: BlurField, row: Span, column: Span) -> Array:
     """(H / 2, W / 2, 2) a field at the centres of 2 x 2 pixels."""
     at_rows, at_columns = (
         np.minimum(np.arange(span.begin + 0.5, span.end, 2), limit - 1) / blur.step_px
@@ -143,7 +143,7 @@ def put(image: AnyArray, restored: Float32Array, row: Span, column: Span) -> Non
         np.copyto(target[..., c] if image.ndim == 3 else target, values, casting="unsafe")
 
 
-def _spans(size: int, parts: int) -> list[Span]:
+def _cut_spans(size: int, parts: int) -> list[Span]:
     """An axis in parts of the same size, but for the last one; as many as there can be where negative."""
     whole = -(-size // MULTIPLE) * MULTIPLE
     kept = MULTIPLE if parts < 0 else -(-whole // (parts * MULTIPLE)) * MULTIPLE
@@ -158,9 +158,9 @@ def _spans(size: int, parts: int) -> list[Span]:
     ]
 
 
-def _largest(spans: list[Span]) -> int:
+def _largest_size(spans: list[Span]) -> int:
     return max(span.size for span in spans)
 
 
-def _total(spans: list[Span]) -> int:
+def _total_size(spans: list[Span]) -> int:
     return sum(span.size for span in spans)

@@ -54,7 +54,7 @@ def deblur(image: NDArray[Code], path: BlurPath, *, network: Network) -> NDArray
         raise ValueError(f"network: deepgyro, not {network.name}")
     filtered = path_wiener(image, path, DeblurOptions(threads=network.threads))
     chords = path.field()
-    known = _known(chords)
+    known = _share_of_network(chords)
     if known.max() == 0:
         return filtered
     restored = network.restore(image, filtered, path)
@@ -64,7 +64,7 @@ def deblur(image: NDArray[Code], path: BlurPath, *, network: Network) -> NDArray
     return restored
 
 
-def _known(blur: BlurField) -> Float32Array:
+def _share_of_network(blur: BlurField) -> Float32Array:
     """(Ny + 1, Nx + 1) share of the network's result at the corners of the cells, by the length of blur."""
     rows, columns = (np.minimum(np.arange(0, n + CELL_PX, CELL_PX), n - 1) for n in (blur.height, blur.width))
     x, y = np.moveaxis(blur.at(rows, columns), -1, 0)

@@ -86,7 +86,7 @@ class Network:
         if threads is not None and threads < 1:
             raise ValueError("threads must be at least 1")
         threads = threads or usable_processors()
-        session = _start(model, source, _chosen(device), threads)
+        session = _start_session(model, source, _choose_device(device), threads)
         on: Literal["cpu", "cuda"] = "cuda" if _CUDA in session.get_providers() else "cpu"
         network = cls(name=name, device=on, threads=threads, _session=session)
         _require_device(network, device)
@@ -135,7 +135,7 @@ class Network:
             }
             try:
                 (restored,) = self._session.run([_OUTPUT], feeds)
-            except Exception as error:  # as in _start
+            except Exception as error:  # as in _start_session
                 raise InertialError(
                     f"the network {self.name} failed on {self.device} ({_first_line(error)}); "
                     + _MORE_MEMORY[self.device]
@@ -180,7 +180,7 @@ def load_network(name: NetworkName, *, device: Device = "auto", threads: int | N
     InertialError
         Where CUDA is asked for by name and cannot be used.
     """
-    key = name, _chosen(device), threads or usable_processors()
+    key = name, _choose_device(device), threads or usable_processors()
     with _LOCK:
         network = _LOADED.get(key)
         if network is None:
@@ -201,7 +201,7 @@ def require_network(name: NetworkName) -> None:
     FormatError
         Where the network's file is missing or damaged.
     """
-    _runtime()
+    _import_runtime()
     read_model(name)
 
 
@@ -210,7 +210,7 @@ _LOCK = threading.Lock()
 _LOADED: WeakValueDictionary[tuple[str, str, int], Network] = WeakValueDictionary()
 
 
-def _runtime() -> Any:
+def _import_runtime() -> Any:
     try:
         import onnxruntime
     except ImportError:
@@ -218,9 +218,9 @@ def _runtime() -> Any:
     return onnxruntime
 
 
-def _chosen(device: Device) -> Literal["cpu", "cuda"]:
+def _choose_device(device: Device) -> Literal["cpu", "cuda"]:
     """What to try to run on."""
-    available = _CUDA in _runtime().get_available_providers()
+    available = _CUDA in _import_runtime().get_available_providers()
     if device == "cuda" and not available:
         raise InertialError(
             "this onnxruntime has no CUDA: install onnxruntime-gpu in place of onnxruntime, or use the processor"
@@ -234,8 +234,10 @@ def _require_device(network: Network, device: Device) -> None:
         raise InertialError(f"{network.name} cannot run on CUDA: onnxruntime found no device, or lacks CUDA or cuDNN")
 
 
-def _start(model: bytes, source: str, device: Literal["cpu", "cuda"], threads: int) -> onnxruntime.InferenceSession:
-    runtime = _runtime()
+def _start_session(
+    model: bytes, source: str, device: Literal["cpu", "cuda"], threads: int
+) -> onnxruntime.InferenceSession:
+    runtime = _import_runtime()
     options = runtime.SessionOptions()
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1

@@ -10,7 +10,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.types import CAL, CameraImuCalibration, CameraModel, Keypoints, Projector, Treatment
 from colmap_inertial.imaging.gyro_camera import GyroCamera
-from colmap_inertial.imaging.rolling_shutter import rays, rectify_image, rectify_keypoints, seen_by_lines
+from colmap_inertial.imaging.rolling_shutter import project_by_lines, rays, rectify_image, rectify_keypoints
 from colmap_inertial.io.calibration import SIGMAS
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.pipeline.stages.gyro_view import GyroView
@@ -70,7 +70,7 @@ class RollingShutterStage:
             return xy_px
         shutter = self.view.shutter(index[name])
         reference = motion.start_from_cam(np.array(shutter.reference_s()))
-        found = seen_by_lines(rays(camera, xy_px) @ reference.T, xy_px, motion, camera, shutter)
+        found = project_by_lines(rays(camera, xy_px) @ reference.T, xy_px, motion, camera, shutter)
         return np.where(np.isfinite(found), found, xy_px)
 
     def move_image(self, name: str, image: Any, /) -> Any:
