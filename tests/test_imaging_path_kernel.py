@@ -8,7 +8,7 @@ from references.path_filters import filter_reference, noise_reference, shares_of
 
 from colmap_inertial._kernels import _path
 from colmap_inertial.imaging import path_filters
-from colmap_inertial.imaging._tiles import Tiling
+from colmap_inertial.imaging._tiles import TiledPaths, Tiling
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.blur_path import BlurPath, middles
 from colmap_inertial.imaging.path_filters import Noise, filter_along, half_quadratic, noise_along, path_wiener, smoothed
@@ -56,7 +56,9 @@ def test_both_filters_are_the_plain_ones(cov_px2, splitting, instruction_set):
     tiling = Tiling.covering(width, height, path.extent_px())
     paths, noise = tiling.paths(path), Noise(2e-5, 1e-4)
     spreads = tiling.spreads(path)
-    found = filter_along(light, tiling, paths, spreads, [noise], splitting, threads=2, instruction_set=instruction_set)
+    found = filter_along(
+        light, tiling, TiledPaths(paths, spreads), [noise], splitting, threads=2, instruction_set=instruction_set
+    )
     expected = filter_reference(light[..., 0], tiling, paths, spreads, noise, splitting)
     assert np.abs(found[..., 0] - light[..., 0]).max() > 0.1
     # a gradient at the threshold may fall on either side of it
@@ -106,11 +108,13 @@ def test_threads_change_no_bit_and_colours_do_not_mix():
     path, light = bent(width, height), light_of(width, height, channels=3)
     tiling = Tiling.covering(width, height, path.extent_px())
     paths, noise = tiling.paths(path), [Noise(1e-4, 0.0)] * 3
-    one, many = (filter_along(light, tiling, paths, tiling.spreads(path), noise, (8.0,), threads=n) for n in (1, 3))
+    one, many = (
+        filter_along(light, tiling, TiledPaths(paths, tiling.spreads(path)), noise, (8.0,), threads=n) for n in (1, 3)
+    )
     np.testing.assert_array_equal(one, many)
     for c in range(3):
         one_plane = np.ascontiguousarray(light[..., c : c + 1])
-        alone = filter_along(one_plane, tiling, paths, tiling.spreads(path), noise[:1], (8.0,))
+        alone = filter_along(one_plane, tiling, TiledPaths(paths, tiling.spreads(path)), noise[:1], (8.0,))
         np.testing.assert_allclose(one[..., c], alone[..., 0], atol=1e-6)
 
 

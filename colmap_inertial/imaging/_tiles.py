@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,6 +35,13 @@ class TilingLimits:
 
 
 TILING = TilingLimits()
+
+
+class TiledPaths(NamedTuple):
+    """(Ty, Tx, S, 2) the path of each tile, px, and (Ty, Tx, 3) the covariance of its chord."""
+
+    px: Float32Array
+    cov_px2: Float32Array
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from colmap_inertial.core.arrays import AnyArray, Array, Float32Array
 from colmap_inertial.imaging._cells import Cells
-from colmap_inertial.imaging._tiles import TILING, Tiling
+from colmap_inertial.imaging._tiles import TILING, TiledPaths, Tiling
 from colmap_inertial.imaging.blur_path import BlurPath
 from colmap_inertial.imaging.transfer import ENCODE_STEPS, decode_table, encode_table, srgb_from_linear
 from colmap_inertial.imaging.wiener import DeblurOptions, require_planes, saturated_code
@@ -165,8 +165,7 @@ def noise_along(light: Float32Array, tiling: Tiling, paths: Float32Array, thread
 def filter_along(
     light: Float32Array,
     tiling: Tiling,
-    paths: Float32Array,
-    spreads: Float32Array,
+    paths: TiledPaths,
     noise: Sequence[Noise],
     splitting: Sequence[float],
     *,
@@ -180,8 +179,8 @@ def filter_along(
     _path.filter(
         light,
         result,
-        paths=paths,
-        spread=spreads,
+        paths=paths.px,
+        spread=paths.cov_px2,
         window_in=tiling.window_in(),
         window_out=tiling.window_out(),
         hop=tiling.hop,
@@ -226,7 +225,8 @@ def _filter_image(
         noise = noise_along(light, tiling, paths, threads)
     else:
         noise = (Noise(options.noise**2, 0.0),) * channels
-    sharp = filter_along(light, tiling, paths, tiling.spreads(path), noise, splitting, threads=threads)
+    tiled = TiledPaths(paths, tiling.spreads(path))
+    sharp = filter_along(light, tiling, tiled, noise, splitting, threads=threads)
     cells = Cells.of(path.field())
     result = np.empty_like(planes)
     _wiener.blend(
