@@ -451,8 +451,8 @@ def test_the_screen_and_the_report_say_how_a_model_was_made(workspace, capsys):
     apart = ModelEnds(model=1, pairs=9, images=("c.jpg", "d.jpg"), agree=0.31, joined=False)
     other = ModelEnds(model=0, pairs=5, images=("e.jpg", "f.jpg"), agree=0.9, joined=True)
     said = {
-        (joined, other): "Its ends that met (a.jpg and b.jpg, 12 pairs of images) were joined.",
-        (apart,): "Its ends that met (c.jpg and d.jpg, 9 pairs of images) do not fit and stay apart (31 % of their "
+        (joined, other): "Its ends that meet (a.jpg and b.jpg, 12 pairs of images) were joined.",
+        (apart,): "Its ends that meet (c.jpg and d.jpg, 9 pairs of images) do not fit and stay apart (31 % of their "
         "matches agree).",
         (): "",
     }

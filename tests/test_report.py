@@ -19,7 +19,7 @@ from report_runs import HOSTILE, cloud, recorded, write_run
 from test_pipeline import DETERMINISTIC, SCENE, copy_scene
 
 from colmap_inertial.checks.report import figures, signals, write_report
-from colmap_inertial.checks.report.content import _path_in_words
+from colmap_inertial.checks.report.content import _describe_path
 from colmap_inertial.checks.report.figure_3d import nice_length, scene_figure
 from colmap_inertial.checks.report.scene import scene_record
 from colmap_inertial.checks.report.series import rounded, strided, thinned
@@ -749,7 +749,7 @@ def test_a_long_path_is_said_to_bend_and_a_refined_one_how_much_it_did():
         ([done], 12.0, ["The IMU took drift out of its path: parts of it were stretched by -0.31 to +0.20 %."]),
     ):
         model = {"treatments": treatments, "sparse_metric": "sparse/0", "scene": {"path_length": length}}
-        assert _path_in_words(model) == said
+        assert _describe_path(model) == said
 
 
 def test_drift_before_and_after_a_refinement_is_drawn_with_its_intervals(full, tmp_path):

@@ -120,7 +120,9 @@ def target_facts(found: Mapping[str, Any]) -> Iterator[Fact]:
     yield "residuals", f"{found['rms_px']:.3f} px rms; {noise}"
     known = [(f"bar {' to '.join(map(str, bar['markers']))}", bar) for bar in found.get("bars") or ()]
     known += [(f"to {apart['other']}", apart) for apart in [found.get("apart")] if apart is not None]
-    yield from ((of, f"{one['known_m']:.6g} m, off by {1000 * one['residual_m']:+.3g} mm") for of, one in known)
+    yield from (
+        (of, f"{length['known_m']:.6g} m, off by {1000 * length['residual_m']:+.3g} mm") for of, length in known
+    )
     points = found.get("check_points")
     if points is not None:
         level_mm, up_mm = 1000 * points["rmse_horizontal_m"], 1000 * points["rmse_vertical_m"]
@@ -159,45 +161,45 @@ def not_checked(checked: Collection[str]) -> str:
     """What a check beforehand had nothing to look at, where that leaves a doubt; empty otherwise."""
     if "gyroscope" not in checked:
         return ""
-    said = []
+    sentences = []
     if "accelerometer" not in checked:
-        said.append("gravity and scale (no accelerometer)")
+        sentences.append("gravity and scale (no accelerometer)")
     if not {"pictures", "pictures far apart", "poses"} & set(checked):
-        said.append(
+        sentences.append(
             "whether camera and gyroscope belong together, their axes, unit and clocks (no poses, and no pictures that "
             "show enough of the same)"
         )
     elif "pictures far apart" in checked:
-        said.append("stabilisation and focal length (the pictures are too far apart in time)")
-    return "; ".join(said)
+        sentences.append("stabilisation and focal length (the pictures are too far apart in time)")
+    return "; ".join(sentences)
 
 
 def parts_mapped_in_words(mapping: dict[str, Any] | None) -> list[str]:
     """In how many parts a recording was mapped, and which of them do not fit; by ``mapping`` of the result."""
     if mapping is None or mapping["parts"] == 1:
         return []
-    said = [f"COLMAP mapped the recording in {mapping['parts']} parts."]
-    for met in mapping.get("seams", ()):
-        if not met["joined"]:
-            said.append(
-                f"What two of them both show ({' and '.join(met['images'])}, {met['pairs']} pairs of images) does not "
-                f"fit and was left out ({100 * met['agree']:.0f} % of the matches agree)."
-            )
-    return said
+    apart = [
+        f"The images that two of them share ({_describe_overlap(overlap)}) do not fit and were left out "
+        f"({100 * overlap['agree']:.0f} % of the matches agree)."
+        for overlap in mapping.get("seams", ())
+        if not overlap["joined"]
+    ]
+    return [f"COLMAP mapped the recording in {mapping['parts']} parts.", *apart]
 
 
 def mapped_in_words(mapping: dict[str, Any] | None, colmap_index: int | None) -> list[str]:
-    """What there is to say of how one model was made: its ends that met; by ``mapping`` of the result."""
-    if mapping is None:
-        return []
-    said = []
-    for met in mapping["ends"]:
-        if met["model"] == colmap_index:
-            where = f"ends that met ({' and '.join(met['images'])}, {met['pairs']} pairs of images)"
-            agree = f"{100 * met['agree']:.0f} %"
-            done = "were joined" if met["joined"] else f"do not fit and stay apart ({agree} of their matches agree)"
-            said.append(f"Its {where} {done}.")
-    return said
+    """Which loops of one model were closed; by ``mapping`` of the result."""
+    sentences = []
+    for closure in [] if mapping is None else mapping["ends"]:
+        if closure["model"] == colmap_index:
+            agree = f"{100 * closure['agree']:.0f} %"
+            done = "were joined" if closure["joined"] else f"do not fit and stay apart ({agree} of their matches agree)"
+            sentences.append(f"Its ends that meet ({_describe_overlap(closure)}) {done}.")
+    return sentences
+
+
+def _describe_overlap(overlap: Mapping[str, Any]) -> str:
+    return f"{' and '.join(overlap['images'])}, {overlap['pairs']} pairs of images"
 
 
 def outcome_of_model(model: dict[str, Any]) -> dict[str, Any]:

@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import difflib
 import functools
+import itertools
 import os
 import sys
 from collections.abc import Iterable, Sequence
@@ -38,31 +39,15 @@ refused), 4 mapping failed, 5 target not found, 130 interrupted.
 #: Values of positional arguments go by their names; an option that is not given is left out, not given as None.
 _CONFIG = (tyro.conf.PositionalMetavarFromFieldName, tyro.conf.DisallowNone)
 
-Command = (
-    Reconstruct
-    | Scale
-    | Apply
-    | Align
-    | CalibrateImu
-    | Diagnose
-    | Validate
-    | View
-    | Export
-    | Deblur
-    | FuseApertures
-    | FuseExposures
-    | Batch
-    | Simulate
-)
 #: By what they begin with.
-_GROUPS: dict[str, dict[str, type[Command]]] = {
+_GROUPS: dict[str, dict[str, type[Speaker]]] = {
     "From a recording to metres": {"diagnose": Diagnose, "reconstruct": Reconstruct, "batch": Batch},
     "With a model that exists": {"scale": Scale, "apply": Apply, "validate": Validate, "view": View, "export": Export},
     "Calibrate a device": {"align": Align, "calibrate-imu": CalibrateImu},
     "Pictures alone": {"deblur": Deblur, "fuse-apertures": FuseApertures, "fuse-exposures": FuseExposures},
     "Practise": {"simulate": Simulate},
 }
-_COMMANDS: dict[str, type[Command]] = {name: cls for group in _GROUPS.values() for name, cls in group.items()}
+_COMMANDS: dict[str, type[Speaker]] = {name: cls for group in _GROUPS.values() for name, cls in group.items()}
 #: Options that most people use, by field; in the help they come first. Without an entry all do, in their order.
 _COMMON: dict[str, tuple[str, ...]] = {
     "reconstruct": ("dense", "calibration", "deblur", "rolling_shutter", "world", "config", "force"),
@@ -78,7 +63,7 @@ _COMMON: dict[str, tuple[str, ...]] = {
 _HELP = ("-h", "--help")
 
 
-def parse(args: Sequence[str]) -> Command:
+def parse(args: Sequence[str]) -> Speaker:
     """The command that the arguments describe; exits with code 2 and a message when they describe none.
 
     ``--help`` prints its page and exits with code 0.
@@ -101,19 +86,19 @@ def parse(args: Sequence[str]) -> Command:
         }
         print_help(name, _COMMANDS[name], _COMMON.get(name, ()), titles, Speaker)
         sys.exit(0)
-    args = [*args[:1], *_spelled_out(args)]
+    args = [*args[:1], *_expand_options(args)]
     _require_known(args)
     choices: list[Any] = []
     for name, cls in _COMMANDS.items():
-        default = _default_from_config(cls, args) if list(args[:1]) == [name] else None
+        default = _read_default(cls, args) if list(args[:1]) == [name] else None
         settings = subcommand(name) if default is None else subcommand(name, default=default)
         choices.append(Annotated[cls, settings])
-    args = _calibrations_last(args)
+    args = _move_calibrations_last(args)
     command: Any = Union[tuple(choices)]  # noqa: UP007 (built at run time)
     return tyro.cli(command, prog="colmap-inertial", description=DESCRIPTION, args=list(args), config=_CONFIG)
 
 
-def _spelled_out(args: Sequence[str]) -> list[str]:
+def _expand_options(args: Sequence[str]) -> list[str]:
     """What follows the command, with each option as that command has it.
 
     The name of an option's group may be left out, and may stand where there is none: ``--latitude-deg`` and
@@ -151,13 +136,13 @@ def _require_known(args: Sequence[str]) -> None:
         return
     command = args[0].replace("_", "-")
     if command not in _COMMANDS:
-        raise InertialError(f"there is no command {args[0]}{_nearest(args[0], _COMMANDS)} (--help lists them)")
+        raise InertialError(f"there is no command {args[0]}{_suggest_nearest(args[0], _COMMANDS)} (--help lists them)")
     words = [word.partition("=")[0] for word in args[1:] if word.startswith("--") and word != "--"]
     options = _options(command)
     for word in words:
         if word.replace("_", "-") not in options:
             raise InertialError(
-                f"{args[0]} has no option {word}{_nearest(word, options)} ({args[0]} --help lists them)"
+                f"{args[0]} has no option {word}{_suggest_nearest(word, options)} ({args[0]} --help lists them)"
             )
 
 
@@ -174,19 +159,17 @@ def _options(command: str) -> tuple[str, ...]:
     return tuple(options)
 
 
-def _nearest(word: str, known: Iterable[str]) -> str:
+def _suggest_nearest(word: str, known: Iterable[str]) -> str:
     like = difflib.get_close_matches(word, list(known), n=1)
     return f"; did you mean {like[0]}?" if like else ""
 
 
-def _calibrations_last(args: Sequence[str]) -> list[str]:
+def _move_calibrations_last(args: Sequence[str]) -> list[str]:
     """The same with what follows ``--calibration`` at the end, where it does not swallow the paths of the command.
 
     It takes one file, and a second one where that is another JSON file.
     """
-    rest: list[str] = []
-    files: list[str] = []
-    remaining = list(args)
+    rest, files, remaining = list[str](), list[str](), list(args)
     while remaining:
         word = remaining.pop(0)
         if word != "--calibration":
@@ -200,26 +183,20 @@ def _calibrations_last(args: Sequence[str]) -> list[str]:
     return [*rest, "--calibration", *files] if files else rest
 
 
-def _default_from_config(cls: type[Command], args: Sequence[str]) -> Command | None:
+def _read_default(cls: type[Speaker], args: Sequence[str]) -> Speaker | None:
     """The command with its options from ``--config``, so that flags go before the file and the file before defaults."""
     from colmap_inertial.pipeline.run.config import read_config
 
-    path = None
-    for i, text in enumerate(args):
-        if text == "--config" and i + 1 < len(args):
-            path = args[i + 1]
-        elif text.startswith("--config="):
-            path = text.removeprefix("--config=")
-    if path is None or cls not in (Reconstruct, Scale, Batch):
+    given = [word.partition("=")[2] for word in args if word.startswith("--config=")]
+    given += [value for word, value in itertools.pairwise(args) if word == "--config"]
+    if not given or cls not in (Reconstruct, Scale, Batch):
         return None
-    fields = {f.name: f for f in dataclasses.fields(cls)}
-    options: Any = read_config(Path(path), ReconstructOptions)
+    options: Any = read_config(Path(given[-1]), ReconstructOptions)
     if cls is Scale:
         options = options.scale
-    required = {
-        name: tyro.MISSING for name, f in fields.items() if f.default is f.default_factory is dataclasses.MISSING
-    }
-    return cls(options=options, **required)
+    missing = dataclasses.MISSING
+    required = [f.name for f in dataclasses.fields(cls) if f.default is f.default_factory is missing]
+    return cls(**dict.fromkeys(required, tyro.MISSING), options=options)
 
 
 def main(args: Sequence[str] | None = None) -> None:
@@ -268,9 +245,9 @@ def _main(args: Sequence[str] | None) -> None:
         print(f"interrupted{again}", file=sys.stderr)
         code = TERMINATED if isinstance(stop, Terminated) else INTERRUPTED
     except (MemoryError, OSError, ImportError, RuntimeError) as error:
-        said = exhausted(error)
-        if said is None:
+        reason = exhausted(error)
+        if reason is None:
             raise
-        print(f"error: {said}", file=sys.stderr)
+        print(f"error: {reason}", file=sys.stderr)
         code = 2
     sys.exit(code)

@@ -64,7 +64,7 @@ def options_of(cls: type[Any], prefix: str = "", *, with_text: bool = True) -> l
     Without their texts it takes a quarter of the time: texts are read from the sources.
     """
     found: list[Option] = []
-    hints, words = get_type_hints(cls, include_extras=True), _words(cls) if with_text else {}
+    hints, words = get_type_hints(cls, include_extras=True), _read_texts(cls) if with_text else {}
     for f in dataclasses.fields(cls):
         hint = hints[f.name]
         kind, *settings = get_args(hint) if get_origin(hint) is Annotated else (hint,)
@@ -77,12 +77,12 @@ def options_of(cls: type[Any], prefix: str = "", *, with_text: bool = True) -> l
         default = f.default if f.default_factory is dataclasses.MISSING else f.default_factory()
         found.append(
             Option(
-                names=(f.name.upper(),) if positional else _names(kind, prefix, name, default),
+                names=(f.name.upper(),) if positional else _spell_names(kind, prefix, name, default),
                 group=prefix.rstrip("."),
                 field=f.name,
-                value="" if positional else _value(kind, name),
+                value="" if positional else _describe_value(kind, name),
                 text=words.get(f.name, ""),
-                default=_default(default, words.get(f.name, "")),
+                default=_describe_default(default, words.get(f.name, "")),
                 positional=positional,
                 required=default is dataclasses.MISSING,
                 source=next(one for one in reversed(cls.__mro__) if f.name in vars(one).get("__annotations__", ())),
@@ -91,34 +91,34 @@ def options_of(cls: type[Any], prefix: str = "", *, with_text: bool = True) -> l
     return found
 
 
-def _names(kind: Any, prefix: str, name: str, default: object) -> tuple[str, ...]:
-    if bool not in _kinds(kind):
+def _spell_names(kind: Any, prefix: str, name: str, default: object) -> tuple[str, ...]:
+    if bool not in _list_types(kind):
         return (f"--{prefix}{name}",)
     both = (f"--{prefix}{name}", f"--{prefix}no-{name}")
     return both[:1] if default is False else both
 
 
-def _kinds(kind: Any) -> tuple[Any, ...]:
+def _list_types(kind: Any) -> tuple[Any, ...]:
     """The types that a value may have, ``None`` left out."""
     if get_origin(kind) in (Union, UnionType):
-        return tuple(inner for one in get_args(kind) if one is not NoneType for inner in _kinds(one))
+        return tuple(inner for one in get_args(kind) if one is not NoneType for inner in _list_types(one))
     return (kind,)
 
 
-def _value(kind: Any, name: str) -> str:
-    (one,) = _kinds(kind)
+def _describe_value(kind: Any, name: str) -> str:
+    (one,) = _list_types(kind)
     if one is bool:
         return ""
     if get_origin(one) is Literal:
         return "{" + ",".join(map(str, get_args(one))) + "}"
     if get_origin(one) is tuple:
         inner = get_args(one)
-        single = _value(inner[0], name)
+        single = _describe_value(inner[0], name)
         return f"{single} ..." if len(inner) == 2 and inner[1] is Ellipsis else " ".join([single] * len(inner))
     return _BY_NAME.get(name, _VALUES[one])
 
 
-def _default(default: object, text: str) -> str:
+def _describe_default(default: object, text: str) -> str:
     """What counts where an option is not given; empty where its text says so, and where that is nothing."""
     if default is dataclasses.MISSING or default is None or default == () or isinstance(default, bool):
         return ""
@@ -127,7 +127,7 @@ def _default(default: object, text: str) -> str:
     return f"{default:g}" if isinstance(default, float) else str(default)
 
 
-def _words(cls: type[Any]) -> dict[str, str]:
+def _read_texts(cls: type[Any]) -> dict[str, str]:
     """The text below each field of a class and of those that it is made of."""
     found: dict[str, str] = {}
     for one in reversed(cls.__mro__):
@@ -239,7 +239,7 @@ class _Page:
             print(f"{indent}{text_line}")
 
     def group(self, title: str, options: Iterable[Option], more: Sequence[tuple[str, str]] = ()) -> None:
-        entries = [(_label(option), _said(option)) for option in options]
+        entries = [(_label(option), _describe(option)) for option in options]
         if not entries:
             return
         self.heading(title)
@@ -251,7 +251,7 @@ def _label(option: Option) -> str:
     return " ".join(filter(None, [", ".join(option.names), option.value]))
 
 
-def _said(option: Option) -> str:
+def _describe(option: Option) -> str:
     marks = ["(required)"] if option.required and not option.positional else []
     marks += [f"[{option.default}]"] if option.default else []
     return " ".join([option.text, *marks])

@@ -171,11 +171,11 @@ class Apply(Reader):
                     follow_links=self.follow_links,
                     progress=files,
                 )
-        self.tell(lambda: show_applied(applied), _applied_as_json(applied))
+        self.tell(lambda: show_applied(applied), _as_json(applied))
         return 0
 
 
-def _applied_as_json(applied: Applied) -> dict[str, Any]:
+def _as_json(applied: Applied) -> dict[str, Any]:
     models = [
         {
             "index": index,

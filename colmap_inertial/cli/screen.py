@@ -122,8 +122,8 @@ class Screen:
         if stage not in self._stages:
             self._say_kept()
             self._stages[stage] = Stage(now, done, total, self._outputs.get(stage, ()))
-            self._tasks[stage] = self._bars.add_task(_named(stage), total=None, stage=self._stages[stage])
-            self._line(f"{_named(stage)} ...")
+            self._tasks[stage] = self._bars.add_task(_name_stage(stage), total=None, stage=self._stages[stage])
+            self._line(f"{_name_stage(stage)} ...")
             self._said_s[stage] = now
         known = self._stages[stage]
         known.moved(now, done, total)
@@ -133,10 +133,10 @@ class Screen:
         self._said_s[stage] = now
         if total and done >= total:
             self._ended.add(stage)
-            self._line(f"{_named(stage)} {done}/{total}, took {clock(known.seconds(now))}")
+            self._line(f"{_name_stage(stage)} {done}/{total}, took {clock(known.seconds(now))}")
         else:
             counted = f"{done}/{total}" if total else f"{done}"
-            self._line(", ".join(filter(None, [f"{_named(stage)} {counted}", known.ends_in(now)])))
+            self._line(", ".join(filter(None, [f"{_name_stage(stage)} {counted}", known.ends_in(now)])))
 
     def kept(self, step: str, /) -> None:
         """A step of an earlier run stands."""
@@ -150,7 +150,7 @@ class Screen:
 
     def _say_kept(self) -> None:
         if self._kept:
-            names = ", ".join(_named(stage).lower() for stage in self._kept)
+            names = ", ".join(_name_stage(stage).lower() for stage in self._kept)
             self._kept.clear()
             self._console.print(f"kept from the earlier run: {names}", soft_wrap=not self._console.is_terminal)
 
@@ -183,7 +183,7 @@ class Screen:
             self._console.print("an error makes a scale wrong or impossible; Ctrl-C ends the run")
 
 
-def _named(stage: str) -> str:
+def _name_stage(stage: str) -> str:
     return _STAGES.get(stage, stage.replace("_", " ").capitalize())
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from colmap_inertial.cli.screen import Screen, live_progress
 from colmap_inertial.core.options import ReadLimits
@@ -33,6 +33,16 @@ class Speaker:
     def __post_init__(self) -> None:
         if self.quiet and self.verbose:
             raise ValueError("give one of --quiet and --verbose")
+
+    if TYPE_CHECKING:  # a field of some commands, computed by others
+
+        @property
+        def limits(self) -> ReadLimits:
+            """How large a file may be that is read."""
+
+    def run(self) -> int:
+        """Run the command; returns the exit code."""
+        raise NotImplementedError
 
     @property
     def answers_in_json(self) -> bool:

@@ -68,18 +68,18 @@ def scale_lines(estimate: ScaleEstimate) -> list[Line]:
         ("verdict", Text(estimate.verdict, f"bold {_COLOUR[estimate.verdict]}")),
         *scale_facts(values),
         *([] if estimate.parts is None else zip(("made of", "narrower"), parts_in_words(estimate.parts), strict=True)),
-        *_listed("reason", estimate.reasons),
-        *_listed("note", estimate.notes),
+        *_label_first("reason", estimate.reasons),
+        *_label_first("note", estimate.notes),
         *sensor_facts(values),
     ]
 
 
-def _listed(label: str, texts: Iterable[object]) -> list[Line]:
+def _label_first(label: str, texts: Iterable[object]) -> list[Line]:
     """Lines of which the first one bears the label."""
     return [("" if i else label, str(text)) for i, text in enumerate(texts)]
 
 
-def _show(title: str, lines: Iterable[Line]) -> None:
+def _print_panel(title: str, lines: Iterable[Line]) -> None:
     from rich.console import Console
     from rich.panel import Panel
     from rich.table import Table
@@ -96,7 +96,7 @@ def _show(title: str, lines: Iterable[Line]) -> None:
 
 def show_scale(estimate: ScaleEstimate, source: Path) -> None:
     """Print one scale estimate."""
-    _show(str(source), [*scale_lines(estimate), ("method", f"{estimate.method}, {estimate.runtime_s:.2f} s")])
+    _print_panel(str(source), [*scale_lines(estimate), ("method", f"{estimate.method}, {estimate.runtime_s:.2f} s")])
 
 
 def show_applied(applied: Applied) -> None:
@@ -118,8 +118,8 @@ def show_applied(applied: Applied) -> None:
         more = f" and {len(paths) - 1} more" if len(paths) > 1 else ""
         lines.append((kind, f"{paths[0]}{more}"))
     lines.append(("unchanged", ", ".join(f"{n} {how}" for how, n in applied.unchanged.items()) or "nothing"))
-    lines += [*_listed("note", applied.notes), ("written", str(applied.out))]
-    _show("Project", lines)
+    lines += [*_label_first("note", applied.notes), ("written", str(applied.out))]
+    _print_panel("Project", lines)
 
 
 def show_remembered(known: Remembered) -> None:
@@ -128,7 +128,7 @@ def show_remembered(known: Remembered) -> None:
         print(f'{known.device}: uses the remembered calibration "{kind}", {path} (--no-remembered leaves it out)')
 
 
-def _kept(kept: Path | None) -> list[Line]:
+def _remembered_lines(kept: Path | None) -> list[Line]:
     return [] if kept is None else [("remembered", f"{kept}; reconstruct and scale take it by the device's name")]
 
 
@@ -139,10 +139,10 @@ def show_imu_calibration(found: RestCalibration, source: Path, out: Path, kept: 
     from colmap_inertial.checks.report.imu_calibration import calibration_facts, gain_effect
 
     colour = {"good": "green", "weak": "yellow"}[found.verdict]
-    lines: list[Line] = [("verdict", Text(found.verdict, f"bold {colour}")), *_listed("reason", found.reasons)]
+    lines: list[Line] = [("verdict", Text(found.verdict, f"bold {colour}")), *_label_first("reason", found.reasons)]
     lines += [*calibration_facts(found), ("scale", gain_effect(found))]
-    lines += [*_listed("written", (out, out.with_suffix(".html"))), *_kept(kept)]
-    _show(str(source), lines)
+    lines += [*_label_first("written", (out, out.with_suffix(".html"))), *_remembered_lines(kept)]
+    _print_panel(str(source), lines)
 
 
 def show_calibration(calibration: CameraImuCalibration, source: Path, kept: Path | None = None) -> None:
@@ -157,7 +157,7 @@ def show_calibration(calibration: CameraImuCalibration, source: Path, kept: Path
         ("time offset", f"{offset:+.4f} s, +-{offset_ms:.2g} ms (camera time = stamp + offset)"),
         ("gyro bias", f"{bias} rad/s, +-{bias_spread:.2g}"),
     ]
-    _show(str(source), [*lines, *_kept(kept)])
+    _print_panel(str(source), [*lines, *_remembered_lines(kept)])
 
 
 def show_diagnosis(diagnosis: Diagnosis, source: Path) -> None:
@@ -219,8 +219,8 @@ def show_reference(found: Reference) -> None:
     metres = length_in_words("trusted", half_width_pct(found.metres_per_unit, found.ci95))
     values = {"metres_per_unit": found.metres_per_unit, "ci95": found.ci95}
     lines: list[Line] = [("metres", f"{metres}{', as far as the target reaches' if small else ''}")]
-    lines += [("from", found.made_of), *scale_facts(values), *_listed("note", found.notes)]
-    _show("Project", [*lines, ("written", str(found.out))])
+    lines += [("from", found.made_of), *scale_facts(values), *_label_first("note", found.notes)]
+    _print_panel("Project", [*lines, ("written", str(found.out))])
     print(f"next: {shlex.join(['colmap-inertial', 'view', str(found.out)])}")
 
 
@@ -242,7 +242,7 @@ def show_deblurred(result: DeblurResult) -> None:
     if result.sheet is not None:
         written.append(result.sheet)
     lines = imaging_lines(result.frames, result.imaging, result.rectified)
-    _show("Images", [*lines, *_listed("written", written)])
+    _print_panel("Images", [*lines, *_label_first("written", written)])
 
 
 def show_result(result: ReconstructResult, source: Path) -> None:
@@ -251,13 +251,13 @@ def show_result(result: ReconstructResult, source: Path) -> None:
         show_nothing_to_do(result.workspace)
     for model in result.models:
         number = "" if model.colmap_index == model.index else f" (COLMAP's {model.colmap_index})"
-        _show(f"Model {model.index}{number}", _model_lines(model, result))
+        _print_panel(f"Model {model.index}{number}", _model_lines(model, result))
     if all(model.sparse_metric is None for model in result.models) and result.workspace.colmap_sparse.is_dir():
         print(
             f"metres by hand: colmap-inertial reconstruct {shlex.quote(str(result.workspace.colmap))} NEW_FOLDER "
             "--scale-from target --target ..., or --scale-from distance (--help)"
         )
-    print(_layout_in_a_line(result))
+    print(_describe_layout(result))
     for fragment in result.fragments:
         print(
             f"COLMAP's model {fragment.colmap_index} is a fragment of {fragment.registered_images} images, left out; "
@@ -304,13 +304,13 @@ def _model_lines(model: ModelResult, result: ReconstructResult) -> Iterator[Line
         yield "dense", f"{maps}, {dense.points} points, {dense.faces} faces"
     made_of_dense = () if dense is None else (dense.fused, dense.mesh)
     paths = (model.sparse_metric, model.trajectory, *made_of_dense, result.project_metric)
-    yield from _listed("written", filter(None, (*paths, result.workspace.result, result.report)))
+    yield from _label_first("written", filter(None, (*paths, result.workspace.result, result.report)))
     if result.report is None:
         yield "report", f"failed, see {result.workspace.log}"
     yield "time", ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in result.seconds.items())
 
 
-def _layout_in_a_line(result: ReconstructResult) -> str:
+def _describe_layout(result: ReconstructResult) -> str:
     """Where what is metric lies, and where what is not."""
     workspace = result.workspace
     if all(model.sparse_metric is None for model in result.models):
@@ -335,11 +335,11 @@ def show_exported(made: Exported) -> None:
         ("unit", unit),
         *([("images", str(made.images))] if made.images else []),
         *([("points", str(made.points))] if made.points else []),
-        *_listed("note", made.notes),
+        *_label_first("note", made.notes),
         *([("use", made.says)] if made.says else []),
         ("written", str(made.folder)),
     ]
-    _show("Export" if made.program is None else f"Export for {made.program}", lines)
+    _print_panel("Export" if made.program is None else f"Export for {made.program}", lines)
     if made.command:
         # not in the panel, which would break the line that is to be copied
         print(made.command)

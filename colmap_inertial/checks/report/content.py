@@ -85,10 +85,10 @@ def gather(
     if shown:
         made = parts_mapped_in_words(done.get("mapping"))
         made += mapped_in_words(done.get("mapping"), shown[0].get("colmap_index"))
-        outcome = {**outcome, "summary": [*outcome["summary"], *made, *_path_in_words(shown[0])]}
+        outcome = {**outcome, "summary": [*outcome["summary"], *made, *_describe_path(shown[0])]}
     if len(shown) > 1:
-        said = f"There are {len(shown)} separate models. This is model {shown[0]['index']}; the others follow below."
-        outcome = {**outcome, "summary": [*outcome["summary"], said]}
+        several = f"There are {len(shown)} separate models. This is model {shown[0]['index']}; the others follow below."
+        outcome = {**outcome, "summary": [*outcome["summary"], several]}
     source = done.get("capture", capture) or str(out)
     return {
         "format": "colmap-inertial report",
@@ -112,9 +112,9 @@ def gather(
     }
 
 
-def _path_in_words(model: Content) -> list[str]:
+def _describe_path(model: Content) -> list[str]:
     """What the refinement did to a model's path, in a sentence; or that it could."""
-    done = [one for one in model.get("treatments", []) if one["stage"] == "refine"]
+    done = [each for each in model.get("treatments", []) if each["stage"] == "refine"]
     if not done:
         length = model.get("scene", {}).get("path_length")
         if model.get("sparse_metric") is None or length is None or length < SIZES.long_path_m:
@@ -129,17 +129,17 @@ def _path_in_words(model: Content) -> list[str]:
 
 def refined_parts(model: Content) -> list[Content]:
     """By how much the refinement stretched the parts of a model's path; empty where it left the model as it was."""
-    done = [one for one in model.get("treatments", []) if one["stage"] == "refine" and one["action"]]
+    done = [each for each in model.get("treatments", []) if each["stage"] == "refine" and each["action"]]
     parts: list[Content] = done[-1]["values"].get("drift", []) if done else []
     return parts
 
 
 def _selection(done: Content) -> Content | None:
-    found = done.get("selection")
-    return None if found is None else {key: found[key] for key in ("frames", "used", "note")}
+    selection = done.get("selection")
+    return None if selection is None else {key: selection[key] for key in ("frames", "used", "note")}
 
 
-def _missing(why: str) -> Content:
+def _mark_missing(why: str) -> Content:
     return {"missing": why}
 
 
@@ -155,9 +155,9 @@ def _model(out: Path, model: Content, *, in_full: bool, project: bool) -> Conten
     kept.setdefault("notes", [])  # earlier runs had all of it among the reasons
     kept["half_width_pct"] = None if scale is None else half_width_pct(scale, ci95)
     if scale is None:
-        kept["drift"] = _missing("There is no scale whose parts could be compared.")
+        kept["drift"] = _mark_missing("There is no scale whose parts could be compared.")
     else:
-        unknown = _missing("This method does not tell the scale of parts of the recording.")
+        unknown = _mark_missing("This method does not tell the scale of parts of the recording.")
         kept["drift"] = model.get("drift") or unknown
     kept["validation"] = _validation(out, model, project=project)
     file = model_file(out, model["index"])
@@ -166,8 +166,8 @@ def _model(out: Path, model: Content, *, in_full: bool, project: bool) -> Conten
     else:
         failed = "What it is drawn from was not kept; where that failed, log.txt says why."
         why = failed if in_full else f"Only the {SIZES.models} largest models are shown in full."
-        kept["scene"], kept["signals"] = _missing(why), _missing(why)
-    kept.setdefault("photogrammetry", _missing("It was not kept: an earlier version made this run."))
+        kept["scene"], kept["signals"] = _mark_missing(why), _mark_missing(why)
+    kept.setdefault("photogrammetry", _mark_missing("It was not kept: an earlier version made this run."))
     kept["outcome"] = outcome_of_model({**model, "signals": kept["signals"]})
     return kept
 
@@ -176,12 +176,14 @@ def _validation(out: Path, model: Content, *, project: bool) -> Content:
     found = model.get("validation")
     if found is None:
         if model["metres_per_unit"] is None:
-            return _missing("Without a scale there is nothing to measure a target with.")
+            return _mark_missing("Without a scale there is nothing to measure a target with.")
         if project:
-            return _missing("No target was named, or the project's images are not at hand (then the notes say so).")
-        return _missing("The capture names no target of known size ([target] in capture.toml).")
+            return _mark_missing(
+                "No target was named, or the project's images are not at hand (then the notes say so)."
+            )
+        return _mark_missing("The capture names no target of known size ([target] in capture.toml).")
     if "error" in found:
-        return _missing(f"The target could not be measured: {found['error']}.")
+        return _mark_missing(f"The target could not be measured: {found['error']}.")
     folder = out / "validation" / str(model["index"])
     images = sorted(folder.glob("*.jpg")) if folder.is_dir() else []
     chosen = [str(images[i].relative_to(out)) for i in strided(len(images), SIZES.target_images)]
@@ -191,7 +193,7 @@ def _validation(out: Path, model: Content, *, project: bool) -> Content:
 def _findings(out: Path) -> Content:
     file = out / "diagnosis.json"
     if not file.is_file():
-        return _missing("The recording was not looked at beforehand, or what was found was not kept.")
+        return _mark_missing("The recording was not looked at beforehand, or what was found was not kept.")
     found = read_json(file)
     return {"checked": found["checked"], "findings": found["findings"]}
 
@@ -205,11 +207,11 @@ def _of_recording(recording: Content) -> Content:
 
 def _blur(done: Content, recording: Content | None, *, project: bool) -> Content:
     if project:
-        return _missing("The images of an existing project are left as they are.")
+        return _mark_missing("The images of an existing project are left as they are.")
     note = done.get("imaging", {}).get("deblur") or "the run did not get that far"
     known = [frame for frame in done["frames"] if frame["blur_px"] is not None]
     if not known or recording is None:
-        return _missing(f"No blur to show: {note}.")
+        return _mark_missing(f"No blur to show: {note}.")
     time_of = dict(zip(recording["frames"]["names"], recording["frames"]["t_s"], strict=True))
     blur_px = np.array([frame["blur_px"] for frame in known])
     some = strided(len(known), SIZES.blur_frames)
@@ -231,8 +233,8 @@ def _crops(out: Path, done: Content) -> Content:
     crops = read_json(file)["crops"] if file.is_file() else []
     if not crops:
         if any(frame["action"] == "deblurred" for frame in done["frames"]):
-            return _missing("Of the frames that were looked at before and after, none differs.")
-        return _missing("No frame was deblurred, so there is nothing to show before and after.")
+            return _mark_missing("Of the frames that were looked at before and after, none differs.")
+        return _mark_missing("No frame was deblurred, so there is nothing to show before and after.")
     reason = {frame["name"]: frame["reason"] for frame in done["frames"]}
     folder = f"{DATA_FOLDER}/{CROPS_FOLDER}/"
     return {
@@ -247,7 +249,7 @@ def _rolling_shutter(done: Content, recording: Content | None) -> Content:
     movement = None if recording is None else recording["rolling_shutter"]
     if movement is None:
         note = done.get("imaging", {}).get("rolling_shutter")
-        return _missing(f"Nothing was done about a rolling shutter{f': {note}' if note else ''}.")
+        return _mark_missing(f"Nothing was done about a rolling shutter{f': {note}' if note else ''}.")
     assert recording is not None
     note = done.get("imaging", {}).get("rolling_shutter", "")
     return {"note": note, "readout_s": recording["frames"]["readout_s"], **movement}
@@ -256,6 +258,6 @@ def _rolling_shutter(done: Content, recording: Content | None) -> Content:
 def _configuration(out: Path) -> Content:
     file = out / "config.toml"
     if not file.is_file():
-        return _missing("The run ended before its configuration was written.")
+        return _mark_missing("The run ended before its configuration was written.")
     text = read_text(file)
     return {"toml": text, "values": tomllib.loads(text)}

@@ -66,14 +66,14 @@ def _right_axis(title: str, overlaying: str, **more: Any) -> Figure:
     return {"overlaying": overlaying, "side": "right", "showgrid": False, **axis(title), **more}
 
 
-def _scaled(lines: Lines, factor: float) -> list[dict[str, Any]]:
+def _scale_lines(lines: Lines, factor: float) -> list[dict[str, Any]]:
     return [
         {"t_s": line["t_s"], "values": [None if v is None else round(v * factor, 5) for v in line["values"]]}
         for line in lines
     ]
 
 
-def _rows(
+def _stack_rows(
     sides: Sequence[tuple[str, str, Lines, str]], titles: Sequence[str], *, unit: str, right_unit: str = ""
 ) -> Figure:
     """Rows over one time axis; a side is name, colour, a line for each row, and its axis (``"left"``, ``"right"``)."""
@@ -103,7 +103,7 @@ def _rows(
     return {"data": data, "layout": rows}
 
 
-def _underlaid(figure: Figure) -> Figure:
+def _underlay(figure: Figure) -> Figure:
     """The first of two curves wide and pale, so that both are seen where they lie on each other."""
     for trace in figure["data"][::2]:
         trace["line"] = {**trace["line"], "width": 5}
@@ -119,7 +119,7 @@ def rotation_before(rotation: dict[str, Any]) -> Figure | None:
     sides = (("camera", CAMERA), ("gyroscope", IMU))
     speeds_only = rotation["after"] is None and "camera_size" in before
     shown = {key: [before[f"{key}_size"]] if speeds_only else before[key] for key, _ in sides}
-    return _rows(_in_degrees(shown, sides), ["angular speed"] if speeds_only else ["x", "y", "z"], unit="°/s")
+    return _stack_rows(_in_degrees(shown, sides), ["angular speed"] if speeds_only else ["x", "y", "z"], unit="°/s")
 
 
 def rotation_after(rotation: dict[str, Any]) -> Figure | None:
@@ -127,13 +127,15 @@ def rotation_after(rotation: dict[str, Any]) -> Figure | None:
     after = rotation["after"]
     if after is None:
         return None
-    return _underlaid(_rows(_in_degrees(after, (("gyroscope", IMU), ("camera", CAMERA))), ["x", "y", "z"], unit="°/s"))
+    return _underlay(
+        _stack_rows(_in_degrees(after, (("gyroscope", IMU), ("camera", CAMERA))), ["x", "y", "z"], unit="°/s")
+    )
 
 
 def _in_degrees(
     record: dict[str, Any], sides: Sequence[tuple[str, str]]
 ) -> list[tuple[str, str, list[dict[str, Any]], str]]:
-    return [(name, colour, _scaled(record[name], math.degrees(1)), "left") for name, colour in sides]
+    return [(name, colour, _scale_lines(record[name], math.degrees(1)), "left") for name, colour in sides]
 
 
 def accelerations(acceleration: dict[str, Any]) -> Figure:
@@ -143,14 +145,14 @@ def accelerations(acceleration: dict[str, Any]) -> Figure:
         ("accelerometer", IMU, acceleration["accelerometer"], "left"),
         ("camera", CAMERA, acceleration["camera"], "left" if metric else "right"),
     )
-    figure = _rows(
+    figure = _stack_rows(
         sides,
         ["level 1", "level 2", "up"],
         unit="m/s²",
         right_unit="" if metric else "model units/s²",
     )
     if metric:
-        return _underlaid(figure)
+        return _underlay(figure)
     # without a unit the factor between the curves is open: zero in the middle of both, and what a hand does as measure
     for row, (imu, camera) in enumerate(zip(acceleration["accelerometer"], acceleration["camera"], strict=True)):
         key = "" if row == 0 else str(row + 1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -44,35 +44,41 @@ def photogrammetry_record(
     lengths = np.array([track.length() for track in tracks], dtype=np.intp)
     upright = quat_rotate(display_from_model_xyzw, xyz) if len(xyz) else xyz
     seen = [
-        _seen(reconstruction.camera(images[i].camera_id), images[i], place)
+        _observe(reconstruction.camera(images[i].camera_id), images[i], place)
         for i in strided(len(images), SIZES.residual_images)
     ]
     sigma, longest = intrinsics_sigma(reconstruction), SIZES.longest_track
     return {
         "unit": unit,
-        "cameras": [_camera(reconstruction, i, image_ids, sigma.get(i)) for i in _most_used(reconstruction, image_ids)],
+        "cameras": [
+            _describe_camera(reconstruction, i, image_ids, sigma.get(i))
+            for i in _choose_cameras(reconstruction, image_ids)
+        ],
         "images": [
             {"name": s.name, "observations": len(s.residual_px), "rms_px": _rms(s.residual_px), "gsd": s.gsd}
             for s in seen
         ],
-        "sensor": _sensor(seen),
+        "sensor": _average_over_sensor(seen),
         "tracks": {
             "mean": float(lengths.mean()) if len(lengths) else 0.0,
             "counts": np.bincount(np.minimum(lengths, longest), minlength=longest + 1)[2:].tolist(),
         },
-        "extent": _span(upright),
-        "ground": _ground(upright, tracks),
+        "extent": _measure_extent(upright),
+        "ground": _count_from_above(upright, tracks),
     }
 
 
-class _Seen:
+class _Seen(NamedTuple):
     """What one image sees: where, how far from where the model has it, and how fine."""
 
-    def __init__(self, name: str, size: tuple[int, int], xy_px: Array, residual_px: Array, gsd: float | None) -> None:
-        self.name, self.size, self.xy_px, self.residual_px, self.gsd = name, size, xy_px, residual_px, gsd
+    name: str
+    size: tuple[int, int]
+    xy_px: Array
+    residual_px: Array
+    gsd: float | None
 
 
-def _seen(camera: pycolmap.Camera, image: pycolmap.Image, place: Mapping[int, Array]) -> _Seen:
+def _observe(camera: pycolmap.Camera, image: pycolmap.Image, place: Mapping[int, Array]) -> _Seen:
     """``place``: (3,) by a point's number."""
     observed = image.get_observation_points2D()
     xy_px = np.array([p.xy for p in observed], dtype=np.float64).reshape(-1, 2)
@@ -91,12 +97,12 @@ def _rms(residual_px: Array) -> float | None:
     return float(np.sqrt(np.mean(np.sum(residual_px**2, axis=1)))) if len(residual_px) else None
 
 
-def _most_used(reconstruction: pycolmap.Reconstruction, image_ids: list[int]) -> list[int]:
+def _choose_cameras(reconstruction: pycolmap.Reconstruction, image_ids: list[int]) -> list[int]:
     used = [reconstruction.image(i).camera_id for i in image_ids]
     return sorted(set(used), key=lambda i: (-used.count(i), i))[: SIZES.cameras]
 
 
-def _camera(
+def _describe_camera(
     reconstruction: pycolmap.Reconstruction, camera_id: int, image_ids: list[int], sigma: Array | None
 ) -> dict[str, Any]:
     """Intrinsics, field of view, and by how much the lens moves points from where a pinhole would have them."""
@@ -127,7 +133,7 @@ def _camera(
     }
 
 
-def _sensor(seen: list[_Seen]) -> dict[str, Any] | None:
+def _average_over_sensor(seen: list[_Seen]) -> dict[str, Any] | None:
     """Mean residual over the sensor, of the images of the commonest size."""
     sizes = [s.size for s in seen if len(s.xy_px)]
     if not sizes:
@@ -149,17 +155,17 @@ def _sensor(seen: list[_Seen]) -> dict[str, Any] | None:
         "columns": columns,
         "rows": rows,
         "count": count.tolist(),
-        "mean_x_px": _known(x),
-        "mean_y_px": _known(y),
-        "rms_px": _known(rms),
+        "mean_x_px": _round_known(x),
+        "mean_y_px": _round_known(y),
+        "rms_px": _round_known(rms),
     }
 
 
-def _known(values: Array) -> list[float | None]:
+def _round_known(values: Array) -> list[float | None]:
     return [round(float(v), 3) if np.isfinite(v) else None for v in values]
 
 
-def _span(upright: Array) -> list[float] | None:
+def _measure_extent(upright: Array) -> list[float] | None:
     """(3,) how far nearly all points reach, along x, y and up."""
     if not len(upright):
         return None
@@ -167,7 +173,7 @@ def _span(upright: Array) -> list[float] | None:
     return [round(float(v), 4) for v in high - low]
 
 
-def _ground(upright: Array, tracks: list[Any]) -> dict[str, Any] | None:
+def _count_from_above(upright: Array, tracks: list[Any]) -> dict[str, Any] | None:
     """Images that see each square of the ground, from above."""
     if len(upright) < 2:
         return None

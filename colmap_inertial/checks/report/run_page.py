@@ -148,12 +148,12 @@ def intrinsics_rows(camera: Content) -> Rows:
     """Name, meaning, value and standard deviation of each parameter of a camera."""
     sigma = camera.get("sigma", {})
     return [
-        (key, _PARAMETERS.get(key, "distortion"), *_with_sigma(value, sigma.get(key)))
+        (key, _PARAMETERS.get(key, "distortion"), *_round_to_sigma(value, sigma.get(key)))
         for key, value in camera["params"].items()
     ]
 
 
-def _with_sigma(value: float, sigma: float | None) -> tuple[str, str]:
+def _round_to_sigma(value: float, sigma: float | None) -> tuple[str, str]:
     """A value to the second digit of its standard deviation, and that."""
     if sigma is None or not sigma > 0:
         return f"{value:.6g}", ""

@@ -47,14 +47,14 @@ def scene_record(
         down = quat_rotate(world_from_cam, np.array([0.0, 1.0, 0.0])).mean(axis=0)
     upright = rotation_between(down, np.array([0.0, 0.0, -1.0]))
     centres = quat_rotate(upright, trajectory.cam_in_world)
-    xyz, rgb = _points(reconstruction, trajectory.cam_in_world)
+    xyz, rgb = _choose_points(reconstruction, trajectory.cam_in_world)
     xyz = quat_rotate(upright, xyz) if len(xyz) else xyz
     some = strided(len(centres), SIZES.scene_cameras)
     poses = strided(len(centres), SIZES.scene_poses)
-    size = _extent(np.concatenate([xyz, centres]))
+    size = _measure_extent(np.concatenate([xyz, centres]))
     digits = int(np.clip(4 - np.floor(np.log10(size)), 0, 9)) if size > 0 else 6
     axes = np.einsum("ij,njk->nik", matrix_from_quat(upright), matrix_from_quat(world_from_cam[some]))
-    half_width, half_height = _half_sides(reconstruction)
+    half_width, half_height = _measure_half_sides(reconstruction)
     return {
         "unit": trajectory.length_unit,
         "gravity_known": gravity_in_world_m_s2 is not None,
@@ -77,7 +77,7 @@ def scene_record(
     }
 
 
-def _half_sides(reconstruction: pycolmap.Reconstruction) -> tuple[float, float]:
+def _measure_half_sides(reconstruction: pycolmap.Reconstruction) -> tuple[float, float]:
     """Half of an image's width and height at distance 1; a nominal size for cameras that see all around."""
     images = reconstruction.reg_image_ids()
     camera = reconstruction.camera(reconstruction.image(min(images)).camera_id)
@@ -86,7 +86,7 @@ def _half_sides(reconstruction: pycolmap.Reconstruction) -> tuple[float, float]:
     return 0.5 * camera.width / focal, 0.5 * camera.height / focal
 
 
-def _points(reconstruction: pycolmap.Reconstruction, centres: Array) -> tuple[Array, UInt8Array]:
+def _choose_points(reconstruction: pycolmap.Reconstruction, centres: Array) -> tuple[Array, UInt8Array]:
     """(N, 3) positions and colours of some points, chosen by their numbers: the same each time."""
     chosen = []
     ids = sorted(reconstruction.point3D_ids())
@@ -106,5 +106,5 @@ def _points(reconstruction: pycolmap.Reconstruction, centres: Array) -> tuple[Ar
     return xyz[near], np.array([chosen[i].color for i in near], dtype=np.uint8).reshape(-1, 3)
 
 
-def _extent(xyz: Array) -> float:
+def _measure_extent(xyz: Array) -> float:
     return float(np.ptp(xyz, axis=0).max()) if len(xyz) else 0.0

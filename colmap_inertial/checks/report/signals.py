@@ -86,12 +86,12 @@ def signal_record(
         "first_frame_s": start_s,
         "alignment": "found" if calibration is not None else "failed",
     }
-    rates = _Rates.of(trajectory)
+    rates = _Rates(trajectory)
     aligned = None
     if calibration is not None:
         timed = CameraTimedImu.from_recording(imu, calibration, trajectory.epoch_ns)
         imu, aligned = timed.imu, GyroCamera.from_timed(timed)
-    record["rotation"] = _rotation(trajectory, imu, rates, aligned, start_s)
+    record["rotation"] = _compare_rotations(trajectory, imu, rates, aligned, start_s)
     no_accel = "The recording has no accelerometer."
     if aligned is None or calibration is None:
         why = "Camera and IMU could not be brought together, so their {} cannot be compared."
@@ -104,11 +104,11 @@ def signal_record(
         why = why.format("accelerations") if imu.has_accel else no_accel
         record["acceleration"] = record["acceleration_spectrum"] = {"missing": why}
         return record
-    record["rotation_spectrum"] = _rotation_spectrum(rates, aligned)
+    record["rotation_spectrum"] = _compare_rotation_spectra(rates, aligned)
     if not imu.has_accel:
         record["acceleration"] = record["acceleration_spectrum"] = {"missing": no_accel}
         return record
-    both = _Accelerations.of(trajectory, timed, estimate, gravity_in_world_m_s2)
+    both = _Accelerations(trajectory, timed, estimate, gravity_in_world_m_s2)
     record["acceleration"] = both.record(start_s)
     record["acceleration_spectrum"] = both.spectrum()
     return record
@@ -117,20 +117,16 @@ def signal_record(
 class _Rates:
     """The camera's rotation from each frame to the next (K, 3), rad/s, camera frame, at ``middle_s``."""
 
-    def __init__(self, begin_s: Array, end_s: Array, rate_rad_s: Array) -> None:
-        self.begin_s, self.end_s, self.rate_rad_s = begin_s, end_s, rate_rad_s
-        self.middle_s = 0.5 * (begin_s + end_s)
-        self.step_s = float(np.median(end_s - begin_s))
-
-    @classmethod
-    def of(cls, trajectory: CameraTrajectory) -> _Rates:
+    def __init__(self, trajectory: CameraTrajectory) -> None:
         t_s, rotation = trajectory.t_s, trajectory.turn_rad()
         rate = rotation / np.diff(t_s)[:, None]
         rate[
             (np.diff(t_s) > SETTINGS.longest_pause_s)
             | (np.linalg.norm(rotation, axis=1) > SETTINGS.largest_rotation_rad)
         ] = np.nan
-        return cls(t_s[:-1], t_s[1:], rate)
+        self.begin_s, self.end_s, self.rate_rad_s = t_s[:-1], t_s[1:], rate
+        self.middle_s = 0.5 * (self.begin_s + self.end_s)
+        self.step_s = float(np.median(self.end_s - self.begin_s))
 
     def by_gyroscope(self, motion: GyroCamera) -> Array:
         """The gyroscope's rotation over the same intervals."""
@@ -140,7 +136,7 @@ class _Rates:
         return np.where(known[:, None], rate, np.nan)
 
 
-def _rotation(
+def _compare_rotations(
     trajectory: CameraTrajectory, imu: ImuRecording, rates: _Rates, aligned: GyroCamera | None, start_s: float
 ) -> Record:
     shift_s = epoch_shift_s(imu, trajectory.epoch_ns)
@@ -148,7 +144,7 @@ def _rotation(
     overlap = gyro_s[0] < trajectory.t_s[-1] and gyro_s[-1] > trajectory.t_s[0]
     # clocks that have nothing in common are drawn from the first sample of each
     gyro_s = gyro_s - start_s if overlap else imu.gyro_t_s - imu.gyro_t_s[0]
-    raw_s, raw = _averaged(gyro_s, imu.gyro_rad_s, max(rates.step_s, 0.02))
+    raw_s, raw = _average_windows(gyro_s, imu.gyro_rad_s, max(rates.step_s, 0.02))
     times = rates.middle_s - start_s
     before_s = times if overlap else rates.middle_s - trajectory.t_s[0]
     near = (raw_s >= before_s[0] - 2) & (raw_s <= before_s[-1] + 2)
@@ -182,7 +178,7 @@ def _rms(vectors: Array) -> float:
     return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
 
 
-def _averaged(t_s: Array, values: Array, width_s: float) -> tuple[Array, Array]:
+def _average_windows(t_s: Array, values: Array, width_s: float) -> tuple[Array, Array]:
     """Means of samples (N, 3) over windows of equal length."""
     place = np.floor((t_s - t_s[0]) / width_s).astype(np.intp)
     found, index, count = np.unique(place, return_inverse=True, return_counts=True)
@@ -190,11 +186,11 @@ def _averaged(t_s: Array, values: Array, width_s: float) -> tuple[Array, Array]:
     return t_s[0] + (found + 0.5) * width_s, sums / count[:, None]
 
 
-def _rotation_spectrum(rates: _Rates, aligned: GyroCamera) -> Record:
+def _compare_rotation_spectra(rates: _Rates, aligned: GyroCamera) -> Record:
     path: GyroPath = aligned.path
     begin_s, end_s = rates.begin_s[0] - aligned.offset_s, rates.end_s[-1] - aligned.offset_s
     during = (path.t_s >= begin_s) & (path.t_s <= end_s)
-    return _spectra(
+    return _collect_spectra(
         camera=(rates.middle_s, rates.rate_rad_s),
         imu_at_frames=(rates.middle_s, rates.by_gyroscope(aligned)),
         imu=(path.t_s[during], path.rate_rad_s[during]),
@@ -205,21 +201,12 @@ class _Accelerations:
     """Accelerations of the IMU's place by camera (K, 3) and accelerometer (K, 3), gravity-aligned, at ``t_s``."""
 
     def __init__(
-        self, trajectory: CameraTrajectory, path: Array, inertial: WorldAcceleration, metric: bool, step_s: float
-    ) -> None:
-        self._t_s, self._path, self._inertial = trajectory.t_s, path, inertial
-        self._sums = inertial.sums(trajectory.t_s)[:, 0]
-        self._covered = np.concatenate([[0], np.cumsum(~inertial.covers(trajectory.t_s))])
-        self._metric, self._step_s = metric, step_s
-
-    @classmethod
-    def of(
-        cls,
+        self,
         trajectory: CameraTrajectory,
         timed: CameraTimedImu,
         estimate: ScaleEstimate,
         gravity: Array | None,
-    ) -> _Accelerations:
+    ) -> None:
         attitude = smooth_attitude(trajectory, timed)
         bias = np.zeros(3) if estimate.accel_bias_m_s2 is None else estimate.accel_bias_m_s2
         inertial = WorldAcceleration.of(timed, attitude, bias_m_s2=bias, gravity_in_world_m_s2=np.zeros(3))
@@ -234,8 +221,10 @@ class _Accelerations:
             calibration = timed.calibration
             lever = quat_rotate(quat_conjugate(calibration.cam_from_imu_xyzw), calibration.imu_in_cam_m)
             path = path + quat_rotate(attitude.world_from_imu_xyzw, lever)
-        step_s = float(np.median(np.diff(trajectory.t_s)))
-        return cls(trajectory, quat_rotate(up, path - path.mean(axis=0)), inertial, metric, step_s)
+        self._t_s, self._path, self._inertial = trajectory.t_s, quat_rotate(up, path - path.mean(axis=0)), inertial
+        self._sums = inertial.sums(trajectory.t_s)[:, 0]
+        self._covered = np.concatenate([[0], np.cumsum(~inertial.covers(trajectory.t_s))])
+        self._metric, self._step_s = metric, float(np.median(np.diff(trajectory.t_s)))
 
     def over(self, reach: int) -> tuple[Array, Array, Array]:
         """Times, and accelerations by second differences over so many frames to both sides."""
@@ -278,7 +267,7 @@ class _Accelerations:
     def spectrum(self) -> Record:
         t_s, by_camera, by_imu = self.over(1)
         during = (self._inertial.t_s >= self._t_s[0]) & (self._inertial.t_s <= self._t_s[-1])
-        spectra = _spectra(
+        spectra = _collect_spectra(
             camera=(t_s, by_camera),
             imu_at_frames=(t_s, by_imu),
             imu=(self._inertial.t_s[during], self._inertial.accel_m_s2[during]),
@@ -286,13 +275,13 @@ class _Accelerations:
         return {**spectra, "camera_unit": "m/s2" if self._metric else "units/s2"}
 
 
-def _spectra(**signals: tuple[Array, Array]) -> Record:
-    found = {name: _spectrum(*signal) for name, signal in signals.items()}
+def _collect_spectra(**signals: tuple[Array, Array]) -> Record:
+    found = {name: _estimate_spectrum(*signal) for name, signal in signals.items()}
     curves = {name: curve for name, curve in found.items() if curve is not None}
     return {"curves": curves} if curves else {"missing": "The recording is too short for a spectrum."}
 
 
-def _spectrum(t_s: Array, values: Array) -> Record | None:
+def _estimate_spectrum(t_s: Array, values: Array) -> Record | None:
     """Amplitude density of a vector (N, 3), unit per root hertz, by Welch's method.
 
     Returns

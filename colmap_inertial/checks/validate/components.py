@@ -105,8 +105,8 @@ def normal_equations(obs: Observations, at: Placement) -> tuple[Normal, Array, A
     return normal, b, residual
 
 
-def weighted(n: Normal, ratio: Array) -> tuple[Array, Array, Array, float]:
-    """Gain (V, 6, 6) of the pose errors, weighted normal matrix (p, p), right side (p,), and weighted y'y."""
+def weigh_equations(n: Normal, ratio: Array) -> tuple[Array, Array, Array, float]:
+    """Gain (V, 6, 6) of the pose errors, weighted normal matrix (p, p), right side (p,), and y'y."""
     cov = np.einsum("k,kvij->vij", ratio, n.shapes)
     gain = np.linalg.solve(np.eye(6) + cov @ n.bb, cov)
     gain = 0.5 * (gain + np.swapaxes(gain, 1, 2))
@@ -128,7 +128,7 @@ def solve(s: Array, rhs: Array) -> tuple[Array, float]:
 
 def restricted_likelihood(n: Normal, ratio: Array) -> tuple[float, Array]:
     """Minus twice the restricted log likelihood, corner noise profiled out, and its gradient over ``ratio``."""
-    gain, s, rhs, yy = weighted(n, ratio)
+    gain, s, rhs, yy = weigh_equations(n, ratio)
     x = np.linalg.solve(s, rhs)
     q = max(yy - float(rhs @ x), 1e-300)
     dof = n.count - len(rhs)
@@ -152,7 +152,9 @@ def estimate_ratio(n: Normal) -> Array:
     unit = len(n.bb) * _DIMENSIONS / np.einsum("kvij,vji->k", n.shapes, n.bb)
     low, high = np.log(FIT.negligible_ratio / 4), np.log(FIT.largest_ratio)
     none = np.zeros(len(unit))
-    if np.isinf(solve(*weighted(n, none)[1:3])[1]):  # the views leave the scale free: its equations cannot be solved
+    if np.isinf(
+        solve(*weigh_equations(n, none)[1:3])[1]
+    ):  # the views leave the scale free: its equations cannot be solved
         return none
 
     def cost(log_ratio: Array) -> tuple[float, Array]:
@@ -177,7 +179,7 @@ def satterthwaite_dof(n: Normal, ratio: Array, corner_var: float, dof: float) ->
     def parts(log_ratio: Array) -> tuple[Array, float]:
         full = np.zeros(len(ratio))
         full[active] = np.exp(log_ratio)
-        gain, s, rhs, yy = weighted(n, full)
+        gain, s, rhs, yy = weigh_equations(n, full)
         x, inverse = solve(s, rhs)
         q = yy - float(rhs @ x)
         # gradient of -2 log likelihood over (log corner variance, log ratios), corner variance not profiled

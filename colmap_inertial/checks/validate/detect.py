@@ -60,27 +60,27 @@ def detect(image: UInt8Array, target: Target, *, thorough: bool = False) -> list
     single markers or where the image holds several copies of a board.
     """
     if target.kind == "checkerboard":
-        return list(_checkerboards(image, target, thorough))
+        return list(_detect_checkerboards(image, target, thorough))
     if target.kind == "charuco":
-        return _charuco(image, target)
+        return _detect_charuco(image, target)
     if target.kind == "aprilgrid":
-        return _aprilgrid(image, target)
-    return _markers(image, target)
+        return _detect_aprilgrid(image, target)
+    return _detect_markers(image, target)
 
 
 def other_checkerboard(image: UInt8Array) -> tuple[int, int] | None:
     """Inner corners (columns, rows) of whatever checkerboard an image shows, to help with a wrong description."""
     import cv2
 
-    small, _ = _shrunk(image)
+    small, _ = _shrink(image)
     found, _, meta = cv2.findChessboardCornersSBWithMeta(small, (3, 3), cv2.CALIB_CB_LARGER)
     return (int(meta.shape[1]), int(meta.shape[0])) if found and meta is not None else None
 
 
-def _checkerboards(image: UInt8Array, target: Target, thorough: bool) -> Iterator[Detection]:
+def _detect_checkerboards(image: UInt8Array, target: Target, thorough: bool) -> Iterator[Detection]:
     import cv2
 
-    small, factor = _shrunk(image)
+    small, factor = _shrink(image)
     small = small.copy()
     for number in range(DETECTION.most_boards if thorough else 1):
         corners = _find_checkerboard(small, target, fallback=thorough and number == 0)
@@ -90,7 +90,7 @@ def _checkerboards(image: UInt8Array, target: Target, thorough: bool) -> Iterato
         grid = xy.reshape(target.rows, target.columns, 2)
         refined, good = _refine(image, xy, 0.4 * _spacing_px(grid).ravel(), allowed_px=1.0 / factor)
         if good.sum() >= 6:
-            yield _detection(np.arange(len(xy)), refined, good)
+            yield _make_detection(np.arange(len(xy)), refined, good)
         # paint over what was found, squares outside the inner corners included, and look again
         hull = cv2.convexHull(corners.reshape(-1, 1, 2)).reshape(-1, 2)
         centre = hull.mean(axis=0)
@@ -98,11 +98,11 @@ def _checkerboards(image: UInt8Array, target: Target, thorough: bool) -> Iterato
         cv2.fillConvexPoly(small, np.round(grown).astype(np.int32), float(np.median(small)))
 
 
-def _detection(corner: IndexArray, xy: Array, good: BoolArray) -> Detection:
+def _make_detection(corner: IndexArray, xy: Array, good: BoolArray) -> Detection:
     return Detection(part=0, corner=corner[good], xy_px=colmap_px_from_opencv(xy[good]))
 
 
-def _shrunk(image: UInt8Array) -> tuple[UInt8Array, float]:
+def _shrink(image: UInt8Array) -> tuple[UInt8Array, float]:
     import cv2
 
     factor = min(1.0, DETECTION.search_size_px / max(image.shape))
@@ -196,7 +196,7 @@ def _side_px(corners: Array) -> Array:
     return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).min(axis=1)
 
 
-def _copies(corners: Array, number: IndexArray, layout_m: Array) -> list[IndexArray]:
+def _split_copies(corners: Array, number: IndexArray, layout_m: Array) -> list[IndexArray]:
     """Indices of the markers of each copy of a board, when several are in view.
 
     Markers are gathered by growing from one to its neighbours on the board: the homography of those gathered says
@@ -241,23 +241,23 @@ def _copies(corners: Array, number: IndexArray, layout_m: Array) -> list[IndexAr
     return out
 
 
-def _aprilgrid(image: UInt8Array, target: Target) -> list[Detection]:
+def _detect_aprilgrid(image: UInt8Array, target: Target) -> list[Detection]:
     corners, number = _find_markers(image, target, 2, target.columns * target.rows)
     # OpenCV numbers a tag's corners clockwise from its upper left, and reads Kalibr's tags turned by 90 degrees
     corners = corners[:, [1, 0, 3, 2]]
     layout_m = target.corners_m[:, :2].reshape(-1, 4, 2)
     out = []
-    for pick in _copies(corners, number, layout_m):
+    for pick in _split_copies(corners, number, layout_m):
         # the nearest other corners: the tag's code (two of its ten cells away) and the far side of the black square
         half = np.repeat(0.9 * min(0.2, target.gap) * _side_px(corners[pick]), 4)
         xy, good = _refine(image, corners[pick].reshape(-1, 2), half, allowed_px=np.inf)
         which = (4 * number[pick][:, None] + np.arange(4)).ravel()
         if good.sum() >= 4:
-            out.append(_detection(which, xy, good))
+            out.append(_make_detection(which, xy, good))
     return out
 
 
-def _charuco(image: UInt8Array, target: Target) -> list[Detection]:
+def _detect_charuco(image: UInt8Array, target: Target) -> list[Detection]:
     import cv2
 
     markers = target.columns * target.rows // 2
@@ -271,7 +271,7 @@ def _charuco(image: UInt8Array, target: Target) -> list[Detection]:
         board.setLegacyPattern(legacy)
         detector = cv2.aruco.CharucoDetector(board)
         layout_m = np.array(board.getObjPoints(), dtype=np.float64)[:, :, :2]
-        for pick in _copies(corners, number, layout_m):
+        for pick in _split_copies(corners, number, layout_m):
             quads = [corners[i].astype(np.float32).reshape(1, 4, 2) for i in pick]
             xy, found, _, _ = detector.detectBoard(
                 image, markerCorners=quads, markerIds=number[pick].astype(np.int32).reshape(-1, 1)
@@ -287,13 +287,13 @@ def _charuco(image: UInt8Array, target: Target) -> list[Detection]:
             half = spacing * min(0.4, 0.45 * (1 - target.marker_m / target.length_m))
             refined, good = _refine(image, start, half, allowed_px=2.0)
             if good.sum() >= 4:
-                out.append(_detection(which, refined, good))
+                out.append(_make_detection(which, refined, good))
         if out or target.rows % 2:
             break
     return out
 
 
-def _markers(image: UInt8Array, target: Target) -> list[Detection]:
+def _detect_markers(image: UInt8Array, target: Target) -> list[Detection]:
     corners, number = _find_markers(image, target, 1, len(target.part) // 4)
     dictionary = _dictionary(target)
     out = []

@@ -36,7 +36,7 @@ def refine_marker(image: UInt8Array, corners_px: Array, bits: BoolArray) -> Arra
 
     n = len(bits)
     square = np.array([[0, 0], [n, 0], [n, n], [0, n]], dtype=np.float64)
-    start, white = _cell_edges(bits)
+    start, white = _sample_cell_edges(bits)
     homography = cv2.getPerspectiveTransform(square.astype(np.float32), corners_px.astype(np.float32))
     homography = np.asarray(homography, dtype=np.float64)
     grey = image.astype(np.float32)
@@ -52,11 +52,11 @@ def refine_marker(image: UInt8Array, corners_px: Array, bits: BoolArray) -> Arra
         if np.median(cell_px) < DETECTION.least_cell_px:
             return None
         reach = float(np.clip(0.5 * np.median(cell_px), 1.5, 4.0))
-        offset, contrast = _edge_offsets(grey, at, normal, reach)
+        offset, contrast = _measure_offsets(grey, at, normal, reach)
         good = contrast > max(0.3 * float(np.median(contrast)), DETECTION.least_contrast)
         if good.sum() < 8 * 5:
             return None
-        step = _fit(homography, start, normal, offset, good)
+        step = _fit_homography(homography, start, normal, offset, good)
         if step is None:
             return None
         homography = homography + step
@@ -68,7 +68,7 @@ def _project(homography: Array, xy: Array) -> Array:
     return p[:, :2] / p[:, 2:]
 
 
-def _cell_edges(bits: BoolArray) -> tuple[Array, Array]:
+def _sample_cell_edges(bits: BoolArray) -> tuple[Array, Array]:
     """Sample points (m, 2) on the borders between unlike cells, and unit directions (m, 2) towards white."""
     padded = np.pad(bits, 1, constant_values=True).astype(int)
     points, towards = [], []
@@ -82,7 +82,7 @@ def _cell_edges(bits: BoolArray) -> tuple[Array, Array]:
     return np.array(points, dtype=np.float64), np.array(towards)
 
 
-def _edge_offsets(image: Float32Array, at: Array, normal: Array, reach: float) -> tuple[Array, Array]:
+def _measure_offsets(image: Float32Array, at: Array, normal: Array, reach: float) -> tuple[Array, Array]:
     """Distance (m,) from each point along its normal to the centre of the brightening there, and its height (m,)."""
     import cv2
 
@@ -101,7 +101,7 @@ def _edge_offsets(image: Float32Array, at: Array, normal: Array, reach: float) -
     return (rise @ middle) / np.maximum(height, 1e-9), height
 
 
-def _fit(homography: Array, xy: Array, normal: Array, offset: Array, good: BoolArray) -> Array | None:
+def _fit_homography(homography: Array, xy: Array, normal: Array, offset: Array, good: BoolArray) -> Array | None:
     """Change (3, 3) of the homography that takes the edges to where they were seen, up to one common shift."""
     p = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
     q = p @ homography.T

@@ -21,7 +21,7 @@ from colmap_inertial.checks.validate.components import (
     plain_equations,
     satterthwaite_dof,
     solve,
-    weighted,
+    weigh_equations,
 )
 from colmap_inertial.checks.validate.limits import FIT
 from colmap_inertial.checks.validate.observations import Observations, Placement, linearise
@@ -112,7 +112,7 @@ def fit_scale(obs: Observations, start: Placement, *, noise: NoiseModel | None =
                 break
             at = settle(obs, at, pose_ratio=ratio)
     n, b, residual = normal_equations(obs, at)
-    gain, s, rhs, yy = weighted(n, ratio)
+    gain, s, rhs, yy = weigh_equations(n, ratio)
     step, inverse = solve(s, rhs)
     dof = n.count - unknowns
     if noise is None:
@@ -167,21 +167,21 @@ def settle(
         size = max(abs(step[0]), float(np.abs(step[1:].reshape(-1, 6)[:, :3]).max()))
         step *= min(1.0, 0.5 / max(size, 1e-300))
         for _ in range(20):
-            residual = linearise(obs, _moved(at, step))[0]
+            residual = linearise(obs, _apply_step(at, step))[0]
             if np.isfinite(residual).all() and (ratio is not None or np.sum(residual**2) <= now):
                 break
             step = 0.5 * step
-        at = _moved(at, step)
+        at = _apply_step(at, step)
         equations = _equations(obs, at, ratio)
     raise NotObservableError("scale", "the fit of the target does not settle; the views may be too close together")
 
 
 def _equations(obs: Observations, at: Placement, ratio: Array | None) -> tuple[Array, Array, float]:
     """Normal matrix, right side and cost, with these pose errors; ``None`` for none."""
-    return plain_equations(obs, at) if ratio is None else weighted(normal_equations(obs, at)[0], ratio)[1:]
+    return plain_equations(obs, at) if ratio is None else weigh_equations(normal_equations(obs, at)[0], ratio)[1:]
 
 
-def _moved(at: Placement, step: Array) -> Placement:
+def _apply_step(at: Placement, step: Array) -> Placement:
     move = step[1:].reshape(-1, 6)
     return Placement(
         log_scale=at.log_scale + float(step[0]),

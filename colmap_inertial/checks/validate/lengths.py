@@ -123,7 +123,7 @@ def check_lengths(
     longest_m = max(distance.known_m for distance in distances)
     diagonal_m = None if diagonal is None else diagonal * to_metres
     share = None if not diagonal_m else longest_m / diagonal_m
-    directions = _directions(np.array(ends).reshape(-1, 2, 3))
+    directions = _count_directions(np.array(ends).reshape(-1, 2, 3))
     return LengthCheck(
         count=len(distances),
         rms_m=float(np.sqrt(np.mean(errors_m**2))),
@@ -132,7 +132,7 @@ def check_lengths(
         diagonal_m=diagonal_m,
         longest_share=share,
         directions=directions,
-        proves=_proves(longest_m, diagonal_m, share, directions),
+        proves=_describe_proof(longest_m, diagonal_m, share, directions),
     )
 
 
@@ -144,7 +144,7 @@ def model_diagonal(xyz: Array) -> float | None:
     return float(np.linalg.norm(high - low)) or None
 
 
-def _directions(ends: Array) -> int:
+def _count_directions(ends: Array) -> int:
     """In how many directions (K, 2, 3) lengths lie."""
     along = ends[:, 1] - ends[:, 0]
     norm = np.linalg.norm(along, axis=1, keepdims=True)
@@ -155,7 +155,7 @@ def _directions(ends: Array) -> int:
     return int((spread > FIT.own_direction * spread[-1]).sum())
 
 
-def _proves(longest_m: float, diagonal_m: float | None, share: float | None, directions: int) -> str:
+def _describe_proof(longest_m: float, diagonal_m: float | None, share: float | None, directions: int) -> str:
     checked = f"lengths up to {longest_m:.3g} m are right to what is said here"
     if share is None or diagonal_m is None:
         return checked

@@ -35,13 +35,13 @@ def with_bars(validation: Validation, path: Path) -> Validation:
     """
     centres, to_metres = marker_centres(validation), _to_metres(validation)
     bars = []
-    for line, row in _rows(path, ("marker_a", "marker_b", "length_m")):
-        a, b = (_marker(centres, row[key], path, line) for key in ("marker_a", "marker_b"))
-        known_m = _number(row, "length_m", path, line)
+    for line, row in _read_rows(path, ("marker_a", "marker_b", "length_m")):
+        a, b = (_find_marker(centres, row[key], path, line) for key in ("marker_a", "marker_b"))
+        known_m = _read_number(row, "length_m", path, line)
         if not known_m > 0:
             raise FormatError(path, f"length_m must be positive, not {known_m:g}", line=line)
         measured = float(np.linalg.norm(centres[a] - centres[b]))
-        sigma_m = _number(row, "sigma_m", path, line) if row.get("sigma_m") else None
+        sigma_m = _read_number(row, "sigma_m", path, line) if row.get("sigma_m") else None
         error_m = measured * to_metres - known_m
         bars.append(ScaleBar(markers=(a, b), known_m=known_m, sigma_m=sigma_m, measured=measured, residual_m=error_m))
     return replace(validation, bars=tuple(bars))
@@ -61,18 +61,18 @@ def with_check_points(validation: Validation, path: Path) -> Validation:
     """
     centres, to_metres = marker_centres(validation), _to_metres(validation)
     names, known, measured, sigmas = [], [], [], []
-    for line, row in _rows(path, ("marker", "x", "y", "z")):
-        marker = _marker(centres, row["marker"], path, line)
+    for line, row in _read_rows(path, ("marker", "x", "y", "z")):
+        marker = _find_marker(centres, row["marker"], path, line)
         names.append(marker)
-        known.append([_number(row, axis, path, line) for axis in "xyz"])
+        known.append([_read_number(row, axis, path, line) for axis in "xyz"])
         measured.append(centres[marker] * to_metres)
         if row.get("sigma_m"):
-            sigmas.append(_number(row, "sigma_m", path, line))
+            sigmas.append(_read_number(row, "sigma_m", path, line))
     if len(names) < FIT.least_points:
         raise NotObservableError(
             "accuracy of points", f"{path} has {len(names)} check points; {FIT.least_points} are needed, apart in space"
         )
-    residual = _moved_onto(np.array(measured), np.array(known)) - np.array(known)
+    residual = _move_onto(np.array(measured), np.array(known)) - np.array(known)
     sigma_m = float(np.sqrt(np.mean(np.square(sigmas)))) if len(sigmas) == len(names) else None
     rmse = np.sqrt(np.mean(residual**2, axis=0))
     both = 0.0 if sigma_m is None else sigma_m
@@ -124,7 +124,7 @@ def middle_of(validation: Validation) -> Array:
     if len(drawn) < FIT.least_points or np.linalg.matrix_rank(drawn - drawn.mean(axis=0), tol=1e-9) < 2:
         raise NotObservableError("distance", f"too few corners of {target.spec} were measured to tell its middle")
     units = float(np.sqrt(np.sum((seen - seen.mean(axis=0)) ** 2) / np.sum((drawn - drawn.mean(axis=0)) ** 2)))
-    return _moved_onto(np.vstack([drawn * units, np.zeros((1, 3))]), seen)[-1]
+    return _move_onto(np.vstack([drawn * units, np.zeros((1, 3))]), seen)[-1]
 
 
 def distance_between(validation: Validation, a: int, b: int) -> float:
@@ -138,11 +138,11 @@ def distance_between(validation: Validation, a: int, b: int) -> float:
     centres = marker_centres(validation)
     for marker in (a, b):
         if marker not in centres:
-            raise NotObservableError("distance", f"marker {marker} was not measured; {_seen(centres)}")
+            raise NotObservableError("distance", f"marker {marker} was not measured; {_list_measured(centres)}")
     return float(np.linalg.norm(centres[a] - centres[b]))
 
 
-def _moved_onto(source: Array, target: Array) -> Array:
+def _move_onto(source: Array, target: Array) -> Array:
     """(N, 3) points, of which the first (M, 3) are turned and moved onto others, by least squares (Kabsch 1976)."""
     fitted = source[: len(target)]
     about, onto = fitted.mean(axis=0), target.mean(axis=0)
@@ -157,7 +157,7 @@ def _to_metres(validation: Validation) -> float:
     return validation.metres_per_unit if validation.control is None else validation.control.metres_per_unit
 
 
-def _rows(path: Path, needed: Sequence[str]) -> list[tuple[int, dict[str, str]]]:
+def _read_rows(path: Path, needed: Sequence[str]) -> list[tuple[int, dict[str, str]]]:
     reader = csv.DictReader(read_text(path).splitlines(), skipinitialspace=True)
     missing = [name for name in needed if name not in (reader.fieldnames or ())]
     if missing:
@@ -165,7 +165,7 @@ def _rows(path: Path, needed: Sequence[str]) -> list[tuple[int, dict[str, str]]]
     return [(reader.line_num, {k: v or "" for k, v in row.items() if isinstance(k, str)}) for row in reader]
 
 
-def _number(row: Mapping[str, str], key: str, path: Path, line: int) -> float:
+def _read_number(row: Mapping[str, str], key: str, path: Path, line: int) -> float:
     try:
         value = float(row[key])
     except ValueError:
@@ -175,11 +175,11 @@ def _number(row: Mapping[str, str], key: str, path: Path, line: int) -> float:
     return value
 
 
-def _marker(centres: Mapping[int, Array], text: str, path: Path, line: int) -> int:
+def _find_marker(centres: Mapping[int, Array], text: str, path: Path, line: int) -> int:
     if not text.isdecimal() or int(text) not in centres:
-        raise FormatError(path, f"marker {text} was not measured in the model; {_seen(centres)}", line=line)
+        raise FormatError(path, f"marker {text} was not measured in the model; {_list_measured(centres)}", line=line)
     return int(text)
 
 
-def _seen(centres: Mapping[int, Array]) -> str:
+def _list_measured(centres: Mapping[int, Array]) -> str:
     return f"those that were: {', '.join(map(str, sorted(centres)))}" if centres else "no marker was"

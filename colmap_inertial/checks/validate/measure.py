@@ -20,7 +20,7 @@ from colmap_inertial.checks.validate.result import (
     Validation,
     ViewResiduals,
 )
-from colmap_inertial.checks.validate.search import Progress, Search, why_not_placed
+from colmap_inertial.checks.validate.search import Progress, Search, explain_failure
 from colmap_inertial.checks.validate.targets import Target
 from colmap_inertial.checks.validate.views import Sighting, load_views
 from colmap_inertial.core.arrays import Array, BoolArray
@@ -90,14 +90,14 @@ def validate_model(
         search.look_closer([v for v in search.searched if v not in seen][: PLACEMENT.most_thorough_views])
         placed = search.place()
     if not placed:
-        raise why_not_placed(search, images)
+        raise explain_failure(search, images)
     used = {search.parts[p][i].view for p, part in placed.items() for i in part.chosen}
     outside = [v for v in sorted({s.view for s in search.sightings}) if v not in used]
     if outside and target.kind == "checkerboard":  # perhaps the detector took another board there
         search.look_closer(outside)
         placed = search.place()
     _require_agreement(search, placed)
-    return _measure(search, placed, missing, _diagonal(model))
+    return _measure(search, placed, missing, _measure_diagonal(model))
 
 
 def _require_agreement(search: Search, placed: dict[int, PartPlacement]) -> None:
@@ -132,7 +132,7 @@ def _reject_outliers(search: Search, placed: dict[int, PartPlacement]) -> tuple[
     return {p: part for p, part in placed.items() if p not in outlying}, reasons
 
 
-def _diagonal(model: Path | pycolmap.Reconstruction) -> float | None:
+def _measure_diagonal(model: Path | pycolmap.Reconstruction) -> float | None:
     found = read_model(model) if isinstance(model, Path) else model
     return model_diagonal(np.array([point.xyz for point in found.points3D.values()]).reshape(-1, 3))
 
@@ -148,7 +148,7 @@ def _measure(
         for index, part in enumerate(sorted(placed))
         for i, numbering in zip(placed[part].chosen, placed[part].numbering, strict=True)
     ]
-    everything, start = _observed(search, placed, sightings)
+    everything, start = _observe_parts(search, placed, sightings)
     obs, fit, dropped = fit_without_outliers(everything, start)
     half = fit.half_width_log()
     if not half < np.log(FIT.widest_factor):
@@ -165,16 +165,16 @@ def _measure(
     seen[obs.corner] = True
     control_corner = target.control(seen)
     sets = [_fit_set(obs, fit, pick[obs.corner]) for pick in (control_corner, ~control_corner)]
-    control, check = (_set_scale(found, of_target) for found in sets)
-    check_error, check_ci = _set_difference(*sets)
+    control, check = (_make_set_scale(found, of_target) for found in sets)
+    check_error, check_ci = _compare_sets(*sets)
     if check_error is None:
         reasons.append("too few corners to keep a control and a check set apart")
     to_metres = 1.0
     if options.unscaled:
         to_metres = float(np.exp(-log_scale)) if control is None else control.metres_per_unit
-    view_results = _view_results(search, sightings, obs, fit, everything)
-    position = _positions(target, obs, fit)
-    distances = _distances(target, position, control_corner, to_metres)
+    view_results = _collect_views(search, sightings, obs, fit, everything)
+    position = _triangulate_corners(target, obs, fit)
+    distances = _measure_distances(target, position, control_corner, to_metres)
     corners = tuple(
         Corner(name=target.label(i), in_model=position[i] + search.views[0].origin_in_model)
         for i in np.flatnonzero(np.isfinite(position[:, 0])).tolist()
@@ -197,17 +197,17 @@ def _measure(
         distances=distances,
         corners=corners,
         views=view_results,
-        views_rejected=_rejected_views(search, placed, obs, dropped, missing),
+        views_rejected=_collect_rejected(search, placed, obs, dropped, missing),
         control=control,
         check=check,
         check_error_pct=check_error,
         check_ci95_pct=check_ci,
-        reasons=tuple(reasons + _remarks(search, obs, fit, view_results)),
+        reasons=tuple(reasons + _list_remarks(search, obs, fit, view_results)),
         lengths=check_lengths(distances, corners, diagonal, to_metres),
     )
 
 
-def _observed(
+def _observe_parts(
     search: Search, placed: dict[int, PartPlacement], sightings: list[tuple[Sighting, int, int]]
 ) -> tuple[Observations, Placement]:
     """The observations of all parts, and where the fit of their common scale starts."""
@@ -221,7 +221,7 @@ def _observed(
     return observe(seen, numbering, parts, search.target, search.views), start
 
 
-def _set_difference(
+def _compare_sets(
     control: tuple[ScaleFit, int] | None, check: tuple[ScaleFit, int] | None
 ) -> tuple[float | None, tuple[float, float] | None]:
     """Scale error of the check corners after scaling by the control corners, per cent, and its 95 % interval."""
@@ -296,7 +296,7 @@ def _fit_set(obs: Observations, fit: ScaleFit, pick: BoolArray) -> tuple[ScaleFi
     return (out, len(part)) if out.half_width_log() < np.log(FIT.widest_factor) else None
 
 
-def _set_scale(of: tuple[ScaleFit, int] | None, of_target: float) -> SetScale | None:
+def _make_set_scale(of: tuple[ScaleFit, int] | None, of_target: float) -> SetScale | None:
     if of is None:
         return None
     fit, corners = of
@@ -309,7 +309,7 @@ def _set_scale(of: tuple[ScaleFit, int] | None, of_target: float) -> SetScale | 
     )
 
 
-def _positions(target: Target, obs: Observations, fit: ScaleFit) -> Array:
+def _triangulate_corners(target: Target, obs: Observations, fit: ScaleFit) -> Array:
     """(N, 3) each corner triangulated on its own; not a number where its views do not determine it."""
     corner, in_world, determined = triangulate(obs, fit.placement)
     position = np.full((len(target.part), 3), np.nan)
@@ -317,7 +317,7 @@ def _positions(target: Target, obs: Observations, fit: ScaleFit) -> Array:
     return position
 
 
-def _distances(target: Target, position: Array, control: BoolArray, to_metres: float) -> tuple[Distance, ...]:
+def _measure_distances(target: Target, position: Array, control: BoolArray, to_metres: float) -> tuple[Distance, ...]:
     out = []
     for a, b in target.pairs(np.isfinite(position[:, 0])).tolist():
         known = float(np.linalg.norm(target.corners_m[a] - target.corners_m[b]))
@@ -337,7 +337,7 @@ def _distances(target: Target, position: Array, control: BoolArray, to_metres: f
     return tuple(out)
 
 
-def _view_results(
+def _collect_views(
     search: Search,
     sightings: list[tuple[Sighting, int, int]],
     obs: Observations,
@@ -368,7 +368,7 @@ def _view_results(
     return tuple(out)
 
 
-def _rejected_views(
+def _collect_rejected(
     search: Search,
     placed: dict[int, PartPlacement],
     obs: Observations,
@@ -402,7 +402,7 @@ def _rejected_views(
     )
 
 
-def _remarks(search: Search, obs: Observations, fit: ScaleFit, views: tuple[ViewResiduals, ...]) -> list[str]:
+def _list_remarks(search: Search, obs: Observations, fit: ScaleFit, views: tuple[ViewResiduals, ...]) -> list[str]:
     out = []
     if len(views) < 5:
         out.append(f"only {len(views)} views: the interval is wide because errors of the poses are hard to judge")

@@ -51,15 +51,8 @@ class Observations:
 
     def select(self, keep: BoolArray) -> Observations:
         """The observations that ``keep`` (M,) picks; cameras and parts keep their numbers."""
-        return replace(
-            self,
-            view=self.view[keep],
-            corner=self.corner[keep],
-            part=self.part[keep],
-            target_m=self.target_m[keep],
-            ray=self.ray[keep],
-            px_from_tangent=self.px_from_tangent[keep],
-        )
+        per_corner = ("view", "corner", "part", "target_m", "ray", "px_from_tangent")
+        return replace(self, **{name: getattr(self, name)[keep] for name in per_corner})
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -98,14 +98,14 @@ def place_part(
         When all views lie in one direction from the target.
     """
     usable = [i for i, s in enumerate(sightings) if len(s.corner) >= DETECTION.least_corners]
-    pairs = _pairs([sightings[i] for i in usable], views, seed)
+    pairs = _choose_pairs([sightings[i] for i in usable], views, seed)
     if not pairs:
         return None
     judge = _Judge([sightings[i] for i in usable], target, views, max_residual_px)
     best: tuple[float, Placement] | None = None
     for a, b in pairs:
         for numbering in range(len(target.relabelings)):
-            placement = _from_pair(judge.sightings[a], judge.sightings[b], numbering, target, views)
+            placement = _place_by_pair(judge.sightings[a], judge.sightings[b], numbering, target, views)
             if placement is None:
                 continue
             cost = judge.cost(placement)[0].sum()
@@ -135,7 +135,7 @@ def place_part(
     return PartPlacement(placement=placement, chosen=tuple(usable[i] for i in chosen), numbering=tuple(numbering_of))
 
 
-def _pairs(sightings: list[Sighting], views: list[View], seed: int) -> list[tuple[int, int]]:
+def _choose_pairs(sightings: list[Sighting], views: list[View], seed: int) -> list[tuple[int, int]]:
     """Pairs of sightings whose lines of sight meet at an angle; of many, some of the larger half.
 
     Raises
@@ -228,7 +228,7 @@ class _Judge:
         return chosen, numbering
 
 
-def _from_pair(a: Sighting, b: Sighting, numbering: int, target: Target, views: list[View]) -> Placement | None:
+def _place_by_pair(a: Sighting, b: Sighting, numbering: int, target: Target, views: list[View]) -> Placement | None:
     """The placement that two views give, the second numbered in this way; ``None`` when their rays do not meet."""
     _, ia, ib = np.intersect1d(a.corner, target.relabelings[numbering][b.corner], return_indices=True)
     if len(ia) < DETECTION.least_corners:
@@ -244,7 +244,7 @@ def _from_pair(a: Sighting, b: Sighting, numbering: int, target: Target, views: 
     if np.mean((along_a > 0) & (along_b > 0)) < 0.9:
         return None
     points = 0.5 * (ca + along_a[:, None] * da + cb + along_b[:, None] * db)
-    placement = _similarity(target.corners_m[a.corner[ia]], points)
+    placement = _fit_similarity(target.corners_m[a.corner[ia]], points)
     if placement is None:
         return None
     obs = observe([a, b], [0, numbering], [0, 0], target, views)
@@ -254,7 +254,7 @@ def _from_pair(a: Sighting, b: Sighting, numbering: int, target: Target, views: 
         return None
 
 
-def _similarity(source: Array, target: Array) -> Placement | None:
+def _fit_similarity(source: Array, target: Array) -> Placement | None:
     """Least-squares similarity between points (Umeyama 1991); ``None`` when they have no extent."""
     mean_s, mean_t = source.mean(axis=0), target.mean(axis=0)
     s, t = source - mean_s, target - mean_t

@@ -238,19 +238,19 @@ class Validation:
         kept["views"] = [{"name": v.name, "corners": len(v.corner), "rms_px": v.rms_px} for v in self.views]
         found: dict[str, Any] = {}
         for name, value in kept.items():
-            found[name] = _plain(value)
+            found[name] = _to_json(value)
             if name == "tolerance_pct":
                 found["within_tolerance"] = self.within_tolerance
         return found
 
 
-def _plain(value: Any) -> Any:
+def _to_json(value: Any) -> Any:
     """JSON's types: tuples become lists, arrays their numbers, and values of ours objects."""
     if is_dataclass(value):
-        return {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
+        return {field.name: _to_json(getattr(value, field.name)) for field in fields(value)}
     if isinstance(value, np.ndarray):
         return value.tolist()
-    return [_plain(one) for one in value] if isinstance(value, (tuple, list)) else value
+    return [_to_json(one) for one in value] if isinstance(value, (tuple, list)) else value
 
 
 def validation_table(result: Validation) -> Group:

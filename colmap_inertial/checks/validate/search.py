@@ -31,11 +31,11 @@ class Search:
 
     def run(self, images: Path) -> None:
         found = 0
-        for done, v in enumerate(_spread(len(self.views))):
+        for done, v in enumerate(_spread_evenly(len(self.views))):
             if self._progress is not None:
                 self._progress(done, len(self.views))
             self.searched.append(v)
-            found += self._look(v, thorough=False)
+            found += self._search_view(v, thorough=False)
             if found >= self.options.max_views:
                 break
         if self._progress is not None:
@@ -48,9 +48,9 @@ class Search:
         """Search these views again, thoroughly; what was found there before is forgotten."""
         self.sightings = [s for s in self.sightings if s.view not in which]
         for v in which:
-            self._look(v, thorough=True)
+            self._search_view(v, thorough=True)
 
-    def _look(self, v: int, *, thorough: bool) -> bool:
+    def _search_view(self, v: int, *, thorough: bool) -> bool:
         image = self.views[v].read()
         if isinstance(image, str):
             self.unreadable[v] = image
@@ -83,24 +83,24 @@ class Search:
         return out
 
 
-def _spread(count: int) -> list[int]:
+def _spread_evenly(count: int) -> list[int]:
     """0..count-1 in an order that covers the range evenly however early it is cut off (van der Corput)."""
     bits = max(count - 1, 1).bit_length()
     reverse = [int(f"{i:0{bits}b}"[::-1], 2) for i in range(2**bits)]
     return [i for i in reverse if i < count]
 
 
-def why_not_placed(search: Search, images: Path) -> Exception:
+def explain_failure(search: Search, images: Path) -> Exception:
     """The error that says why there is no result."""
     target, views = search.target, search.views
     seen = sorted({s.view for s in search.sightings})
-    mirrored = _mirrored(search)
+    mirrored = _find_mirroring(search)
     if mirrored is not None:
         return FormatError(images, f"the images are mirrored {mirrored} against the model: give those it was made from")
     if not seen:
         return TargetNotFoundError(
             f"{target.spec} was not found in any of the {len(search.searched)} images that were searched; "
-            + _absence_hint(search)
+            + _hint_at_absence(search)
         )
     if len(seen) == 1:
         return NotObservableError(
@@ -117,7 +117,7 @@ def why_not_placed(search: Search, images: Path) -> Exception:
     )
 
 
-def _mirrored(search: Search) -> str | None:
+def _find_mirroring(search: Search) -> str | None:
     """How the images are mirrored against the model, if that explains them."""
     for flip, words in ((1, "left to right"), (0, "top to bottom")):
         again = Search(search.views, search.target, search.options, None)
@@ -132,7 +132,7 @@ def _mirrored(search: Search) -> str | None:
     return None
 
 
-def _absence_hint(search: Search) -> str:
+def _hint_at_absence(search: Search) -> str:
     if search.target.kind != "checkerboard":
         return "is the description right, and is the target large and sharp enough in the images?"
     sizes: Counter[tuple[int, int]] = Counter()

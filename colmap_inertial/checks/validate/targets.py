@@ -199,7 +199,7 @@ def parse_target(text: str) -> Target:
         When the description is not one of these; the message says which field is wrong and what is expected.
     """
     if "+-" in text:
-        return _with_sigma(text)
+        return _parse_with_sigma(text)
     kind, *fields = (field.strip() for field in text.split(":"))
     kind = kind.lower()
     if kind not in _FORMS:
@@ -208,33 +208,33 @@ def parse_target(text: str) -> Target:
     if len(fields) != len(wanted):
         raise TargetSpecError(text, f"{len(fields)} fields after {kind}, not {len(wanted)}")
     if kind == "checkerboard":
-        columns, rows = _size(text, fields[0], least=3)
-        return _grid(text, "checkerboard", columns, rows, _length(text, "SQUARE_M", fields[1]))
+        columns, rows = _parse_size(text, fields[0], least=3)
+        return _make_grid(text, "checkerboard", columns, rows, _parse_length(text, "SQUARE_M", fields[1]))
     if kind == "charuco":
-        columns, rows = _size(text, fields[0], least=3)
-        square_m, marker_m = _length(text, "SQUARE_M", fields[1]), _length(text, "MARKER_M", fields[2])
+        columns, rows = _parse_size(text, fields[0], least=3)
+        square_m, marker_m = _parse_length(text, "SQUARE_M", fields[1]), _parse_length(text, "MARKER_M", fields[2])
         if marker_m >= square_m:
             raise TargetSpecError(text, f"the marker ({marker_m} m) must be smaller than the square ({square_m} m)")
-        dictionary = _dictionary(text, fields[3], columns * rows // 2)
-        board = _grid(text, "charuco", columns, rows, square_m)
+        dictionary = _parse_dictionary(text, fields[3], columns * rows // 2)
+        board = _make_grid(text, "charuco", columns, rows, square_m)
         return replace(board, marker_m=marker_m, dictionary=dictionary)
     if kind == "aprilgrid":
-        columns, rows = _size(text, fields[0], least=1)
-        gap = _number(text, "GAP", fields[2])
+        columns, rows = _parse_size(text, fields[0], least=1)
+        gap = _parse_number(text, "GAP", fields[2])
         if not 0 < gap <= 1:
             raise TargetSpecError(text, f"GAP is {gap}: the gap divided by the tag's side lies between 0 and 1")
-        _dictionary(text, APRILGRID_DICTIONARY, columns * rows)
-        return _aprilgrid(text, columns, rows, _length(text, "TAG_M", fields[1]), gap)
-    dictionary = _dictionary(text, fields[0], 1)
-    return _markers(text, dictionary, _length(text, "SIDE_M", fields[1]))
+        _parse_dictionary(text, APRILGRID_DICTIONARY, columns * rows)
+        return _make_aprilgrid(text, columns, rows, _parse_length(text, "TAG_M", fields[1]), gap)
+    dictionary = _parse_dictionary(text, fields[0], 1)
+    return _make_markers(text, dictionary, _parse_length(text, "SIDE_M", fields[1]))
 
 
-def _with_sigma(text: str) -> Target:
+def _parse_with_sigma(text: str) -> Target:
     """The target of a description that says how well its length is known."""
     before, _, after = text.partition("+-")
     number, colon, rest = after.partition(":")
     target = parse_target(f"{before.strip()}{colon}{rest}")
-    sigma_m = _length(text, "what follows +-", number)
+    sigma_m = _parse_length(text, "what follows +-", number)
     length = before.rpartition(":")[2].strip()
     if float(length) != target.length_m:
         raise TargetSpecError(text, "+- belongs to the side of a square, tag or marker")
@@ -243,15 +243,15 @@ def _with_sigma(text: str) -> Target:
     return replace(target, spec=text, sigma_m=sigma_m)
 
 
-def _number(spec: str, name: str, text: str) -> float:
+def _parse_number(spec: str, name: str, text: str) -> float:
     try:
         return float(text)
     except ValueError:
         raise TargetSpecError(spec, f'{name} is "{text}", not a number') from None
 
 
-def _length(spec: str, name: str, text: str) -> float:
-    value = _number(spec, name, text)
+def _parse_length(spec: str, name: str, text: str) -> float:
+    value = _parse_number(spec, name, text)
     if not (np.isfinite(value) and value > 0):
         raise TargetSpecError(spec, f"{name} is {text}: a length must be positive")
     if value > _LONGEST_M:
@@ -259,7 +259,7 @@ def _length(spec: str, name: str, text: str) -> float:
     return value
 
 
-def _size(spec: str, text: str, *, least: int) -> tuple[int, int]:
+def _parse_size(spec: str, text: str, *, least: int) -> tuple[int, int]:
     match = re.fullmatch(r"(\d+)[xX](\d+)", text)
     if match is None:
         raise TargetSpecError(spec, f'COLSxROWS is "{text}", not two whole numbers with an x between them')
@@ -269,7 +269,7 @@ def _size(spec: str, text: str, *, least: int) -> tuple[int, int]:
     return columns, rows
 
 
-def _dictionary(spec: str, text: str, markers: int) -> str:
+def _parse_dictionary(spec: str, text: str, markers: int) -> str:
     name = text.upper().removeprefix("DICT_")
     if name not in DICTIONARIES:
         raise TargetSpecError(spec, f'unknown dictionary "{text}" (known: {", ".join(DICTIONARIES)})')
@@ -278,7 +278,7 @@ def _dictionary(spec: str, text: str, markers: int) -> str:
     return name
 
 
-def _grid(spec: str, kind: Literal["checkerboard", "charuco"], columns: int, rows: int, square_m: float) -> Target:
+def _make_grid(spec: str, kind: Literal["checkerboard", "charuco"], columns: int, rows: int, square_m: float) -> Target:
     nx, ny = (columns, rows) if kind == "checkerboard" else (columns - 1, rows - 1)
     row, column = (a.ravel() for a in np.indices((ny, nx)))
     number = np.arange(nx * ny).reshape(ny, nx)
@@ -291,7 +291,7 @@ def _grid(spec: str, kind: Literal["checkerboard", "charuco"], columns: int, row
         columns=columns,
         rows=rows,
         length_m=square_m,
-        corners_m=_centred(column * square_m, row * square_m),
+        corners_m=_centre(column * square_m, row * square_m),
         part=np.zeros(nx * ny, dtype=np.intp),
         row=row,
         column=column,
@@ -299,7 +299,7 @@ def _grid(spec: str, kind: Literal["checkerboard", "charuco"], columns: int, row
     )
 
 
-def _aprilgrid(spec: str, columns: int, rows: int, tag_m: float, gap: float) -> Target:
+def _make_aprilgrid(spec: str, columns: int, rows: int, tag_m: float, gap: float) -> Target:
     # Kalibr's layout: tag 0 is at the lower left, numbers grow to the right and then upwards; within a tag the
     # corners run lower left, lower right, upper right, upper left.
     tag = np.repeat(np.arange(columns * rows), 4)
@@ -316,7 +316,7 @@ def _aprilgrid(spec: str, columns: int, rows: int, tag_m: float, gap: float) -> 
         length_m=tag_m,
         gap=gap,
         dictionary=APRILGRID_DICTIONARY,
-        corners_m=_centred(x, y),
+        corners_m=_centre(x, y),
         part=np.zeros(len(tag), dtype=np.intp),
         row=2 * (tag // columns) + up,
         column=2 * (tag % columns) + right,
@@ -324,11 +324,11 @@ def _aprilgrid(spec: str, columns: int, rows: int, tag_m: float, gap: float) -> 
     )
 
 
-def _markers(spec: str, dictionary: str, side_m: float) -> Target:
+def _make_markers(spec: str, dictionary: str, side_m: float) -> Target:
     # OpenCV's order: clockwise in the image from the marker's upper left corner
     count = DICTIONARIES[dictionary]
     row, column = np.tile([0, 0, 1, 1], count), np.tile([0, 1, 1, 0], count)
-    one = _centred(column[:4] * side_m, row[:4] * side_m)
+    one = _centre(column[:4] * side_m, row[:4] * side_m)
     return Target(
         spec=spec,
         kind="aruco",
@@ -342,6 +342,6 @@ def _markers(spec: str, dictionary: str, side_m: float) -> Target:
     )
 
 
-def _centred(x: NDArray[np.floating], y: NDArray[np.floating]) -> Array:
+def _centre(x: NDArray[np.floating], y: NDArray[np.floating]) -> Array:
     xy = np.stack([x, y, np.zeros(len(x))], axis=-1).astype(np.float64)
     return xy - xy.mean(axis=0)
