@@ -39,6 +39,8 @@ UNITS = {
     "_rad_s": "rad/s",
     "_m_s": "m/s",
     "_deg": "°",
+    "_per_px": "1/px",
+    "_per_m": "1/m",
     "_rad": "rad",
     "_px": "px",
     "_hz": "Hz",
@@ -175,20 +177,28 @@ def is_frozen_dataclass(node: ast.ClassDef) -> bool:
     return any(re.match(r"dataclass\(.*frozen=True", ast.unparse(d)) for d in node.decorator_list)
 
 
+def described_in(docstring: str) -> dict[str, str]:
+    """Texts of the fields that a numpydoc docstring lists, by their names."""
+    found = re.findall(r"^(\w+(?:, \w+)*)(?: :[^\n]*)?\n((?:    .*(?:\n|$))+)", docstring, re.MULTILINE)
+    return {name: " ".join(text.split()) for names, text in found for name in names.split(", ")}
+
+
 def of_class(node: ast.ClassDef, lines: list[str]) -> Iterator[Constant]:
     """Numeric defaults of a frozen dataclass; none where most of its fields have no default."""
     fields = [one for one in node.body if isinstance(one, ast.AnnAssign)]
     given = [one for one in fields if one.value is not None and has_number(one.value)]
     if 2 * len(given) < len(fields):
         return
+    listed = described_in(ast.get_docstring(node) or "")
     for place, one in enumerate(node.body):
         if one not in given:
             continue
         behind = node.body[place + 1] if place + 1 < len(node.body) else None
         text = behind.value.value if isinstance(behind, ast.Expr) and isinstance(behind.value, ast.Constant) else ""
-        meaning = text if isinstance(text, str) and text else comment_above(lines, one.lineno)
         name = ast.unparse(one.target)
-        yield Constant((f"{node.name}.{name}",), (ast.unparse(one.value),), " ".join(meaning.split()))
+        meaning = (text if isinstance(text, str) else "") or comment_above(lines, one.lineno) or listed.get(name, "")
+        if meaning:
+            yield Constant((f"{node.name}.{name}",), (ast.unparse(one.value),), " ".join(meaning.split()))
 
 
 def of_assignment(node: ast.Assign | ast.AnnAssign, lines: list[str]) -> Iterator[Constant]:
