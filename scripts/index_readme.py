@@ -14,11 +14,15 @@ from pathlib import Path
 
 #: A Markdown link whose target is neither an address nor a place on the same page.
 LINK = re.compile(r"(\]\()(?![a-z]+:|#)([^)\s]+)(\))")
+#: An image, which needs the file itself and not the page about it.
+IMAGE = re.compile(r"(!\[[^\]]*\]\()(?![a-z]+:)([^)\s]+)(\))")
 
 
 def absolute(text: str, repository: str, version: str) -> str:
-    """Markdown whose links to files lead to the repository."""
-    return LINK.sub(rf"\g<1>{repository.rstrip('/')}/blob/v{version}/\g<2>\g<3>", text)
+    """Markdown whose links and images lead to the repository."""
+    base = repository.rstrip("/")
+    text = IMAGE.sub(rf"\g<1>{base}/raw/v{version}/\g<2>\g<3>", text)
+    return LINK.sub(rf"\g<1>{base}/blob/v{version}/\g<2>\g<3>", text)
 
 
 def main() -> None:

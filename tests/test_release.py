@@ -51,6 +51,7 @@ def test_links_of_the_readme_lead_to_files_and_become_addresses(tmp_path):
     made = absolute(text, "https://code.example/it/", "0.2.0")
     assert not LINK.search(made)
     assert "](https://code.example/it/blob/v0.2.0/docs/results.md)" in made
+    assert "](https://code.example/it/raw/v0.2.0/docs/images/desk.jpg)" in made
 
 
 @pytest.mark.parametrize("urls", ["", '\n[project.urls]\nRepository = "https://code.example/it"\n'])
