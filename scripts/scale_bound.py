@@ -60,7 +60,7 @@ SIZE = 55
 
 def bound_of(recording: SimulatedRecording, options: RecordingOptions, priors: BoundPriors | None = None) -> float:
     """:func:`scale_bound` of a recording that was simulated with these options."""
-    return scale_bound(recording.truth.motion, recording.truth.imu_errors, options, priors)
+    return scale_bound(recording.truth.motion, recording.truth.imu.errors, options, priors)
 
 
 def scale_bound(

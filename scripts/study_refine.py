@@ -282,7 +282,7 @@ def judged_calibration(model: Model, tracks: Tracks, late_s: float) -> dict[str,
     found, true, values = model.scale.calibration, tracks.calibration, model.treatments[-1].values
     turn = so3_log(matrix_from_quat(true.cam_from_imu_xyzw) @ matrix_from_quat(found.cam_from_imu_xyzw).T)
     # the truth's offsets hold in the middle of the recording
-    at_s = tracks.errors.middle_s
+    at_s = tracks.sampled.errors.middle_s
     offset = found.gyro_time_offset_s + float(found.drift_s(np.array(at_s))) - true.gyro_time_offset_s + late_s
     accel = found.accel_time_offset_s - found.gyro_time_offset_s
     accel -= true.accel_time_offset_s - true.gyro_time_offset_s
@@ -291,7 +291,7 @@ def judged_calibration(model: Model, tracks: Tracks, late_s: float) -> dict[str,
     accel_sigma = np.sqrt(cov[4, 4] + cov[3, 3] - 2 * cov[3, 4])
     lever = found.imu_in_cam_m - true.imu_in_cam_m
     axes = {
-        sensor: axes_deg(found, values[f"{sensor}_gain"], true, getattr(tracks.errors, f"{sensor}_matrix"))
+        sensor: axes_deg(found, values[f"{sensor}_gain"], true, getattr(tracks.sampled.errors, f"{sensor}_matrix"))
         for sensor in ("gyro", "accel")
     }
     out = {

@@ -29,11 +29,11 @@ from colmap_inertial.tools.simulate import (
     World,
     develop,
     draw_imu_errors,
-    render as rendering,
     sample_imu,
     textures,
 )
 from colmap_inertial.tools.simulate.motion import MARGIN_S
+from colmap_inertial.tools.simulate.render import RenderLimits
 
 #: Half the room, and from the walls to the path, whose corners are rounded.
 HALF_M, AISLE_M, HEIGHT_M = np.array([5.0, 4.0]), 1.8, 2.6
@@ -283,7 +283,7 @@ def write_walk(walk: Walk, folder: Path) -> Path:
 
 def _pictures(walk: Walk, motion: Motion, trigger_s: Array) -> Iterator[np.ndarray]:
     # a third of the rays: it is features that count here; of small pictures, a quarter of these
-    rendering._SAMPLES, rendering._SAMPLES_PER_PX = (4, rendering._SAMPLES_PER_PX) if walk.width > 400 else (2, 0.0)
-    renderer, camera = Renderer(world_of(walk)), walk.camera()
+    limits = RenderLimits(samples=4) if walk.width > 400 else RenderLimits(samples=2, samples_per_px=0.0)
+    renderer, camera = Renderer(world_of(walk), limits), walk.camera()
     for index, t_s in enumerate(trigger_s.tolist()):
         yield develop(renderer.linear(camera, motion, t_s), camera, np.random.default_rng([walk.seed, 4, index]))

@@ -1,5 +1,6 @@
 """Batches of real, small reconstructions: on this machine, and on a Dask cluster whose workers die."""
 
+import contextlib
 import csv
 import dataclasses
 import errno
@@ -378,12 +379,13 @@ def test_a_worker_that_does_not_see_the_files_says_so(tmp_path):
 
 
 def test_what_ran_out_is_said_in_a_sentence(tmp_path, monkeypatch):
-    def refused(pool, task):
+    def refuse(task):
         future = Future()
         future.set_exception(OSError(errno.EMFILE, "Too many open files"))
         return future
 
-    monkeypatch.setattr("colmap_inertial.tools.batch.pools._Local.submit", refused)
+    pool = contextlib.nullcontext(refuse)
+    monkeypatch.setattr("colmap_inertial.tools.batch.local_pool", lambda shares: pool)
     (tmp_path / "m.toml").write_text('[[capture]]\npath = "none"\n')
     (end,) = run_batch(tmp_path / "m.toml", tmp_path / "out").captures
     said = "no worker could finish it: too many files are open at a time: raise the limit (ulimit -n) and start again"

@@ -178,7 +178,7 @@ def test_a_calibrated_imu_narrows_the_interval_and_keeps_the_truth_in_it():
     widths = []
     for seed in (1, 2):
         recorded = simulate_recording(options, seed=seed)
-        rests = simulate_rests(RestOptions(imu=worse), seed=seed, errors=recorded.truth.imu_errors)
+        rests = simulate_rests(RestOptions(imu=worse), seed=seed, errors=recorded.truth.imu.errors)
         calibration = calibrated(rests).calibration
         trajectory, imu, scale = recorded.trajectory, recorded.imu, recorded.truth.metres_per_unit
         plain = estimate_scale(trajectory, imu)
@@ -199,7 +199,7 @@ def test_a_calibrated_imu_narrows_the_interval_and_keeps_the_truth_in_it():
 
 def test_a_recording_warmer_than_its_calibration_is_less_sure_and_says_so():
     recorded = simulate_recording(RecordingOptions(imu=IMU_PRESETS["phone"]), seed=1)
-    rests = simulate_rests(RestOptions(imu=IMU_PRESETS["phone"]), seed=1, errors=recorded.truth.imu_errors)
+    rests = simulate_rests(RestOptions(imu=IMU_PRESETS["phone"]), seed=1, errors=recorded.truth.imu.errors)
     cool = dataclasses.replace(rests.recording, temperature_c=21.0)
     calibration = calibrate_imu(cool, gravity_m_s2=9.81, gravity_sigma_m_s2=5e-4).calibration
     assert calibration.temperature_c == 21.0

@@ -36,7 +36,7 @@ def test_gravity_in_the_camera_is_right_but_for_the_accelerometer_s_bias(seed):
     down = np.array([found[name] for name in trajectory.names])
     cosine = np.sum(down * true_down_in_cam(recording), axis=1)
     error_deg = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-    bias_deg = np.degrees(np.arcsin(np.linalg.norm(recording.truth.imu_errors.accel_bias_m_s2) / 9.8))
+    bias_deg = np.degrees(np.arcsin(np.linalg.norm(recording.truth.imu.errors.accel_bias_m_s2) / 9.8))
     assert np.sqrt(np.mean(error_deg**2)) < bias_deg + 0.5
     assert error_deg.max() < bias_deg + 2.0
     assert bias_deg < 4

@@ -293,7 +293,7 @@ def test_reconstruct_uses_it_and_writes_it_down(capsys, tmp_path, home) -> None:
 
 def test_scale_takes_what_is_remembered_of_its_device_and_says_so(capsys, project, tmp_path, home) -> None:
     files = ["--imu", project.imu, "--frame-times", project.frame_times]
-    rests = simulate_rests(RestOptions(gravity_m_s2=9.80665), seed=1, errors=project.recording.truth.imu_errors)
+    rests = simulate_rests(RestOptions(gravity_m_s2=9.80665), seed=1, errors=project.recording.truth.imu.errors)
     own = calibrate_imu(rests.recording, gravity_sigma_m_s2=5e-4, device="tablet").calibration
     write_imu_calibration(tmp_path / "imu.json", own)
     code, _, err = run(capsys, "align", project.model, *files, "--out", tmp_path / "cam.json", "--remember", "tablet")

@@ -15,7 +15,7 @@ from colmap_inertial.model.similarities import read_scales, read_similarity
 from colmap_inertial.pipeline.run.config import config_as_toml, read_config
 from colmap_inertial.pipeline.stages.frame_folder import FrameRecord, read_frame_records
 from colmap_inertial.tools.batch import read_manifest
-from colmap_inertial.tools.batch.task import CaptureStatus, read_status, with_result, write_status
+from colmap_inertial.tools.batch.task import CaptureStatus, read_end, read_status, write_status
 
 MUTATIONS = 60
 MODEL = {
@@ -63,7 +63,7 @@ KINDS: dict[str, tuple[Callable[[Path], object], Callable[[Path], object]]] = {
         lambda path: read_config(path, ReconstructOptions),
     ),
     "scales of a result": (result, lambda path: read_scales([str(path)])),
-    "result in a batch": (result, lambda path: with_result(CaptureStatus(name="a"), path)),
+    "result in a batch": (result, lambda path: read_end(CaptureStatus(name="a"), path)),
     "similarity": (sim3, read_similarity),
     "frames": (frames, read_frame_records),
 }

@@ -190,8 +190,8 @@ def test_a_sensor_s_own_axes_are_surer_than_the_imu_s(walked):
     gains = [np.array(said.values[f"{sensor}_gain"]) for sensor in ("gyro", "accel")]
     found, true = made.scale.calibration, tracks.calibration
     for gain, matrix, sigma_deg in (
-        (gains[0], tracks.errors.gyro_matrix, gyro),
-        (gains[1], tracks.errors.accel_matrix, accel),
+        (gains[0], tracks.sampled.errors.gyro_matrix, gyro),
+        (gains[1], tracks.sampled.errors.accel_matrix, accel),
     ):
         turns = []
         for calibration, errors in ((found, np.eye(3) + gain), (true, np.linalg.inv(np.eye(3) + matrix))):

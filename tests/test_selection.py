@@ -137,7 +137,7 @@ def test_the_gyroscope_s_choice_is_the_sharpest_by_truth_and_by_picture(turning,
 
 def test_the_offset_between_the_clocks_is_found_and_stated(turning, of_turning):
     selection = of_turning
-    true_s = turning.scene.errors.gyro_time_offset_s
+    true_s = turning.scene.imu.errors.gyro_time_offset_s
     assert selection.offset_from == "pixels"
     assert abs(selection.offset_s - true_s) < 0.003
     assert "ms" in selection.note
@@ -220,7 +220,7 @@ def of_a_long_recording(
         format="h264",
     )
     scene = make_scene(recipe)
-    true = scene.errors
+    true = scene.imu.errors
     assert true.clock_rate == 0
     # stamps of a clock that runs at another rate; in the middle of the recording it shows the same
     recording = scene.imu.recording

@@ -77,7 +77,7 @@ def test_truth_holds_poses_calibration_and_depth(written):
     middle_s = scene.trigger_s + 0.0015
     np.testing.assert_allclose(truth.trajectory.t_s, middle_s, atol=1e-12)
     np.testing.assert_allclose(truth.trajectory.cam_in_world, scene.motion.cam_in_world_m(middle_s), atol=1e-12)
-    assert truth.calibration.gyro_time_offset_s == scene.errors.gyro_time_offset_s
+    assert truth.calibration.gyro_time_offset_s == scene.imu.errors.gyro_time_offset_s
     assert truth.target == recipe.board.spec() and truth.target_corners_m.shape == (48, 3)
     depth = np.load(folder / "depth" / "000002.npy")
     rotation = matrix_from_quat(truth.trajectory.cam_from_world_xyzw[2])
@@ -107,7 +107,7 @@ def test_a_camera_beside_the_body_has_its_own_pose_and_lever_arm(tmp_path):
     write_capture(replace(shifted, motion=replace(shifted.motion, duration_s=0.9)), tmp_path / "c")
     calibration = read_truth(tmp_path / "c" / "truth.json").calibration
     imu_in_body = np.array([0.05, 0.02, 0.0]) + quat_rotate(np.array(turn), calibration.imu_in_cam_m)
-    np.testing.assert_allclose(imu_in_body, scene.errors.imu_in_cam_m, atol=1e-12)
+    np.testing.assert_allclose(imu_in_body, scene.imu.errors.imu_in_cam_m, atol=1e-12)
 
 
 def test_video_frames_carry_exact_presentation_stamps(tmp_path):

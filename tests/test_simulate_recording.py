@@ -141,7 +141,7 @@ def test_scale_misalignment_and_bias_enter_as_documented():
     clean, wrong = record(NO_ERRORS), record(options)
     design = np.column_stack([clean.imu.gyro_rad_s, np.ones(len(clean.imu.gyro_t_s))])
     fit = np.linalg.lstsq(design, wrong.imu.gyro_rad_s, rcond=None)[0]
-    errors = wrong.truth.imu_errors
+    errors = wrong.truth.imu.errors
     np.testing.assert_allclose(fit[:3].T, np.eye(3) + errors.gyro_matrix, atol=1e-9)
     np.testing.assert_allclose(fit[3], errors.gyro_bias_rad_s, atol=1e-9)
     np.testing.assert_allclose(wrong.truth.calibration.gyro_bias_rad_s, errors.gyro_bias_rad_s, atol=1e-12)
@@ -153,7 +153,7 @@ def test_stamps_follow_the_clock_offset_its_rate_and_the_accelerometers_delay():
     options = replace(NO_ERRORS, clock_rate_sd=0.01, accel_delay_s=(-0.01, 0.002), clock_offset_s=(300.0, 400.0))
     simulated = record(options, seed=3)
     truth, imu = simulated.truth, simulated.imu
-    calibration, rate = truth.calibration, 1 + truth.imu_errors.clock_rate
+    calibration, rate = truth.calibration, 1 + truth.imu.errors.clock_rate
     assert 300 <= calibration.gyro_time_offset_s <= 400
     assert abs(calibration.accel_time_offset_s - calibration.gyro_time_offset_s + 0.01) < 0.01
     at_middle = np.interp(15.0, truth.imu.gyro_t_cam_s, imu.gyro_t_s)

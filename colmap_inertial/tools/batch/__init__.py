@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import contextlib
 import csv
-import dataclasses
 import io
 import itertools
 import os
 import time
 import uuid
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from colmap_inertial.core.errors import OutputError, OutputExistsError, exhausted
@@ -31,18 +30,27 @@ from colmap_inertial.tools.batch.task import (
     CaptureTask,
     Job,
     failed,
-    finished_earlier,
+    find_earlier_end,
     read_status,
     write_status,
 )
 
-#: How often progress is shown, and how often finished captures are looked for: a batch ends soon after its last one.
-_POLL_S, _DONE_S = 0.5, 0.05
-#: Captures are begun in their order: of those that wait, so many are looked at.
-_NEXT = 64
-#: After a stop, how long workers may take to notice.
-_STOP_S = 10.0
 
+@dataclass(frozen=True, kw_only=True)
+class BatchTiming:
+    """How often a batch looks at its captures."""
+
+    progress_s: float = 0.5
+    """How often progress is shown."""
+    done_s: float = 0.05
+    """How often finished captures are looked for: a batch ends soon after its last one."""
+    stop_s: float = 10.0
+    """After a stop, how long workers may take to notice."""
+    next_captures: int = 64
+    """Captures are begun in their order: status files of so many waiting ones are read."""
+
+
+BATCH_TIMING = BatchTiming()
 Watch = Callable[[CaptureStatus], None]
 
 
@@ -69,8 +77,8 @@ class BatchResult:
         return 0 if all(capture.state == "done" for capture in self.captures) else 1
 
 
-def unwatched(status: CaptureStatus, /) -> None:
-    """A watcher that looks away."""
+def ignore_status(status: CaptureStatus, /) -> None:
+    """The default watcher: does nothing."""
 
 
 def needs_gpu(options: ReconstructOptions) -> bool:
@@ -89,7 +97,7 @@ def run_batch(
     *,
     stages: StageNames = StageNames(),
     batch: BatchOptions = BatchOptions(),
-    watch: Watch = unwatched,
+    watch: Watch = ignore_status,
     allow_stages: bool = False,
 ) -> BatchResult:
     """Reconstruct many captures; one that fails does not stop the rest.
@@ -138,8 +146,13 @@ def run_batch(
             pool = local_pool(shares_of_this_machine(max(1, len(waiting)), batch.workers))
         try:
             if waiting:
-                with pool as ready, _stopping(out / "status" / "run"):
-                    at_work.follow({task.name: ready.submit(task) for task in waiting})
+                with pool as submit:
+                    try:
+                        at_work.follow({task.name: submit(task) for task in waiting})
+                    except BaseException:
+                        # workers anywhere find their run's file gone, and stop, too
+                        (out / "status" / "run").unlink(missing_ok=True)
+                        raise
         except BaseException:
             at_work.stop()
             raise
@@ -147,16 +160,6 @@ def run_batch(
             result = BatchResult(out=out, captures=at_work.statuses(), unchanged=not waiting)
             write_summary(result)
     return result
-
-
-@contextlib.contextmanager
-def _stopping(run_file: Path) -> Iterator[None]:
-    """Where something stops the batch, workers anywhere find their run's file gone, and stop, too."""
-    try:
-        yield
-    except BaseException:
-        run_file.unlink(missing_ok=True)
-        raise
 
 
 @contextlib.contextmanager
@@ -217,7 +220,7 @@ class _Batch:
         """The captures to work on: those without a result."""
         waiting = []
         for task in self._tasks.values():
-            status = finished_earlier(task) or self._known[task.name]
+            status = find_earlier_end(task) or self._known[task.name]
             write_status(task.status, status)
             self._set(status)
             if not status.finished:
@@ -229,19 +232,16 @@ class _Batch:
         while pending:
             for name in [name for name, one in pending.items() if one.done()]:
                 self._end(name, pending.pop(name))
-            for name in self._looked_at(pending):
+            # the running ones, and the next to run: reading thousands of files takes its time
+            running = [name for name in pending if self._known[name].state == "running"]
+            waiting = (name for name in pending if self._known[name].state == "waiting")
+            for name in [*running, *itertools.islice(waiting, BATCH_TIMING.next_captures)]:
                 status = read_status(self._tasks[name].status)
                 if status is not None and status.state == "running":
                     self._set(status)
-            until = time.monotonic() + _POLL_S
+            until = time.monotonic() + BATCH_TIMING.progress_s
             while pending and time.monotonic() < until and not any(one.done() for one in pending.values()):
-                time.sleep(_DONE_S)
-
-    def _looked_at(self, pending: dict[str, Pending]) -> list[str]:
-        """Those in work, and the next that may be: looking at thousands of files takes its time."""
-        running = [name for name in pending if self._known[name].state == "running"]
-        waiting = (name for name in pending if self._known[name].state == "waiting")
-        return [*running, *itertools.islice(waiting, _NEXT)]
+                time.sleep(BATCH_TIMING.done_s)
 
     def _end(self, name: str, pending: Pending) -> None:
         task = self._tasks[name]
@@ -255,19 +255,15 @@ class _Batch:
 
     def stop(self) -> None:
         """Mark what was neither finished nor stopped by its worker in time."""
-        until = time.monotonic() + _STOP_S
-        while time.monotonic() < until and any(self._at_work(task) for task in self._tasks.values()):
-            time.sleep(_POLL_S)
+        until = time.monotonic() + BATCH_TIMING.stop_s
+        while time.monotonic() < until and any(map(_is_running, self._tasks.values())):
+            time.sleep(BATCH_TIMING.progress_s)
         for task in self._tasks.values():
             status = read_status(task.status) or self._known[task.name]
             if not status.finished:
-                status = dataclasses.replace(status, state="interrupted", stage="")
+                status = replace(status, state="interrupted", stage="")
                 write_status(task.status, status)
             self._set(status)
-
-    def _at_work(self, task: CaptureTask) -> bool:
-        status = read_status(task.status)
-        return status is not None and status.state == "running"
 
     def _set(self, status: CaptureStatus) -> None:
         if status != self._known[status.name]:
@@ -277,6 +273,11 @@ class _Batch:
     def statuses(self) -> tuple[CaptureStatus, ...]:
         """All, in the manifest's order."""
         return tuple(self._known.values())
+
+
+def _is_running(task: CaptureTask) -> bool:
+    status = read_status(task.status)
+    return status is not None and status.state == "running"
 
 
 def write_summary(result: BatchResult) -> None:

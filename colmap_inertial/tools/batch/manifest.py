@@ -91,7 +91,7 @@ def read_manifest(
         ``allow_stages``.
     """
     path = Path(path)
-    captures = _of_folder(path, options) if path.is_dir() else _of_file(path, options)
+    captures = _list_captures(path, options) if path.is_dir() else _read_captures(path, options)
     if not allow_stages:
         _refuse_stages(captures, path)
     if not captures:
@@ -123,12 +123,12 @@ def _refuse_stages(captures: Sequence[BatchCapture], path: Path) -> None:
             )
 
 
-def _of_folder(folder: Path, options: ReconstructOptions) -> list[BatchCapture]:
+def _list_captures(folder: Path, options: ReconstructOptions) -> list[BatchCapture]:
     found = sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
     return [BatchCapture(name=path.name, path=path, options=options) for path in found]
 
 
-def _of_file(path: Path, options: ReconstructOptions) -> list[BatchCapture]:
+def _read_captures(path: Path, options: ReconstructOptions) -> list[BatchCapture]:
     root = read_toml(path)
     tables = root.raw("capture")
     root.finish()

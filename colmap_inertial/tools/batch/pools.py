@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 import queue
 import re
 import threading
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -19,12 +21,18 @@ from colmap_inertial.tools.batch.task import CaptureStatus, CaptureTask, run_cap
 
 log = logging.getLogger(__name__)
 
-#: What a thread needs: 2.4 GB were measured for a picture of 12 megapixels with COLMAP's defaults.
-_MEMORY_PER_THREAD = 3 * 2**30
+
+@dataclass(frozen=True, kw_only=True)
+class MemoryLimits:
+    """How much memory decides the number of workers."""
+
+    per_thread_bytes: int = 3 * 2**30
+    """What a thread needs: 2.4 GB were measured for a picture of 12 megapixels with COLMAP's defaults."""
+    assumed_free_bytes: int = 8 * 2**30
+    """Taken to be free where the system does not say."""
 
 
-#: Bytes that are taken to be free where the system does not say.
-_ASSUMED_MEMORY = 8 * 2**30
+MEMORY_LIMITS = MemoryLimits()
 
 
 class Pending(Protocol):
@@ -39,12 +47,8 @@ class Pending(Protocol):
         ...
 
 
-class Pool(Protocol):
-    """Somebody who works on captures."""
-
-    def submit(self, task: CaptureTask, /) -> Pending:
-        """Hand a capture over."""
-        ...
+#: Hands a capture over to a worker.
+Submit = Callable[[CaptureTask], Pending]
 
 
 def available_memory() -> int:
@@ -52,7 +56,7 @@ def available_memory() -> int:
     try:
         free = int(re.findall(r"MemAvailable:\s+(\d+) kB", Path("/proc/meminfo").read_text())[0]) * 1024
     except OSError:  # no Linux
-        free = _ASSUMED_MEMORY
+        free = MEMORY_LIMITS.assumed_free_bytes
     for folder in ("/sys/fs/cgroup", "/sys/fs/cgroup/memory"):
         for limit, used in (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes")):
             with contextlib.suppress(OSError, ValueError):
@@ -73,7 +77,7 @@ def shares_of_this_machine(captures: int, workers: int | None = None) -> list[li
     """
     cores = usable_cores()
     if workers is None:
-        cores = cores[: max(1, available_memory() // _MEMORY_PER_THREAD)]
+        cores = cores[: max(1, available_memory() // MEMORY_LIMITS.per_thread_bytes)]
         workers = min(len(cores), captures)
     return [cores[i::workers] or [cores[i % len(cores)]] for i in range(workers)]
 
@@ -83,75 +87,32 @@ def number_of_gpus() -> int:
     return sum(re.fullmatch(r"nvidia\d+", path.name) is not None for path in Path("/dev").glob("nvidia*"))
 
 
-class _Local:
-    def __init__(self, shares: list[list[int]]) -> None:
-        self._threads = ThreadPoolExecutor(len(shares), thread_name_prefix="capture")
-        self._shares: queue.SimpleQueue[list[int]] = queue.SimpleQueue()
-        for share in shares:
-            self._shares.put(share)
-        gpus = number_of_gpus()
-        self._gpus = threading.Semaphore(gpus) if gpus else None
+@contextlib.contextmanager
+def local_pool(shares: list[list[int]]) -> Iterator[Submit]:
+    """Threads that each watch one process at a time; captures that need a GPU take turns at those there are."""
+    free_shares: queue.SimpleQueue[list[int]] = queue.SimpleQueue()
+    for share in shares:
+        free_shares.put(share)
+    gpus = number_of_gpus()
+    gpu = threading.Semaphore(gpus) if gpus else contextlib.nullcontext()
 
-    def submit(self, task: CaptureTask, /) -> Pending:
-        return self._threads.submit(self._run, task)
-
-    def _run(self, task: CaptureTask) -> CaptureStatus:
-        share = self._shares.get()
+    def run(task: CaptureTask) -> CaptureStatus:
+        share = free_shares.get()
         try:
-            with self._gpus if task.gpu and self._gpus is not None else contextlib.nullcontext():
+            with gpu if task.gpu else contextlib.nullcontext():
                 return run_capture(task, share)
         finally:
-            self._shares.put(share)
+            free_shares.put(share)
 
-    def close(self) -> None:
-        self._threads.shutdown(cancel_futures=True)
-
-
-@contextlib.contextmanager
-def local_pool(shares: list[list[int]]) -> Iterator[Pool]:
-    """Threads that each watch one process at a time; captures that want a GPU take turns at those there are."""
-    pool = _Local(shares)
+    threads = ThreadPoolExecutor(len(shares), thread_name_prefix="capture")
     try:
-        yield pool
+        yield lambda task: threads.submit(run, task)
     finally:
-        pool.close()
-
-
-class _Dask:
-    def __init__(self, client: Any) -> None:
-        self._client = client
-        self._pending: list[Any] = []
-        self._gpu_checked = False
-
-    def submit(self, task: CaptureTask, /) -> Pending:
-        if task.gpu and not self._gpu_checked:
-            self._gpu_checked = True
-            if not any("GPU" in worker.get("resources", {}) for worker in self._workers()):
-                log.warning("no worker offers a GPU yet (dask worker --resources GPU=1): dense captures wait for one")
-        future: Pending = self._client.submit(
-            run_capture,
-            task,
-            key=f"colmap-inertial-{task.name}-{uuid.uuid4().hex}",
-            pure=False,
-            resources={"GPU": 1} if task.gpu else None,
-        )
-        self._pending.append(future)
-        return future
-
-    def _workers(self) -> list[dict[str, Any]]:
-        try:
-            found = self._client.scheduler_info(n_workers=-1)
-        except TypeError:  # before 2025.2 it tells of all without being asked
-            found = self._client.scheduler_info()
-        return list(found["workers"].values())
-
-    def close(self) -> None:
-        with contextlib.suppress(Exception):  # the scheduler may be gone
-            self._client.cancel([future for future in self._pending if not future.done()])
+        threads.shutdown(cancel_futures=True)
 
 
 @contextlib.contextmanager
-def dask_pool(address: str) -> Iterator[Pool]:
+def dask_pool(address: str) -> Iterator[Submit]:
     """The workers of a Dask cluster. A capture whose worker is lost goes to another one.
 
     Raises
@@ -169,9 +130,29 @@ def dask_pool(address: str) -> Iterator[Pool]:
         client = Client(address, timeout=10, set_as_default=False)
     except (OSError, ValueError) as error:
         raise InertialError(f"no Dask scheduler answers at {address}: {error}") from error
+    submitted: list[Any] = []
+    warn_without_gpu = functools.cache(lambda: _warn_without_gpu(client))
+
+    def submit(task: CaptureTask) -> Pending:
+        if task.gpu:
+            warn_without_gpu()
+        key, resources = f"colmap-inertial-{task.name}-{uuid.uuid4().hex}", {"GPU": 1} if task.gpu else None
+        future: Pending = client.submit(run_capture, task, key=key, pure=False, resources=resources)
+        submitted.append(future)
+        return future
+
     with client:
-        pool = _Dask(client)
         try:
-            yield pool
+            yield submit
         finally:
-            pool.close()
+            with contextlib.suppress(Exception):  # the scheduler may be gone
+                client.cancel([future for future in submitted if not future.done()])
+
+
+def _warn_without_gpu(client: Any) -> None:
+    try:
+        workers = client.scheduler_info(n_workers=-1)["workers"]
+    except TypeError:  # before 2025.2 it lists all workers without being asked
+        workers = client.scheduler_info()["workers"]
+    if not any("GPU" in worker.get("resources", {}) for worker in workers.values()):
+        log.warning("no worker offers a GPU yet (dask worker --resources GPU=1): dense captures wait for one")

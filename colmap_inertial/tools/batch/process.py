@@ -30,17 +30,13 @@ from colmap_inertial.tools.batch.task import (
     Job,
     failed,
     kill_with_children,
+    read_end,
     read_status,
-    with_result,
     write_status,
 )
 
 #: The task's paths, which JSON carries as text.
 _PATHS = ("capture", "out", "config", "status", "log", "run_file")
-#: Progress is written no more often than this.
-_PROGRESS_S = 1.0
-#: A worker that was lost may still be letting go of the folder for this long.
-_LOCK_S = 60.0
 
 
 def main() -> None:
@@ -60,21 +56,20 @@ def main() -> None:
     def progress(stage: str, done: int, total: int, /) -> None:
         nonlocal last
         now = time.monotonic()
-        if now - last >= _PROGRESS_S:
+        if now - last >= 1.0:  # s: a file for every image would be too many
             last = now
             write_status(task.status, dataclasses.replace(status, stage=stage, steps_done=done, steps=total))
 
     def findings(diagnosis: Diagnosis) -> None:
         nonlocal status
-        said = (f for f in diagnosis.findings if f.severity != "info")
-        status = dataclasses.replace(
-            status, findings=tuple(f"{f.severity}: {f.evidence}; {f.advice} ({f.code})" for f in said)
-        )
+        serious = (f for f in diagnosis.findings if f.severity != "info")
+        texts = tuple(f"{f.severity}: {f.evidence}; {f.advice} ({f.code})" for f in serious)
+        status = dataclasses.replace(status, findings=texts)
         write_status(task.status, status)
 
     try:
         _reconstruct(task, progress, findings)
-        end = with_result(status, Workspace(task.out).result)
+        end = read_end(status, Workspace(task.out).result)
     except InertialError as error:
         print(f"error: {error}", file=sys.stderr)
         end = failed(status, str(error), error.exit_code)
@@ -135,7 +130,8 @@ def _begin(workspace: Workspace, stages: StageNames) -> None:
     if workspace.stamps.is_dir() or (vacant and stages != StageNames()):
         with contextlib.suppress(OutputExistsError, OSError):
             workspace.stamps.mkdir(parents=True, exist_ok=True)
-            with locked(workspace.lock, "", wait_s=_LOCK_S):
+            # a worker that was lost may take as long to let go of the folder
+            with locked(workspace.lock, "", wait_s=60.0):
                 write_text(workspace.stage_names, config_as_toml(stages))
 
 

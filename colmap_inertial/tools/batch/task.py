@@ -28,9 +28,6 @@ from colmap_inertial.pipeline.run.workspace import Workspace
 
 State = Literal["waiting", "running", "done", "failed", "interrupted"]
 
-#: How often a process at work is looked at.
-_POLL_S = 0.25
-
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
@@ -160,7 +157,7 @@ def failed(status: CaptureStatus, error: str, exit_code: int = 1) -> CaptureStat
     return dataclasses.replace(status, state="failed", exit_code=exit_code, error=error, stage="")
 
 
-def finished_earlier(task: CaptureTask) -> CaptureStatus | None:
+def find_earlier_end(task: CaptureTask) -> CaptureStatus | None:
     """The end of a capture that has one already; ``None`` where there is work to do.
 
     A result that was made from another capture, with other options or with other stages is an error, not this
@@ -179,17 +176,17 @@ def finished_earlier(task: CaptureTask) -> CaptureStatus | None:
         project = result.get("project", _plain(ProjectOptions()))
         if read_config(workspace.config, ReconstructOptions) != job.options or project != _plain(job.project):
             other = other or "set of options"
-        if made_with(workspace) != job.stages:
+        if read_stage_names(workspace) != job.stages:
             other = other or "set of stages"
         if other is not None:
             text = f"{task.out} holds the result of another {other}; remove it or choose another folder"
             return failed(status, text, FormatError.exit_code)
-        return with_result(status, workspace.result)
+        return read_end(status, workspace.result)
     except FormatError as error:
         return failed(status, str(error), error.exit_code)
 
 
-def made_with(workspace: Workspace) -> StageNames:
+def read_stage_names(workspace: Workspace) -> StageNames:
     """The stages that a folder is made with, as the process at work wrote them down."""
     return read_config(workspace.stage_names, StageNames) if workspace.stage_names.is_file() else StageNames()
 
@@ -198,7 +195,7 @@ def _plain(project: ProjectOptions) -> object:
     return json.loads(json.dumps(dataclasses.asdict(project), default=str))
 
 
-def with_result(status: CaptureStatus, result: Path) -> CaptureStatus:
+def read_end(status: CaptureStatus, result: Path) -> CaptureStatus:
     """The status of a capture whose ``result.json`` is there, by the rules of ``ReconstructResult.exit_code``."""
     values = read_json(result)
     try:
@@ -257,7 +254,7 @@ def run_capture(task: CaptureTask, cores: Sequence[int] = ()) -> CaptureStatus:
     status = CaptureStatus(name=task.name, host=host, run=task.run)
     if not task.config.is_file():
         return failed(status, f"{host} does not see {task.config}: workers need the same files under the same paths", 2)
-    earlier = finished_earlier(task)
+    earlier = find_earlier_end(task)
     if earlier is not None:
         write_status(task.status, earlier)
         return earlier
@@ -288,7 +285,7 @@ def run_capture(task: CaptureTask, cores: Sequence[int] = ()) -> CaptureStatus:
     return status
 
 
-def goes_on(task: CaptureTask) -> bool:
+def is_wanted(task: CaptureTask) -> bool:
     """Whether this run of the batch still wants the capture."""
     try:
         return task.run_file.read_text(encoding="utf-8") == task.run
@@ -306,8 +303,7 @@ def kill_with_children(pid: int) -> None:
 
 def _attend(task: CaptureTask, cores: Sequence[int]) -> int | None:
     """Start the process and wait for it: its return code, or ``None`` where the batch was stopped meanwhile."""
-    values = {f.name: getattr(task, f.name) for f in dataclasses.fields(task)}
-    argument = json.dumps({key: str(value) if isinstance(value, Path) else value for key, value in values.items()})
+    argument = json.dumps(dataclasses.asdict(task), default=str)
     environment = dict(os.environ)
     if cores:
         environment |= {"OMP_NUM_THREADS": str(len(cores)), "OPENBLAS_NUM_THREADS": str(len(cores))}
@@ -320,9 +316,9 @@ def _attend(task: CaptureTask, cores: Sequence[int]) -> int | None:
     try:
         while True:
             try:
-                return process.wait(timeout=_POLL_S)
+                return process.wait(timeout=0.25)
             except subprocess.TimeoutExpired:
-                if not goes_on(task):
+                if not is_wanted(task):
                     return None
     finally:
         with contextlib.suppress(ProcessLookupError, PermissionError):

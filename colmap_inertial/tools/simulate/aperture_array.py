@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -65,7 +66,7 @@ def write_aperture_capture(
     roles = list(array.layout)
     places = {role: (x * array.baseline_m, y * array.baseline_m, 0.0) for role, (x, y) in array.layout.items()}
     rig: dict[str, ShutterCamera] = {
-        role: replace(recipe.camera, cam_in_body_m=_moved(recipe.camera, places[role])) for role in roles[1:]
+        role: replace(recipe.camera, cam_in_body_m=_shift_camera(recipe.camera, places[role])) for role in roles[1:]
     }
     toml = write_capture(replace(recipe, rig=rig), folder, workers=workers, progress=progress)
     (folder / "frames").rename(folder / "frames_rgb")
@@ -74,25 +75,25 @@ def write_aperture_capture(
         target = folder / ("frames" if i == 0 else f"frames_{role}")
         target.mkdir(exist_ok=True)
         for path in sorted(source.glob("*.png")):
-            encode_image(target / path.name, _filtered(read_image(path), role))
-    write_text(folder / "rig_config.json", json.dumps([{"cameras": _cameras(recipe, places)}], indent=1) + "\n")
-    head, camera, rest = _split(toml.read_text(encoding="utf-8"))
-    del camera  # the calibration has it
+            encode_image(target / path.name, _apply_filter(read_image(path), role))
+    write_text(folder / "rig_config.json", json.dumps([{"cameras": _rig_cameras(recipe, places)}], indent=1) + "\n")
     lines = ["[apertures]", 'calibration = "rig_config.json"', 'unit = "m"']
     for i, role in enumerate(roles):
         lines += ["", f"[apertures.{role}]", f'role = "{role}"']
         lines += [] if i == 0 else [f'folder = "frames_{role}"']
-    write_text(toml, head + "\n".join(lines) + "\n\n" + rest)
+    # in place of the [camera] table, where there is one: the calibration has it
+    place = re.compile(r"(\[camera\]\n.*?\n)?(?=\[imu\.)", re.DOTALL)
+    write_text(toml, place.sub(lambda _: "\n".join(lines) + "\n\n", toml.read_text(encoding="utf-8"), count=1))
     return toml
 
 
-def _moved(camera: ShutterCamera, by_m: tuple[float, float, float]) -> tuple[float, float, float]:
+def _shift_camera(camera: ShutterCamera, by_m: tuple[float, float, float]) -> tuple[float, float, float]:
     """Position on the body of a camera moved along its own axes."""
     x, y, z = np.array(camera.cam_in_body_m) + matrix_from_quat(np.array(camera.body_from_cam_xyzw)) @ np.array(by_m)
     return float(x), float(y), float(z)
 
 
-def _filtered(image: UInt8Array | UInt16Array, role: SpectralRole) -> UInt8Array:
+def _apply_filter(image: UInt8Array | UInt16Array, role: SpectralRole) -> UInt8Array:
     """What an aperture lets through of a colour picture."""
     if role in ("red", "green", "blue"):
         return np.asarray(image[..., ("red", "green", "blue").index(role)], dtype=np.uint8)
@@ -100,7 +101,9 @@ def _filtered(image: UInt8Array | UInt16Array, role: SpectralRole) -> UInt8Array
     return np.asarray(np.rint(255 * srgb_from_linear(light)), dtype=np.uint8)
 
 
-def _cameras(recipe: SceneRecipe, places: Mapping[SpectralRole, tuple[float, float, float]]) -> list[dict[str, object]]:
+def _rig_cameras(
+    recipe: SceneRecipe, places: Mapping[SpectralRole, tuple[float, float, float]]
+) -> list[dict[str, object]]:
     model = recipe.camera.model
     cameras: list[dict[str, object]] = []
     for i, (role, place) in enumerate(places.items()):
@@ -114,13 +117,3 @@ def _cameras(recipe: SceneRecipe, places: Mapping[SpectralRole, tuple[float, flo
         entry["camera_params"] = list(model.params)
         cameras.append(entry)
     return cameras
-
-
-def _split(text: str) -> tuple[str, str, str]:
-    """A capture.toml before, in and after its ``[camera]`` table."""
-    head, mark, rest = text.partition("[camera]\n")
-    if not mark:
-        head, _, rest = text.partition("[imu.")
-        return head, "", "[imu." + rest
-    table, _, rest = rest.partition("\n[")
-    return head, mark + table, "[" + rest

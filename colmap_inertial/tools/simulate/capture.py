@@ -22,16 +22,10 @@ from colmap_inertial.core.geometry import matrix_from_quat, quat_conjugate, quat
 from colmap_inertial.io.files import write_json, write_text
 from colmap_inertial.io.video import frame_name
 from colmap_inertial.model.copying import new_folder
-from colmap_inertial.tools.simulate.motion import Motion, make_motion
+from colmap_inertial.tools.simulate.motion import Motion
 from colmap_inertial.tools.simulate.recipe import SceneRecipe, recipe_text
 from colmap_inertial.tools.simulate.render import Renderer, ShutterCamera, develop
-from colmap_inertial.tools.simulate.sensors import (
-    STANDARD_GRAVITY_M_S2,
-    ImuErrors,
-    SampledImu,
-    draw_imu_errors,
-    sample_imu,
-)
+from colmap_inertial.tools.simulate.sensors import STANDARD_GRAVITY_M_S2, SampledImu, simulate_imu
 from colmap_inertial.tools.simulate.world import Board, World, WorldKind, make_world
 
 #: Camera (end of its files' names), frame, folder for the depth map.
@@ -49,7 +43,7 @@ class Scene:
     ----------
     motion
         The body's path: poses at any time.
-    errors, imu
+    imu
         The device and its samples.
     trigger_s
         (F,) when the main camera starts exposing each frame's first line, camera clock.
@@ -59,7 +53,6 @@ class Scene:
 
     recipe: SceneRecipe
     motion: Motion
-    errors: ImuErrors
     imu: SampledImu
     trigger_s: Array
     names: tuple[str, ...]
@@ -83,17 +76,14 @@ class Scene:
 def make_scene(recipe: SceneRecipe) -> Scene:
     """Draw the motion, the device and its samples; the camera's clock starts at 0 with the first frame."""
     streams = [np.random.default_rng(s) for s in np.random.SeedSequence(recipe.seed).spawn(2)]
-    duration_s = recipe.motion.duration_s
-    motion = make_motion(recipe.motion, streams[0])
-    errors = draw_imu_errors(recipe.imu, duration_s, streams[1])
-    imu = sample_imu(motion, errors, recipe.imu, duration_s=duration_s, rng=streams[1])
-    count = int(duration_s * recipe.frame_rate_hz)
+    motion, imu = simulate_imu(recipe.motion, recipe.imu, streams)
+    count = int(recipe.motion.duration_s * recipe.frame_rate_hz)
     ticks = np.rint(np.arange(count) * (_TICKS_HZ / recipe.frame_rate_hz)).astype(np.int64)
     if recipe.format == "h264":
         names = tuple(frame_name(int(t), 0) for t in np.rint(ticks * (1e9 / _TICKS_HZ)))
     else:
         names = tuple(f"{i:06d}.{'jpg' if recipe.format == 'jpeg' else 'png'}" for i in range(count))
-    return Scene(recipe=recipe, motion=motion, errors=errors, imu=imu, trigger_s=ticks / _TICKS_HZ, names=names)
+    return Scene(recipe=recipe, motion=motion, imu=imu, trigger_s=ticks / _TICKS_HZ, names=names)
 
 
 def write_capture(
@@ -270,7 +260,7 @@ def _poses(scene: Scene, camera: ShutterCamera) -> list[dict[str, object]]:
 
 
 def _truth(scene: Scene) -> dict[str, object]:
-    recipe, errors = scene.recipe, scene.errors
+    recipe, errors = scene.recipe, scene.imu.errors
     # the motion is the body's; the calibration that estimators seek is the main camera's
     camera = recipe.camera
     cam_from_body = quat_conjugate(np.array(camera.body_from_cam_xyzw))

@@ -18,18 +18,39 @@ from colmap_inertial.core.geometry import quat_exp, quat_from_matrix, quat_multi
 
 MotionKind = Literal["orbit", "walk", "roam", "constant_velocity", "pure_rotation", "static"]
 
-#: One-sided power spectral densities of handheld motion, mean of the motion-capture ground truth of TUM-VI room1,
-#: room3 and room5 (Schubert et al. 2018, CC BY 4.0), after subtracting the capture system's noise floor (0.1 mm and
-#: 1 mrad per sample at 120 Hz). ``scripts/compare_motion.py`` recomputes and compares them.
-_FREQUENCY_HZ = (0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0)
-#: Velocity of the camera, m2/s2/Hz, world frame: each horizontal axis; vertical.
-_HORIZONTAL = (0.18, 3.3, 0.63, 0.76, 0.33, 0.115, 0.0122, 3.3e-3, 3.9e-4, 7.3e-5, 1.5e-5, 5.6e-6, 2.7e-6, 1.7e-6)
-_VERTICAL = (3.4e-3, 6.4e-3, 0.017, 0.092, 0.45, 0.38, 0.045, 8.3e-3, 7.6e-4, 1.6e-4, 2.3e-5, 4.7e-6, 2.1e-6, 1.8e-6)
-#: Angular velocity, rad2/s2/Hz, mean of the three body axes.
-_ROTATION = (0.79, 0.38, 0.38, 1.18, 1.43, 0.74, 0.26, 0.096, 0.024, 8.1e-3, 2.0e-3, 5.4e-4, 2.4e-4, 1.35e-4)
-#: Nothing moves above this; well below half the knot rate.
-_BAND_LIMIT_HZ = 15.0
-_KNOT_RATE_HZ = 60.0
+Spectrum = tuple[float, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class HandheldSpectra:
+    """One-sided power spectral densities of handheld motion, and the band that is simulated.
+
+    The densities are the mean of the motion-capture ground truth of TUM-VI room1, room3 and room5 (Schubert et al.
+    2018, CC BY 4.0), after subtracting the capture system's noise floor (0.1 mm and 1 mrad per sample at 120 Hz).
+    ``scripts/compare_motion.py`` recomputes and compares them.
+    """
+
+    frequency_hz: Spectrum = (0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0)
+    """Where the densities hold."""
+    horizontal_m2_s2_hz: Spectrum = (
+        *(0.18, 3.3, 0.63, 0.76, 0.33, 0.115, 0.0122, 3.3e-3, 3.9e-4, 7.3e-5, 1.5e-5, 5.6e-6, 2.7e-6, 1.7e-6),
+    )
+    """Velocity of the camera along each horizontal axis of the world."""
+    vertical_m2_s2_hz: Spectrum = (
+        *(3.4e-3, 6.4e-3, 0.017, 0.092, 0.45, 0.38, 0.045, 8.3e-3, 7.6e-4, 1.6e-4, 2.3e-5, 4.7e-6, 2.1e-6, 1.8e-6),
+    )
+    """Velocity of the camera along the world's vertical axis."""
+    rotation_rad2_s2_hz: Spectrum = (
+        *(0.79, 0.38, 0.38, 1.18, 1.43, 0.74, 0.26, 0.096, 0.024, 8.1e-3, 2.0e-3, 5.4e-4, 2.4e-4, 1.35e-4),
+    )
+    """Angular velocity, mean of the three body axes."""
+    band_limit_hz: float = 15.0
+    """Nothing moves above this; well below half the knot rate."""
+    knot_rate_hz: float = 60.0
+    """Of the spline."""
+
+
+HANDHELD = HandheldSpectra()
 #: The motion continues this long before time 0 and after the duration, for an IMU that outlasts the video.
 MARGIN_S = 3.0
 
@@ -214,18 +235,17 @@ def _conjugate_product_vector(a: Array, b: Array) -> Array:
     )
 
 
-def _random_process(
-    density: tuple[float, ...], low_hz: float, high_hz: float, n: int, rng: np.random.Generator
-) -> Array:
+def _random_process(density: Spectrum, low_hz: float, high_hz: float, n: int, rng: np.random.Generator) -> Array:
     """(n, 1) samples at the knot rate of the integral of a Gaussian process with this one-sided density."""
     from scipy.fft import irfft, next_fast_len, rfftfreq
 
-    size = next_fast_len(n + int(_KNOT_RATE_HZ), real=True)
-    frequency = rfftfreq(size, 1 / _KNOT_RATE_HZ)
+    size = next_fast_len(n + int(HANDHELD.knot_rate_hz), real=True)
+    frequency = rfftfreq(size, 1 / HANDHELD.knot_rate_hz)
     inside = (frequency >= max(low_hz, frequency[1])) & (frequency < high_hz)
     f = frequency[inside]
-    level = np.exp(np.interp(np.log(f), np.log(_FREQUENCY_HZ), np.log(density)))
-    taper = np.clip((_BAND_LIMIT_HZ - f) / (_BAND_LIMIT_HZ - _FREQUENCY_HZ[-1]), 0, 1)
+    measured_hz, limit_hz = HANDHELD.frequency_hz, HANDHELD.band_limit_hz
+    level = np.exp(np.interp(np.log(f), np.log(measured_hz), np.log(density)))
+    taper = np.clip((limit_hz - f) / (limit_hz - measured_hz[-1]), 0, 1)
     # cosine and sine of a bin of width df each have variance S df, so that together they carry the power S df
     sigma = np.sqrt(level * taper * frequency[1])
     spectrum = np.zeros(len(frequency), dtype=np.complex128)
@@ -234,10 +254,12 @@ def _random_process(
     return np.asarray(irfft(spectrum, size)[:n, None])
 
 
-def _hand(n: int, rng: np.random.Generator, *, low_hz: float, vigour: float) -> tuple[Array, Array]:
+def _draw_hand(n: int, rng: np.random.Generator, *, low_hz: float, vigour: float) -> tuple[Array, Array]:
     """Position (m, world) and rotation vector (rad, camera) of the hand, (n, 3) each."""
-    position = [_random_process(d, low_hz, _BAND_LIMIT_HZ, n, rng) for d in (_HORIZONTAL, _HORIZONTAL, _VERTICAL)]
-    rotation = [_random_process(_ROTATION, max(low_hz, 0.2), _BAND_LIMIT_HZ, n, rng) for _ in range(3)]
+    axes = (HANDHELD.horizontal_m2_s2_hz, HANDHELD.horizontal_m2_s2_hz, HANDHELD.vertical_m2_s2_hz)
+    position = [_random_process(density, low_hz, HANDHELD.band_limit_hz, n, rng) for density in axes]
+    low_hz = max(low_hz, 0.2)
+    rotation = [_random_process(HANDHELD.rotation_rad2_s2_hz, low_hz, HANDHELD.band_limit_hz, n, rng) for _ in range(3)]
     return vigour * np.concatenate(position, axis=1), vigour * np.concatenate(rotation, axis=1)
 
 
@@ -254,9 +276,9 @@ def make_motion(options: MotionOptions, rng: np.random.Generator) -> Motion:
 
     The world's z axis points up; ``orbit`` circles its start, the others begin near it.
     """
-    step_s = 1 / _KNOT_RATE_HZ
+    step_s = 1 / HANDHELD.knot_rate_hz
     guard = 16  # samples beyond the margin, where the spline's boundary condition has an effect
-    n = int(np.ceil((options.duration_s + 2 * MARGIN_S) * _KNOT_RATE_HZ)) + 2 * guard + 1
+    n = int(np.ceil((options.duration_s + 2 * MARGIN_S) * HANDHELD.knot_rate_hz)) + 2 * guard + 1
     start_s = -MARGIN_S - guard * step_s
     t = start_s + step_s * np.arange(n)
     heading = rng.uniform(0, 2 * np.pi)
@@ -265,9 +287,8 @@ def make_motion(options: MotionOptions, rng: np.random.Generator) -> Motion:
     along = np.array([np.cos(heading), np.sin(heading), 0.0])
     side = np.array([-along[1], along[0], 0.0])
     position = np.zeros((n, 3))
-    shake, turn = _hand(
-        n, rng, low_hz={"orbit": 0.5, "walk": 0.35}.get(options.kind, _FREQUENCY_HZ[0]), vigour=options.vigour
-    )
+    low_hz = {"orbit": 0.5, "walk": 0.35}.get(options.kind, HANDHELD.frequency_hz[0])
+    shake, turn = _draw_hand(n, rng, low_hz=low_hz, vigour=options.vigour)
     if options.kind == "orbit":
         phase = np.pi * t / options.sweep_s
         azimuth = heading - np.deg2rad(options.arc_deg) / 2 * np.cos(phase)
@@ -288,7 +309,7 @@ def make_motion(options: MotionOptions, rng: np.random.Generator) -> Motion:
             position = position + bob[0] * np.cos(2 * np.pi * step_hz * t)[:, None] * np.array([0.0, 0.0, 1.0])
             position = position + bob[1] * np.sin(np.pi * step_hz * t)[:, None] * side
         if options.kind == "roam":
-            yaw = options.vigour * _random_process(_ROTATION, 0.0, 0.2, n, rng)
+            yaw = options.vigour * _random_process(HANDHELD.rotation_rad2_s2_hz, 0.0, 0.2, n, rng)
             looking = quat_multiply(quat_exp(yaw * np.array([0.0, 0.0, 1.0])), looking)
         if options.kind in ("walk", "roam"):
             position = position + shake

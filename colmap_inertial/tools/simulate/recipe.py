@@ -17,11 +17,6 @@ from colmap_inertial.tools.simulate.world import Board, WorldKind
 T = TypeVar("T")
 FrameFormat = Literal["jpeg", "png", "h264"]
 
-_DEFAULT_CAMERA = ShutterCamera(
-    model=CameraModel(
-        model="OPENCV", width=640, height=480, params=(520.0, 520.0, 320.0, 240.0, 0.08, -0.12, 0.0005, -0.0003)
-    )
-)
 #: Fields that take one of a few texts.
 _CHOICES: dict[str, tuple[str, ...]] = {
     "world": get_args(WorldKind),
@@ -62,7 +57,13 @@ class SceneRecipe:
     """How the body moves."""
     imu: ImuOptions = field(default_factory=ImuOptions)
     """The device."""
-    camera: ShutterCamera = _DEFAULT_CAMERA
+    camera: ShutterCamera = field(
+        default_factory=lambda: ShutterCamera(
+            model=CameraModel(
+                model="OPENCV", width=640, height=480, params=(520.0, 520.0, 320.0, 240.0, 0.08, -0.12, 0.0005, -0.0003)
+            )
+        )
+    )
     """The camera that the capture is about."""
     rig: Mapping[str, ShutterCamera] = field(default_factory=dict)
     """More cameras on the body, by name."""

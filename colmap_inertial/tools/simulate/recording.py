@@ -17,15 +17,8 @@ from colmap_inertial.core.geometry import (
     skew,
 )
 from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuRecording
-from colmap_inertial.tools.simulate.motion import Motion, MotionOptions, make_motion
-from colmap_inertial.tools.simulate.sensors import (
-    STANDARD_GRAVITY_M_S2,
-    ImuErrors,
-    ImuOptions,
-    SampledImu,
-    draw_imu_errors,
-    sample_imu,
-)
+from colmap_inertial.tools.simulate.motion import Motion, MotionOptions
+from colmap_inertial.tools.simulate.sensors import STANDARD_GRAVITY_M_S2, ImuOptions, SampledImu, simulate_imu
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,7 +90,7 @@ class RecordingTruth:
         True camera-IMU calibration; its gyroscope bias is the mean over the recording, its ``cov`` zero.
     accel_bias_m_s2
         (3,) mean over the recording.
-    imu_errors, imu
+    imu
         Every parameter of the IMU's model; its samples with their true times and biases.
     """
 
@@ -108,7 +101,6 @@ class RecordingTruth:
     gravity_in_world_m_s2: Array
     calibration: CameraImuCalibration
     accel_bias_m_s2: Array
-    imu_errors: ImuErrors
     imu: SampledImu
 
     def cam_in_model(self, t_s: Array) -> Array:
@@ -170,7 +162,7 @@ def _correlated(n: int, dt_s: float, sigma: float, correlation_s: float, rng: np
     return np.asarray(lfilter([1.0], [1.0, -decay], noise, axis=0))
 
 
-def _seen_by_sfm(motion: Motion, t_s: Array, options: SfmOptions, rng: np.random.Generator) -> tuple[Array, Array]:
+def _perturb_poses(motion: Motion, t_s: Array, options: SfmOptions, rng: np.random.Generator) -> tuple[Array, Array]:
     """World_from_cam and centres (metres, world) with the errors of structure from motion."""
     n, dt = len(t_s), 1 / options.frame_rate_hz
     k = motion.at(t_s)
@@ -212,19 +204,13 @@ def simulate_recording(options: RecordingOptions | None = None, *, seed: int) ->
     """
     options = options or RecordingOptions()
     streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(3)]
-    duration_s = options.motion.duration_s
-    motion = make_motion(options.motion, streams[0])
-    errors = draw_imu_errors(options.imu, duration_s, streams[1])
-    imu = sample_imu(
-        motion, errors, options.imu, duration_s=duration_s, rng=streams[1], gravity_m_s2=options.gravity_m_s2
-    )
-
+    motion, imu = simulate_imu(options.motion, options.imu, streams, gravity_m_s2=options.gravity_m_s2)
     rng = streams[2]
     metres_per_unit = float(np.exp(rng.uniform(*np.log(options.sfm.metres_per_unit))))
     model_from_world = quat_normalize(rng.standard_normal(4))
     world_in_model = rng.standard_normal(3)
-    t_s = np.arange(int(duration_s * options.sfm.frame_rate_hz)) / options.sfm.frame_rate_hz
-    world_from_cam, position = _seen_by_sfm(motion, t_s, options.sfm, rng)
+    t_s = np.arange(int(options.motion.duration_s * options.sfm.frame_rate_hz)) / options.sfm.frame_rate_hz
+    world_from_cam, position = _perturb_poses(motion, t_s, options.sfm, rng)
     trajectory = CameraTrajectory(
         names=tuple(f"{i:06d}" for i in range(len(t_s))),
         t_s=t_s,
@@ -237,9 +223,8 @@ def simulate_recording(options: RecordingOptions | None = None, *, seed: int) ->
         model_from_world_xyzw=model_from_world,
         world_in_model=world_in_model,
         gravity_in_world_m_s2=quat_rotate(model_from_world, np.array([0.0, 0.0, -options.gravity_m_s2])),
-        calibration=errors.calibrate(imu.gyro_bias_rad_s.mean(axis=0), options.sfm.readout_s),
+        calibration=imu.calibration(options.sfm.readout_s),
         accel_bias_m_s2=imu.accel_bias_m_s2.mean(axis=0),
-        imu_errors=errors,
         imu=imu,
     )
     return SimulatedRecording(trajectory=trajectory, imu=imu.recording, truth=truth)

@@ -22,14 +22,25 @@ from colmap_inertial.model import colmap_camera
 from colmap_inertial.tools.simulate.motion import Motion
 from colmap_inertial.tools.simulate.world import World
 
-_NEAR_M = 0.02
-#: Samples of a pixel: so many, and so many more for each pixel of blur. Against 256 samples the error is then about one
-#: grey level rms, from no blur to 60 px of it; more only where black meets white all over the picture.
-_SAMPLES = 12
-_SAMPLES_PER_PX = 2.5
-_MOST_SAMPLES = 128
-#: Pixels whose colours are looked up together: few enough to stay in the processor's cache.
-_CHUNK = 16384
+
+@dataclass(frozen=True, kw_only=True)
+class RenderLimits:
+    """How finely pixels are sampled.
+
+    Against 256 samples the error is then about one grey level rms, from no blur to 60 px of it; more only where black
+    meets white all over the picture.
+    """
+
+    near_m: float = 0.02
+    """What is nearer is not seen."""
+    samples: int = 12
+    """Samples of a pixel without blur."""
+    samples_per_px: float = 2.5
+    """More samples for each pixel of blur."""
+    most_samples: int = 128
+    """Samples of a pixel at most."""
+    chunk_px: int = 16384
+    """Pixels whose colours are looked up together: few enough to stay in the processor's cache."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,10 +167,12 @@ class Renderer:
     ----------
     world
         What to film.
+    limits
+        How finely pixels are sampled.
     """
 
-    def __init__(self, world: World) -> None:
-        self.world = world
+    def __init__(self, world: World, limits: RenderLimits = RenderLimits()) -> None:
+        self.world, self._limits = world, limits
         self._atlas = _Atlas(world)
         quads = world.quads
         self._corner = np.stack([q.corner_m for q in quads])
@@ -221,7 +234,8 @@ class Renderer:
             moved = (points - centre[1]) @ rotation[1].T
             shift = np.hypot(moved[..., 0] / moved[..., 2] - x, moved[..., 1] / moved[..., 2] - y)
             longest = max(longest, float(np.max(shift / pixel)))
-        return min(_MOST_SAMPLES, _SAMPLES + int(np.ceil(_SAMPLES_PER_PX * max(longest, 1.0))))
+        more = int(np.ceil(self._limits.samples_per_px * max(longest, 1.0)))
+        return min(self._limits.most_samples, self._limits.samples + more)
 
     def _sample(
         self, camera: ShutterCamera, motion: Motion, instants: Array, offset: Array, samples: int
@@ -241,8 +255,8 @@ class Renderer:
         size = self._size.astype(np.float32)
         out = np.zeros((quad.size, 3), dtype=np.float32)
         seen = np.flatnonzero(quad >= 0)
-        for i in range(0, len(seen), _CHUNK):
-            part = seen[i : i + _CHUNK]
+        for i in range(0, len(seen), self._limits.chunk_px):
+            part = seen[i : i + self._limits.chunk_px]
             which, z_inverse = quad.ravel()[part], inverse.ravel()[part]
             s, t = u.ravel()[part] / (z_inverse * size[which, 0]), v.ravel()[part] / (z_inverse * size[which, 1])
             out[part] = self._atlas.look_up(which, s, t, np.sqrt(per_depth[which] / z_inverse**3))
@@ -284,7 +298,7 @@ class Renderer:
             lines = [h[:, i, j][None, :] if by_column else h[:, i, j][:, None] for i in range(3) for j in range(3)]
             px, py = x[part], y[part]
             w = lines[6] * px + lines[7] * py + lines[8]
-            nearer = (w > best[part]) & (w < 1 / _NEAR_M)
+            nearer = (w > best[part]) & (w < 1 / self._limits.near_m)
             if not nearer.any():
                 continue
             u = lines[0] * px + lines[1] * py + lines[2]
@@ -305,9 +319,9 @@ class Renderer:
         side_u = a[:, some] * self._size[:, None, :1]
         side_v = b[:, some] * self._size[:, None, 1:]
         corners = c[:, some, None] + np.stack([0 * side_u, side_u, side_v, side_u + side_v], axis=2)
-        behind = (corners[..., 2] < _NEAR_M).any(axis=(1, 2))
-        gone = (corners[..., 2] < _NEAR_M).all(axis=(1, 2))
-        image = corners[..., :2] / np.maximum(corners[..., 2:], _NEAR_M)
+        near = corners[..., 2] < self._limits.near_m
+        behind, gone = near.any(axis=(1, 2)), near.all(axis=(1, 2))
+        image = corners[..., :2] / np.maximum(corners[..., 2:], self._limits.near_m)
         margin = 0.01  # for what happens between the poses looked at
         low, high = image.min(axis=(1, 2)) - margin, image.max(axis=(1, 2)) + margin
         low[behind], high[behind] = -np.inf, np.inf

@@ -25,15 +25,9 @@ _PHONE = replace(
     accel_resolution_m_s2=STANDARD_GRAVITY_M_S2 / 4096,
     gyro_resolution_rad_s=float(np.radians(1 / 16)),
 )
+_EDGES = [[1, 1, 0], [-1, 1, 0], [0, 1, 1], [0, -1, 1], [1, 0, 1], [1, 0, -1], [-1, -1, 0], [1, -1, 0], [0, 1, -1]]
 #: Six sides, then edges: up in the device, before it is laid down carelessly.
-_SIDES = np.concatenate([np.eye(3), -np.eye(3)])
-_EDGES = np.array(
-    [[1, 1, 0], [-1, 1, 0], [0, 1, 1], [0, -1, 1], [1, 0, 1], [1, 0, -1], [-1, -1, 0], [1, -1, 0], [0, 1, -1]],
-    dtype=np.float64,
-) / np.sqrt(2)
-#: A hand's shaking while it turns the device over: amplitude, and accelerations.
-_TREMOR_RAD, _TREMOR_HZ = 0.01, 8.0
-_HAND_M_S2, _KNOCK_M_S2 = 1.5, 2.0
+_UP_IN_IMU = np.concatenate([np.eye(3), -np.eye(3), np.array(_EDGES, dtype=np.float64) / np.sqrt(2)])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,14 +42,22 @@ class RestOptions:
     """Range of how long it is turned over."""
     careless_rad: float = 0.08
     """Standard deviation of each attitude against the one that was meant."""
+    tremor_rad: float = 0.01
+    """Amplitude of the hand's tremor while it turns the device over."""
+    tremor_hz: float = 8.0
+    """Frequency of the tremor."""
+    hand_m_s2: float = 1.5
+    """Acceleration by the hand that turns the device over."""
+    knock_m_s2: float = 2.0
+    """Noise of lifting the device and putting it down."""
     gravity_m_s2: float = 9.81
     """Strength of gravity."""
     imu: ImuOptions = field(default_factory=lambda: _PHONE)
     """The device."""
 
     def __post_init__(self) -> None:
-        if not 1 <= self.attitudes <= len(_SIDES) + len(_EDGES):
-            raise ValueError(f"attitudes must be from 1 to {len(_SIDES) + len(_EDGES)}, not {self.attitudes}")
+        if not 1 <= self.attitudes <= len(_UP_IN_IMU):
+            raise ValueError(f"attitudes must be from 1 to {len(_UP_IN_IMU)}, not {self.attitudes}")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -84,10 +86,10 @@ def simulate_rests(options: RestOptions, *, seed: int, errors: ImuErrors | None 
     """Lay a device down, again and again; a seed gives one device (where none is given by its errors) in one hand."""
     rng = np.random.default_rng(seed)
     errors = draw_imu_errors(options.imu, 0.0, rng) if errors is None else errors
-    ups = np.concatenate([_SIDES, _EDGES])[: options.attitudes]
+    ups = _UP_IN_IMU[: options.attitudes]
     ups = ups + options.careless_rad * rng.standard_normal(ups.shape)
     ups /= np.linalg.norm(ups, axis=1, keepdims=True)
-    turns = [_Turn.drawn(ups[i], ups[i + 1], rng.uniform(*options.turn_s), rng) for i in range(len(ups) - 1)]
+    turns = [_Turn.draw(ups[i], ups[i + 1], options, rng) for i in range(len(ups) - 1)]
     stop_s = np.cumsum([options.rest_s + turn.duration_s for turn in turns])
     begin_s = np.concatenate([[0.0], stop_s])
     gyro_t_s, accel_t_s = (
@@ -136,17 +138,20 @@ def _triangular(matrix: Array) -> tuple[Array, Array]:
 class _Turn:
     """From one rest to the next: about one axis, with a tremor about another."""
 
+    options: RestOptions
     duration_s: float
     rotation_rad: Array
     tremor_axis: Array
     hand_axes: Array
 
     @classmethod
-    def drawn(cls, up: Array, up_next: Array, duration_s: float, rng: np.random.Generator) -> _Turn:
+    def draw(cls, up: Array, up_next: Array, options: RestOptions, rng: np.random.Generator) -> _Turn:
         """A turn after which ``up_next`` points up, and the device heads anywhere."""
+        duration_s = rng.uniform(*options.turn_s)
         spin = quat_exp(rng.uniform(-np.pi, np.pi) * up_next)
         axes = rng.standard_normal((3, 3))
         return cls(
+            options=options,
             duration_s=float(duration_s),
             rotation_rad=quat_log(quat_multiply(rotation_between(up_next, up), spin)),
             tremor_axis=axes[0] / np.linalg.norm(axes[0]),
@@ -173,15 +178,17 @@ class _Turn:
         shaking = np.sin(2 * np.pi * 25.0 * since_s)[:, None] * self.hand_axes[1]
         noise = rng.standard_normal((len(since_s), 3))
         ends = np.exp(-np.minimum(since_s, self.duration_s - since_s) / 0.05)[:, None]
-        return np.asarray(_HAND_M_S2 * swing + 0.3 * _HAND_M_S2 * shaking + noise * (0.3 + _KNOCK_M_S2 * ends))
+        hand_m_s2, knock_m_s2 = self.options.hand_m_s2, self.options.knock_m_s2
+        return np.asarray(hand_m_s2 * swing + 0.3 * hand_m_s2 * shaking + noise * (0.3 + knock_m_s2 * ends))
 
     def _share(self, since_s: Array) -> tuple[Array, Array]:
         s = since_s / self.duration_s
         return s**3 * (10 - 15 * s + 6 * s**2), 30 * s**2 * (1 - s) ** 2 / self.duration_s
 
     def _tremor(self, since_s: Array) -> tuple[Array, Array]:
-        phase, slow = 2 * np.pi * _TREMOR_HZ * since_s, np.pi * since_s / self.duration_s
-        angle = _TREMOR_RAD * np.sin(phase) * np.sin(slow) ** 2
-        by_phase = 2 * np.pi * _TREMOR_HZ * np.cos(phase) * np.sin(slow) ** 2
+        amplitude_rad, rate_hz = self.options.tremor_rad, self.options.tremor_hz
+        phase, slow = 2 * np.pi * rate_hz * since_s, np.pi * since_s / self.duration_s
+        angle = amplitude_rad * np.sin(phase) * np.sin(slow) ** 2
+        by_phase = 2 * np.pi * rate_hz * np.cos(phase) * np.sin(slow) ** 2
         by_slow = np.sin(phase) * np.sin(2 * slow) * np.pi / self.duration_s
-        return angle, _TREMOR_RAD * (by_phase + by_slow)
+        return angle, amplitude_rad * (by_phase + by_slow)

@@ -11,6 +11,7 @@ sensor's own low-pass filter, whose effect is then a pure delay, and delays belo
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -18,11 +19,9 @@ import numpy as np
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, quat_multiply, quat_normalize
 from colmap_inertial.core.types import CAL, CameraImuCalibration, ImuNoise, ImuRecording
-from colmap_inertial.tools.simulate.motion import MARGIN_S, Motion
+from colmap_inertial.tools.simulate.motion import MARGIN_S, Motion, MotionOptions, make_motion
 
 STANDARD_GRAVITY_M_S2 = 9.80665
-#: cam_from_imu of a phone filming in landscape with its rear camera: the IMU's x right, y up, z out of the screen.
-_LANDSCAPE = (1.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,8 +55,9 @@ class ImuOptions:
     """Scale factor error of each axis."""
     accel_misalignment_sd: float = 0.003
     """Each off-diagonal entry of the accelerometer's error matrix."""
-    cam_from_imu_xyzw: tuple[float, float, float, float] | None = _LANDSCAPE
-    """Nominal mounting; None draws any rotation."""
+    cam_from_imu_xyzw: tuple[float, float, float, float] | None = (1.0, 0.0, 0.0, 0.0)
+    """Nominal mounting: by default of a phone filming in landscape with its rear camera (the IMU's x right, y up, z out
+    of the screen); None draws any rotation."""
     mounting_rad_sd: float = 0.01
     """Deviation from the nominal mounting, each axis."""
     lever_arm_m_sd: tuple[float, float, float] = (0.04, 0.04, 0.005)
@@ -93,32 +93,6 @@ class ImuOptions:
 
 
 _PHONE = ImuOptions()
-_TABLET = replace(
-    _PHONE,
-    gyro_rate_hz=100.0,
-    accel_rate_hz=100.0,
-    gyro_density_rad_s_rthz=3e-4,
-    accel_density_m_s2_rthz=1e-2,
-    gyro_walk_rad_s2_rthz=3e-4,
-    accel_walk_m_s3_rthz=5e-4,
-    accel_bias_m_s2_sd=0.3,
-    gyro_scale_sd=0.01,
-    accel_delay_s=(-0.010, 0.002),
-)
-_ACTION_CAMERA = replace(
-    _PHONE,
-    accel_density_m_s2_rthz=3e-3,
-    gyro_bias_rad_s_sd=1e-2,
-    accel_bias_m_s2_sd=0.3,
-    gyro_scale_sd=0.01,
-    accel_scale_sd=0.01,
-    gyro_misalignment_sd=0.005,
-    accel_misalignment_sd=0.005,
-    cam_from_imu_xyzw=None,
-    lever_arm_m_sd=(0.015, 0.015, 0.01),
-    clock_rate_sd=2e-3,
-)
-
 #: Devices by name. The figures are round numbers inside the ranges of these sources:
 #:
 #: * Densities: MEMS data sheets give 3.8-7 mdps/sqrt(Hz) = 0.7-1.2e-4 rad/s/sqrt(Hz) and 70-180 ug/sqrt(Hz) =
@@ -128,7 +102,34 @@ _ACTION_CAMERA = replace(
 #: * Tablet: what was estimated from the recordings of Mustaniemi et al. (IROS 2017): 100 Hz, gyroscope 3e-4 with a walk
 #:   of 3e-4 rad/s/sqrt(s), accelerometer bias 0.2-0.6 m/s2, accelerometer 8-13 ms late, gyroscope scale within 1 %.
 #: * Action camera: 200 Hz and clock errors up to 1 % in GoPro telemetry; the camera is small, so is the lever arm.
-IMU_PRESETS: dict[str, ImuOptions] = {"phone": _PHONE, "tablet": _TABLET, "action_camera": _ACTION_CAMERA}
+IMU_PRESETS: dict[str, ImuOptions] = {
+    "phone": _PHONE,
+    "tablet": replace(
+        _PHONE,
+        gyro_rate_hz=100.0,
+        accel_rate_hz=100.0,
+        gyro_density_rad_s_rthz=3e-4,
+        accel_density_m_s2_rthz=1e-2,
+        gyro_walk_rad_s2_rthz=3e-4,
+        accel_walk_m_s3_rthz=5e-4,
+        accel_bias_m_s2_sd=0.3,
+        gyro_scale_sd=0.01,
+        accel_delay_s=(-0.010, 0.002),
+    ),
+    "action_camera": replace(
+        _PHONE,
+        accel_density_m_s2_rthz=3e-3,
+        gyro_bias_rad_s_sd=1e-2,
+        accel_bias_m_s2_sd=0.3,
+        gyro_scale_sd=0.01,
+        accel_scale_sd=0.01,
+        gyro_misalignment_sd=0.005,
+        accel_misalignment_sd=0.005,
+        cam_from_imu_xyzw=None,
+        lever_arm_m_sd=(0.015, 0.015, 0.01),
+        clock_rate_sd=2e-3,
+    ),
+}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -166,17 +167,6 @@ class ImuErrors:
     def clock_offsets_s(self) -> dict[str, float]:
         """The time offsets by their names."""
         return {name: getattr(self, name) for name in ("gyro_time_offset_s", "accel_time_offset_s")}
-
-    def calibrate(self, gyro_bias_rad_s: Array, readout_s: float) -> CameraImuCalibration:
-        """The true calibration of a recording with a mean gyroscope bias and a camera's readout."""
-        return CameraImuCalibration(
-            cam_from_imu_xyzw=self.cam_from_imu_xyzw,
-            **self.clock_offsets_s,
-            gyro_bias_rad_s=gyro_bias_rad_s,
-            imu_in_cam_m=self.imu_in_cam_m,
-            readout_s=readout_s,
-            cov=np.zeros((CAL.COUNT, CAL.COUNT)),
-        )
 
     def stamp_s(self, t_cam_s: Array, offset_s: float) -> Array:
         """The IMU clock's reading at camera times, for the gyroscope's or the accelerometer's offset."""
@@ -239,6 +229,8 @@ class SampledImu:
     ----------
     recording
         What a user would get.
+    errors
+        The device.
     gyro_t_cam_s, accel_t_cam_s
         (N,), (M,) true camera times of the samples.
     gyro_bias_rad_s, accel_bias_m_s2
@@ -246,10 +238,22 @@ class SampledImu:
     """
 
     recording: ImuRecording
+    errors: ImuErrors
     gyro_t_cam_s: Array
     accel_t_cam_s: Array
     gyro_bias_rad_s: Array
     accel_bias_m_s2: Array
+
+    def calibration(self, readout_s: float) -> CameraImuCalibration:
+        """True camera-IMU calibration; its gyroscope bias is the mean over the recording, its ``cov`` zero."""
+        return CameraImuCalibration(
+            cam_from_imu_xyzw=self.errors.cam_from_imu_xyzw,
+            **self.errors.clock_offsets_s,
+            gyro_bias_rad_s=self.gyro_bias_rad_s.mean(axis=0),
+            imu_in_cam_m=self.errors.imu_in_cam_m,
+            readout_s=readout_s,
+            cov=np.zeros((CAL.COUNT, CAL.COUNT)),
+        )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -347,8 +351,23 @@ def sample_imu(
             device="simulated",
             noise=options.noise(),
         ),
+        errors=errors,
         gyro_t_cam_s=gyro_t_cam_s,
         accel_t_cam_s=accel_t_cam_s,
         gyro_bias_rad_s=gyro_bias,
         accel_bias_m_s2=accel_bias,
     )
+
+
+def simulate_imu(
+    motion_options: MotionOptions,
+    options: ImuOptions,
+    streams: Sequence[np.random.Generator],
+    *,
+    gravity_m_s2: float = STANDARD_GRAVITY_M_S2,
+) -> tuple[Motion, SampledImu]:
+    """Draw a motion from the first stream; a device and what it reads on the way from the second."""
+    duration_s = motion_options.duration_s
+    motion = make_motion(motion_options, streams[0])
+    errors = draw_imu_errors(options, duration_s, streams[1])
+    return motion, sample_imu(motion, errors, options, duration_s=duration_s, rng=streams[1], gravity_m_s2=gravity_m_s2)

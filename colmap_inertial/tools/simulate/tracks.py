@@ -17,22 +17,11 @@ from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.types import CameraImuCalibration, CameraModel, FrameTiming, ImuRecording
 from colmap_inertial.imaging.gyro_camera import FrameShutter
 from colmap_inertial.model import colmap_camera
-from colmap_inertial.tools.simulate.motion import Motion, MotionOptions, make_motion
-from colmap_inertial.tools.simulate.sensors import (
-    STANDARD_GRAVITY_M_S2,
-    ImuErrors,
-    ImuOptions,
-    SampledImu,
-    draw_imu_errors,
-    sample_imu,
-)
+from colmap_inertial.tools.simulate.motion import Motion, MotionOptions
+from colmap_inertial.tools.simulate.sensors import ImuOptions, SampledImu, simulate_imu
 
 if TYPE_CHECKING:
     import pycolmap
-
-
-#: Rounds until a point's line and the instant of that line agree.
-_ROUNDS = 6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,10 +74,8 @@ class Tracks:
         (M, 2) where.
     imu
         The recording that ran along.
-    motion, sampled, errors
-        The path, the samples and the device they came from.
-    calibration
-        The true one.
+    motion, sampled
+        The path; the samples without vibration, and the device they came from.
     """
 
     timing: FrameTiming
@@ -100,8 +87,11 @@ class Tracks:
     imu: ImuRecording
     motion: Motion
     sampled: SampledImu
-    errors: ImuErrors
-    calibration: CameraImuCalibration
+
+    @property
+    def calibration(self) -> CameraImuCalibration:
+        """The true one."""
+        return self.sampled.calibration(self.timing.readout_s or 0.0)
 
     def reconstruction(self, xy_px: Array | None = None) -> pycolmap.Reconstruction:
         """A COLMAP model of the true poses and points, with these observations or others in their place."""
@@ -182,20 +172,15 @@ def simulate_tracks(options: TrackOptions, *, seed: int) -> Tracks:
         Same options and seed, same tracks.
     """
     streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4)]
-    duration_s = options.motion.duration_s
-    motion = make_motion(options.motion, streams[0])
-    errors = draw_imu_errors(options.imu, duration_s, streams[1])
-    sampled = sample_imu(
-        motion, errors, options.imu, duration_s=duration_s, rng=streams[1], gravity_m_s2=STANDARD_GRAVITY_M_S2
-    )
-    imu = _shaken(sampled.recording, options.vibration_m_s2, streams[3])
+    motion, sampled = simulate_imu(options.motion, options.imu, streams)
+    imu = _add_vibration(sampled.recording, options.vibration_m_s2, streams[3])
     # the first line of the last frame still lies within the camera's recording
-    t_s = np.arange(0.05, duration_s - 0.1, 1 / options.frame_rate_hz)
+    t_s = np.arange(0.05, options.motion.duration_s - 0.1, 1 / options.frame_rate_hz)
     timing = FrameTiming(
         names=tuple(f"{i:05d}.jpg" for i in range(len(t_s))), t_s=t_s, readout_s=options.readout_s or None
     )
-    points = _points(motion, timing, options, streams[2])
-    frame, point, xy_px = _seen(motion, timing, points, options, streams[2])
+    points = _draw_points(motion, options, streams[2])
+    frame, point, xy_px = _observe(motion, timing, points, options, streams[2])
     kept, point = np.unique(point, return_inverse=True)
     return Tracks(
         timing=timing,
@@ -207,12 +192,10 @@ def simulate_tracks(options: TrackOptions, *, seed: int) -> Tracks:
         imu=imu,
         motion=motion,
         sampled=sampled,
-        errors=errors,
-        calibration=errors.calibrate(sampled.gyro_bias_rad_s.mean(axis=0), options.readout_s),
     )
 
 
-def _shaken(imu: ImuRecording, amplitude: float, rng: np.random.Generator) -> ImuRecording:
+def _add_vibration(imu: ImuRecording, amplitude: float, rng: np.random.Generator) -> ImuRecording:
     """With vibrations of the accelerometer, which samples at its rate fold into lower frequencies."""
     if amplitude == 0:
         return imu
@@ -226,7 +209,7 @@ def _shaken(imu: ImuRecording, amplitude: float, rng: np.random.Generator) -> Im
     return replace(imu, accel_m_s2=imu.accel_m_s2 + amplitude / 12**0.5 * shake)
 
 
-def _points(motion: Motion, timing: FrameTiming, options: TrackOptions, rng: np.random.Generator) -> Array:
+def _draw_points(motion: Motion, options: TrackOptions, rng: np.random.Generator) -> Array:
     """Points beside, below and above the way, up to seven metres off."""
     steps = motion.cam_in_world_m(np.arange(0.0, options.motion.duration_s, 0.5))
     length_m = float(np.linalg.norm(np.diff(steps, axis=0), axis=1).sum())
@@ -237,7 +220,7 @@ def _points(motion: Motion, timing: FrameTiming, options: TrackOptions, rng: np.
     return at + offset
 
 
-def _seen(
+def _observe(
     motion: Motion, timing: FrameTiming, points: Array, options: TrackOptions, rng: np.random.Generator
 ) -> tuple[Int64Array, Int64Array, Array]:
     """Which frame sees which point and where, each line at its own instant; points by at least three frames."""
@@ -251,7 +234,8 @@ def _seen(
         near = np.flatnonzero(np.linalg.norm(points - centre[i], axis=1) < 9.0)
         shutter = FrameShutter.of(timing, i, width=width, height=height)
         xy = np.full((len(near), 2), [width / 2, height / 2])
-        for _ in range(_ROUNDS if options.readout_s else 1):
+        # after six rounds a point's line and the instant of that line agree
+        for _ in range(6 if options.readout_s else 1):
             line_s = shutter.middle_s(np.clip(np.nan_to_num(xy), 0, [width, height]))
             line_s = np.full(len(near), t_s) if not options.readout_s else line_s
             state = motion.at(line_s)
