@@ -26,12 +26,12 @@ from colmap_inertial.core.types import ScaleEstimate, Similarity
 from colmap_inertial.model import apply_similarity
 from colmap_inertial.model.project import apply_to_project
 from colmap_inertial.model.similarities import plain_factor
-from colmap_inertial.tools.view import load_scene, measured, nearest_to_ray, round_length
+from colmap_inertial.tools.view import load_scene, measure_distance, nearest_to_ray, round_length
 from colmap_inertial.tools.view.clouds import dense_cloud, read_mesh
 from colmap_inertial.tools.view.drawing import AMBER, BLUE, path_colours
 from colmap_inertial.tools.view.measure import ball_at_ray, length_text
-from colmap_inertial.tools.view.panel import camera_text, contents_text, measured_text, scale_text, target_text
-from colmap_inertial.tools.view.scene import START_FOV_RAD
+from colmap_inertial.tools.view.panel import camera_text, contents_text, describe_distance, scale_text, target_text
+from colmap_inertial.tools.view.scene import LIMITS
 from colmap_inertial.tools.view.sources import TargetFacts
 
 METRES_PER_UNIT = 0.25
@@ -172,7 +172,7 @@ def test_the_scale_bar_is_round_level_as_long_as_it_says_and_in_view(out):
     view = scene.centre - scene.start
     for end in [*ground.bar, *scene.cameras.cam_in_world[:2]]:
         seen = end - scene.start
-        assert np.arccos(seen @ view / np.linalg.norm(seen) / np.linalg.norm(view)) < 0.75 * START_FOV_RAD
+        assert np.arccos(seen @ view / np.linalg.norm(seen) / np.linalg.norm(view)) < 0.75 * LIMITS.start_fov_rad
 
 
 @pytest.mark.parametrize(
@@ -200,19 +200,19 @@ def test_two_clicks_measure_the_true_distance_with_the_scale_s_interval(out):
             origin = target + 0.02 * scene.reach * away / np.linalg.norm(away)
             index = nearest_to_ray(candidates, origin, target - origin)
             found.append(candidates[index])
-        result = measured(*found, scene.scale.unit, scene.scale.relative_ci95)
+        result = measure_distance(*found, scene.scale.unit, scene.scale.relative_ci95)
         length = np.linalg.norm(truth[a] - truth[b])
         assert result.length == pytest.approx(length, abs=1e-5)
         assert result.ci95 == pytest.approx((0.98 * length, 1.03 * length), abs=1e-5)
 
 
 def test_a_measured_length_is_written_to_the_digits_of_its_uncertainty():
-    result = measured(np.zeros(3), np.array([1.23456, 0, 0]), "m", (0.98, 1.02))
+    result = measure_distance(np.zeros(3), np.array([1.23456, 0, 0]), "m", (0.98, 1.02))
     assert result.text == "1.235 ± 0.025 m"
-    assert "1.21 m to 1.259 m" in measured_text(result)
-    assert measured(np.zeros(3), np.array([0, 0.28, 0]), "m", (0.99, 1.01)).text == "280.0 ± 2.8 mm"
-    assert measured(np.zeros(3), np.array([0, 0, 2.0]), "m", None).text == "2 m"
-    assert measured(np.zeros(3), np.array([0, 0, 2.0]), "model", (0.9, 1.1)).text == "2 units (no scale)"
+    assert "1.21 m to 1.259 m" in describe_distance(result)
+    assert measure_distance(np.zeros(3), np.array([0, 0.28, 0]), "m", (0.99, 1.01)).text == "280.0 ± 2.8 mm"
+    assert measure_distance(np.zeros(3), np.array([0, 0, 2.0]), "m", None).text == "2 m"
+    assert measure_distance(np.zeros(3), np.array([0, 0, 2.0]), "model", (0.9, 1.1)).text == "2 units (no scale)"
 
 
 def test_a_click_takes_the_point_in_front_and_none_where_there_is_none():
@@ -493,7 +493,7 @@ def on_screen(scene, place, width, height):
     right = np.cross(ahead, scene.up_in_world)
     right /= np.linalg.norm(right)
     x, y, z = np.stack([right, np.cross(ahead, right), ahead]) @ (place - scene.start)
-    focal = 0.5 * height / np.tan(0.5 * START_FOV_RAD)
+    focal = 0.5 * height / np.tan(0.5 * LIMITS.start_fov_rad)
     return 0.5 * width + focal * x / z, 0.5 * height + focal * y / z
 
 
@@ -528,7 +528,7 @@ def test_a_real_browser_shows_it_measures_and_looks_through_a_camera(out, tmp_pa
             for place, answer in ((a, "Click the second point"), (b, "Errors of the two points")):
                 page.click(*on_screen(scene, place, *size))
                 page.wait(f"document.body.innerText.includes({json.dumps(answer)})")
-            text = measured(a, b, "m", scene.scale.relative_ci95).text
+            text = measure_distance(a, b, "m", scene.scale.relative_ci95).text
             assert text in page.evaluate("document.body.innerText")
             picture = cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR)
             drawn = picture[: size[1], : size[0]].reshape(-1, 3)

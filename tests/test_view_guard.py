@@ -15,7 +15,7 @@ from websockets.sync.client import connect
 
 from colmap_inertial.core.errors import OutputError
 from colmap_inertial.tools.view import load_scene
-from colmap_inertial.tools.view.guard import MOST_CONNECTIONS, MOST_VIEWERS, Guard, allowed, guarding, is_loopback
+from colmap_inertial.tools.view.guard import LIMITS, Guard, allowed, guarding, is_loopback
 from colmap_inertial.tools.view.server import Viewer
 
 _ENDED = (WebSocketException, OSError)
@@ -136,10 +136,10 @@ def test_on_the_network_addresses_and_own_names_are_hosts_but_no_others():
 def test_connections_are_bounded(place):
     port, token = place
     with contextlib.ExitStack() as stack:
-        for _ in range(MOST_VIEWERS):
+        for _ in range(LIMITS.viewers):
             stack.enter_context(opened(port, token))
         assert refused(port, token)[0] == 503
-        silent = [socket.create_connection(("127.0.0.1", port)) for _ in range(2 * MOST_CONNECTIONS)]
+        silent = [socket.create_connection(("127.0.0.1", port)) for _ in range(2 * LIMITS.connections)]
         time.sleep(0.3)
         for one in silent:
             stack.enter_context(one)
@@ -151,7 +151,7 @@ def test_connections_are_bounded(place):
                     ended += one.recv(1) == b""
                 except ConnectionResetError:
                     ended += 1
-        assert ended >= 2 * MOST_CONNECTIONS - (MOST_CONNECTIONS - MOST_VIEWERS)
+        assert ended >= 2 * LIMITS.connections - (LIMITS.connections - LIMITS.viewers)
         with pytest.raises(_ENDED):
             opened(port, token)
     for _ in range(50):  # they are gone again

@@ -18,13 +18,25 @@ if TYPE_CHECKING:
     import pycolmap
 
 
-#: Points seen by so few images, or this badly, are left out where enough others remain.
-_FEWEST_VIEWS, _WORST_PX, _ENOUGH = 3, 2.0, 0.3
-_GREY = 150
-#: What float32, the graphics card's numbers, can hold.
-_LARGEST = float(np.finfo(np.float32).max)
-#: The scene reaches as far as this share of its points, and of its cameras.
-_MOST_PER_CENT, _NEARLY_ALL_PER_CENT = 65, 95
+@dataclass(frozen=True, kw_only=True)
+class CloudLimits:
+    """Which points are shown, and how far the scene reaches."""
+
+    fewest_views: int = 3
+    """Points seen by fewer images are left out where enough others remain."""
+    worst_px: float = 2.0
+    """So are points with a larger reprojection error."""
+    enough_share: float = 0.3
+    """Of the points: enough others."""
+    reach_of_points_pct: float = 65
+    """The scene reaches as far as this share of its points."""
+    reach_of_cameras_pct: float = 95
+    """And of its cameras."""
+    grey: int = 150
+    """Of points without a colour."""
+
+
+LIMITS = CloudLimits()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -64,14 +76,15 @@ def sparse_cloud(reconstruction: pycolmap.Reconstruction, most: int) -> Cloud:
     points = reconstruction.points3D
     # a first choice bounds the work for models of millions of points
     chosen = [points[i] for i in ids[strided(len(ids), 2 * most)].tolist()]
-    chosen = [p for p in chosen if np.abs(p.xyz).max() < _LARGEST]
-    good = [p for p in chosen if p.track.length() >= _FEWEST_VIEWS and not p.error > _WORST_PX]
-    if len(good) >= _ENOUGH * len(chosen):
+    largest = float(np.finfo(np.float32).max)  # what the graphics card's numbers can hold
+    chosen = [p for p in chosen if np.abs(p.xyz).max() < largest]
+    good = [p for p in chosen if p.track.length() >= LIMITS.fewest_views and not p.error > LIMITS.worst_px]
+    if len(good) >= LIMITS.enough_share * len(chosen):
         chosen = good
     chosen = [chosen[i] for i in strided(len(chosen), most).tolist()]
     rgb = np.array([p.color for p in chosen], dtype=np.uint8).reshape(-1, 3)
     if not rgb.any():  # a model without colours
-        rgb = np.full_like(rgb, _GREY)
+        rgb = np.full_like(rgb, LIMITS.grey)
     xyz = np.array([p.xyz for p in chosen], dtype=np.float32).reshape(-1, 3)
     return Cloud(xyz=xyz, rgb=rgb, total=len(ids), dense=False)
 
@@ -87,15 +100,11 @@ def dense_cloud(path: Path, most: int) -> Cloud:
     table, _ = _vertices(path)
     some = np.asarray(table[strided(len(table), most)])
     xyz = _positions(some)
-    known = np.isfinite(xyz).all(axis=1)
-    some, xyz = some[known], xyz[known]
+    finite = np.isfinite(xyz).all(axis=1)
+    some, xyz = some[finite], xyz[finite]
     rgb = _colours(some)
-    return Cloud(
-        xyz=xyz,
-        rgb=np.full((len(some), 3), _GREY, np.uint8) if rgb is None else rgb,
-        total=len(table),
-        dense=True,
-    )
+    rgb = np.full((len(some), 3), LIMITS.grey, np.uint8) if rgb is None else rgb
+    return Cloud(xyz=xyz, rgb=rgb, total=len(table), dense=True)
 
 
 def read_mesh(path: Path, most_faces: int) -> Mesh | None:
@@ -128,11 +137,11 @@ def read_mesh(path: Path, most_faces: int) -> Mesh | None:
     if not (faces["count"] == 3).all() or faces["index"].max() >= len(table):
         raise FormatError(path, "a mesh of other faces than triangles")
     vertices, index, rgb = _positions(table), faces["index"].astype(np.uint32), _colours(table)
-    known = np.asarray(np.isfinite(vertices).all(axis=1))
-    if not known.all():
-        renumbered = (np.cumsum(known) - 1).astype(np.uint32)
-        index = renumbered[index[np.all(known[index], axis=1)]]
-        vertices, rgb = vertices[known], None if rgb is None else rgb[known]
+    finite = np.asarray(np.isfinite(vertices).all(axis=1))
+    if not finite.all():
+        renumbered = (np.cumsum(finite) - 1).astype(np.uint32)
+        index = renumbered[index[np.all(finite[index], axis=1)]]
+        vertices, rgb = vertices[finite], None if rgb is None else rgb[finite]
     return Mesh(vertices=vertices, faces=index, rgb=rgb) if len(index) else None
 
 
@@ -176,9 +185,9 @@ def centre_and_reach(xyz: Array, cameras: Array) -> tuple[Array, float]:
 
     Far points, which a model of an open place always has, count for little.
     """
-    every = np.concatenate([xyz, cameras]) if len(xyz) else cameras
-    middle = np.median(xyz, axis=0) if len(xyz) else np.median(cameras, axis=0)
-    points = np.percentile(np.linalg.norm(xyz - middle, axis=1), _MOST_PER_CENT) if len(xyz) else 0.0
-    poses = np.percentile(np.linalg.norm(cameras - middle, axis=1), _NEARLY_ALL_PER_CENT)
+    every = np.concatenate([xyz, cameras])
+    middle = np.median(xyz if len(xyz) else cameras, axis=0)
+    points = np.percentile(np.linalg.norm(xyz - middle, axis=1), LIMITS.reach_of_points_pct) if len(xyz) else 0.0
+    poses = np.percentile(np.linalg.norm(cameras - middle, axis=1), LIMITS.reach_of_cameras_pct)
     reach = max(float(points), float(poses), 1e-6 * float(np.abs(every).max()), 1e-9)
     return middle, reach

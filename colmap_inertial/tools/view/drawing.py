@@ -9,14 +9,14 @@ import numpy as np
 from colmap_inertial.core.arrays import AnyArray, Array, UInt8Array
 from colmap_inertial.core.geometry import quat_rotate
 from colmap_inertial.tools.view import panel
+from colmap_inertial.tools.view.clouds import Mesh
 from colmap_inertial.tools.view.measure import length_text
-from colmap_inertial.tools.view.scene import Scene
+from colmap_inertial.tools.view.scene import Ground, Scene
+from colmap_inertial.tools.view.sources import TargetFacts
 
 if TYPE_CHECKING:
     import viser
 
-#: Opacity of the image that one looks through, so that points show whether they are where the image has them.
-_THROUGH = 0.55
 BLUE, RED, AMBER, GREEN = (70, 130, 230), (230, 40, 30), (240, 170, 30), (30, 190, 90)
 
 
@@ -45,45 +45,41 @@ class Drawing:
         self.cloud = self.points("/points", scene.cloud.xyz, scene.cloud.rgb, self.point_size(), point_shading="flat")
         self.parts["Points"] = [self.cloud]
         if scene.mesh is not None:
-            self.parts["Mesh"] = [self._add_mesh()]
+            self.parts["Mesh"] = [self._add_mesh(scene.mesh)]
         self.parts["Cameras"] = self._add_cameras()
         if len(scene.path):
             line = self.lines("/path", scene.path, path_colours(scene.path_percent), 2.0)
             self.parts["Path"] = [line]
         if scene.ground is not None:
-            self.parts["Ground"] = self._add_ground()
+            self.parts["Ground"] = self._add_ground(scene.ground)
         else:
             self.label("/no_scale", "units of the model, no scale", scene.centre - scene.reach * scene.up_in_world)
         if scene.gravity_known:
             self.parts["Gravity"] = self._add_gravity()
         if scene.target is not None and scene.target.corners:
-            self.parts["Target"] = self._add_target()
+            self.parts["Target"] = self._add_target(scene.target)
 
     def point_size(self) -> float:
         """So that points cover a part of the area they lie in."""
         return self.scene.reach * min(0.75 / max(len(self.scene.cloud.xyz), 1) ** 0.5, 1 / 150)
 
-    def _add_mesh(self) -> Any:
-        mesh = self.scene.mesh
-        assert mesh is not None
-        add = self._api
+    def _add_mesh(self, mesh: Mesh) -> Any:
         if mesh.rgb is None:
-            return add.add_mesh_simple(
-                "/mesh", mesh.vertices, mesh.faces, color=(170, 170, 170), side="double", visible=False
-            )
+            grey, add = (170, 170, 170), self._api.add_mesh_simple
+            return add("/mesh", mesh.vertices, mesh.faces, color=grey, side="double", visible=False)
         import trimesh
 
         coloured = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.rgb, process=False)
-        return add.add_mesh_trimesh("/mesh", coloured, visible=False)
+        return self._api.add_mesh_trimesh("/mesh", coloured, visible=False)
 
     def _add_cameras(self) -> list[Any]:
         """All cameras as instances of one pyramid, in one piece for the graphics card however many there are."""
-        cameras, add = self.scene.cameras, self._api
+        cameras = self.scene.cameras
         tip_and_base = np.array([[0, 0, 0], [-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]], dtype=np.float32)
         faces = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1]], dtype=np.uint32)
         half_height = np.tan(0.5 * cameras.vertical_fov_rad)
         scales = self.camera_size * np.stack([half_height * cameras.aspect, half_height, np.ones(len(cameras))], axis=1)
-        bodies = add.add_batched_meshes_simple(
+        bodies = self._api.add_batched_meshes_simple(
             "/cameras/bodies",
             tip_and_base,
             faces,
@@ -103,9 +99,7 @@ class Drawing:
         lines = self.lines("/cameras/edges", world[:, edges].reshape(-1, 2, 3), BLUE, 1.2)
         return [bodies, lines]
 
-    def _add_ground(self) -> list[Any]:
-        ground = self.scene.ground
-        assert ground is not None
+    def _add_ground(self, ground: Ground) -> list[Any]:
         up = self.scene.up_in_world
         places = np.linspace(-0.5, 0.5, ground.cells + 1) * ground.side_m
         half = 0.5 * ground.side_m
@@ -119,21 +113,17 @@ class Drawing:
         beside = np.cross(up, b - a) / ground.bar_m * 0.03 * self.scene.reach
         strokes = np.array([[a, b], [a - beside, a + beside], [b - beside, b + beside]])
         bar = self.lines("/ground/bar", strokes, (255, 255, 255), 4.0)
-        label = self.label(
-            "/ground/bar_length", length_text(ground.bar_m), 0.5 * (a + b), anchor="top-center", size=1.3
-        )
-        return [grid, bar, label]
+        text, middle = length_text(ground.bar_m), 0.5 * (a + b)
+        return [grid, bar, self.label("/ground/bar_length", text, middle, anchor="top-center", size=1.3)]
 
     def _add_gravity(self) -> list[Any]:
         scene, add = self.scene, self._api
         up, length = scene.up_in_world, 0.35 * scene.reach
         if scene.ground is not None:
             ground = scene.ground
-            corners = [
-                ground.origin + 0.5 * ground.side_m * (s * ground.along + t * ground.across)
-                for s in (-1, 1)
-                for t in (-1, 1)
-            ]
+            half_m = 0.5 * ground.side_m
+            sides = ((s, t) for s in (-1, 1) for t in (-1, 1))
+            corners = [ground.origin + half_m * (s * ground.along + t * ground.across) for s, t in sides]
             # the corner farthest from the scale bar, where it hides nothing
             foot = max(corners, key=lambda corner: float(np.linalg.norm(corner - ground.bar.mean(axis=0))))
         else:
@@ -148,17 +138,16 @@ class Drawing:
         ]
         return [down_arrow, up_arrow, *labels]
 
-    def _add_target(self) -> list[Any]:
+    def _add_target(self, target: TargetFacts) -> list[Any]:
         scene = self.scene
-        assert scene.target is not None
-        corners = np.array(list(scene.target.corners.values()))
+        corners = np.array(list(target.corners.values()))
         spacing = max((float(np.linalg.norm(b - a)) for a, b in scene.target_lines[:1]), default=0.0)
         size = 0.2 * spacing or 0.01 * scene.reach
         drawn: list[Any] = [self.points("/target/corners", corners, GREEN, size, point_shading="flat")]
         if len(scene.target_lines):
             drawn.append(self.lines("/target/lines", scene.target_lines, GREEN, 1.0))
         for i, distance in enumerate(scene.labelled):
-            ends = np.array([scene.target.corners[name] for name in distance.pair])
+            ends = np.array([target.corners[name] for name in distance.pair])
             drawn.append(self.lines(f"/target/known/{i}", ends[None], (255, 255, 255), 2.0))
             # as large as the target, not as the screen: from afar they would hide it
             label = self._api.add_label(
@@ -191,7 +180,8 @@ class Drawing:
         cameras = self.scene.cameras
         half_height, aspect = np.tan(0.5 * cameras.vertical_fov_rad[camera]), float(cameras.aspect[camera])
         if image is not None and through:
-            alpha = np.full((*image.shape[:2], 1), round(255 * _THROUGH), np.uint8)
+            # half transparent: points show whether they are where the image has them
+            alpha = np.full((*image.shape[:2], 1), round(255 * 0.55), np.uint8)
             image = np.concatenate([image, alpha], axis=2)
         return self._api.add_camera_frustum(
             name,

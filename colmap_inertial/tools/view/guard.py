@@ -27,12 +27,6 @@ from colmap_inertial.core.errors import OutputError
 log = logging.getLogger(__name__)
 log.addHandler(logging.NullHandler())  # what strangers send is no news for the terminal
 
-#: At the same time: viewers, and TCP connections, those among them that have not said anything yet.
-MOST_VIEWERS, MOST_CONNECTIONS = 16, 48
-#: A request has to be complete by then.
-_OPEN_TIMEOUT_S = 5.0
-#: Clicks and poses are shorter.
-_LARGEST_MESSAGE = 1 << 16
 #: What the panel's controls and the canvas send.
 _SPOKEN = {
     "ViewerCameraMessage": {
@@ -51,6 +45,23 @@ _HEADERS = {
 #: An address in brackets or a name, and perhaps a port.
 _HOST = re.compile(r"(?:\[([0-9A-Fa-f:.]+)\]|([0-9A-Za-z._-]+))(?::\d{1,5})?")
 _patching = threading.Lock()
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConnectionLimits:
+    """What strangers can take up."""
+
+    viewers: int = 16
+    """At the same time."""
+    connections: int = 48
+    """TCP connections at the same time, those among them that have not sent anything yet."""
+    open_timeout_s: float = 5.0
+    """A request has to be complete by then."""
+    message_bytes: int = 1 << 16
+    """Clicks and poses are shorter."""
+
+
+LIMITS = ConnectionLimits()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,7 +97,8 @@ class Guard:
             return False
         if origins and origins[0] not in (f"http://{hosts[0]}", f"https://{hosts[0]}"):
             return False
-        return secrets.compare_digest(_first(path).encode(errors="surrogateescape"), self.token.encode())
+        first_part = path.partition("?")[0].removeprefix("/").partition("/")[0]
+        return secrets.compare_digest(first_part.encode(errors="surrogateescape"), self.token.encode())
 
     def _is_own(self, host: str) -> bool:
         """Whether a ``Host`` header names this machine.
@@ -122,7 +134,7 @@ def allowed(message: Any) -> bool:
     if not isinstance(message, dict) or not isinstance(message.get("type"), str):
         return False
     known = _SPOKEN.get(message["type"])
-    if known is None or message.keys() != known | {"type"} or not _finite(list(message.values())):
+    if known is None or message.keys() != known | {"type"} or not _is_finite(list(message.values())):
         return False
     if message["type"] != "GuiUpdateMessage":
         return True
@@ -135,18 +147,13 @@ def allowed(message: Any) -> bool:
     )
 
 
-def _finite(value: Any, depth: int = 0) -> bool:
+def _is_finite(value: Any, depth: int = 0) -> bool:
     if isinstance(value, float | int):
         return math.isfinite(value) and abs(value) < 1e12
-    if isinstance(value, dict):
-        return depth < 3 and all(_finite(item, depth + 1) for item in value.values())
-    if isinstance(value, list):
-        return depth < 3 and all(_finite(item, depth + 1) for item in value)
+    if isinstance(value, dict | list):
+        items = value.values() if isinstance(value, dict) else value
+        return depth < 3 and all(_is_finite(item, depth + 1) for item in items)
     return value is None or isinstance(value, str)
-
-
-def _first(path: str) -> str:
-    return path.partition("?")[0].removeprefix("/").partition("/")[0]
 
 
 @contextlib.contextmanager
@@ -168,7 +175,7 @@ def guarding(guard: Guard) -> Iterator[None]:
             if not handler.__module__.startswith("viser.") or "process_request" not in settings:
                 return serve(handler, *args, **settings)
             started.append(handler)
-            return serve(_quiet(handler), *args, **_guarded_settings(guard, settings))
+            return serve(_quiet(handler), *args, **_complete_settings(guard, settings))
 
         server.serve = guarded  # type: ignore[assignment, misc]
         try:
@@ -189,7 +196,7 @@ def _quiet(handler: Callable[..., Any]) -> Callable[..., Any]:
     return handled
 
 
-def _guarded_settings(guard: Guard, settings: dict[str, Any]) -> dict[str, Any]:
+def _complete_settings(guard: Guard, settings: dict[str, Any]) -> dict[str, Any]:
     """What viser gives ``serve``, completed."""
     import msgspec.msgpack
     from websockets.asyncio.connection import Connection
@@ -201,7 +208,7 @@ def _guarded_settings(guard: Guard, settings: dict[str, Any]) -> dict[str, Any]:
 
     class Guarded(ServerConnection):
         def connection_made(self, transport: Any) -> None:
-            if len(connections) >= MOST_CONNECTIONS:
+            if len(connections) >= LIMITS.connections:
                 Connection.connection_made(self, transport)
                 transport.abort()
                 return
@@ -226,7 +233,7 @@ def _guarded_settings(guard: Guard, settings: dict[str, Any]) -> dict[str, Any]:
         if not guard.admits(request.path, headers.get_all("Host"), headers.get_all("Origin"), websocket=wants_socket):
             return connection.respond(http.HTTPStatus.FORBIDDEN, "Forbidden\n")
         if wants_socket:
-            if len(viewers) >= MOST_VIEWERS:
+            if len(viewers) >= LIMITS.viewers:
                 return connection.respond(http.HTTPStatus.SERVICE_UNAVAILABLE, "Too many viewers\n")
             viewers.add(connection)
             return None
@@ -240,7 +247,7 @@ def _guarded_settings(guard: Guard, settings: dict[str, Any]) -> dict[str, Any]:
         **settings,
         "process_request": process_request,
         "create_connection": Guarded,
-        "open_timeout": _OPEN_TIMEOUT_S,
-        "max_size": _LARGEST_MESSAGE,
+        "open_timeout": LIMITS.open_timeout_s,
+        "max_size": LIMITS.message_bytes,
         "logger": log,
     }

@@ -6,13 +6,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.arrays import Array, BoolArray
 from colmap_inertial.core.types import LengthUnit
 
-#: A click means a point within this angle of it, rad; of several closer than the smaller angle, the one in front.
-_WIDEST_RAD, _SAME_RAD = 0.03, 0.004
-#: Nothing that can be clicked is smaller than this angle.
-_LEAST_RAD = 0.008
+
+@dataclass(frozen=True, kw_only=True)
+class ClickAngles:
+    """How close to something a click has to be."""
+
+    widest_rad: float = 0.03
+    """A click means a point within this angle of it."""
+    same_rad: float = 0.004
+    """Of several points within this angle, the one in front."""
+    smallest_rad: float = 0.008
+    """Nothing that can be clicked is smaller."""
+
+
+ANGLES = ClickAngles()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,10 +51,10 @@ class Measured:
             return f"{self.length:.4g} units (no scale)"
         if self.ci95 is None:
             return length_text(self.length, digits=4)
-        return _with_uncertainty(self.length, 0.5 * (self.ci95[1] - self.ci95[0]))
+        return _format_interval(self.length, 0.5 * (self.ci95[1] - self.ci95[0]))
 
 
-def measured(a: Array, b: Array, unit: LengthUnit, relative_ci95: tuple[float, float] | None) -> Measured:
+def measure_distance(a: Array, b: Array, unit: LengthUnit, relative_ci95: tuple[float, float] | None) -> Measured:
     """The distance between two points.
 
     Parameters
@@ -55,8 +65,9 @@ def measured(a: Array, b: Array, unit: LengthUnit, relative_ci95: tuple[float, f
         The scale's 95 % interval divided by the scale; ``None`` where unknown.
     """
     length = float(np.linalg.norm(np.asarray(a) - np.asarray(b)))
-    known = unit == "m" and relative_ci95 is not None
-    ci95 = (length * relative_ci95[0], length * relative_ci95[1]) if known and relative_ci95 is not None else None
+    ci95 = None
+    if unit == "m" and relative_ci95 is not None:
+        ci95 = length * relative_ci95[0], length * relative_ci95[1]
     return Measured(length=length, ci95=ci95, unit=unit)
 
 
@@ -75,28 +86,28 @@ def nearest_to_ray(points: Array, origin: Array, direction: Array) -> int | None
     The index of the point closest to the ray by angle, of several about as close the one in front; ``None`` where none
     is near.
     """
-    away = np.asarray(points, dtype=np.float64) - origin
-    depth = away @ (np.asarray(direction) / np.linalg.norm(direction))
-    ahead = np.flatnonzero(depth > 0)
-    if len(ahead) == 0:
-        return None
-    depth = depth[ahead]
-    beside = np.sqrt(np.maximum(np.sum(away[ahead] ** 2, axis=1) - depth**2, 0))
-    angle = np.arctan2(beside, depth)
-    smallest = float(angle.min())
-    if smallest > _WIDEST_RAD:
-        return None
-    meant = np.flatnonzero(angle <= max(smallest, _SAME_RAD))
-    return int(ahead[meant[np.argmin(depth[meant])]])
+    depth, beside = _project_on_ray(points, origin, direction)
+    angle = np.where(depth > 0, np.arctan2(beside, depth), np.inf)
+    smallest = float(angle.min(initial=np.inf))
+    return None if smallest > ANGLES.widest_rad else _foremost(depth, angle <= max(smallest, ANGLES.same_rad))
 
 
 def ball_at_ray(middles: Array, radius: float, origin: Array, direction: Array) -> int | None:
     """The foremost of equally large balls (N, 3) that a ray meets, far ones a little larger; ``None`` where none."""
-    away = np.asarray(middles, dtype=np.float64) - origin
+    depth, beside = _project_on_ray(middles, origin, direction)
+    return _foremost(depth, (depth > 0) & (beside < np.maximum(radius, ANGLES.smallest_rad * depth)))
+
+
+def _project_on_ray(points: Array, origin: Array, direction: Array) -> tuple[Array, Array]:
+    """(N,) how far along a ray points (N, 3) lie, and how far beside it."""
+    away = np.asarray(points, dtype=np.float64) - origin
     depth = away @ (np.asarray(direction) / np.linalg.norm(direction))
-    beside = np.sqrt(np.maximum(np.sum(away**2, axis=1) - depth**2, 0))
-    met = np.flatnonzero((depth > 0) & (beside < np.maximum(radius, _LEAST_RAD * depth)))
-    return int(met[np.argmin(depth[met])]) if len(met) else None
+    return depth, np.sqrt(np.maximum(np.sum(away**2, axis=1) - depth**2, 0))
+
+
+def _foremost(depth: Array, chosen: BoolArray) -> int | None:
+    """The index of the least depth among the chosen ones."""
+    return int(np.argmin(np.where(chosen, depth, np.inf))) if chosen.any() else None
 
 
 def round_length(about: float) -> float:
@@ -116,7 +127,7 @@ def length_text(length_m: float, digits: int = 6) -> str:
     return f"{length_m * 1e3:.{digits}g} mm"
 
 
-def _with_uncertainty(length_m: float, half_m: float) -> str:
+def _format_interval(length_m: float, half_m: float) -> str:
     """Two digits of the uncertainty, and the length to the same place."""
     unit, size = ("m", 1.0) if length_m >= 1 else ("mm", 1e-3)
     value, half = length_m / size, half_m / size

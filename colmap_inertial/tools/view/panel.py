@@ -14,8 +14,6 @@ from colmap_inertial.tools.view.scene import Scene
 from colmap_inertial.tools.view.sources import KnownDistance, TargetFacts
 
 _COLOUR = {"trusted": "#40c057", "weak": "#fab005", "refused": "#fa5252"}
-#: Rows of the table of distances.
-_ROWS = 8
 
 
 def _plain(text: str) -> str:
@@ -31,9 +29,8 @@ def _flag(colour: str, text: str, size: str) -> str:
 def verdict_html(scene: Scene) -> str:
     """The verdict, with its colour."""
     verdict = scene.scale.verdict
-    return _flag(
-        _COLOUR.get(verdict or "", "#999"), f"Scale {verdict}" if verdict else "Scale without a verdict", "1.25em"
-    )
+    text = f"Scale {verdict}" if verdict else "Scale without a verdict"
+    return _flag(_COLOUR.get(verdict or "", "#999"), text, "1.25em")
 
 
 def scale_text(scene: Scene) -> str:
@@ -59,12 +56,8 @@ def contents_text(scene: Scene) -> str:
     """How much of what is shown."""
     cloud = scene.cloud
     kind = "points from depth maps" if cloud.dense else "points"
-    shown = (
-        f"{len(cloud.xyz):,} {kind}"
-        if len(cloud.xyz) == cloud.total
-        else f"{len(cloud.xyz):,} of {cloud.total:,} {kind}"
-    )
-    lines = [f"{len(scene.cameras)} cameras, {shown}"]
+    of_all = "" if len(cloud.xyz) == cloud.total else f"of {cloud.total:,} "
+    lines = [f"{len(scene.cameras)} cameras, {len(cloud.xyz):,} {of_all}{kind}"]
     if len(scene.source.others) > 1:
         others = ", ".join(map(str, scene.source.others))
         lines.append(f"Model {scene.source.index} of {others} (`--model`)")
@@ -89,7 +82,7 @@ def camera_text(scene: Scene, camera: int, problem: str = "") -> str:
     return f"{text}\n\n{_plain(problem)}" if problem else text
 
 
-def measured_text(result: Measured) -> str:
+def describe_distance(result: Measured) -> str:
     """A measured distance with its interval."""
     lines = [f"### {result.text}"]
     if result.ci95 is not None:
@@ -132,8 +125,7 @@ def _table(distances: Sequence[KnownDistance]) -> str:
     for distance in distances:
         by_length.setdefault(round(distance.known_m * 1e5), []).append(distance.measured_m)
     lengths = sorted(by_length)
-    if len(lengths) > _ROWS:
-        lengths = [lengths[i] for i in strided(len(lengths), _ROWS)]
+    lengths = [lengths[i] for i in strided(len(lengths), 8)]
     rows = [
         f"| {length / 100:.1f} | {1000 * float(np.mean(by_length[length])):.2f} | {len(by_length[length])} |"
         for length in lengths

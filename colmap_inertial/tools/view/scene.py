@@ -21,14 +21,30 @@ from colmap_inertial.tools.view.sources import KnownDistance, ScaleFacts, Target
 if TYPE_CHECKING:
     import pycolmap
 
-#: The path is drawn with so many pieces at most; larger meshes than this are not shown.
-_MOST_PIECES, _MOST_FACES = 4000, 1_500_000
-#: A step of the path this many times longer than usual is a gap.
-_GAP = 10.0
-#: Angle of view at the beginning; at least this much wider than high; so much of it is filled.
-START_FOV_RAD, _ASPECT, _MARGIN = 0.87, 1.2, 0.92
-#: Distances of the target that get a label, and how far apart these are, as a share of the longest distance.
-_LABELS, _APART = 3, 0.2
+
+@dataclass(frozen=True, kw_only=True)
+class SceneLimits:
+    """How much is drawn, and what is seen at first."""
+
+    pieces: int = 4000
+    """Of the path, at most."""
+    faces: int = 1_500_000
+    """Larger meshes are not shown."""
+    gap: float = 10.0
+    """A step of the path this many times longer than usual is a gap."""
+    start_fov_rad: float = 0.87
+    """Angle of view at the beginning, from top to bottom."""
+    aspect: float = 1.2
+    """The view is at least this much wider than high."""
+    filled: float = 0.92
+    """Share of the view that the scene takes at the beginning."""
+    labels: int = 3
+    """Distances of the target that get a label."""
+    label_distance: float = 0.2
+    """How far apart labels are, as a share of the longest distance."""
+
+
+LIMITS = SceneLimits()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -113,8 +129,8 @@ class Scene:
         ``None`` for a model without a scale.
     start
         (3,) where one looks at the scene from in the beginning.
-    target, target_lines, labelled
-        The validator's target; (K, 2, 3) lines between neighbouring corners; distances that get a label.
+    target_lines, labelled
+        Of the validator's target: (K, 2, 3) lines between neighbouring corners; distances that get a label.
     """
 
     out: Path
@@ -131,7 +147,6 @@ class Scene:
     reach: float
     ground: Ground | None
     start: Array
-    target: TargetFacts | None
     target_lines: Array
     labelled: tuple[KnownDistance, ...]
 
@@ -139,6 +154,11 @@ class Scene:
     def scale(self) -> ScaleFacts:
         """What is known of the model's scale."""
         return self.source.scale
+
+    @property
+    def target(self) -> TargetFacts | None:
+        """The validator's target."""
+        return self.source.target
 
     def image_of(self, camera: int) -> Path | None:
         """The file of a camera's image; ``None`` where none of the folders has it."""
@@ -182,9 +202,9 @@ def load_scene(out: Path, *, model: int | None = None, images: Path | None = Non
         cloud = sparse_cloud(reconstruction, max_points)
     mesh, mesh_note = None, ""
     if source.mesh is not None and source.mesh.is_file():
-        mesh = read_mesh(source.mesh, _MOST_FACES)
-        mesh_note = "" if mesh is not None else f"the mesh has no faces, or more than {_MOST_FACES}"
-    up, known = _up(source, cameras)
+        mesh = read_mesh(source.mesh, LIMITS.faces)
+        mesh_note = "" if mesh is not None else f"the mesh has no faces, or more than {LIMITS.faces}"
+    up, gravity_known = _find_up(source, cameras)
     centre, reach = centre_and_reach(cloud.xyz.astype(np.float64), cameras.cam_in_world)
     side = _side(centre, reach, up, cameras)
     ground = _ground(cloud, cameras, centre, reach, up, side) if source.scale.unit == "m" else None
@@ -203,12 +223,11 @@ def load_scene(out: Path, *, model: int | None = None, images: Path | None = Non
         path=path,
         path_percent=path_percent,
         up_in_world=up,
-        gravity_known=known,
+        gravity_known=gravity_known,
         centre=centre,
         reach=reach,
         ground=ground,
         start=start,
-        target=source.target,
         target_lines=lines,
         labelled=labelled,
     )
@@ -230,7 +249,7 @@ def _cameras(reconstruction: pycolmap.Reconstruction) -> Cameras:
     )
 
 
-def _up(source: ViewSource, cameras: Cameras) -> tuple[Array, bool]:
+def _find_up(source: ViewSource, cameras: Cameras) -> tuple[Array, bool]:
     """The direction against gravity, and whether it is known; otherwise that of the images' upper edges."""
     if source.down_in_world is not None:
         return -source.down_in_world / np.linalg.norm(source.down_in_world), True
@@ -251,10 +270,10 @@ def _path(source: ViewSource, cameras: Cameras) -> tuple[Array, Array | None]:
             # both begin with the first image
             middles_s = [0.5 * (part.begin_s + part.end_s) - source.stretched[0].begin_s for part in source.stretched]
             percent = np.interp(trajectory.t_s, middles_s, [part.percent for part in source.stretched])
-    every = -(-len(places) // _MOST_PIECES)
+    every = -(-len(places) // LIMITS.pieces)
     pieces = _pieces(places[::every])
     length = np.linalg.norm(pieces[:, 1] - pieces[:, 0], axis=1)
-    shown = length <= _GAP * np.median(length) if len(pieces) else np.zeros(0, dtype=np.bool_)
+    shown = length <= LIMITS.gap * np.median(length) if len(pieces) else np.zeros(0, dtype=np.bool_)
     return pieces[shown], None if percent is None else _pieces(percent[::every])[shown]
 
 
@@ -280,8 +299,8 @@ def _distance(side: Array, reach: float, up: Array, must_be_seen: Array) -> floa
     right = np.cross(up, side)
     right /= np.linalg.norm(right)
     above = np.cross(side, right)
-    beside = np.maximum(np.abs(must_be_seen @ right) / _ASPECT, np.abs(must_be_seen @ above))
-    needed = beside / np.tan(0.5 * START_FOV_RAD * _MARGIN) + must_be_seen @ side
+    beside = np.maximum(np.abs(must_be_seen @ right) / LIMITS.aspect, np.abs(must_be_seen @ above))
+    needed = beside / np.tan(0.5 * LIMITS.start_fov_rad * LIMITS.filled) + must_be_seen @ side
     return float(np.clip(needed.max(initial=0.0), 1.5 * reach, 6 * reach))
 
 
@@ -326,8 +345,8 @@ def _target_parts(target: TargetFacts | None) -> tuple[Array, tuple[KnownDistanc
         middle = ends(distance).mean(axis=0)
         longest = labelled[0].known_m if labelled else 0.0
         apart = [float(np.linalg.norm(ends(other).mean(axis=0) - middle)) for other in labelled]
-        if all(a > _APART * longest for a in apart):
+        if all(a > LIMITS.label_distance * longest for a in apart):
             labelled.append(distance)
-        if len(labelled) == _LABELS:
+        if len(labelled) == LIMITS.labels:
             break
     return np.array(neighbours).reshape(-1, 2, 3), tuple(labelled)

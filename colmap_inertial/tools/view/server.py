@@ -9,6 +9,7 @@ import io
 import socket
 import threading
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,16 +22,28 @@ from colmap_inertial.tools.view import panel
 from colmap_inertial.tools.view.drawing import RED, Drawing
 from colmap_inertial.tools.view.guard import Guard, guarding
 from colmap_inertial.tools.view.images import read_preview
-from colmap_inertial.tools.view.measure import ball_at_ray, measured, nearest_to_ray
-from colmap_inertial.tools.view.scene import START_FOV_RAD, Scene
+from colmap_inertial.tools.view.measure import ball_at_ray, measure_distance, nearest_to_ray
+from colmap_inertial.tools.view.scene import LIMITS as SCENE_LIMITS, Scene
 
 if TYPE_CHECKING:
     import viser
 
-#: Cameras that carry their image at the same time, and widths of images in the panel and on cameras.
-_THUMBNAILS, _PANEL_PX, _THUMBNAIL_PX = 24, 640, 160
-#: Ports that are tried from the first one on.
-_PORTS = 50
+
+@dataclass(frozen=True, kw_only=True)
+class ViewerLimits:
+    """Sizes and numbers of what the viewer sends."""
+
+    thumbnails: int = 24
+    """Cameras that carry their image at the same time."""
+    thumbnail_px: int = 160
+    """Width of these images."""
+    panel_px: int = 640
+    """Width of the image in the panel."""
+    ports: int = 50
+    """That are tried from the first one on."""
+
+
+LIMITS = ViewerLimits()
 
 
 class Viewer:
@@ -87,7 +100,7 @@ class Viewer:
             server.scene.configure_environment_map(None)
             server.scene.add_light_ambient("/light", intensity=1.5)
         camera = server.initial_camera
-        camera.fov, camera.near, camera.far = START_FOV_RAD, 2e-3 * scene.reach, 300 * scene.reach
+        camera.fov, camera.near, camera.far = SCENE_LIMITS.start_fov_rad, 2e-3 * scene.reach, 300 * scene.reach
         camera.up, camera.look_at, camera.position = scene.up_in_world, scene.centre, scene.start
 
     def _build_panel(self) -> None:
@@ -106,7 +119,7 @@ class Viewer:
         with gui.add_folder("Show"):
             for name, drawn in self._drawing.parts.items():
                 self._add_switch(name, drawn)
-            thumbnails = gui.add_checkbox("Images", False, hint=f"On {_THUMBNAILS} cameras.")
+            thumbnails = gui.add_checkbox("Images", False, hint=f"On {LIMITS.thumbnails} cameras.")
             thumbnails.on_update(lambda event: self._show_thumbnails(bool(event.target.value)))
             size = gui.add_slider("Point size", 0.2, 5.0, 0.1, 1.0)
             if scene.ground is not None:
@@ -163,7 +176,7 @@ class Viewer:
         cameras = self.scene.cameras
         with self._lock:
             self._remove("chosen")
-            image, problem = self._image_of(camera, _PANEL_PX)
+            image, problem = self._image_of(camera, LIMITS.panel_px)
             self._about.content = panel.camera_text(self.scene, camera, problem)
             self._image.visible = image is not None
             if image is not None:
@@ -190,9 +203,8 @@ class Viewer:
             self._remove("thumbnails")
             if not shown:
                 return
-            count = len(self.scene.cameras)
-            for camera in strided(count, _THUMBNAILS).tolist():
-                image, _ = self._image_of(camera, _THUMBNAIL_PX)
+            for camera in strided(len(self.scene.cameras), LIMITS.thumbnails).tolist():
+                image, _ = self._image_of(camera, LIMITS.thumbnail_px)
                 if image is not None:
                     self._temporary["thumbnails"].append(self._drawing.frustum(f"/thumbnails/{camera}", camera, image))
 
@@ -234,11 +246,11 @@ class Viewer:
                 self._temporary["measure"].append(ends)
                 self._measured.content = "Click the second point."
                 return
-            result = measured(points[0], points[1], self.scene.scale.unit, self.scene.scale.relative_ci95)
+            result = measure_distance(points[0], points[1], self.scene.scale.unit, self.scene.scale.relative_ci95)
             line = self._drawing.lines("/measure/line", points[None], RED, 3.0)
             label = self._drawing.label("/measure/label", result.text, points.mean(axis=0), size=1.2)
             self._temporary["measure"] = [ends, line, label]
-            self._measured.content = panel.measured_text(result)
+            self._measured.content = panel.describe_distance(result)
 
     def _clear(self) -> None:
         with self._lock:
@@ -247,7 +259,9 @@ class Viewer:
             self._measured.content = "Click the first point." if self._measuring.value else ""
 
 
-def _aim(client: viser.ClientHandle, position: Array, at: Array, up: Array, *, fov_rad: float = START_FOV_RAD) -> None:
+def _aim(
+    client: viser.ClientHandle, position: Array, at: Array, up: Array, *, fov_rad: float = SCENE_LIMITS.start_fov_rad
+) -> None:
     """Let somebody look from a position at a point."""
     with client.atomic():
         client.camera.fov = fov_rad
@@ -312,7 +326,7 @@ def _free_port(host: str, port: int) -> int:
     """The first port from ``port`` on that is free; viser would look for one without end, or wait for it forever."""
     try:
         address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        for candidate in range(port, min(port + _PORTS, 65536)):
+        for candidate in range(port, min(port + LIMITS.ports, 65536)):
             with socket.socket(address[0], socket.SOCK_STREAM) as probe:
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 try:

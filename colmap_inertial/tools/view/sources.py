@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -155,15 +155,15 @@ def find_source(out: Path, index: int | None = None, *, images: Path | None = No
     given = () if images is None else (images,)
     workspace = Workspace(out)
     if workspace.result.is_file() and model_format(out) is None:
-        return _of_reconstruction(workspace, index, given)
+        return _find_in_result(workspace, index, given)
     if workspace.stamps.is_dir():
         raise FormatError(
             out, "the run that writes this folder is not finished; start it again with the same arguments, it continues"
         )
-    return _of_project(out, index, given)
+    return _find_in_project(out, index, given)
 
 
-def _of_reconstruction(workspace: Workspace, index: int | None, given: tuple[Path, ...]) -> ViewSource:
+def _find_in_result(workspace: Workspace, index: int | None, given: tuple[Path, ...]) -> ViewSource:
     root = workspace.root
     record = read_json(workspace.result)
     with a_record_of_ours(workspace.result):
@@ -194,11 +194,7 @@ def _of_reconstruction(workspace: Workspace, index: int | None, given: tuple[Pat
             others=tuple(models),
             scale=scale,
             down_in_world=down,
-            images=(
-                *given,
-                *places_of(root).images,
-                *_image_folders(folder),
-            ),
+            images=(*given, *places_of(root).images, *_image_folders(folder)),
             fused=path_in(root, fused, workspace.result) if fused else None,
             mesh=path_in(root, mesh, workspace.result) if mesh else None,
             trajectory=path_in(root, path_file, workspace.result) if path_file else None,
@@ -208,14 +204,13 @@ def _of_reconstruction(workspace: Workspace, index: int | None, given: tuple[Pat
 
 
 def _stretched(fields: Mapping[str, Any]) -> tuple[StretchedPart, ...]:
-    done = [one for one in fields.get("treatments", []) if one["stage"] == "refine" and one["action"]]
-    parts = done[-1]["values"].get("drift", []) if done else []
-    return tuple(
-        StretchedPart(**{name: float(part[name]) for name in ("begin_s", "end_s", "percent")}) for part in parts
-    )
+    refined = [t for t in fields.get("treatments", []) if t["stage"] == "refine" and t["action"]]
+    parts = refined[-1]["values"].get("drift", []) if refined else []
+    keys = ("begin_s", "end_s", "percent")
+    return tuple(StretchedPart(**{key: float(part[key]) for key in keys}) for part in parts)
 
 
-def _of_project(out: Path, index: int | None, given: tuple[Path, ...]) -> ViewSource:
+def _find_in_project(out: Path, index: int | None, given: tuple[Path, ...]) -> ViewSource:
     """A COLMAP model, or a project with models where COLMAP has them, as they are or as ``apply`` wrote them."""
     for place in (out, *places_of(out).sparse):
         try:
@@ -225,21 +220,18 @@ def _of_project(out: Path, index: int | None, given: tuple[Path, ...]) -> ViewSo
             continue
     else:
         raise FormatError(out, "no result of ours and no COLMAP model here (cameras, images, points3D, .bin or .txt)")
-    sizes = {i: _num_images(folder) for i, folder in models.items()}
+    # the file's size stands for the number of registered images: no model is read
+    sizes = {i: (folder / f"images{model_format(folder)}").stat().st_size for i, folder in models.items()}
     chosen = _choose(out, sizes, index)
     folder = models[chosen]
-    scale, on_axis = ScaleFacts(unit="model", **_verdict_of_apply(out, folder)), False
+    scale, on_axis = ScaleFacts(unit="model", **_read_verdict_of_apply(out, folder)), False
     if is_metric(folder):
         path = folder / TRANSFORM_FILE
         similarity = similarity_from_json(path, read_json(path))
         sigma = float(np.sqrt(max(similarity.cov[0, 0], 0.0)))
         factor = float(np.exp(Z95 * sigma))
-        scale = ScaleFacts(
-            unit="m",
-            metres_per_unit=similarity.scale,
-            relative_ci95=(1 / factor, factor) if sigma > 0 else None,
-            **_verdict_of_apply(out, folder),
-        )
+        ci95 = (1 / factor, factor) if sigma > 0 else None
+        scale = replace(scale, unit="m", metres_per_unit=similarity.scale, relative_ci95=ci95)
         on_axis = bool(similarity.cov[1:4, 1:4].any())
     single = len(models) == 1
     return ViewSource(
@@ -263,12 +255,6 @@ def _choose(out: Path, sizes: Mapping[int, int], index: int | None) -> int:
     return index
 
 
-def _num_images(folder: Path) -> int:
-    """A measure of the number of registered images, without reading the model."""
-    suffix = model_format(folder)
-    return (folder / f"images{suffix}").stat().st_size
-
-
 def _estimated(fields: Mapping[str, Any], unit: LengthUnit) -> ScaleFacts:
     scale, ci95 = fields["metres_per_unit"], fields["ci95"]
     relative = None if scale is None or ci95 is None else (float(ci95[0]) / scale, float(ci95[1]) / scale)
@@ -281,7 +267,7 @@ def _estimated(fields: Mapping[str, Any], unit: LengthUnit) -> ScaleFacts:
     )
 
 
-def _verdict_of_apply(out: Path, folder: Path) -> dict[str, Any]:
+def _read_verdict_of_apply(out: Path, folder: Path) -> dict[str, Any]:
     """Verdict and reasons that ``apply`` wrote into the project's record, where there is one."""
     path = out / TRANSFORM_FILE
     if not path.is_file():
