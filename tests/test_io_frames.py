@@ -10,7 +10,7 @@ from conftest import write_anew
 
 from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.io.capture import load_capture
-from colmap_inertial.io.frames import frame_source, read_frame_times, read_frame_timing, read_frames
+from colmap_inertial.io.frames import read_frame_times, read_frame_timing, read_frames
 from colmap_inertial.io.images import SUFFIXES, read_image
 
 EPOCH_NS = 1403715273262142976
@@ -45,7 +45,7 @@ def test_names_that_are_nanoseconds_time_frames_exactly_and_in_order(tmp_path: P
     assert tuple(frame.name for frame in read) == timing.names
     assert [frame.t_s for frame in read] == timing.t_s.tolist()
     np.testing.assert_array_equal(read[0].image, picture(1)[:, :, ::-1])
-    assert frame_source(capture) == tmp_path / "frames"
+    assert capture.image_folder == tmp_path / "frames"
 
 
 @pytest.mark.parametrize(

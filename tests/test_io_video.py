@@ -18,7 +18,7 @@ from conftest import write_anew
 from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.core.types import FrameLog
 from colmap_inertial.io.capture import load_capture
-from colmap_inertial.io.frames import frame_source, read_frame_timing, read_frames, read_reduced, thin
+from colmap_inertial.io.frames import read_frame_timing, read_frames, read_reduced, thin
 from colmap_inertial.io.video import decode_grey, decode_reduced, decode_video, video_stamps_ns
 
 VARIABLE_MS = (100, 133, 167, 250, 283, 400, 417, 450, 600, 633, 667, 700)
@@ -72,7 +72,7 @@ def test_variable_rate_and_container_start_are_exact_to_a_microsecond(
         assert frame.t_s == timing.t_s[i] and frame.image.shape == (48, 64, 3)
         levels.append(float(frame.image.mean()))
     np.testing.assert_allclose(levels, [20 + 15 * i for i in range(12)], atol=3)
-    assert frame_source(load_capture(tmp_path)) is None
+    assert load_capture(tmp_path).image_folder is None
 
 
 def test_a_recorders_own_frame_times_replace_the_stamps(tmp_path: Path) -> None:

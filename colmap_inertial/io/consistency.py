@@ -19,17 +19,39 @@ from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, quat_multi
 from colmap_inertial.core.sampling import Coverage, integral_at
 from colmap_inertial.core.types import ImuRecording
 
-#: Windows, the steps in which the gyroscope is integrated, and the means that are compared in a window.
-WINDOW_S, STEP_S, MEAN_S = 4.0, 0.1, 1.0
-#: Enough to decide; keeps hours of recording cheap.
-FEWEST_WINDOWS, MOST_WINDOWS = 6, 100
-#: Added to variances, (m/s2)^2: below this, differences are sensor errors.
-FLOOR_M2_S4 = 0.02
-#: How much better another reading must be, as mean logarithm of the ratio of variances and in standard errors: than
-#: the file's own, and than no rotation at all. On 8 handheld recordings, each with 47 wrong readings of its axes,
-#: 366 of 376 are told with the right one named and none with a wrong one; the best other reading of the 8 clean
-#: recordings and of a drone has 0.02.
-CLEAR_ADVANTAGE, CLEAR_T = 0.5, 3.0
+
+@dataclass(frozen=True, kw_only=True)
+class ConsistencyLimits:
+    """What the comparison of readings decides by.
+
+    On 8 handheld recordings, each with 47 wrong readings of its axes, 366 of 376 are named with the right one and none
+    with a wrong one; the best other reading of the 8 clean recordings and of a drone has 0.02 in place of
+    ``clear_advantage``.
+
+    Attributes
+    ----------
+    window_s, step_s, mean_s
+        Windows, the steps in which the gyroscope is integrated, and the means that are compared in a window.
+    fewest_windows, most_windows
+        Enough to decide; few enough to keep hours of recording cheap.
+    floor_m2_s4
+        Added to variances: below this, differences are sensor errors.
+    clear_advantage, clear_standard_errors
+        How much better another reading must be, as mean logarithm of the ratio of variances and in standard errors:
+        than the file's own, and than no rotation at all.
+    """
+
+    window_s: float = 4.0
+    step_s: float = 0.1
+    mean_s: float = 1.0
+    fewest_windows: int = 6
+    most_windows: int = 100
+    floor_m2_s4: float = 0.02
+    clear_advantage: float = 0.5
+    clear_standard_errors: float = 3.0
+
+
+LIMITS = ConsistencyLimits()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -72,7 +94,7 @@ def better_readings(imu: ImuRecording) -> tuple[Reading, ...]:
     recording cannot tell.
     """
     turns, force = _windows(imu)
-    if len(turns) < FEWEST_WINDOWS:
+    if len(turns) < LIMITS.fewest_windows:
         return ()
     readings = _readings()
     orientations: dict[float, Array] = {}
@@ -93,14 +115,14 @@ def better_readings(imu: ImuRecording) -> tuple[Reading, ...]:
 def _clearly(better: Array, worse: Array) -> bool:
     difference = worse - better
     error = float(difference.std(ddof=1)) / len(difference) ** 0.5
-    return bool(difference.mean() > max(CLEAR_ADVANTAGE, CLEAR_T * error))
+    return bool(difference.mean() > max(LIMITS.clear_advantage, LIMITS.clear_standard_errors * error))
 
 
 def _log_variance(force: Array) -> Array:
-    """(W,) of (W, K, 3) specific forces: logarithm of the variance of their means over ``MEAN_S``."""
-    means = force.reshape(len(force), -1, round(MEAN_S / STEP_S), 3).mean(axis=2)
+    """(W,) of (W, K, 3) specific forces: logarithm of the variance of their means over ``mean_s``."""
+    means = force.reshape(len(force), -1, round(LIMITS.mean_s / LIMITS.step_s), 3).mean(axis=2)
     variance = ((means - means.mean(axis=1, keepdims=True)) ** 2).sum(axis=2).mean(axis=1)
-    return np.asarray(np.log(variance + FLOOR_M2_S4))
+    return np.asarray(np.log(variance + LIMITS.floor_m2_s4))
 
 
 def _integrate(turns: Array) -> Array:
@@ -119,12 +141,13 @@ def _integrate(turns: Array) -> Array:
 def _windows(imu: ImuRecording) -> tuple[Array, Array]:
     """Turns (W, K, 3) in rad and mean specific forces (W, K, 3) in m/s2 of each step of each window without a gap."""
     start_s, end_s = max(imu.gyro_t_s[0], imu.accel_t_s[0]), min(imu.gyro_t_s[-1], imu.accel_t_s[-1])
-    count = max(0, int((end_s - start_s) / WINDOW_S))
-    chosen = np.unique(np.linspace(0, count - 1, min(count, MOST_WINDOWS)).astype(np.intp))
-    edges = start_s + chosen[:, None] * WINDOW_S + np.arange(round(WINDOW_S / STEP_S) + 1) * STEP_S
+    count = max(0, int((end_s - start_s) / LIMITS.window_s))
+    chosen = np.unique(np.linspace(0, count - 1, min(count, LIMITS.most_windows)).astype(np.intp))
+    steps_in_window = round(LIMITS.window_s / LIMITS.step_s)
+    edges = start_s + chosen[:, None] * LIMITS.window_s + np.arange(steps_in_window + 1) * LIMITS.step_s
     whole = np.ones(len(edges), dtype=bool)
     steps = []
     for t_s, values in ((imu.gyro_t_s, imu.gyro_rad_s), (imu.accel_t_s, imu.accel_m_s2)):
         whole &= Coverage(t_s).covers(edges[:, 0], np.minimum(edges[:, -1], end_s))
         steps.append(np.diff(integral_at(t_s, values, edges), axis=1))
-    return steps[0][whole], steps[1][whole] / STEP_S
+    return steps[0][whole], steps[1][whole] / LIMITS.step_s

@@ -6,6 +6,7 @@ import datetime
 import re
 import struct
 from collections.abc import Iterator, Sequence
+from enum import IntEnum
 from math import nan
 from pathlib import Path
 
@@ -21,15 +22,27 @@ PNG = b"\x89PNG\r\n\x1a\n"
 _EXIF_HEADER = b"Exif\0\0"
 #: EXIF stands at the beginning of a file.
 HEAD_BYTES = 256 * 1024
-#: Tags of EXIF (CIPA DC-008): the directory, and DateTimeOriginal, OffsetTimeOriginal, SubSecTimeOriginal in it.
-_DIRECTORY, _DATE, _OFFSET, _FRACTION = 0x8769, 0x9003, 0x9011, 0x9291
-#: ExposureTime, PhotographicSensitivity.
-_EXPOSURE_TIME, _SENSITIVITY = 0x829A, 0x8827
-_ASCII, _SHORT = 2, 3
-#: The directory of positions, and in it GPSLatitudeRef, GPSLatitude, GPSLongitudeRef, GPSLongitude, GPSAltitudeRef,
-#: GPSAltitude, GPSHPositioningError.
-_GPS, _LAT_REF, _LAT, _LON_REF, _LON, _HEIGHT_REF, _HEIGHT, _ERROR = 0x8825, 1, 2, 3, 4, 5, 6, 31
 _EPOCH = datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
+
+
+class _Tag(IntEnum):
+    """Of EXIF (CIPA DC-008): its directories, DateTimeOriginal and what belongs to it, PhotographicSensitivity."""
+
+    EXIF, GPS = 0x8769, 0x8825
+    DATE, OFFSET, FRACTION = 0x9003, 0x9011, 0x9291
+    EXPOSURE_TIME, SENSITIVITY = 0x829A, 0x8827
+
+
+class _GpsTag(IntEnum):
+    """Of the directory of positions: GPSLatitudeRef and so on; GPSHPositioningError."""
+
+    LATITUDE_REF, LATITUDE, LONGITUDE_REF, LONGITUDE, HEIGHT_REF, HEIGHT, ERROR = 1, 2, 3, 4, 5, 6, 31
+
+
+class _Type(IntEnum):
+    """Of an entry's value."""
+
+    ASCII, SHORT = 2, 3
 
 
 def stamps_of_exif(folder: Path, names: Sequence[str]) -> tuple[FrameStamps, int]:
@@ -59,7 +72,7 @@ def stamps_of_exif(folder: Path, names: Sequence[str]) -> tuple[FrameStamps, int
     for name in names:
         path = path_in(folder, name)
         texts = _texts(path)
-        fraction = texts.get(_FRACTION, "").strip()
+        fraction = texts.get(_Tag.FRACTION, "").strip()
         if not re.fullmatch(r"\d{2,9}", fraction):
             tells = "tenths of a second" if fraction.isdigit() else "whole seconds"
             raise TimingError(
@@ -68,11 +81,11 @@ def stamps_of_exif(folder: Path, names: Sequence[str]) -> tuple[FrameStamps, int
                 "where they were taken from one"
             )
         try:
-            local = datetime.datetime.strptime(texts.get(_DATE, "").strip(), "%Y:%m:%d %H:%M:%S")
+            local = datetime.datetime.strptime(texts.get(_Tag.DATE, "").strip(), "%Y:%m:%d %H:%M:%S")
         except ValueError:
             raise FormatError(path, "its EXIF has no DateTimeOriginal; give --frame-times") from None
         seconds = (local.replace(tzinfo=datetime.UTC) - _EPOCH) // datetime.timedelta(seconds=1)
-        offset = re.fullmatch(r"([+-])(\d\d):(\d\d)", texts.get(_OFFSET, "").strip())
+        offset = re.fullmatch(r"([+-])(\d\d):(\d\d)", texts.get(_Tag.OFFSET, "").strip())
         if offset is not None:
             sign, hours, minutes = offset.groups()
             seconds -= (1 if sign == "+" else -1) * (3600 * int(hours) + 60 * int(minutes))
@@ -91,17 +104,17 @@ def _texts(path: Path) -> dict[int, str]:
     """The text entries of a picture's EXIF directory."""
     head = read_bytes(path, HEAD_BYTES, what="picture")
     try:
-        found = exif_directory(head)
+        found = _directory(head, _Tag.EXIF)
         if found is None:
             raise FormatError(path, "has no EXIF, which is to give its time; give --frame-times")
         tiff, order, directory = found
-        return {tag: _text(tiff, order, *entry) for tag, entry in directory.items() if entry[0] == _ASCII}
+        return {tag: _text(tiff, order, *entry) for tag, entry in directory.items() if entry[0] == _Type.ASCII}
     except (struct.error, KeyError):
         raise FormatError(path, "its EXIF is damaged or empty; give --frame-times") from None
 
 
-def exif_directory(head: bytes) -> tuple[bytes, str, dict[int, tuple[int, int, bytes]]] | None:
-    """The EXIF directory in the head of a JPEG, PNG or TIFF file.
+def _directory(head: bytes, tag: _Tag) -> tuple[bytes, str, dict[int, tuple[int, int, bytes]]] | None:
+    """A directory of EXIF in the head of a JPEG, PNG or TIFF file.
 
     Returns
     -------
@@ -111,14 +124,14 @@ def exif_directory(head: bytes) -> tuple[bytes, str, dict[int, tuple[int, int, b
     Raises
     ------
     struct.error, KeyError
-        Where the EXIF is damaged or has no directory.
+        Where the EXIF is damaged or has no such directory.
     """
     tiff = _tiff(head)
     order = {b"II": "<", b"MM": ">"}.get(b"" if tiff is None else tiff[:2])
     if tiff is None or order is None:
         return None
     first = _entries(tiff, order, struct.unpack_from(order + "I", tiff, 4)[0])
-    return tiff, order, _entries(tiff, order, struct.unpack_from(order + "I", first[_DIRECTORY][2])[0])
+    return tiff, order, _entries(tiff, order, struct.unpack_from(order + "I", first[tag][2])[0])
 
 
 def _tiff(head: bytes) -> bytes | None:
@@ -138,22 +151,22 @@ def exposure_of(head: bytes) -> tuple[float | None, float | None]:
     ExposureTime is a fraction, PhotographicSensitivity a whole number (CIPA DC-008).
     """
     try:
-        found = exif_directory(head)
+        found = _directory(head, _Tag.EXIF)
     except (struct.error, KeyError):
         found = None
     if found is None:
         return None, None
     tiff, order, directory = found
     exposure_s = iso = None
-    if _EXPOSURE_TIME in directory:
+    if _Tag.EXPOSURE_TIME in directory:
         try:
-            at = struct.unpack(order + "I", directory[_EXPOSURE_TIME][2])[0]
+            at = struct.unpack(order + "I", directory[_Tag.EXPOSURE_TIME][2])[0]
             numerator, denominator = struct.unpack_from(order + "II", tiff, at)
         except struct.error:
             numerator = denominator = 0
         exposure_s = numerator / denominator if denominator else 0.0
-    if _SENSITIVITY in directory and directory[_SENSITIVITY][0] == _SHORT:
-        iso = float(struct.unpack_from(order + "H", directory[_SENSITIVITY][2])[0])
+    if _Tag.SENSITIVITY in directory and directory[_Tag.SENSITIVITY][0] == _Type.SHORT:
+        iso = float(struct.unpack_from(order + "H", directory[_Tag.SENSITIVITY][2])[0])
     return exposure_s if exposure_s is not None and 0 < exposure_s < 10 else None, iso or None
 
 
@@ -166,16 +179,15 @@ def position_of(head: bytes) -> tuple[float, float, float, float, HeightDatum] |
         nan where the height or the error is not stated (CIPA DC-008, table 15).
     """
     try:
-        tiff = _tiff(head)
-        order = {b"II": "<", b"MM": ">"}.get(b"" if tiff is None else tiff[:2])
-        if tiff is None or order is None:
+        found = _directory(head, _Tag.GPS)
+        if found is None:
             return None
-        first = _entries(tiff, order, struct.unpack_from(order + "I", tiff, 4)[0])
-        gps = _entries(tiff, order, struct.unpack_from(order + "I", first[_GPS][2])[0])
-        latitude = _angle_deg(tiff, order, gps[_LAT], gps[_LAT_REF], "NS")
-        longitude = _angle_deg(tiff, order, gps[_LON], gps[_LON_REF], "EW")
-        height, error = (_fractions(tiff, order, gps[tag], 1)[0] if tag in gps else nan for tag in (_HEIGHT, _ERROR))
-        side = gps[_HEIGHT_REF][2][0] if _HEIGHT_REF in gps else 0
+        tiff, order, gps = found
+        latitude = _angle_deg(tiff, order, gps[_GpsTag.LATITUDE], gps[_GpsTag.LATITUDE_REF], "NS")
+        longitude = _angle_deg(tiff, order, gps[_GpsTag.LONGITUDE], gps[_GpsTag.LONGITUDE_REF], "EW")
+        wanted = (_GpsTag.HEIGHT, _GpsTag.ERROR)
+        height, error = (_fractions(tiff, order, gps[tag], 1)[0] if tag in gps else nan for tag in wanted)
+        side = gps[_GpsTag.HEIGHT_REF][2][0] if _GpsTag.HEIGHT_REF in gps else 0
     except (struct.error, KeyError, IndexError, ValueError):
         return None
     if not (abs(latitude) <= 90 and abs(longitude) <= 180):

@@ -110,11 +110,6 @@ def read_frame_times(path: StrPath) -> FrameTiming:
     return stamps_of_csv(path).timing()
 
 
-def frame_source(capture: Capture) -> Path | None:
-    """The folder that holds the original file of each frame name, or ``None`` where frames come from a video."""
-    return capture.image_folder
-
-
 def picture_folders(capture: Capture) -> tuple[Path, ...]:
     """All folders that pictures of a capture are read from; empty where they come from a video."""
     if not isinstance(capture.frames, ImageFolder):

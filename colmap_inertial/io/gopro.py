@@ -41,19 +41,36 @@ _SENSORS: dict[str, Quantity] = {"GYRO": "gyro", "ACCL": "accel"}
 _OF_FRAMES = ("SHUT", "ISOE", "ISOG", "CORI", "GRAV")
 _POSITIONS = ("GPS9", "GPS5")
 _WANTED = {*_SENSORS, *_OF_FRAMES, *_POSITIONS, "GPSF", "GPSP", "IORI", "SROT", "TMPC"}
-#: Standard deviation of a position, metres, where the dilution of precision is 1.
-_UNDILUTED_M = 1.5
-#: Beyond this dilution of precision a position says nothing.
-_MOST_DILUTED = 10.0
 #: Channel order by the firmware's first letters, where the stream does not say.
 _ORDER = {"HD5": "ZXY", "FS1": "yXZ"}
 _USUAL_ORDER = "YxZ"
-#: No sensor works at more, nor below its opposite (and not at what is no number).
-_HOTTEST_C = 150.0
-#: An image that is rotated by more than this against the camera was stabilised.
-_ROTATED_RAD = 0.005
-#: Samples of the last payload may be missing for so many frames at the end; they take the last one's.
-_MISSING_FRAMES = 2.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class _GoproLimits:
+    """What is believed of a GoPro's telemetry.
+
+    Attributes
+    ----------
+    undiluted_sigma_m, largest_dilution
+        Standard deviation of a position where the dilution of precision is 1; beyond the largest one, a position says
+        nothing.
+    hottest_c
+        No sensor works at more, nor below its opposite.
+    rotated_rad
+        An image that is rotated by more than this against the camera was stabilised.
+    missing_frames
+        Samples of the last payload may be missing for so many frames at the end; they take the last one's.
+    """
+
+    undiluted_sigma_m: float = 1.5
+    largest_dilution: float = 10.0
+    hottest_c: float = 150.0
+    rotated_rad: float = 0.005
+    missing_frames: float = 2.5
+
+
+_LIMITS = _GoproLimits()
 
 
 def is_gopro(path: Path) -> bool:
@@ -153,7 +170,7 @@ def read_gopro_positions(path: Path) -> PositionFixes | None:
         fix = _of_payloads(telemetry.streams.get("GPSF"), stream, default=3.0)
         diluted = _of_payloads(telemetry.streams.get("GPSP"), stream, default=100.0) / 100
     inside = (np.abs(values[:, 0]) <= 90) & (np.abs(values[:, 1]) <= 180) & np.isfinite(values[:, :3]).all(axis=1)
-    good = inside & (fix >= 2) & (diluted > 0) & (diluted <= _MOST_DILUTED)
+    good = inside & (fix >= 2) & (diluted > 0) & (diluted <= _LIMITS.largest_dilution)
     if not good.any():
         return None
     datum = {"MSLV": "sea", "WGS8": "ellipsoid"}.get(stream.text("GPSA")[:4], "unknown")
@@ -161,7 +178,7 @@ def read_gopro_positions(path: Path) -> PositionFixes | None:
         latitude_deg=values[good, 0],
         longitude_deg=values[good, 1],
         height_m=np.where(fix[good] >= 3, values[good, 2], np.nan),
-        sigma_m=_UNDILUTED_M * diluted[good],
+        sigma_m=_LIMITS.undiluted_sigma_m * diluted[good],
         t_ns=t_ns[good],
         height_above=cast(HeightDatum, datum),
         source=f"{key} of {path.name}",
@@ -223,7 +240,7 @@ def _temperature_c(streams: dict[str, Stream]) -> float | None:
     """What the camera says beside its sensors' readings, degrees Celsius; ``None`` where it says nothing possible."""
     stream = streams.get("TMPC")
     said = np.empty(0) if stream is None or not stream.data else stream.values[:, 0]
-    said = said[np.abs(said) < _HOTTEST_C]
+    said = said[np.abs(said) < _LIMITS.hottest_c]
     return float(np.median(said)) if len(said) else None
 
 
@@ -321,7 +338,7 @@ def _stabilisation(settings: dict[str, Entry], image: Array | None) -> tuple[boo
     if image is not None:
         # half the angle's sine is what the vector part of a quaternion holds
         angle_rad = 2 * np.arcsin(np.clip(np.linalg.norm(_unit_length(image)[:, 1:], axis=1), 0, 1))
-        if float(np.sqrt(np.mean(angle_rad**2))) > _ROTATED_RAD:
+        if float(np.sqrt(np.mean(angle_rad**2))) > _LIMITS.rotated_rad:
             return True, f"{words} IORI".strip()
         return False, words
     return (False if flag == "N" else None), words
@@ -329,8 +346,8 @@ def _stabilisation(settings: dict[str, Entry], image: Array | None) -> tuple[boo
 
 def _nearest(t_ns: Int64Array, values: Array, frame_ns: Int64Array) -> Array | None:
     """The sample nearest to each frame; ``None`` where frames lie outside the samples."""
-    step_ns = float(np.median(np.diff(t_ns)))
-    if frame_ns[0] < t_ns[0] - _MISSING_FRAMES * step_ns or frame_ns[-1] > t_ns[-1] + _MISSING_FRAMES * step_ns:
+    slack_ns = _LIMITS.missing_frames * float(np.median(np.diff(t_ns)))
+    if frame_ns[0] < t_ns[0] - slack_ns or frame_ns[-1] > t_ns[-1] + slack_ns:
         return None
     return values[nearest(t_ns, frame_ns)]
 

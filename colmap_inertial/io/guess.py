@@ -6,7 +6,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
-from colmap_inertial.io.plausible import GRAVITY_BOUNDS_M_S2, LARGEST_MEDIAN_RATE_RAD_S, STEADY_SHARE
+from colmap_inertial.io.plausible import PLAUSIBLE
 from colmap_inertial.io.tables import Table
 from colmap_inertial.io.units import STANDARD_GRAVITY_M_S2, TIME_UNITS_NS
 
@@ -65,11 +65,11 @@ def _triples(values: Array, without: set[int | None]) -> list[int]:
 
 def _accel(values: Array, time: int | None) -> tuple[int | None, str]:
     """Three columns whose length stays near gravity, and which leave three for the gyroscope where they can."""
-    low, high = GRAVITY_BOUNDS_M_S2
+    low, high = PLAUSIBLE.smallest_gravity_m_s2, PLAUSIBLE.largest_gravity_m_s2
     found: list[tuple[bool, float, int, str]] = []
     for i in _triples(values, {time}):
         few, median = (float(v) for v in np.percentile(np.linalg.norm(values[:, i : i + 3], axis=1), [5, 50]))
-        if few > STEADY_SHARE * median:
+        if few > PLAUSIBLE.steady_share * median:
             others = bool(_triples(values, {time, i, i + 1, i + 2}))
             units = (("m/s2", 1.0), ("g", STANDARD_GRAVITY_M_S2))
             found += [(others, few / median, i, unit) for unit, factor in units if low <= median * factor <= high]
@@ -86,4 +86,4 @@ def _gyro(values: Array, time: int | None, accel: int | None) -> tuple[int | Non
     if accel is None or not triples:
         return None, "..."
     median = float(np.median(np.linalg.norm(values[:, triples[0] : triples[0] + 3], axis=1)))
-    return triples[0], "rad/s" if median <= LARGEST_MEDIAN_RATE_RAD_S else "deg/s"
+    return triples[0], "rad/s" if median <= PLAUSIBLE.largest_median_rate_rad_s else "deg/s"

@@ -38,8 +38,8 @@ class Track:
         Four letters each: the kind (``vide``, ``meta``), and the format of the samples (``gpmd``, ``camm``, ``avc1``).
     offset, size
         (N,) where each sample lies in the file, in bytes.
-    t_ns, duration_ns
-        (N,) presentation time on the movie's clock, edit list included, and how long each sample lasts.
+    t_ns
+        (N,) presentation time on the movie's clock, edit list included.
     width_px, height_px
         Of a video's stored pictures; 0 for other tracks.
     """
@@ -49,7 +49,6 @@ class Track:
     offset: Int64Array
     size: Int64Array
     t_ns: Int64Array
-    duration_ns: Int64Array
     width_px: int = 0
     height_px: int = 0
 
@@ -293,7 +292,6 @@ def _track(reader: _Boxes, begin: int, end: int, movie_scale: int) -> Track | No
         offset=_offsets(reader, boxes, size),
         size=size,
         t_ns=t_ns,
-        duration_ns=_ns(duration, scale),
         width_px=width,
         height_px=height,
     )

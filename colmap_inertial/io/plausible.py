@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -14,15 +15,33 @@ from colmap_inertial.core.types import ImuRecording
 from colmap_inertial.io.consistency import better_readings
 from colmap_inertial.io.units import SENSOR_NAMES, STANDARD_GRAVITY_M_S2, Axes, Quantity
 
-#: The median of |accelerometer| of a device that is carried or flown stays near gravity: sensors are off by up to 5 %,
-#: and shaking raises it. Measured on the recordings this was tried on: 9.36 to 9.81, and 10.4 in strong shaking.
-GRAVITY_BOUNDS_M_S2 = (7.0, 14.0)
-#: The 5th percentile of |accelerometer| over its median: above 0.75 with gravity, below 0.45 without.
-STEADY_SHARE = 0.6
-#: No gyroscope in phones, cameras or drones measures more than 4000 deg/s = 70 rad/s on an axis.
-LARGEST_RATE_RAD_S = 70.0
-#: Half of a recording faster than a turn in 0.9 s: nobody films like that, but deg/s read as rad/s look like it.
-LARGEST_MEDIAN_RATE_RAD_S = 7.0
+
+@dataclass(frozen=True, kw_only=True)
+class PlausibleReadings:
+    """Bounds that readings of a working IMU in SI units keep.
+
+    Attributes
+    ----------
+    smallest_gravity_m_s2, largest_gravity_m_s2
+        The median of |accelerometer| of a device that is carried or flown stays near gravity: sensors are off by up to
+        5 %, and shaking raises it. Measured on the recordings this was tried on: 9.36 to 9.81, and 10.4 in strong
+        shaking.
+    steady_share
+        The 5th percentile of |accelerometer| over its median: above 0.75 with gravity, below 0.45 without.
+    largest_rate_rad_s
+        No gyroscope in phones, cameras or drones measures more than 4000 deg/s on an axis.
+    largest_median_rate_rad_s
+        Half of a recording faster than a turn in 0.9 s: nobody films like that, but deg/s read as rad/s look like it.
+    """
+
+    smallest_gravity_m_s2: float = 7.0
+    largest_gravity_m_s2: float = 14.0
+    steady_share: float = 0.6
+    largest_rate_rad_s: float = 70.0
+    largest_median_rate_rad_s: float = 7.0
+
+
+PLAUSIBLE = PlausibleReadings()
 
 
 def check_plausible(
@@ -92,8 +111,8 @@ def check_exchanged(imu: ImuRecording, path: Path) -> None:
     """Refuse a gyroscope that reads gravity beside an accelerometer that does not."""
     gyro = float(np.median(np.linalg.norm(imu.gyro_rad_s, axis=1)))
     accel = float(np.median(np.linalg.norm(imu.accel_m_s2, axis=1)))
-    low, high = GRAVITY_BOUNDS_M_S2
-    if low < gyro < high and not low < accel < high and accel < LARGEST_MEDIAN_RATE_RAD_S:
+    low, high = PLAUSIBLE.smallest_gravity_m_s2, PLAUSIBLE.largest_gravity_m_s2
+    if low < gyro < high and not low < accel < high and accel < PLAUSIBLE.largest_median_rate_rad_s:
         raise FormatError(
             path,
             f"the gyroscope's median length is {gyro:.2f} and the accelerometer's {accel:.2f}: the two sensors are "
@@ -138,13 +157,13 @@ def check_gravity(lengths_m_s2: Array, path: Path) -> None:
     lengths_m_s2
         (M,) lengths of the samples.
     """
-    low, high = GRAVITY_BOUNDS_M_S2
+    low, high = PLAUSIBLE.smallest_gravity_m_s2, PLAUSIBLE.largest_gravity_m_s2
     median, few = (float(value) for value in np.percentile(lengths_m_s2, [50, 5]))
     if low <= median <= high:
         return
     found = f"the accelerometer's median length is {median:.4g} where gravity gives about 9.8 m/s2"
     # Gravity keeps the length near its median; what is left without it comes near zero again and again.
-    steady = few > STEADY_SHARE * median
+    steady = few > PLAUSIBLE.steady_share * median
     if steady and low <= median * STANDARD_GRAVITY_M_S2 <= high:
         raise FormatError(
             path, f'{found}: the numbers are in g; set unit = "g" under [imu.accel] in capture.toml', code="accel-in-g"
@@ -179,13 +198,13 @@ def check_rates(gyro_rad_s: Array, path: Path) -> None:
     """Refuse angular velocities that no hand, drone or sensor reaches."""
     median = float(np.median(np.linalg.norm(gyro_rad_s, axis=1)))
     largest = float(np.abs(gyro_rad_s).max())
-    if largest <= LARGEST_RATE_RAD_S and median <= LARGEST_MEDIAN_RATE_RAD_S:
+    if largest <= PLAUSIBLE.largest_rate_rad_s and median <= PLAUSIBLE.largest_median_rate_rad_s:
         return
     raise FormatError(
         path,
         f"the gyroscope reads up to {largest:.4g} rad/s, half of the time above {median:.3g} (a hand reaches about 5, "
-        f'a sensor ends at {LARGEST_RATE_RAD_S:g}): the numbers are in deg/s; set unit = "deg/s" under [imu.gyro] in '
-        "capture.toml",
+        f"a sensor ends at {PLAUSIBLE.largest_rate_rad_s:g}): the numbers are in deg/s; "
+        'set unit = "deg/s" under [imu.gyro] in capture.toml',
         code="gyro-in-deg",
     )
 

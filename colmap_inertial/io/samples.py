@@ -12,16 +12,35 @@ from colmap_inertial.core.arrays import Array, IndexArray, Int64Array
 from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.io.units import SENSOR_NAMES, Quantity, to_si
 
-#: A sample this far behind the newest one before it means that the clock was set back, not that rows changed places.
-LATEST_ARRIVAL_NS = 500_000_000
-#: Share of samples that may be missing (NaN) or stamped twice with different values before the file is refused.
-HARMLESS_SHARE = 0.05
-#: Sampling rates outside these bounds mean a wrong time unit: no phone, camera or drone IMU is slower or faster.
-RATE_BOUNDS_HZ = (4.0, 20_000.0)
-#: No unit makes a reading of a working sensor larger; what is larger is no number but damage.
-LARGEST_READING = 1e9
-#: A pause this long within one recording means a broken stamp.
-LONGEST_GAP_NS = 3_600_000_000_000
+
+@dataclass(frozen=True, kw_only=True)
+class SampleLimits:
+    """What is repaired in a recording, and what refuses it.
+
+    Attributes
+    ----------
+    latest_arrival_ns
+        A sample this far behind the newest one before it means that the clock was set back, not that rows changed
+        places.
+    harmless_share
+        Share of samples that may be missing (NaN) or stamped twice with different values.
+    lowest_rate_hz, highest_rate_hz
+        Other sampling rates mean a wrong time unit: no phone, camera or drone IMU is slower or faster.
+    largest_reading
+        No unit makes a reading of a working sensor larger; a larger one is damage.
+    longest_gap_ns
+        A pause this long within one recording means a broken stamp.
+    """
+
+    latest_arrival_ns: int = 500_000_000
+    harmless_share: float = 0.05
+    lowest_rate_hz: float = 4.0
+    highest_rate_hz: float = 20_000.0
+    largest_reading: float = 1e9
+    longest_gap_ns: int = 3_600_000_000_000
+
+
+LIMITS = SampleLimits()
 
 
 class Repair(str):
@@ -120,10 +139,10 @@ def _complete(rows: _Rows) -> _Rows:
     if absent.any():
         text = f"{int(absent.sum())} of {len(absent)} rows hold no {rows.what} sample"
         rows = rows.taken(~absent, text, code="empty-cells")
-    finite = np.asarray((np.abs(rows.values) < LARGEST_READING).all(axis=1))
+    finite = np.asarray((np.abs(rows.values) < LIMITS.largest_reading).all(axis=1))
     if not finite.all():
         missing, first = int((~finite).sum()), int(rows.numbers[np.argmin(finite)])
-        if missing > HARMLESS_SHARE * len(finite):
+        if missing > LIMITS.harmless_share * len(finite):
             lacking = f"{missing} of {len(finite)} {rows.what} rows lack a value (NaN or empty)"
             raise FormatError(rows.path, lacking, line=first if rows.counted == "line" else None)
         text = f"dropped {missing} {rows.what} rows without a value (first: {rows.counted} {first})"
@@ -143,8 +162,8 @@ def _sorted(rows: _Rows) -> _Rows:
             f"{rows.path}: {rows.what} stamps run backwards; is the file written in reverse order?",
             code="stamps-reversed",
         )
-    if late_ns.max() > LATEST_ARRIVAL_NS:
-        first = int(np.argmax(late_ns > LATEST_ARRIVAL_NS))
+    if late_ns.max() > LIMITS.latest_arrival_ns:
+        first = int(np.argmax(late_ns > LIMITS.latest_arrival_ns))
         where = f"{rows.path}, {rows.counted} {rows.numbers[first]}"
         raise TimingError(
             f"{where}: the {rows.what} stamp is {late_ns[first] * 1e-9:.3f} s behind one before it; the clock was set "
@@ -162,7 +181,7 @@ def _merged(rows: _Rows) -> _Rows:
         return rows
     differs = same & (rows.values[1:] != rows.values[:-1]).any(axis=1)
     n_equal, n_different = int((same & ~differs).sum()), int(differs.sum())
-    if n_different > HARMLESS_SHARE * len(rows.t_ns):
+    if n_different > LIMITS.harmless_share * len(rows.t_ns):
         raise TimingError(
             f"{rows.path}, {rows.counted} {rows.numbers[1 + np.argmax(differs)]}: {n_different} of {len(rows.t_ns)} "
             f"{rows.what} samples repeat the stamp before them with other values; the stamps are too coarse, or this "
@@ -205,16 +224,15 @@ def check_rate(path: Path, what: str, t_ns: Int64Array) -> None:
     """
     steps = np.diff(t_ns)
     median_s = float(np.median(steps)) * 1e-9
-    low, high = RATE_BOUNDS_HZ
-    if not 1 / high <= median_s <= 1 / low:
-        direction = "smaller" if median_s > 1 / low else "larger"
+    if not 1 / LIMITS.highest_rate_hz <= median_s <= 1 / LIMITS.lowest_rate_hz:
+        direction = "smaller" if median_s > 1 / LIMITS.lowest_rate_hz else "larger"
         raise TimingError(
             f"{path}: {what} samples lie {median_s:.3g} s apart, which no IMU does; the stamps are probably in a "
             f"{direction} unit: set time_unit in capture.toml",
             code="time-unit",
         )
     longest = int(np.argmax(steps))
-    if steps[longest] > LONGEST_GAP_NS:
+    if steps[longest] > LIMITS.longest_gap_ns:
         raise TimingError(
             f"{path}: the {what} pauses for {steps[longest] * 1e-9:.0f} s after {(t_ns[longest] - t_ns[0]) * 1e-9:.3f} "
             "s; a stamp is damaged, or this is more than one recording",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -32,19 +33,7 @@ def read_tum(path: Path) -> CameraTrajectory:
     TimingError
         For times that do not increase.
     """
-    path = Path(path)
-    table = read_table(path)
-    _require_width(table, "t x y z qx qy qz qw")
-    numbers = _finite(table, [1, 2, 3, 4, 5, 6, 7])
-    t_ns = _increasing(table, table.stamps_ns(0, "s"))
-    world_from_cam = _unit(table, numbers[:, 3:])
-    return CameraTrajectory(
-        names=tuple(map(str, range(len(t_ns)))),
-        t_s=seconds(t_ns, int(t_ns[0])),
-        cam_from_world_xyzw=quat_conjugate(world_from_cam),
-        cam_in_world=numbers[:, :3],
-        epoch_ns=int(t_ns[0]),
-    )
+    return _read_poses(Path(path), "t x y z qx qy qz qw", "s", quat_conjugate)
 
 
 def write_tum(path: Path, trajectory: CameraTrajectory | SmoothedTrajectory) -> None:
@@ -82,23 +71,24 @@ def read_inertial_scale(folder: Path) -> tuple[CameraTrajectory, ImuRecording]:
 
 def read_inertial_scale_poses(folder: Path) -> CameraTrajectory:
     """The ``poses.txt`` of an InertialScale folder alone; see :func:`read_inertial_scale`."""
-    table = read_table(folder / "poses.txt")
-    _require_width(table, "t_ns x y z qw qx qy qz")
-    numbers = _finite(table, [1, 2, 3, 5, 6, 7, 4])
-    t_ns = _increasing(table, table.stamps_ns(0, "ns"))
+    return _read_poses(folder / "poses.txt", "t_ns x y z qw qx qy qz", "ns", np.asarray)
+
+
+def _read_poses(path: Path, layout: str, time_unit: str, cam_from_world: Callable[[Array], Array]) -> CameraTrajectory:
+    """Poses of a table with these columns; ``cam_from_world`` makes rotations of its quaternions."""
+    table = read_table(path)
+    table.require_width(layout)
+    if len(table) < 2:
+        raise FormatError(path, "holds one pose; a trajectory needs at least two")
+    numbers = _finite(table, [layout.split().index(name) for name in ["x", "y", "z", "qx", "qy", "qz", "qw"]])
+    t_ns = _increasing(table, table.stamps_ns(0, time_unit))
     return CameraTrajectory(
         names=tuple(map(str, range(len(t_ns)))),
         t_s=seconds(t_ns, int(t_ns[0])),
-        cam_from_world_xyzw=_unit(table, numbers[:, 3:]),
+        cam_from_world_xyzw=cam_from_world(_unit(table, numbers[:, 3:])),
         cam_in_world=numbers[:, :3],
         epoch_ns=int(t_ns[0]),
     )
-
-
-def _require_width(table: Table, layout: str) -> None:
-    table.require_width(layout)
-    if len(table) < 2:
-        raise FormatError(table.path, "holds one pose; a trajectory needs at least two")
 
 
 def _finite(table: Table, columns: list[int]) -> Array:

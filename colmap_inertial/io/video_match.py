@@ -15,17 +15,36 @@ from colmap_inertial.io.images import grey_8bit, read_image
 from colmap_inertial.io.names import path_in
 from colmap_inertial.io.video import decode_grey
 
-#: Sides of the thumbnails: the small one chooses which frames are compared closely, the large one decides.
-_SMALL, _LARGE = 40, 128
-#: A frame is compared closely with the images for which it is among this many most similar ones so far.
-_CANDIDATES = 8
-#: Correlation below which a small thumbnail is no candidate, and a large one not the same picture.
-_LEAST, _SAME = 0.5, 0.95
-#: How far an image may lie from its frame towards the next best one, as a fraction: the change from frame to frame is
-#: the measure, so that noise of coding, which has nothing of it, does not count.
-_MOST_FRACTION = 0.25
-#: Frames nearer to each other than this are the same but for rounding.
-_ROUNDING = 0.005
+
+@dataclass(frozen=True, kw_only=True)
+class _MatchLimits:
+    """What decides whether a picture is a frame of the video.
+
+    Attributes
+    ----------
+    small_px, large_px
+        Sides of the thumbnails: the small one chooses which frames are compared closely, the large one decides.
+    candidates
+        A frame is compared closely with the images for which it is among this many most similar ones so far.
+    least_correlation, same_correlation
+        Below which a small thumbnail is no candidate, and a large one not the same picture.
+    largest_fraction
+        How far an image may lie from its frame towards the next best one: the change from frame to frame is the
+        measure, so that noise of coding, which has nothing of it, does not count.
+    rounding
+        Frames nearer to each other than this are the same but for rounding.
+    """
+
+    small_px: int = 40
+    large_px: int = 128
+    candidates: int = 8
+    least_correlation: float = 0.5
+    same_correlation: float = 0.95
+    largest_fraction: float = 0.25
+    rounding: float = 0.005
+
+
+_LIMITS = _MatchLimits()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -53,14 +72,14 @@ class _Candidates:
     def __init__(self, images: UInt8Array) -> None:
         self._small = np.array([_normalised(_smaller(image)) for image in images])
         self._large = np.ascontiguousarray(images)
-        self._correlation = np.full((len(images), _CANDIDATES), _LEAST, dtype=np.float32)
+        self._correlation = np.full((len(images), _LIMITS.candidates), _LIMITS.least_correlation, dtype=np.float32)
         self.distance = np.full((len(images), 2), np.inf)
         self._frames = np.zeros((len(images), 2, *images.shape[1:]), dtype=np.uint8)
         self.t_ns = np.zeros((len(images), 2), dtype=np.int64)
 
     def offer(self, t_ns: int, grey: UInt8Array) -> None:
         """Compare a frame with all pictures."""
-        thumbnail = _thumbnail(grey, _LARGE)
+        thumbnail = _thumbnail(grey, _LIMITS.large_px)
         correlation = self._small @ _normalised(_smaller(thumbnail))
         better = np.flatnonzero(correlation > self._correlation.min(axis=1))
         if not len(better):
@@ -81,7 +100,7 @@ class _Candidates:
         if not np.isfinite(second):
             return 0.0
         between = _distance(*(_normalised(frame) for frame in self._frames[i]))
-        if between < _ROUNDING:
+        if between < _LIMITS.rounding:
             return 0.5
         return float(0.5 * (1 - (second**2 - first**2) / between**2))
 
@@ -109,7 +128,8 @@ def match_to_video(
     FormatError
         For a picture or video that cannot be decoded.
     """
-    thumbnails = np.array([_thumbnail(grey_8bit(read_image(path_in(folder, name))), _LARGE) for name in names])
+    images = (grey_8bit(read_image(path_in(folder, name))) for name in names)
+    thumbnails = np.array([_thumbnail(image, _LIMITS.large_px) for image in images])
     turns: dict[int, _Candidates] = {}
     for seen, (t_ns, angle, grey) in enumerate(decode_grey(video), start=1):
         if not turns:
@@ -131,9 +151,9 @@ def _decided(candidates: _Candidates, names: Sequence[str]) -> tuple[dict[str, i
     found: dict[str, int] = {}
     doubtful: dict[str, str] = {}
     for i, name in enumerate(names):
-        if candidates.distance[i, 0] > np.sqrt(1 - _SAME):
+        if candidates.distance[i, 0] > np.sqrt(1 - _LIMITS.same_correlation):
             doubtful[name] = "is no frame of the video"
-        elif candidates.fraction_to_next(i) > _MOST_FRACTION:
+        elif candidates.fraction_to_next(i) > _LIMITS.largest_fraction:
             doubtful[name] = "looks like several frames of the video"
         else:
             found[name] = int(candidates.t_ns[i, 0])
@@ -155,7 +175,8 @@ def _thumbnail(grey: UInt8Array, side: int) -> UInt8Array:
 def _smaller(thumbnail: UInt8Array) -> UInt8Array:
     import cv2
 
-    return np.asarray(cv2.resize(thumbnail, (_SMALL, _SMALL), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    size = _LIMITS.small_px, _LIMITS.small_px
+    return np.asarray(cv2.resize(thumbnail, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
 def _normalised(thumbnail: UInt8Array) -> Float32Array:

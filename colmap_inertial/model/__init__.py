@@ -24,7 +24,7 @@ from colmap_inertial.core.types import (
     SolvedMotion,
     Treatment,
 )
-from colmap_inertial.io.files import StrPath, read_json, write_json
+from colmap_inertial.io.files import StrPath, as_plain, read_json, write_json
 from colmap_inertial.io.names import check_names
 from colmap_inertial.model.binary import check_binary_model
 from colmap_inertial.model.loading import load_pycolmap
@@ -336,13 +336,7 @@ def _pose_covariances(reconstruction: pycolmap.Reconstruction, images: Sequence[
 
 def similarity_as_json(similarity: Similarity) -> dict[str, object]:
     """The similarity's fields in JSON types."""
-    return {
-        "scale": similarity.scale,
-        "rotation_xyzw": similarity.rotation_xyzw.tolist(),
-        "translation_m": similarity.translation_m.tolist(),
-        "cov": similarity.cov.tolist(),
-        "provenance": similarity.provenance,
-    }
+    return dict(as_plain(similarity))
 
 
 def is_metric(folder: Path) -> bool:

@@ -21,7 +21,7 @@ from colmap_inertial.core.types import (
 from colmap_inertial.inertial.core.priors import PRIORS
 from colmap_inertial.inertial.scale._remarks import remarks
 from colmap_inertial.inertial.scale.verdict import verdict_of
-from colmap_inertial.io.plausible import GRAVITY_BOUNDS_M_S2, LARGEST_MEDIAN_RATE_RAD_S
+from colmap_inertial.io.plausible import PLAUSIBLE
 from colmap_inertial.io.units import STANDARD_GRAVITY_M_S2
 from colmap_inertial.motion.align import AlignOptions, align_clocks
 
@@ -85,7 +85,7 @@ def check_units(imu: ImuRecording) -> list[str]:
     """
     out = []
     accel = float(np.median(np.linalg.norm(imu.accel_m_s2, axis=1))) if imu.has_accel else np.nan
-    low, high = GRAVITY_BOUNDS_M_S2
+    low, high = PLAUSIBLE.smallest_gravity_m_s2, PLAUSIBLE.largest_gravity_m_s2
     if imu.has_accel and not low <= accel <= high:
         hint = "gravity was removed: record the raw accelerometer"
         if low <= STANDARD_GRAVITY_M_S2 * accel <= high:
@@ -94,7 +94,7 @@ def check_units(imu: ImuRecording) -> list[str]:
             hint = "it is in mg or raw counts: convert it to m/s2"
         out.append(f"the accelerometer's median length is {accel:.3g} m/s2 instead of about 9.8; {hint}")
     gyro = float(np.median(np.linalg.norm(imu.gyro_rad_s, axis=1)))
-    if gyro > LARGEST_MEDIAN_RATE_RAD_S:
+    if gyro > PLAUSIBLE.largest_median_rate_rad_s:
         out.append(f"the gyroscope's median rate is {gyro:.3g} rad/s; it is in deg/s: multiply it by pi / 180")
     return out
 

@@ -10,7 +10,6 @@ from colmap_inertial.core.options import ReconstructOptions
 from colmap_inertial.core.types import CameraImuCalibration, FrameTiming, ImuRecording
 from colmap_inertial.io.calibration import largest_offset_s
 from colmap_inertial.io.capture import Capture, Video
-from colmap_inertial.io.frames import frame_source
 from colmap_inertial.io.imu_calibration import CalibrationFiles, read_calibrations, read_for_another
 from colmap_inertial.io.names import path_in
 from colmap_inertial.pipeline.run.progress import Progress, silent
@@ -79,7 +78,7 @@ class Recording:
 
     def inputs(self) -> list[object]:
         """What identifies the files that frames are read from."""
-        capture, source = self.capture, frame_source(self.capture)
+        capture, source = self.capture, self.capture.image_folder
         paths = [] if source is None else [path_in(source, name) for name in self.timing.names]
         if isinstance(capture.frames, Video):
             paths = [capture.frames.file]

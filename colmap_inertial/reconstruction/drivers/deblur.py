@@ -12,7 +12,7 @@ from colmap_inertial.core.errors import FormatError, InertialError, OutputError,
 from colmap_inertial.core.options import BlurRemover, ReconstructOptions
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.files import StrPath, read_json, write_json
-from colmap_inertial.io.frames import frame_source, picture_folders, read_frames
+from colmap_inertial.io.frames import picture_folders, read_frames
 from colmap_inertial.io.imu import read_capture_imu
 from colmap_inertial.io.imu_calibration import CalibrationFiles, as_paths
 from colmap_inertial.pipeline.run.context import Recording, RunContext, corrected_imu, prior_calibration
@@ -145,7 +145,7 @@ def deblur_capture(
             {
                 "versions": {"colmap_inertial": __version__},
                 "capture": str(loaded.path),
-                "source": None if (source := frame_source(loaded)) is None else str(source),
+                "source": None if (source := loaded.image_folder) is None else str(source),
                 "imaging": imaging_as_json(plan, rectified),
                 "frames": [frame_as_json(record, plan, rectified) for record in records],
                 "seconds": session.runner.seconds,

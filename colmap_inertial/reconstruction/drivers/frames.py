@@ -10,7 +10,6 @@ from pathlib import Path
 from colmap_inertial.core.options import ReconstructOptions
 from colmap_inertial.core.types import CameraModel, Frame
 from colmap_inertial.imaging.restoration.shipped import checksum
-from colmap_inertial.io.frames import frame_source
 from colmap_inertial.model import read_model
 from colmap_inertial.pipeline.run.context import Recording
 from colmap_inertial.pipeline.run.session import Session
@@ -67,7 +66,7 @@ def run_frames(
     plan: ImagingPlan | None = None,
 ) -> tuple[FrameRecord, ...]:
     """The frames through the stages into the folder ``images``; with a plan, parts of some are kept for the report."""
-    source, workspace = frame_source(recording.capture), session.workspace
+    source, workspace = recording.capture.image_folder, session.workspace
     kept = None if plan is None else CropKeeper.of(plan)
 
     def work(partial: Sequence[Path]) -> None:

@@ -31,7 +31,7 @@ from colmap_inertial.core.types import (
     FrameTiming,
 )
 from colmap_inertial.io.capture import Capture, ImageFolder
-from colmap_inertial.io.frames import frame_source, read_frames
+from colmap_inertial.io.frames import read_frames
 from colmap_inertial.io.images import read_image
 from colmap_inertial.io.names import path_in
 from colmap_inertial.model import colmap_camera, find_models, read_model, trajectory_from_model
@@ -306,7 +306,7 @@ def _image_folder(
     capture: Capture, timing: FrameTiming, names: Sequence[str], work: Path, stages: Sequence[FrameStage] = ()
 ) -> Path:
     """Where some frames are as pictures: with the capture, or written to a folder of work."""
-    images = frame_source(capture)
+    images = capture.image_folder
     if images is not None and not stages:
         return images
     images = work / "images"

@@ -21,7 +21,6 @@ from colmap_inertial.imaging.gate import (
 from colmap_inertial.imaging.parallax import Parallax
 from colmap_inertial.imaging.psf import predicted_blur_px
 from colmap_inertial.io.capture import Capture
-from colmap_inertial.io.frames import frame_source
 from colmap_inertial.io.image_metadata import stated_exposures_s
 from colmap_inertial.io.names import path_in
 from colmap_inertial.model import colmap_camera
@@ -59,7 +58,7 @@ _JUDGED_FRAMES = 14
 
 def with_stated_exposures(capture: Capture, timing: FrameTiming) -> FrameTiming:
     """The timing with exposure times from the pictures' EXIF, where nothing else gives them."""
-    source = frame_source(capture)
+    source = capture.image_folder
     if timing.exposure_s is not None or source is None:
         return timing
     stated = stated_exposures_s([path_in(source, name) for name in timing.names])
