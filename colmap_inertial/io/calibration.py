@@ -22,38 +22,33 @@ T = TypeVar("T", bound="DataclassInstance")
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrationSigmas:
-    """Standard deviations of a calibration before anything is estimated: of what nobody knows, and of what is stated.
+    """Standard deviations of a calibration before an estimate: of what nobody knows, and of what is stated."""
 
-    Attributes
-    ----------
-    unknown_rotation_rad, unknown_offset_s, unknown_gyro_bias_rad_s
-        A rotation may be any, and the origins of clocks are arbitrary.
-    unknown_lever_arm_m
-        Along each axis: a phone is flat, an action camera or a rig is not.
-    unknown_readout_s
-        Where no readout is declared.
-    shared_clock_offset_s
-        Camera and IMU on one clock differ by pipeline delays at most.
-    accel_minus_gyro_offset_s
-        Within one device the delays of the two sensors differ by filters; -8 to -13 ms on a tablet.
-    known_rotation_rad, known_lever_arm_m, known_offset_s, known_gyro_bias_rad_s
-        What was stated without a standard deviation.
-    known_readout_share, smallest_readout_s
-        A readout that was stated, as a share of it, and at least.
-    """
-
+    #: Any rotation.
     unknown_rotation_rad: float = np.pi
+    #: The origins of clocks are arbitrary.
     unknown_offset_s: float = 1e4
+    #: Of a gyroscope that nothing was said about.
     unknown_gyro_bias_rad_s: float = 0.1
+    #: Along each axis: a phone is flat, an action camera or a rig is not.
     unknown_lever_arm_m: float = 0.08
+    #: Where no readout is declared.
     unknown_readout_s: float = 0.02
+    #: Camera and IMU on one clock differ by pipeline delays at most.
     shared_clock_offset_s: float = 1.0
+    #: Within one device the delays of the two sensors differ by filters; -8 to -13 ms on a tablet.
     accel_minus_gyro_offset_s: float = 0.02
+    #: What was stated without a standard deviation.
     known_rotation_rad: float = 0.01
+    #: What was stated without a standard deviation.
     known_lever_arm_m: float = 0.005
+    #: What was stated without a standard deviation.
     known_offset_s: float = 0.002
+    #: What was stated without a standard deviation.
     known_gyro_bias_rad_s: float = 0.002
+    #: A readout that was stated, as a share of it, and at least.
     known_readout_share: float = 0.02
+    #: A readout that was stated, as a share of it, and at least.
     smallest_readout_s: float = 1e-4
 
 

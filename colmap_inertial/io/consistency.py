@@ -27,27 +27,25 @@ class ConsistencyLimits:
     On 8 handheld recordings, each with 47 wrong readings of its axes, 366 of 376 are named with the right one and none
     with a wrong one; the best other reading of the 8 clean recordings and of a drone has 0.02 in place of
     ``clear_advantage``.
-
-    Attributes
-    ----------
-    window_s, step_s, mean_s
-        Windows, the steps in which the gyroscope is integrated, and the means that are compared in a window.
-    fewest_windows, most_windows
-        Enough to decide; few enough to keep hours of recording cheap.
-    floor_m2_s4
-        Added to variances: below this, differences are sensor errors.
-    clear_advantage, clear_standard_errors
-        How much better another reading must be, as mean logarithm of the ratio of variances and in standard errors:
-        than the file's own, and than no rotation at all.
     """
 
+    #: Windows, the steps in which the gyroscope is integrated, and the means that are compared in a window.
     window_s: float = 4.0
+    #: Windows, the steps in which the gyroscope is integrated, and the means that are compared in a window.
     step_s: float = 0.1
+    #: Windows, the steps in which the gyroscope is integrated, and the means that are compared in a window.
     mean_s: float = 1.0
+    #: Enough to decide; few enough to keep hours of recording cheap.
     fewest_windows: int = 6
+    #: Enough to decide; few enough to keep hours of recording cheap.
     most_windows: int = 100
+    #: Added to variances: below this, differences are sensor errors.
     floor_m2_s4: float = 0.02
+    #: How much better another reading must be, as mean logarithm of the ratio of variances and in standard errors: than
+    #: the file's own, and than no rotation at all.
     clear_advantage: float = 0.5
+    #: How much better another reading must be, as mean logarithm of the ratio of variances and in standard errors: than
+    #: the file's own, and than no rotation at all.
     clear_standard_errors: float = 3.0
 
 

@@ -48,25 +48,19 @@ _USUAL_ORDER = "YxZ"
 
 @dataclass(frozen=True, kw_only=True)
 class _GoproLimits:
-    """What is believed of a GoPro's telemetry.
+    """What is believed of a GoPro's telemetry."""
 
-    Attributes
-    ----------
-    undiluted_sigma_m, largest_dilution
-        Standard deviation of a position where the dilution of precision is 1; beyond the largest one, a position says
-        nothing.
-    hottest_c
-        No sensor works at more, nor below its opposite.
-    rotated_rad
-        An image that is rotated by more than this against the camera was stabilised.
-    missing_frames
-        Samples of the last payload may be missing for so many frames at the end; they take the last one's.
-    """
-
+    #: Standard deviation of a position where the dilution of precision is 1; beyond the largest one, a position says
+    #: nothing.
     undiluted_sigma_m: float = 1.5
+    #: Standard deviation of a position where the dilution of precision is 1; beyond the largest one, a position says
+    #: nothing.
     largest_dilution: float = 10.0
+    #: No sensor works at more, nor below its opposite.
     hottest_c: float = 150.0
+    #: An image that is rotated by more than this against the camera was stabilised.
     rotated_rad: float = 0.005
+    #: Samples of the last payload may be missing for so many frames at the end; they take the last one's.
     missing_frames: float = 2.5
 
 

@@ -18,26 +18,19 @@ from colmap_inertial.io.units import SENSOR_NAMES, STANDARD_GRAVITY_M_S2, Axes, 
 
 @dataclass(frozen=True, kw_only=True)
 class PlausibleReadings:
-    """Bounds that readings of a working IMU in SI units keep.
+    """Bounds that readings of a working IMU in SI units keep."""
 
-    Attributes
-    ----------
-    smallest_gravity_m_s2, largest_gravity_m_s2
-        The median of |accelerometer| of a device that is carried or flown stays near gravity: sensors are off by up to
-        5 %, and shaking raises it. Measured on the recordings this was tried on: 9.36 to 9.81, and 10.4 in strong
-        shaking.
-    steady_share
-        The 5th percentile of |accelerometer| over its median: above 0.75 with gravity, below 0.45 without.
-    largest_rate_rad_s
-        No gyroscope in phones, cameras or drones measures more than 4000 deg/s on an axis.
-    largest_median_rate_rad_s
-        Half of a recording faster than a turn in 0.9 s: nobody films like that, but deg/s read as rad/s look like it.
-    """
-
+    #: The median of |accelerometer| of a device that is carried or flown stays near gravity: sensors are off by up to 5
+    #: %, and shaking raises it. Measured on the recordings this was tried on: 9.36 to 9.81, and 10.4 in strong shaking.
     smallest_gravity_m_s2: float = 7.0
+    #: The median of |accelerometer| of a device that is carried or flown stays near gravity: sensors are off by up to 5
+    #: %, and shaking raises it. Measured on the recordings this was tried on: 9.36 to 9.81, and 10.4 in strong shaking.
     largest_gravity_m_s2: float = 14.0
+    #: The 5th percentile of |accelerometer| over its median: above 0.75 with gravity, below 0.45 without.
     steady_share: float = 0.6
+    #: No gyroscope in phones, cameras or drones measures more than 4000 deg/s on an axis.
     largest_rate_rad_s: float = 70.0
+    #: Half of a recording faster than a turn in 0.9 s: nobody films like that, but deg/s read as rad/s look like it.
     largest_median_rate_rad_s: float = 7.0
 
 

@@ -15,28 +15,20 @@ from colmap_inertial.io.units import SENSOR_NAMES, Quantity, to_si
 
 @dataclass(frozen=True, kw_only=True)
 class SampleLimits:
-    """What is repaired in a recording, and what refuses it.
+    """What is repaired in a recording, and what refuses it."""
 
-    Attributes
-    ----------
-    latest_arrival_ns
-        A sample this far behind the newest one before it means that the clock was set back, not that rows changed
-        places.
-    harmless_share
-        Share of samples that may be missing (NaN) or stamped twice with different values.
-    lowest_rate_hz, highest_rate_hz
-        Other sampling rates mean a wrong time unit: no phone, camera or drone IMU is slower or faster.
-    largest_reading
-        No unit makes a reading of a working sensor larger; a larger one is damage.
-    longest_gap_ns
-        A pause this long within one recording means a broken stamp.
-    """
-
+    #: A sample this far behind the newest one before it means that the clock was set back, not that rows changed
+    #: places.
     latest_arrival_ns: int = 500_000_000
+    #: Share of samples that may be missing (NaN) or stamped twice with different values.
     harmless_share: float = 0.05
+    #: Other sampling rates mean a wrong time unit: no phone, camera or drone IMU is slower or faster.
     lowest_rate_hz: float = 4.0
+    #: Other sampling rates mean a wrong time unit: no phone, camera or drone IMU is slower or faster.
     highest_rate_hz: float = 20_000.0
+    #: No unit makes a reading of a working sensor larger; a larger one is damage.
     largest_reading: float = 1e9
+    #: A pause this long within one recording means a broken stamp.
     longest_gap_ns: int = 3_600_000_000_000
 
 

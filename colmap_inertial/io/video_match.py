@@ -18,29 +18,22 @@ from colmap_inertial.io.video import decode_grey
 
 @dataclass(frozen=True, kw_only=True)
 class _MatchLimits:
-    """What decides whether a picture is a frame of the video.
+    """What decides whether a picture is a frame of the video."""
 
-    Attributes
-    ----------
-    small_px, large_px
-        Sides of the thumbnails: the small one chooses which frames are compared closely, the large one decides.
-    candidates
-        A frame is compared closely with the images for which it is among this many most similar ones so far.
-    least_correlation, same_correlation
-        Below which a small thumbnail is no candidate, and a large one not the same picture.
-    largest_fraction
-        How far an image may lie from its frame towards the next best one: the change from frame to frame is the
-        measure, so that noise of coding, which has nothing of it, does not count.
-    rounding
-        Frames nearer to each other than this are the same but for rounding.
-    """
-
+    #: Sides of the thumbnails: the small one chooses which frames are compared closely, the large one decides.
     small_px: int = 40
+    #: Sides of the thumbnails: the small one chooses which frames are compared closely, the large one decides.
     large_px: int = 128
+    #: A frame is compared closely with the images for which it is among this many most similar ones so far.
     candidates: int = 8
+    #: Below which a small thumbnail is no candidate, and a large one not the same picture.
     least_correlation: float = 0.5
+    #: Below which a small thumbnail is no candidate, and a large one not the same picture.
     same_correlation: float = 0.95
+    #: How far an image may lie from its frame towards the next best one: the change from frame to frame is the measure,
+    #: so that noise of coding, which has nothing of it, does not count.
     largest_fraction: float = 0.25
+    #: Frames nearer to each other than this are the same but for rounding.
     rounding: float = 0.005
 
 
