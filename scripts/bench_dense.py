@@ -31,6 +31,7 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+from bench_report import write_report
 from scipy.spatial import cKDTree
 
 from colmap_inertial.core.arrays import Array, Int64Array
@@ -323,8 +324,7 @@ def main() -> None:
         else:
             found[scene] = measure(scene, arguments.folder)
         print(scene, json.dumps(found[scene], indent=1), flush=True)
-    if arguments.json:
-        arguments.json.write_text(json.dumps(found, indent=1) + "\n")
+    write_report(arguments.json, found)
 
 
 if __name__ == "__main__":

@@ -16,12 +16,12 @@ and ``sharp``).
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from bench_report import write_report
 from restoration.photographs import photographs
 from rich.console import Console
 from rich.progress import track
@@ -67,8 +67,7 @@ def main() -> None:
         report["triplets"] = {"summary": _summary(rows), "pairs": rows}
     for name, found in report.items():
         _print(name, found)
-    if args.json:
-        args.json.write_text(json.dumps(report, indent=2) + "\n")
+    write_report(args.json, report)
 
 
 def _row(pair: Pair, i: int, network: Network) -> dict[str, Any]:

@@ -22,13 +22,10 @@ from __future__ import annotations
 
 import argparse
 import json
-import platform
-import subprocess
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -39,6 +36,7 @@ import imaging_cost
 import imaging_metrics as metrics
 import imaging_shutter
 import numpy as np
+from bench_report import describe_run
 from gated_deblur import deblur_gated
 from imaging_metrics import Features, correct_matches, extract, psnr_db, repeatability, ssim
 from imaging_scenes import Pair, drawn_walls, make_pairs, native_walls, photographed_walls, photographs
@@ -131,25 +129,14 @@ def main() -> None:
 
 def about(args: argparse.Namespace) -> dict[str, Any]:
     """Machine, versions, commit, and what was asked for."""
-    here = Path(__file__).parent
-    commit = subprocess.run(["git", "-C", here, "describe", "--always", "--dirty"], capture_output=True, text=True)
-    names = [line.split(":")[1].strip() for line in _cpu_lines() if line.startswith("model name")]
     return {
-        "cpu": names[0] if names else platform.processor() or platform.machine(),
-        "python": platform.python_version(),
-        **{name: version(name) for name in ("colmap-inertial", "pycolmap", "numpy", "opencv-contrib-python-headless")},
-        "commit": commit.stdout.strip(),
+        **describe_run(),
         "scenes": args.scenes,
         "seed": args.seed,
         "first_octave": args.first_octave,
         "photos": args.photos is not None,
         "quick": args.quick,
     }
-
-
-def _cpu_lines() -> list[str]:
-    path = Path("/proc/cpuinfo")
-    return path.read_text().splitlines() if path.exists() else []
 
 
 def flat(pairs: Sequence[Sequence[T]]) -> list[T]:

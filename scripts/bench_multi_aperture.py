@@ -30,7 +30,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import platform
 import shutil
 import tempfile
 import time
@@ -54,6 +53,7 @@ from aperture_baselines import (
     read_pfm,
     warp_view,
 )
+from bench_report import write_report
 
 from colmap_inertial.core.arrays import AnyArray, Array, BoolArray, Float32Array, UInt8Array
 from colmap_inertial.core.options import ApertureOptions, FuseAperturesOptions
@@ -456,7 +456,7 @@ def main() -> None:
     parser.add_argument("--work", type=Path, help="keeps the simulated capture for the next run")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
-    out: dict[str, Any] = {"machine": platform.processor() or platform.machine(), "cores": len(os.sched_getaffinity(0))}
+    out: dict[str, Any] = {}
     antinous = arguments.data / "antinous"
     cones = next(
         (f for f in (arguments.data / "cones", arguments.data / "middlebury_2003" / "cones") if f.is_dir()), None
@@ -480,8 +480,7 @@ def main() -> None:
     if "cost" in arguments.only:
         out["cost"] = bench_cost()
         show("cost", out["cost"])
-    if arguments.json:
-        arguments.json.write_text(json.dumps(out, indent=1) + "\n")
+    write_report(arguments.json, out)
 
 
 if __name__ == "__main__":

@@ -21,19 +21,16 @@ from __future__ import annotations
 import argparse
 import functools
 import itertools
-import json
 import multiprocessing
 import os
-import platform
-import subprocess
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from bench_report import describe_run, write_report
 from linear_scale import estimate_linear
 from rich.console import Console
 from rich.progress import track
@@ -303,31 +300,6 @@ def draw(outcomes: Sequence[Outcome], path: Path) -> None:
     plt.close(figure)
 
 
-def circumstances() -> dict[str, Any]:
-    """Machine, versions, commit."""
-    here = Path(__file__).parent
-
-    def git(*arguments: str) -> str:
-        done = subprocess.run(["git", *arguments], cwd=here, capture_output=True, text=True, check=False)
-        return done.stdout.strip() if done.returncode == 0 else ""
-
-    cpu = [line.partition(":")[2].strip() for line in _lines(Path("/proc/cpuinfo")) if line.startswith("model name")]
-    return {
-        "machine": {"system": platform.platform(), "processor": (cpu or [platform.processor()])[0]},
-        "cores": os.cpu_count(),
-        "versions": {
-            "python": platform.python_version(),
-            **{name: version(name) for name in ("colmap-inertial", "numpy", "scipy")},
-        },
-        "commit": git("rev-parse", "HEAD"),
-        "modified": bool(git("status", "--porcelain", "--", "../colmap_inertial", ".")),
-    }
-
-
-def _lines(path: Path) -> list[str]:
-    return path.read_text().splitlines() if path.is_file() else []
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
@@ -342,7 +314,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     args = parser.parse_args(arguments)
 
     folders = recordings_in(args.folder)
-    result = circumstances()
+    result = describe_run()
     if args.sensitivity:
         from scale_sensitivity import study
 
@@ -364,8 +336,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if args.figure:
             draw(of_first, args.figure)
         result["outcomes"] = [asdict(outcome) for outcome in outcomes]
-    if args.json:
-        args.json.write_text(json.dumps(result, indent=1) + "\n")
+    write_report(args.json, result)
 
 
 if __name__ == "__main__":

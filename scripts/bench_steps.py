@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import json
 import os
 import shutil
 import subprocess
@@ -29,6 +28,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from bench_report import write_report
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.io.capture import load_capture
@@ -206,7 +206,7 @@ def main() -> None:
     if args.json:
         figures = {"steps": found, "all": total, "matching": matching, "chosen_by_model": by_model}
         figures["covariance_ms_an_image"] = each_ms
-        args.json.write_text(json.dumps(figures, indent=1) + "\n")
+        write_report(args.json, figures)
 
 
 if __name__ == "__main__":

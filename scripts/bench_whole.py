@@ -42,6 +42,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import yaml
+from bench_report import write_report
 from check_euroc import similarity
 from walk_features import write_features
 from walk_scenes import Scene, Walk, places_m, world_of, write_walk
@@ -467,8 +468,7 @@ def main() -> None:
         folder = args.folder / f"long{frames}"
         found[folder.name] = long_walk(frames, folder, args.mappers)
         print(json.dumps({folder.name: found[folder.name]}, indent=1), flush=True)
-    if args.json:
-        args.json.write_text(json.dumps(found, indent=1) + "\n")
+    write_report(args.json, found)
 
 
 if __name__ == "__main__":

@@ -16,8 +16,7 @@ KEPT_WANTED, TREATED_WANTED = 0.98, 0.9
 
 def print_report(report: dict[str, Any], console: Console) -> None:
     """Print every section."""
-    about = report["about"]
-    console.print(", ".join(f"{key} {value}" for key, value in about.items()), style="dim", highlight=False)
+    print_about(report["about"], console)
     for kind, by_blur in report.get("quality", {}).items():
         _quality(kind, by_blur, console)
     for kind, by_blur in report.get("treated", {}).items():
@@ -32,6 +31,14 @@ def print_report(report: dict[str, Any], console: Console) -> None:
     for name, section in sections.items():
         if name in report:
             section(report[name], console)
+
+
+def print_about(about: dict[str, Any], console: Console) -> None:
+    """Print the machine, versions and options of a run on one line."""
+    flat = {
+        k: v for key, value in about.items() for k, v in (value if isinstance(value, dict) else {key: value}).items()
+    }
+    console.print(", ".join(f"{key} {value}" for key, value in flat.items()), style="dim", highlight=False)
 
 
 def verdict(value: float, wanted: float, *, least: bool = True) -> str:

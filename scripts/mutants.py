@@ -9,6 +9,7 @@ caught where a test fails that passes without it. Printed: what became of each, 
 code 1 below 95 %.
 
 All of them take half an hour or more on one processor; a room or a sample takes minutes.
+``random_mutants.py`` draws faults at random instead.
 """
 
 from __future__ import annotations

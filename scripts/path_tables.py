@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from imaging_tables import table_of
+from imaging_tables import print_about, table_of
 from rich.console import Console
 
 #: Least ratio of summed matches at first octave 0 by bin, and least PSNR gained, dB: gyroscope exact; with errors.
@@ -25,23 +25,21 @@ TIMES = {"wiener": {"10": 6.0, "20": 6.0, "40": 6.0}, "path": {"10": 14.0, "20":
 
 def print_report(report: dict[str, Any], console: Console) -> None:
     """Print every section."""
-    console.print(", ".join(f"{key} {value}" for key, value in report["about"].items()), style="dim", highlight=False)
+    print_about(report["about"], console)
     for name, beyond in report.get("pairs_beyond", {}).items():
         console.print(f"{name}: left out {beyond['more']} pairs with more blur, {beyond['less']} with less")
-    if report.get("quality"):
-        _quality(report["quality"], console)
-    if "gate" in report:
-        _gate(report["gate"], console)
-    if "sky" in report:
-        _sky(report["sky"], console)
-    if "false" in report:
-        _false(report["false"], console)
-    if "short" in report:
-        _short(report["short"], console)
-    if "cost" in report:
-        _cost(report["cost"], console)
-    if "colmap" in report:
-        _colmap(report["colmap"], console)
+    sections = {
+        "quality": _quality,
+        "gate": _gate,
+        "sky": _sky,
+        "false": _false,
+        "short": _short,
+        "cost": _cost,
+        "colmap": _colmap,
+    }
+    for name, section in sections.items():
+        if report.get(name):
+            section(report[name], console)
 
 
 def _verdict(value: float, wanted: float | None, text: str, *, least: bool = True) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from imaging_tables import reconstructions, table_of, verdict
+from imaging_tables import print_about, reconstructions, table_of, verdict
 from restoration_exposures import BASELINES
 from rich.console import Console
 
@@ -16,8 +16,7 @@ SECONDS_WANTED = 1.5
 
 def print_report(report: dict[str, Any], console: Console) -> None:
     """Print every section."""
-    about = report["about"]
-    console.print(", ".join(f"{key} {value}" for key, value in about.items()), style="dim", highlight=False)
+    print_about(report["about"], console)
     for kind, by_blur in report.get("deepgyro", {}).items():
         for blur, row in by_blur.items():
             _deepgyro(kind, blur, row, console)

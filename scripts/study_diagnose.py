@@ -11,7 +11,6 @@ error. Exit code 1 where more than one in thirty is missed, or any clean recordi
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import tempfile
 from collections.abc import Callable
@@ -19,6 +18,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from bench_report import write_report
 from real_imu import read
 
 from colmap_inertial.checks.diagnose import Diagnosis, Recorded, diagnose
@@ -449,7 +449,7 @@ def main(arguments: list[str] | None = None) -> int:
     count = sum(bool(row["named"]) for row in rows)
     print(f"{count} of {len(rows)} faults named; {len(accused)} of {len(clean)} clean recordings accused")
     if options.json is not None:
-        options.json.write_text(json.dumps({"faults": rows, "accused": accused}, indent=1))
+        write_report(options.json, {"faults": rows, "accused": accused})
     return int(count < len(rows) - len(rows) // 30 or bool(accused))
 
 

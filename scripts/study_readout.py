@@ -11,12 +11,12 @@ milliseconds and in the standard deviations that were stated.
 from __future__ import annotations
 
 import argparse
-import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import get_args
 
 import numpy as np
+from bench_report import write_report
 
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import NotObservableError
@@ -151,7 +151,7 @@ def main() -> None:
                 print(f"{np.sqrt(np.mean(z**2)):>6.1f} {np.abs(z).max():>8.1f}", end="", flush=True)
             print()
     if asked.json is not None:
-        asked.json.write_text(json.dumps(rows, indent=1) + "\n")
+        write_report(asked.json, {"rows": rows})
 
 
 if __name__ == "__main__":

@@ -29,18 +29,16 @@ import argparse
 import json
 import multiprocessing
 import os
-import platform
 import re
-import subprocess
 import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
+from bench_report import describe_run, write_report
 from scale_bound import BoundPriors, bound_of
 from scale_faults import FAULTS
 
@@ -321,24 +319,6 @@ def show(runs: Sequence[Run]) -> None:
                 console.print(f"  seed {r.seed}: {r.verdict}, {off}; {' | '.join(r.reasons)}", markup=False)
 
 
-def surroundings() -> dict[str, object]:
-    """Machine, versions and commit."""
-    here = Path(__file__).resolve().parent
-
-    def git(*arguments: str) -> str:
-        return subprocess.run(["git", *arguments], cwd=here, capture_output=True, text=True, check=False).stdout.strip()
-
-    return {
-        "machine": {"system": platform.platform(), "processor": platform.machine(), "cores": os.cpu_count()},
-        "versions": {
-            "python": platform.python_version(),
-            **{name: version(name) for name in ("colmap-inertial", "numpy", "scipy")},
-        },
-        "commit": git("rev-parse", "HEAD"),
-        "changed": bool(git("status", "--porcelain", "--", "../colmap_inertial", ".")),
-    }
-
-
 def study(todo: Sequence[int], processes: int) -> list[Run]:
     """Run all seeds, with a progress bar on the error stream."""
     from rich.console import Console
@@ -369,13 +349,13 @@ def main() -> None:
         print(json.dumps(asdict(run(arguments.only)), indent=2))
         return
     counts = (arguments.runs, arguments.runs // 5, arguments.stressed, arguments.unobservable, arguments.faulty)
-    begun_in = surroundings()
+    begun_in = describe_run()
     runs = study(seeds(arguments.seed, counts), arguments.processes)
     show(runs)
     if arguments.json:
         figures = {name: summary(members) for name, members in groups(runs).items()}
         content = {**begun_in, "summary": figures, "runs": [asdict(r) for r in runs]}
-        arguments.json.write_text(json.dumps(content, indent=1).replace("NaN", "null") + "\n")
+        write_report(arguments.json, content)
 
 
 if __name__ == "__main__":

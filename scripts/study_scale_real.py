@@ -14,7 +14,6 @@ the accelerometer calibrated by the motion capture of the others (``capture_gain
 from __future__ import annotations
 
 import argparse
-import json
 import multiprocessing
 import os
 from collections.abc import Sequence
@@ -22,6 +21,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+from bench_report import write_report
 from capture_gains import calibration_by
 from real_imu import HANDHELD, RECORDINGS, Window, recorded, windows
 
@@ -132,7 +132,7 @@ def main() -> None:
             f"{s['trusted']:9d}{s['right']:7.0f}{s['z_rms']:7.2f}{s['half_width']:6.1f}{s['refused']:9d}"
         )
     if args.json:
-        args.json.write_text(json.dumps([asdict(outcome) for outcome in outcomes], indent=1) + "\n")
+        write_report(args.json, {"outcomes": [asdict(outcome) for outcome in outcomes]})
 
 
 if __name__ == "__main__":

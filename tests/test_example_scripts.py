@@ -1,6 +1,7 @@
 """The worked scripts, run as their readers would run them."""
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -61,3 +62,24 @@ def test_a_batch_over_a_folder(config, tmp_path):
     assert "yard: failed" in said
     assert "accel.csv" in said
     assert "hall model 0" in said
+
+
+# --- all scripts -----------------------------------------------------------------------------------------------------
+
+#: Where a script that is of use to somebody is named.
+PLACES = ("README.md", "CONTRIBUTING.md", "SECURITY.md", "docs/**/*.md", ".github/**/*.yml", "scripts/*", "tests/*.py")
+
+
+def test_every_script_is_named_by_a_page_a_test_or_another_script():
+    texts = {path: path.read_text() for place in PLACES for path in SCRIPTS.parent.glob(place) if path.is_file()}
+    for script in SCRIPTS.glob("*.py"):
+        name = re.compile(rf"\b{script.stem}\.py|(import|from) {script.stem}\b|\"{script.stem}\"")
+        assert any(name.search(text) for path, text in texts.items() if path != script), script.name
+
+
+def test_every_script_can_be_imported():
+    names = sorted(path.stem for path in SCRIPTS.glob("*.py"))
+    names.remove("train_restoration")  # needs torch
+    code = f"import importlib, sys; sys.argv = ['script']; [importlib.import_module(name) for name in {names}]"
+    done = subprocess.run([sys.executable, "-c", code], cwd=SCRIPTS, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
