@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from imaging_tables import print_about, table_of
@@ -104,54 +105,52 @@ def _gate(found: dict[str, Any], console: Console) -> None:
     console.print(table)
 
 
-def _sky(rows: list[dict[str, Any]], console: Console) -> None:
-    table = table_of("Mostly sky", "gyroscope", "blur px", "sky", "trusted", "sigmas", "treated")
+def _print_rows(
+    title: str, rows: list[dict[str, Any]], columns: dict[str, Callable[[dict[str, Any]], str]], console: Console
+) -> None:
+    """A table of rows, beginning with the gyroscope and the blur."""
+    table = table_of(title, "gyroscope", "blur px", *columns)
     for row in rows:
-        share = row["treated"] / row["frames"]
-        right = row["gyroscope"] == "right"
-        table.add_row(
-            row["gyroscope"],
-            f"{row['blur_px']:g}",
-            f"{row['sky']:.0%}",
-            str(row["trusted"]),
-            f"{row['support']:.1f}",
-            _verdict(share, TREATED if right else None, f"{row['treated']}/{row['frames']}"),
-        )
+        table.add_row(row["gyroscope"], f"{row['blur_px']:g}", *(cell(row) for cell in columns.values()))
     console.print(table)
+
+
+def _treated_share(row: dict[str, Any]) -> str:
+    return f"{row['treated']}/{row['frames']}"
+
+
+def _sky(rows: list[dict[str, Any]], console: Console) -> None:
+    def treated(row: dict[str, Any]) -> str:
+        wanted = TREATED if row["gyroscope"] == "right" else None
+        return _verdict(row["treated"] / row["frames"], wanted, _treated_share(row))
+
+    columns: dict[str, Callable[[dict[str, Any]], str]] = {
+        "sky": lambda row: f"{row['sky']:.0%}",
+        "trusted": lambda row: str(row["trusted"]),
+        "sigmas": lambda row: f"{row['support']:.1f}",
+        "treated": treated,
+    }
+    _print_rows("Mostly sky", rows, columns, console)
 
 
 def _false(rows: list[dict[str, Any]], console: Console) -> None:
-    table = table_of(
-        "Wrong gyroscopes: correct matches against doing nothing",
-        *("gyroscope", "blur px", "method", "trusted", "kept", "treated"),
-    )
-    for row in rows:
-        table.add_row(
-            row["gyroscope"],
-            f"{row['blur_px']:g}",
-            row["method"],
-            str(row["trusted"]),
-            _verdict(row["kept"], KEPT, f"{row['kept']:.3f}"),
-            f"{row['treated']}/{row['frames']}",
-        )
-    console.print(table)
+    columns: dict[str, Callable[[dict[str, Any]], str]] = {
+        "method": lambda row: row["method"],
+        "trusted": lambda row: str(row["trusted"]),
+        "kept": lambda row: _verdict(row["kept"], KEPT, f"{row['kept']:.3f}"),
+        "treated": _treated_share,
+    }
+    _print_rows("Wrong gyroscopes: correct matches against doing nothing", rows, columns, console)
 
 
 def _short(rows: list[dict[str, Any]], console: Console) -> None:
-    table = table_of(
-        "Little blur in pictures of 640 px, treated against untreated",
-        *("gyroscope", "blur px", "method", "untreated matches", "times", "PSNR gained dB"),
-    )
-    for row in rows:
-        table.add_row(
-            row["gyroscope"],
-            f"{row['blur_px']:g}",
-            row["method"],
-            str(row["untreated"]),
-            f"{row['ratio']:.3f}",
-            f"{row['gained_db']:+.2f}",
-        )
-    console.print(table)
+    columns: dict[str, Callable[[dict[str, Any]], str]] = {
+        "method": lambda row: row["method"],
+        "untreated matches": lambda row: str(row["untreated"]),
+        "times": lambda row: f"{row['ratio']:.3f}",
+        "PSNR gained dB": lambda row: f"{row['gained_db']:+.2f}",
+    }
+    _print_rows("Little blur in pictures of 640 px, treated against untreated", rows, columns, console)
 
 
 def _cost(found: dict[str, Any], console: Console) -> None:

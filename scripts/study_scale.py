@@ -39,6 +39,8 @@ from pathlib import Path
 
 import numpy as np
 from bench_report import describe_run, write_report
+from rich.console import Console
+from rich.table import Table
 from scale_bound import BoundPriors, bound_of
 from scale_faults import FAULTS
 
@@ -268,9 +270,6 @@ def wording(reason: str) -> str:
 
 def show(runs: Sequence[Run]) -> None:
     """Tables and findings on the terminal."""
-    from rich.console import Console
-    from rich.table import Table
-
     # Not cut where the output goes to a file
     console = Console(width=None if sys.stdout.isatty() else 170)
     columns: dict[str, Callable[[dict[str, float]], str]] = {
@@ -295,6 +294,12 @@ def show(runs: Sequence[Run]) -> None:
         label = "  " + name.split(" ")[1] if " " in name else name
         table.add_row(label, *(text(figures) for text in columns.values()), style="bold" if label == name else None)
     console.print(table)
+    _print_observable(runs, console)
+    _print_unobservable([r for r in runs if r.part == "unobservable"], console)
+
+
+def _print_observable(runs: Sequence[Run], console: Console) -> None:
+    """Why runs were not trusted, and which intervals miss the truth."""
     for part in OBSERVABLE:
         odd = [r for r in runs if r.part == part and (r.verdict != "trusted" or not r.inside)]
         counts = Counter(wording(reason) for r in odd for reason in r.reasons)
@@ -307,7 +312,10 @@ def show(runs: Sequence[Run]) -> None:
     if stressed:
         share = 100 * summary(stressed)["inside_or_not_trusted"]
         console.print(f"stressed: {share:.1f} % inside the interval or not trusted (target: at least 90 %)")
-    futile = [r for r in runs if r.part == "unobservable"]
+
+
+def _print_unobservable(futile: Sequence[Run], console: Console) -> None:
+    """How many were refused, and what was said of the others."""
     for kind in FUTILE:
         of_kind = [r for r in futile if r.kind == kind]
         if of_kind:

@@ -172,12 +172,14 @@ def find_earlier_end(task: CaptureTask) -> CaptureStatus | None:
         if result.get("waiting"):
             return None
         made_from = Path(str(read_json(workspace.stamps / "capture.json").get("capture")))
-        other = None if made_from == task.capture or task.capture in made_from.parents else "capture"
         project = result.get("project", _plain(ProjectOptions()))
-        if read_config(workspace.config, ReconstructOptions) != job.options or project != _plain(job.project):
-            other = other or "set of options"
-        if read_stage_names(workspace) != job.stages:
-            other = other or "set of stages"
+        options = read_config(workspace.config, ReconstructOptions)
+        differs = {
+            "capture": made_from != task.capture and task.capture not in made_from.parents,
+            "set of options": options != job.options or project != _plain(job.project),
+            "set of stages": read_stage_names(workspace) != job.stages,
+        }
+        other = next((name for name, differ in differs.items() if differ), None)
         if other is not None:
             text = f"{task.out} holds the result of another {other}; remove it or choose another folder"
             return failed(status, text, FormatError.exit_code)
