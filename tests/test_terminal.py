@@ -80,7 +80,13 @@ def test_what_the_check_beforehand_finds_is_said_before_the_work(still, tmp_path
 
 @pytest.mark.parametrize("width", [80, 140, None], ids=["80", "140", "piped"])
 def test_a_finding_that_stops_the_run_is_left_to_the_error(width):
-    stops = Finding(code="stabilised", severity="error", evidence="the video is stabilised", advice="film without it")
+    stops = Finding(
+        code="stabilised",
+        severity="error",
+        evidence="the video is stabilised",
+        advice="film without it",
+        stops=True,
+    )
     screen, file = screen_of(width)
     screen.findings(Diagnosis(findings=(stops, CUT)), stops=True)
     said = " ".join(file.getvalue().split())
