@@ -219,8 +219,8 @@ MUTANTS = (
     ),
     Mutant(
         "inertial/scale/_noise.py",
-        "gyro_density_rad_s_rthz=max(noise.gyro_density_rad_s_rthz",
-        "gyro_density_rad_s_rthz=min(noise.gyro_density_rad_s_rthz",
+        "max(getattr(noise, name), getattr(sheet, name))",
+        "min(getattr(noise, name), getattr(sheet, name))",
         "a data sheet lowers the noise instead of raising it",
         ("scale_joint::test_a_data_sheet_raises_the_noise_and_never_lowers_it",),
     ),

@@ -17,7 +17,7 @@ from colmap_inertial.inertial.core.preintegration import SensorErrors, SensorStr
 from colmap_inertial.inertial.core.priors import PRIORS
 from colmap_inertial.inertial.scale import _residuals as res, _setup, estimate_scale, first_seconds
 from colmap_inertial.inertial.scale._grouping import first_of_groups, group_frames
-from colmap_inertial.inertial.scale._noise import GROUP_OF, TYPICAL, Expected, roughness
+from colmap_inertial.inertial.scale._noise import LEVELS, TYPICAL, Expected, roughness
 from colmap_inertial.inertial.scale._setup import prepare
 from colmap_inertial.inertial.scale.joint import JointOptions, estimate_joint, fit_path, scale_of
 from colmap_inertial.io.calibration import Declared, calibration_prior
@@ -646,7 +646,7 @@ def test_what_residuals_lose_to_the_fit_is_the_trace_of_a_dense_inverse(recordin
     cov = np.linalg.inv(scaled) * unit[:, None] * unit
     assert np.allclose(inverse.cov, cov[k * m :, k * m :], rtol=1e-6, atol=1e-9 * np.abs(inverse.cov).max())
     steps = np.eye(k * m + n)
-    for name in set(GROUP_OF.values()):
+    for name in {level.group for level in LEVELS.values()}:
         group = groups[name]
         jacobian = group.apply(steps[: k * m].reshape(k, m, -1), steps[k * m :])
         after = np.einsum("kri,ij,ksj->krs", jacobian, cov, jacobian)

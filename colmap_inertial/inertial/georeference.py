@@ -15,13 +15,13 @@ place's uncertainty.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.arrays import Array, BoolArray, ComplexArray
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import matrix_from_quat, rotation_between
 from colmap_inertial.core.quantiles import Z95
@@ -270,48 +270,18 @@ def georeference(
     chosen = np.argsort(t_s, kind="stable")
     chosen = chosen[np.unique(np.linspace(0, len(chosen) - 1, _MOST).round().astype(np.intp))]
     fixes, path_m, t_s = fixes.select(chosen), np.asarray(cam_in_world_m)[chosen], np.asarray(t_s)[chosen]
-    heights = np.isfinite(fixes.height_m)
-    place = np.stack([fixes.latitude_deg, fixes.longitude_deg, np.where(heights, fixes.height_m, 0.0)], axis=1)
-    origin = np.array([np.median(place[:, 0]), place[0, 1], np.median(place[heights, 2]) if heights.any() else 0.0])
-    place[~heights, 2] = origin[2]
-    enu = (ecef_of_geodetic(place) - ecef_of_geodetic(origin[None])[0]) @ ecef_from_enu(origin[0], origin[1])
+    origin, enu, heights = _convert_to_enu(fixes)
     level_from_world = _level(up_in_world)
     target = enu[:, 0] + 1j * enu[:, 1]
 
     def level_at(delay_s: float) -> Array:
         return np.asarray((path_m if path_at is None else path_at(t_s - delay_s)) @ level_from_world.T)
 
-    good = np.ones(len(target), dtype=bool)
-    for _ in range(_ROUNDS):
-        kept = good
-
-        def paths(delays_s: Array, kept: Array = kept) -> Array:
-            levels = [level_at(delay_s)[kept] for delay_s in delays_s]
-            return np.array([level[:, 0] + 1j * level[:, 1] for level in levels])
-
-        fit = _fit_delay(paths, target[good], t_s[good], fixes.sigma_m[good], lags=path_at is not None)
-        level = level_at(fit.delay_s)
-        flat = level[:, 0] + 1j * level[:, 1]
-        off = np.abs(target - np.exp(1j * fit.turn) * (flat - fit.middle) - fit.at)
-        keep = off < max(_OUTLIER * float(np.median(off)), _OUTLIER_M)
-        if (keep == good).all() or keep.sum() < _FEWEST:
-            break
-        good = keep
-    sigma = math.sqrt(fit.cov[0, 0])
-    reach_m = float(np.sqrt(np.mean(np.abs(flat[good] - flat[good].mean()) ** 2)))
-    if np.degrees(sigma) > _LEAST_CERTAIN_DEG:
-        raise NotObservableError(
-            "heading",
-            f"+-{np.degrees(Z95 * min(sigma, np.pi)):.0f} degrees: the path reaches {reach_m:.1f} m to either side, "
-            f"and the positions err by {math.hypot(fit.white_m, fit.slow_m):.1f} m; walk farther",
-        )
-    off_by = abs(fit.ratio - 1) if abs(fit.ratio - 1) > _RATIO_SIGMAS * fit.ratio_sigma else 0.0
-    if off_by > _LARGEST_RATIO:
-        raise NotObservableError(
-            "heading",
-            f"the positions are {fit.ratio:.2f} times as far apart as the model says: they are of another path, or the "
-            "receiver stood still while the camera moved",
-        )
+    fit, good = _fit_inliers(level_at, target, t_s, fixes.sigma_m, lags=path_at is not None)
+    level = level_at(fit.delay_s)
+    flat = level[good, 0] + 1j * level[good, 1]
+    _require_heading(fit, flat)
+    _require_same_path(fit)
     cov = np.zeros((4, 4))
     cov[:3, :3] = fit.cov
     middle_level = np.array([fit.middle.real, fit.middle.imag, float(level[good, 2].mean())])
@@ -321,28 +291,20 @@ def georeference(
     turned = np.array([[np.cos(fit.turn), -np.sin(fit.turn), 0], [np.sin(fit.turn), np.cos(fit.turn), 0], [0, 0, 1.0]])
     at = np.array([fit.at.real, fit.at.imag, middle_level[2] + up_m])
     enu_from_world = turned @ level_from_world
-    left = target[good] - np.exp(1j * fit.turn) * (flat[good] - fit.middle) - fit.at
-    notes = []
-    if off_by > _LEAST_RATIO:
-        notes.append(
-            f"the positions are {fit.ratio:.3f} times as far apart as the model says (+-{Z95 * fit.ratio_sigma:.3f}): "
-            "one of them is wrong; the model's scale was left as it is"
-        )
-    if counted.any() and fixes.height_above != "ellipsoid":
-        what = "the sea" if fixes.height_above == "sea" else "what the receiver took for zero"
-        notes.append(f"heights count from {what}, not from the ellipsoid; the two differ by up to 100 m")
+    residual = target[good] - np.exp(1j * fit.turn) * (flat - fit.middle) - fit.at
+    height_above = fixes.height_above if counted.any() else None
     return Georeference(
         latitude_deg=float(origin[0]),
         longitude_deg=float(origin[1]),
         height_m=float(origin[2]),
-        height_above=fixes.height_above if counted.any() else None,
+        height_above=height_above,
         enu_from_world=enu_from_world,
         shift_m=at - turned @ middle_level,
         middle_in_world_m=level_from_world.T @ middle_level,
         cov=cov,
         used=int(good.sum()),
         left_out=int((~good).sum()),
-        residual_rms_m=float(np.sqrt(np.mean(np.abs(left) ** 2) / 2)),
+        residual_rms_m=float(np.sqrt(np.mean(np.abs(residual) ** 2) / 2)),
         white_m=fit.white_m,
         slow_m=fit.slow_m,
         alike_s=fit.alike_s,
@@ -351,11 +313,52 @@ def georeference(
         delay_s=None if path_at is None else fit.delay_s,
         delay_sigma_s=None if path_at is None else fit.delay_sigma_s,
         source=fixes.source,
-        notes=tuple(notes),
+        notes=tuple(_notes(fit, fixes.height_above if counted.any() else "ellipsoid")),
     )
 
 
-# --- the pieces ------------------------------------------------------------------------------------------------------
+def _convert_to_enu(fixes: PositionFixes) -> tuple[Array, Array, BoolArray]:
+    """Origin (latitude, longitude, height), east, north and up of the positions (N, 3), and which have a height."""
+    heights = np.isfinite(fixes.height_m)
+    place = np.stack([fixes.latitude_deg, fixes.longitude_deg, np.where(heights, fixes.height_m, 0.0)], axis=1)
+    origin = np.array([np.median(place[:, 0]), place[0, 1], np.median(place[heights, 2]) if heights.any() else 0.0])
+    place[~heights, 2] = origin[2]
+    enu = (ecef_of_geodetic(place) - ecef_of_geodetic(origin[None])[0]) @ ecef_from_enu(origin[0], origin[1])
+    return origin, enu, heights
+
+
+def _require_heading(fit: _Fit, path: ComplexArray) -> None:
+    """Refuse a path too short against the errors of the positions."""
+    sigma = math.sqrt(fit.cov[0, 0])
+    reach_m = float(np.sqrt(np.mean(np.abs(path - path.mean()) ** 2)))
+    if np.degrees(sigma) > _LEAST_CERTAIN_DEG:
+        raise NotObservableError(
+            "heading",
+            f"+-{np.degrees(Z95 * min(sigma, np.pi)):.0f} degrees: the path reaches {reach_m:.1f} m to either side, "
+            f"and the positions err by {math.hypot(fit.white_m, fit.slow_m):.1f} m; walk farther",
+        )
+
+
+def _require_same_path(fit: _Fit) -> None:
+    """Refuse positions whose distances are far from the model's."""
+    if fit.ratio_error > _LARGEST_RATIO:
+        raise NotObservableError(
+            "heading",
+            f"the positions are {fit.ratio:.2f} times as far apart as the model says: they are of another path, or the "
+            "receiver stood still while the camera moved",
+        )
+
+
+def _notes(fit: _Fit, height_above: HeightDatum | None) -> Iterator[str]:
+    """Sentences for the user on lengths that differ and on what heights count from."""
+    if fit.ratio_error > _LEAST_RATIO:
+        yield (
+            f"the positions are {fit.ratio:.3f} times as far apart as the model says (+-{Z95 * fit.ratio_sigma:.3f}): "
+            "one of them is wrong; the model's scale was left as it is"
+        )
+    if height_above != "ellipsoid":
+        zero = "the sea" if height_above == "sea" else "what the receiver took for zero"
+        yield f"heights count from {zero}, not from the ellipsoid; the two differ by up to 100 m"
 
 
 def _level(up_in_world: Array) -> Array:
@@ -379,8 +382,39 @@ class _Fit:
     delay_s: float
     delay_sigma_s: float
 
+    @property
+    def ratio_error(self) -> float:
+        """Relative difference of the lengths; zero where chance explains it."""
+        error = abs(self.ratio - 1)
+        return error if error > _RATIO_SIGMAS * self.ratio_sigma else 0.0
 
-def _fit_delay(paths: Callable[[Array], Array], target: Array, t_s: Array, stated_m: Array, *, lags: bool) -> _Fit:
+
+def _fit_inliers(
+    level_at: Callable[[float], Array], target: ComplexArray, t_s: Array, sigma_m: Array, *, lags: bool
+) -> tuple[_Fit, BoolArray]:
+    """The fit without outliers, and which positions these are not."""
+    good = np.ones(len(target), dtype=bool)
+    for _ in range(_ROUNDS):
+        kept = good
+
+        def paths(delays_s: Array, kept: BoolArray = kept) -> ComplexArray:
+            levels = [level_at(delay_s)[kept] for delay_s in delays_s]
+            return np.array([level[:, 0] + 1j * level[:, 1] for level in levels])
+
+        fit = _fit_delay(paths, target[good], t_s[good], sigma_m[good], lags=lags)
+        level = level_at(fit.delay_s)
+        flat = level[:, 0] + 1j * level[:, 1]
+        off = np.abs(target - np.exp(1j * fit.turn) * (flat - fit.middle) - fit.at)
+        keep = off < max(_OUTLIER * float(np.median(off)), _OUTLIER_M)
+        if (keep == good).all() or keep.sum() < _FEWEST:
+            break
+        good = keep
+    return fit, good
+
+
+def _fit_delay(
+    paths: Callable[[Array], ComplexArray], target: ComplexArray, t_s: Array, stated_m: Array, *, lags: bool
+) -> _Fit:
     """The mean over sizes of errors and delays; ``paths`` gives the path (T, N) by each of T delays."""
     if not lags:
         return _fit(paths(np.zeros(1)), np.zeros(1), target, t_s, stated_m)
@@ -395,7 +429,7 @@ def _fit_delay(paths: Callable[[Array], Array], target: Array, t_s: Array, state
     return fit
 
 
-def _fit(paths: Array, delays_s: Array, target: Array, t_s: Array, stated_m: Array) -> _Fit:
+def _fit(paths: ComplexArray, delays_s: Array, target: ComplexArray, t_s: Array, stated_m: Array) -> _Fit:
     """The mean over all sizes of errors and the delays given; plane points as complex numbers."""
     stated = stated_m[np.isfinite(stated_m) & (stated_m > 0)]
     usual_m = float(np.median(stated)) if len(stated) else _USUAL_SLOW_M

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -101,10 +101,10 @@ class Judged:
     chi2: float
     sigma_px: float
     accel_noise_m_s2_rthz: float
-    shared_cov: Array | None
-    drift: tuple[Stretched, ...]
+    shared_cov: Array | None = None
+    drift: tuple[Stretched, ...] = ()
     velocity_m_s: Array
-    motion_covs: dict[int, Array]
+    motion_covs: dict[int, Array] = field(default_factory=dict)
     readout: tuple[float, float] | None
     steps: int
 
@@ -156,33 +156,9 @@ def refine(
     readout = None if readout_declared or not seen.converged else _readout(_part(problem, kept), seen.estimate)
     reason = _rolling(readout) or _doubt(seen_alone, seen, chi2, mean, spread) or _too_late(problem, seen.estimate)
     assert problem.inertial is not None
-    final = start
-    cov: Array | None = None
-    drift: tuple[Stretched, ...] = ()
-    velocity_m_s = np.full_like(start.velocity_m_s, np.nan)
-    motion_covs: dict[int, Array] = {}
-    if not reason:
-        whole = solve(problem, seen.estimate)
-        steps += whole.steps
-        reason = "" if whole.converged else "with all observations, the refinement does not come to rest"
-    if not reason:
-        try:
-            solved = factored(problem, whole.estimate)
-        except np.linalg.LinAlgError:
-            reason = "nothing says how sure it would be"
-        else:
-            final, cov = whole.estimate, solved.shared_cov()
-            by = moving(problem, final)
-            drift = drift_map(problem, start, final, t_s, solved, by)
-            # where the IMU says nothing, the covariance of a velocity is a prior's
-            moved = problem.inertial.touched
-            told = np.flatnonzero(np.isfinite(t_s) & moved)
-            some = told[:: -(-len(told) // _MOST_COVS) or 1]
-            motion_covs = dict(zip(some.tolist(), solved.motion_covs(some, by), strict=True))
-            velocity_m_s = np.where(moved[:, None], by.velocity_m_s, np.nan)
-    return Judged(
-        estimate=final,
-        accepted=not reason,
+    judged = Judged(
+        estimate=start,
+        accepted=False,
         reason=reason,
         held_out=count,
         before_px=_as_px(before, problem.sigma_px),
@@ -192,12 +168,38 @@ def refine(
         chi2=chi2,
         sigma_px=noise.sigma_px,
         accel_noise_m_s2_rthz=problem.inertial.noise.accel_density_m_s2_rthz,
-        shared_cov=cov,
-        drift=drift,
-        velocity_m_s=velocity_m_s,
-        motion_covs=motion_covs,
+        velocity_m_s=np.full_like(start.velocity_m_s, np.nan),
         readout=readout,
         steps=steps,
+    )
+    return judged if reason else _solve_all(judged, problem, seen.estimate, t_s)
+
+
+def _solve_all(judged: Judged, problem: Problem, x: Estimate, t_s: Array) -> Judged:
+    """The refinement by all observations from ``x`` on, with covariances; as it was where that does not succeed."""
+    whole = solve(problem, x)
+    judged = replace(judged, steps=judged.steps + whole.steps)
+    if not whole.converged:
+        return replace(judged, reason="with all observations, the refinement does not come to rest")
+    try:
+        solved = factored(problem, whole.estimate)
+    except np.linalg.LinAlgError:
+        return replace(judged, reason="nothing says how sure it would be")
+    assert problem.inertial is not None
+    final, cov = whole.estimate, solved.shared_cov()
+    by = moving(problem, final)
+    # where the IMU says nothing, the covariance of a velocity is a prior's
+    moved = problem.inertial.touched
+    informed = np.flatnonzero(np.isfinite(t_s) & moved)
+    chosen = informed[:: -(-len(informed) // _MOST_COVS) or 1]
+    return replace(
+        judged,
+        estimate=final,
+        accepted=True,
+        shared_cov=cov,
+        drift=drift_map(problem, judged.estimate, final, t_s, solved, by),
+        velocity_m_s=np.where(moved[:, None], by.velocity_m_s, np.nan),
+        motion_covs=dict(zip(chosen.tolist(), solved.motion_covs(chosen, by), strict=True)),
     )
 
 

@@ -97,28 +97,12 @@ def read_seen(reconstruction: pycolmap.Reconstruction, timing: FrameTiming) -> S
     images.sort(key=lambda image: (t_of.get(image.name, np.inf), image.name))
     number = {image.image_id: i for i, image in enumerate(images)}
     keypoints = [np.array([p.xy for p in image.points2D]).reshape(-1, 2) for image in images]
-    frame: list[int] = []
-    point: list[int] = []
-    place: list[int] = []
-    ids: list[int] = []
-    xyz: list[Array] = []
-    tracks = []
-    for point_id, one in reconstruction.points3D.items():
-        elements = sorted((number[e.image_id], e.point2D_idx) for e in one.track.elements if e.image_id in number)
-        if len(elements) > 1:
-            tracks.append((elements[0][0], int(point_id), elements, one.xyz))
-    # by time: what is worked on one after the other then lies side by side in memory
-    for _, point_id, elements, point_m in sorted(tracks, key=lambda track: track[:2]):
-        frame += [e[0] for e in elements]
-        place += [e[1] for e in elements]
-        point += [len(ids)] * len(elements)
-        ids.append(point_id)
-        xyz.append(point_m)
-    frames, places = np.array(frame, dtype=np.int64), np.array(place, dtype=np.int64)
+    tracks = _read_tracks(reconstruction, number)
+    seen = [element for *_, elements, _ in tracks for element in elements]
+    frames, places = np.array(seen, dtype=np.int64).reshape(-1, 2).T
     first = np.cumsum([0, *(len(k) for k in keypoints)])
     every = np.concatenate(keypoints)
     camera_ids = tuple(sorted({image.camera_id for image in images}))
-    cameras = [reconstruction.camera(i) for i in camera_ids]
     poses = [image.cam_from_world() for image in images]
     return Seen(
         image_ids=tuple(image.image_id for image in images),
@@ -126,21 +110,38 @@ def read_seen(reconstruction: pycolmap.Reconstruction, timing: FrameTiming) -> S
         t_s=np.array([t_of.get(image.name, np.nan) for image in images]),
         cam_from_world=np.array([pose.rotation.matrix() for pose in poses]),
         cam_in_world=np.array([image.projection_center() for image in images]),
-        point_ids=tuple(ids),
-        points=np.array(xyz).reshape(-1, 3),
+        point_ids=tuple(point_id for _, point_id, _, _ in tracks),
+        points=np.array([point_m for *_, point_m in tracks]).reshape(-1, 3),
         observations=Observations(
             frame=frames,
-            point=np.array(point, dtype=np.int64),
+            point=np.repeat(np.arange(len(tracks)), [len(elements) for *_, elements, _ in tracks]),
             xy_px=every[first[frames] + places],
             line=np.zeros(len(frames)),
         ),
         place=places,
-        cameras=tuple(
-            CameraModel(model=c.model.name, width=c.width, height=c.height, params=tuple(c.params)) for c in cameras
-        ),
+        cameras=tuple(_read_camera(reconstruction.camera(i)) for i in camera_ids),
         camera_ids=camera_ids,
         camera_of=np.array([camera_ids.index(image.camera_id) for image in images], dtype=np.int64),
     )
+
+
+def _read_camera(camera: pycolmap.Camera) -> CameraModel:
+    return CameraModel(model=camera.model.name, width=camera.width, height=camera.height, params=tuple(camera.params))
+
+
+def _read_tracks(
+    reconstruction: pycolmap.Reconstruction, number: Mapping[int, int]
+) -> list[tuple[int, int, list[tuple[int, int]], Array]]:
+    """First frame, number, elements (frame, place among keypoints) and position of points seen twice or more.
+
+    By time: what is worked on one after the other then lies side by side in memory.
+    """
+    tracks = []
+    for point_id, point in reconstruction.points3D.items():
+        elements = sorted((number[e.image_id], e.point2D_idx) for e in point.track.elements if e.image_id in number)
+        if len(elements) > 1:
+            tracks.append((elements[0][0], int(point_id), elements, point.xyz))
+    return sorted(tracks, key=lambda track: track[:2])
 
 
 def lines_of(seen: Seen, timing: FrameTiming, xy_px: Array) -> Array:

@@ -9,8 +9,9 @@ import numpy as np
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.types import ImuNoise, ScaleDrift
 from colmap_inertial.inertial.core import factors as fac, parameters as par
-from colmap_inertial.inertial.core.arrow import ArrowSystem
+from colmap_inertial.inertial.core.arrow import ArrowSystem, Inverse
 from colmap_inertial.inertial.core.parameters import Estimate, Noise, Prior
+from colmap_inertial.inertial.core.preintegration import Preintegrated
 from colmap_inertial.inertial.core.priors import model_scale_sigma
 from colmap_inertial.inertial.scale import _noise as levels, _residuals as res, _suspects as sus
 from colmap_inertial.inertial.scale._drift import scale_drift
@@ -103,6 +104,76 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
         When the data leave the system singular.
     """
     search = LevelSearch(expected=Expected.of(data, sheet))
+    at, converged = _find_optimum(data, prior, search)
+    x, groups, inverse = at.estimate, at.groups, at.inverse
+    cov = inverse.cov
+    noise, sums = search.noise, search.sums
+
+    # Once more: the mean gyroscope bias, the scale's variance, suspicions, and scales of the parts
+    k = len(data.t_s)
+    imu = groups["imu"]
+    assert isinstance(imu, fac.Group)
+    where, own = sus.columns(data, x, imu)
+    residual = (imu.residual[:, :, None] + imu.apply(*at.step))[:, :, 0]
+    ends, ends_z = np.zeros((k, par.N_STATE, 4 + own.shape[2])), np.zeros((par.N_GLOBALS, 4 + own.shape[2]))
+    ends[:, par.GYRO_BIAS, :3] = np.eye(3) / k
+    ends_z[par.SCALE, 3] = 1.0
+    imu.pull_back(own, ends[:, :, 4:], ends_z[:, 4:])
+    states, z = inverse.solve(ends, ends_z)
+    suspicions = sus.suspicions(where, own, imu.apply(states[:, :, 4:], z[:, 4:]), residual, z[par.SCALE, 4:])
+    variance_parts = _variance_parts(groups, at.prior, x, at.pre.cov_gaps, states[:, :, 3:4], z[:, 3])
+    level_variance, freedom = search.scale_variance(groups, states[:, :, 3:4], z[:, 3:4])
+    states, z = states[:, :, :3], z[:, :3]
+    inflation = max(1.0, *(squares / expected for squares, expected in sums.values()))
+    drift = scale_drift(
+        data,
+        x,
+        noise,
+        groups["centre"],
+        (inverse, *at.rhs),
+        inflation=inflation,
+        tolerated_log=model_scale_sigma(calibrated=False),
+    )
+    return Fit(
+        estimate=x,
+        noise=noise,
+        cov=cov,
+        gyro_bias_cov=np.mean(states[:, par.GYRO_BIAS], axis=0),
+        gyro_bias_with_globals=z,
+        sums=sums,
+        level_variance=level_variance,
+        freedom=freedom,
+        expected_accel_m_s2_rthz=search.expected.noise.accel_density_m_s2_rthz,
+        converged=converged,
+        drift=drift,
+        excitation_m_s2=_excitation_m_s2(data, x),
+        jumped=int(np.sum(data.broken)) + _jumped(groups["rotation"], groups["centre"]),
+        gain_chi2=prior.gain_chi2(x),
+        gain_surprise=_gain_surprise(at.prior, x, cov),
+        variance_parts=variance_parts,
+        suspicions=suspicions,
+        system=at.system,
+        rate_rad_s=at.pre.rate_rad_s,
+        prior_info=at.prior.info,
+    )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Optimum:
+    """The last step of Gauss-Newton: where it leads to, and the linear system that it solves."""
+
+    estimate: Estimate
+    prior: Prior
+    pre: Preintegrated
+    groups: dict[str, fac.Group | fac.Direct]
+    system: ArrowSystem
+    inverse: Inverse
+    rhs: tuple[Array, Array]
+    step: tuple[Array, Array]
+
+
+def _find_optimum(data: Data, prior: Prior, search: LevelSearch) -> tuple[_Optimum, bool]:
+    """Gauss-Newton with the noise levels along; also whether the scale came to rest."""
     x = _rotations_first(data, search.noise, prior)
     scale = _moment_scale(data, x)
     x = replace(x, metres_per_unit=scale, imu_in_world_m=data.groups.centre * scale)
@@ -123,63 +194,24 @@ def fit_jointly(data: Data, prior: Prior, sheet: ImuNoise | None) -> Fit:
         step = abs(signed)
         shrink = min(1.0, _LARGEST_STEP / max(step, 1e-12)) * (0.5 if turned else 1.0)
         x = x.moved(states[:, :, 0] * shrink, z[:, 0] * shrink, pre.rate_rad_s, data.t_s)
-        cov = inverse.cov
-        sigma = float(cov[par.SCALE, par.SCALE]) ** 0.5
+        sigma = float(inverse.cov[par.SCALE, par.SCALE]) ** 0.5
         converged = step < 0.2 * sigma
         search.update(groups, inverse, states, z, moving=not settled)
         if settled:
             break
         moves = max(step, search.scale_moves())
         settled = iteration >= _FEWEST_ITERATIONS and moves < _SETTLED * sigma and search.at_rest
-    noise, sums = search.noise, search.sums
-
-    # Once more: the mean gyroscope bias, the scale's variance, suspicions, and scales of the parts
-    k = len(data.t_s)
-    imu = groups["imu"]
-    assert isinstance(imu, fac.Group)
-    where, own = sus.columns(data, x, imu)
-    residual = (imu.residual[:, :, None] + imu.apply(states, z))[:, :, 0]
-    ends, ends_z = np.zeros((k, par.N_STATE, 4 + own.shape[2])), np.zeros((par.N_GLOBALS, 4 + own.shape[2]))
-    ends[:, par.GYRO_BIAS, :3] = np.eye(3) / k
-    ends_z[par.SCALE, 3] = 1.0
-    imu.pull_back(own, ends[:, :, 4:], ends_z[:, 4:])
-    states, z = inverse.solve(ends, ends_z)
-    suspicions = sus.suspicions(where, own, imu.apply(states[:, :, 4:], z[:, 4:]), residual, z[par.SCALE, 4:])
-    variance_parts = _variance_parts(groups, local, x, pre.cov_gaps, states[:, :, 3:4], z[:, 3])
-    level_variance, freedom = search.scale_variance(groups, states[:, :, 3:4], z[:, 3:4])
-    states, z = states[:, :, :3], z[:, :3]
-    inflation = max(1.0, *(squares / expected for squares, expected in sums.values()))
-    drift = scale_drift(
-        data,
-        x,
-        noise,
-        groups["centre"],
-        (inverse, rhs, rhs_z),
-        inflation=inflation,
-        tolerated_log=model_scale_sigma(calibrated=False),
-    )
-    return Fit(
+    optimum = _Optimum(
         estimate=x,
-        noise=noise,
-        cov=cov,
-        gyro_bias_cov=np.mean(states[:, par.GYRO_BIAS], axis=0),
-        gyro_bias_with_globals=z,
-        sums=sums,
-        level_variance=level_variance,
-        freedom=freedom,
-        expected_accel_m_s2_rthz=search.expected.noise.accel_density_m_s2_rthz,
-        converged=converged,
-        drift=drift,
-        excitation_m_s2=_excitation_m_s2(data, x),
-        jumped=int(np.sum(data.broken)) + _jumped(groups["rotation"], groups["centre"]),
-        gain_chi2=prior.gain_chi2(x),
-        gain_surprise=_gain_surprise(local, x, cov),
-        variance_parts=variance_parts,
-        suspicions=suspicions,
+        prior=local,
+        pre=pre,
+        groups=groups,
         system=system,
-        rate_rad_s=pre.rate_rad_s,
-        prior_info=local.info,
+        inverse=inverse,
+        rhs=(rhs, rhs_z),
+        step=(states, z),
     )
+    return optimum, converged
 
 
 #: Which part of the scale's variance priors of the globals belong to.

@@ -7,7 +7,7 @@ what is typical. Steps are Newton's with the average information matrix (Gilmour
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
@@ -20,46 +20,43 @@ from colmap_inertial.inertial.scale._grouping import Data
 
 Groups = Mapping[str, Group | Direct]
 
-#: Visual errors: video of about a megapixel of a scene a few metres away. A drift that starts lower may never be found:
-#: the fit then rests where the accelerometer's noise stands for it.
+
+@dataclass(frozen=True, kw_only=True)
+class Level:
+    """What is known beforehand of a noise level, in the unit of its field of :class:`Noise`."""
+
+    #: The most probable value.
+    typical: float
+    #: No estimate falls below this: pixels and samples are not finer.
+    floor: float
+    #: Standard deviation of the logarithm for a device in a hand, with hardly any slow errors of its accelerometer.
+    spread: float
+    #: The same for a device that vibrates, where slow errors are what there is.
+    spread_shaken: float
+    #: Residuals that determine it.
+    group: str
+
+
+#: The levels that are estimated. Visual errors: video of about a megapixel of a scene a few metres away. A drift that
+#: starts lower may never be found: the fit then rests where the accelerometer's noise stands for it. The gyroscope's
+#: noise is not among them: a slow error of the visual rotations looks just like a noisy gyroscope, and real SfM has the
+#: one while real gyroscopes are not the other.
+LEVELS = {
+    "accel_density_m_s2_rthz": Level(
+        typical=TYPICAL_NOISE.accel_density_m_s2_rthz, floor=3e-4, spread=0.2, spread_shaken=0.7, group="imu"
+    ),
+    "rotation_rad": Level(typical=2e-3, floor=5e-5, spread=2.0, spread_shaken=2.0, group="rotation"),
+    "centre_m": Level(typical=1e-3, floor=5e-5, spread=2.0, spread_shaken=2.0, group="centre"),
+    "drift_m_rts": Level(typical=4e-3, floor=1e-5, spread=2.0, spread_shaken=2.0, group="drift"),
+    "accel_slow_m_s2_rts": Level(typical=1e-3, floor=1e-4, spread=0.5, spread_shaken=2.0, group="accel_slow"),
+}
+#: Typical noise of sensors and reconstructions.
 TYPICAL = Noise(
     gyro_density_rad_s_rthz=TYPICAL_NOISE.gyro_density_rad_s_rthz,
     gyro_walk_rad_s2_rthz=JOINT_GYRO_WALK_RAD_S_RTS,
-    accel_density_m_s2_rthz=TYPICAL_NOISE.accel_density_m_s2_rthz,
     accel_walk_m_s3_rthz=TYPICAL_NOISE.accel_walk_m_s3_rthz,
-    rotation_rad=2e-3,
-    centre_m=1e-3,
-    drift_m_rts=4e-3,
-    accel_slow_m_s2_rts=1e-3,
+    **{name: level.typical for name, level in LEVELS.items()},
 )
-#: No estimate may fall below these: pixels and samples are not finer.
-_FLOOR = {
-    "accel_density_m_s2_rthz": 3e-4,
-    "rotation_rad": 5e-5,
-    "centre_m": 5e-5,
-    "drift_m_rts": 1e-5,
-    "accel_slow_m_s2_rts": 1e-4,
-}
-#: Which residuals speak for which level. The gyroscope's is not among them: a slow error of the visual rotations looks
-#: just like a noisy gyroscope, and real SfM has the one while real gyroscopes are not the other.
-GROUP_OF = {
-    "accel_density_m_s2_rthz": "imu",
-    "rotation_rad": "rotation",
-    "centre_m": "centre",
-    "drift_m_rts": "drift",
-    "accel_slow_m_s2_rts": "accel_slow",
-}
-_LEVELS = tuple(GROUP_OF)
-#: Standard deviations of the logarithm of a level before anything is known of the recording: of a device in a hand,
-#: with no slow errors of its accelerometer to speak of, and of one that vibrates, where they are what there is.
-_SPREAD = {
-    "accel_density_m_s2_rthz": 0.2,
-    "rotation_rad": 2.0,
-    "centre_m": 2.0,
-    "drift_m_rts": 2.0,
-    "accel_slow_m_s2_rts": 0.5,
-}
-_SHAKEN = {**_SPREAD, "accel_density_m_s2_rthz": 0.7, "accel_slow_m_s2_rts": 2.0}
 #: What vibration does to an accelerometer: its most probable value where there is any; and where a search starts, with
 #: little white noise, that asks whether it is this.
 _SHAKEN_SLOW, _SLOW_START, _QUIET_START = 1e-2, 6e-2, 3e-3
@@ -141,28 +138,27 @@ class Expected:
         gyro = float(np.clip(data.gyro_roughness_rad_s_rthz, _LEAST_GYRO, _MOST_GYRO))
         rough = max(data.accel_roughness_m_s2_rthz, _LEAST_ACCEL)
         noise = replace(TYPICAL, gyro_density_rad_s_rthz=gyro, accel_density_m_s2_rthz=rough)
-        floor, spread = _FLOOR, _SPREAD
+        floor, shaken = {name: level.floor for name, level in LEVELS.items()}, rough > _VIBRATES
         if rough > _MOST_ACCEL:
             noise = replace(noise, accel_density_m_s2_rthz=float(np.sqrt(rough * _MOST_ACCEL)))
-        if rough > _VIBRATES:
+        if shaken:
             noise = replace(noise, accel_density_m_s2_rthz=_MOST_ACCEL, accel_slow_m_s2_rts=_SHAKEN_SLOW)
-            spread = _SHAKEN
         if sheet is not None:
-            noise = replace(
-                noise,
-                gyro_density_rad_s_rthz=max(noise.gyro_density_rad_s_rthz, sheet.gyro_density_rad_s_rthz),
-                gyro_walk_rad_s2_rthz=max(noise.gyro_walk_rad_s2_rthz, sheet.gyro_walk_rad_s2_rthz),
-                accel_density_m_s2_rthz=max(noise.accel_density_m_s2_rthz, sheet.accel_density_m_s2_rthz),
-                accel_walk_m_s3_rthz=max(noise.accel_walk_m_s3_rthz, sheet.accel_walk_m_s3_rthz),
-            )
-            least = max(_FLOOR["accel_density_m_s2_rthz"], sheet.accel_density_m_s2_rthz)
-            floor = {**_FLOOR, "accel_density_m_s2_rthz": least}
+            levels = [entry.name for entry in fields(ImuNoise)]
+            noise = replace(noise, **{name: max(getattr(noise, name), getattr(sheet, name)) for name in levels})
+            least = max(floor["accel_density_m_s2_rthz"], sheet.accel_density_m_s2_rthz)
+            floor["accel_density_m_s2_rthz"] = least
         start = replace(noise, accel_slow_m_s2_rts=TYPICAL.accel_slow_m_s2_rts)
-        if spread is _SHAKEN:
+        if shaken:
             quiet = max(floor["accel_density_m_s2_rthz"], min(noise.accel_density_m_s2_rthz, _QUIET_START))
             start = replace(noise, accel_density_m_s2_rthz=quiet, accel_slow_m_s2_rts=_SLOW_START)
-        left = _LEAST_LEFT if spread is _SPREAD else _LEAST_LEFT_SHAKEN
-        return cls(noise=noise, floor=floor, spread=spread, start=start, least_left=left)
+        return cls(
+            noise=noise,
+            floor=floor,
+            spread={name: level.spread_shaken if shaken else level.spread for name, level in LEVELS.items()},
+            start=start,
+            least_left=_LEAST_LEFT_SHAKEN if shaken else _LEAST_LEFT,
+        )
 
 
 def correlation_factor(group: Group | Direct, states: Array, z: Array) -> float:
@@ -204,9 +200,9 @@ class LevelSearch:
     expected: Expected
     noise: Noise = field(init=False)
     sums: dict[str, tuple[float, float]] = field(default_factory=dict)
-    information: Array = field(default_factory=lambda: np.eye(len(_LEVELS)))
-    by_scale: Array = field(default_factory=lambda: np.zeros(len(_LEVELS)))
-    wanted: Array = field(default_factory=lambda: np.ones(len(_LEVELS)))
+    information: Array = field(default_factory=lambda: np.eye(len(LEVELS)))
+    by_scale: Array = field(default_factory=lambda: np.zeros(len(LEVELS)))
+    wanted: Array = field(default_factory=lambda: np.ones(len(LEVELS)))
     decrement: float = np.inf
     _damping: float = _DAMPED
     _before: float = np.inf
@@ -217,15 +213,15 @@ class LevelSearch:
 
     def update(self, groups: Groups, inverse: Inverse, states: Array, z: Array, *, moving: bool) -> None:
         """What a step (K, m, 1), (n, 1) of all else and the inverse of its equations say; levels go along if moving."""
-        squares, right, counts = np.zeros((3, len(_LEVELS)))
+        squares, right, counts = np.zeros((3, len(LEVELS)))
         own = []
-        rhs, rhs_z = np.zeros((*states.shape[:2], len(_LEVELS))), np.zeros((len(z), len(_LEVELS)))
-        for i, level in enumerate(_LEVELS):
-            group = groups[GROUP_OF[level]]
+        rhs, rhs_z = np.zeros((*states.shape[:2], len(LEVELS))), np.zeros((len(z), len(LEVELS)))
+        for i, (name, level) in enumerate(LEVELS.items()):
+            group = groups[level.group]
             moved = group.residual[:, :, None] + group.apply(states, z)
             own.append(by_level(group, moved))
             squares[i] = float(np.sum(moved * own[i]))
-            if level == "rotation_rad":
+            if name == "rotation_rad":
                 squares[i] *= self.noise.rotation_excess**2
             count = group.residual.shape[1] * (
                 len(group.residual) if group.weight is None else float(group.weight.sum())
@@ -235,13 +231,13 @@ class LevelSearch:
             counts[i], right[i] = count, max(count - group.explained(inverse), self.expected.least_left * count)
             group.pull_back(own[i], rhs[:, :, i : i + 1], rhs_z[:, i : i + 1])
         # a hundredth of the residuals, or they tell nothing of how much larger than expected they are
-        told = np.maximum(right, 0.01 * counts)
-        self.sums = {level: (float(squares[i]), float(told[i])) for i, level in enumerate(_LEVELS)}
+        expected = np.maximum(right, 0.01 * counts)
+        self.sums = {level: (float(squares[i]), float(expected[i])) for i, level in enumerate(LEVELS)}
         followed, followed_z = inverse.solve(rhs, rhs_z)
         self.by_scale = followed_z[0]
-        average = np.zeros((len(_LEVELS), len(_LEVELS)))
-        for i, level in enumerate(_LEVELS):
-            change = groups[GROUP_OF[level]].apply(followed, followed_z)
+        average = np.zeros((len(LEVELS), len(LEVELS)))
+        for i, level in enumerate(LEVELS.values()):
+            change = groups[level.group].apply(followed, followed_z)
             average[i] = -0.5 * np.einsum("kri,krj->j", own[i], change)
             average[i, i] += 0.5 * float(np.sum(own[i] ** 2))
         noise = self._next(0.5 * (average + average.T), squares, right)
@@ -250,20 +246,20 @@ class LevelSearch:
 
     def _next(self, average: Array, squares: Array, right: Array) -> Noise:
         # Rotations hardly depend on the other levels; their correlation changes along with their level
-        at = _LEVELS.index("rotation_rad")
-        others = np.arange(len(_LEVELS)) != at
+        at = list(LEVELS).index("rotation_rad")
+        others = np.arange(len(LEVELS)) != at
         average[at, :] = average[:, at] = 0.0
         average[at, at] = 0.5 * max(squares[at], right[at])
-        now = 2 * np.log([getattr(self.noise, level) for level in _LEVELS])
-        mean = 2 * np.log([getattr(self.expected.noise, level) for level in _LEVELS])
-        floor = 2 * np.log([self.expected.floor[level] for level in _LEVELS])
-        prior = 1 / (2 * np.array([self.expected.spread[level] for level in _LEVELS])) ** 2
+        now = 2 * np.log([getattr(self.noise, level) for level in LEVELS])
+        mean = 2 * np.log([getattr(self.expected.noise, level) for level in LEVELS])
+        floor = 2 * np.log([self.expected.floor[level] for level in LEVELS])
+        prior = 1 / (2 * np.array([self.expected.spread[level] for level in LEVELS])) ** 2
         self.information = average + np.diag(prior)
         gradient = 0.5 * (squares - right) - prior * (now - mean)
         free = ~((now <= floor + 1e-6) & (gradient < 0))
 
         def newton(damping: float) -> Array:
-            step = np.zeros(len(_LEVELS))
+            step = np.zeros(len(LEVELS))
             stiff = np.diag(np.where(others, damping * 0.5 * np.maximum(np.maximum(right, squares), 1.0), 0.0))
             step[free] = np.linalg.solve((self.information + stiff)[np.ix_(free, free)], gradient[free])
             return step
@@ -273,7 +269,7 @@ class LevelSearch:
         self._steps += 1
         if self._steps <= _BY_SQUARES:
             # an accelerometer's noise is known beforehand better than the rest
-            part = np.where(np.array(_LEVELS) == "accel_density_m_s2_rthz", 0.5, 1.0)
+            part = np.where(np.array(list(LEVELS)) == "accel_density_m_s2_rthz", 0.5, 1.0)
             step = np.clip(
                 part * np.log(np.maximum(squares, 1e-9) / np.maximum(right, 1e-9)), -_LARGEST_FIRST, _LARGEST_FIRST
             )
@@ -286,7 +282,7 @@ class LevelSearch:
             most = _LARGEST_CHANGE * self._left
             step = np.clip(newton(self._damping), -most, most)
         new = np.exp(0.5 * np.maximum(now + step, floor))
-        return replace(self.noise, **dict(zip(_LEVELS, map(float, new), strict=True)))
+        return replace(self.noise, **dict(zip(LEVELS, map(float, new), strict=True)))
 
     @property
     def at_rest(self) -> bool:
@@ -318,8 +314,8 @@ class LevelSearch:
         """
         cov = np.linalg.inv(self.information)
         shares = []
-        for level in _LEVELS:
-            group = groups[GROUP_OF[level]]
+        for level in LEVELS.values():
+            group = groups[level.group]
             values = group.apply(states, z)
             shares.append(float(np.sum(values * by_level(group, values))))
         by_level_of_log = np.array(shares) / float(z[0, 0])

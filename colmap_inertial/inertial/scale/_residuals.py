@@ -49,7 +49,6 @@ def visual_groups(data: Data, noise: Noise, x: Estimate, rate_rad_s: Array, *, r
     to 0.9 in real recordings), and the centre is much better known once the gyroscope has told the rotation. So the
     error of the centre is modelled as coupling times error of the rotation plus a rest; the coupling is estimated.
     """
-    k = len(data.t_s)
     camera = x.world_from_imu @ x.cam_from_imu.T  # world_from_cam
     cam_from_world = camera.transpose(0, 2, 1)
     # Mean rate of the group's frames: what row times and a delay act on
@@ -58,43 +57,9 @@ def visual_groups(data: Data, noise: Noise, x: Estimate, rate_rad_s: Array, *, r
     velocity = rotate(cam_from_world, x.velocity_m_s)
     rotation_by_rate, rotation_by_velocity, centre_by_rate, centre_by_velocity = x.shutter
 
-    rotation = so3_log(data.groups.world_from_cam.transpose(0, 2, 1) @ camera)
-    # The frames were moved to their mean instant with the first guess of the delay
-    rotation = rotation + (rate_rad_s @ x.cam_from_imu.T - rate) * x.delay_s
-    rotation_here = np.zeros((k, 3, par.N_STATE))
-    rotation_here[:, :, par.THETA] = x.cam_from_imu
-    since_middle = (data.t_s - par.middle_s(data.t_s))[:, None]
-    rotation_z = np.zeros((k, 3, par.N_GLOBALS))
-    rotation_z[:, :, par.ROTATION] = -np.eye(3)
-    rotation_z[:, :, par.DELAY] = -rate
-    rotation_z[:, :, par.CLOCK_RATE] = -rate * since_middle
-
-    lever_body = x.cam_from_imu.T @ x.imu_in_cam_m
+    rotation, rotation_here, rotation_z = _rotation_residuals(data, x, rate_rad_s, rate)
     smear = rate @ centre_by_rate.T + velocity @ centre_by_velocity.T
-    half_spread_s2 = 0.5 * data.groups.spread_s2[:, None]
-    displacement = data.groups.displacement_m - half_spread_s2 * x.accel_biases_m_s2
-    displacement = displacement - rotate(data.groups.rotation_since - np.eye(3), np.broadcast_to(lever_body, (k, 3)))
-    predicted = x.imu_in_world_m + rotate(camera, smear - x.imu_in_cam_m)
-    predicted = predicted + half_spread_s2 * x.gravity_m_s2 + rotate(x.world_from_imu, displacement)
-    camera_velocity = x.velocity_m_s - rotate(x.world_from_imu, np.cross(rate_rad_s, lever_body))
-    centre = data.groups.centre * x.metres_per_unit - predicted - x.drift_m
-    centre_here = np.zeros((k, 3, par.N_STATE))
-    centre_here[:, :, par.POSITION] = -np.eye(3)
-    centre_here[:, :, par.DRIFT] = -np.eye(3)
-    centre_here[:, :, par.THETA] = x.world_from_imu @ skew(displacement - lever_body)
-    centre_here[:, :, par.ACCEL_WALK] = centre_here[:, :, par.ACCEL_SLOW] = (
-        half_spread_s2[:, :, None] * x.world_from_imu
-    )
-    centre_here[:, :, par.VELOCITY] = -camera @ centre_by_velocity @ cam_from_world
-    centre_z = np.zeros((k, 3, par.N_GLOBALS))
-    # The noise sits on the visual centre, so a change of log u scales the prediction: total least squares
-    centre_z[:, :, par.SCALE] = -predicted
-    centre_z[:, :, par.ROTATION] = camera @ skew(x.imu_in_cam_m)
-    centre_z[:, :, par.GRAVITY] = -half_spread_s2[:, :, None] * np.eye(3)
-    centre_z[:, :, par.ACCEL_BIAS] = half_spread_s2[:, :, None] * x.world_from_imu
-    centre_z[:, :, par.LEVER] = x.world_from_imu @ data.groups.rotation_since @ x.cam_from_imu.T
-    centre_z[:, :, par.DELAY] = camera_velocity
-    centre_z[:, :, par.CLOCK_RATE] = camera_velocity * since_middle
+    centre, centre_here, centre_z = _centre_residuals(data, x, rate_rad_s, smear)
 
     # Before the shutter's part: that one, too, is mostly along the direction in which a picture changes little
     carried = camera @ (x.coupling_m + x.metres_per_unit * data.coupling)
@@ -114,33 +79,90 @@ def visual_groups(data: Data, noise: Noise, x: Estimate, rate_rad_s: Array, *, r
         centre_z[:, :, at[3] : at[3] + 3] = column * velocity[:, None, :]
         centre_z[:, :, at[4] : at[4] + 3] = column * unsmeared[:, None, :]
 
-    groups = []
-    for residual, here, z, root, columns in (
-        (
-            rotation,
-            rotation_here,
-            rotation_z,
-            data.rotation_shape / (noise.rotation_rad * noise.rotation_excess),
-            par.VISUAL_GLOBALS,
+    rotation_root = data.rotation_shape / (noise.rotation_rad * noise.rotation_excess)
+    columns = par.VISUAL_GLOBALS
+    return (
+        _weighted_group(rotation, rotation_here, rotation_z[:, :, columns], rotation_root, columns, robust=robust),
+        _weighted_group(
+            centre, centre_here, centre_z, data.centre_shape / noise.centre_m, slice(0, par.N_GLOBALS), robust=robust
         ),
-        (centre, centre_here, centre_z, data.centre_shape / noise.centre_m, slice(0, par.N_GLOBALS)),
-    ):
-        whitened = rotate(root, residual)
-        weight = np.ones(k)
-        if robust:
-            weight = 1 / (1 + np.sum(whitened**2, axis=1) / (3 * ROBUST_SIGMAS**2))
-        root_weight = np.sqrt(weight)[:, None, None]
-        root = root * root_weight
-        groups.append(
-            Group(
-                residual=whitened * root_weight[:, :, 0],
-                here=root @ here,
-                by_globals=root @ z[:, :, columns],
-                columns=columns,
-                weight=weight,
-            )
-        )
-    return groups[0], groups[1]
+    )
+
+
+def _rotation_residuals(data: Data, x: Estimate, rate_rad_s: Array, rate: Array) -> tuple[Array, Array, Array]:
+    """(K, 3) visual rotations less those of the IMU, camera frame, with derivatives by states and globals.
+
+    ``rate_rad_s`` (IMU frame) at the nodes, ``rate`` (camera frame) the mean of each node's frames.
+    """
+    k = len(data.t_s)
+    camera = x.world_from_imu @ x.cam_from_imu.T
+    rotation = so3_log(data.groups.world_from_cam.transpose(0, 2, 1) @ camera)
+    # The frames were moved to their mean instant with the first guess of the delay
+    rotation = rotation + (rate_rad_s @ x.cam_from_imu.T - rate) * x.delay_s
+    rotation_here = np.zeros((k, 3, par.N_STATE))
+    rotation_here[:, :, par.THETA] = x.cam_from_imu
+    since_middle = (data.t_s - par.middle_s(data.t_s))[:, None]
+    rotation_z = np.zeros((k, 3, par.N_GLOBALS))
+    rotation_z[:, :, par.ROTATION] = -np.eye(3)
+    rotation_z[:, :, par.DELAY] = -rate
+    rotation_z[:, :, par.CLOCK_RATE] = -rate * since_middle
+
+    return rotation, rotation_here, rotation_z
+
+
+def _centre_residuals(data: Data, x: Estimate, rate_rad_s: Array, smear: Array) -> tuple[Array, Array, Array]:
+    """(K, 3) visual centres in metres less those of the IMU, world frame, with derivatives by states and globals.
+
+    ``smear`` (K, 3): what the rolling shutter moves centres by, camera frame.
+    """
+    k = len(data.t_s)
+    camera = x.world_from_imu @ x.cam_from_imu.T
+    since_middle = (data.t_s - par.middle_s(data.t_s))[:, None]
+    lever_body = x.cam_from_imu.T @ x.imu_in_cam_m
+    half_spread_s2 = 0.5 * data.groups.spread_s2[:, None]
+    displacement = data.groups.displacement_m - half_spread_s2 * x.accel_biases_m_s2
+    displacement = displacement - rotate(data.groups.rotation_since - np.eye(3), np.broadcast_to(lever_body, (k, 3)))
+    predicted = x.imu_in_world_m + rotate(camera, smear - x.imu_in_cam_m)
+    predicted = predicted + half_spread_s2 * x.gravity_m_s2 + rotate(x.world_from_imu, displacement)
+    camera_velocity = x.velocity_m_s - rotate(x.world_from_imu, np.cross(rate_rad_s, lever_body))
+    centre = data.groups.centre * x.metres_per_unit - predicted - x.drift_m
+    centre_here = np.zeros((k, 3, par.N_STATE))
+    centre_here[:, :, par.POSITION] = -np.eye(3)
+    centre_here[:, :, par.DRIFT] = -np.eye(3)
+    centre_here[:, :, par.THETA] = x.world_from_imu @ skew(displacement - lever_body)
+    centre_here[:, :, par.ACCEL_WALK] = centre_here[:, :, par.ACCEL_SLOW] = (
+        half_spread_s2[:, :, None] * x.world_from_imu
+    )
+    centre_here[:, :, par.VELOCITY] = -camera @ x.shutter[3] @ camera.transpose(0, 2, 1)
+    centre_z = np.zeros((k, 3, par.N_GLOBALS))
+    # The noise sits on the visual centre, so a change of log u scales the prediction: total least squares
+    centre_z[:, :, par.SCALE] = -predicted
+    centre_z[:, :, par.ROTATION] = camera @ skew(x.imu_in_cam_m)
+    centre_z[:, :, par.GRAVITY] = -half_spread_s2[:, :, None] * np.eye(3)
+    centre_z[:, :, par.ACCEL_BIAS] = half_spread_s2[:, :, None] * x.world_from_imu
+    centre_z[:, :, par.LEVER] = x.world_from_imu @ data.groups.rotation_since @ x.cam_from_imu.T
+    centre_z[:, :, par.DELAY] = camera_velocity
+    centre_z[:, :, par.CLOCK_RATE] = camera_velocity * since_middle
+    return centre, centre_here, centre_z
+
+
+def _weighted_group(
+    residual: Array, here: Array, by_globals: Array, root: Array, columns: slice, *, robust: bool
+) -> Group:
+    """Whitened residuals; with ``robust``, by the weights of Cauchy's loss."""
+    whitened = rotate(root, residual)
+    weight = np.ones(len(residual))
+    if robust:
+        weight = 1 / (1 + np.sum(whitened**2, axis=1) / (3 * ROBUST_SIGMAS**2))
+    root_weight = np.sqrt(weight)[:, None, None]
+    root = root * root_weight
+    return Group(
+        residual=whitened * root_weight[:, :, 0],
+        here=root @ here,
+        by_globals=root @ by_globals,
+        columns=columns,
+        weight=weight,
+    )
 
 
 #: Which cause of the scale's variance (``parts.CAUSES``) the groups of :func:`all_groups` belong to.

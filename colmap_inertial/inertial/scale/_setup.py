@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.arrays import Array, IndexArray
 from colmap_inertial.core.camera_clock import CameraTimedImu
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import matrix_from_quat
@@ -13,7 +13,7 @@ from colmap_inertial.inertial.core import parameters as par
 from colmap_inertial.inertial.core.parameters import Estimate, Prior
 from colmap_inertial.inertial.core.preintegration import SensorStreams, find_saturated
 from colmap_inertial.inertial.core.priors import PRIORS, gains_cov
-from colmap_inertial.inertial.scale._grouping import Data, find_breaks, group_frames
+from colmap_inertial.inertial.scale._grouping import Data, Groups, find_breaks, group_frames
 from colmap_inertial.inertial.scale._noise import roughness
 
 #: Standard deviation of rows' times about the middle row, in readouts (uniform over the picture).
@@ -23,6 +23,8 @@ _NEAR_M, _FAR_M = 1.0, 2.0
 #: An alignment's covariance stems from the very data that are used again here.
 _COUNTED_ONCE = 5.0
 _MIN_STATES, _FEWEST_READINGS = 8, 4
+#: Frames nearer to the recording's ends than this are left out.
+_MARGIN_S = 0.02
 #: Recordings with more states than the first have fewer of them in a second, down to the second.
 _MANY_STATES, _FEWEST_HZ = 2400.0, 2.0
 
@@ -52,34 +54,12 @@ def prepare(
                 "the sensor a wider range",
             )
     streams = SensorStreams.from_camera(timed)
-    gyro, accel = streams.gyro, streams.accel
-    margin_s = 0.02
-    begin_s = max(gyro.t_s[0], accel.t_s[0]) + margin_s
-    end_s = min(gyro.t_s[-1], accel.t_s[-1]) - margin_s
+    begin_s = max(streams.gyro.t_s[0], streams.accel.t_s[0]) + _MARGIN_S
+    end_s = min(streams.gyro.t_s[-1], streams.accel.t_s[-1]) - _MARGIN_S
     inside = np.flatnonzero((trajectory.t_s >= begin_s) & (trajectory.t_s <= end_s))
     centre = trajectory.cam_in_world[inside]
-    if len(inside) and float(np.max(np.ptp(centre, axis=0))) == 0.0:
-        raise NotObservableError("scale", "the camera does not move in the model: move it, do not only turn it")
     cam_from_imu = matrix_from_quat(calibration.cam_from_imu_xyzw)
-    groups = None
-    if len(inside) > 1:
-        span_s = float(trajectory.t_s[inside[-1]] - trajectory.t_s[inside[0]])
-        groups = group_frames(
-            trajectory.t_s[inside],
-            matrix_from_quat(trajectory.cam_from_world_xyzw[inside]).transpose(0, 2, 1),
-            centre - centre.mean(axis=0),
-            rate_hz=max(min(_MANY_STATES / span_s, states_hz), min(_FEWEST_HZ, states_hz)),
-            streams=streams,
-            gyro_bias_rad_s=calibration.gyro_bias_rad_s,
-            cam_from_imu=cam_from_imu,
-        )
-    k = 0 if groups is None else len(groups.t_s)
-    if groups is None or k < _MIN_STATES:
-        raise NotObservableError(
-            "scale",
-            f"only {k} camera poses, an eighth of a second or more apart, lie inside the IMU recording and at least "
-            f"{_MIN_STATES} are needed: record a longer clip, or check that both recordings belong together",
-        )
+    groups = _group_poses(trajectory, inside, streams, calibration, states_hz)
     world_from_cam = groups.world_from_cam
     pose_cov = None
     if trajectory.pose_cov is not None:
@@ -100,7 +80,7 @@ def prepare(
     )
 
     world_from_imu = world_from_cam @ cam_from_imu
-    mean_force = np.mean((world_from_imu @ accel.at(data.t_s)[0][:, :, None])[:, :, 0], axis=0)
+    mean_force = np.mean((world_from_imu @ streams.accel.at(data.t_s)[0][:, :, None])[:, :, 0], axis=0)
     gravity = -mean_force * gravity_m_s2 / max(float(np.linalg.norm(mean_force)), 1e-9)
     mean = Estimate.at_start(
         world_from_imu, gravity, cam_from_imu, calibration.imu_in_cam_m, calibration.gyro_bias_rad_s
@@ -112,6 +92,39 @@ def prepare(
         gravity_sigma_m_s2=gravity_sigma_m_s2,
     )
     return data, prior
+
+
+def _group_poses(
+    trajectory: CameraTrajectory,
+    inside: IndexArray,
+    streams: SensorStreams,
+    calibration: CameraImuCalibration,
+    states_hz: float,
+) -> Groups:
+    """Averaged poses of the frames inside the recording; refuse too few, or a camera that does not move."""
+    centre = trajectory.cam_in_world[inside]
+    if len(inside) and float(np.max(np.ptp(centre, axis=0))) == 0.0:
+        raise NotObservableError("scale", "the camera does not move in the model: move it, do not only turn it")
+    groups = None
+    if len(inside) > 1:
+        span_s = float(trajectory.t_s[inside[-1]] - trajectory.t_s[inside[0]])
+        groups = group_frames(
+            trajectory.t_s[inside],
+            matrix_from_quat(trajectory.cam_from_world_xyzw[inside]).transpose(0, 2, 1),
+            centre - centre.mean(axis=0),
+            rate_hz=max(min(_MANY_STATES / span_s, states_hz), min(_FEWEST_HZ, states_hz)),
+            streams=streams,
+            gyro_bias_rad_s=calibration.gyro_bias_rad_s,
+            cam_from_imu=matrix_from_quat(calibration.cam_from_imu_xyzw),
+        )
+    k = 0 if groups is None else len(groups.t_s)
+    if groups is None or k < _MIN_STATES:
+        raise NotObservableError(
+            "scale",
+            f"only {k} camera poses, an eighth of a second or more apart, lie inside the IMU recording and at least "
+            f"{_MIN_STATES} are needed: record a longer clip, or check that both recordings belong together",
+        )
+    return groups
 
 
 def _information(calibration: CameraImuCalibration, imu: ImuRecording) -> Array:

@@ -198,14 +198,13 @@ class FittedPath:
         (first_s, first), (last_s, last) = self._stamps_s
         return np.asarray(first + (instant_s - first_s) * (last - first) / (last_s - first_s))
 
-    def at(self, nodes: Int64Array) -> Posterior:
-        """The posterior of n of the nodes and of what is global."""
+    def _rows(self, nodes: Int64Array) -> tuple[Array, Array]:
+        """What is asked for of n nodes, by the fit's states (K, 21, s) and globals (79, s)."""
         fit, x, t_s = self._fit, self._fit.estimate, self._data.t_s
-        n, k, middle_s = len(nodes), len(t_s), par.middle_s(t_s)
-        since_s = t_s[nodes] - middle_s
+        n, k = len(nodes), len(t_s)
+        since_s = t_s[nodes] - par.middle_s(t_s)
         size = NODE * n + OWN + SHARED
         own, shared = NODE * n, NODE * n + OWN
-        # rows of what is asked for, by the fit's states and globals
         states, z = np.zeros((k, par.N_STATE, size)), np.zeros((par.N_GLOBALS, size))
         eye = np.eye(3)
         for i, node in enumerate(nodes.tolist()):
@@ -227,6 +226,14 @@ class FittedPath:
         z[par.GRAVITY, own + GRAVITY.start : own + GRAVITY.stop] = eye
         z[par.DELAY, own + DELAY] = z[par.CLOCK_RATE, own + CLOCK_RATE] = 1.0
         z[_SHARED, shared + np.arange(SHARED)] = 1.0
+        return states, z
+
+    def at(self, nodes: Int64Array) -> Posterior:
+        """The posterior of n of the nodes and of what is global."""
+        fit, x, t_s = self._fit, self._fit.estimate, self._data.t_s
+        n = len(nodes)
+        own = NODE * n
+        states, z = self._rows(nodes)
         solved, solved_z, _ = fit.system.solve(states, z)
         cov = np.einsum("kma,kmb->ab", states, solved) + z.T @ solved_z
         cov = 0.5 * self._widened * (cov + cov.T)
@@ -257,7 +264,7 @@ class FittedPath:
             accel_gain=x.accel_gain,
             cam_from_imu=x.cam_from_imu,
             imu_in_cam_m=x.imu_in_cam_m,
-            since_middle_s=since_s,
+            since_middle_s=t_s[nodes] - par.middle_s(t_s),
             cov=cov,
             prior_info=info,
             prior_offset=found,

@@ -168,6 +168,14 @@ def refine_alignment(
         if iteration > 8 and np.all(np.abs(step) < 1e-3 * np.sqrt(np.diag(cov))):
             break
     cov = _widened(cov, white_residual, white_jacobian, dt_s)
+    _require_observable(cov, state.offset_s - start.offset_s)
+    fitted = _completed(prior, state.rotation, state.offset_s - shift_s, state.bias, cov[:_N, :_N])
+    fitted = replace(fitted, clock_rate=float(state.nuisance[_RATE]), clock_middle_s=middle_s)
+    return Alignment(calibration=fitted, clock_rate_sigma=float(np.sqrt(cov[-1, -1])))
+
+
+def _require_observable(cov: Array, offset_change_s: float) -> None:
+    """Refuse rotations that leave an axis or the offset open."""
     axis_sigma = float(np.sqrt(np.linalg.eigvalsh(cov[_TURN, _TURN])[-1]))
     if axis_sigma > _OPEN_ROTATION_RAD:
         hint = (
@@ -175,12 +183,9 @@ def refine_alignment(
             "two axes while recording"
         )
         raise NotObservableError("camera-IMU rotation", hint)
-    if cov[_OFFSET, _OFFSET] > _OPEN_OFFSET_S**2 or abs(state.offset_s - start.offset_s) > 0.5:
+    if cov[_OFFSET, _OFFSET] > _OPEN_OFFSET_S**2 or abs(offset_change_s) > 0.5:
         hint = "the rotation is too slow to place the clocks to a tenth of a second: turn the camera more briskly"
         raise NotObservableError("time offset", hint)
-    fitted = _completed(prior, state.rotation, state.offset_s - shift_s, state.bias, cov[:_N, :_N])
-    fitted = replace(fitted, clock_rate=float(state.nuisance[_RATE]), clock_middle_s=middle_s)
-    return Alignment(calibration=fitted, clock_rate_sigma=float(np.sqrt(cov[-1, -1])))
 
 
 def middle_of_overlap(trajectory: CameraTrajectory, imu_t_s: Array, offset_s: float) -> float:

@@ -9,6 +9,7 @@ convention is named only where it beats the one that was read as clearly as an a
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -73,16 +74,18 @@ class LikelyConvention:
 
 def _difference(read_as: PoseConvention, written_as: PoseConvention) -> str:
     """What is different in the table from what is read."""
-    said = []
+    differences = []
     if written_as.rotation != read_as.rotation:
-        said.append(f"the quaternions are inverted ({written_as.rotation}, not {read_as.rotation})")
+        differences.append(f"the quaternions are inverted ({written_as.rotation}, not {read_as.rotation})")
     if written_as.order != read_as.order:
-        said.append(f"the quaternions are in the order {' '.join(written_as.order)}, not {' '.join(read_as.order)}")
+        differences.append(
+            f"the quaternions are in the order {' '.join(written_as.order)}, not {' '.join(read_as.order)}"
+        )
     if written_as.position != read_as.position:
         centre, translation = "the camera's centre", "the translation of camera_from_world"
         what = (translation, centre) if written_as.position == "translation" else (centre, translation)
-        said.append(f"the positions are {what[0]}, not {what[1]} (centre = -R' translation)")
-    return " and ".join(said)
+        differences.append(f"the positions are {what[0]}, not {what[1]} (centre = -R' translation)")
+    return " and ".join(differences)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -137,32 +140,21 @@ def likely_convention(
     margin = options.min_log_likelihood
 
     def fit(read: CameraTrajectory, by: ImuRecording) -> ClockFit | None:
-        found = coarse_fit(read, by, prior=prior, options=options)
-        return found if isinstance(found, ClockFit) else None
+        searched = coarse_fit(read, by, prior=prior, options=options)
+        return searched if isinstance(searched, ClockFit) else None
 
-    fits: dict[tuple[str, str], ClockFit | None] = {}
-    candidates = []
-    for convention in (read_as, *read_as.others()):
-        read = reread(trajectory, read_as, convention)
-        rotation = (convention.rotation, convention.order)
-        if rotation not in fits:
-            fits[rotation] = fit(read, imu)
-        found = fits[rotation]
-        if found is not None:
-            candidates.append(_judged(convention, read, imu, found, prior, as_read=convention == read_as))
-            if convention == read_as and candidates[0].fits:
-                return None
+    candidates = _evaluate_conventions(trajectory, imu, read_as, prior, fit)
     if not candidates:
         return None
     best = max(candidates, key=lambda one: one.evidence)
     as_read = next((one for one in candidates if one.convention == read_as), None)
     ahead = np.inf if as_read is None else best.evidence - as_read.evidence
-    explains = best.acceleration - best.still >= margin
     if ahead < margin or best.steadiness < _STEADY:
         return None
     if _inverts(read_as, best.convention):
         mirrored = fit(trajectory, replace(imu, gyro_rad_s=-imu.gyro_rad_s))
         lead = np.inf if mirrored is None else best.rotation - mirrored.log_likelihood
+        explains = best.acceleration - best.still >= margin
         if lead < -margin or (lead < margin and not explains):
             return None
     equal = tuple(one.convention for one in candidates if best.evidence - one.evidence < margin)
@@ -170,12 +162,37 @@ def likely_convention(
     return LikelyConvention(read_as=read_as, written_as=as_positions or equal, log_likelihood=float(ahead))
 
 
+def _evaluate_conventions(
+    trajectory: CameraTrajectory,
+    imu: ImuRecording,
+    read_as: PoseConvention,
+    prior: CameraImuCalibration,
+    fit: Callable[[CameraTrajectory, ImuRecording], ClockFit | None],
+) -> list[_Candidate]:
+    """Evidence for each convention whose rotations fit; empty where the one that was read fits beyond doubt."""
+    fits: dict[tuple[str, str], ClockFit | None] = {}
+    candidates: list[_Candidate] = []
+    for convention in (read_as, *read_as.others()):
+        read = reread(trajectory, read_as, convention)
+        rotation = (convention.rotation, convention.order)
+        if rotation not in fits:
+            fits[rotation] = fit(read, imu)
+        clock_fit = fits[rotation]
+        if clock_fit is not None:
+            candidates.append(
+                _evaluate_candidate(convention, read, imu, clock_fit, prior, as_read=convention == read_as)
+            )
+            if convention == read_as and candidates[0].fits:
+                return []
+    return candidates
+
+
 def _inverts(read_as: PoseConvention, written_as: PoseConvention) -> bool:
     """Whether the rotations of a table, read by one instead of the other, turn the wrong way to a gyroscope."""
     return (read_as.rotation != written_as.rotation) != (read_as.order != written_as.order)
 
 
-def _judged(
+def _evaluate_candidate(
     convention: PoseConvention,
     read: CameraTrajectory,
     imu: ImuRecording,
@@ -196,7 +213,7 @@ def _judged(
         return _Candidate(convention=convention, rotation=fit.log_likelihood)
     # one independent vector in each window
     components = 3 * quick.seconds / ACCELERATION_S
-    still, moving, positive = _left(quick)
+    still, moving, positive = _fit_residual_accelerations(quick)
     explains = moving < (1 - _EXPLAINED) * still
     # the accelerometer may be flipped; other poses than those that were read must not rest on that
     if not as_read and not (positive and explains):
@@ -211,7 +228,7 @@ def _judged(
     )
 
 
-def _left(quick: QuickAccelerations) -> tuple[float, float, bool]:
+def _fit_residual_accelerations(quick: QuickAccelerations) -> tuple[float, float, bool]:
     """Mean square acceleration (m2/s4) that a lever arm leaves, and that it leaves along with the visual acceleration.
 
     Also whether the factor of the latter is positive.

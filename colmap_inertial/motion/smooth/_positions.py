@@ -102,7 +102,7 @@ class PositionSmoother:
             left_out=np.zeros(count, dtype=bool),
             jumps=np.zeros(count - 1, dtype=bool),
         )
-        constant, chain = _without_outliers(model, options.outlier_chi2)
+        constant, chain = _remove_outliers(model, options.outlier_chi2)
         return cls(
             trajectory=trajectory,
             noise_sigma=size * float(np.sqrt(np.median(chain.measured_var))),
@@ -182,7 +182,7 @@ class _Model:
         return constant, self.chain(constant, variance(self.chain(constant, 1.0)))
 
 
-def _without_outliers(model: _Model, limit: float) -> tuple[float, Chain]:
+def _remove_outliers(model: _Model, limit: float) -> tuple[float, Chain]:
     """Leave out poses, and allow jumps, one neighbourhood at a time, until nothing contradicts the rest."""
     constant, chain = model.most_likely()
     for _ in range(_ROUNDS):

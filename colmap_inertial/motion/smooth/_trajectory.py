@@ -87,21 +87,14 @@ def smooth_trajectory(
         For fewer than six poses, without an accelerometer, or where the IMU recorded during none of the frame
         intervals.
     """
-    options = options or SmoothOptions()
-    if trajectory.length_unit != "m":
-        raise ValueError("smooth_trajectory needs a metric trajectory")
-    if len(trajectory) < 6:
-        raise NotObservableError("smooth motion", f"{len(trajectory)} poses are too few to tell motion from noise")
-    if not imu.has_accel:
-        hint = "the recording has no accelerometer; record it along with the gyroscope"
-        raise NotObservableError("smooth motion", hint)
+    _require_smoothable(trajectory, imu)
     timed = CameraTimedImu.from_recording(imu, calibration, trajectory.epoch_ns)
     attitude = smooth_attitude(trajectory, timed)
     bias = np.zeros(3) if accel_bias_m_s2 is None else np.asarray(accel_bias_m_s2, dtype=np.float64)
-    gravity = np.asarray(gravity_in_world_m_s2, dtype=np.float64)
-    inertial = WorldAcceleration.of(timed, attitude, bias_m_s2=bias, gravity_in_world_m_s2=gravity)
-    t_s = trajectory.t_s
-    silent = ~inertial.covers(t_s)
+    inertial = WorldAcceleration.of(
+        timed, attitude, bias_m_s2=bias, gravity_in_world_m_s2=np.asarray(gravity_in_world_m_s2, dtype=np.float64)
+    )
+    t_s, silent = trajectory.t_s, ~inertial.covers(trajectory.t_s)
     if silent.all():
         raise NotObservableError("smoothed trajectory", "the IMU recorded during none of the frame intervals")
 
@@ -118,9 +111,9 @@ def smooth_trajectory(
         jumps=np.zeros(len(t_s) - 1, dtype=bool),
         motion_density=2 * _MOTION_S * inertial.variance,
     )
-    model, logs = _without_outliers(model, options.outlier_chi2)
+    model, logs = _remove_outliers(model, (options or SmoothOptions()).outlier_chi2)
     if also_at_s is not None:
-        model = _with_instants(model, inertial, also_at_s)
+        model = _insert_instants(model, inertial, also_at_s)
     chain, t_s = model.chain(logs), model.t_s
     world_from_imu, rate = attitude.at(t_s)
 
@@ -146,7 +139,17 @@ def smooth_trajectory(
     )
 
 
-def _with_instants(model: _Model, inertial: WorldAcceleration, also_at_s: Array) -> _Model:
+def _require_smoothable(trajectory: CameraTrajectory, imu: ImuRecording) -> None:
+    if trajectory.length_unit != "m":
+        raise ValueError("smooth_trajectory needs a metric trajectory")
+    if len(trajectory) < 6:
+        raise NotObservableError("smooth motion", f"{len(trajectory)} poses are too few to tell motion from noise")
+    if not imu.has_accel:
+        hint = "the recording has no accelerometer; record it along with the gyroscope"
+        raise NotObservableError("smooth motion", hint)
+
+
+def _insert_instants(model: _Model, inertial: WorldAcceleration, also_at_s: Array) -> _Model:
     """The model with states at instants that nothing was measured at."""
     asked = np.unique(np.asarray(also_at_s, dtype=np.float64))
     nearest = np.minimum(np.searchsorted(model.t_s, asked), len(model.t_s) - 1)
@@ -234,7 +237,7 @@ class _Model:
         )
 
 
-def _without_outliers(model: _Model, limit: float) -> tuple[_Model, Array]:
+def _remove_outliers(model: _Model, limit: float) -> tuple[_Model, Array]:
     """The model without the poses and with the jumps that contradict the rest, and its noise."""
     usual = 2 * np.log(_USUAL)
     logs = usual
