@@ -53,16 +53,17 @@ from .imaging.psf import blur_field as blur_field, frame_blur as frame_blur
 from .imaging.wiener import DeblurOptions as DeblurOptions, deblur as deblur
 from .inertial.scale import estimate_scale as estimate_scale, gravity_at_latitude_m_s2 as gravity_at_latitude_m_s2
 from .inertial.static_calibration import RestCalibration as RestCalibration, calibrate_imu as calibrate_imu
-from .io.calibration import read_calibration as read_calibration, write_calibration as write_calibration
-from .io.capture import Capture as Capture, load_capture as load_capture
-from .io.frames import read_frame_times as read_frame_times, read_frames as read_frames
-from .io.imu import read_frame_log as read_frame_log, read_imu as read_imu
-from .io.imu_calibration import (
+from .io.calibration import (
+    read_calibration as read_calibration,
     read_imu_calibration as read_imu_calibration,
+    write_calibration as write_calibration,
     write_imu_calibration as write_imu_calibration,
 )
+from .io.capture import Capture as Capture, load_capture as load_capture
+from .io.files import reading_within as reading_within
+from .io.frames import read_frame_times as read_frame_times, read_frames as read_frames
+from .io.imu import read_frame_log as read_frame_log, read_imu as read_imu
 from .io.imu_formats import ImuFormat as ImuFormat
-from .io.limits import reading_within as reading_within
 from .io.pose_convention import PoseConvention as PoseConvention
 from .model import (
     Model as Model,

@@ -39,7 +39,7 @@ from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.types import CameraModel
 from colmap_inertial.io.files import read_json
 from colmap_inertial.model import read_model
-from colmap_inertial.model.depth_maps import read_map
+from colmap_inertial.model.artefacts import read_map
 from colmap_inertial.pipeline.run.workspace import Workspace
 from colmap_inertial.tools.simulate import (
     Scene,

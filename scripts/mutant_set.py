@@ -655,7 +655,7 @@ MUTANTS = (
         ("io_gopro",),
     ),
     Mutant(
-        "io/exposures.py",
+        "io/aperture_images.py",
         "t_s=short.t_s + self.delay_s",
         "t_s=short.t_s - self.delay_s",
         "long exposures precede their short ones",
@@ -949,7 +949,7 @@ MUTANTS = (
         ("exposures_capture::test_another_long_exposure_makes_the_frames_again",),
     ),
     Mutant(
-        "io/imu_calibration.py",
+        "io/calibration.py",
         "return replace(found, camera_imu=for_another_recording(found.camera_imu, shared_clock=shared_clock))",
         "return found",
         "another recording's time offset counts for this one",
@@ -1320,7 +1320,7 @@ MUTANTS = (
         ("diagnose_study::test_a_seeded_fault_is_named",),
     ),
     Mutant(
-        "io/guess.py",
+        "io/imu_text.py",
         "found += [(others,",
         "found += [(not others,",
         "the hint for a table takes a gyroscope's column for the accelerometer's",

@@ -431,7 +431,7 @@ def main(arguments: list[str] | None = None) -> int:
         if options.faults and not any(fault.name.startswith(name) for name in options.faults):
             continue
         rng = np.random.default_rng([options.seed, i])
-        # flown ones tell nothing of gravity; see io/consistency.py
+        # flown ones tell nothing of gravity; see io/plausible.py
         fit = [base for base in clean if not fault.handheld or not base.name.startswith(("V", "room"))]
         base = fit[rng.integers(len(fit))]
         found = diagnose(fault.make(base, rng))

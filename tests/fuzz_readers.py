@@ -22,9 +22,8 @@ from colmap_inertial.core.errors import InertialError
 from colmap_inertial.core.options import ReconstructOptions
 from colmap_inertial.io.calibration import read_calibration
 from colmap_inertial.io.capture import load_capture
-from colmap_inertial.io.exif import stamps_of_exif
+from colmap_inertial.io.exif import stamps_of_exif, stated_exposures_s
 from colmap_inertial.io.frame_times import stamps_of_log
-from colmap_inertial.io.image_metadata import stated_exposures_s
 from colmap_inertial.io.images import read_image
 from colmap_inertial.io.imu import read_frame_log, read_imu
 from colmap_inertial.io.rig_calibration import read_rig_calibration

@@ -10,7 +10,7 @@ import pytest
 
 from colmap_inertial.colmap import loop_closure
 from colmap_inertial.colmap.loop_closure import LoopClosure, MappedCapture, close_gaps
-from colmap_inertial.io.records import read_record, write_record
+from colmap_inertial.io.files import read_record, write_record
 
 #: A camera turns once around in the middle of a round room, looking outwards.
 FRAMES, RING_M, ROOM_M = 48, 3.0, 5.0

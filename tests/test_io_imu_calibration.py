@@ -15,15 +15,17 @@ from colmap_inertial.cli import main, parse
 from colmap_inertial.core.errors import FormatError, OutputError
 from colmap_inertial.core.options import ReconstructOptions
 from colmap_inertial.core.types import ImuCalibration, ImuRecording
-from colmap_inertial.io.calibration import calibration_prior, read_calibration, write_calibration
-from colmap_inertial.io.capture import load_capture
-from colmap_inertial.io.imu import read_imu
-from colmap_inertial.io.imu_calibration import (
+from colmap_inertial.io.calibration import (
     calibration_kind,
+    calibration_prior,
+    read_calibration,
     read_calibrations,
     read_imu_calibration,
+    write_calibration,
     write_imu_calibration,
 )
+from colmap_inertial.io.capture import load_capture
+from colmap_inertial.io.imu import read_imu
 from colmap_inertial.pipeline.run.config import config_as_toml, read_config
 from colmap_inertial.pipeline.run.context import corrected_imu, prior_calibration
 from colmap_inertial.reconstruction.drivers import device_store

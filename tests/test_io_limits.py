@@ -18,11 +18,10 @@ from colmap_inertial.cli import _COMMANDS, main
 from colmap_inertial.core.errors import FormatError, InertialError
 from colmap_inertial.core.options import ReadLimits, ReconstructOptions
 from colmap_inertial.core.threads import in_order
-from colmap_inertial.io.files import first_line, read_bytes, read_json, read_yaml
+from colmap_inertial.io.files import first_line, read_bytes, read_json, read_limits, read_yaml, reading_within
 from colmap_inertial.io.frame_times import stamps_of_csv
 from colmap_inertial.io.images import _stated_size, read_image
 from colmap_inertial.io.imu import read_imu
-from colmap_inertial.io.limits import read_limits, reading_within
 from colmap_inertial.io.tables import read_table
 from colmap_inertial.io.video import video_stamps_ns
 from colmap_inertial.pipeline.run.config import read_config

@@ -12,7 +12,7 @@ import pytest
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.types import ImuRecording
 from colmap_inertial.io.imu import read_imu
-from colmap_inertial.io.plausible import check_consistent, check_plausible, check_rates
+from colmap_inertial.io.plausible import RawImu, check_consistent, check_rates
 from colmap_inertial.io.units import Axes
 from colmap_inertial.tools.simulate.motion import MotionKind, MotionOptions
 from colmap_inertial.tools.simulate.recording import RecordingOptions, simulate_recording
@@ -80,14 +80,14 @@ def test_every_altered_recording_is_refused_with_what_to_set(
     recordings: dict[str, ImuRecording], name: str, said: str
 ) -> None:
     with pytest.raises(FormatError, match=said):
-        check_plausible(ALTERATIONS[said](recordings[name]), Path("x"))
+        RawImu(imu=ALTERATIONS[said](recordings[name]), path=Path("x")).check()
 
 
 @pytest.mark.parametrize("seconds", [60.0, 25.0, 5.0, 1.0])
 def test_no_part_of_a_clean_recording_is_refused(recordings: dict[str, ImuRecording], seconds: float) -> None:
     for imu in recordings.values():
         for part in pieces(imu, seconds):
-            check_plausible(part, Path("x"))
+            RawImu(imu=part, path=Path("x")).check()
 
 
 HANDHELD = RECORDINGS[:-1]
@@ -119,7 +119,7 @@ def test_nearly_every_wrong_axis_of_a_gyroscope_is_noticed_and_named_rightly(
     for wrong in SIGNED_PERMUTATIONS[1:]:
         altered = replace(imu, gyro_rad_s=imu.gyro_rad_s @ wrong.T)
         try:
-            check_plausible(altered, Path("x"))
+            RawImu(imu=altered, path=Path("x")).check()
         except FormatError as error:
             noticed += 1
             np.testing.assert_array_equal(settings(str(error))["gyro"].matrix @ wrong, np.eye(3))
@@ -135,7 +135,7 @@ def test_a_mirrored_accelerometer_is_noticed_and_named(recordings: dict[str, Imu
         for name in HANDHELD:
             imu = recordings[name]
             try:
-                check_plausible(replace(imu, accel_m_s2=imu.accel_m_s2 * mirror), Path("x"))
+                RawImu(imu=replace(imu, accel_m_s2=imu.accel_m_s2 * mirror), path=Path("x")).check()
             except FormatError as error:
                 noticed[axis] += 1
                 np.testing.assert_array_equal(settings(str(error))["accel"].matrix, np.diag(mirror))
@@ -155,12 +155,12 @@ def test_the_advice_for_an_accelerometer_of_any_mirrored_axes_restores_it(
     for wrong in MIRRORED:
         altered = replace(imu, accel_m_s2=imu.accel_m_s2 @ wrong.T)
         try:
-            check_plausible(altered, Path("x"))
+            RawImu(imu=altered, path=Path("x")).check()
         except FormatError as error:
             axes = settings(str(error))["accel"]
             corrected = replace(altered, accel_m_s2=axes.apply(altered.accel_m_s2))
             np.testing.assert_allclose(corrected.accel_m_s2, imu.accel_m_s2)
-            check_plausible(corrected, Path("x"), accel_axes=axes)
+            RawImu(imu=corrected, path=Path("x"), accel_axes=axes).check()
             restored += 1
     assert restored >= 22  # of 24; see the test of the gyroscope's axes
 
@@ -195,13 +195,13 @@ def test_axes_to_set_replace_those_that_were_set(recordings: dict[str, ImuRecord
     wrong = Axes.parse("-z,y,x")
     altered = replace(imu, gyro_rad_s=wrong.apply(imu.gyro_rad_s))
     with pytest.raises(FormatError) as caught:
-        check_plausible(altered, Path("x"), gyro_axes=wrong)
+        RawImu(imu=altered, path=Path("x"), gyro_axes=wrong).check()
     assert str(settings(str(caught.value))["gyro"]) == "x,y,z"
     wrong = Axes.parse("y,z,-x")
     assert wrong.is_mirrored
     altered = replace(imu, accel_m_s2=wrong.apply(imu.accel_m_s2))
     with pytest.raises(FormatError) as caught:
-        check_plausible(altered, Path("x"), accel_axes=wrong)
+        RawImu(imu=altered, path=Path("x"), accel_axes=wrong).check()
     assert str(settings(str(caught.value))["accel"]) == "x,y,z"
 
 
@@ -210,7 +210,7 @@ def test_a_wrong_unit_of_a_slow_gyroscope_is_noticed_by_gravity(recordings: dict
     imu = recordings[name]
     for factor, unit in ((180 / np.pi, "deg/s"), (np.pi / 180, "rad/s")):
         with pytest.raises(FormatError, match=f'unit = "{unit}" under'):
-            check_consistent(replace(imu, gyro_rad_s=imu.gyro_rad_s * factor), Path("x"))
+            check_consistent(RawImu(imu=replace(imu, gyro_rad_s=imu.gyro_rad_s * factor), path=Path("x")))
 
 
 def test_a_gyroscope_in_a_moving_car_and_one_in_strong_shake_are_accepted(shared_data: Path) -> None:
@@ -218,12 +218,10 @@ def test_a_gyroscope_in_a_moving_car_and_one_in_strong_shake_are_accepted(shared
     check_rates(car, Path("x"))
     rows = np.loadtxt(shared_data / "deepgyro/raw/imu/imu.txt")
     gyro, accel = rows[rows[:, 0] == 4], rows[rows[:, 0] == 1]
-    check_plausible(
-        ImuRecording(
-            gyro_t_s=gyro[:, 1] / 1e9, gyro_rad_s=gyro[:, 2:], accel_t_s=accel[:, 1] / 1e9, accel_m_s2=accel[:, 2:]
-        ),
-        Path("x"),
+    imu = ImuRecording(
+        gyro_t_s=gyro[:, 1] / 1e9, gyro_rad_s=gyro[:, 2:], accel_t_s=accel[:, 1] / 1e9, accel_m_s2=accel[:, 2:]
     )
+    RawImu(imu=imu, path=Path("x")).check()
 
 
 def test_no_simulated_recording_is_refused() -> None:
@@ -231,7 +229,7 @@ def test_no_simulated_recording_is_refused() -> None:
     for seed in range(6 * len(kinds)):
         motion = MotionOptions(kind=kinds[seed % len(kinds)], duration_s=(60, 30, 20)[seed % 3])
         imu = list(IMU_PRESETS.values())[seed // len(kinds) % len(IMU_PRESETS)]
-        check_plausible(simulate_recording(RecordingOptions(motion=motion, imu=imu), seed=seed).imu, Path("x"))
+        RawImu(imu=simulate_recording(RecordingOptions(motion=motion, imu=imu), seed=seed).imu, path=Path("x")).check()
 
 
 def test_a_still_camera_is_accepted() -> None:
@@ -243,4 +241,4 @@ def test_a_still_camera_is_accepted() -> None:
         accel_t_s=t_s,
         accel_m_s2=rng.normal([0.2, 9.6, 0.5], 0.02, (1000, 3)),
     )
-    check_plausible(still, Path("x"))
+    RawImu(imu=still, path=Path("x")).check()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from colmap_inertial.io.capture import load_capture
-from colmap_inertial.io.readouts import published_readouts, readout_of_video
+from colmap_inertial.io.video import published_readouts, readout_of_video
 
 
 def film(path: Path, *, model: str = "iPhone 3GS", rate: int = 30, size: tuple[int, int] = (640, 480)) -> Path:

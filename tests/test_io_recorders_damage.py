@@ -17,7 +17,7 @@ from colmap_inertial.core.errors import FormatError, InertialError
 from colmap_inertial.core.types import ImuRecording
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.imu import read_frame_log, read_imu
-from colmap_inertial.io.zipped import text_of
+from colmap_inertial.io.tables import text_of
 
 MUTATIONS = 200
 #: Sizes that a damaged box or entry may state.

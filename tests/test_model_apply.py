@@ -24,11 +24,11 @@ from colmap_inertial.core.errors import AlreadyMetricError, FormatError, Inertia
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.model import copying, mean_reprojection_error_px, read_model, similarity_as_json
 from colmap_inertial.model.artefacts import transform_depth_map, transform_obj, transform_options
-from colmap_inertial.model.binary import check_binary_model
 from colmap_inertial.model.database import transform_database
 from colmap_inertial.model.layout import read_layout
 from colmap_inertial.model.project import apply_to_project, undo_project
 from colmap_inertial.model.similarities import ModelScale, plain_factor, read_scales, read_similarity
+from colmap_inertial.model.soundness import check_binary_model
 
 ROTATION = matrix_from_quat(SIMILARITY.rotation_xyzw)
 

@@ -17,7 +17,7 @@ from colmap_inertial.core.types import Frame, FrameTiming
 from colmap_inertial.io.aperture_images import SubImages
 from colmap_inertial.io.capture import ImageFolder
 from colmap_inertial.io.exif import stamps_of_exif
-from colmap_inertial.io.names import check_names, path_in
+from colmap_inertial.io.files import check_names, path_in
 from colmap_inertial.model import read_model
 from colmap_inertial.pipeline.run.progress import silent
 from colmap_inertial.pipeline.stages.frame_folder import FramePaths, write_frames

@@ -21,7 +21,7 @@ from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.options import DenseOptions, ProjectOptions, ReconstructOptions
 from colmap_inertial.io.ply import read_ply_header
 from colmap_inertial.model import read_model
-from colmap_inertial.model.depth_maps import read_map, write_map
+from colmap_inertial.model.artefacts import read_map, write_map
 from colmap_inertial.reconstruction.drivers.project import reconstruct_project
 
 QUICK = ReconstructOptions(dense=True, dense_options=DenseOptions(max_image_size=96), deterministic=True)

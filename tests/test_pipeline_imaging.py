@@ -17,8 +17,8 @@ from colmap_inertial.core.errors import InertialError, NotObservableError
 from colmap_inertial.core.options import MappingOptions, ReconstructOptions
 from colmap_inertial.imaging.psf import blur_field
 from colmap_inertial.io.capture import load_capture
+from colmap_inertial.io.exif import carry_metadata, stated_exposures_s
 from colmap_inertial.io.frames import read_frames
-from colmap_inertial.io.image_metadata import carry_metadata, stated_exposures_s
 from colmap_inertial.io.imu import read_capture_imu
 from colmap_inertial.model import colmap_camera, read_model
 from colmap_inertial.pipeline.run.context import Recording, RunContext, prior_calibration

@@ -19,7 +19,7 @@ from colmap_inertial.inertial.refine.solve import held_out, solve
 from colmap_inertial.inertial.refine.values import ROTATION
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.io.capture import Capture
-from colmap_inertial.io.records import read_record
+from colmap_inertial.io.files import read_record
 from colmap_inertial.io.trajectories import read_tum
 from colmap_inertial.model import Model
 from colmap_inertial.pipeline.run.context import Recording

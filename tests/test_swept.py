@@ -13,7 +13,7 @@ from colmap_inertial.colmap.depth_maps import MadeFrom, choose_maker, coverage, 
 from colmap_inertial.colmap.fusion import fuse_maps
 from colmap_inertial.colmap.sweep_stereo import SweptWorkspace
 from colmap_inertial.core.errors import FormatError
-from colmap_inertial.model.depth_maps import read_map, write_map
+from colmap_inertial.model.artefacts import read_map, write_map
 
 VIEWS = [camera((x, -0.6 + z, 0.3 + z), (5 * z, -6 * x, 20 * x)) for x in (-0.5, -0.2, 0.2, 0.5) for z in (-0.15, 0.15)]
 #: One in a folder; the last one sees nothing that others see.

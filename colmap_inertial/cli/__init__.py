@@ -223,7 +223,7 @@ def _main(args: Sequence[str] | None) -> None:
     except (InertialError, ValueError) as error:  # options check their own values when they are built
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
-    from colmap_inertial.io.limits import reading_within
+    from colmap_inertial.io.files import reading_within
 
     try:
         require_limits()

@@ -32,9 +32,8 @@ from colmap_inertial.colmap.sweep_stereo import SweptWorkspace
 from colmap_inertial.colmap.tsdf import tsdf_mesh
 from colmap_inertial.core.errors import FormatError, OutputError
 from colmap_inertial.core.options import DenseOptions
-from colmap_inertial.io.files import read_json, write_json
+from colmap_inertial.io.files import path_in, read_json, write_json
 from colmap_inertial.io.images import read_image
-from colmap_inertial.io.names import path_in
 from colmap_inertial.io.ply import read_ply_header
 from colmap_inertial.model import TRANSFORM_FILE, read_model
 from colmap_inertial.pipeline.run.runner import fingerprint, remove

@@ -12,10 +12,8 @@ from typing import Literal
 import numpy as np
 
 from colmap_inertial.core.errors import FormatError, InertialError, OutputExistsError
-from colmap_inertial.io.files import read_json, write_json
-from colmap_inertial.io.names import path_in
-from colmap_inertial.model.artefacts import check_map
-from colmap_inertial.model.depth_maps import read_map
+from colmap_inertial.io.files import path_in, read_json, write_json
+from colmap_inertial.model.artefacts import check_map, read_map
 from colmap_inertial.pipeline.run.runner import remove
 
 Maker = Literal["patch-match", "plane sweep"]

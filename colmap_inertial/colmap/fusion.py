@@ -11,7 +11,7 @@ import numpy as np
 from colmap_inertial.colmap.depth_maps import Maker, map_file
 from colmap_inertial.core.errors import OutputError
 from colmap_inertial.core.geometry import opencv_px_from_colmap
-from colmap_inertial.io.names import path_in
+from colmap_inertial.io.files import path_in
 from colmap_inertial.model import read_model
 from colmap_inertial.model.copying import copy_file
 from colmap_inertial.pipeline.run.runner import remove

@@ -15,7 +15,7 @@ from colmap_inertial.colmap.submaps import map_in_parts, runs
 from colmap_inertial.core.errors import MappingError
 from colmap_inertial.core.options import MappingOptions
 from colmap_inertial.model import find_models
-from colmap_inertial.model.binary import check_binary_model
+from colmap_inertial.model.soundness import check_binary_model
 from colmap_inertial.pipeline.run.context import RunContext
 from colmap_inertial.pipeline.run.progress import Progress
 from colmap_inertial.pipeline.run.workspace import require_room

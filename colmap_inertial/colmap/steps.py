@@ -11,7 +11,7 @@ from colmap_inertial.colmap.pairing import MatchRecord, match_capture
 from colmap_inertial.colmap.sparse import KeypointRecords, extract_features, write_gravity_priors
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.options import ReconstructOptions
-from colmap_inertial.io.records import read_record, write_record
+from colmap_inertial.io.files import read_record, write_record
 from colmap_inertial.pipeline.run.context import Recording
 from colmap_inertial.pipeline.run.session import Session
 from colmap_inertial.pipeline.stages.frame_folder import FrameRecord

@@ -29,11 +29,10 @@ from colmap_inertial.imaging.plane_sweep import (
     score_partners,
     sweep_depth,
 )
-from colmap_inertial.io.files import as_plain, read_json, write_json
+from colmap_inertial.io.files import as_plain, path_in, read_json, write_json
 from colmap_inertial.io.images import read_image
-from colmap_inertial.io.names import path_in
 from colmap_inertial.model import read_model
-from colmap_inertial.model.depth_maps import read_map, write_map
+from colmap_inertial.model.artefacts import read_map, write_map
 from colmap_inertial.pipeline.run.runner import remove
 
 #: Partners to match with (fewer measure less, more cost time), and views to ask for agreement.

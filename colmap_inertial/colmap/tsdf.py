@@ -20,10 +20,10 @@ from colmap_inertial.colmap.depth_maps import Maker, map_file
 from colmap_inertial.core.arrays import Array, Float32Array
 from colmap_inertial.core.errors import InertialError, MissingExtraError, OutputError
 from colmap_inertial.core.options import ReconstructOptions
+from colmap_inertial.io.files import path_in
 from colmap_inertial.io.images import read_image
-from colmap_inertial.io.names import path_in
 from colmap_inertial.model import read_model
-from colmap_inertial.model.depth_maps import read_map
+from colmap_inertial.model.artefacts import read_map
 
 if TYPE_CHECKING:
     import pycolmap

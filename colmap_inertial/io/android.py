@@ -21,12 +21,11 @@ import numpy as np
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.types import FrameLog, ImuRecording
-from colmap_inertial.io.columns import split_unit
 from colmap_inertial.io.files import first_line
 from colmap_inertial.io.frame_times import frame_log, stamps_of_log
 from colmap_inertial.io.imu_text import ordered, read_csv, recording
 from colmap_inertial.io.samples import Samples, nearest
-from colmap_inertial.io.tables import Table, read_table
+from colmap_inertial.io.tables import Table, read_table, split_unit
 from colmap_inertial.io.units import SENSOR_NAMES, TIME_UNITS_NS, DeclaredUnits, Quantity, unit_of
 
 _MARS_TABLES = ("gyro_accel.csv", "raw_accel_gyro.csv")

@@ -23,20 +23,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import get_args
 
 import numpy as np
 
-from colmap_inertial.core.errors import FormatError
+from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.core.geometry import quat_from_matrix
-from colmap_inertial.core.types import Aperture, ApertureRig, CameraModel, SpectralRole
+from colmap_inertial.core.types import Aperture, ApertureRig, CameraModel, FrameTiming, SpectralRole
+from colmap_inertial.io.exif import HEAD_BYTES, exposure_of
+from colmap_inertial.io.files import path_in, read_bytes
+from colmap_inertial.io.frame_times import stamps_of_csv
 from colmap_inertial.io.images import SUFFIXES, read_image
-from colmap_inertial.io.names import path_in
 from colmap_inertial.io.rig_calibration import Metres, MountedCamera, read_rig_calibration
 from colmap_inertial.io.toml_section import Section
+from colmap_inertial.io.units import TIME_UNITS_NS, seconds
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,3 +170,185 @@ def _size_of_first(source: SubImages, names: Path) -> tuple[int, int]:
             height, width = read_image(source.path(name)).shape[:2]
             return width, height
     raise FormatError(names, "holds no picture that would give the size, which the calibration does not")
+
+
+#: A long exposure that starts farther from its short one is that of another, or timed by another clock.
+_FARTHEST_S = 10.0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LongTiming:
+    """When the long exposures were made.
+
+    Attributes
+    ----------
+    names
+        (F,) of the short ones that they belong to.
+    t_s
+        (F,) start of exposure of row 0, on the clock of the short ones.
+    exposure_s
+        (F,).
+    """
+
+    names: tuple[str, ...]
+    t_s: Array
+    exposure_s: Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class LongExposures:
+    """The long exposures beside a folder of short ones.
+
+    Attributes
+    ----------
+    source
+        Where they are.
+    times, time_unit
+        A CSV with their times, and its unit where the header does not say.
+    delay_s
+        In place of ``times``: start of the long exposure minus start of the short one.
+    exposure_s
+        Of all; ``None`` where ``times`` has it or it is unknown.
+    short_iso, long_iso
+        Sensitivities; ``None`` where only the EXIF may know.
+    """
+
+    source: SubImages
+    times: Path | None = None
+    time_unit: str | None = None
+    delay_s: float | None = None
+    exposure_s: float | None = None
+    short_iso: float | None = None
+    long_iso: float | None = None
+
+    def path(self, name: str) -> Path:
+        """The long exposure that belongs to a short one.
+
+        Raises
+        ------
+        FormatError
+            Where there is none.
+        """
+        if self.source.rename is not None and self.source.rename[0] not in name:
+            raise FormatError(
+                self.source.folder,
+                f'"{self.source.rename[0]}" of rename under [exposures] does not occur in the short exposure\'s name '
+                f"{name!r}; where both kinds lie in one folder, let pattern under [images] take the short ones alone",
+            )
+        wanted = self.source.path(name)
+        if wanted.is_file():
+            return wanted
+        for suffix in (*SUFFIXES, *(suffix.upper() for suffix in SUFFIXES)):
+            if wanted.with_suffix(suffix).is_file():
+                return wanted.with_suffix(suffix)
+        raise FormatError(
+            wanted,
+            f"no such picture: the long exposure of {name} is missing; correct folder or rename under [exposures], or "
+            "take the short one out of [images]",
+        )
+
+    def files(self, names: Sequence[str]) -> list[Path]:
+        """The long exposures of all short ones.
+
+        Raises
+        ------
+        FormatError
+            Where one is missing.
+        """
+        return [self.path(name) for name in names]
+
+    def timing(self, short: FrameTiming) -> LongTiming | None:
+        """When the long exposures were made; ``None`` where their start or their exposure time is unknown.
+
+        Raises
+        ------
+        FormatError, TimingError
+            Where ``times`` cannot be read, lacks one of them, or is of another clock.
+        """
+        if self.times is None:
+            if self.delay_s is None or self.exposure_s is None:
+                return None
+            exposures_s = np.full(len(short.names), self.exposure_s)
+            return LongTiming(names=short.names, t_s=short.t_s + self.delay_s, exposure_s=exposures_s)
+        stamps = stamps_of_csv(self.times, self.time_unit)
+        place = {name: i for i, name in enumerate(stamps.names)}
+        rows = []
+        for name in short.names:
+            own = self.path(name).relative_to(self.source.folder).as_posix()
+            if own not in place:
+                raise TimingError(f"{self.times}: no row for {own}, the long exposure of {name}")
+            rows.append(place[own])
+        t_s = seconds(stamps.t_ns[rows], short.epoch_ns)
+        far = np.flatnonzero(np.abs(t_s - short.t_s) > _FARTHEST_S)
+        if len(far):
+            i = int(far[0])
+            raise TimingError(
+                f"{self.times}: the long exposure of {short.names[i]} starts {t_s[i] - short.t_s[i]:.3g} s after the "
+                "short one; both must be timed by one clock, and belong together"
+            )
+        exposure_s = None if stamps.exposure_s is None else stamps.exposure_s[rows]
+        if exposure_s is None and self.exposure_s is not None:
+            exposure_s = np.full(len(rows), self.exposure_s)
+        return None if exposure_s is None else LongTiming(names=short.names, t_s=t_s, exposure_s=exposure_s)
+
+    def stated_gain(
+        self, short: Path, long: Path, *, short_exposure_s: float | None = None, long_exposure_s: float | None = None
+    ) -> float | None:
+        """Light of a long exposure over that of its short one, by exposure times and sensitivities.
+
+        What is not given is looked for in the EXIF of the pictures; ``None`` where one of the four is unknown.
+        """
+        values = []
+        for path, exposure_s, iso in (
+            (short, short_exposure_s, self.short_iso),
+            (long, long_exposure_s or self.exposure_s, self.long_iso),
+        ):
+            if exposure_s is None or iso is None:
+                by_exif = exposure_of(read_bytes(path, HEAD_BYTES, what="picture"))
+                exposure_s, iso = exposure_s or by_exif[0], iso or by_exif[1]
+            if not exposure_s or not iso:
+                return None
+            values.append(exposure_s * iso)
+        return values[1] / values[0]
+
+
+EXPOSURES_KEYS = (
+    *("folder", "rename", "times", "time_unit", "long_delay_s"),
+    *("long_exposure_s", "short_iso", "long_iso"),
+)
+
+
+def read_exposures_table(table: Section, images: Path | None) -> LongExposures:
+    """The ``[exposures]`` table.
+
+    Parameters
+    ----------
+    images
+        Folder of the short exposures.
+
+    Raises
+    ------
+    FormatError
+        For what is missing or contradicts itself.
+    """
+    if images is None:
+        table.fail(None, "belongs to [images], the folder of the short exposures, which is missing")
+    times = table.file("times")
+    delay_s = table.number("long_delay_s", low=-_FARTHEST_S, high=_FARTHEST_S)
+    exposure_s = table.positive("long_exposure_s")
+    source = SubImages(folder=table.file("folder") or images, rename=read_rename(table))
+    if source == SubImages(folder=images):
+        table.fail(None, "has the same pictures as [images]; give folder or rename")
+    if times is not None and delay_s is not None:
+        table.fail("long_delay_s", "stands in place of times; leave one of them out")
+    if exposure_s is not None and exposure_s > 10:
+        table.fail("long_exposure_s", f"must be from 0 to 10, found {exposure_s!r}")
+    return LongExposures(
+        source=source,
+        times=times,
+        time_unit=table.choice("time_unit", TIME_UNITS_NS),
+        delay_s=delay_s,
+        exposure_s=exposure_s,
+        short_iso=table.positive("short_iso"),
+        long_iso=table.positive("long_iso"),
+    )

@@ -18,7 +18,13 @@ from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.geometry import quat_from_matrix
 from colmap_inertial.core.types import CameraImuCalibration, CameraModel, FrameLog, ImuCalibration, ReadoutDirection
 from colmap_inertial.io import sensor_yaml
-from colmap_inertial.io.aperture_images import ApertureImages, read_apertures_table
+from colmap_inertial.io.aperture_images import (
+    EXPOSURES_KEYS,
+    ApertureImages,
+    LongExposures,
+    read_apertures_table,
+    read_exposures_table,
+)
 from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.io.capture_tables import (
     CALIBRATION_KEYS,
@@ -31,15 +37,13 @@ from colmap_inertial.io.capture_tables import (
     read_camera_table,
     read_imu_table,
 )
-from colmap_inertial.io.exposures import EXPOSURES_KEYS, LongExposures, read_exposures_table
 from colmap_inertial.io.files import StrPath
 from colmap_inertial.io.gcsv import is_gcsv, read_gcsv_frames
-from colmap_inertial.io.imu_formats import refuse_video
+from colmap_inertial.io.imu_formats import Recording, find_recording, refuse_video
 from colmap_inertial.io.imu_text import is_inertial_scale
-from colmap_inertial.io.readouts import readout_of_video
-from colmap_inertial.io.recorders import Recording, find_recording
 from colmap_inertial.io.toml_section import Section, read_toml
 from colmap_inertial.io.units import TIME_UNITS_NS
+from colmap_inertial.io.video import readout_of_video
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,32 +12,11 @@ from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import colmap_px_from_opencv, quat_from_matrix
 from colmap_inertial.core.types import CameraModel, ImuNoise
 from colmap_inertial.io import sensor_yaml
-from colmap_inertial.io.calibration import Declared, calibration_prior
-from colmap_inertial.io.imu_calibration import Calibrations, holds_imu_alone, read_for_another
+from colmap_inertial.io.calibration import Calibrations, Declared, calibration_prior, holds_imu_alone, read_for_another
 from colmap_inertial.io.imu_text import SensorTable
+from colmap_inertial.io.sensor_yaml import CAMERA_MODELS
 from colmap_inertial.io.toml_section import Section
 from colmap_inertial.io.units import SENSOR_UNITS, TIME_UNITS_NS, Axes, DeclaredUnits, Quantity
-
-#: COLMAP's camera models: parameters, and where the principal point stands among them.
-CAMERA_MODELS = {
-    "SIMPLE_PINHOLE": (3, 1),
-    "PINHOLE": (4, 2),
-    "SIMPLE_RADIAL": (4, 1),
-    "RADIAL": (5, 1),
-    "OPENCV": (8, 2),
-    "OPENCV_FISHEYE": (8, 2),
-    "FULL_OPENCV": (12, 2),
-    "FOV": (5, 2),
-    "SIMPLE_RADIAL_FISHEYE": (4, 1),
-    "RADIAL_FISHEYE": (5, 1),
-    "THIN_PRISM_FISHEYE": (12, 2),
-    "RAD_TAN_THIN_PRISM_FISHEYE": (16, 2),
-    "SIMPLE_DIVISION": (4, 1),
-    "DIVISION": (5, 2),
-    "SIMPLE_FISHEYE": (3, 1),
-    "FISHEYE": (4, 2),
-    "EUCM": (6, 2),
-}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -1,24 +1,27 @@
-"""When and where pictures were taken, by their own EXIF: times only where they tell more than whole seconds."""
+"""EXIF of pictures: time, place and exposure, and metadata that is copied to a deblurred picture byte for byte.
+
+Times are taken only where they tell more than whole seconds.
+"""
 
 from __future__ import annotations
 
 import datetime
 import re
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from enum import IntEnum
 from math import nan
 from pathlib import Path
 
 import numpy as np
 
+from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.core.types import HeightDatum
-from colmap_inertial.io.files import read_bytes
+from colmap_inertial.io.files import path_in, read_bytes
 from colmap_inertial.io.frame_times import FrameStamps, stamps_in_order
-from colmap_inertial.io.names import path_in
+from colmap_inertial.io.images import PNG, jpeg_segments, png_chunks, tiff_entries
 
-PNG = b"\x89PNG\r\n\x1a\n"
 _EXIF_HEADER = b"Exif\0\0"
 #: EXIF stands at the beginning of a file.
 HEAD_BYTES = 256 * 1024
@@ -130,14 +133,14 @@ def _directory(head: bytes, tag: _Tag) -> tuple[bytes, str, dict[int, tuple[int,
     order = {b"II": "<", b"MM": ">"}.get(b"" if tiff is None else tiff[:2])
     if tiff is None or order is None:
         return None
-    first = _entries(tiff, order, struct.unpack_from(order + "I", tiff, 4)[0])
-    return tiff, order, _entries(tiff, order, struct.unpack_from(order + "I", first[tag][2])[0])
+    first = tiff_entries(tiff, order, struct.unpack_from(order + "I", tiff, 4)[0])
+    return tiff, order, tiff_entries(tiff, order, struct.unpack_from(order + "I", first[tag][2])[0])
 
 
 def _tiff(head: bytes) -> bytes | None:
     """The TIFF structure that EXIF is, in the head of a file."""
     if head.startswith(b"\xff\xd8"):
-        exif = (part[4:] for marker, part in jpeg_segments(head) if marker == 0xE1)
+        exif = (head[begin + 4 : end] for marker, begin, end in jpeg_segments(head) if marker == 0xE1)
         return next((part[len(_EXIF_HEADER) :] for part in exif if part.startswith(_EXIF_HEADER)), None)
     if head.startswith(PNG):
         chunk = next((part for name, part in png_chunks(head) if name == b"eXIf"), None)
@@ -216,36 +219,47 @@ def _fractions(tiff: bytes, order: str, entry: tuple[int, int, bytes], count: in
     return [above / below for above, below in zip(numbers[::2], numbers[1::2], strict=True)]
 
 
-def jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Marker and bytes (marker and length included) of the segments before the scan (ITU-T T.81, annex B)."""
-    at = 2
-    while at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xDA:
-        size = struct.unpack_from(">H", data, at + 2)[0]
-        yield data[at + 1], data[at : at + 2 + size]
-        at += 2 + size
-
-
-def png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
-    """Name and bytes of the chunks of a PNG (ISO/IEC 15948)."""
-    at = len(PNG)
-    while at + 12 <= len(data):
-        size = 12 + struct.unpack_from(">I", data, at)[0]
-        yield data[at + 4 : at + 8], data[at : at + size]
-        at += size
-
-
-def _entries(tiff: bytes, order: str, at: int) -> dict[int, tuple[int, int, bytes]]:
-    """Type, count and value field of a directory's entries, by tag."""
-    (count,) = struct.unpack_from(order + "H", tiff, at)
-    found = {}
-    for i in range(count):
-        tag, kind, n, value = struct.unpack_from(order + "HHI4s", tiff, at + 2 + 12 * i)
-        found[tag] = (kind, n, value)
-    return found
-
-
 def _text(tiff: bytes, order: str, kind: int, count: int, value: bytes) -> str:
     if count > 4:
         at = struct.unpack(order + "I", value)[0]
         value = tiff[at : at + count]
     return value[:count].split(b"\0")[0].decode("ascii", errors="replace")
+
+
+#: Chunks of a PNG that say something about its pixels or where they come from.
+_PNG_CARRIED = (b"eXIf", b"iCCP", b"sRGB", b"gAMA", b"cHRM", b"pHYs", b"tIME", b"tEXt", b"zTXt", b"iTXt")
+#: JPEG application segments that belong to the coding of the pixels: JFIF's, and Adobe's colour transform.
+_JPEG_CODING = (0xE0, 0xEE)
+
+
+def carry_metadata(original: bytes, encoded: bytes) -> bytes:
+    """A newly encoded picture with the metadata of the one that it was made from: EXIF, XMP, colour profile, comments.
+
+    Of JPEG and PNG; other formats come back as they are.
+    """
+    if original.startswith(b"\xff\xd8") and encoded.startswith(b"\xff\xd8"):
+        *own, (_, scan, _) = jpeg_segments(encoded)
+        carried = [original[begin:end] for marker, begin, end in jpeg_segments(original) if _is_jpeg_metadata(marker)]
+        first = [encoded[begin:end] for marker, begin, end in own if marker == 0xE0]
+        rest = [encoded[begin:end] for marker, begin, end in own if marker != 0xE0 and not _is_jpeg_metadata(marker)]
+        return b"".join([b"\xff\xd8", *first, *carried, *rest, encoded[scan:]])
+    if original.startswith(PNG) and encoded.startswith(PNG):
+        carried = [part for name, part in png_chunks(original) if name in _PNG_CARRIED]
+        kept = [part for name, part in png_chunks(encoded) if name not in _PNG_CARRIED]
+        return PNG + kept[0] + b"".join(carried) + b"".join(kept[1:])
+    return encoded
+
+
+def stated_exposures_s(paths: list[Path]) -> Array | None:
+    """(F,) exposure times by the EXIF of JPEG, PNG or TIFF files; ``None`` where one of them does not say."""
+    found = []
+    for path in paths:
+        exposure_s, _ = exposure_of(read_bytes(path, HEAD_BYTES, what="picture"))
+        if exposure_s is None:
+            return None
+        found.append(exposure_s)
+    return np.array(found)
+
+
+def _is_jpeg_metadata(marker: int) -> bool:
+    return (0xE1 <= marker <= 0xEF and marker not in _JPEG_CODING) or marker == 0xFE

@@ -1,23 +1,58 @@
-"""Files that are either whole or absent: a reader never meets one that was being written when the power went."""
+"""Files of text, JSON and YAML: limits of what is read, checks of names from outside, and writing without torn files.
+
+A file is written to a temporary one beside it and renamed, so that a reader never meets an incomplete one. Values of
+this package are written as JSON records by a run, and read back by the run that continues it.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import json
 import math
 import os
 import re
 import secrets
 import stat
-from collections.abc import Iterator, Mapping
+import typing
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from colmap_inertial.core.errors import FormatError, OutputError, OutputExistsError
-from colmap_inertial.io.limits import read_limits
+from colmap_inertial.core.options import ReadLimits
+
+if TYPE_CHECKING:
+    from cattrs import Converter
+
+
+_USUAL = ReadLimits()
+_LIMITS: ContextVar[ReadLimits] = ContextVar("limits", default=_USUAL)
+
+
+def read_limits() -> ReadLimits:
+    """Those that hold here."""
+    return _LIMITS.get()
+
+
+@contextmanager
+def reading_within(limits: ReadLimits) -> Iterator[None]:
+    """Let these limits hold for all readers that are called inside, as context or decorator.
+
+    ``reconstruct`` and ``reconstruct_project`` take theirs from their options, and ``run_batch`` from those of each
+    capture.
+    """
+    token = _LIMITS.set(limits)
+    try:
+        yield
+    finally:
+        _LIMITS.reset(token)
+
 
 _TEMPORARY = re.compile(r"\..+\.\d+-[0-9a-f]{8}\.tmp")
 
@@ -244,3 +279,120 @@ def _plain(value: object, where: str) -> object:
             return list(value)
         return [_plain(item, f"{where}[{i}]") for i, item in enumerate(value)]
     raise ValueError(f"{where}: {type(value).__name__} cannot be written as JSON")
+
+
+T = TypeVar("T")
+
+
+def write_record(path: Path, value: object) -> None:
+    """Write a frozen value for :func:`read_record`; raises as ``io.files.write_json``."""
+    write_json(path, value, indent=None)
+
+
+def read_record(path: Path, kind: type[T]) -> T:
+    """The value that :func:`write_record` wrote.
+
+    Raises
+    ------
+    FormatError
+        Where the file was changed since.
+    """
+    values = read_json(path)
+    try:
+        return structured(kind, values)
+    except Exception as error:  # whatever a changed file makes of a value's own checks
+        raise FormatError(path, f"was damaged since it was written ({error}); remove it and start again") from None
+
+
+def structured(kind: type[T], values: Any) -> T:
+    """A value of type ``kind`` from JSON types, by the annotations of its fields."""
+    return _converter().structure(values, kind)
+
+
+@functools.cache
+def _converter() -> Converter:
+    import cattrs
+
+    converter = cattrs.Converter()
+    converter.register_structure_hook_func(_is_array, lambda value, kind: np.array(value, _dtype(kind)))
+    converter.register_structure_hook(Path, lambda value, _: Path(value))
+    converter.register_structure_hook_func(lambda kind: kind is object or kind == int | float, lambda value, _: value)
+    return converter
+
+
+def _is_array(kind: Any) -> bool:
+    return typing.get_origin(kind) is np.ndarray
+
+
+def _dtype(kind: Any) -> Any:
+    """The element type that ``NDArray[...]`` names."""
+    return typing.get_args(typing.get_args(kind)[1])[0]
+
+
+#: Of a folder or file, in bytes; common file systems hold no longer ones.
+_LONGEST = 255
+
+
+def check_names(names: Iterable[str], source: Path | str) -> None:
+    """Refuse names that could not be those of files in a folder.
+
+    Parameters
+    ----------
+    names
+        Relative paths with forward slashes, as COLMAP has them.
+    source
+        Where they come from, for the message.
+
+    Raises
+    ------
+    FormatError
+        For a name that is empty or absolute, that holds ``..`` or NUL, or that is too long.
+    """
+    for name in names:
+        fault = _fault(name)
+        if fault is not None:
+            raise FormatError(source, f"names the file {name[:80]!r}, which {fault}; such names are not followed")
+
+
+def path_in(folder: Path, name: str, source: Path | str | None = None) -> Path:
+    """The path of a named file, there already or not, that stays in its folder wherever links lead.
+
+    Parameters
+    ----------
+    folder
+        Where the file belongs. It may itself be a link.
+    name, source
+        As of :func:`check_names`; the source is the folder where nothing else is known.
+
+    Raises
+    ------
+    FormatError
+        For a name that :func:`check_names` refuses, or one that a link leads out of the folder.
+    """
+    check_names((name,), folder if source is None else source)
+    path = folder / name
+    root, real = os.path.realpath(folder), os.path.realpath(path)
+    if os.path.commonpath((root, real)) != root or root == real:
+        raise FormatError(
+            path if source is None else source,
+            f"names the file {name[:80]!r}, which a link leads out of {folder} to {real}; links are not followed: put "
+            "the file itself there",
+        )
+    return path
+
+
+def _fault(name: str) -> str | None:
+    if not name or not name.strip("./\\ "):
+        return "is empty"
+    if "\0" in name:
+        return "holds a NUL character"
+    if name.startswith("/") or Path(name).anchor:
+        return "is absolute"
+    parts = re.split(r"[/\\]", name)
+    if ".." in parts:
+        return 'leads out of its folder by ".."'
+    try:
+        longest = max(len(os.fsencode(part)) for part in parts)
+    except UnicodeEncodeError:
+        return "no file system can hold"
+    return f"is longer than {_LONGEST} bytes" if longest > _LONGEST else None

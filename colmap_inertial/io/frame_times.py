@@ -14,8 +14,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.core.types import FrameLog, FrameTiming
-from colmap_inertial.io.columns import recognise, split_unit
-from colmap_inertial.io.tables import Table, read_table
+from colmap_inertial.io.tables import Table, read_table, recognise, split_unit
 from colmap_inertial.io.units import TIME_UNITS_NS, seconds, stamps_ns, unit_of
 
 _NAME_COLUMNS = {"name", "filename", "file", "image", "imagename", "frame"}

@@ -12,10 +12,9 @@ from colmap_inertial.core.arrays import IndexArray, Int64Array, UInt8Array, UInt
 from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.core.types import Frame, FrameLog, FrameTiming
 from colmap_inertial.io.capture import Capture, ImageFolder, Video, load_capture
-from colmap_inertial.io.files import StrPath
+from colmap_inertial.io.files import StrPath, path_in
 from colmap_inertial.io.frame_times import FrameStamps, stamps_of_csv, stamps_of_log, stamps_of_names
 from colmap_inertial.io.images import SUFFIXES, grey_8bit, read_image
-from colmap_inertial.io.names import path_in
 from colmap_inertial.io.video import decode_reduced, decode_video, frame_name, reduced, video_stamps_ns
 
 

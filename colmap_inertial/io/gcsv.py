@@ -17,9 +17,8 @@ import numpy as np
 
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.types import FrameLog, ImuRecording, ReadoutDirection
-from colmap_inertial.io.files import first_line, read_text
+from colmap_inertial.io.files import first_line, read_limits, read_text
 from colmap_inertial.io.imu_text import ordered, recording
-from colmap_inertial.io.limits import read_limits
 from colmap_inertial.io.samples import Samples
 from colmap_inertial.io.tables import Table, parse_table, too_wide
 from colmap_inertial.io.units import Axes, DeclaredUnits, Quantity

@@ -5,18 +5,22 @@ from __future__ import annotations
 import re
 import struct
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from colmap_inertial.core.arrays import UInt8Array, UInt16Array
 from colmap_inertial.core.errors import FormatError
-from colmap_inertial.io.files import read_bytes
-from colmap_inertial.io.limits import read_limits
+from colmap_inertial.io.files import read_bytes, read_limits
 
 #: File endings of pictures that both OpenCV and the published builds of pycolmap read (the latter read no WebP).
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".pgm", ".ppm")
 
+PNG = b"\x89PNG\r\n\x1a\n"
+#: Markers of JPEG: C4, C8 and CC are none of frames.
+_START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+START_OF_SCAN = 0xDA
 #: OpenCV's level of logging that says nothing.
 _SILENT = 0
 
@@ -78,10 +82,12 @@ def require_modest(path: Path, data: bytes) -> None:
 def _stated_size(data: bytes) -> tuple[int, int] | None:
     """Width and height by the header of a PNG, JPEG, BMP, PGM, PPM or TIFF; ``None`` where it does not tell."""
     try:
-        if data.startswith(b"\x89PNG\r\n\x1a\n"):
+        if data.startswith(PNG):
             return struct.unpack_from(">II", data, 16)
         if data.startswith(b"\xff\xd8"):
-            return _jpeg_size(data)
+            frames = (begin for marker, begin, _ in jpeg_segments(data) if marker in _START_OF_FRAME)
+            begin = next(frames, None)
+            return None if begin is None else struct.unpack_from(">HH", data, begin + 5)[::-1]
         if data.startswith(b"BM"):
             width, height = struct.unpack_from("<ii", data, 18)
             return abs(width), abs(height)
@@ -94,30 +100,16 @@ def _stated_size(data: bytes) -> tuple[int, int] | None:
     return None
 
 
-def _jpeg_size(data: bytes) -> tuple[int, int] | None:
-    at = 2
-    while data[at : at + 1] == b"\xff":
-        marker = data[at + 1]
-        if marker == 0xFF:
-            at += 1
-        elif 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # a start of frame
-            height, width = struct.unpack_from(">HH", data, at + 5)
-            return width, height
-        else:
-            at += 2 + struct.unpack_from(">H", data, at + 2)[0]
-    return None
-
-
 def _tiff_size(data: bytes) -> tuple[int, int] | None:
-    """By the first directory (TIFF 6.0): tags 256 and 257, SHORT or LONG."""
+    """By the first directory: ImageWidth and ImageLength, SHORT or LONG."""
     order = "<" if data.startswith(b"II") else ">"
-    start = struct.unpack_from(f"{order}I", data, 4)[0]
-    found = {}
-    for i in range(struct.unpack_from(f"{order}H", data, start)[0]):
-        tag, kind = struct.unpack_from(f"{order}HH", data, start + 2 + 12 * i)
-        if tag in (256, 257):
-            found[tag] = struct.unpack_from(order + ("H" if kind == 3 else "I"), data, start + 10 + 12 * i)[0]
-    return (found[256], found[257]) if len(found) == 2 else None
+    entries = tiff_entries(data, order, struct.unpack_from(f"{order}I", data, 4)[0])
+    if not {256, 257} <= entries.keys():
+        return None
+    width, height = (
+        struct.unpack_from(order + ("H" if entries[tag][0] == 3 else "I"), entries[tag][2])[0] for tag in (256, 257)
+    )
+    return width, height
 
 
 def grey_8bit(image: UInt8Array | UInt16Array) -> UInt8Array:
@@ -134,39 +126,63 @@ def _fault(data: bytes) -> str | None:
         return "is empty"
     if data.startswith(b"\xff\xd8"):
         return _jpeg_fault(data)
-    if data.startswith(b"\x89PNG\r\n\x1a\n"):
+    if data.startswith(PNG):
         return _png_fault(data)
     return None
 
 
 def _jpeg_fault(data: bytes) -> str | None:
-    """JPEG (ITU-T T.81, annex B): segments up to the first scan, then coded data that an EOI marker ends."""
-    at = 2
-    while at + 4 <= len(data):
-        if data[at] != 0xFF:
-            return "is damaged (a JPEG segment does not start with a marker)"
-        marker = data[at + 1]
-        if marker == 0xFF:
-            at += 1
-            continue
-        at += 2 + struct.unpack_from(">H", data, at + 2)[0]
-        if marker == 0xDA:
-            return None if data.find(b"\xff\xd9", at) >= 0 else "is cut off (no end of image)"
+    """Segments up to the first scan, then coded data that an EOI marker ends."""
+    end = 2
+    for marker, _, end in jpeg_segments(data):
+        if marker == START_OF_SCAN:
+            return None if data.find(b"\xff\xd9", end) >= 0 else "is cut off (no end of image)"
+    if end + 4 <= len(data) and data[end] != 0xFF:
+        return "is damaged (a JPEG segment does not start with a marker)"
     return "is cut off (no picture data)"
 
 
 def _png_fault(data: bytes) -> str | None:
-    """PNG (ISO/IEC 15948): chunks with a CRC each, the last one IEND."""
-    at = 8
-    while at + 12 <= len(data):
-        length = struct.unpack_from(">I", data, at)[0]
-        body = memoryview(data)[at + 4 : at + 8 + length]
-        end = at + 12 + length
-        if end > len(data):
+    """Chunks with a CRC each, the last one IEND."""
+    for name, chunk in png_chunks(data):
+        if len(chunk) != 12 + struct.unpack_from(">I", chunk)[0]:
             break
-        if zlib.crc32(body) != struct.unpack_from(">I", data, end - 4)[0]:
+        if zlib.crc32(memoryview(chunk)[4:-4]) != struct.unpack_from(">I", chunk, len(chunk) - 4)[0]:
             return "is damaged (a PNG checksum is wrong)"
-        if data[at + 4 : at + 8] == b"IEND":
+        if name == b"IEND":
             return None
-        at = end
     return "is cut off (no end of image)"
+
+
+def jpeg_segments(data: bytes) -> Iterator[tuple[int, int, int]]:
+    """Marker, begin and end of the segments up to the first scan, its header included (ITU-T T.81, annex B)."""
+    at = 2
+    while at + 4 <= len(data) and data[at] == 0xFF:
+        marker = data[at + 1]
+        if marker == 0xFF:  # a fill byte
+            at += 1
+            continue
+        end = at + 2 + struct.unpack_from(">H", data, at + 2)[0]
+        yield marker, at, end
+        if marker == START_OF_SCAN:
+            return
+        at = end
+
+
+def png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
+    """Name and bytes (length, name and CRC included) of the chunks of a PNG (ISO/IEC 15948)."""
+    at = len(PNG)
+    while at + 12 <= len(data):
+        size = 12 + struct.unpack_from(">I", data, at)[0]
+        yield data[at + 4 : at + 8], data[at : at + size]
+        at += size
+
+
+def tiff_entries(tiff: bytes, order: str, at: int) -> dict[int, tuple[int, int, bytes]]:
+    """Type, count and value field of a directory's entries, by tag (TIFF 6.0); ``order`` of bytes as of ``struct``."""
+    (count,) = struct.unpack_from(order + "H", tiff, at)
+    found = {}
+    for i in range(count):
+        tag, kind, n, value = struct.unpack_from(order + "HHI4s", tiff, at + 2 + 12 * i)
+        found[tag] = (kind, n, value)
+    return found

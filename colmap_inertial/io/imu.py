@@ -5,7 +5,7 @@ Families of files, and how another package adds one: :mod:`colmap_inertial.io.im
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from colmap_inertial.core.errors import FormatError
@@ -15,8 +15,8 @@ from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.capture_tables import ImuPath
 from colmap_inertial.io.files import StrPath
 from colmap_inertial.io.imu_formats import find_imu_format
-from colmap_inertial.io.plausible import check_plausible
-from colmap_inertial.io.units import Axes, DeclaredUnits
+from colmap_inertial.io.plausible import RawImu
+from colmap_inertial.io.units import DeclaredUnits
 
 
 def read_imu(path: StrPath, *, format: str = "auto") -> ImuRecording:
@@ -41,49 +41,16 @@ def read_imu(path: StrPath, *, format: str = "auto") -> ImuRecording:
     TimingError
         Where its stamps run backwards or cannot be in the stated unit.
     """
-    path = Path(path)
-    raw = read_raw_imu(path, format=format)
+    raw = read_raw_imu(Path(path), format=format)
     raw.check()
     return raw.imu
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class RawImu:
-    """A recording whose numbers nobody has checked.
-
-    Attributes
-    ----------
-    imu
-        In SI units, as far as the units are those that were declared.
-    path, accel_path
-        Where it came from, for messages.
-    gyro_axes, accel_axes
-        Mappings of axes that were applied.
-    """
-
-    imu: ImuRecording
-    path: Path
-    accel_path: Path
-    gyro_axes: Axes | None = None
-    accel_axes: Axes | None = None
-
-    def check(self) -> None:
-        """Refuse numbers that cannot be rad/s and m/s2 of a working IMU; see :func:`check_plausible`."""
-        check_plausible(
-            self.imu,
-            self.path,
-            accel_path=self.accel_path,
-            gyro_axes=self.gyro_axes,
-            accel_axes=self.accel_axes,
-        )
-
-
 def read_raw_imu(path: Path, *, format: str = "auto") -> RawImu:
     """As :func:`read_imu`, without looking whether the numbers are plausible: for those who look themselves."""
-    path = Path(path)
     if format == "capture" or (format == "auto" and is_capture(path)):
         return read_raw_capture_imu(load_capture(path))
-    return RawImu(imu=find_imu_format(path, format).read(path, DeclaredUnits()), path=path, accel_path=path)
+    return RawImu(imu=find_imu_format(path, format).read(path, DeclaredUnits()), path=path)
 
 
 def read_frame_log(path: StrPath, *, format: str = "auto") -> FrameLog | None:
@@ -104,8 +71,8 @@ def read_frame_log(path: StrPath, *, format: str = "auto") -> FrameLog | None:
         Where the recording is damaged or of no known kind.
     """
     path = Path(path)
-    found = find_imu_format(Path(path), format)
-    return None if found.frames is None else found.frames(Path(path))
+    family = find_imu_format(path, format)
+    return None if family.frames is None else family.frames(path)
 
 
 def read_capture_imu(capture: Capture) -> ImuRecording:

@@ -19,14 +19,13 @@ import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 from colmap_inertial.core.errors import FormatError, InertialError
 from colmap_inertial.core.types import FrameLog, ImuRecording
 from colmap_inertial.io import (
     android,
     camm,
-    dji,
     gcsv,
     gopro,
     imu_text,
@@ -37,11 +36,12 @@ from colmap_inertial.io import (
     video_imu_capture,
 )
 from colmap_inertial.io.files import read_bytes, require_regular
-from colmap_inertial.io.mp4 import is_mp4, read_movie
+from colmap_inertial.io.mp4 import has_track, is_mp4, read_movie
 from colmap_inertial.io.units import DeclaredUnits
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
+
 
 log = logging.getLogger(__name__)
 
@@ -218,6 +218,32 @@ def _reason(error: Exception) -> str:
     return f"{type(error).__name__}: {error}"
 
 
+def _is_dji(path: Path) -> bool:
+    """Whether ``path`` is a video with DJI's track of orientations."""
+    return has_track(path, "djmd")
+
+
+def _read_dji(path: Path, units: DeclaredUnits) -> NoReturn:
+    """Say what a DJI video can and cannot give.
+
+    Its ``djmd`` track holds orientations that the camera computed, no accelerometer and no raw gyroscope. Without an
+    accelerometer nothing gives metres or the direction of gravity. The orientations would do for deblurring and the
+    rolling shutter; their layout differs between products and firmware, and Gyroflow reads them all.
+
+    Raises
+    ------
+    FormatError
+        Always.
+    """
+    raise FormatError(
+        path,
+        "is a DJI video: it holds orientations but no accelerometer, so it can give no scale and no gravity. What "
+        "still works: COLMAP's own reconstruction, in its arbitrary units; deblurring and the rolling shutter, with a "
+        "gyroscope log (.gcsv) that Gyroflow exports from it. For metres, record an IMU beside it, or film a target of "
+        "known size",
+    )
+
+
 _OWN: tuple[ImuFormat, ...] = (
     ImuFormat(
         name="euroc",
@@ -250,8 +276,8 @@ _OWN: tuple[ImuFormat, ...] = (
     ImuFormat(
         name="dji",
         layout="a DJI video, of which the message says what it can give",
-        accepts=dji.is_dji,
-        read=dji.read_dji,
+        accepts=_is_dji,
+        read=_read_dji,
     ),
     ImuFormat(
         name="gcsv",
@@ -324,3 +350,48 @@ _OWN: tuple[ImuFormat, ...] = (
         read=imu_text.read_csv,
     ),
 )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Recording:
+    """What was found.
+
+    Attributes
+    ----------
+    format, imu
+        What ``read_imu`` takes.
+    video
+        The pictures; ``None`` where they do not lie where the recorder puts them.
+    log
+        What the recorder noted about the frames.
+    """
+
+    format: str
+    imu: Path
+    video: Path | None
+    log: FrameLog | None
+
+
+def find_recording(path: Path) -> Recording | None:
+    """The recording at ``path``: a video with an IMU inside, or a recorder's folder; ``None`` where it is neither.
+
+    Raises
+    ------
+    FormatError
+        Where it is one of these, and damaged.
+    """
+    for one in imu_formats():
+        if one.video is not None and bool(one.video) == path.is_dir() and one.accepts(path):
+            video = _video(path, one.video) if one.video else path
+            noted = None if one.frames is None else one.frames(path)
+            return Recording(format=one.name, imu=path, video=video, log=noted)
+    return None
+
+
+def _video(folder: Path, places: tuple[str, ...]) -> Path | None:
+    """The one video in the first of the places that has one."""
+    for place in places:
+        found = sorted(file for file in folder.glob(place.format(name=folder.name)) if file.is_file())
+        if len(found) == 1:
+            return found[0]
+    return None

@@ -30,9 +30,8 @@ from colmap_inertial.io.frame_times import frame_log
 from colmap_inertial.io.imu_text import ordered, recording
 from colmap_inertial.io.mp4 import is_mp4, read_movie
 from colmap_inertial.io.samples import Samples
-from colmap_inertial.io.tables import Table, parse_table, read_table
+from colmap_inertial.io.tables import Table, head_of, members_of, parse_table, read_table, text_of
 from colmap_inertial.io.units import DeclaredUnits, seconds
-from colmap_inertial.io.zipped import head_of, members_of, text_of
 
 #: A median length up to this is g, above it m/s2: gravity gives 1 or 9.8.
 _G_BELOW = 3.0

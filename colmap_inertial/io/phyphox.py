@@ -15,9 +15,8 @@ from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.types import ImuRecording
 from colmap_inertial.io.imu_text import ordered, recording
 from colmap_inertial.io.samples import Samples
-from colmap_inertial.io.tables import Table, parse_table
+from colmap_inertial.io.tables import Table, head_of, members_of, parse_table, text_of
 from colmap_inertial.io.units import DeclaredUnits
-from colmap_inertial.io.zipped import head_of, members_of, text_of
 
 #: A line of the header of a table of phyphox, and of what sensor it is.
 _TIME = re.compile(r'^"?Time \(s\)"?', re.IGNORECASE)

@@ -12,9 +12,8 @@ from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.types import PositionFixes
 from colmap_inertial.io.camm import is_camm, read_camm_positions
 from colmap_inertial.io.exif import HEAD_BYTES, position_of
-from colmap_inertial.io.files import read_bytes
+from colmap_inertial.io.files import path_in, read_bytes
 from colmap_inertial.io.gopro import is_gopro, read_gopro_positions
-from colmap_inertial.io.names import path_in
 
 
 def positions_in_video(video: Path) -> PositionFixes:

@@ -15,9 +15,8 @@ from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.geometry import colmap_px_from_opencv, matrix_from_quat
 from colmap_inertial.core.types import LengthUnit
-from colmap_inertial.io.capture_tables import CAMERA_MODELS
 from colmap_inertial.io.files import read_bytes, read_text, read_yaml
-from colmap_inertial.io.sensor_yaml import Sheet, is_rotation
+from colmap_inertial.io.sensor_yaml import CAMERA_MODELS, Sheet, is_rotation
 
 Metres = Literal["m", "mm"]
 

@@ -21,6 +21,26 @@ _NOISE_KEYS = {
     "gyro_walk_rad_s2_rthz": "gyroscope_random_walk",
     "accel_walk_m_s3_rthz": "accelerometer_random_walk",
 }
+#: COLMAP's camera models in the order of their ids: parameters, and where the principal point stands among them.
+CAMERA_MODELS = {
+    "SIMPLE_PINHOLE": (3, 1),
+    "PINHOLE": (4, 2),
+    "SIMPLE_RADIAL": (4, 1),
+    "RADIAL": (5, 1),
+    "OPENCV": (8, 2),
+    "OPENCV_FISHEYE": (8, 2),
+    "FULL_OPENCV": (12, 2),
+    "FOV": (5, 2),
+    "SIMPLE_RADIAL_FISHEYE": (4, 1),
+    "RADIAL_FISHEYE": (5, 1),
+    "THIN_PRISM_FISHEYE": (12, 2),
+    "RAD_TAN_THIN_PRISM_FISHEYE": (16, 2),
+    "SIMPLE_DIVISION": (4, 1),
+    "DIVISION": (5, 2),
+    "SIMPLE_FISHEYE": (3, 1),
+    "FISHEYE": (4, 2),
+    "EUCM": (6, 2),
+}
 #: COLMAP's model for each name of a distortion of pinhole cameras: those of the ASL format, then Kalibr's.
 _COLMAP_MODELS = {
     "radial-tangential": "OPENCV",

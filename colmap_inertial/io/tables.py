@@ -1,19 +1,24 @@
-"""Text tables of numbers: parsed fast, checked line by line only where something is wrong."""
+"""Text tables of numbers in files, folders and zip archives, and what the cells of their headers name.
+
+Tables are parsed fast, and checked line by line only where something is wrong.
+"""
 
 from __future__ import annotations
 
 import re
+import zipfile
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+from typing import Literal
 
 import numpy as np
 
 from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import FormatError
-from colmap_inertial.io.files import read_text
-from colmap_inertial.io.limits import read_limits
-from colmap_inertial.io.units import stamps_ns
+from colmap_inertial.io.files import first_line, read_limits, read_text
+from colmap_inertial.io.units import SENSOR_UNITS, TIME_UNITS_NS, Quantity, stamps_ns, unit_of
 
 _BLANK_OR_COMMENT = re.compile(r"\n\s*(\n|#|\Z)")
 
@@ -220,3 +225,128 @@ def _is_cut_off(line: str, previous: str, delimiter: str | None, width: int) -> 
     if len(cells) != width:
         return len(cells) < width
     return bool(before) and _number(before) is not None and (not cells[-1].strip() or _number(cells[-1]) is None)
+
+
+_TIME_NAMES = {"t", "time", "timestamp", "stamp", "ts", "timestamps", "frametimestamp"}
+_GYRO_NAMES = {"g", "w", "gyr", "gyro", "gyroscope", "omega", "angularvelocity", "angvel", "wrss"}
+_ACCEL_NAMES = {"a", "acc", "acce", "accel", "accelerometer", "acceleration", "arss"}
+# A unit at the end of a name without brackets: "t_ns", "gyro_x_rad_s", "acc_x_m_s2".
+_UNIT_SUFFIX = re.compile(r"[_ ](rad_s|deg_s|dps|m_s2|mps2|g|s|ms|us|ns)$", re.IGNORECASE)
+_BRACKETS = re.compile(r"\s*[\[(]([^\])]*)[\])]\s*$")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Column:
+    """One recognised column.
+
+    Attributes
+    ----------
+    kind
+        ``"time"``, ``"gyro"`` or ``"accel"``.
+    axis
+        0, 1, 2 of a sensor column; 0 for time.
+    unit
+        As in :mod:`colmap_inertial.io.units`; ``None`` where the header does not say.
+    """
+
+    kind: Literal["time", "gyro", "accel"]
+    axis: int
+    unit: str | None
+
+
+def split_unit(cell: str) -> tuple[str, str | None]:
+    """The name and the unit text of a header cell: ``"gx [rad/s]"`` and ``"gx_rad_s"`` give ``("gx", "rad/s")``."""
+    match = _BRACKETS.search(cell)
+    if match:
+        return cell[: match.start()].strip(), match[1].strip()
+    match = _UNIT_SUFFIX.search(cell)
+    if match:
+        return cell[: match.start()].strip(), match[1]
+    return cell.strip(), None
+
+
+def recognise(cell: str) -> Column | None:
+    """What a header cell names, or ``None``.
+
+    Raises
+    ------
+    ValueError
+        Where the name is clear and its unit is not one for that quantity.
+    """
+    name, unit_text = split_unit(cell)
+    flat = re.sub(r"[\s_.\-/]", "", name).lower()
+    if flat in _TIME_NAMES:
+        return Column(kind="time", axis=0, unit=_unit(cell, unit_text, tuple(TIME_UNITS_NS)))
+    if not flat or flat[-1] not in "xyz":
+        return None
+    axis, stem = "xyz".index(flat[-1]), flat[:-1]
+    quantity: Quantity
+    if stem in _GYRO_NAMES:
+        quantity = "gyro"
+    elif stem in _ACCEL_NAMES:
+        quantity = "accel"
+    else:
+        return None
+    return Column(kind=quantity, axis=axis, unit=_unit(cell, unit_text, tuple(SENSOR_UNITS[quantity])))
+
+
+def _unit(cell: str, text: str | None, allowed: tuple[str, ...]) -> str | None:
+    if text is None:
+        return None
+    unit = unit_of(text)
+    if unit not in allowed:
+        raise ValueError(f'column "{cell}" has the unit [{text}]; known here are {", ".join(allowed)}')
+    return unit
+
+
+#: An unpacked table larger than this is no recording.
+_LARGEST_MEMBER = 1 << 31
+#: What the standard library raises for damaged archives is not documented as one class.
+_DAMAGED = (OSError, EOFError, KeyError, ValueError, RuntimeError, zipfile.BadZipFile, zlib.error)
+
+
+def members_of(path: Path) -> dict[str, str]:
+    """The tables of a recording: file name to where it lies. A zip may hold them in one folder."""
+    if path.is_dir():
+        return {file.name: file.name for file in path.glob("*.csv")}
+    try:
+        if not path.is_file() or not zipfile.is_zipfile(path):
+            return {}
+        with zipfile.ZipFile(path) as archive:
+            names = [info.filename for info in archive.infolist() if info.filename.endswith(".csv")]
+    except (OSError, zipfile.BadZipFile, ValueError, NotImplementedError):
+        return {}
+    return {PurePosixPath(name).name: name for name in names if len(PurePosixPath(name).parts) <= 2}
+
+
+def head_of(path: Path, member: str) -> str:
+    """The first line of a table, or as much of it as a thousand bytes hold; empty where it is damaged."""
+    if path.is_dir():
+        return first_line(path / member)
+    try:
+        with zipfile.ZipFile(path) as archive, archive.open(member) as file:
+            return file.read(1000).decode("utf-8-sig", errors="replace").partition("\n")[0]
+    except _DAMAGED:
+        return ""
+
+
+def text_of(path: Path, member: str) -> str:
+    """The text of a table.
+
+    Raises
+    ------
+    FormatError
+        Where it is damaged, or too large.
+    """
+    if path.is_dir():
+        return read_text(path / member)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            told = archive.getinfo(member)
+            if told.compress_size > path.stat().st_size:  # as much memory would be asked for as it says
+                raise FormatError(path, f"its {member} cannot be unpacked: it is said to be larger than the file")
+            if told.file_size > _LARGEST_MEMBER:
+                raise FormatError(path, f"its {member} unpacks to more than {_LARGEST_MEMBER >> 30} GiB")
+            return archive.read(member).decode("utf-8-sig", errors="replace")
+    except _DAMAGED as error:
+        raise FormatError(path, f"its {member} cannot be unpacked: {error}") from None

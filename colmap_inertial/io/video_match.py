@@ -11,8 +11,8 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Float32Array, UInt8Array
 from colmap_inertial.core.errors import FormatError
+from colmap_inertial.io.files import path_in
 from colmap_inertial.io.images import grey_8bit, read_image
-from colmap_inertial.io.names import path_in
 from colmap_inertial.io.video import decode_grey
 
 

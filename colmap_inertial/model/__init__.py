@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
+import sys
+import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from colmap_inertial.core.arrays import Array
+from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import AlreadyMetricError, FormatError, OutputExistsError, TimingError
 from colmap_inertial.core.geometry import cross
 from colmap_inertial.core.types import (
@@ -24,14 +27,12 @@ from colmap_inertial.core.types import (
     SolvedMotion,
     Treatment,
 )
-from colmap_inertial.io.files import StrPath, as_plain, read_json, write_json
-from colmap_inertial.io.names import check_names
-from colmap_inertial.model.binary import check_binary_model
-from colmap_inertial.model.loading import load_pycolmap
-from colmap_inertial.model.soundness import check_values
+from colmap_inertial.io.files import StrPath, as_plain, check_names, read_json, write_json
+from colmap_inertial.model.soundness import check_binary_model, check_values
 
 if TYPE_CHECKING:
     import pycolmap
+
 
 #: Written into every folder whose lengths we have changed; its presence means "already metric".
 TRANSFORM_FILE = "transform.json"
@@ -429,3 +430,23 @@ def summarize(reconstruction: pycolmap.Reconstruction) -> dict[str, int | float]
         "observations": reconstruction.compute_num_observations(),
         "mean_reprojection_error_px": mean_reprojection_error_px(reconstruction),
     }
+
+
+def load_pycolmap() -> None:
+    """Load it, and keep our answer to SIGTERM: its logging library takes it away and prints a trace in place of it."""
+    first = "pycolmap" not in sys.modules
+    import pycolmap  # noqa: F401
+
+    if not first or threading.current_thread() is not threading.main_thread():
+        return
+    ours = signal.getsignal(signal.SIGTERM)  # what Python was told last, which loading does not change
+    if ours is not None:
+        signal.signal(signal.SIGTERM, ours)
+
+
+def points_of_features(image: pycolmap.Image) -> Int64Array:
+    """Of an image's features, the numbers of their points; -1 without one."""
+    points = np.full(image.num_points2D(), -1, dtype=np.int64)
+    seen = np.array(image.get_observation_point2D_idxs(), dtype=np.intp)
+    points[seen] = [point.point3D_id for point in image.get_observation_points2D()]
+    return points

@@ -15,7 +15,7 @@ from types import FrameType
 
 from colmap_inertial.core.errors import FormatError, OutputError, OutputExistsError
 from colmap_inertial.io.files import advise, locked
-from colmap_inertial.model.loading import load_pycolmap
+from colmap_inertial.model import load_pycolmap
 
 #: Linux: share the blocks of another file (Btrfs, XFS, bcachefs, ...).
 _FICLONE = 0x40049409

@@ -28,6 +28,8 @@ SHARED_MEMORY = "-shm"
 
 #: COLMAP's numbers of a coordinate system and of a kind of sensor.
 _WGS84, _CAMERA = 0, 0
+#: Two models are in one frame when the cameras they share stand closer together than this share of their extent.
+_SAME_CENTRE = 0.01
 #: Priors and rigs of a database count as the model's when they differ from it by less than this share of its size.
 _SAME_FRAME = 0.1
 
@@ -54,6 +56,15 @@ class PlacedModel:
         """Diagonal of the box around the cameras."""
         centres = np.array(list(self.centres.values()))
         return float(np.linalg.norm(np.ptp(centres, axis=0)))
+
+    def has_cameras_at(self, pairs: Sequence[tuple[Array, Array]]) -> bool:
+        """Whether centres of its cameras, each with where it stands elsewhere, are in the same places."""
+        return are_near(pairs, max(_SAME_CENTRE * self.extent(), 1e-9))
+
+
+def are_near(pairs: Sequence[tuple[Array, Array]], largest: float) -> bool:
+    """Whether the median distance between the places of pairs is at most ``largest``."""
+    return float(np.median([np.linalg.norm(a - b) for a, b in pairs])) <= largest
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -233,8 +244,7 @@ def _are_in_frame(
     """Whether there are rows and they are in the frame of a model of this size: as was decided, or by their places."""
     if not rows or decided is not None:
         return bool(rows) and decided is not None and model in decided
-    distances = [np.linalg.norm(row.place - places[row.key]) for row in rows]
-    return float(np.median(distances)) <= _SAME_FRAME * size
+    return are_near([(row.place, places[row.key]) for row in rows], _SAME_FRAME * size)
 
 
 def _doubles(path: Path, what: str, blob: object, count: int) -> Array | None:

@@ -30,8 +30,6 @@ NO_UP = "the direction of gravity is not known: up is only taken for z"
 #: What it said before a similarity made it metres, and in that the provenance of this one.
 _BEFORE, _BY = "before_apply", "provenance"
 _DIRECTIONS = ("up_in_world", "gravity_in_world_m_s2")
-#: Its cameras are a model's when they stand closer to them than this share of their extent.
-_SAME_FRAME = 0.01
 
 
 def is_transforms(path: Path) -> bool:
@@ -58,11 +56,11 @@ def cameras_are_those_of(path: Path, placed: Sequence[PlacedModel]) -> bool:
     for model in placed:
         pairs = []
         for name, centre in model.centres.items():
-            path_of = PurePosixPath(name)
-            pairs.append((centre, found.get(path_of.name, found.get(path_of.stem))))
-        distances = [float(np.linalg.norm(a - b)) for a, b in pairs if b is not None]
-        enough = 2 * len(distances) >= min(len(model.centres), len(values["frames"])) > 0
-        if enough and float(np.median(distances)) <= max(_SAME_FRAME * model.extent(), 1e-9):
+            image = PurePosixPath(name)
+            if (written := found.get(image.name, found.get(image.stem))) is not None:
+                pairs.append((centre, written))
+        enough = 2 * len(pairs) >= min(len(model.centres), len(values["frames"])) > 0
+        if enough and model.has_cameras_at(pairs):
             return True
     return False
 

@@ -29,13 +29,12 @@ from colmap_inertial.model import (
     transformed,
     write_files,
 )
-from colmap_inertial.model.binary import check_binary_model
 from colmap_inertial.model.copying import begin_writing, copy_file, list_tree, new_folder
 from colmap_inertial.model.database import SHARED_MEMORY, SIDE_FILES, is_database, transform_database
-from colmap_inertial.model.kinds import WRITERS, foreign_kind, kind_of
-from colmap_inertial.model.layout import Layout, read_layout
+from colmap_inertial.model.layout import WRITERS, Layout, foreign_kind, kind_of, read_layout
 from colmap_inertial.model.nerf import cameras_are_those_of
 from colmap_inertial.model.similarities import ModelScale, require_not_joined, similarity_from_json, undoing
+from colmap_inertial.model.soundness import check_binary_model
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,7 +21,7 @@ from colmap_inertial.core.types import (
     FrameTiming,
     ImuRecording,
 )
-from colmap_inertial.io.plausible import find_implausible
+from colmap_inertial.io.plausible import RawImu
 from colmap_inertial.io.pose_convention import ARRAYS, PoseConvention
 from colmap_inertial.io.units import Axes
 from colmap_inertial.motion.align import Alignment, AlignOptions, align_clocks
@@ -185,7 +185,7 @@ class Recorded:
         """What a reader would refuse the inertial samples for."""
         if self.imu is None:
             return ()
-        found = find_implausible(self.imu, Path("IMU"), gyro_axes=self.gyro_axes, accel_axes=self.accel_axes)
+        found = RawImu(imu=self.imu, path=Path("IMU"), gyro_axes=self.gyro_axes, accel_axes=self.accel_axes).problems()
         return tuple(found)
 
     @property

@@ -20,9 +20,8 @@ import numpy as np
 from colmap_inertial.checks.report.figures import Figure
 from colmap_inertial.checks.words import digits, signed
 from colmap_inertial.inertial.scale.verdict import TRUSTED_HALF_WIDTH, WEAK_HALF_WIDTH
-from colmap_inertial.io.files import read_bytes
+from colmap_inertial.io.files import path_in, read_bytes
 from colmap_inertial.io.images import require_modest
-from colmap_inertial.io.names import path_in
 
 if TYPE_CHECKING:
     from jinja2 import Environment

@@ -11,7 +11,7 @@ from colmap_inertial.checks.report.series import rounded, strided
 from colmap_inertial.checks.report.sizes import SIZES
 from colmap_inertial.core.arrays import Array, IndexArray
 from colmap_inertial.core.geometry import quat_rotate
-from colmap_inertial.model.intrinsics import intrinsics_sigma
+from colmap_inertial.model.readout import intrinsics_sigma
 
 if TYPE_CHECKING:
     import pycolmap

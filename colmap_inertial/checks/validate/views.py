@@ -12,9 +12,8 @@ from colmap_inertial.checks.validate.detect import Detection
 from colmap_inertial.checks.validate.limits import DETECTION
 from colmap_inertial.core.arrays import Array, IndexArray, UInt8Array
 from colmap_inertial.core.errors import FormatError
-from colmap_inertial.io.files import read_bytes
+from colmap_inertial.io.files import path_in, read_bytes
 from colmap_inertial.io.images import require_modest
-from colmap_inertial.io.names import path_in
 from colmap_inertial.model import model_format, read_model
 
 if TYPE_CHECKING:

@@ -19,7 +19,7 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.errors import FormatError
-from colmap_inertial.model.observed import points_of_features
+from colmap_inertial.model import points_of_features
 from colmap_inertial.model.submodels.graph import Pair, SimilarityConstraint
 
 if TYPE_CHECKING:

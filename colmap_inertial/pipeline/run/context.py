@@ -8,10 +8,9 @@ from typing import Literal
 
 from colmap_inertial.core.options import ReconstructOptions
 from colmap_inertial.core.types import CameraImuCalibration, FrameTiming, ImuRecording
-from colmap_inertial.io.calibration import largest_offset_s
+from colmap_inertial.io.calibration import CalibrationFiles, largest_offset_s, read_calibrations, read_for_another
 from colmap_inertial.io.capture import Capture, Video
-from colmap_inertial.io.imu_calibration import CalibrationFiles, read_calibrations, read_for_another
-from colmap_inertial.io.names import path_in
+from colmap_inertial.io.files import path_in
 from colmap_inertial.pipeline.run.progress import Progress, silent
 from colmap_inertial.pipeline.run.runner import fingerprint
 

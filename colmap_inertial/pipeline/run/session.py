@@ -11,7 +11,7 @@ from pathlib import Path
 from colmap_inertial import __version__
 from colmap_inertial.core.errors import InertialError
 from colmap_inertial.io.files import as_plain, read_json, remove_temporaries, write_json, write_text
-from colmap_inertial.model.loading import load_pycolmap
+from colmap_inertial.model import load_pycolmap
 from colmap_inertial.pipeline.run.config import config_as_toml
 from colmap_inertial.pipeline.run.context import RunContext
 from colmap_inertial.pipeline.run.progress import Progress

@@ -21,8 +21,8 @@ from colmap_inertial.imaging.multi_aperture import (
     require_colours,
 )
 from colmap_inertial.io.aperture_images import ApertureImages
+from colmap_inertial.io.files import path_in
 from colmap_inertial.io.images import read_image
-from colmap_inertial.io.names import path_in
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.pipeline.stages.inputs import StageInputs
 

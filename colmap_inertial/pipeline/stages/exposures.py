@@ -25,11 +25,11 @@ from colmap_inertial.imaging.exposure_pairs import (
     fuse_mertens,
 )
 from colmap_inertial.imaging.gyro_camera import FrameShutter, GyroCamera
+from colmap_inertial.io.aperture_images import LongExposures, LongTiming
 from colmap_inertial.io.capture import Capture, ImageFolder
-from colmap_inertial.io.exposures import LongExposures, LongTiming
+from colmap_inertial.io.files import path_in
 from colmap_inertial.io.frames import image_names
 from colmap_inertial.io.images import read_image
-from colmap_inertial.io.names import path_in
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.pipeline.stages.fusers import Fuser
 from colmap_inertial.pipeline.stages.gyro_view import GyroView

@@ -14,9 +14,8 @@ from colmap_inertial.core.arrays import AnyArray
 from colmap_inertial.core.errors import FormatError, InertialError
 from colmap_inertial.core.types import CameraModel, Frame, Treatment
 from colmap_inertial.imaging.path_filters import smoothed
-from colmap_inertial.io.image_metadata import carry_metadata
-from colmap_inertial.io.names import path_in
-from colmap_inertial.io.records import read_record, write_record
+from colmap_inertial.io.exif import carry_metadata
+from colmap_inertial.io.files import path_in, read_record, write_record
 from colmap_inertial.pipeline.run.progress import Progress
 from colmap_inertial.pipeline.stages.protocols import FrameStage
 

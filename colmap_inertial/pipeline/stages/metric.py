@@ -22,7 +22,7 @@ from colmap_inertial.core.types import (
     SmoothedTrajectory,
 )
 from colmap_inertial.imaging.gyro_camera import GyroCamera
-from colmap_inertial.io.records import write_record
+from colmap_inertial.io.files import write_record
 from colmap_inertial.io.trajectories import write_tum
 from colmap_inertial.model import Model, downgraded
 from colmap_inertial.motion.smooth import smooth_trajectory

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from colmap_inertial.core.threads import in_order
+from colmap_inertial.io.files import path_in
 from colmap_inertial.io.images import read_image
-from colmap_inertial.io.names import path_in
 from colmap_inertial.model.copying import copy_file
 from colmap_inertial.pipeline.run.progress import Progress
 from colmap_inertial.pipeline.stages.frame_folder import encode_image

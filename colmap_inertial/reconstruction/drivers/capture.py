@@ -19,12 +19,12 @@ from colmap_inertial.core.errors import FormatError, InertialError
 from colmap_inertial.core.gravity import gravity_in_cam
 from colmap_inertial.core.options import ReconstructOptions
 from colmap_inertial.core.types import Frame, PositionFixes
+from colmap_inertial.io.calibration import used_files
 from colmap_inertial.io.capture import Capture, load_capture
-from colmap_inertial.io.files import StrPath
+from colmap_inertial.io.files import StrPath, reading_within
 from colmap_inertial.io.frames import picture_folders, read_frames
-from colmap_inertial.io.imu import RawImu, read_raw_capture_imu
-from colmap_inertial.io.imu_calibration import used_files
-from colmap_inertial.io.limits import reading_within
+from colmap_inertial.io.imu import read_raw_capture_imu
+from colmap_inertial.io.plausible import RawImu
 from colmap_inertial.pipeline.run.context import Recording, RunContext, corrected_imu, prior_calibration
 from colmap_inertial.pipeline.run.installed import warn_of_conflicts
 from colmap_inertial.pipeline.run.progress import Progress, silent

@@ -14,9 +14,8 @@ from colmap_inertial.core.types import Frame
 from colmap_inertial.imaging.blur_field import BlurField
 from colmap_inertial.imaging.psf import blur_field
 from colmap_inertial.io.capture import Capture
-from colmap_inertial.io.files import write_json
+from colmap_inertial.io.files import path_in, write_json
 from colmap_inertial.io.images import read_image
-from colmap_inertial.io.names import path_in
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.pipeline.stages.frame_folder import encode_image
 from colmap_inertial.pipeline.stages.imaging_plan import ImagingPlan

@@ -10,11 +10,11 @@ from colmap_inertial import __version__
 from colmap_inertial.colmap.sparse import check_pair_names
 from colmap_inertial.core.errors import FormatError, InertialError, OutputError, OutputExistsError
 from colmap_inertial.core.options import BlurRemover, ReconstructOptions
+from colmap_inertial.io.calibration import CalibrationFiles, as_paths
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.files import StrPath, read_json, write_json
 from colmap_inertial.io.frames import picture_folders, read_frames
 from colmap_inertial.io.imu import read_capture_imu
-from colmap_inertial.io.imu_calibration import CalibrationFiles, as_paths
 from colmap_inertial.pipeline.run.context import Recording, RunContext, corrected_imu, prior_calibration
 from colmap_inertial.pipeline.run.progress import Progress, silent
 from colmap_inertial.pipeline.run.runner import remove

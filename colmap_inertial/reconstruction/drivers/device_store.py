@@ -10,11 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from colmap_inertial.core.errors import FormatError, InertialError, OutputError
-from colmap_inertial.io.calibration import CAMERA_IMU
+from colmap_inertial.io.calibration import CAMERA_IMU, IMU, calibration_kind
 from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.files import read_text, write_text
 from colmap_inertial.io.imu import read_raw_capture_imu, read_raw_imu
-from colmap_inertial.io.imu_calibration import IMU, calibration_kind
 
 #: A camera-IMU rotation that is known better than this was stated by the capture.
 _STATED_RAD = 1.0

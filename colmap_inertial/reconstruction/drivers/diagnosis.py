@@ -11,15 +11,15 @@ import numpy as np
 from colmap_inertial.checks.diagnose import Diagnosis, FramesInVideo, Recorded, diagnose, unreadable
 from colmap_inertial.core.errors import FormatError, InertialError, TimingError
 from colmap_inertial.core.types import CameraTrajectory, FrameTiming
-from colmap_inertial.io.calibration import largest_offset_s
+from colmap_inertial.io.calibration import CalibrationFiles, largest_offset_s, read_for_another
 from colmap_inertial.io.capture import Capture, ImageFolder, load_capture
 from colmap_inertial.io.files import write_json
 from colmap_inertial.io.frames import read_frame_times, read_frame_timing
-from colmap_inertial.io.imu import RawImu, is_capture, read_raw_capture_imu, read_raw_imu
-from colmap_inertial.io.imu_calibration import CalibrationFiles, read_for_another
+from colmap_inertial.io.imu import is_capture, read_raw_capture_imu, read_raw_imu
+from colmap_inertial.io.imu_formats import find_recording
 from colmap_inertial.io.imu_text import is_inertial_scale
+from colmap_inertial.io.plausible import RawImu
 from colmap_inertial.io.pose_convention import ARRAYS, COLMAP, INERTIAL_SCALE, TUM, PoseConvention
-from colmap_inertial.io.recorders import find_recording
 from colmap_inertial.io.trajectories import read_inertial_scale_poses, read_tum
 from colmap_inertial.io.video import decode_grey, video_stamps_ns
 from colmap_inertial.io.video_match import match_to_video

@@ -12,10 +12,9 @@ from colmap_inertial.core.options import FuseAperturesOptions
 from colmap_inertial.core.types import Frame
 from colmap_inertial.imaging.multi_aperture import refocus, require_colours
 from colmap_inertial.io.capture import ImageFolder, load_capture
-from colmap_inertial.io.files import StrPath
+from colmap_inertial.io.files import StrPath, path_in
 from colmap_inertial.io.frames import image_names, picture_folders
 from colmap_inertial.io.images import read_image
-from colmap_inertial.io.names import path_in
 from colmap_inertial.pipeline.run.context import RunContext
 from colmap_inertial.pipeline.run.progress import Progress, silent
 from colmap_inertial.pipeline.run.runner import fingerprint, remove

@@ -10,14 +10,12 @@ from colmap_inertial import __version__
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.options import ExposureOptions
 from colmap_inertial.core.types import Frame, FrameTiming
+from colmap_inertial.io.calibration import CalibrationFiles
 from colmap_inertial.io.capture import Capture, ImageFolder, load_capture
-from colmap_inertial.io.files import StrPath
+from colmap_inertial.io.files import StrPath, path_in, structured
 from colmap_inertial.io.frames import image_names, picture_folders, read_frame_timing
 from colmap_inertial.io.images import read_image
 from colmap_inertial.io.imu import read_capture_imu
-from colmap_inertial.io.imu_calibration import CalibrationFiles
-from colmap_inertial.io.names import path_in
-from colmap_inertial.io.records import structured
 from colmap_inertial.pipeline.run.context import Recording, RunContext, corrected_imu, prior_calibration
 from colmap_inertial.pipeline.run.progress import Progress, silent
 from colmap_inertial.pipeline.run.runner import fingerprint

@@ -12,8 +12,7 @@ from colmap_inertial.core.options import WorldAxes
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import DOWN_IN_WORLD, FrameTiming, PositionFixes
 from colmap_inertial.inertial.georeference import Georeference
-from colmap_inertial.io.files import write_json
-from colmap_inertial.io.records import read_record, write_record
+from colmap_inertial.io.files import read_record, write_json, write_record
 from colmap_inertial.model import read_model, trajectory_from_model
 from colmap_inertial.pipeline.run.runner import remove
 from colmap_inertial.pipeline.run.session import Session

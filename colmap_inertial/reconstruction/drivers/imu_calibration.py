@@ -10,9 +10,9 @@ from colmap_inertial.core.errors import FormatError, OutputError, OutputExistsEr
 from colmap_inertial.core.options import GravityOptions
 from colmap_inertial.inertial.scale import check_units, strength_of_gravity
 from colmap_inertial.inertial.static_calibration import RestCalibration, calibrate_imu
+from colmap_inertial.io.calibration import write_imu_calibration
 from colmap_inertial.io.files import write_text
 from colmap_inertial.io.imu import read_raw_imu
-from colmap_inertial.io.imu_calibration import write_imu_calibration
 from colmap_inertial.io.plausible import check_alive
 from colmap_inertial.reconstruction.drivers.sources import check_output
 
@@ -51,7 +51,7 @@ def calibrate_source(
     imu = raw.imu
     if imu.has_accel:
         check_alive(imu.gyro_rad_s, "gyro", raw.path)
-        check_alive(imu.accel_m_s2, "accel", raw.accel_path)
+        check_alive(imu.accel_m_s2, "accel", raw.accel_path or raw.path)
         problems = check_units(imu)
         if problems:
             raise FormatError(raw.path, "; ".join(problems))

@@ -13,7 +13,7 @@ from colmap_inertial.colmap.dense import run_dense
 from colmap_inertial.core.errors import FormatError, NotObservableError, TargetNotFoundError, TimingError
 from colmap_inertial.core.options import DenseOptions
 from colmap_inertial.core.types import Gap, JoinedPart, ScaleEstimate
-from colmap_inertial.io.records import read_record, write_record
+from colmap_inertial.io.files import read_record, write_record
 from colmap_inertial.model import (
     Model,
     downgraded,

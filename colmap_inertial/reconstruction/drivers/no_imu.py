@@ -22,11 +22,10 @@ from colmap_inertial.core.errors import FormatError, InertialError, OutputExists
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, ReferenceOptions
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.io.capture import Capture, ImageFolder, Video, load_capture
-from colmap_inertial.io.files import StrPath, read_json, write_json
+from colmap_inertial.io.files import StrPath, path_in, read_json, write_json
 from colmap_inertial.io.frames import image_names, read_frames
 from colmap_inertial.io.imu import is_capture
 from colmap_inertial.io.mp4 import is_mp4
-from colmap_inertial.io.names import path_in
 from colmap_inertial.model import find_models, read_model
 from colmap_inertial.model.copying import copy_file, new_folder
 from colmap_inertial.pipeline.run.context import RunContext

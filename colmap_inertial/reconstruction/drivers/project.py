@@ -19,19 +19,15 @@ from colmap_inertial.colmap.tsdf import require_mesh_maker
 from colmap_inertial.core.errors import AlreadyMetricError, FormatError, InertialError, OutputError, TimingError
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
 from colmap_inertial.core.types import CameraTrajectory, FrameTiming, ReadoutDirection
-from colmap_inertial.io.calibration import calibration_prior
+from colmap_inertial.io.calibration import calibration_prior, used_files
 from colmap_inertial.io.capture import Capture, Video, load_capture
-from colmap_inertial.io.exif import stamps_of_exif
-from colmap_inertial.io.files import StrPath
+from colmap_inertial.io.exif import stamps_of_exif, stated_exposures_s
+from colmap_inertial.io.files import StrPath, path_in, read_record, reading_within, write_record
 from colmap_inertial.io.frame_times import FrameStamps, stamps_of_pattern
 from colmap_inertial.io.frames import read_frame_times, read_frame_timing
-from colmap_inertial.io.image_metadata import stated_exposures_s
-from colmap_inertial.io.imu import RawImu, is_capture, read_raw_capture_imu, read_raw_imu
-from colmap_inertial.io.imu_calibration import used_files
-from colmap_inertial.io.limits import reading_within
-from colmap_inertial.io.names import path_in
-from colmap_inertial.io.recorders import find_recording
-from colmap_inertial.io.records import read_record, write_record
+from colmap_inertial.io.imu import is_capture, read_raw_capture_imu, read_raw_imu
+from colmap_inertial.io.imu_formats import find_recording
+from colmap_inertial.io.plausible import RawImu
 from colmap_inertial.io.video import video_stamps_ns
 from colmap_inertial.io.video_match import match_to_video
 from colmap_inertial.model import (

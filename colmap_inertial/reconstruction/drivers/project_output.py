@@ -10,9 +10,7 @@ from pathlib import Path, PurePosixPath
 
 from colmap_inertial.core.errors import OutputError, OutputExistsError
 from colmap_inertial.core.options import ProjectOptions
-from colmap_inertial.io.files import read_json, write_json
-from colmap_inertial.io.names import check_names, path_in
-from colmap_inertial.io.records import read_record, write_record
+from colmap_inertial.io.files import check_names, path_in, read_json, read_record, write_json, write_record
 from colmap_inertial.model import TRANSFORM_FILE, model_files, model_format, model_formats, read_model, write_files
 from colmap_inertial.model.project import apply_to_project
 from colmap_inertial.model.similarities import ModelScale

@@ -23,12 +23,18 @@ from colmap_inertial.core.errors import FormatError, InertialError, NotObservabl
 from colmap_inertial.core.options import ScaleOptions, ValidateOptions
 from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, ImuRecording, ScaleEstimate, Similarity
 from colmap_inertial.inertial.scale import estimate_scale, first_seconds
-from colmap_inertial.io.calibration import largest_offset_s, write_calibration
+from colmap_inertial.io.calibration import (
+    CalibrationFiles,
+    as_paths,
+    largest_offset_s,
+    read_for_another,
+    used_files,
+    write_calibration,
+)
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.files import read_json, write_json
 from colmap_inertial.io.frames import read_frame_times
 from colmap_inertial.io.imu import is_capture, read_imu
-from colmap_inertial.io.imu_calibration import CalibrationFiles, as_paths, read_for_another, used_files
 from colmap_inertial.io.imu_text import is_inertial_scale
 from colmap_inertial.io.pose_convention import COLMAP, INERTIAL_SCALE, TUM, PoseConvention
 from colmap_inertial.io.trajectories import read_inertial_scale, read_tum

@@ -31,9 +31,9 @@ from colmap_inertial.core.types import (
     FrameTiming,
 )
 from colmap_inertial.io.capture import Capture, ImageFolder
+from colmap_inertial.io.files import path_in
 from colmap_inertial.io.frames import read_frames
 from colmap_inertial.io.images import read_image
-from colmap_inertial.io.names import path_in
 from colmap_inertial.model import colmap_camera, find_models, read_model, trajectory_from_model
 from colmap_inertial.motion.align import AlignOptions, align_clocks
 from colmap_inertial.motion.flow import FlowOptions, VisualRotation, check_motion, find_stabilisation, measure_rotation

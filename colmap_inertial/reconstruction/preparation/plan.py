@@ -21,8 +21,8 @@ from colmap_inertial.imaging.gate import (
 from colmap_inertial.imaging.parallax import Parallax
 from colmap_inertial.imaging.psf import predicted_blur_px
 from colmap_inertial.io.capture import Capture
-from colmap_inertial.io.image_metadata import stated_exposures_s
-from colmap_inertial.io.names import path_in
+from colmap_inertial.io.exif import stated_exposures_s
+from colmap_inertial.io.files import path_in
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.pipeline.run.context import Recording, RunContext
 from colmap_inertial.pipeline.run.progress import Progress

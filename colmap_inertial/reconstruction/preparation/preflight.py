@@ -14,7 +14,7 @@ from colmap_inertial.core.threads import one_blas_thread
 from colmap_inertial.core.types import CameraTrajectory, FrameTiming
 from colmap_inertial.io.capture import Capture
 from colmap_inertial.io.files import write_json
-from colmap_inertial.io.imu import RawImu
+from colmap_inertial.io.plausible import RawImu
 from colmap_inertial.io.pose_convention import COLMAP
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.motion.flow import VisualRotation

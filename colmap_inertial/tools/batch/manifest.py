@@ -9,8 +9,7 @@ from typing import Any
 
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions, StageNames
-from colmap_inertial.io.files import StrPath
-from colmap_inertial.io.names import check_names
+from colmap_inertial.io.files import StrPath, check_names
 from colmap_inertial.io.toml_section import Section, read_toml
 from colmap_inertial.pipeline.run.config import read_values, with_values
 

@@ -17,8 +17,7 @@ from typing import Any
 from colmap_inertial.checks.diagnose import Diagnosis
 from colmap_inertial.core.errors import InertialError, OutputExistsError
 from colmap_inertial.core.options import ProjectOptions, StageNames
-from colmap_inertial.io.files import locked, write_text
-from colmap_inertial.io.limits import reading_within
+from colmap_inertial.io.files import locked, reading_within, write_text
 from colmap_inertial.pipeline.run.config import config_as_toml, read_config
 from colmap_inertial.pipeline.run.progress import Progress
 from colmap_inertial.pipeline.run.workspace import Workspace

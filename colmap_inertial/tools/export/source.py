@@ -15,11 +15,9 @@ from colmap_inertial.core.options import ExportImages
 from colmap_inertial.core.types import DOWN_IN_WORLD, CameraMotion, CameraTrajectory
 from colmap_inertial.inertial.georeference import Georeference
 from colmap_inertial.io.capture import Capture
-from colmap_inertial.io.files import read_json
+from colmap_inertial.io.files import path_in, read_json, read_record
 from colmap_inertial.io.frames import read_frame_timing
-from colmap_inertial.io.names import path_in
 from colmap_inertial.io.positions import positions_in_pictures
-from colmap_inertial.io.records import read_record
 from colmap_inertial.model import read_model
 from colmap_inertial.pipeline.run.workspace import Workspace, a_record_of_ours, places_of
 from colmap_inertial.pipeline.stages.metric import motion_file

@@ -11,7 +11,7 @@ import numpy as np
 from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import quat_conjugate, quat_rotate
 from colmap_inertial.core.types import DOWN_IN_WORLD
-from colmap_inertial.io.names import path_in
+from colmap_inertial.io.files import path_in
 from colmap_inertial.io.trajectories import read_tum
 from colmap_inertial.model import read_model
 from colmap_inertial.tools.view.clouds import Cloud, Mesh, centre_and_reach, dense_cloud, read_mesh, sparse_cloud

@@ -14,8 +14,7 @@ from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.geometry import quat_rotate
 from colmap_inertial.core.quantiles import Z95
 from colmap_inertial.core.types import LengthUnit
-from colmap_inertial.io.files import read_json
-from colmap_inertial.io.names import path_in
+from colmap_inertial.io.files import path_in, read_json
 from colmap_inertial.model import TRANSFORM_FILE, find_models, is_metric, model_format
 from colmap_inertial.model.similarities import similarity_from_json
 from colmap_inertial.pipeline.run.workspace import Workspace, a_record_of_ours, places_of
