@@ -18,6 +18,7 @@ from pathlib import Path
 import pycolmap
 import pytest
 from batch_captures import TINY, model_bytes, tiny_capture
+from cases import loop_over
 
 from colmap_inertial.cli import main, parse
 from colmap_inertial.core.errors import FormatError, InertialError, MissingExtraError, OutputExistsError
@@ -116,7 +117,7 @@ def test_a_folder_of_captures_is_a_manifest(tmp_path):
     assert [capture.name for capture in read_manifest(tmp_path)] == ["a", "b"]
 
 
-@pytest.mark.parametrize(
+@loop_over(
     ("text", "words"),
     [
         ("", "names no capture"),

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from batch_captures import FRAMES, TINY, model_bytes, tiny_capture
+from cases import loop_over
 
 from colmap_inertial.cli import main
 from colmap_inertial.core.errors import FormatError, InertialError
@@ -182,7 +183,7 @@ def test_names_lead_to_functions_instances_and_the_default_stages(hooks):
     assert stages.model == (..., hooks_of_mine.seen)
 
 
-@pytest.mark.parametrize(
+@loop_over(
     ("name", "words"),
     [
         ("no_such_module:mask", "there is no module no_such_module"),
@@ -208,9 +209,7 @@ def test_a_module_that_fails_is_named(hooks, code):
         load_stages(StageNames(model=("broken_hooks:mask",)))
 
 
-@pytest.mark.parametrize(
-    "name", ["", "mask", "mask:", ":mask", "a:b:c", "a b:c", "a.py:", "a..b:c", "/a/b.py:mask", "a:b()"]
-)
+@loop_over("name", ["", "mask", "mask:", ":mask", "a:b:c", "a b:c", "a.py:", "a..b:c", "/a/b.py:mask", "a:b()"])
 def test_a_name_is_that_of_a_module_and_what_is_in_it(name):
     with pytest.raises(ValueError, match="names no stage"):
         StageNames(keypoint=(name,))
@@ -224,7 +223,7 @@ def test_a_script_s_own_stages_and_dots_twice_are_refused():
     assert StageNames(frame=("...", "a:b.c"), keypoint=(), model=("d:e",)).code == ("a:b.c", "d:e")
 
 
-@pytest.mark.parametrize(
+@loop_over(
     ("line", "words"),
     [
         ('stages.frame = ["mask"]', "stages: frame: 'mask' names no stage"),

@@ -8,6 +8,7 @@ import sys
 
 import numpy as np
 import pytest
+from cases import loop_over
 
 from colmap_inertial.cli import _COMMANDS, _options, main
 
@@ -20,7 +21,7 @@ def run(capsys, *args):
     return stopped.value.code, captured.out, captured.err
 
 
-@pytest.mark.parametrize(
+@loop_over(
     "command",
     [
         [],
@@ -49,7 +50,7 @@ def test_a_wrong_flag_exits_2_and_names_it(capsys):
     assert "--metod" in err
 
 
-@pytest.mark.parametrize(
+@loop_over(
     ("args", "meant"),
     [
         (["scal", "x"], "there is no command scal; did you mean scale?"),
@@ -66,7 +67,7 @@ def test_what_is_mistyped_is_named_also_where_something_is_missing(capsys, args,
     assert len(err.splitlines()) == 1
 
 
-@pytest.mark.parametrize("command", _COMMANDS)
+@loop_over("command", _COMMANDS)
 def test_every_option_of_the_help_is_known(capsys, monkeypatch, command):
     monkeypatch.setenv("COLUMNS", "80")
     _, out, _ = run(capsys, command, "--help")
@@ -295,7 +296,7 @@ def test_a_broken_configuration_exits_2(capsys, tmp_path):
     assert "did you mean seed" in err
 
 
-@pytest.mark.parametrize(
+@loop_over(
     ("flags", "words"),
     [
         (["--latitude-deg", "100"], "latitude_deg must be from -90 to 90"),

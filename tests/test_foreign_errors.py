@@ -8,6 +8,7 @@ import cv2
 import model_project
 import numpy as np
 import pytest
+from cases import loop_over
 from report_runs import write_run
 
 from colmap_inertial.checks.report import write_report
@@ -21,7 +22,7 @@ from colmap_inertial.pipeline.run.config import read_config
 from colmap_inertial.tools.batch import read_manifest
 
 
-@pytest.mark.parametrize("count", ["1e999", "inf", "-inf", "nan", "1e300", "-1", "300", "1_0"])
+@loop_over("count", ["1e999", "inf", "-inf", "nan", "1e300", "-1", "300", "1_0"])
 def test_a_list_s_length_out_of_range(tmp_path, count):
     path = tmp_path / "a.ply"
     path.write_text(
@@ -88,7 +89,7 @@ DAMAGE = [
 ]
 
 
-@pytest.mark.parametrize(("name", "content"), DAMAGE)
+@loop_over(("name", "content"), DAMAGE)
 def test_a_report_of_damaged_files(run, name, content):
     whole = (run / name).read_bytes()
     try:

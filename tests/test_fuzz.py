@@ -4,6 +4,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from cases import loop_over
 from fuzz_readers import READERS, Reader
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
@@ -15,7 +16,7 @@ from colmap_inertial.core.errors import FormatError
 MUTANTS = 12
 
 
-@pytest.mark.parametrize("name", [name for name, reader in READERS.items() if reader.cost < 10])
+@loop_over("name", [name for name, reader in READERS.items() if reader.cost < 10])
 def test_only_errors_of_our_own_come_out(tmp_path, name):
     reader = READERS[name]
     files = whole_files(reader, tmp_path)

@@ -2,7 +2,7 @@
 
 import re
 
-import pytest
+from cases import loop_over
 from test_cli import run
 
 TASKS = [
@@ -20,7 +20,7 @@ TASKS = [
 ]
 
 
-@pytest.mark.parametrize(("task", "command", "name", "words"), TASKS, ids=[task for task, *_ in TASKS])
+@loop_over(("task", "command", "name", "words"), TASKS, ids=[task for task, *_ in TASKS])
 def test_the_help_solves_it(task, command, name, words, monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "80")
     code, out, _ = run(capsys, *([command] if command else []), "--help")

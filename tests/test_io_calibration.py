@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cases import loop_over
 
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.types import CALIBRATION_PARAMETERS, CameraImuCalibration
@@ -63,7 +64,7 @@ def test_the_search_for_a_shared_clock_s_offset_is_narrow_unless_asked_otherwise
     assert largest_offset_s(True, 5.0) == largest_offset_s(False, 5.0) == 5.0
 
 
-@pytest.mark.parametrize(
+@loop_over(
     ("change", "said"),
     [
         ({"readout_s": None}, "missing: readout_s"),

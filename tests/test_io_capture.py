@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cases import loop_over
 from test_io_imu import HEADER, handheld, rows, write_csv
 
 from colmap_inertial.core.errors import FormatError
@@ -125,7 +126,7 @@ def test_a_video_capture(tmp_path: Path) -> None:
     assert capture.imu is None and capture.camera is None
 
 
-@pytest.mark.parametrize(
+@loop_over(
     ("text", "said"),
     [
         ('[images]\nfolder = "a"\nfodler = "b"\n', r'line 3: \[images\] fodler: unknown key; did you mean "folder"'),
@@ -179,7 +180,7 @@ def test_a_mistake_names_file_line_table_and_key(tmp_path: Path, text: str, said
     assert str(tmp_path) in str(caught.value)
 
 
-@pytest.mark.parametrize(
+@loop_over(
     ("gyro", "said"),
     [
         ('columns = ["gx", "gy"]', "three names"),
@@ -354,7 +355,7 @@ def test_dataset_folders_are_captures_where_that_is_unambiguous(shared_data: Pat
         load_capture(tmp_path / "mav0/imu0/data.csv")
 
 
-@pytest.mark.parametrize(
+@loop_over(
     ("change", "said"),
     [
         (("pinhole", "omni"), "camera_model 'omni'"),

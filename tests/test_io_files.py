@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cases import loop_over
 
 from colmap_inertial.core.errors import FormatError, OutputError, OutputExistsError
 from colmap_inertial.io.files import locked, read_json, write_json, write_text
@@ -84,7 +85,7 @@ def test_a_file_is_on_the_disk_before_it_takes_its_name(tmp_path: Path, monkeypa
     assert done == ["flushed", "named"]
 
 
-@pytest.mark.parametrize(
+@loop_over(
     ("text", "said"),
     [('{"a": 1,\n"b" 2}', "line 2"), ("[1]", "object"), ('{"a": NaN}', "NaN"), ("", "line 1"), ("[" * 100000, "JSON")],
 )

@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from cases import loop_over
 from conftest import write_anew
 
 from colmap_inertial.core.errors import FormatError, TimingError
@@ -99,7 +100,7 @@ def test_a_csv_times_frames(tmp_path: Path, text: str, t_ns: list[int], unit: st
     assert [timing.epoch_ns + round(t * 1e9) for t in timing.t_s] == t_ns
 
 
-@pytest.mark.parametrize(
+@loop_over(
     ("text", "said"),
     [
         ("name,t_s\na.png,0.5\n", "no row for 1 of 2 pictures .first: b.png"),

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import pytest
+from cases import loop_over
 from conftest import write_anew
 from test_io_capture import EVERYTHING
 from test_io_frames import picture
@@ -167,7 +167,7 @@ def refusals(path: Path, read: Callable[[], object], *, key: str, count: int) ->
     return found
 
 
-@pytest.mark.parametrize("reader", READERS)
+@loop_over("reader", READERS)
 def test_only_errors_of_our_own_escape(tmp_path: Path, reader: str) -> None:
     build, read = READERS[reader]
     path = build(tmp_path)

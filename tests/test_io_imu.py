@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cases import loop_over
 
 from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.io.imu import read_imu
@@ -127,7 +128,7 @@ def test_sensors_of_two_rates_in_one_table_keep_their_own_times(tmp_path: Path) 
     )
 
 
-@pytest.mark.parametrize(
+@loop_over(
     ("header", "said"),
     [
         (HEADER.replace("[rad s^-1]", "[turns]"), "turns"),
@@ -227,7 +228,7 @@ def test_rows_without_a_value_are_dropped_and_listed(clean: tuple[Path, list[str
     assert any("line 9" in repair for repair in imu.repairs)
 
 
-@pytest.mark.parametrize(
+@loop_over(
     ("change", "error", "said"),
     [
         (lambda lines: [*lines[:10], lines[10] + ",1", *lines[11:]], FormatError, "line 12"),
@@ -293,7 +294,7 @@ def test_a_dataset_with_several_imus_asks_which(tmp_path: Path) -> None:
     assert len(read_imu(tmp_path / "mav0/imu1").gyro_t_s) == 400
 
 
-@pytest.mark.parametrize(
+@loop_over(
     ("accel_unit", "gyro_factor", "accel_factor", "guilty", "said"),
     [
         ("g", 1.0, 1.0, "a.txt", 'unit = "m/s2" under [imu.accel]'),

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from batch_captures import TINY, tiny_capture
+from cases import loop_over
 from jsonschema import Draft202012Validator
 
 from colmap_inertial import calibrate_imu
@@ -98,7 +99,7 @@ def test_a_file_without_a_kind_is_one_of_camera_and_imu(both) -> None:
     read_calibration(both[0])
 
 
-@pytest.mark.parametrize(
+@loop_over(
     ("change", "said"),
     [
         ({"kind": "camera"}, "holds no calibration of an IMU"),
@@ -115,11 +116,12 @@ def test_a_file_without_a_kind_is_one_of_camera_and_imu(both) -> None:
         ({"attitudes": ...}, "missing: attitudes"),
     ],
 )
-def test_a_wrong_file_is_named_with_what_is_wrong(both, change, said) -> None:
+def test_a_wrong_file_is_named_with_what_is_wrong(both, tmp_path, change, said) -> None:
     values = {**json.loads(both[1].read_text()), **change}
-    both[1].write_text(json.dumps({key: value for key, value in values.items() if value is not ...}))
+    wrong = tmp_path / "phone_imu.json"
+    wrong.write_text(json.dumps({key: value for key, value in values.items() if value is not ...}))
     with pytest.raises(FormatError, match=f"phone_imu.json.*{said}"):
-        read_imu_calibration(both[1])
+        read_imu_calibration(wrong)
 
 
 def test_each_file_says_what_it_holds_and_two_of_a_kind_are_an_error(both, tmp_path) -> None:
@@ -360,7 +362,7 @@ def test_the_folder_is_the_system_s_own(monkeypatch, tmp_path, home, platform, f
         assert configuration_folder() == tmp_path / "home" / ".config" / "colmap-inertial"
 
 
-@pytest.mark.parametrize("name", ["../../etc", "a/b", "C:\\x", "nul", "Телефон", "x" * 500, "."])
+@loop_over("name", ["../../etc", "a/b", "C:\\x", "nul", "Телефон", "x" * 500, "."])
 def test_any_name_of_a_device_stays_in_the_folder(both, home, name) -> None:
     kept = remember(name, both[1])
     assert kept.parent.parent == configuration_folder() / "devices"

@@ -12,6 +12,7 @@ from dataclasses import fields
 import cv2
 import numpy as np
 import pytest
+from cases import loop_over
 from test_pipeline import copy_scene
 
 from colmap_inertial.cli import _COMMANDS, main
@@ -64,7 +65,7 @@ def test_a_picture_of_too_many_pixels_is_not_decoded(tmp_path, encode, side):
 KINDS = [(suffix, np.uint8) for suffix in (".png", ".jpg", ".bmp", ".pgm", ".tif")]
 
 
-@pytest.mark.parametrize(("suffix", "dtype"), [*KINDS, (".png", np.uint16), (".pgm", np.uint16), (".tif", np.uint16)])
+@loop_over(("suffix", "dtype"), [*KINDS, (".png", np.uint16), (".pgm", np.uint16), (".tif", np.uint16)])
 def test_the_size_is_told_by_the_header(tmp_path, suffix, dtype):
     path = tmp_path / f"a{suffix}"
     assert cv2.imwrite(str(path), np.zeros((37, 53), dtype))
@@ -78,8 +79,8 @@ def test_the_limit_is_above_any_camera():
     assert ReadLimits().megapixels > 200
 
 
-@pytest.mark.parametrize("delimiter", [",", " ", "\t", ";"])
-@pytest.mark.parametrize("head", ["", "name,t_s\n", "# comment\n"])
+@loop_over("delimiter", [",", " ", "\t", ";"])
+@loop_over("head", ["", "name,t_s\n", "# comment\n"])
 def test_a_table_of_too_many_columns(tmp_path, delimiter, head):
     path = tmp_path / "wide.csv"
     path.write_text(head + delimiter.join(["1"] * 1_000_000) + "\n")
@@ -111,7 +112,7 @@ READERS = [
 ]
 
 
-@pytest.mark.parametrize("reader", READERS)
+@loop_over("reader", READERS)
 def test_devices_and_pipes_are_no_files(tmp_path, reader):
     fifo = tmp_path / "pipe.csv"
     os.mkfifo(fifo)

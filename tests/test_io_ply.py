@@ -4,6 +4,7 @@ import zlib
 
 import numpy as np
 import pytest
+from cases import loop_over
 from conftest import write_anew
 from test_io_fuzz import mutated
 
@@ -152,7 +153,7 @@ def test_a_windows_header_and_points_that_are_not_a_number_pass(tmp_path):
     np.testing.assert_allclose(points[1], wanted, atol=1e-6)
 
 
-@pytest.mark.parametrize(
+@loop_over(
     ("old", "new", "words"),
     [
         (b"ply\n", b"pl\n", "not a PLY file"),

@@ -8,6 +8,7 @@ from pathlib import Path
 import imu_files
 import numpy as np
 import pytest
+from cases import loop_over
 
 from colmap_inertial.core.errors import FormatError, MissingExtraError, TimingError
 from colmap_inertial.core.types import FrameLog, ImuRecording
@@ -386,7 +387,7 @@ def test_a_rosbag_with_two_imus_names_them(tmp_path: Path, one_clock: ImuRecordi
         read_imu(tmp_path / "two.bag")
 
 
-@pytest.mark.parametrize(
+@loop_over(
     ("old", "new", "message"),
     [
         ("orientation,YxZ", "orientation,YyZ", r"line 5: orientation is 'YyZ'"),

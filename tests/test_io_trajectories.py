@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cases import loop_over
 
 from colmap_inertial.core.errors import FormatError, InertialError, TimingError
 from colmap_inertial.core.types import CameraTrajectory
@@ -66,7 +67,7 @@ def test_tum_before_the_clocks_zero(tmp_path: Path) -> None:
     assert (tmp_path / "b.tum").read_text().splitlines()[1].startswith("-0.750000000 ")
 
 
-@pytest.mark.parametrize(
+@loop_over(
     ("rows", "error", "said"),
     [
         (["0 0 0 0 0 0 0", "1 0 0 0 0 0 0"], FormatError, "expected t x y z"),

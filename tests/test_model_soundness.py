@@ -4,6 +4,7 @@ import model_project
 import numpy as np
 import pycolmap
 import pytest
+from cases import loop_over
 
 from colmap_inertial.cli import main
 from colmap_inertial.core.errors import FormatError
@@ -31,9 +32,9 @@ def refuses(reason, suffix, value):
     return pytest.raises(FormatError, match=f"COLMAP cannot read this model|{reason}" if own else reason)
 
 
-@pytest.mark.parametrize("suffix", [".bin", ".txt"])
-@pytest.mark.parametrize("value", [*BAD, 0.0, -150.0])
-@pytest.mark.parametrize("index", [0, 1])
+@loop_over("suffix", [".bin", ".txt"])
+@loop_over("value", [*BAD, 0.0, -150.0])
+@loop_over("index", [0, 1])
 def test_focal_lengths_are_positive_numbers(tmp_path, model, suffix, value, index):
     copy = pycolmap.Reconstruction(model)
     params = np.array(copy.camera(1).params)
@@ -43,8 +44,8 @@ def test_focal_lengths_are_positive_numbers(tmp_path, model, suffix, value, inde
         read_model(saved(copy, tmp_path / "model", suffix))
 
 
-@pytest.mark.parametrize("suffix", [".bin", ".txt"])
-@pytest.mark.parametrize("value", BAD)
+@loop_over("suffix", [".bin", ".txt"])
+@loop_over("value", BAD)
 def test_poses_are_somewhere(tmp_path, model, suffix, value):
     copy = pycolmap.Reconstruction(model)
     pose = pycolmap.Rigid3d(copy.image(3).cam_from_world().rotation, np.array([0.0, value, 1.0]))
@@ -53,8 +54,8 @@ def test_poses_are_somewhere(tmp_path, model, suffix, value):
         read_model(saved(copy, tmp_path / "model", suffix))
 
 
-@pytest.mark.parametrize("suffix", [".bin", ".txt"])
-@pytest.mark.parametrize("value", BAD)
+@loop_over("suffix", [".bin", ".txt"])
+@loop_over("value", BAD)
 def test_points_are_somewhere(tmp_path, model, suffix, value):
     copy = pycolmap.Reconstruction(model)
     number = max(copy.point3D_ids())
@@ -78,7 +79,7 @@ def test_apply_and_view_say_so(tmp_path, model, capsys):
 NAMES = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
 
 
-@pytest.mark.parametrize("name", NAMES)
+@loop_over("name", NAMES)
 def test_every_camera_model_of_colmap_passes(tmp_path, name):
     count = len(pycolmap.Camera.create_from_model_name(1, name, 100.0, 160, 120).params)
     params = pycolmap.Camera.create_from_model_name(1, name, 100.0, 160, 120).params

@@ -9,6 +9,7 @@ import numpy as np
 import pycolmap
 import pytest
 from aperture_scenes import plane_views, psnr_db
+from cases import loop_over
 
 from colmap_inertial.core.errors import FormatError, InertialError, OutputExistsError
 from colmap_inertial.core.geometry import so3_exp
@@ -153,7 +154,7 @@ def test_colmap_s_rig_config_is_read_as_colmap_reads_it(tmp_path):
         read_rig_calibration(path)
 
 
-@pytest.mark.parametrize(
+@loop_over(
     ("text", "reason"),
     [
         (kalibr_text(distortion_model="fov"), "distortion_model 'fov' is not known"),
@@ -233,7 +234,7 @@ def test_a_capture_s_apertures_are_its_camera(tmp_path):
     assert names == ["shot0_1.png", "shot0_2.png", "shot0_3.png"]
 
 
-@pytest.mark.parametrize(
+@loop_over(
     ("old", "new", "reason"),
     [
         ('camera = "c1"', 'camera = "c9"', "no camera 'c9'"),

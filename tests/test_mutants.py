@@ -4,7 +4,7 @@ import ast
 import sys
 from pathlib import Path
 
-import pytest
+from cases import loop_over
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "scripts"))
@@ -14,7 +14,7 @@ finally:
     sys.path.remove(str(ROOT / "scripts"))
 
 
-@pytest.mark.parametrize("mutant", MUTANTS, ids=lambda m: m.breaks)
+@loop_over("mutant", MUTANTS, ids=lambda m: m.breaks)
 def test_a_fault_still_applies_and_names_tests_that_are_there(mutant):
     text = mutated((ROOT / "colmap_inertial" / mutant.file).read_text(encoding="utf-8"), mutant)
     assert text is not None, "stale: what it replaces is not there exactly once"

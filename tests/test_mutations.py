@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import pytest
+from cases import loop_over
 from conftest import write_anew
 from test_io_fuzz import mutated, refusals
 
@@ -69,7 +69,7 @@ KINDS: dict[str, tuple[Callable[[Path], object], Callable[[Path], object]]] = {
 }
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@loop_over("kind", KINDS)
 def test_only_errors_of_our_own_escape(tmp_path, kind):
     write, read = KINDS[kind]
     path = tmp_path / "a.file"

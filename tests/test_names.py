@@ -8,6 +8,7 @@ import model_project
 import numpy as np
 import pycolmap
 import pytest
+from cases import loop_over
 
 from colmap_inertial.checks.report.page import embedded_images
 from colmap_inertial.checks.validate.views import load_views
@@ -43,7 +44,7 @@ def written(model, folder, name, write="write_binary"):
     return folder
 
 
-@pytest.mark.parametrize("name", BAD)
+@loop_over("name", BAD)
 def test_names_that_lead_away_are_refused_and_their_source_is_named(tmp_path, name):
     with pytest.raises(FormatError, match=r"images\.bin.*names the file"):
         check_names(["a.png", name], tmp_path / "images.bin")
@@ -51,7 +52,7 @@ def test_names_that_lead_away_are_refused_and_their_source_is_named(tmp_path, na
         path_in(tmp_path, name)
 
 
-@pytest.mark.parametrize("name", ["a.png", "cam 0/Bild ü.png", "a..b/..c.png", "...x"])
+@loop_over("name", ["a.png", "cam 0/Bild ü.png", "a..b/..c.png", "...x"])
 def test_ordinary_names_pass_there_or_not(tmp_path, name):
     assert path_in(tmp_path, name) == tmp_path / name
 
@@ -71,8 +72,8 @@ def test_links_may_lead_to_the_folder_and_within_it_but_not_out_of_it(tmp_path):
     assert not path_in(real, "loop").is_file()
 
 
-@pytest.mark.parametrize("write", ["write_binary", "write_text"])
-@pytest.mark.parametrize("name", ["/abs.png", "../../up.png", "a/../../../x.png"])
+@loop_over("write", ["write_binary", "write_text"])
+@loop_over("name", ["/abs.png", "../../up.png", "a/../../../x.png"])
 def test_a_model_with_such_a_name_is_not_read(tmp_path, model, name, write):
     with pytest.raises(FormatError, match=r"images\.(bin|txt): names the file"):
         read_model(written(model, tmp_path / "model", name, write))
@@ -146,7 +147,7 @@ def test_a_result_of_others_names_only_what_lies_in_its_folder(tmp_path, model):
         find_source(out)
 
 
-@pytest.mark.parametrize("name", ["..", "a/b", "/a", "x" * 300, "a\\u0000b"])
+@loop_over("name", ["..", "a/b", "/a", "x" * 300, "a\\u0000b"])
 def test_a_batch_s_names_are_those_of_folders(tmp_path, name):
     manifest = tmp_path / "batch.toml"
     manifest.write_text(f'[[capture]]\npath = "a"\nname = "{name}"\n')

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from cases import loop_over
 
 from colmap_inertial.cli.terminal import show_applied
 from colmap_inertial.colmap.sparse import check_pair_names, image_pairs
@@ -123,7 +124,7 @@ def test_the_resolved_configuration_reads_back_as_it_was(tmp_path):
     assert read_config(path, ReconstructOptions) == options
 
 
-@pytest.mark.parametrize(
+@loop_over(
     ("text", "words"),
     [
         ("sede = 3", "unknown option sede; did you mean seed"),

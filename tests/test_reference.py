@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from cases import loop_over
 from test_cli import run
 from test_validate_lengths import validated
 
@@ -71,7 +72,7 @@ def test_markers_and_targets_give_their_scale(bare, tmp_path, monkeypatch):
     assert not (tmp_path / "no").exists()
 
 
-@pytest.mark.parametrize(
+@loop_over(
     ("options", "words"),
     [
         ({"scale_from": "target"}, "--scale-from target needs the target"),
@@ -148,7 +149,7 @@ def test_pictures_alone_are_mapped_and_scaled(pictures, tmp_path, monkeypatch, c
     assert sorted(path.name for path in folder.iterdir()) == ["0.png", "1.png", "2.png", "3.png"]
 
 
-@pytest.mark.parametrize("content", ["[]", "{}", "3", '{"left_out": ["x"]}', '{"left_out": 3}'])
+@loop_over("content", ["[]", "{}", "3", '{"left_out": ["x"]}', '{"left_out": 3}'])
 def test_a_changed_record_of_the_mapping_is_named(pictures, tmp_path, capsys, content):
     folder, _ = pictures
     (tmp_path / "out" / "colmap").mkdir(parents=True)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cases import loop_over
 
 from colmap_inertial.core.errors import FormatError, OutputExistsError
 from colmap_inertial.core.geometry import (
@@ -141,7 +142,7 @@ def test_recipes_survive_writing_and_reading(tmp_path, written):
         assert load_recipe(again).imu == load_recipe(path).imu
 
 
-@pytest.mark.parametrize(
+@loop_over(
     ("text", "complaint"),
     [
         ("[motion]\nvigor = 1.0", "vigour"),

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from cases import loop_over
 
 from colmap_inertial.core.errors import NotObservableError
 from colmap_inertial.core.geometry import matrix_from_quat, quat_rotate
@@ -25,7 +26,7 @@ def recording(**changes):
     return ImuRecording(**{**values, **changes})
 
 
-@pytest.mark.parametrize(
+@loop_over(
     ("changes", "words"),
     [
         ({"gyro_t_s": np.arange(10)[::-1]}, "gyro_t_s: times must increase"),

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from cases import loop_over
 
 from colmap_inertial.checks.validate import (
     Corner,
@@ -55,7 +56,7 @@ def test_a_scale_bar_is_measured_between_centres(tmp_path):
     assert first.measured == pytest.approx(8) and first.residual_m == pytest.approx(-0.001)
 
 
-@pytest.mark.parametrize(
+@loop_over(
     ("text", "words"),
     [
         ("a,b\n1,2\n", "has no column marker_a"),
@@ -109,7 +110,7 @@ def test_the_distance_between_two_boards_is_a_length_to_check_by():
         with_other_target(board("checkerboard:8x6:0.03", [0, 0, 0], left_out=range(3, 48)), other, 5.0)
 
 
-@pytest.mark.parametrize(
+@loop_over(
     ("target", "other", "words"),
     [
         ("checkerboard:8x6:0.03", ("checkerboard:8x6:0.03", "4"), "must be another board"),

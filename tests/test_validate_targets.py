@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from cases import loop_over
 
 from colmap_inertial.checks.validate import TargetSpecError, parse_target
 
@@ -77,7 +78,7 @@ def test_a_lone_marker_gives_one_side_to_each_set():
     np.testing.assert_array_equal(target.control(seen)[seen], [True, True, False, False])
 
 
-@pytest.mark.parametrize(
+@loop_over(
     ("spec", "words"),
     [
         ("chessboard:9x6:0.025", 'unknown kind of target "chessboard"'),
