@@ -655,7 +655,7 @@ MUTANTS = (
         ("io_gopro",),
     ),
     Mutant(
-        "io/aperture_images.py",
+        "io/capture_images.py",
         "t_s=short.t_s + self.delay_s",
         "t_s=short.t_s - self.delay_s",
         "long exposures precede their short ones",
@@ -950,7 +950,7 @@ MUTANTS = (
     ),
     Mutant(
         "io/calibration.py",
-        "return replace(found, camera_imu=for_another_recording(found.camera_imu, shared_clock=shared_clock))",
+        "return replace(found, camera_imu=reset_for_recording(found.camera_imu, shared_clock=shared_clock))",
         "return found",
         "another recording's time offset counts for this one",
         ("run_steps",),

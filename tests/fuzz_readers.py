@@ -22,7 +22,7 @@ from colmap_inertial.core.errors import InertialError
 from colmap_inertial.core.options import ReconstructOptions
 from colmap_inertial.io.calibration import read_calibration
 from colmap_inertial.io.capture import load_capture
-from colmap_inertial.io.exif import stamps_of_exif, stated_exposures_s
+from colmap_inertial.io.exif import read_exposures_s, stamps_of_exif
 from colmap_inertial.io.frame_times import stamps_of_log
 from colmap_inertial.io.images import read_image
 from colmap_inertial.io.imu import read_frame_log, read_imu
@@ -315,7 +315,7 @@ READERS: dict[str, Reader] = {
         _exif,
         lambda folder: each(
             lambda: stamps_of_exif(folder, ["a.jpg"]),
-            lambda: stated_exposures_s([folder / "a.jpg"]),
+            lambda: read_exposures_s([folder / "a.jpg"]),
             lambda: read_image(folder / "a.jpg"),
             lambda: read_preview(folder / "a.jpg", 32),
         ),

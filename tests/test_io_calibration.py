@@ -13,9 +13,9 @@ from colmap_inertial.core.types import CALIBRATION_PARAMETERS, CameraImuCalibrat
 from colmap_inertial.io.calibration import (
     Declared,
     calibration_prior,
-    for_another_recording,
     largest_offset_s,
     read_calibration,
+    reset_for_recording,
     write_calibration,
 )
 
@@ -54,7 +54,7 @@ def test_a_clock_rate_is_kept_and_clocks_that_keep_step_leave_no_trace(tmp_path:
     back = read_calibration(tmp_path / "c.json")
     assert (back.clock_rate, back.clock_middle_s) == (-2e-3, 17.5)
     assert back.drift_s(np.array([17.5, 27.5])).tolist() == [0.0, -0.02]
-    assert for_another_recording(back, shared_clock=True).clock_rate == 0
+    assert reset_for_recording(back, shared_clock=True).clock_rate == 0
     write_calibration(tmp_path / "c.json", known())
     assert not {"clock_rate", "clock_middle_s"} & json.loads((tmp_path / "c.json").read_text()).keys()
 
@@ -114,10 +114,10 @@ def test_what_is_known_is_narrow() -> None:
 
 def test_the_next_recording_of_a_device_keeps_the_delay_and_opens_the_offset() -> None:
     before = known()
-    prior = for_another_recording(before)
+    prior = reset_for_recording(before)
     assert prior.sigma("gyro_time_offset_s") == pytest.approx(1e4)
     assert prior.accel_time_offset_s - prior.gyro_time_offset_s == pytest.approx(-0.01)
-    shared = for_another_recording(before, shared_clock=True)
+    shared = reset_for_recording(before, shared_clock=True)
     assert shared.gyro_time_offset_s == 12.25
     assert sd_of_delay(shared) == pytest.approx(sd_of_delay(before))
     np.testing.assert_allclose(shared.cov[:3, :3], before.cov[:3, :3])

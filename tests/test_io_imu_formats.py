@@ -67,9 +67,9 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     folder = tmp_path / "site"
     folder.mkdir()
     monkeypatch.syspath_prepend(str(folder))
-    formats._of_other_packages.cache_clear()
+    formats._load_other_packages.cache_clear()
     yield folder
-    formats._of_other_packages.cache_clear()
+    formats._load_other_packages.cache_clear()
     sys.modules.pop("my_imu_logs", None)
 
 

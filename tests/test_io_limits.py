@@ -21,7 +21,7 @@ from colmap_inertial.core.options import ReadLimits, ReconstructOptions
 from colmap_inertial.core.threads import in_order
 from colmap_inertial.io.files import first_line, read_bytes, read_json, read_limits, read_yaml, reading_within
 from colmap_inertial.io.frame_times import stamps_of_csv
-from colmap_inertial.io.images import _stated_size, read_image
+from colmap_inertial.io.images import _read_size, read_image
 from colmap_inertial.io.imu import read_imu
 from colmap_inertial.io.tables import read_table
 from colmap_inertial.io.video import video_stamps_ns
@@ -69,10 +69,10 @@ KINDS = [(suffix, np.uint8) for suffix in (".png", ".jpg", ".bmp", ".pgm", ".tif
 def test_the_size_is_told_by_the_header(tmp_path, suffix, dtype):
     path = tmp_path / f"a{suffix}"
     assert cv2.imwrite(str(path), np.zeros((37, 53), dtype))
-    assert _stated_size(path.read_bytes()) == (53, 37)
+    assert _read_size(path.read_bytes()) == (53, 37)
     assert read_image(path).shape == (37, 53)
     for cut in range(0, 40):
-        _stated_size(path.read_bytes()[:cut])  # whatever is missing
+        _read_size(path.read_bytes()[:cut])  # whatever is missing
 
 
 def test_the_limit_is_above_any_camera():

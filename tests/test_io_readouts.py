@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from colmap_inertial.io.capture import load_capture
-from colmap_inertial.io.video import published_readouts, readout_of_video
+from colmap_inertial.io.video import read_published_readouts, readout_of_video
 
 
 def film(path: Path, *, model: str = "iPhone 3GS", rate: int = 30, size: tuple[int, int] = (640, 480)) -> Path:
@@ -27,7 +27,7 @@ def film(path: Path, *, model: str = "iPhone 3GS", rate: int = 30, size: tuple[i
 
 
 def test_every_figure_of_the_table_has_a_source_and_can_be() -> None:
-    table = published_readouts()
+    table = read_published_readouts()
     for one in table:
         assert one.source and one.make and one.model
         assert 0.002 < one.readout_s < 1.05 / one.rate_hz

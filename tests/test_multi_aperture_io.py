@@ -15,8 +15,8 @@ from colmap_inertial.core.errors import FormatError, InertialError, OutputExists
 from colmap_inertial.core.geometry import so3_exp
 from colmap_inertial.core.options import ApertureOptions, FuseAperturesOptions, ReconstructOptions
 from colmap_inertial.core.types import CameraModel
-from colmap_inertial.io.aperture_images import SubImages
 from colmap_inertial.io.capture import load_capture
+from colmap_inertial.io.capture_images import SubImages
 from colmap_inertial.io.frames import read_frames
 from colmap_inertial.io.rig_calibration import read_rig_calibration
 from colmap_inertial.pipeline.stages.apertures import ApertureStage

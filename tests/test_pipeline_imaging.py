@@ -17,7 +17,7 @@ from colmap_inertial.core.errors import InertialError, NotObservableError
 from colmap_inertial.core.options import MappingOptions, ReconstructOptions
 from colmap_inertial.imaging.psf import blur_field
 from colmap_inertial.io.capture import load_capture
-from colmap_inertial.io.exif import carry_metadata, stated_exposures_s
+from colmap_inertial.io.exif import carry_metadata, read_exposures_s
 from colmap_inertial.io.frames import read_frames
 from colmap_inertial.io.imu import read_capture_imu
 from colmap_inertial.model import colmap_camera, read_model
@@ -393,9 +393,9 @@ def test_metadata_of_png_and_jpeg_is_carried_over(tmp_path):
         )
         path = tmp_path / f"a{suffix}"
         path.write_bytes(carried)
-        np.testing.assert_allclose(stated_exposures_s([path, path]), 0.04)
+        np.testing.assert_allclose(read_exposures_s([path, path]), 0.04)
         path.write_bytes(encoded)
-        assert stated_exposures_s([path]) is None
+        assert read_exposures_s([path]) is None
     assert carry_metadata(b"BM...", b"BM....") == b"BM...."
     (tmp_path / "a.tif").write_bytes(exif())
-    assert stated_exposures_s([Path(tmp_path / "a.tif")]) is not None
+    assert read_exposures_s([Path(tmp_path / "a.tif")]) is not None

@@ -24,9 +24,9 @@ from colmap_inertial.core.options import MappingOptions, ProjectOptions, Reconst
 from colmap_inertial.core.threads import in_order
 from colmap_inertial.core.types import CALIBRATION_PARAMETERS, CameraModel, FrameTiming, ImuRecording, Treatment
 from colmap_inertial.imaging.gate import RecordingVerdict
-from colmap_inertial.io.aperture_images import LongExposures, SubImages
 from colmap_inertial.io.calibration import Declared, calibration_prior, write_calibration
 from colmap_inertial.io.capture import Capture, ImageFolder
+from colmap_inertial.io.capture_images import LongExposures, SubImages
 from colmap_inertial.io.files import write_json
 from colmap_inertial.io.video_match import VideoMatch
 from colmap_inertial.model import TRANSFORM_FILE

@@ -116,9 +116,9 @@ class Reader(Speaker):
 
 def print_json(content: Mapping[str, Any]) -> None:
     """Print one JSON object."""
-    from colmap_inertial.io.files import as_plain
+    from colmap_inertial.io.files import convert_to_plain
 
-    print(json.dumps(as_plain(content), indent=1, allow_nan=False))
+    print(json.dumps(convert_to_plain(content), indent=1, allow_nan=False))
 
 
 class _StandardError(logging.StreamHandler[Any]):

@@ -29,7 +29,7 @@ from colmap_inertial.imaging.plane_sweep import (
     score_partners,
     sweep_depth,
 )
-from colmap_inertial.io.files import as_plain, path_in, read_json, write_json
+from colmap_inertial.io.files import convert_to_plain, path_in, read_json, write_json
 from colmap_inertial.io.images import read_image
 from colmap_inertial.model import read_model
 from colmap_inertial.model.artefacts import read_map, write_map
@@ -48,7 +48,7 @@ class SweptWorkspace:
 
     def begin(self, identity: object) -> None:
         """Go on with a sweep of the same pictures and model, or remove what there is of another one."""
-        record, content = self.raw / "made_from.json", as_plain({"identity": identity})
+        record, content = self.raw / "made_from.json", convert_to_plain({"identity": identity})
         if record.is_file() and read_json(record) == content:
             return
         remove(self.raw)

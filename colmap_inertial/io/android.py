@@ -23,10 +23,10 @@ from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.types import FrameLog, ImuRecording
 from colmap_inertial.io.files import first_line
 from colmap_inertial.io.frame_times import frame_log, stamps_of_log
-from colmap_inertial.io.imu_text import ordered, read_csv, recording
-from colmap_inertial.io.samples import Samples, nearest
+from colmap_inertial.io.imu_text import SensorTable, read_csv, read_tables
+from colmap_inertial.io.samples import nearest
 from colmap_inertial.io.tables import Table, read_table, split_unit
-from colmap_inertial.io.units import SENSOR_NAMES, TIME_UNITS_NS, DeclaredUnits, Quantity, unit_of
+from colmap_inertial.io.units import TIME_UNITS_NS, DeclaredUnits, unit_of
 
 _MARS_TABLES = ("gyro_accel.csv", "raw_accel_gyro.csv")
 #: Frames that the sensor took within this of a frame's rounded time are that frame.
@@ -49,9 +49,11 @@ def read_opencamera(path: Path, units: DeclaredUnits) -> ImuRecording:
     """
     gyro_file = _one_gyro_file(path)
     accel_file = _sibling(gyro_file, "accel.csv")
-    gyro = _bare_samples(gyro_file, "gyro", units.gyro or "rad/s")
-    accel = _bare_samples(accel_file, "accel", units.accel or "m/s2") if accel_file.is_file() else None
-    return recording(gyro, accel)
+    gyro, accel = (
+        SensorTable(file=file, time=4, time_unit="ns", columns=(1, 2, 3), unit=unit)
+        for file, unit in ((gyro_file, units.gyro or "rad/s"), (accel_file, units.accel or "m/s2"))
+    )
+    return read_tables(gyro, accel if accel_file.is_file() else None, layout="x y z t_ns")
 
 
 def read_opencamera_frames(path: Path) -> FrameLog | None:
@@ -141,17 +143,6 @@ def _has_bare_rows(path: Path) -> bool:
     """Whether a file begins with a row of four numbers."""
     cells = first_line(path).split(",")
     return len(cells) == 4 and all(re.fullmatch(r"[-+.\deE]+", cell.strip()) for cell in cells)
-
-
-def _bare_samples(path: Path, quantity: Quantity, unit: str) -> Samples:
-    table = read_table(path)
-    if table.width != 4:
-        raise FormatError(
-            path,
-            f"{table.width} cells where the {SENSOR_NAMES[quantity]}'s file has x,y,z,t_ns",
-            line=int(table.line_numbers[0]),
-        )
-    return ordered(table, quantity, unit, table.stamps_ns(3, "ns"), table.numbers([0, 1, 2]))
 
 
 # --- MARS logger -----------------------------------------------------------------------------------------------------

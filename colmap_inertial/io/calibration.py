@@ -1,4 +1,7 @@
-"""Camera-IMU calibrations: what is known before an estimate, and the JSON file that carries one between recordings."""
+"""Calibrations: what is known before an estimate, and JSON files that carry one between recordings.
+
+A file holds the calibration of a camera and an IMU, or the IMU's own; several files describe one device together.
+"""
 
 from __future__ import annotations
 
@@ -153,7 +156,7 @@ def largest_offset_s(shared_clock: bool, asked: float | None = None) -> float | 
     return SIGMAS.shared_clock_offset_s if asked is None and shared_clock else asked
 
 
-def for_another_recording(calibration: CameraImuCalibration, *, shared_clock: bool = False) -> CameraImuCalibration:
+def reset_for_recording(calibration: CameraImuCalibration, *, shared_clock: bool = False) -> CameraImuCalibration:
     """What a calibration of one recording says about the next one of the same device.
 
     Rotation, lever arm, readout and the accelerometer's delay against the gyroscope stay; the time offset, its growth
@@ -184,7 +187,7 @@ def write_calibration(path: StrPath, calibration: CameraImuCalibration) -> None:
     A clock rate and when the offsets hold are written where the clocks do not keep step.
     """
     left_out = _CLOCK if calibration.clock_rate == 0 else frozenset()
-    write_calibration_fields(Path(path), CAMERA_IMU, calibration, CALIBRATION_PARAMETERS, left_out)
+    _write_fields(Path(path), CAMERA_IMU, calibration, CALIBRATION_PARAMETERS, left_out)
 
 
 def read_calibration(path: StrPath) -> CameraImuCalibration:
@@ -200,10 +203,10 @@ def read_calibration(path: StrPath) -> CameraImuCalibration:
     values = {"kind": CAMERA_IMU, "cov_parameters": list(CALIBRATION_PARAMETERS), **read_json(path)}
     if values.pop("kind") != CAMERA_IMU:
         raise FormatError(path, "holds no calibration of a camera and an IMU (its kind is another)")
-    return calibration_from_fields(path, values, CameraImuCalibration, CALIBRATION_PARAMETERS, _CLOCK)
+    return _read_fields(path, values, CameraImuCalibration, CALIBRATION_PARAMETERS, _CLOCK)
 
 
-def write_calibration_fields(
+def _write_fields(
     path: Path, kind: str, calibration: DataclassInstance, parameters: Sequence[str], left_out: Set[str] = frozenset()
 ) -> None:
     """Write a calibration: its kind, its fields but those left out, and the order of ``cov``."""
@@ -211,10 +214,10 @@ def write_calibration_fields(
     write_json(path, {"kind": kind, **written, "cov_parameters": list(parameters)})
 
 
-def calibration_from_fields(
+def _read_fields(
     path: Path, values: dict[str, Any], cls: type[T], parameters: Sequence[str], optional: Set[str] = frozenset()
 ) -> T:
-    """The calibration of fields that :func:`write_calibration_fields` wrote, each of the type that the class states.
+    """The calibration of fields that :func:`_write_fields` wrote, each of the type that the class states.
 
     Raises
     ------
@@ -283,7 +286,7 @@ class Calibrations:
 
 def write_imu_calibration(path: StrPath, calibration: ImuCalibration) -> None:
     """Write an IMU's calibration as JSON: its kind, the fields of :class:`ImuCalibration`, and the order of ``cov``."""
-    write_calibration_fields(Path(path), IMU, calibration, IMU_CALIBRATION_PARAMETERS)
+    _write_fields(Path(path), IMU, calibration, IMU_CALIBRATION_PARAMETERS)
 
 
 def read_imu_calibration(path: StrPath) -> ImuCalibration:
@@ -298,7 +301,7 @@ def read_imu_calibration(path: StrPath) -> ImuCalibration:
     values = read_json(path)
     if values.pop("kind", None) != IMU:
         raise FormatError(path, "holds no calibration of an IMU (colmap-inertial calibrate-imu writes one)")
-    return calibration_from_fields(path, values, ImuCalibration, IMU_CALIBRATION_PARAMETERS)
+    return _read_fields(path, values, ImuCalibration, IMU_CALIBRATION_PARAMETERS)
 
 
 def calibration_kind(path: StrPath) -> str:
@@ -322,16 +325,16 @@ def holds_imu_alone(path: Path) -> bool:
     return path.is_file() and calibration_kind(path) == IMU
 
 
-def as_paths(paths: CalibrationFiles) -> tuple[Path, ...]:
+def list_paths(paths: CalibrationFiles) -> tuple[Path, ...]:
     """The paths of calibration files, however many were given."""
     if paths is None:
         return ()
     return (Path(paths),) if isinstance(paths, str | os.PathLike) else tuple(map(Path, paths))
 
 
-def used_files(paths: CalibrationFiles) -> list[dict[str, str]]:
+def describe_files(paths: CalibrationFiles) -> list[dict[str, str]]:
     """What a result says of the calibration files that were used: path and kind of each."""
-    return [{"path": str(path.resolve()), "kind": calibration_kind(path)} for path in as_paths(paths)]
+    return [{"path": str(path.resolve()), "kind": calibration_kind(path)} for path in list_paths(paths)]
 
 
 def read_calibrations(paths: CalibrationFiles) -> Calibrations:
@@ -343,7 +346,7 @@ def read_calibrations(paths: CalibrationFiles) -> Calibrations:
         Where two files hold the same; for a file that cannot be read.
     """
     found: dict[str, Path] = {}
-    for path in as_paths(paths):
+    for path in list_paths(paths):
         kind = calibration_kind(path)
         if kind in found:
             raise FormatError(path, f"and {found[kind]} both say {_WORDS[kind]}; give one of them")
@@ -354,9 +357,9 @@ def read_calibrations(paths: CalibrationFiles) -> Calibrations:
     )
 
 
-def read_for_another(paths: CalibrationFiles, *, shared_clock: bool = False) -> Calibrations:
+def read_for_recording(paths: CalibrationFiles, *, shared_clock: bool = False) -> Calibrations:
     """As :func:`read_calibrations`; of camera and IMU, what they say about another recording of the device."""
     found = read_calibrations(paths)
     if found.camera_imu is None:
         return found
-    return replace(found, camera_imu=for_another_recording(found.camera_imu, shared_clock=shared_clock))
+    return replace(found, camera_imu=reset_for_recording(found.camera_imu, shared_clock=shared_clock))

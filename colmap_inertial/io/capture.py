@@ -18,14 +18,14 @@ from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.geometry import quat_from_matrix
 from colmap_inertial.core.types import CameraImuCalibration, CameraModel, FrameLog, ImuCalibration, ReadoutDirection
 from colmap_inertial.io import sensor_yaml
-from colmap_inertial.io.aperture_images import (
+from colmap_inertial.io.calibration import Declared, calibration_prior
+from colmap_inertial.io.capture_images import (
     EXPOSURES_KEYS,
     ApertureImages,
     LongExposures,
     read_apertures_table,
     read_exposures_table,
 )
-from colmap_inertial.io.calibration import Declared, calibration_prior
 from colmap_inertial.io.capture_tables import (
     CALIBRATION_KEYS,
     CAMERA_KEYS,
@@ -172,27 +172,27 @@ def load_capture(path: StrPath) -> Capture:
     path = Path(path)
     if path.is_dir():
         if (path / "capture.toml").is_file():
-            return _from_toml(path / "capture.toml")
-        return _from_folder(path)
+            return _read_capture_toml(path / "capture.toml")
+        return _recognise_folder(path)
     if not path.exists():
         raise FormatError(path, "no such file or folder")
     if path.suffix.lower() != ".toml":
         recording = find_recording(path)
         if recording is not None:
-            return _from_recording(path, recording)
+            return _describe_recording(path, recording)
         refuse_video(path)
         raise FormatError(
             path,
             "a capture is described by a .toml file or a folder, unless it is a video with an IMU inside; write a "
             "capture.toml beside it",
         )
-    return _from_toml(path)
+    return _read_capture_toml(path)
 
 
 # --- capture.toml -----------------------------------------------------------------------------------------------------
 
 
-def _from_toml(path: Path) -> Capture:
+def _read_capture_toml(path: Path) -> Capture:
     root = read_toml(path)
     root.require_known(["device", *(section.name for section in SECTIONS)])
     capture = Capture(path=path, device=root.text("device") or "", calibration=calibration_prior())
@@ -359,16 +359,16 @@ SECTIONS = (
 # --- captures without one -------------------------------------------------------------------------------------------
 
 
-def _from_folder(path: Path) -> Capture:
+def _recognise_folder(path: Path) -> Capture:
     if is_inertial_scale(path):
         return Capture(path=path, imu=ImuPath(path=path, format="inertial-scale"), calibration=calibration_prior())
     base = path / "mav0" if (path / "mav0").is_dir() else path
     camera, imu = base / "cam0", base / "imu0"
     if all(part.exists() for part in (camera / "data.csv", camera / "data", imu / "data.csv")):
-        return _from_asl(path, camera, imu)
+        return _describe_asl(path, camera, imu)
     recording = find_recording(path)
     if recording is not None:
-        return _from_recording(path, recording)
+        return _describe_recording(path, recording)
     raise FormatError(
         path,
         "is no capture by itself: it holds no capture.toml, and is neither an ASL/EuRoC dataset (cam0/data.csv, "
@@ -377,7 +377,7 @@ def _from_folder(path: Path) -> Capture:
     )
 
 
-def _from_recording(path: Path, recording: Recording) -> Capture:
+def _describe_recording(path: Path, recording: Recording) -> Capture:
     """A recording that describes itself."""
     log = recording.log
     readout_s = None if log is None else log.readout_s
@@ -395,7 +395,7 @@ def _from_recording(path: Path, recording: Recording) -> Capture:
     )
 
 
-def _from_asl(path: Path, camera: Path, imu: Path) -> Capture:
+def _describe_asl(path: Path, camera: Path, imu: Path) -> Capture:
     """The first camera and IMU of an ASL/EuRoC dataset, which share a clock."""
     source = ImuPath(path=imu, format="euroc")
     model, cam_from_imu = None, None

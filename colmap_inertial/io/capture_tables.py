@@ -12,7 +12,13 @@ from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.geometry import colmap_px_from_opencv, quat_from_matrix
 from colmap_inertial.core.types import CameraModel, ImuNoise
 from colmap_inertial.io import sensor_yaml
-from colmap_inertial.io.calibration import Calibrations, Declared, calibration_prior, holds_imu_alone, read_for_another
+from colmap_inertial.io.calibration import (
+    Calibrations,
+    Declared,
+    calibration_prior,
+    holds_imu_alone,
+    read_for_recording,
+)
 from colmap_inertial.io.imu_text import SensorTable
 from colmap_inertial.io.sensor_yaml import CAMERA_MODELS
 from colmap_inertial.io.toml_section import Section
@@ -135,7 +141,7 @@ def read_calibration_table(
     files = table.files("file")
     if any(key in table for key in CALIBRATION_KEYS[1:]) and not all(holds_imu_alone(file) for file in files):
         table.fail("file", "gives the calibration; leave out the other keys of this table")
-    found = read_for_another(files, shared_clock=shared_clock)
+    found = read_for_recording(files, shared_clock=shared_clock)
     if found.camera_imu is not None:
         return found
     rotation, lever = _read_pose(table)

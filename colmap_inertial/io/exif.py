@@ -250,7 +250,7 @@ def carry_metadata(original: bytes, encoded: bytes) -> bytes:
     return encoded
 
 
-def stated_exposures_s(paths: list[Path]) -> Array | None:
+def read_exposures_s(paths: list[Path]) -> Array | None:
     """(F,) exposure times by the EXIF of JPEG, PNG or TIFF files; ``None`` where one of them does not say."""
     found = []
     for path in paths:

@@ -248,7 +248,7 @@ def first_line(path: Path) -> str:
         return ""
 
 
-def as_plain(value: object) -> Any:
+def convert_to_plain(value: object) -> Any:
     """A value as :func:`read_json` gives it back after :func:`write_json`."""
     return json.loads(json.dumps(_plain(value, "$"), allow_nan=False))
 

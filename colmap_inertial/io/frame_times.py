@@ -164,7 +164,7 @@ def stamps_of_log(path: Path, time_unit: str | None = None) -> Int64Array:
         return _time_column(table, time_unit)
     if table.width != 1:
         raise TimingError(f'{path} has {table.width} columns and no header; name the time column, for example "t_ns"')
-    return table.stamps_ns(0, _required_unit(path, None, time_unit))
+    return table.stamps_ns(0, _require_unit(path, None, time_unit))
 
 
 def frame_log(path: Path, frame_ns: Int64Array, **noted: Any) -> FrameLog:
@@ -194,10 +194,10 @@ def _time_column(table: Table, declared: str | None) -> Int64Array:
         raise TimingError(f"{table.path} has {what} of times (the header is: {table.header_text[:200]}); {_HOW}")
     column = columns[times[0]]
     assert column is not None
-    return table.stamps_ns(times[0], _required_unit(table.path, column.unit, declared))
+    return table.stamps_ns(times[0], _require_unit(table.path, column.unit, declared))
 
 
-def _required_unit(path: Path, written: str | None, declared: str | None) -> str:
+def _require_unit(path: Path, written: str | None, declared: str | None) -> str:
     if written is not None and declared is not None and written != declared:
         raise TimingError(f"{path}: the header says {written}, time_unit says {declared}; correct one of them")
     unit = written or declared

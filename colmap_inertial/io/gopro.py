@@ -161,8 +161,8 @@ def read_gopro_positions(path: Path) -> PositionFixes | None:
     if key == "GPS9":
         diluted, fix = values[:, 7], values[:, 8]
     else:
-        fix = _of_payloads(telemetry.streams.get("GPSF"), stream, default=3.0)
-        diluted = _of_payloads(telemetry.streams.get("GPSP"), stream, default=100.0) / 100
+        fix = _repeat_for_samples(telemetry.streams.get("GPSF"), stream, default=3.0)
+        diluted = _repeat_for_samples(telemetry.streams.get("GPSP"), stream, default=100.0) / 100
     inside = (np.abs(values[:, 0]) <= 90) & (np.abs(values[:, 1]) <= 180) & np.isfinite(values[:, :3]).all(axis=1)
     good = inside & (fix >= 2) & (diluted > 0) & (diluted <= _LIMITS.largest_dilution)
     if not good.any():
@@ -233,15 +233,15 @@ class _Telemetry:
 def _temperature_c(streams: dict[str, Stream]) -> float | None:
     """What the camera says beside its sensors' readings, degrees Celsius; ``None`` where it says nothing possible."""
     stream = streams.get("TMPC")
-    said = np.empty(0) if stream is None or not stream.data else stream.values[:, 0]
-    said = said[np.abs(said) < _LIMITS.hottest_c]
-    return float(np.median(said)) if len(said) else None
+    readings = np.empty(0) if stream is None or not stream.data else stream.values[:, 0]
+    readings = readings[np.abs(readings) < _LIMITS.hottest_c]
+    return float(np.median(readings)) if len(readings) else None
 
 
-def _of_payloads(about: Stream | None, stream: Stream, default: float) -> Array:
+def _repeat_for_samples(about: Stream | None, stream: Stream, default: float) -> Array:
     """(N,) what is said once a payload, for each sample of a stream."""
-    said = {} if about is None else {p: float(rows[0, 0]) for p, rows in zip(about.payload, about.data, strict=True)}
-    return np.repeat([said.get(payload, default) for payload in stream.payload], stream.count)
+    stated = {} if about is None else {p: float(rows[0, 0]) for p, rows in zip(about.payload, about.data, strict=True)}
+    return np.repeat([stated.get(payload, default) for payload in stream.payload], stream.count)
 
 
 def _unit(path: Path, stream: Stream, quantity: Quantity) -> str:

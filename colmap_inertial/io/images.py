@@ -70,7 +70,7 @@ def require_modest(path: Path, data: bytes) -> None:
     FormatError
         For more pixels than the limits allow.
     """
-    size, most = _stated_size(data), read_limits().megapixels
+    size, most = _read_size(data), read_limits().megapixels
     if size is not None and size[0] * size[1] > 1e6 * most:
         raise FormatError(
             path,
@@ -79,7 +79,7 @@ def require_modest(path: Path, data: bytes) -> None:
         )
 
 
-def _stated_size(data: bytes) -> tuple[int, int] | None:
+def _read_size(data: bytes) -> tuple[int, int] | None:
     """Width and height by the header of a PNG, JPEG, BMP, PGM, PPM or TIFF; ``None`` where it does not tell."""
     try:
         if data.startswith(PNG):

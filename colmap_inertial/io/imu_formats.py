@@ -85,7 +85,7 @@ class ImuFormat:
 
 def imu_formats() -> tuple[ImuFormat, ...]:
     """The known families, in the order in which they are tried."""
-    return (*_of_other_packages(), *_OWN)
+    return (*_load_other_packages(), *_OWN)
 
 
 def find_imu_format(path: Path, name: str = "auto") -> ImuFormat:
@@ -107,14 +107,14 @@ def find_imu_format(path: Path, name: str = "auto") -> ImuFormat:
         raise FormatError(path, "no such file or folder")
     require_regular(path)
     known = imu_formats()
-    found = next((one for one in known if (one.accepts(path) if name == "auto" else one.name == name)), None)
-    if found is not None:
-        return found
+    for family in known:
+        if family.accepts(path) if name == "auto" else family.name == name:
+            return family
     if name != "auto":
-        names = ", ".join(["auto", *(one.name for one in known), "capture"])
+        names = ", ".join(["auto", *(family.name for family in known), "capture"])
         raise FormatError(path, f'unknown IMU format "{name}"; known are {names}')
     refuse_video(path)
-    layouts = "; ".join(one.layout for one in known)
+    layouts = "; ".join(family.layout for family in known)
     raise FormatError(
         path,
         f"not an inertial recording known here ({layouts}); describe its files under [imu.gyro] and [imu.accel] in a "
@@ -152,60 +152,60 @@ def refuse_video(path: Path) -> None:
 
 
 @functools.cache
-def _of_other_packages() -> tuple[ImuFormat, ...]:
+def _load_other_packages() -> tuple[ImuFormat, ...]:
     from importlib.metadata import entry_points
 
-    names = {*_RESERVED, *(one.name for one in _OWN)}
+    names = {*_RESERVED, *(family.name for family in _OWN)}
     found = []
     for entry in entry_points(group=ENTRY_POINTS):
         package = entry.dist.name if entry.dist is not None else entry.module
         try:
-            one = _loaded(entry)
-            if one.name in names:
-                raise ValueError(f'the name "{one.name}" is taken')
+            family = _load(entry)
+            if family.name in names:
+                raise ValueError(f'the name "{family.name}" is taken')
         except Exception as error:  # whatever another package does when it is imported
             log.warning("the IMU format %s of the package %s is left out: %s", entry.name, package, _reason(error))
             continue
-        names.add(one.name)
-        found.append(_guarded(one, package))
+        names.add(family.name)
+        found.append(_guard(family, package))
     return tuple(found)
 
 
-def _loaded(entry: EntryPoint) -> ImuFormat:
-    one = entry.load()
-    if not isinstance(one, ImuFormat):
+def _load(entry: EntryPoint) -> ImuFormat:
+    family = entry.load()
+    if not isinstance(family, ImuFormat):
         raise TypeError(f"{entry.value} is no ImuFormat")
-    return one
+    return family
 
 
-def _guarded(one: ImuFormat, package: str) -> ImuFormat:
+def _guard(family: ImuFormat, package: str) -> ImuFormat:
     """The same family; where its functions raise what they should not, the message names the package."""
-    its = f"the IMU format {one.name} of the package {package}"
+    its = f"the IMU format {family.name} of the package {package}"
 
     def accepts(path: Path) -> bool:
         try:
-            return bool(one.accepts(path))
+            return bool(family.accepts(path))
         except Exception as error:
             log.warning("%s: %s cannot tell whether it is one: %s", path, its, _reason(error))
             return False
 
     def read(path: Path, units: DeclaredUnits) -> ImuRecording:
-        with _as_format_error(path, its):
-            recording = one.read(path, units)
+        with _convert_errors(path, its):
+            recording = family.read(path, units)
             if not isinstance(recording, ImuRecording):
                 raise TypeError(f"read gives a {type(recording).__name__}, not an ImuRecording")
             return recording
 
     def frames(path: Path) -> FrameLog | None:
-        assert one.frames is not None
-        with _as_format_error(path, its):
-            return one.frames(path)
+        assert family.frames is not None
+        with _convert_errors(path, its):
+            return family.frames(path)
 
-    return replace(one, accepts=accepts, read=read, frames=None if one.frames is None else frames)
+    return replace(family, accepts=accepts, read=read, frames=None if family.frames is None else frames)
 
 
 @contextlib.contextmanager
-def _as_format_error(path: Path, its: str) -> Iterator[None]:
+def _convert_errors(path: Path, its: str) -> Iterator[None]:
     try:
         yield
     except InertialError:
@@ -380,11 +380,11 @@ def find_recording(path: Path) -> Recording | None:
     FormatError
         Where it is one of these, and damaged.
     """
-    for one in imu_formats():
-        if one.video is not None and bool(one.video) == path.is_dir() and one.accepts(path):
-            video = _video(path, one.video) if one.video else path
-            noted = None if one.frames is None else one.frames(path)
-            return Recording(format=one.name, imu=path, video=video, log=noted)
+    for family in imu_formats():
+        if family.video is not None and bool(family.video) == path.is_dir() and family.accepts(path):
+            video = _video(path, family.video) if family.video else path
+            noted = None if family.frames is None else family.frames(path)
+            return Recording(format=family.name, imu=path, video=video, log=noted)
     return None
 
 

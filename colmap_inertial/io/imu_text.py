@@ -109,7 +109,7 @@ def _gyro(values: Array, time: int | None, accel: int | None) -> tuple[int | Non
 
 @dataclass(frozen=True, kw_only=True)
 class SensorTable:
-    """Where one sensor's samples lie in a text table, in the user's words.
+    """Where one sensor's samples lie in a text table.
 
     Attributes
     ----------
@@ -132,9 +132,23 @@ class SensorTable:
     counts_per_unit: float = 1.0
 
 
-def read_tables(gyro: SensorTable, accel: SensorTable | None) -> ImuRecording:
-    """Read an IMU, or a gyroscope alone, from tables that the user described (units converted, axes as in the file)."""
-    return recording(_read_described(gyro, "gyro"), None if accel is None else _read_described(accel, "accel"))
+def read_tables(gyro: SensorTable, accel: SensorTable | None, *, layout: str | None = None) -> ImuRecording:
+    """Read an IMU, or a gyroscope alone, from described tables (units converted, axes as in the file).
+
+    Parameters
+    ----------
+    gyro, accel
+        The tables; ``None`` without an accelerometer.
+    layout
+        Names of all columns, in words, where tables must have as many.
+
+    Raises
+    ------
+    FormatError, TimingError
+        Where a table cannot be read, or lacks a column.
+    """
+    samples = _read_described(gyro, "gyro", layout)
+    return recording(samples, None if accel is None else _read_described(accel, "accel", layout))
 
 
 def is_inertial_scale(path: Path) -> bool:
@@ -146,13 +160,11 @@ def read_inertial_scale_imu(path: Path, units: DeclaredUnits) -> ImuRecording:
     """Read ``gyroscope.txt`` and ``accelerometer.txt``: rows ``t_ns x y z``, rad/s and m/s2."""
     if not is_inertial_scale(path):
         raise FormatError(path, "holds no gyroscope.txt and accelerometer.txt")
-
-    def samples(quantity: Quantity, unit: str) -> Samples:
-        table = read_table(path / f"{SENSOR_NAMES[quantity]}.txt")
-        table.require_width("t_ns x y z")
-        return ordered(table, quantity, unit, table.stamps_ns(0, "ns"), table.numbers([1, 2, 3]))
-
-    return recording(samples("gyro", units.gyro or "rad/s"), samples("accel", units.accel or "m/s2"))
+    gyro, accel = (
+        SensorTable(file=path / f"{name}.txt", time=1, time_unit="ns", columns=(2, 3, 4), unit=unit)
+        for name, unit in (("gyroscope", units.gyro or "rad/s"), ("accelerometer", units.accel or "m/s2"))
+    )
+    return read_tables(gyro, accel, layout="t_ns x y z")
 
 
 def is_euroc(path: Path) -> bool:
@@ -250,28 +262,17 @@ def _read_csv(path: Path, units: DeclaredUnits, noise: ImuNoise | None) -> ImuRe
     return recording(gyro, ordered(table, "accel", accel_unit, t_ns, numbers[:, 3:]), noise=noise)
 
 
-def _read_described(source: SensorTable, quantity: Quantity) -> Samples:
+def _read_described(source: SensorTable, quantity: Quantity, layout: str | None) -> Samples:
     if source.unit not in SENSOR_UNITS[quantity]:
         raise ValueError(f"{source.unit} is not a unit of the {SENSOR_NAMES[quantity]}")
     table = read_table(source.file)
-    values = table.numbers([column_index(table, column) for column in source.columns])
+    if layout is not None:
+        table.require_width(layout)
+    values = table.numbers([table.column(column) for column in source.columns])
     if source.zero != 0 or source.counts_per_unit != 1:
         values = (values - source.zero) / source.counts_per_unit
-    t_ns = table.stamps_ns(column_index(table, source.time), source.time_unit)
+    t_ns = table.stamps_ns(table.column(source.time), source.time_unit)
     return ordered(table, quantity, source.unit, t_ns, values)
-
-
-def column_index(table: Table, column: str | int) -> int:
-    """The zero-based index of a column that a user gave by name, or by its number counted from 1."""
-    if isinstance(column, int):
-        if not 1 <= column <= table.width:
-            raise FormatError(table.path, f"there is no column {column}: columns count from 1 to {table.width}")
-        return column - 1
-    if table.header is None:
-        raise FormatError(table.path, f'has no header, so no column "{column}"; give its number, counted from 1')
-    if column not in table.header:
-        raise FormatError(table.path, f'has no column "{column}"; the header is: {table.header_text[:300]}')
-    return table.header.index(column)
 
 
 def ordered(table: Table, quantity: Quantity, unit: str, t_ns: Int64Array, values: Array) -> Samples:

@@ -49,9 +49,9 @@ def is_stray_scanner(path: Path) -> bool:
 def read_stray_scanner(path: Path, units: DeclaredUnits) -> ImuRecording:
     """Read the IMU of a Stray Scanner recording."""
     table = read_table(path if path.is_file() else path / "imu.csv")
-    t_ns = table.stamps_ns(_column(table, "timestamp"), "s")
-    gyro = table.numbers([_column(table, f"alpha_{axis}") for axis in "xyz"])
-    accel = -table.numbers([_column(table, f"a_{axis}") for axis in "xyz"])
+    t_ns = table.stamps_ns(table.column("timestamp"), "s")
+    gyro = table.numbers([table.column(f"alpha_{axis}") for axis in "xyz"])
+    accel = -table.numbers([table.column(f"a_{axis}") for axis in "xyz"])
     length = float(np.nanmedian(np.linalg.norm(accel, axis=1))) if len(accel) else 0.0
     unit = units.accel or ("g" if length < _G_BELOW else "m/s2")
     return recording(
@@ -68,7 +68,7 @@ def read_stray_scanner_frames(path: Path) -> FrameLog | None:
     if not file.is_file():
         return None
     table = read_table(file)
-    return frame_log(file, table.stamps_ns(_column(table, "timestamp"), "s"), camera=_camera_matrix(folder))
+    return frame_log(file, table.stamps_ns(table.column("timestamp"), "s"), camera=_camera_matrix(folder))
 
 
 def _camera_matrix(folder: Path) -> CameraModel | None:
@@ -168,12 +168,5 @@ def _platform(path: Path, members: dict[str, str]) -> tuple[bool, bool]:
 
 def _sensor(path: Path, members: dict[str, str], name: str) -> tuple[Table, Int64Array, Array]:
     table = parse_table(path / name if path.is_dir() else path, text_of(path, members[name]))
-    values = table.numbers([_column(table, axis) for axis in "xyz"])
-    return table, table.stamps_ns(_column(table, "time"), "ns"), values
-
-
-def _column(table: Table, name: str) -> int:
-    if table.header is None or name not in table.header:
-        shown = "it has no header" if table.header is None else f"the header is: {table.header_text[:200]}"
-        raise FormatError(table.path, f'has no column "{name}"; {shown}')
-    return table.header.index(name)
+    values = table.numbers([table.column(axis) for axis in "xyz"])
+    return table, table.stamps_ns(table.column("time"), "ns"), values

@@ -19,7 +19,7 @@ from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.geometry import matrix_from_quat
 from colmap_inertial.core.types import Similarity
 from colmap_inertial.io.files import advise
-from colmap_inertial.io.splats import SplatMover, fault_of_splats, moved_fields
+from colmap_inertial.io.splats import SplatMover, fault_of_splats, list_changed_fields
 
 _CHUNK_BYTES = 512 << 10
 _LONGEST_HEADER = 1 << 20
@@ -189,7 +189,7 @@ def _check_vertices(path: Path, vertices: Element) -> tuple[str, ...]:
         changed.append(label)
     if is_splats(set(kinds)):
         fault = fault_of_splats(set(kinds))
-        moved = [] if fault is not None else [kinds[name] for name in moved_fields(set(kinds))]
+        moved = [] if fault is not None else [kinds[name] for name in list_changed_fields(set(kinds))]
         if any(p.kind[0] != "f" or p.count is not None for p in moved):
             fault = "are no floating-point numbers"
         if fault is not None:
@@ -348,7 +348,7 @@ def _ascii(path: Path, file: BufferedReader, header: Header, similarity: Similar
                     raise FormatError(path, f"truncated within element {element.name}", line=number)
                 lines.append(line)
             rows = [
-                _checked_tokens(path, number - len(lines) + i + 1, element, line, n_vertices)
+                _split_line(path, number - len(lines) + i + 1, element, line, n_vertices)
                 for i, line in enumerate(lines)
             ]
             if columns:
@@ -367,7 +367,7 @@ def _ascii(path: Path, file: BufferedReader, header: Header, similarity: Similar
     yield rest
 
 
-def _checked_tokens(path: Path, number: int, element: Element, line: bytes, n_vertices: int) -> list[bytes]:
+def _split_line(path: Path, number: int, element: Element, line: bytes, n_vertices: int) -> list[bytes]:
     """A line as white space, token, white space, token, ..., white space, its values checked."""
     row = re.split(rb"(\S+)", line)
     tokens = row[1::2]

@@ -41,7 +41,7 @@ class PoseConvention:
             for order in ORDERS
             for position in POSITIONS
         )
-        return tuple(one for one in every if one != self)
+        return tuple(convention for convention in every if convention != self)
 
 
 ROTATIONS: tuple[Literal["camera_from_world", "world_from_camera"], ...] = ("camera_from_world", "world_from_camera")

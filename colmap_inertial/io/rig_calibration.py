@@ -81,9 +81,9 @@ def read_rig_calibration(path: Path, *, unit: Metres | None = None) -> RigCalibr
     """
     path = Path(path)
     if path.is_dir():
-        return _from_model(path, unit)
+        return _read_model(path, unit)
     if path.suffix.lower() == ".json":
-        return _from_rig_config(path, unit)
+        return _read_rig_config(path, unit)
     if path.suffix.lower() not in (".yaml", ".yml"):
         raise FormatError(
             path,
@@ -191,7 +191,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
 # --- COLMAP ---------------------------------------------------------------------------------------------------------
 
 
-def _from_rig_config(path: Path, unit: Metres | None) -> RigCalibration:
+def _read_rig_config(path: Path, unit: Metres | None) -> RigCalibration:
     try:
         rigs = json.loads(read_text(path))
     except (ValueError, RecursionError) as error:
@@ -221,7 +221,7 @@ def _from_rig_config(path: Path, unit: Metres | None) -> RigCalibration:
     return RigCalibration(path=path, cameras=cameras, length_unit="model" if unit is None else "m")
 
 
-def _from_model(path: Path, unit: Metres | None) -> RigCalibration:
+def _read_model(path: Path, unit: Metres | None) -> RigCalibration:
     """``rigs.bin`` and ``cameras.bin`` (COLMAP's scene/reconstruction_io): little-endian records after a count."""
     rigs, sheets = path / "rigs.bin", path / "cameras.bin"
     for file in (rigs, sheets):

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from colmap_inertial.core.arrays import Array, IndexArray, Int64Array
 from colmap_inertial.core.errors import FormatError, TimingError
-from colmap_inertial.io.units import SENSOR_NAMES, Quantity, to_si
+from colmap_inertial.io.units import SENSOR_NAMES, Quantity, convert_to_si
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,9 +96,9 @@ def order_samples(
     """
     what, counted = SENSOR_NAMES[quantity], "sample" if line_numbers is None else "line"
     numbers = np.arange(1, len(t_ns) + 1) if line_numbers is None else line_numbers
-    values = to_si(values, quantity, unit)
+    values = convert_to_si(values, quantity, unit)
     rows = _Rows(path=path, what=what, counted=counted, numbers=numbers, t_ns=t_ns, values=values)
-    rows = _merged(_sorted(_complete(rows)))
+    rows = _merge(_sort(_drop_incomplete(rows)))
     check_rate(path, what, rows.t_ns)
     return Samples(t_ns=rows.t_ns, values=rows.values, repairs=rows.repairs)
 
@@ -124,7 +124,7 @@ class _Rows:
         return replace(self, repairs=(*self.repairs, Repair(f"{self.path.name}: {text}", code)))
 
 
-def _complete(rows: _Rows) -> _Rows:
+def _drop_incomplete(rows: _Rows) -> _Rows:
     """The rows that hold a sample."""
     # Loggers that write sensors of different rates to one table leave the cells of the others empty.
     absent = np.asarray(np.isnan(rows.values).all(axis=1))
@@ -144,7 +144,7 @@ def _complete(rows: _Rows) -> _Rows:
     return rows
 
 
-def _sorted(rows: _Rows) -> _Rows:
+def _sort(rows: _Rows) -> _Rows:
     """The rows in order of time."""
     late_ns = np.maximum.accumulate(rows.t_ns) - rows.t_ns
     if not late_ns.any():
@@ -166,7 +166,7 @@ def _sorted(rows: _Rows) -> _Rows:
     return rows.taken(np.argsort(rows.t_ns, kind="stable"), text, code="stamps-reordered")
 
 
-def _merged(rows: _Rows) -> _Rows:
+def _merge(rows: _Rows) -> _Rows:
     """One row for each stamp: the average of those that have it."""
     same = np.diff(rows.t_ns) == 0
     if not same.any():

@@ -92,7 +92,7 @@ def fault_of_splats(names: set[str]) -> str | None:
     return None
 
 
-def moved_fields(names: set[str]) -> list[str]:
+def list_changed_fields(names: set[str]) -> list[str]:
     """The fields of splats that change."""
     sizes = sorted(name for name in names if re.fullmatch(r"scale_\d+", name))
     rest = [f"f_rest_{i}" for i in range(_num_rest(names))]
@@ -110,7 +110,7 @@ class SplatMover:
     def __init__(self, similarity: Similarity, names: set[str]) -> None:
         self._similarity = similarity
         self._rotation = matrix_from_quat(similarity.rotation_xyzw)
-        self.names = moved_fields(names)
+        self.names = list_changed_fields(names)
         self._bands = [sh_rotation(self._rotation, degree) for degree in range(1, _REST[_num_rest(names)] + 1)]
         self._rest = [name for name in self.names if name.startswith("f_rest_")]
         self._sizes = [name for name in self.names if name.startswith("scale_")]

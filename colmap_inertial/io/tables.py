@@ -60,6 +60,24 @@ class Table:
         if self.width != len(layout.split()):
             raise FormatError(self.path, f"{self.width} columns; expected {layout}", line=int(self.line_numbers[0]))
 
+    def column(self, name: str | int) -> int:
+        """The zero-based index of a column, by its name in the header or its number counted from 1.
+
+        Raises
+        ------
+        FormatError
+            Where there is no such column.
+        """
+        if isinstance(name, int):
+            if not 1 <= name <= self.width:
+                raise FormatError(self.path, f"there is no column {name}: columns count from 1 to {self.width}")
+            return name - 1
+        if self.header is None:
+            raise FormatError(self.path, f'has no header, so no column "{name}"; give its number, counted from 1')
+        if name not in self.header:
+            raise FormatError(self.path, f'has no column "{name}"; the header is: {self.header_text[:300]}')
+        return self.header.index(name)
+
     def text(self, column: int) -> list[str]:
         """The cells of one zero-based column."""
         cells = (line.split(self.delimiter, column + 1)[column] for line in self.lines)
@@ -342,10 +360,10 @@ def text_of(path: Path, member: str) -> str:
         return read_text(path / member)
     try:
         with zipfile.ZipFile(path) as archive:
-            told = archive.getinfo(member)
-            if told.compress_size > path.stat().st_size:  # as much memory would be asked for as it says
+            member_info = archive.getinfo(member)
+            if member_info.compress_size > path.stat().st_size:  # as much memory would be asked for as it says
                 raise FormatError(path, f"its {member} cannot be unpacked: it is said to be larger than the file")
-            if told.file_size > _LARGEST_MEMBER:
+            if member_info.file_size > _LARGEST_MEMBER:
                 raise FormatError(path, f"its {member} unpacks to more than {_LARGEST_MEMBER >> 30} GiB")
             return archive.read(member).decode("utf-8-sig", errors="replace")
     except _DAMAGED as error:

@@ -69,8 +69,8 @@ def read_telemetry(path: Path, units: DeclaredUnits) -> ImuRecording:
 def read_telemetry_frames(path: Path) -> FrameLog | None:
     """The readout that an Insta360 states of its frames; ``None`` where it states none."""
     _, found = _parsed(path)
-    said = found.get("Default", {}).get("Metadata")
-    readout_s = 1e-3 * float(said.get("rolling_shutter_time") or 0.0) if isinstance(said, dict) else 0.0
+    metadata = found.get("Default", {}).get("Metadata")
+    readout_s = 1e-3 * float(metadata.get("rolling_shutter_time") or 0.0) if isinstance(metadata, dict) else 0.0
     if not 0 < readout_s < _LONGEST_READOUT_S:
         return None
     return FrameLog(t_s=np.zeros(0), readout_s=readout_s)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from colmap_inertial.core.arrays import Array, Int64Array
+from colmap_inertial.core.arrays import Array, BoolArray
 from colmap_inertial.core.errors import FormatError, TimingError
 from colmap_inertial.core.geometry import quat_conjugate, quat_normalize
 from colmap_inertial.core.types import CameraTrajectory, ImuRecording, SmoothedTrajectory
@@ -80,40 +80,33 @@ def _read_poses(path: Path, layout: str, time_unit: str, cam_from_world: Callabl
     table.require_width(layout)
     if len(table) < 2:
         raise FormatError(path, "holds one pose; a trajectory needs at least two")
-    numbers = _finite(table, [layout.split().index(name) for name in ["x", "y", "z", "qx", "qy", "qz", "qw"]])
-    t_ns = _increasing(table, table.stamps_ns(0, time_unit))
+    numbers = table.numbers([layout.split().index(name) for name in ["x", "y", "z", "qx", "qy", "qz", "qw"]])
+    _require_rows(
+        table, np.asarray(np.isfinite(numbers).all(axis=1)), lambda row: "a pose has a value that is not finite"
+    )
+    t_ns = table.stamps_ns(0, time_unit)
+    late = np.flatnonzero(np.diff(t_ns) <= 0)
+    if len(late):
+        line = int(table.line_numbers[late[0] + 1])
+        raise TimingError(f"{path}, line {line}: the time does not increase; poses must be in order of time")
+    xyzw = numbers[:, 3:]
+    norm = np.linalg.norm(xyzw, axis=1)
+    _require_rows(
+        table,
+        np.abs(norm - 1) <= 1e-2,
+        lambda row: f"the quaternion has length {norm[row]:.4g}, not 1; are these the columns of a rotation?",
+    )
     return CameraTrajectory(
         names=tuple(map(str, range(len(t_ns)))),
         t_s=seconds(t_ns, int(t_ns[0])),
-        cam_from_world_xyzw=cam_from_world(_unit(table, numbers[:, 3:])),
+        cam_from_world_xyzw=cam_from_world(xyzw / norm[:, None]),
         cam_in_world=numbers[:, :3],
         epoch_ns=int(t_ns[0]),
     )
 
 
-def _finite(table: Table, columns: list[int]) -> Array:
-    numbers = table.numbers(columns)
-    bad = np.flatnonzero(~np.isfinite(numbers).all(axis=1))
-    if len(bad):
-        raise FormatError(table.path, "a pose has a value that is not finite", line=int(table.line_numbers[bad[0]]))
-    return numbers
-
-
-def _increasing(table: Table, t_ns: Int64Array) -> Int64Array:
-    bad = np.flatnonzero(np.diff(t_ns) <= 0)
-    if len(bad):
-        line = int(table.line_numbers[bad[0] + 1])
-        raise TimingError(f"{table.path}, line {line}: the time does not increase; poses must be in order of time")
-    return t_ns
-
-
-def _unit(table: Table, xyzw: Array) -> Array:
-    norm = np.linalg.norm(xyzw, axis=1)
-    bad = np.flatnonzero(np.abs(norm - 1) > 1e-2)
-    if len(bad):
-        raise FormatError(
-            table.path,
-            f"the quaternion has length {norm[bad[0]]:.4g}, not 1; are these the columns of a rotation?",
-            line=int(table.line_numbers[bad[0]]),
-        )
-    return xyzw / norm[:, None]
+def _require_rows(table: Table, is_good: BoolArray, reason: Callable[[int], str]) -> None:
+    """Refuse the first pose that is not good; ``reason`` of its row."""
+    if not is_good.all():
+        row = int(np.argmin(is_good))
+        raise FormatError(table.path, reason(row), line=int(table.line_numbers[row]))

@@ -56,7 +56,7 @@ class DeclaredUnits:
     accel: str | None = None
 
 
-def to_si(values: Array, quantity: Quantity, unit: str) -> Array:
+def convert_to_si(values: Array, quantity: Quantity, unit: str) -> Array:
     """Samples in rad/s or m/s2 from samples in ``unit`` (a key of ``SENSOR_UNITS[quantity]``)."""
     factor = SENSOR_UNITS[quantity][unit]
     return values if factor == 1.0 else values * factor

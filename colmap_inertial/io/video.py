@@ -2,6 +2,10 @@
 
 Colours follow what the video says of itself: matrix (BT.601, BT.709, BT.2020) and range, limited where it says nothing,
 BT.709 from 720 rows on where it says nothing, as players have it. Transfer curves stay: a log or HDR picture stays one.
+
+The readout of a video that does not state its own is looked up by camera and mode: model, picture size and frame rate
+must all be those of a row of the table (``readouts.csv``, with the source of each figure). Where two sources contradict
+each other, none of them is in it.
 """
 
 from __future__ import annotations
@@ -47,9 +51,9 @@ def video_stamps_ns(path: Path) -> Int64Array:
     """
     container, stream = _open(path)
     with container:
-        packets = _guarded(path, container.demux(stream))
+        packets = _convert_errors(path, container.demux(stream))
         found = [(packet.pts, packet.is_discard) for packet in packets if packet.size > 0]
-        listed, time_base, duration_s = stream.frames, stream.time_base, _stated_duration_s(stream)
+        listed, time_base, duration_s = stream.frames, stream.time_base, _read_duration_s(stream)
         kind = container.format.name
     stamps = [stamp for stamp, is_discarded in found if not is_discarded]
     known = [stamp for stamp in stamps if stamp is not None]
@@ -58,7 +62,7 @@ def video_stamps_ns(path: Path) -> Int64Array:
         t_ns = np.array(sorted(_ns(stamp, time_base.numerator, time_base.denominator) for stamp in known), np.int64)
     last = f", the last at {t_ns[-1] * 1e-9:.3f} s" if len(t_ns) else ""
     if len(found) < listed:
-        missing = _lost(path, kind, listed, listed - len(found))
+        missing = _count_lost(path, kind, listed, listed - len(found))
         if missing:
             held = f"it holds {listed - missing} of the {listed} frames that its index lists"
             raise FormatError(path, f"is cut off: {held}{last}")
@@ -101,13 +105,13 @@ def decode_video(path: Path, wanted_ns: Int64Array) -> Iterator[tuple[int, UInt8
     FormatError
         Where a wanted frame cannot be decoded whole, or has another size than those before.
     """
-    for t_ns, frame in _wanted(path, wanted_ns):
+    for t_ns, frame in _decode_wanted(path, wanted_ns):
         yield t_ns, _pixels(frame)
 
 
 def decode_reduced(path: Path, wanted_ns: Int64Array, long_side_px: int) -> Iterator[tuple[int, UInt8Array]]:
     """As :func:`decode_video`, but 8 bit of brightness, as coded, not larger than ``long_side_px``: to look at."""
-    for t_ns, frame in _wanted(path, wanted_ns):
+    for t_ns, frame in _decode_wanted(path, wanted_ns):
         yield t_ns, reduced(_brightness(frame), long_side_px)
 
 
@@ -130,14 +134,14 @@ def decode_grey(path: Path) -> Iterator[tuple[int, int, UInt8Array]]:
     container, stream = _open(path)
     stream.thread_type = "AUTO"
     with container:
-        for frame in _guarded(path, container.decode(stream)):
+        for frame in _convert_errors(path, container.decode(stream)):
             if frame.pts is not None and frame.time_base is not None:
                 t_ns = _ns(frame.pts, frame.time_base.numerator, frame.time_base.denominator)
                 turn = int(getattr(frame, "rotation", 0))  # PyAV 13 does not tell it
                 yield t_ns, turn, np.asarray(frame.to_ndarray(format="gray"), dtype=np.uint8)
 
 
-def _wanted(path: Path, wanted_ns: Int64Array) -> Iterator[tuple[int, av.VideoFrame]]:
+def _decode_wanted(path: Path, wanted_ns: Int64Array) -> Iterator[tuple[int, av.VideoFrame]]:
     """The frames with the wanted stamps, each of them whole, and all of one size."""
     if len(wanted_ns) == 0:
         return
@@ -147,7 +151,7 @@ def _wanted(path: Path, wanted_ns: Int64Array) -> Iterator[tuple[int, av.VideoFr
     missing = set(wanted_ns.tolist())
     first_ns = min(missing)
     with container:
-        for frame in _guarded(path, container.decode(stream)):
+        for frame in _convert_errors(path, container.decode(stream)):
             if frame.pts is None or frame.time_base is None:
                 continue
             t_ns = _ns(frame.pts, frame.time_base.numerator, frame.time_base.denominator)
@@ -222,8 +226,8 @@ def video_mode(path: Path) -> VideoMode | None:
     """
     container, stream = _open(path)
     with container:
-        said = container.metadata
-        make, model = (next((said[key] for key in keys if key in said), "") for keys in (_MAKES, _MODELS))
+        tags = container.metadata
+        make, model = (next((tags[key] for key in keys if key in tags), "") for keys in (_MAKES, _MODELS))
         if not make or not model or not stream.average_rate:
             return None
         return VideoMode(
@@ -245,13 +249,13 @@ def _open(path: Path) -> tuple[InputContainer, VideoStream]:
             read_movie(path)  # knows better what is wrong with its index
         raise FormatError(path, f"is no video that FFmpeg reads: {_reason(error)}") from None
     try:
-        return container, _filmed(path, container)
+        return container, _find_filmed(path, container)
     except FormatError:
         container.close()
         raise
 
 
-def _filmed(path: Path, container: InputContainer) -> VideoStream:
+def _find_filmed(path: Path, container: InputContainer) -> VideoStream:
     """The video stream that the camera filmed: no cover picture, no smaller copy."""
     from av.stream import Disposition
 
@@ -276,7 +280,7 @@ def _area(stream: VideoStream) -> int:
     return int(getattr(stream, "width", 0) * getattr(stream, "height", 0))
 
 
-def _lost(path: Path, kind: str, listed: int, not_found: int) -> int:
+def _count_lost(path: Path, kind: str, listed: int, not_found: int) -> int:
     """How many of the frames that an index lists lie beyond the end of the file, where FFmpeg gave fewer than it lists.
 
     An intact file gives fewer, too: what an edit list cuts away is dropped by whole groups of pictures, and AVI counts
@@ -307,7 +311,7 @@ def _ends_inside_riff(path: Path) -> bool:
     return False
 
 
-def _stated_duration_s(stream: VideoStream) -> float | None:
+def _read_duration_s(stream: VideoStream) -> float | None:
     """When the stream ends by its own account, where that was noted at the end of the recording (Matroska)."""
     try:
         hours, minutes, seconds = stream.metadata.get("DURATION", "").split(":")
@@ -316,7 +320,7 @@ def _stated_duration_s(stream: VideoStream) -> float | None:
         return None
 
 
-def _guarded(path: Path, items: Iterator[T]) -> Iterator[T]:
+def _convert_errors(path: Path, items: Iterator[T]) -> Iterator[T]:
     """The same items; FFmpeg's complaint about a damaged file becomes ours."""
     import av
 
@@ -377,7 +381,7 @@ class PublishedReadout:
 
 
 @cache
-def published_readouts() -> tuple[PublishedReadout, ...]:
+def read_published_readouts() -> tuple[PublishedReadout, ...]:
     """The whole table."""
     with files("colmap_inertial.io").joinpath("readouts.csv").open(encoding="utf-8") as table:
         return tuple(
@@ -401,4 +405,4 @@ def readout_of_video(path: Path) -> PublishedReadout | None:
         mode = video_mode(path)
     except FormatError:
         return None  # whoever reads its frames says what is wrong with it
-    return None if mode is None else next((one for one in published_readouts() if one.is_of(mode)), None)
+    return None if mode is None else next((row for row in read_published_readouts() if row.is_of(mode)), None)

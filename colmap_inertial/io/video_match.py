@@ -63,7 +63,7 @@ class _Candidates:
     """The two frames that look most like each picture so far."""
 
     def __init__(self, images: UInt8Array) -> None:
-        self._small = np.array([_normalised(_smaller(image)) for image in images])
+        self._small = np.array([_normalise(_shrink(image)) for image in images])
         self._large = np.ascontiguousarray(images)
         self._correlation = np.full((len(images), _LIMITS.candidates), _LIMITS.least_correlation, dtype=np.float32)
         self.distance = np.full((len(images), 2), np.inf)
@@ -73,14 +73,14 @@ class _Candidates:
     def offer(self, t_ns: int, grey: UInt8Array) -> None:
         """Compare a frame with all pictures."""
         thumbnail = _thumbnail(grey, _LIMITS.large_px)
-        correlation = self._small @ _normalised(_smaller(thumbnail))
+        correlation = self._small @ _normalise(_shrink(thumbnail))
         better = np.flatnonzero(correlation > self._correlation.min(axis=1))
         if not len(better):
             return
-        frame = _normalised(thumbnail)
+        frame = _normalise(thumbnail)
         for i in better:
             self._correlation[i, np.argmin(self._correlation[i])] = correlation[i]
-            distance = _distance(_normalised(self._large[i]), frame)
+            distance = _distance(_normalise(self._large[i]), frame)
             place = 0 if distance < self.distance[i, 0] else 1
             if distance < self.distance[i, place]:
                 for kept in (self.distance, self._frames, self.t_ns):
@@ -92,7 +92,7 @@ class _Candidates:
         first, second = self.distance[i]
         if not np.isfinite(second):
             return 0.0
-        between = _distance(*(_normalised(frame) for frame in self._frames[i]))
+        between = _distance(*(_normalise(frame) for frame in self._frames[i]))
         if between < _LIMITS.rounding:
             return 0.5
         return float(0.5 * (1 - (second**2 - first**2) / between**2))
@@ -136,11 +136,11 @@ def match_to_video(
         raise FormatError(video, "holds no video frames")
     nearest = {turn: np.median(np.minimum(c.distance[:, 0], 1.0)) for turn, c in turns.items()}
     turn = min(nearest, key=lambda t: nearest[t])
-    found, doubtful = _decided(turns[turn], names)
+    found, doubtful = _decide(turns[turn], names)
     return VideoMatch(t_ns=found, doubtful=doubtful, quarter_turns=turn)
 
 
-def _decided(candidates: _Candidates, names: Sequence[str]) -> tuple[dict[str, int], dict[str, str]]:
+def _decide(candidates: _Candidates, names: Sequence[str]) -> tuple[dict[str, int], dict[str, str]]:
     found: dict[str, int] = {}
     doubtful: dict[str, str] = {}
     for i, name in enumerate(names):
@@ -165,14 +165,14 @@ def _thumbnail(grey: UInt8Array, side: int) -> UInt8Array:
     return np.asarray(cv2.GaussianBlur(shrunk, (0, 0), 1.0), dtype=np.uint8)
 
 
-def _smaller(thumbnail: UInt8Array) -> UInt8Array:
+def _shrink(thumbnail: UInt8Array) -> UInt8Array:
     import cv2
 
     size = _LIMITS.small_px, _LIMITS.small_px
     return np.asarray(cv2.resize(thumbnail, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
-def _normalised(thumbnail: UInt8Array) -> Float32Array:
+def _normalise(thumbnail: UInt8Array) -> Float32Array:
     """(N,) zero mean, unit length; zero for a flat picture, which looks like nothing."""
     values = thumbnail.astype(np.float32).ravel()
     values -= values.mean()

@@ -27,7 +27,7 @@ from colmap_inertial.core.types import (
     SolvedMotion,
     Treatment,
 )
-from colmap_inertial.io.files import StrPath, as_plain, check_names, read_json, write_json
+from colmap_inertial.io.files import StrPath, check_names, convert_to_plain, read_json, write_json
 from colmap_inertial.model.soundness import check_binary_model, check_values
 
 if TYPE_CHECKING:
@@ -114,17 +114,25 @@ def downgraded(estimate: ScaleEstimate, doubts: Sequence[str]) -> ScaleEstimate:
     """An estimate from a recording with doubts: they are among its reasons, and it is not trusted."""
     if not doubts:
         return estimate
-    said = estimate.reasons[: len(doubts)] == tuple(doubts)
+    has_doubts = estimate.reasons[: len(doubts)] == tuple(doubts)
     return replace(
         estimate,
         verdict="weak" if estimate.verdict == "trusted" else estimate.verdict,
-        reasons=estimate.reasons if said else (*doubts, *estimate.reasons),
+        reasons=estimate.reasons if has_doubts else (*doubts, *estimate.reasons),
     )
 
 
 def model_format(folder: Path) -> str | None:
     """``".bin"`` or ``".txt"`` where the folder holds a COLMAP model (binary first), else ``None``."""
     return next(iter(model_formats(folder)), None)
+
+
+def require_format(folder: Path) -> str:
+    """As :func:`model_format`; a :class:`FormatError` where the folder holds no model."""
+    suffix = model_format(folder)
+    if suffix is None:
+        raise FormatError(folder, "no COLMAP model here (cameras, images and points3D, .bin or .txt)")
+    return suffix
 
 
 def model_formats(folder: Path) -> list[str]:
@@ -149,14 +157,11 @@ def find_models(folder: StrPath) -> dict[int, Path]:
     folder = Path(folder)
     if model_format(folder) is not None:
         return {0: folder}
-    found = {}
-    if folder.is_dir():
-        for child in folder.iterdir():
-            if child.name.isdigit() and model_format(child) is not None:
-                found[int(child.name)] = child
-    if not found:
-        raise FormatError(folder, "no COLMAP model here (cameras, images and points3D, .bin or .txt)")
-    return dict(sorted(found.items()))
+    numbered = [path for path in folder.iterdir() if path.name.isdigit()] if folder.is_dir() else []
+    models = {int(path.name): path for path in numbered if model_format(path) is not None}
+    if not models:
+        require_format(folder)
+    return dict(sorted(models.items()))
 
 
 def num_registered(folder: Path) -> int:
@@ -167,9 +172,7 @@ def num_registered(folder: Path) -> int:
     FormatError
         When the folder holds no model.
     """
-    suffix = model_format(folder)
-    if suffix is None:
-        raise FormatError(folder, "no COLMAP model here (cameras, images and points3D, .bin or .txt)")
+    suffix = require_format(folder)
     file = folder / f"images{suffix}"
     if suffix == ".bin":
         with open(file, "rb") as opened:
@@ -194,9 +197,7 @@ def read_model(folder: StrPath, suffix: str | None = None) -> pycolmap.Reconstru
         When the folder holds no model, a damaged one, or one whose names or numbers cannot be.
     """
     folder = Path(folder)
-    suffix = suffix or model_format(folder)
-    if suffix is None:
-        raise FormatError(folder, "no COLMAP model here (cameras, images and points3D, .bin or .txt)")
+    suffix = suffix or require_format(folder)
     if suffix == ".bin":
         check_binary_model(folder)
     try:
@@ -337,7 +338,7 @@ def _pose_covariances(reconstruction: pycolmap.Reconstruction, images: Sequence[
 
 def similarity_as_json(similarity: Similarity) -> dict[str, object]:
     """The similarity's fields in JSON types."""
-    return dict(as_plain(similarity))
+    return dict(convert_to_plain(similarity))
 
 
 def is_metric(folder: Path) -> bool:

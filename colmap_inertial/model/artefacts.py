@@ -53,8 +53,8 @@ def check_map(path: Path, channels: int) -> int:
     return match.end()
 
 
-def transform_depth_map(source: Path, target: Path, similarity: Similarity) -> None:
-    """Write a depth map times the scale; 0, which means unknown, stays 0."""
+def transform_depth_map(source: Path, target: Path, similarity: Similarity) -> tuple[str, ...]:
+    """Write a depth map times the scale; 0, which means unknown, stays 0. What was changed: ``"depths"``."""
     header = check_map(source, 1)
     buffer = bytearray(_CHUNK_BYTES)
     view = memoryview(buffer)
@@ -70,6 +70,7 @@ def transform_depth_map(source: Path, target: Path, similarity: Similarity) -> N
             with np.errstate(over="ignore", invalid="ignore"):
                 np.multiply(part, scale, out=part)
             out.write(view[:n])
+    return ("depths",)
 
 
 def transform_options(source: Path, target: Path, similarity: Similarity) -> tuple[str, ...]:

@@ -52,7 +52,7 @@ def new_folder(target: Path, *, into_empty: bool = False) -> Iterator[Path]:
         raise OutputExistsError(f"{target} exists already; choose another folder or remove it")
     partial = target.with_name(f".{target.name}.colmap-inertial-partial")
     lock = target.with_name(f".{target.name}.colmap-inertial-lock")
-    with _ending_by_signal(), _as_output_error(target):
+    with _ending_by_signal(), _convert_os_errors(target):
         target.parent.mkdir(parents=True, exist_ok=True)
         with locked(lock, f"another process is writing {target}"):
             try:
@@ -110,7 +110,7 @@ def _flush(folder: Path) -> None:
 
 
 @contextlib.contextmanager
-def _as_output_error(target: Path) -> Iterator[None]:
+def _convert_os_errors(target: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:

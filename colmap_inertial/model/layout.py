@@ -12,7 +12,7 @@ from colmap_inertial.core.arrays import Array
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.types import Similarity
 from colmap_inertial.io.ply import transform_ply
-from colmap_inertial.model import model_format, read_model
+from colmap_inertial.model import model_format, read_model, require_format
 from colmap_inertial.model.artefacts import check_map, transform_depth_map, transform_obj, transform_options
 from colmap_inertial.model.database import PlacedModel, is_database
 from colmap_inertial.model.nerf import is_export, is_transforms, transform_export, transform_transforms
@@ -51,13 +51,8 @@ def kind_of(file: Path, path: Path) -> str | None:
     return {".ply": "ply", ".ini": "options"}.get(suffix) or ("database" if is_database(file) else None)
 
 
-def _depth_map(source: Path, target: Path, similarity: Similarity) -> tuple[str, ...]:
-    transform_depth_map(source, target, similarity)
-    return ("depths",)
-
-
 WRITERS: dict[str, Callable[[Path, Path, Similarity], tuple[str, ...]]] = {
-    "depth map": _depth_map,
+    "depth map": transform_depth_map,
     "ply": transform_ply,
     "obj": transform_obj,
     "options": transform_options,
@@ -116,7 +111,7 @@ def read_layout(root: Path, folders: Sequence[Path], *, one_for_all: bool) -> La
     """
     models = [folder for folder in (Path(), *folders) if model_format(root / folder) is not None]
     if not models:
-        raise FormatError(root, "no COLMAP model here (cameras, images and points3D, .bin or .txt)")
+        require_format(root)
     known = {Path(), *folders}
     dense = [f for f in known if f / "stereo" in known and any(m.is_relative_to(f / "sparse") for m in models)]
     submodels = _submodels(root, models, dense, one_for_all=one_for_all)

@@ -145,7 +145,7 @@ def transform_export(source: Path, target: Path, similarity: Similarity) -> tupl
         values |= {name: value for name, value in before_apply.items() if name != _BY}
         changed.append("unit")
     elif values.get("unit") == NOT_METRES and not similarity.provenance.startswith(UNDOES):
-        values |= _in_metres(values, similarity)
+        values |= _describe_metres(values, similarity)
         changed.append("unit")
     elif metres is not None and similarity.scale != 1:
         try:
@@ -158,13 +158,13 @@ def transform_export(source: Path, target: Path, similarity: Similarity) -> tupl
     return tuple(dict.fromkeys(changed))
 
 
-def _in_metres(values: Mapping[str, Any], similarity: Similarity) -> dict[str, Any]:
+def _describe_metres(values: Mapping[str, Any], similarity: Similarity) -> dict[str, Any]:
     """What an export of unknown unit says once a similarity made it metric."""
     up = values.get("up_in_world")
     up = _up(similarity) if up is None else up
     sigma = math.sqrt(similarity.cov[0, 0])
     factor = math.exp(Z95 * sigma)
-    said = [note for note in values.get("notes", []) if note != NO_SCALE and (up is None or note != NO_UP)]
+    notes = [note for note in values.get("notes", []) if note != NO_SCALE and (up is None or note != NO_UP)]
     return {
         "unit": "m",
         "up_in_world": up,
@@ -174,7 +174,7 @@ def _in_metres(values: Mapping[str, Any], similarity: Similarity) -> dict[str, A
             "metres_per_unit": similarity.scale,
             "relative_ci95": [1 / factor, factor] if sigma > 0 else None,
         },
-        "notes": said,
+        "notes": notes,
         _BEFORE: {
             _BY: similarity.provenance,
             **{name: values[name] for name in ("unit", "up_in_world", "scale", "notes") if name in values},
@@ -211,22 +211,25 @@ def _applied(path: Path, values: Mapping[str, Any]) -> Array:
 
 def _matrix(path: Path, value: object) -> Array:
     """(4, 4) of 3 or 4 rows."""
-    try:
-        matrix = np.array(value, dtype=np.float64)
-        if matrix.shape == (3, 4):
-            matrix = np.concatenate([matrix, [[0.0, 0.0, 0.0, 1.0]]])
-        if matrix.shape == (4, 4) and abs(np.linalg.det(matrix)) > 0:  # not where one of them is nan
-            return matrix
-    except (TypeError, ValueError):
-        pass
-    raise FormatError(path, "a transform that is no matrix of 3 or 4 rows of 4 numbers; leave the file out with --keep")
+    matrix = _array(value)
+    if matrix.shape == (3, 4):
+        matrix = np.concatenate([matrix, [[0.0, 0.0, 0.0, 1.0]]])
+    if matrix.shape != (4, 4) or not abs(np.linalg.det(matrix)) > 0:  # not where one of them is nan
+        reason = "a transform that is no matrix of 3 or 4 rows of 4 numbers; leave the file out with --keep"
+        raise FormatError(path, reason)
+    return matrix
 
 
 def _vector(path: Path, value: object) -> Array:
+    vector = _array(value)
+    if vector.shape != (3,):
+        raise FormatError(path, "a vector that is not three numbers; leave the file out with --keep")
+    return vector
+
+
+def _array(value: object) -> Array:
+    """The numbers of a value; none where it is no array of numbers."""
     try:
-        vector = np.array(value, dtype=np.float64)
-        if vector.shape == (3,):
-            return vector
+        return np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
-        pass
-    raise FormatError(path, "a vector that is not three numbers; leave the file out with --keep")
+        return np.empty(0)

@@ -130,12 +130,12 @@ def apply_to_project(
                 f"{project / folder} already holds a metric scale ({provenance}); apply it to COLMAP's own project, "
                 "or take it back with --undo"
             )
-    one = scales if isinstance(scales, Similarity) else None
-    layout = read_layout(project, work.open_folders(), one_for_all=one is not None)
-    by_model = _by_model(project, layout, scales)
+    common = scales if isinstance(scales, Similarity) else None
+    layout = read_layout(project, work.open_folders(), one_for_all=common is not None)
+    by_model = _assign_scales(project, layout, scales)
     left_out = [index for index, scale in by_model.items() if only_metric and scale.similarity is None]
     work.leave_out(layout, left_out)
-    plan = _Plan(layout=layout, by_model=by_model, one_for_all=one, left_out=left_out, link=link)
+    plan = _Plan(layout=layout, by_model=by_model, one_for_all=common, left_out=left_out, link=link)
     return work.run(plan, progress)
 
 
@@ -171,15 +171,15 @@ def undo_project(
         for index, fields in models
     }
     work = _Work(project, out, keep, follow_links, beside)
-    one = undoing(similarity_from_json(path, record)) if record.get("one_for_all") is True else None
-    layout = read_layout(project, work.open_folders(), one_for_all=one is not None)
+    common = undoing(similarity_from_json(path, record)) if record.get("one_for_all") is True else None
+    layout = read_layout(project, work.open_folders(), one_for_all=common is not None)
     if layout.submodels.keys() != by_model.keys():
         raise FormatError(path, "the models of the project are not those that it records")
-    plan = _Plan(layout=layout, by_model=by_model, one_for_all=one, databases=databases, link=link, is_undo=True)
+    plan = _Plan(layout=layout, by_model=by_model, one_for_all=common, databases=databases, link=link, is_undo=True)
     return work.run(plan, progress)
 
 
-def _by_model(
+def _assign_scales(
     project: Path, layout: Layout, scales: Similarity | Mapping[int | None, ModelScale]
 ) -> dict[int, ModelScale]:
     if isinstance(scales, Similarity):
@@ -266,15 +266,15 @@ class _Work:
         """Folders that are not kept as they are."""
         return [folder for folder in self.folders if not self.is_kept(folder)]
 
-    def leave_out(self, layout: Layout, left: Collection[int]) -> None:
+    def leave_out(self, layout: Layout, indices: Collection[int]) -> None:
         """Leave out some of the sub-models, and what was made from them."""
-        gone = {folder for folder, index in (*layout.owners.items(), *layout.workspaces.items()) if index in left}
+        gone = {folder for folder, index in (*layout.owners.items(), *layout.workspaces.items()) if index in indices}
 
         def staying(paths: Sequence[Path]) -> list[Path]:
             return [path for path in paths if not gone.intersection((path, *path.parents))]
 
         self.folders, self._files, self._links = map(staying, (self.folders, self._files, self._links))
-        for index in left:
+        for index in indices:
             self._notes.append(f"{layout.submodels[index]} and what was made from it is left out: its scale is refused")
 
     @one_blas_thread()
@@ -429,14 +429,14 @@ class _Work:
             self._changes.append(Change(path=str(path), kind="database", changed=tuple(changed), model=None))
         return bool(changed)
 
-    def _record(self, applied: Applied, one: Similarity | None) -> dict[str, object]:
+    def _record(self, applied: Applied, common: Similarity | None) -> dict[str, object]:
         """The content of ``transform.json``."""
         found = [scale.similarity for _, scale in applied.models.values() if scale.similarity is not None]
-        same = one or (found[0] if len(applied.models) == 1 else None)
+        same = common or (found[0] if len(applied.models) == 1 else None)
         whole = {"provenance": "; ".join(s.provenance for s in found)} if same is None else similarity_as_json(same)
         return {
             **whole,
-            "one_for_all": one is not None,
+            "one_for_all": common is not None,
             "source": str(self._project.resolve()),
             "version": __version__,
             "keep": list(self._keep),

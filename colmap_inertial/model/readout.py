@@ -7,7 +7,7 @@ seen at the instant that the pose holds; bundle adjustment of those gives the mo
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -84,16 +84,9 @@ def settle_readout(
     shift_px = float(np.median([float(np.percentile(s, 90)) for s in shifts if len(s)] or [0.0]))
     if shift_px < _LEAST_SHIFT_PX:
         return reconstruction, Settled(shift_px=shift_px, before_px=before_px, after_px=before_px, accepted=False)
-    options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
-    options.refine_focal_length = options.refine_extra_params = refine_intrinsics
-    options.refine_principal_point = False
+    options, config = _prepare_adjustment(settled.reg_image_ids(), refine_intrinsics=refine_intrinsics)
     solver: Any = getattr(options, "ceres", options)  # COLMAP 4.2 keeps the solver apart
     solver.solver_options.num_threads = num_threads
-    config = pycolmap.BundleAdjustmentConfig()
-    for image_id in settled.reg_image_ids():
-        config.add_image(image_id)
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     # pycolmap.bundle_adjustment would switch COLMAP's log back on
     pycolmap.create_default_bundle_adjuster(options, config, settled).solve()
     settled.update_point_3d_errors()
@@ -153,13 +146,7 @@ def intrinsics_sigma(reconstruction: pycolmap.Reconstruction) -> dict[int, Array
     if noise_px is None:
         return {}
     model = pycolmap.Reconstruction(reconstruction)
-    config = pycolmap.BundleAdjustmentConfig()
-    for i in image_ids:
-        config.add_image(i)
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    options = pycolmap.BundleAdjustmentOptions()
-    options.refine_focal_length = options.refine_extra_params = True
-    options.refine_principal_point = options.print_summary = False
+    options, config = _prepare_adjustment(image_ids, refine_intrinsics=True)
     wanted = pycolmap.BACovarianceOptions()
     wanted.params = pycolmap.BACovarianceOptionsParams.ALL
     adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
@@ -190,3 +177,18 @@ def _noise_px(reconstruction: pycolmap.Reconstruction) -> float | None:
     # a point's error is the mean length of its residuals, whose square is 4 / pi times smaller than their mean square
     squares = sum(p.track.length() * p.error**2 for p in points) * 4 / np.pi
     return float(np.sqrt(squares / free))
+
+
+def _prepare_adjustment(
+    image_ids: Iterable[int], *, refine_intrinsics: bool
+) -> tuple[pycolmap.BundleAdjustmentOptions, pycolmap.BundleAdjustmentConfig]:
+    """Options and images of a bundle adjustment; the principal point is held."""
+    import pycolmap
+
+    options, config = pycolmap.BundleAdjustmentOptions(), pycolmap.BundleAdjustmentConfig()
+    options.refine_focal_length = options.refine_extra_params = refine_intrinsics
+    options.refine_principal_point = options.print_summary = False
+    for image_id in image_ids:
+        config.add_image(image_id)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    return options, config

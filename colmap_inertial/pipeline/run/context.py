@@ -8,7 +8,7 @@ from typing import Literal
 
 from colmap_inertial.core.options import ReconstructOptions
 from colmap_inertial.core.types import CameraImuCalibration, FrameTiming, ImuRecording
-from colmap_inertial.io.calibration import CalibrationFiles, largest_offset_s, read_calibrations, read_for_another
+from colmap_inertial.io.calibration import CalibrationFiles, largest_offset_s, read_calibrations, read_for_recording
 from colmap_inertial.io.capture import Capture, Video
 from colmap_inertial.io.files import path_in
 from colmap_inertial.pipeline.run.progress import Progress, silent
@@ -90,7 +90,7 @@ class Recording:
 
 def prior_calibration(capture: Capture, given: CalibrationFiles) -> CameraImuCalibration:
     """What is known of camera and IMU beforehand: from a calibration file where one is given, else from the capture."""
-    files = read_for_another(given, shared_clock=capture.shared_clock)
+    files = read_for_recording(given, shared_clock=capture.shared_clock)
     calibration, of_imu = files.camera_imu or capture.calibration, files.imu or capture.imu_calibration
     return calibration if of_imu is None else of_imu.loosened(calibration)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from colmap_inertial import __version__
 from colmap_inertial.core.errors import InertialError
-from colmap_inertial.io.files import as_plain, read_json, remove_temporaries, write_json, write_text
+from colmap_inertial.io.files import convert_to_plain, read_json, remove_temporaries, write_json, write_text
 from colmap_inertial.model import load_pycolmap
 from colmap_inertial.pipeline.run.config import config_as_toml
 from colmap_inertial.pipeline.run.context import RunContext
@@ -49,7 +49,7 @@ class Session:
         if self.runner.worked or not self.workspace.result.is_file():
             return False
         known = read_json(self.workspace.result)
-        return {**known, "seconds": {}} == as_plain({**content, "seconds": {}})
+        return {**known, "seconds": {}} == convert_to_plain({**content, "seconds": {}})
 
     def finish(self, content: Mapping[str, object]) -> bool:
         """Write ``result.json``, whose presence says that the run is finished; returns whether it stood already."""

@@ -20,7 +20,7 @@ from colmap_inertial.imaging.multi_aperture import (
     rectify,
     require_colours,
 )
-from colmap_inertial.io.aperture_images import ApertureImages
+from colmap_inertial.io.capture_images import ApertureImages
 from colmap_inertial.io.files import path_in
 from colmap_inertial.io.images import read_image
 from colmap_inertial.model import colmap_camera

@@ -19,7 +19,7 @@ from colmap_inertial.core.errors import FormatError, InertialError
 from colmap_inertial.core.gravity import gravity_in_cam
 from colmap_inertial.core.options import ReconstructOptions
 from colmap_inertial.core.types import Frame, PositionFixes
-from colmap_inertial.io.calibration import used_files
+from colmap_inertial.io.calibration import describe_files
 from colmap_inertial.io.capture import Capture, load_capture
 from colmap_inertial.io.files import StrPath, reading_within
 from colmap_inertial.io.frames import picture_folders, read_frames
@@ -205,7 +205,7 @@ def _reconstruct(
     findings: Callable[[Diagnosis], None],
 ) -> ReconstructResult:
     given = _read(path, options, stages)
-    capture, used_calibration = given.capture, used_files(options.calibration)
+    capture, used_calibration = given.capture, describe_files(options.calibration)
     device = mapping_device(options.mapping, deterministic=options.deterministic)
     context = RunContext.of(options, device=device, progress=progress)
     with (

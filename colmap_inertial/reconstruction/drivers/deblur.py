@@ -10,7 +10,7 @@ from colmap_inertial import __version__
 from colmap_inertial.colmap.sparse import check_pair_names
 from colmap_inertial.core.errors import FormatError, InertialError, OutputError, OutputExistsError
 from colmap_inertial.core.options import BlurRemover, ReconstructOptions
-from colmap_inertial.io.calibration import CalibrationFiles, as_paths
+from colmap_inertial.io.calibration import CalibrationFiles, list_paths
 from colmap_inertial.io.capture import load_capture
 from colmap_inertial.io.files import StrPath, read_json, write_json
 from colmap_inertial.io.frames import picture_folders, read_frames
@@ -117,7 +117,7 @@ def deblur_capture(
     timing = with_stated_exposures(loaded, timing)
     check_pair_names(timing.names)
     options = ReconstructOptions(
-        deblur=method, rolling_shutter="rectify" if rectify else "off", calibration=as_paths(calibration)
+        deblur=method, rolling_shutter="rectify" if rectify else "off", calibration=list_paths(calibration)
     )
     imu = corrected_imu(loaded, imu, calibration)
     recording = Recording.of(loaded, imu, timing, prior_calibration(loaded, calibration))

@@ -11,7 +11,7 @@ import numpy as np
 from colmap_inertial.checks.diagnose import Diagnosis, FramesInVideo, Recorded, diagnose, unreadable
 from colmap_inertial.core.errors import FormatError, InertialError, TimingError
 from colmap_inertial.core.types import CameraTrajectory, FrameTiming
-from colmap_inertial.io.calibration import CalibrationFiles, largest_offset_s, read_for_another
+from colmap_inertial.io.calibration import CalibrationFiles, largest_offset_s, read_for_recording
 from colmap_inertial.io.capture import Capture, ImageFolder, load_capture
 from colmap_inertial.io.files import write_json
 from colmap_inertial.io.frames import read_frame_times, read_frame_timing
@@ -113,7 +113,7 @@ def collect(source: ScaleSource, progress: Progress) -> Recorded:
     captures = [load_capture(p) for p in (source.imu, source.frame_times, path) if p is not None and is_capture(p)]
     shared = any(capture.shared_clock for capture in captures)
     calibration = captures[0].calibration if captures else None
-    calibration = read_for_another(source.calibration, shared_clock=shared).camera_imu or calibration
+    calibration = read_for_recording(source.calibration, shared_clock=shared).camera_imu or calibration
     return _recorded(
         reading,
         imu=lambda: read_raw_imu(path if source.imu is None else source.imu),
@@ -180,7 +180,7 @@ def _of_capture(capture: Capture, calibration: CalibrationFiles, progress: Progr
         )
         in_video = reading.attempt(lambda: _find_in_video(capture, known, progress))
     # the readings stay the sensor's own: that is what the checks are about
-    prior = read_for_another(calibration, shared_clock=capture.shared_clock).camera_imu or capture.calibration
+    prior = read_for_recording(calibration, shared_clock=capture.shared_clock).camera_imu or capture.calibration
     return _recorded(
         reading,
         imu=None if capture.imu is None else lambda: read_raw_capture_imu(capture),

@@ -19,9 +19,9 @@ from colmap_inertial.colmap.tsdf import require_mesh_maker
 from colmap_inertial.core.errors import AlreadyMetricError, FormatError, InertialError, OutputError, TimingError
 from colmap_inertial.core.options import ProjectOptions, ReconstructOptions
 from colmap_inertial.core.types import CameraTrajectory, FrameTiming, ReadoutDirection
-from colmap_inertial.io.calibration import calibration_prior, used_files
+from colmap_inertial.io.calibration import calibration_prior, describe_files
 from colmap_inertial.io.capture import Capture, Video, load_capture
-from colmap_inertial.io.exif import stamps_of_exif, stated_exposures_s
+from colmap_inertial.io.exif import read_exposures_s, stamps_of_exif
 from colmap_inertial.io.files import StrPath, path_in, read_record, reading_within, write_record
 from colmap_inertial.io.frame_times import FrameStamps, stamps_of_pattern
 from colmap_inertial.io.frames import read_frame_times, read_frame_timing
@@ -161,7 +161,7 @@ def _reconstruct(
     given = _given(project, source, options)
     capture = given.capture
     raw = checked_imu(given.raw, force=options.force)
-    used = used_files(options.calibration)
+    used = describe_files(options.calibration)
     prior = prior_calibration(capture, options.calibration)
     imu = corrected_imu(capture, raw.imu, options.calibration)
     target = None if capture.target is None else parse_target(capture.target)
@@ -397,7 +397,7 @@ def _times(
     if timing.exposure_s is None and images is not None:
         paths = [path_in(images, name) for name in timing.names]
         if all(path.is_file() for path in paths):
-            timing = dataclasses.replace(timing, exposure_s=stated_exposures_s(paths))
+            timing = dataclasses.replace(timing, exposure_s=read_exposures_s(paths))
     return timing, notes
 
 

@@ -25,10 +25,10 @@ from colmap_inertial.core.types import CameraImuCalibration, CameraTrajectory, I
 from colmap_inertial.inertial.scale import estimate_scale, first_seconds
 from colmap_inertial.io.calibration import (
     CalibrationFiles,
-    as_paths,
+    describe_files,
     largest_offset_s,
-    read_for_another,
-    used_files,
+    list_paths,
+    read_for_recording,
     write_calibration,
 )
 from colmap_inertial.io.capture import load_capture
@@ -119,7 +119,7 @@ def load_source(source: ScaleSource) -> TimedPoses:
     shared = any(capture.shared_clock for capture in captures)
     calibration = captures[0].calibration if captures else None
     of_imu = captures[0].imu_calibration if captures else None
-    files = read_for_another(source.calibration, shared_clock=shared)
+    files = read_for_recording(source.calibration, shared_clock=shared)
     calibration, of_imu = files.camera_imu or calibration, files.imu or of_imu
     if of_imu is not None:
         imu = of_imu.corrected(imu)
@@ -255,7 +255,7 @@ def scale_source(
         Use only the first seconds of the camera's recording, for the alignment too.
     """
     if json is not None:
-        check_output(json, [source.source, source.imu, source.frame_times, *as_paths(source.calibration)])
+        check_output(json, [source.source, source.imu, source.frame_times, *list_paths(source.calibration)])
     recording = load_source(source)
     trajectory = recording.trajectory
     if first_s is not None:
@@ -276,7 +276,7 @@ def scale_source(
 
 def scale_as_json(estimate: ScaleEstimate, calibration: CalibrationFiles = None) -> dict[str, object]:
     """What ``scale --json`` writes: the estimate, and the calibration files that it used."""
-    return {**estimate.as_json(), "calibration_files": used_files(calibration)}
+    return {**estimate.as_json(), "calibration_files": describe_files(calibration)}
 
 
 @dataclass(frozen=True, kw_only=True)

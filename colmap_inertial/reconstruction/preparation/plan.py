@@ -21,7 +21,7 @@ from colmap_inertial.imaging.gate import (
 from colmap_inertial.imaging.parallax import Parallax
 from colmap_inertial.imaging.psf import predicted_blur_px
 from colmap_inertial.io.capture import Capture
-from colmap_inertial.io.exif import stated_exposures_s
+from colmap_inertial.io.exif import read_exposures_s
 from colmap_inertial.io.files import path_in
 from colmap_inertial.model import colmap_camera
 from colmap_inertial.pipeline.run.context import Recording, RunContext
@@ -61,7 +61,7 @@ def with_stated_exposures(capture: Capture, timing: FrameTiming) -> FrameTiming:
     source = capture.image_folder
     if timing.exposure_s is not None or source is None:
         return timing
-    stated = stated_exposures_s([path_in(source, name) for name in timing.names])
+    stated = read_exposures_s([path_in(source, name) for name in timing.names])
     return timing if stated is None else replace(timing, exposure_s=stated)
 
 

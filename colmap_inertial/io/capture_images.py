@@ -1,4 +1,6 @@
-"""The ``[apertures]`` table of a capture.toml: the sub-images of a multi-aperture camera and their calibration.
+"""Tables of a capture.toml for pictures beside the frames: ``[apertures]`` and ``[exposures]``.
+
+The sub-images of a multi-aperture camera and their calibration:
 
 .. code-block:: toml
 
@@ -19,6 +21,25 @@
     camera = "cam1"
     folder = "red"                  # pictures of the same names here; by default the folder of [images]
     rename = ["_1.", "_2."]         # or: the reference's "IMG_0007_1.tif" is "IMG_0007_2.tif" here
+
+A long exposure beside each short one:
+
+.. code-block:: toml
+
+    [images]
+    folder = "short"                # the short exposures; their names and times are the frames'
+    times = "frames.csv"
+
+    [exposures]
+    folder = "long"                 # the long ones: pictures of the same names here, whatever their endings
+    rename = ["_short.", "_long."]  # or: "IMG_7_short.jpg" is "IMG_7_long.jpg" there
+    times = "long.csv"              # columns name,t_s and, best, exposure_s, on the clock of the short ones' times
+    time_unit = "ns"                # of times, where the header does not say
+
+    long_delay_s = 0.012            # or, in place of times: start of the long exposure minus start of the short one
+    long_exposure_s = 0.1           # one for all, where times has no column of it
+    short_iso = 1600                # sensitivities, where the pictures' EXIF does not state them
+    long_iso = 100
 """
 
 from __future__ import annotations
