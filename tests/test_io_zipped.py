@@ -1,0 +1,74 @@
+"""Tables in a zip are those of the folder that it was unpacked to."""
+
+import zipfile
+
+import pytest
+from cases import loop_over
+
+from colmap_inertial.core.errors import FormatError
+from colmap_inertial.io import zipped
+from colmap_inertial.io.zipped import head_of, members_of, text_of
+
+TABLES = {
+    "plain.csv": "t,x\n1,2\n",
+    "bom.csv": "\ufefft,x\n1,2\n",
+    "long.csv": "t" * 400 + "\n" + "1,2\n" * 3000,
+    "umlaut.csv": "größe,µT\n1,2\n",
+}
+
+
+@pytest.fixture
+def both(tmp_path):
+    """The same tables in a folder, and in a zip of it that holds them one folder down."""
+    folder, archive = tmp_path / "folder", tmp_path / "tables.zip"
+    folder.mkdir()
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as opened:
+        for name, text in TABLES.items():
+            (folder / name).write_bytes(text.encode())
+            opened.writestr(f"export/{name}", text.encode())
+    (folder / "notes.txt").touch()
+    return folder, archive
+
+
+def test_a_zip_reads_as_its_folder(both):
+    folder, archive = both
+    assert members_of(folder) == {name: name for name in TABLES}
+    assert members_of(archive) == {name: f"export/{name}" for name in TABLES}
+    for name, text in TABLES.items():
+        whole = text.removeprefix("\ufeff")
+        assert text_of(folder, name) == text_of(archive, f"export/{name}") == whole
+        assert head_of(folder, name).rstrip("\n") == head_of(archive, f"export/{name}") == whole.split("\n")[0]
+
+
+def test_tables_lie_at_the_top_or_one_folder_down(tmp_path):
+    path = tmp_path / "a.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        for name in ("top.csv", "one/down.csv", "two/folders/deep.csv", "one/notes.txt", "csv"):
+            archive.writestr(name, "t\n")
+    assert members_of(path) == {"top.csv": "top.csv", "down.csv": "one/down.csv"}
+    (tmp_path / "no.zip").write_bytes(b"PK no archive")
+    assert members_of(tmp_path / "no.zip") == members_of(tmp_path / "absent.zip") == {}
+
+
+def test_the_head_of_a_table_without_lines_is_its_first_thousand_bytes(tmp_path):
+    path = tmp_path / "a.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a.csv", "x" * 5000)
+    assert head_of(path, "a.csv") == "x" * 1000
+    assert head_of(path, "b.csv") == ""
+
+
+@loop_over("compression", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
+def test_a_table_is_read_up_to_the_limit(tmp_path, compression):
+    path = tmp_path / "a.zip"
+    with zipfile.ZipFile(path, "w", compression) as archive:
+        archive.writestr("a.csv", "t,x\n" * 100)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(zipped, "_LARGEST_MEMBER", 400)
+        assert text_of(path, "a.csv") == "t,x\n" * 100
+        patch.setattr(zipped, "_LARGEST_MEMBER", 399)
+        with pytest.raises(FormatError, match=r"a\.zip: its a\.csv unpacks to more than"):
+            text_of(path, "a.csv")
+    with pytest.raises(FormatError, match=r"its b\.csv cannot be unpacked"):
+        text_of(path, "b.csv")
+    assert zipped._LARGEST_MEMBER == 2**31

@@ -1,0 +1,140 @@
+"""What decides whether a refinement is believed, and what is told of it: against counts and closed forms."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from cases import loop_over
+
+from colmap_inertial.inertial.refine import judge
+
+
+def test_the_size_of_a_path_and_its_derivative():
+    angle = 2 * np.pi * np.arange(12) / 12
+    ring = 3.0 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1) + [5, 6, 7]
+    assert judge.size_of(ring) == pytest.approx(3.0)
+    rng = np.random.default_rng(0)
+    centres, part, step = rng.standard_normal((9, 3)), np.array([2, 3, 5, 8]), 1e-6
+    by = judge._by_log_size(centres, part)
+    for i in range(9):
+        for axis in range(3):
+            sizes = []
+            for sign in (1, -1):
+                moved = centres.copy()
+                moved[i, axis] += sign * step
+                sizes.append(np.log(judge.size_of(moved[part])))
+            assert by[i, axis] == pytest.approx((sizes[0] - sizes[1]) / (2 * step), abs=1e-8)
+    assert not judge._by_log_size(centres, part[:1]).any()
+    assert np.isfinite(judge._by_log_size(np.zeros((3, 3)), np.arange(3))).all()
+
+
+def test_errors_in_pixels_are_roots_of_mean_costs():
+    assert judge._as_px(np.array([1.0, 4.0, 7.0]), 0.5) == pytest.approx(1.0)
+    assert judge._as_px(np.zeros(0), 0.5) == 0.0
+
+
+@loop_over(
+    ("links", "nodes", "expected"),
+    # nine residuals of a link; three velocities of each node that it touches are unknown
+    [(10, 11, 57), (1, 2, 3), (0, 0, 1), (2, 6, 1)],
+)
+def test_what_the_imu_adds_is_counted(links, nodes, expected):
+    flags = [np.arange(20) < count for count in (links, nodes)]
+    inertial = SimpleNamespace(linked=flags[0], touched=flags[1])
+    assert judge._freedom(SimpleNamespace(inertial=inertial)) == expected
+
+
+@loop_over(
+    ("readout", "rolling"),
+    [
+        (None, False),
+        ((1.01e-3, 3e-4), True),
+        ((0.99e-3, 1e-5), False),
+        ((1.0e-3, 1e-5), True),
+        ((-20e-3, 1e-3), True),
+        ((6.1e-3, 2e-3), True),
+        ((5.9e-3, 2e-3), False),
+    ],
+)
+def test_a_readout_is_one_where_it_is_long_and_sure(readout, rolling):
+    words = judge._rolling(readout)
+    assert bool(words) == rolling
+    if rolling:
+        assert f"{1e3 * abs(readout[0]):.1f} +- {1e3 * readout[1]:.1f} ms" in words
+        assert ("from the last line to the first" in words) == (readout[0] < 0)
+
+
+@loop_over(
+    ("alone", "seen", "chi2", "change", "words"),
+    [
+        (True, True, 3.0, -0.1, ""),
+        (True, True, 3.01, -0.1, "contradicts the pictures (3.0 times"),
+        (True, True, 1.0, -0.011, ""),
+        (True, True, 1.0, -0.01, "no better"),
+        (False, True, 1.0, -0.1, "pictures alone"),
+        (True, False, 9.0, -0.1, "the refinement does not come to rest"),
+    ],
+)
+def test_a_refinement_is_doubted(alone, seen, chi2, change, words):
+    solutions = [SimpleNamespace(converged=rests) for rests in (alone, seen)]
+    doubt = judge._doubt(*solutions, chi2, change, 0.01)
+    assert words in doubt and bool(doubt) == bool(words)
+
+
+@loop_over(
+    ("offset_s", "clock_rate", "readout_s", "refused"),
+    # readings reach 50 ms from each of the frames from -20 to 30 s
+    [
+        (0.049, 0.0, 0.0, False),
+        (0.051, 0.0, 0.0, True),
+        (-0.051, 0.0, 0.0, True),
+        (0.039, 0.0, 0.020, False),
+        (0.041, 0.0, 0.020, True),
+        (0.041, 0.0, -0.020, True),
+        (0.019, 1e-3, 0.0, False),
+        (0.021, 1e-3, 0.0, True),
+        (-0.021, 1e-3, 0.0, False),
+        (-0.031, 1e-3, 0.0, True),
+    ],
+)
+def test_clocks_are_too_far_apart_where_readings_do_not_reach(offset_s, clock_rate, readout_s, refused):
+    inertial = SimpleNamespace(
+        nodes_s=np.array([0.0, 80.0, 110.0, 130.0, 500.0]),
+        touched=np.array([False, True, True, True, False]),
+        middle_s=100.0,
+        turning=SimpleNamespace(half_span_s=0.05),
+    )
+    x = SimpleNamespace(offset_s=offset_s, clock_rate=clock_rate, readout_s=readout_s)
+    assert bool(judge._too_late(SimpleNamespace(inertial=inertial), x)) == refused
+
+
+def test_every_tenth_of_points_that_are_seen_often_is_held_out():
+    lengths = np.array([3, 4, 5, 2, 30, 4, 3, 25])
+    first = np.concatenate([[0], np.cumsum(lengths)])
+    point = np.repeat(np.arange(8), lengths)
+    observations = SimpleNamespace(first=first, point=point, frame=np.zeros(len(point)))
+    often = [m for m in range(len(point)) if lengths[point[m]] >= 4]
+    assert np.flatnonzero(judge._chosen(observations)).tolist() == often[5::10]
+
+
+def test_a_sigma_of_the_readout_is_that_of_its_column(monkeypatch):
+    cov = np.diag(np.arange(1.0, 41.0)) * 1e-6
+    monkeypatch.setattr(judge, "factored", lambda problem, x: SimpleNamespace(shared_cov=lambda: cov))
+    found = judge._readout(SimpleNamespace(), SimpleNamespace(readout_s=0.02))
+    assert found == (0.02, pytest.approx(np.sqrt(1e-6 * (judge.READOUT + 1))))
+
+    def singular(problem, x):
+        raise np.linalg.LinAlgError
+
+    monkeypatch.setattr(judge, "factored", singular)
+    assert judge._readout(SimpleNamespace(), SimpleNamespace(readout_s=0.02)) is None
+
+
+def test_noise_that_cannot_be_measured_stays_as_it_was(monkeypatch):
+    def singular(problem, x):
+        raise np.linalg.LinAlgError
+
+    monkeypatch.setattr(judge, "with_measured_noise", singular)
+    monkeypatch.setattr(judge, "_part", lambda problem, keep: problem)
+    problem = SimpleNamespace(inertial=1)
+    assert judge._measured(problem, np.ones(3, dtype=bool), None) is problem

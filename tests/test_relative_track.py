@@ -1,0 +1,228 @@
+"""The relative track and the loops on it: exact data give it exactly; decisions are those of loops over pairs."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_pairing import circle, headings_of, sightings_along, way_along
+
+from colmap_inertial.colmap import loops, relative_track
+from colmap_inertial.colmap.loops import candidates, key_frames, without_contradictions
+from colmap_inertial.colmap.relative_track import DRIFT, RelativeTrack, Sightings, estimate_relative_track, joined
+from colmap_inertial.colmap.two_views import Return
+from colmap_inertial.core.geometry import so3_exp
+
+
+def similarity(found, true):
+    """Scale and offset by which true places become those found, least squares."""
+    a, b = true - true.mean(axis=0), found - found.mean(axis=0)
+    scale = np.sum(a * b) / np.sum(a**2)
+    return scale, found.mean(axis=0) - scale * true.mean(axis=0)
+
+
+@pytest.mark.parametrize("path", ["circle", "line", "stops"])
+def test_exact_rays_give_places_and_points_exactly(path):
+    count = 40
+    along = np.linspace(0, 6, count)
+    centre = {
+        "circle": circle(count),
+        "line": np.stack([along, 0.1 * along, 0 * along], axis=1),
+        "stops": np.stack(
+            [np.interp(along, [0, 2, 3, 5, 6], [0, 2, 2, 4, 3.5]), 0.3 * np.sin(along), 0 * along], axis=1
+        ),
+    }[path]
+    headings = headings_of(np.linspace(0, 360 if path == "circle" else 20, count), 0.5 * np.arange(count))
+    rng = np.random.default_rng(3)
+    points = centre[rng.integers(count, size=1500)] + rng.uniform(-1, 1, (1500, 3)) * [3, 3, 1]
+    seen = sightings_along(centre, headings.start_from_cam, np.random.default_rng(3), noise_rad=0.0)
+    way = estimate_relative_track(seen, count)
+    assert (way.part == 0).all()
+    scale, offset = similarity(way.centre, centre)
+    np.testing.assert_allclose(way.centre, scale * centre + offset, atol=1e-6 * scale)
+    known = np.isfinite(way.points[:, 0])
+    assert known.mean() > 0.15
+    np.testing.assert_allclose(way.points[known], scale * points[: len(way.points)][known] + offset, atol=1e-4 * scale)
+    # the first is the origin, and the length of the first step with parallax is one
+    assert not way.centre[0].any()
+    assert np.abs(np.linalg.norm(way.centre[1:9], axis=1) - 1).min() < 1e-12
+    # points lie where they are seen, not behind
+    away = way.points[seen.point] - way.centre[seen.frame]
+    good = np.isfinite(away[:, 0])
+    assert (np.sum(away[good] * seen.rays[good], axis=1) > 0).all()
+
+
+def test_false_matches_hardly_move_the_track():
+    count = 40
+    headings = headings_of(np.linspace(0, 360, count), 0.5 * np.arange(count))
+    rng = np.random.default_rng(5)
+    seen = sightings_along(circle(count), headings.start_from_cam, rng, noise_rad=5e-4)
+    rays = seen.rays.copy()
+    false = rng.random(len(rays)) < 0.15
+    turned = np.einsum("nij,nj->ni", so3_exp(rng.uniform(-0.3, 0.3, (false.sum(), 3))), rays[false])
+    rays[false] = turned
+    way = estimate_relative_track(replace(seen, rays=rays), count)
+    assert (way.part == 0).all()
+    scale, offset = similarity(way.centre, circle(count))
+    assert np.linalg.norm(way.centre - scale * circle(count) - offset, axis=1).max() < 0.08 * scale
+
+
+def test_what_is_seen_and_how_far_away_it_is():
+    rng = np.random.default_rng(2)
+    frame = np.sort(rng.integers(0, 6, 80))
+    point, feature = rng.integers(0, 30, 80), rng.integers(0, 500, 80)
+    points = rng.standard_normal((30, 3))
+    points[::4] = np.nan
+    sightings = Sightings(frame=frame, point=point, feature=feature, rays=np.zeros((80, 3)))
+    way = RelativeTrack(part=np.zeros(7, int), centre=rng.standard_normal((7, 3)), points=points, sightings=sightings)
+    for k in range(7):
+        rows = [m for m in range(80) if frame[m] == k and point[m] % 4]
+        features, at = way.seen(k)
+        assert features.tolist() == [feature[m] for m in rows]
+        assert np.array_equal(at, points[[point[m] for m in rows]].reshape(-1, 3))
+        far = [np.linalg.norm(points[point[m]] - way.centre[k]) for m in rows]
+        assert way.depth(k) == pytest.approx(np.median(far)) if rows else np.isnan(way.depth(k))
+
+
+@pytest.mark.parametrize("span", [(0, 30), (7, 25), (12, 13), (9, 9)])
+def test_covariances_of_the_track_are_the_scatter_of_tracks_whose_length_walks(span):
+    """Each step is as long as the one before but for a chance factor; a heading's error is there all the way."""
+    i, j = span
+    rng = np.random.default_rng(0)
+    centre = np.cumsum(rng.standard_normal((31, 3)) + np.array([0.5, 0, 0]), axis=0)
+    steps = np.diff(centre[i : j + 1], axis=0)
+    way = way_along(centre)
+    found = way.covariance(np.array([i]), np.array([j]), np.zeros(1))[0]
+    factors = np.cumsum(DRIFT * rng.standard_normal((60_000, len(steps))), axis=1)
+    off = factors @ steps
+    np.testing.assert_allclose(found, off.T @ off / 60_000, atol=0.03 * np.trace(found) + 1e-12)
+    # by so much is what is left at each frame turned, in any direction
+    left = centre[j] - centre[i : j + 1]
+    turned = way.covariance(np.array([i]), np.array([j]), np.array([0.3]))[0] - found
+    np.testing.assert_allclose(turned, 0.3**2 * np.mean(np.sum(left**2, axis=1)) * np.eye(3), atol=1e-10)
+
+
+@pytest.mark.parametrize("most", [800, 3])
+def test_points_of_matches_are_those_of_a_search_through_all_of_them(monkeypatch, most):
+    monkeypatch.setattr(relative_track, "_MOST_SIGHTINGS", most)
+    rng = np.random.default_rng(9)
+    # feature of 60 things in each of 6 frames; some matches of neighbours are false
+    features = [60, 61, 62, 63, 64, 65]
+    feature_of = [rng.permutation(count)[:60] for count in features]
+    seen = rng.random((6, 60)) < 0.7
+    matches = []
+    for i in range(6):
+        for j in range(i + 1, 6):
+            both = np.flatnonzero(seen[i] & seen[j] & (rng.random(60) < 0.6))
+            pairs = np.stack([feature_of[i][both], feature_of[j][both]], axis=1)
+            matches.append((i, j, np.concatenate([pairs, rng.integers(0, 60, (int(j == i + 1), 2))])))
+    group = {(k, f): {(k, f)} for k in range(6) for f in range(features[k])}
+    for i, j, pairs in matches:
+        for a, b in pairs.tolist():
+            both = group[i, a] | group[j, b]
+            for member in both:
+                group[member] = both
+    groups = {frozenset(one) for one in group.values()}
+    expected = {one for one in groups if len(one) >= 3 and len({k for k, _ in one}) == len(one)}
+    frame, feature, point = joined(features, matches)
+    assert np.all(np.diff(frame) >= 0) and set(point.tolist()) == set(range(int(point.max()) + 1))
+    of_point = [np.flatnonzero(point == p) for p in range(int(point.max()) + 1)]
+    found = {frozenset(zip(frame[mine].tolist(), feature[mine].tolist(), strict=True)) for mine in of_point}
+    every = -(-sum(map(len, expected)) // (most * 6))
+    assert found <= expected and len(found) == -(-len(expected) // max(1, every))
+    assert len(expected) > 5 and (most > 3 or len(frame) < sum(map(len, expected)))
+
+
+def test_key_frames_and_candidates_are_those_of_a_loop():
+    rng = np.random.default_rng(1)
+    for spacing_s in (0.3, 0.97, 5.0):
+        t_s = np.cumsum(rng.uniform(0.5, 1.5, 300) * spacing_s)
+        kept = [0]
+        for i in range(1, 300):
+            if t_s[i] - t_s[kept[-1]] >= 0.95:
+                kept.append(i)
+        assert key_frames(t_s).tolist() == kept
+    i, j = np.triu_indices(12, 1)
+    votes = rng.permutation(len(i))
+    best = set()
+    for frame in range(12):
+        mine = sorted((m for m in range(len(i)) if frame in (i[m], j[m])), key=lambda m: -votes[m])
+        best |= set(mine[:3])
+    assert set(np.flatnonzero(candidates(votes, i, j)).tolist()) == {m for m in best if votes[m] >= 6}
+
+
+def test_pairs_beside_a_pair_are_its_neighbours_in_both():
+    assert loops._beside((10, 30), 2, 100, 10) == {
+        (8, 28), (8, 30), (8, 32), (10, 28), (10, 32), (12, 28), (12, 30), (12, 32)
+    }  # fmt: skip
+    assert loops._beside((0, 11), 1, 13, 11) == {(0, 12), (1, 12)}
+
+
+def scalar_contradictions(found, headings, way, nearest):
+    """The same decision, loop by loop, from what each of two says of where the other one's late frame is."""
+
+    def leg(i, j):
+        first, last = (np.array([k]) for k in (min(i, j), max(i, j)))
+        return way.centre[j] - way.centre[i], way.covariance(first, last, headings.sigma_rad(first, last))[0]
+
+    def contradict(a, b):
+        (i, j), (k, m) = a, b
+        one, other = found[a], found[b]
+        (early, early_cov), (late, late_cov) = leg(i, k), leg(j, m)
+        # from i to m by one loop and the way, and by the way and the other loop
+        off = (one.step + one.ratio * late) - (early + other.step)
+        place = (0.1 * one.depth) ** 2 + (0.1 * other.depth) ** 2 + (0.1 * np.linalg.norm(late)) ** 2
+        cov = early_cov + one.ratio**2 * late_cov + place * np.eye(3)
+        return off @ np.linalg.inv(cov) @ off > 16.3
+
+    pairs = sorted(found)
+    near = {p: {q for q in pairs if max(abs(p[0] - q[0]), abs(p[1] - q[1])) <= nearest} for p in pairs}
+    against = {p: set() for p in pairs}
+    for a, p in enumerate(pairs):
+        for q in pairs[a + 1 :]:
+            if q in near[p] and contradict(p, q):
+                against[p].add(q)
+                against[q].add(p)
+    behind = {p: sum(found[q].matches for q in near[p] - against[p]) for p in pairs}
+    return {p for p in pairs if behind[p] >= 2 * max([behind[q] for q in against[p]], default=0)}
+
+
+def test_contradictions_are_those_of_a_loop_over_pairs():
+    rng = np.random.default_rng(12)
+    headings, way = headings_of(np.linspace(0, 360, 40), np.arange(40.0)), way_along(circle())
+    kept = refused = 0
+    for _ in range(60):
+        found = {}
+        for _ in range(int(rng.integers(2, 8))):
+            i, j = int(rng.integers(0, 12)), int(rng.integers(24, 40))
+            wrong = rng.standard_normal(3) * rng.choice([0.02, 0.3, 1.0])
+            found[i, j] = Return(
+                step=way.centre[j] - way.centre[i] + wrong,
+                start_from_second=headings.start_from_cam[j],
+                ratio=float(np.exp(0.1 * rng.standard_normal())),
+                depth=float(rng.uniform(0.5, 2)),
+                matches=int(rng.integers(20, 200)),
+            )
+        expected = scalar_contradictions(found, headings, way, 10)
+        assert without_contradictions(found, headings, way, 10) == expected
+        kept, refused = kept + len(expected), refused + len(found) - len(expected)
+    assert kept > 30 and refused > 30
+
+
+def test_frames_are_surely_apart_where_the_way_between_them_is_longer_than_what_they_see():
+    """Each frame sees one point a metre away; at two metres and three standard deviations nothing is in common."""
+    count = 300
+    centre = np.stack([np.linspace(0, 8, count), np.zeros(count), np.zeros(count)], axis=1)
+    one = np.arange(count)
+    sightings = Sightings(frame=one, point=one, feature=one, rays=np.zeros((count, 3)))
+    points = centre + np.array([0.0, 0.6, 0.8])
+    way = RelativeTrack(part=np.zeros(count, dtype=int), centre=centre, points=points, sightings=sightings)
+    headings = headings_of(np.linspace(0, 5, count), 0.1 * np.arange(count))
+    i, j = np.triu_indices(count, 1)
+    apart = loops._away(headings, way, i, j)
+    cov = way.covariance(i, j, headings.sigma_rad(i, j))
+    margin = np.abs(centre[j, 0] - centre[i, 0]) - 2.0 - 3 * np.sqrt(np.einsum("maa->m", cov))
+    assert np.array_equal(apart, margin > 0) and 0.1 < apart.mean() < 0.9
+    # of another part nothing is known
+    split = replace(way, part=(one > count // 2).astype(int))
+    other = (i <= count // 2) & (j > count // 2)
+    assert not loops._away(headings, split, i[other], j[other]).any()
