@@ -115,7 +115,7 @@ class Trial:
             done = self._pytest(tests)
         except subprocess.TimeoutExpired:
             return "caught", f"tests run for more than {_LONGEST_S} s"
-        failed = re.search(r"^(?:FAILED|ERROR) \S*?(tests/.+?)(?: - .*)?$", done.stdout, re.MULTILINE)
+        failed = re.search(r"^(?:FAILED|ERROR) \S*?(tests/test_.+?)(?: - .*)?$", done.stdout, re.MULTILINE)
         if failed is not None:
             sound = "::" not in failed[1] or self._passes(failed[1])
             return ("caught", failed[1]) if sound else ("broken", f"{failed[1]} fails without the fault")

@@ -256,7 +256,9 @@ class Tests:
 
     def of(self, fault: Fault) -> tuple[list[str], list[str]]:
         """The quickest tests that run a fault's line, and the files that all of these are from."""
-        contexts = self._lines.get(fault.file, {}).get(str(fault.line), [])
+        lines = self._lines.get(fault.file, {})
+        # what runs when the module is imported, such as a default, is of every test that runs anything of the module
+        contexts = lines.get(str(fault.line)) or sorted(set().union(*lines.values()))
         names = {re.sub(r"\[.*", "", name, flags=re.DOTALL) for name in contexts}
         quickest = sorted(names, key=lambda name: self._seconds.get(name, 10.0))[:MOST_TESTS]
         files, left_s = [], MOST_FILES_S

@@ -9,7 +9,7 @@ from test_pairing import circle, headings_of, sightings_along, way_along
 from colmap_inertial.colmap import loops, relative_track
 from colmap_inertial.colmap.loops import candidates, key_frames, without_contradictions
 from colmap_inertial.colmap.relative_track import DRIFT, RelativeTrack, Sightings, estimate_relative_track, joined
-from colmap_inertial.colmap.two_views import Return
+from colmap_inertial.colmap.two_views import Return, TwoViews
 from colmap_inertial.core.geometry import so3_exp
 
 
@@ -226,3 +226,41 @@ def test_frames_are_surely_apart_where_the_way_between_them_is_longer_than_what_
     split = replace(way, part=(one > count // 2).astype(int))
     other = (i <= count // 2) & (j > count // 2)
     assert not loops._away(headings, split, i[other], j[other]).any()
+
+
+def test_loops_are_judged_as_one_by_one(monkeypatch):
+    """Place against the way, length against its walk, rotation against the gyroscope."""
+    rng = np.random.default_rng(21)
+    headings, way = headings_of(np.linspace(0, 360, 40), np.arange(40.0)), way_along(circle())
+    pairs = [(i, j) for i in range(10) for j in range(25, 40)]
+    told, expected = {}, set()
+    for i, j in pairs:
+        _, cov = loops._between(way, headings, np.array([i]), np.array([j]))
+        depth = float(rng.uniform(0.3, 2.0))
+        total = cov[0] + (0.1 * depth) ** 2 * np.eye(3)
+        off = np.linalg.cholesky(total) @ (rng.uniform(0.2, 2.4) * rng.standard_normal(3))
+        longer = rng.uniform(0.0, 1.5) * np.sqrt(DRIFT**2 * (j - i) + 0.1**2) * np.sqrt(10.8)
+        turned = headings.start_from_cam[j] @ so3_exp(np.array([0.0, 0.6 if rng.random() < 0.2 else 0.0, 0.0]))
+        told[i, j] = Return(
+            step=way.centre[j] - way.centre[i] - off,
+            start_from_second=turned,
+            ratio=float(np.exp(longer * rng.choice([-1, 1]))),
+            depth=depth,
+            matches=50,
+        )
+        fits = off @ np.linalg.inv(total) @ off < 16.3 and longer**2 / (DRIFT**2 * (j - i) + 0.1**2) < 10.8
+        if fits and np.array_equal(turned, headings.start_from_cam[j] @ so3_exp(np.zeros(3))):
+            expected.add((i, j))
+    # COLMAP verified all but every seventh; every fifth covers too little
+    verified = np.arange(len(pairs)) % 7 > 0
+    covered = np.where(np.arange(len(pairs)) % 5 > 0, 0.5, 0.49)
+    i, j = np.array(pairs).T
+    rotations = np.swapaxes(headings.start_from_cam[i], 1, 2) @ headings.start_from_cam[j]
+    rotations[~verified] = np.nan
+    views = TwoViews(first_from_second=rotations, covered=covered)
+    monkeypatch.setattr(loops, "compare", lambda database, names: views)
+    monkeypatch.setattr(loops, "returns", lambda database, names, some, way: [told[pair] for pair in some])
+    sound, found = loops._judged(None, [f"{k}" for k in range(40)], headings, way, pairs)
+    assert sound == {pair for pair, good in zip(pairs, verified, strict=True) if good}
+    looked_at = {pair for pair, good in zip(pairs, verified & (covered >= 0.5), strict=True) if good}
+    assert set(found) == expected & looked_at and len(found) > 20 and len(looked_at - expected) > 20
