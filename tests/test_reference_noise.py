@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from test_validate_lengths import validated
 
+from colmap_inertial.core.errors import FormatError
 from colmap_inertial.core.options import ReferenceOptions
 from colmap_inertial.reconstruction.drivers import reference
 from colmap_inertial.reconstruction.drivers.reference import _by_distance, _by_target
@@ -68,3 +69,26 @@ def test_the_interval_that_is_written_has_that_width(tmp_path, monkeypatch, chec
     low, high = found.ci95
     assert low < 0.5 < high and low * high == pytest.approx(0.25) and high / low == pytest.approx(0.52 / 0.48)
     assert any("+1.2 % off" in note for note in found.notes) == told
+
+
+def test_a_target_needs_the_project_s_pictures(tmp_path, monkeypatch):
+    monkeypatch.setattr(reference, "only_model", lambda folder: folder)
+    options = ReferenceOptions(scale_from="target", target="aruco:DICT_4X4_50:0.1")
+    with pytest.raises(FormatError, match=r"images.*give the project's images with --images DIR"):
+        reference.scale_project_by(tmp_path, tmp_path / "out", options)
+
+
+def test_the_model_lies_in_sparse_or_is_the_folder_itself(tmp_path, monkeypatch):
+    asked = []
+
+    def look(folder):
+        asked.append(folder)
+        raise FormatError(folder, "seen")
+
+    monkeypatch.setattr(reference, "only_model", look)
+    known = ReferenceOptions(scale_from="distance", between=("1,2,3", "4,6,3"), distance="2.0+-0.03")
+    for _ in range(2):
+        with pytest.raises(FormatError, match="seen"):
+            reference.scale_project_by(tmp_path, tmp_path / "out", known)
+        (tmp_path / "sparse").mkdir(exist_ok=True)
+    assert asked == [tmp_path, tmp_path / "sparse"]
