@@ -1,11 +1,13 @@
 """Covariances across a gap, against derivatives of how two submodels lie, by finite differences."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from colmap_inertial.core.geometry import so3_exp, so3_log
+from colmap_inertial.core.geometry import matrix_from_quat, quat_from_matrix, so3_exp, so3_log
+from colmap_inertial.inertial.join import joined_model
 from colmap_inertial.inertial.join.judge import Ends, relative_cov, worst
 from colmap_inertial.inertial.join.placement import Placed
 from colmap_inertial.inertial.join.values import ImuLink
@@ -114,3 +116,104 @@ def test_the_worst_direction_is_the_largest_of_many():
     for found, part in zip(worst(cov), (slice(3, 6), slice(0, 3)), strict=True):
         most = np.sqrt(np.einsum("ni,ij,nj->n", directions, cov[part, part], directions).max())
         assert most <= found * (1 + 1e-12) and found == pytest.approx(most, rel=2e-3)
+
+
+def changed(placed, change):
+    """The same submodels, moved a little."""
+    before, steps = placed.places, change.reshape(3, 7)
+    places = Placements.at_origin(before.scale * np.exp(steps[:, 0]), 21)
+    places.rotation[:] = so3_exp(steps[:, 1:4]) @ before.rotation
+    places.translation[:] = before.translation + steps[:, 4:]
+    return replace(placed, places=places)
+
+
+def parameters(similarity, reference):
+    """(7,) from one similarity to another: logarithm of scale, rotation, translation."""
+    turn = matrix_from_quat(similarity.rotation_xyzw) @ matrix_from_quat(reference.rotation_xyzw).T
+    log_scale = np.log(similarity.scale / reference.scale)
+    return np.concatenate([[log_scale], so3_log(turn), similarity.translation_m - reference.translation_m])
+
+
+def apply(similarity, points):
+    return similarity.scale * points @ matrix_from_quat(similarity.rotation_xyzw).T + similarity.translation_m
+
+
+@pytest.mark.parametrize("world", ["y-down", "z-up"])
+def test_the_similarity_of_a_submodel_moves_its_points_and_is_as_sure_as_where_it_lies(world):
+    placed, points, _ = placements()
+    placed = replace(placed, gravity_m_s2=np.array([3.0, -7.0, 6.0]))
+    moves = [joined_model._metric_move(placed, k, world) for k in range(3)]
+    # the world is turned upright, and what was the first one's origin stays
+    apart = np.array([apply(moves[k], points) for k in range(3)])
+    before = np.array([placed.points(k, points) for k in range(3)])
+    up = matrix_from_quat(moves[0].rotation_xyzw) @ placed.places.rotation[0].T
+    np.testing.assert_allclose(apart, before @ up.T + placed.origins[0], atol=1e-9)
+    down = up @ placed.gravity_m_s2 / np.linalg.norm(placed.gravity_m_s2)
+    np.testing.assert_allclose(down, [0, 1, 0] if world == "y-down" else [0, 0, -1], atol=1e-9)
+    for k in range(3):
+        by = np.zeros((7, 7))
+        for column in range(7):
+            ends = []
+            for sign in (1, -1):
+                change = np.zeros(21)
+                change[7 * k + column] = sign * 1e-6
+                ends.append(parameters(joined_model._metric_move(changed(placed, change), k, world), moves[k]))
+            by[:, column] = (ends[0] - ends[1]) / 2e-6
+        own = slice(7 * k, 7 * k + 7)
+        expected_cov = placed.inflation * by @ placed.cov[own, own] @ by.T
+        found = joined_model._similarity_cov(placed, k, moves[k])
+        assert found == pytest.approx(expected_cov, rel=1e-6, abs=1e-12)
+
+
+def test_a_similarity_after_another_is_both_in_turn():
+    placed, points, _ = placements()
+    placed = replace(placed, gravity_m_s2=np.array([3.0, -7.0, 6.0]))
+    first, then = (joined_model._metric_move(placed, k, "z-up") for k in (1, 2))
+    both = joined_model._after(then, SimpleNamespace(similarity=first))
+    np.testing.assert_allclose(apply(both, points), apply(then, apply(first, points)), atol=1e-9)
+
+
+def test_a_longer_metre_and_a_turned_world_move_a_similarity():
+    """Of a similarity, after the whole world was scaled and turned about its origin."""
+    placed, _, _ = placements()
+    placed = replace(placed, gravity_m_s2=np.array([3.0, -7.0, 6.0]))
+    move = joined_model._metric_move(placed, 1, "z-up")
+
+    def of(change):
+        scale, turn = np.exp(change[0]), so3_exp(change[1:])
+        whole = replace(
+            move,
+            scale=scale * move.scale,
+            rotation_xyzw=quat_from_matrix(turn @ matrix_from_quat(move.rotation_xyzw)),
+            translation_m=scale * turn @ move.translation_m,
+        )
+        return parameters(whole, move)
+
+    assert joined_model._by_world(move.translation_m) == pytest.approx(slopes(of, 4), abs=1e-7)
+
+
+def test_a_scale_s_standard_deviation_becomes_what_is_known_and_never_larger():
+    root = np.random.default_rng(5).standard_normal((7, 7))
+    cov = root @ root.T
+    before = np.sqrt(np.diagonal(cov))
+    narrower = joined_model._with_scale(cov, 0.5 * before[0])
+    np.testing.assert_allclose(np.sqrt(np.diagonal(narrower)), before * [0.5, 1, 1, 1, 1, 1, 1])
+    # correlations stay
+    np.testing.assert_allclose(
+        narrower / np.sqrt(np.outer(np.diagonal(narrower), np.diagonal(narrower))), cov / np.outer(before, before)
+    )
+    np.testing.assert_array_equal(joined_model._with_scale(cov, 2 * before[0]), cov)
+    assert not joined_model._with_scale(np.zeros((7, 7)), 1.0).any()
+
+
+def test_what_the_fit_does_not_say_of_a_scale_stays_when_it_is_joined():
+    placed, _, _ = placements()
+    of_fit, whole = 4e-4, 9e-4
+    model = SimpleNamespace(scale=SimpleNamespace(sigma_log=whole**0.5))
+    submodel = SimpleNamespace(path=SimpleNamespace(scale=(1.0, of_fit)))
+    for variance, left in ((1e-4, 1.7e-4), (3e-4, of_fit)):
+        cov = placed.cov.copy()
+        cov[7, 7] = variance
+        sigma = joined_model._sigma_log(model, submodel, replace(placed, cov=cov), 1)
+        assert sigma**2 == pytest.approx(left + whole - of_fit)
+    assert joined_model._unmodelled_variance(model, SimpleNamespace(path=SimpleNamespace(scale=(1.0, 1e-3)))) == 0
