@@ -9,7 +9,7 @@ from scipy import stats
 
 from colmap_inertial.core.geometry import so3_exp, so3_log
 from colmap_inertial.inertial.core.priors import PRIORS
-from colmap_inertial.inertial.join import evidence
+from colmap_inertial.inertial.join import evidence, judge
 from colmap_inertial.inertial.join.evidence import chi2_limit, clocks_differ, mounting_differs, overlaps, times_counted
 from colmap_inertial.inertial.join.values import ImuLink
 from colmap_inertial.inertial.scale import posterior as post
@@ -126,3 +126,13 @@ def test_pairs_that_cannot_be_one_model(shared, cameras, agree, why):
     constraints = [SimpleNamespace(first=0, second=1)] if agree else []
     found = evidence.incompatible_pairs(both, constraints)
     assert (why is None and found == {}) or why in found[0, 1]
+
+
+@loop_over(
+    ("sigma_m", "sigma_deg", "words"),
+    [(0.1, 1.0, ""), (0.1001, 1.0, "--join-options.sigma-m"), (0.1, 1.001, "--join-options.sigma-deg")],
+)
+def test_a_gap_is_closed_up_to_the_limits(sigma_m, sigma_deg, words):
+    gap = SimpleNamespace(sigma_m=sigma_m, sigma_deg=sigma_deg)
+    found = judge._unsure(gap, SimpleNamespace(sigma_m=0.1, sigma_deg=1.0))
+    assert words in found and bool(found) == bool(words)

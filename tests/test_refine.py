@@ -397,6 +397,35 @@ def test_standard_deviations_of_the_calibration_are_honest(small):
     assert abs(x.offset_s) < 3e-4
 
 
+@pytest.mark.parametrize("share", [1e-3, -1e-3])
+def test_what_a_small_step_promises_is_what_it_gives(small, share):
+    """A gain of the whole cost, robust and with all priors, by the linear model of the solver."""
+    _, problem, start, _ = small
+    at = _evaluate(problem, nudged(start, np.random.default_rng(11), 3e-4), problem.observations)
+    by, residual = _weighted(problem, at)
+    order = Order.of(problem.observations, len(start.velocity_m_s))
+    system = solver._built(problem, order, at, by, residual, 1e-4)
+    step = tuple(share * part for part in solver._step(system, problem.observations, by))
+    promised = solver._promised(problem, at, by, residual, step, problem.observations)
+    gained = at.cost - _evaluate(problem, at.estimate.moved(*step), problem.observations).cost
+    assert np.sign(promised) == np.sign(share) and gained == pytest.approx(promised, rel=0.01)
+
+
+@pytest.mark.parametrize("robust_px", [0.5, 3.0])
+def test_weights_are_the_slope_of_the_robust_cost(robust_px):
+    residual = np.random.default_rng(1).normal(0, 2.0, (40, 2))
+    costs, step = solver.robust_cost(residual, 0.4, robust_px), 1e-6
+    for axis in range(2):
+        ends = [solver.robust_cost(residual + sign * step * np.eye(2)[axis], 0.4, robust_px) for sign in (1, -1)]
+        weight = 1 / 0.4**2 / (1 + np.sum(residual**2, axis=1) / robust_px**2)
+        np.testing.assert_allclose((ends[0] - ends[1]) / (2 * step), weight * residual[:, axis], rtol=1e-6, atol=1e-8)
+    # of small residuals, half squares over variances
+    small = 1e-4 * residual
+    squares = 0.5 * np.sum(small**2, axis=1) / 0.4**2
+    np.testing.assert_allclose(solver.robust_cost(small, 0.4, robust_px), squares, rtol=1e-5)
+    assert (costs < 0.5 * np.sum(residual**2, axis=1) / 0.4**2).all()
+
+
 def test_known_numbers_stay_where_they_are(small):
     tracks, _, _, _ = small
     options = walk(4.0, readout_s=tracks.timing.readout_s or 0.0, points_per_m=100.0)

@@ -7,7 +7,15 @@ import pytest
 from sweep_scenes import camera, depth_view, sights_of
 from test_sweep import AROUND, REFERENCE
 
-from colmap_inertial.imaging.plane_sweep import DepthView, Sights, choose_partners, confirm_depth, depth, depth_range
+from colmap_inertial.imaging.plane_sweep import (
+    DepthView,
+    Sights,
+    choose_partners,
+    confirm_depth,
+    depth,
+    depth_range,
+    estimate_normals,
+)
 from colmap_inertial.imaging.plane_sweep.tiles import cut_tiles
 
 
@@ -170,3 +178,54 @@ def test_a_depth_in_the_plane_of_a_camera_is_confirmed_by_none():
     beside = camera((0.5, 2.0, 0.0))
     flat = DepthView(depth=np.full_like(level.depth, 2.0), camera=view)
     assert not confirm_depth(flat, [depth_view(beside)]).any()
+
+
+def plane_normal(depth, view, x, y):
+    """By least squares over the window's inverse depths, one pixel by itself."""
+    height, width = depth.shape
+    inverse = np.where(depth > 0, 1 / np.where(depth > 0, depth, 1), 0)
+    if depth[y, x] <= 0:
+        return np.zeros(3)
+    # the median over 5 x 5, edges repeated, unless it is of another surface
+    rows, columns = (np.clip(np.arange(at - 2, at + 3), 0, size - 1) for at, size in ((y, height), (x, width)))
+    middle = np.median(inverse[np.ix_(rows, columns)])
+    middle = inverse[y, x] if abs(middle - inverse[y, x]) > 0.03 * inverse[y, x] else middle
+    (fx, fy), (cx, cy) = view.focal_px, view.centre_px
+    table, values = [], []
+    for j in range(max(0, y - 3), min(height, y + 4)):
+        for i in range(max(0, x - 3), min(width, x + 4)):
+            if abs(inverse[j, i] - middle) <= 0.03 * middle:
+                # inverse depth is n (ray) / d
+                table.append(
+                    [(i - view.centre_px[0]) / view.focal_px[0], (j - view.centre_px[1]) / view.focal_px[1], 1]
+                )
+                values.append(inverse[j, i])
+    table = np.array(table).reshape(-1, 3)
+    own = np.array([(x - cx) / fx, (y - cy) / fy, 1.0])
+    flat = len(values) >= 6 and np.linalg.matrix_rank(table) == 3
+    normal = np.linalg.lstsq(table, np.array(values), rcond=None)[0] if flat else own
+    return -normal / np.linalg.norm(normal)
+
+
+def test_normals_are_those_of_least_squares_pixel_by_pixel():
+    view = camera((0.1, -0.4, 0.3), (0, 25, 10), width=34, height=26, focal=(33.0, 30.0))
+    rng = np.random.default_rng(9)
+    shown = depth_view(view).depth
+    shown *= np.exp(rng.normal(0, 0.004, shown.shape)).astype("f4")
+    # holes, and a step that no plane reaches over
+    shown[rng.random(shown.shape) < 0.15] = 0
+    shown[:, 20:] *= 1.3
+    found = estimate_normals(shown, view)
+    expected = np.array([[plane_normal(shown, view, x, y) for x in range(34)] for y in range(26)])
+    off = np.linalg.norm(found - expected, axis=-1)
+    # single precision decides otherwise about a neighbour at the threshold
+    assert np.mean(off < 2e-3) > 0.97
+    assert np.array_equal(np.any(found != 0, axis=-1), shown > 0)
+
+
+def test_alone_a_pixel_faces_the_camera():
+    view = camera((0, 0, 0), width=34, height=26, focal=(33.0, 30.0))
+    depth = np.zeros((26, 34), dtype="f4")
+    depth[4, 30] = 2.0
+    ray = np.array([(30 - view.centre_px[0]) / 33.0, (4 - view.centre_px[1]) / 30.0, 1.0])
+    np.testing.assert_allclose(estimate_normals(depth, view)[4, 30], -ray / np.linalg.norm(ray), atol=1e-6)
