@@ -4,10 +4,10 @@ import zipfile
 
 import pytest
 from cases import loop_over
+from colmap_inertial.io.zipped import head_of, members_of, text_of
 
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.io import zipped
-from colmap_inertial.io.zipped import head_of, members_of, text_of
 
 TABLES = {
     "plain.csv": "t,x\n1,2\n",
