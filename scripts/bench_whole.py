@@ -30,6 +30,7 @@ COLMAP's; ``bare`` COLMAP's incremental one with its own settings, in one go. Fe
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import resource
 import shutil
@@ -327,9 +328,7 @@ def loop_errors(walk: Walk, folder: Path) -> dict[str, Figures]:
             database,
             folder / "frames",
             models,
-            options,
-            refine_intrinsics=False,
-            num_images=len(names),
+            dataclasses.replace(options, refine_intrinsics=False),
             context=context,
             in_time=names,
         )
@@ -396,9 +395,7 @@ def map_by(mapper: str, folder: Path) -> Figures:
             folder / "database.db",
             folder / "frames",
             models,
-            MappingOptions(mapper="global" if mapper == "global" else "incremental"),
-            refine_intrinsics=False,
-            num_images=len(truth),
+            MappingOptions(mapper="global" if mapper == "global" else "incremental", refine_intrinsics=False),
             context=RunContext(scratch=folder, num_threads=1),
             in_time=list(truth),
         )

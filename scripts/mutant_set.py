@@ -1607,7 +1607,7 @@ MUTANTS = (
         ("swept::test_a_sweep_that_was_cut_off_goes_on",),
     ),
     Mutant(
-        "colmap/fusion.py",
+        "colmap/depth_maps.py",
         "[fx, fy, *opencv_px_from_colmap(np.array([cx, cy]))]",
         "[fx, fy, cx, cy]",
         "fused points are half a pixel aside",
@@ -1740,14 +1740,14 @@ MUTANTS = (
         ("pairing",),
     ),
     Mutant(
-        "colmap/gyro_bias.py",
+        "colmap/gyro_orientations.py",
         "so3_exp(-(lever @ change))",
         "so3_exp(lever @ change)",
         "sign of the bias that matches tell",
         ("pairing",),
     ),
     Mutant(
-        "colmap/gyro_bias.py",
+        "colmap/gyro_orientations.py",
         '"abc,mcd->mabd"',
         '"abc,mdc->mabd"',
         "matches are turned the other way round",
@@ -1761,7 +1761,7 @@ MUTANTS = (
         ("flow",),
     ),
     Mutant(
-        "colmap/covisibility.py",
+        "colmap/two_views.py",
         "angle < _RATIO * next_angle",
         "angle < next_angle",
         "any nearest descriptor votes",
@@ -1783,7 +1783,7 @@ MUTANTS = (
     ),
     Mutant(
         "colmap/loops.py",
-        "len(beside[pair] & believed) >= _LEAST_WITNESSES",
+        "len(beside[pair] & consistent) >= _LEAST_WITNESSES",
         "len(beside[pair] & believed) >= 0",
         "a chance match closes a loop",
         ("pairing",),
@@ -1804,8 +1804,8 @@ MUTANTS = (
     ),
     Mutant(
         "colmap/relative_track.py",
-        "DRIFT**2 * left",
-        "DRIFT * left",
+        "DRIFT**2 * remaining",
+        "DRIFT * remaining",
         "how fast the way's length drifts",
         ("pairing",),
     ),

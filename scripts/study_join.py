@@ -38,9 +38,8 @@ from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, so3_log
 from colmap_inertial.core.options import JoinOptions, ScaleOptions
 from colmap_inertial.core.types import ImuRecording
 from colmap_inertial.inertial.join.evidence import find_links
-from colmap_inertial.inertial.join.judge import Ends, join_submodels
-from colmap_inertial.inertial.join.placement import Placed
-from colmap_inertial.inertial.join.values import FittedSubmodel
+from colmap_inertial.inertial.join.judge import end_images, join_submodels, tie_cov
+from colmap_inertial.inertial.join.placement import FittedSubmodel, ImuLink, Placed
 from colmap_inertial.inertial.scale.posterior import FittedPath
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.io.trajectories import read_inertial_scale
@@ -137,19 +136,19 @@ def judged(
             members = [fitted[k] for k in group.members]
             for link in find_links(members):
                 if (members[link.first].number, members[link.second].number) == (gap.first, gap.second):
-                    one |= error_across(members, group.placed, Ends.of(members, link), truth)
+                    one |= error_across(members, group.placed, link, truth)
     return out
 
 
 def error_across(
     parts: list[FittedSubmodel],
     placed: Placed,
-    ends: Ends,
+    link: ImuLink,
     truth: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
 ) -> dict[str, Any]:
     """Of the first image after a gap as seen from the last one before it."""
     poses = []
-    for k, image in zip(ends.pair, ends.images, strict=True):
+    for k, image in zip((link.first, link.second), end_images(parts, link), strict=True):
         part = parts[k]
         at = placed.points(k, part.trajectory.cam_in_world[image : image + 1])[0]
         poses.append((placed.places.rotation[k] @ part.world_from_cam[image], at, float(part.trajectory.t_s[image])))
@@ -157,7 +156,7 @@ def error_across(
     turn = poses[0][0].T @ poses[1][0] @ (true[0].T @ true[1]).T
     away = poses[0][0].T @ (poses[1][1] - poses[0][1]) - true[0].T @ (centres[1] - centres[0])
     error = np.concatenate([poses[0][0] @ so3_log(turn), poses[0][0] @ away])
-    cov = ends.cov(parts, placed)
+    cov = tie_cov(parts, placed, link)
     inside = [
         bool(error[part] @ np.linalg.solve(cov[part, part], error[part]) < CHI2_95)
         for part in (slice(3, 6), slice(0, 3))

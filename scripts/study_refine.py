@@ -96,14 +96,11 @@ def by_mapper(tracks: Tracks, xy_px: np.ndarray) -> pycolmap.Reconstruction:
         database, sparse = Path(folder) / "database.db", Path(folder) / "sparse"
         tracks.write_database(database, xy_px)
         context = RunContext(scratch=Path(folder), num_threads=1)
-        count = len(tracks.timing.names)
         map_images(
             database,
             Path(folder),
             sparse,
-            MappingOptions(),
-            refine_intrinsics=False,
-            num_images=count,
+            MappingOptions(refine_intrinsics=False),
             context=context,
         )
         models = [pycolmap.Reconstruction(str(one)) for one in sorted(sparse.iterdir())]

@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from colmap_inertial.colmap.fusion import fuse_maps
+from colmap_inertial.colmap.depth_maps import fuse_maps
 from colmap_inertial.colmap.sweep_stereo import SweptWorkspace
 from colmap_inertial.core.geometry import matrix_from_quat, so3_exp
 from colmap_inertial.core.types import CameraModel

@@ -195,15 +195,13 @@ def test_the_mapper_s_model_is_the_joined_one_where_the_order_in_time_is_known(t
 
     monkeypatch.setattr(pycolmap, "incremental_mapping", made)
     monkeypatch.setattr(mapping, "close_gaps", close)
-    options = MappingOptions(overlap=3)
+    options = MappingOptions(overlap=3, refine_intrinsics=False)
     assert mapping.matches_every_pair(FRAMES, options)
     record = mapping.map_images(
         ring.database,
         tmp_path,
         tmp_path / "sparse",
         options,
-        refine_intrinsics=False,
-        num_images=FRAMES,
         context=RunContext(scratch=tmp_path),
         in_time=NAMES if given else (),
     )
@@ -234,9 +232,7 @@ def test_pairs_far_apart_in_time_are_believed_where_somebody_looked(tmp_path, mo
         ring.database,
         tmp_path,
         tmp_path / "sparse",
-        MappingOptions(overlap=3, pairing=pairing),
-        refine_intrinsics=False,
-        num_images=FRAMES,
+        MappingOptions(overlap=3, pairing=pairing, refine_intrinsics=False),
         context=RunContext(scratch=tmp_path),
         in_time=NAMES,
         judged=judged,

@@ -16,9 +16,8 @@ from colmap_inertial.cli.terminal import show_result
 from colmap_inertial.core.geometry import matrix_from_quat, quat_exp, quat_rotate, so3_exp, so3_log
 from colmap_inertial.core.options import JoinOptions, ProjectOptions, ReconstructOptions, ScaleOptions
 from colmap_inertial.inertial.join.evidence import Evidence, find_links, find_shared
-from colmap_inertial.inertial.join.judge import Ends, join_submodels, worst
-from colmap_inertial.inertial.join.placement import Problem, place_submodels
-from colmap_inertial.inertial.join.values import FittedSubmodel, ImuLink
+from colmap_inertial.inertial.join.judge import end_images, join_submodels, tie_cov, worst
+from colmap_inertial.inertial.join.placement import FittedSubmodel, ImuLink, Problem, place_submodels
 from colmap_inertial.inertial.scale.posterior import CLOCK_RATE, DELAY, FittedPath
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.model import Model, trajectory_from_model, transformed
@@ -99,8 +98,8 @@ def halves(walked):
 
 def across(tracks, parts, placed, link):
     """Error and covariance of the first image after a gap as seen from the last one before it: rotation, position."""
-    ends, poses = Ends.of(parts, link), []
-    for k, image in zip(ends.pair, ends.images, strict=True):
+    poses = []
+    for k, image in zip((link.first, link.second), end_images(parts, link), strict=True):
         part = parts[k]
         at = placed.points(k, part.trajectory.cam_in_world[image : image + 1])[0]
         poses.append((placed.places.rotation[k] @ part.world_from_cam[image], at, part.trajectory.t_s[image]))
@@ -108,7 +107,7 @@ def across(tracks, parts, placed, link):
     true = matrix_from_quat(state.world_from_cam_xyzw)
     turn = poses[0][0].T @ poses[1][0] @ (true[0].T @ true[1]).T
     away = poses[0][0].T @ (poses[1][1] - poses[0][1]) - true[0].T @ np.diff(state.cam_in_world_m, axis=0)[0]
-    return np.concatenate([poses[0][0] @ so3_log(turn), poses[0][0] @ away]), ends.cov(parts, placed)
+    return np.concatenate([poses[0][0] @ so3_log(turn), poses[0][0] @ away]), tie_cov(parts, placed, link)
 
 
 def test_the_imu_places_one_part_in_the_world_of_the_other(walked, halves):

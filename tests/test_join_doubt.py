@@ -12,8 +12,8 @@ from colmap_inertial.core.options import JoinOptions, ScaleOptions
 from colmap_inertial.core.types import CameraTrajectory
 from colmap_inertial.inertial.join.evidence import find_links
 from colmap_inertial.inertial.join.joined_model import _sigma_log
-from colmap_inertial.inertial.join.judge import Ends, join_submodels, worst
-from colmap_inertial.inertial.join.values import FittedSubmodel
+from colmap_inertial.inertial.join.judge import join_submodels, tie_cov, worst
+from colmap_inertial.inertial.join.placement import FittedSubmodel
 from colmap_inertial.inertial.scale.posterior import FittedPath
 from colmap_inertial.io.calibration import calibration_prior
 from colmap_inertial.pipeline.stages.join import _cameras
@@ -70,7 +70,7 @@ def test_a_part_in_a_hole_is_held_to_the_poses_on_both_sides(walked, inside, shi
     else:
         (group,) = joined.groups
         parts = [around, inside]
-        sigmas = [worst(Ends.of(parts, link).cov(parts, group.placed))[0] for link in find_links(parts)]
+        sigmas = [worst(tie_cov(parts, group.placed, link))[0] for link in find_links(parts)]
         assert gap.sigma_m == pytest.approx(max(sigmas))
 
 

@@ -8,21 +8,30 @@ import pycolmap
 import pytest
 
 from colmap_inertial.colmap import loops, pairing, relative_track, sparse
-from colmap_inertial.colmap.covisibility import Covisibility
-from colmap_inertial.colmap.gyro_bias import RayPairs, bias_correction
-from colmap_inertial.colmap.gyro_orientations import GyroOrientations, estimate_gyro_orientations
-from colmap_inertial.colmap.loops import candidates, close_loops, key_frames, without_contradictions
+from colmap_inertial.colmap.gyro_orientations import (
+    GyroOrientations,
+    RayPairs,
+    estimate_bias_correction,
+    estimate_gyro_orientations,
+)
+from colmap_inertial.colmap.loops import LoopSearch, candidates, key_frames
 from colmap_inertial.colmap.pairing import match_capture
-from colmap_inertial.colmap.relative_track import RelativeTrack, Sightings, estimate_relative_track, joined
+from colmap_inertial.colmap.relative_track import (
+    Observations,
+    RelativeTrack,
+    estimate_relative_track,
+    link_observations,
+)
 from colmap_inertial.colmap.sparse import mapping_device
 from colmap_inertial.colmap.two_views import (
-    Return,
+    Covisibility,
+    LoopPose,
     TwoViews,
     compare,
     count_verified,
-    forget,
-    returns,
-    sightings_of,
+    delete_matches,
+    localise_frames,
+    read_observations,
 )
 from colmap_inertial.core.errors import InertialError, NotObservableError
 from colmap_inertial.core.geometry import quat_from_matrix, so3_exp
@@ -144,7 +153,7 @@ def test_the_bias_is_found_by_matches_of_neighbours_also_before_a_wall(wall):
     true = headings_of(30 * np.sin(t_s), t_s)
     wrong = headings_of(30 * np.sin(t_s), t_s, bias=BIAS + np.array([0.01, -0.03, 0.02]))
     pairs = ray_pairs_of(true, np.random.default_rng(0), wall=wall)
-    change, cov = bias_correction(pairs, wrong.start_from_cam, wrong.bias_lever_s)
+    change, cov = estimate_bias_correction(pairs, wrong.start_from_cam, wrong.bias_lever_s)
     off = change - [-0.01, 0.03, -0.02]
     assert np.abs(off).max() < (0.01 if wall else 2e-3)
     assert off @ np.linalg.solve(cov, off) < 16
@@ -155,9 +164,11 @@ def test_matches_that_suit_no_bias_are_refused():
     headings = headings_of(30 * np.sin(t_s), t_s)
     pairs = ray_pairs_of(headings, np.random.default_rng(0), noise_px=5)
     with pytest.raises(NotObservableError, match="suit no bias"):
-        bias_correction(pairs, headings.start_from_cam, headings.bias_lever_s)
+        estimate_bias_correction(pairs, headings.start_from_cam, headings.bias_lever_s)
     with pytest.raises(NotObservableError, match="too few"):
-        bias_correction(pairs.only(np.arange(len(pairs.first)) < 3), headings.start_from_cam, headings.bias_lever_s)
+        estimate_bias_correction(
+            pairs.only(np.arange(len(pairs.first)) < 3), headings.start_from_cam, headings.bias_lever_s
+        )
 
 
 # --- votes and loops -------------------------------------------------------------------------------------------------
@@ -222,9 +233,9 @@ def test_candidates_are_the_best_of_a_frame():
 def way_along(centre):
     """A way through centres (N, 3), with one point before each frame."""
     none = np.zeros(0, dtype=np.intp)
-    sightings = Sightings(frame=none, point=none, feature=none, rays=np.zeros((0, 3)))
+    sightings = Observations(frame=none, point=none, feature=none, rays=np.zeros((0, 3)))
     return RelativeTrack(
-        part=np.zeros(len(centre), dtype=np.intp), centre=centre, points=np.zeros((0, 3)), sightings=sightings
+        part=np.zeros(len(centre), dtype=np.intp), centre=centre, points=np.zeros((0, 3)), observations=sightings
     )
 
 
@@ -232,6 +243,13 @@ def circle(count=40):
     """Around, and back to the start."""
     angle = np.linspace(0, 2 * np.pi, count)
     return 2 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+
+
+def search_of(headings, way, names=(), covisibility=None):
+    """Loops of frames at least ten apart."""
+    return LoopSearch(
+        database=None, names=names, orientations=headings, track=way, covisibility=covisibility, nearest=10
+    )
 
 
 def closing(monkeypatch, seen, votes, *, centre=None, said=None, also=()):
@@ -264,15 +282,14 @@ def closing(monkeypatch, seen, votes, *, centre=None, said=None, also=()):
         for i, j in pairs:
             step = way.centre[j] - way.centre[i] if said is None else said(i, j)
             turned = headings.start_from_cam[j]
-            told.append(Return(step=step, start_from_second=turned, ratio=1.0, depth=2.0, matches=100))
+            told.append(LoopPose(step=step, start_from_second=turned, ratio=1.0, depth=2.0, matches=100))
         return told
 
     monkeypatch.setattr(loops, "compare", compared)
-    monkeypatch.setattr(loops, "returns", returned)
-    monkeypatch.setattr(loops, "forget", lambda database, pairs: forgotten.extend(pairs))
-    found = close_loops(
-        None, names, headings, way, Counted(), 10, doubtful=also, neighbours=[(0, 1)], match=matched.extend
-    )
+    monkeypatch.setattr(loops, "localise_frames", returned)
+    monkeypatch.setattr(loops, "delete_matches", lambda database, pairs: forgotten.extend(pairs))
+    search = search_of(headings, way, names, Counted())
+    found = search.close_loops(matched.extend, doubtful=also, neighbours=[(0, 1)])
     assert matched[0] == (0, 1) and len(set(matched)) == len(matched) == found.candidates + 1
     return found, forgotten
 
@@ -325,7 +342,7 @@ def test_of_loops_that_contradict_each_other_only_those_with_by_far_the_most_mat
 
     def said(pairs, matches, off=0.0):
         return {
-            (i, j): Return(
+            (i, j): LoopPose(
                 step=way.centre[j] - way.centre[i] + [off, 0, 0],
                 start_from_second=headings.start_from_cam[j],
                 ratio=1.0,
@@ -336,12 +353,12 @@ def test_of_loops_that_contradict_each_other_only_those_with_by_far_the_most_mat
         }
 
     true, shifted = [(0, 37), (1, 38), (2, 39)], [(0, 38), (1, 39)]
-    assert without_contradictions({}, headings, way, 10) == set()
-    assert without_contradictions(said(true, 100), headings, way, 10) == set(true)
+    assert search_of(headings, way).select_consistent({}) == set()
+    assert search_of(headings, way).select_consistent(said(true, 100)) == set(true)
     both = {**said(true, 100), **said(shifted, 60, off=1.5)}
-    assert without_contradictions(both, headings, way, 10) == set(true)
+    assert search_of(headings, way).select_consistent(both) == set(true)
     both = {**said(true, 100), **said(shifted, 150, off=1.5)}
-    assert without_contradictions(both, headings, way, 10) == set()
+    assert search_of(headings, way).select_consistent(both) == set()
 
 
 def sightings_along(centre, start_from_cam, rng, *, noise_rad=1e-3, reach=2.5):
@@ -356,7 +373,7 @@ def sightings_along(centre, start_from_cam, rng, *, noise_rad=1e-3, reach=2.5):
         point.append(mine)
         rays.append(ray / np.linalg.norm(ray, axis=1)[:, None])
     which = np.concatenate(point)
-    return Sightings(frame=np.concatenate(frame), point=which, feature=which, rays=np.concatenate(rays))
+    return Observations(frame=np.concatenate(frame), point=which, feature=which, rays=np.concatenate(rays))
 
 
 def test_the_way_is_found_up_to_its_length_and_is_as_sure_as_it_says():
@@ -390,7 +407,7 @@ def test_a_way_that_nothing_leads_across_has_two_parts():
 
 def test_matches_that_join_two_features_of_one_frame_make_no_point():
     pairs = [(0, 1, np.array([[0, 0], [1, 1]])), (1, 2, np.array([[0, 0], [1, 1]])), (0, 2, np.array([[2, 1]]))]
-    frame, feature, point = joined([3, 2, 2], pairs)
+    frame, feature, point = link_observations([3, 2, 2], pairs)
     assert frame.tolist() == [0, 1, 2] and feature.tolist() == [0, 0, 0] and point.tolist() == [0, 0, 0]
 
 
@@ -427,7 +444,7 @@ def test_without_a_gyroscope_a_long_capture_matches_neighbours_only(database, tm
     def refused(*_):
         raise NotObservableError("time offset", "no")
 
-    monkeypatch.setattr(pairing, "turns_rad", refused)
+    monkeypatch.setattr(pairing, "read_rotations_rad", refused)
     names = tuple(f"{i:03}" for i in range(40))
     recording = type("Recording", (), {"timing": FrameTiming(names=names, t_s=np.arange(40.0))})()
     options = MappingOptions(pairing="sequential", overlap=3)
@@ -444,7 +461,7 @@ def test_matches_are_verified_counted_and_forgotten(database, tmp_path):
     views = compare(database, [("a", "b"), ("a", "c")])
     assert np.isfinite(views.first_from_second).all(axis=(1, 2)).tolist() == [True, False]
     assert views.covered[0] > 0.9 and views.covered[1] == 0
-    forget(database, [("a", "b")])
+    delete_matches(database, [("a", "b")])
     assert count_verified(database) == 0
     with pycolmap.Database.open(str(database)) as opened:
         assert not opened.exists_matches(1, 2) and opened.exists_matches(1, 3)
@@ -483,13 +500,12 @@ def test_headings_are_found_by_the_turns_of_the_pictures():
 
 def test_a_capture_too_short_for_loops_has_none(monkeypatch):
     headings = headings_of([0.0, 5.0, 10.0], np.arange(3.0))
-    monkeypatch.setattr(loops, "forget", lambda database, pairs: None)
+    monkeypatch.setattr(loops, "delete_matches", lambda database, pairs: None)
     empty = TwoViews(first_from_second=np.zeros((0, 3, 3)), covered=np.zeros(0))
     monkeypatch.setattr(loops, "compare", lambda database, pairs: empty)
     voters = Covisibility(descriptors=(), xy_px=())
-    found = close_loops(
-        None, ["a", "b", "c"], headings, way_along(circle(3)), voters, 10, doubtful=[], neighbours=[], match=len
-    )
+    search = search_of(headings, way_along(circle(3)), ["a", "b", "c"], voters)
+    found = search.close_loops(len, doubtful=[], neighbours=[])
     assert found.compared == found.candidates == found.refused == 0 and found.closed == ()
 
 
@@ -516,7 +532,7 @@ def test_points_are_those_that_three_frames_saw_and_rays_are_turned(tmp_path):
     xy = {name: rng.uniform(10, 350, (50, 2)) for name in "abc"}
     path = written(tmp_path / "database.db", xy, {(0, 1): np.arange(50), (1, 2): np.arange(40)[::-1]})
     turned = so3_exp(np.array([[0, 0, 0], [0, 0.2, 0], [0.1, 0, 0]]))
-    found = sightings_of(path, list("abc"), [(0, 1), (1, 2)], turned)
+    found = read_observations(path, list("abc"), [(0, 1), (1, 2)], turned)
     assert found.frame.tolist() == [0] * 40 + [1] * 40 + [2] * 40
     of_c = found.feature[found.frame == 2][np.argsort(found.point[found.frame == 2])]
     of_a = found.feature[found.frame == 0][np.argsort(found.point[found.frame == 0])]
@@ -536,7 +552,7 @@ def test_a_frame_is_placed_by_points_that_another_one_knew(tmp_path):
     second[:12] = np.roll(second[:12], 5)
     path = written(tmp_path / "database.db", dict(zip("ab", xy, strict=True)), {(0, 1): second})
     half = 0.5 * (points - centre) + [7, 7, 7]
-    sightings = Sightings(
+    sightings = Observations(
         frame=np.repeat([0, 1], 60),
         point=np.arange(120),
         feature=np.tile(np.arange(60), 2),
@@ -546,15 +562,15 @@ def test_a_frame_is_placed_by_points_that_another_one_knew(tmp_path):
         part=np.zeros(2, dtype=np.intp),
         centre=np.array([[0, 0, 0], [7.0, 7, 7]]),
         points=np.concatenate([points, half]),
-        sightings=sightings,
+        observations=sightings,
     )
-    told = returns(path, ["a", "b"], [(0, 1)], way)[0]
+    told = localise_frames(path, ["a", "b"], [(0, 1)], way)[0]
     assert told is not None and told.matches == 48
     assert told.step == pytest.approx(centre, abs=1e-3)
     assert told.start_from_second == pytest.approx(turned, abs=1e-3)
     assert told.ratio == pytest.approx(2.0, rel=1e-2)
     few = replace(way, points=np.where(np.arange(120)[:, None] < 50, np.nan, way.points))
-    assert returns(path, ["a", "b"], [(0, 1)], few) == [None]
+    assert localise_frames(path, ["a", "b"], [(0, 1)], few) == [None]
 
 
 def test_batches_of_pairs_grow_and_hold_every_pair_once():

@@ -368,7 +368,7 @@ def colmap(workspace, monkeypatch):
         database.write_text("matches")
         return MatchRecord(device="cpu", pairing="exhaustive", images=2, pairs=1, matched=1, verified=1, gyroscope="")
 
-    def map_them(database, images, target, options, **more):
+    def map_them(database, images, target, *rest, **more):
         target.mkdir()
         return MapRecord(mapper="incremental", models=1)
 
@@ -490,9 +490,7 @@ def test_intrinsics_are_refined_where_that_is_asked_for(features, tmp_path, monk
         features[0],
         tmp_path,
         tmp_path / "sparse",
-        MappingOptions(),
-        refine_intrinsics=refine,
-        num_images=2,
+        MappingOptions(refine_intrinsics=refine),
         context=RunContext(scratch=tmp_path),
     )
     (options,) = asked

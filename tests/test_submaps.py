@@ -347,9 +347,7 @@ def test_what_is_too_long_for_one_go_is_mapped_in_parts(tmp_path, monkeypatch, l
         ring.database,
         tmp_path,
         tmp_path / "sparse",
-        MappingOptions(overlap=3, pairing=pairing),
-        refine_intrinsics=False,
-        num_images=FRAMES,
+        MappingOptions(overlap=3, pairing=pairing, refine_intrinsics=False),
         context=RunContext(scratch=tmp_path, num_threads=1, progress=lambda *step: told.append(step)),
         in_time=NAMES,
     )

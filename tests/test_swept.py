@@ -9,8 +9,7 @@ from sweep_scenes import camera, depth_of, picture_of, sights_of
 from test_pipeline_dense import vertices
 
 from colmap_inertial.colmap import sweep_stereo
-from colmap_inertial.colmap.depth_maps import MadeFrom, choose_maker, coverage, find_maps, map_file
-from colmap_inertial.colmap.fusion import fuse_maps
+from colmap_inertial.colmap.depth_maps import MadeFrom, choose_maker, coverage, find_maps, fuse_maps, map_file
 from colmap_inertial.colmap.sweep_stereo import SweptWorkspace
 from colmap_inertial.core.errors import FormatError
 from colmap_inertial.model.artefacts import read_map, write_map

@@ -24,10 +24,10 @@ from colmap_inertial.colmap.depth_maps import (
     choose_maker,
     coverage,
     find_maps,
+    fuse_maps,
     map_file,
     patch_match,
 )
-from colmap_inertial.colmap.fusion import fuse_maps
 from colmap_inertial.colmap.sweep_stereo import SweptWorkspace
 from colmap_inertial.colmap.tsdf import tsdf_mesh
 from colmap_inertial.core.errors import FormatError, OutputError
@@ -56,7 +56,7 @@ _STEPS = 3
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DenseResult:
-    """What became of the dense reconstruction of one model.
+    """The dense reconstruction of one model.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class DenseResult:
     images, depth_maps
         How many undistorted images there are, and how many of them have a depth map.
     maps
-        Who made the depth maps: patch-match or plane sweep.
+        The method that made the depth maps: patch-match or plane sweep.
     coverage
         Share of the maps' pixels that have a depth.
     fused, points
@@ -73,7 +73,7 @@ class DenseResult:
     mesh, faces
         Its surface (PLY); ``None`` where none was asked for, or there are no points.
     waiting
-        Why it cannot go on; empty where it is finished.
+        Why it is incomplete; empty where it is finished.
     """
 
     folder: Path
@@ -89,18 +89,8 @@ class DenseResult:
 
     def as_json(self, root: Path) -> dict[str, object]:
         """In JSON types; paths count from ``root``."""
-        return {
-            "folder": str(self.folder.relative_to(root)),
-            "images": self.images,
-            "depth_maps": self.depth_maps,
-            "maps": self.maps,
-            "coverage": self.coverage,
-            "fused": self.fused and str(self.fused.relative_to(root)),
-            "points": self.points,
-            "mesh": self.mesh and str(self.mesh.relative_to(root)),
-            "faces": self.faces,
-            "waiting": self.waiting or None,
-        }
+        paths = {name: str(value.relative_to(root)) for name, value in vars(self).items() if isinstance(value, Path)}
+        return vars(self) | paths | {"waiting": self.waiting or None}
 
 
 def run_dense(session: Session, indices: Sequence[int], images: Path, options: DenseOptions) -> dict[int, DenseResult]:
@@ -124,9 +114,7 @@ def run_dense(session: Session, indices: Sequence[int], images: Path, options: D
     OutputExistsError
         Where depth maps of patch-match lie in the workspace that were made from another model.
     """
-    prepared: dict[int, _Prepared] = {}
-    for index in indices:
-        prepared[index] = _prepare_model(session, index, images, options)
+    prepared = {index: _prepare_model(session, index, images, options) for index in indices}
     done, total = 0, sum(model.steps for model in prepared.values())
 
     def step() -> None:
@@ -149,7 +137,7 @@ def run_dense(session: Session, indices: Sequence[int], images: Path, options: D
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Prepared:
-    """What is to be made of a model.
+    """A model before its dense reconstruction.
 
     Attributes
     ----------
@@ -167,7 +155,7 @@ class _Prepared:
 
     @property
     def steps(self) -> int:
-        """How many there are to hear of."""
+        """Steps that progress counts."""
         return _STEPS + (2 * len(self.names) if self.made_from.maps == "plane sweep" else 1)
 
 

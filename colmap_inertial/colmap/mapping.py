@@ -1,4 +1,4 @@
-"""COLMAP's mapper: models of what was matched, in one go or in parts, and what is known of how they were made."""
+"""COLMAP's mapper: models of what was matched, in one go or in parts, and a record of how they were made."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _NEIGHBOURS = 2
 
 @dataclass(frozen=True, kw_only=True)
 class ModelEnds(LoopClosure):
-    """The same, of one of several models; ``model`` is its number."""
+    """The loop closure of one of several models; ``model`` is its number."""
 
     model: int
 
@@ -52,9 +52,9 @@ class MapRecord:
     parts
         Runs of images that were mapped by themselves; 1 where all were mapped in one go.
     ends
-        Of models that were mapped in one go: their ends that met.
+        Loop closures of models that were mapped in one go.
     seams
-        Of parts: where they met, also where they do not fit and these matches were left out.
+        Overlaps of parts, also those that do not fit and whose matches were left out.
     """
 
     mapper: str
@@ -69,10 +69,8 @@ def map_images(
     images: Path,
     sparse: Path,
     options: MappingOptions,
-    *,
-    refine_intrinsics: bool,
-    num_images: int,
     context: RunContext,
+    *,
     in_time: Sequence[str] = (),
     judged: bool = True,
 ) -> MapRecord:
@@ -80,9 +78,11 @@ def map_images(
 
     Parameters
     ----------
+    options
+        Here ``refine_intrinsics`` must be given.
     in_time
-        The images in order of time, where they are of one recording: ends of a model that met are joined then, and what
-        is too long for one go is mapped in parts.
+        The images in order of time, where they are of one recording: loops of a model are closed then, and what is too
+        long for one go is mapped in parts.
     judged
         Whether somebody looked which pairs far apart in time join copies. Nobody does where every pair is matched.
 
@@ -93,26 +93,27 @@ def map_images(
     """
     import pycolmap
 
+    if options.refine_intrinsics is None:
+        raise ValueError("whoever knows the cameras decides whether they are refined")
     pycolmap.set_random_seed(context.seed)
     sparse.mkdir(parents=True)
     require_room(sparse, database.stat().st_size)
+    with pycolmap.Database.open(str(database)) as opened:
+        num_images = opened.num_images()
     context.progress("mapping", 0, num_images)
     every_pair = matches_every_pair(num_images, options)
-    nearest = None if judged and not every_pair else _NEIGHBOURS * options.overlap
+    near = _NEIGHBOURS * options.overlap
     if options.mapper == "incremental":
-        pipeline = _incremental_options(refine_intrinsics, context.num_threads, context.seed)
+        pipeline = _incremental_options(options.refine_intrinsics, context)
         capture = MappedCapture(database=database, pipeline=pipeline, names=in_time)
         if len(in_time) > LONGEST and not every_pair:
-            near = _NEIGHBOURS * options.overlap
             record = _map_in_parts(capture, images, sparse, context, near=near, loops=judged)
         else:
-            record = _map_in_one_go(capture, images, sparse, context, nearest=nearest, num_images=num_images)
+            nearest = None if judged and not every_pair else near
+            record = _map_in_one_go(capture, images, sparse, _counter(context.progress, num_images), nearest=nearest)
     else:
         models = pycolmap.global_mapping(
-            str(database),
-            str(images),
-            str(sparse),
-            options=_global_options(options, refine_intrinsics, context.num_threads, context.seed),
+            str(database), str(images), str(sparse), options=_global_options(options, context)
         )
         record = MapRecord(mapper="global", models=len(models))
     context.progress("mapping", num_images, num_images)
@@ -130,7 +131,7 @@ def map_images(
 
 
 def _map_in_one_go(
-    capture: MappedCapture, images: Path, sparse: Path, context: RunContext, *, nearest: int | None, num_images: int
+    capture: MappedCapture, images: Path, sparse: Path, registered: Callable[[], None], *, nearest: int | None
 ) -> MapRecord:
     import pycolmap
 
@@ -139,7 +140,7 @@ def _map_in_one_go(
         str(images),
         str(sparse),
         options=capture.pipeline,
-        next_image_callback=_counter(context.progress, num_images),
+        next_image_callback=registered,
     )
     ends = []
     for number, model in models.items() if capture.names else ():
@@ -175,12 +176,11 @@ def _counter(progress: Progress, total: int, *, of: int | None = None) -> Callab
     return registered
 
 
-def _incremental_options(refine: bool, num_threads: int, seed: int) -> pycolmap.IncrementalPipelineOptions:
+def _incremental_options(refine: bool, context: RunContext) -> pycolmap.IncrementalPipelineOptions:
     import pycolmap
 
     pipeline = pycolmap.IncrementalPipelineOptions()
-    pipeline.num_threads = num_threads
-    pipeline.random_seed = seed
+    pipeline.num_threads, pipeline.random_seed = context.num_threads, context.seed
     pipeline.ba_refine_focal_length = refine
     pipeline.ba_refine_extra_params = refine
     pipeline.mapper.abs_pose_refine_focal_length = refine
@@ -190,15 +190,12 @@ def _incremental_options(refine: bool, num_threads: int, seed: int) -> pycolmap.
     return pipeline
 
 
-def _global_options(
-    options: MappingOptions, refine: bool, num_threads: int, seed: int
-) -> pycolmap.GlobalPipelineOptions:
+def _global_options(options: MappingOptions, context: RunContext) -> pycolmap.GlobalPipelineOptions:
     import pycolmap
 
     pipeline = pycolmap.GlobalPipelineOptions()
-    pipeline.num_threads = num_threads
-    pipeline.random_seed = seed
-    pipeline.mapper.bundle_adjustment.refine_focal_length = refine
-    pipeline.mapper.bundle_adjustment.refine_extra_params = refine
+    pipeline.num_threads, pipeline.random_seed = context.num_threads, context.seed
+    pipeline.mapper.bundle_adjustment.refine_focal_length = bool(options.refine_intrinsics)
+    pipeline.mapper.bundle_adjustment.refine_extra_params = bool(options.refine_intrinsics)
     pipeline.mapper.rotation_averaging.use_gravity = options.gravity_priors
     return pipeline

@@ -1,9 +1,9 @@
-"""The way of a camera before there is a model: by its gyroscope's orientations and what neighbouring frames see.
+"""The relative track of a camera before there is a model, by gyroscope orientations and matches of neighbours.
 
 With orientations known, a frame's place among points is linear, and so is a point's among frames. Frames are placed
 one after another by points that earlier ones saw, and points by the frames that see them. Its length is arbitrary and
-drifts from frame to frame, which is reckoned with: it is no reconstruction, but tells a place that was come back to
-from one that only looks the same.
+drifts from frame to frame, which the covariance allows for: it is no reconstruction, but tells a revisited place from
+one that only looks the same.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from colmap_inertial.core.threads import one_blas_thread
 _PARALLAX_RAD = 0.02
 #: Errors of orientations and matches, as an angle: what is farther off counts less.
 _OFF_RAD = 0.004
-#: A frame is placed by so many points at least, and by this share of those it knows, or the way breaks.
+#: A frame is placed by so many points at least, and by this share of those it knows, or the track breaks.
 _LEAST_POINTS, _LEAST_SHARE = 8, 0.25
 #: A frame sees this many points on average at most.
-_MOST_SIGHTINGS = 800
+_MOST_OBSERVATIONS = 800
 #: How far the logarithm of its length walks from frame to frame.
 DRIFT = 0.02
 #: Rounds of weighting.
@@ -31,13 +31,13 @@ _ROUNDS = 4
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Sightings:
-    """What N frames saw of points.
+class Observations:
+    """Observations of points by N frames.
 
     Attributes
     ----------
     frame, point
-        (M,) which frame saw which point, frame by frame.
+        (M,) which frame observed which point, frame by frame.
     feature
         (M,) which of the frame's features it was.
     rays
@@ -61,22 +61,22 @@ class RelativeTrack:
     centre
         (N, 3) in the frame of the orientations.
     points
-        (P, 3) as the way knew them last; NaN where it did not.
-    sightings
+        (P, 3) as last triangulated; NaN where they were not.
+    observations
         Of these.
     """
 
     part: IndexArray
     centre: Array
     points: Array
-    sightings: Sightings
+    observations: Observations
 
     def known(self, i: IndexArray, j: IndexArray) -> BoolArray:
-        """(M,) whether there is a way from frames i to frames j, (M,) each."""
+        """(M,) whether one part of the track has frames i and j, (M,) each."""
         return np.asarray((self.part[i] == self.part[j]) & (self.part[i] >= 0))
 
     def covariance(self, i: IndexArray, j: IndexArray, heading_rad: Array) -> Array:
-        """(M, 3, 3) of the ways from frames i to frames j >= i, (M,) each.
+        """(M, 3, 3) of the displacements from frames i to frames j >= i, (M,) each.
 
         Each step's length is off by a factor that walks; headings are off by ``heading_rad`` (M,) at the end.
         """
@@ -87,30 +87,30 @@ class RelativeTrack:
         )
         end, between = self.centre[j], sums[j + 1] - sums[i]
         mixed = end[:, :, None] * between[:, None, :]
-        # of what was left of the way at each frame of it
-        left = (
+        # of the displacements from each frame on the track to its end
+        remaining = (
             count * end[:, :, None] * end[:, None, :] - mixed - np.swapaxes(mixed, 1, 2) + squares[j + 1] - squares[i]
         )
-        mean = np.trace(left, axis1=1, axis2=2)[:, None, None] / count
-        return np.asarray(DRIFT**2 * left + (heading_rad[:, None, None] ** 2 * mean) * np.eye(3))
+        mean = np.trace(remaining, axis1=1, axis2=2)[:, None, None] / count
+        return np.asarray(DRIFT**2 * remaining + (heading_rad[:, None, None] ** 2 * mean) * np.eye(3))
 
     def depth(self, frame: int) -> float:
-        """How far away what a frame sees usually is; NaN where nothing is known."""
+        """Median distance of the points that a frame sees; NaN where it sees none."""
         at = self.seen(frame)[1]
         return float(np.median(np.linalg.norm(at - self.centre[frame], axis=1))) if len(at) else float("nan")
 
     def seen(self, frame: int) -> tuple[IndexArray, Array]:
         """Features (K,) of a frame whose points are known, and these (K, 3)."""
-        mine = slice(*np.searchsorted(self.sightings.frame, [frame, frame + 1]))
-        feature, at = self.sightings.feature[mine], self.points[self.sightings.point[mine]]
+        mine = slice(*np.searchsorted(self.observations.frame, [frame, frame + 1]))
+        feature, at = self.observations.feature[mine], self.points[self.observations.point[mine]]
         known = np.isfinite(at).all(axis=1)
         return feature[known], at[known]
 
 
-def joined(
+def link_observations(
     features: Sequence[int], matches: Sequence[tuple[int, int, IndexArray]]
 ) -> tuple[IndexArray, IndexArray, IndexArray]:
-    """Points that matches of pairs of frames are of: frame, feature and point (M,) of all sightings, frame by frame.
+    """Link matches of pairs of frames to points: frame, feature and point (M,) of all observations, frame by frame.
 
     Of very many points, some are enough.
 
@@ -133,20 +133,20 @@ def joined(
     _, label = connected_components(graph, directed=False)
     node = np.flatnonzero(np.bincount(label)[label] >= 3)
     frame = np.searchsorted(begin, node, side="right") - 1
-    # what is twice in one frame are two things
+    # a point that is twice in one frame is two things
     key = label[node] * len(features) + frame
     _, place, often = np.unique(key, return_inverse=True, return_counts=True)
     twice = np.unique(label[node][often[place] > 1])
     kept = ~np.isin(label[node], twice)
     frame, feature = frame[kept], (node - begin[frame])[kept]
     _, point = np.unique(label[node][kept], return_inverse=True)
-    some = point % max(1, -(-len(point) // (_MOST_SIGHTINGS * len(features)))) == 0
+    some = point % max(1, -(-len(point) // (_MOST_OBSERVATIONS * len(features)))) == 0
     _, point = np.unique(point[some], return_inverse=True)
     return frame[some], feature[some], point
 
 
 @one_blas_thread()
-def estimate_relative_track(sightings: Sightings, frames: int) -> RelativeTrack:
+def estimate_relative_track(observations: Observations, frames: int) -> RelativeTrack:
     """Place frames one after another; where too little hangs together, a new part begins.
 
     Parameters
@@ -154,18 +154,18 @@ def estimate_relative_track(sightings: Sightings, frames: int) -> RelativeTrack:
     frames
         How many there are.
     """
-    count = int(sightings.point.max(initial=-1)) + 1
+    count = int(observations.point.max(initial=-1)) + 1
     centre, part = np.zeros((frames, 3)), np.full(frames, -1, dtype=np.intp)
     points = np.full((count, 3), np.nan)
     square, moment = np.zeros((count, 3, 3)), np.zeros((count, 3))
     first, wide = np.full((count, 3), np.nan), np.zeros(count)
-    bounds = np.searchsorted(sightings.frame, np.arange(frames + 1))
+    bounds = np.searchsorted(observations.frame, np.arange(frames + 1))
 
     def add(k: int, trusted: BoolArray) -> None:
-        """Let a placed frame's rays tell of points."""
+        """Triangulate points by a placed frame's rays."""
         mine = np.arange(bounds[k], bounds[k + 1])[trusted]
-        which, rays = sightings.point[mine], sightings.rays[mine]
-        through = _across(rays)
+        which, rays = observations.point[mine], observations.rays[mine]
+        through = _project_across(rays)
         square[which] += through
         moment[which] += through @ centre[k]
         new = np.isnan(first[which, 0])
@@ -176,7 +176,7 @@ def estimate_relative_track(sightings: Sightings, frames: int) -> RelativeTrack:
 
     begun, now = 0, 0
     while begun < frames - 1:
-        ahead = _beginning(sightings, bounds, begun)
+        ahead = _find_beginning(observations, bounds, begun)
         if ahead is None:
             begun += 1
             continue
@@ -191,27 +191,27 @@ def estimate_relative_track(sightings: Sightings, frames: int) -> RelativeTrack:
         while k < frames:
             if k != other:
                 mine = slice(bounds[k], bounds[k + 1])
-                which = sightings.point[mine]
+                which = observations.point[mine]
                 step = centre[k - 1] - centre[k - 2] if k - 2 >= begun else step
-                placed = _placed(points[which], sightings.rays[mine], centre[k - 1] + step, step)
-                if placed is None:
+                located = _locate_frame(points[which], observations.rays[mine], centre[k - 1] + step, step)
+                if located is None:
                     break
-                centre[k], trusted = placed
+                centre[k], trusted = located
                 part[k] = now
                 add(k, trusted)
             k += 1
         begun, now = max(k, begun + 1), now + 1
-    return RelativeTrack(part=part, centre=centre, points=points, sightings=sightings)
+    return RelativeTrack(part=part, centre=centre, points=points, observations=observations)
 
 
-def _beginning(sightings: Sightings, bounds: IndexArray, i: int) -> tuple[int, Array] | None:
+def _find_beginning(observations: Observations, bounds: IndexArray, i: int) -> tuple[int, Array] | None:
     """A frame soon after frame i from which much looks different, and the direction to it; ``None`` without one."""
     for j in range(i + 1, min(i + 9, len(bounds) - 1)):
         a, b = slice(bounds[i], bounds[i + 1]), slice(bounds[j], bounds[j + 1])
-        _, at_a, at_b = np.intersect1d(sightings.point[a], sightings.point[b], return_indices=True)
+        _, at_a, at_b = np.intersect1d(observations.point[a], observations.point[b], return_indices=True)
         if len(at_a) < 2 * _LEAST_POINTS:
             return None
-        one, two = sightings.rays[a][at_a], sightings.rays[b][at_b]
+        one, two = observations.rays[a][at_a], observations.rays[b][at_b]
         normal = np.cross(one, two)
         if np.median(np.linalg.norm(normal, axis=1)) < 2 * _PARALLAX_RAD:
             continue
@@ -225,20 +225,20 @@ def _beginning(sightings: Sightings, bounds: IndexArray, i: int) -> tuple[int, A
     return None
 
 
-def _across(rays: Array) -> Array:
-    """(K, 3, 3) what is left of a vector across each of (K, 3) unit rays."""
+def _project_across(rays: Array) -> Array:
+    """(K, 3, 3) projections of a vector across each of (K, 3) unit rays."""
     return np.asarray(np.eye(3) - rays[:, :, None] * rays[:, None, :])
 
 
-def _placed(points: Array, rays: Array, guess: Array, step: Array) -> tuple[Array, BoolArray] | None:
-    """(3,) where a frame is by the points it sees, and (K,) which of its rays may tell of points.
+def _locate_frame(points: Array, rays: Array, guess: Array, step: Array) -> tuple[Array, BoolArray] | None:
+    """(3,) where a frame is by the points it sees, and (K,) which of its rays may triangulate points.
 
     It is sought near the guess: what hangs twice may have more points that agree on a place elsewhere.
     """
     known = np.isfinite(points[:, 0])
     if known.sum() < _LEAST_POINTS:
         return None
-    at, through, seen = points[known], _across(rays[known]), rays[known]
+    at, through, seen = points[known], _project_across(rays[known]), rays[known]
     centre = guess
     about = max(_OFF_RAD, float(np.linalg.norm(step) / np.median(np.linalg.norm(at - guess, axis=1))) / 2)
     for scale in np.geomspace(about, _OFF_RAD, _ROUNDS + 1):

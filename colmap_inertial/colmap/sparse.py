@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -21,9 +21,6 @@ from colmap_inertial.model import colmap_camera
 from colmap_inertial.pipeline.run.context import RunContext
 from colmap_inertial.pipeline.run.workspace import require_room
 from colmap_inertial.pipeline.stages.protocols import KeypointStage
-
-if TYPE_CHECKING:
-    pass
 
 #: Up to this many images every pair is matched; above it, neighbours in time.
 _EXHAUSTIVE_UP_TO = 150
@@ -56,7 +53,7 @@ def _writing(database: Path) -> Iterator[None]:
 
 
 def mapping_device(options: MappingOptions, *, deterministic: bool) -> Literal["cpu", "cuda"]:
-    """What features are found and matched on.
+    """The device that features are extracted and matched on.
 
     Raises
     ------
@@ -139,7 +136,8 @@ def extract_features(
             colmap_camera(camera)  # raises on wrong parameters before any work
             reader.camera_model = camera.model
             reader.camera_params = ",".join(repr(p) for p in camera.params)
-        for batch in _batches(sorted(names), _EXTRACTION_BATCH):
+        names.sort()
+        for batch in (names[k : k + _EXTRACTION_BATCH] for k in range(0, len(names), _EXTRACTION_BATCH)):
             context.progress("features", done, len(cameras))
             require_room(database.parent, len(batch) * options.max_num_features * _FEATURE_BYTES)
             with _writing(database):
@@ -169,16 +167,12 @@ def extract_features(
                 reader.existing_camera_id = first.camera_id
             done += len(batch)
     context.progress("features", done, len(cameras))
-    return _through_stages(database, keypoint_stages)
+    return apply_keypoint_stages(database, keypoint_stages)
 
 
 def _intern(camera: CameraModel | None, known: Mapping[CameraModel | None, list[str]]) -> CameraModel | None:
     """The equal camera among the known ones, so that frames of one device share one COLMAP camera."""
     return next((k for k in known if k is not None and camera is not None and vars(k) == vars(camera)), camera)
-
-
-def _batches(items: Sequence[str], size: int) -> list[list[str]]:
-    return [list(items[i : i + size]) for i in range(0, len(items), size)]
 
 
 def growing_batches(pairs: Sequence[str], *, first: int = _FIRST_MATCHING_BATCH) -> list[list[str]]:
@@ -210,7 +204,8 @@ class KeypointRecords:
         return frozenset(record.name for record in self.images if record.rectified)
 
 
-def _through_stages(database: Path, stages: Sequence[KeypointStage]) -> KeypointRecords:
+def apply_keypoint_stages(database: Path, stages: Sequence[KeypointStage]) -> KeypointRecords:
+    """Let stages move all keypoints of a database, and record what they did."""
     import pycolmap
 
     if not stages:
@@ -251,11 +246,11 @@ def verify_again(
     keypoint_stages: Sequence[KeypointStage],
     context: RunContext,
 ) -> None:
-    """The same matches of keypoints that stages move, verified anew: descriptors tell what they told before."""
+    """The same matches of keypoints that stages move, verified anew: descriptors do not change."""
     import pycolmap
 
     shutil.copyfile(matched, database)
-    _through_stages(database, keypoint_stages)
+    apply_keypoint_stages(database, keypoint_stages)
     with _writing(database), pycolmap.Database.open(str(database)) as opened:
         opened.clear_two_view_geometries()
     match_pairs(database, pairs, context)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from colmap_inertial.colmap.mapping import MapRecord, map_images
@@ -80,14 +81,14 @@ def run_colmap(
 
     def models(partial: Sequence[Path]) -> None:
         refine = mapping.refine_intrinsics
+        if refine is None:
+            refine = any(camera is None for camera in cameras.values())
         record = map_images(
             workspace.colmap_database,
             workspace.colmap_images,
             partial[0],
-            mapping,
-            refine_intrinsics=any(camera is None for camera in cameras.values()) if refine is None else refine,
-            num_images=len(cameras),
-            context=context,
+            replace(mapping, refine_intrinsics=refine),
+            context,
             in_time=recording.timing.names,
         )
         write_record(partial[1], record)

@@ -1,33 +1,81 @@
-"""What COLMAP's database knows of pairs of images: how the camera turned, how much of what both show was matched."""
+"""What COLMAP's database holds of pairs of images: rotations, the overlap that was matched, shared features."""
 
 from __future__ import annotations
 
+import contextlib
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from colmap_inertial.colmap.gyro_bias import RayPairs
-from colmap_inertial.colmap.relative_track import RelativeTrack, Sightings, joined
-from colmap_inertial.core.arrays import Array, BoolArray
+from colmap_inertial.colmap.gyro_orientations import RayPairs
+from colmap_inertial.colmap.relative_track import Observations, RelativeTrack, link_observations
+from colmap_inertial.core.arrays import Array, BoolArray, IndexArray, UInt8Array
 from colmap_inertial.core.geometry import matrix_from_quat, so3_log
+from colmap_inertial.core.threads import one_blas_thread
 
 if TYPE_CHECKING:
     import pycolmap
 
+#: Places of two frames in time, the earlier one first.
+FramePair = tuple[int, int]
 
 #: A rotation of fewer matches is not believed.
 _LEAST_MATCHES = 30
 #: Matches of a pair that the gyroscope's bias is sought by.
 _RAYS = 100
-#: Points of the way by which a frame is placed, how far off they may lie, and how many of those matched must not.
+#: Points of the track by which a frame is localised, how far off they may lie, and how many of those matched must not.
 _LEAST_PLACED, _PLACED_PX, _PLACED_SHARE = 12, 8.0, 0.7
 #: A picture in cells, and the features that a cell must have for it to count.
 _COLUMNS, _ROWS, _LEAST_FEATURES = 8, 6, 3
+#: Features of each image that vote.
+_VOTERS = 500
+#: A vote: the nearest descriptor is nearer than this share of the next one's angle, and than this angle (COLMAP's).
+_RATIO, _FARTHEST_RAD = 0.7, 0.7
+#: COLMAP stores descriptors of this length.
+_LENGTH = 512.0
+
+
+class Features:
+    """An open database of features and matches, by names of images."""
+
+    def __init__(self, database: pycolmap.Database) -> None:
+        self.database = database
+        self.images = {image.name: image for image in database.read_all_images()}
+        self.cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
+
+    def camera(self, name: str) -> pycolmap.Camera:
+        """An image's camera."""
+        return self.cameras[self.images[name].camera_id]
+
+    def xy_px(self, name: str) -> Array:
+        """(K, 2) an image's keypoints."""
+        return np.array(self.database.read_keypoints(self.images[name].image_id))[:, :2].astype(np.float64)
+
+    def rays(self, name: str, which: IndexArray | slice = slice(None)) -> Array:
+        """(K, 3) directions to some of an image's keypoints, camera frame; their length is arbitrary."""
+        seen = np.asarray(self.camera(name).cam_from_img(self.xy_px(name)[which]))[:, :2]
+        return np.column_stack([seen, np.ones(len(seen))])
+
+    def geometry(self, first: str, second: str) -> pycolmap.TwoViewGeometry:
+        """The verified matches of two images."""
+        return self.database.read_two_view_geometry(self.images[first].image_id, self.images[second].image_id)
+
+    def matches(self, first: str, second: str) -> IndexArray:
+        """(K, 2) features that verified matches of two images join."""
+        return np.array(self.geometry(first, second).inlier_matches, dtype=np.intp)
+
+
+@contextlib.contextmanager
+def open_features(database: Path) -> Iterator[Features]:
+    """Open COLMAP's database."""
+    import pycolmap
+
+    with pycolmap.Database.open(str(database)) as opened:
+        yield Features(opened)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -48,37 +96,33 @@ class TwoViews:
 
 
 def compare(database: Path, pairs: Sequence[tuple[str, str]]) -> TwoViews:
-    """What the verified matches of pairs tell."""
+    """Rotation and matched overlap of pairs of images, by their verified matches."""
     import pycolmap
 
-    turned, covered = np.full((len(pairs), 3, 3), np.nan), np.zeros(len(pairs))
-    with pycolmap.Database.open(str(database)) as opened:
-        images = {image.name: image for image in opened.read_all_images()}
-        cameras = {camera.camera_id: camera for camera in opened.read_all_cameras()}
+    rotations, covered = np.full((len(pairs), 3, 3), np.nan), np.zeros(len(pairs))
+    with open_features(database) as features:
         points: dict[str, Array] = {}
         for place, pair in enumerate(pairs):
-            both = [images[name] for name in pair]
-            views = opened.read_two_view_geometry(both[0].image_id, both[1].image_id)
+            views = features.geometry(*pair)
             if len(views.inlier_matches) < _LEAST_MATCHES:
                 continue
-            for image in both:
-                if image.name not in points:
-                    stored = np.array(opened.read_keypoints(image.image_id))
-                    points[image.name] = stored[:, :2].astype(np.float64)
-            seen = [(cameras[image.camera_id], points[image.name]) for image in both]
-            if pycolmap.estimate_two_view_geometry_pose(*seen[0], *seen[1], views) and views.cam2_from_cam1 is not None:
+            for name in pair:
+                if name not in points:
+                    points[name] = features.xy_px(name)
+            first, second = ((features.camera(name), points[name]) for name in pair)
+            if pycolmap.estimate_two_view_geometry_pose(*first, *second, views) and views.cam2_from_cam1 is not None:
                 second_from_first = matrix_from_quat(np.array(views.cam2_from_cam1.rotation.quat))
-                turned[place] = second_from_first.T
-                matches = np.array(views.inlier_matches)
+                rotations[place] = second_from_first.T
+                matches = np.array(views.inlier_matches, dtype=np.intp)
                 covered[place] = min(
-                    _covered(*seen[0], matches[:, 0], seen[1][0], second_from_first),
-                    _covered(*seen[1], matches[:, 1], seen[0][0], second_from_first.T),
+                    _coverage(*first, matches[:, 0], second[0], second_from_first),
+                    _coverage(*second, matches[:, 1], first[0], second_from_first.T),
                 )
-    return TwoViews(first_from_second=turned, covered=covered)
+    return TwoViews(first_from_second=rotations, covered=covered)
 
 
-def _covered(
-    camera: pycolmap.Camera, xy_px: Array, matched: NDArray[np.uint32], other: pycolmap.Camera, other_from_this: Array
+def _coverage(
+    camera: pycolmap.Camera, xy_px: Array, matched: IndexArray, other: pycolmap.Camera, other_from_this: Array
 ) -> float:
     """Share of the picture's cells with features, as far as the other one shows them, that have a match."""
     scale = np.array([_COLUMNS / camera.width, _ROWS / camera.height])
@@ -87,12 +131,12 @@ def _covered(
     again = np.bincount(cell[matched], minlength=_COLUMNS * _ROWS)
     row, column = np.divmod(np.arange(_COLUMNS * _ROWS), _COLUMNS)
     middle = (np.stack([column, row], axis=1) + 0.5) / scale
-    asked = (count >= _LEAST_FEATURES) & _shown(middle, camera, other, other_from_this)
+    asked = (count >= _LEAST_FEATURES) & _is_visible(middle, camera, other, other_from_this)
     return int((asked & (again > 0)).sum()) / max(int(asked.sum()), 1)
 
 
-def _shown(xy_px: Array, camera: pycolmap.Camera, other: pycolmap.Camera, other_from_this: Array) -> BoolArray:
-    """(N,) which points of a picture, infinitely far away, the other one shows."""
+def _is_visible(xy_px: Array, camera: pycolmap.Camera, other: pycolmap.Camera, other_from_this: Array) -> BoolArray:
+    """(N,) which points of an image, infinitely far away, are visible in the other one."""
     rays = np.asarray(camera.cam_from_img(xy_px))[:, :2]
     there = np.column_stack([rays, np.ones(len(rays))]) @ other_from_this.T
     before = np.isfinite(there).all(axis=1) & (there[:, 2] > 0.05)
@@ -102,42 +146,35 @@ def _shown(xy_px: Array, camera: pycolmap.Camera, other: pycolmap.Camera, other_
     return np.asarray(inside, dtype=np.bool_)
 
 
-def turns_rad(database: Path, names: Sequence[str]) -> Array:
-    """(N - 1, 3) rotation vectors ``earlier_from_later`` of consecutive images; NaN where their matches tell none."""
-    turned = compare(database, list(itertools.pairwise(names))).first_from_second
-    known = np.isfinite(turned).all(axis=(1, 2))
-    turn = np.full((len(turned), 3), np.nan)
-    turn[known] = so3_log(turned[known])
-    return turn
+def read_rotations_rad(database: Path, names: Sequence[str]) -> Array:
+    """(N - 1, 3) rotation vectors ``earlier_from_later`` of consecutive images; NaN where there are too few matches."""
+    rotations = compare(database, list(itertools.pairwise(names))).first_from_second
+    measured = np.isfinite(rotations).all(axis=(1, 2))
+    turn_rad = np.full((len(rotations), 3), np.nan)
+    turn_rad[measured] = so3_log(rotations[measured])
+    return turn_rad
 
 
-def ray_pairs(database: Path, names: Sequence[str], pairs: Sequence[tuple[int, int]]) -> RayPairs:
+def read_ray_pairs(database: Path, names: Sequence[str], pairs: Sequence[FramePair]) -> RayPairs:
     """Rays of some matches of those pairs of images that have enough of them."""
-    import pycolmap
-
     rays: dict[int, Array] = {}
-    kept, found = [], []
-    with pycolmap.Database.open(str(database)) as opened:
-        images = {image.name: image for image in opened.read_all_images()}
-        cameras = {camera.camera_id: camera for camera in opened.read_all_cameras()}
+    kept, rays_of_pairs = [], []
+    with open_features(database) as features:
         for pair in pairs:
-            both = [images[names[index]] for index in pair]
-            matches = np.array(opened.read_two_view_geometry(both[0].image_id, both[1].image_id).inlier_matches)
+            matches = features.matches(names[pair[0]], names[pair[1]])
             if len(matches) < _LEAST_MATCHES:
                 continue
-            for index, image in zip(pair, both, strict=True):
+            for index in pair:
                 if index not in rays:
-                    xy_px = np.array(opened.read_keypoints(image.image_id))[:, :2].astype(np.float64)
-                    seen = np.asarray(cameras[image.camera_id].cam_from_img(xy_px))[:, :2]
-                    ray = np.column_stack([seen, np.ones(len(seen))])
+                    ray = features.rays(names[index])
                     rays[index] = ray / np.linalg.norm(ray, axis=1, keepdims=True)
             some = matches[np.linspace(0, len(matches) - 1, _RAYS).astype(np.intp)]
             of_both = np.stack([rays[pair[0]][some[:, 0]], rays[pair[1]][some[:, 1]]])
             if np.isfinite(of_both).all():
                 kept.append(pair)
-                found.append(of_both)
-        focal_px = float(np.median([camera.mean_focal_length() for camera in cameras.values()]))
-    places, stacked = np.array(kept, dtype=np.intp).reshape(-1, 2), np.array(found).reshape(-1, 2, _RAYS, 3)
+                rays_of_pairs.append(of_both)
+        focal_px = float(np.median([camera.mean_focal_length() for camera in features.cameras.values()]))
+    places, stacked = np.array(kept, dtype=np.intp).reshape(-1, 2), np.array(rays_of_pairs).reshape(-1, 2, _RAYS, 3)
     return RayPairs(
         first=places[:, 0],
         second=places[:, 1],
@@ -147,47 +184,36 @@ def ray_pairs(database: Path, names: Sequence[str], pairs: Sequence[tuple[int, i
     )
 
 
-def sightings_of(
-    database: Path, names: Sequence[str], pairs: Sequence[tuple[int, int]], start_from_cam: Array
-) -> Sightings:
-    """What the verified matches of pairs of frames say of points, with (N, 3, 3) orientations of the frames."""
-    import pycolmap
-
-    matches = []
-    with pycolmap.Database.open(str(database)) as opened:
-        images = {image.name: image for image in opened.read_all_images()}
-        cameras = {camera.camera_id: camera for camera in opened.read_all_cameras()}
-        counts = [opened.num_keypoints_for_image(images[name].image_id) for name in names]
-        for i, j in pairs:
-            found = opened.read_two_view_geometry(images[names[i]].image_id, images[names[j]].image_id).inlier_matches
-            if len(found) >= _LEAST_MATCHES:
-                matches.append((i, j, np.array(found, dtype=np.intp)))
-        frame, feature, point = joined(counts, matches)
+def read_observations(
+    database: Path, names: Sequence[str], pairs: Sequence[FramePair], start_from_cam: Array
+) -> Observations:
+    """Observations of points by the verified matches of pairs of frames, with (N, 3, 3) orientations of the frames."""
+    with open_features(database) as features:
+        counts = [features.database.num_keypoints_for_image(features.images[name].image_id) for name in names]
+        matches = [(i, j, features.matches(names[i], names[j])) for i, j in pairs]
+        frame, feature, point = link_observations(counts, [of for of in matches if len(of[2]) >= _LEAST_MATCHES])
         rays = np.zeros((len(frame), 3))
         bounds = np.searchsorted(frame, np.arange(len(names) + 1))
         for k, name in enumerate(names):
-            mine, image = slice(bounds[k], bounds[k + 1]), images[name]
-            if bounds[k] == bounds[k + 1]:
-                continue
-            xy_px = np.array(opened.read_keypoints(image.image_id))[feature[mine], :2]
-            seen = np.asarray(cameras[image.camera_id].cam_from_img(xy_px.astype(np.float64)))[:, :2]
-            ray = np.column_stack([seen, np.ones(len(seen))]) @ start_from_cam[k].T
-            rays[mine] = ray / np.linalg.norm(ray, axis=1, keepdims=True)
-    return Sightings(frame=frame, point=point, feature=feature, rays=rays)
+            own = slice(bounds[k], bounds[k + 1])
+            if bounds[k] < bounds[k + 1]:
+                ray = features.rays(name, feature[own]) @ start_from_cam[k].T
+                rays[own] = ray / np.linalg.norm(ray, axis=1, keepdims=True)
+    return Observations(frame=frame, point=point, feature=feature, rays=rays)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Return:
-    """Where a frame is by points that another one, long before or after, had seen.
+class LoopPose:
+    """The pose of a frame by points that another one, long before or after, had seen.
 
     Attributes
     ----------
     step
-        (3,) from the first frame to the second, in the length of the way at the first.
+        (3,) from the first frame to the second, in the length of the track at the first.
     start_from_second
         (3, 3) orientation of the second.
     ratio
-        Length of the way at the first frame over that at the second.
+        Length of the track at the first frame over that at the second.
     depth
         How far away the points are.
     matches
@@ -201,67 +227,121 @@ class Return:
     matches: int
 
 
-def returns(
-    database: Path, names: Sequence[str], pairs: Sequence[tuple[int, int]], way: RelativeTrack
-) -> list[Return | None]:
-    """What the verified matches of pairs say; ``None`` where too few of them are points of the way that fit."""
+def localise_frames(
+    database: Path, names: Sequence[str], pairs: Sequence[FramePair], track: RelativeTrack
+) -> list[LoopPose | None]:
+    """Localise the second frame of each pair by the first one's points; ``None`` where too few of them agree."""
     import pycolmap
 
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac.max_error, options.ransac.random_seed = _PLACED_PX, 0
-    said: list[Return | None] = []
-    with pycolmap.Database.open(str(database)) as opened:
-        images = {image.name: image for image in opened.read_all_images()}
-        cameras = {camera.camera_id: camera for camera in opened.read_all_cameras()}
+    poses: list[LoopPose | None] = []
+    with open_features(database) as features:
         for i, j in pairs:
-            said.append(None)
-            one, two = images[names[i]], images[names[j]]
-            matches = np.array(opened.read_two_view_geometry(one.image_id, two.image_id).inlier_matches, dtype=np.intp)
-            (of_one, at_one), (of_two, at_two) = way.seen(i), way.seen(j)
-            _, mine, place = np.intersect1d(matches[:, 0], of_one, return_indices=True)
-            if len(mine) < _LEAST_PLACED:
+            poses.append(None)
+            matches = features.matches(names[i], names[j])
+            (of_first, at_first), (of_second, at_second) = track.seen(i), track.seen(j)
+            _, seen, place = np.intersect1d(matches[:, 0], of_first, return_indices=True)
+            if len(seen) < _LEAST_PLACED:
                 continue
-            xy_px = np.array(opened.read_keypoints(two.image_id))[matches[mine, 1], :2].astype(np.float64)
-            points = at_one[place]
-            found = pycolmap.estimate_and_refine_absolute_pose(
-                xy_px, points, cameras[two.camera_id], estimation_options=options
+            xy_px, points = features.xy_px(names[j])[matches[seen, 1]], at_first[place]
+            estimate = pycolmap.estimate_and_refine_absolute_pose(
+                xy_px, points, features.camera(names[j]), estimation_options=options
             )
-            if found is None or found["num_inliers"] < max(_LEAST_PLACED, _PLACED_SHARE * len(mine)):
+            if estimate is None or estimate["num_inliers"] < max(_LEAST_PLACED, _PLACED_SHARE * len(seen)):
                 continue
-            second_from_start = found["cam_from_world"]
+            second_from_start = estimate["cam_from_world"]
             centre = -second_from_start.rotation.matrix().T @ second_from_start.translation
-            fit = np.array(found["inlier_mask"])
+            fit = np.array(estimate["inlier_mask"])
             away = np.linalg.norm(points - centre, axis=1)
-            _, both, other = np.intersect1d(matches[mine, 1], of_two, return_indices=True)
+            _, both, other = np.intersect1d(matches[seen, 1], of_second, return_indices=True)
             usable = fit[both]
             if usable.sum() < _LEAST_PLACED // 2:
                 continue
-            there = np.linalg.norm(at_two[other[usable]] - way.centre[j], axis=1)
-            said[-1] = Return(
-                step=centre - way.centre[i],
+            there = np.linalg.norm(at_second[other[usable]] - track.centre[j], axis=1)
+            poses[-1] = LoopPose(
+                step=centre - track.centre[i],
                 start_from_second=second_from_start.rotation.matrix().T,
                 ratio=float(np.median(away[both[usable]] / there)),
                 depth=float(np.median(away[fit])),
                 matches=int(fit.sum()),
             )
-    return said
+    return poses
 
 
 def count_verified(database: Path) -> int:
     """Pairs whose matches COLMAP verified."""
-    import pycolmap
-
-    with pycolmap.Database.open(str(database)) as opened:
-        _, inliers = opened.read_two_view_geometry_num_inliers()
-    return int(np.count_nonzero(np.array(inliers)))
+    with open_features(database) as features:
+        return int(np.count_nonzero(features.database.read_two_view_geometry_num_inliers()[1]))
 
 
-def forget(database: Path, pairs: Sequence[tuple[str, str]]) -> None:
-    """Take the matches of pairs out of a database."""
-    import pycolmap
+def delete_matches(database: Path, pairs: Sequence[tuple[str, str]]) -> None:
+    """Remove the matches of pairs from a database."""
+    with open_features(database) as features:
+        for pair in pairs:
+            numbers = [features.images[name].image_id for name in pair]
+            features.database.delete_matches(*numbers)
+            features.database.delete_two_view_geometry(*numbers)
 
-    with pycolmap.Database.open(str(database)) as opened:
-        images = {image.name: image.image_id for image in opened.read_all_images()}
-        for first, second in pairs:
-            opened.delete_matches(images[first], images[second])
-            opened.delete_two_view_geometry(images[first], images[second])
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Covisibility:
+    """The largest features of each image.
+
+    Attributes
+    ----------
+    descriptors
+        Of each image (K, 128), as COLMAP stores them.
+    xy_px
+        Of each image (K, 2).
+    """
+
+    descriptors: tuple[UInt8Array, ...]
+    xy_px: tuple[Array, ...]
+
+    @classmethod
+    def of(cls, database: Path, names: Sequence[str]) -> Covisibility:
+        """Of images, from a database that holds their features."""
+        descriptors, places = [], []
+        with open_features(database) as features:
+            for name in names:
+                number = features.images[name].image_id
+                keypoints = np.array(features.database.read_keypoints(number), dtype=np.float64).reshape(-1, 6)
+                size = np.hypot(keypoints[:, 2], keypoints[:, 4])
+                largest = np.argsort(-size, kind="stable")[:_VOTERS]
+                stored = np.array(features.database.read_descriptors(number).data, dtype=np.uint8).reshape(-1, 128)
+                descriptors.append(stored[largest])
+                places.append(keypoints[largest, :2])
+        return cls(descriptors=tuple(descriptors), xy_px=tuple(places))
+
+    def are_unlike(self, i: IndexArray, j: IndexArray, least_votes: int) -> BoolArray:
+        """(M,) whether images i and j, both with features enough, have fewer votes than this."""
+        return np.asarray((self.count(i, j) < least_votes) & self.plenty[i] & self.plenty[j])
+
+    @property
+    def plenty(self) -> BoolArray:
+        """(N,) which images have features enough for few votes to mean something."""
+        return np.array([len(own) == _VOTERS for own in self.descriptors], dtype=np.bool_)
+
+    def count(self, i: IndexArray, j: IndexArray) -> IndexArray:
+        """(M,) votes that images i and j, (M,) each, show the same."""
+        counted = np.zeros(len(i), dtype=np.intp)
+        with one_blas_thread():
+            for place in range(len(i)):
+                counted[place] = _count_votes(self.descriptors[i[place]], self.descriptors[j[place]])
+        return counted
+
+
+def _count_votes(first: UInt8Array, second: UInt8Array) -> int:
+    """Mutually nearest descriptors that are clearly nearer than the next."""
+    if len(first) < 2 or len(second) < 2:
+        return 0
+    cosine = first.astype(np.float32) @ second.astype(np.float32).T / np.float32(_LENGTH**2)
+    row = np.arange(len(first))
+    nearest = cosine.argmax(axis=1)
+    best = cosine[row, nearest]
+    mutual = cosine.argmax(axis=0)[nearest] == row
+    cosine[row, nearest] = -1
+    near = np.flatnonzero(mutual & (best > np.cos(_FARTHEST_RAD)))
+    angle, next_angle = (np.arccos(np.clip(c, -1, 1)) for c in (best[near], cosine[near].max(axis=1, initial=-1)))
+    return int(np.count_nonzero(angle < _RATIO * next_angle))

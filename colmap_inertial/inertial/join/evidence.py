@@ -15,8 +15,7 @@ from colmap_inertial.core.types import ImuRecording
 from colmap_inertial.inertial.core.parameters import DRIFT_S
 from colmap_inertial.inertial.core.preintegration import SensorStreams
 from colmap_inertial.inertial.core.priors import PRIORS
-from colmap_inertial.inertial.join.placement import LEAST_STAMP_S
-from colmap_inertial.inertial.join.values import FittedSubmodel, ImuLink
+from colmap_inertial.inertial.join.placement import LEAST_STAMP_S, FittedSubmodel, ImuLink
 from colmap_inertial.inertial.scale import posterior as post
 from colmap_inertial.model.submodels.graph import Pair, SimilarityConstraint, pair_of
 from colmap_inertial.model.submodels.matches import PlacedImages

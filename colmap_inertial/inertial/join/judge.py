@@ -22,8 +22,7 @@ from colmap_inertial.inertial.join.evidence import (
     silent_s,
     times_counted,
 )
-from colmap_inertial.inertial.join.placement import Placed, Problem, place_submodels
-from colmap_inertial.inertial.join.values import FittedSubmodel, ImuLink
+from colmap_inertial.inertial.join.placement import FittedSubmodel, ImuLink, Placed, Problem, place_submodels
 from colmap_inertial.model.submodels.graph import Pair, SimilarityConstraint, among, columns_of, pair_of
 from colmap_inertial.model.submodels.matches import PlacedImages
 
@@ -248,7 +247,7 @@ def _gap(evidence: Evidence, pair: Pair) -> Gap:
     (first, second), seconds = pair, 0.0
     if shortest is not None:
         first, second = shortest.first, shortest.second
-        before, after = Ends.of(submodels, shortest).images
+        before, after = end_images(submodels, shortest)
         seconds = float(submodels[second].trajectory.t_s[after] - submodels[first].trajectory.t_s[before])
     if shortest is None or overlaps(submodels, shortest):
         begin_s, end_s = (f(float(submodels[k].trajectory.t_s[i]) for k in pair) for f, i in ((max, 0), (min, -1)))
@@ -307,7 +306,7 @@ def _try(evidence: Evidence, members: Sequence[int], matched: Collection[Similar
     sigmas: dict[Pair, tuple[float, float]] = {}
     farthest = 0.0
     for tie, misfit in zip(ties, [*placed.misfits, *(_misfit(placed, one) for one in images)], strict=True):
-        cov = Ends.of(submodels, tie).cov(submodels, placed)
+        cov = tie_cov(submodels, placed, tie)
         farthest = max(farthest, float(misfit @ np.linalg.solve(cov, misfit)))
         a, b = pair_of(tie)
         pair = members[a], members[b]
@@ -359,54 +358,35 @@ def _unsure(gap: Gap, limits: JoinOptions) -> str:
     return ""
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Ends:
-    """The images on both sides of a gap.
+def end_images(submodels: Sequence[FittedSubmodel], tie: ImuLink | SimilarityConstraint) -> tuple[int, int]:
+    """The images on both sides of a link; or the first one that a constraint was measured by."""
+    if isinstance(tie, SimilarityConstraint):
+        first, second = tie.images[0].tolist()
+        return first, second
+    before_s, after_s = (submodels[k].trajectory.t_s for k, _ in tie.ends)
+    middle_s = 0.5 * sum(float(submodels[k].path.nodes_s[node]) for k, node in tie.ends)
+    return int(np.searchsorted(before_s, middle_s, side="right")) - 1, int(np.searchsorted(after_s, middle_s))
 
-    Attributes
-    ----------
-    pair
-        Places of the two submodels.
-    images, nodes
-        Of each, which image, and the node next to it.
-    """
 
-    pair: tuple[int, int]
-    images: tuple[int, int]
-    nodes: tuple[int, int]
-
-    @classmethod
-    def of(cls, submodels: Sequence[FittedSubmodel], tie: ImuLink | SimilarityConstraint) -> Ends:
-        """The images on both sides of a link; or the first one that a constraint was measured by."""
-        pair = (tie.first, tie.second)
-        times = [submodels[k].trajectory.t_s for k in pair]
-        if isinstance(tie, SimilarityConstraint):
-            first, second = tie.images[0].tolist()
-            nodes = [
-                int(np.argmin(np.abs(submodels[k].path.nodes_s - t_s[i])))
-                for k, t_s, i in zip(pair, times, (first, second), strict=True)
-            ]
-            return cls(pair=pair, images=(first, second), nodes=(nodes[0], nodes[1]))
-        middle_s = 0.5 * sum(float(submodels[k].path.nodes_s[node]) for k, node in tie.ends)
-        last = int(np.searchsorted(times[0], middle_s, side="right")) - 1
-        first = int(np.searchsorted(times[1], middle_s))
-        return cls(pair=pair, images=(last, first), nodes=(tie.from_node, tie.to_node))
-
-    def cov(self, submodels: Sequence[FittedSubmodel], placed: Placed) -> Array:
-        """(6, 6) of the second one's pose as seen from the first: rotation and position, along the world's axes."""
-        points = [submodels[k].trajectory.cam_in_world[i] for k, i in zip(self.pair, self.images, strict=True)]
-        cov = relative_cov(submodels, placed, points, self.pair)
-        here, there = (placed.points(k, point[None])[0] for k, point in zip(self.pair, points, strict=True))
-        for k, node, arm in zip(self.pair, self.nodes, (there - here, np.zeros(3)), strict=True):
-            by = np.eye(6)
-            by[3:, :3] = -skew(arm)  # the first one's own turn swings the other around it
-            by = by @ np.kron(np.eye(2), placed.places.rotation[k])
-            cov += by @ submodels[k].path.seen_cov(node) @ by.T
-        return cov
+def tie_cov(submodels: Sequence[FittedSubmodel], placed: Placed, tie: ImuLink | SimilarityConstraint) -> Array:
+    """(6, 6) covariance of the second image's pose as seen from the first one's, of :func:`end_images`."""
+    pair, images = (tie.first, tie.second), end_images(submodels, tie)
+    members = [submodels[k] for k in pair]
+    if isinstance(tie, ImuLink):
+        nodes = [tie.from_node, tie.to_node]
+    else:
+        ends_s = [one.trajectory.t_s[i] for one, i in zip(members, images, strict=True)]
+        nodes = [int(np.argmin(np.abs(one.path.nodes_s - t_s))) for one, t_s in zip(members, ends_s, strict=True)]
+    points = [one.trajectory.cam_in_world[i] for one, i in zip(members, images, strict=True)]
+    return relative_cov(submodels, placed, points, pair, nodes)
 
 
 def relative_cov(
-    submodels: Sequence[FittedSubmodel], placed: Placed, points: Sequence[Array], pair: tuple[int, int]
+    submodels: Sequence[FittedSubmodel],
+    placed: Placed,
+    points: Sequence[Array],
+    pair: tuple[int, int],
+    nodes: Sequence[int] = (),
 ) -> Array:
     """(6, 6) covariance of rotation and position of one submodel's point as seen from another one's.
 
@@ -416,6 +396,8 @@ def relative_cov(
         (3,) of each of the two, in its own world.
     pair
         Places of the two.
+    nodes
+        Of each, the node by which the visual pose there is uncertain; without, the submodels' places alone count.
     """
     here, there = (placed.points(k, point[None])[0] for k, point in zip(pair, points, strict=True))
     by = np.zeros((6, 14))
@@ -423,13 +405,18 @@ def relative_cov(
         arm = at - placed.places.translation[k]
         by[:3, columns][:, 1:4] = sign * np.eye(3)
         by[3:, columns] = sign * np.c_[arm, -skew(arm), np.eye(3)]
-    # as seen from the first: its own turn swings the other around it
+    # as seen from the first: its own rotation swings the other around it
     by[3:, 1:4] += skew(there - here)
     rows = np.r_[columns_of(pair[0]), columns_of(pair[1])]
     cov = placed.inflation * by @ placed.cov[np.ix_(rows, rows)] @ by.T
     # lens and accelerometer leave a share of any length, of all submodels alike
     between = (there - here) * max(submodels[k].path.floor_log for k in pair)
     cov[3:, 3:] += np.outer(between, between)
+    for k, node, arm in zip(pair, nodes, (there - here, np.zeros(3)), strict=False):
+        by = np.eye(6)
+        by[3:, :3] = -skew(arm)
+        by = by @ np.kron(np.eye(2), placed.places.rotation[k])
+        cov += by @ submodels[k].path.seen_cov(node) @ by.T
     return np.asarray(cov)
 
 

@@ -14,14 +14,13 @@ import numpy as np
 
 from colmap_inertial.core.arrays import Array, Int64Array
 from colmap_inertial.core.geometry import matrix_from_quat, rotation_between, skew, so3_exp, so3_log
-from colmap_inertial.core.types import ImuNoise
+from colmap_inertial.core.types import CameraTrajectory, ImuNoise
 from colmap_inertial.inertial.core import parameters as par
 from colmap_inertial.inertial.core.factors import imu_group
 from colmap_inertial.inertial.core.preintegration import Preintegrated, SensorErrors, SensorStreams, preintegrate
 from colmap_inertial.inertial.core.priors import PRIORS
-from colmap_inertial.inertial.join.values import FittedSubmodel, ImuLink
 from colmap_inertial.inertial.scale import posterior as post
-from colmap_inertial.inertial.scale.posterior import Posterior
+from colmap_inertial.inertial.scale.posterior import FittedPath, Posterior
 from colmap_inertial.model.submodels.graph import (
     PLACEMENT,
     Convergence,
@@ -53,6 +52,61 @@ class JointPlacement:
 PLACEMENT_OPTIONS = JointPlacement()
 #: What contradicts itself never lies quite still: it is settled where squares change by so little.
 CONVERGENCE = Convergence(rounds=15, step=1e-4, squares=0.1, squares_share=0.01)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FittedSubmodel:
+    """A submodel that its own scale estimate made metric.
+
+    Attributes
+    ----------
+    number
+        COLMAP's.
+    trajectory
+        Its poses, in metres.
+    path
+        The same fitted to the IMU once more: the posterior of its motion.
+    cameras
+        Names for its cameras, by which those of two submodels are told apart; empty where they are not known.
+    """
+
+    number: int
+    trajectory: CameraTrajectory
+    path: FittedPath
+    cameras: frozenset[str] = frozenset()
+
+    @property
+    def world_from_cam(self) -> Array:
+        """(F, 3, 3) of its images."""
+        return matrix_from_quat(self.trajectory.cam_from_world_xyzw).transpose(0, 2, 1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImuLink:
+    """The IMU between a node of one submodel and the next node of another one.
+
+    Attributes
+    ----------
+    first, second
+        Places of the submodels, the earlier one first.
+    from_node, to_node
+        Nodes of their paths.
+    """
+
+    first: int
+    second: int
+    from_node: int
+    to_node: int
+
+    @property
+    def ends(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """Submodel and node of both ends."""
+        return (self.first, self.from_node), (self.second, self.to_node)
+
+    def seconds(self, submodels: Sequence[FittedSubmodel]) -> float:
+        """How long it lasts."""
+        begin_s, end_s = (float(submodels[k].path.nodes_s[node]) for k, node in self.ends)
+        return end_s - begin_s
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

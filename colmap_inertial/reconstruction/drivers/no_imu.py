@@ -171,17 +171,8 @@ def _map(
     features.unlink()
     refine = capture.camera is None if mapping.refine_intrinsics is None else mapping.refine_intrinsics
     made = project / "models"
-    map_images(
-        database,
-        images,
-        made,
-        mapping,
-        refine_intrinsics=refine,
-        num_images=len(names),
-        context=context,
-        in_time=names,
-        judged=False,
-    )
+    decided = dataclasses.replace(mapping, refine_intrinsics=refine)
+    map_images(database, images, made, decided, context, in_time=names, judged=False)
     sizes = {folder: int(read_model(folder).num_reg_images()) for folder in find_models(made).values()}
     ranked = sorted(sizes, key=lambda folder: -sizes[folder])
     sparse.mkdir()

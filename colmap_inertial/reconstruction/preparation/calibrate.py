@@ -345,15 +345,7 @@ def _small_models(
         match_features(features, database, pairs, context)
     else:
         verify_again(matched / "database.db", database, pairs, stages, context)
-    map_images(
-        database,
-        images,
-        sparse,
-        _SMALL,
-        refine_intrinsics=capture.camera is None,
-        num_images=len(names),
-        context=context,
-    )
+    map_images(database, images, sparse, replace(_SMALL, refine_intrinsics=capture.camera is None), context)
     models = [read_model(folder) for folder in find_models(sparse).values()]
     return tuple(sorted(models, key=lambda model: -int(model.num_reg_images())))
 
