@@ -16,7 +16,7 @@ from colmap_inertial.colmap.submaps import PART, SHARED, MappedRun, join_runs, m
 from colmap_inertial.core.geometry import so3_exp
 from colmap_inertial.core.options import MappingOptions
 from colmap_inertial.model.submodels.graph import Placements, SimilarityConstraint
-from colmap_inertial.model.submodels.matches import Submodel, constrain_by_points, shared_features
+from colmap_inertial.model.submodels.matches import Submodel, constrain_by_points, find_common_features
 from colmap_inertial.pipeline.run.context import RunContext
 
 #: Runs of the ring's images.
@@ -179,7 +179,7 @@ def test_points_that_contradict_most_others_do_not_place_parts(ring):
     ring, (first, second, *_) = ring
     rng = np.random.default_rng(3)
     submodels = [Submodel(first.model), Submodel(second.model)]
-    views = shared_features(submodels)[0, 1]
+    views = find_common_features(submodels)[0, 1]
     assert [name for name, _, _ in views] == NAMES[second.begin : first.end]
     some = [(a, b, f.copy()) for a, b, f in views]
     for _, _, features in some:

@@ -1,9 +1,9 @@
-"""Closing of loops: ends of a model that met and were not joined.
+"""Loop closure of COLMAP's models: points that both ends of a loop hold are merged.
 
-COLMAP's incremental mapper grows both ways around a long loop. Where its ends meet they are off by what has drifted;
-and where that is more than a few pixels, nothing that both show becomes one point: each end keeps its own, and the
-model stays torn there, however often it is adjusted. The matches are in the database. So what both ends hold twice is
-made one, and the model is adjusted and its points completed, as COLMAP does at the end.
+COLMAP's incremental mapper grows both ways around a long loop. Where its ends meet they are off by the drift; and where
+that is more than a few pixels, no track joins them: each end keeps its own points, and the model stays torn there,
+however often it is adjusted. The matches are in the database. So points of matched features are merged, the model is
+adjusted, and its points are completed, as COLMAP does at the end.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ LONGEST = 1000
 
 @dataclass(frozen=True, kw_only=True)
 class LoopClosureLimits:
-    """What decides whether ends of a model met, and whether they belong together."""
+    """Which pairs of images close a loop, and whether the closed loop is accepted."""
 
     #: A pair is torn that has so many matches between points: COLMAP asks so many to place an image ...
     torn_matches: int = 30
@@ -43,9 +43,9 @@ class LoopClosureLimits:
     #: Images that are linked over no more others than this lie as the model has them, and what contradicts that joins
     #: copies; farther on, the model may have drifted. More than neighbours in time that are matched lie apart.
     links: int = 10
-    #: Ends that met see each other in so many pairs at least.
+    #: A loop is closed by so many pairs at least.
     pairs: int = 3
-    #: Merged points stay one in this share of the matches, or the ends do not belong together.
+    #: Merged points stay one in this share of the matches, or the loop is not accepted.
     agreeing_share: float = 0.5
     #: To move ends that are far apart takes more rounds than COLMAP's 50; 500 frames, off by a metre, took 60.
     rounds: int = 200
@@ -59,7 +59,7 @@ CLOSURE = LoopClosureLimits()
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MappedCapture:
-    """What models are made from.
+    """A matched capture, from which models are made.
 
     Attributes
     ----------
@@ -87,7 +87,7 @@ class MappedCapture:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _TornPair:
-    """A pair of images that shows the same, and of which each has points of its own.
+    """A pair of images that are matched, each with points of its own.
 
     Attributes
     ----------
@@ -107,18 +107,18 @@ class _TornPair:
 
 @dataclass(frozen=True, kw_only=True)
 class LoopClosure:
-    """Ends of a model, or two parts of one, that met, and whether they belong together.
+    """A loop of a model, or an overlap of two parts, and whether it was closed.
 
     Attributes
     ----------
     pairs
-        Of images, in which they see each other.
+        Of images that close it.
     images
         The two that have most matches, by name, the earlier one first.
     agree
-        Share of their matches that are one point, once they were made one and the model was adjusted.
+        Share of their matches that are one point, once points were merged and the model was adjusted.
     joined
-        Whether the model has them as one; else it is as it was.
+        Whether the model keeps the merged points; else it is as it was.
     """
 
     pairs: int
@@ -129,7 +129,7 @@ class LoopClosure:
 
 @dataclass(frozen=True, kw_only=True)
 class SubmapOverlap:
-    """Seams of a model that were made one, each by the numbers of the two parts that it is between.
+    """Overlaps of parts whose points were merged, by the numbers of the two parts.
 
     Attributes
     ----------
@@ -149,12 +149,12 @@ class SubmapOverlap:
 def close_gaps(
     capture: MappedCapture, reconstruction: pycolmap.Reconstruction, *, nearest: int | None
 ) -> LoopClosure | None:
-    """Join the ends of a model that met; ``None`` where there are none.
+    """Close the loops of a model; ``None`` where there are none.
 
     Parameters
     ----------
     reconstruction
-        Is changed; where they were not joined it may be of no further use.
+        Is changed; where the loop was not closed it may be of no further use.
     nearest
         Pairs farther apart in time may join copies, and are not looked at; ``None`` where all may be believed.
     """
@@ -176,7 +176,7 @@ def merge_overlaps(
     part_of: Mapping[int, int],
     nearest: Mapping[Pair, int | None],
 ) -> SubmapOverlap:
-    """Merge what a model holds twice, adjust it, and judge of each seam whether it fits then.
+    """Merge points that a model holds twice, adjust it, and judge whether each overlap fits then.
 
     Parameters
     ----------
@@ -191,7 +191,7 @@ def merge_overlaps(
     place = {name: at for at, name in enumerate(capture.names)}
     part = {reconstruction.image(number).name: k for number, k in part_of.items()}
     of_seam: dict[Pair, list[_TornPair]] = {}
-    for pair in _torn_pairs(capture.database, Submodel(reconstruction), place, part, nearest):
+    for pair in _find_torn_pairs(capture.database, Submodel(reconstruction), place, part, nearest):
         of_seam.setdefault(_seam(part, pair.first, pair.second), []).append(pair)
     of_seam = {seam: pairs for seam, pairs in of_seam.items() if len(pairs) >= CLOSURE.pairs}
     if not of_seam:
@@ -223,15 +223,28 @@ def _seam(part_of: Mapping[str, int], first: str, second: str) -> Pair:
 
 
 def _adjust(reconstruction: pycolmap.Reconstruction, capture: MappedCapture) -> None:
-    """Move what was made one together, and finish the model as COLMAP does."""
+    """Adjust a model whose points were merged, and complete its points in turn, as COLMAP does at the end."""
     import pycolmap
 
-    options = _adjustment(capture.pipeline, reconstruction)
+    pipeline = capture.pipeline
+    options = _adjustment(pipeline, reconstruction)
     options.ceres.solver_options.max_num_iterations = CLOSURE.rounds
     pycolmap.bundle_adjustment(reconstruction, options)
     mapper = pycolmap.IncrementalMapper(capture.cache())
     mapper.begin_reconstruction(reconstruction)
-    _refine(mapper, reconstruction, capture.pipeline)
+    # COLMAP's own loop would answer no signal until its end
+    options = _adjustment(pipeline, reconstruction)
+    mapper.complete_and_merge_tracks(pipeline.get_triangulation())
+    mapper.retriangulate(pipeline.get_triangulation())
+    for _ in range(pipeline.ba_global_max_refinements):
+        observations = reconstruction.compute_num_observations()
+        pycolmap.bundle_adjustment(reconstruction, options)
+        changed = mapper.complete_and_merge_tracks(pipeline.get_triangulation())
+        changed += mapper.filter_points(pipeline.get_mapper())
+        if changed < pipeline.ba_global_max_refinement_change * observations:
+            break
+    reconstruction.normalize()
+    mapper.filter_frames(pipeline.get_mapper())
     mapper.end_reconstruction(False)
 
 
@@ -296,36 +309,14 @@ def _work_of(images: int) -> float:
     return images * (images + 1.0) * (2 * images + 1.0) / 6
 
 
-def _refine(
-    mapper: pycolmap.IncrementalMapper,
-    reconstruction: pycolmap.Reconstruction,
-    pipeline: pycolmap.IncrementalPipelineOptions,
-) -> None:
-    """Adjust the model and complete its points in turn; COLMAP's own loop would answer no signal until its end."""
-    import pycolmap
-
-    adjustment = _adjustment(pipeline, reconstruction)
-    mapper.complete_and_merge_tracks(pipeline.get_triangulation())
-    mapper.retriangulate(pipeline.get_triangulation())
-    for _ in range(pipeline.ba_global_max_refinements):
-        observations = reconstruction.compute_num_observations()
-        pycolmap.bundle_adjustment(reconstruction, adjustment)
-        changed = mapper.complete_and_merge_tracks(pipeline.get_triangulation())
-        changed += mapper.filter_points(pipeline.get_mapper())
-        if changed < pipeline.ba_global_max_refinement_change * observations:
-            break
-    reconstruction.normalize()
-    mapper.filter_frames(pipeline.get_mapper())
-
-
-def _torn_pairs(
+def _find_torn_pairs(
     database: Path,
     model: Submodel,
     place: Mapping[str, int],
     part_of: Mapping[str, int],
     nearest: Mapping[Pair, int | None],
 ) -> list[_TornPair]:
-    """Pairs that show the same, and hang together by nothing but a long way round."""
+    """Find matched pairs that are linked only over many other images."""
     linked: list[tuple[str, str]] = []
     suspects: list[_TornPair] = []
     timed = model.images.keys() & place.keys()
@@ -344,7 +335,7 @@ def _torn_pairs(
 
 
 def _hops(names: Sequence[str], linked: Sequence[tuple[str, str]], asked: Sequence[tuple[str, str]]) -> list[float]:
-    """Over how many pairs that are linked one comes from one image to the other."""
+    """Number of linked pairs on the shortest path from one image to the other."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import dijkstra
 

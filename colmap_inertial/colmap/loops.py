@@ -66,6 +66,11 @@ class Loops:
     refused: int
     closed: tuple[FramePair, ...]
 
+    def counts(self) -> dict[str, int]:
+        """The numbers of pairs, by their names in a record of matching."""
+        numbers = (self.compared, self.candidates, self.refused, len(self.closed))
+        return dict(zip(("loops_compared", "loop_candidates", "loops_refused", "loops_closed"), numbers, strict=True))
+
 
 def key_frames(t_s: Array) -> IndexArray:
     """Frames about a second apart, or farther in a capture that is very long."""
@@ -97,7 +102,7 @@ def name_pairs(names: Sequence[str], pairs: Sequence[FramePair]) -> list[tuple[s
     return [(names[a], names[b]) for a, b in pairs]
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False)
 class LoopSearch:
     """A capture whose loops are sought.
 

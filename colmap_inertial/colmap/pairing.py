@@ -12,7 +12,7 @@ import numpy as np
 
 from colmap_inertial.colmap.gyro_orientations import GyroOrientations, estimate_gyro_orientations
 from colmap_inertial.colmap.loops import LoopSearch, name_pairs, split_pairs
-from colmap_inertial.colmap.relative_track import estimate_relative_track
+from colmap_inertial.colmap.relative_track import RelativeTrack, estimate_relative_track
 from colmap_inertial.colmap.sparse import image_pairs, match_pairs, matches_every_pair
 from colmap_inertial.colmap.two_views import (
     Covisibility,
@@ -142,8 +142,7 @@ def match_capture(
     counts: dict[str, int] = {}
     sigma_deg = None
     try:
-        turn_rad = read_rotations_rad(database, names)
-        orientations = estimate_gyro_orientations(recording, turn_rad, read_ray_pairs(database, names, close), camera)
+        orientations = _estimate_orientations(database, recording, close, camera)
     except NotObservableError as error:
         note = f"not used: {error}"
         match(_list_pairs(i, j, rest))
@@ -151,33 +150,14 @@ def match_capture(
         note = "the frames turn as the gyroscope does"
         sigma_deg = _largest_sigma_deg(orientations)
         covisibility = Covisibility.of(database, names)
-        apart = rest.copy()
-        apart[rest] = orientations.see_nothing_in_common(i[rest], j[rest])
-        unlike = rest & ~apart & every_pair
-        unlike[unlike] = covisibility.are_unlike(i[unlike], j[unlike], _LEAST_VOTES)
-        counts = {"apart": int(apart.sum()), "unlike": int(unlike.sum())}
-        near_pairs = _list_pairs(i, j, rest & ~apart & ~unlike)
+        near_pairs, counts = _exclude_pairs(orientations, covisibility if every_pair else None, (i[rest], j[rest]))
         if every_pair:
             match(near_pairs)
         else:
-            next_pairs = [(a, b) for a, b in close if b - a <= _NEXT]
-            observations = read_observations(database, names, next_pairs, orientations.start_from_cam)
-            search = LoopSearch(
-                database=database,
-                names=names,
-                orientations=orientations,
-                track=estimate_relative_track(observations, len(names)),
-                covisibility=covisibility,
-                nearest=near + 1,
-            )
+            track = _estimate_track(database, names, close, orientations)
+            search = LoopSearch(database, names, orientations, track, covisibility, near + 1)
             doubtful = _list_pairs(i, j, far & (j - i <= _NEAR * near))
-            loops = search.close_loops(match, doubtful=doubtful, neighbours=near_pairs)
-            counts |= {
-                "loops_compared": loops.compared,
-                "loop_candidates": loops.candidates,
-                "loops_refused": loops.refused,
-                "loops_closed": len(loops.closed),
-            }
+            counts |= search.close_loops(match, doubtful=doubtful, neighbours=near_pairs).counts()
     record = MatchRecord(
         device=context.device,
         pairing="exhaustive" if every_pair else "sequential",
@@ -192,6 +172,34 @@ def match_capture(
     )
     log.info("matches: %s", record)
     return record
+
+
+def _estimate_orientations(
+    database: Path, recording: Recording, close: Sequence[FramePair], camera: CameraModel | None
+) -> GyroOrientations:
+    names = recording.timing.names
+    turn_rad = read_rotations_rad(database, names)
+    return estimate_gyro_orientations(recording, turn_rad, read_ray_pairs(database, names, close), camera)
+
+
+def _estimate_track(
+    database: Path, names: Sequence[str], close: Sequence[FramePair], orientations: GyroOrientations
+) -> RelativeTrack:
+    next_pairs = [(a, b) for a, b in close if b - a <= _NEXT]
+    observations = read_observations(database, names, next_pairs, orientations.start_from_cam)
+    return estimate_relative_track(observations, len(names))
+
+
+def _exclude_pairs(
+    orientations: GyroOrientations, covisibility: Covisibility | None, pairs: tuple[IndexArray, IndexArray]
+) -> tuple[list[FramePair], dict[str, int]]:
+    """Pairs that the gyroscope and, where given, a quick comparison do not exclude; how many these exclude."""
+    i, j = pairs
+    apart = orientations.see_nothing_in_common(i, j)
+    unlike = np.zeros(len(i), dtype=np.bool_)
+    if covisibility is not None:
+        unlike[~apart] = covisibility.are_unlike(i[~apart], j[~apart], _LEAST_VOTES)
+    return _list_pairs(i, j, ~apart & ~unlike), {"apart": int(apart.sum()), "unlike": int(unlike.sum())}
 
 
 def _list_pairs(i: IndexArray, j: IndexArray, which: BoolArray) -> list[FramePair]:

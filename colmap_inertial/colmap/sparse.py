@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -21,6 +21,9 @@ from colmap_inertial.model import colmap_camera
 from colmap_inertial.pipeline.run.context import RunContext
 from colmap_inertial.pipeline.run.workspace import require_room
 from colmap_inertial.pipeline.stages.protocols import KeypointStage
+
+if TYPE_CHECKING:
+    import pycolmap
 
 #: Up to this many images every pair is matched; above it, neighbours in time.
 _EXHAUSTIVE_UP_TO = 150
@@ -118,13 +121,6 @@ def extract_features(
     """
     import pycolmap
 
-    extraction = pycolmap.FeatureExtractionOptions()
-    extraction.use_gpu = context.device == "cuda"
-    extraction.num_threads = context.num_threads
-    if options.max_image_size is not None:
-        extraction.max_image_size = options.max_image_size
-    extraction.sift.max_num_features = options.max_num_features
-    extraction.sift.first_octave = options.first_octave
     pycolmap.set_random_seed(context.seed)
     groups: dict[CameraModel | None, list[str]] = {}
     for name, camera in cameras.items():
@@ -136,8 +132,8 @@ def extract_features(
             colmap_camera(camera)  # raises on wrong parameters before any work
             reader.camera_model = camera.model
             reader.camera_params = ",".join(repr(p) for p in camera.params)
-        names.sort()
-        for batch in (names[k : k + _EXTRACTION_BATCH] for k in range(0, len(names), _EXTRACTION_BATCH)):
+        for k in range(0, len(names), _EXTRACTION_BATCH):
+            batch = sorted(names)[k : k + _EXTRACTION_BATCH]
             context.progress("features", done, len(cameras))
             require_room(database.parent, len(batch) * options.max_num_features * _FEATURE_BYTES)
             with _writing(database):
@@ -157,7 +153,7 @@ def extract_features(
                     image_names=batch,
                     camera_mode=pycolmap.CameraMode.SINGLE,
                     reader_options=reader,
-                    extraction_options=extraction,
+                    extraction_options=_extraction_options(options, context),
                     device=pycolmap.Device(context.device),
                 )
             with _writing(database), pycolmap.Database.open(str(database)) as opened:
@@ -168,6 +164,19 @@ def extract_features(
             done += len(batch)
     context.progress("features", done, len(cameras))
     return apply_keypoint_stages(database, keypoint_stages)
+
+
+def _extraction_options(options: MappingOptions, context: RunContext) -> pycolmap.FeatureExtractionOptions:
+    import pycolmap
+
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.use_gpu = context.device == "cuda"
+    extraction.num_threads = context.num_threads
+    if options.max_image_size is not None:
+        extraction.max_image_size = options.max_image_size
+    extraction.sift.max_num_features = options.max_num_features
+    extraction.sift.first_octave = options.first_octave
+    return extraction
 
 
 def _intern(camera: CameraModel | None, known: Mapping[CameraModel | None, list[str]]) -> CameraModel | None:

@@ -1,4 +1,4 @@
-"""Captures too long for one go: mapped in parts that overlap, which then become one model.
+"""Mapping of long captures in overlapping parts, which are then merged to one model.
 
 COLMAP adjusts the whole model again and again while it grows, and from 1000 images on by conjugate gradients, which
 along a chain of images hardly move. Parts take as long for each image in a capture of any length.
@@ -33,7 +33,7 @@ from colmap_inertial.model.submodels.graph import (
     connected,
     minimised,
 )
-from colmap_inertial.model.submodels.matches import Submodel, constrain_by_points, matches_between, shared_features
+from colmap_inertial.model.submodels.matches import Submodel, constrain_by_points, find_common_features, matches_between
 from colmap_inertial.model.submodels.merging import merge_models
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ def map_in_parts(
 
     Returns
     -------
-    The models, and where parts met.
+    The models, and the overlaps of parts.
     """
     import pycolmap
 
@@ -121,10 +121,10 @@ def map_in_parts(
 def join_runs(
     capture: MappedCapture, parts: Sequence[MappedRun], *, near: int, loops: bool
 ) -> tuple[list[pycolmap.Reconstruction], list[LoopClosure]]:
-    """Of parts that lie beside each other, one model, and the seams between them, those that did not fit, too.
+    """Join overlapping parts to one model; the seams between them, those that did not fit, too.
 
-    Of a seam that does not fit, first loops are not believed, then nothing is: its constraint places no part, and its
-    matches merge no points. Each time one seam is less, so that it ends; at worst, parts stay as they are.
+    Of a seam that does not fit, first the loops are left out, then all its matches: it constrains no part then, and
+    merges no points. Each round leaves one out, so that the loop ends; at worst, parts stay as they are.
     """
     farthest = None if loops else near
     ties = find_ties(capture, parts, nearest=farthest)
@@ -166,7 +166,7 @@ def join_runs(
 
 
 def _worst(overlap: SubmapOverlap, misfit: dict[Pair, float]) -> Pair:
-    """The seam that fits least once all was adjusted; where that does not tell, the constraint that fits least."""
+    """The seam that fits worst after the adjustment; where all fit, the constraint that fits worst."""
     if all(seam.joined for seam in overlap.seams.values()) and (unseen := misfit.keys() - overlap.seams.keys()):
         return max(unseen, key=lambda pair: (misfit[pair], pair))
     return min(overlap.seams, key=lambda pair: (overlap.seams[pair].agree, -misfit.get(pair, 0.0), pair))
@@ -184,14 +184,14 @@ def find_ties(
     """
     place = {name: at for at, name in enumerate(capture.names)}
     submodels = [Submodel(part.model) for part in parts]
-    shared = shared_features(submodels)
+    shared = find_common_features(submodels)
 
     def near(first: str, second: str) -> bool:
         return nearest is None or abs(place[first] - place[second]) <= nearest
 
     views = matches_between(capture.database, submodels, near) | shared
-    found = {pair: constrain_by_points(submodels, pair, views[pair]) for pair in sorted(views)}
-    return {pair: tie for pair, tie in found.items() if tie is not None}
+    ties = {pair: constrain_by_points(submodels, pair, views[pair]) for pair in sorted(views)}
+    return {pair: tie for pair, tie in ties.items() if tie is not None}
 
 
 def place_parts(count: int, ties: Sequence[SimilarityConstraint]) -> Placements:

@@ -1,4 +1,4 @@
-"""One metric model of several that were placed together: images, points, scale, and what is known of each part."""
+"""One metric model of several that were placed together: images, points, scale, and a record of each part."""
 
 from __future__ import annotations
 
@@ -56,24 +56,47 @@ def join_models(
     first, placed = members[0], group.placed
     assert first.scale is not None and first.similarity is not None
     moves = [_metric_move(placed, k, world) for k in range(len(members))]
-    after = [_after(move, model) for move, model in zip(moves, members, strict=True)]
-    # its own up and scale are as uncertain as before, at most
-    placements = [replace(after[0], cov=_with_scale(first.similarity.cov, _sigma_log(first, fitted[0], placed, 0)))]
-    for k in range(1, len(members)):
-        cov = _similarity_cov(placed, k, moves[k])
-        shared = np.zeros((4, 4))
-        shared[0, 0], shared[1:, 1:] = _unmodelled_variance(members[k], fitted[k]), placements[0].cov[1:4, 1:4]
-        by = _by_world(after[k].translation_m)
-        cov = cov + by @ shared @ by.T
-        placements.append(replace(after[k], cov=0.5 * (cov + cov.T)))
-    about = [_part_of(model, fitted, placed, k, placements[k]) for k, model in enumerate(members)]
+    about: list[JoinedPart] = []
+    for k, (model, submodel, move) in enumerate(zip(members, fitted, moves, strict=True)):
+        assert model.scale is not None
+        similarity, sigma_log = _after(move, model), _sigma_log(model, submodel, placed, k)
+        sigma_m = sigma_rad = 0.0
+        if k:
+            cov = _similarity_cov(placed, k, move)
+            shared = np.zeros((4, 4))
+            shared[0, 0] = _scale_variance_beside(model, submodel)
+            shared[1:, 1:] = about[0].similarity.cov[1:4, 1:4]
+            by = _world_jacobian(similarity.translation_m)
+            cov = cov + by @ shared @ by.T
+            cov = 0.5 * (cov + cov.T)
+            middles = [one.trajectory.cam_in_world.mean(axis=0) for one in (fitted[0], submodel)]
+            sigma_m, sigma_rad = worst(relative_cov(fitted, placed, middles, (0, k)))
+        else:
+            # the first one's up and scale are as uncertain as before, at most
+            before = float(first.similarity.cov[0, 0]) ** 0.5
+            by = np.eye(7)
+            by[0, 0] = min(1.0, sigma_log / before) if before > 0 else 1.0
+            cov = by @ first.similarity.cov @ by.T
+        about.append(
+            JoinedPart(
+                colmap_index=model.colmap_index,
+                images=model.reconstruction.num_reg_images(),
+                begin_s=float(submodel.trajectory.t_s[0]),
+                end_s=float(submodel.trajectory.t_s[-1]),
+                verdict=model.scale.verdict,
+                sigma_log=sigma_log,
+                similarity=replace(similarity, cov=cov),
+                sigma_m=sigma_m,
+                sigma_deg=float(np.degrees(sigma_rad)),
+            )
+        )
     numbers = ", ".join(str(model.colmap_index) for model in members)
     reason = f"joined of COLMAP's models {numbers}, {sum(part.images for part in about)} images"
     scale = _scale_of(members, about, float(np.linalg.norm(placed.gravity_m_s2)) * DOWN_IN_WORLD[world])
     return replace(
         _merged(members, moves, fitted, group, found),
         scale=replace(scale, notes=(*scale.notes, f"the model was {reason}")),
-        similarity=replace(placements[0], provenance=f"{first.similarity.provenance}; {reason}"),
+        similarity=replace(about[0].similarity, provenance=f"{first.similarity.provenance}; {reason}"),
         treatments=(
             *first.treatments,
             Treatment(stage="join", reason=reason, action="joined", values={"parts": len(members)}),
@@ -144,15 +167,7 @@ def _similarity_cov(placed: Placed, k: int, move: Similarity) -> Array:
     return np.asarray(placed.inflation * by @ placed.cov[own, own] @ by.T)
 
 
-def _with_scale(cov: Array, sigma_log: float) -> Array:
-    """A similarity's covariance with another standard deviation of its scale."""
-    before = float(cov[0, 0]) ** 0.5
-    by = np.eye(7)
-    by[0, 0] = min(1.0, sigma_log / before) if before > 0 else 1.0
-    return np.asarray(by @ cov @ by.T)
-
-
-def _by_world(translation_m: Array) -> Array:
+def _world_jacobian(translation_m: Array) -> Array:
     """(7, 4) of a similarity by the size of a metre and by a rotation of the world, both about the world's origin."""
     by = np.zeros((PLACEMENT, 4))
     by[0, 0], by[4:, 0] = 1.0, translation_m
@@ -160,45 +175,26 @@ def _by_world(translation_m: Array) -> Array:
     return by
 
 
-def _unmodelled_variance(model: Model, submodel: FittedSubmodel) -> float:
-    """What the fit itself does not say of a scale's variance: lens, accelerometer and more."""
+def _scale_variance_beside(model: Model, submodel: FittedSubmodel) -> float:
+    """Variance of a scale beside that of the fit itself: lens, accelerometer and more."""
     assert model.scale is not None and model.scale.sigma_log is not None
     return max(0.0, model.scale.sigma_log**2 - submodel.path.scale[1])
 
 
 def _sigma_log(model: Model, submodel: FittedSubmodel, placed: Placed, k: int) -> float:
-    """Of a scale once joined: what the fit left of it goes down, all the rest stays."""
+    """Standard deviation of a scale once joined: the share of the fit goes down, the rest stays."""
     # where the ties are off by more than noise makes them, the scale gains less by them
     joined = placed.inflation * float(placed.cov[7 * k, 7 * k])
-    return float((min(submodel.path.scale[1], joined) + _unmodelled_variance(model, submodel)) ** 0.5)
-
-
-def _part_of(
-    model: Model, fitted: Sequence[FittedSubmodel], placed: Placed, k: int, similarity: Similarity
-) -> JoinedPart:
-    assert model.scale is not None
-    trajectory, (sigma_m, sigma_rad) = fitted[k].trajectory, (0.0, 0.0)
-    if k:
-        middles = [one.trajectory.cam_in_world.mean(axis=0) for one in (fitted[0], fitted[k])]
-        sigma_m, sigma_rad = worst(relative_cov(fitted, placed, middles, (0, k)))
-    return JoinedPart(
-        colmap_index=model.colmap_index,
-        images=model.reconstruction.num_reg_images(),
-        begin_s=float(trajectory.t_s[0]),
-        end_s=float(trajectory.t_s[-1]),
-        verdict=model.scale.verdict,
-        sigma_log=_sigma_log(model, fitted[k], placed, k),
-        similarity=similarity,
-        sigma_m=sigma_m,
-        sigma_deg=float(np.degrees(sigma_rad)),
-    )
+    return float((min(submodel.path.scale[1], joined) + _scale_variance_beside(model, submodel)) ** 0.5)
 
 
 def _scale_of(members: Sequence[Model], parts: Sequence[JoinedPart], down: Array) -> ScaleEstimate:
-    """The scale of a joined model: that of its first part, with what the others say of it."""
+    """The scale of a joined model: that of its first part, constrained by the others."""
     first, similarity, sigma_log = members[0].scale, parts[0].similarity, parts[0].sigma_log
     assert first is not None and first.gravity_in_world_m_s2 is not None and first.sigma_log is not None
-    verdict, ci95, reasons = verdict_of(similarity.scale, sigma_log, [*first.reasons, *_doubts(members[1:], parts[1:])])
+    verdict, ci95, reasons = verdict_of(
+        similarity.scale, sigma_log, [*first.reasons, *_scale_warnings(members[1:], parts[1:])]
+    )
     narrower = sigma_log / first.sigma_log
     return replace(
         first,
@@ -213,15 +209,15 @@ def _scale_of(members: Sequence[Model], parts: Sequence[JoinedPart], down: Array
     )
 
 
-def _doubts(members: Sequence[Model], parts: Sequence[JoinedPart]) -> list[str]:
-    """What keeps a joined model from being trusted, beside its first part."""
+def _scale_warnings(members: Sequence[Model], parts: Sequence[JoinedPart]) -> list[str]:
+    """Reasons not to trust a joined model's scale, of all parts but the first."""
     out = []
     for model, part in zip(members, parts, strict=True):
         scale = model.scale
         assert scale is not None and scale.sigma_log is not None
-        known = half_width(part.sigma_log)
-        if known > TRUSTED_HALF_WIDTH:
-            why = f"its scale is known to +-{100 * known:.1f} % only"
+        width = half_width(part.sigma_log)
+        if width > TRUSTED_HALF_WIDTH:
+            why = f"its scale is known to +-{100 * width:.1f} % only"
         elif scale.verdict == "weak" and half_width(scale.sigma_log) <= TRUSTED_HALF_WIDTH:
             why = "; ".join(scale.reasons)
         else:

@@ -1,4 +1,4 @@
-"""What images say of two submodels: features that both have, and verified matches between images of either.
+"""Constraints by images of two submodels: features that both have, and verified matches between images of either.
 
 A chain of images breaks where COLMAP cannot go on, and what comes later may see again what was seen before: the
 database has these matches, and neither submodel uses them. Points of both give a similarity, whatever the units; where
@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import logging
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -123,7 +123,7 @@ def matches_between(
     return out
 
 
-def shared_features(submodels: Sequence[Submodel]) -> dict[Pair, list[View]]:
+def find_common_features(submodels: Sequence[Submodel]) -> dict[Pair, list[View]]:
     """By pairs of submodels: the features of images that both have."""
     out: dict[Pair, list[View]] = {}
     for (a, first), (b, second) in itertools.combinations(enumerate(submodels), 2):
@@ -154,10 +154,10 @@ def constrain_by_points(
     ransac = pycolmap.RANSACOptions()
     ransac.random_seed = 0
     ransac.max_error = LIMITS.same_share * float(np.median(away))
-    found: Any = pycolmap.estimate_sim3d_robust(in_second, in_first, ransac)  # a dict, whatever its stub says
-    if found is None:
+    estimate: Any = pycolmap.estimate_sim3d_robust(in_second, in_first, ransac)  # a dict, whatever its stub says
+    if estimate is None:
         return None
-    similarity: pycolmap.Sim3d = found["tgt_from_src"]
+    similarity: pycolmap.Sim3d = estimate["tgt_from_src"]
     agree = np.linalg.norm(in_first - similarity * in_second, axis=1) < LIMITS.same_share * away
     if agree.sum() < max(LIMITS.matches, len(pairs) / 2):
         return None
@@ -221,27 +221,26 @@ def place_images(
         views = between.get((min(a, b), max(a, b)), [])
         if a > b:
             views = [(second, first, features[:, ::-1]) for first, second, features in views]
-        placed = _placed(submodels[a], submodels[b], views)
-        if names := sorted(placed):
-            poses = [placed[name][1] for name in names]
+        if placed := _localise(submodels[a], submodels[b], views):
+            names, beside, poses, points = zip(*placed, strict=True)
             out.append(
                 PlacedImages(
                     first=numbers[a],
                     second=numbers[b],
-                    names=tuple(names),
-                    beside=tuple(placed[name][0] for name in names),
+                    names=names,
+                    beside=beside,
                     world_from_cam=np.array([pose.rotation.matrix().T for pose in poses]),
                     cam_in_world=np.array([pose.inverse().translation for pose in poses]),
-                    matches=np.unique(np.concatenate([placed[name][2] for name in names]), axis=0),
+                    matches=np.unique(np.concatenate(points), axis=0),
                 )
             )
     return out
 
 
-def _placed(
+def _localise(
     there: Submodel, own: Submodel, views: Sequence[View]
-) -> Mapping[str, tuple[str, pycolmap.Rigid3d, Int64Array]]:
-    """By name of images of ``own``: the image that it matches best, its pose, and points (there, own) that are one."""
+) -> list[tuple[str, str, pycolmap.Rigid3d, Int64Array]]:
+    """Of images of ``own``: name, image that matches best, pose, and pairs of points (there, own) that are the same."""
     seen: dict[str, list[Int64Array]] = defaultdict(list)
     best: dict[str, Counter[str]] = defaultdict(Counter)
     for other, name, features in views:
@@ -251,18 +250,21 @@ def _placed(
         couples = np.stack([inside[:, 1], points[inside[:, 0]]], axis=1)
         seen[name].append(couples[couples[:, 1] >= 0])
         best[name][other] += len(seen[name][-1])
-    out = {}
-    for name, parts in seen.items():
-        couples, order = np.unique(np.concatenate(parts), axis=0, return_index=True)
+    out = []
+    for name, of_views in sorted(seen.items()):
+        couples, order = np.unique(np.concatenate(of_views), axis=0, return_index=True)
         couples = couples[np.argsort(order)]  # as they were read: RANSAC draws by their order
-        pose, agree = _pose(there, own, name, couples)
+        pose, agree = _estimate_pose(there, own, name, couples)
         if pose is not None:
             of_own = own.points(name)[agree[:, 0]]
-            out[name] = best[name].most_common(1)[0][0], pose, np.stack([agree[:, 1], of_own], axis=1)[of_own >= 0]
+            points = np.stack([agree[:, 1], of_own], axis=1)[of_own >= 0]
+            out.append((name, best[name].most_common(1)[0][0], pose, points))
     return out
 
 
-def _pose(there: Submodel, own: Submodel, name: str, couples: Int64Array) -> tuple[pycolmap.Rigid3d | None, Int64Array]:
+def _estimate_pose(
+    there: Submodel, own: Submodel, name: str, couples: Int64Array
+) -> tuple[pycolmap.Rigid3d | None, Int64Array]:
     """The pose of an image by (K, 2) keypoints and points of another model, and those that agree; none where few do."""
     import pycolmap
 
