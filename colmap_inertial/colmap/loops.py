@@ -29,8 +29,8 @@ from colmap_inertial.core.arrays import Array, BoolArray, IndexArray
 
 #: Frames among which loops are sought are about so far apart, and so many at most.
 _SPACING_S, _MOST_FRAMES = 1.0, 1000
-#: Candidates have at least so many votes, and are among the best so many of one of their frames.
-_LEAST_VOTES, _BEST = 6, 3
+#: Candidates have at least so many quick matches, and are among the best so many of one of their frames.
+_LEAST_QUICK_MATCHES, _BEST = 6, 3
 #: A loop's matches cover this share of what both pictures show.
 _LEAST_COVERED = 0.5
 #: Places of a loop's frames and lengths by its matches are as sure as this share of how far away its points are.
@@ -82,14 +82,14 @@ def key_frames(t_s: Array) -> IndexArray:
     return np.array(kept, dtype=np.intp)
 
 
-def candidates(votes: IndexArray, i: IndexArray, j: IndexArray) -> BoolArray:
-    """(M,) which pairs of frames i, j, (M,) each, have votes enough and are among the best of one of their frames."""
-    chosen = np.zeros(len(votes), dtype=np.bool_)
+def candidates(matches: IndexArray, i: IndexArray, j: IndexArray) -> BoolArray:
+    """(M,) which pairs of frames i, j, (M,) each, have matches enough and are among the best of one of their frames."""
+    chosen = np.zeros(len(matches), dtype=np.bool_)
     for frame in np.unique(np.concatenate([i, j])):
-        mine = np.flatnonzero((i == frame) | (j == frame))
-        best = mine[np.argsort(-votes[mine], kind="stable")[:_BEST]]
+        own = np.flatnonzero((i == frame) | (j == frame))
+        best = own[np.argsort(-matches[own], kind="stable")[:_BEST]]
         chosen[best] = True
-    return chosen & (votes >= _LEAST_VOTES)
+    return chosen & (matches >= _LEAST_QUICK_MATCHES)
 
 
 def split_pairs(pairs: Sequence[FramePair]) -> IndexArray:
@@ -139,7 +139,7 @@ class LoopSearch:
         match
             Matches and verifies pairs in the database.
         doubtful
-            Pairs that are candidates, too, if they have votes enough; those beside them are not.
+            Pairs that are candidates, too, if they have quick matches enough; those beside them are not.
         neighbours
             Pairs that are matched and not judged; in one go with candidates, as COLMAP indexes the features of all
             images anew each time.
@@ -152,7 +152,7 @@ class LoopSearch:
         voted = set(zip(i[chosen].tolist(), j[chosen].tolist(), strict=True))
         a, b = split_pairs(doubtful)
         alike = ~self._surely_apart(a, b)
-        alike[alike] = self.covisibility.count(a[alike], b[alike]) >= _LEAST_VOTES
+        alike[alike] = self.covisibility.count(a[alike], b[alike]) >= _LEAST_QUICK_MATCHES
         first = sorted(voted.union(itertools.compress(doubtful, alike)))
         match([*neighbours, *first])
         verified, poses = self._judge(first)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import logging
+import sqlite3
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -98,8 +100,9 @@ def map_images(
     pycolmap.set_random_seed(context.seed)
     sparse.mkdir(parents=True)
     require_room(sparse, database.stat().st_size)
-    with pycolmap.Database.open(str(database)) as opened:
-        num_images = opened.num_images()
+    # COLMAP's own reader would write to the file
+    with contextlib.closing(sqlite3.connect(f"{database.absolute().as_uri()}?immutable=1", uri=True)) as opened:
+        (num_images,) = opened.execute("SELECT COUNT(*) FROM images").fetchone()
     context.progress("mapping", 0, num_images)
     every_pair = matches_every_pair(num_images, options)
     near = _NEIGHBOURS * options.overlap

@@ -31,8 +31,8 @@ from colmap_inertial.pipeline.run.context import Recording, RunContext
 log = logging.getLogger(__name__)
 
 
-#: Pairs with fewer votes are not worth matching: of V1_01, they hold .7 % of the inliers.
-_LEAST_VOTES = 4
+#: Pairs with fewer quick matches are not worth matching: of V1_01, they hold .7 % of the inliers.
+_LEAST_QUICK_MATCHES = 4
 #: Images so many places apart are matched first, and in any case: the gyroscope is calibrated by them.
 _CLOSE = (1, 2, 4)
 #: The relative track is estimated by images so many places apart: farther apart, matches may join repeated structure.
@@ -198,7 +198,7 @@ def _exclude_pairs(
     apart = orientations.see_nothing_in_common(i, j)
     unlike = np.zeros(len(i), dtype=np.bool_)
     if covisibility is not None:
-        unlike[~apart] = covisibility.are_unlike(i[~apart], j[~apart], _LEAST_VOTES)
+        unlike[~apart] = covisibility.are_unlike(i[~apart], j[~apart], _LEAST_QUICK_MATCHES)
     return _list_pairs(i, j, ~apart & ~unlike), {"apart": int(apart.sum()), "unlike": int(unlike.sum())}
 
 

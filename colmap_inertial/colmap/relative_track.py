@@ -75,10 +75,10 @@ class RelativeTrack:
         """(M,) whether one part of the track has frames i and j, (M,) each."""
         return np.asarray((self.part[i] == self.part[j]) & (self.part[i] >= 0))
 
-    def covariance(self, i: IndexArray, j: IndexArray, heading_rad: Array) -> Array:
+    def covariance(self, i: IndexArray, j: IndexArray, orientation_rad: Array) -> Array:
         """(M, 3, 3) of the displacements from frames i to frames j >= i, (M,) each.
 
-        Each step's length is off by a factor that walks; headings are off by ``heading_rad`` (M,) at the end.
+        Each step's length is off by a factor that walks; orientations are off by ``orientation_rad`` (M,) at the end.
         """
         count = (j - i + 1).astype(np.float64)[:, None, None]
         sums = np.concatenate([np.zeros((1, 3)), np.cumsum(self.centre, axis=0)])
@@ -92,7 +92,7 @@ class RelativeTrack:
             count * end[:, :, None] * end[:, None, :] - mixed - np.swapaxes(mixed, 1, 2) + squares[j + 1] - squares[i]
         )
         mean = np.trace(remaining, axis1=1, axis2=2)[:, None, None] / count
-        return np.asarray(DRIFT**2 * remaining + (heading_rad[:, None, None] ** 2 * mean) * np.eye(3))
+        return np.asarray(DRIFT**2 * remaining + (orientation_rad[:, None, None] ** 2 * mean) * np.eye(3))
 
     def depth(self, frame: int) -> float:
         """Median distance of the points that a frame sees; NaN where it sees none."""

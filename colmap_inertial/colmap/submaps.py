@@ -202,7 +202,7 @@ def place_parts(count: int, ties: Sequence[SimilarityConstraint]) -> Placements:
     )
 
     def equations(state: Placements) -> Equations:
-        out = Equations.of_size(len(state.change))
+        out = Equations(len(state.change))
         for tie in ties:
             tie.add_to(out, state)
         out.hold(columns_of(0))

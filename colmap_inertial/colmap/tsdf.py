@@ -55,7 +55,7 @@ SURFACE = SurfaceLimits()
 
 
 def require_mesh_maker(options: ReconstructOptions) -> None:
-    """See whether Open3D can be loaded where it is to make the mesh: what is missing is said before the work.
+    """Check that Open3D can be loaded where it is to make the mesh, before the work begins.
 
     In a process of its own: it takes 200 MB, which COLMAP may need until the mesh is made.
 

@@ -31,9 +31,10 @@ _RAYS = 100
 _LEAST_PLACED, _PLACED_PX, _PLACED_SHARE = 12, 8.0, 0.7
 #: A picture in cells, and the features that a cell must have for it to count.
 _COLUMNS, _ROWS, _LEAST_FEATURES = 8, 6, 3
-#: Features of each image that vote.
-_VOTERS = 500
-#: A vote: the nearest descriptor is nearer than this share of the next one's angle, and than this angle (COLMAP's).
+#: Features of each image in the quick comparison, the largest ones.
+_COMPARED_FEATURES = 500
+#: A quick match: the nearest descriptor is nearer than this share of the next one's angle, and than this angle, as in
+#: COLMAP.
 _RATIO, _FARTHEST_RAD = 0.7, 0.7
 #: COLMAP stores descriptors of this length.
 _LENGTH = 512.0
@@ -308,31 +309,31 @@ class Covisibility:
                 number = features.images[name].image_id
                 keypoints = np.array(features.database.read_keypoints(number), dtype=np.float64).reshape(-1, 6)
                 size = np.hypot(keypoints[:, 2], keypoints[:, 4])
-                largest = np.argsort(-size, kind="stable")[:_VOTERS]
+                largest = np.argsort(-size, kind="stable")[:_COMPARED_FEATURES]
                 stored = np.array(features.database.read_descriptors(number).data, dtype=np.uint8).reshape(-1, 128)
                 descriptors.append(stored[largest])
                 places.append(keypoints[largest, :2])
         return cls(descriptors=tuple(descriptors), xy_px=tuple(places))
 
-    def are_unlike(self, i: IndexArray, j: IndexArray, least_votes: int) -> BoolArray:
-        """(M,) whether images i and j, both with features enough, have fewer votes than this."""
-        return np.asarray((self.count(i, j) < least_votes) & self.plenty[i] & self.plenty[j])
+    def are_unlike(self, i: IndexArray, j: IndexArray, least: int) -> BoolArray:
+        """(M,) whether images i and j, both with features enough, have fewer quick matches than this."""
+        return np.asarray((self.count(i, j) < least) & self.plenty[i] & self.plenty[j])
 
     @property
     def plenty(self) -> BoolArray:
-        """(N,) which images have features enough for few votes to mean something."""
-        return np.array([len(own) == _VOTERS for own in self.descriptors], dtype=np.bool_)
+        """(N,) which images have features enough for few matches to mean something."""
+        return np.array([len(own) == _COMPARED_FEATURES for own in self.descriptors], dtype=np.bool_)
 
     def count(self, i: IndexArray, j: IndexArray) -> IndexArray:
-        """(M,) votes that images i and j, (M,) each, show the same."""
+        """(M,) quick matches of images i and j, (M,) each."""
         counted = np.zeros(len(i), dtype=np.intp)
         with one_blas_thread():
             for place in range(len(i)):
-                counted[place] = _count_votes(self.descriptors[i[place]], self.descriptors[j[place]])
+                counted[place] = _count_matches(self.descriptors[i[place]], self.descriptors[j[place]])
         return counted
 
 
-def _count_votes(first: UInt8Array, second: UInt8Array) -> int:
+def _count_matches(first: UInt8Array, second: UInt8Array) -> int:
     """Mutually nearest descriptors that are clearly nearer than the next."""
     if len(first) < 2 or len(second) < 2:
         return 0

@@ -58,7 +58,7 @@ class JoinedGroup:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Joined:
-    """What became of all submodels.
+    """The submodels as they were joined.
 
     Attributes
     ----------

@@ -67,7 +67,7 @@ class FittedSubmodel:
     path
         The same fitted to the IMU once more: the posterior of its motion.
     cameras
-        Names for its cameras, by which those of two submodels are told apart; empty where they are not known.
+        Names for its cameras, to distinguish those of two submodels; empty where they are unknown.
     """
 
     number: int
@@ -248,7 +248,7 @@ class Problem:
 
     def equations(self, state: Placements, *, by_imu: bool) -> Equations:
         """Normal equations and the sum of squares where the unknowns are."""
-        out, shared, every = Equations.of_size(self.size), np.arange(self.shared, self.size), np.arange(self.size)
+        out, shared, every = Equations(self.size), np.arange(self.shared, self.size), np.arange(self.size)
         for k, fit in enumerate(self.fits):
             columns = self.columns(k)
             away = state.change[columns]

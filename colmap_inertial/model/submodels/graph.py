@@ -95,18 +95,12 @@ def columns_of(k: int) -> slice:
     return slice(PLACEMENT * k, PLACEMENT * (k + 1))
 
 
-@dataclass(eq=False)
 class Equations:
     """Normal equations as they grow, and the sum of squares over variances."""
 
-    matrix: Array
-    gradient: Array
-    squares: float = 0.0
-
-    @classmethod
-    def of_size(cls, size: int) -> Self:
-        """No equations yet, of so many unknowns."""
-        return cls(matrix=np.zeros((size, size)), gradient=np.zeros(size))
+    def __init__(self, size: int) -> None:
+        self.matrix, self.gradient = np.zeros((size, size)), np.zeros(size)
+        self.squares = 0.0
 
     def add(
         self,
